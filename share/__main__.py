@@ -8,13 +8,13 @@ from types import FrameType
 def run() -> None:
     """The command line. Until a command has begun, Ctrl-C ends the program with one line."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where a script has it ignored
-        signal.signal(signal.SIGINT, interrupted)
+        signal.signal(signal.SIGINT, handle_interrupt)
     from share.cli.main import main
 
     main()
 
 
-def interrupted(number: int, frame: FrameType | None) -> None:
+def handle_interrupt(signal_number: int, frame: FrameType | None) -> None:
     """Exit code 130, as shells give it for SIGINT."""
     os.write(2, b"share: interrupted\n")
     os._exit(130)

@@ -259,7 +259,7 @@ class MergeConfig:
 
 
 STREAMED = "streamed"
-POLICIES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # see `share.scheduling.policies`
+POLICY_NAMES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # see `share.scheduling.policies`
 
 
 @dataclass(frozen=True)
@@ -277,14 +277,14 @@ class EdgeConfig:
     hurry_candidates: int = 3  # at most these, and one that is verified is enough
 
     def __post_init__(self) -> None:
-        if self.policy not in POLICIES:
-            raise ValueError(f"policy: '{self.policy}' is not known; known: {', '.join(POLICIES)}")
+        if self.policy not in POLICY_NAMES:
+            raise ValueError(f"policy: '{self.policy}' is not known; known: {', '.join(POLICY_NAMES)}")
         _require_positive(self, "max_agents", "max_keyframes", "max_waiting", "each_waiting")
         _require_positive(self, "hurry_waiting", "hurry_candidates")
 
 
 @dataclass(frozen=True)
-class AgentNeeds:
+class AgentQoe:
     """What one agent needs, under its name in `control.agents`; None is what its form has."""
 
     form: str | None = None  # ar or robot; None: its kind
@@ -311,7 +311,7 @@ class ControlConfig:
     robot_theta_ms: float = 20.0  # a delay well below this is as good as none
     robot_target: float = 0.9  # QoE that is aimed at
     signed_penalty: bool = False  # what is better than asked for raises QoE beyond 1, as the paper prints it
-    agents: dict[str, AgentNeeds] = field(default_factory=dict)  # NAME: {form, beta, gamma, theta_ms, target}
+    agents: dict[str, AgentQoe] = field(default_factory=dict)  # NAME: {form, beta, gamma, theta_ms, target}
     attribution: bool = True  # a QoE that is short because of delay lowers the rate, unlike in the paper
     kp: float = 0.8  # Hz per evaluation, of an error of 1 in QoE
     ki: float = 0.15  # the same, of an error of 1 for a second
@@ -362,7 +362,7 @@ def _require_positive(config: Any, *names: str) -> None:
             raise ValueError(f"{name}: {getattr(config, name)} must be positive")
 
 
-def load(text: str, where: str = "configuration") -> Config:
+def load_config(text: str, where: str = "configuration") -> Config:
     """A `Config` from YAML text. Raises ConfigError naming the key and what would be right."""
     data = load_yaml(text, where)
     return from_mapping(Config, {} if data is None else data, where)

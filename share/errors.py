@@ -31,7 +31,7 @@ class DataError(ShareError):
     """A recording is damaged or does not fit its calibration."""
 
 
-class MisfitError(DataError):
+class CalibrationMismatchError(DataError):
     """Not one image but the recording as a whole does not fit its calibration: reading on is no use."""
 
 
@@ -42,8 +42,10 @@ class WireError(ShareError):
 class VersionError(WireError):
     """A message of another version of the wire. code: of its kind, None where that cannot be read."""
 
-    def __init__(self, version: int, code: int | None, own: int) -> None:
-        super().__init__(f"header: peer speaks wire {version}, this SHARE wire {own}: upgrade the older one")
+    def __init__(self, version: int, code: int | None, own_version: int) -> None:
+        super().__init__(
+            f"header: peer speaks wire {version}, this SHARE wire {own_version}: upgrade the older one"
+        )
         self.version, self.code = version, code
 
 
@@ -55,7 +57,7 @@ class StoreError(ShareError):
     """The file of a map cannot be opened, read or written."""
 
 
-def describe(error: BaseException) -> str:
+def describe_exception(error: BaseException) -> str:
     """One line on an exception that nobody expected: its kind, its text, and where it was raised."""
     frames = traceback.extract_tb(error.__traceback__)
     where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
@@ -63,7 +65,7 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}{where}"
 
 
-def not_installed(packages: str, extra: str) -> str:
+def install_hint(packages: str, extra: str) -> str:
     """Who wants `packages` is told how to get them: with an extra of SHARE, and not in a frozen program."""
     how = f"pip install 'share-slam[{extra}]', in a checkout .venv/bin/pip install -e '.[{extra}]'"
     if getattr(sys, "frozen", False):
@@ -74,7 +76,11 @@ def not_installed(packages: str, extra: str) -> str:
 def one_line(text: str) -> str:
     """A message that quotes somebody's file: without control characters, of a bearable length."""
     clean = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-    return clean if len(clean) <= _LONGEST else f"{clean[: _LONGEST // 2]} … {clean[-_LONGEST // 2 :]}"
+    return (
+        clean
+        if len(clean) <= _MAX_LINE_LENGTH
+        else f"{clean[: _MAX_LINE_LENGTH // 2]} … {clean[-_MAX_LINE_LENGTH // 2 :]}"
+    )
 
 
-_LONGEST = 1500  # characters
+_MAX_LINE_LENGTH = 1500  # characters

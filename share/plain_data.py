@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from share.errors import ConfigError
 
 T = TypeVar("T")
-_LARGEST = 1e9  # no setting means anything beyond; NaN and infinity are refused with it
+_MAX_NUMBER = 1e9  # no setting means anything beyond; NaN and infinity are refused with it
 
 
 def from_mapping(cls: type[T], data: Any, where: str) -> T:
@@ -26,13 +26,13 @@ def from_mapping(cls: type[T], data: Any, where: str) -> T:
     values = {}
     for key, value in data.items():
         if key not in hints:
-            near = difflib.get_close_matches(str(key), hints, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(hints)}"
+            similar = difflib.get_close_matches(str(key), hints, n=1)
+            hint = f"; did you mean '{similar[0]}'?" if similar else f"; known: {', '.join(hints)}"
             raise ConfigError(f"{where}: unknown key '{key}'{hint}")
         values[key] = _convert(hints[key], value, f"{where}: {key}")
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
-        given = field.default, field.default_factory
-        if field.name not in values and given == (dataclasses.MISSING, dataclasses.MISSING):
+        defaults = field.default, field.default_factory
+        if field.name not in values and defaults == (dataclasses.MISSING, dataclasses.MISSING):
             raise ConfigError(f"{where}: key '{field.name}' is missing")
     try:
         return cls(**values)
@@ -54,8 +54,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if float in accepted and isinstance(value, str):  # PyYAML reads 1e-3 as text
         with contextlib.suppress(ValueError):
             value = float(value)
-    if type(value) in (int, float) and not 0 <= value <= _LARGEST:
-        raise ConfigError(f"{where}: expected a number from 0 to {_LARGEST:g}, found {value}")
+    if type(value) in (int, float) and not 0 <= value <= _MAX_NUMBER:
+        raise ConfigError(f"{where}: expected a number from 0 to {_MAX_NUMBER:g}, found {value}")
     if float in accepted and type(value) is int:
         return float(value)
     for kind in accepted:
@@ -70,10 +70,10 @@ def load_yaml(text: str, where: str) -> Any:
     memory than a file of settings needs. Raises ConfigError."""
     import yaml
 
-    from share.plain_yaml import PlainLoader
+    from share.strict_yaml import StrictLoader
 
     try:
-        return yaml.load(text, PlainLoader)
+        return yaml.load(text, StrictLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""

@@ -8,58 +8,66 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import multiprocessing.util  # before `_kill_left` is registered, so that it is called before theirs
+import multiprocessing.util  # before `_kill_remaining` is registered, so that it is called before theirs
 import os
 import signal
 from collections.abc import Iterator, Mapping
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
-from share import children
+from share import child_processes
 
-_GROUP = {signal.SIGINT, signal.SIGHUP}  # a terminal sends them to all: the parent handles them
-_WAITING = {*_GROUP, signal.SIGTERM, signal.SIGALRM}  # until they can be handled; ALRM: `share.cli.unwinding`
+_TERMINAL_SIGNALS = {signal.SIGINT, signal.SIGHUP}  # a terminal sends them to all: the parent handles them
+_DEFERRED_SIGNALS = {
+    *_TERMINAL_SIGNALS,
+    signal.SIGTERM,
+    signal.SIGALRM,
+}  # until they can be handled; ALRM: `share.cli.signals`
 
 
-def _begin(parent: int, kernel: bool) -> None:
+def _initialise_child(parent: int, from_main_thread: bool) -> None:
     """Called while a spawned process is told what it is to do, before that imports anything."""
-    children.follow(parent, kernel)
-    for number in _GROUP:
+    child_processes.exit_with_parent(parent, from_main_thread)
+    for number in _TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _WAITING)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _DEFERRED_SIGNALS)
 
 
-class _First:
-    """Pickled before all else of a process: to read it is to call `_begin`."""
+class _ChildInitialiser:
+    """Pickled before all else of a process: to read it is to call `_initialise_child`."""
 
     def __reduce__(self) -> Any:
-        return _begin, (os.getpid(), children.is_main())
+        return _initialise_child, (os.getpid(), child_processes.is_main_thread())
 
 
 @contextlib.contextmanager
-def held() -> Iterator[None]:
+def signals_deferred() -> Iterator[None]:
     """Signals are handled after the block: a child that is left half started writes a traceback. The mask is
     inherited by the child and holds back this thread alone; another thread may take a signal, which Python
     then handles in the main thread."""
-    came: list[int] = []
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _WAITING)
-    handlers = {number: signal.getsignal(number) for number in _WAITING} if children.is_main() else {}
+    received: list[int] = []
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, _DEFERRED_SIGNALS)
+    handlers = (
+        {number: signal.getsignal(number) for number in _DEFERRED_SIGNALS}
+        if child_processes.is_main_thread()
+        else {}
+    )
     for number, handler in handlers.items():
         if callable(handler):
-            signal.signal(number, lambda number, _: came.append(number))
+            signal.signal(number, lambda number, _: received.append(number))
     try:
         yield
     finally:
         for number, handler in handlers.items():
             if callable(handler):
                 signal.signal(number, handler)
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for late in came:
-            signal.raise_signal(late)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
+        for pending in received:
+            signal.raise_signal(pending)
 
 
-def _made(first: None, kind: type[_Process], state: Mapping[str, Any]) -> _Process:
-    process = kind.__new__(kind)
+def _restore_process(initialiser: None, process_type: type[_Process], state: Mapping[str, Any]) -> _Process:
+    process = process_type.__new__(process_type)
     process.__dict__.update(state)
     return process
 
@@ -68,11 +76,11 @@ class _Process(SpawnProcess):
     """It ignores SIGINT and SIGHUP from its first instruction: a terminal sends them to the whole group."""
 
     def start(self) -> None:
-        with held():
+        with signals_deferred():
             super().start()
 
     def __reduce__(self) -> Any:
-        return _made, (_First(), type(self), self.__dict__)
+        return _restore_process, (_ChildInitialiser(), type(self), self.__dict__)
 
 
 class _Context(SpawnContext):
@@ -80,10 +88,10 @@ class _Context(SpawnContext):
 
 
 @atexit.register
-def _kill_left() -> None:
+def _kill_remaining() -> None:
     for process in multiprocessing.active_children():
         if isinstance(process, _Process):
             process.kill()
 
 
-SPAWN = _Context()
+SPAWN_CONTEXT = _Context()

@@ -11,9 +11,9 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from share import children
+from share import child_processes
 
-_THREADS = (
+_THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -21,45 +21,46 @@ _THREADS = (
     "OPENCV_FOR_THREADS_NUM",
 )
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # mallopt(3) parameter numbers
-_KEEP_BYTES = 512 * 1024 * 1024
-_TIDY_S = 60.0
+_MALLOC_THRESHOLD_BYTES = 512 * 1024 * 1024
+_TRIM_S = 60.0
 
 
-def prepare() -> None:
+def prepare_process() -> None:
     """Ends with the SHARE process that started it, if one did; thread counts and malloc thresholds. What the
     user set in the environment stays."""
-    children.follow_starter()
-    for name in _THREADS:
+    child_processes.exit_with_starter()
+    for name in _THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
-    if (mallopt := _of_glibc("mallopt")) is not None:
-        mallopt(_M_MMAP_THRESHOLD, _KEEP_BYTES)
-        mallopt(_M_TRIM_THRESHOLD, _KEEP_BYTES)
+    if (mallopt := _glibc_function("mallopt")) is not None:
+        mallopt(_M_MMAP_THRESHOLD, _MALLOC_THRESHOLD_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, _MALLOC_THRESHOLD_BYTES)
 
 
-class Heap:
-    """Of a process that runs for hours. What `prepare` keeps from going back to the kernel lies ever more
+class HeapTrimmer:
+    """Of a process that runs for hours. What `prepare_process` keeps from going back to the kernel lies ever
+    more
     scattered among what is in use, so memory would grow though nothing is held: once a minute, what is free
     goes back (a millisecond, and a slower frame after it)."""
 
     def __init__(self) -> None:
-        self._trim = _of_glibc("malloc_trim")
+        self._trim = _glibc_function("malloc_trim")
         self._due_s: float | None = None
 
-    def tidy(self, now_s: float) -> None:
+    def trim_if_due(self, now_s: float) -> None:
         """To be called often, with a monotonic time."""
         if self._due_s is not None and now_s < self._due_s:
             return
         if self._due_s is not None and self._trim is not None:
             self._trim(0)
-        self._due_s = now_s + _TIDY_S
+        self._due_s = now_s + _TRIM_S
 
 
-def _of_glibc(name: str) -> Callable[..., Any] | None:
+def _glibc_function(name: str) -> Callable[..., Any] | None:
     """None with another C library."""
     if sys.platform != "linux":
         return None
     import ctypes
 
-    found: Callable[..., Any] | None = getattr(ctypes.CDLL(None), name, None)
-    return found
+    function: Callable[..., Any] | None = getattr(ctypes.CDLL(None), name, None)
+    return function

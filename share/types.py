@@ -25,13 +25,18 @@ DESCRIPTOR_BYTES = 32  # ORB: 256 bits
 # Limits of value. Whatever exceeds them is refused where the value is made, so that nothing computed from it
 # overflows: not a room, not a sensor, not a run of any length gets near them.
 MAX_KEYPOINTS = 2000  # per keyframe
-MAX_NAME = 64  # characters, of an agent's name
-MAX_MAP_ID = MAX_NAME + 32  # characters: a run's key has at most 17 more than its name, a segment's number 11
-MAX_M = 1e5  # m, of a position or a landmark
+MAX_NAME_LENGTH = 64  # characters, of an agent's name
+MAX_MAP_ID_LENGTH = (
+    MAX_NAME_LENGTH + 32
+)  # characters: a run's key has at most 17 more than its name, a segment's number 11
+MAX_POSITION_M = 1e5  # m, of a position or a landmark
 MAX_ODOM_M = 1e4  # m, of odometry from its origin: poses in maps, which are made of several, stay below MAX_M
 MAX_UV = 1e3  # of normalised image coordinates: 89.9 degrees off the axis
 MAX_ID = 2**31 - 1  # of keyframes, frames and revisions: 13 years at 5 Hz
-MAX_RAD_S, MAX_M_S2 = 1e3, 1e4  # of an IMU's samples: twenty times what the widest usual sensor can measure
+MAX_GYRO_RAD_S, MAX_ACCEL_M_S2 = (
+    1e3,
+    1e4,
+)  # of an IMU's samples: twenty times what the widest usual sensor can measure
 MAX_SIGMA = 1e6  # of anything, in its unit
 MAX_STAMP_NS = 2**62  # either way of 0: 146 years; differences fit 64 bits
 
@@ -58,7 +63,7 @@ class TrackState(StrEnum):
         return self not in (TrackState.INITIALISING, TrackState.LOST)
 
 
-class Wait(StrEnum):
+class WaitReason(StrEnum):
     """What a tracker still has to know before it tells a pose."""
 
     IMU = "imu"
@@ -68,21 +73,21 @@ class Wait(StrEnum):
     SCALE = "scale"
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """For a person, after "waits for"."""
-        return _WAITS_FOR[self]
+        return _WAIT_TEXTS[self]
 
 
-_WAITS_FOR = {
-    Wait.IMU: "the IMU's first samples",
-    Wait.VIEW: "something to see",
-    Wait.TILT: "what is up",
-    Wait.SPEED: "its velocity",
-    Wait.SCALE: "the scale: move the camera",
+_WAIT_TEXTS = {
+    WaitReason.IMU: "the IMU's first samples",
+    WaitReason.VIEW: "something to see",
+    WaitReason.TILT: "what is up",
+    WaitReason.SPEED: "its velocity",
+    WaitReason.SCALE: "the scale: move the camera",
 }
 
 
-def checked(
+def checked_array(
     name: str, value: ArrayLike, shape: tuple[int | None, ...], dtype: DTypeLike, finite: bool = True
 ) -> NDArray[Any]:
     """`value` as a read-only array of `dtype`; None in `shape` admits any length.
@@ -91,7 +96,7 @@ def checked(
     not finite.
     """
     array = np.asarray(value, dtype)
-    if array.shape != shape and not _fits(array.shape, shape):
+    if array.shape != shape and not _shape_matches(array.shape, shape):
         raise ValueError(f"{name}: shape {array.shape}, expected {shape}")
     if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{name}: has values that are not finite")
@@ -100,28 +105,28 @@ def checked(
     return array
 
 
-def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(wanted) and all(
-        want is None or have == want for have, want in zip(shape, wanted, strict=True)
+def _shape_matches(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(expected) and all(
+        want is None or have == want for have, want in zip(shape, expected, strict=True)
     )
 
 
-def checked_pose(name: str, value: ArrayLike, most_m: float = MAX_M) -> F64:
+def checked_pose(name: str, value: ArrayLike, max_m: float = MAX_POSITION_M) -> F64:
     """`value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (1e-3), or if its
-    translation exceeds `most_m`."""
-    T = checked(name, value, (4, 4), np.float64)
+    translation exceeds `max_m`."""
+    T = checked_array(name, value, (4, 4), np.float64)
     rows = T.tolist()
     if not _is_rigid(*rows):
         raise ValueError(f"{name}: is not a rigid transform")
-    if not max(abs(row[3]) for row in rows) <= most_m:
-        raise ValueError(f"{name}: is more than {most_m:g} m away")
+    if not max(abs(row[3]) for row in rows) <= max_m:
+        raise ValueError(f"{name}: is more than {max_m:g} m away")
     return T
 
 
-def checked_id(name: str, value: int, least: int = 0) -> int:
-    """`value`, from `least` to MAX_ID. Raises ValueError."""
-    if not least <= value <= MAX_ID:
-        raise ValueError(f"{name}: {value} is outside {least} .. {MAX_ID}")
+def checked_id(name: str, value: int, minimum: int = 0) -> int:
+    """`value`, from `minimum` to MAX_ID. Raises ValueError."""
+    if not minimum <= value <= MAX_ID:
+        raise ValueError(f"{name}: {value} is outside {minimum} .. {MAX_ID}")
     return value
 
 
@@ -134,17 +139,17 @@ def checked_stamp(name: str, value: int) -> int:
 
 def checked_up(name: str, value: ArrayLike) -> F64:
     """`value` as a read-only unit vector (3,), or zeros where it is unknown. Raises ValueError (1e-3)."""
-    up = checked(name, value, (3,), np.float64)
+    up = checked_array(name, value, (3,), np.float64)
     x, y, z = up.tolist()
     if any(up) and not abs(x * x + y * y + z * z - 1) <= 1e-3:
         raise ValueError(f"{name}: is no unit vector")
     return up
 
 
-def _is_rigid(x: list[float], y: list[float], z: list[float], last: list[float]) -> bool:
+def _is_rigid(x: list[float], y: list[float], z: list[float], bottom: list[float]) -> bool:
     """By the rows of T (4, 4), finite. In plain floats, as every pose of every message comes by here: of so
     few numbers numpy takes several times as long."""
-    (a, b, c, _), (d, e, f, _), (g, h, i, _), (p, q, r, s) = x, y, z, last
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), (p, q, r, s) = x, y, z, bottom
     return (
         # R R' = 1; squares first, which are within the bound only where nothing below overflows
         abs(a * a + b * b + c * c - 1) <= 1e-3
@@ -161,7 +166,7 @@ def _is_rigid(x: list[float], y: list[float], z: list[float], last: list[float])
 def checked_cov(name: str, value: ArrayLike) -> F64:
     """`value` as a read-only covariance (6, 6). Raises ValueError unless symmetric and not negative:
     one that is neither would stop the solver for everybody in the map."""
-    cov = checked(name, value, (6, 6), np.float64)
+    cov = checked_array(name, value, (6, 6), np.float64)
     size = np.abs(cov).max()
     if size > 1e12 or np.abs(cov - cov.T).max() > 1e-6 * size:
         raise ValueError(f"{name}: is not symmetric, or beyond all measure")
@@ -178,7 +183,7 @@ def checked_sigma(name: str, value: float) -> float:
     return sigma
 
 
-def _set(obj: object, **values: object) -> None:
+def _set_fields(obj: object, **values: object) -> None:
     """Replace fields of a frozen dataclass during its own __post_init__."""
     for key, value in values.items():
         object.__setattr__(obj, key, value)
@@ -194,36 +199,36 @@ class ImuBatch:
 
     def __post_init__(self) -> None:
         n = len(self.stamps_ns)
-        _set(
+        _set_fields(
             self,
-            stamps_ns=checked("stamps_ns", self.stamps_ns, (n,), np.int64),
-            gyro=checked("gyro", self.gyro, (n, 3), np.float64),
-            accel=checked("accel", self.accel, (n, 3), np.float64),
+            stamps_ns=checked_array("stamps_ns", self.stamps_ns, (n,), np.int64),
+            gyro=checked_array("gyro", self.gyro, (n, 3), np.float64),
+            accel=checked_array("accel", self.accel, (n, 3), np.float64),
         )
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def take(self, which: slice | I64 | NDArray[np.bool_]) -> ImuBatch:
+    def take(self, selection: slice | I64 | NDArray[np.bool_]) -> ImuBatch:
         """These samples, by numbers or a mask (N,)."""
-        return ImuBatch._checked(self.stamps_ns[which], self.gyro[which], self.accel[which])
+        return ImuBatch._from_checked(self.stamps_ns[selection], self.gyro[selection], self.accel[selection])
 
-    def join(self, *others: ImuBatch) -> ImuBatch:
+    def concatenate(self, *others: ImuBatch) -> ImuBatch:
         """All samples, one batch after the other."""
         parts = (self, *others)
-        return ImuBatch._checked(
+        return ImuBatch._from_checked(
             np.concatenate([part.stamps_ns for part in parts]),
             np.concatenate([part.gyro for part in parts]),
             np.concatenate([part.accel for part in parts]),
         )
 
     @staticmethod
-    def _checked(stamps_ns: I64, gyro: F64, accel: F64) -> ImuBatch:
+    def _from_checked(stamps_ns: I64, gyro: F64, accel: F64) -> ImuBatch:
         """Of what has been in batches before, and was checked then."""
         out = object.__new__(ImuBatch)
         for array in (stamps_ns, gyro, accel):
             array.flags.writeable = False
-        _set(out, stamps_ns=stamps_ns, gyro=gyro, accel=accel)
+        _set_fields(out, stamps_ns=stamps_ns, gyro=gyro, accel=accel)
         return out
 
     @staticmethod
@@ -250,7 +255,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Footing:
+class FeatureStatistics:
     """What the pose of a frame stands on: the features that its tracker found in cam0's image.
 
     px (N, 2) float32. believed (N,) bool: those that agreed with the pose. depth (N,) m in cam0, NaN unknown.
@@ -258,18 +263,18 @@ class Footing:
     """
 
     px: F32
-    believed: NDArray[np.bool_]
+    inlier: NDArray[np.bool_]
     depth: F64
-    sought: int
-    known: int
+    expected: int
+    mapped: int
 
     def __post_init__(self) -> None:
         n = len(self.px)
-        _set(
+        _set_fields(
             self,
-            px=checked("px", self.px, (n, 2), np.float32),
-            believed=checked("believed", self.believed, (n,), np.bool_),
-            depth=checked("depth", self.depth, (n,), np.float64, finite=False),
+            px=checked_array("px", self.px, (n, 2), np.float32),
+            believed=checked_array("believed", self.inlier, (n,), np.bool_),
+            depth=checked_array("depth", self.depth, (n,), np.float64, finite=False),
         )
 
 
@@ -289,23 +294,23 @@ class View:
         n = len(self.uv)
         if n > MAX_KEYPOINTS:
             raise ValueError(f"uv: {n} keypoints, at most {MAX_KEYPOINTS}")
-        _set(
+        _set_fields(
             self,
-            uv=checked("uv", self.uv, (n, 2), np.float32),
-            points=checked("points", self.points, (n, 3), np.float32, finite=False),
-            descriptors=checked("descriptors", self.descriptors, (n, DESCRIPTOR_BYTES), np.uint8),
+            uv=checked_array("uv", self.uv, (n, 2), np.float32),
+            points=checked_array("points", self.points, (n, 3), np.float32, finite=False),
+            descriptors=checked_array("descriptors", self.descriptors, (n, DESCRIPTOR_BYTES), np.uint8),
         )
         if (np.abs(self.uv) > MAX_UV).any():
             raise ValueError(f"uv: exceeds {MAX_UV:g}")
-        if (np.abs(self.points) > MAX_M).any():  # NaN does not
-            raise ValueError(f"points: are more than {MAX_M:g} m away (unknown depth is NaN)")
+        if (np.abs(self.points) > MAX_POSITION_M).any():  # NaN does not
+            raise ValueError(f"points: are more than {MAX_POSITION_M:g} m away (unknown depth is NaN)")
 
     def __len__(self) -> int:
         return len(self.uv)
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class KeyframeCandidate:
     """A keyframe as the tracker offers it, before it is decided whether it is sent.
 
     T_odom_body (4, 4). T_last_body (4, 4): the motion since the previous candidate as it is known by now,
@@ -317,19 +322,19 @@ class Candidate:
     """
 
     T_odom_body: F64
-    T_last_body: F64
+    T_previous_body: F64
     cov: F64
     up: F64
     up_sigma: float
     view: View
-    new_stretch: bool = False
+    new_segment: bool = False
     frames_ago: int = 0
 
     def __post_init__(self) -> None:
-        _set(
+        _set_fields(
             self,
             T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
-            T_last_body=checked_pose("T_last_body", self.T_last_body),
+            T_last_body=checked_pose("T_last_body", self.T_previous_body),
             cov=checked_cov("cov", self.cov),
             up=checked_up("up", self.up),
             up_sigma=checked_sigma("up_sigma", self.up_sigma),
@@ -365,10 +370,10 @@ class Keyframe:
         checked_stamp("stamp_ns", self.stamp_ns)
         if not -1 <= self.reference < self.id:
             raise ValueError(f"reference: {self.reference} must lie in -1 .. {self.id - 1}")
-        _set(self, follows=max(self.reference, self.follows))
+        _set_fields(self, follows=max(self.reference, self.follows))
         if not self.follows < self.id:
             raise ValueError(f"follows: {self.follows} must lie in -1 .. {self.id - 1}")
-        _set(
+        _set_fields(
             self,
             T_ref_body=checked_pose("T_ref_body", self.T_ref_body, MAX_ODOM_M),
             cov=checked_cov("cov", self.cov),
@@ -395,12 +400,12 @@ class Correction:
     answers: int = -1
 
     def __post_init__(self) -> None:
-        if not (0 < len(self.map_id) <= MAX_MAP_ID and self.map_id.isprintable()):
-            raise ValueError(f"map_id: 1 to {MAX_MAP_ID} printable characters")
+        if not (0 < len(self.map_id) <= MAX_MAP_ID_LENGTH and self.map_id.isprintable()):
+            raise ValueError(f"map_id: 1 to {MAX_MAP_ID_LENGTH} printable characters")
         checked_id("revision", self.revision)
         checked_id("about", self.about)
-        checked_id("answers", self.answers, least=-1)
-        _set(
+        checked_id("answers", self.answers, minimum=-1)
+        _set_fields(
             self,
             T_map_odom=checked_pose("T_map_odom", self.T_map_odom),
             cov=checked_cov("cov", self.cov),

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from share.lab.calibrate.target import Target
-from share.lab.calibrate.target_sheet import darkness, ink
+from share.lab.calibrate.target_sheet import black_rectangles, darkness_image
 from share.types import F64, U8
 
 _TEXEL, _MARGIN = 0.001, 0.04  # m
@@ -37,4 +37,6 @@ def printed(board: Target) -> Printed:
     xs, ys = low[0] + _TEXEL * np.arange(columns + 1), high[1] - _TEXEL * np.arange(rows + 1)
     shift = (-low[0] / _TEXEL - 0.5, high[1] / _TEXEL - 0.5)
     to_texels = np.array([[1 / _TEXEL, 0, shift[0]], [0, -1 / _TEXEL, shift[1]], [0, 0, 1]])
-    return Printed(np.round(PAPER - 190 * darkness(ink(board), xs, ys)).astype(np.uint8), to_texels)
+    return Printed(
+        np.round(PAPER - 190 * darkness_image(black_rectangles(board), xs, ys)).astype(np.uint8), to_texels
+    )

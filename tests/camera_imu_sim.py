@@ -8,7 +8,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.lab.calibrate.camera_bundle import View
+from share.lab.calibrate.camera_bundle import BoardView
 from share.lab.calibrate.corners import Detection
 from share.lab.calibrate.target import AprilGrid, Target
 from share.types import F64, I64, ImuBatch
@@ -40,9 +40,9 @@ class Dance:
         hz, phase = rng.uniform(0.15, 0.9, (4, 6)), rng.uniform(0, 6.28, (4, 6))
         waves = np.sin(2 * np.pi * hz[:, :, None] * t + phase[:, :, None]).sum(axis=0)
         middle = np.append(self.target.extent.mean(axis=0), 0.8)
-        facing = se3.compose(np.diag([1.0, -1, -1]), middle)
+        facing = se3.from_rt(np.diag([1.0, -1, -1]), middle)
         turn = 0.13 * waves[:3].T * self.axes
-        return facing @ se3.compose(se3.so3_exp(turn), 0.06 * waves[3:].T)
+        return facing @ se3.from_rt(se3.so3_exp(turn), 0.06 * waves[3:].T)
 
     def body(self, t: F64) -> F64:
         """T_target_imu (N, 4, 4)."""
@@ -61,7 +61,7 @@ class Recorded:
     """What a calibration is given."""
 
     stamps_ns: I64
-    views: list[View]
+    views: list[BoardView]
     imu: ImuBatch
     rig: Rig
 
@@ -78,7 +78,7 @@ def record(
     rng = np.random.default_rng((dance.seed, 11))
     t = np.arange(0.2, seconds - 0.2, 1 / hz)
     poses = dance.camera(t + SHIFT_S)
-    views = [View(str(k), _seen(T, rng, noise_px, wrong)) for k, T in enumerate(poses)]
+    views = [BoardView(str(k), _seen(T, rng, noise_px, wrong)) for k, T in enumerate(poses)]
     rig = Rig(CAM0, np.eye(4), CAM1, T_CAM1_CAM0, imu=NOISE)
     return Recorded(_stamps(t), views, _imu(dance, seconds, rng, imu), rig)
 
@@ -93,7 +93,7 @@ def _seen(
     out = []
     for camera, mount in ((CAM0, np.eye(4)), (CAM1, T_CAM1_CAM0)):
         px = camera.project(se3.transform(mount @ se3.inverse(T_target_cam0), TARGET.corners))
-        ids = np.flatnonzero(camera.inside(px, 3.0))
+        ids = np.flatnonzero(camera.is_inside(px, 3.0))
         noisy = px[ids] + rng.normal(0, noise_px, (len(ids), 2))
         spoilt = rng.random(len(ids)) < wrong
         noisy[spoilt] += rng.uniform(-8, 8, (int(spoilt.sum()), 2))

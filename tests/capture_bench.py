@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 from software_camera import SoftwareCamera
 
-from share.cameras.feed import Feed, MakeWatchdog
-from share.cameras.handover import Handover
-from share.cameras.realsense.camera import RealSense
+from share.cameras.feed import CameraFeed, MakeWatchdog
+from share.cameras.realsense.camera import RealSenseCamera
 from share.cameras.realsense.devices import load_sdk
-from share.cameras.realsense.streams import Wanted
+from share.cameras.realsense.streams import StreamRequest
+from share.cameras.sample_queue import SampleQueue
 from share.config import SequencerConfig
 from share.errors import ShareError, UsageError
 from share.recordings.calibration import Calibration
 from share.runtime.capture import Capture
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
 from share.sensors.watchdog import Watchdog
 
-WANTED = Wanted(profile("d435i"))
+WANTED = StreamRequest(load_profile("d435i"))
 PICTURE = np.tile(np.arange(640, dtype=np.uint16) % 251, (480, 1)).astype(np.uint8)
 WRAP_US = 2**32
 
@@ -34,9 +34,9 @@ class Fake:
     resets = 0
 
     def __init__(
-        self, camera: SoftwareCamera, wanted: Wanted, epoch: int, say: Callable[[str], None]
+        self, camera: SoftwareCamera, wanted: StreamRequest, epoch: int, say: Callable[[str], None]
     ) -> None:
-        self.device = RealSense(wanted, context=camera.context, epoch=epoch, say=say)
+        self.device = RealSenseCamera(wanted, context=camera.context, epoch=epoch, notify=say)
         self.rig, self.serial, self.rates_hz = self.device.rig, self.device.serial, self.device.rates_hz
         self.start, self.stop = self.device.start, self.device.stop
 
@@ -52,7 +52,7 @@ class Bench:
         self,
         out: Path,
         watchdog: MakeWatchdog = Watchdog,
-        wanted: Wanted = WANTED,
+        wanted: StreamRequest = WANTED,
         most_images: int = 60,
         calibration: Calibration | None = None,
     ) -> None:
@@ -60,8 +60,8 @@ class Bench:
         self.said, self.there, self.error = list[str](), True, ""
         self.wanted, self.connected = wanted, 0
         rates_hz, max_jump_s = wanted.rates_hz(), SequencerConfig().max_jump_s
-        queue = Handover(most_images)
-        self.source = Feed(self.connect, None, rates_hz, max_jump_s, self.said.append, queue, watchdog)
+        queue = SampleQueue(most_images)
+        self.source = CameraFeed(self.connect, None, rates_hz, max_jump_s, self.said.append, queue, watchdog)
         self.run = Capture(self.source, out, 0.0, self.said.append, calibration=calibration)
         self.report: dict[str, Any] = {}
         self.thread = threading.Thread(target=self._go, daemon=True)
@@ -120,7 +120,7 @@ class Bench:
 
     def _go(self) -> None:
         try:
-            self.report = self.run.go()
+            self.report = self.run.run()
         except ShareError as error:
             self.error = str(error)
 

@@ -2,7 +2,7 @@
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import itertools  # noqa: E402
 import signal  # noqa: E402
@@ -74,10 +74,10 @@ def plain_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     --seconds 3 --seed 18` plays: ar1, ar2 and robot in the plain room, 45 frames each. With this seed
     each device has had 20 IMU samples by its first picture, all that the tracker needs to begin."""
     from share.lab.emulate.demo import recipe
-    from share.lab.emulate.session import cached_session
+    from share.lab.emulate.session import make_cached_session
 
     cache = tmp_path_factory.mktemp("cache")
-    cached_session(recipe("plain", 3.0, 18), cache / "share")
+    make_cached_session(recipe("plain", 3.0, 18), cache / "share")
     return cache
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from share.net.keys import edge_keys
 from share.net.transport import bind
-from share.runtime.stop import on_stop
+from share.runtime.signals import stop_on_signal
 
 
 def main() -> None:
@@ -26,14 +26,14 @@ def main() -> None:
         stopping.append(True)
         link.wake()
 
-    with on_stop(stop):
+    with stop_on_signal(stop):
         while not stopping:
             arrival = link.receive(50)
             if arrival is not None:
                 messages += 1
                 link.send(arrival.peer, arrival.frames)
             said.update(link.refusals())
-    strangers = link.strangers  # type: ignore[attr-defined]
+    strangers = link.discarded_messages  # type: ignore[attr-defined]
     link.close()
     print(json.dumps({"messages": messages, "strangers": strangers, "said": sorted(said)}), flush=True)
 

@@ -13,14 +13,14 @@ from hellos import hello_of
 from share.config import Config, EdgeConfig
 from share.geometry import se3
 from share.geometry.se3 import umeyama
-from share.mapping.graph.solver import Solver
+from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
-from share.mapping.steps import Finding, Solve, Step
+from share.mapping.steps import MapEvent, SolveStep, Step
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
-from share.types import F64, U8, AgentKind, Candidate, Keyframe, TrackState, View
+from share.types import F64, U8, AgentKind, Keyframe, KeyframeCandidate, TrackState, View
 from share.wire.codec import decode
 from share.wire.messages import Hello, peer_id
 
@@ -110,12 +110,12 @@ class Person:
         """0.2 m on along a ring, looking at the wall outside. Returns T_odom_body and the view."""
         angle = self.start + 0.1 * len(self.T_world_body)
         R = se3.so3_exp(np.array([0, 0, angle])) @ _FORWARD
-        T = se3.compose(R, np.array([4 + 1.5 * np.cos(angle), 3 + 1.0 * np.sin(angle), 1.5]))
+        T = se3.from_rt(R, np.array([4 + 1.5 * np.cos(angle), 3 + 1.0 * np.sin(angle), 1.5]))
         if self.T_world_body:
             moved = se3.inverse(self.T_world_body[-1]) @ T @ se3.exp(self.rng.normal(0, 1, 6) * 0.002)
             self.T_odom_body.append(self.T_odom_body[-1] @ moved)
         else:
-            self.T_odom_body.append(se3.compose(_FORWARD, np.zeros(3)))
+            self.T_odom_body.append(se3.from_rt(_FORWARD, np.zeros(3)))
         self.T_world_body.append(T)
         return self.T_odom_body[-1], look(self.place, T, self.rng)
 
@@ -126,7 +126,7 @@ class ModelRun:
     def __init__(self, config: Config, session: int) -> None:
         self.machine = Edge(config, session)
         self.mapper = Mapper(config)
-        self.solver = Solver(config.graph)
+        self.solver = PoseGraphSolver(config.graph)
 
     def report(self) -> dict[str, Any]:
         return self.machine.report(self.mapper.report())
@@ -168,7 +168,7 @@ class Town:
 
     def keyframes(self, name: str) -> list[Keyframe]:
         """Those that the agent sent, in order."""
-        messages = [decode([bytes(f) for f in e.frames]) for e in self.event(ev.Send, name)]
+        messages = [decode([bytes(f) for f in e.frames]) for e in self.event(ev.SendToEdge, name)]
         return [message for message in messages if isinstance(message, Keyframe)]
 
     def event(self, effect_type: type, name: str) -> list:
@@ -194,56 +194,61 @@ class Town:
             for act in due:
                 act()
             if self.now_ns % (50 * MS) == 0:
-                self.to_edge(ed.Tick())
+                self.to_edge(ed.EdgeTick())
                 for peer in list(self.agents):
-                    self.to_agent(peer, ev.Tick())
+                    self.to_agent(peer, ev.AgentTick())
 
-    def to_edge(self, event: ed.Event) -> None:
+    def to_edge(self, event: ed.EdgeEvent) -> None:
         edge = self.edge
         for effect in edge.machine.handle(event, self.now_ns) if edge else ():
             match effect:
-                case ed.Send(peer, frames):
+                case ed.SendToPeer(peer, frames):
                     copy = [bytes(f) for f in frames]
                     for late in self.weather.delays_ns():
-                        self._in(late, lambda peer=peer, copy=copy: self.to_agent(peer, ev.Received(copy)))
-                case ed.Join(key, hello):
-                    edge.mapper.join(key, hello)
-                case ed.Present(key, here):
-                    edge.mapper.present(key, here)
+                        self._in(
+                            late,
+                            lambda peer=peer, copy=copy: self.to_agent(peer, ev.EdgeMessageReceived(copy)),
+                        )
+                case ed.AddRun(key, hello):
+                    edge.mapper.add_run(key, hello)
+                case ed.SetPresence(key, here):
+                    edge.mapper.set_present(key, here)
                     self._mapped(edge, [])
-                case ed.Add(key, keyframe, is_extra):
-                    self._mapped(edge, edge.mapper.add(key, keyframe, is_extra))
-                case ed.Forget(key):
-                    edge.mapper.forget(key)
-                case ed.Record(fields):
+                case ed.AddKeyframe(key, keyframe, is_extra):
+                    self._mapped(edge, edge.mapper.add_keyframe(key, keyframe, is_extra))
+                case ed.DropRun(key):
+                    edge.mapper.remove_run(key)
+                case ed.WriteEvent(fields):
                     self.records.append(fields)
 
-    def _mapped(self, edge: ModelRun, findings: list[Finding]) -> None:
+    def _mapped(self, edge: ModelRun, findings: list[MapEvent]) -> None:
         """The mapper has decided something, and goes on to its next steps, each in its own time."""
         if self.edge is not edge:
             return
-        if found := ed.Found(tuple(findings), edge.mapper.take_changes(), edge.mapper.take_emptied()):
+        if found := ed.MapperResult(
+            tuple(findings), edge.mapper.take_changes(), edge.mapper.take_empty_runs()
+        ):
             self._in(0, lambda: self.to_edge(found) if self.edge is edge else None)
-        for step in (edge.mapper.next_look(), edge.mapper.next_solve()):
+        for step in (edge.mapper.next_lookup(), edge.mapper.next_solve()):
             if step is not None:
-                result = step.run(edge.solver) if isinstance(step, Solve) else step.run()
+                result = step.run(edge.solver) if isinstance(step, SolveStep) else step.run()
                 self._in(self._job_ns, lambda step=step, result=result: self._done(edge, step, result))
 
     def _done(self, edge: ModelRun, step: Step, result: object) -> None:
-        self._mapped(edge, edge.mapper.done(step, result, self._job_ns / MS))
+        self._mapped(edge, edge.mapper.finish_step(step, result, self._job_ns / MS))
 
     def to_agent(self, peer: bytes, event: ev.AgentEvent) -> None:
         agent = self.agents.get(peer)
         for effect in agent.handle(event, self.now_ns) if agent else ():
             self.agent_effects[peer].append(effect)
-            if isinstance(effect, ev.Send):
+            if isinstance(effect, ev.SendToEdge):
                 frames = [bytes(f) for f in effect.frames]
                 for late in self.weather.delays_ns():
-                    self._in(late, lambda frames=frames: self.to_edge(ed.Received(peer, frames)))
+                    self._in(late, lambda frames=frames: self.to_edge(ed.PeerMessageReceived(peer, frames)))
 
     def map_error_m(self, name: str, T_world_map: F64) -> float:
         """How far the agent's last pose in the map lies from the truth."""
-        last = self.event(ev.Localised, name)[-1]
+        last = self.event(ev.LocalisedPose, name)[-1]
         assert last.T_map_odom is not None
         found = T_world_map @ last.T_map_odom @ last.T_odom_body
         return float(np.linalg.norm(found[:3, 3] - self.people[self.peer(name)].T_world_body[-1][:3, 3]))
@@ -251,12 +256,12 @@ class Town:
     def map_error(self, names: Collection[str]) -> float:
         """Of all keyframes of these agents, one alignment: RMSE in m; inf unless they are in one map."""
         assert self.edge is not None
-        kept = self.edge.mapper.poses()
+        kept = self.edge.mapper.current_poses()
         told = {p.name: p.T_world_body for p in self.people.values() if p.name in names}
         owners = {key.agent: key.agent.rpartition("-")[0] for key in kept.keys}  # a run: name-tag
         truth = {run: told[name] for run, name in owners.items() if name in told}
         which = [i for i, key in enumerate(kept.keys) if key.agent in truth]
-        if len({kept.maps[i] for i in which}) > 1:
+        if len({kept.map_ids[i] for i in which}) > 1:
             return float("inf")
         found = kept.T_map_body[which, :3, 3]
         true = np.array([truth[kept.keys[i].agent][kept.keys[i].id][:3, 3] for i in which])
@@ -270,7 +275,7 @@ class Town:
         tracked = ev.FrameTracked(k, person.stamp_ns(at), at, at + 4 * MS, TrackState.OK, T, True, k == 0)
         self.to_agent(peer, tracked)
         T_last_body = T if k == 0 else se3.inverse(person.T_odom_body[-2]) @ T
-        candidate = Candidate(T, T_last_body, person.cov, np.zeros(3), 0.0, view, k == 0)
+        candidate = KeyframeCandidate(T, T_last_body, person.cov, np.zeros(3), 0.0, view, k == 0)
         self.to_agent(peer, ev.KeyframeMade(tracked, candidate))
 
     def _in(self, ns: int, act: Callable[[], None]) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from share.geometry import se3
-from share.lab.emulate.preparation import prepare
-from share.lab.emulate.progress import silent
-from share.lab.emulate.recipe import Recipe
-from share.lab.emulate.types import Path as Motion
+from share.lab.emulate.preparation import prepare_session
+from share.lab.emulate.progress import no_progress
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.types import MotionPath as Motion
 from share.recordings.mcap.recorder import Recorder
 from share.runtime.source import open_source
 from share.types import F64
@@ -33,8 +33,8 @@ class Watched:
     hidden: tuple[tuple[float, float], ...] = ()
 
 
-def paths(recipe: Recipe, room: Path) -> dict[str, Motion]:
-    return {actor.name: actor.path for actor in prepare(recipe, room, silent).stage.actors}
+def paths(recipe: SessionRecipe, room: Path) -> dict[str, Motion]:
+    return {actor.name: actor.path for actor in prepare_session(recipe, room, no_progress).stage.actors}
 
 
 def offset_of(path: Motion, watched: Watched) -> int:

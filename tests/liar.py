@@ -10,7 +10,7 @@ import numpy as np
 from hellos import hello_of
 
 from share.geometry import se3
-from share.types import MAX_ID, MAX_M, MAX_STAMP_NS, Correction, Keyframe, TrackState
+from share.types import MAX_ID, MAX_POSITION_M, MAX_STAMP_NS, Correction, Keyframe, TrackState
 from share.wire import messages as m
 from share.wire.codec import encode
 
@@ -49,13 +49,15 @@ class Liar:
         id_ = lambda least=0: self._pick(*IDS, *range(least, max(1, self.sent)))  # noqa: E731
         session = lambda: self._pick(1, 2, 3, int(self.rng.integers(2**62)))  # noqa: E731
         yield lambda: m.Welcome(session(), id_())
-        yield lambda: m.Refused(self._pick("", "no", "\x1b[2J\r\n", "x" * m.MAX_TEXT))
+        yield lambda: m.Refused(self._pick("", "no", "\x1b[2J\r\n", "x" * m.MAX_TEXT_LENGTH))
         yield lambda: m.Ack(id_(), tuple(id_() for _ in range(self._pick(0, 1, 256))))
         yield lambda: Correction(self._pose(), self._cov(), self._map(), id_(), id_(), self._pick(-1, id_()))
         yield lambda: m.Rate(self._pick(0.0, 1e-300, 1e-3, m.MAX_RATE_HZ))
         yield self._pong
-        yield lambda: m.Tracked(id_(), self._pick(*STAMPS), TrackState.OK, self._pose(), True, True)
-        yield lambda: m.Tracked(id_(), 0, TrackState.LOST, None)
+        yield lambda: m.RemoteTrackingResult(
+            id_(), self._pick(*STAMPS), TrackState.OK, self._pose(), True, True
+        )
+        yield lambda: m.RemoteTrackingResult(id_(), 0, TrackState.LOST, None)
         yield lambda: m.Bye()
         yield lambda: HELLO
 
@@ -67,8 +69,8 @@ class Liar:
         return m.Pong(ping.sequence, ping.sent_ns, received, replied, self._pick(1, 2, 3))
 
     def _pose(self) -> np.ndarray:
-        far = self._pick(0.0, 1.0, MAX_M, -MAX_M) * np.ones(3)
-        T = se3.compose(se3.so3_exp(self.rng.uniform(-4, 4, 3)), far)
+        far = self._pick(0.0, 1.0, MAX_POSITION_M, -MAX_POSITION_M) * np.ones(3)
+        T = se3.from_rt(se3.so3_exp(self.rng.uniform(-4, 4, 3)), far)
         T[:3, :3] *= self._pick(1.0, 1.0004)  # as far from rigid as may be
         return T
 

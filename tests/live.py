@@ -10,10 +10,10 @@ from recordings import HEIGHT, STEP_NS, WIDTH, depth_mm, picture
 from share.config import SequencerConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.recordings.images import ArrayImage, load
+from share.recordings.images import ArrayImage, decode_frame
 from share.recordings.recording import Source
 from share.sensors.measurement import Measurement
-from share.sensors.sequencer import SequencerCounters, sequence, streams_of
+from share.sensors.sequencer import SequencerCounters, rig_streams, sequence_frames
 from share.types import Frame
 
 CAMERA = Camera(WIDTH, HEIGHT, 50.0, 51.0, 31.5, 23.5, (-0.1, 0.02, 0.001, -0.001))
@@ -38,12 +38,12 @@ def live(count: int, depth_scale: float = 1000.0) -> Iterator[Measurement]:
 
 def frames(source: Source) -> list[Frame]:
     counters = SequencerCounters()
-    bundles = sequence(
+    bundles = sequence_frames(
         source.measurements(),
-        streams_of(source.rig),
+        rig_streams(source.rig),
         source.rate_hz,
         SequencerConfig(),
         counters,
         source.rig.timeshift_ns,
     )
-    return [load(bundle) for bundle in bundles]
+    return [decode_frame(bundle) for bundle in bundles]

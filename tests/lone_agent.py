@@ -25,7 +25,7 @@ def main() -> None:
         messages, tick_s = messages + taken, max(tick_s, time.monotonic() - began)
         time.sleep(max(0.0, began + 0.05 - time.monotonic()))
         link.send([b"hello"])
-        joined += link.connected()
+        joined += link.poll_connected()
         if (trouble := link.trouble()) is not None and trouble not in said:
             said.append(trouble)
     link.close()

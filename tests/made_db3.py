@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from recordings import HEIGHT, WIDTH, depth_mm, picture
 
-from share.recordings.mcap import types as ros
+from share.recordings.mcap import ros_messages as ros
 
 EYE = "/device_0/sensor_0/Infrared_1"
 RIGHT = "/device_0/sensor_0/Infrared_2"
@@ -28,14 +28,14 @@ SCHEMA = (
 
 
 def text(said: str) -> bytes:
-    return ros.encode(ros.make("std_msgs/msg/String", data=said))
+    return ros.encode(ros.make_message("std_msgs/msg/String", data=said))
 
 
 def image(stamp_ns: int, data: bytes) -> bytes:
     return ros.encode(
-        ros.make(
+        ros.make_message(
             ros.COMPRESSED,
-            header=ros.header(stamp_ns, "x"),
+            header=ros.make_header(stamp_ns, "x"),
             format="png",
             data=np.frombuffer(data, np.uint8),
         )
@@ -44,14 +44,14 @@ def image(stamp_ns: int, data: bytes) -> bytes:
 
 def motion(stamp_ns: int, gyro: tuple[float, ...], accel: tuple[float, ...]) -> bytes:
     def vector(v: tuple[float, ...]) -> Any:
-        return ros.make("geometry_msgs/msg/Vector3", x=v[0], y=v[1], z=v[2])
+        return ros.make_message("geometry_msgs/msg/Vector3", x=v[0], y=v[1], z=v[2])
 
     zeros = np.zeros(9)
     return ros.encode(
-        ros.make(
+        ros.make_message(
             ros.IMU_MSG,
-            header=ros.header(stamp_ns, "x"),
-            orientation=ros.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            header=ros.make_header(stamp_ns, "x"),
+            orientation=ros.make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
             orientation_covariance=zeros,
             angular_velocity=vector(gyro),
             angular_velocity_covariance=zeros,

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.odometry.error_model.features import SHAPES, Features, kind_of
+from share.odometry.error_model.inputs import INPUT_SHAPES, ErrorModelInput, input_dtype
 
 
-def made_features(rng: np.random.Generator, **given: np.ndarray) -> Features:
+def made_features(rng: np.random.Generator, **given: np.ndarray) -> ErrorModelInput:
     """Drawn, but for what is given."""
     drawn = {
         name: rng.integers(0, 256, shape, np.uint8)
-        if kind_of(name) is np.uint8
+        if input_dtype(name) is np.uint8
         else rng.random(shape, np.float32)
-        for name, shape in SHAPES.items()
+        for name, shape in INPUT_SHAPES.items()
     }
-    return Features(**drawn | given)
+    return ErrorModelInput(**drawn | given)

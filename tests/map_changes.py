@@ -6,8 +6,16 @@ import numpy as np
 from hellos import hello_of
 
 from share.geometry import se3
-from share.mapping.changes import Change, KeepKeyframe, KeepLoop, KeepPoses, KeepRun, Kept, KeptKeyframe
-from share.mapping.loops import Key, Loop
+from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.map_changes import (
+    MapChange,
+    SaveKeyframe,
+    SaveLoop,
+    SavePoses,
+    SaveRun,
+    StoredKeyframe,
+    StoredMap,
+)
 from share.types import F64, Keyframe, View
 
 ANN, BOB = "ann-0001", "bob-0002"
@@ -17,13 +25,13 @@ def pose(i: int) -> F64:
     return se3.exp(np.array([0.01 * i, 0.02 * i, -0.03 * i, 0.1 * i, 0.2, 0.3]))
 
 
-def run(key: str) -> KeepRun:
+def run(key: str) -> SaveRun:
     """Keys speak for all runs, but not for Bob's."""
     name, _, number = key.rpartition("-")
-    return KeepRun(key, hello_of(name, int(number, 16), T=pose(3)), "" if key == BOB else f"key of {name}")
+    return SaveRun(key, hello_of(name, int(number, 16), T=pose(3)), "" if key == BOB else f"key of {name}")
 
 
-def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> KeepKeyframe:
+def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> SaveKeyframe:
     """Number i of a run, relative to the one before unless it is the first of a stretch."""
     rng = np.random.default_rng([i, *key.encode()])
     view = View(
@@ -36,47 +44,47 @@ def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> KeepKey
     cov = np.diag([1e-6, 1e-6, 1e-6, 1e-5, 1e-5, 2e-5])
     up = np.array([0.0, 0.0, 1.0])
     own = Keyframe(i, -1 if begins else i - 1, 10**9 + i * 10**8, T, cov, pose(i), up, 0.01, view, i - 1)
-    return KeepKeyframe(key, own)
+    return SaveKeyframe(key, own)
 
 
-def kept_keyframe(key: str, i: int, stretch: int = 0) -> KeptKeyframe:
+def kept_keyframe(key: str, i: int, stretch: int = 0) -> StoredKeyframe:
     """The same, found again."""
-    return KeptKeyframe(key, keyframe(key, i).keyframe, f"{key}/{stretch}", i)
+    return StoredKeyframe(key, keyframe(key, i).keyframe, f"{key}/{stretch}", i)
 
 
 def loop(i: int, j: int) -> Loop:
-    return Loop(Key(ANN, i), Key(BOB, j), pose(i - j), np.eye(6) * 1e-4, 20 + i)
+    return Loop(KeyframeKey(ANN, i), KeyframeKey(BOB, j), pose(i - j), np.eye(6) * 1e-4, 20 + i)
 
 
-def solution(keys: list[Key], name: str = f"{ANN}/0") -> KeepPoses:
-    return KeepPoses(tuple(keys), np.array([pose(7) @ pose(k.id) for k in keys]), (name,) * len(keys))
+def solution(keys: list[KeyframeKey], name: str = f"{ANN}/0") -> SavePoses:
+    return SavePoses(tuple(keys), np.array([pose(7) @ pose(k.id) for k in keys]), (name,) * len(keys))
 
 
-def small_map(count: int = 20, points: int = 40) -> list[Change]:
+def small_map(count: int = 20, points: int = 40) -> list[MapChange]:
     """Two runs of `count` keyframes each, by turns, a loop for every fourth, and a solution of all."""
     frames = [keyframe(key, i, points) for i in range(count) for key in (ANN, BOB)]
-    loops = [KeepLoop(loop(i, i)) for i in range(0, count, 4)]
-    return [run(ANN), run(BOB), *frames, *loops, solution([k.at for k in frames])]
+    loops = [SaveLoop(loop(i, i)) for i in range(0, count, 4)]
+    return [run(ANN), run(BOB), *frames, *loops, solution([k.keyframe_key for k in frames])]
 
 
-def told(kept: Kept) -> dict[str, object]:
+def told(kept: StoredMap) -> dict[str, object]:
     """All of it in a form that can be compared to the last bit."""
     return {
         "runs": [
-            (r.key, r.hello.name, r.hello.run_id, r.hello.rig.T_body_cam0.tobytes(), r.voice)
+            (r.run_key, r.hello.name, r.hello.run_id, r.hello.rig.T_body_cam0.tobytes(), r.credential)
             for r in kept.runs
         ],
-        "stretches": kept.stretches,
+        "stretches": kept.segments,
         "keyframes": [_keyframe(k) for k in kept.keyframes],
         "links": {k: (x.reference, x.T_ref_body.tobytes(), x.cov.tobytes()) for k, x in kept.links.items()},
         "loops": [(x.a, x.b, x.T_a_b.tobytes(), x.cov.tobytes(), x.inliers) for x in kept.loops],
-        "poses": kept.poses and (kept.poses.keys, kept.poses.T_map_body.tobytes(), kept.poses.maps),
-        "next": dict(kept.next_keyframe),
-        "complaints": kept.complaints,
+        "poses": kept.poses and (kept.poses.keys, kept.poses.T_map_body.tobytes(), kept.poses.map_ids),
+        "next": dict(kept.next_ids),
+        "complaints": kept.problems,
     }
 
 
-def _keyframe(k: KeptKeyframe) -> tuple[object, ...]:
+def _keyframe(k: StoredKeyframe) -> tuple[object, ...]:
     own = k.keyframe
     arrays = (
         k.keyframe.T_odom_body,
@@ -88,8 +96,8 @@ def _keyframe(k: KeptKeyframe) -> tuple[object, ...]:
         own.view.descriptors,
     )
     return (
-        k.at,
-        (k.stretch, k.ordinal),
+        k.keyframe_key,
+        (k.segment_name, k.ordinal),
         own.reference,
         own.stamp_ns,
         own.follows,

@@ -8,7 +8,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
-from share.lab.mocap.mocap import Mocap
+from share.lab.mocap.trajectory import MocapTrajectory
 from share.types import F64, I64, ImuBatch
 
 NOISE = ImuNoise(1.7e-4, 2e-3, 2e-5, 3e-3, 200.0)
@@ -35,7 +35,7 @@ class Motion:
         p = 0.3 * waves[:, :3].sum(1).T + (2.0, 1.0, 1.5)
         angles = 0.35 * waves[:, 3:].sum(1).T
         roll_pitch = angles * (1, 1, 0) * (not self.planar)
-        return se3.compose(se3.so3_exp(angles * (0, 0, 1.5)) @ se3.so3_exp(roll_pitch), p)
+        return se3.from_rt(se3.so3_exp(angles * (0, 0, 1.5)) @ se3.so3_exp(roll_pitch), p)
 
     def inertial(self, t: F64) -> tuple[F64, F64]:
         """Angular rate (N, 3) and specific force (N, 3), body frame."""
@@ -76,15 +76,15 @@ def record_mocap(
     hz: float = 100.0,
     gaps: tuple[tuple[float, float], ...] = (),
     drift: float = 0.0,
-) -> Mocap:
+) -> MocapTrajectory:
     """Poses of the mocap's body, stamped with a clock that is `offset_ns` behind the IMU's
     in the middle, and more so by `drift` s a second. sigma: m, rad. gaps: s, where it sees nothing."""
     t = stamps(seconds - 0.3, hz, 0.3)
     s = (t - START_NS) * 1e-9
     rng = np.random.default_rng((seed, 2))
-    T = se3.compose(se3.so3_exp(np.append(TILT, 0.0)), np.zeros(3)) @ motion.pose(s) @ BODY
+    T = se3.from_rt(se3.so3_exp(np.append(TILT, 0.0)), np.zeros(3)) @ motion.pose(s) @ BODY
     T[:, :3, :3] = T[:, :3, :3] @ se3.so3_exp(rng.normal(0, sigma[1], (len(t), 3)))
     T[:, :3, 3] += rng.normal(0, sigma[0], (len(t), 3))
     keep = ~np.any([(s > a) & (s < b) for a, b in gaps], axis=0) if gaps else np.ones(len(t), bool)
     late = offset_ns + np.round(drift * (t - START_NS - seconds * 5e8)).astype(np.int64)
-    return Mocap((t - late)[keep], T[keep])
+    return MocapTrajectory((t - late)[keep], T[keep])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from share.odometry.error_model.features import SHAPES
+from share.odometry.error_model.inputs import INPUT_SHAPES
 
 FLOAT, UINT8 = 1, 2
 
@@ -72,7 +72,8 @@ def model(
 
 
 INPUTS = [
-    value_info(name, UINT8 if name == "picture" else FLOAT, ["N", *shape]) for name, shape in SHAPES.items()
+    value_info(name, UINT8 if name == "picture" else FLOAT, ["N", *shape])
+    for name, shape in INPUT_SHAPES.items()
 ]
 OUTPUTS = [
     value_info("log_error", FLOAT, ["N", 3]),

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from share.geometry import se3
-from share.lab.emulate.motion.plan import plan
-from share.lab.emulate.plain.scene import SIZE, PlainRenderer, layout
-from share.lab.emulate.sensor.device import Device
-from share.lab.emulate.types import Moment, Path
-from share.sensors.profile import profile
+from share.lab.emulate.motion.motion_plan import plan_motions
+from share.lab.emulate.plain.scene import DEFAULT_SIZE, PlainRenderer, plain_layout
+from share.lab.emulate.sensor.device import EmulatedDevice
+from share.lab.emulate.types import MotionPath, SceneInstant
+from share.sensors.profile import load_profile
 from share.types import F64, U8
 
 MOTIONS = {  # heads that turn at leisure: the tests want to see the room, not motion
@@ -20,7 +20,7 @@ MOTIONS = {  # heads that turn at leisure: the tests want to see the room, not m
     "stroller": "walk:speed=0.55,turns=0.9",
     "robot": "robot:speed=0.3",
 }
-_DEVICE = profile("d435i", "640x480@15")
+_DEVICE = load_profile("d435i", "640x480@15")
 RIG = _DEVICE.rig(depth=False)
 STEREO = replace(RIG, T_body_cam0=np.eye(4), imu=None)  # its body is cam0
 CAMERA = RIG.cam0
@@ -36,8 +36,8 @@ def poses(who: str, seconds: F64, seed: int, lasts: float = 20.0) -> F64:
 
 def gray(T_world_cam: F64, seed: int, frame: int, camera: int = 0) -> U8:
     """Image (480, 640) of the plain room of this seed, as a D435i delivers it at its reference exposure."""
-    radiance = _renderer(seed).radiance(CAMERA, [Moment(T_world_cam)])
-    return _device(seed).develop(radiance, frame, camera)
+    radiance = _renderer(seed).radiance(CAMERA, [SceneInstant(T_world_cam)])
+    return _device(seed).develop_image(radiance, frame, camera)
 
 
 def pairs(T_world_cam0: F64, seed: int) -> list[tuple[U8, U8]]:
@@ -50,16 +50,16 @@ def pairs(T_world_cam0: F64, seed: int) -> list[tuple[U8, U8]]:
 
 
 @functools.cache
-def _paths(seed: int, lasts: float) -> dict[str, Path]:
+def _paths(seed: int, lasts: float) -> dict[str, MotionPath]:
     specs = [f"{name}={spec}" for name, spec in MOTIONS.items()]
-    return {agent.name: agent.path for agent in plan(specs, layout(seed), lasts, seed).agents}
+    return {agent.name: agent.path for agent in plan_motions(specs, plain_layout(seed), lasts, seed).agents}
 
 
 @functools.cache
 def _renderer(seed: int) -> PlainRenderer:
-    return PlainRenderer(seed, SIZE)
+    return PlainRenderer(seed, DEFAULT_SIZE)
 
 
 @functools.cache
-def _device(seed: int) -> Device:
-    return Device(_DEVICE, seed=(seed,))
+def _device(seed: int) -> EmulatedDevice:
+    return EmulatedDevice(_DEVICE, seed=(seed,))

@@ -22,8 +22,8 @@ from plain_walk import RIG
 from share.config import Config
 from share.geometry import rig_check, se3
 from share.geometry.camera import Camera, Rig
-from share.runtime.guarded_tracker import Guard, GuardedTracker
-from share.runtime.pipeline import tracker_of
+from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.pipeline import make_tracker
 from share.types import U8, Frame, ImuBatch
 
 SEED, RATE_HZ, STEP_S, _H = 18, 15.0, 0.005, 2e-3
@@ -83,7 +83,7 @@ def rigs(count: int, seed: int) -> Iterator[tuple[str, Rig]]:
 
 
 def _base(rng: np.random.Generator) -> Rig:
-    depth = {"depth": RIG.cam0, "T_depth_cam0": se3.compose(np.eye(3), np.array([0.015, 0, 0]))}
+    depth = {"depth": RIG.cam0, "T_depth_cam0": se3.from_rt(np.eye(3), np.array([0.015, 0, 0]))}
     kinds = [
         RIG,
         RIG,
@@ -208,16 +208,16 @@ def _fitted(image: U8, camera: Camera) -> U8:
 def play(rig: Rig, walk: Walk, guarded: bool = True) -> Counter[str]:
     """States of the frames, what failed (`failed`), or why the rig was refused (`refused`)."""
     states: Counter[str] = Counter()
-    if guarded and rig_check.objection(rig) is not None:
+    if guarded and rig_check.rig_problem(rig) is not None:
         return Counter(refused=1)
-    guard = Guard(lambda text: states.update([f"failed: {text}"]))
-    tracker = GuardedTracker(rig, Config(), guard) if guarded else tracker_of(rig, Config())
+    guard = FaultGuard(lambda text: states.update([f"failed: {text}"]))
+    tracker = GuardedTracker(rig, Config(), guard) if guarded else make_tracker(rig, Config())
     for frame in frames_for(rig, walk):
         result = tracker.track(frame)
         states[str(result.state)] += 1
         if result.T_odom_body is not None:
             assert np.isfinite(result.T_odom_body).all()
-        if result.keyframe:
+        if result.keyframe_ready:
             if isinstance(tracker, GuardedTracker):
                 tracker.attempt("keyframe", frame, lambda frame=frame: _keep(tracker, frame))
             else:
@@ -226,8 +226,8 @@ def play(rig: Rig, walk: Walk, guarded: bool = True) -> Counter[str]:
 
 
 def _keep(tracker: object, frame: Frame) -> None:
-    tracker.keyframe(frame)
-    tracker.settle()
+    tracker.make_keyframe(frame)
+    tracker.finish_keyframe()
 
 
 def main() -> None:
@@ -264,5 +264,5 @@ def main() -> None:
 if __name__ == "__main__":
     from share import startup
 
-    startup.prepare()
+    startup.prepare_process()
     main()

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 from software_camera import DEPTH_UNIT_M, SoftwareCamera
 
-from share.cameras.feed import Feed, MakeWatchdog
-from share.cameras.handover import Handover
-from share.cameras.realsense.camera import RealSense
-from share.cameras.realsense.streams import Wanted
+from share.cameras.feed import CameraFeed, MakeWatchdog
+from share.cameras.realsense.camera import RealSenseCamera
+from share.cameras.realsense.streams import StreamRequest
+from share.cameras.sample_queue import SampleQueue
 from share.config import SequencerConfig
 from share.errors import UsageError
 from share.runtime.source import Source
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
 from share.sensors.watchdog import Watchdog
 
 HZ, LENS = 15, (385.0, 385.0, 320.4, 239.6)  # of the demo's cameras
-STEREO = Wanted(profile("d435i", f"640x480@{HZ}"))
-RGBD = Wanted(STEREO.profile, depth=True, right=False)
+STEREO = StreamRequest(load_profile("d435i", f"640x480@{HZ}"))
+RGBD = StreamRequest(STEREO.profile, depth=True, right=False)
 BEGIN_US = 5_000_000  # of the camera's clock
 
 
@@ -35,21 +35,21 @@ class RoomCamera:
         self.there = True  # it can be connected
         self.first_ns = next(iter(source.measurements())).stamp_ns
 
-    def device(self, wanted: Wanted, epoch: int = 0) -> RealSense:
-        return RealSense(wanted, context=self.camera.context, epoch=epoch)
+    def device(self, wanted: StreamRequest, epoch: int = 0) -> RealSenseCamera:
+        return RealSenseCamera(wanted, context=self.camera.context, epoch=epoch)
 
     def feed(
-        self, wanted: Wanted, queue: Handover, said: list[str], watchdog: MakeWatchdog = Watchdog
-    ) -> Feed:
+        self, wanted: StreamRequest, queue: SampleQueue, said: list[str], watchdog: MakeWatchdog = Watchdog
+    ) -> CameraFeed:
         """What the camera delivers, not opened yet."""
         rates, jump_s = wanted.rates_hz(), SequencerConfig().max_jump_s
 
-        def connect(serial: str | None, epoch: int) -> RealSense:
+        def connect(serial: str | None, epoch: int) -> RealSenseCamera:
             if not self.there:
                 raise UsageError("no camera")
             return self.device(wanted, epoch)
 
-        return Feed(connect, None, rates, jump_s, said.append, queue, watchdog)
+        return CameraFeed(connect, None, rates, jump_s, said.append, queue, watchdog)
 
     def play(self, before_image: Callable[[], None] = lambda: None, begin_us: int = BEGIN_US) -> int:
         """All of it; the stamp of the camera's clock after it. before_image: called before each frame."""
@@ -68,22 +68,22 @@ class RoomCamera:
                 self.camera.image(m.stream == "cam1", now, m.payload.load())
         return now
 
-    def taken(self, feed: Feed, pause_s: float = 0.0) -> Callable[[], None]:
+    def taken(self, feed: CameraFeed, pause_s: float = 0.0) -> Callable[[], None]:
         """Waits until all frames that were shown before have been taken; where a pause is given, so long."""
-        images = [name for name in feed.intake.streams if name not in ("accel", "gyro")]
+        images = [name for name in feed.processor.streams if name not in ("accel", "gyro")]
         shown = itertools.count()
 
         def wait() -> None:
             before, until = next(shown), time.monotonic() + 20
             time.sleep(pause_s)
             while not pause_s and time.monotonic() < until:
-                if all(feed.intake.streams[name].samples >= before for name in images):
+                if all(feed.processor.streams[name].samples >= before for name in images):
                     return
                 time.sleep(0.001)
 
         return wait
 
-    def begin(self, feed: Feed, pause_s: float = 0.0) -> threading.Thread:
+    def begin(self, feed: CameraFeed, pause_s: float = 0.0) -> threading.Thread:
         """Play to who reads `feed`, then stop it. See `taken`."""
 
         def play() -> None:

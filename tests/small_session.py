@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from share.lab.emulate.recipe import Recipe
-from share.lab.emulate.sensor.effects import parse
-from share.sensors.profile import shipped
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.sensor.effects import parse_effects
+from share.sensors.profile import shipped_profiles
 from share.types import I64
 
 RATE_HZ, SIZE = 10, (160, 120)
@@ -23,16 +23,20 @@ _MODE = """  modes:
 
 def small_profile(folder: Path) -> Path:
     """A D435i of 160x120 at 10 Hz."""
-    text = shipped()["d435i"].read_text()
+    text = shipped_profiles()["d435i"].read_text()
     text = text.replace("default_mode: 640x480@30", "default_mode: 160x120@10").replace("  modes:\n", _MODE)
     path = folder / "small.yaml"
     path.write_text(text)
     return path
 
 
-def small_recipe(profile: Path, *motions: str, effects: tuple[str, ...] = (), **more: object) -> Recipe:
+def small_recipe(
+    profile: Path, *motions: str, effects: tuple[str, ...] = (), **more: object
+) -> SessionRecipe:
     settings: dict[str, object] = {"scene": "plain", "seconds": 3.0} | more
-    return Recipe(motions=motions, profiles={"": str(profile)}, effects=parse(effects), **settings)  # type: ignore[arg-type]
+    return SessionRecipe(
+        motions=motions, profiles={"": str(profile)}, effects=parse_effects(effects), **settings
+    )  # type: ignore[arg-type]
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -13,7 +13,7 @@ CHILD = """
 import json
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 
 def rss_mb():
@@ -22,9 +22,9 @@ def rss_mb():
 
 
 kept = [bytearray(2000) for _ in range(30_000)][::100]  # a little of it, scattered
-heap, found = startup.Heap(), []
+heap, found = startup.HeapTrimmer(), []
 for now_s in (0.0, 59.0, 61.0, 62.0):
-    heap.tidy(now_s)
+    heap.trim_if_due(now_s)
     found.append(rss_mb())
 print(json.dumps(found))
 """

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from share.devices.time_server import TimeServer
-from share.net.ntp import Packet, to_stamp
+from share.net.ntp import NtpPacket, to_stamp
 
 MS = 1_000_000
 CHRONYD = shutil.which("chronyd") or next(iter(map(str, Path("/usr/sbin").glob("chronyd"))), None)
@@ -59,7 +59,7 @@ def shifted(offset_ms: float, slow_ms: float = 0.0, **changed: object) -> Replie
     def replies(data: bytes) -> list[bytes]:
         time.sleep(slow_ms / 1e3)
         reply = server.answer(data, "", time.time_ns() + offset_ns, time.monotonic_ns())
-        assert isinstance(reply, Packet)
+        assert isinstance(reply, NtpPacket)
         whole = replace(reply, **changed)  # type: ignore[arg-type]
         return [replace(whole, transmit=to_stamp(time.time_ns() + offset_ns)).encode()]
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
@@ -31,9 +31,9 @@ from gtsam_graph import solve  # noqa: E402
 from rooms import Room, simulate  # noqa: E402
 
 from share.config import GraphConfig  # noqa: E402
-from share.mapping.graph.covariance import Roads  # noqa: E402
-from share.mapping.graph.solver import Solver  # noqa: E402
-from share.mapping.graph.updates import Change, Solution  # noqa: E402
+from share.mapping.graph.covariance import CovariancePaths  # noqa: E402
+from share.mapping.graph.solver import PoseGraphSolver  # noqa: E402
+from share.mapping.graph.updates import GraphSolution, GraphUpdate  # noqa: E402
 from share.types import F64  # noqa: E402
 
 CONFIG = GraphConfig()
@@ -74,7 +74,7 @@ def cold(room: Room, agents: int) -> dict[str, float]:
     news = change(room, range(n), dict(enumerate(room.guess)), room.closures)
     times, pickling = [], []
     for _ in range(5):
-        solver = Solver(CONFIG)
+        solver = PoseGraphSolver(CONFIG)
         times.append(cpu_ms(lambda s=solver: (s.update(news), s.solve(0, range(n - agents, n))))[0])
         pickling.append(cpu_ms(lambda: pickle.loads(pickle.dumps(news, protocol=5)))[0])
     return {"cold": round(np.median(times), 1), "pickle": round(np.median(pickling), 2)}
@@ -97,7 +97,7 @@ def one_warm(n: int, agents: int, density: float, seed: int, steps: int) -> tupl
     """Times [ms], and how far every pose is from the minimum [mm] at the end."""
     room = simulate(n, agents, seed, density)
     first = n - steps * NEW
-    solver = Solver(CONFIG)
+    solver = PoseGraphSolver(CONFIG)
     loops = [edge for edges in room.loops[:first] for edge in edges]
     solver.update(change(room, range(first), dict(enumerate(room.guess[:first])), loops))
     solution, known, times = solver.solve(0), loops, []
@@ -109,15 +109,15 @@ def one_warm(n: int, agents: int, density: float, seed: int, steps: int) -> tupl
         wanted = range(k + NEW - agents, k + NEW)
         spent, solution = cpu_ms(lambda c=news, w=wanted: (solver.update(c), solver.solve(0, w))[1])
         times.append(spent)
-    exact = Solver(EXACT)
+    exact = PoseGraphSolver(EXACT)
     exact.update(change(room, range(n), dict(enumerate(solution.poses)), known))
     off = np.linalg.norm((exact.solve(0).poses - solution.poses)[:, :3, 3], axis=1)
     return np.array(times), 1e3 * off
 
 
-def laid_on(room: Room, solution: Solution, new: range) -> dict[int, F64]:
+def laid_on(room: Room, solution: GraphSolution, new: range) -> dict[int, F64]:
     """New keyframes where their odometry says, as the mapper lays them."""
-    poses = dict(zip(solution.numbers.tolist(), solution.poses, strict=True))
+    poses = dict(zip(solution.pose_ids.tolist(), solution.poses, strict=True))
     for i in new:
         edge = room.odometry[i]
         assert edge is not None
@@ -127,14 +127,16 @@ def laid_on(room: Room, solution: Solution, new: range) -> dict[int, F64]:
 
 def change(
     room: Room, numbers: range, poses: dict[int, F64], loops: list[Any], first_loop: int = FIRST_LOOP
-) -> Change:
+) -> GraphUpdate:
     odometry = [(i, edge, False) for i in numbers if (edge := room.odometry[i]) is not None]
-    return Change.of(poses, odometry + [(first_loop + k, edge, True) for k, edge in enumerate(loops)])
+    return GraphUpdate.from_edges(
+        poses, odometry + [(first_loop + k, edge, True) for k, edge in enumerate(loops)]
+    )
 
 
 def roads(room: Room) -> dict[str, float]:
     """To ask how well eight poses are known from one: after an edge came, and when none did."""
-    net, n, rng = Roads(), len(room), np.random.default_rng(0)
+    net, n, rng = CovariancePaths(), len(room), np.random.default_rng(0)
     edges = room.chain + room.closures
     adding = cpu_ms(lambda: [net.add(edge) for edge in edges])[0] / len(edges)
     fresh, kept = [], []
@@ -143,7 +145,7 @@ def roads(room: Room) -> dict[str, float]:
         net.add(edges[-1 - k])
         for times in (fresh, kept):
             goals = rng.choice(n, 8).tolist()
-            times.append(cpu_ms(lambda g=goals: net.known_from(n - 1, g, room.guess))[0])
+            times.append(cpu_ms(lambda g=goals: net.covariances_from(n - 1, g, room.guess))[0])
     return {
         "edge_added_us": round(1e3 * adding, 1),
         "known_from_after_news": round(float(np.median(fresh)), 2),

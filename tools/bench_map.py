@@ -19,7 +19,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
@@ -31,8 +31,8 @@ from place_sim import sights  # noqa: E402
 from share.config import PlaceConfig  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.mapping.recognition.index import PlaceIndex  # noqa: E402
-from share.mapping.recognition.verification import Sight, Verified, verify  # noqa: E402
-from share.vision.matching import match  # noqa: E402
+from share.mapping.recognition.verification import CameraView, Verification, verify  # noqa: E402
+from share.vision.matching import match_descriptors  # noqa: E402
 
 PLACE = PlaceConfig()
 
@@ -48,7 +48,7 @@ def main() -> None:
     print(json.dumps(report, indent=2))
 
 
-def simulated() -> list[Sight]:
+def simulated() -> list[CameraView]:
     T = se3.exp(np.array([0.1, -0.1, 0.05, 0.3, 0.1, -0.2]))
     return [sight for seed in range(15) for sight in sights(seed, T)]
 
@@ -62,7 +62,7 @@ def median_ms(runs: Iterable[Callable[[], Any]]) -> float:
     return round(1e3 * float(np.median(times)), 3)
 
 
-def bench_place(views: list[Sight], n: int) -> dict[str, float]:
+def bench_place(views: list[CameraView], n: int) -> dict[str, float]:
     """`add` and `query` at n stored keyframes, and `chain`: query and verification of all candidates."""
     rng = np.random.default_rng(0)
     index = PlaceIndex(PLACE.index_seed, PLACE.tables, PLACE.hash_bits)
@@ -74,19 +74,21 @@ def bench_place(views: list[Sight], n: int) -> dict[str, float]:
     asked = [views[i % len(views)] for i in range(40)]
     ask = median_ms([lambda v=v: index.query(v.view.descriptors, PLACE.candidates) for v in asked])
 
-    def chain(query: Sight) -> None:
+    def chain(query: CameraView) -> None:
         for candidate in index.query(query.view.descriptors, PLACE.candidates):
             verify(query, views[candidate.id % len(views)], PLACE)
 
     return {"add": add, "query": ask, "chain": median_ms([lambda v=v: chain(v) for v in asked])}
 
 
-def bench_pair(views: list[Sight]) -> dict[str, float]:
+def bench_pair(views: list[CameraView]) -> dict[str, float]:
     """Of neighbouring and of distant views: matching, and verification by its outcome."""
     pairs = [*itertools.pairwise(views), *zip(views, views[7:], strict=False)]
-    accepts = [isinstance(verify(a, b, PLACE), Verified) for a, b in pairs]
+    accepts = [isinstance(verify(a, b, PLACE), Verification) for a, b in pairs]
     matching = [
-        lambda a=a, b=b: match(a.view.descriptors, b.view.descriptors, PLACE.max_distance_bits, 1.0)
+        lambda a=a, b=b: match_descriptors(
+            a.view.descriptors, b.view.descriptors, PLACE.max_distance_bits, 1.0
+        )
         for a, b in pairs
     ]
 

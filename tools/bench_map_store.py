@@ -17,13 +17,13 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
 from share.geometry.camera import Camera, Rig  # noqa: E402
-from share.mapping.changes import Change, KeepKeyframe, KeepPoses, KeepRun, Retire  # noqa: E402
-from share.mapping.loops import Key  # noqa: E402
+from share.mapping.loops import KeyframeKey  # noqa: E402
+from share.mapping.map_changes import MapChange, RemoveKeyframes, SaveKeyframe, SavePoses, SaveRun  # noqa: E402
 from share.store.map_store import MapStore  # noqa: E402
 from share.types import AgentKind, Keyframe, View  # noqa: E402
 from share.wire.messages import Hello  # noqa: E402
@@ -55,21 +55,21 @@ def fresh(folder: Path | None, bench: Callable[[Path], dict[str, Any]]) -> dict[
         return bench(Path(name) / "map.sqlite")
 
 
-def keyframes() -> Callable[[int], KeepKeyframe]:
+def keyframes() -> Callable[[int], SaveKeyframe]:
     rng = np.random.default_rng(0)
     view = View(rng.normal(size=(500, 2)), rng.normal(size=(500, 3)), rng.integers(0, 256, (500, 32)))
     step, up = np.eye(4), np.array([0.0, 0.0, 1.0])
 
-    def make(i: int) -> KeepKeyframe:
+    def make(i: int) -> SaveKeyframe:
         cov = np.eye(6) * 1e-6
-        return KeepKeyframe(RUN, Keyframe(i, i - 1, i * 10**8, step, cov, step, up, 0.01, view))
+        return SaveKeyframe(RUN, Keyframe(i, i - 1, i * 10**8, step, cov, step, up, 0.01, view))
 
     return make
 
 
 def opened(path: Path, power_cut: bool = False) -> MapStore:
     store = MapStore.open(path, power_cut)
-    store.write([KeepRun(RUN, Hello("ann", AgentKind.AR, 1, RIG))])
+    store.write([SaveRun(RUN, Hello("ann", AgentKind.AR, 1, RIG))])
     return store
 
 
@@ -85,8 +85,10 @@ def bench_solutions(path: Path) -> dict[str, Any]:
     make = keyframes()
     with opened(path) as store:
         store.write([make(i) for i in range(2000)])
-        poses = KeepPoses(
-            tuple(Key(RUN, i) for i in range(2000)), np.tile(np.eye(4), (2000, 1, 1)), (f"{RUN}/0",) * 2000
+        poses = SavePoses(
+            tuple(KeyframeKey(RUN, i) for i in range(2000)),
+            np.tile(np.eye(4), (2000, 1, 1)),
+            (f"{RUN}/0",) * 2000,
         )
         return timed(store, [[poses]] * 50)
 
@@ -111,8 +113,10 @@ def bench_turnover(path: Path, count: int, held: int) -> dict[str, Any]:
         for start in range(0, count, 20):
             there += range(start, start + 20)
             gone = [there.pop(draw.integers(len(there) - 20)) for _ in range(max(0, len(there) - held))]
-            news: list[Change] = [make(i) for i in range(start, start + 20)]
-            batches_ms += times_ms(store, [[*news, Retire(tuple(Key(RUN, i) for i in gone))]])
+            news: list[MapChange] = [make(i) for i in range(start, start + 20)]
+            batches_ms += times_ms(
+                store, [[*news, RemoveKeyframes(tuple(KeyframeKey(RUN, i) for i in gone))]]
+            )
             sizes.append(sum(f.stat().st_size for f in path.parent.iterdir()) / 1e6)
         left = len(store.load().keyframes)
     tenth = len(sizes) // 10

@@ -17,17 +17,17 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
 from share.geometry.camera import Camera  # noqa: E402
 from share.lab.emulate.render.gl import GlRenderer  # noqa: E402
-from share.lab.emulate.types import Moment, Room  # noqa: E402
-from share.lab.emulate.world.build import build  # noqa: E402
-from share.lab.emulate.world.files import load_room, save_room  # noqa: E402
-from share.lab.emulate.world.scenes import SCENES, layout  # noqa: E402
-from share.spawning import SPAWN  # noqa: E402
+from share.lab.emulate.types import DrawableRoom, SceneInstant  # noqa: E402
+from share.lab.emulate.world.build import build_room  # noqa: E402
+from share.lab.emulate.world.room_files import load_room, save_room  # noqa: E402
+from share.lab.emulate.world.scenes import SCENES, make_scene_layout  # noqa: E402
+from share.spawning import SPAWN_CONTEXT  # noqa: E402
 
 D435I = Camera(640, 480, 383.2, 384.1, 318.7, 242.3)
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))
@@ -53,18 +53,18 @@ def main() -> None:
     print(json.dumps(report, indent=2))
 
 
-def the_room(scene: str, seed: int, kept: Path | None) -> Room:
+def the_room(scene: str, seed: int, kept: Path | None) -> DrawableRoom:
     if kept and kept.exists():
         return load_room(kept)
-    room = build(layout(scene, seed))
+    room = build_room(make_scene_layout(scene, seed))
     if kept:
         save_room(room, kept)
     return room
 
 
-def moments(room: Room, k: int, count: int) -> list[Moment]:
+def moments(room: DrawableRoom, k: int, count: int) -> list[SceneInstant]:
     """The k-th image's exposure: a slow turn in the middle of the room."""
-    return [Moment(looking(room.size, 0.15 * k + 0.005 * j)) for j in range(count)]
+    return [SceneInstant(looking(room.size, 0.15 * k + 0.005 * j)) for j in range(count)]
 
 
 def looking(size: np.ndarray, yaw: float) -> np.ndarray:
@@ -84,7 +84,7 @@ JOBS = {
 }
 
 
-def cpu_ms(renderer: GlRenderer, room: Room, job: str, images: int) -> float:
+def cpu_ms(renderer: GlRenderer, room: DrawableRoom, job: str, images: int) -> float:
     times = []
     for k in range(max(4, images if "lens" not in job else images // 4)):
         start = time.process_time()
@@ -93,10 +93,12 @@ def cpu_ms(renderer: GlRenderer, room: Room, job: str, images: int) -> float:
     return round(1e3 * float(np.median(times[2:])), 1)  # the first ones compile and allocate
 
 
-def per_second(room: Room, processes: int, images: int) -> float:
+def per_second(room: DrawableRoom, processes: int, images: int) -> float:
     """Images without depth, of all processes together, each on its own."""
-    barrier, done = SPAWN.Barrier(processes + 1), SPAWN.Queue()
-    workers = [SPAWN.Process(target=draw, args=(room, images, barrier, done)) for _ in range(processes)]
+    barrier, done = SPAWN_CONTEXT.Barrier(processes + 1), SPAWN_CONTEXT.Queue()
+    workers = [
+        SPAWN_CONTEXT.Process(target=draw, args=(room, images, barrier, done)) for _ in range(processes)
+    ]
     for worker in workers:
         worker.start()
     barrier.wait()
@@ -106,7 +108,7 @@ def per_second(room: Room, processes: int, images: int) -> float:
     return round(processes * images / slowest, 1)
 
 
-def draw(room: Room, images: int, barrier: Any, done: Any) -> None:
+def draw(room: DrawableRoom, images: int, barrier: Any, done: Any) -> None:
     renderer = GlRenderer(room)
     JOBS["image"](renderer, room, 0)
     barrier.wait()

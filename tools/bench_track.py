@@ -28,26 +28,26 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 import poselib  # noqa: E402, F401 -- else the first frame would pay for it
 
 from share.config import Config, TrackerConfig  # noqa: E402
-from share.lab.emulate.demo import FALLBACK, SCENE  # noqa: E402
-from share.lab.emulate.recipe import Recipe  # noqa: E402
-from share.lab.emulate.render.context import missing  # noqa: E402
-from share.lab.emulate.session import cached_session, make_session  # noqa: E402
-from share.odometry import features, filter, measurement  # noqa: E402
-from share.odometry.landmarks import Scene  # noqa: E402
-from share.odometry.tracker import InertialTracker  # noqa: E402
+from share.lab.emulate.demo import DEFAULT_SCENE, FALLBACK_SCENE  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
+from share.lab.emulate.render.context import missing_reason  # noqa: E402
+from share.lab.emulate.session import make_cached_session, make_session  # noqa: E402
+from share.odometry import feature_appearance, feature_matching, filter  # noqa: E402
+from share.odometry.inertial_tracker import InertialTracker  # noqa: E402
+from share.odometry.landmarks import LandmarkMap  # noqa: E402
 from share.odometry.visual_tracker import VisualTracker  # noqa: E402
-from share.runtime.pipeline import frames_of, tracker_for  # noqa: E402
+from share.runtime.pipeline import make_source_tracker, read_frames  # noqa: E402
 from share.runtime.source import Source, open_source  # noqa: E402
 from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64  # noqa: E402
 from share.vision import corners, patches  # noqa: E402
-from share.vision.orb import ViewInSteps  # noqa: E402
+from share.vision.orb import ViewBuilder  # noqa: E402
 
 STEREO = {"euroc_752x480": ("euroc", 20), "d435i_848x480": ("d435i:848x480@30", 30)}  # profile, Hz
 NEEDS_LENS = "euroc_752x480"  # which the plain room does not have
@@ -56,29 +56,29 @@ SHORTEST_S = 3  # of a session
 KITCHEN = Path(__file__).resolve().parents[2] / "shared" / "data" / "real" / "redkitchen_0000_0499"
 STAGES: tuple[tuple[Any, str, str], ...] = (
     (filter, "propagate", "imu"),
-    (measurement, "aim_of", "expect"),
+    (feature_matching, "predict_patches", "expect"),
     (patches, "align", "align"),
-    (measurement, "rescue", "rescue"),
-    (Scene, "mark_movers", "movers"),
-    (Scene, "heard", "rows"),
-    (filter, "relinearised", "anew where far off"),
-    (filter, "gains", "gains"),
+    (feature_matching, "match_by_flow", "rescue"),
+    (LandmarkMap, "mark_dynamic", "movers"),
+    (LandmarkMap, "frame_measurements", "rows"),
+    (filter, "relinearised_rows", "anew where far off"),
+    (filter, "innovation_covariance", "gains"),
     (filter, "update", "update"),
-    (Scene, "seen", "slant and runaways"),
-    (Scene, "wake", "keyframe: wake"),
-    (Scene, "_forget", "keyframe: forget"),
-    (Scene, "_inverse_depths", "keyframe: depth"),
-    (features, "looks", "keyframe: patches"),
-    (ViewInSteps, "detect", "view: features"),
-    (ViewInSteps, "describe", "view: descriptors"),
-    (ViewInSteps, "finish", "view: depth"),
+    (LandmarkMap, "record_frame", "slant and runaways"),
+    (LandmarkMap, "reactivate", "keyframe: wake"),
+    (LandmarkMap, "drop_dormant", "keyframe: forget"),
+    (LandmarkMap, "_initial_depths", "keyframe: depth"),
+    (feature_appearance, "extract_appearance", "keyframe: patches"),
+    (ViewBuilder, "detect", "view: features"),
+    (ViewBuilder, "describe", "view: descriptors"),
+    (ViewBuilder, "finish", "view: depth"),
     (corners, "detect", "keyframe: corners"),
-    (VisualTracker, "_find", "klt"),
-    (VisualTracker, "_pose", "pose"),
+    (VisualTracker, "_follow_tracks", "klt"),
+    (VisualTracker, "_estimate_pose", "pose"),
     (VisualTracker, "_reobserve", "reobservation"),
     (VisualTracker, "_add_corners", "corners"),
-    (VisualTracker, "_recover", "relocalisation"),
-    (VisualTracker, "keyframe", "view"),
+    (VisualTracker, "_relocalise", "relocalisation"),
+    (VisualTracker, "make_keyframe", "view"),
 )
 Tracker = VisualTracker | InertialTracker
 
@@ -122,22 +122,28 @@ def main() -> None:
 
 def bench_stereo(frames: int, stages: Stages) -> dict[str, Any]:
     """With an IMU."""
-    reason = missing()
-    report: dict[str, Any] = {"scene": SCENE if reason is None else f"{FALLBACK}, because {reason}"}
+    reason = missing_reason()
+    report: dict[str, Any] = {
+        "scene": DEFAULT_SCENE if reason is None else f"{FALLBACK_SCENE}, because {reason}"
+    }
     for name, (profile, rate_hz) in STEREO.items():
         if reason is not None and name == NEEDS_LENS:
             report[name] = "the plain room has no lens distortion"
             continue
         seconds = max(SHORTEST_S, frames / rate_hz)
-        recipe = Recipe(FALLBACK if reason else SCENE, ("a=walk:",), seconds, profiles={"": profile})
-        source = open_source(str(cached_session(recipe) / "a"))
-        report[name] = bench(source, tracker_for(source, Config()), stages, frames)
+        recipe = SessionRecipe(
+            FALLBACK_SCENE if reason else DEFAULT_SCENE, ("a=walk:",), seconds, profiles={"": profile}
+        )
+        source = open_source(str(make_cached_session(recipe) / "a"))
+        report[name] = bench(source, make_source_tracker(source, Config()), stages, frames)
     return report
 
 
 def bench_robot(frames: int, stages: Stages) -> dict[str, Any]:
     """RGB-D, by its camera alone."""
-    recipe = Recipe(FALLBACK, (ROBOT,), max(SHORTEST_S, frames / ROBOT_HZ), profiles={"": ROBOT_PROFILE})
+    recipe = SessionRecipe(
+        FALLBACK_SCENE, (ROBOT,), max(SHORTEST_S, frames / ROBOT_HZ), profiles={"": ROBOT_PROFILE}
+    )
     with tempfile.TemporaryDirectory() as folder:
         source = open_source(str(make_session(recipe, Path(folder) / "room") / "robot"))
         return {"room_robot": bench(source, VisualTracker(source.rig, TrackerConfig()), stages, frames)}
@@ -148,24 +154,24 @@ def bench_recording(given: Path | None, stages: Stages) -> dict[str, Any]:
     if not given and not path.exists():
         return {"recording": "the kitchen is not beside this checkout; name another with --recording"}
     source = open_source(str(path))
-    return {path.name: bench(source, tracker_for(source, Config()), stages)}
+    return {path.name: bench(source, make_source_tracker(source, Config()), stages)}
 
 
 def bench(source: Source, estimator: Tracker, stages: Stages, most: int | None = None) -> dict[str, Any]:
     """Over the first frames of `source`, one thread."""
     stages.spent.clear()
     tracked, track_ms, pose_ms, keyframe_ms = 0, [], [], []
-    for frame in islice(frames_of(source, Config(), SequencerCounters()), most):
+    for frame in islice(read_frames(source, Config(), SequencerCounters()), most):
         stages.second = tuple(x for x in (source.rig.cam1, frame.image1) if x is not None)
         began, cpu_began = time.perf_counter(), time.process_time()
         result = estimator.track(frame)
         track_ms.append(1e3 * (time.perf_counter() - began))
         pose_out = time.process_time()
-        if result.keyframe:
-            estimator.keyframe(frame)
-        estimator.settle()
+        if result.keyframe_ready:
+            estimator.make_keyframe(frame)
+        estimator.finish_keyframe()
         pose_ms.append(1e3 * (pose_out - cpu_began))
-        keyframe_ms.append(1e3 * (time.process_time() - pose_out) if result.keyframe else np.nan)
+        keyframe_ms.append(1e3 * (time.process_time() - pose_out) if result.keyframe_ready else np.nan)
         tracked += result.T_odom_body is not None
     return {"tracker": type(estimator).__name__, "frames": len(pose_ms), "tracked": tracked} | report_of(
         np.array(track_ms), np.array(pose_ms), np.array(keyframe_ms), stages.spent

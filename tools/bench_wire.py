@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate
-from share.net.memory import MemoryNetwork
+from share.net.in_memory import MemoryNetwork
+from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate_pair
 from share.net.transport import AgentLink, EdgeLink, bind, connect
 from share.types import Keyframe, TrackState, View
-from share.wire.codec import Bytes, decode, encode, size
+from share.wire.codec import Bytes, decode, encode, message_bytes
 from share.wire.messages import Message, Ping, PoseUpdate
 
 
@@ -52,7 +52,7 @@ def timed_us(call: Callable[[], Any], rounds: int) -> float:
 
 def keys(folder: Path) -> tuple[EdgeKeys, AgentKeys]:
     """Of an edge and of an agent that it lets in."""
-    edge, agent = generate(folder / "edge", "edge"), generate(folder / "agent", "agent")
+    edge, agent = generate_pair(folder / "edge", "edge"), generate_pair(folder / "agent", "agent")
     authorize(folder / "edge", "agent", agent.public)
     return EdgeKeys(edge, allow_list(folder / "edge")), AgentKeys(agent, edge.public)
 
@@ -93,7 +93,7 @@ def main() -> None:
     for name, message in messages().items():
         frames = [bytes(frame) for frame in encode(message)]
         result[name] = {
-            "bytes": size(frames),
+            "bytes": message_bytes(frames),
             "encode": timed_us(partial(encode, message), rounds),
             "decode": timed_us(partial(decode, frames), rounds),
         }

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from scipy.stats import spearmanr  # noqa: E402
@@ -24,8 +24,8 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
-from share.lab.train.labels import keyframes  # noqa: E402
-from share.odometry.error_model.model import Network, estimate  # noqa: E402
+from share.lab.train.labels import labelled_keyframes  # noqa: E402
+from share.odometry.error_model.inference import OnnxSession, estimate_error  # noqa: E402
 from share.odometry.error_model.network import open_network, read_model  # noqa: E402
 from share.runtime.source import open_source  # noqa: E402
 from share.types import F64  # noqa: E402
@@ -72,13 +72,13 @@ def check(options: argparse.Namespace) -> None:
         draw(options.picture, found)
 
 
-def checked(name: str, network: Network) -> Checked:
+def checked(name: str, network: OnnxSession) -> Checked:
     rows = []
-    for stamp_ns, error_cm, features in keyframes(open_source(name), Config()):
+    for stamp_ns, error_cm, features in labelled_keyframes(open_source(name), Config()):
         if not np.isnan(error_cm):
-            told = estimate(network, features)
+            told = estimate_error(network, features)
             interval = told.error_cm, told.low_cm, told.high_cm
-            rows.append((stamp_ns * 1e-9, error_cm, *interval, told.strange))
+            rows.append((stamp_ns * 1e-9, error_cm, *interval, told.out_of_distribution))
     if len(rows) < 2:
         raise UsageError(f"{name}: has {len(rows)} keyframes with a known error; that tells nothing")
     table = np.array(rows, float)

@@ -21,8 +21,8 @@ import numpy as np
 from tool_main import exit_code, line
 
 from share.errors import UsageError
-from share.net.channel import Network, Way
-from share.net.emulated import ShapedLink
+from share.net.channel import ChannelModel, NetworkModel
+from share.net.emulated_link import EmulatedLink
 from share.net.transport import AgentLink, EdgeLink, bind, connect
 
 POSE, KEYFRAME = 200, 30_000  # bytes
@@ -48,11 +48,15 @@ def compare(options: argparse.Namespace) -> None:
     if os.geteuid():
         raise UsageError("network namespaces need root: sudo python tools/check_link.py")
     kernel, has_netem = by_kernel(options)
-    way = Way(options.mbps, options.delay_ms, 0.0, options.loss) if has_netem else Way(options.mbps)
+    way = (
+        ChannelModel(options.mbps, options.delay_ms, 0.0, options.loss)
+        if has_netem
+        else ChannelModel(options.mbps)
+    )
     print(
         "with netem" if has_netem else "this kernel has no netem: only the rate is compared (tbf)", flush=True
     )
-    ours = talk(options.seconds, Network(way, Way(delay_ms=way.delay_ms)))
+    ours = talk(options.seconds, NetworkModel(way, ChannelModel(delay_ms=way.delay_ms)))
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))))
     for size in (POSE, KEYFRAME):
         for name, delays in (("kernel", kernel[size]), ("emulated", ours[size])):
@@ -89,16 +93,16 @@ def inside(options: argparse.Namespace) -> None:
     print(json.dumps(talk(options.seconds, None)))
 
 
-def talk(seconds: float, network: Network | None) -> Delays:
+def talk(seconds: float, network: NetworkModel | None) -> Delays:
     """One-way delays, ms, of what an agent says to an edge in this process."""
     edge = bind("tcp://127.0.0.1:0")
     plain = connect(edge.endpoint, 1)
-    link: AgentLink = plain if network is None else ShapedLink(plain, network, 1)
+    link: AgentLink = plain if network is None else EmulatedLink(plain, network, 1)
     out: Delays = {POSE: [], KEYFRAME: []}
     over = threading.Event()
     listener = threading.Thread(target=listen, args=(edge, out, over))
     listener.start()
-    while not link.connected():
+    while not link.poll_connected():
         link.receive(20)
     due = [(POSE_S, POSE, time.monotonic()), (KEYFRAME_S, KEYFRAME, time.monotonic())]
     end = time.monotonic() + seconds

@@ -19,13 +19,13 @@ import numpy as np
 
 from share.geometry.camera import Camera
 from share.lab.emulate.render.gl import GlRenderer
-from share.lab.emulate.session import PLAN
-from share.lab.emulate.types import Moment
-from share.lab.emulate.world.build import build
+from share.lab.emulate.session import PLAN_FILE
+from share.lab.emulate.types import SceneInstant
+from share.lab.emulate.world.build import build_room
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.emulate.world.scenes import SCENES, layout
-from share.lab.emulate.world.views import looking
+from share.lab.emulate.world.scenes import SCENES, make_scene_layout
+from share.lab.emulate.world.views import level_camera_pose
 from share.recordings.session import read_session
 from share.runtime.source import open_source
 from share.sensors.measurement import CAM0
@@ -43,7 +43,7 @@ def views(room: Layout, count: int) -> list[F64]:
     """Poses (4, 4) where people and every third time a robot can be. Each looks along the freest of
     three directions: who walks looks where he goes, mostly."""
     rng = np.random.default_rng((room.seed, 77))
-    distance, origin, step = Occupancy.of(room, 0.1).floor_clearance(0.1, 1.9)
+    distance, origin, step = Occupancy.from_layout(room, 0.1).floor_clearance(0.1, 1.9)
     cells = np.argwhere(distance >= CLEARANCE)
     out = []
     for k in range(count):
@@ -52,7 +52,7 @@ def views(room: Layout, count: int) -> list[F64]:
         robot = k % 3 == 2
         height = 0.35 if robot else rng.uniform(1.5, 1.75)
         pitch = 0.1 if robot else rng.normal(-0.08, 0.12)
-        out.append(looking((x, y, height), yaw, pitch))
+        out.append(level_camera_pose((x, y, height), yaw, pitch))
     return out
 
 
@@ -67,9 +67,9 @@ def _free_ahead(distance: F32, x: float, y: float, yaw: float) -> int:
 
 def photograph(room: Layout, poses: list[F64]) -> list[U8]:
     """Images (480, 640) of a room."""
-    renderer, rng, out = GlRenderer(build(room)), np.random.default_rng((room.seed, 78)), []
+    renderer, rng, out = GlRenderer(build_room(room)), np.random.default_rng((room.seed, 78)), []
     for T in poses:
-        light = renderer.radiance(CAMERA, [Moment(T)])
+        light = renderer.radiance(CAMERA, [SceneInstant(T)])
         light *= min(BRIGHTEST_GAIN, EXPOSED / max(float(light.mean()), 1.0))
         light = cv2.GaussianBlur(light, (0, 0), BLUR)
         out.append((light + rng.normal(0, NOISE, light.shape)).clip(0, 255).astype(np.uint8))
@@ -86,7 +86,7 @@ def seen(folder: Path) -> U8:
     """The plan of a session (colour), and COLUMNS images of each agent over its whole length."""
     rows = [_along(folder / name) for name in read_session(folder).agents]
     images = cv2.cvtColor(np.concatenate(rows), cv2.COLOR_GRAY2BGR)
-    plan = cv2.imread(str(folder / PLAN))
+    plan = cv2.imread(str(folder / PLAN_FILE))
     size = round(plan.shape[1] * len(images) / plan.shape[0]), len(images)
     return np.hstack([cv2.resize(plan, size, interpolation=cv2.INTER_AREA), images])
 
@@ -117,7 +117,7 @@ def main() -> None:
         return
     for name in args.scene or SCENES:
         for seed in args.seeds:
-            room = layout(name, seed, tuple(args.size) if args.size else None)
+            room = make_scene_layout(name, seed, tuple(args.size) if args.size else None)
             images = photograph(room, views(room, ROWS * COLUMNS))
             write(args.out / f"{name}-{seed}.jpg", sheet(images))
 

@@ -18,7 +18,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from share.lab.emulate.world.stats import HEIGHT, WIDTH, ImageStatistics, comparable, statistics
+from share.lab.emulate.world.image_statistics import (
+    HEIGHT,
+    WIDTH,
+    ImageStatistics,
+    image_statistics,
+    resize_to_standard,
+)
 from share.types import F32, U8
 
 _FOCAL, _MEAN, _BLUR, _NOISE = 458.0, 110.0, 0.5, 1.5
@@ -30,24 +36,26 @@ def of_folder(folder: Path, most: int) -> list[U8]:
         p for p in folder.rglob("*") if p.suffix.lower() in (".png", ".jpg") and "depth" not in p.parts
     )
     chosen = found[:: max(1, len(found) // most)][:most]
-    return [comparable(np.asarray(cv2.imread(str(p), cv2.IMREAD_GRAYSCALE), np.uint8)) for p in chosen]
+    return [
+        resize_to_standard(np.asarray(cv2.imread(str(p), cv2.IMREAD_GRAYSCALE), np.uint8)) for p in chosen
+    ]
 
 
 def of_room(name: str, seed: int, count: int) -> list[U8]:
     """Views of one room."""
     from share.geometry.camera import Camera
     from share.lab.emulate.render.gl import GlRenderer
-    from share.lab.emulate.types import Moment
-    from share.lab.emulate.world.build import build
+    from share.lab.emulate.types import SceneInstant
+    from share.lab.emulate.world.build import build_room
     from share.lab.emulate.world.occupancy import Occupancy
-    from share.lab.emulate.world.scenes import layout
+    from share.lab.emulate.world.scenes import make_scene_layout
     from share.lab.emulate.world.views import standing_views
 
-    room, rng = layout(name, seed), np.random.default_rng((seed, 5))
+    room, rng = make_scene_layout(name, seed), np.random.default_rng((seed, 5))
     camera = Camera(WIDTH, HEIGHT, _FOCAL, _FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)
-    renderer = GlRenderer(build(room))
-    views = standing_views(Occupancy.of(room), seed, count)
-    return [taken(renderer.radiance(camera, [Moment(T)]), rng) for T in views]
+    renderer = GlRenderer(build_room(room))
+    views = standing_views(Occupancy.from_layout(room), seed, count)
+    return [taken(renderer.radiance(camera, [SceneInstant(T)]), rng) for T in views]
 
 
 def taken(radiance: F32, rng: np.random.Generator) -> U8:
@@ -64,7 +72,7 @@ def sheet(images: list[U8], columns: int = 4, rows: int = 3) -> U8:
 
 
 def line(name: str, images: list[U8]) -> str:
-    found = np.array([astuple(statistics(image)) for image in images])
+    found = np.array([astuple(image_statistics(image)) for image in images])
     figures = [*found.mean(0), *np.percentile(found[:, 0], (25, 50, 75))]
     return f"{name:22}" + "".join(f"{v:10.2f}" for v in figures)
 

@@ -16,7 +16,7 @@ from deploy_release import Release, read_release, write_tar
 from deploy_settings import merged
 from tool_main import exit_code
 
-from share.cli.progress import progress
+from share.cli.terminal import progress
 from share.devices import checks
 from share.errors import UsageError
 from share.net.keys import public_key
@@ -211,7 +211,7 @@ def plan(
             for name, text in files.items()
         ),
         f"{where}/etc/systemd/system/share-*.service, /etc/udev/rules.d/99-share-realsense.rules",
-        f"{where}{checks.FILE}: CPU governor and USB memory, as the profile wants them",
+        f"{where}{checks.TMPFILES_PATH}: CPU governor and USB memory, as the profile wants them",
         f"{where}/opt/share/current: {there.current or 'none'} -> {release.name}",
         *(begin if service.unit else []),
     ]

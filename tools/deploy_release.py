@@ -15,7 +15,7 @@ from typing import IO
 
 from share.devices import camera_check, checks
 from share.errors import ShareError, UsageError
-from share.sensors.profile import host_profile, shipped
+from share.sensors.profile import load_host_profile, shipped_profiles
 
 HERE = Path(__file__).resolve().parent / "device"
 RULES = "deploy/99-share-realsense.rules"
@@ -72,16 +72,18 @@ def _members(folder: Path) -> list[tuple[str, Path | bytes]]:
     return [
         *((str(path.relative_to(folder)), path) for path in program),
         *((f"deploy/{path.name}", path) for path in units),
-        *((f"deploy/{name}.conf", _at_boot(name)) for name in shipped()),
-        (RULES, "".join(f"{rule}\n" for rule in camera_check.RULES).encode()),
+        *((f"deploy/{name}.conf", _at_boot(name)) for name in shipped_profiles()),
+        (RULES, "".join(f"{rule}\n" for rule in camera_check.UDEV_RULES).encode()),
     ]
 
 
 def _at_boot(profile: str) -> bytes:
     """What such a computer is set to."""
-    host = host_profile(profile).host
+    host = load_host_profile(profile).host
     head = f"# Of SHARE, for {profile}: docs/deployment.md"
-    return "".join(f"{line}\n" for line in (head, *checks.lines(host.cpu_governor, host.usbfs_mb))).encode()
+    return "".join(
+        f"{line}\n" for line in (head, *checks.tmpfiles_lines(host.cpu_governor, host.usbfs_mb))
+    ).encode()
 
 
 def _content(source: Path | bytes) -> bytes:

@@ -11,7 +11,7 @@ from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
 
 from share.errors import DataError, WireError
 from share.files.writing import atomic_write
-from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.recipe import SessionRecipe
 from share.types import F64, Keyframe
 from share.wire.codec import decode, encode
 from share.wire.messages import Hello, Message
@@ -37,7 +37,7 @@ def save(made: KeyframeSet, path: Path) -> None:
     atomic_write(path, msgspec.msgpack.encode(_Set(made.size, agents)))
 
 
-def load(path: Path, recipe: Recipe, every: Spacing) -> KeyframeSet:
+def load(path: Path, recipe: SessionRecipe, every: Spacing) -> KeyframeSet:
     """The set that was made of this recipe. Raises DataError where the file is damaged."""
     try:
         found = msgspec.msgpack.decode(path.read_bytes(), type=_Set)

@@ -12,37 +12,37 @@ from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
 from keyframe_views import views
 
 from share.geometry import se3
-from share.lab.emulate.preparation import Prepared, keep_room, prepare
-from share.lab.emulate.progress import Progress, silent
-from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.preparation import PreparedSession, keep_room, prepare_session
+from share.lab.emulate.progress import Progress, no_progress
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.recordings import true_trajectory
 from share.lab.emulate.stage import Actor
-from share.lab.emulate.takes import truth_of
-from share.protocol.agent_ledger import Chain
+from share.protocol.agent_ledger import KeyframeChain
 from share.recordings.trajectory import Trajectory
-from share.types import F64, I64, Candidate, Keyframe, View
+from share.types import F64, I64, Keyframe, KeyframeCandidate, View
 from share.wire.messages import Hello
 
 _POINTS = 500  # of a view, as a tracker's
 _STREAM = 81  # of random numbers; the emulator has others
 
 
-def make(recipe: Recipe, every: Spacing, workers: int, progress: Progress) -> KeyframeSet:
+def make(recipe: SessionRecipe, every: Spacing, workers: int, progress: Progress) -> KeyframeSet:
     """Nothing is kept. Raises UsageError, ConfigError or DataError for what cannot be made, RenderError
     where nothing can be drawn."""
     with TemporaryDirectory(prefix="keyframes-") as folder:
-        prepared = prepare(recipe, Path(folder) / "room", progress)
+        prepared = prepare_session(recipe, Path(folder) / "room", progress)
         keep_room(prepared, progress)
         chosen = [_chosen(actor, every) for actor in prepared.stage.actors]
         seen = views(prepared.stage, [at for at, _ in chosen], recipe.images, workers, progress)
     return _set(recipe, every, prepared, [truth for _, truth in chosen], seen)
 
 
-def make_unseen(recipe: Recipe, every: Spacing) -> KeyframeSet:
+def make_unseen(recipe: SessionRecipe, every: Spacing) -> KeyframeSet:
     """The same but for the views: as many bytes, of nothing; depths drawn from 1 to 8 m, one a view. Takes
     seconds, and no OpenGL."""
     rng = np.random.default_rng((recipe.seed, _STREAM))
     with TemporaryDirectory(prefix="keyframes-") as folder:
-        prepared = prepare(recipe, Path(folder) / "room", silent)
+        prepared = prepare_session(recipe, Path(folder) / "room", no_progress)
     truths = [_chosen(actor, every)[1] for actor in prepared.stage.actors]
     uv = rng.uniform(-0.5, 0.5, (_POINTS, 2)).astype(np.float32)
     rays, nothing = np.c_[uv, np.ones(len(uv), np.float32)], np.zeros((len(uv), 32), np.uint8)
@@ -51,7 +51,11 @@ def make_unseen(recipe: Recipe, every: Spacing) -> KeyframeSet:
 
 
 def _set(
-    recipe: Recipe, every: Spacing, prepared: Prepared, truths: list[Trajectory], seen: list[list[View]]
+    recipe: SessionRecipe,
+    every: Spacing,
+    prepared: PreparedSession,
+    truths: list[Trajectory],
+    seen: list[list[View]],
 ) -> KeyframeSet:
     agents = {
         actor.name: _agent(actor, truth, shown, np.random.default_rng((recipe.seed, _STREAM, k)))
@@ -67,7 +71,7 @@ def spaced(truth: Trajectory, every: Spacing) -> I64:
     for k in range(1, len(truth.stamps_ns)):
         last = chosen[-1]
         T = se3.inverse(truth.T[last]) @ truth.T[k]
-        far = np.linalg.norm(T[:3, 3]) >= every.metres or se3.angle(T) >= every.radians
+        far = np.linalg.norm(T[:3, 3]) >= every.metres or se3.rotation_angle(T) >= every.radians
         if far and truth.stamps_ns[k] - truth.stamps_ns[last] >= every.seconds * 1e9:
             chosen.append(k)
     return np.array(chosen, np.int64)
@@ -75,7 +79,7 @@ def spaced(truth: Trajectory, every: Spacing) -> I64:
 
 def _chosen(actor: Actor, every: Spacing) -> tuple[I64, Trajectory]:
     """Which of its pictures (N,), and their true poses."""
-    known, truth = truth_of(actor)
+    known, truth = true_trajectory(actor)
     at = spaced(truth, every)
     return known[at], Trajectory(truth.stamps_ns[at], truth.T[at])
 
@@ -91,11 +95,11 @@ def _chained(T_odom_body: F64, cov: F64, stamps_ns: I64, seen: list[View]) -> tu
     """Candidates that are all sent. As a tracker has it, up is the z of odom."""
     before = np.concatenate([np.eye(4)[None], T_odom_body[:-1]])
     T_last_body = se3.orthonormal(se3.inverse(before) @ T_odom_body)
-    chain, out = Chain(), []
+    chain, out = KeyframeChain(), []
     for T, T_last, step, stamp_ns, view in zip(
         T_odom_body, T_last_body, cov, stamps_ns.tolist(), seen, strict=True
     ):
-        candidate = Candidate(T, T_last, step, T[2, :3], Drift().tilt_rad, view)
+        candidate = KeyframeCandidate(T, T_last, step, T[2, :3], Drift().tilt_rad, view)
         chain.extend(candidate)
-        out.append(chain.keyframe(candidate, stamp_ns))
+        out.append(chain.make_keyframe(candidate, stamp_ns))
     return tuple(out)

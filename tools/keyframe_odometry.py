@@ -41,14 +41,14 @@ def odometry(T_world_body: F64, stamps_ns: I64, rng: np.random.Generator, drift:
     """
     T_step = se3.inverse(T_world_body[:-1]) @ T_world_body[1:]
     way = np.append(0.0, np.linalg.norm(T_step[:, :3, 3], axis=1))
-    turn = np.append(0.0, se3.angle(T_step))
+    turn = np.append(0.0, se3.rotation_angle(T_step))
     keeps = np.append(0.0, np.exp(-np.diff(stamps_ns) * 1e-9 / drift.tilt_s))  # share of the tilt that stays
     sigma_m = np.hypot(drift.step_m, drift.per_metre * way)
     sigma_yaw = drift.yaw_rad + drift.per_radian * turn
     sigma_tilt = drift.tilt_rad * np.sqrt(np.where(keeps > 0, 2 * (1 - keeps), 1.0))
     R_odom_body = _turned(T_world_body[:, :3, :3], sigma_yaw, keeps, drift.tilt_rad, rng)
     shift = sigma_m[:, None] * rng.standard_normal((len(way), 3))
-    poses = [se3.compose(R_odom_body[0], np.zeros(3))]
+    poses = [se3.from_rt(R_odom_body[0], np.zeros(3))]
     for k, D in enumerate(T_step, start=1):
         reached = poses[-1] @ D
         rotation = se3.so3_log(reached[:3, :3].T @ R_odom_body[k])

@@ -19,8 +19,8 @@ from keyframe_file import load, save
 from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
 
 from share.files.writing import writable_dir
-from share.lab.emulate.progress import Progress, silent
-from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.progress import Progress, no_progress
+from share.lab.emulate.recipe import SessionRecipe
 from share.lab.emulate.session import default_cache
 
 __all__ = ["AgentKeyframes", "KeyframeSet", "Spacing", "keyframe_set", "place"]
@@ -28,18 +28,18 @@ __all__ = ["AgentKeyframes", "KeyframeSet", "Spacing", "keyframe_set", "place"]
 VERSION = 3  # raise it when any keyframe changes (ORB, depth, odometry); emulation has its own in the recipe
 
 
-def place(recipe: Recipe, every: Spacing, cache: Path | None = None) -> Path:
+def place(recipe: SessionRecipe, every: Spacing, cache: Path | None = None) -> Path:
     """The file of this set in `cache` (default: the user's), whether or not it is there."""
     folder = (default_cache() if cache is None else cache) / "keyframes"
     return folder / f"{recipe.digest}-{every}-v{VERSION}.msgpack"
 
 
 def keyframe_set(
-    recipe: Recipe,
+    recipe: SessionRecipe,
     every: Spacing | None = None,
     cache: Path | None = None,
     workers: int = 1,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
 ) -> KeyframeSet:
     """The set of this recipe, made with `workers` processes if it is not there yet; to open one takes no
     OpenGL. Raises UsageError, ConfigError or DataError for what cannot be made, DataError for a damaged file,

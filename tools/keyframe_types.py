@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from share.errors import UsageError
-from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.recipe import SessionRecipe
 from share.types import F64, Keyframe
 from share.wire.messages import Hello
 
@@ -43,7 +43,7 @@ class KeyframeSet:
     """agents: by name. size: of the room (x, y, z) m, as `share.lab.emulate.world.scenes.corridor.twins`
     wants it."""
 
-    recipe: Recipe
+    recipe: SessionRecipe
     every: Spacing
     size: tuple[float, float, float]
     agents: dict[str, AgentKeyframes]

@@ -19,7 +19,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import msgspec  # noqa: E402
 import numpy as np  # noqa: E402

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 from share.config import Config
-from share.mapping.graph.solver import Solver
+from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
-from share.mapping.steps import Finding
+from share.mapping.steps import MapEvent
 from share.types import Keyframe
 from share.wire.messages import Hello
 
@@ -19,25 +19,25 @@ class TimedMap:
     """A mapper and a solver that take turns. ms: CPU times of each kind of step."""
 
     def __init__(self, config: Config) -> None:
-        self.mapper, self.solver = Mapper(config), Solver(config.graph)
+        self.mapper, self.solver = Mapper(config), PoseGraphSolver(config.graph)
         self.ms: dict[str, list[float]] = defaultdict(list)
-        self.findings: list[Finding] = []
+        self.findings: list[MapEvent] = []
 
     def join(self, agent: str, hello: Hello) -> None:
-        self.mapper.join(agent, hello)
+        self.mapper.add_run(agent, hello)
 
     def add(self, agent: str, keyframe: Keyframe) -> None:
-        before = self.mapper.taken_out
-        found, ms = _timed(self.mapper.add, agent, keyframe)
-        self.ms["add" if self.mapper.taken_out == before else "thin"].append(ms)
+        before = self.mapper.removed_count
+        found, ms = _timed(self.mapper.add_keyframe, agent, keyframe)
+        self.ms["add" if self.mapper.removed_count == before else "thin"].append(ms)
         self.findings += found
 
     def look(self) -> None:
         """All that waits to be looked up."""
-        while (step := self.mapper.next_look()) is not None:
+        while (step := self.mapper.next_lookup()) is not None:
             result, ms = _timed(step.run)
             self.ms["query" if step.kind == "place" else step.kind].append(ms)
-            found, ms = _timed(self.mapper.done, step, result, ms)
+            found, ms = _timed(self.mapper.finish_step, step, result, ms)
             if step.kind == "verify":
                 self.ms["judge"].append(ms)
             self.findings += found
@@ -50,7 +50,7 @@ class TimedMap:
                 return
             result, ms = _timed(step.run, self.solver)
             self.ms["solve"].append(ms)
-            found, ms = _timed(self.mapper.done, step, result, ms)
+            found, ms = _timed(self.mapper.finish_step, step, result, ms)
             self.ms["apply"].append(ms + tell_ms)
             self.findings += found
 

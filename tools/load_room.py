@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from keyframe_set import KeyframeSet, keyframe_set
 
-from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.recipe import SessionRecipe
 
-RECIPE = Recipe("warehouse", ("ar1=walk:", "ar2=walk:", "robot=robot:"), 60.0, seed=301)
+RECIPE = SessionRecipe("warehouse", ("ar1=walk:", "ar2=walk:", "robot=robot:"), 60.0, seed=301)
 
 
 def room() -> KeyframeSet:

@@ -24,7 +24,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 import onnx  # noqa: E402
@@ -35,7 +35,7 @@ from torch.nn import functional  # noqa: E402
 
 from share.errors import DataError, UsageError  # noqa: E402
 from share.lab.train.labels import read_labels  # noqa: E402
-from share.odometry.error_model.features import PICTURE_PX  # noqa: E402
+from share.odometry.error_model.inputs import PICTURE_PX  # noqa: E402
 from share.types import F32, U8  # noqa: E402
 
 _STAGES = ((6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2), (6, 96, 3, 1), (6, 160, 3, 2), (6, 320, 1, 1))

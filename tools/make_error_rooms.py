@@ -16,13 +16,13 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
-from share.cli.progress import Stages  # noqa: E402
-from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.cli.terminal import Stages  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
 from share.lab.emulate.sensor.effects import Effects  # noqa: E402
 from share.lab.emulate.session import make_session  # noqa: E402
 
@@ -32,7 +32,7 @@ _PROFILE = {"": "d435i:640x480@15"}
 _PREFIX = {"stereo": "room", "rgbd": "rgbd"}
 
 
-def recipe(number: int, seconds: float, sensors: str) -> Recipe:
+def recipe(number: int, seconds: float, sensors: str) -> SessionRecipe:
     """Of room `number`."""
     rng = np.random.default_rng((_SEED, number))
     first = f"ann={_person(rng)}"
@@ -42,7 +42,7 @@ def recipe(number: int, seconds: float, sensors: str) -> Recipe:
         Effects(lamp_every_s=round(lamps[0], 1), lamp_stops=round(lamps[1], 1)) if number % 2 else Effects()
     )
     scene, seed = _SCENES[number % len(_SCENES)], 10_000 + number
-    return Recipe(scene, (first, second), seconds, seed, None, {"": sensors}, _PROFILE, effects)
+    return SessionRecipe(scene, (first, second), seconds, seed, None, {"": sensors}, _PROFILE, effects)
 
 
 def _person(rng: np.random.Generator) -> str:
@@ -63,7 +63,7 @@ def main() -> int:
 
 
 def make(options: argparse.Namespace) -> None:
-    for number in range(options.first, options.first + options.rooms):
+    for number in range(options.first, options.first + options.room_log_sigma):
         out = options.out / f"{_PREFIX[options.sensors]}-{number:03d}"
         if not out.exists():
             print(out.name, file=sys.stderr, flush=True)

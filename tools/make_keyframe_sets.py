@@ -18,15 +18,15 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 from keyframe_set import KeyframeSet, Spacing, keyframe_set, place  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
-from share.cli.progress import Stages  # noqa: E402
+from share.cli.terminal import Stages  # noqa: E402
 from share.errors import UsageError  # noqa: E402
-from share.lab.emulate.preparation import furnish  # noqa: E402
-from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.lab.emulate.preparation import make_layout  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
 
 NAME = "make_keyframe_sets"
 
@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
 
 def make_all(options: argparse.Namespace) -> None:
     """Raises ShareError, but not for a seed with which the room has no place for the motions."""
-    furnish(recipe_of(options, options.seeds[0]))  # a scene that there is not is no matter of seeds
+    make_layout(recipe_of(options, options.seeds[0]))  # a scene that there is not is no matter of seeds
     if sum(one(options, seed) for seed in options.seeds) == 0:
         raise UsageError("no set could be made; see above")
 
@@ -77,10 +77,10 @@ def one(options: argparse.Namespace, seed: int) -> bool:
     return True
 
 
-def recipe_of(options: argparse.Namespace, seed: int) -> Recipe:
+def recipe_of(options: argparse.Namespace, seed: int) -> SessionRecipe:
     profiles = {"": options.profile} if options.profile else {}
     motions = tuple(options.motion)
-    return Recipe(options.scene, motions, options.seconds, seed, options.size, profiles=profiles)
+    return SessionRecipe(options.scene, motions, options.seconds, seed, options.size, profiles=profiles)
 
 
 def line(made: KeyframeSet) -> str:

@@ -16,12 +16,12 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 from tool_main import exit_code  # noqa: E402
 
-from share.cli.progress import Stages  # noqa: E402
-from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.cli.terminal import Stages  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
 from share.lab.emulate.session import make_session  # noqa: E402
 
 _DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "motion"
@@ -30,15 +30,15 @@ _V1, _MH, _HALL = (11.0, 9.0, 4.5), (14.0, 11.0, 5.0), (10.0, 8.0, 4.0)  # m; th
 Size = tuple[float, float, float]
 
 
-def recipes(data: Path) -> dict[str, Recipe]:
+def recipes(data: Path) -> dict[str, SessionRecipe]:
     """By name. data: the folder that has euroc/NAME and tumvi/NAME."""
 
-    def real(scene: str, seed: int, profile: str, size: Size, **who: str) -> Recipe:
+    def real(scene: str, seed: int, profile: str, size: Size, **who: str) -> SessionRecipe:
         motions = [f"{name}={path.partition('/')[0]}:{data / path}" for name, path in who.items()]
-        return Recipe(scene, tuple(motions), 60.0, seed, size, profiles={"": profile})
+        return SessionRecipe(scene, tuple(motions), 60.0, seed, size, profiles={"": profile})
 
     paper = {
-        f"{scene}-{k}": Recipe(scene, (f"paper:{k}",), 60.0, 50 + k, profiles={"": _D435I})
+        f"{scene}-{k}": SessionRecipe(scene, (f"paper:{k}",), 60.0, 50 + k, profiles={"": _D435I})
         for k in range(1, 6)
         for scene in ("warehouse", "firestation")
     }
@@ -68,7 +68,7 @@ def main() -> int:
     return exit_code("make_sessions", lambda: make(chosen, options))
 
 
-def make(chosen: dict[str, Recipe], options: argparse.Namespace) -> None:
+def make(chosen: dict[str, SessionRecipe], options: argparse.Namespace) -> None:
     for name, recipe in chosen.items():
         missing = [folder for folder in recorded(recipe) if not folder.is_dir()]
         if options.list:
@@ -81,7 +81,7 @@ def make(chosen: dict[str, Recipe], options: argparse.Namespace) -> None:
                 make_session(recipe, options.out / name, options.workers, stages)
 
 
-def recorded(recipe: Recipe) -> list[Path]:
+def recorded(recipe: SessionRecipe) -> list[Path]:
     """The recordings that its agents move by."""
     specs = (motion.partition("=")[2].partition(":") for motion in recipe.motions)
     return [Path(folder) for kind, _, folder in specs if kind in ("euroc", "tumvi")]

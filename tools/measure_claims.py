@@ -7,8 +7,8 @@ Takes what `make_keyframe_sets.py` takes; sets that it has not made are left out
 `LIES`. ATE is that of the other agents: `final` of their keyframes as the edge has them at the end, `causal`
 of each keyframe as its agent was placed when it was made; one alignment (SE3) for all of a map. In brackets:
 against the same session where the last agent is honest, and against the session without it. A run is a room
-of `share.lab.evaluate.world` by policy covins-g, so everything is sent and every loop that is verified is
-judged. """
+of `share.lab.evaluate.simulation` by policy covins-g, so everything is sent and every loop that is verified
+is judged. """
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from keyframe_set import AgentKeyframes, KeyframeSet, Spacing, keyframe_set, place  # noqa: E402
@@ -36,10 +36,10 @@ from share.config import Config  # noqa: E402
 from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.se3 import umeyama  # noqa: E402
-from share.lab.evaluate.world import Costs, Seen, World  # noqa: E402
+from share.lab.evaluate.simulation import ProcessingDelays, Simulation, TrackedFrame  # noqa: E402
 from share.mapping.mapper import Mapper  # noqa: E402
-from share.net.channel import NETWORKS  # noqa: E402
-from share.types import F64, Candidate, View  # noqa: E402
+from share.net.channel import NETWORK_PRESETS  # noqa: E402
+from share.types import F64, KeyframeCandidate, View  # noqa: E402
 from share.wire.messages import Hello, peer_id  # noqa: E402
 
 
@@ -100,9 +100,9 @@ class Outcome:
     said: list[str] = field(default_factory=list)
 
 
-def told(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[Seen]]]:
+def told(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[TrackedFrame]]]:
     """What each of its runs says of itself and sees; its frames are its keyframes."""
-    first_ns, runs = agent.keyframes[0].stamp_ns, list[list[Seen]]()
+    first_ns, runs = agent.keyframes[0].stamp_ns, list[list[TrackedFrame]]()
     began_ns, T_odom = first_ns, np.eye(4)
     for n, keyframe in enumerate(agent.keyframes):
         since_s = (keyframe.stamp_ns - first_ns) * 1e-9
@@ -120,13 +120,13 @@ def told(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[Seen]]]:
         if now.depth != 1:
             view = View(view.uv, view.points * np.float32(now.depth), view.descriptors)
         cov = keyframe.cov / now.sure**2
-        candidate = Candidate(T_odom, T, cov, keyframe.up, keyframe.up_sigma, view, begins)
-        runs[-1].append(Seen(keyframe.stamp_ns, T_odom, candidate=candidate))
+        candidate = KeyframeCandidate(T_odom, T, cov, keyframe.up, keyframe.up_sigma, view, begins)
+        runs[-1].append(TrackedFrame(keyframe.stamp_ns, T_odom, candidate=candidate))
     hello = _turned(agent.hello, lie.turn_deg)
     return [(replace(hello, run_id=(hello.run_id + n) % 2**64), seen) for n, seen in enumerate(runs)]
 
 
-class _Room(World):
+class _Room(Simulation):
     """Who comes later, or goes earlier, is not heard before and after; it says nothing when it goes."""
 
     def __init__(self, spans_ns: Mapping[bytes, tuple[int, int]], *args: Any, **kwargs: Any) -> None:
@@ -141,12 +141,12 @@ class _Room(World):
 
 
 def _longer(T: F64, by: float) -> F64:
-    return se3.compose(T[:3, :3], by * T[:3, 3])
+    return se3.from_rt(T[:3, :3], by * T[:3, 3])
 
 
 def _turned(hello: Hello, degrees: float) -> Hello:
     rig, axis = hello.rig, np.array([1.0, 2.0, 2.0]) / 3
-    turn = se3.compose(se3.so3_exp(np.radians(degrees) * axis), np.zeros(3))
+    turn = se3.from_rt(se3.so3_exp(np.radians(degrees) * axis), np.zeros(3))
     return replace(hello, rig=replace(rig, T_body_cam0=se3.orthonormal(rig.T_body_cam0 @ turn)))
 
 
@@ -156,20 +156,24 @@ def played(made: KeyframeSet, lie: Lie | None, config: Config, seed: int = 0) ->
     agents = [run for name in honest for run in told(made.agents[name], Lie())]
     lies = [] if lie is None else told(made.agents[liar], lie)
     agents += lies
-    began_ns = min(seen[0].at_ns for _, seen in agents)
-    ends_ns = max(seen[-1].at_ns for _, seen in agents)
+    began_ns = min(seen[0].arrival_ns for _, seen in agents)
+    ends_ns = max(seen[-1].arrival_ns for _, seen in agents)
     records: list[dict[str, object]] = []
     mapper = RememberingMapper(config)
     members = [
-        (hello, iter([replace(s, at_ns=s.at_ns - began_ns) for s in seen]), NETWORKS["wifi5"])
+        (
+            hello,
+            iter([replace(s, arrival_ns=s.arrival_ns - began_ns) for s in seen]),
+            NETWORK_PRESETS["wifi5"],
+        )
         for hello, seen in agents
     ]
     spans_ns = {
-        peer_id(hello.run_id): (seen[0].at_ns - began_ns, seen[-1].at_ns - began_ns + 200_000_000)
+        peer_id(hello.run_id): (seen[0].arrival_ns - began_ns, seen[-1].arrival_ns - began_ns + 200_000_000)
         for hello, seen in lies
         if len(lies) > 1
     }
-    room = _Room(spans_ns, config, members, Costs(), seed, mapper=mapper, record=records.append)
+    room = _Room(spans_ns, config, members, ProcessingDelays(), seed, mapper=mapper, on_record=records.append)
     room.run((ends_ns - began_ns) * 1e-9 + 3.0)
     apart = [r for r in records if r["event"] in ("set apart", "disputed", "agrees again")]
     runs = mapper.runs
@@ -198,21 +202,21 @@ def _rmse_cm(groups: list[tuple[F64, F64]]) -> float:
 
 
 def _final(made: KeyframeSet, mapper: Mapper, honest: dict[str, str]) -> float:
-    found = mapper.poses()
+    found = mapper.current_poses()
     by_map: dict[str, list[tuple[F64, F64]]] = {}
-    for key, T, map_id in zip(found.keys, found.T_map_body, found.maps, strict=True):
+    for key, T, map_id in zip(found.keys, found.T_map_body, found.map_ids, strict=True):
         if key.agent in honest:
             true = made.agents[honest[key.agent]].T_world_body[key.id]
             by_map.setdefault(map_id, []).append((T[:3, 3], true[:3, 3]))
     return _rmse_cm([_stacked(pairs) for pairs in by_map.values()])
 
 
-def _causal(made: KeyframeSet, room: World, honest: Sequence[str], began_ns: int) -> float:
+def _causal(made: KeyframeSet, room: Simulation, honest: Sequence[str], began_ns: int) -> float:
     by_map: dict[str, list[tuple[F64, F64]]] = {}
     for name in honest:
         agent = made.agents[name]
         at = {k.stamp_ns - began_ns: n for n, k in enumerate(agent.keyframes)}
-        for frame in room.placed[name]:
+        for frame in room.localised[name]:
             assert frame.T_map_odom is not None
             p = (frame.T_map_odom @ frame.T_odom_body)[:3, 3]
             true = agent.T_world_body[at[frame.stamp_ns], :3, 3]
@@ -224,9 +228,9 @@ def _stacked(pairs: list[tuple[F64, F64]]) -> tuple[F64, F64]:
     return np.array([p for p, _ in pairs]), np.array([q for _, q in pairs])
 
 
-def _together(room: World, honest: Sequence[str]) -> float | None:
+def _together(room: Simulation, honest: Sequence[str]) -> float | None:
     """Since when all of them are told of one map, s; None: they are not."""
-    frames = sorted((f.stamp_ns, name, f.map_id) for name in honest for f in room.placed[name])
+    frames = sorted((f.stamp_ns, name, f.map_id) for name in honest for f in room.localised[name])
     now: dict[str, str | None] = {}
     since: float | None = None
     for stamp_ns, name, map_id in frames:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
@@ -33,12 +33,12 @@ from share.errors import UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.interpolation import interpolate  # noqa: E402
 from share.mapping.recognition.index import PlaceIndex  # noqa: E402
-from share.mapping.recognition.verification import Sight, Verified, verify  # noqa: E402
-from share.odometry.error_model.features import SHAPES, picture  # noqa: E402
-from share.odometry.error_model.network import SHIPPED, open_network, read_model  # noqa: E402
+from share.mapping.recognition.verification import CameraView, Verification, verify  # noqa: E402
+from share.odometry.error_model.inputs import INPUT_SHAPES, input_picture  # noqa: E402
+from share.odometry.error_model.network import SHIPPED_MODEL, open_network, read_model  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402
 from share.recordings.trajectory import Trajectory  # noqa: E402
-from share.runtime.pipeline import frames_of  # noqa: E402
+from share.runtime.pipeline import read_frames  # noqa: E402
 from share.runtime.source import open_source  # noqa: E402
 from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64, U8  # noqa: E402
@@ -58,14 +58,14 @@ class Seen:
 
     agent: str
     T: F64
-    sight: Sight
+    sight: CameraView
     picture: U8
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("sessions", nargs="+", type=Path)
-    parser.add_argument("--model", type=Path, default=SHIPPED)
+    parser.add_argument("--model", type=Path, default=SHIPPED_MODEL)
     options = parser.parse_args()
     return exit_code("measure_embedding", lambda: measure(options))
 
@@ -75,7 +75,7 @@ def measure(options: argparse.Namespace) -> None:
     for folder in options.sessions:
         seen = [one for agent in read_session(folder).agents for one in keyframes(folder, agent)]
         pictures = np.array([one.picture for one in seen])
-        inputs = {name: np.zeros((len(seen), *shape), np.float32) for name, shape in SHAPES.items()}
+        inputs = {name: np.zeros((len(seen), *shape), np.float32) for name, shape in INPUT_SHAPES.items()}
         embedding = network.run(["embedding"], {**inputs, "picture": pictures})[0]
         tiny = np.array([cv2.resize(p, (16, 12), interpolation=cv2.INTER_AREA) for p in pictures], float)
         report(folder.name, seen, {"embedding": embedding, "tiny pictures": tiny.reshape(len(tiny), -1)})
@@ -108,10 +108,10 @@ def keyframes(folder: Path, agent: str) -> Iterator[Seen]:
     known, T = interpolate(truth.stamps_ns, truth.T, stamps)
     at = spaced(Trajectory(stamps[known], T), EVERY)
     wanted = dict(zip(stamps[known][at].tolist(), T[at], strict=True))
-    for frame in frames_of(source, Config(), SequencerCounters()):
+    for frame in read_frames(source, Config(), SequencerCounters()):
         if (pose := wanted.get(frame.stamp_ns)) is not None:
-            sight = Sight(make_view(frame, rig), rig.cam0.focal, rig.T_body_cam0, pose[2, :3])
-            yield Seen(agent, pose, sight, picture(frame.image0))
+            sight = CameraView(make_view(frame, rig), rig.cam0.focal, rig.T_body_cam0, pose[2, :3])
+            yield Seen(agent, pose, sight, input_picture(frame.image0))
 
 
 def truths(seen: list[Seen]) -> np.ndarray:
@@ -121,18 +121,20 @@ def truths(seen: list[Seen]) -> np.ndarray:
     for q, one in enumerate(seen):
         apart = se3.inverse(cameras[q]) @ cameras
         near = (np.linalg.norm(apart[:, :3, 3], axis=1) < NEAR_M) & (
-            se3.angle(apart) < math.radians(NEAR_DEG)
+            se3.rotation_angle(apart) < math.radians(NEAR_DEG)
         )
         for c in np.flatnonzero(near):
             if seen[c].agent != one.agent:
                 found = verify(one.sight, seen[c].sight, config)
-                out[q, c] = isinstance(found, Verified) and right(seen[c].T, one.T, found.T_c_q)
+                out[q, c] = isinstance(found, Verification) and right(seen[c].T, one.T, found.T_c_q)
     return out
 
 
 def right(T_c: F64, T_q: F64, T_c_q: F64) -> bool:
     wrong = se3.inverse(se3.inverse(T_c) @ T_q) @ T_c_q
-    return bool(np.linalg.norm(wrong[:3, 3]) < RIGHT_M and se3.angle(wrong) < math.radians(RIGHT_DEG))
+    return bool(
+        np.linalg.norm(wrong[:3, 3]) < RIGHT_M and se3.rotation_angle(wrong) < math.radians(RIGHT_DEG)
+    )
 
 
 def by_words(seen: list[Seen], own: np.ndarray) -> F64:

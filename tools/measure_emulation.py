@@ -21,27 +21,27 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.geometry.absolute_pose import Terms, absolute_pose  # noqa: E402
+from share.geometry.absolute_pose import RansacOptions, absolute_pose  # noqa: E402
 from share.geometry.camera import Camera, rays  # noqa: E402
-from share.lab.emulate.motion.plan import Plan, plan  # noqa: E402
+from share.lab.emulate.motion.motion_plan import MotionPlan, plan_motions  # noqa: E402
 from share.lab.emulate.motion.recorded import RecordedPath  # noqa: E402
 from share.lab.emulate.world.layout import Layout  # noqa: E402
-from share.lab.emulate.world.rays import Scene  # noqa: E402
-from share.lab.emulate.world.scenes import layout  # noqa: E402
-from share.lab.mocap.factors import preintegrate, sampled  # noqa: E402
+from share.lab.emulate.world.ray_casting import RayCaster  # noqa: E402
+from share.lab.emulate.world.scenes import make_scene_layout  # noqa: E402
+from share.lab.mocap.factors import interpolate_samples, preintegrate  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402
+from share.runtime.offline_tracking import track, trajectory_accuracy  # noqa: E402
 from share.runtime.source import Source, open_source  # noqa: E402
-from share.runtime.track import accuracy, track  # noqa: E402
 from share.sensors.measurement import CAM0, IMU  # noqa: E402
 from share.types import F64, I64, U8, ImuBatch  # noqa: E402
 from share.vision.corners import detect  # noqa: E402
-from share.vision.optical_flow import follow  # noqa: E402
+from share.vision.optical_flow import track_points  # noqa: E402
 
 Row = dict[str, Any]
 CORNERS, SPACING_PX, INLIER_PX, LEAST = 200, 16, 1.0, 20
@@ -67,11 +67,14 @@ def of_session(name: str) -> Row:
     return row
 
 
-def replanned(about: Row) -> Plan:
+def replanned(about: Row) -> MotionPlan:
     """The plan that a session was made by: seeds make it the same."""
     size = about["size"] and tuple(about["size"])
-    return plan(
-        about["motions"], layout(about["scene"], about["seed"], size), about["seconds"], about["seed"]
+    return plan_motions(
+        about["motions"],
+        make_scene_layout(about["scene"], about["seed"], size),
+        about["seconds"],
+        about["seed"],
     )
 
 
@@ -79,7 +82,7 @@ def tracked(source: Source) -> Row:
     """By cameras alone, causal."""
     run = track(source, Config(), lambda _: None)
     whole = run.report["stretches"] == 1
-    found = accuracy(run, source.truth()) if whole else None
+    found = trajectory_accuracy(run, source.truth()) if whole else None
     return {
         "track_frames": run.report["frames"],
         "track_tracked": run.report["tracked"],
@@ -113,10 +116,10 @@ def turned(source: Source, path: RecordedPath, room: Layout) -> Row:
     return {
         "intervals": len(start),
         "of": len(stamps) - 1,
-        "turn_median_mrad": _mrad(np.median(se3.angle(felt))),
-        "turn_most_mrad": _mrad(se3.angle(felt).max()),
+        "turn_median_mrad": _mrad(np.median(se3.rotation_angle(felt))),
+        "turn_most_mrad": _mrad(se3.rotation_angle(felt).max()),
         "turn_imu_images_mrad": _mrad(_rms_between(felt, seen)),
-        "turn_imu_images_median_mrad": _mrad(np.median(se3.angle(felt.swapaxes(1, 2) @ seen))),
+        "turn_imu_images_median_mrad": _mrad(np.median(se3.rotation_angle(felt.swapaxes(1, 2) @ seen))),
         "turn_imu_path_mrad": _mrad(_rms_between(felt, gone)),
         "turn_images_path_mrad": _mrad(_rms_between(seen, gone)),
         "shift_ms": _round(best_shift_ms(imu, path, start, end, seen)),
@@ -138,7 +141,7 @@ def seen_turns(source: Source, path: RecordedPath, room: Layout) -> tuple[I64, I
     """Stamps (N,) of a picture and the next, and R_body_next (N, 3, 3) by the pictures alone: depth is the
     room's where the path says the first camera was, and PnP finds the second. Left out: pairs with a hole
     (lost frames, a gap in the truth) between them, and with too few matches."""
-    rig, scene = source.rig, scene_of([p.shape.mesh.triangles for p in room.everything])
+    rig, scene = source.rig, scene_of([p.shape.mesh.triangles for p in room.all_pieces])
     R = rig.T_body_cam0[:3, :3]
     longest = 1.5 * float(np.median(np.diff(I64_of(stamp for stamp, _ in pictures(source)))))
     found = []
@@ -153,24 +156,24 @@ def seen_turns(source: Source, path: RecordedPath, room: Layout) -> tuple[I64, I
     return I64_of(start), I64_of(end), np.array(turns)
 
 
-def relative(before: U8, after: U8, camera: Camera, scene: Scene, T_world_cam: F64) -> F64 | None:
+def relative(before: U8, after: U8, camera: Camera, scene: RayCaster, T_world_cam: F64) -> F64 | None:
     """T_after_before (4, 4) of a camera, None where the pictures do not tell."""
     px = detect(before, np.zeros((0, 2), np.float32), CORNERS, SPACING_PX)
-    there, ok = follow(before, after, px, px)
+    there, ok = track_points(before, after, px, px)
     ways = rays(camera.normalise(px[ok].astype(float)))
     points, hit = first_hits(scene, T_world_cam, ways)
     points = se3.transform(se3.inverse(T_world_cam), points)[hit]
     if len(points) < LEAST:
         return None
     uv = camera.normalise(there[ok][hit].astype(float))
-    T, inliers = absolute_pose(points, uv, camera.focal, Terms(INLIER_PX, seed=0))
+    T, inliers = absolute_pose(points, uv, camera.focal, RansacOptions(INLIER_PX, seed=0))
     return T if inliers.sum() >= LEAST else None
 
 
 def felt_turns(imu: ImuBatch, path: RecordedPath, start: I64, end: I64) -> F64:
     """R_start_end (N, 3, 3) of the body by the gyro, less the bias of the fit."""
     nodes = ImuBatch(path.fit.stamps_ns, path.fit.gyro_bias, path.fit.accel_bias)
-    bias = sampled(nodes, start, nodes.gyro)
+    bias = interpolate_samples(nodes, start, nodes.gyro)
     return preintegrate(imu, start, end, bias, 0 * bias).dR
 
 
@@ -191,14 +194,14 @@ def best_shift_ms(imu: ImuBatch, path: RecordedPath, start: I64, end: I64, seen:
     return float(SHIFTS_MS[k] + (SHIFTS_MS[1] - SHIFTS_MS[0]) * 0.5 * (a - c) / (a - 2 * b + c))
 
 
-def scene_of(triangles: list[Any]) -> Scene:
-    return Scene(np.concatenate(triangles).astype(np.float32))
+def scene_of(triangles: list[Any]) -> RayCaster:
+    return RayCaster(np.concatenate(triangles).astype(np.float32))
 
 
-def first_hits(scene: Scene, T_world_cam: F64, ways: F64) -> tuple[F64, np.ndarray]:
+def first_hits(scene: RayCaster, T_world_cam: F64, ways: F64) -> tuple[F64, np.ndarray]:
     """World points (N, 3) that rays through ways (N, 3) of a camera meet first, and which meet any (N,)."""
     start = np.tile(T_world_cam[:3, 3], (len(ways), 1)).astype(np.float32)
-    which, weights = scene.first(start, (ways @ T_world_cam[:3, :3].T).astype(np.float32))
+    which, weights = scene.first_hits(start, (ways @ T_world_cam[:3, :3].T).astype(np.float32))
     points: F64 = np.einsum("nc,ncd->nd", weights.astype(float), scene.triangles[which].astype(float))
     return points, which >= 0
 
@@ -209,7 +212,7 @@ def I64_of(values: Any) -> I64:
 
 def _rms_between(a: F64, b: F64) -> float:
     """Of the angle between rotations (N, 3, 3), rad."""
-    return _rms(se3.angle(a.swapaxes(1, 2) @ b))
+    return _rms(se3.rotation_angle(a.swapaxes(1, 2) @ b))
 
 
 def _rms(values: Any) -> float:

@@ -4,7 +4,7 @@
 
 Faults are those of `share/lab/emulate/faults.py`, each on its own, on the first S seconds. Of each:
 `ate_cm`: causal poses, SE3 alignment, of the longest stretch (`scored`: its share of all frames that have a
-pose); `ratio`: to the clean run. `states`: % of the frames. `lost_s`, `stretches`: as in report.json.
+pose); `ratio`: to the clean run. `states`: % of the frames. `lost_s`, `segments`: as in report.json.
 `wrong_ok`: % of all frames that are told OK though the position is off by more than 5 cm and more than three
 sigmas of what is told; from the first pose of the stretch on, turned about the vertical so that it is right,
 or, where the tracker did not know what is up, turned in full. `changed`: % of cam0's pixels that differ from
@@ -26,7 +26,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
@@ -35,14 +35,14 @@ from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Rig  # noqa: E402
 from share.geometry.interpolation import interpolate  # noqa: E402
-from share.lab.emulate.faults import FAULTS, Arriving, Fault, apply  # noqa: E402
+from share.lab.emulate.faults import FAULTS, Fault, MeasurementFilter, apply_fault  # noqa: E402
 from share.lab.evaluate.statistics import deviations  # noqa: E402
 from share.metrics.ate import ate  # noqa: E402
 from share.metrics.frame_log import RunLog  # noqa: E402
-from share.odometry.result import TrackResult  # noqa: E402
-from share.odometry.tracker import InertialTracker  # noqa: E402
+from share.odometry.inertial_tracker import InertialTracker  # noqa: E402
+from share.odometry.track_result import TrackResult  # noqa: E402
 from share.recordings.trajectory import Trajectory  # noqa: E402
-from share.runtime.pipeline import frames_of  # noqa: E402
+from share.runtime.pipeline import read_frames  # noqa: E402
 from share.runtime.source import Source, open_source  # noqa: E402
 from share.sensors.measurement import Measurement  # noqa: E402
 from share.sensors.sequencer import SequencerCounters  # noqa: E402
@@ -91,7 +91,7 @@ class Run:
 
     def stretches(self) -> list[Run]:
         """The frames with a pose, by unbroken stretch; without those that have less than three."""
-        number = np.cumsum([r.new_stretch for r in self.results])
+        number = np.cumsum([r.new_segment for r in self.results])
         told = np.array([r.T_odom_body is not None for r in self.results])
         chosen = [np.flatnonzero(told & (number == n)) for n in np.unique(number)]
         return [
@@ -125,7 +125,7 @@ def case(name: str, seconds: float) -> Case:
     truth = whole.truth()
     if truth is None:
         raise UsageError(f"{name}: has no truth to compare with")
-    return Case(name, source, list(frames_of(source, Config(), SequencerCounters())), truth)
+    return Case(name, source, list(read_frames(source, Config(), SequencerCounters())), truth)
 
 
 def rows_of(case: Case, faults: Sequence[str]) -> Iterator[Row]:
@@ -146,10 +146,10 @@ def measured(case: Case, fault: Fault) -> Row:
 def faulty(case: Case, fault: Fault) -> list[Frame]:
     """What comes out of the sequencer, with the fault."""
     frames = case.frames
-    if fault.arriving is not None:
-        door = Door(case.source, fault.arriving)
-        frames = list(frames_of(door, Config(), SequencerCounters()))
-    return apply(fault, frames, case.source.rig, case.truth)
+    if fault.change_measurements is not None:
+        door = Door(case.source, fault.change_measurements)
+        frames = list(read_frames(door, Config(), SequencerCounters()))
+    return apply_fault(fault, frames, case.source.rig, case.truth)
 
 
 def tracked(rig: Rig, frames: list[Frame]) -> Run:
@@ -159,11 +159,11 @@ def tracked(rig: Rig, frames: list[Frame]) -> Run:
     for frame in frames:
         began = time.process_time()
         result = tracker.track(frame)
-        if result.keyframe:
-            tracker.keyframe(frame)
-            tracker.settle()
-        log.add(frame.stamp_ns, 1e3 * (time.process_time() - began), result.state, result.keyframe)
-        log.stretches += result.new_stretch
+        if result.keyframe_ready:
+            tracker.make_keyframe(frame)
+            tracker.finish_keyframe()
+        log.add(frame.stamp_ns, 1e3 * (time.process_time() - began), result.state, result.keyframe_ready)
+        log.segments += result.new_segment
         results.append(result)
     return Run(frames, results, log)
 
@@ -223,7 +223,7 @@ def changed(clean: list[Frame], frames: list[Frame]) -> float:
 class Door(Source):
     """A recording to whose measurements something happens before they are put in order."""
 
-    def __init__(self, source: Source, arriving: Arriving) -> None:
+    def __init__(self, source: Source, arriving: MeasurementFilter) -> None:
         self.name, self.rig, self.notes = source.name, source.rig, source.notes
         self._source, self._arriving = source, arriving
 

@@ -25,7 +25,7 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from keyframe_set import KeyframeSet, Spacing, keyframe_set, place  # noqa: E402
@@ -36,10 +36,10 @@ from tool_main import exit_code  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.mapping.graph.solver import Solver  # noqa: E402
-from share.mapping.loops import Key  # noqa: E402
+from share.mapping.graph.solver import PoseGraphSolver  # noqa: E402
+from share.mapping.loops import KeyframeKey  # noqa: E402
 from share.mapping.mapper import Mapper  # noqa: E402
-from share.mapping.steps import Solve  # noqa: E402
+from share.mapping.steps import SolveStep  # noqa: E402
 from share.metrics.ate import joint_ate  # noqa: E402
 from share.plain_data import from_mapping, to_mapping  # noqa: E402
 from share.types import F64  # noqa: E402
@@ -80,18 +80,18 @@ class Replay:
     """One set, keyframe by keyframe."""
 
     def __init__(self, made: KeyframeSet, config: Config) -> None:
-        self._made, self._mapper, self._solver = made, Mapper(config), Solver(config.graph)
+        self._made, self._mapper, self._solver = made, Mapper(config), PoseGraphSolver(config.graph)
         self._seen: dict[str, int] = {}  # how many keyframes of an agent have come
         self._before = 0.0
         self.run = Run(made.recipe.seed)
         for name, agent in made.agents.items():
-            self._mapper.join(name, agent.hello)
+            self._mapper.add_run(name, agent.hello)
         for x, y in itertools.combinations(made.agents, 2):
             self.run.pairs[f"{x} {y}"] = Pair()
 
     def whole(self) -> Run:
         for t, name, k in order(self._made):
-            self._mapper.add(name, self._made.agents[name].keyframes[k])
+            self._mapper.add_keyframe(name, self._made.agents[name].keyframes[k])
             self._seen[name] = k + 1
             self._work()
             self._look(t, name)
@@ -101,15 +101,16 @@ class Replay:
 
     def _work(self) -> None:
         mapper = self._mapper
-        while (step := mapper.next_look() or mapper.next_solve()) is not None:
-            result = step.run(self._solver) if isinstance(step, Solve) else step.run()
-            mapper.done(step, result, 0.0)
+        while (step := mapper.next_lookup() or mapper.next_solve()) is not None:
+            result = step.run(self._solver) if isinstance(step, SolveStep) else step.run()
+            mapper.finish_step(step, result, 0.0)
 
     def _look(self, t: float, name: str) -> None:
         """How all pairs are now; what was wrong stays so until the next keyframe."""
-        found = self._mapper.poses()
+        found = self._mapper.current_poses()
         at = {
-            key: (T, map_id) for key, T, map_id in zip(found.keys, found.T_map_body, found.maps, strict=True)
+            key: (T, map_id)
+            for key, T, map_id in zip(found.keys, found.T_map_body, found.map_ids, strict=True)
         }
         for pair_name, pair in self.run.pairs.items():
             x, y = pair_name.split(" ")
@@ -125,33 +126,33 @@ class Replay:
             if pair.end == "wrong" and pair.wrong is None:
                 pair.wrong = t
 
-    def _newest(self, name: str) -> Key:
-        return Key(name, self._made.agents[name].keyframes[self._seen[name] - 1].id)
+    def _newest(self, name: str) -> KeyframeKey:
+        return KeyframeKey(name, self._made.agents[name].keyframes[self._seen[name] - 1].id)
 
     def _common(self, name: str, other: str) -> bool:
         """Whether the newest keyframe shows what the other agent has seen."""
         T = self._made.agents[name].T_world_body[self._seen[name] - 1]
         step = se3.inverse(T) @ self._made.agents[other].T_world_body[: self._seen[other]]
         near = np.linalg.norm(step[:, :3, 3], axis=1) < SEEN_M
-        return bool((near & (se3.angle(step) < SEEN_RAD)).any())
+        return bool((near & (se3.rotation_angle(step) < SEEN_RAD)).any())
 
     def _state(self, a: tuple[F64, str], b: tuple[F64, str], x: str, y: str) -> str:
         if a[1] != b[1]:
             return "apart"
         true_x, true_y = (self._made.agents[name].T_world_body[self._seen[name] - 1] for name in (x, y))
         off = se3.inverse(se3.inverse(true_x) @ true_y) @ se3.inverse(a[0]) @ b[0]
-        wrong = np.linalg.norm(off[:3, 3]) > WRONG_M or se3.angle(off) > WRONG_RAD
+        wrong = np.linalg.norm(off[:3, 3]) > WRONG_M or se3.rotation_angle(off) > WRONG_RAD
         return "wrong" if wrong else "right"
 
     def _end(self) -> None:
-        found = self._mapper.poses()
-        largest = max(set(found.maps), key=found.maps.count)
+        found = self._mapper.current_poses()
+        largest = max(set(found.map_ids), key=found.map_ids.count)
         pairs = {}
         for name, agent in self._made.agents.items():
-            number = {Key(name, keyframe.id): k for k, keyframe in enumerate(agent.keyframes)}
+            number = {KeyframeKey(name, keyframe.id): k for k, keyframe in enumerate(agent.keyframes)}
             inside = [
                 (number[key], T)
-                for key, T, map_id in zip(found.keys, found.T_map_body, found.maps, strict=True)
+                for key, T, map_id in zip(found.keys, found.T_map_body, found.map_ids, strict=True)
                 if key in number and map_id == largest
             ]
             if inside:

@@ -22,9 +22,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from share import children, startup
+from share import child_processes, startup
 
-startup.prepare()
+startup.prepare_process()
 
 from load_process import cpu_s, rss_mb, worker_of  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
@@ -89,7 +89,7 @@ def carry(agents: int, seconds: float, config: Path | None) -> Row:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=children.environment(),
+            env=child_processes.child_environment(),
         ) as generator:
             used = _watch(generator, front, status)
             told, _ = generator.communicate("\n")
@@ -109,7 +109,10 @@ def edge(folder: Path, config: Path | None) -> Iterator[tuple[subprocess.Popen[s
     command += ["--map", folder / "map.sqlite", "--out", folder / "out"]
     command += [] if config is None else ["--config", config]
     front = subprocess.Popen(
-        [str(word) for word in command], stderr=subprocess.PIPE, text=True, env=children.environment()
+        [str(word) for word in command],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=child_processes.child_environment(),
     )
     try:
         assert front.stderr is not None

@@ -23,7 +23,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from load_map import TimedMap  # noqa: E402
@@ -34,7 +34,7 @@ from tool_main import exit_code  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.files.writing import atomic_write, writable_dir  # noqa: E402
-from share.mapping.changes import KeepKeyframe, KeepRun  # noqa: E402
+from share.mapping.map_changes import SaveKeyframe, SaveRun  # noqa: E402
 from share.store.map_store import MapStore  # noqa: E402
 from share.types import Keyframe  # noqa: E402
 
@@ -131,17 +131,17 @@ def hour(limit_s: float, every: int, most: int) -> Iterator[Row]:
         for name, keyframe, walker in everybody(3):
             if keyframe is None:
                 timed.join(name, walker.hello)
-                store.write([KeepRun(name, walker.hello)])
+                store.write([SaveRun(name, walker.hello)])
                 continue
             timed.add(name, keyframe)
             if count % every == 0:
                 timed.look()
             if count % (3 * every) == 0:
                 timed.solve()
-            store.write([KeepKeyframe(name, keyframe), *timed.mapper.take_changes()])
+            store.write([SaveKeyframe(name, keyframe), *timed.mapper.take_changes()])
             count += 1
             if count % 45 == 0:  # 5 s
-                store.write([timed.mapper.poses()])
+                store.write([timed.mapper.current_poses()])
             if count % _SAMPLE == 0:
                 yield _state(timed, count, Path(folder))
             if count >= _HOUR_S * RATE_HZ * 3 or time.monotonic() - began > limit_s:

@@ -14,14 +14,14 @@ import time
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
 from share.config import ControlConfig  # noqa: E402
 from share.geometry.camera import Camera  # noqa: E402
-from share.geometry.se3 import compose, exp, so3_exp  # noqa: E402
-from share.scheduling.overlap import Frustum, Seen, ious, volumes  # noqa: E402
+from share.geometry.se3 import exp, from_rt, so3_exp  # noqa: E402
+from share.scheduling.overlap import Frustum, SampledFrustum, ious, overlap_volumes  # noqa: E402
 from share.types import F64  # noqa: E402
 
 SIDE_M = 8.0
@@ -35,7 +35,7 @@ def views(rng: np.random.Generator, count: int) -> F64:
     turn[:, 2] = rng.uniform(-math.pi, math.pi, count)
     nod = np.column_stack([rng.normal(0, 0.1, count), rng.normal(0, 0.2, count), np.zeros(count)])
     place = np.column_stack([rng.uniform(0, SIDE_M, (count, 2)), rng.choice([0.3, 1.6], count)])
-    return compose(so3_exp(turn) @ so3_exp(nod) @ LOOK, place)
+    return from_rt(so3_exp(turn) @ so3_exp(nod) @ LOOK, place)
 
 
 def pairs(rng: np.random.Generator) -> list[tuple[F64, F64]]:
@@ -44,10 +44,10 @@ def pairs(rng: np.random.Generator) -> list[tuple[F64, F64]]:
     return anyhow + [(a, a @ move) for a, move in zip(views(rng, 150), moves, strict=True)]
 
 
-def seen(interval_m: float) -> tuple[Seen, Seen]:
+def seen(interval_m: float) -> tuple[SampledFrustum, SampledFrustum]:
     config = ControlConfig()
-    a, b = (Frustum.of(camera, config.near_m, config.far_m) for camera in CAMERAS)
-    return Seen(a, interval_m), Seen(b, interval_m)
+    a, b = (Frustum.from_camera(camera, config.near_m, config.far_m) for camera in CAMERAS)
+    return SampledFrustum(a, interval_m), SampledFrustum(b, interval_m)
 
 
 def all_ious(interval_m: float, them: list[tuple[F64, F64]]) -> F64:
@@ -60,7 +60,7 @@ def cpu_ms(interval_m: float, rooms: list[F64]) -> F64:
     (a, b), out = seen(interval_m), []
     for room in rooms:
         begun = time.process_time_ns()
-        volumes(a, room[0], b, room[1:])
+        overlap_volumes(a, room[0], b, room[1:])
         out.append((time.process_time_ns() - begun) / 1e6)
     return np.array(out)
 

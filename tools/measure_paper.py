@@ -22,7 +22,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from measure_emulation import first_hits, scene_of  # noqa: E402
@@ -30,17 +30,17 @@ from measure_emulation import first_hits, scene_of  # noqa: E402
 from share.errors import ShareError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Camera, rays  # noqa: E402
-from share.lab.emulate.motion.avatars import Avatar, shapes  # noqa: E402
-from share.lab.emulate.motion.crowd import length_of, present_of  # noqa: E402
+from share.lab.emulate.motion.avatars import Avatar, avatar_shapes  # noqa: E402
+from share.lab.emulate.motion.crowd import path_length, settled_path  # noqa: E402
 from share.lab.emulate.motion.floor import Floor  # noqa: E402
+from share.lab.emulate.motion.motion_plan import PlannedAgent, plan_motions  # noqa: E402
 from share.lab.emulate.motion.paper import LENGTHS_M, NAMES, SECONDS  # noqa: E402
-from share.lab.emulate.motion.plan import Agent, plan  # noqa: E402
-from share.lab.emulate.motion.together import nearest  # noqa: E402
+from share.lab.emulate.motion.planned_motion import min_distance  # noqa: E402
 from share.lab.emulate.world.layout import Layout  # noqa: E402
 from share.lab.emulate.world.occupancy import Occupancy  # noqa: E402
-from share.lab.emulate.world.rays import Scene  # noqa: E402
-from share.lab.emulate.world.scenes import layout  # noqa: E402
-from share.sensors.profile import profile  # noqa: E402
+from share.lab.emulate.world.ray_casting import RayCaster  # noqa: E402
+from share.lab.emulate.world.scenes import make_scene_layout  # noqa: E402
+from share.sensors.profile import load_profile  # noqa: E402
 from share.types import F64, I64  # noqa: E402
 
 Row = dict[str, Any]
@@ -86,28 +86,28 @@ def measured(
 
 def of_plan(scene: str, number: int, seed: int) -> Row:
     """One experiment planned in one room."""
-    room = layout(scene, seed, SIZE)
+    room = make_scene_layout(scene, seed, SIZE)
     began = time.process_time()
     try:
-        agents = plan([f"paper:{number}"], room, SECONDS, seed).agents
+        agents = plan_motions([f"paper:{number}"], room, SECONDS, seed).agents
     except ShareError as error:
         return {"failed": str(error)}
     cpu_s = time.process_time() - began
     wanted = LENGTHS_M[number]
-    off = [100 * (length_of(a.path) / length - 1) for a, length in zip(agents, wanted, strict=True)]
+    off = [100 * (path_length(a.path) / length - 1) for a, length in zip(agents, wanted, strict=True)]
     return {"length_off": [_round(x) for x in off], "cpu_s": _round(cpu_s)} | distances(room, agents)
 
 
-def distances(room: Layout, agents: Sequence[Agent]) -> Row:
+def distances(room: Layout, agents: Sequence[PlannedAgent]) -> Row:
     """Least ones, m: of each from things at body height, of each head from anything, between agents."""
-    xyz1, xyz2, xyz3 = xyz = [present_of(a.path, 0.0).xyz for a in agents]
-    free = Occupancy.of(room)
+    xyz1, xyz2, xyz3 = xyz = [settled_path(a.path, 0.0).xyz for a in agents]
+    free = Occupancy.from_layout(room)
     floor = fine_floor(free)
     return {
-        "floor_m": [_round(floor.at(p[:, :2]).min()) for p in xyz],
+        "floor_m": [_round(floor.clearance_at(p[:, :2]).min()) for p in xyz],
         "head_m": [_round(free.clearance(p).min()) for p in xyz],
-        "people_m": _round(nearest(xyz1, xyz2)),
-        "robot_m": _round(min(nearest(xyz1, xyz3), nearest(xyz2, xyz3))),
+        "people_m": _round(min_distance(xyz1, xyz2)),
+        "robot_m": _round(min(min_distance(xyz1, xyz3), min_distance(xyz2, xyz3))),
     }
 
 
@@ -140,12 +140,12 @@ def summary_of_plans(rows: list[Row]) -> Row:
 
 def of_sight(scene: str, number: int, seed: int) -> Row:
     """What share of user1's pictures has user2, or the robot, in it; how large they are where they are."""
-    planned = plan([f"paper:{number}"], layout(scene, seed, SIZE), SECONDS, seed)
+    planned = plan_motions([f"paper:{number}"], make_scene_layout(scene, seed, SIZE), SECONDS, seed)
     me, *others = planned.agents
     stamps = np.arange(me.path.start_ns, me.path.end_ns + 1, round(LOOKS_S * 1e9))
     poses = me.path.poses(stamps)  # a simulated body has its camera's axes, and is within centimetres of it
-    ways = grid(profile("d435i").rig().cam0)
-    room = scene_of([piece.shape.mesh.triangles for piece in planned.layout.everything])
+    ways = grid(load_profile("d435i").rig().cam0)
+    room = scene_of([piece.shape.mesh.triangles for piece in planned.layout.all_pieces])
     walls = [depths(room, T, ways) for T in poses]
     row: Row = {"looks": len(stamps)}
     anyone = np.zeros(len(stamps), bool)
@@ -165,19 +165,21 @@ def grid(camera: Camera) -> F64:
     return rays(camera.normalise(np.column_stack([x.ravel(), y.ravel()]).astype(float)))
 
 
-def bodies(agent: Agent, stamps: I64) -> Iterator[Scene]:
+def bodies(agent: PlannedAgent, stamps: I64) -> Iterator[RayCaster]:
     """What there is of an agent at each time."""
-    parts = [shape.mesh.triangles.astype(float) for shape in shapes(agent.look, agent.path, (0, 9))]
-    for T in Avatar(agent.look, agent.path).parts(stamps):
+    parts = [
+        shape.mesh.triangles.astype(float) for shape in avatar_shapes(agent.body_kind, agent.path, (0, 9))
+    ]
+    for T in Avatar(agent.body_kind, agent.path).part_poses(stamps):
         yield scene_of([se3.transform(T_part, part) for T_part, part in zip(T, parts, strict=True)])
 
 
-def area(T_world_cam: F64, body: Scene, ways: F64, wall: F64) -> int:
+def area(T_world_cam: F64, body: RayCaster, ways: F64, wall: F64) -> int:
     """Pixels of the body that nothing in the room hides."""
     return int((depths(body, T_world_cam, ways) < wall).sum()) * GRID_PX**2
 
 
-def depths(scene: Scene, T_world_cam: F64, ways: F64) -> F64:
+def depths(scene: RayCaster, T_world_cam: F64, ways: F64) -> F64:
     """Depth (N,) m of what rays through ways (N, 3) of a camera meet first, infinite where nothing is."""
     points, hit = first_hits(scene, T_world_cam, ways)
     return np.where(hit, se3.transform(se3.inverse(T_world_cam), points)[:, 2], np.inf)

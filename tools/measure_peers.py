@@ -16,17 +16,17 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import vio_options  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 from vio_kept import code_version  # noqa: E402
 
-from share.cli.compare import pythons  # noqa: E402
+from share.cli.compare_trackers import peer_interpreters  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.files.writing import atomic_write, writable_dir  # noqa: E402
-from share.lab.emulate.session import cached_session  # noqa: E402
-from share.lab.evaluate.peer_comparison import contenders, rows  # noqa: E402
+from share.lab.emulate.session import make_cached_session  # noqa: E402
+from share.lab.evaluate.peer_comparison import tracker_entries, tracker_rows  # noqa: E402
 from share.lab.evaluate.peer_report import markdown  # noqa: E402
 from share.runtime.source import open_source  # noqa: E402
 
@@ -41,8 +41,10 @@ def main() -> int:
 
 def measure(options: argparse.Namespace) -> None:
     """All runs, seed by seed; then the table."""
-    (ours, *others), lacking = contenders(Config(), pythons(options.peer), options.vocabulary)
-    trackers = [replace(ours, about={**ours.about, "code": code_version()}), *others]
+    (ours, *others), lacking = tracker_entries(
+        Config(), peer_interpreters(options.peer), options.needs_vocabulary
+    )
+    trackers = [replace(ours, identity={**ours.identity, "code": code_version()}), *others]
     for text in lacking:
         print(f"left out: {text}", file=sys.stderr)
     chosen, found = vio_options.chosen(options), []
@@ -50,12 +52,12 @@ def measure(options: argparse.Namespace) -> None:
     for seed in options.seeds:
         for sequence in chosen:
             recipe = sequence.recipe(seed, options.data)
-            source = open_source(str(cached_session(recipe, options.cache, options.workers) / "agent"))
+            source = open_source(str(make_cached_session(recipe, options.cache, options.workers) / "agent"))
             for tracker in trackers:
                 name = f"{sequence.name}-{seed}"
                 if options.again:
                     (options.out / f"{name}-{tracker.key}.json").unlink(missing_ok=True)
-                found += rows(name, source, tracker, options.out, lambda done: None)
+                found += tracker_rows(name, source, tracker, options.out, lambda done: None)
     text = markdown(found, lacking)
     print(text)
     atomic_write(options.out / "table.md", text)

@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from tool_main import exit_code  # noqa: E402
@@ -36,15 +36,15 @@ from share.errors import DataError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.interpolation import associate, interpolate  # noqa: E402
 from share.geometry.se3 import umeyama  # noqa: E402
-from share.lab.emulate.motion.sources import EUROC, open_recording  # noqa: E402
-from share.lab.emulate.recipe import Recipe  # noqa: E402
-from share.lab.emulate.session import cached_session  # noqa: E402
+from share.lab.emulate.motion.recorded_sources import EUROC_OPTIONS, open_recorded_motion  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
+from share.lab.emulate.session import make_cached_session  # noqa: E402
 from share.metrics.ate import ate  # noqa: E402
 from share.recordings import tables  # noqa: E402
-from share.recordings.trajectory import Trajectory, poses  # noqa: E402
-from share.runtime.pipeline import frames_of, tracker_for  # noqa: E402
+from share.recordings.trajectory import Trajectory, make_poses  # noqa: E402
+from share.runtime.offline_tracking import TrackingOutput, track, trajectory_accuracy  # noqa: E402
+from share.runtime.pipeline import make_source_tracker, read_frames  # noqa: E402
 from share.runtime.source import Source, open_source  # noqa: E402
-from share.runtime.track import TrackRun, accuracy, track  # noqa: E402
 from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64, TrackState  # noqa: E402
 
@@ -151,13 +151,13 @@ def followed(folder: Path) -> list[Seen]:
     given = source.truth()
     if given is None:
         raise DataError(f"{folder}: has no truth")
-    T_mocap_imu = se3.inverse(open_recording(folder, EUROC).path.fit.T_body_mocap)
-    tracker, stretch, out = tracker_for(source, settings), 0, []
-    for frame in frames_of(source, settings, SequencerCounters()):
+    T_mocap_imu = se3.inverse(open_recorded_motion(folder, EUROC_OPTIONS).path.fit.T_body_mocap)
+    tracker, stretch, out = make_source_tracker(source, settings), 0, []
+    for frame in read_frames(source, settings, SequencerCounters()):
         result = tracker.track(frame)
-        if result.keyframe:
-            tracker.keyframe(frame)
-        stretch += result.new_stretch
+        if result.keyframe_ready:
+            tracker.make_keyframe(frame)
+        stretch += result.new_segment
         known, T = interpolate(*given, np.array([frame.stamp_ns]))
         if not known[0]:
             raise DataError(f"{folder}: no truth at {frame.stamp_ns}")
@@ -189,7 +189,7 @@ def kitchen(options: argparse.Namespace) -> Iterator[str]:
         first, last = map(int, frames.split(":"))
         source = open_source(str(folder), frames=slice(first, last))
         run = track(source, Config(), lambda _: None)
-        found = accuracy(run, source.truth()) if run.report["stretches"] == 1 else None
+        found = trajectory_accuracy(run, source.truth()) if run.report["stretches"] == 1 else None
         error = f"{100 * found.rmse:.2f}" if found else "broke"
         tracked = f"{run.report['tracked']} of {run.report['frames']}"
         yield f"| {frames} | {error} | {before} | {tracked} | {run.report['lost_s']:.1f} |"
@@ -211,11 +211,11 @@ def rooms(options: argparse.Namespace) -> Iterator[str]:
 
 def room_session(folder: Path, options: argparse.Namespace) -> Source:
     motion = f"ann=tumvi:{folder},start={options.start:g},seconds={options.seconds:g}"
-    session = cached_session(Recipe(SCENE, (motion,), options.seconds, SEED), options.cache)
+    session = make_cached_session(SessionRecipe(SCENE, (motion,), options.seconds, SEED), options.cache)
     return open_source(f"{session}/ann")
 
 
-def room_row(run: TrackRun, source: Source, raw: Trajectory) -> str:
+def room_row(run: TrackingOutput, source: Source, raw: Trajectory) -> str:
     report, truth = run.report, source.truth()
     assert truth is not None  # an emulated session has one
     if report["stretches"] == 1:
@@ -239,13 +239,13 @@ def on_mocap(estimate: Trajectory, raw: Trajectory) -> Trajectory:
         back = se3.inverse(umeyama(p + R @ arm, truth[:, :3, 3]))
         left = se3.transform(back, truth[:, :3, 3]) - p
         arm = (R.swapaxes(1, 2) @ left[..., None])[..., 0].mean(axis=0)
-    return Trajectory(estimate.stamps_ns, estimate.T @ se3.compose(np.eye(3), arm))
+    return Trajectory(estimate.stamps_ns, estimate.T @ se3.from_rt(np.eye(3), arm))
 
 
 def mocap(folder: Path) -> Trajectory:
     path = folder / "groundtruth.csv"
     stamps, values = tables.read_table(path, 8)
-    return Trajectory(stamps, poses(values[:, :3], values[:, [4, 5, 6, 3]], path))
+    return Trajectory(stamps, make_poses(values[:, :3], values[:, [4, 5, 6, 3]], path))
 
 
 def there(folder: Path) -> Path:

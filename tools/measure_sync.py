@@ -24,13 +24,13 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
-from share.devices.time_client import check  # noqa: E402
+from share.devices.time_client import query_servers  # noqa: E402
 from share.devices.time_server import TimeServer, TimeServerRun  # noqa: E402
-from share.net.udp import Host, StampedSocket, clock_precision  # noqa: E402
+from share.net.udp import HostPort, StampedSocket, clock_precision  # noqa: E402
 
 LEAST_S, THERE_S, BACK_S = 0.0005, 0.002, 0.001  # of the relay: at least, and more on average
 US = 1e3
@@ -48,9 +48,9 @@ class Round:
 
 @contextmanager
 def our_server() -> Iterator[int]:
-    with closing(StampedSocket.bound(Host(HERE, 0))) as link:
+    with closing(StampedSocket.bind(HostPort(HERE, 0))) as link:
         run = TimeServerRun(link, TimeServer(precision=clock_precision()), lambda text: None)
-        with in_thread(run.go, run.stop):
+        with in_thread(run.run, run.stop):
             yield link.port
 
 
@@ -109,7 +109,7 @@ def chronyd(*arguments: str) -> list[str]:
 
 
 def measure(port: int) -> Round:
-    (found,) = check([Host(HERE, port)], 8)
+    (found,) = query_servers([HostPort(HERE, port)], 8)
     assert found.estimate is not None, found.trouble
     asked = chronyd("-Q", "-t", "30", f"server {HERE} port {port} iburst minpoll -2 maxpoll -2")
     done = subprocess.run(asked, capture_output=True, text=True, check=True)

@@ -22,7 +22,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
@@ -30,10 +30,10 @@ from tool_main import exit_code, line  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.files.json_file import read_json_lines  # noqa: E402
 from share.geometry.interpolation import associate  # noqa: E402
-from share.lab.evaluate.play import score  # noqa: E402
-from share.lab.evaluate.scoring import began_s, traces  # noqa: E402
-from share.lab.evaluate.trial import RUN, SETTINGS, Trial, read_trial  # noqa: E402
-from share.metrics.ate import position_errors, spread  # noqa: E402
+from share.lab.evaluate.real_time import score_session  # noqa: E402
+from share.lab.evaluate.scoring import first_join_s, traces  # noqa: E402
+from share.lab.evaluate.trial import RUN_FILE, SETTINGS_FILE, Trial, read_trial  # noqa: E402
+from share.metrics.ate import error_statistics, position_errors  # noqa: E402
 from share.types import F64  # noqa: E402
 
 HEAD = ("agents", "runs", "N", "told, cm", "true, cm", "true / told", "within twice, %", "rank", "of runs")
@@ -75,10 +75,10 @@ def measure(options: argparse.Namespace) -> None:
 
 def told_and_true(trial: Trial) -> Iterator[Pairs]:
     """Of each agent in the largest map. Raises DataError on damaged files."""
-    found = score(trial.session, trial.folders)
+    found = score_session(trial.session, trial.folders)
     if found.joint is None:
         return
-    began = began_s(read_json_lines(trial.folder / "edge" / "events.jsonl"))
+    began = first_join_s(read_json_lines(trial.folder / "edge" / "events.jsonl"))
     first_ns = min(int(agent.truth.stamps_ns[0]) for agent in found.agents.values())
     for name, trace in traces(trial).items():
         estimate, truth = found.agents[name].map, found.agents[name].truth
@@ -93,9 +93,13 @@ def told_and_true(trial: Trial) -> Iterator[Pairs]:
 
 
 def _runs(top: Path) -> list[Path]:
-    found = [top] if (top / RUN).is_file() else sorted(path.parent for path in top.glob(f"runs/*/{RUN}"))
+    found = (
+        [top]
+        if (top / RUN_FILE).is_file()
+        else sorted(path.parent for path in top.glob(f"runs/*/{RUN_FILE}"))
+    )
     if not found:
-        raise UsageError(f"{top}: has no {RUN}, and no runs with one; give a folder by `share evaluate`")
+        raise UsageError(f"{top}: has no {RUN_FILE}, and no runs with one; give a folder by `share evaluate`")
     return found
 
 
@@ -103,11 +107,11 @@ def _setting(trial: Trial, name: str) -> str:
     import yaml
 
     if name == "policy":
-        return trial.terms.policy
-    value: Any = yaml.safe_load((trial.folder / SETTINGS).read_text())
+        return trial.options.policy
+    value: Any = yaml.safe_load((trial.folder / SETTINGS_FILE).read_text())
     for part in name.split("."):
         if not isinstance(value, dict) or part not in value:
-            raise UsageError(f"--by {name}: is not a setting in {trial.folder / SETTINGS}")
+            raise UsageError(f"--by {name}: is not a setting in {trial.folder / SETTINGS_FILE}")
         value = value[part]
     return str(value)
 
@@ -115,9 +119,17 @@ def _setting(trial: Trial, name: str) -> str:
 def _figures(of: list[Pairs]) -> list[str]:
     told, true = (np.concatenate([getattr(pairs, what) for pairs in of]) for what in ("told_cm", "true_cm"))
     runs = np.array(
-        [[spread(pairs.told_cm).rmse, spread(pairs.true_cm).rmse] for pairs in of if len(pairs.told_cm)]
+        [
+            [error_statistics(pairs.told_cm).rmse, error_statistics(pairs.true_cm).rmse]
+            for pairs in of
+            if len(pairs.told_cm)
+        ]
     )
-    cells = [f"{spread(told).rmse:.2f}", f"{spread(true).rmse:.2f}", f"{np.median(true / told):.2f}"]
+    cells = [
+        f"{error_statistics(told).rmse:.2f}",
+        f"{error_statistics(true).rmse:.2f}",
+        f"{np.median(true / told):.2f}",
+    ]
     cells += f"{100 * np.mean(true <= 2 * told):.0f}", f"{_rank(told, true):.2f}", f"{_rank(*runs.T):.2f}"
     return [str(len(runs)), str(len(told)), *cells]
 

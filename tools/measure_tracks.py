@@ -32,28 +32,28 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
-from share.columns import Columns  # noqa: E402
+from share.array_table import ArrayTable  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Camera, rays  # noqa: E402
-from share.lab.emulate.preparation import keep_room, prepare  # noqa: E402
-from share.lab.emulate.progress import silent  # noqa: E402
-from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.lab.emulate.preparation import keep_room, prepare_session  # noqa: E402
+from share.lab.emulate.progress import no_progress  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
 from share.lab.emulate.room_file import open_renderer  # noqa: E402
-from share.lab.emulate.sensor.effects import NONE, Effects  # noqa: E402
-from share.lab.emulate.session import cached_session  # noqa: E402
-from share.lab.emulate.types import Moment  # noqa: E402
-from share.odometry.state import State  # noqa: E402
-from share.odometry.tracker import InertialTracker  # noqa: E402
+from share.lab.emulate.sensor.effects import NO_EFFECTS, Effects  # noqa: E402
+from share.lab.emulate.session import make_cached_session  # noqa: E402
+from share.lab.emulate.types import SceneInstant  # noqa: E402
+from share.odometry.inertial_tracker import InertialTracker  # noqa: E402
+from share.odometry.state import FilterState  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402
-from share.runtime.pipeline import frames_of  # noqa: E402
+from share.runtime.pipeline import read_frames  # noqa: E402
 from share.runtime.source import open_source  # noqa: E402
 from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F32, F64, I64  # noqa: E402
@@ -85,14 +85,14 @@ def main() -> None:
 
 def own_sessions(seconds: float) -> Iterator[str]:
     """Pictures of the perfect device are kept as they are, others as JPEG."""
-    for effects, images in ((NONE, "png"), (Effects(), "jpeg")):
+    for effects, images in ((NO_EFFECTS, "png"), (Effects(), "jpeg")):
         for scene in ROOMS:
             for seed in SEEDS:
                 motion, profiles = ("a=walk:",), {"": PROFILE}
-                recipe = Recipe(
+                recipe = SessionRecipe(
                     scene, motion, seconds, seed, profiles=profiles, effects=effects, images=images
                 )
-                yield str(cached_session(recipe) / "a")
+                yield str(make_cached_session(recipe) / "a")
 
 
 def of_session(name: str, spent: list[float]) -> Row:
@@ -104,21 +104,21 @@ def of_session(name: str, spent: list[float]) -> Row:
         Tracks(source.rig.cam0),
     )
     align_ms = []
-    for frame in frames_of(source, Config(), SequencerCounters()):
+    for frame in read_frames(source, Config(), SequencerCounters()):
         spent.clear()
         result = tracker.track(frame)
         align_ms.append(sum(spent))
         tracks.see(frame.stamp_ns, tracker, room)
-        if result.keyframe:
-            tracker.keyframe(frame)
-            tracker.settle()
+        if result.keyframe_ready:
+            tracker.make_keyframe(frame)
+            tracker.finish_keyframe()
         tracks.begin(frame.stamp_ns, tracker, room)
     return {
         "session": name,
         "scene": room.recipe.scene,
         "motion": room.recipe.motions[0].partition(":")[0].split("=")[-1],
         "seed": room.recipe.seed,
-        "effects": "none" if room.recipe.effects == NONE else "device",
+        "effects": "none" if room.recipe.effects == NO_EFFECTS else "device",
         "frames": len(align_ms),
         "features": tracks.features,
         "align_ms": {"median": _round(np.median(align_ms)), "p99": _round(np.percentile(align_ms, 99))},
@@ -141,8 +141,8 @@ class TrueRoom:
         T_world_cam = truth.T @ source.rig.T_body_cam0
         self._T: dict[int, F64] = dict(zip(truth.stamps_ns.tolist(), T_world_cam, strict=True))
         with tempfile.TemporaryDirectory() as folder:
-            prepared = prepare(self.recipe, Path(folder) / "room", silent)
-            keep_room(prepared, silent)
+            prepared = prepare_session(self.recipe, Path(folder) / "room", no_progress)
+            keep_room(prepared, no_progress)
             self._renderer = open_renderer(prepared.stage.room)
 
     def T_world_cam(self, stamp_ns: int) -> F64:
@@ -151,20 +151,20 @@ class TrueRoom:
 
     def surface(self, stamp_ns: int, px: F32) -> tuple[F64, F64]:
         """Inverse depth (N,) 1/m of what px (N, 2) show, and the share (N,) of depth that patches span."""
-        depth = self._renderer.depth(self._camera, Moment(self.T_world_cam(stamp_ns)))
-        square = np.ones((2 * patches.HALF + 1,) * 2, np.uint8)
+        depth = self._renderer.depth(self._camera, SceneInstant(self.T_world_cam(stamp_ns)))
+        square = np.ones((2 * patches.HALF_SIZE + 1,) * 2, np.uint8)
         span = (cv2.dilate(depth, square) - cv2.erode(depth, square)) / depth
         inside = np.clip(px, 0, (self._camera.width - 1.001, self._camera.height - 1.001))  # or just beyond
         x, y = np.rint(inside).astype(int).T
         return one_surface(np.float32(1) / depth, inside), span[y, x].astype(np.float64)
 
 
-def recipe_of(about: Row) -> Recipe:
+def recipe_of(about: Row) -> SessionRecipe:
     """What a session says that it was made by."""
-    given = {f.name: about[f.name] for f in fields(Recipe)}
+    given = {f.name: about[f.name] for f in fields(SessionRecipe)}
     size = about["size"] and tuple(about["size"])
     effects = Effects(**about["effects"])
-    return Recipe(**given | {"motions": tuple(about["motions"]), "size": size, "effects": effects})
+    return SessionRecipe(**given | {"motions": tuple(about["motions"]), "size": size, "effects": effects})
 
 
 def one_surface(values: F32, px: F32) -> F64:
@@ -181,7 +181,7 @@ def one_surface(values: F32, px: F32) -> F64:
 
 
 @dataclass(frozen=True, eq=False)
-class Births(Columns):
+class Births(ArrayTable):
     """Of N features: number of the frame that saw them first, ray (N, 2) and inverse depth (N,) there, share
     of the depth (N,) that the patch spans."""
 
@@ -192,7 +192,7 @@ class Births(Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class Errors(Columns):
+class Errors(ArrayTable):
     """Of M sights: frames since the birth; edge as above; px off, and with depths of their own."""
 
     age: I64
@@ -218,27 +218,27 @@ class Tracks:
     def see(self, stamp_ns: int, tracker: InertialTracker, room: TrueRoom) -> None:
         """The frame just tracked."""
         self._T_world_cam.append(room.T_world_cam(stamp_ns))
-        if tracker.state is None or tracker.looks is None:
+        if tracker.state is None or tracker.appearance is None:
             self._number = {}  # who begins anew counts anew
             return
         known = self._known(tracker.state)
-        which = np.array([self._number[k] for k in tracker.state.ids[known].tolist()], np.int64)
-        self._sights.append((which, np.full(len(which), self._now), tracker.looks.px[known]))
+        which = np.array([self._number[k] for k in tracker.state.feature_ids[known].tolist()], np.int64)
+        self._sights.append((which, np.full(len(which), self._now), tracker.appearance.last_px[known]))
 
     def begin(self, stamp_ns: int, tracker: InertialTracker, room: TrueRoom) -> None:
         """Features that the frame just tracked has added."""
-        if tracker.state is None or tracker.looks is None:
+        if tracker.state is None or tracker.appearance is None:
             return
         new, first = ~self._known(tracker.state), self.features
-        self._number |= {k: first + i for i, k in enumerate(tracker.state.ids[new].tolist())}
+        self._number |= {k: first + i for i, k in enumerate(tracker.state.feature_ids[new].tolist())}
         if new.any():
-            surface = room.surface(stamp_ns, tracker.looks.px[new])
+            surface = room.surface(stamp_ns, tracker.appearance.last_px[new])
             self._births.append(Births(np.full(new.sum(), self._now), tracker.state.ray[new], *surface))
 
     def errors(self) -> Errors:
         """Of all sights."""
         which, frame, px = (np.concatenate(column) for column in zip(*self._sights, strict=True))
-        births = self._births[0].join(*self._births[1:])
+        births = self._births[0].concatenate(*self._births[1:])
         host = births.frame[which]
         T = np.array(self._T_world_cam)
         ways = Ways(self._camera, se3.inverse(T[frame]) @ T[host], births.ray[which])
@@ -250,8 +250,8 @@ class Tracks:
     def _now(self) -> int:
         return len(self._T_world_cam) - 1
 
-    def _known(self, state: State) -> NDArray[np.bool_]:
-        return np.array([k in self._number for k in state.ids.tolist()], bool)
+    def _known(self, state: FilterState) -> NDArray[np.bool_]:
+        return np.array([k in self._number for k in state.feature_ids.tolist()], bool)
 
 
 class Ways:
@@ -306,7 +306,7 @@ def watch_alignment() -> list[float]:
     align = patches.align
 
     @wraps(align)
-    def timed(*arguments: Any, **named: Any) -> patches.Found:
+    def timed(*arguments: Any, **named: Any) -> patches.AlignedPatches:
         began = time.process_time()
         found = align(*arguments, **named)
         spent.append(1e3 * (time.process_time() - began))

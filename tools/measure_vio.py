@@ -16,7 +16,7 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 import vio_options  # noqa: E402
@@ -29,7 +29,7 @@ from vio_table import Row, table  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.files.writing import atomic_write  # noqa: E402
-from share.lab.emulate.session import cached_session  # noqa: E402
+from share.lab.emulate.session import make_cached_session  # noqa: E402
 from share.runtime.source import open_source  # noqa: E402
 
 
@@ -63,7 +63,7 @@ def run(sequence: Sequence, seed: int, options: argparse.Namespace, code: str) -
     file = _file(options.out, sequence.name, seed)
     if not options.again and (known := kept(file, made_by)) is not None:
         return known
-    source = open_source(str(cached_session(recipe, options.cache, options.workers) / "agent"))
+    source = open_source(str(make_cached_session(recipe, options.cache, options.workers) / "agent"))
     told = follow(source, Config())
     found = series(source, told)
     row: Row = made_by | figures(source, told, found)

@@ -10,7 +10,7 @@ from places_data import Views
 
 from share.config import PlaceConfig
 from share.mapping.recognition.index import PlaceIndex
-from share.mapping.recognition.verification import Verified, verify
+from share.mapping.recognition.verification import Verification, verify
 from share.types import F64
 
 FALSE_M, FALSE_DEG = 0.25, 5.0
@@ -53,7 +53,7 @@ def _kind(views: Views, q: int) -> np.ndarray:
 def _try(views: Views, config: PlaceConfig, q: int, c: int, stands_for: float) -> tuple[float, ...]:
     true = bool(views.true(q)[c])
     found = verify(views.sights[q], views.sights[c], config)
-    if not isinstance(found, Verified):
+    if not isinstance(found, Verification):
         return true, False, False, 0, 0.0, stands_for
     right = _right(views.error(q, c, found.T_c_q))
     twin = not right and views.T_twin is not None and _right(views.error(q, c, found.T_c_q, twin=True))

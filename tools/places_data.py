@@ -10,9 +10,9 @@ import numpy as np
 from keyframe_set import KeyframeSet, Spacing, keyframe_set
 
 from share.geometry import se3
-from share.lab.emulate.recipe import Recipe
-from share.lab.emulate.world.scenes.corridor import twins
-from share.mapping.recognition.verification import Sight
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.world.scenes.corridor import twin_corridors
+from share.mapping.recognition.verification import CameraView
 from share.types import F64
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "place"))
@@ -21,9 +21,9 @@ from place_real import load
 
 STEREO, KITCHEN = "euroc_v1_01_keyframes", "redkitchen_0000_0499"
 _THREE = ("ar1=walk:", "ar2=walk:", "robot=robot:")
-WAREHOUSE = Recipe("warehouse", _THREE, 60.0, seed=301)
-FIRESTATION = Recipe("firestation", _THREE, 60.0, seed=301)
-TWINS = Recipe("corridor-twins", ("walk:", "walk:"), 40.0, seed=6)
+WAREHOUSE = SessionRecipe("warehouse", _THREE, 60.0, seed=301)
+FIRESTATION = SessionRecipe("firestation", _THREE, 60.0, seed=301)
+TWINS = SessionRecipe("corridor-twins", ("walk:", "walk:"), 40.0, seed=6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Views:
     takes the room's places to those that look alike, and back."""
 
     name: str
-    sights: list[Sight]
+    sights: list[CameraView]
     T_world_body: F64
     T_world_cam0: F64
     T_twin: F64 | None = None
@@ -41,7 +41,7 @@ class Views:
         """Distance [m] and angle [deg] (N,) of camera q, moved by T in the world, from every other."""
         own = self.T_world_cam0[q] if T is None else T @ self.T_world_cam0[q]
         rel = se3.inverse(own) @ self.T_world_cam0
-        return np.linalg.norm(rel[:, :3, 3], axis=1), np.degrees(se3.angle(rel))
+        return np.linalg.norm(rel[:, :3, 3], axis=1), np.degrees(se3.rotation_angle(rel))
 
     def true(self, q: int) -> np.ndarray:
         """Which views (N,) show the place of view q: nearer than 1 m and 30 degrees."""
@@ -56,7 +56,7 @@ class Views:
         if twin and self.T_twin is not None:
             own = self.T_twin @ own
         wrong = se3.inverse(se3.inverse(self.T_world_body[c]) @ own) @ T_c_q
-        return float(np.linalg.norm(wrong[:3, 3])), float(np.degrees(se3.angle(wrong)))
+        return float(np.linalg.norm(wrong[:3, 3])), float(np.degrees(se3.rotation_angle(wrong)))
 
 
 def real(folder: Path) -> list[Views]:
@@ -65,12 +65,12 @@ def real(folder: Path) -> list[Views]:
     return [Views("stereo", *stereo), Views("kitchen", *kitchen)]
 
 
-def emulated(recipe: Recipe, every: Spacing, step: int) -> Views:
+def emulated(recipe: SessionRecipe, every: Spacing, step: int) -> Views:
     """Every `step`-th keyframe of all agents of an emulated room. Raises as `keyframe_set`."""
     made = keyframe_set(recipe, every)
     agents = [(a, slice(None, None, step)) for a in made.agents.values()]
     sights = [
-        Sight(k.view, a.hello.rig.cam0.focal, a.hello.rig.T_body_cam0, k.up)
+        CameraView(k.view, a.hello.rig.cam0.focal, a.hello.rig.T_body_cam0, k.up)
         for a, some in agents
         for k in a.keyframes[some]
     ]
@@ -80,4 +80,4 @@ def emulated(recipe: Recipe, every: Spacing, step: int) -> Views:
 
 
 def _twin(made: KeyframeSet) -> F64 | None:
-    return twins(made.size)[2] if made.recipe.scene == "corridor-twins" else None
+    return twin_corridors(made.size)[2] if made.recipe.scene == "corridor-twins" else None

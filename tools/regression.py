@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
@@ -38,18 +38,18 @@ from share import __version__  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.errors import DataError, ShareError, UsageError  # noqa: E402
 from share.files.writing import atomic_write  # noqa: E402
-from share.lab.emulate.recipe import Recipe  # noqa: E402
-from share.lab.emulate.session import cached_session  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
+from share.lab.emulate.session import make_cached_session  # noqa: E402
 from share.lab.evaluate.campaign import (  # noqa: E402
-    go_through,
-    plan,
-    side_by_side,
+    plan_policies,
+    run_all,
+    worker_pool,
 )
-from share.lab.evaluate.figures import RunFigures  # noqa: E402
-from share.lab.evaluate.play import Terms  # noqa: E402
-from share.lab.evaluate.report import number  # noqa: E402
-from share.lab.evaluate.scoring import figures  # noqa: E402
-from share.lab.evaluate.statistics import MEASURES, policies  # noqa: E402
+from share.lab.evaluate.real_time import RunOptions  # noqa: E402
+from share.lab.evaluate.report import format_number  # noqa: E402
+from share.lab.evaluate.run_metrics import RunMetrics  # noqa: E402
+from share.lab.evaluate.scoring import run_metrics  # noqa: E402
+from share.lab.evaluate.statistics import MEASURES, policy_names  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402
 from share.runtime.machine import describe_machine  # noqa: E402
 
@@ -57,7 +57,7 @@ HISTORY = Path(__file__).resolve().parents[1] / "docs" / "results" / "regression
 _WHO = ("ar1=walk:", "ar2=walk:speed=1.2", "robot=robot:")
 _PROFILES = {"": "d435i:640x480@15"}
 SET = tuple(
-    Recipe(scene, _WHO, seconds=30.0, seed=seed, profiles=_PROFILES)
+    SessionRecipe(scene, _WHO, seconds=30.0, seed=seed, profiles=_PROFILES)
     for scene, seed in (("warehouse", 901), ("firestation", 902))
 )
 POLICIES, SEEDS = ("share", "covins-g"), (0, 1)
@@ -171,27 +171,27 @@ def wanted(lines: Sequence[Mapping[str, Any]]) -> Figures:
 
 def played(config: Config, options: argparse.Namespace) -> Figures:
     """Raises ShareError where a run fails."""
-    sessions = [read_session(cached_session(recipe, options.cache, options.workers)) for recipe in SET]
+    sessions = [read_session(make_cached_session(recipe, options.cache, options.workers)) for recipe in SET]
     with tempfile.TemporaryDirectory() as folder:
-        terms = Terms("", link="wifi5", virtual=True)
-        runs = plan(sessions, POLICIES, SEEDS, terms, Path(folder), config)
+        terms = RunOptions("", link="wifi5", virtual=True)
+        runs = plan_policies(sessions, POLICIES, SEEDS, terms, Path(folder), config)
         found = []
-        for _, came in go_through(runs, lambda n, now: None, side_by_side(options.workers)):
+        for _, came in run_all(runs, lambda n, now: None, worker_pool(options.workers)):
             if isinstance(came, ShareError):
                 raise came
-            found.append(figures(came))
+            found.append(run_metrics(came))
     return figures_of(found)
 
 
-def figures_of(runs: Sequence[RunFigures]) -> Figures:
+def figures_of(runs: Sequence[RunMetrics]) -> Figures:
     """Medians by name, `POLICY: MEASURE`: one run that ends amid a join should not be all there is to see. Of
     agents in one map the mean, in which one that does not come into it shows."""
     out = {f"{POLICIES[0]}: {_ODOMETRY}": _median(a.odom_ate_cm for run in runs for a in run.agents)}
-    for policy in policies(runs):
+    for policy in policy_names(runs):
         mine = [run for run in runs if run.conditions.policy == policy]
         for measure in (m for m in MEASURES if m.name in NOISE):
             summed = _mean if measure.name in MORE_IS_BETTER else _median
-            out[f"{policy}: {measure.name}"] = summed(measure.of(run) for run in mine)
+            out[f"{policy}: {measure.name}"] = summed(measure.value_of(run) for run in mine)
     return out
 
 
@@ -238,7 +238,8 @@ def by_chance(options: argparse.Namespace) -> None:
 def table(verdicts: Sequence[Verdict]) -> str:
     head = ("figure", "before", "now", "part", "noise", "")
     rows = [
-        [v.name, *(number(x) for x in (v.before, v.now, v.part)), f"± {v.noise:g}", v.says] for v in verdicts
+        [v.name, *(format_number(x) for x in (v.before, v.now, v.part)), f"± {v.noise:g}", v.says]
+        for v in verdicts
     ]
     return "\n".join(line(cells) for cells in (head, ["---"] * len(head), *rows))
 

@@ -8,18 +8,18 @@ from typing import Any
 
 from share.config import Config, PlaceConfig
 from share.mapping.mapper import Mapper
-from share.mapping.recognition.verification import Refusal, Sight, Verified
-from share.mapping.steps import Finding, Look, Step, Verify
+from share.mapping.recognition.verification import CameraView, Refusal, Verification
+from share.mapping.steps import LookupStep, MapEvent, Step, VerifyStep
 from share.wire.messages import Hello
 
-_seen: dict[tuple[bytes, bytes, PlaceConfig], Verified | Refusal] = {}
+_seen: dict[tuple[bytes, bytes, PlaceConfig], Verification | Refusal] = {}
 
 
-class _Remembered(Verify):
+class _Remembered(VerifyStep):
     """Its result hangs on both views alone."""
 
-    def run(self) -> Verified | Refusal:
-        key = _digest(self.sight), _digest(self.seen), self.config
+    def run(self) -> Verification | Refusal:
+        key = _digest(self.query_view), _digest(self.candidate_view), self.config
         if key not in _seen:
             _seen[key] = super().run()
         return _seen[key]
@@ -34,19 +34,19 @@ class RememberingMapper(Mapper):
         self._doubts: dict[frozenset[str], float] = {}  # the most ever
         self._were_apart: set[frozenset[str]] = set()  # ever
 
-    def join(self, agent: str, hello: Hello) -> None:
+    def add_run(self, agent: str, hello: Hello) -> None:
         self.runs[hello.name] = agent
-        super().join(agent, hello)
+        super().add_run(agent, hello)
 
-    def next_look(self) -> Look | None:
-        look = super().next_look()
-        if not isinstance(look, Verify):
+    def next_lookup(self) -> LookupStep | None:
+        look = super().next_lookup()
+        if not isinstance(look, VerifyStep):
             return look
-        return _Remembered(look.number, look.sight, look.candidate, look.seen, look.config)
+        return _Remembered(look.node_id, look.query_view, look.candidate_id, look.candidate_view, look.config)
 
-    def done(self, step: Step, result: Any, ms: float) -> list[Finding]:
-        findings = super().done(step, result, ms)
-        if isinstance(step, Verify):
+    def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
+        findings = super().finish_step(step, result, ms)
+        if isinstance(step, VerifyStep):
             self._note_standing()
         return findings
 
@@ -59,14 +59,14 @@ class RememberingMapper(Mapper):
         return any(pair <= set(honest) for pair in self._were_apart)
 
     def _note_standing(self) -> None:
-        for names, doubt in self._atlas.doubts().items():
+        for names, doubt in self._atlas.contradictions().items():
             pair = frozenset(names)
             self._doubts[pair] = max(doubt, self._doubts.get(pair, 0.0))
-            if self._atlas.are_apart(*names):
+            if self._atlas.are_separated(*names):
                 self._were_apart.add(pair)
 
 
-def _digest(sight: Sight) -> bytes:
+def _digest(sight: CameraView) -> bytes:
     view, made = sight.view, hashlib.blake2b(digest_size=16)
     for array in (view.uv, view.points, view.descriptors, sight.T_body_cam0, sight.up):
         made.update(array.tobytes())

@@ -24,7 +24,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from keyframe_set import AgentKeyframes, KeyframeSet  # noqa: E402
@@ -32,18 +32,18 @@ from load_room import room  # noqa: E402
 from measure_joins import configured  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
-from share.config import POLICIES, STREAMED, Config  # noqa: E402
+from share.config import POLICY_NAMES, STREAMED, Config  # noqa: E402
 from share.geometry.interpolation import Trajectory  # noqa: E402
 from share.geometry.se3 import transform, umeyama  # noqa: E402
-from share.lab.evaluate.modelled_mapper import ModelledMapper, Odds, Truth  # noqa: E402
-from share.lab.evaluate.world import Costs, Seen, World  # noqa: E402
+from share.lab.evaluate.modelled_mapper import GroundTruth, ModelledMapper, RecognitionModel  # noqa: E402
+from share.lab.evaluate.simulation import ProcessingDelays, Simulation, TrackedFrame  # noqa: E402
 from share.metrics.frame_log import summary as summarised  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402
-from share.net.emulated import Links  # noqa: E402
-from share.protocol.agent_events import Localised  # noqa: E402
-from share.types import F64, Candidate  # noqa: E402
+from share.net.emulated_link import LinkAssignment  # noqa: E402
+from share.protocol.agent_events import LocalisedPose  # noqa: E402
+from share.types import F64, KeyframeCandidate  # noqa: E402
 
-SIMULATED = [policy for policy in POLICIES if policy != STREAMED]  # its agents send raw frames
+SIMULATED = [policy for policy in POLICY_NAMES if policy != STREAMED]  # its agents send raw frames
 FRAME_NS = 33_333_333
 HEAD = ("policy", "agent", "latency ms", "frames ms", "corrected ms", "n", "sent", "Hz told", "QoE", "cm")
 
@@ -95,12 +95,12 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
     mapper = None
     if modelled:
         known = truth_of(made, config.control.near_m, config.control.far_m)
-        mapper = ModelledMapper(config, known, which(truth), Odds(), seed)
-    links = Links.parse(link)
+        mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
+    links = LinkAssignment.parse(link)
     links.check(made.agents)
-    networks = [links.network(agent.hello.name) for agent in who]
+    networks = [links.network_for(agent.hello.name) for agent in who]
     members = list(zip((a.hello for a in who), seen, networks, strict=True))
-    world = World(config, members, Costs(), seed, mapper)
+    world = Simulation(config, members, ProcessingDelays(), seed, mapper)
     world.run((last_ns - first_ns) / 1e9 + 2.0)
     report = world.edge.report(world.mapper.report())
     agents = {}
@@ -116,7 +116,7 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
             "rate_hz": own["rate_hz"],
             "qoe": mean(series["qoe"]),
         }
-    errors_cm = shared_errors(world.placed, truth)
+    errors_cm = shared_errors(world.localised, truth)
     for name, row in agents.items():
         row["error_cm"] = errors_cm.get(name, float("nan"))
     metres = sum(float(np.linalg.norm(np.diff(a.T_world_body[:, :3, 3], axis=0), axis=1).sum()) for a in who)
@@ -128,8 +128,8 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
         "joined": joined,
         "maps": len({own["map_id"] for own in report["agents"].values()}),
         "corrected_ms": summarised(late_ms).report(),
-        "busy": world.mapping_ns / world.now_ns,
-        "solving": world.solving_ns / world.now_ns,
+        "busy": world.mapper_busy_ns / world.now_ns,
+        "solving": world.solver_busy_ns / world.now_ns,
         "passed_over": sum(own["queries_skipped"] for own in report["agents"].values()),
         "took_s": time.monotonic() - began,
     }
@@ -137,9 +137,9 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
 
 
 @lru_cache(1)  # runs in a room follow each other
-def truth_of(made: KeyframeSet, near_m: float, far_m: float) -> Truth:
+def truth_of(made: KeyframeSet, near_m: float, far_m: float) -> GroundTruth:
     who = made.agents.items()
-    return Truth(near_m, far_m, {n: a.hello.rig for n, a in who}, {n: a.T_world_body for n, a in who})
+    return GroundTruth(near_m, far_m, {n: a.hello.rig for n, a in who}, {n: a.T_world_body for n, a in who})
 
 
 def which(truth: dict[str, Trajectory]) -> Callable[[str, int], int]:
@@ -148,35 +148,35 @@ def which(truth: dict[str, Trajectory]) -> Callable[[str, int], int]:
     return lambda name, stamp_ns: at[name][stamp_ns]
 
 
-def looks(agent: AgentKeyframes, first_ns: int, last_ns: int) -> Iterator[Seen]:
+def looks(agent: AgentKeyframes, first_ns: int, last_ns: int) -> Iterator[TrackedFrame]:
     """Frames at 30 Hz since `first_ns`; a keyframe takes the place of the frame that is due by then."""
     at_ns, error_before_cm = first_ns, None
     for stamp_ns, candidate, error_cm in offered(agent):
         T = candidate.T_odom_body
         while at_ns < stamp_ns - FRAME_NS // 2:
-            yield Seen(at_ns - first_ns, T, error_before_cm)
+            yield TrackedFrame(at_ns - first_ns, T, error_before_cm)
             at_ns += FRAME_NS
-        yield Seen(stamp_ns - first_ns, T, error_cm, candidate)
+        yield TrackedFrame(stamp_ns - first_ns, T, error_cm, candidate)
         at_ns, error_before_cm = stamp_ns + FRAME_NS, error_cm
     while at_ns < last_ns:
-        yield Seen(at_ns - first_ns, agent.T_odom_body[-1], error_before_cm)
+        yield TrackedFrame(at_ns - first_ns, agent.T_odom_body[-1], error_before_cm)
         at_ns += FRAME_NS
 
 
 @lru_cache(64)
-def offered(agent: AgentKeyframes) -> list[tuple[int, Candidate, float | None]]:
+def offered(agent: AgentKeyframes) -> list[tuple[int, KeyframeCandidate, float | None]]:
     """Every keyframe as its tracker offers it, its stamp, and odometry's error (cm) by then."""
     stamps = np.array([k.stamp_ns for k in agent.keyframes])
     error = LocalError((stamps, agent.T_world_body))
     out = []
     for keyframe, T in zip(agent.keyframes, agent.T_odom_body, strict=True):
         up, fresh = (keyframe.up, keyframe.up_sigma), keyframe.reference < 0
-        candidate = Candidate(T, keyframe.T_ref_body, keyframe.cov, *up, keyframe.view, fresh)
-        out.append((keyframe.stamp_ns, candidate, error.after(keyframe.stamp_ns, T)))
+        candidate = KeyframeCandidate(T, keyframe.T_ref_body, keyframe.cov, *up, keyframe.view, fresh)
+        out.append((keyframe.stamp_ns, candidate, error.update(keyframe.stamp_ns, T)))
     return out
 
 
-def shared_errors(placed: dict[str, list[Localised]], truth: dict[str, Trajectory]) -> dict[str, float]:
+def shared_errors(placed: dict[str, list[LocalisedPose]], truth: dict[str, Trajectory]) -> dict[str, float]:
     """cm rms, of each agent: where it took itself to be in the map that it shared with others when it was
     there, at the stamps of `truth`. Every map is laid over the truth once, for all who share it."""
     told: dict[str, list[tuple[str, F64, F64]]] = {}

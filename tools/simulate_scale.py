@@ -21,7 +21,7 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from keyframe_making import make_unseen  # noqa: E402
@@ -31,8 +31,8 @@ from simulate import SIMULATED, Row, mean, play  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import UsageError  # noqa: E402
-from share.lab.emulate.recipe import Recipe  # noqa: E402
-from share.spawning import SPAWN  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
+from share.spawning import SPAWN_CONTEXT  # noqa: E402
 
 KINDS = ("ar", "ar", "robot")
 APART_M = 1000.0  # of rooms
@@ -67,7 +67,7 @@ def simulate(options: argparse.Namespace) -> None:
     ]
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))), flush=True)
     rows: list[Row] = []
-    with ProcessPoolExecutor(options.workers, SPAWN) as pool:
+    with ProcessPoolExecutor(options.workers, SPAWN_CONTEXT) as pool:
         played = pool.map(_played, jobs)
         for size in sizes:
             runs = [next(played) for _ in seeds]
@@ -102,7 +102,7 @@ def _room(seed: int, agents: int) -> KeyframeSet:
     side = max(8.0, 3.0 * agents**0.5 + 3)
     width = min(side, 20.0)
     size = side**2 / width, width, 4.0
-    return make_unseen(Recipe("warehouse", motions, 60.0, seed=seed, size=size), Spacing())
+    return make_unseen(SessionRecipe("warehouse", motions, 60.0, seed=seed, size=size), Spacing())
 
 
 def apart(rooms: Sequence[KeyframeSet]) -> KeyframeSet:

@@ -27,7 +27,7 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from keyframe_making import make_unseen  # noqa: E402
@@ -37,8 +37,8 @@ from simulate import SIMULATED, Row, play  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import UsageError  # noqa: E402
-from share.lab.emulate.recipe import Recipe  # noqa: E402
-from share.spawning import SPAWN  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
+from share.spawning import SPAWN_CONTEXT  # noqa: E402
 
 FIGURES = ("AR latency", "robot latency", "AR error", "robot error", "merges")
 USUAL = {"ar": "walk:", "robot": "robot:"}
@@ -68,7 +68,7 @@ def tune(options: argparse.Namespace) -> None:
     if options.picture and len(names) < 2:
         raise UsageError("--picture: of two settings or more")
     points = list(itertools.product(*values))
-    first, end = map(int, options.rooms.split(":"))
+    first, end = map(int, options.room_log_sigma.split(":"))
     usual = (f"{kind}{k}={USUAL[kind]}" for k, kind in enumerate(options.agents))
     motions = tuple(options.motions or usual)
     rooms: list[Room] = [(scene, seed, motions) for scene in options.scenes for seed in range(first, end)]
@@ -76,7 +76,7 @@ def tune(options: argparse.Namespace) -> None:
         ("edge.policy=" + json.dumps(options.policy), *_settings(names, point)) for point in points
     ]
     jobs = [(room, settings, options.link) for room in rooms for settings in sets]  # a room stays in memory
-    with ProcessPoolExecutor(options.workers, SPAWN) as pool:
+    with ProcessPoolExecutor(options.workers, SPAWN_CONTEXT) as pool:
         rows = list(pool.map(_play, jobs, chunksize=len(sets)))
     runs = dict(zip(jobs, rows, strict=True))
     head = (*names, *FIGURES, "AR QoE", "least QoE")
@@ -117,7 +117,7 @@ def _room(scene: str, seed: int, motions: tuple[str, ...]) -> KeyframeSet:
     side = 3.0 * len(motions) ** 0.5 + 3
     longer = max(side, side**2 / LARGEST_M[1])
     size = (min(longer, LARGEST_M[0]), min(side, LARGEST_M[1]), LARGEST_M[2]) if len(motions) > 4 else None
-    return make_unseen(Recipe(scene, motions, 60.0, seed=seed, size=size), Spacing())
+    return make_unseen(SessionRecipe(scene, motions, 60.0, seed=seed, size=size), Spacing())
 
 
 def _play(job: tuple[Room, tuple[str, ...], str]) -> Row:

@@ -12,13 +12,13 @@ import numpy as np
 from share.config import Config
 from share.errors import DataError
 from share.geometry.interpolation import associate
-from share.lab.evaluate.statistics import Deviations, deviations, inside, nees
+from share.lab.evaluate.statistics import Deviations, deviations, nees, share_within
 from share.metrics.ate import ate
 from share.metrics.frame_log import RunLog
 from share.metrics.rpe import rpe_time
-from share.odometry.result import TrackResult
+from share.odometry.track_result import TrackResult
 from share.recordings.trajectory import Trajectory
-from share.runtime.pipeline import frames_of, tracker_for
+from share.runtime.pipeline import make_source_tracker, read_frames
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
 from share.types import F64, I64, TrackState
@@ -47,14 +47,14 @@ class Told:
         return Trajectory(np.array(self.stamps, np.int64), np.array(self.poses).reshape(-1, 4, 4))
 
     def add(self, stamp_ns: int, result: TrackResult) -> None:
-        self.log.stretches += result.new_stretch
-        self.log.add(stamp_ns, self.track_ms[-1], result.state, result.keyframe)
+        self.log.segments += result.new_segment
+        self.log.add(stamp_ns, self.track_ms[-1], result.state, result.keyframe_ready)
         if result.T_odom_body is not None:
             assert result.cov is not None  # the inertial tracker always tells it
             self.stamps.append(stamp_ns)
             self.poses.append(result.T_odom_body)
             self.covs.append(result.cov)
-            self.stretches.append(self.log.stretches)
+            self.stretches.append(self.log.segments)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +68,15 @@ class Series:
 
 def follow(source: Source, settings: Config) -> Told:
     """Track every frame in turn, causal. Decoding is not counted."""
-    tracker, told = tracker_for(source, settings), Told()
-    for frame in frames_of(source, settings, SequencerCounters()):
+    tracker, told = make_source_tracker(source, settings), Told()
+    for frame in read_frames(source, settings, SequencerCounters()):
         began = time.process_time()
         result = tracker.track(frame)
         told.track_ms.append(1e3 * (time.process_time() - began))
-        if result.keyframe:
+        if result.keyframe_ready:
             began = time.process_time()
-            tracker.keyframe(frame)
-            tracker.settle()
+            tracker.make_keyframe(frame)
+            tracker.finish_keyframe()
             told.keyframe_ms.append(1e3 * (time.process_time() - began))
         told.add(frame.stamp_ns, result)
     return told
@@ -100,7 +100,7 @@ def figures(source: Source, told: Told, found: Series) -> dict[str, Any]:
         "told": report["tracked"] / report["frames"],
         "with_truth": len(found.stamps_ns),
         **accuracy(source, told, found),
-        "states": {str(state): int(frames.has(state).sum()) / len(frames) for state in TrackState},
+        "states": {str(state): int(frames.in_state(state).sum()) / len(frames) for state in TrackState},
         "lost_s": report["lost_s"],
         "init_s": report["init_s"],
         "new_stretches": max(report["stretches"] - 1, 0),
@@ -133,7 +133,7 @@ def consistency(found: Deviations) -> Iterator[float]:
     for part in (slice(3, 6), slice(0, 3)):
         errors, cov = found.errors[1:, part], found.cov[1:, part, part]
         yield float(nees(errors, cov).mean())
-        yield inside(errors, found.sigmas[1:, part])
+        yield share_within(errors, found.sigmas[1:, part])
 
 
 def _percentile(values: list[float], q: float) -> float | None:

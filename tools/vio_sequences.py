@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.recipe import SessionRecipe
 
 SECONDS = 60.0
 _D435I = "d435i:640x480@30"
@@ -28,11 +28,13 @@ class Sequence:
         kind, _, name = self.motion.partition(":")
         return data / kind / name if name else None
 
-    def recipe(self, seed: int, data: Path) -> Recipe:
+    def recipe(self, seed: int, data: Path) -> SessionRecipe:
         folder = self.recording(data)
         motion = self.motion if folder is None else f"{self.motion.partition(':')[0]}:{folder}"
         sensors = {"": self.sensors} if self.sensors else {}
-        return Recipe(self.scene, (f"agent={motion}",), SECONDS, seed, self.size, sensors, {"": self.profile})
+        return SessionRecipe(
+            self.scene, (f"agent={motion}",), SECONDS, seed, self.size, sensors, {"": self.profile}
+        )
 
 
 SEQUENCES = (

@@ -12,29 +12,29 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from share.cameras.handover import Handover
+from share.cameras.sample_queue import SampleQueue
 from share.errors import NotAttachedError, ShareError
 from share.geometry.camera import Rig
-from share.rates import Every
-from share.sensors.intake import Intake, Sample
 from share.sensors.measurement import CAM0, Measurement
+from share.sensors.sample_processor import DeviceSample, SampleProcessor
 from share.sensors.watchdog import Action, Health, Watchdog
+from share.timing import PeriodicTimer
 
 _TICK_S = 0.1
-_REMEMBERED = 1000  # images whose arrival can be asked for
-_MANY = 30  # stamps of the host's clock in one stream; fewer are exceptions
-_SAID = {
+_MAX_ARRIVALS = 1000  # images whose arrival can be asked for
+_MIN_HOST_STAMPS = 30  # stamps of the host's clock in one stream; fewer are exceptions
+_ACTION_NOTICES = {
     Action.RESET: "{silent}: silent; the camera is reset once",
     Action.GO_WITHOUT: "{silent}: still silent; {health}: goes on without",
-    Action.HEARD_AGAIN: "{silent}: heard again",
+    Action.RECOVERED: "{silent}: heard again",
 }
-_IN_VAIN = (
+_GIVE_UP_NOTICE = (
     "camera {serial}: {silent}: no sample came, nor after a hardware reset; unplug it and plug it in again, "
     "with another cable or port if need be"
 )
 
 
-class Device(Protocol):
+class CameraDevice(Protocol):
     """A camera that is connected, such as `share.cameras.realsense.camera.RealSense`."""
 
     @property
@@ -46,21 +46,23 @@ class Device(Protocol):
     @property
     def rates_hz(self) -> Mapping[str, float]: ...
 
-    def start(self, sink: Callable[[Sample], None]) -> None: ...
+    def start(self, sink: Callable[[DeviceSample], None]) -> None: ...
 
     def stop(self) -> None: ...
 
     def reset(self) -> None: ...
 
 
-Connect = Callable[[str | None, int], Device]  # serial number (None: any), how often it was tried before
+Connect = Callable[
+    [str | None, int], CameraDevice
+]  # serial number (None: any), how often it was tried before
 MakeWatchdog = Callable[[int, Collection[str]], Watchdog]
 
 
-class Feed:
+class CameraFeed:
     """`open` it, read `measurements` in one thread, `stop` it from any; the reader lets the camera go.
 
-    `say` is told what happens to the camera, a line each.
+    `notify` is told what happens to the camera, a line each.
     """
 
     def __init__(
@@ -69,46 +71,46 @@ class Feed:
         serial: str | None,
         rates_hz: Mapping[str, float],
         max_jump_s: float,
-        say: Callable[[str], None],
-        queue: Handover,
+        notify: Callable[[str], None],
+        queue: SampleQueue,
         watchdog: MakeWatchdog = Watchdog,
     ) -> None:
         """rates_hz: of every stream that is expected, until the device says its own."""
-        self._connect, self._say, self.queue = connect, say, queue
-        self.serial, self.intake = serial, Intake(rates_hz, max_jump_s)
+        self._connect, self._notify, self.queue = connect, notify, queue
+        self.serial, self.processor = serial, SampleProcessor(rates_hz, max_jump_s)
         self._max_jump_s = max_jump_s
         self._watchdog = watchdog(time.monotonic_ns(), rates_hz)
-        self.in_vain = False  # what is needed has never come
-        self._tick = Every(_TICK_S)
+        self.has_failed = False  # what is needed has never come
+        self._tick = PeriodicTimer(_TICK_S)
         self._stop = threading.Event()
-        self._device: Device | None = None
-        self._heard: dict[str, int] = {}
-        self._attempts = self._restarts = 0
-        self._reasons: set[str] = set()  # said: why the camera could not be opened again
-        self._mixed = False  # said: some streams are of the host's clock
-        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
-        self._rates = Rates()
+        self._device: CameraDevice | None = None
+        self._last_sample_ns: dict[str, int] = {}
+        self._attempts = self._notified_restarts = 0
+        self._notified_reasons: set[str] = set()  # said: why the camera could not be opened again
+        self._has_warned_clocks = False  # said: some streams are of the host's clock
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_MAX_ARRIVALS)
+        self._rate_meter = RateMeter()
 
     def open(self) -> Rig:
         """Connect; samples come from now on, and wait. Raises UsageError, ShareError, DataError."""
         device = self._connect(self.serial, 0)
         rig, self.serial = device.rig, device.serial
-        self.intake = Intake(device.rates_hz, self._max_jump_s)
-        device.start(self._take)
+        self.processor = SampleProcessor(device.rates_hz, self._max_jump_s)
+        device.start(self._receive)
         self._device = device
-        self._watchdog.connected(time.monotonic_ns())
+        self._watchdog.record_connect(time.monotonic_ns())
         return rig
 
     def measurements(self) -> Iterator[Measurement]:
         """Until it is stopped; what has come by then is still given. Raises ShareError where a stream that is
-        needed never comes (`in_vain`)."""
+        needed never comes (`has_failed`)."""
         try:
-            while not self.queue.done:
-                self._guard()
+            while not self.queue.is_drained:
+                self._poll_watchdog()
                 sample = self.queue.get(_TICK_S)
                 if sample is not None:
-                    yield from self._used(sample)
-            yield from self.intake.end()
+                    yield from self._process(sample)
+            yield from self.processor.flush()
         finally:
             self.close()
 
@@ -135,7 +137,7 @@ class Feed:
     @property
     def image_ns(self) -> int | None:
         """When cam0's newest image came, read or not, on the host's monotonic clock; None before any."""
-        return self._heard.get(CAM0)
+        return self._last_sample_ns.get(CAM0)
 
     @property
     def trouble(self) -> str:
@@ -143,14 +145,16 @@ class Feed:
         health = self.health
         if health is Health.AWAY:
             return "the camera is away"
-        return "" if health is Health.OK else f"the camera goes without {', '.join(self._watchdog.without)}"
+        return "" if health is Health.OK else f"the camera goes without {', '.join(self._watchdog.excluded)}"
 
     def status(self) -> FeedStatus:
         """For a live line."""
-        streams = self.intake.streams
+        streams = self.processor.streams
         return FeedStatus(
             health=self.health,
-            rates_hz=self._rates.of({name: gaps.samples for name, gaps in streams.items()}, time.monotonic()),
+            rates_hz=self._rate_meter.update(
+                {name: gaps.samples for name, gaps in streams.items()}, time.monotonic()
+            ),
             missing=sum(gaps.missing for gaps in streams.values()),
             dropped=sum(self.queue.dropped.values()),
             queue=len(self.queue),
@@ -158,92 +162,97 @@ class Feed:
 
     def report(self) -> dict[str, Any]:
         """What came, was repaired and lost."""
-        return feed_report(self.intake, self.queue.dropped, self._watchdog)
+        return feed_report(self.processor, self.queue.dropped, self._watchdog)
 
-    def _take(self, sample: Sample) -> None:
+    def _receive(self, sample: DeviceSample) -> None:
         """In the device's threads."""
-        self._heard[sample.stream] = time.monotonic_ns()
+        self._last_sample_ns[sample.stream] = time.monotonic_ns()
         self.queue.put(sample)
 
-    def _used(self, sample: Sample) -> Iterator[Measurement]:
-        for measurement in self.intake.feed(sample):
+    def _process(self, sample: DeviceSample) -> Iterator[Measurement]:
+        for measurement in self.processor.feed(sample):
             if measurement.stream == CAM0:
                 self._arrivals.append((measurement.stamp_ns, sample.arrived_ns))
             yield measurement
-        if self.intake.restarts > self._restarts:
-            self._restarts = self.intake.restarts
-            self._say("the camera's clock began anew; so does a new stretch")
-        if not self._mixed and max(self.intake.placed.values()) >= _MANY:
-            self._mixed = True
-            self._say(_clocks(self.intake.placed))
+        if self.processor.restarts > self._notified_restarts:
+            self._notified_restarts = self.processor.restarts
+            self._notify("the camera's clock began anew; so does a new stretch")
+        if not self._has_warned_clocks and max(self.processor.placed_by_arrival.values()) >= _MIN_HOST_STAMPS:
+            self._has_warned_clocks = True
+            self._notify(_describe_clocks(self.processor.placed_by_arrival))
 
-    def _guard(self) -> None:
+    def _poll_watchdog(self) -> None:
         """Feed the watchdog, and do what it asks for."""
         if self._stop.is_set():
             self.close()
-        if self.queue.closed or not self._tick.due(time.monotonic_ns()):
+        if self.queue.is_closed or not self._tick.fire_if_due(time.monotonic_ns()):
             return
         if self._device is not None:
-            for stream, now_ns in list(self._heard.items()):
-                self._watchdog.heard(stream, now_ns)
-        self._do(self._watchdog.tick(time.monotonic_ns()))
+            for stream, now_ns in list(self._last_sample_ns.items()):
+                self._watchdog.record_sample(stream, now_ns)
+        self._execute(self._watchdog.tick(time.monotonic_ns()))
 
-    def _do(self, action: Action) -> None:
+    def _execute(self, action: Action) -> None:
         if action is Action.NOTHING:  # ten times a second
             return
-        told = {
+        details = {
             "silent": ", ".join(self._watchdog.silent),
             "health": self.health.value,
             "serial": self.serial,
         }
-        if action in _SAID:
-            self._say(_SAID[action].format(**told))
+        if action in _ACTION_NOTICES:
+            self._notify(_ACTION_NOTICES[action].format(**details))
         if action is Action.RESET and self._device is not None:
             self._device.reset()
             self._device = None
         if action is Action.RECONNECT:
             self._reconnect()
         if action is Action.GIVE_UP:
-            self.in_vain = True
-            raise ShareError(_IN_VAIN.format(**told))
+            self.has_failed = True
+            raise ShareError(_GIVE_UP_NOTICE.format(**details))
 
     def _reconnect(self) -> None:
         if self._device is not None:
             silent = ", ".join(self._watchdog.silent)
-            self._say(f"{silent}: no more samples come; looks for camera {self.serial} until it is back")
+            self._notify(f"{silent}: no more samples come; looks for camera {self.serial} until it is back")
             self._device.stop()
             self._device = None
         self._attempts += 1
         try:
             device = self._connect(self.serial, self._attempts)
-            device.start(self._take)
+            device.start(self._receive)
         except ShareError as error:
-            self._explain(error)
-            self._watchdog.lost(time.monotonic_ns())
+            self._notify_reason(error)
+            self._watchdog.record_disconnect(time.monotonic_ns())
             return
         self._device = device
-        self._reasons.clear()
-        self._watchdog.connected(time.monotonic_ns())
-        self._say(f"camera {self.serial} is connected again; a new stretch begins")
+        self._notified_reasons.clear()
+        self._watchdog.record_connect(time.monotonic_ns())
+        self._notify(f"camera {self.serial} is connected again; a new stretch begins")
 
-    def _explain(self, error: ShareError) -> None:
+    def _notify_reason(self, error: ShareError) -> None:
         """Why a camera that may well be plugged in is still away; each reason once."""
-        if not isinstance(error, NotAttachedError) and str(error) not in self._reasons:
-            self._reasons.add(str(error))
-            self._say(str(error))
+        if not isinstance(error, NotAttachedError) and str(error) not in self._notified_reasons:
+            self._notified_reasons.add(str(error))
+            self._notify(str(error))
 
 
-def _clocks(placed: Mapping[str, int]) -> str:
+def _describe_clocks(placed_by_arrival: Mapping[str, int]) -> str:
     """Which streams are of the host's clock, in words. placed: samples of it among those of the camera's."""
-    theirs, ours = (
-        ", ".join(n for n, count in placed.items() if bool(count) is host) for host in (True, False)
+    host_streams, device_streams = (
+        ", ".join(n for n, count in placed_by_arrival.items() if bool(count) is host)
+        for host in (True, False)
     )
-    return f"{theirs} carry the host's clock, {ours} the camera's: kernel patch missing, see docs/capture.md"
+    return (
+        f"{host_streams} carry the "
+        f"host's clock, {device_streams} "
+        f"the camera's: kernel patch missing, see docs/capture.md"
+    )
 
 
 # ---- How a live camera does: for a live line, and for a report.
 
-_OVER_S = 1.0
+_RATE_WINDOW_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -262,25 +271,25 @@ class FeedStatus:
         return f"{self.health.value}  {rates} Hz  {counts}"
 
 
-class Rates:
+class RateMeter:
     """Counts to rates over about a second."""
 
     def __init__(self) -> None:
-        self._then: tuple[float, Mapping[str, int]] | None = None
+        self._previous: tuple[float, Mapping[str, int]] | None = None
         self._rates: dict[str, float] = {}
 
-    def of(self, counts: Mapping[str, int], now_s: float) -> dict[str, float]:
+    def update(self, counts: Mapping[str, int], now_s: float) -> dict[str, float]:
         """Hz by name; before the first second is over, 0."""
-        if self._then is None:
-            self._then, self._rates = (now_s, counts), dict.fromkeys(counts, 0.0)
-        since_s, before = now_s - self._then[0], self._then[1]
-        if since_s >= _OVER_S:
+        if self._previous is None:
+            self._previous, self._rates = (now_s, counts), dict.fromkeys(counts, 0.0)
+        since_s, before = now_s - self._previous[0], self._previous[1]
+        if since_s >= _RATE_WINDOW_S:
             self._rates = {name: (count - before.get(name, 0)) / since_s for name, count in counts.items()}
-            self._then = (now_s, counts)
+            self._previous = (now_s, counts)
         return self._rates
 
 
-def feed_report(intake: Intake, dropped: Mapping[str, int], watchdog: Watchdog) -> dict[str, Any]:
+def feed_report(processor: SampleProcessor, dropped: Mapping[str, int], watchdog: Watchdog) -> dict[str, Any]:
     """What came, was repaired and lost, as plain data (docs/capture.md)."""
     streams = {
         name: {
@@ -291,14 +300,14 @@ def feed_report(intake: Intake, dropped: Mapping[str, int], watchdog: Watchdog) 
             "backward": gaps.backward,
             "dropped": dropped.get(name, 0),
         }
-        for name, gaps in intake.streams.items()
+        for name, gaps in processor.streams.items()
     }
     return {
         "streams": streams,
-        "imu": intake.join.joined,
-        "stretches": intake.stretches,
+        "imu": processor.imu_interpolator.interpolated,
+        "stretches": processor.segments,
         "reconnections": watchdog.reconnections,
         "resets": watchdog.resets,
         "health": watchdog.health.value,
-        **intake.counts(),
+        **processor.counts(),
     }

@@ -6,31 +6,33 @@ from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
-from share.cameras.feed import Feed
+from share.cameras.feed import CameraFeed
 from share.errors import UsageError
 from share.geometry.camera import Rig
 from share.recordings.calibration import Calibration
+from share.recordings.device_match import device_mismatch, fit_to_device, uncalibrated_sensors
 from share.recordings.recording import Source
 from share.recordings.trajectory import Trajectory
-from share.recordings.unit import as_read, of_another, unused
 from share.sensors.imu_check import ImuRange
 from share.sensors.measurement import CAM0, Measurement
 from share.types import I64
 
-WAITING = 2  # frames that may wait for the tracker
+MAX_WAITING_FRAMES = 2  # frames that may wait for the tracker
 
 
-def given_rig(given: Calibration | None, factory: Rig, serial: str | None) -> tuple[Rig, tuple[str, ...]]:
+def choose_rig(
+    calibration: Calibration | None, factory: Rig, serial: str | None
+) -> tuple[Rig, tuple[str, ...]]:
     """What is to be believed of a camera, and what a person should know of that. Raises UsageError where the
     calibration that was given cannot be of it as it is read."""
-    if given is None:
+    if calibration is None:
         return factory, ()
     try:
-        rig = as_read(given.rig, factory)
+        rig = fit_to_device(calibration.rig, factory)
     except ValueError as error:
-        raise UsageError(f"{given.where}: {error}") from None
-    doubt = of_another(given.serials, serial)
-    return rig, (*unused(rig, factory), *([] if doubt is None else [doubt]))
+        raise UsageError(f"{calibration.where}: {error}") from None
+    warning = device_mismatch(calibration.serials, serial)
+    return rig, (*uncalibrated_sensors(rig, factory), *([] if warning is None else [warning]))
 
 
 class LiveSource(Source):
@@ -39,11 +41,11 @@ class LiveSource(Source):
     Raises UsageError, ShareError or DataError where it cannot be opened, or not with that calibration.
     """
 
-    tells_silence = True
+    reports_silence = True
 
     def __init__(
         self,
-        feed: Feed,
+        feed: CameraFeed,
         rate_hz: float,
         calibration: Calibration | None = None,
         imu_range: ImuRange | None = None,
@@ -54,7 +56,7 @@ class LiveSource(Source):
         self.feed, self._rate_hz = feed, rate_hz
         self.name, self.serial = f"realsense:{feed.serial}", feed.serial
         try:
-            self.rig, self.notes = given_rig(calibration, factory, feed.serial)
+            self.rig, self.notes = choose_rig(calibration, factory, feed.serial)
         except BaseException:
             feed.close()
             raise
@@ -100,7 +102,7 @@ class LiveSource(Source):
 
     @property
     def images_count(self) -> int:
-        return self.feed.intake.streams[CAM0].samples
+        return self.feed.processor.streams[CAM0].samples
 
     @cached_property
     def rate_hz(self) -> float:

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli import live, options
-from share.cli.progress import LiveLine
+from share.cli import camera_options, options
+from share.cli.terminal import LiveLine
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
-    from share.cameras.feed import Feed
+    from share.cameras.feed import CameraFeed
     from share.config import Config
     from share.net.keys import AgentKeys
     from share.net.transport import AgentLink
-    from share.runtime.agent import AgentRun, Status
-    from share.runtime.error_model import Errors
+    from share.runtime.agent import AgentRun, LiveStatus
+    from share.runtime.error_estimators import ErrorEstimator
     from share.runtime.source import Source
     from share.types import AgentKind
 
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 @click.option("--true-error", is_flag=True, help="Tell the edge the true error of tracking, for experiments.")
 @options.calib
 @options.frames
-@live.camera
+@camera_options.camera_options
 @click.option("--out", metavar="DIR", help="Write odom.tum, map.tum, latency.csv and report.json here.")
 @click.option(
     "--poses", metavar="udp://H:P", help="Send every pose to a program that listens there (docs/poses.md)."
@@ -72,7 +72,7 @@ def agent(
     true_error: bool,
     calib: str | None,
     frames: slice | None,
-    camera: live.Asked,
+    camera: camera_options.CameraOptions,
     out: str | None,
     poses: str | None,
     config_file: str | None,
@@ -91,45 +91,54 @@ def agent(
     settings = options.load_config(config_file)
     from share.runtime.agent import AgentRun
     from share.runtime.pose_feed import PoseFeed
-    from share.runtime.stop import on_stop
-    from share.runtime.stream import StreamRun
+    from share.runtime.signals import stop_on_signal
+    from share.runtime.streaming_agent import StreamingAgentRun
     from share.wire.messages import Hello
 
     if streamed and true_error:
         raise UsageError("--true-error: is of an agent that tracks itself; leave out --streamed, or this")
-    served = _kind(kind, camera.profile_name)
+    agent_kind = _agent_kind(kind, camera.profile_name)
     run_id = secrets.randbits(63)
-    dial = _dial(address, run_id, _keys(keys, server_key))
-    through = dial if link is None else _shaped(dial, link, link_seed)
-    line = _LiveLine(streamed)
-    opened = live.open_source(source, calib, frames, camera, settings, line.say)
-    line.of(opened)
-    options.say_notes(opened)
-    hello = Hello(options.agent_name(name), served, run_id, opened.rig, streamed)
-    errors = None if streamed else _errors(opened, settings, true_error, line.say)
+    connect_edge = _connector(address, run_id, _agent_keys(keys, server_key))
+    connect_link = connect_edge if link is None else _emulated_link(connect_edge, link, link_seed)
+    live_line = _AgentLine(streamed)
+    opened = camera_options.open_source(source, calib, frames, camera, settings, live_line.print_line)
+    live_line.watch_source(opened)
+    options.print_notes(opened)
+    hello = Hello(options.agent_name(name), agent_kind, run_id, opened.rig, streamed)
+    errors = None if streamed else _error_estimator(opened, settings, true_error, live_line.print_line)
     feed = None if poses is None else PoseFeed(poses, hello.name)
     folder = None if out is None else Path(out)
-    run = (StreamRun if streamed else AgentRun)(
-        opened, hello, settings, through, folder, line.say, line.show, verbose, errors, feed
+    run = (StreamingAgentRun if streamed else AgentRun)(
+        opened,
+        hello,
+        settings,
+        connect_link,
+        folder,
+        live_line.print_line,
+        live_line.show,
+        verbose,
+        errors,
+        feed,
     )
-    with on_stop(run.stop):
-        run.go()
-    line.end()
-    options.say_losses(opened)
+    with stop_on_signal(run.stop):
+        run.run()
+    live_line.end()
+    options.print_losses(opened)
     click.echo(json.dumps(run.report) if as_json else _summary(run))
-    if (missing := _unacknowledged(run, hello.name, settings.agent.finish_s)) is not None:
-        line.say(missing)
-        line.end()
+    if (warning := _unacknowledged_text(run, hello.name, settings.agent.finish_s)) is not None:
+        live_line.print_line(warning)
+        live_line.end()
     if not run.report["protocol"]["edge_sessions"]:
         if (refusal := run.report["protocol"]["refusal"]) is not None:
             raise ShareError(f"the edge at {address} refuses '{hello.name}': {refusal}")
-        raise ShareError(f"no edge ever answered at {address}; {run.trouble or _NOBODY}")
+        raise ShareError(f"no edge ever answered at {address}; {run.trouble or _NO_EDGE_HINT}")
 
 
-_NOBODY = "is `share edge` running there?"
+_NO_EDGE_HINT = "is `share edge` running there?"
 
 
-def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
+def _agent_keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
     """None without --server-key. Raises UsageError."""
     from share.net.keys import agent_keys
 
@@ -140,12 +149,12 @@ def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
     return agent_keys(None if folder is None else Path(folder), server_key)
 
 
-def _kind(given: str | None, profile_name: str | None) -> AgentKind:
+def _agent_kind(kind_given: str | None, profile_name: str | None) -> AgentKind:
     """As given, or what the computer of that profile is for. Raises UsageError, ConfigError."""
-    from share.sensors.profile import host_profile
+    from share.sensors.profile import load_host_profile
     from share.types import AgentKind
 
-    role = given or ("" if profile_name is None else host_profile(profile_name).role)
+    role = kind_given or ("" if profile_name is None else load_host_profile(profile_name).role)
     if role not in set(AgentKind):
         raise UsageError(
             "--kind: who is served, ar or robot? Say it, or name a --profile that does: d435i-n100-headset"
@@ -153,7 +162,7 @@ def _kind(given: str | None, profile_name: str | None) -> AgentKind:
     return AgentKind(role)
 
 
-def _dial(address: str, run_id: int, keys: AgentKeys | None) -> Callable[[], AgentLink]:
+def _connector(address: str, run_id: int, keys: AgentKeys | None) -> Callable[[], AgentLink]:
     """What connects to the edge. Raises UsageError for an address that is none, or wants keys."""
     from share.net.transport import check_keys, connect, parse_address
 
@@ -161,53 +170,55 @@ def _dial(address: str, run_id: int, keys: AgentKeys | None) -> Callable[[], Age
     return partial(connect, address, run_id, keys)
 
 
-def _errors(source: Source, settings: Config, true_error: bool, say: Callable[[str], None]) -> Errors | None:
+def _error_estimator(
+    source: Source, settings: Config, true_error: bool, say: Callable[[str], None]
+) -> ErrorEstimator | None:
     """Who tells how wrong the tracker is. Raises UsageError, DataError."""
     if true_error:
-        return _by_truth(source)
+        return _true_error(source)
     if not settings.agent.error_model:
         return None
-    from share.odometry.error_model.network import error_model
-    from share.runtime.error_model import ByModel
+    from share.odometry.error_model.network import open_error_model
+    from share.runtime.error_estimators import BackgroundErrorModel
 
-    return ByModel(error_model(settings.agent.error_model), say)
+    return BackgroundErrorModel(open_error_model(settings.agent.error_model), say)
 
 
-def _by_truth(source: Source) -> Errors:
+def _true_error(source: Source) -> ErrorEstimator:
     """Raises UsageError where nobody knows it."""
     from share.metrics.local_error import LocalError
-    from share.runtime.error_model import ByTruth
+    from share.runtime.error_estimators import GroundTruthError
 
     truth = source.truth()
     if truth is None:
         raise UsageError(
             "--true-error: this source comes without a truth; SESSION/NAME has one in truth/NAME.tum"
         )
-    return ByTruth(LocalError(truth))
+    return GroundTruthError(LocalError(truth))
 
 
-def _shaped(dial: Callable[[], AgentLink], name: str, seed: int) -> Callable[[], AgentLink]:
-    """`dial`, with an emulated network around the link. Raises UsageError, ConfigError."""
-    from share.net.emulated import ShapedLink, network
+def _emulated_link(dial: Callable[[], AgentLink], name: str, seed: int) -> Callable[[], AgentLink]:
+    """`connect_edge`, with an emulated network around the link. Raises UsageError, ConfigError."""
+    from share.net.emulated_link import EmulatedLink, load_network
 
-    found = network(name)
-    return lambda: ShapedLink(dial(), found, seed)
+    link_network = load_network(name)
+    return lambda: EmulatedLink(dial(), link_network, seed)
 
 
-class _LiveLine(LiveLine):
+class _AgentLine(LiveLine):
     """How far the run is, written over; and what is said, on lines of its own."""
 
     def __init__(self, streamed: bool) -> None:
         super().__init__()
         self._streamed, self._total = streamed, 0
-        self._feed: Feed | None = None  # of a live camera
+        self._feed: CameraFeed | None = None  # of a live camera
 
-    def of(self, source: Source) -> None:
+    def watch_source(self, source: Source) -> None:
         """Whose frames are shown."""
         self._feed, self._total = getattr(source, "feed", None), source.images_count
 
-    def show(self, status: Status) -> None:
-        if not self.seen or (status.frames % 5 and status.frames != self._total and not status.idle):
+    def show(self, status: LiveStatus) -> None:
+        if not self.is_terminal or (status.frames % 5 and status.frames != self._total and not status.idle):
             return
         r = status.report()
         rtt = "  –  " if r["rtt_ms"] is None else f"{r['rtt_ms']:.1f} ms"
@@ -218,10 +229,12 @@ class _LiveLine(LiveLine):
             f"rtt {rtt} map {r['map_id'] or '–'}"
         )
         of = f"/{self._total}" if self._feed is None else ""
-        self.write(f"{status.frames}{of} {status.state:4} {live.brief(self._feed)}{counts}")
+        self.write(
+            f"{status.frames}{of} {status.state:4} {camera_options.camera_status_text(self._feed)}{counts}"
+        )
 
-    def say(self, text: str) -> None:
-        super().say(f"share agent: {text}")
+    def print_line(self, text: str) -> None:
+        super().print_line(f"share agent: {text}")
 
 
 def _summary(run: AgentRun) -> str:
@@ -232,7 +245,7 @@ def _summary(run: AgentRun) -> str:
     if "untracked" in r:
         lines += [f"{r['untracked']} more frames had no answer of the edge, {traffic}"]
     else:
-        lines += [_keyframes(r, traffic)]
+        lines += [_keyframes_text(r, traffic)]
     if r["drop_late"]:
         lines.append(f"{r['drop_late']} more frames came too late and were left out")
     if r["frames_late"]:
@@ -240,44 +253,48 @@ def _summary(run: AgentRun) -> str:
     if p95 is not None:
         lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (95 %: {p95:.1f} ms)")
     if r["clock"]["uncertainty_ms"] is not None:
-        lines.append(f"clock of the edge: {_clock(r['clock'])}")
-    return "\n".join([*lines, *live.summary(r)])
+        lines.append(f"clock of the edge: {_clock_text(r['clock'])}")
+    return "\n".join([*lines, *camera_options.camera_summary(r)])
 
 
-def _keyframes(r: dict[str, Any], traffic: str) -> str:
+def _keyframes_text(r: dict[str, Any], traffic: str) -> str:
     """What the link took of them, and what the edge has acknowledged."""
-    told, made = r["protocol"], r["keyframes"]
-    if not told["edge_sessions"]:
-        return f"no edge answered: {_of(made)} not sent"
-    safe = told["keyframes"] - told["unacknowledged"]
-    sent = f"{told['sent']} sent, {safe} acknowledged"
-    return f"{_of(made)}: {sent}, {r['corrections']} corrections, {traffic}"
+    protocol, count = r["protocol"], r["keyframes"]
+    if not protocol["edge_sessions"]:
+        return f"no edge answered: {_count_text(count)} not sent"
+    acknowledged = protocol["keyframes"] - protocol["unacknowledged"]
+    sent = f"{protocol['sent']} sent, {acknowledged} acknowledged"
+    return f"{_count_text(count)}: {sent}, {r['corrections']} corrections, {traffic}"
 
 
-def _unacknowledged(run: AgentRun, name: str, finish_s: float) -> str | None:
+def _unacknowledged_text(run: AgentRun, name: str, finish_s: float) -> str | None:
     """How many keyframes an edge that was there has not acknowledged, and why as far as the agent knows."""
-    told = run.report["protocol"]
-    count = told["unacknowledged"]
-    if not count or not told["edge_sessions"]:
+    protocol = run.report["protocol"]
+    count = protocol["unacknowledged"]
+    if not count or not protocol["edge_sessions"]:
         return None
-    if told["refusal"] is not None:
-        why = f"the edge refuses '{name}': {told['refusal']}"
-    elif not told["connected"]:
+    if protocol["refusal"] is not None:
+        why = f"the edge refuses '{name}': {protocol['refusal']}"
+    elif not protocol["connected"]:
         why = run.trouble or "the edge is silent"
-    elif told["held"]:
-        why = f"it has {told['held']} of them, but not in its map's file; can it write that? It says why not"
+    elif protocol["held"]:
+        why = (
+            f"it has {protocol['held']} of them, but not in "
+            f"its map's file; can it "
+            f"write that? It says why not"
+        )
     else:
         why = f"it did not answer within agent.finish_s, {finish_s:g} s"
-    return f"the edge never acknowledged {_of(count)}: {why}"
+    return f"the edge never acknowledged {_count_text(count)}: {why}"
 
 
-def _of(keyframes: int) -> str:
+def _count_text(keyframes: int) -> str:
     return "1 keyframe" if keyframes == 1 else f"{keyframes} keyframes"
 
 
-def _clock(c: dict[str, Any]) -> str:
-    sure = f"±{c['uncertainty_ms']:.3g} ms"
+def _clock_text(c: dict[str, Any]) -> str:
+    uncertainty = f"±{c['uncertainty_ms']:.3g} ms"
     if c["claim"]:
-        return f"{c['offset_ms']:+.3f} ms from this one's, {sure}"
+        return f"{c['offset_ms']:+.3f} ms from this one's, {uncertainty}"
     bound = f"more than clock.claim_ms, {c['claim_ms']:g}"
-    return f"offset too uncertain ({sure}, {bound}); latencies are by this machine's clock alone"
+    return f"offset too uncertain ({uncertainty}, {bound}); latencies are by this machine's clock alone"

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
-from share.cli.progress import Stages
-from share.cli.table import aligned
+from share.cli.table import aligned_table
+from share.cli.terminal import Stages
 from share.errors import DataError, ShareError
 
 if TYPE_CHECKING:
-    from share.lab.calibrate.board_views import Pictures
-    from share.lab.calibrate.camera_report import Outcome
+    from share.lab.calibrate.board_views import BoardImages
+    from share.lab.calibrate.camera_report import CameraCalibration
     from share.lab.calibrate.target import Target
 
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     help="Look at each N-th picture.",
 )  # fmt: skip
 @click.option(
-    "--views", "most", type=click.IntRange(4), default=60, show_default=True, metavar="N",
+    "--views", "max_views", type=click.IntRange(4), default=60, show_default=True, metavar="N",
     help="Use the N views that together tell most.",
 )  # fmt: skip
 @click.option(
@@ -45,7 +45,7 @@ def camera(
     target_name: str,
     camera: str,
     every: int,
-    most: int,
+    max_views: int,
     model: str,
     calib: str | None,
     workers: int,
@@ -63,42 +63,44 @@ def camera(
     Example:  share calibrate camera board.mcap --target aprilgrid --out calib/mine
               share calibrate camera pictures --target board.yaml --camera cam0 --out calib/mine
     """
-    from share.files.json_file import known
+    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, writable_dir
     from share.lab.calibrate import camera_report
-    from share.lab.calibrate.board_views import open_pictures
-    from share.lab.calibrate.camera_report import PICTURE, REPORT, places, written
+    from share.lab.calibrate.board_views import open_board_images
+    from share.lab.calibrate.camera_report import PICTURE, REPORT, output_paths, written_message
     from share.lab.calibrate.target import named_target
     from share.recordings.calibration import CAMCHAIN, to_kalibr
 
     target = named_target(target_name)
-    pictures = open_pictures(source, ("cam0", "cam1") if camera == "both" else ("cam0",), calib)
-    if pictures.said is not None:
-        to_kalibr(pictures.said.rig, pictures.said)  # what is kept of it must be sound: said before the work
-    options.say_another(source, pictures.said, pictures.serial)
+    pictures = open_board_images(source, ("cam0", "cam1") if camera == "both" else ("cam0",), calib)
+    if pictures.given_calibration is not None:
+        to_kalibr(
+            pictures.given_calibration.rig, pictures.given_calibration
+        )  # what is kept of it must be sound: said before the work
+    options.warn_other_device(source, pictures.given_calibration, pictures.serial)
     writable_dir(out, CAMCHAIN, REPORT, PICTURE)
-    outcome = _calibrated(source, pictures, target, every, most, model, workers)
-    text = json.dumps(known(camera_report.to_json(outcome)), indent=1)
-    files = places(out, outcome.verdict.passed, CAMCHAIN, REPORT, PICTURE)
+    outcome = _calibrate(source, pictures, target, every, max_views, model, workers)
+    text = json.dumps(nan_to_none(camera_report.report_values(outcome)), indent=1)
+    files = output_paths(out, outcome.verdict.passed, CAMCHAIN, REPORT, PICTURE)
     chain, report, picture = files
-    atomic_write(chain, camera_report.kalibr_text(outcome, source, report.name))
+    atomic_write(chain, camera_report.camchain_yaml(outcome, source, report.name))
     atomic_write(report, text + "\n")
-    atomic_write(picture, camera_report.picture(outcome, source))
+    atomic_write(picture, camera_report.residual_chart(outcome, source))
     click.echo(text if as_json else _summary(outcome, files))
     if not outcome.verdict.passed:
         raise ShareError(
-            f"{source}: not to be believed ({written(chain)}): " + "; ".join(outcome.verdict.reasons)
+            f"{source}: not to be believed ({written_message(chain)}): " + "; ".join(outcome.verdict.reasons)
         )
 
 
-def _calibrated(
-    source: str, pictures: Pictures, target: Target, every: int, most: int, model: str, workers: int
-) -> Outcome:
+def _calibrate(
+    source: str, pictures: BoardImages, target: Target, every: int, max_views: int, model: str, workers: int
+) -> CameraCalibration:
     from share.lab.calibrate.board_views import find_views
-    from share.lab.calibrate.camera_bundle import calibrate
-    from share.lab.calibrate.camera_report import Outcome
-    from share.lab.calibrate.camera_start import enough
-    from share.lab.calibrate.camera_verdict import choose, coverage, judge, typical_miss
+    from share.lab.calibrate.camera_bundle import calibrate_cameras
+    from share.lab.calibrate.camera_initialisation import has_enough_corners
+    from share.lab.calibrate.camera_report import CameraCalibration
+    from share.lab.calibrate.camera_verdict import choose_views, coverage, judge_cameras, median_epipolar_px
 
     with Stages() as stages:
         views, sizes = find_views(
@@ -108,63 +110,71 @@ def _calibrated(
             raise DataError(
                 f"{source}: pictures of {sizes[0]} and {sizes[1]}; calibrate one with --camera cam0"
             )
-        seen = [view for view in views if any(enough(target.corners[one.ids, :2]) for one in view.seen)]
-        if not seen:
+        with_target = [
+            view
+            for view in views
+            if any(has_enough_corners(target.corners[one.ids, :2]) for one in view.detections)
+        ]
+        if not with_target:
             raise DataError(
                 f"{source}: no board in {len(views)} pictures; is --target the board that was shown?"
             )
-        used = [seen[k] for k in choose(seen, target, sizes[0], most)]
+        used = [with_target[k] for k in choose_views(with_target, target, sizes[0], max_views)]
         stages("calibrating", 0, 1)
         try:
-            solution = calibrate(used, target, sizes[0], model)
+            solution = calibrate_cameras(used, target, sizes[0], model)
         except ValueError as error:
             raise DataError(f"{source}: {error}") from None
         stages("calibrating", 1, 1)
     state, rig = solution.state, pictures.rig
-    before = None
+    previous_px = None
     if len(sizes) == 2 and rig is not None and rig.cam1 is not None and rig.T_cam1_cam0 is not None:
-        before = typical_miss(rig.cam0, rig.cam1, rig.T_cam1_cam0, seen)
+        previous_px = median_epipolar_px(rig.cam0, rig.cam1, rig.T_cam1_cam0, with_target)
     covers = tuple(
-        coverage([view.seen[eye].px for view in used], T, target, sizes[0])
-        for eye, T in enumerate((state.T_cam0_target, state.T_cam1_cam0 @ state.T_cam0_target)[: len(sizes)])
+        coverage([view.detections[cam].px for view in used], T, target, sizes[0])
+        for cam, T in enumerate((state.T_cam0_target, state.T_cam1_cam0 @ state.T_cam0_target)[: len(sizes)])
     )
-    return Outcome(
-        used, solution, covers, judge(solution, covers, seen), rig, len(seen), before, pictures.said,
-        pictures.serial,
+    return CameraCalibration(
+        used, solution, covers, judge_cameras(solution, covers, with_target), rig, len(with_target),
+        previous_px, pictures.given_calibration, pictures.serial,
     )  # fmt: skip
 
 
-def _summary(outcome: Outcome, files: tuple[Path, ...]) -> str:
-    from share.lab.calibrate.camera_report import table
+def _summary(outcome: CameraCalibration, files: tuple[Path, ...]) -> str:
+    from share.lab.calibrate.camera_report import parameter_table
 
     verdict = outcome.verdict
     lines = [
-        f"{len(outcome.views)} views of {outcome.seen} that show the board",
+        f"{len(outcome.views)} views of {outcome.views_with_target} that show the board",
         "",
-        aligned(table(outcome)),
+        aligned_table(parameter_table(outcome)),
         "",
     ]
-    for eye, cover in enumerate(outcome.covers):
+    for cam, cover in enumerate(outcome.coverages):
         lines.append(
-            f"cam{eye}: {verdict.rms_px[eye]:.3f} px RMS, {verdict.rms_all_px[eye]:.3f} with the "
-            f"{verdict.wrong[eye]} corners that are left out; "
+            f"cam{cam}: {verdict.rms_px[cam]:.3f} px RMS, {verdict.rms_all_px[cam]:.3f} with the "
+            f"{verdict.outlier_corners[cam]} corners that are left out; "
             f"corners in {cover.share:.0%} of the image"
         )
-        lines += [f"  {what}" for what in cover.missing]
-        if (radius := outcome.reach(eye)) is not None:
+        lines += [f"  {what}" for what in cover.gaps]
+        if (radius := outcome.model_radius(cam)) is not None:
             lines.append(
                 f"  most corners beyond {radius:.0f} px of the principal point do not fit: there the lens is "
                 "not of this model"
             )
-    if verdict.pair_px is not None:
-        was = (
-            "" if outcome.pair_before_px is None else f" ({outcome.pair_before_px:.3f} px by the one before)"
+    if verdict.epipolar_px is not None:
+        previous_text = (
+            ""
+            if outcome.previous_epipolar_px is None
+            else f" ({outcome.previous_epipolar_px:.3f} px by the one before)"
         )
         lines.append(
-            f"the pair: half of the corners within {verdict.pair_px:.3f} px of their epipolar line{was}"
+            f"the pair: half of the corners "
+            f"within {verdict.epipolar_px:.3f} "
+            f"px of their epipolar line{previous_text}"
         )
-    if verdict.outliers:
-        names = ", ".join(outcome.views[k].name for k in verdict.outliers[:6])
-        more = ", …" if len(verdict.outliers) > 6 else ""
-        lines.append(f"{len(verdict.outliers)} views fit worse than the rest: {names}{more}")
+    if verdict.outlier_views:
+        names = ", ".join(outcome.views[k].name for k in verdict.outlier_views[:6])
+        more = ", …" if len(verdict.outlier_views) > 6 else ""
+        lines.append(f"{len(verdict.outlier_views)} views fit worse than the rest: {names}{more}")
     return "\n".join([*lines, f"{files[0].parent}: {', '.join(path.name for path in files)}"])

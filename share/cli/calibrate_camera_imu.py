@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
-from share.cli.progress import Stages
-from share.cli.table import aligned
+from share.cli.table import aligned_table
+from share.cli.terminal import Stages
 from share.errors import DataError, ShareError
 
 if TYPE_CHECKING:
     from share.geometry.camera import ImuNoise
-    from share.lab.calibrate.board_views import RigPictures
-    from share.lab.calibrate.camera_imu.verdict import Comparison
-    from share.lab.calibrate.camera_imu_report import Outcome
+    from share.lab.calibrate.board_views import RigImages
+    from share.lab.calibrate.camera_imu.verdict import MountingComparison
+    from share.lab.calibrate.camera_imu_report import CameraImuCalibration
     from share.types import F64
 
-_WORTH = 2.0  # times the stated noise: worth a word
+_WARN_NOISE_RATIO = 2.0  # times the stated noise: worth a word
 
 
 @click.command("camera-imu", short_help="Where cameras sit on an IMU, and the offset of their clocks.")
@@ -40,7 +40,7 @@ _WORTH = 2.0  # times the stated noise: worth a word
     help="Look at each N-th picture.",
 )  # fmt: skip
 @click.option(
-    "--within", type=click.FloatRange(0.01, 1.0), default=0.5, show_default=True, metavar="S",
+    "--within", "max_offset_s", type=click.FloatRange(0.01, 1.0), default=0.5, show_default=True, metavar="S",
     help="How far apart the clocks may be, s.",
 )  # fmt: skip
 @options.workers
@@ -52,7 +52,7 @@ def camera_imu(
     camera: str | None,
     imu: str | None,
     every: int,
-    within: float,
+    max_offset_s: float,
     workers: int,
     out: Path,
     as_json: bool,
@@ -67,56 +67,58 @@ def camera_imu(
     Example:  share calibrate camera-imu dance.mcap --target board.yaml --camera calib/mine \\
                 --imu calib/mine --out calib/mine
     """
-    from share.files.json_file import known
+    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, writable_dir
-    from share.files.yaml_file import text_of
+    from share.files.yaml_file import read_yaml_text
     from share.lab.calibrate import camera_imu_report as report
-    from share.lab.calibrate.board_views import open_rig_pictures
-    from share.lab.calibrate.camera_imu_report import residual_png
-    from share.lab.calibrate.camera_report import places, says_noise, written
+    from share.lab.calibrate.board_views import open_rig_images
+    from share.lab.calibrate.camera_imu_report import residual_chart
+    from share.lab.calibrate.camera_report import has_noise, output_paths, written_message
     from share.lab.calibrate.imu_table import chain_file, stated_noise
     from share.recordings.calibration import CAMCHAIN, IMU_CHAIN
 
-    pictures = open_rig_pictures(source, camera)
+    pictures = open_rig_images(source, camera)
     noise = stated_noise(source, imu, "--imu")
-    options.say_another(source, pictures.pictures.said, pictures.pictures.serial)
+    options.warn_other_device(source, pictures.images.given_calibration, pictures.images.serial)
     writable_dir(out, CAMCHAIN, IMU_CHAIN, report.REPORT, report.PICTURE)
-    outcome = _calibrated(source, pictures, noise, target_name, every, within, workers)
-    text = json.dumps(known(report.to_json(outcome)), indent=1)
+    outcome = _calibrate(source, pictures, noise, target_name, every, max_offset_s, workers)
+    text = json.dumps(nan_to_none(report.report_values(outcome)), indent=1)
     verdict = "passed" if outcome.verdict.passed else "FAILED"
-    chain, told, picture = places(out, outcome.verdict.passed, CAMCHAIN, report.REPORT, report.PICTURE)
+    chain, report_file, picture = output_paths(
+        out, outcome.verdict.passed, CAMCHAIN, report.REPORT, report.PICTURE
+    )
     imu_chain = out / IMU_CHAIN
-    atomic_write(chain, report.camchain_text(outcome, source, told.name))
+    atomic_write(chain, report.camchain_yaml(outcome, source, report_file.name))
     warnings = _warnings(outcome)
     if not imu_chain.exists():
-        as_given = None if imu is None else text_of(chain_file(imu, "--imu"))
-        atomic_write(imu_chain, as_given or report.imu_chain_text(outcome, source))
-    elif not says_noise(imu_chain, noise):
+        as_given = None if imu is None else read_yaml_text(chain_file(imu, "--imu"))
+        atomic_write(imu_chain, as_given or report.imu_chain_yaml(outcome, source))
+    elif not has_noise(imu_chain, noise):
         used = "the recording's own" if imu is None else f"that of --imu {imu}"
         warnings.append(f"{imu_chain} is of other noise and is kept; used was {used}; --imu {out} uses it")
-    atomic_write(told, text + "\n")
-    atomic_write(picture, residual_png(outcome.fit, f"{source}: {verdict}"))
-    click.echo(text if as_json else _summary(outcome, (chain, imu_chain, told, picture)))
+    atomic_write(report_file, text + "\n")
+    atomic_write(picture, residual_chart(outcome.fit, f"{source}: {verdict}"))
+    click.echo(text if as_json else _summary(outcome, (chain, imu_chain, report_file, picture)))
     for warning in warnings:
         click.echo(f"share: {source}: {warning}", err=True)
     if not outcome.verdict.passed:
         reasons = "; ".join(outcome.verdict.reasons)
-        raise ShareError(f"{source}: not to be believed ({written(chain)}): {reasons}")
+        raise ShareError(f"{source}: not to be believed ({written_message(chain)}): {reasons}")
 
 
-def _calibrated(
+def _calibrate(
     source: str,
-    pictures: RigPictures,
+    pictures: RigImages,
     noise: ImuNoise,
     target_name: str,
     every: int,
-    within: float,
+    max_offset_s: float,
     workers: int,
-) -> Outcome:
-    from share.lab.calibrate.board_views import find_stamped
-    from share.lab.calibrate.camera_imu.fit import fit
-    from share.lab.calibrate.camera_imu.verdict import compare, judge
-    from share.lab.calibrate.camera_imu_report import Outcome
+) -> CameraImuCalibration:
+    from share.lab.calibrate.board_views import find_stamped_views
+    from share.lab.calibrate.camera_imu.fit import fit_camera_imu
+    from share.lab.calibrate.camera_imu.verdict import compare_mountings, judge_camera_imu
+    from share.lab.calibrate.camera_imu_report import CameraImuCalibration
     from share.lab.calibrate.imu_table import read_imu
     from share.lab.calibrate.target import named_target
 
@@ -125,63 +127,79 @@ def _calibrated(
         table = read_imu(source, partial(stages, "reading the IMU"))
         if not len(table.imu):
             raise DataError(f"{source}: has no IMU")
-        seen = find_stamped(pictures, target, every, partial(stages, "looking for the board"), workers)
-        found = fit(
-            seen.stamps, seen.views, target, pictures.rig, table.imu, noise, within,
-            partial(stages, "fitting"), pictures.doubt.covariance,
+        views = find_stamped_views(pictures, target, every, partial(stages, "looking for the board"), workers)
+        result = fit_camera_imu(
+            views.stamps, views.views, target, pictures.rig, table.imu, noise, max_offset_s,
+            partial(stages, "fitting"), pictures.uncertainty.covariance,
         )  # fmt: skip
-    before = None if pictures.before is None else compare(found.T_imu_cam0, pictures.before)
-    of = pictures.pictures
-    return Outcome(found, judge(found), pictures.rig, pictures.doubt, noise, before, seen, of.said, of.serial)
+    comparison = (
+        None
+        if pictures.given_T_imu_cam0 is None
+        else compare_mountings(result.T_imu_cam0, pictures.given_T_imu_cam0)
+    )
+    images = pictures.images
+    return CameraImuCalibration(
+        result,
+        judge_camera_imu(result),
+        pictures.rig,
+        pictures.uncertainty,
+        noise,
+        comparison,
+        views,
+        images.given_calibration,
+        images.serial,
+    )
 
 
-def _summary(outcome: Outcome, files: tuple[Path, ...]) -> str:
+def _summary(outcome: CameraImuCalibration, files: tuple[Path, ...]) -> str:
     import numpy as np
 
     from share.geometry import se3
 
     fit, verdict = outcome.fit, outcome.verdict
-    turn = np.degrees(se3.so3_log(fit.T_imu_cam0[:3, :3]))
+    rotation_deg = np.degrees(se3.so3_log(fit.T_imu_cam0[:3, :3]))
     rows = [
         ["", "", "x", "y", "z"],
-        ["rotation of cam0", "deg", *_cells(turn, np.degrees(fit.sigma_rotation), 3)],
+        ["rotation of cam0", "deg", *_cells(rotation_deg, np.degrees(fit.sigma_rotation), 3)],
         ["position of cam0", "mm", *_cells(fit.T_imu_cam0[:3, 3] * 1e3, fit.sigma_position * 1e3, 2)],
     ]
     shift = f"{fit.shift_s * 1e3:+.3f} ± {fit.sigma_shift * 1e3:.3f} ms"
     lines = [
-        f"{outcome.pictures.with_target} of {outcome.pictures.looked} pictures show the board, "
+        f"{outcome.views.with_target} of {outcome.views.images_searched} pictures show the board, "
         f"{fit.state.curve.end_s:.1f} s",
         "",
-        aligned(rows),
+        aligned_table(rows),
         "in the IMU's frame (rotation vector); ± one sigma",
         "",
         f"time offset: {shift} (t_imu = t_cam + offset)",
-        _of_cameras(outcome),
+        _camera_sigmas_text(outcome),
         *(
-            f"cam{eye}: {rms:.3f} px RMS, {wrong} of {len(r)} corners left out"
-            for eye, (rms, wrong, r) in enumerate(
-                zip(verdict.rms_px, verdict.wrong, fit.corners, strict=True)
+            f"cam{cam}: {rms:.3f} px RMS, {wrong} of {len(r)} corners left out"
+            for cam, (rms, wrong, r) in enumerate(
+                zip(verdict.rms_px, verdict.outlier_corners, fit.corners, strict=True)
             )
         ),
-        f"gyroscope: residuals {verdict.gyro:.2f} times its stated noise; turned by "
-        f"{_list(verdict.turning)} rad/s rms",
-        f"accelerometer: {verdict.accel:.2f} times; moved by {_list(verdict.moving)} m/s^2 rms; "
+        f"gyroscope: residuals {verdict.gyro_noise_ratio:.2f} times its stated noise; turned by "
+        f"{_comma_list(verdict.rotation_rate_rms)} rad/s rms",
+        f"accelerometer: {verdict.accel_noise_ratio:.2f} times; "
+        f"moved by {_comma_list(verdict.acceleration_rms)} "
+        f"m/s^2 rms; "
         f"gravity {np.linalg.norm(fit.state.gravity):.4f} m/s^2",
         f"{files[0].parent}: {', '.join(path.name for path in files)}",
     ]
     return "\n".join(lines)
 
 
-def _of_cameras(outcome: Outcome) -> str:
+def _camera_sigmas_text(outcome: CameraImuCalibration) -> str:
     """What of the sigmas comes from the cameras' own."""
-    from share.lab.calibrate.camera_imu.verdict import largest
+    from share.lab.calibrate.camera_imu.verdict import largest_sigmas
 
-    fit, doubt = outcome.fit, outcome.doubt
+    fit, uncertainty = outcome.fit, outcome.uncertainty
     if fit.by_rig is None:
-        return f"cameras: taken as exact, the sigmas leave their errors out ({doubt.where})"
-    deg, mm, ms = largest(fit.sigmas_of(fit.by_rig))
+        return f"cameras: taken as exact, the sigmas leave their errors out ({uncertainty.source})"
+    deg, mm, ms = largest_sigmas(fit.axis_sigmas(fit.by_rig))
     return (
-        f"cameras: as well known as {doubt.where} says; of the sigmas that is up to "
+        f"cameras: as well known as {uncertainty.source} says; of the sigmas that is up to "
         f"{deg:.3f} deg, {mm:.2f} mm, {ms:.3f} ms"
     )
 
@@ -190,40 +208,45 @@ def _cells(values: F64, errors: F64, digits: int) -> list[str]:
     return [f"{v:+.{digits}f} ± {e:.{digits}f}" for v, e in zip(values, errors, strict=True)]
 
 
-def _list(values: F64) -> str:
+def _comma_list(values: F64) -> str:
     return ", ".join(f"{value:.2f}" for value in values)
 
 
-def _warnings(outcome: Outcome) -> list[str]:
+def _warnings(outcome: CameraImuCalibration) -> list[str]:
     """What a person ought to know before believing it: a line each."""
     verdict = outcome.verdict
-    out = _of_given(outcome.before)
-    if not outcome.doubt.passed:
-        out.append(f"{outcome.doubt.where} does not believe these cameras; calibrate them again first")
-    if dropped := outcome.pictures.dropped:
+    out = _comparison_warnings(outcome.comparison)
+    if not outcome.uncertainty.passed:
+        out.append(f"{outcome.uncertainty.source} does not believe these cameras; calibrate them again first")
+    if dropped := outcome.views.dropped:
         out.append(
             f"{dropped} pictures of the board are left out: their stamps are not later than those before"
         )
     return out + [
         f"{name} errs by {times:.1f} times its stated noise: scale, axes, or the board's size; the sigmas "
         "take that into account"
-        for name, times in (("gyroscope", verdict.gyro), ("accelerometer", verdict.accel))
-        if times > _WORTH and verdict.passed
+        for name, times in (
+            ("gyroscope", verdict.gyro_noise_ratio),
+            ("accelerometer", verdict.accel_noise_ratio),
+        )
+        if times > _WARN_NOISE_RATIO and verdict.passed
     ]
 
 
-def _of_given(before: Comparison | None) -> list[str]:
+def _comparison_warnings(comparison: MountingComparison | None) -> list[str]:
     """How the calibration that was there before compares."""
-    if before is None:
+    if comparison is None:
         return []
-    if before.inverted:
+    if comparison.inverted:
         return [
             "the extrinsics that were given are inverted: what stands there as T_cam_imu is T_imu_cam, or "
             "the other way round; the new file has it right"
         ]
-    if before.far:
+    if comparison.is_far:
         return [
-            f"cam0 sits {before.shifted_mm:.0f} mm and {before.turned_deg:.1f} deg from where the given "
+            f"cam0 sits {comparison.shifted_mm:.0f} mm and "
+            f"{comparison.turned_deg:.1f} "
+            f"deg from where the given "
             "calibration has it"
         ]
     return []

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
-from share.cli.progress import Stages
-from share.cli.table import aligned
+from share.cli.table import aligned_table
+from share.cli.terminal import Stages
 
 if TYPE_CHECKING:
-    from share.lab.calibrate.imu import ImuNature
-    from share.lab.calibrate.imu_report import Row
+    from share.lab.calibrate.imu import ImuCharacteristics
+    from share.lab.calibrate.imu_report import NoiseRow
 
-_FAR = 2.0  # times the profile's figure, or part of it: worth a word
-_LETTERS = {"density": "N", "instability": "B", "walk": "K"}
+_WARN_RATIO = 2.0  # times the profile's figure, or part of it: worth a word
+_SYMBOLS = {"density": "N", "instability": "B", "walk": "K"}
 
 
 @click.command(short_help="Noise and bias of an IMU, from a recording at rest.")
@@ -39,45 +39,61 @@ def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_jso
     \b
     Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine
     """
-    from share.files.json_file import known
+    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, writable_dir
     from share.lab.calibrate import imu_report
     from share.lab.calibrate.imu import characterise
-    from share.lab.calibrate.imu_report import allan_png
+    from share.lab.calibrate.imu_report import allan_chart
     from share.lab.calibrate.imu_table import read_imu
-    from share.sensors.profile import profile
+    from share.sensors.profile import load_profile
 
-    stated = profile(profile_name) if profile_name else None
+    device_profile = load_profile(profile_name) if profile_name else None
     writable_dir(out, "kalibr_imu_chain.yaml", "imu-report.json", "imu-report.png")
     with Stages() as stages:
         table = read_imu(source, lambda done, total: stages("reading", done, total))
         stages("Allan deviation", 0, 1)
-        nature = characterise(table.imu)
+        characteristics = characterise(table.imu)
         stages("Allan deviation", 1, 1)
-    report = imu_report.to_json(nature, source, stated, inflate) | {"dropped": table.dropped}
-    text = json.dumps(known(report), indent=1)
-    atomic_write(out / "kalibr_imu_chain.yaml", imu_report.kalibr_text(nature, source, inflate, table.serial))
+    report = imu_report.report_values(characteristics, source, device_profile, inflate) | {
+        "dropped": table.dropped
+    }
+    text = json.dumps(nan_to_none(report), indent=1)
+    atomic_write(
+        out / "kalibr_imu_chain.yaml",
+        imu_report.imu_chain_yaml(characteristics, source, inflate, table.serial),
+    )
     atomic_write(out / "imu-report.json", text + "\n")
     atomic_write(
-        out / "imu-report.png", allan_png(nature, stated, f"{source}, {nature.rest_s:.0f} s at rest")
+        out / "imu-report.png",
+        allan_chart(characteristics, device_profile, f"{source}, {characteristics.rest_s:.0f} s at rest"),
     )
-    rows = imu_report.rows(nature, stated)
-    click.echo(text if as_json else _summary(nature, rows, table.dropped))
-    for warning in _warnings(nature, rows):
+    rows = imu_report.noise_rows(characteristics, device_profile)
+    click.echo(text if as_json else _summary(characteristics, rows, table.dropped))
+    for warning in _warnings(characteristics, rows):
         click.echo(f"share: {source}: {warning}", err=True)
 
 
-def _summary(nature: ImuNature, rows: list[Row], dropped: int) -> str:
-    from share.lab.calibrate.imu_report import STANDARD_GRAVITY, gravity
+def _summary(characteristics: ImuCharacteristics, rows: list[NoiseRow], dropped: int) -> str:
+    from share.lab.calibrate.imu_report import STANDARD_GRAVITY, gravity_norm
 
-    heads = ["", "", "x", "y", "z", "all", *(["profile", "ratio"] if any(r.stated for r in rows) else [])]
-    norm, bias = gravity(nature), ", ".join(f"{b:+.5f}" for b in nature.gyro.mean)
+    heads = [
+        "",
+        "",
+        "x",
+        "y",
+        "z",
+        "all",
+        *(["profile", "ratio"] if any(r.profile_value for r in rows) else []),
+    ]
+    norm, bias = gravity_norm(characteristics), ", ".join(f"{b:+.5f}" for b in characteristics.gyro.mean)
     return "\n".join(
         [
-            f"{nature.rest_s:.0f} s at rest of {nature.total_s:.0f} s, {nature.rate_hz:.2f} Hz; "
-            f"{nature.missing} samples lost in {nature.gaps} gaps, {dropped} out of order",
+            f"{characteristics.rest_s:.0f} s at rest of "
+            f"{characteristics.total_s:.0f} s, "
+            f"{characteristics.rate_hz:.2f} Hz; "
+            f"{characteristics.missing} samples lost in {characteristics.gaps} gaps, {dropped} out of order",
             "",
-            aligned([heads, *([_name(row), row.unit, *_cells(row)][: len(heads)] for row in rows)]),
+            aligned_table([heads, *([_row_name(row), row.unit, *_cells(row)][: len(heads)] for row in rows)]),
             "",
             "N: white noise, B: bias instability, K: random walk of the bias",
             "± one sigma; < where the recording does not tell it, by 95 %",
@@ -88,32 +104,42 @@ def _summary(nature: ImuNature, rows: list[Row], dropped: int) -> str:
     )
 
 
-def _name(row: Row) -> str:
-    return f"{row.sensor} {_LETTERS[row.figure]}"
+def _row_name(row: NoiseRow) -> str:
+    return f"{row.sensor} {_SYMBOLS[row.quantity]}"
 
 
-def _cells(row: Row) -> list[str]:
-    stated = "" if row.stated is None else f"{row.stated:.3g}"
-    ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
-    return [*(figure.text for figure in (*row.axes, row.together)), stated, ratio]
+def _cells(row: NoiseRow) -> list[str]:
+    stated = "" if row.profile_value is None else f"{row.profile_value:.3g}"
+    ratio = "" if row.ratio_to_profile is None else f"{row.ratio_to_profile:.2f}"
+    return [*(figure.text for figure in (*row.axes, row.combined)), stated, ratio]
 
 
-def _warnings(nature: ImuNature, rows: list[Row]) -> list[str]:
+def _warnings(characteristics: ImuCharacteristics, rows: list[NoiseRow]) -> list[str]:
     """What a person ought to know before believing it: a line each."""
     out = []
-    if nature.total_s - nature.rest_s > 10:
+    if characteristics.total_s - characteristics.rest_s > 10:
         out.append(
-            f"it was moved; what is used is the rest from {nature.start_s:.0f} to "
-            f"{nature.start_s + nature.rest_s:.0f} s after its start"
+            f"it was moved; what is used is the rest from {characteristics.start_s:.0f} to "
+            f"{characteristics.start_s + characteristics.rest_s:.0f} s after its start"
         )
-    if nature.cuts:
-        out.append(f"{nature.cuts} gaps are too long to be bridged: averages do not go across them")
+    if characteristics.unbridged_gaps:
+        out.append(
+            f"{characteristics.unbridged_gaps} gaps are too "
+            f"long to be bridged: averages "
+            f"do not go across them"
+        )
     for row in rows:
-        if row.ratio is not None and not 1 / _FAR <= row.ratio <= _FAR:
-            out.append(f"{_name(row)} is {row.ratio:.2g} times the profile's {row.stated:.2g} {row.unit}")
-        if row.figure == "walk" and not row.together.told:
+        if row.ratio_to_profile is not None and not 1 / _WARN_RATIO <= row.ratio_to_profile <= _WARN_RATIO:
             out.append(
-                f"{_name(row)} is not told by {nature.rest_s / 60:.0f} min; the file has an upper bound, "
+                f"{_row_name(row)} is "
+                f"{row.ratio_to_profile:.2g} times "
+                f"the profile's {row.profile_value:.2g} {row.unit}"
+            )
+        if row.quantity == "walk" and not row.combined.told:
+            out.append(
+                f"{_row_name(row)} is not told by "
+                f"{characteristics.rest_s / 60:.0f} "
+                f"min; the file has an upper bound, "
                 "three hours would tell"
             )
     return out

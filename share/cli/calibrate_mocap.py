@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
-from share.cli.progress import Stages
+from share.cli.terminal import Stages
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.lab.calibrate.handeye import Check
-    from share.lab.mocap.fit import Fit
-    from share.lab.mocap.mocap import Mocap
+    from share.lab.calibrate.handeye import HandEyeCheck
+    from share.lab.mocap.fit import MocapFit
+    from share.lab.mocap.trajectory import MocapTrajectory
     from share.types import F64
 
 
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 @click.option("--one-clock", is_flag=True, help="Both were stamped by one clock.")
 @click.option(
     "--within",
+    "max_offset_s",
     type=click.FloatRange(min=0.01),
     default=0.5,
     show_default=True,
@@ -67,7 +68,7 @@ def mocap(
     calib: str | None,
     track: Path | None,
     one_clock: bool,
-    within: float,
+    max_offset_s: float,
     sigma_mm: float,
     out: Path,
     as_json: bool,
@@ -78,74 +79,78 @@ def mocap(
     \b
     Example:  share calibrate mocap walk.mcap --truth walk.vicon.tum --out calib/mine
     """
-    from share.files.json_file import known
+    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, writable_dir
     from share.lab.calibrate.imu_table import read_imu, stated_noise
     from share.lab.mocap.files import pick_body, read_bodies
-    from share.lab.mocap.fit import fit
-    from share.lab.mocap.report import mocap_json, mocap_text
-    from share.lab.mocap.state import FitOptions
-    from share.lab.mocap.verdict import check_fit, doubts
+    from share.lab.mocap.fit import fit_mocap
+    from share.lab.mocap.report import mocap_yaml, report_values
+    from share.lab.mocap.state import MocapFitOptions
+    from share.lab.mocap.verdict import check_fit, fit_warnings
 
-    chosen = FitOptions(sigma_position=sigma_mm * 1e-3, within_s=within)
+    fit_options = MocapFitOptions(sigma_position=sigma_mm * 1e-3, within_s=max_offset_s)
     if one_clock:
-        chosen = replace(chosen, within_s=0.0, offset_sigma=1e-5, drift_sigma=1e-8)
+        fit_options = replace(fit_options, within_s=0.0, offset_sigma=1e-5, drift_sigma=1e-8)
     noise, bodies = stated_noise(source, calib, "--calib"), read_bodies(truth, rotations)
-    _, seen = pick_body(str(truth), bodies, body, Path(source).stem, "--body BODY")
+    _, trajectory = pick_body(str(truth), bodies, body, Path(source).stem, "--body BODY")
     writable_dir(out, "mocap.yaml", "mocap-report.json")
     with Stages() as stages:
         table = read_imu(source, lambda done, total: stages("reading", done, total))
         stages("fitting", 0, 1)
-        found = fit(table.imu, noise, seen, chosen)
-        check_fit(found)
+        result = fit_mocap(table.imu, noise, trajectory, fit_options)
+        check_fit(result)
         stages("fitting", 1, 1)
-    checked = _check(found, track, seen) if track else None
-    report = json.dumps(known(mocap_json(found, source, str(truth), checked)), indent=1)
-    atomic_write(out / "mocap.yaml", mocap_text(found, source, str(truth)))
+    hand_eye_check = _check_with_track(result, track, trajectory) if track else None
+    report = json.dumps(nan_to_none(report_values(result, source, str(truth), hand_eye_check)), indent=1)
+    atomic_write(out / "mocap.yaml", mocap_yaml(result, source, str(truth)))
     atomic_write(out / "mocap-report.json", report + "\n")
-    click.echo(report if as_json else _summary(found, checked))
-    for doubt in doubts(found):
-        click.echo(f"share: {source}: {doubt}", err=True)
-    if checked and not checked.agrees:
+    click.echo(report if as_json else _summary(result, hand_eye_check))
+    for warning in fit_warnings(result):
+        click.echo(f"share: {source}: {warning}", err=True)
+    if hand_eye_check and not hand_eye_check.agrees:
         click.echo(f"share: {track}: does not agree with the fit; is it of this recording?", err=True)
 
 
-def _check(found: Fit, track: Path, seen: Mocap) -> Check:
-    from share.lab.calibrate.handeye import check
+def _check_with_track(result: MocapFit, track: Path, trajectory: MocapTrajectory) -> HandEyeCheck:
+    from share.lab.calibrate.handeye import check_mounting
     from share.recordings.trajectory import read_tum
 
     if not track.is_file():
         raise UsageError(f"--track {track}: no such file")
-    own, shifted = read_tum(track), seen.shifted(found.offset_ns)
-    both = shifted.known(own.stamps_ns)
-    stamps = own.stamps_ns[both]
-    return check(found.T_body_mocap, stamps, own.T[both], shifted.at(stamps))
+    track_poses, shifted = read_tum(track), trajectory.shifted(result.offset_ns)
+    is_known = shifted.is_covered(track_poses.stamps_ns)
+    stamps = track_poses.stamps_ns[is_known]
+    return check_mounting(result.T_body_mocap, stamps, track_poses.T[is_known], shifted.interpolate(stamps))
 
 
-def _summary(found: Fit, checked: Check | None) -> str:
+def _summary(result: MocapFit, hand_eye_check: HandEyeCheck | None) -> str:
     import numpy as np
 
     from share.geometry import se3
-    from share.lab.mocap.verdict import sigmas
+    from share.lab.mocap.verdict import shared_sigmas
 
-    T, left, sigma = found.T_body_mocap, found.residuals, sigmas(found)
-    turn = np.degrees(se3.so3_log(T[:3, :3]))
+    T, residuals, sigma = result.T_body_mocap, result.residuals, shared_sigmas(result)
+    rotation_deg = np.degrees(se3.so3_log(T[:3, :3]))
     lines = [
-        f"body rotation   {_triple(turn, np.degrees(sigma[2:5]), 2)} deg (rotation vector)",
-        f"body position   {_triple(T[:3, 3] * 1e3, sigma[5:8] * 1e3, 1)} mm, in the IMU's frame",
-        f"world tilt      {found.tilt_deg:.3f} ± {np.degrees(sigma[:2].max()):.3f} deg, its {found.up} up",
-        f"clock           IMU's less mocap's {found.offset_ns * 1e-6:+.2f} ± {sigma[8] * 1e3:.2f} ms, "
-        f"drift {found.drift_ppm:+.1f} ± {sigma[9] * 1e6:.1f} ppm",
-        f"left            {left.position_mm:.1f} mm, {left.rotation_deg:.2f} deg rms of {left.samples} "
-        f"poses, {100 * left.doubted:.1f} % doubted",
+        f"body rotation   {_triple_text(rotation_deg, np.degrees(sigma[2:5]), 2)} deg (rotation vector)",
+        f"body position   {_triple_text(T[:3, 3] * 1e3, sigma[5:8] * 1e3, 1)} mm, in the IMU's frame",
+        f"world tilt      {result.tilt_deg:.3f} ± {np.degrees(sigma[:2].max()):.3f} deg, its {result.up} up",
+        f"clock           IMU's less mocap's {result.offset_ns * 1e-6:+.2f} ± {sigma[8] * 1e3:.2f} ms, "
+        f"drift {result.drift_ppm:+.1f} ± {sigma[9] * 1e6:.1f} ppm",
+        f"left            {residuals.position_mm:.1f} mm, "
+        f"{residuals.rotation_deg:.2f} "
+        f"deg rms of {residuals.samples} "
+        f"poses, {100 * residuals.doubted:.1f} % doubted",
     ]
-    if checked:
+    if hand_eye_check:
         lines.append(
-            f"hand-eye        by the track: {np.degrees(checked.turned):.2f} deg and "
-            f"{checked.shifted * 1e3:.1f} mm from that, {checked.sigmas:.1f} standard errors"
+            f"hand-eye        by the track: {np.degrees(hand_eye_check.rotation_error_rad):.2f} deg and "
+            f"{hand_eye_check.translation_error_m * 1e3:.1f} mm "
+            f"from that, {hand_eye_check.sigmas:.1f} "
+            f"standard errors"
         )
     return "\n".join(lines)
 
 
-def _triple(values: F64, errors: F64, digits: int) -> str:
+def _triple_text(values: F64, errors: F64, digits: int) -> str:
     return "  ".join(f"{v:+.{digits}f} ± {e:.{digits}f}" for v, e in zip(values, errors, strict=True))

@@ -41,28 +41,30 @@ def target(
     import yaml
 
     from share.files.writing import atomic_write, check_replaceable, check_writable
-    from share.lab.calibrate.camera_report import says_target
-    from share.lab.calibrate.target import to_plain
-    from share.lab.calibrate.target_sheet import USUAL, pdf, sheet, words
+    from share.lab.calibrate.camera_report import has_target
+    from share.lab.calibrate.target import target_mapping
+    from share.lab.calibrate.target_sheet import DEFAULT_SIZES, describe_sheet, make_sheet, sheet_pdf
 
     if out.suffix.lower() != ".pdf":
         raise UsageError(f"--out {out}: expected a name that ends in .pdf")
-    usual = USUAL[kind]
+    default_size = DEFAULT_SIZES[kind]
     try:
-        made = sheet(kind, columns or usual[0], rows or usual[1], paper, size)
+        target_sheet = make_sheet(kind, columns or default_size[0], rows or default_size[1], paper, size)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    known_as = out.with_suffix(".yaml")
+    yaml_file = out.with_suffix(".yaml")
     check_writable(out)
-    check_replaceable(known_as)
-    there = known_as.exists()
-    if there and not says_target(known_as, made.target):
+    check_replaceable(yaml_file)
+    yaml_exists = yaml_file.exists()
+    if yaml_exists and not has_target(yaml_file, target_sheet.target):
         raise UsageError(
-            f"{known_as}: is of another board, or its size was mended, and is kept; give another --out, or "
+            f"{yaml_file}: is of another board, or its size was mended, and is kept; give another --out, or "
             "move it away"
         )
-    atomic_write(out, pdf(made))
-    if not there:
-        atomic_write(known_as, yaml.safe_dump(to_plain(made.target), sort_keys=False))
-    click.echo(f"{words(made)}, on {paper} ({made.width:g} x {made.height:g} mm)")
-    click.echo(f"print: {out}   for --target: {known_as}")
+    atomic_write(out, sheet_pdf(target_sheet))
+    if not yaml_exists:
+        atomic_write(yaml_file, yaml.safe_dump(target_mapping(target_sheet.target), sort_keys=False))
+    click.echo(
+        f"{describe_sheet(target_sheet)}, on {paper} ({target_sheet.width:g} x {target_sheet.height:g} mm)"
+    )
+    click.echo(f"print: {out}   for --target: {yaml_file}")

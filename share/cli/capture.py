@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli import live, options
-from share.cli.progress import LiveLine
+from share.cli import camera_options, options
+from share.cli.terminal import LiveLine
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.runtime.capture import Status
+    from share.runtime.capture import CaptureStatus
 
 
 @click.command()
 @click.argument("source", default="realsense")
-@live.profile
+@camera_options.profile
 @click.option("--out", required=True, metavar="REC.mcap", type=click.Path(path_type=Path), help="Recording.")
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after so long.")
-@live.mode
+@camera_options.mode
 @click.option(
     "--calib",
     metavar="DIR",
@@ -56,45 +56,52 @@ def capture(
     \b
     Example:  share capture --out walk.mcap --seconds 60
     """
-    from share.cameras.handover import Handover
-    from share.cameras.realsense.live import feed_of
-    from share.cameras.realsense.streams import Wanted
+    from share.cameras.realsense.source import make_feed
+    from share.cameras.realsense.streams import StreamRequest
+    from share.cameras.sample_queue import SampleQueue
     from share.config import SequencerConfig
     from share.runtime.capture import Capture
-    from share.runtime.source import calibration_of
-    from share.runtime.stop import on_stop
-    from share.sensors.profile import profile
+    from share.runtime.signals import stop_on_signal
+    from share.runtime.source import read_given_calibration
+    from share.sensors.profile import load_profile
 
     if depth and imu_only:
         raise UsageError("--depth, --imu-only: give one of them")
     if calib is not None and imu_only:
         raise UsageError("--calib, --imu-only: give one of them; there are no images to be calibrated")
-    wanted = Wanted(profile(profile_name or live.PROFILE, mode), images=not imu_only, depth=depth)
-    given, line = calibration_of(calib), LiveLine()
+    request = StreamRequest(
+        load_profile(profile_name or camera_options.PROFILE, mode), images=not imu_only, depth=depth
+    )
+    given_calibration, line = read_given_calibration(calib), LiveLine()
 
-    def say(text: str) -> None:
-        line.say(f"share: {text}")
+    def print_line(text: str) -> None:
+        line.print_line(f"share: {text}")
 
-    feed = feed_of(source, wanted, SequencerConfig(), say, Handover())
-    run = Capture(feed, out, min_free_gb, say, lambda status: line.write(_live(status)), given)
-    with on_stop(run.stop):
-        report = run.go(seconds)
+    feed = make_feed(source, request, SequencerConfig(), print_line, SampleQueue())
+    run = Capture(
+        feed, out, min_free_gb, print_line, lambda status: line.write(_status_text(status)), given_calibration
+    )
+    with stop_on_signal(run.stop):
+        report = run.run(seconds)
     line.end()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
-def _live(status: Status) -> str:
-    lasts = "" if status.minutes == float("inf") else f" ({status.minutes:.0f} min)"
-    return f"{status.feed}  {status.mb_s:.1f} MB/s  {status.free_gb:.1f} GB free{lasts}"
+def _status_text(status: CaptureStatus) -> str:
+    time_left = "" if status.minutes == float("inf") else f" ({status.minutes:.0f} min)"
+    return f"{status.feed}  {status.mb_s:.1f} MB/s  {status.free_gb:.1f} GB free{time_left}"
 
 
 def _summary(report: dict[str, Any]) -> str:
-    from share.cli.table import aligned
+    from share.cli.table import aligned_table
 
     head = ["stream", "samples", "seconds", "gaps", "missing", "backward", "dropped"]
-    rows = [[name, *(f"{told[key]:g}" for key in head[1:])] for name, told in report["streams"].items()]
-    notes = live.met(report)
-    lines = [aligned([head, *rows]), f"{report['imu']} IMU samples joined" + (f"; {notes}" if notes else "")]
+    rows = [[name, *(f"{stream[key]:g}" for key in head[1:])] for name, stream in report["streams"].items()]
+    notes = camera_options.camera_events(report)
+    lines = [
+        aligned_table([head, *rows]),
+        f"{report['imu']} IMU samples joined" + (f"; {notes}" if notes else ""),
+    ]
     if report["foreign"]:
         lines.append(
             f"{report['foreign']} stamps are of the host's clock, not of the camera's: see docs/capture.md"

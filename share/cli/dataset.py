@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from share.cli import dataset_align, dataset_map, options
-from share.cli.progress import progress
+from share.cli.terminal import progress
 from share.errors import UsageError
 
 
@@ -39,18 +39,18 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
               share dataset info session/ann --json
               share dataset info room.sqlite
     """
-    from share.recordings.describe import describe
+    from share.recordings.describe import describe_recording
     from share.runtime.source import open_source
     from share.store.map_store import is_map
 
     if is_map(Path(source)):
         if calib or frames:
             raise UsageError(f"{source}: is a map; --calib and --frames are for recordings")
-        found = dataset_map.info(Path(source))
-        click.echo(json.dumps(found) if as_json else dataset_map.info_text(found))
+        map_info = dataset_map.map_info(Path(source))
+        click.echo(json.dumps(map_info) if as_json else dataset_map.map_info_text(map_info))
         return
-    description = describe(open_source(source, calib, frames))
-    click.echo(json.dumps(description) if as_json else _text(description))
+    description = describe_recording(open_source(source, calib, frames))
+    click.echo(json.dumps(description) if as_json else _description_text(description))
 
 
 @dataset.command(short_help="Write a recording as MCAP or as an EuRoC/ASL folder.")
@@ -80,20 +80,20 @@ def convert(
     from share.recordings.convert import to_euroc, to_mcap
     from share.runtime.source import open_source
 
-    target = Path(out)
+    out_file = Path(out)
     if kind == "euroc" and jpeg is not None:
         raise UsageError("--jpeg: goes with --format mcap only")
     if kind == "mcap":
-        _check_mcap(check_replaceable(target), source)
+        _check_mcap(check_replaceable(out_file), source)
     opened = open_source(source, calib, frames)
-    options.say_notes(opened)
+    options.print_notes(opened)
     with progress(opened.images_count, "converting") as bar:
         if kind == "mcap":
-            to_mcap(opened, target, jpeg, bar)
+            to_mcap(opened, out_file, jpeg, bar)
         else:
-            to_euroc(opened, target, bar)
-    options.say_losses(opened)
-    click.echo(f"{target}: {opened.images_count} frames")
+            to_euroc(opened, out_file, bar)
+    options.print_losses(opened)
+    click.echo(f"{out_file}: {opened.images_count} frames")
 
 
 @dataset.command(short_help="Save what is whole of a broken recording.")
@@ -108,15 +108,15 @@ def recover(broken: str, out: str, as_json: bool) -> None:
     \b
     Example:  share dataset recover walk.mcap.part --out walk.mcap
     """
-    from share.recordings.mcap.recover import recover as run
+    from share.recordings.mcap.recover import recover_recording as run
 
-    path, target = Path(broken), Path(out)
+    path, out_file = Path(broken), Path(out)
     if not path.is_file():
         raise UsageError(f"{broken}: no such file")
-    _check_mcap(target, broken)
+    _check_mcap(out_file, broken)
     with progress(path.stat().st_size, "recovering") as bar:
-        result = run(path, target, bar)
-    click.echo(json.dumps(result._asdict()) if as_json else _recovered(path, target, result))
+        result = run(path, out_file, bar)
+    click.echo(json.dumps(result._asdict()) if as_json else _recovery_text(path, out_file, result))
 
 
 def _check_mcap(out: Path, source: str) -> None:
@@ -126,7 +126,7 @@ def _check_mcap(out: Path, source: str) -> None:
         raise UsageError(f"--out {out}: is the source itself; give another name")
 
 
-def _recovered(broken: Path, out: Path, result: Any) -> str:
+def _recovery_text(broken: Path, out: Path, result: Any) -> str:
     lines = [f"{out}: {sum(result.messages.values())} messages saved"]
     lines += [f"  {topic:<34} {count:>8}" for topic, count in sorted(result.messages.items())]
     if result.reason:
@@ -136,7 +136,7 @@ def _recovered(broken: Path, out: Path, result: Any) -> str:
     return "\n".join(lines)
 
 
-def _text(d: dict[str, Any]) -> str:
+def _description_text(d: dict[str, Any]) -> str:
     device = f", device {d['serial']}" if d["serial"] else ""
     lines = [f"{d['name']}: {d['kind']}, {d['duration_s']:.1f} s{device}"]
     for name, s in d["streams"].items():
@@ -146,7 +146,7 @@ def _text(d: dict[str, Any]) -> str:
         lines.append(line + "".join(f", {s[k]} {k}" for k in ("duplicates", "backward") if s[k]))
     for name in ("cam0", "cam1", "depth"):
         if name in d["calibration"]:
-            lines.append(f"  {name:<6} {_camera(d['calibration'][name])}")
+            lines.append(f"  {name:<6} {_camera_text(d['calibration'][name])}")
     if "baseline_m" in d["calibration"]:
         lines.append(f"  baseline {100 * d['calibration']['baseline_m']:.2f} cm")
     if shift := d["calibration"].get("timeshift_s", 0.0):
@@ -160,8 +160,8 @@ def _text(d: dict[str, Any]) -> str:
     return "\n".join(lines + [f"  note: {note}" for note in d["notes"]])
 
 
-def _camera(camera: dict[str, Any]) -> str:
+def _camera_text(camera: dict[str, Any]) -> str:
     (width, height), (fx, fy, *_) = camera["resolution"], camera["intrinsics"]
-    named = "fisheye" if camera["lens"] == "equidistant" else "radial-tangential"
-    distortion = named if camera["distortion"] else "no distortion"
+    lens_name = "fisheye" if camera["lens"] == "equidistant" else "radial-tangential"
+    distortion = lens_name if camera["distortion"] else "no distortion"
     return f"{width}x{height}, f {fx:.1f} {fy:.1f} px, {camera['fov_deg']:.0f} deg wide, {distortion}"

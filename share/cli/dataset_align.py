@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.progress import Stages
-from share.cli.table import aligned
+from share.cli.table import aligned_table
+from share.cli.terminal import Stages
 from share.errors import DataError, UsageError
 
 if TYPE_CHECKING:
-    from share.lab.mocap.mocap import Mocap
-    from share.lab.mocap.session import Device
-    from share.lab.mocap.state import FitOptions
+    from share.lab.mocap.session import AlignedRecording
+    from share.lab.mocap.state import MocapFitOptions
+    from share.lab.mocap.trajectory import MocapTrajectory
 
-_CLOCK = ("device", "offset s", "± ms", "drift ppm", "alike", "next")
-_MOUNTING = ("body deg", "±", "body mm", "±", "up", "tilt deg")
-_LEFT = ("left mm", "left deg", "doubted %", "gaps", "truth s")
+_CLOCK_COLUMNS = ("device", "offset s", "± ms", "drift ppm", "alike", "next")
+_MOUNTING_COLUMNS = ("body deg", "±", "body mm", "±", "up", "tilt deg")
+_RESIDUAL_COLUMNS = ("left mm", "left deg", "doubted %", "gaps", "truth s")
 
 
 @click.command(short_help="Make a session of field recordings and a motion capture.")
@@ -103,11 +103,11 @@ def align(
     """
     from share.files.writing import new_folder
     from share.lab.mocap.session import write_session
-    from share.lab.mocap.state import FitOptions
+    from share.lab.mocap.state import MocapFitOptions
 
-    names = _devices(recordings)
-    told = {
-        option: _of(names, option, words)
+    names = _recordings_by_device(recordings)
+    by_option = {
+        option: _values_by_device(names, option, words)
         for option, words in (
             ("--mocap", mocaps),
             ("--body", bodies),
@@ -116,34 +116,35 @@ def align(
             ("--mounting", mountings),
         )
     }
-    chosen = FitOptions(
-        sigma_position=fitting["sigma_mm"] * 1e-3, within_s=fitting["within"], bridge_s=fitting["bridge"]
+    fit_options = MocapFitOptions(
+        sigma_position=fitting["sigma_mm"] * 1e-3, within_s=fitting["within"], max_bridged_s=fitting["bridge"]
     )
     with new_folder(out) as work, Stages() as stages:
-        seen = _bodies(names, told["--mocap"], told["--body"], fitting["rotations"])
+        trajectories = _trajectories(names, by_option["--mocap"], by_option["--body"], fitting["rotations"])
         devices = {
-            name: _device(name, path, told, seen[name], chosen, stages) for name, path in names.items()
+            name: _fit_device(name, path, by_option, trajectories[name], fit_options, stages)
+            for name, path in names.items()
         }
-        found = write_session(work, devices, _settings(**fitting), stages)
-    click.echo(json.dumps(found) if as_json else _text(found))
-    for name, one in found.items():
-        for line in (*_said_of_up(one), *one["doubts"]):
+        results = write_session(work, devices, _fit_settings(**fitting), stages)
+    click.echo(json.dumps(results) if as_json else _result_table(results))
+    for name, one in results.items():
+        for line in (*_axis_warnings(one), *one["doubts"]):
             click.echo(f"share: {name}: {line}", err=True)
     if not as_json:
         click.echo(f"{out}: ready; `share evaluate run {out} --virtual --out RUN` plays it")
 
 
-def _settings(rotations: str, within: float | None, sigma_mm: float, bridge: float) -> dict[str, Any]:
+def _fit_settings(rotations: str, within: float | None, sigma_mm: float, bridge: float) -> dict[str, Any]:
     """For the session's provenance."""
     return {"rotations": rotations, "within_s": within, "sigma_mm": sigma_mm, "bridge_s": bridge}
 
 
-def _devices(recordings: tuple[str, ...]) -> dict[str, str]:
+def _recordings_by_device(recordings: tuple[str, ...]) -> dict[str, str]:
     """The recording of each device, by its name."""
     for text in recordings:
         if "=" not in text:
             raise UsageError(f"{text}: give NAME=RECORDING, such as ann={text}")
-    out = options.by_name("RECORDING", recordings)
+    out = options.values_by_name("RECORDING", recordings)
     for name in out:
         options.agent_name(name)
         if name == "truth":
@@ -151,75 +152,77 @@ def _devices(recordings: tuple[str, ...]) -> dict[str, str]:
     return out
 
 
-def _of(names: dict[str, str], option: str, words: tuple[str, ...]) -> dict[str, str]:
+def _values_by_device(names: dict[str, str], option: str, values: tuple[str, ...]) -> dict[str, str]:
     """What an option says of each device, by its name; of all others under ""."""
-    out = options.by_name(option, words)
+    out = options.values_by_name(option, values)
     for name in out:
         if name and name not in names:
             raise UsageError(f"{option} {name}=: there is no device '{name}'; there are {', '.join(names)}")
     return out
 
 
-def _bodies(
+def _trajectories(
     names: dict[str, str], files: dict[str, str], bodies: dict[str, str], rotations: str
-) -> dict[str, tuple[str, Mocap]]:
+) -> dict[str, tuple[str, MocapTrajectory]]:
     """By device: file and body for a person, and what the motion capture saw of it."""
     from share.lab.mocap.files import pick_body, read_bodies
 
-    read = {file: read_bodies(Path(file), rotations) for file in dict.fromkeys(files.values())}
-    out: dict[str, tuple[str, Mocap]] = {}
-    taken: dict[tuple[Path, str], str] = {}
+    bodies_of = {file: read_bodies(Path(file), rotations) for file in dict.fromkeys(files.values())}
+    out: dict[str, tuple[str, MocapTrajectory]] = {}
+    device_of_body: dict[tuple[Path, str], str] = {}
     for name in names:
         file = files.get(name, files.get("", ""))
         if not file:
             raise UsageError(f"{name}: has no motion capture; give --mocap {name}=FILE, or FILE for all")
-        wanted = bodies.get(name, bodies.get(""))
-        body, seen = pick_body(file, read[file], wanted, name, f"--body {name}=BODY")
-        if (other := taken.setdefault((Path(file).resolve(), body), name)) != name:
+        body_wanted = bodies.get(name, bodies.get(""))
+        body, trajectory = pick_body(file, bodies_of[file], body_wanted, name, f"--body {name}=BODY")
+        if (other := device_of_body.setdefault((Path(file).resolve(), body), name)) != name:
             both = f"body '{body}'" if body else "one body"
             raise UsageError(
                 f"{file}: its {both} cannot be both {other} and {name}; give each its own by "
                 f"--body {name}=BODY or --mocap {name}=FILE"
             )
-        out[name] = (f"{file} {body}".strip(), seen)
+        out[name] = (f"{file} {body}".strip(), trajectory)
     return out
 
 
-def _device(
+def _fit_device(
     name: str,
     recording: str,
-    told: dict[str, dict[str, str]],
-    seen: tuple[str, Mocap],
-    chosen: FitOptions,
+    by_option: dict[str, dict[str, str]],
+    trajectory: tuple[str, MocapTrajectory],
+    fit_options: MocapFitOptions,
     stages: Stages,
-) -> Device:
+) -> AlignedRecording:
     from share.lab.calibrate.imu_table import read_imu
-    from share.lab.mocap.align import align as run
-    from share.lab.mocap.session import Device
+    from share.lab.mocap.align import align_device as run
+    from share.lab.mocap.session import AlignedRecording
     from share.runtime.source import open_source
 
-    def of(option: str) -> str | None:
-        return told[option].get(name, told[option].get(""))
+    def value_of(option: str) -> str | None:
+        return by_option[option].get(name, by_option[option].get(""))
 
-    kind, calib = _kind(of("--kind") or "ar"), of("--calib")
+    kind, calib = _agent_kind(value_of("--kind") or "ar"), value_of("--calib")
     source = open_source(recording, calib)
-    options.say_notes(source)
+    options.print_notes(source)
     if source.rig.imu is None:
         raise UsageError(f"{recording}: has no IMU, or its calibration has none; align goes by the gyro")
-    mounted = _mounted(chosen, of("--mounting"))
+    device_options = _with_mounting(fit_options, value_of("--mounting"))
     imu = read_imu(recording, lambda done, total: stages(f"reading {name}", done, total)).imu
     stages(f"fitting {name}", 0, 1)
     try:
-        found = run(imu, source.rig.imu, seen[1], mounted)
+        result = run(imu, source.rig.imu, trajectory[1], device_options)
     except DataError as error:
         raise type(error)(f"{name}: {error}") from None
     stages(f"fitting {name}", 1, 1)
-    as_it_is = Path(recording) if recording.endswith(".mcap") and calib is None else None
-    given = (("recording", recording), ("calib", calib), ("mounting", of("--mounting")))
-    return Device(kind, source, as_it_is, seen[0], {key: text for key, text in given if text}, found)
+    copied_file = Path(recording) if recording.endswith(".mcap") and calib is None else None
+    inputs = (("recording", recording), ("calib", calib), ("mounting", value_of("--mounting")))
+    return AlignedRecording(
+        kind, source, copied_file, trajectory[0], {key: text for key, text in inputs if text}, result
+    )
 
 
-def _kind(text: str) -> Any:
+def _agent_kind(text: str) -> Any:
     from share.types import AgentKind
 
     if text not in list(AgentKind):
@@ -227,20 +230,20 @@ def _kind(text: str) -> Any:
     return AgentKind(text)
 
 
-def _mounted(chosen: FitOptions, mounting: str | None) -> FitOptions:
+def _with_mounting(fit_options: MocapFitOptions, mounting: str | None) -> MocapFitOptions:
     from share.lab.mocap.report import read_mounting
 
     if mounting is None:
-        return chosen
+        return fit_options
     T, sigma = read_mounting(Path(mounting))
-    return replace(chosen, T_body_mocap=T, guess_sigma=sigma)
+    return replace(fit_options, T_body_mocap=T, guess_sigma=sigma)
 
 
-def _said_of_up(one: dict[str, Any]) -> list[str]:
+def _axis_warnings(one: dict[str, Any]) -> list[str]:
     return [] if one["up"] == "z" else [f"the motion capture has {one['up']} up; in the session z is"]
 
 
-def _text(found: dict[str, Any]) -> str:
+def _result_table(results: dict[str, Any]) -> str:
     """A line a device."""
     rows = [
         [
@@ -262,6 +265,6 @@ def _text(found: dict[str, Any]) -> str:
             f"{len(one['gaps_s'])}",
             f"{one['truth_s']:.1f}",
         ]
-        for name, one in found.items()
+        for name, one in results.items()
     ]
-    return aligned([(*_CLOCK, *_MOUNTING, *_LEFT), *rows])
+    return aligned_table([(*_CLOCK_COLUMNS, *_MOUNTING_COLUMNS, *_RESIDUAL_COLUMNS), *rows])

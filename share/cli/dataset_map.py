@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from share.cli import options
-from share.cli.progress import progress
+from share.cli.terminal import progress
 from share.errors import UsageError
 
 
@@ -27,27 +27,27 @@ def export(map_file: str, out: str, as_json: bool) -> None:
     """
     import json
 
-    from share.store.export import export as run
+    from share.store.export import export_map as run
     from share.store.map_store import MapStore
 
     if not Path(map_file).is_file():
         raise UsageError(f"{map_file}: no such file")
-    kept = MapStore.read(Path(map_file)).load()
-    for complaint in kept.complaints:
+    map_state = MapStore.read(Path(map_file)).load()
+    for complaint in map_state.problems:
         click.echo(f"share: {map_file}: {complaint}", err=True)
-    with progress(len(kept.keyframes), "exporting") as bar:
-        done = run(kept, Path(out), bar)
+    with progress(len(map_state.keyframes), "exporting") as bar:
+        exported = run(map_state, Path(out), bar)
     if as_json:
-        click.echo(json.dumps({name: {**vars(e), "folder": str(e.folder)} for name, e in done.items()}))
+        click.echo(json.dumps({name: {**vars(e), "folder": str(e.folder)} for name, e in exported.items()}))
         return
-    for name, e in done.items():
+    for name, e in exported.items():
         click.echo(
             f"{e.folder}: map {name}, {e.keyframes} keyframes of {', '.join(e.agents)}; "
             f"{e.points} points, {e.loops} loops"
         )
 
 
-def info(path: Path) -> dict[str, Any]:
+def map_info(path: Path) -> dict[str, Any]:
     """Of a map file. Raises ShareError."""
     from share.store.export import describe_map
     from share.store.map_store import MapStore
@@ -55,14 +55,16 @@ def info(path: Path) -> dict[str, Any]:
     return describe_map(MapStore.read(path))
 
 
-def info_text(d: dict[str, Any]) -> str:
+def map_info_text(d: dict[str, Any]) -> str:
     """For a person."""
     lines = [f"{d['name']}: map, schema {d['schema']}, {d['bytes'] / 1e6:.1f} MB"]
     for name, agent in d["agents"].items():
-        retired = agent["next_keyframe"] - agent["keyframes"]
-        stretches = f", {agent['stretches']} stretches" if agent["stretches"] > 1 else ""
+        removed = agent["next_keyframe"] - agent["keyframes"]
+        segments_text = f", {agent['stretches']} stretches" if agent["stretches"] > 1 else ""
         lines.append(
-            f"  {name:<10} {agent['kind']:<6} {agent['keyframes']:>6} keyframes, {retired} gone{stretches}"
+            f"  {name:<10} {agent['kind']:<6} "
+            f"{agent['keyframes']:>6} "
+            f"keyframes, {removed} gone{segments_text}"
         )
     lines += [f"  map {name}: {count} keyframes" for name, count in d["maps"].items()]
     lines.append(f"  {d['loops']} loops, {d['solved']} keyframes in the newest solution")

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.progress import LiveLine, Stages
-from share.cli.table import aligned
-from share.config import POLICIES, STREAMED
+from share.cli.table import aligned_table
+from share.cli.terminal import LiveLine, Stages
+from share.config import POLICY_NAMES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.lab.evaluate.play import SessionScore
+    from share.lab.evaluate.real_time import SessionScore
     from share.metrics.ate import Ate
 
 
@@ -31,7 +31,7 @@ class _Seconds(click.FloatRange):
 
 @click.command()
 @click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True)
-@click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
+@click.option("--policy", type=click.Choice(POLICY_NAMES), default=POLICY_NAMES[0], show_default=True)
 @click.option(
     "--link",
     metavar="LINK[,AGENT=LINK…]",
@@ -67,27 +67,31 @@ def demo(
         raise UsageError("--true-error: is of agents that track themselves; leave it out by policy streamed")
     from share.files.writing import writable_dir
     from share.lab.emulate.demo import AGENTS, meeting_seed, recipe
-    from share.lab.emulate.session import cached_session
-    from share.lab.evaluate.play import Terms, play, score
-    from share.net.emulated import Links
+    from share.lab.emulate.session import make_cached_session
+    from share.lab.evaluate.real_time import RunOptions, play_in_real_time, score_session
+    from share.net.emulated_link import LinkAssignment
     from share.recordings.session import read_session
-    from share.runtime.machine import cores
+    from share.runtime.machine import core_count
 
-    Links.parse(link).check(AGENTS)
+    LinkAssignment.parse(link).check(AGENTS)
     writable_dir(folder)
-    room = _drawable(scene)
+    room = _renderable_scene(scene)
     seed = meeting_seed(room) if seed is None else seed
     with Stages() as stages:
-        session = read_session(cached_session(recipe(room, seconds, seed), progress=stages))
+        session = read_session(make_cached_session(recipe(room, seconds, seed), progress=stages))
     live = LiveLine()
-    terms = Terms(policy, link, seed, true_error, config=config_file, agents_first=True)
-    folders = play(session, seconds, terms, folder, lambda now: live.write(str(now)))
+    terms = RunOptions(policy, link, seed, true_error, config=config_file, agents_first=True)
+    folders = play_in_real_time(session, seconds, terms, folder, lambda now: live.write(str(now)))
     live.end()
-    result = score(session, folders)
-    click.echo(_table(result, policy == STREAMED))
-    if cores() <= len(folders):
-        late = f"{len(folders)} agents and the edge shared {cores()} cores, so frames waited for one another"
-        click.echo(f"{late}; on machines of their own they do not")
+    result = score_session(session, folders)
+    click.echo(_score_table(result, policy == STREAMED))
+    if core_count() <= len(folders):
+        warning = (
+            f"{len(folders)} agents and the edge shared "
+            f"{core_count()} cores, so "
+            f"frames waited for one another"
+        )
+        click.echo(f"{warning}; on machines of their own they do not")
     picture = folder / "trajectories.png"
     picture.unlink(missing_ok=True)  # of an earlier demo
     if result.joint is not None:
@@ -99,20 +103,20 @@ def demo(
         click.echo(f"\npicture: {picture}   decisions of the edge: {folder / 'edge' / 'events.jsonl'}")
 
 
-def _drawable(scene: str | None) -> str:
+def _renderable_scene(scene: str | None) -> str:
     """The scene asked for; else the usual one, or the plain one where there is no OpenGL."""
-    from share.lab.emulate.demo import FALLBACK, SCENE
-    from share.lab.emulate.render.context import missing
+    from share.lab.emulate.demo import DEFAULT_SCENE, FALLBACK_SCENE
+    from share.lab.emulate.render.context import missing_reason
 
     if scene is not None:
         return scene
-    reason = missing()
-    if reason is not None:
-        click.echo(f"share: the plain room, because {reason}", err=True)
-    return SCENE if reason is None else FALLBACK
+    missing_renderer = missing_reason()
+    if missing_renderer is not None:
+        click.echo(f"share: the plain room, because {missing_renderer}", err=True)
+    return DEFAULT_SCENE if missing_renderer is None else FALLBACK_SCENE
 
 
-def _table(result: SessionScore, streamed: bool) -> str:
+def _score_table(result: SessionScore, streamed: bool) -> str:
     joint = {} if result.joint is None else result.joint.agents
     head = (
         "agent",
@@ -145,11 +149,11 @@ def _table(result: SessionScore, streamed: bool) -> str:
                 str(r["corrections"]),
             )
         )
-    lines = aligned(rows).splitlines()
+    lines = aligned_table(rows).splitlines()
     if streamed:
         untracked = ", ".join(f"{name} {agent.report['untracked']}" for name, agent in result.agents.items())
-        told = f"each tracked alone by the edge; frames without an answer: {untracked}"
-        return "\n".join([*lines, "", told])
+        note = f"each tracked alone by the edge; frames without an answer: {untracked}"
+        return "\n".join([*lines, "", note])
     members = len(joint)
     verdict = (
         f"{members} of {len(result.agents)} agents in one map"

@@ -13,7 +13,7 @@ from share.cli import options
 from share.errors import ShareError
 
 if TYPE_CHECKING:
-    from share.devices.checks import Finding
+    from share.devices.checks import CheckResult
 
 
 @click.command()
@@ -47,33 +47,40 @@ def doctor(
     Example:  share doctor --profile d435i-n100-headset --calib calib/d435i
     """
     from share.devices.checks import failures
-    from share.runtime.doctor import ask, of_calibration, of_camera, of_edge, of_host, of_port
-    from share.sensors.profile import host_profile
+    from share.runtime.doctor import (
+        inspect_calibration,
+        inspect_camera,
+        inspect_edge,
+        inspect_host,
+        inspect_port,
+        query_sdk,
+    )
+    from share.sensors.profile import load_host_profile
 
-    wanted = host_profile(profile)
-    sdk = ask(wanted)
-    found = [
-        *of_camera(wanted, sdk),
-        *of_calibration(wanted, None if calib is None else Path(calib), sdk),
-        *of_host(wanted, Path(out)),
-        *of_port(wanted),
-        *of_edge(wanted, address, None if keys is None else Path(keys), server_key),
+    host = load_host_profile(profile)
+    sdk = query_sdk(host)
+    findings = [
+        *inspect_camera(host, sdk),
+        *inspect_calibration(host, None if calib is None else Path(calib), sdk),
+        *inspect_host(host, Path(out)),
+        *inspect_port(host),
+        *inspect_edge(host, address, None if keys is None else Path(keys), server_key),
     ]
-    failed = failures(found)
-    click.echo(_plain(wanted.name, found, not failed) if as_json else _table(found))
+    failed = failures(findings)
+    click.echo(_report_json(host.name, findings, not failed) if as_json else _findings_text(findings))
     if failed:
         raise ShareError(f"doctor: {len(failed)} FAIL: {', '.join(one.name for one in failed)}")
 
 
-def _plain(profile: str, found: Sequence[Finding], fine: bool) -> str:
-    rows = [{"name": f.name, "state": f.state.value, "what": f.what, "mend": list(f.mend)} for f in found]
-    return json.dumps({"profile": profile, "ok": fine, "findings": rows})
+def _report_json(profile: str, findings: Sequence[CheckResult], is_ok: bool) -> str:
+    rows = [{"name": f.name, "state": f.state.value, "what": f.what, "mend": list(f.fix)} for f in findings]
+    return json.dumps({"profile": profile, "ok": is_ok, "findings": rows})
 
 
-def _table(found: Sequence[Finding]) -> str:
-    width = max(len(one.name) for one in found)
-    lines = [f"{one.state.value:7}  {one.name:{width}}  {one.what}" for one in found]
-    for one in found:
-        if one.mend:
-            lines += ["", f"{one.name}:", *(f"    {line}" for line in one.mend)]
+def _findings_text(findings: Sequence[CheckResult]) -> str:
+    width = max(len(one.name) for one in findings)
+    lines = [f"{one.state.value:7}  {one.name:{width}}  {one.what}" for one in findings]
+    for one in findings:
+        if one.fix:
+            lines += ["", f"{one.name}:", *(f"    {line}" for line in one.fix)]
     return "\n".join(lines)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.config import POLICIES, STREAMED
+from share.config import POLICY_NAMES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @click.option("--bind", default="tcp://127.0.0.1:5555", show_default=True, metavar="tcp://H:P")
 @click.option(
     "--policy",
-    type=click.Choice(POLICIES),
+    type=click.Choice(POLICY_NAMES),
     help="Whom the edge serves how much. By default share; covins-g: every keyframe is sent and merged.",
 )
 @options.keys
@@ -61,22 +61,22 @@ def edge(
     from share.net.transport import bind as bind_link
     from share.net.transport import parse_address
     from share.runtime.edge import EdgeRun
-    from share.runtime.status import StatusServer
-    from share.runtime.stop import on_stop
+    from share.runtime.signals import stop_on_signal
+    from share.runtime.status_server import StatusServer
     from share.wire.codec import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
-    with_keys = _keys(keys, parse_address(bind, bind=True).local)
+    edge_key_pair = _edge_keys(keys, parse_address(bind, bind=True).local)
     if policy is not None:
         settings = replace(settings, edge=replace(settings.edge, policy=policy))
-    raw = settings.edge.policy == STREAMED
-    if raw and map_file is not None:
+    is_streamed = settings.edge.policy == STREAMED
+    if is_streamed and map_file is not None:
         raise UsageError("--map: there is none by policy streamed; leave it out, or take another policy")
-    most = MAX_IMAGE_BYTES if raw else MAX_FRAME_BYTES
+    max_message_bytes = MAX_IMAGE_BYTES if is_streamed else MAX_FRAME_BYTES
     folder = None if out is None else Path(out)
     runs: list[EdgeRun] = []
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
-        link = stack.enter_context(closing(bind_link(bind, with_keys, most)))
+        link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
         status = None
         if http is not None:  # before any process is started: the port may be in use
             status = stack.enter_context(
@@ -84,19 +84,19 @@ def edge(
             )
         store = None if map_file is None else stack.enter_context(_open_map(stderr, Path(map_file)))
         run = stack.enter_context(
-            closing(EdgeRun(settings, link, folder, lambda e: _tell(stderr, e, verbose), store))
+            closing(EdgeRun(settings, link, folder, lambda e: _print_event(stderr, e, verbose), store))
         )
         runs.append(run)
-        with on_stop(run.stop):
+        with stop_on_signal(run.stop):
             stderr.tell(f"listening on {link.endpoint}, policy {settings.edge.policy}")
-            _say_keys(stderr, with_keys)
+            _say_keys(stderr, edge_key_pair)
             if status is not None:
                 stderr.tell(f"status at http://{status.endpoint}/")
-            report = run.go()
+            report = run.run()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
-def _keys(folder: str | None, local: bool) -> EdgeKeys | None:
+def _edge_keys(folder: str | None, local: bool) -> EdgeKeys | None:
     """Those of --keys; for a network, else of the default folder, if there are any. Raises UsageError."""
     from share.net.keys import default_folder, edge_keys, has_pair
 
@@ -110,24 +110,26 @@ def _open_map(stderr: Stderr, path: Path) -> MapStore:
     from share.store.map_store import MapStore
 
     store = MapStore.open(path)
-    kept = store.peek()
-    for complaint in kept.complaints:
+    map_state = store.opened_map()
+    for complaint in map_state.problems:
         stderr.tell(f"map {path}: {complaint}")
     if not store.writable:
-        stderr.tell(f"map {path}: {store.reason}; what is in it is used, nothing new is kept")
-    counts = f"{len(kept.keyframes)} keyframes of {len(kept.runs)} runs, {len(kept.loops)} loops"
+        stderr.tell(f"map {path}: {store.read_only_reason}; what is in it is used, nothing new is kept")
+    counts = (
+        f"{len(map_state.keyframes)} keyframes of {len(map_state.runs)} runs, {len(map_state.loops)} loops"
+    )
     stderr.tell(f"map {path}: {counts}")
     return store
 
 
 def _say_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
     if keys is not None:
-        names = ", ".join(sorted(keys.allowed.names().values()))
+        names = ", ".join(sorted(keys.allowed.names_by_key().values()))
         stderr.tell(f"public key '{keys.own.public}'; authorized: {names or 'nobody yet'}")
 
 
-_NEWS = {"joined the edge", "left", "back", "silent", "refused"}
-_NEWS |= {
+_SHOWN_EVENTS = {"joined the edge", "left", "back", "silent", "refused"}
+_SHOWN_EVENTS |= {
     "not let in",
     "maps joined",
     "merge undone",
@@ -136,24 +138,24 @@ _NEWS |= {
     "mapper lost",
     "solver lost",
 }
-_NEWS |= {"odometry doubted", "map", "tracking lost"}
+_SHOWN_EVENTS |= {"odometry doubted", "map", "tracking lost"}
 
 
-def _tell(stderr: Stderr, event: dict[str, Any], verbose: bool) -> None:
-    if verbose or event["event"] in _NEWS:
+def _print_event(stderr: Stderr, event: dict[str, Any], verbose: bool) -> None:
+    if verbose or event["event"] in _SHOWN_EVENTS:
         agent = f" {event['agent']}:" if event["agent"] else ""
         stderr.tell(f"{event['t_s']:9.3f} s {event['event']}:{agent} {event['reason']}")
 
 
 def _summary(report: dict[str, Any]) -> str:
-    lines = [_of_agent(name, agent) for name, agent in report["agents"].items()]
+    lines = [_agent_summary(name, agent) for name, agent in report["agents"].items()]
     if loops := report.get("loops"):  # the mapper has reported
         done = report["merges"]["done"]
         lines.append(f"loops: {loops['tried']} tried, {loops['accepted']} accepted; {done} merges")
     return "\n".join(lines)
 
 
-def _of_agent(name: str, a: dict[str, Any]) -> str:
+def _agent_summary(name: str, a: dict[str, Any]) -> str:
     up = f"{a['bytes_up'] / 1e6:.2f} MB up"
     if "frames_streamed" in a:
         done = f"{a['frames_tracked']} of {a['frames_streamed']} frames tracked"

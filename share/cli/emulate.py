@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from share.cli import options
-from share.cli.progress import Stages
+from share.cli.terminal import Stages
 
 _WORKERS = 2
 
@@ -108,47 +108,49 @@ def emulate(
     Example:  share emulate --scene warehouse --motion ann=walk: --motion bob=walk: --out room1
               share track room1/ann
     """
-    from share.lab.emulate.recipe import Recipe
-    from share.lab.emulate.sensor.effects import parse
+    from share.lab.emulate.recipe import SessionRecipe
+    from share.lab.emulate.sensor.effects import parse_effects
     from share.lab.emulate.session import make_session
 
     euroc = form == "euroc"
-    recipe = Recipe(
+    recipe = SessionRecipe(
         scene=scene,
         motions=motions,
         seconds=seconds,
         seed=seed,
         size=size,
-        sensors=options.by_name("--sensors", sensors) or ({"": "stereo"} if euroc else {}),
-        profiles=options.by_name("--profile", profiles),
-        effects=parse(effects),
+        sensors=options.values_by_name("--sensors", sensors) or ({"": "stereo"} if euroc else {}),
+        profiles=options.values_by_name("--profile", profiles),
+        effects=parse_effects(effects),
         images=images or ("png" if euroc else "jpeg"),
     )
     with Stages() as stages:
         folder = make_session(recipe, Path(out), workers, stages, asl=euroc)
-    made = _described(folder, euroc)
-    click.echo(json.dumps(made) if as_json else _text(made))
+    description = _describe_session(folder, euroc)
+    click.echo(json.dumps(description) if as_json else _description_text(description))
 
 
-def _described(folder: Path, euroc: bool) -> dict[str, Any]:
+def _describe_session(folder: Path, euroc: bool) -> dict[str, Any]:
     """What is in the new folder, as plain data."""
     from share.files.yaml_file import read_yaml
-    from share.recordings.describe import describe
+    from share.recordings.describe import describe_recording
     from share.runtime.source import open_source
 
     top = read_yaml(folder / ("emulation.yaml" if euroc else "session.yaml"))
-    agents = {name: describe(open_source(str(folder / name))) for name in top.section("agents").data}
+    agents = {
+        name: describe_recording(open_source(str(folder / name))) for name in top.section("agents").data
+    }
     kinds = {name: agent["kind"] for name, agent in top.section("agents").data.items()}
     return {"folder": str(folder), "kinds": kinds, "agents": agents, "provenance": top.get("provenance")}
 
 
-def _text(made: dict[str, Any]) -> str:
+def _description_text(description: dict[str, Any]) -> str:
     """A line an agent."""
-    lines = list(made["provenance"]["notes"])
-    for name, agent in made["agents"].items():
+    lines = list(description["provenance"]["notes"])
+    for name, agent in description["agents"].items():
         frames, truth = agent["streams"]["cam0"], agent["truth"]
         lines.append(
-            f"{name:>12}  {made['kinds'][name]:5}  {agent['kind']:10}  {frames['count']} frames at "
+            f"{name:>12}  {description['kinds'][name]:5}  {agent['kind']:10}  {frames['count']} frames at "
             f"{frames['rate_hz']:.4g} Hz  {agent['duration_s']:.1f} s  {truth['length_m']:.2f} m"
         )
-    return "\n".join([*lines, f"{made['folder']}: ready"])
+    return "\n".join([*lines, f"{description['folder']}: ready"])

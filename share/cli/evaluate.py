@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.compare import compare
-from share.cli.playing import check_all, of_many, played
-from share.cli.progress import LiveLine
-from share.cli.run_table import table
-from share.cli.sweep import sweep
-from share.cli.terms import on_terms, settings
-from share.config import POLICIES
+from share.cli.compare_trackers import compare
+from share.cli.evaluate_sweep import sweep
+from share.cli.playing import check_none_failed, many_run_options, play_runs
+from share.cli.run_options import load_run_config, run_options
+from share.cli.run_table import run_table
+from share.cli.terminal import LiveLine
+from share.config import POLICY_NAMES
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.lab.evaluate.report import Annex
+    from share.lab.evaluate.report import ReportSection
     from share.lab.evaluate.trial import Trial
 
-BASE = "covins-g"  # what the others are told as a part of
+BASE_POLICY = "covins-g"  # what the others are told as a part of
 
 
 @click.group()
@@ -44,8 +44,8 @@ evaluate.add_command(compare)
 
 @evaluate.command(short_help="Play a session, and keep everything.")
 @click.argument("session", type=click.Path(path_type=Path))
-@click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
-@on_terms
+@click.option("--policy", type=click.Choice(POLICY_NAMES), default=POLICY_NAMES[0], show_default=True)
+@run_options
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of link and scheduler.")
 @options.config
 @click.option("--out", required=True, metavar="RUN", type=click.Path(path_type=Path), help="A new folder.")
@@ -55,7 +55,7 @@ def run(
     seed: int,
     config_file: str | None,
     out: Path,
-    **told: Any,
+    **options_given: Any,
 ) -> None:
     """Play SESSION in real time: an edge and its agents, each a process of its own. Or, with --virtual, by
     the same trackers and machines in virtual time, whatever else this machine does.
@@ -66,16 +66,19 @@ def run(
     \b
     Example:  share evaluate run room1 --policy covins-g --link wifi5 --out runs/covins
     """
-    from share.lab.evaluate.play import Terms
-    from share.lab.evaluate.scoring import figures
+    from share.lab.evaluate.real_time import RunOptions
+    from share.lab.evaluate.scoring import run_metrics
     from share.lab.evaluate.trial import run_trial
     from share.recordings.session import read_session
 
     opened, live = read_session(session), LiveLine()
-    config, terms = settings(config_file, told, [opened]), Terms(policy, seed=seed, **told)
+    config, terms = (
+        load_run_config(config_file, options_given, [opened]),
+        RunOptions(policy, seed=seed, **options_given),
+    )
     trial = run_trial(opened, terms, config, out, lambda now: live.write(str(now)))
     live.end()
-    click.echo(table(figures(trial)))
+    click.echo(run_table(run_metrics(trial)))
 
 
 @evaluate.command(short_help="Errors, latency, merges and QoE of runs.")
@@ -94,53 +97,53 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_
     \b
     Example:  share evaluate score runs/* --plots plots
     """
-    from share.files.json_file import known
+    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, check_writable, writable_dir
-    from share.lab.evaluate.pictures import draw_each
     from share.lab.evaluate.report import PROTOCOL, agents_csv
-    from share.lab.evaluate.scoring import figures
+    from share.lab.evaluate.report_charts import draw_sessions
+    from share.lab.evaluate.scoring import run_metrics
     from share.lab.evaluate.trial import read_trial
 
     if csv_file is not None:
         check_writable(csv_file)
     trials = [read_trial(folder) for folder in runs]
-    found = [figures(trial) for trial in trials]
+    all_metrics = [run_metrics(trial) for trial in trials]
     if csv_file is not None:
-        atomic_write(csv_file, agents_csv(found))
+        atomic_write(csv_file, agents_csv(all_metrics))
     if as_json:
-        told = [
-            known(dataclasses.asdict(one) | {"metres": one.metres}) | {"record": trial.record}
-            for one, trial in zip(found, trials, strict=True)
+        documents = [
+            nan_to_none(dataclasses.asdict(one) | {"metres": one.metres}) | {"record": trial.record}
+            for one, trial in zip(all_metrics, trials, strict=True)
         ]
-        click.echo(json.dumps({"protocol": PROTOCOL, "runs": told}, default=str))
+        click.echo(json.dumps({"protocol": PROTOCOL, "runs": documents}, default=str))
         return
-    for one, trial in zip(found, trials, strict=True):
+    for one, trial in zip(all_metrics, trials, strict=True):
         machine, code = trial.record["machine"], one.conditions.code or "unknown"
-        click.echo(table(one))
+        click.echo(run_table(one))
         click.echo(
             f"played {trial.record['began']} by SHARE {trial.record['version']} (code {code}) on "
             f"{machine['cores']} cores of {machine['cpu']}, load before {machine['load']:g}\n"
         )
     click.echo("\n".join(PROTOCOL))
     if plots is not None:
-        drawn = draw_each(writable_dir(plots), trials)
-        click.echo(f"\npictures: {', '.join(map(str, drawn))}")
+        pictures = draw_sessions(writable_dir(plots), trials)
+        click.echo(f"\npictures: {', '.join(map(str, pictures))}")
 
 
 @evaluate.command(short_help="All policies on sessions, in turn, compared.")
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--policy",
-    "chosen",
-    type=click.Choice(POLICIES),
+    "policies_given",
+    type=click.Choice(POLICY_NAMES),
     multiple=True,
     help="May be repeated.  [default: all that share a map]",
 )
-@on_terms
-@of_many
+@run_options
+@many_run_options
 @click.option(
     "--with",
-    "annexes",
+    "section_paths",
     multiple=True,
     metavar="PATH",
     type=click.Path(path_type=Path, exists=True),
@@ -150,13 +153,13 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_
 @click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
 def ablation(
     sessions: tuple[Path, ...],
-    chosen: tuple[str, ...],
-    annexes: tuple[Path, ...],
+    policies_given: tuple[str, ...],
+    section_paths: tuple[Path, ...],
     seeds: int,
     workers: int,
     config_file: str | None,
     out: Path,
-    **told: Any,
+    **options_given: Any,
 ) -> None:
     """Play SESSIONS by each policy with each seed, and compare the policies.
 
@@ -167,46 +170,53 @@ def ablation(
     \b
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
     """
-    if workers > 1 and not told["virtual"]:
+    if workers > 1 and not options_given["virtual"]:
         raise UsageError("--workers: runs in real time would slow each other down; it goes with --virtual")
     from share.files.writing import writable_dir
-    from share.lab.evaluate.campaign import plan, side_by_side
-    from share.lab.evaluate.play import Terms
-    from share.lab.evaluate.report import annex
+    from share.lab.evaluate.campaign import plan_policies, worker_pool
+    from share.lab.evaluate.real_time import RunOptions
+    from share.lab.evaluate.report import read_section
     from share.recordings.session import read_session
 
-    policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
-    also = [annex(path, number) for number, path in enumerate(annexes, 1)]
+    policies = policies_given or tuple(policy for policy in POLICY_NAMES if policy != "streamed")
+    sections = [read_section(path, number) for number, path in enumerate(section_paths, 1)]
     opened = [read_session(folder) for folder in sessions]
-    config = settings(config_file, told, opened)
-    planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs", config)
+    config = load_run_config(config_file, options_given, opened)
+    planned_runs = plan_policies(
+        opened, policies, range(seeds), RunOptions("", **options_given), out / "runs", config
+    )
     writable_dir(out, "agents.csv", "runs.csv", "report.md", "report.html")
-    came = played(planned, side_by_side(workers), lambda one: one.out.name)
-    trials, failed = list(came.values()), [one.out.name for one in planned if one.out not in came]
+    trials_by_folder = play_runs(planned_runs, worker_pool(workers), lambda one: one.out.name)
+    trials, failed = (
+        list(trials_by_folder.values()),
+        [one.out.name for one in planned_runs if one.out not in trials_by_folder],
+    )
     if trials:
-        _write(out, trials, failed, also)
-    check_all(len(trials), len(planned))
+        _write_report(out, trials, failed, sections)
+    check_none_failed(len(trials), len(planned_runs))
 
 
-def _write(out: Path, trials: list[Trial], failed: list[str], also: list[Annex]) -> None:
+def _write_report(out: Path, trials: list[Trial], failed: list[str], sections: list[ReportSection]) -> None:
     from share.files.writing import atomic_write
-    from share.lab.evaluate.page import page
-    from share.lab.evaluate.pictures import draw
+    from share.lab.evaluate.html_page import html_page
     from share.lab.evaluate.report import agents_csv, markdown, runs_csv
-    from share.lab.evaluate.scoring import figures
-    from share.lab.evaluate.statistics import policies
+    from share.lab.evaluate.report_charts import draw_report
+    from share.lab.evaluate.scoring import run_metrics
+    from share.lab.evaluate.statistics import policy_names
     from share.recordings.images import read_picture
 
-    found = [figures(trial) for trial in trials]
-    names = policies(found)
-    base = BASE if BASE in names else names[0]
-    shown = draw(out, found, trials, base)
-    report = "\n".join([markdown(found, trials, base, failed, shown), *(one.text for one in also)])
-    for name, path in (named for one in also for named in one.pictures.items()):
+    all_metrics = [run_metrics(trial) for trial in trials]
+    names = policy_names(all_metrics)
+    base = BASE_POLICY if BASE_POLICY in names else names[0]
+    report_pictures = draw_report(out, all_metrics, trials, base)
+    report = "\n".join(
+        [markdown(all_metrics, trials, base, failed, report_pictures), *(one.text for one in sections)]
+    )
+    for name, path in (named for one in sections for named in one.pictures.items()):
         atomic_write(out / name, read_picture(path))
-    atomic_write(out / "agents.csv", agents_csv(found))
-    atomic_write(out / "runs.csv", runs_csv(found))
+    atomic_write(out / "agents.csv", agents_csv(all_metrics))
+    atomic_write(out / "runs.csv", runs_csv(all_metrics))
     atomic_write(out / "report.md", report)
-    atomic_write(out / "report.html", page("Policies compared", report, out))
-    click.echo(markdown(found, trials, base, failed))
+    atomic_write(out / "report.html", html_page("Policies compared", report, out))
+    click.echo(markdown(all_metrics, trials, base, failed))
     click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv")

@@ -37,9 +37,9 @@ def generate(name: str | None, keys: str | None) -> None:
     \b
     Example:  share keys generate
     """
-    from share.net.keys import generate as make
+    from share.net.keys import generate_pair as make
 
-    folder = _folder(keys)
+    folder = _key_folder(keys)
     pair = make(folder, name)
     click.echo(f"{folder / pair.name}.public: give this key to the other machine:", err=True)
     click.echo(pair.public)
@@ -68,7 +68,7 @@ def authorize(name: str, public_key: str, agents: tuple[str, ...], keys: str | N
     """
     from share.net import keys as store
 
-    store.authorize(_folder(keys), name, store.public_key(public_key), agents)
+    store.authorize(_key_folder(keys), name, store.public_key(public_key), agents)
 
 
 @keys.command(short_help="Let an agent in no more.")
@@ -82,13 +82,13 @@ def revoke(name: str, keys: str | None) -> None:
     """
     from share.net.keys import revoke as drop
 
-    drop(_folder(keys), name)
+    drop(_key_folder(keys), name)
 
 
 @keys.command("list", short_help="Print this machine's public key and who is let in.")
 @options.keys
 @options.as_json
-def show(keys: str | None, as_json: bool) -> None:
+def list_keys(keys: str | None, as_json: bool) -> None:
     """Print this machine's public key and who is let in.
 
     \b
@@ -96,21 +96,21 @@ def show(keys: str | None, as_json: bool) -> None:
     """
     from share.net.keys import edge_keys
 
-    folder = _folder(keys)
-    found = edge_keys(folder)
-    grants = sorted((grant.name, key, grant.agents) for key, grant in found.allowed.grants().items())
-    own: dict[str, Any] = {"name": found.own.name, "public_key": found.own.public}
+    folder = _key_folder(keys)
+    edge_key_set = edge_keys(folder)
+    grants = sorted((grant.name, key, grant.agents) for key, grant in edge_key_set.allowed.grants().items())
+    own: dict[str, Any] = {"name": edge_key_set.own.name, "public_key": edge_key_set.own.public}
     if as_json:
         listed = [{"name": name, "public_key": key, "agents": agents} for name, key, agents in grants]
         click.echo(json.dumps({"folder": str(folder), "own": own, "authorized": listed}))
         return
-    click.echo(f"{found.own.public}  {found.own.name} (this machine)")
+    click.echo(f"{edge_key_set.own.public}  {edge_key_set.own.name} (this machine)")
     for name, key, agents in grants:
         others = "" if agents == (name,) else f", for {', '.join(agents)}"
         click.echo(f"{key}  {name}{others}")
 
 
-def _folder(given: str | None) -> Path:
+def _key_folder(folder_given: str | None) -> Path:
     from share.net.keys import default_folder
 
-    return default_folder() if given is None else Path(given)
+    return default_folder() if folder_given is None else Path(folder_given)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from share import startup
 
-startup.prepare()  # before anything below can import numpy
+startup.prepare_process()  # before anything below can import numpy
 
 import contextlib  # noqa: E402
 import difflib  # noqa: E402
@@ -15,7 +15,7 @@ from typing import Any  # noqa: E402
 import click  # noqa: E402
 
 from share import __version__  # noqa: E402
-from share.cli.unwinding import unwinding  # noqa: E402
+from share.cli.signals import unwind_on_signal  # noqa: E402
 from share.errors import ShareError, UsageError, one_line  # noqa: E402
 
 # name: (module, attribute, one line of help). Literal, so that a freezer sees every module.
@@ -40,7 +40,7 @@ COMMANDS = {
 }
 
 
-class _Lazy(click.Group):
+class _LazyGroup(click.Group):
     """A group whose commands are modules that are not imported until one is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -57,12 +57,12 @@ class _Lazy(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args[0] not in COMMANDS and not args[0].startswith("-"):
-            raise UsageError(f"no command '{args[0]}'; {_nearest(args[0])} (see `share --help`)")
+            raise UsageError(f"no command '{args[0]}'; {_suggestion(args[0])} (see `share --help`)")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            with unwinding():
+            with unwind_on_signal():
                 return super().invoke(ctx)
         except KeyboardInterrupt:  # click would put an empty line before ours
             raise _InterruptedError("interrupted") from None
@@ -72,7 +72,9 @@ class _Lazy(click.Group):
             formatter.write_dl([(name, text) for name, (_, _, text) in COMMANDS.items()])
 
 
-@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
 @click.version_option(__version__, prog_name="share")
 def cli() -> None:
     """SHARE: several people in AR headsets and robots track themselves in one shared map.
@@ -90,7 +92,7 @@ class _InterruptedError(ShareError):
     exit_code = 130
 
 
-def _nearest(name: str) -> str:
+def _suggestion(name: str) -> str:
     near = difflib.get_close_matches(name, COMMANDS, n=1)
     return f"did you mean '{near[0]}'?" if near else f"there are {', '.join(COMMANDS)}"
 
@@ -101,26 +103,26 @@ def main(arguments: list[str] | None = None) -> None:
         code = cli.main(arguments, prog_name="share", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except ShareError as error:
-        _fail(str(error), error.exit_code)
+        _exit_with(str(error), error.exit_code)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.ctx.get_help() if error.ctx else "", err=True)
         sys.exit(2)
     except click.ClickException as error:
         context = getattr(error, "ctx", None)
         hint = f" (see `{context.command_path} --help`)" if context else ""
-        _fail(error.format_message().replace("\n", " ") + hint, error.exit_code)
+        _exit_with(error.format_message().replace("\n", " ") + hint, error.exit_code)
     except (KeyboardInterrupt, click.Abort):
-        _fail("interrupted", 130)
+        _exit_with("interrupted", 130)
     except BrokenPipeError:  # the reader of our output went away; nothing is left to tell it
         sys.stderr.close()
         sys.exit(1)
     except OSError as error:  # what nobody foresaw: files have been checked, so most likely stdout
         with contextlib.suppress(OSError):  # or Python would try again at its end, and complain itself
             sys.stdout.close()
-        _fail(f"{error.filename or 'cannot write the output'}: {error.strerror or error}", 1)
+        _exit_with(f"{error.filename or 'cannot write the output'}: {error.strerror or error}", 1)
 
 
-def _fail(text: str, code: int) -> None:
+def _exit_with(text: str, code: int) -> None:
     with contextlib.suppress(OSError):  # its terminal may be gone
         click.echo(f"share: {one_line(text)}", err=True)
     sys.exit(code)

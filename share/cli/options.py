@@ -37,9 +37,9 @@ target = click.option(
 
 
 def _cores() -> int:
-    from share.runtime.machine import cores
+    from share.runtime.machine import core_count
 
-    return cores()
+    return core_count()
 
 
 workers = click.option(
@@ -90,18 +90,18 @@ def load_config(path: str | None) -> Config:
 
 def agent_name(value: str) -> str:
     """A name that can be a file's, as Unicode composes it (NFC). Raises UsageError."""
-    from share.recordings.session import AGENT_NAME, is_agent_name
+    from share.recordings.session import AGENT_NAME_RULE, is_agent_name
 
     name = normalize("NFC", value)
     if not is_agent_name(name):
-        raise UsageError(f"--name {value[:80]!r}: use {AGENT_NAME}")
+        raise UsageError(f"--name {value[:80]!r}: use {AGENT_NAME_RULE}")
     return name
 
 
-def by_name(option: str, words: tuple[str, ...]) -> dict[str, str]:
+def values_by_name(option: str, values: tuple[str, ...]) -> dict[str, str]:
     """`NAME=VALUE` by its name, a bare VALUE, which is for everybody, by ""."""
     out: dict[str, str] = {}
-    for word in words:
+    for word in values:
         name, _, value = word.partition("=") if "=" in word else ("", "", word)
         if name in out:
             raise UsageError(f"{option} is given twice for {name or 'everybody'}; give one of them")
@@ -109,27 +109,27 @@ def by_name(option: str, words: tuple[str, ...]) -> dict[str, str]:
     return out
 
 
-def say_notes(source: Source) -> None:
+def print_notes(source: Source) -> None:
     """What a person should know of a recording, such as streams that are not used: a line each on stderr."""
     for note in source.notes:
         click.echo(f"share: {source.name}: {note}", err=True)
 
 
-def say_losses(source: Source) -> None:
+def print_losses(source: Source) -> None:
     """What of a recording could not be read: a line a kind on stderr."""
     for line in source.losses.lines():
         click.echo(f"share: {source.name}: {one_line(line)}", err=True)
 
 
-def say_another(name: str, said: Calibration | None, serial: str | None) -> None:
+def warn_other_device(name: str, given_calibration: Calibration | None, serial: str | None) -> None:
     """That a calibration which was given is of another device, on stderr, if it is."""
-    from share.recordings.unit import of_another
+    from share.recordings.device_match import device_mismatch
 
-    if said is not None and (wrong := of_another(said.serials, serial)):
+    if given_calibration is not None and (wrong := device_mismatch(given_calibration.serials, serial)):
         click.echo(f"share: {name}: {wrong}", err=True)
 
 
-def say_counters(counters: dict[str, int]) -> None:
+def print_counters(counters: dict[str, int]) -> None:
     """What the sequencer met, on stderr: one line, without what never happened."""
-    met = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counters.items() if count)
-    click.echo(f"sequencer: {met or 'nothing'}", err=True)
+    counts_text = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counters.items() if count)
+    click.echo(f"sequencer: {counts_text or 'nothing'}", err=True)

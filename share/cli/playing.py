@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from share.cli.progress import LiveLine
+from share.cli.terminal import LiveLine
 from share.errors import ShareError
 
 if TYPE_CHECKING:
-    from share.lab.evaluate.campaign import Planned, Workers
-    from share.lab.evaluate.play import Progress
+    from share.lab.evaluate.campaign import PlannedRun, WorkerPool
+    from share.lab.evaluate.real_time import Progress
     from share.lab.evaluate.trial import Trial
 
-_MANY = (
+_MANY_RUN_OPTIONS = (
     click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …"),
     click.option(
         "--workers",
@@ -29,36 +29,36 @@ _MANY = (
 )
 
 
-def of_many(command: Callable[..., None]) -> Callable[..., None]:
+def many_run_options(command: Callable[..., None]) -> Callable[..., None]:
     """How many seeds, and sessions at a time."""
-    for option in reversed(_MANY):
+    for option in reversed(_MANY_RUN_OPTIONS):
         command = option(command)
     return command
 
 
-def played(
-    runs: Sequence[Planned],
-    workers: AbstractContextManager[Workers] | None,
-    named: Callable[[Planned], str],
+def play_runs(
+    runs: Sequence[PlannedRun],
+    workers: AbstractContextManager[WorkerPool] | None,
+    label_of: Callable[[PlannedRun], str],
 ) -> dict[Path, Trial]:
     """By folder, in the order of `runs`, those that did not fail; the others are said."""
-    from share.lab.evaluate.campaign import go_through
+    from share.lab.evaluate.campaign import run_all
 
     live, done = LiveLine(), dict[Path, "Trial"]()
 
     def show(number: int, now: Progress | None) -> None:
-        live.write(f"{number + 1} of {len(runs)}: {named(runs[number])}  {now or ''}")
+        live.write(f"{number + 1} of {len(runs)}: {label_of(runs[number])}  {now or ''}")
 
-    for one, came in go_through(runs, show, workers):
-        if isinstance(came, ShareError):
-            live.say(f"share: {one.out.name}: {came}")
+    for one, result in run_all(runs, show, workers):
+        if isinstance(result, ShareError):
+            live.print_line(f"share: {one.out.name}: {result}")
         else:
-            done[one.out] = came
+            done[one.out] = result
     live.end()
     return {one.out: done[one.out] for one in runs if one.out in done}
 
 
-def check_all(done: int, of: int) -> None:
+def check_none_failed(succeeded: int, total: int) -> None:
     """Raises ShareError where runs have failed."""
-    if done < of:
-        raise ShareError(f"{of - done} of {of} runs failed; the same command plays them again")
+    if succeeded < total:
+        raise ShareError(f"{total - succeeded} of {total} runs failed; the same command plays them again")

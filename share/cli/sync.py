@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.progress import LiveLine, progress
-from share.cli.table import aligned
+from share.cli.table import aligned_table
+from share.cli.terminal import LiveLine, progress
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
-    from share.devices.clocks import Row
+    from share.devices.clocks import ClockCheck
     from share.devices.time_server import TimeServer
-    from share.net.udp import Host
+    from share.net.udp import HostPort
 
 PORT = 11123  # NTP's own, 123, needs root
 
@@ -56,37 +56,42 @@ def server(bind: str, stratum: int) -> None:
     from contextlib import closing
 
     from share.devices.time_server import TimeServer, TimeServerRun
-    from share.net.udp import Host, StampedSocket, clock_precision, parse_host
-    from share.runtime.stop import on_stop
+    from share.net.udp import HostPort, StampedSocket, clock_precision, parse_host
+    from share.runtime.signals import stop_on_signal
 
     host = parse_host(bind, PORT, bind=True)
     live = LiveLine()
-    with closing(StampedSocket.bound(host)) as link:
+    with closing(StampedSocket.bind(host)) as link:
         times = TimeServer(stratum, clock_precision())
-        say, show = (lambda text: live.say(f"share sync: {text}")), (lambda: live.write(_counts(times)))
+        say, show = (
+            (lambda text: live.print_line(f"share sync: {text}")),
+            (lambda: live.write(_counts_text(times))),
+        )
         run = TimeServerRun(link, times, say, show)
-        with on_stop(run.stop):
-            _introduce(Host(host.name, link.port), stratum, link.by_kernel)
-            run.go()
+        with stop_on_signal(run.stop):
+            _print_server(HostPort(host.name, link.port), stratum, link.has_kernel_stamps)
+            run.run()
     live.end()
-    click.echo(_counts(times))
+    click.echo(_counts_text(times))
 
 
-def _introduce(at: Host, stratum: int, by_kernel: bool) -> None:
-    from share.devices.chrony import follow
-    from share.net.udp import Host
+def _print_server(address: HostPort, stratum: int, by_kernel: bool) -> None:
+    from share.devices.chrony import follow_lines
+    from share.net.udp import HostPort
 
     stamps = "by the kernel" if by_kernel else "by this program, which is less exact"
-    click.echo(f"telling this machine's own time at {at} (UDP); arrivals are stamped {stamps}", err=True)
+    click.echo(f"telling this machine's own time at {address} (UDP); arrivals are stamped {stamps}", err=True)
     click.echo(
         f"stratum {stratum}, reference 127.127.1.1: this machine's own clock, none better behind it", err=True
     )
-    click.echo(f"clients' chrony.conf: {follow(Host('THIS-MACHINE', at.port))[0]}", err=True)
+    click.echo(f"clients' chrony.conf: {follow_lines(HostPort('THIS-MACHINE', address.port))[0]}", err=True)
 
 
-def _counts(times: TimeServer) -> str:
+def _counts_text(times: TimeServer) -> str:
     c = times.counts
-    clients = f"clients: {times.clients}" + ("" if times.newest is None else f" (last {times.newest})")
+    clients = f"clients: {times.clients}" + (
+        "" if times.last_client is None else f" (last {times.last_client})"
+    )
     return (
         f"answered: {c['answered']}, {clients}, asked too often: {c['limited']}, no questions: {c['ignored']}"
     )
@@ -115,69 +120,69 @@ def check(hosts: tuple[str, ...], count: int, limit_ms: float, as_json: bool) ->
     \b
     Example:  share sync check 192.168.1.10 192.168.1.20:123
     """
-    from share.devices.clocks import of_chrony, of_servers
+    from share.devices.clocks import check_chrony, check_servers
     from share.net.udp import parse_host
 
-    asked = [parse_host(text, PORT) for text in hosts]
-    if asked:
-        with progress(count * len(asked), "asking") as bar:
-            rows = of_servers(asked, count, limit_ms, bar)
-    elif (own := of_chrony(limit_ms)) is not None:
-        rows = [own]
+    addresses = [parse_host(text, PORT) for text in hosts]
+    if addresses:
+        with progress(count * len(addresses), "asking") as bar:
+            rows = check_servers(addresses, count, limit_ms, bar)
+    elif (chrony_row := check_chrony(limit_ms)) is not None:
+        rows = [chrony_row]
     else:
         raise UsageError(
             "no HOST is given, and no chronyd runs on this machine; give the machine that "
             "`share sync server` runs on, such as 192.168.1.10"
         )
-    click.echo(json.dumps(_plain(rows, limit_ms)) if as_json else _table(rows))
-    _judge(rows, limit_ms)
+    click.echo(json.dumps(_report_values(rows, limit_ms)) if as_json else _table(rows))
+    _check_rows(rows, limit_ms)
 
 
-def _judge(rows: Sequence[Row], limit_ms: float) -> None:
+def _check_rows(rows: Sequence[ClockCheck], limit_ms: float) -> None:
     """Raises ShareError where not all is well."""
     for row in rows:
         if row.note:
             click.echo(f"{row.name}: {row.note}", err=True)
-    bad = [row for row in rows if row.wrong]
-    if not bad:
+    failed = [row for row in rows if row.wrong]
+    if not failed:
         click.echo(f"within {limit_ms:g} ms", err=True)
         return
-    to_follow = next((row.host for row in bad if row.to_follow), None)
-    if to_follow is not None:
-        _advise(to_follow)
+    reference_host = next((row.host for row in failed if row.to_follow), None)
+    if reference_host is not None:
+        _print_chrony_advice(reference_host)
     if len(rows) == 1:
-        raise ShareError(f"{bad[0].name}: {bad[0].wrong}")
-    for row in bad:
+        raise ShareError(f"{failed[0].name}: {failed[0].wrong}")
+    for row in failed:
         click.echo(f"{row.name}: {row.wrong}", err=True)
     raise ShareError(
-        f"{len(bad)} of {len(rows)} clocks are not known to be within {limit_ms:g} ms; see above"
+        f"{len(failed)} of {len(rows)} clocks are not known to be within {limit_ms:g} ms; see above"
     )
 
 
-def _advise(host: Host) -> None:
-    from share.devices.chrony import follow
+def _print_chrony_advice(host: HostPort) -> None:
+    from share.devices.chrony import follow_lines
 
     click.echo(
         "to follow it: install chrony, put this at the end of /etc/chrony/chrony.conf, restart it:", err=True
     )
-    for line in follow(host):
+    for line in follow_lines(host):
         click.echo(f"    {line}", err=True)
 
 
-def _plain(rows: Sequence[Row], limit_ms: float) -> dict[str, Any]:
+def _report_values(rows: Sequence[ClockCheck], limit_ms: float) -> dict[str, Any]:
     return {
         "limit_ms": limit_ms,
         "ok": not any(row.wrong for row in rows),
-        "clocks": [r.plain() for r in rows],
+        "clocks": [r.to_plain() for r in rows],
     }
 
 
-def _table(rows: Sequence[Row]) -> str:
+def _table(rows: Sequence[ClockCheck]) -> str:
     head = ("clock", "offset ms", "± ms", "delay ms", "jitter ms", "stratum", "answers", "took s")
-    return aligned([head, *(_cells(row) for row in rows)])
+    return aligned_table([head, *(_cells(row) for row in rows)])
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: ClockCheck) -> tuple[str, ...]:
     ms = (row.uncertainty_ms, row.delay_ms, row.jitter_ms)
     numbers = (_number(row.offset_ms, "+.3f"), *(_number(value, ".3f") for value in ms))
     answers = "–" if row.asked is None else f"{row.answers}/{row.asked}"

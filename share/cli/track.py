@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli import live, options
-from share.cli.progress import LiveLine, progress
+from share.cli import camera_options, options
+from share.cli.terminal import LiveLine, progress
 from share.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
+    from share.runtime.offline_tracking import TrackingOutput
     from share.runtime.source import Source
-    from share.runtime.track import TrackRun
 
-_SOON_S = 1.0  # a first pose that needs no word
+_LONG_INIT_S = 1.0  # a first pose that needs no word
 
 
 @click.command()
@@ -26,7 +26,7 @@ _SOON_S = 1.0  # a first pose that needs no word
 @options.frames
 @click.option("--out", metavar="T.tum", help="Write the causal poses of the body in odom here.")
 @click.option("--report", "report_file", metavar="R.json", help="Write the report here.")
-@live.camera
+@camera_options.camera_options
 @options.config
 @options.verbose
 @options.as_json
@@ -36,7 +36,7 @@ def track(
     frames: slice | None,
     out: str | None,
     report_file: str | None,
-    camera: live.Asked,
+    camera: camera_options.CameraOptions,
     config_file: str | None,
     verbose: bool,
     as_json: bool,
@@ -52,73 +52,75 @@ def track(
               share track realsense --out walk.tum
     """
     settings = options.load_config(config_file)
-    named = {"--out": out, "--report": report_file}
+    paths_given = {"--out": out, "--report": report_file}
     from share.files.writing import atomic_write
     from share.recordings.trajectory import format_tum
-    from share.runtime.track import accuracy
+    from share.runtime.offline_tracking import trajectory_accuracy
 
     line = LiveLine()
-    opened = live.open_source(
-        source, calib, frames, camera, settings, lambda text: line.say(f"share: {text}")
+    opened = camera_options.open_source(
+        source, calib, frames, camera, settings, lambda text: line.print_line(f"share: {text}")
     )
-    options.say_notes(opened)
-    wanted = _targets(named, source)
+    options.print_notes(opened)
+    output_files = _output_files(paths_given, source)
     truth = opened.truth()  # if it is damaged, better now than after tracking
-    run = _tracked(opened, settings, line)
+    run = _run_tracker(opened, settings, line)
     line.end()
-    options.say_losses(opened)
+    options.print_losses(opened)
     if not len(run.trajectory.stamps_ns):
         raise DataError(
             f"{opened.name}: none of its {run.report['frames']} frames could be tracked; are they dark, "
             "blurred or bare, or is the calibration another camera's?"
-            + "".join(f" {line}." for line in [*_waited(run.report), *live.summary(run.report)])
+            + "".join(
+                f" {line}." for line in [*_wait_text(run.report), *camera_options.camera_summary(run.report)]
+            )
         )
-    ate = accuracy(run, truth) if run.report["stretches"] == 1 else None
+    ate = trajectory_accuracy(run, truth) if run.report["stretches"] == 1 else None
     report = {**run.report, "ate_m": ate.rmse if ate else None}
     texts = {"--out": format_tum(run.trajectory), "--report": json.dumps(report, indent=2) + "\n"}
-    for option, path in wanted.items():
+    for option, path in output_files.items():
         atomic_write(path, texts[option])
     click.echo(json.dumps(report) if as_json else _summary(report, ate))
     if verbose:
-        options.say_counters(report["sequencer"])
+        options.print_counters(report["sequencer"])
 
 
-def _targets(named: dict[str, str | None], source: str) -> dict[str, Path]:
+def _output_files(paths_given: dict[str, str | None], source: str) -> dict[str, Path]:
     """The files to write, by option. Raises UsageError if one cannot be, or would take another's place."""
     from share.files.writing import check_writable, is_special
 
-    wanted = {option: check_writable(Path(name)) for option, name in named.items() if name is not None}
-    for option, path in wanted.items():
+    files = {option: check_writable(Path(name)) for option, name in paths_given.items() if name is not None}
+    for option, path in files.items():
         if path.exists() and Path(source).exists() and path.samefile(source):
             raise UsageError(f"{option} {path}: is the source itself; give another name")
-    paths = [path.resolve() for path in wanted.values() if not is_special(path)]
+    paths = [path.resolve() for path in files.values() if not is_special(path)]
     if len(paths) != len(set(paths)):
-        raise UsageError(f"--report {wanted['--report']}: is --out too; give another name")
-    return wanted
+        raise UsageError(f"--report {files['--report']}: is --out too; give another name")
+    return files
 
 
-def _tracked(opened: Source, settings: Config, line: LiveLine) -> TrackRun:
+def _run_tracker(opened: Source, settings: Config, line: LiveLine) -> TrackingOutput:
     """All of a recording, or of a camera until somebody ends it."""
     from share.cameras.live import LiveSource
-    from share.runtime.stop import on_stop
-    from share.runtime.track import track
+    from share.runtime.offline_tracking import track
+    from share.runtime.signals import stop_on_signal
 
-    def say(text: str) -> None:
-        line.say(f"share: {opened.name}: {text}")
+    def print_line(text: str) -> None:
+        line.print_line(f"share: {opened.name}: {text}")
 
     if not isinstance(opened, LiveSource):
         with progress(opened.images_count, "tracking") as bar:
-            return track(opened, settings, lambda result: bar(1), say)
-    with on_stop(opened.stop):
-        return track(opened, settings, live.Shown(opened.feed, line), say)
+            return track(opened, settings, lambda result: bar(1), print_line)
+    with stop_on_signal(opened.stop):
+        return track(opened, settings, camera_options.TrackLine(opened.feed, line), print_line)
 
 
-def _waited(report: dict[str, Any]) -> list[str]:
+def _wait_text(report: dict[str, Any]) -> list[str]:
     """For what, for most of the time without a pose."""
-    from share.types import Wait
+    from share.types import WaitReason
 
     frames = report["waited"]
-    return [f"The tracker waited for {Wait(max(frames, key=frames.get)).words}"] if frames else []
+    return [f"The tracker waited for {WaitReason(max(frames, key=frames.get)).text}"] if frames else []
 
 
 def _summary(report: dict[str, Any], ate: Any) -> str:
@@ -128,8 +130,8 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
         f"{report['cpu_ms_per_frame']:.1f} ms CPU a frame, "
         f"and {report['decode_ms_per_frame']:.1f} ms to decode it",
     ]
-    if report["init_s"] > _SOON_S:
-        lines.append(". ".join([f"the first pose came after {report['init_s']:.1f} s", *_waited(report)]))
+    if report["init_s"] > _LONG_INIT_S:
+        lines.append(". ".join([f"the first pose came after {report['init_s']:.1f} s", *_wait_text(report)]))
     if report["contradicted"]:
         lines.append(
             f"images and IMU contradict each other in {report['contradicted']} frames: see whether the "
@@ -144,4 +146,4 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
             f"ATE {100 * ate.rmse:.2f} cm rms, {100 * ate.max:.2f} cm at most "
             f"({ate.n} causal poses, SE3 alignment)"
         )
-    return "\n".join([*lines, *live.summary(report)])
+    return "\n".join([*lines, *camera_options.camera_summary(report)])

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
-from share.cli.progress import LiveLine
-from share.errors import UsageError, not_installed
+from share.cli.terminal import LiveLine
+from share.errors import UsageError, install_hint
 
 if TYPE_CHECKING:
     from share.types import F32
 
-_BASE = click.option(
+_BASE_OPTION = click.option(
     "--base",
     metavar="FILE",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
@@ -66,15 +66,15 @@ def labels(
     """
     config, live = options.load_config(config_file), LiveLine()
     from share.files.writing import writable_dir
-    from share.lab.train.labels import make, plan
+    from share.lab.train.labels import make_labels, plan_label_runs
     from share.recordings.session import read_session
 
-    jobs = plan([read_session(folder) for folder in sessions], runs, seed, not without_imu, out)
+    jobs = plan_label_runs([read_session(folder) for folder in sessions], runs, seed, not without_imu, out)
     writable_dir(out)
     errors = []  # not what they are of: pictures of hundreds of runs would fill the memory
-    for job, found in make(jobs, config, workers):
-        errors.append(found.error_cm)
-        live.write(f"{len(errors)} of {len(jobs)} runs: {job.out.name}, {len(found)} keyframes")
+    for job, run_labels in make_labels(jobs, config, workers):
+        errors.append(run_labels.error_cm)
+        live.write(f"{len(errors)} of {len(jobs)} runs: {job.out.name}, {len(run_labels)} keyframes")
     live.end()
     click.echo(_summary(errors))
     click.echo(f"labels: {out}")
@@ -86,7 +86,7 @@ def labels(
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the split, and of chance."
 )
-@_BASE
+@_BASE_OPTION
 @click.option(
     "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where it is kept."
 )
@@ -100,28 +100,32 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
     Example:  share train fit labels --out fit
               share train export fit --labels labels --out error_model.onnx
     """
-    _need_extra()
+    _check_train_extra()
     from share.files.writing import writable_dir
-    from share.lab.train.fit import FitOptions
-    from share.lab.train.fitted import write_fitted
-    from share.lab.train.graph import backbone_id
-    from share.lab.train.table import collect
-    from share.lab.train.teach import teach
-    from share.odometry.error_model.network import deep_of, open_network, read_model
+    from share.lab.train.keyframe_table import collect_labels
+    from share.lab.train.onnx_graph import backbone_id
+    from share.lab.train.optimisation import TrainingOptions
+    from share.lab.train.trained_heads import write_trained
+    from share.lab.train.training import train_model
+    from share.odometry.error_model.network import backbone_features, open_network, read_model
 
-    collection, live, taken = collect(labels, seed), LiveLine(), read_model(_base(base))
+    collection, live, base_model = (
+        collect_labels(labels, seed),
+        LiveLine(),
+        read_model(_base_model_file(base)),
+    )
     writable_dir(out)
     live.write(f"{len(collection.table.error_cm)} pictures go through the backbone")
-    deep = deep_of(open_network(taken), collection.table.picture)
+    deep_features = backbone_features(open_network(base_model), collection.table.picture)
 
     def show(epoch: int, learnt: float, stopped: float) -> None:
         live.write(f"epoch {epoch}: loss {learnt:.4f} where it learns, {stopped:.4f} where it stops")
 
-    wanted = FitOptions(epochs=epochs, seed=seed)
-    backbone = backbone_id(taken)
-    fitted = teach(collection, deep, backbone, wanted, out / "checkpoint.pt", show)
+    fit_options = TrainingOptions(epochs=epochs, seed=seed)
+    backbone = backbone_id(base_model)
+    fitted = train_model(collection, deep_features, backbone, fit_options, out / "checkpoint.pt", show)
     live.end()
-    write_fitted(out / "fit.npz", fitted)
+    write_trained(out / "fit.npz", fitted)
     counts = ", ".join(f"{count} to {part}" for part, count in fitted.about["keyframes"].items())
     click.echo(f"keyframes: {counts}")
     click.echo(f"fit: {out / 'fit.npz'}")
@@ -132,7 +136,7 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
 @click.option(
     "--labels", required=True, metavar="LABELS", type=click.Path(path_type=Path), help="It was taught on."
 )
-@_BASE
+@_BASE_OPTION
 @click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="An .onnx file.")
 def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
     """Put the head in FIT, a folder by `share train fit`, onto the backbone, and write a model card beside it
@@ -141,20 +145,20 @@ def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
     \b
     Example:  share train export fit --labels labels --out error_model.onnx
     """
-    _need_extra()
+    _check_train_extra()
     from share.files.writing import atomic_write, check_writable
-    from share.lab.train.assembly import assemble
-    from share.lab.train.card import card
-    from share.lab.train.compare import of_network
-    from share.lab.train.graph import origin
+    from share.lab.train.assembled_model import assemble
+    from share.lab.train.card import model_card
+    from share.lab.train.compare import score_network
+    from share.lab.train.onnx_graph import origin
 
     check_writable(out)
-    made = assemble(fitted, labels, _base(base))
-    score = of_network("this model", made.network, made.test)
-    told = card(made.fitted.about, [score], len(made.model), origin(made.model))
-    atomic_write(out, made.model)
-    atomic_write(out.with_suffix(".md"), told)
-    click.echo(told)
+    assembled = assemble(fitted, labels, _base_model_file(base))
+    score = score_network("this model", assembled.network, assembled.test)
+    card_text = model_card(assembled.fitted.about, [score], len(assembled.model), origin(assembled.model))
+    atomic_write(out, assembled.model)
+    atomic_write(out.with_suffix(".md"), card_text)
+    click.echo(card_text)
     click.echo(f"model: {out}   card: {out.with_suffix('.md')}")
 
 
@@ -168,7 +172,7 @@ def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
     type=click.Path(path_type=Path),
     help="By train fit.",
 )
-@_BASE
+@_BASE_OPTION
 @options.as_json
 def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> None:
     """Teach linear regression, a random forest, an MLP and a contrastive CNN on the rooms that the network in
@@ -177,41 +181,41 @@ def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> Non
     \b
     Example:  share train compare labels --fit fit
     """
-    _need_extra()
-    from share.lab.train.assembly import assemble
-    from share.lab.train.compare import of_network, of_rivals
-    from share.lab.train.score import table, to_json
+    _check_train_extra()
+    from share.lab.train.assembled_model import assemble
+    from share.lab.train.compare import score_baselines, score_network
+    from share.lab.train.score import score_table, scores_json
 
     live = LiveLine()
     live.write("pictures go through the backbone")
-    made = assemble(fitted, labels, _base(base))
-    seed, scores = made.fitted.about["options"]["seed"], []
-    for score in of_rivals(made.collection, made.deep, seed, live.write):
-        live.say(f"{score.name}: RMSE {score.rmse_cm:.2f} cm")
+    assembled = assemble(fitted, labels, _base_model_file(base))
+    seed, scores = assembled.fitted.about["options"]["seed"], []
+    for score in score_baselines(assembled.collection, assembled.deep_features, seed, live.write):
+        live.print_line(f"{score.name}: RMSE {score.rmse_cm:.2f} cm")
         scores.append(score)
     live.write("ours, keyframe by keyframe")
-    scores.append(of_network("ours", made.network, made.test))
+    scores.append(score_network("ours", assembled.network, assembled.test))
     live.end()
     if as_json:
-        click.echo(to_json(scores))
+        click.echo(scores_json(scores))
     else:
-        click.echo(table(scores))
+        click.echo(score_table(scores))
 
 
-def _base(given: Path | None) -> Path:
-    from share.odometry.error_model.network import SHIPPED
+def _base_model_file(model_given: Path | None) -> Path:
+    from share.odometry.error_model.network import SHIPPED_MODEL
 
-    if given is None and not SHIPPED.is_file():
+    if model_given is None and not SHIPPED_MODEL.is_file():
         raise UsageError("--base: SHARE comes with no model yet; make a backbone with tools/make_backbone.py")
-    return given or SHIPPED
+    return model_given or SHIPPED_MODEL
 
 
-def _need_extra() -> None:
+def _check_train_extra() -> None:
     import importlib.util
 
-    absent = [name for name in ("torch", "onnx", "sklearn") if importlib.util.find_spec(name) is None]
-    if absent:
-        raise UsageError(not_installed(", ".join(absent), "train"))
+    missing = [name for name in ("torch", "onnx", "sklearn") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageError(install_hint(", ".join(missing), "train"))
 
 
 def _summary(errors: list[F32]) -> str:
@@ -219,10 +223,11 @@ def _summary(errors: list[F32]) -> str:
 
     error_cm = np.concatenate(errors)
     known = error_cm[np.isfinite(error_cm)]
-    told = f"{len(errors)} runs, {len(error_cm)} keyframes, {len(known)} with a known error"
+    text = f"{len(errors)} runs, {len(error_cm)} keyframes, {len(known)} with a known error"
     if not len(known):
-        return told
-    at = np.percentile(known, [5, 25, 50, 75, 95, 99])
-    return f"{told}\nerror, cm: " + ", ".join(
-        f"{of} % below {cm:.2g}" for of, cm in zip((5, 25, 50, 75, 95, 99), at, strict=True)
+        return text
+    percentiles = np.percentile(known, [5, 25, 50, 75, 95, 99])
+    return f"{text}\nerror, cm: " + ", ".join(
+        f"{percent} % below {cm:.2g}"
+        for percent, cm in zip((5, 25, 50, 75, 95, 99), percentiles, strict=True)
     )

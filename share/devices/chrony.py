@@ -6,15 +6,15 @@ import subprocess
 from dataclasses import dataclass
 
 from share.errors import DataError
-from share.net.udp import Host
+from share.net.udp import HostPort
 
-_NOBODY = "7F7F0101"  # reference id of a chronyd that follows its own clock
+_LOCAL_REFERENCE = "7F7F0101"  # reference id of a chronyd that follows its own clock
 _FIELDS = 14  # of `chronyc -c tracking`, chrony 2.2 and later
-_PATIENCE_S = 10.0
+_TIMEOUT_S = 10.0
 
 
 @dataclass(frozen=True)
-class Tracking:
+class ChronyTracking:
     """offset_s: the clock that it follows minus this one. rms_s: of that over the last updates. delay_s
     and dispersion_s: from here to where the time comes from. source: whom it follows, may be empty.
     synchronised: it follows somebody. local: that is its own clock."""
@@ -35,18 +35,18 @@ class Tracking:
         return self.delay_s / 2 + self.dispersion_s
 
 
-def tracking() -> Tracking | None:
+def read_tracking() -> ChronyTracking | None:
     """None where no chronyd runs. Raises DataError where it answers what is not understood."""
     try:
-        done = subprocess.run(
-            ["chronyc", "-c", "tracking"], capture_output=True, text=True, timeout=_PATIENCE_S, check=False
+        result = subprocess.run(
+            ["chronyc", "-c", "tracking"], capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
         )
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return parse(done.stdout) if done.returncode == 0 else None
+    return parse_tracking(result.stdout) if result.returncode == 0 else None
 
 
-def parse(text: str) -> Tracking:
+def parse_tracking(text: str) -> ChronyTracking:
     """Of the line that `chronyc -c tracking` prints. Raises DataError."""
     row = text.strip().split(",")
     try:
@@ -57,11 +57,11 @@ def parse(text: str) -> Tracking:
         stratum = int(row[2])
     except ValueError as error:
         raise DataError(f"chronyc -c tracking: not understood ({error}): {text.strip()!r}") from None
-    synchronised, local = row[13] != "Not synchronised", row[0].upper() == _NOBODY
-    return Tracking(row[1], synchronised, local, stratum, offset_s, rms_s, delay_s, dispersion_s)
+    synchronised, local = row[13] != "Not synchronised", row[0].upper() == _LOCAL_REFERENCE
+    return ChronyTracking(row[1], synchronised, local, stratum, offset_s, rms_s, delay_s, dispersion_s)
 
 
-def follow(server: Host) -> list[str]:
+def follow_lines(server: HostPort) -> list[str]:
     """Lines of chrony.conf that make a machine follow `server`: asked every 1 to 16 s, stepped only at the
     start where it is off by more than 10 ms. Servers of the internet, which packages of chrony bring, would
     outvote the room's one: it is the one to trust, and to take before others."""

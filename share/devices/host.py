@@ -16,47 +16,47 @@ from pathlib import Path
 from share.devices.camera_check import UsbCamera
 
 _VENDOR, _D435I = "8086", "0b3a"
-_RULES = ("etc/udev/rules.d", "lib/udev/rules.d", "usr/lib/udev/rules.d")
+_RULE_FOLDERS = ("etc/udev/rules.d", "lib/udev/rules.d", "usr/lib/udev/rules.d")
 _CPUS = "sys/devices/system/cpu/cpu[0-9]*"
-_NATIVE = ("numpy", "cv2", "scipy.linalg", "zmq", "onnxruntime")
-_WHERE_THERE_IS_ONE = ("poselib",)  # for this processor; share.geometry.absolute_pose does without
+_NATIVE_LIBRARIES = ("numpy", "cv2", "scipy.linalg", "zmq", "onnxruntime")
+_OPTIONAL_LIBRARIES = ("poselib",)  # for this processor; share.geometry.absolute_pose does without
 
 
 def governors(root: Path = Path("/")) -> list[str]:
     """Of each core."""
-    return [text for path in root.glob(f"{_CPUS}/cpufreq/scaling_governor") if (text := _text(path))]
+    return [text for path in root.glob(f"{_CPUS}/cpufreq/scaling_governor") if (text := _read_text(path))]
 
 
-def throttles(root: Path = Path("/")) -> list[int]:
+def throttle_counts(root: Path = Path("/")) -> list[int]:
     """How often each core was slowed by heat since the start (Intel's; core_throttle_count)."""
     files = root.glob(f"{_CPUS}/thermal_throttle/core_throttle_count")
-    return [count for path in files if (count := _whole(path)) is not None]
+    return [count for path in files if (count := _read_int(path)) is not None]
 
 
-def pi_throttled(root: Path = Path("/")) -> int | None:
+def pi_throttled_bits(root: Path = Path("/")) -> int | None:
     """What a Raspberry Pi's firmware says of supply and heat, as `vcgencmd get_throttled` has it; None of
     another computer. A kernel that is not the Pi's own tells of the supply alone (rpi_volt)."""
     for path in root.glob("sys/devices/platform/soc*/*firmware*/get_throttled"):
-        if re.fullmatch(r"(0x)?[0-9a-fA-F]{1,8}", text := _text(path) or ""):
+        if re.fullmatch(r"(0x)?[0-9a-fA-F]{1,8}", text := _read_text(path) or ""):
             return int(text, 16)
     for path in root.glob("sys/class/hwmon/hwmon*/in0_lcrit_alarm"):
-        if _text(path.parent / "name") == "rpi_volt":
-            return _whole(path)
+        if _read_text(path.parent / "name") == "rpi_volt":
+            return _read_int(path)
     return None
 
 
-def resets_governor(root: Path = Path("/")) -> bool:
+def is_governor_reset(root: Path = Path("/")) -> bool:
     """Whether a power-profiles-daemon is installed and may run, which sets the governor of processors that
     have an energy preference (Intel's, AMD's) to powersave whenever it starts."""
     unit = "systemd/system/power-profiles-daemon.service"
     masked = os.path.realpath(root / "etc" / unit) == "/dev/null"
-    there = any((root / folder / unit).exists() for folder in ("lib", "usr/lib"))
+    is_installed = any((root / folder / unit).exists() for folder in ("lib", "usr/lib"))
     preference = "sys/devices/system/cpu/cpufreq/policy*/energy_performance_preference"
-    return there and not masked and any(root.glob(preference))
+    return is_installed and not masked and any(root.glob(preference))
 
 
 def usb_memory_mb(root: Path = Path("/")) -> int | None:
-    return _whole(root / "sys/module/usbcore/parameters/usbfs_memory_mb")
+    return _read_int(root / "sys/module/usbcore/parameters/usbfs_memory_mb")
 
 
 def cameras(root: Path = Path("/")) -> list[UsbCamera] | None:
@@ -64,43 +64,45 @@ def cameras(root: Path = Path("/")) -> list[UsbCamera] | None:
     folder = root / "sys/bus/usb/devices"
     if not folder.is_dir():
         return None
-    return [_camera(path, root / "dev/bus/usb") for path in sorted(folder.iterdir()) if _is_d435i(path)]
+    return [_read_camera(path, root / "dev/bus/usb") for path in sorted(folder.iterdir()) if _is_d435i(path)]
 
 
 def camera_rules(root: Path = Path("/")) -> list[str]:
     """Files of udev that name the camera and its IMU in lines that are no comments."""
-    files = [path for folder in _RULES for path in sorted((root / folder).glob("*.rules"))]
-    found = {path.resolve(): path for path in files if _names_camera(_text(path) or "")}  # /lib is /usr/lib
-    return [f"/{path.relative_to(root)}" for path in found.values()]
+    files = [path for folder in _RULE_FOLDERS for path in sorted((root / folder).glob("*.rules"))]
+    rule_files = {
+        path.resolve(): path for path in files if _names_camera(_read_text(path) or "")
+    }  # /lib is /usr/lib
+    return [f"/{path.relative_to(root)}" for path in rule_files.values()]
 
 
-def free_bytes(folder: Path) -> tuple[Path, int]:
+def free_disk_bytes(folder: Path) -> tuple[Path, int]:
     """Of the disk of `folder`, by the nearest folder above that is there."""
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    return there, shutil.disk_usage(there).free
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    return existing, shutil.disk_usage(existing).free
 
 
-def port_free(port: int) -> bool:
+def is_port_free(port: int) -> bool:
     """Whether a TCP port can be listened at, on all addresses."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as asked:
-        asked.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # what has ended does not count
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # what has ended does not count
         try:
-            asked.bind(("", port))
-            asked.listen()
+            probe.bind(("", port))
+            probe.listen()
         except OSError:
             return False
     return True
 
 
 def native_libraries(
-    names: Sequence[str] = _NATIVE, optional: Sequence[str] = _WHERE_THERE_IS_ONE
+    names: Sequence[str] = _NATIVE_LIBRARIES, optional: Sequence[str] = _OPTIONAL_LIBRARIES
 ) -> dict[str, str | None]:
     """Why each does not load; None where it does. optional: those that may not be installed at all."""
-    there = [name for name in optional if importlib.util.find_spec(name) is not None]
-    return {name: _trouble(name) for name in (*names, *there)}
+    installed = [name for name in optional if importlib.util.find_spec(name) is not None]
+    return {name: _load_error(name) for name in (*names, *installed)}
 
 
-def _trouble(name: str) -> str | None:
+def _load_error(name: str) -> str | None:
     try:
         importlib.import_module(name)
     except ImportError as error:  # also a wrong glibc, a missing .so
@@ -109,12 +111,12 @@ def _trouble(name: str) -> str | None:
 
 
 def _is_d435i(path: Path) -> bool:
-    return (_text(path / "idVendor"), _text(path / "idProduct")) == (_VENDOR, _D435I)
+    return (_read_text(path / "idVendor"), _read_text(path / "idProduct")) == (_VENDOR, _D435I)
 
 
-def _camera(path: Path, nodes: Path) -> UsbCamera:
-    speed_mbit_s, control = _number(path / "speed") or 0.0, _text(path / "power/control")
-    node = nodes / f"{_whole(path / 'busnum') or 0:03}" / f"{_whole(path / 'devnum') or 0:03}"
+def _read_camera(path: Path, nodes: Path) -> UsbCamera:
+    speed_mbit_s, control = _read_float(path / "speed") or 0.0, _read_text(path / "power/control")
+    node = nodes / f"{_read_int(path / 'busnum') or 0:03}" / f"{_read_int(path / 'devnum') or 0:03}"
     may_open = os.access(node, os.R_OK | os.W_OK)
     return UsbCamera(path.name, speed_mbit_s, control, may_open, _may_start_imu(path))
 
@@ -131,19 +133,19 @@ def _names_camera(text: str) -> bool:
     return any("iio" in line for line in named) and any("iio" not in line for line in named)
 
 
-def _text(path: Path) -> str | None:
+def _read_text(path: Path) -> str | None:
     try:
         return path.read_text(errors="replace").strip()
     except OSError:
         return None
 
 
-def _number(path: Path) -> float | None:
+def _read_float(path: Path) -> float | None:
     """Also None of `unknown`, as the kernel calls the speed of a device that is coming or going."""
-    text = _text(path) or ""
+    text = _read_text(path) or ""
     return float(text) if re.fullmatch(r"\d+(\.\d+)?", text) else None
 
 
-def _whole(path: Path) -> int | None:
-    text = _text(path)
+def _read_int(path: Path) -> int | None:
+    text = _read_text(path)
     return int(text) if text and text.isdigit() else None

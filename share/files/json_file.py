@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from share.errors import DataError
-from share.files.reading import EVENTS, REPORT, read_text
+from share.files.reading import MAX_EVENTS_BYTES, MAX_REPORT_BYTES, read_text
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """One object, the whole file. Raises DataError that names it."""
-    return _object(_text(path, REPORT), str(path))
+    return _parse_object(_read_text(path, MAX_REPORT_BYTES), str(path))
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
@@ -23,21 +23,23 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
     Raises DataError that names file and line.
     """
-    text = _text(path, EVENTS)
-    whole = text[: text.rfind("\n") + 1].splitlines()
-    return [_object(line, f"{path}, line {number}") for number, line in enumerate(whole, 1)]
+    text = _read_text(path, MAX_EVENTS_BYTES)
+    complete = text[: text.rfind("\n") + 1].splitlines()
+    return [_parse_object(line, f"{path}, line {number}") for number, line in enumerate(complete, 1)]
 
 
 def parse_json(text: str | bytes) -> Any:
     """As json.loads; a number that is none, or beyond what a float holds, is refused. Raises ValueError."""
     try:
-        return json.loads(text, parse_constant=_no_number, parse_float=_float, parse_int=_int)
+        return json.loads(
+            text, parse_constant=_raise_not_a_number, parse_float=_parse_float, parse_int=_parse_int
+        )
     except RecursionError:
         raise ValueError("lists in lists without end") from None
 
 
 @contextlib.contextmanager
-def as_we_write_it(path: Path) -> Iterator[None]:
+def own_format_errors(path: Path) -> Iterator[None]:
     """What a file of ours holds is taken for what it should be: errors that come of its being something else
     become a DataError that names `path`."""
     try:
@@ -46,39 +48,39 @@ def as_we_write_it(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: is damaged, or by another SHARE: {error!r:.200}") from None
 
 
-def known(value: Any) -> Any:
+def nan_to_none(value: Any) -> Any:
     """Plain data for JSON, which knows no NaN: None in its place."""
     match value:
         case float() if math.isnan(value):
             return None
         case dict():
-            return {name: known(one) for name, one in value.items()}
+            return {name: nan_to_none(one) for name, one in value.items()}
         case list() | tuple():
-            return [known(one) for one in value]
+            return [nan_to_none(one) for one in value]
         case _:
             return value
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """As it comes back from JSON, in which what that does not know is text."""
     return json.loads(json.dumps(value, default=str))
 
 
-def with_nan(row: dict[str, Any]) -> dict[str, Any]:
-    """What `known` made of a row of numbers, as it was."""
+def none_to_nan(row: dict[str, Any]) -> dict[str, Any]:
+    """What `nan_to_none` made of a row of numbers, as it was."""
     return {name: math.nan if value is None else value for name, value in row.items()}
 
 
-def _text(path: Path, most: int) -> str:
+def _read_text(path: Path, max_bytes: int) -> str:
     try:
-        return read_text(path, most)
+        return read_text(path, max_bytes)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: is damaged: {error}") from None
 
 
-def _object(text: str, where: str) -> dict[str, Any]:
+def _parse_object(text: str, where: str) -> dict[str, Any]:
     try:
         value = parse_json(text)
     except ValueError as error:
@@ -88,20 +90,20 @@ def _object(text: str, where: str) -> dict[str, Any]:
     return value
 
 
-def _no_number(text: str) -> NoReturn:
+def _raise_not_a_number(text: str) -> NoReturn:
     raise ValueError(f"{text} is no number")
 
 
-def _float(text: str) -> float:
+def _parse_float(text: str) -> float:
     if not math.isfinite(value := float(text)):
-        _no_number(f"{text:.40}")
+        _raise_not_a_number(f"{text:.40}")
     return value
 
 
-def _int(text: str) -> int:
-    if len(text) > _DIGITS:
-        _no_number(f"{text:.40}")
+def _parse_int(text: str) -> int:
+    if len(text) > _MAX_DIGITS:
+        _raise_not_a_number(f"{text:.40}")
     return int(text)
 
 
-_DIGITS = 40  # more than any stamp or count has, and a float holds it
+_MAX_DIGITS = 40  # more than any stamp or count has, and a float holds it

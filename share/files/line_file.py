@@ -12,7 +12,7 @@ from typing import IO
 
 from share.errors import ShareError
 from share.files.reading import MB, open_regular
-from share.files.writing import fresh
+from share.files.writing import open_new
 
 # ---- A text file that a live run appends to, and that never ends the run: a full disk is said once.
 
@@ -20,20 +20,20 @@ from share.files.writing import fresh
 class LineFile:
     """Every line is in the system's hands when `write` returns, so a crash loses none.
 
-    After the first line that cannot be written (disk full, quota), `say` is told once and nothing
+    After the first line that cannot be written (disk full, quota), `notify` is told once and nothing
     more is tried: what is there stays, in whole lines.
     """
 
     def __init__(
-        self, path: Path, say: Callable[[str], None], opened: Callable[[Path], IO[bytes]] = fresh
+        self, path: Path, notify: Callable[[str], None], open_file: Callable[[Path], IO[bytes]] = open_new
     ) -> None:
         """opened: makes the file; may raise OSError."""
-        self.path, self._say = path, say
-        self.whole_bytes = 0  # of whole lines
+        self.path, self._notify = path, notify
+        self.written_bytes = 0  # of whole lines
         self._file: IO[str] | None = None
         self._failure = ""
         try:
-            self._file = io.TextIOWrapper(opened(path), "utf-8", line_buffering=True)
+            self._file = io.TextIOWrapper(open_file(path), "utf-8", line_buffering=True)
         except OSError as error:
             self._fail(error)
 
@@ -43,7 +43,7 @@ class LineFile:
             return
         try:
             self._file.write(line + "\n")
-            self.whole_bytes += len(line.encode()) + 1
+            self.written_bytes += len(line.encode()) + 1
         except OSError as error:
             self._fail(error)
 
@@ -64,12 +64,12 @@ class LineFile:
                 self._file.close()
             self._file = None
             with contextlib.suppress(OSError):  # a device has no end to cut off
-                os.truncate(self.path, self.whole_bytes)
-        self._say(f"{self.path}: cannot be written: {self._failure}; the run goes on without it")
+                os.truncate(self.path, self.written_bytes)
+        self._notify(f"{self.path}: cannot be written: {self._failure}; the run goes on without it")
 
 
-_LASTING = Path("/var/tmp")  # /tmp may lie in memory
-_AT_ONCE = 1 << 20  # bytes
+_VAR_TMP = Path("/var/tmp")  # /tmp may lie in memory
+_READ_BYTES = 1 << 20  # bytes
 
 
 class Spool:
@@ -79,27 +79,29 @@ class Spool:
     however the run ends.
     """
 
-    def __init__(self, path: Path | None, say: Callable[[str], None]) -> None:
-        self._path, self._say = path, say
+    def __init__(self, path: Path | None, notify: Callable[[str], None]) -> None:
+        self._path, self._notify = path, notify
         self._file: LineFile | None = None
-        self._reading: int | None = None  # a handle of the same file
+        self._read_handle: int | None = None  # a handle of the same file
 
     def write(self, line: str) -> None:
         """One line, without its end."""
         if self._file is None:
-            shown = _lasting() / "share (without a name)" if self._path is None else self._path
-            self._file = LineFile(shown, self._say, self._opened)
+            shown_path = _temp_folder() / "share (without a name)" if self._path is None else self._path
+            self._file = LineFile(shown_path, self._notify, self._open_file)
         self._file.write(line)
 
     def read(self) -> Iterator[str]:
         """Lines in order, but for those that could not be written. Raises ShareError if the disk fails."""
-        if self._file is None or self._reading is None:
+        if self._file is None or self._read_handle is None:
             return
-        at, cut = 0, b""
-        while at < self._file.whole_bytes:
-            lines = (cut + self._part(at, min(_AT_ONCE, self._file.whole_bytes - at))).split(b"\n")
-            at += sum(map(len, lines)) + len(lines) - 1 - len(cut)
-            cut = lines.pop()
+        offset, partial_line = 0, b""
+        while offset < self._file.written_bytes:
+            lines = (
+                partial_line + self._read_at(offset, min(_READ_BYTES, self._file.written_bytes - offset))
+            ).split(b"\n")
+            offset += sum(map(len, lines)) + len(lines) - 1 - len(partial_line)
+            partial_line = lines.pop()
             yield from (line.decode() for line in lines)
 
     def check(self) -> None:
@@ -110,22 +112,22 @@ class Spool:
     def close(self) -> None:
         if self._file is not None:
             self._file.close()
-        if self._reading is not None:
-            os.close(self._reading)
-            self._reading = None
+        if self._read_handle is not None:
+            os.close(self._read_handle)
+            self._read_handle = None
 
-    def _opened(self, path: Path) -> IO[bytes]:
-        file = self._nameless() if self._path is None else fresh(path)
-        self._reading = os.dup(file.fileno())
+    def _open_file(self, path: Path) -> IO[bytes]:
+        file = self._open_nameless() if self._path is None else open_new(path)
+        self._read_handle = os.dup(file.fileno())
         return file
 
-    def _nameless(self) -> IO[bytes]:
-        return tempfile.TemporaryFile(dir=_lasting())
+    def _open_nameless(self) -> IO[bytes]:
+        return tempfile.TemporaryFile(dir=_temp_folder())
 
-    def _part(self, at: int, size: int) -> bytes:
-        assert self._file is not None and self._reading is not None
+    def _read_at(self, offset: int, size: int) -> bytes:
+        assert self._file is not None and self._read_handle is not None
         try:
-            part = os.pread(self._reading, size, at)
+            part = os.pread(self._read_handle, size, offset)
         except OSError as error:
             raise ShareError(f"{self._file.path}: cannot be read: {error.strerror}") from None
         if not part:
@@ -133,13 +135,13 @@ class Spool:
         return part
 
 
-def _lasting() -> Path:
-    return _LASTING if os.access(_LASTING, os.W_OK) else Path(tempfile.gettempdir())
+def _temp_folder() -> Path:
+    return _VAR_TMP if os.access(_VAR_TMP, os.W_OK) else Path(tempfile.gettempdir())
 
 
 # ---- A text file that another process is writing, read as it grows.
 
-_PIECE = 10 * MB  # the rest the next time
+_MAX_READ_BYTES = 10 * MB  # the rest the next time
 
 
 class GrowingFile:
@@ -148,21 +150,21 @@ class GrowingFile:
 
     def __init__(self, path: Path, partial: Path | None = None) -> None:
         self._path, self._partial = path, partial
-        self._read = 0  # bytes
+        self._read_bytes = 0  # bytes
 
-    def lines(self) -> list[str]:
+    def new_lines(self) -> list[str]:
         """Whole lines that have come since the last time; none while there is no file."""
-        new = b"" if self._partial is None else self._beyond(self._partial)
-        if not new and (self._partial is None or self._read):
-            new = self._beyond(self._path)
-        whole = new[: new.rfind(b"\n") + 1]
-        self._read += len(whole)
-        return whole.decode(errors="replace").splitlines()
+        new = b"" if self._partial is None else self._read_new(self._partial)
+        if not new and (self._partial is None or self._read_bytes):
+            new = self._read_new(self._path)
+        complete = new[: new.rfind(b"\n") + 1]
+        self._read_bytes += len(complete)
+        return complete.decode(errors="replace").splitlines()
 
-    def _beyond(self, path: Path) -> bytes:
+    def _read_new(self, path: Path) -> bytes:
         try:
             with open_regular(path) as file:
-                file.seek(self._read)
-                return file.read(_PIECE)
+                file.seek(self._read_bytes)
+                return file.read(_MAX_READ_BYTES)
         except OSError:
             return b""

@@ -15,10 +15,10 @@ _TYPE, _ATTRIBUTE, _DOMAIN = 4, 5, 7  # of a node
 _TENSOR, _GRAPH_OF, _TENSORS, _GRAPHS, _SPARSE, _SPARSES = 5, 6, 10, 11, 22, 23  # of an attribute
 _EXTERNAL, _LOCATION = 13, 14  # of a tensor
 _BYTES, _FIXED = 2, {1: 8, 5: 4}  # wire types, and how long those of one length are
-_MOST_NODES = 20_000
+_MAX_NODES = 20_000
 _DOMAINS = (b"", b"ai.onnx")
 
-LAYERS = frozenset((
+ALLOWED_LAYERS = frozenset((
     "Abs", "Add", "And", "ArgMax", "ArgMin", "AveragePool", "BatchNormalization", "Cast", "CastLike",
     "Ceil", "Clip", "Concat", "Constant", "Conv", "ConvInteger", "Cos", "DequantizeLinear", "Div",
     "Dropout", "DynamicQuantizeLinear", "Elu", "Equal", "Erf", "Exp", "Flatten", "Floor", "Gather", "Gelu",
@@ -52,11 +52,11 @@ def _check_graph(graph: bytes) -> None:
     for number, value in _fields(graph):
         if number == _NODE:
             nodes += 1
-            if nodes > _MOST_NODES:
-                raise ValueError(f"it has more than {_MOST_NODES} layers")
-            _check_node(_whole(value))
+            if nodes > _MAX_NODES:
+                raise ValueError(f"it has more than {_MAX_NODES} layers")
+            _check_node(_checked_bytes(value))
         elif number == _INITIALIZER:
-            _check_tensor(_whole(value))
+            _check_tensor(_checked_bytes(value))
         elif number == _SPARSE_INITIALIZER:
             raise ValueError("it has sparse weights")
 
@@ -65,12 +65,12 @@ def _check_node(node: bytes) -> None:
     kind = domain = b""
     for number, value in _fields(node):
         if number == _TYPE:
-            kind = _whole(value)
+            kind = _checked_bytes(value)
         elif number == _DOMAIN:
-            domain = _whole(value)
+            domain = _checked_bytes(value)
         elif number == _ATTRIBUTE:
-            _check_attribute(_whole(value))
-    if domain not in _DOMAINS or kind.decode(errors="replace") not in LAYERS:
+            _check_attribute(_checked_bytes(value))
+    if domain not in _DOMAINS or kind.decode(errors="replace") not in ALLOWED_LAYERS:
         name = b".".join((domain, kind) if domain else (kind,)).decode(errors="replace")
         raise ValueError(f"its layer '{name:.60}' is none that an error model may have")
 
@@ -78,7 +78,7 @@ def _check_node(node: bytes) -> None:
 def _check_attribute(attribute: bytes) -> None:
     for number, value in _fields(attribute):
         if number in (_TENSOR, _TENSORS):
-            _check_tensor(_whole(value))
+            _check_tensor(_checked_bytes(value))
         elif number in (_GRAPH_OF, _GRAPHS, _SPARSE, _SPARSES):
             raise ValueError("a layer of it holds a graph, or sparse numbers")
 
@@ -89,7 +89,7 @@ def _check_tensor(tensor: bytes) -> None:
             raise ValueError("its weights lie in other files; save it with its weights inside")
 
 
-def _whole(value: bytes | int) -> bytes:
+def _checked_bytes(value: bytes | int) -> bytes:
     if not isinstance(value, bytes):
         raise ValueError("it is no protocol buffer, or damaged")
     return value
@@ -97,32 +97,32 @@ def _whole(value: bytes | int) -> bytes:
 
 def _fields(data: bytes) -> Iterator[tuple[int, bytes | int]]:
     """Number and value of each. Raises IndexError where they are cut short, ValueError."""
-    at = 0
-    while at < len(data):
-        key, at = _varint(data, at)
+    offset = 0
+    while offset < len(data):
+        key, offset = _varint(data, offset)
         number, wire = key >> 3, key & 7
         if wire == 0:
-            value, at = _varint(data, at)
+            value, offset = _varint(data, offset)
             yield number, value
             continue
         if wire == _BYTES:
-            length, at = _varint(data, at)
+            length, offset = _varint(data, offset)
         elif wire in _FIXED:
             length = _FIXED[wire]
         else:
             raise ValueError("it is no protocol buffer, or damaged")
-        if length > len(data) - at:
+        if length > len(data) - offset:
             raise IndexError
-        yield number, data[at : at + length]
-        at += length
+        yield number, data[offset : offset + length]
+        offset += length
 
 
-def _varint(data: bytes, at: int) -> tuple[int, int]:
+def _varint(data: bytes, offset: int) -> tuple[int, int]:
     value = 0
     for shift in range(0, 70, 7):
-        byte = data[at]
-        at += 1
+        byte = data[offset]
+        offset += 1
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
-            return value, at
+            return value, offset
     raise ValueError("it is no protocol buffer, or damaged")

@@ -7,59 +7,59 @@ from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import quote
 
-from share.files.reading import is_hollow, open_regular
+from share.files.reading import is_sparse, open_regular
 
-_EVERY = 10_000  # of SQLite's steps, between two counts of them: some 0.1 ms
-_STEPS, _STEPS_A_BYTE = (
+_STEPS_PER_CHECK = 10_000  # of SQLite's steps, between two counts of them: some 0.1 ms
+_MIN_STEPS, _STEPS_PER_BYTE = (
     10**8,
     100,
 )  # before a row is given: seconds, and more where there is more to look through
 _CACHE_KB = 8000
 
 
-def distrust(connection: sqlite3.Connection, most_bytes: int) -> None:
+def limit_untrusted(connection: sqlite3.Connection, max_row_bytes: int) -> None:
     """Before anything is read. most_bytes: of a row, and so of a blob. Raises sqlite3.Error."""
     connection.execute("PRAGMA trusted_schema = OFF")
     connection.execute("PRAGMA cell_size_check = ON")
-    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most_bytes)
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max_row_bytes)
 
 
-def log_of(path: Path) -> Path:
+def wal_path(path: Path) -> Path:
     """Where SQLite keeps what is committed, but not yet in the file."""
     return path.with_name(path.name + "-wal")
 
 
-def index_of(path: Path) -> Path:
+def shm_path(path: Path) -> Path:
     """What SQLite looks up in that log, shared between processes."""
     return path.with_name(path.name + "-shm")
 
 
-def read_only(path: Path) -> str:
+def read_only_uri(path: Path) -> str:
     """Its URI. Without a log nobody writes, and no file beside it is needed."""
-    mode = "mode=ro" if log_of(path).exists() else "immutable=1"
+    mode = "mode=ro" if wal_path(path).exists() else "immutable=1"
     return f"file:{quote(str(path.resolve()))}?{mode}"
 
 
-class Untrusted:
+class UntrustedDatabase:
     """Tables of one file; columns: those that each must have, by table. Raises OSError for what is no regular
     file, sqlite3.Error for what is no database of such tables: each a plain one, whose first column is the
     number of its rows and no column of which is computed."""
 
-    def __init__(self, path: Path, columns: Mapping[str, tuple[str, ...]], most_bytes: int) -> None:
-        for file in (path, log_of(path)):
+    def __init__(self, path: Path, columns: Mapping[str, tuple[str, ...]], max_row_bytes: int) -> None:
+        for file in (path, wal_path(path)):
             if file == path or file.is_symlink() or file.exists():
                 open_regular(file).close()
-                if is_hollow(file):
+                if is_sparse(file):
                     raise sqlite3.DatabaseError("it is nearly all holes")
-        self._connection = sqlite3.connect(read_only(path), uri=True, isolation_level=None)
-        self._most = _STEPS + _STEPS_A_BYTE * path.stat().st_size
+        self._connection = sqlite3.connect(read_only_uri(path), uri=True, isolation_level=None)
+        self._max_steps = _MIN_STEPS + _STEPS_PER_BYTE * path.stat().st_size
         self._steps = 0
         try:
-            distrust(self._connection, most_bytes)
+            limit_untrusted(self._connection, max_row_bytes)
             self._connection.execute(f"PRAGMA cache_size = -{_CACHE_KB}")
-            self._connection.set_progress_handler(self._step, _EVERY)
+            self._connection.set_progress_handler(self._step, _STEPS_PER_CHECK)
             for table, names in columns.items():
-                self._check(table, names)
+                self._check_table(table, names)
         except BaseException:
             self.close()
             raise
@@ -73,18 +73,18 @@ class Untrusted:
         return self._connection.execute(query, values)
 
     def _step(self) -> bool:
-        self._steps += _EVERY
-        return self._steps > self._most
+        self._steps += _STEPS_PER_CHECK
+        return self._steps > self._max_steps
 
-    def _check(self, table: str, names: tuple[str, ...]) -> None:
+    def _check_table(self, table: str, names: tuple[str, ...]) -> None:
         kinds = self.rows(f"SELECT type, sql FROM sqlite_schema WHERE name = '{table}'").fetchall()
         if [(kind, str(sql).upper().split()[:2]) for kind, sql in kinds] != [("table", ["CREATE", "TABLE"])]:
             raise sqlite3.DatabaseError(f"no table {table} as it should be")
-        found = self.rows(f"PRAGMA table_xinfo({table})").fetchall()
-        if any(hidden for *_, hidden in found):
+        columns = self.rows(f"PRAGMA table_xinfo({table})").fetchall()
+        if any(hidden for *_, hidden in columns):
             raise sqlite3.DatabaseError(f"a column of {table} is computed")
-        if missing := [name for name in names if name not in {column[1] for column in found}]:
+        if missing := [name for name in names if name not in {column[1] for column in columns}]:
             raise sqlite3.DatabaseError(f"table {table} has no {missing[0]}")
-        numbered = [(name, str(kind).upper()) for _, name, kind, _, _, key, _ in found if key]
+        numbered = [(name, str(kind).upper()) for _, name, kind, _, _, key, _ in columns if key]
         if numbered != [(names[0], "INTEGER")]:
             raise sqlite3.DatabaseError(f"rows of {table} are not numbered by {names[0]}")

@@ -25,14 +25,14 @@ def atomic_write(path: Path, data: bytes | str) -> None:
     if is_special(path):
         _write_special(path, content)
         return
-    path = path.resolve() if _of_system(path) else path
+    path = path.resolve() if _is_system_path(path) else path
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     except OSError as error:
         raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
     try:
-        with writing(path):
-            _fill(handle, name, content)
+        with write_errors(path):
+            _write_durably(handle, name, content)
             os.replace(name, path)
     finally:
         with contextlib.suppress(FileNotFoundError):
@@ -40,7 +40,7 @@ def atomic_write(path: Path, data: bytes | str) -> None:
     sync_folder(path.parent)
 
 
-def _fill(handle: int, name: str, content: bytes) -> None:
+def _write_durably(handle: int, name: str, content: bytes) -> None:
     with os.fdopen(handle, "wb") as file:
         file.write(content)
         file.flush()
@@ -49,7 +49,7 @@ def _fill(handle: int, name: str, content: bytes) -> None:
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
+def write_errors(path: Path) -> Iterator[None]:
     """Says a full disk and its like in one line: OSError inside becomes a ShareError that names `path`."""
     try:
         yield
@@ -84,7 +84,7 @@ def check_writable(path: Path) -> Path:
 def check_replaceable(path: Path) -> Path:
     """`path`, if it is a file or nothing, and so can be replaced by one. Else UsageError."""
     if is_special(path):
-        raise _in_the_way(path)
+        raise _blocked_path_error(path)
     return check_writable(path)
 
 
@@ -95,42 +95,44 @@ def _open_pipe(path: Path) -> None:
     """It stays open from here on: a reader takes the close of its last writer for the end. Raises UsageError
     where nobody reads it, for which open(2) would wait."""
     if not path.is_fifo():
-        raise UsageError(f"{path}: is {_what(path)}; give the name of a file")
-    if (which := _which(path)) in _pipes:
+        raise UsageError(f"{path}: is {_kind_text(path)}; give the name of a file")
+    if (file_id := _file_id(path)) in _pipes:
         return
     try:
         handle = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
-        why = "that nobody reads" if error.errno == errno.ENXIO else f"and cannot be opened: {error.strerror}"
-        raise UsageError(f"{path}: is a pipe {why}; give the name of a file") from None
+        problem = (
+            "that nobody reads" if error.errno == errno.ENXIO else f"and cannot be opened: {error.strerror}"
+        )
+        raise UsageError(f"{path}: is a pipe {problem}; give the name of a file") from None
     os.set_blocking(handle, True)  # its reader may be slow
-    _pipes[which] = handle
+    _pipes[file_id] = handle
 
 
 def _write_special(path: Path, content: bytes) -> None:
-    with writing(path):
+    with write_errors(path):
         if path.is_char_device():
             handle = os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_NOCTTY)
-        elif (known := _pipes.get(_which(path))) is not None:
-            handle = os.dup(known)
+        elif (pipe := _pipes.get(_file_id(path))) is not None:
+            handle = os.dup(pipe)
         else:
-            raise _in_the_way(path)
+            raise _blocked_path_error(path)
         with os.fdopen(handle, "wb") as file:
             file.write(content)
 
 
-def _which(path: Path) -> tuple[int, int]:
-    found = path.stat()
-    return found.st_dev, found.st_ino
+def _file_id(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_dev, status.st_ino
 
 
-def _in_the_way(path: Path) -> UsageError:
+def _blocked_path_error(path: Path) -> UsageError:
     return UsageError(
-        f"{path}: is {_what(path)}, where a file is to be written; remove it, or give another --out"
+        f"{path}: is {_kind_text(path)}, where a file is to be written; remove it, or give another --out"
     )
 
 
-def _what(path: Path) -> str:
+def _kind_text(path: Path) -> str:
     """A name for what is no file."""
     return "a pipe" if path.is_fifo() else "a socket" if path.is_socket() else "a device"
 
@@ -138,32 +140,32 @@ def _what(path: Path) -> str:
 def is_special(path: Path) -> bool:
     """Whether it is a device or a pipe (/dev/null, /dev/stdout), which must not be replaced by a file. A link
     to one is not, but for those of the system."""
-    if path.is_symlink() and not _of_system(path):
+    if path.is_symlink() and not _is_system_path(path):
         return False
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
-def _of_system(path: Path) -> bool:
+def _is_system_path(path: Path) -> bool:
     """Whether the system made it, as /dev/stdout, which is a link."""
     return path.absolute().parts[1:2] in (("dev",), ("proc",))
 
 
-def fresh(path: Path) -> IO[bytes]:
+def open_new(path: Path) -> IO[bytes]:
     """A new, empty file in the place of what had that name: neither a link there nor another name of the same
     file is written through. A device is opened as it is. Raises OSError, also for a pipe."""
     if path.is_char_device() and is_special(path):
         return path.open("wb")
     if is_special(path):
-        raise OSError(errno.EINVAL, f"it is {_what(path)}, not a file; remove it", str(path))
+        raise OSError(errno.EINVAL, f"it is {_kind_text(path)}, not a file; remove it", str(path))
     with contextlib.suppress(FileNotFoundError):
         path.unlink()
-    return os.fdopen(os.open(path, _FRESH, 0o666), "wb")
+    return os.fdopen(os.open(path, _NEW_FILE_FLAGS, 0o666), "wb")
 
 
-_FRESH = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_NEW_FILE_FLAGS = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
-def claim(folder: Path) -> int:
+def lock_folder(folder: Path) -> int:
     """Make `folder` (as `writable_dir`) and lock it for one run: two must not write the same files.
 
     Returns a handle; closing it, or the end of the process, gives the folder free. Raises UsageError
@@ -195,7 +197,7 @@ def writable_dir(path: Path, *names: str) -> Path:
         raise UsageError(f"{path}: cannot be written to: {error.strerror}; give another --out") from None
     for name in names:
         if is_special(path / name):
-            raise _in_the_way(path / name)
+            raise _blocked_path_error(path / name)
     return path
 
 
@@ -216,7 +218,7 @@ def new_file(out: Path) -> Iterator[IO[bytes]]:
         raise UsageError(f"{out}: exists and is not overwritten; give a new name")
     handle, name = tempfile.mkstemp(prefix=f".{out.name}.", dir=out.parent)
     try:
-        with writing(out), os.fdopen(handle, "wb") as file:
+        with write_errors(out), os.fdopen(handle, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -238,7 +240,7 @@ def new_folder(out: Path) -> Iterator[Path]:
     writable_dir(out.parent)
     work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
-        with writing(out):
+        with write_errors(out):
             yield work
             work.chmod(0o755)
             work.replace(out)
@@ -246,8 +248,8 @@ def new_folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def xdg_folder(variable: str, otherwise: str) -> Path:
+def xdg_folder(variable: str, default: str) -> Path:
     """What the environment's `variable` says, or that folder of the user's home (XDG Base Directory
     Specification). Raises RuntimeError where nobody has a home."""
-    given = os.environ.get(variable, "")
-    return Path(given) if os.path.isabs(given) else Path.home() / otherwise
+    folder = os.environ.get(variable, "")
+    return Path(folder) if os.path.isabs(folder) else Path.home() / default

@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from share.config import Config, load
+from share.config import Config, load_config
 from share.errors import ConfigError, UsageError
-from share.files.reading import SETTINGS, read_text
+from share.files.reading import MAX_SETTINGS_BYTES, read_text
 from share.plain_data import load_yaml
 from share.types import F64, checked_pose
 
@@ -24,7 +24,7 @@ class Section:
 
     def __init__(self, data: Any, where: str) -> None:
         if not isinstance(data, dict):
-            raise ConfigError(f"{where}: expected keys and values, found {_kind(data)}")
+            raise ConfigError(f"{where}: expected keys and values, found {_describe_value(data)}")
         self.data: dict[Any, Any] = data
         self.where = where
 
@@ -43,7 +43,7 @@ class Section:
         value = self.get(key) if default is None else self.data.get(key, default)
         if not isinstance(value, str):
             quoted = "" if value is None or isinstance(value, dict | list) else "; put it in quotes"
-            raise ConfigError(f"{self.where}: {key}: expected a word, found {_kind(value)}{quoted}")
+            raise ConfigError(f"{self.where}: {key}: expected a word, found {_describe_value(value)}{quoted}")
         return value
 
     def number(self, key: str, default: float | None = None, positive: bool = False) -> float:
@@ -56,9 +56,9 @@ class Section:
     def numbers(self, key: str, lengths: tuple[int, ...]) -> list[float]:
         value = self.get(key)
         if not isinstance(value, list) or len(value) not in lengths:
-            have = len(value) if isinstance(value, list) else _kind(value)
+            count = len(value) if isinstance(value, list) else _describe_value(value)
             raise ConfigError(
-                f"{self.where}: {key}: expected {' or '.join(map(str, lengths))} numbers, found {have}"
+                f"{self.where}: {key}: expected {' or '.join(map(str, lengths))} numbers, found {count}"
             )
         return self._numbers(key, value)
 
@@ -88,10 +88,10 @@ class Section:
         return numbers
 
 
-def text_of(path: Path) -> str:
+def read_yaml_text(path: Path) -> str:
     """What a YAML file says. Raises ConfigError."""
     try:
-        return read_text(path, SETTINGS, "utf-8-sig")  # some editors begin with a byte-order mark
+        return read_text(path, MAX_SETTINGS_BYTES, "utf-8-sig")  # some editors begin with a byte-order mark
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the calibration with --calib") from None
     except UnicodeDecodeError:
@@ -103,14 +103,14 @@ def text_of(path: Path) -> str:
 def read_yaml(path: Path) -> Section:
     """The top mapping of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, `!!opencv-matrix`). Raises
     ConfigError."""
-    text = text_of(path)
+    text = read_yaml_text(path)
     lines = text.replace("!!opencv-matrix", "").split("\n")
     if lines[0].startswith("%YAML"):  # not valid YAML: the directive needs a space, and a `---` after it
         lines[0] = ""
     return Section(load_yaml("\n".join(lines), str(path)), str(path))
 
 
-def _kind(value: Any) -> str:
+def _describe_value(value: Any) -> str:
     return "nothing" if value is None else f"{type(value).__name__} {value!r:.40}"
 
 
@@ -120,77 +120,77 @@ def _kind(value: Any) -> str:
 T = TypeVar("T")
 
 
-def read(cls: type[T], section: Section) -> T:
+def read_dataclass(cls: type[T], section: Section) -> T:
     """`section` as the dataclass `cls`, recursively. A key without a field, a missing one without a
     default and a value of another type are a ConfigError naming file and key; so is what `cls` refuses."""
     hints = typing.get_type_hints(cls)
     for key in section.data:
         if key not in hints:
-            raise ConfigError(f"{section.where}: unknown key '{key}'{_hint(str(key), list(hints))}")
+            raise ConfigError(f"{section.where}: unknown key '{key}'{_key_hint(str(key), list(hints))}")
     values = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         optional = field.default is not dataclasses.MISSING
         if field.name in section or not optional:
-            values[field.name] = _value(hints[field.name], section, field.name)
+            values[field.name] = _read_value(hints[field.name], section, field.name)
     try:
         return cls(**values)
     except ValueError as error:
         raise ConfigError(f"{section.where}: {error}") from None
 
 
-def _hint(key: str, known: list[str]) -> str:
+def _key_hint(key: str, known: list[str]) -> str:
     near = difflib.get_close_matches(key, known, n=1)
     return f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known)}"
 
 
-def _value(hint: Any, section: Section, key: str) -> Any:
+def _read_value(hint: Any, section: Section, key: str) -> Any:
     if isinstance(hint, _types.UnionType):  # X | None
         if section.get(key) is None:
             return None
         hint = next(kind for kind in typing.get_args(hint) if kind is not type(None))
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return read(hint, section.section(key))
+        return read_dataclass(hint, section.section(key))
     if typing.get_origin(hint) is tuple:
-        return _items(typing.get_args(hint), section, key)
+        return _read_items(typing.get_args(hint), section, key)
     if typing.get_origin(hint) is np.ndarray:
         return section.pose(key)
-    return _SCALARS[hint](section, key)
+    return _SCALAR_READERS[hint](section, key)
 
 
-def _items(kinds: tuple[Any, ...], section: Section, key: str) -> tuple[Any, ...]:
+def _read_items(kinds: tuple[Any, ...], section: Section, key: str) -> tuple[Any, ...]:
     """tuple[X, ...] or tuple[X, X]: a list; each entry is read as if it were a key of its own."""
     data = section.get(key)
     length = None if kinds[-1] is Ellipsis else len(kinds)
     if not isinstance(data, list) or length not in (None, len(data)):
         raise ConfigError(f"{section.where}: {key}: expected a list{f' of {length}' if length else ''}")
     entries = Section({f"{key}[{i}]": entry for i, entry in enumerate(data)}, section.where)
-    return tuple(_value(kinds[0], entries, name) for name in entries.data)
+    return tuple(_read_value(kinds[0], entries, name) for name in entries.data)
 
 
-def _number(section: Section, key: str) -> float:
+def _read_number(section: Section, key: str) -> float:
     if isinstance(section.get(key), bool):
         raise ConfigError(f"{section.where}: {key}: expected a number, found {section.get(key)}")
     return section.number(key)
 
 
-def _whole(section: Section, key: str) -> int:
+def _read_int(section: Section, key: str) -> int:
     value = section.get(key)
     if type(value) is not int:
         raise ConfigError(f"{section.where}: {key}: expected a whole number, found {value!r}")
     return value
 
 
-def _yes_no(section: Section, key: str) -> bool:
+def _read_bool(section: Section, key: str) -> bool:
     value = section.get(key)
     if type(value) is not bool:
         raise ConfigError(f"{section.where}: {key}: expected true or false, found {value!r}")
     return value
 
 
-_SCALARS: dict[Any, Callable[[Section, str], Any]] = {
-    float: _number,
-    int: _whole,
-    bool: _yes_no,
+_SCALAR_READERS: dict[Any, Callable[[Section, str], Any]] = {
+    float: _read_number,
+    int: _read_int,
+    bool: _read_bool,
     str: lambda section, key: section.text(key),
 }
 
@@ -201,8 +201,8 @@ _SCALARS: dict[Any, Callable[[Section, str], Any]] = {
 def read_settings(path: Path) -> Config:
     """Raises ConfigError that names the key and what would be right, UsageError."""
     try:
-        text = read_text(path, SETTINGS)
+        text = read_text(path, MAX_SETTINGS_BYTES)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise UsageError(f"{path}: cannot read the configuration: {reason}") from None
-    return load(text, str(path))
+    return load_config(text, str(path))

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from share.geometry.se3 import compose
+from share.geometry.se3 import from_rt
 from share.types import F64
 
 try:
@@ -21,13 +21,13 @@ try:
 except ModuleNotFoundError:
     poselib = None
 
-_LEAST = 4  # matches: three for the pose, one to choose among its solutions
-_NOWHERE = np.full((4, 4), np.nan)
-Found = tuple[F64, NDArray[np.bool_]]
+_MIN_MATCHES = 4  # matches: three for the pose, one to choose among its solutions
+_NO_POSE = np.full((4, 4), np.nan)
+PoseAndInliers = tuple[F64, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
-class Terms:
+class RansacOptions:
     """Of a search. best_first: the matches are in the order of trust, which finds a consensus sooner (PROSAC,
     Chum and Matas, CVPR 2005). confidence: that some sample had no wrong match. OpenCV knows no least number
     of iterations."""
@@ -40,53 +40,53 @@ class Terms:
     confidence: float = 0.9999
 
 
-def absolute_pose(points: F64, uv: F64, focal: float, terms: Terms) -> Found:
+def absolute_pose(points: F64, uv: F64, focal: float, options: RansacOptions) -> PoseAndInliers:
     """T_cam_world (4, 4), not finite where there is none, and the inliers (N,). The same for the same seed.
 
     points: (N, 3) m, world. uv: (N, 2) normalised; focal turns them into px for the threshold.
     """
-    return (by_opencv if poselib is None else by_poselib)(points, uv, focal, terms)
+    return (by_opencv if poselib is None else by_poselib)(points, uv, focal, options)
 
 
-def by_poselib(points: F64, uv: F64, focal: float, terms: Terms) -> Found:
+def by_poselib(points: F64, uv: F64, focal: float, options: RansacOptions) -> PoseAndInliers:
     camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
-    options = {
-        "max_reproj_error": terms.threshold_px,
-        "seed": terms.seed,
-        "min_iterations": terms.min_iterations,
-        "max_iterations": terms.max_iterations,
-        "success_prob": terms.confidence,
-        "progressive_sampling": terms.best_first,
+    settings = {
+        "max_reproj_error": options.threshold_px,
+        "seed": options.seed,
+        "min_iterations": options.min_iterations,
+        "max_iterations": options.max_iterations,
+        "success_prob": options.confidence,
+        "progressive_sampling": options.best_first,
     }
-    pose, info = poselib.estimate_absolute_pose(uv * focal, points, camera, options, {})
-    return compose(np.asarray(pose.R), np.asarray(pose.t)), np.asarray(info["inliers"], bool)
+    pose, info = poselib.estimate_absolute_pose(uv * focal, points, camera, settings, {})
+    return from_rt(np.asarray(pose.R), np.asarray(pose.t)), np.asarray(info["inliers"], bool)
 
 
-def by_opencv(points: F64, uv: F64, focal: float, terms: Terms) -> Found:
+def by_opencv(points: F64, uv: F64, focal: float, options: RansacOptions) -> PoseAndInliers:
     inlier = np.zeros(len(points), bool)
-    if len(points) < _LEAST:
-        return _NOWHERE, inlier
-    sure, _, turn, shift, which = cv2.solvePnPRansac(
+    if len(points) < _MIN_MATCHES:
+        return _NO_POSE, inlier
+    ok, _, rvec, tvec, which = cv2.solvePnPRansac(
         np.ascontiguousarray(points)[:, None],
         np.ascontiguousarray(uv)[:, None],
         np.eye(3),
         None,
-        params=_usac(terms, focal),
+        params=_usac_params(options, focal),
     )
-    if not sure or which is None:
-        return _NOWHERE, inlier
+    if not ok or which is None:
+        return _NO_POSE, inlier
     inlier[which.ravel()] = True
-    return compose(np.asarray(cv2.Rodrigues(turn)[0], np.float64), shift.ravel()), inlier
+    return from_rt(np.asarray(cv2.Rodrigues(rvec)[0], np.float64), tvec.ravel()), inlier
 
 
-def _usac(terms: Terms, focal: float) -> cv2.UsacParams:
+def _usac_params(options: RansacOptions, focal: float) -> cv2.UsacParams:
     """Of normalised image coordinates."""
     params = cv2.UsacParams()
-    params.threshold = terms.threshold_px / focal
-    params.randomGeneratorState = terms.seed % 2**31
-    params.maxIterations = terms.max_iterations
-    params.confidence = terms.confidence
-    params.sampler = cv2.SAMPLING_PROSAC if terms.best_first else cv2.SAMPLING_UNIFORM
+    params.threshold = options.threshold_px / focal
+    params.randomGeneratorState = options.seed % 2**31
+    params.maxIterations = options.max_iterations
+    params.confidence = options.confidence
+    params.sampler = cv2.SAMPLING_PROSAC if options.best_first else cv2.SAMPLING_UNIFORM
     params.score = cv2.SCORE_METHOD_MSAC
     params.loMethod, params.loIterations, params.loSampleSize = cv2.LOCAL_OPTIM_INNER_LO, 10, 14
     params.final_polisher, params.final_polisher_iterations = cv2.LSQ_POLISHER, 3

@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.geometry.lens import COUNTS, EQUIDISTANT, RADTAN, Equidistant, Radtan, lens
-from share.types import F64, checked, checked_pose
+from share.geometry.lens import COEFFICIENT_COUNTS, EQUIDISTANT, RADTAN, Equidistant, Radtan, lens_model
+from share.types import F64, checked_array, checked_pose
 
-MOST_TIMESHIFT_S = 1.0
-BASELINE_M = (0.005, 2.0)  # of two cameras that see one room
-MOST_PIXELS = 10**8  # of an image: beyond any camera's
-_FOCAL_PX = (1.0, 1e5)  # shorter or longer, and what is divided or multiplied by it is noise
-_MOST_PX = 1e6  # the principal point, which may lie outside the image, from its corner
-_MOST_NOISE, _MOST_RATE_HZ = 1e3, 1e5  # of an IMU
-_MOST_GYRO_BIAS, _MOST_ACCEL_BIAS = 0.5, 3.0  # rad/s, m/s^2
+MAX_TIMESHIFT_S = 1.0
+BASELINE_RANGE_M = (0.005, 2.0)  # of two cameras that see one room
+MAX_PIXELS = 10**8  # of an image: beyond any camera's
+_FOCAL_RANGE_PX = (1.0, 1e5)  # shorter or longer, and what is divided or multiplied by it is noise
+_MAX_PRINCIPAL_POINT_PX = 1e6  # the principal point, which may lie outside the image, from its corner
+_MAX_NOISE, _MAX_RATE_HZ = 1e3, 1e5  # of an IMU
+_MAX_GYRO_BIAS, _MAX_ACCEL_BIAS = 0.5, 3.0  # rad/s, m/s^2
 MOST_APART_M = 1e3  # of what sits on one body, also in millimetres, of which `rig_check` says more
 _RIGID = 1e-6  # what is off by less stays to the last digit
-_MOST_DISTORTION = 1e4  # of a coefficient; k3 of a lens with a narrow view is some hundreds
+_MAX_DISTORTION = 1e4  # of a coefficient; k3 of a lens with a narrow view is some hundreds
 
 
 def rays(uv: F64) -> F64:
@@ -33,7 +33,7 @@ def rays(uv: F64) -> F64:
     return np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
 
 
-def _either(counts: tuple[int, ...]) -> str:
+def _alternatives(counts: tuple[int, ...]) -> str:
     *first, last = (str(count) for count in counts)
     return " or ".join([", ".join(first), last]) if first else last
 
@@ -53,27 +53,31 @@ class Camera:
     model: str = RADTAN
 
     def __post_init__(self) -> None:
-        if self.model not in COUNTS:
-            raise ValueError(f"lens model '{self.model:.40}' is not known; known: {', '.join(COUNTS)}")
+        if self.model not in COEFFICIENT_COUNTS:
+            raise ValueError(
+                f"lens model '{self.model:.40}' is not known; known: {', '.join(COEFFICIENT_COUNTS)}"
+            )
         if self.width <= 0 or self.height <= 0:
             raise ValueError(f"resolution: {self.width}x{self.height} is not positive")
-        if self.width * self.height > MOST_PIXELS:
+        if self.width * self.height > MAX_PIXELS:
             raise ValueError(f"resolution: {self.width}x{self.height} is more than a camera has")
         if not (self.fx > 0 and self.fy > 0):
             raise ValueError(f"intrinsics: focal lengths {self.fx}, {self.fy} must be positive")
-        if len(self.distortion) not in (counts := COUNTS[self.model]):
+        if len(self.distortion) not in (counts := COEFFICIENT_COUNTS[self.model]):
             raise ValueError(
-                f"distortion: {len(self.distortion)} coefficients, expected {_either(counts)} of {self.model}"
+                f"distortion: {len(self.distortion)} "
+                f"coefficients, "
+                f"expected {_alternatives(counts)} of {self.model}"
             )
         if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all():
             raise ValueError("intrinsics: has values that are not finite")
-        shortest, longest = _FOCAL_PX
+        shortest, longest = _FOCAL_RANGE_PX
         if not shortest <= min(self.fx, self.fy) <= max(self.fx, self.fy) <= longest:
             raise ValueError(f"intrinsics: focal lengths {self.fx:g}, {self.fy:g} px are no camera's")
-        if max(abs(self.cx), abs(self.cy)) > _MOST_PX:
+        if max(abs(self.cx), abs(self.cy)) > _MAX_PRINCIPAL_POINT_PX:
             raise ValueError(f"intrinsics: principal point {self.cx:g}, {self.cy:g} px is no camera's")
-        if max(map(abs, self.distortion), default=0.0) > _MOST_DISTORTION:
-            raise ValueError(f"distortion: coefficients beyond {_MOST_DISTORTION:g} are no lens's")
+        if max(map(abs, self.distortion), default=0.0) > _MAX_DISTORTION:
+            raise ValueError(f"distortion: coefficients beyond {_MAX_DISTORTION:g} are no lens's")
 
     @property
     def K(self) -> F64:
@@ -83,26 +87,26 @@ class Camera:
     @property
     def lens(self) -> Radtan | Equidistant | None:
         """None without distortion."""
-        return lens(self.model, self.distortion) if self.distortion else None
+        return lens_model(self.model, self.distortion) if self.distortion else None
 
     @property
-    def fisheye(self) -> bool:
+    def is_fisheye(self) -> bool:
         """Whether a pixel is much more of the normalised coordinates at the edge than in the middle."""
         return self.model == EQUIDISTANT
 
     @property
-    def bounded(self) -> bool:
+    def is_bounded(self) -> bool:
         """Whether the lens's range may end within the image: there pixels have no normalised coordinates."""
-        return self.fisheye or ((bends := self.lens) is not None and bends.limit < math.inf)
+        return self.is_fisheye or ((distortion := self.lens) is not None and distortion.limit < math.inf)
 
     @property
-    def field_rad(self) -> tuple[float, float]:
+    def field_of_view_rad(self) -> tuple[float, float]:
         """Across and upright: 2 atan(size / 2 f), as without distortion; of a fisheye lens as it has it, as
         far as there are normalised coordinates."""
-        if isinstance(bends := self.lens, Equidistant):
+        if isinstance(distortion := self.lens, Equidistant):
             sides = np.array([[self.width / (2 * self.fx), 0.0], [0.0, self.height / (2 * self.fy)]])
-            half = np.arccos(bends.directions(sides)[:, 2])
-            across, upright = (2 * np.fmin(half, bends.widest)).tolist()
+            half = np.arccos(distortion.directions(sides)[:, 2])
+            across, upright = (2 * np.fmin(half, distortion.max_field_rad)).tolist()
             return across, upright
         return 2 * math.atan(self.width / (2 * self.fx)), 2 * math.atan(self.height / (2 * self.fy))
 
@@ -117,32 +121,32 @@ class Camera:
         z = np.where(points[..., 2:] > 1e-6, points[..., 2:], np.nan)
         return self.distort(points[..., :2] / z)
 
-    def project_all(self, points: F64) -> F64:
+    def project_wide(self, points: F64) -> F64:
         """The same, also of what a fisheye lens sees that has none; NaN beyond the lens's range."""
-        if not isinstance(bends := self.lens, Equidistant):
+        if not isinstance(distortion := self.lens, Equidistant):
             return self.project(points)
-        return bends.bend_points(points) * (self.fx, self.fy) + (self.cx, self.cy)
+        return distortion.distort_points(points) * (self.fx, self.fy) + (self.cx, self.cy)
 
     def distort(self, uv: F64) -> F64:
         """Normalised coordinates (..., 2) -> pixels (..., 2); NaN beyond the lens's range."""
         if self.distortion:
-            uv = lens(self.model, self.distortion).bend(uv)
+            uv = lens_model(self.model, self.distortion).distort(uv)
         return uv * (self.fx, self.fy) + (self.cx, self.cy)
 
-    def normalise(self, px: F64, about: F64 | None = None) -> F64:
+    def normalise(self, px: F64, guess: F64 | None = None) -> F64:
         """Pixels (..., 2) -> undistorted normalised coordinates (x/z, y/z), to 1e-9 inside the image; NaN
         beyond the lens's range. about: where they nearly are, from which it is found sooner."""
         observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion:
             return observed
-        return lens(self.model, self.distortion).straighten(observed, about)
+        return lens_model(self.model, self.distortion).undistort(observed, guess)
 
     def directions(self, px: F64) -> F64:
         """Pixels (..., 2) -> unit vectors (..., 3) in the camera frame, also of what has no normalised
         coordinates; NaN beyond the lens's range."""
         observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
-        if (bends := self.lens) is not None:
-            return bends.directions(observed)
+        if (distortion := self.lens) is not None:
+            return distortion.directions(observed)
         ray = np.concatenate([observed, np.ones((*observed.shape[:-1], 1))], axis=-1)
         return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
 
@@ -151,20 +155,20 @@ class Camera:
         scale = np.array([[self.fx], [self.fy]])
         if not self.distortion:
             return np.broadcast_to(scale * np.eye(2), (*uv.shape, 2)).copy()
-        return scale * lens(self.model, self.distortion).jacobian(uv)
+        return scale * lens_model(self.model, self.distortion).jacobian(uv)
 
-    def evened(self, uv: F64) -> F64:
+    def to_image_plane(self, uv: F64) -> F64:
         """Normalised coordinates (..., 2) to such of which a pixel is as much, 1 / focal, all over the image:
         of a fisheye lens those in its image plane, of others the same."""
-        return lens(self.model, self.distortion).bend(uv) if self.fisheye else uv
+        return lens_model(self.model, self.distortion).distort(uv) if self.is_fisheye else uv
 
-    def knows(self, px: F64) -> NDArray[np.bool_]:
+    def has_normalised(self, px: F64) -> NDArray[np.bool_]:
         """Which pixels (..., 2) have normalised coordinates."""
-        if not self.bounded:
+        if not self.is_bounded:
             return np.ones(px.shape[:-1], bool)
         return np.asarray(np.isfinite(self.normalise(px)).all(axis=-1))
 
-    def inside(self, px: F64, border: float = 0.0) -> np.ndarray:
+    def is_inside(self, px: F64, border: float = 0.0) -> np.ndarray:
         """Which pixels (..., 2) lie in the image, at least `border` px from its edge."""
         upper = (self.width - 1 - border, self.height - 1 - border)
         return np.asarray(((px >= border) & (px <= upper)).all(axis=-1))
@@ -181,13 +185,11 @@ class ImuNoise:
     rate_hz: float
 
     def __post_init__(self) -> None:
-        told = (self.gyro_density, self.accel_density, self.gyro_walk, self.accel_walk, self.rate_hz)
-        if not all(0 <= value < np.inf for value in told):
+        values = (self.gyro_density, self.accel_density, self.gyro_walk, self.accel_walk, self.rate_hz)
+        if not all(0 <= value < np.inf for value in values):
             raise ValueError("IMU: has noise or a rate that is negative or not finite")
-        if max(told[:4]) > _MOST_NOISE or self.rate_hz > _MOST_RATE_HZ:
-            raise ValueError(
-                f"IMU: noise beyond {_MOST_NOISE:g} or a rate beyond {_MOST_RATE_HZ:g} Hz is none"
-            )
+        if max(values[:4]) > _MAX_NOISE or self.rate_hz > _MAX_RATE_HZ:
+            raise ValueError(f"IMU: noise beyond {_MAX_NOISE:g} or a rate beyond {_MAX_RATE_HZ:g} Hz is none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,14 +203,14 @@ class ImuBias:
     accel_sigma: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "gyro", checked("gyro bias", self.gyro, (3,), np.float64))
-        object.__setattr__(self, "accel", checked("accelerometer bias", self.accel, (3,), np.float64))
-        for name, value, most in (
-            ("gyro", max(np.abs(self.gyro).max(), self.gyro_sigma), _MOST_GYRO_BIAS),
-            ("accelerometer", max(np.abs(self.accel).max(), self.accel_sigma), _MOST_ACCEL_BIAS),
+        object.__setattr__(self, "gyro", checked_array("gyro bias", self.gyro, (3,), np.float64))
+        object.__setattr__(self, "accel", checked_array("accelerometer bias", self.accel, (3,), np.float64))
+        for name, value, limit in (
+            ("gyro", max(np.abs(self.gyro).max(), self.gyro_sigma), _MAX_GYRO_BIAS),
+            ("accelerometer", max(np.abs(self.accel).max(), self.accel_sigma), _MAX_ACCEL_BIAS),
         ):
-            if not value <= most:
-                raise ValueError(f"IMU: a bias of the {name} beyond {most:g} is none")
+            if not value <= limit:
+                raise ValueError(f"IMU: a bias of the {name} beyond {limit:g} is none")
         if not (self.gyro_sigma > 0 and self.accel_sigma > 0):
             raise ValueError("IMU: a bias is never known exactly")
 
@@ -250,13 +252,13 @@ class Rig:
             T = getattr(self, name)
             if T is not None:
                 object.__setattr__(self, name, _extrinsics(name, T))
-        if self.T_cam1_cam0 is not None and not BASELINE_M[0] <= self.baseline <= BASELINE_M[1]:
+        if self.T_cam1_cam0 is not None and not BASELINE_RANGE_M[0] <= self.baseline <= BASELINE_RANGE_M[1]:
             raise ValueError(
-                f"T_cam1_cam0: the cameras are {self.baseline:g} m apart, not {BASELINE_M[0]:g} to "
-                f"{BASELINE_M[1]:g}; translations are in metres"
+                f"T_cam1_cam0: the cameras are {self.baseline:g} m apart, not {BASELINE_RANGE_M[0]:g} to "
+                f"{BASELINE_RANGE_M[1]:g}; translations are in metres"
             )
-        if not abs(self.timeshift_s) <= MOST_TIMESHIFT_S:
-            raise ValueError(f"timeshift_s: {self.timeshift_s} is not within {MOST_TIMESHIFT_S:g} s")
+        if not abs(self.timeshift_s) <= MAX_TIMESHIFT_S:
+            raise ValueError(f"timeshift_s: {self.timeshift_s} is not within {MAX_TIMESHIFT_S:g} s")
 
     def without_imu(self) -> Rig:
         """The same cameras where no IMU was recorded: the body is cam0."""
@@ -265,8 +267,8 @@ class Rig:
     @property
     def kind(self) -> str:
         """`stereo`, `rgbd` or `mono`, with `+imu` where there is one."""
-        eyes = "stereo" if self.cam1 else "rgbd" if self.depth else "mono"
-        return eyes + ("+imu" if self.imu else "")
+        cameras = "stereo" if self.cam1 else "rgbd" if self.depth else "mono"
+        return cameras + ("+imu" if self.imu else "")
 
     @property
     def timeshift_ns(self) -> int:

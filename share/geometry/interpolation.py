@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from share.errors import DataError
-from share.geometry.se3 import compose, so3_exp, so3_log
+from share.geometry.se3 import from_rt, so3_exp, so3_log
 from share.types import F64, I64
 
 Trajectory = tuple[I64, F64]
@@ -42,14 +42,14 @@ def interpolate(stamps_ns: I64, T: F64, at_ns: I64, max_gap_ns: int = MAX_GAP_NS
     u = ((at_ns - stamps_ns[a]) / step)[:, None]
     Ra, Rb, ta, tb = T[a, :3, :3], T[b, :3, :3], T[a, :3, 3], T[b, :3, 3]
     phi = so3_log(np.swapaxes(Ra, -1, -2) @ Rb)
-    return known, compose(Ra @ so3_exp(u * phi), (1 - u) * ta + u * tb)
+    return known, from_rt(Ra @ so3_exp(u * phi), (1 - u) * ta + u * tb)
 
 
-def require(n: int, least: int, what: str) -> None:
-    """Raises DataError where fewer than `least` associated poses leave nothing to measure."""
-    if n < least:
+def require_poses(n: int, minimum: int, metric: str) -> None:
+    """Raises DataError where fewer than `minimum` associated poses leave nothing to measure."""
+    if n < minimum:
         raise DataError(
-            f"{what}: {n} poses of the estimate have a truth at their time, at least {least} are needed; "
+            f"{metric}: {n} poses of the estimate have a truth at their time, at least {minimum} are needed; "
             "check that both use the same clock"
         )
 

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from share.types import F64
 
 RADTAN, EQUIDISTANT = "radtan", "equidistant"
-COUNTS = {RADTAN: (0, 4, 5), EQUIDISTANT: (4,)}  # of coefficients
+COEFFICIENT_COUNTS = {RADTAN: (0, 4, 5), EQUIDISTANT: (4,)}  # of coefficients
 # Off the axis of a fisheye lens, beyond which a tracker uses nothing: (x/z, y/z) ends at 90 degrees, and here
 # a pixel is 15 times as much of it as in the middle.
-WIDEST_DEG = 75.0
-_TINY = 1e-8  # of a squared radius: below it limits are taken
-_ROUNDS, _EXACT = 60, 1e-12  # of Newton's method for an angle
+MAX_FIELD_DEG = 75.0
+_MIN_SQUARED_RADIUS = 1e-8  # of a squared radius: below it limits are taken
+_MAX_ITERATIONS, _ANGLE_TOLERANCE = 60, 1e-12  # of Newton's method for an angle
 
 
 @dataclass(frozen=True)
@@ -33,15 +33,15 @@ class Radtan:
     coefficients: tuple[float, ...]
     limit: float
 
-    def bend(self, uv: F64) -> F64:
+    def distort(self, uv: F64) -> F64:
         """Normalised coordinates (..., 2) -> those in the image plane (..., 2)."""
-        out = self._bend(uv)
+        out = self._distort(uv)
         if self.limit < math.inf:
             out[(uv**2).sum(axis=-1) > self.limit**2] = np.nan
         return out
 
-    def _bend(self, uv: F64) -> F64:
-        k1, k2, p1, p2, k3 = self._all()
+    def _distort(self, uv: F64) -> F64:
+        k1, k2, p1, p2, k3 = self._padded_coefficients()
         x, y = uv[..., 0], uv[..., 1]
         r2 = x * x + y * y
         xy, radial = 2 * x * y, 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -52,7 +52,7 @@ class Radtan:
 
     def jacobian(self, uv: F64) -> F64:
         """d(bent)/d(uv), (..., 2, 2)."""
-        k1, k2, p1, p2, k3 = self._all()
+        k1, k2, p1, p2, k3 = self._padded_coefficients()
         x, y = uv[..., 0], uv[..., 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -63,40 +63,40 @@ class Radtan:
         J[..., 0, 1] = J[..., 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
         return J
 
-    def straighten(self, bent: F64, about: F64 | None = None) -> F64:
-        """The inverse of `bend`, to 1e-9 inside the image. about: where they nearly are, from which it is
+    def undistort(self, distorted: F64, guess: F64 | None = None) -> F64:
+        """The inverse of `distort`, to 1e-9 inside the image. about: where they nearly are, from which it is
         found sooner."""
-        uv = (bent if about is None else about).copy()
-        if self.limit < math.inf and about is None:  # begin inside, where there is a way
+        uv = (distorted if guess is None else guess).copy()
+        if self.limit < math.inf and guess is None:  # begin inside, where there is a way
             r = np.hypot(uv[..., 0], uv[..., 1])[..., None]
             uv *= np.minimum(1, 0.9 * self.limit / np.maximum(r, 1e-12))
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # a lens that no glass has
-            found = self._newton(bent, uv, about is not None)
-            if self.limit < math.inf or not found:  # what fell into the fold, or found no way
-                off = np.abs(bent - self._bend(uv)).max(axis=-1)
-                uv[~(((uv**2).sum(axis=-1) <= self.limit**2) & (off < 1e-6))] = np.nan
+            converged = self._newton(distorted, uv, guess is not None)
+            if self.limit < math.inf or not converged:  # what fell into the fold, or found no way
+                error = np.abs(distorted - self._distort(uv)).max(axis=-1)
+                uv[~(((uv**2).sum(axis=-1) <= self.limit**2) & (error < 1e-6))] = np.nan
         return uv
 
-    def _newton(self, bent: F64, uv: F64, near: bool) -> bool:
+    def _newton(self, distorted: F64, uv: F64, is_near: bool) -> bool:
         """Move uv (..., 2) to where its image is bent (..., 2); whether all of them arrived. near: they are
         nearly there, so that the first derivative will do."""
         for k in range(8):  # converges quadratically inside the image
-            if k == 0 or not near:
+            if k == 0 or not is_near:
                 J = self.jacobian(uv)
                 J = J / (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])[..., None, None]
-            r = bent - self._bend(uv)
+            r = distorted - self._distort(uv)
             uv[..., 0] += J[..., 1, 1] * r[..., 0] - J[..., 0, 1] * r[..., 1]
             uv[..., 1] += J[..., 0, 0] * r[..., 1] - J[..., 1, 0] * r[..., 0]
             if np.nanmax(np.abs(r), initial=0.0) < 1e-6:  # so the step leaves about its square
                 return True
         return False
 
-    def bend_points(self, points: F64) -> F64:
+    def distort_points(self, points: F64) -> F64:
         """Points (..., 3) in the camera frame -> image plane (..., 2); NaN behind the camera."""
         z = np.where(points[..., 2:] > 1e-6, points[..., 2:], np.nan)
-        return self.bend(points[..., :2] / z)
+        return self.distort(points[..., :2] / z)
 
-    def jacobian_points(self, points: F64) -> F64:
+    def point_jacobian(self, points: F64) -> F64:
         """d(bent)/d(point), (..., 2, 3); NaN behind the camera."""
         z = np.where(points[..., 2] > 1e-6, points[..., 2], np.nan)
         uv = points[..., :2] / z[..., None]
@@ -105,7 +105,7 @@ class Radtan:
         into[..., :, 2] = -uv / z[..., None]
         return self.jacobian(uv) @ into
 
-    def by_coefficients(self, points: F64) -> F64:
+    def coefficient_jacobian(self, points: F64) -> F64:
         """d(bent)/d(k1, k2, p1, p2, k3) at points (..., 3), (..., 2, 5), or without k3 (..., 2, 4)."""
         uv = points[..., :2] / points[..., 2:]
         x, y = uv[..., 0], uv[..., 1]
@@ -117,13 +117,13 @@ class Radtan:
         out = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
         return np.asarray(out[..., : max(len(self.coefficients), 4)])
 
-    def directions(self, bent: F64) -> F64:
+    def directions(self, distorted: F64) -> F64:
         """Image plane (..., 2) -> unit vectors (..., 3) to what is seen there."""
-        uv = self.straighten(bent)
+        uv = self.undistort(distorted)
         ray = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
         return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
 
-    def _all(self) -> tuple[float, float, float, float, float]:
+    def _padded_coefficients(self) -> tuple[float, float, float, float, float]:
         k1, k2, p1, p2, *k3 = self.coefficients
         return k1, k2, p1, p2, k3[0] if k3 else 0.0
 
@@ -131,100 +131,100 @@ class Radtan:
 @dataclass(frozen=True)
 class Equidistant:
     """limit: of the angle from the axis, rad, up to which it grows; at most pi. Normalised coordinates are of
-    rays up to WIDEST_DEG only, `bend_points` and `directions` are of all."""
+    rays up to WIDEST_DEG only, `distort_points` and `directions` are of all."""
 
     coefficients: tuple[float, ...]
     limit: float
 
     @property
-    def widest(self) -> float:
+    def max_field_rad(self) -> float:
         """rad off the axis, up to which there are normalised coordinates."""
-        return min(self.limit, math.radians(WIDEST_DEG))
+        return min(self.limit, math.radians(MAX_FIELD_DEG))
 
-    def bend(self, uv: F64) -> F64:
+    def distort(self, uv: F64) -> F64:
         """Normalised coordinates (..., 2) -> those in the image plane (..., 2)."""
         r2 = (uv**2).sum(axis=-1)
         theta = np.arctan(np.sqrt(r2))
-        scale = self._by_radius(self._bent(theta), r2)
-        scale[theta > self.widest] = np.nan
+        scale = self._scale_of_radius(self._distorted_angle(theta), r2)
+        scale[theta > self.max_field_rad] = np.nan
         return np.asarray(uv * scale[..., None])
 
     def jacobian(self, uv: F64) -> F64:
         """d(bent)/d(uv), (..., 2, 2)."""
         r2 = (uv**2).sum(axis=-1)
         theta = np.arctan(np.sqrt(r2))
-        scale = self._by_radius(self._bent(theta), r2)
+        scale = self._scale_of_radius(self._distorted_angle(theta), r2)
         with np.errstate(divide="ignore", invalid="ignore"):
-            slope = (self._slope(theta) / (1 + r2) - scale) / r2
-        slope = np.where(r2 < _TINY, 2 * (self.coefficients[0] - 1 / 3), slope)
+            slope = (self._angle_derivative(theta) / (1 + r2) - scale) / r2
+        slope = np.where(r2 < _MIN_SQUARED_RADIUS, 2 * (self.coefficients[0] - 1 / 3), slope)
         out = slope[..., None, None] * uv[..., :, None] * uv[..., None, :]
         out[..., 0, 0] += scale
         out[..., 1, 1] += scale
-        out[theta > self.widest] = np.nan
+        out[theta > self.max_field_rad] = np.nan
         return np.asarray(out)
 
-    def straighten(self, bent: F64, about: F64 | None = None) -> F64:
-        """The inverse of `bend`, to 1e-9. about: is not needed."""
-        radius = np.hypot(bent[..., 0], bent[..., 1])
-        theta = self._angle(radius, self.widest)
+    def undistort(self, distorted: F64, guess: F64 | None = None) -> F64:
+        """The inverse of `distort`, to 1e-9. about: is not needed."""
+        radius = np.hypot(distorted[..., 0], distorted[..., 1])
+        theta = self._solve_angle(radius, self.max_field_rad)
         with np.errstate(divide="ignore", invalid="ignore"):
-            scale = np.where(radius**2 < _TINY, 1.0, np.tan(theta) / radius)
-        return np.asarray(bent * scale[..., None])
+            scale = np.where(radius**2 < _MIN_SQUARED_RADIUS, 1.0, np.tan(theta) / radius)
+        return np.asarray(distorted * scale[..., None])
 
-    def bend_points(self, points: F64) -> F64:
+    def distort_points(self, points: F64) -> F64:
         """Points (..., 3) in the camera frame, also behind it, -> image plane (..., 2); NaN beyond
         `limit`."""
-        theta, across = self._of(points)
+        theta, across = self._polar(points)
         return np.asarray(points[..., :2] * self._scale(points, theta, across)[..., None])
 
-    def jacobian_points(self, points: F64) -> F64:
+    def point_jacobian(self, points: F64) -> F64:
         """d(bent)/d(point), (..., 2, 3)."""
-        theta, across = self._of(points)
+        theta, across = self._polar(points)
         z, d2 = points[..., 2], (points**2).sum(axis=-1)
-        scale, slope = self._scale(points, theta, across), self._slope(theta)
-        near = across**2 < _TINY * d2
+        scale, slope = self._scale(points, theta, across), self._angle_derivative(theta)
+        near = across**2 < _MIN_SQUARED_RADIUS * d2
         with np.errstate(divide="ignore", invalid="ignore"):
-            along = np.where(near, 0.0, (slope * z / d2 - scale) / across**2)
+            slope_term = np.where(near, 0.0, (slope * z / d2 - scale) / across**2)
         xy = points[..., :2]
         out = np.zeros((*points.shape[:-1], 2, 3))
-        out[..., :2] = along[..., None, None] * xy[..., :, None] * xy[..., None, :]
+        out[..., :2] = slope_term[..., None, None] * xy[..., :, None] * xy[..., None, :]
         out[..., 0, 0] += scale
         out[..., 1, 1] += scale
         out[..., 2] = -xy * (slope / d2)[..., None]
         return out
 
-    def by_coefficients(self, points: F64) -> F64:
+    def coefficient_jacobian(self, points: F64) -> F64:
         """d(bent)/d(k1, k2, k3, k4) at points (..., 3), (..., 2, 4)."""
-        theta, across = self._of(points)
+        theta, across = self._polar(points)
         with np.errstate(divide="ignore", invalid="ignore"):
-            way = np.where(across[..., None] > 0, points[..., :2] / across[..., None], 0.0)
+            direction = np.where(across[..., None] > 0, points[..., :2] / across[..., None], 0.0)
         powers = theta[..., None] ** np.array([3, 5, 7, 9])
-        return np.asarray(way[..., :, None] * powers[..., None, :])
+        return np.asarray(direction[..., :, None] * powers[..., None, :])
 
-    def directions(self, bent: F64) -> F64:
+    def directions(self, distorted: F64) -> F64:
         """Image plane (..., 2) -> unit vectors (..., 3) to what is seen there; NaN beyond `limit`."""
-        radius = np.hypot(bent[..., 0], bent[..., 1])
-        theta = self._angle(radius, self.limit)
+        radius = np.hypot(distorted[..., 0], distorted[..., 1])
+        theta = self._solve_angle(radius, self.limit)
         with np.errstate(divide="ignore", invalid="ignore"):
-            scale = np.where(radius**2 < _TINY, 1.0, np.sin(theta) / radius)
-        return np.concatenate([bent * scale[..., None], np.cos(theta)[..., None]], axis=-1)
+            scale = np.where(radius**2 < _MIN_SQUARED_RADIUS, 1.0, np.sin(theta) / radius)
+        return np.concatenate([distorted * scale[..., None], np.cos(theta)[..., None]], axis=-1)
 
-    def _bent(self, theta: F64) -> F64:
+    def _distorted_angle(self, theta: F64) -> F64:
         k1, k2, k3, k4 = self.coefficients
         t2 = theta * theta
         return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 
-    def _slope(self, theta: F64) -> F64:
+    def _angle_derivative(self, theta: F64) -> F64:
         k1, k2, k3, k4 = self.coefficients
         t2 = theta * theta
         return 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
 
-    def _by_radius(self, bent: F64, r2: F64) -> F64:
+    def _scale_of_radius(self, distorted: F64, r2: F64) -> F64:
         with np.errstate(divide="ignore", invalid="ignore"):
-            out = bent / np.sqrt(r2)
-        return np.where(r2 < _TINY, 1 + r2 * (self.coefficients[0] - 1 / 3), out)
+            out = distorted / np.sqrt(r2)
+        return np.where(r2 < _MIN_SQUARED_RADIUS, 1 + r2 * (self.coefficients[0] - 1 / 3), out)
 
-    def _of(self, points: F64) -> tuple[F64, F64]:
+    def _polar(self, points: F64) -> tuple[F64, F64]:
         """The angle off the axis (...), rad, and the distance from it (...); NaN beyond `limit`."""
         across = np.hypot(points[..., 0], points[..., 1])
         theta = np.arctan2(across, points[..., 2])
@@ -234,32 +234,33 @@ class Equidistant:
         """(...) of what the coordinates across the axis are multiplied by."""
         ahead = (across < 1e-6 * np.abs(points[..., 2])) & (theta < 1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(ahead, 1 / points[..., 2], self._bent(theta) / across)
+            return np.where(ahead, 1 / points[..., 2], self._distorted_angle(theta) / across)
 
-    def _angle(self, radius: F64, most: float) -> F64:
-        """rad (...) off the axis of what is seen at a radius (...) in the image plane; NaN beyond `most`.
-        Newton's method between 0 and `most`, where the radius grows with the angle; the interval is halved
-        where a step would leave it or is more than half of the one before."""
-        end = float(self._bent(np.asarray(most)))
-        sought = np.where(radius <= end, radius, np.nan)
-        low, high = np.zeros_like(sought), np.full_like(sought, most)
-        theta, moved = np.minimum(sought, most), np.full_like(sought, 2 * most)
-        for _ in range(_ROUNDS):
-            off = self._bent(theta) - sought
-            low, high = np.where(off < 0, theta, low), np.where(off > 0, theta, high)
+    def _solve_angle(self, radius: F64, max_angle: float) -> F64:
+        """rad (...) off the axis of what is seen at a radius (...) in the image plane; NaN beyond
+        `max_angle`.
+        Newton's method between 0 and `max_angle`, where the radius grows with the angle; the interval is
+        halved where a step would leave it or is more than half of the one before."""
+        end = float(self._distorted_angle(np.asarray(max_angle)))
+        radius_inside = np.where(radius <= end, radius, np.nan)
+        low, high = np.zeros_like(radius_inside), np.full_like(radius_inside, max_angle)
+        theta, moved = np.minimum(radius_inside, max_angle), np.full_like(radius_inside, 2 * max_angle)
+        for _ in range(_MAX_ITERATIONS):
+            error = self._distorted_angle(theta) - radius_inside
+            low, high = np.where(error < 0, theta, low), np.where(error > 0, theta, high)
             with np.errstate(divide="ignore", invalid="ignore"):
-                step = theta - off / self._slope(theta)
+                step = theta - error / self._angle_derivative(theta)
             fits = (step >= low) & (step <= high) & (np.abs(step - theta) <= moved / 2)
             step = np.where(fits, step, (low + high) / 2)
-            moved, theta = np.abs(step - theta), np.where(np.isnan(sought), np.nan, step)
-            if np.nanmax(moved, initial=0.0) < _EXACT:
+            moved, theta = np.abs(step - theta), np.where(np.isnan(radius_inside), np.nan, step)
+            if np.nanmax(moved, initial=0.0) < _ANGLE_TOLERANCE:
                 break
         return theta
 
 
 @lru_cache(maxsize=64)
-def lens(model: str, coefficients: tuple[float, ...]) -> Radtan | Equidistant:
-    """The lens of a model of `COUNTS` with as many coefficients as that says, but not none."""
+def lens_model(model: str, coefficients: tuple[float, ...]) -> Radtan | Equidistant:
+    """The lens of a model of `COEFFICIENT_COUNTS` with as many coefficients as that says, but not none."""
     if model == RADTAN:
         k1, k2, _, _, *k3 = coefficients
         return Radtan(coefficients, math.sqrt(_first_root([3 * k1, 5 * k2, *(7 * k for k in k3)])))
@@ -274,6 +275,6 @@ def _first_root(by_power: list[float]) -> float:
     if not by_power:
         return math.inf
     # 1 / s is a root of the reversed polynomial, which begins with 1 and so loses none to small coefficients
-    found = np.roots([1.0, *by_power])
-    real: NDArray[np.float64] = found.real[(np.abs(found.imag) < 1e-9 * np.abs(found)) & (found.real > 0)]
+    roots = np.roots([1.0, *by_power])
+    real: NDArray[np.float64] = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(1 / real.max()) if len(real) else math.inf

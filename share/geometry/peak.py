@@ -7,7 +7,7 @@ import numpy as np
 from share.types import F64
 
 
-def between_steps(score: F64, i: int) -> float:
+def subsample_peak(score: F64, i: int) -> float:
     """Top of the parabola through score[i - 1 : i + 2], in steps from i, at most half of one; 0 at an end of
     the curve and where it does not bend down."""
     if not 0 < i < len(score) - 1:

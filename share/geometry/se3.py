@@ -93,7 +93,7 @@ def matrix_from_quat(q: F64) -> F64:
     return _EYE + 2 * (q[..., 3, None, None] * K + K @ K)
 
 
-def compose(R: F64, t: F64) -> F64:
+def from_rt(R: F64, t: F64) -> F64:
     """(..., 3, 3) and (..., 3) -> (..., 4, 4)."""
     T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
@@ -102,13 +102,13 @@ def compose(R: F64, t: F64) -> F64:
 
 def from_quat(t: F64, q: F64) -> F64:
     """Positions (..., 3) and quaternions (..., 4, xyzw) -> (..., 4, 4)."""
-    return compose(matrix_from_quat(q), t)
+    return from_rt(matrix_from_quat(q), t)
 
 
 def inverse(T: F64) -> F64:
     """T_b_a of T_a_b: (..., 4, 4)."""
     Rt = T[..., :3, :3].swapaxes(-1, -2)
-    return compose(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
+    return from_rt(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
 
 def exp(xi: F64) -> F64:
@@ -118,7 +118,7 @@ def exp(xi: F64) -> F64:
     K = hat(phi)
     KK = K @ K
     V = _EYE + B * K + C * KK
-    return compose(_EYE + A * K + B * KK, (V @ rho[..., None])[..., 0])
+    return from_rt(_EYE + A * K + B * KK, (V @ rho[..., None])[..., 0])
 
 
 def log(T: F64) -> F64:
@@ -165,7 +165,7 @@ def transform(T: F64, points: F64) -> F64:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def angle(R: F64) -> F64:
+def rotation_angle(R: F64) -> F64:
     """Rotation angle [rad], 0 .. pi, of (..., 3, 3) or (..., 4, 4), by R - R' and the trace."""
     skew = R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]
     cosine2 = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1
@@ -173,7 +173,7 @@ def angle(R: F64) -> F64:
     return out
 
 
-def apart(T: F64, others: F64) -> tuple[F64, F64]:
+def pairwise_distances(T: F64, others: F64) -> tuple[F64, F64]:
     """How far poses (N, 4, 4) are from others (M, 4, 4), m and rad, (N, M) each. For many at a time: what is
     less than some 1e-8 of how far they are from the origin, or 1e-8 rad, is rounding."""
     p, q = T[:, :3, 3], others[:, :3, 3]
@@ -185,7 +185,7 @@ def apart(T: F64, others: F64) -> tuple[F64, F64]:
 def orthonormal(T: F64) -> F64:
     """The rigid transform nearest to T (..., 4, 4): removes drift of repeated products."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
-    return compose(U @ Vt, T[..., :3, 3])
+    return from_rt(U @ Vt, T[..., :3, 3])
 
 
 # ---- Rigid alignment of two point sets.
@@ -200,11 +200,11 @@ def umeyama(source: F64, target: F64) -> F64:
     if source.shape != target.shape or len(source) == 0:
         raise ValueError(f"umeyama: shapes {source.shape} and {target.shape} must agree and not be empty")
     ms, mt = source.mean(0), target.mean(0)
-    R = rotation((target - mt).T @ (source - ms))
-    return compose(R, mt - R @ ms)
+    R = best_rotation((target - mt).T @ (source - ms))
+    return from_rt(R, mt - R @ ms)
 
 
-def rotation(M: F64) -> F64:
+def best_rotation(M: F64) -> F64:
     """The rotation R (3, 3) that maximises trace(R' M): of M = sum target source', what turns sources best to
     targets. Source: Umeyama, eq. 40 and 43."""
     U, _, Vt = np.linalg.svd(M)

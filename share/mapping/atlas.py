@@ -1,7 +1,7 @@
 """The joint map of all agents: stretches of odometry, and the loops that tie them together.
 
-Plain sequential calls without clock or thread. Solving is somebody else's: `snapshot` hands out what is
-new, `apply` takes the solution in.
+Plain sequential calls without clock or thread. Solving is somebody else's: `make_job` hands out what is
+new, `apply_solution` takes the solution in.
 """
 
 from __future__ import annotations
@@ -15,171 +15,176 @@ import numpy as np
 
 from share.config import MergeConfig
 from share.geometry import se3
-from share.mapping.agents.agreement import Standing
-from share.mapping.agents.covariance_scale import believed, plumb_line
-from share.mapping.agents.quarantine import Parted, Parting
-from share.mapping.candidates import promising_first
-from share.mapping.corrections import Found, Surety
-from share.mapping.culling import Culling, Link, TakenOut, take_out, tied_again
-from share.mapping.graph.updates import Change, Solution
-from share.mapping.loop_acceptance import Decision, Judge, that_waited
-from share.mapping.loops import Key, Loop
-from share.mapping.map_graph import Chart
-from share.mapping.overlap_check import Survey
-from share.mapping.recognition.scale import Scale
-from share.mapping.recognition.verification import Sight
-from share.mapping.segments import Owners
+from share.mapping.agents.agreement import AgentStanding
+from share.mapping.agents.covariance_scales import inflate_covariance, make_gravity_factor
+from share.mapping.agents.quarantine import Quarantine, QuarantineChange
+from share.mapping.corrections import LocalisationGate, PlacementUncertainty
+from share.mapping.culling import KeyframeCulling, OdometryLink, RemovedKeyframe, reconnect, remove_keyframe
+from share.mapping.graph.updates import GraphSolution, GraphUpdate
+from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision, pending_text
+from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.map_graph import MapGraph
+from share.mapping.overlap_check import OverlapCheck
+from share.mapping.query_queue import rank_candidates
+from share.mapping.recognition.depth_scale import DepthScale
+from share.mapping.recognition.verification import CameraView
+from share.mapping.segments import AgentRuns
 from share.types import F64, Correction, Keyframe
 
 
 @dataclass(frozen=True, eq=False)
-class Applied:
+class AppliedSolution:
     """What a solution changed. corrections: by agent. tied, dropped: loops that are believed since, and those
     that are no longer. waiting: agents who do not hear of it yet, since it knows them to so many m only."""
 
     corrections: dict[str, Correction]
     reason: str
-    tied: tuple[Loop, ...] = ()
+    added: tuple[Loop, ...] = ()
     dropped: tuple[Loop, ...] = ()
-    waiting: Mapping[str, float] = field(default_factory=dict)
+    waiting_sigma_m: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class RestoredKeyframe:
     """A keyframe as an earlier life kept it. stretch: by name. T_ref_body (4, 4), cov (6, 6): of the step
     that leads to it, as the agent sent it or as the pose graph had it."""
 
-    key: Key
-    stretch: str
+    key: KeyframeKey
+    segment_name: str
     ordinal: int
     keyframe: Keyframe
     T_ref_body: F64
     cov: F64
-    as_sent: bool
+    is_as_sent: bool
 
 
 class Atlas:
     """All keyframes of all agents, in maps."""
 
-    def __init__(self, config: MergeConfig, sights: Mapping[int, Sight] | None = None) -> None:
+    def __init__(self, config: MergeConfig, camera_views: Mapping[int, CameraView] | None = None) -> None:
         """sights: what each keyframe saw, by its number; kept by whoever asks."""
         self._config = config
-        seen: Mapping[int, Sight] = {} if sights is None else sights
-        self._chart = Chart()
-        self._judge = Judge(config, self._chart, Survey(self._chart, seen))
-        self._answers: dict[str, int] = {}  # agent -> its newest keyframe that a loop came from
-        self._surety = Surety(config.enter_m, config.enter_patience)
-        self._owners = Owners()
-        self._culling = Culling(config, self._chart, self._owners)
-        self._parting = Parting(config.scale_tolerance, self._chart, self._judge, seen)
+        known_views: Mapping[int, CameraView] = {} if camera_views is None else camera_views
+        self._graph = MapGraph()
+        self._loop_acceptance = LoopAcceptance(config, self._graph, OverlapCheck(self._graph, known_views))
+        self._answered_ids: dict[str, int] = {}  # agent -> its newest keyframe that a loop came from
+        self._localisation_gate = LocalisationGate(config.enter_m, config.enter_patience)
+        self._runs = AgentRuns()
+        self._culling = KeyframeCulling(config, self._graph, self._runs)
+        self._quarantine = Quarantine(config.scale_tolerance, self._graph, self._loop_acceptance, known_views)
 
     # ------------------------------------------------------------ what is known
 
     def __len__(self) -> int:
-        return len(self._chart.poses)
+        return len(self._graph.poses)
 
-    def pose(self, key: Key) -> F64:
-        """T_map_body (4, 4), in the map that `map_of` names. Raises ValueError if unknown."""
-        return self._chart.poses[self._chart.trails.number(key)]
+    def pose(self, key: KeyframeKey) -> F64:
+        """T_map_body (4, 4), in the map that `map_id` names. Raises ValueError if unknown."""
+        return self._graph.poses[self._graph.odometry.node_id(key)]
 
-    def map_of(self, key: Key) -> str:
+    def map_id(self, key: KeyframeKey) -> str:
         """Raises ValueError if there is no such keyframe."""
-        return self._chart.name(self._chart.stretch_of(key))
+        return self._graph.map_id(self._graph.segment(key))
 
-    def current_map(self, agent: str) -> str | None:
+    def current_map_id(self, agent: str) -> str | None:
         """The map that the agent's present stretch is in; None before its first keyframe."""
-        stretch = self._chart.trails.current(agent)
-        return None if stretch is None else self._chart.name(stretch)
+        segment = self._graph.odometry.current_segment(agent)
+        return None if segment is None else self._graph.map_id(segment)
 
-    def sizes(self) -> dict[str, int]:
+    def map_sizes(self) -> dict[str, int]:
         """How many keyframes each map has."""
         out = Counter[str]()
-        for stretch in sorted(self._chart.trails.live):
-            out[self._chart.name(stretch)] += len(self._chart.trails.stretches[stretch].nodes)
+        for segment in sorted(self._graph.odometry.live_segments):
+            out[self._graph.map_id(segment)] += len(self._graph.odometry.segments[segment].nodes)
         return out
 
     def T_map_odom(self, agent: str) -> F64 | None:
         """Where the agent's present odometry lies in its map; None before its first keyframe."""
-        newest = self._chart.trails.newest(agent)
-        return None if newest is None else self._chart.placement(newest)
+        newest = self._graph.odometry.newest_node(agent)
+        return None if newest is None else self._graph.T_map_odom(newest)
 
-    def key(self, number: int) -> Key:
+    def key(self, node_id: int) -> KeyframeKey:
         """Of the keyframe with this number."""
-        return self._chart.trails.nodes[number].key
+        return self._graph.odometry.nodes[node_id].key
 
-    def neighbours(self, number: int) -> tuple[int, ...]:
+    def neighbours(self, node_id: int) -> tuple[int, ...]:
         """The keyframe, and those that odometry ties to it too closely for a loop."""
-        trails, gap = self._chart.trails, self._config.min_loop_gap
-        nodes = trails.stretches[trails.nodes[number].stretch].nodes
-        at = bisect_left(nodes, number)
-        beside = nodes[max(0, at - gap) : at + gap]
-        return tuple(n for n in beside if trails.are_neighbours(n, number, gap))
+        odometry, disagreement = self._graph.odometry, self._config.min_loop_gap
+        nodes = odometry.segments[odometry.nodes[node_id].segment].nodes
+        position = bisect_left(nodes, node_id)
+        nearby = nodes[max(0, position - disagreement) : position + disagreement]
+        return tuple(n for n in nearby if odometry.are_neighbours(n, node_id, disagreement))
 
-    def promising_first(self, number: int, others: Sequence[int]) -> list[int]:
+    def rank_candidates(self, node_id: int, others: Sequence[int]) -> list[int]:
         """Keyframes that look like this one, those whose loop would tell most first."""
-        return promising_first(self._chart, number, others)
+        return rank_candidates(self._graph, node_id, others)
 
-    def everything(self) -> tuple[tuple[Key, ...], F64, tuple[str, ...]]:
+    def all_poses(self) -> tuple[tuple[KeyframeKey, ...], F64, tuple[str, ...]]:
         """Every keyframe, its T_map_body (N, 4, 4), and its map."""
-        nodes, poses = self._chart.trails.nodes, self._chart.poses
+        nodes, poses = self._graph.odometry.nodes, self._graph.poses
         keys = tuple(node.key for node in nodes.values())
-        maps = tuple(self._chart.name(node.stretch) for node in nodes.values())
+        maps = tuple(self._graph.map_id(node.segment) for node in nodes.values())
         return keys, np.array([poses[n] for n in nodes]).reshape(-1, 4, 4), maps
 
     @property
     def pending(self) -> tuple[Loop, ...]:
         """Loops that wait for a witness, oldest first."""
-        return tuple(self._judge.waiting)
+        return tuple(self._loop_acceptance.pending)
 
     @property
     def loops(self) -> tuple[Loop, ...]:
         """Accepted loops, oldest first."""
-        return tuple(self._chart.ties.loops.values())
+        return tuple(self._graph.edges.loops.values())
 
     # ------------------------------------------------------------ what arrives
 
-    def enter(self, agent: str, name: str, voice: str | None = "") -> None:
+    def add_run(self, agent: str, name: str, credential: str | None = "") -> None:
         """A run of the agent of this name comes. voice: see `Subjects.speaks`."""
-        self._owners.join(agent, name)
-        self._parting.enter(agent, name, voice)
+        self._runs.add(agent, name)
+        self._quarantine.add_run(agent, name, credential)
 
-    def present(self, agent: str, here: bool) -> None:
+    def set_present(self, agent: str, is_present: bool) -> None:
         """Who is not heard need not be told where he is, and nobody waits for him. Once he is heard again, a
         map that he does not know of is due."""
-        if self._owners.present(agent, here) and here:
-            stretch = self._chart.trails.current(agent)
-            if stretch is not None and stretch in self._chart.trails.live:
-                self._tell_soon(stretch)
+        if self._runs.set_present(agent, is_present) and is_present:
+            segment = self._graph.odometry.current_segment(agent)
+            if segment is not None and segment in self._graph.odometry.live_segments:
+                self._schedule_solve(segment)
 
-    def is_forgotten(self, agent: str) -> bool:
+    def is_run_gone(self, agent: str) -> bool:
         """Whether it is not heard, and nothing of it is left."""
-        return self._owners.is_absent(agent) and not self._chart.trails.has_any(agent)
+        return self._runs.is_absent(agent) and not self._graph.odometry.has_nodes(agent)
 
-    def forget(self, agent: str) -> None:
+    def remove_run(self, agent: str) -> None:
         """A run of which nothing is left will not come back."""
-        self._owners.forget(agent)
-        self._parting.forget(agent)
-        self._answers.pop(agent, None)
-        self._chart.trails.forget(agent)
+        self._runs.remove(agent)
+        self._quarantine.remove_run(agent)
+        self._answered_ids.pop(agent, None)
+        self._graph.odometry.remove_agent(agent)
 
-    def _tell_soon(self, stretch: int) -> None:
-        founder = self._chart.founder[stretch]
-        if founder != stretch and self._surety.told(stretch, founder) is None:
-            self._chart.unsolved[founder] = None
+    def _schedule_solve(self, segment: int) -> None:
+        reference_segment = self._graph.reference_segments[segment]
+        if (
+            reference_segment != segment
+            and self._localisation_gate.published_cov(segment, reference_segment) is None
+        ):
+            self._graph.unsolved_maps[reference_segment] = None
 
-    def tied(self, agent: str, keyframe: Keyframe) -> tuple[Keyframe, Link | None]:
+    def reconnect(self, agent: str, keyframe: Keyframe) -> tuple[Keyframe, OdometryLink | None]:
         """Before it is added: a keyframe whose reference was taken out, tied to what is left of its stretch,
         and the odometry edge that leads to it now. None: as it came."""
-        chart, reference = self._chart, Key(agent, keyframe.reference)
-        current = chart.trails.current(agent)
-        if keyframe.reference < 0 or chart.trails.has(reference) or current is None:
+        graph, reference = self._graph, KeyframeKey(agent, keyframe.reference)
+        current = graph.odometry.current_segment(agent)
+        if keyframe.reference < 0 or graph.odometry.has_keyframe(reference) or current is None:
             return keyframe, None
-        newest = chart.trails.newest(agent)
-        link = tied_again(agent, keyframe, None if newest is None else chart.trails.nodes[newest])
+        newest_id = graph.odometry.newest_node(agent)
+        link = reconnect(agent, keyframe, None if newest_id is None else graph.odometry.nodes[newest_id])
         if link.reference is None:
             return keyframe, link
-        kept = replace(link, cov=believed(self._config, link.T_ref_body, link.cov))
-        return replace(keyframe, reference=link.reference.id, T_ref_body=link.T_ref_body, cov=link.cov), kept
+        stored_link = replace(link, cov=inflate_covariance(self._config, link.T_ref_body, link.cov))
+        return replace(
+            keyframe, reference=link.reference.id, T_ref_body=link.T_ref_body, cov=link.cov
+        ), stored_link
 
     def add_keyframe(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
         """Its number here. A keyframe without a reference founds a map of its own; of maps that are joined,
@@ -188,212 +193,249 @@ class Atlas:
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
         c = self._config
-        cov, plumb = believed(c, keyframe.T_ref_body, keyframe.cov), plumb_line(c, keyframe)
-        number = self._chart.add(agent, keyframe, cov, plumb, rank)
-        self._parting.walked(number, keyframe.T_ref_body, cov)
-        return number
+        cov, gravity_factor = (
+            inflate_covariance(c, keyframe.T_ref_body, keyframe.cov),
+            make_gravity_factor(c, keyframe),
+        )
+        node_id = self._graph.add_keyframe(agent, keyframe, cov, gravity_factor, rank)
+        self._quarantine.add_step(node_id, keyframe.T_ref_body, cov)
+        return node_id
 
     def restore(
         self,
-        stretches: Sequence[tuple[str, int]],
-        keyframes: Iterable[Placed],
+        segments: Sequence[tuple[str, int]],
+        keyframes: Iterable[RestoredKeyframe],
         loops: Iterable[Loop],
-        T_map_body: Mapping[Key, F64],
+        T_map_body: Mapping[KeyframeKey, F64],
     ) -> list[int]:
         """What an earlier life knew; this one must be empty. stretches: of every one there was, in order, the
         agent and its rank.
 
         Returns the keyframes' numbers. All maps are due.
         """
-        chart, at = self._chart, {}
-        for agent, rank in stretches:
-            stretch = chart.trails.begin(agent, rank)
-            at[chart.trails.stretches[stretch].name] = stretch
-        numbers = []
-        for found in keyframes:
-            cov = believed(self._config, found.T_ref_body, found.cov) if found.as_sent else found.cov
-            T_odom_body = found.keyframe.T_odom_body
-            numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
-            chart.place(numbers[-1], found.T_ref_body, cov, plumb_line(self._config, found.keyframe))
-            self._parting.walked(numbers[-1], found.T_ref_body, cov)
-            chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
+        graph, segment_by_name = self._graph, {}
+        for agent, rank in segments:
+            segment = graph.odometry.new_segment(agent, rank)
+            segment_by_name[graph.odometry.segments[segment].name] = segment
+        node_ids = []
+        for restored in keyframes:
+            cov = (
+                inflate_covariance(self._config, restored.T_ref_body, restored.cov)
+                if restored.is_as_sent
+                else restored.cov
+            )
+            T_odom_body = restored.keyframe.T_odom_body
+            node_ids.append(
+                graph.odometry.append_node(
+                    restored.key, segment_by_name[restored.segment_name], T_odom_body, restored.ordinal
+                )
+            )
+            graph.add_node(
+                node_ids[-1], restored.T_ref_body, cov, make_gravity_factor(self._config, restored.keyframe)
+            )
+            self._quarantine.add_step(node_ids[-1], restored.T_ref_body, cov)
+            graph.poses[node_ids[-1]] = T_map_body.get(restored.key, graph.poses[node_ids[-1]])
         for loop in loops:
-            chart.tie(loop)
-        self._parting.restored()
-        for agent in {agent for agent, _ in stretches}:
-            current = chart.trails.current(agent)
-            if current is not None and chart.trails.stretches[current].nodes:  # a damaged file may lack them
-                self._surety.remember(current, chart.founder[current])
-        return numbers
+            graph.add_loop(loop)
+        self._quarantine.suspect_restored()
+        for agent in {agent for agent, _ in segments}:
+            current = graph.odometry.current_segment(agent)
+            if current is not None and graph.odometry.segments[current].nodes:  # a damaged file may lack them
+                self._localisation_gate.restore(current, graph.reference_segments[current])
+        return node_ids
 
-    def redundant(self, count: int) -> list[int]:
-        """Numbers of so many keyframes, if there are as many that may go: see `Culling`."""
+    def choose_redundant(self, count: int) -> list[int]:
+        """Numbers of so many keyframes, if there are as many that may go: see `KeyframeCulling`."""
         return self._culling.choose(count)
 
-    def take_out(self, numbers: Iterable[int]) -> list[TakenOut]:
+    def remove_keyframes(self, node_ids: Iterable[int]) -> list[RemovedKeyframe]:
         """These keyframes, but for those that have to stay by now."""
-        chart, taken = self._chart, list[TakenOut]()
-        for number in numbers:
-            if number in chart.poses and self._culling.may_go(number):
-                stretch = chart.trails.nodes[number].stretch
-                taken.append(self._parting.as_told(take_out(chart, number, self._config.most_loops)))
-                chart.find_maps()
-                if stretch not in chart.trails.live:
-                    self._surety.forget([stretch])
-        live = {chart.founder[stretch] for stretch in chart.trails.live}
-        chart.unsolved = dict.fromkeys(founder for founder in chart.unsolved if founder in live)
-        self._judge.forget({out.key for out in taken})
-        self._parting.agreement.forget([out.number for out in taken], chart.trails.live)
-        return taken
+        graph, removed = self._graph, list[RemovedKeyframe]()
+        for node_id in node_ids:
+            if node_id in graph.poses and self._culling.is_removable(node_id):
+                segment = graph.odometry.nodes[node_id].segment
+                removed.append(
+                    self._quarantine.to_agent_scale(remove_keyframe(graph, node_id, self._config.most_loops))
+                )
+                graph.update_maps()
+                if segment not in graph.odometry.live_segments:
+                    self._localisation_gate.forget([segment])
+        live = {graph.reference_segments[segment] for segment in graph.odometry.live_segments}
+        graph.unsolved_maps = dict.fromkeys(
+            reference_segment for reference_segment in graph.unsolved_maps if reference_segment in live
+        )
+        self._loop_acceptance.remove_keyframes({out.key for out in removed})
+        self._quarantine.agreement.remove_nodes(
+            [out.node_id for out in removed], graph.odometry.live_segments
+        )
+        return removed
 
-    def propose(self, loop: Loop) -> Decision:
+    def propose(self, loop: Loop) -> LoopDecision:
         """A verified loop from candidate a to query b: accepted, waiting, or refused, with the reason. Raises
         ValueError if either keyframe is unknown."""
-        if why := self._parting.forbids(loop):
-            return Decision(False, f"loop {loop}: {why}")
-        decision = self._judge.decide(loop)
+        if reason := self._quarantine.separation_reason(loop):
+            return LoopDecision(False, f"loop {loop}: {reason}")
+        decision = self._loop_acceptance.decide(loop)
         if decision.accepted:  # loops that waited are believed because of it: it is what is answered
-            self._answers[loop.b.agent] = max(loop.b.id, self._answers.get(loop.b.agent, -1))
+            self._answered_ids[loop.b.agent] = max(loop.b.id, self._answered_ids.get(loop.b.agent, -1))
         return decision
 
-    def witness(self, loop: Loop, scale: Scale | None) -> Parted:
-        """A verified loop, before it is proposed, says how its agents agree: see `Parting`."""
-        return self._parting.witness(loop, scale)
+    def compare_agents(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
+        """A verified loop, before it is proposed, says how its agents agree: see `Quarantine`."""
+        return self._quarantine.add_loop(loop, depth_scale)
 
-    def put_right(self, loop: Loop, scale: Scale | None) -> Loop:
-        """A loop in true metres, so far as they are known: see `Parting`."""
-        return self._parting.put_right(loop, scale)
+    def rescale_loop(self, loop: Loop, depth_scale: DepthScale | None) -> Loop:
+        """A loop in true metres, so far as they are known: see `Quarantine`."""
+        return self._quarantine.rescale_loop(loop, depth_scale)
 
-    def standing(self, agent: str) -> Standing:
+    def standing(self, agent: str) -> AgentStanding:
         """How the agent agrees with the others."""
-        return self._parting.agreement.standing(agent)
+        return self._quarantine.agreement.standing(agent)
 
-    def doubts(self) -> dict[tuple[str, str], float]:
+    def contradictions(self) -> dict[tuple[str, str], float]:
         """See `Agreement`."""
-        return self._parting.agreement.doubts()
+        return self._quarantine.agreement.contradictions()
 
-    def are_apart(self, one: str, other: str) -> bool:
+    def are_separated(self, first: str, second: str) -> bool:
         """Whether these agents must not come into one map."""
-        return bool(self._parting.agreement.forbids([one], [other]))
+        return bool(self._quarantine.agreement.separation_reason([first], [second]))
 
-    def kept_apart(self, number: int) -> tuple[int, ...]:
+    def separated_keyframes(self, node_id: int) -> tuple[int, ...]:
         """Keyframes of agents that must not come into one map with this one's."""
-        return self._parting.kept_apart(self.key(number).agent)
+        return self._quarantine.quarantined_nodes(self.key(node_id).agent)
 
-    def review(self, number: int) -> Decision | None:
+    def review_joins(self, node_id: int) -> LoopDecision | None:
         """Whether what this keyframe saw speaks against a young join of its map: it is undone."""
-        return self._judge.review(number)
+        return self._loop_acceptance.review_joins(node_id)
 
     # ------------------------------------------------------------ the solver's side
 
-    def due(self) -> list[str]:
+    def due_maps(self) -> list[str]:
         """Maps with news that no job has had yet, the oldest news first."""
-        return [self._chart.trails.stretches[founder].name for founder in self._chart.unsolved]
+        return [
+            self._graph.odometry.segments[reference_segment].name
+            for reference_segment in self._graph.unsolved_maps
+        ]
 
-    def snapshot(self, map_id: str) -> SolveJob:
+    def make_job(self, map_id: str) -> SolveJob:
         """What the solver has to know to solve this map. ValueError if there is none."""
-        chart = self._chart
-        founder = chart.named(map_id)
-        stretches = tuple(chart.stretches_of(founder))
-        agents = {chart.trails.stretches[s].agent for s in stretches}
-        chart.unsolved.pop(founder, None)
-        anew = chart.ties.anew
+        graph = self._graph
+        reference_segment = graph.find_map(map_id)
+        segments = tuple(graph.map_segments(reference_segment))
+        agents = {graph.odometry.segments[s].agent for s in segments}
+        graph.unsolved_maps.pop(reference_segment, None)
+        anew = graph.edges.is_reset
         return SolveJob(
             map_id,
-            stretches,
-            chart.anchor(founder),
-            tuple(chart.trails.stretches[s].nodes[-1] for s in stretches),
-            self._asked(founder, stretches),
-            chart.ties.news(chart.poses, chart.plumb),
+            segments,
+            graph.anchor(reference_segment),
+            tuple(graph.odometry.segments[s].nodes[-1] for s in segments),
+            self._segments_wanting_covariance(reference_segment, segments),
+            graph.edges.take_update(graph.poses, graph.gravity_factors),
             anew,
-            tuple((agent, self._answers.pop(agent)) for agent in sorted(agents & self._answers.keys())),
+            tuple(
+                (agent, self._answered_ids.pop(agent)) for agent in sorted(agents & self._answered_ids.keys())
+            ),
         )
 
-    def _asked(self, founder: int, stretches: Sequence[int]) -> tuple[int, ...]:
+    def _segments_wanting_covariance(
+        self, reference_segment: int, segments: Sequence[int]
+    ) -> tuple[int, ...]:
         """Whose covariance is worth its time: who is answered, or never heard how sure he is in this map. Not
         who is away and would come into it; but who was in it before a restart is told with his welcome."""
-        trails = self._chart.trails
+        odometry = self._graph.odometry
         return tuple(
             s
-            for s in stretches
-            if trails.current(agent := trails.stretches[s].agent) == s
-            and (not self._owners.is_absent(agent) or self._surety.heard(s, founder))
-            and (agent in self._answers or self._surety.told(s, founder) is None)
+            for s in segments
+            if odometry.current_segment(agent := odometry.segments[s].agent) == s
+            and (
+                not self._runs.is_absent(agent) or self._localisation_gate.is_published(s, reference_segment)
+            )
+            and (
+                agent in self._answered_ids
+                or self._localisation_gate.published_cov(s, reference_segment) is None
+            )
         )
 
-    def solver_lost(self) -> None:
+    def reset_solver(self) -> None:
         """The solver knows nothing any more: the next job tells everything."""
-        self._chart.ties.untold()
+        self._graph.edges.reset()
 
-    def apply(self, job: SolveJob, solution: Solution) -> Applied:
+    def apply_solution(self, job: SolveJob, solution: GraphSolution) -> AppliedSolution:
         """Take a solution in; keyframes and loops that came meanwhile are kept.
 
         If the map was joined or split meanwhile the solution no longer speaks of it: it is left
         aside and the map is due again.
         """
-        chart = self._chart
-        founder = job.stretches[0]
-        if tuple(chart.stretches_of(founder)) != job.stretches:
-            if founder in chart.trails.live:
-                chart.unsolved[chart.founder[founder]] = None
-            self._answers = dict(job.answers) | self._answers
-            chart.ties.moved(n for n in solution.numbers.tolist() if n in chart.poses)
-            return Applied({}, f"map {job.map_id}: joined or split while it was solved, due again")
+        graph = self._graph
+        reference_segment = job.segments[0]
+        if tuple(graph.map_segments(reference_segment)) != job.segments:
+            if reference_segment in graph.odometry.live_segments:
+                graph.unsolved_maps[graph.reference_segments[reference_segment]] = None
+            self._answered_ids = dict(job.answered_ids) | self._answered_ids
+            graph.edges.mark_moved(n for n in solution.pose_ids.tolist() if n in graph.poses)
+            return AppliedSolution({}, f"map {job.map_id}: joined or split while it was solved, due again")
         if solution.reason:
-            return Applied({}, f"map {job.map_id}: not solved, {solution.reason}")
-        self._take_in(job, solution)
-        odd = solution.loop_ids[solution.loop_chi2 > self._config.drop_chi2].tolist()
-        dropped = chart.drop([n for n in odd if n in chart.ties.loops]) if odd else ()
-        tied = self._judge.settle()
-        waiting = self._take_surety(job, solution)
+            return AppliedSolution({}, f"map {job.map_id}: not solved, {solution.reason}")
+        self._apply_poses(job, solution)
+        outlier_ids = solution.loop_ids[solution.loop_chi2 > self._config.drop_chi2].tolist()
+        dropped = graph.drop_loops([n for n in outlier_ids if n in graph.edges.loops]) if outlier_ids else ()
+        added = self._loop_acceptance.accept_fitting()
+        waiting = self._update_gate(job, solution)
         corrections, failed = self._corrections(job)
-        counts = f"{len(solution.numbers)} poses, {len(solution.loop_ids)} loops solved"
+        counts = f"{len(solution.pose_ids)} poses, {len(solution.loop_ids)} loops solved"
         reason = f"map {job.map_id}: {counts}, corrects {', '.join(corrections) or 'nobody'}"
-        reason += "".join(f"; {agent}: {why}" for agent, why in failed.items())
+        reason += "".join(f"; {agent}: {cause}" for agent, cause in failed.items())
         if dropped:
             reason += f"; dropped loops at odds with it: {', '.join(map(str, dropped))}"
-        return Applied(corrections, reason + that_waited(tied), tied, dropped, waiting)
+        return AppliedSolution(corrections, reason + pending_text(added), added, dropped, waiting)
 
-    def _take_in(self, job: SolveJob, solution: Solution) -> None:
-        chart = self._chart
-        for number, T in zip(solution.numbers.tolist(), solution.poses, strict=True):
-            if number in chart.poses:
-                chart.poses[number] = T
-        for stretch, last in zip(job.stretches, job.last, strict=True):
-            chart.follow(n for n in chart.trails.stretches[stretch].nodes if n > last)
+    def _apply_poses(self, job: SolveJob, solution: GraphSolution) -> None:
+        graph = self._graph
+        for node_id, T in zip(solution.pose_ids.tolist(), solution.poses, strict=True):
+            if node_id in graph.poses:
+                graph.poses[node_id] = T
+        for segment, last in zip(job.segments, job.newest_nodes, strict=True):
+            graph.propagate(n for n in graph.odometry.segments[segment].nodes if n > last)
 
-    def _take_surety(self, job: SolveJob, solution: Solution) -> dict[str, float]:
+    def _update_gate(self, job: SolveJob, solution: GraphSolution) -> dict[str, float]:
         """Of those who were asked for. Returns which agents wait to hear of this map: their spread, m."""
-        trails, told = self._chart.trails, dict(zip(job.wanted, solution.covariances, strict=True))
-        nodes, answers = trails.nodes, dict(job.answers)
-        found = {
-            stretch: Found(
-                se3.inverse_cov(nodes[last].T_odom_body, told[last]),
-                se3.position_sigma(told[last]),
-                answers.get(trails.stretches[stretch].agent),
+        odometry, covariances = (
+            self._graph.odometry,
+            dict(zip(job.covariance_nodes, solution.covariances, strict=True)),
+        )
+        nodes, answers = odometry.nodes, dict(job.answered_ids)
+        placements = {
+            segment: PlacementUncertainty(
+                se3.inverse_cov(nodes[last].T_odom_body, covariances[last]),
+                se3.position_sigma(covariances[last]),
+                answers.get(odometry.segments[segment].agent),
             )
-            for stretch, last in zip(job.stretches, job.last, strict=True)
-            if last in told and last in nodes
+            for segment, last in zip(job.segments, job.newest_nodes, strict=True)
+            if last in covariances and last in nodes
         }
-        self._surety.parted(self._chart.parted)
-        self._chart.parted.clear()
-        waiting = self._surety.take(job.stretches[0], job.stretches, found)
-        return {trails.stretches[s].agent: spread for s, spread in waiting.items()}
+        self._localisation_gate.forget_waits(self._graph.split_segments)
+        self._graph.split_segments.clear()
+        waiting = self._localisation_gate.update(job.segments[0], job.segments, placements)
+        return {odometry.segments[s].agent: spread for s, spread in waiting.items()}
 
     def _corrections(self, job: SolveJob) -> tuple[dict[str, Correction], dict[str, str]]:
         """For whom the map knows surely enough; those after the newest that was solved hang on it rigidly.
         And of whom a correction would be none, with the reason: that costs nobody else."""
-        trails, answers = self._chart.trails, dict(job.answers)
+        odometry, answers = self._graph.odometry, dict(job.answered_ids)
         out: dict[str, Correction] = {}
         failed: dict[str, str] = {}
-        for stretch, last in zip(job.stretches, job.last, strict=True):
-            agent, cov = trails.stretches[stretch].agent, self._surety.told(stretch, job.stretches[0])
-            if cov is None or trails.current(agent) != stretch or last not in trails.nodes:
+        for segment, last in zip(job.segments, job.newest_nodes, strict=True):
+            agent, cov = (
+                odometry.segments[segment].agent,
+                self._localisation_gate.published_cov(segment, job.segments[0]),
+            )
+            if cov is None or odometry.current_segment(agent) != segment or last not in odometry.nodes:
                 continue  # he waits, or that odometry has ended: nothing is left to correct
-            placement, name = self._chart.placement(last), self._chart.name(stretch)
-            about, answer = trails.nodes[last].key.id, answers.get(agent, -1)
+            T_map_odom, map_id = self._graph.T_map_odom(last), self._graph.map_id(segment)
+            about_id, answered_id = odometry.nodes[last].key.id, answers.get(agent, -1)
             try:
-                out[agent] = Correction(placement, cov, name, 0, about, answer)
+                out[agent] = Correction(T_map_odom, cov, map_id, 0, about_id, answered_id)
             except ValueError as error:
                 failed[agent] = f"no correction, {error}"
         return out, failed
@@ -412,15 +454,19 @@ class SolveJob:
     """
 
     map_id: str
-    stretches: tuple[int, ...]
+    segments: tuple[int, ...]
     anchor: int
-    last: tuple[int, ...]
-    asked: tuple[int, ...]
-    change: Change
-    anew: bool
-    answers: tuple[tuple[str, int], ...]
+    newest_nodes: tuple[int, ...]
+    covariance_segments: tuple[int, ...]
+    change: GraphUpdate
+    is_reset: bool
+    answered_ids: tuple[tuple[str, int], ...]
 
     @property
-    def wanted(self) -> tuple[int, ...]:
+    def covariance_nodes(self) -> tuple[int, ...]:
         """The nodes whose covariances are asked for."""
-        return tuple(last for s, last in zip(self.stretches, self.last, strict=True) if s in self.asked)
+        return tuple(
+            last
+            for s, last in zip(self.segments, self.newest_nodes, strict=True)
+            if s in self.covariance_segments
+        )

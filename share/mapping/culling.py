@@ -18,12 +18,12 @@ import numpy as np
 
 from share.config import MergeConfig
 from share.geometry import se3
-from share.mapping.graph.edges import Edge
-from share.mapping.graph.updates import contract
-from share.mapping.loop_consistency import bridging
-from share.mapping.loops import Key, Loop
-from share.mapping.map_graph import Chart
-from share.mapping.segments import Node, Owners, dues
+from share.mapping.graph.edges import PoseEdge
+from share.mapping.graph.updates import contract_pose
+from share.mapping.loop_consistency import articulation_segments
+from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.map_graph import MapGraph
+from share.mapping.segments import AgentRuns, Node, fair_quotas
 from share.types import F64, Keyframe
 
 # ---- Fewer keyframes, the same room: those that show what others show as well are taken out.
@@ -31,271 +31,306 @@ from share.types import F64, Keyframe
 # What is left covers the same views; odometry and loops of a keyframe that goes are moved to its neighbour
 # (`share.mapping.graph.updates`), so what was known stays known, a little less surely.
 
-_ROWS = 256
-_ALONE = 1e9  # as unlike as that is who has no other beside it
+_BLOCK_ROWS = 256
+_NO_NEIGHBOUR_DISTANCE = 1e9  # as unlike as that is who has no other beside it
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
+class OdometryLink:
     """The odometry edge that leads to keyframe `key` now, from keyframe `reference` of the same agent; None:
     it is the first of its stretch now, and T_ref_body (4, 4) is its T_odom_body. cov (6, 6): of it."""
 
-    key: Key
-    reference: Key | None
+    key: KeyframeKey
+    reference: KeyframeKey | None
     T_ref_body: F64
     cov: F64
 
 
 @dataclass(frozen=True, eq=False)
-class TakenOut:
+class RemovedKeyframe:
     """A keyframe that is gone, what leads to the one after it now, and loops that were moved elsewhere."""
 
-    number: int
-    key: Key
-    link: Link | None
-    moved: tuple[Loop, ...]
+    node_id: int
+    key: KeyframeKey
+    link: OdometryLink | None
+    moved_loops: tuple[Loop, ...]
 
 
 def redundant(
-    poses: F64, whose: Sequence[str | None], due: Counter[str], apart_m: float, apart_rad: float, below: float
+    poses: F64,
+    owners: Sequence[str | None],
+    quotas: Counter[str],
+    scale_m: float,
+    scale_rad: float,
+    max_distance: float,
 ) -> list[int]:
     """Which of poses (N, 4, 4) to take out: again and again one of the two that are most alike, the one that
-    has the nearer second neighbour, while they are no less alike than `below`.
+    has the nearer second neighbour, while they are no less alike than `max_distance`.
 
     whose: of each pose; of those of None none goes. due: how many go of each name; counted down. Two poses
     are as unlike as |shift| / apart_m + angle / apart_rad.
     """
-    gap = _unlike(poses, apart_m, apart_rad)
-    np.fill_diagonal(gap, np.inf)
-    names = np.array([name or "" for name in whose])
-    free = np.array([name is not None and due[name] > 0 for name in whose], bool)
-    nearest = np.concatenate([_two_least(gap[rows]) for rows in _blocks(len(poses))])
+    distance = _pairwise_distance(poses, scale_m, scale_rad)
+    np.fill_diagonal(distance, np.inf)
+    names = np.array([name or "" for name in owners])
+    is_removable = np.array([name is not None and quotas[name] > 0 for name in owners], bool)
+    two_nearest = np.concatenate([_two_nearest(distance[rows]) for rows in _row_blocks(len(poses))])
     out: list[int] = []
-    while free.any():
-        rank = np.minimum(nearest[:, 0] + 1e-3 * nearest[:, 1], _ALONE)
-        gone = int(np.where(free, rank, np.inf).argmin())
-        if nearest[gone, 0] > below:
+    while is_removable.any():
+        rank = np.minimum(two_nearest[:, 0] + 1e-3 * two_nearest[:, 1], _NO_NEIGHBOUR_DISTANCE)
+        removed = int(np.where(is_removable, rank, np.inf).argmin())
+        if two_nearest[removed, 0] > max_distance:
             break
-        out.append(gone)
-        free[gone] = False
-        due[str(names[gone])] -= 1
-        if not due[str(names[gone])]:
-            free[names == names[gone]] = False
-        stale = np.flatnonzero(gap[gone] <= nearest[:, 1])
-        gap[gone], gap[:, gone] = np.inf, np.inf
-        nearest[stale] = _two_least(gap[stale])
+        out.append(removed)
+        is_removable[removed] = False
+        quotas[str(names[removed])] -= 1
+        if not quotas[str(names[removed])]:
+            is_removable[names == names[removed]] = False
+        stale = np.flatnonzero(distance[removed] <= two_nearest[:, 1])
+        distance[removed], distance[:, removed] = np.inf, np.inf
+        two_nearest[stale] = _two_nearest(distance[stale])
     return out
 
 
-def across(T_odom_before: F64, lost: int, keyframe: Keyframe) -> tuple[F64, F64]:
+def bridge_odometry(T_odom_previous: F64, lost_steps: int, keyframe: Keyframe) -> tuple[F64, F64]:
     """T_before_body (4, 4) of a keyframe whose reference is not there any more, from one before it on its
     stretch, and its covariance (6, 6). lost: how many steps lie between that and the reference.
 
     Both stand in one odometry, so their relative pose is known: T_odom_before^-1 T_odom_body. Of the steps in
     between nothing is left; each is taken to be as uncertain as the step that is known.
     """
-    cov: F64 = se3.compose_cov(keyframe.T_ref_body, max(1, lost) * keyframe.cov, keyframe.cov)
-    return se3.orthonormal(se3.inverse(T_odom_before) @ keyframe.T_odom_body), (cov + cov.T) / 2
+    cov: F64 = se3.compose_cov(keyframe.T_ref_body, max(1, lost_steps) * keyframe.cov, keyframe.cov)
+    return se3.orthonormal(se3.inverse(T_odom_previous) @ keyframe.T_odom_body), (cov + cov.T) / 2
 
 
-def tied_again(agent: str, keyframe: Keyframe, before: Node | None) -> Link:
+def reconnect(agent: str, keyframe: Keyframe, previous: Node | None) -> OdometryLink:
     """The odometry edge to such a keyframe from the newest that is left of its stretch, if one is."""
-    key = Key(agent, keyframe.id)
-    if before is None:
-        return Link(key, None, keyframe.T_odom_body, keyframe.cov)
-    return Link(key, before.key, *across(before.T_odom_body, keyframe.reference - before.key.id, keyframe))
+    key = KeyframeKey(agent, keyframe.id)
+    if previous is None:
+        return OdometryLink(key, None, keyframe.T_odom_body, keyframe.cov)
+    return OdometryLink(
+        key,
+        previous.key,
+        *bridge_odometry(previous.T_odom_body, keyframe.reference - previous.key.id, keyframe),
+    )
 
 
-def take_out(chart: Chart, number: int, most_loops: int) -> TakenOut:
+def remove_keyframe(graph: MapGraph, node_id: int, max_loops: int) -> RemovedKeyframe:
     """Of a keyframe with an odometry neighbour; one without takes its loops along. No keyframe is given
-    more than `most_loops` loops, but for the last between two stretches. `chart.find_maps` is due
+    more than `max_loops` loops, but for the last between two stretches. `chart.find_maps` is due
     afterwards."""
-    trails, ties = chart.trails, chart.ties
-    key, before, after = trails.nodes[number].key, trails.before(number), trails.after(number)
-    touching = ties.touching(number)
-    loops = [(ties.loops[n], ties.edges[n]) for n in touching if n in ties.loops]
-    odometry = [ties.edges[n] for n in touching if n not in ties.loops]
-    for n in touching:
-        if n in ties.loops:
-            chart.unbind(n)
+    segments, edges = graph.odometry, graph.edges
+    key, previous, following = (
+        segments.nodes[node_id].key,
+        segments.previous_node(node_id),
+        segments.next_node(node_id),
+    )
+    incident = edges.incident(node_id)
+    loops = [(edges.loops[n], edges.by_id[n]) for n in incident if n in edges.loops]
+    odometry_edges = [edges.by_id[n] for n in incident if n not in edges.loops]
+    for n in incident:
+        if n in edges.loops:
+            graph.remove_loop_edge(n)
         else:
-            ties.remove(n)
-    chart.forget(number)
-    if not odometry:
-        return TakenOut(number, key, None, ())
-    left = contract(number, odometry, [edge for _, edge in loops])
-    for edge in left.odometry:
-        ties.add(edge)
-    link = None if after is None else _link(chart, before, after)
-    pairs = [(old, edge) for (old, _), edge in zip(loops, left.loops, strict=True) if edge is not None]
-    moved = [_move(chart, old, edge, most_loops) for old, edge in pairs]
-    return TakenOut(number, key, link, tuple(loop for loop in moved if loop is not None))
+            edges.remove(n)
+    graph.remove_node(node_id)
+    if not odometry_edges:
+        return RemovedKeyframe(node_id, key, None, ())
+    contracted = contract_pose(node_id, odometry_edges, [edge for _, edge in loops])
+    for edge in contracted.odometry:
+        edges.add(edge)
+    link = None if following is None else _odometry_link(graph, previous, following)
+    moving = [(old, edge) for (old, _), edge in zip(loops, contracted.loops, strict=True) if edge is not None]
+    moved_loops = [_move_loop(graph, old, edge, max_loops) for old, edge in moving]
+    return RemovedKeyframe(node_id, key, link, tuple(loop for loop in moved_loops if loop is not None))
 
 
-def _unlike(poses: F64, apart_m: float, apart_rad: float) -> F64:
-    gap: F64 = np.empty((len(poses), len(poses)))
-    for rows in _blocks(len(poses)):
-        shift, angle = se3.apart(poses[rows], poses)
-        gap[rows] = shift / apart_m + angle / apart_rad
-    return gap
+def _pairwise_distance(poses: F64, scale_m: float, scale_rad: float) -> F64:
+    distance: F64 = np.empty((len(poses), len(poses)))
+    for rows in _row_blocks(len(poses)):
+        shift, angle = se3.pairwise_distances(poses[rows], poses)
+        distance[rows] = shift / scale_m + angle / scale_rad
+    return distance
 
 
-def _blocks(count: int) -> list[slice]:
+def _row_blocks(count: int) -> list[slice]:
     """Of rows: what is made on the way for all of thousands at once would take five times the result."""
-    return [slice(k, k + _ROWS) for k in range(0, count, _ROWS)]
+    return [slice(k, k + _BLOCK_ROWS) for k in range(0, count, _BLOCK_ROWS)]
 
 
-def _two_least(gap: F64) -> F64:
+def _two_nearest(distance: F64) -> F64:
     """Of each row, (N, 2); inf where there are none."""
-    if gap.shape[1] < 2:
-        return np.full((len(gap), 2), np.inf)
-    return np.partition(gap, 1, axis=1)[:, :2].copy()
+    if distance.shape[1] < 2:
+        return np.full((len(distance), 2), np.inf)
+    return np.partition(distance, 1, axis=1)[:, :2].copy()
 
 
-def _link(chart: Chart, before: int | None, after: int) -> Link:
-    node = chart.trails.nodes[after]
-    if before is None:
-        return Link(node.key, None, node.T_odom_body, np.zeros((6, 6)))
-    edge = chart.step(before, after)
-    return Link(node.key, chart.trails.nodes[before].key, edge.T_a_b, edge.cov)
+def _odometry_link(graph: MapGraph, previous: int | None, node_id: int) -> OdometryLink:
+    node = graph.odometry.nodes[node_id]
+    if previous is None:
+        return OdometryLink(node.key, None, node.T_odom_body, np.zeros((6, 6)))
+    edge = graph.odometry_edge(previous, node_id)
+    return OdometryLink(node.key, graph.odometry.nodes[previous].key, edge.T_a_b, edge.cov)
 
 
-def _move(chart: Chart, old: Loop, edge: Edge, most_loops: int) -> Loop | None:
+def _move_loop(graph: MapGraph, old: Loop, edge: PoseEdge, max_loops: int) -> Loop | None:
     """The loop at its new ends; None where there is one already, or enough."""
-    ties, nodes = chart.ties, chart.trails.nodes
-    at_a, at_b = ({n for n in ties.touching(end) if n in ties.loops} for end in (edge.a, edge.b))
-    if at_a & at_b or (max(len(at_a), len(at_b)) >= most_loops and chart.bonds[chart.bond(edge)]):
+    edges, nodes = graph.edges, graph.odometry.nodes
+    loops_at_a, loops_at_b = (
+        {n for n in edges.incident(end) if n in edges.loops} for end in (edge.a, edge.b)
+    )
+    if loops_at_a & loops_at_b or (
+        max(len(loops_at_a), len(loops_at_b)) >= max_loops and graph.loop_counts[graph.segment_pair(edge)]
+    ):
         return None
-    loop = Loop(nodes[edge.a].key, nodes[edge.b].key, edge.T_a_b, edge.cov, old.inliers, old.found)
-    chart.bind(edge, loop)
+    loop = Loop(nodes[edge.a].key, nodes[edge.b].key, edge.T_a_b, edge.cov, old.inliers, old.found_share)
+    graph.add_loop_edge(edge, loop)
     return loop
 
 
-_AWAY = ""  # no name
-_ALIKE = 1.0  # nearer than this in the measure of `redundant` two keyframes are of one place
+_ABSENT_AGENTS = ""  # no name
+_SAME_PLACE_DISTANCE = 1.0  # nearer than this in the measure of `redundant` two keyframes are of one place
 
 
-class Awaited(Enum):
+class ReturnReserve(Enum):
     """What stays for the return of who is away, the most first: its newest keyframes, and something of its
     map; only this; nothing."""
 
-    WITH_PLACES = auto()
-    IN_MAPS = auto()
-    NOBODY = auto()
+    NEWEST_AND_MAP = auto()
+    MAP_ONLY = auto()
+    NOTHING = auto()
 
 
-class Culling:
+class KeyframeCulling:
     """Of one chart."""
 
-    def __init__(self, config: MergeConfig, chart: Chart, owners: Owners) -> None:
-        self._config, self._chart, self._owners = config, chart, owners
+    def __init__(self, config: MergeConfig, graph: MapGraph, runs: AgentRuns) -> None:
+        self._config, self._graph, self._runs = config, graph, runs
 
     def choose(self, count: int) -> list[int]:
         """Numbers of so many keyframes, if there are as many that may go. The newest of a run that is away
         stay for its return, and something of a map in which nobody is heard, if there is another way."""
-        for awaited in Awaited:
-            if len(chosen := self._chosen(count, awaited)) >= count:
+        for reserve in ReturnReserve:
+            if len(chosen := self._choose_with(count, reserve)) >= count:
                 break
         return chosen
 
-    def may_go(self, number: int) -> bool:
+    def is_removable(self, node_id: int) -> bool:
         """Whether a keyframe can be taken out now."""
-        chart = self._chart
-        stretch = chart.trails.nodes[number].stretch
-        nodes, founder = chart.trails.stretches[stretch].nodes, chart.founder[stretch]
-        if self._walks(stretch, Awaited.NOBODY) and number in nodes[-self._config.min_loop_gap :]:
+        graph = self._graph
+        segment = graph.odometry.nodes[node_id].segment
+        nodes, reference_segment = graph.odometry.segments[segment].nodes, graph.reference_segments[segment]
+        if (
+            self._is_growing(segment, ReturnReserve.NOTHING)
+            and node_id in nodes[-self._config.min_loop_gap :]
+        ):
             return False
-        if self._is_over(chart.stretches_of(founder), Awaited.NOBODY):
+        if self._is_finished(graph.map_segments(reference_segment), ReturnReserve.NOTHING):
             return True
-        return number != chart.anchor(founder) and (len(nodes) > 1 or stretch not in bridging(chart.bonds))
+        return node_id != graph.anchor(reference_segment) and (
+            len(nodes) > 1 or segment not in articulation_segments(graph.loop_counts)
+        )
 
-    def _chosen(self, count: int, awaited: Awaited) -> list[int]:
-        maps = self._maps()
-        over = [founder for founder, stretches in maps.items() if self._is_over(stretches, awaited)]
-        others = [founder for founder in maps if founder not in set(over)]
-        stay = self._staying(others, awaited)
-        due, out = self._due(count, stay), dict[int, None]()
-        for founders, below in ((over, _ALIKE), (others, _ALIKE)):
-            for founder in founders:
-                self._thin(maps[founder], stay, due, out, below)
-        for founder in (*reversed(over), *others):
-            self._thin(maps[founder], stay, due, out)
+    def _choose_with(self, count: int, reserve: ReturnReserve) -> list[int]:
+        maps = self._segments_by_map()
+        finished = [
+            reference_segment
+            for reference_segment, segments in maps.items()
+            if self._is_finished(segments, reserve)
+        ]
+        ongoing = [reference_segment for reference_segment in maps if reference_segment not in set(finished)]
+        protected = self._protected(ongoing, reserve)
+        quotas, out = self._quotas(count, protected), dict[int, None]()
+        for reference_segments, max_distance in (
+            (finished, _SAME_PLACE_DISTANCE),
+            (ongoing, _SAME_PLACE_DISTANCE),
+        ):
+            for reference_segment in reference_segments:
+                self._add_redundant(maps[reference_segment], protected, quotas, out, max_distance)
+        for reference_segment in (*reversed(finished), *ongoing):
+            self._add_redundant(maps[reference_segment], protected, quotas, out)
         return list(out)
 
-    def _thin(
+    def _add_redundant(
         self,
-        stretches: Sequence[int],
-        stay: set[int],
-        due: Counter[str],
-        out: dict[int, None],
-        below: float = np.inf,
+        segments: Sequence[int],
+        protected: set[int],
+        quotas: Counter[str],
+        removed: dict[int, None],
+        max_distance: float = np.inf,
     ) -> None:
-        """Into `out`, of one map and those that may go, as many of each name as are due, while two are more
-        alike than `below`."""
-        chart, c = self._chart, self._config
-        numbers = [n for s in stretches for n in chart.trails.stretches[s].nodes if n not in out]
-        whose = [None if n in stay else self._name(n) for n in numbers]
-        if any(name is not None and due[name] for name in whose):
-            poses = np.array([chart.poses[n] for n in numbers])
-            gone = redundant(poses, whose, due, c.place_m, c.place_rad, below)
-            out |= dict.fromkeys(numbers[i] for i in gone)
+        """Into `removed`, of one map and those that may go, as many of each name as are due, while two are
+        more alike than `max_distance`."""
+        graph, c = self._graph, self._config
+        node_ids = [n for s in segments for n in graph.odometry.segments[s].nodes if n not in removed]
+        owners = [None if n in protected else self._agent_name(n) for n in node_ids]
+        if any(name is not None and quotas[name] for name in owners):
+            poses = np.array([graph.poses[n] for n in node_ids])
+            chosen = redundant(poses, owners, quotas, c.place_m, c.place_rad, max_distance)
+            removed |= dict.fromkeys(node_ids[i] for i in chosen)
 
-    def _due(self, count: int, stay: set[int]) -> Counter[str]:
+    def _quotas(self, count: int, protected: set[int]) -> Counter[str]:
         """How many keyframes each name gives."""
-        held = Counter(map(self._name, self._chart.poses))
-        free = Counter(self._name(n) for n in self._chart.poses if n not in stay)
-        owners, heard_of = self._owners, self._owners.heard_of()
-        away = {name for name in held if owners.is_away(name)}
-        least = (held.total() - count) // (len(held.keys() - away) + 1) if away else 0
-        for name in held.keys() - away:
-            free[name] = min(free[name], max(0, held[name] - least))
+        held_counts = Counter(map(self._agent_name, self._graph.poses))
+        removable = Counter(self._agent_name(n) for n in self._graph.poses if n not in protected)
+        runs, presence_order = self._runs, self._runs.presence_order()
+        absent_names = {name for name in held_counts if runs.is_name_absent(name)}
+        fair_share = (
+            (held_counts.total() - count) // (len(held_counts.keys() - absent_names) + 1)
+            if absent_names
+            else 0
+        )
+        for name in held_counts.keys() - absent_names:
+            removable[name] = min(removable[name], max(0, held_counts[name] - fair_share))
 
-        def of_all(counts: Counter[str]) -> Counter[str]:
-            here = Counter({name: n for name, n in counts.items() if name not in away})
-            here[_AWAY] = sum(counts[name] for name in away)
+        def merge_absent(counts: Counter[str]) -> Counter[str]:
+            here = Counter({name: n for name, n in counts.items() if name not in absent_names})
+            here[_ABSENT_AGENTS] = sum(counts[name] for name in absent_names)
             return here
 
-        out = dues(of_all(held), of_all(free), count, heard_of)
-        held, free = (Counter({name: counts[name] for name in away}) for counts in (held, free))
-        return out + dues(held, free, out.pop(_AWAY, 0), heard_of)
+        out = fair_quotas(merge_absent(held_counts), merge_absent(removable), count, presence_order)
+        held_counts, removable = (
+            Counter({name: counts[name] for name in absent_names}) for counts in (held_counts, removable)
+        )
+        return out + fair_quotas(held_counts, removable, out.pop(_ABSENT_AGENTS, 0), presence_order)
 
-    def _staying(self, founders: Iterable[int], awaited: Awaited) -> set[int]:
+    def _protected(self, reference_segments: Iterable[int], reserve: ReturnReserve) -> set[int]:
         """The newest of every agent that walks on, and of these maps what holds their gauge, or them
         together."""
-        chart, trails = self._chart, self._chart.trails
-        out = {chart.anchor(founder) for founder in founders}
-        for stretch in trails.live:
-            if self._walks(stretch, awaited):
-                out.update(trails.stretches[stretch].nodes[-self._config.min_loop_gap :])
-        for stretch in bridging(chart.bonds):
-            nodes = trails.stretches[stretch].nodes
-            out.add(max(nodes, key=lambda n: len(chart.ties.touching(n))))
+        graph, odometry = self._graph, self._graph.odometry
+        out = {graph.anchor(reference_segment) for reference_segment in reference_segments}
+        for segment in odometry.live_segments:
+            if self._is_growing(segment, reserve):
+                out.update(odometry.segments[segment].nodes[-self._config.min_loop_gap :])
+        for segment in articulation_segments(graph.loop_counts):
+            nodes = odometry.segments[segment].nodes
+            out.add(max(nodes, key=lambda n: len(graph.edges.incident(n))))
         return out
 
-    def _maps(self) -> dict[int, list[int]]:
+    def _segments_by_map(self) -> dict[int, list[int]]:
         """Stretches by the founder of their map, the largest map first; of maps alike the newest."""
-        chart, maps = self._chart, dict[int, list[int]]()
-        for stretch in sorted(chart.trails.live, reverse=True):
-            maps.setdefault(chart.founder[stretch], []).append(stretch)
-        return dict(sorted(maps.items(), key=lambda one: -sum(map(self._size, one[1]))))
+        graph, maps = self._graph, dict[int, list[int]]()
+        for segment in sorted(graph.odometry.live_segments, reverse=True):
+            maps.setdefault(graph.reference_segments[segment], []).append(segment)
+        return dict(sorted(maps.items(), key=lambda one: -sum(map(self._segment_size, one[1]))))
 
-    def _size(self, stretch: int) -> int:
-        return len(self._chart.trails.stretches[stretch].nodes)
+    def _segment_size(self, segment: int) -> int:
+        return len(self._graph.odometry.segments[segment].nodes)
 
-    def _is_over(self, stretches: Sequence[int], awaited: Awaited) -> bool:
+    def _is_finished(self, segments: Sequence[int], reserve: ReturnReserve) -> bool:
         """Whether nobody walks in the map of these any more and only one name ever did."""
-        agents = {self._chart.trails.stretches[s].agent for s in stretches}
-        if awaited is Awaited.IN_MAPS:
-            awaited = Awaited.WITH_PLACES
-        alone = awaited is Awaited.NOBODY or len(set(map(self._owners.name, agents))) == 1
-        return alone and not any(self._walks(s, awaited) for s in stretches)
+        agents = {self._graph.odometry.segments[s].agent for s in segments}
+        if reserve is ReturnReserve.MAP_ONLY:
+            reserve = ReturnReserve.NEWEST_AND_MAP
+        has_one_name = reserve is ReturnReserve.NOTHING or len(set(map(self._runs.name, agents))) == 1
+        return has_one_name and not any(self._is_growing(s, reserve) for s in segments)
 
-    def _walks(self, stretch: int, awaited: Awaited) -> bool:
+    def _is_growing(self, segment: int, reserve: ReturnReserve) -> bool:
         """Whether keyframes come to this stretch, or would if its agent came back and is awaited, which has
         not begun another run."""
-        agent, owners = self._chart.trails.stretches[stretch].agent, self._owners
-        away = owners.is_ended if awaited is Awaited.WITH_PLACES else owners.is_absent
-        return not away(agent) and self._chart.trails.current(agent) == stretch
+        agent, runs = self._graph.odometry.segments[segment].agent, self._runs
+        is_gone = runs.is_superseded if reserve is ReturnReserve.NEWEST_AND_MAP else runs.is_absent
+        return not is_gone(agent) and self._graph.odometry.current_segment(agent) == segment
 
-    def _name(self, number: int) -> str:
-        return self._owners.name(self._chart.trails.nodes[number].key.agent)
+    def _agent_name(self, node_id: int) -> str:
+        return self._runs.name(self._graph.odometry.nodes[node_id].key.agent)

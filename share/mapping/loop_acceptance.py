@@ -15,310 +15,347 @@ import numpy as np
 
 from share.config import MergeConfig
 from share.geometry import se3
-from share.mapping.loop_consistency import Evidence, fewest, near, places, weigh
-from share.mapping.loops import Disagreement, Key, Known, Loop, disagreement, near_any, opposite, witness_chi2
-from share.mapping.map_graph import Chart
-from share.mapping.overlap_check import Survey, doubt
+from share.mapping.loop_consistency import LoopEvidence, count_places, is_near, minimum_cut, weigh_loops
+from share.mapping.loops import (
+    Disagreement,
+    KeyframeKey,
+    Loop,
+    RelativePose,
+    disagreement,
+    inverse_pose,
+    is_near_any,
+    pairwise_chi2,
+)
+from share.mapping.map_graph import MapGraph
+from share.mapping.overlap_check import OverlapCheck, cusum
 from share.types import F64
 
-_NAMED = 3  # loops, in a reason
-_MOVED = 2e-3  # rad and m: with less, what did not fit does not
-_LOOKED_AT = 8  # loops that stand, whenever others contradict them
+_MAX_NAMED = 3  # loops, in a reason
+_MIN_MOVE = 2e-3  # rad and m: with less, what did not fit does not
+_MAX_CHECKED = 8  # loops that stand, whenever others contradict them
 
 
 @dataclass(frozen=True)
-class Decision:
+class LoopDecision:
     """What became of a loop, and why, for a person. joined: maps that became one, the survivor first.
     tied: all loops that are believed since, this one and those that waited; dropped: those no longer."""
 
     accepted: bool
     reason: str
-    joined: tuple[str, str] | None = None
-    tied: tuple[Loop, ...] = ()
+    joined_maps: tuple[str, str] | None = None
+    added: tuple[Loop, ...] = ()
     dropped: tuple[Loop, ...] = ()
 
 
-class Judge:
+class LoopAcceptance:
     """Of the loops of one chart, which it changes by what it believes.
 
     waiting: for witnesses, oldest first. rebels: those that contradict their map.
     """
 
-    def __init__(self, config: MergeConfig, chart: Chart, survey: Survey) -> None:
-        self.waiting: list[Loop] = []
-        self.rebels: list[Loop] = []
-        self._alike: set[int] = set()  # nodes at places of which a look-alike is known
-        self._held: dict[Loop, F64] = {}  # waiting loops that did not fit their map, which then had T_a_b
-        self._config, self._chart, self._survey = config, chart, survey
+    def __init__(self, config: MergeConfig, graph: MapGraph, overlap_check: OverlapCheck) -> None:
+        self.pending: list[Loop] = []
+        self.contradicting: list[Loop] = []
+        self._ambiguous_nodes: set[int] = set()  # nodes at places of which a look-alike is known
+        self._rejected_at: dict[
+            Loop, F64
+        ] = {}  # waiting loops that did not fit their map, which then had T_a_b
+        self._config, self._graph, self._overlap_check = config, graph, overlap_check
 
-    def decide(self, loop: Loop) -> Decision:
+    def decide(self, loop: Loop) -> LoopDecision:
         """Accepted, waiting, or refused, with the reason. Raises ValueError if a keyframe is unknown."""
-        a, b = self._chart.ends(loop)
-        ties, gap = self._chart.ties, self._config.min_loop_gap
-        if any(n in ties.loops and {a, b} == {ties.edges[n].a, ties.edges[n].b} for n in ties.touching(b)):
-            return Decision(False, f"loop {loop}: joined already")
-        if self._chart.trails.are_neighbours(a, b, gap):
-            need = f"at least {gap} keyframes apart needed"
-            return Decision(False, f"loop {loop}: neighbours by odometry, {need}")
-        if self._chart.same_map(a, b):
-            return self._close(loop)
-        return self._join(self._survey.looked_at(loop))
+        a, b = self._graph.loop_nodes(loop)
+        edges, disagreement = self._graph.edges, self._config.min_loop_gap
+        if any(
+            n in edges.loops and {a, b} == {edges.by_id[n].a, edges.by_id[n].b} for n in edges.incident(b)
+        ):
+            return LoopDecision(False, f"loop {loop}: joined already")
+        if self._graph.odometry.are_neighbours(a, b, disagreement):
+            need = f"at least {disagreement} keyframes apart needed"
+            return LoopDecision(False, f"loop {loop}: neighbours by odometry, {need}")
+        if self._graph.is_same_map(a, b):
+            return self._decide_within_map(loop)
+        return self._decide_join(self._overlap_check.with_found_share(loop))
 
-    def review(self, number: int) -> Decision | None:
+    def review_joins(self, node_id: int) -> LoopDecision | None:
         """A new node, in a map: undoes the join that what it sees speaks against, if any does."""
         c = self._config
-        for (a, b), doubts in self._survey.review(number, c.overlap_gone):
-            if doubts > c.undo_doubt:
-                self._survey.end((a, b))
-                dropped = self._chart.drop(self._ties_between(a, b))
-                one, other = (self._chart.trails.stretches[s].name for s in (a, b))
-                why = f"what {one} and {other} should share is gone (doubt {doubts:.1f})"
-                return Decision(True, f"{why}; {taken_out(dropped)}", dropped=dropped)
+        for (a, b), cusum_value in self._overlap_check.review_joins(node_id, c.overlap_gone):
+            if cusum_value > c.undo_doubt:
+                self._overlap_check.end_probation((a, b))
+                dropped = self._graph.drop_loops(self._separating_loops(a, b))
+                first, second = (self._graph.odometry.segments[s].name for s in (a, b))
+                reason = f"what {first} and {second} should share is gone (doubt {cusum_value:.1f})"
+                return LoopDecision(True, f"{reason}; {dropped_text(dropped)}", dropped=dropped)
         return None
 
-    def part(self, a: int, b: int) -> tuple[Loop, ...]:
+    def split_segments(self, a: int, b: int) -> tuple[Loop, ...]:
         """Take back the loops without which stretches a and b, of one map, are of two."""
-        return self._chart.drop(self._ties_between(a, b))
+        return self._graph.drop_loops(self._separating_loops(a, b))
 
-    def settle(self) -> tuple[Loop, ...]:
+    def accept_fitting(self) -> tuple[Loop, ...]:
         """Those that waited and fit the map that they are in by now are believed."""
-        inside = [loop for loop in self.waiting if self._chart.same_map(*self._chart.ends(loop))]
-        lie = {loop: self._chart.lie(*self._chart.ends(loop)) for loop in inside}
-        moved = [loop for loop in inside if loop not in self._held or _has_moved(self._held[loop], lie[loop])]
-        gaps = self._gaps(moved)
-        fitting = [loop for loop, gap in zip(moved, gaps, strict=True) if gap.chi2 <= self._config.agree_chi2]
-        self._held = {x: lie[x] if x in moved else self._held[x] for x in inside if x not in fitting}
-        self._believe(fitting)
+        in_one_map = [loop for loop in self.pending if self._graph.is_same_map(*self._graph.loop_nodes(loop))]
+        map_poses = {loop: self._graph.relative_pose(*self._graph.loop_nodes(loop)) for loop in in_one_map}
+        moved = [
+            loop
+            for loop in in_one_map
+            if loop not in self._rejected_at or _has_moved(self._rejected_at[loop], map_poses[loop])
+        ]
+        gaps = self._disagreements(moved)
+        fitting = [
+            loop
+            for loop, disagreement in zip(moved, gaps, strict=True)
+            if disagreement.chi2 <= self._config.agree_chi2
+        ]
+        self._rejected_at = {
+            x: map_poses[x] if x in moved else self._rejected_at[x] for x in in_one_map if x not in fitting
+        }
+        self._add_loops(fitting)
         return tuple(fitting)
 
-    def forget(self, gone: Collection[Key]) -> None:
+    def remove_keyframes(self, removed: Collection[KeyframeKey]) -> None:
         """Loops of these keyframes, which the chart has no more, are waited with no longer."""
-        self._alike.intersection_update(self._chart.poses)
-        self.waiting = [loop for loop in self.waiting if loop.pair.isdisjoint(gone)]
-        self.rebels = [loop for loop in self.rebels if loop.pair.isdisjoint(gone)]
+        self._ambiguous_nodes.intersection_update(self._graph.poses)
+        self.pending = [loop for loop in self.pending if loop.keyframes.isdisjoint(removed)]
+        self.contradicting = [loop for loop in self.contradicting if loop.keyframes.isdisjoint(removed)]
 
     # ------------------------------------------------------------ within a map
 
-    def _close(self, loop: Loop) -> Decision:
-        (gap,) = self._gaps([loop])
-        if gap.chi2 <= self._config.agree_chi2:
-            return self._accept([loop], f"loop {loop}: fits the map, {gap}")
-        if gap.chi2 > self._config.surprise_chi2:
-            return self._contradiction(loop, f"loop {loop}: contradicts the map, {gap}")
-        return self._corrected(loop, f"loop {loop}: fits the map badly ({gap})")
+    def _decide_within_map(self, loop: Loop) -> LoopDecision:
+        (disagreement,) = self._disagreements([loop])
+        if disagreement.chi2 <= self._config.agree_chi2:
+            return self._accept([loop], f"loop {loop}: fits the map, {disagreement}")
+        if disagreement.chi2 > self._config.surprise_chi2:
+            return self._decide_contradiction(loop, f"loop {loop}: contradicts the map, {disagreement}")
+        return self._decide_drift(loop, f"loop {loop}: fits the map badly ({disagreement})")
 
-    def _gaps(self, loops: Sequence[Loop]) -> list[Disagreement]:
+    def _disagreements(self, loops: Sequence[Loop]) -> list[Disagreement]:
         """Between what each loop says and what its map knows."""
-        ends = [self._chart.ends(loop) for loop in loops]
-        to: dict[int, list[int]] = {}
+        ends = [self._graph.loop_nodes(loop) for loop in loops]
+        nodes_by_goal: dict[int, list[int]] = {}
         for a, b in ends:
-            to.setdefault(b, []).append(a)
+            nodes_by_goal.setdefault(b, []).append(a)
         known = {
             (a, b): k
-            for b, goals in to.items()
-            for a, k in zip(goals, self._chart.between(b, goals), strict=True)
+            for b, goals in nodes_by_goal.items()
+            for a, k in zip(goals, self._graph.relative_estimates(b, goals), strict=True)
         }
         return [
-            disagreement(opposite(known[end]), Known(loop.T_a_b, loop.cov))
+            disagreement(inverse_pose(known[end]), RelativePose(loop.T_a_b, loop.cov))
             for loop, end in zip(loops, ends, strict=True)
         ]
 
-    def _corrected(self, loop: Loop, why: str) -> Decision:
+    def _decide_drift(self, loop: Loop, reason: str) -> LoopDecision:
         """The map has drifted, if another loop elsewhere says so too."""
-        story = self._same_story(loop, self.waiting)
-        if not story:
-            self._wait(self._survey.looked_at(loop))
-            return Decision(False, f"{why}: waits for a witness")
-        return self._accept([*story, loop], f"{why}: agrees with {story[-1]}")
+        consistent = self._consistent_loops(loop, self.pending)
+        if not consistent:
+            self._add_pending(self._overlap_check.with_found_share(loop))
+            return LoopDecision(False, f"{reason}: waits for a witness")
+        return self._accept([*consistent, loop], f"{reason}: agrees with {consistent[-1]}")
 
-    def _contradiction(self, loop: Loop, why: str) -> Decision:
+    def _decide_contradiction(self, loop: Loop, reason: str) -> LoopDecision:
         """Odometry does not lie so much: the places look alike. Between stretches the map may be wrong:
         it is, if what contradicts it is better evidence than what ties the two."""
-        a, b = (self._chart.stretch_of(key) for key in (loop.a, loop.b))
+        a, b = (self._graph.segment(key) for key in (loop.a, loop.b))
         if a == b:
-            self._alike.update(self._chart.ends(loop))
-            return Decision(False, f"{why}: two places look alike")
-        loop = self._survey.looked_at(loop)
-        story = [*self._same_story(loop, self.rebels), loop]
-        self.rebels = [*self.rebels, loop][-self._config.max_pending :]
-        c, have = self._config, self._weigh(story)
-        why = f"{why}; {have} say so"
-        if have.places < c.rebel_places:
-            return Decision(False, f"{why}, {c.rebel_places} places needed")
-        against = self._ties_between(a, b)
-        standing = self._standing(against)
-        why = f"{why}, {standing} do not"
-        if have.weight <= c.rebel_weight * standing.weight:
-            return Decision(False, f"{why}, more weight needed")
-        if denial := self._denial(loop):
-            return Decision(False, why + denial)
-        return self._overthrow(story, against, why)
+            self._ambiguous_nodes.update(self._graph.loop_nodes(loop))
+            return LoopDecision(False, f"{reason}: two places look alike")
+        loop = self._overlap_check.with_found_share(loop)
+        consistent = [*self._consistent_loops(loop, self.contradicting), loop]
+        self.contradicting = [*self.contradicting, loop][-self._config.max_pending :]
+        c, evidence = self._config, self._weigh(consistent)
+        reason = f"{reason}; {evidence} say so"
+        if evidence.places < c.rebel_places:
+            return LoopDecision(False, f"{reason}, {c.rebel_places} places needed")
+        existing_ids = self._separating_loops(a, b)
+        existing = self._weigh_existing(existing_ids)
+        reason = f"{reason}, {existing} do not"
+        if evidence.weight <= c.rebel_weight * existing.weight:
+            return LoopDecision(False, f"{reason}, more weight needed")
+        if objection := self._overlap_objection(loop):
+            return LoopDecision(False, reason + objection)
+        return self._replace_loops(consistent, existing_ids, reason)
 
-    def _ties_between(self, a: int, b: int) -> list[int]:
+    def _separating_loops(self, a: int, b: int) -> list[int]:
         """The fewest loops without which stretches a and b are not of one map."""
         loops = {
-            n: tuple(self._chart.stretch_of(key) for key in (loop.a, loop.b))
-            for n, loop in self._chart.ties.loops.items()
-            if self._chart.founder_of(loop.a) == self._chart.founder[a]
+            n: tuple(self._graph.segment(key) for key in (loop.a, loop.b))
+            for n, loop in self._graph.edges.loops.items()
+            if self._graph.reference_segment(loop.a) == self._graph.reference_segments[a]
         }
-        numbers = list(loops)
-        return [numbers[i] for i in fewest([(x, y) for x, y in loops.values()], a, b)]
+        edge_ids = list(loops)
+        return [edge_ids[i] for i in minimum_cut([(x, y) for x, y in loops.values()], a, b)]
 
-    def _standing(self, against: Sequence[int]) -> Evidence:
+    def _weigh_existing(self, edge_ids: Sequence[int]) -> LoopEvidence:
         """What loops of a map, by their edges' numbers, are worth; a few of those that nobody has looked at
         yet are looked at."""
-        loops = self._chart.ties.loops
-        unknown = [n for n in against if loops[n].found is None and near(loops[n], self._config)]
-        for n in unknown[:: 1 + len(unknown) // _LOOKED_AT]:
-            loops[n] = self._survey.looked_at(loops[n])
-        return self._weigh([loops[n] for n in against])
+        loops = self._graph.edges.loops
+        unchecked = [n for n in edge_ids if loops[n].found_share is None and is_near(loops[n], self._config)]
+        for n in unchecked[:: 1 + len(unchecked) // _MAX_CHECKED]:
+            loops[n] = self._overlap_check.with_found_share(loops[n])
+        return self._weigh([loops[n] for n in edge_ids])
 
-    def _overthrow(self, loops: list[Loop], against: list[int], why: str) -> Decision:
-        dropped = self._chart.drop(against)
-        self.rebels, others = [], [loop for loop in self.rebels if loop not in loops]
-        self.waiting += others
-        accepted = self._accept(loops, f"{why}; {taken_out(dropped)}")
-        return Decision(True, accepted.reason, accepted.joined, accepted.tied, dropped)
+    def _replace_loops(self, loops: list[Loop], edge_ids: list[int], reason: str) -> LoopDecision:
+        dropped = self._graph.drop_loops(edge_ids)
+        self.contradicting, others = [], [loop for loop in self.contradicting if loop not in loops]
+        self.pending += others
+        accepted = self._accept(loops, f"{reason}; {dropped_text(dropped)}")
+        return LoopDecision(True, accepted.reason, accepted.joined_maps, accepted.added, dropped)
 
     # ------------------------------------------------------------ between two maps
 
-    def _join(self, loop: Loop) -> Decision:
-        story = [*self._same_story(loop, self.waiting), loop]
-        have, need = self._unique(story), self._places_needed(loop)
-        why = f"loop {loop}: would join two maps, {have.places} of {need} places that say so"
-        lacks = "" if have.places >= need and have.keyframes >= 2 else ": waits"
-        lacks = lacks or self._doubt(loop, have) or self._denial(loop)
-        if lacks:
-            self._wait(loop)
-            return Decision(False, why + lacks)
-        return self._accept(story, why)
+    def _decide_join(self, loop: Loop) -> LoopDecision:
+        consistent = [*self._consistent_loops(loop, self.pending), loop]
+        evidence, min_places = self._weigh_unambiguous(consistent), self._min_places(loop)
+        reason = f"loop {loop}: would join two maps, {evidence.places} of {min_places} places that say so"
+        objection = "" if evidence.places >= min_places and evidence.keyframes >= 2 else ": waits"
+        objection = objection or self._join_objection(loop, evidence) or self._overlap_objection(loop)
+        if objection:
+            self._add_pending(loop)
+            return LoopDecision(False, reason + objection)
+        return self._accept(consistent, reason)
 
-    def _doubt(self, loop: Loop, have: Evidence) -> str:
+    def _join_objection(self, loop: Loop, evidence: LoopEvidence) -> str:
         """Why a story that is told at enough places may yet be of a copy; empty if nothing says so."""
         c = self._config
-        if have.found < c.join_found:
-            return f", but only {have.found:.0%} of what both should show is found: waits"
-        allowed = c.rival_weight * have.weight
-        rival = self._rival(loop, allowed)
-        return f"; another story has {rival}: waits" if rival.weight > allowed else ""
+        if evidence.found_share < c.join_found:
+            return f", but only {evidence.found_share:.0%} of what both should show is found: waits"
+        max_weight = c.rival_weight * evidence.weight
+        competing = self._competing_hypothesis(loop, max_weight)
+        return f"; another story has {competing}: waits" if competing.weight > max_weight else ""
 
-    def _denial(self, loop: Loop) -> str:
+    def _overlap_objection(self, loop: Loop) -> str:
         """What the overlap of both maps has against it, whatever was recognised; empty if nothing."""
-        looks, c = self._survey.overlap(loop), self._config
-        if len(looks) < c.overlap_pairs:
-            return f", but only {len(looks)} views overlap: waits"
-        gone = sum(look.share for look in looks) / max(1, len(looks))
-        if gone > c.overlap_gone:
-            return f", but {gone:.0%} of the {len(looks)} views that overlap is gone: waits"
-        doubts = itertools.accumulate(looks, lambda d, look: doubt(d, look, c.overlap_gone), initial=0.0)
-        if (worst := max(doubts)) > c.undo_doubt:
+        comparisons, c = self._overlap_check.compare_overlap(loop), self._config
+        if len(comparisons) < c.overlap_pairs:
+            return f", but only {len(comparisons)} views overlap: waits"
+        missing_share = sum(comparison.missing_share for comparison in comparisons) / max(1, len(comparisons))
+        if missing_share > c.overlap_gone:
+            return f", but {missing_share:.0%} of the {len(comparisons)} views that overlap is gone: waits"
+        cusums = itertools.accumulate(
+            comparisons, lambda d, look: cusum(d, look, c.overlap_gone), initial=0.0
+        )
+        if (worst := max(cusums)) > c.undo_doubt:
             return f", but views in a row show things gone (doubt {worst:.1f}): waits"
         return ""
 
-    def _places_needed(self, loop: Loop) -> int:
+    def _min_places(self, loop: Loop) -> int:
         """Of a map that knows few places, all but one."""
-        chart, c = self._chart, self._config
-        maps = [chart.nodes_of(chart.founder_of(key)) for key in (loop.a, loop.b)]
-        known = min(places([chart.poses[n] for n in nodes], c, c.join_places + 1) for nodes in maps)
-        return max(1, known - 1)
+        graph, c = self._graph, self._config
+        maps = [graph.map_nodes(graph.reference_segment(key)) for key in (loop.a, loop.b)]
+        known_places = min(
+            count_places([graph.poses[n] for n in nodes], c, c.join_places + 1) for nodes in maps
+        )
+        return max(1, known_places - 1)
 
-    def _rival(self, loop: Loop, allowed: float) -> Evidence:
+    def _competing_hypothesis(self, loop: Loop, max_weight: float) -> LoopEvidence:
         """Of the stories between the same two maps that contradict this one, the first that weighs more
         than allowed, or else the best."""
-        compared = self._compared(loop, self.waiting)
-        left = [other for other, chi2 in compared if chi2 > self._config.surprise_chi2]
-        best = Evidence()
-        while left and best.weight <= allowed:
-            told = [*self._same_story(left[-1], left[:-1]), left[-1]]
-            weighs = self._weigh(told)
-            if weighs.weight > best.weight and not self._denial(told[-1]):
-                best = weighs
-            pairs = {x.pair for x in told}
-            left = [x for x in left if x.pair not in pairs]
+        compared = self._compare_loops(loop, self.pending)
+        remaining = [other for other, chi2 in compared if chi2 > self._config.surprise_chi2]
+        best = LoopEvidence()
+        while remaining and best.weight <= max_weight:
+            hypothesis = [*self._consistent_loops(remaining[-1], remaining[:-1]), remaining[-1]]
+            evidence = self._weigh(hypothesis)
+            if evidence.weight > best.weight and not self._overlap_objection(hypothesis[-1]):
+                best = evidence
+            pairs = {x.keyframes for x in hypothesis}
+            remaining = [x for x in remaining if x.keyframes not in pairs]
         return best
 
     # ------------------------------------------------------------ witnesses
 
-    def _same_story(self, loop: Loop, others: Sequence[Loop]) -> list[Loop]:
+    def _consistent_loops(self, loop: Loop, others: Sequence[Loop]) -> list[Loop]:
         """Of others between the same two maps (in one map: the same stretches), those that agree."""
-        return [x for x, chi2 in self._compared(loop, others) if chi2 <= self._config.agree_chi2]
+        return [x for x, chi2 in self._compare_loops(loop, others) if chi2 <= self._config.agree_chi2]
 
-    def _compared(self, loop: Loop, others: Sequence[Loop]) -> list[tuple[Loop, float]]:
+    def _compare_loops(self, loop: Loop, others: Sequence[Loop]) -> list[tuple[Loop, float]]:
         """Others between the same two maps, and by how much each disagrees."""
-        facing = [turned for other in others if (turned := self._facing(loop, other)) is not None]
+        facing = [turned for other in others if (turned := self._oriented(loop, other)) is not None]
         if not facing:
             return []
-        (a, b), ends = self._chart.ends(loop), [self._chart.ends(x) for x in facing]
-        from_a = self._chart.between(a, [x for x, _ in ends])
-        to_b = opposite(self._chart.between(b, [y for _, y in ends]))
-        return list(zip(facing, witness_chi2(loop, from_a, facing, to_b).tolist(), strict=True))
+        (a, b), ends = self._graph.loop_nodes(loop), [self._graph.loop_nodes(x) for x in facing]
+        from_a = self._graph.relative_estimates(a, [x for x, _ in ends])
+        to_b = inverse_pose(self._graph.relative_estimates(b, [y for _, y in ends]))
+        return list(zip(facing, pairwise_chi2(loop, from_a, facing, to_b).tolist(), strict=True))
 
-    def _facing(self, loop: Loop, other: Loop) -> Loop | None:
+    def _oriented(self, loop: Loop, other: Loop) -> Loop | None:
         """The other loop, from where this one comes from to where it goes, if it has such ends and is
         not about the very same keyframes."""
-        if loop.pair == other.pair:
+        if loop.keyframes == other.keyframes:
             return None
-        chart = self._chart
-        side = chart.stretch_of if chart.founder_of(loop.a) == chart.founder_of(loop.b) else chart.founder_of
+        graph = self._graph
+        side = (
+            graph.segment
+            if graph.reference_segment(loop.a) == graph.reference_segment(loop.b)
+            else graph.reference_segment
+        )
         ours = side(loop.a), side(loop.b)
         for turned in (other, other.reverse()):
             if (side(turned.a), side(turned.b)) == ours:
                 return turned
         return None
 
-    def _weigh(self, loops: Sequence[Loop]) -> Evidence:
-        return weigh(loops, self._chart, self._config)
+    def _weigh(self, loops: Sequence[Loop]) -> LoopEvidence:
+        return weigh_loops(loops, self._graph, self._config)
 
-    def _unique(self, loops: Sequence[Loop]) -> Evidence:
+    def _weigh_unambiguous(self, loops: Sequence[Loop]) -> LoopEvidence:
         """Where nothing else is known to look the same."""
-        seen = [loop for loop in loops if near(loop, self._config)]
-        return self._weigh([loop for loop in seen if not self._looks_alike(loop)])
+        near_loops = [loop for loop in loops if is_near(loop, self._config)]
+        return self._weigh([loop for loop in near_loops if not self._is_ambiguous(loop)])
 
-    def _looks_alike(self, loop: Loop) -> bool:
-        chart, c = self._chart, self._config
-        for number in chart.ends(loop):
-            stretch = chart.trails.nodes[number].stretch
-            known = [n for n in self._alike if n in chart.poses and chart.trails.nodes[n].stretch == stretch]
-            if near_any(chart.poses[number], [chart.poses[n] for n in known], c.place_m, c.place_rad):
+    def _is_ambiguous(self, loop: Loop) -> bool:
+        graph, c = self._graph, self._config
+        for node_id in graph.loop_nodes(loop):
+            segment = graph.odometry.nodes[node_id].segment
+            ambiguous = [
+                n
+                for n in self._ambiguous_nodes
+                if n in graph.poses and graph.odometry.nodes[n].segment == segment
+            ]
+            if is_near_any(graph.poses[node_id], [graph.poses[n] for n in ambiguous], c.place_m, c.place_rad):
                 return True
         return False
 
     # ------------------------------------------------------------ believing
 
-    def _accept(self, loops: list[Loop], reason: str) -> Decision:
-        chart = self._chart
-        before = sorted({chart.founder_of(key) for key in (loops[-1].a, loops[-1].b)}, key=chart.rank)
-        if len(before) > 1:
-            chart.lay_beside(min(loops, key=lambda loop: float(loop.cov.trace())))
-        self._believe(loops)
-        if len(before) == 1:
-            return Decision(True, reason, tied=tuple(loops))
-        self._survey.begin(loops[-1])
-        waited = self.settle()
-        survivor, gone = (chart.trails.stretches[s].name for s in before)
-        reason += f"{that_waited(waited)}: map {gone} joins {survivor}"
-        return Decision(True, reason, (survivor, gone), (*loops, *waited))
+    def _accept(self, loops: list[Loop], reason: str) -> LoopDecision:
+        graph = self._graph
+        references = sorted(
+            {graph.reference_segment(key) for key in (loops[-1].a, loops[-1].b)}, key=graph.rank
+        )
+        if len(references) > 1:
+            graph.align_maps(min(loops, key=lambda loop: float(loop.cov.trace())))
+        self._add_loops(loops)
+        if len(references) == 1:
+            return LoopDecision(True, reason, added=tuple(loops))
+        self._overlap_check.begin_probation(loops[-1])
+        added = self.accept_fitting()
+        survivor, absorbed = (graph.odometry.segments[s].name for s in references)
+        reason += f"{pending_text(added)}: map {absorbed} joins {survivor}"
+        return LoopDecision(True, reason, (survivor, absorbed), (*loops, *added))
 
-    def _believe(self, loops: Sequence[Loop]) -> None:
-        told = {loop.pair for loop in loops}
-        self.waiting = [loop for loop in self.waiting if loop.pair not in told]
+    def _add_loops(self, loops: Sequence[Loop]) -> None:
+        accepted = {loop.keyframes for loop in loops}
+        self.pending = [loop for loop in self.pending if loop.keyframes not in accepted]
         for loop in loops:
-            self._chart.tie(loop)
+            self._graph.add_loop(loop)
 
-    def _wait(self, loop: Loop) -> None:
-        self.waiting = [*self.waiting, loop][-self._config.max_pending :]
+    def _add_pending(self, loop: Loop) -> None:
+        self.pending = [*self.pending, loop][-self._config.max_pending :]
 
 
 def _has_moved(before: F64, now: F64) -> bool:
-    return bool(np.abs(se3.log(se3.inverse(before) @ now)).max() > _MOVED)
+    return bool(np.abs(se3.log(se3.inverse(before) @ now)).max() > _MIN_MOVE)
 
 
-def taken_out(loops: Sequence[Loop]) -> str:
+def dropped_text(loops: Sequence[Loop]) -> str:
     """For a reason."""
-    named = ", ".join(map(str, loops[:_NAMED]))
-    return f"taken out: {named}" + (f" and {len(loops) - _NAMED} more" if len(loops) > _NAMED else "")
+    named = ", ".join(map(str, loops[:_MAX_NAMED]))
+    return f"taken out: {named}" + (f" and {len(loops) - _MAX_NAMED} more" if len(loops) > _MAX_NAMED else "")
 
 
-def that_waited(loops: Sequence[Loop]) -> str:
+def pending_text(loops: Sequence[Loop]) -> str:
     """For a reason."""
     return f", {len(loops)} that waited fit too" if loops else ""

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.types import F64, checked, checked_pose
+from share.types import F64, checked_array, checked_pose
 
 
-class Key(NamedTuple):
+class KeyframeKey(NamedTuple):
     """A keyframe: whose, and its number. `agent` names one run of an agent: ids begin anew with each."""
 
     agent: str
@@ -34,55 +34,55 @@ class Loop:
     """Body of keyframe b as seen from that of a: T_a_b (4, 4), cov (6, 6), and the inliers behind it.
 
     found: of the points that both views should then show, the share that they do
-    (`share.mapping.recognition.missing`); None where nobody has looked."""
+    (`share.mapping.recognition.missing_points`); None where nobody has looked."""
 
-    a: Key
-    b: Key
+    a: KeyframeKey
+    b: KeyframeKey
     T_a_b: F64
     cov: F64
     inliers: int
-    found: float | None = None
+    found_share: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
-        object.__setattr__(self, "cov", checked("cov", self.cov, (6, 6), np.float64))
+        object.__setattr__(self, "cov", checked_array("cov", self.cov, (6, 6), np.float64))
 
     @cached_property
-    def pair(self) -> frozenset[Key]:
+    def keyframes(self) -> frozenset[KeyframeKey]:
         """The two keyframes, whichever way round."""
         return frozenset((self.a, self.b))
 
     @cached_property
-    def apart(self) -> tuple[float, float]:
+    def view_offset(self) -> tuple[float, float]:
         """The two views, m and rad."""
-        return float(np.linalg.norm(self.T_a_b[:3, 3])), float(se3.angle(self.T_a_b))
+        return float(np.linalg.norm(self.T_a_b[:3, 3])), float(se3.rotation_angle(self.T_a_b))
 
     def reverse(self) -> Loop:
         """The same, from the other end; made once, for a loop that waits is asked for it again and again."""
-        return self._reversed
+        return self._cached_reverse
 
     @cached_property
-    def _reversed(self) -> Loop:
+    def _cached_reverse(self) -> Loop:
         T_b_a, cov = se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov)
-        return Loop(self.b, self.a, T_b_a, cov, self.inliers, self.found)
+        return Loop(self.b, self.a, T_b_a, cov, self.inliers, self.found_share)
 
     def __str__(self) -> str:
         return f"{self.a} - {self.b}"
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class RelativePose:
     """A relative pose T (..., 4, 4) and its covariance (..., 6, 6), or many of them."""
 
     T: F64
     cov: F64
 
-    def then(self, other: Known) -> Known:
-        return Known(self.T @ other.T, se3.compose_cov(other.T, self.cov, other.cov))
+    def compose(self, other: RelativePose) -> RelativePose:
+        return RelativePose(self.T @ other.T, se3.compose_cov(other.T, self.cov, other.cov))
 
-    def __iter__(self) -> Iterator[Known]:
+    def __iter__(self) -> Iterator[RelativePose]:
         """Each of many."""
-        return (Known(T, cov) for T, cov in zip(self.T, self.cov, strict=True))
+        return (RelativePose(T, cov) for T, cov in zip(self.T, self.cov, strict=True))
 
 
 @dataclass(frozen=True)
@@ -90,58 +90,60 @@ class Disagreement:
     """How far two statements about one relative pose lie apart."""
 
     chi2: float
-    metres: float
-    degrees: float
+    distance_m: float
+    angle_deg: float
 
     def __str__(self) -> str:
-        return f"{self.metres:.2f} m and {self.degrees:.1f}° apart, chi2 {self.chi2:.0f}"
+        return f"{self.distance_m:.2f} m and {self.angle_deg:.1f}° apart, chi2 {self.chi2:.0f}"
 
 
-def opposite(known: Known) -> Known:
+def inverse_pose(pose: RelativePose) -> RelativePose:
     """The same, from the other end."""
-    return Known(se3.inverse(known.T), se3.inverse_cov(known.T, known.cov))
+    return RelativePose(se3.inverse(pose.T), se3.inverse_cov(pose.T, pose.cov))
 
 
-def disagreement(first: Known, second: Known) -> Disagreement:
+def disagreement(first: RelativePose, second: RelativePose) -> Disagreement:
     """Of two independent estimates of the same pose."""
-    xi, chi2 = _apart(first, second)
+    xi, chi2 = _difference(first, second)
     metres, radians = np.linalg.norm(xi[3:]), np.linalg.norm(xi[:3])
     return Disagreement(float(chi2), float(metres), float(np.degrees(radians)))
 
 
-def witness_chi2(first: Loop, a1_a2: Known, second: Sequence[Loop], b2_b1: Known) -> F64:
+def pairwise_chi2(first: Loop, a1_a2: RelativePose, second: Sequence[Loop], b2_b1: RelativePose) -> F64:
     """By how much each of N loops disagrees with the first (N,), given the ways (N, ...) between their ends
     on either side."""
-    said = Known(np.array([loop.T_a_b for loop in second]), np.array([loop.cov for loop in second]))
-    return _apart(Known(first.T_a_b, first.cov), a1_a2.then(said).then(b2_b1))[1]
+    measured = RelativePose(
+        np.array([loop.T_a_b for loop in second]), np.array([loop.cov for loop in second])
+    )
+    return _difference(RelativePose(first.T_a_b, first.cov), a1_a2.compose(measured).compose(b2_b1))[1]
 
 
-def _apart(first: Known, second: Known) -> tuple[F64, F64]:
+def _difference(first: RelativePose, second: RelativePose) -> tuple[F64, F64]:
     """xi (..., 6) from the one to the other, and its squared Mahalanobis length (...)."""
     xi = se3.log(se3.inverse(first.T) @ second.T)
-    told = np.linalg.solve(first.cov + second.cov, xi[..., None])[..., 0]
-    return xi, np.asarray((xi * told).sum(-1))
+    weighted = np.linalg.solve(first.cov + second.cov, xi[..., None])[..., 0]
+    return xi, np.asarray((xi * weighted).sum(-1))
 
 
 # ---- How many places a set of poses is: neighbouring views of one spot are one witness, not many.
 
 
-def distinct(poses: F64, apart_m: float, apart_rad: float, enough: int | None = None) -> int:
+def count_distinct(poses: F64, distance_m: float, angle_rad: float, max_count: int | None = None) -> int:
     """Of poses (N, 4, 4), as many as lie further than this, or are turned by more, from each one that
-    was counted before it. With `enough` counting ends there."""
+    was counted before it. With `max_count` counting ends there."""
     count = 0
-    while len(poses) and count != enough:
+    while len(poses) and count != max_count:
         count += 1
-        poses = poses[~_near(poses[0], poses, apart_m, apart_rad)]
+        poses = poses[~_is_near(poses[0], poses, distance_m, angle_rad)]
     return count
 
 
-def near_any(T: F64, poses: Sequence[F64], within_m: float, within_rad: float) -> bool:
+def is_near_any(T: F64, poses: Sequence[F64], within_m: float, within_rad: float) -> bool:
     """Whether pose T (4, 4) lies as near as this to one of the others."""
-    return len(poses) > 0 and bool(_near(T, np.array(poses), within_m, within_rad).any())
+    return len(poses) > 0 and bool(_is_near(T, np.array(poses), within_m, within_rad).any())
 
 
-def _near(T: F64, poses: F64, within_m: float, within_rad: float) -> NDArray[np.bool_]:
+def _is_near(T: F64, poses: F64, within_m: float, within_rad: float) -> NDArray[np.bool_]:
     """Which of poses (N, 4, 4) lie as near as this to T (4, 4); T itself does, whatever was rounded."""
     shift = poses[:, :3, 3] - T[:3, 3]
     cosine = (poses[:, :3, :3].reshape(-1, 9) @ T[:3, :3].ravel() - 1) / 2

@@ -15,314 +15,338 @@ from dataclasses import replace
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.graph.covariance import Roads
-from share.mapping.graph.edges import Edge
-from share.mapping.graph.updates import Change
-from share.mapping.loops import Key, Known, Loop
-from share.mapping.segments import Trails
+from share.mapping.graph.covariance import CovariancePaths
+from share.mapping.graph.edges import PoseEdge
+from share.mapping.graph.updates import GraphUpdate
+from share.mapping.loops import KeyframeKey, Loop, RelativePose
+from share.mapping.segments import OdometrySegments
 from share.types import F64, Keyframe
 
 # ---- The edges of the pose graph by number, and what of it the solver does not know yet.
 
 
-class Ties:
+class GraphEdges:
     """Odometry and loops between numbered poses."""
 
     def __init__(self) -> None:
-        self.roads = Roads()
-        self.edges: dict[int, Edge] = {}
+        self.covariance_paths = CovariancePaths()
+        self.by_id: dict[int, PoseEdge] = {}
         self.loops: dict[int, Loop] = {}  # of those edges that are loops, oldest first
-        self._touching: dict[int, set[int]] = {}
-        self._next = 0
-        self.anew = True  # the solver knows nothing yet
-        self._fresh: set[int] = set()  # edges that the solver does not have
-        self._known: set[int] = set()  # poses that the solver has
-        self._moved: set[int] = set()  # poses that it has otherwise, or not at all
-        self._gone: set[int] = set()  # edges that it has, but should not
-        self._lost: set[int] = set()  # poses that it has, but should not
+        self._incident: dict[int, set[int]] = {}
+        self._next_id = 0
+        self.is_reset = True  # the solver knows nothing yet
+        self._pending_edges: set[int] = set()  # edges that the solver does not have
+        self._sent_nodes: set[int] = set()  # poses that the solver has
+        self._moved_nodes: set[int] = set()  # poses that it has otherwise, or not at all
+        self._removed_edges: set[int] = set()  # edges that it has, but should not
+        self._removed_nodes: set[int] = set()  # poses that it has, but should not
 
-    def add(self, edge: Edge, loop: Loop | None = None) -> int:
+    def add(self, edge: PoseEdge, loop: Loop | None = None) -> int:
         """The number of the new edge; with a loop, it may be false."""
-        number, self._next = self._next, self._next + 1
-        self.edges[number] = edge
-        self._fresh.add(number)
+        edge_id, self._next_id = self._next_id, self._next_id + 1
+        self.by_id[edge_id] = edge
+        self._pending_edges.add(edge_id)
         if loop is not None:
-            self.loops[number] = loop
+            self.loops[edge_id] = loop
         for end in (edge.a, edge.b):
-            self._touching.setdefault(end, set()).add(number)
-        self.roads.add(edge)
-        return number
+            self._incident.setdefault(end, set()).add(edge_id)
+        self.covariance_paths.add(edge)
+        return edge_id
 
-    def remove(self, number: int) -> None:
-        edge = self.edges.pop(number)
-        self.loops.pop(number, None)
+    def remove(self, edge_id: int) -> None:
+        edge = self.by_id.pop(edge_id)
+        self.loops.pop(edge_id, None)
         for end in (edge.a, edge.b):
-            self._touching[end].discard(number)
-        self.roads.remove(edge)
-        if number in self._fresh:
-            self._fresh.discard(number)
+            self._incident[end].discard(edge_id)
+        self.covariance_paths.remove(edge)
+        if edge_id in self._pending_edges:
+            self._pending_edges.discard(edge_id)
         else:
-            self._gone.add(number)
+            self._removed_edges.add(edge_id)
 
-    def touching(self, pose: int) -> list[int]:
+    def incident(self, node_id: int) -> list[int]:
         """Edges that end there, oldest first."""
-        return sorted(self._touching.get(pose, ()))
+        return sorted(self._incident.get(node_id, ()))
 
-    def moved(self, poses: Iterable[int]) -> None:
+    def mark_moved(self, node_ids: Iterable[int]) -> None:
         """These lie elsewhere than the solver would think."""
-        self._moved.update(poses)
+        self._moved_nodes.update(node_ids)
 
-    def forget(self, pose: int) -> None:
+    def remove_node(self, node_id: int) -> None:
         """A pose without edges goes."""
-        self._touching.pop(pose, None)
-        self._moved.discard(pose)
-        if pose in self._known:
-            self._known.discard(pose)
-            self._lost.add(pose)
+        self._incident.pop(node_id, None)
+        self._moved_nodes.discard(node_id)
+        if node_id in self._sent_nodes:
+            self._sent_nodes.discard(node_id)
+            self._removed_nodes.add(node_id)
 
-    def news(self, poses: Mapping[int, F64], plumb: Mapping[int, F64]) -> Change:
+    def take_update(self, poses: Mapping[int, F64], gravity_factors: Mapping[int, F64]) -> GraphUpdate:
         """All that the solver has not been told yet; it is taken as told. poses: of all numbers, as is
         plumb (`share.mapping.graph.edges`)."""
-        edges = [(n, self.edges[n], n in self.loops) for n in sorted(self._fresh)]
-        change = Change.of(
-            {number: poses[number] for number in sorted(self._moved)},
+        edges = [(n, self.by_id[n], n in self.loops) for n in sorted(self._pending_edges)]
+        update = GraphUpdate.from_edges(
+            {node_id: poses[node_id] for node_id in sorted(self._moved_nodes)},
             edges,
-            sorted(self._gone),
-            sorted(self._lost),
-            plumb,
+            sorted(self._removed_edges),
+            sorted(self._removed_nodes),
+            gravity_factors,
         )
-        self.anew = False
-        self._known |= self._moved
-        for done in (self._fresh, self._moved, self._gone, self._lost):
-            done.clear()
-        return change
+        self.is_reset = False
+        self._sent_nodes |= self._moved_nodes
+        for sent in (self._pending_edges, self._moved_nodes, self._removed_edges, self._removed_nodes):
+            sent.clear()
+        return update
 
-    def untold(self) -> None:
+    def reset(self) -> None:
         """The solver has lost everything."""
-        self.anew = True
-        self._fresh = set(self.edges)
-        self._moved |= self._known
-        for nothing in (self._known, self._gone, self._lost):
-            nothing.clear()
+        self.is_reset = True
+        self._pending_edges = set(self.by_id)
+        self._moved_nodes |= self._sent_nodes
+        for forgotten in (self._sent_nodes, self._removed_edges, self._removed_nodes):
+            forgotten.clear()
 
 
-def shortened(T: F64, log: float) -> F64:
+def rescale_translation(T: F64, log_scale: float) -> F64:
     """T (4, 4) whose way was too long by this."""
-    return se3.compose(T[:3, :3], T[:3, 3] * np.exp(-log)) if log else T
+    return se3.from_rt(T[:3, :3], T[:3, 3] * np.exp(-log_scale)) if log_scale else T
 
 
-class Chart:
+class MapGraph:
     """poses: T_map_body (4, 4) of every node, by its number. plumb: which way is up there, if it is known
     (`share.mapping.graph.edges`). founder: of the map of each stretch. parted: stretches that were left in
     another map when loops were taken back, since somebody last asked. scale: log of what each agent's
     odometry is shortened by; width: by what its variances are multiplied; nothing where it is not there."""
 
     def __init__(self) -> None:
-        self.trails = Trails()
-        self.ties = Ties()
+        self.odometry = OdometrySegments()
+        self.edges = GraphEdges()
         self.poses: dict[int, F64] = {}
-        self.plumb: dict[int, F64] = {}
-        self.founder: list[int] = []
-        self.parted: set[int] = set()
-        self.bonds: Counter[tuple[int, int]] = Counter()  # loops by the two stretches that they tie
-        self.scale: dict[str, float] = {}
-        self.width: dict[str, float] = {}
-        self.unsolved: dict[int, None] = {}  # founders of maps with news, the oldest first
+        self.gravity_factors: dict[int, F64] = {}
+        self.reference_segments: list[int] = []
+        self.split_segments: set[int] = set()
+        self.loop_counts: Counter[tuple[int, int]] = Counter()  # loops by the two stretches that they tie
+        self.log_scales: dict[str, float] = {}
+        self.covariance_scales: dict[str, float] = {}
+        self.unsolved_maps: dict[int, None] = {}  # founders of maps with news, the oldest first
 
-    def add(self, agent: str, keyframe: Keyframe, cov: F64, plumb: F64, rank: int = 0) -> int:
+    def add_keyframe(
+        self, agent: str, keyframe: Keyframe, cov: F64, gravity_factor: F64, rank: int = 0
+    ) -> int:
         """The number of the new node. cov (6, 6): of its step from the one before, as it is believed; so is
         plumb (3,). rank: of a stretch that it begins."""
-        number = self.trails.add(agent, keyframe, rank)
-        self.place(number, keyframe.T_ref_body, cov, plumb)
-        return number
+        node_id = self.odometry.add_keyframe(agent, keyframe, rank)
+        self.add_node(node_id, keyframe.T_ref_body, cov, gravity_factor)
+        return node_id
 
-    def place(self, number: int, T_ref_body: F64, cov: F64, plumb: F64) -> None:
+    def add_node(self, node_id: int, T_ref_body: F64, cov: F64, gravity_factor: F64) -> None:
         """Give a new node its pose, by odometry as its agent told it, and tie it to the one before it, if
         there is one."""
-        node, before = self.trails.nodes[number], self.trails.before(number)
-        agent = self.trails.stretches[node.stretch].agent
-        T_ref_body = shortened(T_ref_body, self.scale.get(agent, 0.0))
-        self.founder += range(len(self.founder), len(self.trails.stretches))
-        if before is None:
-            self.poses[number] = node.T_odom_body
+        node, previous = self.odometry.nodes[node_id], self.odometry.previous_node(node_id)
+        agent = self.odometry.segments[node.segment].agent
+        T_ref_body = rescale_translation(T_ref_body, self.log_scales.get(agent, 0.0))
+        self.reference_segments += range(len(self.reference_segments), len(self.odometry.segments))
+        if previous is None:
+            self.poses[node_id] = node.T_odom_body
         else:
-            self.ties.add(Edge(before, number, T_ref_body, cov * self.width.get(agent, 1.0)))
-            self.poses[number] = se3.orthonormal(self.poses[before] @ T_ref_body)
-        if plumb.any():
-            self.plumb[number] = plumb
-        self.ties.moved([number])
+            self.edges.add(
+                PoseEdge(previous, node_id, T_ref_body, cov * self.covariance_scales.get(agent, 1.0))
+            )
+            self.poses[node_id] = se3.orthonormal(self.poses[previous] @ T_ref_body)
+        if gravity_factor.any():
+            self.gravity_factors[node_id] = gravity_factor
+        self.edges.mark_moved([node_id])
 
-    def forget(self, number: int) -> None:
+    def remove_node(self, node_id: int) -> None:
         """A node without edges goes."""
-        self.ties.forget(number)
-        self.trails.take_out(number)
-        del self.poses[number]
-        self.plumb.pop(number, None)
+        self.edges.remove_node(node_id)
+        self.odometry.remove_node(node_id)
+        del self.poses[node_id]
+        self.gravity_factors.pop(node_id, None)
 
     # ------------------------------------------------------------ changes
 
-    def tie(self, loop: Loop) -> None:
+    def add_loop(self, loop: Loop) -> None:
         """Two maps that it ties are one from now on."""
-        a, b = self.ends(loop)
-        self.bind(Edge(a, b, loop.T_a_b, loop.cov), loop)
-        if not self.same_map(a, b):
-            self.find_maps()
-        self.unsolved = dict.fromkeys([*(self.founder[f] for f in self.unsolved), self.founder_of(loop.a)])
+        a, b = self.loop_nodes(loop)
+        self.add_loop_edge(PoseEdge(a, b, loop.T_a_b, loop.cov), loop)
+        if not self.is_same_map(a, b):
+            self.update_maps()
+        self.unsolved_maps = dict.fromkeys(
+            [*(self.reference_segments[f] for f in self.unsolved_maps), self.reference_segment(loop.a)]
+        )
 
-    def bind(self, edge: Edge, loop: Loop) -> None:
-        """A loop as an edge; if it ties what no other does, `find_maps` is due."""
-        self.ties.add(edge, loop)
-        self.bonds[self.bond(edge)] += 1
+    def add_loop_edge(self, edge: PoseEdge, loop: Loop) -> None:
+        """A loop as an edge; if it ties what no other does, `update_maps` is due."""
+        self.edges.add(edge, loop)
+        self.loop_counts[self.segment_pair(edge)] += 1
 
-    def unbind(self, number: int) -> None:
-        """Take a loop's edge out; if it was the last of its bond, `find_maps` is due."""
-        bond = self.bond(self.ties.edges[number])
-        self.bonds[bond] -= 1
-        if not self.bonds[bond]:
-            del self.bonds[bond]
-        self.ties.remove(number)
+    def remove_loop_edge(self, edge_id: int) -> None:
+        """Take a loop's edge out; if it was the last of its bond, `update_maps` is due."""
+        pair = self.segment_pair(self.edges.by_id[edge_id])
+        self.loop_counts[pair] -= 1
+        if not self.loop_counts[pair]:
+            del self.loop_counts[pair]
+        self.edges.remove(edge_id)
 
-    def drop(self, numbers: Sequence[int]) -> tuple[Loop, ...]:
+    def drop_loops(self, edge_ids: Sequence[int]) -> tuple[Loop, ...]:
         """Take loops, by their edges' numbers, back, and the joins that hung on them."""
-        dropped = tuple(self.ties.loops[n] for n in numbers)
-        touched = {self.founder_of(key) for loop in dropped for key in (loop.a, loop.b)}
-        stretches = [s for founder in touched for s in self.stretches_of(founder)]
-        for number in numbers:
-            self.unbind(number)
-        before = self.founder
-        self.find_maps()
-        self.parted |= {s for s in stretches if self.founder[s] != before[s]}
-        for founder in sorted({self.founder[s] for s in stretches}):
-            anchor = self.anchor(founder)
-            self.move(founder, self.trails.nodes[anchor].T_odom_body @ se3.inverse(self.poses[anchor]))
-            self.unsolved[founder] = None
+        dropped = tuple(self.edges.loops[n] for n in edge_ids)
+        touched_maps = {self.reference_segment(key) for loop in dropped for key in (loop.a, loop.b)}
+        segments = [s for reference_segment in touched_maps for s in self.map_segments(reference_segment)]
+        for edge_id in edge_ids:
+            self.remove_loop_edge(edge_id)
+        before = self.reference_segments
+        self.update_maps()
+        self.split_segments |= {s for s in segments if self.reference_segments[s] != before[s]}
+        for reference_segment in sorted({self.reference_segments[s] for s in segments}):
+            anchor = self.anchor(reference_segment)
+            self.move_map(
+                reference_segment, self.odometry.nodes[anchor].T_odom_body @ se3.inverse(self.poses[anchor])
+            )
+            self.unsolved_maps[reference_segment] = None
         return dropped
 
-    def lay_beside(self, loop: Loop) -> None:
+    def align_maps(self, loop: Loop) -> None:
         """Of the two maps that it would tie, move that of the lesser founder rigidly to where it says."""
-        if self.rank(self.founder_of(loop.a)) > self.rank(self.founder_of(loop.b)):
+        if self.rank(self.reference_segment(loop.a)) > self.rank(self.reference_segment(loop.b)):
             loop = loop.reverse()
-        a, b = self.ends(loop)
-        self.move(self.founder_of(loop.b), self.poses[a] @ loop.T_a_b @ se3.inverse(self.poses[b]))
+        a, b = self.loop_nodes(loop)
+        self.move_map(self.reference_segment(loop.b), self.poses[a] @ loop.T_a_b @ se3.inverse(self.poses[b]))
 
-    def move(self, founder: int, T: F64) -> None:
+    def move_map(self, reference_segment: int, T: F64) -> None:
         """The whole map, rigidly, by T (4, 4) from the left."""
-        numbers = self.nodes_of(founder)
-        moved = se3.orthonormal(T @ np.array([self.poses[n] for n in numbers]))
-        self.poses.update(zip(numbers, moved, strict=True))
-        self.ties.moved(numbers)
+        node_ids = self.map_nodes(reference_segment)
+        moved = se3.orthonormal(T @ np.array([self.poses[n] for n in node_ids]))
+        self.poses.update(zip(node_ids, moved, strict=True))
+        self.edges.mark_moved(node_ids)
 
-    def rescale(self, agent: str, log: float, width: float) -> None:
+    def rescale_odometry(self, agent: str, log_scale: float, covariance_scale: float) -> None:
         """All odometry of this agent is to be shortened by log, and its variances multiplied by width; its
         maps are due."""
-        by, wider = log - self.scale.get(agent, 0.0), width / self.width.get(agent, 1.0)
-        self.scale[agent], self.width[agent] = log, width
-        for number, stretch in enumerate(self.trails.stretches):
-            if stretch.agent != agent or not stretch.nodes:
+        log_change, covariance_ratio = (
+            log_scale - self.log_scales.get(agent, 0.0),
+            covariance_scale / self.covariance_scales.get(agent, 1.0),
+        )
+        self.log_scales[agent], self.covariance_scales[agent] = log_scale, covariance_scale
+        for segment_index, segment in enumerate(self.odometry.segments):
+            if segment.agent != agent or not segment.nodes:
                 continue
-            for before, after in itertools.pairwise(stretch.nodes):
-                old, edge = self._step(before, after)
-                self.ties.remove(old)
-                self.ties.add(replace(edge, T_a_b=shortened(edge.T_a_b, by), cov=wider * edge.cov))
-            self.unsolved.setdefault(self.founder[number])
+            for before, after in itertools.pairwise(segment.nodes):
+                edge_id, edge = self._find_odometry_edge(before, after)
+                self.edges.remove(edge_id)
+                self.edges.add(
+                    replace(
+                        edge,
+                        T_a_b=rescale_translation(edge.T_a_b, log_change),
+                        cov=covariance_ratio * edge.cov,
+                    )
+                )
+            self.unsolved_maps.setdefault(self.reference_segments[segment_index])
 
-    def follow(self, numbers: Iterable[int]) -> None:
+    def propagate(self, node_ids: Iterable[int]) -> None:
         """These go where odometry takes them from the ones before them."""
-        for number in numbers:
-            before = self.trails.before(number)
-            if before is not None:
-                T = self.poses[before] @ self.step(before, number).T_a_b
-                self.poses[number] = se3.orthonormal(T)
+        for node_id in node_ids:
+            previous = self.odometry.previous_node(node_id)
+            if previous is not None:
+                T = self.poses[previous] @ self.odometry_edge(previous, node_id).T_a_b
+                self.poses[node_id] = se3.orthonormal(T)
 
     # ------------------------------------------------------------ looking things up
 
-    def ends(self, loop: Loop) -> tuple[int, int]:
+    def loop_nodes(self, loop: Loop) -> tuple[int, int]:
         """The nodes of its keyframes. Raises ValueError if one is unknown."""
-        return self.trails.number(loop.a), self.trails.number(loop.b)
+        return self.odometry.node_id(loop.a), self.odometry.node_id(loop.b)
 
-    def step(self, before: int, number: int) -> Edge:
+    def odometry_edge(self, previous: int, node_id: int) -> PoseEdge:
         """The odometry edge from a node to the next of its stretch."""
-        _, edge = self._step(before, number)
-        return edge if edge.a == before else edge.reverse()
+        _, edge = self._find_odometry_edge(previous, node_id)
+        return edge if edge.a == previous else edge.reverse()
 
-    def _step(self, before: int, number: int) -> tuple[int, Edge]:
-        for n in self.ties.touching(number):
-            edge = self.ties.edges[n]
-            if n not in self.ties.loops and before in (edge.a, edge.b):
-                return n, edge
-        raise ValueError(f"odometry does not lead from node {before} to {number}")
+    def _find_odometry_edge(self, previous: int, node_id: int) -> tuple[int, PoseEdge]:
+        for edge_id in self.edges.incident(node_id):
+            edge = self.edges.by_id[edge_id]
+            if edge_id not in self.edges.loops and previous in (edge.a, edge.b):
+                return edge_id, edge
+        raise ValueError(f"odometry does not lead from node {previous} to {node_id}")
 
-    def stretch_of(self, key: Key) -> int:
-        return self.trails.nodes[self.trails.number(key)].stretch
+    def segment(self, key: KeyframeKey) -> int:
+        return self.odometry.nodes[self.odometry.node_id(key)].segment
 
-    def founder_of(self, key: Key) -> int:
-        return self.founder[self.stretch_of(key)]
+    def reference_segment(self, key: KeyframeKey) -> int:
+        return self.reference_segments[self.segment(key)]
 
-    def same_map(self, a: int, b: int) -> bool:
-        stretch_a, stretch_b = self.trails.nodes[a].stretch, self.trails.nodes[b].stretch
-        return self.founder[stretch_a] == self.founder[stretch_b]
+    def is_same_map(self, a: int, b: int) -> bool:
+        segment_a, segment_b = self.odometry.nodes[a].segment, self.odometry.nodes[b].segment
+        return self.reference_segments[segment_a] == self.reference_segments[segment_b]
 
-    def name(self, stretch: int) -> str:
+    def map_id(self, segment: int) -> str:
         """Of the map that this stretch is in."""
-        lost = stretch >= len(
-            self.founder
+        lost = segment >= len(
+            self.reference_segments
         )  # of a damaged file that has none of its keyframes, nor later ones
-        return self.trails.stretches[stretch if lost else self.founder[stretch]].name
+        return self.odometry.segments[segment if lost else self.reference_segments[segment]].name
 
-    def named(self, map_id: str) -> int:
+    def find_map(self, map_id: str) -> int:
         """The founder of a map. Raises ValueError if there is none of that name."""
-        for founder in {self.founder[stretch] for stretch in self.trails.live}:
-            if self.trails.stretches[founder].name == map_id:
-                return founder
+        for reference_segment in {
+            self.reference_segments[segment] for segment in self.odometry.live_segments
+        }:
+            if self.odometry.segments[reference_segment].name == map_id:
+                return reference_segment
         raise ValueError(f"there is no map {map_id}")
 
-    def rank(self, stretch: int) -> tuple[int, int]:
+    def rank(self, segment: int) -> tuple[int, int]:
         """Of the stretches of a map, the least founds it."""
-        return self.trails.stretches[stretch].rank, stretch
+        return self.odometry.segments[segment].rank, segment
 
-    def stretches_of(self, founder: int) -> list[int]:
+    def map_segments(self, reference_segment: int) -> list[int]:
         """Those of a map that have keyframes, its founder first, if that has any."""
-        return sorted((s for s in self.trails.live if self.founder[s] == founder), key=self.rank)
+        return sorted(
+            (s for s in self.odometry.live_segments if self.reference_segments[s] == reference_segment),
+            key=self.rank,
+        )
 
-    def nodes_of(self, founder: int) -> list[int]:
-        return [n for s in self.stretches_of(founder) for n in self.trails.stretches[s].nodes]
+    def map_nodes(self, reference_segment: int) -> list[int]:
+        return [n for s in self.map_segments(reference_segment) for n in self.odometry.segments[s].nodes]
 
-    def anchor(self, founder: int) -> int:
+    def anchor(self, reference_segment: int) -> int:
         """The keyframe that holds the gauge of a map."""
-        return self.trails.stretches[founder].nodes[0]
+        return self.odometry.segments[reference_segment].nodes[0]
 
-    def placement(self, number: int) -> F64:
+    def T_map_odom(self, node_id: int) -> F64:
         """T_map_odom (4, 4) as this node has it."""
-        T_odom_body = self.trails.nodes[number].T_odom_body
-        return se3.orthonormal(self.poses[number] @ se3.inverse(T_odom_body))
+        T_odom_body = self.odometry.nodes[node_id].T_odom_body
+        return se3.orthonormal(self.poses[node_id] @ se3.inverse(T_odom_body))
 
-    def lie(self, a: int, b: int) -> F64:
+    def relative_pose(self, a: int, b: int) -> F64:
         """T_a_b (4, 4) of two nodes of a map."""
         return se3.inverse(self.poses[a]) @ self.poses[b]
 
-    def between(self, a: int, goals: Sequence[int]) -> Known:
+    def relative_estimates(self, a: int, goals: Sequence[int]) -> RelativePose:
         """Poses (N, 4, 4) of the goals in node a of the same map, as the map has them now."""
-        covs = self.ties.roads.known_from(a, goals, self.poses)
+        covs = self.edges.covariance_paths.covariances_from(a, goals, self.poses)
         for goal, cov in zip(goals, covs, strict=True):
             if cov is None:
                 raise ValueError(f"nodes {a} and {goal} are not in one map")
-        return Known(se3.inverse(self.poses[a]) @ np.array([self.poses[n] for n in goals]), np.array(covs))
+        return RelativePose(
+            se3.inverse(self.poses[a]) @ np.array([self.poses[n] for n in goals]), np.array(covs)
+        )
 
-    def bond(self, edge: Edge) -> tuple[int, int]:
+    def segment_pair(self, edge: PoseEdge) -> tuple[int, int]:
         """The stretches at its ends, the older first."""
-        a, b = (self.trails.nodes[end].stretch for end in (edge.a, edge.b))
+        a, b = (self.odometry.nodes[end].segment for end in (edge.a, edge.b))
         return (a, b) if a < b else (b, a)
 
-    def find_maps(self) -> None:
+    def update_maps(self) -> None:
         """Every stretch's founder, from the loops: the connected parts."""
-        root = list(range(len(self.founder)))
+        root = list(range(len(self.reference_segments)))
 
         def find(i: int) -> int:
             while root[i] != i:
                 i = root[i]
             return i
 
-        for pair in self.bonds:
+        for pair in self.loop_counts:
             low, high = sorted(map(find, pair), key=self.rank)
             root[high] = low
-        self.founder = [find(i) for i in range(len(root))]
+        self.reference_segments = [find(i) for i in range(len(root))]

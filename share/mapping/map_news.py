@@ -4,28 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from share.mapping.atlas import Placed
-from share.mapping.changes import Change, KeepLink, KeepLoop, KeptKeyframe, Retire, edge_to
-from share.mapping.culling import Link, TakenOut
-from share.mapping.loops import Key
+from share.mapping.atlas import RestoredKeyframe
+from share.mapping.culling import OdometryLink, RemovedKeyframe
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import (
+    MapChange,
+    RemoveKeyframes,
+    SaveLink,
+    SaveLoop,
+    StoredKeyframe,
+    odometry_link,
+)
 
 
-def placed_again(found: KeptKeyframe, links: Mapping[Key, KeepLink]) -> Placed:
-    edge, as_sent = edge_to(found, links), found.at not in links
-    own = found.keyframe
-    return Placed(found.at, found.stretch, found.ordinal, own, edge.T_ref_body, edge.cov, as_sent)
+def restored_keyframe(stored: StoredKeyframe, links: Mapping[KeyframeKey, SaveLink]) -> RestoredKeyframe:
+    edge, as_sent = odometry_link(stored, links), stored.keyframe_key not in links
+    sent = stored.keyframe
+    return RestoredKeyframe(
+        stored.keyframe_key, stored.segment_name, stored.ordinal, sent, edge.T_ref_body, edge.cov, as_sent
+    )
 
 
-def kept_link(link: Link) -> KeepLink:
+def stored_link(link: OdometryLink) -> SaveLink:
     reference = -1 if link.reference is None else link.reference.id
-    return KeepLink(link.key, reference, link.T_ref_body, link.cov)
+    return SaveLink(link.key, reference, link.T_ref_body, link.cov)
 
 
-def changes_of(taken: Iterable[TakenOut]) -> list[Change]:
+def removal_changes(removed: Iterable[RemovedKeyframe]) -> list[MapChange]:
     """In the order in which they happened: a link may lead to one that goes next."""
-    changes: list[Change] = []
-    for out in taken:
-        if out.link is not None:
-            changes.append(kept_link(out.link))
-        changes += [Retire((out.key,)), *(KeepLoop(loop) for loop in out.moved)]
+    changes: list[MapChange] = []
+    for keyframe in removed:
+        if keyframe.link is not None:
+            changes.append(stored_link(keyframe.link))
+        changes += [RemoveKeyframes((keyframe.key,)), *(SaveLoop(loop) for loop in keyframe.moved_loops)]
     return changes

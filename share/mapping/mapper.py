@@ -12,37 +12,37 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from share.config import Config
-from share.errors import describe
-from share.mapping.agents.quarantine import Parted
-from share.mapping.atlas import Applied, Atlas
-from share.mapping.candidates import Effort, Lookups, Search, form_of, served_as
-from share.mapping.changes import Change, DropLoop, KeepLoop, KeepPoses, Kept, KeptKeyframe
-from share.mapping.corrections import Concern
-from share.mapping.graph.updates import Solution
-from share.mapping.loop_acceptance import Decision
-from share.mapping.loops import Key, Loop
-from share.mapping.map_news import changes_of, kept_link, placed_again
+from share.errors import describe_exception
+from share.mapping.agents.quarantine import QuarantineChange
+from share.mapping.atlas import AppliedSolution, Atlas
+from share.mapping.corrections import CorrectionFilter
+from share.mapping.graph.updates import GraphSolution
+from share.mapping.loop_acceptance import LoopDecision
+from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.map_changes import MapChange, RemoveLoops, SaveLoop, SavePoses, StoredKeyframe, StoredMap
+from share.mapping.map_news import removal_changes, restored_keyframe, stored_link
+from share.mapping.query_queue import CandidateSearch, QueryQueue, SearchBudget, qoe_form, service_kind
 from share.mapping.recognition.index import PlaceIndex
-from share.mapping.recognition.verification import Refusal, Sight, Verified
-from share.mapping.steps import Finding, Look, Query, Solve, Step, Verify, in_map
+from share.mapping.recognition.verification import CameraView, Refusal, Verification
+from share.mapping.steps import LookupStep, MapEvent, QueryStep, SolveStep, Step, VerifyStep, map_assignment
 from share.metrics.frame_log import summary
-from share.scheduling.gate import Gating
+from share.scheduling.merge_gate import MergeGate
 from share.types import AgentKind, Keyframe
 from share.wire.messages import Hello
 
-_TIMES = 5000  # of each kind of step that a report is about: the newest
-_SLACK = 1.05  # so much above the bound before it is asked which keyframes may go
-_AT_ONCE = 2
-_LOOK_AGAIN = 4
+_MAX_STEP_TIMES = 5000  # of each kind of step that a report is about: the newest
+_CULL_MARGIN = 1.05  # so much above the bound before it is asked which keyframes may go
+_REMOVED_PER_KEYFRAME = 2
+_RETRY_INTERVAL = 4
 
 
 @dataclass
-class _Account:
+class _RunCounters:
     """Of one agent."""
 
     loops_tried: int = 0
     merges: Counter[str] = field(default_factory=Counter)  # requested, skipped, done
-    newest: int = -1  # keyframe that came
+    newest_id: int = -1  # keyframe that came
 
 
 class Mapper:
@@ -53,348 +53,372 @@ class Mapper:
         self._config = config
         self._index = PlaceIndex(place.index_seed, place.tables, place.hash_bits)
         self._hellos: dict[str, Hello] = {}
-        self._sights: dict[int, Sight] = {}  # by the number of a keyframe in atlas and index
-        self._atlas = Atlas(config.merge, self._sights)
-        self._unseen: list[tuple[int, KeptKeyframe]] = []  # restored
-        self._lookups = Lookups(config.edge)
-        self._gating = Gating(config.control, config.edge.policy)
-        self._concern = Concern()
-        self._untold: set[tuple[str, str]] = set()  # who has been said to wait to hear of which map
-        self._effort = Effort.of(config)
-        self._search: Search | None = None
-        self._query: Query | None = None  # that the search is about
-        self._looking = self._solving = False
-        self._leaving: list[int] = []  # keyframes that go next
-        self._crowded = 0.0  # so many before it is asked again which may go
-        self._changes: list[Change] = []
-        self._accounts: dict[str, _Account] = {}
-        self._closed = _Account()  # of runs that are forgotten
-        self._emptied: list[Key] = []
-        self._ms = {kind: deque[float](maxlen=_TIMES) for kind in ("place", "verify", "solve")}
+        self._camera_views: dict[int, CameraView] = {}  # by the number of a keyframe in atlas and index
+        self._atlas = Atlas(config.merge, self._camera_views)
+        self._unindexed: list[tuple[int, StoredKeyframe]] = []  # restored
+        self._queries = QueryQueue(config.edge)
+        self._merge_gate = MergeGate(config.control, config.edge.policy)
+        self._correction_filter = CorrectionFilter()
+        self._reported_waits: set[tuple[str, str]] = set()  # who has been said to wait to hear of which map
+        self._search_budget = SearchBudget.from_config(config)
+        self._search: CandidateSearch | None = None
+        self._query: QueryStep | None = None  # that the search is about
+        self._is_looking_up = self._is_solving = False
+        self._to_remove: list[int] = []  # keyframes that go next
+        self._cull_threshold = 0.0  # so many before it is asked again which may go
+        self._changes: list[MapChange] = []
+        self._counters: dict[str, _RunCounters] = {}
+        self._removed_runs_counters = _RunCounters()  # of runs that are forgotten
+        self._empty_runs: list[KeyframeKey] = []
+        self._step_ms = {kind: deque[float](maxlen=_MAX_STEP_TIMES) for kind in ("place", "verify", "solve")}
         self._counts: Counter[str] = Counter()
 
-    def join(self, agent: str, hello: Hello, voice: str | None = "") -> None:
+    def add_run(self, agent: str, hello: Hello, credential: str | None = "") -> None:
         """A run of an agent, before its first keyframe. voice: see `KeepRun`."""
         self._hellos[agent] = hello
-        self._accounts[agent] = _Account()
-        self._atlas.enter(agent, hello.name, voice)
+        self._counters[agent] = _RunCounters()
+        self._atlas.add_run(agent, hello.name, credential)
 
-    def speaks(self, agent: str, voice: str) -> None:
+    def set_credential(self, agent: str, credential: str) -> None:
         """See `Speaks`."""
-        self._atlas.enter(agent, self.name(agent), voice)
+        self._atlas.add_run(agent, self.agent_name(agent), credential)
 
-    def name(self, agent: str) -> str:
+    def agent_name(self, agent: str) -> str:
         """Of the agent whose run it is."""
         return self._hellos[agent].name if agent in self._hellos else agent
 
-    def present(self, agent: str, here: bool) -> None:
+    def set_present(self, agent: str, is_present: bool) -> None:
         """Nobody waits for a run that is not heard."""
-        self._atlas.present(agent, here)
+        self._atlas.set_present(agent, is_present)
 
-    def forget(self, agent: str) -> None:
+    def remove_run(self, agent: str) -> None:
         """A run of which nothing is left, and that will not come back."""
-        self._atlas.forget(agent)
-        self._lookups.forget(agent)
-        self._concern.forget(agent)
-        self._untold = {(run, map_id) for run, map_id in self._untold if run != agent}
+        self._atlas.remove_run(agent)
+        self._queries.remove_agent(agent)
+        self._correction_filter.remove_agent(agent)
+        self._reported_waits = {(run, map_id) for run, map_id in self._reported_waits if run != agent}
         del self._hellos[agent]
-        closed = self._accounts.pop(agent)
-        self._closed.loops_tried += closed.loops_tried
-        self._closed.merges += closed.merges
+        counters = self._counters.pop(agent)
+        self._removed_runs_counters.loops_tried += counters.loops_tried
+        self._removed_runs_counters.merges += counters.merges
 
-    def add(self, agent: str, keyframe: Keyframe, is_extra: bool = False) -> list[Finding]:
+    def add_keyframe(self, agent: str, keyframe: Keyframe, is_extra: bool = False) -> list[MapEvent]:
         """A keyframe, in order, each once. is_extra: see `Add`."""
-        self._accounts[agent].newest = keyframe.id
-        keyframe, link = self._atlas.tied(agent, keyframe)
-        self._changes += [] if link is None else [kept_link(link)]
-        number = self._atlas.add_keyframe(agent, keyframe, rank=self._rank(agent))
-        self._see(number, agent, keyframe)
-        self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number, is_extra)
-        founds = keyframe.reference < 0 or (link is not None and link.reference is None)
-        findings = [self._founding(agent, keyframe)] if founds else []
-        self._thin()
-        return findings
+        self._counters[agent].newest_id = keyframe.id
+        keyframe, link = self._atlas.reconnect(agent, keyframe)
+        self._changes += [] if link is None else [stored_link(link)]
+        node_id = self._atlas.add_keyframe(agent, keyframe, rank=self._map_rank(agent))
+        self._index_keyframe(node_id, agent, keyframe)
+        self._queries.add(agent, service_kind(self._config, self._hellos[agent]), node_id, is_extra)
+        begins_map = keyframe.reference < 0 or (link is not None and link.reference is None)
+        events = [self._new_map_event(agent, keyframe)] if begins_map else []
+        self._cull_keyframes()
+        return events
 
-    def restore(self, kept: Kept) -> None:
+    def restore(self, kept: StoredMap) -> None:
         """What an earlier life of the edge knew, before anything else comes. Maps keep their founders, also
         before headsets that come now. The views are gone through when one is first looked up."""
         for run in kept.runs:
-            self.join(run.key, run.hello, run.voice)
-            self.present(run.key, False)
+            self.add_run(run.run_key, run.hello, run.credential)
+            self.set_present(run.run_key, False)
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
-        founders = set[str]() if kept.poses is None else set(kept.poses.maps)
-        agents = [name.rpartition("/")[0] for name in kept.stretches]
-        ranks = [self._rank(a, name in founders) for a, name in zip(agents, kept.stretches, strict=True)]
-        stretches = list(zip(agents, ranks, strict=True))
-        placed = [placed_again(found, kept.links) for found in kept.keyframes]
-        numbers = self._atlas.restore(stretches, placed, kept.loops, poses)
-        self._unseen = list(zip(numbers, kept.keyframes, strict=True))
-        for found in kept.keyframes:
-            account = self._accounts.get(found.key)  # a damaged file may have lost its run
+        reference_segments = set[str]() if kept.poses is None else set(kept.poses.map_ids)
+        agents = [name.rpartition("/")[0] for name in kept.segments]
+        ranks = [
+            self._map_rank(a, name in reference_segments)
+            for a, name in zip(agents, kept.segments, strict=True)
+        ]
+        segments = list(zip(agents, ranks, strict=True))
+        restored = [restored_keyframe(stored, kept.links) for stored in kept.keyframes]
+        node_ids = self._atlas.restore(segments, restored, kept.loops, poses)
+        self._unindexed = list(zip(node_ids, kept.keyframes, strict=True))
+        for stored in kept.keyframes:
+            account = self._counters.get(stored.run_key)  # a damaged file may have lost its run
             if account is not None:
-                account.newest = max(account.newest, found.keyframe.id)
+                account.newest_id = max(account.newest_id, stored.keyframe.id)
 
-    def _see_restored(self) -> None:
-        for number, found in self._unseen:
-            self._see(number, found.key, found.keyframe)
-        self._unseen = []
+    def _index_restored(self) -> None:
+        for node_id, stored in self._unindexed:
+            self._index_keyframe(node_id, stored.run_key, stored.keyframe)
+        self._unindexed = []
 
-    def _see(self, number: int, agent: str, keyframe: Keyframe) -> None:
+    def _index_keyframe(self, node_id: int, agent: str, keyframe: Keyframe) -> None:
         hello = self._hellos[agent]
-        self._sights[number] = Sight(keyframe.view, hello.rig.cam0.focal, hello.rig.T_body_cam0, keyframe.up)
-        self._index.add(number, keyframe.view.descriptors)
+        self._camera_views[node_id] = CameraView(
+            keyframe.view, hello.rig.cam0.focal, hello.rig.T_body_cam0, keyframe.up
+        )
+        self._index.add(node_id, keyframe.view.descriptors)
 
-    def _rank(self, agent: str, founded: bool = False) -> int:
+    def _map_rank(self, agent: str, is_reference: bool = False) -> int:
         """Who wears a headset sees a map move, so it is the others' maps that come to his; all come to one
         that an earlier life had."""
         hello = self._hellos.get(agent)  # a damaged file may have lost it
-        wears = hello is not None and form_of(self._config, hello) is AgentKind.AR
-        return (0 if wears else 1) + (0 if founded else 2)
+        is_headset = hello is not None and qoe_form(self._config, hello) is AgentKind.AR
+        return (0 if is_headset else 1) + (0 if is_reference else 2)
 
-    def _founding(self, agent: str, keyframe: Keyframe) -> Finding:
-        T, map_id = self._atlas.T_map_odom(agent), self._atlas.current_map(agent)
+    def _new_map_event(self, agent: str, keyframe: Keyframe) -> MapEvent:
+        T, map_id = self._atlas.T_map_odom(agent), self._atlas.current_map_id(agent)
         assert T is not None and map_id is not None
-        return in_map(agent, map_id, T, keyframe.id)
+        return map_assignment(agent, map_id, T, keyframe.id)
 
     # ------------------------------------------------------------------ what to work on
 
-    def next_look(self) -> Look | None:
+    def next_lookup(self) -> LookupStep | None:
         """The next step of looking a keyframe up; None if there is none, or one is under way."""
-        if self._looking:
+        if self._is_looking_up:
             return None
-        self._see_restored()
-        step: Look | None = self._next_verify()
-        while step is None and (number := self._next_number()) is not None:
-            if number in self._sights:
-                step = self._ask(number)
-        self._looking = step is not None
+        self._index_restored()
+        step: LookupStep | None = self._next_verify()
+        while step is None and (node_id := self._next_query_id()) is not None:
+            if node_id in self._camera_views:
+                step = self._make_query(node_id)
+        self._is_looking_up = step is not None
         return step
 
-    def _next_number(self) -> int | None:
+    def _next_query_id(self) -> int | None:
         """One that was passed over is looked up only where it may join maps: it is late for an answer."""
-        number = self._lookups.next()
-        return self._lookups.next_late() if number is None and len(self._atlas.sizes()) > 1 else number
+        node_id = self._queries.next_query()
+        return (
+            self._queries.next_skipped() if node_id is None and len(self._atlas.map_sizes()) > 1 else node_id
+        )
 
-    def next_solve(self) -> Solve | None:
+    def next_solve(self) -> SolveStep | None:
         """The next map to be solved; None if there is none, or one is under way."""
-        for map_id in [] if self._solving else self._atlas.due():
+        for map_id in [] if self._is_solving else self._atlas.due_maps():
             try:
-                job = self._atlas.snapshot(map_id)
+                job = self._atlas.make_job(map_id)
             except Exception:  # it costs this map its solution, not the others theirs
                 self._counts["failed_jobs"] += 1
                 continue
-            self._solving = True
-            return Solve(job)
+            self._is_solving = True
+            return SolveStep(job)
         return None
 
-    def done(self, step: Step, result: Any, ms: float) -> list[Finding]:
+    def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
         """What follows from a step's result; an exception as the result costs that step only."""
-        self._ms[step.kind].append(ms)
+        self._step_ms[step.kind].append(ms)
         self._counts[step.kind] += 1
-        if isinstance(step, Solve):
-            self._solving = False
+        if isinstance(step, SolveStep):
+            self._is_solving = False
         else:
-            self._looking = False
+            self._is_looking_up = False
         try:
-            return self._follow(step, result)
+            return self._handle_result(step, result)
         except Exception as error:
-            return self._failed(step, error)
+            return self._step_failed(step, error)
 
-    def _follow(self, step: Step, result: Any) -> list[Finding]:
+    def _handle_result(self, step: Step, result: Any) -> list[MapEvent]:
         """What the result leads to. Raises what the step raised."""
         match step:
-            case Query() if isinstance(result, list):
+            case QueryStep() if isinstance(result, list):
                 self._begin_search(step, [c.id for c in result])
-                return self._review(step.number)
-            case Verify() if isinstance(result, Verified | Refusal):
-                return self._judge(step, result)
-            case Solve() if isinstance(result, Solution):
-                return self._solved(step, result)
-            case Solve():
-                self._atlas.solver_lost()
+                return self._review_joins(step.node_id)
+            case VerifyStep() if isinstance(result, Verification | Refusal):
+                return self._handle_verification(step, result)
+            case SolveStep() if isinstance(result, GraphSolution):
+                return self._handle_solution(step, result)
+            case SolveStep():
+                self._atlas.reset_solver()
         raise result
 
-    def _failed(self, step: Step, error: Exception) -> list[Finding]:
-        agent = None if isinstance(step, Solve) else self._atlas.key(step.number).agent
-        return self.failed(step.kind, error, agent)
+    def _step_failed(self, step: Step, error: Exception) -> list[MapEvent]:
+        agent = None if isinstance(step, SolveStep) else self._atlas.key(step.node_id).agent
+        return self.report_failure(step.kind, error, agent)
 
-    def failed(self, what: str, error: Exception, agent: str | None = None) -> list[Finding]:
+    def report_failure(self, what: str, error: Exception, agent: str | None = None) -> list[MapEvent]:
         """It is counted and said; the map goes on without what raised `error`. agent: that it is about."""
         self._counts["failed_jobs"] += 1
         agent = next(iter(self._hellos), None) if agent is None else agent
-        return [] if agent is None else [Finding(agent, "job failed", f"{what}: {describe(error)}")]
+        return (
+            [] if agent is None else [MapEvent(agent, "job failed", f"{what}: {describe_exception(error)}")]
+        )
 
-    def solver_lost(self) -> None:
+    def reset_solver(self) -> None:
         """The solver knows nothing any more."""
-        self._atlas.solver_lost()
+        self._atlas.reset_solver()
 
     @property
-    def taken_out(self) -> int:
+    def removed_count(self) -> int:
         """Keyframes, since the beginning."""
         return self._counts["taken_out"]
 
-    def take_changes(self) -> tuple[Change, ...]:
+    def take_changes(self) -> tuple[MapChange, ...]:
         """What has to be kept since the last call."""
-        taken, self._changes = tuple(self._changes), []
-        return taken
+        changes, self._changes = tuple(self._changes), []
+        return changes
 
-    def take_emptied(self) -> tuple[Key, ...]:
+    def take_empty_runs(self) -> tuple[KeyframeKey, ...]:
         """Runs of which nothing is left since the last call, each with the newest keyframe that came."""
-        taken, self._emptied = tuple(self._emptied), []
-        return taken
+        empty_runs, self._empty_runs = tuple(self._empty_runs), []
+        return empty_runs
 
-    def poses(self) -> KeepPoses:
+    def current_poses(self) -> SavePoses:
         """Where everything lies now."""
-        keys, T_map_body, maps = self._atlas.everything()
-        return KeepPoses(keys, T_map_body, maps)
+        keys, T_map_body, maps = self._atlas.all_poses()
+        return SavePoses(keys, T_map_body, maps)
 
     # ------------------------------------------------------------------ steps
 
-    def _ask(self, number: int) -> Query:
-        near = self._atlas.neighbours(number)
-        if number % _LOOK_AGAIN:  # what is kept apart is looked up seldom: it may agree by now
-            near += self._atlas.kept_apart(number)
-        return Query(self._index, number, self._sights[number], self._config.place.candidates, near)
+    def _make_query(self, node_id: int) -> QueryStep:
+        excluded = self._atlas.neighbours(node_id)
+        if node_id % _RETRY_INTERVAL:  # what is kept apart is looked up seldom: it may agree by now
+            excluded += self._atlas.separated_keyframes(node_id)
+        return QueryStep(
+            self._index, node_id, self._camera_views[node_id], self._config.place.candidates, excluded
+        )
 
-    def _begin_search(self, query: Query, found: list[int]) -> None:
-        if self._lookups.in_a_hurry:
-            found = self._atlas.promising_first(query.number, [n for n in found if n in self._sights])
-        self._query, self._search = query, Search(query.number, found, self._effort)
+    def _begin_search(self, query: QueryStep, candidates: list[int]) -> None:
+        if self._queries.is_hurried:
+            candidates = self._atlas.rank_candidates(
+                query.node_id, [n for n in candidates if n in self._camera_views]
+            )
+        self._query, self._search = query, CandidateSearch(query.node_id, candidates, self._search_budget)
 
-    def _next_verify(self) -> Verify | None:
+    def _next_verify(self) -> VerifyStep | None:
         """Those that have been taken out meanwhile are passed over."""
         search, query = self._search, self._query
         while search is not None and query is not None:
-            candidate = search.next(self._lookups.in_a_hurry)
+            candidate = search.next_candidate(self._queries.is_hurried)
             if candidate is None:
                 break
-            if {query.number, candidate} <= self._sights.keys():
-                seen = self._sights[candidate]
-                return Verify(query.number, query.sight, candidate, seen, self._config.place)
+            if {query.node_id, candidate} <= self._camera_views.keys():
+                candidate_view = self._camera_views[candidate]
+                return VerifyStep(
+                    query.node_id, query.camera_view, candidate, candidate_view, self._config.place
+                )
         self._search = self._query = None
         return None
 
-    def _judge(self, step: Verify, outcome: Verified | Refusal) -> list[Finding]:
-        if not {step.number, step.candidate} <= self._sights.keys():
+    def _handle_verification(self, step: VerifyStep, outcome: Verification | Refusal) -> list[MapEvent]:
+        if not {step.node_id, step.candidate_id} <= self._camera_views.keys():
             return []  # taken out meanwhile
-        a, b = self._atlas.key(step.candidate), self._atlas.key(step.number)
-        account = self._accounts[b.agent]
+        a, b = self._atlas.key(step.candidate_id), self._atlas.key(step.node_id)
+        account = self._counters[b.agent]
         account.loops_tried += 1
         if isinstance(outcome, Refusal):
-            return [Finding(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
-        if self._search is not None and not self._atlas.are_apart(a.agent, b.agent):
-            self._search.verified()
+            return [MapEvent(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
+        if self._search is not None and not self._atlas.are_separated(a.agent, b.agent):
+            self._search.count_verified()
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
         account.merges["requested"] += 1
-        volume = self._gating.volume(self._hellos[a.agent].rig, self._hellos[b.agent].rig, loop.T_a_b)
-        if objection := self._gating.refuses(volume, self._atlas.map_of(a) == self._atlas.map_of(b)):
+        volume = self._merge_gate.overlap_volume(
+            self._hellos[a.agent].rig, self._hellos[b.agent].rig, loop.T_a_b
+        )
+        if objection := self._merge_gate.skip_reason(volume, self._atlas.map_id(a) == self._atlas.map_id(b)):
             account.merges["skipped"] += 1
-            return [Finding(b.agent, "merge skipped", f"loop {loop}: {objection}")]
-        parted = self._atlas.witness(loop, outcome.scale)
-        findings = self._parted(parted)
-        decision = self._atlas.propose(self._atlas.put_right(loop, outcome.scale))
+            return [MapEvent(b.agent, "merge skipped", f"loop {loop}: {objection}")]
+        change = self._atlas.compare_agents(loop, outcome.depth_scale)
+        events = self._quarantine_events(change)
+        decision = self._atlas.propose(self._atlas.rescale_loop(loop, outcome.depth_scale))
         reason = f"{decision.reason} ({outcome.reason})"
-        self._note(decision)
+        self._record_loops(decision)
         if not decision.accepted:
-            return [*findings, Finding(b.agent, "loop not taken", reason)]
+            return [*events, MapEvent(b.agent, "loop not taken", reason)]
         account.merges["done"] += 1
-        self._gating.completed(volume)
-        undone = [Finding(b.agent, "merge undone", reason)] if decision.dropped else []
-        taken = Finding(b.agent, "maps joined" if decision.joined else "loop accepted", reason)
-        return [*findings, *undone, taken]
+        self._merge_gate.record_merge(volume)
+        undone_events = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
+        accepted = MapEvent(b.agent, "maps joined" if decision.joined_maps else "loop accepted", reason)
+        return [*events, *undone_events, accepted]
 
-    def _parted(self, parted: Parted) -> list[Finding]:
+    def _quarantine_events(self, change: QuarantineChange) -> list[MapEvent]:
         """Who disagrees with the others since now, or no longer."""
-        gone = (DropLoop(loop.a, loop.b) for loop in parted.dropped)
-        self._changes += [*gone, *map(KeepLoop, parted.tied)]
+        removals = (RemoveLoops(loop.a, loop.b) for loop in change.dropped)
+        self._changes += [*removals, *map(SaveLoop, change.added)]
         return [
-            Finding(who, now.state, now.reason)
-            if now.state in ("set apart", "disputed")
-            else Finding(who, "agrees again", "its claims fit the others'")
-            for who, now in parted.standing.items()
+            MapEvent(agent, standing.state, standing.reason)
+            if standing.state in ("set apart", "disputed")
+            else MapEvent(agent, "agrees again", "its claims fit the others'")
+            for agent, standing in change.standings.items()
         ]
 
-    def _review(self, number: int) -> list[Finding]:
-        decision = self._atlas.review(number) if number in self._sights else None
+    def _review_joins(self, node_id: int) -> list[MapEvent]:
+        decision = self._atlas.review_joins(node_id) if node_id in self._camera_views else None
         if decision is None:
             return []
-        self._note(decision)
-        return [Finding(self._atlas.key(number).agent, "merge undone", decision.reason)]
+        self._record_loops(decision)
+        return [MapEvent(self._atlas.key(node_id).agent, "merge undone", decision.reason)]
 
-    def _solved(self, step: Solve, solution: Solution) -> list[Finding]:
-        applied = self._atlas.apply(step.job, solution)
-        self._note(applied)
-        told = [
-            Finding(agent, "correction", applied.reason, correction)
+    def _handle_solution(self, step: SolveStep, solution: GraphSolution) -> list[MapEvent]:
+        applied = self._atlas.apply_solution(step.job, solution)
+        self._record_loops(applied)
+        sent = [
+            MapEvent(agent, "correction", applied.reason, correction)
             for agent, correction in applied.corrections.items()
-            if self._concern.concerns(agent, correction)
+            if self._correction_filter.should_send(agent, correction)
         ]
         map_id = step.job.map_id
-        untold = [
-            Finding(agent, "not told yet", f"map {map_id} knows it to {100 * m:.0f} cm only")
-            for agent, m in applied.waiting.items()
-            if (agent, map_id) not in self._untold
+        waiting = [
+            MapEvent(agent, "not told yet", f"map {map_id} knows it to {100 * m:.0f} cm only")
+            for agent, m in applied.waiting_sigma_m.items()
+            if (agent, map_id) not in self._reported_waits
         ]
-        self._untold |= {(agent, map_id) for agent in applied.waiting}
-        return told + untold
+        self._reported_waits |= {(agent, map_id) for agent in applied.waiting_sigma_m}
+        return sent + waiting
 
-    def _note(self, made: Decision | Applied) -> None:
+    def _record_loops(self, outcome: LoopDecision | AppliedSolution) -> None:
         """The loops that are believed since, and those that are no longer, are to be kept so."""
-        self._changes += [DropLoop(loop.a, loop.b) for loop in made.dropped]
-        self._changes += [KeepLoop(loop) for loop in made.tied]
+        self._changes += [RemoveLoops(loop.a, loop.b) for loop in outcome.dropped]
+        self._changes += [SaveLoop(loop) for loop in outcome.added]
 
-    def _thin(self) -> None:
+    def _cull_keyframes(self) -> None:
         """Two keyframes go while one comes: all at once would hold the others up."""
-        most = self._config.edge.max_keyframes
-        if not self._leaving and len(self._atlas) > max(most * _SLACK, self._crowded):
-            self._leaving = self._atlas.redundant(len(self._atlas) - most)
+        max_keyframes = self._config.edge.max_keyframes
+        if not self._to_remove and len(self._atlas) > max(max_keyframes * _CULL_MARGIN, self._cull_threshold):
+            self._to_remove = self._atlas.choose_redundant(len(self._atlas) - max_keyframes)
             # Where nothing may go, it is not asked each time.
-            self._crowded = 0.0 if self._leaving else len(self._atlas) * _SLACK
-        if not self._leaving:
+            self._cull_threshold = 0.0 if self._to_remove else len(self._atlas) * _CULL_MARGIN
+        if not self._to_remove:
             return
-        self._see_restored()
-        taken = self._atlas.take_out(self._leaving[:_AT_ONCE])
-        del self._leaving[:_AT_ONCE]
-        for out in taken:
-            self._index.remove(out.number)
-            del self._sights[out.number]
-        self._counts["taken_out"] += len(taken)
-        self._changes += changes_of(taken)
-        empty = {out.key.agent for out in taken if self._atlas.is_forgotten(out.key.agent)}
-        self._emptied += [Key(agent, self._accounts[agent].newest) for agent in sorted(empty)]
+        self._index_restored()
+        removed = self._atlas.remove_keyframes(self._to_remove[:_REMOVED_PER_KEYFRAME])
+        del self._to_remove[:_REMOVED_PER_KEYFRAME]
+        for keyframe in removed:
+            self._index.remove(keyframe.node_id)
+            del self._camera_views[keyframe.node_id]
+        self._counts["taken_out"] += len(removed)
+        self._changes += removal_changes(removed)
+        empty_runs = {
+            keyframe.key.agent for keyframe in removed if self._atlas.is_run_gone(keyframe.key.agent)
+        }
+        self._empty_runs += [
+            KeyframeKey(agent, self._counters[agent].newest_id) for agent in sorted(empty_runs)
+        ]
 
     # ------------------------------------------------------------------ report
 
     def report(self) -> dict[str, Any]:
         """edge.json's fields of the whole, and under `agents` those of each run."""
-        accounts = [*self._accounts.values(), self._closed]
-        merges = _told(sum((a.merges for a in accounts), Counter()))
+        all_counters = [*self._counters.values(), self._removed_runs_counters]
+        merges = _merge_counts(sum((counters.merges for counters in all_counters), Counter()))
         return {
-            "agents": {agent: self._report_of(agent) for agent in self._accounts},
+            "agents": {agent: self._run_report(agent) for agent in self._counters},
             "loops": {
-                "tried": sum(a.loops_tried for a in accounts),
+                "tried": sum(counters.loops_tried for counters in all_counters),
                 "accepted": merges["done"],
                 "waiting": len(self._atlas.pending),
                 "in_map": len(self._atlas.loops),
             },
             "merges": merges,
-            "maps": self._atlas.sizes(),
+            "maps": self._atlas.map_sizes(),
             "taken_out": self._counts["taken_out"],
-            "waiting": len(self._lookups),
+            "waiting": len(self._queries),
             "failed_jobs": self._counts["failed_jobs"],
-            **{f"{k}_ms": {**summary(list(ms)).report(), "n": self._counts[k]} for k, ms in self._ms.items()},
+            **{
+                f"{k}_ms": {**summary(list(ms)).report(), "n": self._counts[k]}
+                for k, ms in self._step_ms.items()
+            },
         }
 
-    def _report_of(self, agent: str) -> dict[str, Any]:
-        account = self._accounts[agent]
+    def _run_report(self, agent: str) -> dict[str, Any]:
+        counters = self._counters[agent]
         return {
-            "loops": {"tried": account.loops_tried, "accepted": account.merges["done"]},
-            "merges": _told(account.merges),
-            "queries_skipped": self._lookups.skipped[agent],
-            "map_id": self._atlas.current_map(agent),
+            "loops": {"tried": counters.loops_tried, "accepted": counters.merges["done"]},
+            "merges": _merge_counts(counters.merges),
+            "queries_skipped": self._queries.skipped[agent],
+            "map_id": self._atlas.current_map_id(agent),
             "consistency": asdict(self._atlas.standing(agent)),
         }
 
 
-def _told(merges: Counter[str]) -> dict[str, int]:
-    return {what: merges[what] for what in ("requested", "skipped", "done")}
+def _merge_counts(merges: Counter[str]) -> dict[str, int]:
+    return {outcome: merges[outcome] for outcome in ("requested", "skipped", "done")}

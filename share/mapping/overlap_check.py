@@ -2,8 +2,8 @@
 
 A copy of a room is recognised as well as the room, so loops alone speak for it. What speaks against it are
 views that, by the map, should show the same and do not: things are gone
-(`share.mapping.recognition.missing`). Nobody proposes those, so they are looked for: before two maps are
-joined, in all of their overlap, and after that for as long as the join is on probation, wherever an agent
+(`share.mapping.recognition.missing_points`). Nobody proposes those, so they are looked for: before two maps
+are joined, in all of their overlap, and after that for as long as the join is on probation, wherever an agent
 comes to where the other has been."""
 
 from __future__ import annotations
@@ -16,141 +16,147 @@ import numpy as np
 
 from share.geometry import se3
 from share.mapping.loops import Loop
-from share.mapping.map_graph import Chart
-from share.mapping.recognition.missing import Gone, gone, missing
-from share.mapping.recognition.verification import Sight
+from share.mapping.map_graph import MapGraph
+from share.mapping.recognition.missing_points import MissingRegions, missing_points, missing_regions
+from share.mapping.recognition.verification import CameraView
 from share.types import F64
 
 _NEAR_M, _NEAR_RAD = 1.0, 0.5  # of one spot: views this near ought to look alike
-_POINTS = 20  # a pair of views that share fewer says nothing
-_PAIRS = 40  # looked at before a join
-_PROBATION = 40  # views after a join, without a doubt at the last of them
+_MIN_POINTS = 20  # a pair of views that share fewer says nothing
+_MAX_PAIRS = 40  # looked at before a join
+_PROBATION_VIEWS = 40  # views after a join, without a doubt at the last of them
 _SAME_M, _SAME_RAD = 0.02, 0.01  # a pair that has moved by less is not looked at again
-_REMEMBERED = 4000  # pairs
+_MAX_CACHED = 4000  # pairs
 
 
 @dataclass(eq=False)
-class Probation:
+class JoinProbation:
     """Of a join between two stretches. doubt: see the function."""
 
-    doubt: float = 0.0
-    looks: int = 0
+    cusum: float = 0.0
+    view_count: int = 0
 
 
-class Survey:
+class OverlapCheck:
     """Of one chart. sights: what each node saw, as far as it is known."""
 
-    def __init__(self, chart: Chart, sights: Mapping[int, Sight]) -> None:
-        self._chart, self._sights = chart, sights
-        self._seen: dict[tuple[int, int], tuple[F64, Gone]] = {}
-        self._probations: dict[tuple[int, int], Probation] = {}
+    def __init__(self, graph: MapGraph, camera_views: Mapping[int, CameraView]) -> None:
+        self._graph, self._camera_views = graph, camera_views
+        self._cache: dict[tuple[int, int], tuple[F64, MissingRegions]] = {}
+        self._probations: dict[tuple[int, int], JoinProbation] = {}
 
-    def looked_at(self, loop: Loop) -> Loop:
+    def with_found_share(self, loop: Loop) -> Loop:
         """With what is found of it, if both its views are known."""
-        a, b = (self._sights.get(n) for n in self._chart.ends(loop))
-        if loop.found is not None or a is None or b is None:
+        a, b = (self._camera_views.get(n) for n in self._graph.loop_nodes(loop))
+        if loop.found_share is not None or a is None or b is None:
             return loop
-        return replace(loop, found=1 - missing(b, a, loop.T_a_b).share)
+        return replace(loop, found_share=1 - missing_points(b, a, loop.T_a_b).missing_share)
 
-    def overlap(self, loop: Loop) -> list[Gone]:
+    def compare_overlap(self, loop: Loop) -> list[MissingRegions]:
         """Of two maps (in one map: two stretches), if they lay as the loop says: pairs of views from about
         one spot, each view in one of them, in the order of b's."""
-        chart, (a, b) = self._chart, self._chart.ends(loop)
-        ours, theirs = (self._known(self._side(n, chart.same_map(a, b))) for n in (a, b))
-        if not ours or not theirs:
+        graph, (a, b) = self._graph, self._graph.loop_nodes(loop)
+        nodes_a, nodes_b = (self._with_views(self._nodes_on_side(n, graph.is_same_map(a, b))) for n in (a, b))
+        if not nodes_a or not nodes_b:
             return []
-        T_b = chart.poses[a] @ loop.T_a_b @ se3.inverse(chart.poses[b])  # map of b in that of a
-        x, y = (np.array([chart.poses[n] for n in nodes]) for nodes in (ours, theirs))
-        pairs = _near_pairs(x, T_b @ y)
-        looks = ((j, self._look(ours[i], theirs[j], T)) for i, j, T in pairs)
-        return [look for _, look in sorted(_telling(looks, _PAIRS))]
+        T_b = graph.poses[a] @ loop.T_a_b @ se3.inverse(graph.poses[b])  # map of b in that of a
+        poses_a, poses_b = (np.array([graph.poses[n] for n in nodes]) for nodes in (nodes_a, nodes_b))
+        pairs = _near_pairs(poses_a, T_b @ poses_b)
+        comparisons = ((j, self._compare_views(nodes_a[i], nodes_b[j], T)) for i, j, T in pairs)
+        return [comparison for _, comparison in sorted(_informative(comparisons, _MAX_PAIRS))]
 
-    def begin(self, loop: Loop) -> None:
+    def begin_probation(self, loop: Loop) -> None:
         """A join that this loop made is on probation."""
-        self._probations[self._stretches(loop)] = Probation()
+        self._probations[self._segment_pair(loop)] = JoinProbation()
 
-    def review(self, number: int, allowed: float) -> Iterator[tuple[tuple[int, int], float]]:
+    def review_joins(self, node_id: int, allowed_share: float) -> Iterator[tuple[tuple[int, int], float]]:
         """A new node: for each stretch to which its own was joined not long ago, where it comes to what that
         has seen, the join as both stretches, and its doubt. allowed: share of a view that may be gone."""
-        own = self._chart.trails.nodes[number].stretch
+        segment = self._graph.odometry.nodes[node_id].segment
         for pair, probation in list(self._probations.items()):
-            if own in pair and self._one_map(pair):
-                look = self._nearest(number, pair[0] if own == pair[1] else pair[1])
-                if look is None:
+            if segment in pair and self._is_one_map(pair):
+                comparison = self._compare_nearest(node_id, pair[0] if segment == pair[1] else pair[1])
+                if comparison is None:
                     continue
-                probation.looks += 1
-                probation.doubt = doubt(probation.doubt, look, allowed)
-                yield pair, probation.doubt
-                if probation.looks >= _PROBATION and not probation.doubt:
+                probation.view_count += 1
+                probation.cusum = cusum(probation.cusum, comparison, allowed_share)
+                yield pair, probation.cusum
+                if probation.view_count >= _PROBATION_VIEWS and not probation.cusum:
                     self._probations.pop(pair, None)
 
-    def end(self, pair: tuple[int, int]) -> None:
+    def end_probation(self, pair: tuple[int, int]) -> None:
         """The join of these stretches is undone."""
         self._probations.pop(pair, None)
 
-    def _side(self, number: int, of_stretch: bool) -> list[int]:
-        stretch = self._chart.trails.nodes[number].stretch
-        if of_stretch:
-            return self._chart.trails.stretches[stretch].nodes
-        return self._chart.nodes_of(self._chart.founder[stretch])
+    def _nodes_on_side(self, node_id: int, is_one_segment: bool) -> list[int]:
+        segment = self._graph.odometry.nodes[node_id].segment
+        if is_one_segment:
+            return self._graph.odometry.segments[segment].nodes
+        return self._graph.map_nodes(self._graph.reference_segments[segment])
 
-    def _stretches(self, loop: Loop) -> tuple[int, int]:
-        a, b = sorted(self._chart.stretch_of(key) for key in (loop.a, loop.b))
+    def _segment_pair(self, loop: Loop) -> tuple[int, int]:
+        a, b = sorted(self._graph.segment(key) for key in (loop.a, loop.b))
         return a, b
 
-    def _one_map(self, pair: tuple[int, int]) -> bool:
-        return self._chart.founder[pair[0]] == self._chart.founder[pair[1]]
+    def _is_one_map(self, pair: tuple[int, int]) -> bool:
+        return self._graph.reference_segments[pair[0]] == self._graph.reference_segments[pair[1]]
 
-    def _nearest(self, number: int, stretch: int) -> Gone | None:
+    def _compare_nearest(self, node_id: int, segment: int) -> MissingRegions | None:
         """What the nearest view of this stretch shows of what the node shows, if it is near enough."""
-        nodes = self._known(self._chart.trails.stretches[stretch].nodes)
-        if not nodes or number not in self._sights:
+        nodes = self._with_views(self._graph.odometry.segments[segment].nodes)
+        if not nodes or node_id not in self._camera_views:
             return None
-        poses = self._chart.poses
-        pairs = _near_pairs(np.array([poses[n] for n in nodes]), poses[number][None])
-        looks = _telling(((j, self._look(nodes[i], number, T)) for i, j, T in pairs), 1)
-        return looks[0][1] if looks else None
+        poses = self._graph.poses
+        pairs = _near_pairs(np.array([poses[n] for n in nodes]), poses[node_id][None])
+        comparisons = _informative(((j, self._compare_views(nodes[i], node_id, T)) for i, j, T in pairs), 1)
+        return comparisons[0][1] if comparisons else None
 
-    def _known(self, nodes: Sequence[int]) -> list[int]:
-        return [n for n in nodes if n in self._sights]
+    def _with_views(self, nodes: Sequence[int]) -> list[int]:
+        return [n for n in nodes if n in self._camera_views]
 
-    def _look(self, a: int, b: int, T_a_b: F64) -> Gone:
+    def _compare_views(self, a: int, b: int, T_a_b: F64) -> MissingRegions:
         """Remembered, for the same pairs are asked for whenever another loop tells the same story."""
-        if (known := self._seen.get((a, b))) is not None:
-            off = se3.inverse(known[0]) @ T_a_b
-            if np.linalg.norm(off[:3, 3]) < _SAME_M and se3.angle(off) < _SAME_RAD:
-                return known[1]
-        look = gone(self._sights[b], self._sights[a], T_a_b)
-        if len(self._seen) >= _REMEMBERED:
-            self._seen.clear()
-        self._seen[a, b] = T_a_b, look
-        return look
+        if (cached := self._cache.get((a, b))) is not None:
+            offset = se3.inverse(cached[0]) @ T_a_b
+            if np.linalg.norm(offset[:3, 3]) < _SAME_M and se3.rotation_angle(offset) < _SAME_RAD:
+                return cached[1]
+        comparison = missing_regions(self._camera_views[b], self._camera_views[a], T_a_b)
+        if len(self._cache) >= _MAX_CACHED:
+            self._cache.clear()
+        self._cache[a, b] = T_a_b, comparison
+        return comparison
 
 
-def doubt(before: float, look: Gone, allowed: float) -> float:
+def cusum(previous: float, comparison: MissingRegions, allowed_share: float) -> float:
     """What was gone beyond the share that is allowed, summed up over views as long as it is above 0 (Page's
     CUSUM, Biometrika 1954)."""
-    return max(0.0, before + look.share - allowed)
+    return max(0.0, previous + comparison.missing_share - allowed_share)
 
 
-def _telling(looks: Iterator[tuple[int, Gone]], most: int) -> list[tuple[int, Gone]]:
+def _informative(
+    comparisons: Iterator[tuple[int, MissingRegions]], limit: int
+) -> list[tuple[int, MissingRegions]]:
     """The first of those that say something."""
-    return list(itertools.islice((look for look in looks if look[1].visible >= _POINTS), most))
+    return list(
+        itertools.islice(
+            (comparison for comparison in comparisons if comparison[1].visible >= _MIN_POINTS), limit
+        )
+    )
 
 
-def _near_pairs(x: F64, y: F64) -> Iterator[tuple[int, int, F64]]:
+def _near_pairs(poses_a: F64, poses_b: F64) -> Iterator[tuple[int, int, F64]]:
     """Pairs of poses x (N, 4, 4), y (K, 4, 4) from about one spot, as i, j, T_x_y; nearest first, each pose
     in one of them."""
-    a, b = x[:, :3, 3], y[:, :3, 3]
+    a, b = poses_a[:, :3, 3], poses_b[:, :3, 3]
     square = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
     rows, cols = np.nonzero(square < _NEAR_M**2)
-    cosine = ((x[rows, :3, :3] * y[cols, :3, :3]).sum((1, 2)) - 1) / 2
-    alike = cosine > np.cos(_NEAR_RAD)
-    rows, cols = rows[alike], cols[alike]
-    used_x, used_y = set[int](), set[int]()
+    cosine = ((poses_a[rows, :3, :3] * poses_b[cols, :3, :3]).sum((1, 2)) - 1) / 2
+    is_similar = cosine > np.cos(_NEAR_RAD)
+    rows, cols = rows[is_similar], cols[is_similar]
+    used_a, used_b = set[int](), set[int]()
     for k in np.argsort(square[rows, cols], kind="stable"):
         i, j = int(rows[k]), int(cols[k])
-        if i not in used_x and j not in used_y:
-            used_x.add(i)
-            used_y.add(j)
-            yield i, j, se3.inverse(x[i]) @ y[j]
+        if i not in used_a and j not in used_b:
+            used_a.add(i)
+            used_b.add(j)
+            yield i, j, se3.inverse(poses_a[i]) @ poses_b[j]

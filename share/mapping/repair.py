@@ -5,57 +5,59 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from share.mapping.changes import KeepLink, KeptKeyframe, edge_to
-from share.mapping.culling import across
-from share.mapping.loops import Key
+from share.mapping.culling import bridge_odometry
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import SaveLink, StoredKeyframe, odometry_link
 
 
 @dataclass(frozen=True, eq=False)
-class Mended:
+class Repaired:
     """keyframes, links: with every reference there. tied: keyframes whose edge was made anew."""
 
-    keyframes: tuple[KeptKeyframe, ...]
-    links: dict[Key, KeepLink]
-    tied: int
+    keyframes: tuple[StoredKeyframe, ...]
+    links: dict[KeyframeKey, SaveLink]
+    reconnected_count: int
 
 
-def mended(keyframes: Sequence[KeptKeyframe], links: Mapping[Key, KeepLink]) -> Mended:
+def repair_references(keyframes: Sequence[StoredKeyframe], links: Mapping[KeyframeKey, SaveLink]) -> Repaired:
     """Tie each keyframe whose reference is not there to the nearest before it on the same stretch.
 
     keyframes: in the order in which they came. Both stand in one odometry, so their relative pose is known:
     T_ref_body = T_odom_ref^-1 T_odom_body. Of the steps in between nothing is left; each is taken to be as
     uncertain as the step that is known. With none before it, a keyframe begins its stretch.
     """
-    out: list[KeptKeyframe] = []
-    ties = dict(links)
-    newest: dict[str, KeptKeyframe] = {}
-    there: set[Key] = set()
-    tied = 0
+    out: list[StoredKeyframe] = []
+    current_links = dict(links)
+    newest_in_segment: dict[str, StoredKeyframe] = {}
+    present_keys: set[KeyframeKey] = set()
+    reconnected_count = 0
     for keyframe in keyframes:
-        reference = (ties.get(keyframe.at) or keyframe.keyframe).reference
-        if reference >= 0 and Key(keyframe.key, reference) not in there:
-            edge = _tie(keyframe, edge_to(keyframe, ties), newest.get(keyframe.stretch))
-            if keyframe.at in ties:
-                ties[keyframe.at] = edge
+        reference = (current_links.get(keyframe.keyframe_key) or keyframe.keyframe).reference
+        if reference >= 0 and KeyframeKey(keyframe.run_key, reference) not in present_keys:
+            edge = _reconnect(
+                keyframe, odometry_link(keyframe, current_links), newest_in_segment.get(keyframe.segment_name)
+            )
+            if keyframe.keyframe_key in current_links:
+                current_links[keyframe.keyframe_key] = edge
             else:
-                keyframe = _as_sent(keyframe, edge)
-            tied += 1
+                keyframe = _with_edge(keyframe, edge)
+            reconnected_count += 1
         out.append(keyframe)
-        newest[keyframe.stretch] = keyframe
-        there.add(keyframe.at)
-    present = {key: link for key, link in ties.items() if key in there}
-    return Mended(tuple(out), present, tied)
+        newest_in_segment[keyframe.segment_name] = keyframe
+        present_keys.add(keyframe.keyframe_key)
+    present_links = {key: link for key, link in current_links.items() if key in present_keys}
+    return Repaired(tuple(out), present_links, reconnected_count)
 
 
-def _tie(keyframe: KeptKeyframe, edge: KeepLink, before: KeptKeyframe | None) -> KeepLink:
-    if before is None:
-        return KeepLink(keyframe.at, -1, keyframe.keyframe.T_odom_body, edge.cov)
-    own = replace(keyframe.keyframe, T_ref_body=edge.T_ref_body, cov=edge.cov)
-    T, cov = across(before.keyframe.T_odom_body, edge.reference - before.at.id, own)
-    return KeepLink(keyframe.at, before.at.id, T, cov)
+def _reconnect(keyframe: StoredKeyframe, edge: SaveLink, previous: StoredKeyframe | None) -> SaveLink:
+    if previous is None:
+        return SaveLink(keyframe.keyframe_key, -1, keyframe.keyframe.T_odom_body, edge.cov)
+    sent = replace(keyframe.keyframe, T_ref_body=edge.T_ref_body, cov=edge.cov)
+    T, cov = bridge_odometry(previous.keyframe.T_odom_body, edge.reference - previous.keyframe_key.id, sent)
+    return SaveLink(keyframe.keyframe_key, previous.keyframe_key.id, T, cov)
 
 
-def _as_sent(keyframe: KeptKeyframe, edge: KeepLink) -> KeptKeyframe:
+def _with_edge(keyframe: StoredKeyframe, edge: SaveLink) -> StoredKeyframe:
     """As if its agent had said so: the covariance is still the agent's, not yet the graph's."""
-    own = replace(keyframe.keyframe, reference=edge.reference, T_ref_body=edge.T_ref_body, cov=edge.cov)
-    return replace(keyframe, keyframe=own)
+    sent = replace(keyframe.keyframe, reference=edge.reference, T_ref_body=edge.T_ref_body, cov=edge.cov)
+    return replace(keyframe, keyframe=sent)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from share.mapping.loops import Key
+from share.mapping.loops import KeyframeKey
 from share.types import F64, Keyframe
 
 
@@ -16,14 +16,14 @@ class Node:
     """A keyframe of a stretch. T_odom_body (4, 4): where its agent took itself to be. ordinal: how many
     came before it there."""
 
-    key: Key
-    stretch: int
+    key: KeyframeKey
+    segment: int
     ordinal: int
     T_odom_body: F64
 
 
 @dataclass(eq=False)
-class Stretch:
+class Segment:
     """nodes: their numbers, rising. name: `agent/n`, the n-th of this agent. rank: of a map's stretches the
     least founds it, the oldest of those that are alike. count: of all it ever had."""
 
@@ -31,175 +31,182 @@ class Stretch:
     name: str
     rank: int = 0
     nodes: list[int] = field(default_factory=list)
-    count: int = 0
+    total_count: int = 0
 
 
-class Trails:
+class OdometrySegments:
     """Nodes by number, in the order of arrival, and the stretches that they make up, oldest first; live:
     those that have nodes."""
 
     def __init__(self) -> None:
         self.nodes: dict[int, Node] = {}
-        self.stretches: list[Stretch] = []
-        self.live: dict[int, None] = {}
-        self._next = 0
-        self._at: dict[Key, int] = {}
+        self.segments: list[Segment] = []
+        self.live_segments: dict[int, None] = {}
+        self._next_id = 0
+        self._node_ids: dict[KeyframeKey, int] = {}
         self._current: dict[str, int] = {}  # agent -> stretch that it is on
-        self._begun: dict[str, int] = {}  # agent -> how many stretches
+        self._segment_counts: dict[str, int] = {}  # agent -> how many stretches
 
-    def add(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
+    def add_keyframe(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
         """The number of the new node. rank: of a stretch that it begins. Where all of its stretch was taken
         out, that goes on with it. Raises ValueError for a keyframe known already, or one whose reference is
         unknown: the caller applies each once and in order."""
-        key = Key(agent, keyframe.id)
-        if key in self._at:
+        key = KeyframeKey(agent, keyframe.id)
+        if key in self._node_ids:
             raise ValueError(f"keyframe {key} was added before")
         if keyframe.reference < 0:
-            return self.put(key, self.begin(agent, rank), keyframe.T_odom_body)
-        if (current := self._current.get(agent)) is not None and current not in self.live:
-            return self.put(key, current, keyframe.T_odom_body)
-        before = self.nodes[self.number(Key(agent, keyframe.reference))]
-        return self.put(key, before.stretch, keyframe.T_odom_body)
+            return self.append_node(key, self.new_segment(agent, rank), keyframe.T_odom_body)
+        if (current := self._current.get(agent)) is not None and current not in self.live_segments:
+            return self.append_node(key, current, keyframe.T_odom_body)
+        previous = self.nodes[self.node_id(KeyframeKey(agent, keyframe.reference))]
+        return self.append_node(key, previous.segment, keyframe.T_odom_body)
 
-    def begin(self, agent: str, rank: int = 0) -> int:
+    def new_segment(self, agent: str, rank: int = 0) -> int:
         """A new stretch of this agent, which is on it from now on."""
-        count = self._begun.get(agent, 0)
-        self._begun[agent] = count + 1
-        self._current[agent] = len(self.stretches)
-        self.stretches.append(Stretch(agent, f"{agent}/{count}", rank))
-        return len(self.stretches) - 1
+        count = self._segment_counts.get(agent, 0)
+        self._segment_counts[agent] = count + 1
+        self._current[agent] = len(self.segments)
+        self.segments.append(Segment(agent, f"{agent}/{count}", rank))
+        return len(self.segments) - 1
 
-    def put(self, key: Key, stretch: int, T_odom_body: F64, ordinal: int | None = None) -> int:
+    def append_node(
+        self, key: KeyframeKey, segment: int, T_odom_body: F64, ordinal: int | None = None
+    ) -> int:
         """The number of a new node at the end of a stretch."""
-        at = self.stretches[stretch]
-        number, self._next = self._next, self._next + 1
-        self.nodes[number] = Node(key, stretch, at.count if ordinal is None else ordinal, T_odom_body)
-        at.nodes.append(number)
-        self.live[stretch] = None
-        at.count = self.nodes[number].ordinal + 1
-        self._at[key] = number
-        return number
+        segment_record = self.segments[segment]
+        node_id, self._next_id = self._next_id, self._next_id + 1
+        self.nodes[node_id] = Node(
+            key, segment, segment_record.total_count if ordinal is None else ordinal, T_odom_body
+        )
+        segment_record.nodes.append(node_id)
+        self.live_segments[segment] = None
+        segment_record.total_count = self.nodes[node_id].ordinal + 1
+        self._node_ids[key] = node_id
+        return node_id
 
-    def take_out(self, number: int) -> None:
+    def remove_node(self, node_id: int) -> None:
         """Forget a node; its stretch goes on without it."""
-        node = self.nodes.pop(number)
-        nodes = self.stretches[node.stretch].nodes
-        nodes.remove(number)
+        node = self.nodes.pop(node_id)
+        nodes = self.segments[node.segment].nodes
+        nodes.remove(node_id)
         if not nodes:
-            del self.live[node.stretch]
-        del self._at[node.key]
+            del self.live_segments[node.segment]
+        del self._node_ids[node.key]
 
-    def forget(self, agent: str) -> None:
+    def remove_agent(self, agent: str) -> None:
         """An agent that has no nodes any more. Its stretches stay as numbers without any."""
         self._current.pop(agent, None)
-        self._begun.pop(agent, None)
+        self._segment_counts.pop(agent, None)
 
-    def newest(self, agent: str) -> int | None:
+    def newest_node(self, agent: str) -> int | None:
         """The newest node of the agent's present stretch."""
-        nodes = self.stretches[self._current[agent]].nodes if agent in self._current else []
+        nodes = self.segments[self._current[agent]].nodes if agent in self._current else []
         return nodes[-1] if nodes else None
 
-    def has_any(self, agent: str) -> bool:
+    def has_nodes(self, agent: str) -> bool:
         """Whether a node of the agent is left, on any of its stretches."""
-        return any(self.stretches[number].agent == agent for number in self.live)
+        return any(self.segments[segment].agent == agent for segment in self.live_segments)
 
-    def has(self, key: Key) -> bool:
-        return key in self._at
+    def has_keyframe(self, key: KeyframeKey) -> bool:
+        return key in self._node_ids
 
-    def number(self, key: Key) -> int:
+    def node_id(self, key: KeyframeKey) -> int:
         """Raises ValueError if no such keyframe is there."""
-        if key not in self._at:
+        if key not in self._node_ids:
             raise ValueError(f"keyframe {key} is not known")
-        return self._at[key]
+        return self._node_ids[key]
 
-    def current(self, agent: str) -> int | None:
+    def current_segment(self, agent: str) -> int | None:
         """The stretch that the agent is on now."""
         return self._current.get(agent)
 
-    def before(self, number: int) -> int | None:
+    def previous_node(self, node_id: int) -> int | None:
         """The node before this one on its stretch; None for the first."""
-        return self._beside(number, -1)
+        return self._neighbour(node_id, -1)
 
-    def after(self, number: int) -> int | None:
+    def next_node(self, node_id: int) -> int | None:
         """The node after this one on its stretch; None for the newest."""
-        return self._beside(number, +1)
+        return self._neighbour(node_id, +1)
 
-    def are_neighbours(self, a: int, b: int, gap: int) -> bool:
-        """Fewer than `gap` keyframes apart on one stretch, so that odometry knows their pose best."""
+    def are_neighbours(self, a: int, b: int, disagreement: int) -> bool:
+        """Fewer than `disagreement` keyframes apart on one stretch, so that odometry knows their pose
+        best."""
         first, second = self.nodes[a], self.nodes[b]
-        return first.stretch == second.stretch and abs(first.ordinal - second.ordinal) < gap
+        return first.segment == second.segment and abs(first.ordinal - second.ordinal) < disagreement
 
-    def _beside(self, number: int, step: int) -> int | None:
-        nodes = self.stretches[self.nodes[number].stretch].nodes
-        at = bisect_left(nodes, number) + step
+    def _neighbour(self, node_id: int, step: int) -> int | None:
+        nodes = self.segments[self.nodes[node_id].segment].nodes
+        at = bisect_left(nodes, node_id) + step
         return nodes[at] if 0 <= at < len(nodes) else None
 
 
 # ---- Whose each run is, and which run of a name is its present one.
 
 
-class Owners:
+class AgentRuns:
     """Runs by name. A run that nobody has introduced is its own name's, and present."""
 
     def __init__(self) -> None:
-        self._name: dict[str, str] = {}
-        self._latest: dict[str, str] = {}  # run of each name, the one heard of longest ago first
+        self._name_by_run: dict[str, str] = {}
+        self._present_run: dict[str, str] = {}  # run of each name, the one heard of longest ago first
         self._absent: set[str] = set()
 
-    def join(self, run: str, name: str) -> None:
+    def add(self, run: str, name: str) -> None:
         """A new run: it is its name's present one from now on."""
-        self._name[run] = name
-        self.present(run, True)
+        self._name_by_run[run] = name
+        self.set_present(run, True)
 
-    def present(self, run: str, here: bool) -> bool:
+    def set_present(self, run: str, is_present: bool) -> bool:
         """Whether it is heard; returns whether that is news. An older run that comes back is its name's
         present one again."""
         was_absent = run in self._absent
-        if not here:
+        if not is_present:
             self._absent.add(run)
             return not was_absent
         self._absent.discard(run)
         name = self.name(run)
-        self._latest.pop(name, None)
-        self._latest[name] = run
+        self._present_run.pop(name, None)
+        self._present_run[name] = run
         return was_absent
 
-    def forget(self, run: str) -> None:
+    def remove(self, run: str) -> None:
         """Nothing of it is left."""
-        name = self._name.pop(run, run)
+        name = self._name_by_run.pop(run, run)
         self._absent.discard(run)
-        if self._latest.get(name) == run:
-            del self._latest[name]
-            if left := [one for one in self._name if self._name[one] == name]:
-                self._latest[name] = left[-1]
+        if self._present_run.get(name) == run:
+            del self._present_run[name]
+            if remaining := [one for one in self._name_by_run if self._name_by_run[one] == name]:
+                self._present_run[name] = remaining[-1]
 
     def name(self, run: str) -> str:
-        return self._name.get(run, run)
+        return self._name_by_run.get(run, run)
 
     def is_absent(self, run: str) -> bool:
         return run in self._absent
 
-    def is_away(self, name: str) -> bool:
+    def is_name_absent(self, name: str) -> bool:
         """Whether none of its runs is heard."""
-        return self._latest.get(name, name) in self._absent
+        return self._present_run.get(name, name) in self._absent
 
-    def is_ended(self, run: str) -> bool:
+    def is_superseded(self, run: str) -> bool:
         """Whether it is not heard, and another run of its name has come after it."""
-        return run in self._absent and self._latest.get(self.name(run), run) != run
+        return run in self._absent and self._present_run.get(self.name(run), run) != run
 
-    def heard_of(self) -> dict[str, int]:
+    def presence_order(self) -> dict[str, int]:
         """Of each name, when its present run came or came back: in the order of these numbers."""
-        return {name: at for at, name in enumerate(self._latest)}
+        return {name: at for at, name in enumerate(self._present_run)}
 
 
-def dues(held: Counter[str], most: Counter[str], count: int, heard_of: Mapping[str, int]) -> Counter[str]:
-    """How many of `count` each name gives: again and again the one that holds most, of several the one heard
-    of longest ago. So nobody who holds no more than a fair share gives anything.
+def fair_quotas(
+    counts: Counter[str], limits: Counter[str], count: int, presence_order: Mapping[str, int]
+) -> Counter[str]:
+    """How many of `total_count` each name gives: again and again the one that holds most, of several the one
+    heard of longest ago. So nobody who holds no more than a fair share gives anything.
 
-    held: keyframes of each name. most: that it can give. heard_of: as `Owners.heard_of`.
+    held: keyframes of each name. most: that it can give. heard_of: as `Owners.presence_order`.
     """
     out = Counter[str]()
-    for _ in range(min(count, most.total())):
-        able = (name for name in held if out[name] < most[name])
-        out[max(able, key=lambda one: (held[one] - out[one], -heard_of.get(one, -1)))] += 1
+    for _ in range(min(count, limits.total())):
+        candidates = (name for name in counts if out[name] < limits[name])
+        out[max(candidates, key=lambda one: (counts[one] - out[one], -presence_order.get(one, -1)))] += 1
     return out

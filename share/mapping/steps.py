@@ -8,81 +8,83 @@ import numpy as np
 
 from share.config import PlaceConfig
 from share.mapping.atlas import SolveJob
-from share.mapping.graph.solver import Solver
-from share.mapping.graph.updates import Solution
-from share.mapping.recognition.index import Candidate, PlaceIndex
-from share.mapping.recognition.verification import Refusal, Sight, Verified, verify
+from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.graph.updates import GraphSolution
+from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
+from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
 from share.types import F64, Correction
 
 
 @dataclass(frozen=True, eq=False)
-class Query:
+class QueryStep:
     """Which stored keyframes look like this one?"""
 
     index: PlaceIndex
-    number: int
-    sight: Sight
+    node_id: int
+    camera_view: CameraView
     limit: int
-    exclude: tuple[int, ...]
+    excluded: tuple[int, ...]
     kind: str = "place"
 
-    def run(self) -> list[Candidate]:
-        return self.index.query(self.sight.view.descriptors, self.limit, self.exclude)
+    def run(self) -> list[PlaceCandidate]:
+        return self.index.query(self.camera_view.view.descriptors, self.limit, self.excluded)
 
 
 @dataclass(frozen=True, eq=False)
-class Verify:
+class VerifyStep:
     """Is this the place of that candidate?"""
 
-    number: int
-    sight: Sight
-    candidate: int
-    seen: Sight
+    node_id: int
+    query_view: CameraView
+    candidate_id: int
+    candidate_view: CameraView
     config: PlaceConfig
     kind: str = "verify"
 
-    def run(self) -> Verified | Refusal:
-        return verify(self.sight, self.seen, self.config)
+    def run(self) -> Verification | Refusal:
+        return verify(self.query_view, self.candidate_view, self.config)
 
 
 @dataclass(frozen=True, eq=False)
-class Solve:
+class SolveStep:
     """Where was everybody?"""
 
     job: SolveJob
     kind: str = "solve"
 
-    def run(self, solver: Solver) -> Solution:
-        if self.job.anew:
+    def run(self, solver: PoseGraphSolver) -> GraphSolution:
+        if self.job.is_reset:
             solver.clear()
         solver.update(self.job.change)
-        return solver.solve(self.job.anchor, self.job.wanted)
+        return solver.solve(self.job.anchor, self.job.covariance_nodes)
 
 
-Look = Query | Verify
-Step = Query | Verify | Solve
+LookupStep = QueryStep | VerifyStep
+Step = QueryStep | VerifyStep | SolveStep
 
 
 # ---- What the mapper decides, and tells the edge.
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class MapEvent:
     """Something decided about an agent's run, why, and the correction that follows, if one does."""
 
     agent: str
-    what: str
+    event: str
     reason: str
     correction: Correction | None = None
 
 
-def in_map(agent: str, map_id: str, T_map_odom: F64, about: int, cov: F64 | None = None) -> Finding:
+def map_assignment(
+    agent: str, map_id: str, T_map_odom: F64, about_id: int, cov: F64 | None = None
+) -> MapEvent:
     """Which map a run is in, before anything moves it there. A map is named after what founded it. about: a
     keyframe of the stretch. cov (6, 6): of T_map_odom; exact where it is the map's own gauge."""
-    founds = "founds" if map_id.startswith(f"{agent}/") else "is in"
-    return Finding(
+    verb = "founds" if map_id.startswith(f"{agent}/") else "is in"
+    return MapEvent(
         agent,
         "correction",
-        f"{founds} map {map_id}",
-        Correction(T_map_odom, np.zeros((6, 6)) if cov is None else cov, map_id, 0, about),
+        f"{verb} map {map_id}",
+        Correction(T_map_odom, np.zeros((6, 6)) if cov is None else cov, map_id, 0, about_id),
     )

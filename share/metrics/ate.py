@@ -13,13 +13,13 @@ from typing import Literal
 
 import numpy as np
 
-from share.geometry.interpolation import MAX_GAP_NS, Trajectory, associate, require
+from share.geometry.interpolation import MAX_GAP_NS, Trajectory, associate, require_poses
 from share.geometry.se3 import inverse, transform, umeyama
 from share.types import F64
 
 Alignment = Literal["se3", "origin", "none"]
 
-_LEAST = {"se3": 3, "origin": 1, "none": 1}  # associated poses without which there is no alignment
+_MIN_POSES = {"se3": 3, "origin": 1, "none": 1}  # associated poses without which there is no alignment
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,9 @@ def ate(
     """ATE of one trajectory. `se3`: least squares over all positions; `origin`: first poses made
     equal; `none`: as given. Raises DataError where too few poses have a truth at their time."""
     _, T_est, T_truth = associate(estimate, truth, max_gap_ns)
-    require(len(T_est), _LEAST[alignment], "ATE")
-    T = _align(T_est, T_truth, alignment)
-    return _ate(spread(position_errors(T, T_est, T_truth)), T)
+    require_poses(len(T_est), _MIN_POSES[alignment], "ATE")
+    T = _fit_alignment(T_est, T_truth, alignment)
+    return _make_ate(error_statistics(position_errors(T, T_est, T_truth)), T)
 
 
 def joint_ate(
@@ -68,11 +68,13 @@ def joint_ate(
     """
     associated = {name: associate(*pair, max_gap_ns)[1:] for name, pair in pairs.items()}
     associated = {name: pair for name, pair in associated.items() if len(pair[0])}
-    require(sum(len(T) for T, _ in associated.values()), _LEAST[alignment], "joint ATE")
+    require_poses(sum(len(T) for T, _ in associated.values()), _MIN_POSES[alignment], "joint ATE")
     all_est, all_truth = (np.concatenate(side) for side in zip(*associated.values(), strict=True))
-    T = _align(all_est, all_truth, alignment)
-    agents = {name: _ate(spread(position_errors(T, *pair)), T) for name, pair in associated.items()}
-    return JointAte(_ate(spread(position_errors(T, all_est, all_truth)), T), agents)
+    T = _fit_alignment(all_est, all_truth, alignment)
+    agents = {
+        name: _make_ate(error_statistics(position_errors(T, *pair)), T) for name, pair in associated.items()
+    }
+    return JointAte(_make_ate(error_statistics(position_errors(T, all_est, all_truth)), T), agents)
 
 
 def position_errors(T_truth_est: F64, T_est: F64, T_truth: F64) -> F64:
@@ -81,7 +83,7 @@ def position_errors(T_truth_est: F64, T_est: F64, T_truth: F64) -> F64:
     return out
 
 
-def _align(T_est: F64, T_truth: F64, alignment: Alignment) -> F64:
+def _fit_alignment(T_est: F64, T_truth: F64, alignment: Alignment) -> F64:
     if alignment == "se3":
         return umeyama(T_est[:, :3, 3], T_truth[:, :3, 3])
     if alignment == "origin":
@@ -90,15 +92,15 @@ def _align(T_est: F64, T_truth: F64, alignment: Alignment) -> F64:
     return np.eye(4)
 
 
-def _ate(s: Spread, T: F64) -> Ate:
-    return Ate(s.rmse, s.mean, s.median, s.max, s.n, T)
+def _make_ate(statistics: ErrorStatistics, T: F64) -> Ate:
+    return Ate(statistics.rmse, statistics.mean, statistics.median, statistics.max, statistics.n, T)
 
 
 # ---- How a set of errors is summed up.
 
 
 @dataclass(frozen=True)
-class Spread:
+class ErrorStatistics:
     """Of n errors, in their unit."""
 
     rmse: float
@@ -108,9 +110,9 @@ class Spread:
     n: int
 
 
-def spread(errors: F64) -> Spread:
+def error_statistics(errors: F64) -> ErrorStatistics:
     """Of errors (N,), N >= 1, none negative."""
-    return Spread(
+    return ErrorStatistics(
         rmse=float(np.sqrt(np.mean(errors**2))),
         mean=float(errors.mean()),
         median=float(np.median(errors)),

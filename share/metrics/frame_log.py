@@ -18,28 +18,28 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from share.errors import DataError
-from share.types import F64, I64, TrackState, Wait
+from share.types import F64, I64, TrackState, WaitReason
 
 CSV_HEADER = "stamp_ns,track_ms,corrected_ms,state,keyframe,sent"
-_LINE = np.dtype(
+_LINE_DTYPE = np.dtype(
     [
         *(("stamp_ns", "i8"), ("track_ms", "f8"), ("corrected_ms", "f8")),
         *(("state", "S14"), ("keyframe", "i1"), ("sent", "i1")),
     ]
 )
-_AT_ONCE = 65_536  # lines
+_CHUNK_LINES = 65_536  # lines
 
 
-def line_of_frame(stamp_ns: int, track_ms: float, state: TrackState, keyframe: bool, sent: bool) -> str:
+def frame_line(stamp_ns: int, track_ms: float, state: TrackState, keyframe: bool, sent: bool) -> str:
     return f"{stamp_ns},{float(track_ms)!r},nan,{state},{int(keyframe)},{int(sent)}"
 
 
-def line_of_correction(stamp_ns: int, corrected_ms: float) -> str:
+def correction_line(stamp_ns: int, corrected_ms: float) -> str:
     return f"{stamp_ns},nan,{float(corrected_ms)!r},,0,0"
 
 
 @dataclass(frozen=True, eq=False)
-class FrameColumns:
+class FrameTable:
     """N frames in order of their stamps: each (N,). state: names of `TrackState`, as bytes.
     corrected_ms: NaN where no correction came of the frame."""
 
@@ -53,10 +53,10 @@ class FrameColumns:
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
-    def has(self, state: TrackState) -> NDArray[np.bool_]:
+    def in_state(self, state: TrackState) -> NDArray[np.bool_]:
         """Which frames were in that state."""
-        found: NDArray[np.bool_] = self.state == state.encode()
-        return found
+        mask: NDArray[np.bool_] = self.state == state.encode()
+        return mask
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:
@@ -70,7 +70,7 @@ class FrameColumns:
     @property
     def lost_s(self) -> float:
         """Time from each LOST frame to the next frame."""
-        lost = self.has(TrackState.LOST)[:-1]
+        lost = self.in_state(TrackState.LOST)[:-1]
         return float((np.diff(self.stamp_ns) * lost).sum() * 1e-9)
 
     @property
@@ -79,12 +79,12 @@ class FrameColumns:
         first = np.flatnonzero(self.has_pose)[:1]
         return int(self.stamp_ns[first[0]] - self.stamp_ns[0]) * 1e-9 if first.size else None
 
-    def csv(self) -> Iterator[str]:
+    def csv_chunks(self) -> Iterator[str]:
         """latency.csv, in parts of whole lines."""
         yield CSV_HEADER + "\n"
         columns = (self.stamp_ns, self.track_ms, self.corrected_ms, self.state, self.keyframe, self.sent)
-        for k in range(0, len(self), _AT_ONCE):
-            rows = zip(*(column[k : k + _AT_ONCE].tolist() for column in columns), strict=True)
+        for k in range(0, len(self), _CHUNK_LINES):
+            rows = zip(*(column[k : k + _CHUNK_LINES].tolist() for column in columns), strict=True)
             yield "".join(_csv_line(*row) for row in rows)
 
 
@@ -95,18 +95,20 @@ def _csv_line(
     return f"{stamp_ns},{track_ms:.3f},{corrected},{state.decode()},{int(keyframe)},{int(sent)}\n"
 
 
-def read(lines: Iterable[str]) -> FrameColumns:
+def read_frames(lines: Iterable[str]) -> FrameTable:
     """Of the lines, the first of which is CSV_HEADER, where there are any. Raises DataError."""
-    told = _parsed(lines)
-    told = told[np.argsort(told["stamp_ns"], kind="stable")]  # of one stamp: as they came
-    is_frame = told["state"] != b""
-    frames, corrections = told[is_frame], told[~is_frame]
-    before = np.cumsum(is_frame)[~is_frame]  # how many frames, in this order, of each correction
-    corrections, before = corrections[before > 0], before[before > 0]
-    meant = frames["stamp_ns"][before - 1] == corrections["stamp_ns"]
+    rows = _parse(lines)
+    rows = rows[np.argsort(rows["stamp_ns"], kind="stable")]  # of one stamp: as they came
+    is_frame = rows["state"] != b""
+    frames, corrections = rows[is_frame], rows[~is_frame]
+    frame_counts = np.cumsum(is_frame)[~is_frame]  # how many frames, in this order, of each correction
+    corrections, frame_counts = corrections[frame_counts > 0], frame_counts[frame_counts > 0]
+    matches = frames["stamp_ns"][frame_counts - 1] == corrections["stamp_ns"]
     corrected_ms = np.ascontiguousarray(frames["corrected_ms"])
-    corrected_ms[before[meant] - 1] = corrections["corrected_ms"][meant]  # of several of a frame, the last
-    return FrameColumns(
+    corrected_ms[frame_counts[matches] - 1] = corrections["corrected_ms"][
+        matches
+    ]  # of several of a frame, the last
+    return FrameTable(
         np.ascontiguousarray(frames["stamp_ns"]),
         np.ascontiguousarray(frames["track_ms"]),
         corrected_ms,
@@ -116,13 +118,13 @@ def read(lines: Iterable[str]) -> FrameColumns:
     )
 
 
-def _parsed(lines: Iterable[str]) -> NDArray[Any]:
+def _parse(lines: Iterable[str]) -> NDArray[Any]:
     """As many of _LINE, a part at a time: parsing takes several times the memory of what is parsed."""
     rest = itertools.islice(lines, 1, None)
-    parts = [np.empty(0, _LINE)]
+    parts = [np.empty(0, _LINE_DTYPE)]
     try:
-        while some := list(itertools.islice(rest, _AT_ONCE)):
-            parts.append(np.loadtxt(some, _LINE, delimiter=",", ndmin=1, comments=None))
+        while chunk := list(itertools.islice(rest, _CHUNK_LINES)):
+            parts.append(np.loadtxt(chunk, _LINE_DTYPE, delimiter=",", ndmin=1, comments=None))
     except ValueError as error:
         raise DataError(f"the run's own latencies were changed by somebody: {error}") from None
     return np.concatenate(parts)
@@ -131,7 +133,7 @@ def _parsed(lines: Iterable[str]) -> NDArray[Any]:
 # ---- What happened to every frame of one agent's run, and the report that comes of it.
 
 
-class Lines(Protocol):
+class LineStore(Protocol):
     """Where the lines of a run go, and come from again."""
 
     def write(self, line: str) -> None:
@@ -141,7 +143,7 @@ class Lines(Protocol):
         """All of them, in order."""
 
 
-class InMemory:
+class MemoryLineStore:
     """For runs that end before that matters."""
 
     def __init__(self) -> None:
@@ -162,15 +164,17 @@ class RunLog:
     seconds, until its report is made.
     """
 
-    lines: Lines = field(default_factory=InMemory)
+    lines: LineStore = field(default_factory=MemoryLineStore)
     cpu_s: float = 0.0  # process CPU time of the tracking pipeline
     decode_s: float = 0.0  # CPU time of image decoding
-    contradicted: int = 0  # frames in which images and IMU told of different motions
-    waited: Counter[Wait] = field(default_factory=Counter)  # frames, by what was still waited for
-    stretches: int = 0  # of unbroken odometry; poses of different ones do not compare
-    imu_doubted: int = 0  # samples of the IMU that the tracker did not believe
+    inconsistent_frames: int = 0  # frames in which images and IMU told of different motions
+    waiting_frames: Counter[WaitReason] = field(
+        default_factory=Counter
+    )  # frames, by what was still waited for
+    segments: int = 0  # of unbroken odometry; poses of different ones do not compare
+    imu_outliers: int = 0  # samples of the IMU that the tracker did not believe
     _frames: int = 0
-    _begun: bool = False  # the first line, the columns' names, is written
+    _has_header: bool = False  # the first line, the columns' names, is written
 
     def __len__(self) -> int:
         """How many frames."""
@@ -179,37 +183,37 @@ class RunLog:
     def add(
         self, stamp_ns: int, track_ms: float, state: TrackState, keyframe: bool, sent: bool = False
     ) -> None:
-        self._write(line_of_frame(stamp_ns, track_ms, state, keyframe, sent))
+        self._write(frame_line(stamp_ns, track_ms, state, keyframe, sent))
         self._frames += 1
 
-    def add_result(self, new_stretch: bool, sound: bool, waits: Wait | None) -> None:
+    def add_result(self, new_segment: bool, is_consistent: bool, waiting_for: WaitReason | None) -> None:
         """Of a frame: whether odometry broke before it, whether images and IMU agree, and what is still
         waited for; None: nothing."""
-        self.stretches += new_stretch
-        self.contradicted += not sound
-        if waits is not None:
-            self.waited[waits] += 1
+        self.segments += new_segment
+        self.inconsistent_frames += not is_consistent
+        if waiting_for is not None:
+            self.waiting_frames[waiting_for] += 1
 
-    def add_decode(self, cpu_s: float) -> None:
+    def add_decode_time(self, cpu_s: float) -> None:
         self.decode_s += cpu_s
 
-    def mark_corrected(self, stamp_ns: int, corrected_ms: float) -> None:
+    def add_correction(self, stamp_ns: int, corrected_ms: float) -> None:
         """Of a frame that was added; a later mark of the same frame replaces this one."""
-        self._write(line_of_correction(stamp_ns, corrected_ms))
+        self._write(correction_line(stamp_ns, corrected_ms))
 
     def _write(self, line: str) -> None:
-        if not self._begun:
+        if not self._has_header:
             self.lines.write(CSV_HEADER)
-            self._begun = True
+            self._has_header = True
         self.lines.write(line)
 
-    def frames(self) -> FrameColumns:
+    def frames(self) -> FrameTable:
         """In order of time, which is not the order in which their fate was known."""
-        return read(self.lines.read())
+        return read_frames(self.lines.read())
 
-    def csv(self) -> Iterator[str]:
+    def csv_chunks(self) -> Iterator[str]:
         """The whole of latency.csv, in parts."""
-        return self.frames().csv()
+        return self.frames().csv_chunks()
 
     def report(self) -> dict[str, Any]:
         """The fields of report.json that come from frames alone (docs/architecture.md)."""
@@ -223,9 +227,9 @@ class RunLog:
             "keyframes": int(rows.keyframe.sum()),
             "sent": sent,
             "lost_s": rows.lost_s,
-            "stretches": self.stretches,
-            "contradicted": self.contradicted,
-            "imu_doubted": self.imu_doubted,
+            "stretches": self.segments,
+            "contradicted": self.inconsistent_frames,
+            "imu_doubted": self.imu_outliers,
             "track_ms": parts.track_ms.report(),
             "corrected_ms": parts.corrected_ms.report(),
             "latency_ms": parts.latency_ms.report(),
@@ -234,16 +238,16 @@ class RunLog:
             "decode_ms_per_frame": 1e3 * self.decode_s / frames if frames else None,
             "rate_hz": sent / rows.span_s if rows.span_s else None,
             "init_s": rows.init_s,
-            "waited": {str(wait): frames for wait, frames in self.waited.items()},
+            "waited": {str(reason): frames for reason, frames in self.waiting_frames.items()},
         }
 
 
 # ---- Latency as every table means it (docs/architecture.md; docs/evaluation.md).
 
-NOTICED_MS = 20.0  # a headset wearer notices more
+NOTICEABLE_LATENCY_MS = 20.0  # a headset wearer notices more
 
 
-class Queue:
+class ReplayQueue:
     """How long a frame of a recording would wait if frames came at the recording's pace: for what the one
     before left to do."""
 
@@ -254,7 +258,7 @@ class Queue:
         """Of the next frame."""
         return max(0.0, self._busy_ms - (stamp_ns - self._stamp_ns) * 1e-6)
 
-    def served(self, stamp_ns: int, busy_ms: float) -> None:
+    def finish_frame(self, stamp_ns: int, busy_ms: float) -> None:
         """busy_ms: from when the frame came until all work on it was done, its wait included."""
         self._stamp_ns, self._busy_ms = stamp_ns, busy_ms
 
@@ -305,6 +309,6 @@ def latency(track_ms: ArrayLike, corrected_ms: ArrayLike) -> Latency:
     track = np.asarray(track_ms, np.float64)
     corrected = np.asarray(corrected_ms, np.float64)
     corrected = corrected[~np.isnan(corrected)]
-    over = float((track > NOTICED_MS).mean()) if track.size else math.nan
+    over = float((track > NOTICEABLE_LATENCY_MS).mean()) if track.size else math.nan
     both = np.concatenate([track, corrected])
     return Latency(summary(track), summary(corrected), summary(both), over)

@@ -15,7 +15,7 @@ from share.geometry.se3 import transform, umeyama
 from share.types import F64
 
 WINDOW_S = 5.0
-_LEAST = 10  # poses; and no less than half the window
+_MIN_POSES = 10  # poses; and no less than half the window
 
 
 class LocalError:
@@ -23,22 +23,22 @@ class LocalError:
 
     def __init__(self, truth: Trajectory, window_s: float = WINDOW_S) -> None:
         self._truth, self._window_ns = truth, round(window_s * 1e9)
-        self._seen: deque[tuple[int, F64, F64]] = deque()  # stamp, position told, position in truth
+        self._window: deque[tuple[int, F64, F64]] = deque()  # stamp, position told, position in truth
 
-    def after(self, stamp_ns: int, T_odom_body: F64 | None, new_stretch: bool = False) -> float | None:
+    def update(self, stamp_ns: int, T_odom_body: F64 | None, new_segment: bool = False) -> float | None:
         """cm, after another frame. None without a pose or a truth now, or where there are too few of late."""
-        if new_stretch:
-            self._seen.clear()
-        while self._seen and self._seen[0][0] < stamp_ns - self._window_ns:
-            self._seen.popleft()
+        if new_segment:
+            self._window.clear()
+        while self._window and self._window[0][0] < stamp_ns - self._window_ns:
+            self._window.popleft()
         if T_odom_body is None:
             return None
-        known, T_truth = interpolate(*self._truth, np.array([stamp_ns]))
-        if not known[0]:
+        has_truth, T_truth = interpolate(*self._truth, np.array([stamp_ns]))
+        if not has_truth[0]:
             return None
-        self._seen.append((stamp_ns, T_odom_body[:3, 3], T_truth[0, :3, 3]))
-        if len(self._seen) < _LEAST or stamp_ns - self._seen[0][0] < self._window_ns // 2:
+        self._window.append((stamp_ns, T_odom_body[:3, 3], T_truth[0, :3, 3]))
+        if len(self._window) < _MIN_POSES or stamp_ns - self._window[0][0] < self._window_ns // 2:
             return None
-        told, true = (np.array([seen[i] for seen in self._seen]) for i in (1, 2))
-        off = transform(umeyama(told, true), told) - true
-        return 100 * float(np.sqrt((off**2).sum(1).mean()))
+        estimated, actual = (np.array([entry[i] for entry in self._window]) for i in (1, 2))
+        residuals = transform(umeyama(estimated, actual), estimated) - actual
+        return 100 * float(np.sqrt((residuals**2).sum(1).mean()))

@@ -12,8 +12,8 @@ import numpy as np
 
 from share.errors import DataError
 from share.geometry.interpolation import MAX_GAP_NS, Trajectory, associate
-from share.geometry.se3 import angle, inverse
-from share.metrics.ate import Spread, spread
+from share.geometry.se3 import inverse, rotation_angle
+from share.metrics.ate import ErrorStatistics, error_statistics
 from share.types import F64, I64
 
 
@@ -21,8 +21,8 @@ from share.types import F64, I64
 class Rpe:
     """translation in m, rotation in rad, over the same pairs of poses."""
 
-    translation: Spread
-    rotation: Spread
+    translation: ErrorStatistics
+    rotation: ErrorStatistics
 
 
 def rpe_frames(
@@ -56,17 +56,17 @@ def rpe_time(
     return _rpe(T_est, T_truth, i, j[i], f"over {delta_ns / 1e9:g} s")
 
 
-def _nearest(stamps: I64, at: I64) -> I64:
-    right = np.searchsorted(stamps, at).clip(0, len(stamps) - 1)
+def _nearest(stamps: I64, queries_ns: I64) -> I64:
+    right = np.searchsorted(stamps, queries_ns).clip(0, len(stamps) - 1)
     left = (right - 1).clip(0)
-    out: I64 = np.where(np.abs(stamps[left] - at) <= np.abs(stamps[right] - at), left, right)
+    out: I64 = np.where(np.abs(stamps[left] - queries_ns) <= np.abs(stamps[right] - queries_ns), left, right)
     return out
 
 
-def _rpe(T_est: F64, T_truth: F64, i: I64, j: I64, what: str) -> Rpe:
+def _rpe(T_est: F64, T_truth: F64, i: I64, j: I64, label: str) -> Rpe:
     if len(i) == 0:
-        raise DataError(f"RPE {what}: no pair of poses of the estimate has a truth at both times")
+        raise DataError(f"RPE {label}: no pair of poses of the estimate has a truth at both times")
     moved_est = inverse(T_est[i]) @ T_est[j]
     moved_truth = inverse(T_truth[i]) @ T_truth[j]
     E = inverse(moved_truth) @ moved_est
-    return Rpe(spread(np.linalg.norm(E[:, :3, 3], axis=1)), spread(angle(E)))
+    return Rpe(error_statistics(np.linalg.norm(E[:, :3, 3], axis=1)), error_statistics(rotation_angle(E)))

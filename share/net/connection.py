@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 
 from share.net import tcp
-from share.net.account import Account
+from share.net.backlog import Backlog
 
 
 @dataclass(eq=False)
@@ -18,35 +18,36 @@ class Connection:
     descriptor: int
     cookie: int
     address: str
-    account: Account
-    sure: bool
+    backlog: Backlog
+    is_unambiguous: bool
     key: str = ""
-    is_cut: bool = False
+    is_aborted: bool = False
     is_held: bool = False
 
     @property
-    def strange(self) -> bool:
-        return self.account.messages == 0
+    def is_unidentified(self) -> bool:
+        return self.backlog.message_count == 0
 
     @property
     def name(self) -> str:
         return f"the key '{self.key}'" if self.key else self.address
 
-    def culprit(self, homes: Container[str]) -> str | None:
-        """Whom to keep out: the key, if it is known; the address, unless agents live there (`homes`)."""
+    def block_target(self, agent_addresses: Container[str]) -> str | None:
+        """Whom to keep out: the key, if it is known; the address, unless agents live there
+        (`agent_addresses`)."""
         if self.key:
             return self.key
         local = ip_address(self.address.partition("%")[0]).is_loopback
-        return None if local or self.address in homes else self.address
+        return None if local or self.address in agent_addresses else self.address
 
-    def sample(self) -> bool:
+    def update_backlog(self) -> bool:
         """Notes how much libzmq has read; False where the connection is no longer there."""
-        same = tcp.cookie(self.descriptor) == self.cookie
+        same = tcp.socket_cookie(self.descriptor) == self.cookie
         read = tcp.bytes_read(self.descriptor) if same else None
         if read is not None:
-            self.account.sample(*read)
+            self.backlog.update_read(*read)
         return read is not None
 
-    def cut(self) -> bool:
+    def abort(self) -> bool:
         """Breaks it off. Whether it was there."""
-        return tcp.cut(self.descriptor, self.cookie)
+        return tcp.abort(self.descriptor, self.cookie)

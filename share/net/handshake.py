@@ -10,7 +10,7 @@ import zmq
 from zmq.utils import z85
 from zmq.utils.monitor import recv_monitor_message
 
-from share.net.guard import Guard
+from share.net.connection_guard import ConnectionGuard
 from share.net.keys import EdgeKeys
 
 # ---- How handshakes end: what libzmq's monitor tells of a socket (zmq_socket_monitor).
@@ -18,20 +18,20 @@ from share.net.keys import EdgeKeys
 _MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
 
 
-class Outcome(Enum):
+class HandshakeOutcome(Enum):
     CONNECTED = "connected"  # the handshake begins
     DISCONNECTED = "disconnected"
-    JOINED = "joined"
+    SUCCEEDED = "joined"
     UNKNOWN_KEY = "unknown key"  # the edge does not let this key in
     NO_KEYS = "no keys"  # one side uses keys, the other none, and libzmq could tell
     BROKEN_OFF = "broken off"  # by the other side, which says no more
 
 
-class Handshakes:
+class HandshakeMonitor:
     """The outcomes of one socket's handshakes, as they happen. descriptor: of its newest connection."""
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
-        self._monitored = socket
+        self._socket = socket
         self.descriptor: int | None = None
         self.events: zmq.Socket[bytes] = socket.get_monitor_socket(
             zmq.EVENT_CONNECTED
@@ -42,7 +42,7 @@ class Handshakes:
             | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
         )
 
-    def next(self) -> Outcome | None:
+    def next_outcome(self) -> HandshakeOutcome | None:
         """None: nothing has happened since."""
         try:
             event = recv_monitor_message(self.events, zmq.NOBLOCK)
@@ -50,18 +50,20 @@ class Handshakes:
             return None
         if event["event"] == zmq.EVENT_CONNECTED:
             self.descriptor = int(event["value"])
-            return Outcome.CONNECTED
+            return HandshakeOutcome.CONNECTED
         if event["event"] == zmq.EVENT_DISCONNECTED:
-            return Outcome.DISCONNECTED
+            return HandshakeOutcome.DISCONNECTED
         if event["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-            return Outcome.JOINED
+            return HandshakeOutcome.SUCCEEDED
         if event["event"] == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-            return Outcome.UNKNOWN_KEY
-        return Outcome.NO_KEYS if event["value"] == _MECHANISM_MISMATCH else Outcome.BROKEN_OFF
+            return HandshakeOutcome.UNKNOWN_KEY
+        return (
+            HandshakeOutcome.NO_KEYS if event["value"] == _MECHANISM_MISMATCH else HandshakeOutcome.BROKEN_OFF
+        )
 
     def close(self) -> None:
         """Before the socket itself is closed."""
-        self._monitored.disable_monitor()
+        self._socket.disable_monitor()
         self.events.close(linger=0)
 
 
@@ -69,7 +71,7 @@ _ENDPOINT = "inproc://zeromq.zap.01"
 _DOMAIN = b"share"
 
 
-class Doorkeeper:
+class ZapAuthenticator:
     """Makes `socket` a CURVE server and answers for each handshake whether that key may come in.
 
     A thread of its own, so that agents connect also while the edge is busy. It ends by itself when the
@@ -77,12 +79,16 @@ class Doorkeeper:
     """
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], socket: zmq.Socket[bytes], keys: EdgeKeys, guard: Guard
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        socket: zmq.Socket[bytes],
+        keys: EdgeKeys,
+        guard: ConnectionGuard,
     ) -> None:
         self._guard = guard
         self._refusals: deque[str] = deque(maxlen=128)
         self._allowed = keys.allowed
-        self._inside: set[str] = set()  # keys let in so far
+        self._admitted_keys: set[str] = set()  # keys let in so far
         socket.setsockopt(zmq.CURVE_SERVER, 1)
         socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
         socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN)
@@ -92,14 +98,14 @@ class Doorkeeper:
         self._thread = Thread(target=self._serve, name="doorkeeper", daemon=True)
         self._thread.start()
 
-    def revoked(self) -> bool:
+    def has_revoked(self) -> bool:
         """Whether someone who was let in may not be here any more."""
-        return not all(self._allowed.admits(key) for key in tuple(self._inside))
+        return not all(self._allowed.is_allowed(key) for key in tuple(self._admitted_keys))
 
     def trouble(self) -> str | None:
         """Why nobody is let in, for a person; None where the list can be read."""
-        wrong = self._allowed.trouble()
-        return None if wrong is None else f"nobody is let in: {wrong}"
+        list_trouble = self._allowed.trouble()
+        return None if list_trouble is None else f"nobody is let in: {list_trouble}"
 
     def refusals(self) -> list[str]:
         """A line for each since the last call."""
@@ -119,10 +125,10 @@ class Doorkeeper:
     def _answer(self, request: list[bytes]) -> list[bytes]:
         version, number, _domain, address, _identity, _mechanism, credentials = request
         key = z85.encode(credentials).decode()
-        if self._allowed.admits(key):
-            if not self._guard.admits(key, address.decode()):  # 300: for now, so libzmq goes on trying
+        if self._allowed.is_allowed(key):
+            if not self._guard.admit(key, address.decode()):  # 300: for now, so libzmq goes on trying
                 return [version, number, b"300", b"kept out", b"", b""]
-            self._inside.add(key)  # a revocation since then is seen by the next `revoked`
+            self._admitted_keys.add(key)  # a revocation since then is seen by the next `has_revoked`
             return [version, number, b"200", b"", key.encode(), b""]
         self._refusals.append(
             self.trouble()

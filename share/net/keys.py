@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from share.errors import UsageError
-from share.files.reading import KEYS, read_text
-from share.files.writing import atomic_write, writing, xdg_folder
+from share.files.reading import MAX_KEYS_BYTES, read_text
+from share.files.writing import atomic_write, write_errors, xdg_folder
 
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
 _Z85 = r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}"
-_LIST = "authorized"
+_LIST_FILE = "authorized"
 _LINE = re.compile(rf"share-(public|secret)-key ({_NAME}) ({_Z85})((?: {_NAME})*)")
 
 
@@ -62,13 +62,13 @@ class AllowList:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._read: tuple[tuple[int, ...], dict[str, Grant]] = (), {}
+        self._cached: tuple[tuple[int, ...], dict[str, Grant]] = (), {}
 
-    def names(self) -> dict[str, str]:
+    def names_by_key(self) -> dict[str, str]:
         """Name by public key. Raises UsageError if the file cannot be read or has another form."""
         return {key: grant.name for key, grant in self.grants().items()}
 
-    def agents(self, public: str) -> frozenset[str]:
+    def agents_for(self, public: str) -> frozenset[str]:
         """Names of the agents that this key may speak for; none while the file cannot be read."""
         try:
             grant = self.grants().get(public)
@@ -84,13 +84,13 @@ class AllowList:
             return {}
         except OSError as error:
             raise UsageError(f"{self.path}: cannot be read: {error.strerror}") from None
-        _check_guarded(self.path, status)
+        _check_not_world_writable(self.path, status)
         state = (status.st_mtime_ns, status.st_ino, status.st_size)
-        if state != self._read[0]:
-            self._read = state, self._parsed()
-        return self._read[1]
+        if state != self._cached[0]:
+            self._cached = state, self._parse()
+        return self._cached[1]
 
-    def admits(self, public: str) -> bool:
+    def is_allowed(self, public: str) -> bool:
         """Whether that key may connect. Nobody may while the file cannot be read."""
         try:
             return public in self.grants()
@@ -105,8 +105,8 @@ class AllowList:
             return str(error)
         return None
 
-    def _parsed(self) -> dict[str, Grant]:
-        return {line.key: Grant(line.name, line.agents) for line in _lines(self.path) if line.key}
+    def _parse(self) -> dict[str, Grant]:
+        return {line.key: Grant(line.name, line.agents) for line in _read_lines(self.path) if line.key}
 
 
 class Grant(NamedTuple):
@@ -116,7 +116,7 @@ class Grant(NamedTuple):
     agents: tuple[str, ...]
 
 
-class _Line(NamedTuple):
+class _ListLine(NamedTuple):
     """Of the list, with its end. name and key are empty for a comment."""
 
     text: str
@@ -130,45 +130,47 @@ def default_folder() -> Path:
     return xdg_folder("XDG_CONFIG_HOME", ".config") / "share" / "keys"
 
 
-def generate(folder: Path, name: str | None = None) -> KeyPair:
+def generate_pair(folder: Path, name: str | None = None) -> KeyPair:
     """A new pair in `folder`, named after this machine unless `name` is given. Raises UsageError, also
     if there is a pair already: it is never replaced."""
     import zmq
 
-    name = _checked(name or re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()).strip("-")[:64] or "share")
-    _make(folder)
+    name = _checked_name(
+        name or re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()).strip("-")[:64] or "share"
+    )
+    _make_folder(folder)
     with _locked(folder):
-        if old := _secrets(folder):
+        if old := _secret_files(folder):
             raise UsageError(f"{old[0]}: there is a key pair already; give another folder with --keys")
         public, secret = b"-", b""
         while not public[:1].isalnum():  # or a shell command could take the key for an option
             public, secret = zmq.curve_keypair()
         pair = KeyPair(name, public.decode(), secret.decode())
         _write_secret(folder / f"{name}.secret", f"share-secret-key {name} {pair.secret}\n")
-        atomic_write(folder / f"{name}.public", _line(name, pair.public))
+        atomic_write(folder / f"{name}.public", _format_line(name, pair.public))
     return pair
 
 
 def has_pair(folder: Path) -> bool:
     """Raises UsageError where it cannot be looked into."""
-    return bool(_secrets(folder))
+    return bool(_secret_files(folder))
 
 
-def load(folder: Path) -> KeyPair:
+def load_pair(folder: Path) -> KeyPair:
     """The pair in `folder`. Raises UsageError if there is none or not just one, or others can read it."""
     import zmq
 
-    found = _secrets(folder)
-    if not found:
+    secrets = _secret_files(folder)
+    if not secrets:
         where = "" if folder == default_folder() else f" --keys {folder}"
         raise UsageError(f"{folder}: has no key pair; make one with `share keys generate{where}`")
-    if len(found) > 1:
-        raise UsageError(f"{folder}: has {len(found)} key pairs; keep one in each folder")
-    path = found[0]
-    _check_guarded(folder, folder.stat())
+    if len(secrets) > 1:
+        raise UsageError(f"{folder}: has {len(secrets)} key pairs; keep one in each folder")
+    path = secrets[0]
+    _check_not_world_writable(folder, folder.stat())
     if path.stat().st_mode & 0o077:
         raise UsageError(f"{path}: others can read this secret; `chmod 600 {path}`, or make a new pair")
-    match = _LINE.fullmatch(_text(path).strip())
+    match = _LINE.fullmatch(_read_text(path).strip())
     if not match or match[1] != "secret" or not _is_key(match[3]) or match[4]:
         raise UsageError(
             f"{path}: is not a secret key of SHARE; move it away, then `share keys generate` makes a new pair"
@@ -176,73 +178,75 @@ def load(folder: Path) -> KeyPair:
     return KeyPair(match[2], zmq.curve_public(match[3].encode()).decode(), match[3])
 
 
-def public_key(given: str) -> str:
-    """The key in the file `given`, or `given` itself, if it is one. Raises UsageError."""
-    if re.fullmatch(_Z85, given) and _is_key(given):
-        return given
-    if given.startswith("share-"):
-        return _public(given, "what was given")[1]
-    path = Path(given)
+def public_key(key_or_path: str) -> str:
+    """The key in the file `key_or_path`, or `key_or_path` itself, if it is one. Raises UsageError."""
+    if re.fullmatch(_Z85, key_or_path) and _is_key(key_or_path):
+        return key_or_path
+    if key_or_path.startswith("share-"):
+        return _parse_public_line(key_or_path, "what was given")[1]
+    path = Path(key_or_path)
     if not _is_file(path):
-        raise UsageError(f"'{given:.60}': neither a file nor a public key (40 characters, in single quotes)")
-    return _public(_text(path).strip(), given)[1]
+        raise UsageError(
+            f"'{key_or_path:.60}': neither a file nor a public key (40 characters, in single quotes)"
+        )
+    return _parse_public_line(_read_text(path).strip(), key_or_path)[1]
 
 
 def allow_list(folder: Path) -> AllowList:
-    return AllowList(folder / _LIST)
+    return AllowList(folder / _LIST_FILE)
 
 
 def authorize(folder: Path, name: str, public: str, agents: Sequence[str] = ()) -> None:
-    """Let the machine `name` in, to speak for `agents` (default: the one agent called `name`), in place of
-    those it could speak for before. Raises UsageError if the name or the key is taken, or the list is
+    """Let the machine `name` in, to speak for `agents_for` (default: the one agent called `name`), in place
+    of those it could speak for before. Raises UsageError if the name or the key is taken, or the list is
     damaged."""
-    name, agents = _checked(name), [_checked(agent) for agent in agents]
-    line = _line(name, public, agents)
-    _make(folder)
+    name, agents = _checked_name(name), [_checked_name(agent) for agent in agents]
+    line = _format_line(name, public, agents)
+    _make_folder(folder)
     with _locked(folder):
-        names = dict(allow_list(folder).names())
+        names = dict(allow_list(folder).names_by_key())
         if names.get(public, name) != name:
             raise UsageError(f"'{name}': this key is authorized already, as '{names[public]}'")
         if name in names.values() and public not in names:
             raise UsageError(f"'{name}' has another key; `share keys revoke {name}` takes that away first")
-        lines = _lines(folder / _LIST)
+        lines = _read_lines(folder / _LIST_FILE)
         if public not in names:
-            _save(folder, [*lines, _Line(line)])
+            _write_list(folder, [*lines, _ListLine(line)])
         elif agents:
-            _save(folder, [old._replace(text=line) if old.key == public else old for old in lines])
+            _write_list(folder, [old._replace(text=line) if old.key == public else old for old in lines])
 
 
 def revoke(folder: Path, name: str) -> None:
     """Let it in no more, by any of its keys. Raises UsageError if there is none of that name, or the list is
     damaged."""
-    if not (folder / _LIST).exists():
+    if not (folder / _LIST_FILE).exists():
         raise UsageError(f"'{name}' is not authorized; there is nobody")
     with _locked(folder):
-        lines = _lines(folder / _LIST)
+        lines = _read_lines(folder / _LIST_FILE)
         keys = {line.key for line in lines if line.key and line.name == name}
         if not keys:
             others = ", ".join(dict.fromkeys(line.name for line in lines if line.key))
             raise UsageError(f"'{name}' is not authorized; there is {others or 'nobody'}")
-        _save(folder, [line for line in lines if line.key not in keys])  # also under another name
+        _write_list(folder, [line for line in lines if line.key not in keys])  # also under another name
 
 
 def agent_keys(folder: Path | None, edge: str) -> AgentKeys:
     """folder: of the agent's own pair, None for the default one; edge: see `public_key`."""
-    return AgentKeys(load(folder or default_folder()), public_key(edge))
+    return AgentKeys(load_pair(folder or default_folder()), public_key(edge))
 
 
 def edge_keys(folder: Path | None) -> EdgeKeys:
     """The keys in `folder`, None for the default one. Raises UsageError, also for a damaged list."""
     folder = folder or default_folder()
-    keys = EdgeKeys(load(folder), allow_list(folder))
-    keys.allowed.names()
+    keys = EdgeKeys(load_pair(folder), allow_list(folder))
+    keys.allowed.names_by_key()
     return keys
 
 
 # ---------------------------------------------------------------- files
 
 
-def _public(line: str, where: str) -> tuple[str, str]:
+def _parse_public_line(line: str, where: str) -> tuple[str, str]:
     """Name and key of a line. Raises UsageError."""
     match = _LINE.fullmatch(line.strip())
     if match and match[1] == "secret":
@@ -252,15 +256,15 @@ def _public(line: str, where: str) -> tuple[str, str]:
     return match[2], match[3]
 
 
-def _granted(line: str, where: str) -> tuple[str, str, tuple[str, ...]]:
+def _parse_grant_line(line: str, where: str) -> tuple[str, str, tuple[str, ...]]:
     """Name, key and agents of a line of the list. Raises UsageError."""
-    name, key = _public(line, where)
+    name, key = _parse_public_line(line, where)
     match = _LINE.fullmatch(line.strip())
     assert match is not None
     return name, key, tuple(match[4].split()) or (name,)
 
 
-def _line(name: str, public: str, agents: Sequence[str] = ()) -> str:
+def _format_line(name: str, public: str, agents: Sequence[str] = ()) -> str:
     return " ".join(("share-public-key", name, public, *agents)) + "\n"
 
 
@@ -274,21 +278,21 @@ def _is_key(text: str) -> bool:
         return False
 
 
-def _checked(name: str) -> str:
+def _checked_name(name: str) -> str:
     if not re.fullmatch(_NAME, name):
         raise UsageError(f"'{name}': a name has 1 to 64 letters, digits, '_', '-' or '.'")
     return name
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
-        return read_text(path, KEYS, "ascii")
+        return read_text(path, MAX_KEYS_BYTES, "ascii")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise UsageError(f"{path}: cannot be read: {reason}") from None
 
 
-def _secrets(folder: Path) -> list[Path]:
+def _secret_files(folder: Path) -> list[Path]:
     """None where there is no folder. Raises UsageError where it cannot be looked into."""
     try:
         names = os.listdir(folder)  # glob would find nothing where it may not look
@@ -299,27 +303,29 @@ def _secrets(folder: Path) -> list[Path]:
     return sorted(folder / name for name in names if name.endswith(".secret"))
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be made: {error.strerror}; give another --keys") from None
 
 
-def _lines(path: Path) -> list[_Line]:
+def _read_lines(path: Path) -> list[_ListLine]:
     """Of a list; none where there is no file. Raises UsageError."""
     if not path.exists():
         return []
-    found = []
-    for number, text in enumerate(_text(path).splitlines(), 1):
+    lines = []
+    for number, text in enumerate(_read_text(path).splitlines(), 1):
         comment = not text.strip() or text.startswith("#")
-        found.append(_Line(text + "\n", *(() if comment else _granted(text, f"{path}, line {number}"))))
-    return found
+        lines.append(
+            _ListLine(text + "\n", *(() if comment else _parse_grant_line(text, f"{path}, line {number}")))
+        )
+    return lines
 
 
-def _save(folder: Path, lines: Iterable[_Line]) -> None:
+def _write_list(folder: Path, lines: Iterable[_ListLine]) -> None:
     """Comments stay where they are."""
-    atomic_write(folder / _LIST, "".join(line.text for line in lines))
+    atomic_write(folder / _LIST_FILE, "".join(line.text for line in lines))
 
 
 def _is_file(path: Path) -> bool:
@@ -329,7 +335,7 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _check_guarded(path: Path, status: os.stat_result) -> None:
+def _check_not_world_writable(path: Path, status: os.stat_result) -> None:
     """Raises UsageError where anybody could let himself in."""
     if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
         raise UsageError(f"{path}: anybody may write to it; `chmod o-w {path}`")
@@ -337,7 +343,7 @@ def _check_guarded(path: Path, status: os.stat_result) -> None:
 
 def _write_secret(path: Path, text: str) -> None:
     """Nobody else can read it at any moment, and it replaces nothing."""
-    with writing(path):
+    with write_errors(path):
         handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
         try:
             with os.fdopen(handle, "w") as file:

@@ -13,17 +13,17 @@ from enum import IntEnum
 
 PACKET_BYTES = 48  # the header; extension fields and a MAC may follow
 SECOND_NS = 1_000_000_000
-KISS = 0  # the stratum of an answer that is a refusal
-UNSYNCHRONISED = 16  # the stratum of a server that does not know the time
+KISS_STRATUM = 0  # the stratum of an answer that is a refusal
+UNSYNCHRONISED_STRATUM = 16  # the stratum of a server that does not know the time
 LEAP_UNKNOWN = 3  # the leap indicator of such a server
 
-_UNIX_S = 2_208_988_800  # from 1900 to 1970
+_UNIX_EPOCH_S = 2_208_988_800  # from 1900 to 1970
 _ERA = 1 << 64
 _VERSIONS = (3, 4)  # clients of version 3 (RFC 1305, 2030) read the same header
 _LAYOUT = struct.Struct(">BBbbII4sQQQQ")
 
 
-class Mode(IntEnum):
+class NtpMode(IntEnum):
     """Who speaks (figure 10)."""
 
     RESERVED = 0
@@ -37,14 +37,14 @@ class Mode(IntEnum):
 
 
 @dataclass(frozen=True)
-class Packet:
+class NtpPacket:
     """The header, field by field (figure 8). Stamps are as they are sent; 0 is "unknown".
 
     poll, precision: log2 of seconds. root_delay, root_dispersion: 2^-16 s, from the server to what
     it has its time from. refid: what that is; of a KISS, four letters that say why (section 7.4).
     """
 
-    mode: Mode
+    mode: NtpMode
     version: int = 4
     leap: int = 0
     stratum: int = 0
@@ -71,7 +71,7 @@ class Packet:
             raise ValueError(f"a field does not fit: {error}") from None
 
     @classmethod
-    def decode(cls, data: bytes) -> Packet:
+    def decode(cls, data: bytes) -> NtpPacket:
         """What follows the header is not read. Raises ValueError with the reason."""
         if len(data) < PACKET_BYTES or len(data) % 4:
             raise ValueError(f"{len(data)} bytes; expected {PACKET_BYTES}, or more by whole words of 4")
@@ -79,12 +79,12 @@ class Packet:
         version = head >> 3 & 7
         if version not in _VERSIONS:
             raise ValueError(f"NTP version {version}; 3 and 4 are understood")
-        if stratum > UNSYNCHRONISED:
-            raise ValueError(f"stratum {stratum}; the most is {UNSYNCHRONISED}")
-        return cls(Mode(head & 7), version, head >> 6, stratum, poll, precision, *rest)
+        if stratum > UNSYNCHRONISED_STRATUM:
+            raise ValueError(f"stratum {stratum}; the most is {UNSYNCHRONISED_STRATUM}")
+        return cls(NtpMode(head & 7), version, head >> 6, stratum, poll, precision, *rest)
 
 
-def sent_at(packet: bytes, unix_ns: int) -> bytes:
+def with_transmit_time(packet: bytes, unix_ns: int) -> bytes:
     """An encoded packet with its transmit stamp put in, quicker than making it anew: what is done between
     reading the clock and sending is an error of the time that is told."""
     return packet[: PACKET_BYTES - 8] + to_stamp(unix_ns).to_bytes(8, "big")
@@ -92,7 +92,7 @@ def sent_at(packet: bytes, unix_ns: int) -> bytes:
 
 def to_stamp(unix_ns: int) -> int:
     """The stamp nearest to a time of any era; never 0, which would say "unknown"."""
-    return _fixed(unix_ns) % _ERA or 1
+    return _to_fixed_point(unix_ns) % _ERA or 1
 
 
 def from_stamp(stamp: int, near_ns: int) -> int:
@@ -100,16 +100,16 @@ def from_stamp(stamp: int, near_ns: int) -> int:
     years off. `from_stamp(to_stamp(t), near_ns)` is t. Raises ValueError for 0."""
     if stamp == 0:
         raise ValueError("a time stamp is 0, which is to say unknown")
-    near = _fixed(near_ns)
+    near = _to_fixed_point(near_ns)
     ahead = (stamp - near + _ERA // 2) % _ERA - _ERA // 2
     seconds, fraction = divmod(near + ahead, 1 << 32)
-    return (seconds - _UNIX_S) * SECOND_NS + ((fraction * SECOND_NS + (1 << 31)) >> 32)
+    return (seconds - _UNIX_EPOCH_S) * SECOND_NS + ((fraction * SECOND_NS + (1 << 31)) >> 32)
 
 
-def _fixed(unix_ns: int) -> int:
+def _to_fixed_point(unix_ns: int) -> int:
     """Since 1900 in 2^-32 s, without an end."""
     seconds, rest_ns = divmod(unix_ns, SECOND_NS)
-    return ((seconds + _UNIX_S) << 32) + ((rest_ns << 32) + SECOND_NS // 2) // SECOND_NS
+    return ((seconds + _UNIX_EPOCH_S) << 32) + ((rest_ns << 32) + SECOND_NS // 2) // SECOND_NS
 
 
 def short_ns(short: int) -> int:

@@ -38,7 +38,7 @@ class AgentLink(Protocol):
         """Why the edge did not let us in, and what to do, or why we left it; None if neither."""
         ...
 
-    def connected(self) -> bool:
+    def poll_connected(self) -> bool:
         """Whether it has reached an edge, once for each time."""
         ...
 
@@ -52,7 +52,7 @@ class AgentLink(Protocol):
 
 
 @dataclass(frozen=True)
-class Arrival:
+class IncomingMessage:
     """A message at the edge. peer: its sender's 8-byte id; key: that sender's CURVE public key in Z85, ""
     without keys."""
 
@@ -73,11 +73,11 @@ class EdgeLink(Protocol):
         """Whether the message was taken; False if the peer is not connected or its queue is full."""
         ...
 
-    def receive(self, timeout_ms: int) -> Arrival | None:
+    def receive(self, timeout_ms: int) -> IncomingMessage | None:
         """The next message and who sent it; None after `timeout_ms`, or at once if woken."""
         ...
 
-    def names(self, key: str) -> frozenset[str] | None:
+    def agent_names(self, key: str) -> frozenset[str] | None:
         """Of the agents that the owner of this key may speak for; None where no keys are used."""
         ...
 
@@ -134,13 +134,13 @@ def parse_address(text: str, bind: bool = False) -> Address:
 def bind_error(target: object, number: int | None, text: str, other: str = "edge") -> TransportError:
     """Why nothing can listen at `target`: errno `number`, which the system calls `text`. other: who may
     have the port."""
-    mend = {
+    fixes = {
         errno.EADDRINUSE: f"the port is in use; stop the other {other} or choose another port",
         errno.EACCES: "this port needs root; choose one above 1023",
         errno.EADDRNOTAVAIL: "this machine has no such address",
         errno.ENODEV: "this machine has no such address",
     }
-    return TransportError(f"{target}: {mend.get(number or 0, f'cannot be bound: {text}')}")
+    return TransportError(f"{target}: {fixes.get(number or 0, f'cannot be bound: {text}')}")
 
 
 def check_keys(target: Address, keys: AgentKeys | EdgeKeys | None) -> Address:

@@ -17,7 +17,7 @@ from typing import Any
 from share.errors import UsageError
 from share.net.transport import bind_error
 
-MAX_BYTES = 2048  # of a datagram; longer ones are cut off
+MAX_DATAGRAM_BYTES = 2048  # of a datagram; longer ones are cut off
 _TIMESTAMPNS = (
     35  # SO_TIMESTAMPNS of asm-generic/socket.h, the same on x86 and ARM; Python has no name for it
 )
@@ -26,7 +26,7 @@ _ADDRESS = re.compile(r"(?:\[([0-9A-Fa-f:.%\w]+)\]|([A-Za-z0-9_.-]+))(?::(\d{1,5
 
 
 @dataclass(frozen=True)
-class Host:
+class HostPort:
     """Where a UDP socket is."""
 
     name: str
@@ -46,40 +46,40 @@ class Datagram:
 
 
 class StampedSocket:
-    """One socket; `by_kernel` says whose stamps its datagrams have."""
+    """One socket; `has_kernel_stamps` says whose stamps its datagrams have."""
 
     def __init__(self, family: int) -> None:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self.by_kernel = False
+        self.has_kernel_stamps = False
         if sys.platform == "linux":
             with contextlib.suppress(OSError):
                 self._socket.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
-                self.by_kernel = True
+                self.has_kernel_stamps = True
 
     @classmethod
-    def bound(cls, host: Host) -> StampedSocket:
+    def bind(cls, host: HostPort) -> StampedSocket:
         """Raises UsageError for a host that is unknown, TransportError where nobody can listen."""
         family, target = resolve(host)
-        made = cls(family)
+        bound_socket = cls(family)
         try:
-            made._socket.bind(target)
+            bound_socket._socket.bind(target)
         except OSError as error:
-            made.close()
+            bound_socket.close()
             raise bind_error(host, error.errno, error.strerror or str(error), "server") from None
-        return made
+        return bound_socket
 
     @classmethod
-    def connected(cls, host: Host) -> StampedSocket:
+    def connect(cls, host: HostPort) -> StampedSocket:
         """Hears that host only. Raises UsageError for one that is unknown, OSError for one without a way."""
         family, target = resolve(host)
-        made = cls(family)
+        connected_socket = cls(family)
         try:
-            made._socket.connect(target)
+            connected_socket._socket.connect(target)
         except OSError:
-            made.close()
+            connected_socket.close()
             raise
-        return made
+        return connected_socket
 
     @property
     def port(self) -> int:
@@ -99,17 +99,17 @@ class StampedSocket:
         if not select.select([self._socket], [], [], max(0.0, timeout_s))[0]:
             return None
         try:
-            data, extra, _, source = self._socket.recvmsg(MAX_BYTES, 64)
+            data, extra, _, source = self._socket.recvmsg(MAX_DATAGRAM_BYTES, 64)
         except BlockingIOError:  # a damaged one, which the kernel threw away
             return None
-        return Datagram(data, source, _kernel_ns(extra) or time.time_ns())
+        return Datagram(data, source, _kernel_stamp_ns(extra) or time.time_ns())
 
     def close(self) -> None:
         """May be repeated."""
         self._socket.close()
 
 
-def _kernel_ns(extra: list[tuple[int, int, bytes]]) -> int | None:
+def _kernel_stamp_ns(extra: list[tuple[int, int, bytes]]) -> int | None:
     for level, kind, data in extra:
         if (level, kind, len(data)) == (socket.SOL_SOCKET, _TIMESTAMPNS, _TIMESPEC.size):
             seconds, rest_ns = _TIMESPEC.unpack(data)
@@ -117,7 +117,7 @@ def _kernel_ns(extra: list[tuple[int, int, bytes]]) -> int | None:
     return None
 
 
-def parse_host(text: str, default_port: int, bind: bool = False) -> Host:
+def parse_host(text: str, default_port: int, bind: bool = False) -> HostPort:
     """HOST, HOST:PORT, [IPV6] or [IPV6]:PORT. Raises UsageError."""
     match = _ADDRESS.fullmatch(text)
     port = int(match[3]) if match and match[3] else default_port
@@ -126,21 +126,21 @@ def parse_host(text: str, default_port: int, bind: bool = False) -> Host:
             f"'{text}' is no address; give HOST or HOST:PORT, such as 192.168.1.10:{default_port}"
         )
     name = match[1] or match[2]
-    return Host("127.0.0.1" if name == "localhost" else name, port)
+    return HostPort("127.0.0.1" if name == "localhost" else name, port)
 
 
-def resolve(host: Host) -> tuple[int, Any]:
+def resolve(host: HostPort) -> tuple[int, Any]:
     """Family and socket address. Raises UsageError where nobody knows that host."""
     try:
-        found = socket.getaddrinfo(host.name, host.port, type=socket.SOCK_DGRAM)
+        candidates = socket.getaddrinfo(host.name, host.port, type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UsageError(f"{host.name}: no such host ({reason}); give its name or IP address") from None
-    return found[0][0], found[0][4]
+    return candidates[0][0], candidates[0][4]
 
 
 def clock_precision() -> int:
     """How long it takes to read this machine's clock, as log2 of s (RFC 5905, section 7.3)."""
     readings = [time.time_ns() for _ in range(200)]
-    least_ns = min((b - a for a, b in pairwise(readings) if b > a), default=1_000_000)
-    return math.ceil(math.log2(least_ns * 1e-9))
+    min_step_ns = min((b - a for a, b in pairwise(readings) if b > a), default=1_000_000)
+    return math.ceil(math.log2(min_step_ns * 1e-9))

@@ -14,35 +14,37 @@ from functools import partial
 import zmq
 
 from share.errors import TransportError, UsageError
-from share.net.account import Bounds, wire_bytes
-from share.net.edge_watch import EdgeWatch
-from share.net.gate import KeepOut
-from share.net.guard import Guard
-from share.net.handshake import Doorkeeper, Handshakes, Outcome
+from share.net.agent_guard import AgentConnectionGuard
+from share.net.backlog import BacklogLimits, wire_bytes
+from share.net.connection_gate import Blocklist
+from share.net.connection_guard import ConnectionGuard
+from share.net.handshake import HandshakeMonitor, HandshakeOutcome, ZapAuthenticator
 from share.net.keys import AgentKeys, EdgeKeys
 from share.net.transport import (
     LINGER_MS,
     QUEUE_MESSAGES,
     Address,
-    Arrival,
+    IncomingMessage,
     bind_error,
     check_keys,
     parse_address,
 )
-from share.rates import Backoff
+from share.timing import Backoff
 from share.wire.codec import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
-from share.wire.messages import PEER_BYTES, peer_id
+from share.wire.messages import PEER_ID_BYTES, peer_id
 
 _MAX_PARTS = 2 + MAX_ARRAYS  # peer, header, arrays; parts beyond are read and thrown away
-_SLICE = 2000  # of these, in one call: 3 ms
+_SKIPPED_PARTS_PER_CALL = 2000  # of these, in one call: 3 ms
 _WAKE, _POKE = b"w", b"p"
-_REFUSALS = 128  # lines at a time
-_IN_VAIN = 2000  # messages of strangers, or of who was cut off, in one call
-_LIST_S = 0.1  # so old is what the edge knows of its list; a look at each message was a quarter of its work
-_LOOK_MS = 20  # how often an agent looks how much of its edge waits
-_WELL_S = 10.0  # an edge that has been connected so long does not send too much
-_REDIAL_S = 1.0  # after a handshake that failed, or a connection; libzmq gives up where it was wrong ZMTP
-_COMMON: dict[int, int] = {
+_MAX_REFUSALS = 128  # lines at a time
+_MAX_DISCARDED_PER_CALL = 2000  # messages of strangers, or of who was cut off, in one call
+_LIST_REFRESH_S = (
+    0.1  # so old is what the edge knows of its list; a look at each message was a quarter of its work
+)
+_BACKLOG_CHECK_MS = 20  # how often an agent looks how much of its edge waits
+_FORGIVE_S = 10.0  # an edge that has been connected so long does not send too much
+_RECONNECT_S = 1.0  # after a handshake that failed, or a connection; libzmq gives up where it was wrong ZMTP
+_COMMON_OPTIONS: dict[int, int] = {
     zmq.LINGER: LINGER_MS,
     zmq.SNDHWM: QUEUE_MESSAGES,
     zmq.RCVHWM: 0,  # see ZmqEdgeLink: an edge that resets while a full queue stops the input ends an agent
@@ -52,9 +54,11 @@ _COMMON: dict[int, int] = {
     zmq.HEARTBEAT_TIMEOUT: 2000,
     zmq.HEARTBEAT_TTL: 2000,
 }
-_SEAL_BYTES = 33  # libzmq measures the sealed frame: name and nonce 16, authenticator 16, flags 1 byte
-_SEALED: dict[int, int] = {zmq.MAXMSGSIZE: MAX_FRAME_BYTES + _SEAL_BYTES}
-_DEALER: dict[int, int] = {
+_CURVE_OVERHEAD_BYTES = (
+    33  # libzmq measures the sealed frame: name and nonce 16, authenticator 16, flags 1 byte
+)
+_CURVE_OPTIONS: dict[int, int] = {zmq.MAXMSGSIZE: MAX_FRAME_BYTES + _CURVE_OVERHEAD_BYTES}
+_DEALER_OPTIONS: dict[int, int] = {
     zmq.IMMEDIATE: 1,  # nothing queues for an edge that is not there
     zmq.RECONNECT_IVL: 100,
     zmq.RECONNECT_IVL_MAX: 400,
@@ -62,7 +66,7 @@ _DEALER: dict[int, int] = {
     zmq.SNDBUF: 256 * 1024,  # on a slow network poses must not grow old in the kernel
     zmq.RCVBUF: 256 * 1024,  # an edge sends little; the kernel would take up to 32 MB of it
 }
-_ROUTER: dict[int, int] = {
+_ROUTER_OPTIONS: dict[int, int] = {
     zmq.ROUTER_MANDATORY: 1,  # sending to a peer that is gone is an error, not silence
     # An agent that comes back over another network takes over from its own half-open connection;
     # without this, libzmq would never route to it again. Ids are 64 random bits.
@@ -78,7 +82,9 @@ _ROUTER: dict[int, int] = {
     zmq.TCP_KEEPALIVE_CNT: 2,
     zmq.SNDBUF: 256 * 1024,  # of a peer that reads nothing
 }
-_RECEIVED_BYTES = 256 * 1024  # in the kernel, of a connection: else up to 32 MB; images need more than that
+_RECEIVE_BUFFER_BYTES = (
+    256 * 1024
+)  # in the kernel, of a connection: else up to 32 MB; images need more than that
 
 
 class _Socket:
@@ -87,7 +93,7 @@ class _Socket:
     def __init__(self, kind: int, options: dict[int, int], target: Address) -> None:
         self.context = zmq.Context()
         self.socket: zmq.Socket[bytes] = self.context.socket(kind)
-        for option, value in (_COMMON | options).items():
+        for option, value in (_COMMON_OPTIONS | options).items():
             self.socket.setsockopt(option, value)
         self.socket.setsockopt(zmq.IPV6, ":" in target.host)
         self._wake_reader, self._wake_writer = socket.socketpair()
@@ -96,8 +102,8 @@ class _Socket:
         self._poller = zmq.Poller()
         self._poller.register(self.socket, zmq.POLLIN)
         self._poller.register(self._wake_reader, zmq.POLLIN)
-        self._too_long = False  # what comes next are parts of a message that has too many
-        self.empty_s = 0.0  # when it was last asked for a message and there was none
+        self._is_skipping = False  # what comes next are parts of a message that has too many
+        self.last_empty_s = 0.0  # when it was last asked for a message and there was none
 
     def send(self, frames: Sequence[Bytes]) -> bool:
         try:
@@ -110,35 +116,35 @@ class _Socket:
 
     def wait(self, timeout_ms: int) -> bytes:
         """Until there is something to receive, or it is woken; by what it was."""
-        ready = dict(self._poller.poll(0 if self._too_long else timeout_ms))
+        ready = dict(self._poller.poll(0 if self._is_skipping else timeout_ms))
         return self._wake_reader.recv(4096) if self._wake_reader.fileno() in ready else b""
 
     def receive_now(self) -> list[zmq.Frame] | None:
         """The next message. Of one with too many parts one too many stays, so that it is refused."""
         asked_s = time.monotonic()
-        if self._too_long and not self._skip():
+        if self._is_skipping and not self._skip_parts():
             return None
         parts: list[zmq.Frame] = []
         try:
             while not parts or (parts[-1].more and len(parts) <= _MAX_PARTS):
                 parts.append(self.socket.recv(zmq.NOBLOCK, copy=False))
         except zmq.Again:
-            self.empty_s = asked_s
+            self.last_empty_s = asked_s
             return None
-        self._too_long = parts[-1].more
+        self._is_skipping = parts[-1].more
         return parts
 
-    def _skip(self) -> bool:
+    def _skip_parts(self) -> bool:
         """Throws away what is left of a message that is too long, or some of it. Whether that was all."""
-        for _ in range(_SLICE):
+        for _ in range(_SKIPPED_PARTS_PER_CALL):
             if not self.socket.recv(zmq.NOBLOCK, copy=False).more:
-                self._too_long = False
+                self._is_skipping = False
                 break
-        return not self._too_long
+        return not self._is_skipping
 
-    def wake(self, how: bytes = _WAKE) -> None:
+    def wake(self, reason: bytes = _WAKE) -> None:
         try:
-            self._wake_writer.send(how)
+            self._wake_writer.send(reason)
         except OSError:  # full: it is awake already; closed: nobody sleeps
             return
 
@@ -159,12 +165,12 @@ class ZmqAgentLink:
         self._target = check_keys(parse_address(address), keys)
         self._keys, self._run_id = keys, run_id
         self._trouble: str | None = None
-        self._excess: str | None = None  # what the edge there sent too much of, of late
-        self._watch = EdgeWatch(Bounds.of(MAX_FRAME_BYTES))
+        self._flood_trouble: str | None = None  # what the edge there sent too much of, of late
+        self._guard = AgentConnectionGuard(BacklogLimits.for_frame_size(MAX_FRAME_BYTES))
         self._backoff = Backoff(time.monotonic_ns())
-        self._redial_s: float | None = None  # when
-        self._well_s = 0.0  # when what the edge sent too much of is forgiven
-        self._joined = False  # since last asked
+        self._reconnect_s: float | None = None  # when
+        self._forgive_s = 0.0  # when what the edge sent too much of is forgiven
+        self._has_connected = False  # since last asked
         self._open()
         try:
             self._link.socket.connect(str(self._target))
@@ -174,8 +180,10 @@ class ZmqAgentLink:
             raise UsageError(f"{self._target}: '{host}' cannot be the name of a machine") from None
 
     def _open(self) -> None:
-        self._link = _Socket(zmq.DEALER, _DEALER | (_SEALED if self._keys else {}), self._target)
-        self._handshakes = Handshakes(self._link.socket)
+        self._link = _Socket(
+            zmq.DEALER, _DEALER_OPTIONS | (_CURVE_OPTIONS if self._keys else {}), self._target
+        )
+        self._handshakes = HandshakeMonitor(self._link.socket)
         self._link.socket.setsockopt(zmq.ROUTING_ID, peer_id(self._run_id))
         if self._keys is not None:
             self._link.socket.setsockopt(zmq.CURVE_PUBLICKEY, self._keys.own.public.encode())
@@ -189,24 +197,26 @@ class ZmqAgentLink:
         end_s, is_over = time.monotonic() + timeout_ms * 1e-3, timeout_ms <= 0
         while True:
             self._keep_connected()
-            self._look(self._watch.look())
+            self._handle_excess(self._guard.check())
             parts = self._link.receive_now()
             left_ms = round((end_s - time.monotonic()) * 1e3)
             if parts is not None:
                 size = sum(wire_bytes(len(part), self._keys is not None) for part in parts)
-                self._watch.took(size, len(parts), time.monotonic())
+                self._guard.deliver(size, len(parts), time.monotonic())
                 return [part.bytes for part in parts]
-            self._look(self._watch.empty())
+            self._handle_excess(self._guard.check_empty())
             if is_over:
                 return None
-            is_over = bool(self._link.wait(min(max(0, left_ms), _LOOK_MS))) or left_ms <= _LOOK_MS
+            is_over = (
+                bool(self._link.wait(min(max(0, left_ms), _BACKLOG_CHECK_MS))) or left_ms <= _BACKLOG_CHECK_MS
+            )
 
     def trouble(self) -> str | None:
-        return self._trouble or self._excess
+        return self._trouble or self._flood_trouble
 
-    def connected(self) -> bool:
-        joined, self._joined = self._joined, False
-        return joined
+    def poll_connected(self) -> bool:
+        has_connected, self._has_connected = self._has_connected, False
+        return has_connected
 
     def wake(self) -> None:
         self._link.wake()
@@ -216,45 +226,49 @@ class ZmqAgentLink:
             self._handshakes.close()
         self._link.close()
 
-    def _look(self, excess: str | None) -> None:
+    def _handle_excess(self, excess: str | None) -> None:
         """excess: what the edge sends too much of. What it sent is dropped; it is tried again later."""
         now_ns = time.monotonic_ns()
         if excess is not None:
             self._handshakes.close()
             self._link.close(linger_ms=0)
             self._open()
-            self._redial_s = (now_ns * 1e-9) + self._backoff.died(now_ns)
+            self._reconnect_s = (now_ns * 1e-9) + self._backoff.record_failure(now_ns)
             self._trouble = None
-            self._excess = (
+            self._flood_trouble = (
                 f"the edge there sends what no edge does ({excess}): cut off; this run goes on without it, "
                 "and tries again, ever more rarely"
             )
-        elif self._excess and self._redial_s is None and now_ns * 1e-9 > self._well_s:
-            self._excess = None
+        elif self._flood_trouble and self._reconnect_s is None and now_ns * 1e-9 > self._forgive_s:
+            self._flood_trouble = None
 
     def _keep_connected(self) -> None:
-        while (outcome := self._handshakes.next()) is not None:
-            if outcome is Outcome.CONNECTED:
-                self._redial_s = None
+        while (outcome := self._handshakes.next_outcome()) is not None:
+            if outcome is HandshakeOutcome.CONNECTED:
+                self._reconnect_s = None
                 if self._handshakes.descriptor is not None:
-                    self._watch.connected(self._handshakes.descriptor, time.monotonic())
+                    self._guard.set_connection(self._handshakes.descriptor, time.monotonic())
                 continue
-            joined = outcome is Outcome.JOINED
-            self._redial_s = None if joined else time.monotonic() + _REDIAL_S
-            if joined:
-                self._joined, self._trouble, self._well_s = True, None, time.monotonic() + _WELL_S
-            elif outcome is not Outcome.DISCONNECTED:
+            is_connected = outcome is HandshakeOutcome.SUCCEEDED
+            self._reconnect_s = None if is_connected else time.monotonic() + _RECONNECT_S
+            if is_connected:
+                self._has_connected, self._trouble, self._forgive_s = (
+                    True,
+                    None,
+                    time.monotonic() + _FORGIVE_S,
+                )
+            elif outcome is not HandshakeOutcome.DISCONNECTED:
                 self._trouble = f"not let in: {self._reason(outcome)}"
-        if self._redial_s is not None and time.monotonic() >= self._redial_s:
-            self._redial_s = None
+        if self._reconnect_s is not None and time.monotonic() >= self._reconnect_s:
+            self._reconnect_s = None
             with contextlib.suppress(zmq.ZMQError):  # libzmq has forgotten it already
                 self._link.socket.disconnect(str(self._target))
             self._link.socket.connect(str(self._target))
 
-    def _reason(self, outcome: Outcome) -> str:
+    def _reason(self, outcome: HandshakeOutcome) -> str:
         if self._keys is None:
             return "the edge there wants keys; give --server-key, its public key"
-        if outcome is Outcome.UNKNOWN_KEY:
+        if outcome is HandshakeOutcome.UNKNOWN_KEY:
             own = self._keys.own
             return f"the edge does not know this key; there: share keys authorize {own.name} '{own.public}'"
         return "whatever answers there has another key than --server-key says, or none"
@@ -273,19 +287,19 @@ class ZmqEdgeLink:
     ) -> None:
         self._target = check_keys(parse_address(address, bind=True), keys)
         self._keys = keys
-        self._bounds = Bounds.of(max_frame_bytes)
-        self._options = _ROUTER | {
-            zmq.MAXMSGSIZE: max_frame_bytes + (_SEAL_BYTES if keys else 0),
+        self._bounds = BacklogLimits.for_frame_size(max_frame_bytes)
+        self._options = _ROUTER_OPTIONS | {
+            zmq.MAXMSGSIZE: max_frame_bytes + (_CURVE_OVERHEAD_BYTES if keys else 0),
             # libzmq 4.3.5 aborts where a peer resets its connection while a full queue has stopped its input
             # (stream_engine_base.cpp: !_io_error), so it never is full: the guard bounds what waits.
             zmq.RCVHWM: 0,
-            **({} if max_frame_bytes > MAX_FRAME_BYTES else {zmq.RCVBUF: _RECEIVED_BYTES}),
+            **({} if max_frame_bytes > MAX_FRAME_BYTES else {zmq.RCVBUF: _RECEIVE_BUFFER_BYTES}),
         }
-        self._kept_out = KeepOut()
-        self._names: dict[str, frozenset[str]] = {}  # by key, since the last look at the list
+        self._blocklist = Blocklist()
+        self._agent_names: dict[str, frozenset[str]] = {}  # by key, since the last look at the list
         self._list_due_s = 0.0
         self._list_trouble: str | None = None
-        self.strangers = 0  # messages dropped: their sender is no agent, or was cut off
+        self.discarded_messages = 0  # messages dropped: their sender is no agent, or was cut off
         self._open()
 
     @property
@@ -295,8 +309,8 @@ class ZmqEdgeLink:
     def send(self, peer: bytes, frames: Sequence[Bytes]) -> bool:
         return self._link.send([peer, *frames])
 
-    def receive(self, timeout_ms: int) -> Arrival | None:
-        self._keep_to_list()
+    def receive(self, timeout_ms: int) -> IncomingMessage | None:
+        self._refresh_allow_list()
         end_s = time.monotonic() + timeout_ms * 1e-3
         arrival, poked = self._receive_now(), True
         while arrival is None and poked:
@@ -305,65 +319,65 @@ class ZmqEdgeLink:
             arrival = self._receive_now()
         return arrival
 
-    def _receive_now(self) -> Arrival | None:
-        for _ in range(_IN_VAIN):
-            self._guard.look()
+    def _receive_now(self) -> IncomingMessage | None:
+        for _ in range(_MAX_DISCARDED_PER_CALL):
+            self._guard.check()
             parts = self._link.receive_now()
             if parts is None:
-                self._guard.empty(self._link.empty_s)
+                self._guard.record_empty(self._link.last_empty_s)
                 return None
-            key = self._account_for(parts)
-            if key is not None and len(parts[0]) == PEER_BYTES:
-                return Arrival(parts[0].bytes, [part.bytes for part in parts[1:]], key)
-            self.strangers += 1
+            key = self._record_message(parts)
+            if key is not None and len(parts[0]) == PEER_ID_BYTES:
+                return IncomingMessage(parts[0].bytes, [part.bytes for part in parts[1:]], key)
+            self.discarded_messages += 1
         return None
 
-    def _account_for(self, parts: list[zmq.Frame]) -> str | None:
+    def _record_message(self, parts: list[zmq.Frame]) -> str | None:
         """Tells the guard of a message; its sender's key, None where it is to be thrown away."""
-        sealed = self._keys is not None
+        is_encrypted = self._keys is not None
         try:
-            descriptor, key = int(parts[0].get(zmq.SRCFD)), self._key(parts[0])
+            descriptor, key = int(parts[0].get(zmq.SRCFD)), self._sender_key(parts[0])
         except zmq.ZMQError:  # ZMTP 1.0 has no such thing
             return ""
-        if self._guard.discards(descriptor):
+        if self._guard.is_discarding(descriptor):
             return None
-        size = sum(wire_bytes(len(part), sealed) for part in parts[1:])
-        self._guard.took(descriptor, size, len(parts) - 1, key)
-        if len(parts[0]) != PEER_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
-            self._guard.charge(descriptor, "its id is not 8 bytes: no agent")
+        size = sum(wire_bytes(len(part), is_encrypted) for part in parts[1:])
+        self._guard.deliver(descriptor, size, len(parts) - 1, key)
+        if len(parts[0]) != PEER_ID_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
+            self._guard.report_offence(descriptor, "its id is not 8 bytes: no agent")
         elif len(parts) > _MAX_PARTS:
-            self._guard.charge(descriptor, "a message of too many parts")
+            self._guard.report_offence(descriptor, "a message of too many parts")
         return key
 
-    def _key(self, part: zmq.Frame) -> str:
+    def _sender_key(self, part: zmq.Frame) -> str:
         """The sender's, that the doorkeeper gave as its ZAP user id."""
         return "" if self._keys is None else str(part.get("User-Id"))
 
-    def names(self, key: str) -> frozenset[str] | None:
+    def agent_names(self, key: str) -> frozenset[str] | None:
         if self._keys is None:
             return None
-        if key not in self._names:
-            self._names[key] = self._keys.allowed.agents(key)
-        return self._names[key]
+        if key not in self._agent_names:
+            self._agent_names[key] = self._keys.allowed.agents_for(key)
+        return self._agent_names[key]
 
     def trouble(self) -> str | None:
         return self._list_trouble
 
-    def _keep_to_list(self) -> None:
+    def _refresh_allow_list(self) -> None:
         """Of who is authorized, as the file says now and then."""
-        if self._door is not None and (now_s := time.monotonic()) >= self._list_due_s:
-            self._list_due_s = now_s + _LIST_S
-            self._names.clear()
-            self._list_trouble = self._door.trouble()
-            if self._door.revoked():
+        if self._authenticator is not None and (now_s := time.monotonic()) >= self._list_due_s:
+            self._list_due_s = now_s + _LIST_REFRESH_S
+            self._agent_names.clear()
+            self._list_trouble = self._authenticator.trouble()
+            if self._authenticator.has_revoked():
                 self._reopen()
 
     def refusals(self) -> list[str]:
-        cut_off, failed = self._guard.lines(), min(self._guard.failed(), _REFUSALS)
-        if self._door is None:
+        cut_off, failed = self._guard.take_reports(), min(self._guard.take_failed_handshakes(), _MAX_REFUSALS)
+        if self._authenticator is None:
             return cut_off + ["an agent with keys; this edge uses none: start it with --keys"] * failed
         lines = ["one without keys, or with the key of another edge: see its --server-key"] * failed
-        return cut_off + lines + self._door.refusals()
+        return cut_off + lines + self._authenticator.refusals()
 
     def wake(self) -> None:
         self._link.wake()
@@ -374,10 +388,10 @@ class ZmqEdgeLink:
     def _open(self) -> None:
         self._link = _Socket(zmq.ROUTER, self._options, self._target)
         socket = self._link.socket
-        self._guard = Guard(socket, self._bounds, self._kept_out, partial(self._link.wake, _POKE))
-        self._door = None
+        self._guard = ConnectionGuard(socket, self._bounds, self._blocklist, partial(self._link.wake, _POKE))
+        self._authenticator = None
         if self._keys is not None:
-            self._door = Doorkeeper(self._link.context, socket, self._keys, self._guard)
+            self._authenticator = ZapAuthenticator(self._link.context, socket, self._keys, self._guard)
         try:
             socket.bind(str(self._target))
         except zmq.ZMQError as error:
@@ -394,5 +408,5 @@ class ZmqEdgeLink:
     def _close(self, linger_ms: int) -> None:
         self._guard.close()
         self._link.close(linger_ms)
-        if self._door is not None:
-            self._door.join()
+        if self._authenticator is not None:
+            self._authenticator.join()

@@ -7,112 +7,125 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from share.columns import Columns
+from share.array_table import ArrayTable
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.odometry import measurement
-from share.odometry.features import Looks
-from share.odometry.state import State
+from share.odometry import feature_matching
+from share.odometry.feature_appearance import Appearance
+from share.odometry.state import FilterState
 from share.types import F64, I64
 
-_KNOWN = 0.1  # relative sigma of an inverse depth worth remembering
-_FORGETFUL = 1.5  # times the sigma that it had: what it shared with the pose is lost
-_MOST = 40  # of a keyframe
+_MAX_RELATIVE_SIGMA = 0.1  # relative sigma of an inverse depth worth remembering
+_SIGMA_INFLATION = 1.5  # times the sigma that it had: what it shared with the pose is lost
+_MAX_PER_KEYFRAME = 40  # of a keyframe
 
 
 @dataclass(frozen=True, eq=False)
-class Asleep(Columns):
+class DormantTable(ArrayTable):
     """Features: ids (N,), number of the host (N,), rays (N, 2), inverse depths and sigmas (N,), looks."""
 
     ids: I64
-    host: I64
+    anchor: I64
     ray: F64
     rho: F64
     sigma: F64
-    looks: Looks
+    appearance: Appearance
 
 
-class Memory:
+class DormantFeatures:
     """By keyframe id. Memory is bounded by the keyframes of the state."""
 
     def __init__(self) -> None:
-        self._of: dict[int, list[Asleep]] = {}  # in the order in which they fell asleep
-        self._new: list[tuple[I64, Asleep]] = []  # ids of their hosts; sorted only where somebody asks
+        self._by_keyframe: dict[int, list[DormantTable]] = {}  # in the order in which they fell asleep
+        self._unsorted: list[
+            tuple[I64, DormantTable]
+        ] = []  # ids of their hosts; sorted only where somebody asks
 
-    def sleep(self, state: State, looks: Looks, which: I64) -> None:
-        """Remember features number `which` of the state if their depth is known."""
-        sigma = _FORGETFUL * np.sqrt(state.rho_variance[which])
-        known = (sigma < _KNOWN * np.abs(state.rho[which])) | (sigma < 0.003)
-        known &= looks.age[which] >= 5
-        part = which[known]
-        if len(part):
-            hosts, looked = state.host[part], looks.take(part)
-            asleep = Asleep(state.ids[part], hosts, state.ray[part], state.rho[part], sigma[known], looked)
-            self._new.append((state.keyframes[hosts], asleep))
+    def deactivate(self, state: FilterState, appearance: Appearance, indices: I64) -> None:
+        """Remember features number `indices` of the state if their depth is known."""
+        sigma = _SIGMA_INFLATION * np.sqrt(state.rho_variance[indices])
+        is_known = (sigma < _MAX_RELATIVE_SIGMA * np.abs(state.rho[indices])) | (sigma < 0.003)
+        is_known &= appearance.age[indices] >= 5
+        indices_kept = indices[is_known]
+        if len(indices_kept):
+            anchors, appearance_kept = state.anchor[indices_kept], appearance.take(indices_kept)
+            dormant = DormantTable(
+                state.feature_ids[indices_kept],
+                anchors,
+                state.ray[indices_kept],
+                state.rho[indices_kept],
+                sigma[is_known],
+                appearance_kept,
+            )
+            self._unsorted.append((state.keyframe_ids[anchors], dormant))
 
-    def _sort(self) -> None:
+    def _group_by_keyframe(self) -> None:
         """By keyframe."""
-        if not self._new:
+        if not self._unsorted:
             return
-        keys = np.concatenate([keys for keys, _ in self._new])
-        first, *others = (asleep for _, asleep in self._new)
-        new, self._new = first.join(*others), []
+        keys = np.concatenate([keys for keys, _ in self._unsorted])
+        first, *others = (dormant for _, dormant in self._unsorted)
+        new, self._unsorted = first.concatenate(*others), []
         for key in np.unique(keys).tolist():
-            self._of.setdefault(key, []).append(new.take(keys == key))
+            self._by_keyframe.setdefault(key, []).append(new.take(keys == key))
 
-    def _best(self, keyframe: int) -> Asleep | None:
+    def _most_certain(self, keyframe: int) -> DormantTable | None:
         """Of one keyframe."""
-        if keyframe not in self._of:
+        if keyframe not in self._by_keyframe:
             return None
-        first, *others = self._of[keyframe]
-        asleep = first.join(*others) if others else first
-        if len(asleep.ids) > _MOST:
-            best = np.argsort(asleep.sigma, kind="stable")[:_MOST]
-            asleep = asleep.take(np.sort(best))
-        self._of[keyframe] = [asleep]
-        return asleep
+        first, *others = self._by_keyframe[keyframe]
+        dormant = first.concatenate(*others) if others else first
+        if len(dormant.ids) > _MAX_PER_KEYFRAME:
+            best = np.argsort(dormant.sigma, kind="stable")[:_MAX_PER_KEYFRAME]
+            dormant = dormant.take(np.sort(best))
+        self._by_keyframe[keyframe] = [dormant]
+        return dormant
 
-    def has(self, keyframes: I64) -> NDArray[np.bool_]:
+    def has_features(self, keyframe_ids: I64) -> NDArray[np.bool_]:
         """Of which keyframes (K,) there are any."""
-        self._sort()
-        return np.isin(keyframes, list(self._of))
+        self._group_by_keyframe()
+        return np.isin(keyframe_ids, list(self._by_keyframe))
 
-    def forget(self, keyframes: I64) -> None:
-        self._sort()
-        for keyframe in keyframes.tolist():
-            self._of.pop(keyframe, None)
+    def drop_keyframes(self, keyframe_ids: I64) -> None:
+        self._group_by_keyframe()
+        for keyframe_id in keyframe_ids.tolist():
+            self._by_keyframe.pop(keyframe_id, None)
 
-    def near(self, state: State, camera: Camera, max_m: float, max_rad: float, most: int) -> Asleep | None:
+    def nearby(
+        self, state: FilterState, camera: Camera, max_m: float, max_rad: float, max_count: int
+    ) -> DormantTable | None:
         """Those that the camera should see of the keyframes that look from about here, the nearest ones first
-        until there are `most`; their hosts are numbers in the state. None where there are none."""
-        self._sort()
-        (far,), (turned,) = se3.apart(state.T[None], state.poses)
-        out: list[Asleep] = []
-        for k in np.argsort(far + turned, kind="stable").tolist():
-            if far[k] >= max_m or turned[k] >= max_rad:
+        until there are `max_count`; their hosts are numbers in the state. None where there are none."""
+        self._group_by_keyframe()
+        (distance,), (angle,) = se3.pairwise_distances(state.T[None], state.keyframe_poses)
+        out: list[DormantTable] = []
+        for k in np.argsort(distance + angle, kind="stable").tolist():
+            if distance[k] >= max_m or angle[k] >= max_rad:
                 continue
-            mine = self._best(int(state.keyframes[k]))
-            if mine is None:
+            candidates = self._most_certain(int(state.keyframe_ids[k]))
+            if candidates is None:
                 continue
-            mine = mine.take(measurement.in_view(state, camera, k, mine.ray, mine.rho))
-            if len(mine.ids) == 0:
+            candidates = candidates.take(
+                feature_matching.is_in_view(state, camera, k, candidates.ray, candidates.rho)
+            )
+            if len(candidates.ids) == 0:
                 continue
-            out.append(replace(mine, host=np.full(len(mine.ids), k)))
-            if sum(len(one.ids) for one in out) >= most:
+            out.append(replace(candidates, anchor=np.full(len(candidates.ids), k)))
+            if sum(len(table.ids) for table in out) >= max_count:
                 break
-        return out[0].join(*out[1:]) if out else None
+        return out[0].concatenate(*out[1:]) if out else None
 
-    def wake(self, ids: I64) -> None:
+    def reactivate(self, ids: I64) -> None:
         """These are features of the state again."""
-        self._sort()
-        gone = set(ids.tolist())
-        for keyframe, parts in list(self._of.items()):
-            left = [_without(part, gone) for part in parts]
-            self._of[keyframe] = [part for part in left if len(part.ids)]
-            if not self._of[keyframe]:
-                del self._of[keyframe]
+        self._group_by_keyframe()
+        reactivated = set(ids.tolist())
+        for keyframe, parts in list(self._by_keyframe.items()):
+            remaining = [_without_ids(part, reactivated) for part in parts]
+            self._by_keyframe[keyframe] = [part for part in remaining if len(part.ids)]
+            if not self._by_keyframe[keyframe]:
+                del self._by_keyframe[keyframe]
 
 
-def _without(asleep: Asleep, ids: set[int]) -> Asleep:
-    keep = [n for n, feature in enumerate(asleep.ids.tolist()) if feature not in ids]
-    return asleep if len(keep) == len(asleep.ids) else asleep.take(np.array(keep, np.int64))
+def _without_ids(dormant: DormantTable, ids: set[int]) -> DormantTable:
+    keep = [n for n, feature in enumerate(dormant.ids.tolist()) if feature not in ids]
+    return dormant if len(keep) == len(dormant.ids) else dormant.take(np.array(keep, np.int64))

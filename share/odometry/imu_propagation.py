@@ -16,11 +16,11 @@ from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.types import F64, ImuBatch
 
-_SIDE = 15  # pose, velocity, biases
+_IMU_STATE_SIZE = 15  # pose, velocity, biases
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ImuPropagation:
     """At the end of the interval: T (4, 4), v (3,), bias-free rate (3,) rad/s in the body. transition,
     noise (15, 15) of the errors of pose, velocity and biases."""
 
@@ -28,32 +28,32 @@ class Motion:
     v: F64
     rate: F64
     transition: F64
-    noise: F64
+    noise_cov: F64
 
 
 def integrate(
     T: F64, v: F64, bg: F64, ba: F64, imu: ImuBatch, from_ns: int, to_ns: int, noise: ImuNoise, gravity: float
-) -> Motion:
+) -> ImuPropagation:
     """Motion over (from_ns, to_ns) by the trapezoidal rule. imu: samples about the interval, in order; the
     first and last are held where they do not reach its ends. Raises ValueError without any."""
     dt, gyro, accel = _intervals(imu, from_ns, to_ns)
-    gyro, accel, each = gyro - bg, accel - ba, dt[:, None]
-    half = se3.so3_exp(gyro * (each / 2))
-    R = _products(T[:3, :3], half @ half)
-    middle = R[:-1] @ half
+    gyro, accel, dt_column = gyro - bg, accel - ba, dt[:, None]
+    half_turn = se3.so3_exp(gyro * (dt_column / 2))
+    R = _cumulative_rotations(T[:3, :3], half_turn @ half_turn)
+    middle = R[:-1] @ half_turn
     g = np.array([0.0, 0.0, -gravity])
     a = (middle @ accel[:, :, None])[:, :, 0] + g
-    v_at = _sums(v, a * each)
-    p_at = _sums(T[:3, 3], v_at[:-1] * each + a * (each**2 / 2))
+    v_at = _cumulative_sums(v, a * dt_column)
+    p_at = _cumulative_sums(T[:3, 3], v_at[:-1] * dt_column + a * (dt_column**2 / 2))
     v_mid, p_mid = (v_at[1:] + v_at[:-1]) / 2, (p_at[1:] + p_at[:-1]) / 2
-    left = float(dt.sum()) - (np.cumsum(dt) - dt / 2)  # from the middle of each part to the end
-    effect = _effects(middle, v_mid, p_mid, left[:, None], g)
-    return Motion(
-        se3.compose(R[-1], p_at[-1]),
+    remaining = float(dt.sum()) - (np.cumsum(dt) - dt / 2)  # from the middle of each part to the end
+    response = _impulse_responses(middle, v_mid, p_mid, remaining[:, None], g)
+    return ImuPropagation(
+        se3.from_rt(R[-1], p_at[-1]),
         v_at[-1],
         gyro[-1],
-        _transition(effect, dt, se3.hat(g)),
-        _noise(effect, dt, noise),
+        _transition(response, dt, se3.hat(g)),
+        _noise_cov(response, dt, noise),
     )
 
 
@@ -64,20 +64,20 @@ def _intervals(imu: ImuBatch, from_ns: int, to_ns: int) -> tuple[F64, F64, F64]:
     seconds = (imu.stamps_ns - from_ns) * 1e-9
     length = (to_ns - from_ns) * 1e-9
     inside = seconds[(seconds > 0) & (seconds < length)]
-    at = np.concatenate([[0.0], inside, [length]])
+    bounds = np.concatenate([[0.0], inside, [length]])
     values = np.concatenate([imu.gyro, imu.accel], axis=1)
-    after = np.searchsorted(seconds, at).clip(1, max(len(seconds) - 1, 1)) if len(seconds) > 1 else None
+    after = np.searchsorted(seconds, bounds).clip(1, max(len(seconds) - 1, 1)) if len(seconds) > 1 else None
     if after is None:
-        ends = np.repeat(values, len(at), axis=0)
+        ends = np.repeat(values, len(bounds), axis=0)
     else:
         t0, t1 = seconds[after - 1], seconds[after]
-        share = ((at - t0) / np.maximum(t1 - t0, 1e-9)).clip(0, 1)[:, None]
-        ends = values[after - 1] * (1 - share) + values[after] * share
+        fraction = ((bounds - t0) / np.maximum(t1 - t0, 1e-9)).clip(0, 1)[:, None]
+        ends = values[after - 1] * (1 - fraction) + values[after] * fraction
     means = (ends[1:] + ends[:-1]) / 2
-    return np.diff(at), means[:, :3], means[:, 3:]
+    return np.diff(bounds), means[:, :3], means[:, 3:]
 
 
-def _products(R: F64, steps: F64) -> F64:
+def _cumulative_rotations(R: F64, steps: F64) -> F64:
     """R and what it becomes by each of the steps (N, 3, 3): (N + 1, 3, 3). By doubling: after k rounds each
     is the product of up to 2^k of them."""
     out, reach = np.concatenate([R[None], steps]), 1
@@ -87,65 +87,65 @@ def _products(R: F64, steps: F64) -> F64:
     return out
 
 
-def _sums(first: F64, steps: F64) -> F64:
+def _cumulative_sums(first: F64, steps: F64) -> F64:
     """(3,) and what it becomes by each of the steps (N, 3): (N + 1, 3)."""
     return np.cumsum(np.concatenate([first[None], steps]), axis=0)
 
 
-def _effects(R: F64, v: F64, p: F64, left: F64, g: F64) -> F64:
+def _impulse_responses(R: F64, v: F64, p: F64, remaining: F64, g: F64) -> F64:
     """What an impulse of gyro and of accel error in each part does to (phi, rho, nu) at the end, (N, 9, 6).
 
     phi' = -R w; rho' = nu - [p] R w; nu' = [g] phi - [v] R w - R a; the rest of the way, left (N, 1) s, is
     phi = const, nu = [g] phi t, rho = nu t + [g] phi t^2 / 2: as if turned about where a body in free fall
     would be then.
     """
-    falling = np.concatenate([p + v * left + g * (left**2 / 2), v + g * left])
+    falling = np.concatenate([p + v * remaining + g * (remaining**2 / 2), v + g * remaining])
     levers = se3.hat(falling).reshape(2, -1, 3, 3) @ R
     out = np.zeros((len(R), 9, 6))
     out[:, :3, :3], out[:, 3:6, :3], out[:, 6:, :3] = R, levers[0], levers[1]
-    out[:, 3:6, 3:], out[:, 6:, 3:] = R * left[:, :, None], R
+    out[:, 3:6, 3:], out[:, 6:, 3:] = R * remaining[:, :, None], R
     return np.negative(out, out=out)
 
 
-def _transition(effect: F64, dt: F64, g: F64) -> F64:
+def _transition(response: F64, dt: F64, g: F64) -> F64:
     T = float(dt.sum())
-    out = np.eye(_SIDE)
+    out = np.eye(_IMU_STATE_SIZE)
     out[3:6, 0:3], out[6:9, 0:3] = g * (T**2 / 2), g * T
     out[3, 6] = out[4, 7] = out[5, 8] = T
-    out[:9, 9:] = (dt @ effect.reshape(-1, 54)).reshape(9, 6)
+    out[:9, 9:] = (dt @ response.reshape(-1, 54)).reshape(9, 6)
     return out
 
 
-def _noise(effect: F64, dt: F64, imu: ImuNoise) -> F64:
+def _noise_cov(response: F64, dt: F64, imu: ImuNoise) -> F64:
     T = float(dt.sum())
     density = np.repeat([imu.gyro_density, imu.accel_density], 3)
-    weighted = effect * (np.sqrt(dt)[:, None, None] * density)
+    weighted = response * (np.sqrt(dt)[:, None, None] * density)
     flat = weighted.transpose(1, 0, 2).reshape(9, -1)
-    out = np.zeros((_SIDE, _SIDE))
+    out = np.zeros((_IMU_STATE_SIZE, _IMU_STATE_SIZE))
     out[:9, :9] = flat @ flat.T
-    walks = np.arange(9, _SIDE)
+    walks = np.arange(9, _IMU_STATE_SIZE)
     out[walks, walks] = T * np.repeat([imu.gyro_walk**2, imu.accel_walk**2], 3)
     return out
 
 
 # ---- How loud the IMU is taken to be.
 
-_BLOCKS_S = 0.005, 0.01, 0.015, 0.02  # of samples whose means are compared
-_TIMES = 20.0  # by which third differences have more variance than what is white
+_BLOCK_LENGTHS_S = 0.005, 0.01, 0.015, 0.02  # of samples whose means are compared
+_DIFFERENCE_VARIANCE = 20.0  # by which third differences have more variance than what is white
 
 
-def louder(imu: ImuNoise, times: float) -> ImuNoise:
+def scaled_noise(imu: ImuNoise, noise_scale: float) -> ImuNoise:
     """Densities and walks so many times as large."""
     return ImuNoise(
-        imu.gyro_density * times,
-        imu.accel_density * times,
-        imu.gyro_walk * times,
-        imu.accel_walk * times,
+        imu.gyro_density * noise_scale,
+        imu.accel_density * noise_scale,
+        imu.gyro_walk * noise_scale,
+        imu.accel_walk * noise_scale,
         imu.rate_hz,
     )
 
 
-def shaken(imu: ImuNoise, samples: ImuBatch) -> ImuNoise:
+def noise_with_vibration(imu: ImuNoise, samples: ImuBatch) -> ImuNoise:
     """Densities no smaller than those that the samples themselves show.
 
     What shakes a body faster than its IMU is sampled is noise to who integrates the samples. The body's own
@@ -159,18 +159,20 @@ def shaken(imu: ImuNoise, samples: ImuBatch) -> ImuNoise:
     step_s = (samples.stamps_ns[-1] - samples.stamps_ns[0]) * 1e-9 / (len(samples) - 1)
     sums = np.zeros((len(samples) + 1, 6))
     np.cumsum(np.concatenate([samples.gyro, samples.accel], axis=1), axis=0, out=sums[1:])
-    shown = []  # squared densities
-    for block in {max(1, round(block_s / step_s)) for block_s in _BLOCKS_S}:
+    densities = []  # squared densities
+    for block in {max(1, round(block_s / step_s)) for block_s in _BLOCK_LENGTHS_S}:
         fourth = _fourth_differences(sums, block)  # of the sums: third ones of the means, times block
         if (count := len(fourth)) > block:
-            shown.append(np.einsum("na,na->a", fourth, fourth) * (step_s / (_TIMES * count * block)))
-    if not shown:
+            densities.append(
+                np.einsum("na,na->a", fourth, fourth) * (step_s / (_DIFFERENCE_VARIANCE * count * block))
+            )
+    if not densities:
         return imu
-    least = np.sqrt(np.min(shown, axis=0))
+    density = np.sqrt(np.min(densities, axis=0))
     return replace(
         imu,
-        gyro_density=max(imu.gyro_density, float(least[:3].max())),
-        accel_density=max(imu.accel_density, float(least[3:].max())),
+        gyro_density=max(imu.gyro_density, float(density[:3].max())),
+        accel_density=max(imu.accel_density, float(density[3:].max())),
     )
 
 
@@ -182,12 +184,12 @@ def _fourth_differences(x: F64, by: int) -> F64:
     return out
 
 
-def without(imu: ImuNoise, coasting: ImuNoise, axes: NDArray[np.bool_]) -> ImuNoise:
+def noise_without_axes(imu: ImuNoise, constant_velocity: ImuNoise, axes: NDArray[np.bool_]) -> ImuNoise:
     """Of an IMU of whose axes (6,), gyro then accelerometer, some say nothing."""
     if not axes.any():
         return imu
     return replace(
         imu,
-        gyro_density=coasting.gyro_density if axes[:3].any() else imu.gyro_density,
-        accel_density=coasting.accel_density if axes[3:].any() else imu.accel_density,
+        gyro_density=constant_velocity.gyro_density if axes[:3].any() else imu.gyro_density,
+        accel_density=constant_velocity.accel_density if axes[3:].any() else imu.accel_density,
     )

@@ -21,37 +21,37 @@ from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import Rig
 from share.odometry import filter
-from share.odometry.initialisation import tilt
-from share.odometry.landmarks import Scene
-from share.odometry.state import State
-from share.types import F32, F64, Footing, Frame, View
-from share.vision.orb import ViewInSteps
+from share.odometry.initialisation import tilt_sigma
+from share.odometry.landmarks import LandmarkMap
+from share.odometry.state import FilterState
+from share.types import F32, F64, FeatureStatistics, Frame, View
+from share.vision.orb import ViewBuilder
 
 # ---- When a frame is far enough from the newest keyframe to be the next one.
 
 
-class Spacing:
+class KeyframeSpacing:
     """From the newest keyframe of one tracker, by poses (4, 4) of its body or of its camera.
 
     gap_s: s, sooner there is none; m, rad: after so much motion; left: or with less than this part in view
     of the features that the newest had.
     """
 
-    def __init__(self, gap_s: float, m: float, rad: float, left: float) -> None:
-        self._gap_ns, self._m, self._left = gap_s * 1e9, m, left
-        self._least_cosine = np.cos(min(rad, np.pi))
-        self.stamp_ns = self.features = 0  # of the newest
+    def __init__(self, gap_s: float, distance_m: float, angle_rad: float, min_share: float) -> None:
+        self._gap_ns, self._distance_m, self._min_share = gap_s * 1e9, distance_m, min_share
+        self._min_cosine = np.cos(min(angle_rad, np.pi))
+        self.stamp_ns = self.feature_count = 0  # of the newest
         self.T = np.eye(4)
 
-    def wanted(self, stamp_ns: int, T: F64, seen: int) -> bool:
+    def wants_keyframe(self, stamp_ns: int, T: F64, inlier_count: int) -> bool:
         """Whether a frame with so many features seen is to be one: moved, turned, or little left in view."""
         if stamp_ns - self.stamp_ns < self._gap_ns:
             return False
         cosine = ((self.T[:3, :3] * T[:3, :3]).sum() - 1) / 2  # of the angle between the two
         return bool(
-            np.linalg.norm(T[:3, 3] - self.T[:3, 3]) > self._m
-            or cosine < self._least_cosine
-            or seen < self._left * self.features
+            np.linalg.norm(T[:3, 3] - self.T[:3, 3]) > self._distance_m
+            or cosine < self._min_cosine
+            or inlier_count < self._min_share * self.feature_count
         )
 
 
@@ -60,119 +60,138 @@ class Spacing:
 # What was told of that keyframe has been corrected since: at first mostly its tilt, by degrees. The
 # difference of what was told would have that as a turn of the body.
 
-_FOUND_COV = np.diag(np.repeat([0.01**2, 0.03**2], 3))  # rad, m: of a place found again by its ORB features
+_RELOCALISED_COV = np.diag(
+    np.repeat([0.01**2, 0.03**2], 3)
+)  # rad, m: of a place found again by its ORB features
 
 
-class Shown:
+class LastPublishedKeyframe:
     """The keyframe that others were told of last: its id; -1 where the filter has none."""
 
     def __init__(self) -> None:
-        self.keyframe, self._T_odom_body = -1, np.eye(4)
+        self.keyframe_id, self._T_odom_body = -1, np.eye(4)
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """The filter's keyframes are numbered anew."""
-        self.keyframe = -1
+        self.keyframe_id = -1
 
-    def told(self, s: State, keyframe: int) -> None:
+    def update(self, s: FilterState, keyframe_id: int) -> None:
         """The one with this id is the last one from now on: others have it."""
-        self.keyframe, self._T_odom_body = keyframe, s.poses[filter.number_of(s, keyframe)]
+        self.keyframe_id, self._T_odom_body = (
+            keyframe_id,
+            s.keyframe_poses[filter.keyframe_index(s, keyframe_id)],
+        )
 
-    def motion(self, s: State, k: int, new_stretch: bool) -> tuple[F64, F64]:
+    def motion_to(self, s: FilterState, k: int, new_segment: bool) -> tuple[F64, F64]:
         """T_last_body (4, 4) of keyframe number k and its covariance (6, 6): as the state knows both now.
         Where it has the last one no longer, after a loss, as they were told, and as unsure as the place where
         the body was found again."""
-        known = np.flatnonzero(s.keyframes[:k] == self.keyframe)
-        if new_stretch:
-            return s.poses[k], filter.keyframe_cov(s, k)
+        known = np.flatnonzero(s.keyframe_ids[:k] == self.keyframe_id)
+        if new_segment:
+            return s.keyframe_poses[k], filter.keyframe_cov(s, k)
         if len(known):
-            return filter.motion(s, int(known[0]), k), filter.motion_cov(s, int(known[0]), k)
-        return se3.inverse(self._T_odom_body) @ s.poses[k], filter.keyframe_cov(s, k) + _FOUND_COV
+            return filter.relative_pose(s, int(known[0]), k), filter.relative_pose_cov(s, int(known[0]), k)
+        return se3.inverse(self._T_odom_body) @ s.keyframe_poses[k], filter.keyframe_cov(
+            s, k
+        ) + _RELOCALISED_COV
 
 
-_SHOWN_GAP_NS = 400_000_000  # between keyframes that others are told of
-_SLICE_NS = 30_000_000  # of the time between frames: two slices a frame at 15 Hz, one at 20 and at 30
+_PUBLISH_GAP_NS = 400_000_000  # between keyframes that others are told of
+_SLICE_PERIOD_NS = 30_000_000  # of the time between frames: two slices a frame at 15 Hz, one at 20 and at 30
 
 
-class Showing(NamedTuple):
+class PublishedView(NamedTuple):
     """Of a keyframe: its view, its pose T (4, 4) and the sigma of what is up there, rad, as the filter knows
     them now; T_last_body (4, 4) since the one shown before, and its covariance (6, 6). frames_ago: how many
     frames have been tracked since its own."""
 
     view: View
-    T: F64
-    tilt: float
-    T_last_body: F64
+    T_odom_body: F64
+    tilt_sigma: float
+    T_previous_body: F64
     cov: F64
     frames_ago: int
 
 
-class Unsettled(NamedTuple):
+class OfferedKeyframe(NamedTuple):
     """A keyframe, by id, whose candidate was made, and that others are told of unless something fails."""
 
     frame: Frame
-    keyframe: int
+    keyframe_id: int
     view: View
 
 
 @dataclass(eq=False)
-class _Making:
-    """Of the keyframe with id `number`, whose frame this is: px (N, 2) near which nothing new is sought, and
-    of new corners; `ago` frames have been settled since. view, and what its pose rested on: if others are to
-    be told of it."""
+class _PendingKeyframe:
+    """Of the keyframe with id `keyframe_id`, whose frame this is: px (N, 2) near which nothing new is
+    sought, and
+    of new corners; `frames_ago` frames have been settled since. view, and what its pose rested on: if others
+    are to be told of it."""
 
     frame: Frame
-    number: int
-    taken: F32
+    keyframe_id: int
+    occupied_px: F32
     corners: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    ago: int = 0
-    view: ViewInSteps | None = None
-    footing: Footing | None = None
-    is_due: bool = False  # what it shows is for the next who asks
+    frames_ago: int = 0
+    view: ViewBuilder | None = None
+    footing: FeatureStatistics | None = None
+    is_ready: bool = False  # what it shows is for the next who asks
 
 
-Step = Callable[[_Making, Scene, Frame, F64], None]  # with the frame just tracked, and its rate
-Slice = list[tuple[Step, _Making]]
+KeyframeStep = Callable[
+    [_PendingKeyframe, LandmarkMap, Frame, F64], None
+]  # with the frame just tracked, and its rate
+Slice = list[tuple[KeyframeStep, _PendingKeyframe]]
 
 
-class Keyframes:
+class KeyframeScheduler:
     """Those of one tracker, newest last in its scene."""
 
     def __init__(self, rig: Rig, config: InertialConfig, view_features: int) -> None:
         self._rig, self._view_features = rig, view_features
         c = config
-        self._newest = Spacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_seen)
-        self._shown = Shown()
-        self._shown_ns = self._settled_ns = 0
-        self._unsettled: Unsettled | None = None
-        self._newest_made: _Making | None = None
-        self._showing: _Making | None = None  # of which others are told next
+        self._spacing = KeyframeSpacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_seen)
+        self._last_published = LastPublishedKeyframe()
+        self._published_ns = self._processed_ns = 0
+        self._offered: OfferedKeyframe | None = None
+        self._newest_pending: _PendingKeyframe | None = None
+        self._to_publish: _PendingKeyframe | None = None  # of which others are told next
         self._slices: deque[Slice] = deque()
 
-    def wanted(self, stamp_ns: int, T_odom_body: F64, seen: int) -> bool:
+    def wants_keyframe(self, stamp_ns: int, T_odom_body: F64, inlier_count: int) -> bool:
         """Whether a frame with so many features seen is to be one."""
-        steps = (step for part in self._slices for step, _ in part)
-        return self._admit not in steps and self._newest.wanted(stamp_ns, T_odom_body, seen)
+        steps = (step for group in self._slices for step, _ in group)
+        return self._add_features not in steps and self._spacing.wants_keyframe(
+            stamp_ns, T_odom_body, inlier_count
+        )
 
-    def anchor(self, frame: Frame, scene: Scene, rate: F64) -> None:
+    def add_at_once(self, frame: Frame, landmarks: LandmarkMap, rate: F64) -> None:
         """Make the frame just tracked one, all at once: where no pose is told yet. rate (3,): rad/s."""
-        self.begin(frame, scene, rate, urgent=True)
-        self._work(scene, frame, rate)
+        self.add(frame, landmarks, rate, urgent=True)
+        self._run_slice(landmarks, frame, rate)
 
-    def begin(self, frame: Frame, scene: Scene, rate: F64, urgent: bool, to_show: bool = False) -> None:
-        """Make the frame just tracked one, if it is not: its pose; the rest is for `settle`, after what an
+    def add(
+        self, frame: Frame, landmarks: LandmarkMap, rate: F64, urgent: bool, publish: bool = False
+    ) -> None:
+        """Make the frame just tracked one, if it is not: its pose; the rest is for `process_pending`, after
+        what an
         earlier one still takes. to_show: others are to be told of it, when its view is made, which is what
         comes first. urgent: all new features with the next slice, for there is little to go by."""
-        if frame.stamp_ns == self._newest.stamp_ns:
+        if frame.stamp_ns == self._spacing.stamp_ns:
             return
-        number = scene.add_keyframe(rate)
-        self._newest.stamp_ns, self._newest.T = frame.stamp_ns, scene.state.T
-        made = self._newest_made = _Making(frame, number, scene.taken())
-        features: Slice = [(step, made) for step in (self._recall, self._corners, self._admit)]
-        view: Slice = [(step, made) for step in (self._detect, self._describe)] if to_show else []
+        keyframe_id = landmarks.add_keyframe(rate)
+        self._spacing.stamp_ns, self._spacing.T = frame.stamp_ns, landmarks.state.T
+        pending = self._newest_pending = _PendingKeyframe(frame, keyframe_id, landmarks.occupied_px())
+        features: Slice = [
+            (step, pending) for step in (self._reactivate, self._find_corners, self._add_features)
+        ]
+        view: Slice = (
+            [(step, pending) for step in (self._detect_view, self._describe_view)] if publish else []
+        )
         if view and self._at_a_time(frame) == 1:
-            view[-1] = (self._describe_more, made)
-        if to_show:
-            self._offer(scene)
+            view[-1] = (self._describe_more, pending)
+        if publish:
+            self._start_publishing(landmarks)
         if not urgent:
             self._slices.extend([step] for step in [*view, *features])
             return
@@ -182,99 +201,127 @@ class Keyframes:
             self._slices.append(features)
         self._slices.extend([step] for step in view)
 
-    def show_at_once(self, scene: Scene) -> None:
+    def publish_at_once(self, landmarks: LandmarkMap) -> None:
         """Others are to be told of the newest, which is the frame just tracked, now."""
-        self._offer(scene).is_due = True
+        self._start_publishing(landmarks).is_ready = True
 
-    def _offer(self, scene: Scene) -> _Making:
-        made = self._showing = self._newest_made
-        assert made is not None
-        self._shown_ns, made.footing = made.frame.stamp_ns, scene.footing()
-        made.view = ViewInSteps(made.frame, self._rig, self._view_features, scene.depths(made.frame))
-        return made
+    def _start_publishing(self, landmarks: LandmarkMap) -> _PendingKeyframe:
+        pending = self._to_publish = self._newest_pending
+        assert pending is not None
+        self._published_ns, pending.footing = pending.frame.stamp_ns, landmarks.feature_statistics()
+        pending.view = ViewBuilder(
+            pending.frame, self._rig, self._view_features, landmarks.known_depths(pending.frame)
+        )
+        return pending
 
-    def may_show(self, stamp_ns: int) -> bool:
+    def may_publish(self, stamp_ns: int) -> bool:
         """Whether it is time to tell others of one."""
-        return self._showing is None and stamp_ns - self._shown_ns >= _SHOWN_GAP_NS
+        return self._to_publish is None and stamp_ns - self._published_ns >= _PUBLISH_GAP_NS
 
     @property
-    def is_due(self) -> bool:
+    def is_ready(self) -> bool:
         """Whether there is one that others are to be told of now."""
-        return self._showing is not None and self._showing.is_due
+        return self._to_publish is not None and self._to_publish.is_ready
 
     @property
-    def footing(self) -> Footing | None:
+    def footing(self) -> FeatureStatistics | None:
         """What the pose of the one that is due rested on; None where none is."""
-        return self._showing.footing if self._showing is not None and self._showing.is_due else None
+        return (
+            self._to_publish.footing if self._to_publish is not None and self._to_publish.is_ready else None
+        )
 
-    def show(self, scene: Scene, new_stretch: bool) -> Showing:
+    def publish(self, landmarks: LandmarkMap, new_segment: bool) -> PublishedView:
         """The one that is due. Raises ValueError where none is."""
-        made, s = self._showing, scene.state
-        if made is None or made.view is None or not made.is_due:
+        pending, s = self._to_publish, landmarks.state
+        if pending is None or pending.view is None or not pending.is_ready:
             raise ValueError("no keyframe is due")
-        view = made.view.finish()
-        self._unsettled = Unsettled(made.frame, made.number, view)
-        k = filter.number_of(s, made.number)
-        T_last_body, cov = self._shown.motion(s, k, new_stretch)
-        return Showing(view, s.poses[k], tilt(s, s.keyframe(k)), T_last_body, cov, made.ago)
+        view = pending.view.finish()
+        self._offered = OfferedKeyframe(pending.frame, pending.keyframe_id, view)
+        k = filter.keyframe_index(s, pending.keyframe_id)
+        T_previous_body, cov = self._last_published.motion_to(s, k, new_segment)
+        return PublishedView(
+            view,
+            s.keyframe_poses[k],
+            tilt_sigma(s, s.keyframe_columns(k)),
+            T_previous_body,
+            cov,
+            pending.frames_ago,
+        )
 
-    def settle(self, scene: Scene, frame: Frame, rate: F64) -> Unsettled | None:
+    def process_pending(self, landmarks: LandmarkMap, frame: Frame, rate: F64) -> OfferedKeyframe | None:
         """A slice of what is left to do, or as many as there is time for between frames, once a frame, of
         which `frame` is the last. The keyframe that was shown, if there was one."""
-        done, self._unsettled = self._unsettled, None
-        if done is not None:
-            self._shown.told(scene.state, done.keyframe)  # not before: making its candidate might have failed
+        offered, self._offered = self._offered, None
+        if offered is not None:
+            self._last_published.update(
+                landmarks.state, offered.keyframe_id
+            )  # not before: making its candidate might have failed
         slices = self._at_a_time(frame)
-        if self._showing is not None:
-            self._showing.ago += 1
-            if self._showing.is_due:  # others have it, or nobody asked
-                self._showing = None
+        if self._to_publish is not None:
+            self._to_publish.frames_ago += 1
+            if self._to_publish.is_ready:  # others have it, or nobody asked
+                self._to_publish = None
                 slices -= 1  # to show it was one
-        self._settled_ns = frame.stamp_ns
+        self._processed_ns = frame.stamp_ns
         for _ in range(max(1, slices)):
             if not self._slices:
                 break
-            self._work(scene, frame, rate)
-        return done
+            self._run_slice(landmarks, frame, rate)
+        return offered
 
     def _at_a_time(self, frame: Frame) -> int:
         """How many slices there is time for after the frame just tracked."""
-        return int(max(1, (frame.stamp_ns - self._settled_ns) // _SLICE_NS))
+        return int(max(1, (frame.stamp_ns - self._processed_ns) // _SLICE_PERIOD_NS))
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """The filter begins anew, and numbers its keyframes anew. What is left to do is void."""
-        self._unsettled = self._newest_made = self._showing = None
+        self._offered = self._newest_pending = self._to_publish = None
         self._slices.clear()
-        self._shown.forget()
+        self._last_published.reset()
 
     # ------------------------------------------------------------------ slices
 
-    def _work(self, scene: Scene, last: Frame, rate: F64) -> None:
-        for step, made in self._slices.popleft():
-            step(made, scene, last, rate)
+    def _run_slice(self, landmarks: LandmarkMap, last_frame: Frame, rate: F64) -> None:
+        for step, pending in self._slices.popleft():
+            step(pending, landmarks, last_frame, rate)
 
-    def _recall(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
-        woken = scene.wake(last, rate)
-        made.taken = np.concatenate([made.taken, woken])
-        scene.forget((self._shown.keyframe, -1 if self._showing is None else self._showing.number))
+    def _reactivate(
+        self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
+    ) -> None:
+        reactivated_px = landmarks.reactivate(last_frame, rate)
+        pending.occupied_px = np.concatenate([pending.occupied_px, reactivated_px])
+        landmarks.forget(
+            (
+                self._last_published.keyframe_id,
+                -1 if self._to_publish is None else self._to_publish.keyframe_id,
+            )
+        )
 
-    def _corners(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
-        made.corners = scene.corners(made.frame, made.taken)
+    def _find_corners(
+        self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
+    ) -> None:
+        pending.corners = landmarks.find_corners(pending.frame, pending.occupied_px)
 
-    def _admit(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
-        scene.admit(made.frame, made.number, made.corners)
-        self._newest.features = len(scene.state.ids)
+    def _add_features(
+        self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
+    ) -> None:
+        landmarks.admit_features(pending.frame, pending.keyframe_id, pending.corners)
+        self._spacing.feature_count = len(landmarks.state.feature_ids)
 
-    def _detect(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
-        if made.view is not None:
-            made.view.detect()
+    def _detect_view(
+        self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
+    ) -> None:
+        if pending.view is not None:
+            pending.view.detect()
 
-    def _describe(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
-        if made.view is not None:
-            made.view.describe()
-            made.is_due = True
+    def _describe_view(
+        self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
+    ) -> None:
+        if pending.view is not None:
+            pending.view.describe()
+            pending.is_ready = True
 
-    def _describe_more(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
-        self._describe(made, scene, last, rate)
+    def _describe_more(self, made: _PendingKeyframe, scene: LandmarkMap, last: Frame, rate: F64) -> None:
+        self._describe_view(made, scene, last, rate)
         if made.view is not None:
             made.view.measure_half()

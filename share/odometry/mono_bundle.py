@@ -15,14 +15,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from share.columns import Columns
+from share.array_table import ArrayTable
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, rays
-from share.odometry import measurement
-from share.odometry.imu_propagation import Motion, integrate
-from share.odometry.measurement import lever
-from share.odometry.normal_equations import SHOT, Normal, inverse
-from share.odometry.state import EXTRINSIC, State
+from share.odometry import feature_matching
+from share.odometry.feature_matching import pose_jacobian
+from share.odometry.imu_propagation import ImuPropagation, integrate
+from share.odometry.normal_equations import FRAME_SIZE, BundleNormalEquations, inverse
+from share.odometry.state import EXTRINSIC, FilterState
 from share.types import F64, I64, ImuBatch
 
 # ---- A start for the fit of a single camera's first seconds, from nothing.
@@ -31,8 +31,8 @@ from share.types import F64, I64, ImuBatch
 # these and in depths, that rays meet is nearly linear (Dong-Si and Mourikis 2012): from anywhere, a few
 # rounds of weighted least squares lead there.
 
-SIDE = EXTRINSIC.start  # columns of pose, velocity and biases
-_USUAL_DEPTHS = (
+IMU_STATE_SIZE = EXTRINSIC.start  # columns of pose, velocity and biases
+_START_SCALES = (
     100.0,
     30.0,
     10.0,
@@ -40,126 +40,142 @@ _USUAL_DEPTHS = (
     3.0,
     3.0,
 )  # sigmas, round by round: what is further off counts ever less
-_NEAREST = 0.1  # m
+_MIN_DEPTH_M = 0.1  # m
 
 
 @dataclass(frozen=True, eq=False)
-class Sights(Columns):
+class BundleObservations(ArrayTable):
     """M times a feature was seen: by shot `at` (M,), at uv (M, 2) with sigma (M,); feature `which` (M,),
-    which shot `host` (M,) sees on ray (M, 2)."""
+    which shot `anchor` (M,) sees on ray (M, 2)."""
 
-    at: I64
-    host: I64
-    which: I64
+    frame: I64
+    anchor: I64
+    feature: I64
     ray: F64
     uv: F64
     sigma: F64
 
 
-class Shooting:
+class ShootingSolver:
     """first: the state at the first shot and how well it is known. carry: motions by IMU from shot to shot,
     K - 1 of them, of a state there. depth: about how far features are, m, for N of them."""
 
     def __init__(
         self,
-        first: State,
-        carry: Callable[[State], list[Motion]],
-        sights: Sights,
+        first: FilterState,
+        propagate: Callable[[FilterState], list[ImuPropagation]],
+        observations: BundleObservations,
         features: int,
         depth: float,
     ) -> None:
-        self._first, self._carry, self._sights, self._usual_depth = first, carry, sights, depth
-        self._prior = inverse(first.cov[:SIDE, :SIDE])
+        self._first, self._propagate, self._observations, self._prior_depth = (
+            first,
+            propagate,
+            observations,
+            depth,
+        )
+        self._prior = inverse(first.cov[:IMU_STATE_SIZE, :IMU_STATE_SIZE])
         self.state, self.depth = first, np.full(features, depth)
-        self.T, self.v, self._by_first = self._carried()
+        self.T, self.v, self._J_first = self._propagated()
 
     def solve(self) -> None:
         """Raises numpy.linalg.LinAlgError where nothing can be solved."""
-        for usual in _USUAL_DEPTHS:
-            r, J, by_depth = self._residuals(usual)
-            self._step(r, J, by_depth)
-            self.T, self.v, self._by_first = self._carried()
+        for scale in _START_SCALES:
+            r, J, J_depth = self._residuals(scale)
+            self._step(r, J, J_depth)
+            self.T, self.v, self._J_first = self._propagated()
 
-    def _carried(self) -> tuple[F64, F64, F64]:
+    def _propagated(self) -> tuple[F64, F64, F64]:
         """T (K, 4, 4), v (K, 3) of all shots, and how errors depend on that of the first (K, 15, 15)."""
-        motions = self._carry(self.state)
-        s, by_first = self.state, [np.eye(SIDE)]
+        motions = self._propagate(self.state)
+        s, J_first = self.state, [np.eye(IMU_STATE_SIZE)]
         for m in motions:
-            by_first.append(m.transition @ by_first[-1])
+            J_first.append(m.transition @ J_first[-1])
         T, v = np.array([s.T, *(m.T for m in motions)]), np.array([s.v, *(m.v for m in motions)])
-        return T, v, np.array(by_first)
+        return T, v, np.array(J_first)
 
-    def _residuals(self, usual: float) -> tuple[F64, F64, F64]:
+    def _residuals(self, scale: float) -> tuple[F64, F64, F64]:
         """(M, 2) in sigmas, weighted, and what the first state's error (M, 2, 15) and depth (M, 2) take of
         them. It is the way across the ray that was seen, as large as it looks from the depth that we
         have."""
-        s, cams = self._sights, self.T @ self.state.T_body_cam
-        at, host, ray = cams[s.at], cams[s.host], rays(s.ray)[:, :, None]
-        along = host[:, :3, :3] @ ray
-        point = along[:, :, 0] * self.depth[s.which, None] + host[:, :3, 3]
-        turn = at[:, :3, :3].transpose(0, 2, 1)
-        seen = (turn @ (point - at[:, :3, 3])[:, :, None])[:, :, 0]
-        across = np.concatenate([np.tile(np.eye(2), (len(s.at), 1, 1)), -s.uv[:, :, None]], axis=2)
-        across /= (np.maximum(seen[:, 2], _NEAREST) * s.sigma)[:, None, None]
-        r = -(across @ seen[:, :, None])[:, :, 0]
-        weight = 1 / np.sqrt(1 + (r**2).sum(axis=1) / usual**2)
-        across = (across @ turn) * weight[:, None, None]
-        by_pose = lever(np.eye(3), point, np.ones(len(point)))
-        J = across @ (by_pose @ (self._by_first[s.host, :6] - self._by_first[s.at, :6]))
-        return r * weight[:, None], J, (across @ along)[:, :, 0]
+        s, cams = self._observations, self.T @ self.state.T_body_cam
+        frame, anchor, ray = cams[s.frame], cams[s.anchor], rays(s.ray)[:, :, None]
+        direction = anchor[:, :3, :3] @ ray
+        point = direction[:, :, 0] * self.depth[s.feature, None] + anchor[:, :3, 3]
+        R_cam_odom = frame[:, :3, :3].transpose(0, 2, 1)
+        in_camera = (R_cam_odom @ (point - frame[:, :3, 3])[:, :, None])[:, :, 0]
+        project = np.concatenate([np.tile(np.eye(2), (len(s.frame), 1, 1)), -s.uv[:, :, None]], axis=2)
+        project /= (np.maximum(in_camera[:, 2], _MIN_DEPTH_M) * s.sigma)[:, None, None]
+        r = -(project @ in_camera[:, :, None])[:, :, 0]
+        weight = 1 / np.sqrt(1 + (r**2).sum(axis=1) / scale**2)
+        project = (project @ R_cam_odom) * weight[:, None, None]
+        J_pose = pose_jacobian(np.eye(3), point, np.ones(len(point)))
+        J = project @ (J_pose @ (self._J_first[s.anchor, :6] - self._J_first[s.frame, :6]))
+        return r * weight[:, None], J, (project @ direction)[:, :, 0]
 
-    def _step(self, r: F64, J: F64, by_depth: F64) -> None:
+    def _step(self, r: F64, J: F64, J_depth: F64) -> None:
         """Least squares with depths eliminated."""
-        which, N = self._sights.which, len(self.depth)
-        own = 1 / self._usual_depth**2
-        known = own + np.bincount(which, (by_depth**2).sum(axis=1), N)
-        wanted = own * (self._usual_depth - self.depth) + np.bincount(which, (by_depth * r).sum(axis=1), N)
-        shared = (J * by_depth[:, :, None]).sum(axis=1)
-        cross = np.stack([np.bincount(which, column, N) for column in shared.T])
-        flat = J.reshape(-1, SIDE)
-        A = self._prior + flat.T @ flat - (cross / known) @ cross.T
-        b = self._prior @ off(self._first, self.state) + flat.T @ r.ravel() - cross @ (wanted / known)
+        indices, N = self._observations.feature, len(self.depth)
+        prior_information = 1 / self._prior_depth**2
+        information = prior_information + np.bincount(indices, (J_depth**2).sum(axis=1), N)
+        weighted = prior_information * (self._prior_depth - self.depth) + np.bincount(
+            indices, (J_depth * r).sum(axis=1), N
+        )
+        shared = (J * J_depth[:, :, None]).sum(axis=1)
+        cross = np.stack([np.bincount(indices, column, N) for column in shared.T])
+        flat = J.reshape(-1, IMU_STATE_SIZE)
+        A = self._prior + flat.T @ flat - (cross / information) @ cross.T
+        b = (
+            self._prior @ state_error(self._first, self.state)
+            + flat.T @ r.ravel()
+            - cross @ (weighted / information)
+        )
         x = np.asarray(np.linalg.solve(A, b), np.float64)
-        self.depth = np.maximum(self.depth + (wanted - cross.T @ x) / known, _NEAREST)
-        by, s = se3.exp(x[:6]), self.state
-        v = by[:3, :3] @ s.v + x[6:9]
-        self.state = replace(s, T=by @ s.T, v=v, bg=s.bg + x[9:12], ba=s.ba + x[12:])
+        self.depth = np.maximum(self.depth + (weighted - cross.T @ x) / information, _MIN_DEPTH_M)
+        delta, s = se3.exp(x[:6]), self.state
+        v = delta[:3, :3] @ s.v + x[6:9]
+        self.state = replace(s, T=delta @ s.T, v=v, bg=s.bg + x[9:12], ba=s.ba + x[12:])
 
 
-def off(to: State, of: State) -> F64:
+def state_error(target: FilterState, source: FilterState) -> F64:
     """The error (15,) of pose, velocity and biases that takes one state to another."""
-    return np.concatenate([gap(to.T, to.v, of.T, of.v), to.bg - of.bg, to.ba - of.ba])
+    return np.concatenate(
+        [motion_error(target.T, target.v, source.T, source.v), target.bg - source.bg, target.ba - source.ba]
+    )
 
 
-def gap(T: F64, v: F64, from_T: F64, from_v: F64) -> F64:
+def motion_error(T: F64, v: F64, from_T: F64, from_v: F64) -> F64:
     """The error (9,) that takes one pose and velocity to another."""
-    by = T @ se3.inverse(from_T)
-    return np.concatenate([se3.log(by), v - by[:3, :3] @ from_v])
+    delta = T @ se3.inverse(from_T)
+    return np.concatenate([se3.log(delta), v - delta[:3, :3] @ from_v])
 
 
-_ROUNDS, _GAIN = 20, 0.1  # at most; of the cost, squared sigmas, below which it is settled
+_MAX_ITERATIONS, _MIN_COST_DECREASE = (
+    20,
+    0.1,
+)  # at most; of the cost, squared sigmas, below which it is settled
 _DAMPING = 1e-4
-_USUAL = 2.0  # sigmas; what is further off counts ever less (Cauchy)
-_BEHIND = 1e3  # sigmas, of what is behind the camera
-_LEAST = 1e-12
+_CAUCHY_SCALE = 2.0  # sigmas; what is further off counts ever less (Cauchy)
+_BEHIND_RESIDUAL = 1e3  # sigmas, of what is behind the camera
+_MIN_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class WindowFrame:
     """A frame at stamp_ns, IMU time, with imu since the shot before. It sees at uv (M, 2) the features ids
-    (M,), which the keyframes `host` (M,) see on rays (M, 2). keyframe: its own id, -1 where it is none."""
+    (M,), which the keyframes `anchor` (M,) see on rays (M, 2). keyframe: its own id, -1 where it is none."""
 
     stamp_ns: int
     imu: ImuBatch
-    keyframe: int
-    ids: I64
-    host: I64
+    keyframe_id: int
+    feature_ids: I64
+    anchor: I64
     ray: F64
     uv: F64
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class BundleModel:
     """IMU noise and gravity; sigma of a coordinate that is seen; common (6, 6), covariance of what a whole
     image is off by. Rooms: inverse depth 1/m, sigma of its logarithm, and by how much of it a feature
     may differ."""
@@ -167,14 +183,14 @@ class Model:
     noise: ImuNoise
     gravity: float
     sigma: float
-    common: F64
-    room: float
-    rooms: float
-    differ: float
+    common_cov: F64
+    room_rho: float
+    room_log_sigma: float
+    feature_spread: float
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class BundleSolution:
     """Of K shots T (K, 4, 4) and v (K, 3), the biases (3,), inverse depths rho (N,) of features ids (N,).
     cov: of the errors, 9 a shot, 6 of the biases, one a feature. cost: of a sight, squared sigmas."""
 
@@ -182,38 +198,38 @@ class Fit:
     v: F64
     bg: F64
     ba: F64
-    ids: I64
+    feature_ids: I64
     rho: F64
     cov: F64
     cost: float
 
     @property
-    def moved(self) -> float:
+    def relative_baseline(self) -> float:
         """How far the body came, as a part of how far features are."""
-        far = np.linalg.norm(self.T[:, :3, 3] - self.T[0, :3, 3], axis=1).max()
-        return float(far * np.median(self.rho))
+        baseline = np.linalg.norm(self.T[:, :3, 3] - self.T[0, :3, 3], axis=1).max()
+        return float(baseline * np.median(self.rho))
 
 
-def fit(shots: list[Shot], first: State, model: Model) -> Fit:
+def solve_bundle(frames: list[WindowFrame], first: FilterState, model: BundleModel) -> BundleSolution:
     """first: what was known at the first shot, which is a keyframe. Raises numpy.linalg.LinAlgError where
     nothing can be solved."""
-    problem, damping = _Problem(shots, first, model), _DAMPING
-    best = problem.normal()
-    for _ in range(_ROUNDS):
-        before = problem.means
-        problem.move(*best.step(damping))
-        new = problem.normal()
+    problem, damping = _BundleProblem(frames, first, model), _DAMPING
+    best = problem.normal_equations()
+    for _ in range(_MAX_ITERATIONS):
+        means = problem.means
+        problem.apply_step(*best.step(damping))
+        new = problem.normal_equations()
         if not new.cost <= best.cost:
-            problem.means, damping = before, damping * 10
+            problem.means, damping = means, damping * 10
             continue
-        gained, best, damping = best.cost - new.cost, new, damping / 10
-        if gained < _GAIN:
+        decrease, best, damping = best.cost - new.cost, new, damping / 10
+        if decrease < _MIN_COST_DECREASE:
             break
     return problem.result(best)
 
 
 @dataclass(frozen=True, eq=False)
-class _Means:
+class _BundleMeans:
     """Poses (K, 4, 4), velocities (K, 3), biases (3,), logarithm of the room's inverse depth, inverse
     depths (N,), and by how much the body of each image is off (K, 6), on its right."""
 
@@ -221,139 +237,170 @@ class _Means:
     v: F64
     bg: F64
     ba: F64
-    room: float
+    log_room_rho: float
     rho: F64
-    off: F64
+    image_offsets: F64
 
 
-class _Problem:
-    def __init__(self, shots: list[Shot], first: State, model: Model) -> None:
-        self._shots, self._first, self._model = shots, first, model
-        self._prior = inverse(first.cov[:SIDE, :SIDE])
-        self._common = inverse(model.common)
-        number = {s.keyframe: k for k, s in enumerate(shots) if s.keyframe >= 0}
-        ids, hosts, ray = (
-            np.concatenate([getattr(s, name) for s in shots]) for name in ("ids", "host", "ray")
+class _BundleProblem:
+    def __init__(self, frames: list[WindowFrame], first: FilterState, model: BundleModel) -> None:
+        self._frames, self._first, self._model = frames, first, model
+        self._prior = inverse(first.cov[:IMU_STATE_SIZE, :IMU_STATE_SIZE])
+        self._common = inverse(model.common_cov)
+        frame_of_keyframe = {s.keyframe_id: k for k, s in enumerate(frames) if s.keyframe_id >= 0}
+        ids, anchors, ray = (
+            np.concatenate([getattr(s, name) for s in frames]) for name in ("feature_ids", "anchor", "ray")
         )
-        known = np.isin(hosts, list(number))
-        self._ids, at = np.unique(ids[known], return_index=True)
-        self._host = np.array([number[h] for h in hosts[known][at].tolist()], np.int64)
-        self._ray = ray[known][at]
-        self._sights = [self._of_shot(k) for k in range(len(shots))]
-        self.means = self._start()
+        known = np.isin(anchors, list(frame_of_keyframe))
+        self._ids, first_rows = np.unique(ids[known], return_index=True)
+        self._anchor = np.array([frame_of_keyframe[h] for h in anchors[known][first_rows].tolist()], np.int64)
+        self._ray = ray[known][first_rows]
+        self._observations = [self._observations_of(k) for k in range(len(frames))]
+        self.means = self._initial_means()
 
-    def _of_shot(self, k: int) -> Sights:
+    def _observations_of(self, k: int) -> BundleObservations:
         """What a shot sees of features of other ones, by host."""
-        shot = self._shots[k]
-        which = np.searchsorted(self._ids, shot.ids).clip(0, len(self._ids) - 1)
-        rows = np.flatnonzero((self._ids[which] == shot.ids) & (self._host[which] != k))
-        rows = rows[np.argsort(self._host[which[rows]], kind="stable")]
-        which, each = which[rows], np.ones(len(rows))
-        at, sigma = np.full(len(rows), k), self._model.sigma * each
-        return Sights(at, self._host[which], which, self._ray[which], shot.uv[rows], sigma)
-
-    def _start(self) -> _Means:
-        first, others = self._sights[0], self._sights[1:]
-        start = Shooting(
-            self._first, self._carried, first.join(*others), len(self._ids), 1 / self._model.room
+        frame = self._frames[k]
+        indices = np.searchsorted(self._ids, frame.feature_ids).clip(0, len(self._ids) - 1)
+        rows = np.flatnonzero((self._ids[indices] == frame.feature_ids) & (self._anchor[indices] != k))
+        rows = rows[np.argsort(self._anchor[indices[rows]], kind="stable")]
+        indices, ones = indices[rows], np.ones(len(rows))
+        frame_index, sigma = np.full(len(rows), k), self._model.sigma * ones
+        return BundleObservations(
+            frame_index, self._anchor[indices], indices, self._ray[indices], frame.uv[rows], sigma
         )
-        start.solve()
-        s, rho = start.state, 1 / start.depth
-        room = float(np.log(np.median(rho)))
-        return _Means(start.T, start.v, s.bg, s.ba, room, rho, np.zeros((len(self._shots), 6)))
 
-    def _carried(self, s: State) -> list[Motion]:
+    def _initial_means(self) -> _BundleMeans:
+        first, others = self._observations[0], self._observations[1:]
+        solver = ShootingSolver(
+            self._first,
+            self._propagated,
+            first.concatenate(*others),
+            len(self._ids),
+            1 / self._model.room_rho,
+        )
+        solver.solve()
+        s, rho = solver.state, 1 / solver.depth
+        room = float(np.log(np.median(rho)))
+        return _BundleMeans(solver.T, solver.v, s.bg, s.ba, room, rho, np.zeros((len(self._frames), 6)))
+
+    def _propagated(self, s: FilterState) -> list[ImuPropagation]:
         """By IMU from the first shot on, where the state is s."""
-        out: list[Motion] = []
-        for k in range(len(self._shots) - 1):
+        out: list[ImuPropagation] = []
+        for k in range(len(self._frames) - 1):
             T, v = (out[-1].T, out[-1].v) if out else (s.T, s.v)
-            out.append(self._motion(k, T, v, s.bg, s.ba))
+            out.append(self._propagate(k, T, v, s.bg, s.ba))
         return out
 
-    def _motion(self, k: int, T: F64, v: F64, bg: F64, ba: F64) -> Motion:
+    def _propagate(self, k: int, T: F64, v: F64, bg: F64, ba: F64) -> ImuPropagation:
         """From shot k to the next."""
-        m, a, b = self._model, self._shots[k], self._shots[k + 1]
+        m, a, b = self._model, self._frames[k], self._frames[k + 1]
         return integrate(T, v, bg, ba, b.imu, a.stamp_ns, b.stamp_ns, m.noise, m.gravity)
 
-    def move(self, step: F64, by_rho: F64) -> None:
+    def apply_step(self, step: F64, delta_rho: F64) -> None:
         """Means by what `Normal.step` says."""
-        m, K = self.means, len(self._shots)
-        e, rest = step[: SHOT * K].reshape(-1, SHOT), step[SHOT * K :]
-        by = se3.exp(e[:, :6])
-        v = (by[:, :3, :3] @ m.v[:, :, None])[:, :, 0] + e[:, 6:]
-        room, of_image = m.room + float(rest[6]), m.off + rest[7:].reshape(K, 6)
-        self.means = _Means(by @ m.T, v, m.bg + rest[:3], m.ba + rest[3:6], room, m.rho + by_rho, of_image)
+        m, K = self.means, len(self._frames)
+        e, tail = step[: FRAME_SIZE * K].reshape(-1, FRAME_SIZE), step[FRAME_SIZE * K :]
+        delta = se3.exp(e[:, :6])
+        v = (delta[:, :3, :3] @ m.v[:, :, None])[:, :, 0] + e[:, 6:]
+        room, image_offsets = m.log_room_rho + float(tail[6]), m.image_offsets + tail[7:].reshape(K, 6)
+        self.means = _BundleMeans(
+            delta @ m.T, v, m.bg + tail[:3], m.ba + tail[3:6], room, m.rho + delta_rho, image_offsets
+        )
 
-    def normal(self) -> Normal:
+    def normal_equations(self) -> BundleNormalEquations:
         """Where the means are."""
-        K, m = len(self._shots), self.means
-        out = Normal(K, len(self._ids))
-        now = self._at(0)
-        out.add(np.r_[0:SHOT, out.biases], np.eye(SIDE), off(self._first, now), self._prior)
-        self._add_room(out)
+        K, m = len(self._frames), self.means
+        out = BundleNormalEquations(K, len(self._ids))
+        first_now = self._state_of_frame(0)
+        out.add(
+            np.r_[0:FRAME_SIZE, out.bias_columns],
+            np.eye(IMU_STATE_SIZE),
+            state_error(self._first, first_now),
+            self._prior,
+        )
+        self._add_depth_prior(out)
         for k in range(K - 1):
-            motion = self._motion(k, m.T[k], m.v[k], m.bg, m.ba)
-            F = motion.transition[:SHOT]
-            J = np.concatenate([-F[:, :SHOT], np.eye(SHOT), -F[:, SHOT:]], axis=1)
-            W = inverse(motion.noise[:SHOT, :SHOT] + _LEAST * np.eye(SHOT))
-            at = np.r_[SHOT * k : SHOT * (k + 2), out.biases]
-            out.add(at, J, gap(motion.T, motion.v, m.T[k + 1], m.v[k + 1]), W)
+            motion = self._propagate(k, m.T[k], m.v[k], m.bg, m.ba)
+            F = motion.transition[:FRAME_SIZE]
+            J = np.concatenate([-F[:, :FRAME_SIZE], np.eye(FRAME_SIZE), -F[:, FRAME_SIZE:]], axis=1)
+            W = inverse(motion.noise_cov[:FRAME_SIZE, :FRAME_SIZE] + _MIN_VARIANCE * np.eye(FRAME_SIZE))
+            columns = np.r_[FRAME_SIZE * k : FRAME_SIZE * (k + 2), out.bias_columns]
+            out.add(columns, J, motion_error(motion.T, motion.v, m.T[k + 1], m.v[k + 1]), W)
         for k in range(K):
-            self._add_image(out, k)
+            self._add_frame(out, k)
         return out
 
-    def _at(self, k: int, by: F64 | None = None) -> State:
+    def _state_of_frame(self, k: int, offset: F64 | None = None) -> FilterState:
         """The state at shot k; by: its image's body is off by so much."""
         m = self.means
-        T = m.T[k] if by is None else m.T[k] @ se3.exp(by)
-        now = replace(self._first, T=T, v=m.v[k], bg=m.bg, ba=m.ba, poses=m.T)
-        return replace(now, ids=self._ids, host=self._host, ray=self._ray, rho=m.rho)
+        T = m.T[k] if offset is None else m.T[k] @ se3.exp(offset)
+        state = replace(self._first, T=T, v=m.v[k], bg=m.bg, ba=m.ba, keyframe_poses=m.T)
+        return replace(state, feature_ids=self._ids, anchor=self._anchor, ray=self._ray, rho=m.rho)
 
-    def _add_room(self, out: Normal) -> None:
+    def _add_depth_prior(self, out: BundleNormalEquations) -> None:
         """How far rooms are, and that features are as far as the room, more or less."""
-        m, room = self._model, self.means.room
-        out.add(np.array([out.room]), np.eye(1), np.array([np.log(m.room) - room]), np.eye(1) / m.rooms**2)
+        m, room = self._model, self.means.log_room_rho
+        out.add(
+            np.array([out.room_column]),
+            np.eye(1),
+            np.array([np.log(m.room_rho) - room]),
+            np.eye(1) / m.room_log_sigma**2,
+        )
         share = self.means.rho * np.exp(-room)
-        by_rho, by_room, r = np.exp(-room) / m.differ, -share / m.differ, (1 - share) / m.differ
-        out.A[out.room, out.room] += by_room @ by_room
-        out.b[out.room] += by_room @ r
-        out.cross[out.room] += by_room * by_rho
-        out.depth += by_rho**2
-        out.b_rho += by_rho * r
+        J_rho, J_room, r = (
+            np.exp(-room) / m.feature_spread,
+            -share / m.feature_spread,
+            (1 - share) / m.feature_spread,
+        )
+        out.A[out.room_column, out.room_column] += J_room @ J_room
+        out.b[out.room_column] += J_room @ r
+        out.cross[out.room_column] += J_room * J_rho
+        out.rho_information += J_rho**2
+        out.b_rho += J_rho * r
         out.cost += float(r @ r)
 
-    def _add_image(self, out: Normal, k: int) -> None:
-        common = out.common(k)
-        out.add(common, np.eye(6), -self.means.off[k], self._common)
-        which, host = self._sights[k].which, self._sights[k].host
-        if len(which) == 0:
+    def _add_frame(self, out: BundleNormalEquations, k: int) -> None:
+        offset_columns = out.offset_columns(k)
+        out.add(offset_columns, np.eye(6), -self.means.image_offsets[k], self._common)
+        indices, anchor = self._observations[k].feature, self._observations[k].anchor
+        if len(indices) == 0:
             return
-        r, J, by_rho = self._seen(k)
-        square = np.nan_to_num((r**2).sum(axis=1), nan=_BEHIND**2)
-        out.cost += float(_USUAL**2 * np.log1p(square / _USUAL**2).sum())
-        weight = 1 / np.sqrt(1 + square / _USUAL**2)
-        r, by_rho = (np.nan_to_num(x) * weight[:, None] for x in (r, by_rho))
+        r, J, J_rho = self._linearise_frame(k)
+        squared = np.nan_to_num((r**2).sum(axis=1), nan=_BEHIND_RESIDUAL**2)
+        out.cost += float(_CAUCHY_SCALE**2 * np.log1p(squared / _CAUCHY_SCALE**2).sum())
+        weight = 1 / np.sqrt(1 + squared / _CAUCHY_SCALE**2)
+        r, J_rho = (np.nan_to_num(x) * weight[:, None] for x in (r, J_rho))
         J = np.nan_to_num(J) * weight[:, None, None]
-        out.depth[which] += (by_rho**2).sum(axis=1)
-        out.b_rho[which] += (by_rho * r).sum(axis=1)
-        shared = (J * by_rho[:, :, None]).sum(axis=1).T
-        for h in np.unique(host).tolist():
-            part = host == h
-            at, mine = np.r_[out.pose(k), out.pose(h), common], J[part].reshape(-1, 18)
-            out.A[np.ix_(at, at)] += mine.T @ mine
-            out.b[at] += mine.T @ r[part].ravel()
-            out.cross[np.ix_(at, which[part])] += shared[:, part]
+        out.rho_information[indices] += (J_rho**2).sum(axis=1)
+        out.b_rho[indices] += (J_rho * r).sum(axis=1)
+        shared = (J * J_rho[:, :, None]).sum(axis=1).T
+        for h in np.unique(anchor).tolist():
+            rows = anchor == h
+            columns, J_rows = (
+                np.r_[out.pose_columns(k), out.pose_columns(h), offset_columns],
+                J[rows].reshape(-1, 18),
+            )
+            out.A[np.ix_(columns, columns)] += J_rows.T @ J_rows
+            out.b[columns] += J_rows.T @ r[rows].ravel()
+            out.cross[np.ix_(columns, indices[rows])] += shared[:, rows]
 
-    def _seen(self, k: int) -> tuple[F64, F64, F64]:
+    def _linearise_frame(self, k: int) -> tuple[F64, F64, F64]:
         """Of the M sights of shot k, in sigmas: residuals (M, 2), NaN behind the camera, and slopes by
         pose, host's pose and what the image is off by (M, 2, 18), and by inverse depth (M, 2)."""
-        sights, sigma, now = self._sights[k], self._model.sigma, self._at(k, self.means.off[k])
-        seen = measurement.predict(now, sights.which)
-        by_pose = seen.by_pose / sigma
-        J = np.concatenate([by_pose, -by_pose, by_pose @ se3.adjoint(now.T)], axis=2)
-        return (sights.uv - seen.uv) / sigma, J, seen.by_rho / sigma
+        observations, sigma, state = (
+            self._observations[k],
+            self._model.sigma,
+            self._state_of_frame(k, self.means.image_offsets[k]),
+        )
+        predicted = feature_matching.predict(state, observations.feature)
+        J_pose = predicted.H_pose / sigma
+        J = np.concatenate([J_pose, -J_pose, J_pose @ se3.adjoint(state.T)], axis=2)
+        return (observations.uv - predicted.uv) / sigma, J, predicted.H_rho / sigma
 
-    def result(self, best: Normal) -> Fit:
-        """best: `normal` of the means."""
-        m, sights = self.means, sum(len(s.which) for s in self._sights)
-        return Fit(m.T, m.v, m.bg, m.ba, self._ids, m.rho, best.covariance(), best.cost / max(sights, 1))
+    def result(self, best: BundleNormalEquations) -> BundleSolution:
+        """best: `normal_equations` of the means."""
+        m, count = self.means, sum(len(s.feature) for s in self._observations)
+        return BundleSolution(
+            m.T, m.v, m.bg, m.ba, self._ids, m.rho, best.covariance(), best.cost / max(count, 1)
+        )

@@ -6,54 +6,54 @@ import numpy as np
 
 from share.types import F64, I64
 
-SHOT = 9  # columns of a shot: pose and velocity
+FRAME_SIZE = 9  # columns of a shot: pose and velocity
 
 
 def inverse(A: F64) -> F64:
     return np.asarray(np.linalg.inv(A), np.float64)
 
 
-class Normal:
+class BundleNormalEquations:
     """A (D, D), b (D,) of what is shared: shots, 6 of biases, the room, 6 of each image; cross (D, N),
     depth (N,), b_rho (N,) of features' inverse depths. cost: the sum of squares."""
 
-    def __init__(self, shots: int, features: int) -> None:
-        self.biases = slice(SHOT * shots, SHOT * shots + 6)
-        self.room = SHOT * shots + 6
-        D = self.room + 1 + 6 * shots
+    def __init__(self, frames: int, features: int) -> None:
+        self.bias_columns = slice(FRAME_SIZE * frames, FRAME_SIZE * frames + 6)
+        self.room_column = FRAME_SIZE * frames + 6
+        D = self.room_column + 1 + 6 * frames
         self.A, self.b, self.cross = np.zeros((D, D)), np.zeros(D), np.zeros((D, features))
-        self.depth, self.b_rho = np.zeros(features), np.zeros(features)
+        self.rho_information, self.b_rho = np.zeros(features), np.zeros(features)
         self.cost = 0.0
 
-    def pose(self, k: int) -> I64:
+    def pose_columns(self, k: int) -> I64:
         """Columns of the pose of shot number k,"""
-        return np.arange(SHOT * k, SHOT * k + 6)
+        return np.arange(FRAME_SIZE * k, FRAME_SIZE * k + 6)
 
-    def common(self, k: int) -> I64:
+    def offset_columns(self, k: int) -> I64:
         """and of what its image is off by."""
-        return np.arange(self.room + 1 + 6 * k, self.room + 7 + 6 * k)
+        return np.arange(self.room_column + 1 + 6 * k, self.room_column + 7 + 6 * k)
 
-    def add(self, at: I64, J: F64, r: F64, W: F64) -> None:
-        """Residuals r (m,) of information W (m, m), of which J (m, n) times columns `at` (n,) is taken
+    def add(self, columns: I64, J: F64, r: F64, W: F64) -> None:
+        """Residuals r (m,) of information W (m, m), of which J (m, n) times columns `columns` (n,) is taken
         away."""
         weighted = J.T @ W
-        self.A[np.ix_(at, at)] += weighted @ J
-        self.b[at] += weighted @ r
+        self.A[np.ix_(columns, columns)] += weighted @ J
+        self.b[columns] += weighted @ r
         self.cost += float(r @ W @ r)
 
     def step(self, damping: float) -> tuple[F64, F64]:
         """By how much all that is shared (D,) and inverse depths (N,) should move (Marquardt 1963)."""
-        depth = self.depth * (1 + damping)
-        by_depth = self.cross / depth
-        A = self.A + damping * np.diag(np.diag(self.A)) - by_depth @ self.cross.T
-        x = np.asarray(np.linalg.solve(A, self.b - by_depth @ self.b_rho), np.float64)
-        return x, (self.b_rho - self.cross.T @ x) / depth
+        damped = self.rho_information * (1 + damping)
+        eliminated = self.cross / damped
+        A = self.A + damping * np.diag(np.diag(self.A)) - eliminated @ self.cross.T
+        x = np.asarray(np.linalg.solve(A, self.b - eliminated @ self.b_rho), np.float64)
+        return x, (self.b_rho - self.cross.T @ x) / damped
 
     def covariance(self) -> F64:
         """Of shots, biases and features."""
-        by_depth = self.cross / self.depth
-        P = inverse(self.A - by_depth @ self.cross.T)[: self.room, : self.room]
-        to_depth = -P @ by_depth[: self.room]
-        own = np.diag(1 / self.depth) - by_depth[: self.room].T @ to_depth
-        out: F64 = np.block([[P, to_depth], [to_depth.T, own]])
+        eliminated = self.cross / self.rho_information
+        P = inverse(self.A - eliminated @ self.cross.T)[: self.room_column, : self.room_column]
+        cross_cov = -P @ eliminated[: self.room_column]
+        rho_cov = np.diag(1 / self.rho_information) - eliminated[: self.room_column].T @ cross_cov
+        out: F64 = np.block([[P, cross_cov], [cross_cov.T, rho_cov]])
         return (out + out.T) / 2

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from share.config import TrackerConfig
 from share.geometry import se3
-from share.geometry.absolute_pose import Terms, absolute_pose
+from share.geometry.absolute_pose import RansacOptions, absolute_pose
 from share.geometry.camera import Camera, Rig
 from share.types import F32, F64, I64, U8, Frame, View
-from share.vision.mask import EVEN_DEG, within
-from share.vision.matching import match
-from share.vision.orb import orb
+from share.vision.mask import UNIFORM_FIELD_DEG, field_mask
+from share.vision.matching import match_descriptors
+from share.vision.orb import detect_orb
 
 # ---- Pose of a camera from points whose place is known: consensus, then weighted least squares.
 
@@ -29,15 +29,15 @@ class PoseEstimate:
     inliers: NDArray[np.bool_]
 
 
-def consensus(points: F64, uv: F64, focal: float, threshold_px: float, seed: int) -> PoseEstimate | None:
+def ransac_pose(points: F64, uv: F64, focal: float, threshold_px: float, seed: int) -> PoseEstimate | None:
     """`absolute_pose` of points (N, 3) m, world, seen at uv (N, 2); None without a model."""
     if len(points) < 4:
         return None
-    T, inliers = absolute_pose(points, uv, focal, Terms(threshold_px, seed))
+    T, inliers = absolute_pose(points, uv, focal, RansacOptions(threshold_px, seed))
     return PoseEstimate(T, np.eye(6), inliers) if inliers.sum() >= 4 else None
 
 
-def refine(
+def refine_pose(
     T: F64, points: F64, uv: F64, focal: float, sigma_px: F64, gate_px: float, iterations: int = 8
 ) -> PoseEstimate:
     """Gauss-Newton on reprojection errors with Cauchy weights, from T_cam_world.
@@ -48,14 +48,14 @@ def refine(
     """
     scale = focal / sigma_px
     for _ in range(iterations):
-        r, J = reprojection(T, points, uv, scale)
-        w = 1 / (1 + (r * r).sum(axis=1) / 4.0)  # Cauchy, 2 sigma
-        H, g = _normal_equations(r, J, w)
+        r, J = reprojection_residuals(T, points, uv, scale)
+        weight = 1 / (1 + (r * r).sum(axis=1) / 4.0)  # Cauchy, 2 sigma
+        H, g = _normal_equations(r, J, weight)
         step: F64 = np.asarray(-np.linalg.solve(H, g), np.float64)
         T = T @ se3.exp(step)
         if np.abs(step).max() < 1e-6:
             break
-    r, J = reprojection(T, points, uv, scale)
+    r, J = reprojection_residuals(T, points, uv, scale)
     squared = (r * r).sum(axis=1)
     inliers = squared < gate_px**2
     H, _ = _normal_equations(r, J, inliers.astype(np.float64))
@@ -70,7 +70,7 @@ def _normal_equations(r: F64, J: F64, w: F64) -> tuple[F64, F64]:
     return weighted.T @ flat + 1e-9 * np.eye(6), weighted.T @ r.ravel()
 
 
-def reprojection(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F64, F64]:
+def reprojection_residuals(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F64, F64]:
     """Residuals (N, 2) = scale (projection - uv), and d/d(xi) (N, 2, 6) for T Exp(xi).
 
     With p_c = R p + t, T Exp(xi) moves it by R (rho - p x phi). So a row d of D R, where D is the
@@ -115,55 +115,55 @@ class LocalMap:
         self._next_id = 0
         self.ids: I64 = np.zeros(0, np.int64)  # ascending
         self.points: F64 = np.zeros((0, 3))
-        self.hosts: I64 = np.zeros(0, np.int64)
-        self.host_px: F32 = np.zeros((0, 2), np.float32)
+        self.anchors: I64 = np.zeros(0, np.int64)
+        self.anchor_px: F32 = np.zeros((0, 2), np.float32)
 
     def add_keyframe(self, image: U8, T_odom_cam: F64) -> int:
         """Its number. Where the map is full, the keyframe nearest to another one makes room."""
         if len(self.keyframes) >= self._max_keyframes:
-            self._drop(self._most_redundant())
-        number = self._next_keyframe
+            self._drop_keyframe(self._most_redundant())
+        keyframe_id = self._next_keyframe
         self._next_keyframe += 1
-        self.keyframes[number] = LocalKeyframe(image, T_odom_cam)
-        return number
+        self.keyframes[keyframe_id] = LocalKeyframe(image, T_odom_cam)
+        return keyframe_id
 
     def set_view(self, view: View) -> None:
         """The features of the newest keyframe."""
         newest = self._next_keyframe - 1
         self.keyframes[newest] = replace(self.keyframes[newest], view=view)
 
-    def add_points(self, host: int, points: F64, px: F32) -> I64:
-        """Ids (N,) of new points (N, 3) m in odom, seen at px (N, 2) in keyframe `host`."""
+    def add_points(self, anchor: int, points: F64, px: F32) -> I64:
+        """Ids (N,) of new points (N, 3) m in odom, seen at px (N, 2) in keyframe `anchor`."""
         ids = np.arange(self._next_id, self._next_id + len(points))
         self._next_id += len(points)
         self.ids = np.concatenate([self.ids, ids])
         self.points = np.concatenate([self.points, points])
-        self.hosts = np.concatenate([self.hosts, np.full(len(points), host)])
-        self.host_px = np.concatenate([self.host_px, px.astype(np.float32)])
+        self.anchors = np.concatenate([self.anchors, np.full(len(points), anchor)])
+        self.anchor_px = np.concatenate([self.anchor_px, px.astype(np.float32)])
         return ids
 
-    def rows(self, ids: I64) -> I64:
+    def row_indices(self, ids: I64) -> I64:
         """Row of each point, -1 where it is gone."""
         row = np.searchsorted(self.ids, ids)
         row = np.minimum(row, max(len(self.ids) - 1, 0))
-        known = self.ids[row] == ids if len(self.ids) else np.zeros(len(ids), bool)
-        return np.where(known, row, -1)
+        is_known = self.ids[row] == ids if len(self.ids) else np.zeros(len(ids), bool)
+        return np.where(is_known, row, -1)
 
-    def visible(
-        self, T_cam_odom: F64, camera: Camera, hosts: list[int], border: float = 12.0
+    def visible_points(
+        self, T_cam_odom: F64, camera: Camera, anchors: list[int], border: float = 12.0
     ) -> tuple[I64, F32]:
-        """Rows and predicted px of the points of `hosts` that the camera should see."""
-        rows = np.flatnonzero(np.isin(self.hosts, hosts))
+        """Rows and predicted px of the points of `anchors` that the camera should see."""
+        rows = np.flatnonzero(np.isin(self.anchors, anchors))
         px = camera.project(se3.transform(T_cam_odom, self.points[rows]))
-        inside = camera.inside(np.nan_to_num(px, nan=-1e6), border)
+        inside = camera.is_inside(np.nan_to_num(px, nan=-1e6), border)
         return rows[inside], px[inside].astype(np.float32)
 
-    def hosts_near(self, T_odom_cam: F64, max_m: float, max_rad: float) -> list[int]:
+    def keyframes_near(self, T_odom_cam: F64, max_m: float, max_rad: float) -> list[int]:
         """Keyframes seen from about here, nearest first; one metre weighs as much as one radian."""
         numbers = np.array(sorted(self.keyframes), np.int64)
         if len(numbers) == 0:
             return []
-        (distance,), (angle,) = se3.apart(T_odom_cam[None], self._poses(numbers))
+        (distance,), (angle,) = se3.pairwise_distances(T_odom_cam[None], self._poses(numbers))
         near = (distance < max_m) & (angle < max_rad)
         cost = distance + angle
         return [int(n) for n in numbers[near][np.argsort(cost[near], kind="stable")]]
@@ -175,68 +175,80 @@ class LocalMap:
         """The older keyframe of the closest pair."""
         numbers = np.array(sorted(self.keyframes), np.int64)
         poses = self._poses(numbers)
-        distance, angle = se3.apart(poses[:-1], poses)  # the newest is never dropped
+        distance, angle = se3.pairwise_distances(poses[:-1], poses)  # the newest is never dropped
         cost = distance + angle
         cost[np.tril_indices_from(cost)] = np.inf
         return int(numbers[np.argmin(cost.min(axis=1))])
 
-    def _drop(self, number: int) -> None:
+    def _drop_keyframe(self, number: int) -> None:
         del self.keyframes[number]
-        keep: NDArray[np.bool_] = self.hosts != number
+        keep: NDArray[np.bool_] = self.anchors != number
         self.ids, self.points = self.ids[keep], self.points[keep]
-        self.hosts, self.host_px = self.hosts[keep], self.host_px[keep]
+        self.anchors, self.anchor_px = self.anchors[keep], self.anchor_px[keep]
 
 
 # ---- Finding oneself again among keyframes one has been at.
 
-MAX_HAMMING = 64  # of 256 bits
-RATIO = 0.8  # the best match must be so much nearer than the second (Lowe 2004)
+MAX_HAMMING_BITS = 64  # of 256 bits
+MATCH_RATIO = 0.8  # the best match must be so much nearer than the second (Lowe 2004)
 
 
-class Turns:
+class RoundRobin:
     """Some of the keyframes at a frame, others at the next: looking at all of them would make a live
     camera's frames late. count: at a time."""
 
-    def __init__(self, count: int) -> None:
-        self._count, self._tried = count, 0
+    def __init__(self, batch_size: int) -> None:
+        self._batch_size, self._offset = batch_size, 0
 
-    def begin(self) -> None:
+    def reset(self) -> None:
         """Lost anew."""
-        self._tried = 0
+        self._offset = 0
 
-    def next(self, numbers: Sequence[int]) -> Sequence[int]:
+    def next_batch(self, numbers: Sequence[int]) -> Sequence[int]:
         """Of `numbers`, the likeliest first, those whose turn it is."""
-        first = self._tried % max(len(numbers), 1)
-        self._tried += self._count
-        return numbers[first : first + self._count]
+        first = self._offset % max(len(numbers), 1)
+        self._offset += self._batch_size
+        return numbers[first : first + self._batch_size]
 
 
-def find(
+def relocalise(
     keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, config: TrackerConfig, seed: int
 ) -> F64 | None:
     """T_odom_cam (4, 4) of the frame by its ORB features, from the keyframe that most of them agree with.
 
     Twice as many inliers are asked for as tracking needs: nothing else vouches for the answer.
     """
-    px, descriptors = orb(frame.image0, config.view_features, within=within(rig.cam0, EVEN_DEG))
+    px, descriptors = detect_orb(
+        frame.image0, config.view_features, mask=field_mask(rig.cam0, UNIFORM_FIELD_DEG)
+    )
     uv = rig.cam0.normalise(px.astype(np.float64))
-    found = (_against(keyframe, uv, descriptors, rig.cam0.focal, config, seed) for keyframe in keyframes)
-    best = max((f for f in found if f is not None), key=lambda f: f.inliers.sum(), default=None)
+    estimates = (
+        _match_keyframe(keyframe, uv, descriptors, rig.cam0.focal, config, seed) for keyframe in keyframes
+    )
+    best = max(
+        (estimate for estimate in estimates if estimate is not None),
+        key=lambda f: f.inliers.sum(),
+        default=None,
+    )
     if best is None or best.inliers.sum() < 2 * config.min_inliers:
         return None
     return se3.inverse(best.T)
 
 
-def _against(
+def _match_keyframe(
     keyframe: LocalKeyframe, uv: F64, descriptors: U8, focal: float, config: TrackerConfig, seed: int
 ) -> PoseEstimate | None:
     if keyframe.view is None:
         return None
-    known = np.flatnonzero(~np.isnan(keyframe.view.points[:, 0]))
-    pairs = match(descriptors, keyframe.view.descriptors[known], MAX_HAMMING, RATIO)
-    points = keyframe.view.points[known[pairs[:, 1]]].astype(np.float64)
-    points, seen = se3.transform(keyframe.T_odom_cam, points), uv[pairs[:, 0]]
-    first = consensus(points, seen, focal, config.ransac_px, seed)
-    if first is None:
+    with_depth = np.flatnonzero(~np.isnan(keyframe.view.points[:, 0]))
+    pairs = match_descriptors(
+        descriptors, keyframe.view.descriptors[with_depth], MAX_HAMMING_BITS, MATCH_RATIO
+    )
+    points = keyframe.view.points[with_depth[pairs[:, 1]]].astype(np.float64)
+    points, matched_uv = se3.transform(keyframe.T_odom_cam, points), uv[pairs[:, 0]]
+    rough = ransac_pose(points, matched_uv, focal, config.ransac_px, seed)
+    if rough is None:
         return None
-    return refine(first.T, points, seen, focal, np.full(len(points), config.noise_px), config.gate_sigma)
+    return refine_pose(
+        rough.T, points, matched_uv, focal, np.full(len(points), config.noise_px), config.gate_sigma
+    )

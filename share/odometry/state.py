@@ -23,12 +23,12 @@ VELOCITY = slice(6, 9)
 GYRO_BIAS = slice(9, 12)
 ACCEL_BIAS = slice(12, 15)
 EXTRINSIC = slice(15, 21)
-OFFSET = 21
-CORE = 22
+TIMESHIFT = 21
+CORE_SIZE = 22
 
 
 @dataclass(eq=False)
-class State:
+class FilterState:
     """stamp_ns: IMU time of the body's mean. T (4, 4) T_odom_body; v (3,) m/s in odom; bg rad/s, ba m/s^2
     (3,) in the body; T_body_cam (4, 4); offset_s: IMU time less camera time.
 
@@ -43,48 +43,50 @@ class State:
     bg: F64
     ba: F64
     T_body_cam: F64
-    offset_s: float
+    timeshift_s: float
     cov: F64
-    keyframes: I64
-    poses: F64
-    ids: I64
-    host: I64
+    keyframe_ids: I64
+    keyframe_poses: F64
+    feature_ids: I64
+    anchor: I64
     ray: F64
     rho: F64
 
     @property
     def size(self) -> int:
-        return CORE + 6 * len(self.keyframes) + len(self.ids)
+        return CORE_SIZE + 6 * len(self.keyframe_ids) + len(self.feature_ids)
 
     @property
-    def features_at(self) -> int:
+    def features_start(self) -> int:
         """The column of the first feature's inverse depth."""
-        return CORE + 6 * len(self.keyframes)
+        return CORE_SIZE + 6 * len(self.keyframe_ids)
 
     @property
     def rho_variance(self) -> F64:
         """(N,) 1/m^2."""
-        return np.diag(self.cov)[self.features_at :]
+        return np.diag(self.cov)[self.features_start :]
 
     def means(self) -> tuple[Any, ...]:
         """All but the covariance, for `restore`."""
-        calibration = self.bg, self.ba, self.T_body_cam, self.offset_s
-        return self.T, self.v, *calibration, self.poses, self.rho
+        calibration = self.bg, self.ba, self.T_body_cam, self.timeshift_s
+        return self.T, self.v, *calibration, self.keyframe_poses, self.rho
 
     def restore(self, means: tuple[Any, ...]) -> None:
         """What `means` gave. Steps of the filter replace arrays and never write into them."""
-        self.T, self.v, self.bg, self.ba, self.T_body_cam, self.offset_s = means[:6]
-        self.poses, self.rho = means[6:]
+        self.T, self.v, self.bg, self.ba, self.T_body_cam, self.timeshift_s = means[:6]
+        self.keyframe_poses, self.rho = means[6:]
 
-    def keyframe(self, k: int) -> slice:
-        """Columns of keyframe number k of `poses`."""
-        return slice(CORE + 6 * k, CORE + 6 * k + 6)
+    def keyframe_columns(self, k: int) -> slice:
+        """Columns of keyframe number k of `keyframe_poses`."""
+        return slice(CORE_SIZE + 6 * k, CORE_SIZE + 6 * k + 6)
 
 
-def begin(stamp_ns: int, T: F64, v: F64, bg: F64, ba: F64, T_body_cam: F64, sigma: F64) -> State:
+def initial_state(
+    stamp_ns: int, T: F64, v: F64, bg: F64, ba: F64, T_body_cam: F64, sigma: F64
+) -> FilterState:
     """A state without keyframes; sigma (22,): standard deviations of the core, uncorrelated."""
     none = np.zeros(0, np.int64)
-    return State(
+    return FilterState(
         stamp_ns,
         T.copy(),
         v.copy(),

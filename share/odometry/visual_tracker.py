@@ -13,25 +13,36 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from share.columns import Columns
+from share.array_table import ArrayTable
 from share.config import TrackerConfig
 from share.geometry import se3
 from share.geometry.camera import ImuBias, Rig, rays
 from share.odometry import initialisation, relocalisation
-from share.odometry.keyframes import Spacing
-from share.odometry.relocalisation import LocalKeyframe, LocalMap, PoseEstimate, consensus, refine
-from share.odometry.result import TrackResult, typical
-from share.types import F32, F64, I64, U8, Candidate, Footing, Frame, TrackState, View, Wait
+from share.odometry.keyframes import KeyframeSpacing
+from share.odometry.relocalisation import LocalKeyframe, LocalMap, PoseEstimate, ransac_pose, refine_pose
+from share.odometry.track_result import TrackResult, finite_median
+from share.types import (
+    F32,
+    F64,
+    I64,
+    U8,
+    FeatureStatistics,
+    Frame,
+    KeyframeCandidate,
+    TrackState,
+    View,
+    WaitReason,
+)
 from share.vision import corners, optical_flow
-from share.vision.mask import EVEN_DEG, within
-from share.vision.orb import depth_at, make_view
+from share.vision.mask import UNIFORM_FIELD_DEG, field_mask
+from share.vision.orb import make_view, measure_depth
 
-RESEMBLANCE = 0.8  # NCC below which a re-found patch is another thing
-MIN_TO_LOOK_FOR = 8  # fewer points of an old keyframe are not worth an image pyramid
+MIN_NCC = 0.8  # NCC below which a re-found patch is another thing
+MIN_POINTS_TO_MATCH = 8  # fewer points of an old keyframe are not worth an image pyramid
 
 
 @dataclass(frozen=True, eq=False)
-class _Tracks(Columns):
+class _Tracks(ArrayTable):
     """Points of the local map seen in the last image: ids (N,), px (N, 2)."""
 
     ids: I64
@@ -49,70 +60,77 @@ class VisualTracker:
             raise ValueError("a camera alone gives no scale: stereo or depth is needed")
         self._rig, self._config, self._seed = rig, config, seed
         self._T_cam_body = se3.inverse(rig.T_body_cam0)
-        self._gravity = initialisation.AtRest() if rig.imu else None
+        self._gravity_estimator = initialisation.GravityEstimator() if rig.imu else None
         self._map = LocalMap(config.max_keyframes)
         self._tracks = _NO_TRACKS
-        self._found, self._sought = _NO_TRACKS, 0  # in the last frame, of so many that were followed
+        self._found_tracks, self._sought_count = (
+            _NO_TRACKS,
+            0,
+        )  # in the last frame, of so many that were followed
         self._image: U8 | None = None
         self._stamp_ns = 0
         self._T_odom_cam: F64 | None = None  # last believed pose
         self._velocity = np.zeros(6)  # body twist of the camera, rad/s and m/s
         self._cov = np.zeros((6, 6))  # of the last pose against the local map, camera frame
         c = config
-        self._newest = Spacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_tracked)
-        self._new_stretch = True  # of the last keyframe
-        self._T_shown = np.eye(4)  # T_odom_body of the last keyframe that others were told of
-        self._to_anchor = False  # the last frame is to become a keyframe of the local map
-        self._unsettled: tuple[Frame, View] | None = None
+        self._spacing = KeyframeSpacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_tracked)
+        self._new_segment = True  # of the last keyframe
+        self._T_last_published = np.eye(4)  # T_odom_body of the last keyframe that others were told of
+        self._keyframe_pending = False  # the last frame is to become a keyframe of the local map
+        self._offered: tuple[Frame, View] | None = None
         self._lost_since_ns: int | None = None
-        self._turns = relocalisation.Turns(config.relocalise_hosts)
+        self._round_robin = relocalisation.RoundRobin(config.relocalise_hosts)
 
     def track(self, frame: Frame) -> TrackResult:
         """The pose of this frame, causal. Frames must come with rising stamps."""
-        self.settle()
+        self.finish_keyframe()
         if self._T_odom_cam is None:
-            result = self._start(frame)
+            result = self._initialise(frame)
         elif self._lost_since_ns is not None:
-            result = self._recover(frame)
+            result = self._relocalise(frame)
         else:
-            result = self._follow(frame, self._T_odom_cam)
+            result = self._track_frame(frame, self._T_odom_cam)
         if self._rig.imu and not len(frame.imu) and result.state is TrackState.OK:
             result = replace(result, state=TrackState.VISION_ONLY)  # the IMU is silent: let it be seen
         self._image, self._stamp_ns = frame.image0, frame.stamp_ns
         return result
 
-    def keyframe(self, frame: Frame) -> Candidate:
+    def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
         """Make the frame just tracked a keyframe; call it where `track` said so. What it shows to others.
 
         Apart from `track`, because a headset should have its pose before this is computed.
         """
         view = make_view(frame, self._rig, self._config.view_features)
-        new_stretch = self._new_stretch and not self._to_anchor
+        new_segment = self._new_segment and not self._keyframe_pending
         T_odom_body = self._T_odom_body()
-        up = T_odom_body[2, :3] if self._gravity else np.zeros(3)
-        T_last_body = T_odom_body if new_stretch else se3.inverse(self._T_shown) @ T_odom_body
+        up = T_odom_body[2, :3] if self._gravity_estimator else np.zeros(3)
+        T_previous_body = T_odom_body if new_segment else se3.inverse(self._T_last_published) @ T_odom_body
         cov = se3.compose_cov(self._T_cam_body, self._cov, np.zeros((6, 6)))
-        self._unsettled = frame, view
-        return Candidate(T_odom_body, T_last_body, cov, up, initialisation.SIGMA_RAD, view, new_stretch)
+        self._offered = frame, view
+        return KeyframeCandidate(
+            T_odom_body, T_previous_body, cov, up, initialisation.UP_SIGMA_RAD, view, new_segment
+        )
 
-    def settle(self) -> None:
-        """See `InertialTracker.settle`."""
-        if self._unsettled is None:
+    def finish_keyframe(self) -> None:
+        """See `InertialTracker.finish_keyframe`."""
+        if self._offered is None:
             return
-        (frame, view), self._unsettled = self._unsettled, None
-        self._T_shown = self._T_odom_body()  # only now: before, making its candidate might have failed
-        if self._to_anchor:
-            self._anchor(frame)
+        (frame, view), self._offered = self._offered, None
+        self._T_last_published = (
+            self._T_odom_body()
+        )  # only now: before, making its candidate might have failed
+        if self._keyframe_pending:
+            self._add_keyframe(frame)
         self._map.set_view(view)
 
-    def give_up(self, frame: Frame) -> None:
+    def reset_after_failure(self, frame: Frame) -> None:
         """Something failed in or after `frame`, the last: where it is now is not known."""
-        self._lose(frame)
-        self._tracks, self._unsettled, self._to_anchor = _NO_TRACKS, None, False
+        self._declare_lost(frame)
+        self._tracks, self._offered, self._keyframe_pending = _NO_TRACKS, None, False
         self._image, self._stamp_ns = frame.image0, frame.stamp_ns
 
     @property
-    def doubted(self) -> int:
+    def rejected_imu_samples(self) -> int:
         """How many samples of an IMU were not believed: none is used."""
         return 0
 
@@ -121,82 +139,84 @@ class VisualTracker:
         """Of an IMU: none is used."""
         return None
 
-    def footing(self) -> Footing:
+    def feature_statistics(self) -> FeatureStatistics:
         """Of the frame just tracked, one with a pose."""
         assert self._T_odom_cam is not None
-        found = self._all_found()
-        rows = self._map.rows(found.ids)
+        tracks = self._all_found_tracks()
+        rows = self._map.row_indices(tracks.ids)
         points = np.where(rows[:, None] >= 0, self._map.points[rows], np.nan)
         z = se3.transform(se3.inverse(self._T_odom_cam), points)[:, 2]
-        believed = np.arange(len(rows)) < len(self._tracks.ids)
-        due, known = max(self._sought, len(rows)), len(self._map.ids)
-        return Footing(found.px, believed, z, due, known)
+        is_inlier = np.arange(len(rows)) < len(self._tracks.ids)
+        sought_count, known_count = max(self._sought_count, len(rows)), len(self._map.ids)
+        return FeatureStatistics(tracks.px, is_inlier, z, sought_count, known_count)
 
-    def _all_found(self) -> _Tracks:
+    def _all_found_tracks(self) -> _Tracks:
         """Of the last frame: those that were believed, then the others."""
-        return self._tracks.join(self._found.take(~np.isin(self._found.ids, self._tracks.ids)))
+        return self._tracks.concatenate(
+            self._found_tracks.take(~np.isin(self._found_tracks.ids, self._tracks.ids))
+        )
 
-    def _surprise(self, found: _Tracks) -> float:
+    def _median_nis(self, tracks: _Tracks) -> float:
         """See `TrackResult`."""
         assert self._T_odom_cam is not None
-        expected = self._project(se3.inverse(self._T_odom_cam), self._map.rows(found.ids))
-        return typical((((found.px - expected) / self._config.noise_px) ** 2).sum(axis=1))
+        expected = self._project(se3.inverse(self._T_odom_cam), self._map.row_indices(tracks.ids))
+        return finite_median((((tracks.px - expected) / self._config.noise_px) ** 2).sum(axis=1))
 
     # ------------------------------------------------------------------ the usual frame
 
-    def _follow(self, frame: Frame, T_last: F64) -> TrackResult:
+    def _track_frame(self, frame: Frame, T_last: F64) -> TrackResult:
         dt = (frame.stamp_ns - self._stamp_ns) * 1e-9
         # Over a gap the last velocity says nothing.
         T_predicted = T_last if frame.gap_ns else T_last @ se3.exp(self._velocity * dt)
-        tracks = self._find(frame.image0, T_predicted)
-        estimate, tracks = self._pose(tracks)
-        if estimate is None or not self._plausible(T_last, estimate, dt):
-            self._lose(frame)
+        tracks = self._follow_tracks(frame.image0, T_predicted)
+        estimate, tracks = self._estimate_pose(tracks)
+        if estimate is None or not self._is_plausible(T_last, estimate, dt):
+            self._declare_lost(frame)
             return TrackResult(TrackState.LOST, None)
         T_odom_cam = se3.inverse(estimate.T)
         self._velocity = se3.log(se3.inverse(T_last) @ T_odom_cam) / dt
         self._tracks, self._T_odom_cam = tracks, T_odom_cam
         self._cov = se3.inverse_cov(estimate.T, estimate.cov)
-        wanted = self._newest.wanted(frame.stamp_ns, T_odom_cam, len(tracks.ids))
-        if wanted:
+        wants_keyframe = self._spacing.wants_keyframe(frame.stamp_ns, T_odom_cam, len(tracks.ids))
+        if wants_keyframe:
             self._reobserve(frame)
-            self._to_anchor = True
+            self._keyframe_pending = True
         count = len(self._tracks.ids)
         state = TrackState.OK if count >= self._config.weak_inliers else TrackState.WEAK
-        found = self._all_found()
-        told = TrackResult(state, self._T_odom_body(), wanted, count)
-        return replace(told, found=len(found.ids), surprise=self._surprise(found))
+        found = self._all_found_tracks()
+        result = TrackResult(state, self._T_odom_body(), wants_keyframe, count)
+        return replace(result, found_count=len(found.ids), median_nis=self._median_nis(found))
 
-    def _find(self, image: U8, T_predicted: F64) -> _Tracks:
+    def _follow_tracks(self, image: U8, T_predicted: F64) -> _Tracks:
         assert self._image is not None
-        rows = self._map.rows(self._tracks.ids)
+        rows = self._map.row_indices(self._tracks.ids)
         tracks = self._tracks.take(rows >= 0)
         expected = self._project(se3.inverse(T_predicted), rows[rows >= 0])
         guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
-        px, found = optical_flow.follow(self._image, image, tracks.px, guess, levels=2)
-        found &= self._rig.cam0.knows(px.astype(np.float64))
-        self._found, self._sought = _Tracks(tracks.ids, px).take(found), len(tracks.ids)
-        return self._found
+        px, found = optical_flow.track_points(self._image, image, tracks.px, guess, levels=2)
+        found &= self._rig.cam0.has_normalised(px.astype(np.float64))
+        self._found_tracks, self._sought_count = _Tracks(tracks.ids, px).take(found), len(tracks.ids)
+        return self._found_tracks
 
     def _project(self, T_cam_odom: F64, rows: I64) -> F64:
         """Where the map's points should be seen, (N, 2) px, NaN behind the camera."""
         return self._rig.cam0.project(se3.transform(T_cam_odom, self._map.points[rows]))
 
-    def _pose(self, tracks: _Tracks) -> tuple[PoseEstimate | None, _Tracks]:
+    def _estimate_pose(self, tracks: _Tracks) -> tuple[PoseEstimate | None, _Tracks]:
         """Pose T_cam_odom from tracks; the tracks that agree with it."""
         config, focal = self._config, self._rig.cam0.focal
-        points = self._map.points[self._map.rows(tracks.ids)]
+        points = self._map.points[self._map.row_indices(tracks.ids)]
         uv = self._rig.cam0.normalise(tracks.px.astype(np.float64))
-        first = consensus(points, uv, focal, config.ransac_px, self._seed)
-        if first is None or first.inliers.sum() < config.min_inliers:
+        rough = ransac_pose(points, uv, focal, config.ransac_px, self._seed)
+        if rough is None or rough.inliers.sum() < config.min_inliers:
             return None, _NO_TRACKS
         sigma = np.full(len(points), config.noise_px)
-        best = refine(first.T, points, uv, focal, sigma, config.gate_sigma)
+        best = refine_pose(rough.T, points, uv, focal, sigma, config.gate_sigma)
         if best.inliers.sum() < config.min_inliers:
             return None, _NO_TRACKS
         return best, tracks.take(best.inliers)
 
-    def _plausible(self, T_last: F64, estimate: PoseEstimate, dt: float) -> bool:
+    def _is_plausible(self, T_last: F64, estimate: PoseEstimate, dt: float) -> bool:
         """Finite, and no faster than a person or robot can be."""
         if dt <= 0 or not np.isfinite(estimate.T).all():
             return False
@@ -206,14 +226,18 @@ class VisualTracker:
 
     # ------------------------------------------------------------------ keyframes
 
-    def _anchor(self, frame: Frame, new_stretch: bool = False) -> None:
+    def _add_keyframe(self, frame: Frame, new_segment: bool = False) -> None:
         """Make this frame a keyframe of the local map, and its free corners points."""
         assert self._T_odom_cam is not None
-        host = self._map.add_keyframe(frame.image0, self._T_odom_cam)
-        self._add_corners(frame, host)
-        newest = self._newest
-        newest.stamp_ns, newest.T, newest.features = frame.stamp_ns, self._T_odom_cam, len(self._tracks.ids)
-        self._new_stretch, self._to_anchor = new_stretch, False
+        anchor = self._map.add_keyframe(frame.image0, self._T_odom_cam)
+        self._add_corners(frame, anchor)
+        spacing = self._spacing
+        spacing.stamp_ns, spacing.T, spacing.feature_count = (
+            frame.stamp_ns,
+            self._T_odom_cam,
+            len(self._tracks.ids),
+        )
+        self._new_segment, self._keyframe_pending = new_segment, False
 
     def _reobserve(self, frame: Frame) -> None:
         """Take up points of earlier keyframes that lie where they should.
@@ -225,92 +249,94 @@ class VisualTracker:
         config = self._config
         assert self._T_odom_cam is not None
         T_cam_odom = se3.inverse(self._T_odom_cam)
-        hosts = self._map.hosts_near(self._T_odom_cam, config.reobserve_m, config.reobserve_rad)
+        anchors = self._map.keyframes_near(self._T_odom_cam, config.reobserve_m, config.reobserve_rad)
         found = _NO_TRACKS
-        for host in hosts[: config.reobserve_hosts]:
-            rows, guess = self._map.visible(T_cam_odom, self._rig.cam0, [host])
+        for anchor in anchors[: config.reobserve_hosts]:
+            rows, guess = self._map.visible_points(T_cam_odom, self._rig.cam0, [anchor])
             fresh = ~np.isin(self._map.ids[rows], self._tracks.ids)
-            if fresh.sum() >= MIN_TO_LOOK_FOR:
-                found = found.join(self._look_for(frame.image0, host, rows[fresh], guess[fresh]))
-        expected = self._project(T_cam_odom, self._map.rows(found.ids))
+            if fresh.sum() >= MIN_POINTS_TO_MATCH:
+                found = found.concatenate(
+                    self._match_patches(frame.image0, anchor, rows[fresh], guess[fresh])
+                )
+        expected = self._project(T_cam_odom, self._map.row_indices(found.ids))
         found = found.take(np.linalg.norm(found.px - expected, axis=1) < config.reobserve_px)
-        estimate, tracks = self._pose(self._tracks.join(found))
+        estimate, tracks = self._estimate_pose(self._tracks.concatenate(found))
         if estimate is not None:
             self._T_odom_cam, self._tracks = se3.inverse(estimate.T), tracks
 
-    def _look_for(self, image: U8, host: int, rows: I64, guess: F32) -> _Tracks:
-        source = self._map.keyframes[host].image
-        host_px = self._map.host_px[rows]
-        px, found = optical_flow.follow(
+    def _match_patches(self, image: U8, anchor: int, rows: I64, guess: F32) -> _Tracks:
+        source = self._map.keyframes[anchor].image
+        host_px = self._map.anchor_px[rows]
+        px, found = optical_flow.track_points(
             source, image, host_px, guess, window=15, levels=1, back_check_px=None
         )
-        found &= optical_flow.resemblance(source, image, host_px, px) > RESEMBLANCE
-        found &= self._rig.cam0.knows(px.astype(np.float64))
+        found &= optical_flow.ncc(source, image, host_px, px) > MIN_NCC
+        found &= self._rig.cam0.has_normalised(px.astype(np.float64))
         return _Tracks(self._map.ids[rows], px).take(found)
 
-    def _add_corners(self, frame: Frame, host: int) -> None:
+    def _add_corners(self, frame: Frame, anchor: int) -> None:
         assert self._T_odom_cam is not None
-        wanted = self._config.corners - len(self._tracks.ids)
-        seen = within(self._rig.cam0, EVEN_DEG)
-        px = corners.strongest(frame.image0, self._tracks.px, wanted, self._config.spacing_px, within=seen)
+        max_count = self._config.corners - len(self._tracks.ids)
+        mask = field_mask(self._rig.cam0, UNIFORM_FIELD_DEG)
+        px = corners.strongest(frame.image0, self._tracks.px, max_count, self._config.spacing_px, mask=mask)
         uv = self._rig.cam0.normalise(px.astype(np.float64))
-        z = depth_at(frame, self._rig, px, uv)
+        z = measure_depth(frame, self._rig, px, uv)
         known = ~np.isnan(z)
         points = se3.transform(self._T_odom_cam, rays(uv[known]) * z[known, None])
-        ids = self._map.add_points(host, points, px[known])
-        self._tracks = self._tracks.join(_Tracks(ids, px[known]))
+        ids = self._map.add_points(anchor, points, px[known])
+        self._tracks = self._tracks.concatenate(_Tracks(ids, px[known]))
 
     # ------------------------------------------------------------------ beginnings and losses
 
-    def _start(self, frame: Frame) -> TrackResult:
+    def _initialise(self, frame: Frame) -> TrackResult:
         """The first keyframe defines odom: body at the origin, z up as far as that is known."""
-        up = self._gravity.add(frame.imu) if self._gravity else None
-        if self._gravity and up is None and not self._gravity.gave_up:
-            return TrackResult(TrackState.INITIALISING, None, waits=Wait.TILT)
+        up = self._gravity_estimator.add(frame.imu) if self._gravity_estimator else None
+        if self._gravity_estimator and up is None and not self._gravity_estimator.has_timed_out:
+            return TrackResult(TrackState.INITIALISING, None, waiting_for=WaitReason.TILT)
         if up is None:
-            up = self._gravity.guess() if self._gravity else None
-            self._gravity = None
+            up = self._gravity_estimator.mean_direction() if self._gravity_estimator else None
+            self._gravity_estimator = None
         if up is None:
             up = self._rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
         forward = self._rig.T_body_cam0[:3, 2]
-        self._T_odom_cam = initialisation.level(up, forward) @ self._rig.T_body_cam0
-        self._anchor(frame, new_stretch=True)
+        self._T_odom_cam = initialisation.align_to_gravity(up, forward) @ self._rig.T_body_cam0
+        self._add_keyframe(frame, new_segment=True)
         if len(self._tracks.ids) < self._config.min_inliers:
             self._T_odom_cam, self._tracks = None, _NO_TRACKS
             self._map = LocalMap(self._config.max_keyframes)
-            return TrackResult(TrackState.INITIALISING, None, waits=Wait.VIEW)
+            return TrackResult(TrackState.INITIALISING, None, waiting_for=WaitReason.VIEW)
         return TrackResult(TrackState.OK, self._T_odom_body(), True, len(self._tracks.ids), True)
 
-    def _lose(self, frame: Frame) -> None:
+    def _declare_lost(self, frame: Frame) -> None:
         self._lost_since_ns, self._velocity = frame.stamp_ns, np.zeros(6)
-        self._turns.begin()
+        self._round_robin.reset()
 
-    def _recover(self, frame: Frame) -> TrackResult:
+    def _relocalise(self, frame: Frame) -> TrackResult:
         """Find ourselves in the local map; after a while, begin a new stretch where we were lost."""
         assert self._lost_since_ns is not None
         config = self._config
-        found = relocalisation.find(self._next_places(), frame, self._rig, config, self._seed)
+        T_found = relocalisation.relocalise(self._next_keyframes(), frame, self._rig, config, self._seed)
         waited_s = (frame.stamp_ns - self._lost_since_ns) * 1e-9
-        if found is not None:
-            self._T_odom_cam, self._tracks = found, _NO_TRACKS
+        if T_found is not None:
+            self._T_odom_cam, self._tracks = T_found, _NO_TRACKS
             self._reobserve(frame)
         elif waited_s < config.new_stretch_s:
             return TrackResult(TrackState.LOST, None)
         old_map = self._map
-        if found is None:
+        if T_found is None:
             self._map, self._tracks = LocalMap(config.max_keyframes), _NO_TRACKS
-        self._anchor(frame, new_stretch=found is None)
+        self._add_keyframe(frame, new_segment=T_found is None)
         if len(self._tracks.ids) < config.min_inliers:
             self._map = old_map  # nothing to see here either: keep what may be found again
             return TrackResult(TrackState.LOST, None)
         self._lost_since_ns = None
-        return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids), found is None)
+        return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids), T_found is None)
 
-    def _next_places(self) -> list[LocalKeyframe]:
+    def _next_keyframes(self) -> list[LocalKeyframe]:
         """Of the local map's keyframes, nearest to where we were first."""
         assert self._T_odom_cam is not None
-        nearest = self._map.hosts_near(self._T_odom_cam, np.inf, np.inf)
-        return [self._map.keyframes[n] for n in self._turns.next(nearest)]
+        nearest = self._map.keyframes_near(self._T_odom_cam, np.inf, np.inf)
+        return [self._map.keyframes[n] for n in self._round_robin.next_batch(nearest)]
 
     def _T_odom_body(self) -> F64:
         assert self._T_odom_cam is not None

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from share.errors import ShareError
-from share.types import F64, Candidate, Frame, TrackState, Wait
+from share.types import F64, Frame, KeyframeCandidate, TrackState, WaitReason
 from share.wire.codec import Bytes
 from share.wire.messages import Status
 
@@ -29,10 +29,10 @@ class FrameTracked:
     done_ns: int
     state: TrackState
     T_odom_body: F64 | None = None
-    keyframe: bool = False
-    new_stretch: bool = False
+    is_keyframe: bool = False
+    new_segment: bool = False
     error_cm: float | None = None
-    waits: Wait | None = None
+    waiting_for: WaitReason | None = None
 
     @property
     def track_ms(self) -> float:
@@ -44,7 +44,7 @@ class KeyframeMade:
     """What a tracked frame shows to others: made after its pose was out. candidate: None if that failed."""
 
     frame: FrameTracked
-    candidate: Candidate | None
+    candidate: KeyframeCandidate | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,14 +56,14 @@ class FrameArrived:
 
 
 @dataclass(frozen=True, eq=False)
-class NotTaken:
+class SendFailed:
     """The link could not take this message or frame: nothing of it is sent."""
 
-    sent: Send | SendFrame
+    effect: SendToEdge | SendFrameToEdge
 
 
 @dataclass(frozen=True, eq=False)
-class Received:
+class EdgeMessageReceived:
     """A message from the edge, undecoded."""
 
     frames: Sequence[Bytes]
@@ -75,35 +75,44 @@ class Connected:
 
 
 @dataclass(frozen=True)
-class Tick:
+class AgentTick:
     """Time has passed; every 50 ms is often enough. image_ns: when the newest image came that is not tracked
     yet, None where none waits. trouble: what is wrong with the sensors, for a person; empty: nothing."""
 
-    image_ns: int | None = None
-    trouble: str = ""
+    waiting_image_ns: int | None = None
+    sensor_trouble: str = ""
 
 
 @dataclass(frozen=True)
-class Finished:
+class InputFinished:
     """No frame will follow."""
 
 
-AgentEvent = Connected | FrameTracked | KeyframeMade | FrameArrived | NotTaken | Received | Tick | Finished
+AgentEvent = (
+    Connected
+    | FrameTracked
+    | KeyframeMade
+    | FrameArrived
+    | SendFailed
+    | EdgeMessageReceived
+    | AgentTick
+    | InputFinished
+)
 
 # ---------------------------------------------------------------- effects
 
 
 @dataclass(frozen=True, eq=False)
-class Send:
-    """Hand these frames to the link; if it does not take them, `NotTaken` is the answer. keyframe: the id, if
-    they are one."""
+class SendToEdge:
+    """Hand these frames to the link; if it does not take them, `SendFailed` is the answer. keyframe: the id,
+    if they are one."""
 
     frames: Sequence[Bytes]
-    keyframe: int | None = None
+    keyframe_id: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class SendFrame:
+class SendFrameToEdge:
     """The same for a frame to be tracked."""
 
     index: int
@@ -111,23 +120,23 @@ class SendFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackedAfar:
+class FrameTrackedRemotely:
     """The edge has tracked a frame; `FrameDone` follows. frame: as for one that is tracked here."""
 
     frame: FrameTracked
-    sound: bool
-    waits: Wait | None
+    is_consistent: bool
+    waiting_for: WaitReason | None
 
 
 @dataclass(frozen=True, eq=False)
-class Localised:
+class LocalisedPose:
     """Where the agent is. arrived_ns: when its frame came in. stretch: grows where odometry begins anew.
     T_map_odom: in force at this moment (blended), None before a correction."""
 
     index: int
     stamp_ns: int
     arrived_ns: int
-    stretch: int
+    segment: int
     T_odom_body: F64
     T_map_odom: F64 | None
     map_id: str | None
@@ -143,8 +152,8 @@ class CorrectionApplied:
     not for keyframes that a restarted edge was given again.
     """
 
-    keyframe: int | None
-    frame: int | None
+    keyframe_id: int | None
+    frame_index: int | None
     stamp_ns: int | None
     corrected_ms: float | None
     map_id: str
@@ -163,48 +172,48 @@ class FrameDone:
     stamp_ns: int
     track_ms: float
     state: TrackState
-    keyframe: bool
-    sent: bool
+    is_keyframe: bool
+    is_sent: bool
 
 
 @dataclass(frozen=True)
-class StatusSaid:
+class StatusReport:
     """What the agent says of its own state now, twice a second and where it changes. stamp_ns: of the newest
     frame, None before the first. idle: no frame was tracked of late, so no FrameDone says so."""
 
     status: Status
     stamp_ns: int | None
-    idle: bool
+    is_stale: bool
 
 
 @dataclass(frozen=True)
-class Say:
+class PrintLine:
     """One line for a person."""
 
     text: str
 
 
 @dataclass(frozen=True)
-class Fail:
+class FailRun:
     """The run cannot go on; `error` says why."""
 
     error: ShareError
 
 
 @dataclass(frozen=True)
-class Stop:
+class CloseLink:
     """Everything is done: close the link."""
 
 
 AgentEffect = (
-    Send
-    | SendFrame
-    | TrackedAfar
-    | Localised
+    SendToEdge
+    | SendFrameToEdge
+    | FrameTrackedRemotely
+    | LocalisedPose
     | CorrectionApplied
     | FrameDone
-    | StatusSaid
-    | Say
-    | Fail
-    | Stop
+    | StatusReport
+    | PrintLine
+    | FailRun
+    | CloseLink
 )

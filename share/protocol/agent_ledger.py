@@ -9,27 +9,27 @@ import numpy as np
 
 from share.config import AgentConfig, LinkConfig
 from share.geometry.se3 import compose_cov, orthonormal
-from share.rates import seconds
-from share.types import F64, Candidate, Keyframe
+from share.timing import seconds_to_ns
+from share.types import F64, Keyframe, KeyframeCandidate
 from share.wire.messages import Ack, Welcome
 
 
 @dataclass(eq=False, slots=True)
-class Entry:
+class LedgerEntry:
     """A keyframe, its frame, and how far it has come."""
 
     keyframe: Keyframe
-    frame: int
+    frame_index: int
     arrived_ns: int
     attempts: int = 0  # in this life of the edge
-    sendings: int = 0  # that the link took, in any life
+    send_count: int = 0  # that the link took, in any life
     due_ns: int | None = None  # None: now
     sent_ns: int = 0
-    replayed: bool = False  # an earlier life of the edge had acknowledged it
-    answered: bool = False  # a correction based on it came back
+    is_replayed: bool = False  # an earlier life of the edge had acknowledged it
+    is_corrected: bool = False  # a correction based on it came back
 
 
-class Ledger:
+class KeyframeLedger:
     """Keyframes in order of their ids: first those acknowledged, then those open.
 
     Only the first `window` open ones are in flight. A full ledger drops the oldest acknowledged one
@@ -39,83 +39,85 @@ class Ledger:
 
     def __init__(self, agent: AgentConfig, link: LinkConfig) -> None:
         self.counts: Counter[str] = Counter()
-        self._keep = agent.keep_keyframes
+        self._capacity = agent.keep_keyframes
         self._link = link
-        self._acknowledged: dict[int, Entry] = {}
-        self._open: dict[int, Entry] = {}
-        self._held: frozenset[int] = frozenset()  # arrived, but waiting at the edge for a gap to close
-        self._sent_to = -1  # highest id put on the wire in this life of the edge
-        self._ever_sent_to = -1  # in any life
+        self._acknowledged: dict[int, LedgerEntry] = {}
+        self._pending: dict[int, LedgerEntry] = {}
+        self._buffered_at_edge: frozenset[int] = (
+            frozenset()
+        )  # arrived, but waiting at the edge for a gap to close
+        self._max_sent_id = -1  # highest id put on the wire in this life of the edge
+        self._max_ever_sent_id = -1  # in any life
 
     def __len__(self) -> int:
-        return len(self._acknowledged) + len(self._open)
+        return len(self._acknowledged) + len(self._pending)
 
     @property
-    def open(self) -> int:
+    def pending(self) -> int:
         """How many keyframes are not acknowledged."""
-        return len(self._open)
+        return len(self._pending)
 
     @property
     def unacknowledged(self) -> int:
         """How many keyframes are not known to be safe at the edge, those included that were dropped."""
-        return len(self._open) + self.counts["drop_oldest"]
+        return len(self._pending) + self.counts["drop_oldest"]
 
     @property
-    def held(self) -> int:
+    def buffered_at_edge(self) -> int:
         """How many of them the edge has, but has not made safe."""
-        return sum(keyframe in self._open for keyframe in self._held)
+        return sum(keyframe in self._pending for keyframe in self._buffered_at_edge)
 
     @property
-    def last_acknowledged(self) -> Entry | None:
+    def last_acknowledged(self) -> LedgerEntry | None:
         return next(reversed(self._acknowledged.values()), None)
 
     @property
-    def next_unsent(self) -> int:
+    def next_unsent_id(self) -> int:
         """No edge can know of a keyframe from here on."""
-        return self._ever_sent_to + 1
+        return self._max_ever_sent_id + 1
 
-    def find(self, keyframe: int) -> Entry | None:
-        return self._acknowledged.get(keyframe) or self._open.get(keyframe)
+    def find(self, keyframe: int) -> LedgerEntry | None:
+        return self._acknowledged.get(keyframe) or self._pending.get(keyframe)
 
-    def answered(self, keyframe: int, now_ns: int) -> tuple[Entry | None, float | None]:
+    def record_correction(self, keyframe: int, now_ns: int) -> tuple[LedgerEntry | None, float | None]:
         """A correction came of this keyframe. Its entry, if it is remembered; and ms since its frame arrived,
         for the first correction only, and not where a restarted edge was given it again."""
         entry = self.find(keyframe)
-        if entry is None or entry.answered or entry.replayed:
+        if entry is None or entry.is_corrected or entry.is_replayed:
             return entry, None
-        entry.answered = True
+        entry.is_corrected = True
         return entry, (now_ns - entry.arrived_ns) / 1e6
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: LedgerEntry) -> None:
         """Appends the newest keyframe; drops one where that is one too many."""
-        self._open[entry.keyframe.id] = entry
-        if len(self) > self._keep:
-            self._drop()
+        self._pending[entry.keyframe.id] = entry
+        if len(self) > self._capacity:
+            self._drop_oldest()
 
-    def due(self, now_ns: int) -> list[Entry]:
-        """What to send now, in order; taken as sent, unless `not_taken` says otherwise."""
-        window = list(self._open.values())[: self._link.window]
-        chosen = [entry for entry in window if self._is_due(entry, now_ns)]
-        for entry in chosen:
-            self._count(entry, 1)
+    def take_due(self, now_ns: int) -> list[LedgerEntry]:
+        """What to send now, in order; taken as sent, unless `record_send_failure` says otherwise."""
+        window = list(self._pending.values())[: self._link.window]
+        due = [entry for entry in window if self._is_due(entry, now_ns)]
+        for entry in due:
+            self._count_sends(entry, 1)
             backoff = self._link.resend_s * 2.0 ** min(entry.attempts, 30)
-            entry.due_ns = now_ns + seconds(min(backoff, self._link.resend_max_s))
+            entry.due_ns = now_ns + seconds_to_ns(min(backoff, self._link.resend_max_s))
             entry.attempts += 1
             entry.sent_ns = now_ns
-            self._sent_to = max(self._sent_to, entry.keyframe.id)
-        self._ever_sent_to = max(self._ever_sent_to, self._sent_to)
-        return chosen
+            self._max_sent_id = max(self._max_sent_id, entry.keyframe.id)
+        self._max_ever_sent_id = max(self._max_ever_sent_id, self._max_sent_id)
+        return due
 
-    def not_taken(self, keyframe: int) -> None:
+    def record_send_failure(self, keyframe: int) -> None:
         """The link had no room for one that was due, or nobody to take it to. It is due again in its time."""
-        if (entry := self.find(keyframe)) is not None and entry.sendings:
-            self._count(entry, -1)
+        if (entry := self.find(keyframe)) is not None and entry.send_count:
+            self._count_sends(entry, -1)
 
-    def _count(self, entry: Entry, change: int) -> None:
+    def _count_sends(self, entry: LedgerEntry, change: int) -> None:
         """One sending more or less. sent: keyframes; resent: what was sent of them once more."""
-        first = max(entry.sendings, entry.sendings + change) == 1
+        first = max(entry.send_count, entry.send_count + change) == 1
         self.counts["sent" if first else "resent"] += change
-        entry.sendings += change
+        entry.send_count += change
 
     def acknowledge(self, ack: Ack) -> bool:
         """Takes note of what has arrived; gaps below what is held are due again after `gap_s`.
@@ -123,70 +125,70 @@ class Ledger:
         Returns whether it is believed: what says more than was sent in this life of the edge is of an
         earlier one, or a lie.
         """
-        if ack.next_keyframe > self._sent_to + 1 or max(ack.held, default=-1) > self._ever_sent_to:
+        if ack.next_keyframe > self._max_sent_id + 1 or max(ack.held, default=-1) > self._max_ever_sent_id:
             self.counts["bad_acks"] += 1
             return False
-        while self._open and (first := next(iter(self._open))) < ack.next_keyframe:
-            self._acknowledged[first] = self._open.pop(first)
+        while self._pending and (first := next(iter(self._pending))) < ack.next_keyframe:
+            self._acknowledged[first] = self._pending.pop(first)
             self.counts["acknowledged"] += 1
-        self._held = frozenset(ack.held)
-        top = max(self._held, default=-1)
-        if top in self._open:  # it was under way when this life of the edge began
-            self._sent_to = max(self._sent_to, top)
-        for entry in list(self._open.values())[: self._link.window]:
-            if entry.attempts and entry.keyframe.id < top:
-                entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds(self._link.gap_s))
+        self._buffered_at_edge = frozenset(ack.held)
+        max_buffered = max(self._buffered_at_edge, default=-1)
+        if max_buffered in self._pending:  # it was under way when this life of the edge began
+            self._max_sent_id = max(self._max_sent_id, max_buffered)
+        for entry in list(self._pending.values())[: self._link.window]:
+            if entry.attempts and entry.keyframe.id < max_buffered:
+                entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds_to_ns(self._link.gap_s))
         return True
 
     def resume(self, welcome: Welcome) -> None:
         """The edge was silent and is back: what was on its way is taken as lost, and due."""
         self.acknowledge(Ack(welcome.next_keyframe))
-        self._retry()
+        self._make_all_due()
 
-    def begin(self, welcome: Welcome) -> int:
+    def begin_session(self, welcome: Welcome) -> int:
         """A new life of the edge: everything held from `next_keyframe` on is due. Returns how many.
 
         The first one stands on its own if this life of the edge does not have what it refers to.
         """
-        everything = self._acknowledged | self._open
+        entries = self._acknowledged | self._pending
         for entry in self._acknowledged.values():
-            entry.replayed = True
-        self._acknowledged = {k: v for k, v in everything.items() if k < welcome.next_keyframe}
-        self._open = {k: v for k, v in everything.items() if k >= welcome.next_keyframe}
-        self._sent_to = welcome.next_keyframe - 1
-        first = next(iter(self._open.values()), None)
+            entry.is_replayed = True
+        self._acknowledged = {k: v for k, v in entries.items() if k < welcome.next_keyframe}
+        self._pending = {k: v for k, v in entries.items() if k >= welcome.next_keyframe}
+        self._max_sent_id = welcome.next_keyframe - 1
+        first = next(iter(self._pending.values()), None)
         if first and first.keyframe.follows >= welcome.next_keyframe:
-            first.keyframe = _cut_loose(first)
-        for entry in self._open.values():
+            first.keyframe = _detach(first)
+        for entry in self._pending.values():
             entry.attempts = 0
-        self._retry()
-        return self.open
+        self._make_all_due()
+        return self.pending
 
-    def _is_due(self, entry: Entry, now_ns: int) -> bool:
-        if entry.keyframe.id in self._held and entry.keyframe.id != next(iter(self._open)):
+    def _is_due(self, entry: LedgerEntry, now_ns: int) -> bool:
+        if entry.keyframe.id in self._buffered_at_edge and entry.keyframe.id != next(iter(self._pending)):
             return False  # the oldest open one is never safe there: what it waits for may be dropped here
         return entry.due_ns is None or entry.due_ns <= now_ns
 
-    def _retry(self) -> None:
-        self._held = frozenset()
-        for entry in self._open.values():
+    def _make_all_due(self) -> None:
+        self._buffered_at_edge = frozenset()
+        for entry in self._pending.values():
             entry.due_ns = None
 
-    def _drop(self) -> None:
+    def _drop_oldest(self) -> None:
         if self._acknowledged:
             del self._acknowledged[next(iter(self._acknowledged))]
             self.counts["drop_oldest_acknowledged"] += 1
             return
-        dropped = self._open.pop(next(iter(self._open))).keyframe
+        dropped = self._pending.pop(next(iter(self._pending))).keyframe
         self.counts["drop_oldest"] += 1
-        heir = next(iter(self._open.values()), None)
-        if heir:
-            heir.keyframe = _inherit(heir.keyframe, dropped)
-            heir.due_ns = None
+        successor = next(iter(self._pending.values()), None)
+        if successor:
+            successor.keyframe = _rebase(successor.keyframe, dropped)
+            successor.due_ns = None
 
 
-def _inherit(keyframe: Keyframe, dropped: Keyframe) -> Keyframe:
-    """`keyframe` relative to what the dropped one, its predecessor, was relative to."""
+def _rebase(keyframe: Keyframe, dropped: Keyframe) -> Keyframe:
+    """`make_keyframe` relative to what the dropped one, its predecessor, was relative to."""
     if keyframe.reference != dropped.id:  # a stretch of its own
         return replace(keyframe, follows=dropped.follows)
     return replace(
@@ -198,7 +200,7 @@ def _inherit(keyframe: Keyframe, dropped: Keyframe) -> Keyframe:
     )
 
 
-def _cut_loose(entry: Entry) -> Keyframe:
+def _detach(entry: LedgerEntry) -> Keyframe:
     """The keyframe at the beginning of a stretch, for an edge that has nothing before it."""
     return replace(entry.keyframe, reference=-1, follows=-1, T_ref_body=entry.keyframe.T_odom_body)
 
@@ -206,7 +208,7 @@ def _cut_loose(entry: Entry) -> Keyframe:
 # ---- From candidates to keyframes: numbers, relative poses, and the covariance of what is left out.
 
 
-class Chain:
+class KeyframeChain:
     """Every keyframe is relative to the one before it, across the candidates that were not sent."""
 
     _T_keyframe_candidate: F64
@@ -214,31 +216,31 @@ class Chain:
 
     def __init__(self) -> None:
         self.next_id = 0
-        self.first_of_stretch = 0  # lowest id that the present stretch of odometry has or will have
-        self._begun = False  # else the next keyframe begins a stretch
-        self._forget_motion()
+        self.first_of_segment = 0  # lowest id that the present stretch of odometry has or will have
+        self._has_reference = False  # else the next keyframe begins a stretch
+        self._reset_motion()
 
-    def break_off(self) -> None:
+    def begin_segment(self) -> None:
         """Odometry broke: what comes now is of another stretch."""
-        self.first_of_stretch = self.next_id
-        self._begun = False
-        self._forget_motion()
+        self.first_of_segment = self.next_id
+        self._has_reference = False
+        self._reset_motion()
 
-    def extend(self, candidate: Candidate) -> None:
+    def extend(self, candidate: KeyframeCandidate) -> None:
         """Takes note of a candidate's motion, whether or not it will be sent."""
-        if candidate.new_stretch:
-            self.break_off()
-        T = candidate.T_last_body
+        if candidate.new_segment:
+            self.begin_segment()
+        T = candidate.T_previous_body
         self._T_keyframe_candidate = orthonormal(self._T_keyframe_candidate @ T)
         self._cov = compose_cov(T, self._cov, candidate.cov)
 
-    def keyframe(self, candidate: Candidate, stamp_ns: int) -> Keyframe:
+    def make_keyframe(self, candidate: KeyframeCandidate, stamp_ns: int) -> Keyframe:
         """The last extended candidate as the next keyframe."""
         keyframe = Keyframe(
             id=self.next_id,
-            reference=self.next_id - 1 if self._begun else -1,
+            reference=self.next_id - 1 if self._has_reference else -1,
             stamp_ns=stamp_ns,
-            T_ref_body=self._T_keyframe_candidate if self._begun else candidate.T_odom_body,
+            T_ref_body=self._T_keyframe_candidate if self._has_reference else candidate.T_odom_body,
             cov=self._cov,
             T_odom_body=candidate.T_odom_body,
             up=candidate.up,
@@ -247,10 +249,10 @@ class Chain:
             follows=self.next_id - 1,
         )
         self.next_id += 1
-        self._begun = True
-        self._forget_motion()
+        self._has_reference = True
+        self._reset_motion()
         return keyframe
 
-    def _forget_motion(self) -> None:
+    def _reset_motion(self) -> None:
         """What is summed up from here on is since the last keyframe, or since the stretch began."""
         self._T_keyframe_candidate, self._cov = np.eye(4), np.zeros((6, 6))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from share.config import ClockConfig, LinkConfig
-from share.rates import SECOND_NS, Every
+from share.timing import SECOND_NS, PeriodicTimer
 from share.types import F64
 from share.wire.messages import Ping, Pong
 
@@ -24,40 +24,40 @@ class Exchange:
     sent_ns: int
     received_ns: int
     replied_ns: int
-    back_ns: int
+    returned_ns: int
 
     @property
     def offset_ns(self) -> int:
         """The other clock minus the own, to the half ns below; wrong by at most half of `delay_ns`,
         namely by half of what the way there took longer than the way back."""
-        return ((self.received_ns - self.sent_ns) + (self.replied_ns - self.back_ns)) // 2
+        return ((self.received_ns - self.sent_ns) + (self.replied_ns - self.returned_ns)) // 2
 
     @property
     def delay_ns(self) -> int:
         """Time on the way, both ways. Negative only if a clock was set meanwhile."""
-        return (self.back_ns - self.sent_ns) - (self.replied_ns - self.received_ns)
+        return (self.returned_ns - self.sent_ns) - (self.replied_ns - self.received_ns)
 
     @property
-    def unproven_ns(self) -> int:
+    def unverified_ns(self) -> int:
         """Twice what `offset_ns` can be wrong by if one of the two times of the other clock is made up: that
         one was read within the exchange, which the own clock has timed, is all that it cannot feign."""
-        return (self.back_ns - self.sent_ns) + (self.replied_ns - self.received_ns)
+        return (self.returned_ns - self.sent_ns) + (self.replied_ns - self.received_ns)
 
     @property
-    def is_possible(self) -> bool:
+    def is_valid(self) -> bool:
         """Whether it can be of clocks that nobody set meanwhile."""
-        return self.back_ns >= self.sent_ns and self.replied_ns >= self.received_ns and self.delay_ns >= 0
+        return self.returned_ns >= self.sent_ns and self.replied_ns >= self.received_ns and self.delay_ns >= 0
 
 
 _SMOOTHING = 1 / 8  # RFC 6298, section 2
-MOST_APART_NS = 10 * 365 * 86_400 * SECOND_NS  # clocks that begin at start-up: no machine is up for longer
-_WITNESSES = 3  # exchanges that agree before a clock is believed: its stamps must advance as ours do
-_SETTLED = 8  # exchanges before the quickest of them counts as one that met no queue
+MAX_OFFSET_NS = 10 * 365 * 86_400 * SECOND_NS  # clocks that begin at start-up: no machine is up for longer
+_MIN_AGREEING = 3  # exchanges that agree before a clock is believed: its stamps must advance as ours do
+_MIN_EXCHANGES = 8  # exchanges before the quickest of them counts as one that met no queue
 
 
-def smoothed(before: float | None, now: float) -> float:
+def exponential_average(average: float | None, sample: float) -> float:
     """As the round trip time of TCP is."""
-    return now if before is None else before + _SMOOTHING * (now - before)
+    return sample if average is None else average + _SMOOTHING * (sample - average)
 
 
 class ClockFilter:
@@ -84,49 +84,49 @@ class ClockFilter:
         self.rtt_ms: float | None = None
         self._filter: Any = None
         self._base_ns = 0  # the state is relative to this offset, so that it stays small
-        self._at_ns = 0
-        self._recent_ns: deque[int] = deque(maxlen=self._config.least_of)
-        self._unproven_ns: deque[int] = deque(maxlen=self._config.least_of)
-        self._refused_in_a_row = 0
-        self._agreeing = 0  # exchanges since the clock was last set
+        self._updated_ns = 0
+        self._recent_rtt_ns: deque[int] = deque(maxlen=self._config.least_of)
+        self._recent_unverified_ns: deque[int] = deque(maxlen=self._config.least_of)
+        self._consecutive_rejects = 0
+        self._agreeing_exchanges = 0  # exchanges since the clock was last set
 
     @property
-    def is_witnessed(self) -> bool:
+    def is_confirmed(self) -> bool:
         """Whether so many exchanges agree that it is a clock at all."""
-        return self._agreeing >= _WITNESSES
+        return self._agreeing_exchanges >= _MIN_AGREEING
 
-    def update(self, sent_ns: int, received_ns: int, replied_ns: int, back_ns: int) -> bool:
+    def update(self, sent_ns: int, received_ns: int, replied_ns: int, returned_ns: int) -> bool:
         """One exchange: sent and back by the agent's clock, received and replied by the edge's.
 
         Returns whether it was believed.
         """
-        exchange = Exchange(sent_ns, received_ns, replied_ns, back_ns)
-        if not exchange.is_possible or abs(exchange.offset_ns) > MOST_APART_NS:
+        exchange = Exchange(sent_ns, received_ns, replied_ns, returned_ns)
+        if not exchange.is_valid or abs(exchange.offset_ns) > MAX_OFFSET_NS:
             self.rejected += 1
             return False
         rtt_ns, offset_ns = exchange.delay_ns, exchange.offset_ns
-        middle_ns = (sent_ns + back_ns) // 2
-        self._recent_ns.append(rtt_ns)
-        self._unproven_ns.append(exchange.unproven_ns)
-        self.rtt_ms = smoothed(self.rtt_ms, rtt_ns / 1e6)
+        middle_ns = (sent_ns + returned_ns) // 2
+        self._recent_rtt_ns.append(rtt_ns)
+        self._recent_unverified_ns.append(exchange.unverified_ns)
+        self.rtt_ms = exponential_average(self.rtt_ms, rtt_ns / 1e6)
         variance = self._variance(rtt_ns)
         if self._filter is None:
-            self._start(offset_ns, middle_ns, variance)
+            self._initialise(offset_ns, middle_ns, variance)
             return True
-        return self._correct(offset_ns, middle_ns, variance)
+        return self._gated_update(offset_ns, middle_ns, variance)
 
     def offset_ns(self, now_ns: int) -> int | None:
         """Edge time minus agent time at the agent's `now_ns`; None before the first exchange."""
         if self._filter is None:
             return None
         offset_us, drift_ppm = self._filter.x
-        return self._base_ns + round(float(offset_us + drift_ppm * self._since_s(now_ns)) * 1e3)
+        return self._base_ns + round(float(offset_us + drift_ppm * self._elapsed_s(now_ns)) * 1e3)
 
     def sigma_ns(self, now_ns: int) -> float | None:
         """Standard deviation of `offset_ns`."""
         if self._filter is None:
             return None
-        P = self._predicted(now_ns)[1]
+        P = self._predict(now_ns)[1]
         return float(np.sqrt(P[0, 0])) * 1e3
 
     @property
@@ -134,7 +134,7 @@ class ClockFilter:
         """What `offset_ns` can be wrong by unseen, rounded up; None before the first exchange. It is half of
         the least sum, among recent exchanges, of the round trip by our own clock and the time that the edge
         says it held the question. Added, so that an edge that says it held it for long makes this more."""
-        return -(-min(self._unproven_ns) // 2) if self._unproven_ns else None
+        return -(-min(self._recent_unverified_ns) // 2) if self._recent_unverified_ns else None
 
     @property
     def drift_ppm(self) -> float | None:
@@ -142,10 +142,10 @@ class ClockFilter:
 
     def report(self) -> dict[str, Any]:
         """Plain data; the offset is that of the last exchange."""
-        sigma_ns = self.sigma_ns(self._at_ns)
+        sigma_ns = self.sigma_ns(self._updated_ns)
         return {
             "rtt_ms": self.rtt_ms,
-            "clock_offset_ns": self.offset_ns(self._at_ns),
+            "clock_offset_ns": self.offset_ns(self._updated_ns),
             "clock_sigma_ms": None if sigma_ns is None else sigma_ns / 1e6,
             "clock_drift_ppm": self.drift_ppm,
             "clock_steps": self.steps,
@@ -153,51 +153,51 @@ class ClockFilter:
 
     def _variance(self, rtt_ns: int) -> float:
         """us^2. Half the round trip is the most that an exchange can be wrong by (RFC 5905, section 8)."""
-        settled = len(self._recent_ns) >= _SETTLED
-        excess_us = (rtt_ns - (min(self._recent_ns) if settled else 0)) / 1e3
+        has_enough = len(self._recent_rtt_ns) >= _MIN_EXCHANGES
+        excess_us = (rtt_ns - (min(self._recent_rtt_ns) if has_enough else 0)) / 1e3
         return self._config.noise_us**2 + (self._config.asymmetry * excess_us) ** 2
 
-    def _start(self, offset_ns: int, at_ns: int, variance: float) -> None:
+    def _initialise(self, offset_ns: int, at_ns: int, variance: float) -> None:
         self._filter = self._make_filter(dim_x=2, dim_z=1)
         self._filter.x = np.zeros(2)
         self._filter.P = np.diag([variance, self._config.drift_ppm**2])
         self._filter.H = np.array([[1.0, 0.0]])
-        self._base_ns, self._at_ns = offset_ns, at_ns
-        self._refused_in_a_row = 0
-        self._agreeing = 1
+        self._base_ns, self._updated_ns = offset_ns, at_ns
+        self._consecutive_rejects = 0
+        self._agreeing_exchanges = 1
         self.accepted += 1
 
-    def _correct(self, offset_ns: int, at_ns: int, variance: float) -> bool:
+    def _gated_update(self, offset_ns: int, at_ns: int, variance: float) -> bool:
         kf = self._filter
-        kf.x, kf.P = self._predicted(at_ns)
-        self._at_ns = max(at_ns, self._at_ns)
+        kf.x, kf.P = self._predict(at_ns)
+        self._updated_ns = max(at_ns, self._updated_ns)
         innovation = (offset_ns - self._base_ns) / 1e3 - kf.x[0]
         if innovation**2 > self._config.gate_sigma**2 * (kf.P[0, 0] + variance):
-            return self._refuse(offset_ns, at_ns, variance)
+            return self._reject(offset_ns, at_ns, variance)
         kf.update(np.array([(offset_ns - self._base_ns) / 1e3]), R=variance)
-        self._refused_in_a_row = 0
-        self._agreeing += 1
+        self._consecutive_rejects = 0
+        self._agreeing_exchanges += 1
         self.accepted += 1
         return True
 
-    def _refuse(self, offset_ns: int, at_ns: int, variance: float) -> bool:
-        self._refused_in_a_row += 1
+    def _reject(self, offset_ns: int, at_ns: int, variance: float) -> bool:
+        self._consecutive_rejects += 1
         self.rejected += 1
-        if self._refused_in_a_row >= self._config.step_after:
+        if self._consecutive_rejects >= self._config.step_after:
             self.steps += 1
-            self._start(offset_ns, at_ns, variance)
+            self._initialise(offset_ns, at_ns, variance)
         return False
 
-    def _predicted(self, now_ns: int) -> tuple[F64, F64]:
+    def _predict(self, now_ns: int) -> tuple[F64, F64]:
         """State and covariance at `now_ns`: random walks of the offset and of its drift."""
-        dt = max(0.0, self._since_s(now_ns))
+        dt = max(0.0, self._elapsed_s(now_ns))
         F = np.array([[1.0, dt], [0.0, 1.0]])
         q, r = self._config.offset_walk_us**2, self._config.drift_walk_ppm**2
         Q = np.array([[q * dt + r * dt**3 / 3, r * dt**2 / 2], [r * dt**2 / 2, r * dt]])
         return F @ self._filter.x, F @ self._filter.P @ F.T + Q
 
-    def _since_s(self, now_ns: int) -> float:
-        return (now_ns - self._at_ns) / SECOND_NS
+    def _elapsed_s(self, now_ns: int) -> float:
+        return (now_ns - self._updated_ns) / SECOND_NS
 
 
 # ---- Whether an agent may say how far the edge's clock is off, and so compare the stamps of two machines.
@@ -209,7 +209,7 @@ class ClockFilter:
 
 
 @dataclass(frozen=True)
-class ClockClaim:
+class ClockEstimate:
     """Of the edge's monotonic clock minus the agent's, ms. sigma_ms: standard deviation by the filter;
     asymmetry_ms: half of the least recent round trip by the agent's own clock, which no filter sees and no
     word of the edge makes smaller; None before exchanges that agree. offset_ms: None too where it is not
@@ -221,17 +221,21 @@ class ClockClaim:
     claim_ms: float  # setting `clock.claim_ms`
 
     @classmethod
-    def of(cls, clock: ClockFilter, now_ns: int, claim_ms: float) -> ClockClaim:
+    def from_filter(cls, clock: ClockFilter, now_ns: int, claim_ms: float) -> ClockEstimate:
         """At `now_ns`: what was not asked for long is known less."""
         offset_ns, sigma_ns, asymmetry_ns = (
             clock.offset_ns(now_ns),
             clock.sigma_ns(now_ns),
             clock.asymmetry_ns,
         )
-        if not clock.is_witnessed or offset_ns is None or sigma_ns is None or asymmetry_ns is None:
+        if not clock.is_confirmed or offset_ns is None or sigma_ns is None or asymmetry_ns is None:
             return cls(None, None, None, claim_ms)
-        found = cls(offset_ns / 1e6, sigma_ns / 1e6, asymmetry_ns / 1e6, claim_ms)
-        return found if found.claimed else cls(None, found.sigma_ms, found.asymmetry_ms, claim_ms)
+        estimate = cls(offset_ns / 1e6, sigma_ns / 1e6, asymmetry_ns / 1e6, claim_ms)
+        return (
+            estimate
+            if estimate.is_reliable
+            else cls(None, estimate.sigma_ms, estimate.asymmetry_ms, claim_ms)
+        )
 
     @property
     def uncertainty_ms(self) -> float | None:
@@ -240,49 +244,49 @@ class ClockClaim:
         return self.sigma_ms + self.asymmetry_ms
 
     @property
-    def claimed(self) -> bool:
+    def is_reliable(self) -> bool:
         return self.uncertainty_ms is not None and self.uncertainty_ms <= self.claim_ms
 
     def report(self) -> dict[str, Any]:
         """Plain data."""
-        return {**asdict(self), "uncertainty_ms": self.uncertainty_ms, "claim": self.claimed}
+        return {**asdict(self), "uncertainty_ms": self.uncertainty_ms, "claim": self.is_reliable}
 
 
 # ---- Pings of an agent and what their answers tell: the round trip, and the edge's clock.
 
-_UNDER_WAY = 16
+_MAX_IN_FLIGHT = 16
 
 
-class Pings:
+class PingTracker:
     """`clock` is that of the edge's present life."""
 
     def __init__(self, link: LinkConfig, clock: ClockConfig) -> None:
         self.clock = ClockFilter(clock)
-        self._every = Every(link.ping_s)
+        self._timer = PeriodicTimer(link.ping_s)
         self._sequence = 0
-        self._under_way: deque[Ping] = deque(maxlen=_UNDER_WAY)
+        self._in_flight: deque[Ping] = deque(maxlen=_MAX_IN_FLIGHT)
 
-    def due(self, now_ns: int) -> Ping | None:
+    def due_ping(self, now_ns: int) -> Ping | None:
         """The ping that goes now."""
-        if not self._every.due(now_ns):
+        if not self._timer.fire_if_due(now_ns):
             return None
         self._sequence += 1
-        self._under_way.append(Ping(self._sequence, now_ns))
-        return self._under_way[-1]
+        self._in_flight.append(Ping(self._sequence, now_ns))
+        return self._in_flight[-1]
 
-    def answers(self, pong: Pong) -> bool:
+    def take_answer(self, pong: Pong) -> bool:
         """Whether it answers a ping that waits; that waits no longer."""
         ping = Ping(pong.sequence, pong.sent_ns)
-        known = ping in self._under_way
-        if known:
-            self._under_way.remove(ping)
-        return known
+        is_pending = ping in self._in_flight
+        if is_pending:
+            self._in_flight.remove(ping)
+        return is_pending
 
     def measure(self, pong: Pong, now_ns: int) -> None:
         """An answer, which came at `now_ns`, of the present life."""
         self.clock.update(pong.sent_ns, pong.received_ns, pong.replied_ns, now_ns)
 
-    def begin(self) -> None:
+    def begin_session(self) -> None:
         """A new life of the edge: another clock."""
         self.clock.reset()
-        self._under_way.clear()
+        self._in_flight.clear()

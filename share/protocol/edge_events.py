@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from share.geometry.camera import Rig
-from share.mapping.changes import Change
-from share.mapping.loops import Key
-from share.mapping.steps import Finding
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import MapChange
+from share.mapping.steps import MapEvent
 from share.types import Frame, Keyframe
 from share.wire import messages as wire
 from share.wire.codec import Bytes
@@ -19,39 +19,41 @@ from share.wire.codec import Bytes
 
 
 @dataclass(frozen=True)
-class Received:
+class PeerMessageReceived:
     """A message, still bytes, from the peer that the transport knows by this id.
 
     names: of the agents that its key may speak for; None where no keys are used. voice: that key; ""
     without."""
 
-    peer: bytes
+    peer_id: bytes
     frames: Sequence[Bytes]
-    names: frozenset[str] | None = None
-    voice: str = ""
+    allowed_names: frozenset[str] | None = None
+    credential: str = ""
 
-    def speaks_for(self, name: str) -> bool:
-        return self.names is None or name in self.names
+    def is_authorised_for(self, name: str) -> bool:
+        return self.allowed_names is None or name in self.allowed_names
 
 
 @dataclass(frozen=True)
-class Found:
+class MapperResult:
     """What the mapper has decided, and what of it must survive a crash."""
 
-    findings: Sequence[Finding]
-    changes: Sequence[Change] = ()
-    emptied: Sequence[Key] = ()  # runs of which nothing is left, each with its newest keyframe that came
+    findings: Sequence[MapEvent]
+    changes: Sequence[MapChange] = ()
+    empty_runs: Sequence[
+        KeyframeKey
+    ] = ()  # runs of which nothing is left, each with its newest keyframe that came
 
 
 @dataclass(frozen=True)
-class Kept:
+class ChangesSaved:
     """Everything up to this ticket will be there after a crash."""
 
     ticket: int
 
 
 @dataclass(frozen=True)
-class Tick:
+class EdgeTick:
     """Time has passed."""
 
 
@@ -59,92 +61,92 @@ class Tick:
 
 
 @dataclass(frozen=True)
-class Ready:
+class TrackerReady:
     key: str
-    life: int
+    generation: int
 
 
 @dataclass(frozen=True, eq=False)
-class Answered:
+class TrackerAnswered:
     key: str
-    life: int
-    answer: wire.Tracked
+    generation: int
+    result: wire.RemoteTrackingResult
 
 
 @dataclass(frozen=True)
-class Lost:
+class TrackerLost:
     """The tracker has died; how, for a person."""
 
     key: str
-    life: int
-    how: str
+    generation: int
+    reason: str
 
 
-FromTracker = Ready | Answered | Lost
-Event = Received | Found | Kept | Tick | FromTracker
+TrackerEvent = TrackerReady | TrackerAnswered | TrackerLost
+EdgeEvent = PeerMessageReceived | MapperResult | ChangesSaved | EdgeTick | TrackerEvent
 
 # ---------------------------------------------------------------- effects
 
 
 @dataclass(frozen=True)
-class Send:
-    peer: bytes
+class SendToPeer:
+    peer_id: bytes
     frames: Sequence[Bytes]
 
 
 @dataclass(frozen=True)
-class Join:
+class AddRun:
     """To the mapper: a run of an agent, before its first keyframe. voice: the key that speaks for it, and has
     one vote with all its names; "": the name has a vote of its own."""
 
     key: str
     hello: wire.Hello
-    voice: str = ""
+    credential: str = ""
 
 
 @dataclass(frozen=True)
-class Speaks:
-    """To the mapper: who speaks for a run from now on; voice: as of `Join`."""
+class SetCredential:
+    """To the mapper: who speaks for a run from now on; voice: as of `AddRun`."""
 
     key: str
-    voice: str
+    credential: str
 
 
 @dataclass(frozen=True)
-class Add:
+class AddKeyframe:
     """To the mapper: the next keyframe of a run, each once and in order. is_extra: more than its agent may
     send; it is looked up only when nothing else waits, and maps may be joined by it."""
 
     key: str
     keyframe: Keyframe
-    is_extra: bool = False
+    is_over_rate: bool = False
 
 
 @dataclass(frozen=True)
-class Present:
+class SetPresence:
     """To the mapper: a run is heard, or no longer. Whoever joins is; a run of an earlier life is not yet."""
 
     key: str
-    here: bool
+    is_present: bool
 
 
 @dataclass(frozen=True)
-class Forget:
+class DropRun:
     """To the mapper: nothing is left of this run, and it will not come back."""
 
     key: str
 
 
 @dataclass(frozen=True)
-class Keep:
-    """Make this safe, and answer with `Kept`. Tickets rise."""
+class SaveChanges:
+    """Make this safe, and answer with `ChangesSaved`. Tickets rise."""
 
     ticket: int
-    changes: tuple[Change, ...]
+    changes: tuple[MapChange, ...]
 
 
 @dataclass(frozen=True)
-class Record:
+class WriteEvent:
     """A decision with its reason: one line of events.jsonl."""
 
     fields: dict[str, Any]
@@ -154,28 +156,38 @@ class Record:
 
 
 @dataclass(frozen=True, eq=False)
-class BeginTracking:
-    """A tracker for this rig; it answers `Ready`. life: how many this agent has had before."""
+class StartTracker:
+    """A tracker for this rig; it answers `TrackerReady`. life: how many this agent has had before."""
 
     key: str
-    life: int
+    generation: int
     rig: Rig
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """The next frame of this agent; it is answered by `Answered`."""
+class TrackFrame:
+    """The next frame of this agent; it is answered by `TrackerAnswered`."""
 
     key: str
     frame: Frame
 
 
 @dataclass(frozen=True)
-class EndTracking:
+class StopTracker:
     """Its tracker is not needed any more."""
 
     key: str
 
 
-ToTracker = BeginTracking | Track | EndTracking
-Effect = Send | Join | Speaks | Present | Add | Forget | Keep | Record | ToTracker
+TrackerEffect = StartTracker | TrackFrame | StopTracker
+EdgeEffect = (
+    SendToPeer
+    | AddRun
+    | SetCredential
+    | SetPresence
+    | AddKeyframe
+    | DropRun
+    | SaveChanges
+    | WriteEvent
+    | TrackerEffect
+)

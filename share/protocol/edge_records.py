@@ -6,146 +6,153 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, Generic, TypeVar
 
-from share.mapping.changes import Change
-from share.protocol.edge_events import Keep, Record
+from share.mapping.map_changes import MapChange
+from share.protocol.edge_events import SaveChanges, WriteEvent
 from share.protocol.peer import Peer
-from share.rates import Throttle
+from share.timing import Throttle
 
 # ---- What the edge writes down: a decision, its reason, and when; what a peer can cause at any rate,
 # seldom.
 
-_HZ, _BURST = 1.0, 20.0  # records of one kind that one agent can cause,
-_LASTING_HZ, _LASTING_BURST = 1 / 60, 200.0  # and those if it goes on causing them
+_EVENT_HZ, _EVENT_BURST = 1.0, 20.0  # records of one kind that one agent can cause,
+_SUSTAINED_HZ, _SUSTAINED_BURST = 1 / 60, 200.0  # and those if it goes on causing them
 
 
-class Records:
+class EventLog:
     """began_ns: times count from here; None: from the first event."""
 
     def __init__(self, began_ns: int | None) -> None:
         self._began_ns = began_ns
-        self._throttle, self._lasting = Throttle(_HZ, _BURST), Throttle(_LASTING_HZ, _LASTING_BURST)
+        self._throttle, self._sustained = (
+            Throttle(_EVENT_HZ, _EVENT_BURST),
+            Throttle(_SUSTAINED_HZ, _SUSTAINED_BURST),
+        )
 
-    def begin(self, now_ns: int) -> None:
+    def start(self, now_ns: int) -> None:
         """An event has come."""
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
 
-    def since_began_s(self, now_ns: int) -> float:
+    def elapsed_s(self, now_ns: int) -> float:
         assert self._began_ns is not None
         return round((now_ns - self._began_ns) * 1e-9, 6)
 
-    def of(self, now_ns: int, what: str, agent: str | None, reason: str, **fields: Any) -> Record:
-        head = {"t_s": self.since_began_s(now_ns), "event": what, "agent": agent, "reason": reason}
-        return Record(head | fields)
+    def event(self, now_ns: int, kind: str, agent: str | None, reason: str, **fields: Any) -> WriteEvent:
+        head = {"t_s": self.elapsed_s(now_ns), "event": kind, "agent": agent, "reason": reason}
+        return WriteEvent(head | fields)
 
-    def seldom(self, now_ns: int, what: str, agent: str | None, reason: str, **fields: Any) -> Record | None:
+    def throttled_event(
+        self, now_ns: int, kind: str, agent: str | None, reason: str, **fields: Any
+    ) -> WriteEvent | None:
         """None where so many of this kind and agent have just been written; the next one counts them."""
-        held_back = self._throttle.admit((what, agent), now_ns)
-        if held_back is None:
+        suppressed = self._throttle.admit((kind, agent), now_ns)
+        if suppressed is None:
             return None
-        held_back = self._lasting.admit((what, agent), now_ns, held_back)
-        if held_back is None:
+        suppressed = self._sustained.admit((kind, agent), now_ns, suppressed)
+        if suppressed is None:
             return None
-        more = f" (and {held_back} more since the last line)" if held_back else ""
-        return self.of(now_ns, what, agent, f"{reason}{more}", **fields)
+        more = f" (and {suppressed} more since the last line)" if suppressed else ""
+        return self.event(now_ns, kind, agent, f"{reason}{more}", **fields)
 
 
 # ---- When a keyframe is safe, so that it may be acknowledged: once what was to be kept with it is kept.
 
 
-class Safekeeping:
+class DurabilityTracker:
     """Of all agents of an edge. keeps: what is applied is safe once it is kept; else at once."""
 
-    def __init__(self, keeps: bool) -> None:
-        self._keeps = keeps
+    def __init__(self, has_store: bool) -> None:
+        self._has_store = has_store
         self._ticket = 0  # of the newest that is to be kept
-        self._kept_to = 0  # the newest ticket that is kept
-        self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
+        self._saved_ticket = 0  # the newest ticket that is kept
+        self._pending: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
 
-    def keep(self, changes: tuple[Change, ...]) -> Keep | None:
+    def save(self, changes: tuple[MapChange, ...]) -> SaveChanges | None:
         """These are to be kept, after all before them; None where nothing is."""
-        if not self._keeps or not changes:
+        if not self._has_store or not changes:
             return None
         self._ticket += 1
-        return Keep(self._ticket, changes)
+        return SaveChanges(self._ticket, changes)
 
-    def applied(self, peer: Peer, keyframe: int) -> None:
+    def add_keyframe(self, peer: Peer, keyframe: int) -> None:
         """A keyframe of this peer: it is safe with the newest that is to be kept."""
-        peer.unsafe += 1
-        self._unsafe.append((self._ticket, peer, keyframe + 1))
+        peer.pending_saves += 1
+        self._pending.append((self._ticket, peer, keyframe + 1))
 
-    def kept(self, ticket: int) -> list[Peer]:
+    def mark_saved(self, ticket: int) -> list[Peer]:
         """All up to this ticket is kept. Returns whose keyframes are safe by that."""
-        self._kept_to = max(self._kept_to, ticket)
-        told = {}
-        while self._unsafe and self._unsafe[0][0] <= ticket:
-            _, peer, next_keyframe = self._unsafe.popleft()
-            peer.safe = next_keyframe
-            peer.unsafe -= 1
-            told[peer.key] = peer
-        return list(told.values())
+        self._saved_ticket = max(self._saved_ticket, ticket)
+        peers = {}
+        while self._pending and self._pending[0][0] <= ticket:
+            _, peer, next_keyframe = self._pending.popleft()
+            peer.durable_below = next_keyframe
+            peer.pending_saves -= 1
+            peers[peer.key] = peer
+        return list(peers.values())
 
-    def safe(self) -> list[Peer]:
+    def take_durable(self) -> list[Peer]:
         """The same, of what waits for nothing that is not kept yet."""
-        return self.kept(self._kept_to if self._keeps else self._ticket)
+        return self.mark_saved(self._saved_ticket if self._has_store else self._ticket)
 
 
-_MERGES = tuple(("merges", what) for what in ("requested", "skipped", "done"))
-_LOOPS = (("loops", "tried"), ("loops", "accepted"))
-_OF_ALL = (
-    *_LOOPS,
-    *_MERGES,
+_MERGE_COUNTS = tuple(("merges", what) for what in ("requested", "skipped", "done"))
+_LOOP_COUNTS = (("loops", "tried"), ("loops", "accepted"))
+_TOTAL_COUNTS = (
+    *_LOOP_COUNTS,
+    *_MERGE_COUNTS,
     *((name,) for name in ("taken_out", "failed_jobs", "internal_errors", "forgotten_runs")),
     *((f"{kind}_ms", "n") for kind in ("place", "verify", "solve")),
 )
-_OF_AGENT = (
-    *_LOOPS,
-    *_MERGES,
+_AGENT_COUNTS = (
+    *_LOOP_COUNTS,
+    *_MERGE_COUNTS,
     *((name,) for name in ("keyframes", "poses", "evaluations", "corrections", "bytes_up", "bytes_down")),
     *((name,) for name in ("bad_messages", "unexpected", "queries_skipped", "refused_messages")),
     ("doubted_keyframes",),
 )
-_MOST_RUNS = 4096  # that are remembered
+_MAX_RUNS = 4096  # that are remembered
 
 
-class Totals:
-    """A life begins to count at 0; `added` goes on where the one before it ended."""
+class SessionTotals:
+    """A life begins to count at 0; `with_totals` goes on where the one before it ended."""
 
     def __init__(self) -> None:
-        self._before: Mapping[str, Any] = {}
-        self._runs: dict[str, Mapping[str, Any]] = {}  # of agents, also those that the last life did not hear
+        self._previous: Mapping[str, Any] = {}
+        self._agent_reports: dict[
+            str, Mapping[str, Any]
+        ] = {}  # of agents, also those that the last life did not hear
 
-    def ended(self, report: Mapping[str, Any]) -> None:
-        """A life's last report, with what was `added`."""
-        self._before = report
+    def add_session(self, report: Mapping[str, Any]) -> None:
+        """A life's last report, with what was `with_totals`."""
+        self._previous = report
         for agent in report["agents"].values():
-            self._runs.pop(agent["run"], None)
-            self._runs[agent["run"]] = agent
-        for run in list(self._runs)[:-_MOST_RUNS]:
-            del self._runs[run]
+            self._agent_reports.pop(agent["run"], None)
+            self._agent_reports[agent["run"]] = agent
+        for run in list(self._agent_reports)[:-_MAX_RUNS]:
+            del self._agent_reports[run]
 
-    def added(self, report: Mapping[str, Any]) -> dict[str, Any]:
+    def with_totals(self, report: Mapping[str, Any]) -> dict[str, Any]:
         """A life's report, with the counts of those before it. An agent's are those of the same run."""
-        if not self._before:
+        if not self._previous:
             return dict(report)
-        out = _sum(report, self._before, _OF_ALL)
+        out = _add_counts(report, self._previous, _TOTAL_COUNTS)
         out["agents"] = {
-            name: _sum(agent, self._runs.get(agent["run"], {}), _OF_AGENT)
+            name: _add_counts(agent, self._agent_reports.get(agent["run"], {}), _AGENT_COUNTS)
             for name, agent in report["agents"].items()
         }
-        was = self._before["strangers"]
+        previous = self._previous["strangers"]
         out["strangers"] = {
-            what: report["strangers"].get(what, 0) + was.get(what, 0)
-            for what in sorted({*report["strangers"], *was})
+            what: report["strangers"].get(what, 0) + previous.get(what, 0)
+            for what in sorted({*report["strangers"], *previous})
         }
         return out
 
 
-def _sum(
-    now: Mapping[str, Any], before: Mapping[str, Any], paths: tuple[tuple[str, ...], ...]
+def _add_counts(
+    now: Mapping[str, Any], previous: Mapping[str, Any], paths: tuple[tuple[str, ...], ...]
 ) -> dict[str, Any]:
     out = dict(now)
     for path in paths:
-        count = _at(before, path)
+        count = _count_at(previous, path)
         if not count:
             continue
         if len(path) == 1:
@@ -157,42 +164,42 @@ def _sum(
     return out
 
 
-def _at(report: Mapping[str, Any], path: tuple[str, ...]) -> int:
-    found: Any = report
+def _count_at(report: Mapping[str, Any], path: tuple[str, ...]) -> int:
+    value: Any = report
     for key in path:
-        if key not in found:
+        if key not in value:
             return 0
-        found = found[key]
-    return int(found)
+        value = value[key]
+    return int(value)
 
 
 # ---- Keyframes that wait to be taken into the map, of each name in turn: who sends many waits for itself.
 
 T = TypeVar("T")
 
-_MOST_MS = 10.0  # that keyframes are taken in before one is looked up
+_MAX_ADD_MS = 10.0  # that keyframes are taken in before one is looked up
 
 
-class Turns(Generic[T]):
+class FairQueue(Generic[T]):
     """In order of arrival of each name."""
 
     def __init__(self) -> None:
-        self._waiting: dict[str, deque[T]] = {}  # whose turn is next first
+        self._queues: dict[str, deque[T]] = {}  # whose turn is next first
 
     def __len__(self) -> int:
-        return sum(map(len, self._waiting.values()))
+        return sum(map(len, self._queues.values()))
 
-    def add(self, name: str, what: T) -> None:
-        self._waiting.setdefault(name, deque()).append(what)
+    def add(self, name: str, item: T) -> None:
+        self._queues.setdefault(name, deque()).append(item)
 
-    def next(self, spent_ms: float = 0.0) -> T | None:
+    def take_next(self, spent_ms: float = 0.0) -> T | None:
         """What is taken in now. spent_ms: on those before it, since a keyframe was last looked up. None:
         there is nothing, or it is time to look one up."""
-        if not self._waiting or spent_ms >= _MOST_MS:
+        if not self._queues or spent_ms >= _MAX_ADD_MS:
             return None
-        name = next(iter(self._waiting))
-        queue = self._waiting.pop(name)
-        what = queue.popleft()
+        name = next(iter(self._queues))
+        queue = self._queues.pop(name)
+        item = queue.popleft()
         if queue:
-            self._waiting[name] = queue
-        return what
+            self._queues[name] = queue
+        return item

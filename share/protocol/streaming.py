@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 
 from share.config import StreamConfig
 from share.protocol import agent_events as ev
-from share.rates import seconds
+from share.timing import seconds_to_ns
 from share.types import Frame, ImuBatch
-from share.wire.messages import MAX_SAMPLES, Tracked
+from share.wire.messages import MAX_IMU_SAMPLES, RemoteTrackingResult
 
 
 @dataclass(frozen=True, eq=False)
-class Sent:
+class InFlightFrame:
     """A frame under way: when it came, and when it went."""
 
     frame: Frame
@@ -22,21 +22,21 @@ class Sent:
     sent_ns: int
 
 
-class Window:
-    """At most `most` frames under way. Of those that find no room the newest waits, the older is dropped
+class FrameWindow:
+    """At most `capacity` frames under way. Of those that find no room the newest waits, the older is dropped
     (policy `drop_frame`); what the IMU said meanwhile goes with the next, the newest MAX_SAMPLES of it."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._under_way: deque[Sent] = deque()
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._in_flight: deque[InFlightFrame] = deque()
         self._waiting: tuple[Frame, int] | None = None  # and when it came
-        self._imu = ImuBatch.empty()  # of frames that did not go, since the last that went
+        self._skipped_imu = ImuBatch.empty()  # of frames that did not go, since the last that went
         self.dropped = 0
         self.unanswered = 0
 
     @property
     def is_idle(self) -> bool:
-        return not self._under_way and self._waiting is None
+        return not self._in_flight and self._waiting is None
 
     def offer(self, frame: Frame, arrived_ns: int) -> None:
         """The newest frame; `next` says when it goes."""
@@ -47,106 +47,106 @@ class Window:
 
     def skip(self, frame: Frame) -> None:
         """This one does not go."""
-        self._imu = self._imu.join(frame.imu).take(slice(-MAX_SAMPLES, None))
+        self._skipped_imu = self._skipped_imu.concatenate(frame.imu).take(slice(-MAX_IMU_SAMPLES, None))
 
-    def next(self, now_ns: int) -> Frame | None:
+    def take_next(self, now_ns: int) -> Frame | None:
         """The frame that goes now, with all that the IMU said since the last that went."""
-        if self._waiting is None or len(self._under_way) >= self._most:
+        if self._waiting is None or len(self._in_flight) >= self._capacity:
             return None
         (frame, arrived_ns), self._waiting = self._waiting, None
-        if len(self._imu):
+        if len(self._skipped_imu):
             self.skip(frame)
-            frame, self._imu = replace(frame, imu=self._imu), ImuBatch.empty()
-        self._under_way.append(Sent(frame, arrived_ns, now_ns))
+            frame, self._skipped_imu = replace(frame, imu=self._skipped_imu), ImuBatch.empty()
+        self._in_flight.append(InFlightFrame(frame, arrived_ns, now_ns))
         return frame
 
-    def refused(self, index: int) -> None:
+    def cancel(self, index: int) -> None:
         """The newest, number `index`, could not go after all."""
-        if self._under_way and self._under_way[-1].frame.index == index:
-            self.skip(self._under_way.pop().frame)
+        if self._in_flight and self._in_flight[-1].frame.index == index:
+            self.skip(self._in_flight.pop().frame)
 
-    def answered(self, index: int) -> Sent | None:
+    def take_answered(self, index: int) -> InFlightFrame | None:
         """The frame, if it was still waited for. Those that went before it will not be answered any more."""
-        self._give_up(lambda sent: sent.frame.index < index)
-        known = self._under_way and self._under_way[0].frame.index == index
-        return self._under_way.popleft() if known else None
+        self._discard_while(lambda sent: sent.frame.index < index)
+        is_in_flight = self._in_flight and self._in_flight[0].frame.index == index
+        return self._in_flight.popleft() if is_in_flight else None
 
     def expire(self, before_ns: int) -> None:
         """No answer is expected any more to what went before then."""
-        self._give_up(lambda sent: sent.sent_ns < before_ns)
+        self._discard_while(lambda sent: sent.sent_ns < before_ns)
 
     def clear(self) -> None:
         """Nor to anything under way."""
-        self._give_up(lambda sent: True)
+        self._discard_while(lambda sent: True)
 
-    def _give_up(self, gone: Callable[[Sent], bool]) -> None:
-        while self._under_way and gone(self._under_way[0]):
-            self._under_way.popleft()
+    def _discard_while(self, is_lost: Callable[[InFlightFrame], bool]) -> None:
+        while self._in_flight and is_lost(self._in_flight[0]):
+            self._in_flight.popleft()
             self.unanswered += 1
 
 
 # ---- An agent that does not track itself: its frames go up, poses come back.
 
 
-class Streaming:
+class FrameStreamer:
     """Which frames go, and what became of them. One that gets no answer was not tracked."""
 
     def __init__(self, config: StreamConfig) -> None:
-        self._patience_ns = seconds(config.patience_s)
-        self._window = Window(config.window)
+        self._timeout_ns = seconds_to_ns(config.patience_s)
+        self._window = FrameWindow(config.window)
         self._counts: Counter[str] = Counter()
-        self._broken = False  # what comes is of another odometry, though no frame has said so yet
+        self._segment_broken = False  # what comes is of another odometry, though no frame has said so yet
 
     @property
     def is_idle(self) -> bool:
         return self._window.is_idle
 
-    def arrived(self, event: ev.FrameArrived, connected: bool) -> None:
+    def add_frame(self, event: ev.FrameArrived, is_connected: bool) -> None:
         self._counts["arrived"] += 1
-        if connected:
+        if is_connected:
             self._window.offer(event.frame, event.arrived_ns)
         else:
             self._counts["drop_link"] += 1
             self._window.skip(event.frame)
 
-    def next(self, now_ns: int) -> Frame | None:
+    def next_frame(self, now_ns: int) -> Frame | None:
         """The frame that goes up now."""
-        self._window.expire(now_ns - self._patience_ns)
-        frame = self._window.next(now_ns)
+        self._window.expire(now_ns - self._timeout_ns)
+        frame = self._window.take_next(now_ns)
         self._counts["streamed"] += frame is not None
         return frame
 
-    def not_taken(self, index: int) -> None:
+    def cancel(self, index: int) -> None:
         """The link did not take it."""
         self._counts["drop_link"] += 1
         self._counts["streamed"] -= 1
-        self._window.refused(index)
+        self._window.cancel(index)
 
-    def edge_restarted(self) -> None:
+    def reset(self) -> None:
         """It knows nothing of what is under way, and its odometry begins anew."""
         self._window.clear()
-        self._broken = True
+        self._segment_broken = True
 
-    def tracked(self, answer: Tracked, now_ns: int) -> ev.FrameTracked | None:
+    def take_result(self, result: RemoteTrackingResult, now_ns: int) -> ev.FrameTracked | None:
         """The frame that was answered; None if it is not waited for any more."""
-        sent = self._window.answered(answer.index)
+        sent = self._window.take_answered(result.index)
         if sent is None:
             self._counts["late"] += 1
-            self._broken = self._broken or answer.new_stretch  # so is what comes after it
+            self._segment_broken = self._segment_broken or result.new_stretch  # so is what comes after it
             return None
         self._counts["answered"] += 1
-        broken = self._broken and answer.state.has_pose
-        self._broken = self._broken and not broken
+        starts_segment = self._segment_broken and result.state.has_pose
+        self._segment_broken = self._segment_broken and not starts_segment
         return ev.FrameTracked(
-            index=answer.index,
+            index=result.index,
             stamp_ns=sent.frame.stamp_ns,
             arrived_ns=sent.arrived_ns,
             done_ns=now_ns,
-            state=answer.state,
-            T_odom_body=answer.T_odom_body,
-            keyframe=answer.keyframe,
-            new_stretch=answer.new_stretch or broken,
-            waits=answer.waits,
+            state=result.state,
+            T_odom_body=result.T_odom_body,
+            is_keyframe=result.keyframe,
+            new_segment=result.new_stretch or starts_segment,
+            waiting_for=result.waits,
         )
 
     def report(self) -> dict[str, int]:

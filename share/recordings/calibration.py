@@ -19,8 +19,8 @@ import numpy as np
 from share.errors import ConfigError
 from share.files.yaml_file import Section, read_yaml
 from share.geometry import se3
-from share.geometry.camera import MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
-from share.geometry.lens import COUNTS, EQUIDISTANT, RADTAN
+from share.geometry.camera import MAX_TIMESHIFT_S, Camera, ImuNoise, Rig
+from share.geometry.lens import COEFFICIENT_COUNTS, EQUIDISTANT, RADTAN
 from share.types import F64
 
 CAMCHAIN = "kalibr_imucam_chain.yaml"
@@ -29,8 +29,8 @@ _MODELS = dict.fromkeys(("radtan", "radial-tangential", "plumb_bob"), RADTAN)  #
 _MODELS |= dict.fromkeys(("equidistant", "kannala_brandt", "fisheye"), EQUIDISTANT)
 TIMESHIFT = "timeshift_cam_imu"
 SERIAL = "serial"
-_AGREE_S = 1e-3  # timeshifts of two cameras that look together
-_DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres, as ROS and RealSense have it
+_MAX_TIMESHIFT_SPREAD_S = 1e-3  # timeshifts of two cameras that look together
+_DEFAULT_DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres, as ROS and RealSense have it
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,21 +40,23 @@ class Calibration:
 
     rig: Rig
     where: str
-    depth_scale: float = _DEPTH_SCALE
+    depth_scale: float = _DEFAULT_DEPTH_SCALE
     topics: dict[str, str] = field(default_factory=dict)
-    eyes: tuple[Section, ...] = ()
+    camera_sections: tuple[Section, ...] = ()
     serials: tuple[str, ...] = ()
 
     @property
     def T_imu_cam0(self) -> F64 | None:
         """(4, 4) as the file says, also without an IMU chain beside it. Raises ConfigError."""
-        told = self.eyes and {"T_cam_imu", "T_imu_cam"} & self.eyes[0].data.keys()
-        return kalibr_T_imu_cam(self.eyes[0]) if told else None
+        has_extrinsics = (
+            self.camera_sections and {"T_cam_imu", "T_imu_cam"} & self.camera_sections[0].data.keys()
+        )
+        return kalibr_T_imu_cam(self.camera_sections[0]) if has_extrinsics else None
 
     @property
     def timeshift_s(self) -> float:
         """IMU time less camera time, s, likewise. Raises ConfigError."""
-        return _timeshift_s(self.eyes)
+        return _mean_timeshift_s(self.camera_sections)
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -70,52 +72,52 @@ def read_calibration(path: Path) -> Calibration:
 
 def read_kalibr(path: Path, imu_path: Path | None = None) -> Calibration:
     """Kalibr's camchain and, if given, IMU chain. Without the latter the rig has no IMU, body = cam0."""
-    return kalibr(read_yaml(path), read_yaml(imu_path).section("imu0") if imu_path else None)
+    return calibration_from_kalibr(read_yaml(path), read_yaml(imu_path).section("imu0") if imu_path else None)
 
 
-def kalibr(chain: Section, imu: Section | None) -> Calibration:
+def calibration_from_kalibr(chain: Section, imu: Section | None) -> Calibration:
     """The rig of a camchain (cam0, cam1 and, ours alone, depth) and an IMU chain's imu0."""
     cams = {name: chain.section(name) for name in ("cam0", "cam1", "depth") if name in chain}
     cam0 = chain.section("cam0")
-    eyes = tuple(cams[name] for name in ("cam0", "cam1") if name in cams)
+    camera_sections = tuple(cams[name] for name in ("cam0", "cam1") if name in cams)
     rig = Rig(
-        cam0=_camera(cam0),
+        cam0=_read_camera(cam0),
         T_body_cam0=kalibr_T_imu_cam(cam0) if imu else np.eye(4),
         imu=imu_noise(imu, "update_rate") if imu else None,
-        timeshift_s=_timeshift_s(eyes) if imu else 0.0,
+        timeshift_s=_mean_timeshift_s(camera_sections) if imu else 0.0,
     )
     if "cam1" in cams:
         T_cam1_cam0 = _kalibr_T_cam1_cam0(cam0, cams["cam1"])
-        with said_of(cams["cam1"].where):
-            rig = replace(rig, cam1=_camera(cams["cam1"]), T_cam1_cam0=T_cam1_cam0)
-    scale = _DEPTH_SCALE
+        with config_errors(cams["cam1"].where):
+            rig = replace(rig, cam1=_read_camera(cams["cam1"]), T_cam1_cam0=T_cam1_cam0)
+    scale = _DEFAULT_DEPTH_SCALE
     if "depth" in cams:
         depth = cams["depth"]
-        rig = replace(rig, depth=_camera(depth), T_depth_cam0=depth.pose("T_depth_cam0"))
-        scale = depth.number("depth_scale", _DEPTH_SCALE, positive=True)
+        rig = replace(rig, depth=_read_camera(depth), T_depth_cam0=depth.pose("T_depth_cam0"))
+        scale = depth.number("depth_scale", _DEFAULT_DEPTH_SCALE, positive=True)
     named = cams | ({"imu": imu} if imu else {})
     topics = {name: section.text("rostopic", "") for name, section in named.items()}
-    told = {k: v for k, v in topics.items() if v}
-    return Calibration(rig, chain.where, scale, told, eyes, serials(named.values()))
+    stated_topics = {k: v for k, v in topics.items() if v}
+    return Calibration(rig, chain.where, scale, stated_topics, camera_sections, read_serials(named.values()))
 
 
-def serials(sections: Iterable[Section]) -> tuple[str, ...]:
+def read_serials(sections: Iterable[Section]) -> tuple[str, ...]:
     """Of which devices they say to be, each once (ours alone: Kalibr reads past it). Raises ConfigError."""
-    said = (_serial(section) for section in sections if section.data.get(SERIAL) not in (None, ""))
-    return tuple(dict.fromkeys(said))
+    values = (_read_serial(section) for section in sections if section.data.get(SERIAL) not in (None, ""))
+    return tuple(dict.fromkeys(values))
 
 
-def _serial(section: Section) -> str:
-    found = section.get(SERIAL)
-    if not isinstance(found, str):
+def _read_serial(section: Section) -> str:
+    serial = section.get(SERIAL)
+    if not isinstance(serial, str):
         raise ConfigError(f"{section.where}: {SERIAL}: put it in quotes, else YAML takes it for a number")
-    if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", found):
-        raise ConfigError(f"{section.where}: {SERIAL}: {found!r:.40} is no serial number; leave it out")
-    return found
+    if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", serial):
+        raise ConfigError(f"{section.where}: {SERIAL}: {serial!r:.40} is no serial number; leave it out")
+    return serial
 
 
 @contextlib.contextmanager
-def said_of(where: str) -> Iterator[None]:
+def config_errors(where: str) -> Iterator[None]:
     """What a camera or a rig cannot be is a ConfigError, with where it was found."""
     try:
         yield
@@ -126,27 +128,29 @@ def said_of(where: str) -> Iterator[None]:
 def read_camera_yaml(path: Path) -> Calibration:
     """camera.yaml of a TUM RGB-D folder: one colour camera and its depth, registered or not."""
     top = read_yaml(path)
-    cam0 = _camera(top)
+    cam0 = _read_camera(top)
     if "depth_intrinsics" in top:
         fx, fy, cx, cy = top.numbers("depth_intrinsics", (4,))
-        width, height = _resolution(top, "depth_resolution" if "depth_resolution" in top else "resolution")
-        depth, T = _make(top, width, height, (fx, fy, cx, cy)), top.pose("T_depth_cam0")
+        width, height = _read_resolution(
+            top, "depth_resolution" if "depth_resolution" in top else "resolution"
+        )
+        depth, T = _make_camera(top, width, height, (fx, fy, cx, cy)), top.pose("T_depth_cam0")
     else:  # registered: depth lies on the pixels of the undistorted colour image
         depth, T = replace(cam0, distortion=(), model=RADTAN), np.eye(4)
     rig = Rig(cam0=cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=T)
-    return Calibration(rig, str(path), top.number("depth_scale", positive=True), eyes=(top,))
+    return Calibration(rig, str(path), top.number("depth_scale", positive=True), camera_sections=(top,))
 
 
-def read_euroc(cam0: Path, cam1: Path | None, imu0: Path | None) -> Calibration:
+def read_asl_calibration(cam0: Path, cam1: Path | None, imu0: Path | None) -> Calibration:
     """sensor.yaml files of an ASL folder. T_BS of every sensor is taken into the IMU's frame."""
     section = read_yaml(cam0)
     T_b_cam0 = section.pose("T_BS")
-    rig = Rig(cam0=_camera(section), T_body_cam0=np.eye(4))
+    rig = Rig(cam0=_read_camera(section), T_body_cam0=np.eye(4))
     if cam1:
         other = read_yaml(cam1)
         T_cam1_cam0 = se3.inverse(other.pose("T_BS")) @ T_b_cam0
-        with said_of(other.where):
-            rig = replace(rig, cam1=_camera(other), T_cam1_cam0=T_cam1_cam0)
+        with config_errors(other.where):
+            rig = replace(rig, cam1=_read_camera(other), T_cam1_cam0=T_cam1_cam0)
     if imu0:
         imu = read_yaml(imu0)
         T_imu_cam0 = se3.inverse(imu.pose("T_BS")) @ T_b_cam0
@@ -154,16 +158,16 @@ def read_euroc(cam0: Path, cam1: Path | None, imu0: Path | None) -> Calibration:
     return Calibration(rig, str(cam0))
 
 
-def _camera(section: Section) -> Camera:
+def _read_camera(section: Section) -> Camera:
     model = section.text("camera_model", "pinhole")
     if model != "pinhole":
         raise ConfigError(f"{section.where}: camera_model '{model}' is not supported; supported: pinhole")
     fx, fy, cx, cy = section.numbers("intrinsics", (4,))
-    width, height = _resolution(section, "resolution")
-    return _make(section, width, height, (fx, fy, cx, cy), *_distortion(section))
+    width, height = _read_resolution(section, "resolution")
+    return _make_camera(section, width, height, (fx, fy, cx, cy), *_read_distortion(section))
 
 
-def _make(
+def _make_camera(
     section: Section,
     width: int,
     height: int,
@@ -171,35 +175,35 @@ def _make(
     distortion: tuple[float, ...] = (),
     model: str = RADTAN,
 ) -> Camera:
-    with said_of(section.where):
+    with config_errors(section.where):
         return Camera(width, height, *intrinsics, distortion, model)
 
 
-def _resolution(section: Section, key: str) -> tuple[int, int]:
+def _read_resolution(section: Section, key: str) -> tuple[int, int]:
     width, height = section.numbers(key, (2,))
     if not (width.is_integer() and height.is_integer()):
         raise ConfigError(f"{section.where}: {key}: expected whole numbers, found {width:g} and {height:g}")
     return int(width), int(height)
 
 
-def _distortion(section: Section) -> tuple[tuple[float, ...], str]:
+def _read_distortion(section: Section) -> tuple[tuple[float, ...], str]:
     """Coefficients and model."""
-    named = section.text("distortion_model", "none")
-    if named == "none":
+    name = section.text("distortion_model", "none")
+    if name == "none":
         return (), RADTAN
-    model = lens_model(named)
+    model = lens_model(name)
     if model is None:
         raise ConfigError(
-            f"{section.where}: distortion_model '{named}' is not supported; supported: {', '.join(_MODELS)}, "
+            f"{section.where}: distortion_model '{name}' is not supported; supported: {', '.join(_MODELS)}, "
             "none (calibrate again with one of these)"
         )
     key = "distortion_coeffs" if "distortion_coeffs" in section else "distortion_coefficients"
-    return tuple(section.numbers(key, tuple(n for n in COUNTS[model] if n))), model
+    return tuple(section.numbers(key, tuple(n for n in COEFFICIENT_COUNTS[model] if n))), model
 
 
-def lens_model(named: str) -> str | None:
+def lens_model(name: str) -> str | None:
     """The model (`share.geometry.lens`) that files give this name; None where there is none."""
-    return _MODELS.get(named)
+    return _MODELS.get(name)
 
 
 def imu_noise(section: Section, rate: str) -> ImuNoise:
@@ -229,22 +233,22 @@ def kalibr_T_imu_cam(cam: Section) -> F64:
     raise ConfigError(f"{cam.where}: has no extrinsics to the IMU; add T_cam_imu (or T_imu_cam)")
 
 
-def _timeshift_s(cams: Sequence[Section]) -> float:
+def _mean_timeshift_s(cams: Sequence[Section]) -> float:
     """IMU time less camera time, s: the mean of what the cameras say, 0 where they say nothing."""
-    said = [_one_timeshift_s(cam) for cam in cams if TIMESHIFT in cam]
-    if said and max(said) - min(said) > _AGREE_S:
+    shifts = [_read_timeshift_s(cam) for cam in cams if TIMESHIFT in cam]
+    if shifts and max(shifts) - min(shifts) > _MAX_TIMESHIFT_SPREAD_S:
         raise ConfigError(
-            f"{cams[-1].where}: {TIMESHIFT}: {said[-1]:g} s, but {said[0]:g} s of cam0; both look at "
-            f"the same time, so these must agree within {_AGREE_S:g} s"
+            f"{cams[-1].where}: {TIMESHIFT}: {shifts[-1]:g} s, but {shifts[0]:g} s of cam0; both look at "
+            f"the same time, so these must agree within {_MAX_TIMESHIFT_SPREAD_S:g} s"
         )
-    return float(np.mean(said)) if said else 0.0
+    return float(np.mean(shifts)) if shifts else 0.0
 
 
-def _one_timeshift_s(cam: Section) -> float:
+def _read_timeshift_s(cam: Section) -> float:
     shift = cam.number(TIMESHIFT)
-    if abs(shift) > MOST_TIMESHIFT_S:
+    if abs(shift) > MAX_TIMESHIFT_S:
         raise ConfigError(
-            f"{cam.where}: {TIMESHIFT}: {shift:g} s is more than {MOST_TIMESHIFT_S:g} s; "
+            f"{cam.where}: {TIMESHIFT}: {shift:g} s is more than {MAX_TIMESHIFT_S:g} s; "
             "it is given in seconds"
         )
     return shift
@@ -262,29 +266,29 @@ def _kalibr_T_cam1_cam0(cam0: Section, cam1: Section) -> F64:
 # ---- A rig written under Kalibr's names, as `share.recordings.calibration` reads it.
 
 
-def to_kalibr(rig: Rig, said: Calibration | None = None, serial: str | None = None) -> dict[str, Any]:
+def to_kalibr(rig: Rig, original: Calibration | None = None, serial: str | None = None) -> dict[str, Any]:
     """cam0, cam1, depth (ours) and imu0 of the rig, as plain data for a YAML file.
 
     said: what the rig was known by before. Of that is kept what no Rig holds: topics, depth_scale and, for a
     rig without IMU, how cam0 sits on one and how late their clock is. serial: of the device, in each section:
     Kalibr takes every key at the top for a camera. Raises ConfigError.
     """
-    said = said or Calibration(rig, "")
+    original = original or Calibration(rig, "")
     T_imu_cam0, shift_s = (
-        (said.T_imu_cam0, said.timeshift_s) if rig.imu is None else (rig.T_body_cam0, rig.timeshift_s)
+        (original.T_imu_cam0, original.timeshift_s) if rig.imu is None else (rig.T_body_cam0, rig.timeshift_s)
     )
     shift = {TIMESHIFT: shift_s} if shift_s else {}  # 0 is what its absence means
     out = {"cam0": _kalibr_camera(rig.cam0) | shift}
     if T_imu_cam0 is not None:
         out["cam0"]["T_cam_imu"] = se3.inverse(T_imu_cam0).tolist()
     if rig.imu is not None:
-        out["imu0"] = _imu(rig.imu)
+        out["imu0"] = _kalibr_imu(rig.imu)
     if rig.cam1 is not None and rig.T_cam1_cam0 is not None:
         out["cam1"] = _kalibr_camera(rig.cam1) | shift | {"T_cn_cnm1": rig.T_cam1_cam0.tolist()}
     if rig.depth is not None and rig.T_depth_cam0 is not None:
         T = rig.T_depth_cam0.tolist()
-        out["depth"] = _kalibr_camera(rig.depth) | {"T_depth_cam0": T, "depth_scale": said.depth_scale}
-    for stream, topic in said.topics.items():
+        out["depth"] = _kalibr_camera(rig.depth) | {"T_depth_cam0": T, "depth_scale": original.depth_scale}
+    for stream, topic in original.topics.items():
         name = "imu0" if stream == "imu" else stream
         if name in out:
             out[name]["rostopic"] = topic
@@ -320,7 +324,7 @@ def _kalibr_camera(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _imu(imu: ImuNoise) -> dict[str, Any]:
+def _kalibr_imu(imu: ImuNoise) -> dict[str, Any]:
     return {
         "gyroscope_noise_density": imu.gyro_density,
         "gyroscope_random_walk": imu.gyro_walk,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from share.errors import DataError, MisfitError, UsageError
+from share.errors import CalibrationMismatchError, DataError, UsageError
 from share.files.writing import atomic_write, check_replaceable, new_folder
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise
@@ -21,17 +21,17 @@ from share.sensors.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
 from share.types import F64
 
 Progress = Callable[[int], None]
-Told = Callable[[str, int, int], None]  # stage, done, of how many
+StageProgress = Callable[[str, int, int], None]  # stage, done, of how many
 
 
-def counting(told: Told, stage: str, total: int) -> Progress:
+def stage_progress(report: StageProgress, stage: str, total: int) -> Progress:
     """What is told how much more is done, and tells how much is."""
     done = 0
 
     def more(count: int) -> None:
         nonlocal done
         done += count
-        told(stage, done, total)
+        report(stage, done, total)
 
     return more
 
@@ -52,7 +52,7 @@ def write_recording(source: Source, out: Path, jpeg: int | None, progress: Progr
     check_replaceable(out)
     try:
         with Recorder(out, source.rig, jpeg, serial=source.serial) as recorder:
-            for measurement in _counted(source, progress):
+            for measurement in _intact_measurements(source, progress):
                 recorder.write(measurement)
     except BaseException:  # also Ctrl-C
         out.with_name(out.name + ".part").unlink(missing_ok=True)
@@ -69,23 +69,23 @@ def to_euroc(source: Source, out: Path, progress: Progress) -> None:
         _write_asl(source, work / "mav0", progress)
 
 
-def _counted(source: Source, progress: Progress) -> Iterator[Measurement]:
+def _intact_measurements(source: Source, progress: Progress) -> Iterator[Measurement]:
     """All measurements but images that are damaged; of each camera they are decoded until one is whole, to
     find a wrong size before the end."""
-    tried = set()
+    verified = set()
     for measurement in source.measurements():
         stream, image = measurement.stream, measurement.payload
         try:
-            if stream != IMU and stream not in tried:
+            if stream != IMU and stream not in verified:
                 image.load()
-                tried.add(stream)
+                verified.add(stream)
             elif isinstance(image, EncodedImage):
                 image.check()
-        except MisfitError:
+        except CalibrationMismatchError:
             raise
         except DataError as error:
-            source.losses.add(what := f"images of {stream}", str(measurement.stamp_ns), str(error))
-            source.losses.check(what, source.images_count)
+            source.losses.add(kind := f"images of {stream}", str(measurement.stamp_ns), str(error))
+            source.losses.check(kind, source.images_count)
             continue
         yield measurement
         if measurement.stream == CAM0:
@@ -97,7 +97,7 @@ def _write_asl(source: Source, root: Path, progress: Progress) -> None:
     T_imu = {CAM0: rig.T_body_cam0}
     if rig.T_cam1_cam0 is not None:
         T_imu[CAM1] = rig.T_body_cam0 @ se3.inverse(rig.T_cam1_cam0)
-    for stream, camera in ros_rig.cameras(rig).items():
+    for stream, camera in ros_rig.rig_cameras(rig).items():
         (root / stream / "data").mkdir(parents=True)
         (root / stream / "sensor.yaml").write_text(_camera_yaml(camera, T_imu[stream], source.rate_hz))
         listings[stream] = ["#timestamp [ns],filename"]
@@ -105,7 +105,7 @@ def _write_asl(source: Source, root: Path, progress: Progress) -> None:
         (root / "imu0").mkdir()
         (root / "imu0" / "sensor.yaml").write_text(_imu_yaml(rig.imu))
         listings["imu0"] = ["#timestamp [ns],w_x,w_y,w_z [rad s^-1],a_x,a_y,a_z [m s^-2]"]
-    for m in _counted(source, progress):
+    for m in _intact_measurements(source, progress):
         if m.stream == IMU:
             listings["imu0"].append(f"{m.stamp_ns},{_numbers(m.payload)}")
         else:
@@ -149,7 +149,7 @@ def _pose(T: F64) -> dict[str, object]:
 
 
 def _camera_yaml(camera: Camera, T_bs: F64, rate_hz: float) -> str:
-    named = EQUIDISTANT if camera.fisheye else "radial-tangential"
+    named = EQUIDISTANT if camera.is_fisheye else "radial-tangential"
     distortion = {"distortion_model": named, "distortion_coefficients": list(camera.distortion)}
     return _yaml(
         {

@@ -13,7 +13,7 @@ from share.types import I64
 _GAP_FACTOR = 2.5  # as the sequencer's
 
 
-def describe(source: Source) -> dict[str, Any]:
+def describe_recording(source: Source) -> dict[str, Any]:
     """Streams with counts, rates and gaps; calibration; truth. Reads stamps only, no images."""
     stamps = source.stamps()
     first = min((int(s[0]) for s in stamps.values() if len(s)), default=0)
@@ -65,7 +65,7 @@ def _camera(camera: Camera) -> dict[str, Any]:
         "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
         "distortion": list(camera.distortion),
         "lens": camera.model,
-        "fov_deg": round(float(np.degrees(camera.field_rad[0])), 1),
+        "fov_deg": round(float(np.degrees(camera.field_of_view_rad[0])), 1),
     }
 
 
@@ -75,6 +75,6 @@ def _truth(source: Source) -> dict[str, Any] | None:
         return None
     return {
         "poses": len(truth.stamps_ns),
-        "length_m": round(truth.metres, 3),
+        "length_m": round(truth.length_m, 3),
         "duration_s": float(truth.stamps_ns[-1] - truth.stamps_ns[0]) / 1e9,
     }

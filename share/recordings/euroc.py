@@ -11,20 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from share.errors import ConfigError
-from share.files.reading import inside
+from share.files.reading import path_inside
 from share.files.yaml_file import read_yaml
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.recordings import tables
-from share.recordings.calibration import Calibration, read_euroc
+from share.recordings.calibration import Calibration, read_asl_calibration
 from share.recordings.images import file_image
-from share.recordings.losses import Losses
+from share.recordings.losses import DataLosses
 from share.recordings.recording import FolderSource
-from share.recordings.trajectory import Trajectory, trajectory_of
+from share.recordings.trajectory import Trajectory, make_trajectory
 from share.sensors.measurement import CAM0, CAM1, LazyImage
 from share.types import F64
 
-TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
+TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 
 
 def is_euroc(path: Path) -> bool:
@@ -34,8 +34,8 @@ def is_euroc(path: Path) -> bool:
 def open_euroc(path: Path, calibration: Calibration | None, frames: slice | None) -> FolderSource:
     """The recording in `path` (holds mav0, or is it). Raises DataError, ConfigError, UsageError."""
     root = path / "mav0" if (path / "mav0").is_dir() else path
-    rig = fit(_own_rig(root) if calibration is None else calibration.rig, root)
-    losses = Losses()
+    rig = fit_rig_to_folder(_own_rig(root) if calibration is None else calibration.rig, root)
+    losses = DataLosses()
     images: dict[str, list[tuple[int, LazyImage]]] = {CAM0: _images(root / CAM0, rig.cam0, losses)}
     if rig.cam1:
         images[CAM1] = _images(root / CAM1, rig.cam1, losses)
@@ -44,10 +44,10 @@ def open_euroc(path: Path, calibration: Calibration | None, frames: slice | None
     source = FolderSource(
         name, rig, images, imu, lambda: _truth(root, rig, losses), _notes(root, rig), losses
     )
-    return source.part(frames)
+    return source.slice_frames(frames)
 
 
-def fit(rig: Rig, root: Path) -> Rig:
+def fit_rig_to_folder(rig: Rig, root: Path) -> Rig:
     """The rig, less the IMU where the folder has none. ConfigError if it wants a camera that is missing."""
     missing = "cam1" if rig.cam1 and not (root / CAM1).is_dir() else "depth" if rig.depth else ""
     if missing:
@@ -63,40 +63,40 @@ def _own_rig(root: Path) -> Rig:
     def sensor(name: str) -> Path | None:
         return root / name / "sensor.yaml" if (root / name).is_dir() else None
 
-    return read_euroc(root / CAM0 / "sensor.yaml", sensor(CAM1), sensor("imu0")).rig
+    return read_asl_calibration(root / CAM0 / "sensor.yaml", sensor(CAM1), sensor("imu0")).rig
 
 
-def _images(folder: Path, camera: Camera, losses: Losses) -> list[tuple[int, LazyImage]]:
+def _images(folder: Path, camera: Camera, losses: DataLosses) -> list[tuple[int, LazyImage]]:
     """data.csv's images that are there."""
     listing, data = folder / "data.csv", folder / "data"
 
     def parse(fields: list[str], where: str) -> tuple[int, str]:
-        inside(data, fields[1], where)
+        path_inside(data, fields[1], where)
         return tables.parse_ns(fields[0], where), fields[1]
 
-    _, found = tables.parsed(listing, ",", 2, parse, losses)
-    there = present(data, [name for _, name in found], listing, losses)
-    return [(stamp, file_image(data / name, camera)) for stamp, name in found if name in there]
+    _, listed = tables.parse_rows(listing, ",", 2, parse, losses)
+    existing = existing_images(data, [name for _, name in listed], listing, losses)
+    return [(stamp, file_image(data / name, camera)) for stamp, name in listed if name in existing]
 
 
-def present(folder: Path, names: list[str], listing: Path, losses: Losses) -> set[str]:
+def existing_images(folder: Path, names: list[str], listing: Path, losses: DataLosses) -> set[str]:
     """Which of the images `names` are in `folder`: better found now than in mid-run. Raises DataError where
     more than 5 % are missing."""
-    have = set(os.listdir(folder)) if folder.is_dir() else set()
-    what = f"images of {listing}"
-    for name in (name for name in names if name not in have):
-        losses.add(what, name, f"{listing}: {name} is missing from {folder}; copy the recording again")
-    losses.check(what, len(names))
-    return have
+    existing = set(os.listdir(folder)) if folder.is_dir() else set()
+    kind = f"images of {listing}"
+    for name in (name for name in names if name not in existing):
+        losses.add(kind, name, f"{listing}: {name} is missing from {folder}; copy the recording again")
+    losses.check(kind, len(names))
+    return existing
 
 
-def _truth(root: Path, rig: Rig, losses: Losses) -> Trajectory | None:
-    folder = next((root / name for name in TRUTHS if (root / name / "data.csv").is_file()), None)
+def _truth(root: Path, rig: Rig, losses: DataLosses) -> Trajectory | None:
+    folder = next((root / name for name in TRUTH_FOLDERS if (root / name / "data.csv").is_file()), None)
     if folder is None:
         return None
     file = folder / "data.csv"
     stamps, values = tables.read_table(file, 8, losses=losses)
-    truth = trajectory_of(stamps, values[:, :3], values[:, [4, 5, 6, 3]], file, losses)
+    truth = make_trajectory(stamps, values[:, :3], values[:, [4, 5, 6, 3]], file, losses)
     return Trajectory(truth.stamps_ns, truth.T @ _T_sensor_body(root, folder, rig))
 
 

@@ -16,17 +16,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from share.errors import DataError, MisfitError
+from share.errors import CalibrationMismatchError, DataError
 from share.files.reading import MB, read_bytes
-from share.geometry.camera import MOST_PIXELS, Camera
-from share.sensors.sequencer import Bundle
+from share.geometry.camera import MAX_PIXELS, Camera
+from share.sensors.sequencer import UndecodedFrame
 from share.types import F32, U8, Frame
 
-_MEND = "record or copy it again, or take it out of the list"
-_TAIL = 64  # bytes in which an end marker may be followed by padding
+_ADVICE = "record or copy it again, or take it out of the list"
+_TAIL_BYTES = 64  # bytes in which an end marker may be followed by padding
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_MOST_BYTES = 16  # of a file for each pixel: four channels of 16 bits, twice
-_MOST_SCANS = 200  # of a JPEG; progressive ones have ten, and each costs as much as a whole image
+_MAX_BYTES_PER_PIXEL = 16  # of a file for each pixel: four channels of 16 bits, twice
+_MAX_SCANS = 200  # of a JPEG; progressive ones have ten, and each costs as much as a whole image
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is said once, by DataError
 
@@ -47,21 +47,21 @@ class EncodedImage:
 
     def read(self) -> bytes:
         """The encoded bytes. Raises DataError if the file is missing or the image is cut short."""
-        most = _MOST_BYTES * self.width * self.height + MB
-        data = self.data if isinstance(self.data, bytes) else _read_file(self.data, most)
+        max_bytes = _MAX_BYTES_PER_PIXEL * self.width * self.height + MB
+        data = self.data if isinstance(self.data, bytes) else _read_file(self.data, max_bytes)
         check_complete(data, self.where)
         return data
 
     def check(self) -> None:
         """Raises DataError unless it is whole and of the calibration's size, as far as that is known without
         its pixels."""
-        header = _header(self.read(), self.where)
-        check_said(header.width, header.height, self.width, self.height, self.where)
+        header = _checked_header(self.read(), self.where)
+        check_header_size(header.width, header.height, self.width, self.height, self.where)
 
     def load(self) -> NDArray[Any]:
         data = self.read()
-        header = _header(data, self.where)
-        check_said(header.width, header.height, self.width, self.height, self.where)
+        header = _checked_header(data, self.where)
+        check_header_size(header.width, header.height, self.width, self.height, self.where)
         image = (
             decode_depth(data, self.depth_scale, self.where)
             if self.depth_scale
@@ -85,51 +85,51 @@ def file_image(path: Path, camera: Camera, depth_scale: float = 0.0) -> EncodedI
     return EncodedImage(path, str(path), camera.width, camera.height, depth_scale)
 
 
-def load(bundle: Bundle) -> Frame:
+def decode_frame(undecoded: UndecodedFrame) -> Frame:
     """Decode the images of a bundle. Raises DataError naming the image that is damaged."""
     return Frame(
-        stamp_ns=bundle.stamp_ns,
-        index=bundle.index,
-        image0=bundle.image0.load(),
-        image1=None if bundle.image1 is None else bundle.image1.load(),
-        depth=None if bundle.depth is None else bundle.depth.load(),
-        imu=bundle.imu,
-        gap_ns=bundle.gap_ns,
+        stamp_ns=undecoded.stamp_ns,
+        index=undecoded.index,
+        image0=undecoded.image0.load(),
+        image1=None if undecoded.image1 is None else undecoded.image1.load(),
+        depth=None if undecoded.depth is None else undecoded.depth.load(),
+        imu=undecoded.imu,
+        gap_ns=undecoded.gap_ns,
     )
 
 
 def decode_gray(data: bytes, where: str) -> U8:
     """JPEG or PNG, gray or colour -> (H, W) uint8."""
-    return np.asarray(_decoded(data, cv2.IMREAD_GRAYSCALE, where), np.uint8)
+    return np.asarray(_decode(data, cv2.IMREAD_GRAYSCALE, where), np.uint8)
 
 
 def decode_depth(data: bytes, depth_scale: float, where: str) -> F32:
     """16-bit PNG -> (H, W) float32 m, 0 = no reading."""
-    if not _header(data, where).is_depth:
-        raise DataError(f"{where}: depth must have one 16-bit channel and be a PNG; {_MEND}")
-    return depth_metres(_decoded(data, cv2.IMREAD_UNCHANGED, where), depth_scale, where)
+    if not _checked_header(data, where).is_depth:
+        raise DataError(f"{where}: depth must have one 16-bit channel and be a PNG; {_ADVICE}")
+    return depth_metres(_decode(data, cv2.IMREAD_UNCHANGED, where), depth_scale, where)
 
 
-def _decoded(data: bytes, how: int, where: str) -> NDArray[Any]:
-    header = _header(data, where)
-    if not 0 < header.width * header.height <= MOST_PIXELS or header.scans > _MOST_SCANS:
+def _decode(data: bytes, flags: int, where: str) -> NDArray[Any]:
+    header = _checked_header(data, where)
+    if not 0 < header.width * header.height <= MAX_PIXELS or header.scans > _MAX_SCANS:
         raise DataError(
             f"{where}: says that it has {header.width}x{header.height} pixels in {header.scans} scans, "
-            f"which no camera takes; {_MEND}"
+            f"which no camera takes; {_ADVICE}"
         )
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):
         image = None
     if image is None:
-        raise DataError(f"{where}: the image cannot be decoded; {_MEND}")
+        raise DataError(f"{where}: the image cannot be decoded; {_ADVICE}")
     return np.asarray(image)
 
 
-def _header(data: bytes, where: str) -> ImageHeader:
+def _checked_header(data: bytes, where: str) -> ImageHeader:
     header = image_header(data)
     if header is None:
-        raise DataError(f"{where}: the image cannot be decoded: its header is damaged; {_MEND}")
+        raise DataError(f"{where}: the image cannot be decoded: its header is damaged; {_ADVICE}")
     return header
 
 
@@ -157,14 +157,14 @@ def encode_png(image: U8) -> bytes:
 
 def check_size(image: NDArray[Any], width: int, height: int, where: str) -> NDArray[Any]:
     """`image` if it is as large as the calibration says, else MisfitError."""
-    check_said(image.shape[1], image.shape[0], width, height, where)
+    check_header_size(image.shape[1], image.shape[0], width, height, where)
     return image
 
 
-def check_said(found_width: int, found_height: int, width: int, height: int, where: str) -> None:
+def check_header_size(found_width: int, found_height: int, width: int, height: int, where: str) -> None:
     """Raises MisfitError for an image of another size than the calibration's; its pixels are not touched."""
     if (found_width, found_height) != (width, height):
-        raise MisfitError(
+        raise CalibrationMismatchError(
             f"{where}: is {found_width}x{found_height}, but the calibration is for {width}x{height}; "
             "give the calibration of this recording with --calib"
         )
@@ -173,51 +173,55 @@ def check_said(found_width: int, found_height: int, width: int, height: int, whe
 def check_complete(data: bytes, where: str) -> None:
     """Raises DataError unless `data` is a JPEG or PNG from its first marker to its last."""
     if data[:2] == b"\xff\xd8":
-        complete = b"\xff\xd9" in data[-_TAIL:]
+        complete = b"\xff\xd9" in data[-_TAIL_BYTES:]
     elif data[:8] == _PNG_MAGIC:
-        complete = b"IEND" in data[-_TAIL:] and _png_sound(data)
+        complete = b"IEND" in data[-_TAIL_BYTES:] and _is_png_intact(data)
     elif not data:
-        raise DataError(f"{where}: the image is empty; {_MEND}")
+        raise DataError(f"{where}: the image is empty; {_ADVICE}")
     else:
         raise DataError(f"{where}: is neither JPEG nor PNG; convert it, or record again")
     if not complete:
-        raise DataError(f"{where}: the image is cut short or damaged; {_MEND}")
+        raise DataError(f"{where}: the image is cut short or damaged; {_ADVICE}")
 
 
-def _png_sound(data: bytes) -> bool:
+def _is_png_intact(data: bytes) -> bool:
     """Whether every chunk's CRC holds (PNG specification, 5.3)."""
-    at = 8
-    while at + 12 <= len(data):
-        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+    offset = 8
+    while offset + 12 <= len(data):
+        end = offset + 8 + int.from_bytes(data[offset : offset + 4], "big")
+        if zlib.crc32(data[offset + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             return False
-        if data[at + 4 : at + 8] == b"IEND":
+        if data[offset + 4 : offset + 8] == b"IEND":
             return True
-        at = end + 4
+        offset = end + 4
     return False
 
 
 def read_picture(path: Path) -> bytes:
     """A picture without a calibration that says how large it is. Raises DataError."""
-    return _read_file(path, _MOST_BYTES * MOST_PIXELS)
+    return _read_file(path, _MAX_BYTES_PER_PIXEL * MAX_PIXELS)
 
 
-def _read_file(path: Path, most: int) -> bytes:
+def _read_file(path: Path, max_bytes: int) -> bytes:
     try:
-        return read_bytes(path, most)
+        return read_bytes(path, max_bytes)
     except FileNotFoundError:
-        raise DataError(f"{path}: the image is listed but missing; {_MEND}") from None
+        raise DataError(f"{path}: the image is listed but missing; {_ADVICE}") from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 # ---- What a JPEG or PNG says it is, before a decoder sees it. Pure: bytes in, numbers out.
 
-_SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # frames; the others are tables (ITU T.81, B.1.1.3)
-_BARE = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a length
-_SEQUENTIAL = frozenset((0xC0, 0xC1))
-_END = 0xD9
-_SCAN = b"\xff\xda"
+_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {
+    0xC4,
+    0xC8,
+    0xCC,
+}  # frames; the others are tables (ITU T.81, B.1.1.3)
+_BARE_MARKERS = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a length
+_SEQUENTIAL_MARKERS = frozenset((0xC0, 0xC1))
+_END_MARKER = 0xD9
+_SCAN_MARKER = b"\xff\xda"
 _GRAY_16 = (16, 0)  # bits, colour type (PNG 11.2.2)
 
 
@@ -233,39 +237,45 @@ class ImageHeader(NamedTuple):
 
 def image_header(data: bytes) -> ImageHeader | None:
     """None where it does not say, or is neither."""
-    return _png(data) if data[:8] == _PNG_MAGIC else _jpeg(data) if data[:2] == b"\xff\xd8" else None
+    return (
+        _png_header(data)
+        if data[:8] == _PNG_MAGIC
+        else _jpeg_header(data)
+        if data[:2] == b"\xff\xd8"
+        else None
+    )
 
 
-def _png(data: bytes) -> ImageHeader | None:
+def _png_header(data: bytes) -> ImageHeader | None:
     if len(data) < 33 or data[8:16] != b"\x00\x00\x00\rIHDR":
         return None
-    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    width, height = (int.from_bytes(data[offset : offset + 4], "big") for offset in (16, 20))
     return ImageHeader(width, height, (data[24], data[25]) == _GRAY_16)
 
 
-def _jpeg(data: bytes) -> ImageHeader | None:
+def _jpeg_header(data: bytes) -> ImageHeader | None:
     """From its segments up to the first scan, among which there is one frame header."""
-    at, frame = 2, 0
-    while at + 10 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
+    offset, frame = 2, 0
+    while offset + 10 <= len(data) and data[offset] == 0xFF:
+        marker = data[offset + 1]
         if marker == 0xFF:  # padding
-            at += 1
+            offset += 1
             continue
-        if marker in _BARE:
-            at += 2
+        if marker in _BARE_MARKERS:
+            offset += 2
             continue
-        if marker == _SCAN[1]:
-            return _of_frame(data, frame, at) if frame else None
-        if marker == _END or (frame and marker in _SOF):
+        if marker == _SCAN_MARKER[1]:
+            return _jpeg_frame_header(data, frame, offset) if frame else None
+        if marker == _END_MARKER or (frame and marker in _FRAME_MARKERS):
             return None
-        frame = at if marker in _SOF else frame
-        at += 2 + max(2, int.from_bytes(data[at + 2 : at + 4], "big"))
+        frame = offset if marker in _FRAME_MARKERS else frame
+        offset += 2 + max(2, int.from_bytes(data[offset + 2 : offset + 4], "big"))
     return None
 
 
-def _of_frame(data: bytes, frame: int, scan: int) -> ImageHeader:
+def _jpeg_frame_header(data: bytes, frame: int, scan: int) -> ImageHeader:
     """One scan is all there is where it has all components of a frame that is not progressive: a decoder
     stops there. Else scans are counted, which takes a moment."""
     height, width = (int.from_bytes(data[k : k + 2], "big") for k in (frame + 5, frame + 7))
-    whole = data[frame + 1] in _SEQUENTIAL and data[frame + 9] == data[scan + 4]
-    return ImageHeader(width, height, False, 1 if whole else data.count(_SCAN))
+    is_single_scan = data[frame + 1] in _SEQUENTIAL_MARKERS and data[frame + 9] == data[scan + 4]
+    return ImageHeader(width, height, False, 1 if is_single_scan else data.count(_SCAN_MARKER))

@@ -14,21 +14,25 @@ from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.recordings.calibration import Calibration
+from share.recordings.device_match import device_mismatch
 from share.recordings.images import EncodedImage
-from share.recordings.losses import Losses
-from share.recordings.mcap.rig import cameras
+from share.recordings.losses import DataLosses
+from share.recordings.mcap.rig import rig_cameras
 from share.recordings.realsense_db3 import Db3
-from share.recordings.recording import Source, span_of
+from share.recordings.recording import Source, select_span
 from share.recordings.trajectory import Trajectory
-from share.recordings.unit import of_another
-from share.sensors.intake import ACCEL, GYRO, Intake
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, Measurement
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
+from share.sensors.sample_processor import ACCEL, GYRO, SampleProcessor
 from share.types import F64, I64, checked_pose
 
-_UNITS_M, _RATES_HZ = (1e-6, 1.0), (0.1, 1e5)
-_LIKE = "d435i"  # its IMU is believed where the recording says nothing of one
-_NOTE = f"does not say where the IMU sits and how noisy it is: taken from profile {_LIKE}, or give --calib"
+_UNIT_RANGE_M, _RATE_RANGE_HZ = (1e-6, 1.0), (0.1, 1e5)
+_DEFAULT_PROFILE = "d435i"  # its IMU is believed where the recording says nothing of one
+_DEFAULT_PROFILE_NOTE = (
+    f"does not say where the IMU sits and how noisy it is: "
+    f"taken from profile "
+    f"{_DEFAULT_PROFILE}, or give --calib"
+)
 
 
 def open_db3(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
@@ -39,23 +43,23 @@ def open_db3(path: Path, calibration: Calibration | None, frames: slice | None) 
             f"{path}: has no left infrared images (Infrared 1), compressed as the SDK does it; record them"
         )
     if calibration is not None:
-        doubt = of_another(calibration.serials, file.serial)
-        return RecordedSource(file, calibration.rig, () if doubt is None else (doubt,), frames)
-    rig = recorded_rig(file)
-    return RecordedSource(file, rig, (_NOTE,) if rig.imu else (), frames)
+        warning = device_mismatch(calibration.serials, file.serial)
+        return RealSenseRecording(file, calibration.rig, () if warning is None else (warning,), frames)
+    rig = read_recorded_rig(file)
+    return RealSenseRecording(file, rig, (_DEFAULT_PROFILE_NOTE,) if rig.imu else (), frames)
 
 
-class RecordedSource(Source):
+class RealSenseRecording(Source):
     """The streams of the file that the rig has."""
 
     def __init__(self, file: Db3, rig: Rig, notes: tuple[str, ...], frames: slice | None) -> None:
         self.name, self.rig, self.notes, self.serial = file.path.stem, rig, notes, file.serial
-        self._file, self._cameras = file, cameras(rig)
+        self._file, self._cameras = file, rig_cameras(rig)
         if missing := sorted(self._cameras.keys() - file.streams.keys()):
             raise UsageError(f"{file.path}: has no {missing[0]}, which the calibration has")
         unit = f"{file.streams.get(DEPTH, '').rpartition('/')[0]}/option/Depth_Units/value"
-        self._depth_scale = 1 / file.number(unit, None, 0.001, *_UNITS_M)
-        self._span = span_of(self._all_stamps[CAM0], frames, str(file.path), rig.timeshift_ns)
+        self._depth_scale = 1 / file.read_number(unit, None, 0.001, *_UNIT_RANGE_M)
+        self._span = select_span(self._all_stamps[CAM0], frames, str(file.path), rig.timeshift_ns)
 
     def stamps(self) -> dict[str, I64]:
         out = {}
@@ -65,7 +69,7 @@ class RecordedSource(Source):
         return out
 
     def measurements(self) -> Iterator[Measurement]:
-        for m in self._repaired(images=True):
+        for m in self._repair(images=True):
             lo, hi = self._span.limits(m.stream)
             if lo < m.stamp_ns <= hi:
                 yield m if m.stream == IMU else Measurement(m.stream, m.stamp_ns, self._image(m))
@@ -75,18 +79,18 @@ class RecordedSource(Source):
 
     @cached_property
     def _all_stamps(self) -> dict[str, I64]:
-        found: dict[str, list[int]] = {name: [] for name in self._cameras}
+        stamps_by_stream: dict[str, list[int]] = {name: [] for name in self._cameras}
         if self.rig.imu:
-            found[IMU] = []
-        for m in self._repaired(images=False):
-            found[m.stream].append(m.stamp_ns)
-        if not found[CAM0]:
+            stamps_by_stream[IMU] = []
+        for m in self._repair(images=False):
+            stamps_by_stream[m.stream].append(m.stamp_ns)
+        if not stamps_by_stream[CAM0]:
             raise DataError(f"{self._file.path}: has no images")
-        return {name: np.array(stamps, np.int64) for name, stamps in found.items()}
+        return {name: np.array(stamps, np.int64) for name, stamps in stamps_by_stream.items()}
 
-    def _repaired(self, images: bool) -> Iterator[Measurement]:
-        used = [*self._cameras, *((ACCEL, GYRO) if self.rig.imu else ())]
-        return repaired(self._file, used, images, self.losses)
+    def _repair(self, images: bool) -> Iterator[Measurement]:
+        streams = [*self._cameras, *((ACCEL, GYRO) if self.rig.imu else ())]
+        return repair_samples(self._file, streams, images, self.losses)
 
     def _image(self, m: Measurement) -> EncodedImage:
         camera, scale = self._cameras[m.stream], self._depth_scale if m.stream == DEPTH else 0.0
@@ -94,64 +98,71 @@ class RecordedSource(Source):
         return EncodedImage(m.payload, where, camera.width, camera.height, scale)
 
 
-def repaired(file: Db3, streams: Collection[str], images: bool, losses: Losses) -> Iterator[Measurement]:
+def repair_samples(
+    file: Db3, streams: Collection[str], images: bool, losses: DataLosses
+) -> Iterator[Measurement]:
     """These streams of the file as a live camera's: in one time that goes forward, accel and gyro joined.
     images: with pixels. losses: takes what is damaged. Raises DataError."""
-    rates = {name: file.number(f"{file.streams[name]}/info", "fps", 30.0, *_RATES_HZ) for name in streams}
-    intake = Intake(rates, SequencerConfig().max_jump_s)
+    rates = {
+        name: file.read_number(f"{file.streams[name]}/info", "fps", 30.0, *_RATE_RANGE_HZ) for name in streams
+    }
+    intake = SampleProcessor(rates, SequencerConfig().max_jump_s)
     for sample in file.samples(losses, images):
         yield from intake.feed(sample)
-    yield from intake.end()
+    yield from intake.flush()
 
 
-def recorded_imu(file: Db3, losses: Losses) -> tuple[I64, F64]:
+def read_recorded_imu(file: Db3, losses: DataLosses) -> tuple[I64, F64]:
     """Stamps (N,) ns and (N, 6) wx wy wz ax ay az, rad/s and m/s^2. losses: takes what is damaged. Raises
     DataError."""
     if missing := [name for name in (ACCEL, GYRO) if name not in file.streams]:
         raise DataError(f"{file.path}: has no {' and no '.join(missing)}; record both")
-    samples = [(m.stamp_ns, m.payload) for m in repaired(file, (ACCEL, GYRO), False, losses)]
+    samples = [(m.stamp_ns, m.payload) for m in repair_samples(file, (ACCEL, GYRO), False, losses)]
     if not samples:
         raise DataError(f"{file.path}: has no IMU samples")
     stamps, values = zip(*samples, strict=True)
     return np.array(stamps, np.int64), np.array(values)
 
 
-def recorded_rig(file: Db3) -> Rig:
+def read_recorded_rig(file: Db3) -> Rig:
     """Lenses and baseline as recorded; the IMU, if there is one, of a profile. Raises DataError."""
-    lenses = {name: _camera(file, name) for name in (CAM0, CAM1, DEPTH) if name in file.streams}
+    lenses = {name: _read_camera(file, name) for name in (CAM0, CAM1, DEPTH) if name in file.streams}
     rig: dict[str, Any] = {"cam0": lenses[CAM0], "T_body_cam0": np.eye(4)}
     for name in (CAM1, DEPTH):
         if name in lenses:
-            rig |= {name: lenses[name], f"T_{name}_cam0": _T(file, name) @ se3.inverse(_T(file, CAM0))}
+            rig |= {
+                name: lenses[name],
+                f"T_{name}_cam0": _read_extrinsics(file, name) @ se3.inverse(_read_extrinsics(file, CAM0)),
+            }
     if ACCEL in file.streams and GYRO in file.streams:
-        stated = profile(_LIKE).rig()
-        rig |= {"imu": stated.imu, "T_body_cam0": stated.T_body_cam0}
+        default_rig = load_profile(_DEFAULT_PROFILE).rig()
+        rig |= {"imu": default_rig.imu, "T_body_cam0": default_rig.T_body_cam0}
     try:
         return Rig(**rig)
     except ValueError as error:
         raise DataError(f"{file.path}: {error}") from None
 
 
-def _camera(file: Db3, stream: str) -> Camera:
-    told = file.told(f"{file.streams[stream]}/camera_info")
+def _read_camera(file: Db3, stream: str) -> Camera:
+    fields = file.text_fields(f"{file.streams[stream]}/camera_info")
     try:
-        width, height = int(told["width"]), int(told["height"])
-        fx, fy, cx, cy = (float(told[key]) for key in ("fx", "fy", "ppx", "ppy"))
-        coefficients = tuple(float(c) for c in told["coeffs"].split(","))
-        if any(coefficients) and told["model"] != "Brown Conrady":
-            raise ValueError(f"distortion model {told['model']} is not known; give --calib")
+        width, height = int(fields["width"]), int(fields["height"])
+        fx, fy, cx, cy = (float(fields[key]) for key in ("fx", "fy", "ppx", "ppy"))
+        coefficients = tuple(float(c) for c in fields["coeffs"].split(","))
+        if any(coefficients) and fields["model"] != "Brown Conrady":
+            raise ValueError(f"distortion model {fields['model']} is not known; give --calib")
         return Camera(width, height, fx, fy, cx, cy, coefficients if any(coefficients) else ())
     except (KeyError, ValueError) as error:
         raise DataError(f"{file.path}: calibration of {stream}: {error}") from None
 
 
-def _T(file: Db3, stream: str) -> F64:
+def _read_extrinsics(file: Db3, stream: str) -> F64:
     """T_stream_reference (4, 4), one reference for the whole device. The rotation is column by column."""
-    told = file.told(file.topic(f"{file.streams[stream]}/tf/ref_"))
+    fields = file.text_fields(file.find_topic(f"{file.streams[stream]}/tf/ref_"))
     try:
         T = np.eye(4)
-        T[:3, :3] = np.reshape([float(v) for v in told["rotation"].split(",")], (3, 3), order="F")
-        T[:3, 3] = [float(v) for v in told["translation"].split(",")]
+        T[:3, :3] = np.reshape([float(v) for v in fields["rotation"].split(",")], (3, 3), order="F")
+        T[:3, 3] = [float(v) for v in fields["translation"].split(",")]
         return se3.orthonormal(checked_pose("extrinsics", T))
     except (KeyError, ValueError) as error:
         raise DataError(f"{file.path}: extrinsics of {stream}: {error}; give --calib") from None

@@ -16,21 +16,21 @@ from typing import Any
 
 from share.errors import DataError
 from share.files.reading import MB
-from share.files.sqlite_file import Untrusted
-from share.recordings.losses import Losses
-from share.recordings.mcap import types as ros
-from share.recordings.tables import MOST_NS
-from share.sensors.intake import ACCEL, GYRO, Sample
+from share.files.sqlite_file import UntrustedDatabase
+from share.recordings.losses import DataLosses
+from share.recordings.mcap import ros_messages as ros
+from share.recordings.tables import MAX_STAMP_NS
 from share.sensors.measurement import CAM0, CAM1, DEPTH
+from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 
 STREAMS = {"Infrared_1": CAM0, "Infrared_2": CAM1, "Depth_0": DEPTH, "Accel_0": ACCEL, "Gyro_0": GYRO}
-_DATA = ("/imu/data", "/image/data/compressed", "/image/data/compressedDepth")
+_DATA_SUFFIXES = ("/imu/data", "/image/data/compressed", "/image/data/compressedDepth")
 _DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport's ConfigHeader before the PNG
-_HARDWARE = "Hardware Clock"
+_HARDWARE_CLOCK = "Hardware Clock"
 _COLUMNS = {"topics": ("id", "name"), "messages": ("id", "topic_id", "timestamp", "data")}  # rosbag2's
-_MOST_TOPICS, _LONGEST = 10_000, 500  # the SDK writes 100 of 60 characters
-_MOST_MESSAGE = 64 * MB  # of bytes; four times as much as a raw image of 8 megapixels
-_MOST_ROW = 4 * _MOST_MESSAGE
+_MAX_TOPICS, _MAX_NAME_LENGTH = 10_000, 500  # the SDK writes 100 of 60 characters
+_MAX_MESSAGE_BYTES = 64 * MB  # of bytes; four times as much as a raw image of 8 megapixels
+_MAX_ROW_BYTES = 4 * _MAX_MESSAGE_BYTES
 
 
 class Db3:
@@ -38,49 +38,56 @@ class Db3:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._ids = self._topics()
-        parts = [(name.split("/"), name) for name in self._ids if name.endswith(_DATA)]
-        self._data = {STREAMS[p[3]]: name for p, name in parts if len(p) > 3 and p[3] in STREAMS}
-        self.streams = {stream: "/".join(name.split("/")[:4]) for stream, name in self._data.items()}
+        self._topic_ids = self._read_topic_ids()
+        parts = [(name.split("/"), name) for name in self._topic_ids if name.endswith(_DATA_SUFFIXES)]
+        self._data_topics = {STREAMS[p[3]]: name for p, name in parts if len(p) > 3 and p[3] in STREAMS}
+        self.streams = {stream: "/".join(name.split("/")[:4]) for stream, name in self._data_topics.items()}
 
     @property
     def serial(self) -> str | None:
         """Of the device."""
-        told = self.told("/device_0/info").get("Serial Number")
-        return told if told is not None and re.fullmatch(r"[\w-]{1,64}", told) else None
+        serial = self.text_fields("/device_0/info").get("Serial Number")
+        return serial if serial is not None and re.fullmatch(r"[\w-]{1,64}", serial) else None
 
-    def number(self, topic: str, key: str | None, default: float, least: float, most: float) -> float:
+    def read_number(
+        self, topic: str, key: str | None, default: float, minimum: float, maximum: float
+    ) -> float:
         """What `told` says by `key`, or all of it; `default` where it says nothing. Raises DataError where it
-        is no number from `least` to `most`."""
-        told = self.told(topic)
-        text = next(iter(told), None) if key is None else told.get(key)
+        is no number from `minimum` to `maximum`."""
+        fields = self.text_fields(topic)
+        text = next(iter(fields), None) if key is None else fields.get(key)
         try:
             value = default if text is None else float(text)
         except ValueError:
             value = math.nan
-        if not least <= value <= most:
-            raise DataError(f"{self.path}: {topic}: '{text:.40}' is no number from {least:g} to {most:g}")
+        if not minimum <= value <= maximum:
+            raise DataError(
+                f"{self.path}: {topic}: '{text:.40}' is no number from {minimum:g} to {maximum:g}"
+            )
         return value
 
-    def told(self, topic: str) -> dict[str, str]:
+    def text_fields(self, topic: str) -> dict[str, str]:
         """What a text such as `key=value;key=value` says, empty if it is not there."""
         query = f"SELECT {_DATA_OR_NULL} FROM messages NOT INDEXED WHERE topic_id = ? ORDER BY id LIMIT 1"
-        for (data,) in self._rows(query, self._ids.get(topic, -1)):
-            return self._text(data)
+        for (data,) in self._rows(query, self._topic_ids.get(topic, -1)):
+            return self._parse_text(data)
         return {}
 
-    def topic(self, begins: str) -> str:
+    def find_topic(self, prefix: str) -> str:
         """The first topic whose name begins so. Raises DataError if there is none."""
-        for name in sorted(self._ids):
-            if name.startswith(begins):
+        for name in sorted(self._topic_ids):
+            if name.startswith(prefix):
                 return name
-        raise DataError(f"{self.path}: has no {begins}, which the SDK writes")
+        raise DataError(f"{self.path}: has no {prefix}, which the SDK writes")
 
-    def samples(self, losses: Losses, images: bool = True) -> Iterator[Sample]:
+    def samples(self, losses: DataLosses, images: bool = True) -> Iterator[DeviceSample]:
         """All of them as they came; those that are damaged go to `losses`. images: with pixels, encoded; else
         an image's payload is None. Raises DataError where more than 5 % of a stream are damaged."""
-        data = {self._ids[name]: stream for stream, name in self._data.items()}
-        metadata = {self._ids[self.topic(_metadata(name))]: s for s, name in self._data.items()}
+        data = {self._topic_ids[name]: stream for stream, name in self._data_topics.items()}
+        metadata = {
+            self._topic_ids[self.find_topic(_metadata_topic(name))]: s
+            for s, name in self._data_topics.items()
+        }
         read = [n for n, stream in data.items() if images or stream in (ACCEL, GYRO)] + list(metadata)
         marks = ", ".join("?" * len(read))
         query = (
@@ -88,7 +95,7 @@ class Db3:
             f"WHERE topic_id IN ({marks}) ORDER BY id"
         )
         waiting: dict[str, Any] = {}
-        total = dict.fromkeys(self._data, 0)
+        total = dict.fromkeys(self._data_topics, 0)
         for row, number, at_ns, blob in self._rows(query, *read):
             if number in data:
                 waiting[data[number]] = blob
@@ -96,8 +103,10 @@ class Db3:
             stream = metadata[number]
             total[stream] += 1
             try:
-                whole = images or stream in (ACCEL, GYRO)
-                sample = self._sample(stream, waiting.pop(stream, None), whole, self._text(blob), at_ns)
+                with_payload = images or stream in (ACCEL, GYRO)
+                sample = self._make_sample(
+                    stream, waiting.pop(stream, None), with_payload, self._parse_text(blob), at_ns
+                )
             except DataError as error:  # it costs itself
                 losses.add(f"samples of {stream}", str(row), str(error))
                 continue
@@ -105,31 +114,31 @@ class Db3:
         for stream, count in total.items():
             losses.check(f"samples of {stream}", count)
 
-    def _topics(self) -> dict[str, int]:
+    def _read_topic_ids(self) -> dict[str, int]:
         """Their numbers by name."""
         query = (
             f"SELECT id, name FROM topics NOT INDEXED "
-            f"WHERE typeof(name) = 'text' AND length(name) <= {_LONGEST} LIMIT {_MOST_TOPICS}"
+            f"WHERE typeof(name) = 'text' AND length(name) <= {_MAX_NAME_LENGTH} LIMIT {_MAX_TOPICS}"
         )
         return {name: number for number, name in self._rows(query)}
 
-    def _sample(
-        self, stream: str, blob: bytes | None, whole: bool, told: dict[str, str], at_ns: int
-    ) -> Sample:
+    def _make_sample(
+        self, stream: str, blob: bytes | None, with_payload: bool, metadata: dict[str, str], at_ns: int
+    ) -> DeviceSample:
         """whole: with what was recorded, not only when."""
         try:
-            return Sample(
+            return DeviceSample(
                 stream=stream,
-                stamp_ns=_bounded(round(float(told["timestamp"]) * 1e3) * 1000),
-                payload=_payload(stream, blob) if whole else None,
-                arrived_ns=_bounded(at_ns),
-                number=None if stream in (ACCEL, GYRO) else _bounded(int(told["Frame number"])),
-                hardware=told["timestamp_domain"] == _HARDWARE,
+                stamp_ns=_checked_int(round(float(metadata["timestamp"]) * 1e3) * 1000),
+                payload=_decode_payload(stream, blob) if with_payload else None,
+                arrived_ns=_checked_int(at_ns),
+                number=None if stream in (ACCEL, GYRO) else _checked_int(int(metadata["Frame number"])),
+                is_device_clock=metadata["timestamp_domain"] == _HARDWARE_CLOCK,
             )
         except Exception as error:  # rosbags raises many kinds on bytes that are no such message
             raise DataError(f"{self.path}: a sample of {stream} cannot be read ({error!r})") from None
 
-    def _text(self, blob: bytes) -> dict[str, str]:
+    def _parse_text(self, blob: bytes) -> dict[str, str]:
         try:
             text: str = ros.decode(blob, "std_msgs/msg/String").data
         except Exception as error:
@@ -138,7 +147,7 @@ class Db3:
 
     def _rows(self, query: str, *values: int) -> Iterator[tuple[Any, ...]]:
         try:
-            with closing(Untrusted(self.path, _COLUMNS, _MOST_ROW)) as file:
+            with closing(UntrustedDatabase(self.path, _COLUMNS, _MAX_ROW_BYTES)) as file:
                 yield from file.rows(query, *values)
         except OSError as error:
             raise DataError(f"{self.path}: cannot be read: {error.strerror}") from None
@@ -148,22 +157,22 @@ class Db3:
             ) from None
 
 
-_DATA_OR_NULL = f"CASE WHEN typeof(data) = 'blob' AND length(data) <= {_MOST_MESSAGE} THEN data END"
+_DATA_OR_NULL = f"CASE WHEN typeof(data) = 'blob' AND length(data) <= {_MAX_MESSAGE_BYTES} THEN data END"
 
 
-def _bounded(number: Any) -> int:
+def _checked_int(number: Any) -> int:
     """A stamp, or number of a frame. Raises ValueError."""
-    if type(number) is not int or abs(number) >= MOST_NS:
+    if type(number) is not int or abs(number) >= MAX_STAMP_NS:
         raise ValueError(f"{number!r:.40} is out of range")
     return number
 
 
-def _metadata(data: str) -> str:
+def _metadata_topic(data: str) -> str:
     """The topic with the stamps of the samples in topic `data`."""
     return data[: data.rindex("/data")] + "/metadata"
 
 
-def _payload(stream: str, blob: bytes | None) -> Any:
+def _decode_payload(stream: str, blob: bytes | None) -> Any:
     """Raises ValueError and what rosbags does."""
     if blob is None:
         raise ValueError("its data are missing, or too large")

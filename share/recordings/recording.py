@@ -13,7 +13,7 @@ import numpy as np
 
 from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
-from share.recordings.losses import Losses
+from share.recordings.losses import DataLosses
 from share.recordings.trajectory import Trajectory
 from share.sensors.imu_check import ImuRange
 from share.sensors.measurement import CAM0, IMU, LazyImage, Measurement
@@ -29,7 +29,7 @@ class Source(ABC):
     notes: tuple[str, ...]
     serial: str | None = None
     imu_range = ImuRange()  # of the widest usual sensor, where nobody says which it is
-    tells_silence = False  # whether a person is told by it that a stream has stopped
+    reports_silence = False  # whether a person is told by it that a stream has stopped
 
     @abstractmethod
     def stamps(self) -> dict[str, I64]:
@@ -47,9 +47,9 @@ class Source(ABC):
         """Ask a live camera to end, from any thread or signal handler."""
 
     @cached_property
-    def losses(self) -> Losses:
+    def losses(self) -> DataLosses:
         """What could not be read so far and was left out."""
-        return Losses()
+        return DataLosses()
 
     def report(self) -> dict[str, Any]:
         """What a live camera met, for report.json."""
@@ -79,28 +79,28 @@ class Span(NamedTuple):
         return (self.imu_from, self.imu_to) if stream == IMU else (self.image_from, self.image_to)
 
 
-_EVER = 2**62
+_UNBOUNDED = 2**62
 
 
-def span_of(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> Span:
+def select_span(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> Span:
     """The span of cam0's images number `frames`, with the IMU samples since the image before them, whose
     stamps are imu_shift_ns later than those of images taken with them.
 
     Raises UsageError if nothing is left or the slice has a step.
     """
     if frames is None:
-        return Span(-_EVER, _EVER, -_EVER, _EVER)
+        return Span(-_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, _UNBOUNDED)
     first, last, step = frames.indices(len(cam0))
     if step != 1 or first >= last:
-        wanted = ":".join("" if end is None else str(end) for end in (frames.start, frames.stop))
-        raise UsageError(f"{where}: --frames {wanted} selects nothing; it has {len(cam0)} frames")
-    before = int(cam0[first - 1]) if first else -_EVER
-    until = int(cam0[last - 1])
+        requested = ":".join("" if end is None else str(end) for end in (frames.start, frames.stop))
+        raise UsageError(f"{where}: --frames {requested} selects nothing; it has {len(cam0)} frames")
+    previous_ns = int(cam0[first - 1]) if first else -_UNBOUNDED
+    last_ns = int(cam0[last - 1])
     return Span(
-        image_from=(before + int(cam0[first])) // 2 if first else -_EVER,
-        image_to=(until + int(cam0[last])) // 2 if last < len(cam0) else _EVER,
-        imu_from=before + imu_shift_ns,
-        imu_to=until + imu_shift_ns if last < len(cam0) else _EVER,
+        image_from=(previous_ns + int(cam0[first])) // 2 if first else -_UNBOUNDED,
+        image_to=(last_ns + int(cam0[last])) // 2 if last < len(cam0) else _UNBOUNDED,
+        imu_from=previous_ns + imu_shift_ns,
+        imu_to=last_ns + imu_shift_ns if last < len(cam0) else _UNBOUNDED,
     )
 
 
@@ -114,7 +114,7 @@ class FolderSource(Source):
     imu: tuple[I64, F64] | None = None
     read_truth: Callable[[], Trajectory | None] = lambda: None
     notes: tuple[str, ...] = field(default=())
-    losses: Losses = field(default_factory=Losses)
+    losses: DataLosses = field(default_factory=DataLosses)
 
     def stamps(self) -> dict[str, I64]:
         out = {
@@ -128,11 +128,11 @@ class FolderSource(Source):
     def truth(self) -> Trajectory | None:
         return self.read_truth()
 
-    def part(self, frames: slice | None) -> FolderSource:
+    def slice_frames(self, frames: slice | None) -> FolderSource:
         """The same recording, only the frames number `frames` of cam0."""
         if not self.images[CAM0]:
             raise DataError(f"{self.name}: has no images")
-        span = span_of(self.stamps()[CAM0], frames, self.name, self.rig.timeshift_ns)
+        span = select_span(self.stamps()[CAM0], frames, self.name, self.rig.timeshift_ns)
         lo, hi = span.limits(CAM0)
         images = {
             name: [(stamp, image) for stamp, image in items if lo < stamp <= hi]

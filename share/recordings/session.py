@@ -12,18 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from share.agent_names import checked_name
 from share.errors import ConfigError, UsageError
-from share.files.reading import inside
+from share.files.reading import path_inside
 from share.files.yaml_file import Section, read_yaml
-from share.names import checked_name
-from share.recordings.calibration import Calibration, kalibr, read_calibration
+from share.recordings.calibration import Calibration, calibration_from_kalibr, read_calibration
 from share.types import AgentKind
 
-SESSION = "session.yaml"
+SESSION_FILE = "session.yaml"
 SCHEMA = 1
-AGENT_NAME = "1 to 64 letters, digits, '_', '-' or '.'"
-_MOST_NS = 2**62  # of a clock's offset
-_KEYS = ("kind", "sensors", "rate_hz", "clock_offset_ns", "calibration")
+AGENT_NAME_RULE = "1 to 64 letters, digits, '_', '-' or '.'"
+_MAX_OFFSET_NS = 2**62  # of a clock's offset
+_AGENT_KEYS = ("kind", "sensors", "rate_hz", "clock_offset_ns", "calibration")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Session:
             raise UsageError(f"{self.folder}: has no agent '{name}'; it has {', '.join(self.agents)}")
         recording = self.folder / f"{name}.mcap"
         if not recording.is_file():
-            raise UsageError(f"{recording}: no such file, although {self.folder / SESSION} names it")
+            raise UsageError(f"{recording}: no such file, although {self.folder / SESSION_FILE} names it")
         return recording
 
 
@@ -66,15 +66,15 @@ def is_agent_name(text: str) -> bool:
 
 
 def is_session(folder: Path) -> bool:
-    return (folder / SESSION).is_file()
+    return (folder / SESSION_FILE).is_file()
 
 
 def read_session(folder: Path) -> Session:
     """Raises ConfigError naming the key that is wrong, UsageError where it is no session."""
     if not is_session(folder):
-        what = f"has no {SESSION}" if folder.is_dir() else "there is no such folder"
+        what = f"has no {SESSION_FILE}" if folder.is_dir() else "there is no such folder"
         raise UsageError(f"{folder}: {what}; give a session, by `share emulate` or `share dataset align`")
-    top = read_yaml(folder / SESSION)
+    top = read_yaml(folder / SESSION_FILE)
     schema = top.number("schema")
     if schema != SCHEMA:
         raise ConfigError(f"{top.where}: schema {schema:g} is not known; this SHARE reads schema {SCHEMA}")
@@ -82,39 +82,42 @@ def read_session(folder: Path) -> Session:
     if not agents.data:
         raise ConfigError(f"{agents.where}: names nobody")
     provenance = top.section("provenance").data if "provenance" in top else {}
-    found = {_name(name, agents.where): _agent(agents.section(name), folder) for name in agents.data}
-    return Session(folder, found, provenance)
+    session_agents = {
+        _checked_agent_name(name, agents.where): _read_agent(agents.section(name), folder)
+        for name in agents.data
+    }
+    return Session(folder, session_agents, provenance)
 
 
-def _name(name: Any, where: str) -> str:
+def _checked_agent_name(name: Any, where: str) -> str:
     """That of an agent, which its files have too. Raises ConfigError."""
     if not isinstance(name, str | int) or not is_agent_name(str(name)):
-        raise ConfigError(f"{where}: '{name!s:.80}' is no name of an agent: use {AGENT_NAME}")
+        raise ConfigError(f"{where}: '{name!s:.80}' is no name of an agent: use {AGENT_NAME_RULE}")
     return str(name)
 
 
-def _agent(section: Section, folder: Path) -> SessionAgent:
-    unknown = [key for key in section.data if key not in _KEYS]
+def _read_agent(section: Section, folder: Path) -> SessionAgent:
+    unknown = [key for key in section.data if key not in _AGENT_KEYS]
     if unknown:
-        raise ConfigError(f"{section.where}: unknown key '{unknown[0]}'; known: {', '.join(_KEYS)}")
+        raise ConfigError(f"{section.where}: unknown key '{unknown[0]}'; known: {', '.join(_AGENT_KEYS)}")
     kind = section.text("kind")
     if kind not in list(AgentKind):
         raise ConfigError(f"{section.where}: kind '{kind}' is not known; known: {', '.join(AgentKind)}")
     offset = section.data.get("clock_offset_ns", 0)
-    if type(offset) is not int or abs(offset) >= _MOST_NS:
+    if type(offset) is not int or abs(offset) >= _MAX_OFFSET_NS:
         raise ConfigError(f"{section.where}: clock_offset_ns: expected whole nanoseconds, found {offset!r}")
     return SessionAgent(
         AgentKind(kind),
         section.text("sensors", ""),
         section.number("rate_hz", 0.0),
         offset,
-        _calibration(section, folder) if "calibration" in section else None,
+        _read_agent_calibration(section, folder) if "calibration" in section else None,
     )
 
 
-def _calibration(section: Section, folder: Path) -> Calibration:
+def _read_agent_calibration(section: Section, folder: Path) -> Calibration:
     """A file or folder below the session's, or Kalibr's chains written out: cam0, cam1, depth, imu0."""
     if isinstance(section.get("calibration"), str):
-        return read_calibration(inside(folder, section.text("calibration"), section.where))
+        return read_calibration(path_inside(folder, section.text("calibration"), section.where))
     chain = section.section("calibration")
-    return kalibr(chain, chain.section("imu0") if "imu0" in chain else None)
+    return calibration_from_kalibr(chain, chain.section("imu0") if "imu0" in chain else None)

@@ -14,11 +14,11 @@ import numpy as np
 from share.errors import DataError
 from share.geometry import se3
 from share.recordings import tables
-from share.recordings.losses import Losses
+from share.recordings.losses import DataLosses
 from share.types import F64, I64
 
-MOST_M = 1e7  # of a place: a truth by satellite counts from the middle of the earth
-_NEAR_ONE = 0.05  # what the length of a quaternion may be off 1
+MAX_POSITION_M = 1e7  # of a place: a truth by satellite counts from the middle of the earth
+_MAX_NORM_ERROR = 0.05  # what the length of a quaternion may be off 1
 
 
 class Trajectory(NamedTuple):
@@ -28,15 +28,15 @@ class Trajectory(NamedTuple):
     T: F64
 
     @property
-    def way(self) -> F64:
+    def travelled_m(self) -> F64:
         """m (N,), how far it has gone by each pose; [0] without any."""
         steps = np.linalg.norm(np.diff(self.T[:, :3, 3], axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     @property
-    def metres(self) -> float:
+    def length_m(self) -> float:
         """The length of its way."""
-        return float(self.way[-1])
+        return float(self.travelled_m[-1])
 
 
 def format_pose(stamp_ns: int, T: F64) -> str:
@@ -52,55 +52,57 @@ def format_tum(trajectory: Trajectory) -> str:
     return "".join(f"{t} {_format_numbers(row)}\n" for t, row in zip(stamps, numbers, strict=True))
 
 
-def read_tum(path: Path, losses: Losses | None = None) -> Trajectory:
+def read_tum(path: Path, losses: DataLosses | None = None) -> Trajectory:
     """losses: takes the lines that are damaged. Raises DataError naming file and line, where that is not
     given or more than 5 % are."""
     stamps_ns, numbers = read_tum_table(path, losses=losses)
-    return trajectory_of(stamps_ns, numbers[:, :3], numbers[:, 3:], path, losses)
+    return make_trajectory(stamps_ns, numbers[:, :3], numbers[:, 3:], path, losses)
 
 
-def read_tum_table(path: Path, nan: bool = False, losses: Losses | None = None) -> tuple[I64, F64]:
+def read_tum_table(path: Path, nan: bool = False, losses: DataLosses | None = None) -> tuple[I64, F64]:
     """Stamps (N,) ns, and x y z qx qy qz qw (N, 7). nan: these may be NaN. Raises DataError likewise."""
 
     def parse(fields: list[str], where: str) -> tuple[int, list[float]]:
         stamp = tables.parse_seconds(fields[0], where)
         return stamp, [tables.parse_number(field, where, nan) for field in fields[1:8]]
 
-    stamps_ns, found = tables.parsed(path, None, 8, parse, losses)
-    return stamps_ns, np.array([values for _, values in found]).reshape(-1, 7)
+    stamps_ns, parsed_rows = tables.parse_rows(path, None, 8, parse, losses)
+    return stamps_ns, np.array([values for _, values in parsed_rows]).reshape(-1, 7)
 
 
-def trajectory_of(stamps_ns: I64, p: F64, q: F64, path: Path, losses: Losses | None) -> Trajectory:
+def make_trajectory(stamps_ns: I64, p: F64, q: F64, path: Path, losses: DataLosses | None) -> Trajectory:
     """Poses of rows (N, 3) m and quaternions (N, 4) xyzw; rows that are no pose of a body go to `losses`.
     Raises DataError likewise."""
     if losses is None:
-        return Trajectory(stamps_ns, poses(p, q, path))
-    length = _lengths(q)
-    good = (np.abs(length - 1) <= _NEAR_ONE) & (np.abs(p) <= MOST_M).all(1)
-    for i in np.flatnonzero(~good):
-        why = f"quaternion has length {length[i]:.3g}, or it is farther than {MOST_M:g} m"
-        losses.add(f"poses of {path}", str(stamps_ns[i]), f"{path}: pose at {stamps_ns[i]} ns: {why}")
-    losses.check(f"poses of {path}", len(good))
-    return Trajectory(stamps_ns[good], poses(p[good], q[good], path))
+        return Trajectory(stamps_ns, make_poses(p, q, path))
+    norms = _norms(q)
+    valid = (np.abs(norms - 1) <= _MAX_NORM_ERROR) & (np.abs(p) <= MAX_POSITION_M).all(1)
+    for i in np.flatnonzero(~valid):
+        reason = f"quaternion has length {norms[i]:.3g}, or it is farther than {MAX_POSITION_M:g} m"
+        losses.add(f"poses of {path}", str(stamps_ns[i]), f"{path}: pose at {stamps_ns[i]} ns: {reason}")
+    losses.check(f"poses of {path}", len(valid))
+    return Trajectory(stamps_ns[valid], make_poses(p[valid], q[valid], path))
 
 
-def poses(p: F64, q: F64, path: Path) -> F64:
+def make_poses(p: F64, q: F64, path: Path) -> F64:
     """(N, 3) m and quaternions (N, 4) xyzw -> (N, 4, 4). DataError where a quaternion is no rotation."""
-    length = _lengths(q)
-    bad = np.flatnonzero(~(np.abs(length - 1) <= _NEAR_ONE))
-    if len(bad):
-        raise DataError(f"{path}: pose {bad[0] + 1}: quaternion has length {length[bad[0]]:.3g}, expected 1")
-    check_near(p, path)
+    norms = _norms(q)
+    invalid = np.flatnonzero(~(np.abs(norms - 1) <= _MAX_NORM_ERROR))
+    if len(invalid):
+        raise DataError(
+            f"{path}: pose {invalid[0] + 1}: quaternion has length {norms[invalid[0]]:.3g}, expected 1"
+        )
+    check_position_range(p, path)
     return se3.from_quat(p, q)
 
 
-def check_near(p: F64, path: Path) -> None:
+def check_position_range(p: F64, path: Path) -> None:
     """Raises DataError where a position (N, 3), m, is beyond any room."""
-    if (far := np.flatnonzero(~(np.abs(p) <= MOST_M).all(1))).size:
-        raise DataError(f"{path}: pose {far[0] + 1}: is farther than {MOST_M:g} m from the origin")
+    if (far := np.flatnonzero(~(np.abs(p) <= MAX_POSITION_M).all(1))).size:
+        raise DataError(f"{path}: pose {far[0] + 1}: is farther than {MAX_POSITION_M:g} m from the origin")
 
 
-def _lengths(q: F64) -> F64:
+def _norms(q: F64) -> F64:
     """(N,) of rows (N, 4) that may hold anything."""
     with np.errstate(over="ignore"):
         out: F64 = np.linalg.norm(q, axis=1)
@@ -109,8 +111,8 @@ def _lengths(q: F64) -> F64:
 
 def format_seconds(stamp_ns: int) -> str:
     """Integer nanoseconds as decimal seconds with nine decimals."""
-    whole, fraction = divmod(abs(stamp_ns), 10**9)
-    return f"{'-' if stamp_ns < 0 else ''}{whole}.{fraction:09d}"
+    seconds, fraction = divmod(abs(stamp_ns), 10**9)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{fraction:09d}"
 
 
 def _format_numbers(values: list[float]) -> str:

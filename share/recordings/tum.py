@@ -12,23 +12,23 @@ from pathlib import Path
 import numpy as np
 
 from share.errors import ConfigError, DataError
-from share.files.reading import inside
+from share.files.reading import path_inside
 from share.files.yaml_file import read_yaml
 from share.geometry.camera import Rig
 from share.recordings import tables
 from share.recordings.calibration import Calibration, read_camera_yaml
-from share.recordings.euroc import present
+from share.recordings.euroc import existing_images
 from share.recordings.images import file_image
-from share.recordings.losses import Losses
+from share.recordings.losses import DataLosses
 from share.recordings.recording import FolderSource
 from share.recordings.trajectory import Trajectory, read_tum
 from share.sensors.measurement import CAM0, DEPTH, LazyImage
 from share.types import F64
 
-CAMERA = "camera.yaml"
-_NEAR_NS = 20_000_000
+CAMERA_FILE = "camera.yaml"
+_MAX_PAIR_GAP_NS = 20_000_000
 
-Pair = tuple[int, str, str]  # stamp of the colour image, its file, its depth file
+ImagePair = tuple[int, str, str]  # stamp of the colour image, its file, its depth file
 
 
 def is_tum(path: Path) -> bool:
@@ -37,7 +37,7 @@ def is_tum(path: Path) -> bool:
 
 def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) -> FolderSource:
     """The recording in `path`. Raises DataError, ConfigError, UsageError."""
-    own = path / CAMERA
+    own = path / CAMERA_FILE
     if calibration is None:
         calibration = read_camera_yaml(own)
     rig, scale = calibration.rig, calibration.depth_scale
@@ -47,8 +47,8 @@ def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) 
         raise ConfigError(f"{path}: the calibration has cam1, the recording has not; give another --calib")
     depth = rig.depth
     rig = Rig(cam0=rig.cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=rig.T_depth_cam0)
-    losses = Losses()
-    pairs, note = _pairs(path, losses)
+    losses = DataLosses()
+    pairs, note = _read_pairs(path, losses)
     images: dict[str, list[tuple[int, LazyImage]]] = {
         CAM0: [(stamp, file_image(path / colour, rig.cam0)) for stamp, colour, _ in pairs],
         DEPTH: [(stamp, file_image(path / file, depth, scale)) for stamp, _, file in pairs],
@@ -56,52 +56,52 @@ def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) 
     source = FolderSource(
         path.resolve().name, rig, images, None, lambda: _truth(path, rig, losses), note, losses
     )
-    return source.part(frames)
+    return source.slice_frames(frames)
 
 
-def _pairs(path: Path, losses: Losses) -> tuple[list[Pair], tuple[str, ...]]:
+def _read_pairs(path: Path, losses: DataLosses) -> tuple[list[ImagePair], tuple[str, ...]]:
     listing = path / "associations.txt"
     note: tuple[str, ...] = ()
     if listing.is_file():
-        pairs = _associated(listing, losses)
+        pairs = _read_associations(listing, losses)
     else:
         listing = path / "rgb.txt"
-        colour, depth = _list(listing, losses), _list(path / "depth.txt", losses)
-        pairs = _nearest(colour, depth)
-        lost = len(colour) - len(pairs)
-        if lost:
-            note = (f"{lost} of {len(colour)} colour images have no depth image within 20 ms",)
+        colour, depth = _read_list(listing, losses), _read_list(path / "depth.txt", losses)
+        pairs = _pair_nearest(colour, depth)
+        unpaired = len(colour) - len(pairs)
+        if unpaired:
+            note = (f"{unpaired} of {len(colour)} colour images have no depth image within 20 ms",)
     if not pairs:
         raise DataError(f"{listing}: no colour image has a depth image within 20 ms; are both of one clock?")
     for column in (1, 2):
-        there = _there(path, [str(pair[column]) for pair in pairs], listing, losses)
-        pairs = [pair for pair in pairs if pair[column] in there]
+        existing = _existing_files(path, [str(pair[column]) for pair in pairs], listing, losses)
+        pairs = [pair for pair in pairs if pair[column] in existing]
     return pairs, note
 
 
-def _associated(listing: Path, losses: Losses) -> list[Pair]:
+def _read_associations(listing: Path, losses: DataLosses) -> list[ImagePair]:
     """`t colour t depth`, or the other way round (told by the folder's name)."""
 
-    def parse(fields: list[str], where: str) -> Pair:
+    def parse(fields: list[str], where: str) -> ImagePair:
         stamp, colour, other, depth = fields[:4]
         if colour.startswith("depth"):
             stamp, colour, depth = other, depth, colour
         for name in (colour, depth):
-            inside(listing.parent, name, where)
+            path_inside(listing.parent, name, where)
         return tables.parse_seconds(stamp, where), colour, depth
 
-    return tables.parsed(listing, None, 4, parse, losses)[1]
+    return tables.parse_rows(listing, None, 4, parse, losses)[1]
 
 
-def _list(listing: Path, losses: Losses) -> list[tuple[int, str]]:
+def _read_list(listing: Path, losses: DataLosses) -> list[tuple[int, str]]:
     def parse(fields: list[str], where: str) -> tuple[int, str]:
-        inside(listing.parent, fields[1], where)
+        path_inside(listing.parent, fields[1], where)
         return tables.parse_seconds(fields[0], where), fields[1]
 
-    return tables.parsed(listing, None, 2, parse, losses)[1]
+    return tables.parse_rows(listing, None, 2, parse, losses)[1]
 
 
-def _nearest(colour: list[tuple[int, str]], depth: list[tuple[int, str]]) -> list[Pair]:
+def _pair_nearest(colour: list[tuple[int, str]], depth: list[tuple[int, str]]) -> list[ImagePair]:
     """Every colour image with the depth image nearest in time; a depth image serves once."""
     stamps = np.array([stamp for stamp, _ in depth], np.int64)
     pairs, used = [], -1
@@ -110,22 +110,24 @@ def _nearest(colour: list[tuple[int, str]], depth: list[tuple[int, str]]) -> lis
         near = min(
             (i for i in (right - 1, right) if 0 <= i < len(stamps)), key=lambda i: abs(stamps[i] - stamp)
         )
-        if near > used and abs(int(stamps[near]) - stamp) <= _NEAR_NS:
+        if near > used and abs(int(stamps[near]) - stamp) <= _MAX_PAIR_GAP_NS:
             pairs.append((stamp, file, depth[near][1]))
             used = near
     return pairs
 
 
-def _there(path: Path, files: list[str], listing: Path, losses: Losses) -> set[str]:
+def _existing_files(path: Path, files: list[str], listing: Path, losses: DataLosses) -> set[str]:
     """Which of `files` are there. Raises DataError where many are not."""
     by_folder: dict[Path, list[str]] = {}
     for file in files:
         by_folder.setdefault((path / file).parent, []).append(Path(file).name)
-    have = {folder: present(folder, names, listing, losses) for folder, names in by_folder.items()}
-    return {file for file in files if Path(file).name in have[(path / file).parent]}
+    existing = {
+        folder: existing_images(folder, names, listing, losses) for folder, names in by_folder.items()
+    }
+    return {file for file in files if Path(file).name in existing[(path / file).parent]}
 
 
-def _truth(path: Path, rig: Rig, losses: Losses) -> Trajectory | None:
+def _truth(path: Path, rig: Rig, losses: DataLosses) -> Trajectory | None:
     if not (path / "groundtruth.txt").is_file():
         return None
     stamps, T = read_tum(path / "groundtruth.txt", losses)
@@ -138,7 +140,7 @@ def _T_truth_cam0(path: Path, rig: Rig) -> F64:
     Unsaid, it is the depth camera where that is one of its own: then the truth comes of depth fusion.
     """
     default = "cam0" if rig.T_depth_cam0 is None or np.allclose(rig.T_depth_cam0, np.eye(4)) else "depth"
-    camera = path / CAMERA
+    camera = path / CAMERA_FILE
     frame = read_yaml(camera).text("truth_frame", default) if camera.exists() else default
     if frame not in ("cam0", "depth"):
         raise ConfigError(f"{camera}: truth_frame '{frame}' is unknown; known: cam0, depth")

@@ -29,33 +29,43 @@ from share.cameras.live import LiveSource
 from share.errors import DataError
 from share.metrics.frame_log import RunLog
 from share.net.transport import AgentLink
-from share.odometry.result import TrackResult
+from share.odometry.track_result import TrackResult
 from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
-from share.protocol.edge_trust import Lasting
+from share.protocol.reply_validation import FaultDeduplicator
 from share.runtime.agent_files import AgentFiles
-from share.runtime.arrivals import Arrivals, Late, Lateness, Played, Seen
-from share.runtime.error_model import Errors, Unknown
-from share.runtime.guarded_tracker import Guard, GuardedTracker
-from share.runtime.imu_memory import ImuMemory
-from share.runtime.pipeline import check_trackable, frames_of
+from share.runtime.arrivals import (
+    FrameArrivals,
+    LateFrameDropper,
+    LatenessMonitor,
+    LiveArrivals,
+    RecordedArrivals,
+)
+from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate
+from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.imu_bias_store import ImuBiasStore
+from share.runtime.output_writer import BackgroundLines, OutputWriter
+from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.pose_feed import PoseFeed
-from share.runtime.scribe import Scribe, Written
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
-from share.startup import Heap
+from share.startup import HeapTrimmer
 from share.types import Frame
 from share.wire import messages as m
 
 TICK_MS = 50
-_POSTED = 64  # events between tracker and main: policy block, as the camera keeps the newest of what waits
-_AT_ONCE = 64  # messages of the edge in one tick: more wait in the link, so that no flood takes the processor
-_OVERDUE_S = 5.0  # beyond agent.finish_s: the machine should have ended the run
+_INBOX_SIZE = (
+    64  # events between tracker and main: policy block, as the camera keeps the newest of what waits
+)
+_MAX_MESSAGES_PER_TICK = (
+    64  # messages of the edge in one tick: more wait in the link, so that no flood takes the processor
+)
+_OVERDUE_MARGIN_S = 5.0  # beyond agent.finish_s: the machine should have ended the run
 
 
 @dataclass(frozen=True, eq=False)
-class Status:
+class LiveStatus:
     """For the live line. idle: no frame was tracked of late."""
 
     frames: int
@@ -68,14 +78,14 @@ class Status:
 class _Shared:
     """What the threads tell each other."""
 
-    inbox: queue.Queue[ev.AgentEvent] = field(default_factory=lambda: queue.Queue(_POSTED))
+    inbox: queue.Queue[ev.AgentEvent] = field(default_factory=lambda: queue.Queue(_INBOX_SIZE))
     stop: threading.Event = field(default_factory=threading.Event)
     closed: threading.Event = field(default_factory=threading.Event)  # nobody takes from the inbox any more
     error: BaseException | None = None  # what ended a thread
 
 
 class AgentRun:
-    """One run: `go` returns when the recording is over and everything is acknowledged and written.
+    """One run: `run` returns when the recording is over and everything is acknowledged and written.
 
     A damaged image costs its frame; a recording that cannot be read on ends the run in good order,
     and then raises.
@@ -88,101 +98,111 @@ class AgentRun:
         settings: config.Config,
         connect: Callable[[], AgentLink],
         out: Path | None,
-        say: Callable[[str], None],
-        show: Callable[[Status], None] = lambda status: None,
+        notify: Callable[[str], None],
+        show: Callable[[LiveStatus], None] = lambda status: None,
         verbose: bool = False,
-        errors: Errors | None = None,
-        poses: PoseFeed | None = None,
+        error_estimator: ErrorEstimator | None = None,
+        pose_feed: PoseFeed | None = None,
     ) -> None:
         """errors: tells how wrong the tracker is. poses: who else is told where this agent is."""
         self._source, self._settings = source, settings
-        self._say, self._show, self._verbose = say, show, verbose
-        self._guard = Guard(say)
-        self._machine = Agent(hello, settings)
-        self._memory: ImuMemory | None = None  # of who tracks itself
+        self._notify, self._show, self._verbose = notify, show, verbose
+        self._guard = FaultGuard(notify)
+        self._state_machine = Agent(hello, settings)
+        self._imu_bias_store: ImuBiasStore | None = None  # of who tracks itself
         self._prepare()
-        self._files, self._scribe = AgentFiles(out, say), Scribe(out, say)
-        self._log = RunLog(Written(self._files.frames, self._scribe))
-        self._errors, self._poses = Unknown() if errors is None else errors, poses
-        self._late = Late(settings.agent.late_ms)
-        self._lateness = Lateness(say, "the edge" if hello.streams else "this machine")
+        self._files, self._output_writer = AgentFiles(out, notify), OutputWriter(out, notify)
+        self._log = RunLog(BackgroundLines(self._files.frame_lines, self._output_writer))
+        self._error_estimator, self._pose_feed = (
+            NoErrorEstimate() if error_estimator is None else error_estimator,
+            pose_feed,
+        )
+        self._late_dropper = LateFrameDropper(settings.agent.late_ms)
+        self._lateness_monitor = LatenessMonitor(notify, "the edge" if hello.streams else "this machine")
         self._counters = SequencerCounters()
         self._link = connect()  # last: whatever is wrong with the above has been said by now
         self._shared = _Shared()
         self._arrivals = self._make_arrivals()
-        self._damaged = 0
+        self._damaged_images = 0
         self._ended = False
-        self._tick_ns = 0  # when the present tick ends
-        self._received = 0  # messages in it
-        self._over_ns: int | None = None  # when the last frame was done
+        self._tick_end_ns = 0  # when the present tick ends
+        self._messages_in_tick = 0  # messages in it
+        self._finished_ns: int | None = None  # when the last frame was done
         self.report: dict[str, Any] = {}
-        self._troubles = Lasting()
+        self._troubles = FaultDeduplicator()
         self.trouble: str | None = None  # why the edge does not let this agent in
 
     def _prepare(self) -> None:
         """Raises what is wrong with the source before there is a link."""
         check_trackable(self._source.name, self._source.rig)
-        self._memory = ImuMemory(self._source, self._settings.inertial, self._say)
-        self._tracker = GuardedTracker(self._source.rig, self._settings, self._guard, self._memory.bias)
+        self._imu_bias_store = ImuBiasStore(self._source, self._settings.inertial, self._notify)
+        self._tracker = GuardedTracker(
+            self._source.rig, self._settings, self._guard, self._imu_bias_store.bias
+        )
 
     def stop(self) -> None:
         """End early, in good order: no more frames, but what was sent is still waited for."""
         self._shared.stop.set()
         self._arrivals.stop()
 
-    def go(self) -> None:
+    def run(self) -> None:
         """Raises what ended the run before its time, after everything was closed."""
         tracker = threading.Thread(target=self._track, name="tracker", daemon=True)
         tracker.start()
         try:
             self._loop()
             self.report = self._report()
-            self._scribe.do(partial(self._files.finish, self._log, self.report))
+            self._output_writer.submit(partial(self._files.finish, self._log, self.report))
         finally:
             self.stop()
             self._shared.closed.set()
-            self._scribe.do(self._files.release)
+            self._output_writer.submit(self._files.release)
             self._link.close()
-            if self._poses is not None:
-                self._poses.close()
+            if self._pose_feed is not None:
+                self._pose_feed.close()
             tracker.join(timeout=4)
-            if self._memory is not None:
-                self._scribe.do(partial(self._memory.keep, self._tracker.bias))
-            self._errors.close()
-            self._scribe.end()
-        self._scribe.check()
+            if self._imu_bias_store is not None:
+                self._output_writer.submit(partial(self._imu_bias_store.save, self._tracker.bias))
+            self._error_estimator.close()
+            self._output_writer.stop()
+        self._output_writer.check()
         if self._shared.error is not None:
             raise self._shared.error
 
     # ------------------------------------------------------------------ frames
 
-    def _make_arrivals(self) -> Arrivals:
+    def _make_arrivals(self) -> FrameArrivals:
         if isinstance(self._source, LiveSource):
-            return Seen(self._decoded, self._source)
-        return Played(self._decoded, self._late)
+            return LiveArrivals(self._decode_frames, self._source)
+        return RecordedArrivals(self._decode_frames, self._late_dropper)
 
-    def _decoded(self) -> Iterator[Frame]:
-        return frames_of(
-            self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode, self._say
+    def _decode_frames(self) -> Iterator[Frame]:
+        return read_frames(
+            self._source,
+            self._settings,
+            self._counters,
+            self._skip_damaged,
+            self._log.add_decode_time,
+            self._notify,
         )
 
     def _skip_damaged(self, error: DataError) -> None:
-        self._damaged += 1
-        self._say(f"a frame is left out: {error}")
+        self._damaged_images += 1
+        self._notify(f"a frame is left out: {error}")
 
     # ------------------------------------------------------------------ tracker
 
     def _track(self) -> None:
         try:
-            for frame, arrived_ns in self._arrivals.each():
-                self._track_one(frame, arrived_ns)
+            for frame, arrived_ns in self._arrivals.iter_frames():
+                self._track_frame(frame, arrived_ns)
         except BaseException as error:
             self._shared.error = error
         finally:
-            self._post(ev.Finished())
+            self._post(ev.InputFinished())
 
-    def _track_one(self, frame: Frame, arrived_ns: int) -> None:
-        cpu = time.thread_time()
+    def _track_frame(self, frame: Frame, arrived_ns: int) -> None:
+        cpu_start_s = time.thread_time()
         result = self._tracker.track(frame)
         tracked = ev.FrameTracked(
             index=frame.index,
@@ -191,28 +211,28 @@ class AgentRun:
             done_ns=time.monotonic_ns(),
             state=result.state,
             T_odom_body=result.T_odom_body,
-            keyframe=result.keyframe,
-            new_stretch=result.new_stretch,
-            error_cm=self._error_cm(frame, result),
-            waits=result.waits,
+            is_keyframe=result.keyframe_ready,
+            new_segment=result.new_segment,
+            error_cm=self._estimate_error_cm(frame, result),
+            waiting_for=result.waiting_for,
         )
         self._post(tracked)  # the pose goes out before others are served
-        self._log.add_result(result.new_stretch, result.sound, result.waits)
-        if result.keyframe:
-            self._keyframe(frame, tracked)
-        self._tracker.attempt("settling a frame", frame, self._tracker.settle)
-        self._log.imu_doubted = self._tracker.doubted
-        self._log.cpu_s += time.thread_time() - cpu
+        self._log.add_result(result.new_segment, result.is_consistent, result.waiting_for)
+        if result.keyframe_ready:
+            self._make_keyframe(frame, tracked)
+        self._tracker.attempt("settling a frame", frame, self._tracker.finish_keyframe)
+        self._log.imu_outliers = self._tracker.rejected_imu_samples
+        self._log.cpu_s += time.thread_time() - cpu_start_s
 
-    def _error_cm(self, frame: Frame, result: TrackResult) -> float | None:
+    def _estimate_error_cm(self, frame: Frame, result: TrackResult) -> float | None:
         error_cm: float | None = None
         with self._guard.step("estimating the error"):
-            error_cm = self._errors.after(frame, result)
+            error_cm = self._error_estimator.update(frame, result)
         return error_cm
 
-    def _keyframe(self, frame: Frame, tracked: ev.FrameTracked) -> None:
-        make = partial(self._errors.keyframe, frame, self._tracker)
-        candidate = self._tracker.attempt("making a keyframe", frame, make)
+    def _make_keyframe(self, frame: Frame, tracked: ev.FrameTracked) -> None:
+        make_candidate = partial(self._error_estimator.make_keyframe, frame, self._tracker)
+        candidate = self._tracker.attempt("making a keyframe", frame, make_candidate)
         self._post(ev.KeyframeMade(tracked, candidate))
 
     def _post(self, event: ev.AgentEvent) -> None:
@@ -228,129 +248,147 @@ class AgentRun:
     # ------------------------------------------------------------------ main
 
     def _loop(self) -> None:
-        heap = Heap()
+        heap = HeapTrimmer()
         while not self._ended and not self._is_overdue():
-            heap.tidy(time.monotonic())
-            self._listen()
+            heap.trim_if_due(time.monotonic())
+            self._receive()
             while not self._shared.inbox.empty():
-                self._take(self._shared.inbox.get())
+                self._handle_posted(self._shared.inbox.get())
             self._handle(self._arrivals.tick())
 
-    def _listen(self) -> None:
+    def _receive(self) -> None:
         """One message of the edge, or what the tracker posts, or the end of the tick."""
         now_ns = time.monotonic_ns()
-        if now_ns >= self._tick_ns:
-            self._tick_ns, self._received = now_ns + TICK_MS * 1_000_000, 0
-        if self._received >= _AT_ONCE:
+        if now_ns >= self._tick_end_ns:
+            self._tick_end_ns, self._messages_in_tick = now_ns + TICK_MS * 1_000_000, 0
+        if self._messages_in_tick >= _MAX_MESSAGES_PER_TICK:
             with contextlib.suppress(queue.Empty):
-                self._take(self._shared.inbox.get(timeout=(self._tick_ns - now_ns) * 1e-9))
+                self._handle_posted(self._shared.inbox.get(timeout=(self._tick_end_ns - now_ns) * 1e-9))
             return
         frames = self._link.receive(TICK_MS)
-        self._say_trouble()
-        if self._link.connected():
+        self._notify_trouble()
+        if self._link.poll_connected():
             self._handle(ev.Connected())
         if frames is not None:
-            self._received += 1
-            self._handle(ev.Received(frames))
+            self._messages_in_tick += 1
+            self._handle(ev.EdgeMessageReceived(frames))
 
-    def _take(self, event: ev.AgentEvent) -> None:
-        if isinstance(event, ev.Finished):
-            self._over_ns = time.monotonic_ns()
+    def _handle_posted(self, event: ev.AgentEvent) -> None:
+        if isinstance(event, ev.InputFinished):
+            self._finished_ns = time.monotonic_ns()
         self._handle(event)
 
     def _is_overdue(self) -> bool:
         """Whether the machine should have ended the run long ago."""
-        patience_s = self._settings.agent.finish_s + _OVERDUE_S
-        return self._over_ns is not None and time.monotonic_ns() - self._over_ns > patience_s * 1e9
+        limit_s = self._settings.agent.finish_s + _OVERDUE_MARGIN_S
+        return self._finished_ns is not None and time.monotonic_ns() - self._finished_ns > limit_s * 1e9
 
-    def _say_trouble(self) -> None:
+    def _notify_trouble(self) -> None:
         self.trouble = self._link.trouble()
-        if self.trouble is not None and self._troubles.begins(self.trouble, time.monotonic_ns()):
-            self._say(self.trouble)
+        if self.trouble is not None and self._troubles.is_new(self.trouble, time.monotonic_ns()):
+            self._notify(self.trouble)
 
     def _handle(self, event: ev.AgentEvent) -> None:
         """One guarded step: what fails costs this event, and never the run."""
         try:
-            effects = self._machine.handle(event, time.monotonic_ns())
+            effects = self._state_machine.handle(event, time.monotonic_ns())
         except Exception as error:
-            self._guard.note(f"handling {type(event).__name__}", error)
-            effects = self._machine.unfinished()
+            self._guard.record(f"handling {type(event).__name__}", error)
+            effects = self._state_machine.pending_effects()
         for effect in effects:
             with self._guard.step(f"carrying out {type(effect).__name__}"):
-                self._carry_out(effect)
+                self._execute(effect)
 
-    def _carry_out(self, effect: ev.AgentEffect) -> None:
+    def _execute(self, effect: ev.AgentEffect) -> None:
         match effect:
-            case ev.Send():
+            case ev.SendToEdge():
                 if not self._link.send(effect.frames):
-                    self._handle(ev.NotTaken(effect))
-            case ev.Localised():
-                self._localised(effect)
+                    self._handle(ev.SendFailed(effect))
+            case ev.LocalisedPose():
+                self._publish_pose(effect)
             case ev.FrameDone():
-                if self._poses is not None and not effect.state.has_pose:
-                    self._poses.tell(effect.stamp_ns, effect.state)
-                self._lateness.done(effect.track_ms)
-                self._log.add(effect.stamp_ns, effect.track_ms, effect.state, effect.keyframe, effect.sent)
-                self._show_status(self._machine.status(time.monotonic_ns()))
-            case ev.StatusSaid() if effect.idle:
-                self._say_idle(effect)
+                if self._pose_feed is not None and not effect.state.has_pose:
+                    self._pose_feed.publish(effect.stamp_ns, effect.state)
+                self._lateness_monitor.record(effect.track_ms)
+                self._log.add(
+                    effect.stamp_ns, effect.track_ms, effect.state, effect.is_keyframe, effect.is_sent
+                )
+                self._show_status(self._state_machine.status(time.monotonic_ns()))
+            case ev.StatusReport() if effect.is_stale:
+                self._show_idle(effect)
             case ev.CorrectionApplied():
                 if effect.stamp_ns is not None and effect.corrected_ms is not None:
-                    self._log.mark_corrected(effect.stamp_ns, effect.corrected_ms)
+                    self._log.add_correction(effect.stamp_ns, effect.corrected_ms)
                 if self._verbose:
-                    self._say(_correction(effect))
-            case ev.Say():
-                self._say(effect.text)
-            case ev.Fail():
-                self._scribe.do(self._files.discard)
+                    self._notify(_describe_correction(effect))
+            case ev.PrintLine():
+                self._notify(effect.text)
+            case ev.FailRun():
+                self._output_writer.submit(self._files.discard)
                 raise effect.error
-            case ev.Stop():
+            case ev.CloseLink():
                 self._ended = True
 
-    def _localised(self, at: ev.Localised) -> None:
-        T_map_body = None if at.T_map_odom is None or at.map_id is None else at.T_map_odom @ at.T_odom_body
-        if self._poses is not None:  # first: somebody waits for it
-            age_ms = (time.monotonic_ns() - at.arrived_ns) / 1e6
-            self._poses.tell(at.stamp_ns, at.state, age_ms, at.stretch, at.T_odom_body, T_map_body, at.map_id)
-        self._scribe.do(partial(self._files.odom, at.stamp_ns, at.T_odom_body))
-        if T_map_body is not None and at.map_id is not None:
-            self._scribe.do(partial(self._files.map, at.stamp_ns, T_map_body, at.map_id))
+    def _publish_pose(self, localised: ev.LocalisedPose) -> None:
+        T_map_body = (
+            None
+            if localised.T_map_odom is None or localised.map_id is None
+            else localised.T_map_odom @ localised.T_odom_body
+        )
+        if self._pose_feed is not None:  # first: somebody waits for it
+            age_ms = (time.monotonic_ns() - localised.arrived_ns) / 1e6
+            self._pose_feed.publish(
+                localised.stamp_ns,
+                localised.state,
+                age_ms,
+                localised.segment,
+                localised.T_odom_body,
+                T_map_body,
+                localised.map_id,
+            )
+        self._output_writer.submit(
+            partial(self._files.write_odom_pose, localised.stamp_ns, localised.T_odom_body)
+        )
+        if T_map_body is not None and localised.map_id is not None:
+            self._output_writer.submit(
+                partial(self._files.write_map_pose, localised.stamp_ns, T_map_body, localised.map_id)
+            )
 
-    def _say_idle(self, said: ev.StatusSaid) -> None:
+    def _show_idle(self, event: ev.StatusReport) -> None:
         """No frame says it: the pose that was told last is not where the agent is now."""
-        if self._poses is not None and said.stamp_ns is not None:
-            self._poses.tell(said.stamp_ns, said.status.state, said.status.pose_age_ms)
-        self._show_status(said.status, idle=True)
+        if self._pose_feed is not None and event.stamp_ns is not None:
+            self._pose_feed.publish(event.stamp_ns, event.status.state, event.status.pose_age_ms)
+        self._show_status(event.status, idle=True)
 
     def _show_status(self, status: m.Status, idle: bool = False) -> None:
         state = f"{status.state}, {status.reason}," if status.reason else str(status.state)
-        self._show(Status(len(self._log), state, self._machine.report, idle))
+        self._show(LiveStatus(len(self._log), state, self._state_machine.report, idle))
 
     def _report(self) -> dict[str, Any]:
-        protocol = self._machine.report()
+        protocol = self._state_machine.report()
         frames = self._log.report()
         return {
             **frames,
             "corrections": protocol["corrections"],
             "bytes_up": protocol["bytes_up"],
             "bytes_down": protocol["bytes_down"],
-            "damaged_images": self._damaged,
-            "failed_steps": self._guard.failed,
+            "damaged_images": self._damaged_images,
+            "failed_steps": self._guard.failure_count,
             "left_out": self._source.losses.counts,
-            "drop_late": self._late.dropped,
-            **self._lateness.report(),
+            "drop_late": self._late_dropper.dropped,
+            **self._lateness_monitor.report(),
             **self._source.report(),
-            **({} if self._memory is None else self._memory.report()),
-            **self._errors.report(),
+            **({} if self._imu_bias_store is None else self._imu_bias_store.report()),
+            **self._error_estimator.report(),
             "sequencer": dataclasses.asdict(self._counters),
-            "clock": self._machine.clock(time.monotonic_ns()).report(),
+            "clock": self._state_machine.clock_estimate(time.monotonic_ns()).report(),
             "protocol": protocol,
             "version": __version__,
             "config": to_mapping(self._settings),
         }
 
 
-def _correction(effect: ev.CorrectionApplied) -> str:
+def _describe_correction(effect: ev.CorrectionApplied) -> str:
     after = "" if effect.corrected_ms is None else f", {effect.corrected_ms:.0f} ms after its frame"
-    answers = "" if effect.keyframe is None else f", answers keyframe {effect.keyframe}{after}"
+    answers = "" if effect.keyframe_id is None else f", answers keyframe {effect.keyframe_id}{after}"
     return f"correction {effect.revision} of map {effect.map_id}{answers}"

@@ -15,19 +15,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from share.cameras.feed import Feed, FeedStatus
-from share.cameras.live import given_rig
+from share.cameras.feed import CameraFeed, FeedStatus
+from share.cameras.live import choose_rig
 from share.errors import ShareError, UsageError
-from share.files.writing import writing
+from share.files.writing import write_errors
 from share.recordings.calibration import Calibration
-from share.recordings.mcap.recorder import Recorder, left_over, part_of
+from share.recordings.mcap.recorder import Recorder, leftover_error, part_path
 
 _TICK_S = 0.1
-_SHOW_S = 1.0
+_SHOW_PERIOD_S = 1.0
 
 
 @dataclass(frozen=True)
-class Status:
+class CaptureStatus:
     """For the live line. minutes: that the disk lasts, infinite where nothing is written."""
 
     feed: FeedStatus
@@ -37,7 +37,7 @@ class Status:
 
 
 class Capture:
-    """One recording. `go` returns when it was stopped, is long enough or the disk is almost full.
+    """One recording. `run` returns when it was stopped, is long enough or the disk is almost full.
 
     Raises UsageError and ShareError before anything is written; later, only where the file itself cannot
     be written any more (its `.part` stays, for `share dataset recover`).
@@ -45,35 +45,35 @@ class Capture:
 
     def __init__(
         self,
-        feed: Feed,
+        feed: CameraFeed,
         out: Path,
         min_free_gb: float,
-        say: Callable[[str], None],
-        show: Callable[[Status], None] = lambda status: None,
+        notify: Callable[[str], None],
+        show: Callable[[CaptureStatus], None] = lambda status: None,
         calibration: Calibration | None = None,
     ) -> None:
         """calibration: what the recording says of the camera, in place of the factory's."""
-        self._feed, self._out, self._free_least = feed, out, min_free_gb * 1e9
+        self._feed, self._out, self._min_free_bytes = feed, out, min_free_gb * 1e9
         self._calibration = calibration
-        self._say, self._show = say, show
+        self._notify, self._show = notify, show
         self._stop = threading.Event()
         self._error: BaseException | None = None
-        self._written = 0  # measurements
-        self._shown = (time.monotonic(), 0)  # when, and bytes by then
-        self.ended = "stopped"
+        self._written_measurements = 0  # measurements
+        self._last_shown = (time.monotonic(), 0)  # when, and bytes by then
+        self.end_reason = "stopped"
 
     def stop(self) -> None:
         """End in good order."""
         self._stop.set()
 
-    def go(self, seconds: float | None = None) -> dict[str, Any]:
+    def run(self, seconds: float | None = None) -> dict[str, Any]:
         """Record, and tell what came of it."""
-        _check_disk(self._out, self._free_least)
+        _check_disk(self._out, self._min_free_bytes)
         factory = self._feed.open()  # before there is a file: the queue holds what comes meanwhile
         try:
-            rig, doubts = given_rig(self._calibration, factory, self._feed.serial)
-            for doubt in doubts:
-                self._say(f"camera {self._feed.serial}: {doubt}")
+            rig, warnings = choose_rig(self._calibration, factory, self._feed.serial)
+            for warning in warnings:
+                self._notify(f"camera {self._feed.serial}: {warning}")
             recorder = Recorder(self._out, rig, durable=True, serial=self._feed.serial)
         except BaseException:
             self._feed.close()
@@ -81,99 +81,103 @@ class Capture:
         self._record(recorder, seconds)
         if self._error is not None:
             raise self._error
-        return {"out": str(self._out), "ended": self.ended, **self._feed.report()}
+        return {"out": str(self._out), "ended": self.end_reason, **self._feed.report()}
 
     def _record(self, recorder: Recorder, seconds: float | None) -> None:
         """Until it ends; then the file is whole, or keeps its `.part` if something went wrong."""
-        writer = threading.Thread(target=self._write, args=(recorder,), daemon=True)
+        writer = threading.Thread(target=self._write_measurements, args=(recorder,), daemon=True)
         writer.start()
         try:
             self._loop(seconds)
         except BaseException as error:
             self._error = self._error or error
         self._feed.stop()
-        self._wait(writer, recorder)
-        if self._error is not None and not self._feed.in_vain:
+        self._wait_for_writer(writer, recorder)
+        if self._error is not None and not self._feed.has_failed:
             recorder.abort()
-            self._unclosed(recorder)
-        elif self._feed.in_vain or not self._written:
+            self._notify_unclosed(recorder)
+        elif self._feed.has_failed or not self._written_measurements:
             recorder.abort()
             recorder.part.unlink()
-            nothing = f"camera {self._feed.serial}: {self._came()}"
+            nothing = f"camera {self._feed.serial}: {self._describe_samples()}"
             self._error = ShareError(f"{self._error or nothing}; nothing was recorded")
         else:
             recorder.close()
 
-    def _wait(self, writer: threading.Thread, recorder: Recorder) -> None:
+    def _wait_for_writer(self, writer: threading.Thread, recorder: Recorder) -> None:
         """Until all that came is written, or a person does not want to wait for that."""
         try:
             writer.join()
         except BaseException:
-            self._unclosed(recorder)
+            self._notify_unclosed(recorder)
             raise
 
-    def _unclosed(self, recorder: Recorder) -> None:
+    def _notify_unclosed(self, recorder: Recorder) -> None:
         out, part = self._out, recorder.part
-        self._say(f"{part}: is not closed; `share dataset recover {part} --out {out}` saves what it has")
+        self._notify(f"{part}: is not closed; `share dataset recover {part} --out {out}` saves what it has")
 
-    def _came(self) -> str:
+    def _describe_samples(self) -> str:
         """What came where nothing could be written: not all of an IMU, or nothing."""
-        counts = {name: gaps.samples for name, gaps in self._feed.intake.streams.items()}
+        counts = {name: gaps.samples for name, gaps in self._feed.processor.streams.items()}
         if not any(counts.values()):
             return "no sample came"
-        told = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        return f"samples came ({told}), but the IMU needs both accel and gyro"
+        listed = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        return f"samples came ({listed}), but the IMU needs both accel and gyro"
 
-    def _write(self, recorder: Recorder) -> None:
+    def _write_measurements(self, recorder: Recorder) -> None:
         try:
             for measurement in self._feed.measurements():
                 recorder.write(measurement)
-                self._written += 1
+                self._written_measurements += 1
         except BaseException as error:
             self._error = error
             self._feed.close()
             self._stop.set()
 
     def _loop(self, seconds: float | None) -> None:
-        began = time.monotonic()
+        start_s = time.monotonic()
         while not self._stop.wait(_TICK_S):
-            with writing(self._out):  # a disk that was pulled out
+            with write_errors(self._out):  # a disk that was pulled out
                 free = shutil.disk_usage(self._out.parent).free
-            if free < self._free_least:
-                self.ended = "disk almost full"
-                self._say(f"{self._out.parent}: less than {self._free_least / 1e9:g} GB left; ends here")
+            if free < self._min_free_bytes:
+                self.end_reason = "disk almost full"
+                self._notify(
+                    f"{self._out.parent}: less than {self._min_free_bytes / 1e9:g} GB left; ends here"
+                )
                 return
-            if seconds is not None and time.monotonic() - began >= seconds:
-                self.ended = "time is over"
+            if seconds is not None and time.monotonic() - start_s >= seconds:
+                self.end_reason = "time is over"
                 return
-            if time.monotonic() - self._shown[0] >= _SHOW_S:
+            if time.monotonic() - self._last_shown[0] >= _SHOW_PERIOD_S:
                 self._show(self._status(free))
 
-    def _status(self, free: int) -> Status:
-        (then, size), now = self._shown, time.monotonic()
-        self._shown = (now, _size(self._out))
-        mb_s = (self._shown[1] - size) / (now - then) / 1e6
-        left = max(0.0, free - self._free_least)
-        minutes = left / (mb_s * 1e6) / 60 if mb_s > 0 else float("inf")
-        return Status(self._feed.status(), mb_s, free / 1e9, minutes)
+    def _status(self, free: int) -> CaptureStatus:
+        (then_s, size), now_s = self._last_shown, time.monotonic()
+        self._last_shown = (now_s, _part_size(self._out))
+        mb_s = (self._last_shown[1] - size) / (now_s - then_s) / 1e6
+        left_bytes = max(0.0, free - self._min_free_bytes)
+        minutes = left_bytes / (mb_s * 1e6) / 60 if mb_s > 0 else float("inf")
+        return CaptureStatus(self._feed.status(), mb_s, free / 1e9, minutes)
 
 
-def _check_disk(out: Path, least: float) -> None:
+def _check_disk(out: Path, min_free_bytes: float) -> None:
     """Raises UsageError where a recording is not to begin."""
     if out.exists():
         raise UsageError(f"{out}: exists; give a new name, a recording is never overwritten")
-    if part_of(out).exists():
-        raise left_over(part_of(out))
+    if part_path(out).exists():
+        raise leftover_error(part_path(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(out.parent).free
-    if free < least:
+    if free < min_free_bytes:
         raise UsageError(
-            f"{out.parent}: has {free / 1e9:.1f} GB left and {least / 1e9:g} must stay free (--min-free-gb); "
+            f"{out.parent}: has {free / 1e9:.1f} GB left and "
+            f"{min_free_bytes / 1e9:g} must "
+            f"stay free (--min-free-gb); "
             "delete something or record to another disk"
         )
 
 
-def _size(out: Path) -> int:
+def _part_size(out: Path) -> int:
     with contextlib.suppress(OSError):
-        return part_of(out).stat().st_size
+        return part_path(out).stat().st_size
     return 0

@@ -1,10 +1,10 @@
 """The edge as a process: one receive loop that never computes and never waits for a disk.
 
-link -> Edge (core) -> mapper's process (share.runtime.mapper) -> findings -> Edge -> link
-                    -> keeper's thread (share.runtime.keeper)   -> what is safe -> acknowledgements
-                    -> scribe's thread (share.runtime.scribe)   -> events.jsonl, edge.json
+link -> Edge (core) -> mapper's process (share.runtime.mapper_process) -> findings -> Edge -> link
+                    -> keeper's thread (share.runtime.map_writer)   -> what is safe -> acknowledgements
+                    -> scribe's thread (share.runtime.output_writer)   -> events.jsonl, edge.json
      or by policy `streamed`
-link -> TrackingEdge -> a process each (share.runtime.tracking) -> poses -> TrackingEdge -> link
+link -> TrackingEdge -> a process each (share.runtime.tracker_processes) -> poses -> TrackingEdge -> link
 """
 
 from __future__ import annotations
@@ -24,59 +24,59 @@ from typing import Any
 from share.config import Config
 from share.errors import StoreError
 from share.files.line_file import LineFile
-from share.files.writing import atomic_write, check_replaceable, claim
-from share.mapping.changes import Kept as KeptMap
+from share.files.writing import atomic_write, check_replaceable, lock_folder
+from share.mapping.map_changes import StoredMap as KeptMap
 from share.net.transport import EdgeLink
 from share.protocol.edge import Edge
 from share.protocol.edge_events import (
-    Add,
-    Answered,
-    BeginTracking,
-    Effect,
-    EndTracking,
-    Event,
-    Forget,
-    Found,
-    Join,
-    Keep,
-    Kept,
-    Lost,
-    Present,
-    Ready,
-    Received,
-    Record,
-    Send,
-    Speaks,
-    Tick,
-    Track,
+    AddKeyframe,
+    AddRun,
+    ChangesSaved,
+    DropRun,
+    EdgeEffect,
+    EdgeEvent,
+    EdgeTick,
+    MapperResult,
+    PeerMessageReceived,
+    SaveChanges,
+    SendToPeer,
+    SetCredential,
+    SetPresence,
+    StartTracker,
+    StopTracker,
+    TrackerAnswered,
+    TrackerLost,
+    TrackerReady,
+    TrackFrame,
+    WriteEvent,
 )
-from share.protocol.edge_records import Totals
-from share.protocol.peer import Known
+from share.protocol.edge_records import SessionTotals
+from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
-from share.runtime.guarded_tracker import Guard
-from share.runtime.keeper import Keeper
-from share.runtime.mapper import Mapped, Restore, Restored, SolverLost, map_all
-from share.runtime.restarts import Restarts
-from share.runtime.scribe import Scribe
-from share.runtime.tracking import Trackers, room
-from share.runtime.worker import Companion
+from share.runtime.guarded_tracker import FaultGuard
+from share.runtime.map_writer import MapWriter
+from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap, SolverDied, run_mapper
+from share.runtime.mapper_restarts import MapperRestarts
+from share.runtime.output_writer import OutputWriter
+from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
+from share.runtime.worker_process import WorkerProcess
 from share.scheduling.policies import POLICIES
-from share.startup import Heap
+from share.startup import HeapTrimmer
 from share.store.map_store import MapStore
 
 TICK_MS = 50
 _REPORT_S = 0.1  # so that what is shown of agents is true within a second
-_UNWELL_S = 10.0  # how long a death is trouble
-REFUSALS_SAID = 64  # strangers at the door; more are only counted
-_AT_ONCE = 64  # messages, before anything else is looked after
-_MUTE_S = 5.0  # of the mapper, which says something every second
-_SOLVING_S = 15.0  # of one solution
-_STUCK_S = 1.0  # without a report: what is shown is no longer true
+_TROUBLE_SHOWN_S = 10.0  # how long a death is trouble
+MAX_REFUSAL_KINDS = 64  # strangers at the door; more are only counted
+_MAX_MESSAGES_PER_STEP = 64  # messages, before anything else is looked after
+_MAPPER_SILENT_S = 5.0  # of the mapper, which says something every second
+_MAX_SOLVE_S = 15.0  # of one solution
+_STALE_REPORT_S = 1.0  # without a report: what is shown is no longer true
 _DRAIN_S = 0.5  # that the loop waits for the keeper of a life that is over
 
 
 @dataclass(frozen=True)
-class _Said:
+class _Notice:
     """By another thread, for a person."""
 
     event: str
@@ -84,59 +84,59 @@ class _Said:
 
 
 @dataclass(frozen=True)
-class _MapperLost:
+class _MapperDied:
     """The mapper's process has died."""
 
-    how: str
+    reason: str
 
 
 class EdgeRun:
-    """`go` runs until `stop`. In `out`: events.jsonl as things happen, edge.json at the end."""
+    """`run` runs until `stop`. In `out`: events.jsonl as things happen, edge.json at the end."""
 
     def __init__(
         self,
         settings: Config,
         link: EdgeLink,
         out: Path | None,
-        tell: Callable[[dict[str, Any]], None],
+        on_record: Callable[[dict[str, Any]], None],
         store: MapStore | None = None,
     ) -> None:
-        self._settings, self._link, self._tell = settings, link, tell
-        has_keys = link.names("") is not None
-        said = partial(self._say, "map")
-        self._restarts = Restarts(store, settings.merge.enter_m, said, has_keys)
-        self._begin_at: float | None = None  # a life that waits for the disk
-        self._waits_for = ""
+        self._settings, self._link, self._on_record = settings, link, on_record
+        has_keys = link.agent_names("") is not None
+        notify_map = partial(self._log_event, "map")
+        self._restarts = MapperRestarts(store, settings.merge.enter_m, notify_map, has_keys)
+        self._restart_due_s: float | None = None  # a life that waits for the disk
+        self._restart_reason = ""
         self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._out = out
-        self._claim: int | None = None
-        self._events: LineFile | None = None
-        self._scribe: Scribe | None = None
+        self._lock_handle: int | None = None
+        self._event_log: LineFile | None = None
+        self._output_writer: OutputWriter | None = None
         if out is not None:
             check_replaceable(out / "edge.json")
             check_replaceable(out / "events.jsonl")
-            self._claim = claim(out)
-            self._events = LineFile(out / "events.jsonl", self._complain)
-            self._scribe = Scribe(out, self._complain)
+            self._lock_handle = lock_folder(out)
+            self._event_log = LineFile(out / "events.jsonl", self._post_write_failure)
+            self._output_writer = OutputWriter(out, self._post_write_failure)
         self._stopping = self._closed = False
-        self._incomplete: str | None = None  # the map's file, at the end
-        self._began_ns = time.monotonic_ns()
-        self._refused: Counter[str] = Counter()  # handshakes, by what was said of them
-        self._trouble: dict[str, float] = {}  # what to say until when
-        self._of_agents: dict[str, float] = {}  # the same, where it is one agent's alone
+        self._incomplete_reason: str | None = None  # the map's file, at the end
+        self._start_ns = time.monotonic_ns()
+        self._refused_handshakes: Counter[str] = Counter()  # handshakes, by what was said of them
+        self._troubles_until: dict[str, float] = {}  # what to say until when
+        self._agent_troubles_until: dict[str, float] = {}  # the same, where it is one agent's alone
         self._report: dict[str, Any] = {}
-        self._report_at = self._noted_at = 0.0  # when the next is due, and when there was one last
-        self._heap = Heap()
-        self._totals = Totals()
-        self._guard = Guard(lambda text: self._say("internal error", text))
-        self._begin(self._found())
+        self._report_due_s = self._reported_s = 0.0  # when the next is due, and when there was one last
+        self._heap = HeapTrimmer()
+        self._totals = SessionTotals()
+        self._guard = FaultGuard(lambda text: self._log_event("internal error", text))
+        self._start_session(self._load_stored_map())
 
     def stop(self) -> None:
         """From any thread or a signal handler."""
         self._stopping = True
         self._link.wake()
 
-    def go(self) -> dict[str, Any]:
+    def run(self) -> dict[str, Any]:
         """The report, once stopped. Raises ShareError if it could not be written, or not all events, or not
         all of the map."""
         try:
@@ -144,242 +144,271 @@ class EdgeRun:
                 self._step()
         finally:
             self.close()
-            self._try_to_note()
-            self._report["series"] = self._machine.series()
-            self._finish(self._report)
-        if self._incomplete is not None:
-            raise StoreError(self._incomplete)
+            self._try_to_report()
+            self._report["series"] = self._state_machine.series()
+            self._write_report(self._report)
+        if self._incomplete_reason is not None:
+            raise StoreError(self._incomplete_reason)
         return self._report
 
     def close(self) -> None:
-        """Ends the processes and threads it has started, also where it never came to `go`. May be
+        """Ends the processes and threads it has started, also where it never came to `run`. May be
         repeated."""
         self._stopping = True
         if self._closed:
             return
         self._closed = True
-        if self._mapping is not None:
-            self._mapping.close()
-        self._take_answers()
+        if self._mapper_process is not None:
+            self._mapper_process.close()
+        self._handle_answers()
         self._trackers.close()
-        if self._keeper is not None:
-            self._incomplete = self._keeper.close()
-            self._take_answers()  # what is safe by now is acknowledged
-            if self._incomplete is not None:
-                self._say("map", self._incomplete)
+        if self._map_writer is not None:
+            self._incomplete_reason = self._map_writer.close()
+            self._handle_answers()  # what is safe by now is acknowledged
+            if self._incomplete_reason is not None:
+                self._log_event("map", self._incomplete_reason)
         self._link.close()
 
     def report(self) -> dict[str, Any]:
         """As edge.json, 0.1 s old, and `trouble`: what is wrong now. From any thread."""
-        report, late_s = self._report, time.monotonic() - self._noted_at - _REPORT_S
-        if not report or late_s < _STUCK_S:
+        report, late_s = self._report, time.monotonic() - self._reported_s - _REPORT_S
+        if not report or late_s < _STALE_REPORT_S:
             return report
         stuck = f"the edge has been stuck for {late_s:.0f} s; what is shown of agents is as old as that"
         return {**report, "trouble": [stuck, *report["trouble"]]}
 
-    def _try_to_note(self) -> None:
+    def _try_to_report(self) -> None:
         """A fault of ours costs this report, which is then shown to be old."""
         with self._guard.step("a report"):
-            self._note()
+            self._update_report()
 
-    def _note(self) -> None:
+    def _update_report(self) -> None:
         """A report, and when the next is due."""
         now = time.monotonic()
-        self._report_at = now + _REPORT_S
-        self._heap.tidy(now)
-        disks = [writer.trouble for writer in (self._keeper, self._scribe) if writer is not None]
-        standing = [*disks, self._standstill(now), self._link.trouble()]
-        self._trouble = {text: until for text, until in self._trouble.items() if now < until}
-        self._of_agents = {text: until for text, until in self._of_agents.items() if now < until}
-        report = self._totals.added(self._machine.report(self._mapped))
+        self._report_due_s = now + _REPORT_S
+        self._heap.trim_if_due(now)
+        disk_troubles = [
+            writer.trouble for writer in (self._map_writer, self._output_writer) if writer is not None
+        ]
+        current_troubles = [*disk_troubles, self._find_stall(now), self._link.trouble()]
+        self._troubles_until = {text: until for text, until in self._troubles_until.items() if now < until}
+        self._agent_troubles_until = {
+            text: until for text, until in self._agent_troubles_until.items() if now < until
+        }
+        report = self._totals.with_totals(self._state_machine.report(self._mapper_report))
         self._report = {
             **report,
-            "refused": [*self._of_agents, *report["refused"]],
-            "refused_handshakes": self._refused.total(),
-            "trouble": [*self._trouble, *(text for text in standing if text is not None)],
-            "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
-            **({} if self._solved_at is None else {"last_solve_s": round(now - self._solved_at, 3)}),
+            "refused": [*self._agent_troubles_until, *report["refused"]],
+            "refused_handshakes": self._refused_handshakes.total(),
+            "trouble": [*self._troubles_until, *(text for text in current_troubles if text is not None)],
+            "uptime_s": round((time.monotonic_ns() - self._start_ns) * 1e-9, 3),
+            **({} if self._solved_s is None else {"last_solve_s": round(now - self._solved_s, 3)}),
         }
-        self._noted_at = now
+        self._reported_s = now
 
-    def _standstill(self, now: float) -> str | None:
+    def _find_stall(self, now: float) -> str | None:
         """Which process does not go on though it is alive, if one does not."""
-        if self._mapping is None or self._mapped_at is None:
+        if self._mapper_process is None or self._mapper_report_s is None:
             return None
-        if (mute_s := now - self._mapped_at) > _MUTE_S:
-            return f"the mapper has not answered for {mute_s:.0f} s: no corrections meanwhile"
-        if (solving_s := self._solving_s + mute_s) > _SOLVING_S:
+        if (silent_s := now - self._mapper_report_s) > _MAPPER_SILENT_S:
+            return f"the mapper has not answered for {silent_s:.0f} s: no corrections meanwhile"
+        if (solving_s := self._solving_s + silent_s) > _MAX_SOLVE_S:
             return f"the solver has been at one solution for {solving_s:.0f} s: no corrections meanwhile"
         return None
 
-    def _found(self) -> tuple[KeptMap | None, list[Known]]:
+    def _load_stored_map(self) -> tuple[KeptMap | None, list[RestoredRun]]:
         """What a new life begins with. Raises StoreError if the map's file cannot be read."""
-        return (None, []) if POLICIES[self._settings.edge.policy].raw else self._restarts.found()
+        return (
+            (None, []) if POLICIES[self._settings.edge.policy].streams_frames else self._restarts.load_map()
+        )
 
-    def _begin(self, found: tuple[KeptMap | None, list[Known]], after_s: float = 0.0) -> None:
+    def _start_session(
+        self, loaded: tuple[KeptMap | None, list[RestoredRun]], start_delay_s: float = 0.0
+    ) -> None:
         """A new life: agents notice by its number, and send again what it lacks.
 
         after_s: its mapper begins then.
         """
-        self._mapped: dict[str, Any] = {}
-        self._solved_at: float | None = None
-        self._mapped_at: float | None = None  # when the mapper last said something
+        self._mapper_report: dict[str, Any] = {}
+        self._solved_s: float | None = None
+        self._mapper_report_s: float | None = None  # when the mapper last said something
         self._solving_s = 0.0  # at that time
-        self._mapping: Companion | None = None
-        self._keeper: Keeper | None = None
-        self._trackers = Trackers(self._settings, self._answered)
-        self._machine: Edge
-        if POLICIES[self._settings.edge.policy].raw:
-            self._machine = TrackingEdge(
-                self._settings, secrets.randbits(63), began_ns=self._began_ns, room=room()
+        self._mapper_process: WorkerProcess | None = None
+        self._map_writer: MapWriter | None = None
+        self._trackers = TrackerProcesses(self._settings, self._post)
+        self._state_machine: Edge
+        if POLICIES[self._settings.edge.policy].streams_frames:
+            self._state_machine = TrackingEdge(
+                self._settings, secrets.randbits(63), began_ns=self._start_ns, capacity=tracker_capacity()
             )
         else:
-            self._begin_mapping(*found, after_s)
+            self._start_mapping(*loaded, start_delay_s)
 
-    def _begin_mapping(self, kept: KeptMap | None, known: list[Known], after_s: float) -> None:
+    def _start_mapping(
+        self, stored_map: KeptMap | None, known: list[RestoredRun], start_delay_s: float
+    ) -> None:
         store, writable = self._restarts.store, self._restarts.writable
-        self._machine = Edge(self._settings, secrets.randbits(63), writable, known, self._began_ns)
-        about = (self._settings,)
-        self._mapping = Companion("mapping", map_all, about, self._answered, self._mapping_lost, after_s)
-        if kept is not None:
-            self._mapping.send(Restore(kept))
+        self._state_machine = Edge(self._settings, secrets.randbits(63), writable, known, self._start_ns)
+        arguments = (self._settings,)
+        self._mapper_process = WorkerProcess(
+            "mapping", run_mapper, arguments, self._post, self._post_mapper_died, start_delay_s
+        )
+        if stored_map is not None:
+            self._mapper_process.send(RestoreMap(stored_map))
         if store is not None and writable:
-            self._keeper = Keeper(store, self._answered, self._map_said)
+            self._map_writer = MapWriter(store, self._post, self._post_map_notice)
 
-    def _finish(self, report: dict[str, Any]) -> None:
-        if self._out is None or self._events is None or self._claim is None or self._scribe is None:
+    def _write_report(self, report: dict[str, Any]) -> None:
+        if (
+            self._out is None
+            or self._event_log is None
+            or self._lock_handle is None
+            or self._output_writer is None
+        ):
             return
-        self._scribe.do(self._events.close)
-        self._scribe.do(partial(atomic_write, self._out / "edge.json", json.dumps(report, indent=2) + "\n"))
-        self._scribe.end()
-        self._forget_answers()
-        self._scribe.check()
-        os.close(self._claim)
-        self._events.check()
+        self._output_writer.submit(self._event_log.close)
+        self._output_writer.submit(
+            partial(atomic_write, self._out / "edge.json", json.dumps(report, indent=2) + "\n")
+        )
+        self._output_writer.stop()
+        self._discard_answers()
+        self._output_writer.check()
+        os.close(self._lock_handle)
+        self._event_log.check()
 
     # ------------------------------------------------------------------ the loop
 
     def _step(self) -> None:
-        for i in range(_AT_ONCE):
+        for i in range(_MAX_MESSAGES_PER_STEP):
             message = self._link.receive(0 if i else TICK_MS)
             if message is None:
                 break
-            names = self._link.names(message.key)
-            self._handle(Received(message.peer, message.frames, names, message.key))
+            names = self._link.agent_names(message.key)
+            self._handle(PeerMessageReceived(message.peer, message.frames, names, message.key))
         for line in self._link.refusals():
-            self._refuse(line)
-        self._take_answers()
-        self._handle(Tick())
-        if self._begin_at is not None and time.monotonic() >= self._begin_at:
-            self._begin_anew(self._waits_for)
-        if time.monotonic() >= self._report_at:
-            self._try_to_note()
+            self._count_refusal(line)
+        self._handle_answers()
+        self._handle(EdgeTick())
+        if self._restart_due_s is not None and time.monotonic() >= self._restart_due_s:
+            self._restart_mapping(self._restart_reason)
+        if time.monotonic() >= self._report_due_s:
+            self._try_to_report()
 
-    def _take_answers(self) -> None:
+    def _handle_answers(self) -> None:
         while not self._inbox.empty():
             match self._inbox.get():
-                case Found() as found:
-                    self._handle(found)
-                case Kept() | Ready() | Answered() as answer:
+                case MapperResult() as findings:
+                    self._handle(findings)
+                case ChangesSaved() | TrackerReady() | TrackerAnswered() as answer:
                     self._handle(answer)
-                case Lost() as lost if not self._stopping:
-                    text = f"agent's run {lost.key}: its tracker {lost.how}"
-                    self._of_agents[text] = time.monotonic() + _UNWELL_S
-                    self._handle(lost)
-                case Mapped() as mapped:
-                    if _solved(mapped.report) > _solved(self._mapped):
-                        self._solved_at = time.monotonic()
-                    self._mapped = mapped.report
-                    self._mapped_at, self._solving_s = time.monotonic(), mapped.solving_s
-                case _Said() as said:
-                    self._say(said.event, said.text)
-                case Restored():
-                    self._restarts.restored()
-                case SolverLost() as solver:
-                    self._say("solver lost", solver.text)
-                    self._trouble[f"the solver: {solver.text}"] = time.monotonic() + _UNWELL_S
-                case _MapperLost() as gone if not self._stopping:
-                    self._begin_anew(f"its process {gone.how}")
+                case TrackerLost() as tracker if not self._stopping:
+                    text = f"agent's run {tracker.key}: its tracker {tracker.reason}"
+                    self._agent_troubles_until[text] = time.monotonic() + _TROUBLE_SHOWN_S
+                    self._handle(tracker)
+                case MapperReport() as report:
+                    if _solve_count(report.report) > _solve_count(self._mapper_report):
+                        self._solved_s = time.monotonic()
+                    self._mapper_report = report.report
+                    self._mapper_report_s, self._solving_s = time.monotonic(), report.solving_s
+                case _Notice() as notice:
+                    self._log_event(notice.event, notice.text)
+                case MapRestored():
+                    self._restarts.record_restored()
+                case SolverDied() as solver:
+                    self._log_event("solver lost", solver.text)
+                    self._troubles_until[f"the solver: {solver.text}"] = time.monotonic() + _TROUBLE_SHOWN_S
+                case _MapperDied() as mapper if not self._stopping:
+                    self._restart_mapping(f"its process {mapper.reason}")
 
-    def _begin_anew(self, how: str) -> None:
+    def _restart_mapping(self, reason: str) -> None:
         """The mapper has died: as if the whole edge had been restarted, to its agents too."""
-        pause_s = self._restarts.died()
-        text = f"{how}; a new one begins in {pause_s:g} s; agents are asked for what is not in the map's file"
-        self._say("mapper lost", text)
-        self._trouble[f"the mapper: {text}"] = time.monotonic() + pause_s + _UNWELL_S
-        if self._mapping is not None:
-            self._mapping.close()
+        pause_s = self._restarts.record_death()
+        text = (
+            f"{reason}; a new one begins in {pause_s:g} s; agents are asked for what is not in the map's file"
+        )
+        self._log_event("mapper lost", text)
+        self._troubles_until[f"the mapper: {text}"] = time.monotonic() + pause_s + _TROUBLE_SHOWN_S
+        if self._mapper_process is not None:
+            self._mapper_process.close()
         try:
-            if self._keeper is not None and not self._keeper.drain(_DRAIN_S):
+            if self._map_writer is not None and not self._map_writer.drain(_DRAIN_S):
                 raise StoreError("the map's disk does not answer")
-            self._forget_answers()
-            found = self._found()
-            self._totals.ended(self._totals.added(self._machine.report(self._mapped)))
-            self._begin(found, pause_s)
-            self._begin_at = None
+            self._discard_answers()
+            loaded = self._load_stored_map()
+            self._totals.add_session(
+                self._totals.with_totals(self._state_machine.report(self._mapper_report))
+            )
+            self._start_session(loaded, pause_s)
+            self._restart_due_s = None
         except StoreError as error:  # nothing is taken in or acknowledged until it can be read
-            self._say("map", f"{error}; tried again in {pause_s:g} s")
-            self._begin_at, self._waits_for = time.monotonic() + pause_s, str(error)
+            self._log_event("map", f"{error}; tried again in {pause_s:g} s")
+            self._restart_due_s, self._restart_reason = time.monotonic() + pause_s, str(error)
 
-    def _forget_answers(self) -> None:
+    def _discard_answers(self) -> None:
         """Those of the mapper and keeper of a life that is over are no answers to the next."""
         while not self._inbox.empty():
             match self._inbox.get():
-                case _Said() as said:
-                    self._say(said.event, said.text)
+                case _Notice() as notice:
+                    self._log_event(notice.event, notice.text)
 
-    def _handle(self, event: Event) -> None:
-        for effect in self._machine.handle(event, time.monotonic_ns()):
-            self._carry_out(effect)
+    def _handle(self, event: EdgeEvent) -> None:
+        for effect in self._state_machine.handle(event, time.monotonic_ns()):
+            self._execute(effect)
 
-    def _carry_out(self, effect: Effect) -> None:
+    def _execute(self, effect: EdgeEffect) -> None:
         match effect:
-            case Send():
-                self._link.send(effect.peer, effect.frames)
-            case Join() | Speaks() | Present() | Add() | Forget() if self._mapping is not None:
-                self._mapping.send(effect)
-            case BeginTracking() | Track() | EndTracking():
-                self._trackers.do(effect)
-            case Keep() if self._keeper is not None:
-                self._keeper.keep(effect)
-            case Record():
+            case SendToPeer():
+                self._link.send(effect.peer_id, effect.frames)
+            case AddRun() | SetCredential() | SetPresence() | AddKeyframe() | DropRun() if (
+                self._mapper_process is not None
+            ):
+                self._mapper_process.send(effect)
+            case StartTracker() | TrackFrame() | StopTracker():
+                self._trackers.execute(effect)
+            case SaveChanges() if self._map_writer is not None:
+                self._map_writer.submit(effect)
+            case WriteEvent():
                 self._record(effect.fields)
 
     # ------------------------------------------------------------------ from other threads
 
-    def _answered(self, message: object) -> None:
+    def _post(self, message: object) -> None:
         self._inbox.put(message)
         self._link.wake()
 
-    def _map_said(self, text: str) -> None:
-        self._answered(_Said("map", text))
+    def _post_map_notice(self, text: str) -> None:
+        self._post(_Notice("map", text))
 
-    def _mapping_lost(self, how: str) -> None:
-        self._answered(_MapperLost(how))
+    def _post_mapper_died(self, reason: str) -> None:
+        self._post(_MapperDied(reason))
 
     # ------------------------------------------------------------------ what is said
 
     def _record(self, fields: dict[str, Any]) -> None:
-        if self._events is not None and self._scribe is not None:
-            self._scribe.do(partial(self._events.write, json.dumps(fields)))
-        self._tell(fields)
+        if self._event_log is not None and self._output_writer is not None:
+            self._output_writer.submit(partial(self._event_log.write, json.dumps(fields)))
+        self._on_record(fields)
 
-    def _say(self, event: str, reason: str) -> None:
-        t_s = round((time.monotonic_ns() - self._began_ns) * 1e-9, 6)
+    def _log_event(self, event: str, reason: str) -> None:
+        t_s = round((time.monotonic_ns() - self._start_ns) * 1e-9, 6)
         self._record({"t_s": t_s, "event": event, "agent": None, "reason": reason})
 
-    def _complain(self, text: str) -> None:
+    def _post_write_failure(self, text: str) -> None:
         """From any thread."""
-        self._inbox.put(_Said("not written", text))
+        self._inbox.put(_Notice("not written", text))
 
-    def _refuse(self, line: str) -> None:
+    def _count_refusal(self, line: str) -> None:
         """Counts a handshake that was refused; says each kind once, for a bounded number of kinds."""
-        line = line if line in self._refused or len(self._refused) < REFUSALS_SAID else "and others"
-        self._refused[line] += 1
-        if self._refused[line] == 1:
-            self._say("not let in", line)
+        line = (
+            line
+            if line in self._refused_handshakes or len(self._refused_handshakes) < MAX_REFUSAL_KINDS
+            else "and others"
+        )
+        self._refused_handshakes[line] += 1
+        if self._refused_handshakes[line] == 1:
+            self._log_event("not let in", line)
 
 
-def _solved(mapped: Mapping[str, Any]) -> int:
+def _solve_count(report: Mapping[str, Any]) -> int:
     """How often poses were solved for, by the mapper's report."""
-    return int(mapped.get("solve_ms", {}).get("n", 0))
+    return int(report.get("solve_ms", {}).get("n", 0))

@@ -19,8 +19,8 @@ _LIBRARIES = ("numpy", "opencv-python-headless", "pyzmq", "scipy")
 def describe_machine() -> dict[str, Any]:
     """Plain data. load: how many processes wanted a core over the last minute."""
     return {
-        "cpu": _cpu() or platform.processor() or platform.machine(),
-        "cores": cores(),
+        "cpu": _cpu_name() or platform.processor() or platform.machine(),
+        "cores": core_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **{name: version(name) for name in _LIBRARIES},
@@ -28,58 +28,60 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
-def cores() -> int:
+def core_count() -> int:
     """That this process may run on."""
     return len(os.sched_getaffinity(0))
 
 
-def _cpu() -> str | None:
+def _cpu_name() -> str | None:
     """Its name, as Linux gives it."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), None)
 
 
-def free_bytes(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:
+def free_memory_bytes(proc: Path = Path("/proc"), cgroups: Path = Path("/sys/fs/cgroup")) -> int | None:
     """Memory that this process may still take: what the machine has available, or less where a control group
     (a container, a systemd unit) has a limit. None where the system does not say."""
-    left = [
-        free for free in (_available(proc / "meminfo"), *_left_in_groups(proc, groups)) if free is not None
+    candidates = [
+        free
+        for free in (_available_bytes(proc / "meminfo"), *_free_in_cgroups(proc, cgroups))
+        if free is not None
     ]
-    return min(left, default=None)
+    return min(candidates, default=None)
 
 
-def _available(meminfo: Path) -> int | None:
+def _available_bytes(meminfo: Path) -> int | None:
     lines = meminfo.read_text().splitlines() if meminfo.exists() else []
-    found = next((line for line in lines if line.startswith("MemAvailable:")), None)
-    return None if found is None else 1024 * int(found.split()[1])
+    match = next((line for line in lines if line.startswith("MemAvailable:")), None)
+    return None if match is None else 1024 * int(match.split()[1])
 
 
-def _left_in_groups(proc: Path, groups: Path) -> list[int]:
+def _free_in_cgroups(proc: Path, cgroups: Path) -> list[int]:
     """Of this process's control group and all that it lies in, of those with a limit."""
-    file = proc / "self" / "cgroup"
-    lines = file.read_text().splitlines() if file.exists() else []
+    cgroup_file = proc / "self" / "cgroup"
+    lines = cgroup_file.read_text().splitlines() if cgroup_file.exists() else []
     out = []
     for line in lines:
         _, kinds, name = line.split(":", 2)
         if kinds == "":  # version 2
-            root, limit, used = groups, "memory.max", "memory.current"
+            root, limit, used = cgroups, "memory.max", "memory.current"
         elif "memory" in kinds.split(","):
-            root, limit, used = groups / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"
+            root, limit, used = cgroups / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"
         else:
             continue
         folder = root / name.lstrip("/")
         while folder.is_relative_to(root):
-            most, now = _number(folder / limit), _number(folder / used)
-            if most is not None and now is not None:
-                out.append(max(0, most - now))
+            max_bytes, used_bytes = _read_int(folder / limit), _read_int(folder / used)
+            if max_bytes is not None and used_bytes is not None:
+                out.append(max(0, max_bytes - used_bytes))
             if folder == root:
                 break
             folder = folder.parent
     return out
 
 
-def _number(file: Path) -> int | None:
+def _read_int(file: Path) -> int | None:
     """None for "max", or where there is no such file."""
     try:
         text = file.read_text().strip()
@@ -90,11 +92,11 @@ def _number(file: Path) -> int | None:
 
 # ---- Which state of SHARE's code made something: a version number stays while code changes.
 
-_DIGITS = 10
+_DIGEST_DIGITS = 10
 
 
 @cache
-def code_state() -> str:
+def code_digest() -> str:
     """Hexadecimal digits that differ where any of SHARE's sources do; of a frozen program, where it does."""
     frozen = getattr(sys, "frozen", False)
     folder = Path(share.__file__).parent
@@ -103,4 +105,4 @@ def code_state() -> str:
     for path in files:
         digest.update(path.name.encode() if frozen else path.relative_to(folder).as_posix().encode())
         digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()[:_DIGITS]
+    return digest.hexdigest()[:_DIGEST_DIGITS]

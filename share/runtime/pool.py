@@ -14,12 +14,12 @@ from types import TracebackType
 from typing import TypeVar
 
 from share.errors import ShareError
-from share.spawning import SPAWN, held
+from share.spawning import SPAWN_CONTEXT, signals_deferred
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-_failed: ShareError | None = None  # of this process, at its start
-_AHEAD = 2  # jobs handed out per worker, so that none waits for work
+_start_error: ShareError | None = None  # of this process, at its start
+_JOBS_AHEAD = 2  # jobs handed out per worker, so that none waits for work
 
 
 class Pool:
@@ -28,11 +28,15 @@ class Pool:
 
     def __init__(self, workers: int, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
         self._workers = workers
-        self._going_on, self._ours = SPAWN.Pipe(duplex=False)  # nothing is sent: workers end when it closes
-        self._pool = ProcessPoolExecutor(workers, SPAWN, _begin, (self._going_on, start, arguments))
+        self._child_end, self._parent_end = SPAWN_CONTEXT.Pipe(
+            duplex=False
+        )  # nothing is sent: workers end when it closes
+        self._pool = ProcessPoolExecutor(
+            workers, SPAWN_CONTEXT, _init_worker, (self._child_end, start, arguments)
+        )
 
     @property
-    def count(self) -> int:
+    def worker_count(self) -> int:
         return self._workers
 
     def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
@@ -42,9 +46,9 @@ class Pool:
         running: dict[Future[Result], Job] = {}
         try:
             while True:
-                for job in islice(waiting, _AHEAD * self._workers - len(running)):
-                    with held():
-                        running[self._pool.submit(_do, work, job)] = job
+                for job in islice(waiting, _JOBS_AHEAD * self._workers - len(running)):
+                    with signals_deferred():
+                        running[self._pool.submit(_run_job, work, job)] = job
                 if not running:
                     return
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -59,29 +63,29 @@ class Pool:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is not None:
-            self._ours.close()  # a job may take many seconds; what it writes is whole or not there
+            self._parent_end.close()  # a job may take many seconds; what it writes is whole or not there
         self._pool.shutdown(cancel_futures=True)
-        self._ours.close()
-        self._going_on.close()
+        self._parent_end.close()
+        self._child_end.close()
 
 
-def _begin(going_on: Connection, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
+def _init_worker(child_end: Connection, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
     """The first thing that a process does."""
-    threading.Thread(target=_end_with_block, args=(going_on,), daemon=True).start()
-    global _failed  # an exception here would be printed, and tell the parent nothing
+    threading.Thread(target=_exit_with_parent, args=(child_end,), daemon=True).start()
+    global _start_error  # an exception here would be printed, and tell the parent nothing
     try:
         start(*arguments)
     except ShareError as error:
-        _failed = error
+        _start_error = error
 
 
-def _do(work: Callable[[Job], Result], job: Job) -> Result:
-    if _failed is not None:
-        raise _failed
+def _run_job(work: Callable[[Job], Result], job: Job) -> Result:
+    if _start_error is not None:
+        raise _start_error
     return work(job)
 
 
-def _end_with_block(going_on: Connection) -> None:
+def _exit_with_parent(child_end: Connection) -> None:
     with suppress(OSError):
-        going_on.poll(None)  # nothing is sent: until the other end is closed
+        child_end.poll(None)  # nothing is sent: until the other end is closed
     os._exit(1)

@@ -13,12 +13,12 @@ from typing import Any
 
 from share.errors import UsageError
 from share.geometry.se3 import quat_from_matrix
-from share.net.udp import Host, parse_host, resolve
+from share.net.udp import HostPort, parse_host, resolve
 from share.types import F64
 
 SCHEMA = 1
 _SCHEME = "udp://"
-_PORT = 5570
+_DEFAULT_PORT = 5570
 _DIGITS = 9  # 1 nm
 
 
@@ -27,47 +27,49 @@ class PoseFeed:
 
     def __init__(self, address: str, agent: str) -> None:
         if not address.startswith(_SCHEME):
-            raise UsageError(f"--poses {address}: expected udp://HOST:PORT, such as udp://127.0.0.1:{_PORT}")
-        self.host: Host = parse_host(address.removeprefix(_SCHEME), _PORT)
+            raise UsageError(
+                f"--poses {address}: expected udp://HOST:PORT, such as udp://127.0.0.1:{_DEFAULT_PORT}"
+            )
+        self.host: HostPort = parse_host(address.removeprefix(_SCHEME), _DEFAULT_PORT)
         family, self._target = resolve(self.host)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._agent, self._sequence = agent, 0
 
-    def tell(
+    def publish(
         self,
         stamp_ns: int,
         state: str,
         age_ms: float | None = None,
-        stretch: int | None = None,
+        segment: int | None = None,
         T_odom_body: F64 | None = None,
         T_map_body: F64 | None = None,
         map_id: str | None = None,
     ) -> None:
         """One frame. age_ms: since it arrived in this process. stretch: of odometry. Poses (4, 4), None where
         there is none."""
-        told = {
+        message = {
             "schema": SCHEMA,
             "agent": self._agent,
             "sequence": self._sequence,
             "stamp_ns": stamp_ns,
             "age_ms": None if age_ms is None else round(age_ms, 3),
             "state": state,
-            "stretch": stretch,
-            "odom": _pose(T_odom_body),
-            "map": _pose(T_map_body),
+            "stretch": segment,
+            "odom": _pose_fields(T_odom_body),
+            "map": _pose_fields(T_map_body),
             "map_id": None if T_map_body is None else map_id,
         }
         self._sequence += 1
         with contextlib.suppress(OSError):  # no network, a full buffer: the next one is newer
-            self._socket.sendto(json.dumps(told).encode(), self._target)
+            self._socket.sendto(json.dumps(message).encode(), self._target)
 
     def close(self) -> None:
         self._socket.close()
 
 
-def _pose(T: F64 | None) -> dict[str, Any] | None:
+def _pose_fields(T: F64 | None) -> dict[str, Any] | None:
     if T is None:
         return None
-    position, turn = T[:3, 3].round(_DIGITS).tolist(), quat_from_matrix(T[:3, :3]).round(_DIGITS).tolist()
-    return {"position": position, "quaternion": turn}
+    position, rotation = T[:3, 3].round(_DIGITS).tolist(), quat_from_matrix(T[:3, :3]).round(_DIGITS).tolist()
+    return {"position": position, "quaternion": rotation}

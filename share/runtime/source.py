@@ -20,8 +20,8 @@ __all__ = ["READERS", "Source", "open_source"]
 class Reader(NamedTuple):
     """One kind of recording: how to know it, and how to open it."""
 
-    what: str
-    knows: Callable[[Path], bool]
+    description: str
+    matches: Callable[[Path], bool]
     open: Callable[[Path, Calibration | None, slice | None], Source]
 
 
@@ -35,11 +35,11 @@ def _is_mcap(path: Path) -> bool:
     return path.suffix == ".mcap" and path.is_file()
 
 
-def _is_agent(path: Path) -> bool:
+def _is_session_agent(path: Path) -> bool:
     return is_session(path.parent) and path.suffix != ".mcap" and not path.is_dir()
 
 
-def _open_agent(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
+def _open_session_agent(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
     session = read_session(path.parent)
     recording = session.recording(path.name)
     return _open_mcap(recording, calibration or session.agents[path.name].calibration, frames)
@@ -56,7 +56,7 @@ def _is_db3(path: Path) -> bool:
 
 
 READERS = (
-    Reader("SESSION/NAME (a folder with session.yaml)", _is_agent, _open_agent),
+    Reader("SESSION/NAME (a folder with session.yaml)", _is_session_agent, _open_session_agent),
     Reader("an MCAP recording (.mcap)", _is_mcap, _open_mcap),
     Reader("a recording of the RealSense SDK (.db3)", _is_db3, _open_db3),
     Reader("an EuRoC/ASL folder (mav0/)", is_euroc, open_euroc),
@@ -73,34 +73,34 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
     if is_camera(spec):
         raise UsageError(f"{spec}: a live camera is recorded with `share capture`; then give the recording")
     path = Path(spec)
-    calibration = calibration_of(calib)
+    calibration = read_given_calibration(calib)
     for reader in READERS:
-        if reader.knows(path):
+        if reader.matches(path):
             return reader.open(path, calibration, frames)
-    _existing(path, "SOURCE")
+    _check_exists(path, "SOURCE")
     if path.name.endswith(".mcap.part"):
-        raise _unclosed(path)
+        raise _unclosed_error(path)
     if is_session(path):
         agents = ", ".join(str(path / name) for name in read_session(path).agents)
         raise UsageError(f"{spec}: is a session; name one of its agents: {agents}")
-    known = "; ".join(reader.what for reader in READERS)
+    known = "; ".join(reader.description for reader in READERS)
     raise UsageError(f"{spec}: is none of the recordings that SHARE reads: {known}")
 
 
-def calibration_of(calib: str | None) -> Calibration | None:
+def read_given_calibration(calib: str | None) -> Calibration | None:
     """What --calib names, None where it was not given. Raises UsageError, ConfigError."""
-    return None if calib is None else read_calibration(_existing(Path(calib), "--calib"))
+    return None if calib is None else read_calibration(_check_exists(Path(calib), "--calib"))
 
 
-def _existing(path: Path, what: str) -> Path:
+def _check_exists(path: Path, what: str) -> Path:
     if not path.exists():
         part = path.with_name(path.name + ".part")
         if part.exists():
-            raise _unclosed(part)
+            raise _unclosed_error(part)
         raise UsageError(f"{what} {path}: no such file or folder")
     return path
 
 
-def _unclosed(part: Path) -> UsageError:
+def _unclosed_error(part: Path) -> UsageError:
     saves = f"`share dataset recover {part} --out {part.with_suffix('')}` saves it"
     return UsageError(f"{part}: was not closed, or is being recorded; {saves}")

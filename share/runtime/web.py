@@ -20,12 +20,12 @@ from http import HTTPStatus
 from share.errors import UsageError
 from share.net.transport import Address, bind_error, parse_address
 
-CONNECTIONS = 16  # at a time; one more closes the oldest
-REQUEST_BYTES = 8192
-PATIENCE_S = 5.0  # to ask, and again to take the answer
-_LEAVE_S = 1.0  # what is still sent after the answer is read so long, else the answer would be lost with it
-_BREATHER_S = 0.1  # where the machine has no socket left, and the longest sleep after work
-_SLEEP = 4.0  # times as long as it worked
+MAX_CONNECTIONS = 16  # at a time; one more closes the oldest
+MAX_REQUEST_BYTES = 8192
+CLIENT_TIMEOUT_S = 5.0  # to ask, and again to take the answer
+_LINGER_S = 1.0  # what is still sent after the answer is read so long, else the answer would be lost with it
+_MAX_SLEEP_S = 0.1  # where the machine has no socket left, and the longest sleep after work
+_SLEEP_RATIO = 4.0  # times as long as it worked
 
 _REQUEST = re.compile(r"([A-Z]+) (\S+) HTTP/1\.[01]")
 _HEADERS = (
@@ -39,20 +39,20 @@ _HEADERS = (
 
 
 @dataclass(frozen=True)
-class Answer:
+class Response:
     """What is said, and of which media type."""
 
     status: HTTPStatus
-    type: str
+    media_type: str
     body: bytes
 
-    def message(self, with_body: bool) -> bytes:
+    def encode(self, with_body: bool) -> bytes:
         """As it goes over the wire."""
         allow = ["Allow: GET, HEAD"] if self.status is HTTPStatus.METHOD_NOT_ALLOWED else []
         head = [
             f"HTTP/1.1 {self.status.value} {self.status.phrase}",
             f"Date: {formatdate(usegmt=True)}",
-            f"Content-Type: {self.type}",
+            f"Content-Type: {self.media_type}",
             f"Content-Length: {len(self.body)}",
             *_HEADERS,
             *allow,
@@ -60,9 +60,9 @@ class Answer:
         return "\r\n".join([*head, "", ""]).encode() + (self.body if with_body else b"")
 
 
-def line(status: HTTPStatus, text: str) -> Answer:
+def text_response(status: HTTPStatus, text: str) -> Response:
     """One line of plain text."""
-    return Answer(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+    return Response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
 
 
 class WebServer:
@@ -72,15 +72,15 @@ class WebServer:
     Raises UsageError if that is no address, TransportError if nothing can listen there.
     """
 
-    def __init__(self, address: str, answer: Callable[[str], Answer]) -> None:
-        self._answer, self._target = answer, _parse(address)
+    def __init__(self, address: str, handler: Callable[[str], Response]) -> None:
+        self._handler, self._target = handler, _parse(address)
         self._listener = _listen(self._target)
-        self._waker, self._woken = socket.socketpair()
+        self._wake_sender, self._wake_receiver = socket.socketpair()
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
-        self._selector.register(self._woken, selectors.EVENT_READ)
+        self._selector.register(self._wake_receiver, selectors.EVENT_READ)
         self._clients: list[_Client] = []  # oldest first
-        self._worked_s = 0.0  # CPU time of the thread so far
+        self._cpu_s = 0.0  # CPU time of the thread so far
         self._thread = threading.Thread(target=self._serve, name="web", daemon=True)
         self.endpoint = str(Address(self._target.host, self._listener.getsockname()[1])).removeprefix(
             "tcp://"
@@ -90,36 +90,36 @@ class WebServer:
     def close(self) -> None:
         """Frees the address. May be repeated."""
         with contextlib.suppress(OSError):
-            self._waker.send(b"!")
-        self._thread.join(timeout=PATIENCE_S)
-        self._waker.close()
+            self._wake_sender.send(b"!")
+        self._thread.join(timeout=CLIENT_TIMEOUT_S)
+        self._wake_sender.close()
 
     def _serve(self) -> None:
         try:
             while self._step():
-                self._breathe()
+                self._throttle()
         finally:
             for client in list(self._clients):
                 self._drop(client)
             self._selector.close()
             self._listener.close()
-            self._woken.close()
+            self._wake_receiver.close()
 
-    def _breathe(self) -> None:
-        worked_s, self._worked_s = time.thread_time() - self._worked_s, time.thread_time()
-        time.sleep(min(_SLEEP * worked_s, _BREATHER_S))
+    def _throttle(self) -> None:
+        cpu_s, self._cpu_s = time.thread_time() - self._cpu_s, time.thread_time()
+        time.sleep(min(_SLEEP_RATIO * cpu_s, _MAX_SLEEP_S))
 
     def _step(self) -> bool:
         """Waits for somebody and goes on with them. False once closed."""
-        next_late = min((client.deadline for client in self._clients), default=None)
-        wait_s = None if next_late is None else max(next_late - time.monotonic(), 0.0)
+        next_deadline = min((client.deadline for client in self._clients), default=None)
+        wait_s = None if next_deadline is None else max(next_deadline - time.monotonic(), 0.0)
         for key, _ in self._selector.select(wait_s):
-            if key.fileobj is self._woken:
+            if key.fileobj is self._wake_receiver:
                 return False
             if key.fileobj is self._listener:
                 self._accept()
             elif key.data in self._clients:
-                self._go_on(key.data)
+                self._advance(key.data)
         for client in [c for c in self._clients if c.deadline <= time.monotonic()]:
             self._drop(client)
         return True
@@ -130,18 +130,18 @@ class WebServer:
         except (BlockingIOError, ConnectionAbortedError):
             return
         except OSError:
-            time.sleep(_BREATHER_S)
+            time.sleep(_MAX_SLEEP_S)
             return
         connection.setblocking(False)
-        if len(self._clients) == CONNECTIONS:
+        if len(self._clients) == MAX_CONNECTIONS:
             self._drop(self._clients[0])
         client = _Client(connection)
         self._clients.append(client)
         self._selector.register(connection, selectors.EVENT_READ, client)
 
-    def _go_on(self, client: _Client) -> None:
+    def _advance(self, client: _Client) -> None:
         try:
-            events = client.go_on(self._respond)
+            events = client.advance(self._respond)
         except Exception:  # gone; or whatever it said that nobody thought of costs it its own connection
             events = 0
         if events:
@@ -154,22 +154,22 @@ class WebServer:
         self._selector.unregister(client.socket)
         client.socket.close()
 
-    def _respond(self, heard: bytes) -> bytes:
-        if len(heard) > REQUEST_BYTES:
-            text = f"a request has at most {REQUEST_BYTES} bytes"
-            return line(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, text).message(True)
-        first, _, rest = heard.decode("latin-1").replace("\r\n", "\n").partition("\n")
+    def _respond(self, request: bytes) -> bytes:
+        if len(request) > MAX_REQUEST_BYTES:
+            text = f"a request has at most {MAX_REQUEST_BYTES} bytes"
+            return text_response(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, text).encode(True)
+        first, _, rest = request.decode("latin-1").replace("\r\n", "\n").partition("\n")
         match = _REQUEST.fullmatch(first)
         if match is None:
-            return line(HTTPStatus.BAD_REQUEST, "this is not HTTP/1.1").message(True)
+            return text_response(HTTPStatus.BAD_REQUEST, "this is not HTTP/1.1").encode(True)
         method, path = match[1], match[2].partition("?")[0]
         if method not in ("GET", "HEAD"):
-            answer = line(HTTPStatus.METHOD_NOT_ALLOWED, "only GET and HEAD")
-        elif self._target.local and not _names_this_machine(rest):
-            answer = line(HTTPStatus.FORBIDDEN, "this is for localhost, asked for by that name")
+            response = text_response(HTTPStatus.METHOD_NOT_ALLOWED, "only GET and HEAD")
+        elif self._target.local and not _has_local_host_header(rest):
+            response = text_response(HTTPStatus.FORBIDDEN, "this is for localhost, asked for by that name")
         else:
-            answer = self._answer(path)
-        return answer.message(method != "HEAD")
+            response = self._handler(path)
+        return response.encode(method != "HEAD")
 
 
 @dataclass(eq=False)
@@ -177,32 +177,32 @@ class _Client:
     """One connection: it asks, takes its answer, and goes."""
 
     socket: socket.socket
-    deadline: float = field(default_factory=lambda: time.monotonic() + PATIENCE_S)
-    _heard: bytearray = field(default_factory=bytearray)
-    _answer: memoryview | None = None
+    deadline: float = field(default_factory=lambda: time.monotonic() + CLIENT_TIMEOUT_S)
+    _request: bytearray = field(default_factory=bytearray)
+    _response: memoryview | None = None
 
-    def go_on(self, respond: Callable[[bytes], bytes]) -> int:
+    def advance(self, respond: Callable[[bytes], bytes]) -> int:
         """Selector events to wait for next; 0 where it is over. Raises OSError where the other has gone."""
-        if self._answer is None:
-            return self._listen(respond)
-        if not self._answer:
-            return selectors.EVENT_READ if self.socket.recv(REQUEST_BYTES) else 0
-        self._answer = self._answer[self.socket.send(self._answer) :]
-        if self._answer:
+        if self._response is None:
+            return self._read_request(respond)
+        if not self._response:
+            return selectors.EVENT_READ if self.socket.recv(MAX_REQUEST_BYTES) else 0
+        self._response = self._response[self.socket.send(self._response) :]
+        if self._response:
             return selectors.EVENT_WRITE
         self.socket.shutdown(socket.SHUT_WR)
-        self.deadline = time.monotonic() + _LEAVE_S
+        self.deadline = time.monotonic() + _LINGER_S
         return selectors.EVENT_READ
 
-    def _listen(self, respond: Callable[[bytes], bytes]) -> int:
-        more = self.socket.recv(REQUEST_BYTES)
-        self._heard += more
-        if not more:
+    def _read_request(self, respond: Callable[[bytes], bytes]) -> int:
+        received = self.socket.recv(MAX_REQUEST_BYTES)
+        self._request += received
+        if not received:
             return 0
-        if not re.search(rb"\n\r?\n", self._heard) and len(self._heard) <= REQUEST_BYTES:
+        if not re.search(rb"\n\r?\n", self._request) and len(self._request) <= MAX_REQUEST_BYTES:
             return selectors.EVENT_READ
-        self._answer = memoryview(respond(bytes(self._heard)))
-        self.deadline = time.monotonic() + PATIENCE_S
+        self._response = memoryview(respond(bytes(self._request)))
+        self.deadline = time.monotonic() + CLIENT_TIMEOUT_S
         return selectors.EVENT_WRITE
 
 
@@ -217,25 +217,25 @@ def _parse(address: str) -> Address:
 def _listen(target: Address) -> socket.socket:
     family = socket.AF_INET6 if ":" in target.host else socket.AF_INET
     try:
-        listener = socket.create_server((target.host, target.port), family=family, backlog=CONNECTIONS)
+        listener = socket.create_server((target.host, target.port), family=family, backlog=MAX_CONNECTIONS)
     except OSError as error:
         raise bind_error(target, error.errno, error.strerror or str(error)) from None
     listener.setblocking(False)
     return listener
 
 
-def _names_this_machine(headers: str) -> bool:
+def _has_local_host_header(headers: str) -> bool:
     """Whether a request means a name that only this machine has. A web page whose own name was made to lead
     here (DNS rebinding) would ask for that."""
     for field_ in headers.split("\n"):
         name, _, value = field_.partition(":")
         if name.lower() == "host":
-            return _is_this_machine(value.strip(" \t"))
+            return _is_local_host(value.strip(" \t"))
     return True
 
 
-def _is_this_machine(host: str) -> bool:
+def _is_local_host(host: str) -> bool:
     """host: a name or an address, perhaps with a port. In time that rises with its length, no faster."""
-    before, colon, port = host.rpartition(":")
-    name = (before if colon and port.isdecimal() else host).strip("[]").lower()
+    host_part, colon, port = host.rpartition(":")
+    name = (host_part if colon and port.isdecimal() else host).strip("[]").lower()
     return name == "localhost" or Address(name, 0).local

@@ -18,9 +18,9 @@ from share.geometry.camera import Camera
 from share.geometry.se3 import inverse
 from share.types import F64, I64
 
-_WIDEST_RAD = math.radians(160)  # beyond, it is no pinhole
-_LEAST, _MOST = 3, 80  # points along half a side and along the depth, whatever their interval
-_SLACK_M = 1e-9  # a point on the border is inside, on whatever side rounding puts it
+_MAX_FIELD_RAD = math.radians(160)  # beyond, it is no pinhole
+_MIN_SAMPLES, _MAX_SAMPLES = 3, 80  # points along half a side and along the depth, whatever their interval
+_BORDER_TOLERANCE_M = 1e-9  # a point on the border is inside, on whatever side rounding puts it
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class Frustum:
             raise ValueError(f"frustum: from {self.near_m} to {self.far_m} m is no depth")
 
     @classmethod
-    def of(cls, camera: Camera, near_m: float, far_m: float) -> Frustum:
+    def from_camera(cls, camera: Camera, near_m: float, far_m: float) -> Frustum:
         """By its focal lengths and the size of its image, as if centred and without distortion."""
-        horizontal, vertical = camera.field_rad
-        return cls(min(horizontal, _WIDEST_RAD), min(vertical, _WIDEST_RAD), near_m, far_m)
+        horizontal, vertical = camera.field_of_view_rad
+        return cls(min(horizontal, _MAX_FIELD_RAD), min(vertical, _MAX_FIELD_RAD), near_m, far_m)
 
     @property
     def slopes(self) -> tuple[float, float]:
@@ -67,7 +67,7 @@ class Frustum:
         return np.vstack([sides / np.linalg.norm(sides, axis=1, keepdims=True), ends])
 
     @property
-    def sphere(self) -> tuple[float, float]:
+    def bounding_sphere(self) -> tuple[float, float]:
         """z of the centre and radius of the least sphere around it, m."""
         sx, sy = self.slopes
         square = 1 + sx**2 + sy**2
@@ -75,54 +75,54 @@ class Frustum:
         return z, math.hypot(self.far_m * sx, self.far_m * sy, self.far_m - z)
 
 
-class Seen:
+class SampledFrustum:
     """What views of one camera see: a frustum, sampled about `interval_m` apart."""
 
     def __init__(self, frustum: Frustum, interval_m: float) -> None:
         self.frustum = frustum
         self.planes = frustum.planes
-        self.points = _grid(frustum, interval_m)
-        self.centre, self.radius = frustum.sphere
+        self.points = _sample_points(frustum, interval_m)
+        self.centre, self.radius = frustum.bounding_sphere
 
-    def inside(self, other: Seen, T_other_self: F64) -> F64:
+    def volume_inside(self, other: SampledFrustum, T_other_self: F64) -> F64:
         """How much of it, m^3, lies in `other`, from where it stands at T_other_self (N, 4, 4): (N,)."""
         planes = (other.planes @ T_other_self).transpose(1, 0, 2)  # (6, N, 4): first, so that min is quick
         distances = (planes.reshape(-1, 4) @ self.points).reshape(6, len(T_other_self), -1)
-        count: I64 = np.count_nonzero(distances.min(axis=0) >= -_SLACK_M, axis=-1)
+        count: I64 = np.count_nonzero(distances.min(axis=0) >= -_BORDER_TOLERANCE_M, axis=-1)
         volume: F64 = count * (self.frustum.volume / self.points.shape[1])
         return volume
 
 
-def volumes(a: Seen, T_w_a: F64, b: Seen, T_w_b: F64) -> F64:
+def overlap_volumes(a: SampledFrustum, T_w_a: F64, b: SampledFrustum, T_w_b: F64) -> F64:
     """V_overlap, m^3, of one view T_w_a (4, 4) of camera a with each view T_w_b (N, 4, 4) of b: (N,).
 
     Poses are of cameras, z forward, in one frame.
     """
     out = np.zeros(len(T_w_b))
-    away = T_w_b @ [0.0, 0.0, b.centre, 1.0] - T_w_a @ [0.0, 0.0, a.centre, 1.0]
-    (near,) = np.nonzero((away**2).sum(-1) < (a.radius + b.radius) ** 2)
-    if len(near):
-        T_b_a = inverse(T_w_b[near]) @ T_w_a
-        out[near] = (a.inside(b, T_b_a) + b.inside(a, inverse(T_b_a))) / 2
+    offset = T_w_b @ [0.0, 0.0, b.centre, 1.0] - T_w_a @ [0.0, 0.0, a.centre, 1.0]
+    (close,) = np.nonzero((offset**2).sum(-1) < (a.radius + b.radius) ** 2)
+    if len(close):
+        T_b_a = inverse(T_w_b[close]) @ T_w_a
+        out[close] = (a.volume_inside(b, T_b_a) + b.volume_inside(a, inverse(T_b_a))) / 2
     return out
 
 
-def ious(a: Seen, T_w_a: F64, b: Seen, T_w_b: F64) -> F64:
+def ious(a: SampledFrustum, T_w_a: F64, b: SampledFrustum, T_w_b: F64) -> F64:
     """V_overlap / V_union, 0 to 1, for the same: (N,)."""
-    shared = volumes(a, T_w_a, b, T_w_b)
-    iou: F64 = shared / (a.frustum.volume + b.frustum.volume - shared)
+    overlap = overlap_volumes(a, T_w_a, b, T_w_b)
+    iou: F64 = overlap / (a.frustum.volume + b.frustum.volume - overlap)
     return iou
 
 
-def _grid(frustum: Frustum, interval_m: float) -> F64:
+def _sample_points(frustum: Frustum, interval_m: float) -> F64:
     """Homogeneous points (4, M), M > 0. Where the interval is too wide or too narrow for the frustum, it is
     changed: whatever an agent's calibration says, there are some points, and not too many."""
     depth = frustum.far_m - frustum.near_m
     sizes = np.array([s * frustum.far_m for s in frustum.slopes] + [depth])
-    steps = np.clip(interval_m, sizes / _MOST, sizes / _LEAST)
+    steps = np.clip(interval_m, sizes / _MAX_SAMPLES, sizes / _MIN_SAMPLES)
     across_x, across_y, layers = np.ceil(sizes / steps).astype(int)
     x, y = ((np.arange(-n, n) + 0.5) * step for n, step in ((across_x, steps[0]), (across_y, steps[1])))
     z = frustum.near_m + (np.arange(layers) + 0.5) * depth / layers
     grid = np.stack(np.meshgrid(x, y, z), axis=-1).reshape(-1, 3)
     points: F64 = np.vstack([grid.T, np.ones(len(grid))])
-    return points[:, (frustum.planes @ points >= -_SLACK_M).all(axis=0)]
+    return points[:, (frustum.planes @ points >= -_BORDER_TOLERANCE_M).all(axis=0)]

@@ -16,7 +16,7 @@ from share.config import ControlConfig
 
 
 @dataclass(frozen=True)
-class Gains:
+class PidGains:
     """kp Hz, ki Hz/s, kd Hz s, per unit of QoE; alpha 0 .. 1; a dt beyond gap_s is a gap."""
 
     kp: float
@@ -29,34 +29,34 @@ class Gains:
     gap_s: float
 
     @classmethod
-    def of(cls, config: ControlConfig) -> Gains:
+    def from_config(cls, config: ControlConfig) -> PidGains:
         return cls(**{name: getattr(config, name) for name in cls.__dataclass_fields__})
 
 
 @dataclass(frozen=True)
-class State:
+class PidState:
     """Of one agent after an evaluation. integral_hz: I; slope: d, 1/s; seen_ns: when; None: none so far."""
 
     rate_hz: float
     error: float = 0.0
     integral_hz: float = 0.0
-    slope: float = 0.0
-    seen_ns: int | None = None
+    derivative: float = 0.0
+    updated_ns: int | None = None
 
 
-def step(state: State, error: float, now_ns: int, gains: Gains) -> State:
+def step(state: PidState, error: float, now_ns: int, gains: PidGains) -> PidState:
     """After an evaluation at `now_ns` whose QoE is short of the target by `error` (finite).
 
     The first evaluation, one that is not after the last, and one after a gap tell no slope: d = 0, I is held.
     """
-    dt = 0.0 if state.seen_ns is None else (now_ns - state.seen_ns) / 1e9
-    integral, slope = state.integral_hz, 0.0
+    dt = 0.0 if state.updated_ns is None else (now_ns - state.updated_ns) / 1e9
+    integral, derivative = state.integral_hz, 0.0
     if 0 < dt <= gains.gap_s:
         integral = _clip(integral + gains.ki * error * dt, -gains.integral_max_hz, gains.integral_max_hz)
-        slope = gains.alpha * (error - state.error) / dt + (1 - gains.alpha) * state.slope
-    rate = state.rate_hz + gains.kp * error + integral + gains.kd * slope
-    return State(_clip(rate, gains.rate_min_hz, gains.rate_max_hz), error, integral, slope, now_ns)
+        derivative = gains.alpha * (error - state.error) / dt + (1 - gains.alpha) * state.derivative
+    rate = state.rate_hz + gains.kp * error + integral + gains.kd * derivative
+    return PidState(_clip(rate, gains.rate_min_hz, gains.rate_max_hz), error, integral, derivative, now_ns)
 
 
-def _clip(value: float, least: float, most: float) -> float:
-    return min(most, max(least, value))
+def _clip(value: float, low: float, high: float) -> float:
+    return min(high, max(low, value))

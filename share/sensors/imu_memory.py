@@ -12,7 +12,7 @@ import numpy as np
 
 from share.config import InertialConfig
 from share.errors import DataError, UsageError
-from share.files.json_file import as_we_write_it, read_json
+from share.files.json_file import own_format_errors, read_json
 from share.files.writing import atomic_write, writable_dir, xdg_folder
 from share.geometry.camera import ImuBias, ImuNoise
 
@@ -24,12 +24,12 @@ from share.geometry.camera import ImuBias, ImuNoise
 POWER_ON_GYRO, POWER_ON_ACCEL = 0.003, 0.1  # rad/s, m/s^2
 
 
-def aged(bias: ImuBias, noise: ImuNoise, age_s: float, config: InertialConfig) -> ImuBias | None:
+def propagate_bias(bias: ImuBias, noise: ImuNoise, age_s: float, config: InertialConfig) -> ImuBias | None:
     """`bias` as of a run that ended `age_s` ago: since then it has walked as the IMU's noise says, and the
     IMU may have been switched off. None where that is no better than what is known of any IMU."""
-    walked_s = max(age_s, 0.0) * config.imu_noise**2
-    gyro = np.sqrt(bias.gyro_sigma**2 + POWER_ON_GYRO**2 + noise.gyro_walk**2 * walked_s)
-    accel = np.sqrt(bias.accel_sigma**2 + POWER_ON_ACCEL**2 + noise.accel_walk**2 * walked_s)
+    random_walk_s = max(age_s, 0.0) * config.imu_noise**2
+    gyro = np.sqrt(bias.gyro_sigma**2 + POWER_ON_GYRO**2 + noise.gyro_walk**2 * random_walk_s)
+    accel = np.sqrt(bias.accel_sigma**2 + POWER_ON_ACCEL**2 + noise.accel_walk**2 * random_walk_s)
     if not (gyro < config.gyro_bias and accel < config.accel_bias):
         return None
     return ImuBias(bias.gyro, bias.accel, float(gyro), float(accel))
@@ -38,14 +38,14 @@ def aged(bias: ImuBias, noise: ImuNoise, age_s: float, config: InertialConfig) -
 _SCHEMA = 1
 
 
-class Remembered(NamedTuple):
+class SavedBias(NamedTuple):
     """When the run ended that learnt it, ns since 1970 (UTC), and what it learnt."""
 
-    at_ns: int
+    run_end_ns: int
     bias: ImuBias
 
 
-def folder() -> Path:
+def bias_folder() -> Path:
     """$XDG_STATE_HOME/share/imu, or ~/.local/state/share/imu (XDG Base Directory Specification). Raises
     UsageError where nobody has a home."""
     try:
@@ -54,36 +54,36 @@ def folder() -> Path:
         raise UsageError("no home folder to remember the IMU's bias in; set XDG_STATE_HOME") from None
 
 
-def file_of(serial: str) -> Path:
+def bias_file(serial: str) -> Path:
     """Where the bias of that device is. Raises DataError for what a device says that is no serial number."""
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}", serial):
         raise DataError(f"camera {serial!r:.40}: is no serial number to remember the bias of its IMU by")
-    return folder() / f"{serial}.json"
+    return bias_folder() / f"{serial}.json"
 
 
-def recall(serial: str) -> Remembered | None:
+def load_bias(serial: str) -> SavedBias | None:
     """None where nothing is remembered. Raises DataError, UsageError."""
-    path = file_of(serial)
+    path = bias_file(serial)
     if not os.path.lexists(path):
         return None
-    told = read_json(path)
-    with as_we_write_it(path):
-        if told["schema"] != _SCHEMA or told["serial"] != serial:
+    record = read_json(path)
+    with own_format_errors(path):
+        if record["schema"] != _SCHEMA or record["serial"] != serial:
             raise ValueError("of another device or of another SHARE")
-        gyro, accel = told["gyro"], told["accel"]
+        gyro, accel = record["gyro"], record["accel"]
         bias = ImuBias(gyro["bias"], accel["bias"], float(gyro["sigma"]), float(accel["sigma"]))
-        return Remembered(int(told["at_ns"]), bias)
+        return SavedBias(int(record["at_ns"]), bias)
 
 
-def remember(serial: str, what: Remembered) -> None:
+def save_bias(serial: str, saved: SavedBias) -> None:
     """In place of what was known of the device. Raises DataError, UsageError, ShareError."""
-    path, bias = file_of(serial), what.bias
-    told = {
+    path, bias = bias_file(serial), saved.bias
+    record = {
         "schema": _SCHEMA,
         "serial": serial,
-        "at_ns": what.at_ns,
+        "at_ns": saved.run_end_ns,
         "gyro": {"bias": bias.gyro.tolist(), "sigma": bias.gyro_sigma},
         "accel": {"bias": bias.accel.tolist(), "sigma": bias.accel_sigma},
     }
     writable_dir(path.parent)
-    atomic_write(path, json.dumps(told, indent=2) + "\n")
+    atomic_write(path, json.dumps(record, indent=2) + "\n")

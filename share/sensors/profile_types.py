@@ -19,7 +19,7 @@ from share.types import F64
 
 
 @dataclass(frozen=True)
-class Inertial:
+class InertialFacts:
     """Three alike axes of a gyroscope or an accelerometer, and one of the rates that it offers.
 
     density u/sqrt(Hz) and walk u/s/sqrt(Hz): white noise and bias random walk (IEEE Std 952, Kalibr's
@@ -38,11 +38,11 @@ class Inertial:
     instability_s: float = 100.0
 
     def __post_init__(self) -> None:
-        _rates(self.rates_hz)
-        _positive(self, "rate_hz", "range", "instability_s")
-        _not_negative(self, "step", "density", "walk", "start_bias", "instability")
+        _check_rates(self.rates_hz)
+        _check_positive(self, "rate_hz", "range", "instability_s")
+        _check_not_negative(self, "step", "density", "walk", "start_bias", "instability")
         if self.rate_hz not in self.rates_hz:
-            raise ValueError(f"rate_hz: {self.rate_hz:g} is not one of {_listed(self.rates_hz)}")
+            raise ValueError(f"rate_hz: {self.rate_hz:g} is not one of {_format_numbers(self.rates_hz)}")
 
     @property
     def kalibr_walk(self) -> float:
@@ -56,8 +56,8 @@ class ImuFacts:
 
     model: str
     joined: bool
-    gyro: Inertial
-    accel: Inertial
+    gyro: InertialFacts
+    accel: InertialFacts
 
     def __post_init__(self) -> None:
         if self.joined and self.gyro.rate_hz != self.accel.rate_hz:
@@ -65,7 +65,7 @@ class ImuFacts:
 
 
 @dataclass(frozen=True)
-class Lens:
+class LensFacts:
     """intrinsics: fx fy cx cy, px; distortion: none or k1 k2 p1 p2 [k3] of model radtan, k1 k2 k3 k4 of
     equidistant."""
 
@@ -75,17 +75,17 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Mode:
+class CameraMode:
     """One image size of both cameras, and the rates that it comes at."""
 
     width: int
     height: int
     rates_hz: tuple[float, ...]
-    cam0: Lens
-    cam1: Lens
+    cam0: LensFacts
+    cam1: LensFacts
 
     def __post_init__(self) -> None:
-        _rates(self.rates_hz)
+        _check_rates(self.rates_hz)
         self.cameras()
 
     def cameras(self) -> tuple[Camera, Camera]:
@@ -105,9 +105,9 @@ class DepthFacts:
     step_px: float
 
     def __post_init__(self) -> None:
-        _positive(self, "step_px")
+        _check_positive(self, "step_px")
         if not 0 < self.range_m[0] < self.range_m[1]:
-            raise ValueError(f"range_m: {_listed(self.range_m)} is not near < far")
+            raise ValueError(f"range_m: {_format_numbers(self.range_m)} is not near < far")
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class ClockFacts:
     triggered: bool = False
 
     def __post_init__(self) -> None:
-        _positive(self, "tick_ns")
+        _check_positive(self, "tick_ns")
         if not 0 <= self.bits <= 64:
             raise ValueError(f"bits: {self.bits} must lie in 0 .. 64")
 
@@ -136,7 +136,7 @@ class DeviceFacts:
     firmware_oldest: str | None
     emitter: str
     default_mode: str
-    modes: tuple[Mode, ...]
+    modes: tuple[CameraMode, ...]
     T_imu_cam0: F64
     T_imu_cam1: F64
     exposure_ms: tuple[float, float]
@@ -146,8 +146,8 @@ class DeviceFacts:
     depth: DepthFacts | None = None
 
     def __post_init__(self) -> None:
-        if self.emitter not in _EMITTER:
-            raise ValueError(f"emitter: '{self.emitter}' is not one of {', '.join(_EMITTER)}")
+        if self.emitter not in _EMITTERS:
+            raise ValueError(f"emitter: '{self.emitter}' is not one of {', '.join(_EMITTERS)}")
         for text in (*self.firmware, *filter(None, [self.firmware_oldest])):
             if not re.fullmatch(r"\d+(\.\d+)+", text, re.ASCII):
                 raise ValueError(f"firmware: '{text}' is not dotted numbers such as 5.16.0.1")
@@ -171,8 +171,8 @@ class HostFacts:
             raise ValueError(
                 f"cpu_governor: '{self.cpu_governor}' is not one of {', '.join(_GOVERNORS)}, or \"\""
             )
-        if not 0 <= self.usbfs_mb <= _USBFS_MOST:
-            raise ValueError(f"usbfs_mb: {self.usbfs_mb} must lie in 0 .. {_USBFS_MOST}")
+        if not 0 <= self.usbfs_mb <= _MAX_USBFS_MB:
+            raise ValueError(f"usbfs_mb: {self.usbfs_mb} must lie in 0 .. {_MAX_USBFS_MB}")
 
 
 @dataclass(frozen=True)
@@ -191,8 +191,8 @@ class CameraModel:
     reference_ms: float
 
     def __post_init__(self) -> None:
-        _positive(self, "full_well_e", "corner_light", "reference_ms")
-        _not_negative(self, "read_e", "pixel_offset_e", "pixel_gain", "psf_px")
+        _check_positive(self, "full_well_e", "corner_light", "reference_ms")
+        _check_not_negative(self, "read_e", "pixel_offset_e", "pixel_gain", "psf_px")
         if self.corner_light > 1:
             raise ValueError(f"corner_light: {self.corner_light:g} must not exceed 1")
 
@@ -210,7 +210,7 @@ class ExposureModel:
     longest_ms: float
 
     def __post_init__(self) -> None:
-        _positive(self, "target", "damping", "step", "longest_ms")
+        _check_positive(self, "target", "damping", "step", "longest_ms")
         if not (0 <= self.delay_frames <= 30 and self.damping <= 1 and self.target < 255):
             raise ValueError("delay_frames: 0 .. 30, damping: up to 1, target: below 255")
 
@@ -230,8 +230,8 @@ class DepthModel:
     edge_px: int
 
     def __post_init__(self) -> None:
-        _positive(self, "window_px")
-        _not_negative(self, "sigma_px", "hole_snr", "hole_spread", "smooth_px", "edge_px")
+        _check_positive(self, "window_px")
+        _check_not_negative(self, "sigma_px", "hole_snr", "hole_spread", "smooth_px", "edge_px")
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ class Profile:
     device: DeviceFacts
     host: HostFacts
     emulation: Emulation
-    mode: Mode
+    mode: CameraMode
     rate_hz: float
 
     def rig(self, depth: bool = False) -> Rig:
@@ -280,30 +280,32 @@ class Profile:
         return float(np.linalg.norm((inverse(self.device.T_imu_cam1) @ self.device.T_imu_cam0)[:3, 3]))
 
 
-_EMITTER = ("off", "on", "interleaved", "none")
+_EMITTERS = ("off", "on", "interleaved", "none")
 _GOVERNORS = ("performance", "powersave", "ondemand", "conservative", "schedutil", "userspace")
-_USBFS_MOST = 2047  # of the kernel
+_MAX_USBFS_MB = 2047  # of the kernel
 
 
-_RATE_MOST = 10_000.0  # Hz; above it somebody has mistaken the unit
+_MAX_RATE_HZ = 10_000.0  # Hz; above it somebody has mistaken the unit
 
 
-def _rates(rates_hz: tuple[float, ...]) -> None:
-    if not rates_hz or not all(0 < hz <= _RATE_MOST for hz in rates_hz):
-        raise ValueError(f"rates_hz: [{_listed(rates_hz)}] must be rates above 0, up to {_RATE_MOST:g} Hz")
+def _check_rates(rates_hz: tuple[float, ...]) -> None:
+    if not rates_hz or not all(0 < hz <= _MAX_RATE_HZ for hz in rates_hz):
+        raise ValueError(
+            f"rates_hz: [{_format_numbers(rates_hz)}] must be rates above 0, up to {_MAX_RATE_HZ:g} Hz"
+        )
 
 
-def _listed(values: tuple[float, ...]) -> str:
+def _format_numbers(values: tuple[float, ...]) -> str:
     return ", ".join(f"{value:g}" for value in values)
 
 
-def _positive(obj: object, *names: str) -> None:
+def _check_positive(obj: object, *names: str) -> None:
     for name in names:
         if not getattr(obj, name) > 0:
             raise ValueError(f"{name}: {getattr(obj, name)} must be positive")
 
 
-def _not_negative(obj: object, *names: str) -> None:
+def _check_not_negative(obj: object, *names: str) -> None:
     for name in names:
         if not getattr(obj, name) >= 0:
             raise ValueError(f"{name}: {getattr(obj, name)} must not be negative")

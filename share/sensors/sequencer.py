@@ -22,12 +22,12 @@ from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, LazyImage, Measure
 from share.sensors.stamps import StampRepair
 from share.types import ImuBatch
 
-_USUAL = ImuRange()
-_DEAD = 10  # a stream silent for so many times what a frame waits is not waited for any more
+_DEFAULT_IMU_RANGE = ImuRange()
+_DEAD_FACTOR = 10  # a stream silent for so many times what a frame waits is not waited for any more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bundle:
+class UndecodedFrame:
     """A `Frame` whose images are not decoded yet. index counts the bundles of this iterator from 0."""
 
     stamp_ns: int
@@ -58,22 +58,22 @@ class SequencerCounters:
     strays: int = 0
 
 
-def streams_of(rig: Rig) -> tuple[str, ...]:
+def rig_streams(rig: Rig) -> tuple[str, ...]:
     """The streams that a rig's frames are made of."""
-    have = ((CAM0, True), (CAM1, rig.cam1), (DEPTH, rig.depth), (IMU, rig.imu))
-    return tuple(name for name, there in have if there)
+    options = ((CAM0, True), (CAM1, rig.cam1), (DEPTH, rig.depth), (IMU, rig.imu))
+    return tuple(name for name, is_present in options if is_present)
 
 
-def sequence(
+def sequence_frames(
     measurements: Iterable[Measurement],
     streams: Collection[str],
     rate_hz: float,
     config: SequencerConfig,
     counters: SequencerCounters,
     imu_shift_ns: int = 0,
-    imu_range: ImuRange = _USUAL,
-) -> Iterator[Bundle]:
-    """Merge by time. `streams` as `streams_of` gives them; rate_hz: the frame rate, 0 if unknown;
+    imu_range: ImuRange = _DEFAULT_IMU_RANGE,
+) -> Iterator[UndecodedFrame]:
+    """Merge by time. `streams` as `rig_streams` gives them; rate_hz: the frame rate, 0 if unknown;
     imu_shift_ns: IMU time less camera time, by which a frame's IMU samples are later stamped than it;
     imu_range: beyond which a sample is none (`share.sensors.imu_check`).
 
@@ -90,17 +90,17 @@ def sequence(
         if measurement.stream in merger.buffers:
             for stamp, usable in repair.feed(measurement):
                 merger.add(usable.stream, stamp, usable.payload)
-                yield from merger.ready()
-        _count(repair, counters, merger)
+                yield from merger.ready_frames()
+        _update_counters(repair, counters, merger)
     for stamp, usable in repair.flush():
         merger.add(usable.stream, stamp, usable.payload)
-        yield from merger.ready()
-    merger.end()
-    yield from merger.ready()
-    _count(repair, counters, merger)
+        yield from merger.ready_frames()
+    merger.finish()
+    yield from merger.ready_frames()
+    _update_counters(repair, counters, merger)
 
 
-def _count(repair: StampRepair, counters: SequencerCounters, merger: _Merger) -> None:
+def _update_counters(repair: StampRepair, counters: SequencerCounters, merger: _Merger) -> None:
     counters.wraps, counters.jumps, counters.strays = repair.wraps, repair.jumps, repair.strays
     counters.backward = merger.backward + repair.past
 
@@ -111,17 +111,17 @@ class _Buffer:
     def __init__(self, reorder_ns: int) -> None:
         self.items: list[tuple[int, Any]] = []
         self.newest = -(2**62)
-        self.taken = -(2**62)  # nothing up to here is accepted any more
-        self.died = False  # was dead when all ended
+        self.consumed_until = -(2**62)  # nothing up to here is accepted any more
+        self.was_dead = False  # was dead when all ended
         self._reorder_ns = reorder_ns
 
     @property
-    def reached(self) -> int:
+    def complete_until(self) -> int:
         """Everything up to here has come, unless the stream is more disordered than we allow."""
         return self.newest - self._reorder_ns
 
     def accepts(self, stamp: int) -> bool:
-        return stamp >= self.reached and stamp > self.taken
+        return stamp >= self.complete_until and stamp > self.consumed_until
 
     def insert(self, stamp: int, payload: Any) -> bool:
         """Whether it was new."""
@@ -129,20 +129,20 @@ class _Buffer:
             self.items.append((stamp, payload))
             self.newest = stamp
             return True
-        at = bisect_left(self.items, stamp, key=itemgetter(0))
-        if stamp == self.newest or (at < len(self.items) and self.items[at][0] == stamp):
+        index = bisect_left(self.items, stamp, key=itemgetter(0))
+        if stamp == self.newest or (index < len(self.items) and self.items[index][0] == stamp):
             return False
-        self.items.insert(at, (stamp, payload))
+        self.items.insert(index, (stamp, payload))
         return True
 
     def first_from(self, stamp: int) -> int | None:
         """The stamp of the first item that waits and is not before `stamp`."""
-        at = bisect_left(self.items, stamp, key=itemgetter(0))
-        return self.items[at][0] if at < len(self.items) else None
+        index = bisect_left(self.items, stamp, key=itemgetter(0))
+        return self.items[index][0] if index < len(self.items) else None
 
     def pop_until(self, stamp: int) -> list[tuple[int, Any]]:
         """Take everything with a stamp up to `stamp`."""
-        self.taken = max(self.taken, stamp)
+        self.consumed_until = max(self.consumed_until, stamp)
         count = bisect_right(self.items, stamp, key=itemgetter(0))
         out, self.items = self.items[:count], self.items[count:]
         return out
@@ -156,22 +156,22 @@ class _Merger:
         config: SequencerConfig,
         counters: SequencerCounters,
         imu_shift_ns: int = 0,
-        imu_range: ImuRange = _USUAL,
+        imu_range: ImuRange = _DEFAULT_IMU_RANGE,
     ) -> None:
         self.buffers = {name: _Buffer(_ns(config.reorder_ms)) for name in streams}
         self.backward = 0
         self._partners = [self.buffers[name] for name in (CAM1, DEPTH) if name in streams]
         self._images = self.buffers[CAM0]
         self._imu = self.buffers.get(IMU)
-        self._check = ImuCheck(imu_range)
-        self._now, self._first = -(2**62), 2**62
-        self._last: int | None = None
+        self._imu_check = ImuCheck(imu_range)
+        self._newest_ns, self._first_ns = -(2**62), 2**62
+        self._last_frame_ns: int | None = None
         self._counters = counters
-        self._tolerance = _ns(config.sync_tolerance_ms)
-        self._wait = _ns(config.imu_silent_ms) + _ns(config.reorder_ms)
-        self._shift, self._ahead = imu_shift_ns, max(imu_shift_ns, 0)
-        self._keep = int(config.max_jump_s * 1e9)
-        self._gap = config.gap_factor / rate_hz * 1e9 if rate_hz > 0 else float("inf")
+        self._tolerance_ns = _ns(config.sync_tolerance_ms)
+        self._wait_ns = _ns(config.imu_silent_ms) + _ns(config.reorder_ms)
+        self._imu_shift_ns, self._imu_ahead_ns = imu_shift_ns, max(imu_shift_ns, 0)
+        self._max_jump_ns = int(config.max_jump_s * 1e9)
+        self._min_gap_ns = config.gap_factor / rate_hz * 1e9 if rate_hz > 0 else float("inf")
 
     def add(self, stream: str, stamp: int, payload: Any) -> None:
         buffer = self.buffers[stream]
@@ -181,126 +181,133 @@ class _Merger:
             self.backward += 1
         elif not buffer.insert(stamp, payload):
             self._counters.duplicates += 1
-        self._now = max(self._now, stamp)
-        self._first = min(self._first, stamp)
+        self._newest_ns = max(self._newest_ns, stamp)
+        self._first_ns = min(self._first_ns, stamp)
 
-    def end(self) -> None:
+    def finish(self) -> None:
         """No more will come: whatever waits is as whole as it gets."""
         for buffer in self.buffers.values():
-            buffer.died = self._dead(buffer)
+            buffer.was_dead = self._is_dead(buffer)
         for buffer in self.buffers.values():
-            buffer.newest = self._now = 2**62
+            buffer.newest = self._newest_ns = 2**62
 
-    def ready(self) -> Iterator[Bundle]:
+    def ready_frames(self) -> Iterator[UndecodedFrame]:
         """The bundles that are whole, in order of time."""
-        while self._images.items and self._settled(self._images.items[0][0]):
+        while self._images.items and self._is_settled(self._images.items[0][0]):
             stamp, image0 = self._images.items[0]
             self._images.pop_until(stamp)
-            partners = [self._partner(buffer, stamp) for buffer in self._partners]
-            if self._incomplete(partners):
+            partners = [self._take_partner(buffer, stamp) for buffer in self._partners]
+            if self._is_incomplete(partners):
                 self._counters.unpaired += 1 + sum(p is not None for p in partners)
             else:
-                yield self._bundle(stamp, image0, partners)
-        self._forget()
+                yield self._make_frame(stamp, image0, partners)
+        self._drop_old()
 
-    def _incomplete(self, partners: list[Any]) -> bool:
+    def _is_incomplete(self, partners: list[Any]) -> bool:
         """Whether the frame lacks an image that it needs: the first partner, unless that one is dead and
         something else tells how far things are."""
         if not partners or partners[0] is not None:
             return False
-        other = partners[-1] is not None or (self._imu is not None and not self._dead(self._imu))
-        return not (other and self._dead(self._partners[0]))
+        other = partners[-1] is not None or (self._imu is not None and not self._is_dead(self._imu))
+        return not (other and self._is_dead(self._partners[0]))
 
-    def _settled(self, stamp: int) -> bool:
+    def _is_settled(self, stamp: int) -> bool:
         """Whether waiting longer can change nothing in the frame at `stamp`, or has lasted too long."""
-        if self._now >= stamp + self._wait + self._tolerance + self._ahead:
+        if self._newest_ns >= stamp + self._wait_ns + self._tolerance_ns + self._imu_ahead_ns:
             return True
         return (
-            self._images.reached >= stamp
+            self._images.complete_until >= stamp
             and all(self._has_partner(buffer, stamp) for buffer in self._partners)
-            and self._imu_reached(stamp + self._shift)
+            and self._has_imu_until(stamp + self._imu_shift_ns)
         )
 
     def _has_partner(self, buffer: _Buffer, stamp: int) -> bool:
         """The partner is there, or it will not come any more."""
-        if buffer.reached > stamp + self._tolerance:
+        if buffer.complete_until > stamp + self._tolerance_ns:
             return True
-        if self._dead(buffer):
+        if self._is_dead(buffer):
             return True
-        at = bisect_left(buffer.items, stamp - self._tolerance, key=itemgetter(0))
-        return at < len(buffer.items) and buffer.items[at][0] <= min(stamp + self._tolerance, buffer.reached)
+        index = bisect_left(buffer.items, stamp - self._tolerance_ns, key=itemgetter(0))
+        return index < len(buffer.items) and buffer.items[index][0] <= min(
+            stamp + self._tolerance_ns, buffer.complete_until
+        )
 
-    def _imu_reached(self, stamp: int) -> bool:
+    def _has_imu_until(self, stamp: int) -> bool:
         """The first sample from `stamp` on is there, and none can come before it."""
         imu = self._imu
-        if imu is None or imu.taken >= stamp:
+        if imu is None or imu.consumed_until >= stamp:
             return True
         first = imu.first_from(stamp)
-        return (first is not None and imu.reached >= first) or self._dead(imu)
+        return (first is not None and imu.complete_until >= first) or self._is_dead(imu)
 
-    def _dead(self, buffer: _Buffer) -> bool:
+    def _is_dead(self, buffer: _Buffer) -> bool:
         """It is silent for so long that nobody waits for it any more."""
-        return buffer.died or self._now - max(buffer.newest, self._first) > _DEAD * self._wait
+        return (
+            buffer.was_dead
+            or self._newest_ns - max(buffer.newest, self._first_ns) > _DEAD_FACTOR * self._wait_ns
+        )
 
-    def _partner(self, buffer: _Buffer, stamp: int) -> Any | None:
+    def _take_partner(self, buffer: _Buffer, stamp: int) -> Any | None:
         """The first image within the tolerance. Those before it have missed their frame."""
-        self._counters.unpaired += len(buffer.pop_until(stamp - self._tolerance - 1))
-        if buffer.items and buffer.items[0][0] <= stamp + self._tolerance:
+        self._counters.unpaired += len(buffer.pop_until(stamp - self._tolerance_ns - 1))
+        if buffer.items and buffer.items[0][0] <= stamp + self._tolerance_ns:
             return buffer.pop_until(buffer.items[0][0])[0][1]
         return None
 
-    def _bundle(self, stamp: int, image0: LazyImage, partners: list[Any]) -> Bundle:
-        step = 0 if self._last is None else stamp - self._last
-        gap = step if step > self._gap else 0
+    def _make_frame(self, stamp: int, image0: LazyImage, partners: list[Any]) -> UndecodedFrame:
+        step = 0 if self._last_frame_ns is None else stamp - self._last_frame_ns
+        gap = step if step > self._min_gap_ns else 0
         images = dict(zip([name for name in (CAM1, DEPTH) if name in self.buffers], partners, strict=True))
-        bundle = Bundle(
+        frame = UndecodedFrame(
             stamp_ns=stamp,
             index=self._counters.frames,
             image0=image0,
             image1=images.get(CAM1),
             depth=images.get(DEPTH),
-            imu=self._take_imu(stamp + self._shift),
+            imu=self._take_imu(stamp + self._imu_shift_ns),
             gap_ns=gap,
         )
-        self._last = stamp
+        self._last_frame_ns = stamp
         self._counters.frames += 1
         self._counters.gaps += gap > 0
-        return bundle
+        return frame
 
     def _take_imu(self, stamp: int) -> ImuBatch:
         """Samples since the frame before, until the first that is not before `stamp`."""
         imu = self._imu
         if imu is None:
             return ImuBatch.empty()
-        self._counters.imu_dropped += len(imu.pop_until(stamp - self._keep))
-        if imu.taken >= stamp:  # the frame before has the first after both
+        self._counters.imu_dropped += len(imu.pop_until(stamp - self._max_jump_ns))
+        if imu.consumed_until >= stamp:  # the frame before has the first after both
             return ImuBatch.empty()
         first = imu.first_from(stamp)
-        batch = self._measured(imu.pop_until(stamp if first is None or first > stamp + self._wait else first))
+        batch = self._valid_samples(
+            imu.pop_until(stamp if first is None or first > stamp + self._wait_ns else first)
+        )
         self._counters.imu_samples += len(batch)
         self._counters.imu_silent += not len(batch)
         return batch
 
-    def _measured(self, samples: list[tuple[int, Any]]) -> ImuBatch:
+    def _valid_samples(self, samples: list[tuple[int, Any]]) -> ImuBatch:
         """Those that are measurements."""
         if not samples:
             return ImuBatch.empty()
         stamps, table = np.array([s for s, _ in samples], np.int64), np.array([v for _, v in samples], float)
-        good = self._check.believed(stamps, table)
-        self._counters.imu_out_of_range = self._check.out_of_range
-        self._counters.imu_spikes = self._check.spikes
-        if not good.all():
-            stamps, table = stamps[good], table[good]
+        valid = self._imu_check.valid_mask(stamps, table)
+        self._counters.imu_out_of_range = self._imu_check.out_of_range
+        self._counters.imu_spikes = self._imu_check.spikes
+        if not valid.all():
+            stamps, table = stamps[valid], table[valid]
         return ImuBatch(stamps, table[:, :3], table[:, 3:])
 
-    def _forget(self) -> None:
+    def _drop_old(self) -> None:
         """Drop what no frame can want any more, so that a stream without frames does not fill memory."""
-        oldest = self._now - 2 * (self._wait + self._tolerance) - self._ahead
+        oldest = self._newest_ns - 2 * (self._wait_ns + self._tolerance_ns) - self._imu_ahead_ns
         for buffer in self._partners:
             if buffer.items and buffer.items[0][0] < oldest:
                 self._counters.unpaired += len(buffer.pop_until(oldest))
-        if self._imu and self._imu.items and self._imu.items[0][0] < oldest - self._keep:
-            self._counters.imu_dropped += len(self._imu.pop_until(oldest - self._keep))
+        if self._imu and self._imu.items and self._imu.items[0][0] < oldest - self._max_jump_ns:
+            self._counters.imu_dropped += len(self._imu.pop_until(oldest - self._max_jump_ns))
 
 
 def _ns(ms: float) -> int:

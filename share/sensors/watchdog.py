@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection
 from enum import Enum
 
-from share.sensors.intake import ACCEL, GYRO
 from share.sensors.measurement import CAM0, CAM1, DEPTH
+from share.sensors.sample_processor import ACCEL, GYRO
 
-_IN_VAIN = 2  # connections after a reset in which a stream never came: then it is broken
+_MAX_FAILED_CONNECTIONS = 2  # connections after a reset in which a stream never came: then it is broken
 
 
 class Action(Enum):
@@ -17,7 +17,7 @@ class Action(Enum):
     NOTHING = "nothing"
     RESET = "reset"  # the device by its hardware, once; then reconnect
     GO_WITHOUT = "go without"  # say what stays silent; go on without it
-    HEARD_AGAIN = "heard again"  # say that it is back
+    RECOVERED = "heard again"  # say that it is back
     RECONNECT = "reconnect"  # look for the device by its serial number
     GIVE_UP = "give up"  # what is needed has never come: say so, and end
 
@@ -31,16 +31,17 @@ class Health(Enum):
     AWAY = "AWAY"
 
 
-def enough(streams: Collection[str], sees: bool = True) -> bool:
+def is_sufficient(streams: Collection[str], needs_image: bool = True) -> bool:
     """Whether one can go on with these: the left eye, and what tells how far things are. sees: else it is the
     IMU alone that is wanted."""
     imu = ACCEL in streams and GYRO in streams
-    return CAM0 in streams and (imu or CAM1 in streams or DEPTH in streams) if sees else imu
+    return CAM0 in streams and (imu or CAM1 in streams or DEPTH in streams) if needs_image else imu
 
 
 class Watchdog:
     """Some streams silent for twice silent_ms while others come: one reset in a run; then they are done
-    without if the rest is `enough` (`VISION_ONLY`: the IMU; `DEGRADED`: others), else reconnect. All silent
+    without if the rest is `is_sufficient` (`VISION_ONLY`: the IMU; `DEGRADED`: others), else reconnect. All
+    silent
     for silent_ms, or a device that is gone: reconnect, again and again. What is needed and has never come,
     not in _IN_VAIN connections after the reset either, will not come: give up. Silence is not counted in the
     first warm_up_ms after a connection, nor at a tick that comes late: who has slept cannot know. `silent`
@@ -59,13 +60,13 @@ class Watchdog:
         """streams: that are expected; reset_ms: what a device needs after its reset."""
         self.health, self.silent = Health.OK, tuple[str, ...]()
         self.resets = 0
-        self._connections = self._vain = 0
-        self._without, self._ever = set[str](), set[str]()
+        self._connections = self._failed_connections = 0
+        self._excluded, self._delivered = set[str](), set[str]()
         self._silent_ns, self._warm_up_ns = int(silent_ms * 1e6), int(warm_up_ms * 1e6)
         self._retry_ns, self._reset_ns = int(retry_ms * 1e6), int(reset_ms * 1e6)
-        self._heard_ns = dict.fromkeys(streams, now_ns)
-        self._tick_ns, self._late = now_ns, False
-        self._listen(now_ns)
+        self._last_sample_ns = dict.fromkeys(streams, now_ns)
+        self._tick_ns, self._is_late = now_ns, False
+        self._reset_timers(now_ns)
 
     @property
     def reconnections(self) -> int:
@@ -73,99 +74,101 @@ class Watchdog:
         return max(0, self._connections - 1)
 
     @property
-    def without(self) -> tuple[str, ...]:
+    def excluded(self) -> tuple[str, ...]:
         """Streams that are done without."""
-        return tuple(name for name in self._heard_ns if name in self._without)
+        return tuple(name for name in self._last_sample_ns if name in self._excluded)
 
-    def connected(self, now_ns: int) -> None:
+    def record_connect(self, now_ns: int) -> None:
         """The device delivers, or is about to."""
         self.health = Health.OK
         self._connections += 1
-        self._listen(now_ns)
+        self._reset_timers(now_ns)
 
-    def lost(self, now_ns: int) -> None:
+    def record_disconnect(self, now_ns: int) -> None:
         """The device is gone, or cannot be opened."""
-        self._away(now_ns + self._retry_ns)
+        self._set_away(now_ns + self._retry_ns)
 
-    def heard(self, stream: str, now_ns: int) -> None:
+    def record_sample(self, stream: str, now_ns: int) -> None:
         """A sample of the stream came."""
-        if stream in self._heard_ns:
-            self._ever.add(stream)
-            self._heard_ns[stream] = max(self._heard_ns[stream], now_ns)
+        if stream in self._last_sample_ns:
+            self._delivered.add(stream)
+            self._last_sample_ns[stream] = max(self._last_sample_ns[stream], now_ns)
 
     def tick(self, now_ns: int) -> Action:
         """What to do now."""
-        slept, self._tick_ns = now_ns - self._tick_ns > self._silent_ns // 2, now_ns
+        was_late, self._tick_ns = now_ns - self._tick_ns > self._silent_ns // 2, now_ns
         if self.health is Health.AWAY:
             return self._retry(now_ns)
-        self._late = slept and not self._late  # but who is always late must judge all the same
-        return Action.NOTHING if self._late else self._judge(now_ns)
+        self._is_late = was_late and not self._is_late  # but who is always late must judge all the same
+        return Action.NOTHING if self._is_late else self._evaluate(now_ns)
 
-    def _listen(self, now_ns: int) -> None:
-        self._without = set()
+    def _reset_timers(self, now_ns: int) -> None:
+        self._excluded = set()
         self._tick_ns = now_ns
-        self._heard_ns = dict.fromkeys(self._heard_ns, now_ns + self._warm_up_ns - self._silent_ns)
+        self._last_sample_ns = dict.fromkeys(
+            self._last_sample_ns, now_ns + self._warm_up_ns - self._silent_ns
+        )
 
-    def _away(self, until_ns: int) -> None:
-        self.health, self._try_ns = Health.AWAY, until_ns
+    def _set_away(self, until_ns: int) -> None:
+        self.health, self._retry_due_ns = Health.AWAY, until_ns
 
     def _retry(self, now_ns: int) -> Action:
-        if now_ns < self._try_ns:
+        if now_ns < self._retry_due_ns:
             return Action.NOTHING
-        self._try_ns = now_ns + self._retry_ns
+        self._retry_due_ns = now_ns + self._retry_ns
         return Action.RECONNECT
 
-    def _judge(self, now_ns: int) -> Action:
-        ages = {name: now_ns - at_ns for name, at_ns in self._heard_ns.items()}
+    def _evaluate(self, now_ns: int) -> Action:
+        ages = {name: now_ns - at_ns for name, at_ns in self._last_sample_ns.items()}
         silent = {name for name, age in ages.items() if age > self._silent_ns}
-        if back := self._without - silent:
-            return self._back(back)
+        if recovered := self._excluded - silent:
+            return self._recover(recovered)
         if len(silent) == len(ages):  # where all fall silent, it is gone
-            self._name(silent - self._without)
-            return self._lose(now_ns, gone=bool(self._ever))
+            self._set_silent(silent - self._excluded)
+            return self._reconnect(now_ns, is_device_gone=bool(self._delivered))
         # what is pulled out falls silent stream by stream, since queues differ: so the others must go on
-        surely = {name for name in silent if ages[name] > 2 * self._silent_ns}
-        if surely <= self._without or min(ages.values()) > self._silent_ns // 2:
+        long_silent = {name for name in silent if ages[name] > 2 * self._silent_ns}
+        if long_silent <= self._excluded or min(ages.values()) > self._silent_ns // 2:
             return Action.NOTHING
-        self._name(surely - self._without)
+        self._set_silent(long_silent - self._excluded)
         if self.resets == 0:
             return self._reset(now_ns)
-        if enough(self._heard_ns.keys() - surely, sees=CAM0 in self._heard_ns):
-            return self._go_without(surely)
-        return self._lose(now_ns, gone=False)
+        if is_sufficient(self._last_sample_ns.keys() - long_silent, needs_image=CAM0 in self._last_sample_ns):
+            return self._exclude(long_silent)
+        return self._reconnect(now_ns, is_device_gone=False)
 
-    def _name(self, silent: set[str]) -> None:
-        self.silent = tuple(name for name in self._heard_ns if name in silent)
+    def _set_silent(self, silent: set[str]) -> None:
+        self.silent = tuple(name for name in self._last_sample_ns if name in silent)
 
-    def _lose(self, now_ns: int, gone: bool) -> Action:
+    def _reconnect(self, now_ns: int, is_device_gone: bool) -> Action:
         """gone: the device as a whole, which has delivered before."""
-        if not gone and not set(self.silent) <= self._ever:
+        if not is_device_gone and not set(self.silent) <= self._delivered:
             if self.resets == 0:
                 return self._reset(now_ns)
-            self._vain += 1
-            if self._vain >= _IN_VAIN:
+            self._failed_connections += 1
+            if self._failed_connections >= _MAX_FAILED_CONNECTIONS:
                 return Action.GIVE_UP
-        self.lost(now_ns)
+        self.record_disconnect(now_ns)
         return Action.RECONNECT
 
     def _reset(self, now_ns: int) -> Action:
         self.resets += 1
-        self._away(now_ns + self._reset_ns)
+        self._set_away(now_ns + self._reset_ns)
         return Action.RESET
 
-    def _go_without(self, silent: set[str]) -> Action:
-        self._without = set(silent)
-        self._say_health()
+    def _exclude(self, silent: set[str]) -> Action:
+        self._excluded = set(silent)
+        self._update_health()
         return Action.GO_WITHOUT
 
-    def _back(self, back: set[str]) -> Action:
-        self._name(back)
-        self._without -= back
-        self._say_health()
-        return Action.HEARD_AGAIN
+    def _recover(self, recovered: set[str]) -> Action:
+        self._set_silent(recovered)
+        self._excluded -= recovered
+        self._update_health()
+        return Action.RECOVERED
 
-    def _say_health(self) -> None:
-        if self._without & {ACCEL, GYRO}:
+    def _update_health(self) -> None:
+        if self._excluded & {ACCEL, GYRO}:
             self.health = Health.VISION_ONLY
         else:
-            self.health = Health.DEGRADED if self._without else Health.OK
+            self.health = Health.DEGRADED if self._excluded else Health.OK

@@ -5,133 +5,133 @@ from __future__ import annotations
 import sqlite3
 from typing import Any
 
-from share.mapping.changes import (
-    Change,
-    DropLoop,
-    ForgetRun,
-    KeepKeyframe,
-    KeepLink,
-    KeepLoop,
-    KeepPoses,
-    KeepRun,
-    KeepVoice,
-    Retire,
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import (
+    MapChange,
+    RemoveKeyframes,
+    RemoveLoops,
+    RemoveRun,
+    SaveCredential,
+    SaveKeyframe,
+    SaveLink,
+    SaveLoop,
+    SavePoses,
+    SaveRun,
 )
-from share.mapping.loops import Key
 from share.store import rows
 from share.store.rows import COLUMNS, insert
 
-_OF_RUN = (
+_RUN_COLUMNS = (
     *(("run", "key"), ("run_copy", "key"), ("stretch", "run"), ("keyframe", "run"), ("link", "run")),
     *(("loop", "a_run"), ("loop", "b_run")),
 )
 
 
-def apply(db: sqlite3.Connection, change: Change) -> None:
+def apply_change(db: sqlite3.Connection, change: MapChange) -> None:
     """Raises ValueError for a keyframe of a run that was never kept."""
     match change:
-        case KeepRun():
-            _run(db, change)
-        case KeepVoice(run, voice):
-            _voice(db, run, voice)
-        case KeepKeyframe():
-            _keyframe(db, change)
-        case KeepLink():
-            _forget(db, "link", change.key)
-            insert(db, "link", rows.of_link(change))
-        case KeepLoop():
-            _loop(db, change)
-        case DropLoop(a, b):
+        case SaveRun():
+            _insert_run(db, change)
+        case SaveCredential(run, voice):
+            _set_credential(db, run, voice)
+        case SaveKeyframe():
+            _insert_keyframe(db, change)
+        case SaveLink():
+            _delete_row(db, "link", change.key)
+            insert(db, "link", rows.link_row(change))
+        case SaveLoop():
+            _insert_loop(db, change)
+        case RemoveLoops(a, b):
             for first, second in ((a, b), (b, a)):
                 db.execute(
                     "DELETE FROM loop WHERE a_run = ? AND a_id = ? AND b_run = ? AND b_id = ?",
                     (*first, *second),
                 )
-        case Retire():
+        case RemoveKeyframes():
             for key in change.keys:
-                _retire(db, key)
-        case ForgetRun():
-            _forget_run(db, change.key)
-        case KeepPoses():
+                _remove_keyframe(db, key)
+        case RemoveRun():
+            _delete_run(db, change.run_key)
+        case SavePoses():
             db.execute("DELETE FROM poses")
-            insert(db, "poses", rows.of_poses(change))
+            insert(db, "poses", rows.poses_row(change))
 
 
-def _run(db: sqlite3.Connection, change: KeepRun) -> None:
-    if not _one(db, "SELECT 1 FROM run WHERE key = ?", change.key):
+def _insert_run(db: sqlite3.Connection, change: SaveRun) -> None:
+    if not _first_row(db, "SELECT 1 FROM run WHERE key = ?", change.run_key):
         for table in ("run", "run_copy"):
-            insert(db, table, rows.of_run(change, 0))
-        _voice(db, change.key, change.voice)
+            insert(db, table, rows.run_row(change, 0))
+        _set_credential(db, change.run_key, change.credential)
 
 
-def _voice(db: sqlite3.Connection, run: str, voice: str | None) -> None:
-    row = rows.of_voice(run, voice or "")
+def _set_credential(db: sqlite3.Connection, run: str, credential: str | None) -> None:
+    row = rows.credential_row(run, credential or "")
     db.execute("DELETE FROM about WHERE name = ?", row[:1])
-    if voice and _one(db, "SELECT 1 FROM run WHERE key = ?", run):
+    if credential and _first_row(db, "SELECT 1 FROM run WHERE key = ?", run):
         insert(db, "about", row)
 
 
-def _keyframe(db: sqlite3.Connection, change: KeepKeyframe) -> None:
-    if change.at.id < _next(db, change.key):
+def _insert_keyframe(db: sqlite3.Connection, change: SaveKeyframe) -> None:
+    if change.keyframe_key.id < _next_id(db, change.run_key):
         return
-    stretch, ordinal = _place(db, change.key, begins=change.keyframe.reference < 0)
-    insert(db, "keyframe", rows.of_keyframe(change, stretch, ordinal))
+    segment, ordinal = _segment_and_ordinal(db, change.run_key, starts_segment=change.keyframe.reference < 0)
+    insert(db, "keyframe", rows.keyframe_row(change, segment, ordinal))
 
 
-def _place(db: sqlite3.Connection, run: str, begins: bool) -> tuple[int, int]:
+def _segment_and_ordinal(db: sqlite3.Connection, run: str, starts_segment: bool) -> tuple[int, int]:
     """The run's newest stretch, since a keyframe refers to the one before it, or a new one; and its place."""
-    (stretch,) = _one(db, "SELECT ifnull(max(nth), -1) FROM stretch WHERE run = ?", run)
-    if begins or stretch < 0:
-        insert(db, "stretch", (run, stretch + 1))
-        return stretch + 1, 0
+    (segment,) = _first_row(db, "SELECT ifnull(max(nth), -1) FROM stretch WHERE run = ?", run)
+    if starts_segment or segment < 0:
+        insert(db, "stretch", (run, segment + 1))
+        return segment + 1, 0
     newest = "SELECT stretch, ordinal FROM keyframe WHERE run = ? ORDER BY id DESC LIMIT 1"
-    before, ordinal = _one(db, newest, run) or (-1, -1)
-    return stretch, ordinal + 1 if before == stretch else 0
+    previous_segment, ordinal = _first_row(db, newest, run) or (-1, -1)
+    return segment, ordinal + 1 if previous_segment == segment else 0
 
 
-def _next(db: sqlite3.Connection, run: str) -> int:
+def _next_id(db: sqlite3.Connection, run: str) -> int:
     """One above all numbers that the run ever had."""
-    known = _one(db, "SELECT next FROM run WHERE key = ?", run)
-    if not known:
+    row = _first_row(db, "SELECT next FROM run WHERE key = ?", run)
+    if not row:
         raise ValueError(f"run {run} is not kept; its KeepRun comes first")
-    (above,) = _one(db, "SELECT ifnull(max(id) + 1, 0) FROM keyframe WHERE run = ?", run)
-    return max(int(known[0]), int(above))
+    (next_id,) = _first_row(db, "SELECT ifnull(max(id) + 1, 0) FROM keyframe WHERE run = ?", run)
+    return max(int(row[0]), int(next_id))
 
 
-def _loop(db: sqlite3.Connection, change: KeepLoop) -> None:
-    row = rows.of_loop(change.loop)
+def _insert_loop(db: sqlite3.Connection, change: SaveLoop) -> None:
+    row = rows.loop_row(change.loop)
     same = " AND ".join(f"{name} IS ?" for name in COLUMNS["loop"])
-    if not _one(db, f"SELECT 1 FROM loop WHERE {same}", *row):
+    if not _first_row(db, f"SELECT 1 FROM loop WHERE {same}", *row):
         insert(db, "loop", row)
 
 
-def _retire(db: sqlite3.Connection, key: Key) -> None:
-    following = _next(db, key.agent)
+def _remove_keyframe(db: sqlite3.Connection, key: KeyframeKey) -> None:
+    next_id = _next_id(db, key.agent)
     for table in ("keyframe", "link"):
-        _forget(db, table, key)
+        _delete_row(db, table, key)
     db.execute("DELETE FROM loop WHERE a_run = ? AND a_id = ?", key)
     db.execute("DELETE FROM loop WHERE b_run = ? AND b_id = ?", key)
-    if _next(db, key.agent) < following:  # it was the newest: the rest no longer says so
-        _remember_next(db, key.agent, following)
+    if _next_id(db, key.agent) < next_id:  # it was the newest: the rest no longer says so
+        _store_next_id(db, key.agent, next_id)
 
 
-def _forget_run(db: sqlite3.Connection, run: str) -> None:
-    for table, column in _OF_RUN:
+def _delete_run(db: sqlite3.Connection, run: str) -> None:
+    for table, column in _RUN_COLUMNS:
         db.execute(f"DELETE FROM {table} WHERE {column} = ?", (run,))
-    _voice(db, run, None)
+    _set_credential(db, run, None)
 
 
-def _remember_next(db: sqlite3.Connection, run: str, following: int) -> None:
+def _store_next_id(db: sqlite3.Connection, run: str, next_id: int) -> None:
     for table in ("run", "run_copy"):
-        number, codec, hello = _one(db, f"SELECT number, codec, hello FROM {table} WHERE key = ?", run)
+        number, codec, hello = _first_row(db, f"SELECT number, codec, hello FROM {table} WHERE key = ?", run)
         db.execute(f"DELETE FROM {table} WHERE number = ?", (number,))
-        insert(db, table, (run, following, codec, hello), number)
+        insert(db, table, (run, next_id, codec, hello), number)
 
 
-def _forget(db: sqlite3.Connection, table: str, key: Key) -> None:
+def _delete_row(db: sqlite3.Connection, table: str, key: KeyframeKey) -> None:
     db.execute(f"DELETE FROM {table} WHERE run = ? AND id = ?", key)
 
 
-def _one(db: sqlite3.Connection, query: str, *values: Any) -> tuple[Any, ...]:
+def _first_row(db: sqlite3.Connection, query: str, *values: Any) -> tuple[Any, ...]:
     """The first row, or ()."""
     return db.execute(query, values).fetchone() or ()

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from share.errors import UsageError
-from share.files.sqlite_file import log_of
-from share.files.writing import atomic_write, fresh, new_folder, writing
+from share.files.sqlite_file import wal_path
+from share.files.writing import atomic_write, new_folder, open_new, write_errors
 from share.geometry import se3
-from share.mapping.changes import Kept, KeptKeyframe, placed
-from share.mapping.loops import Key, Loop
+from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.map_changes import StoredKeyframe, StoredMap, map_poses
 from share.recordings.trajectory import Trajectory, format_tum
 from share.store.map_store import MapStore
 from share.types import F64
@@ -27,7 +27,7 @@ COLOURS: tuple[Colour, ...] = (  # matplotlib's tab10: one an agent run, in the 
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportResult:
     """Of one map: the folder it went to, its agents by file name, how many of each."""
 
     folder: Path
@@ -37,74 +37,78 @@ class Exported:
     loops: int
 
 
-def export(kept: Kept, out: Path, progress: Callable[[int], None]) -> dict[str, Exported]:
+def export_map(stored_map: StoredMap, out: Path, progress: Callable[[int], None]) -> dict[str, ExportResult]:
     """Write every map into `out`, a new folder; of several maps each into a folder there. On error: nothing.
 
     In each: NAME.tum, poses of the body at the keyframes in the map; points.ply; loops.csv. progress: told of
     each keyframe. Raises UsageError if there is nothing to write or something in `out`, ShareError.
     """
-    if not kept.keyframes:
+    if not stored_map.keyframes:
         raise UsageError("the map is empty: there is nothing to export")
     with new_folder(out) as work:
-        done = _write_all(kept, work, progress)
-    return {name: _moved(e, work, out) for name, e in done.items()}
+        done = _write_all(stored_map, work, progress)
+    return {name: _with_final_folder(e, work, out) for name, e in done.items()}
 
 
-def file_names(kept: Kept) -> dict[str, str]:
+def file_names(stored_map: StoredMap) -> dict[str, str]:
     """By run: the agent's name, or the run's key where several runs have one name, or one is called as it."""
-    names = Counter(run.hello.name for run in kept.runs)
-    keys = {run.key for run in kept.runs}
+    names = Counter(run.hello.name for run in stored_map.runs)
+    keys = {run.run_key for run in stored_map.runs}
     return {
-        run.key: run.key if names[run.hello.name] > 1 or run.hello.name in keys else run.hello.name
-        for run in kept.runs
+        run.run_key: run.run_key if names[run.hello.name] > 1 or run.hello.name in keys else run.hello.name
+        for run in stored_map.runs
     }
 
 
-def _write_all(kept: Kept, work: Path, progress: Callable[[int], None]) -> dict[str, Exported]:
-    poses = placed(kept)
-    by_map: dict[str, list[KeptKeyframe]] = {}
-    for keyframe in kept.keyframes:
-        by_map.setdefault(poses[keyframe.at][0], []).append(keyframe)
+def _write_all(stored_map: StoredMap, work: Path, progress: Callable[[int], None]) -> dict[str, ExportResult]:
+    poses = map_poses(stored_map)
+    by_map: dict[str, list[StoredKeyframe]] = {}
+    for keyframe in stored_map.keyframes:
+        by_map.setdefault(poses[keyframe.keyframe_key][0], []).append(keyframe)
     done = {}
     for name, keyframes in by_map.items():
         folder = work if len(by_map) == 1 else work / name.replace("/", ".")
         folder.mkdir(exist_ok=True)
-        T = {k.at: poses[k.at][1] for k in keyframes}
-        loops = [x for x in kept.loops if x.a in T and x.b in T]
+        T = {k.keyframe_key: poses[k.keyframe_key][1] for k in keyframes}
+        loops = [x for x in stored_map.loops if x.a in T and x.b in T]
         _write_loops(folder / "loops.csv", loops)
-        agents = _write_trajectories(kept, keyframes, T, folder)
-        points = write_ply(folder / "points.ply", _clouds(kept, keyframes, T, progress))
-        done[name] = Exported(folder, agents, len(keyframes), points, len(loops))
+        agents = _write_trajectories(stored_map, keyframes, T, folder)
+        points = write_ply(folder / "points.ply", _point_clouds(stored_map, keyframes, T, progress))
+        done[name] = ExportResult(folder, agents, len(keyframes), points, len(loops))
     return done
 
 
 def _write_trajectories(
-    kept: Kept, keyframes: list[KeptKeyframe], T: dict[Key, F64], folder: Path
+    stored_map: StoredMap, keyframes: list[StoredKeyframe], T: dict[KeyframeKey, F64], folder: Path
 ) -> tuple[str, ...]:
-    names = file_names(kept)
-    by_run: dict[str, list[KeptKeyframe]] = {}
+    names = file_names(stored_map)
+    by_run: dict[str, list[StoredKeyframe]] = {}
     for keyframe in keyframes:
-        by_run.setdefault(keyframe.key, []).append(keyframe)
+        by_run.setdefault(keyframe.run_key, []).append(keyframe)
     for run, own in by_run.items():
         own.sort(key=lambda k: k.keyframe.stamp_ns)
         stamps = np.array([k.keyframe.stamp_ns for k in own], np.int64)
-        text = format_tum(Trajectory(stamps, np.array([T[k.at] for k in own])))
+        text = format_tum(Trajectory(stamps, np.array([T[k.keyframe_key] for k in own])))
         atomic_write(folder / f"{names[run]}.tum", text)
     return tuple(names[run] for run in by_run)
 
 
-def _clouds(
-    kept: Kept, keyframes: list[KeptKeyframe], T: dict[Key, F64], progress: Callable[[int], None]
+def _point_clouds(
+    stored_map: StoredMap,
+    keyframes: list[StoredKeyframe],
+    T: dict[KeyframeKey, F64],
+    progress: Callable[[int], None],
 ) -> Iterator[tuple[F64, Colour]]:
     """The points that each keyframe saw, in the map, in its agent's colour."""
     runs = {
-        run.key: (run.hello.rig.T_body_cam0, COLOURS[i % len(COLOURS)]) for i, run in enumerate(kept.runs)
+        run.run_key: (run.hello.rig.T_body_cam0, COLOURS[i % len(COLOURS)])
+        for i, run in enumerate(stored_map.runs)
     }
     for keyframe in keyframes:
-        T_body_cam0, colour = runs[keyframe.key]
+        T_body_cam0, colour = runs[keyframe.run_key]
         points = keyframe.keyframe.view.points.astype(np.float64)
         known = points[~np.isnan(points).any(1)]
-        yield se3.transform(T[keyframe.at] @ T_body_cam0, known), colour
+        yield se3.transform(T[keyframe.keyframe_key] @ T_body_cam0, known), colour
         progress(1)
 
 
@@ -113,9 +117,9 @@ def _write_loops(path: Path, loops: list[Loop]) -> None:
     lines = ["a_run,a,b_run,b,x,y,z,qx,qy,qz,qw,inliers"]
     for loop in loops:
         numbers = (*loop.T_a_b[:3, 3], *se3.quat_from_matrix(loop.T_a_b[:3, :3]))
-        told = ",".join(f"{value:.9f}" for value in numbers)
+        pose_text = ",".join(f"{value:.9f}" for value in numbers)
         lines.append(
-            f"{_quoted(loop.a.agent)},{loop.a.id},{_quoted(loop.b.agent)},{loop.b.id},{told},{loop.inliers}"
+            f"{_quoted(loop.a.agent)},{loop.a.id},{_quoted(loop.b.agent)},{loop.b.id},{pose_text},{loop.inliers}"
         )
     atomic_write(path, "\n".join(lines) + "\n")
 
@@ -125,9 +129,9 @@ def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
-def _moved(exported: Exported, work: Path, out: Path) -> Exported:
+def _with_final_folder(exported: ExportResult, work: Path, out: Path) -> ExportResult:
     folder = out / exported.folder.relative_to(work)
-    return Exported(folder, exported.agents, exported.keyframes, exported.points, exported.loops)
+    return ExportResult(folder, exported.agents, exported.keyframes, exported.points, exported.loops)
 
 
 # ---- What is in a map file, as plain data: `share dataset info`.
@@ -135,35 +139,35 @@ def _moved(exported: Exported, work: Path, out: Path) -> Exported:
 
 def describe_map(store: MapStore) -> dict[str, Any]:
     """Agents, maps, loops, size, schema, damage. Raises ShareError."""
-    kept = store.load()
-    log = log_of(store.path)
+    stored_map = store.load()
+    log = wal_path(store.path)
     return {
         "name": store.path.name,
         "schema": store.schema,
         "bytes": store.path.stat().st_size + (log.stat().st_size if log.exists() else 0),
-        "keyframes": len(kept.keyframes),
-        "agents": _agents(kept),
-        "maps": dict(Counter(name for name, _ in placed(kept).values())),
-        "solved": 0 if kept.poses is None else len(kept.poses.keys),
-        "loops": len(kept.loops),
-        "damage": list(kept.complaints),
+        "keyframes": len(stored_map.keyframes),
+        "agents": _describe_agents(stored_map),
+        "maps": dict(Counter(name for name, _ in map_poses(stored_map).values())),
+        "solved": 0 if stored_map.poses is None else len(stored_map.poses.keys),
+        "loops": len(stored_map.loops),
+        "damage": list(stored_map.problems),
     }
 
 
-def _agents(kept: Kept) -> dict[str, Any]:
+def _describe_agents(stored_map: StoredMap) -> dict[str, Any]:
     """By file name of each run, in the order in which they came."""
-    held = Counter(k.key for k in kept.keyframes)
-    stretches = Counter(name.rpartition("/")[0] for name in kept.stretches)
-    names = file_names(kept)
+    keyframe_counts = Counter(k.run_key for k in stored_map.keyframes)
+    segment_counts = Counter(name.rpartition("/")[0] for name in stored_map.segments)
+    names = file_names(stored_map)
     return {
-        names[run.key]: {
-            "run": run.key,
+        names[run.run_key]: {
+            "run": run.run_key,
             "kind": str(run.hello.kind),
-            "keyframes": held[run.key],
-            "next_keyframe": kept.next_keyframe[run.key],
-            "stretches": stretches[run.key],
+            "keyframes": keyframe_counts[run.run_key],
+            "next_keyframe": stored_map.next_ids[run.run_key],
+            "stretches": segment_counts[run.run_key],
         }
-        for run in kept.runs
+        for run in stored_map.runs
     }
 
 
@@ -172,7 +176,7 @@ def _agents(kept: Kept) -> dict[str, Any]:
 Colour = tuple[int, int, int]
 
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
-_NAMES = {"<f4": "float", "|u1": "uchar"}
+_PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
 def write_ply(path: Path, clouds: Iterable[tuple[F64, Colour]]) -> int:
@@ -180,8 +184,8 @@ def write_ply(path: Path, clouds: Iterable[tuple[F64, Colour]]) -> int:
 
     The clouds are written as they come, their number into the header in the end.
     """
-    with writing(path), fresh(path) as file:
-        file.write(_header(0))
+    with write_errors(path), open_new(path) as file:
+        file.write(_ply_header(0))
         count = 0
         for points, colour in clouds:
             vertices = np.empty(len(points), _VERTEX)
@@ -191,14 +195,14 @@ def write_ply(path: Path, clouds: Iterable[tuple[F64, Colour]]) -> int:
             file.write(vertices.tobytes())
             count += len(points)
         file.seek(0)
-        file.write(_header(count))
+        file.write(_ply_header(count))
     return count
 
 
-def _header(count: int) -> bytes:
+def _ply_header(count: int) -> bytes:
     """Of the same length for every count."""
     assert _VERTEX.fields is not None
-    properties = [f"property {_NAMES[kind.str]} {name}" for name, (kind, *_) in _VERTEX.fields.items()]
+    properties = [f"property {_PLY_TYPES[kind.str]} {name}" for name, (kind, *_) in _VERTEX.fields.items()]
     lines = [
         "ply",
         "format binary_little_endian 1.0",

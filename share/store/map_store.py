@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from share.errors import StoreError, UsageError
-from share.files.sqlite_file import log_of
-from share.mapping.changes import Change, Kept
-from share.store import changes, connect, reading, schema
-from share.store.connect import is_map, why_not_written
-from share.store.opening import examine, look, make
-from share.store.salvage import set_aside, whole_rows
+from share.files.sqlite_file import wal_path
+from share.mapping.map_changes import MapChange, StoredMap
+from share.store import changes, database, decoding, schema
+from share.store.database import is_map, why_not_written
+from share.store.opening import load_and_repair, load_read_only, open_writer
+from share.store.salvage import read_intact_rows, set_aside
 
 # ---- The edge's map on disk.
 
@@ -27,20 +27,20 @@ class MapStore:
     writable: whether `write` can be called. reason: why not. schema: of the file, as it was found.
     """
 
-    def __init__(self, path: Path, kept: Kept, schema: int, reason: str) -> None:
-        self.path, self.schema, self.reason = path, schema, reason
-        self._kept: Kept | None = kept
+    def __init__(self, path: Path, loaded_map: StoredMap, schema: int, reason: str) -> None:
+        self.path, self.schema, self.read_only_reason = path, schema, reason
+        self._loaded_map: StoredMap | None = loaded_map
         self._db: sqlite3.Connection | None = None
-        self._files: dict[Path, tuple[int, int]] = {}  # those of the map, and which they are
+        self._file_ids: dict[Path, tuple[int, int]] = {}  # those of the map, and which they are
         self._lock: int | None = None
-        self._power_cut = False
+        self._durable = False
 
     @property
     def writable(self) -> bool:
         return self._db is not None
 
     @staticmethod
-    def open(path: Path, power_cut: bool = False) -> MapStore:
+    def open(path: Path, durable: bool = False) -> MapStore:
         """The map in `path`, made if there is none; all of it is read and checked.
 
         An older schema is brought up to date after a copy, FILE.schema-N, was made. From a damaged file
@@ -52,38 +52,38 @@ class MapStore:
         path = path.resolve() if path.is_symlink() else path
         if path.is_dir():
             raise UsageError(f"{path}: is a folder; give the name of a file")
-        reason = connect.obstacle(path)
+        reason = database.write_obstacle(path)
         if reason and not path.exists():
             raise UsageError(f"{path}: a map cannot be made there: {reason}")
         if reason:
             return MapStore.read(path, reason)
-        held = connect.take(path)
+        lock = database.lock_map(path)
         try:
-            store = MapStore(path, examine(path), schema.SCHEMA, "")
-            store._db, store._lock = make(path, power_cut), held
-            store._files, store._power_cut = _which(path), power_cut
+            store = MapStore(path, load_and_repair(path), schema.SCHEMA, "")
+            store._db, store._lock = open_writer(path, durable), lock
+            store._file_ids, store._durable = _read_file_ids(path), durable
             return store
         except BaseException:
-            os.close(held)
+            os.close(lock)
             raise
 
     @staticmethod
     def read(path: Path, reason: str = "it was opened for reading") -> MapStore:
         """A map to read only, beside an edge in another process too. Raises UsageError, ShareError."""
-        return MapStore(path, *look(path), reason)
+        return MapStore(path, *load_read_only(path), reason)
 
-    def write(self, news: Sequence[Change]) -> None:
+    def write(self, new_changes: Sequence[MapChange]) -> None:
         """All of them or none; on return they survive the end of this process, however it ends.
 
         Raises StoreError if the disk is full or fails: then none was kept, and it may be tried again.
         """
-        db = self._writer()
+        db = self._writable_db()
         self._check_in_place()
-        self._kept = None  # of before
+        self._loaded_map = None  # of before
         try:
             db.execute("BEGIN IMMEDIATE")
-            for change in news:
-                changes.apply(db, change)
+            for change in new_changes:
+                changes.apply_change(db, change)
             db.execute("COMMIT")
         except BaseException as error:
             with contextlib.suppress(sqlite3.Error):  # a full disk has rolled back by itself
@@ -94,31 +94,31 @@ class MapStore:
             raise
         self._check_in_place()
 
-    def peek(self) -> Kept:
+    def opened_map(self) -> StoredMap:
         """What `open` has read, before anything is written or loaded."""
-        return Kept() if self._kept is None else self._kept
+        return StoredMap() if self._loaded_map is None else self._loaded_map
 
-    def load(self) -> Kept:
+    def load(self) -> StoredMap:
         """All that is kept. The first time it is what `open` has read. Raises StoreError."""
-        kept, self._kept = self._kept, None
-        if kept is not None:
-            return kept
+        loaded, self._loaded_map = self._loaded_map, None
+        if loaded is not None:
+            return loaded
         if self._db is None:
-            return look(self.path)[0]
-        return reading.kept(whole_rows(self._db))
+            return load_read_only(self.path)[0]
+        return decoding.decode_map(read_intact_rows(self._db))
 
     def set_aside(self) -> Path:
         """A fresh map in place of this one, which is kept beside; its new name.
 
         Raises ShareError where that cannot be: then the map is as it was.
         """
-        self._writer().close()
+        self._writable_db().close()
         try:
             return set_aside(self.path)
         finally:
-            self._kept = None
-            self._db = make(self.path, self._power_cut)
-            self._files = _which(self.path)
+            self._loaded_map = None
+            self._db = open_writer(self.path, self._durable)
+            self._file_ids = _read_file_ids(self.path)
 
     def close(self) -> None:
         """Moves the log into the file and gives it free."""
@@ -142,26 +142,28 @@ class MapStore:
 
     def _check_in_place(self) -> None:
         """SQLite would go on writing to a file that has lost its name, and nobody would find it there."""
-        now = _which(self.path)
-        for path, which in self._files.items():
-            if now.get(path) != which:
+        now = _read_file_ids(self.path)
+        for path, file_id in self._file_ids.items():
+            if now.get(path) != file_id:
                 what = "removed" if path not in now else "replaced"
                 raise StoreError(
                     f"{self.path}: the map cannot be written: {path.name} was {what} while the edge ran; "
                     "put it back, or start the edge again"
                 )
 
-    def _writer(self) -> sqlite3.Connection:
+    def _writable_db(self) -> sqlite3.Connection:
         if self._db is None:
-            raise StoreError(f"{self.path}: the map cannot be written: {self.reason or 'it was closed'}")
+            raise StoreError(
+                f"{self.path}: the map cannot be written: {self.read_only_reason or 'it was closed'}"
+            )
         return self._db
 
 
-def _which(path: Path) -> dict[Path, tuple[int, int]]:
+def _read_file_ids(path: Path) -> dict[Path, tuple[int, int]]:
     """Device and inode of the map and its log, of those that are there."""
     out = {}
-    for file in (path, log_of(path)):
+    for file in (path, wal_path(path)):
         with contextlib.suppress(FileNotFoundError):
-            found = file.stat()
-            out[file] = found.st_dev, found.st_ino
+            status = file.stat()
+            out[file] = status.st_dev, status.st_ino
     return out

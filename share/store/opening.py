@@ -10,51 +10,58 @@ from pathlib import Path
 
 from share.errors import StoreError, UsageError
 from share.files.reading import open_regular
-from share.files.writing import fresh, writing
-from share.mapping.changes import Kept
-from share.store import connect, reading, schema
-from share.store.connect import DamageError, complaints
-from share.store.salvage import copied, finish, salvage, whole_of, whole_rows, with_copies
+from share.files.writing import open_new, write_errors
+from share.mapping.map_changes import StoredMap
+from share.store import database, decoding, schema
+from share.store.database import DamageError, translate_errors
+from share.store.salvage import (
+    finish_salvage,
+    merge_run_copies,
+    read_damaged,
+    read_intact_rows,
+    salvage,
+    temporary_copy,
+)
 
 
-def examine(path: Path) -> Kept:
+def load_and_repair(path: Path) -> StoredMap:
     """All of a map file, before it is opened for writing; brought up to date or salvaged first."""
-    finish(path)
-    if not connect.check_is_map(path):
-        return Kept()
+    finish_salvage(path)
+    if not database.check_is_map(path):
+        return StoredMap()
     try:
-        found = _version(path)
-        if found < schema.SCHEMA:
-            _bring_up_to_date(path, found)
-        return _contents(path)
+        version = _read_schema(path)
+        if version < schema.SCHEMA:
+            _upgrade(path, version)
+        return _load_intact(path)
     except DamageError:
-        whole, beside = salvage(path)
-        return _with(
-            reading.kept(whole),
-            f"the file was damaged; it is kept as {beside.name}, what is whole was taken over",
+        salvaged, renamed = salvage(path)
+        return _with_complaint(
+            decoding.decode_map(salvaged),
+            f"the file was damaged; it is kept as {renamed.name}, what is whole was taken over",
         )
 
 
-def look(path: Path) -> tuple[Kept, int]:
+def load_read_only(path: Path) -> tuple[StoredMap, int]:
     """All of a map file and its schema, the file left as it is."""
-    if not connect.check_is_map(path):
+    if not database.check_is_map(path):
         raise UsageError(f"{path}: there is no map in it")
     try:
-        found = _version(path)
-        if found == schema.SCHEMA:
-            return _contents(path), found
-        with copied(path) as copy:
-            _migrate(copy, found)
-            return _contents(copy), found
+        version = _read_schema(path)
+        if version == schema.SCHEMA:
+            return _load_intact(path), version
+        with temporary_copy(path) as copy:
+            _migrate(copy, version)
+            return _load_intact(copy), version
     except DamageError:
-        kept = reading.kept(with_copies(whole_of(path)))
-        return _with(kept, "the file is damaged; only what is whole was read"), schema.SCHEMA
+        salvaged = decoding.decode_map(merge_run_copies(read_damaged(path)))
+        return _with_complaint(salvaged, "the file is damaged; only what is whole was read"), schema.SCHEMA
 
 
-def make(path: Path, power_cut: bool) -> sqlite3.Connection:
-    """The writer's connection to a file that `examine` found good; its tables, if it has none."""
-    with complaints(path, "opened"):
-        connection = connect.for_writing(path, power_cut)
+def open_writer(path: Path, durable: bool) -> sqlite3.Connection:
+    """The writer's connection to a file that `load_and_repair` found good; its tables, if it has none."""
+    with translate_errors(path, "opened"):
+        connection = database.open_for_writing(path, durable)
         if schema.is_empty(connection):
             connection.execute("BEGIN IMMEDIATE")
             schema.create(connection)
@@ -62,60 +69,66 @@ def make(path: Path, power_cut: bool) -> sqlite3.Connection:
     return connection
 
 
-def _version(path: Path) -> int:
+def _read_schema(path: Path) -> int:
     """Raises UsageError for a newer schema, DamageError if the file does not say."""
-    with complaints(path, "opened"), contextlib.closing(connect.for_reading(path)) as connection:
-        if schema.is_empty(connection) and connect.is_bare(path):
+    with translate_errors(path, "opened"), contextlib.closing(database.open_for_reading(path)) as connection:
+        if schema.is_empty(connection) and database.is_blank(path):
             return schema.SCHEMA
-        found = schema.version(connection)
-    if found is None:
+        version = schema.read_version(connection)
+    if version is None:
         raise DamageError(f"{path}: the map is damaged: it does not say its schema")
-    if found > schema.SCHEMA:
+    if version > schema.SCHEMA:
         raise UsageError(
-            f"{path}: was made by a newer SHARE (schema {found}, this one knows {schema.SCHEMA}); "
+            f"{path}: was made by a newer SHARE (schema {version}, this one knows {schema.SCHEMA}); "
             "use that, or give another file"
         )
-    return found
+    return version
 
 
-def _contents(path: Path) -> Kept:
+def _load_intact(path: Path) -> StoredMap:
     """Raises DamageError unless every part of the file is whole."""
-    connect.check_header(path)
-    with complaints(path, "read"), contextlib.closing(connect.for_reading(path)) as connection:
+    database.check_header(path)
+    with translate_errors(path, "read"), contextlib.closing(database.open_for_reading(path)) as connection:
         if schema.is_empty(connection):
-            return Kept()
-        if not schema.is_ours(connection):
+            return StoredMap()
+        if not schema.matches_schema(connection):
             raise DamageError(f"{path}: the map is damaged: its tables")
         (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
         if verdict != "ok":
             raise DamageError(f"{path}: the map is damaged: {verdict}")
-        found = whole_rows(connection)
-    if found.damaged:
+        read_rows = read_intact_rows(connection)
+    if read_rows.is_damaged:
         raise DamageError(f"{path}: the map is damaged: its rows")
-    return reading.kept(found)
+    return decoding.decode_map(read_rows)
 
 
-def _bring_up_to_date(path: Path, found: int) -> None:
+def _upgrade(path: Path, version: int) -> None:
     """In place, after a copy was made."""
-    with complaints(path, "opened"), contextlib.closing(connect.for_writing(path, True)) as connection:
+    with (
+        translate_errors(path, "opened"),
+        contextlib.closing(database.open_for_writing(path, True)) as connection,
+    ):
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    copy = path.with_name(f"{path.name}.schema-{found}")
-    with writing(path), open_regular(path) as old, fresh(copy) as new:
+    copy = path.with_name(f"{path.name}.schema-{version}")
+    with write_errors(path), open_regular(path) as old, open_new(copy) as new:
         shutil.copyfileobj(old, new)
-    _migrate(path, found)
+    _migrate(path, version)
 
 
-def _migrate(path: Path, found: int) -> None:
-    if missing := [n for n in range(found, schema.SCHEMA) if n not in schema.STEPS]:
+def _migrate(path: Path, version: int) -> None:
+    if missing := [n for n in range(version, schema.SCHEMA) if n not in schema.MIGRATIONS]:
         raise UsageError(f"{path}: is of schema {missing[0]}, from which no way leads to {schema.SCHEMA}")
     try:
-        with complaints(path, "brought up to date"), contextlib.closing(sqlite3.connect(path)) as connection:
+        with (
+            translate_errors(path, "brought up to date"),
+            contextlib.closing(sqlite3.connect(path)) as connection,
+        ):
             connection.isolation_level = None
-            schema.migrate(connection, found, schema.STEPS)
+            schema.migrate(connection, version, schema.MIGRATIONS)
     except DamageError as error:
-        raise StoreError(f"{error}; it is of schema {found}: use the SHARE that made it") from None
+        raise StoreError(f"{error}; it is of schema {version}: use the SHARE that made it") from None
 
 
-def _with(kept: Kept, complaint: str) -> Kept:
-    nothing = () if kept.complaints else ("nothing of it is lost",)
-    return replace(kept, complaints=(complaint, *kept.complaints, *nothing))
+def _with_complaint(loaded: StoredMap, complaint: str) -> StoredMap:
+    nothing_lost = () if loaded.problems else ("nothing of it is lost",)
+    return replace(loaded, problems=(complaint, *loaded.problems, *nothing_lost))

@@ -16,15 +16,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from share.files.reading import open_regular
-from share.files.sqlite_file import log_of
-from share.files.writing import fresh, sync_folder, writing
-from share.store import connect, rows, schema
-from share.store.connect import BROKEN
-from share.store.rows import COLUMNS, Row, insert, is_whole
+from share.files.sqlite_file import wal_path
+from share.files.writing import open_new, sync_folder, write_errors
+from share.store import database, rows, schema
+from share.store.database import DAMAGE_ERRORS
+from share.store.rows import COLUMNS, Row, insert, is_intact
 from share.store.schema import PAGE_BYTES, own_tables
 
 # What hangs on rows that are lost. A keyframe that its agent still has may come again under its number.
-_ORPHANS = (
+_DELETE_ORPHANS = (
     "DELETE FROM keyframe WHERE run NOT IN (SELECT key FROM run)",
     "DELETE FROM link WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
     "DELETE FROM loop WHERE (a_run, a_id) NOT IN (SELECT run, id FROM keyframe)"
@@ -32,72 +32,72 @@ _ORPHANS = (
 )
 
 # Stretches whose own row is lost.
-_NAMELESS = (
+_SEGMENTS_WITHOUT_ROW = (
     "SELECT DISTINCT run, stretch FROM keyframe"
     " WHERE (run, stretch) NOT IN (SELECT run, nth FROM stretch) ORDER BY number"
 )
 
 
 @contextlib.contextmanager
-def copied(path: Path, folder: Path | None = None) -> Iterator[Path]:
+def temporary_copy(path: Path, folder: Path | None = None) -> Iterator[Path]:
     """A copy of `path` and its log for the time of the block, below `folder` or where temporary files are."""
     with tempfile.TemporaryDirectory(prefix=".map.", dir=folder) as name:
         copy = Path(name) / path.name
-        with writing(Path(name)):
-            for old, new in ((path, copy), (log_of(path), log_of(copy))):
+        with write_errors(Path(name)):
+            for old, new in ((path, copy), (wal_path(path), wal_path(copy))):
                 if old == path or old.exists():
-                    with open_regular(old) as source, fresh(new) as sink:
+                    with open_regular(old) as source, open_new(new) as sink:
                         shutil.copyfileobj(source, sink)
         yield copy
 
 
-def whole_of(path: Path, folder: Path | None = None) -> Found:
+def read_damaged(path: Path, folder: Path | None = None) -> ReadRows:
     """What is whole of a damaged file, read from a copy; with a first page of our own, if that finds more.
 
     The first page says where tables begin. It is the same in all maps, but for counters.
     """
-    with copied(path, folder) as copy:
-        as_it_is = _found(copy)
-        log_of(copy).unlink(missing_ok=True)
-        with writing(copy), copy.open("r+b") as file:
+    with temporary_copy(path, folder) as copy:
+        unchanged = _read_copy(copy)
+        wal_path(copy).unlink(missing_ok=True)
+        with write_errors(copy), copy.open("r+b") as file:
             file.write(schema.first_page())
-        return max(as_it_is, _found(copy), key=Found.size)
+        return max(unchanged, _read_copy(copy), key=ReadRows.row_count)
 
 
-def salvage(path: Path) -> tuple[Found, Path]:
+def salvage(path: Path) -> tuple[ReadRows, Path]:
     """Replace `path` by what is whole of it. Also answers the damaged file's new name. Raises ShareError."""
-    found = with_copies(whole_of(path, path.parent))
+    read_rows = merge_run_copies(read_damaged(path, path.parent))
     part = path.with_name(path.name + ".salvaged.part")
     part.unlink(missing_ok=True)
-    with connect.complaints(part, "written"), writing(part):
-        _write(found, part)
-        part.replace(_finished(path))
-    return found, finish(path)
+    with database.translate_errors(part, "written"), write_errors(part):
+        _write_rows(read_rows, part)
+        part.replace(_salvaged_path(path))
+    return read_rows, finish_salvage(path)
 
 
-def finish(path: Path) -> Path:
+def finish_salvage(path: Path) -> Path:
     """The last steps, each of which may be done already; `path` itself if there is nothing to finish."""
-    if not _finished(path).exists():
+    if not _salvaged_path(path).exists():
         return path
-    with writing(path):
-        kept = set_aside(path)
-        _finished(path).replace(path)
+    with write_errors(path):
+        renamed = set_aside(path)
+        _salvaged_path(path).replace(path)
     sync_folder(path.parent)
-    return kept
+    return renamed
 
 
 def set_aside(path: Path) -> Path:
     """A map that nobody has open, and its log, get another name, which is answered. Raises ShareError."""
-    kept = _free_name(path)
-    with writing(path):
-        for old, new in ((log_of(path), log_of(kept)), (path, kept)):
+    renamed = _free_name(path)
+    with write_errors(path):
+        for old, new in ((wal_path(path), wal_path(renamed)), (path, renamed)):
             if old.exists():
                 old.replace(new)
         path.with_name(path.name + "-shm").unlink(missing_ok=True)
-    return kept
+    return renamed
 
 
-def _finished(path: Path) -> Path:
+def _salvaged_path(path: Path) -> Path:
     return path.with_name(path.name + ".salvaged")
 
 
@@ -108,129 +108,133 @@ def _free_name(path: Path) -> Path:
     return name
 
 
-def _found(copy: Path) -> Found:
+def _read_copy(copy: Path) -> ReadRows:
     bare = sqlite3.connect(copy, isolation_level=None)
-    with contextlib.closing(connect.for_so_long(bare, copy)) as connection:
-        with contextlib.suppress(*BROKEN):  # moves the log into the file, as far as that is whole
+    with contextlib.closing(database.limit_time(bare, copy)) as connection:
+        with contextlib.suppress(*DAMAGE_ERRORS):  # moves the log into the file, as far as that is whole
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        return whole_rows(connection)
+        return read_intact_rows(connection)
 
 
-def _write(found: Found, part: Path) -> None:
+def _write_rows(read_rows: ReadRows, part: Path) -> None:
     with contextlib.closing(sqlite3.connect(part, isolation_level=None)) as connection:
         connection.execute(f"PRAGMA page_size = {schema.PAGE_BYTES}")
         connection.execute("BEGIN")
         schema.create(connection)
-        for table, numbered in found.tables.items():
+        for table, numbered in read_rows.tables.items():
             for number, row in numbered:
                 if table != "about":
                     insert(connection, table, row, number)
-        own = {run for _, (run, *_) in found.tables["run"]}
-        for run, voice in rows.voices(found.tables["about"]).items():
-            if run in own:
-                insert(connection, "about", rows.of_voice(run, voice))
-        for statement in _ORPHANS:
+        known_runs = {run for _, (run, *_) in read_rows.tables["run"]}
+        for run, credential in rows.read_credentials(read_rows.tables["about"]).items():
+            if run in known_runs:
+                insert(connection, "about", rows.credential_row(run, credential))
+        for statement in _DELETE_ORPHANS:
             connection.execute(statement)
-        for stretch in connection.execute(_NAMELESS).fetchall():
-            insert(connection, "stretch", stretch)
+        for segment in connection.execute(_SEGMENTS_WITHOUT_ROW).fetchall():
+            insert(connection, "stretch", segment)
         connection.execute("COMMIT")
 
 
 # ---- All rows of a map file that are whole; what is not is counted, never guessed.
 
-PROBES = 100_000  # numbers looked up one by one between two parts of a damaged table, and no more than
-_ROW_BYTES = 32  # rows of so many bytes that the file has room for
+MAX_PROBES = 100_000  # numbers looked up one by one between two parts of a damaged table, and no more than
+_MIN_ROW_BYTES = 32  # rows of so many bytes that the file has room for
 
 
 @dataclass
-class Found:
+class ReadRows:
     """Whole rows by table, with their numbers; how many others there are; and tables where nobody knows."""
 
     tables: dict[str, list[tuple[int, Row]]] = field(default_factory=dict)
-    lost: Counter[str] = field(default_factory=Counter)
+    lost_counts: Counter[str] = field(default_factory=Counter)
     uncounted: set[str] = field(default_factory=set)
 
-    def size(self) -> int:
+    def row_count(self) -> int:
         return sum(map(len, self.tables.values()))
 
     @property
-    def damaged(self) -> bool:
-        return any(self.lost.values()) or bool(self.uncounted)
+    def is_damaged(self) -> bool:
+        return any(self.lost_counts.values()) or bool(self.uncounted)
 
 
-def whole_rows(connection: sqlite3.Connection) -> Found:
+def read_intact_rows(connection: sqlite3.Connection) -> ReadRows:
     """Every row of every table of our making that can be read and whose CRC is right."""
-    found, own = Found(), _own(connection)
+    read_rows, own = ReadRows(), _own_tables(connection)
     for table in COLUMNS:
-        everything, all_read = _everything(connection, table) if table in own else ({}, False)
-        good = {n: row for n, row in everything.items() if is_whole(table, n, row)}
-        found.tables[table] = [(n, row[:-1]) for n, row in sorted(good.items())]
-        count = _count(connection, table) if table in own else None
-        found.lost[table] = max(count or 0, len(everything)) - len(good)
+        table_rows, all_read = _read_table(connection, table) if table in own else ({}, False)
+        intact = {n: row for n, row in table_rows.items() if is_intact(table, n, row)}
+        read_rows.tables[table] = [(n, row[:-1]) for n, row in sorted(intact.items())]
+        count = _count_rows(connection, table) if table in own else None
+        read_rows.lost_counts[table] = max(count or 0, len(table_rows)) - len(intact)
         if count is None and not all_read:
-            found.uncounted.add(table)
-    return found
+            read_rows.uncounted.add(table)
+    return read_rows
 
 
-def with_copies(found: Found) -> Found:
+def merge_run_copies(read_rows: ReadRows) -> ReadRows:
     """Runs that can be read in only one of their two tables, in both."""
-    first, second = (dict(found.tables[table]) for table in ("run", "run_copy"))
+    first, second = (dict(read_rows.tables[table]) for table in ("run", "run_copy"))
     both = sorted((second | first).items())
-    there = max(len(first) + found.lost["run"], len(second) + found.lost["run_copy"])
-    lost = found.lost.copy()
-    lost["run"], lost["run_copy"] = there - len(both), 0
-    one = {"run", "run_copy"} <= found.uncounted
-    uncounted = found.uncounted - {"run_copy"} - (set() if one else {"run"})
-    return Found(found.tables | {"run": both, "run_copy": both}, lost, uncounted)
+    run_count = max(
+        len(first) + read_rows.lost_counts["run"], len(second) + read_rows.lost_counts["run_copy"]
+    )
+    lost_counts = read_rows.lost_counts.copy()
+    lost_counts["run"], lost_counts["run_copy"] = run_count - len(both), 0
+    one_uncounted = {"run", "run_copy"} <= read_rows.uncounted
+    uncounted = read_rows.uncounted - {"run_copy"} - (set() if one_uncounted else {"run"})
+    return ReadRows(read_rows.tables | {"run": both, "run_copy": both}, lost_counts, uncounted)
 
 
-def _own(connection: sqlite3.Connection) -> set[str]:
+def _own_tables(connection: sqlite3.Connection) -> set[str]:
     try:
         return own_tables(connection)
-    except BROKEN:
+    except DAMAGE_ERRORS:
         return set()
 
 
-def _everything(connection: sqlite3.Connection, table: str) -> tuple[dict[int, Row], bool]:
+def _read_table(connection: sqlite3.Connection, table: str) -> tuple[dict[int, Row], bool]:
     """Rows by number, and whether that is all. From the front; where that breaks, from the back; and in
     between number by number."""
     select = f"SELECT number, {', '.join(COLUMNS[table])}, crc FROM {table} NOT INDEXED"
     rows: dict[int, Row] = {}
-    if not _read(connection, f"{select} LIMIT 0", (), rows):
+    if not _read_query(connection, f"{select} LIMIT 0", (), rows):
         return rows, False  # not even the table is known
-    if _read(connection, f"{select} ORDER BY number", (), rows):
+    if _read_query(connection, f"{select} ORDER BY number", (), rows):
         return rows, True
     low = next(reversed(rows), 0)
-    _read(connection, f"{select} WHERE number > ? ORDER BY number DESC", (low,), rows)
+    _read_query(connection, f"{select} WHERE number > ? ORDER BY number DESC", (low,), rows)
     high = next(reversed(rows), 0)
-    probes = min(PROBES, _room(connection))
+    probes = min(MAX_PROBES, _max_row_count(connection))
     for number in range(low + 1, min(high if high > low else low + probes, low + probes)):
-        _read(connection, f"{select} WHERE number = ?", (number,), rows)
+        _read_query(connection, f"{select} WHERE number = ?", (number,), rows)
     return rows, False
 
 
-def _room(connection: sqlite3.Connection) -> int:
+def _max_row_count(connection: sqlite3.Connection) -> int:
     """For how many rows a file has room."""
     try:
         (pages,) = connection.execute("PRAGMA page_count").fetchone()
-    except BROKEN:
-        return PROBES
-    return int(pages) * PAGE_BYTES // _ROW_BYTES
+    except DAMAGE_ERRORS:
+        return MAX_PROBES
+    return int(pages) * PAGE_BYTES // _MIN_ROW_BYTES
 
 
-def _read(connection: sqlite3.Connection, query: str, values: tuple[int, ...], rows: dict[int, Row]) -> bool:
+def _read_query(
+    connection: sqlite3.Connection, query: str, values: tuple[int, ...], rows: dict[int, Row]
+) -> bool:
     """Into `rows`, up to where it breaks; whether it came to the end."""
     try:
         for number, *row in connection.execute(query, values):
             rows[number] = tuple(row)
-    except BROKEN:
+    except DAMAGE_ERRORS:
         return False
     return True
 
 
-def _count(connection: sqlite3.Connection, table: str) -> int | None:
+def _count_rows(connection: sqlite3.Connection, table: str) -> int | None:
     """As an index has it, which is another part of the file; None where that cannot be read either."""
     try:
         return int(connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0])
-    except BROKEN:
+    except DAMAGE_ERRORS:
         return None

@@ -10,7 +10,7 @@ import sqlite3
 from collections.abc import Mapping
 
 from share import __version__
-from share.store.rows import insert, is_whole
+from share.store.rows import insert, is_intact
 
 SCHEMA = 3
 PAGE_BYTES = 8192
@@ -34,7 +34,7 @@ STATEMENTS = tuple(TABLES.strip().split(";\n"))
 
 # From each older schema to the next, in SQL. None leads on from schema 1: its keyframes do not say where
 # their agents took themselves to be; nor from 2: its agents do not say how large their images are.
-STEPS: Mapping[int, tuple[str, ...]] = {}
+MIGRATIONS: Mapping[int, tuple[str, ...]] = {}
 
 
 def create(connection: sqlite3.Connection) -> None:
@@ -45,21 +45,25 @@ def create(connection: sqlite3.Connection) -> None:
         insert(connection, "about", (name, value))
 
 
-def version(connection: sqlite3.Connection) -> int | None:
+def read_version(connection: sqlite3.Connection) -> int | None:
     """The file's schema; None if the row that says so is not whole. Raises sqlite3.Error."""
     if "about" not in own_tables(connection):
         return None
-    found = connection.execute("SELECT number, name, value, crc FROM about NOT INDEXED").fetchall()
-    whole = (row for number, *row in found if is_whole("about", number, tuple(row)))
-    return next((int(value) for name, value, _ in whole if name == "schema" and str(value).isdecimal()), None)
+    rows = connection.execute("SELECT number, name, value, crc FROM about NOT INDEXED").fetchall()
+    intact = (row for number, *row in rows if is_intact("about", number, tuple(row)))
+    return next(
+        (int(value) for name, value, _ in intact if name == "schema" and str(value).isdecimal()), None
+    )
 
 
-def migrate(connection: sqlite3.Connection, found: int, steps: Mapping[int, tuple[str, ...]]) -> None:
+def migrate(
+    connection: sqlite3.Connection, from_version: int, migrations: Mapping[int, tuple[str, ...]]
+) -> None:
     """From schema `found` to ours, all steps or none. Raises sqlite3.Error, KeyError for a missing step."""
     connection.execute("BEGIN IMMEDIATE")
     try:
-        for number in range(found, SCHEMA):
-            for statement in steps[number]:
+        for number in range(from_version, SCHEMA):
+            for statement in migrations[number]:
                 connection.execute(statement)
         connection.execute("DELETE FROM about WHERE name = 'schema'")
         insert(connection, "about", ("schema", str(SCHEMA)))
@@ -69,7 +73,7 @@ def migrate(connection: sqlite3.Connection, found: int, steps: Mapping[int, tupl
         raise
 
 
-def is_ours(connection: sqlite3.Connection) -> bool:
+def matches_schema(connection: sqlite3.Connection) -> bool:
     """Whether tables and indexes are those of this schema, to the letter."""
     return _objects(connection) == _objects(_template())
 

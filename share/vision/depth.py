@@ -10,9 +10,9 @@ from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8
 from share.vision import optical_flow
 
-EDGE = 0.05  # relative depth step within 3x3 px that marks an object's edge
+EDGE_RATIO = 0.05  # relative depth step within 3x3 px that marks an object's edge
 MIN_DEPTH, MAX_DEPTH = 0.2, 12.0  # m
-_FIRST = 3.0  # m, a guess
+_DEFAULT_DEPTH_M = 3.0  # m, a guess
 
 
 def from_depth_camera(depth: F32, rig: Rig, uv: F64) -> F64:
@@ -26,15 +26,15 @@ def from_depth_camera(depth: F32, rig: Rig, uv: F64) -> F64:
     if len(uv) == 0:
         return np.zeros(0)
     T_cam0_depth = se3.inverse(rig.T_depth_cam0)
-    clean = _without_edges(depth)
+    without_edges = _without_edges(depth)
     ray = rays(uv)
     out = np.full(len(uv), np.nan)
     for guess in (2.0, 1.0, 4.0):
         z = np.where(np.isnan(out), guess, out)
         for _ in range(4):
             px = rig.depth.project(se3.transform(rig.T_depth_cam0, ray * z[:, None]))
-            seen = _sample(clean, px)
-            points = _back_project(rig, px, seen)
+            depth_at_px = _sample(without_edges, px)
+            points = _back_project(rig, px, depth_at_px)
             points = se3.transform(T_cam0_depth, points)
             z = np.where(np.isnan(points[:, 2]), z, points[:, 2])
         error_px = np.abs(points[:, :2] / points[:, 2:] - uv).max(axis=1) * rig.cam0.focal
@@ -49,7 +49,7 @@ def _without_edges(depth: F32) -> F32:
     filled = np.where((depth > MIN_DEPTH) & (depth < MAX_DEPTH), depth, np.float32(0))
     low = cv2.erode(filled, np.ones((3, 3), np.uint8))  # a hole makes it 0
     high = cv2.dilate(filled, np.ones((3, 3), np.uint8))
-    out: F32 = np.where((low > 0) & (high - low < EDGE * high), filled, np.float32("nan"))
+    out: F32 = np.where((low > 0) & (high - low < EDGE_RATIO * high), filled, np.float32("nan"))
     return out
 
 
@@ -79,25 +79,25 @@ def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64
         return out
     ray = rays(uv)
     expected = np.full(len(px), np.nan) if guess_m is None else guess_m
-    for fallback in (_FIRST, 1.2):  # a second try where nothing was expected
-        todo = np.flatnonzero(np.isnan(out) & (np.isnan(expected) | (fallback == _FIRST)))
+    for fallback in (_DEFAULT_DEPTH_M, 1.2):  # a second try where nothing was expected
+        todo = np.flatnonzero(np.isnan(out) & (np.isnan(expected) | (fallback == _DEFAULT_DEPTH_M)))
         if len(todo) == 0:
             break
         z = np.where(np.isnan(expected[todo]), fallback, expected[todo])
         guess = rig.cam1.project(se3.transform(rig.T_cam1_cam0, ray[todo] * z[:, None]))
         start = np.where(np.isnan(guess), px[todo], guess).astype(np.float32)
-        levels = 1 if guess_m is not None and fallback == _FIRST else 2
-        right, found = optical_flow.follow(
+        levels = 1 if guess_m is not None and fallback == _DEFAULT_DEPTH_M else 2
+        right, found = optical_flow.track_points(
             image0, image1, px[todo], start, window=15, levels=levels, back_check_px=None
         )
-        depth, error_px = _two_rays(rig, ray[todo], rig.cam1.normalise(right.astype(np.float64)))
+        depth, error_px = _triangulate(rig, ray[todo], rig.cam1.normalise(right.astype(np.float64)))
         found &= (error_px < 1.5) & (depth > MIN_DEPTH) & (depth < MAX_DEPTH * 2)
-        found &= optical_flow.resemblance(image0, image1, px[todo], right) > 0.8
+        found &= optical_flow.ncc(image0, image1, px[todo], right) > 0.8
         out[todo[found]] = depth[found]
     return out
 
 
-def _two_rays(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
+def _triangulate(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
     """Depth in cam0 that best explains uv1 on the epipolar line, and the distance from it in px, NaN where
     cam1 cannot see it.
 
@@ -109,22 +109,22 @@ def _two_rays(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
     b = uv1 * t[2] - t[:2]
     z = (A * b).sum(axis=1) / np.maximum((A * A).sum(axis=1), 1e-12)
     p1 = z[:, None] * a + t
-    ahead = np.where(p1[:, 2:] > 0, p1[:, 2:], np.nan)
-    off = rig.cam1.evened(p1[:, :2] / ahead) - rig.cam1.evened(uv1)
-    error: F64 = np.linalg.norm(off, axis=1) * rig.cam1.focal
+    depth1 = np.where(p1[:, 2:] > 0, p1[:, 2:], np.nan)
+    error_uv = rig.cam1.to_image_plane(p1[:, :2] / depth1) - rig.cam1.to_image_plane(uv1)
+    error: F64 = np.linalg.norm(error_uv, axis=1) * rig.cam1.focal
     return z, error
 
 
-def disparity_px(rig: Rig, uv: F64, rho: F64) -> F64:
+def disparity_per_rho(rig: Rig, uv: F64, rho: F64) -> F64:
     """px (N,) by which points on rays uv (N, 2), at inverse depths (N,), move in cam1 for 1/m more. Of a
     fisheye lens they move less the farther off the axis they are; of others this takes it as it is in the
     middle."""
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
-    if not rig.cam1.fisheye:
+    if not rig.cam1.is_fisheye:
         return np.full(len(uv), rig.cam1.focal * rig.baseline)
     R, t = rig.T_cam1_cam0[:3, :3], rig.T_cam1_cam0[:3, 3]
     q = rays(uv) @ R.T + np.nan_to_num(rho)[:, None] * t
-    by_rho = (t[:2] - q[:, :2] / q[:, 2:] * t[2]) / q[:, 2:]
-    moved = rig.cam1.jacobian(q[:, :2] / q[:, 2:]) @ by_rho[:, :, None]
-    out: F64 = np.linalg.norm(moved[:, :, 0], axis=1)
+    J_rho = (t[:2] - q[:, :2] / q[:, 2:] * t[2]) / q[:, 2:]
+    J = rig.cam1.jacobian(q[:, :2] / q[:, 2:]) @ J_rho[:, :, None]
+    out: F64 = np.linalg.norm(J[:, :, 0], axis=1)
     return out

@@ -9,55 +9,55 @@ from numpy.typing import NDArray
 
 from share.types import I64, U8
 
-_ROWS = 50  # at a time, so that what is in between stays in the cache
+_BLOCK_ROWS = 50  # at a time, so that what is in between stays in the cache
 
 
-class Pairs(NamedTuple):
+class DescriptorPairs(NamedTuple):
     """Possible matches: rows (M,) of the one view, cols (M,) of the other, and differing bits (M,)."""
 
     rows: I64
     cols: I64
     bits: NDArray[np.uint16]
 
-    def only(self, keep: NDArray[np.bool_]) -> Pairs:
+    def keep(self, keep: NDArray[np.bool_]) -> DescriptorPairs:
         at = np.flatnonzero(keep)
-        return Pairs(self.rows[at], self.cols[at], self.bits[at])
+        return DescriptorPairs(self.rows[at], self.cols[at], self.bits[at])
 
 
-def hamming(a: U8, b: U8) -> NDArray[np.uint16]:
+def hamming_matrix(a: U8, b: U8) -> NDArray[np.uint16]:
     """Differing bits (N, K) of every descriptor in a (N, 32) with every one in b (K, 32)."""
     words_a, words_b = (np.ascontiguousarray(np.ascontiguousarray(x).view(np.uint64).T) for x in (a, b))
     out = np.empty((len(a), len(b)), np.uint16)
-    for start in range(0, len(a), _ROWS):
-        differ = (x[start : start + _ROWS, None] ^ y for x, y in zip(words_a, words_b, strict=True))
+    for start in range(0, len(a), _BLOCK_ROWS):
+        differ = (x[start : start + _BLOCK_ROWS, None] ^ y for x, y in zip(words_a, words_b, strict=True))
         first, *others, last = (np.bitwise_count(d) for d in differ)  # 64 at most in a byte
         for count in others:
             first += count
-        np.add(first, last, out=out[start : start + _ROWS], dtype=np.uint16)
+        np.add(first, last, out=out[start : start + _BLOCK_ROWS], dtype=np.uint16)
     return out
 
 
-def apart(a: U8, b: U8) -> I64:
+def hamming_rowwise(a: U8, b: U8) -> I64:
     """Differing bits (N,) of descriptors a (N, 32) and b (N, 32), each with its own."""
     differ = np.ascontiguousarray(a).view(np.uint64) ^ np.ascontiguousarray(b).view(np.uint64)
     return np.asarray(np.bitwise_count(differ).sum(1, dtype=np.int64))
 
 
-def near(distance: NDArray[np.uint16], max_bits: int) -> Pairs:
+def pairs_within(distance: NDArray[np.uint16], max_bits: int) -> DescriptorPairs:
     """All pairs of a distance matrix (N, K) that differ in at most `max_bits`."""
     at = np.flatnonzero(distance <= max_bits)
     rows, cols = np.divmod(at, distance.shape[1])
-    return Pairs(rows, cols, distance.ravel()[at])
+    return DescriptorPairs(rows, cols, distance.ravel()[at])
 
 
-def mutual(pairs: Pairs) -> Pairs:
+def mutual_best(pairs: DescriptorPairs) -> DescriptorPairs:
     """Those that are the best of their row and of their column, the most alike first."""
     order = np.argsort(pairs.bits, kind="stable")
-    ranked = Pairs(pairs.rows[order], pairs.cols[order], pairs.bits[order])
-    return ranked.only(_first(ranked.rows) & _first(ranked.cols))
+    ranked = DescriptorPairs(pairs.rows[order], pairs.cols[order], pairs.bits[order])
+    return ranked.keep(_is_first(ranked.rows) & _is_first(ranked.cols))
 
 
-def _first(ids: I64) -> NDArray[np.bool_]:
+def _is_first(ids: I64) -> NDArray[np.bool_]:
     """Which (M,) appear for the first time."""
     number = np.arange(len(ids))
     first = np.empty(ids.max(initial=-1) + 1, np.int64)
@@ -65,7 +65,7 @@ def _first(ids: I64) -> NDArray[np.bool_]:
     return np.asarray(first[ids] == number)
 
 
-def match(query: U8, candidate: U8, max_distance: int, ratio: float) -> I64:
+def match_descriptors(query: U8, candidate: U8, max_distance: int, ratio: float) -> I64:
     """Mutual nearest neighbours: indices (M, 2) into query (N, 32) and candidate (K, 32) descriptors.
 
     A pair stays if its Hamming distance is at most `max_distance` bits and less than `ratio` times
@@ -73,7 +73,7 @@ def match(query: U8, candidate: U8, max_distance: int, ratio: float) -> I64:
     """
     if len(query) < 2 or len(candidate) < 2:
         return np.zeros((0, 2), np.int64)
-    distance = hamming(query, candidate)
+    distance = hamming_matrix(query, candidate)
     rows = np.arange(len(query))
     to_candidate, to_query = distance.argmin(1), distance.argmin(0)
     best = distance[rows, to_candidate]

@@ -13,7 +13,7 @@ from share.vision.patches import sample
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
 
-def follow(
+def track_points(
     source: U8,
     target: U8,
     px: F32,
@@ -29,15 +29,15 @@ def follow(
     """
     if len(px) == 0:
         return guess.copy(), np.zeros(0, bool)
-    ahead, ok = _lucas_kanade(source, target, px, guess, window, levels)
+    forward, ok = _lucas_kanade(source, target, px, guess, window, levels)
     height, width = target.shape
     found = ok
     if back_check_px is not None:
         # The way back begins at its own end, so one level is enough to see whether it agrees.
-        back, ok_back = _lucas_kanade(target, source, ahead, px, window, 0)
+        back, ok_back = _lucas_kanade(target, source, forward, px, window, 0)
         found = ok & ok_back & (np.linalg.norm(back - px, axis=1) <= back_check_px)
-    found &= ((ahead >= 1) & (ahead <= (width - 2, height - 2))).all(axis=1)
-    return ahead, found
+    found &= ((forward >= 1) & (forward <= (width - 2, height - 2))).all(axis=1)
+    return forward, found
 
 
 def _lucas_kanade(
@@ -57,7 +57,7 @@ def _lucas_kanade(
     return np.asarray(out, np.float32).reshape(-1, 2), status.ravel() > 0
 
 
-def resemblance(source: U8, target: U8, px: F32, found_px: F32, half: int = 5) -> F32:
+def ncc(source: U8, target: U8, px: F32, found_px: F32, half: int = 5) -> F32:
     """Normalised cross-correlation (N,) of the (2 half + 1)^2 patches: 1 is alike up to gain and bias."""
     if len(px) == 0:
         return np.zeros(0, np.float32)

@@ -8,11 +8,11 @@ import numpy as np
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8, Frame, View
 from share.vision import depth as depths
-from share.vision.corners import evenly
-from share.vision.mask import EVEN_DEG, within
+from share.vision.corners import spread_order
+from share.vision.mask import UNIFORM_FIELD_DEG, field_mask
 
 _GRID = 8, 6  # cells of the image, over which features are spread
-_BESIDE_PX = 4.0  # of a known point, where nothing measures depth: as deep
+_NEIGHBOUR_PX = 4.0  # of a known point, where nothing measures depth: as deep
 
 
 def measures_depth(frame: Frame, rig: Rig) -> bool:
@@ -22,7 +22,7 @@ def measures_depth(frame: Frame, rig: Rig) -> bool:
     )
 
 
-def depth_at(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
+def measure_depth(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
     """Depth (N,) m in cam0 of image points, from whatever the frame carries; NaN where unknown. guess_m (N,):
     about how far they are, if that is known."""
     if frame.depth is not None and rig.depth is not None:
@@ -32,90 +32,92 @@ def depth_at(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = Non
     return np.full(len(px), np.nan)
 
 
-class ViewInSteps:
+class ViewBuilder:
     """A view, made in steps that take about equally long, for who cannot wait for all of them at once. known:
     px (M, 2) and depth (M,) m of points whose neighbours will not be much nearer or further; where the frame
     measures nothing, only what is right beside them has a depth."""
 
-    def __init__(self, frame: Frame, rig: Rig, count: int, known: tuple[F32, F64] | None = None) -> None:
-        self._frame, self._rig, self._count, self._known = frame, rig, count, known
+    def __init__(
+        self, frame: Frame, rig: Rig, count: int, known_depths: tuple[F32, F64] | None = None
+    ) -> None:
+        self._frame, self._rig, self._count, self._known_depths = frame, rig, count, known_depths
         self._keypoints: list[cv2.KeyPoint] | None = None
-        self._described: tuple[F32, U8] | None = None
+        self._features: tuple[F32, U8] | None = None
         self._measured = np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32)
 
     def detect(self) -> None:
         """The first step."""
-        seen = within(self._rig.cam0, EVEN_DEG)
-        self._keypoints = _detected(self._frame.image0, self._count, seen)
+        mask = field_mask(self._rig.cam0, UNIFORM_FIELD_DEG)
+        self._keypoints = _detect(self._frame.image0, self._count, mask)
 
     def describe(self) -> None:
         """The second."""
         if self._keypoints is None:
             self.detect()
-        self._described = _described(self._frame.image0, self._keypoints or [])
+        self._features = _describe(self._frame.image0, self._keypoints or [])
 
     def measure_half(self) -> None:
         """Half of the third, for who has the time now. After `describe`."""
-        assert self._described is not None
-        px, _ = self._described
+        assert self._features is not None
+        px, _ = self._features
         self._measured = self._points(px[: len(px) // 2])
 
     def finish(self) -> View:
         """The third, with those before it where they were not made."""
-        if self._described is None:
+        if self._features is None:
             self.describe()
-        assert self._described is not None
-        px, descriptors = self._described
+        assert self._features is not None
+        px, descriptors = self._features
         uv, points = self._points(px[len(self._measured[0]) :])
         uv, points = np.concatenate([self._measured[0], uv]), np.concatenate([self._measured[1], points])
         return View(uv, points, descriptors)
 
     def _points(self, px: F32) -> tuple[F32, F32]:
         """Of px (N, 2): normalised coordinates (N, 2), and where they are (N, 3) m, NaN unknown."""
-        rig, known = self._rig, self._known
+        rig, known = self._rig, self._known_depths
         uv = rig.cam0.normalise(px.astype(np.float64))
         if known is not None and not measures_depth(self._frame, rig):
-            z = _nearest(px, *known, _BESIDE_PX)
+            z = _nearest_depth(px, *known, _NEIGHBOUR_PX)
         else:
-            z = depth_at(self._frame, rig, px, uv, None if known is None else _nearest(px, *known))
+            z = measure_depth(self._frame, rig, px, uv, None if known is None else _nearest_depth(px, *known))
         return uv.astype(np.float32), (rays(uv) * z[:, None]).astype(np.float32)
 
 
 def make_view(frame: Frame, rig: Rig, count: int = 500) -> View:
     """ORB features (Rublee et al. 2011) of cam0 with 3D points where the frame gives depth."""
-    return ViewInSteps(frame, rig, count).finish()
+    return ViewBuilder(frame, rig, count).finish()
 
 
-def _nearest(px: F32, known_px: F32, known_m: F64, within_px: float = np.inf) -> F64:
+def _nearest_depth(px: F32, known_px: F32, known_m: F64, within_px: float = np.inf) -> F64:
     """Depth (N,) m of the known point next to each; NaN where there is none within so many px."""
     if len(known_px) == 0:
         return np.full(len(px), np.nan)
-    apart = (px**2).sum(axis=1)[:, None] - 2 * px @ known_px.T + (known_px**2).sum(axis=1)
-    out: F64 = np.where(apart.min(axis=1) <= within_px**2, known_m[apart.argmin(axis=1)], np.nan)
+    squared_px = (px**2).sum(axis=1)[:, None] - 2 * px @ known_px.T + (known_px**2).sum(axis=1)
+    out: F64 = np.where(squared_px.min(axis=1) <= within_px**2, known_m[squared_px.argmin(axis=1)], np.nan)
     return out
 
 
-def orb(image: U8, count: int, within: U8 | None = None) -> tuple[F32, U8]:
+def detect_orb(image: U8, count: int, mask: U8 | None = None) -> tuple[F32, U8]:
     """Up to `count` ORB keypoints (N, 2) px and descriptors (N, 32), strongest first in each cell. within
     (H, W): a mask of where to look.
 
     OpenCV's detector alone crowds them on the strongest texture; pose from a crowd is weak.
     """
-    return _described(image, _detected(image, count, within))
+    return _describe(image, _detect(image, count, mask))
 
 
-def _detected(image: U8, count: int, within: U8 | None = None) -> list[cv2.KeyPoint]:
+def _detect(image: U8, count: int, mask: U8 | None = None) -> list[cv2.KeyPoint]:
     """The `count` that spread best over the image."""
-    keypoints = _detector(3 * count).detect(image, within)
+    keypoints = _detector(3 * count).detect(image, mask)
     if not keypoints:
         return []
     px = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
     response = np.array([k.response for k in keypoints])
-    chosen = np.sort(evenly(px, response, image.shape[::-1], _GRID)[:count])
+    chosen = np.sort(spread_order(px, response, image.shape[::-1], _GRID)[:count])
     return [keypoints[i] for i in chosen]
 
 
-def _described(image: U8, keypoints: list[cv2.KeyPoint]) -> tuple[F32, U8]:
+def _describe(image: U8, keypoints: list[cv2.KeyPoint]) -> tuple[F32, U8]:
     if not keypoints:
         return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
     kept, descriptors = _detector(len(keypoints)).compute(image, keypoints)
@@ -123,5 +125,5 @@ def _described(image: U8, keypoints: list[cv2.KeyPoint]) -> tuple[F32, U8]:
     return px, np.asarray(descriptors, np.uint8)
 
 
-def _detector(most: int) -> cv2.ORB:
-    return cv2.ORB.create(nfeatures=most, scaleFactor=1.2, nlevels=6, fastThreshold=10)
+def _detector(max_count: int) -> cv2.ORB:
+    return cv2.ORB.create(nfeatures=max_count, scaleFactor=1.2, nlevels=6, fastThreshold=10)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 
+from share.agent_names import checked_name
 from share.geometry.camera import Camera, Rig
-from share.names import checked_name
 from share.types import (
     F64,
     AgentKind,
@@ -18,29 +18,29 @@ from share.types import (
     Frame,
     Keyframe,
     TrackState,
-    Wait,
+    WaitReason,
     checked_id,
     checked_pose,
     checked_stamp,
 )
 
 MAX_RATE_HZ = 1000.0
-MAX_HELD = 256  # ids in one Ack: the most keyframes that may wait at the edge for a gap to close
-MAX_TEXT = 512  # characters of anything a person reads
-MAX_REASON = 120  # characters of why an agent is in its state
-MAX_AGE_MS = 1e9  # 11 days
-MAX_SIDE = 8192  # px, of an image
-MAX_SAMPLES = 20_000  # of an IMU, in one frame
+MAX_BUFFERED = 256  # ids in one Ack: the most keyframes that may wait at the edge for a gap to close
+MAX_TEXT_LENGTH = 512  # characters of anything a person reads
+MAX_REASON_LENGTH = 120  # characters of why an agent is in its state
+MAX_POSE_AGE_MS = 1e9  # 11 days
+MAX_IMAGE_SIDE = 8192  # px, of an image
+MAX_IMU_SAMPLES = 20_000  # of an IMU, in one frame
 MAX_DELAY_MS = 1e7  # three hours
 MAX_ERROR_CM = 1e7  # 100 km, as far as a pose may be
-PEER_BYTES = 8
+PEER_ID_BYTES = 8
 
 
 def peer_id(run_id: int) -> bytes:
     """The PEER_BYTES by which the transport of the edge knows the agent of this run.
 
     Whoever knows them can speak for the run, so they are random and shown to nobody but the edge."""
-    return run_id.to_bytes(PEER_BYTES, "big", signed=True)
+    return run_id.to_bytes(PEER_ID_BYTES, "big", signed=True)
 
 
 def public_tag(run_id: int) -> str:
@@ -48,9 +48,9 @@ def public_tag(run_id: int) -> str:
     return hashlib.sha256(peer_id(run_id)).hexdigest()[:16]
 
 
-def _check_camera(camera: Camera) -> None:
-    if max(camera.width, camera.height) > MAX_SIDE:
-        raise ValueError(f"image: {camera.width}x{camera.height} px is more than {MAX_SIDE} a side")
+def _check_image_size(camera: Camera) -> None:
+    if max(camera.width, camera.height) > MAX_IMAGE_SIDE:
+        raise ValueError(f"image: {camera.width}x{camera.height} px is more than {MAX_IMAGE_SIDE} a side")
 
 
 # ---------------------------------------------------------------- up: agent -> edge
@@ -74,7 +74,7 @@ class Hello:
         object.__setattr__(self, "name", checked_name(self.name))
         for camera in (self.rig.cam0, self.rig.cam1, self.rig.depth):
             if camera is not None:
-                _check_camera(camera)
+                _check_image_size(camera)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class PoseUpdate:
 
     def __post_init__(self) -> None:
         checked_stamp("stamp_ns", self.stamp_ns)
-        checked_id("keyframe", self.keyframe, least=-1)
+        checked_id("keyframe", self.keyframe, minimum=-1)
         object.__setattr__(self, "T_keyframe_body", checked_pose("T_keyframe_body", self.T_keyframe_body))
 
 
@@ -118,10 +118,10 @@ class Status:
     reason: str = ""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.pose_age_ms <= MAX_AGE_MS:
-            raise ValueError(f"pose_age_ms: {self.pose_age_ms} is outside 0 .. {MAX_AGE_MS:g}")
-        if len(self.reason) > MAX_REASON or not self.reason.isprintable():
-            raise ValueError(f"reason: at most {MAX_REASON} printable characters")
+        if not 0 <= self.pose_age_ms <= MAX_POSE_AGE_MS:
+            raise ValueError(f"pose_age_ms: {self.pose_age_ms} is outside 0 .. {MAX_POSE_AGE_MS:g}")
+        if len(self.reason) > MAX_REASON_LENGTH or not self.reason.isprintable():
+            raise ValueError(f"reason: at most {MAX_REASON_LENGTH} printable characters")
 
 
 @dataclass(frozen=True)
@@ -159,8 +159,8 @@ class Refused:
     reason: str
 
     def __post_init__(self) -> None:
-        if len(self.reason) > MAX_TEXT:
-            raise ValueError(f"reason: {len(self.reason)} characters, at most {MAX_TEXT}")
+        if len(self.reason) > MAX_TEXT_LENGTH:
+            raise ValueError(f"reason: {len(self.reason)} characters, at most {MAX_TEXT_LENGTH}")
 
 
 @dataclass(frozen=True)
@@ -176,8 +176,8 @@ class Ack:
     def __post_init__(self) -> None:
         for id_ in (self.next_keyframe, *self.held):
             checked_id("keyframe ids", id_)
-        if len(self.held) > MAX_HELD:
-            raise ValueError(f"held: {len(self.held)} ids, at most {MAX_HELD}")
+        if len(self.held) > MAX_BUFFERED:
+            raise ValueError(f"held: {len(self.held)} ids, at most {MAX_BUFFERED}")
 
 
 @dataclass(frozen=True)
@@ -210,9 +210,9 @@ class Pong:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class RemoteTrackingResult:
     """What a streamed frame came to: its index and stamp, and of the tracker's result what an agent uses
-    (`share.odometry.result`). T_odom_body (4, 4) where the state has a pose."""
+    (`share.odometry.track_result`). T_odom_body (4, 4) where the state has a pose."""
 
     index: int
     stamp_ns: int
@@ -221,7 +221,7 @@ class Tracked:
     keyframe: bool = False
     new_stretch: bool = False
     sound: bool = True
-    waits: Wait | None = None
+    waits: WaitReason | None = None
 
     def __post_init__(self) -> None:
         checked_id("index", self.index)
@@ -232,6 +232,6 @@ class Tracked:
             object.__setattr__(self, "T_odom_body", checked_pose("T_odom_body", self.T_odom_body))
 
 
-Up = Hello | PoseUpdate | Keyframe | Evaluation | Status | Ping | Bye | Frame
-Down = Welcome | Refused | Ack | Correction | Rate | Pong | Tracked
-Message = Up | Down
+UplinkMessage = Hello | PoseUpdate | Keyframe | Evaluation | Status | Ping | Bye | Frame
+DownlinkMessage = Welcome | Refused | Ack | Correction | Rate | Pong | RemoteTrackingResult
+Message = UplinkMessage | DownlinkMessage

@@ -7,10 +7,24 @@ import pytest
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.lab.calibrate import camera_bundle
-from share.lab.calibrate.camera_bundle import View, calibrate
-from share.lab.calibrate.camera_start import camera_of, enough, intrinsics, moved, names, project
-from share.lab.calibrate.camera_verdict import GRID as COVER_GRID
-from share.lab.calibrate.camera_verdict import Coverage, choose, coverage, judge, off_line, typical_miss
+from share.lab.calibrate.camera_bundle import BoardView, calibrate_cameras
+from share.lab.calibrate.camera_initialisation import (
+    camera_from_parameters,
+    has_enough_corners,
+    intrinsics,
+    parameter_names,
+    project_with_jacobians,
+    transform_with_jacobian,
+)
+from share.lab.calibrate.camera_verdict import CELL_GRID as COVER_GRID
+from share.lab.calibrate.camera_verdict import (
+    Coverage,
+    choose_views,
+    coverage,
+    epipolar_distances,
+    judge_cameras,
+    median_epipolar_px,
+)
 from share.lab.calibrate.corners import Detection
 from share.lab.calibrate.target import AprilGrid, CharucoBoard
 from share.types import F64
@@ -47,18 +61,18 @@ def _views(
     count: int = 25,
     wrong: float = 0.0,
     pair: tuple[Camera, Camera] = (LEFT, RIGHT),
-) -> list[View]:
+) -> list[BoardView]:
     out = []
     for k, T in enumerate(_poses(rng, count)):
         seen = []
         for camera, pose in zip(pair, (T, _mount() @ T), strict=True):
-            px = camera.project_all(se3.transform(pose, GRID.corners))
-            ids = np.flatnonzero(camera.inside(px, 3.0))
+            px = camera.project_wide(se3.transform(pose, GRID.corners))
+            ids = np.flatnonzero(camera.is_inside(px, 3.0))
             noisy = px[ids] + rng.normal(0, noise_px, (len(ids), 2))
             spoilt = rng.random(len(ids)) < wrong
             noisy[spoilt] += rng.uniform(-8, 8, (int(spoilt.sum()), 2))
             seen.append(Detection(ids, noisy))
-        out.append(View(str(k), tuple(seen)))
+        out.append(BoardView(str(k), tuple(seen)))
     return out
 
 
@@ -67,13 +81,15 @@ def test_the_derivatives_of_a_projection_are_those_by_differences(camera: Camera
     T, points = _poses(np.random.default_rng(0), 1)[0], GRID.corners[::7]
     points = points[np.isfinite(camera.project(se3.transform(T, points))).all(axis=1)]
     assert len(points) > 10
-    at, by_pose = moved(T, points)
-    px, by_intrinsics, by_points = project(camera, at)
+    at, by_pose = transform_with_jacobian(T, points)
+    px, by_intrinsics, by_points = project_with_jacobians(camera, at)
     np.testing.assert_allclose(px, camera.project(at), atol=1e-9)
-    h, count = 1e-6, len(names(camera))
+    h, count = 1e-6, len(parameter_names(camera))
     for k in range(count):
         step = np.eye(count)[k] * h
-        high, low = (camera_of(intrinsics(camera) + s * step, camera).project(at) for s in (1, -1))
+        high, low = (
+            camera_from_parameters(intrinsics(camera) + s * step, camera).project(at) for s in (1, -1)
+        )
         np.testing.assert_allclose(by_intrinsics[:, :, k], (high - low) / (2 * h), rtol=1e-5, atol=1e-5)
     for k in range(6):
         xi = np.eye(6)[k] * h
@@ -83,16 +99,16 @@ def test_the_derivatives_of_a_projection_are_those_by_differences(camera: Camera
 
 
 def test_without_noise_a_stereo_pair_is_found_exactly(rng: np.random.Generator) -> None:
-    solution = calibrate(_views(rng, 0.0), GRID, SIZE)
+    solution = calibrate_cameras(_views(rng, 0.0), GRID, SIZE)
     for found, truth in zip(solution.state.cameras, (LEFT, RIGHT), strict=True):
         np.testing.assert_allclose(intrinsics(found), intrinsics(truth), rtol=1e-6, atol=1e-6)
     assert np.linalg.norm(se3.log(se3.inverse(_mount()) @ solution.state.T_cam1_cam0)) < 1e-7
 
 
 def test_k3_is_taken_where_the_views_tell_it(rng: np.random.Generator) -> None:
-    def one_camera(pair: tuple[Camera, Camera]) -> camera_bundle.State:
-        views = [View(view.name, view.seen[:1]) for view in _views(rng, 0.1, 12, pair=pair)]
-        solution = calibrate(views, GRID, SIZE)
+    def one_camera(pair: tuple[Camera, Camera]) -> camera_bundle.CameraBundleState:
+        views = [BoardView(view.name, view.detections[:1]) for view in _views(rng, 0.1, 12, pair=pair)]
+        solution = calibrate_cameras(views, GRID, SIZE)
         off = (intrinsics(solution.state.cameras[0]) - intrinsics(pair[0])) / solution.sigmas
         assert np.abs(off).max() < 4.5
         return solution.state
@@ -108,30 +124,30 @@ def test_a_fisheye_pair_is_found(rng: np.random.Generator) -> None:
         T[:3, 3] *= 0.4
         seen = []
         for pose in (T, _mount() @ T):
-            px = FISHEYE.project_all(se3.transform(pose, GRID.corners))
-            ids = np.flatnonzero(FISHEYE.inside(np.nan_to_num(px, nan=-1.0), 3.0))
+            px = FISHEYE.project_wide(se3.transform(pose, GRID.corners))
+            ids = np.flatnonzero(FISHEYE.is_inside(np.nan_to_num(px, nan=-1.0), 3.0))
             seen.append(Detection(ids, px[ids] + rng.normal(0, 0.1, (len(ids), 2))))
-        views.append(View(str(k), tuple(seen)))
-    every = np.concatenate([one.px for view in views for one in view.seen])
+        views.append(BoardView(str(k), tuple(seen)))
+    every = np.concatenate([one.px for view in views for one in view.detections])
     assert np.isnan(FISHEYE.normalise(every)).any()
-    found = calibrate(views, GRID, (512, 512), "equidistant")
-    for camera, part in zip(found.state.cameras, found.state.parts, strict=True):
+    found = calibrate_cameras(views, GRID, (512, 512), "equidistant")
+    for camera, part in zip(found.state.cameras, found.state.intrinsic_slices, strict=True):
         assert camera.model == "equidistant"
         assert np.abs((intrinsics(camera) - intrinsics(FISHEYE)) / found.sigmas[part]).max() < 4.5
     assert found.sigma_px == pytest.approx(0.1, rel=0.1)
     assert np.linalg.norm(se3.log(se3.inverse(_mount()) @ found.state.T_cam1_cam0)) < 1e-3
     state = found.state
-    assert typical_miss(*state.cameras, state.T_cam1_cam0, views) < 0.2
+    assert median_epipolar_px(*state.cameras, state.T_cam1_cam0, views) < 0.2
 
 
 def test_with_corners_of_one_weight_it_is_opencvs_solution(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(camera_bundle, "_HUBER", 1e6)  # OpenCV doubts no corner
-    views = [View(v.name, v.seen[:1]) for v in _views(rng, 0.2)]
-    solution = calibrate(views, GRID, SIZE)
-    boards = [GRID.corners[v.seen[0].ids].astype(np.float32) for v in views]
-    pixels = [v.seen[0].px.astype(np.float32) for v in views]
+    monkeypatch.setattr(camera_bundle, "_HUBER_SIGMAS", 1e6)  # OpenCV doubts no corner
+    views = [BoardView(v.name, v.detections[:1]) for v in _views(rng, 0.2)]
+    solution = calibrate_cameras(views, GRID, SIZE)
+    boards = [GRID.corners[v.detections[0].ids].astype(np.float32) for v in views]
+    pixels = [v.detections[0].px.astype(np.float32) for v in views]
     _, K, bent, _, _ = cv2.calibrateCamera(
         boards, pixels, SIZE, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3, criteria=(3, 200, 1e-12)
     )
@@ -144,7 +160,7 @@ def test_with_corners_of_one_weight_it_is_opencvs_solution(
 def test_its_sigmas_are_honest() -> None:
     nees = []
     for seed in range(12):
-        solution = calibrate(_views(np.random.default_rng(seed), 0.2, count=15), GRID, SIZE)
+        solution = calibrate_cameras(_views(np.random.default_rng(seed), 0.2, count=15), GRID, SIZE)
         error = np.concatenate(
             [
                 intrinsics(f) - intrinsics(t)
@@ -168,9 +184,9 @@ def test_so_they_are_where_the_board_bends_anew_in_each_view() -> None:
             bent = GRID.corners.copy()
             bent[:, 2] = np.stack([across**2, up**2, across * up], axis=1) @ rng.normal(0, 1e-3, 3)
             px = LEFT.project(se3.transform(T, bent))
-            ids = np.flatnonzero(LEFT.inside(px, 3.0))
-            views.append(View(str(k), (Detection(ids, px[ids] + rng.normal(0, 0.1, (len(ids), 2))),)))
-        solution = calibrate(views, GRID, SIZE)
+            ids = np.flatnonzero(LEFT.is_inside(px, 3.0))
+            views.append(BoardView(str(k), (Detection(ids, px[ids] + rng.normal(0, 0.1, (len(ids), 2))),)))
+        solution = calibrate_cameras(views, GRID, SIZE)
         error = intrinsics(solution.state.cameras[0]) - intrinsics(LEFT)
         z.append(error / solution.sigmas)
         naive.append(error / np.sqrt(np.diag(solution.independent)))
@@ -179,7 +195,7 @@ def test_so_they_are_where_the_board_bends_anew_in_each_view() -> None:
 
 
 def test_corners_that_were_found_wrongly_do_little_harm(rng: np.random.Generator) -> None:
-    solution = calibrate(_views(rng, 0.1, wrong=0.03), GRID, SIZE)
+    solution = calibrate_cameras(_views(rng, 0.1, wrong=0.03), GRID, SIZE)
     assert solution.state.cameras[0].fx == pytest.approx(LEFT.fx, rel=1e-3)
     assert solution.state.cameras[1].cx == pytest.approx(RIGHT.cx, abs=0.5)
 
@@ -188,16 +204,19 @@ def test_epipolar_lines_tell_a_pair_that_sits_otherwise(rng: np.random.Generator
     """0.2 px of noise on both corners, across the line: a median of 0.6745 sqrt(2) 0.2, and up to half as
     much again where the lens draws together what lies outside. Then a pitch, and a camera that is late."""
     views = _views(rng, 0.2, wrong=0.03)
-    assert np.abs(off_line(LEFT, RIGHT, _mount(), _views(rng, 0.0))).max() < 1e-6
-    assert 1.0 < typical_miss(LEFT, RIGHT, _mount(), views) / (0.6745 * np.sqrt(2) * 0.2) < 1.3
+    assert np.abs(epipolar_distances(LEFT, RIGHT, _mount(), _views(rng, 0.0))).max() < 1e-6
+    assert 1.0 < median_epipolar_px(LEFT, RIGHT, _mount(), views) / (0.6745 * np.sqrt(2) * 0.2) < 1.3
     pitched = se3.exp(np.array([0.002, 0, 0, 0, 0, 0])) @ _mount()
-    assert typical_miss(LEFT, RIGHT, pitched, views) == pytest.approx(0.002 * RIGHT.fy, rel=0.15)
+    assert median_epipolar_px(LEFT, RIGHT, pitched, views) == pytest.approx(0.002 * RIGHT.fy, rel=0.15)
     lower = np.array([0.0, 3.0])
-    late = [View(v.name, (v.seen[0], Detection(v.seen[1].ids, v.seen[1].px + lower))) for v in views]
-    solution = calibrate(views, GRID, SIZE)
+    late = [
+        BoardView(v.name, (v.detections[0], Detection(v.detections[1].ids, v.detections[1].px + lower)))
+        for v in views
+    ]
+    solution = calibrate_cameras(views, GRID, SIZE)
     covers = [Coverage(np.full(COVER_GRID, 5), np.zeros((20, 2)), np.linspace(0.5, 1.0, 20))] * 2
-    assert judge(solution, covers, views).passed
-    (reason,) = judge(solution, covers, late).reasons
+    assert judge_cameras(solution, covers, views).passed
+    (reason,) = judge_cameras(solution, covers, late).reasons
     assert reason.startswith("the pair: half of the corners are 3.")
 
 
@@ -208,39 +227,41 @@ def test_a_board_that_never_leans_is_refused(rng: np.random.Generator) -> None:
         T = facing.copy()
         T[:3, 3] = (-0.35, 0.3, 0.9 + 0.001 * k)
         px = LEFT.project(se3.transform(T, GRID.corners)) + rng.normal(0, 0.1, (144, 2))
-        views.append(View(str(k), (Detection(np.arange(144), px),)))
+        views.append(BoardView(str(k), (Detection(np.arange(144), px),)))
     with pytest.raises(ValueError, match="tilt the board"):
-        calibrate(views, GRID, SIZE)
+        calibrate_cameras(views, GRID, SIZE)
 
 
 def test_too_few_views_are_refused(rng: np.random.Generator) -> None:
     with pytest.raises(ValueError, match="3 views of the target; 4 are needed"):
-        calibrate(_views(rng, 0.1, count=3), GRID, SIZE)
+        calibrate_cameras(_views(rng, 0.1, count=3), GRID, SIZE)
 
 
 def test_the_views_that_are_chosen_reach_more_of_the_image_than_the_first(rng: np.random.Generator) -> None:
     views = _views(rng, 0.1, count=60)
-    one = [View(v.name, v.seen[:1]) for v in views]
-    chosen = choose(one, GRID, SIZE, 8)
+    one = [BoardView(v.name, v.detections[:1]) for v in views]
+    chosen = choose_views(one, GRID, SIZE, 8)
     assert len(chosen) == 8
 
     def reached(numbers: list[int]) -> float:
         poses = np.stack([np.eye(4)] * len(numbers))
-        return coverage([one[k].seen[0].px for k in numbers], poses, GRID, SIZE).share
+        return coverage([one[k].detections[0].px for k in numbers], poses, GRID, SIZE).share
 
     assert reached(chosen) >= reached(list(range(8)))
 
 
 def test_of_views_that_are_nearly_copies_few_are_chosen(rng: np.random.Generator) -> None:
     """A hand rests: each view comes ten times in a row."""
-    views = [View(f"{v.name}-{k}", v.seen[:1]) for v in _views(rng, 0.1, count=20) for k in range(10)]
-    chosen = choose(views, GRID, SIZE, 20)
+    views = [
+        BoardView(f"{v.name}-{k}", v.detections[:1]) for v in _views(rng, 0.1, count=20) for k in range(10)
+    ]
+    chosen = choose_views(views, GRID, SIZE, 20)
     assert len(chosen) == 20 and len({k // 10 for k in chosen}) >= 19
 
 
 def test_what_is_missing_is_said_in_words() -> None:
     facing = se3.exp(np.array([[np.pi, 0, 0, 0, 0, 0.8]]))
-    said = coverage([np.array([[300.0, 200.0]])], facing, GRID, SIZE).missing
+    said = coverage([np.array([[300.0, 200.0]])], facing, GRID, SIZE).gaps
     assert "no view reaches the image's upper right corner" in said
     assert "all views are from one distance: go nearer and farther" in said
 
@@ -248,23 +269,23 @@ def test_what_is_missing_is_said_in_words() -> None:
 @pytest.mark.parametrize(("ids", "told"), [(range(8), False), (range(9), False), (range(10), True)])
 def test_corners_on_a_line_tell_no_homography(ids: range, told: bool) -> None:
     board = CharucoBoard().corners[list(ids), :2]  # 8 corners a row
-    assert enough(board) == told
+    assert has_enough_corners(board) == told
 
 
 def test_views_of_one_row_of_corners_are_passed_over(rng: np.random.Generator) -> None:
     board, views = CharucoBoard(), []
     for k, T in enumerate(_poses(rng, 12)):
         px = LEFT.project(se3.transform(T, board.corners))
-        ids = np.arange(8) if k == 5 else np.flatnonzero(LEFT.inside(px, 3.0))
-        views.append(View(str(k), (Detection(ids, px[ids]),)))
-    assert 5 not in choose(views, board, SIZE, 12)
+        ids = np.arange(8) if k == 5 else np.flatnonzero(LEFT.is_inside(px, 3.0))
+        views.append(BoardView(str(k), (Detection(ids, px[ids]),)))
+    assert 5 not in choose_views(views, board, SIZE, 12)
     told = [view for view in views if view.name != "5"]
-    solution = calibrate(told, board, SIZE)
+    solution = calibrate_cameras(told, board, SIZE)
     np.testing.assert_allclose(intrinsics(solution.state.cameras[0]), intrinsics(LEFT), rtol=1e-5, atol=1e-5)
 
 
 def test_a_view_that_a_camera_does_not_see_covers_nothing() -> None:
     poses = se3.exp(np.array([[np.pi, 0, 0, 0, 0, 0.8], [np.pi, 0.9, 0, 0, 0, 1.6]]))
     covered = coverage([np.array([[300.0, 200.0]]), np.empty((0, 2))], poses, GRID, SIZE)
-    assert len(covered.distances) == len(covered.leans) == 1
-    assert "all views are from one distance: go nearer and farther" in covered.missing
+    assert len(covered.distances) == len(covered.tilts) == 1
+    assert "all views are from one distance: go nearer and farther" in covered.gaps

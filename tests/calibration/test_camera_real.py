@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from share.lab.calibrate.camera_bundle import View, calibrate
+from share.lab.calibrate.camera_bundle import BoardView, calibrate_cameras
 from share.lab.calibrate.corners import detector
 from share.lab.calibrate.target import AprilGrid
-from share.recordings.calibration import read_euroc
+from share.recordings.calibration import read_asl_calibration
 
 
 @pytest.mark.slow
@@ -22,9 +22,9 @@ def test_eurocs_own_focal_lengths_are_found_within_half_a_percent(shared_data: P
     views = []
     for k in range(0, 52, 2):
         images = [cv2.imread(str(folder / f"{k}_{eye}.jpg"), cv2.IMREAD_GRAYSCALE) for eye in (0, 1)]
-        views.append(View(str(k), tuple(find(np.asarray(image, np.uint8)) for image in images)))
-    solution = calibrate(views, AprilGrid(), (752, 480))
-    rig = read_euroc(mav / "cam0/sensor.yaml", mav / "cam1/sensor.yaml", None).rig
+        views.append(BoardView(str(k), tuple(find(np.asarray(image, np.uint8)) for image in images)))
+    solution = calibrate_cameras(views, AprilGrid(), (752, 480))
+    rig = read_asl_calibration(mav / "cam0/sensor.yaml", mav / "cam1/sensor.yaml", None).rig
     for found, truth in zip(solution.state.cameras, (rig.cam0, rig.cam1), strict=True):
         assert truth is not None and found.focal == pytest.approx(truth.focal, rel=5e-3)
     assert np.linalg.norm(solution.state.T_cam1_cam0[:3, 3]) == pytest.approx(rig.baseline, abs=1e-3)

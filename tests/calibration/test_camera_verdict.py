@@ -6,18 +6,20 @@ import numpy as np
 import pytest
 
 from share.geometry.camera import Camera
-from share.lab.calibrate.camera_bundle import Solution, State
-from share.lab.calibrate.camera_verdict import GRID, Coverage, judge
+from share.lab.calibrate.camera_bundle import CameraBundleSolution, CameraBundleState
+from share.lab.calibrate.camera_verdict import CELL_GRID, Coverage, judge_cameras
 from share.types import F64
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (0.0,) * 4)
-ALL = Coverage(np.full(GRID, 5), np.zeros((20, 2)), np.linspace(0.5, 1.0, 20))
+ALL = Coverage(np.full(CELL_GRID, 5), np.zeros((20, 2)), np.linspace(0.5, 1.0, 20))
 
 
-def _solution(residuals: list[F64], focal_sigma: float = 0.1) -> Solution:
-    state = State((CAMERA,), np.eye(4), np.stack([np.eye(4)] * len(residuals)))
+def _solution(residuals: list[F64], focal_sigma: float = 0.1) -> CameraBundleSolution:
+    state = CameraBundleState((CAMERA,), np.eye(4), np.stack([np.eye(4)] * len(residuals)))
     covariance = np.diag([focal_sigma**2] * 2 + [0.01] * 6)
-    return Solution(state, covariance, np.zeros_like(covariance), tuple((r,) for r in residuals), 0.2)
+    return CameraBundleSolution(
+        state, covariance, np.zeros_like(covariance), tuple((r,) for r in residuals), 0.2
+    )
 
 
 def _views(rng: np.random.Generator, count: int = 20) -> list[F64]:
@@ -25,7 +27,7 @@ def _views(rng: np.random.Generator, count: int = 20) -> list[F64]:
 
 
 def test_good_views_pass_and_their_rms_is_that_of_the_distances(rng: np.random.Generator) -> None:
-    verdict = judge(_solution(_views(rng)), [ALL])
+    verdict = judge_cameras(_solution(_views(rng)), [ALL])
     assert verdict.passed
     assert verdict.rms_px[0] == pytest.approx(0.2 * np.sqrt(2), rel=0.05)
 
@@ -33,19 +35,19 @@ def test_good_views_pass_and_their_rms_is_that_of_the_distances(rng: np.random.G
 def test_a_view_that_fits_worse_than_the_rest_is_named(rng: np.random.Generator) -> None:
     views = _views(rng)
     views[7] = 3 * views[7]
-    assert judge(_solution(views), [ALL]).outliers == (7,)
+    assert judge_cameras(_solution(views), [ALL]).outlier_views == (7,)
 
 
 def test_corners_far_away_are_counted_and_kept_out_of_the_rms(rng: np.random.Generator) -> None:
     views = _views(rng)
     views[3][:4] = 30.0
-    verdict = judge(_solution(views), [ALL])
-    assert verdict.wrong == (4,)
+    verdict = judge_cameras(_solution(views), [ALL])
+    assert verdict.outlier_corners == (4,)
     assert verdict.rms_px[0] < 0.35
 
 
 def test_each_reason_is_given(rng: np.random.Generator) -> None:
-    half = replace(ALL, cells=np.repeat([[5] * 4 + [0] * 4], GRID[0], axis=0))
+    half = replace(ALL, cells=np.repeat([[5] * 4 + [0] * 4], CELL_GRID[0], axis=0))
     spoilt = _views(rng)
     for view in spoilt:
         view[:5] = 30.0
@@ -57,6 +59,6 @@ def test_each_reason_is_given(rng: np.random.Generator) -> None:
         (_solution(spoilt), ALL, "100 of 1000 corners do not fit within 0.5 px"),
         (blurred, ALL, "px RMS, at most 0.5"),
     ):
-        reasons = judge(solution, [cover]).reasons
+        reasons = judge_cameras(solution, [cover]).reasons
         assert len(reasons) == 1
         assert reason in reasons[0]

@@ -5,7 +5,7 @@ import pytest
 
 from share.lab.calibrate.corners import detector
 from share.lab.calibrate.target import AprilGrid, CharucoBoard, Target
-from share.lab.calibrate.target_sheet import darkness, ink
+from share.lab.calibrate.target_sheet import black_rectangles, darkness_image
 from share.types import F64, U8
 
 _TEXEL = 0.002  # m: tags of 44 px
@@ -18,7 +18,7 @@ def _picture(target: Target) -> tuple[U8, F64]:
     columns, rows = np.round((high - low) / _TEXEL).astype(int)
     xs = low[0] + _TEXEL * np.arange(columns + 1)
     ys = high[1] - _TEXEL * np.arange(rows + 1)
-    image = np.round(220 - 190 * darkness(ink(target), xs, ys)).astype(np.uint8)
+    image = np.round(220 - 190 * darkness_image(black_rectangles(target), xs, ys)).astype(np.uint8)
     px = (target.corners[:, :2] - (low[0], high[1])) / (_TEXEL, -_TEXEL) - 0.5
     return image, px
 

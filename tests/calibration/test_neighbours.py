@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from share.lab.calibrate.corners import by_neighbours
+from share.lab.calibrate.corners import predict_from_neighbours
 from share.lab.calibrate.target import AprilGrid
 from share.types import F64
 
@@ -16,7 +16,7 @@ def seen() -> F64:
 
 
 def test_without_errors_each_is_where_it_is() -> None:
-    np.testing.assert_allclose(by_neighbours(BOARD, seen()), seen(), atol=1e-6)
+    np.testing.assert_allclose(predict_from_neighbours(BOARD, seen()), seen(), atol=1e-6)
 
 
 def test_those_found_wrongly_or_not_at_all_change_nothing(rng: np.random.Generator) -> None:
@@ -25,26 +25,26 @@ def test_those_found_wrongly_or_not_at_all_change_nothing(rng: np.random.Generat
     wrong = rng.random(len(px)) < 1 / 6
     px[wrong] += rng.choice([-1, 1], (wrong.sum(), 2)) * rng.uniform(3, 9, (wrong.sum(), 2))
     px[rng.random(len(px)) < 0.1] = np.nan
-    off = np.linalg.norm(by_neighbours(BOARD, px) - seen(), axis=1)
+    off = np.linalg.norm(predict_from_neighbours(BOARD, px) - seen(), axis=1)
     assert np.median(off) < 0.15 and np.quantile(off, 0.97) < 0.6
 
 
 def test_a_corner_does_not_tell_of_itself(rng: np.random.Generator) -> None:
     px = seen()
     px[70] += 5
-    np.testing.assert_allclose(by_neighbours(BOARD, px)[70], seen()[70], atol=1e-6)
+    np.testing.assert_allclose(predict_from_neighbours(BOARD, px)[70], seen()[70], atol=1e-6)
 
 
 def test_too_few_tell_nothing() -> None:
     px = np.full(BOARD.shape, np.nan)
     px[:6] = seen()[:6]
-    assert np.isnan(by_neighbours(BOARD, px)).all()
-    assert by_neighbours(np.empty((0, 2)), np.empty((0, 2))).shape == (0, 2)
+    assert np.isnan(predict_from_neighbours(BOARD, px)).all()
+    assert predict_from_neighbours(np.empty((0, 2)), np.empty((0, 2))).shape == (0, 2)
 
 
 def test_neighbours_on_one_line_are_no_error() -> None:
     line = np.column_stack([np.arange(8.0), np.zeros(8)])
-    assert by_neighbours(line, 10 * line).shape == (8, 2)
+    assert predict_from_neighbours(line, 10 * line).shape == (8, 2)
 
 
 def test_corners_that_lie_anywhere_are_no_error(rng: np.random.Generator) -> None:
@@ -56,4 +56,4 @@ def test_corners_that_lie_anywhere_are_no_error(rng: np.random.Generator) -> Non
         rng.integers(0, 4, BOARD.shape).astype(float),
         np.column_stack([np.arange(144.0), np.arange(144.0)]),
     ):
-        assert by_neighbours(BOARD, px).shape == px.shape
+        assert predict_from_neighbours(BOARD, px).shape == px.shape

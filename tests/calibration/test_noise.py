@@ -5,8 +5,8 @@ import pytest
 from scipy.signal import lfilter
 
 from share.errors import DataError
-from share.lab.calibrate.allan import allan_deviation, scatter
-from share.lab.calibrate.imu_noise import fit, together
+from share.lab.calibrate.allan import allan_deviation, variance_covariance
+from share.lab.calibrate.imu_noise import combine_axes, fit_noise
 
 N, K = 3e-3, 4e-4  # white noise and walk cross at 13 s
 
@@ -19,7 +19,9 @@ def made(seed: int, seconds: float, rate_hz: float, axes: int = 12, n: float = N
 
 def test_true_figures_lie_within_the_stated_errors():
     """24 axes of 20 min: as many standard errors off as chance has it, and few beyond two."""
-    axes = [a for seed in range(2) for a in fit(allan_deviation(made(seed, 1200, 50), 50), model_error=0)]
+    axes = [
+        a for seed in range(2) for a in fit_noise(allan_deviation(made(seed, 1200, 50), 50), model_error=0)
+    ]
     assert all(axis.density.told for axis in axes) and np.mean([axis.walk.told for axis in axes]) > 0.7
     for k, truth in ((1, N), (3, K)):
         off = np.array([(axis.squares[k] - truth**2) / axis.errors[k] for axis in axes])
@@ -28,38 +30,38 @@ def test_true_figures_lie_within_the_stated_errors():
 
 
 def test_the_axes_together_are_nearer_to_the_truth():
-    axes = fit(allan_deviation(made(7, 1200, 50, axes=20), 50))
-    assert together(axes, "walk").value == pytest.approx(K, rel=0.08)
-    assert together(axes, "walk").sigma < 0.4 * np.mean([axis.walk.sigma for axis in axes])
-    assert together(axes, "density").value == pytest.approx(N, rel=0.01)
+    axes = fit_noise(allan_deviation(made(7, 1200, 50, axes=20), 50))
+    assert combine_axes(axes, "walk").value == pytest.approx(K, rel=0.08)
+    assert combine_axes(axes, "walk").sigma < 0.4 * np.mean([axis.walk.sigma for axis in axes])
+    assert combine_axes(axes, "density").value == pytest.approx(N, rel=0.01)
 
 
 def test_figures_do_not_depend_on_the_rate():
     for rate_hz in (20.0, 200.0):
-        axes = fit(allan_deviation(made(3, 1200, rate_hz, axes=6), rate_hz))
-        density, walk = together(axes, "density"), together(axes, "walk")
+        axes = fit_noise(allan_deviation(made(3, 1200, rate_hz, axes=6), rate_hz))
+        density, walk = combine_axes(axes, "density"), combine_axes(axes, "walk")
         assert abs(density.value - N) < 3 * density.sigma < 0.1 * N
         assert abs(walk.value - K) < 3 * walk.sigma < 0.5 * K
 
 
 def test_white_noise_alone_has_a_bound_for_the_walk_and_no_number():
-    axes = fit(allan_deviation(made(4, 600, 50, k=0), 50))
+    axes = fit_noise(allan_deviation(made(4, 600, 50, k=0), 50))
     assert sum(axis.walk.told for axis in axes) <= 1
     assert all(axis.walk.bound < K for axis in axes)
-    assert together(axes, "density").value == pytest.approx(N, rel=0.01)
+    assert combine_axes(axes, "density").value == pytest.approx(N, rel=0.01)
 
 
 def test_a_bound_is_above_the_truth_in_most_short_recordings():
     """One minute, in which the walk does not yet show."""
-    axes = [a for seed in range(3) for a in fit(allan_deviation(made(seed, 60, 50), 50))]
+    axes = [a for seed in range(3) for a in fit_noise(allan_deviation(made(seed, 60, 50), 50))]
     assert np.mean([axis.walk.told for axis in axes]) < 0.4
     assert np.mean([axis.walk.bound > K for axis in axes]) >= 0.85
 
 
 def test_a_walk_alone_is_found():
-    axes = fit(allan_deviation(made(5, 600, 20, n=0), 20.0))
-    assert together(axes, "walk").value == pytest.approx(K, rel=0.05)
-    assert together(axes, "density").cautious < 1e-3
+    axes = fit_noise(allan_deviation(made(5, 600, 20, n=0), 20.0))
+    assert combine_axes(axes, "walk").value == pytest.approx(K, rel=0.05)
+    assert combine_axes(axes, "density").conservative < 1e-3
 
 
 def test_flicker_noise_is_bias_instability():
@@ -72,7 +74,7 @@ def test_flicker_noise_is_bias_instability():
     # a Lorentzian of variance 1 is 4 T / (1 + (2 pi f T)^2) one-sided; over ln T, ln(10) / 2 apart, they
     # add up to (1 / f) / (ln(10) / 2), and B^2 / (2 pi f) is two-sided, so B^2 = pi / (ln(10) / 2)
     expected = np.sqrt(np.pi / (np.log(10) / 2))
-    found = together(fit(allan_deviation(flicker, 1.0)), "instability")
+    found = combine_axes(fit_noise(allan_deviation(flicker, 1.0)), "instability")
     assert found.told and found.value == pytest.approx(expected, rel=0.06)
 
 
@@ -80,15 +82,17 @@ def test_coarse_digits_are_quantisation_and_not_white_noise():
     """A slow signal in digits: 3 Q^2 / tau^2 with Q = step sqrt(dt^2 / 12) where errors are independent."""
     rng, rate_hz, Q = np.random.default_rng(80), 50.0, 2e-3
     angle = Q * rng.standard_normal((60_001, 3))
-    axes = fit(allan_deviation(np.diff(angle, axis=0) * rate_hz + made(8, 1200, rate_hz, 3), rate_hz))
+    axes = fit_noise(allan_deviation(np.diff(angle, axis=0) * rate_hz + made(8, 1200, rate_hz, 3), rate_hz))
     assert [axis.quantisation.value for axis in axes] == pytest.approx([Q] * 3, rel=0.05)
     assert all(axis.quantisation.told for axis in axes)
-    assert together(axes, "density").value == pytest.approx(N, rel=0.03)
+    assert combine_axes(axes, "density").value == pytest.approx(N, rel=0.03)
 
 
 def test_a_filter_in_the_sensor_does_not_spoil_the_white_noise():
     smooth = lfilter(np.ones(4) / 4, [1], made(9, 1200, 200, 6), axis=0)
-    assert together(fit(allan_deviation(smooth, 200.0)), "density").value == pytest.approx(N, rel=0.01)
+    assert combine_axes(fit_noise(allan_deviation(smooth, 200.0)), "density").value == pytest.approx(
+        N, rel=0.01
+    )
 
 
 def test_equivalent_degrees_of_freedom_are_those_of_nist():
@@ -96,7 +100,7 @@ def test_equivalent_degrees_of_freedom_are_those_of_nist():
     n, sizes = 4097, np.array([8, 64, 512])
     white = {m: (3 * (n - 1) / (2 * m) - 2 * (n - 2) / n) * 4 * m**2 / (4 * m**2 + 5) for m in sizes}
     walk = {m: (n - 2) / m * ((n - 1) ** 2 - 3 * m * (n - 1) + 4 * m**2) / (n - 3) ** 2 for m in sizes}
-    spread = scatter(sizes, np.array([n - 1]), 1.0)
+    spread = variance_covariance(sizes, np.array([n - 1]), 1.0)
     for k, (part, stated) in enumerate(((0, white), (2, walk))):
         own = (1 / sizes, sizes / 3)[k]
         freedom = 2 * own**2 / np.diag(spread[part, part])
@@ -107,7 +111,7 @@ def test_the_covariance_of_variances_is_what_many_recordings_show():
     curve = allan_deviation(made(10, 1000, 1.0, axes=3000, n=1.0, k=0.05), 1.0)
     some = [10, 14, 22]
     seen = np.cov(curve.deviation[some] ** 2)
-    spread = scatter(curve.sizes[some], curve.lengths, 1.0)
+    spread = variance_covariance(curve.sizes[some], curve.segment_lengths, 1.0)
     parts = np.array([1.0, 0.0, 0.05**2])
     assert np.einsum("a,b,abij->ij", parts, parts, spread) == pytest.approx(seen, rel=0.15)
 
@@ -115,13 +119,15 @@ def test_the_covariance_of_variances_is_what_many_recordings_show():
 def test_a_gap_costs_as_much_as_it_should():
     """Two halves tell of short averages as much as the whole; of long ones, less."""
     sizes = np.array([8, 400])
-    whole, halves = (scatter(sizes, np.array(lengths), 1.0)[0, 0] for lengths in ([4000], [2000, 2000]))
+    whole, halves = (
+        variance_covariance(sizes, np.array(lengths), 1.0)[0, 0] for lengths in ([4000], [2000, 2000])
+    )
     assert halves[0, 0] == pytest.approx(whole[0, 0], rel=0.02)
     assert halves[1, 1] > 1.1 * whole[1, 1]
 
 
 def test_a_dead_axis_and_a_few_samples_are_refused():
     with pytest.raises(DataError, match="is the sensor alive"):
-        fit(allan_deviation(np.zeros((10_000, 1)), 100.0))
+        fit_noise(allan_deviation(np.zeros((10_000, 1)), 100.0))
     with pytest.raises(DataError, match="too short"):
-        fit(allan_deviation(np.random.default_rng(0).standard_normal((100, 1)), 100.0))
+        fit_noise(allan_deviation(np.random.default_rng(0).standard_normal((100, 1)), 100.0))

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 
 from share.errors import DataError
-from share.lab.calibrate.imu import characterise, rest
-from share.lab.emulate.sensor.imu import measured
-from share.sensors.profile import profile
+from share.lab.calibrate.imu import characterise, find_rest
+from share.lab.emulate.sensor.imu import measured_samples
+from share.sensors.profile import load_profile
 from share.types import ImuBatch
 
 RATE_HZ = 200.0
-IMU = profile("euroc").device.imu
+IMU = load_profile("euroc").device.imu
 
 
 def still(seconds: float, seed: int = 0) -> ImuBatch:
@@ -16,8 +16,8 @@ def still(seconds: float, seed: int = 0) -> ImuBatch:
     n = int(seconds * RATE_HZ)
     stamps = np.arange(n, dtype=np.int64) * 5_000_000
     force = np.tile([0.1, 9.8, -0.3], (n, 1))
-    gyro = measured(np.zeros((n, 3)), IMU.gyro, (seed, 1))
-    return ImuBatch(stamps, gyro, measured(force, IMU.accel, (seed, 2)))
+    gyro = measured_samples(np.zeros((n, 3)), IMU.gyro, (seed, 1))
+    return ImuBatch(stamps, gyro, measured_samples(force, IMU.accel, (seed, 2)))
 
 
 def handled(imu: ImuBatch, start_s: float, end_s: float) -> ImuBatch:
@@ -34,13 +34,13 @@ def seconds(part: slice) -> tuple[float, float]:
 
 def test_a_recording_at_rest_is_used_from_end_to_end():
     for seed in range(3):
-        assert seconds(rest(still(400, seed), RATE_HZ)) == (0, 400)
+        assert seconds(find_rest(still(400, seed), RATE_HZ)) == (0, 400)
 
 
 def test_the_longer_rest_before_or_after_a_movement_is_used():
-    start, end = seconds(rest(handled(still(400), 250, 300), RATE_HZ))
+    start, end = seconds(find_rest(handled(still(400), 250, 300), RATE_HZ))
     assert start == 0 and 240 <= end <= 250
-    start, end = seconds(rest(handled(still(400), 0, 30), RATE_HZ))
+    start, end = seconds(find_rest(handled(still(400), 0, 30), RATE_HZ))
     assert 30 <= start <= 36 and end == 400
 
 
@@ -48,24 +48,24 @@ def test_a_knock_ends_the_rest():
     imu = still(300)
     accel = imu.accel.copy()
     accel[40_000:40_010] += 3.0
-    assert 190 <= seconds(rest(ImuBatch(imu.stamps_ns, imu.gyro, accel), RATE_HZ))[1] <= 200
+    assert 190 <= seconds(find_rest(ImuBatch(imu.stamps_ns, imu.gyro, accel), RATE_HZ))[1] <= 200
 
 
 def test_a_device_in_a_hand_is_refused():
     with pytest.raises(DataError, match=r"at rest for 0 s of 200 s.*leave it alone"):
-        rest(handled(still(200), 0, 200), RATE_HZ)
+        find_rest(handled(still(200), 0, 200), RATE_HZ)
 
 
 def test_less_than_a_minute_is_refused():
     with pytest.raises(DataError, match="at rest for 50 s of 50 s, at least 60 s"):
-        rest(still(50), RATE_HZ)
+        find_rest(still(50), RATE_HZ)
 
 
 def test_samples_that_a_filter_has_smoothed_are_at_rest_too():
     imu = still(300)
     smooth = [np.apply_along_axis(np.convolve, 0, v, np.ones(6) / 6, "same") for v in (imu.gyro, imu.accel)]
     inner = ImuBatch(imu.stamps_ns, *smooth).take(slice(20, -20))
-    assert rest(inner, RATE_HZ) == slice(0, len(inner))
+    assert find_rest(inner, RATE_HZ) == slice(0, len(inner))
 
 
 def test_lost_samples_are_counted_and_do_not_change_the_noise():
@@ -76,18 +76,18 @@ def test_lost_samples_are_counted_and_do_not_change_the_noise():
     keep[50_000:50_400] = False
     nature = characterise(imu.take(keep))
     assert nature.rate_hz == pytest.approx(RATE_HZ, rel=1e-4)
-    assert nature.missing == np.count_nonzero(~keep[:-1]) and nature.cuts == 1
+    assert nature.missing == np.count_nonzero(~keep[:-1]) and nature.unbridged_gaps == 1
     whole = characterise(imu)
-    assert nature.gyro.typical("density").value == pytest.approx(
-        whole.gyro.typical("density").value, rel=0.01
+    assert nature.gyro.combined("density").value == pytest.approx(
+        whole.gyro.combined("density").value, rel=0.01
     )
-    assert nature.gyro.curve.lengths.sum() == pytest.approx(len(imu) - 400, abs=5)
+    assert nature.gyro.curve.segment_lengths.sum() == pytest.approx(len(imu) - 400, abs=5)
 
 
 def test_the_noise_of_the_profile_is_found():
     nature = characterise(still(600))
-    assert nature.accel.typical("density").value == pytest.approx(IMU.accel.density, rel=0.03)
-    assert nature.accel.typical("walk").value == pytest.approx(IMU.accel.walk, rel=0.25)
+    assert nature.accel.combined("density").value == pytest.approx(IMU.accel.density, rel=0.03)
+    assert nature.accel.combined("walk").value == pytest.approx(IMU.accel.walk, rel=0.25)
     assert nature.accel.mean == pytest.approx([0.1, 9.8, -0.3], abs=4 * IMU.accel.start_bias)
 
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from share.lab.calibrate.corners import is_saddle, refined
+from share.lab.calibrate.corners import refine_corners, saddle_mask
 from share.types import F64, U8
 
 RADII = np.full(3, 5)
@@ -24,26 +24,26 @@ NEAR: F64 = np.array([[60.5, 59.0], [59.0, 60.2], [58.9, 58.8]])
 
 def test_a_saddle_is_one_in_perspective() -> None:
     image = fields([(LOW, LOW), (HIGH, HIGH)])
-    found = refined(image, NEAR, RADII)
+    found = refine_corners(image, NEAR, RADII)
     np.testing.assert_allclose(found, np.full((3, 2), 59.5), atol=0.1)
-    assert is_saddle(image, found, RADII).all()
+    assert saddle_mask(image, found, RADII).all()
 
 
 def test_the_corner_of_one_dark_field_is_none() -> None:
-    """`refined` finds it just as well."""
+    """`refine_corners` finds it just as well."""
     image = fields([(LOW, LOW)])
-    found = refined(image, NEAR, RADII)
+    found = refine_corners(image, NEAR, RADII)
     np.testing.assert_allclose(found, np.full((3, 2), 59.5), atol=0.8)
-    assert not is_saddle(image, found, RADII).any()
+    assert not saddle_mask(image, found, RADII).any()
 
 
 def test_a_saddle_at_the_end_of_the_light_is_one() -> None:
     shade = np.linspace(0.5, 1.0, 120)
     image = (fields([(LOW, LOW), (HIGH, HIGH)]) * shade).astype(np.uint8)
-    assert is_saddle(image, np.full((1, 2), 59.5), RADII[:1]).all()
+    assert saddle_mask(image, np.full((1, 2), 59.5), RADII[:1]).all()
 
 
 def test_what_was_not_found_is_none() -> None:
     image = fields([])
-    assert not is_saddle(image, np.array([[np.nan, np.nan], [50.0, 50.0]]), RADII[:2]).any()
-    assert is_saddle(image, np.empty((0, 2)), RADII[:0]).shape == (0,)
+    assert not saddle_mask(image, np.array([[np.nan, np.nan], [50.0, 50.0]]), RADII[:2]).any()
+    assert saddle_mask(image, np.empty((0, 2)), RADII[:0]).shape == (0,)

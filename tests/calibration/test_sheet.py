@@ -2,36 +2,36 @@
 
 import pytest
 
-from share.lab.calibrate.target_sheet import FOOT_MM, MARGIN_MM, sheet
+from share.lab.calibrate.target_sheet import FOOTER_MM, MARGIN_MM, make_sheet
 
 
 def ends(made):
     """Left, low, right, high of what is black, mm."""
     low, high = 1000 * made.target.extent
     wide, tall = high - low
-    return made.left, made.low, made.left + wide, made.low + tall
+    return made.left, made.bottom, made.left + wide, made.bottom + tall
 
 
 @pytest.mark.parametrize("kind", ["aprilgrid", "charuco"])
 @pytest.mark.parametrize("paper", ["A4", "A0", "letter", "600x300"])
 def test_it_lies_within_the_margins_and_a_millimetre_more_would_not(kind, paper):
-    made = sheet(kind, 6, 5, paper)
+    made = make_sheet(kind, 6, 5, paper)
     left, low, right, high = ends(made)
     assert left == pytest.approx(made.width - right)
     assert min(left, made.height - high) >= MARGIN_MM - 1e-9
-    assert low >= MARGIN_MM + FOOT_MM - 1e-9
+    assert low >= MARGIN_MM + FOOTER_MM - 1e-9
     edge = round(1000 * (made.target.tag_size if kind == "aprilgrid" else made.target.square))
     with pytest.raises(ValueError, match="is the most there"):
-        sheet(kind, 6, 5, paper, edge + 1)
+        make_sheet(kind, 6, 5, paper, edge + 1)
 
 
 def test_the_paper_is_turned_for_a_wide_board():
-    assert sheet("charuco", 9, 6, "A4").width == 297
-    assert sheet("charuco", 6, 9, "A4").width == 210
+    assert make_sheet("charuco", 9, 6, "A4").width == 297
+    assert make_sheet("charuco", 6, 9, "A4").width == 210
 
 
 def test_a_size_is_taken_as_it_is():
-    made = sheet("aprilgrid", 4, 5, "A3", 30.5)
+    made = make_sheet("aprilgrid", 4, 5, "A3", 30.5)
     assert (made.target.cols, made.target.rows, made.target.tag_size) == (4, 5, pytest.approx(0.0305))
 
 
@@ -46,9 +46,9 @@ def test_a_size_is_taken_as_it_is():
 )
 def test_what_cannot_be_is_said(columns, paper, edge, said):
     with pytest.raises(ValueError, match=said):
-        sheet("aprilgrid", columns, 6, paper, edge)
+        make_sheet("aprilgrid", columns, 6, paper, edge)
 
 
 def test_many_squares_get_a_dictionary_that_has_as_many_markers():
-    assert sheet("charuco", 9, 7, "A3").target.dictionary == "DICT_5X5_100"
-    assert sheet("charuco", 20, 15, "A0").target.dictionary == "DICT_5X5_1000"
+    assert make_sheet("charuco", 9, 7, "A3").target.dictionary == "DICT_5X5_100"
+    assert make_sheet("charuco", 20, 15, "A0").target.dictionary == "DICT_5X5_1000"

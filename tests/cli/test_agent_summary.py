@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from share.cli.agent import _keyframes, _unacknowledged
+from share.cli.agent import _keyframes_text, _unacknowledged_text
 
 TOLD = {
     "edge_sessions": 1, "keyframes": 53, "sent": 50, "unacknowledged": 5, "refusal": None, "connected": True,
@@ -35,14 +35,14 @@ def report(**told):
 )
 def test_why_keyframes_were_never_acknowledged(told, trouble, why):
     run = SimpleNamespace(report=report(**told), trouble=trouble)
-    assert _unacknowledged(run, "ann", 5.0) == f"the edge never acknowledged 5 keyframes: {why}"
+    assert _unacknowledged_text(run, "ann", 5.0) == f"the edge never acknowledged 5 keyframes: {why}"
 
 
 @pytest.mark.parametrize("told", [{"unacknowledged": 0}, {"edge_sessions": 0}])
 def test_nothing_is_said_where_all_is_well_or_there_never_was_an_edge(told):
-    assert _unacknowledged(SimpleNamespace(report=report(**told), trouble=None), "ann", 5.0) is None
+    assert _unacknowledged_text(SimpleNamespace(report=report(**told), trouble=None), "ann", 5.0) is None
 
 
 def test_the_last_line_says_what_was_sent():
-    assert _keyframes(report(), "T") == "60 keyframes: 50 sent, 48 acknowledged, 3 corrections, T"
-    assert _keyframes(report(edge_sessions=0), "T") == "no edge answered: 60 keyframes not sent"
+    assert _keyframes_text(report(), "T") == "60 keyframes: 50 sent, 48 acknowledged, 3 corrections, T"
+    assert _keyframes_text(report(edge_sessions=0), "T") == "no edge answered: 60 keyframes not sent"

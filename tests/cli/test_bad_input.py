@@ -625,7 +625,7 @@ class Careless(threading.Thread):
                     self.link.send(arrival.peer, encode(answer))
         self.link.close()
 
-    def _answers(self, message: object) -> Iterator[m.Down]:
+    def _answers(self, message: object) -> Iterator[m.DownlinkMessage]:
         match message:
             case m.Hello():
                 yield m.Welcome(7, 0)

@@ -14,7 +14,7 @@ from shell import Done
 
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.lab.calibrate.camera_start import intrinsics, names
+from share.lab.calibrate.camera_initialisation import intrinsics, parameter_names
 from share.lab.calibrate.target import CharucoBoard
 from share.recordings.calibration import read_calibration, to_kalibr
 
@@ -77,7 +77,7 @@ def badly_known(dance: Path, folder: Path) -> Path:
     """bare.yaml and a report beside it, of half a pixel: 2e-3 rad."""
     folder.mkdir()
     (folder / "kalibr_imucam_chain.yaml").write_text((dance / "bare.yaml").read_text())
-    parameters = dict(zip(names(CAMERA), intrinsics(CAMERA).tolist(), strict=True))
+    parameters = dict(zip(parameter_names(CAMERA), intrinsics(CAMERA).tolist(), strict=True))
     covariance = np.diag([0.3, 0.3, 0.5, 0.5, 1e-3, 1e-3, 1e-4, 1e-4]) ** 2
     told = {"passed": False, "cameras": [{"parameters": parameters}], "covariance": covariance.tolist()}
     (folder / "camera-report.json").write_text(json.dumps(told))

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from share.files.yaml_file import read_yaml
-from share.lab.emulate.sensor.imu import measured
+from share.lab.emulate.sensor.imu import measured_samples
 from share.recordings.calibration import imu_noise
 from share.recordings.mcap.recorder import Recorder
 from share.sensors.measurement import Measurement
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
 
-IMU = profile("euroc").device.imu
+IMU = load_profile("euroc").device.imu
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +25,8 @@ def table(tmp_path_factory) -> Path:
 
 def written(path: Path, seconds: int, louder: float = 1.0) -> Path:
     n = seconds * 200
-    gyro = measured(np.zeros((n, 3)), replace(IMU.gyro, density=IMU.gyro.density * louder), (1,))
-    accel = measured(np.tile([0, 9.81, 0], (n, 1)), IMU.accel, (2,))
+    gyro = measured_samples(np.zeros((n, 3)), replace(IMU.gyro, density=IMU.gyro.density * louder), (1,))
+    accel = measured_samples(np.tile([0, 9.81, 0], (n, 1)), IMU.accel, (2,))
     rows = np.concatenate([np.arange(n)[:, None] * 5_000_000, gyro, accel], axis=1)
     np.savetxt(path, rows, ["%d", *["%.8f"] * 6], delimiter=",", header="t,wx,wy,wz,ax,ay,az")
     return path
@@ -79,7 +79,7 @@ def test_inflated_noise_is_written_and_said(share, table, tmp_path):
 
 
 def test_the_device_is_named_where_the_recording_knows_it(share, tmp_path):
-    with Recorder(tmp_path / "rest.mcap", profile("euroc").rig(), serial="0123") as recorder:
+    with Recorder(tmp_path / "rest.mcap", load_profile("euroc").rig(), serial="0123") as recorder:
         for stamp, *values in np.loadtxt(written(tmp_path / "a.csv", 70), delimiter=",", skiprows=1):
             recorder.write(Measurement("imu", int(stamp), tuple(values)))
     assert share("calibrate", "imu", tmp_path / "rest.mcap", "--out", tmp_path / "mine").code == 0

@@ -163,5 +163,5 @@ def test_real_recordings(share, shared_data, tmp_path, name, turned, mm):
     settings = ("--calib", calib, "--one-clock", "--sigma-mm", "1.5", "--out", tmp_path)
     assert share("calibrate", "mocap", folder / "imu0.csv", "--truth", truth, *settings).code == 0
     T = read_yaml(tmp_path / "mocap.yaml").pose("T_body_mocap")
-    assert np.degrees(se3.angle(T[:3, :3])) == pytest.approx(turned, abs=0.05)
+    assert np.degrees(se3.rotation_angle(T[:3, :3])) == pytest.approx(turned, abs=0.05)
     assert np.linalg.norm(T[:3, 3]) * 1e3 == pytest.approx(mm, abs=1)

@@ -123,9 +123,9 @@ def test_an_import_is_not_interrupted(tmp_path):
         "except BaseException as error:\n    raise RuntimeError('cannot be imported') from error\n"
     )
     program = (
-        "import sys, time\nfrom share.cli.unwinding import unwinding\n"
+        "import sys, time\nfrom share.cli.signals import unwind_on_signal\n"
         f"sys.path.insert(0, {str(tmp_path)!r})\n"
-        "try:\n    with unwinding():\n        import swallows\n        time.sleep(10)\n"
+        "try:\n    with unwind_on_signal():\n        import swallows\n        time.sleep(10)\n"
         "except KeyboardInterrupt:\n    print('interrupted')\n"
     )
     assert printed(program) == "interrupted\n"
@@ -137,8 +137,8 @@ def test_a_worker_is_not_left_half_started():
     program = (
         "import os, signal, threading, time\n"
         "from multiprocessing import popen_spawn_posix as spawning\n"
-        "from share.cli.unwinding import unwinding\n"
-        "from share.spawning import SPAWN\n"
+        "from share.cli.signals import unwind_on_signal\n"
+        "from share.spawning import SPAWN_CONTEXT\n"
         "threading.Thread(target=time.sleep, args=(2.0,), daemon=True).start()\n"
         "start = spawning.util.spawnv_passfds\n"
         "def interrupted(*arguments):\n"
@@ -147,8 +147,8 @@ def test_a_worker_is_not_left_half_started():
         "    time.sleep(0.1)\n"
         "    return worker\n"
         "spawning.util.spawnv_passfds = interrupted\n"
-        "worker = SPAWN.Process(target=print, args=('worked',))\n"
-        "try:\n    with unwinding():\n        worker.start()\n"
+        "worker = SPAWN_CONTEXT.Process(target=print, args=('worked',))\n"
+        "try:\n    with unwind_on_signal():\n        worker.start()\n"
         "except KeyboardInterrupt:\n    worker.join()\n    print('interrupted')\n"
     )
     assert printed(program) == "worked\ninterrupted\n"
@@ -160,12 +160,12 @@ def test_a_worker_that_nobody_has_taken_charge_of_is_not_waited_for(number):
     program = (
         "import os\n"
         "from share.__main__ import run\n"
-        "from share.runtime.worker import Companion\n"
-        "begin = Companion.__init__\n"
+        "from share.runtime.worker_process import WorkerProcess\n"
+        "begin = WorkerProcess.__init__\n"
         "def interrupted(self, *about):\n"
         "    begin(self, *about)\n"
         f"    os.kill(os.getpid(), {int(number)})\n"
-        "Companion.__init__ = interrupted\n"
+        "WorkerProcess.__init__ = interrupted\n"
         "run()\n"
     )
     command = [sys.executable, "-c", program, "edge", "--bind", "tcp://127.0.0.1:0"]
@@ -179,18 +179,18 @@ def test_what_waited_for_an_import_waits_for_a_worker_too():
     program = (
         "import os, signal, time\n"
         "from multiprocessing import popen_spawn_posix as spawning\n"
-        "from share.cli import unwinding as module\n"
-        "from share.spawning import SPAWN\n"
+        "from share.cli import signals as module\n"
+        "from share.spawning import SPAWN_CONTEXT\n"
         "start = spawning.util.spawnv_passfds\n"
         "def slow(*arguments):\n"
         "    worker = start(*arguments)\n"
         "    time.sleep(0.1)\n"
         "    return worker\n"
-        "worker = SPAWN.Process(target=print, args=('worked',))\n"
+        "worker = SPAWN_CONTEXT.Process(target=print, args=('worked',))\n"
         "spawning.util.spawnv_passfds = slow\n"
         "importing = iter([True])\n"
         "module._is_importing = lambda frame: next(importing, False)\n"
-        "try:\n    with module.unwinding():\n"
+        "try:\n    with module.unwind_on_signal():\n"
         "        os.kill(os.getpid(), signal.SIGTERM)\n        worker.start()\n"
         "except SystemExit:\n    worker.join()\n    print('ended')\n"
     )

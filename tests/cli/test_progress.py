@@ -7,7 +7,7 @@ import io
 
 import pytest
 
-from share.cli.progress import LiveLine
+from share.cli.terminal import LiveLine
 
 
 class Gone(io.StringIO):
@@ -21,7 +21,7 @@ class Gone(io.StringIO):
 def test_a_terminal_that_is_gone_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stderr", Gone())
     line = LiveLine()
-    assert line.seen
+    assert line.is_terminal
     line.write("1 frame")
-    line.say("the camera is away")
+    line.print_line("the camera is away")
     line.end()

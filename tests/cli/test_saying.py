@@ -17,8 +17,8 @@ import pytest
 import zmq
 
 from share.cli import saying
-from share.cli.progress import LiveLine
 from share.cli.saying import Stderr
+from share.cli.terminal import LiveLine
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
@@ -62,7 +62,7 @@ def test_lines_come_in_their_order_and_are_there_after_the_end(monkeypatch: pyte
     with pipe(monkeypatch) as (reader, writer):
         line = LiveLine()
         for i in range(20):
-            line.say(f"{i}")
+            line.print_line(f"{i}")
         line.end()
         os.write(writer, b"after")
         assert read(reader, b"after").decode().split() == [*map(str, range(20)), "after"]
@@ -72,9 +72,9 @@ def test_a_disk_that_is_full_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> No
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stderr", full)
         line = LiveLine()
-        line.say("one")
+        line.print_line("one")
         line.end()
-        line.say("two")
+        line.print_line("two")
         line.end()
 
 

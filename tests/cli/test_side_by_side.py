@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 from share import __version__
-from share.lab.peers import PEERS
+from share.lab.peer_trackers import PEERS
 
 SHARE = f"SHARE {__version__}"
 INTERPRETER = f"""#!{sys.executable}
 import sys
 sys.path.insert(0, {str(PEERS["basalt"].path.parent)!r})
-from peer_wire import claim_stdout, read_line, read_moment, write_line
+from peer_wire import claim_stdout, read_line, read_frame, write_line
 
 answers = claim_stdout()
 if "orbslam3" in sys.argv[1]:
@@ -29,7 +29,7 @@ print("begins", file=sys.stderr)
 read_line(sys.stdin.buffer)
 at = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 stamps = []
-while (moment := read_moment(sys.stdin.buffer)) is not None:
+while (moment := read_frame(sys.stdin.buffer)) is not None:
     stamps.append(moment.stamp_ns)
     write_line(answers, dict(T_world_body=at if len(stamps) > 3 else None, cpu_s=0.002))
     if len(stamps) == BREAKS:

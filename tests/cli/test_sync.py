@@ -18,10 +18,10 @@ import pytest
 from shell import Done
 from time_servers import shifted, udp
 
-from share.cli.agent import _clock
+from share.cli.agent import _clock_text
 from share.devices import time_client
-from share.net.ntp import Mode, Packet
-from share.protocol.edge_clock import ClockClaim
+from share.net.ntp import NtpMode, NtpPacket
+from share.protocol.edge_clock import ClockEstimate
 
 SHARE = [sys.executable, "-m", "share"]
 Share = Callable[..., Done]
@@ -29,7 +29,7 @@ Share = Callable[..., Done]
 
 @pytest.fixture(autouse=True)
 def _brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(time_client, "PAUSE_S", 0.02)
+    monkeypatch.setattr(time_client, "QUESTION_PERIOD_S", 0.02)
 
 
 def asked(done: Done) -> dict[str, object]:
@@ -116,7 +116,7 @@ def test_nobody_at_that_port_is_said_at_once(share: Share) -> None:
 
 
 def test_who_does_not_answer_is_given_up_after_three(share: Share, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(time_client, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(time_client, "REPLY_TIMEOUT_S", 0.05)
     questions = []
     with udp(lambda data: questions.append(data) or []) as port:  # type: ignore[func-returns-value]
         done = share("sync", "check", f"127.0.0.1:{port}", "--count", 50)
@@ -141,7 +141,7 @@ def test_a_kiss_of_death_ends_the_questions(share: Share) -> None:
 
     def kiss(data: bytes) -> list[bytes]:
         questions.append(data)
-        return [Packet(Mode.SERVER, refid=b"DENY", origin=Packet.decode(data).transmit).encode()]
+        return [NtpPacket(NtpMode.SERVER, refid=b"DENY", origin=NtpPacket.decode(data).transmit).encode()]
 
     with udp(kiss) as port:
         done = share("sync", "check", f"127.0.0.1:{port}")
@@ -156,7 +156,7 @@ def test_what_was_answered_before_a_kiss_counts(share: Share) -> None:
         questions.append(data)
         if len(questions) <= 2:
             return good(data)
-        return [Packet(Mode.SERVER, refid=b"RATE", origin=Packet.decode(data).transmit).encode()]
+        return [NtpPacket(NtpMode.SERVER, refid=b"RATE", origin=NtpPacket.decode(data).transmit).encode()]
 
     with udp(soon_tired) as port:
         done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 50)
@@ -170,7 +170,7 @@ def test_forged_answers_are_passed_over_and_the_true_one_is_taken(share: Share) 
     good = shifted(0.0)
 
     def besieged(data: bytes) -> list[bytes]:
-        forged = Packet(Mode.SERVER, stratum=1, origin=7, receive=1 << 60, transmit=1 << 60)
+        forged = NtpPacket(NtpMode.SERVER, stratum=1, origin=7, receive=1 << 60, transmit=1 << 60)
         return [b"", b"junk", secrets.token_bytes(48), data, forged.encode(), *good(data)]
 
     with udp(besieged) as port:
@@ -274,5 +274,5 @@ def test_a_port_in_use_is_said(share: Share) -> None:
     ],
 )
 def test_share_agent_says_the_offset_or_that_it_is_too_uncertain(sigma_ms: float, said: str) -> None:
-    claim = ClockClaim(0.431, sigma_ms, 0.357, claim_ms=1.0)
-    assert _clock(claim.report()).startswith(said)
+    claim = ClockEstimate(0.431, sigma_ms, 0.357, claim_ms=1.0)
+    assert _clock_text(claim.report()).startswith(said)

@@ -9,7 +9,7 @@ import pytest
 
 from share.lab.train.labels import read_labels
 from share.metrics.local_error import LocalError
-from share.odometry.error_model.features import RECENT
+from share.odometry.error_model.inputs import RECENT_NAMES
 
 
 @pytest.mark.slow
@@ -28,11 +28,11 @@ def test_labels_of_a_session(share, plain_session, tmp_path):
     known = np.isfinite(labels.error_cm)
     assert not known[labels.stamps_ns < labels.stamps_ns[0] + 2.4e9].any()  # half a window first
     assert (labels.error_cm[known] < 1).all()
-    assert labels.about["imu"] and not labels.recent[:, RECENT.index("deaf")].any()
+    assert labels.about["imu"] and not labels.recent[:, RECENT_NAMES.index("deaf")].any()
 
     assert share(*arguments, "--without-imu").code == 0  # beside the others
     bare = read_labels(out / clean.name.replace("-0", "-without-imu-0"))
-    assert not bare.about["imu"] and bare.recent[:, RECENT.index("deaf")].all()
+    assert not bare.about["imu"] and bare.recent[:, RECENT_NAMES.index("deaf")].all()
     assert np.nanmedian(bare.error_cm) < 2
 
     made = {path: path.stat().st_mtime_ns for path in out.iterdir() if "without" not in path.name}
@@ -70,6 +70,6 @@ def test_labels_are_the_errors_of_the_run(share, plain_session, tmp_path):
         (path,) = out.glob(f"*-{agent}-0.npz")
         labels, told = read_labels(path), read_tum(tum)
         error = LocalError(open_source(f"{plain_session}/{agent}").truth())
-        errors = {int(ns): error.after(int(ns), T) for ns, T in zip(told.stamps_ns, told.T, strict=True)}
+        errors = {int(ns): error.update(int(ns), T) for ns, T in zip(told.stamps_ns, told.T, strict=True)}
         wanted = [np.nan if errors[int(ns)] is None else errors[int(ns)] for ns in labels.stamps_ns]
         assert labels.error_cm == pytest.approx(wanted, abs=1e-3, nan_ok=True)

@@ -12,13 +12,13 @@ from share.errors import ConfigError
 from share.geometry.camera import Camera
 from share.geometry.se3 import exp, transform
 from share.plain_data import from_mapping
-from share.scheduling.overlap import Frustum, Seen, ious, volumes
+from share.scheduling.overlap import Frustum, SampledFrustum, ious, overlap_volumes
 from share.types import F64
 
 WIDE = Frustum(math.radians(87), math.radians(58), 0.3, 5.0)
 NARROW = Frustum(math.radians(50), math.radians(40), 0.5, 3.0)
-USUAL, OTHER = Seen(WIDE, 0.5), Seen(NARROW, 0.5)
-FINE, OTHER_FINE = Seen(WIDE, 0.12), Seen(NARROW, 0.12)
+USUAL, OTHER = SampledFrustum(WIDE, 0.5), SampledFrustum(NARROW, 0.5)
+FINE, OTHER_FINE = SampledFrustum(WIDE, 0.12), SampledFrustum(NARROW, 0.12)
 seeds = st.integers(0, 10_000)
 
 
@@ -33,9 +33,9 @@ def shifted(x: float = 0, y: float = 0, z: float = 0) -> F64:
 
 
 def test_a_frustum_follows_from_a_calibration() -> None:
-    frustum = Frustum.of(Camera(640, 480, 320.0, 240.0, 319.5, 239.5), 0.3, 5.0)
+    frustum = Frustum.from_camera(Camera(640, 480, 320.0, 240.0, 319.5, 239.5), 0.3, 5.0)
     assert frustum.slopes == (pytest.approx(1.0), pytest.approx(1.0))
-    assert Frustum.of(Camera(8192, 480, 1.0, 240.0, 0, 0), 0.3, 5.0).horizontal_rad < math.pi
+    assert Frustum.from_camera(Camera(8192, 480, 1.0, 240.0, 0, 0), 0.3, 5.0).horizontal_rad < math.pi
 
 
 def test_volume_by_hand() -> None:
@@ -46,7 +46,7 @@ def test_volume_by_hand() -> None:
 def test_a_view_overlaps_itself_wholly() -> None:
     for T in poses(0, 20):
         assert ious(USUAL, T, USUAL, T[None])[0] == 1
-        assert volumes(USUAL, T, USUAL, T[None])[0] == WIDE.volume
+        assert overlap_volumes(USUAL, T, USUAL, T[None])[0] == WIDE.volume
 
 
 @pytest.mark.parametrize("step", [0.25, 1.0, 2.2, 4.0, 4.7, 5.5])
@@ -54,11 +54,11 @@ def test_a_step_forward_is_as_worked_out(step: float) -> None:
     """Of the rear frustum there remains what is within the front one, from its near end on."""
     sx, sy = WIDE.slopes
     expected = 4 / 3 * sx * sy * max(0.0, (WIDE.far_m - step) ** 3 - WIDE.near_m**3)
-    got = volumes(FINE, np.eye(4), FINE, shifted(z=step)[None])[0]
+    got = overlap_volumes(FINE, np.eye(4), FINE, shifted(z=step)[None])[0]
     assert got == pytest.approx(expected, abs=0.015 * WIDE.volume)
     assert (
-        volumes(FINE, np.eye(4), FINE, shifted(z=step)[None])[0]
-        == volumes(FINE, shifted(z=step), FINE, np.eye(4)[None])[0]
+        overlap_volumes(FINE, np.eye(4), FINE, shifted(z=step)[None])[0]
+        == overlap_volumes(FINE, shifted(z=step), FINE, np.eye(4)[None])[0]
     )
 
 
@@ -67,7 +67,7 @@ def test_a_step_aside_is_as_worked_out() -> None:
     sx, sy = WIDE.slopes
     depth = np.linspace(WIDE.near_m, WIDE.far_m, 20_001)
     expected = np.trapezoid(np.maximum(0, 2 * sx * depth - 1.5) * 2 * sy * depth, depth)
-    assert volumes(FINE, np.eye(4), FINE, shifted(x=1.5)[None])[0] == pytest.approx(
+    assert overlap_volumes(FINE, np.eye(4), FINE, shifted(x=1.5)[None])[0] == pytest.approx(
         expected, abs=0.01 * WIDE.volume
     )
 
@@ -75,9 +75,9 @@ def test_a_step_aside_is_as_worked_out() -> None:
 def test_who_look_away_from_each_other_share_nothing() -> None:
     back = exp(np.array([0, math.pi, 0, 0, 0, 0]))
     others = np.array([back, shifted(z=50), shifted(x=20)])
-    assert volumes(USUAL, np.eye(4), USUAL, others).tolist() == [0, 0, 0]
+    assert overlap_volumes(USUAL, np.eye(4), USUAL, others).tolist() == [0, 0, 0]
     assert ious(USUAL, np.eye(4), USUAL, others).tolist() == [0, 0, 0]
-    assert volumes(USUAL, np.eye(4), USUAL, np.zeros((0, 4, 4))).shape == (0,)
+    assert overlap_volumes(USUAL, np.eye(4), USUAL, np.zeros((0, 4, 4))).shape == (0,)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -96,17 +96,17 @@ def test_small_frusta_against_chance(seed: int) -> None:
         for p in (points, transform(np.linalg.inv(T_a_b), points))
     )
     expected = (in_a & in_b).mean() * 4 * top[0] * top[1] * 0.4
-    one = Seen(frustum, 0.01)
-    got = volumes(one, np.eye(4), one, T_a_b[None])[0]
+    one = SampledFrustum(frustum, 0.01)
+    got = overlap_volumes(one, np.eye(4), one, T_a_b[None])[0]
     assert got == pytest.approx(expected, abs=0.01 * frustum.volume)
 
 
 @given(seeds)
 def test_symmetric_and_between_nothing_and_all(seed: int) -> None:
     a, b = poses(seed, 2)
-    assert volumes(USUAL, a, USUAL, b[None])[0] == volumes(USUAL, b, USUAL, a[None])[0]
+    assert overlap_volumes(USUAL, a, USUAL, b[None])[0] == overlap_volumes(USUAL, b, USUAL, a[None])[0]
     assert 0 <= ious(USUAL, a, USUAL, b[None])[0] <= 1
-    assert 0 <= volumes(USUAL, a, USUAL, b[None])[0] <= WIDE.volume * (1 + 1e-12)
+    assert 0 <= overlap_volumes(USUAL, a, USUAL, b[None])[0] <= WIDE.volume * (1 + 1e-12)
 
 
 @given(seeds)
@@ -121,8 +121,8 @@ def test_where_the_world_begins_does_not_matter(seed: int) -> None:
 @settings(max_examples=30)
 def test_many_at_once_are_each_as_alone(seed: int) -> None:
     a, *others = poses(seed, 8, 12.0)
-    together = volumes(USUAL, a, USUAL, np.array(others))
-    assert together.tolist() == [volumes(USUAL, a, USUAL, other[None])[0] for other in others]
+    together = overlap_volumes(USUAL, a, USUAL, np.array(others))
+    assert together.tolist() == [overlap_volumes(USUAL, a, USUAL, other[None])[0] for other in others]
 
 
 def test_the_usual_grid_is_as_exact_as_documented() -> None:
@@ -139,7 +139,7 @@ def test_the_usual_grid_is_as_exact_as_documented() -> None:
 )
 def test_sphere_holds_all_corners(frustum: Frustum) -> None:
     sx, sy = frustum.slopes
-    z, radius = frustum.sphere
+    z, radius = frustum.bounding_sphere
     far = [math.hypot(d * sx, d * sy, d - z) for d in (frustum.near_m, frustum.far_m)]
     assert max(far) == pytest.approx(radius)
 
@@ -148,8 +148,8 @@ def test_sphere_holds_all_corners(frustum: Frustum) -> None:
 def test_two_sorts_of_cameras(seed: int) -> None:
     """Symmetric, within the smaller, and of many at once each as alone."""
     a, *others = poses(seed, 6, 6.0)
-    together = volumes(USUAL, a, OTHER, np.array(others))
-    assert together.tolist() == [volumes(OTHER, b, USUAL, a[None])[0] for b in others]
+    together = overlap_volumes(USUAL, a, OTHER, np.array(others))
+    assert together.tolist() == [overlap_volumes(OTHER, b, USUAL, a[None])[0] for b in others]
     assert (together <= NARROW.volume * 1.1).all()
     union = WIDE.volume + NARROW.volume - together
     assert ious(USUAL, a, OTHER, np.array(others)).tolist() == (together / union).tolist()
@@ -158,15 +158,15 @@ def test_two_sorts_of_cameras(seed: int) -> None:
 def test_two_sorts_of_cameras_against_finer_points() -> None:
     views = poses(7, 160, 2.0)
     pairs = list(zip(views[::2], views[1::2], strict=True))
-    rough = np.array([volumes(USUAL, a, OTHER, b[None])[0] for a, b in pairs])
-    fine = np.array([volumes(FINE, a, OTHER_FINE, b[None])[0] for a, b in pairs])
+    rough = np.array([overlap_volumes(USUAL, a, OTHER, b[None])[0] for a, b in pairs])
+    fine = np.array([overlap_volumes(FINE, a, OTHER_FINE, b[None])[0] for a, b in pairs])
     assert (fine > 1).sum() >= 10
     assert np.abs(rough - fine).max() < 0.1 * NARROW.volume
 
 
 def test_one_view_within_the_other() -> None:
     """Looking the same way from the same place, the narrow one sees nothing that the wide one does not."""
-    got = volumes(FINE, np.eye(4), OTHER_FINE, np.eye(4)[None])[0]
+    got = overlap_volumes(FINE, np.eye(4), OTHER_FINE, np.eye(4)[None])[0]
     assert got == pytest.approx(NARROW.volume, rel=0.02)
 
 
@@ -175,7 +175,7 @@ def test_one_view_within_the_other() -> None:
 def test_whatever_the_interval_there_are_some_points_and_not_too_many(
     frustum: Frustum, interval_m: float
 ) -> None:
-    assert 9 <= Seen(frustum, interval_m).points.shape[1] <= 2_048_000
+    assert 9 <= SampledFrustum(frustum, interval_m).points.shape[1] <= 2_048_000
 
 
 @pytest.mark.parametrize(

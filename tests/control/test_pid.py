@@ -7,40 +7,40 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from share.config import ControlConfig
-from share.scheduling.pid import Gains, State, step
+from share.scheduling.pid import PidGains, PidState, step
 
-GAINS = Gains(0.8, 0.15, 0.2, 0.25, integral_max_hz=0.1, rate_min_hz=0.5, rate_max_hz=10, gap_s=5)
+GAINS = PidGains(0.8, 0.15, 0.2, 0.25, integral_max_hz=0.1, rate_min_hz=0.5, rate_max_hz=10, gap_s=5)
 S = 1_000_000_000
 
 
-def close(state: State, expected: State) -> None:
-    for name in ("rate_hz", "error", "integral_hz", "slope", "seen_ns"):
+def close(state: PidState, expected: PidState) -> None:
+    for name in ("rate_hz", "error", "integral_hz", "derivative", "updated_ns"):
         assert getattr(state, name) == pytest.approx(getattr(expected, name), abs=1e-12, rel=0)
 
 
 def test_three_steps_by_hand() -> None:
-    first = step(State(5.0), 0.5, 0, GAINS)
-    close(first, State(5.4, 0.5, 0.0, 0.0, 0))  # P 0.4
+    first = step(PidState(5.0), 0.5, 0, GAINS)
+    close(first, PidState(5.4, 0.5, 0.0, 0.0, 0))  # P 0.4
     second = step(first, 0.25, S // 2, GAINS)
     # P 0.2; I 0.15 * 0.25 * 0.5 = 0.01875; slope 0.25 * -0.5 = -0.125, D -0.025
-    close(second, State(5.59375, 0.25, 0.01875, -0.125, S // 2))
+    close(second, PidState(5.59375, 0.25, 0.01875, -0.125, S // 2))
     third = step(second, -0.25, S // 2 + S, GAINS)
     # P -0.2; I 0.01875 - 0.0375; slope 0.25 * -0.5 + 0.75 * -0.125 = -0.21875, D -0.04375
-    close(third, State(5.33125, -0.25, -0.01875, -0.21875, S // 2 + S))
+    close(third, PidState(5.33125, -0.25, -0.01875, -0.21875, S // 2 + S))
 
 
 @pytest.mark.parametrize("later_ns", [0, -S, 5 * S + 1])
 def test_no_time_back_in_time_and_a_gap_reset_the_slope_and_hold_the_integral(later_ns: int) -> None:
-    state = step(State(5.0, 0.5, 0.05, -0.3, S), 0.25, S + later_ns, GAINS)
-    close(state, State(5.25, 0.25, 0.05, 0.0, S + later_ns))  # P 0.2, I 0.05
+    state = step(PidState(5.0, 0.5, 0.05, -0.3, S), 0.25, S + later_ns, GAINS)
+    close(state, PidState(5.25, 0.25, 0.05, 0.0, S + later_ns))  # P 0.2, I 0.05
 
 
 def test_the_longest_step_is_no_gap() -> None:
-    assert step(State(5.0, 0.5, 0.0, 0.0, 0), 0.1, 5 * S, GAINS).slope == pytest.approx(-0.02)
+    assert step(PidState(5.0, 0.5, 0.0, 0.0, 0), 0.1, 5 * S, GAINS).derivative == pytest.approx(-0.02)
 
 
 def test_the_integral_does_not_wind_up() -> None:
-    state = State(5.0)
+    state = PidState(5.0)
     for second in range(1000):
         state = step(state, 1.0, second * S, GAINS)
     assert (state.rate_hz, state.integral_hz) == (10.0, 0.1)
@@ -50,8 +50,8 @@ def test_the_integral_does_not_wind_up() -> None:
 
 
 def test_the_rate_is_clipped_on_either_side() -> None:
-    assert step(State(9.9), 1.0, 0, GAINS).rate_hz == 10
-    assert step(State(0.6), -1.0, 0, GAINS).rate_hz == 0.5
+    assert step(PidState(9.9), 1.0, 0, GAINS).rate_hz == 10
+    assert step(PidState(0.6), -1.0, 0, GAINS).rate_hz == 0.5
 
 
 @given(
@@ -63,16 +63,16 @@ def test_rate_and_integral_stay_within_bounds(
     steps: list[tuple[float, int]], gain: float, alpha: float
 ) -> None:
     gains = replace(GAINS, kp=gain, ki=gain, kd=gain, alpha=alpha)
-    state, now_ns = State(10.0), 0
+    state, now_ns = PidState(10.0), 0
     for error, passed_ns in steps:
         now_ns += passed_ns
         state = step(state, error, now_ns, gains)
         assert 0.5 <= state.rate_hz <= 10 and abs(state.integral_hz) <= 0.1
-        assert (state.error, state.seen_ns) == (error, now_ns)
+        assert (state.error, state.updated_ns) == (error, now_ns)
 
 
 def test_gains_are_what_is_set() -> None:
-    gains = Gains.of(ControlConfig())
+    gains = PidGains.from_config(ControlConfig())
     assert (gains.kp, gains.ki, gains.kd) == (0.8, 0.15, 0.2)
     assert (
         gains.gap_s > 1 / gains.rate_min_hz

@@ -42,7 +42,7 @@ def settled(plant: Plant, seconds: float = 90) -> dict[str, float]:
 
 
 def test_every_policy_that_may_be_set_is_here() -> None:
-    assert set(settings.POLICIES) <= set(POLICIES)
+    assert set(settings.POLICY_NAMES) <= set(POLICIES)
     assert list(POLICIES) == ["share", "covins-g", "linear", "equal", "random", "streamed"]
 
 
@@ -59,7 +59,7 @@ def test_every_policy_that_may_be_set_is_here() -> None:
 )
 def test_what_policies_say_of_themselves(name: str, gated: bool, alike: bool, raw: bool) -> None:
     policy = made(name)
-    assert (policy.gated, policy.alike, policy.raw) == (gated, alike, raw)
+    assert (policy.has_merge_gate, policy.treats_alike, policy.streams_frames) == (gated, alike, raw)
 
 
 @pytest.mark.parametrize("name", ["covins-g", "streamed"])
@@ -84,7 +84,7 @@ def test_equal_takes_a_robot_for_a_headset() -> None:
 
 
 def test_a_robot_gets_the_form_of_a_headset_by_settings_alone() -> None:
-    policy = made("share", settings.load("control: {agents: {bob: {form: ar}}}").control)
+    policy = made("share", settings.load_config("control: {agents: {bob: {form: ar}}}").control)
     for t in range(3):
         at = (60.0, 0.3, t * S)
         assert policy.rate("bob", AgentKind.ROBOT, *at) == policy.rate("ann", AgentKind.AR, *at)

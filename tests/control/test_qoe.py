@@ -12,11 +12,11 @@ from share import config as settings
 from share.config import ControlConfig
 from share.errors import ConfigError
 from share.plain_data import to_mapping
-from share.scheduling.qoe import Needs, accuracy, factors, qoe
+from share.scheduling.qoe import QoeParameters, accuracy, qoe, qoe_factors
 from share.types import AgentKind
 
-AR = Needs(AgentKind.AR, beta=0.01, gamma=0.5, theta_ms=20, target=0.9)
-ROBOT = Needs(AgentKind.ROBOT, beta=2, gamma=100, theta_ms=25, target=0.9)
+AR = QoeParameters(AgentKind.AR, beta=0.01, gamma=0.5, theta_ms=20, target=0.9)
+ROBOT = QoeParameters(AgentKind.ROBOT, beta=2, gamma=100, theta_ms=25, target=0.9)
 delays = st.floats(0, 5000)
 errors = st.floats(0, 50)
 
@@ -37,7 +37,9 @@ errors = st.floats(0, 50)
         (ROBOT, 25, None, 0.8646647167633873),
     ],
 )
-def test_printed_formulas(needs: Needs, delay_ms: float, error_cm: float | None, expected: float) -> None:
+def test_printed_formulas(
+    needs: QoeParameters, delay_ms: float, error_cm: float | None, expected: float
+) -> None:
     assert math.isclose(qoe(delay_ms, error_cm, needs), expected, rel_tol=0, abs_tol=1e-12)
 
 
@@ -49,7 +51,7 @@ def test_accuracy_is_one_over_the_error_with_a_floor() -> None:
 def test_less_delay_and_less_error_are_never_worse(
     d1: float, d2: float, e1: float, e2: float, kind: AgentKind, signed: bool
 ) -> None:
-    needs = Needs.of(ControlConfig(signed_penalty=signed), kind)
+    needs = QoeParameters.from_config(ControlConfig(signed_penalty=signed), kind)
     better, worse = qoe(min(d1, d2), min(e1, e2), needs), qoe(max(d1, d2), max(e1, e2), needs)
     assert 0 <= worse <= better < math.inf
     assert signed or better <= 1
@@ -61,7 +63,7 @@ def test_what_no_double_holds_is_still_finite() -> None:
 
 
 def test_default_needs_are_about_met_where_they_should_be() -> None:
-    ar, robot = (Needs.of(ControlConfig(), kind) for kind in (AgentKind.AR, AgentKind.ROBOT))
+    ar, robot = (QoeParameters.from_config(ControlConfig(), kind) for kind in (AgentKind.AR, AgentKind.ROBOT))
     assert abs(qoe(20, 1.35, ar) - ar.target) < 0.02
     assert qoe(200, 0.5, robot) < robot.target < qoe(100, 0.5, robot)
     for needs, delay_ms, wrong_cm in ((ar, 200, 30), (robot, 1000, 10)):
@@ -75,7 +77,7 @@ def test_default_needs_are_about_met_where_they_should_be() -> None:
 def test_the_table_of_the_documentation_is_so() -> None:
     text = (Path(__file__).parents[2] / "docs" / "scheduling.md").read_text()
     table = text.split("<!-- QoE by default")[1].split("\n\n")[1].splitlines()
-    ar, robot = (Needs.of(ControlConfig(), kind) for kind in (AgentKind.AR, AgentKind.ROBOT))
+    ar, robot = (QoeParameters.from_config(ControlConfig(), kind) for kind in (AgentKind.AR, AgentKind.ROBOT))
     points = [(ar, d) for d in (10, 20, 50, 100, 200)] + [(robot, d) for d in (20, 100, 200, 500, 1000)]
     for row in table[2:]:
         error_cm, *cells = (float(cell) for cell in row.strip("| ").split("|"))
@@ -85,11 +87,13 @@ def test_the_table_of_the_documentation_is_so() -> None:
 
 def test_one_agent_has_needs_of_its_own() -> None:
     text = "control: {agents: {bob: {form: ar, target: 0.8}, ann: {beta: 0}}}"
-    control = settings.load(text).control
-    bob = Needs.of(control, AgentKind.ROBOT, "bob")
-    assert bob == replace(Needs.of(control, AgentKind.AR), target=0.8)
-    assert Needs.of(control, AgentKind.AR, "ann").beta == 0
-    assert Needs.of(control, AgentKind.ROBOT, "carl") == Needs.of(ControlConfig(), AgentKind.ROBOT)
+    control = settings.load_config(text).control
+    bob = QoeParameters.from_config(control, AgentKind.ROBOT, "bob")
+    assert bob == replace(QoeParameters.from_config(control, AgentKind.AR), target=0.8)
+    assert QoeParameters.from_config(control, AgentKind.AR, "ann").beta == 0
+    assert QoeParameters.from_config(control, AgentKind.ROBOT, "carl") == QoeParameters.from_config(
+        ControlConfig(), AgentKind.ROBOT
+    )
     assert to_mapping(control)["agents"]["bob"]["form"] == "ar"
 
 
@@ -105,23 +109,25 @@ def test_one_agent_has_needs_of_its_own() -> None:
 )
 def test_wrong_settings_are_named(text: str, said: str) -> None:
     with pytest.raises(ConfigError) as error:
-        settings.load(f"control: {{{text}}}")
+        settings.load_config(f"control: {{{text}}}")
     assert said in str(error.value)
 
 
 @given(delays, errors, st.sampled_from(AgentKind))
 def test_blame_is_of_what_costs_more(delay_ms: float, error_cm: float, kind: AgentKind) -> None:
-    needs = Needs.of(ControlConfig(), kind)
-    found = factors(delay_ms, error_cm, needs)
+    needs = QoeParameters.from_config(ControlConfig(), kind)
+    found = qoe_factors(delay_ms, error_cm, needs)
     assert math.prod(found) == qoe(delay_ms, error_cm, needs)
-    assert -1 <= found.blame <= 1
-    assert (found.blame > 0) == (found.error < found.delay)
+    assert -1 <= found.error_attribution <= 1
+    assert (found.error_attribution > 0) == (found.error < found.delay)
 
 
 def test_blame_by_hand() -> None:
     """e^-1 is lost by delay, 1 - e^-1 is left by error: ln is -1 and -0.45868."""
-    found = factors(120, 0.5, AR)
+    found = qoe_factors(120, 0.5, AR)
     assert found.delay == pytest.approx(math.exp(-1), abs=1e-15)
-    assert found.blame == pytest.approx((0.4586751453870819 - 1) / (0.4586751453870819 + 1), abs=1e-12)
-    assert factors(20, 0.5, AR).blame == 1
-    assert factors(75, 0.5, ROBOT).blame == -1
+    assert found.error_attribution == pytest.approx(
+        (0.4586751453870819 - 1) / (0.4586751453870819 + 1), abs=1e-12
+    )
+    assert qoe_factors(20, 0.5, AR).error_attribution == 1
+    assert qoe_factors(75, 0.5, ROBOT).error_attribution == -1

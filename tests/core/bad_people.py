@@ -23,7 +23,7 @@ class Miscalibrated(Person):
 
     @property
     def hello(self) -> Hello:
-        T_body_cam0 = se3.compose(se3.so3_exp(np.array(self.tilt)), np.zeros(3))
+        T_body_cam0 = se3.from_rt(se3.so3_exp(np.array(self.tilt)), np.zeros(3))
         hello = super().hello
         return replace(hello, rig=replace(hello.rig, T_body_cam0=T_body_cam0))
 
@@ -60,7 +60,7 @@ class Leaper(Person):
     def step(self) -> tuple[F64, View]:
         T, view = super().step()
         if len(self.T_odom_body) - 1 in self.at:
-            T = self.T_odom_body[-1] = se3.compose(np.eye(3), np.array([100.0, 0.0, 0.0])) @ T
+            T = self.T_odom_body[-1] = se3.from_rt(np.eye(3), np.array([100.0, 0.0, 0.0])) @ T
         return T, view
 
 

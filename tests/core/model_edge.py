@@ -13,8 +13,8 @@ from hellos import hello_of
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
-from share.protocol.peer import InOrder
-from share.types import Candidate, Correction, Keyframe, TrackState, View
+from share.protocol.peer import ReorderBuffer
+from share.types import Correction, Keyframe, KeyframeCandidate, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
@@ -41,12 +41,12 @@ _T_LAST: WeakKeyDictionary[Agent, np.ndarray] = WeakKeyDictionary()  # of its la
 def handle(agent: Agent, event: ev.AgentEvent, now_ns: int, view: View = EMPTY) -> list[ev.AgentEffect]:
     """Gives the agent the event, and after a keyframe's pose the keyframe, as a tracker does."""
     effects = agent.handle(event, now_ns)
-    if isinstance(event, ev.FrameTracked) and event.keyframe:
+    if isinstance(event, ev.FrameTracked) and event.is_keyframe:
         assert event.T_odom_body is not None
         T = event.T_odom_body
         T_last_body = se3.inverse(_T_LAST.get(agent, np.eye(4))) @ T
         _T_LAST[agent] = T
-        candidate = Candidate(T, T_last_body, COV, UP, 0.01, view, event.new_stretch)
+        candidate = KeyframeCandidate(T, T_last_body, COV, UP, 0.01, view, event.new_segment)
         effects = effects + agent.handle(ev.KeyframeMade(event, candidate), now_ns)
     return effects
 
@@ -58,12 +58,12 @@ class ModelEdge:
     session: int
     next_keyframe: int = 0
     applied: list[Keyframe] = field(default_factory=list)
-    inorder: InOrder = field(init=False)
+    inorder: ReorderBuffer = field(init=False)
     known: bool = False
     revision: int = 0
 
     def __post_init__(self) -> None:
-        self.inorder = InOrder(self.next_keyframe)
+        self.inorder = ReorderBuffer(self.next_keyframe)
 
     def receive(self, message: m.Message, now_ns: int) -> list[m.Message]:
         match message:
@@ -132,14 +132,14 @@ class World:
         for frames in self.up.arrived(now_ns):
             for answer in self.edge.receive(decode(frames), now_ns) if self.edge else ():
                 self.down.send([bytes(f) for f in encode(answer)], now_ns)
-        received = [ev.Received(frames) for frames in self.down.arrived(now_ns)]
-        for event in (*received, *events, ev.Tick()):
+        received = [ev.EdgeMessageReceived(frames) for frames in self.down.arrived(now_ns)]
+        for event in (*received, *events, ev.AgentTick()):
             effects = handle(self.agent, event, now_ns)
             self.effects += effects
             for effect in effects:
-                if isinstance(effect, ev.Send) and self.edge:
+                if isinstance(effect, ev.SendToEdge) and self.edge:
                     self.up.send([bytes(f) for f in effect.frames], now_ns)
 
     @property
     def stopped(self) -> bool:
-        return any(isinstance(effect, ev.Stop) for effect in self.effects)
+        return any(isinstance(effect, ev.CloseLink) for effect in self.effects)

@@ -23,17 +23,19 @@ def walk(count: int) -> list[ev.FrameTracked]:
     """Somebody goes round in circles; each fifth frame is a candidate, and odometry breaks once."""
     out = []
     for k in range(count):
-        T = se3.compose(se3.so3_exp(np.array([0, 0, k / 50])), np.array([np.sin(k / 50), k / 200, 0.0]))
+        T = se3.from_rt(se3.so3_exp(np.array([0, 0, k / 50])), np.array([np.sin(k / 50), k / 200, 0.0]))
         out.append(tracked(k, T, candidate=k % 5 == 0, new_stretch=k == count // 2))
     return out
 
 
 def odometry(effects: list[ev.AgentEffect]) -> list[tuple[int, int, bytes]]:
-    return [(e.stamp_ns, e.stretch, e.T_odom_body.tobytes()) for e in effects if isinstance(e, ev.Localised)]
+    return [
+        (e.stamp_ns, e.segment, e.T_odom_body.tobytes()) for e in effects if isinstance(e, ev.LocalisedPose)
+    ]
 
 
 def messages(effects: list[ev.AgentEffect]) -> list[m.Message]:
-    return [decode(effect.frames) for effect in effects if isinstance(effect, ev.Send)]
+    return [decode(effect.frames) for effect in effects if isinstance(effect, ev.SendToEdge)]
 
 
 def alone(frames: list[ev.FrameTracked]) -> list[tuple[int, int, bytes]]:
@@ -45,7 +47,7 @@ def lied_to(agent: Agent, frames: list[ev.FrameTracked], liar: Liar, each: int) 
     """All that comes of frames, with so many lies between each two of them."""
     effects: list[ev.AgentEffect] = []
     for frame in frames:
-        news = [frame, *(ev.Received(liar.say()) for _ in range(each)), ev.Tick()]
+        news = [frame, *(ev.EdgeMessageReceived(liar.say()) for _ in range(each)), ev.AgentTick()]
         for event in news:
             more = handle(agent, event, frame.done_ns)
             for message in messages(more):
@@ -64,24 +66,24 @@ def test_odometry_is_the_same_whatever_the_edge_says_and_an_honest_edge_finds_al
     # an honest edge, after the silence by which its agent notices that the liar is gone
     honest = [
         *frames[300:],
-        *(ev.Tick() for _ in range(400)),
-        ev.Finished(),
-        *(ev.Tick() for _ in range(200)),
+        *(ev.AgentTick() for _ in range(400)),
+        ev.InputFinished(),
+        *(ev.AgentTick() for _ in range(200)),
     ]
     for k, event in enumerate(honest):
         now = frames[299].done_ns + (k + 1) * FRAME_MS * MS
         more = handle(agent, event, now)
         for answer in down if k > 80 else ():
-            more += handle(agent, ev.Received(encode(answer)), now)
+            more += handle(agent, ev.EdgeMessageReceived(encode(answer)), now)
         down = [answer for message in messages(more) for answer in edge.receive(message, now)]
         effects += more
     assert odometry(effects) == alone(frames)
     report = agent.report()
-    assert report["open"] == 0 and isinstance(effects[-1], ev.Stop)
+    assert report["open"] == 0 and isinstance(effects[-1], ev.CloseLink)
     assert edge.applied[-1].id == report["keyframes"] - 1
     assert report["map_id"] == f"map-{edge.session}"
     assert report["bad_messages"] > 100
-    said = [e.text for e in effects[:lies] if isinstance(e, ev.Say)]
+    said = [e.text for e in effects[:lies] if isinstance(e, ev.PrintLine)]
     assert all(line.isprintable() and len(line) < 400 for line in said)
     assert 3 < len(said) < 30
 
@@ -98,7 +100,7 @@ def test_what_is_sent_to_a_liar_is_bounded() -> None:
     assert by_kind[m.Hello] <= 2 * 15 + 2  # two a second
     assert by_kind[m.Ping] <= 2 * 15 + 2
     assert by_kind[Keyframe] <= 60 + 16 * (2 * 15 + 2)  # each life of the edge is sent a window again
-    places = [e.T_map_odom for e in effects if isinstance(e, ev.Localised) and e.T_map_odom is not None]
+    places = [e.T_map_odom for e in effects if isinstance(e, ev.LocalisedPose) and e.T_map_odom is not None]
     assert places and all(np.isfinite(T).all() for T in places)
 
 
@@ -107,7 +109,7 @@ def test_what_is_sent_to_a_liar_is_bounded() -> None:
 
 def welcomed(frames: int = 0) -> tuple[Agent, int]:
     agent, now = Agent(HELLO, Config()), 0
-    handle(agent, ev.Tick(), 0)
+    handle(agent, ev.AgentTick(), 0)
     tell(agent, m.Welcome(7, 0), 0)
     for frame in walk(frames):
         now = frame.done_ns
@@ -116,19 +118,19 @@ def welcomed(frames: int = 0) -> tuple[Agent, int]:
 
 
 def tell(agent: Agent, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
-    return handle(agent, ev.Received(encode(message)), now_ns)
+    return handle(agent, ev.EdgeMessageReceived(encode(message)), now_ns)
 
 
 def said(effects: list[ev.AgentEffect]) -> list[str]:
-    return [effect.text for effect in effects if isinstance(effect, ev.Say)]
+    return [effect.text for effect in effects if isinstance(effect, ev.PrintLine)]
 
 
 def test_a_welcome_that_acknowledges_everything_for_ever_does_not_silence_an_agent() -> None:
     agent = Agent(HELLO, Config())
-    handle(agent, ev.Tick(), 0)
+    handle(agent, ev.AgentTick(), 0)
     [line] = said(tell(agent, m.Welcome(7, MAX_ID), 0))
     assert line == "the edge sent a welcome of keyframes that were never sent; it is not believed"
-    assert not agent.connected
+    assert not agent.is_connected
     tell(agent, m.Ack(MAX_ID), 0)
     tell(agent, m.Welcome(7, 0), 0)
     effects = [e for frame in walk(20) for e in handle(agent, frame, frame.done_ns)]
@@ -171,10 +173,10 @@ def test_a_rate_of_nothing_for_ever_still_lets_a_keyframe_through_now_and_then()
     tell(agent, m.Rate(0.0), now)
     sent = 0
     for frame in walk(1200)[1:]:  # a minute
-        if frame.keyframe:
+        if frame.is_keyframe:
             tell(agent, m.Rate(0.0), frame.done_ns)
         effects = handle(agent, frame, frame.done_ns)
-        tell(agent, m.Ack(agent._ledger.next_unsent), frame.done_ns)
+        tell(agent, m.Ack(agent._ledger.next_unsent_id), frame.done_ns)
         sent += sum(isinstance(x, Keyframe) for x in messages(effects))
     assert 5 <= sent <= 9
 
@@ -201,9 +203,9 @@ def test_a_refusal_long_after_the_beginning_ends_nothing() -> None:
 def test_a_clock_that_no_machine_can_have_is_not_believed(edge_ns: int) -> None:
     agent, _ = welcomed(1)
     for t in range(1, 60):
-        for ping in [x for x in messages(handle(agent, ev.Tick(), t * S // 2)) if isinstance(x, m.Ping)]:
+        for ping in [x for x in messages(handle(agent, ev.AgentTick(), t * S // 2)) if isinstance(x, m.Ping)]:
             tell(agent, m.Pong(ping.sequence, ping.sent_ns, edge_ns, edge_ns, 7), t * S // 2 + MS)
-    assert agent.clock(30 * S).offset_ms is None
+    assert agent.clock_estimate(30 * S).offset_ms is None
     assert agent.report()["clock_offset_ns"] is None
 
 
@@ -212,8 +214,8 @@ def test_a_clock_that_does_not_advance_as_ours_does_is_not_claimed() -> None:
     claims = []
     for t in range(1, 200):
         now = t * S // 2
-        for ping in [x for x in messages(handle(agent, ev.Tick(), now)) if isinstance(x, m.Ping)]:
+        for ping in [x for x in messages(handle(agent, ev.AgentTick(), now)) if isinstance(x, m.Ping)]:
             edge = 10**15 * (t % 7) + now
             tell(agent, m.Pong(ping.sequence, ping.sent_ns, edge, edge, 7), now + MS // 10)
-        claims.append(agent.clock(now + MS).claimed)
+        claims.append(agent.clock_estimate(now + MS).is_reliable)
     assert not any(claims)

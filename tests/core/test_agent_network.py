@@ -64,7 +64,7 @@ def world(walk_seed: int, network: dict[str, float], edge: ModelEdge | None, kee
 
 def finish(run: World) -> None:
     """Ends the run and lets virtual time pass until the agent stops."""
-    run.step(run.now_ns + STEP, ev.Finished())
+    run.step(run.now_ns + STEP, ev.InputFinished())
     while not run.stopped:
         run.step(run.now_ns + STEP)
         assert run.now_ns < 2 * PATIENT * S
@@ -141,7 +141,7 @@ def test_restarted_edges_get_what_they_lack(
         check_applied(edge.applied, walk, edge.next_keyframe)
     assert run.agent.report()["open"] == 0
     if (
-        run.agent._lives.session == lives[-1].session and lives[-1].applied
+        run.agent._sessions.session == lives[-1].session and lives[-1].applied
     ):  # else the end came before it was noticed
         assert lives[-1].applied[-1].id == run.agent.report()["keyframes"] - 1
 
@@ -161,7 +161,7 @@ def test_an_edge_without_memory_is_given_all_that_is_held() -> None:
         run.step(frame.done_ns, frame)
     assert [k.id for k in second.applied[:held]] == list(range(held))
     check_applied(second.applied, walk)
-    lines = [effect.text for effect in run.effects if isinstance(effect, ev.Say)]
+    lines = [effect.text for effect in run.effects if isinstance(effect, ev.PrintLine)]
     assert lines[0] == "connected to the edge"
     assert lines[1].startswith("the edge has restarted; it is sent ")
 
@@ -171,7 +171,7 @@ def odometry(run: World) -> list[bytes]:
     return [
         b"%d %d %b" % (effect.index, effect.stamp_ns, effect.T_odom_body.tobytes())
         for effect in run.effects
-        if isinstance(effect, ev.Localised)
+        if isinstance(effect, ev.LocalisedPose)
     ]
 
 

@@ -10,16 +10,16 @@ import pytest
 
 from share.devices import camera_check, checks
 from share.devices import host as facts
-from share.devices.camera_check import Sdk, UsbCamera
-from share.devices.checks import State, calibration, device
+from share.devices.camera_check import SdkReport, UsbCamera
+from share.devices.checks import CheckState, check_calibration, check_serial
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.se3 import inverse
 
 
 @pytest.mark.parametrize(("mbit_s", "state"), [(480, "FAIL"), (5000, "OK"), (10000, "OK")])
 def test_a_link_is_usb_3_from_5000_mbit_on(mbit_s: float, state: str) -> None:
-    assert camera_check.link([UsbCamera("2-1", mbit_s)]).state.value == state
-    assert camera_check.link([]).state is camera_check.link(None).state is State.FAIL
+    assert camera_check.check_link([UsbCamera("2-1", mbit_s)]).state.value == state
+    assert camera_check.check_link([]).state is camera_check.check_link(None).state is CheckState.FAIL
 
 
 @pytest.mark.parametrize(
@@ -28,63 +28,80 @@ def test_a_link_is_usb_3_from_5000_mbit_on(mbit_s: float, state: str) -> None:
 )
 def test_firmware_is_compared_by_numbers_not_letters(found: str, state: str) -> None:
     good = ["5.13.0.50", "5.16.0.1"]
-    told = camera_check.firmware(Sdk(firmware=(found,)), good, "5.12.0.0")
+    told = camera_check.check_firmware(SdkReport(firmware=(found,)), good, "5.12.0.0")
     assert told.state.value == state
-    assert any("librealsense2-utils" in line for line in told.mend) == (state != "OK")
+    assert any("librealsense2-utils" in line for line in told.fix) == (state != "OK")
 
 
 def test_nobody_is_told_to_go_back_to_an_older_firmware() -> None:
-    found = camera_check.firmware(Sdk(firmware=("5.17.0.10",)), ["5.9.0.1", "5.16.0.1", "5.13"], None)
-    assert (found.state, found.mend) == (State.OK, ())
+    found = camera_check.check_firmware(
+        SdkReport(firmware=("5.17.0.10",)), ["5.9.0.1", "5.16.0.1", "5.13"], None
+    )
+    assert (found.state, found.fix) == (CheckState.OK, ())
     assert found.what.startswith("5.17.0.10, newer than those tried")
 
 
 def test_a_processor_for_which_there_is_no_poselib_is_told() -> None:
-    assert checks.libraries({"numpy": None, "poselib": None}).what == "numpy, poselib load"
-    found = checks.libraries({"numpy": None})
-    assert (found.state, found.mend) == (State.OK, ())
+    assert checks.check_libraries({"numpy": None, "poselib": None}).what == "numpy, poselib load"
+    found = checks.check_libraries({"numpy": None})
+    assert (found.state, found.fix) == (CheckState.OK, ())
     assert found.what.startswith("numpy load; no poselib for this processor")
 
 
 def test_into_a_frozen_program_nothing_can_be_installed() -> None:
     for frozen in (False, True):
         mends = [
-            *camera_check.sdk(Sdk("no module pyrealsense2"), [], frozen).mend,
-            *checks.libraries({"zmq": "no", "numpy": None}, frozen).mend,
+            *camera_check.check_sdk(SdkReport("no module pyrealsense2"), [], frozen).fix,
+            *checks.check_libraries({"zmq": "no", "numpy": None}, frozen).fix,
         ]
         assert ["pip" in mend for mend in mends] == [not frozen] * 2
         assert ["tools/deploy" in mend for mend in mends] == [frozen] * 2
-    assert camera_check.sdk(Sdk("libusb-1.0.so.0: not there"), [], True).mend == (
+    assert camera_check.check_sdk(SdkReport("libusb-1.0.so.0: not there"), [], True).fix == (
         "sudo apt install libusb-1.0-0",
     )
 
 
 def test_a_camera_that_is_plugged_in_must_be_one_that_the_sdk_sees() -> None:
-    here, seen = UsbCamera("2-1", 5000), Sdk(firmware=("5.16.0.1",))
-    assert camera_check.sdk(seen, [here]).state is camera_check.sdk(Sdk(), []).state is State.OK
-    assert camera_check.sdk(seen, [here, here]).state is State.FAIL
-    unseen, closed = (
-        camera_check.sdk(Sdk(), [here]),
-        camera_check.sdk(Sdk(), [UsbCamera("2-1", 5000, may_open=False)]),
+    here, seen = UsbCamera("2-1", 5000), SdkReport(firmware=("5.16.0.1",))
+    assert (
+        camera_check.check_sdk(seen, [here]).state
+        is camera_check.check_sdk(SdkReport(), []).state
+        is CheckState.OK
     )
-    assert unseen.state is closed.state is State.FAIL
+    assert camera_check.check_sdk(seen, [here, here]).state is CheckState.FAIL
+    unseen, closed = (
+        camera_check.check_sdk(SdkReport(), [here]),
+        camera_check.check_sdk(SdkReport(), [UsbCamera("2-1", 5000, may_open=False)]),
+    )
+    assert unseen.state is closed.state is CheckState.FAIL
     assert unseen.what == "loads, but sees 0 of 1 cameras: not permitted, or in use"
     assert closed.what == "loads, but sees 0 of 1 cameras: this user may not open 2-1"
-    assert "plugdev" in unseen.mend[0]
+    assert "plugdev" in unseen.fix[0]
 
 
 def test_what_cannot_be_seen_is_skipped() -> None:
-    found = [checks.governor([], "performance"), checks.throttling([]), camera_check.usb_memory(None, 128)]
-    found += [camera_check.firmware(Sdk("no"), [], None), camera_check.autosuspend([], False)]
-    assert {one.state for one in found} == {State.SKIPPED}
+    found = [
+        checks.check_governor([], "performance"),
+        checks.check_throttling([]),
+        camera_check.check_usb_memory(None, 128),
+    ]
+    found += [
+        camera_check.check_firmware(SdkReport("no"), [], None),
+        camera_check.check_autosuspend([], False),
+    ]
+    assert {one.state for one in found} == {CheckState.SKIPPED}
 
 
 def test_the_host_is_held_against_the_profile() -> None:
-    assert checks.governor(["performance"] * 4, "performance").state is State.OK
-    assert "1 of 2 cores" in checks.governor(["performance", "powersave"], "performance").what
-    assert checks.throttling([0, 3]).state is camera_check.usb_memory(16, 128).state is State.WARN
-    assert camera_check.usb_memory(128, 128).state is State.OK
-    assert camera_check.udev([], is_root=False).state is State.FAIL
+    assert checks.check_governor(["performance"] * 4, "performance").state is CheckState.OK
+    assert "1 of 2 cores" in checks.check_governor(["performance", "powersave"], "performance").what
+    assert (
+        checks.check_throttling([0, 3]).state
+        is camera_check.check_usb_memory(16, 128).state
+        is CheckState.WARN
+    )
+    assert camera_check.check_usb_memory(128, 128).state is CheckState.OK
+    assert camera_check.check_udev([], is_root=False).state is CheckState.FAIL
 
 
 @pytest.mark.parametrize(
@@ -98,46 +115,48 @@ def test_the_host_is_held_against_the_profile() -> None:
     ],
 )
 def test_a_raspberry_pi_tells_of_its_supply_and_of_heat(bits: int, what: str, mend: str) -> None:
-    found = checks.throttling([], bits)
-    assert found.state is (State.WARN if bits else State.OK)
+    found = checks.check_throttling([], bits)
+    assert found.state is (CheckState.WARN if bits else CheckState.OK)
     assert found.what.startswith(what)
-    assert all(mend in line for line in found.mend) and bool(found.mend) == bool(bits)
-    assert len(checks.throttling([], bits | 0x90000).mend) == 2  # each has a remedy of its own
+    assert all(mend in line for line in found.fix) and bool(found.fix) == bool(bits)
+    assert len(checks.check_throttling([], bits | 0x90000).fix) == 2  # each has a remedy of its own
 
 
 def test_an_edge_without_keys_or_agents_serves_its_own_machine_only() -> None:
-    assert (checks.no_edge_keys("k").state, checks.no_edge_keys("k").mend) == (
-        State.WARN,
+    assert (checks.missing_edge_keys("k").state, checks.missing_edge_keys("k").fix) == (
+        CheckState.WARN,
         ("share keys generate",),
     )
-    assert checks.edge_keys("edge", []).state is State.WARN
-    assert checks.edge_keys("edge", ["ann", "bob"]).what == "edge; lets in: ann, bob"
+    assert checks.check_edge_keys("edge", []).state is CheckState.WARN
+    assert checks.check_edge_keys("edge", ["ann", "bob"]).what == "edge; lets in: ann, bob"
 
 
 def test_what_mends_the_host_outlives_a_start() -> None:
-    lines, mend = checks.lines("performance", 128), checks.mend("performance", 128)
+    lines, mend = checks.tmpfiles_lines("performance", 128), checks.boot_settings_fix("performance", 128)
     assert [line.split()[-1] for line in lines] == ["performance", "128"]
     assert all(f"'{line}'" in mend[0] for line in lines)
-    assert checks.FILE in mend[0] and checks.FILE in mend[1]
-    assert checks.lines("", 0) == ()
-    asleep = camera_check.autosuspend([UsbCamera("2-1", 5000, "auto")], allowed=False)
-    assert any('ATTR{power/control}="on"' in line and "rules.d" in line for line in asleep.mend)
+    assert checks.TMPFILES_PATH in mend[0] and checks.TMPFILES_PATH in mend[1]
+    assert checks.tmpfiles_lines("", 0) == ()
+    asleep = camera_check.check_autosuspend([UsbCamera("2-1", 5000, "auto")], allowed=False)
+    assert any('ATTR{power/control}="on"' in line and "rules.d" in line for line in asleep.fix)
 
 
 @pytest.mark.parametrize(("minutes", "state"), [(4, "FAIL"), (6, "WARN"), (61, "OK")])
 def test_a_disk_is_told_in_minutes(minutes: int, state: str) -> None:
-    assert checks.disk("/", minutes * 60 * 10_000_000, 1e7).state.value == state
+    assert checks.check_disk("/", minutes * 60 * 10_000_000, 1e7).state.value == state
 
 
 def test_a_disk_that_may_not_be_written_to_is_of_no_use() -> None:
-    found = checks.disk("/data", 10**12, 1e7, may_write=False)
-    assert (found.state, found.what) == (State.FAIL, "/data: this user may not write there")
+    found = checks.check_disk("/data", 10**12, 1e7, may_write=False)
+    assert (found.state, found.what) == (CheckState.FAIL, "/data: this user may not write there")
 
 
-@pytest.mark.parametrize(("offset", "state"), [(0.5, State.OK), (-0.5, State.OK), (0.8, State.WARN)])
-def test_the_clock_counts_with_its_uncertainty(offset: float, state: State) -> None:
-    assert checks.clock((offset, 0.3), None).state is state
-    assert checks.clock(None, None).state is State.WARN
+@pytest.mark.parametrize(
+    ("offset", "state"), [(0.5, CheckState.OK), (-0.5, CheckState.OK), (0.8, CheckState.WARN)]
+)
+def test_the_clock_counts_with_its_uncertainty(offset: float, state: CheckState) -> None:
+    assert checks.check_clock((offset, 0.3), None).state is state
+    assert checks.check_clock(None, None).state is CheckState.WARN
 
 
 def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
@@ -147,36 +166,38 @@ def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
     T_10[0, 3] = -0.05
     lens = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
 
-    def of(T_imu_cam0: np.ndarray, cam1: np.ndarray, size: tuple[int, int] = (640, 480)) -> tuple[State, str]:
+    def of(
+        T_imu_cam0: np.ndarray, cam1: np.ndarray, size: tuple[int, int] = (640, 480)
+    ) -> tuple[CheckState, str]:
         noise = ImuNoise(1e-4, 2e-3, 2e-5, 3e-3, 200.0)
         rig = Rig(lens, T_imu_cam0, cam1=lens, T_cam1_cam0=cam1, imu=noise)
-        found = calibration(rig, 1.0, T, 0.05, size)
+        found = check_calibration(rig, 1.0, T, 0.05, size)
         return found.state, found.what
 
-    assert of(T, T_10) == (State.OK, "cameras (640x480) and IMU, 1 days old")
+    assert of(T, T_10) == (CheckState.OK, "cameras (640x480) and IMU, 1 days old")
     assert of(T, T_10, (848, 480))[1].endswith("; goes with --mode 640x480 only")
-    assert of(inverse(T), T_10) == (State.FAIL, "the extrinsics to the IMU are inverted")
-    assert of(np.eye(4), T_10)[0] is State.WARN
+    assert of(inverse(T), T_10) == (CheckState.FAIL, "the extrinsics to the IMU are inverted")
+    assert of(np.eye(4), T_10)[0] is CheckState.WARN
     assert "cam1 lies left" in of(T, inverse(T_10))[1]
 
 
 @pytest.mark.parametrize(
     ("said", "there", "state", "mended"),
     [
-        (("0123",), ("0123",), State.OK, []),
-        (("0123",), ("0456", "0123"), State.OK, []),
-        (("0123",), ("0456",), State.WARN, ["0456"]),
-        (("0123", "0789"), ("0123",), State.WARN, ["0123"]),
-        (("0123",), (), State.SKIPPED, []),
-        ((), ("0123",), State.SKIPPED, []),
+        (("0123",), ("0123",), CheckState.OK, []),
+        (("0123",), ("0456", "0123"), CheckState.OK, []),
+        (("0123",), ("0456",), CheckState.WARN, ["0456"]),
+        (("0123", "0789"), ("0123",), CheckState.WARN, ["0123"]),
+        (("0123",), (), CheckState.SKIPPED, []),
+        ((), ("0123",), CheckState.SKIPPED, []),
     ],
 )
 def test_a_calibration_of_another_camera_is_a_warning(
-    said: tuple[str, ...], there: tuple[str, ...], state: State, mended: list[str]
+    said: tuple[str, ...], there: tuple[str, ...], state: CheckState, mended: list[str]
 ) -> None:
-    found = device(said, there)
+    found = check_serial(said, there)
     assert found.state is state
-    assert [line.partition("  #")[0] for line in found.mend] == [
+    assert [line.partition("  #")[0] for line in found.fix] == [
         f"share calibrate realsense {one} --out calib/{one}" for one in mended
     ]
     assert all(one in found.what for one in said)
@@ -198,7 +219,7 @@ def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
         (usb / name).write_text(text + "\n")
     assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_open=False, may_start_imu=None)]
     (usb / "speed").write_text("unknown\n")  # on its way out
-    assert camera_check.link(facts.cameras(tmp_path)).state is State.FAIL
+    assert camera_check.check_link(facts.cameras(tmp_path)).state is CheckState.FAIL
     (usb / "speed").write_text("480\n")
     node = tmp_path / "dev/bus/usb/002/013"
     node.parent.mkdir(parents=True)
@@ -206,13 +227,13 @@ def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
     assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_open=True, may_start_imu=None)]
     for told in (
         [],
-        [f"# {rule}" for rule in camera_check.RULES],
-        camera_check.RULES[:1],
-        camera_check.RULES[1:2],
+        [f"# {rule}" for rule in camera_check.UDEV_RULES],
+        camera_check.UDEV_RULES[:1],
+        camera_check.UDEV_RULES[1:2],
     ):
         (rules / "9.rules").write_text("\n".join(told))
         assert facts.camera_rules(tmp_path) == []  # the IMU as well as the camera
-    (rules / "9.rules").write_text("\n".join(camera_check.RULES))
+    (rules / "9.rules").write_text("\n".join(camera_check.UDEV_RULES))
     assert facts.camera_rules(tmp_path) == ["/etc/udev/rules.d/9.rules"]
 
 
@@ -228,13 +249,13 @@ def test_the_imu_is_started_by_files_that_we_must_be_able_to_write(
         (switches / name).write_text("0\n")
     shut: set[str] = set()
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name not in shut)  # root may anything
-    assert camera_check.imu(facts.cameras(tmp_path) or ()).state is State.OK
+    assert camera_check.check_imu(facts.cameras(tmp_path) or ()).state is CheckState.OK
     shut.add("in_accel_x_en")
-    found = camera_check.imu(facts.cameras(tmp_path) or ())
-    assert found.state is State.FAIL
+    found = camera_check.check_imu(facts.cameras(tmp_path) or ())
+    assert found.state is CheckState.FAIL
     assert [
-        rule for rule in camera_check.RULES if not any(f"echo '{rule}'" in line for line in found.mend)
+        rule for rule in camera_check.UDEV_RULES if not any(f"echo '{rule}'" in line for line in found.fix)
     ] == []
     (switches / "in_accel_x_en").unlink()
-    assert camera_check.imu(facts.cameras(tmp_path) or ()).state is State.WARN
-    assert camera_check.imu([]).state is State.SKIPPED
+    assert camera_check.check_imu(facts.cameras(tmp_path) or ()).state is CheckState.WARN
+    assert camera_check.check_imu([]).state is CheckState.SKIPPED

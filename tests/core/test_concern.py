@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.corrections import Concern
+from share.mapping.corrections import CorrectionFilter
 from share.types import Correction
 
 
@@ -17,22 +17,22 @@ def correction(
 
 
 def test_what_moves_nobody_is_not_sent() -> None:
-    concern = Concern()
-    assert concern.concerns("ann", correction())
-    assert not concern.concerns("ann", correction(shift_m=0.0009))
-    assert not concern.concerns("ann", correction(turn_deg=0.019))
-    assert concern.concerns("bob", correction())
+    concern = CorrectionFilter()
+    assert concern.should_send("ann", correction())
+    assert not concern.should_send("ann", correction(shift_m=0.0009))
+    assert not concern.should_send("ann", correction(turn_deg=0.019))
+    assert concern.should_send("bob", correction())
 
 
 def test_small_steps_add_up() -> None:
-    concern = Concern()
-    sent = [concern.concerns("ann", correction(shift_m=0.0004 * k)) for k in range(7)]
+    concern = CorrectionFilter()
+    sent = [concern.should_send("ann", correction(shift_m=0.0004 * k)) for k in range(7)]
     assert sent == [True, False, False, True, False, False, True]
 
 
 def test_an_answer_and_another_map_are_always_sent() -> None:
-    concern = Concern()
-    concern.concerns("ann", correction())
-    assert concern.concerns("ann", correction(answers=3))
-    assert concern.concerns("ann", correction(map_id="b/0"))
-    assert concern.concerns("ann", correction(turn_deg=0.021, map_id="b/0"))
+    concern = CorrectionFilter()
+    concern.should_send("ann", correction())
+    assert concern.should_send("ann", correction(answers=3))
+    assert concern.should_send("ann", correction(map_id="b/0"))
+    assert concern.should_send("ann", correction(turn_deg=0.021, map_id="b/0"))

@@ -11,12 +11,12 @@ import pytest
 from edge_sim import MS, ModelRun, Person, Town, walls
 from hellos import hello_of
 
-from share.config import AgentNeeds, Config, ControlConfig, EdgeConfig, GraphConfig
+from share.config import AgentQoe, Config, ControlConfig, EdgeConfig, GraphConfig
 from share.geometry import se3
-from share.mapping.graph.solver import Solver
+from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
-from share.mapping.recognition.verification import Refusal, Verified
-from share.mapping.steps import Query, Solve, Verify
+from share.mapping.recognition.verification import Refusal, Verification
+from share.mapping.steps import QueryStep, SolveStep, VerifyStep
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
@@ -31,8 +31,8 @@ def town(**changes) -> Town:
     return Town([Person("ann", ROOM, 0.0, 11), Person("bob", ROOM, 0.5, 22)], **changes)
 
 
-def sent(effects: list[ed.Effect], kind: type) -> list:
-    messages = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+def sent(effects: list[ed.EdgeEffect], kind: type) -> list:
+    messages = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
     return [message for message in messages if isinstance(message, kind)]
 
 
@@ -46,7 +46,7 @@ def joined() -> Town:
 
 
 def test_two_agents_come_to_share_a_map(joined):
-    maps = {name: joined.event(ev.Localised, name)[-1].map_id for name in ("ann", "bob")}
+    maps = {name: joined.event(ev.LocalisedPose, name)[-1].map_id for name in ("ann", "bob")}
     assert len(set(maps.values())) == 1
     ann, bob = joined.people[joined.peer("ann")], joined.people[joined.peer("bob")]
     T_world_map = ann.T_world_body[0] @ se3.inverse(ann.T_odom_body[0])
@@ -106,17 +106,17 @@ def test_an_edge_without_memory_is_given_the_map_again_and_joins_it_again(joined
     again = town()
     again.walk(16)
     again.edge = None
-    odometry = len(again.event(ev.Localised, "ann"))
+    odometry = len(again.event(ev.LocalisedPose, "ann"))
     again.walk(4)
-    assert len(again.event(ev.Localised, "ann")) == odometry + 4
+    assert len(again.event(ev.LocalisedPose, "ann")) == odometry + 4
     again.edge = ModelRun(again.config, session=2)
     again.walk(24)
     again.run(2000)
     report = again.edge.report()
     assert [a["keyframes"] for a in report["agents"].values()] == [44, 44]
     assert len(report["maps"]) == 1
-    assert {again.event(ev.Localised, n)[-1].map_id for n in ("ann", "bob")} == set(report["maps"])
-    said = [e.text for e in again.event(ev.Say, "ann")]
+    assert {again.event(ev.LocalisedPose, n)[-1].map_id for n in ("ann", "bob")} == set(report["maps"])
+    said = [e.text for e in again.event(ev.PrintLine, "ann")]
     assert sum("restarted" in text for text in said) == 1
 
 
@@ -149,7 +149,7 @@ def test_who_was_away_is_told_what_was_missed(silent_ms):
     both.agents[peer] = agent
     both.run(4000)
     assert len(both.event(ev.CorrectionApplied, "bob")) == before + 1
-    assert both.event(ev.Localised, "bob")[-1].map_id is not None
+    assert both.event(ev.LocalisedPose, "bob")[-1].map_id is not None
     newest = {n: both.event(ev.CorrectionApplied, n)[-1].map_id for n in ("ann", "bob")}
     assert newest["ann"] == newest["bob"]
 
@@ -161,9 +161,9 @@ def hello(name: str = "ann", run_id: int = 1) -> m.Hello:
     return hello_of(name, run_id)
 
 
-def tell(edge: Edge, run_id: int, message: m.Message, now_ms: float = 0) -> list[ed.Effect]:
+def tell(edge: Edge, run_id: int, message: m.Message, now_ms: float = 0) -> list[ed.EdgeEffect]:
     frames = [bytes(f) for f in encode(message)]
-    return edge.handle(ed.Received(m.peer_id(run_id), frames), round(now_ms * MS))
+    return edge.handle(ed.PeerMessageReceived(m.peer_id(run_id), frames), round(now_ms * MS))
 
 
 def test_a_name_in_use_is_refused_until_its_holder_is_silent():
@@ -179,11 +179,11 @@ def test_the_mapper_hears_who_is_there():
     edge = Edge(Config(), 7)
     tell(edge, 1, hello())
     told = [
-        [e.here for e in effects if isinstance(e, ed.Present)]
+        [e.is_present for e in effects if isinstance(e, ed.SetPresence)]
         for effects in (
             tell(edge, 1, m.Ping(1, 1), 100),
-            edge.handle(ed.Tick(), 3500 * MS),
-            edge.handle(ed.Tick(), 3600 * MS),
+            edge.handle(ed.EdgeTick(), 3500 * MS),
+            edge.handle(ed.EdgeTick(), 3600 * MS),
             tell(edge, 1, m.Ping(2, 2), 4000),
             tell(edge, 1, m.Bye(), 4100),
         )
@@ -221,8 +221,8 @@ def test_malformed_messages_are_counted_and_said_once():
     tell(edge, 1, hello())
     records = []
     for k in range(1000):
-        effects = edge.handle(ed.Received(m.peer_id(1), [b"\x00" * (k % 50)]), k)
-        records += [e for e in effects if isinstance(e, ed.Record)]
+        effects = edge.handle(ed.PeerMessageReceived(m.peer_id(1), [b"\x00" * (k % 50)]), k)
+        records += [e for e in effects if isinstance(e, ed.WriteEvent)]
     assert len(records) == 1
     assert edge.report({})["agents"]["ann"]["bad_messages"] == 1000
     assert sent(tell(edge, 1, m.Ping(1, 1), 1), m.Pong)
@@ -243,14 +243,14 @@ def test_a_step_that_fails_costs_its_keyframe_only():
     both = town()
     both.walk(1)
     mapper = Mapper(Config())
-    mapper.join("ann-000b", hello(run_id=11))
-    mapper.add("ann-000b", both.keyframes("ann")[0])
-    look = mapper.next_look()
-    (finding,) = mapper.done(look, MemoryError("no room"), 1.0)
-    assert (finding.what, finding.agent) == ("job failed", "ann-000b")
+    mapper.add_run("ann-000b", hello(run_id=11))
+    mapper.add_keyframe("ann-000b", both.keyframes("ann")[0])
+    look = mapper.next_lookup()
+    (finding,) = mapper.finish_step(look, MemoryError("no room"), 1.0)
+    assert (finding.event, finding.agent) == ("job failed", "ann-000b")
     assert "no room" in finding.reason
     assert mapper.report()["failed_jobs"] == 1
-    assert mapper.next_look() is None
+    assert mapper.next_lookup() is None
 
 
 def test_under_load_keyframes_are_kept_but_not_looked_up():
@@ -270,14 +270,14 @@ def test_maps_that_came_all_at_once_are_joined_at_leisure():
     both, mapper = town(), Mapper(Config())
     both.walk(16)
     for run_id, name in enumerate(("ann", "bob"), start=11):
-        mapper.join(name, hello(name, run_id=run_id))
+        mapper.add_run(name, hello(name, run_id=run_id))
         for keyframe in both.keyframes(name):
-            mapper.add(name, keyframe)
-    looked, solver = 0, Solver(GraphConfig())
+            mapper.add_keyframe(name, keyframe)
+    looked, solver = 0, PoseGraphSolver(GraphConfig())
     assert len(mapper.report()["maps"]) == 2
-    while (step := mapper.next_look() or mapper.next_solve()) is not None:
-        mapper.done(step, step.run(solver) if isinstance(step, Solve) else step.run(), 1.0)
-        looked += isinstance(step, Query)
+    while (step := mapper.next_lookup() or mapper.next_solve()) is not None:
+        mapper.finish_step(step, step.run(solver) if isinstance(step, SolveStep) else step.run(), 1.0)
+        looked += isinstance(step, QueryStep)
     assert len(mapper.report()["maps"]) == 1
     assert looked < 32  # once they are joined, what was passed over is left alone
 
@@ -288,7 +288,7 @@ def test_maps_that_came_all_at_once_are_joined_at_leisure():
         ("covins-g", {}, "ababab"),
         ("equal", {}, "ababab"),
         ("share", {}, "aaaaba"),
-        ("share", {"bob": AgentNeeds(form="ar")}, "ababab"),
+        ("share", {"bob": AgentQoe(form="ar")}, "ababab"),
     ],
 )
 def test_headsets_and_who_needs_the_same_go_first_unless_all_are_alike(policy, needs, turns):
@@ -297,15 +297,15 @@ def test_headsets_and_who_needs_the_same_go_first_unless_all_are_alike(policy, n
     config = Config(edge=EdgeConfig(policy=policy, each_waiting=10), control=ControlConfig(agents=needs))
     mapper, kinds = Mapper(config), {"ann": AgentKind.AR, "bob": AgentKind.ROBOT}
     for run_id, (name, kind) in enumerate(kinds.items()):
-        mapper.join(name, replace(hello(name, run_id), kind=kind))
+        mapper.add_run(name, replace(hello(name, run_id), kind=kind))
     for keyframes in zip(*(both.keyframes(name) for name in kinds), strict=True):
         for name, keyframe in zip(kinds, keyframes, strict=True):
-            mapper.add(name, keyframe)
+            mapper.add_keyframe(name, keyframe)
     looked = ""
     for _ in range(6):
-        query = mapper.next_look()
-        mapper.done(query, [], 1.0)
-        looked += mapper._atlas.key(query.number).agent[0]
+        query = mapper.next_lookup()
+        mapper.finish_step(query, [], 1.0)
+        looked += mapper._atlas.key(query.node_id).agent[0]
     assert looked == turns
 
 
@@ -313,23 +313,23 @@ def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
     both = town()
     both.walk(40)
     config = Config(edge=EdgeConfig(each_waiting=12))
-    tried, same = {}, Verified(np.eye(4), 1e-4 * np.eye(6), 40, 30)
+    tried, same = {}, Verification(np.eye(4), 1e-4 * np.eye(6), 40, 30)
     for waiting, refuse in itertools.product((0, config.edge.hurry_waiting), (True, False)):
         mapper = Mapper(config)
-        mapper.join("ann-000b", hello(run_id=11))
+        mapper.add_run("ann-000b", hello(run_id=11))
         keyframes = both.keyframes("ann")
         for keyframe in keyframes[:29]:
-            mapper.add("ann-000b", keyframe)
-        while mapper._lookups.next() is not None:
+            mapper.add_keyframe("ann-000b", keyframe)
+        while mapper._queries.next_query() is not None:
             pass
         for keyframe in keyframes[29 : 30 + waiting]:
-            mapper.add("ann-000b", keyframe)
-        query = mapper.next_look()
-        mapper.done(query, query.run(), 1.0)
+            mapper.add_keyframe("ann-000b", keyframe)
+        query = mapper.next_lookup()
+        mapper.finish_step(query, query.run(), 1.0)
         tried[waiting, refuse] = 0
-        while isinstance(verify := mapper.next_look(), Verify):
+        while isinstance(verify := mapper.next_lookup(), VerifyStep):
             tried[waiting, refuse] += 1
-            mapper.done(verify, Refusal("not it") if refuse else same, 1.0)
+            mapper.finish_step(verify, Refusal("not it") if refuse else same, 1.0)
     assert [tried[0, True], tried[0, False]] == [config.place.candidates, config.place.enough]
     assert [tried[config.edge.hurry_waiting, True], tried[config.edge.hurry_waiting, False]] == [
         config.edge.hurry_candidates,

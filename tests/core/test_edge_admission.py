@@ -10,13 +10,13 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config
-from share.mapping.changes import KeepKeyframe, KeepRun
+from share.mapping.map_changes import SaveKeyframe, SaveRun
 from share.protocol import edge_events as ed
-from share.protocol.admission import Newcomers
+from share.protocol.admission import NewRunLimits
 from share.protocol.edge import Edge
-from share.protocol.edge_events import Keep
-from share.protocol.peer import Foot, Known
-from share.protocol.remote_tracking import Room, TrackingEdge
+from share.protocol.edge_events import SaveChanges
+from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.remote_tracking import TrackingCapacity, TrackingEdge
 from share.types import AgentKind, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -32,23 +32,23 @@ def keyframe(id: int) -> Keyframe:
 
 def tell(
     edge: Edge, run_id: int, message: m.Message, now_s: float = 0, names: Iterable[str] | None = None
-) -> list[ed.Effect]:
+) -> list[ed.EdgeEffect]:
     """names: of its key; None: no keys are used."""
     frames, owned = [bytes(frame) for frame in encode(message)], None if names is None else frozenset(names)
     key = "" if names is None else "its key"
-    return edge.handle(ed.Received(m.peer_id(run_id), frames, owned, key), round(now_s * S))
+    return edge.handle(ed.PeerMessageReceived(m.peer_id(run_id), frames, owned, key), round(now_s * S))
 
 
-def come(edge: Edge, name: str, run_id: int, now_s: float = 0) -> list[ed.Effect]:
+def come(edge: Edge, name: str, run_id: int, now_s: float = 0) -> list[ed.EdgeEffect]:
     return tell(edge, run_id, hello_of(name, run_id), now_s)
 
 
-def refusal(effects: list[ed.Effect]) -> str | None:
-    messages = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+def refusal(effects: list[ed.EdgeEffect]) -> str | None:
+    messages = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
     return next((message.reason for message in messages if isinstance(message, m.Refused)), None)
 
 
-def of(effects: list[ed.Effect], kind: type) -> list:
+def of(effects: list[ed.EdgeEffect], kind: type) -> list:
     return [effect for effect in effects if isinstance(effect, kind)]
 
 
@@ -105,7 +105,7 @@ def test_new_runs_of_all_names_of_one_key_do_not_keep_others_out() -> None:
 def test_a_run_whose_name_was_taken_from_its_key_is_refused() -> None:
     edge = Edge(Config(), 7)
     assert refusal(tell(edge, 1, hello_of("zoe", 1), 0, ["zoe"])) is None
-    assert not of(tell(edge, 1, keyframe(0), 1, ["yan"]), ed.Send)  # so it is silent, and says hello
+    assert not of(tell(edge, 1, keyframe(0), 1, ["yan"]), ed.SendToPeer)  # so it is silent, and says hello
     why = "its key speaks for 'yan', not for 'zoe'; at the edge: share keys authorize … --agent zoe"
     assert refusal(tell(edge, 1, hello_of("zoe", 1), 2, ["yan"])) == why
     zoe = edge.report({})["agents"]["zoe"]
@@ -114,16 +114,19 @@ def test_a_run_whose_name_was_taken_from_its_key_is_refused() -> None:
 
 
 def test_names_that_came_long_ago_take_no_memory() -> None:
-    newcomers = Newcomers()
+    newcomers = NewRunLimits()
     for k in range(2000):
-        newcomers.came(f"eve{k}", f"eve{k}", k * S // 2)
-    assert len(newcomers._of_name) <= 2 * 10 + 1
-    assert len(newcomers._of_voice) <= 2 * 4 + 1
+        newcomers.record(f"eve{k}", f"eve{k}", k * S // 2)
+    assert len(newcomers._by_name) <= 2 * 10 + 1
+    assert len(newcomers._by_credential) <= 2 * 4 + 1
 
 
 def test_who_is_known_comes_again_as_often_as_it_likes() -> None:
-    known = [Known(f"bob-{k:04x}", hello_of("bob", 100 + k), Foot(4, 0, np.eye(4)), 5) for k in range(12)]
-    edge = Edge(Config(), 7, keeps=True, known=known)
+    known = [
+        RestoredRun(f"bob-{k:04x}", hello_of("bob", 100 + k), OdometryBase(4, 0, np.eye(4)), 5)
+        for k in range(12)
+    ]
+    edge = Edge(Config(), 7, has_store=True, restored=known)
     for _ in range(200):  # a hello that is repeated, and a reconnect
         assert refusal(come(edge, "ann", 1)) is None
     for k in range(12):  # of the map's file
@@ -146,12 +149,12 @@ def test_a_refusal_for_another_reason_costs_no_new_run() -> None:
 
 
 def test_a_run_without_a_keyframe_is_not_kept() -> None:
-    edge = Edge(Config(), 7, keeps=True)
-    assert not of(come(edge, "ann", 1), Keep)
-    (keep,) = of(tell(edge, 1, keyframe(0)), Keep)
-    assert [type(change) for change in keep.changes] == [KeepRun, KeepKeyframe]
-    (keep,) = of(tell(edge, 1, keyframe(1)), Keep)
-    assert [type(change) for change in keep.changes] == [KeepKeyframe]
+    edge = Edge(Config(), 7, has_store=True)
+    assert not of(come(edge, "ann", 1), SaveChanges)
+    (keep,) = of(tell(edge, 1, keyframe(0)), SaveChanges)
+    assert [type(change) for change in keep.changes] == [SaveRun, SaveKeyframe]
+    (keep,) = of(tell(edge, 1, keyframe(1)), SaveChanges)
+    assert [type(change) for change in keep.changes] == [SaveKeyframe]
 
 
 # ---------------------------------------------------------------- who comes back
@@ -170,8 +173,8 @@ def test_an_old_run_does_not_come_back_beside_the_present_one(message: m.Message
     effects = tell(edge, 1, message, 1)
     asks = isinstance(message, m.Ping | m.Hello)  # what it may send many of is not answered
     assert ("in use" in str(refusal(effects))) == asks
-    assert not of(effects, ed.Present) + of(effects, ed.Add)
-    assert len(of(effects, ed.Send)) == asks
+    assert not of(effects, ed.SetPresence) + of(effects, ed.AddKeyframe)
+    assert len(of(effects, ed.SendToPeer)) == asks
     assert present(edge) == 1
     assert sum(agent["refused_messages"] for agent in edge.report({})["agents"].values()) == 1
     assert sum(agent["evaluations"] for agent in edge.report({})["agents"].values()) == 0
@@ -198,7 +201,9 @@ def test_who_was_silent_for_too_long_has_lost_its_name() -> None:
     edge = Edge(Config(), 7)
     come(edge, "ann", 1)
     effects = come(edge, "ann", 2, 3.5)
-    assert [(e.key, e.here) for e in of(effects, ed.Present)] == [(f"ann-{m.public_tag(1)[:4]}", False)]
+    assert [(e.key, e.is_present) for e in of(effects, ed.SetPresence)] == [
+        (f"ann-{m.public_tag(1)[:4]}", False)
+    ]
     assert "in use" in str(refusal(tell(edge, 1, m.Ping(1, 1), 3.6)))
     assert present(edge) == 1
 
@@ -209,12 +214,12 @@ def test_an_agent_that_was_killed_and_started_again_is_let_in_once_its_name_is_f
     tell(edge, 1, m.Ping(1, 1), 1)
     assert "in use" in str(refusal(come(edge, "ann", 2, 1.5)))  # it has a ping's time to answer for itself
     for now_s in (1.7, 2.2, 3.9):
-        assert not of(come(edge, "ann", 2, now_s), ed.Send)
+        assert not of(come(edge, "ann", 2, now_s), ed.SendToPeer)
     welcome = come(edge, "ann", 2, 4.1)
     assert refusal(welcome) is None
-    assert of(welcome, ed.Join)
+    assert of(welcome, ed.AddRun)
     tell(edge, 2, m.Ping(1, 1), 5)
-    assert not of(come(edge, "ann", 3, 5.8), ed.Send)
+    assert not of(come(edge, "ann", 3, 5.8), ed.SendToPeer)
     tell(edge, 2, m.Ping(2, 2), 5.9)  # it was there all the time
     assert "in use" in str(refusal(come(edge, "ann", 3, 6.3)))
 
@@ -227,13 +232,13 @@ def test_bye_is_heard_once() -> None:
 
 
 def test_no_tracker_begins_for_who_cannot_come_back() -> None:
-    edge = TrackingEdge(Config(), 7, room=Room(1, "it is small"))
+    edge = TrackingEdge(Config(), 7, capacity=TrackingCapacity(1, "it is small"))
     for k, name in enumerate(("ann", "bob")):
         hello = replace(hello_of(name, k, AgentKind.AR), streams=True)
-        assert of(tell(edge, k, hello), ed.BeginTracking)
+        assert of(tell(edge, k, hello), ed.StartTracker)
         tell(edge, k, m.Bye())
-    assert of(tell(edge, 0, m.Ping(1, 1)), ed.BeginTracking)
+    assert of(tell(edge, 0, m.Ping(1, 1)), ed.StartTracker)
     effects = tell(edge, 1, m.Ping(1, 1))
     assert "can track 1 streamed agent" in str(refusal(effects))
-    assert not of(effects, ed.BeginTracking)
+    assert not of(effects, ed.StartTracker)
     assert present(edge) == 1

@@ -13,18 +13,18 @@ from share.config import Config, EdgeConfig
 from share.errors import WireError
 from share.geometry import se3
 from share.mapping.mapper import Mapper
-from share.mapping.steps import Query
+from share.mapping.steps import QueryStep
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
-from share.protocol.peer import Foot, Known
+from share.protocol.peer import OdometryBase, RestoredRun
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
-AHEAD = se3.compose(np.eye(3), np.array([0.1, 0.0, 0.0]))
+AHEAD = se3.from_rt(np.eye(3), np.array([0.1, 0.0, 0.0]))
 HELLO = hello_of("ann", 0xA000B)
 
 
@@ -33,16 +33,18 @@ def keyframe(id: int, cov: np.ndarray | None = None, view: View = EMPTY) -> Keyf
     return Keyframe(id, id - 1, 10**8 * id, np.eye(4), cov, np.eye(4), np.zeros(3), 0.0, view, id - 1)
 
 
-def tell(edge: Edge, message: m.Message, peer: int = HELLO.run_id) -> list[ed.Effect]:
-    return edge.handle(ed.Received(m.peer_id(peer), [bytes(f) for f in encode(message)]), 0)
+def tell(edge: Edge, message: m.Message, peer: int = HELLO.run_id) -> list[ed.EdgeEffect]:
+    return edge.handle(ed.PeerMessageReceived(m.peer_id(peer), [bytes(f) for f in encode(message)]), 0)
 
 
-def of(effects: list[ed.Effect], kind: type) -> list:
+def of(effects: list[ed.EdgeEffect], kind: type) -> list:
     return [effect for effect in effects if isinstance(effect, kind)]
 
 
 def sent(effects: list, kind: type) -> list:
-    messages = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, (ed.Send, ev.Send))]
+    messages = [
+        decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, (ed.SendToPeer, ev.SendToEdge))
+    ]
     return [message for message in messages if isinstance(message, kind)]
 
 
@@ -61,35 +63,37 @@ def test_numbers_that_are_none_stop_at_the_door(frame, value):
     with pytest.raises(WireError):
         decode([bytes(f) for f in frames])
     for again in range(3):
-        effects = edge.handle(ed.Received(m.peer_id(HELLO.run_id), [bytes(f) for f in frames]), 0)
-        assert not of(effects, ed.Add)
-        assert len(of(effects, ed.Record)) == (again == 0)  # said once
+        effects = edge.handle(ed.PeerMessageReceived(m.peer_id(HELLO.run_id), [bytes(f) for f in frames]), 0)
+        assert not of(effects, ed.AddKeyframe)
+        assert len(of(effects, ed.WriteEvent)) == (again == 0)  # said once
     assert edge.report({})["agents"]["ann"]["bad_messages"] == 3
 
 
 def test_a_number_that_is_used_again_changes_nothing():
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
-    assert of(tell(edge, keyframe(0)), ed.Add)
+    assert of(tell(edge, keyframe(0)), ed.AddKeyframe)
     effects = tell(edge, replace(keyframe(0), stamp_ns=5, up=np.array([0.0, 0.6, 0.8])))
-    assert not of(effects, ed.Add)
+    assert not of(effects, ed.AddKeyframe)
     assert sent(effects, m.Ack) == [m.Ack(1)]
 
 
 def test_two_runs_of_one_name_whose_tags_begin_alike():
     tag = m.public_tag(0xB000B)
-    edge = Edge(Config(), 8, known=[Known(f"ann-{tag[:4]}", HELLO, Foot(0, 0, np.eye(4)), 1)])
-    (join,) = of(tell(edge, replace(HELLO, run_id=0xB000B), 0xB000B), ed.Join)
+    edge = Edge(
+        Config(), 8, restored=[RestoredRun(f"ann-{tag[:4]}", HELLO, OdometryBase(0, 0, np.eye(4)), 1)]
+    )
+    (join,) = of(tell(edge, replace(HELLO, run_id=0xB000B), 0xB000B), ed.AddRun)
     assert join.key == f"ann-{tag[:5]}"
-    assert of(tell(edge, keyframe(0), 0xB000B), ed.Add)[0].key == f"ann-{tag[:5]}"
+    assert of(tell(edge, keyframe(0), 0xB000B), ed.AddKeyframe)[0].key == f"ann-{tag[:5]}"
 
 
 def test_a_covariance_beyond_measure_is_bounded_and_said():
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     effects = tell(edge, keyframe(0, 1e11 * np.eye(6)))
-    assert np.allclose(of(effects, ed.Add)[0].keyframe.cov, 100 * np.eye(6))
-    (record,) = of(effects, ed.Record)
+    assert np.allclose(of(effects, ed.AddKeyframe)[0].keyframe.cov, 100 * np.eye(6))
+    (record,) = of(effects, ed.WriteEvent)
     assert "1e+11" in record.fields["reason"]
 
 
@@ -107,23 +111,23 @@ def test_huge_covariances_do_not_end_the_mapper():
 
 def test_a_result_that_cannot_be_used_costs_its_step(monkeypatch):
     mapper = Mapper(Config())
-    mapper.join("ann", HELLO)
-    mapper.add("ann", keyframe(0))
-    step = mapper.next_look()
-    assert isinstance(step, Query)
+    mapper.add_run("ann", HELLO)
+    mapper.add_keyframe("ann", keyframe(0))
+    step = mapper.next_lookup()
+    assert isinstance(step, QueryStep)
 
     def bad(*_):
         raise ValueError("no such thing")
 
     monkeypatch.setattr(mapper, "_begin_search", bad)
-    (finding,) = mapper.done(step, step.run(), 1.0)
-    assert finding.what == "job failed"
+    (finding,) = mapper.finish_step(step, step.run(), 1.0)
+    assert finding.event == "job failed"
     assert finding.reason.startswith("place: ValueError: no such thing")
     monkeypatch.undo()
-    mapper.add("ann", keyframe(1))
-    step = mapper.next_look()
-    assert isinstance(step, Query)
-    assert not mapper.done(step, step.run(), 1.0)
+    mapper.add_keyframe("ann", keyframe(1))
+    step = mapper.next_lookup()
+    assert isinstance(step, QueryStep)
+    assert not mapper.finish_step(step, step.run(), 1.0)
     assert mapper.report()["failed_jobs"] == 1
 
 
@@ -132,15 +136,15 @@ def test_ten_thousand_keyframes_at_once_stay_bounded():
     rng = np.random.default_rng(1)
     config = Config(edge=EdgeConfig(max_keyframes=500, max_waiting=12))
     mapper = Mapper(config)
-    mapper.join("ann", HELLO)
-    mapper.join("eve", replace(HELLO, name="eve"))
+    mapper.add_run("ann", HELLO)
+    mapper.add_run("eve", replace(HELLO, name="eve"))
     for k in range(20):
-        mapper.add("ann", keyframe(k))
+        mapper.add_keyframe("ann", keyframe(k))
     few = [
         View(rng.normal(size=(5, 2)), np.ones((5, 3)), rng.integers(0, 256, (5, 32), np.uint8)) for _ in "ab"
     ]
     for k in range(10_000):
-        mapper.add("eve", replace(keyframe(k, view=few[k % 2]), T_ref_body=AHEAD))
+        mapper.add_keyframe("eve", replace(keyframe(k, view=few[k % 2]), T_ref_body=AHEAD))
         if k % 100 == 0:
             mapper.take_changes()
     report = mapper.report()
@@ -156,20 +160,20 @@ def test_hello_at_once_when_the_link_is_back():
     hello = agent.handle(ev.Connected(), 0)
     assert sent(hello, m.Hello)
     (welcome,) = sent(tell(edge, HELLO), m.Welcome)
-    agent.handle(ev.Received(encode(welcome)), 1)
-    assert not sent(agent.handle(ev.Tick(), 2), m.Hello)
+    agent.handle(ev.EdgeMessageReceived(encode(welcome)), 1)
+    assert not sent(agent.handle(ev.AgentTick(), 2), m.Hello)
     assert sent(agent.handle(ev.Connected(), 3), m.Hello)
-    effects = agent.handle(ev.Received(encode(m.Welcome(8, 0))), 4)
-    assert any("restarted" in e.text for e in effects if isinstance(e, ev.Say))
+    effects = agent.handle(ev.EdgeMessageReceived(encode(m.Welcome(8, 0))), 4)
+    assert any("restarted" in e.text for e in effects if isinstance(e, ev.PrintLine))
 
 
 def test_who_is_not_greeted_yet_is_told_the_newest_correction_with_the_welcome():
     """Until then it counts revisions of our predecessor, and would not take it."""
-    known = Known("ann-000b", HELLO, Foot(0, 0, np.eye(4)), 1)
-    edge, mapper = Edge(Config(), 8, known=[known]), Mapper(Config())
-    mapper.join("ann-000b", HELLO)
+    known = RestoredRun("ann-000b", HELLO, OdometryBase(0, 0, np.eye(4)), 1)
+    edge, mapper = Edge(Config(), 8, restored=[known]), Mapper(Config())
+    mapper.add_run("ann-000b", HELLO)
     tell(edge, m.Ping(1, 0))
-    effects = edge.handle(ed.Found(tuple(mapper.add("ann-000b", keyframe(0)))), 0)
-    assert not of(effects, ed.Send)
+    effects = edge.handle(ed.MapperResult(tuple(mapper.add_keyframe("ann-000b", keyframe(0)))), 0)
+    assert not of(effects, ed.SendToPeer)
     (correction,) = sent(tell(edge, HELLO), m.Correction)
     assert (correction.map_id, correction.revision) == ("ann-000b/0", 1)

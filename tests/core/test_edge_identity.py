@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from hellos import hello_of
 
+from share.agent_names import checked_name
 from share.config import Config
-from share.mapping.changes import KeepVoice
-from share.names import checked_name
+from share.mapping.map_changes import SaveCredential
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
-from share.protocol.peer import Foot, Known
+from share.protocol.peer import OdometryBase, RestoredRun
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -37,16 +37,16 @@ def tell(
     peer: int = SECRET,
     now_ns: int = 0,
     key: str = "",
-) -> list[ed.Effect]:
+) -> list[ed.EdgeEffect]:
     frames = [bytes(frame) for frame in encode(message)]
-    return edge.handle(ed.Received(m.peer_id(peer), frames, names, key), now_ns)
+    return edge.handle(ed.PeerMessageReceived(m.peer_id(peer), frames, names, key), now_ns)
 
 
-def sent(effects: list[ed.Effect]) -> list[m.Message]:
-    return [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+def sent(effects: list[ed.EdgeEffect]) -> list[m.Message]:
+    return [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
 
 
-def of(effects: list[ed.Effect], kind: type) -> list:
+def of(effects: list[ed.EdgeEffect], kind: type) -> list:
     return [effect for effect in effects if isinstance(effect, kind)]
 
 
@@ -67,16 +67,16 @@ def test_a_run_is_not_taken_over_by_another_key() -> None:
     tell(edge, keyframe(0), ANN)
     for message in (keyframe(1), m.Bye(), hello_of("ann", SECRET), m.Evaluation(0, 1.0, 1.0), m.Ping(1, 0)):
         effects = tell(edge, message, EVE)
-        assert not of(effects, ed.Add), message
+        assert not of(effects, ed.AddKeyframe), message
         assert not [answer for answer in sent(effects) if not isinstance(answer, m.Refused)], message
     assert not edge.report({})["agents"]["ann"]["gone"]
-    assert of(tell(edge, keyframe(1), ANN), ed.Add)
+    assert of(tell(edge, keyframe(1), ANN), ed.AddKeyframe)
 
 
 def test_without_keys_who_holds_the_number_goes_on() -> None:
     edge = Edge(Config(), 7)
     tell(edge, hello_of("ann", SECRET), None)
-    assert of(tell(edge, keyframe(0), None), ed.Add)
+    assert of(tell(edge, keyframe(0), None), ed.AddKeyframe)
     (welcome,) = sent(tell(edge, hello_of("ann", SECRET), None, now_ns=10**9))  # connected again
     assert welcome == m.Welcome(7, 1)
     (refused,) = sent(tell(edge, hello_of("ann", 5), None, peer=5, now_ns=10**9))
@@ -84,10 +84,10 @@ def test_without_keys_who_holds_the_number_goes_on() -> None:
 
 
 def test_nothing_that_is_shown_tells_the_number() -> None:
-    edge = Edge(Config(), 7, keeps=True)
+    edge = Edge(Config(), 7, has_store=True)
     effects = tell(edge, hello_of("ann", SECRET), None) + tell(edge, keyframe(0), None)
-    shown = [edge.report({}), edge.series(), *(e.fields for e in of(effects, ed.Record))]
-    keys = [e.key for e in of(effects, ed.Join)]
+    shown = [edge.report({}), edge.series(), *(e.fields for e in of(effects, ed.WriteEvent))]
+    keys = [e.key for e in of(effects, ed.AddRun)]
     text = json.dumps([shown, keys])
     for digits in (str(SECRET), f"{SECRET:x}", f"{SECRET:016x}"[-4:], f"{SECRET:016x}"[:4]):
         assert digits not in text
@@ -98,21 +98,21 @@ def test_an_id_that_leaps_costs_its_own_message() -> None:
     tell(edge, hello_of("ann", SECRET), None)
     tell(edge, keyframe(0), None)
     effects = tell(edge, replace(keyframe(1), id=10**9, reference=-1, follows=-1), None)
-    assert not of(effects, ed.Add)
+    assert not of(effects, ed.AddKeyframe)
     assert sent(effects) == [m.Ack(1)]
-    assert of(tell(edge, keyframe(1), None), ed.Add)
+    assert of(tell(edge, keyframe(1), None), ed.AddKeyframe)
     assert edge.report({})["agents"]["ann"]["refused_messages"] == 1
 
 
 def test_the_voice_of_a_run_is_the_key_that_speaks_for_it_also_where_the_list_changes() -> None:
-    edge = Edge(Config(), 7, keeps=True)
-    (join,) = of(tell(edge, hello_of("eve", SECRET), EVE, key="E"), ed.Join)
-    (other,) = of(tell(edge, hello_of("mallory", 5), frozenset({"bob", "mallory"}), 5, key="E"), ed.Join)
-    assert join.voice == other.voice == "E"
-    (same,) = of(tell(edge, hello_of("mallory", 6), EVE, 6, 10**10, key="F"), ed.Join)
-    assert same.voice == "F"
-    (keep,) = of(tell(edge, keyframe(0), EVE, key="E"), ed.Keep)
-    assert keep.changes[0].voice == "E"
+    edge = Edge(Config(), 7, has_store=True)
+    (join,) = of(tell(edge, hello_of("eve", SECRET), EVE, key="E"), ed.AddRun)
+    (other,) = of(tell(edge, hello_of("mallory", 5), frozenset({"bob", "mallory"}), 5, key="E"), ed.AddRun)
+    assert join.credential == other.credential == "E"
+    (same,) = of(tell(edge, hello_of("mallory", 6), EVE, 6, 10**10, key="F"), ed.AddRun)
+    assert same.credential == "F"
+    (keep,) = of(tell(edge, keyframe(0), EVE, key="E"), ed.SaveChanges)
+    assert keep.changes[0].credential == "E"
     assert "'E'" not in str(edge.report({}))
 
 
@@ -121,18 +121,20 @@ def test_the_voice_of_a_run_is_the_key_that_speaks_for_it_also_where_the_list_ch
 def test_a_run_of_an_earlier_life_has_the_voice_of_whoever_speaks_for_it_now(
     kept: str | None, message: m.Message
 ) -> None:
-    known = Known("eve-1234", hello_of("eve", SECRET), Foot.of(keyframe(2)), 3, voice=kept)
-    edge = Edge(Config(), 7, keeps=True, known=[known])
+    known = RestoredRun(
+        "eve-1234", hello_of("eve", SECRET), OdometryBase.from_keyframe(keyframe(2)), 3, credential=kept
+    )
+    edge = Edge(Config(), 7, has_store=True, restored=[known])
     effects = tell(edge, message, EVE, now_ns=1, key="E")
-    changes = [change for keep in of(effects, ed.Keep) for change in keep.changes]
+    changes = [change for keep in of(effects, ed.SaveChanges) for change in keep.changes]
     if kept == "E":
-        assert not of(effects, ed.Speaks)
+        assert not of(effects, ed.SetCredential)
     else:
-        assert of(effects, ed.Speaks) == [ed.Speaks("eve-1234", "E")]
-        assert KeepVoice("eve-1234", "E") in changes
+        assert of(effects, ed.SetCredential) == [ed.SetCredential("eve-1234", "E")]
+        assert SaveCredential("eve-1234", "E") in changes
     again = tell(edge, m.Ping(2, 0), EVE, now_ns=2, key="E")
-    assert not of(again, ed.Speaks)
-    assert not of(again, ed.Keep)
+    assert not of(again, ed.SetCredential)
+    assert not of(again, ed.SaveChanges)
 
 
 def test_no_name_is_taken_for_an_earlier_run_of_another() -> None:
@@ -142,7 +144,7 @@ def test_no_name_is_taken_for_an_earlier_run_of_another() -> None:
     for run, now_ns in ((number, 1), (5, 2)):
         tell(edge, hello_of("eve", run), None, run, now_ns)
         tell(edge, m.Bye(), None, run, now_ns)
-    assert of(tell(edge, keyframe(0), None, now_ns=3), ed.Add)
+    assert of(tell(edge, keyframe(0), None, now_ns=3), ed.AddKeyframe)
     own = edge.report({})["agents"]["eve-0001"]["run"]
     agents = edge.report({"agents": {"eve-0001": {"map_id": "hers"}, own: {"map_id": "own"}}})["agents"]
     assert agents.keys() == {"eve-0001", "eve", "eve/0001"}

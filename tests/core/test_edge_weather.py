@@ -29,7 +29,7 @@ def walked(seed: int, loss: float, **network) -> Town:
 
 
 def check_nothing_lost(town: Town) -> None:
-    keys = town.edge.mapper.poses().keys
+    keys = town.edge.mapper.current_poses().keys
     assert len(keys) == len(set(keys)) == FRAMES * len(NAMES)
     for agent in town.agents.values():
         report = agent.report()
@@ -77,5 +77,5 @@ def test_two_agents_of_whom_a_fifth_is_lost():
     town.walk(16)
     town.run(30_000)
     assert [agent.report()["open"] for agent in town.agents.values()] == [0, 0]
-    keys = town.edge.mapper.poses().keys
+    keys = town.edge.mapper.current_poses().keys
     assert len(keys) == len(set(keys)) == 32

@@ -11,12 +11,12 @@ from hellos import hello_of
 
 from share.config import Config
 from share.geometry import se3
-from share.mapping.changes import ForgetRun, Retire
-from share.mapping.loops import Key, Loop
+from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.map_changes import RemoveKeyframes, RemoveRun
 from share.mapping.mapper import Mapper
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
-from share.protocol.peer import known_runs
+from share.protocol.peer import restored_runs
 from share.store.map_store import MapStore
 from share.types import F64, Keyframe, View
 from share.wire import messages as m
@@ -29,7 +29,7 @@ CONFIG = replace(Config(), edge=replace(Config().edge, max_keyframes=MOST))
 
 
 def at(x: float) -> F64:
-    return se3.compose(np.eye(3), np.array([x, 0.0, 0.0]))
+    return se3.from_rt(np.eye(3), np.array([x, 0.0, 0.0]))
 
 
 class Life:
@@ -38,35 +38,35 @@ class Life:
     def __init__(self, store: MapStore, session: int = 7) -> None:
         kept = store.load()
         self.store, self.mapper = store, Mapper(CONFIG)
-        self.edge = Edge(CONFIG, session, keeps=True, known=known_runs(kept, 0.05))
+        self.edge = Edge(CONFIG, session, has_store=True, restored=restored_runs(kept, 0.05))
         if kept.runs:
             self.mapper.restore(kept)
         self.sent: list[m.Message] = []
         self.left_out: list[type] = []  # changes that the disk loses
         self.now_ns = S
 
-    def handle(self, event: ed.Event) -> None:
+    def handle(self, event: ed.EdgeEvent) -> None:
         for effect in self.edge.handle(event, self.now_ns):
             match effect:
-                case ed.Send():
+                case ed.SendToPeer():
                     self.sent.append(decode([bytes(f) for f in effect.frames]))
-                case ed.Join():
-                    self.mapper.join(effect.key, effect.hello)
-                case ed.Present():
-                    self.mapper.present(effect.key, effect.here)
-                case ed.Forget():
-                    self.mapper.forget(effect.key)
-                case ed.Add():
-                    self.mapper.add(effect.key, effect.keyframe)
-                case ed.Keep():
+                case ed.AddRun():
+                    self.mapper.add_run(effect.key, effect.hello)
+                case ed.SetPresence():
+                    self.mapper.set_present(effect.key, effect.is_present)
+                case ed.DropRun():
+                    self.mapper.remove_run(effect.key)
+                case ed.AddKeyframe():
+                    self.mapper.add_keyframe(effect.key, effect.keyframe)
+                case ed.SaveChanges():
                     self.store.write([c for c in effect.changes if type(c) not in self.left_out])
-                    self.handle(ed.Kept(effect.ticket))
-        changes, emptied = self.mapper.take_changes(), self.mapper.take_emptied()
+                    self.handle(ed.ChangesSaved(effect.ticket))
+        changes, emptied = self.mapper.take_changes(), self.mapper.take_empty_runs()
         if changes or emptied:
-            self.handle(ed.Found((), changes, emptied))
+            self.handle(ed.MapperResult((), changes, emptied))
 
     def tell(self, run_id: int, message: m.Message) -> None:
-        self.handle(ed.Received(m.peer_id(run_id), [bytes(f) for f in encode(message)]))
+        self.handle(ed.PeerMessageReceived(m.peer_id(run_id), [bytes(f) for f in encode(message)]))
 
     def run(self, name: str, run_id: int, count: int, stays: bool = False) -> None:
         """A run with so many keyframes, 1 m apart; then it leaves."""
@@ -79,10 +79,10 @@ class Life:
             self.tell(run_id, m.Bye())
         self.now_ns += 10 * S
         self.tell(1, m.Ping(0, 0))  # ann is still there
-        self.handle(ed.Tick())
+        self.handle(ed.EdgeTick())
 
     def held(self) -> Counter[str]:
-        return Counter(key.agent.partition("-")[0] for key in self.mapper.poses().keys)
+        return Counter(key.agent.partition("-")[0] for key in self.mapper.current_poses().keys)
 
 
 def crowded(store: MapStore, runs: int = 30) -> Life:
@@ -99,15 +99,15 @@ def test_runs_without_end_take_nothing_of_anothers_and_leave_nothing(tmp_path: P
         life = crowded(store)
         report = life.edge.report(life.mapper.report())
         assert life.held()["ann"] == 30
-        assert len(life.mapper.poses().keys) <= 1.05 * MOST
+        assert len(life.mapper.current_poses().keys) <= 1.05 * MOST
         assert len(report["agents"]) == len(life.mapper.report()["agents"]) <= 6
         assert report["forgotten_runs"] + len(report["agents"]) == 31
         assert report["maps"].keys() == {f"{run}/0" for run in life.mapper.report()["agents"]}
         kept = store.load()
-    assert {run.key for run in kept.runs} == life.mapper.report()["agents"].keys()
-    assert {k.at for k in kept.keyframes} == set(life.mapper.poses().keys)
-    assert {name.rpartition("/")[0] for name in kept.stretches} == {run.key for run in kept.runs}
-    assert kept.complaints == ()
+    assert {run.run_key for run in kept.runs} == life.mapper.report()["agents"].keys()
+    assert {k.keyframe_key for k in kept.keyframes} == set(life.mapper.current_poses().keys)
+    assert {name.rpartition("/")[0] for name in kept.segments} == {run.run_key for run in kept.runs}
+    assert kept.problems == ()
 
 
 def test_the_map_that_is_left_is_found_again(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_the_map_that_is_left_is_found_again(tmp_path: Path) -> None:
         for k in range(10):
             second.run("eve", 300 + k, 8)
         assert second.held()["ann"] == 30
-        assert len(second.mapper.poses().keys) <= 1.05 * MOST
+        assert len(second.mapper.current_poses().keys) <= 1.05 * MOST
 
 
 def test_a_run_that_was_forgotten_and_comes_back_is_told_to_start_again(tmp_path: Path) -> None:
@@ -143,9 +143,9 @@ def test_a_run_that_comes_back_before_it_is_forgotten_goes_on(tmp_path: Path) ->
         number = next(k for k in range(6) if f"-{m.public_tag(100 + k)[:4]}" in gone)
         life.tell(100 + number, hello_of("eve", 100 + number))
         life.tell(100 + number, step)
-        life.handle(ed.Found((), (), (ed.Key(gone, 7),)))
+        life.handle(ed.MapperResult((), (), (ed.KeyframeKey(gone, 7),)))
         life.tell(100 + number, m.Bye())
-        life.handle(ed.Tick())
+        life.handle(ed.EdgeTick())
         assert gone in life.mapper.report()["agents"]
 
 
@@ -155,24 +155,24 @@ def test_a_run_that_comes_back_to_less_is_tied_to_what_is_left_in_the_file_too(t
         for name, run_id, count in (("ann", 1, 2), ("eve", 100, 20), ("eve", 101, 1)):
             life.run(name, run_id, count, stays=name == "ann")
         atlas = life.mapper._atlas
-        key = next(key.agent for key in atlas.everything()[0] if key.id == 19)
-        life.mapper._leaving = [
-            n for n in atlas._chart.poses if atlas.key(n) in {(key, k) for k in range(8, 20)}
+        key = next(key.agent for key in atlas.all_poses()[0] if key.id == 19)
+        life.mapper._to_remove = [
+            n for n in atlas._graph.poses if atlas.key(n) in {(key, k) for k in range(8, 20)}
         ]
-        while life.mapper._leaving:
-            life.mapper._thin()
-        life.handle(ed.Tick())
+        while life.mapper._to_remove:
+            life.mapper._cull_keyframes()
+        life.handle(ed.EdgeTick())
         life.tell(100, hello_of("eve", 100))
         life.tell(
             100, Keyframe(20, 19, 20 * S, at(1.0), 1e-6 * np.eye(6), at(20), np.zeros(3), 0.0, EMPTY, 19)
         )
         kept = store.load()
-        link = kept.links[ed.Key(key, 20)]
+        link = kept.links[ed.KeyframeKey(key, 20)]
         assert (link.reference, link.T_ref_body[0, 3]) == (7, 13.0)
         second = Life(store, session=8)
-        assert np.allclose(second.mapper.poses().T_map_body, life.mapper.poses().T_map_body)
+        assert np.allclose(second.mapper.current_poses().T_map_body, life.mapper.current_poses().T_map_body)
         covs = [
-            one._atlas._chart.step(*one._atlas._chart.trails.stretches[1].nodes[-2:]).cov
+            one._atlas._graph.odometry_edge(*one._atlas._graph.odometry.segments[1].nodes[-2:]).cov
             for one in (life.mapper, second.mapper)
         ]
         assert np.allclose(covs[0], covs[1])
@@ -183,14 +183,14 @@ def test_a_crash_before_a_run_is_forgotten_is_made_up_for(tmp_path: Path) -> Non
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = crowded(store, runs=2)
         gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
-        keys = tuple(k.at for k in store.load().keyframes if k.key == gone)
-        store.write([Retire(keys)])
+        keys = tuple(k.keyframe_key for k in store.load().keyframes if k.run_key == gone)
+        store.write([RemoveKeyframes(keys)])
         second = Life(store, session=8)
         assert gone in second.mapper.report()["agents"]
-        second.handle(ed.Tick())
+        second.handle(ed.EdgeTick())
         assert gone not in second.mapper.report()["agents"]
-        assert gone not in {run.key for run in store.load().runs}
-        store.write([ForgetRun(gone)])  # again: nothing happens
+        assert gone not in {run.run_key for run in store.load().runs}
+        store.write([RemoveRun(gone)])  # again: nothing happens
         assert len(store.load().runs) == 2
 
 
@@ -199,11 +199,13 @@ def test_a_run_that_such_a_crash_left_begins_anew(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = crowded(store, runs=1)
         gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
-        store.write([Retire(tuple(k.at for k in store.load().keyframes if k.key == gone))])
+        store.write(
+            [RemoveKeyframes(tuple(k.keyframe_key for k in store.load().keyframes if k.run_key == gone))]
+        )
         second = Life(store, session=8)
         second.run("eve", 100, 3)
         assert second.sent[0] == m.Welcome(8, 0)
-        assert [k.at.id for k in store.load().keyframes if k.key == gone] == [0, 1, 2]
+        assert [k.keyframe_key.id for k in store.load().keyframes if k.run_key == gone] == [0, 1, 2]
 
 
 def test_runs_that_never_sent_a_keyframe_leave_the_mapper_too(tmp_path: Path) -> None:
@@ -225,20 +227,20 @@ def test_a_restored_run_that_is_emptied_is_forgotten_in_this_life(tmp_path: Path
         for k in range(12):
             life.run("eve", 300 + k, 8)
         report = life.edge.report(life.mapper.report())
-        held = {key.agent for key in life.mapper.poses().keys}
+        held = {key.agent for key in life.mapper.current_poses().keys}
         kept = store.load()
-    assert {run.key for run in kept.runs} == {agent["run"] for agent in report["agents"].values()}
-    assert {run.key for run in kept.runs} - held <= {f"ann-{m.public_tag(1)[:4]}"}
+    assert {run.run_key for run in kept.runs} == {agent["run"] for agent in report["agents"].values()}
+    assert {run.run_key for run in kept.runs} - held <= {f"ann-{m.public_tag(1)[:4]}"}
 
 
 def emptied(life: Life, run_id: int) -> None:
     """All keyframes of a run of eve are taken out."""
     atlas, run = life.mapper._atlas, f"eve-{m.public_tag(run_id)[:4]}"
-    life.mapper._leaving = [n for n in atlas._chart.poses if atlas.key(n).agent == run]
-    while life.mapper._leaving:
-        life.mapper._thin()
+    life.mapper._to_remove = [n for n in atlas._graph.poses if atlas.key(n).agent == run]
+    while life.mapper._to_remove:
+        life.mapper._cull_keyframes()
     for _ in range(2):
-        life.handle(ed.Tick())
+        life.handle(ed.EdgeTick())
 
 
 def test_a_run_that_came_back_is_its_names_present_one_and_stays_so(tmp_path: Path) -> None:
@@ -266,7 +268,7 @@ def test_of_a_name_whose_newest_run_is_forgotten_the_one_before_it_is_shown(tmp_
             life.tell(1000 + k, m.Bye())
             life.now_ns += 10 * S
             life.tell(1, m.Ping(0, 0))
-            life.handle(ed.Tick())
+            life.handle(ed.EdgeTick())
         report = life.edge.report(life.mapper.report())
     assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
 
@@ -283,21 +285,21 @@ def test_a_run_is_forgotten_only_with_the_last_of_its_stretches(tmp_path: Path) 
             life.tell(100, own)
         life.tell(100, m.Bye())
         life.run("eve", 101, 2)
-        gone = next(key.agent for key in life.mapper.poses().keys if key.id == 11)
+        gone = next(key.agent for key in life.mapper.current_poses().keys if key.id == 11)
 
         def leave(ids: range) -> None:
             keys, atlas = {(gone, k) for k in ids}, life.mapper._atlas
-            life.mapper._leaving = [n for n in life.mapper._sights if atlas.key(n) in keys]
-            while life.mapper._leaving:
-                life.mapper._thin()
-            life.handle(ed.Tick())
-            life.handle(ed.Tick())
+            life.mapper._to_remove = [n for n in life.mapper._camera_views if atlas.key(n) in keys]
+            while life.mapper._to_remove:
+                life.mapper._cull_keyframes()
+            life.handle(ed.EdgeTick())
+            life.handle(ed.EdgeTick())
 
         leave(range(9, 12))
-        assert {k.at.id for k in store.load().keyframes if k.key == gone} == set(range(9))
+        assert {k.keyframe_key.id for k in store.load().keyframes if k.run_key == gone} == set(range(9))
         assert gone in life.mapper.report()["agents"]
         leave(range(9))
-        assert gone not in {run.key for run in store.load().runs} | life.mapper.report()["agents"].keys()
+        assert gone not in {run.run_key for run in store.load().runs} | life.mapper.report()["agents"].keys()
 
 
 def test_a_run_that_comes_back_to_nothing_hears_that_it_is_in_a_map_of_its_own(tmp_path: Path) -> None:
@@ -307,15 +309,15 @@ def test_a_run_that_comes_back_to_nothing_hears_that_it_is_in_a_map_of_its_own(t
         life.run("ann", 1, 20, stays=True)
         life.run("eve", 100, 5)
         atlas, mapper = life.mapper._atlas, life.mapper
-        ann, eve = sorted({key.agent for key in mapper.poses().keys})
-        atlas._chart.tie(Loop(Key(ann, 3), Key(eve, 3), np.eye(4), 1e-4 * np.eye(6), 50))
-        assert atlas.current_map(eve) == f"{ann}/0"
-        atlas.take_out([n for n in range(len(atlas)) if atlas.key(n).agent == eve])
-        mapper.present(eve, True)
+        ann, eve = sorted({key.agent for key in mapper.current_poses().keys})
+        atlas._graph.add_loop(Loop(KeyframeKey(ann, 3), KeyframeKey(eve, 3), np.eye(4), 1e-4 * np.eye(6), 50))
+        assert atlas.current_map_id(eve) == f"{ann}/0"
+        atlas.remove_keyframes([n for n in range(len(atlas)) if atlas.key(n).agent == eve])
+        mapper.set_present(eve, True)
         own = Keyframe(5, 4, 5 * S, at(1.0), 1e-6 * np.eye(6), at(5), np.zeros(3), 0.0, EMPTY, 4)
-        (finding,) = mapper.add(eve, own)
+        (finding,) = mapper.add_keyframe(eve, own)
         assert finding.correction is not None
         assert (finding.agent, finding.correction.map_id) == (eve, f"{eve}/0")
         assert np.allclose(finding.correction.T_map_odom, np.eye(4))
         step = Keyframe(6, 5, 6 * S, at(1.0), 1e-6 * np.eye(6), at(6), np.zeros(3), 0.0, EMPTY, 5)
-        assert mapper.add(eve, step) == []
+        assert mapper.add_keyframe(eve, step) == []

@@ -10,7 +10,7 @@ import pytest
 from share.config import SequencerConfig
 from share.sensors.imu_check import ImuCheck, ImuRange
 from share.sensors.measurement import Measurement
-from share.sensors.sequencer import SequencerCounters, sequence
+from share.sensors.sequencer import SequencerCounters, sequence_frames
 
 STEP = 5_000_000
 MOTION = Path(__file__).parents[3] / "shared" / "data" / "motion"
@@ -26,7 +26,9 @@ def walking(count: int = 400, seed: int = 0) -> np.ndarray:
 def judged(values: np.ndarray, each: int = 10, step: int = STEP) -> tuple[np.ndarray, ImuCheck]:
     """Which are believed, in frames of so many samples."""
     check, stamps = ImuCheck(ImuRange()), np.arange(len(values)) * step
-    parts = [check.believed(stamps[k : k + each], values[k : k + each]) for k in range(0, len(values), each)]
+    parts = [
+        check.valid_mask(stamps[k : k + each], values[k : k + each]) for k in range(0, len(values), each)
+    ]
     return np.concatenate(parts), check
 
 
@@ -141,7 +143,8 @@ def test_across_a_gap_nothing_is_judged() -> None:
     stamps = np.arange(400) * STEP
     stamps[200:] += 10**9
     assert (
-        check.believed(stamps[:200], values[:200]).all() and check.believed(stamps[200:], values[200:]).all()
+        check.valid_mask(stamps[:200], values[:200]).all()
+        and check.valid_mask(stamps[200:], values[200:]).all()
     )
 
 
@@ -149,7 +152,7 @@ def test_samples_beyond_a_known_range_are_left_out() -> None:
     values = walking()
     values[200:240, 0] = 18.0  # many: no spike
     check = ImuCheck(ImuRange(17.5, 39.3))
-    assert np.flatnonzero(~check.believed(np.arange(400) * STEP, values)).tolist() == list(range(200, 240))
+    assert np.flatnonzero(~check.valid_mask(np.arange(400) * STEP, values)).tolist() == list(range(200, 240))
     assert (check.out_of_range, check.spikes) == (40, 0)
 
 
@@ -162,7 +165,7 @@ def test_of_what_was_recorded_everything_stays(path: Path) -> None:
     table = np.loadtxt(path, delimiter=",")
     stamps, values = table[:, 0].astype(np.int64), table[:, 1:7]
     check, parts = ImuCheck(ImuRange(17.5, 180.0)), range(0, len(values), 10)
-    assert all(check.believed(stamps[k : k + 10], values[k : k + 10]).all() for k in parts)
+    assert all(check.valid_mask(stamps[k : k + 10], values[k : k + 10]).all() for k in parts)
 
 
 # ---------------------------------------------------------------- in the sequencer
@@ -173,7 +176,7 @@ def bundles(values: np.ndarray) -> tuple[list, SequencerCounters]:
     images = [Measurement("cam0", k * 10 * STEP, f"image {k}") for k in range(len(values) // 10)]
     counters = SequencerCounters()
     both = sorted([*samples, *images], key=lambda m: m.stamp_ns)
-    return list(sequence(both, ("cam0", "imu"), 20.0, SequencerConfig(), counters)), counters
+    return list(sequence_frames(both, ("cam0", "imu"), 20.0, SequencerConfig(), counters)), counters
 
 
 def test_frames_come_without_what_is_no_sample_and_it_is_counted() -> None:

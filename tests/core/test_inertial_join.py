@@ -6,20 +6,20 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from share.sensors.intake import InertialJoin
+from share.sensors.sample_processor import ImuInterpolator
 
 GAP = 20
 
 
 def run(
     gyro: list[int], accel: list[int], lag: int = 0
-) -> tuple[InertialJoin, list[tuple[int, list[float]]]]:
+) -> tuple[ImuInterpolator, list[tuple[int, list[float]]]]:
     """Both in order of arrival, the accelerometer later by `lag`; its value is 2 * time."""
-    join = InertialJoin(GAP)
+    join = ImuInterpolator(GAP)
     events = [(t, 1, t) for t in gyro] + [(t + lag, 0, t) for t in accel]
     out: list[tuple[int, list[float]]] = []
     for _, is_gyro, t in sorted(events):
-        fed = join.gyro(t, (t, 0, 0)) if is_gyro else join.accel(t, (2 * t, 0, 0))
+        fed = join.add_gyro(t, (t, 0, 0)) if is_gyro else join.add_accel(t, (2 * t, 0, 0))
         out += list(fed)
     return join, out
 
@@ -43,18 +43,18 @@ def test_what_is_joined_is_as_numpy_interpolates_and_lies_between_near_neighbour
     np.testing.assert_allclose([v[3] for _, v in out], np.interp(wanted, a, 2 * a) if wanted else [])
     assert [v[0] for _, v in out] == wanted
     inside = [t for t in gyro if len(a) and t <= a[-1]]
-    assert (join.joined, join.alone) == (len(wanted), len(inside) - len(wanted))
+    assert (join.interpolated, join.unmatched) == (len(wanted), len(inside) - len(wanted))
 
 
 def test_a_sample_waits_for_the_next_of_the_other_sensor() -> None:
-    join = InertialJoin(GAP)
-    assert list(join.accel(0, (0, 0, 0))) == []
-    assert list(join.gyro(5, (1, 2, 3))) == []
-    assert list(join.accel(10, (10, 20, 30))) == [(5, [1, 2, 3, 5, 10, 15])]
+    join = ImuInterpolator(GAP)
+    assert list(join.add_accel(0, (0, 0, 0))) == []
+    assert list(join.add_gyro(5, (1, 2, 3))) == []
+    assert list(join.add_accel(10, (10, 20, 30))) == [(5, [1, 2, 3, 5, 10, 15])]
 
 
 def test_a_silent_accelerometer_does_not_fill_the_memory() -> None:
-    join = InertialJoin(GAP, most_wait_ns=100)
+    join = ImuInterpolator(GAP, max_wait_ns=100)
     for t in range(1000):
-        assert list(join.gyro(t, (0, 0, 0))) == []
-    assert join.alone == 899
+        assert list(join.add_gyro(t, (0, 0, 0))) == []
+    assert join.unmatched == 899

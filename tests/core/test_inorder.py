@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.protocol.peer import InOrder
+from share.protocol.peer import ReorderBuffer
 from share.types import Keyframe, View
-from share.wire.messages import MAX_HELD, Ack
+from share.wire.messages import MAX_BUFFERED, Ack
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32)))
 
@@ -24,13 +24,13 @@ def ids(keyframes: list[Keyframe]) -> list[int]:
 
 
 def test_in_order_passes_through() -> None:
-    book = InOrder()
+    book = ReorderBuffer()
     assert [ids(book.push(keyframe(k))) for k in range(3)] == [[0], [1], [2]]
     assert book.ack() == Ack(3)
 
 
 def test_a_gap_holds_what_comes_after_it() -> None:
-    book = InOrder()
+    book = ReorderBuffer()
     book.push(keyframe(0))
     assert book.push(keyframe(3)) == book.push(keyframe(2)) == []
     assert book.ack() == Ack(1, (2, 3))
@@ -39,7 +39,7 @@ def test_a_gap_holds_what_comes_after_it() -> None:
 
 
 def test_duplicates_are_ignored_and_acknowledged_again() -> None:
-    book = InOrder()
+    book = ReorderBuffer()
     book.push(keyframe(0))
     assert book.push(keyframe(0)) == []
     book.push(keyframe(2))
@@ -49,14 +49,14 @@ def test_duplicates_are_ignored_and_acknowledged_again() -> None:
 
 
 def test_a_new_stretch_does_not_overtake() -> None:
-    book = InOrder()
+    book = ReorderBuffer()
     book.push(keyframe(0))
     assert book.push(keyframe(2, follows=1, reference=-1)) == []
     assert ids(book.push(keyframe(1))) == [1, 2]
 
 
 def test_dropped_ids_are_skipped() -> None:
-    book = InOrder()
+    book = ReorderBuffer()
     book.push(keyframe(0))
     assert ids(book.push(keyframe(5, follows=0))) == [5]
     assert book.push(keyframe(3)) == []  # dropped by the agent, but late on its way
@@ -64,7 +64,7 @@ def test_dropped_ids_are_skipped() -> None:
 
 
 def test_the_later_version_of_a_waiting_keyframe_counts() -> None:
-    book = InOrder()
+    book = ReorderBuffer()
     book.push(keyframe(0))
     book.push(keyframe(2))
     assert ids(book.push(keyframe(2, follows=0))) == [2]
@@ -73,24 +73,24 @@ def test_the_later_version_of_a_waiting_keyframe_counts() -> None:
 
 
 def test_an_old_version_does_not_replace_a_later_one() -> None:
-    book = InOrder()
+    book = ReorderBuffer()
     book.push(keyframe(9, follows=3))
     book.push(keyframe(9, follows=8))
     assert ids(book.push(keyframe(3, follows=-1))) == [3, 9]
 
 
 def test_an_edge_without_memory_begins_where_the_agent_does() -> None:
-    assert ids(InOrder().push(keyframe(40, follows=-1))) == [40]
+    assert ids(ReorderBuffer().push(keyframe(40, follows=-1))) == [40]
 
 
 def test_an_edge_with_memory_goes_on() -> None:
-    book = InOrder(next_keyframe=40)
+    book = ReorderBuffer(next_keyframe=40)
     assert book.push(keyframe(39)) == []
     assert ids(book.push(keyframe(40))) == [40]
 
 
 def test_the_holding_area_is_bounded() -> None:
-    book = InOrder(hold=4)
+    book = ReorderBuffer(capacity=4)
     for k in (9, 8, 7, 6, 5, 4, 3, 2, 1):
         assert book.push(keyframe(k)) == []
     assert book.ack() == Ack(0, (1, 2, 3, 4))
@@ -98,7 +98,7 @@ def test_the_holding_area_is_bounded() -> None:
     assert ids(book.push(keyframe(0))) == [0, 1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("hold", [0, MAX_HELD + 1])
+@pytest.mark.parametrize("hold", [0, MAX_BUFFERED + 1])
 def test_hold_must_fit_an_ack(hold: int) -> None:
     with pytest.raises(ValueError, match="hold"):
-        InOrder(hold=hold)
+        ReorderBuffer(capacity=hold)

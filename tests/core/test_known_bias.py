@@ -7,7 +7,7 @@ import pytest
 
 from share.config import InertialConfig
 from share.geometry.camera import ImuBias, ImuNoise
-from share.sensors.imu_memory import POWER_ON_ACCEL, POWER_ON_GYRO, aged
+from share.sensors.imu_memory import POWER_ON_ACCEL, POWER_ON_GYRO, propagate_bias
 
 CONFIG = InertialConfig()
 BMI055 = ImuNoise(2.44e-4, 1.47e-3, 1.0e-5, 1.5e-4, 400.0)
@@ -16,7 +16,7 @@ DAY_S = 86_400.0
 
 
 def test_the_bias_stays_and_its_sigma_is_that_of_another_power_on() -> None:
-    now = aged(LEARNT, BMI055, 60.0, CONFIG)
+    now = propagate_bias(LEARNT, BMI055, 60.0, CONFIG)
     assert now is not None
     np.testing.assert_array_equal(now.gyro, LEARNT.gyro)
     np.testing.assert_array_equal(now.accel, LEARNT.accel)
@@ -25,7 +25,7 @@ def test_the_bias_stays_and_its_sigma_is_that_of_another_power_on() -> None:
 
 
 def test_it_walks_as_the_noise_says_that_the_filter_goes_by() -> None:
-    now = aged(LEARNT, BMI055, DAY_S, CONFIG)
+    now = propagate_bias(LEARNT, BMI055, DAY_S, CONFIG)
     assert now is not None
     walked = CONFIG.imu_noise * BMI055.accel_walk * np.sqrt(DAY_S)
     assert walked > 0.08
@@ -36,10 +36,10 @@ def test_it_walks_as_the_noise_says_that_the_filter_goes_by() -> None:
 
 @pytest.mark.parametrize("days", [60.0, 1e5, np.inf])
 def test_after_long_nothing_is_known_of_it(days: float) -> None:
-    assert aged(LEARNT, BMI055, DAY_S, CONFIG) is not None
-    assert aged(LEARNT, BMI055, days * DAY_S, CONFIG) is None
+    assert propagate_bias(LEARNT, BMI055, DAY_S, CONFIG) is not None
+    assert propagate_bias(LEARNT, BMI055, days * DAY_S, CONFIG) is None
 
 
 def test_who_learnt_less_than_anybody_knows_tells_nothing() -> None:
     vague = ImuBias(LEARNT.gyro, LEARNT.accel, CONFIG.gyro_bias, 0.01)
-    assert aged(vague, BMI055, 0.0, CONFIG) is None
+    assert propagate_bias(vague, BMI055, 0.0, CONFIG) is None

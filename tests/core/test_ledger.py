@@ -7,8 +7,8 @@ import pytest
 
 from share.config import AgentConfig, LinkConfig
 from share.geometry import se3
-from share.protocol.agent_ledger import Chain, Entry, Ledger
-from share.types import Candidate, View
+from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry
+from share.types import KeyframeCandidate, View
 from share.wire.messages import Ack, Welcome
 
 S = 1_000_000_000
@@ -21,56 +21,56 @@ for step in STEPS:
 COV = np.diag([1.0, 2, 3, 4, 5, 6]) * 1e-6
 
 
-def candidate(k: int, new_stretch: bool = False) -> Candidate:
+def candidate(k: int, new_stretch: bool = False) -> KeyframeCandidate:
     T_last_body = ODOMETRY[k] if k == 0 or new_stretch else se3.inverse(ODOMETRY[k - 1]) @ ODOMETRY[k]
-    return Candidate(ODOMETRY[k], T_last_body, COV, np.array([0, 0, 1.0]), 0.01, EMPTY, new_stretch)
+    return KeyframeCandidate(ODOMETRY[k], T_last_body, COV, np.array([0, 0, 1.0]), 0.01, EMPTY, new_stretch)
 
 
-def entries(n: int, new_stretches: tuple[int, ...] = ()) -> list[Entry]:
-    chain = Chain()
+def entries(n: int, new_stretches: tuple[int, ...] = ()) -> list[LedgerEntry]:
+    chain = KeyframeChain()
     made = []
     for k in range(n):
         chain.extend(candidate(k, k in new_stretches))
-        made.append(Entry(chain.keyframe(candidate(k), k), frame=k, arrived_ns=k))
+        made.append(LedgerEntry(chain.make_keyframe(candidate(k), k), frame_index=k, arrived_ns=k))
     return made
 
 
-def ledger(n: int, keep: int = 100, window: int = 4, new_stretches: tuple[int, ...] = ()) -> Ledger:
-    book = Ledger(AgentConfig(keep_keyframes=keep), LinkConfig(window=window))
+def ledger(n: int, keep: int = 100, window: int = 4, new_stretches: tuple[int, ...] = ()) -> KeyframeLedger:
+    book = KeyframeLedger(AgentConfig(keep_keyframes=keep), LinkConfig(window=window))
     for entry in entries(n, new_stretches):
         book.add(entry)
     return book
 
 
-def due(book: Ledger, now_ns: int) -> list[int]:
-    return [entry.keyframe.id for entry in book.due(now_ns)]
+def due(book: KeyframeLedger, now_ns: int) -> list[int]:
+    return [entry.keyframe.id for entry in book.take_due(now_ns)]
 
 
-def links(book: Ledger) -> list[tuple[int, int, int]]:
+def links(book: KeyframeLedger) -> list[tuple[int, int, int]]:
     """(id, reference, follows) of all that is open."""
-    return [(e.keyframe.id, e.keyframe.reference, e.keyframe.follows) for e in book._open.values()]
+    return [(e.keyframe.id, e.keyframe.reference, e.keyframe.follows) for e in book._pending.values()]
 
 
 def test_the_chain_composes_what_was_left_out() -> None:
-    chain = Chain()
+    chain = KeyframeChain()
     chain.extend(candidate(0))
-    chain.keyframe(candidate(0), 0)
+    chain.make_keyframe(candidate(0), 0)
     chain.extend(candidate(1))
     chain.extend(candidate(2))
-    keyframe = chain.keyframe(candidate(2), 2)
+    keyframe = chain.make_keyframe(candidate(2), 2)
     assert (keyframe.id, keyframe.reference, keyframe.follows) == (1, 0, 0)
     np.testing.assert_allclose(keyframe.T_ref_body, STEPS[0] @ STEPS[1], atol=1e-12)
     np.testing.assert_allclose(keyframe.cov, se3.compose_cov(STEPS[1], COV, COV), atol=1e-15)
 
 
 def test_a_stretch_begins_even_if_its_first_candidate_was_left_out() -> None:
-    chain = Chain()
+    chain = KeyframeChain()
     chain.extend(candidate(0))
-    chain.keyframe(candidate(0), 0)
+    chain.make_keyframe(candidate(0), 0)
     chain.extend(candidate(1, new_stretch=True))
     chain.extend(candidate(2))
-    keyframe = chain.keyframe(candidate(2), 2)
-    assert (keyframe.reference, keyframe.follows, chain.first_of_stretch) == (-1, 0, 1)
+    keyframe = chain.make_keyframe(candidate(2), 2)
+    assert (keyframe.reference, keyframe.follows, chain.first_of_segment) == (-1, 0, 1)
     np.testing.assert_array_equal(keyframe.T_ref_body, ODOMETRY[2])
 
 
@@ -80,7 +80,7 @@ def test_a_window_is_sent_and_moves_with_the_acknowledgements() -> None:
     assert due(book, 0) == []
     book.acknowledge(Ack(2))
     assert due(book, 1) == [4, 5]
-    assert (book.open, book.counts["sent"], book.counts["acknowledged"]) == (8, 6, 2)
+    assert (book.pending, book.counts["sent"], book.counts["acknowledged"]) == (8, 6, 2)
 
 
 def test_what_is_not_acknowledged_is_sent_again_ever_more_slowly() -> None:
@@ -107,9 +107,9 @@ def test_old_and_impossible_acknowledgements_are_harmless() -> None:
     due(book, 0)
     book.acknowledge(Ack(3))
     book.acknowledge(Ack(1))
-    assert book.open == 5
+    assert book.pending == 5
     book.acknowledge(Ack(9))  # more than was ever sent
-    assert (book.open, book.counts["bad_acks"]) == (5, 1)
+    assert (book.pending, book.counts["bad_acks"]) == (5, 1)
 
 
 def test_full_drops_the_oldest_acknowledged_first() -> None:
@@ -118,7 +118,7 @@ def test_full_drops_the_oldest_acknowledged_first() -> None:
     book.acknowledge(Ack(2))
     for entry in entries(8)[6:]:
         book.add(entry)
-    assert (len(book), book.open) == (6, 6)
+    assert (len(book), book.pending) == (6, 6)
     assert book.counts == {"sent": 4, "acknowledged": 2, "drop_oldest_acknowledged": 2}
     assert links(book)[0] == (2, 1, 1)  # the edge has keyframe 1, though we have it no more
 
@@ -133,7 +133,7 @@ def test_full_of_open_ones_drops_the_oldest_and_mends_the_chain(acknowledged: in
     reference = acknowledged - 1
     assert links(book)[0] == (4, reference, reference)
     assert book.counts["drop_oldest"] == 4 - acknowledged
-    first = next(iter(book._open.values())).keyframe
+    first = next(iter(book._pending.values())).keyframe
     T_odom_ref = ODOMETRY[reference] if reference >= 0 else np.eye(4)
     np.testing.assert_allclose(first.T_ref_body, se3.inverse(T_odom_ref) @ ODOMETRY[4], atol=1e-9)
     cov = COV
@@ -145,7 +145,7 @@ def test_full_of_open_ones_drops_the_oldest_and_mends_the_chain(acknowledged: in
 def test_dropping_the_end_of_a_stretch_leaves_the_next_one_its_own() -> None:
     book = ledger(5, keep=2, new_stretches=(3,))
     assert links(book) == [(3, -1, -1), (4, 3, 3)]
-    np.testing.assert_array_equal(next(iter(book._open.values())).keyframe.T_ref_body, ODOMETRY[3])
+    np.testing.assert_array_equal(next(iter(book._pending.values())).keyframe.T_ref_body, ODOMETRY[3])
 
 
 def test_a_returned_edge_is_sent_the_window_again() -> None:
@@ -162,9 +162,9 @@ def test_an_edge_without_memory_is_sent_everything_held() -> None:
     for entry in entries(9)[8:]:
         book.add(entry)
     assert len(book) == 5
-    assert book.begin(Welcome(2, 0)) == 5
+    assert book.begin_session(Welcome(2, 0)) == 5
     assert links(book)[:2] == [(4, -1, -1), (5, 4, 4)]
-    np.testing.assert_array_equal(next(iter(book._open.values())).keyframe.T_ref_body, ODOMETRY[4])
+    np.testing.assert_array_equal(next(iter(book._pending.values())).keyframe.T_ref_body, ODOMETRY[4])
     assert due(book, 1) == [4, 5, 6, 7]
 
 
@@ -172,15 +172,15 @@ def test_what_an_earlier_edge_had_acknowledged_is_marked() -> None:
     book = ledger(4)
     due(book, 0)
     book.acknowledge(Ack(2))
-    book.begin(Welcome(2, 0))
-    assert [entry.replayed for entry in book.due(1)] == [True, True, False, False]
+    book.begin_session(Welcome(2, 0))
+    assert [entry.is_replayed for entry in book.take_due(1)] == [True, True, False, False]
 
 
 def test_an_edge_with_memory_goes_on_where_it_was() -> None:
     book = ledger(6)
     due(book, 0)
     book.acknowledge(Ack(4))
-    assert book.begin(Welcome(2, 3)) == 3
+    assert book.begin_session(Welcome(2, 3)) == 3
     assert links(book)[0] == (3, 2, 2)
     assert book.last_acknowledged is not None
     assert book.last_acknowledged.keyframe.id == 2
@@ -188,8 +188,8 @@ def test_an_edge_with_memory_goes_on_where_it_was() -> None:
 
 def test_an_edge_restored_from_an_older_map_is_given_a_new_stretch() -> None:
     book = ledger(8, keep=4)
-    book.begin(Welcome(1, 0))
-    assert book.begin(Welcome(2, 2)) == 4  # it has 0 and 1; 2 and 3 are gone for good
+    book.begin_session(Welcome(1, 0))
+    assert book.begin_session(Welcome(2, 2)) == 4  # it has 0 and 1; 2 and 3 are gone for good
     assert links(book)[0][0] == 4
 
 
@@ -197,4 +197,4 @@ def test_find_knows_both_halves() -> None:
     book = ledger(4)
     due(book, 0)
     book.acknowledge(Ack(2))
-    assert [getattr(book.find(k), "frame", None) for k in (0, 3, 9)] == [0, 3, None]
+    assert [getattr(book.find(k), "frame_index", None) for k in (0, 3, 9)] == [0, 3, None]

@@ -11,33 +11,35 @@ from test_world import MS, seen
 
 from share.config import Config, EdgeConfig
 from share.geometry import se3
-from share.lab.evaluate.modelled_mapper import ModelledMapper, Odds, Truth
-from share.lab.evaluate.world import Costs, World
-from share.net.channel import NETWORKS
+from share.lab.evaluate.modelled_mapper import GroundTruth, ModelledMapper, RecognitionModel
+from share.lab.evaluate.simulation import ProcessingDelays, Simulation
+from share.net.channel import NETWORK_PRESETS
 
 ROOM = walls(1)
 SECONDS = 6.0
-USUAL = Odds()
+USUAL = RecognitionModel()
 
 
-def played(policy: str = "covins-g", seed: int = 0, odds: Odds | None = USUAL, apart_m: float = 0.0) -> World:
+def played(
+    policy: str = "covins-g", seed: int = 0, odds: RecognitionModel | None = USUAL, apart_m: float = 0.0
+) -> Simulation:
     """Ann and Bob in one room, half a wall and apart_m apart. odds: None for a real mapper."""
     people = {name: Person(name, ROOM, at, run) for name, at, run in (("ann", 0.0, 11), ("bob", 0.5, 22))}
     frames = {name: list(seen(person, SECONDS)) for name, person in people.items()}
-    stamps_ns = {name: [f.at_ns for f in frames[name] if f.candidate] for name in people}
+    stamps_ns = {name: [f.arrival_ns for f in frames[name] if f.candidate] for name in people}
     config = Config(edge=EdgeConfig(policy=policy))
     rigs = {name: person.hello.rig for name, person in people.items()}
     there = {name: np.array(person.T_world_body) for name, person in people.items()}
     there["bob"][:, 0, 3] += apart_m
-    truth = Truth(config.control.near_m, config.control.far_m, rigs, there)
+    truth = GroundTruth(config.control.near_m, config.control.far_m, rigs, there)
     mapper = odds and ModelledMapper(config, truth, lambda name, ns: stamps_ns[name].index(ns), odds, seed)
-    agents = [(p.hello, iter(frames[n]), NETWORKS["wifi5"]) for n, p in people.items()]
-    made = World(config, agents, Costs(), seed, mapper)
+    agents = [(p.hello, iter(frames[n]), NETWORK_PRESETS["wifi5"]) for n, p in people.items()]
+    made = Simulation(config, agents, ProcessingDelays(), seed, mapper)
     made.run(SECONDS + 1.0)
     return made
 
 
-def late_ms(room: World) -> tuple[float, float]:
+def late_ms(room: Simulation) -> tuple[float, float]:
     """All, and Ann's corrections alone."""
     told = {name: log.report() for name, log in room.logs.items()}
     everyone = float(np.mean([one["latency_ms"]["mean"] for one in told.values()]))
@@ -60,10 +62,10 @@ def test_agents_are_joined_corrected_and_as_late_as_with_a_real_mapper() -> None
 
 
 def test_a_placed_agent_is_where_it_is_but_for_the_drawn_error() -> None:
-    sure = Odds(sigma_m=0.0, sigma_rad=0.0)
+    sure = RecognitionModel(sigma_m=0.0, sigma_rad=0.0)
     for odds, most_m in ((sure, 0.03), (replace(sure, sigma_m=0.5), 3.0)):
         room = played(odds=odds)
-        both = {name: poses[-1] for name, poses in room.placed.items()}
+        both = {name: poses[-1] for name, poses in room.localised.items()}
         assert len({pose.map_id for pose in both.values()}) == 1
         off = []
         for pose in both.values():
@@ -80,20 +82,22 @@ def test_a_placed_agent_is_where_it_is_but_for_the_drawn_error() -> None:
 
 def test_an_agent_is_told_how_sure_its_place_is_as_it_was_drawn() -> None:
     for sigma_m in (0.006, 0.02):
-        told = played(odds=Odds(sigma_m=sigma_m, sigma_rad=0.0)).edge.series()["ann"]["error_cm"][-1]
-        sure = played(odds=Odds(sigma_m=0.0, sigma_rad=0.0)).edge.series()["ann"]["error_cm"][-1]
+        told = played(odds=RecognitionModel(sigma_m=sigma_m, sigma_rad=0.0)).edge.series()["ann"]["error_cm"][
+            -1
+        ]
+        sure = played(odds=RecognitionModel(sigma_m=0.0, sigma_rad=0.0)).edge.series()["ann"]["error_cm"][-1]
         assert told == pytest.approx(np.hypot(100 * sigma_m * np.sqrt(3), sure), rel=0.05)
 
 
 def test_views_that_share_nothing_are_never_merged() -> None:
-    room = played(odds=Odds(half=5.0, width=0.01))
+    room = played(odds=RecognitionModel(half_overlap=5.0, logistic_width=0.01))
     report = room.edge.report(room.mapper.report())
     assert report["merges"] == {"requested": 0, "skipped": 0, "done": 0}
     assert sorted(report["maps"].values()) == [24, 24]
 
 
 def test_nor_by_chance_where_all_that_share_something_are() -> None:
-    room = played(odds=Odds(half=-1.0), apart_m=1000.0)
+    room = played(odds=RecognitionModel(half_overlap=-1.0), apart_m=1000.0)
     report = room.edge.report(room.mapper.report())
     assert report["merges"]["done"] > 0
     assert sorted(report["maps"].values()) == [24, 24]

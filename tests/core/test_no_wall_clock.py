@@ -17,7 +17,7 @@ ALLOWED = {
     "net/udp.py": {"time.time_ns"},  # of `share sync`: stamps of datagrams
     "devices/time_client.py": {"time.time_ns"},
     "devices/time_server.py": {"time.time_ns"},
-    "runtime/imu_memory.py": {"time.time_ns", "time.gmtime"},  # how old the bias of an earlier run is
+    "runtime/imu_bias_store.py": {"time.time_ns", "time.gmtime"},  # how old the bias of an earlier run is
     "runtime/doctor.py": {"time.time"},  # how old a calibration's file is
 }
 

@@ -10,7 +10,7 @@ from model_edge import HELLO, MS, S, tracked
 from share.config import Config
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
-from share.types import TrackState, Wait
+from share.types import TrackState, WaitReason
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
@@ -18,7 +18,7 @@ from share.wire.codec import decode, encode
 def agent_with(frames: int, ms: float = 4.0) -> tuple[Agent, int]:
     """An agent that has tracked so many frames, 50 ms apart, each done `ms` after it came; and now."""
     agent, now = Agent(HELLO, Config()), 0
-    agent.handle(ev.Tick(), 0)
+    agent.handle(ev.AgentTick(), 0)
     for k in range(frames):
         frame = tracked(k, ms=ms)
         now = frame.done_ns
@@ -29,11 +29,11 @@ def agent_with(frames: int, ms: float = 4.0) -> tuple[Agent, int]:
 
 def heard_again(agent: Agent, now_ns: int) -> None:
     """The edge is there."""
-    agent.handle(ev.Received(encode(m.Welcome(1, 0))), now_ns)
+    agent.handle(ev.EdgeMessageReceived(encode(m.Welcome(1, 0))), now_ns)
 
 
 def said(effects: list[ev.AgentEffect]) -> list[m.Status]:
-    messages = [decode(effect.frames) for effect in effects if isinstance(effect, ev.Send)]
+    messages = [decode(effect.frames) for effect in effects if isinstance(effect, ev.SendToEdge)]
     return [message for message in messages if isinstance(message, m.Status)]
 
 
@@ -54,7 +54,10 @@ def test_a_camera_that_is_gone_is_said_within_half_a_second_and_how_long() -> No
     heard = []
     for t in range(1, 61):
         now = last + t * 50 * MS
-        heard += [(now - last, s) for s in said(agent.handle(ev.Tick(trouble="the camera is away"), now))]
+        heard += [
+            (now - last, s)
+            for s in said(agent.handle(ev.AgentTick(sensor_trouble="the camera is away"), now))
+        ]
         heard_again(agent, now)
     after_ns, first = next((t, s) for t, s in heard if s.state is TrackState.LOST)
     assert after_ns <= 500 * MS
@@ -64,9 +67,9 @@ def test_a_camera_that_is_gone_is_said_within_half_a_second_and_how_long() -> No
     assert status.reason == f"no image for {(age_ns + 4 * MS) / S:.1f} s; the camera is away"
     assert status.pose_age_ms == (age_ns + 4 * MS) / 1e6
     back = last + 3050 * MS
-    agent.handle(ev.Tick(), back)
+    agent.handle(ev.AgentTick(), back)
     frame = replace(tracked(161), arrived_ns=back - 4 * MS, done_ns=back)
-    statuses = said(agent.handle(frame, back)) + said(agent.handle(ev.Tick(), back + 100 * MS))
+    statuses = said(agent.handle(frame, back)) + said(agent.handle(ev.AgentTick(), back + 100 * MS))
     status = statuses[-1]
     assert (status.state, status.reason) == (TrackState.OK, "")
 
@@ -81,7 +84,7 @@ def test_a_slow_machine_says_how_late_its_poses_are() -> None:
 def test_a_tracker_that_hangs_while_images_come_is_not_called_a_camera_that_is_gone() -> None:
     agent, last = agent_with(20)
     now = last + 2 * S
-    agent.handle(ev.Tick(image_ns=now - 30 * MS), now)
+    agent.handle(ev.AgentTick(waiting_image_ns=now - 30 * MS), now)
     status = agent.status(now)
     assert (status.state, status.reason) == (
         TrackState.LOST,
@@ -91,7 +94,7 @@ def test_a_tracker_that_hangs_while_images_come_is_not_called_a_camera_that_is_g
 
 def test_a_slow_camera_is_not_lost_between_its_frames() -> None:
     agent, now = Agent(HELLO, Config()), 0
-    agent.handle(ev.Tick(), 0)
+    agent.handle(ev.AgentTick(), 0)
     for k in range(30):  # 2 Hz
         now = k * 500 * MS
         agent.handle(replace(tracked(k), arrived_ns=now - 4 * MS, done_ns=now), now)
@@ -102,7 +105,7 @@ def test_a_slow_camera_is_not_lost_between_its_frames() -> None:
 def test_however_slow_all_was_a_camera_that_is_gone_is_said_within_a_second() -> None:
     """As on a machine that others keep busy, where a frame took 0.9 s: it was said after 2.7 s."""
     agent, now = Agent(HELLO, Config()), 0
-    agent.handle(ev.Tick(), 0)
+    agent.handle(ev.AgentTick(), 0)
     for k in range(30):
         now = k * 900 * MS
         agent.handle(replace(tracked(k), arrived_ns=now - 4 * MS, done_ns=now), now)
@@ -112,7 +115,7 @@ def test_however_slow_all_was_a_camera_that_is_gone_is_said_within_a_second() ->
 
 def test_states_have_their_reasons() -> None:
     for state, waits, reason in (
-        (TrackState.INITIALISING, Wait.IMU, "waits for the IMU's first samples"),
+        (TrackState.INITIALISING, WaitReason.IMU, "waits for the IMU's first samples"),
         (TrackState.VISION_ONLY, None, "no IMU sample for 0.2 s"),
         (TrackState.LOST, None, "lost for 0.2 s"),
         (TrackState.WEAK, None, "few points in view"),
@@ -120,21 +123,21 @@ def test_states_have_their_reasons() -> None:
         agent, now = agent_with(3)
         T = tracked(0).T_odom_body if state.has_pose else None
         for k in range(4, 9):
-            frame = replace(tracked(k, T), state=state, T_odom_body=T, waits=waits)
+            frame = replace(tracked(k, T), state=state, T_odom_body=T, waiting_for=waits)
             agent.handle(frame, now := frame.done_ns)
         assert (agent.status(now).state, agent.status(now).reason) == (state, reason)
 
 
 def test_no_image_at_all_is_said_too() -> None:
     agent = Agent(HELLO, Config())
-    agent.handle(ev.Tick(), 7 * S)
-    agent.handle(ev.Tick(), 9 * S)
+    agent.handle(ev.AgentTick(), 7 * S)
+    agent.handle(ev.AgentTick(), 9 * S)
     assert agent.status(9 * S) == m.Status(TrackState.INITIALISING, 2000.0, "no image for 2.0 s")
 
 
 def test_after_the_last_frame_it_is_not_called_lost() -> None:
     agent, now = agent_with(20)
-    agent.handle(ev.Finished(), now)
+    agent.handle(ev.InputFinished(), now)
     status = agent.status(now + 3 * S)
     assert (status.state, status.reason) == (TrackState.OK, "no more frames follow")
 

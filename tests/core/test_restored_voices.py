@@ -12,8 +12,8 @@ from edge_sim import Person, walls
 
 from share.config import Config
 from share.geometry import se3
-from share.mapping.changes import Change, KeepKeyframe, KeepRun, Kept, with_keys
-from share.mapping.graph.solver import Solver
+from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.map_changes import MapChange, SaveKeyframe, SaveRun, StoredMap, with_unknown_credentials
 from share.mapping.mapper import Mapper
 from share.store.map_store import MapStore
 from share.types import Keyframe, View
@@ -29,9 +29,9 @@ class Life:
 
     def __init__(self) -> None:
         self.config = Config()
-        self.mapper, self.solver = Mapper(self.config), Solver(self.config.graph)
+        self.mapper, self.solver = Mapper(self.config), PoseGraphSolver(self.config.graph)
 
-    def step(self, person: Person) -> KeepKeyframe:
+    def step(self, person: Person) -> SaveKeyframe:
         """One keyframe on, and all that follows from it."""
         scale = LONG.get(person.name, 1.0)
         before = scaled(person.T_odom_body[-1], scale) if person.T_odom_body else None
@@ -40,14 +40,14 @@ class Life:
         id = len(person.T_odom_body) - 1
         T_ref_body = T if before is None else se3.inverse(before) @ T
         keyframe = Keyframe(id, id - 1, id * 10**8, T_ref_body, 4e-6 * np.eye(6), T, np.zeros(3), 0.0, view)
-        self.mapper.add(person.name, keyframe)
-        while (look := self.mapper.next_look()) is not None:
-            self.mapper.done(look, look.run(), 1.0)
+        self.mapper.add_keyframe(person.name, keyframe)
+        while (look := self.mapper.next_lookup()) is not None:
+            self.mapper.finish_step(look, look.run(), 1.0)
         while (solve := self.mapper.next_solve()) is not None:
-            self.mapper.done(solve, solve.run(self.solver), 1.0)
-        return KeepKeyframe(person.name, keyframe)
+            self.mapper.finish_step(solve, solve.run(self.solver), 1.0)
+        return SaveKeyframe(person.name, keyframe)
 
-    def walk(self, people: Iterable[Person]) -> list[Change]:
+    def walk(self, people: Iterable[Person]) -> list[MapChange]:
         return [self.step(person) for _ in range(STEPS) for person in people]
 
     def standing(self) -> dict[str, str]:
@@ -56,7 +56,7 @@ class Life:
 
 
 def scaled(T: np.ndarray, scale: float) -> np.ndarray:
-    return se3.compose(T[:3, :3], scale * T[:3, 3])
+    return se3.from_rt(T[:3, :3], scale * T[:3, 3])
 
 
 @pytest.fixture(scope="module")
@@ -64,14 +64,14 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Person]
     """The map of ann, and of two of one key who agree with each other and not with her."""
     people = [Person(name, ROOM, 0.2 * i, 11 + i) for i, name in enumerate(KEYS)]
     life, path = Life(), tmp_path_factory.mktemp("voices") / "room.sqlite"
-    changes: list[Change] = []
+    changes: list[MapChange] = []
     for person in people:
-        life.mapper.join(person.name, person.hello, KEYS[person.name])
-        changes.append(KeepRun(person.name, person.hello, KEYS[person.name]))
+        life.mapper.add_run(person.name, person.hello, KEYS[person.name])
+        changes.append(SaveRun(person.name, person.hello, KEYS[person.name]))
     changes += life.walk(people)
     assert life.standing() == dict.fromkeys(KEYS, "disputed")
     with MapStore.open(path) as store:
-        store.write([*changes, *life.mapper.take_changes(), life.mapper.poses()])
+        store.write([*changes, *life.mapper.take_changes(), life.mapper.current_poses()])
     return path, people
 
 
@@ -79,12 +79,14 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Person]
 def test_a_restored_run_has_the_voice_that_was_kept_until_another_is_heard(kept: str | None) -> None:
     people = [Person(name, ROOM, 0.0, 11 + i) for i, name in enumerate(KEYS)]
     mapper = Mapper(Config())
-    mapper.restore(Kept(tuple(KeepRun(p.name, p.hello, "A" if p.name == "ann" else kept) for p in people)))
-    voice = mapper._atlas._parting.agreement.subjects.voice
+    mapper.restore(
+        StoredMap(tuple(SaveRun(p.name, p.hello, "A" if p.name == "ann" else kept) for p in people))
+    )
+    voice = mapper._atlas._quarantine.agreement.identities.credential
     assert [voice(name) for name in KEYS] == ["A", kept, kept]
-    mapper.speaks("e2", "F")
+    mapper.set_credential("e2", "F")
     assert [voice(name) for name in KEYS] == ["A", kept, "F"]
-    mapper.join("e2-2", replace(people[2].hello, run_id=5), "")
+    mapper.add_run("e2-2", replace(people[2].hello, run_id=5), "")
     assert voice("e2") not in (None, "A", "E", "F")  # without a key a name has one of its own
 
 
@@ -96,14 +98,14 @@ def test_after_a_restart_one_key_has_one_voice(walked: tuple[Path, list[Person]]
     people = [replace(p, T_world_body=[*p.T_world_body], T_odom_body=[*p.T_odom_body]) for p in people]
     kept = MapStore.read(path).load()
     if file == "of SHARE 0.1":
-        kept = replace(kept, runs=tuple(replace(run, voice="") for run in kept.runs))
+        kept = replace(kept, runs=tuple(replace(run, credential="") for run in kept.runs))
     second = Life()
-    second.mapper.restore(with_keys(kept))
+    second.mapper.restore(with_unknown_credentials(kept))
     present = people[:2] if file == "of SHARE 0.1" else people
     for person in present:
-        second.mapper.present(person.name, True)
+        second.mapper.set_present(person.name, True)
         if file == "of SHARE 0.1":
-            second.mapper.speaks(person.name, KEYS[person.name])
+            second.mapper.set_credential(person.name, KEYS[person.name])
     second.walk(present)
     standing = second.standing()
     assert standing["ann"] == standing["e1"] == "disputed"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from share.config import SequencerConfig
 from share.sensors.measurement import Measurement
-from share.sensors.sequencer import SequencerCounters, _Merger, sequence
+from share.sensors.sequencer import SequencerCounters, _Merger, sequence_frames
 from share.sensors.stamps import WRAP_NS
 
 MS = 1_000_000
@@ -42,7 +42,7 @@ def in_order(measurements: list[Measurement]) -> list[Measurement]:
 
 def run(measurements, streams=STEREO_IMU, config=CONFIG, rate=RATE):
     counters = SequencerCounters()
-    return list(sequence(measurements, streams, rate, config, counters)), counters
+    return list(sequence_frames(measurements, streams, rate, config, counters)), counters
 
 
 def plain(bundles) -> list[tuple]:
@@ -139,7 +139,7 @@ def test_a_frame_goes_out_as_soon_as_it_is_whole(before):
             fed.append(m.stamp_ns)
             yield m
 
-    out = [(b.stamp_ns, fed[-1]) for b in sequence(feed(), STEREO_IMU, RATE, CONFIG, counters)]
+    out = [(b.stamp_ns, fed[-1]) for b in sequence_frames(feed(), STEREO_IMU, RATE, CONFIG, counters)]
     assert all(now == stamp + before for stamp, now in out[:-1])
 
 
@@ -156,7 +156,7 @@ def test_an_imu_with_a_shifted_clock_gives_the_same_samples(shift):
             yield m
 
     for b, e in zip(
-        sequence(feed(), STEREO_IMU, RATE, CONFIG, counters, imu_shift_ns=shift), expected, strict=True
+        sequence_frames(feed(), STEREO_IMU, RATE, CONFIG, counters, imu_shift_ns=shift), expected, strict=True
     ):
         assert (b.stamp_ns, b.image0, b.image1) == (e.stamp_ns, e.image0, e.image1)
         assert (b.imu.stamps_ns - shift).tolist() == e.imu.stamps_ns.tolist()
@@ -223,7 +223,7 @@ def test_depth_beside_stereo_may_be_missing_or_die_and_costs_no_frame():
 
     streams = ("cam0", "cam1", "depth", "imu")
     out = []
-    for b in sequence(feed(), streams, RATE, CONFIG, SequencerCounters()):
+    for b in sequence_frames(feed(), streams, RATE, CONFIG, SequencerCounters()):
         out.append(b)
         late.append(fed[-1] - b.stamp_ns)
     assert [b.stamp_ns for b in out] == times.tolist()
@@ -245,7 +245,7 @@ def test_a_silent_imu_does_not_end_the_run():
             yield m
 
     counters = SequencerCounters()
-    for b in sequence(feed(), STEREO_IMU, RATE, CONFIG, counters):
+    for b in sequence_frames(feed(), STEREO_IMU, RATE, CONFIG, counters):
         lateness[b.stamp_ns // STEP] = newest - b.stamp_ns
     assert sorted(lateness) == list(range(80))
     assert counters.imu_silent == 40
@@ -328,7 +328,7 @@ def test_memory_is_bounded_whichever_stream_dies(without):
         for m in recording(20 * 40, second * 10**9 + 10**12):
             if m.stream != without:
                 merger.add(m.stream, m.stamp_ns, m.payload)
-                for _ in merger.ready():
+                for _ in merger.ready_frames():
                     pass
                 most = max(most, sum(len(b.items) for b in merger.buffers.values()))
     assert most < 200 * CONFIG.max_jump_s + 200

@@ -6,8 +6,8 @@ import re
 
 from model_edge import S
 
-from share.protocol.edge_records import Records
-from share.rates import Throttle
+from share.protocol.edge_records import EventLog
+from share.timing import Throttle
 
 
 def test_a_burst_then_so_many_a_second_and_the_rest_is_counted() -> None:
@@ -37,17 +37,17 @@ def test_keys_that_are_new_each_time_are_few() -> None:
 
 
 def test_what_goes_on_and_on_is_written_once_a_minute() -> None:
-    records = Records(0)
-    written = [records.seldom(s * S, "back", "eve", "is heard again") for s in range(3600)]
+    records = EventLog(0)
+    written = [records.throttled_event(s * S, "back", "eve", "is heard again") for s in range(3600)]
     first, later = written[:300], written[600:]
     assert sum(r is not None for r in first) > 150
     assert sum(r is not None for r in later) <= 51
 
 
 def test_nothing_that_is_held_back_is_forgotten() -> None:
-    records, counted = Records(0), 0
+    records, counted = EventLog(0), 0
     for k in range(36_000):
-        if (record := records.seldom(k * S // 10, "back", "eve", "is heard again")) is not None:
+        if (record := records.throttled_event(k * S // 10, "back", "eve", "is heard again")) is not None:
             more = re.search(r"and (\d+) more", record.fields["reason"])
             counted += 1 + (int(more[1]) if more else 0)
     assert 36_000 - counted < 700  # of the last minute

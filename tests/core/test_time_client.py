@@ -10,16 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from share.devices.time_client import Answer, KissError, estimate, read, request
-from share.net.ntp import Mode, Packet, to_stamp
+from share.devices.time_client import KissError, NtpReply, estimate_offset, make_request, parse_reply
+from share.net.ntp import NtpMode, NtpPacket, to_stamp
 from share.protocol.edge_clock import Exchange
 
 MS = 1_000_000
 S = 1000 * MS
 NOW = 1_795_446_605 * S
 NONCE = 0xFEEDFACECAFEBEEF
-GOOD = Packet(
-    Mode.SERVER,
+GOOD = NtpPacket(
+    NtpMode.SERVER,
     stratum=3,
     precision=-20,
     root_delay=1 << 6,  # 0.9765625 ms
@@ -30,28 +30,28 @@ GOOD = Packet(
 )
 
 
-def answer(there: int, back: int, offset: int = 0) -> Answer:
+def answer(there: int, back: int, offset: int = 0) -> NtpReply:
     arrived = NOW + there
-    return Answer(Exchange(NOW, arrived + offset, arrived + offset, arrived + back), 10, 0, 0)
+    return NtpReply(Exchange(NOW, arrived + offset, arrived + offset, arrived + back), 10, 0, 0)
 
 
 def test_a_question_gives_nothing_away_but_its_nonce() -> None:
-    assert request(NONCE) == b"\x23" + bytes(39) + NONCE.to_bytes(8, "big")
+    assert make_request(NONCE) == b"\x23" + bytes(39) + NONCE.to_bytes(8, "big")
 
 
 def test_an_answer_and_its_bound_by_hand() -> None:
-    found = read(GOOD.encode(), NONCE, NOW, NOW + 5 * MS)
+    found = parse_reply(GOOD.encode(), NONCE, NOW, NOW + 5 * MS)
     assert (found.exchange.offset_ns, found.exchange.delay_ns) == (5 * MS, 4 * MS)
     assert (found.stratum, found.precision_ns) == (3, 954)
     root = -(-976_563 // 2) + 1_953_125
-    assert found.bound_ns(46) == 2 * MS + 954 + 46 + 75 + root  # 15 ppm of 5 ms are 75 ns
+    assert found.max_error_ns(46) == 2 * MS + 954 + 46 + 75 + root  # 15 ppm of 5 ms are 75 ns
 
 
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"mode": Mode.CLIENT}, "mode CLIENT in place of an answer"),
-        ({"mode": Mode.BROADCAST}, "mode BROADCAST in place of an answer"),
+        ({"mode": NtpMode.CLIENT}, "mode CLIENT in place of an answer"),
+        ({"mode": NtpMode.BROADCAST}, "mode BROADCAST in place of an answer"),
         ({"origin": NONCE + 1}, "answers another question"),
         ({"leap": 3}, "does not know the time itself"),
         ({"stratum": 16}, "does not know the time itself"),
@@ -65,13 +65,13 @@ def test_an_answer_and_its_bound_by_hand() -> None:
 )
 def test_what_cannot_be_believed_is_refused(changed: dict[str, object], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
-        read(replace(GOOD, **changed).encode(), NONCE, NOW, NOW + 5 * MS)  # type: ignore[arg-type]
+        parse_reply(replace(GOOD, **changed).encode(), NONCE, NOW, NOW + 5 * MS)  # type: ignore[arg-type]
 
 
 def test_a_kiss_of_death_is_told_by_its_code() -> None:
     kiss = replace(GOOD, stratum=0, refid=b"RATE")
     with pytest.raises(KissError, match=r"refuses to answer \(RATE\)") as told:
-        read(kiss.encode(), NONCE, NOW, NOW + MS)
+        parse_reply(kiss.encode(), NONCE, NOW, NOW + MS)
     assert told.value.code == "RATE"
 
 
@@ -79,7 +79,7 @@ def test_a_kiss_from_who_did_not_hear_the_question_is_none() -> None:
     """Else anybody could keep us from our server."""
     kiss = replace(GOOD, stratum=0, refid=b"DENY", origin=1)
     with pytest.raises(ValueError, match="another question") as told:
-        read(kiss.encode(), NONCE, NOW, NOW + MS)
+        parse_reply(kiss.encode(), NONCE, NOW, NOW + MS)
     assert not isinstance(told.value, KissError)
 
 
@@ -88,11 +88,11 @@ def test_a_kiss_from_who_did_not_hear_the_question_is_none() -> None:
 def test_any_bytes_are_an_answer_or_a_value_error(data: bytes) -> None:
     for tried in (data, GOOD.encode()[:24] + NONCE.to_bytes(8, "big") + data[:16].ljust(16, b"\1")):
         with contextlib.suppress(ValueError):
-            assert read(tried, NONCE, NOW, NOW + S).exchange.is_possible
+            assert parse_reply(tried, NONCE, NOW, NOW + S).exchange.is_valid
 
 
 def test_the_answer_that_was_quickest_is_taken() -> None:
-    found = estimate([answer(5 * MS, MS, 10), answer(MS, MS, 20), answer(MS, 9 * MS, 30)], 0)
+    found = estimate_offset([answer(5 * MS, MS, 10), answer(MS, MS, 20), answer(MS, 9 * MS, 30)], 0)
     assert (found.offset_ns, found.delay_ns, found.uncertainty_ns) == (20, 2 * MS, MS + 30)
     assert found.answers == 3
 
@@ -100,16 +100,18 @@ def test_the_answer_that_was_quickest_is_taken() -> None:
 def test_jitter_is_the_rms_of_the_others_against_the_best() -> None:
     """Against numpy: three others, off by 2, 0 and -4 ms."""
     answers = [answer(MS, MS), answer(6 * MS, 2 * MS), answer(2 * MS, 2 * MS), answer(2 * MS, 10 * MS)]
-    assert estimate(answers, 0).jitter_ns == int(np.sqrt(np.mean(np.array([2 * MS, 0, -4 * MS]) ** 2.0)))
+    assert estimate_offset(answers, 0).jitter_ns == int(
+        np.sqrt(np.mean(np.array([2 * MS, 0, -4 * MS]) ** 2.0))
+    )
 
 
 def test_jitter_is_no_less_than_what_clocks_resolve() -> None:
-    assert estimate([answer(MS, MS)], 40).jitter_ns == 40
+    assert estimate_offset([answer(MS, MS)], 40).jitter_ns == 40
 
 
 def test_without_answers_there_is_no_estimate() -> None:
     with pytest.raises(ValueError, match="no answers"):
-        estimate([], 1)
+        estimate_offset([], 1)
 
 
 @given(
@@ -134,8 +136,8 @@ def test_the_truth_is_within_the_stated_uncertainty(
         sent = NOW + k * S // 4
         replied = sent + there + kept
         exchange = Exchange(sent, theirs(sent + there), theirs(replied), replied + back)
-        answers.append(Answer(exchange, 10, 1, 0))
+        answers.append(NtpReply(exchange, 10, 1, 0))
         truths.append(theirs(replied + back) - (replied + back))
-    found = estimate(answers, 1)
+    found = estimate_offset(answers, 1)
     taken = min(range(len(ways)), key=lambda k: answers[k].exchange.delay_ns)
     assert abs(found.offset_ns - truths[taken]) <= found.uncertainty_ns

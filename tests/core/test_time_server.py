@@ -6,24 +6,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.devices.time_server import BURST, CLIENTS, PER_S, TimeServer
-from share.net.ntp import Mode, Packet, to_stamp
+from share.devices.time_server import BURST, MAX_CLIENTS, RATE_PER_S, TimeServer
+from share.net.ntp import NtpMode, NtpPacket, to_stamp
 
 S = 1_000_000_000
 NOW = 1_795_446_605 * S
-QUESTION = Packet(Mode.CLIENT, version=3, poll=6, transmit=0xFEEDFACECAFEBEEF).encode()
+QUESTION = NtpPacket(NtpMode.CLIENT, version=3, poll=6, transmit=0xFEEDFACECAFEBEEF).encode()
 
 
 def ask(
     server: TimeServer, data: bytes = QUESTION, address: str = "192.0.2.7", at_s: float = 0.0
-) -> Packet | None:
+) -> NtpPacket | None:
     return server.answer(data, address, NOW, round(at_s * S))
 
 
 def test_an_answer_says_what_it_answers_and_when_it_was_asked() -> None:
     answer = ask(TimeServer(stratum=9, precision=-23))
-    assert answer == Packet(
-        Mode.SERVER,
+    assert answer == NtpPacket(
+        NtpMode.SERVER,
         version=3,  # the client's
         stratum=9,
         poll=6,  # the client's
@@ -35,11 +35,11 @@ def test_an_answer_says_what_it_answers_and_when_it_was_asked() -> None:
     )
 
 
-@pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.CLIENT])
-def test_only_questions_are_answered(mode: Mode) -> None:
+@pytest.mark.parametrize("mode", [mode for mode in NtpMode if mode is not NtpMode.CLIENT])
+def test_only_questions_are_answered(mode: NtpMode) -> None:
     """Above all no answers: two servers would answer each other for ever."""
     server = TimeServer()
-    assert ask(server, Packet(mode).encode()) is None
+    assert ask(server, NtpPacket(mode).encode()) is None
     assert server.counts == {"ignored": 1}
     assert server.clients == 0
 
@@ -56,7 +56,7 @@ def test_whatever_comes_nobody_gets_more_than_was_sent(data: bytes) -> None:
 def test_who_asks_too_often_is_not_answered_and_others_are() -> None:
     server = TimeServer()
     answered = [ask(server, at_s=k / 1000) is not None for k in range(1000)]
-    assert sum(answered) == BURST + int(PER_S * 0.999)
+    assert sum(answered) == BURST + int(RATE_PER_S * 0.999)
     assert server.counts["limited"] == 1000 - sum(answered)
     assert ask(server, address="192.0.2.8", at_s=1.0) is not None
     assert ask(server, at_s=2.0) is not None  # and again after a while
@@ -71,6 +71,6 @@ def test_chronyd_at_its_quickest_is_never_turned_away() -> None:
 
 def test_a_flood_of_forged_addresses_is_forgotten_again() -> None:
     server = TimeServer()
-    for k in range(3 * CLIENTS):
+    for k in range(3 * MAX_CLIENTS):
         ask(server, address=f"forged-{k}")
-    assert server.clients == CLIENTS
+    assert server.clients == MAX_CLIENTS

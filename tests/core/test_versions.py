@@ -20,12 +20,12 @@ from share.protocol.edge import Edge
 from share.protocol.remote_tracking import TrackingEdge
 from share.types import TrackState
 from share.wire import messages as m
-from share.wire.codec import VERSION, decode, encode
+from share.wire.codec import WIRE_VERSION, decode, encode
 
 S = 1_000_000_000
 HELLO = hello_of("ann", 0xA000B)
 PING, REFUSED = 5, 17
-OLD = [version for version in VERSIONS if version < VERSION]
+OLD = [version for version in VERSIONS if version < WIRE_VERSION]
 
 pytestmark = pytest.mark.parametrize("old", OLD)
 
@@ -38,8 +38,8 @@ def ups(old: int) -> list[Message]:
     return [message for message in traffic(old) if message.way == "up"]
 
 
-def sends(effects: list[ed.Effect]) -> list[ed.Send]:
-    return [effect for effect in effects if isinstance(effect, ed.Send)]
+def sends(effects: list[ed.EdgeEffect]) -> list[ed.SendToPeer]:
+    return [effect for effect in effects if isinstance(effect, ed.SendToPeer)]
 
 
 def test_every_kind_of_message_was_recorded(old: int) -> None:
@@ -49,7 +49,7 @@ def test_every_kind_of_message_was_recorded(old: int) -> None:
 def test_each_message_of_an_older_agent_is_refused_in_its_own_version(old: int) -> None:
     for edge in (edge for message in ups(old)[:1] for edge in edges()):
         for i, message in enumerate(ups(old)):
-            effects = edge.handle(ed.Received(i.to_bytes(8, "big"), message.frames), i * S)
+            effects = edge.handle(ed.PeerMessageReceived(i.to_bytes(8, "big"), message.frames), i * S)
             if message.code == PING:
                 assert effects == []
                 continue
@@ -58,7 +58,7 @@ def test_each_message_of_an_older_agent_is_refused_in_its_own_version(old: int) 
             refused = decode(answer.frames, (old,))
             assert isinstance(refused, m.Refused)
             assert refused.reason.endswith(
-                f"(wire {VERSION}), this agent speaks wire {old}: upgrade the agent"
+                f"(wire {WIRE_VERSION}), this agent speaks wire {old}: upgrade the agent"
             )
             assert "\n" not in refused.reason
         report = edge.report({})
@@ -70,7 +70,7 @@ def test_each_message_of_an_older_agent_is_refused_in_its_own_version(old: int) 
 def test_the_older_agents_conversation_is_refused_seldom(old: int) -> None:
     """As it passed, several messages in a frame's time."""
     for edge in edges():
-        said = [sends(edge.handle(ed.Received(up.peer, up.frames), up.t_ns)) for up in ups(old)]
+        said = [sends(edge.handle(ed.PeerMessageReceived(up.peer, up.frames), up.t_ns)) for up in ups(old)]
         agents, last_s = len({up.peer for up in ups(old)}), ups(old)[-1].t_ns / S
         assert agents <= sum(map(len, said)) <= agents * (1 + last_s / 2)
 
@@ -81,8 +81,8 @@ def test_the_refusal_is_written_down_and_seen_on_the_page(old: int) -> None:
     records = [
         effect.fields
         for i in range(30)
-        for effect in edge.handle(ed.Received(b"12345678", frames), 2 * i * S)
-        if isinstance(effect, ed.Record)
+        for effect in edge.handle(ed.PeerMessageReceived(b"12345678", frames), 2 * i * S)
+        if isinstance(effect, ed.WriteEvent)
     ]
     assert 1 <= len(records) <= 30
     assert {record["event"] for record in records} == {"refused"}
@@ -118,20 +118,20 @@ def run(agent: Agent, edge: OlderEdge | None, seconds: int) -> list[ev.AgentEffe
     effects = agent.handle(ev.Connected(), 0)
     inbox: list[list[bytes]] = []
     for k in range(10 * seconds):
-        for event in (frame(k), ev.Tick(), *map(ev.Received, inbox)):
+        for event in (frame(k), ev.AgentTick(), *map(ev.EdgeMessageReceived, inbox)):
             effects += agent.handle(event, k * S // 10)
-        sent = [[bytes(f) for f in e.frames] for e in effects if isinstance(e, ev.Send)]
-        effects = [e for e in effects if not isinstance(e, ev.Send)]
+        sent = [[bytes(f) for f in e.frames] for e in effects if isinstance(e, ev.SendToEdge)]
+        effects = [e for e in effects if not isinstance(e, ev.SendToEdge)]
         inbox = [a for frames in sent if edge and (a := edge.answer(frames, k * S // 10)) is not None]
     return effects
 
 
 def said(effects: list[ev.AgentEffect]) -> list[str]:
-    return [effect.text for effect in effects if isinstance(effect, ev.Say)]
+    return [effect.text for effect in effects if isinstance(effect, ev.PrintLine)]
 
 
-def poses(effects: list[ev.AgentEffect]) -> list[ev.Localised]:
-    return [effect for effect in effects if isinstance(effect, ev.Localised)]
+def poses(effects: list[ev.AgentEffect]) -> list[ev.LocalisedPose]:
+    return [effect for effect in effects if isinstance(effect, ev.LocalisedPose)]
 
 
 def test_an_agent_finds_out_that_the_edge_is_older_and_goes_on(old: int) -> None:
@@ -139,7 +139,7 @@ def test_an_agent_finds_out_that_the_edge_is_older_and_goes_on(old: int) -> None
     effects = run(agent, OlderEdge(old), 20)
     (line,) = said(effects)
     assert line.startswith(f"the edge speaks wire {old}, this SHARE ")
-    assert line.endswith(f"wire {VERSION}: upgrade the edge; tracking goes on alone")
+    assert line.endswith(f"wire {WIRE_VERSION}: upgrade the edge; tracking goes on alone")
     assert len(poses(effects)) == 200
     assert not agent.report()["connected"]
     assert agent.report()["bad_messages"] == 0
@@ -153,8 +153,8 @@ def test_it_joins_the_edge_once_that_is_upgraded(old: int) -> None:
     agent = Agent(HELLO, Config())
     run(agent, OlderEdge(old), 5)
     welcome = [bytes(f) for f in encode(m.Welcome(8, 0))]
-    assert said(agent.handle(ev.Received(welcome), 6 * S)) == ["connected to the edge"]
-    assert agent.connected
+    assert said(agent.handle(ev.EdgeMessageReceived(welcome), 6 * S)) == ["connected to the edge"]
+    assert agent.is_connected
 
 
 def test_an_edge_of_this_version_is_not_taken_for_an_older_one(old: int) -> None:
@@ -163,9 +163,9 @@ def test_an_edge_of_this_version_is_not_taken_for_an_older_one(old: int) -> None
     agent.handle(ev.Connected(), 0)
     for k in range(100):
         now_ns = k * S // 10
-        for effect in agent.handle(ev.Tick(), now_ns):
-            if isinstance(effect, ev.Send):
-                received = ed.Received(m.peer_id(HELLO.run_id), [bytes(f) for f in effect.frames])
+        for effect in agent.handle(ev.AgentTick(), now_ns):
+            if isinstance(effect, ev.SendToEdge):
+                received = ed.PeerMessageReceived(m.peer_id(HELLO.run_id), [bytes(f) for f in effect.frames])
                 answers += sends(edge.handle(received, now_ns))
     assert edge.report({})["strangers"]["other_version"] >= 30
     assert answers == []
@@ -176,8 +176,10 @@ def test_whatever_an_older_edge_says_changes_nothing(old: int) -> None:
     effects = run(agent, None, 5)
     downs = [message for message in traffic(old) if message.way == "down"]
     for message in downs:
-        effects += agent.handle(ev.Received(message.frames), 5 * S)
-    assert not [effect for effect in effects if isinstance(effect, (ev.Fail, ev.Stop, ev.CorrectionApplied))]
+        effects += agent.handle(ev.EdgeMessageReceived(message.frames), 5 * S)
+    assert not [
+        effect for effect in effects if isinstance(effect, (ev.FailRun, ev.CloseLink, ev.CorrectionApplied))
+    ]
     report = agent.report()
     assert (report["connected"], report["corrections"], report["map_id"]) == (False, 0, None)
     pongs = sum(message.code == 21 for message in downs)

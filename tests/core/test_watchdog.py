@@ -16,7 +16,7 @@ def run(dog: Watchdog, begin_ms: int, end_ms: int, *streams: str) -> list[Action
     asked = []
     for now in range(begin_ms, end_ms, 100):
         for stream in streams:
-            dog.heard(stream, now * MS)
+            dog.record_sample(stream, now * MS)
         asked.append(dog.tick(now * MS))
     return [action for action in asked if action is not Action.NOTHING]
 
@@ -34,10 +34,10 @@ def test_a_silent_imu_is_reset_once_and_then_done_without() -> None:
     assert run(dog, 0, 5000, *ALL) == []
     assert run(dog, 5000, 7100, "cam0", "cam1") == [Action.RESET]
     assert (dog.health, dog.silent) == (Health.AWAY, IMU)
-    dog.connected(8000 * MS)
+    dog.record_connect(8000 * MS)
     assert run(dog, 8000, 20_000, "cam0", "cam1") == [Action.GO_WITHOUT]
     assert (dog.health, dog.silent) == (Health.VISION_ONLY, IMU)
-    assert run(dog, 20_000, 22_000, *ALL) == [Action.HEARD_AGAIN]
+    assert run(dog, 20_000, 22_000, *ALL) == [Action.RECOVERED]
     assert (dog.health, dog.silent) == (Health.OK, IMU)
     assert run(dog, 22_000, 25_000, "cam0", "cam1") == [Action.GO_WITHOUT]
     assert dog.resets == 1
@@ -55,7 +55,7 @@ def test_a_lost_camera_is_looked_for_once_a_second_until_it_is_there() -> None:
     dog = Watchdog(0, ALL)
     run(dog, 0, 5000, *ALL)
     assert run(dog, 5000, 10_000) == [Action.RECONNECT] * 4
-    dog.connected(10_000 * MS)
+    dog.record_connect(10_000 * MS)
     assert run(dog, 10_000, 20_000, *ALL) == []
     assert dog.resets == 0
 
@@ -91,17 +91,17 @@ def test_half_an_imu_is_a_silent_one(left: str) -> None:
     dog = Watchdog(0, ALL)
     run(dog, 0, 5000, *ALL)
     assert run(dog, 5000, 7100, "cam0", "cam1", left) == [Action.RESET]
-    dog.connected(8000 * MS)
+    dog.record_connect(8000 * MS)
     assert run(dog, 8000, 20_000, "cam0", "cam1", left) == [Action.GO_WITHOUT]
     assert (dog.health, dog.silent) == (Health.VISION_ONLY, tuple(name for name in IMU if name != left))
-    assert run(dog, 20_000, 22_000, *ALL) == [Action.HEARD_AGAIN]
+    assert run(dog, 20_000, 22_000, *ALL) == [Action.RECOVERED]
 
 
 def test_half_an_imu_without_images_is_looked_for_after_its_reset() -> None:
     dog = Watchdog(0, IMU)
     run(dog, 0, 5000, *IMU)
     assert run(dog, 5000, 7100, "gyro") == [Action.RESET]
-    dog.connected(9000 * MS)
+    dog.record_connect(9000 * MS)
     assert run(dog, 9000, 14_200, "gyro") == [Action.RECONNECT]
 
 
@@ -117,7 +117,7 @@ def test_what_cannot_be_done_without_is_reset_once_and_then_looked_for(
     run(dog, 0, 5000, *streams)
     assert run(dog, 5000, 7100, *others) == [Action.RESET]
     for began in range(10_000, 80_000, 10_000):
-        dog.connected(began * MS)
+        dog.record_connect(began * MS)
         assert run(dog, began, began + 5200, *others) == [Action.RECONNECT]
     assert (dog.resets, dog.silent) == (1, silent)
 
@@ -128,10 +128,10 @@ def test_what_tells_distance_too_is_reset_once_and_then_done_without(silent: str
     others = [name for name in streams if name != silent]
     dog = Watchdog(0, streams)
     assert run(dog, 0, 5200, *others) == [Action.RESET]
-    dog.connected(9000 * MS)
+    dog.record_connect(9000 * MS)
     assert run(dog, 9000, 30_000, *others) == [Action.GO_WITHOUT]
     assert (dog.health, dog.silent) == (Health.DEGRADED, (silent,))
-    assert run(dog, 30_000, 33_000, "cam0", "cam1", "depth") == [Action.HEARD_AGAIN, Action.GO_WITHOUT]
+    assert run(dog, 30_000, 33_000, "cam0", "cam1", "depth") == [Action.RECOVERED, Action.GO_WITHOUT]
     assert (dog.health, dog.silent) == (Health.VISION_ONLY, IMU)
 
 
@@ -144,7 +144,7 @@ def test_what_is_needed_and_never_came_is_given_up_after_a_reset(
 ) -> None:
     dog, asked = Watchdog(0, streams), []
     for began in range(0, 40_000, 10_000):
-        dog.connected(began * MS)
+        dog.record_connect(began * MS)
         asked += run(dog, began, began + (5200 if comes else 4200), *comes)
         if Action.GIVE_UP in asked:
             break
@@ -157,7 +157,7 @@ def test_a_camera_that_is_away_is_not_given_up() -> None:
     run(dog, 0, 4000, *IMU)  # then it was pulled out, before anybody missed its eyes
     for began in range(5_000, 60_000, 10_000):
         assert Action.GIVE_UP not in run(dog, began, began + 9000)
-        dog.connected((began + 9000) * MS)
+        dog.record_connect((began + 9000) * MS)
 
 
 def test_a_stream_that_nobody_expects_does_not_count() -> None:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.geometry.se3 import compose
-from share.recordings.unit import as_read, of_another, unused
+from share.geometry.se3 import from_rt
+from share.recordings.device_match import device_mismatch, fit_to_device, uncalibrated_sensors
 
 LENS = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
-STEREO = Rig(LENS, np.eye(4), cam1=LENS, T_cam1_cam0=compose(np.eye(3), np.array([-0.05, 0, 0])))
+STEREO = Rig(LENS, np.eye(4), cam1=LENS, T_cam1_cam0=from_rt(np.eye(3), np.array([-0.05, 0, 0])))
 ALL = replace(STEREO, depth=LENS, T_depth_cam0=np.eye(4))
 RGBD = replace(ALL, cam1=None, T_cam1_cam0=None)
 
@@ -27,24 +27,24 @@ RGBD = replace(ALL, cam1=None, T_cam1_cam0=None)
     ],
 )
 def test_another_device_is_named_with_the_one_at_hand(said, serial, named):
-    told = of_another(said, serial)
+    told = device_mismatch(said, serial)
     assert (told is None) == (named is None)
     assert told is None or told.startswith(f"the calibration is of device {named}, this is {serial}: ")
 
 
 def test_cameras_that_are_not_read_are_left_out():
-    assert as_read(ALL, STEREO).kind == "stereo" and as_read(ALL, STEREO).depth is None
-    assert (as_read(ALL, RGBD).cam1, as_read(ALL, RGBD).depth) == (None, LENS)
-    assert as_read(STEREO, ALL).depth is None
-    assert unused(STEREO, ALL) == ("depth is not used: the calibration has no depth",)
-    assert unused(ALL, STEREO) == unused(ALL, ALL) == ()
+    assert fit_to_device(ALL, STEREO).kind == "stereo" and fit_to_device(ALL, STEREO).depth is None
+    assert (fit_to_device(ALL, RGBD).cam1, fit_to_device(ALL, RGBD).depth) == (None, LENS)
+    assert fit_to_device(STEREO, ALL).depth is None
+    assert uncalibrated_sensors(STEREO, ALL) == ("depth is not used: the calibration has no depth",)
+    assert uncalibrated_sensors(ALL, STEREO) == uncalibrated_sensors(ALL, ALL) == ()
     moved = replace(STEREO, imu=ImuNoise(1e-4, 2e-3, 2e-5, 3e-3, 200.0))
-    assert unused(STEREO, moved) == ("imu is not used: the calibration has no imu",)
+    assert uncalibrated_sensors(STEREO, moved) == ("imu is not used: the calibration has no imu",)
 
 
 def test_images_of_another_size_cannot_be_meant():
     larger = replace(STEREO, cam0=replace(LENS, width=848), cam1=replace(LENS, width=848))
     with pytest.raises(ValueError, match="its cam0 is 848x480, the camera sends 640x480; add --mode 848x480"):
-        as_read(larger, STEREO)
+        fit_to_device(larger, STEREO)
     with pytest.raises(ValueError, match="its depth is 640x480, the camera sends 320x240"):
-        as_read(ALL, replace(RGBD, depth=replace(LENS, width=320, height=240)))
+        fit_to_device(ALL, replace(RGBD, depth=replace(LENS, width=320, height=240)))

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.protocol.streaming import Window
+from share.protocol.streaming import FrameWindow
 from share.types import Frame, ImuBatch
-from share.wire.messages import MAX_SAMPLES
+from share.wire.messages import MAX_IMU_SAMPLES
 
 
 def frame(index: int, samples: int = 1) -> Frame:
@@ -17,56 +17,56 @@ def frame(index: int, samples: int = 1) -> Frame:
     return Frame(1000 * index, index, np.zeros((2, 2), np.uint8), imu=imu)
 
 
-def offered(window: Window, index: int, now_ns: int = 0) -> int | None:
+def offered(window: FrameWindow, index: int, now_ns: int = 0) -> int | None:
     window.offer(frame(index), index)
-    went = window.next(now_ns)
+    went = window.take_next(now_ns)
     return None if went is None else went.index
 
 
 def test_the_newest_waits_and_brings_along_what_the_imu_said() -> None:
-    window = Window(2)
+    window = FrameWindow(2)
     assert [offered(window, i) for i in range(6)] == [0, 1, None, None, None, None]
     assert (window.dropped, window.unanswered) == (3, 0)
-    sent = window.answered(0)
+    sent = window.take_answered(0)
     assert sent is not None
     assert (sent.frame.index, sent.arrived_ns) == (0, 0)
-    went = window.next(0)
+    went = window.take_next(0)
     assert went is not None
     assert went.index == 5
     assert went.imu.stamps_ns.tolist() == [2000, 3000, 4000, 5000]
-    assert window.next(0) is None
+    assert window.take_next(0) is None
     assert not window.is_idle
 
 
 def test_an_answer_ends_the_wait_for_those_before_it() -> None:
-    window = Window(3)
+    window = FrameWindow(3)
     assert [offered(window, i) for i in range(3)] == [0, 1, 2]
-    assert window.answered(1) is not None
+    assert window.take_answered(1) is not None
     assert window.unanswered == 1
-    assert window.answered(0) is None
-    assert window.answered(1) is None
-    assert window.answered(2) is not None
+    assert window.take_answered(0) is None
+    assert window.take_answered(1) is None
+    assert window.take_answered(2) is not None
     assert window.is_idle
 
 
 def test_what_was_not_taken_goes_with_the_next() -> None:
-    window = Window(1)
+    window = FrameWindow(1)
     assert offered(window, 0) == 0
-    window.refused(0)
+    window.cancel(0)
     assert window.is_idle
     window.offer(frame(1), 0)
-    went = window.next(0)
+    went = window.take_next(0)
     assert went is not None
     assert went.imu.stamps_ns.tolist() == [0, 1000]
 
 
 def test_nobody_waits_for_ever() -> None:
-    window = Window(2)
+    window = FrameWindow(2)
     for i in range(3):
         offered(window, i, now_ns=10 * i)
     window.expire(before_ns=5)
     assert window.unanswered == 1
-    went = window.next(20)
+    went = window.take_next(20)
     assert went is not None
     assert went.index == 2
     window.clear()
@@ -74,19 +74,19 @@ def test_nobody_waits_for_ever() -> None:
 
 
 def test_a_long_silence_does_not_fill_memory() -> None:
-    window = Window(1)
+    window = FrameWindow(1)
     for i in range(5):
-        window.skip(frame(i, MAX_SAMPLES // 2))
+        window.skip(frame(i, MAX_IMU_SAMPLES // 2))
     window.offer(frame(5, 10), 0)
-    went = window.next(0)
+    went = window.take_next(0)
     assert went is not None
-    assert len(went.imu) == MAX_SAMPLES
+    assert len(went.imu) == MAX_IMU_SAMPLES
     assert went.imu.stamps_ns[-1] == 5009
 
 
 @given(st.lists(st.sampled_from(["offer", "answer the oldest", "answer the newest"]), max_size=60))
 def test_every_frame_has_one_fate_and_every_sample_goes_once(acts: list[str]) -> None:
-    window, came, answered = Window(2), 0, 0
+    window, came, answered = FrameWindow(2), 0, 0
     under_way, heard = list[int](), list[int]()
     for act in acts:
         if act == "offer":
@@ -94,10 +94,10 @@ def test_every_frame_has_one_fate_and_every_sample_goes_once(acts: list[str]) ->
             came += 1
         elif under_way:
             at = 0 if act == "answer the oldest" else len(under_way) - 1
-            assert window.answered(under_way[at]) is not None
+            assert window.take_answered(under_way[at]) is not None
             del under_way[: at + 1]
             answered += 1
-        if (went := window.next(0)) is not None:
+        if (went := window.take_next(0)) is not None:
             under_way.append(went.index)
             heard += went.imu.stamps_ns.tolist()
         assert len(under_way) <= 2

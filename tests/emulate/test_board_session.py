@@ -7,26 +7,29 @@ from scipy.optimize import least_squares
 
 from share.geometry import se3
 from share.lab.calibrate.target import session_target
-from share.lab.emulate.motion.plan import plan
-from share.lab.emulate.recipe import Recipe
-from share.lab.emulate.render.context import missing
-from share.lab.emulate.sensor.effects import parse
+from share.lab.emulate.motion.motion_plan import plan_motions
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.render.context import missing_reason
+from share.lab.emulate.sensor.effects import parse_effects
 from share.lab.emulate.session import make_session
-from share.lab.emulate.world.scenes import layout
+from share.lab.emulate.world.scenes import make_scene_layout
 from share.runtime.source import open_source
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(missing() is not None, reason=f"cannot draw: {missing()}")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}"),
+]
 SCENE, MOTION, SECONDS, OFFSET_MS = "charuco-board", "board:", 6.0, 5.0
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    recipe = Recipe(
+    recipe = SessionRecipe(
         scene=SCENE,
         motions=(MOTION,),
         seconds=SECONDS,
         profiles={"": "d435i:640x480@15"},
-        effects=parse([f"time_offset_ms={OFFSET_MS}"]),
+        effects=parse_effects([f"time_offset_ms={OFFSET_MS}"]),
     )
     return make_session(recipe, tmp_path_factory.mktemp("board") / "session")
 
@@ -35,7 +38,7 @@ def test_extrinsics_and_time_offset_are_what_the_session_says(session):
     target, T_world_target = session_target(session)
     source = open_source(str(session / "board1"))
     rig = source.rig
-    path = plan([MOTION], layout(SCENE, 0), SECONDS, 0).agents[0].path
+    path = plan_motions([MOTION], make_scene_layout(SCENE, 0), SECONDS, 0).agents[0].path
     seen = {stream: detections(source, stream, target) for stream in ("cam0", "cam1")}
     true = {"cam0": rig.T_body_cam0, "cam1": rig.T_body_cam0 @ se3.inverse(rig.T_cam1_cam0)}
 

@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from share.cli.main import cli
-from share.lab.emulate.recipe import Recipe
-from share.lab.emulate.render.context import missing
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.render.context import missing_reason
 from share.lab.emulate.session import make_session
 
 pytestmark = pytest.mark.slow
@@ -40,11 +40,11 @@ def test_the_papers_experiments_fit_into_every_room(tools, scene, number, seed):
     assert row["people_m"] >= 0.6 and row["robot_m"] >= 0.5
 
 
-@pytest.mark.skipif(missing() is not None, reason=f"cannot draw: {missing()}")
+@pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}")
 @pytest.mark.parametrize("motion", ["euroc:euroc/V1_02_medium,start=12", "tumvi:tumvi/room1,start=5"])
 def test_a_real_gyro_turns_as_the_pictures_do(tools, motion, shared_data, tmp_path):
     kind, _, folder = motion.partition(":")
-    recipe = Recipe("warehouse", (f"a={kind}:{shared_data}/motion/{folder}",), seconds=5.0)
+    recipe = SessionRecipe("warehouse", (f"a={kind}:{shared_data}/motion/{folder}",), seconds=5.0)
     row = tools.emulation.of_session(str(make_session(recipe, tmp_path / "session") / "a"))
     assert row["fit_mm"] < 4.0
     assert row["fit_imu_turn_sigmas"] < 3.0 and row["fit_imu_velocity_sigmas"] < 3.0
@@ -55,11 +55,11 @@ def test_a_real_gyro_turns_as_the_pictures_do(tools, motion, shared_data, tmp_pa
     assert row["track_lost_s"] < 0.5 and row["track_ate_cm"] < 3.0
 
 
-@pytest.mark.skipif(missing() is not None, reason=f"cannot draw: {missing()}")
+@pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}")
 def test_a_fisheye_pair_is_tracked(tmp_path):
     """15 s of such walks gave 0.33 and 0.19 cm; 0.72 and 1.13 where a pixel at the edge counted as one in the
     middle."""
-    recipe = Recipe("warehouse", ("a=walk:",), seconds=6.0, seed=11, profiles={"": "tumvi"})
+    recipe = SessionRecipe("warehouse", ("a=walk:",), seconds=6.0, seed=11, profiles={"": "tumvi"})
     session = make_session(recipe, tmp_path / "session")
     done = CliRunner().invoke(cli, ["track", str(session / "a"), "--json"], catch_exceptions=False)
     told = json.loads(done.stdout)

@@ -9,12 +9,12 @@ from share.config import SequencerConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.lab.emulate import mover
-from share.lab.emulate.faults import FAULTS, apply
-from share.lab.emulate.panel import Panel, drawn, share_of_view
+from share.lab.emulate.faults import FAULTS, apply_fault
+from share.lab.emulate.moving_panel import Panel, draw_panel, share_of_view
 from share.recordings.images import ArrayImage
 from share.recordings.trajectory import Trajectory
 from share.sensors.measurement import CAM0, CAM1, IMU, Measurement
-from share.sensors.sequencer import SequencerCounters, sequence
+from share.sensors.sequencer import SequencerCounters, sequence_frames
 from share.types import Frame, ImuBatch
 
 RATE_HZ, SECONDS, IMU_HZ = 10, 20, 200
@@ -25,18 +25,18 @@ BASELINE = 0.05
 EAST = np.array(
     [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 )  # R_world_cam of who looks along x, upright
-UPRIGHT = se3.compose(EAST, np.zeros(3))
+UPRIGHT = se3.from_rt(EAST, np.zeros(3))
 RIG = Rig(
     CAMERA,
     UPRIGHT,  # the body's x is ahead, its z up
     cam1=CAMERA,
-    T_cam1_cam0=se3.compose(np.eye(3), np.array([-BASELINE, 0.0, 0.0])),
+    T_cam1_cam0=se3.from_rt(np.eye(3), np.array([-BASELINE, 0.0, 0.0])),
     depth=CAMERA,
     T_depth_cam0=np.eye(4),
     imu=ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, IMU_HZ),
 )
 IMU_FAULTS = {"imu_silent_1s", "imu_dead", "imu_never", "saturating"}
-CHANGES = sorted(name for name, fault in FAULTS.items() if fault.change)
+CHANGES = sorted(name for name, fault in FAULTS.items() if fault.change_frames)
 
 
 def seconds(frames):
@@ -60,11 +60,11 @@ def frames():
 def truth(frames):
     stamps = np.array([f.stamp_ns for f in frames])
     p = np.stack([0.1 * seconds(frames), 0 * stamps, 1.6 + 0 * stamps], axis=1)
-    return Trajectory(stamps, se3.compose(np.tile(np.eye(3), (len(p), 1, 1)), p))
+    return Trajectory(stamps, se3.from_rt(np.tile(np.eye(3), (len(p), 1, 1)), p))
 
 
 def done(name, frames, truth):
-    return apply(FAULTS[name], frames, RIG, truth)
+    return apply_fault(FAULTS[name], frames, RIG, truth)
 
 
 def images(frame):
@@ -132,7 +132,7 @@ def test_bad_stamps_go_through_the_sequencer(frames):
         for f in frames
         for stream, image in ((IMU, (0.0,) * 6), (CAM0, ArrayImage(f.image0)), (CAM1, ArrayImage(f.image1)))
     ]
-    arriving = FAULTS["stamps"].arriving(measurements)
+    arriving = FAULTS["stamps"].change_measurements(measurements)
     told = {name: [m.stamp_ns for m in arriving if m.stream == name] for name in (CAM0, CAM1, IMU)}
     assert told[CAM0] == told[CAM1]
     assert told[IMU] == [f.stamp_ns for f in frames]
@@ -141,7 +141,7 @@ def test_bad_stamps_go_through_the_sequencer(frames):
     assert all(1 <= wrong.sum() <= 12 for wrong in sorts)  # 2 % of 200 is 4
     assert sum(wrong.sum() for wrong in sorts) == (off != 0).sum()
     counters = SequencerCounters()
-    bundles = list(sequence(arriving, (CAM0, CAM1, IMU), RATE_HZ, SequencerConfig(), counters))
+    bundles = list(sequence_frames(arriving, (CAM0, CAM1, IMU), RATE_HZ, SequencerConfig(), counters))
     assert (np.diff([b.stamp_ns for b in bundles]) > 0).all()
     assert counters.duplicates > 0
     assert counters.backward > 0
@@ -245,7 +245,7 @@ def test_an_imu_at_its_end(frames, truth):
 
 def at(x, y, z):
     """T_cam_panel of one that faces the camera."""
-    return se3.compose(np.eye(3), np.array([x, y, z]))
+    return se3.from_rt(np.eye(3), np.array([x, y, z]))
 
 
 def extent(frame, clean):
@@ -256,8 +256,8 @@ def extent(frame, clean):
 
 def test_a_panel_is_where_both_cameras_would_see_it(frames):
     panel, clean = Panel(0.4, 0.4), frames[0]
-    (near,) = drawn([clean], RIG, panel, (RIG.T_body_cam0 @ at(0, 0, 1.0))[None])
-    (far,) = drawn([clean], RIG, panel, (RIG.T_body_cam0 @ at(0, 0, 2.0))[None])
+    (near,) = draw_panel([clean], RIG, panel, (RIG.T_body_cam0 @ at(0, 0, 1.0))[None])
+    (far,) = draw_panel([clean], RIG, panel, (RIG.T_body_cam0 @ at(0, 0, 2.0))[None])
     assert extent(near, clean) == pytest.approx(40, abs=1)
     assert extent(far, clean) == pytest.approx(20, abs=1)
     assert set(np.unique(near.depth)) == {1.0, 5.0}
@@ -275,15 +275,15 @@ def test_a_panel_is_where_both_cameras_would_see_it(frames):
 def test_a_panel_that_is_not_there_or_behind_is_not_drawn(frames):
     panel = Panel(0.4, 0.4)
     behind, nowhere = RIG.T_body_cam0 @ at(0, 0, -1.0), np.full((4, 4), np.nan)
-    after = drawn(frames[:2], RIG, panel, np.array([behind, nowhere]))
+    after = draw_panel(frames[:2], RIG, panel, np.array([behind, nowhere]))
     assert all((a.image0 == b.image0).all() for a, b in zip(frames, after, strict=False))
     assert after[1] is frames[1]
 
 
 def test_a_panel_seen_from_its_edge(frames):
     """Some ways run along it and never meet it."""
-    edge_on = se3.compose(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([0.005, -0.005, 1.0]))
-    (after,) = drawn(frames[:1], RIG, Panel(0.4, 0.4), (RIG.T_body_cam0 @ edge_on)[None])
+    edge_on = se3.from_rt(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([0.005, -0.005, 1.0]))
+    (after,) = draw_panel(frames[:1], RIG, Panel(0.4, 0.4), (RIG.T_body_cam0 @ edge_on)[None])
     assert (after.depth != frames[0].depth).mean() < 0.02
     assert share_of_view(CAMERA, Panel(0.4, 0.4), edge_on[None], 1)[0] < 0.02
 
@@ -297,7 +297,7 @@ def ride(frames, truth):
 def test_what_was_part_of_the_room_goes_off_slowly(ride):
     t, T_world_cam = ride
     panel = Panel(1.1, 1.4)
-    T = mover.starting(t, T_world_cam, CAMERA, panel, 5.0)
+    T = mover.path_starts(t, T_world_cam, CAMERA, panel, 5.0)
     gone = np.linalg.norm(T[:, :3, 3] - T[0, :3, 3], axis=1)
     begin = t[np.flatnonzero(gone > 0)[0] - 1]
     assert 0.3 <= begin / t[-1] <= 0.55
@@ -306,7 +306,7 @@ def test_what_was_part_of_the_room_goes_off_slowly(ride):
     seen = share_of_view(CAMERA, panel, se3.inverse(T_world_cam) @ T)
     assert seen[(t > begin - 3) & (t < begin + 5)].min() > 0.2
     assert np.linalg.norm(T[:, :3, 3] - T_world_cam[:, :3, 3], axis=1).min() > 0.4
-    stays = mover.starting(t, T_world_cam, CAMERA, panel, 5.0, speed=0.0)
+    stays = mover.path_starts(t, T_world_cam, CAMERA, panel, 5.0, speed=0.0)
     assert np.ptp(stays, axis=0).max() == 0
 
 
@@ -316,12 +316,12 @@ def test_no_place_for_a_panel(ride):
     ahead = T_world_cam.copy()
     ahead[:, 0, 3] = t
     with pytest.raises(ValueError, match="no place"):
-        mover.starting(t, ahead, CAMERA, Panel(1.1, 1.4), 5.0)
+        mover.path_starts(t, ahead, CAMERA, Panel(1.1, 1.4), 5.0)
 
 
 def test_what_comes_in_moves_by_itself_and_stays_before_the_camera(ride):
     t, T_world_cam = ride
-    T = mover.coming(t, T_world_cam, 5.0, 10.0)
+    T = mover.path_comes(t, T_world_cam, 5.0, 10.0)
     there = ~np.isnan(T[:, 0, 0])
     assert (there == ((t >= 5) & (t <= 15))).all()
     p = (se3.inverse(T_world_cam[there]) @ T[there])[:, :3, 3]
@@ -332,7 +332,7 @@ def test_what_comes_in_moves_by_itself_and_stays_before_the_camera(ride):
 
 def test_what_goes_along_is_fixed_in_the_view(ride):
     t, T_world_cam = ride
-    T = se3.inverse(T_world_cam) @ mover.along(t, T_world_cam, 5.0, 10.0)
+    T = se3.inverse(T_world_cam) @ mover.path_follows(t, T_world_cam, 5.0, 10.0)
     inside = (t > 6.6) & (t < 13.4)
     assert np.ptp(T[inside], axis=0).max() < 1e-9
     assert T[inside][0, :3, 3] == pytest.approx([-0.35, 0, 1.0])

@@ -16,15 +16,15 @@ from small_session import RATE_HZ, SIZE, files, small_profile, small_recipe, wri
 from share.errors import ShareError, UsageError
 from share.geometry import se3
 from share.lab.emulate import session as sessions
-from share.lab.emulate.preparation import prepare
-from share.lab.emulate.progress import silent
-from share.lab.emulate.session import cached_session, make_session
+from share.lab.emulate.preparation import prepare_session
+from share.lab.emulate.progress import no_progress
+from share.lab.emulate.session import make_cached_session, make_session
 from share.lab.emulate.types import START_NS
 from share.recordings.session import read_session
 from share.recordings.trajectory import read_tum
 from share.runtime.source import open_source
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
 from share.types import AgentKind
 
 SECONDS = 3.0
@@ -48,7 +48,7 @@ def whole(recipe, tmp_path_factory):
 
 
 def stage_of(recipe, tmp_path):
-    return prepare(recipe, tmp_path / "room", silent).stage
+    return prepare_session(recipe, tmp_path / "room", no_progress).stage
 
 
 # ------------------------------------------------------------------ what is in it
@@ -102,12 +102,12 @@ def test_truth_is_the_path_at_the_stamps_of_the_pictures(whole, recipe, tmp_path
         stamps, T = read_tum(whole / "truth" / f"{actor.name}.tum")
         np.testing.assert_array_equal(stamps, open_source(str(whole / actor.name)).stamps()[CAM0])
         exact = actor.path.poses(stamps)  # no offset: its clock is the path's
-        assert se3.angle(se3.inverse(exact) @ T).max() < TICK
+        assert se3.rotation_angle(se3.inverse(exact) @ T).max() < TICK
         assert np.abs(exact[:, :3, 3] - T[:, :3, 3]).max() < TICK
 
 
 def test_calibration_is_the_rig(whole, small):
-    made = profile(small)
+    made = load_profile(small)
     for name, depth in (("ann", False), ("robot1", True)):
         rig, stated = made.rig(depth=depth), read_session(whole).agents[name].calibration.rig
         assert (stated.cam0, stated.cam1, stated.depth, stated.imu) == (
@@ -126,7 +126,7 @@ def test_calibration_is_the_rig(whole, small):
 def test_provenance_tells_how_to_make_it_again(whole, recipe):
     told = read_session(whole).provenance
     assert told["generator"] == "share emulate"
-    assert {key: told[key] for key in recipe.plain()} == recipe.plain()
+    assert {key: told[key] for key in recipe.to_mapping()} == recipe.to_mapping()
     assert told["seed"] == 5
 
 
@@ -142,10 +142,12 @@ def test_one_worker_makes_the_same_bytes(whole, recipe, tmp_path):
 def test_another_seed_is_another_room_and_other_noise(whole, recipe, tmp_path):
     other = replace(recipe, seed=6)
     a, b = (stage_of(r, tmp_path).actors[0] for r in (recipe, other))
-    boxes = [prepare(r, tmp_path, silent).layout.pieces[0].bounds for r in (recipe, other)]
+    boxes = [prepare_session(r, tmp_path, no_progress).layout.pieces[0].bounding_box for r in (recipe, other)]
     assert not np.allclose(*boxes)
     assert not np.allclose(a.path.poses(a.pictures.true_ns[:5]), b.path.poses(b.pictures.true_ns[:5]))
-    assert np.abs(a.device.imu(a.path).gyro[:50] - b.device.imu(a.path).gyro[:50]).max() > 1e-4
+    assert (
+        np.abs(a.device.imu_streams(a.path).gyro[:50] - b.device.imu_streams(a.path).gyro[:50]).max() > 1e-4
+    )
     assert recipe.digest != other.digest
 
 
@@ -198,9 +200,9 @@ def test_a_folder_that_exists_is_not_touched(recipe, tmp_path):
 
 
 def test_two_at_a_time_are_told_apart(recipe, tmp_path):
-    from share.files.writing import claim
+    from share.files.writing import lock_folder
 
-    held = claim(tmp_path / ".session.partial")
+    held = lock_folder(tmp_path / ".session.partial")
     try:
         with pytest.raises(UsageError, match="another run is writing there"):
             make_session(recipe, tmp_path / "session")
@@ -223,8 +225,11 @@ def test_a_cached_session_is_made_once_and_not_from_work_for_another(small, tmp_
     left = tmp_path / f".{name}.partial" / "123456789abc" / "frames" / "ann"
     left.mkdir(parents=True)
     (left / "000000.chunk").write_bytes(b"of another recipe")
-    assert cached_session(recipe, tmp_path, workers=1) == tmp_path / name
-    assert cached_session(recipe, tmp_path, progress=lambda *_: pytest.fail("made again")) == tmp_path / name
+    assert make_cached_session(recipe, tmp_path, workers=1) == tmp_path / name
+    assert (
+        make_cached_session(recipe, tmp_path, progress=lambda *_: pytest.fail("made again"))
+        == tmp_path / name
+    )
     assert os.listdir(tmp_path) == [name]
 
 

@@ -9,12 +9,12 @@ from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
 from share.config import InertialConfig
 from share.geometry import se3
-from share.lab.emulate.sensor.vibration import turning, vibration
-from share.odometry import filter, measurement
-from share.odometry.depth_prior import guess
-from share.odometry.imu_buffer import Samples
-from share.odometry.imu_propagation import shaken
-from share.odometry.state import CORE, State, begin
+from share.lab.emulate.sensor.vibration import rotation_rates, vibration_acceleration
+from share.odometry import feature_matching, filter
+from share.odometry.depth_prior import prior_from_neighbours
+from share.odometry.imu_buffer import ImuBuffer
+from share.odometry.imu_propagation import noise_with_vibration
+from share.odometry.state import CORE_SIZE, FilterState, initial_state
 from share.types import ImuBatch
 
 FRAME_HZ = 20
@@ -54,7 +54,7 @@ class Run:
     stamps: np.ndarray
     nees: np.ndarray  # (N, 2): orientation, position, 3 dof each
     pose_errors: np.ndarray  # (N, 6) right
-    state: State
+    state: FilterState
     extrinsics: np.ndarray  # (N, 7) errors: turn, shift, offset
     surprise: np.ndarray  # (N,) mean squared Mahalanobis distance over degrees of freedom
 
@@ -65,7 +65,7 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
     t_imu, noise = np.arange(0, setup.seconds + 0.5, 1 / setup.imu_hz), replace(NOISE, rate_hz=setup.imu_hz)
     imu, bg, ba = imu_of(path, t_imu, rng.normal(0, setup.bg, 3), rng.normal(0, setup.ba, 3), rng, noise)
     imu = _shaken(imu, t_imu, seed, setup, rng)
-    samples = Samples()
+    samples = ImuBuffer()
     sigma = _sigmas(setup)
     world = _World(path, sensors, rng, setup)
     extrinsic = (
@@ -74,32 +74,34 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
     offset = setup.offset_error if setup.offset_error is not None else rng.normal(0, setup.offset)
     # The clock of the camera is behind by `offset`: a frame stamped t is taken at t + offset, IMU time.
     T0, v0 = path.poses(np.array([0.0]))[0], path.velocity(np.array([0.0]))[0]
-    first = rng.normal(0, 1, CORE) * sigma
-    state = begin(0, T0, v0, bg[0], ba[0], sensors.T_body_cam0, sigma)
+    first = rng.normal(0, 1, CORE_SIZE) * sigma
+    state = initial_state(0, T0, v0, bg[0], ba[0], sensors.T_body_cam0, sigma)
     first[15:] = 0
-    filter.move(state, -first)
+    filter.correct_means(state, -first)
     state.T_body_cam = sensors.T_body_cam0 @ se3.exp(extrinsic)
     log, next_id, keyframe_at = [], 0, -np.inf
     for k in range(1, int(setup.seconds * FRAME_HZ)):
         stamp = k / FRAME_HZ + setup.phase / setup.imu_hz
-        to_ns = round((stamp + state.offset_s) * 1e9)
+        to_ns = round((stamp + state.timeshift_s) * 1e9)
         near = slice(*np.searchsorted(imu.stamps_ns, (state.stamp_ns - 10**7, to_ns + 10**7)))
         part = imu.take(near)
-        samples.all = imu.take(slice(int(np.searchsorted(imu.stamps_ns, to_ns)) + 1))
-        rate = filter.propagate(state, part, to_ns, shaken(noise, samples.latest(to_ns)), GRAVITY)
+        samples.samples = imu.take(slice(int(np.searchsorted(imu.stamps_ns, to_ns)) + 1))
+        rate = filter.propagate(
+            state, part, to_ns, noise_with_vibration(noise, samples.latest(to_ns)), GRAVITY
+        )
         taken = stamp + offset
         level = world.see(state, taken, rate)
-        if len(state.ids) < 0.7 * setup.features or stamp - keyframe_at > 1.0:
+        if len(state.feature_ids) < 0.7 * setup.features or stamp - keyframe_at > 1.0:
             keyframe_at = stamp
             host = filter.add_keyframe(state, k, rate)
-            next_id = world.new(state, host, k, taken, setup.features - len(state.ids), next_id)
+            next_id = world.new(state, host, k, taken, setup.features - len(state.feature_ids), next_id)
             _forget_idle(state)
         true = path.poses(np.array([state.stamp_ns * 1e-9]))[0]
         error = se3.log(se3.inverse(state.T) @ true)
         cov = filter.pose_cov(state)
         nees = [error[a:b] @ np.linalg.solve(cov[a:b, a:b], error[a:b]) for a, b in ((0, 3), (3, 6))]
         calib = se3.log(se3.inverse(state.T_body_cam) @ sensors.T_body_cam0)
-        log.append((stamp, *nees, *error, *calib, state.offset_s - offset, level))
+        log.append((stamp, *nees, *error, *calib, state.timeshift_s - offset, level))
     out = np.array(log)
     return Run(out[:, 0], out[:, 1:3], out[:, 3:9], state, out[:, 9:16], out[:, 16])
 
@@ -109,12 +111,12 @@ def _shaken(imu: ImuBatch, t: np.ndarray, seed: int, setup: Setup, rng) -> ImuBa
     if setup.white:
         extra += rng.normal(0, setup.white, extra.shape)
     if setup.machine:
-        extra += vibration(t, setup.machine, (seed, 3))
-    return ImuBatch(imu.stamps_ns, imu.gyro + turning(extra), imu.accel + extra)
+        extra += vibration_acceleration(t, setup.machine, (seed, 3))
+    return ImuBatch(imu.stamps_ns, imu.gyro + rotation_rates(extra), imu.accel + extra)
 
 
 def _sigmas(setup: Setup) -> np.ndarray:
-    out = np.zeros(CORE)
+    out = np.zeros(CORE_SIZE)
     out[0:2], out[2] = setup.pose[0], 1e-4
     out[3:6] = setup.pose[1]
     out[6:9], out[9:12], out[12:15] = setup.velocity, setup.bg, setup.ba
@@ -122,10 +124,10 @@ def _sigmas(setup: Setup) -> np.ndarray:
     return out
 
 
-def _forget_idle(state: State) -> None:
-    busy = np.unique(state.host)
-    idle = np.setdiff1d(np.arange(len(state.keyframes)), busy)
-    filter.drop_keyframes(state, state.keyframes[idle])
+def _forget_idle(state: FilterState) -> None:
+    busy = np.unique(state.anchor)
+    idle = np.setdiff1d(np.arange(len(state.keyframe_ids)), busy)
+    filter.drop_keyframes(state, state.keyframe_ids[idle])
 
 
 class _World:
@@ -143,26 +145,26 @@ class _World:
 
     def see(self, state, taken, rate):
         """Update with all that are in view; the others are lost. Mean surprise a degree of freedom."""
-        if len(state.ids) == 0:
+        if len(state.feature_ids) == 0:
             return 1.0
-        points = np.array([self._points[i] for i in state.ids])
-        lasting = self._what_lasts(state.ids)
+        points = np.array([self._points[i] for i in state.feature_ids])
+        lasting = self._what_lasts(state.feature_ids)
         seen = []
         for T_right_left in self._eyes:
             T = se3.inverse(self._camera(taken))
             T = T if T_right_left is None else T_right_left @ T
             px = CAMERA.project(se3.transform(T, points))
             px += self._rng.normal(0, self._sigma_px, px.shape) + lasting
-            seen.append(np.where(CAMERA.inside(np.nan_to_num(px, nan=-1e9))[:, None], px, np.nan))
+            seen.append(np.where(CAMERA.is_inside(np.nan_to_num(px, nan=-1e9))[:, None], px, np.nan))
         inside = ~np.isnan([px[:, 0] for px in seen]).any(axis=0)
         which = np.flatnonzero(inside)
         sigma = np.full(len(which), self._sigma_px / CAMERA.focal)
         lasts = np.full(len(which), LASTING_PX / CAMERA.focal)
         first, *others = (
-            filter.sight(
+            filter.feature_measurements(
                 state,
                 which,
-                measurement.predict(state, which, T),
+                feature_matching.predict(state, which, T),
                 CAMERA.normalise(px[which]),
                 sigma,
                 lasts,
@@ -170,11 +172,13 @@ class _World:
             )
             for px, T in zip(seen, self._eyes, strict=True)
         )
-        rows = first.join(*others)
-        rows = rows.take(np.argsort(rows.host, kind="stable"))
+        rows = first.concatenate(*others)
+        rows = rows.take(np.argsort(rows.anchor, kind="stable"))
         level = 1.0
         if len(which):
-            level = filter.update(state, rows, *filter.gains(state, rows)) / (2 * len(rows.which))
+            level = filter.update(state, rows, *filter.innovation_covariance(state, rows)) / (
+                2 * len(rows.feature)
+            )
         filter.keep_features(state, inside)
         self._px = seen[0][inside].astype(np.float32)
         return level
@@ -197,8 +201,10 @@ class _World:
             self._points[next_id + i] = p
         ids = np.arange(next_id, next_id + count)
         if self._mono:
-            g = guess(state, px.astype(np.float32), self._px)
-            filter.add_features(state, ids, np.full(count, host), uv, g.rho, g.sigma, g.like, g.common)
+            g = prior_from_neighbours(state, px.astype(np.float32), self._px)
+            filter.add_features(
+                state, ids, np.full(count, host), uv, g.rho, g.sigma, g.J_existing, g.common_sigma
+            )
             return next_id + count
         sigma = self._sigma_px / CAMERA.fx / self._rig.baseline
         rho = np.maximum(1 / z + self._rng.normal(0, sigma, count), 0.02)

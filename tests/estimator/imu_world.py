@@ -17,7 +17,7 @@ _H = 1e-3  # s, of differences
 def rig(baseline=0.05):
     T_body_cam = se3.exp(np.array([0.02, -0.03, 0.01, 0.01, -0.02, 0.03]))
     T_body_cam[:3, :3] = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]) @ T_body_cam[:3, :3]
-    T_right_left = se3.compose(np.eye(3), np.array([-baseline, 0, 0]))
+    T_right_left = se3.from_rt(np.eye(3), np.array([-baseline, 0, 0]))
     return Rig(CAMERA, T_body_cam, CAMERA, T_right_left, imu=NOISE)
 
 
@@ -37,7 +37,7 @@ class Path:
         t = np.asarray(t, np.float64)[..., None, None]
         p = (self._a * np.sin(self._w * t + self._f)).sum(axis=-2)
         phi = (self._b * np.sin(self._u * t + self._g)).sum(axis=-2)
-        return se3.compose(se3.so3_exp(phi), p)
+        return se3.from_rt(se3.so3_exp(phi), p)
 
     def velocity(self, t):
         return (self.poses(t + _H)[..., :3, 3] - self.poses(t - _H)[..., :3, 3]) / (2 * _H)

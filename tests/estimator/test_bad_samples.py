@@ -10,8 +10,8 @@ import rig_fuzzer
 from plain_walk import RIG
 
 from share.config import Config
-from share.odometry.result import TrackResult
-from share.odometry.tracker import InertialTracker
+from share.odometry.inertial_tracker import InertialTracker
+from share.odometry.track_result import TrackResult
 from share.types import Frame, ImuBatch, TrackState
 
 AT = 5  # the frame that they come in
@@ -31,9 +31,9 @@ def tracked(frames: tuple[Frame, ...]) -> tuple[list[TrackResult], InertialTrack
     tracker, results = InertialTracker(RIG, Config().inertial, Config().tracker), []
     for frame in frames:
         results.append(tracker.track(frame))
-        if results[-1].keyframe:
-            tracker.keyframe(frame)
-            tracker.settle()
+        if results[-1].keyframe_ready:
+            tracker.make_keyframe(frame)
+            tracker.finish_keyframe()
     return results, tracker
 
 
@@ -72,7 +72,7 @@ def test_a_run_of_wrong_samples_moves_no_pose_and_is_said(
     walk: tuple[Frame, ...], clean: list[TrackResult], first: int, count: int, axis: int, by: float
 ) -> None:
     results, tracker = tracked(spoiled(walk, first, count, axis, by))
-    assert tracker.doubted == count
+    assert tracker.rejected_imu_samples == count
     assert max(apart_m(results, clean)) < 0.02
     assert results[AT].state is TrackState.VISION_ONLY
     assert results[-1].state is TrackState.OK
@@ -85,7 +85,7 @@ def test_a_wrong_sample_after_the_image_is_held_against_the_next_frame_only(
     last = len(walk[AT].imu) - 1
     assert walk[AT].imu.stamps_ns[last] > walk[AT].stamp_ns
     results, tracker = tracked(spoiled(walk, last, 1, 3, 80.0))
-    assert tracker.doubted == 1
+    assert tracker.rejected_imu_samples == 1
     doubted = [result.state is TrackState.VISION_ONLY for result in results]
     assert doubted == [k == AT + 1 for k in range(len(walk))]
     assert max(apart_m(results, clean)) < 0.02
@@ -107,10 +107,10 @@ def test_a_wrong_sample_after_a_gap_moves_no_pose(
     frames = with_gap(walk)
     first = len(frames[AT].imu) - 4
     cut = replace(frames[AT], imu=frames[AT].imu.take(slice(0, first + 1 + after)))
-    later = frames[AT].imu.take(slice(first + 1 + after, None)).join(frames[AT + 1].imu)
+    later = frames[AT].imu.take(slice(first + 1 + after, None)).concatenate(frames[AT + 1].imu)
     frames = (*frames[:AT], cut, replace(frames[AT + 1], imu=later), *frames[AT + 2 :])
     results, tracker = tracked(spoiled(frames, first, 1, axis, by))
-    assert tracker.doubted == 1
+    assert tracker.rejected_imu_samples == 1
     assert max(apart_m(results, clean)) < 0.02
     assert results[-1].state is TrackState.OK
 
@@ -122,7 +122,7 @@ def test_nor_does_the_first_of_all(walk: tuple[Frame, ...], axis: int, by: float
     first = replace(walk[0], imu=ImuBatch(walk[0].imu.stamps_ns, values[:, :3], values[:, 3:]))
     without = replace(walk[0], imu=walk[0].imu.take(slice(1, None)))
     results, tracker = tracked((first, *walk[1:]))
-    assert tracker.doubted == 1
+    assert tracker.rejected_imu_samples == 1
     assert apart_m(results, tracked((without, *walk[1:]))[0]) == [0.0] * len(walk)
 
 
@@ -131,7 +131,7 @@ def test_what_is_too_small_for_that_is_outvoted_by_the_images(
     walk: tuple[Frame, ...], clean: list[TrackResult], axis: int, by: float
 ) -> None:
     results, tracker = tracked(spoiled(walk, 3, 10, axis, by))
-    assert tracker.doubted == 0
+    assert tracker.rejected_imu_samples == 0
     assert max(apart_m(results, clean)) < 0.02
 
 
@@ -149,4 +149,4 @@ def test_in_the_dark_nobody_is_told_a_pose_that_rests_on_them(walk: tuple[Frame,
 
 def test_of_the_walk_itself_nothing_is_doubted(walk: tuple[Frame, ...], clean: list[TrackResult]) -> None:
     assert {result.state for result in clean} == {TrackState.OK}
-    assert tracked(walk)[1].doubted == 0
+    assert tracked(walk)[1].rejected_imu_samples == 0

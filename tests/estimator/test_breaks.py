@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.odometry.imu_buffer import Samples
-from share.odometry.imu_outliers import Breaks
+from share.odometry.imu_buffer import ImuBuffer
+from share.odometry.imu_outliers import ImuOutlierDetector
 from share.types import ImuBatch
 
 STEP = 5_000_000
@@ -31,12 +31,12 @@ def batch(values: np.ndarray, first: int = 0, step: int = STEP) -> ImuBatch:
 
 def doubted(values: np.ndarray, each: int = 10, step: int = STEP) -> list[int]:
     """Numbers of the samples that are left out, in frames of so many."""
-    breaks, kept = Breaks(), []
+    breaks, kept = ImuOutlierDetector(), []
     for k in range(0, len(values), each):
         part = values[k : k + each]
-        good = breaks.believed((k + np.arange(len(part))) * step, part)
+        good = breaks.accepted_mask((k + np.arange(len(part))) * step, part)
         kept += [k + n for n in range(len(part)) if good is None or good[n]]
-    assert breaks.count == len(values) - len(kept)
+    assert breaks.rejected_count == len(values) - len(kept)
     return sorted(set(range(len(values))) - set(kept))
 
 
@@ -87,47 +87,47 @@ def test_what_lasts_is_how_things_are() -> None:
 
 
 def test_after_a_gap_nothing_is_held_against_what_was_before() -> None:
-    breaks, values = Breaks(), walking()
+    breaks, values = ImuOutlierDetector(), walking()
     values[200:, 0] += 9.0
-    assert breaks.believed(np.arange(200) * STEP, values[:200]) is None
-    assert breaks.believed(np.arange(400, 600) * STEP, values[200:]) is None
+    assert breaks.accepted_mask(np.arange(200) * STEP, values[:200]) is None
+    assert breaks.accepted_mask(np.arange(400, 600) * STEP, values[200:]) is None
 
 
 def test_what_is_doubted_is_known_for_the_frame_that_it_is_in() -> None:
-    samples, values = Samples(), walking()
+    samples, values = ImuBuffer(), walking()
     values[104:108, 3] += 50.0
     samples.add(batch(values[:100]))
-    assert samples.doubt(0, 100 * STEP) is None
+    assert samples.inflation(0, 100 * STEP) is None
     samples.add(batch(values[100:110], 100))
-    told = samples.doubt(100 * STEP, 110 * STEP)
-    assert told is not None and samples.doubted == 4
-    assert told.axes.tolist() == [False] * 3 + [True, False, False]
-    assert told.turn == 0.0 and told.speed == pytest.approx(4 * 50 * 0.005, abs=0.2)
-    assert samples.doubt(108 * STEP, 118 * STEP) is None
-    assert not set(range(104, 108)) & set((samples.all.stamps_ns // STEP).tolist())
+    told = samples.inflation(100 * STEP, 110 * STEP)
+    assert told is not None and samples.rejected_count == 4
+    assert told.rejected_axes.tolist() == [False] * 3 + [True, False, False]
+    assert told.turn_rad == 0.0 and told.speed_m_s == pytest.approx(4 * 50 * 0.005, abs=0.2)
+    assert samples.inflation(108 * STEP, 118 * STEP) is None
+    assert not set(range(104, 108)) & set((samples.samples.stamps_ns // STEP).tolist())
 
 
 def test_what_is_doubted_is_of_one_frame_only() -> None:
-    samples, values = Samples(), walking()
+    samples, values = ImuBuffer(), walking()
     values[110, 3] += 50.0  # the sample after the image's time that came with it
     samples.add(batch(values[:111]))
     at = 110 * STEP - 1_500_000
-    assert samples.doubt(100 * STEP, at) is None
-    assert samples.doubt(100 * STEP, 110 * STEP) is None
+    assert samples.inflation(100 * STEP, at) is None
+    assert samples.inflation(100 * STEP, 110 * STEP) is None
     samples.add(batch(values[111:121], 111))
-    told = samples.doubt(at, at + 10 * STEP)
-    assert told is not None and told.axes[3]
-    assert samples.doubt(110 * STEP, 120 * STEP) is not None
+    told = samples.inflation(at, at + 10 * STEP)
+    assert told is not None and told.rejected_axes[3]
+    assert samples.inflation(110 * STEP, 120 * STEP) is not None
 
 
 def test_looking_ahead_changes_nothing() -> None:
-    samples, values = Samples(), walking()
+    samples, values = ImuBuffer(), walking()
     values[100:104, 0] += 20.0
     samples.add(batch(values[:98]))
-    ahead = samples.with_more(batch(values[98:110], 98))
-    assert (ahead.doubted, samples.doubted) == (4, 0)
+    ahead = samples.extended(batch(values[98:110], 98))
+    assert (ahead.rejected_count, samples.rejected_count) == (4, 0)
     samples.add(batch(values[98:110], 98))
-    assert samples.doubted == 4
+    assert samples.rejected_count == 4
 
 
 # ---------------------------------------------------------------- beginnings: the first, and after a gap
@@ -135,22 +135,24 @@ def test_looking_ahead_changes_nothing() -> None:
 GAP = 30_000_000
 
 
-def begun(values: np.ndarray, cuts: list[int], gap_at: int | None) -> tuple[list[int], Breaks, Samples]:
+def begun(
+    values: np.ndarray, cuts: list[int], gap_at: int | None
+) -> tuple[list[int], ImuOutlierDetector, ImuBuffer]:
     """Numbers of the samples that are not believed in the end; frames end before the numbers `cuts`. A gap
     before number `gap_at`."""
     stamps = np.arange(len(values)) * STEP
     if gap_at is not None:
         stamps[gap_at:] += GAP
-    breaks, samples, good = Breaks(), Samples(), dict.fromkeys(range(len(values)), True)
+    breaks, samples, good = ImuOutlierDetector(), ImuBuffer(), dict.fromkeys(range(len(values)), True)
     for first, past in zip([0, *cuts], [*cuts, len(values)], strict=True):
         part = slice(first, past)
-        said = breaks.believed(stamps[part], values[part])
+        said = breaks.accepted_mask(stamps[part], values[part])
         good |= {} if said is None else dict(zip(range(first, past), said.tolist(), strict=True))
-        good |= dict.fromkeys(np.searchsorted(stamps, breaks.taken_back).tolist(), False)
+        good |= dict.fromkeys(np.searchsorted(stamps, breaks.retracted_ns).tolist(), False)
         samples.add(ImuBatch(stamps[part], values[part, :3], values[part, 3:]))
     out = [k for k, is_good in good.items() if not is_good]
-    assert samples.doubted == breaks.count == len(out)
-    assert set(samples.all.stamps_ns.tolist()) == set(np.delete(stamps, out).tolist())
+    assert samples.rejected_count == breaks.rejected_count == len(out)
+    assert set(samples.samples.stamps_ns.tolist()) == set(np.delete(stamps, out).tolist())
     return out, breaks, samples
 
 
@@ -185,12 +187,12 @@ def test_what_the_next_frame_outvotes_is_taken_back(gap_at: int | None, count: i
     out, breaks, samples = begun(values, [past, past + 13], gap_at)
     assert out == list(range(first, past))
     from_ns = past * STEP + (GAP if gap_at else 0)
-    told = breaks.doubt(from_ns, from_ns + STEP)  # whoever has heard it is unsure from now on
-    assert told is not None and not told.axes.any()
+    told = breaks.inflation(from_ns, from_ns + STEP)  # whoever has heard it is unsure from now on
+    assert told is not None and not told.rejected_axes.any()
     off = np.array([by / 4, by]) * (count * STEP + (GAP if gap_at else 0)) * 1e-9
-    assert told.turn == pytest.approx(min(off[0], 0.3), rel=0.2)
-    assert told.speed == pytest.approx(min(off[1], 3.0), rel=0.2)
-    assert samples._most.max() < 20  # nor is it the end of a scale
+    assert told.turn_rad == pytest.approx(min(off[0], 0.3), rel=0.2)
+    assert told.speed_m_s == pytest.approx(min(off[1], 3.0), rel=0.2)
+    assert samples._max_abs.max() < 20  # nor is it the end of a scale
 
 
 @pytest.mark.parametrize(("count", "by"), [(1, 5.0), (1, 30.0), (8, 10.0)])
@@ -199,9 +201,9 @@ def test_those_that_alone_came_after_a_gap_are_held_against_what_was_before(coun
     assert begun(values, [100, 100 + count], 100)[0] == []
     values[100 : 100 + count, 2] += by
     out, breaks, _ = begun(values, [100, 100 + count], 100)
-    assert out == list(range(100, 100 + count)) and breaks.taken_back == []
-    told = breaks.doubt(100 * STEP + GAP, (100 + count) * STEP + GAP)
-    assert told is not None and told.axes.tolist() == [False, False, True, False, False, False]
+    assert out == list(range(100, 100 + count)) and breaks.retracted_ns == []
+    told = breaks.inflation(100 * STEP + GAP, (100 + count) * STEP + GAP)
+    assert told is not None and told.rejected_axes.tolist() == [False, False, True, False, False, False]
 
 
 def test_where_they_may_be_right_the_filter_is_unsure_of_the_gap() -> None:
@@ -209,9 +211,9 @@ def test_where_they_may_be_right_the_filter_is_unsure_of_the_gap() -> None:
     values[100:, 2] += 4.0
     out, breaks, _ = begun(values, [100], 100)
     assert out == []
-    told = breaks.doubt(99 * STEP, 99 * STEP + GAP)
-    assert told is not None and not told.axes.any()
-    assert told.turn == pytest.approx(4.0 * (GAP + STEP) * 1e-9, rel=0.2)
+    told = breaks.inflation(99 * STEP, 99 * STEP + GAP)
+    assert told is not None and not told.rejected_axes.any()
+    assert told.turn_rad == pytest.approx(4.0 * (GAP + STEP) * 1e-9, rel=0.2)
 
 
 def test_an_imu_slower_than_that_is_believed() -> None:
@@ -228,13 +230,13 @@ def test_of_a_beginning_under_vibration_nothing_is_left_out(gap_at: int | None) 
 
 
 def test_looking_ahead_does_not_take_back() -> None:
-    samples, values = Samples(), walking(60)
+    samples, values = ImuBuffer(), walking(60)
     values[0, 3] += 80.0
     samples.add(batch(values[:1]))
-    assert samples.with_more(batch(values[1:10], 1)).doubted == 1
-    assert (samples.doubted, len(samples.all)) == (0, 1)
+    assert samples.extended(batch(values[1:10], 1)).rejected_count == 1
+    assert (samples.rejected_count, len(samples.samples)) == (0, 1)
     samples.add(batch(values[1:10], 1))
-    assert (samples.doubted, samples.all.stamps_ns[0]) == (1, STEP)
+    assert (samples.rejected_count, samples.samples.stamps_ns[0]) == (1, STEP)
 
 
 def test_time_is_linear_in_the_samples_of_a_frame() -> None:
@@ -242,12 +244,12 @@ def test_time_is_linear_in_the_samples_of_a_frame() -> None:
     for count in (2_000, 16_000):
         wild = rng.normal(size=(count, 6)) * np.repeat([30.0, 150.0], 3)
         stamps = np.sort(rng.choice(66_000_000, count, replace=False)) + 10**9
-        breaks = Breaks()
-        breaks.believed(stamps[0] + np.arange(-20, 0) * STEP, np.zeros((20, 6)))
+        breaks = ImuOutlierDetector()
+        breaks.accepted_mask(stamps[0] + np.arange(-20, 0) * STEP, np.zeros((20, 6)))
         began = time.process_time()
-        breaks.believed(stamps, wild)
+        breaks.accepted_mask(stamps, wild)
         spent.append(time.process_time() - began)
-        assert breaks.doubt(0, 2**62) is not None
+        assert breaks.inflation(0, 2**62) is not None
     assert spent[1] < 24 * spent[0]  # 8 times as many; it would be 64
 
 
@@ -259,10 +261,10 @@ RECORDED = sorted(MOTION.glob("*/*/imu0.csv"))
 def test_of_what_was_recorded_nothing_is(path: Path) -> None:
     table = np.loadtxt(path, delimiter=",")
     stamps, values = table[:, 0].astype(np.int64), table[:, 1:7]
-    breaks = Breaks()
+    breaks = ImuOutlierDetector()
     for k in range(0, len(values), 10):
-        breaks.believed(stamps[k : k + 10], values[k : k + 10])
-    assert breaks.count == 0
+        breaks.accepted_mask(stamps[k : k + 10], values[k : k + 10])
+    assert breaks.rejected_count == 0
 
 
 @pytest.mark.skipif(not RECORDED, reason="the recorded motions are not here")
@@ -271,11 +273,11 @@ def test_of_what_was_recorded_nothing_is_wherever_it_begins_or_has_gaps(path: Pa
     table = np.loadtxt(path, delimiter=",")
     stamps, values, rng = table[:, 0].astype(np.int64), table[:, 1:7], np.random.default_rng(7)
     for first in rng.integers(len(stamps) - 100, size=40).tolist():
-        breaks, lost = Breaks(), np.zeros(100, np.bool_)
+        breaks, lost = ImuOutlierDetector(), np.zeros(100, np.bool_)
         gap = int(rng.integers(5, 12))
         lost[40 : 40 + gap] = True
         at, of = stamps[first : first + 100][~lost], values[first : first + 100][~lost]
         cuts = [0, *range(int(rng.integers(1, 14)), len(at), 13), len(at)]
         for k, past in pairwise(cuts):
-            breaks.believed(at[k:past], of[k:past])
-        assert breaks.count == 0
+            breaks.accepted_mask(at[k:past], of[k:past])
+        assert breaks.rejected_count == 0

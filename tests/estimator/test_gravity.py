@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from share.odometry.initialisation import AtRest
+from share.odometry.initialisation import GravityEstimator
 from share.types import ImuBatch
 
 UP = np.array([0.6, 0.0, 0.8])
@@ -13,14 +13,14 @@ def batch(accel, gyro=(0.0, 0.0, 0.0), n=10):
 
 
 def test_at_rest_up_is_known_from_twenty_samples():
-    rest = AtRest()
+    rest = GravityEstimator()
     assert rest.add(batch(9.8 * UP)) is None
     assert rest.add(batch(9.8 * UP)) == pytest.approx(UP)
 
 
 def test_the_zero_of_a_cheap_accelerometer_is_no_motion():
     """70 mg, the most that the data sheet of a D435i's BMI055 allows."""
-    assert AtRest().add(batch((9.807 + 0.07 * 9.807) * UP, n=20)) == pytest.approx(UP)
+    assert GravityEstimator().add(batch((9.807 + 0.07 * 9.807) * UP, n=20)) == pytest.approx(UP)
 
 
 @pytest.mark.parametrize(
@@ -32,20 +32,20 @@ def test_the_zero_of_a_cheap_accelerometer_is_no_motion():
     ],
 )
 def test_in_motion_up_is_not_claimed_but_guessed(imu):
-    moving = AtRest(patience=3)
+    moving = GravityEstimator(max_frames=3)
     assert [moving.add(imu) for _ in range(3)] == [None] * 3
-    assert moving.gave_up
-    assert moving.guess() == pytest.approx(UP, abs=0.05)
+    assert moving.has_timed_out
+    assert moving.mean_direction() == pytest.approx(UP, abs=0.05)
 
 
 def test_rest_after_motion_is_noticed():
-    rest = AtRest()
+    rest = GravityEstimator()
     assert rest.add(batch(9.8 * UP, gyro=(0, 2.0, 0), n=60)) is None
     assert rest.add(batch(9.8 * UP, n=60)) == pytest.approx(UP)
 
 
 def test_a_silent_imu_has_no_guess():
-    silent = AtRest(patience=1)
+    silent = GravityEstimator(max_frames=1)
     assert silent.add(ImuBatch.empty()) is None
-    assert silent.gave_up
-    assert silent.guess() is None
+    assert silent.has_timed_out
+    assert silent.mean_direction() is None

@@ -10,13 +10,13 @@ from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
 from share.metrics.ate import ate
-from share.odometry.tracker import InertialTracker
+from share.odometry.inertial_tracker import InertialTracker
 from share.recordings.trajectory import Trajectory
-from share.runtime.pipeline import frames_of
+from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.measurement import IMU
 from share.sensors.sequencer import SequencerCounters
-from share.types import ImuBatch, TrackState, Wait
+from share.types import ImuBatch, TrackState, WaitReason
 
 OK, BLIND, DEAF, LOST = TrackState.OK, TrackState.INERTIAL_ONLY, TrackState.VISION_ONLY, TrackState.LOST
 STARTING = TrackState.INITIALISING
@@ -26,7 +26,7 @@ STARTING = TrackState.INITIALISING
 def walk(plain_session):
     """Frames, the rig, the truth."""
     source = open_source(f"{plain_session}/ar1")
-    return list(frames_of(source, Config(), SequencerCounters())), source.rig, source.truth()
+    return list(read_frames(source, Config(), SequencerCounters())), source.rig, source.truth()
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +43,8 @@ def run(walk, frames, config=None):
     )
     for frame in frames:
         results.append(tracker.track(frame))
-        if results[-1].keyframe:
-            candidates.append(tracker.keyframe(frame))
+        if results[-1].keyframe_ready:
+            candidates.append(tracker.make_keyframe(frame))
     return results, candidates, tracker
 
 
@@ -79,8 +79,8 @@ def test_to_the_centimetre_and_every_frame(walk, tracked):
     assert set(states(results)[:3]) <= {STARTING, OK}
     assert states(results)[3:] == [OK] * (len(frames) - 3)
     assert error_m(walk, frames, results) < 0.01
-    assert candidates[0].new_stretch
-    assert not any(c.new_stretch for c in candidates[1:])
+    assert candidates[0].new_segment
+    assert not any(c.new_segment for c in candidates[1:])
     for r in results[3:]:
         assert np.linalg.eigvalsh(r.cov)[0] > 0
 
@@ -100,17 +100,17 @@ def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
     frames, rig, truth = walk
     tracker, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), []
     for k, frame in enumerate(frames):
-        if tracker.track(frame).keyframe:
-            candidate = tracker.keyframe(frame)
+        if tracker.track(frame).keyframe_ready:
+            candidate = tracker.make_keyframe(frame)
             shown.append((frames[k - candidate.frames_ago].stamp_ns, candidate))
     stamps = np.array([stamp for stamp, _ in shown])
     _, true = interpolate(truth.stamps_ns, truth.T, stamps)
     true = se3.inverse(true[:-1]) @ true[1:]
     told = np.array([c.T_odom_body for _, c in shown])
     told = se3.inverse(told[:-1]) @ told[1:]
-    steps = np.array([c.T_last_body for _, c in shown[1:]])
+    steps = np.array([c.T_previous_body for _, c in shown[1:]])
     sigma = np.sqrt([np.trace(c.cov[:3, :3]) for _, c in shown[1:]])
-    off, before = (se3.angle(se3.inverse(T) @ true) for T in (steps, told))
+    off, before = (se3.rotation_angle(se3.inverse(T) @ true) for T in (steps, told))
     assert before.max() > 10 * sigma.max()
     assert (off < 4 * sigma).all()
     assert np.sqrt((off**2).mean()) < 0.2 * np.sqrt((before**2).mean())
@@ -118,22 +118,22 @@ def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
 
 def test_a_keyframe_brings_two_slices_of_work_a_frame_and_nothing_depends_on_when(walk, tracked):
     """Others are told of it one frame after its own; its features come with the second slice, or with the
-    third where it is shown. Whether anybody calls `settle`, or the next frame does it."""
+    third where it is shown. Whether anybody calls `finish_keyframe`, or the next frame does it."""
     frames, rig, _ = walk
     tracker, poses, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], {}
     begun, hosts = {}, []  # when each keyframe came; which have features after each frame
     for k, frame in enumerate(frames):
         result = tracker.track(frame)
         poses.append(result.T_odom_body)
-        if result.keyframe:
-            candidate = tracker.keyframe(frame)
+        if result.keyframe_ready:
+            candidate = tracker.make_keyframe(frame)
             assert candidate.frames_ago == (1 if shown else 0)
             shown[k - candidate.frames_ago] = candidate
-        for keyframe in tracker.state.keyframes.tolist():
+        for keyframe in tracker.state.keyframe_ids.tolist():
             begun.setdefault(keyframe, k)
-        tracker.settle()
-        tracker.settle()  # once a frame is enough
-        hosts.append(set(tracker.state.keyframes[tracker.state.host].tolist()))
+        tracker.finish_keyframe()
+        tracker.finish_keyframe()  # once a frame is enough
+        hosts.append(set(tracker.state.keyframe_ids[tracker.state.anchor].tolist()))
     later = {keyframe: k for keyframe, k in begun.items() if 0 < k < len(frames) - 3}
     for keyframe, k in later.items():
         assert [keyframe in at for at in hosts[k : k + 3]] == [False, k not in shown, True]
@@ -152,7 +152,7 @@ def test_where_frames_are_rare_others_are_told_with_the_next(walk, every):
     frames, rig, _ = walk
     rare, samples = [], ImuBatch.empty()
     for k, frame in enumerate(frames):
-        samples = samples.join(frame.imu)
+        samples = samples.concatenate(frame.imu)
         if k % every == 0:
             rare.append(dataclasses.replace(frame, index=len(rare), imu=samples))
             samples = ImuBatch.empty()
@@ -164,7 +164,7 @@ class Late:
     """A source whose IMU has a clock of its own, as its calibration says."""
 
     def __init__(self, source, shift_s):
-        self.imu_range, self.tells_silence = source.imu_range, source.tells_silence
+        self.imu_range, self.reports_silence = source.imu_range, source.reports_silence
         self.rig, self.rate_hz = dataclasses.replace(source.rig, timeshift_s=shift_s), source.rate_hz
         self._source = source
 
@@ -181,10 +181,10 @@ class Late:
 def test_a_timeshift_that_the_calibration_tells_costs_nothing(walk, tracked, plain_session, shift_s):
     """Poses are of when the IMU's clock shows the stamp, so the truth is shifted too."""
     source = Late(open_source(f"{plain_session}/ar1"), shift_s)
-    frames = list(frames_of(source, Config(), SequencerCounters()))
+    frames = list(read_frames(source, Config(), SequencerCounters()))
     truth = Trajectory(walk[2].stamps_ns + source.rig.timeshift_ns, walk[2].T)
     results, _, tracker = run((None, source.rig, truth), frames)
-    assert tracker.state.offset_s == pytest.approx(shift_s, abs=1e-3)
+    assert tracker.state.timeshift_s == pytest.approx(shift_s, abs=1e-3)
     assert states(results)[3:] == [OK] * (len(frames) - 3)
     clean = error_m(walk, walk[0], tracked[0])
     assert error_m((None, None, truth), frames, results) < clean + 0.001
@@ -230,7 +230,7 @@ def test_an_imu_that_was_never_there(walk):
     frames = some(walk[0], mute, 0, 99)
     results, candidates, _ = run(walk, frames)
     assert states(results)[:9] == [STARTING] * 9
-    assert {r.waits for r in results[:9]} == {Wait.IMU}
+    assert {r.waiting_for for r in results[:9]} == {WaitReason.IMU}
     assert states(results)[10:] == [DEAF] * 35
     assert error_m(walk, frames, results) < 0.04
     assert all((c.up == 0).all() for c in candidates)
@@ -242,13 +242,13 @@ def test_lost_without_imu_and_sight_and_found_again(walk):
     assert set(states(results)[9:18]) == {LOST}
     assert all(r.T_odom_body is None for r in results if r.state is LOST)
     assert all(r.state.has_pose for r in results[20:26])
-    assert not any(c.new_stretch for c in candidates[1:])
+    assert not any(c.new_segment for c in candidates[1:])
 
 
 def test_dropped_frames(walk):
     kept, waiting = [], ImuBatch.empty()
     for k, frame in enumerate(walk[0]):
-        waiting = waiting.join(frame.imu)
+        waiting = waiting.concatenate(frame.imu)
         if k <= 5 or k % 4:
             kept.append(dataclasses.replace(frame, imu=waiting))
             waiting = ImuBatch.empty()
@@ -260,16 +260,16 @@ def test_waits_for_something_to_see(walk):
     frames = some(walk[0][:15], dark, 0, 6)
     results, _, _ = run(walk, frames)
     assert states(results)[:6] == [STARTING] * 6
-    assert {r.waits for r in results[1:6]} == {Wait.VIEW}
+    assert {r.waiting_for for r in results[1:6]} == {WaitReason.VIEW}
     assert results[-1].state is OK
-    assert results[-1].waits is None
+    assert results[-1].waiting_for is None
 
 
 def test_memory_is_bounded(walk):
     config = InertialConfig(max_keyframes=4, keyframe_m=0.02, keyframe_rad=0.02)
     results, _, tracker = run(walk, walk[0], config)
-    assert tracker.state.keyframes[-1] >= 6
-    assert len(tracker.state.keyframes) <= 4 + 1  # one whose features are still to come
+    assert tracker.state.keyframe_ids[-1] >= 6
+    assert len(tracker.state.keyframe_ids) <= 4 + 1  # one whose features are still to come
     assert tracker.state.size <= 22 + 6 * 5 + config.features
     assert results[-1].state is OK
 
@@ -279,7 +279,7 @@ def test_a_renderer_knows_the_pose_between_frames(walk):
     frames, _, truth = walk
     _, _, tracker = run(walk, frames[:40])
     to = frames[41].stamp_ns
-    imu = frames[40].imu.join(frames[41].imu)
+    imu = frames[40].imu.concatenate(frames[41].imu)
     at = {int(t): T for t, T in zip(truth.stamps_ns, truth.T, strict=True)}
     true = se3.inverse(at[frames[39].stamp_ns]) @ at[to]
     before = tracker.state.T
@@ -299,14 +299,14 @@ def test_a_camera_that_sits_elsewhere_is_told_and_found(walk, tracked):
     wrong = dataclasses.replace(rig, T_body_cam0=rig.T_body_cam0 @ off)
     fixed, _, _ = run((frames, wrong, truth), frames)
     _, _, tracker = run((frames, wrong, truth), frames, InertialConfig(extrinsic_rad=0.05, extrinsic_m=0.03))
-    assert all(r.sound for r in tracked[0])
-    assert not any(r.sound for r in fixed[-5:])
+    assert all(r.is_consistent for r in tracked[0])
+    assert not any(r.is_consistent for r in fixed[-5:])
     left = se3.log(se3.inverse(rig.T_body_cam0) @ tracker.state.T_body_cam)
     assert np.degrees(np.linalg.norm(left[:3])) < 1.5
 
 
 def test_what_it_cannot_track_is_refused():
     camera = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
-    stereo = Rig(camera, np.eye(4), cam1=camera, T_cam1_cam0=se3.compose(np.eye(3), np.array([-0.05, 0, 0])))
+    stereo = Rig(camera, np.eye(4), cam1=camera, T_cam1_cam0=se3.from_rt(np.eye(3), np.array([-0.05, 0, 0])))
     with pytest.raises(ValueError, match="IMU"):
         InertialTracker(stereo, InertialConfig(), TrackerConfig())

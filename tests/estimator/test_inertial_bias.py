@@ -7,8 +7,8 @@ from imu_world import GRAVITY, NOISE, rig
 from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import ImuBias
-from share.odometry.initialisation import first_state, learnt_bias, tilt, unknown_bias
-from share.odometry.state import ACCEL_BIAS, CORE, GYRO_BIAS, begin
+from share.odometry.initialisation import estimated_bias, state_from_imu, tilt_sigma, unknown_bias
+from share.odometry.state import ACCEL_BIAS, CORE_SIZE, GYRO_BIAS, initial_state
 from share.types import ImuBatch
 
 CONFIG = InertialConfig()
@@ -26,7 +26,7 @@ def at_rest(gyro=GYRO, accel=ACCEL, shake=0.0):
 
 
 def begun(imu, bias):
-    state = first_state(int(imu.stamps_ns[-1]), imu, rig(), CONFIG, bias)
+    state = state_from_imu(int(imu.stamps_ns[-1]), imu, rig(), CONFIG, bias)
     assert state is not None
     up = float(np.degrees(np.arccos(np.clip(state.T[2, :3] @ LEVEL[2], -1, 1))))
     return state, up
@@ -34,10 +34,10 @@ def begun(imu, bias):
 
 def test_who_knows_its_bias_knows_what_is_up():
     state, off_deg = begun(at_rest(), unknown_bias(CONFIG))
-    assert 2.3 < np.degrees(tilt(state)) < 2.7
+    assert 2.3 < np.degrees(tilt_sigma(state)) < 2.7
     assert off_deg > 1.0
     state, off_deg = begun(at_rest(), KNOWN)
-    assert np.degrees(tilt(state)) < 0.9
+    assert np.degrees(tilt_sigma(state)) < 0.9
     assert off_deg < 0.1
     np.testing.assert_allclose(state.ba, ACCEL, atol=0.02)
     np.testing.assert_allclose(state.bg, GYRO, atol=0.002)
@@ -46,7 +46,7 @@ def test_who_knows_its_bias_knows_what_is_up():
 def test_it_is_as_unsure_of_what_is_up_as_of_the_bias():
     off = ImuBias(GYRO, ACCEL + np.array([0.1, -0.1, 0.1]), 0.003, 0.1)
     state, off_deg = begun(at_rest(), off)
-    assert 0.4 < off_deg < 2 * np.degrees(tilt(state))
+    assert 0.4 < off_deg < 2 * np.degrees(tilt_sigma(state))
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_samples_at_rest_that_contradict_it_are_believed(gyro, accel):
     assert contradicted.cov.tobytes() == unknown.cov.tobytes()
     assert contradicted.ba.tobytes() == unknown.ba.tobytes()
     agreeing, _ = begun(at_rest(), KNOWN)
-    assert tilt(agreeing) < 0.5 * tilt(unknown)
+    assert tilt_sigma(agreeing) < 0.5 * tilt_sigma(unknown)
 
 
 def test_in_motion_a_mean_force_contradicts_nothing():
@@ -67,13 +67,13 @@ def test_in_motion_a_mean_force_contradicts_nothing():
 
 
 def state(gyro_sigma, accel_sigma, ba=ACCEL):
-    sigma = np.full(CORE, 1e-3)
+    sigma = np.full(CORE_SIZE, 1e-3)
     sigma[GYRO_BIAS], sigma[ACCEL_BIAS] = gyro_sigma, accel_sigma
-    return begin(0, np.eye(4), np.zeros(3), GYRO, ba, np.eye(4), sigma)
+    return initial_state(0, np.eye(4), np.zeros(3), GYRO, ba, np.eye(4), sigma)
 
 
 def test_what_is_told_of_it_is_what_the_filter_knows():
-    learnt = learnt_bias(state(0.0002, 0.01), CONFIG)
+    learnt = estimated_bias(state(0.0002, 0.01), CONFIG)
     assert learnt is not None
     np.testing.assert_array_equal(learnt.gyro, GYRO)
     np.testing.assert_array_equal(learnt.accel, ACCEL)
@@ -91,7 +91,7 @@ def test_what_is_told_of_it_is_what_the_filter_knows():
     ],
 )
 def test_nothing_is_told_before_it_is_learnt_or_where_it_is_none(s):
-    assert learnt_bias(s, CONFIG) is None
+    assert estimated_bias(s, CONFIG) is None
 
 
 def test_noise_of_the_rig_is_as_the_test_thinks():

@@ -6,15 +6,15 @@ from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
 from share.geometry import se3
 from share.odometry import filter
-from share.odometry.mono_bundle import SIDE, Model, Shot, fit, gap
-from share.odometry.state import ACCEL_BIAS, CORE, GYRO_BIAS, VELOCITY, begin
+from share.odometry.mono_bundle import IMU_STATE_SIZE, BundleModel, WindowFrame, motion_error, solve_bundle
+from share.odometry.state import ACCEL_BIAS, CORE_SIZE, GYRO_BIAS, VELOCITY, initial_state
 
 SIGMA, SHOTS, STEP_S, KEYFRAMES, EACH = 0.5 / CAMERA.focal, 16, 0.12, (0, 6), 50
-MODEL = Model(NOISE, GRAVITY, SIGMA, 1e-12 * np.eye(6), 0.4, 0.8, 0.5)
+MODEL = BundleModel(NOISE, GRAVITY, SIGMA, 1e-12 * np.eye(6), 0.4, 0.8, 0.5)
 
 
 def unsure():
-    out = np.full(CORE, 1e-6)
+    out = np.full(CORE_SIZE, 1e-6)
     out[:2], out[2:6] = 0.05, 1e-4
     out[VELOCITY], out[GYRO_BIAS], out[ACCEL_BIAS] = 1.0, 0.01, 0.1
     return out
@@ -26,9 +26,11 @@ def scene(seed, outliers=0.0):
     t = np.arange(SHOTS) * STEP_S
     imu, bg, ba = imu_of(path, np.arange(0, 3, 0.005), rng.normal(0, 0.01, 3), rng.normal(0, 0.1, 3), rng)
     T, v = path.poses(t), path.velocity(t)
-    first = begin(0, T[0], v[0], bg[0], ba[0], sensors.T_body_cam0, unsure())
-    error = np.r_[rng.normal(0, 1, SIDE) * unsure()[:SIDE], np.zeros(CORE - SIDE)]
-    filter.move(first, -error)
+    first = initial_state(0, T[0], v[0], bg[0], ba[0], sensors.T_body_cam0, unsure())
+    error = np.r_[
+        rng.normal(0, 1, IMU_STATE_SIZE) * unsure()[:IMU_STATE_SIZE], np.zeros(CORE_SIZE - IMU_STATE_SIZE)
+    ]
+    filter.correct_means(first, -error)
     cams = T @ sensors.T_body_cam0
     hosts = np.repeat(KEYFRAMES, EACH)
     ray = CAMERA.normalise(rng.uniform((5, 5), (634, 474), (len(hosts), 2)))
@@ -47,16 +49,16 @@ def scene(seed, outliers=0.0):
         )
         part = imu.take(near)
         stamp, keyframe = round(t[k] * 1e9), k if k in KEYFRAMES else -1
-        shots.append(Shot(stamp, part, keyframe, seen, hosts[seen], ray[seen], uv[seen]))
+        shots.append(WindowFrame(stamp, part, keyframe, seen, hosts[seen], ray[seen], uv[seen]))
     return shots, first, T, v
 
 
 def error_of(seed):
     """(9,) of the last shot, and its covariance."""
     shots, first, T, v = scene(seed)
-    out = fit(shots, first, MODEL)
+    out = solve_bundle(shots, first, MODEL)
     last = slice(9 * (SHOTS - 1), 9 * SHOTS)
-    return gap(T[-1], v[-1], out.T[-1], out.v[-1]), out.cov[last, last]
+    return motion_error(T[-1], v[-1], out.T[-1], out.v[-1]), out.cov[last, last]
 
 
 def test_it_finds_velocity_and_scale_and_knows_how_well():
@@ -74,11 +76,11 @@ def test_it_finds_velocity_and_scale_and_knows_how_well():
 def test_a_few_wrong_sights(seed):
     """Two in a hundred, by up to 20 px."""
     shots, first, T, v = scene(seed, outliers=0.02)
-    out = fit(shots, first, MODEL)
-    print(out.cost, gap(T[-1], v[-1], out.T[-1], out.v[-1]))
-    assert np.linalg.norm(gap(T[-1], v[-1], out.T[-1], out.v[-1])[6:]) < 0.1
+    out = solve_bundle(shots, first, MODEL)
+    print(out.cost, motion_error(T[-1], v[-1], out.T[-1], out.v[-1]))
+    assert np.linalg.norm(motion_error(T[-1], v[-1], out.T[-1], out.v[-1])[6:]) < 0.1
 
 
 def test_the_same_shots_give_the_same_bits():
-    a, b = (fit(*scene(3)[:2], MODEL) for _ in range(2))
+    a, b = (solve_bundle(*scene(3)[:2], MODEL) for _ in range(2))
     assert a.cov.tobytes() == b.cov.tobytes()

@@ -8,9 +8,9 @@ import pytest
 from imu_world import GRAVITY, NOISE, Path, imu_of, rig
 
 from share.geometry import se3
-from share.odometry import filter, measurement
+from share.odometry import feature_matching, filter
 from share.odometry.imu_propagation import integrate
-from share.odometry.state import CORE, OFFSET, begin
+from share.odometry.state import CORE_SIZE, TIMESHIFT, initial_state
 
 RIG = rig()
 STEP = 1e-6
@@ -21,14 +21,14 @@ def state():
     """Two keyframes, five features each, everything correlated with everything."""
     rng, path = np.random.default_rng(3), Path(2)
     T = path.poses(np.array([0.0, 0.3, 0.7]))
-    s = begin(
+    s = initial_state(
         0,
         T[0],
         path.velocity(np.array([0.7]))[0],
         np.full(3, 0.01),
         np.full(3, -0.05),
         RIG.T_body_cam0,
-        np.full(CORE, 0.1),
+        np.full(CORE_SIZE, 0.1),
     )
     for k in range(2):
         s.T = T[k]
@@ -49,7 +49,7 @@ def state():
 
 def moved(state, error):
     out = copy.deepcopy(state)
-    filter.move(out, error)
+    filter.correct_means(out, error)
     return out
 
 
@@ -61,7 +61,7 @@ def basis(state, k):
 
 def looked(state, T):
     """Where features show in an image."""
-    return measurement.predict(state, np.arange(10), T).uv
+    return feature_matching.predict(state, np.arange(10), T).uv
 
 
 @pytest.mark.parametrize("right", [False, True])
@@ -69,15 +69,15 @@ def test_what_is_seen(state, right):
     T = RIG.T_cam1_cam0 if right else None
     which = np.arange(10)
     rate = np.array([0.3, -0.2, 0.5])
-    seen = measurement.predict(state, which, T)
-    rows = filter.sight(state, which, seen, np.zeros((10, 2)), np.ones(10), np.zeros(10), rate)
+    seen = feature_matching.predict(state, which, T)
+    rows = filter.feature_measurements(state, which, seen, np.zeros((10, 2)), np.ones(10), np.zeros(10), rate)
     H = np.zeros((20, state.size))
-    H[:, :CORE] = rows.core.reshape(20, CORE)
+    H[:, :CORE_SIZE] = rows.H_core.reshape(20, CORE_SIZE)
     for i in range(10):
-        H[2 * i : 2 * i + 2, state.keyframe(rows.host[i])] = rows.by_host[i]
-        H[2 * i : 2 * i + 2, state.features_at + i] = rows.by_rho[i]
+        H[2 * i : 2 * i + 2, state.keyframe_columns(rows.anchor[i])] = rows.H_anchor[i]
+        H[2 * i : 2 * i + 2, state.features_start + i] = rows.H_rho[i]
     for k in range(state.size):
-        if k == OFFSET:
+        if k == TIMESHIFT:
             continue
         up, down = (looked(moved(state, s * basis(state, k)), T) for s in (1, -1))
         assert np.allclose(H[:, k], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
@@ -85,8 +85,8 @@ def test_what_is_seen(state, right):
     V = filter.twist(state, rate)
     later.T, sooner.T = se3.exp(V * STEP) @ state.T, se3.exp(-V * STEP) @ state.T
     up, down = (looked(s, T) for s in (later, sooner))
-    assert np.allclose(H[:, OFFSET], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
-    HP, S = filter.gains(state, rows)
+    assert np.allclose(H[:, TIMESHIFT], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
+    HP, S = filter.innovation_covariance(state, rows)
     assert np.allclose(HP, H @ state.cov, atol=1e-14)
     assert np.allclose(S, H @ state.cov @ H.T + np.eye(20), atol=1e-14)
 
@@ -95,17 +95,20 @@ def test_what_lasts_is_the_same_in_both_cameras(state):
     which, rate = np.arange(10), np.zeros(3)
     sigma, lasting = np.full(10, 0.5), np.full(10, 0.3)
     left, right = (
-        filter.sight(
-            state, which, measurement.predict(state, which, T), np.zeros((10, 2)), sigma, lasting, rate
+        filter.feature_measurements(
+            state, which, feature_matching.predict(state, which, T), np.zeros((10, 2)), sigma, lasting, rate
         )
         for T in (None, RIG.T_cam1_cam0)
     )
     right = right.take(np.arange(3, 7))
-    rows = left.join(right)
-    rows = rows.take(np.argsort(rows.host, kind="stable"))
-    alone, together = (filter.gains(state, r)[1] for r in (replace(rows, lasting=0 * rows.lasting), rows))
-    same = (rows.which[:, None] == rows.which)[:, None, :, None] * np.eye(2)[:, None, :]
-    shared = filter.AS_ONE * 0.3**2 * same.reshape(alone.shape)
+    rows = left.concatenate(right)
+    rows = rows.take(np.argsort(rows.anchor, kind="stable"))
+    alone, together = (
+        filter.innovation_covariance(state, r)[1]
+        for r in (replace(rows, correlated_sigma=0 * rows.correlated_sigma), rows)
+    )
+    same = (rows.feature[:, None] == rows.feature)[:, None, :, None] * np.eye(2)[:, None, :]
+    shared = filter.CORRELATION_INFLATION * 0.3**2 * same.reshape(alone.shape)
     assert np.allclose(together - alone, shared, atol=1e-14)
 
 
@@ -113,19 +116,21 @@ def test_covariance_of_a_motion(state):
     """Of T_a_b = T_a^-1 T_b, by differences."""
 
     def motion(s):
-        return se3.inverse(s.poses[0]) @ s.poses[1]
+        return se3.inverse(s.keyframe_poses[0]) @ s.keyframe_poses[1]
 
     J = np.zeros((6, state.size))
     for k in range(state.size):
         up, down = (motion(moved(state, sign * basis(state, k))) for sign in (1, -1))
         J[:, k] = se3.log(se3.inverse(motion(state)) @ up) - se3.log(se3.inverse(motion(state)) @ down)
     J /= 2 * STEP
-    assert np.allclose(filter.motion_cov(state, 0, 1), J @ state.cov @ J.T, atol=1e-9, rtol=1e-5)
+    assert np.allclose(filter.relative_pose_cov(state, 0, 1), J @ state.cov @ J.T, atol=1e-9, rtol=1e-5)
 
 
 def test_the_twist_is_how_the_pose_moves():
     path, t = Path(4), np.array([1.0])
-    s = begin(0, path.poses(t)[0], path.velocity(t)[0], np.zeros(3), np.zeros(3), np.eye(4), np.ones(CORE))
+    s = initial_state(
+        0, path.poses(t)[0], path.velocity(t)[0], np.zeros(3), np.zeros(3), np.eye(4), np.ones(CORE_SIZE)
+    )
     rate = path.inertial(t)[0][0]
     moved = path.poses(t + 1e-4)[0] @ se3.inverse(path.poses(t - 1e-4)[0])
     assert np.allclose(filter.twist(s, rate), se3.log(moved) / 2e-4, atol=1e-5)
@@ -148,7 +153,7 @@ def test_integration_follows_the_path():
         GRAVITY,
     )
     assert np.linalg.norm(out.T[:3, 3] - end[:3, 3]) < 2e-4
-    assert se3.angle(se3.inverse(out.T) @ end) < 5e-5
+    assert se3.rotation_angle(se3.inverse(out.T) @ end) < 5e-5
     assert np.allclose(out.v, path.velocity(t1)[0], atol=3e-4)
 
 
@@ -158,14 +163,14 @@ def test_transition(dt, close):
     path = Path(6)
     imu, _, _ = imu_of(path, np.arange(0, 0.205, dt))
     t = np.array([0.05])
-    s = begin(
+    s = initial_state(
         50_000_000,
         path.poses(t)[0],
         path.velocity(t)[0],
         np.full(3, 0.01),
         np.full(3, -0.05),
         RIG.T_body_cam0,
-        np.ones(CORE),
+        np.ones(CORE_SIZE),
     )
 
     def after(error):
@@ -174,7 +179,7 @@ def test_transition(dt, close):
         x.T, x.v = m.T, m.v
         return x, m
 
-    mean, motion = after(np.zeros(CORE))
+    mean, motion = after(np.zeros(CORE_SIZE))
     for k in range(15):
         (up, _), (down, _) = after(basis(s, k)), after(-basis(s, k))
         turn = se3.log(up.T @ se3.inverse(down.T)) / (2 * STEP)
@@ -204,6 +209,6 @@ def test_noise_is_that_of_many_runs():
         xi = se3.log(m.T @ se3.inverse(mean.T))
         errors.append(np.concatenate([xi, m.v - mean.v - np.cross(xi[:3], mean.v)]))
     sampled = np.cov(np.array(errors).T)
-    ratio = np.linalg.eigvals(np.linalg.solve(mean.noise[:9, :9], sampled)).real
+    ratio = np.linalg.eigvals(np.linalg.solve(mean.noise_cov[:9, :9], sampled)).real
     assert ratio.min() > 0.75
     assert ratio.max() < 1.3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_inertial import error_m, run, some, states, walk  # noqa: F401
 
-from share.types import ImuBatch, TrackState, Wait
+from share.types import ImuBatch, TrackState, WaitReason
 
 OK, STARTING = TrackState.OK, TrackState.INITIALISING
 
@@ -52,12 +52,12 @@ def test_scale_from_the_imu(walk):  # noqa: F811
     print(ready, scale_of(mono[0], results, mono[2]), error_m(mono, mono[0], results))
     assert set(states(results)[:ready]) == {STARTING}
     assert all(r.T_odom_body is None for r in results[:ready])
-    assert {r.waits for r in results[1:ready]} == {Wait.SCALE}
+    assert {r.waiting_for for r in results[1:ready]} == {WaitReason.SCALE}
     assert 10 <= ready < 40
     assert set(states(results)[ready:]) == {OK}
     assert scale_of(mono[0], results, mono[2]) == pytest.approx(1, abs=0.08)
     assert error_m(mono, mono[0], results) < 0.03
-    assert candidates[0].new_stretch
+    assert candidates[0].new_segment
     assert np.isfinite(candidates[-1].view.points[:, 2]).sum() > 20
 
 
@@ -79,7 +79,7 @@ def test_a_second_camera_that_goes_and_comes_back(walk):  # noqa: F811
     frames = some(walk[0], one_eyed, 12, 32)
     results, _, _ = run(walk, frames)
     assert states(results)[3:] == [OK] * (len(frames) - 3)
-    assert min(r.points for r in results[12:]) >= 25
+    assert min(r.inlier_count for r in results[12:]) >= 25
     assert error_m(walk, frames, results) < 0.015
 
 

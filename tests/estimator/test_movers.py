@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from share.config import Config, InertialConfig
-from share.odometry import measurement
-from share.odometry.landmarks import Scene
-from share.odometry.state import CORE, begin
-from share.runtime.pipeline import frames_of
+from share.odometry import feature_matching
+from share.odometry.landmarks import LandmarkMap
+from share.odometry.state import CORE_SIZE, initial_state
+from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 
@@ -23,24 +23,24 @@ def source(plain_session):
 @pytest.fixture(scope="module")
 def frames(source):
     """Of a body at rest."""
-    return list(frames_of(source, Config(), SequencerCounters()))[:12]
+    return list(read_frames(source, Config(), SequencerCounters()))[:12]
 
 
 @pytest.fixture
 def scene(source, frames):
-    state = begin(0, np.eye(4), STILL, STILL, STILL, source.rig.T_body_cam0, np.full(CORE, 1e-3))
-    scene = Scene(state, source.rig, CONFIG)
+    state = initial_state(0, np.eye(4), STILL, STILL, STILL, source.rig.T_body_cam0, np.full(CORE_SIZE, 1e-3))
+    scene = LandmarkMap(state, source.rig, CONFIG)
     keyframe = scene.add_keyframe(STILL)
-    scene.admit(frames[0], keyframe, scene.corners(frames[0], scene.taken()))
+    scene.admit_features(frames[0], keyframe, scene.find_corners(frames[0], scene.occupied_px()))
     return scene
 
 
 def look(scene, rig, frame, movers=0):
     """At a frame in which the first few features went their own way."""
-    scene.step(1 / 15)
-    sought = measurement.seek(frame, rig, scene.state, scene.looks, CONFIG)
-    sought.astray[:movers] = True
-    scene.seen(sought, sought.found & ~sought.astray)
+    scene.begin_frame(1 / 15)
+    sought = feature_matching.match_features(frame, rig, scene.state, scene.appearance, CONFIG)
+    sought.is_dynamic[:movers] = True
+    scene.record_frame(sought, sought.is_found & ~sought.is_dynamic)
 
 
 def test_a_view_in_which_nothing_moves_is_static_at_once(source, frames, scene):
@@ -58,4 +58,4 @@ def test_with_movers_it_is_once_enough_features_have_proven_static(source, frame
     for frame in frames[5:8]:
         look(scene, source.rig, frame)
     assert scene.is_static(ENOUGH)
-    assert not scene.is_static(len(scene.state.ids) + 1)
+    assert not scene.is_static(len(scene.state.feature_ids) + 1)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from imu_world import CAMERA, rig
 
-from share.odometry import filter, measurement, outliers
-from share.odometry.state import CORE, VELOCITY, begin
+from share.odometry import feature_matching, filter, outliers
+from share.odometry.state import CORE_SIZE, VELOCITY, initial_state
 
 RIG, SIZE = rig(), (CAMERA.width, CAMERA.height)
 SIGMA = 0.5 / CAMERA.focal
@@ -15,9 +15,9 @@ N = 100
 @pytest.fixture
 def state():
     """A body that has gone on a little since its only keyframe, and knows where it is to a few mm."""
-    rng, sigma = np.random.default_rng(1), np.full(CORE, 1e-4)
+    rng, sigma = np.random.default_rng(1), np.full(CORE_SIZE, 1e-4)
     sigma[VELOCITY] = 0.01
-    s = begin(0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), RIG.T_body_cam0, sigma)
+    s = initial_state(0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), RIG.T_body_cam0, sigma)
     host = filter.add_keyframe(s, 0, np.zeros(3))
     px = np.stack(np.meshgrid(np.linspace(40, SIZE[0] - 40, 10), np.linspace(40, SIZE[1] - 40, 10)), -1)
     ray = RIG.cam0.normalise(px.reshape(-1, 2))
@@ -28,12 +28,14 @@ def state():
 
 def judged(state, shift_px, proven=None, noise=0.3):
     """Which of the features are taken for the room seen shift_px (N, 2) from where they should be."""
-    seen = measurement.predict(state, np.arange(N))
+    seen = feature_matching.predict(state, np.arange(N))
     rng = np.random.default_rng(2)
     uv = seen.uv + (shift_px + noise * rng.normal(size=(N, 2))) / CAMERA.focal
-    rows = filter.sight(state, np.arange(N), seen, uv, np.full(N, SIGMA), np.zeros(N), np.zeros(3))
+    rows = filter.feature_measurements(
+        state, np.arange(N), seen, uv, np.full(N, SIGMA), np.zeros(N), np.zeros(3)
+    )
     px = RIG.cam0.distort(uv).astype(np.float32)
-    return outliers.of_the_room(state, rows, px, np.ones(N, bool) if proven is None else proven, RIG.cam0)
+    return outliers.static_inliers(state, rows, px, np.ones(N, bool) if proven is None else proven, RIG.cam0)
 
 
 def mistaken(room, mover):
@@ -43,7 +45,7 @@ def mistaken(room, mover):
 
 def part(state, left_of):
     """Features in the left part of the image."""
-    return RIG.cam0.distort(measurement.predict(state, np.arange(N)).uv)[:, 0] < left_of * SIZE[0]
+    return RIG.cam0.distort(feature_matching.predict(state, np.arange(N)).uv)[:, 0] < left_of * SIZE[0]
 
 
 def test_noise_is_no_reason_to_doubt(state):
@@ -77,17 +79,21 @@ def test_what_is_new_has_no_vote(state):
 
 def test_a_motion_that_the_imu_missed_is_no_split(state):
     """All of the room shifts alike, by what the filter holds for possible."""
-    seen = measurement.predict(state, np.arange(N))
-    shift = seen.by_pose[:, :, 3:] @ np.array([2e-3, -2e-3, 1e-3]) * CAMERA.focal
+    seen = feature_matching.predict(state, np.arange(N))
+    shift = seen.H_pose[:, :, 3:] @ np.array([2e-3, -2e-3, 1e-3]) * CAMERA.focal
     assert np.abs(shift).max() > 1.0
     assert judged(state, shift).all()
 
 
 def test_too_few_are_believed(state):
     few = np.arange(5)
-    seen = measurement.predict(state, few)
-    rows = filter.sight(state, few, seen, seen.uv + 1.0, np.full(5, SIGMA), np.zeros(5), np.zeros(3))
-    assert outliers.of_the_room(state, rows, np.zeros((5, 2), np.float32), np.ones(5, bool), RIG.cam0).all()
+    seen = feature_matching.predict(state, few)
+    rows = filter.feature_measurements(
+        state, few, seen, seen.uv + 1.0, np.full(5, SIGMA), np.zeros(5), np.zeros(3)
+    )
+    assert outliers.static_inliers(
+        state, rows, np.zeros((5, 2), np.float32), np.ones(5, bool), RIG.cam0
+    ).all()
 
 
 @pytest.mark.parametrize(("share", "as_expected"), [(0.05, True), (0.3, False), (1.0, False)])
@@ -95,4 +101,4 @@ def test_the_imu_alone_explains_an_image_where_nothing_moves(share, as_expected)
     """Else somebody is asked; so too if all of the image moves."""
     off_px = np.random.default_rng(4).normal(0, 0.3, (N, 2))
     off_px[: round(share * N)] += 3.0
-    assert outliers.as_expected(off_px, 0.15, 0.3) == as_expected
+    assert outliers.matches_imu(off_px, 0.15, 0.3) == as_expected

@@ -7,9 +7,9 @@ from imu_simulation import Setup, run
 from imu_world import NOISE, Path, imu_of
 
 from share.geometry.camera import ImuNoise
-from share.lab.emulate.sensor.vibration import vibration
-from share.odometry.imu_buffer import Samples
-from share.odometry.imu_propagation import shaken
+from share.lab.emulate.sensor.vibration import vibration_acceleration
+from share.odometry.imu_buffer import ImuBuffer
+from share.odometry.imu_propagation import noise_with_vibration
 from share.types import ImuBatch
 
 QUIET = ImuNoise(1e-9, 1e-9, 1e-9, 1e-9, 400.0)
@@ -25,7 +25,7 @@ def shown(imu, window_s=0.2):
     parts = [
         imu.take(slice(*np.searchsorted(imu.stamps_ns, edges[k : k + 2]))) for k in range(len(edges) - 1)
     ]
-    noises = [shaken(QUIET, part) for part in parts]
+    noises = [noise_with_vibration(QUIET, part) for part in parts]
     return np.mean([(n.gyro_density, n.accel_density) for n in noises], axis=0)
 
 
@@ -56,7 +56,7 @@ def test_a_body_that_moves_shows_no_noise(hz):
         gyro, accel = shown(imu)
         assert gyro < 0.2 * NOISE.gyro_density
         assert accel < 0.2 * NOISE.accel_density
-        assert shaken(NOISE, imu.take(slice(0, 60))) == NOISE
+        assert noise_with_vibration(NOISE, imu.take(slice(0, 60))) == NOISE
 
 
 def test_the_bob_of_a_walk_is_motion():
@@ -71,7 +71,7 @@ def test_machines_show_more_than_what_they_add_to_velocities():
     faster than half their rate, and looks slow, it does not; such samples look like a bias.)"""
     t, ratios = np.arange(0, 10, 1 / 400), []
     for seed in range(6):
-        a, n = vibration(t, 1.0, (seed, 3)), 120
+        a, n = vibration_acceleration(t, 1.0, (seed, 3)), 120
         sums = np.cumsum((a[1:] + a[:-1]) / 2 / 400, axis=0)
         adds = np.sqrt(((sums[n:] - sums[:-n]) ** 2).mean() / 0.3)
         ratios.append(shown(batch(t, np.zeros_like(a), a))[1] / adds)
@@ -83,12 +83,12 @@ def test_too_few_samples_show_nothing(rng):
     for n in (0, 1, 2, 7):
         t = np.arange(n) / 400
         loud = batch(t, rng.normal(0, 1, (n, 3)), rng.normal(0, 1, (n, 3)))
-        assert shaken(NOISE, loud) == NOISE
+        assert noise_with_vibration(NOISE, loud) == NOISE
 
 
 def test_the_latest_samples_reach_one_beyond_the_image():
     t = np.arange(0, 1, 1 / 200)
-    samples = Samples()
+    samples = ImuBuffer()
     samples.add(batch(t, np.zeros((len(t), 3)), np.zeros((len(t), 3))))
     latest = samples.latest(502_000_000)
     assert (latest.stamps_ns[0], latest.stamps_ns[-1]) == (305_000_000, 505_000_000)
@@ -99,7 +99,7 @@ def test_a_shaken_body_goes_less_astray_and_knows_how_far(monkeypatch):
     """White shaking of 1 m/s^2 a sample, as of many small blows."""
     setup = Setup(seconds=3.0, white=1.0, phase=0.4)
     heard = run(1, setup)
-    monkeypatch.setattr(imu_simulation, "shaken", lambda noise, samples: noise)
+    monkeypatch.setattr(imu_simulation, "noise_with_vibration", lambda noise, samples: noise)
     deaf = run(1, setup)
     off = [np.sqrt((r.pose_errors[20:, 3:6] ** 2).sum(axis=1).mean()) for r in (heard, deaf)]
     assert off[0] < 0.5 * off[1]

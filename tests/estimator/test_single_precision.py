@@ -21,6 +21,6 @@ def apart(one: Run, other: Run) -> float:
 def test_poses_do_not_drift_apart(seconds, features, mono, monkeypatch):
     setup = Setup(seconds=seconds, features=features, mono=mono)
     short = run(0, setup)
-    assert not filter._is_vague(short.state)
-    monkeypatch.setattr(filter, "_is_vague", lambda state: True)
+    assert not filter._needs_double_precision(short.state)
+    monkeypatch.setattr(filter, "_needs_double_precision", lambda state: True)
     assert 0 < apart(short, run(0, setup)) < MOST

@@ -9,7 +9,7 @@ from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
 from share.odometry import initialisation
 from share.odometry.visual_tracker import VisualTracker
-from share.types import Frame, ImuBatch, TrackState, Wait
+from share.types import Frame, ImuBatch, TrackState, WaitReason
 
 HZ = 20
 DEFAULT = TrackerConfig()
@@ -31,8 +31,8 @@ def run(images, config=DEFAULT, stamps=None, rig=STEREO):
     for i, (left, right) in enumerate(images):
         frame = Frame(stamps[i] if stamps else stamp(i), i, left, right)
         results.append(tracker.track(frame))
-        if results[-1].keyframe:
-            candidates.append(tracker.keyframe(frame))
+        if results[-1].keyframe_ready:
+            candidates.append(tracker.make_keyframe(frame))
     return results, candidates
 
 
@@ -44,10 +44,10 @@ def test_tracks_every_frame_to_the_centimetre(walk):
     truth = se3.inverse(T[0]) @ T
     relative = se3.inverse(estimate[0]) @ estimate
     assert np.linalg.norm(relative[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
-    assert np.degrees(se3.angle(se3.inverse(relative) @ truth)).max() < 0.6
+    assert np.degrees(se3.rotation_angle(se3.inverse(relative) @ truth)).max() < 0.6
     assert 4 < len(candidates) < 40
-    assert candidates[0].new_stretch
-    assert not any(c.new_stretch for c in candidates[1:])
+    assert candidates[0].new_segment
+    assert not any(c.new_segment for c in candidates[1:])
 
 
 def test_what_settles_a_keyframe_may_wait_for_the_next_frame(walk):
@@ -57,9 +57,9 @@ def test_what_settles_a_keyframe_may_wait_for_the_next_frame(walk):
         frame = Frame(stamp(i), i, left, right)
         result = tracker.track(frame)
         poses.append(result.T_odom_body)
-        if result.keyframe:
-            tracker.keyframe(frame)
-            tracker.settle()
+        if result.keyframe_ready:
+            tracker.make_keyframe(frame)
+            tracker.finish_keyframe()
     for mine, result in zip(poses, run(images[:30])[0], strict=True):
         np.testing.assert_array_equal(mine, result.T_odom_body)
 
@@ -89,7 +89,7 @@ def test_lost_in_the_dark_and_found_again_in_the_same_frame(walk):
     truth = se3.inverse(T[0]) @ T[45:60]
     found = np.array([se3.inverse(results[0].T_odom_body) @ r.T_odom_body for r in back])
     assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.04
-    assert not any(c.new_stretch for c in candidates[1:])
+    assert not any(c.new_segment for c in candidates[1:])
 
 
 def test_a_long_darkness_does_not_cost_the_map(walk):
@@ -99,7 +99,7 @@ def test_a_long_darkness_does_not_cost_the_map(walk):
     results, candidates = run([*images[:40], *[dark] * 20, *images[45:55]], TrackerConfig(new_stretch_s=0.3))
     assert [r.state for r in results[40:60]] == [TrackState.LOST] * 20
     assert all(r.state.has_pose for r in results[60:])
-    assert not any(c.new_stretch for c in candidates[1:])
+    assert not any(c.new_segment for c in candidates[1:])
 
 
 def test_carried_away_while_blind_begins_a_new_stretch(walk):
@@ -110,7 +110,7 @@ def test_carried_away_while_blind_begins_a_new_stretch(walk):
     states = [r.state for r in results]
     assert TrackState.LOST in states[20:30]
     assert states[-1].has_pose
-    assert sum(c.new_stretch for c in candidates) == 2
+    assert sum(c.new_segment for c in candidates) == 2
 
 
 def test_a_pose_that_implies_a_leap_is_not_believed(walk):
@@ -125,7 +125,7 @@ def test_waits_for_something_to_see(walk):
     dark = (np.zeros((480, 640), np.uint8),) * 2
     results, _ = run([dark, dark, *walk[0][:3]])
     assert [r.state for r in results] == [TrackState.INITIALISING] * 2 + [TrackState.OK] * 3
-    assert [r.waits for r in results] == [Wait.VIEW] * 2 + [None] * 3
+    assert [r.waiting_for for r in results] == [WaitReason.VIEW] * 2 + [None] * 3
 
 
 def test_memory_is_bounded(walk):
@@ -133,12 +133,12 @@ def test_memory_is_bounded(walk):
     tracker = VisualTracker(STEREO, config)
     for i, (left, right) in enumerate(walk[0]):
         frame = Frame(stamp(i), i, left, right)
-        if tracker.track(frame).keyframe:
-            tracker.keyframe(frame)
+        if tracker.track(frame).keyframe_ready:
+            tracker.make_keyframe(frame)
         local_map = tracker._map
         assert len(local_map.keyframes) <= 5
         assert len(local_map.ids) <= 5 * config.corners
-        assert set(local_map.hosts) <= set(local_map.keyframes)
+        assert set(local_map.anchors) <= set(local_map.keyframes)
 
 
 def test_one_camera_alone_is_refused():
@@ -156,7 +156,7 @@ def test_up_comes_from_the_accelerometer(walk):
     frame = Frame(0, 0, *walk[0][0], imu=imu)
     result = tracker.track(frame)
     assert np.allclose(result.T_odom_body[2, :3], up, atol=1e-9)
-    assert np.allclose(tracker.keyframe(frame).up, up, atol=1e-9)
+    assert np.allclose(tracker.make_keyframe(frame).up, up, atol=1e-9)
 
 
 def test_without_gravity_in_the_accelerometer_up_stays_unknown(walk):
@@ -164,7 +164,7 @@ def test_without_gravity_in_the_accelerometer_up_stays_unknown(walk):
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
     results, candidates = run(walk[0][:15], rig=rig)  # the IMU says nothing at all
     assert [r.state for r in results[:9]] == [TrackState.INITIALISING] * 9
-    assert {r.waits for r in results[:9]} == {Wait.TILT}
+    assert {r.waiting_for for r in results[:9]} == {WaitReason.TILT}
     assert results[9].state is TrackState.VISION_ONLY
     assert (candidates[0].up == 0).all()
 
@@ -178,16 +178,16 @@ def test_an_imu_that_falls_silent_is_seen_and_ends_nothing(walk):
         frame = Frame(stamp(i), i, *images, imu=ImuBatch.empty() if 4 <= i < 8 else imu)
         result = tracker.track(frame)
         states.append(result.state)
-        if result.keyframe:
-            tracker.keyframe(frame)
+        if result.keyframe_ready:
+            tracker.make_keyframe(frame)
     ok, alone = [TrackState.OK] * 4, [TrackState.VISION_ONLY] * 4
     assert states == [*ok, *alone, *ok]
 
 
 def test_level_looks_ahead_and_survives_looking_down():
-    T = initialisation.level(np.array([0, -1.0, 0]), np.array([0, 0, 1.0]))
+    T = initialisation.align_to_gravity(np.array([0, -1.0, 0]), np.array([0, 0, 1.0]))
     assert np.allclose(T[:3, :3] @ [0, -1, 0], (0, 0, 1))
     assert np.allclose(T[:3, :3] @ [0, 0, 1], (1, 0, 0))
-    down = initialisation.level(np.array([0, 0, -1.0]), np.array([0, 0, 1.0]))
+    down = initialisation.align_to_gravity(np.array([0, 0, -1.0]), np.array([0, 0, 1.0]))
     assert np.allclose(down[:3, :3] @ [0, 0, -1], (0, 0, 1))
     assert np.linalg.det(down[:3, :3]) == pytest.approx(1)

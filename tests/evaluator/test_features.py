@@ -8,28 +8,35 @@ import cv2
 import numpy as np
 import pytest
 
-from share.odometry.error_model.features import NAMES, PICTURE_PX, Features, features, psd, scalars
-from share.odometry.error_model.history import Fared, Lately
-from share.types import U8, Footing, TrackState
+from share.odometry.error_model.history import FrameOutcome, RecentMotion
+from share.odometry.error_model.inputs import (
+    PICTURE_PX,
+    SCALAR_NAMES,
+    ErrorModelInput,
+    error_model_input,
+    point_distribution,
+    scalar_features,
+)
+from share.types import U8, FeatureStatistics, TrackState
 
 SIZE = (640, 480)
-LATELY = Lately((Fared(0, True, TrackState.OK, 50, 50, 0.0),), 1.0, 0.5, (0.3,))
+LATELY = RecentMotion((FrameOutcome(0, True, TrackState.OK, 50, 50, 0.0),), 1.0, 0.5, (0.3,))
 GREY: U8 = np.full((240, 320), 128, np.uint8)
 
 
-def footing(px=(), believed=None, depth=None, sought=0, known=0) -> Footing:
+def footing(px=(), believed=None, depth=None, sought=0, known=0) -> FeatureStatistics:
     px = np.array(px, np.float32).reshape(-1, 2)
     believed = np.ones(len(px), bool) if believed is None else np.array(believed, bool)
     depth = np.full(len(px), 2.0) if depth is None else np.array(depth, float)
-    return Footing(px, believed, depth, sought, known)
+    return FeatureStatistics(px, believed, depth, sought, known)
 
 
 def told(image: U8 = GREY, sigma_cm: float = 1.0, **points) -> dict[str, float]:
-    return dict(zip(NAMES, scalars(image, footing(**points), sigma_cm).tolist(), strict=True))
+    return dict(zip(SCALAR_NAMES, scalar_features(image, footing(**points), sigma_cm).tolist(), strict=True))
 
 
 def test_a_plain_wall_without_points_is_nothing():
-    assert (psd(GREY, footing(), SIZE) == 0).all()
+    assert (point_distribution(GREY, footing(), SIZE) == 0).all()
     plain = told(sigma_cm=0.0)
     assert plain.pop("brightness") == pytest.approx(128 / 255)
     assert set(plain.values()) == {0.0}
@@ -39,17 +46,17 @@ def test_a_corner_is_strong_in_its_own_cell():
     image = GREY.copy()
     image[:, 170:] = 40  # cells 20 px wide: an edge within column 8
     image[130:, :] = 40  # and row 6
-    strength = psd(image, footing(), SIZE)[0]
+    strength = point_distribution(image, footing(), SIZE)[0]
     assert np.argwhere(strength > 0.3).tolist() == [[6, 8]]
     assert strength.max() <= 1
-    fainter = psd(((image.astype(int) - 128) // 4 + 128).astype(np.uint8), footing(), SIZE)[0]
+    fainter = point_distribution(((image.astype(int) - 128) // 4 + 128).astype(np.uint8), footing(), SIZE)[0]
     assert 0 < fainter[6, 8] < strength[6, 8]
 
 
 def test_points_count_where_they_are_whatever_the_size_of_the_image():
     for size in (SIZE, (752, 480), (320, 240)):
         at = np.array([[0.5 / 16, 0.5 / 12], [0.6 / 16, 0.4 / 12], [15.5 / 16, 11.5 / 12]]) * size
-        grid = psd(GREY, footing(at, depth=[1.0, 2.0, np.nan]), size)
+        grid = point_distribution(GREY, footing(at, depth=[1.0, 2.0, np.nan]), size)
         assert np.argwhere(grid[1]).tolist() == [[0, 0], [11, 15]]
         assert grid[1, 0, 0] == pytest.approx(2 / 4)
         assert grid[2, 0, 0] == pytest.approx((1 / 1 + 1 / 2) / 2 * 0.5)
@@ -57,14 +64,14 @@ def test_points_count_where_they_are_whatever_the_size_of_the_image():
 
 
 def test_points_that_were_refused_do_not_count():
-    grid = psd(GREY, footing([[10, 10], [11, 11]], believed=[True, False]), SIZE)
+    grid = point_distribution(GREY, footing([[10, 10], [11, 11]], believed=[True, False]), SIZE)
     assert grid[1, 0, 0] == pytest.approx(1 / 4)
 
 
 def test_channels_stay_between_0_and_1(rng):
     image = rng.integers(0, 256, (240, 320), np.uint8)
     px = rng.uniform(0, 479, (500, 2))
-    grid = psd(image, footing(px, depth=rng.uniform(0.05, 12, 500)), SIZE)
+    grid = point_distribution(image, footing(px, depth=rng.uniform(0.05, 12, 500)), SIZE)
     assert grid.min() >= 0
     assert grid.max() <= 1
 
@@ -94,14 +101,14 @@ def test_what_is_counted_of_the_image(rng):
 def test_all_of_it_is_made_of_any_camera(rng):
     for shape in ((480, 640), (480, 752), (240, 320)):
         image = rng.integers(0, 256, shape, np.uint8)
-        made = features(image, footing([[5, 5]], sought=1, known=1), LATELY)
+        made = error_model_input(image, footing([[5, 5]], sought=1, known=1), LATELY)
         assert made.picture.shape == (PICTURE_PX, PICTURE_PX)
         assert abs(made.picture.mean() - image.mean()) < 1.5
         assert made.psd[1, 0, 0] == 0.25
-        assert made.recent[0] == pytest.approx(made.scalars[NAMES.index("tracking score")])
+        assert made.recent[0] == pytest.approx(made.scalars[SCALAR_NAMES.index("tracking score")])
 
 
 def test_features_of_another_shape_are_refused():
-    right = features(np.zeros((480, 640), np.uint8), footing(), LATELY)
+    right = error_model_input(np.zeros((480, 640), np.uint8), footing(), LATELY)
     with pytest.raises(ValueError, match="scalars: shape"):
-        Features(right.picture, right.psd, right.scalars[:-1], right.recent)
+        ErrorModelInput(right.picture, right.psd, right.scalars[:-1], right.recent)

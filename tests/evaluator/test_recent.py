@@ -6,17 +6,17 @@ import math
 
 import pytest
 
-from share.odometry.error_model.features import RECENT, recent
-from share.odometry.error_model.history import Fared, Lately
+from share.odometry.error_model.history import FrameOutcome, RecentMotion
+from share.odometry.error_model.inputs import RECENT_NAMES, recent_features
 from share.types import TrackState
 
 S = 1_000_000_000
-FINE = Fared(0, True, TrackState.OK, 50, 50, 0.0)
+FINE = FrameOutcome(0, True, TrackState.OK, 50, 50, 0.0)
 
 
-def told(*frames: Fared, sigmas_cm=(1.0,), way_m=0.0, turn_rad=0.0) -> dict[str, float]:
-    lately = Lately(frames or (FINE,), way_m, turn_rad, sigmas_cm)
-    return dict(zip(RECENT, recent(lately).tolist(), strict=True))
+def told(*frames: FrameOutcome, sigmas_cm=(1.0,), way_m=0.0, turn_rad=0.0) -> dict[str, float]:
+    lately = RecentMotion(frames or (FINE,), way_m, turn_rad, sigmas_cm)
+    return dict(zip(RECENT_NAMES, recent_features(lately).tolist(), strict=True))
 
 
 def test_where_all_is_well_nothing_is_told():
@@ -37,13 +37,16 @@ def test_how_far_it_went_and_turned():
 
 
 def test_a_surprise_between_keyframes_is_told():
-    now = told(FINE, FINE._replace(surprise=100.0), FINE, FINE)
+    now = told(FINE, FINE._replace(median_nis=100.0), FINE, FINE)
     assert (now["mean surprise"], now["most surprise"]) == pytest.approx((0.25, 1))
 
 
 def test_what_was_found_and_not_believed():
     now = told(
-        FINE._replace(believed=0), FINE._replace(believed=25), FINE._replace(found=0, believed=0), FINE
+        FINE._replace(inlier_count=0),
+        FINE._replace(inlier_count=25),
+        FINE._replace(found_count=0, inlier_count=0),
+        FINE,
     )
     assert now["refused"] == pytest.approx((1 + 0.5) / 4)
     assert now["least matches"] == 0
@@ -51,7 +54,7 @@ def test_what_was_found_and_not_believed():
 
 def test_more_believed_than_found_is_not_less_than_none_refused():
     """The visual tracker takes up old points after it has the pose."""
-    assert told(FINE._replace(believed=80))["refused"] == 0
+    assert told(FINE._replace(inlier_count=80))["refused"] == 0
 
 
 def test_in_what_state_it_was():
@@ -61,7 +64,7 @@ def test_in_what_state_it_was():
 
 
 def test_without_an_imu_it_was_deaf():
-    assert told(FINE, FINE._replace(heard=False))["deaf"] == 0.5
+    assert told(FINE, FINE._replace(has_imu=False))["deaf"] == 0.5
 
 
 def test_the_longest_time_without_a_frame():

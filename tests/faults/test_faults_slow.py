@@ -11,19 +11,19 @@ from pathlib import Path
 import pytest
 
 from share.lab.emulate.faults import FAULTS
-from share.lab.emulate.recipe import Recipe
-from share.lab.emulate.render.context import missing
-from share.lab.emulate.session import cached_session
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.render.context import missing_reason
+from share.lab.emulate.session import make_cached_session
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(missing() is not None, reason=f"cannot draw: {missing()}"),
+    pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}"),
 ]
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 SESSIONS = {
-    "warehouse": Recipe("warehouse", ("a=walk:",), 20.0, seed=7, profiles={"": "d435i:640x480@30"}),
-    "firestation": Recipe("firestation", ("a=walk:",), 20.0, seed=3),
-    "firestation 11": Recipe("firestation", ("a=walk:",), 20.0, seed=11),
+    "warehouse": SessionRecipe("warehouse", ("a=walk:",), 20.0, seed=7, profiles={"": "d435i:640x480@30"}),
+    "firestation": SessionRecipe("firestation", ("a=walk:",), 20.0, seed=3),
+    "firestation 11": SessionRecipe("firestation", ("a=walk:",), 20.0, seed=11),
 }
 BORNE = [(session, fault) for session in ("warehouse", "firestation") for fault in FAULTS]
 # What goes along with a wearer does harm in one walk of three: 1.0, 5.5, 0.6 cm by seeds 3, 11, 12.
@@ -48,7 +48,7 @@ def row_of():
 
         @cache
         def case(session):
-            return tool.case(f"{cached_session(SESSIONS[session])}/a", SESSIONS[session].seconds)
+            return tool.case(f"{make_cached_session(SESSIONS[session])}/a", SESSIONS[session].seconds)
 
         @cache
         def row(session, fault):

@@ -5,7 +5,7 @@ import pytest
 
 from share.geometry import absolute_pose as searches
 from share.geometry import se3
-from share.geometry.absolute_pose import Terms, absolute_pose, by_opencv, by_poselib
+from share.geometry.absolute_pose import RansacOptions, absolute_pose, by_opencv, by_poselib
 
 FOCAL = 450.0
 BOTH = pytest.mark.parametrize("search", [by_poselib, by_opencv])
@@ -13,7 +13,7 @@ BOTH = pytest.mark.parametrize("search", [by_poselib, by_opencv])
 
 def matches(rng, n, wrong, noise_px=1.0):
     """points (n, 3) m, uv (n, 2), T_cam_world, wrong (n,)."""
-    T = se3.compose(se3.so3_exp(rng.normal(0, 0.3, 3)), rng.normal(0, 0.5, 3))
+    T = se3.from_rt(se3.so3_exp(rng.normal(0, 0.3, 3)), rng.normal(0, 0.5, 3))
     seen = np.column_stack([rng.uniform(-2, 2, n), rng.uniform(-1.5, 1.5, n), rng.uniform(1.5, 6, n)])
     uv = seen[:, :2] / seen[:, 2:] + rng.normal(0, noise_px / FOCAL, (n, 2))
     bad = rng.random(n) < wrong
@@ -32,7 +32,7 @@ def test_the_pose_is_found_among_wrong_matches(search, wrong, most, rng):
     off = []
     for seed in range(15):
         points, uv, truth, bad = matches(rng, 200, wrong)
-        T, inlier = search(points, uv, FOCAL, Terms(3.0, seed))
+        T, inlier = search(points, uv, FOCAL, RansacOptions(3.0, seed))
         off.append(apart(T, truth))
         assert inlier[~bad].mean() > 0.9
         assert inlier[bad].sum() <= 3  # by chance
@@ -42,7 +42,7 @@ def test_the_pose_is_found_among_wrong_matches(search, wrong, most, rng):
 @BOTH
 def test_the_same_seed_gives_the_same_pose(search, rng):
     points, uv, *_ = matches(rng, 60, 0.5)
-    first, second = (search(points, uv, FOCAL, Terms(3.0, 7)) for _ in range(2))
+    first, second = (search(points, uv, FOCAL, RansacOptions(3.0, 7)) for _ in range(2))
     assert np.array_equal(first[0], second[0])
     assert np.array_equal(first[1], second[1])
 
@@ -52,7 +52,7 @@ def test_the_best_first_need_few_samples(search, rng):
     """80 % are wrong, and nobody draws so often as to find the others by chance."""
     points, uv, truth, bad = matches(rng, 200, 0.8)
     order = np.argsort(bad, kind="stable")
-    few = Terms(3.0, 0, min_iterations=10, max_iterations=50, best_first=True)
+    few = RansacOptions(3.0, 0, min_iterations=10, max_iterations=50, best_first=True)
     T, _ = search(points[order], uv[order], FOCAL, few)
     assert apart(T, truth) < 0.03
 
@@ -61,7 +61,7 @@ def test_the_best_first_need_few_samples(search, rng):
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 30])
 def test_where_there_is_none_nothing_is_raised(search, n, rng):
     points, uv = rng.normal([0, 0, 4], 1.0, (n, 3)), rng.uniform(-0.5, 0.5, (n, 2))
-    T, inlier = search(points, uv, FOCAL, Terms(1.0, 0, max_iterations=100))
+    T, inlier = search(points, uv, FOCAL, RansacOptions(1.0, 0, max_iterations=100))
     assert inlier.shape == (n,)
     assert T.shape == (4, 4)
     assert inlier.sum() < 8
@@ -70,5 +70,5 @@ def test_where_there_is_none_nothing_is_raised(search, n, rng):
 def test_without_poselib_it_is_opencv_s(monkeypatch, rng):
     points, uv, *_ = matches(rng, 60, 0.3)
     monkeypatch.setattr(searches, "poselib", None)
-    found, _ = absolute_pose(points, uv, FOCAL, Terms(3.0, 5))
-    assert np.array_equal(found, by_opencv(points, uv, FOCAL, Terms(3.0, 5))[0])
+    found, _ = absolute_pose(points, uv, FOCAL, RansacOptions(3.0, 5))
+    assert np.array_equal(found, by_opencv(points, uv, FOCAL, RansacOptions(3.0, 5))[0])

@@ -31,8 +31,8 @@ def test_behind_the_camera_is_nowhere():
 
 def test_inside_counts_pixel_centres():
     px = np.array([[0, 0], [639, 479], [-0.1, 5], [639.1, 5]], float)
-    assert PLAIN.inside(px).tolist() == [True, True, False, False]
-    assert PLAIN.inside(px, border=1).tolist() == [False, False, False, False]
+    assert PLAIN.is_inside(px).tolist() == [True, True, False, False]
+    assert PLAIN.is_inside(px, border=1).tolist() == [False, False, False, False]
 
 
 @pytest.mark.parametrize(

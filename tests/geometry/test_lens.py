@@ -34,7 +34,7 @@ def test_equidistant_is_opencvs(rng):
     points = _everywhere(rng, 74)
     want, _ = cv2.fisheye.projectPoints(points[:, None], NONE, NONE, TUMVI.K, np.array(TUMVI.distortion))
     assert np.abs(TUMVI.project(points) - want[:, 0]).max() < 1e-9
-    np.testing.assert_allclose(TUMVI.project_all(points), TUMVI.project(points), atol=1e-9)
+    np.testing.assert_allclose(TUMVI.project_wide(points), TUMVI.project(points), atol=1e-9)
 
 
 @pytest.mark.parametrize(("camera", "deg"), [(EUROC, 45), (FIVE, 45), (TUMVI, 74)])
@@ -49,7 +49,7 @@ def test_there_and_back(camera, deg, rng):
 def test_directions_of_a_fisheye_go_behind_the_camera(rng):
     points = _everywhere(rng, 110)
     assert (points[:, 2] < 0).any()
-    px = TUMVI.project_all(points)
+    px = TUMVI.project_wide(points)
     unit = points / np.linalg.norm(points, axis=1, keepdims=True)
     assert np.abs(TUMVI.directions(px) - unit).max() < 1e-9
 
@@ -67,13 +67,13 @@ def test_jacobian_against_differences(camera, deg, rng):
 @pytest.mark.parametrize(("camera", "deg"), [(EUROC, 45), (FIVE, 45), (TUMVI, 110)])
 def test_derivatives_by_points_and_by_coefficients_against_differences(camera, deg, rng):
     points, eps, lens = _everywhere(rng, deg), 1e-6, camera.lens
-    J, K = lens.jacobian_points(points), lens.by_coefficients(points)
+    J, K = lens.point_jacobian(points), lens.coefficient_jacobian(points)
     for axis, d in enumerate(np.eye(3) * eps):
-        difference = (lens.bend_points(points + d) - lens.bend_points(points - d)) / (2 * eps)
+        difference = (lens.distort_points(points + d) - lens.distort_points(points - d)) / (2 * eps)
         assert np.abs(J[..., axis] - difference).max() < 1e-7
     for k, d in enumerate(np.eye(len(camera.distortion)) * eps):
         more, less = (type(lens)(tuple(lens.coefficients + s * d), lens.limit) for s in (1, -1))
-        difference = (more.bend_points(points) - less.bend_points(points)) / (2 * eps)
+        difference = (more.distort_points(points) - less.distort_points(points)) / (2 * eps)
         assert np.abs(K[..., k] - difference).max() < 1e-7
 
 
@@ -85,9 +85,9 @@ def test_the_axis_is_no_exception(camera):
     np.testing.assert_allclose(camera.normalise(centre), [[0, 0]], atol=1e-12)
     np.testing.assert_allclose(camera.directions(centre), [[0, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(camera.jacobian(np.zeros((1, 2)))[0], np.diag([camera.fx, camera.fy]))
-    J = camera.lens.jacobian_points(middle)[0]
+    J = camera.lens.point_jacobian(middle)[0]
     np.testing.assert_allclose(J, np.diag([0.5, 0.5, 0])[:2], atol=1e-12)
-    assert np.isfinite(camera.lens.by_coefficients(middle)).all()
+    assert np.isfinite(camera.lens.coefficient_jacobian(middle)).all()
 
 
 def test_beyond_its_range_a_lens_shows_nothing():
@@ -101,13 +101,13 @@ def test_beyond_its_range_a_lens_shows_nothing():
     angles = np.array([1.0, 1.1])  # 1 - 0.9 a^2 is 0 at 1.054
     points = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
     assert np.isfinite(short.project(points)).tolist() == [[True, True], [False, False]]
-    assert np.isfinite(short.project_all(points)).tolist() == [[True, True], [False, False]]
+    assert np.isfinite(short.project_wide(points)).tolist() == [[True, True], [False, False]]
 
 
 def test_normalised_coordinates_of_a_fisheye_end_at_75_degrees():
     angles = np.radians([74.9, 75.1, 89.0, 91.0])
     points = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
-    px = TUMVI.project_all(points)
+    px = TUMVI.project_wide(points)
     assert np.isfinite(px).all()
     known = [[True, True], *[[False, False]] * 3]
     assert np.isfinite(TUMVI.project(points)).tolist() == known
@@ -115,9 +115,9 @@ def test_normalised_coordinates_of_a_fisheye_end_at_75_degrees():
 
 
 def test_field_of_view():
-    assert np.degrees(TUMVI.field_rad) == pytest.approx([150.0, 150.0])
+    assert np.degrees(TUMVI.field_of_view_rad) == pytest.approx([150.0, 150.0])
     narrow = Camera(320, 240, 190.98, 190.97, 160.0, 120.0, TUMVI.distortion, "equidistant")
-    assert np.degrees(narrow.field_rad[0]) == pytest.approx(2 * np.degrees(160 / 190.98), abs=0.5)
+    assert np.degrees(narrow.field_of_view_rad[0]) == pytest.approx(2 * np.degrees(160 / 190.98), abs=0.5)
 
 
 @pytest.mark.parametrize(

@@ -83,18 +83,18 @@ def test_orthonormal_mends_a_drifted_rotation(rng):
 def test_angle_is_that_of_the_logarithm_from_nothing_to_half_a_turn() -> None:
     axis = np.array([0.6, -0.48, 0.64])
     for radians in (0.0, 1e-9, 1e-4, 0.5, 2.0, 3.0, np.pi - 1e-7, np.pi):
-        assert abs(se3.angle(se3.so3_exp(radians * axis)) - radians) < 1e-8
+        assert abs(se3.rotation_angle(se3.so3_exp(radians * axis)) - radians) < 1e-8
 
 
 def test_poses_are_as_far_apart_as_one_by_one(rng):
     poses, others = (se3.exp(rng.normal(0, 1, (n, 6))) for n in (5, 7))
-    metres, radians = se3.apart(poses, others)
+    metres, radians = se3.pairwise_distances(poses, others)
     for i, T in enumerate(poses):
         for j, other in enumerate(others):
             between = se3.inverse(T) @ other
             assert metres[i, j] == pytest.approx(np.linalg.norm(between[:3, 3]), abs=1e-12)
-            assert radians[i, j] == pytest.approx(float(se3.angle(between)), abs=1e-7)
-    for gap in se3.apart(poses, poses):
+            assert radians[i, j] == pytest.approx(float(se3.rotation_angle(between)), abs=1e-7)
+    for gap in se3.pairwise_distances(poses, poses):
         assert np.diagonal(gap) == pytest.approx(0.0, abs=1e-7)
 
 

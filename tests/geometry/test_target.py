@@ -27,7 +27,7 @@ def test_charuco_corners_are_opencvs_seen_with_y_up():
     np.testing.assert_allclose(ours.corners, np.stack([x, 5 * 0.04 - y, -z], axis=1), atol=1e-7)
     middles = np.array([np.mean(marker, axis=0) for marker in theirs.getObjPoints()])
     np.testing.assert_allclose(
-        ours.marked + 0.02, np.stack([middles[:, 0], 0.2 - middles[:, 1]], axis=1), atol=1e-7
+        ours.marker_squares + 0.02, np.stack([middles[:, 0], 0.2 - middles[:, 1]], axis=1), atol=1e-7
     )
 
 

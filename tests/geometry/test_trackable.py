@@ -9,7 +9,7 @@ import pytest
 
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.geometry.rig_check import lens_objection, objection
+from share.geometry.rig_check import lens_problem, rig_problem
 
 LENS = (-0.28340811, 0.07395907, 0.00019359, 1.76e-05)
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, LENS)
@@ -19,12 +19,12 @@ TUMVI = {
     **{"distortion": FISHEYE, "model": "equidistant"},
 }
 NOISE = ImuNoise(1.7e-4, 2.0e-3, 1.9e-5, 3.0e-3, 200.0)
-RIG = Rig(EUROC, np.eye(4), EUROC, se3.compose(np.eye(3), np.array([-0.11, 0, 0])), imu=NOISE)
+RIG = Rig(EUROC, np.eye(4), EUROC, se3.from_rt(np.eye(3), np.array([-0.11, 0, 0])), imu=NOISE)
 DEPTH = replace(RIG, cam1=None, T_cam1_cam0=None, depth=EUROC, T_depth_cam0=np.eye(4))
 
 
 def turned(degrees: float, axis: int) -> np.ndarray:
-    T = se3.compose(se3.so3_exp(np.radians(degrees) * np.eye(3)[axis]), np.array([-0.11, 0, 0]))
+    T = se3.from_rt(se3.so3_exp(np.radians(degrees) * np.eye(3)[axis]), np.array([-0.11, 0, 0]))
     return np.asarray(T)
 
 
@@ -54,7 +54,7 @@ def both(**values: object) -> Rig:
     ids=lambda rig: rig.kind,
 )
 def test_what_people_have_is_let_through(rig: Rig) -> None:
-    assert objection(rig) is None
+    assert rig_problem(rig) is None
 
 
 @pytest.mark.parametrize(
@@ -76,20 +76,20 @@ def test_what_people_have_is_let_through(rig: Rig) -> None:
         (replace(RIG, T_cam1_cam0=turned(90.0, 1)), "% of what cam0 sees"),
         (replace(RIG, T_cam1_cam0=turned(180.0, 0)), "sees 0 % of what cam0 sees"),
         (replace(DEPTH, T_depth_cam0=turned(90.0, 0)), "sees 0 % of what cam0 sees"),
-        (replace(DEPTH, T_depth_cam0=se3.compose(np.eye(3), np.array([25.0, 0, 0]))), "25 m from cam0"),
-        (replace(RIG, T_body_cam0=se3.compose(np.eye(3), np.array([0, 500.0, 0]))), "500 m from the IMU"),
+        (replace(DEPTH, T_depth_cam0=se3.from_rt(np.eye(3), np.array([25.0, 0, 0]))), "25 m from cam0"),
+        (replace(RIG, T_body_cam0=se3.from_rt(np.eye(3), np.array([0, 500.0, 0]))), "500 m from the IMU"),
         (replace(RIG, imu=replace(NOISE, gyro_density=0.0)), "gyroscope_noise_density"),
         (replace(RIG, imu=replace(NOISE, accel_density=900.0)), "accelerometer_noise_density"),
         (replace(RIG, imu=replace(NOISE, accel_walk=900.0)), "random walk"),
     ],
 )
 def test_what_no_tracker_can_use_is_refused_in_a_line_that_says_why(rig: Rig, says: str) -> None:
-    told = objection(rig)
+    told = rig_problem(rig)
     assert told is not None
     assert any(part in told for part in says.split("|")), told
     assert "\n" not in told and len(told) < 250
 
 
 def test_a_lens_alone() -> None:
-    assert lens_objection(EUROC) is None
-    assert "folds" in str(lens_objection(replace(EUROC, distortion=(-30.0, 0.0, 0.0, 0.0))))
+    assert lens_problem(EUROC) is None
+    assert "folds" in str(lens_problem(replace(EUROC, distortion=(-30.0, 0.0, 0.0, 0.0))))

@@ -10,7 +10,7 @@ import numpy as np
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.mapping.graph.edges import Edge
+from share.mapping.graph.edges import PoseEdge
 from share.types import F64
 
 ANCHOR_SIGMA = 1e-4  # rad and m; holds the gauge, removed again after solving
@@ -29,8 +29,8 @@ class SolvedGraph:
 
 def solve(
     poses: F64,
-    odometry: Sequence[Edge],
-    loops: Sequence[Edge],
+    odometry: Sequence[PoseEdge],
+    loops: Sequence[PoseEdge],
     anchors: Sequence[int],
     config: GraphConfig,
     covariances_of: Sequence[int] = (),
@@ -66,7 +66,7 @@ def solve(
     )
 
 
-def chi2(poses: F64, edges: Sequence[Edge]) -> F64:
+def chi2(poses: F64, edges: Sequence[PoseEdge]) -> F64:
     """Squared Mahalanobis residual (E,) of every edge at `poses` (N, 4, 4)."""
     if not edges:
         return np.zeros(0)
@@ -77,7 +77,7 @@ def chi2(poses: F64, edges: Sequence[Edge]) -> F64:
     return np.asarray((residual * whitened[:, :, 0]).sum(1), np.float64)
 
 
-def _between(edge: Edge, noise: Any) -> Any:
+def _between(edge: PoseEdge, noise: Any) -> Any:
     import gtsam
 
     return gtsam.BetweenFactorPose3(edge.a, edge.b, gtsam.Pose3(edge.T_a_b), noise)
@@ -99,7 +99,7 @@ def _marginals(graph: Any, values: Any, wanted: Sequence[int]) -> F64:
     return np.array([marginals.marginalCovariance(index) for index in wanted])
 
 
-def _check(n: int, odometry: Sequence[Edge], loops: Sequence[Edge], anchors: Sequence[int]) -> None:
+def _check(n: int, odometry: Sequence[PoseEdge], loops: Sequence[PoseEdge], anchors: Sequence[int]) -> None:
     parent = list(range(n))
 
     def root(i: int) -> int:

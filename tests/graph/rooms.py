@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.graph.edges import Edge
+from share.mapping.graph.edges import PoseEdge
 from share.types import F64
 
 ODOMETRY = np.diag([0.004**2] * 3 + [0.01**2] * 3)
@@ -26,18 +26,18 @@ class Room:
 
     truth: F64
     guess: F64
-    odometry: list[Edge | None]
-    loops: list[list[Edge]]
+    odometry: list[PoseEdge | None]
+    loops: list[list[PoseEdge]]
 
     def __len__(self) -> int:
         return len(self.truth)
 
     @property
-    def chain(self) -> list[Edge]:
+    def chain(self) -> list[PoseEdge]:
         return [edge for edge in self.odometry if edge is not None]
 
     @property
-    def closures(self) -> list[Edge]:
+    def closures(self) -> list[PoseEdge]:
         return [edge for edges in self.loops for edge in edges]
 
 
@@ -48,7 +48,7 @@ def simulate(n: int, agents: int, seed: int, density: float = 1.0) -> Room:
     walks = [_walk(rng) for _ in range(agents)]
     truth = np.array([next(walks[i % agents]) for i in range(n)])
     guess = truth.copy()
-    odometry: list[Edge | None] = [None] * min(agents, n)
+    odometry: list[PoseEdge | None] = [None] * min(agents, n)
     for i in range(agents, n):
         edge = measured(truth, i - agents, i, ODOMETRY, rng)
         odometry.append(edge)
@@ -57,16 +57,16 @@ def simulate(n: int, agents: int, seed: int, density: float = 1.0) -> Room:
     return Room(truth, guess, odometry, loops)
 
 
-def measured(truth: F64, a: int, b: int, cov: F64, rng: np.random.Generator) -> Edge:
+def measured(truth: F64, a: int, b: int, cov: F64, rng: np.random.Generator) -> PoseEdge:
     noise = se3.exp(rng.multivariate_normal(np.zeros(6), cov))
-    return Edge(a, b, se3.orthonormal(se3.inverse(truth[a]) @ truth[b] @ noise), cov)
+    return PoseEdge(a, b, se3.orthonormal(se3.inverse(truth[a]) @ truth[b] @ noise), cov)
 
 
-def false_loops(room: Room, count: int, seed: int) -> list[Edge]:
+def false_loops(room: Room, count: int, seed: int) -> list[PoseEdge]:
     """Between any two keyframes, and saying anything."""
     rng = np.random.default_rng(seed)
     pairs = (rng.choice(len(room), 2, replace=False) for _ in range(count))
-    return [Edge(int(a), int(b), se3.exp(rng.normal(0, [0.5] * 3 + [1.5] * 3)), LOOP) for a, b in pairs]
+    return [PoseEdge(int(a), int(b), se3.exp(rng.normal(0, [0.5] * 3 + [1.5] * 3)), LOOP) for a, b in pairs]
 
 
 def _walk(rng: np.random.Generator) -> Iterator[F64]:
@@ -85,7 +85,7 @@ def _walk(rng: np.random.Generator) -> Iterator[F64]:
             yield T
 
 
-def _loops(truth: F64, i: int, agents: int, rng: np.random.Generator, density: float) -> list[Edge]:
+def _loops(truth: F64, i: int, agents: int, rng: np.random.Generator, density: float) -> list[PoseEdge]:
     if i // agents % 2 or i == 0 or (rng.random() > density and i >= agents):
         return []
     older = np.arange(max(0, i - 10 * agents)) if i >= 11 * agents else np.arange(i)

@@ -9,8 +9,8 @@ from rooms import Room, simulate
 from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.graph import edges
-from share.mapping.graph.solver import Solver
-from share.mapping.graph.updates import Change, Solution
+from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.graph.updates import GraphSolution, GraphUpdate
 from share.types import F64
 
 CONFIG = GraphConfig()
@@ -25,11 +25,11 @@ def plumb_lines(room: Room, seed: int) -> dict[int, F64]:
     return dict(enumerate(up / SIGMA))
 
 
-def solved(room: Room, lines: dict[int, F64] | None, wanted: list[int], config: GraphConfig) -> Solution:
-    solver = Solver(config)
+def solved(room: Room, lines: dict[int, F64] | None, wanted: list[int], config: GraphConfig) -> GraphSolution:
+    solver = PoseGraphSolver(config)
     edges = [(i, edge, False) for i, edge in enumerate(room.chain)]
     loops = [(10**6 + i, edge, True) for i, edge in enumerate(room.closures)]
-    solver.update(Change.of(dict(enumerate(room.guess)), edges + loops, plumb=lines))
+    solver.update(GraphUpdate.from_edges(dict(enumerate(room.guess)), edges + loops, gravity_factors=lines))
     return solver.solve(0, wanted)
 
 
@@ -44,14 +44,14 @@ def test_slope_and_curvature_are_the_cost_s() -> None:
     rng = np.random.default_rng(3)
     poses = se3.exp(rng.normal(0, 0.4, (5, 6)))
     lines = np.concatenate([rng.normal(0, 1, (4, 3)), np.zeros((1, 3))])
-    slope, curvature = edges.equations(poses, lines)
+    slope, curvature = edges.gravity_equations(poses, lines)
     step, numeric = 1e-5, np.zeros((5, 6))
     for k in range(5):
         for j in range(6):
             there, back = poses.copy(), poses.copy()
             xi = step * np.eye(6)[j]
             there[k], back[k] = poses[k] @ se3.exp(xi), poses[k] @ se3.exp(-xi)
-            numeric[k, j] = (edges.cost(there, lines) - edges.cost(back, lines)) / (4 * step)
+            numeric[k, j] = (edges.gravity_cost(there, lines) - edges.gravity_cost(back, lines)) / (4 * step)
     assert slope == pytest.approx(numeric, abs=1e-8)
     assert np.linalg.eigvalsh(curvature).min() > -1e-12
     assert not slope[4].any() and not curvature[4].any()

@@ -27,42 +27,42 @@ from share.errors import ShareError, UsageError
 from share.lab.calibrate.imu_table import read_imu
 from share.lab.emulate.session import make_session
 from share.lab.emulate.world.gltf import load_gltf
-from share.lab.evaluate.play import Terms
-from share.lab.evaluate.scoring import figures, merges, traces
+from share.lab.evaluate.real_time import RunOptions
+from share.lab.evaluate.scoring import merge_locations, run_metrics, traces
 from share.lab.evaluate.trial import read_trial, run_trial
-from share.lab.evaluate.virtual import costs_of
+from share.lab.evaluate.virtual_time import read_delays
 from share.lab.mocap.files import read_bodies
+from share.lab.train.keyframe_table import collect_labels, tabulate
 from share.lab.train.labels import Labels, read_labels, write_labels
-from share.lab.train.table import collect, tabulate
 from share.net.keys import AllowList
-from share.odometry.error_model.features import SHAPES, kind_of
-from share.odometry.error_model.model import estimate
-from share.odometry.error_model.network import error_model
+from share.odometry.error_model.inference import estimate_error
+from share.odometry.error_model.inputs import INPUT_SHAPES, input_dtype
+from share.odometry.error_model.network import open_error_model
 from share.recordings.calibration import kalibr_texts, read_calibration
-from share.recordings.describe import describe
+from share.recordings.describe import describe_recording
 from share.recordings.mcap.recorder import Recorder
-from share.recordings.mcap.recover import recover
+from share.recordings.mcap.recover import recover_recording
 from share.recordings.session import read_session
-from share.runtime.pipeline import frames_of, tracker_for
+from share.runtime.pipeline import make_source_tracker, read_frames
 from share.runtime.source import open_source
-from share.sensors.profile import host_profile, profile
+from share.sensors.profile import load_host_profile, load_profile
 from share.sensors.sequencer import SequencerCounters
 from share.store.export import describe_map
 from share.store.map_store import MapStore
 
 
 def _tracked(source: object) -> None:
-    tracker = tracker_for(source, config.Config())
-    for frame in frames_of(source, config.Config(), SequencerCounters()):
-        if tracker.track(frame).keyframe:
-            tracker.keyframe(frame)
-            tracker.settle()
+    tracker = make_source_tracker(source, config.Config())
+    for frame in read_frames(source, config.Config(), SequencerCounters()):
+        if tracker.track(frame).keyframe_ready:
+            tracker.make_keyframe(frame)
+            tracker.finish_keyframe()
 
 
 def read_recording(path: Path) -> None:
     source = open_source(str(path))
     with contextlib.suppress(ShareError):
-        describe(source)
+        describe_recording(source)
     with contextlib.suppress(ShareError):
         source.truth()
     with contextlib.suppress(ShareError):
@@ -73,7 +73,7 @@ def read_recording(path: Path) -> None:
 
 def read_mcap(path: Path) -> None:
     with contextlib.suppress(ShareError):
-        recover(path, path.with_name("saved.mcap"))
+        recover_recording(path, path.with_name("saved.mcap"))
     read_recording(path)
 
 
@@ -96,12 +96,12 @@ def read_settings(path: Path) -> None:
 
 
 def read_profile(path: Path) -> None:
-    profile(str(path)).rig()
-    host_profile(str(path))
+    load_profile(str(path)).rig()
+    load_host_profile(str(path))
 
 
 def read_onnx(path: Path) -> None:
-    estimate(error_model(str(path)), made_features(np.random.default_rng(1)))
+    estimate_error(open_error_model(str(path)), made_features(np.random.default_rng(1)))
 
 
 def read_room(path: Path) -> None:
@@ -116,7 +116,7 @@ def read_keys(path: Path) -> None:
 
 def read_labels_of(path: Path) -> None:
     with contextlib.suppress(UsageError):  # of four rooms at least
-        collect(path, 0)
+        collect_labels(path, 0)
     for file in path.iterdir():
         tabulate([read_labels(file)])
 
@@ -124,9 +124,9 @@ def read_labels_of(path: Path) -> None:
 def read_a_run(path: Path) -> None:
     """What agents and the edge left, in virtual time."""
     with contextlib.suppress(ShareError):
-        costs_of(path / "run")
+        read_delays(path / "run")
     trial = read_trial(path / "run")
-    for read in (figures, traces, merges):
+    for read in (run_metrics, traces, merge_locations):
         with contextlib.suppress(ShareError):
             read(trial)
     load_config(str(path / "run" / "config.yaml"))
@@ -165,7 +165,7 @@ def seeds(root: Path) -> dict[str, Seed]:
     (root / "room").mkdir()
     write(root / "room", tree())
     (root / "labels").mkdir()
-    columns = (np.zeros((3, *shape), kind_of(name)) for name, shape in SHAPES.items())
+    columns = (np.zeros((3, *shape), input_dtype(name)) for name, shape in INPUT_SHAPES.items())
     about = {"session": "s", "seed": 0, "provenance": {"scene": "plain", "seed": 1, "motions": ["walk:"]}}
     write_labels(root / "labels" / "a.npz", Labels(about, np.arange(3), np.ones(3, np.float32), *columns))
     (root / "keys").mkdir()
@@ -198,7 +198,7 @@ def _study(root: Path) -> None:
     case.mkdir(parents=True)
     session = case / "session"
     make_session(small_recipe(root / "small.yaml", "ann=walk:", "bob=walk:"), session, workers=1)
-    terms = Terms("share", virtual=True)
+    terms = RunOptions("share", virtual=True)
     run_trial(read_session(session), terms, config.Config(), case / "run", lambda now: None)
     shutil.copytree(case, root / "study")
 

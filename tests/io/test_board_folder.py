@@ -10,8 +10,8 @@ import yaml
 from share.errors import DataError, UsageError
 from share.geometry.camera import Camera, Rig
 from share.lab.calibrate import board_views
-from share.lab.calibrate.board_views import RigPictures, find_stamped, open_pictures
-from share.lab.calibrate.camera_bundle import View
+from share.lab.calibrate.board_views import RigImages, find_stamped_views, open_board_images
+from share.lab.calibrate.camera_bundle import BoardView
 from share.lab.calibrate.corners import Detection
 from share.lab.calibrate.target import AprilGrid
 
@@ -29,14 +29,14 @@ def written(folder: Path, *names: str) -> Path:
 
 def test_a_stamp_with_fewer_digits_goes_first(tmp_path: Path) -> None:
     written(tmp_path / "cam0", "100000000000.png", "99950000000.png", "99900000000.png")
-    names = [name for name, _ in open_pictures(str(tmp_path), ("cam0",)).read()]
+    names = [name for name, _ in open_board_images(str(tmp_path), ("cam0",)).read_images()]
     assert names == ["99900000000", "99950000000", "100000000000"]
 
 
 def test_where_pictures_are_missing_it_is_said_how_to_do_without(tmp_path: Path) -> None:
     written(tmp_path / "mono" / "cam0", "1.png", "2.png")
     with pytest.raises(DataError, match=r"of the same name in cam0 and cam1; give --camera cam0$"):
-        open_pictures(str(tmp_path / "mono"), ("cam0", "cam1"))
+        open_board_images(str(tmp_path / "mono"), ("cam0", "cam1"))
     beside = np.eye(4)
     beside[0, 3] = -0.05
     chain = {"cam0": CAMERA, "cam1": CAMERA | {"T_cn_cnm1": beside.tolist()}}
@@ -44,27 +44,27 @@ def test_where_pictures_are_missing_it_is_said_how_to_do_without(tmp_path: Path)
     with pytest.raises(
         DataError, match=r"in cam0 and cam1; for one camera, give --camera a camchain without"
     ):
-        board_views.open_rig_pictures(str(tmp_path / "mono"), str(tmp_path / "stereo.yaml"))
+        board_views.open_rig_images(str(tmp_path / "mono"), str(tmp_path / "stereo.yaml"))
     flat = written(tmp_path / "flat", "1.png")
     with pytest.raises(
         UsageError, match=r"flat: has pictures, but no cam0 .*; give a folder with cam0/\*\.png"
     ):
-        open_pictures(str(flat), ("cam0",))
+        open_board_images(str(flat), ("cam0",))
 
 
-def stamped(monkeypatch: pytest.MonkeyPatch, *names: str) -> board_views.Stamped:
+def stamped(monkeypatch: pytest.MonkeyPatch, *names: str) -> board_views.StampedViews:
     """What is found in pictures of these names, which all show the board."""
-    views = [View(name, (CORNER,)) for name in names]
+    views = [BoardView(name, (CORNER,)) for name in names]
     monkeypatch.setattr(board_views, "find_views", lambda *_: (views, [(12, 8)]))
     rig = Rig(Camera(12, 8, 9.0, 9.0, 6.0, 4.0), np.eye(4))
-    return find_stamped(RigPictures("dance", None, rig, None), AprilGrid(), 1, lambda done, total: None)  # type: ignore[arg-type]
+    return find_stamped_views(RigImages("dance", None, rig, None), AprilGrid(), 1, lambda done, total: None)  # type: ignore[arg-type]
 
 
 def test_pictures_that_are_not_later_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     found = stamped(monkeypatch, "10", "30", "20", "30", "40")
     assert found.stamps.tolist() == [10, 30, 40]
     assert [view.name for view in found.views] == ["10", "30", "40"]
-    assert (found.looked, found.with_target, found.dropped) == (5, 5, 2)
+    assert (found.images_searched, found.with_target, found.dropped) == (5, 5, 2)
 
 
 @pytest.mark.parametrize("name", ["row", "1.5", "12345678901234567890"])

@@ -8,11 +8,11 @@ import pytest
 from share.errors import ConfigError
 from share.files.yaml_file import Section, read_yaml
 from share.geometry import se3
-from share.geometry.rig_check import objection
+from share.geometry.rig_check import rig_problem
 from share.recordings.calibration import (
     CAMCHAIN,
     IMU_CHAIN,
-    kalibr,
+    calibration_from_kalibr,
     kalibr_texts,
     read_calibration,
     read_camera_yaml,
@@ -171,7 +171,7 @@ def test_a_rig_written_under_kalibrs_names_is_read_as_it_was(tmp_path, seconds):
     written = Section(to_kalibr(rig), "written")
     for name in ("cam0", "cam1"):
         assert ("timeshift_cam_imu" in written.section(name)) == (seconds != 0)
-    back = kalibr(written, written.section("imu0")).rig
+    back = calibration_from_kalibr(written, written.section("imu0")).rig
     assert (back.cam0, back.cam1, back.imu, back.timeshift_s) == (rig.cam0, rig.cam1, rig.imu, seconds)
     np.testing.assert_allclose(back.T_body_cam0, rig.T_body_cam0, atol=1e-12)
 
@@ -263,7 +263,7 @@ def test_real_calibrations(shared_data):
     tumvi = read_calibration(shared_data / "motion" / "tumvi" / "calib").rig
     assert (tumvi.kind, tumvi.cam0.model, tumvi.cam1.model) == ("stereo+imu", "equidistant", "equidistant")
     assert tumvi.cam0.distortion[:2] == pytest.approx((0.003482, 0.000715), abs=1e-6)
-    assert objection(tumvi) is None
+    assert rig_problem(tumvi) is None
     kitchen = read_camera_yaml(shared_data / "real" / "redkitchen_0000_0499" / "camera.yaml").rig
     assert (kitchen.cam0.fx, kitchen.depth.fx) == (525.0, 585.0)
     assert kitchen.T_depth_cam0[0, 3] == 0.025

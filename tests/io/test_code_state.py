@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import share
-from share.runtime.machine import code_state
+from share.runtime.machine import code_digest
 
 
 def test_it_is_another_once_a_source_is(tmp_path, monkeypatch):
@@ -13,12 +13,12 @@ def test_it_is_another_once_a_source_is(tmp_path, monkeypatch):
     shutil.copytree(Path(share.__file__).parent / "scheduling", copy / "scheduling")
     (copy / "__init__.py").write_text("")
     monkeypatch.setattr(share, "__file__", str(copy / "__init__.py"))
-    states = [code_state.__wrapped__()]
-    states.append(code_state.__wrapped__())
+    states = [code_digest.__wrapped__()]
+    states.append(code_digest.__wrapped__())
     (copy / "__init__.py").write_text("changed = True\n")
-    states.append(code_state.__wrapped__())
+    states.append(code_digest.__wrapped__())
     (copy / "__init__.py").rename(copy / "other.py")
-    states.append(code_state.__wrapped__())
+    states.append(code_digest.__wrapped__())
     assert states[0] == states[1]
     assert len(set(states)) == 3
 
@@ -30,5 +30,5 @@ def test_of_a_frozen_program_it_is_the_program_that_counts(tmp_path, monkeypatch
     states = []
     for content in (b"one", b"two"):
         program.write_bytes(content)
-        states.append(code_state.__wrapped__())
+        states.append(code_digest.__wrapped__())
     assert len(set(states)) == 2

@@ -13,31 +13,43 @@ from onnx_bytes import FLOAT, field, ints, model, node, number, small_error_mode
 from special_files import KINDS, special
 
 from share.errors import DataError, ShareError
-from share.odometry.error_model.features import SHAPES, features
-from share.odometry.error_model.history import Fared, Lately
-from share.odometry.error_model.model import MOST_CM, Estimate, estimate
-from share.odometry.error_model.network import SHIPPED, deep_of, error_model, open_network, read_model
-from share.types import Footing, TrackState
+from share.odometry.error_model.history import FrameOutcome, RecentMotion
+from share.odometry.error_model.inference import MAX_ERROR_CM, ErrorEstimate, estimate_error
+from share.odometry.error_model.inputs import INPUT_SHAPES, error_model_input
+from share.odometry.error_model.network import (
+    SHIPPED_MODEL,
+    backbone_features,
+    open_error_model,
+    open_network,
+    read_model,
+)
+from share.types import FeatureStatistics, TrackState
 
 
 @pytest.fixture(scope="module")
 def network():
-    return error_model("shipped")
+    return open_error_model("shipped")
 
 
-def told(network, found: int, believed: int, sigma_cm: float, state=TrackState.OK, surprise=0.3) -> Estimate:
+def told(
+    network, found: int, believed: int, sigma_cm: float, state=TrackState.OK, surprise=0.3
+) -> ErrorEstimate:
     rng = np.random.default_rng(7)
     image = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), np.uint8), (0, 0), 2)
     px = rng.uniform(0, 470, (found, 2)).astype(np.float32)
-    footing = Footing(px, np.arange(found) < believed, np.full(found, 2.5), max(found, 30), 3 * found)
-    frames = tuple(Fared(k * 66_666_667, True, state, found, believed, surprise) for k in range(75))
-    return estimate(network, features(image, footing, Lately(frames, 2.0, 1.5, (sigma_cm,) * 12)))
+    footing = FeatureStatistics(
+        px, np.arange(found) < believed, np.full(found, 2.5), max(found, 30), 3 * found
+    )
+    frames = tuple(FrameOutcome(k * 66_666_667, True, state, found, believed, surprise) for k in range(75))
+    return estimate_error(
+        network, error_model_input(image, footing, RecentMotion(frames, 2.0, 1.5, (sigma_cm,) * 12))
+    )
 
 
 def test_it_is_there_and_small(network):
-    assert SHIPPED.stat().st_size <= 6e6
-    assert "MIT" in SHIPPED.with_suffix(".md").read_text()
-    assert {given.name for given in network.get_inputs()} == set(SHAPES)
+    assert SHIPPED_MODEL.stat().st_size <= 6e6
+    assert "MIT" in SHIPPED_MODEL.with_suffix(".md").read_text()
+    assert {given.name for given in network.get_inputs()} == set(INPUT_SHAPES)
 
 
 def test_it_expects_more_where_the_tracker_fares_badly(network):
@@ -47,7 +59,7 @@ def test_it_expects_more_where_the_tracker_fares_badly(network):
     assert well.error_cm < 0.5 * unsure.error_cm < blind.error_cm
     assert 0.02 < well.error_cm < 1
     assert blind.error_cm > 3
-    assert blind.high_cm <= MOST_CM  # more is not told
+    assert blind.high_cm <= MAX_ERROR_CM  # more is not told
 
 
 def test_what_it_expects_lies_in_its_interval(network):
@@ -59,7 +71,7 @@ def test_a_file_that_is_no_network_is_named(tmp_path):
     path = tmp_path / "mine.onnx"
     path.write_bytes(b"not a network")
     with pytest.raises(DataError, match=r"mine\.onnx: is no network"):
-        error_model(str(path))
+        open_error_model(str(path))
 
 
 # ------------------------------------------------------------------ files from anywhere
@@ -71,14 +83,14 @@ def small(path: Path, **given: Any) -> Path:
 
 
 def test_one_written_by_hand_is_an_error_model(tmp_path):
-    assert told(error_model(str(small(tmp_path / "a.onnx"))), 80, 78, 0.4).error_cm == pytest.approx(1.0)
+    assert told(open_error_model(str(small(tmp_path / "a.onnx"))), 80, 78, 0.4).error_cm == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("says", [(np.inf, 0, 0), (np.nan, 0, 0), (0, -np.inf, 0), (1e38, -1e38, 1e38)])
 def test_one_that_says_no_number(tmp_path, says):
-    network = error_model(str(small(tmp_path / "a.onnx", says=says)))
+    network = open_error_model(str(small(tmp_path / "a.onnx", says=says)))
     if np.isfinite(says).all():
-        assert told(network, 80, 78, 0.4).error_cm == MOST_CM
+        assert told(network, 80, 78, 0.4).error_cm == MAX_ERROR_CM
         return
     with pytest.raises(DataError, match="says no number"):
         told(network, 80, 78, 0.4)
@@ -108,7 +120,7 @@ LAYERS = {
 def test_what_no_error_model_needs_is_not_run(tmp_path, name):
     more, weights, says = LAYERS[name]
     with pytest.raises(DataError, match=says) as error:
-        error_model(str(small(tmp_path / "a.onnx", more=more, weights=weights)))
+        open_error_model(str(small(tmp_path / "a.onnx", more=more, weights=weights)))
     assert "\n" not in str(error.value)
 
 
@@ -126,9 +138,9 @@ def test_memory_is_bounded_whatever_layers_make_of_it(tmp_path):
         weights = [tensor("row", [1, long], [0.0] * long), tensor("column", [long, 1], [0.0] * long)]
         return str(small(tmp_path / f"{long}.onnx", more=more, weights=weights, first="said"))
 
-    assert error_model(made(60))
+    assert open_error_model(made(60))
     with pytest.raises(DataError, match=r"is no error model: .*Add"):
-        error_model(made(60_000))
+        open_error_model(made(60_000))
 
 
 def test_cut_short_or_not_of_this_kind(tmp_path):
@@ -136,14 +148,14 @@ def test_cut_short_or_not_of_this_kind(tmp_path):
     for k in (0, 1, 5, 100, len(whole) // 2, len(whole) - 1):
         (tmp_path / "b.onnx").write_bytes(whole[:k])
         with pytest.raises(DataError, match="is no "):
-            error_model(str(tmp_path / "b.onnx"))
+            open_error_model(str(tmp_path / "b.onnx"))
     (tmp_path / "c.onnx").write_bytes(
         model([node("Relu", ["x"], "y")], [], [value_info("x", FLOAT, [1])], [value_info("y", FLOAT, [1])])
     )
     with pytest.raises(DataError, match="is no error model: it takes x, not"):
-        error_model(str(tmp_path / "c.onnx"))
+        open_error_model(str(tmp_path / "c.onnx"))
     with pytest.raises(DataError, match="has no backbone"):
-        deep_of(open_network((tmp_path / "c.onnx").read_bytes()), np.zeros((2, 128, 128), np.uint8))
+        backbone_features(open_network((tmp_path / "c.onnx").read_bytes()), np.zeros((2, 128, 128), np.uint8))
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "huge"])

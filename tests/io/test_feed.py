@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from share.cameras.feed import Feed
-from share.cameras.handover import Handover
+from share.cameras.feed import CameraFeed
+from share.cameras.sample_queue import SampleQueue
 from share.errors import NotAttachedError, ShareError, UsageError
 from share.geometry.camera import Rig
-from share.sensors.intake import Sample
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
+from share.sensors.sample_processor import DeviceSample
 from share.sensors.watchdog import Health, Watchdog
 
 RATES = {"cam0": 30.0, "accel": 250.0, "gyro": 400.0}
@@ -24,12 +24,12 @@ RATES = {"cam0": 30.0, "accel": 250.0, "gyro": 400.0}
 class Fake:
     """A camera that delivers what it is told to."""
 
-    rig: Rig = field(default_factory=profile("d435i").rig)
+    rig: Rig = field(default_factory=load_profile("d435i").rig)
     serial: str = "0123"
     rates_hz: dict[str, float] = field(default_factory=lambda: dict(RATES))
-    sink: Callable[[Sample], None] = print
+    sink: Callable[[DeviceSample], None] = print
 
-    def start(self, sink: Callable[[Sample], None]) -> None:
+    def start(self, sink: Callable[[DeviceSample], None]) -> None:
         self.sink = sink
 
     def stop(self) -> None:
@@ -70,9 +70,9 @@ def test_why_a_camera_is_still_away_is_said_once_unless_it_is_just_not_there() -
 
     first = answers[0]
     assert isinstance(first, Fake)
-    feed = Feed(connect, None, RATES, 10.0, said.append, Handover(), quick)
+    feed = CameraFeed(connect, None, RATES, 10.0, said.append, SampleQueue(), quick)
     feed.open()
-    first.sink(Sample("cam0", 10**9, None, time.monotonic_ns()))
+    first.sink(DeviceSample("cam0", 10**9, None, time.monotonic_ns()))
     reader = threading.Thread(target=lambda: list(feed.measurements()), daemon=True)
     reader.start()
     wait(lambda: len(said) >= 4)
@@ -92,7 +92,7 @@ class Playing(Fake):
 
     streams: tuple[str, ...] = ()
 
-    def start(self, sink: Callable[[Sample], None]) -> None:
+    def start(self, sink: Callable[[DeviceSample], None]) -> None:
         self.sink, self._ended = sink, threading.Event()
         threading.Thread(target=self._play, daemon=True).start()
 
@@ -100,7 +100,7 @@ class Playing(Fake):
         while not self._ended.wait(0.005):
             for stream in self.streams:
                 now = time.monotonic_ns()
-                self.sink(Sample(stream, now, (0, 0, 0), now))
+                self.sink(DeviceSample(stream, now, (0, 0, 0), now))
 
     def stop(self) -> None:
         self._ended.set()
@@ -108,13 +108,13 @@ class Playing(Fake):
 
 def test_a_stream_that_is_needed_and_never_comes_ends_it_in_a_line_after_one_reset() -> None:
     said: list[str] = []
-    feed = Feed(
+    feed = CameraFeed(
         lambda serial, epoch: Playing(streams=("accel", "gyro")),
         None,
         RATES,
         10.0,
         said.append,
-        Handover(),
+        SampleQueue(),
         quick,
     )
     feed.open()
@@ -128,14 +128,14 @@ def test_a_stream_that_is_needed_and_never_comes_ends_it_in_a_line_after_one_res
         "cam0: no more samples come; looks for camera 0123 until it is back",
         "camera 0123 is connected again; a new stretch begins",
     ]
-    assert feed.in_vain
+    assert feed.has_failed
 
 
 def test_depth_beside_stereo_is_done_without_and_welcome_again() -> None:
     said: list[str] = []
     rates = RATES | {"cam1": 30.0, "depth": 30.0}
     camera = Playing(streams=("cam0", "cam1", "accel", "gyro"))
-    feed = Feed(lambda serial, epoch: camera, None, rates, 10.0, said.append, Handover(), quick)
+    feed = CameraFeed(lambda serial, epoch: camera, None, rates, 10.0, said.append, SampleQueue(), quick)
     feed.open()
     reader = threading.Thread(target=lambda: list(feed.measurements()), daemon=True)
     reader.start()
@@ -147,17 +147,17 @@ def test_depth_beside_stereo_is_done_without_and_welcome_again() -> None:
     assert said[-1] == "depth: heard again"
     feed.stop()
     reader.join(5)
-    assert (feed.report()["resets"], feed.in_vain) == (1, False)
+    assert (feed.report()["resets"], feed.has_failed) == (1, False)
 
 
 def test_gaps_are_told_by_the_rates_that_the_camera_has() -> None:
     slow = Fake(rates_hz=RATES | {"accel": 100.0})
-    feed = Feed(lambda serial, epoch: slow, None, RATES, 10.0, print, Handover())
+    feed = CameraFeed(lambda serial, epoch: slow, None, RATES, 10.0, print, SampleQueue())
     feed.open()
     for at_ms in range(0, 1000, 10):
         for stream in ("accel", "gyro"):
-            slow.sink(Sample(stream, at_ms * 10**6, (0, 0, 0), at_ms * 10**6))
+            slow.sink(DeviceSample(stream, at_ms * 10**6, (0, 0, 0), at_ms * 10**6))
     feed.stop()
     joined = list(feed.measurements())
     assert len(joined) == 100
-    assert (feed.intake.streams["accel"].gaps, feed.intake.streams["gyro"].gaps) == (0, 99)
+    assert (feed.processor.streams["accel"].gaps, feed.processor.streams["gyro"].gaps) == (0, 99)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from share.cameras.handover import Handover, KeepNewest
-from share.sensors.intake import Sample
+from share.cameras.sample_queue import NewestImageQueue, SampleQueue
+from share.sensors.sample_processor import DeviceSample
 
 
-def filled(queue: Handover, pairs: int) -> list[tuple[str, int]]:
+def filled(queue: SampleQueue, pairs: int) -> list[tuple[str, int]]:
     """What can be taken after so many pairs of images, each with a sample of the gyroscope before it."""
     for stamp in range(pairs):
         for stream in ("gyro", "cam0", "cam1"):
-            queue.put(Sample(stream, stamp, None, 0))
+            queue.put(DeviceSample(stream, stamp, None, 0))
     queue.close()
     taken = []
     while (sample := queue.get(0)) is not None:
@@ -23,27 +23,27 @@ def images(taken: list[tuple[str, int]]) -> list[tuple[str, int]]:
 
 
 def test_the_oldest_pairs_stay_and_a_pair_is_never_parted() -> None:
-    queue = Handover(most_images=3)
+    queue = SampleQueue(max_images=3)
     assert images(filled(queue, 5)) == [("cam0", 0), ("cam1", 0), ("cam0", 1), ("cam1", 1)]
     assert queue.dropped == {"cam0": 3, "cam1": 3}
 
 
 def test_the_newest_pairs_stay_and_a_pair_is_never_parted() -> None:
-    queue = KeepNewest(most_images=4)
+    queue = NewestImageQueue(max_images=4)
     assert images(filled(queue, 5)) == [("cam0", 3), ("cam1", 3), ("cam0", 4), ("cam1", 4)]
     assert queue.dropped == {"cam0": 3, "cam1": 3}
 
 
 def test_the_imu_stays_in_order_whatever_is_dropped() -> None:
-    for queue in (Handover(most_images=2), KeepNewest(most_images=2)):
+    for queue in (SampleQueue(max_images=2), NewestImageQueue(max_images=2)):
         taken = filled(queue, 50)
         assert [stamp for stream, stamp in taken if stream == "gyro"] == list(range(50))
         assert "gyro" not in queue.dropped
-        assert (queue.images, len(queue)) == (0, 0)
+        assert (queue.image_count, len(queue)) == (0, 0)
 
 
 def test_a_bound_holds_for_the_imu_too() -> None:
-    queue = Handover(most_motion=3)
+    queue = SampleQueue(max_imu_samples=3)
     for stamp in range(5):
-        queue.put(Sample("accel", stamp, None, 0))
+        queue.put(DeviceSample("accel", stamp, None, 0))
     assert (len(queue), queue.dropped) == (3, {"accel": 2})

@@ -16,7 +16,7 @@ from share.config import Config
 from share.errors import DataError, ShareError
 from share.lab.calibrate.imu_table import read_imu
 from share.recordings import realsense_db3
-from share.runtime.pipeline import frames_of
+from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 
@@ -38,7 +38,7 @@ def change(path: Path, *statements: str, values: tuple[object, ...] = ()) -> Non
 def read(path: Path) -> tuple[int, dict[str, int]]:
     """How many frames, and what was left out."""
     source = open_source(str(path))
-    return len(list(frames_of(source, Config(), SequencerCounters()))), source.losses.counts
+    return len(list(read_frames(source, Config(), SequencerCounters()))), source.losses.counts
 
 
 def test_it_is_read_as_it_is(path):
@@ -98,9 +98,9 @@ def test_what_hangs_on_tables_is_never_run(path):
 
 def test_a_search_ends(path, monkeypatch):
     """Rows of other topics, of which there may be any number."""
-    monkeypatch.setattr("share.files.sqlite_file._STEPS", 1000)
-    monkeypatch.setattr("share.files.sqlite_file._STEPS_A_BYTE", 0)
-    monkeypatch.setattr("share.files.sqlite_file._EVERY", 100)
+    monkeypatch.setattr("share.files.sqlite_file._MIN_STEPS", 1000)
+    monkeypatch.setattr("share.files.sqlite_file._STEPS_PER_BYTE", 0)
+    monkeypatch.setattr("share.files.sqlite_file._STEPS_PER_CHECK", 100)
     with pytest.raises(DataError, match="interrupted"):
         open_source(str(path))
 
@@ -167,7 +167,7 @@ def test_a_message_larger_than_any_is_not_read(path, monkeypatch):
     monkeypatch.setattr(
         realsense_db3,
         "_DATA_OR_NULL",
-        realsense_db3._DATA_OR_NULL.replace(str(realsense_db3._MOST_MESSAGE), "100000"),
+        realsense_db3._DATA_OR_NULL.replace(str(realsense_db3._MAX_MESSAGE_BYTES), "100000"),
     )
     change(path, "UPDATE messages SET data = zeroblob(200000) WHERE id = (SELECT id FROM messages "
            f"WHERE topic_id = {topic(path, EYE_DATA)} LIMIT 1)")  # fmt: skip

@@ -15,19 +15,19 @@ from recordings import HEIGHT, WIDTH, depth_mm, make_euroc, make_tum, picture
 from special_files import KINDS, special
 
 from share.config import Config
-from share.errors import ConfigError, DataError, MisfitError, one_line
+from share.errors import CalibrationMismatchError, ConfigError, DataError, one_line
 from share.files.json_file import read_json
 from share.files.line_file import LineFile
-from share.files.reading import inside, read_bytes
-from share.files.writing import atomic_write, fresh
+from share.files.reading import path_inside, read_bytes
+from share.files.writing import atomic_write, open_new
 from share.files.yaml_file import read_yaml
 from share.plain_data import load_yaml
 from share.recordings.calibration import read_calibration
 from share.recordings.images import EncodedImage, decode_gray, image_header
 from share.recordings.mcap.recorder import Recorder
 from share.recordings.session import read_session
-from share.recordings.tables import longest_rising, read_table
-from share.runtime.pipeline import frames_of
+from share.recordings.tables import longest_nondecreasing, read_table
+from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 
@@ -149,7 +149,7 @@ def test_an_image_that_is_no_file_costs_itself(tmp_path, kind, file):
     (room / file).unlink()
     special(room / file, kind)
     source = open_source(str(room))
-    assert len(list(frames_of(source, Config(), SequencerCounters()))) == 29
+    assert len(list(read_frames(source, Config(), SequencerCounters()))) == 29
     (said,) = source.losses.lines()
     assert f"a {kind}, not a regular file" in said
 
@@ -203,7 +203,9 @@ def test_an_image_that_says_that_it_is_huge_is_never_decoded(monkeypatch, make, 
     data = make(*size)
     monkeypatch.setattr(cv2, "imdecode", None)  # would be a TypeError
     assert image_header(data)[:2] == size
-    with pytest.raises(MisfitError, match=f"is {size[0]}x{size[1]}, but the calibration is for 64x48"):
+    with pytest.raises(
+        CalibrationMismatchError, match=f"is {size[0]}x{size[1]}, but the calibration is for 64x48"
+    ):
         EncodedImage(data, "x", WIDTH, HEIGHT).load()
     with pytest.raises(DataError, match="which no camera takes"):
         decode_gray(data, "x")
@@ -240,7 +242,7 @@ def test_one_damaged_image_costs_itself_and_its_imu_samples_go_to_the_next(tmp_p
     names = [line.split(",")[1] for line in (room / "mav0/cam0/data.csv").read_text().splitlines()[1:]]
     (room / "mav0/cam0/data" / names[number]).write_bytes(damage)
     source = open_source(str(room))
-    out = list(frames_of(source, Config(), SequencerCounters()))
+    out = list(read_frames(source, Config(), SequencerCounters()))
     assert [f.stamp_ns for f in out] == [f.stamp_ns for k, f in enumerate(whole) if k != number]
     at = min(number, len(out) - 1)
     expected = np.concatenate([whole[number].imu.stamps_ns, whole[number + 1].imu.stamps_ns])
@@ -252,16 +254,23 @@ def test_a_recording_of_another_size_is_refused_soon(tmp_path):
     room = make_euroc(tmp_path / "room", frames=30)
     sheet = room / "mav0/cam0/sensor.yaml"
     sheet.write_text(sheet.read_text().replace("[64, 48]", "[32, 24]"))
-    with pytest.raises(MisfitError, match="is 64x48, but the calibration is for 32x24"):
-        list(frames_of(open_source(str(room)), Config(), SequencerCounters()))
+    with pytest.raises(CalibrationMismatchError, match="is 64x48, but the calibration is for 32x24"):
+        list(read_frames(open_source(str(room)), Config(), SequencerCounters()))
 
 
 # ------------------------------------------------------------------ tables, paths, names
 
 
 def test_stamps_in_disorder_cost_the_fewest_lines_that_they_can():
-    assert longest_rising(np.array([1, 2, 9, 3, 3, 4])).tolist() == [True, True, False, True, True, True]
-    assert longest_rising(np.arange(200_000)[::-1]).sum() == 1
+    assert longest_nondecreasing(np.array([1, 2, 9, 3, 3, 4])).tolist() == [
+        True,
+        True,
+        False,
+        True,
+        True,
+        True,
+    ]
+    assert longest_nondecreasing(np.arange(200_000)[::-1]).sum() == 1
 
 
 def test_a_line_of_100_mb_is_one_short_complaint(tmp_path):
@@ -279,8 +288,8 @@ def test_a_message_is_one_line_whatever_it_quotes():
 @pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/../../x", "a\0b", "", "x" * 300, "a/" * 600])
 def test_paths_in_files_stay_in_their_folder(tmp_path, name):
     with pytest.raises(DataError, match="is no name of a file below"):
-        inside(tmp_path, name, "x.csv, line 1")
-    assert inside(tmp_path, "rgb/1.png", "") == tmp_path / "rgb/1.png"
+        path_inside(tmp_path, name, "x.csv, line 1")
+    assert path_inside(tmp_path, "rgb/1.png", "") == tmp_path / "rgb/1.png"
 
 
 @pytest.mark.parametrize("name", ["../x", "/etc/x", "a\\0b", "x" * 1_000, ".hidden", "a b", ""])
@@ -305,7 +314,7 @@ def test_nothing_is_written_through_a_link_in_the_folder(tmp_path):
     for name, write in (
         ("report.json", lambda path: atomic_write(path, "new")),
         ("events.jsonl", lambda path: LineFile(path, print).close()),
-        ("log", lambda path: fresh(path).close()),
+        ("log", lambda path: open_new(path).close()),
         ("x.mcap.part", lambda path: Recorder(path.with_suffix(""), RIG).abort()),
     ):
         for link in (os.symlink, os.link):

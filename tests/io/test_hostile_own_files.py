@@ -21,18 +21,18 @@ from share.files.line_file import GrowingFile
 from share.files.yaml_file import read_settings, read_yaml
 from share.lab.emulate.chunks import read_chunk
 from share.lab.emulate.room_file import open_renderer
-from share.lab.emulate.world.files import load_room
+from share.lab.emulate.world.room_files import load_room
 from share.lab.evaluate import charts
 from share.lab.evaluate.charts import draw_bars
-from share.lab.evaluate.page import page
-from share.lab.evaluate.report import annex
+from share.lab.evaluate.html_page import html_page
+from share.lab.evaluate.report import read_section
 from share.lab.evaluate.trial import read_trial
-from share.lab.evaluate.virtual import costs_of
-from share.lab.train.fitted import Fitted, read_fitted, write_fitted
+from share.lab.evaluate.virtual_time import read_delays
 from share.lab.train.labels import Labels, read_labels, write_labels
 from share.lab.train.score import read_scores
+from share.lab.train.trained_heads import TrainedHeads, read_trained, write_trained
 from share.net.keys import AllowList
-from share.odometry.error_model.features import SHAPES, kind_of
+from share.odometry.error_model.inputs import INPUT_SHAPES, input_dtype
 from share.recordings.tables import read_table
 
 pytestmark = pytest.mark.usefixtures("soon")
@@ -115,7 +115,7 @@ def test_an_archive_that_unpacks_without_end_is_not_unpacked(tmp_path, monkeypat
 
 
 def labels(count: int = 3) -> Labels:
-    columns = (np.zeros((count, *shape), kind_of(name)) for name, shape in SHAPES.items())
+    columns = (np.zeros((count, *shape), input_dtype(name)) for name, shape in INPUT_SHAPES.items())
     return Labels({"session": "s"}, np.arange(count), np.zeros(count, np.float32), *columns)
 
 
@@ -141,9 +141,9 @@ def test_labels_of_other_shapes_and_kinds(tmp_path):
 
 def test_weights_that_are_not_finite(tmp_path):
     head = {"a.weight": np.full(3, np.nan, np.float32)}
-    write_fitted(tmp_path / "fit.npz", Fitted([head], 0.1, np.zeros(96), np.eye(96), {}))
+    write_trained(tmp_path / "fit.npz", TrainedHeads([head], 0.1, np.zeros(96), np.eye(96), {}))
     with pytest.raises(DataError, match=r"0/a\.weight is not finite"):
-        read_fitted(tmp_path / "fit.npz")
+        read_trained(tmp_path / "fit.npz")
 
 
 # ------------------------------------------------------------------ JSON
@@ -186,7 +186,7 @@ def test_costs_by_reports_that_say_something_else(tmp_path, report):
     (tmp_path / "edge/edge.json").write_text("{}")
     (tmp_path / "ann/report.json").write_text(json.dumps(report))
     with pytest.raises(ShareError) as error:
-        costs_of(tmp_path)
+        read_delays(tmp_path)
     assert str(tmp_path) in str(error.value)
 
 
@@ -254,7 +254,7 @@ def test_byte_order_marks(tmp_path, encoding):
 
 READERS = {
     "a.npz": read_labels,
-    "fit.npz": read_fitted,
+    "fit.npz": read_trained,
     "a.npy": read_array,
     "a.json": read_scores,
     "b.json": read_json,
@@ -293,7 +293,7 @@ def test_what_is_kept_of_a_room(tmp_path, kind):
 @pytest.mark.parametrize("kind", ["pipe", "device", "socket"])
 def test_what_another_process_writes_is_no_file(tmp_path, kind):
     special(tmp_path / "odom.tum", kind)
-    assert GrowingFile(tmp_path / "odom.tum").lines() == []
+    assert GrowingFile(tmp_path / "odom.tum").new_lines() == []
 
 
 # ------------------------------------------------------------------ reports of others in ours
@@ -304,14 +304,14 @@ def test_a_report_shows_no_pictures_from_elsewhere(tmp_path, name):
     (tmp_path / "secret.png").write_bytes(b"secret")
     (tmp_path / "out").mkdir()
     with pytest.raises(DataError, match="is no name of a file below"):
-        page("x", f"![a picture]({name})", tmp_path / "out")
+        html_page("x", f"![a picture]({name})", tmp_path / "out")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_annex_that_is_no_file(tmp_path, kind):
     special(tmp_path / "sweep.md", kind)
     with pytest.raises(UsageError):
-        annex(tmp_path, 1)
+        read_section(tmp_path, 1)
 
 
 # ------------------------------------------------------------------ what is written
@@ -334,6 +334,6 @@ def test_pictures_replace_a_link_and_are_whole(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pyplot, "close", lambda figure: None)
     with pytest.raises(MemoryError):
-        charts.save(Broken(), path, 100)
+        charts.save_png(Broken(), path, 100)
     assert path.read_bytes().startswith(b"\x89PNG")
     assert sorted(one.name for one in tmp_path.iterdir()) == ["link.png", "precious", "symlink.png"]

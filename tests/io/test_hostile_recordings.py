@@ -16,13 +16,13 @@ from special_files import KINDS, special
 from share.config import Config
 from share.errors import DataError, ShareError, UsageError
 from share.geometry import se3
-from share.mapping.changes import KeepLink, Kept
-from share.mapping.loops import Key
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import SaveLink, StoredMap
 from share.recordings.images import ArrayImage
-from share.recordings.mcap.chunks import MOST_CHUNK
+from share.recordings.mcap.chunks import MAX_CHUNK_BYTES
 from share.recordings.mcap.recorder import Recorder
-from share.recordings.mcap.recover import recover
-from share.runtime.pipeline import frames_of
+from share.recordings.mcap.recover import recover_recording
+from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.measurement import Measurement
 from share.sensors.sequencer import SequencerCounters
@@ -57,19 +57,19 @@ def test_a_chunk_is_unpacked_no_further_than_it_says(tmp_path, compression, said
     import zstandard
     from mcap.records import Chunk
 
-    from share.recordings.mcap.chunks import records_of
-    from share.recordings.mcap.file import damage
+    from share.recordings.mcap.chunks import chunk_records
+    from share.recordings.mcap.file import damage_errors
 
     pack = zstandard.ZstdCompressor().compress if compression == "zstd" else lz4.frame.compress
     data = pack(bytes(50 * 10**6))
-    with pytest.raises(damage()):
-        records_of(Chunk(compression, data, 10, 0, 0, said))
+    with pytest.raises(damage_errors()):
+        chunk_records(Chunk(compression, data, 10, 0, 0, said))
     (tmp_path / "x.mcap").write_bytes(_chunk(compression, data, said))
     with pytest.raises(DataError, match="holds no complete message"):
-        recover(tmp_path / "x.mcap", tmp_path / "y.mcap")
+        recover_recording(tmp_path / "x.mcap", tmp_path / "y.mcap")
     with pytest.raises(ShareError):
         list(open_source(str(tmp_path / "x.mcap")).measurements())
-    assert MOST_CHUNK < 2 * 10**9
+    assert MAX_CHUNK_BYTES < 2 * 10**9
 
 
 def _recorded(path: Path, images: int = 40) -> Path:
@@ -114,7 +114,7 @@ def test_an_image_message_of_an_absurd_size_and_a_sample_that_is_not_finite(tmp_
                 Measurement("cam0", m.stamp_ns, ArrayImage(np.zeros((3, 5000), np.uint8))) if wrong else m
             )
     source = open_source(str(other))
-    assert len(list(frames_of(source, Config(), SequencerCounters()))) == 39
+    assert len(list(read_frames(source, Config(), SequencerCounters()))) == 39
     assert "is 5000x3, but the calibration is for 64x48" in source.losses.lines()[0]
 
 
@@ -155,10 +155,10 @@ def test_an_index_that_leads_astray(tmp_path, attack):
 # ------------------------------------------------------------------ map files
 
 
-def filled(path: Path) -> Kept:
+def filled(path: Path) -> StoredMap:
     T, cov = se3.inverse(pose(0)) @ pose(2), np.eye(6) * 1e-4
     with MapStore.open(path) as store:
-        store.write([*small_map(), KeepLink(Key(ANN, 2), 0, T, cov)])
+        store.write([*small_map(), SaveLink(KeyframeKey(ANN, 2), 0, T, cov)])
     return MapStore.read(path).load()
 
 
@@ -192,7 +192,7 @@ def test_a_map_whose_tables_are_not_ours_is_read_without_them(tmp_path, name):
             db.execute(statement)
     db.close()
     found = MapStore.read(path).load()
-    assert "damaged" in found.complaints[0]
+    assert "damaged" in found.problems[0]
     if "keyframe" not in name:
         assert len(found.keyframes) == len(kept.keyframes)
     with MapStore.open(path) as store:
@@ -204,7 +204,7 @@ def test_a_map_whose_tables_are_not_ours_is_read_without_them(tmp_path, name):
 
 
 def test_rows_that_say_what_cannot_be_cost_themselves(tmp_path):
-    from share.store.rows import COLUMNS, check
+    from share.store.rows import COLUMNS, row_crc
 
     path = tmp_path / "map.sqlite"
     kept = filled(path)
@@ -225,7 +225,7 @@ def test_rows_that_say_what_cannot_be_cost_themselves(tmp_path):
             sets = ", ".join(f"{name} = ?" for name in (*COLUMNS[table], "crc"))
             db.execute(
                 f"UPDATE {table} SET {sets} WHERE number = ?",
-                (*row, check(table, number, tuple(row)), number),
+                (*row, row_crc(table, number, tuple(row)), number),
             )
         db.execute("UPDATE run SET next = 1")
     db.close()
@@ -233,7 +233,7 @@ def test_rows_that_say_what_cannot_be_cost_themselves(tmp_path):
     assert len(found.keyframes) == len(kept.keyframes)
     assert len(found.loops) == len(kept.loops) - 1
     assert found.poses is None
-    said = " ".join(found.complaints)
+    said = " ".join(found.problems)
     for what in (
         "odometry edges could not be read",
         "loops could not be read",

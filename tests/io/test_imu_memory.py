@@ -12,36 +12,36 @@ import pytest
 
 from share.errors import DataError, ShareError, UsageError
 from share.geometry.camera import ImuBias
-from share.sensors.imu_memory import Remembered, file_of, folder, recall, remember
+from share.sensors.imu_memory import SavedBias, bias_file, bias_folder, load_bias, save_bias
 
 SERIAL = "845112070914"
-WHAT = Remembered(1_790_000_000_123_456_789, ImuBias([0.004, -0.005, 1 / 3e3], [0.1, -0.2, 0.25], 2e-4, 4e-3))
+WHAT = SavedBias(1_790_000_000_123_456_789, ImuBias([0.004, -0.005, 1 / 3e3], [0.1, -0.2, 0.25], 2e-4, 4e-3))
 
 
 def told(**changes: Any) -> dict[str, Any]:
-    remember(SERIAL, WHAT)
-    return json.loads(file_of(SERIAL).read_text()) | changes
+    save_bias(SERIAL, WHAT)
+    return json.loads(bias_file(SERIAL).read_text()) | changes
 
 
 def test_it_is_read_as_it_was_written_to_the_last_digit() -> None:
-    assert recall(SERIAL) is None
-    remember(SERIAL, WHAT)
-    found = recall(SERIAL)
+    assert load_bias(SERIAL) is None
+    save_bias(SERIAL, WHAT)
+    found = load_bias(SERIAL)
     assert found is not None
-    assert found.at_ns == WHAT.at_ns
+    assert found.run_end_ns == WHAT.run_end_ns
     assert found.bias.gyro.tobytes() == WHAT.bias.gyro.tobytes()
     assert found.bias.accel.tobytes() == WHAT.bias.accel.tobytes()
     assert (found.bias.gyro_sigma, found.bias.accel_sigma) == (2e-4, 4e-3)
-    assert recall("0123") is None
+    assert load_bias("0123") is None
 
 
 def test_it_is_where_the_system_keeps_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    assert file_of(SERIAL) == tmp_path / "share" / "imu" / f"{SERIAL}.json"
+    assert bias_file(SERIAL) == tmp_path / "share" / "imu" / f"{SERIAL}.json"
     monkeypatch.setenv("HOME", str(tmp_path))
     for unset in ("", "relative/to/nothing"):  # which the XDG specification calls invalid
         monkeypatch.setenv("XDG_STATE_HOME", unset)
-        assert folder() == tmp_path / ".local" / "state" / "share" / "imu"
+        assert bias_folder() == tmp_path / ".local" / "state" / "share" / "imu"
 
 
 def test_nobody_without_a_home_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,7 +51,7 @@ def test_nobody_without_a_home_is_remembered(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delenv("XDG_STATE_HOME")
     monkeypatch.setattr(Path, "home", homeless)
     with pytest.raises(UsageError, match="set XDG_STATE_HOME"):
-        recall(SERIAL)
+        load_bias(SERIAL)
 
 
 @pytest.mark.parametrize(
@@ -60,10 +60,10 @@ def test_nobody_without_a_home_is_remembered(monkeypatch: pytest.MonkeyPatch) ->
 )
 def test_no_serial_number_leads_out_of_the_folder(serial: str) -> None:
     with pytest.raises(DataError, match="is no serial number"):
-        recall(serial)
+        load_bias(serial)
     with pytest.raises(DataError, match="is no serial number"):
-        remember(serial, WHAT)
-    assert not folder().exists()
+        save_bias(serial, WHAT)
+    assert not bias_folder().exists()
 
 
 @pytest.mark.parametrize(
@@ -85,9 +85,9 @@ def test_no_serial_number_leads_out_of_the_folder(serial: str) -> None:
     ],
 )
 def test_a_file_that_says_what_no_imu_has_is_damaged(change: dict[str, Any]) -> None:
-    file_of(SERIAL).write_text(json.dumps(told(**change)))
+    bias_file(SERIAL).write_text(json.dumps(told(**change)))
     with pytest.raises(DataError, match=rf"{SERIAL}.json: is damaged, or by another SHARE"):
-        recall(SERIAL)
+        load_bias(SERIAL)
 
 
 @pytest.mark.parametrize(
@@ -95,26 +95,26 @@ def test_a_file_that_says_what_no_imu_has_is_damaged(change: dict[str, Any]) -> 
 )
 def test_a_file_that_is_no_json_object_is_damaged(text: str) -> None:
     told()
-    file_of(SERIAL).write_text(text)
+    bias_file(SERIAL).write_text(text)
     with pytest.raises(DataError, match="damaged"):
-        recall(SERIAL)
+        load_bias(SERIAL)
 
 
 def test_what_is_no_file_is_not_waited_for() -> None:
-    folder().mkdir(parents=True)
-    os.mkfifo(file_of(SERIAL))
+    bias_folder().mkdir(parents=True)
+    os.mkfifo(bias_file(SERIAL))
     with pytest.raises(DataError, match="it is a pipe"):
-        recall(SERIAL)
+        load_bias(SERIAL)
     with pytest.raises(ShareError):
-        remember(SERIAL, WHAT)
+        save_bias(SERIAL, WHAT)
 
 
 def test_a_link_in_the_place_of_the_file_is_replaced_and_not_followed(tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     mine.write_text("mine")
-    folder().mkdir(parents=True)
-    file_of(SERIAL).symlink_to(mine)
-    remember(SERIAL, WHAT)
+    bias_folder().mkdir(parents=True)
+    bias_file(SERIAL).symlink_to(mine)
+    save_bias(SERIAL, WHAT)
     assert mine.read_text() == "mine"
-    assert recall(SERIAL) is not None
-    assert np.array_equal(recall(SERIAL).bias.accel, WHAT.bias.accel)  # type: ignore[union-attr]
+    assert load_bias(SERIAL) is not None
+    assert np.array_equal(load_bias(SERIAL).bias.accel, WHAT.bias.accel)  # type: ignore[union-attr]

@@ -9,19 +9,19 @@ from recordings import make_euroc, make_tum
 from share.errors import DataError, UsageError
 from share.lab.calibrate.imu_table import read_imu
 from share.recordings.convert import to_mcap
-from share.recordings.losses import Losses
+from share.recordings.losses import DataLosses
 from share.recordings.mcap import imu as fast
-from share.recordings.mcap import types as ros
+from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.recorder import Recorder
 from share.runtime.source import open_source
 from share.sensors.measurement import IMU, Measurement
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
 from share.sensors.stamps import WRAP_NS
 
 
 def recorded(path: Path, stamps: list[int], values: np.ndarray, log: list[int] | None = None) -> Path:
     """An MCAP with the IMU alone."""
-    with Recorder(path, profile("d435i").rig()) as recorder:
+    with Recorder(path, load_profile("d435i").rig()) as recorder:
         for stamp, sample, at in zip(stamps, values, log or stamps, strict=True):
             recorder.write(Measurement(IMU, stamp, sample), at)
     return path
@@ -57,12 +57,14 @@ def test_all_forms_of_one_recording_say_the_same(tmp_path, monkeypatch):
 def test_messages_are_read_as_rosbags_writes_them(frame):
     """Doubles begin at a multiple of eight, whatever the length of the frame's name."""
     numbers = iter(np.random.default_rng(1).normal(size=10))
-    vector, other = (ros.make("geometry_msgs/msg/Vector3", **{k: next(numbers) for k in "xyz"}) for _ in "ab")
-    q = ros.make("geometry_msgs/msg/Quaternion", **{k: next(numbers) for k in "xyzw"})
+    vector, other = (
+        ros.make_message("geometry_msgs/msg/Vector3", **{k: next(numbers) for k in "xyz"}) for _ in "ab"
+    )
+    q = ros.make_message("geometry_msgs/msg/Quaternion", **{k: next(numbers) for k in "xyzw"})
     covariances = [np.full(9, float(k)) for k in range(3)]
-    message = ros.make(
+    message = ros.make_message(
         ros.IMU_MSG,
-        header=ros.header(12_000_000_345, frame),
+        header=ros.make_header(12_000_000_345, frame),
         orientation=q,
         orientation_covariance=covariances[0],
         angular_velocity=vector,
@@ -70,13 +72,13 @@ def test_messages_are_read_as_rosbags_writes_them(frame):
         linear_acceleration=other,
         linear_acceleration_covariance=covariances[2],
     )
-    stamps, values = fast._unpacked([ros.encode(message)] * 2)
+    stamps, values = fast._parse_batch([ros.encode(message)] * 2)
     assert stamps.tolist() == [12_000_000_345] * 2
     assert values[1].tolist() == [getattr(v, k) for v in (vector, other) for k in "xyz"]
-    losses = Losses()
-    assert len(fast._readable([ros.encode(message)[:-8], ros.encode(message)], "here", losses)) == 1
+    losses = DataLosses()
+    assert len(fast._intact_messages([ros.encode(message)[:-8], ros.encode(message)], "here", losses)) == 1
     losses.check("IMU messages", 2)
-    assert not fast._readable([ros.encode(message)[:-8]], "here", losses)
+    assert not fast._intact_messages([ros.encode(message)[:-8]], "here", losses)
     with pytest.raises(DataError, match="here: a message is no sensor_msgs/Imu"):
         losses.check("IMU messages", 3)
 

@@ -29,8 +29,8 @@ def text(*paths: Path) -> str:
 
 
 def test_a_pair_is_read_as_it_was_made(tmp_path: Path) -> None:
-    pair = keys.generate(tmp_path / "new" / "keys", "edge")
-    assert keys.load(tmp_path / "new" / "keys") == pair
+    pair = keys.generate_pair(tmp_path / "new" / "keys", "edge")
+    assert keys.load_pair(tmp_path / "new" / "keys") == pair
     assert zmq.curve_public(pair.secret.encode()).decode() == pair.public
     assert text(tmp_path / "new/keys/edge.public") == f"share-public-key edge {pair.public}\n"
     assert pair.secret not in repr(pair)
@@ -40,7 +40,7 @@ def test_a_pair_is_read_as_it_was_made(tmp_path: Path) -> None:
 def test_only_the_owner_can_read_the_secret(tmp_path: Path) -> None:
     old = os.umask(0)
     try:
-        keys.generate(tmp_path / "keys", "edge")
+        keys.generate_pair(tmp_path / "keys", "edge")
     finally:
         os.umask(old)
     assert stat.S_IMODE((tmp_path / "keys" / "edge.secret").stat().st_mode) == 0o600
@@ -49,17 +49,17 @@ def test_only_the_owner_can_read_the_secret(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])
 def test_a_secret_that_others_can_read_is_refused(mode: int, tmp_path: Path) -> None:
-    keys.generate(tmp_path, "edge")
+    keys.generate_pair(tmp_path, "edge")
     (tmp_path / "edge.secret").chmod(mode)
     with pytest.raises(UsageError, match=r"edge\.secret: others can read this secret; `chmod 600 "):
-        keys.load(tmp_path)
+        keys.load_pair(tmp_path)
 
 
 def test_a_pair_is_never_replaced(tmp_path: Path) -> None:
-    pair = keys.generate(tmp_path, "edge")
+    pair = keys.generate_pair(tmp_path, "edge")
     with pytest.raises(UsageError, match="there is a key pair already"):
-        keys.generate(tmp_path, "other")
-    assert keys.load(tmp_path) == pair
+        keys.generate_pair(tmp_path, "other")
+    assert keys.load_pair(tmp_path) == pair
     assert sorted(os.listdir(tmp_path)) == ["edge.public", "edge.secret"]
 
 
@@ -68,19 +68,19 @@ def test_no_public_key_looks_like_an_option(tmp_path: Path, monkeypatch: pytest.
     drawn[2] = next(pair for pair in iter(zmq.curve_keypair, None) if pair[0][:1].isalnum())
     expected = drawn[2][0].decode()
     monkeypatch.setattr(zmq, "curve_keypair", lambda: drawn.pop(0))
-    assert keys.generate(tmp_path, "edge").public == expected
+    assert keys.generate_pair(tmp_path, "edge").public == expected
 
 
 def test_named_after_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("socket.gethostname", lambda: "-lab pc.local")
-    assert keys.generate(tmp_path).name == "lab-pc-local"
+    assert keys.generate_pair(tmp_path).name == "lab-pc-local"
 
 
 @pytest.mark.parametrize("name", ["", "a b", "../x", ".x", "-x", "x" * 65, "zoë", "a\n"])
 def test_names(name: str, tmp_path: Path) -> None:
     for use in (
         lambda: keys.authorize(tmp_path, name, "0" * 40),
-        lambda: keys.generate(tmp_path, name or " "),
+        lambda: keys.generate_pair(tmp_path, name or " "),
     ):
         with pytest.raises(UsageError, match="a name has 1 to 64 letters"):
             use()
@@ -101,10 +101,10 @@ def test_names(name: str, tmp_path: Path) -> None:
     ],
 )
 def test_a_folder_that_cannot_be_used(damage, said: str, tmp_path: Path) -> None:
-    keys.generate(tmp_path, "edge")
+    keys.generate_pair(tmp_path, "edge")
     damage(tmp_path)
     with pytest.raises(UsageError, match=said):
-        keys.load(tmp_path)
+        keys.load_pair(tmp_path)
 
 
 def test_a_folder_that_may_not_be_read_is_not_said_to_be_empty(
@@ -113,11 +113,11 @@ def test_a_folder_that_may_not_be_read_is_not_said_to_be_empty(
     def denied(where: object) -> list[str]:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(where))
 
-    keys.generate(tmp_path, "edge")
+    keys.generate_pair(tmp_path, "edge")
     assert not keys.has_pair(tmp_path / "none")
     monkeypatch.setattr(os, "listdir", denied)  # root, who may run this, may read all
     monkeypatch.setattr(os, "scandir", denied)
-    for look in (keys.load, keys.has_pair, keys.edge_keys):
+    for look in (keys.load_pair, keys.has_pair, keys.edge_keys):
         with pytest.raises(UsageError, match=rf"^{tmp_path}: cannot be read: Permission denied$"):
             look(tmp_path)
 
@@ -130,7 +130,7 @@ def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_public_key_is_given_as_text_line_or_file(tmp_path: Path) -> None:
-    pair = keys.generate(tmp_path, "ann")
+    pair = keys.generate_pair(tmp_path, "ann")
     line = text(tmp_path / "ann.public")
     given = (pair.public, line.strip(), str(tmp_path / "ann.public"))
     assert [keys.public_key(one) for one in given] == [pair.public] * 3
@@ -147,7 +147,7 @@ def test_a_public_key_is_given_as_text_line_or_file(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_public_key(given: str, said: str, tmp_path: Path) -> None:
-    keys.generate(tmp_path, "ann")
+    keys.generate_pair(tmp_path, "ann")
     with pytest.raises(UsageError, match=said):
         keys.public_key(given.format(tmp_path))
 
@@ -161,14 +161,14 @@ def key(number: int) -> str:
 
 def test_authorize_and_revoke(tmp_path: Path) -> None:
     allowed = keys.allow_list(tmp_path)
-    assert allowed.names() == {}
+    assert allowed.names_by_key() == {}
     keys.authorize(tmp_path, "bob", key(2))
     keys.authorize(tmp_path, "ann", key(1))
     keys.authorize(tmp_path, "ann", key(1))  # again: nothing new
-    assert allowed.names() == {key(1): "ann", key(2): "bob"}
+    assert allowed.names_by_key() == {key(1): "ann", key(2): "bob"}
     assert text(allowed.path) == f"share-public-key bob {key(2)}\nshare-public-key ann {key(1)}\n"
     keys.revoke(tmp_path, "ann")
-    assert [allowed.admits(key(n)) for n in (1, 2)] == [False, True]
+    assert [allowed.is_allowed(key(n)) for n in (1, 2)] == [False, True]
     with pytest.raises(UsageError, match="'ann' is not authorized; there is bob"):
         keys.revoke(tmp_path, "ann")
 
@@ -179,14 +179,14 @@ def test_one_name_one_key(tmp_path: Path) -> None:
         keys.authorize(tmp_path, "ann", key(2))
     with pytest.raises(UsageError, match="'bob': this key is authorized already, as 'ann'"):
         keys.authorize(tmp_path, "bob", key(1))
-    assert keys.allow_list(tmp_path).names() == {key(1): "ann"}
+    assert keys.allow_list(tmp_path).names_by_key() == {key(1): "ann"}
 
 
 def test_a_list_made_of_public_key_files(tmp_path: Path) -> None:
-    pairs = [keys.generate(tmp_path / name, name) for name in ("ann", "bob")]
+    pairs = [keys.generate_pair(tmp_path / name, name) for name in ("ann", "bob")]
     path = tmp_path / "authorized"
     path.write_text("# ours\n\n" + text(*(tmp_path / p.name / f"{p.name}.public" for p in pairs)))
-    assert AllowList(path).names() == {pair.public: pair.name for pair in pairs}
+    assert AllowList(path).names_by_key() == {pair.public: pair.name for pair in pairs}
 
 
 def test_what_was_written_by_hand_stays(tmp_path: Path) -> None:
@@ -202,32 +202,32 @@ def test_a_key_that_stands_there_twice_is_revoked_by_either_name(tmp_path: Path)
     for name in ("ann", "old-ann"):
         path.write_text("".join(f"share-public-key {n} {key(1)}\n" for n in ("ann", "old-ann")))
         keys.revoke(tmp_path, name)
-        assert not AllowList(path).admits(key(1))
+        assert not AllowList(path).is_allowed(key(1))
 
 
 def test_what_anybody_may_write_to_lets_nobody_in(tmp_path: Path) -> None:
-    keys.generate(tmp_path, "edge")
+    keys.generate_pair(tmp_path, "edge")
     keys.authorize(tmp_path, "ann", key(1))
     allowed = keys.allow_list(tmp_path)
-    assert (allowed.admits(key(1)), allowed.trouble()) == (True, None)
+    assert (allowed.is_allowed(key(1)), allowed.trouble()) == (True, None)
     allowed.path.chmod(0o666)
-    assert not allowed.admits(key(1))
+    assert not allowed.is_allowed(key(1))
     assert allowed.trouble() == f"{allowed.path}: anybody may write to it; `chmod o-w {allowed.path}`"
     allowed.path.chmod(0o664)
-    assert allowed.admits(key(1))
+    assert allowed.is_allowed(key(1))
     tmp_path.chmod(0o777)
     with pytest.raises(UsageError, match=f"^{tmp_path}: anybody may write to it; `chmod o-w"):
-        keys.load(tmp_path)
+        keys.load_pair(tmp_path)
     tmp_path.chmod(0o700)
 
 
 def test_a_damaged_list_lets_nobody_in_and_says_where(tmp_path: Path) -> None:
-    keys.generate(tmp_path, "edge")
+    keys.generate_pair(tmp_path, "edge")
     keys.authorize(tmp_path, "ann", key(1))
     allowed = keys.allow_list(tmp_path)
-    assert allowed.admits(key(1))
+    assert allowed.is_allowed(key(1))
     allowed.path.write_text(text(allowed.path) + "bob\n")
-    assert not allowed.admits(key(1))
+    assert not allowed.is_allowed(key(1))
     with pytest.raises(UsageError, match="authorized, line 2: is not `share-public-key NAME KEY`"):
         keys.edge_keys(tmp_path)
 
@@ -240,7 +240,7 @@ class House:
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder, self._stack = folder / "edge", stack
-        self.pair = keys.generate(self.folder, "edge")
+        self.pair = keys.generate_pair(self.folder, "edge")
         self.ann = self.pair_of("ann")
         keys.authorize(self.folder, "ann", self.ann.public)
         self.edge: EdgeLink = stack.enter_context(
@@ -248,7 +248,7 @@ class House:
         )
 
     def pair_of(self, name: str) -> KeyPair:
-        return keys.generate(self.folder.parent / name, name)
+        return keys.generate_pair(self.folder.parent / name, name)
 
     def agent(self, run_id: int, own: KeyPair | None, server: str | None = None) -> AgentLink:
         with_keys = None if own is None else AgentKeys(own, server or self.pair.public)

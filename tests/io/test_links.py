@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from share.errors import UsageError
-from share.net.channel import NETWORKS, Network, Way
-from share.net.emulated import Links
+from share.net.channel import NETWORK_PRESETS, ChannelModel, NetworkModel
+from share.net.emulated_link import LinkAssignment
 
 
 @pytest.mark.parametrize(
@@ -21,9 +21,9 @@ from share.net.emulated import Links
     ],
 )
 def test_whose_link_is_which(text: str | None, ann: str | None, bob: str | None) -> None:
-    links = Links.parse(text)
-    assert (links.of("ann"), links.of("bob")) == (ann, bob)
-    assert links.network("ann") == (NETWORKS[ann] if ann else Network())
+    links = LinkAssignment.parse(text)
+    assert (links.name_for("ann"), links.name_for("bob")) == (ann, bob)
+    assert links.network_for("ann") == (NETWORK_PRESETS[ann] if ann else NetworkModel())
 
 
 @pytest.mark.parametrize(
@@ -38,11 +38,11 @@ def test_whose_link_is_which(text: str | None, ann: str | None, bob: str | None)
 )
 def test_what_cannot_be_read_is_said(text: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
-        Links.parse(text)
+        LinkAssignment.parse(text)
 
 
 def test_a_link_of_nobody_is_said() -> None:
-    links = Links.parse("wifi5,bop=wifi-busy")
+    links = LinkAssignment.parse("wifi5,bop=wifi-busy")
     links.check(["ann", "bop"])
     with pytest.raises(UsageError, match="no agent is called 'bop'; there are ann, bob"):
         links.check(["ann", "bob"])
@@ -52,5 +52,5 @@ def test_a_file_may_be_called_anything(tmp_path: Path) -> None:
     odd, plain = tmp_path / "a=b,c.yaml", tmp_path / "far.yaml"
     for file in (odd, plain):
         file.write_text("up: {mbps: 5, delay_ms: 40}\n")
-    assert Links.parse(str(odd)).network("ann") == Network(Way(5.0, 40.0))
-    assert Links.parse(f"bob={plain}").network("bob") == Network(Way(5.0, 40.0))
+    assert LinkAssignment.parse(str(odd)).network_for("ann") == NetworkModel(ChannelModel(5.0, 40.0))
+    assert LinkAssignment.parse(f"bob={plain}").network_for("bob") == NetworkModel(ChannelModel(5.0, 40.0))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from share.runtime.machine import free_bytes
+from share.runtime.machine import free_memory_bytes
 
 GB = 1_000_000_000
 
@@ -20,7 +20,7 @@ def machine(
     for name, text in (files or {}).items():
         (groups / name).parent.mkdir(parents=True, exist_ok=True)
         (groups / name).write_text(text + "\n")
-    return free_bytes(proc, groups)
+    return free_memory_bytes(proc, groups)
 
 
 @pytest.mark.parametrize(
@@ -47,4 +47,4 @@ def test_a_system_that_does_not_say(tmp_path):
 
 
 def test_this_one_says():
-    assert free_bytes() > 10_000_000
+    assert free_memory_bytes() > 10_000_000

@@ -9,8 +9,8 @@ import pytest
 from map_changes import ANN, BOB, keyframe, run, small_map, solution, told
 
 from share.errors import ShareError
-from share.mapping.changes import KeepLink, Retire
-from share.mapping.loops import Key
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import RemoveKeyframes, SaveLink
 from share.store import salvage
 from share.store.map_store import MapStore, is_map
 from share.store.schema import PAGE_BYTES
@@ -27,7 +27,7 @@ def whole(tmp_path_factory):
 
 
 def damaged(folder, data, at, by):
-    """A copy of `data`, its byte `at` changed."""
+    """A copy of `data`, its byte `keyframe_key` changed."""
     path = folder / "room.sqlite"
     for old in folder.iterdir():
         old.unlink()
@@ -131,12 +131,12 @@ def test_a_row_that_says_something_else_is_not_believed(whole, tmp_path):
         kept = store.load()
         store.write([keyframe(ANN, 20)])
         newest = store.load().keyframes[-1]
-    assert (newest.stretch, newest.ordinal) == (f"{ANN}/0", 20)
-    assert kept.stretches == (f"{BOB}/0", f"{ANN}/0")
+    assert (newest.segment_name, newest.ordinal) == (f"{ANN}/0", 20)
+    assert kept.segments == (f"{BOB}/0", f"{ANN}/0")
     assert len(kept.loops) == 4
     assert len(kept.keyframes) == 39
-    assert kept.next_keyframe == {ANN: 20, BOB: 20}
-    assert [line for line in kept.complaints if "loops could" in line] == ["1 loops could not be read"]
+    assert kept.next_ids == {ANN: 20, BOB: 20}
+    assert [line for line in kept.problems if "loops could" in line] == ["1 loops could not be read"]
     assert len(kept.runs) == 2  # from their copies
 
 
@@ -152,11 +152,11 @@ def test_who_speaks_for_a_run_is_taken_over_from_a_damaged_file(whole, tmp_path)
         connection.close()
         with MapStore.open(path) as store:
             kept = store.load()
-        assert [run.voice for run in kept.runs] == (["", ""] if lost else [good["runs"][0][-1], ""])
-        said = [line for line in kept.complaints if SPEAKS in line]
+        assert [run.credential for run in kept.runs] == (["", ""] if lost else [good["runs"][0][-1], ""])
+        said = [line for line in kept.problems if SPEAKS in line]
         assert said == ([f"{lost} rows about the file, and who {SPEAKS}"] if lost else [])
         with MapStore.open(path) as store:
-            assert [run.voice for run in store.load().runs] == [run.voice for run in kept.runs]
+            assert [run.credential for run in store.load().runs] == [run.credential for run in kept.runs]
 
 
 def test_a_file_cut_short_or_grown(whole, tmp_path):
@@ -177,15 +177,15 @@ def test_a_lost_keyframe_that_others_hang_on(tmp_path):
     """Those after it are tied to the one before, by odometry; retired numbers stay retired."""
     path = tmp_path / "room.sqlite"
     with MapStore.open(path) as store:
-        link = KeepLink(Key(ANN, 6), 3, np.eye(4), np.eye(6))
+        link = SaveLink(KeyframeKey(ANN, 6), 3, np.eye(4), np.eye(6))
         frames = [keyframe(ANN, i, 300) for i in range(9)]
         store.write(
             [
                 run(ANN),
                 *frames,
                 link,
-                Retire((Key(ANN, 4), Key(ANN, 5), Key(ANN, 8))),
-                solution([Key(ANN, 6)]),
+                RemoveKeyframes((KeyframeKey(ANN, 4), KeyframeKey(ANN, 5), KeyframeKey(ANN, 8))),
+                solution([KeyframeKey(ANN, 6)]),
             ]
         )
     data = bytearray(path.read_bytes())
@@ -193,14 +193,14 @@ def test_a_lost_keyframe_that_others_hang_on(tmp_path):
     path.write_bytes(data)
     with MapStore.open(path) as store:
         kept = store.load()
-    assert [k.at.id for k in kept.keyframes] == [0, 1, 2, 6, 7]
-    assert kept.next_keyframe == {ANN: 9}
-    tie = kept.links[Key(ANN, 6)]
+    assert [k.keyframe_key.id for k in kept.keyframes] == [0, 1, 2, 6, 7]
+    assert kept.next_ids == {ANN: 9}
+    tie = kept.links[KeyframeKey(ANN, 6)]
     assert tie.reference == 2
-    T_odom = {k.at.id: k.keyframe.T_odom_body for k in kept.keyframes}
+    T_odom = {k.keyframe_key.id: k.keyframe.T_odom_body for k in kept.keyframes}
     assert np.allclose(T_odom[2] @ tie.T_ref_body, T_odom[6], atol=1e-12)
     assert np.linalg.eigvalsh(tie.cov - link.cov)[0] > 0
-    assert "1 keyframes lost the one before them and are tied to an earlier one" in kept.complaints
+    assert "1 keyframes lost the one before them and are tied to an earlier one" in kept.problems
 
 
 def test_damaged_twice_keeps_both(whole, tmp_path):
@@ -259,9 +259,9 @@ def test_a_damaged_log_costs_what_comes_after(tmp_path):
         copy.with_name("room.sqlite-wal").write_bytes(changed)
         with MapStore.open(copy) as store:
             kept = store.load()
-        numbers = [k.at.id for k in kept.keyframes]
+        numbers = [k.keyframe_key.id for k in kept.keyframes]
         assert numbers == list(range(len(numbers)))
         assert len(numbers) % 2 == 0
-        assert kept.next_keyframe.get(ANN, 0) == len(numbers)
+        assert kept.next_ids.get(ANN, 0) == len(numbers)
         lost.append(40 - len(numbers))
     assert 0 < max(lost) <= 40

@@ -10,10 +10,10 @@ from map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution
 
 from share.errors import UsageError
 from share.geometry import se3
-from share.mapping.changes import KeepLoop, KeepRun, placed
-from share.mapping.loops import Key
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import SaveLoop, SaveRun, map_poses
 from share.recordings.trajectory import read_tum
-from share.store.export import COLOURS, export, file_names
+from share.store.export import COLOURS, export_map, file_names
 from share.store.map_store import MapStore
 from share.types import AgentKind
 
@@ -47,7 +47,7 @@ def read_ply(path):
 def test_one_map(tmp_path):
     kept = kept_of(tmp_path, small_map())
     counted = []
-    done = export(kept, tmp_path / "out", counted.append)
+    done = export_map(kept, tmp_path / "out", counted.append)
     assert sorted(os.listdir(tmp_path / "out")) == ["ann.tum", "bob.tum", "loops.csv", "points.ply"]
     stamps, T = read_tum(tmp_path / "out" / "bob.tum")
     assert stamps.tolist() == [10**9 + i * 10**8 for i in range(20)]
@@ -75,18 +75,18 @@ def test_points_of_unknown_depth_are_left_out(tmp_path):
     hidden = np.array(kept.keyframes[0].keyframe.view.points)
     hidden[3:10, 2] = np.nan
     object.__setattr__(kept.keyframes[0].keyframe.view, "points", hidden)
-    export(kept, tmp_path / "out", nothing)
+    export_map(kept, tmp_path / "out", nothing)
     found, _ = read_ply(tmp_path / "out" / "points.ply")
     assert len(found) == 80 - 7
     assert np.isfinite(found).all()
 
 
 def test_several_maps_and_several_runs_of_one_name(tmp_path):
-    again = KeepRun("ann-0003", hello_of("ann", 3, AgentKind.ROBOT))
+    again = SaveRun("ann-0003", hello_of("ann", 3, AgentKind.ROBOT))
     changes = [run(ANN), run(BOB), again]
     changes += [keyframe(key, i) for i in range(3) for key in (ANN, BOB, "ann-0003")]
-    kept = kept_of(tmp_path, [*changes, solution([Key(k, i) for k in (ANN, BOB) for i in range(3)])])
-    done = export(kept, tmp_path / "out", nothing)
+    kept = kept_of(tmp_path, [*changes, solution([KeyframeKey(k, i) for k in (ANN, BOB) for i in range(3)])])
+    done = export_map(kept, tmp_path / "out", nothing)
     assert set(done) == {f"{ANN}/0", "ann-0003/0"}
     assert sorted(os.listdir(tmp_path / "out" / "ann-0001.0")) == [
         "ann-0001.tum",
@@ -100,31 +100,31 @@ def test_several_maps_and_several_runs_of_one_name(tmp_path):
 
 
 def test_a_name_that_is_another_run_s_key(tmp_path):
-    sly = KeepRun("ann-0001-0009", hello_of(ANN, 9))
+    sly = SaveRun("ann-0001-0009", hello_of(ANN, 9))
     kept = kept_of(tmp_path, [run(ANN), sly])
     assert file_names(kept) == {ANN: "ann", "ann-0001-0009": "ann-0001-0009"}
 
 
 def test_keyframes_after_the_solution_follow_their_references(tmp_path):
     kept = kept_of(tmp_path, [*small_map(), keyframe(ANN, 20), keyframe(ANN, 21)])
-    name, T = placed(kept)[Key(ANN, 21)]
+    name, T = map_poses(kept)[KeyframeKey(ANN, 21)]
     assert name == f"{ANN}/0"
     assert np.allclose(T, pose(7) @ pose(21), atol=1e-9)
 
 
 def test_refusals(tmp_path):
-    kept = kept_of(tmp_path, [run(ANN), KeepLoop(loop(1, 1))])
+    kept = kept_of(tmp_path, [run(ANN), SaveLoop(loop(1, 1))])
     with pytest.raises(UsageError, match="the map is empty"):
-        export(kept, tmp_path / "out", nothing)
+        export_map(kept, tmp_path / "out", nothing)
     with MapStore.open(tmp_path / "room.sqlite") as store:
         store.write([keyframe(ANN, 0)])
         kept = store.load()
     with pytest.raises(UsageError, match="exists and is not an empty folder"):
-        export(kept, tmp_path, nothing)
+        export_map(kept, tmp_path, nothing)
 
     def breaks(done):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        export(kept, tmp_path / "out", breaks)
+        export_map(kept, tmp_path / "out", breaks)
     assert sorted(os.listdir(tmp_path)) == ["room.sqlite", "room.sqlite.lock"]

@@ -20,12 +20,12 @@ from share.store.map_store import MapStore
 
 draw = random.Random(int(sys.argv[2]))
 with MapStore.open(Path(sys.argv[1])) as store:
-    following = store.load().next_keyframe.get(ANN, 0)
+    following = store.load().next_ids.get(ANN, 0)
     store.write([run(ANN)])
     while True:
         frames = [keyframe(ANN, following + i, 200) for i in range(draw.randrange(1, 6))]
         following += len(frames)
-        news = [*frames, solution([k.at for k in frames])]
+        news = [*frames, solution([k.keyframe_key for k in frames])]
         print("offered", following, flush=True)
         store.write(news)
         print("written", following, flush=True)
@@ -42,11 +42,11 @@ def test_killed_at_random_instants(tmp_path, kills):
         logs += path.with_name("room.sqlite-wal").exists()
         with MapStore.open(path) as store:
             kept = store.load()
-        numbers = [k.at.id for k in kept.keyframes]
+        numbers = [k.keyframe_key.id for k in kept.keyframes]
         assert numbers == list(range(len(numbers)))  # each once, in order, none missing
         assert len(numbers) in {offered, max(acknowledged, written)}  # all of a list or none
         assert len(numbers) >= max(acknowledged, written)
-        assert kept.complaints == ()
+        assert kept.problems == ()
         if numbers:
             assert kept.poses.keys[-1].id == numbers[-1]  # the solution of the same list
         written = len(numbers)

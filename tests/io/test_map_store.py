@@ -19,17 +19,17 @@ from map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution
 from special_files import KINDS, special
 
 from share.errors import StoreError, UsageError
-from share.mapping.changes import (
-    DropLoop,
-    ForgetRun,
-    KeepLink,
-    KeepLoop,
-    KeepRun,
-    KeepVoice,
-    Retire,
-    with_keys,
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import (
+    RemoveKeyframes,
+    RemoveLoops,
+    RemoveRun,
+    SaveCredential,
+    SaveLink,
+    SaveLoop,
+    SaveRun,
+    with_unknown_credentials,
 )
-from share.mapping.loops import Key
 from share.store import schema
 from share.store.map_store import MapStore, is_map
 from share.store.rows import insert
@@ -53,7 +53,7 @@ def files(path):
 def test_a_new_file_is_empty(path):
     with MapStore.open(path) as store:
         assert told(store.load()) == told(type(store.load())())
-        assert (store.writable, store.reason, store.schema) == (True, "", schema.SCHEMA)
+        assert (store.writable, store.read_only_reason, store.schema) == (True, "", schema.SCHEMA)
     assert is_map(path)
     assert files(path) == ["room.sqlite", "room.sqlite.lock"]
 
@@ -65,16 +65,16 @@ def test_all_is_found_again(path):
     kept = again(path)
     assert told(kept) == before
     frames = [keyframe(key, i) for i in range(20) for key in (ANN, BOB)]
-    assert [k.at for k in kept.keyframes] == [k.at for k in frames]
+    assert [k.keyframe_key for k in kept.keyframes] == [k.keyframe_key for k in frames]
     for found, sent in zip(kept.keyframes, frames, strict=True):
         assert np.array_equal(found.keyframe.view.descriptors, sent.keyframe.view.descriptors)
         assert np.array_equal(found.keyframe.view.points, sent.keyframe.view.points)
         assert np.array_equal(found.keyframe.T_odom_body, sent.keyframe.T_odom_body)
     assert [(x.a.id, x.inliers) for x in kept.loops] == [(i, 20 + i) for i in range(0, 20, 4)]
     assert np.array_equal(kept.poses.T_map_body[5], pose(7) @ pose(2))
-    assert kept.stretches == (f"{ANN}/0", f"{BOB}/0")
-    assert kept.next_keyframe == {ANN: 20, BOB: 20}
-    assert kept.complaints == ()
+    assert kept.segments == (f"{ANN}/0", f"{BOB}/0")
+    assert kept.next_ids == {ANN: 20, BOB: 20}
+    assert kept.problems == ()
 
 
 def test_the_same_again_changes_nothing(path):
@@ -88,44 +88,53 @@ def test_the_same_again_changes_nothing(path):
 def test_a_new_solution_takes_the_place_of_the_old(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-        store.write([solution([Key(ANN, 3)], "elsewhere")])
+        store.write([solution([KeyframeKey(ANN, 3)], "elsewhere")])
         poses = store.load().poses
-    assert (poses.keys, poses.maps) == ((Key(ANN, 3),), ("elsewhere",))
+    assert (poses.keys, poses.map_ids) == ((KeyframeKey(ANN, 3),), ("elsewhere",))
 
 
 def test_retired_keyframes_go_but_not_their_numbers(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-        link = KeepLink(Key(ANN, 5), 3, pose(2), np.eye(6) * 1e-3)
-        moved = KeepLoop(loop(3, 4))
-        store.write([DropLoop(Key(BOB, 4), Key(ANN, 4)), moved, link, Retire((Key(ANN, 4), Key(ANN, 19)))])
+        link = SaveLink(KeyframeKey(ANN, 5), 3, pose(2), np.eye(6) * 1e-3)
+        moved = SaveLoop(loop(3, 4))
+        store.write(
+            [
+                RemoveLoops(KeyframeKey(BOB, 4), KeyframeKey(ANN, 4)),
+                moved,
+                link,
+                RemoveKeyframes((KeyframeKey(ANN, 4), KeyframeKey(ANN, 19))),
+            ]
+        )
         store.write([keyframe(ANN, 4), keyframe(ANN, 19)])  # late copies
     kept = again(path)
-    numbers = [k.at.id for k in kept.keyframes if k.key == ANN]
+    numbers = [k.keyframe_key.id for k in kept.keyframes if k.run_key == ANN]
     assert numbers == [i for i in range(19) if i != 4]
-    assert kept.next_keyframe[ANN] == 20
+    assert kept.next_ids[ANN] == 20
     assert [x.a.id for x in kept.loops] == [0, 8, 12, 16, 3]
-    assert kept.links.keys() == {Key(ANN, 5)}
-    assert (kept.links[Key(ANN, 5)].reference, kept.links[Key(ANN, 5)].cov[0, 0]) == (3, 1e-3)
-    assert Key(ANN, 4) not in kept.poses.keys
+    assert kept.links.keys() == {KeyframeKey(ANN, 5)}
+    assert (kept.links[KeyframeKey(ANN, 5)].reference, kept.links[KeyframeKey(ANN, 5)].cov[0, 0]) == (3, 1e-3)
+    assert KeyframeKey(ANN, 4) not in kept.poses.keys
     assert len(kept.poses.keys) == 38
-    assert kept.complaints == ()
+    assert kept.problems == ()
 
 
 def test_the_order_of_stretches_outlives_their_keyframes(path):
     with MapStore.open(path) as store:
         store.write([run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0), keyframe(ANN, 1, first=True)])
-        store.write([Retire((Key(ANN, 0),))])
-        store.write([keyframe(ANN, 2), keyframe(ANN, 3), Retire((Key(ANN, 2),)), keyframe(ANN, 4)])
+        store.write([RemoveKeyframes((KeyframeKey(ANN, 0),))])
+        store.write(
+            [keyframe(ANN, 2), keyframe(ANN, 3), RemoveKeyframes((KeyframeKey(ANN, 2),)), keyframe(ANN, 4)]
+        )
         store.write([keyframe(ANN, 5, first=True)])
     kept = again(path)
-    assert kept.stretches == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1", f"{ANN}/2")
-    places = [(k.at.id, k.stretch, k.ordinal) for k in kept.keyframes if k.key == ANN]
+    assert kept.segments == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1", f"{ANN}/2")
+    places = [(k.keyframe_key.id, k.segment_name, k.ordinal) for k in kept.keyframes if k.run_key == ANN]
     assert places == [(1, f"{ANN}/1", 0), (3, f"{ANN}/1", 2), (4, f"{ANN}/1", 3), (5, f"{ANN}/2", 0)]
 
 
 def voices(path):
-    return {run.key: run.voice for run in again(path).runs}
+    return {run.run_key: run.credential for run in again(path).runs}
 
 
 def test_who_speaks_for_a_run_is_kept_and_may_change(path):
@@ -134,10 +143,12 @@ def test_who_speaks_for_a_run_is_kept_and_may_change(path):
     assert voices(path) == {ANN: f"key of {ANN[:3]}", BOB: ""}
     for voice in ("E", "F", ""):
         with MapStore.open(path) as store:
-            store.write([KeepVoice(BOB, voice), KeepVoice(ANN, voice), KeepVoice("eve-0003", "E")])
+            store.write(
+                [SaveCredential(BOB, voice), SaveCredential(ANN, voice), SaveCredential("eve-0003", "E")]
+            )
         assert voices(path) == {ANN: voice, BOB: voice}
     with MapStore.open(path) as store:
-        store.write([KeepVoice(BOB, "B"), KeepVoice(ANN, "A"), ForgetRun(BOB)])
+        store.write([SaveCredential(BOB, "B"), SaveCredential(ANN, "A"), RemoveRun(BOB)])
         store.write([run(BOB)])
     assert voices(path) == {ANN: "A", BOB: ""}
 
@@ -145,25 +156,28 @@ def test_who_speaks_for_a_run_is_kept_and_may_change(path):
 def test_a_map_of_share_0_1_says_of_no_run_who_speaks_for_it_and_is_not_changed_by_opening(path):
     """It has only the rows that `about` begins with; whose number and schema are the same as now."""
     with MapStore.open(path) as store:
-        store.write([replace(one, voice="") if isinstance(one, KeepRun) else one for one in small_map()])
+        store.write([replace(one, credential="") if isinstance(one, SaveRun) else one for one in small_map()])
         assert schema.SCHEMA == 3
     with closing(sqlite3.connect(path)) as connection:
         assert {name for (name,) in connection.execute("SELECT name FROM about")} == {"schema", "made by"}
     kept = again(path)
-    assert {run.voice for run in kept.runs} == {""}
-    assert {run.voice for run in with_keys(kept).runs} == {None}  # may be anybody
-    assert kept.complaints == ()
+    assert {run.credential for run in kept.runs} == {""}
+    assert {run.credential for run in with_unknown_credentials(kept).runs} == {None}  # may be anybody
+    assert kept.problems == ()
     assert files(path) == ["room.sqlite", "room.sqlite.lock"]
     with MapStore.open(path) as store:
-        store.write([KeepVoice(ANN, "A")])
-    assert {run.key: run.voice for run in with_keys(again(path)).runs} == {ANN: "A", BOB: None}
+        store.write([SaveCredential(ANN, "A")])
+    assert {run.run_key: run.credential for run in with_unknown_credentials(again(path)).runs} == {
+        ANN: "A",
+        BOB: None,
+    }
 
 
 def test_two_loops_may_tie_one_pair(path):
     with MapStore.open(path) as store:
-        store.write([*small_map(), KeepLoop(loop(4, 4)), KeepLoop(loop(4, 4).reverse())])
+        store.write([*small_map(), SaveLoop(loop(4, 4)), SaveLoop(loop(4, 4).reverse())])
         assert len(store.load().loops) == 6
-        store.write([DropLoop(Key(ANN, 4), Key(BOB, 4))])
+        store.write([RemoveLoops(KeyframeKey(ANN, 4), KeyframeKey(BOB, 4))])
         assert len(store.load().loops) == 4
 
 
@@ -172,7 +186,7 @@ def test_a_list_of_changes_is_kept_whole_or_not_at_all(path):
         store.write([run(ANN), keyframe(ANN, 0)])
         with pytest.raises(ValueError, match=r"bob-0002 is not kept; its KeepRun comes first"):
             store.write([keyframe(ANN, 1), keyframe(BOB, 0)])
-        assert [k.at.id for k in store.load().keyframes] == [0]
+        assert [k.keyframe_key.id for k in store.load().keyframes] == [0]
 
 
 def test_another_thread_may_write(path):
@@ -262,7 +276,7 @@ def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch
     before = path.read_bytes()
     with pytest.raises(UsageError, match=f"is of schema {OLD}, from which no way leads to {schema.SCHEMA}"):
         MapStore.open(path)
-    monkeypatch.setattr(schema, "STEPS", {OLD: STEP})
+    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
     with MapStore.read(path) as reader:
         assert reader.schema == OLD
         assert told(reader.load()) == whole
@@ -278,12 +292,12 @@ def test_a_step_that_fails_leaves_the_old_file(path, monkeypatch):
         store.write(small_map())
     schema_said(path, OLD)
     before = path.read_bytes()
-    monkeypatch.setattr(schema, "STEPS", {OLD: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
+    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
     with pytest.raises(
         StoreError, match=f"no such table: nonsense; it is of schema {OLD}: use the SHARE that made it"
     ):
         MapStore.open(path)
-    monkeypatch.setattr(schema, "STEPS", {OLD: STEP})
+    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
     assert len(again(path).keyframes) == 40
     assert path.with_name(f"room.sqlite.schema-{OLD}").read_bytes() == before
 
@@ -301,12 +315,12 @@ def test_a_full_disk_keeps_nothing_half_and_works_again_afterwards(path):
         try:
             with pytest.raises(StoreError, match=r"room\.sqlite: the map cannot be written: "):
                 store.write([keyframe(ANN, i, 500) for i in range(3, 20)])
-            assert [k.at.id for k in store.load().keyframes] == [0, 1, 2]
+            assert [k.keyframe_key.id for k in store.load().keyframes] == [0, 1, 2]
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
             signal.signal(signal.SIGXFSZ, before)
         store.write([keyframe(ANN, i, 500) for i in range(3, 20)])
-    assert [k.at.id for k in again(path).keyframes] == list(range(20))
+    assert [k.keyframe_key.id for k in again(path).keyframes] == list(range(20))
 
 
 @pytest.mark.parametrize("killed", [False, True], ids=["closed", "killed"])
@@ -329,7 +343,7 @@ def test_a_map_that_may_only_be_read(killed):
             "import os, sys; from pathlib import Path; from share.store.map_store import MapStore\n"
             "if os.geteuid() == 0: os.setuid(65534)\n"
             "store = MapStore.open(Path(sys.argv[1]))\n"
-            "print(len(store.load().keyframes), store.writable, store.reason)"
+            "print(len(store.load().keyframes), store.writable, store.read_only_reason)"
         )
         done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True)
         assert (done.stdout, done.stderr) == ("40 False the file is read-only\n", "")
@@ -344,7 +358,9 @@ def test_the_file_stays_bounded_when_as_many_retire_as_come(path):
         sizes = []
         for start in range(0, 600, 20):
             batch = [keyframe(ANN, i, 500) for i in range(start, start + 20)]
-            store.write([*batch, Retire(tuple(Key(ANN, i) for i in range(start - 60, start - 40)))])
+            store.write(
+                [*batch, RemoveKeyframes(tuple(KeyframeKey(ANN, i) for i in range(start - 60, start - 40)))]
+            )
             sizes.append(sum(f.stat().st_size for f in path.parent.iterdir()))
         assert len(store.load().keyframes) == 60
     assert max(sizes[10:]) < 1.1 * max(sizes[:10])
@@ -353,13 +369,13 @@ def test_the_file_stays_bounded_when_as_many_retire_as_come(path):
 
 def test_keyframes_of_an_earlier_wire_version_that_have_not_changed_are_read(path, monkeypatch):
     with monkeypatch.context() as then:
-        then.setattr(codec, "VERSION", 3)
+        then.setattr(codec, "WIRE_VERSION", 3)
         with MapStore.open(path) as store:
             store.write(small_map())
             before = told(store.load())
     assert told(again(path)) == before
     path.unlink()
-    monkeypatch.setattr(codec, "VERSION", 99)
+    monkeypatch.setattr(codec, "WIRE_VERSION", 99)
     with MapStore.open(path) as store:
         store.write(small_map())
     monkeypatch.undo()

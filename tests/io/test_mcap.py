@@ -18,10 +18,10 @@ from share.geometry.camera import Camera, Rig
 from share.lab.calibrate.imu_table import read_imu
 from share.recordings.calibration import kalibr_texts
 from share.recordings.convert import to_euroc, to_mcap
-from share.recordings.describe import describe
+from share.recordings.describe import describe_recording
 from share.recordings.images import ArrayImage
 from share.recordings.mcap import rig as ros_rig
-from share.recordings.mcap import types as ros
+from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.recorder import Recorder
 from share.runtime.source import open_source
 from share.sensors.measurement import Measurement
@@ -65,7 +65,7 @@ def test_a_recording_comes_back_bit_for_bit(folder, tmp_path):
     assert_same_rig(source.rig, back.rig)
     np.testing.assert_allclose(back.truth().T, source.truth().T, atol=1e-8)
     assert sorted(os.listdir(out.parent)) == ["walk.mcap", "walk.truth.tum"]
-    assert describe(back)["streams"] == describe(source)["streams"]
+    assert describe_recording(back)["streams"] == describe_recording(source)["streams"]
     part = slice(2, 4)
     assert_same(frames(open_source(str(folder), frames=part)), frames(open_source(str(out), frames=part)))
 
@@ -102,7 +102,7 @@ def test_a_part_of_a_recording_with_a_timeshift(tmp_path):
     whole = frames(shifted)
     part = frames(open_source(str(tmp_path / "walk.mcap"), frames=slice(2, 4)))
     assert_same(part, whole[2:4])
-    assert_same(frames(shifted.part(slice(2, 4))), part)
+    assert_same(frames(shifted.slice_frames(slice(2, 4))), part)
     assert part[-1].imu.stamps_ns[-1] == part[-1].stamp_ns + 20_000_000
 
 
@@ -159,18 +159,18 @@ def test_jpeg_is_close_and_small(tmp_path):
 
 def test_the_rigs_timeshift_is_recorded_with_it():
     shifted = dataclasses.replace(RIG, timeshift_s=-0.0123456789)
-    assert_same_rig(ros_rig.from_json(ros_rig.to_json(shifted), "x"), shifted)
+    assert_same_rig(ros_rig.rig_from_json(ros_rig.rig_to_json(shifted), "x"), shifted)
     with pytest.raises(DataError, match="timeshift_s: 2 is not within 1 s"):
-        ros_rig.from_json(ros_rig.to_json(RIG)[:-1] + ', "timeshift_s": 2}', "x")
+        ros_rig.rig_from_json(ros_rig.rig_to_json(RIG)[:-1] + ', "timeshift_s": 2}', "x")
 
 
 def test_the_record_tells_a_lens_only_where_it_is_not_radtan():
     """So what reads no lens models still reads the recordings of cameras that it knows."""
-    assert "model" not in ros_rig.to_json(RIG)
+    assert "model" not in ros_rig.rig_to_json(RIG)
     fisheye = dataclasses.replace(
         RIG, cam0=dataclasses.replace(CAMERA, distortion=(0.01,) * 4, model="equidistant")
     )
-    assert_same_rig(ros_rig.from_json(ros_rig.to_json(fisheye), "x"), fisheye)
+    assert_same_rig(ros_rig.rig_from_json(ros_rig.rig_to_json(fisheye), "x"), fisheye)
 
 
 def test_the_rig_survives_as_ros_messages():
@@ -179,12 +179,14 @@ def test_the_rig_survives_as_ros_messages():
     np.testing.assert_allclose(tree.find("body", "cam0"), RIG.T_body_cam0, atol=1e-12)
     np.testing.assert_allclose(tree.find("depth", "cam0"), RIG.T_depth_cam0, atol=1e-12)
     assert tree.find("cam0", "moon") is None
-    info = ros_rig.to_camera_info(CAMERA, ros.header(0, "cam0"))
+    info = ros_rig.to_camera_info(CAMERA, ros.make_header(0, "cam0"))
     back = ros_rig.from_camera_info(info, "x")
     assert (back.fx, back.fy, back.cx, back.cy) == (50.0, 51.0, 31.5, 23.5)
     assert back.distortion == (*CAMERA.distortion, 0.0)
     fisheye = dataclasses.replace(CAMERA, distortion=(0.01, 0.002, -0.003, 4e-4), model="equidistant")
-    assert ros_rig.from_camera_info(ros_rig.to_camera_info(fisheye, ros.header(0, "cam0")), "x") == fisheye
+    assert (
+        ros_rig.from_camera_info(ros_rig.to_camera_info(fisheye, ros.make_header(0, "cam0")), "x") == fisheye
+    )
     info.d = np.array([0.1] * 8)
     with pytest.raises(ConfigError, match="not supported"):
         ros_rig.from_camera_info(info, "x")
@@ -218,12 +220,12 @@ def write_foreign(path: Path, topics: dict, tf=None, info=CAMERA) -> Path:
             extra["/tf_static"] = [tf]
         for name in topics if info else ():
             frame = name.split("/")[2]
-            message = ros_rig.to_camera_info(info, ros.header(10**9, frame))
+            message = ros_rig.to_camera_info(info, ros.make_header(10**9, frame))
             extra[name.rpartition("/")[0] + "/camera_info"] = [message]
         for name, messages in {**extra, **topics}.items():
             kind = messages[0].__msgtype__
             if kind not in schemas:
-                schemas[kind] = writer.register_schema(kind, "ros2msg", ros.schema(kind))
+                schemas[kind] = writer.register_schema(kind, "ros2msg", ros.message_definition(kind))
             channel = writer.register_channel(name, "cdr", schemas[kind])
             for i, message in enumerate(messages):
                 when = 10**9 + i * STEP_NS
@@ -234,7 +236,8 @@ def write_foreign(path: Path, topics: dict, tf=None, info=CAMERA) -> Path:
 
 def image_messages(count: int, frame: str, make):
     return [
-        ros.make(ros.IMAGE, header=ros.header(10**9 + i * STEP_NS, frame), **make(i)) for i in range(count)
+        ros.make_message(ros.IMAGE, header=ros.make_header(10**9 + i * STEP_NS, frame), **make(i))
+        for i in range(count)
     ]
 
 
@@ -344,7 +347,7 @@ def test_the_device_goes_with_its_recording_and_a_calibration_of_another_is_said
         for file, text in kalibr_texts(RIG, name, said).items():
             (tmp_path / name / file).write_text(text)
     for recording in (path, again):
-        assert describe(open_source(str(recording)))["serial"] == "0123"
+        assert describe_recording(open_source(str(recording)))["serial"] == "0123"
         assert open_source(str(recording), str(tmp_path / "own")).notes == ()
         (note,) = open_source(str(recording), str(tmp_path / "other")).notes
         assert note.startswith("the calibration is of device 0456, this is 0123")

@@ -9,7 +9,7 @@ import pytest
 
 from share.errors import DataError, UsageError
 from share.lab.mocap.files import pick_body, read_bodies, read_mocap
-from share.lab.mocap.mocap import Mocap
+from share.lab.mocap.trajectory import MocapTrajectory
 
 TUM = "1.0 1 2 3 0 0 0 1\n1.1 1 2 4 0 0 0 1\n1.2 1 2 5 0 0 0 1\n"
 CSV = "1000000000,1,2,3,1,0,0,0\n1100000000,1,2,4,1,0,0,0\n1200000000,1,2,5,1,0,0,0\n"
@@ -63,7 +63,7 @@ def test_what_is_damaged_is_still_said(tmp_path: Path, text: str, said: str) -> 
         read_mocap(written(tmp_path / "a.tum", text))
 
 
-SEEN = Mocap(np.array([0, 10]), np.tile(np.eye(4), (2, 1, 1)))
+SEEN = MocapTrajectory(np.array([0, 10]), np.tile(np.eye(4), (2, 1, 1)))
 
 
 def test_a_device_is_the_body_wanted_or_of_its_name_or_the_only_one() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from share.lab.evaluate.page import page
+from share.lab.evaluate.html_page import html_page
 
 TEXT = """# Two < three
 
@@ -25,7 +25,7 @@ PNG = b"\x89PNG and so on"
 @pytest.fixture
 def made(tmp_path: Path) -> str:
     (tmp_path / "one.png").write_bytes(PNG)
-    return page("R & D", TEXT, tmp_path)
+    return html_page("R & D", TEXT, tmp_path)
 
 
 def test_text_and_tables_are_html(made):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from share.errors import UsageError
-from share.geometry.se3 import compose, matrix_from_quat, so3_exp
+from share.geometry.se3 import from_rt, matrix_from_quat, so3_exp
 from share.recordings.trajectory import read_tum
 from share.runtime.pose_feed import PoseFeed
 
@@ -41,10 +41,10 @@ def waiting(app: socket.socket) -> Iterator[dict[str, Any]]:
 
 def test_a_pose_comes_as_it_was_told(app):
     feed = PoseFeed(where(app), "ann")
-    T_odom = compose(so3_exp(np.array([0.1, -0.2, 0.3])), np.array([1.0, 2.0, -0.5]))
-    T_map = compose(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.25, 0.0, 3.0]))
-    feed.tell(123, "INITIALISING")
-    feed.tell(456, "OK", 7.1234, 1, T_odom, T_map, "bob-1/0")
+    T_odom = from_rt(so3_exp(np.array([0.1, -0.2, 0.3])), np.array([1.0, 2.0, -0.5]))
+    T_map = from_rt(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.25, 0.0, 3.0]))
+    feed.publish(123, "INITIALISING")
+    feed.publish(456, "OK", 7.1234, 1, T_odom, T_map, "bob-1/0")
     first, second = (json.loads(app.recv(2000)) for _ in range(2))
     assert first == {
         "schema": 1,
@@ -72,9 +72,9 @@ def test_nobody_has_to_listen():
         address = where(gone)
     feed = PoseFeed(address, "ann")
     for stamp_ns in range(100):
-        feed.tell(stamp_ns, "LOST")
+        feed.publish(stamp_ns, "LOST")
     feed.close()
-    feed.tell(0, "LOST")  # as a socket that has failed
+    feed.publish(0, "LOST")  # as a socket that has failed
 
 
 @pytest.mark.parametrize(

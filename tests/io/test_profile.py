@@ -7,7 +7,7 @@ import pytest
 from share.errors import ConfigError
 from share.recordings.calibration import read_calibration
 from share.sensors import profile as profiles
-from share.sensors.profile import host_profile, profile, shipped
+from share.sensors.profile import load_host_profile, load_profile, shipped_profiles
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -27,28 +27,28 @@ def changed(tmp_path: Path):
 
 def test_every_shipped_profile_reads_in_every_mode():
     hosts = {"d435i-n100-headset", "d435i-turtlebot4", "laptop-edge"}
-    assert set(shipped()) == {"d435i", "euroc", "tumvi"} | hosts
-    for name in set(shipped()) - {"laptop-edge"}:
-        for mode in profile(name).device.modes:
+    assert set(shipped_profiles()) == {"d435i", "euroc", "tumvi"} | hosts
+    for name in set(shipped_profiles()) - {"laptop-edge"}:
+        for mode in load_profile(name).device.modes:
             for hz in mode.rates_hz:
-                chosen = profile(name, f"{mode.width}x{mode.height}@{hz:g}")
+                chosen = load_profile(name, f"{mode.width}x{mode.height}@{hz:g}")
                 assert (chosen.rig().cam0.width, chosen.rate_hz) == (mode.width, hz)
 
 
 def test_the_d435i_has_its_baseline_field_of_view_and_rates():
-    p = profile("d435i")
+    p = load_profile("d435i")
     assert p.baseline_m == pytest.approx(0.05)
     assert (p.mode.width, p.mode.height, p.rate_hz) == (640, 480, 30)
-    wide = profile("d435i", "848x480").rig().cam0
+    wide = load_profile("d435i", "848x480").rig().cam0
     assert 2 * np.rad2deg(np.arctan(424 / wide.fx)) == pytest.approx(90, abs=1)  # data sheet: 87 +- 3
     assert 2 * np.rad2deg(np.arctan(240 / wide.fy)) == pytest.approx(58.9, abs=1)  # 58 +- 1
     imu = p.device.imu
     assert not imu.joined and set(imu.gyro.rates_hz) == {200, 400} and {100, 250} < set(imu.accel.rates_hz)
-    assert profile("d435i", gyro_hz=200, accel_hz=100).device.imu.gyro.rate_hz == 200
+    assert load_profile("d435i", gyro_hz=200, accel_hz=100).device.imu.gyro.rate_hz == 200
 
 
 def test_the_d435i_agrees_with_the_example_calibration():
-    rig, example = profile("d435i", "848x480").rig(), read_calibration(ROOT / "calib" / "d435i").rig
+    rig, example = load_profile("d435i", "848x480").rig(), read_calibration(ROOT / "calib" / "d435i").rig
     assert rig.cam0 == example.cam0 and rig.cam1 == example.cam1
     assert np.allclose(rig.T_body_cam0, example.T_body_cam0)
     assert np.allclose(rig.T_cam1_cam0, example.T_cam1_cam0)
@@ -56,7 +56,7 @@ def test_the_d435i_agrees_with_the_example_calibration():
 
 def test_the_tumvi_rig_is_that_of_its_calibration(shared_data: Path):
     real = read_calibration(shared_data / "motion" / "tumvi" / "calib").rig
-    rig = profile("tumvi").rig()
+    rig = load_profile("tumvi").rig()
     assert rig.cam0.model == rig.cam1.model == "equidistant"
     for mine, theirs in ((rig.cam0, real.cam0), (rig.cam1, real.cam1)):
         assert (mine.fx, mine.cy) == pytest.approx((theirs.fx, theirs.cy))
@@ -66,7 +66,7 @@ def test_the_tumvi_rig_is_that_of_its_calibration(shared_data: Path):
 
 def test_the_euroc_rig_is_that_of_its_calibration(shared_data: Path):
     real = read_calibration(shared_data / "motion" / "euroc" / "calib").rig
-    rig = profile("euroc").rig()
+    rig = load_profile("euroc").rig()
     assert rig.cam0 == real.cam0 and rig.cam1 == real.cam1
     assert np.allclose(rig.T_body_cam0, real.T_body_cam0, atol=1e-9)
     assert np.allclose(rig.T_cam1_cam0, real.T_cam1_cam0, atol=1e-9)
@@ -75,11 +75,11 @@ def test_the_euroc_rig_is_that_of_its_calibration(shared_data: Path):
 
 
 def test_with_depth_the_rig_is_the_left_camera_with_depth_registered_to_it():
-    rig = profile("d435i").rig(depth=True)
+    rig = load_profile("d435i").rig(depth=True)
     assert rig.kind == "rgbd+imu" and rig.cam1 is None
     assert rig.depth == rig.cam0 and np.array_equal(rig.T_depth_cam0, np.eye(4))
     with pytest.raises(ConfigError, match="profile 'euroc': its device measures no depth"):
-        profile("euroc").rig(depth=True)
+        load_profile("euroc").rig(depth=True)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_with_depth_the_rig_is_the_left_camera_with_depth_registered_to_it():
 )
 def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
     with pytest.raises(ConfigError) as refused:
-        profile(*arguments)
+        load_profile(*arguments)
     assert says in str(refused.value) and "\n" not in str(refused.value)
 
 
@@ -150,28 +150,30 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
 )
 def test_a_file_with_a_mistake_is_refused_by_its_key(changed, old: str, new: str, says: str):
     with pytest.raises(ConfigError) as refused:
-        profile(changed(old, new))
+        load_profile(changed(old, new))
     assert says in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_a_file_of_ones_own_is_read(changed):
-    assert profile(changed("model: Bosch BMI055", "model: Bosch BMI085")).device.imu.model == "Bosch BMI085"
+    assert (
+        load_profile(changed("model: Bosch BMI055", "model: Bosch BMI085")).device.imu.model == "Bosch BMI085"
+    )
 
 
 def test_the_folder_is_found_in_a_frozen_bundle_and_its_absence_is_said(monkeypatch, tmp_path: Path):
     monkeypatch.setattr(profiles, "__file__", str(tmp_path / "lib" / "share" / "io" / "profile.py"))
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "nowhere"))
     with pytest.raises(ConfigError, match="firmware_profiles is missing from this installation"):
-        shipped()
+        shipped_profiles()
     (tmp_path / "bundle" / "firmware_profiles").mkdir(parents=True)
     (tmp_path / "bundle" / "firmware_profiles" / "x.yaml").write_text("name: x")
     monkeypatch.setattr(sys, "_MEIPASS", str(tmp_path / "bundle"), raising=False)
-    assert set(shipped()) == {"x"}
+    assert set(shipped_profiles()) == {"x"}
 
 
 def test_a_device_by_its_name_is_that_of_the_shipped_profile():
-    headset, bare = host_profile("d435i-n100-headset"), profile("d435i")
-    assert headset.role == "ar" and host_profile("d435i-turtlebot4").role == "robot"
+    headset, bare = load_host_profile("d435i-n100-headset"), load_profile("d435i")
+    assert headset.role == "ar" and load_host_profile("d435i-turtlebot4").role == "robot"
     assert headset.sensor is not None and headset.sensor.device.firmware == bare.device.firmware
     assert headset.sensor.emulation == bare.emulation
 
@@ -184,10 +186,10 @@ def test_a_device_by_a_name_that_describes_none(name: str, tmp_path: Path):
     with pytest.raises(
         ConfigError, match=f"^{mine}: device: '{name}' is no shipped profile that describes one"
     ):
-        host_profile(mine)
+        load_host_profile(mine)
 
 
 def test_an_edge_has_no_device_and_is_refused_where_one_is_needed():
-    assert host_profile("laptop-edge").sensor is None
+    assert load_host_profile("laptop-edge").sensor is None
     with pytest.raises(ConfigError, match="profile 'laptop-edge' has no device"):
-        profile("laptop-edge")
+        load_profile("laptop-edge")

@@ -13,25 +13,25 @@ import pytest
 from software_camera import BASELINE, T_GYRO_IR, Listed, SoftwareCamera
 
 from share.cameras.realsense import camera as adapter
-from share.cameras.realsense.camera import RealSense
-from share.cameras.realsense.devices import Attached, choose
-from share.cameras.realsense.factory import camera as factory_camera
-from share.cameras.realsense.frames import metres
-from share.cameras.realsense.streams import Wanted
+from share.cameras.realsense.camera import RealSenseCamera
+from share.cameras.realsense.devices import AttachedDevice, choose_device
+from share.cameras.realsense.factory import read_camera as factory_camera
+from share.cameras.realsense.frames import scale_depth
+from share.cameras.realsense.streams import StreamRequest
 from share.errors import ShareError, UsageError
-from share.recordings.mcap import types as ros
-from share.recordings.mcap.images import to_raw
-from share.sensors.intake import Sample
-from share.sensors.profile import profile
+from share.recordings.mcap import ros_messages as ros
+from share.recordings.mcap.images import encode_raw
+from share.sensors.profile import load_profile
+from share.sensors.sample_processor import DeviceSample
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
-D435I = profile("d435i")
+D435I = load_profile("d435i")
 FACTS = D435I.device
 
 
-def attached(serial: str = "1", firmware: str = "5.16.0.1", usb: str = "3.2") -> Attached:
-    return Attached(serial, "Intel RealSense D435I", firmware, usb, None)
+def attached(serial: str = "1", firmware: str = "5.16.0.1", usb: str = "3.2") -> AttachedDevice:
+    return AttachedDevice(serial, "Intel RealSense D435I", firmware, usb, None)
 
 
 @pytest.fixture
@@ -40,11 +40,11 @@ def camera() -> SoftwareCamera:
 
 
 def read(
-    camera: SoftwareCamera, count: int, feed: Callable[[], None], wanted: Wanted | None = None
-) -> list[Sample]:
+    camera: SoftwareCamera, count: int, feed: Callable[[], None], wanted: StreamRequest | None = None
+) -> list[DeviceSample]:
     """The samples that come out when `feed` puts them in; waits for `count`, at most 5 s."""
-    got: list[Sample] = []
-    with RealSense(wanted or Wanted(D435I), context=camera.context) as device:
+    got: list[DeviceSample] = []
+    with RealSenseCamera(wanted or StreamRequest(D435I), context=camera.context) as device:
         device.start(got.append)
         feed()
         until = time.monotonic() + 5
@@ -69,7 +69,7 @@ def test_pictures_and_motion_come_out_as_they_went_in(camera: SoftwareCamera) ->
     assert got["cam0"].stamp_ns == 4_294_967_295_000
     assert (got["gyro"].stamp_ns, got["gyro"].payload) == (12_345_000, [0.25, -0.5, 1.0])
     assert (got["accel"].stamp_ns, got["accel"].payload) == (23_456_000, [0.5, 9.75, -1.0])
-    assert all(sample.hardware for sample in got.values())
+    assert all(sample.is_device_clock for sample in got.values())
 
 
 @pytest.mark.parametrize(
@@ -78,10 +78,10 @@ def test_pictures_and_motion_come_out_as_they_went_in(camera: SoftwareCamera) ->
 def test_depth_in_millimetres_is_recorded_as_such(unit_m: float, encoding: str) -> None:
     steps = np.arange(2**16, dtype=np.uint16).reshape(256, 256)
     told = float(np.float32(unit_m))  # in single precision
-    depth = metres(steps, told)
+    depth = scale_depth(steps, told)
     assert depth.dtype == np.float32
     np.testing.assert_allclose(depth, steps * unit_m, rtol=2e-7)
-    message = to_raw(ros.header(0, "depth"), depth)
+    message = encode_raw(ros.make_header(0, "depth"), depth)
     assert message.encoding == encoding
     if encoding == "16UC1":
         np.testing.assert_array_equal(message.data.view(np.uint16).reshape(256, 256), steps)
@@ -98,11 +98,11 @@ def test_a_thousand_samples_of_the_imu_are_all_there(camera: SoftwareCamera) -> 
 def test_a_stamp_of_the_hosts_clock_is_told_apart(camera: SoftwareCamera) -> None:
     picture = np.zeros((480, 640), np.uint8)
     got = read(camera, 1, lambda: camera.image(0, 1000, picture, rs.timestamp_domain.system_time))
-    assert [sample.hardware for sample in got] == [False]
+    assert [sample.is_device_clock for sample in got] == [False]
 
 
 def test_the_factory_calibration_becomes_a_rig_with_the_body_in_the_imu(camera: SoftwareCamera) -> None:
-    rig = RealSense(Wanted(D435I), context=camera.context).rig
+    rig = RealSenseCamera(StreamRequest(D435I), context=camera.context).rig
     assert (rig.cam0.fx, rig.cam0.fy, rig.cam0.cx, rig.cam0.cy) == (385.0, 386.0, 320.5, 239.5)
     assert rig.T_cam1_cam0 is not None
     assert rig.baseline == pytest.approx(BASELINE)
@@ -112,7 +112,7 @@ def test_the_factory_calibration_becomes_a_rig_with_the_body_in_the_imu(camera: 
 
 
 def test_a_rotation_of_the_sdk_is_read_column_by_column() -> None:
-    from share.cameras.realsense.factory import transform
+    from share.cameras.realsense.factory import read_extrinsics
 
     class Told:
         rotation, translation = (0, 1, 0, -1, 0, 0, 0, 0, 1), (1, 2, 3)  # rs2_extrinsics: column-major
@@ -120,7 +120,7 @@ def test_a_rotation_of_the_sdk_is_read_column_by_column() -> None:
         def get_extrinsics_to(self, other: object) -> Any:
             return self
 
-    T = transform(Told(), None)
+    T = read_extrinsics(Told(), None)
     np.testing.assert_allclose(T @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-12)
 
 
@@ -128,9 +128,9 @@ def test_a_mode_that_the_camera_lacks_is_named(camera: SoftwareCamera) -> None:
     with pytest.raises(
         UsageError, match=r"cam0 \(848x480@30\), cam1 \(848x480@30\); choose .* infrared has 640x480@30"
     ):
-        RealSense(Wanted(profile("d435i", "848x480@30")), context=camera.context)
+        RealSenseCamera(StreamRequest(load_profile("d435i", "848x480@30")), context=camera.context)
     with pytest.raises(UsageError, match=r"does not offer depth"):
-        RealSense(Wanted(D435I, depth=True), context=camera.context)
+        RealSenseCamera(StreamRequest(D435I, depth=True), context=camera.context)
 
 
 @pytest.mark.parametrize(
@@ -138,8 +138,8 @@ def test_a_mode_that_the_camera_lacks_is_named(camera: SoftwareCamera) -> None:
 )
 def test_an_imu_with_other_rates_is_read_at_the_best_of_them(offered: tuple[int, ...], taken: int) -> None:
     said: list[str] = []
-    with RealSense(
-        Wanted(D435I), context=SoftwareCamera(rs, accel_hz=offered).context, say=said.append
+    with RealSenseCamera(
+        StreamRequest(D435I), context=SoftwareCamera(rs, accel_hz=offered).context, notify=said.append
     ) as one:
         one.start(print)
         assert (one.rates_hz["accel"], one.rates_hz["gyro"], one.rates_hz["cam0"]) == (taken, 400, 30)
@@ -148,13 +148,13 @@ def test_an_imu_with_other_rates_is_read_at_the_best_of_them(offered: tuple[int,
 
 
 def test_the_rate_of_the_gyroscope_that_is_read_is_in_the_rig() -> None:
-    imu = RealSense(Wanted(D435I), context=SoftwareCamera(rs, gyro_hz=(200,)).context).rig.imu
+    imu = RealSenseCamera(StreamRequest(D435I), context=SoftwareCamera(rs, gyro_hz=(200,)).context).rig.imu
     assert imu is not None and imu.rate_hz == 200
 
 
 def test_an_imu_with_none_of_the_rates_is_named() -> None:
     with pytest.raises(UsageError, match=r"does not offer accel \(250 or 200 or 100 or 63 Hz\)"):
-        RealSense(Wanted(D435I), context=SoftwareCamera(rs, accel_hz=(50,)).context)
+        RealSenseCamera(StreamRequest(D435I), context=SoftwareCamera(rs, accel_hz=(50,)).context)
 
 
 def test_an_emitter_that_another_program_left_on_is_switched_off_and_no_longer_alternates(
@@ -172,8 +172,8 @@ def test_an_emitter_that_another_program_left_on_is_switched_off_and_no_longer_a
 
 def test_dots_of_an_emitter_that_should_be_off_are_said_once(camera: SoftwareCamera) -> None:
     """They come with the third image; one of thirty is looked at."""
-    said, got = list[str](), list[Sample]()
-    with RealSense(Wanted(D435I), context=camera.context, say=said.append) as device:
+    said, got = list[str](), list[DeviceSample]()
+    with RealSenseCamera(StreamRequest(D435I), context=camera.context, notify=said.append) as device:
         device.start(got.append)
         for k in range(70):
             camera.stereo.set_metadata(rs.frame_metadata_value.frame_laser_power_mode, int(k > 1))
@@ -187,9 +187,9 @@ def test_dots_of_an_emitter_that_should_be_off_are_said_once(camera: SoftwareCam
 
 
 def test_an_interleaved_emitter_that_does_not_alternate_is_said(camera: SoftwareCamera) -> None:
-    said, got = list[str](), list[Sample]()
+    said, got = list[str](), list[DeviceSample]()
     interleaved = replace(D435I, device=replace(FACTS, emitter="interleaved"))
-    with RealSense(Wanted(interleaved), context=camera.context, say=said.append) as device:
+    with RealSenseCamera(StreamRequest(interleaved), context=camera.context, notify=said.append) as device:
         device.start(got.append)
         camera.stereo.set_metadata(rs.frame_metadata_value.frame_laser_power_mode, 1)
         for k in range(40):
@@ -205,15 +205,15 @@ def test_an_interleaved_emitter_that_does_not_alternate_is_said(camera: Software
 def test_a_frame_that_cannot_be_read_is_said_once_and_those_after_it_are_read(
     camera: SoftwareCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said, got, as_sample = list[str](), list[Sample](), adapter.to_sample
+    said, got, as_sample = list[str](), list[DeviceSample](), adapter.to_sample
 
-    def sometimes(sdk: Any, frame: Any, *more: Any) -> Sample:
+    def sometimes(sdk: Any, frame: Any, *more: Any) -> DeviceSample:
         if frame.frame_number in (1, 2):
             raise RuntimeError("null pointer passed for argument")
         return as_sample(sdk, frame, *more)
 
     monkeypatch.setattr(adapter, "to_sample", sometimes)
-    with RealSense(Wanted(D435I), context=camera.context, say=said.append) as device:
+    with RealSenseCamera(StreamRequest(D435I), context=camera.context, notify=said.append) as device:
         device.start(got.append)
         for k in range(4):
             camera.image(0, 1_000_000 + 33_333 * k, np.zeros((480, 640), np.uint8))
@@ -224,7 +224,7 @@ def test_a_frame_that_cannot_be_read_is_said_once_and_those_after_it_are_read(
 
 def test_without_a_camera_one_line_says_so() -> None:
     with pytest.raises(UsageError, match=r"no RealSense camera is attached, or none may.*plugdev.*stop"):
-        RealSense(Wanted(D435I), context=rs.context())
+        RealSenseCamera(StreamRequest(D435I), context=rs.context())
 
 
 class Leaving:
@@ -243,12 +243,12 @@ class Leaving:
 def test_a_camera_that_leaves_while_it_is_asked_is_a_line(camera: SoftwareCamera, last: str) -> None:
     context = Leaving(Listed([Leaving(camera.device, last)]), last)
     with pytest.raises(ShareError, match=r"^RealSense camera 0123: cannot be opened: get_xu.*device; plug"):
-        RealSense(Wanted(D435I), "0123", context)
+        RealSenseCamera(StreamRequest(D435I), "0123", context)
 
 
 def test_a_serial_number_that_is_not_there_lists_those_that_are(camera: SoftwareCamera) -> None:
     with pytest.raises(UsageError, match=r"serial number 99 is attached; there is 0123 \(Intel"):
-        RealSense(Wanted(D435I), "99", camera.context)
+        RealSenseCamera(StreamRequest(D435I), "99", camera.context)
 
 
 def test_a_camera_that_leaves_as_it_is_started_is_a_line_and_is_let_go(
@@ -259,7 +259,7 @@ def test_a_camera_that_leaves_as_it_is_started_is_a_line_and_is_let_go(
 
     monkeypatch.setattr(adapter, "_depth_unit", gone)
     with pytest.raises(ShareError, match=r"^Intel RealSense D435I 0123: cannot be opened: gone; "):
-        RealSense(Wanted(D435I), context=camera.context).start(print)
+        RealSenseCamera(StreamRequest(D435I), context=camera.context).start(print)
     monkeypatch.undo()
     assert len(read(camera, 1, lambda: camera.turn(1, 0, 0, 0))) == 1
 
@@ -272,13 +272,13 @@ def test_a_camera_that_leaves_as_it_is_started_is_a_line_and_is_let_go(
         ([attached(firmware="5.9.14.0")], "firmware 5.9.14.0 is older than 5.12.0.0; update"),
     ],
 )
-def test_a_camera_that_cannot_be_used_is_refused(devices: list[Attached], says: str) -> None:
+def test_a_camera_that_cannot_be_used_is_refused(devices: list[AttachedDevice], says: str) -> None:
     with pytest.raises(UsageError, match=says):
-        choose(devices, None, FACTS)
+        choose_device(devices, None, FACTS)
 
 
 def test_firmware_is_compared_by_number_and_not_by_letter() -> None:
-    assert choose([attached(firmware="5.12.10.0")], None, replace(FACTS, firmware_oldest="5.12.9.0"))
+    assert choose_device([attached(firmware="5.12.10.0")], None, replace(FACTS, firmware_oldest="5.12.9.0"))
 
 
 def test_a_fisheye_lens_of_the_factory() -> None:

@@ -15,7 +15,7 @@ from recordings import STEP_NS, make_tum
 from share.errors import DataError, ShareError, UsageError
 from share.recordings.convert import to_mcap
 from share.recordings.mcap.recorder import Recorder
-from share.recordings.mcap.recover import recover
+from share.recordings.mcap.recover import recover_recording
 from share.runtime.source import open_source
 
 
@@ -29,7 +29,7 @@ def test_no_mcap_and_empty(tmp_path):
         with pytest.raises(DataError, match="is not an MCAP file, or is empty"):
             open_source(str(tmp_path / "x.mcap"))
         with pytest.raises(DataError, match="is not an MCAP file, or is empty"):
-            recover(tmp_path / "x.mcap", tmp_path / "y.mcap")
+            recover_recording(tmp_path / "x.mcap", tmp_path / "y.mcap")
     assert not (tmp_path / "y.mcap").exists()
 
 
@@ -41,7 +41,7 @@ def record(path: Path, count: int) -> Path:
 
 
 def test_any_cut_is_refused_and_recovered(tmp_path):
-    """Cut anywhere: open says `recover`; recover saves a beginning of what was there, unaltered."""
+    """Cut anywhere: open says `recover_recording`; recover saves a beginning of what was there, unaltered."""
     data = record(tmp_path / "whole.mcap", 200).read_bytes()
     whole = [(m.stream, m.stamp_ns) for m in open_source(str(tmp_path / "whole.mcap")).measurements()]
     saved_before = 0
@@ -50,7 +50,7 @@ def test_any_cut_is_refused_and_recovered(tmp_path):
         cut.write_bytes(data[: int(len(data) * part)])
         with pytest.raises(DataError, match=r"share dataset recover"):
             open_source(str(cut))
-        result = recover(cut, good)
+        result = recover_recording(cut, good)
         back = [(m.stream, m.stamp_ns) for m in open_source(str(good)).measurements()]
         assert back == whole[: len(back)]
         assert len(back) > saved_before
@@ -59,7 +59,7 @@ def test_any_cut_is_refused_and_recovered(tmp_path):
     assert result.lost_bytes < 400_000
     (tmp_path / "nothing.mcap").write_bytes(data[:60])
     with pytest.raises(DataError, match="holds no complete message"):
-        recover(tmp_path / "nothing.mcap", tmp_path / "no.mcap")
+        recover_recording(tmp_path / "nothing.mcap", tmp_path / "no.mcap")
     assert not list(tmp_path.glob("no.mcap*"))
 
 
@@ -74,7 +74,7 @@ def test_a_flipped_bit_costs_one_chunk(tmp_path):
     (said,) = source.losses.lines()
     assert said.startswith(f"left out, since damaged: 1 of the chunks of {broken}; the first: ")
     assert "share dataset recover" in said
-    result = recover(broken, tmp_path / "good.mcap")
+    result = recover_recording(broken, tmp_path / "good.mcap")
     assert result.reason
     left = open_source(str(tmp_path / "good.mcap")).images_count
     assert 60 < left < 100
@@ -101,7 +101,7 @@ def test_a_disk_that_cannot_be_read_to_its_end_costs_what_is_behind(tmp_path, mo
     monkeypatch.setattr(
         "share.recordings.mcap.recover.open_regular", lambda name: io.BufferedReader(Worn(name, "rb"))
     )
-    result = recover(path, tmp_path / "good.mcap")
+    result = recover_recording(path, tmp_path / "good.mcap")
     monkeypatch.undo()
     assert says in result.reason
     assert 0.3 * path.stat().st_size < result.lost_bytes < 0.8 * path.stat().st_size
@@ -119,7 +119,7 @@ def test_a_chunk_that_takes_more_memory_than_there_is_is_left_out(tmp_path, monk
         return opened(chunk)
 
     monkeypatch.setattr(stream_reader, "breakup_chunk", greedy)
-    assert recover(path, tmp_path / "good.mcap").reason == "damaged: MemoryError"
+    assert recover_recording(path, tmp_path / "good.mcap").reason == "damaged: MemoryError"
     assert 60 < open_source(str(tmp_path / "good.mcap")).images_count < 100
 
 
@@ -129,8 +129,8 @@ def test_other_recordings_are_left_alone(tmp_path):
     other.write_bytes(b"dear")
     part.write_bytes(b"dear too")
     with pytest.raises(UsageError, match=r"a\.mcap: exists and is not overwritten; give a new name"):
-        recover(whole, other)
-    recover(whole, tmp_path / "b.mcap")
+        recover_recording(whole, other)
+    recover_recording(whole, tmp_path / "b.mcap")
     assert (other.read_bytes(), part.read_bytes()) == (b"dear", b"dear too")
     assert sorted(os.listdir(tmp_path)) == ["a.mcap", "b.mcap", "b.mcap.part", "whole.mcap"]
     assert (tmp_path / "b.mcap").stat().st_mode & 0o777 == whole.stat().st_mode & 0o777
@@ -143,7 +143,7 @@ def test_a_full_disk_is_not_taken_for_a_broken_recording(tmp_path, monkeypatch):
     whole = record(tmp_path / "whole.mcap", 20)
     monkeypatch.setattr("mcap.writer.Writer.add_message", full)
     with pytest.raises(ShareError, match=r"good\.mcap: cannot be written: No space left"):
-        recover(whole, tmp_path / "good.mcap")
+        recover_recording(whole, tmp_path / "good.mcap")
     assert os.listdir(tmp_path) == ["whole.mcap"]
 
 
@@ -172,7 +172,7 @@ def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
     for given in (f"{out}.part", str(out)):
         with pytest.raises(UsageError, match=f"recorded; `share dataset recover {out}.part --out {out}`"):
             open_source(given)
-    recover(tmp_path / "walk.mcap.part", out)
+    recover_recording(tmp_path / "walk.mcap.part", out)
     stamps = open_source(str(out)).stamps()["cam0"]
     assert last - stamps[-1] <= 10**9 + STEP_NS
     assert len(frames(open_source(str(out)))) >= 125

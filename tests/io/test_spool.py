@@ -72,14 +72,14 @@ def test_a_full_disk_is_said_once_and_the_run_goes_on() -> None:
 
 def test_a_run_gives_its_latencies_their_name_and_a_killed_one_leaves_them_readable(tmp_path: Path) -> None:
     killed = AgentFiles(tmp_path, print)
-    RunLog(killed.frames).add(7, 1.5, TrackState.OK, True, True)
+    RunLog(killed.frame_lines).add(7, 1.5, TrackState.OK, True, True)
     lines = (tmp_path / "latency.csv.partial").read_text().splitlines()
     assert lines == ["stamp_ns,track_ms,corrected_ms,state,keyframe,sent", "7,1.5,nan,OK,1,1"]
     killed.release()
 
     files = AgentFiles(tmp_path, print)
     assert not (tmp_path / "latency.csv.partial").exists()
-    log = RunLog(files.frames)
+    log = RunLog(files.frame_lines)
     log.add(9, 2.5, TrackState.LOST, False)
     files.finish(log, log.report())
     files.release()
@@ -89,7 +89,7 @@ def test_a_run_gives_its_latencies_their_name_and_a_killed_one_leaves_them_reada
 
 def test_a_run_without_a_folder_leaves_nothing() -> None:
     files = AgentFiles(None, print)
-    log = RunLog(files.frames)
+    log = RunLog(files.frame_lines)
     log.add(9, 2.5, TrackState.OK, False)
     files.finish(log, log.report())
     assert log.report()["frames"] == 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from share.errors import ConfigError
-from share.files.yaml_file import Section, read
+from share.files.yaml_file import Section, read_dataclass
 from share.types import F64
 
 
@@ -33,7 +33,7 @@ WHOLE = {"size": 2, "pair": [1, "2e-3"], "inner": {"count": 3, "names": ["a"]}, 
 
 
 def outer(**changes: object) -> Outer:
-    return read(Outer, Section({**WHOLE, **changes}, "f.yaml"))
+    return read_dataclass(Outer, Section({**WHOLE, **changes}, "f.yaml"))
 
 
 def test_values_and_defaults_and_nested_sections_are_read():
@@ -75,4 +75,4 @@ def test_what_does_not_fit_is_refused_by_file_and_key(changes: dict[str, object]
 
 def test_a_missing_key_is_named():
     with pytest.raises(ConfigError, match=r"f\.yaml: key 'size' is missing"):
-        read(Outer, Section({k: v for k, v in WHOLE.items() if k != "size"}, "f.yaml"))
+        read_dataclass(Outer, Section({k: v for k, v in WHOLE.items() if k != "size"}, "f.yaml"))

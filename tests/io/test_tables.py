@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from share.errors import DataError
 from share.geometry import se3
-from share.recordings.losses import Losses
+from share.recordings.losses import DataLosses
 from share.recordings.tables import parse_seconds, read_table
 from share.recordings.trajectory import Trajectory, format_seconds, format_tum, read_tum
 
@@ -111,7 +111,7 @@ def test_tum_refuses_what_is_no_rotation_and_what_is_cut(tmp_path):
 def test_a_quaternion_beyond_all_numbers_is_one_damaged_line(tmp_path):
     lines = [f"{k}.0 0 0 0 0 0 0 1" for k in range(40)]
     lines[7] = "7.0 0 0 0 0 0 1e308 1e308"
-    path, losses = tmp_path / "truth.tum", Losses()
+    path, losses = tmp_path / "truth.tum", DataLosses()
     path.write_text("\n".join(lines))
     assert len(read_tum(path, losses).stamps_ns) == 39
     with pytest.raises(DataError, match="pose 8: quaternion has length inf"):

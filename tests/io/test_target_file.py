@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from share.errors import ConfigError
-from share.lab.calibrate.target import AprilGrid, CharucoBoard, read_target, session_target, to_plain
+from share.lab.calibrate.target import AprilGrid, CharucoBoard, read_target, session_target, target_mapping
 
 KALIBR = """
 target_type: 'aprilgrid' #gridtype
@@ -38,7 +38,7 @@ def test_kalibrs_newer_file_is_read(tmp_path):
     "target", [AprilGrid(3, 4, 0.05, 0.2), CharucoBoard(5, 4, 0.1, 0.07, "DICT_6X6_250")]
 )
 def test_what_is_written_is_read_again(tmp_path, target):
-    assert read_target(written(tmp_path, yaml.safe_dump(to_plain(target)))) == target
+    assert read_target(written(tmp_path, yaml.safe_dump(target_mapping(target)))) == target
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, said):
 def test_a_session_says_where_its_target_stands(tmp_path):
     T = np.eye(4)
     T[:3, 3] = 1, 2, 3
-    session = {"schema": 1, "target": to_plain(AprilGrid()) | {"T_world_target": T.tolist()}}
+    session = {"schema": 1, "target": target_mapping(AprilGrid()) | {"T_world_target": T.tolist()}}
     (tmp_path / "session.yaml").write_text(yaml.safe_dump(session))
     target, T_world_target = session_target(tmp_path)
     assert target == AprilGrid()

@@ -5,14 +5,14 @@ import pypdfium2
 import pytest
 
 from share.lab.calibrate.corners import detector
-from share.lab.calibrate.target_sheet import pdf, sheet
+from share.lab.calibrate.target_sheet import make_sheet, sheet_pdf
 
 INCH = 25.4
 
 
 def printed(made, dpi):
     """The page (H, W) as gray values."""
-    page = pypdfium2.PdfDocument(pdf(made))[0]
+    page = pypdfium2.PdfDocument(sheet_pdf(made))[0]
     size_mm = np.array(page.get_size()) / 72 * INCH
     assert size_mm == pytest.approx([made.width, made.height], abs=1e-3)
     return np.ascontiguousarray(page.render(scale=dpi / 72, grayscale=True).to_numpy())
@@ -23,7 +23,7 @@ def printed(made, dpi):
     [("aprilgrid", 6, 6, "A4", 60), ("aprilgrid", 4, 7, "letter", 60), ("charuco", 9, 7, "A3", 75)],
 )
 def test_every_corner_is_found_where_the_target_has_it(kind, columns, rows, paper, dpi):
-    made = sheet(kind, columns, rows, paper)
+    made = make_sheet(kind, columns, rows, paper)
     page = printed(made, dpi)
     found = detector(made.target)(page)
     assert len(found) == len(made.target.corners)
@@ -31,14 +31,14 @@ def test_every_corner_is_found_where_the_target_has_it(kind, columns, rows, pape
         (found.px + 0.5) * (made.width, made.height) / np.array(page.shape[::-1])
     )  # whole pixels: not quite dpi
     low = made.target.extent[0]
-    wanted = 1000 * (made.target.corners[found.ids, :2] - low) + (made.left, made.low)
+    wanted = 1000 * (made.target.corners[found.ids, :2] - low) + (made.left, made.bottom)
     wanted[:, 1] = made.height - wanted[:, 1]
     assert np.abs(mm - wanted).max() < 0.1
 
 
 def test_the_ruler_is_as_long_as_it_says():
     dpi = 254  # ten pixels a millimetre
-    made = sheet("aprilgrid", 6, 6, "A4")
+    made = make_sheet("aprilgrid", 6, 6, "A4")
     page = printed(made, dpi)
     y = round((made.height - 11) * dpi / INCH)  # 11 mm above the paper's edge
     dark = np.flatnonzero(page[y - 2 : y + 3].min(axis=0) < 128)
@@ -48,14 +48,14 @@ def test_the_ruler_is_as_long_as_it_says():
 
 def test_neighbours_show_no_seam():
     """The border of a tag is one black square to a camera, not cells."""
-    made = sheet("aprilgrid", 6, 6, "A4")
+    made = make_sheet("aprilgrid", 6, 6, "A4")
     page = printed(made, 97)  # cells end within pixels
-    tag = np.array([made.left, made.low]) + 1000 * made.target.gap
+    tag = np.array([made.left, made.bottom]) + 1000 * made.target.gap
     x, y = (tag * 97 / INCH).astype(int)
     edge = page[-(y + 2) - 60 : -(y + 2), x + 2 : x + 8]  # within the two cells on the left
     assert edge.max() < 40
 
 
 def test_the_same_board_is_the_same_file():
-    made = sheet("charuco", 9, 7, "A3")
-    assert pdf(made) == pdf(made)
+    made = make_sheet("charuco", 9, 7, "A3")
+    assert sheet_pdf(made) == sheet_pdf(made)

@@ -14,17 +14,17 @@ import pytest
 import zmq
 
 from share.errors import ConfigError, TransportError, UsageError
-from share.net.channel import Network, Way
-from share.net.emulated import ShapedLink, network
-from share.net.guard import Guard
-from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate
-from share.net.memory import MemoryNetwork
+from share.net.channel import ChannelModel, NetworkModel
+from share.net.connection_guard import ConnectionGuard
+from share.net.emulated_link import EmulatedLink, load_network
+from share.net.in_memory import MemoryNetwork
+from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate_pair
 from share.net.transport import (
     LINGER_MS,
     QUEUE_MESSAGES,
     AgentLink,
-    Arrival,
     EdgeLink,
+    IncomingMessage,
     bind,
     connect,
     parse_address,
@@ -54,7 +54,7 @@ class Net:
 
 def keys_in(folder: Path) -> tuple[EdgeKeys, AgentKeys]:
     """Of an edge and of an agent that it lets in."""
-    edge, ann = generate(folder / "edge", "edge"), generate(folder / "ann", "ann")
+    edge, ann = generate_pair(folder / "edge", "edge"), generate_pair(folder / "ann", "ann")
     authorize(folder / "edge", "ann", ann.public)
     return EdgeKeys(edge, allow_list(folder / "edge")), AgentKeys(ann, edge.public)
 
@@ -103,21 +103,21 @@ def test_who_sent_a_message_is_known_by_its_key(net: Net) -> None:
     agent = net.agent(edge.endpoint)
     eventually(lambda: agent.send([b"hello"]))
     arrival = eventually(lambda: edge.receive(100))
-    assert arrival == Arrival(peer_id(1), [b"hello"], net.agent_key)
+    assert arrival == IncomingMessage(peer_id(1), [b"hello"], net.agent_key)
 
 
 def test_a_fault_of_the_guard_costs_neither_the_edge_nor_the_guard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failing = [True]
-    check = Guard._check
+    check = ConnectionGuard._check
 
-    def faulty(guard: Guard, now_s: float) -> int:
+    def faulty(guard: ConnectionGuard, now_s: float) -> int:
         if failing[0]:
             raise ZeroDivisionError
         return check(guard, now_s)
 
-    monkeypatch.setattr(Guard, "_check", faulty)
+    monkeypatch.setattr(ConnectionGuard, "_check", faulty)
     with ExitStack() as stack:
         net = Net("zmq", stack, tmp_path)
         edge = net.edge()
@@ -332,7 +332,9 @@ def test_bytes_that_are_not_zeromq_harm_nobody() -> None:
 def test_an_emulated_network_delays_both_ways_and_wakes_still_come_through() -> None:
     memory = MemoryNetwork()
     edge = memory.bind("edge")
-    link = ShapedLink(memory.connect("edge", 1), Network(Way(delay_ms=30.0), Way(delay_ms=20.0)), 0)
+    link = EmulatedLink(
+        memory.connect("edge", 1), NetworkModel(ChannelModel(delay_ms=30.0), ChannelModel(delay_ms=20.0)), 0
+    )
     took = []
     for i in range(5):
         sent = time.monotonic()
@@ -359,10 +361,10 @@ def test_an_emulated_network_delays_both_ways_and_wakes_still_come_through() -> 
 def test_a_network_of_a_file(tmp_path: Path) -> None:
     file = tmp_path / "far.yaml"
     file.write_text("up: {mbps: 5, delay_ms: 40}\ndown: {delay_ms: 35, jitter_ms: 2}\n")
-    assert network(str(file)) == Network(Way(5.0, 40.0), Way(0.0, 35.0, 2.0))
-    assert network("wifi5").round_trip_ms == pytest.approx(3.4)
+    assert load_network(str(file)) == NetworkModel(ChannelModel(5.0, 40.0), ChannelModel(0.0, 35.0, 2.0))
+    assert load_network("wifi5").round_trip_ms == pytest.approx(3.4)
     with pytest.raises(UsageError, match="no file and none of wifi5, wifi-busy"):
-        network("wifi6")
+        load_network("wifi6")
     file.write_text("up: {speed: 5}\n")
     with pytest.raises(ConfigError, match=r"far.yaml: up: unknown key 'speed'"):
-        network(str(file))
+        load_network(str(file))

@@ -25,7 +25,7 @@ import pytest
 from raw_curve import CurvePeer
 from raw_zmtp import RawPeer, frame, greeting, message, parts, ready
 
-from share.net.keys import AgentKeys, authorize, generate
+from share.net.keys import AgentKeys, authorize, generate_pair
 from share.net.transport import connect
 from share.wire.messages import peer_id
 
@@ -95,9 +95,9 @@ class Front:
 def front(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Front]:
     agent = rogue = None
     if request.param == "curve":
-        edge = generate(tmp_path / "edge", "edge")
+        edge = generate_pair(tmp_path / "edge", "edge")
         agent, rogue = (
-            AgentKeys(generate(tmp_path / name, name), edge.public) for name in ("agent", "rogue")
+            AgentKeys(generate_pair(tmp_path / name, name), edge.public) for name in ("agent", "rogue")
         )
         for keys in (agent, rogue):
             authorize(tmp_path / "edge", keys.own.name, keys.own.public)

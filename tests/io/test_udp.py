@@ -11,14 +11,14 @@ import pytest
 
 from share.errors import TransportError, UsageError
 from share.net import udp
-from share.net.udp import Host, StampedSocket, clock_precision, parse_host
+from share.net.udp import HostPort, StampedSocket, clock_precision, parse_host
 
 
 @contextmanager
 def pair() -> Iterator[tuple[StampedSocket, StampedSocket]]:
     with (
-        closing(StampedSocket.bound(Host("127.0.0.1", 0))) as server,
-        closing(StampedSocket.connected(Host("127.0.0.1", server.port))) as client,
+        closing(StampedSocket.bind(HostPort("127.0.0.1", 0))) as server,
+        closing(StampedSocket.connect(HostPort("127.0.0.1", server.port))) as client,
     ):
         yield server, client
 
@@ -36,7 +36,7 @@ def test_the_kernel_says_when_a_datagram_came_not_when_it_was_read() -> None:
         after = time.time_ns()
         time.sleep(0.05)
         datagram = server.receive(1.0)
-        assert server.by_kernel
+        assert server.has_kernel_stamps
         assert datagram is not None
         assert datagram.data == b"hello"
         assert before <= datagram.stamp_ns <= after + 10_000_000 < time.time_ns()
@@ -49,7 +49,7 @@ def test_without_stamps_of_the_kernel_it_stamps_itself_and_says_so(monkeypatch: 
         time.sleep(0.02)
         before = time.time_ns()
         datagram = server.receive(1.0)
-        assert not server.by_kernel
+        assert not server.has_kernel_stamps
         assert datagram is not None
         assert before <= datagram.stamp_ns <= time.time_ns()
 
@@ -76,27 +76,27 @@ def test_nobody_at_the_other_end_is_told_to_who_waits_for_an_answer() -> None:
 
 def test_a_port_in_use_is_said() -> None:
     with pair() as (server, _):
-        at = Host("127.0.0.1", server.port)
+        at = HostPort("127.0.0.1", server.port)
         with pytest.raises(TransportError, match=f"^{at}: the port is in use; stop the other server"):
-            StampedSocket.bound(at)
+            StampedSocket.bind(at)
 
 
 def test_an_address_of_nobody_is_said() -> None:
     with pytest.raises(TransportError, match="this machine has no such address"):
-        StampedSocket.bound(Host("192.0.2.1", 0))
+        StampedSocket.bind(HostPort("192.0.2.1", 0))
 
 
 @pytest.mark.parametrize(
     ("text", "host"),
     [
-        ("192.168.1.10", Host("192.168.1.10", 11123)),
-        ("edge.local:123", Host("edge.local", 123)),
-        ("localhost", Host("127.0.0.1", 11123)),
-        ("[::1]", Host("::1", 11123)),
-        ("[fe80::1%eth0]:9", Host("fe80::1%eth0", 9)),
+        ("192.168.1.10", HostPort("192.168.1.10", 11123)),
+        ("edge.local:123", HostPort("edge.local", 123)),
+        ("localhost", HostPort("127.0.0.1", 11123)),
+        ("[::1]", HostPort("::1", 11123)),
+        ("[fe80::1%eth0]:9", HostPort("fe80::1%eth0", 9)),
     ],
 )
-def test_hosts_may_have_a_port_or_not(text: str, host: Host) -> None:
+def test_hosts_may_have_a_port_or_not(text: str, host: HostPort) -> None:
     assert parse_host(text, 11123) == host
     assert parse_host(str(host), 1) == host
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.mapping.atlas import Applied, Atlas, SolveJob
-from share.mapping.graph.solver import Solver
-from share.mapping.graph.updates import Solution
-from share.mapping.loops import Key, Loop
+from share.mapping.atlas import AppliedSolution, Atlas, SolveJob
+from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.graph.updates import GraphSolution
+from share.mapping.loops import KeyframeKey, Loop
 from share.types import F64, Keyframe, View
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
@@ -35,7 +35,7 @@ class Walker:
         s = phase + np.linspace(0, turn, n)
         zero = np.zeros(n)
         t = np.column_stack([2.5 * np.cos(s), 2.0 * np.sin(s), 1.3 + 0.2 * np.sin(2 * s)])
-        self.truth = se3.compose(se3.so3_exp(np.column_stack([zero, zero, s])), t)
+        self.truth = se3.from_rt(se3.so3_exp(np.column_stack([zero, zero, s])), t)
         self.keyframes: list[Keyframe] = []
         self.T_odom_body: list[F64] = []
         for i in range(n):
@@ -55,7 +55,7 @@ class Walker:
 def loop(a: Walker, i: int, b: Walker, j: int, rng: np.random.Generator, wrong: F64 | None = None) -> Loop:
     """Keyframe j of b as recognised in keyframe i of a; `wrong` (4, 4) is added to a false one."""
     T = se3.inverse(a.truth[i]) @ b.truth[j] @ se3.exp(rng.multivariate_normal(np.zeros(6), SEEN))
-    return Loop(Key(a.name, i), Key(b.name, j), T if wrong is None else T @ wrong, SEEN, 80)
+    return Loop(KeyframeKey(a.name, i), KeyframeKey(b.name, j), T if wrong is None else T @ wrong, SEEN, 80)
 
 
 def near_loops(a: Walker, b: Walker, rng: np.random.Generator, every: int = 4) -> list[Loop]:
@@ -71,18 +71,18 @@ def near_loops(a: Walker, b: Walker, rng: np.random.Generator, every: int = 4) -
     return out
 
 
-def answer(atlas: Atlas, map_id: str) -> tuple[SolveJob, Solution]:
+def answer(atlas: Atlas, map_id: str) -> tuple[SolveJob, GraphSolution]:
     """By a solver that knows nothing before."""
-    atlas.solver_lost()
-    job, solver = atlas.snapshot(map_id), Solver(GraphConfig())
+    atlas.reset_solver()
+    job, solver = atlas.make_job(map_id), PoseGraphSolver(GraphConfig())
     solver.update(job.change)
-    return job, solver.solve(job.anchor, job.wanted)
+    return job, solver.solve(job.anchor, job.covariance_nodes)
 
 
-def settle(atlas: Atlas) -> list[Applied]:
+def settle(atlas: Atlas) -> list[AppliedSolution]:
     done = []
-    while atlas.due():
-        done.append(atlas.apply(*answer(atlas, atlas.due()[0])))
+    while atlas.due_maps():
+        done.append(atlas.apply_solution(*answer(atlas, atlas.due_maps()[0])))
     return done
 
 

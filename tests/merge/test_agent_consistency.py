@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.mapping.agents.agreement import Agreement
-from share.mapping.agents.consistency import Walked, Witness, compare, points_scale
-from share.mapping.graph.edges import Edge
-from share.mapping.recognition.scale import Scale
+from share.mapping.agents.agreement import AgentAgreement
+from share.mapping.agents.pairwise import (
+    AccumulatedOdometry,
+    InterAgentLoop,
+    compare_odometry,
+    robust_depth_scale,
+)
+from share.mapping.graph.edges import PoseEdge
+from share.mapping.recognition.depth_scale import DepthScale
 
 STEP_COV = np.diag([2e-4**2] * 3 + [2e-3**2] * 3)
 LOOP_COV = np.diag([4e-3**2] * 3 + [0.02**2] * 3)
@@ -24,7 +29,7 @@ def ring(phase: float) -> list:
     for k in range(FRAMES):
         angle = phase + 0.1 * k
         R = se3.so3_exp(np.array([0, 0, angle])) @ se3.so3_exp(np.array([0.3 * np.sin(k / 5), 0, 0]))
-        out.append(se3.compose(R, np.array([3 * np.cos(angle), 2 * np.sin(angle), 1.5])))
+        out.append(se3.from_rt(R, np.array([3 * np.cos(angle), 2 * np.sin(angle), 1.5])))
     return out
 
 
@@ -37,14 +42,14 @@ def steps_of(poses: list, rng, scale: float = 1.0, drift: float = 1.0) -> list:
     return out
 
 
-def chain(steps: list, sure: float = 1.0) -> list[Walked]:
-    out = [Walked.start()]
+def chain(steps: list, sure: float = 1.0) -> list[AccumulatedOdometry]:
+    out = [AccumulatedOdometry.origin()]
     for step in steps:
-        out.append(out[-1].on(step, sure * STEP_COV))
+        out.append(out[-1].with_step(step, sure * STEP_COV))
     return out
 
 
-def loops(rng, turn: float = 0.0, sure: float = 1.0, **bad) -> list[Witness]:
+def loops(rng, turn: float = 0.0, sure: float = 1.0, **bad) -> list[InterAgentLoop]:
     """24 of them, of which two are false, between an honest odometry and one that is `bad`."""
     x, y = ring(0.0), ring(0.7)
     a, b = chain(steps_of(x, rng)), chain(steps_of(y, rng, **bad), sure)
@@ -56,31 +61,31 @@ def loops(rng, turn: float = 0.0, sure: float = 1.0, **bad) -> list[Witness]:
         T = se3.inverse(x[i]) @ y[j] @ noise @ X
         if n in (5, 11):
             T = T @ se3.exp(np.array([0.3, 0, 0, 1.0, 2.0, 0]))
-        out.append(Witness(a[i], b[j], se3.orthonormal(T), LOOP_COV))
+        out.append(InterAgentLoop(a[i], b[j], se3.orthonormal(T), LOOP_COV))
     return out
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_honest_agents_show_nothing(seed):
-    found = compare(loops(np.random.default_rng(seed)))
-    assert found.path.significance < 3.5
-    assert found.turn.significance < 4
+    found = compare_odometry(loops(np.random.default_rng(seed)))
+    assert found.path_scale.significance < 3.5
+    assert found.camera_rotation.significance < 4
     assert found.nis < 2
-    assert found.inside > 0.8
+    assert found.inlier_share > 0.8
 
 
 @pytest.mark.parametrize("scale", [0.95, 0.97, 1.03, 1.05])
 @pytest.mark.parametrize("sure", [1.0, 0.01])
 def test_a_longer_way_is_measured(scale, sure):
-    found = compare(loops(np.random.default_rng(3), scale=scale, sure=sure))
-    assert found.path.value == pytest.approx(np.log(scale), abs=3.5 * found.path.sigma)
-    assert found.path.significance > 4.5
+    found = compare_odometry(loops(np.random.default_rng(3), scale=scale, sure=sure))
+    assert found.path_scale.value == pytest.approx(np.log(scale), abs=3.5 * found.path_scale.sigma)
+    assert found.path_scale.significance > 4.5
 
 
 def test_a_turned_camera_is_measured():
-    found = compare(loops(np.random.default_rng(4), turn=np.radians(4.0)))
-    assert np.degrees(found.turn.value) == pytest.approx(4.0, abs=1.0)
-    assert found.turn.significance > 4.5
+    found = compare_odometry(loops(np.random.default_rng(4), turn=np.radians(4.0)))
+    assert np.degrees(found.camera_rotation.value) == pytest.approx(4.0, abs=1.0)
+    assert found.camera_rotation.significance > 4.5
 
 
 def test_noise_of_who_is_too_sure_is_no_turn_once_its_claims_are_widened():
@@ -88,47 +93,51 @@ def test_noise_of_who_is_too_sure_is_no_turn_once_its_claims_are_widened():
     found, as_claimed = [], []
     for seed in range(20):
         few = loops(np.random.default_rng(seed), drift=10.0)[:10]
-        as_claimed.append(compare(few).turn)
-        found.append(compare(few, (1.0, 100.0)).turn)
+        as_claimed.append(compare_odometry(few).camera_rotation)
+        found.append(compare_odometry(few, (1.0, 100.0)).camera_rotation)
     assert max(turn.significance for turn in as_claimed) > 4.5
     assert max(turn.significance for turn in found) < 3
 
 
 def test_claims_that_are_widened_hide_neither_a_turned_camera_nor_a_longer_way():
-    wide = compare(loops(np.random.default_rng(4), turn=np.radians(4.0)), (1.0, 4.0))
-    assert np.degrees(wide.turn.value) == pytest.approx(4.0, abs=1.0)
-    assert wide.turn.significance > 4.5
+    wide = compare_odometry(loops(np.random.default_rng(4), turn=np.radians(4.0)), (1.0, 4.0))
+    assert np.degrees(wide.camera_rotation.value) == pytest.approx(4.0, abs=1.0)
+    assert wide.camera_rotation.significance > 4.5
     long = loops(np.random.default_rng(3), scale=1.03)
-    assert compare(long, (1.0, 100.0)).path == compare(long).path
+    assert compare_odometry(long, (1.0, 100.0)).path_scale == compare_odometry(long).path_scale
 
 
 def test_drift_beyond_its_covariances_is_seen():
     """Beyond the loops' own noise: 6 cm a step. What is less than that noise, no loop can tell."""
-    assert compare(loops(np.random.default_rng(5), drift=30.0, sure=0.01)).nis > 3
+    assert compare_odometry(loops(np.random.default_rng(5), drift=30.0, sure=0.01)).nis > 3
 
 
 def test_points_are_pooled_robustly():
     rng = np.random.default_rng(1)
-    scales = [Scale(0.05 + 0.005 * rng.standard_normal(), 0.005) for _ in range(12)] + [Scale(-0.3, 0.005)]
-    found = points_scale(scales)
+    scales = [DepthScale(0.05 + 0.005 * rng.standard_normal(), 0.005) for _ in range(12)] + [
+        DepthScale(-0.3, 0.005)
+    ]
+    found = robust_depth_scale(scales)
     assert found.value == pytest.approx(0.05, abs=3 * found.sigma)
     assert found.sigma < 0.005
 
 
-def town(scales: dict[str, float], pairs: list[tuple[str, str]]) -> tuple[Agreement, list[bool]]:
+def town(scales: dict[str, float], pairs: list[tuple[str, str]]) -> tuple[AgentAgreement, list[bool]]:
     """Agents whose depths are so much too large, who meet so."""
-    agreement, rng, said = Agreement(0.015), np.random.default_rng(2), []
+    agreement, rng, said = AgentAgreement(0.015), np.random.default_rng(2), []
     nodes = {name: range(10 * i, 10 * i + 10) for i, name in enumerate(scales)}
     for name, numbers in nodes.items():
         for number in numbers:
             before = number - 1 if number > numbers[0] else None
-            step = se3.compose(np.eye(3), np.array([0.3, 0, 0]))
-            agreement.walk(name, number, before, step, STEP_COV)
+            step = se3.from_rt(np.eye(3), np.array([0.3, 0, 0]))
+            agreement.add_step(name, number, before, step, STEP_COV)
     for k in range(6):
         for a, b in pairs:
-            edge = Edge(nodes[a][k], nodes[b][k], np.eye(4), LOOP_COV)
+            edge = PoseEdge(nodes[a][k], nodes[b][k], np.eye(4), LOOP_COV)
             log = np.log(scales[b] / scales[a]) + 0.004 * rng.standard_normal()
-            said.append(agreement.witness((a, b), (nodes[a][0], nodes[b][0]), edge, Scale(log, 0.004), None))
+            said.append(
+                agreement.add_loop((a, b), (nodes[a][0], nodes[b][0]), edge, DepthScale(log, 0.004), None)
+            )
     return agreement, said
 
 
@@ -139,7 +148,7 @@ THREE = [("ann", "bob"), ("eve", "ann"), ("bob", "eve")]
 @pytest.mark.parametrize("scale", [0.9, 0.95, 0.97, 1.03, 1.05])
 def test_of_three_the_one_that_is_wrong_is_set_apart(liar, scale):
     agreement, said = town({n: scale if n == liar else 1.0 for n in ("ann", "bob", "eve")}, THREE)
-    assert agreement.apart == {liar}
+    assert agreement.quarantined == {liar}
     assert any(said)
     standing = agreement.standing(liar)
     assert standing.state == "set apart"
@@ -147,20 +156,20 @@ def test_of_three_the_one_that_is_wrong_is_set_apart(liar, scale):
     assert standing.log_scale == pytest.approx(np.log(scale), abs=0.015)
     honest = {"ann", "bob", "eve"} - {liar}
     assert all(agreement.standing(name).state == "agrees" for name in honest)
-    assert agreement.forbids([liar], honest)
-    assert not agreement.forbids(honest, honest)
+    assert agreement.separation_reason([liar], honest)
+    assert not agreement.separation_reason(honest, honest)
 
 
 def test_honest_agents_stay_together():
     agreement, said = town({"ann": 1.003, "bob": 1.0, "eve": 0.997}, THREE)
-    assert not agreement.apart
+    assert not agreement.quarantined
     assert not agreement.disputed
     assert not any(said)
 
 
 def test_of_two_nobody_can_say_who_is_wrong():
     agreement, _ = town({"ann": 1.0, "eve": 1.05}, [("ann", "eve")])
-    assert not agreement.apart
+    assert not agreement.quarantined
     assert agreement.disputed == {frozenset(("ann", "eve"))}
     assert "nobody can say" in agreement.standing("ann").reason
     assert "smaller" in agreement.standing("ann").reason
@@ -172,7 +181,7 @@ def test_who_agrees_by_later_loops_is_let_in_again():
     assert agreement.disputed
     for k in range(200):
         i, j = k % 10, k // 3 % 10
-        edge = Edge(i, 10 + j, se3.compose(np.eye(3), np.array([0.3 * (j - i), 0, 0])), LOOP_COV)
-        agreement.witness(("ann", "eve"), (0, 10), edge, Scale(0.0, 0.004), None)
+        edge = PoseEdge(i, 10 + j, se3.from_rt(np.eye(3), np.array([0.3 * (j - i), 0, 0])), LOOP_COV)
+        agreement.add_loop(("ann", "eve"), (0, 10), edge, DepthScale(0.0, 0.004), None)
     assert not agreement.disputed
-    assert not agreement.forbids(["ann"], ["eve"])
+    assert not agreement.separation_reason(["ann"], ["eve"])

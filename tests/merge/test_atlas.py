@@ -7,7 +7,7 @@ from atlas_sim import Walker, answer, error, loop, near_loops, settle
 from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.atlas import Atlas
-from share.mapping.loops import Key, Loop
+from share.mapping.loops import KeyframeKey, Loop
 from share.types import F64
 
 # as careful as where copies of whole corridors are to be expected
@@ -26,7 +26,7 @@ def atlas_of(*walkers: Walker, config: MergeConfig = CONFIG) -> Atlas:
 
 
 def poses(atlas: Atlas, *walkers: Walker) -> F64:
-    return np.array([atlas.pose(Key(w.name, k.id)) for w in walkers for k in w.keyframes])
+    return np.array([atlas.pose(KeyframeKey(w.name, k.id)) for w in walkers for k in w.keyframes])
 
 
 def truth(*walkers: Walker) -> F64:
@@ -45,9 +45,9 @@ def bob() -> Walker:
 
 def test_every_stretch_is_a_map_until_joined(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
-    assert atlas.sizes() == {"ann/0": 60, "bob/0": 60}
+    assert atlas.map_sizes() == {"ann/0": 60, "bob/0": 60}
     assert len(atlas) == 120
-    assert atlas.due() == []
+    assert atlas.due_maps() == []
     assert atlas.T_map_odom("bob") == pytest.approx(np.eye(4), abs=1e-9)
     assert atlas.T_map_odom("nobody") is None
 
@@ -60,11 +60,11 @@ def test_two_agents_are_joined_to_truth(ann: Walker, bob: Walker) -> None:
         decisions.append(atlas.propose(x))
         applied += settle(atlas)
     assert "would join two maps, 1 of 5 places that say so: waits" in decisions[0].reason
-    joining = [k for k, d in enumerate(decisions) if d.joined]
+    joining = [k for k, d in enumerate(decisions) if d.joined_maps]
     assert joining == [4]  # every one of these loops is at a place of its own
-    assert decisions[4].joined == ("ann/0", "bob/0")
+    assert decisions[4].joined_maps == ("ann/0", "bob/0")
     assert not any(d.accepted for d in decisions[:4])
-    assert len(decisions[4].tied) == 5
+    assert len(decisions[4].added) == 5
     assert all(d.accepted for d in decisions[4:])
     before = error(np.array(ann.T_odom_body), ann.truth), error(np.array(bob.T_odom_body), bob.truth)
     assert applied[-1].corrections.keys() == {"ann", "bob"}
@@ -79,11 +79,11 @@ def test_the_founders_gauge_never_moves(ann: Walker, bob: Walker) -> None:
     for x in near_loops(bob, ann, rng) + near_loops(ann, ann, rng):
         atlas.propose(x)
         settle(atlas)
-        T = se3.inverse(ann.T_odom_body[0]) @ atlas.pose(Key("ann", 0))
+        T = se3.inverse(ann.T_odom_body[0]) @ atlas.pose(KeyframeKey("ann", 0))
         assert np.array_equal(T[:3, 3], np.zeros(3))
         turned = np.degrees(se3.so3_log(T[:3, :3]))
         assert abs(turned[2]) < 1e-4 and np.abs(turned).max() < 0.5
-        assert atlas.map_of(Key("ann", 5)) == "ann/0"
+        assert atlas.map_id(KeyframeKey("ann", 5)) == "ann/0"
 
 
 def test_a_map_that_leads_stays_where_it_is_however_old_the_other_is() -> None:
@@ -93,14 +93,14 @@ def test_a_map_that_leads_stays_where_it_is_however_old_the_other_is() -> None:
     for walker in (robot, ann, bob):
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe, rank=int(walker is robot))
-    joined = [d.joined for x in near_loops(ann, bob, rng) if (d := atlas.propose(x)).joined]
+    joined = [d.joined_maps for x in near_loops(ann, bob, rng) if (d := atlas.propose(x)).joined_maps]
     settle(atlas)
     before = atlas.T_map_odom("ann")
-    joined += [d.joined for x in near_loops(robot, bob, rng) if (d := atlas.propose(x)).joined]
+    joined += [d.joined_maps for x in near_loops(robot, bob, rng) if (d := atlas.propose(x)).joined_maps]
     applied = settle(atlas)[-1]
     assert joined == [("ann/0", "bob/0"), ("ann/0", "robot/0")]
     assert {c.map_id for c in applied.corrections.values()} == {"ann/0"}
-    assert np.array_equal(atlas.pose(Key("ann", 0))[:3, 3], ann.T_odom_body[0][:3, 3])
+    assert np.array_equal(atlas.pose(KeyframeKey("ann", 0))[:3, 3], ann.T_odom_body[0][:3, 3])
     moved = se3.log(se3.inverse(before) @ atlas.T_map_odom("ann"))
     assert np.abs(moved).max() < 0.05
     assert error(poses(atlas, robot, ann, bob), truth(robot, ann, bob)) < 0.08
@@ -113,7 +113,7 @@ def test_correction_brings_odometry_into_the_map(ann: Walker, bob: Walker) -> No
         atlas.propose(x)
     (applied,) = settle(atlas)
     correction = applied.corrections["bob"]
-    last = Key("bob", 59)
+    last = KeyframeKey("bob", 59)
     assert correction.T_map_odom @ bob.T_odom_body[-1] == pytest.approx(atlas.pose(last), abs=1e-9)
     assert correction.T_map_odom == pytest.approx(atlas.T_map_odom("bob"))
     assert (correction.map_id, correction.revision, correction.answers) == ("ann/0", 0, 56)
@@ -163,7 +163,7 @@ def test_of_small_maps_fewer_places_are_enough_but_never_one_keyframe() -> None:
     assert "0 of 1 places" in atlas.propose(far_loop(ann, 0, bob, 4, rng)).reason
     for i in (1, 2, 3):
         assert not atlas.propose(loop(ann, i, bob, 1, rng)).accepted
-    assert atlas.propose(loop(ann, 1, bob, 2, rng)).joined == ("ann/0", "bob/0")
+    assert atlas.propose(loop(ann, 1, bob, 2, rng)).joined_maps == ("ann/0", "bob/0")
 
 
 def test_views_from_afar_are_no_witnesses(ann: Walker, bob: Walker) -> None:
@@ -224,7 +224,7 @@ def test_order_of_arrival_does_not_matter(ann: Walker, bob: Walker) -> None:
             atlas.propose(loops[i])
         settle(atlas)
         settle(atlas)
-        assert atlas.sizes().keys() == {"ann/0"}
+        assert atlas.map_sizes().keys() == {"ann/0"}
         assert len(atlas.loops) == len(loops)
         results.append(poses(atlas, ann, bob))
     for other in results[1:]:
@@ -238,11 +238,11 @@ def test_three_agents_find_together(ann: Walker, bob: Walker) -> None:
     for x in near_loops(bob, cyd, rng):
         atlas.propose(x)
     settle(atlas)
-    assert atlas.sizes().keys() == {"ann/0", "bob/0"}
+    assert atlas.map_sizes().keys() == {"ann/0", "bob/0"}
     for x in near_loops(ann, bob, rng):
         atlas.propose(x)
     applied = settle(atlas)[-1]
-    assert atlas.sizes().keys() == {"ann/0"}
+    assert atlas.map_sizes().keys() == {"ann/0"}
     assert applied.corrections["cyd"].map_id == "ann/0"
     assert error(poses(atlas, ann, bob, cyd), truth(ann, bob, cyd)) < 0.08
 
@@ -250,14 +250,14 @@ def test_three_agents_find_together(ann: Walker, bob: Walker) -> None:
 def test_a_new_stretch_is_a_map_of_its_own_and_rejoins() -> None:
     ann = Walker("ann", 1, breaks=(40,))
     atlas = atlas_of(ann)
-    assert atlas.sizes() == {"ann/0": 40, "ann/1": 20}
+    assert atlas.map_sizes() == {"ann/0": 40, "ann/1": 20}
     rng = np.random.default_rng(0)
     for x in (y for y in near_loops(ann, ann, rng) if y.b.id >= 40):
         atlas.propose(x)
     (applied,) = settle(atlas)
-    assert atlas.sizes().keys() == {"ann/0"}
+    assert atlas.map_sizes().keys() == {"ann/0"}
     assert applied.corrections.keys() == {"ann"}
-    expected = atlas.pose(Key("ann", 59))
+    expected = atlas.pose(KeyframeKey("ann", 59))
     assert applied.corrections["ann"].T_map_odom @ ann.T_odom_body[-1] == pytest.approx(expected, abs=1e-9)
     assert error(poses(atlas, ann), ann.truth) < 0.06
 
@@ -275,11 +275,11 @@ def test_keyframes_that_came_while_solving_follow(ann: Walker, bob: Walker) -> N
     result = answer(atlas, "ann/0")
     for k in bob.keyframes[late:]:
         atlas.add_keyframe("bob", k)
-    applied = atlas.apply(*result)
+    applied = atlas.apply_solution(*result)
     rigid = se3.inverse(bob.T_odom_body[late - 1]) @ bob.T_odom_body[-1]
-    assert se3.inverse(atlas.pose(Key("bob", late - 1))) @ atlas.pose(Key("bob", 59)) == pytest.approx(
-        rigid, abs=1e-9
-    )
+    assert se3.inverse(atlas.pose(KeyframeKey("bob", late - 1))) @ atlas.pose(
+        KeyframeKey("bob", 59)
+    ) == pytest.approx(rigid, abs=1e-9)
     assert applied.corrections["bob"].T_map_odom == pytest.approx(atlas.T_map_odom("bob"), abs=1e-9)
 
 
@@ -292,11 +292,11 @@ def test_a_solution_of_a_map_that_was_joined_meanwhile_is_left_aside(ann: Walker
     for x in near_loops(ann, bob, rng):
         atlas.propose(x)
     before = poses(atlas, ann, bob)
-    applied = atlas.apply(*result)
+    applied = atlas.apply_solution(*result)
     assert applied.corrections == {}
     assert "joined or split" in applied.reason
     assert np.array_equal(poses(atlas, ann, bob), before)
-    assert atlas.due() == ["ann/0"]
+    assert atlas.due_maps() == ["ann/0"]
     assert settle(atlas)[0].corrections.keys() == {"ann", "bob"}
 
 
@@ -316,7 +316,7 @@ def twin_loops(ann: Walker, bob: Walker, count: int, found: float = 0.46) -> lis
         j = i + 13
         T = se3.inverse(ann.truth[i]) @ half @ bob.truth[j]
         assert np.linalg.norm(T[:3, 3]) < CONFIG.near_m
-        out.append(Loop(Key("ann", i), Key("bob", j), T, cov, 80, found))
+        out.append(Loop(KeyframeKey("ann", i), KeyframeKey("bob", j), T, cov, 80, found))
     return out
 
 
@@ -326,7 +326,7 @@ def test_a_false_join_is_taken_out_once_better_evidence_is_there(ann: Walker, bo
     false = twin_loops(ann, bob, 5)
     assert [atlas.propose(x).accepted for x in false] == [False] * 4 + [True]
     settle(atlas)
-    true = [replace(x, found=0.62) for x in near_loops(ann, bob, np.random.default_rng(0))]
+    true = [replace(x, found_share=0.62) for x in near_loops(ann, bob, np.random.default_rng(0))]
     first, second, third, fourth = [atlas.propose(x) for x in true[:4]]
     settle(atlas)
     others = []
@@ -338,8 +338,8 @@ def test_a_false_join_is_taken_out_once_better_evidence_is_there(ann: Walker, bo
     assert not (first.dropped or second.dropped or third.dropped)
     assert set(fourth.dropped) == set(false)
     assert "taken out: ann:0 - bob:13, ann:4 - bob:17" in fourth.reason
-    assert fourth.joined == ("ann/0", "bob/0")
-    assert len(fourth.tied) == 4
+    assert fourth.joined_maps == ("ann/0", "bob/0")
+    assert len(fourth.added) == 4
     assert all(d.accepted for d in others)
     settle(atlas)
     assert error(poses(atlas, ann, bob), truth(ann, bob)) < 0.06
@@ -351,7 +351,7 @@ def test_what_stands_is_not_taken_out_by_hardly_more(ann: Walker, bob: Walker) -
     for x in twin_loops(ann, bob, 5):
         atlas.propose(x)
     settle(atlas)
-    true = [replace(x, found=0.58) for x in near_loops(ann, bob, np.random.default_rng(0))]
+    true = [replace(x, found_share=0.58) for x in near_loops(ann, bob, np.random.default_rng(0))]
     fourth = [atlas.propose(x) for x in true[:4]][-1]
     assert "4 places (weight 1.35) say so, 5 places (weight 1.06) do not" in fourth.reason
     assert not fourth.accepted
@@ -362,7 +362,7 @@ def test_copies_match_worse_and_do_not_outvote_the_truth(ann: Walker, bob: Walke
     for found, overthrown in ((0.4, False), (0.7, True)):  # the second as a check that they could
         atlas = atlas_of(ann, bob)
         for x in near_loops(ann, bob, rng)[:6]:
-            atlas.propose(replace(x, found=0.6))
+            atlas.propose(replace(x, found_share=0.6))
         settle(atlas)
         decisions = [atlas.propose(x) for x in twin_loops(ann, bob, 8, found)]
         assert any(d.dropped for d in decisions) == overthrown
@@ -384,14 +384,14 @@ def test_views_that_lack_what_both_should_show_join_nothing(ann: Walker, bob: Wa
     true = near_loops(ann, bob, np.random.default_rng(0))
     for found, joined in ((CONFIG.join_found - 0.01, False), (CONFIG.join_found + 0.01, True)):
         atlas = atlas_of(ann, bob)
-        decisions = [atlas.propose(replace(x, found=found)) for x in true]
-        assert any(d.joined for d in decisions) == joined
+        decisions = [atlas.propose(replace(x, found_share=found)) for x in true]
+        assert any(d.joined_maps for d in decisions) == joined
     assert "only 44% of what both should show is found" in atlas_says(ann, bob, true, 0.44)
 
 
 def atlas_says(ann: Walker, bob: Walker, loops: list[Loop], found: float) -> str:
     atlas = atlas_of(ann, bob)
-    return [atlas.propose(replace(x, found=found)).reason for x in loops][-1]
+    return [atlas.propose(replace(x, found_share=found)).reason for x in loops][-1]
 
 
 def test_many_views_of_one_spot_are_one_place(ann: Walker, bob: Walker) -> None:
@@ -409,9 +409,9 @@ def test_what_cannot_be_is_refused_by_name(ann: Walker) -> None:
     with pytest.raises(ValueError, match="keyframe zoe:3 is not known"):
         atlas.add_keyframe("zoe", ann.keyframes[4])
     with pytest.raises(ValueError, match="keyframe ann:99 is not known"):
-        atlas.propose(Loop(Key("ann", 1), Key("ann", 99), np.eye(4), np.eye(6), 50))
+        atlas.propose(Loop(KeyframeKey("ann", 1), KeyframeKey("ann", 99), np.eye(4), np.eye(6), 50))
     with pytest.raises(ValueError, match="there is no map"):
-        atlas.snapshot("zoe/0")
+        atlas.make_job("zoe/0")
 
 
 def test_a_loop_that_the_solved_map_speaks_against_is_dropped(ann: Walker, bob: Walker) -> None:
@@ -434,11 +434,11 @@ def test_without_its_loops_a_join_is_undone(ann: Walker, bob: Walker) -> None:
     for x in near_loops(ann, bob, rng):
         atlas.propose(x)
     job, solution = answer(atlas, "ann/0")
-    applied = atlas.apply(job, replace(solution, loop_chi2=np.full_like(solution.loop_chi2, 1e6)))
-    assert atlas.sizes().keys() == {"ann/0", "bob/0"}
+    applied = atlas.apply_solution(job, replace(solution, loop_chi2=np.full_like(solution.loop_chi2, 1e6)))
+    assert atlas.map_sizes().keys() == {"ann/0", "bob/0"}
     assert applied.corrections["bob"].map_id == "bob/0"
-    assert np.abs(atlas.pose(Key("bob", 0)) - bob.T_odom_body[0]).max() < 1e-9
-    assert atlas.due() == ["ann/0", "bob/0"]
+    assert np.abs(atlas.pose(KeyframeKey("bob", 0)) - bob.T_odom_body[0]).max() < 1e-9
+    assert atlas.due_maps() == ["ann/0", "bob/0"]
     settle(atlas)
     assert not atlas.propose(near_loops(ann, bob, rng)[0]).accepted
 
@@ -452,7 +452,7 @@ def test_how_surely_somebody_is_known_is_reckoned_for_who_is_answered(ann: Walke
     first = settle(atlas)[-1]
     atlas.propose(loops[-1])
     job, solution = answer(atlas, "ann/0")
-    assert job.asked == (atlas._chart.trails.current("bob"),)
-    second = atlas.apply(job, solution)
+    assert job.covariance_segments == (atlas._graph.odometry.current_segment("bob"),)
+    second = atlas.apply_solution(job, solution)
     assert (second.corrections["ann"].cov == first.corrections["ann"].cov).all()
     assert (second.corrections["bob"].cov != first.corrections["bob"].cov).any()

@@ -8,13 +8,13 @@ from atlas_sim import Walker, near_loops
 
 from share.config import MergeConfig
 from share.geometry import se3
-from share.mapping.agents.agreement import Agreement
-from share.mapping.agents.subjects import Subjects, outvoted
+from share.mapping.agents.agreement import AgentAgreement
+from share.mapping.agents.identities import AgentIdentities, outvoted_agents
 from share.mapping.atlas import Atlas
-from share.mapping.graph.edges import Edge
-from share.mapping.loop_acceptance import Decision
-from share.mapping.loops import Key, Loop
-from share.mapping.recognition.scale import Scale
+from share.mapping.graph.edges import PoseEdge
+from share.mapping.loop_acceptance import LoopDecision
+from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.recognition.depth_scale import DepthScale
 
 STEP = np.diag([2e-4**2] * 3 + [2e-3**2] * 3)
 LOOP = np.diag([4e-3**2] * 3 + [0.02**2] * 3)
@@ -25,19 +25,19 @@ class Town:
     """Runs that meet at one spot, one after the other."""
 
     def __init__(self) -> None:
-        self.agreement, self.rng = Agreement(0.015), np.random.default_rng(3)
+        self.agreement, self.rng = AgentAgreement(0.015), np.random.default_rng(3)
         self.numbers: dict[str, int] = {}
 
     def enter(self, run: str) -> None:
         """`eve-1` is a run of eve."""
-        self.agreement.enter(run, run.partition("-")[0])
+        self.agreement.add_run(run, run.partition("-")[0])
         self.walk(run)
 
     def walk(self, run: str) -> None:
         self.numbers[run] = first = 1000 * len(self.numbers)
         step = se3.exp(np.array([0, 0, 0, 0.3, 0, 0]))
         for k in range(12):
-            self.agreement.walk(run, first + k, first + k - 1 if k else None, step, STEP)
+            self.agreement.add_step(run, first + k, first + k - 1 if k else None, step, STEP)
 
     def meet(self, a: str, b: str, scale: float, times: int = 1) -> None:
         """b's depths over a's."""
@@ -45,8 +45,8 @@ class Town:
             k = int(self.rng.integers(12))
             ends = self.numbers[a], self.numbers[b]
             log = np.log(scale) + SIGMA * self.rng.standard_normal()
-            edge = Edge(ends[0] + k, ends[1] + k, np.eye(4), LOOP)
-            self.agreement.witness((a, b), ends, edge, Scale(log, SIGMA), None)
+            edge = PoseEdge(ends[0] + k, ends[1] + k, np.eye(4), LOOP)
+            self.agreement.add_loop((a, b), ends, edge, DepthScale(log, SIGMA), None)
 
 
 def with_a_wrong_one():
@@ -72,11 +72,11 @@ def test_who_is_restarted_before_it_is_found_out_is_found_out_by_all_its_runs():
             for other in ("ann-1", "bob-1"):
                 town.meet(other, f"eve-{n}", 1.05)
     for n in range(1, 4):
-        assert town.agreement.forbids(["ann-1"], [f"eve-{n}"]) or town.agreement.yet_to_compare(
+        assert town.agreement.separation_reason(["ann-1"], [f"eve-{n}"]) or town.agreement.unverified_reason(
             ["ann-1"], [f"eve-{n}"]
         )
     assert town.agreement.standing("eve-1").state == "set apart"
-    assert not town.agreement.forbids(["ann-1"], ["bob-1"])
+    assert not town.agreement.separation_reason(["ann-1"], ["bob-1"])
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
@@ -85,8 +85,8 @@ def test_a_run_of_a_name_that_was_set_apart_is_compared_before_it_comes_in(scale
     assert town.agreement.standing("eve-1").state == "set apart"
     town.enter("eve-2")
     assert "earlier run" in town.agreement.standing("eve-2").reason
-    assert "earlier run" in town.agreement.yet_to_compare(["ann-1"], ["eve-2"])
-    assert not town.agreement.yet_to_compare(["eve-2"], ["eve-2"])  # its own stretches
+    assert "earlier run" in town.agreement.unverified_reason(["ann-1"], ["eve-2"])
+    assert not town.agreement.unverified_reason(["eve-2"], ["eve-2"])  # its own stretches
     for _ in range(10):
         for other in ("ann-1", "bob-1"):
             town.meet(other, "eve-2", scale)
@@ -95,11 +95,11 @@ def test_a_run_of_a_name_that_was_set_apart_is_compared_before_it_comes_in(scale
     assert town.agreement.standing("eve-1").state == "set apart"
     if scale == 1.0:
         assert standing.state == "agrees"
-        assert not town.agreement.yet_to_compare(["ann-1"], ["eve-2"])
-        assert not town.agreement.forbids(["ann-1"], ["eve-2"])
+        assert not town.agreement.unverified_reason(["ann-1"], ["eve-2"])
+        assert not town.agreement.separation_reason(["ann-1"], ["eve-2"])
     else:
         assert standing.state == "set apart"
-        assert town.agreement.forbids(["ann-1"], ["eve-2"])
+        assert town.agreement.separation_reason(["ann-1"], ["eve-2"])
 
 
 def test_who_was_set_apart_before_is_wrong_again_where_only_one_can_say_so():
@@ -117,7 +117,7 @@ def test_many_runs_of_one_name_are_one_voice():
         town.enter(f"eve-{n}")
         town.meet("ann-1", f"eve-{n}", 1.05, 8)
     assert town.agreement.standing("ann-1").state == "disputed"
-    assert not town.agreement.apart
+    assert not town.agreement.quarantined
 
 
 def test_what_is_known_of_a_names_scale_holds_for_its_next_run():
@@ -128,8 +128,8 @@ def test_what_is_known_of_a_names_scale_holds_for_its_next_run():
         for a, b, scale in (("ann-1", "bob-1", 1.0), ("bob-1", "eve-1", 0.99), ("ann-1", "eve-1", 0.99)):
             town.meet(a, b, scale)
     town.enter("eve-2")
-    assert town.agreement.scale_of("eve-2") == town.agreement.scale_of("eve-1")
-    assert town.agreement.scale_of("eve-2") == pytest.approx(np.log(0.99), abs=0.004)
+    assert town.agreement.log_scale("eve-2") == town.agreement.log_scale("eve-1")
+    assert town.agreement.log_scale("eve-2") == pytest.approx(np.log(0.99), abs=0.004)
 
 
 def test_who_turns_bad_is_found_out_by_its_newest_loops():
@@ -147,19 +147,19 @@ def test_who_turns_bad_is_found_out_by_its_newest_loops():
         for other in ("ann-1", "bob-1"):
             town.meet(other, "eve-1", 1.05)
     assert loops <= 12
-    assert not town.agreement.forbids(["ann-1"], ["bob-1"])
+    assert not town.agreement.separation_reason(["ann-1"], ["bob-1"])
 
 
 def test_runs_of_an_earlier_life_that_were_outside_are_a_subject_of_their_own():
-    subjects = Subjects()
+    subjects = AgentIdentities()
     for run, name in (("eve-1", "eve"), ("eve-2", "eve"), ("ann-1", "ann"), ("eve-3", "eve")):
-        subjects.enter(run, name, ())
-    subjects.doubt({"eve-1", "eve-3"})
-    assert subjects.of("eve-3") == subjects.of("eve-1") != subjects.of("eve-2")
-    assert subjects.unproven == {subjects.of("eve-1")}
+        subjects.add_run(run, name, ())
+    subjects.mark_unverified({"eve-1", "eve-3"})
+    assert subjects.identity("eve-3") == subjects.identity("eve-1") != subjects.identity("eve-2")
+    assert subjects.unverified == {subjects.identity("eve-1")}
     assert subjects.name("eve-2") == subjects.name("eve-3") == "eve"
-    subjects.enter("eve-4", "eve", ())
-    assert subjects.of("eve-4") in subjects.unproven
+    subjects.add_run("eve-4", "eve", ())
+    assert subjects.identity("eve-4") in subjects.unverified
 
 
 def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
@@ -168,14 +168,14 @@ def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
     first, second = Walker("eve-1", 3, phase=0.7), Walker("eve-2", 4, phase=0.7)
     atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
     for walker in (ann, bob, first):
-        atlas.enter(walker.name, walker.name.partition("-")[0])
+        atlas.add_run(walker.name, walker.name.partition("-")[0])
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     for a, b, log in ((ann, bob, 0.0), (ann, first, 0.05), (bob, first, 0.05)):
         for loop in near_loops(a, b, rng):
-            atlas.witness(loop, Scale(log, 0.005))
+            atlas.compare_agents(loop, DepthScale(log, 0.005))
     assert atlas.standing("eve-1").state == "set apart"
-    atlas.enter("eve-2", "eve")
+    atlas.add_run("eve-2", "eve")
     for keyframe in second.keyframes:
         atlas.add_keyframe("eve-2", keyframe)
     said = [atlas.propose(loop) for loop in near_loops(ann, second, rng)[:6]]
@@ -192,65 +192,65 @@ def test_who_is_set_apart_is_no_measure_of_the_others_scale():
     town.meet("bob-1", "eve-1", 1.0, 10)
     town.meet("bob-1", "eve-1", 1.05, 30)
     assert town.agreement.standing("eve-1").state == "set apart"
-    assert town.agreement.scale_of("ann-1") == town.agreement.scale_of("bob-1") == 0.0
+    assert town.agreement.log_scale("ann-1") == town.agreement.log_scale("bob-1") == 0.0
 
 
 def test_a_run_that_is_forgotten_takes_nothing_of_its_name_with_it():
-    subjects = Subjects()
+    subjects = AgentIdentities()
     for number in range(1, 4):
-        subjects.enter(f"eve-{number}", "eve", ())
-    assert [subjects.forget(f"eve-{number}", (), ()) for number in (1, 2)] == [None, None]
-    subjects.enter("eve-4", "eve", ())
-    assert subjects.of("eve-4") == "eve-1"
-    assert (subjects.name("eve-1"), subjects.newest("eve-1")) == ("eve", "eve-4")
-    assert [subjects.forget(f"eve-{number}", (), ()) for number in (3, 4)] == [None, "eve-1"]
-    subjects.enter("eve-5", "eve", ())
-    assert (subjects.of("eve-5"), subjects.unproven) == ("eve-5", set())
+        subjects.add_run(f"eve-{number}", "eve", ())
+    assert [subjects.remove_run(f"eve-{number}", (), ()) for number in (1, 2)] == [None, None]
+    subjects.add_run("eve-4", "eve", ())
+    assert subjects.identity("eve-4") == "eve-1"
+    assert (subjects.name("eve-1"), subjects.newest_run("eve-1")) == ("eve", "eve-4")
+    assert [subjects.remove_run(f"eve-{number}", (), ()) for number in (3, 4)] == [None, "eve-1"]
+    subjects.add_run("eve-5", "eve", ())
+    assert (subjects.identity("eve-5"), subjects.unverified) == ("eve-5", set())
 
 
 def test_what_is_held_against_a_name_outlives_its_runs():
-    subjects = Subjects()
-    subjects.enter("eve-1", "eve", ())
-    assert subjects.forget("eve-1", {"eve-1"}, ()) == "eve-1"
+    subjects = AgentIdentities()
+    subjects.add_run("eve-1", "eve", ())
+    assert subjects.remove_run("eve-1", {"eve-1"}, ()) == "eve-1"
     for number in range(2, 5):
-        subjects.enter(f"eve-{number}", "eve", ())
-        assert subjects.unproven == {f"eve-{number}"}
+        subjects.add_run(f"eve-{number}", "eve", ())
+        assert subjects.unverified == {f"eve-{number}"}
         assert f"eve-{number}" in subjects.suspected
-        assert subjects.follows_one_apart(f"eve-{number}", ())
-        subjects.forget(f"eve-{number}", (), ())
-    assert not subjects.unproven
-    subjects.enter("eve-9", "eve", ())
-    subjects.prove("eve-9")  # it was compared, and agrees
-    subjects.forget("eve-9", (), ())
-    subjects.enter("eve-10", "eve", ())
-    assert not subjects.unproven
+        assert subjects.had_quarantined_run(f"eve-{number}", ())
+        subjects.remove_run(f"eve-{number}", (), ())
+    assert not subjects.unverified
+    subjects.add_run("eve-9", "eve", ())
+    subjects.mark_verified("eve-9")  # it was compared, and agrees
+    subjects.remove_run("eve-9", (), ())
+    subjects.add_run("eve-10", "eve", ())
+    assert not subjects.unverified
 
 
 def test_runs_of_a_suspect_without_end_leave_nothing_but_the_suspicion():
     """Eve met ann in each of her runs, and disagreed; each is forgotten with its keyframes."""
     ann, atlas, rng = Walker("ann", 1, n=20), Atlas(MergeConfig()), np.random.default_rng(0)
-    atlas.enter("ann", "ann")
+    atlas.add_run("ann", "ann")
     for keyframe in ann.keyframes:
         atlas.add_keyframe("ann", keyframe)
-    agreement = atlas._parting.agreement
+    agreement = atlas._quarantine.agreement
     for n in range(1, 6):
         eve = Walker(f"eve-{n}", n, n=20, phase=0.1)
-        atlas.enter(eve.name, "eve")
-        assert agreement.subjects.unproven == ({eve.name} if n > 1 else set())
+        atlas.add_run(eve.name, "eve")
+        assert agreement.identities.unverified == ({eve.name} if n > 1 else set())
         numbers = [atlas.add_keyframe(eve.name, keyframe) for keyframe in eve.keyframes]
         for loop in near_loops(ann, eve, rng):
-            atlas.witness(loop, Scale(0.05, 0.005))
+            atlas.compare_agents(loop, DepthScale(0.05, 0.005))
         assert atlas.standing("ann").state == "disputed"
-        atlas.present(eve.name, False)
-        atlas.enter("eve-next", "eve")
-        atlas.take_out(numbers)
-        assert atlas.is_forgotten(eve.name)
-        atlas.forget(eve.name)
-        atlas.present("eve-next", False)
-        atlas.forget("eve-next")
+        atlas.set_present(eve.name, False)
+        atlas.add_run("eve-next", "eve")
+        atlas.remove_keyframes(numbers)
+        assert atlas.is_run_gone(eve.name)
+        atlas.remove_run(eve.name)
+        atlas.set_present("eve-next", False)
+        atlas.remove_run("eve-next")
         assert not agreement._pairs
         assert not agreement.disputed
-        assert agreement._sureness._claims.agents == {"ann"}
+        assert agreement._covariance_scales._claims.known_agents == {"ann"}
         assert atlas.standing("ann").state == "unknown"
 
 
@@ -263,31 +263,31 @@ def test_a_disagreement_outlives_the_keyframes_that_showed_it():
     for n in range(1, 30):
         town.meet("ann-1", f"bob-{n}", 1.05, 2)
         first = town.numbers[f"bob-{n}"]
-        town.agreement.forget(range(first, first + 12), {town.numbers["ann-1"]})
+        town.agreement.remove_nodes(range(first, first + 12), {town.numbers["ann-1"]})
         assert bool(town.agreement.disputed) == (n > 1)
     (pair,) = town.agreement._pairs.values()
-    assert len(pair.met) == 1
-    assert sum(len(met.loops) for met in pair.met.values()) <= 32
+    assert len(pair.by_segments) == 1
+    assert sum(len(met.loops) for met in pair.by_segments.values()) <= 32
 
 
 def test_what_loops_said_of_a_stretch_goes_with_it():
     ann, bob = Walker("ann", 1), Walker("bob-1", 2, phase=0.3)
     atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
     for walker in (ann, bob):
-        atlas.enter(walker.name, walker.name.partition("-")[0])
+        atlas.add_run(walker.name, walker.name.partition("-")[0])
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     for loop in near_loops(ann, bob, rng, every=2):
-        atlas.witness(loop, Scale(0.0, 0.005))
-    agreement = atlas._parting.agreement
+        atlas.compare_agents(loop, DepthScale(0.0, 0.005))
+    agreement = atlas._quarantine.agreement
     (pair,) = agreement._pairs.values()
-    assert agreement._sureness._told.keys() == pair.met.keys() == {(0, 1)}
-    atlas.present("bob-1", False)
-    atlas.enter("bob-2", "bob")
+    assert agreement._covariance_scales._evidence.keys() == pair.by_segments.keys() == {(0, 1)}
+    atlas.set_present("bob-1", False)
+    atlas.add_run("bob-2", "bob")
     gone = [n for n in range(len(atlas)) if atlas.key(n).agent == "bob-1"]
-    assert len(atlas.take_out(gone)) == len(gone)
-    assert not agreement._sureness._told
-    assert (0, 1) not in pair.met
+    assert len(atlas.remove_keyframes(gone)) == len(gone)
+    assert not agreement._covariance_scales._evidence
+    assert (0, 1) not in pair.by_segments
     assert atlas.standing("ann").state == "agrees"
 
 
@@ -296,12 +296,12 @@ def test_who_is_doubted_since_the_edge_was_started_again_is_proven_by_another_wh
     town = Town()
     for run in ("ann-1", "bob-1"):
         town.enter(run)
-    town.agreement.subjects.doubt({"ann-1", "bob-1"})
+    town.agreement.identities.mark_unverified({"ann-1", "bob-1"})
     for run in ("ann-2", "bob-2"):
         town.enter(run)
-    assert "started again" in town.agreement.yet_to_compare(["ann-2"], ["bob-2"])
+    assert "started again" in town.agreement.unverified_reason(["ann-2"], ["bob-2"])
     town.meet("ann-2", "bob-2", 1.0, 10)
-    assert not town.agreement.yet_to_compare(["ann-2"], ["bob-2"])
+    assert not town.agreement.unverified_reason(["ann-2"], ["bob-2"])
 
 
 def test_names_of_one_key_have_one_voice():
@@ -311,14 +311,14 @@ def test_names_of_one_key_have_one_voice():
         for run in ("ann-1", "bob-1"):
             town.enter(run)
         for run in ("e1-1", "e2-1", "e3-1"):
-            town.agreement.enter(run, run[:2], voice)
+            town.agreement.add_run(run, run[:2], voice)
             town.walk(run)
         town.meet("ann-1", "bob-1", 1.0, 12)
         for run in ("e1-1", "e2-1", "e3-1"):
             for honest in ("ann-1", "bob-1"):
                 town.meet(honest, run, 1.05, 12)
-        assert apart is None or town.agreement.apart == apart
-        assert not apart or not town.agreement.forbids(["ann-1"], ["bob-1"])
+        assert apart is None or town.agreement.quarantined == apart
+        assert not apart or not town.agreement.separation_reason(["ann-1"], ["bob-1"])
 
 
 def quarrel(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
@@ -327,7 +327,7 @@ def quarrel(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
     town = Town()
     names = (*honest, "e1", "e2")
     for name in names:
-        town.agreement.enter(f"{name}-1", name, known.get(name))
+        town.agreement.add_run(f"{name}-1", name, known.get(name))
         town.walk(f"{name}-1")
     for k, one in enumerate(names):
         for other in names[k + 1 :]:
@@ -342,32 +342,34 @@ def quarrel(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
 def test_voices_that_are_not_known_may_be_one_and_the_same(known):
     """Ann stands against one key, also while it is not known yet that it is one."""
     town = quarrel(known)
-    assert not town.agreement.apart
+    assert not town.agreement.quarantined
     assert town.agreement.standing("ann-1").state == "disputed"
 
 
 def test_who_is_outvoted_whoever_the_unknown_are_is_set_apart_at_once():
     known = {"ann": "A", "bob": "B", "e1": "E", "e2": "E"}
-    assert quarrel(known, ("ann", "bob", "cat")).agreement.apart == {"e1-1", "e2-1"}
+    assert quarrel(known, ("ann", "bob", "cat")).agreement.quarantined == {"e1-1", "e2-1"}
     town = quarrel({"e1": "E"}, ("ann", "bob"))  # who may both be Eve
-    assert not town.agreement.apart
+    assert not town.agreement.quarantined
 
 
 def test_a_voice_that_becomes_known_counts_from_then_on():
     town = quarrel({"ann": "A"})
-    town.agreement.enter("e1-1", "e1", "E")
-    town.agreement.enter("e2-1", "e2", "F")
+    town.agreement.add_run("e1-1", "e1", "E")
+    town.agreement.add_run("e2-1", "e2", "F")
     town.meet("ann-1", "e1-1", 1.05, 12)
-    assert town.agreement.apart == {"ann-1"}  # against two
-    town.agreement.enter("e2-1", "e2", "E")
+    assert town.agreement.quarantined == {"ann-1"}  # against two
+    town.agreement.add_run("e2-1", "e2", "E")
     town.meet("ann-1", "e1-1", 1.05, 12)
-    assert not town.agreement.apart
+    assert not town.agreement.quarantined
 
 
 def test_names_of_one_key_that_disagree_are_disputed():
     """Nobody else has a vote: this is decided, and ends."""
-    assert outvoted([frozenset("ab")], [], dict.fromkeys("ab", "E"), ()) == frozenset()
-    assert outvoted([frozenset("ab"), frozenset("ac")], [], {"a": "E", "b": "E", "c": "C"}, "a") == {"a"}
+    assert outvoted_agents([frozenset("ab")], [], dict.fromkeys("ab", "E"), ()) == frozenset()
+    assert outvoted_agents([frozenset("ab"), frozenset("ac")], [], {"a": "E", "b": "E", "c": "C"}, "a") == {
+        "a"
+    }
 
 
 def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
@@ -375,46 +377,46 @@ def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.3)
     atlas = Atlas(MergeConfig())
     for walker in (ann, bob):
-        atlas.enter(walker.name, walker.name)
+        atlas.add_run(walker.name, walker.name)
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     loops = near_loops(ann, bob, np.random.default_rng(0))
-    atlas._parting._taken_back = list(loops)
+    atlas._quarantine._withdrawn = list(loops)
     if decide is not None:
-        atlas._judge.decide = decide
+        atlas._loop_acceptance.decide = decide
     return atlas, loops
 
 
 def test_loops_that_were_taken_back_wait_while_anything_forbids_them():
     """Bob is not kept apart any more, but has to be compared first."""
     atlas, loops = pair_that_met()
-    parting, unproven = atlas._parting, atlas._parting.agreement.subjects.unproven
+    parting, unproven = atlas._quarantine, atlas._quarantine.agreement.identities.unverified
     unproven.add("bob")
-    assert parting._give_back() == ((), ())
+    assert parting._reconsider_withdrawn() == ((), ())
     unproven.clear()
-    gone = Loop(Key("ann", 99), loops[0].b, loops[0].T_a_b, loops[0].cov, 9)
-    parting._taken_back.append(gone)
-    tied, undone = parting._give_back()
+    gone = Loop(KeyframeKey("ann", 99), loops[0].b, loops[0].T_a_b, loops[0].cov, 9)
+    parting._withdrawn.append(gone)
+    tied, undone = parting._reconsider_withdrawn()
     assert len(tied) > len(loops) / 2
     assert not undone
-    assert not parting._taken_back
+    assert not parting._withdrawn
 
 
 def test_loops_that_were_taken_back_are_judged_once_who_was_to_be_compared_is():
     atlas, loops = pair_that_met()
-    atlas._parting.agreement.subjects.unproven.add("bob")
-    said = [atlas.witness(loop, Scale(0.0, 0.005)) for loop in loops]
-    assert "bob" not in atlas._parting.agreement.subjects.unproven
-    assert sum(len(parted.tied) for parted in said) > len(loops) / 2
-    assert not any(parted.standing for parted in said)
+    atlas._quarantine.agreement.identities.unverified.add("bob")
+    said = [atlas.compare_agents(loop, DepthScale(0.0, 0.005)) for loop in loops]
+    assert "bob" not in atlas._quarantine.agreement.identities.unverified
+    assert sum(len(parted.added) for parted in said) > len(loops) / 2
+    assert not any(parted.standings for parted in said)
 
 
 def test_a_loop_that_is_believed_again_and_undone_at_once_is_not_said_to_be_tied():
-    def decide(loop: Loop) -> Decision:
-        return Decision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
+    def decide(loop: Loop) -> LoopDecision:
+        return LoopDecision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
 
     atlas, loops = pair_that_met(decide)
-    tied, undone = atlas._parting._give_back()
+    tied, undone = atlas._quarantine._reconsider_withdrawn()
     assert tied == tuple(loops[1:])
     assert undone == (loops[0],)
 
@@ -425,7 +427,7 @@ def test_what_is_put_right_is_so_in_one_order():
     names = [f"agent{k}" for k in range(10)]
     for name in names:
         atlas.add_keyframe(name, Walker(name, 1, n=1).keyframes[0])
-    atlas._parting.agreement.scale = dict.fromkeys(names, 0.01)
-    atlas._chart.rescale = lambda agent, log, width: done.append(agent)
-    atlas._parting._put_right()
+    atlas._quarantine.agreement.log_scales = dict.fromkeys(names, 0.01)
+    atlas._graph.rescale_odometry = lambda agent, log, width: done.append(agent)
+    atlas._quarantine._apply_scales()
     assert done == names

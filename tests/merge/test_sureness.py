@@ -9,18 +9,23 @@ import pytest
 from test_agent_consistency import FRAMES, LOOP_COV, STEP_COV, chain, ring, steps_of
 
 from share.geometry import se3
-from share.mapping.agents.agreement import Agreement
-from share.mapping.agents.consistency import Witness, equations, points_scale, solved
-from share.mapping.agents.covariance_scale import Claims, Sureness
-from share.mapping.graph.edges import Edge
-from share.mapping.recognition.scale import Scale
+from share.mapping.agents.agreement import AgentAgreement
+from share.mapping.agents.covariance_scales import CovarianceClaims, CovarianceScales
+from share.mapping.agents.pairwise import (
+    InterAgentLoop,
+    comparison_equations,
+    robust_depth_scale,
+    solve_comparison,
+)
+from share.mapping.graph.edges import PoseEdge
+from share.mapping.recognition.depth_scale import DepthScale
 
 MOVED = se3.exp(np.array([0, 0, 0.05, 0.3, 0, 0]))
 WALKERS = {"ann": 0.0, "bob": 0.7, "eve": 1.4}
 DRIFT = 4.0  # by what all odometry is worse than STEP_COV, so that it shows beside the loops' noise
 
 
-def walkers(seed: int, sure: float, rounds: int = 8) -> Sureness:
+def walkers(seed: int, sure: float, rounds: int = 8) -> CovarianceScales:
     """What is known of three agents that have gone round a room, of whom eve's sigmas are so many times too
     small."""
     rng, paths, walked = np.random.default_rng(seed), {}, {}
@@ -29,24 +34,24 @@ def walkers(seed: int, sure: float, rounds: int = 8) -> Sureness:
         told = DRIFT**2 / (sure**2 if name == "eve" else 1.0)
         walked[name] = chain(steps_of(paths[name], rng, drift=DRIFT), told)
     claims = claimed({name: 1 / sure if name == "eve" else 1.0 for name in WALKERS})
-    sureness, met = Sureness(claims), {}
+    sureness, met = CovarianceScales(claims), {}
     for n, (a, b) in enumerate((("ann", "bob"), ("ann", "eve"), ("bob", "eve"))):
         loops = []
         for j in range(4, FRAMES, 2):
             i = min(FRAMES - 1, j + 7)
             noise = se3.exp(np.sqrt(np.diag(LOOP_COV)) * rng.standard_normal(6))
             T = se3.orthonormal(se3.inverse(paths[a][i]) @ paths[b][j] @ noise)
-            loops.append(Witness(walked[a][i], walked[b][j], T, LOOP_COV))
-        met[(n, n + 1)] = (a, b), equations(loops)
+            loops.append(InterAgentLoop(walked[a][i], walked[b][j], T, LOOP_COV))
+        met[(n, n + 1)] = (a, b), comparison_equations(loops)
     for _ in range(rounds):
         for meeting, (agents, told) in met.items():
-            sureness.take(meeting, agents, told, solved(told).weight)
+            sureness.set_evidence(meeting, agents, told, solve_comparison(told).weights)
     return sureness
 
 
 def factors(seed: int, sure: float, rounds: int = 8) -> dict[str, float]:
     sureness = walkers(seed, sure, rounds)
-    return {name: sureness.factor.get(name, 1.0) for name in WALKERS}
+    return {name: sureness.scales.get(name, 1.0) for name in WALKERS}
 
 
 @pytest.mark.parametrize("sure", [3.0, 10.0])
@@ -62,23 +67,23 @@ def test_honest_agents_are_not_widened():
 
 
 def test_few_loops_say_nothing():
-    sureness = Sureness(Claims())
+    sureness = CovarianceScales(CovarianceClaims())
     rng = np.random.default_rng(0)
     x, y = ring(0.0), ring(0.7)
     a, b = chain(steps_of(x, rng, drift=10.0)), chain(steps_of(y, rng, drift=10.0))
-    loops = [Witness(a[j + 7], b[j], se3.inverse(x[j + 7]) @ y[j], LOOP_COV) for j in range(7)]
-    told = equations(loops)
-    sureness.take((0, 1), ("ann", "bob"), told, solved(told).weight)
-    assert sureness.factor == {}
+    loops = [InterAgentLoop(a[j + 7], b[j], se3.inverse(x[j + 7]) @ y[j], LOOP_COV) for j in range(7)]
+    told = comparison_equations(loops)
+    sureness.set_evidence((0, 1), ("ann", "bob"), told, solve_comparison(told).weights)
+    assert sureness.scales == {}
 
 
-def claimed(sigmas: dict[str, float]) -> Claims:
-    claims = Claims()
+def claimed(sigmas: dict[str, float]) -> CovarianceClaims:
+    claims = CovarianceClaims()
     for name, sigma in sigmas.items():
         for _ in range(10):
-            claims.add(name, MOVED, sigma**2 * STEP_COV)
+            claims.add_step(name, MOVED, sigma**2 * STEP_COV)
     for one, other in itertools.combinations(sigmas, 2):
-        claims.met(one, other)
+        claims.link(one, other)
     return claims
 
 
@@ -86,40 +91,40 @@ def test_who_was_never_met_measures_nobody():
     """Its variances may be anything."""
     claims = claimed({"ann": 1.0})
     for _ in range(10):
-        claims.add("eve", MOVED, 1e6 * STEP_COV)
-    assert claims.least("ann") == 1.0
-    claims.met("ann", "eve")
-    assert claims.least("ann") == 100.0
+        claims.add_step("eve", MOVED, 1e6 * STEP_COV)
+    assert claims.min_scale("ann") == 1.0
+    claims.link("ann", "eve")
+    assert claims.min_scale("ann") == 100.0
 
 
 def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
     claims = claimed({"ann": 1.0, "bob": 3.0, "eve": 0.1})
-    assert claims.least("ann") == claims.least("bob") == 1.0
-    assert claims.least("eve") == pytest.approx(100 / 2.25)
-    claims.leave_out(["ann"])
-    assert claims.least("eve") == 100.0  # of 400
-    claims.leave_out(["eve"])
-    assert claims.least("ann") == pytest.approx(9 / 2.25)
-    assert claims.least("eve") == pytest.approx(100 / 2.25)
-    claims.remove("ann")
-    assert claims.least("eve") == 100.0  # of 400
-    assert claims.agents == {"bob", "eve"}
+    assert claims.min_scale("ann") == claims.min_scale("bob") == 1.0
+    assert claims.min_scale("eve") == pytest.approx(100 / 2.25)
+    claims.exclude(["ann"])
+    assert claims.min_scale("eve") == 100.0  # of 400
+    claims.exclude(["eve"])
+    assert claims.min_scale("ann") == pytest.approx(9 / 2.25)
+    assert claims.min_scale("eve") == pytest.approx(100 / 2.25)
+    claims.remove_agent("ann")
+    assert claims.min_scale("eve") == 100.0  # of 400
+    assert claims.known_agents == {"bob", "eve"}
 
 
 def test_honest_agents_may_differ():
     claims = claimed({"ann": 1.0, "bob": 1.4, "eve": 0.7})
-    assert all(claims.least(name) == 1.0 for name in ("ann", "bob", "eve"))
+    assert all(claims.min_scale(name) == 1.0 for name in ("ann", "bob", "eve"))
 
 
 def test_who_is_alone_is_measured_by_nobody():
-    assert claimed({"eve": 0.01}).least("eve") == 1.0
+    assert claimed({"eve": 0.01}).min_scale("eve") == 1.0
 
 
 def test_depths_that_are_spread_say_so():
     """Each loop says 0.5 %, and they differ by 10: the mean is not known to 0.5."""
     rng = np.random.default_rng(4)
     logs = 0.4 + 0.1 * rng.standard_normal((200, 12))
-    found = [points_scale([Scale(log, 0.005) for log in one]) for one in logs]
+    found = [robust_depth_scale([DepthScale(log, 0.005) for log in one]) for one in logs]
     off = np.array([(one.value - 0.4) / one.sigma for one in found])
     assert 0.6 < np.sqrt((off**2).mean()) < 1.7
 
@@ -127,37 +132,37 @@ def test_depths_that_are_spread_say_so():
 def test_what_loops_said_is_no_longer_told_once_they_are_left():
     """At once, not with the next step; what eve claims still holds."""
     claimed_only = 100 / 2.25
-    for let_go in (lambda s: s.leave([(0, 1), (1, 2), (2, 3)]), lambda s: s.forget(["eve"])):
+    for let_go in (lambda s: s.drop_evidence([(0, 1), (1, 2), (2, 3)]), lambda s: s.exclude(["eve"])):
         sureness = walkers(0, 10.0, rounds=2)
-        assert sureness.factor["eve"] != pytest.approx(claimed_only, rel=0.01)
+        assert sureness.scales["eve"] != pytest.approx(claimed_only, rel=0.01)
         let_go(sureness)
-        assert sureness.factor["eve"] == pytest.approx(claimed_only, rel=0.01)
+        assert sureness.scales["eve"] == pytest.approx(claimed_only, rel=0.01)
 
 
 def test_loops_between_agents_that_disagree_widen_nobody():
     """Bob's way is a tenth too long, which is no reason to take either for less sure than it says."""
-    rng, agreement, widths = np.random.default_rng(1), Agreement(0.015), []
+    rng, agreement, widths = np.random.default_rng(1), AgentAgreement(0.015), []
     x, y = ring(0.0), ring(0.7)
     for name, first, steps in (("ann", 0, steps_of(x, rng)), ("bob", 1000, steps_of(y, rng, scale=1.1))):
         for i, step in enumerate([np.eye(4), *steps]):
-            agreement.walk(name, first + i, first + i - 1 if i else None, step, STEP_COV)
+            agreement.add_step(name, first + i, first + i - 1 if i else None, step, STEP_COV)
     for j in range(4, FRAMES - 7, 2):
         noise = se3.exp(np.sqrt(np.diag(LOOP_COV)) * rng.standard_normal(6))
         T = se3.orthonormal(se3.inverse(x[j + 7]) @ y[j] @ noise)
-        agreement.witness(("ann", "bob"), (0, 1), Edge(j + 7, 1000 + j, T, LOOP_COV), None, None)
-        widths.append((agreement.widened("ann"), agreement.widened("bob")))
+        agreement.add_loop(("ann", "bob"), (0, 1), PoseEdge(j + 7, 1000 + j, T, LOOP_COV), None, None)
+        widths.append((agreement.covariance_scale("ann"), agreement.covariance_scale("bob")))
     assert agreement.disputed
     assert set(widths) == {(1.0, 1.0)}
 
 
 def test_who_is_just_sure_enough_to_be_widened_is_not_told_so_again_and_again():
     """Its variances are 4.5 times below another's, twice the leeway; steps differ in size."""
-    rng, sureness, told = np.random.default_rng(0), Sureness(Claims()), list[float]()
-    sureness.met("ann", "bob")
+    rng, sureness, told = np.random.default_rng(0), CovarianceScales(CovarianceClaims()), list[float]()
+    sureness.link("ann", "bob")
     for _ in range(300):
         for name, part in (("ann", 1.0), ("bob", 1 / 4.5)):
             step = se3.exp(np.r_[rng.normal(0, 0.05, 3), rng.normal(0, 0.15, 3)])
-            sureness.claimed(name, step, part * STEP_COV)
-            if (now := sureness.factor.get("bob", 1.0)) != (told or [1.0])[-1]:
+            sureness.add_step(name, step, part * STEP_COV)
+            if (now := sureness.scales.get("bob", 1.0)) != (told or [1.0])[-1]:
                 told.append(now)
     assert 1 <= len(told) <= 4

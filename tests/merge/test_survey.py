@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 from share.config import GraphConfig, MergeConfig
 from share.geometry import se3
 from share.mapping.atlas import Atlas
-from share.mapping.graph.solver import Solver
-from share.mapping.loop_acceptance import Decision
+from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import Loop
-from share.mapping.recognition.verification import Sight
+from share.mapping.recognition.verification import CameraView
 from share.types import F64, U8, View
 
 FOCAL = 400.0
 # The camera looks along the body's x.
-X_CAM = se3.compose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+X_CAM = se3.from_rt(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
 
 
 class Ring:
@@ -36,12 +36,12 @@ class Ring:
         ring.descriptors = np.where(others[self.poster][:, None], new, self.descriptors)
         return ring
 
-    def sight(self, T_world_body: F64, rng: np.random.Generator) -> Sight:
+    def sight(self, T_world_body: F64, rng: np.random.Generator) -> CameraView:
         p = se3.transform(se3.inverse(T_world_body @ X_CAM), self.points)
         uv = p[:, :2] / np.abs(p[:, 2:])
         seen = (p[:, 2] > 0.3) & (np.abs(uv) < [0.8, 0.6]).all(1) & (rng.random(len(p)) < 0.9)
         noisy = uv[seen] + rng.normal(0, 1 / FOCAL, (int(seen.sum()), 2))
-        return Sight(View(noisy, p[seen], self.descriptors[seen]), FOCAL, X_CAM, np.zeros(3))
+        return CameraView(View(noisy, p[seen], self.descriptors[seen]), FOCAL, X_CAM, np.zeros(3))
 
 
 class Room:
@@ -49,30 +49,30 @@ class Room:
 
     def __init__(self, rings: tuple[Ring, Ring], config: MergeConfig | None = None) -> None:
         self.walkers = Walker("a", 1, n=60, turn=1.9 * np.pi), Walker("b", 2, n=60, turn=1.9 * np.pi)
-        self.sights: dict[int, Sight] = {}
+        self.sights: dict[int, CameraView] = {}
         self.atlas = Atlas(config or MergeConfig(), self.sights)
-        self.rings, self.rng, self.solver = rings, np.random.default_rng(3), Solver(GraphConfig())
+        self.rings, self.rng, self.solver = rings, np.random.default_rng(3), PoseGraphSolver(GraphConfig())
 
-    def walk(self, first: int, last: int) -> list[Decision]:
+    def walk(self, first: int, last: int) -> list[LoopDecision]:
         """Keyframes first .. last - 1 of both; what their reviews led to."""
         decisions = []
         for i in range(first, last):
             for walker, ring in zip(self.walkers, self.rings, strict=True):
                 number = self.atlas.add_keyframe(walker.name, walker.keyframes[i])
                 self.sights[number] = ring.sight(walker.truth[i], self.rng)
-                decisions.append(self.atlas.review(number))
+                decisions.append(self.atlas.review_joins(number))
         return [d for d in decisions if d is not None]
 
     def solve(self) -> None:
-        job = self.atlas.snapshot("a/0")
+        job = self.atlas.make_job("a/0")
         self.solver.update(job.change)
-        self.atlas.apply(job, self.solver.solve(job.anchor, job.wanted))
+        self.atlas.apply_solution(job, self.solver.solve(job.anchor, job.covariance_nodes))
 
     def loops(self, at: range) -> list[Loop]:
         a, b = self.walkers
         return [loop(a, i, b, i, self.rng) for i in at]
 
-    def propose(self, loops: list[Loop]) -> list[Decision]:
+    def propose(self, loops: list[Loop]) -> list[LoopDecision]:
         return [self.atlas.propose(x) for x in loops]
 
 
@@ -84,7 +84,7 @@ def test_maps_that_look_alike_where_they_overlap_are_joined_and_stay_so() -> Non
     room = Room((Ring(), Ring()))
     room.walk(0, 20)
     assert room.propose(room.loops(range(0, 20, 5)))[-1].accepted
-    assert room.atlas.sizes() == {"a/0": 40}
+    assert room.atlas.map_sizes() == {"a/0": 40}
     for first in range(20, 60, 5):
         assert room.walk(first, first + 5) == []
         room.propose(room.loops(range(first, first + 5, 2)))
@@ -111,7 +111,7 @@ def test_a_join_is_undone_where_the_copy_ends() -> None:
     assert {str(x) for x in undone.dropped} == {"a:0 - b:0", "a:3 - b:3", "a:6 - b:6", "a:9 - b:9"}
     assert "what a/0 and b/0 should share is gone" in undone.reason
     assert "a:0 - b:0, a:3 - b:3, a:6 - b:6 and 1 more" in undone.reason
-    assert sorted(room.atlas.sizes().values()) == [40, 40]
+    assert sorted(room.atlas.map_sizes().values()) == [40, 40]
     again = room.propose(room.loops(range(1, 13, 3)))[-1]  # the same story, by others who were there
     assert not again.accepted
     assert "views" in again.reason

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from share.errors import DataError
-from share.geometry.se3 import compose, exp, inverse, quat_from_matrix, so3_exp
+from share.geometry.se3 import exp, from_rt, inverse, quat_from_matrix, so3_exp
 from share.metrics.ate import ate, joint_ate
 from share.metrics.rpe import rpe_frames, rpe_time
 
@@ -17,7 +17,7 @@ def walk(n: int, seed: int, step_ns: int = 50_000_000):
     rng = np.random.default_rng(seed)
     phi = np.cumsum(rng.normal(0, 0.05, (n, 3)), axis=0)
     t = np.cumsum(rng.normal(0.02, 0.02, (n, 3)), axis=0)
-    return T0 + step_ns * np.arange(n, dtype=np.int64), compose(so3_exp(phi), t)
+    return T0 + step_ns * np.arange(n, dtype=np.int64), from_rt(so3_exp(phi), t)
 
 
 def noisy(trajectory, seed: int, T_left=None):
@@ -85,10 +85,10 @@ def test_alignment_is_found_and_reported():
 def test_truth_is_interpolated_on_an_arc_and_only_across_short_gaps():
     stamps = T0 + np.array([0, 80, 160, 1000, 1080], np.int64) * 1_000_000
     angle = (stamps - T0) / 1e9  # 1 rad/s, 1 m/s: exactly what slerp and the straight line give back
-    truth = stamps, compose(so3_exp(np.outer(angle, [0, 0, 1.0])), np.outer(angle, [1.0, 0, 0]))
+    truth = stamps, from_rt(so3_exp(np.outer(angle, [0, 0, 1.0])), np.outer(angle, [1.0, 0, 0]))
     at = T0 + np.array([-1, 0, 37, 160, 500, 1000, 1043, 1081], np.int64) * 1_000_000
     a = (at - T0) / 1e9
-    estimate = at, compose(so3_exp(np.outer(a, [0, 0, 1.0])), np.outer(a, [1.0, 0, 0]))
+    estimate = at, from_rt(so3_exp(np.outer(a, [0, 0, 1.0])), np.outer(a, [1.0, 0, 0]))
     found = ate(estimate, truth, "none")
     assert found.n == 5  # 0, 37, 160, 1000, 1043: not before, not in the gap, not after
     assert found.max < 1e-9

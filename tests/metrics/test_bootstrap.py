@@ -19,17 +19,17 @@ def same(found: Interval, wanted: tuple[float, ...]) -> bool:
 
 
 def test_one_session_cannot_say_how_sure_it_is(rng):
-    assert same(statistics.mean([3.0], ["a"], rng), (3.0, math.nan, math.nan))
-    assert same(statistics.mean([3.0, 5.0], ["a", "a"], rng), (4.0, math.nan, math.nan))
+    assert same(statistics.bootstrap_mean([3.0], ["a"], rng), (3.0, math.nan, math.nan))
+    assert same(statistics.bootstrap_mean([3.0, 5.0], ["a", "a"], rng), (4.0, math.nan, math.nan))
     assert same(statistics.bootstrap_ratio([3.0, 6.0], [1.0, 2.0], ["a", "b"], rng), (3.0, 3.0, 3.0))
 
 
 def test_what_was_not_measured_is_left_out_with_its_pair(rng):
-    assert statistics.mean([1.0, math.nan, 3.0], each(3), rng).value == 2.0
+    assert statistics.bootstrap_mean([1.0, math.nan, 3.0], each(3), rng).value == 2.0
     found = statistics.bootstrap_ratio([1.0, math.nan, 100.0], [2.0, 5.0, math.nan], each(3), rng)
     assert same(found, (0.5, math.nan, math.nan))
-    assert all(math.isnan(value) for value in statistics.mean([math.nan], ["a"], rng))
-    assert all(math.isnan(value) for value in statistics.mean([], [], rng))
+    assert all(math.isnan(value) for value in statistics.bootstrap_mean([math.nan], ["a"], rng))
+    assert all(math.isnan(value) for value in statistics.bootstrap_mean([], [], rng))
     assert all(math.isnan(value) for value in statistics.bootstrap_ratio([1.0], [0.0], ["a"], rng))
 
 
@@ -38,7 +38,7 @@ def test_it_covers_the_mean_as_often_as_it_says():
     inside = 0
     for seed in range(400):
         rng = np.random.default_rng(seed)
-        _, low, high = statistics.mean(rng.normal(5.0, 2.0, 20), each(20), rng)
+        _, low, high = statistics.bootstrap_mean(rng.normal(5.0, 2.0, 20), each(20), rng)
         inside += low <= 5.0 <= high
     assert 0.89 < inside / 400 < 0.96
 
@@ -50,7 +50,7 @@ def test_it_covers_the_mean_over_rooms_however_often_each_is_played():
         rng = np.random.default_rng(seed)
         rooms = np.repeat(rng.normal(5.0, 2.0, 20), 3)
         names = np.repeat(each(20), 3).tolist()
-        _, low, high = statistics.mean(rooms + rng.normal(0.0, 0.3, 60), names, rng)
+        _, low, high = statistics.bootstrap_mean(rooms + rng.normal(0.0, 0.3, 60), names, rng)
         inside += low <= 5.0 <= high
     assert 0.89 < inside / 400 < 0.96
 
@@ -62,5 +62,5 @@ def test_pairs_stay_together():
     ratio = statistics.bootstrap_ratio(0.8 * base, base, each(12), rng)
     assert ratio.low == pytest.approx(0.8)
     assert ratio.high == pytest.approx(0.8)
-    mean = statistics.mean(0.8 * base, each(12), rng)
+    mean = statistics.bootstrap_mean(0.8 * base, each(12), rng)
     assert mean.high - mean.low > 2.0

@@ -5,16 +5,22 @@ import math
 
 import pytest
 
-from share.lab.evaluate.figures import AgentFigures, Conditions, RunFigures
-from share.lab.evaluate.statistics import MEASURES, compare, no_worse, no_worse_on_average, policies
+from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
+from share.lab.evaluate.statistics import (
+    MEASURES,
+    compare_policies,
+    count_no_worse,
+    count_no_worse_on_average,
+    policy_names,
+)
 
 NAN = math.nan
 
 
-def agent(name: str, kind: str, **known: float) -> AgentFigures:
+def agent(name: str, kind: str, **known: float) -> AgentMetrics:
     """Everything else is 0 or unknown."""
-    blank = {f.name: 0 if f.type == "int" else NAN for f in dataclasses.fields(AgentFigures)}
-    return AgentFigures(**{**blank, "agent": name, "kind": kind, **known})  # type: ignore[arg-type]
+    blank = {f.name: 0 if f.type == "int" else NAN for f in dataclasses.fields(AgentMetrics)}
+    return AgentMetrics(**{**blank, "agent": name, "kind": kind, **known})  # type: ignore[arg-type]
 
 
 def run(
@@ -24,12 +30,12 @@ def run(
     ate: tuple[float, float],
     done: int,
     seed: int = 0,
-) -> RunFigures:
+) -> RunMetrics:
     agents = tuple(
         agent(name, kind, latency_ms=ms, ate_cm=cm, metres=10.0)
         for name, kind, ms, cm in zip(("ann", "bot"), ("ar", "robot"), latency, ate, strict=True)
     )
-    return RunFigures(Conditions(session, policy, "wifi5", seed), agents, 2, 1.0, 2 * done, 0, done)
+    return RunMetrics(Conditions(session, policy, "wifi5", seed), agents, 2, 1.0, 2 * done, 0, done)
 
 
 RUNS = [
@@ -42,7 +48,10 @@ RUNS = [
 
 
 def found(policy: str) -> dict[str, tuple[float, float]]:
-    return {one.measure.name: (one.value.value, one.ratio.value) for one in compare(RUNS, policy, "covins-g")}
+    return {
+        one.measure.name: (one.value.value, one.ratio.value)
+        for one in compare_policies(RUNS, policy, "covins-g")
+    }
 
 
 def test_ratios_are_of_sessions_that_both_have_played():
@@ -55,7 +64,9 @@ def test_ratios_are_of_sessions_that_both_have_played():
 
 
 def test_how_many_pairs_a_ratio_rests_on_is_told():
-    pairs = {one.measure.name: (one.pairs, one.of) for one in compare(RUNS, "share", "covins-g")}
+    pairs = {
+        one.measure.name: (one.pairs, one.total_pairs) for one in compare_policies(RUNS, "share", "covins-g")
+    }
     assert pairs["AR latency"] == (2, 2)
     assert pairs["robot ATE in the map"] == (1, 2)
     assert pairs["AR QoE"] == (0, 2)
@@ -64,7 +75,7 @@ def test_how_many_pairs_a_ratio_rests_on_is_told():
 def test_seeds_of_one_session_do_not_make_it_surer():
     again = [dataclasses.replace(r, conditions=dataclasses.replace(r.conditions, seed=1)) for r in RUNS]
     once, twice = (
-        {one.measure.name: one.ratio for one in compare(runs, "share", "covins-g")}["AR latency"]
+        {one.measure.name: one.ratio for one in compare_policies(runs, "share", "covins-g")}["AR latency"]
         for runs in (RUNS, RUNS + again)
     )
     assert once == twice
@@ -75,8 +86,8 @@ def test_the_base_is_all_of_itself():
 
 
 def test_whose_error_is_no_more():
-    assert no_worse(RUNS, "share", "covins-g") == (2, 3)
-    assert no_worse(RUNS, "covins-g", "share") == (2, 3)
+    assert count_no_worse(RUNS, "share", "covins-g") == (2, 3)
+    assert count_no_worse(RUNS, "covins-g", "share") == (2, 3)
 
 
 def test_whose_error_is_no_more_on_average():
@@ -84,11 +95,11 @@ def test_whose_error_is_no_more_on_average():
         run("share", "one", (10.0, 40.0), (1.0, 3.0), 20, seed=1),
         run("covins-g", "one", (10.0, 40.0), (0.4, 3.5), 20, seed=1),  # means: 0.7 for 1.0, 2.75 for 3.0
     ]
-    assert no_worse_on_average(RUNS, "share", "covins-g") == (2, 3)
-    assert no_worse_on_average(RUNS + again, "share", "covins-g") == (1, 3)
-    assert no_worse_on_average(RUNS + again, "covins-g", "share") == (2, 3)
+    assert count_no_worse_on_average(RUNS, "share", "covins-g") == (2, 3)
+    assert count_no_worse_on_average(RUNS + again, "share", "covins-g") == (1, 3)
+    assert count_no_worse_on_average(RUNS + again, "covins-g", "share") == (2, 3)
 
 
 def test_policies_keep_their_order_and_every_measure_has_a_name():
-    assert policies(RUNS) == ["covins-g", "share"]
+    assert policy_names(RUNS) == ["covins-g", "share"]
     assert len({measure.name for measure in MEASURES}) == len(MEASURES)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.lab.evaluate.statistics import deviations, inside, nees, upright
+from share.lab.evaluate.statistics import deviations, nees, share_within, yaw_alignment
 
 COV = np.diag([0.02, 0.01, 0.03, 0.05, 0.1, 0.02]) ** 2
 COV[0, 4] = COV[4, 0] = 0.8 * 0.02 * 0.1
@@ -20,7 +20,7 @@ def drawn(n: int, seed: int = 0):
 
 
 def level(yaw: float, shift):
-    return se3.compose(se3.so3_exp(np.array([0.0, 0.0, yaw])), np.array(shift))
+    return se3.from_rt(se3.so3_exp(np.array([0.0, 0.0, yaw])), np.array(shift))
 
 
 def test_truth_drawn_from_the_covariance_is_consistent_in_any_world():
@@ -29,7 +29,9 @@ def test_truth_drawn_from_the_covariance_is_consistent_in_any_world():
     for part in (slice(0, 3), slice(3, 6)):
         mean = nees(found.errors[:, part], found.cov[:, part, part]).mean()
         assert mean == pytest.approx(3, abs=0.15)  # four sigma of the mean of 4000
-        assert inside(found.errors[:, part], found.sigmas[:, part]) == pytest.approx(0.9973**3, abs=0.006)
+        assert share_within(found.errors[:, part], found.sigmas[:, part]) == pytest.approx(
+            0.9973**3, abs=0.006
+        )
 
 
 def test_too_small_a_covariance_shows():
@@ -50,9 +52,9 @@ def test_errors_are_told_less_true_along_odom():
 def test_a_wrong_tilt_is_not_aligned_away():
     truth = se3.exp(np.array([0.3, -0.2, 1.0, 1, 2, 3]))
     tilted = se3.exp(np.array([0.05, 0, 0, 0, 0, 0])) @ level(1.0, [5, 5, 5]) @ truth
-    left = tilted @ se3.inverse(upright(tilted, truth) @ truth)
+    left = tilted @ se3.inverse(yaw_alignment(tilted, truth) @ truth)
     np.testing.assert_allclose(se3.so3_log(left[:3, :3]), [0.05, 0, 0], atol=1e-9)
-    np.testing.assert_allclose((upright(tilted, truth) @ truth)[:3, 3], tilted[:3, 3], atol=1e-12)
+    np.testing.assert_allclose((yaw_alignment(tilted, truth) @ truth)[:3, 3], tilted[:3, 3], atol=1e-12)
 
 
 def test_each_stretch_is_laid_over_for_itself():
@@ -70,4 +72,4 @@ def test_nees_of_no_covariance_is_infinite():
 
 
 def test_inside_asks_for_every_axis():
-    assert inside(np.array([[1.0, 3.1], [2.9, -2.9]]), np.ones((2, 2))) == 0.5
+    assert share_within(np.array([[1.0, 3.1], [2.9, -2.9]]), np.ones((2, 2))) == 0.5

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from share.metrics.frame_log import Queue, latency, summary
+from share.metrics.frame_log import ReplayQueue, latency, summary
 
 
 def test_mean_is_over_the_multiset_of_both():
@@ -30,16 +30,16 @@ def test_nothing_is_null_in_json_and_nan_is_refused():
 
 
 def test_a_frame_waits_for_what_the_one_before_left_to_do():
-    queue = Queue()
+    queue = ReplayQueue()
     assert queue.wait_ms(5) == 0
-    queue.served(5, 40.0)
+    queue.finish_frame(5, 40.0)
     assert queue.wait_ms(5 + 30_000_000) == pytest.approx(10)
     assert queue.wait_ms(5 + 50_000_000) == 0
 
 
 def test_who_is_too_slow_falls_behind_ever_more():
-    queue = Queue()
+    queue = ReplayQueue()
     for k in range(60):
         stamp = k * 33_000_000
-        queue.served(stamp, queue.wait_ms(stamp) + 50)
+        queue.finish_frame(stamp, queue.wait_ms(stamp) + 50)
     assert queue.wait_ms(60 * 33_000_000) == pytest.approx(60 * 17)

@@ -15,12 +15,12 @@ STAMPS = np.arange(0, 20_000, 50) * MS
 def walk() -> np.ndarray:
     s = np.arange(len(STAMPS)) * 0.05
     t = np.column_stack([2 * np.cos(s), 2 * np.sin(s), 0.1 * np.sin(5 * s)])
-    return se3.compose(se3.so3_exp(np.column_stack([0 * s, 0 * s, s])), t)
+    return se3.from_rt(se3.so3_exp(np.column_stack([0 * s, 0 * s, s])), t)
 
 
 def told(poses: np.ndarray, **also: bool) -> list[float | None]:
     error = LocalError((STAMPS, walk()))
-    return [error.after(int(stamp), T, **also) for stamp, T in zip(STAMPS, poses, strict=True)]
+    return [error.update(int(stamp), T, **also) for stamp, T in zip(STAMPS, poses, strict=True)]
 
 
 def test_odometry_that_lies_elsewhere_is_not_wrong() -> None:
@@ -50,8 +50,8 @@ def test_where_there_is_no_truth_or_no_pose_there_is_no_error() -> None:
     error = LocalError((STAMPS, walk()))
     poses = walk()
     for stamp, T in zip(STAMPS[:150], poses[:150], strict=True):
-        last = error.after(int(stamp), T)
+        last = error.update(int(stamp), T)
     assert last is not None
-    assert error.after(int(STAMPS[150]), None) is None
-    assert error.after(10**15, poses[0]) is None
-    assert error.after(int(STAMPS[151]), poses[151], new_stretch=True) is None
+    assert error.update(int(STAMPS[150]), None) is None
+    assert error.update(10**15, poses[0]) is None
+    assert error.update(int(STAMPS[151]), poses[151], new_segment=True) is None

@@ -14,8 +14,8 @@ import pytest
 
 from share.errors import DataError
 from share.files.line_file import Spool
-from share.metrics.frame_log import InMemory, RunLog, latency
-from share.types import TrackState, Wait
+from share.metrics.frame_log import MemoryLineStore, RunLog, latency
+from share.types import TrackState, WaitReason
 
 STATES = list(TrackState)
 
@@ -32,7 +32,7 @@ class Rows:
         self.rows.append(row)
         self.by_stamp[stamp_ns] = row
 
-    def mark_corrected(self, stamp_ns: int, corrected_ms: float) -> None:
+    def add_correction(self, stamp_ns: int, corrected_ms: float) -> None:
         self.by_stamp[stamp_ns][2] = corrected_ms
 
     def csv(self) -> str:
@@ -78,7 +78,7 @@ def drive(logs: list[Any], n: int, seed: int) -> None:
         for log in logs:
             log.add(stamps[-1], track_ms, state, bool(keyframe), bool(sent))
             if corrected:
-                log.mark_corrected(*late)
+                log.add_correction(*late)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 20, 3000])
@@ -94,7 +94,7 @@ def test_the_report_is_that_of_all_rows_to_the_last_byte(
     for log in (spooled, in_memory):
         told = log.report()
         assert json.dumps({key: told[key] for key in rows.report()}) == json.dumps(rows.report())
-        assert "".join(log.csv()) == rows.csv()
+        assert "".join(log.csv_chunks()) == rows.csv()
     spool.close()
 
 
@@ -102,8 +102,8 @@ def test_what_does_not_come_of_rows_is_told_too() -> None:
     log = RunLog()
     log.add(5, 2.0, TrackState.OK, False)
     log.cpu_s = 0.5
-    log.add_decode(0.25)
-    for waits in (Wait.IMU, Wait.IMU, None):
+    log.add_decode_time(0.25)
+    for waits in (WaitReason.IMU, WaitReason.IMU, None):
         log.add_result(waits is None, waits is not None, waits)
     told = log.report()
     assert (told["cpu_ms_per_frame"], told["decode_ms_per_frame"]) == (500.0, 250.0)
@@ -118,7 +118,7 @@ def test_an_hour_of_frames_takes_no_memory(tmp_path: Path) -> None:
     tracemalloc.start()
     for k in range(1, 5000):
         log.add(k, k / 7, TrackState.OK, True, True)
-        log.mark_corrected(k, k / 3)
+        log.add_correction(k, k / 3)
     held, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert held < 50_000
@@ -127,7 +127,7 @@ def test_an_hour_of_frames_takes_no_memory(tmp_path: Path) -> None:
 
 
 def test_a_line_that_somebody_changed_is_said() -> None:
-    lines = InMemory()
+    lines = MemoryLineStore()
     log = RunLog(lines)
     log.add(5, 2.0, TrackState.OK, False)
     lines.write("5,what,,OK,0,0")

@@ -1,17 +1,17 @@
 """Who shares a map, as corrections come."""
 
-from share.lab.evaluate.together import Together
+from share.lab.evaluate.map_membership import MapMembership
 
 
 def test_agents_come_together_and_part():
-    together = Together()
-    assert together.agents == []
-    together.corrected("a", "a/0")
-    together.corrected("b", "b/0")
-    assert together.agents == []
-    together.corrected("b", "a/0")
-    assert together.agents == ["a", "b"]
-    together.corrected("c", "c/0")
-    assert together.agents == ["a", "b"]
-    together.corrected("a", "c/0")
-    assert together.agents == ["a", "c"]
+    together = MapMembership()
+    assert together.sharing_agents == []
+    together.add_correction("a", "a/0")
+    together.add_correction("b", "b/0")
+    assert together.sharing_agents == []
+    together.add_correction("b", "a/0")
+    assert together.sharing_agents == ["a", "b"]
+    together.add_correction("c", "c/0")
+    assert together.sharing_agents == ["a", "b"]
+    together.add_correction("a", "c/0")
+    assert together.sharing_agents == ["a", "c"]

@@ -4,46 +4,46 @@ import numpy as np
 import pytest
 from mocap_sim import BODY, NOISE, START_NS, TILT, G, Motion, record_imu, record_mocap, stamps
 
-from share.errors import DataError, MisfitError
+from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
-from share.lab.mocap.fit import Fit, fit
-from share.lab.mocap.mocap import Mocap
-from share.lab.mocap.state import FitOptions
+from share.lab.mocap.fit import MocapFit, fit_mocap
+from share.lab.mocap.state import MocapFitOptions
+from share.lab.mocap.trajectory import MocapTrajectory
 from share.types import F64, ImuBatch
 
 DELAY = 12_345_678  # ns
 GAPS = ((8.0, 8.4), (12.0, 14.0))
-WHITE = FitOptions(sigma_rotation=np.radians(0.2), independent_hz=100.0, imu_inflation=1.0)
+WHITE = MocapFitOptions(sigma_rotation=np.radians(0.2), independent_hz=100.0, imu_inflation=1.0)
 
 
 @pytest.fixture(scope="module")
-def found() -> Fit:
+def found() -> MocapFit:
     motion = Motion()
     mocap = record_mocap(motion, 30, DELAY, gaps=GAPS)
-    return fit(record_imu(motion, 30), NOISE, mocap, WHITE)
+    return fit_mocap(record_imu(motion, 30), NOISE, mocap, WHITE)
 
 
-def shared_error(fit: Fit, delay_ns: int = DELAY) -> F64:
+def shared_error(fit: MocapFit, delay_ns: int = DELAY) -> F64:
     """(9,) found against true: tilt, body (rotation, position), offset s; drift apart."""
     body = se3.log(se3.inverse(fit.T_body_mocap) @ BODY)
     tilt = TILT - se3.so3_log(fit.R_mocap_world)[:2]
     return np.concatenate([tilt, body, [(delay_ns - fit.offset_ns) * 1e-9]])
 
 
-def pose_error(fit: Fit, motion: Motion) -> F64:
+def pose_error(fit: MocapFit, motion: Motion) -> F64:
     """(N, 6) of the nodes, perturbation at the right."""
     truth = motion.pose((fit.stamps_ns - START_NS) * 1e-9)
     return se3.log(se3.inverse(fit.T_world_body) @ truth)
 
 
-def test_tilt_mounting_and_delay_are_recovered(found: Fit) -> None:
+def test_tilt_mounting_and_delay_are_recovered(found: MocapFit) -> None:
     error = np.abs(shared_error(found))
     assert np.degrees(error[:5]).max() < 0.05
     assert error[5:8].max() < 1e-3
     assert error[8] < 0.2e-3
 
 
-def test_the_path_is_better_than_the_mocap(found: Fit) -> None:
+def test_the_path_is_better_than_the_mocap(found: MocapFit) -> None:
     error = pose_error(found, Motion())
     assert np.sqrt((error[:, 3:] ** 2).sum(1).mean()) < 1e-3  # the mocap's is 3.5 mm
     assert np.degrees(np.sqrt((error[:, :3] ** 2).sum(1).mean())) < 0.05
@@ -51,14 +51,14 @@ def test_the_path_is_better_than_the_mocap(found: Fit) -> None:
     assert found.residuals.rotation_deg == pytest.approx(0.2 * np.sqrt(3), rel=0.05)
 
 
-def test_velocities_and_the_world_is_level(found: Fit) -> None:
+def test_velocities_and_the_world_is_level(found: MocapFit) -> None:
     t = (found.stamps_ns - START_NS) * 1e-9
     velocity = (Motion().pose(t + 1e-4) - Motion().pose(t - 1e-4))[:, :3, 3] / 2e-4
     assert np.abs(found.velocity - velocity).max() < 0.01
     assert found.tilt_deg == pytest.approx(np.degrees(np.linalg.norm(TILT)), abs=0.05)
 
 
-def test_a_short_hole_is_bridged_and_a_long_one_is_a_gap(found: Fit) -> None:
+def test_a_short_hole_is_bridged_and_a_long_one_is_a_gap(found: MocapFit) -> None:
     np.testing.assert_allclose((found.gaps - START_NS) * 1e-9, [(12.0, 14.0)], atol=0.02)
     inside = (found.stamps_ns > START_NS + 12_000_000_000) & (found.stamps_ns < START_NS + 14_000_000_000)
     sigma = np.sqrt(found.cov_poses[:, 3, 3])
@@ -73,8 +73,11 @@ def test_a_mocap_with_y_up_an_unrelated_clock_and_outliers() -> None:
     T = flip @ mocap.T
     wrong = np.arange(37, len(T), 41)
     T[wrong] = T[wrong] @ se3.exp(np.array([0, 0, 2.0, 0.5, 0, 0]))
-    found = fit(
-        record_imu(motion, 30), NOISE, Mocap(mocap.stamps_ns, T), FitOptions(within_s=None, imu_inflation=1.0)
+    found = fit_mocap(
+        record_imu(motion, 30),
+        NOISE,
+        MocapTrajectory(mocap.stamps_ns, T),
+        MocapFitOptions(within_s=None, imu_inflation=1.0),
     )
     error = shared_error(found, 5_000_000_000_000 + DELAY)
     assert np.degrees(np.abs(error[2:5])).max() < 0.05
@@ -87,7 +90,7 @@ def test_a_mocap_with_y_up_an_unrelated_clock_and_outliers() -> None:
 def test_a_clock_that_runs_fast_is_seen_to() -> None:
     motion = Motion(8)
     mocap = record_mocap(motion, 40, DELAY, drift=60e-6)
-    found = fit(record_imu(motion, 40), NOISE, mocap, WHITE)
+    found = fit_mocap(record_imu(motion, 40), NOISE, mocap, WHITE)
     assert found.drift_ppm == pytest.approx(60, abs=10)
     assert abs(shared_error(found)[8]) < 0.2e-3
 
@@ -95,8 +98,8 @@ def test_a_clock_that_runs_fast_is_seen_to() -> None:
 def test_a_chain_broken_for_long_goes_on_in_the_same_frame() -> None:
     motion = Motion(4)
     mocap = record_mocap(motion, 45, DELAY, gaps=((13.0, 24.0), (24.5, 35.0)))  # half a second is no part
-    found = fit(record_imu(motion, 45), NOISE, mocap, WHITE)
-    assert found.breaks.sum() == 1
+    found = fit_mocap(record_imu(motion, 45), NOISE, mocap, WHITE)
+    assert found.is_break.sum() == 1
     assert np.abs(shared_error(found))[5:8].max() < 1e-3
     assert np.abs(pose_error(found, motion)[:, 3:]).max() < 0.006
 
@@ -105,9 +108,9 @@ def test_a_robot_that_only_yaws_needs_a_guess() -> None:
     motion = Motion(5, planar=True)
     imu, mocap = record_imu(motion, 15), record_mocap(motion, 15)
     with pytest.raises(DataError, match="one axis"):
-        fit(imu, NOISE, mocap)
+        fit_mocap(imu, NOISE, mocap)
     guess = BODY @ se3.exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.01]))
-    found = fit(imu, NOISE, mocap, FitOptions(T_body_mocap=guess, guess_sigma=(0.03, 0.02)))
+    found = fit_mocap(imu, NOISE, mocap, MocapFitOptions(T_body_mocap=guess, guess_sigma=(0.03, 0.02)))
     error = se3.log(se3.inverse(found.T_body_mocap) @ BODY)
     lever = BODY[:3, :3] @ error[3:]  # in the body: what yaw shows is found, the height stays the guess
     assert np.abs(lever[:2]).max() < 3e-3
@@ -119,7 +122,7 @@ def test_stillness_is_exact() -> None:
     """Without noise, what is left is what midpoint steps leave."""
     motion = Motion(6)
     mocap = record_mocap(motion, 12, DELAY, sigma=(0.0, 0.0))
-    found = fit(record_imu(motion, 12, None), NOISE, mocap, FitOptions(imu_inflation=1.0))
+    found = fit_mocap(record_imu(motion, 12, None), NOISE, mocap, MocapFitOptions(imu_inflation=1.0))
     error = np.abs(shared_error(found))
     assert np.degrees(error[:5]).max() < 2e-3
     assert error[5:8].max() < 2e-4
@@ -131,7 +134,7 @@ def test_errors_are_what_the_covariances_say() -> None:
     shared, poses = [], []
     for seed in range(12):
         motion = Motion(seed)
-        found = fit(
+        found = fit_mocap(
             record_imu(motion, 30, NOISE, seed), NOISE, record_mocap(motion, 30, DELAY, seed=seed), WHITE
         )
         error, path = shared_error(found), pose_error(found, motion)
@@ -149,7 +152,7 @@ def still(seconds: float) -> ImuBatch:
     return ImuBatch(t, np.zeros((len(t), 3)), np.tile((0.0, 0.0, G), (len(t), 1)))
 
 
-def bad(name: str) -> tuple[ImuBatch, Mocap]:
+def bad(name: str) -> tuple[ImuBatch, MocapTrajectory]:
     motion = Motion()
     imu, mocap = record_imu(motion, 8), record_mocap(motion, 8)
     t = imu.stamps_ns.copy()
@@ -166,7 +169,7 @@ def bad(name: str) -> tuple[ImuBatch, Mocap]:
     if name == "millimetres":
         T = mocap.T.copy()
         T[:, :3, 3] *= 1000
-        return imu, Mocap(mocap.stamps_ns, T)
+        return imu, MocapTrajectory(mocap.stamps_ns, T)
     if name == "other body":
         return record_imu(Motion(77), 8), mocap
     return still(8), mocap
@@ -186,10 +189,10 @@ def bad(name: str) -> tuple[ImuBatch, Mocap]:
 )
 def test_what_cannot_be_fitted_is_said(name: str, says: str) -> None:
     with pytest.raises(DataError, match=says):
-        fit(*_swap(bad(name)))
+        fit_mocap(*_swap(bad(name)))
 
 
-def _swap(pair: tuple[ImuBatch, Mocap]) -> tuple[ImuBatch, object, Mocap]:
+def _swap(pair: tuple[ImuBatch, MocapTrajectory]) -> tuple[ImuBatch, object, MocapTrajectory]:
     return pair[0], NOISE, pair[1]
 
 
@@ -199,11 +202,11 @@ def test_what_is_no_mocap_is_said() -> None:
     lost = T.copy()
     lost[2, 0, 3] = np.nan
     with pytest.raises(DataError, match="not finite"):
-        Mocap(t, lost)
+        MocapTrajectory(t, lost)
     with pytest.raises(DataError, match="pose 2 of 5"):
-        Mocap(t, T * np.array([1, 0, 1, 1, 1])[:, None, None])
+        MocapTrajectory(t, T * np.array([1, 0, 1, 1, 1])[:, None, None])
     with pytest.raises(DataError, match="not later"):
-        Mocap(t[::-1].copy(), T)
+        MocapTrajectory(t[::-1].copy(), T)
     with pytest.raises(DataError, match="0 poses"):
-        Mocap(t[:0], T[:0])
-    assert issubclass(MisfitError, DataError)
+        MocapTrajectory(t[:0], T[:0])
+    assert issubclass(CalibrationMismatchError, DataError)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.recognition.verification import Sight
+from share.mapping.recognition.verification import CameraView
 from share.recordings.recording import FolderSource
 from share.runtime.source import open_source
 from share.sensors.measurement import CAM0, CAM1, DEPTH
@@ -19,14 +19,14 @@ from share.vision.orb import make_view
 class Seen(NamedTuple):
     """Sights, and the true poses of their bodies T_world_body (N, 4, 4) and cameras T_world_cam0."""
 
-    sights: list[Sight]
+    sights: list[CameraView]
     T_world_body: F64
     T_world_cam0: F64
 
     def relative(self) -> tuple[F64, F64]:
         """Distance [m] and angle [deg] (N, N) between cameras."""
         rel = se3.inverse(self.T_world_cam0)[:, None] @ self.T_world_cam0[None]
-        return np.linalg.norm(rel[..., :3, 3], axis=-1), np.degrees(se3.angle(rel))
+        return np.linalg.norm(rel[..., :3, 3], axis=-1), np.degrees(se3.rotation_angle(rel))
 
 
 def load(path: Path, step: int = 1, upright: bool = True) -> Seen:
@@ -43,7 +43,7 @@ def load(path: Path, step: int = 1, upright: bool = True) -> Seen:
         view = make_view(Frame(stamp, 0, image.load(), image1, depth), source.rig)
         T = truth.T[np.abs(truth.stamps_ns - stamp).argmin()]
         up = T[:3, :3].T @ (0.0, 0.0, 1.0) if upright else np.zeros(3)
-        sights.append(Sight(view, source.rig.cam0.focal, source.rig.T_body_cam0, up))
+        sights.append(CameraView(view, source.rig.cam0.focal, source.rig.T_body_cam0, up))
         poses.append(T)
     bodies = np.array(poses)
     return Seen(sights, bodies, bodies @ source.rig.T_body_cam0)

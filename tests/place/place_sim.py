@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.recognition.verification import Sight
+from share.mapping.recognition.verification import CameraView
 from share.types import F64, U8, View
 
 FOCAL = 458.0
@@ -37,7 +37,7 @@ def view(
 
 def sights(
     seed: int, T_c_q: F64, depth_share: float = 0.8, up: bool = True, n: int = 400
-) -> tuple[Sight, Sight]:
+) -> tuple[CameraView, CameraView]:
     """Query and candidate; T_c_q (4, 4) between the cameras; the candidate's body stands upright."""
     rng = np.random.default_rng(seed + 1000)
     points, descriptors = scene(seed, n)
@@ -48,7 +48,7 @@ def sights(
     up_c = np.array([0.0, 0.0, 1.0])
     up_q = bodies(T_c_q)[:3, :3].T @ up_c
     none = np.zeros(3)
-    return Sight(query, FOCAL, X_CAM, up_q if up else none), Sight(
+    return CameraView(query, FOCAL, X_CAM, up_q if up else none), CameraView(
         candidate, FOCAL, X_CAM, up_c if up else none
     )
 

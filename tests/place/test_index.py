@@ -3,7 +3,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from share.mapping.recognition.index import PlaceIndex, joined, written
+from share.mapping.recognition.index import PlaceIndex, build_page, merge_pages
 from share.types import U8
 
 
@@ -104,13 +104,13 @@ def test_joined_pages_are_the_page_written_at_once_from_what_lives() -> None:
     vocabulary = 150_000  # joined in several blocks
     common = rng.integers(0, vocabulary, 500, np.uint32)
     views = [np.append(rng.choice(common, n), [0, vocabulary - 1]).astype(np.uint32) for n in range(120)]
-    pages = [written(range(i, j), views[i:j], vocabulary) for i, j in ((0, 70), (70, 80), (80, 120))]
+    pages = [build_page(range(i, j), views[i:j], vocabulary) for i, j in ((0, 70), (70, 80), (80, 120))]
     dead = [0, 5, 69, *range(70, 80), 119]
     for page in pages:
-        page.alive[np.isin(page.ids, dead)] = False
+        page.is_alive[np.isin(page.ids, dead)] = False
     left = [i for i in range(120) if i not in dead]
-    one, whole = joined(pages), written(left, [views[i] for i in left], vocabulary)
-    for name in ("ids", "sizes", "alive", "starts", "slots"):
+    one, whole = merge_pages(pages), build_page(left, [views[i] for i in left], vocabulary)
+    for name in ("ids", "sizes", "is_alive", "starts", "slots"):
         np.testing.assert_array_equal(getattr(one, name), getattr(whole, name), name, strict=True)
 
 
@@ -156,9 +156,9 @@ def test_words_of_those_that_are_gone_are_held_no_longer() -> None:
         index.remove(1000 + int(i))
     for i in range(256):
         index.add(5000 + i, rng.integers(0, 256, (20, 32), np.uint8))
-    on_pages = sum(page.held() for page in index._pages)
+    on_pages = sum(page.word_counts() for page in index._pages)
     fresh = np.bincount(
-        np.concatenate([np.zeros(0, np.uint32), *index._fresh.values()]), minlength=len(on_pages)
+        np.concatenate([np.zeros(0, np.uint32), *index._unpaged.values()]), minlength=len(on_pages)
     )
-    assert (index._held == on_pages + fresh).all()
+    assert (index._word_counts == on_pages + fresh).all()
     assert len(index) == 376

@@ -14,7 +14,7 @@ from place_real import Seen, load
 from share.config import PlaceConfig
 from share.geometry import se3
 from share.mapping.recognition.index import PlaceIndex
-from share.mapping.recognition.verification import Verified, verify
+from share.mapping.recognition.verification import Verification, verify
 
 CONFIG = PlaceConfig()
 
@@ -40,9 +40,9 @@ def accepted(seen: Seen, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, in
     out = {}
     for q, c in pairs:
         found = verify(seen.sights[q], seen.sights[c], CONFIG)
-        if isinstance(found, Verified):
+        if isinstance(found, Verification):
             apart = se3.inverse(se3.inverse(seen.T_world_body[c]) @ seen.T_world_body[q]) @ found.T_c_q
-            out[q, c] = float(np.linalg.norm(apart[:3, 3])), float(np.degrees(se3.angle(apart)))
+            out[q, c] = float(np.linalg.norm(apart[:3, 3])), float(np.degrees(se3.rotation_angle(apart)))
     return out
 
 
@@ -106,5 +106,5 @@ def test_kitchen_every_pair(kitchen: Seen) -> None:
 def test_two_different_rooms_are_never_one(euroc: Seen, kitchen: Seen) -> None:
     for query in euroc.sights[::2]:
         for candidate in kitchen.sights[::2]:
-            assert not isinstance(verify(query, candidate, CONFIG), Verified)
-            assert not isinstance(verify(candidate, query, CONFIG), Verified)
+            assert not isinstance(verify(query, candidate, CONFIG), Verification)
+            assert not isinstance(verify(candidate, query, CONFIG), Verification)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.mapping.recognition.refinement import Noise
-from share.mapping.recognition.scale import Scale, relative_scale
+from share.mapping.recognition.depth_scale import DepthScale, relative_depth_scale
+from share.mapping.recognition.refinement import KeypointNoise
 
-NOISE = Noise(1.5 / 400, 0.01)
+NOISE = KeypointNoise(1.5 / 400, 0.01)
 T_C_Q = se3.exp(np.array([0.02, -0.1, 0.05, 0.3, 0.1, -0.2]))
 
 
@@ -28,7 +28,7 @@ def views(log: float, rng, n: int = 80):
 def test_it_is_found_with_its_sigma(log):
     found = []
     for seed in range(30):
-        got = relative_scale(T_C_Q, *views(log, np.random.default_rng(seed)), NOISE, NOISE, 11.3)
+        got = relative_depth_scale(T_C_Q, *views(log, np.random.default_rng(seed)), NOISE, NOISE, 11.3)
         assert got is not None
         found.append((got.log - log) / got.sigma)
     assert abs(np.mean(found)) < 1.0
@@ -38,7 +38,7 @@ def test_it_is_found_with_its_sigma(log):
 def test_wrong_matches_do_not_matter():
     y_q, y_c = views(0.05, np.random.default_rng(3))
     y_c[:16, :2] = np.random.default_rng(4).uniform(-0.5, 0.5, (16, 2))
-    found = relative_scale(T_C_Q, y_q, y_c, NOISE, NOISE, 11.3)
+    found = relative_depth_scale(T_C_Q, y_q, y_c, NOISE, NOISE, 11.3)
     assert found is not None
     assert found.log == pytest.approx(0.05, abs=4 * found.sigma)
 
@@ -46,8 +46,8 @@ def test_wrong_matches_do_not_matter():
 def test_too_few_depths_say_nothing():
     y_q, y_c = views(0.05, np.random.default_rng(3))
     y_q[5:, 2] = np.nan
-    assert relative_scale(T_C_Q, y_q, y_c, NOISE, NOISE, 11.3) is None
+    assert relative_depth_scale(T_C_Q, y_q, y_c, NOISE, NOISE, 11.3) is None
 
 
 def test_from_the_other_end():
-    assert Scale(0.1, 0.02).reverse() == Scale(-0.1, 0.02)
+    assert DepthScale(0.1, 0.02).reverse() == DepthScale(-0.1, 0.02)

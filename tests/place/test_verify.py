@@ -7,8 +7,8 @@ from place_sim import bodies, sights
 
 from share.config import PlaceConfig
 from share.geometry import se3
-from share.mapping.recognition.verification import Refusal, Sight, Verified, verify
-from share.types import MAX_M, MAX_UV, View
+from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
+from share.types import MAX_POSITION_M, MAX_UV, View
 
 CONFIG = PlaceConfig()
 T_C_Q = se3.exp(np.array([0.1, -0.15, 0.05, 0.3, 0.1, -0.2]))
@@ -16,7 +16,7 @@ T_C_Q = se3.exp(np.array([0.1, -0.15, 0.05, 0.3, 0.1, -0.2]))
 
 def test_finds_the_pose_between_bodies() -> None:
     found = verify(*sights(0, T_C_Q), CONFIG)
-    assert isinstance(found, Verified), found
+    assert isinstance(found, Verification), found
     xi = se3.log(se3.inverse(bodies(T_C_Q)) @ found.T_c_q)
     assert np.linalg.norm(xi[:3]) < np.radians(0.5)
     assert np.linalg.norm(xi[3:]) < 0.02
@@ -29,7 +29,7 @@ def test_covariance_of_the_body_pose_is_consistent() -> None:
     nees = []
     for seed in range(40):
         found = verify(*sights(seed, T_C_Q), config)
-        assert isinstance(found, Verified)
+        assert isinstance(found, Verification)
         xi = se3.log(se3.inverse(bodies(T_C_Q)) @ found.T_c_q)
         nees.append(xi @ np.linalg.solve(found.cov, xi))
     assert 4.0 < np.mean(nees) < 9.0
@@ -38,20 +38,20 @@ def test_covariance_of_the_body_pose_is_consistent() -> None:
 def test_the_reverse_question_has_the_inverse_answer() -> None:
     query, candidate = sights(1, T_C_Q)
     there, back = verify(query, candidate, CONFIG), verify(candidate, query, CONFIG)
-    assert isinstance(there, Verified)
-    assert isinstance(back, Verified)
+    assert isinstance(there, Verification)
+    assert isinstance(back, Verification)
     assert np.abs(se3.log(there.T_c_q @ back.T_c_q)).max() < 2e-3
 
 
 def test_same_input_same_output() -> None:
     pair = sights(2, T_C_Q)
     first, second = verify(*pair, CONFIG, seed=7), verify(*pair, CONFIG, seed=7)
-    assert isinstance(first, Verified)
-    assert isinstance(second, Verified)
+    assert isinstance(first, Verification)
+    assert isinstance(second, Verification)
     assert first.T_c_q.tobytes() == second.T_c_q.tobytes()
 
 
-def reason(query: Sight, candidate: Sight, config: PlaceConfig = CONFIG) -> str:
+def reason(query: CameraView, candidate: CameraView, config: PlaceConfig = CONFIG) -> str:
     found = verify(query, candidate, config)
     assert isinstance(found, Refusal), found
     return found.reason
@@ -79,7 +79,7 @@ def test_gravity_must_agree() -> None:
     query, candidate = sights(7, T_C_Q)
     tilted = replace(query, up=se3.so3_exp(np.array([0.2, 0, 0])) @ query.up)
     assert reason(tilted, candidate).startswith("gravity differs by 11.")
-    assert isinstance(verify(replace(query, up=np.zeros(3)), candidate, CONFIG), Verified)
+    assert isinstance(verify(replace(query, up=np.zeros(3)), candidate, CONFIG), Verification)
 
 
 def test_scale_that_differs_between_the_directions_is_refused() -> None:
@@ -125,9 +125,9 @@ def test_hostile_numbers_do_not_raise(seed: int) -> None:
     some = rng.random(len(uv)) < 0.5 + 0.5 * (seed % 2)
     kind = seed % 5
     if kind == 0:
-        uv[some], points[some] = MAX_UV, MAX_M
+        uv[some], points[some] = MAX_UV, MAX_POSITION_M
     elif kind == 1:
-        points[some, 2] = rng.choice([0.0, -1.0, 1e-30, MAX_M], some.sum())
+        points[some, 2] = rng.choice([0.0, -1.0, 1e-30, MAX_POSITION_M], some.sum())
     elif kind == 2:
         uv[some], points[some] = uv[0], points[0]
     elif kind == 3:
@@ -142,4 +142,4 @@ def test_hostile_numbers_do_not_raise(seed: int) -> None:
         verify(candidate, broken, CONFIG),
         verify(broken, broken, CONFIG),
     ):
-        assert isinstance(result, Verified | Refusal)
+        assert isinstance(result, Verification | Refusal)

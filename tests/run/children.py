@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from share.children import environment
+from share.child_processes import child_environment
 
 SHARE = [sys.executable, "-m", "share"]
 
@@ -25,7 +25,7 @@ class Child:
                 stdin=subprocess.DEVNULL,
                 stdout=sink,
                 stderr=sink,
-                env=environment(),
+                env=child_environment(),
             )
 
     @property

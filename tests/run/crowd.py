@@ -14,7 +14,7 @@ from share.geometry import se3
 from share.net.transport import AgentLink, connect
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
-from share.types import F64, Candidate, TrackState, View
+from share.types import F64, KeyframeCandidate, TrackState, View
 from share.wire.messages import Hello
 
 FRAME_S = 0.1
@@ -83,18 +83,18 @@ class Walker(threading.Thread):
             due = began + k * FRAME_S
             wait = min(0.05, max(0.0, due - time.monotonic()))
             if (frames := link.receive(round(1e3 * wait))) is not None:
-                self._handle(link, ev.Received(frames))
-            if link.connected():
+                self._handle(link, ev.EdgeMessageReceived(frames))
+            if link.poll_connected():
                 self._handle(link, ev.Connected())
             if not told and time.monotonic() >= due:
                 if self._finish.is_set() or k == len(self.script.T_odom_body):
-                    self._handle(link, ev.Finished())
+                    self._handle(link, ev.InputFinished())
                     told = True
                 else:
                     self.late_s.append(time.monotonic() - due)
                     self._frame(link, k)
                     k += 1
-            self._handle(link, ev.Tick())
+            self._handle(link, ev.AgentTick())
         link.close()
 
     def _frame(self, link: AgentLink, k: int) -> None:
@@ -105,28 +105,28 @@ class Walker(threading.Thread):
         if view is not None:
             T_last_body = se3.inverse(self._T_last) @ T
             self._T_last = T
-            candidate = Candidate(T, T_last_body, 4e-6 * np.eye(6), np.zeros(3), 0.0, view, k == 0)
+            candidate = KeyframeCandidate(T, T_last_body, 4e-6 * np.eye(6), np.zeros(3), 0.0, view, k == 0)
             self._handle(link, ev.KeyframeMade(frame, candidate))
 
     def _handle(self, link: AgentLink, event: ev.AgentEvent) -> None:
-        session = self.machine._lives.session
+        session = self.machine._sessions.session
         for effect in self.machine.handle(event, time.monotonic_ns()):
             match effect:
-                case ev.Send():
+                case ev.SendToEdge():
                     link.send(effect.frames)
-                case ev.Localised():
+                case ev.LocalisedPose():
                     self.odometry.append(effect.T_odom_body)
-                case ev.Say():
+                case ev.PrintLine():
                     self.said.append(effect.text)
                 case ev.CorrectionApplied():
                     self.maps.append((time.monotonic(), effect.map_id))
                     if self.lives and self.lives[-1].corrected is None:
                         self.lives[-1].corrected = time.monotonic()
-                case ev.Fail():
+                case ev.FailRun():
                     raise effect.error
-                case ev.Stop():
+                case ev.CloseLink():
                     self._ended = True
-        if self.machine._lives.session != session:
+        if self.machine._sessions.session != session:
             self.lives.append(Life(time.monotonic()))
 
 

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from share.lab.evaluate.play import AgentScore, _joint
+from share.lab.evaluate.real_time import AgentScore, _joint_ate
 from share.metrics.ate import ate
 from share.metrics.frame_log import RunLog
 from share.recordings.trajectory import Trajectory, format_tum, read_tum
@@ -15,9 +15,9 @@ from share.runtime.agent_files import AgentFiles
 
 def test_a_map_that_comes_after_the_last_pose_is_not_that_of_the_file(tmp_path):
     files = AgentFiles(tmp_path, print)
-    files.odom(1, np.eye(4))
-    files.map(1, np.eye(4), "ann-1/0")
-    files.map(2, np.eye(4), "bob-1/0")
+    files.write_odom_pose(1, np.eye(4))
+    files.write_map_pose(1, np.eye(4), "ann-1/0")
+    files.write_map_pose(2, np.eye(4), "bob-1/0")
     files.finish(RunLog(), {"protocol": {"map_id": "eve-1/0"}})
     assert json.loads((tmp_path / "report.json").read_text())["map_tum"] == "bob-1/0"
     assert len(read_tum(tmp_path / "map.tum").stamps_ns) == 1
@@ -27,8 +27,8 @@ def test_an_edge_that_moves_an_agent_from_map_to_map_does_not_fill_the_folder(tm
     said = []
     files = AgentFiles(tmp_path, said.append)
     for k in range(300):
-        files.odom(k, np.eye(4))
-        files.map(k, np.eye(4), f"map {k}")
+        files.write_odom_pose(k, np.eye(4))
+        files.write_map_pose(k, np.eye(4), f"map {k}")
     files.finish(RunLog(), {})
     assert len(list(tmp_path.glob("map.before-*"))) == 100
     assert said == ["taken into more than 100 maps: poses of those between are not kept"]
@@ -49,10 +49,12 @@ def test_who_was_told_of_the_join_too_late_is_not_scored_with_the_others(tmp_pat
         report = {"map_tum": map_tum, "protocol": {"map_id": "joined/0"}}
         return AgentScore(report, ate(told, truth), told, truth)
 
-    found = _joint({"ann": agent("a/0", truth), "bob": agent("a/0", truth), "late": agent("b/0", elsewhere)})
+    found = _joint_ate(
+        {"ann": agent("a/0", truth), "bob": agent("a/0", truth), "late": agent("b/0", elsewhere)}
+    )
     assert found is not None
     assert set(found.agents) == {"ann", "bob"}
     assert found.joint.rmse < 1e-9
     alone = {"ann": agent("a/0", truth)}
-    assert _joint(alone | {"late": agent("b/0", elsewhere)}) is None  # each in a map of its own
-    assert _joint(alone) is not None  # who plays alone is all there are
+    assert _joint_ate(alone | {"late": agent("b/0", elsewhere)}) is None  # each in a map of its own
+    assert _joint_ate(alone) is not None  # who plays alone is all there are

@@ -7,20 +7,23 @@ import math
 import pytest
 
 from share.errors import DataError, UsageError
-from share.lab.evaluate.report import annex
-from share.lab.train.score import Score, read_scores, to_json
+from share.lab.evaluate.report import read_section
+from share.lab.train.score import ErrorModelScore, read_scores, scores_json
 
-SCORES = [Score("always the mean", 2.5, 1.0, 0.0, 0.2), Score("ours", 1.5, 0.5, 0.8, 0.1, 0.9, 1.2)]
+SCORES = [
+    ErrorModelScore("always the mean", 2.5, 1.0, 0.0, 0.2),
+    ErrorModelScore("ours", 1.5, 0.5, 0.8, 0.1, 0.9, 1.2),
+]
 
 
 def test_models_of_the_error(tmp_path):
     file = tmp_path / "scores.json"
-    file.write_text(to_json(SCORES))
+    file.write_text(scores_json(SCORES))
     assert "NaN" not in file.read_text()
     first, second = read_scores(file)
     assert math.isnan(first.ms)
     assert second == SCORES[1]
-    made = annex(file, 1)
+    made = read_section(file, 1)
     assert made.text.startswith("## Models of the error: scores\n")
     assert "| ours | 1.500 | 0.500 | 0.80 | 0.100 | 90 % | 1.20 |" in made.text
     assert made.pictures == {}
@@ -31,18 +34,18 @@ def test_scores_that_are_damaged_are_named(tmp_path, text):
     file = tmp_path / "scores.json"
     file.write_text(text)
     with pytest.raises(DataError, match=r"scores\.json: is not by `share train compare --json`, or damaged"):
-        annex(file, 1)
+        read_section(file, 1)
 
 
 def test_settings_tried(tmp_path):
     folder = tmp_path / "gains"
     folder.mkdir()
     with pytest.raises(UsageError, match="give a folder by `share evaluate sweep`"):
-        annex(folder, 1)
+        read_section(folder, 1)
     (folder / "sweep.md").write_text("| control.kp |\n|---|\n| 0.8 |\n")
-    assert annex(folder, 1).pictures == {}
+    assert read_section(folder, 1).pictures == {}
     (folder / "heat.png").write_bytes(b"")
-    made = annex(folder, 2)
+    made = read_section(folder, 2)
     text, shown = made.text.split("\n![")
     assert text == "## Settings tried: gains\n\n| control.kp |\n|---|\n| 0.8 |\n"
     assert shown == "Means over the first two settings](heat-2.png)\n"

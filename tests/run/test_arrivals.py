@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from share.protocol.agent_events import Tick
-from share.runtime.arrivals import READ_AHEAD, Late, Played, Seen
+from share.protocol.agent_events import AgentTick
+from share.runtime.arrivals import READ_AHEAD, LateFrameDropper, LiveArrivals, RecordedArrivals
 from share.types import Frame, ImuBatch
 
 _PATIENCE_S = 5.0
@@ -41,7 +41,7 @@ class _Recording:
 
 def test_no_more_is_decoded_ahead_than_there_is_room_for() -> None:
     recording = _Recording(2 * READ_AHEAD)
-    played = Played(recording.frames, Late(0.0)).each()
+    played = RecordedArrivals(recording.frames, LateFrameDropper(0.0)).iter_frames()
     next(played)
     most = READ_AHEAD + 2  # one with the tracker, one that waits for room
     assert recording.reaches(most)
@@ -50,12 +50,12 @@ def test_no_more_is_decoded_ahead_than_there_is_room_for() -> None:
 
 def test_every_frame_comes_in_order_and_the_end_ends_it() -> None:
     count = 3 * READ_AHEAD
-    played = Played(_Recording(count).frames, Late(0.0)).each()
+    played = RecordedArrivals(_Recording(count).frames, LateFrameDropper(0.0)).iter_frames()
     assert [frame.index for frame, _ in played] == list(range(count))
 
 
 def test_what_cannot_be_read_on_is_raised_after_the_frames_before_it() -> None:
-    played = Played(_Recording(50, broken=40).frames, Late(0.0)).each()
+    played = RecordedArrivals(_Recording(50, broken=40).frames, LateFrameDropper(0.0)).iter_frames()
     assert [next(played)[0].index for _ in range(40)] == list(range(40))
     with pytest.raises(ValueError, match="cannot be read on"):
         next(played)
@@ -63,8 +63,8 @@ def test_what_cannot_be_read_on_is_raised_after_the_frames_before_it() -> None:
 
 def test_a_stop_ends_it_while_the_reader_waits_for_room() -> None:
     recording = _Recording(2 * READ_AHEAD)
-    arrivals = Played(recording.frames, Late(0.0))
-    played = arrivals.each()
+    arrivals = RecordedArrivals(recording.frames, LateFrameDropper(0.0))
+    played = arrivals.iter_frames()
     next(played)
     assert recording.reaches(READ_AHEAD)
     arrivals.stop()
@@ -83,10 +83,10 @@ class _Camera:
 
 def test_images_left_out_are_told_but_not_those_before_anybody_read_the_camera() -> None:
     camera: Any = _Camera()
-    seen = Seen(_Recording(3).frames, camera)
-    assert seen.tick() == Tick(7, "")
-    frames = seen.each()
+    seen = LiveArrivals(_Recording(3).frames, camera)
+    assert seen.tick() == AgentTick(7, "")
+    frames = seen.iter_frames()
     next(frames)
-    assert seen.tick().trouble == ""
+    assert seen.tick().sensor_trouble == ""
     camera.images_dropped += 1
-    assert seen.tick().trouble == "too slow for the camera: images are left out"
+    assert seen.tick().sensor_trouble == "too slow for the camera: images are left out"

@@ -12,8 +12,8 @@ from plain_walk import RIG
 from share.cameras.live import LiveSource
 from share.config import Config
 from share.geometry.camera import ImuBias
-from share.runtime.imu_memory import ImuMemory
-from share.sensors.imu_memory import POWER_ON_ACCEL, file_of
+from share.runtime.imu_bias_store import ImuBiasStore
+from share.sensors.imu_memory import POWER_ON_ACCEL, bias_file
 
 DAY_NS = 86_400 * 10**9
 NOON_NS = 1_790_000_000 * 10**9
@@ -27,16 +27,16 @@ class Camera(LiveSource):
         self.serial, self.rig = serial, rig
 
 
-def memory(source: Any, now_ns: int = NOON_NS) -> tuple[ImuMemory, list[str]]:
+def memory(source: Any, now_ns: int = NOON_NS) -> tuple[ImuBiasStore, list[str]]:
     said: list[str] = []
-    return ImuMemory(source, Config().inertial, said.append, lambda: now_ns), said
+    return ImuBiasStore(source, Config().inertial, said.append, lambda: now_ns), said
 
 
 def test_the_next_run_begins_with_what_this_one_has_learnt() -> None:
     first, said = memory(Camera())
     assert first.bias is None
     assert first.report() == {"imu_bias": {"from": None}}
-    first.keep(LEARNT)
+    first.save(LEARNT)
     second, more = memory(Camera(), NOON_NS + 10**9)
     assert second.bias is not None
     np.testing.assert_array_equal(second.bias.accel, LEARNT.accel)
@@ -47,39 +47,39 @@ def test_the_next_run_begins_with_what_this_one_has_learnt() -> None:
 
 
 def test_a_run_that_learnt_nothing_leaves_what_was_known() -> None:
-    memory(Camera())[0].keep(LEARNT)
-    memory(Camera(), NOON_NS + DAY_NS)[0].keep(None)
+    memory(Camera())[0].save(LEARNT)
+    memory(Camera(), NOON_NS + DAY_NS)[0].save(None)
     assert memory(Camera(), NOON_NS + DAY_NS)[0].report()["imu_bias"]["from"] == "2026-09-21T14:13:20Z"
 
 
 def test_what_is_too_old_is_nothing() -> None:
-    memory(Camera())[0].keep(LEARNT)
+    memory(Camera())[0].save(LEARNT)
     old, said = memory(Camera(), NOON_NS + 365 * DAY_NS)
     assert (old.bias, old.report(), said) == (None, {"imu_bias": {"from": None}}, [])
 
 
 def test_a_clock_that_was_set_back_makes_no_age() -> None:
-    memory(Camera())[0].keep(LEARNT)
+    memory(Camera())[0].save(LEARNT)
     young, said = memory(Camera(), NOON_NS - DAY_NS)
     assert young.bias is None
     assert said == ["the IMU's bias is taken as unknown: it is from later than this machine's clock says"]
 
 
 def test_a_damaged_file_costs_one_line_and_is_replaced() -> None:
-    memory(Camera())[0].keep(LEARNT)
-    file_of("0123").write_text("{")
+    memory(Camera())[0].save(LEARNT)
+    bias_file("0123").write_text("{")
     run, said = memory(Camera())
     assert run.bias is None
     assert len(said) == 1
     assert said[0].startswith("the IMU's bias is taken as unknown: ")
     assert "0123.json: is damaged" in said[0]
-    run.keep(LEARNT)
+    run.save(LEARNT)
     assert memory(Camera())[0].bias is not None
 
 
 def test_a_device_that_says_what_is_no_serial_number_costs_a_line_each_time() -> None:
     run, said = memory(Camera("../../0123"))
-    run.keep(LEARNT)
+    run.save(LEARNT)
     assert run.bias is None
     assert len(said) == 2
     assert all("is no serial number" in line for line in said)
@@ -91,16 +91,16 @@ def test_a_folder_that_cannot_be_made_does_not_end_the_run(
     (tmp_path / "state").write_text("a file")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     run, said = memory(Camera())
-    run.keep(LEARNT)
+    run.save(LEARNT)
     assert len(said) == 1
     assert said[0].startswith("the IMU's bias is not remembered: ")
 
 
 def test_a_recording_is_not_remembered_though_it_has_a_serial_number() -> None:
-    memory(Camera())[0].keep(LEARNT)
+    memory(Camera())[0].save(LEARNT)
     recording = SimpleNamespace(serial="0123", rig=RIG)
     run, said = memory(recording, NOON_NS + DAY_NS)
-    before = file_of("0123").read_bytes()
-    run.keep(ImuBias([0.0] * 3, [0.0] * 3, 1e-3, 1e-2))
+    before = bias_file("0123").read_bytes()
+    run.save(ImuBias([0.0] * 3, [0.0] * 3, 1e-3, 1e-2))
     assert (run.bias, run.report(), said) == (None, {}, [])
-    assert file_of("0123").read_bytes() == before
+    assert bias_file("0123").read_bytes() == before

@@ -16,8 +16,8 @@ from capture_bench import quick
 from children import Child
 from room_camera import HZ, STEREO, RoomCamera
 
-from share.cameras.handover import KeepNewest
-from share.cameras.live import WAITING, LiveSource
+from share.cameras.live import MAX_WAITING_FRAMES, LiveSource
+from share.cameras.sample_queue import NewestImageQueue
 from share.config import Config
 from share.net.transport import connect
 from share.runtime.agent import AgentRun
@@ -45,14 +45,14 @@ def test_a_camera_that_is_gone_is_said_everywhere_within_a_second(
     child = Child(tmp_path / "edge.log", "edge", "--bind", "tcp://127.0.0.1:0", "--http", str(http))
     address = child.wait_for(r"listening on (tcp://\S+?),")[1]
     room, said, lines = RoomCamera(rs, open_source(str(plain_session / "ar1"))), list[str](), list[str]()
-    source = LiveSource(room.feed(STEREO, KeepNewest(2 * WAITING), said, quick), HZ)
+    source = LiveSource(room.feed(STEREO, NewestImageQueue(2 * MAX_WAITING_FRAMES), said, quick), HZ)
     hello = Hello("ann", AgentKind.AR, 77, source.rig)
     feed = PoseFeed(f"udp://127.0.0.1:{udp.getsockname()[1]}", "ann")
     run = AgentRun(
         source, hello, Config(), lambda: connect(address, 77), None, said.append,
-        lambda status: lines.append(status.state), poses=feed,
+        lambda status: lines.append(status.state), pose_feed=feed,
     )  # fmt: skip
-    thread = threading.Thread(target=run.go, daemon=True)
+    thread = threading.Thread(target=run.run, daemon=True)
 
     def shown() -> dict[str, Any]:
         with urllib.request.urlopen(f"http://127.0.0.1:{http}/snapshot.json", timeout=5) as answer:

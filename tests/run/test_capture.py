@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from capture_bench import PICTURE, WANTED, WRAP_US, Bench, Fake, quick
 
-from share.cameras.feed import Feed
-from share.cameras.handover import Handover
+from share.cameras.feed import CameraFeed
+from share.cameras.sample_queue import SampleQueue
 from share.errors import ShareError, UsageError
 from share.lab.calibrate.imu_table import read_imu
 from share.recordings.calibration import Calibration
 from share.recordings.mcap.recorder import Recorder
 from share.runtime.capture import Capture
 from share.runtime.source import open_source
-from share.sensors.intake import Sample
 from share.sensors.measurement import Measurement
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
+from share.sensors.sample_processor import DeviceSample
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
@@ -44,7 +44,7 @@ def test_what_the_camera_sees_is_in_the_recording(tmp_path: Path) -> None:
 
 
 def test_a_calibration_of_another_camera_is_recorded_and_said(tmp_path: Path) -> None:
-    own = profile("d435i").rig()
+    own = load_profile("d435i").rig()
     given = Calibration(replace(own, timeshift_s=0.004), "mine", serials=("0456",))
     with Bench(tmp_path / "a.mcap", calibration=given) as bench:
         bench.feed(1_000_000, 5)
@@ -55,10 +55,10 @@ def test_a_calibration_of_another_camera_is_recorded_and_said(tmp_path: Path) ->
 
 
 def test_a_calibration_of_other_images_ends_it_before_there_is_a_file(tmp_path: Path) -> None:
-    given = Calibration(profile("d435i", "848x480").rig(), "mine")
+    given = Calibration(load_profile("d435i", "848x480").rig(), "mine")
     bench = Bench(tmp_path / "a.mcap", calibration=given)
     with pytest.raises(UsageError, match="mine: its cam0 is 848x480, the camera sends 640x480; add --mode"):
-        bench.run.go(1)
+        bench.run.run(1)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -133,9 +133,11 @@ def test_a_recording_is_not_overwritten_and_not_begun_on_a_full_disk(tmp_path: P
     there = tmp_path / "a.mcap"
     there.write_bytes(b"dear")
     for out, least, says in ((there, 0.0, "never overwritten"), (tmp_path / "b.mcap", 1e9, "must stay free")):
-        run = Capture(Feed(_never, None, WANTED.rates_hz(), 10.0, print, Handover()), out, least, print)
+        run = Capture(
+            CameraFeed(_never, None, WANTED.rates_hz(), 10.0, print, SampleQueue()), out, least, print
+        )
         with pytest.raises(UsageError, match=says):
-            run.go()
+            run.run()
     assert there.read_bytes() == b"dear"
     assert list(tmp_path.iterdir()) == [there]
 
@@ -143,9 +145,9 @@ def test_a_recording_is_not_overwritten_and_not_begun_on_a_full_disk(tmp_path: P
 def test_what_a_power_cut_left_is_not_overwritten(tmp_path: Path) -> None:
     part, out = tmp_path / "a.mcap.part", tmp_path / "a.mcap"
     part.write_bytes(b"dear")
-    run = Capture(Feed(_never, None, WANTED.rates_hz(), 10.0, print, Handover()), out, 0.0, print)
+    run = Capture(CameraFeed(_never, None, WANTED.rates_hz(), 10.0, print, SampleQueue()), out, 0.0, print)
     with pytest.raises(UsageError, match=rf"a\.mcap\.part: is left .* recover {part} --out {out}`, or give"):
-        run.go()
+        run.run()
     assert part.read_bytes() == b"dear"
 
 
@@ -163,9 +165,9 @@ class Gyroscope:
 
     rig, serial, rates_hz = WANTED.profile.rig(), "0123", {"accel": 250.0, "gyro": 400.0}
 
-    def start(self, sink: Callable[[Sample], None]) -> None:
+    def start(self, sink: Callable[[DeviceSample], None]) -> None:
         for k in range(100):
-            sink(Sample("gyro", k * 2_500_000, (0, 0, 0), k * 2_500_000))
+            sink(DeviceSample("gyro", k * 2_500_000, (0, 0, 0), k * 2_500_000))
 
     def stop(self) -> None:
         pass
@@ -174,11 +176,11 @@ class Gyroscope:
 
 
 def test_an_imu_alone_without_an_accelerometer_is_no_recording(tmp_path: Path) -> None:
-    feed = Feed(lambda *_: Gyroscope(), None, Gyroscope.rates_hz, 10.0, print, Handover())
+    feed = CameraFeed(lambda *_: Gyroscope(), None, Gyroscope.rates_hz, 10.0, print, SampleQueue())
     with pytest.raises(
         ShareError, match=r"0123: samples came \(0 of accel, 100 of gyro\), but the IMU needs"
     ):
-        Capture(feed, tmp_path / "a.mcap", 0.0, print).go(0.3)
+        Capture(feed, tmp_path / "a.mcap", 0.0, print).run(0.3)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.recordings.mcap.recover import recover
+from share.recordings.mcap.recover import recover_recording
 from share.runtime.source import open_source
 
 pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
@@ -94,14 +94,14 @@ def test_who_does_not_want_to_wait_for_the_disk_is_told_how_to_save_it(tmp_path:
         "saves what it has",
         "share: interrupted",
     ]
-    recover(part, tmp_path / "b.mcap")
+    recover_recording(part, tmp_path / "b.mcap")
     assert len(open_source(str(tmp_path / "b.mcap")).stamps()["cam0"]) > 2
 
 
 def test_what_a_power_cut_leaves_is_mended(tmp_path: Path) -> None:
     with capturing(tmp_path / "a.mcap"):
         grown(tmp_path / "a.mcap.part", 20_000_000)
-    recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
+    recover_recording(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
     stamps = open_source(str(tmp_path / "b.mcap")).stamps()
     assert len(stamps["cam0"]) > 25
     np.testing.assert_array_equal(np.diff(stamps["cam0"]), np.full(len(stamps["cam0"]) - 1, 33_333_000))

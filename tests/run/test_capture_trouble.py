@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from capture_bench import PICTURE, WANTED, Bench, Fake, quick
 
-from share.cameras.realsense.streams import Wanted
+from share.cameras.realsense.streams import StreamRequest
 from share.config import Config
 from share.lab.calibrate.imu_table import read_imu
-from share.recordings.mcap.recover import recover
-from share.runtime.pipeline import frames_of
+from share.recordings.mcap.recover import recover_recording
+from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 from share.sensors.watchdog import Health
@@ -64,7 +64,7 @@ def test_images_by_the_hosts_clock_do_not_cost_the_imu(tmp_path: Path) -> None:
 
 def test_an_interleaved_emitter_without_metadata_is_said_and_all_is_kept(tmp_path: Path) -> None:
     device = replace(WANTED.profile.device, emitter="interleaved")
-    with Bench(tmp_path / "a.mcap", wanted=Wanted(replace(WANTED.profile, device=device))) as bench:
+    with Bench(tmp_path / "a.mcap", wanted=StreamRequest(replace(WANTED.profile, device=device))) as bench:
         bench.feed(1_000_000, 10)
     assert bench.report["streams"]["cam0"]["samples"] == 10
     assert len(bench.said) == 1
@@ -84,7 +84,7 @@ def test_without_images_the_imu_alone_is_recorded(tmp_path: Path) -> None:
 
 def test_of_an_interleaved_emitter_the_images_without_dots_are_recorded(tmp_path: Path) -> None:
     device = replace(WANTED.profile.device, emitter="interleaved")
-    wanted = Wanted(replace(WANTED.profile, device=device))
+    wanted = StreamRequest(replace(WANTED.profile, device=device))
     dots = np.full_like(PICTURE, 255)
     with Bench(tmp_path / "a.mcap", wanted=wanted) as bench:
         for k in range(20):
@@ -117,7 +117,7 @@ def test_what_tells_distance_too_and_never_comes_costs_one_reset_and_the_rest_go
     source, counters = open_source(str(tmp_path / "a.mcap")), SequencerCounters()
     assert source.notes == (f"has no images of {missing}: done without",)
     assert source.rig.kind == ("stereo+imu" if missing == "depth" else "mono+imu")
-    frames = list(frames_of(source, Config(), counters))
+    frames = list(read_frames(source, Config(), counters))
     assert len(frames) >= bench.report["streams"]["cam0"]["samples"] - 2  # a pair cut by the reset
 
 
@@ -153,5 +153,5 @@ def test_a_disk_that_fills_ends_the_recording_in_a_line_and_what_was_written_is_
         f"share: {out}: cannot be written: {reason}",
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.part"]
-    recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
+    recover_recording(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
     assert len(open_source(str(tmp_path / "b.mcap")).stamps()["cam0"]) > 15

@@ -14,10 +14,10 @@ from shell import Done
 from time_servers import CHRONYC, chronyd, free_port, needs_chrony, running_chronyd, shifted, udp, wait_for
 
 from share.devices import time_client
-from share.devices.chrony import follow, tracking
-from share.devices.time_client import check
+from share.devices.chrony import follow_lines, read_tracking
+from share.devices.time_client import query_servers
 from share.devices.time_server import TimeServer, TimeServerRun
-from share.net.udp import Host, StampedSocket
+from share.net.udp import HostPort, StampedSocket
 
 pytestmark = needs_chrony
 QUICK = "iburst minpoll -2 maxpoll -2"  # four questions in a second
@@ -27,15 +27,15 @@ CLOSE_MS = 2.0  # on a machine as busy as one that runs tests; tools/measure_syn
 
 @pytest.fixture(autouse=True)
 def _brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(time_client, "PAUSE_S", 0.02)
+    monkeypatch.setattr(time_client, "QUESTION_PERIOD_S", 0.02)
 
 
 @contextmanager
 def our_server() -> Iterator[tuple[int, TimeServer]]:
-    with closing(StampedSocket.bound(Host("127.0.0.1", 0))) as link:
+    with closing(StampedSocket.bind(HostPort("127.0.0.1", 0))) as link:
         server = TimeServer(precision=-20)
         run = TimeServerRun(link, server, lambda text: None)
-        thread = threading.Thread(target=run.go)
+        thread = threading.Thread(target=run.run)
         thread.start()
         try:
             yield link.port, server
@@ -69,7 +69,7 @@ def test_chronyd_believes_our_server_and_finds_this_machines_own_time() -> None:
 def test_chronyd_and_our_client_agree_on_a_clock_that_is_off(offset_ms: float) -> None:
     with udp(shifted(offset_ms)) as port:
         theirs = chrony_says_ms(port)
-        (ours,) = check([Host("127.0.0.1", port)], 8)
+        (ours,) = query_servers([HostPort("127.0.0.1", port)], 8)
     assert ours.estimate is not None
     assert abs(ours.estimate.offset_ns / MS - offset_ms) <= ours.estimate.uncertainty_ns / MS
     assert theirs == pytest.approx(offset_ms, abs=CLOSE_MS)
@@ -82,7 +82,7 @@ def test_the_room_s_clock_is_followed_though_three_of_the_internet_disagree(tmp_
     with ExitStack() as servers:
         ports = [servers.enter_context(udp(shifted(0.0, stratum=2), address)) for address in addresses]
         lines = [f"server {a} port {p} {QUICK}" for a, p in zip(addresses, ports, strict=True)]
-        room = follow(Host("127.0.0.1", servers.enter_context(udp(shifted(40.0)))))
+        room = follow_lines(HostPort("127.0.0.1", servers.enter_context(udp(shifted(40.0)))))
         control = servers.enter_context(running_chronyd(tmp_path / "run", "port 0", *lines, *room))
         refused = dict.fromkeys(addresses, "x")  # falsetickers, chronyc(1)
         wait_for(lambda: _chosen(control) == {**refused, "127.0.0.1": "*"})
@@ -98,7 +98,7 @@ def _chosen(control: Path) -> dict[str, str]:
 def test_our_client_asks_a_chronyd(tmp_path: Path) -> None:
     port = free_port()
     with running_chronyd(tmp_path / "run", "local stratum 10", f"port {port}", "allow 127.0.0.1"):
-        (found,) = check([Host("127.0.0.1", port)], 8)
+        (found,) = query_servers([HostPort("127.0.0.1", port)], 8)
     assert found.trouble is None and found.estimate is not None
     assert (found.estimate.answers, found.estimate.stratum) == (8, 10)
     assert abs(found.estimate.offset_ns) <= found.estimate.uncertainty_ns < MS
@@ -107,10 +107,10 @@ def test_our_client_asks_a_chronyd(tmp_path: Path) -> None:
 def test_a_chronyd_that_does_not_know_the_time_is_not_believed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(time_client, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(time_client, "REPLY_TIMEOUT_S", 0.3)
     port = free_port()
     with running_chronyd(tmp_path / "run", f"port {port}", "allow 127.0.0.1"):
-        (found,) = check([Host("127.0.0.1", port)], 4)
+        (found,) = query_servers([HostPort("127.0.0.1", port)], 4)
     assert found.estimate is None
     assert (
         found.trouble
@@ -127,7 +127,7 @@ def own_chronyd(folder: Path, control: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def is_settled() -> bool:
     """In its first second chronyd knows how far it is off, but not how fast that changes."""
-    found = tracking()
+    found = read_tracking()
     return found is not None and found.synchronised and found.uncertainty_s < 1e-3
 
 
@@ -143,7 +143,7 @@ def test_a_chronyd_here_that_follows_nobody_says_nothing_of_other_clocks(
 ) -> None:
     with running_chronyd(tmp_path / "run", config, f"port {free_port()}") as control:
         own_chronyd(tmp_path, control, monkeypatch)
-        wait_for(lambda: (found := tracking()) is not None and found.local == ("local" in config))
+        wait_for(lambda: (found := read_tracking()) is not None and found.local == ("local" in config))
         done = share("sync", "check")
     assert (done.code, done.err) == (1, f"share: chronyd: {said}\n")
     assert done.out.splitlines()[1].split() == ["chronyd", *"–––––––"]

@@ -11,14 +11,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from share.runtime.worker import END, Companion, Inbox
+from share.runtime.worker_process import END, Inbox, WorkerProcess
 
 LINES = """
 import sys, time
 from test_companion import doubles
-from share.runtime.worker import Companion
+from share.runtime.worker_process import WorkerProcess
 if __name__ == "__main__":
-    c = Companion("doubles", doubles, (), lambda m: None, lambda how: None)
+    c = WorkerProcess("doubles", doubles, (), lambda m: None, lambda how: None)
     print(c.pid, flush=True)
     time.sleep(60)
 """
@@ -26,15 +26,15 @@ if __name__ == "__main__":
 
 INTERRUPTED = """
 from test_companion import doubles
-from share.runtime import worker as companion
-start = companion.SPAWN.Process.start
+from share.runtime import worker_process as companion
+start = companion.SPAWN_CONTEXT.Process.start
 def interrupted(process):
     start(process)
     raise KeyboardInterrupt
 if __name__ == "__main__":
-    companion.SPAWN.Process.start = interrupted
+    companion.SPAWN_CONTEXT.Process.start = interrupted
     try:
-        companion.Companion("doubles", doubles, (), lambda m: None, lambda how: None)
+        companion.WorkerProcess("doubles", doubles, (), lambda m: None, lambda how: None)
     except KeyboardInterrupt as error:
         kept = error  # as a traceback that is printed keeps it
     print("interrupted", flush=True)
@@ -51,7 +51,7 @@ def doubles(inbox: Inbox, answer: Callable[[Any], None]) -> None:
 def test_it_answers_and_ends() -> None:
     heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
     lost: list[str] = []
-    companion = Companion("doubles", doubles, (), heard.put, lost.append)
+    companion = WorkerProcess("doubles", doubles, (), heard.put, lost.append)
     for number in range(100):
         companion.send(number)
     companion.close()
@@ -61,7 +61,7 @@ def test_it_answers_and_ends() -> None:
 
 def test_its_death_is_told_once() -> None:
     lost: queue.SimpleQueue[str] = queue.SimpleQueue()
-    companion = Companion("doubles", doubles, (), lambda message: None, lost.put)
+    companion = WorkerProcess("doubles", doubles, (), lambda message: None, lost.put)
     companion.send("die")
     assert "SIGKILL" in lost.get(timeout=20)
     companion.send(1)  # goes nowhere, and waits for nobody

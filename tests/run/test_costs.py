@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from share.errors import DataError, ShareError, UsageError
-from share.lab.evaluate.virtual import costs_of
-from share.lab.evaluate.world import Cost, Costs, Sampled
+from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.virtual_time import read_delays
 
 
 def spread(p50: float, p95: float, n: int = 10) -> dict[str, float | None]:
@@ -33,24 +33,24 @@ def run(folder: Path, solved: int = 10) -> Path:
 
 
 def test_what_was_measured_and_the_rest_in_proportion(tmp_path):
-    costs, usual = costs_of(run(tmp_path)), Costs()
-    assert costs.frame == Cost(20.0, 40.0)
-    assert costs.query == Cost(6.0, 9.0)
-    assert costs.accepted == costs.refused == Cost(2.0, 5.0)
-    assert costs.solve == Cost(20.0, 50.0)
+    costs, usual = read_delays(run(tmp_path)), ProcessingDelays()
+    assert costs.frame == Delay(20.0, 40.0)
+    assert costs.query == Delay(6.0, 9.0)
+    assert costs.verify_accepted == costs.verify_refused == Delay(2.0, 5.0)
+    assert costs.solve == Delay(20.0, 50.0)
     slower = 20.0 / usual.frame.p50
-    assert costs.keyframe == Cost(slower * usual.keyframe.p50, slower * usual.keyframe.p95)
-    assert costs.settle == Sampled(tuple(slower * ms for ms in usual.settle.ms))
-    for name in ("front", "add", "judge", "apply"):
+    assert costs.keyframe == Delay(slower * usual.keyframe.p50, slower * usual.keyframe.p95)
+    assert costs.finish_keyframe == Sampled(tuple(slower * ms for ms in usual.finish_keyframe.ms))
+    for name in ("receive", "add", "check_loop", "apply_solution"):
         assert getattr(costs, name).p50 == pytest.approx(0.5 * getattr(usual, name).p50)
 
 
 def test_what_is_not_there_is_said(tmp_path):
     with pytest.raises(UsageError, match="is not a run by"):
-        costs_of(tmp_path)
+        read_delays(tmp_path)
     folder = run(tmp_path, solved=0)
     with pytest.raises(DataError, match="nothing was measured"):
-        costs_of(folder)
+        read_delays(folder)
     (folder / "ann" / "report.json").write_text("{")
     with pytest.raises(ShareError, match="is damaged"):
-        costs_of(folder)
+        read_delays(folder)

@@ -15,11 +15,11 @@ from children import SHARE
 from share.config import Config
 from share.geometry import se3
 from share.geometry.interpolation import associate
-from share.lab.emulate.demo import SCENE, recipe
-from share.lab.emulate.session import cached_session
-from share.odometry.initialisation import LEAST
+from share.lab.emulate.demo import DEFAULT_SCENE, recipe
+from share.lab.emulate.session import make_cached_session
+from share.odometry.initialisation import MIN_SAMPLES
+from share.runtime.offline_tracking import track
 from share.runtime.source import open_source
-from share.runtime.track import track
 from share.sensors.measurement import CAM0, IMU
 
 FRAMES = 90  # 6 s at 15 Hz
@@ -41,7 +41,7 @@ def without_up(recording: Path) -> int:
     frames = samples = 0
     for measurement in open_source(str(recording)).measurements():
         samples += measurement.stream == IMU
-        if samples >= LEAST:
+        if samples >= MIN_SAMPLES:
             break
         frames += measurement.stream == CAM0
     return frames
@@ -102,7 +102,7 @@ def test_the_whole_demo_to_the_centimetre(tmp_path):
 @pytest.mark.slow
 def test_odometry_does_not_jump_when_a_place_is_seen_again(tmp_path):
     """ar2 comes round to where it began; what it has drifted is for the edge to correct."""
-    session = cached_session(recipe(SCENE, 20, 0), tmp_path)
+    session = make_cached_session(recipe(DEFAULT_SCENE, 20, 0), tmp_path)
     source = open_source(f"{session}/ar2")
     run = track(source, Config(), lambda done: None)
     _, estimate, truth = associate(run.trajectory, source.truth())

@@ -14,8 +14,8 @@ import pytest
 from children import Child, start_edge
 from shell import Done
 
-from share.cameras.realsense import asked
-from share.devices.host import governors, pi_throttled, resets_governor, throttles, usb_memory_mb
+from share.cameras.realsense import sdk_probe
+from share.devices.host import governors, is_governor_reset, pi_throttled_bits, throttle_counts, usb_memory_mb
 from share.runtime import doctor
 
 Share = Callable[..., Done]
@@ -85,7 +85,7 @@ def test_an_edge_that_is_there_answers_soon(share: Share, edge: str, tmp_path: P
 def test_an_edge_that_is_not_there_fails_in_one_line(
     share: Share, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(doctor.probe, "__defaults__", (0.3,))
+    monkeypatch.setattr(doctor.probe_edge, "__defaults__", (0.3,))
     done = share("doctor", *LAPTOP, "--edge", "tcp://127.0.0.1:1", "--keys", tmp_path / "none")
     assert done.code == 1
     assert done.err == "share: doctor: 1 FAIL: edge\n"
@@ -115,12 +115,12 @@ def test_the_key_of_another_edge_is_found_out(share: Share, guarded: Guarded) ->
 
 
 def test_librealsense_that_hangs_or_crashes_does_not_take_us_along(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(asked, "_query", lambda: time.sleep(60))
+    monkeypatch.setattr(sdk_probe, "_query_sdk", lambda: time.sleep(60))
     began = time.monotonic()
-    assert "said nothing for 0.2 s" in str(asked.ask(0.2).trouble)
+    assert "said nothing for 0.2 s" in str(sdk_probe.probe_sdk(0.2).trouble)
     assert time.monotonic() - began < 10
-    monkeypatch.setattr(asked, "_query", lambda: os._exit(3))
-    assert "crashed" in str(asked.ask().trouble)
+    monkeypatch.setattr(sdk_probe, "_query_sdk", lambda: os._exit(3))
+    assert "crashed" in str(sdk_probe.probe_sdk().trouble)
 
 
 def test_what_the_computer_says_of_itself_is_read(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_what_the_computer_says_of_itself_is_read(tmp_path: Path) -> None:
     usb.mkdir(parents=True)
     (usb / "usbfs_memory_mb").write_text("16\n")
     assert sorted(governors(tmp_path)) == ["performance", "powersave"]
-    assert sorted(throttles(tmp_path)) == [0, 3]
+    assert sorted(throttle_counts(tmp_path)) == [0, 3]
     assert usb_memory_mb(tmp_path) == 16
     assert usb_memory_mb(tmp_path / "nowhere") is None
 
@@ -149,28 +149,28 @@ def test_what_the_computer_says_of_itself_is_read(tmp_path: Path) -> None:
     ],
 )
 def test_a_raspberry_pi_is_read(path: str, text: str, bits: int | None, tmp_path: Path) -> None:
-    assert pi_throttled(tmp_path) is None
+    assert pi_throttled_bits(tmp_path) is None
     (tmp_path / path).parent.mkdir(parents=True)
     (tmp_path / path).write_text(text + "\n")
     if "hwmon" in path:
-        assert pi_throttled(tmp_path) is None  # of something else
+        assert pi_throttled_bits(tmp_path) is None  # of something else
         (tmp_path / path).with_name("name").write_text("rpi_volt\n")
-    assert pi_throttled(tmp_path) == bits
+    assert pi_throttled_bits(tmp_path) == bits
 
 
 def test_what_sets_the_governor_back_is_found_unless_it_is_masked(tmp_path: Path) -> None:
     unit = tmp_path / "usr/lib/systemd/system/power-profiles-daemon.service"
     unit.parent.mkdir(parents=True)
     unit.touch()
-    assert not resets_governor(tmp_path)  # it leaves processors alone that have no energy preference
+    assert not is_governor_reset(tmp_path)  # it leaves processors alone that have no energy preference
     policy = tmp_path / "sys/devices/system/cpu/cpufreq/policy0"
     policy.mkdir(parents=True)
     (policy / "energy_performance_preference").touch()
-    assert resets_governor(tmp_path)
+    assert is_governor_reset(tmp_path)
     masked = tmp_path / "etc/systemd/system/power-profiles-daemon.service"
     masked.parent.mkdir(parents=True)
     masked.symlink_to("/dev/null")
-    assert not resets_governor(tmp_path)
+    assert not is_governor_reset(tmp_path)
 
 
 def test_an_edge_is_told_of_its_keys(share: Share, tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def test_a_disk_that_is_full_for_a_while(tmp_path):
     assert child.interrupt() == 0
     assert child.said.count("the map cannot be written") == 1
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        numbers = [k.at.id for k in store.load().keyframes]
+        numbers = [k.keyframe_key.id for k in store.load().keyframes]
     assert numbers == list(range(ann.machine.report()["keyframes"]))
     assert len(numbers) > 5
 
@@ -127,7 +127,7 @@ def kept_ids(path: Path, to: Path) -> list[int]:
     for file in path.parent.glob("room.sqlite*"):
         shutil.copyfile(file, to / file.name)
     with MapStore.open(to / path.name) as store:
-        return [k.at.id for k in store.load().keyframes]
+        return [k.keyframe_key.id for k in store.load().keyframes]
 
 
 def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
@@ -180,5 +180,5 @@ def test_a_file_that_is_taken_away_from_under_the_edge(tmp_path, how):
     ann.join(20)
     assert child.interrupt() == 0
     with MapStore.open(path) as store:
-        numbers = [k.at.id for k in store.load().keyframes]
+        numbers = [k.keyframe_key.id for k in store.load().keyframes]
     assert numbers == list(range(ann.machine.report()["keyframes"]))

@@ -18,7 +18,7 @@ import pytest
 from children import Child
 from crowd import EVERY, FRAME_S, Walker, crowd
 
-from share.mapping.changes import placed
+from share.mapping.map_changes import map_poses
 from share.store.map_store import MapStore
 
 NAMES = ("ann", "bob", "cy")
@@ -162,15 +162,15 @@ def check_map(path: Path, walkers: list[Walker]) -> None:
     """Every keyframe that was acknowledged, once, with the pose that odometry gave it."""
     with MapStore.open(path) as store:
         kept = store.load()
-    assert kept.complaints == ()
+    assert kept.problems == ()
     assert len(kept.runs) == len(walkers)
     for walker in walkers:
-        own = [k for k in kept.keyframes if k.key.startswith(walker.name)]
-        assert [k.at.id for k in own] == list(range(walker.machine.report()["keyframes"]))
-        assert {k.stretch for k in own} == {f"{own[0].key}/0"}
+        own = [k for k in kept.keyframes if k.run_key.startswith(walker.name)]
+        assert [k.keyframe_key.id for k in own] == list(range(walker.machine.report()["keyframes"]))
+        assert {k.segment_name for k in own} == {f"{own[0].run_key}/0"}
         for found in own:
             np.testing.assert_allclose(
-                found.keyframe.T_odom_body, walker.odometry[EVERY * found.at.id], atol=1e-9
+                found.keyframe.T_odom_body, walker.odometry[EVERY * found.keyframe_key.id], atol=1e-9
             )
-    maps = {name for name, _ in placed(kept).values()}
+    maps = {name for name, _ in map_poses(kept).values()}
     print(f"kept: {len(kept.keyframes)} keyframes, {len(kept.loops)} loops, {len(maps)} maps")

@@ -9,21 +9,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from share.odometry.result import TrackResult
-from share.runtime.error_model import AtOnce, ByModel
-from share.types import Candidate, Footing, Frame, TrackState, View
+from share.odometry.track_result import TrackResult
+from share.runtime.error_estimators import BackgroundErrorModel, SynchronousErrorModel
+from share.types import FeatureStatistics, Frame, KeyframeCandidate, TrackState, View
 
 NOTHING = View(np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 32), np.uint8))
-STANDS_ON = Footing(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0), 0, 0)
-CANDIDATE = Candidate(np.eye(4), np.eye(4), np.zeros((6, 6)), np.zeros(3), 0.0, NOTHING)
+STANDS_ON = FeatureStatistics(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0), 0, 0)
+CANDIDATE = KeyframeCandidate(np.eye(4), np.eye(4), np.zeros((6, 6)), np.zeros(3), 0.0, NOTHING)
 TRACKED, LOST = TrackResult(TrackState.OK, np.eye(4)), TrackResult(TrackState.LOST, None)
 
 
 class Tracker:
-    def footing(self):
+    def feature_statistics(self):
         return STANDS_ON
 
-    def keyframe(self, frame):
+    def make_keyframe(self, frame):
         return CANDIDATE
 
 
@@ -50,9 +50,9 @@ def frame(brightness: int) -> Frame:
     return Frame(brightness, brightness, np.full((48, 64), brightness, np.uint8))
 
 
-def keyframe(errors: AtOnce, brightness: int) -> None:
-    errors.after(frame(brightness), TRACKED)
-    errors.keyframe(frame(brightness), Tracker())
+def keyframe(errors: SynchronousErrorModel, brightness: int) -> None:
+    errors.update(frame(brightness), TRACKED)
+    errors.make_keyframe(frame(brightness), Tracker())
 
 
 def until(reached, limit_s: float = 5.0) -> None:
@@ -65,12 +65,12 @@ def until(reached, limit_s: float = 5.0) -> None:
 def test_what_was_said_last_holds():
     network, said = Network(), []
     network.may.set()
-    errors = ByModel(network, said.append)
-    assert errors.after(frame(0), TRACKED) is None
+    errors = BackgroundErrorModel(network, said.append)
+    assert errors.update(frame(0), TRACKED) is None
     keyframe(errors, 3)
-    until(lambda: errors.after(frame(1), TRACKED) is not None)
-    assert errors.after(frame(1), TRACKED) == pytest.approx(3)
-    assert errors.after(frame(2), LOST) is None  # there is no pose that could be wrong
+    until(lambda: errors.update(frame(1), TRACKED) is not None)
+    assert errors.update(frame(1), TRACKED) == pytest.approx(3)
+    assert errors.update(frame(2), LOST) is None  # there is no pose that could be wrong
     errors.close()
     told = errors.report()["error_model"]
     assert told["estimate_ms"]["n"] == 1
@@ -78,10 +78,10 @@ def test_what_was_said_last_holds():
 
 
 def test_times_are_remembered_of_the_newest_estimates_only(monkeypatch):
-    monkeypatch.setattr("share.runtime.error_model._TIMES", 3)
+    monkeypatch.setattr("share.runtime.error_estimators._MAX_TIMINGS", 3)
     network = Network()
     network.may.set()
-    errors = ByModel(network, print)
+    errors = BackgroundErrorModel(network, print)
     for brightness in range(1, 6):
         keyframe(errors, brightness)
         until(lambda at=brightness: network.seen[-1:] == [at])
@@ -91,7 +91,7 @@ def test_times_are_remembered_of_the_newest_estimates_only(monkeypatch):
 
 def test_who_is_busy_leaves_the_older_out():
     network = Network()
-    errors = ByModel(network, lambda text: None)
+    errors = BackgroundErrorModel(network, lambda text: None)
     began = time.monotonic()
     keyframe(errors, 1)
     until(lambda: network.seen == [1.0])  # it is at work, and waits
@@ -99,7 +99,7 @@ def test_who_is_busy_leaves_the_older_out():
         keyframe(errors, brightness)
     assert time.monotonic() - began < 2
     network.may.set()
-    until(lambda: errors.after(frame(1), TRACKED) == pytest.approx(4))
+    until(lambda: errors.update(frame(1), TRACKED) == pytest.approx(4))
     errors.close()
     assert network.seen == [1.0, 4.0]
     assert errors.report()["error_model"]["drop_estimate"] == 2
@@ -108,36 +108,36 @@ def test_who_is_busy_leaves_the_older_out():
 def test_a_network_that_fails_is_left_alone_and_said_so():
     network, said = Network(), []
     network.may.set()
-    errors = ByModel(network, said.append)
+    errors = BackgroundErrorModel(network, said.append)
     keyframe(errors, 5)
-    until(lambda: errors.after(frame(1), TRACKED) is not None)
+    until(lambda: errors.update(frame(1), TRACKED) is not None)
     keyframe(errors, 250)
     until(lambda: said)
     assert said == ["the error model has failed and is left alone: too bright"]
     keyframe(errors, 6)
-    assert errors.after(frame(2), TRACKED) is None
+    assert errors.update(frame(2), TRACKED) is None
     errors.close()
 
 
 def test_in_virtual_time_it_has_answered_at_once():
     network = Network()
     network.may.set()
-    errors = AtOnce(network)
-    assert errors.after(frame(0), TRACKED) is None
+    errors = SynchronousErrorModel(network)
+    assert errors.update(frame(0), TRACKED) is None
     keyframe(errors, 7)
-    assert errors.after(frame(1), TRACKED) == pytest.approx(7)
-    assert errors.after(frame(1), LOST) is None
+    assert errors.update(frame(1), TRACKED) == pytest.approx(7)
+    assert errors.update(frame(1), LOST) is None
 
 
 def test_a_keyframe_that_is_told_late_is_judged_by_its_own_picture():
     class Late(Tracker):
-        def keyframe(self, frame):
+        def make_keyframe(self, frame):
             return replace(CANDIDATE, frames_ago=2)
 
     network = Network()
     network.may.set()
-    errors = AtOnce(network)
+    errors = SynchronousErrorModel(network)
     for brightness in (3, 40, 90):
-        errors.after(frame(brightness), TRACKED)
-    errors.keyframe(frame(90), Late())
+        errors.update(frame(brightness), TRACKED)
+    errors.make_keyframe(frame(90), Late())
     assert network.seen == [3.0]

@@ -14,9 +14,9 @@ from share.config import Config, InertialConfig, TrackerConfig
 from share.geometry import rig_check, se3
 from share.geometry.camera import ImuBias, Rig
 from share.odometry import filter
-from share.odometry.result import TrackResult
-from share.odometry.tracker import InertialTracker
-from share.runtime.guarded_tracker import Guard, GuardedTracker
+from share.odometry.inertial_tracker import InertialTracker
+from share.odometry.track_result import TrackResult
+from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
 from share.types import TrackState
 from share.vision import corners
 
@@ -31,12 +31,12 @@ def played(walk: rig_fuzzer.Walk, tracker: GuardedTracker, fails: dict[int, pyte
     for frame in walk.frames:
         if (broken := fails.get(frame.index)) is not None:
             with broken.context() as patch:
-                patch.setattr(filter, "_gain", _no_gain)
-                patch.setattr(corners, "count", _no_gain)
+                patch.setattr(filter, "_whitened_update", _no_gain)
+                patch.setattr(corners, "count_fast", _no_gain)
                 results.append(tracker.track(frame))
             continue
         results.append(tracker.track(frame))
-        if results[-1].keyframe:
+        if results[-1].keyframe_ready:
             tracker.attempt("a keyframe", frame, lambda frame=frame: rig_fuzzer._keep(tracker, frame))
     return results
 
@@ -49,37 +49,37 @@ def test_an_update_that_fails_costs_its_frame_and_odometry_finds_itself_again(
     walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    guard = Guard(said.append)
+    guard = FaultGuard(said.append)
     results = played(walk, GuardedTracker(RIG, Config(), guard), {4: monkeypatch})
     assert [result.state for result in results[:4]] == [TrackState.OK] * 4
     assert (results[4].state, results[4].T_odom_body) == (TrackState.LOST, None)
     assert results[-1].state is TrackState.OK
-    assert not any(result.new_stretch for result in results[1:])  # its places were kept: the same odom
+    assert not any(result.new_segment for result in results[1:])  # its places were kept: the same odom
     far = np.linalg.norm(results[-1].T_odom_body[:3, 3] - results[3].T_odom_body[:3, 3])
     assert far < 0.2
-    assert guard.failed == 1
+    assert guard.failure_count == 1
     assert len(said) == 1 and "LinAlgError" in said[0]
 
 
 def test_one_that_fails_twice_begins_anew(walk: rig_fuzzer.Walk) -> None:
-    guard = Guard(lambda text: None)
+    guard = FaultGuard(lambda text: None)
     tracker = GuardedTracker(RIG, Config(), guard)
 
     class Broken:
-        doubted = 7
+        rejected_imu_samples = 7
 
         def track(self, frame: object) -> TrackResult:
             raise FloatingPointError
 
-        def give_up(self, frame: object) -> None:
+        def reset_after_failure(self, frame: object) -> None:
             raise ValueError
 
     tracker._tracker = Broken()  # type: ignore[assignment]
-    tracker._has_posed = True
+    tracker._had_pose = True
     results = [tracker.track(frame) for frame in walk.frames[:4]]
     assert [result.state for result in results[:1]] == [TrackState.LOST]
-    assert results[-1].state is TrackState.OK and guard.failed == 2
-    assert tracker.doubted == 7  # by the first
+    assert results[-1].state is TrackState.OK and guard.failure_count == 2
+    assert tracker.rejected_imu_samples == 7  # by the first
 
 
 def test_what_a_lost_tracker_had_learnt_of_the_bias_is_not_lost(
@@ -88,10 +88,10 @@ def test_what_a_lost_tracker_had_learnt_of_the_bias_is_not_lost(
     learnt = ImuBias([0.01, 0.0, 0.0], [0.1, 0.2, 0.3], 1e-3, 1e-2)
     told = iter([None, learnt, None])
     monkeypatch.setattr(InertialTracker, "bias", property(lambda self: next(told)))
-    tracker = GuardedTracker(RIG, Config(), Guard(lambda text: None), learnt)
+    tracker = GuardedTracker(RIG, Config(), FaultGuard(lambda text: None), learnt)
     assert tracker.bias is None  # what it was told is not what it has learnt
     tracker.track(walk.frames[0])
-    monkeypatch.setattr(InertialTracker, "keyframe", lambda self, frame: None)
+    monkeypatch.setattr(InertialTracker, "make_keyframe", lambda self, frame: None)
     biases = []
     for frame in walk.frames[:3]:
         tracker.finish(frame, True)
@@ -100,19 +100,19 @@ def test_what_a_lost_tracker_had_learnt_of_the_bias_is_not_lost(
 
 
 def test_one_of_cameras_alone_knows_no_bias(walk: rig_fuzzer.Walk) -> None:
-    tracker = GuardedTracker(RIG.without_imu(), Config(), Guard(lambda text: None))
-    assert tracker.track(walk.frames[0]).keyframe
+    tracker = GuardedTracker(RIG.without_imu(), Config(), FaultGuard(lambda text: None))
+    assert tracker.track(walk.frames[0]).keyframe_ready
     tracker.finish(walk.frames[0], True)
     assert tracker.bias is None
 
 
 def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
-    guard = Guard(lambda text: None)
+    guard = FaultGuard(lambda text: None)
     tracker = GuardedTracker(RIG, Config(), guard)
-    assert tracker.track(walk.frames[0]).keyframe
-    monkeypatch.setattr("share.odometry.keyframes.ViewInSteps.finish", _no_gain)
-    kept = tracker.attempt("a keyframe", walk.frames[0], lambda: tracker.keyframe(walk.frames[0]))
-    assert kept is None and guard.failed == 1
+    assert tracker.track(walk.frames[0]).keyframe_ready
+    monkeypatch.setattr("share.odometry.keyframes.ViewBuilder.finish", _no_gain)
+    kept = tracker.attempt("a keyframe", walk.frames[0], lambda: tracker.make_keyframe(walk.frames[0]))
+    assert kept is None and guard.failure_count == 1
     assert tracker.track(walk.frames[1]).state is TrackState.LOST
 
 
@@ -120,33 +120,33 @@ def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytes
 def test_after_a_keyframe_that_failed_the_next_step_is_from_the_last_that_others_have(rig: Rig) -> None:
     often = {"keyframe_m": 1e-4, "keyframe_gap_s": 0.1}
     config = Config(inertial=InertialConfig(**often), tracker=TrackerConfig(**often))
-    tracker = GuardedTracker(rig, config, Guard(lambda text: None))
+    tracker = GuardedTracker(rig, config, FaultGuard(lambda text: None))
     frames = iter(rig_fuzzer.walk(16).frames)
     frame = next(frames)
-    assert tracker.track(frame).keyframe
-    first = tracker.keyframe(frame)
-    while not tracker.track(frame := next(frames)).keyframe:
+    assert tracker.track(frame).keyframe_ready
+    first = tracker.make_keyframe(frame)
+    while not tracker.track(frame := next(frames)).keyframe_ready:
         pass
 
     def fails_once_made() -> None:
-        tracker.keyframe(frame)
+        tracker.make_keyframe(frame)
         _no_gain()
 
     assert tracker.attempt("a keyframe", frame, fails_once_made) is None
-    while not tracker.track(frame := next(frames)).keyframe:
+    while not tracker.track(frame := next(frames)).keyframe_ready:
         pass
-    again = tracker.keyframe(frame)
+    again = tracker.make_keyframe(frame)
     step = se3.inverse(first.T_odom_body) @ again.T_odom_body
-    assert not again.new_stretch and np.linalg.norm(step[:3, 3]) > 1e-3
-    np.testing.assert_allclose(again.T_last_body, step, atol=1e-4)
+    assert not again.new_segment and np.linalg.norm(step[:3, 3]) > 1e-3
+    np.testing.assert_allclose(again.T_previous_body, step, atol=1e-4)
 
 
 def test_giving_up_leaves_nothing_of_a_keyframe_for_the_next_beginning(walk: rig_fuzzer.Walk) -> None:
     tracker, frame = InertialTracker(RIG, Config().inertial, Config().tracker), walk.frames[0]
     tracker.track(frame)
-    tracker.keyframe(frame)
-    tracker.give_up(frame)
-    assert tracker._keyframes._unsettled is None
+    tracker.make_keyframe(frame)
+    tracker.reset_after_failure(frame)
+    assert tracker._keyframes._offered is None
 
 
 # ---------------------------------------------------------------- rigs that nobody has
@@ -163,7 +163,7 @@ def test_the_rig_of_the_walk_is_tracked_without_a_failure(walk: rig_fuzzer.Walk)
 
 
 def test_the_fuzzer_makes_rigs_that_are_refused_for_many_reasons_and_such_that_are_not() -> None:
-    told = [rig_check.objection(rig) for _, rig in rig_fuzzer.rigs(200, seed=1)]
+    told = [rig_check.rig_problem(rig) for _, rig in rig_fuzzer.rigs(200, seed=1)]
     count = sum(why is not None for why in told)
     assert 60 < count < 190
     assert len({str(why)[:25] for why in told}) > 10

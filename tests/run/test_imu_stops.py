@@ -9,9 +9,9 @@ import pytest
 from recordings import make_euroc
 
 from share.config import Config
-from share.runtime.pipeline import frames_of
+from share.runtime.offline_tracking import track
+from share.runtime.pipeline import read_frames
 from share.runtime.source import Source, open_source
-from share.runtime.track import track
 from share.sensors.measurement import IMU, Measurement
 from share.sensors.sequencer import SequencerCounters
 
@@ -34,7 +34,7 @@ def silenced(tmp_path: Path, from_s: float, to_s: float = 1e9) -> Source:
 
 def said_of(source: Source) -> list[str]:
     said: list[str] = []
-    assert len(list(frames_of(source, Config(), SequencerCounters(), say=said.append))) == FRAMES
+    assert len(list(read_frames(source, Config(), SequencerCounters(), notify=said.append))) == FRAMES
     return said
 
 
@@ -52,7 +52,7 @@ def test_a_short_silence_is_not(tmp_path: Path) -> None:
 
 def test_nor_is_that_of_a_camera_whose_feed_says_it(tmp_path: Path) -> None:
     source = silenced(tmp_path, 1.0)
-    object.__setattr__(source, "tells_silence", True)
+    object.__setattr__(source, "reports_silence", True)
     assert said_of(source) == []
 
 

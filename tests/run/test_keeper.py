@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 from share.errors import StoreError
-from share.mapping.changes import DropLoop, KeepPoses
-from share.mapping.loops import Key
-from share.protocol.edge_events import Keep, Kept
-from share.runtime import keeper as keeper_module
-from share.runtime.keeper import Keeper, newest_poses_only
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import RemoveLoops, SavePoses
+from share.protocol.edge_events import ChangesSaved, SaveChanges
+from share.runtime import map_writer as keeper_module
+from share.runtime.map_writer import MapWriter, newest_poses_only
 
 FULL = "/room.sqlite: the map cannot be written: No space left on device"
 
 
 def change(number):
-    return DropLoop(Key("ann", number), Key("ann", number + 1))
+    return RemoveLoops(KeyframeKey("ann", number), KeyframeKey("ann", number + 1))
 
 
 def poses(number):
-    return KeepPoses((Key("ann", number),), np.eye(4)[None], ("ann/0",))
+    return SavePoses((KeyframeKey("ann", number),), np.eye(4)[None], ("ann/0",))
 
 
 class Disk:
@@ -51,9 +51,9 @@ class Disk:
 
 @pytest.fixture
 def kept(monkeypatch):
-    monkeypatch.setattr(keeper_module, "_AGAIN_S", 0.02)
+    monkeypatch.setattr(keeper_module, "_RETRY_S", 0.02)
     disk, tickets, said = Disk(), [], []
-    keeper = Keeper(disk, lambda done: tickets.append(done), said.append)
+    keeper = MapWriter(disk, lambda done: tickets.append(done), said.append)
     yield keeper, disk, tickets, said
     disk.go_on.set()
     keeper.close()
@@ -69,8 +69,8 @@ def until(condition):
 def test_what_is_written_is_kept(kept):
     keeper, disk, tickets, said = kept
     for n in range(200):
-        keeper.keep(Keep(n, (change(n),)))
-    until(lambda: tickets and tickets[-1] == Kept(199))
+        keeper.submit(SaveChanges(n, (change(n),)))
+    until(lambda: tickets and tickets[-1] == ChangesSaved(199))
     assert disk.rows == [change(n) for n in range(200)]
     assert (said, keeper.trouble) == ([], None)
 
@@ -78,19 +78,19 @@ def test_what_is_written_is_kept(kept):
 @pytest.mark.parametrize("reason", [FULL, FULL.replace("No space left on device", "disk I/O error")])
 def test_what_is_not_on_the_disk_is_not_kept(kept, reason):
     keeper, disk, tickets, said = kept
-    keeper.keep(Keep(0, (change(0),)))
-    until(lambda: tickets == [Kept(0)])
+    keeper.submit(SaveChanges(0, (change(0),)))
+    until(lambda: tickets == [ChangesSaved(0)])
     disk.error = StoreError(reason)
     for n in range(1, 40):
-        keeper.keep(Keep(n, (change(n),)))
+        keeper.submit(SaveChanges(n, (change(n),)))
     tries = disk.tries
     until(lambda: disk.tries > tries + 5)
-    assert tickets == [Kept(0)]
+    assert tickets == [ChangesSaved(0)]
     assert disk.rows == [change(0)]
     assert said == [f"{reason}; keyframes are not acknowledged until it can"]
     assert keeper.trouble == f"{reason}; keyframes are not acknowledged"
     disk.error = None
-    until(lambda: tickets[-1] == Kept(39))
+    until(lambda: tickets[-1] == ChangesSaved(39))
     assert disk.rows == [change(n) for n in range(40)]  # in order, each once
     assert said[1:] == ["the map is kept again"]
     assert keeper.trouble is None
@@ -100,22 +100,22 @@ def test_another_reason_is_said(kept):
     keeper, disk, _, said = kept
     for reason in ("full", "broken"):
         disk.error = StoreError(reason)
-        keeper.keep(Keep(0, (change(0),)))
+        keeper.submit(SaveChanges(0, (change(0),)))
         until(lambda reason=reason: said and said[-1].startswith(reason))
     assert len(said) == 2
 
 
 def test_a_disk_that_does_not_answer_is_said(kept, monkeypatch):
     keeper, disk, tickets, _ = kept
-    monkeypatch.setattr(keeper_module, "_SLOW_S", 0.05)
+    monkeypatch.setattr(keeper_module, "_SLOW_WRITE_S", 0.05)
     disk.go_on.clear()
-    keeper.keep(Keep(0, (change(0),)))
+    keeper.submit(SaveChanges(0, (change(0),)))
     until(lambda: keeper.trouble is not None)
     assert "has been writing for" in keeper.trouble
     assert "not acknowledged" in keeper.trouble
     assert not tickets
     disk.go_on.set()
-    until(lambda: tickets == [Kept(0)])
+    until(lambda: tickets == [ChangesSaved(0)])
     assert keeper.trouble is None
 
 
@@ -123,9 +123,9 @@ def test_a_change_that_cannot_be_kept_costs_itself(kept):
     keeper, disk, tickets, said = kept
     disk.go_on.clear()
     for n in range(5):
-        keeper.keep(Keep(n, (change(n) if n != 2 else "poison",)))
+        keeper.submit(SaveChanges(n, (change(n) if n != 2 else "poison",)))
     disk.go_on.set()
-    until(lambda: tickets and tickets[-1] == Kept(4))
+    until(lambda: tickets and tickets[-1] == ChangesSaved(4))
     assert disk.rows == [change(n) for n in (0, 1, 3, 4)]
     assert said == ["a change cannot be kept and is left out: OverflowError: int too large"]
 
@@ -134,15 +134,21 @@ def test_solutions_do_not_pile_up(kept):
     keeper, disk, tickets, _ = kept
     disk.error = StoreError(FULL)
     for n in range(500):
-        keeper.keep(Keep(n, (poses(n),)))
-    until(lambda: disk.tries > 3 and keeper.held == 1)
+        keeper.submit(SaveChanges(n, (poses(n),)))
+    until(lambda: disk.tries > 3 and keeper.pending_changes == 1)
     disk.error = None
-    until(lambda: tickets and tickets[-1] == Kept(499))
+    until(lambda: tickets and tickets[-1] == ChangesSaved(499))
     assert [p.keys[0].id for p in disk.rows] == [499]
 
 
 def test_the_newest_solution_stays_in_its_place():
-    held = deque([Keep(0, (poses(0), change(0))), Keep(1, (poses(1), change(1))), Keep(2, (change(2),))])
+    held = deque(
+        [
+            SaveChanges(0, (poses(0), change(0))),
+            SaveChanges(1, (poses(1), change(1))),
+            SaveChanges(2, (change(2),)),
+        ]
+    )
     out = newest_poses_only(held)
     assert [keep.ticket for keep in out] == [0, 1, 2]
     assert [keep.changes for keep in out] == [(change(0),), held[1].changes, (change(2),)]
@@ -151,7 +157,7 @@ def test_the_newest_solution_stays_in_its_place():
 def test_what_is_left_at_the_end_is_said(kept):
     keeper, disk, tickets, said = kept
     disk.error = StoreError(FULL)
-    keeper.keep(Keep(0, (change(0), change(1))))
+    keeper.submit(SaveChanges(0, (change(0), change(1))))
     assert keeper.close() == f"{FULL}: 2 changes are not in the map's file"
     assert disk.closed
     assert not tickets
@@ -160,9 +166,9 @@ def test_what_is_left_at_the_end_is_said(kept):
 
 def test_who_ends_does_not_wait_for_a_disk_that_does_not_answer(kept, monkeypatch):
     keeper, disk, tickets, _ = kept
-    monkeypatch.setattr(keeper_module, "_PATIENCE_S", 0.05)
+    monkeypatch.setattr(keeper_module, "_TIMEOUT_S", 0.05)
     disk.go_on.clear()
-    keeper.keep(Keep(0, (change(0),)))
+    keeper.submit(SaveChanges(0, (change(0),)))
     until(lambda: disk.tries)
     assert not keeper.drain(0.05)
     assert "the map's disk does not answer" in keeper.close()
@@ -170,5 +176,5 @@ def test_who_ends_does_not_wait_for_a_disk_that_does_not_answer(kept, monkeypatc
     assert not disk.closed  # which would wait for the write
     assert not tickets
     disk.go_on.set()
-    until(lambda: tickets == [Kept(0)])  # it was written after all
+    until(lambda: tickets == [ChangesSaved(0)])  # it was written after all
     assert keeper.drain(1.0)

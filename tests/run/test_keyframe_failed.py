@@ -13,10 +13,10 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config
-from share.odometry.result import TrackResult
+from share.odometry.track_result import TrackResult
 from share.runtime.agent import AgentRun
-from share.runtime.error_model import Unknown
-from share.types import Candidate, Frame, ImuBatch, TrackState, View
+from share.runtime.error_estimators import NoErrorEstimate
+from share.types import Frame, ImuBatch, KeyframeCandidate, TrackState, View
 
 FRAME = Frame(10**9, 0, np.zeros((480, 640), np.uint8), None, None, ImuBatch.empty())
 VIEW = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
@@ -25,7 +25,7 @@ VIEW = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
 class Tracker:
     """Wants every frame as a keyframe; `fails`: what it cannot do."""
 
-    doubted, bias = 0, None
+    rejected_imu_samples, bias = 0, None
 
     def __init__(self, fails: str = "") -> None:
         self._fails = fails
@@ -39,14 +39,14 @@ class Tracker:
     def track(self, frame: Frame) -> TrackResult:
         return TrackResult(TrackState.OK, np.eye(4), True, 40, True)
 
-    def keyframe(self, frame: Frame) -> Candidate:
+    def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
         self._do("keyframe")
-        return Candidate(np.eye(4), np.eye(4), 1e-6 * np.eye(6), np.zeros(3), 0.01, VIEW, True)
+        return KeyframeCandidate(np.eye(4), np.eye(4), 1e-6 * np.eye(6), np.zeros(3), 0.01, VIEW, True)
 
-    def settle(self) -> None:
+    def finish_keyframe(self) -> None:
         self._do("settle")
 
-    def give_up(self, frame: Frame) -> None:
+    def reset_after_failure(self, frame: Frame) -> None:
         self._do("give up")
 
 
@@ -61,14 +61,14 @@ def run_of(tracker: Tracker, said: list[str]) -> Iterator[AgentRun]:
         yield run
     finally:
         run._files.release()
-        run._scribe.end()
+        run._output_writer.stop()
 
 
 def tracked(run: AgentRun) -> list[tuple[bool, bool]]:
     """Whether each frame that is in the log then is a keyframe, and was given an id."""
-    run._track_one(FRAME, 0)
+    run._track_frame(FRAME, 0)
     while not run._shared.inbox.empty():
-        run._take(run._shared.inbox.get())
+        run._handle_posted(run._shared.inbox.get())
     rows = run._log.frames()
     return list(zip(rows.keyframe.tolist(), rows.sent.tolist(), strict=True))
 
@@ -102,18 +102,18 @@ def test_what_fails_in_posting_a_keyframe_is_no_failure_of_the_tracker() -> None
     with run_of(tracker, []) as run:
         run._link.wake = wake  # type: ignore[method-assign]
         with pytest.raises(OSError, match="no such socket"):
-            run._track_one(FRAME, 0)
+            run._track_frame(FRAME, 0)
     assert tracker.calls == ["keyframe"]
 
 
 def test_an_error_model_that_fails_costs_its_estimate() -> None:
-    class Broken(Unknown):
-        def after(self, frame: Frame, result: TrackResult) -> float | None:
+    class Broken(NoErrorEstimate):
+        def update(self, frame: Frame, result: TrackResult) -> float | None:
             raise FloatingPointError("overflow")
 
     said, tracker = list[str](), Tracker()
     with run_of(tracker, said) as run:
-        run._errors = Broken()
+        run._error_estimator = Broken()
         assert tracked(run) == [(True, True)]
     assert tracker.calls == ["keyframe", "settle"]
     assert sum("FloatingPointError" in line for line in said) == 1

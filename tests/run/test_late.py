@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from share.runtime.arrivals import Late
+from share.runtime.arrivals import LateFrameDropper
 from share.types import Frame, ImuBatch
 
 MS = 1_000_000
@@ -16,27 +16,27 @@ def frame(k):
 
 
 def test_a_late_frame_is_left_out_if_another_waits():
-    late = Late(20.0)
-    assert late.take(frame(0), 19 * MS, another=True) is not None
-    assert late.take(frame(1), 21 * MS, another=True) is None
-    assert late.take(frame(2), 21 * MS, another=True) is None
+    late = LateFrameDropper(20.0)
+    assert late.admit(frame(0), 19 * MS, has_next=True) is not None
+    assert late.admit(frame(1), 21 * MS, has_next=True) is None
+    assert late.admit(frame(2), 21 * MS, has_next=True) is None
     assert late.dropped == 2
 
 
 def test_the_next_frame_has_all_that_the_imu_said():
-    late = Late(20.0)
-    late.take(frame(1), 30 * MS, another=True)
-    late.take(frame(2), 30 * MS, another=True)
-    taken = late.take(frame(3), 5 * MS, another=True)
+    late = LateFrameDropper(20.0)
+    late.admit(frame(1), 30 * MS, has_next=True)
+    late.admit(frame(2), 30 * MS, has_next=True)
+    taken = late.admit(frame(3), 5 * MS, has_next=True)
     assert taken.index == 3
     assert taken.imu.stamps_ns.tolist() == [10 * MS, 15 * MS, 20 * MS, 25 * MS, 30 * MS, 35 * MS]
     assert taken.imu.gyro[:, 0].tolist() == [1, 1, 2, 2, 3, 3]
     assert taken.imu.accel[:, 0].tolist() == [-1, -1, -2, -2, -3, -3]
-    assert late.take(frame(4), 0, another=True).imu.stamps_ns.tolist() == [40 * MS, 45 * MS]
+    assert late.admit(frame(4), 0, has_next=True).imu.stamps_ns.tolist() == [40 * MS, 45 * MS]
 
 
 @pytest.mark.parametrize(("late_ms", "another"), [(0.0, True), (20.0, False)])
 def test_none_is_left_out_where_none_may_be_or_none_waits(late_ms, another):
-    late = Late(late_ms)
-    assert late.take(frame(1), 10**12, another) is not None
+    late = LateFrameDropper(late_ms)
+    assert late.admit(frame(1), 10**12, another) is not None
     assert late.dropped == 0

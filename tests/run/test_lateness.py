@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from share.runtime.arrivals import Lateness
+from share.runtime.arrivals import LatenessMonitor
 
 
 def test_poses_in_time_are_not_spoken_of() -> None:
     said: list[str] = []
-    lateness = Lateness(said.append, "this machine")
+    lateness = LatenessMonitor(said.append, "this machine")
     for _ in range(100):
-        lateness.done(45.0)
+        lateness.record(45.0)
     assert (said, lateness.report()) == ([], {"frames_late": 0, "latest_s": 0.045})
 
 
 def test_late_ones_are_counted_and_said_once_and_where_it_doubles() -> None:
     said: list[str] = []
-    lateness = Lateness(said.append, "this machine")
+    lateness = LatenessMonitor(said.append, "this machine")
     for k in range(100):
-        lateness.done(100.0 * k)  # to 9.9 s
+        lateness.record(100.0 * k)  # to 9.9 s
     assert [line.split(":")[0] for line in said] == [f"poses are {s:.1f} s late" for s in (1, 2, 4, 8)]
     assert "this machine is too slow for this source; consider agent.late_ms" in said[0]
     assert lateness.report() == {"frames_late": 94, "latest_s": 9.9}

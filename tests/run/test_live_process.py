@@ -19,7 +19,7 @@ import pytest
 
 from share.geometry.camera import ImuBias
 from share.recordings.trajectory import read_tum
-from share.sensors.imu_memory import Remembered, remember
+from share.sensors.imu_memory import SavedBias, save_bias
 
 pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
@@ -86,7 +86,7 @@ def test_a_person_ends_tracking_and_finds_the_poses_and_what_the_camera_did(
 
 def test_a_person_ends_an_agent_and_its_files_are_whole(tmp_path: Path, plain_session: Path) -> None:
     who = ("agent", "realsense", *MODE, "--name", "ann", "--profile", "d435i-n100-headset")
-    remember("0123", Remembered(10**9 * int(time.time() - 60), ImuBias([0.0] * 3, [0.0] * 3, 1e-3, 1e-2)))
+    save_bias("0123", SavedBias(10**9 * int(time.time() - 60), ImuBias([0.0] * 3, [0.0] * 3, 1e-3, 1e-2)))
     with running(plain_session / "ar1", *who, "--edge", "tcp://127.0.0.1:9", "--out", tmp_path) as (child, t):
         live = shown(t)
         told, after = ended(child, t)

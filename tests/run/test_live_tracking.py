@@ -15,29 +15,29 @@ import pytest
 from capture_bench import quick
 from room_camera import BEGIN_US, HZ, RGBD, STEREO, RoomCamera
 
-from share.cameras.handover import Handover, KeepNewest
-from share.cameras.live import WAITING, LiveSource
-from share.cli import live
+from share.cameras.live import MAX_WAITING_FRAMES, LiveSource
+from share.cameras.sample_queue import NewestImageQueue, SampleQueue
+from share.cli import camera_options
 from share.config import Config
 from share.geometry.camera import ImuBias
-from share.odometry import tracker
-from share.odometry.result import TrackResult
+from share.odometry import inertial_tracker
+from share.odometry.track_result import TrackResult
 from share.recordings.calibration import Calibration
 from share.runtime.capture import Capture
+from share.runtime.offline_tracking import TrackingOutput, track
 from share.runtime.source import Source, open_source
-from share.runtime.track import TrackRun, track
-from share.sensors.imu_memory import Remembered, recall, remember
+from share.sensors.imu_memory import SavedBias, load_bias, save_bias
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
 SAME_M = 0.002  # calibration and IMU are of single precision there
 
 
-def tracked(source: Source) -> TrackRun:
+def tracked(source: Source) -> TrackingOutput:
     return track(source, Config(), lambda result: None)
 
 
-def assert_same(room: RoomCamera, run: TrackRun, original: TrackRun) -> None:
+def assert_same(room: RoomCamera, run: TrackingOutput, original: TrackingOutput) -> None:
     """Poses at the same moments, and at the same places."""
     theirs = original.trajectory
     shift_ns = BEGIN_US * 1000 - room.first_ns
@@ -54,26 +54,26 @@ def room(plain_session: Path) -> RoomCamera:
 
 
 @pytest.fixture(scope="module")
-def original(room: RoomCamera) -> TrackRun:
+def original(room: RoomCamera) -> TrackingOutput:
     return tracked(room.source)
 
 
 def test_a_recorded_camera_is_tracked_as_the_original(
-    room: RoomCamera, original: TrackRun, tmp_path: Path
+    room: RoomCamera, original: TrackingOutput, tmp_path: Path
 ) -> None:
-    feed, said = room.feed(STEREO, Handover(), told := []), told
+    feed, said = room.feed(STEREO, SampleQueue(), told := []), told
     room.begin(feed)
     run = Capture(feed, tmp_path / "a.mcap", 0.0, said.append)
     feed_stopped = feed.stop
     feed.stop = lambda: (feed_stopped(), run.stop())  # type: ignore[method-assign,assignment]
-    report = run.go(30)
+    report = run.run(30)
     assert (report["ended"], said) == ("stopped", [])
     assert_same(room, tracked(open_source(str(tmp_path / "a.mcap"))), original)
 
 
-def test_a_live_camera_is_tracked_as_the_original(room: RoomCamera, original: TrackRun) -> None:
+def test_a_live_camera_is_tracked_as_the_original(room: RoomCamera, original: TrackingOutput) -> None:
     said: list[str] = []
-    source = LiveSource(room.feed(STEREO, KeepNewest(2 * WAITING), said), HZ)
+    source = LiveSource(room.feed(STEREO, NewestImageQueue(2 * MAX_WAITING_FRAMES), said), HZ)
     assert source.name == "realsense:0123"
     room.begin(source.feed)
     run = tracked(source)
@@ -93,33 +93,35 @@ def test_a_live_camera_begins_with_the_bias_of_the_run_before_and_keeps_its_own(
     room: RoomCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before, after = (ImuBias([0.0, x, 0.0], [0.0, 0.0, x], 1e-3, 2e-2) for x in (0.001, 0.002))
-    remember("0123", Remembered(time.time_ns() - 3600 * 10**9, before))
+    save_bias("0123", SavedBias(time.time_ns() - 3600 * 10**9, before))
     begun: list[ImuBias] = []
-    first_state = tracker.first_state
-    monkeypatch.setattr(tracker, "first_state", lambda *a: begun.append(a[-1]) or first_state(*a))
-    monkeypatch.setattr(tracker, "learnt_bias", lambda *a: after)
-    source = LiveSource(room.feed(STEREO, KeepNewest(2 * WAITING), []), HZ)
+    first_state = inertial_tracker.state_from_imu
+    monkeypatch.setattr(inertial_tracker, "state_from_imu", lambda *a: begun.append(a[-1]) or first_state(*a))
+    monkeypatch.setattr(inertial_tracker, "estimated_bias", lambda *a: after)
+    source = LiveSource(room.feed(STEREO, NewestImageQueue(2 * MAX_WAITING_FRAMES), []), HZ)
     room.begin(source.feed)
     run = tracked(source)
     assert (begun[0].gyro[1], begun[0].accel[2]) == (0.001, 0.001)
     assert 0.1 < begun[0].accel_sigma < 0.11
     assert run.report["imu_bias"]["from"] is not None
-    assert f"imu bias: from the run of {run.report['imu_bias']['from']}" in live.summary(run.report)
+    assert f"imu bias: from the run of {run.report['imu_bias']['from']}" in camera_options.camera_summary(
+        run.report
+    )
     assert run.report["tracked"] > 40
-    kept = recall("0123")
+    kept = load_bias("0123")
     assert kept is not None
     assert kept.bias.gyro[1] == 0.002
-    assert 0 <= time.time_ns() - kept.at_ns < 60 * 10**9
+    assert 0 <= time.time_ns() - kept.run_end_ns < 60 * 10**9
     begun.clear()
     assert "imu_bias" not in tracked(room.source).report  # a recording: as if nothing were known
     assert begun[0].accel_sigma == Config().inertial.accel_bias
-    assert recall("0123").at_ns == kept.at_ns  # type: ignore[union-attr]
+    assert load_bias("0123").run_end_ns == kept.run_end_ns  # type: ignore[union-attr]
 
 
 def test_a_calibration_of_another_camera_is_noted_and_used(room: RoomCamera) -> None:
     rig = replace(room.source.rig, depth=room.source.rig.cam0, T_depth_cam0=np.eye(4), timeshift_s=0.004)
     given = Calibration(rig, "mine", serials=("0456",))
-    source = LiveSource(room.feed(STEREO, KeepNewest(2 * WAITING), []), HZ, given)
+    source = LiveSource(room.feed(STEREO, NewestImageQueue(2 * MAX_WAITING_FRAMES), []), HZ, given)
     source.close()
     assert (source.rig.timeshift_s, source.rig.depth) == (0.004, None)  # depth is not read
     (note,) = source.notes
@@ -127,11 +129,11 @@ def test_a_calibration_of_another_camera_is_noted_and_used(room: RoomCamera) -> 
 
 
 def test_a_tracker_slower_than_its_camera_takes_the_newest_and_all_of_the_imu(room: RoomCamera) -> None:
-    source = LiveSource(room.feed(STEREO, KeepNewest(2 * WAITING), []), HZ)
+    source = LiveSource(room.feed(STEREO, NewestImageQueue(2 * MAX_WAITING_FRAMES), []), HZ)
     waited = []
 
     def slowly(result: TrackResult) -> None:
-        stamp_ns = source.feed.intake.streams["cam0"].last_ns
+        stamp_ns = source.feed.processor.streams["cam0"].last_ns
         waited.append(time.monotonic_ns() - source.arrived_ns(stamp_ns or 0))
         time.sleep(0.15)
 
@@ -150,7 +152,7 @@ def test_depth_of_a_live_camera_is_in_metres_and_is_tracked(plain_session: Path)
     room = RoomCamera(rs, open_source(str(plain_session / "robot")))
     assert room.source.rig.depth is not None
     original = tracked(room.source)
-    source = LiveSource(room.feed(RGBD, KeepNewest(2 * WAITING), []), HZ)
+    source = LiveSource(room.feed(RGBD, NewestImageQueue(2 * MAX_WAITING_FRAMES), []), HZ)
     assert (source.rig.cam1, source.rig.kind) == (None, "rgbd+imu")
     room.begin(source.feed)
     run = tracked(source)
@@ -160,7 +162,7 @@ def test_depth_of_a_live_camera_is_in_metres_and_is_tracked(plain_session: Path)
 
 def test_a_camera_that_was_unplugged_is_tracked_on_with_its_new_clock(plain_session: Path) -> None:
     room, said = RoomCamera(rs, open_source(str(plain_session / "ar1"))), list[str]()
-    source = LiveSource(room.feed(STEREO, KeepNewest(200), said, quick), HZ)
+    source = LiveSource(room.feed(STEREO, NewestImageQueue(200), said, quick), HZ)
     feed = source.feed
 
     def heard(text: str) -> Callable[[], bool]:
@@ -175,7 +177,7 @@ def test_a_camera_that_was_unplugged_is_tracked_on_with_its_new_clock(plain_sess
         room.there = True
         wait_for(heard("connected again"))
         room.play(lambda: time.sleep(1 / HZ), begin_us=0)
-        wait_for(lambda: feed.intake.streams["cam0"].samples == 90)
+        wait_for(lambda: feed.processor.streams["cam0"].samples == 90)
         feed.stop()
 
     threading.Thread(target=plugged, daemon=True).start()

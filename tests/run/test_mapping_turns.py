@@ -10,9 +10,9 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config
-from share.protocol.edge_events import Add, Found, Join
-from share.runtime import mapper
-from share.runtime.worker import END
+from share.protocol.edge_events import AddKeyframe, AddRun, MapperResult
+from share.runtime import mapper_process
+from share.runtime.worker_process import END
 from share.types import Keyframe, View
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
@@ -23,44 +23,46 @@ class NoSolver:
     def close(self) -> None: ...
 
 
-def add(run: str, id: int) -> Add:
+def add(run: str, id: int) -> AddKeyframe:
     T = np.eye(4)
-    return Add(run, Keyframe(id, id - 1, id, T, 1e-6 * np.eye(6), T, np.zeros(3), 0.0, EMPTY, id - 1))
+    return AddKeyframe(run, Keyframe(id, id - 1, id, T, 1e-6 * np.eye(6), T, np.zeros(3), 0.0, EMPTY, id - 1))
 
 
 @pytest.mark.parametrize("ends", [False, True])
 def test_whoever_sends_many_waits_for_itself(monkeypatch: pytest.MonkeyPatch, ends: bool) -> None:
     """eve by two runs, ann after all of them."""
-    monkeypatch.setattr(mapper._Mapping, "_new_solver", lambda self, after_s: NoSolver())
+    monkeypatch.setattr(mapper_process._MapperProcess, "_new_solver", lambda self, after_s: NoSolver())
     order: list[str] = []
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
     for name, run in (("eve", "eve-1"), ("eve", "eve-2"), ("ann", "ann-1")):
-        inbox.put(Join(run, hello_of(name, 1)))
+        inbox.put(AddRun(run, hello_of(name, 1)))
     for run, count in (("eve-1", 40), ("eve-2", 40), ("ann-1", 3)):
         for k in range(count):
             inbox.put(add(run, k))
-    work = mapper._Mapping(inbox, lambda answer: None, Config())
-    taken = work._mapper.add
-    monkeypatch.setattr(work._mapper, "add", lambda run, *more: order.append(run) or taken(run, *more))
+    work = mapper_process._MapperProcess(inbox, lambda answer: None, Config())
+    taken = work._mapper.add_keyframe
+    monkeypatch.setattr(
+        work._mapper, "add_keyframe", lambda run, *more: order.append(run) or taken(run, *more)
+    )
     if ends:
         inbox.put(END)
-        work.go()
+        work.run()
     else:
-        for message in work._arrived(wait=True):
-            work._hear(message)
-        while work._turns:
-            work._take_in()
+        for message in work._receive(wait=True):
+            work._handle(message)
+        while work._keyframe_queue:
+            work._add_keyframes()
     assert len(order) == 83
     assert max(k for k, run in enumerate(order) if run == "ann-1") <= 5
 
 
 def test_a_keyframe_that_fails_costs_itself_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapper._Mapping, "_new_solver", lambda self, after_s: NoSolver())
+    monkeypatch.setattr(mapper_process._MapperProcess, "_new_solver", lambda self, after_s: NoSolver())
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
     answers: list[Any] = []
-    for message in (Join("ann-1", hello_of("ann", 1)), add("who-1", 0), add("ann-1", 0), END):
+    for message in (AddRun("ann-1", hello_of("ann", 1)), add("who-1", 0), add("ann-1", 0), END):
         inbox.put(message)
-    mapper._Mapping(inbox, answers.append, Config()).go()
-    said = [one.what for found in answers if isinstance(found, Found) for one in found.findings]
+    mapper_process._MapperProcess(inbox, answers.append, Config()).run()
+    said = [one.event for found in answers if isinstance(found, MapperResult) for one in found.findings]
     assert "job failed" in said
     assert len(said) == 2

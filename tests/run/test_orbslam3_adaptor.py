@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from recordings import make_euroc
 
-from share.lab.evaluate.peers import calibration, moments
-from share.lab.peers import PEERS
+from share.lab.evaluate.tracker_runs import peer_frames, rig_calibration
+from share.lab.peer_trackers import PEERS
 from share.runtime.source import open_source
 
 SCRIPT = f"""
@@ -20,13 +20,13 @@ import json, sys, types
 sys.path.insert(0, {str(PEERS["orbslam3"].path.parent)!r})
 sys.modules["pyorbslam3"] = types.ModuleType("pyorbslam3")
 import orbslam3
-from peer_wire import read_line, read_moment, write_line
+from peer_wire import read_line, read_frame, write_line
 
 told = read_line(sys.stdin.buffer)
-samples, taken = orbslam3.Samples(), []
-while (moment := read_moment(sys.stdin.buffer)) is not None:
-    taken.append(samples.until(moment, 0)[:, 0].tolist())
-write_line(orbslam3.ANSWERS, dict(settings=orbslam3.settings(told), taken=taken))
+samples, taken = orbslam3.ImuQueue(), []
+while (moment := read_frame(sys.stdin.buffer)) is not None:
+    taken.append(samples.take_until(moment, 0)[:, 0].tolist())
+write_line(orbslam3.ANSWER_STREAM, dict(settings=orbslam3.settings_yaml(told), taken=taken))
 """
 
 
@@ -38,16 +38,16 @@ def source(tmp_path):
 @pytest.fixture
 def told(source, tmp_path):
     """What the adaptor makes of the recording."""
-    return answered(tmp_path, calibration(source), moments(source))
+    return answered(tmp_path, rig_calibration(source), peer_frames(source))
 
 
 def answered(tmp_path, rig, what):
-    from share.lab.peers.peer_wire import write_line, write_moment
+    from share.lab.peer_trackers.peer_wire import write_frame, write_line
 
     with (tmp_path / "moments").open("wb") as file:
         write_line(file, rig)
         for moment in what:
-            write_moment(file, moment)
+            write_frame(file, moment)
     with (tmp_path / "moments").open("rb") as file:
         done = subprocess.run([sys.executable, "-c", SCRIPT], stdin=file, capture_output=True, timeout=60)
     assert done.returncode == 0, done.stderr.decode()
@@ -74,7 +74,7 @@ def test_settings_are_the_recordings(told, source):
 
 
 def test_a_fifth_coefficient_is_passed_on(source, tmp_path):
-    rig = calibration(source)
+    rig = rig_calibration(source)
     rig["cameras"][0]["distortion"] = [0.1, 0.2, 0.3, 0.4, 0.5]
     settings = answered(tmp_path, rig, [])["settings"]
     read = cv2.FileStorage(settings, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -89,7 +89,7 @@ def test_a_fifth_coefficient_is_passed_on(source, tmp_path):
 
 
 def test_each_frame_has_the_samples_since_the_one_before(told, source):
-    stamps = [moment.stamp_ns for moment in moments(source)]
+    stamps = [moment.stamp_ns for moment in peer_frames(source)]
     recorded = [m.stamp_ns for m in source.measurements() if m.stream == "imu"]
     before = 0
     for stamp, taken in zip(stamps, told["taken"], strict=True):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from children import Child, start_agent, start_edge
 
-from share.wire.codec import VERSION
+from share.wire.codec import WIRE_VERSION
 
 LAST, LAST_VERSION = "f2e709f", 4  # the commit of the last release, and its wire version
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,7 +65,7 @@ def test_an_agent_of_the_last_release_is_told_to_upgrade(
     with of_last_release:
         old = start_agent(tmp_path, "ann", plain_session / "ar1", address)
     assert old.wait(60) == 2
-    line = f"(wire {VERSION}), this agent speaks wire {LAST_VERSION}: upgrade the agent"
+    line = f"(wire {WIRE_VERSION}), this agent speaks wire {LAST_VERSION}: upgrade the agent"
     assert "share: the edge refuses 'ann': this edge is SHARE" in old.said
     assert line in old.said and "Traceback" not in old.said
     new = start_agent(tmp_path, "bob", plain_session / "ar2", address)

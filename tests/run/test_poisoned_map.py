@@ -16,12 +16,12 @@ from children import Child, start_agent
 from recorded_traffic import map_file
 from test_edge_killed import _workers, until
 
-from share.mapping.loops import Key
+from share.mapping.loops import KeyframeKey
 from share.store import rows
 from share.store.map_store import MapStore
 
 pytestmark = pytest.mark.slow
-POISONED = Key("ann-0fb6", 3)
+POISONED = KeyframeKey("ann-0fb6", 3)
 
 
 def poison(path: Path) -> None:
@@ -57,7 +57,7 @@ def test_a_pose_beyond_measure_costs_its_keyframe(tmp_path: Path, plain_session:
     assert child.interrupt() == 0
     assert "mapper lost" not in child.said
     with MapStore.read(path) as store:
-        keys = [found.at for found in store.load().keyframes]
+        keys = [found.keyframe_key for found in store.load().keyframes]
     assert len([key for key in keys if not key.agent.startswith("eve")]) == 15
     assert len(keys) > 15
 
@@ -88,4 +88,4 @@ def test_a_map_that_ends_three_mappers_is_set_aside(tmp_path: Path, plain_sessio
             kept = store.load()
         assert {run.hello.name for run in kept.runs} == people
         assert kept.keyframes
-        assert kept.complaints == ()
+        assert kept.problems == ()

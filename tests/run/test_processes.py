@@ -3,11 +3,13 @@
 import subprocess
 
 from share import __version__
-from share.runtime.commands import command
+from share.runtime.child_commands import share_command
 
 
 def test_a_folder_called_share_where_one_stands_is_not_taken_for_the_program(tmp_path):
     (tmp_path / "share").mkdir()
-    told = subprocess.run(command("--version"), cwd=tmp_path, capture_output=True, text=True, timeout=30)
+    told = subprocess.run(
+        share_command("--version"), cwd=tmp_path, capture_output=True, text=True, timeout=30
+    )
     assert (told.returncode, told.stderr) == (0, "")
     assert __version__ in told.stdout

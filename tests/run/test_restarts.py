@@ -12,12 +12,12 @@ from map_changes import ANN, BOB, small_map
 
 from share.config import Config, EdgeConfig
 from share.errors import StoreError
-from share.protocol.edge_events import Lost
+from share.protocol.edge_events import TrackerLost
 from share.runtime import edge as edge_module
 from share.runtime.edge import EdgeRun
-from share.runtime.mapper import Mapped, Restore, Restored
-from share.runtime.restarts import Restarts
-from share.runtime.worker import END
+from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
+from share.runtime.mapper_restarts import MapperRestarts
+from share.runtime.worker_process import END
 from share.store.map_store import MapStore
 
 
@@ -33,7 +33,7 @@ class Link:
     def refusals(self):
         return []
 
-    def names(self, key): ...
+    def agent_names(self, key): ...
     def trouble(self): ...
     def wake(self): ...
     def close(self): ...
@@ -42,17 +42,17 @@ class Link:
 def dies_of_a_map(inbox, answer, settings):
     """A mapper that cannot take in any keyframe."""
     while (message := inbox.get()) is not END:
-        if isinstance(message, Restore):
-            if message.kept.keyframes:
+        if isinstance(message, RestoreMap):
+            if message.stored_map.keyframes:
                 os._exit(3)
-            answer(Restored())
+            answer(MapRestored())
 
 
 def dies_later(inbox, answer, settings):
     """A mapper that dies of what comes after its map."""
     while (message := inbox.get()) is not END:
-        if isinstance(message, Restore):
-            answer(Restored())
+        if isinstance(message, RestoreMap):
+            answer(MapRestored())
             time.sleep(0.1)
             os._exit(3)
 
@@ -70,9 +70,11 @@ def edge(path, monkeypatch):
     runs = []
 
     def make(mapper):
-        monkeypatch.setattr(edge_module, "map_all", mapper)
-        died = Restarts.died
-        monkeypatch.setattr(Restarts, "died", lambda self: pauses.append(died(self)) or pauses[-1] / 100)
+        monkeypatch.setattr(edge_module, "run_mapper", mapper)
+        died = MapperRestarts.record_death
+        monkeypatch.setattr(
+            MapperRestarts, "record_death", lambda self: pauses.append(died(self)) or pauses[-1] / 100
+        )
         pauses, told = [], []
         run = EdgeRun(Config(), Link(), None, told.append, MapStore.open(path))
         runs.append(run)
@@ -81,7 +83,7 @@ def edge(path, monkeypatch):
     yield make
     for run in runs:
         run.stop()
-        run.go()
+        run.run()
 
 
 def step_until(run, condition, seconds=30):
@@ -105,8 +107,8 @@ def test_a_map_that_ends_mappers_is_set_aside(edge, path):
     aside = "the map is set aside as room.sqlite.damaged-1: 3 mappers, one after the other, have died of it"
     assert events(told, "map") == [f"{aside}; a fresh one is begun"]
     assert path.with_name("room.sqlite.damaged-1").read_bytes() == before
-    step_until(run, lambda: run._restarts._tries == 0 and run._mapping.pid is not None)
-    run._note()
+    step_until(run, lambda: run._restarts._tries == 0 and run._mapper_process.pid is not None)
+    run._update_report()
     assert any(text.startswith("the mapper: its process ended") for text in run.report()["trouble"])
     deadline = time.monotonic() + 0.5
     step_until(run, lambda: time.monotonic() > deadline)
@@ -127,10 +129,10 @@ def test_a_mapper_that_dies_of_something_else_keeps_its_map(edge, path):
 def test_answers_of_a_life_that_is_over_are_none_of_the_next(edge):
     """A ticket of the keeper before would acknowledge what the new one has not written."""
     run, _, _ = edge(dies_later)
-    run._answered(edge_module.Kept(10**6))
-    run._begin_anew("its process was ended")
-    run._take_answers()
-    assert run._machine._safekeeping._kept_to == 0
+    run._post(edge_module.ChangesSaved(10**6))
+    run._restart_mapping("its process was ended")
+    run._handle_answers()
+    assert run._state_machine._durability._saved_ticket == 0
 
 
 class Store:
@@ -152,7 +154,7 @@ def raises(error):
 @pytest.mark.parametrize("error", [np.linalg.LinAlgError("no pose"), ValueError("x"), RecursionError("deep")])
 def test_a_map_that_the_front_cannot_read_is_set_aside(error):
     said, store = [], Store(raises(error))
-    assert Restarts(store, 0.05, said.append).found() == (None, [])
+    assert MapperRestarts(store, 0.05, said.append).load_map() == (None, [])
     assert store.asides == 1
     aside = f"the map is set aside as m.damaged-1: {type(error).__name__}: {error}; a fresh one is begun"
     assert said == [aside]
@@ -160,8 +162,8 @@ def test_a_map_that_the_front_cannot_read_is_set_aside(error):
 
 def test_a_map_that_may_not_be_written_is_no_longer_used():
     said = []
-    restarts = Restarts(Store(raises(ValueError("x")), writable=False), 0.05, said.append)
-    assert restarts.found() == (None, [])
+    restarts = MapperRestarts(Store(raises(ValueError("x")), writable=False), 0.05, said.append)
+    assert restarts.load_map() == (None, [])
     assert restarts.store is None
     assert said == ["the map is not used any more: ValueError: x; nothing is kept"]
 
@@ -170,34 +172,34 @@ def test_who_speaks_for_a_run_is_not_known_where_no_key_did_before_and_keys_are_
     """Of the map of `small_map`, a key speaks for Ann."""
     for has_keys, bob in ((True, None), (False, "")):
         store = MapStore.read(path)
-        kept, known = Restarts(store, 0.05, print, has_keys).found()
-        voices = {run.key: run.voice for run in kept.runs}
-        assert voices == {run.key: run.voice for run in known} == {ANN: "key of ann", BOB: bob}
+        kept, known = MapperRestarts(store, 0.05, print, has_keys).load_map()
+        voices = {run.run_key: run.credential for run in kept.runs}
+        assert voices == {run.key: run.credential for run in known} == {ANN: "key of ann", BOB: bob}
 
 
 def test_a_disk_that_fails_is_not_the_maps_fault():
     store = Store(raises(StoreError("the map cannot be read: disk I/O error")))
     with pytest.raises(StoreError):
-        Restarts(store, 0.05, print).found()
+        MapperRestarts(store, 0.05, print).load_map()
     assert store.asides == 0
 
 
 def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
     run, _, told = edge(dies_later)
-    found = run._restarts.found
+    found = run._restarts.load_map
     monkeypatch.setattr(
-        run._restarts, "found", raises(StoreError("room: the map cannot be read: disk I/O error"))
+        run._restarts, "load_map", raises(StoreError("room: the map cannot be read: disk I/O error"))
     )
-    run._begin_anew("its process was ended")
+    run._restart_mapping("its process was ended")
     assert events(told, "map") == ["room: the map cannot be read: disk I/O error; tried again in 0.01 s"]
-    monkeypatch.setattr(run._restarts, "found", found)
-    step_until(run, lambda: run._begin_at is None)
-    assert run._mapping is not None
+    monkeypatch.setattr(run._restarts, "load_map", found)
+    step_until(run, lambda: run._restart_due_s is None)
+    assert run._mapper_process is not None
 
 
 def counts(inbox, answer, settings):
     """A mapper that has looked up seven keyframes and dies."""
-    answer(Mapped({"loops": {"tried": 7, "accepted": 2}, "place_ms": {"n": 7}, "maps": {}}))
+    answer(MapperReport({"loops": {"tried": 7, "accepted": 2}, "place_ms": {"n": 7}, "maps": {}}))
     time.sleep(0.1)
     os._exit(3)
 
@@ -206,7 +208,7 @@ def test_what_was_counted_before_a_mapper_died_still_counts(edge):
     run, _, told = edge(counts)
     for dead in range(1, 4):
         step_until(run, lambda dead=dead: len(events(told, "mapper lost")) >= dead)
-        run._note()
+        run._update_report()
         assert run.report()["loops"] == {"tried": 7 * dead, "accepted": 2 * dead}
         assert run.report()["place_ms"]["n"] == 7 * dead
 
@@ -216,23 +218,23 @@ def test_a_tracker_that_dies_is_its_agents_trouble(monkeypatch):
     settings = Config(edge=EdgeConfig(policy="streamed"))
     run = EdgeRun(settings, Link(), None, lambda fields: None)
     try:
-        run._inbox.put(Lost("ann-0001", 0, "was ended by SIGKILL"))
+        run._inbox.put(TrackerLost("ann-0001", 0, "was ended by SIGKILL"))
         run._step()
-        run._note()
+        run._update_report()
         assert run.report()["trouble"] == []
         assert run.report()["refused"] == ["agent's run ann-0001: its tracker was ended by SIGKILL"]
     finally:
         run.stop()
-        run.go()
+        run.run()
 
 
 def test_a_report_that_fails_costs_itself_and_is_shown_to_be_old(edge, monkeypatch):
     run, _, told = edge(dies_later)
     step_until(run, run.report)
-    report = run._machine.report
-    monkeypatch.setattr(run._machine, "report", lambda mapped: report({})["nobody"])
-    monkeypatch.setattr(edge_module, "_STUCK_S", 0.2)
+    report = run._state_machine.report
+    monkeypatch.setattr(run._state_machine, "report", lambda mapped: report({})["nobody"])
+    monkeypatch.setattr(edge_module, "_STALE_REPORT_S", 0.2)
     step_until(run, lambda: any("stuck" in line for line in run.report()["trouble"]))
     assert [line["event"] for line in told].count("internal error") == 1
-    monkeypatch.setattr(run._machine, "report", report)
+    monkeypatch.setattr(run._state_machine, "report", report)
     step_until(run, lambda: not any("stuck" in line for line in run.report()["trouble"]))

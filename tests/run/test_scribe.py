@@ -8,8 +8,8 @@ import time
 import pytest
 
 from share.errors import ShareError
-from share.runtime import scribe as scribe_module
-from share.runtime.scribe import Scribe
+from share.runtime import output_writer as scribe_module
+from share.runtime.output_writer import OutputWriter
 
 
 class Disk:
@@ -23,24 +23,24 @@ class Disk:
         self.lines.append(line)
 
 
-def write(scribe: Scribe, disk: Disk, lines: range) -> None:
+def write(scribe: OutputWriter, disk: Disk, lines: range) -> None:
     for line in lines:
-        scribe.do(lambda line=line: disk.write(line))
+        scribe.submit(lambda line=line: disk.write(line))
 
 
 def test_all_is_written_in_order() -> None:
     said, disk = list[str](), Disk()
-    scribe = Scribe("out", said.append)
+    scribe = OutputWriter("out", said.append)
     write(scribe, disk, range(1000))
-    scribe.end()
+    scribe.stop()
     scribe.check()
     assert (disk.lines, said, scribe.trouble) == (list(range(1000)), [], None)
 
 
 def test_a_disk_that_does_not_answer_is_said_and_that_it_does_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scribe_module, "_SLOW_S", 0.05)
+    monkeypatch.setattr(scribe_module, "_SLOW_WRITE_S", 0.05)
     said, disk = list[str](), Disk()
-    scribe = Scribe("out", said.append)
+    scribe = OutputWriter("out", said.append)
     disk.go_on.clear()
     write(scribe, disk, range(2))
     time.sleep(0.1)
@@ -50,7 +50,7 @@ def test_a_disk_that_does_not_answer_is_said_and_that_it_does_again(monkeypatch:
     assert scribe.trouble == "out: its disk has not answered for 0 s"
     assert said == ["out: its disk has not answered for 0 s; what is to be written waits"]
     disk.go_on.set()
-    scribe.end()
+    scribe.stop()
     scribe.check()
     assert disk.lines == list(range(100))
     assert said[1:] == ["out: is written again"]
@@ -59,24 +59,24 @@ def test_a_disk_that_does_not_answer_is_said_and_that_it_does_again(monkeypatch:
 
 def test_who_ends_does_not_wait_for_it() -> None:
     disk = Disk()
-    scribe = Scribe("out", print)
+    scribe = OutputWriter("out", print)
     disk.go_on.clear()
     write(scribe, disk, range(2))
-    scribe.end(0.05)
+    scribe.stop(0.05)
     with pytest.raises(ShareError, match="out: is not complete: its disk does not answer"):
         scribe.check()
     disk.go_on.set()
 
 
 def test_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scribe_module, "MOST", 10)
+    monkeypatch.setattr(scribe_module, "MAX_PENDING", 10)
     said, disk = list[str](), Disk()
-    scribe = Scribe("out", said.append)
+    scribe = OutputWriter("out", said.append)
     disk.go_on.clear()
     write(scribe, disk, range(50))
     assert said == ["out: too much waits for its disk; what comes now is left out"]
     disk.go_on.set()
-    scribe.end()
+    scribe.stop()
     assert disk.lines == list(range(len(disk.lines)))
     assert 10 <= len(disk.lines) <= 11
     with pytest.raises(ShareError, match="out: is not complete: its disk did not answer for too long"):
@@ -85,14 +85,14 @@ def test_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_fails_is_raised_at_the_end_and_costs_itself() -> None:
     disk = Disk()
-    scribe = Scribe("out", print)
+    scribe = OutputWriter("out", print)
 
     def fails() -> None:
         raise ShareError("out/a: cannot be written: Disk quota exceeded")
 
-    scribe.do(fails)
+    scribe.submit(fails)
     write(scribe, disk, range(3))
-    scribe.end()
+    scribe.stop()
     assert disk.lines == [0, 1, 2]
     with pytest.raises(ShareError, match="Disk quota exceeded"):
         scribe.check()

@@ -14,14 +14,14 @@ from room_camera import RoomCamera
 from shell import Done
 from software_camera import BASELINE, SoftwareCamera
 
-from share.cameras.realsense.camera import RealSense
-from share.cameras.realsense.streams import Wanted
+from share.cameras.realsense.camera import RealSenseCamera
+from share.cameras.realsense.streams import StreamRequest
 from share.config import Config
 from share.geometry import se3
 from share.lab.calibrate.imu_table import read_imu
+from share.runtime.offline_tracking import track
 from share.runtime.source import open_source
-from share.runtime.track import track
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
@@ -91,7 +91,7 @@ def test_images_are_the_same_to_the_last_bit_and_depth_is_in_metres(
 
 def test_its_extrinsics_are_those_that_the_sdk_itself_tells(tmp_path: Path) -> None:
     camera = Turned(rs)
-    with RealSense(Wanted(profile("d435i")), context=camera.context) as device:
+    with RealSenseCamera(StreamRequest(load_profile("d435i")), context=camera.context) as device:
         theirs = device.rig
 
     def play() -> None:

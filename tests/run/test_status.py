@@ -21,12 +21,12 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from share.config import Config
 from share.errors import TransportError, UsageError
-from share.mapping.agents.agreement import Standing
+from share.mapping.agents.agreement import AgentStanding
 from share.mapping.mapper import Mapper
 from share.protocol.edge import Edge
-from share.protocol.edge_events import Join, Received
+from share.protocol.edge_events import AddRun, PeerMessageReceived
 from share.runtime import status_metrics, web
-from share.runtime.status import KEPT_S, StatusServer
+from share.runtime.status_server import CACHE_S, StatusServer
 from share.wire.codec import encode
 from share.wire.messages import peer_id
 
@@ -90,9 +90,9 @@ def real_report():
     """Of an edge that knows one agent and nothing more."""
     edge, mapper = Edge(Config(), session=5), Mapper(Config())
     hello = hello_of("ann", 1)
-    for effect in edge.handle(Received(peer_id(1), encode(hello)), 10**9):
-        if isinstance(effect, Join):
-            mapper.join(effect.key, effect.hello)
+    for effect in edge.handle(PeerMessageReceived(peer_id(1), encode(hello)), 10**9):
+        if isinstance(effect, AddRun):
+            mapper.add_run(effect.key, effect.hello)
     return edge.report(mapper.report())
 
 
@@ -120,9 +120,9 @@ def test_what_a_peer_says_wrong_is_in_health_and_does_not_make_it_503():
     """Whoever restarts an edge because of that would do the attacker's work."""
     edge = Edge(Config(), session=5)
     for k in range(100):
-        edge.handle(Received(peer_id(1), [b"nonsense"]), 10**9)
-        edge.handle(Received(peer_id(2), encode(hello_of("ann", 2))), 10**9 + k)
-        edge.handle(Received(peer_id(2), [b"nonsense"]), 10**9 + k)
+        edge.handle(PeerMessageReceived(peer_id(1), [b"nonsense"]), 10**9)
+        edge.handle(PeerMessageReceived(peer_id(2), encode(hello_of("ann", 2))), 10**9 + k)
+        edge.handle(PeerMessageReceived(peer_id(2), [b"nonsense"]), 10**9 + k)
     with serving(lambda: edge.report({})) as server:
         status, _, body = get(server, "/health")
         samples = metrics(get(server, "/metrics")[2])
@@ -180,14 +180,14 @@ def test_metrics_are_read_back():
 def test_what_the_report_lacks_is_left_out():
     odd = {"agents": {"ann": {"keyframes": "many"}, "bob": None}, "maps": 3, "loops": None, "x_ms": {"n": 0}}
     for report in ({}, odd):
-        body, _ = status_metrics.text(report)
+        body, _ = status_metrics.render_metrics(report)
         assert all(value == value for value in metrics(body).values())
 
 
 def test_all_that_an_edge_reports_is_in_a_metric():
-    body, _ = status_metrics.text({**real_report(), "uptime_s": 1.0, "trouble": []})
+    body, _ = status_metrics.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": []})
     names = {name for name, _ in metrics(body)}
-    absent = {row.name for row in status_metrics.ROWS} - names
+    absent = {row.name for row in status_metrics.METRICS} - names
     by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}
     not_yet = {
         "share_edge_map_keyframes",
@@ -198,17 +198,17 @@ def test_all_that_an_edge_reports_is_in_a_metric():
 
 
 def test_names_and_units_are_as_prometheus_wants_them():
-    for row in status_metrics.ROWS:
+    for row in status_metrics.METRICS:
         assert re.fullmatch(r"share_edge(_[a-z]+)+", row.name)
-        assert row.help.endswith(".") and len({r.name for r in status_metrics.ROWS}) == len(
-            status_metrics.ROWS
+        assert row.help.endswith(".") and len({r.name for r in status_metrics.METRICS}) == len(
+            status_metrics.METRICS
         )
 
 
 def test_every_metric_is_in_the_documentation():
     page = (Path(__file__).parents[2] / "docs" / "status.md").read_text()
     assert [
-        r.name for r in status_metrics.ROWS if f"`{r.name.removeprefix('share_edge_')}`" not in page
+        r.name for r in status_metrics.METRICS if f"`{r.name.removeprefix('share_edge_')}`" not in page
     ] == []
 
 
@@ -232,7 +232,7 @@ def test_the_page_needs_nothing_from_elsewhere():
 
 def test_the_page_says_whose_claims_agree_and_the_snapshot_why():
     """Each field that the page reads is one of the report's."""
-    told = asdict(Standing("set apart", "against ann its depths are larger", 0.03, 0.002))
+    told = asdict(AgentStanding("set apart", "against ann its depths are larger", 0.03, 0.002))
     with serving(lambda: {"agents": {"eve": {**AGENT, "consistency": told}}}) as server:
         assert json.loads(get(server, "/snapshot.json")[2])["agents"]["eve"]["consistency"] == told
         page = get(server, "/")[2].decode()
@@ -275,7 +275,7 @@ def test_it_recovers():
     with serving(report) as server:
         assert get(server, "/health")[0] == 500
         fail.clear()
-        time.sleep(1.5 * KEPT_S)
+        time.sleep(1.5 * CACHE_S)
         assert get(server, "/health")[0] == 200
 
 
@@ -285,7 +285,7 @@ def test_the_edge_is_not_asked_for_each_of_many():
         began = time.monotonic()
         for _ in range(50):
             assert get(server, "/metrics")[0] == 200
-        most = 2 + (time.monotonic() - began) / KEPT_S
+        most = 2 + (time.monotonic() - began) / CACHE_S
     assert 1 <= len(asked) <= most
 
 
@@ -336,11 +336,13 @@ def test_a_request_may_come_in_pieces():
 
 
 def test_slow_clients_hold_nobody_up(monkeypatch):
-    monkeypatch.setattr(web, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(web, "CLIENT_TIMEOUT_S", 0.5)
     with serving() as server:
         host, _, port = server.endpoint.rpartition(":")
         threads = threading.active_count()
-        slow = [socket.create_connection((host, int(port)), timeout=10) for _ in range(3 * web.CONNECTIONS)]
+        slow = [
+            socket.create_connection((host, int(port)), timeout=10) for _ in range(3 * web.MAX_CONNECTIONS)
+        ]
         for _ in range(8):
             for client in slow:
                 with suppress(ConnectionError):
@@ -357,7 +359,7 @@ def test_slow_clients_hold_nobody_up(monkeypatch):
 
 
 def test_who_does_not_take_the_answer_is_dropped(monkeypatch):
-    monkeypatch.setattr(web, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(web, "CLIENT_TIMEOUT_S", 0.5)
     with serving(lambda: {"x": "y" * 20_000_000, "agents": {}}) as server:
         host, _, port = server.endpoint.rpartition(":")
         with socket.create_connection((host, int(port)), timeout=10) as lazy:
@@ -500,7 +502,7 @@ def test_whatever_clients_do_the_server_takes_little_and_goes_on(attack):
         assert share < 0.35
         assert get(server, "/health")[0] == 200
         assert threading.active_count() == threads
-        assert len(os.listdir("/proc/self/fd")) <= files + 2 * web.CONNECTIONS
+        assert len(os.listdir("/proc/self/fd")) <= files + 2 * web.MAX_CONNECTIONS
         assert resident_bytes() - memory < 20e6
 
 

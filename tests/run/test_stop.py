@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from share.runtime.stop import on_stop
+from share.runtime.signals import stop_on_signal
 
 
 @pytest.fixture(autouse=True)
@@ -28,7 +28,7 @@ def counted() -> tuple[list[int], Callable[[], None]]:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_first_signal_asks_for_the_end(number: signal.Signals) -> None:
     calls, stop = counted()
-    with on_stop(stop):
+    with stop_on_signal(stop):
         signal.raise_signal(number)
     assert calls == [1]
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == [signal.SIG_DFL] * 2
@@ -36,7 +36,7 @@ def test_the_first_signal_asks_for_the_end(number: signal.Signals) -> None:
 
 def test_a_terminal_that_goes_away_twice_ends_in_good_order_too() -> None:
     calls, stop = counted()
-    with on_stop(stop):
+    with stop_on_signal(stop):
         for _ in range(3):
             signal.raise_signal(signal.SIGHUP)
     signal.raise_signal(signal.SIGHUP)  # while the files are written
@@ -44,7 +44,7 @@ def test_a_terminal_that_goes_away_twice_ends_in_good_order_too() -> None:
 
 
 def test_where_nobody_asks_for_the_end_all_is_as_before() -> None:
-    with on_stop(counted()[1]):
+    with stop_on_signal(counted()[1]):
         pass
     assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
 
@@ -52,7 +52,7 @@ def test_where_nobody_asks_for_the_end_all_is_as_before() -> None:
 def test_under_nohup_it_goes_on() -> None:
     calls, stop = counted()
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    with on_stop(stop):
+    with stop_on_signal(stop):
         signal.raise_signal(signal.SIGHUP)
     assert calls == []
     assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN

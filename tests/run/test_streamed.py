@@ -14,8 +14,8 @@ from children import SHARE, Child, start_agent
 
 from share.config import Config
 from share.recordings.trajectory import format_tum
+from share.runtime.offline_tracking import track
 from share.runtime.source import open_source
-from share.runtime.track import track
 
 FRAMES = 45
 ROOMY = "stream: {window: 60}\n"  # nothing is dropped, however busy this machine is

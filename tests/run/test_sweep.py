@@ -11,9 +11,9 @@ import pytest
 
 from share.config import Config
 from share.errors import ConfigError, UsageError
-from share.lab.evaluate.play import Terms
+from share.lab.evaluate.real_time import RunOptions
 from share.lab.evaluate.statistics import MEASURES
-from share.lab.evaluate.sweep import Axis, at, drawn, grid, heat, planned
+from share.lab.evaluate.sweep import Axis, config_at, grid, heat_map, plan_sweep, random_points
 from share.recordings.session import Session
 
 KP, KI = Axis.parse("control.kp=0.2,0.8"), Axis.parse("control.ki=0,0.1,1e-3")
@@ -36,39 +36,41 @@ def test_a_grid_is_every_combination():
 
 def test_points_are_drawn_evenly_by_the_logarithm_and_the_same_again():
     axes = [Axis.parse("control.kp=0.1:10"), Axis.parse("control.ki=0:2"), KI]
-    points = drawn(axes, 2000, seed=0)
+    points = random_points(axes, 2000, seed=0)
     kp, ki = (np.array([float(point[k]) for point in points]) for k in (0, 1))
     assert 0.1 <= kp.min() < 0.12 < 8 < kp.max() <= 10
     assert np.mean(kp < 1) == pytest.approx(0.5, abs=0.04)
     assert np.mean(ki < 1) == pytest.approx(0.5, abs=0.04)
     assert {point[2] for point in points} == set(KI.values)
-    assert drawn(axes, 20, seed=0) == points[:20]
-    assert drawn(axes, 20, seed=1) != points[:20]
+    assert random_points(axes, 20, seed=0) == points[:20]
+    assert random_points(axes, 20, seed=1) != points[:20]
 
 
 def test_a_point_is_played_once_however_often_it_is_named_or_drawn():
     assert grid([Axis.parse("control.kp=1,1,2")]) == [("1",), ("2",)]
-    assert sorted(drawn([KP, KI], 50, seed=0)) == sorted(grid([KP, KI]))
+    assert sorted(random_points([KP, KI], 50, seed=0)) == sorted(grid([KP, KI]))
 
 
 def test_a_point_changes_its_settings_and_no_other():
     tied = Axis.parse("control.rate_min_hz+control.rate_max_hz=2,3")
-    config = at(Config(), [KP, tied], ("0.2", "3"))
+    config = config_at(Config(), [KP, tied], ("0.2", "3"))
     assert config.control.kp == 0.2
     assert (config.control.rate_min_hz, config.control.rate_max_hz) == (3, 3)
     assert config.edge == Config().edge
     assert config.control.kd == Config().control.kd
     with pytest.raises(ConfigError, match="unknown key 'kpp'; did you mean 'kp'"):
-        at(Config(), [Axis.parse("control.kpp=1")], ("1",))
+        config_at(Config(), [Axis.parse("control.kpp=1")], ("1",))
 
 
 def test_every_run_has_a_folder_of_its_own():
     sessions = [Session(Path(name), {}, {}) for name in ("a", "b")]
-    runs = planned(sessions, [KP, KI], grid([KP, KI]), range(2), Terms("share"), Path("out"), Config())
+    runs = plan_sweep(
+        sessions, [KP, KI], grid([KP, KI]), range(2), RunOptions("share"), Path("out"), Config()
+    )
     assert len({one.out for one, _ in runs}) == len(runs) == 2 * 6 * 2
     assert {one.terms.seed for one, _ in runs} == {0, 1}
     assert all(one.config.control.kp == float(point[0]) for one, point in runs)
-    again = planned(sessions, [KP], grid([KP]), range(1), Terms("share"), Path("out"), Config())
+    again = plan_sweep(sessions, [KP], grid([KP]), range(1), RunOptions("share"), Path("out"), Config())
     assert not {one.out for one, _ in again} & {one.out for one, _ in runs}  # of another sweep
 
 
@@ -82,7 +84,7 @@ def test_heat_is_the_mean_over_all_other_settings():
         }
         for p, i, d in grid([KP, KI, third])
     ]
-    found = heat([KP, KI, third], rows, measure)
+    found = heat_map([KP, KI, third], rows, measure)
     assert found.shape == (2, 3)
     assert found[1, 1] == pytest.approx(0.8 + 1 + 50)
-    assert math.isnan(heat([KP, KI], rows[:1], measure)[1, 1])
+    assert math.isnan(heat_map([KP, KI], rows[:1], measure)[1, 1])

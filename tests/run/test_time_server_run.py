@@ -7,11 +7,11 @@ import time
 from typing import Any
 
 from share.devices.time_server import TimeServer, TimeServerRun
-from share.net.ntp import Mode, Packet, from_stamp
+from share.net.ntp import NtpMode, NtpPacket, from_stamp
 from share.net.udp import Datagram
 
 NOW = 1_795_446_605 * 10**9
-QUESTION = Packet(Mode.CLIENT, transmit=5).encode()
+QUESTION = NtpPacket(NtpMode.CLIENT, transmit=5).encode()
 
 
 class Script:
@@ -41,7 +41,7 @@ def serve(*steps: Datagram | OSError) -> tuple[list[tuple[bytes, Any]], list[str
     over, said = threading.Event(), []
     link = Script(*steps, over=over)
     run = TimeServerRun(link, TimeServer(), said.append)  # type: ignore[arg-type]
-    thread = threading.Thread(target=run.go)
+    thread = threading.Thread(target=run.run)
     thread.start()
     assert over.wait(10)
     run.stop()
@@ -76,6 +76,6 @@ def test_a_socket_that_fails_for_a_while_is_asked_again() -> None:
 def test_an_answer_says_when_it_was_sent() -> None:
     before = time.time_ns()
     sent, _ = serve(question("192.0.2.1", 4000))
-    answer = Packet.decode(sent[0][0])
+    answer = NtpPacket.decode(sent[0][0])
     assert from_stamp(answer.receive, NOW) == NOW
     assert before <= from_stamp(answer.transmit, before) <= time.time_ns()

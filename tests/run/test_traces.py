@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from share.lab.evaluate.scoring import merges, traces
+from share.lab.evaluate.scoring import merge_locations, traces
 from share.recordings.trajectory import Trajectory, format_tum, read_tum
 
 S = 1_000_000_000
@@ -41,7 +41,7 @@ def trial(tmp_path):
     return SimpleNamespace(
         folder=tmp_path / "run",
         session=SimpleNamespace(folder=session, agents=agents),
-        terms=SimpleNamespace(virtual=False),
+        options=SimpleNamespace(virtual=False),
     )
 
 
@@ -54,9 +54,9 @@ def test_what_an_agent_was_told_over_time(trial):
 
 
 def test_merges_lie_where_all_had_gone_by_then(trial):
-    assert merges(trial).metres.tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
-    assert merges(trial).xy["ann"].tolist() == [[2.0, 0.0], [10.0, 0.0]]
-    assert merges(trial).xy["bob"].tolist() == [[2.0, 0.0]]
+    assert merge_locations(trial).metres.tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
+    assert merge_locations(trial).xy["ann"].tolist() == [[2.0, 0.0], [10.0, 0.0]]
+    assert merge_locations(trial).xy["bob"].tolist() == [[2.0, 0.0]]
 
 
 def test_who_began_later_has_gone_less_in_virtual_time_alone(trial):
@@ -64,6 +64,6 @@ def test_who_began_later_has_gone_less_in_virtual_time_alone(trial):
     later = read_tum(bob)
     bob.write_text(format_tum(Trajectory(later.stamps_ns + 103 * S, later.T)))
     trial.session.agents["bob"].clock_offset_ns = 100 * S  # by the session's clock 3 s after Ann
-    assert merges(trial).metres.tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
-    trial.terms.virtual = True
-    assert merges(trial).metres.tolist() == pytest.approx([2.0, 4 + 0.5, 15.0])
+    assert merge_locations(trial).metres.tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
+    trial.options.virtual = True
+    assert merge_locations(trial).metres.tolist() == pytest.approx([2.0, 4 + 0.5, 15.0])

@@ -20,9 +20,9 @@ from ssh_server import HOST, ssh_server
 
 from share.cli.main import cli
 from share.devices import checks
-from share.devices.camera_check import RULES
+from share.devices.camera_check import UDEV_RULES
 from share.errors import ShareError, UsageError
-from share.sensors.profile import host_profile, shipped
+from share.sensors.profile import load_host_profile, shipped_profiles
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_a_first_agent_is_copied_set_up_and_started(device):
     settings = device.root / "etc/share/agent-ann.env"
     assert settings.read_text() == "SOURCE=realsense\nKIND=ar\nKEYS=\nOPTIONS=\nEDGE=tcp://127.0.0.1:5555\n"
     rules = (device.root / "etc/udev/rules.d/99-share-realsense.rules").read_text()
-    assert rules.splitlines() == list(RULES)
+    assert rules.splitlines() == list(UDEV_RULES)
     (secret,) = (device.root / "etc/share/keys").glob("*.secret")
     assert secret.stat().st_mode & 0o077 == 0
     asked = device.asked()
@@ -70,7 +70,7 @@ def test_the_program_alone_is_there_and_no_service(device):
     assert device.current == "1.0"
     assert (device.root / "usr/local/bin/share").is_symlink()
     rules = (device.root / "etc/udev/rules.d/99-share-realsense.rules").read_text()
-    assert rules.splitlines() == list(RULES)
+    assert rules.splitlines() == list(UDEV_RULES)
     assert not (device.root / "etc/share/keys").exists()
     assert not [line for line in device.asked() if "enable" in line or "restart" in line]
     assert "is there already" in device.deploy("program", dist=program).out
@@ -219,10 +219,10 @@ def test_the_doctor_looks_for_what_that_kind_of_computer_needs(device, kind, pro
         device.agent(program, "--kind", kind)
         device.agent(device.program("1.1"))  # the kind is known by now
     assert (device.root / "etc/share/profile").read_text() == f"{profile}\n"
-    assert profile in shipped()
-    wanted = host_profile(profile).host
+    assert profile in shipped_profiles()
+    wanted = load_host_profile(profile).host
     _head, *lines = (device.root / "etc/tmpfiles.d/share.conf").read_text().splitlines()
-    assert lines == list(checks.lines(wanted.cpu_governor, wanted.usbfs_mb))
+    assert lines == list(checks.tmpfiles_lines(wanted.cpu_governor, wanted.usbfs_mb))
     assert f"systemd-tmpfiles --create {device.root}/etc/tmpfiles.d/share.conf" in device.asked()
 
 

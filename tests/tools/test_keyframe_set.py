@@ -13,7 +13,7 @@ from share.config import Config
 from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.lab.emulate.session import make_session
-from share.runtime.pipeline import frames_of
+from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 from share.types import AgentKind
@@ -56,7 +56,7 @@ def test_views_and_truth_are_the_recordings(made, recipe, tmp_path):
     session = make_session(recipe, tmp_path / "session", workers=1)
     for name, kind in NAMES.items():
         source, agent = open_source(str(session / name)), made.agents[name]
-        truth, frames = source.truth(), frames_of(source, Config(), SequencerCounters())
+        truth, frames = source.truth(), read_frames(source, Config(), SequencerCounters())
         recorded = {frame.stamp_ns: frame for frame in frames}
         assert (agent.hello.name, agent.hello.kind) == (name, kind)
         assert agent.hello.rig.cam0.focal == source.rig.cam0.focal
@@ -75,7 +75,7 @@ def test_keyframes_come_when_it_has_moved(made, every):
     for agent in made.agents.values():
         stamps = np.array([k.stamp_ns for k in agent.keyframes])
         T = se3.inverse(agent.T_world_body[:-1]) @ agent.T_world_body[1:]
-        far = (np.linalg.norm(T[:, :3, 3], axis=1) >= every.metres) | (se3.angle(T) >= every.radians)
+        far = (np.linalg.norm(T[:, :3, 3], axis=1) >= every.metres) | (se3.rotation_angle(T) >= every.radians)
         assert far.all() and (np.diff(stamps) >= every.seconds * 1e9).all()
 
 
@@ -124,7 +124,7 @@ def test_odometry_errs_as_its_covariance_says(tool, rng):
         yaw = np.arctan2((truth[-1] @ step)[1, 0], (truth[-1] @ step)[0, 0])
         lean = rng.normal(0, 0.2, 3)  # of the body, which does not add up
         turned = se3.so3_exp(np.array([0, 0, yaw])) @ se3.so3_exp(lean)
-        truth.append(se3.compose(turned, (truth[-1] @ step)[:3, 3]))
+        truth.append(se3.from_rt(turned, (truth[-1] @ step)[:3, 3]))
     stamps = np.arange(count + 1) * 400_000_000
     T, cov = tool("keyframe_odometry").odometry(np.array(truth), stamps, rng, drift)
     true_step = se3.inverse(np.array(truth)[:-1]) @ np.array(truth)[1:]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from share.lab.emulate.motion.spec import parse
+from share.lab.emulate.motion.spec import parse_motion
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 
@@ -27,7 +27,7 @@ def test_sessions_have_names_and_motions_that_are_understood(tools, tmp_path):
     assert {len(recipe.motions) for recipe in found.values()} == {1, 2, 3}
     for recipe in found.values():
         for motion in recipe.motions:
-            name, spec = parse(motion)
+            name, spec = parse_motion(motion)
             path = getattr(spec, "path", None)
             assert (name is not None) == (path is not None)
             assert path is None or Path(path).parent.parent == tmp_path

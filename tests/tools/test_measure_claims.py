@@ -87,14 +87,14 @@ def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
     ((hello, honest),) = tool.told(agent, tool.Lie())
     assert (hello.name, hello.run_id) == (agent.hello.name, agent.hello.run_id)
     ((turned, seen),) = tool.told(agent, tool.Lie(path=1.1, depth=0.9, sure=10.0, turn_deg=5.0))
-    apart = se3.angle(se3.inverse(hello.rig.T_body_cam0) @ turned.rig.T_body_cam0)
+    apart = se3.rotation_angle(se3.inverse(hello.rig.T_body_cam0) @ turned.rig.T_body_cam0)
     assert np.degrees(apart) == pytest.approx(5.0)
     for k, (one, other) in enumerate(zip(honest, seen, strict=True)):
         a, b = one.candidate, other.candidate
         assert b.view.points == pytest.approx(0.9 * a.view.points, rel=1e-5)
         assert b.cov == pytest.approx(a.cov / 100)
         if k:
-            assert b.T_last_body[:3, 3] == pytest.approx(1.1 * a.T_last_body[:3, 3])
+            assert b.T_previous_body[:3, 3] == pytest.approx(1.1 * a.T_previous_body[:3, 3])
             assert a.T_odom_body == pytest.approx(agent.T_odom_body[k], abs=1e-9)
 
 
@@ -110,7 +110,7 @@ def test_who_lies_later_or_is_started_again(tool):
     assert len({hello.run_id for hello, _ in runs}) == len(runs) > 1
     assert len({hello.name for hello, _ in runs}) == 1
     for (_, before), (_, after) in itertools.pairwise(runs):
-        assert after[0].at_ns - before[-1].at_ns > 3e9
+        assert after[0].arrival_ns - before[-1].arrival_ns > 3e9
 
 
 def test_a_lie_that_there_is_not_is_said(tool, capsys):

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from share.lab.evaluate.play import AgentScore, SessionScore
+from share.lab.evaluate.real_time import AgentScore, SessionScore
 from share.metrics.ate import Ate, JointAte
 from share.recordings.trajectory import Trajectory
 
@@ -36,7 +36,7 @@ def trial(tool, tmp_path, monkeypatch):
     score = AgentScore({}, None, Trajectory(stamps_ns[5:], told[5:]), Trajectory(stamps_ns, T))
     whole = Ate(0.0, 0.0, 0.0, 0.0, 11, np.eye(4))
     monkeypatch.setattr(
-        tool, "score", lambda *_: SessionScore({"ann": score}, JointAte(whole, {"ann": whole}))
+        tool, "score_session", lambda *_: SessionScore({"ann": score}, JointAte(whole, {"ann": whole}))
     )
     series = {"t_s": [12.0, 16.0, 17.5, 19.0, 30.0], "error_cm": [0.1, 3.0, 7.5, None, 1.0]}
     (tmp_path / "edge").mkdir()

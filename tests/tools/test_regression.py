@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 
 from share.errors import DataError, ShareError, UsageError
-from share.lab.evaluate.figures import Conditions, RunFigures
+from share.lab.evaluate.run_metrics import Conditions, RunMetrics
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 
 
-def comparable(policy: str, in_one_map: int) -> RunFigures:
-    return RunFigures(Conditions("room", policy, "wifi5", 0), (), in_one_map, 1.0, 1, 0, 1)
+def comparable(policy: str, in_one_map: int) -> RunMetrics:
+    return RunMetrics(Conditions("room", policy, "wifi5", 0), (), in_one_map, 1.0, 1, 0, 1)
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ sys.path[:0] = [str(TESTS), str(TESTS / "run"), str(Path(__file__).parent)]
 
 from share import startup  # noqa: E402
 
-startup.prepare()
+startup.prepare_process()
 
 import crowd  # noqa: E402
 import numpy as np  # noqa: E402

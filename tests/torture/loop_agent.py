@@ -19,18 +19,18 @@ from typing import Any
 
 from share import startup
 
-startup.prepare()
+startup.prepare_process()
 
 
 from share.config import Config  # noqa: E402
 from share.net.transport import connect  # noqa: E402
-from share.odometry.error_model.network import error_model  # noqa: E402
+from share.odometry.error_model.network import open_error_model  # noqa: E402
 from share.recordings.recording import Source  # noqa: E402
 from share.recordings.trajectory import Trajectory  # noqa: E402
 from share.runtime.agent import AgentRun  # noqa: E402
-from share.runtime.error_model import ByModel  # noqa: E402
+from share.runtime.error_estimators import BackgroundErrorModel  # noqa: E402
+from share.runtime.signals import stop_on_signal  # noqa: E402
 from share.runtime.source import open_source  # noqa: E402
-from share.runtime.stop import on_stop  # noqa: E402
 from share.sensors.measurement import Measurement  # noqa: E402
 from share.types import AgentKind  # noqa: E402
 from share.wire.messages import Hello  # noqa: E402
@@ -73,9 +73,11 @@ def main() -> None:
     def say(text: str) -> None:
         print(f"{time.monotonic():.1f} {text}", file=sys.stderr, flush=True)
 
-    errors = ByModel(error_model(settings.agent.error_model), say)
+    errors = BackgroundErrorModel(open_error_model(settings.agent.error_model), say)
     hello = Hello(name, AgentKind.AR, run_id, source.rig)
-    run = AgentRun(source, hello, settings, lambda: connect(address, run_id), Path(out), say, errors=errors)
+    run = AgentRun(
+        source, hello, settings, lambda: connect(address, run_id), Path(out), say, error_estimator=errors
+    )
 
     def end() -> None:
         source.stop()
@@ -84,8 +86,8 @@ def main() -> None:
     timer = threading.Timer(float(seconds), end)
     timer.daemon = True  # nobody waits for it once the agent has ended
     timer.start()
-    with on_stop(end):
-        run.go()
+    with stop_on_signal(end):
+        run.run()
 
 
 if __name__ == "__main__":

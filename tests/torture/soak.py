@@ -34,7 +34,7 @@ import harness
 import numpy as np
 from harness import EdgeProgram, Program, Setup, say
 
-from share.geometry.se3 import compose
+from share.geometry.se3 import from_rt
 from share.recordings.trajectory import Trajectory, format_tum
 
 EVERY_S, BLOCKS = 5.0, 300
@@ -157,7 +157,7 @@ def poses_of_a_round(begin_rad: float, seconds: float = ROUND_S) -> str:
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     down = np.broadcast_to([0.0, 0.0, -1.0], forward.shape)
     R = np.stack([np.cross(down, forward), down, forward], axis=2)
-    return format_tum(Trajectory(np.round(1e9 * (1000 + t)).astype(np.int64), compose(R, at)))
+    return format_tum(Trajectory(np.round(1e9 * (1000 + t)).astype(np.int64), from_rt(R, at)))
 
 
 def session_at(folder: Path) -> Path:

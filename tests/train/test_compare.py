@@ -10,38 +10,40 @@ import pytest
 pytest.importorskip("torch", reason="make train-test brings it")
 pytest.importorskip("sklearn", reason="make train-test brings it")
 
-from share.lab.train.compare import of_network, scored
-from share.lab.train.rivals import Rows, _contrast, _numbers
-from share.lab.train.score import table
-from share.lab.train.table import Table
-from share.odometry.error_model.features import SHAPES, kind_of
+from share.lab.train.baselines import KeyframeRows, _contrastive_loss, _forest_inputs
+from share.lab.train.compare import score_network, score_predictions
+from share.lab.train.keyframe_table import KeyframeTable
+from share.lab.train.score import score_table
+from share.odometry.error_model.inputs import INPUT_SHAPES, input_dtype
 
 ERROR_CM = np.array([0.1, 0.2, 0.4, 0.8], np.float32)
 
 
-def rows(error_cm=ERROR_CM) -> Rows:
+def rows(error_cm=ERROR_CM) -> KeyframeRows:
     n = len(error_cm)
-    table_of = Table(
+    table_of = KeyframeTable(
         np.zeros(n, np.int64),
         error_cm,
-        *(np.zeros((n, *shape), kind_of(name)) for name, shape in SHAPES.items()),
+        *(np.zeros((n, *shape), input_dtype(name)) for name, shape in INPUT_SHAPES.items()),
     )
-    return Rows(table_of, np.zeros((n, 1280), np.float32))
+    return KeyframeRows(table_of, np.zeros((n, 1280), np.float32))
 
 
 def test_who_is_right_has_no_error():
-    perfect = scored("x", ERROR_CM.astype(float), ERROR_CM)
+    perfect = score_predictions("x", ERROR_CM.astype(float), ERROR_CM)
     assert (perfect.rmse_cm, perfect.mae_cm, perfect.qoe_off) == (0, 0, 0)
     assert perfect.rank == pytest.approx(1)
 
 
 def test_errors_are_told_by_their_size_and_their_order():
-    off = scored("x", ERROR_CM[::-1].astype(float), ERROR_CM)
+    off = score_predictions("x", ERROR_CM[::-1].astype(float), ERROR_CM)
     assert off.rank == pytest.approx(-1)
     assert off.rmse_cm == pytest.approx(math.sqrt((0.7**2 + 0.2**2 + 0.2**2 + 0.7**2) / 4), rel=1e-6)
     assert off.mae_cm == pytest.approx(0.45, rel=1e-6)
     assert 0 < off.qoe_off < 1
-    assert scored("x", np.full(4, 0.3), ERROR_CM).rank == 0  # who says always the same knows no order
+    assert (
+        score_predictions("x", np.full(4, 0.3), ERROR_CM).rank == 0
+    )  # who says always the same knows no order
 
 
 def test_a_network_is_asked_keyframe_by_keyframe():
@@ -58,17 +60,17 @@ def test_a_network_is_asked_keyframe_by_keyframe():
             return [np.array([[log, log - 0.8, log + 0.8]]), np.zeros((1, 64)), np.array([0.5])]
 
     network = Network()
-    told = of_network("ours", network, rows())
+    told = score_network("ours", network, rows())
     assert network.asked == 4
     assert told.covered == 0.75  # 0.8 cm is more than 0.2 e^0.8
-    assert "| ours | " in table([told])
-    assert "75 %" in table([told])
+    assert "| ours | " in score_table([told])
+    assert "75 %" in score_table([told])
 
 
 def test_the_forest_has_1312_numbers_each_in_its_place():
     one = rows()
     one.table.psd[0, 1, 7, 5] = 24.0  # in the lower half, the second of four across: of 24 cells
-    numbers = _numbers(one)
+    numbers = _forest_inputs(one)
     assert numbers.shape == (4, 1312)
     assert numbers[0, 1280 + 8 + 4 + 1] == 1
     assert numbers[0].sum() == 1
@@ -82,7 +84,7 @@ def test_contrast_is_less_where_likes_are_together():
         torch.tensor([[1.0, 0.0], [1.0, 0.1], [-1.0, 0.0], [-1.0, 0.1]]), dim=1
     )
     apart = together[[0, 2, 1, 3]]
-    assert _contrast(together, y) < _contrast(apart, y)
+    assert _contrastive_loss(together, y) < _contrastive_loss(apart, y)
 
 
 def test_contrast_is_the_sum_as_it_is_written():
@@ -98,4 +100,4 @@ def test_contrast_is_the_sum_as_it_is_written():
         for j in set(range(12)) - {i}:
             against = [k for k in range(12) if k != i and abs(y[i] - y[k]) >= abs(y[i] - y[j])]
             terms.append(torch.logsumexp(alike[i, against], 0) - alike[i, j])
-    assert _contrast(z, y) == pytest.approx(float(torch.stack(terms).mean()), rel=1e-5)
+    assert _contrastive_loss(z, y) == pytest.approx(float(torch.stack(terms).mean()), rel=1e-5)

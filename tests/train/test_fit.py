@@ -15,15 +15,15 @@ pytest.importorskip("sklearn", reason="make train-test brings it")
 from made_features import made_features  # noqa: E402
 from tiny_backbone import tiny_backbone  # noqa: E402
 
-from share.lab.train.fit import FitOptions, fit  # noqa: E402
+from share.lab.train.keyframe_table import collect_labels  # noqa: E402
 from share.lab.train.labels import Labels, write_labels  # noqa: E402
-from share.lab.train.table import collect  # noqa: E402
-from share.lab.train.teach import _Scale  # noqa: E402
-from share.odometry.error_model.features import SHAPES  # noqa: E402
-from share.odometry.error_model.network import deep_of, open_network  # noqa: E402
+from share.lab.train.optimisation import TrainingOptions, train_heads  # noqa: E402
+from share.lab.train.training import _Standardiser  # noqa: E402
+from share.odometry.error_model.inputs import INPUT_SHAPES  # noqa: E402
+from share.odometry.error_model.network import backbone_features, open_network  # noqa: E402
 
 ROOMS, EACH = 8, 300
-NOTHING = np.zeros(SHAPES["recent"], np.float32)
+NOTHING = np.zeros(INPUT_SHAPES["recent"], np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def labels(tmp_path_factory) -> Path:
             rows.append((k, float(error_cm) if k else float("nan"), seen))
         made = {"scene": "warehouse", "seed": room, "size": None, "motions": ["ar=walk:"]}
         write_labels(
-            folder / f"w{room}-ar-0.npz", Labels.of({"session": f"w{room}", "provenance": made}, rows)
+            folder / f"w{room}-ar-0.npz", Labels.from_rows({"session": f"w{room}", "provenance": made}, rows)
         )
     return folder
 
@@ -111,11 +111,11 @@ def test_too_few_rooms_are_said(share, labels, base, tmp_path):
 
 
 def test_what_is_broken_off_goes_on_as_it_would_have(labels, base, tmp_path):
-    collection = collect(labels, 0)
-    deep = deep_of(open_network(base), collection.table.picture)
-    scale = _Scale(deep, collection)
+    collection = collect_labels(labels, 0)
+    deep = backbone_features(open_network(base), collection.table.picture)
+    scale = _Standardiser(deep, collection)
     learn, stop = scale.inputs("learn"), scale.inputs("stop")
-    whole = fit(learn, stop, FitOptions(epochs=6), None, lambda *told: None)
+    whole = train_heads(learn, stop, TrainingOptions(epochs=6), None, lambda *told: None)
 
     class BrokenOffError(Exception):
         pass
@@ -126,12 +126,14 @@ def test_what_is_broken_off_goes_on_as_it_would_have(labels, base, tmp_path):
 
     kept = tmp_path / "checkpoint.pt"
     with pytest.raises(BrokenOffError):
-        fit(learn, stop, FitOptions(epochs=6), kept, after_three)
+        train_heads(learn, stop, TrainingOptions(epochs=6), kept, after_three)
     told: list[int] = []
-    resumed = fit(learn, stop, FitOptions(epochs=6), kept, lambda epoch, *_: told.append(epoch))
+    resumed = train_heads(learn, stop, TrainingOptions(epochs=6), kept, lambda epoch, *_: told.append(epoch))
     assert told == [4, 5, 6]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
-    other = fit(learn, stop, FitOptions(epochs=1, seed=9), kept, lambda epoch, *_: told.append(epoch))
+    other = train_heads(
+        learn, stop, TrainingOptions(epochs=1, seed=9), kept, lambda epoch, *_: told.append(epoch)
+    )
     assert told[-1] == 1  # of other options: begins anew
     assert other is not resumed

@@ -13,12 +13,12 @@ onnx = pytest.importorskip("onnx", reason="make train-test brings it")
 from made_features import made_features  # noqa: E402
 from tiny_backbone import tiny_backbone  # noqa: E402
 
-from share.lab.train.fitted import Fitted  # noqa: E402
-from share.lab.train.graph import backbone_id, with_heads  # noqa: E402
 from share.lab.train.network import Heads, loss  # noqa: E402
-from share.odometry.error_model.features import Features  # noqa: E402
-from share.odometry.error_model.model import estimate  # noqa: E402
-from share.odometry.error_model.network import deep_of, open_network  # noqa: E402
+from share.lab.train.onnx_graph import backbone_id, with_heads  # noqa: E402
+from share.lab.train.trained_heads import TrainedHeads  # noqa: E402
+from share.odometry.error_model.inference import estimate_error  # noqa: E402
+from share.odometry.error_model.inputs import ErrorModelInput  # noqa: E402
+from share.odometry.error_model.network import backbone_features, open_network  # noqa: E402
 
 
 @pytest.fixture
@@ -27,31 +27,31 @@ def heads() -> Heads:
     return Heads(3).eval()
 
 
-def fitted(heads: Heads, margin: float = 0.2, reach: float = 4.0) -> Fitted:
+def fitted(heads: Heads, margin: float = 0.2, reach: float = 4.0) -> TrainedHeads:
     weights = [{name: value.numpy() for name, value in one.state_dict().items()} for one in heads.each]
-    return Fitted(
+    return TrainedHeads(
         weights, margin, np.zeros(96, np.float32), np.eye(96, dtype=np.float32) / reach, {"version": "x"}
     )
 
 
-def keyframes(rng, n: int = 7) -> list[Features]:
+def keyframes(rng, n: int = 7) -> list[ErrorModelInput]:
     return [made_features(rng) for _ in range(n)]
 
 
 def test_the_file_says_what_the_heads_say_on_average(heads, rng):
     network = open_network(with_heads(tiny_backbone(), fitted(heads)))
     for one in keyframes(rng):
-        deep = torch.from_numpy(deep_of(network, one.picture[None]))
+        deep = torch.from_numpy(backbone_features(network, one.picture[None]))
         numbers = np.concatenate([one.scalars, one.recent])
         with torch.no_grad():
             inputs = deep, torch.from_numpy(one.psd[None].copy()), torch.from_numpy(numbers[None])
             expected, low, high = heads(*inputs).mean(dim=0)[0].tolist()
             joined = heads.join(*inputs)[0].numpy()
-        told = estimate(network, one)
+        told = estimate_error(network, one)
         assert math.log(told.error_cm) == pytest.approx(expected, abs=1e-4)
         assert told.embedding == pytest.approx(joined[:64], abs=1e-4)
         strange = np.linalg.norm(joined) > 4
-        assert told.strange == strange
+        assert told.out_of_distribution == strange
         wider = 2 if strange else 1
         assert math.log(told.low_cm) == pytest.approx(expected - wider * (expected - low + 0.2), abs=1e-4)
         assert math.log(told.high_cm) == pytest.approx(expected + wider * (high - expected + 0.2), abs=1e-4)
@@ -65,14 +65,14 @@ def test_other_heads_take_the_place_of_the_first(heads, rng):
     assert again == with_heads(tiny_backbone(), other)
     assert backbone_id(first) == backbone_id(again) == backbone_id(tiny_backbone())
     (one,) = keyframes(rng, 1)
-    told = [estimate(open_network(model), one).error_cm for model in (first, again)]
+    told = [estimate_error(open_network(model), one).error_cm for model in (first, again)]
     assert told[0] != told[1]
 
 
 def test_an_interval_that_is_too_wide_shrinks_no_further_than_to_nothing(heads, rng):
     network = open_network(with_heads(tiny_backbone(), fitted(heads, margin=-50.0, reach=1e6)))
     (one,) = keyframes(rng, 1)
-    told = estimate(network, one)
+    told = estimate_error(network, one)
     assert told.low_cm == pytest.approx(told.error_cm) == told.high_cm
 
 

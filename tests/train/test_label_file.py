@@ -8,7 +8,7 @@ from made_features import made_features
 
 from share.errors import DataError
 from share.lab.train.labels import Labels, read_labels, write_labels
-from share.odometry.error_model.features import SHAPES
+from share.odometry.error_model.inputs import INPUT_SHAPES
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def labels(rng) -> Labels:
         )
         for k in range(4)
     ]
-    return Labels.of({"session": "w1", "agent": "ar", "spells": []}, rows)
+    return Labels.from_rows({"session": "w1", "agent": "ar", "spells": []}, rows)
 
 
 def test_what_is_written_is_read(labels, tmp_path):
@@ -29,7 +29,7 @@ def test_what_is_written_is_read(labels, tmp_path):
     found = read_labels(tmp_path / "one.npz")
     assert found.about == labels.about
     assert len(found) == 4
-    for name in ("stamps_ns", "error_cm", *SHAPES):
+    for name in ("stamps_ns", "error_cm", *INPUT_SHAPES):
         one, two = getattr(labels, name), getattr(found, name)
         assert one.dtype == two.dtype
         assert np.array_equal(one, two, equal_nan=name == "error_cm")
@@ -46,5 +46,5 @@ def test_what_is_damaged_is_named(labels, tmp_path):
 
 
 def test_a_run_without_keyframes_is_kept_as_such(tmp_path):
-    write_labels(tmp_path / "none.npz", Labels.of({"session": "w1"}, []))
+    write_labels(tmp_path / "none.npz", Labels.from_rows({"session": "w1"}, []))
     assert len(read_labels(tmp_path / "none.npz")) == 0

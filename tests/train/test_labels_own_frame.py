@@ -1,29 +1,29 @@
 """A label is of the keyframe's own frame, not of the one with which it is told."""
 
 from share.config import Config
-from share.lab.train.labels import keyframes
+from share.lab.train.labels import labelled_keyframes
 from share.metrics.local_error import LocalError
-from share.odometry.error_model.features import picture
-from share.runtime.pipeline import frames_of, tracker_of
+from share.odometry.error_model.inputs import input_picture
+from share.runtime.pipeline import make_tracker, read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 
 
 def test_stamp_error_and_picture_are_its_own(plain_session):
     source = open_source(f"{plain_session}/ar1")
-    tracker, error = tracker_of(source.rig, Config()), LocalError(source.truth())
+    tracker, error = make_tracker(source.rig, Config()), LocalError(source.truth())
     frames, errors, own, late = [], [], [], 0
-    for frame in frames_of(source, Config(), SequencerCounters()):
+    for frame in read_frames(source, Config(), SequencerCounters()):
         result = tracker.track(frame)
         frames.append(frame)
-        errors.append(error.after(frame.stamp_ns, result.T_odom_body, result.new_stretch))
-        if result.keyframe:
-            ago = tracker.keyframe(frame).frames_ago
+        errors.append(error.update(frame.stamp_ns, result.T_odom_body, result.new_segment))
+        if result.keyframe_ready:
+            ago = tracker.make_keyframe(frame).frames_ago
             own.append((frames[-1 - ago], errors[-1 - ago]))
             late += ago > 0
-    told = list(keyframes(source, Config()))
+    told = list(labelled_keyframes(source, Config()))
     assert late > 0
     assert [stamp_ns for stamp_ns, *_ in told] == [frame.stamp_ns for frame, _ in own]
     for (_, error_cm, found), (frame, own_cm) in zip(told, own, strict=True):
         assert own_cm is None or error_cm == own_cm
-        assert (found.picture == picture(frame.image0)).all()
+        assert (found.picture == input_picture(frame.image0)).all()

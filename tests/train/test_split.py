@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.lab.train.split import PARTS, groups, split
+from share.lab.train.split import PARTS, room_groups, split_runs
 
 
 def about(scene="warehouse", seed=1, motions=("ar=walk:speed=0.6",), session="s"):
@@ -13,15 +13,17 @@ def about(scene="warehouse", seed=1, motions=("ar=walk:speed=0.6",), session="s"
 
 
 def test_runs_in_one_room_are_one_group():
-    found = groups([about(seed=1), about(seed=2), about(seed=1), about("firestation", 1)])
+    found = room_groups([about(seed=1), about(seed=2), about(seed=1), about("firestation", 1)])
     assert found[0] == found[2]
     assert len(set(found.tolist())) == 3
 
 
 def test_a_recorded_motion_ties_rooms_together_and_a_planned_one_does_not():
-    found = groups([about(seed=1, motions=["paper:1"]), about(seed=2, motions=["paper:1"]), about(seed=3)])
+    found = room_groups(
+        [about(seed=1, motions=["paper:1"]), about(seed=2, motions=["paper:1"]), about(seed=3)]
+    )
     assert found[0] == found[1] != found[2]
-    chained = groups(
+    chained = room_groups(
         [
             about(seed=1, motions=["a=paper:1"]),
             about(seed=2, motions=["b=tum:x.tum"]),
@@ -33,14 +35,14 @@ def test_a_recorded_motion_ties_rooms_together_and_a_planned_one_does_not():
 
 def test_recordings_of_real_rooms_are_groups_of_their_own():
     real = {"session": "field", "provenance": {}}
-    found = groups([real, about(), {"session": "field", "provenance": {}}])
+    found = room_groups([real, about(), {"session": "field", "provenance": {}}])
     assert found[0] == found[2] != found[1]
 
 
 @pytest.mark.parametrize("rooms", [4, 5, 9, 40])
 def test_parts_are_whole_groups_and_none_is_empty(rooms):
     group = np.repeat(np.arange(rooms), 3)
-    parts = split(group, seed=1)
+    parts = split_runs(group, seed=1)
     assert list(parts) == list(PARTS)
     assert sorted(np.concatenate(list(parts.values())).tolist()) == list(range(3 * rooms))
     assert all(len(runs) for runs in parts.values())
@@ -51,5 +53,5 @@ def test_parts_are_whole_groups_and_none_is_empty(rooms):
 
 def test_the_seed_decides():
     group = np.arange(20)
-    one, same, other = (split(group, seed)["test"].tolist() for seed in (1, 1, 2))
+    one, same, other = (split_runs(group, seed)["test"].tolist() for seed in (1, 1, 2))
     assert one == same != other

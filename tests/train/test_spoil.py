@@ -10,7 +10,7 @@ import pytest
 
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.lab.train.spoil import KINDS, Spell, draw, spoiled
+from share.lab.train.fault_injection import FAULT_KINDS, FaultInterval, draw_faults, inject_faults
 from share.types import Frame, ImuBatch
 
 S = 1_000_000_000
@@ -35,7 +35,9 @@ def frames(seconds: float = 3.0) -> list[Frame]:
 
 
 def during(how: str, much: float, begin_s: float = 2.0, end_s: float = 3.0) -> list[Frame]:
-    return list(spoiled(frames(), [Spell(how, round(begin_s * S), round(end_s * S), much)], 1, RIG))
+    return list(
+        inject_faults(frames(), [FaultInterval(how, round(begin_s * S), round(end_s * S), much)], 1, RIG)
+    )
 
 
 @pytest.mark.parametrize("how", ["dark", "blur", "haze", "cover"])
@@ -63,9 +65,9 @@ def test_a_cover_hides_what_it_says():
 def test_what_covers_is_near_to_both_eyes_and_to_a_depth_camera():
     """So that it is where things right in front are, not where the sky is."""
     for away, away_m in ((0.0, 0.1), (1.0, 0.5)):
-        spell = Spell("cover", S, 2 * S, 0.2, (0.7, 0.5, away))
+        spell = FaultInterval("cover", S, 2 * S, 0.2, (0.7, 0.5, away))
         (whole,) = (replace(frame, depth=np.ones((24, 32), np.float32)) for frame in frames(0.1))
-        (seen,) = spoiled([whole], [spell], 1, RIG)
+        (seen,) = inject_faults([whole], [spell], 1, RIG)
         assert seen.image1 is not None and seen.depth is not None and whole.image1 is not None
         left, right = (
             np.flatnonzero((a != b).mean(axis=0) > 0.5)
@@ -93,16 +95,16 @@ def test_an_imu_is_silent_in_its_spell():
 
 
 def test_the_same_seed_spoils_alike():
-    spells = [Spell("dark", S, 4 * S, 0.5)]
-    one, two, other = (list(spoiled(frames(), spells, seed, RIG)) for seed in (1, 1, 2))
+    spells = [FaultInterval("dark", S, 4 * S, 0.5)]
+    one, two, other = (list(inject_faults(frames(), spells, seed, RIG)) for seed in (1, 1, 2))
     assert all((a.image0 == b.image0).all() for a, b in zip(one, two, strict=True))
     assert any((a.image0 != b.image0).any() for a, b in zip(one, other, strict=True))
 
 
 def test_spells_are_drawn_within_the_run_and_of_all_strengths(rng):
-    spells = draw(rng, 0, 3000 * S, KINDS)
-    assert {spell.how for spell in spells} == set(KINDS)
-    for how in KINDS:
+    spells = draw_faults(rng, 0, 3000 * S, FAULT_KINDS)
+    assert {spell.how for spell in spells} == set(FAULT_KINDS)
+    for how in FAULT_KINDS:
         mine = [spell for spell in spells if spell.how == how]
         assert mine[0].begin_ns >= 2 * S
         assert all(a.end_ns < b.begin_ns for a, b in pairwise(mine))

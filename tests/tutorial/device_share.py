@@ -20,8 +20,8 @@ from software_share import share
 from share.cli import main as command_line
 from share.recordings.images import ArrayImage
 from share.runtime.source import Source
-from share.sensors.intake import GYRO
 from share.sensors.measurement import Measurement
+from share.sensors.sample_processor import GYRO
 from share.types import I64
 
 PATIENCE_S = 1.0  # of the person who ends what runs until Ctrl-C

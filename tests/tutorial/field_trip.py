@@ -11,14 +11,14 @@ import numpy as np
 from field_sim import Watched, export, paths, seen
 
 from share.geometry import se3
-from share.lab.emulate.progress import Progress, silent
-from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.progress import Progress, no_progress
+from share.lab.emulate.recipe import SessionRecipe
 from share.lab.emulate.sensor.effects import Effects
-from share.lab.emulate.sensor.imu import measured
-from share.lab.emulate.session import cached_session
+from share.lab.emulate.sensor.imu import measured_samples
+from share.lab.emulate.session import make_cached_session
 from share.runtime.source import Source, open_source
-from share.sensors.intake import ACCEL, GYRO
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
+from share.sensors.sample_processor import ACCEL, GYRO
 
 MODE = "d435i:640x480@15"
 LATE = Effects(time_offset_ms=3.0)  # the pictures of these devices
@@ -27,8 +27,8 @@ REST_S = 600.0
 REST = "rest"
 
 
-def _recipe(scene: str, motions: tuple[str, ...], seconds: float, seed: int) -> Recipe:
-    return Recipe(
+def _recipe(scene: str, motions: tuple[str, ...], seconds: float, seed: int) -> SessionRecipe:
+    return SessionRecipe(
         scene, motions, seconds + SPARE_S, seed, sensors={"": "stereo"}, profiles={"": MODE}, effects=LATE
     )
 
@@ -51,12 +51,12 @@ MOCAP_NOISE = (0.0005, np.radians(0.1))
 
 def session(name: str, progress: Progress) -> Path:
     """That world's, made once."""
-    return cached_session(RECIPES[name], progress=progress)
+    return make_cached_session(RECIPES[name], progress=progress)
 
 
 def world(machine: str, name: str) -> Source:
     """What the camera of `machine` is in while it records `name`."""
-    return open_source(str(session(name, silent) / machine))
+    return open_source(str(session(name, no_progress) / machine))
 
 
 def exports(folder: Path) -> None:
@@ -74,13 +74,13 @@ def exports(folder: Path) -> None:
 
 def rest(seed: int = 1) -> Iterator[tuple[int, str, list[float]]]:
     """A D435i that lies on a table: stamp (us), sensor, and what it feels, in order."""
-    imu = profile(MODE.partition(":")[0]).device.imu
+    imu = load_profile(MODE.partition(":")[0]).device.imu
     rows = []
     for k, (name, sensor, felt) in enumerate(
         ((GYRO, imu.gyro, (0.0, 0.0, 0.0)), (ACCEL, imu.accel, (0.0, -9.81, 0.0)))
     ):
         n = int((REST_S + SPARE_S) * sensor.rate_hz)
         stamps = np.round(np.arange(n) * 1e6 / sensor.rate_hz).astype(int).tolist()
-        values = measured(np.tile(felt, (n, 1)), sensor, (seed, k)).tolist()
+        values = measured_samples(np.tile(felt, (n, 1)), sensor, (seed, k)).tolist()
         rows.append(zip(stamps, [name] * n, values, strict=True))
     return heapq.merge(*rows)

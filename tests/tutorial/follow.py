@@ -14,14 +14,14 @@ from pathlib import Path
 
 from share import startup
 
-startup.prepare()  # before numpy: walkers are planned as `share emulate` would, to the last digit
+startup.prepare_process()  # before numpy: walkers are planned as `share emulate` would, to the last digit
 
 import click  # noqa: E402
 import field_trip  # noqa: E402
 from machines import Machine  # noqa: E402
 from page import MACHINES, Block, Step, blocks, renewed  # noqa: E402
 
-from share.cli.progress import Stages  # noqa: E402
+from share.cli.terminal import Stages  # noqa: E402
 
 PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
 LIMIT_S = 1500.0  # of one command

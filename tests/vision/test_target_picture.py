@@ -8,7 +8,7 @@ import pytest
 
 from share.geometry.camera import Camera
 from share.lab.calibrate.target import AprilGrid, CharucoBoard, Target
-from share.lab.calibrate.target_sheet import darkness, ink
+from share.lab.calibrate.target_sheet import black_rectangles, darkness_image
 
 TARGETS = [AprilGrid(), AprilGrid(3, 5, 0.055, 0.28), CharucoBoard(), CharucoBoard(8, 6, 0.05, 0.035)]
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))
@@ -20,7 +20,7 @@ def drawn(target: Target, texel: float, margin: float = 0.03) -> tuple[np.ndarra
     low, high = target.extent[0] - margin, target.extent[1] + margin
     width, height = ((high - low) / texel).astype(int)
     xs, ys = low[0] + np.arange(width + 1) * texel, high[1] - np.arange(height + 1) * texel
-    picture = (225 - 200 * darkness(ink(target), xs, ys)).round().astype(np.uint8)
+    picture = (225 - 200 * darkness_image(black_rectangles(target), xs, ys)).round().astype(np.uint8)
     x, y, _ = target.corners.T
     return picture, np.stack([(x - xs[0]) / texel - 0.5, (ys[0] - y) / texel - 0.5], axis=1)
 
@@ -40,16 +40,16 @@ def tags(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_rectangles_cover_each_other_nowhere(target):
     low, high = target.extent
     xs, ys = np.linspace(low[0], high[0], 301), np.linspace(high[1], low[1], 301)
-    dark = darkness(ink(target), xs, ys)
+    dark = darkness_image(black_rectangles(target), xs, ys)
     assert dark.min() > -1e-9
     assert dark.max() < 1 + 1e-9
-    x0, y0, x1, y1 = ink(target).T
+    x0, y0, x1, y1 = black_rectangles(target).T
     np.testing.assert_allclose(dark.mean() * np.prod(high - low), ((x1 - x0) * (y1 - y0)).sum())
 
 
 def test_an_edge_lies_where_it_should_to_a_hundredth_of_a_texel():
     rectangle = np.array([[0.0123, -1, 1, 1]])
-    dark = darkness(rectangle, np.linspace(0, 0.05, 51), np.array([0.001, 0.0]))[0]
+    dark = darkness_image(rectangle, np.linspace(0, 0.05, 51), np.array([0.001, 0.0]))[0]
     assert 50 - dark.sum() == pytest.approx(12.3, abs=1e-9)
 
 

@@ -8,19 +8,19 @@ from plain_walk import CAMERA, T_CAM1_CAM0
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.lab.emulate.motion import walk
-from share.lab.emulate.plain.render import Renderer
+from share.lab.emulate.plain.render import PlainRoomRenderer
 from share.lab.emulate.plain.room import make_room
 from share.types import Frame
 from share.vision import corners, depth, epipolar, optical_flow
-from share.vision.orb import make_view, orb
+from share.vision.orb import detect_orb, make_view
 
 
 @pytest.fixture(scope="module")
 def scene():
     """Left image, its exact depth, right image, and an image from 8 cm and 3 degrees away."""
     room = make_room(3)
-    renderer = Renderer(room, CAMERA)
-    T = se3.compose(walk.turn(1, np.array([0.1]))[0] @ walk.CAMERA_AXES, np.array([5.35, 1.5, 1.66]))
+    renderer = PlainRoomRenderer(room, CAMERA)
+    T = se3.from_rt(walk.axis_rotation(1, np.array([0.1]))[0] @ walk.CAMERA_AXES, np.array([5.35, 1.5, 1.66]))
     near = T @ se3.exp(np.array([0.01, 0.05, 0.0, 0.05, 0.01, 0.06]))
     left, exact = renderer.render(T)
     right, _ = renderer.render(T @ se3.inverse(T_CAM1_CAM0))
@@ -55,7 +55,7 @@ def test_no_corners_on_a_blank_wall():
     blank = np.full((480, 640), 128, np.uint8)
     for detect in (corners.detect, corners.strongest):
         assert detect(blank, np.zeros((0, 2), np.float32), 100, 15).shape == (0, 2)
-    assert orb(blank, 100)[0].shape == (0, 2)
+    assert detect_orb(blank, 100)[0].shape == (0, 2)
 
 
 def test_following_is_subpixel_exact(scene):
@@ -65,13 +65,13 @@ def test_following_is_subpixel_exact(scene):
     z = exact[np.rint(px[:, 1]).astype(int), np.rint(px[:, 0]).astype(int)]
     points = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) * z[:, None]
     want = CAMERA.project(se3.transform(T_other_left, points))
-    found_px, found = optical_flow.follow(left, other, px, px)
+    found_px, found = optical_flow.track_points(left, other, px, px)
     error = np.linalg.norm(found_px - want, axis=1)[found]
     assert found.mean() > 0.7
     assert np.median(error) < 0.15
-    alike = optical_flow.resemblance(left, other, px, found_px)
+    alike = optical_flow.ncc(left, other, px, found_px)
     assert np.median(alike[found]) > 0.9
-    assert np.median(optical_flow.resemblance(left, other, px, px[::-1].copy())) < 0.5
+    assert np.median(optical_flow.ncc(left, other, px, px[::-1].copy())) < 0.5
 
 
 def stereo_by(method, scene):
@@ -101,7 +101,7 @@ def test_what_is_infinitely_far_has_no_depth(scene):
 
 
 def test_the_whole_line_is_searched(scene):
-    known, disparity_error = stereo_by(epipolar.search, scene)
+    known, disparity_error = stereo_by(epipolar.search_depth, scene)
     assert known.mean() > 0.7
     assert (disparity_error < 1.5).mean() > 0.95
 
@@ -111,8 +111,8 @@ def test_what_repeats_along_the_line_has_no_depth():
     image = stripes + np.linspace(0, 20, 480).astype(np.uint8)[:, None]
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
     px = np.array([[300.0, 200.0], [400.0, 300.0]], np.float32)
-    assert np.isnan(epipolar.search(image, image, rig, px, CAMERA.normalise(px.astype(float)))).all()
-    assert len(epipolar.search(image, image, rig, px[:0], np.zeros((0, 2)))) == 0
+    assert np.isnan(epipolar.search_depth(image, image, rig, px, CAMERA.normalise(px.astype(float)))).all()
+    assert len(epipolar.search_depth(image, image, rig, px[:0], np.zeros((0, 2)))) == 0
 
 
 def test_depth_of_an_unregistered_camera():
@@ -154,7 +154,7 @@ def test_nothing_to_see_is_no_error():
     stereo = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
     assert depth.from_depth_camera(far, rgbd, none).shape == (0,)
     assert depth.from_stereo(image, image, stereo, px, none).shape == (0,)
-    assert optical_flow.follow(image, image, px, px)[0].shape == (0, 2)
+    assert optical_flow.track_points(image, image, px, px)[0].shape == (0, 2)
     for frame, rig in ((Frame(0, 0, image, depth=far), rgbd), (Frame(0, 0, image, image), stereo)):
         assert len(make_view(frame, rig)) == 0
 

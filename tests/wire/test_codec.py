@@ -16,16 +16,16 @@ from wire_strategies import messages
 
 from share.errors import WireError
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.types import AgentKind, Correction, Frame, ImuBatch, Keyframe, TrackState, View, Wait
+from share.types import AgentKind, Correction, Frame, ImuBatch, Keyframe, TrackState, View, WaitReason
 from share.wire import codec
 from share.wire import messages as m
 
 POSE = np.eye(4)
-V = codec.VERSION
+V = codec.WIRE_VERSION
 CAMERA = Camera(752, 480, 458.0, 457.0, 367.0, 248.0, (-0.28, 0.07, 2e-4, 1.8e-5))
 BESIDE = np.block([[np.eye(3), np.array([[-0.05], [0], [0]])], [0, 0, 0, 1]])
 STEREO = Rig(CAMERA, POSE, CAMERA, BESIDE, imu=ImuNoise(1.7e-4, 2e-3, 2e-5, 3e-3, 200.0), timeshift_s=0.01)
-EVERY_CLASS = {*m.Up.__args__, *m.Down.__args__}
+EVERY_CLASS = {*m.UplinkMessage.__args__, *m.DownlinkMessage.__args__}
 
 
 def keyframe(n: int, id_: int = 7) -> Keyframe:
@@ -60,8 +60,8 @@ EXAMPLES: list[m.Message] = [
     m.Pong(1, 1, 2, 3, 2**62),
     frame(True),
     frame(False),
-    m.Tracked(4, 10**18, TrackState.OK, POSE, keyframe=True),
-    m.Tracked(5, 10**18, TrackState.INITIALISING, None, waits=Wait.TILT),
+    m.RemoteTrackingResult(4, 10**18, TrackState.OK, POSE, keyframe=True),
+    m.RemoteTrackingResult(5, 10**18, TrackState.INITIALISING, None, waits=WaitReason.TILT),
 ]
 
 
@@ -88,7 +88,7 @@ def test_the_examples_cover_every_message() -> None:
 
 
 def test_codes_are_unique() -> None:
-    assert len(codec._BY_CODE) == len(codec._LAYOUTS)
+    assert len(codec._LAYOUT_BY_CODE) == len(codec._LAYOUTS)
 
 
 @given(messages)
@@ -100,8 +100,8 @@ def test_round_trip(message: m.Message) -> None:
 
 
 def test_a_pose_fits_into_200_bytes_and_a_keyframe_into_30_kb() -> None:
-    assert codec.size(codec.encode(EXAMPLES[1])) <= 200
-    assert codec.size(codec.encode(keyframe(500, 10**9))) <= 30_000
+    assert codec.message_bytes(codec.encode(EXAMPLES[1])) <= 200
+    assert codec.message_bytes(codec.encode(keyframe(500, 10**9))) <= 30_000
 
 
 def test_arrays_are_views_on_both_sides() -> None:
@@ -246,7 +246,7 @@ def _message(code: int, scalars: object, table: list, frames: list[bytes]) -> li
 
 wrong_content = st.builds(
     _message,
-    st.sampled_from(sorted(codec._BY_CODE)) | st.integers(),
+    st.sampled_from(sorted(codec._LAYOUT_BY_CODE)) | st.integers(),
     nested,
     st.lists(
         st.tuples(
@@ -440,7 +440,7 @@ def test_images_are_not_copied_on_either_side() -> None:
 def test_a_pose_goes_with_its_state() -> None:
     for state, T in ((TrackState.LOST, POSE), (TrackState.OK, None)):
         with pytest.raises(ValueError, match="goes with a state that has a pose"):
-            m.Tracked(1, 2, state, T)
+            m.RemoteTrackingResult(1, 2, state, T)
 
 
 def test_a_second_camera_stands_somewhere() -> None:

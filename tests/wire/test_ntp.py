@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.net.ntp import Mode, Packet, from_stamp, log2_ns, sent_at, short_ns, to_stamp
+from share.net.ntp import NtpMode, NtpPacket, from_stamp, log2_ns, short_ns, to_stamp, with_transmit_time
 
 S = 1_000_000_000
 YEAR = 31_556_952 * S
@@ -31,8 +31,8 @@ BY_HAND = bytes.fromhex(
     "876ce580 80000000"  # receive: 1 January 1972 and half a second
     "0000f680 40000000"  # transmit: 8 February 2036 and a quarter, era 1
 )
-PACKET = Packet(
-    Mode.SERVER,
+PACKET = NtpPacket(
+    NtpMode.SERVER,
     version=4,
     leap=1,
     stratum=2,
@@ -48,8 +48,8 @@ PACKET = Packet(
 )
 
 packets = st.builds(
-    Packet,
-    mode=st.sampled_from(Mode),
+    NtpPacket,
+    mode=st.sampled_from(NtpMode),
     version=st.sampled_from([3, 4]),
     leap=st.integers(0, 3),
     stratum=st.integers(0, 16),
@@ -70,19 +70,19 @@ def unix_ns(*date: int) -> int:
 
 
 def test_a_packet_is_what_the_rfc_draws() -> None:
-    assert Packet.decode(BY_HAND) == PACKET
+    assert NtpPacket.decode(BY_HAND) == PACKET
     assert PACKET.encode() == BY_HAND
 
 
 def test_a_client_of_version_3_is_understood() -> None:
-    packet = Packet.decode(b"\x1b" + bytes(47))  # the question of many small SNTP clients
-    assert packet == Packet(Mode.CLIENT, version=3)
+    packet = NtpPacket.decode(b"\x1b" + bytes(47))  # the question of many small SNTP clients
+    assert packet == NtpPacket(NtpMode.CLIENT, version=3)
 
 
 @given(packets)
-def test_what_is_encoded_is_decoded(packet: Packet) -> None:
-    assert Packet.decode(packet.encode()) == packet
-    assert Packet.decode(packet.encode() + bytes(20)) == packet  # a MAC follows
+def test_what_is_encoded_is_decoded(packet: NtpPacket) -> None:
+    assert NtpPacket.decode(packet.encode()) == packet
+    assert NtpPacket.decode(packet.encode() + bytes(20)) == packet  # a MAC follows
 
 
 @pytest.mark.parametrize(
@@ -98,13 +98,13 @@ def test_what_is_encoded_is_decoded(packet: Packet) -> None:
 )
 def test_what_is_no_packet_is_refused_with_the_reason(data: bytes, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
-        Packet.decode(data)
+        NtpPacket.decode(data)
 
 
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_packet_or_a_value_error(data: bytes) -> None:
     try:
-        packet = Packet.decode(data)
+        packet = NtpPacket.decode(data)
     except ValueError:
         return
     assert packet.encode() == data[:48]
@@ -115,11 +115,11 @@ def test_any_bytes_are_a_packet_or_a_value_error(data: bytes) -> None:
 )
 def test_a_field_that_does_not_fit_is_a_value_error(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="does not fit"):
-        Packet(Mode.CLIENT, **wrong).encode()  # type: ignore[arg-type]
+        NtpPacket(NtpMode.CLIENT, **wrong).encode()  # type: ignore[arg-type]
 
 
 def test_a_late_transmit_stamp_changes_nothing_else() -> None:
-    late = Packet.decode(sent_at(BY_HAND, unix_ns(1999, 12, 31)))
+    late = NtpPacket.decode(with_transmit_time(BY_HAND, unix_ns(1999, 12, 31)))
     assert late.transmit == 3_155_587_200 << 32
     assert late.encode()[:40] == BY_HAND[:40]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.types import MAX_M, checked_pose
+from share.types import MAX_POSITION_M, checked_pose
 
 T = se3.exp(np.array([0.3, -0.2, 0.9, 4.0, -5.0, 6.0]))
 
@@ -50,10 +50,10 @@ def test_nor_one_with_a_number_that_is_not_finite(value: float) -> None:
     for at in np.ndindex(4, 4):
         with pytest.raises(ValueError, match="not finite"):
             checked_pose("T", changed(at, value))
-    assert checked_pose("T", changed((0, 3), MAX_M)).flags.writeable is False
+    assert checked_pose("T", changed((0, 3), MAX_POSITION_M)).flags.writeable is False
 
 
-@pytest.mark.parametrize("value", [1.001 * MAX_M, -1e300, 1.7e308])
+@pytest.mark.parametrize("value", [1.001 * MAX_POSITION_M, -1e300, 1.7e308])
 def test_nor_one_that_is_further_away_than_any_room(value: float) -> None:
     for row in range(3):
         with pytest.raises(ValueError, match="m away"):

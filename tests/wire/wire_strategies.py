@@ -9,13 +9,13 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from share.agent_names import checked_name
 from share.geometry import se3
-from share.geometry.camera import BASELINE_M, MOST_APART_M, MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
-from share.names import checked_name
+from share.geometry.camera import BASELINE_RANGE_M, MAX_TIMESHIFT_S, MOST_APART_M, Camera, ImuNoise, Rig
 from share.types import (
     MAX_ID,
-    MAX_M,
     MAX_ODOM_M,
+    MAX_POSITION_M,
     MAX_STAMP_NS,
     AgentKind,
     Correction,
@@ -24,7 +24,7 @@ from share.types import (
     Keyframe,
     TrackState,
     View,
-    Wait,
+    WaitReason,
 )
 from share.wire import messages as m
 
@@ -40,7 +40,7 @@ int64 = st.integers(-(2**63), 2**63 - 1)
 stamps = st.integers(-MAX_STAMP_NS, MAX_STAMP_NS)
 ids = st.integers(0, MAX_ID)
 ids_or_none = st.integers(-1, MAX_ID)
-near = st.floats(-MAX_M, MAX_M)
+near = st.floats(-MAX_POSITION_M, MAX_POSITION_M)
 finite = st.floats(-1e6, 1e6)
 words = st.text(st.characters(categories=["L", "N"]), min_size=1, max_size=64)
 names = st.text(st.characters(categories=["Lu", "Ll", "Lo", "Nd"]), min_size=1, max_size=64)
@@ -50,10 +50,10 @@ ups = st.sampled_from([(0, 0, 0), (0, 0, 1), (0.6, 0, -0.8)]).map(lambda up: np.
 
 
 @st.composite
-def poses(draw: st.DrawFn, most_m: float = MAX_M) -> np.ndarray:
+def poses(draw: st.DrawFn, most_m: float = MAX_POSITION_M) -> np.ndarray:
     rotation = draw(hnp.arrays(np.float64, 3, elements=st.floats(-3, 3)))
     position = draw(hnp.arrays(np.float64, 3, elements=st.floats(-most_m, most_m)))
-    return se3.compose(se3.so3_exp(rotation), position)
+    return se3.from_rt(se3.so3_exp(rotation), position)
 
 
 @st.composite
@@ -78,7 +78,7 @@ def keyframes(draw: st.DrawFn) -> Keyframe:
     )
 
 
-focals, sides = st.floats(1, 1e5), st.integers(1, m.MAX_SIDE)
+focals, sides = st.floats(1, 1e5), st.integers(1, m.MAX_IMAGE_SIDE)
 coefficients = st.floats(-1e4, 1e4)
 distortions = st.sampled_from([0, 4, 5]).flatmap(lambda n: st.tuples(*[coefficients] * n))
 fisheye = st.tuples(*[coefficients] * 4), st.just("equidistant")
@@ -106,19 +106,21 @@ def frames(draw: st.DrawFn) -> Frame:
 
 
 @st.composite
-def tracked(draw: st.DrawFn) -> m.Tracked:
+def tracked(draw: st.DrawFn) -> m.RemoteTrackingResult:
     state = draw(st.sampled_from(TrackState))
     T = draw(poses()) if state.has_pose else None
-    flags = draw(st.tuples(st.booleans(), st.booleans(), st.booleans(), st.none() | st.sampled_from(Wait)))
-    return m.Tracked(draw(ids), draw(stamps), state, T, *flags)
+    flags = draw(
+        st.tuples(st.booleans(), st.booleans(), st.booleans(), st.none() | st.sampled_from(WaitReason))
+    )
+    return m.RemoteTrackingResult(draw(ids), draw(stamps), state, T, *flags)
 
 
 @st.composite
 def rigs(draw: st.DrawFn) -> Rig:
-    beside = poses(BASELINE_M[1] / 2).filter(lambda T: np.linalg.norm(T[:3, 3]) > BASELINE_M[0])
+    beside = poses(BASELINE_RANGE_M[1] / 2).filter(lambda T: np.linalg.norm(T[:3, 3]) > BASELINE_RANGE_M[0])
     cam1 = draw(st.none() | st.tuples(cameras, beside)) or (None, None)
     depth = draw(st.none() | st.tuples(cameras, poses(MOST_APART_M))) or (None, None)
-    shift_s = draw(st.floats(-MOST_TIMESHIFT_S, MOST_TIMESHIFT_S))
+    shift_s = draw(st.floats(-MAX_TIMESHIFT_S, MAX_TIMESHIFT_S))
     return Rig(draw(cameras), draw(poses(MOST_APART_M)), *cam1, *depth, draw(st.none() | imus), shift_s)
 
 
@@ -130,14 +132,14 @@ messages = st.one_of(
     st.builds(
         m.Status,
         st.sampled_from(TrackState),
-        st.floats(0, m.MAX_AGE_MS),
-        st.text(st.characters(categories=["L", "N"]), max_size=m.MAX_REASON),
+        st.floats(0, m.MAX_POSE_AGE_MS),
+        st.text(st.characters(categories=["L", "N"]), max_size=m.MAX_REASON_LENGTH),
     ),
     st.builds(m.Ping, int64, stamps),
     st.just(m.Bye()),
     st.builds(m.Welcome, int64, ids),
-    st.builds(m.Refused, st.text(st.characters(codec="utf-8"), max_size=m.MAX_TEXT)),
-    st.builds(m.Ack, ids, st.lists(ids, max_size=m.MAX_HELD).map(tuple)),
+    st.builds(m.Refused, st.text(st.characters(codec="utf-8"), max_size=m.MAX_TEXT_LENGTH)),
+    st.builds(m.Ack, ids, st.lists(ids, max_size=m.MAX_BUFFERED).map(tuple)),
     st.builds(Correction, poses(), covs, words, ids, ids, ids_or_none),
     st.builds(m.Rate, st.floats(0, m.MAX_RATE_HZ)),
     st.builds(m.Pong, int64, stamps, stamps, stamps, int64),

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from share.devices.camera_check import version
-from share.errors import NotAttachedError, ShareError, UsageError, not_installed
+from share.devices.camera_check import parse_version
+from share.errors import NotAttachedError, ShareError, UsageError, install_hint
 from share.sensors.profile_types import DeviceFacts
 
 KIND = "realsense"
@@ -19,7 +19,7 @@ def is_camera(spec: str) -> bool:
     return spec == KIND or spec.startswith(f"{KIND}:")
 
 
-def serial_of(spec: str) -> str | None:
+def parse_serial(spec: str) -> str | None:
     """The serial number in realsense[:SERIAL], None if there is none. Raises UsageError."""
     if not is_camera(spec):
         raise UsageError(f"{spec}: is not a camera; give {KIND} or {KIND}:SERIAL")
@@ -27,7 +27,7 @@ def serial_of(spec: str) -> str | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Attached:
+class AttachedDevice:
     """A device as the SDK lists it. usb: the kind of port, such as 3.2; empty if it is not told."""
 
     serial: str
@@ -37,19 +37,19 @@ class Attached:
     handle: Any
 
 
-def attached(rs: Any, context: Any) -> list[Attached]:
+def list_devices(rs: Any, context: Any) -> list[AttachedDevice]:
     """All devices with a serial number, in the SDK's order."""
     kinds = rs.camera_info
-    wanted = (kinds.serial_number, kinds.name, kinds.firmware_version, kinds.usb_type_descriptor)
-    found = []
+    info_keys = (kinds.serial_number, kinds.name, kinds.firmware_version, kinds.usb_type_descriptor)
+    devices = []
     for handle in context.query_devices():
-        told = (handle.get_info(kind) if handle.supports(kind) else "" for kind in wanted)
-        serial, name, firmware, usb = told
-        found.append(Attached(serial, name, firmware, usb, handle))
-    return [device for device in found if device.serial]
+        values = (handle.get_info(kind) if handle.supports(kind) else "" for kind in info_keys)
+        serial, name, firmware, usb = values
+        devices.append(AttachedDevice(serial, name, firmware, usb, handle))
+    return [device for device in devices if device.serial]
 
 
-def choose(devices: list[Attached], serial: str | None, facts: DeviceFacts) -> Attached:
+def choose_device(devices: list[AttachedDevice], serial: str | None, facts: DeviceFacts) -> AttachedDevice:
     """The device `serial`, or the only one. Raises NotAttachedError, UsageError if it cannot be used."""
     listed = ", ".join(f"{device.serial} ({device.name})" for device in devices)
     if not devices:
@@ -60,23 +60,23 @@ def choose(devices: list[Attached], serial: str | None, facts: DeviceFacts) -> A
     if serial is None:
         if len(devices) > 1:
             raise UsageError(f"several RealSense cameras are attached; name one, realsense:SERIAL: {listed}")
-        return _usable(devices[0], facts)
+        return _check_usable(devices[0], facts)
     for device in devices:
         if device.serial == serial:
-            return _usable(device, facts)
+            return _check_usable(device, facts)
     raise NotAttachedError(f"no RealSense camera with serial number {serial} is attached; there is {listed}")
 
 
-def _usable(device: Attached, facts: DeviceFacts) -> Attached:
-    who = f"{device.name} {device.serial}"
+def _check_usable(device: AttachedDevice, facts: DeviceFacts) -> AttachedDevice:
+    label = f"{device.name} {device.serial}"
     if device.usb.startswith("2"):
         raise UsageError(
-            f"{who}: is on USB {device.usb}, too slow for it; use a USB 3 port and a USB 3 cable"
+            f"{label}: is on USB {device.usb}, too slow for it; use a USB 3 port and a USB 3 cable"
         )
     oldest = facts.firmware_oldest
-    if oldest and device.firmware and version(device.firmware) < version(oldest):
+    if oldest and device.firmware and parse_version(device.firmware) < parse_version(oldest):
         raise UsageError(
-            f"{who}: its firmware {device.firmware} is older than {oldest}; update it with rs-fw-update "
+            f"{label}: its firmware {device.firmware} is older than {oldest}; update it with rs-fw-update "
             f"(known to be good: {', '.join(facts.firmware)})"
         )
     return device
@@ -90,7 +90,7 @@ def load_sdk() -> Any:
     try:
         import pyrealsense2
     except ModuleNotFoundError:
-        raise UsageError(f"a RealSense camera: {not_installed('pyrealsense2', 'realsense')}") from None
+        raise UsageError(f"a RealSense camera: {install_hint('pyrealsense2', 'realsense')}") from None
     except ImportError as error:
         hint = " (apt install libusb-1.0-0)" if "libusb" in str(error) else ""
         raise UsageError(f"a RealSense camera: pyrealsense2 cannot be loaded: {error}{hint}") from None
@@ -98,11 +98,11 @@ def load_sdk() -> Any:
 
 
 @contextlib.contextmanager
-def opening(who: str) -> Iterator[None]:
+def sdk_errors(label: str) -> Iterator[None]:
     """The SDK raises RuntimeError, at any question to a camera that comes or goes: here it becomes a
-    ShareError that names `who`, in one line."""
+    ShareError that names `label`, in one line."""
     try:
         yield
     except RuntimeError as error:
-        reason, mend = str(error).partition("\n")[0], "plug it in anew, or ask `share doctor`"
-        raise ShareError(f"{who}: cannot be opened: {reason}; {mend}") from None
+        reason, fix = str(error).partition("\n")[0], "plug it in anew, or ask `share doctor`"
+        raise ShareError(f"{label}: cannot be opened: {reason}; {fix}") from None

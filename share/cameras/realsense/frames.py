@@ -8,58 +8,61 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.recordings.images import ArrayImage
-from share.sensors.intake import ACCEL, GYRO, Sample
 from share.sensors.measurement import CAM0, CAM1, DEPTH
+from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 from share.types import F32
 
-_WHOLE = 1e-3  # so far from a whole number a depth unit's inverse may be
+_INTEGER_TOLERANCE = 1e-3  # so far from a whole number a depth unit's inverse may be
 
 
-def to_sample(rs: Any, frame: Any, depth_unit_m: float, arrived_ns: int, epoch: int) -> Sample:
+def to_sample(rs: Any, frame: Any, depth_unit_m: float, arrived_ns: int, epoch: int) -> DeviceSample:
     """An image, a depth map (in m) or three values, with the device's stamp to the microsecond."""
-    stream = _name(rs, frame.profile)
+    stream = _stream_name(rs, frame.profile)
     motion = stream in (ACCEL, GYRO)
-    return Sample(
+    return DeviceSample(
         stream=stream,
         stamp_ns=round(frame.timestamp * 1e3) * 1000,
-        payload=_motion(frame) if motion else ArrayImage(_pixels(frame, stream, depth_unit_m)),
+        payload=_motion_values(frame) if motion else ArrayImage(_pixels(frame, stream, depth_unit_m)),
         arrived_ns=arrived_ns,
         number=None if motion else int(frame.frame_number),  # the IMU's two streams may share a counter
-        hardware=frame.frame_timestamp_domain == rs.timestamp_domain.hardware_clock,
+        is_device_clock=frame.frame_timestamp_domain == rs.timestamp_domain.hardware_clock,
         epoch=epoch,
     )
 
 
 def has_dots(rs: Any, frame: Any) -> bool | None:
     """Whether the emitter was on; None where the frame does not say, for want of metadata."""
-    told = rs.frame_metadata_value
-    for kind in (told.frame_emitter_mode, told.frame_laser_power_mode):  # the power itself is a setting
+    metadata = rs.frame_metadata_value
+    for kind in (
+        metadata.frame_emitter_mode,
+        metadata.frame_laser_power_mode,
+    ):  # the power itself is a setting
         if frame.supports_frame_metadata(kind):
             return bool(frame.get_frame_metadata(kind))
     return None
 
 
-def _name(rs: Any, profile: Any) -> str:
+def _stream_name(rs: Any, profile: Any) -> str:
     kind = profile.stream_type()
     if kind == rs.stream.infrared:
         return CAM0 if profile.stream_index() == 1 else CAM1
     return {rs.stream.depth: DEPTH, rs.stream.accel: ACCEL, rs.stream.gyro: GYRO}[kind]
 
 
-def _motion(frame: Any) -> list[float]:
-    told = frame.as_motion_frame().get_motion_data()
-    return [told.x, told.y, told.z]
+def _motion_values(frame: Any) -> list[float]:
+    motion = frame.as_motion_frame().get_motion_data()
+    return [motion.x, motion.y, motion.z]
 
 
 def _pixels(frame: Any, stream: str, depth_unit_m: float) -> NDArray[Any]:
     pixels = np.asarray(frame.get_data())
-    return metres(pixels, depth_unit_m) if stream == DEPTH else pixels.copy()
+    return scale_depth(pixels, depth_unit_m) if stream == DEPTH else pixels.copy()
 
 
-def metres(steps: NDArray[np.uint16], unit_m: float) -> F32:
+def scale_depth(steps: NDArray[np.uint16], unit_m: float) -> F32:
     """(H, W) depth in m. The unit is told in single precision: one of 1/n m is taken to be just that, and
     divided by. So whole millimetres come out to the last bit, and are recorded as such."""
     n = round(1 / unit_m)
-    if n and abs(1 / unit_m - n) < _WHOLE:
+    if n and abs(1 / unit_m - n) < _INTEGER_TOLERANCE:
         return np.asarray(steps / np.float32(n))
     return np.asarray(steps * np.float32(unit_m))

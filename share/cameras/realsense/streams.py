@@ -8,17 +8,17 @@ from typing import Any
 
 from share.errors import UsageError
 from share.sensors.imu_check import ImuRange
-from share.sensors.intake import ACCEL, GYRO
 from share.sensors.measurement import CAM0, CAM1, DEPTH
-from share.sensors.profile_types import Inertial, Profile
+from share.sensors.profile_types import InertialFacts, Profile
+from share.sensors.sample_processor import ACCEL, GYRO
 
-_SCALE = 1.1
-_ENOUGH_HZ = 100  # of an IMU; slower ones are taken only where there is nothing else
-Fits = Callable[[Any], bool]  # whether a profile of the SDK is the one
+_RANGE_MARGIN = 1.1
+_MIN_IMU_HZ = 100  # of an IMU; slower ones are taken only where there is nothing else
+ProfileMatcher = Callable[[Any], bool]  # whether a profile of the SDK is the one
 
 
 @dataclass(frozen=True)
-class Wanted:
+class StreamRequest:
     """What to read: images, depth, IMU, as the firmware profile says. right: the other eye's images too."""
 
     profile: Profile
@@ -30,94 +30,94 @@ class Wanted:
         """Expected rate of every stream. Of images with an interleaved emitter, every other one is used."""
         imu = self.profile.device.imu
         rates = {ACCEL: imu.accel.rate_hz, GYRO: imu.gyro.rate_hz}
-        image_hz = self.profile.rate_hz / (2 if self.interleaved else 1)
+        image_hz = self.profile.rate_hz / (2 if self.is_interleaved else 1)
         return rates | {name: self.profile.rate_hz if name == DEPTH else image_hz for name in self.cameras}
 
     def imu_range(self) -> ImuRange:
         """Beyond what the sensor shows where it saturates, by as much as its scale and bias are corrected."""
         imu = self.profile.device.imu
-        return ImuRange(_SCALE * imu.gyro.range, _SCALE * imu.accel.range)
+        return ImuRange(_RANGE_MARGIN * imu.gyro.range, _RANGE_MARGIN * imu.accel.range)
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The streams of images."""
-        have = ((CAM0, self.images), (CAM1, self.images and self.right), (DEPTH, self.depth))
-        return tuple(name for name, wanted in have if wanted)
+        options = ((CAM0, self.images), (CAM1, self.images and self.right), (DEPTH, self.depth))
+        return tuple(name for name, is_requested in options if is_requested)
 
     @property
-    def interleaved(self) -> bool:
+    def is_interleaved(self) -> bool:
         """Whether the dots are on in every other image."""
         return self.profile.device.emitter == "interleaved"
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
+class OpenedSensor:
     """One sensor of a device and those of its profiles that are wanted, by our name of the stream."""
 
     sensor: Any
     profiles: dict[str, Any]
 
 
-def choose_streams(rs: Any, device: Any, wanted: Wanted) -> list[Opened]:
+def choose_streams(rs: Any, device: Any, request: StreamRequest) -> list[OpenedSensor]:
     """Sensors and profiles for all that is wanted. Raises UsageError naming what the device lacks."""
-    missing = {name: _matchers(rs, name, wanted) for name in wanted.rates_hz()}
+    missing = {name: _matchers(rs, name, request) for name in request.rates_hz()}
     out = []
     for sensor in device.query_sensors():
-        found, offered = {}, sensor.get_stream_profiles()
+        matched, offered = {}, sensor.get_stream_profiles()
         for name, (matchers, _) in list(missing.items()):
             profile = next((p for fits in matchers for p in offered if fits(p)), None)
             if profile is not None:
-                found[name] = profile
+                matched[name] = profile
                 del missing[name]
-        if found:
-            out.append(Opened(sensor, found))
+        if matched:
+            out.append(OpenedSensor(sensor, matched))
     if missing:
-        told = ", ".join(f"{name} ({what})" for name, (_, what) in missing.items())
-        modes = ", ".join(_modes(rs, device)) or "none"
+        lacking = ", ".join(f"{name} ({what})" for name, (_, what) in missing.items())
+        modes = ", ".join(_infrared_modes(rs, device)) or "none"
         raise UsageError(
-            f"the camera does not offer {told}; choose another --mode or --profile; infrared has {modes}"
+            f"the camera does not offer {lacking}; choose another --mode or --profile; infrared has {modes}"
         )
     return out
 
 
-def _modes(rs: Any, device: Any) -> list[str]:
+def _infrared_modes(rs: Any, device: Any) -> list[str]:
     """Of the left eye, as --mode takes them."""
-    found = set()
+    modes = set()
     for p in (p for sensor in device.query_sensors() for p in sensor.get_stream_profiles()):
         if (p.stream_type(), p.stream_index(), p.format()) == (rs.stream.infrared, 1, rs.format.y8):
             video = p.as_video_stream_profile()
-            found.add((video.width(), video.height(), p.fps()))
-    return [f"{width}x{height}@{hz}" for width, height, hz in sorted(found)]
+            modes.add((video.width(), video.height(), p.fps()))
+    return [f"{width}x{height}@{hz}" for width, height, hz in sorted(modes)]
 
 
-def rates_hz(opened: list[Opened], wanted: Wanted) -> dict[str, float]:
+def stream_rates_hz(sensors: list[OpenedSensor], request: StreamRequest) -> dict[str, float]:
     """Of every stream as it comes: an IMU may have other rates than the profile states."""
     inertial = {
         name: float(profile.fps())
-        for one in opened
+        for one in sensors
         for name, profile in one.profiles.items()
         if name in (ACCEL, GYRO)
     }
-    return wanted.rates_hz() | inertial
+    return request.rates_hz() | inertial
 
 
-def preferred_hz(facts: Inertial) -> list[float]:
+def preferred_hz(facts: InertialFacts) -> list[float]:
     """An IMU's rates, best first: as stated, then the nearest of those that are enough, then the others."""
     return sorted(
-        facts.rates_hz, key=lambda hz: (hz != facts.rate_hz, hz < _ENOUGH_HZ, abs(hz - facts.rate_hz))
+        facts.rates_hz, key=lambda hz: (hz != facts.rate_hz, hz < _MIN_IMU_HZ, abs(hz - facts.rate_hz))
     )
 
 
-def _matchers(rs: Any, name: str, wanted: Wanted) -> tuple[list[Fits], str]:
+def _matchers(rs: Any, name: str, request: StreamRequest) -> tuple[list[ProfileMatcher], str]:
     """What knows the stream's profile, the best first, and words for it."""
-    imu = wanted.profile.device.imu
+    imu = request.profile.device.imu
     if name in (ACCEL, GYRO):
         kind, facts = (rs.stream.accel, imu.accel) if name == ACCEL else (rs.stream.gyro, imu.gyro)
         rates = preferred_hz(facts)
-        return [_motion(kind, hz) for hz in rates], f"{' or '.join(f'{hz:g}' for hz in rates)} Hz"
+        return [_motion_matcher(kind, hz) for hz in rates], f"{' or '.join(f'{hz:g}' for hz in rates)} Hz"
     stream = {CAM0: (rs.stream.infrared, 1), CAM1: (rs.stream.infrared, 2), DEPTH: (rs.stream.depth, 0)}[name]
     form = rs.format.z16 if name == DEPTH else rs.format.y8
-    mode, hz = wanted.profile.mode, wanted.profile.rate_hz
+    mode, hz = request.profile.mode, request.profile.rate_hz
 
     def fits(p: Any) -> bool:
         if (p.stream_type(), p.stream_index(), p.format(), p.fps()) != (*stream, form, hz):
@@ -128,5 +128,5 @@ def _matchers(rs: Any, name: str, wanted: Wanted) -> tuple[list[Fits], str]:
     return [fits], f"{mode.width}x{mode.height}@{hz:g}"
 
 
-def _motion(kind: Any, hz: float) -> Fits:
+def _motion_matcher(kind: Any, hz: float) -> ProfileMatcher:
     return lambda p: bool(p.stream_type() == kind and abs(p.fps() - hz) <= 1)

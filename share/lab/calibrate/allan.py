@@ -14,8 +14,8 @@ import numpy as np
 from share.errors import DataError
 from share.types import F64, I64
 
-_LEAST_SAMPLES = 100
-_OVERLAP = 16
+_MIN_SAMPLES = 100
+_STARTS_PER_AVERAGE = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class AllanCurve:
 
     sizes: I64
     deviation: F64
-    lengths: I64
+    segment_lengths: I64
     rate_hz: float
 
     @property
@@ -37,8 +37,8 @@ class AllanCurve:
     def clusters(self) -> I64:
         """(T,) independent averages, side by side: in each stretch as many as fit, less those that have
         no neighbour."""
-        fit = self.lengths // self.sizes[:, None]
-        return np.asarray(np.where(fit >= 2, fit, 0).sum(axis=1), np.int64)
+        averages = self.segment_lengths // self.sizes[:, None]
+        return np.asarray(np.where(averages >= 2, averages, 0).sum(axis=1), np.int64)
 
 
 def allan_deviation(samples: F64 | Sequence[F64], rate_hz: float, per_octave: int = 4) -> AllanCurve:
@@ -47,36 +47,36 @@ def allan_deviation(samples: F64 | Sequence[F64], rate_hz: float, per_octave: in
 
     Raises DataError where no stretch has 100 samples, or for values that are not finite.
     """
-    given = [samples] if isinstance(samples, np.ndarray) else samples
-    stretches = [np.asarray(one, np.float64) for one in given if len(one) >= 2]
-    longest = max(map(len, stretches), default=0)
-    if longest < _LEAST_SAMPLES:
-        raise DataError(f"Allan deviation: {longest} samples in a row, needs {_LEAST_SAMPLES}; record longer")
-    if not all(np.isfinite(s).all() for s in stretches):
+    segments_given = [samples] if isinstance(samples, np.ndarray) else samples
+    segments = [np.asarray(one, np.float64) for one in segments_given if len(one) >= 2]
+    longest = max(map(len, segments), default=0)
+    if longest < _MIN_SAMPLES:
+        raise DataError(f"Allan deviation: {longest} samples in a row, needs {_MIN_SAMPLES}; record longer")
+    if not all(np.isfinite(s).all() for s in segments):
         raise DataError("Allan deviation: has samples that are not finite")
     octaves = np.log2(longest / 4)
     sizes = np.unique(np.rint(2 ** np.linspace(0, octaves, int(octaves * per_octave) + 1)).astype(np.int64))
-    total = np.sum([_squares(_summed(one), sizes) for one in stretches], axis=0)
+    total = np.sum([_squared_differences(_running_sum(one), sizes) for one in segments], axis=0)
     return AllanCurve(
         sizes=sizes,
         deviation=np.sqrt(total[:, :-1] / total[:, -1:] / 2) / sizes[:, None],
-        lengths=np.array([len(s) for s in stretches], np.int64),
+        segment_lengths=np.array([len(s) for s in segments], np.int64),
         rate_hz=rate_hz,
     )
 
 
-def _summed(samples: F64) -> F64:
+def _running_sum(samples: F64) -> F64:
     """Running sum (N + 1, A) of samples (N, A) less their mean, which tells nothing."""
     sums = np.cumsum(samples - samples.mean(axis=0), axis=0)
     return np.concatenate([np.zeros((1, samples.shape[1])), sums])
 
 
-def _squares(theta: F64, sizes: I64) -> F64:
+def _squared_differences(theta: F64, sizes: I64) -> F64:
     """(T, A + 1): sum of squared second differences of the running sum at each size, and their number."""
     out = np.zeros((len(sizes), theta.shape[1] + 1))
     for row, m in zip(out, sizes, strict=True):
         if 2 * m < len(theta):
-            step = max(1, m // _OVERLAP)  # starts closer than that tell nothing new
+            step = max(1, m // _STARTS_PER_AVERAGE)  # starts closer than that tell nothing new
             second = theta[2 * m :: step] - 2 * theta[m:-m:step] + theta[: -2 * m : step]
             row[:-1], row[-1] = (second**2).sum(axis=0), len(second)
     return out
@@ -93,8 +93,8 @@ def _squares(theta: F64, sizes: I64) -> F64:
 # equivalent degrees of freedom of NIST SP 1065, 5.4, for any mixture of the three, and the covariance between
 # averaging times, which fits usually leave out: neighbours are nearly copies.
 
-_FULL, _NEAR = 65, 33  # lags over all of a sum, and about each of its nine corners
-_SECOND = np.array([1.0, -2.0, 1.0])
+_WIDE_LAGS, _CORNER_LAGS = 65, 33  # lags over all of a sum, and about each of its nine corners
+_SECOND_DIFFERENCE = np.array([1.0, -2.0, 1.0])
 
 
 def _white(h: F64) -> F64:
@@ -109,26 +109,28 @@ def _walk(h: F64) -> F64:
     return h**3 / 12
 
 
-_PARTS: tuple[Callable[[F64], F64], ...] = (_white, _flicker, _walk)
+_NOISE_MODELS: tuple[Callable[[F64], F64], ...] = (_white, _flicker, _walk)
 
 
-def scatter(sizes: I64, lengths: I64, rate_hz: float) -> F64:
+def variance_covariance(sizes: I64, lengths: I64, rate_hz: float) -> F64:
     """(3, 3, T, T): with squares p = (N^2, B^2, K^2) of one axis, sum_ab p_a p_b out[a, b] is the covariance
-    of its Allan variances at T sizes, from stretches of `lengths` (S,) samples."""
+    of its Allan variances at T sizes, from stretches of `segment_lengths` (S,) samples."""
     out = np.zeros((3, 3, len(sizes), len(sizes)))
     for i, m in enumerate(sizes):
         for j, n in enumerate(sizes[: i + 1]):
-            out[:, :, i, j] = out[:, :, j, i] = _pair(int(m), int(n), lengths, 1 / rate_hz)
+            out[:, :, i, j] = out[:, :, j, i] = _pair_covariance(int(m), int(n), lengths, 1 / rate_hz)
     return out
 
 
-def _pair(m: int, n: int, lengths: I64, dt: float) -> F64:
+def _pair_covariance(m: int, n: int, lengths: I64, dt: float) -> F64:
     """(3, 3) of the variances at m and n samples."""
     corners = np.arange(3)[:, None] * m - np.arange(3) * n
     k, weight = _lags(corners, m, n)
     h = np.abs(k[:, None, None] - corners) * dt
-    R = np.stack([np.einsum("kab,a,b->k", part(h), _SECOND, _SECOND) for part in _PARTS])
-    count, pairs = _pairs(k, lengths, m, n)
+    R = np.stack(
+        [np.einsum("kab,a,b->k", part(h), _SECOND_DIFFERENCE, _SECOND_DIFFERENCE) for part in _NOISE_MODELS]
+    )
+    count, pairs = _lag_counts(k, lengths, m, n)
     return np.asarray(
         2 * (R * (weight * count)) @ R.T / pairs / (4 * (m * dt) ** 2 * (n * dt) ** 2), np.float64
     )
@@ -137,14 +139,14 @@ def _pair(m: int, n: int, lengths: I64, dt: float) -> F64:
 def _lags(corners: I64, m: int, n: int) -> tuple[I64, F64]:
     """Whole lags, close where the covariance has corners, and how many each stands for."""
     reach, near = 2 * (m + n), 2 * min(m, n)
-    around = corners.reshape(-1, 1) + np.linspace(-near, near, _NEAR)
-    everywhere = m - n + np.linspace(-reach, reach, _FULL)
-    k = np.unique(np.rint(np.concatenate([around.ravel(), everywhere])).astype(np.int64))
+    corner_lags = corners.reshape(-1, 1) + np.linspace(-near, near, _CORNER_LAGS)
+    wide_lags = m - n + np.linspace(-reach, reach, _WIDE_LAGS)
+    k = np.unique(np.rint(np.concatenate([corner_lags.ravel(), wide_lags])).astype(np.int64))
     gaps = np.diff(k, prepend=k[0] - 1, append=k[-1] + 1)
     return k, (gaps[1:] + gaps[:-1]) / 2
 
 
-def _pairs(k: I64, lengths: I64, m: int, n: int) -> tuple[F64, float]:
+def _lag_counts(k: I64, lengths: I64, m: int, n: int) -> tuple[F64, float]:
     """At how many places each lag is found, over all stretches; the product of the numbers of differences."""
     of_m, of_n = np.maximum(lengths + 1 - 2 * m, 0), np.maximum(lengths + 1 - 2 * n, 0)
     lag = k[:, None]

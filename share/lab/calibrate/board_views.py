@@ -12,99 +12,105 @@ import numpy as np
 from share.errors import DataError, UsageError
 from share.geometry import rig_check
 from share.geometry.camera import Camera, Rig
-from share.lab.calibrate.camera_bundle import View
-from share.lab.calibrate.camera_report import UNTOLD, RigDoubt, rig_doubt
+from share.lab.calibrate.camera_bundle import BoardView
+from share.lab.calibrate.camera_report import UNKNOWN_UNCERTAINTY, RigUncertainty, read_rig_uncertainty
 from share.lab.calibrate.corners import Detection, detector
 from share.lab.calibrate.target import Target
 from share.recordings.calibration import CAMCHAIN, Calibration
 from share.recordings.images import decode_gray, read_picture
 from share.runtime.pool import Pool
-from share.runtime.source import READERS, calibration_of, open_source
+from share.runtime.source import READERS, open_source, read_given_calibration
 from share.sensors.measurement import CAM0, CAM1
 from share.types import F64, I64, U8
 
-_PICTURES = (".png", ".jpg", ".jpeg")
-_TOGETHER_NS = 2_000_000  # stamps of two pictures taken at once
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_MAX_PAIR_GAP_NS = 2_000_000  # stamps of two pictures taken at once
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class BoardImages:
     """count: of cam0's; rig: the calibration so far, if the source has one; read: name and images of each,
     which of a recording is the stamp of the first camera's, ns; said: the calibration that was given; serial:
     of the device that took them, else of the one that the calibration is of."""
 
     count: int
     rig: Rig | None
-    read: Callable[[], Iterator[tuple[str, tuple[U8, ...]]]]
-    said: Calibration | None = None
+    read_images: Callable[[], Iterator[tuple[str, tuple[U8, ...]]]]
+    given_calibration: Calibration | None = None
     serial: str | None = None
 
 
-def open_pictures(
-    source: str, eyes: Sequence[str], calib: str | None = None, alone: str = "give --camera cam0"
-) -> Pictures:
+def open_board_images(
+    source: str, cameras: Sequence[str], calib: str | None = None, mono_hint: str = "give --camera cam0"
+) -> BoardImages:
     """A recording, or a folder with cam0/*.png and, for stereo, cam1/*.png of the same names (.jpg too).
 
     eyes: which cameras; alone: how a person may ask for cam0 alone. Raises UsageError, ConfigError or
     DataError.
     """
-    folder, said = Path(source), calibration_of(calib)
+    folder, given = Path(source), read_given_calibration(calib)
     if any((folder / CAM0).glob("*")) and not (folder / CAM0 / "data.csv").exists():
-        return _folder(folder, eyes, said, alone)
-    if _pictures(folder) and not any(reader.knows(folder) for reader in READERS):
+        return _folder_images(folder, cameras, given, mono_hint)
+    if _image_files(folder) and not any(reader.matches(folder) for reader in READERS):
         raise UsageError(f"{source}: has pictures, but no cam0 with them; give a folder with cam0/*.png")
     opened = open_source(source, calib)
-    if CAM1 in eyes and opened.rig.cam1 is None:
-        raise UsageError(f"{source}: has no cam1; {alone}")
+    if CAM1 in cameras and opened.rig.cam1 is None:
+        raise UsageError(f"{source}: has no cam1; {mono_hint}")
 
     def read() -> Iterator[tuple[str, tuple[U8, ...]]]:
         waiting: dict[str, tuple[int, object]] = {}
         for m in opened.measurements():
-            if m.stream not in eyes:
+            if m.stream not in cameras:
                 continue
             waiting[m.stream] = (m.stamp_ns, m.payload)
             stamps = [stamp for stamp, _ in waiting.values()]
-            if len(waiting) == len(eyes) and max(stamps) - min(stamps) <= _TOGETHER_NS:
-                first = waiting[eyes[0]][0]
-                pair = tuple(waiting.pop(eye)[1].load() for eye in eyes)  # type: ignore[attr-defined]
+            if len(waiting) == len(cameras) and max(stamps) - min(stamps) <= _MAX_PAIR_GAP_NS:
+                first = waiting[cameras[0]][0]
+                pair = tuple(waiting.pop(eye)[1].load() for eye in cameras)  # type: ignore[attr-defined]
                 yield str(first), pair
 
-    return Pictures(opened.images_count, opened.rig, read, said, opened.serial or _only(said))
+    return BoardImages(opened.images_count, opened.rig, read, given, opened.serial or _only_serial(given))
 
 
-def _folder(folder: Path, eyes: Sequence[str], said: Calibration | None, alone: str) -> Pictures:
-    found = [_pictures(folder / eye) for eye in eyes]
-    names = [name for name in found[0] if all(name in others for others in found)]
+def _folder_images(
+    folder: Path, cameras: Sequence[str], given: Calibration | None, mono_hint: str
+) -> BoardImages:
+    files = [_image_files(folder / cam) for cam in cameras]
+    names = [name for name in files[0] if all(name in others for others in files)]
     if not names:
-        wanted = f"of the same name in {' and '.join(eyes)}; {alone}" if len(eyes) > 1 else f"in {eyes[0]}"
-        raise DataError(f"{folder}: has no pictures {wanted}")
+        requirement = (
+            f"of the same name in {' and '.join(cameras)}; {mono_hint}"
+            if len(cameras) > 1
+            else f"in {cameras[0]}"
+        )
+        raise DataError(f"{folder}: has no pictures {requirement}")
 
     def read() -> Iterator[tuple[str, tuple[U8, ...]]]:
         for name in names:
-            yield name, tuple(decode_gray(read_picture(one[name]), str(one[name])) for one in found)
+            yield name, tuple(decode_gray(read_picture(one[name]), str(one[name])) for one in files)
 
-    return Pictures(len(names), None if said is None else said.rig, read, said, _only(said))
+    return BoardImages(len(names), None if given is None else given.rig, read, given, _only_serial(given))
 
 
-def _only(said: Calibration | None) -> str | None:
+def _only_serial(calibration: Calibration | None) -> str | None:
     """The device that a calibration is of, where it names just one."""
-    return said.serials[0] if said is not None and len(said.serials) == 1 else None
+    return calibration.serials[0] if calibration is not None and len(calibration.serials) == 1 else None
 
 
-def _pictures(folder: Path) -> dict[str, Path]:
+def _image_files(folder: Path) -> dict[str, Path]:
     """By their names, in the order of numbers: 99 goes before 100."""
-    paths = [path for path in folder.glob("*") if path.suffix.lower() in _PICTURES]
+    paths = [path for path in folder.glob("*") if path.suffix.lower() in _IMAGE_SUFFIXES]
     return {path.stem: path for path in sorted(paths, key=lambda path: (len(path.stem), path.stem))}
 
 
 def find_views(
-    pictures: Pictures,
+    images: BoardImages,
     target: Target,
     every: int,
-    told: Callable[[int, int], None],
+    on_progress: Callable[[int, int], None],
     workers: int = 1,
     fisheye: bool = False,
-) -> tuple[list[View], list[tuple[int, int]]]:
+) -> tuple[list[BoardView], list[tuple[int, int]]]:
     """Views of every `every`-th picture, also empty ones, and each camera's size. Finding a board takes
     some hundredths of a second: `workers` processes share that.
 
@@ -112,95 +118,99 @@ def find_views(
     camera differ in size.
     """
     sizes: list[tuple[int, int]] = []
-    views: dict[int, View] = {}
-    count = -(-pictures.count // every)
-    for job, seen in _looked(_jobs(pictures, every, sizes), (target, fisheye), max(1, min(workers, count))):
-        views[job.number] = View(job.name, seen)
-        told(len(views), count)
+    views: dict[int, BoardView] = {}
+    count = -(-images.count // every)
+    for job, detections in _detect_all(
+        _image_jobs(images, every, sizes), (target, fisheye), max(1, min(workers, count))
+    ):
+        views[job.number] = BoardView(job.name, detections)
+        on_progress(len(views), count)
     return [views[k] for k in sorted(views)], sizes
 
 
 @dataclass(frozen=True, eq=False)
-class _Job:
+class _ImageJob:
     number: int
     name: str
     images: tuple[U8, ...]
 
 
-def _jobs(pictures: Pictures, every: int, sizes: list[tuple[int, int]]) -> Iterator[_Job]:
+def _image_jobs(board_images: BoardImages, every: int, sizes: list[tuple[int, int]]) -> Iterator[_ImageJob]:
     """Fills `sizes`. Raises DataError."""
-    for k, (name, images) in enumerate(pictures.read()):
+    for k, (name, images) in enumerate(board_images.read_images()):
         if k % every:
             continue
-        here = [(image.shape[1], image.shape[0]) for image in images]
-        sizes.extend(here[len(sizes) :])
-        if here != sizes:
-            raise DataError(f"picture {name}: is {here}, the first was {sizes}; give pictures of one size")
-        yield _Job(k, name, images)
+        image_sizes = [(image.shape[1], image.shape[0]) for image in images]
+        sizes.extend(image_sizes[len(sizes) :])
+        if image_sizes != sizes:
+            raise DataError(
+                f"picture {name}: is {image_sizes}, the first was {sizes}; give pictures of one size"
+            )
+        yield _ImageJob(k, name, images)
 
 
-def _looked(
-    jobs: Iterator[_Job], what: tuple[Target, bool], workers: int
-) -> Iterator[tuple[_Job, tuple[Detection, ...]]]:
+def _detect_all(
+    jobs: Iterator[_ImageJob], detector_arguments: tuple[Target, bool], workers: int
+) -> Iterator[tuple[_ImageJob, tuple[Detection, ...]]]:
     """Every job and what its images show, as they are done."""
     if workers == 1:  # a process of its own takes a second to begin
-        _begin(*what)
-        yield from ((job, _seen(job)) for job in jobs)
+        _start_worker(*detector_arguments)
+        yield from ((job, _detections(job)) for job in jobs)
         return
-    with Pool(workers, _begin, what) as pool:
-        yield from pool.run(_seen, jobs)
+    with Pool(workers, _start_worker, detector_arguments) as pool:
+        yield from pool.run(_detections, jobs)
 
 
-_find: Callable[[U8], Detection] | None = None  # of a process
+_detect_in_worker: Callable[[U8], Detection] | None = None  # of a process
 
 
-def _begin(target: Target, fisheye: bool) -> None:
-    global _find
-    _find = detector(target, fisheye)
+def _start_worker(target: Target, fisheye: bool) -> None:
+    global _detect_in_worker
+    _detect_in_worker = detector(target, fisheye)
 
 
-def _seen(job: _Job) -> tuple[Detection, ...]:
-    assert _find is not None
-    return tuple(_find(image) for image in job.images)
+def _detections(job: _ImageJob) -> tuple[Detection, ...]:
+    assert _detect_in_worker is not None
+    return tuple(_detect_in_worker(image) for image in job.images)
 
 
 # ---- Pictures of a calibration target with their stamps, from a recording whose cameras are known.
 
-_ALONE = "for one camera, give --camera a camchain without cam1"
+_MONO_HINT = "for one camera, give --camera a camchain without cam1"
 
 
 @dataclass(frozen=True, eq=False)
-class RigPictures:
+class RigImages:
     """rig: the cameras; before: T_imu_cam0 (4, 4) as it was given, if it was; doubt: how well the cameras are
     known."""
 
     name: str
-    pictures: Pictures
+    images: BoardImages
     rig: Rig
-    before: F64 | None
-    doubt: RigDoubt = UNTOLD
+    given_T_imu_cam0: F64 | None
+    uncertainty: RigUncertainty = UNKNOWN_UNCERTAINTY
 
 
-def open_rig_pictures(source: str, camera: str | None) -> RigPictures:
+def open_rig_images(source: str, camera: str | None) -> RigImages:
     """Of a recording, or a folder with cam0/STAMP.png. camera: a camchain or a folder with one, in place
     of the source's own. Raises UsageError, ConfigError or DataError."""
-    path = None if camera is None else _chain(camera)
+    path = None if camera is None else _camchain_file(camera)
     chain = None if path is None else str(path)
-    first = open_pictures(source, (CAM0,), chain)
+    first = open_board_images(source, (CAM0,), chain)
     if first.rig is None:
         raise UsageError(f"{source}: does not say what its cameras are like; give --camera FILE")
-    for name, eye in (("cam0", first.rig.cam0), ("cam1", first.rig.cam1)):
-        if eye is not None and (why := rig_check.lens_objection(eye)) is not None:
+    for name, cam in (("cam0", first.rig.cam0), ("cam1", first.rig.cam1)):
+        if cam is not None and (why := rig_check.lens_problem(cam)) is not None:
             raise UsageError(f"{source if chain is None else chain}: {name}: {why}")
-    two = first.rig.cam1 is not None
-    pictures = open_pictures(source, (CAM0, CAM1), chain, _ALONE) if two else first
+    has_two = first.rig.cam1 is not None
+    images = open_board_images(source, (CAM0, CAM1), chain, _MONO_HINT) if has_two else first
     own = first.rig.T_body_cam0 if first.rig.imu is not None else None
-    before = own if first.said is None else first.said.T_imu_cam0
-    doubt = UNTOLD if path is None else rig_doubt(path, first.rig)
-    return RigPictures(source, pictures, first.rig, before, doubt)
+    given_T_imu_cam0 = own if first.given_calibration is None else first.given_calibration.T_imu_cam0
+    uncertainty = UNKNOWN_UNCERTAINTY if path is None else read_rig_uncertainty(path, first.rig)
+    return RigImages(source, images, first.rig, given_T_imu_cam0, uncertainty)
 
 
-def _chain(camera: str) -> Path:
+def _camchain_file(camera: str) -> Path:
     """The file alone: with the IMU's beside it, a reader asks for extrinsics that are yet to be found."""
     path = Path(camera) / CAMCHAIN if Path(camera).is_dir() else Path(camera)
     if not path.is_file():
@@ -208,13 +218,13 @@ def _chain(camera: str) -> Path:
     return path
 
 
-class Stamped(NamedTuple):
+class StampedViews(NamedTuple):
     """stamps (F,) ns, rising, and views with at least one corner; looked: how many pictures were looked at;
     dropped: how many show the board, but their stamps are not later than the one before."""
 
     stamps: I64
-    views: list[View]
-    looked: int
+    views: list[BoardView]
+    images_searched: int
     dropped: int
 
     @property
@@ -222,30 +232,30 @@ class Stamped(NamedTuple):
         return len(self.views) + self.dropped
 
 
-def find_stamped(
-    source: RigPictures, target: Target, every: int, told: Callable[[int, int], None], workers: int = 1
-) -> Stamped:
+def find_stamped_views(
+    source: RigImages, target: Target, every: int, on_progress: Callable[[int, int], None], workers: int = 1
+) -> StampedViews:
     """told: how many are done, of how many. Raises DataError."""
-    views, sizes = find_views(source.pictures, target, every, told, workers, source.rig.cam0.fisheye)
+    views, sizes = find_views(source.images, target, every, on_progress, workers, source.rig.cam0.is_fisheye)
     cameras = [camera for camera in (source.rig.cam0, source.rig.cam1) if camera is not None]
-    for eye, (size, camera) in enumerate(zip(sizes, cameras, strict=False)):
-        _same_size(source.name, eye, size, camera)
-    seen = [view for view in views if any(len(one) for one in view.seen)]
-    if not seen:
+    for cam, (size, camera) in enumerate(zip(sizes, cameras, strict=False)):
+        _check_size(source.name, cam, size, camera)
+    with_target = [view for view in views if any(len(one) for one in view.detections)]
+    if not with_target:
         raise DataError(
             f"{source.name}: no board in {len(views)} pictures; is --target the board that was shown?"
         )
-    if not all(view.name.isdecimal() and int(view.name) < 2**63 for view in seen):
+    if not all(view.name.isdecimal() and int(view.name) < 2**63 for view in with_target):
         raise DataError(f"{source.name}: pictures without stamps; name them cam0/STAMP.png, STAMP in ns")
-    stamps = np.array([int(view.name) for view in seen], np.int64)
+    stamps = np.array([int(view.name) for view in with_target], np.int64)
     later = stamps > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps[:-1]]))
-    kept = [view for view, keep in zip(seen, later, strict=True) if keep]
-    return Stamped(stamps[later], kept, len(views), len(seen) - len(kept))
+    kept_views = [view for view, keep in zip(with_target, later, strict=True) if keep]
+    return StampedViews(stamps[later], kept_views, len(views), len(with_target) - len(kept_views))
 
 
-def _same_size(name: str, eye: int, size: tuple[int, int], camera: Camera) -> None:
+def _check_size(name: str, cam: int, size: tuple[int, int], camera: Camera) -> None:
     if size != (camera.width, camera.height):
         raise DataError(
-            f"{name}: cam{eye}'s pictures are {size[0]}x{size[1]}, its calibration is of "
+            f"{name}: cam{cam}'s pictures are {size[0]}x{size[1]}, its calibration is of "
             f"{camera.width}x{camera.height}; calibrate it as it records"
         )

@@ -17,10 +17,16 @@ import numpy as np
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.geometry.lens import RADTAN
-from share.geometry.rig_check import lens_objection
-from share.lab.calibrate import camera_start
-from share.lab.calibrate.camera_start import camera_of, intrinsics, moved, names, project
-from share.lab.calibrate.corners import Detection, spread
+from share.geometry.rig_check import lens_problem
+from share.lab.calibrate import camera_initialisation
+from share.lab.calibrate.camera_initialisation import (
+    camera_from_parameters,
+    intrinsics,
+    parameter_names,
+    project_with_jacobians,
+    transform_with_jacobian,
+)
+from share.lab.calibrate.corners import Detection, robust_sigma
 from share.lab.calibrate.target import Target
 from share.types import F64
 
@@ -37,34 +43,34 @@ def jackknife(H: F64, g: F64) -> F64:
     return out
 
 
-def larger(one: F64, other: F64) -> F64:
+def enclosing_covariance(one: F64, other: F64) -> F64:
     """A covariance (S, S) in no direction below `one`, which is positive definite, nor below `other`: where
     `one` is a unit ball, the principal axes of `other` that are shorter than 1 are made 1."""
     root = np.linalg.cholesky(one)
-    inside = np.linalg.solve(root, np.linalg.solve(root, other).T)
-    squares, axes = np.linalg.eigh((inside + inside.T) / 2)
-    back = root @ axes * np.sqrt(np.maximum(squares, 1))
-    out: F64 = back @ back.T
+    whitened = np.linalg.solve(root, np.linalg.solve(root, other).T)
+    squares, axes = np.linalg.eigh((whitened + whitened.T) / 2)
+    axes_back = root @ axes * np.sqrt(np.maximum(squares, 1))
+    out: F64 = axes_back @ axes_back.T
     return out
 
 
-LEAST_VIEWS = 4
-_ROUNDS = 60
-_HUBER = 2.5  # times the residuals' own spread
-_SURE = 3.0  # sigmas from 0 at which a fifth coefficient is told
-_STILL = 1e-9  # relative fall of the cost at which it has arrived
+MIN_VIEWS = 4
+_MAX_ITERATIONS = 60
+_HUBER_SIGMAS = 2.5  # times the residuals' own spread
+_K3_SIGMAS = 3.0  # sigmas from 0 at which a fifth coefficient is told
+_MIN_RELATIVE_DECREASE = 1e-9  # relative fall of the cost at which it has arrived
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """One look at the target: corners of each camera, in the order of the cameras; none is an empty one."""
 
     name: str
-    seen: tuple[Detection, ...]
+    detections: tuple[Detection, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class CameraBundleState:
     """What is sought. T_cam0_target: (V, 4, 4)."""
 
     cameras: tuple[Camera, ...]
@@ -72,19 +78,20 @@ class State:
     T_cam0_target: F64
 
     @property
-    def parts(self) -> tuple[slice, ...]:
+    def intrinsic_slices(self) -> tuple[slice, ...]:
         """Where each camera's intrinsics are among the shared parameters."""
-        return parts(self.cameras)
+        return intrinsic_slices(self.cameras)
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """`state`, with two covariances (S, S) of the intrinsics of each camera, see `projection.names`, and, of
+class CameraBundleSolution:
+    """`state`, with two covariances (S, S) of the intrinsics of each camera, see
+    `projection.parameter_names`, and, of
     two, xi of T_cam1_cam0 Exp(xi): `independent`, if corners err so; `by_views`, as views contradict one
     another. Of each view and camera the residuals (N, 2) px, seen less predicted; sigma_px: noise of a
     coordinate."""
 
-    state: State
+    state: CameraBundleState
     independent: F64
     by_views: F64
     residuals: tuple[tuple[F64, ...], ...]
@@ -94,7 +101,7 @@ class Solution:
     def covariance(self) -> F64:
         """(S, S): in each direction the larger of both. Corners of a view err together: by a bent board, by
         blur, by what a detector makes of a slant."""
-        return larger(self.independent, self.by_views)
+        return enclosing_covariance(self.independent, self.by_views)
 
     @property
     def sigmas(self) -> F64:
@@ -102,156 +109,195 @@ class Solution:
         return np.sqrt(np.diag(self.covariance))
 
 
-def calibrate(views: Sequence[View], target: Target, size: tuple[int, int], model: str = RADTAN) -> Solution:
-    """From views each of which `start.enough` corners of one camera tell. size: (width, height) of an image.
-    model: of the lenses. Radtan's k3 is taken where it is told, `_SURE` sigmas from 0 in one camera at least,
-    and a tracker can use it.
+def calibrate_cameras(
+    views: Sequence[BoardView], target: Target, size: tuple[int, int], model: str = RADTAN
+) -> CameraBundleSolution:
+    """From views each of which `start.has_enough_corners` corners of one camera tell. size: (width, height)
+    of an image.
+    model: of the lenses. Radtan's k3 is taken where it is told, `_K3_SIGMAS` sigmas from 0 in one camera at
+    least, and a tracker can use it.
 
     Raises ValueError where the views are too few, or do not tell what is sought.
     """
-    eyes = len(views[0].seen) if views else 0
-    alone = [_alone(views, target, size, eye, model) for eye in range(eyes)]
-    if eyes == 0:
+    cams = len(views[0].detections) if views else 0
+    single_solutions = [_calibrate_single(views, target, size, cam, model) for cam in range(cams)]
+    if cams == 0:
         raise ValueError("no view of the target")
-    first = alone[0][0]
-    if eyes == 2:
-        first = _together([state for state, _ in alone], [at for _, at in alone], len(views))
-    four = _solve(views, target, first)
-    return four if model != RADTAN else _with_k3(four, views, target)
+    initial = single_solutions[0][0]
+    if cams == 2:
+        initial = _initial_stereo(
+            [state for state, _ in single_solutions], [at for _, at in single_solutions], len(views)
+        )
+    without_k3 = _solve(views, target, initial)
+    return without_k3 if model != RADTAN else _with_k3(without_k3, views, target)
 
 
-def _with_k3(four: Solution, views: Sequence[View], target: Target) -> Solution:
+def _with_k3(
+    without_k3: CameraBundleSolution, views: Sequence[BoardView], target: Target
+) -> CameraBundleSolution:
     """The solution with a fifth coefficient, where it tells that one; else as it is."""
-    wider = [replace(camera, distortion=(*camera.distortion, 0.0)) for camera in four.state.cameras]
+    extended = [replace(camera, distortion=(*camera.distortion, 0.0)) for camera in without_k3.state.cameras]
     try:
-        five = _solve(views, target, replace(four.state, cameras=tuple(wider)))
+        with_k3 = _solve(views, target, replace(without_k3.state, cameras=tuple(extended)))
     except (ValueError, np.linalg.LinAlgError):
-        return four
-    told = [
-        abs(camera.distortion[4]) > _SURE * five.sigmas[part.stop - 1]
-        for part, camera in zip(five.state.parts, five.state.cameras, strict=True)
+        return without_k3
+    is_significant = [
+        abs(camera.distortion[4]) > _K3_SIGMAS * with_k3.sigmas[part.stop - 1]
+        for part, camera in zip(with_k3.state.intrinsic_slices, with_k3.state.cameras, strict=True)
     ]
-    sound = all(lens_objection(camera) is None for camera in five.state.cameras)
-    return five if any(told) and sound else four
+    is_valid = all(lens_problem(camera) is None for camera in with_k3.state.cameras)
+    return with_k3 if any(is_significant) and is_valid else without_k3
 
 
-def errors(state: State, views: Sequence[View], target: Target) -> tuple[tuple[F64, ...], ...]:
+def reprojection_residuals(
+    state: CameraBundleState, views: Sequence[BoardView], target: Target
+) -> tuple[tuple[F64, ...], ...]:
     """Of each view and camera the residuals (N, 2) px, seen less predicted."""
     return tuple(
-        tuple(_linear(state, view, k, eye, target)[0] for eye in range(len(state.cameras)))
+        tuple(_linearise(state, view, k, cam, target)[0] for cam in range(len(state.cameras)))
         for k, view in enumerate(views)
     )
 
 
-def refit(state: State, views: Sequence[View], target: Target) -> State:
+def refit(state: CameraBundleState, views: Sequence[BoardView], target: Target) -> CameraBundleState:
     """Poses of other views by cameras that are known: intrinsics and T_cam1_cam0 stay."""
-    poses = np.stack([_first_pose(state, view, target) for view in views])
+    poses = np.stack([_initial_pose(state, view, target) for view in views])
     return _solve(views, target, replace(state, T_cam0_target=poses), cameras_fixed=True).state
 
 
-def _board(view: View, eye: int, target: Target) -> F64:
+def _board_points(view: BoardView, cam: int, target: Target) -> F64:
     """Corners (N, 2) m on the target that a camera sees."""
-    return target.corners[view.seen[eye].ids, :2]
+    return target.corners[view.detections[cam].ids, :2]
 
 
-def _alone(
-    views: Sequence[View], target: Target, size: tuple[int, int], eye: int, model: str
-) -> tuple[State, list[int]]:
+def _calibrate_single(
+    views: Sequence[BoardView], target: Target, size: tuple[int, int], cam: int, model: str
+) -> tuple[CameraBundleState, list[int]]:
     """One camera by itself, and which views it has."""
-    at = [k for k, view in enumerate(views) if camera_start.enough(_board(view, eye, target))]
-    if len(at) < LEAST_VIEWS:
-        raise ValueError(f"cam{eye}: {len(at)} views of the target; {LEAST_VIEWS} are needed at least")
-    mine = [View(views[k].name, (views[k].seen[eye],)) for k in at]
-    boards = [_board(view, 0, target) for view in mine]
-    begin = camera_start.first_camera if model == RADTAN else camera_start.first_fisheye
-    camera = begin(boards, [view.seen[0].px for view in mine], size)
-    poses = [camera_start.pose(camera, xy, view.seen[0].px) for xy, view in zip(boards, mine, strict=True)]
-    return _solve(mine, target, State((camera,), np.eye(4), np.stack(poses))).state, at
+    view_rows = [
+        k
+        for k, view in enumerate(views)
+        if camera_initialisation.has_enough_corners(_board_points(view, cam, target))
+    ]
+    if len(view_rows) < MIN_VIEWS:
+        raise ValueError(f"cam{cam}: {len(view_rows)} views of the target; {MIN_VIEWS} are needed at least")
+    camera_views = [BoardView(views[k].name, (views[k].detections[cam],)) for k in view_rows]
+    boards = [_board_points(view, 0, target) for view in camera_views]
+    initial_camera = (
+        camera_initialisation.initial_pinhole if model == RADTAN else camera_initialisation.initial_fisheye
+    )
+    camera = initial_camera(boards, [view.detections[0].px for view in camera_views], size)
+    poses = [
+        camera_initialisation.board_pose(camera, xy, view.detections[0].px)
+        for xy, view in zip(boards, camera_views, strict=True)
+    ]
+    return _solve(
+        camera_views, target, CameraBundleState((camera,), np.eye(4), np.stack(poses))
+    ).state, view_rows
 
 
-def _together(alone: list[State], at: list[list[int]], count: int) -> State:
+def _initial_stereo(
+    singles: list[CameraBundleState], view_rows: list[list[int]], count: int
+) -> CameraBundleState:
     """Both cameras, where each begins where it ended alone."""
-    first, second = (dict(zip(k, s.T_cam0_target, strict=True)) for s, k in zip(alone, at, strict=True))
-    both = sorted(first.keys() & second.keys())
-    if len(both) < LEAST_VIEWS:
-        raise ValueError(f"both cameras see the target in {len(both)} views; {LEAST_VIEWS} are needed")
-    pairs = np.stack([second[k] @ se3.inverse(first[k]) for k in both])
-    middle = pairs[np.argmin([np.linalg.norm(se3.log(se3.inverse(T) @ pairs), axis=1).sum() for T in pairs])]
-    poses = [first[k] if k in first else se3.inverse(middle) @ second[k] for k in range(count)]
-    return State((alone[0].cameras[0], alone[1].cameras[0]), middle, np.stack(poses))
+    first, second = (
+        dict(zip(k, s.T_cam0_target, strict=True)) for s, k in zip(singles, view_rows, strict=True)
+    )
+    common = sorted(first.keys() & second.keys())
+    if len(common) < MIN_VIEWS:
+        raise ValueError(f"both cameras see the target in {len(common)} views; {MIN_VIEWS} are needed")
+    pairs = np.stack([second[k] @ se3.inverse(first[k]) for k in common])
+    median_mount = pairs[
+        np.argmin([np.linalg.norm(se3.log(se3.inverse(T) @ pairs), axis=1).sum() for T in pairs])
+    ]
+    poses = [first[k] if k in first else se3.inverse(median_mount) @ second[k] for k in range(count)]
+    return CameraBundleState((singles[0].cameras[0], singles[1].cameras[0]), median_mount, np.stack(poses))
 
 
-def _first_pose(state: State, view: View, target: Target) -> F64:
-    eye = int(np.argmax([len(seen) for seen in view.seen]))
-    seen = view.seen[eye]
-    T = camera_start.pose(state.cameras[eye], target.corners[seen.ids, :2], seen.px)
-    return T if eye == 0 else se3.inverse(state.T_cam1_cam0) @ T
+def _initial_pose(state: CameraBundleState, view: BoardView, target: Target) -> F64:
+    cam = int(np.argmax([len(detection) for detection in view.detections]))
+    detection = view.detections[cam]
+    T = camera_initialisation.board_pose(state.cameras[cam], target.corners[detection.ids, :2], detection.px)
+    return T if cam == 0 else se3.inverse(state.T_cam1_cam0) @ T
 
 
-def _linear(state: State, view: View, k: int, eye: int, target: Target) -> tuple[F64, F64, F64, F64]:
+def _linearise(
+    state: CameraBundleState, view: BoardView, k: int, cam: int, target: Target
+) -> tuple[F64, F64, F64, F64]:
     """Residuals (N, 2) and the derivatives of what is predicted, by intrinsics (N, 2, I), by xi of
     T_cam1_cam0 and by xi of T_cam0_target (N, 2, 6)."""
-    seen = view.seen[eye]
-    points, by_pose = moved(state.T_cam0_target[k], target.corners[seen.ids])
-    by_mount = np.zeros((len(seen), 3, 6))
-    if eye == 1:
-        points, by_mount = moved(state.T_cam1_cam0, points)
-        by_pose = state.T_cam1_cam0[:3, :3] @ by_pose
-    px, by_intrinsics, by_points = project(state.cameras[eye], points)
-    return seen.px - px, by_intrinsics, by_points @ by_mount, by_points @ by_pose
+    detection = view.detections[cam]
+    points, jacobian_pose = transform_with_jacobian(state.T_cam0_target[k], target.corners[detection.ids])
+    jacobian_mount = np.zeros((len(detection), 3, 6))
+    if cam == 1:
+        points, jacobian_mount = transform_with_jacobian(state.T_cam1_cam0, points)
+        jacobian_pose = state.T_cam1_cam0[:3, :3] @ jacobian_pose
+    px, jacobian_intrinsics, jacobian_points = project_with_jacobians(state.cameras[cam], points)
+    return (
+        detection.px - px,
+        jacobian_intrinsics,
+        jacobian_points @ jacobian_mount,
+        jacobian_points @ jacobian_pose,
+    )
 
 
-def _block(state: State, view: View, k: int, target: Target) -> tuple[F64, F64]:
+def _linearise_view(state: CameraBundleState, view: BoardView, k: int, target: Target) -> tuple[F64, F64]:
     """Residuals (M, 2) of one view and derivatives (M, 2, S + 6): shared parameters, then its pose."""
-    eyes = len(state.cameras)
-    size = shared(state.cameras)
+    cams = len(state.cameras)
+    size = shared_size(state.cameras)
     rs, Js = [], []
-    for eye in range(eyes):
-        r, by_intrinsics, by_mount, by_pose = _linear(state, view, k, eye, target)
+    for cam in range(cams):
+        r, by_intrinsics, by_mount, by_pose = _linearise(state, view, k, cam, target)
         J = np.zeros((len(r), 2, size + 6))
-        J[:, :, state.parts[eye]] = by_intrinsics
+        J[:, :, state.intrinsic_slices[cam]] = by_intrinsics
         J[:, :, size:] = by_pose
-        if eyes == 2:
+        if cams == 2:
             J[:, :, size - 6 : size] = by_mount
         rs.append(r)
         Js.append(J)
     return np.concatenate(rs), np.concatenate(Js)
 
 
-def parts(cameras: Sequence[Camera]) -> tuple[slice, ...]:
+def intrinsic_slices(cameras: Sequence[Camera]) -> tuple[slice, ...]:
     """Where each camera's intrinsics are among the parameters that the views share."""
-    ends = np.cumsum([0, *(len(names(camera)) for camera in cameras)]).tolist()
+    ends = np.cumsum([0, *(len(parameter_names(camera)) for camera in cameras)]).tolist()
     return tuple(slice(a, b) for a, b in pairwise(ends))
 
 
-def shared(cameras: Sequence[Camera]) -> int:
+def shared_size(cameras: Sequence[Camera]) -> int:
     """How many parameters the views share: intrinsics of each camera, and xi of T_cam1_cam0."""
-    return int(parts(cameras)[-1].stop) + 6 * (len(cameras) - 1)
+    return int(intrinsic_slices(cameras)[-1].stop) + 6 * (len(cameras) - 1)
 
 
-def _solve(views: Sequence[View], target: Target, state: State, cameras_fixed: bool = False) -> Solution:
+def _solve(
+    views: Sequence[BoardView], target: Target, state: CameraBundleState, cameras_fixed: bool = False
+) -> CameraBundleSolution:
     """Levenberg-Marquardt; the spread that Huber's weights go by is fixed in each of three runs."""
     for _ in range(3):
-        blocks = [_block(state, view, k, target) for k, view in enumerate(views)]
-        limit = _HUBER * spread(np.concatenate([r for r, _ in blocks]))
-        state = _descend(views, target, state, limit, cameras_fixed)
+        blocks = [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
+        limit = _HUBER_SIGMAS * robust_sigma(np.concatenate([r for r, _ in blocks]))
+        state = _levenberg_marquardt(views, target, state, limit, cameras_fixed)
     return _solution(views, target, state, limit)
 
 
-def _descend(views: Sequence[View], target: Target, state: State, limit: float, fixed: bool) -> State:
-    damping, blocks = 1e-4, [_block(state, view, k, target) for k, view in enumerate(views)]
+def _levenberg_marquardt(
+    views: Sequence[BoardView], target: Target, state: CameraBundleState, limit: float, cameras_fixed: bool
+) -> CameraBundleState:
+    damping, blocks = 1e-4, [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
     cost = _cost(blocks, limit)
-    for _ in range(_ROUNDS):
-        trial = _moved(state, *_step(blocks, limit, damping, fixed))
-        after = [_block(trial, v, k, target) for k, v in enumerate(views)] if trial else blocks
-        fallen = cost - _cost(after, limit) if trial else -1.0
-        if trial is None or not fallen > 0:
+    for _ in range(_MAX_ITERATIONS):
+        trial = _updated_state(state, *_solve_step(blocks, limit, damping, cameras_fixed))
+        trial_blocks = (
+            [_linearise_view(trial, v, k, target) for k, v in enumerate(views)] if trial else blocks
+        )
+        decrease = cost - _cost(trial_blocks, limit) if trial else -1.0
+        if trial is None or not decrease > 0:
             damping *= 8
             if damping > 1e8:
                 break
             continue
-        state, blocks, cost, damping = trial, after, cost - fallen, damping / 5
-        if fallen < _STILL * cost:
+        state, blocks, cost, damping = trial, trial_blocks, cost - decrease, damping / 5
+        if decrease < _MIN_RELATIVE_DECREASE * cost:
             break
     return state
 
@@ -263,7 +309,7 @@ def _cost(blocks: list[tuple[F64, F64]], limit: float) -> float:
     return float(np.where(d <= limit, d * d / 2, limit * (d - limit / 2)).sum())
 
 
-def _normal(block: tuple[F64, F64], limit: float) -> tuple[F64, F64]:
+def _normal_equations(block: tuple[F64, F64], limit: float) -> tuple[F64, F64]:
     """H (S + 6, S + 6) and g (S + 6,) of one view, weighted by Huber."""
     r, J = block
     root = np.sqrt(np.minimum(1, limit / np.maximum(np.linalg.norm(r, axis=1), 1e-12)))[:, None]
@@ -271,51 +317,59 @@ def _normal(block: tuple[F64, F64], limit: float) -> tuple[F64, F64]:
     return A.T @ A, A.T @ b
 
 
-def _step(blocks: list[tuple[F64, F64]], limit: float, damping: float, fixed: bool) -> tuple[F64, F64]:
+def _solve_step(
+    blocks: list[tuple[F64, F64]], limit: float, damping: float, cameras_fixed: bool
+) -> tuple[F64, F64]:
     """Of the shared parameters (S,) and of the poses (V, 6)."""
-    H, g = _normals(blocks, limit)
+    H, g = _view_normal_equations(blocks, limit)
     S = H.shape[1] - 6
-    told, back = _eliminated(H, g, damping)
-    if fixed:
-        return np.zeros(S), back[..., -1]
-    whole = told.sum(axis=0)
-    held = damping * np.diag(np.diag(H[:, :S, :S].sum(axis=0)))
-    shared = np.linalg.solve(whole[:, :S] + held, whole[:, S])
-    return shared, back[..., -1] - back[..., :S] @ shared
+    reduced, back_substitution = _schur_complement(H, g, damping)
+    if cameras_fixed:
+        return np.zeros(S), back_substitution[..., -1]
+    total = reduced.sum(axis=0)
+    damped = damping * np.diag(np.diag(H[:, :S, :S].sum(axis=0)))
+    shared = np.linalg.solve(total[:, :S] + damped, total[:, S])
+    return shared, back_substitution[..., -1] - back_substitution[..., :S] @ shared
 
 
-def _normals(blocks: list[tuple[F64, F64]], limit: float) -> tuple[F64, F64]:
-    """`_normal` of each view: H (V, S + 6, S + 6) and g (V, S + 6)."""
-    H, g = zip(*(_normal(block, limit) for block in blocks), strict=True)
+def _view_normal_equations(blocks: list[tuple[F64, F64]], limit: float) -> tuple[F64, F64]:
+    """`_normal_equations` of each view: H (V, S + 6, S + 6) and g (V, S + 6)."""
+    H, g = zip(*(_normal_equations(block, limit) for block in blocks), strict=True)
     return np.stack(H), np.stack(g)
 
 
-def _eliminated(H: F64, g: F64, damping: float) -> tuple[F64, F64]:
+def _schur_complement(H: F64, g: F64, damping: float) -> tuple[F64, F64]:
     """What each view tells of the shared parameters, its pose left free: H and g beside it, (V, S, S + 1);
     and by how much its pose follows them, with where it goes by itself, (V, 6, S + 1)."""
     S = H.shape[1] - 6
     Hpp = H[:, S:, S:] * (1 + damping * np.eye(6))
-    back = np.linalg.solve(Hpp, np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
-    return np.concatenate([H[:, :S, :S], g[:, :S, None]], axis=2) - H[:, :S, S:] @ back, back
+    back_substitution = np.linalg.solve(Hpp, np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
+    return np.concatenate([H[:, :S, :S], g[:, :S, None]], axis=2) - H[
+        :, :S, S:
+    ] @ back_substitution, back_substitution
 
 
-def _moved(state: State, shared: F64, poses: F64) -> State | None:
+def _updated_state(state: CameraBundleState, shared: F64, poses: F64) -> CameraBundleState | None:
     """None where a step leads to no camera."""
     try:
         cameras = tuple(
-            camera_of(intrinsics(camera) + shared[part], camera)
-            for camera, part in zip(state.cameras, state.parts, strict=True)
+            camera_from_parameters(intrinsics(camera) + shared[part], camera)
+            for camera, part in zip(state.cameras, state.intrinsic_slices, strict=True)
         )
     except ValueError:
         return None
     mount = state.T_cam1_cam0 @ se3.exp(shared[-6:]) if len(cameras) == 2 else state.T_cam1_cam0
-    return State(cameras, mount, state.T_cam0_target @ se3.exp(poses))
+    return CameraBundleState(cameras, mount, state.T_cam0_target @ se3.exp(poses))
 
 
-def _solution(views: Sequence[View], target: Target, state: State, limit: float) -> Solution:
-    blocks = [_block(state, view, k, target) for k, view in enumerate(views)]
-    told, _ = _eliminated(*_normals(blocks, limit), damping=0.0)
-    sigma_px = spread(np.concatenate([r for r, _ in blocks]))
-    H, g = told[..., :-1], told[..., -1]
+def _solution(
+    views: Sequence[BoardView], target: Target, state: CameraBundleState, limit: float
+) -> CameraBundleSolution:
+    blocks = [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
+    reduced, _ = _schur_complement(*_view_normal_equations(blocks, limit), damping=0.0)
+    sigma_px = robust_sigma(np.concatenate([r for r, _ in blocks]))
+    H, g = reduced[..., :-1], reduced[..., -1]
     independent = sigma_px**2 * np.linalg.inv(H.sum(axis=0))
-    return Solution(state, independent, jackknife(H, g), errors(state, views, target), sigma_px)
+    return CameraBundleSolution(
+        state, independent, jackknife(H, g), reprojection_residuals(state, views, target), sigma_px
+    )

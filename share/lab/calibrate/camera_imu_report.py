@@ -11,11 +11,11 @@ import yaml
 
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
-from share.lab.calibrate.board_views import Stamped
-from share.lab.calibrate.camera_imu.fit import Fit
-from share.lab.calibrate.camera_imu.verdict import Comparison, Verdict
-from share.lab.calibrate.camera_report import RigDoubt
-from share.lab.calibrate.corners import kept
+from share.lab.calibrate.board_views import StampedViews
+from share.lab.calibrate.camera_imu.fit import CameraImuFit
+from share.lab.calibrate.camera_imu.verdict import CameraImuVerdict, MountingComparison
+from share.lab.calibrate.camera_report import RigUncertainty
+from share.lab.calibrate.corners import inlier_mask
 from share.recordings.calibration import Calibration, to_kalibr
 from share.types import F64, I64
 
@@ -24,7 +24,7 @@ from share.types import F64, I64
 _COLOURS = ("#00798c", "#d1495b", "#edae49")
 
 
-def residual_png(fit: Fit, title: str) -> bytes:
+def residual_chart(fit: CameraImuFit, title: str) -> bytes:
     """PNG: RMS of each picture's corners that were kept, and the residuals of gyroscope and accelerometer
     with three sigmas of what they are said to have."""
     import matplotlib
@@ -35,8 +35,8 @@ def residual_png(fit: Fit, title: str) -> bytes:
     figure, panels = pyplot.subplots(3, 1, figsize=(12, 8), layout="constrained", sharex=True)
     _draw_corners(panels[0], fit)
     t = _seconds(fit, fit.imu.stamps_ns)
-    _draw_inertial(panels[1], t, fit.gyro, fit.stated.gyro, "gyroscope, rad/s")
-    _draw_inertial(panels[2], t, fit.accel, fit.stated.accel, "accelerometer, m/s²")
+    _draw_inertial(panels[1], t, fit.gyro, fit.stated_sigmas.gyro, "gyroscope, rad/s")
+    _draw_inertial(panels[2], t, fit.accel, fit.stated_sigmas.accel, "accelerometer, m/s²")
     panels[2].set_xlabel("s")
     figure.suptitle(title)
     out = io.BytesIO()
@@ -45,18 +45,18 @@ def residual_png(fit: Fit, title: str) -> bytes:
     return out.getvalue()
 
 
-def _seconds(fit: Fit, stamps_ns: I64) -> F64:
+def _seconds(fit: CameraImuFit, stamps_ns: I64) -> F64:
     return np.asarray((stamps_ns - fit.state.curve.start_ns) * 1e-9, np.float64)
 
 
-def _draw_corners(panel: Any, fit: Fit) -> None:
-    t = _seconds(fit, fit.sights.stamps_ns) + fit.shift_s
-    for eye, (r, seen) in enumerate(zip(fit.corners, fit.sights.corners, strict=True)):
-        inside = kept(r, fit.sigmas.px)
-        frames, size = seen.frame[inside], len(t)
+def _draw_corners(panel: Any, fit: CameraImuFit) -> None:
+    t = _seconds(fit, fit.observations.stamps_ns) + fit.shift_s
+    for cam, (r, observations) in enumerate(zip(fit.corners, fit.observations.corners, strict=True)):
+        inliers = inlier_mask(r, fit.sigmas.px)
+        frames, size = observations.frame[inliers], len(t)
         count = np.bincount(frames, minlength=size)
-        rms = np.sqrt(np.bincount(frames, (r[inside] ** 2).sum(axis=1), size) / np.maximum(count, 1))
-        panel.plot(t[count > 0], rms[count > 0], ".", markersize=3, color=_COLOURS[eye], label=f"cam{eye}")
+        rms = np.sqrt(np.bincount(frames, (r[inliers] ** 2).sum(axis=1), size) / np.maximum(count, 1))
+        panel.plot(t[count > 0], rms[count > 0], ".", markersize=3, color=_COLOURS[cam], label=f"cam{cam}")
     panel.set(ylabel="px", ylim=(0, None), title="corners, RMS of each picture")
     panel.legend(loc="upper right", fontsize=8)
     panel.grid(alpha=0.3)
@@ -77,23 +77,23 @@ REPORT, PICTURE = "camera-imu-report.json", "camera-imu-report.png"
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class CameraImuCalibration:
     """All that is told of one calibration. rig: the cameras as they were known, doubt: how well; before: how
     T_imu_cam0 that was given compares; pictures: what was looked at; said: the cameras' calibration that was
     given; serial: of the device."""
 
-    fit: Fit
-    verdict: Verdict
+    fit: CameraImuFit
+    verdict: CameraImuVerdict
     rig: Rig
-    doubt: RigDoubt
+    uncertainty: RigUncertainty
     noise: ImuNoise
-    before: Comparison | None
-    pictures: Stamped
-    said: Calibration | None = None
+    comparison: MountingComparison | None
+    views: StampedViews
+    given_calibration: Calibration | None = None
     serial: str | None = None
 
     @property
-    def calibrated(self) -> Rig:
+    def calibrated_rig(self) -> Rig:
         return replace(
             self.rig, T_body_cam0=self.fit.T_imu_cam0, timeshift_s=self.fit.shift_s, imu=self.noise
         )
@@ -102,72 +102,75 @@ class Outcome:
     def T_cam_imu(self) -> tuple[F64, ...]:
         """(4, 4) of each camera."""
         T = se3.inverse(self.fit.T_imu_cam0)
-        return tuple(mount @ T for mount in self.fit.sights.mounts)
+        return tuple(mount @ T for mount in self.fit.observations.mounts)
 
 
-def camchain_text(outcome: Outcome, source: str, report: str) -> str:
+def camchain_yaml(outcome: CameraImuCalibration, source: str, report: str) -> str:
     """Kalibr's camchain-imucam: intrinsics as they were, T_cam_imu and timeshift_cam_imu of each camera.
     report: the name of the file that says why it failed."""
-    chain = to_kalibr(outcome.calibrated, outcome.said, outcome.serial)
+    chain = to_kalibr(outcome.calibrated_rig, outcome.given_calibration, outcome.serial)
     del chain["imu0"]
-    for eye, T in enumerate(outcome.T_cam_imu):
-        chain[f"cam{eye}"] |= {"T_cam_imu": T.tolist(), "timeshift_cam_imu": outcome.fit.shift_s}
+    for cam, T in enumerate(outcome.T_cam_imu):
+        chain[f"cam{cam}"] |= {"T_cam_imu": T.tolist(), "timeshift_cam_imu": outcome.fit.shift_s}
     verdict = "passed" if outcome.verdict.passed else f"FAILED, see {report}"
     head = f"# share calibrate camera-imu {source}: {verdict}\n# t_imu = t_cam + timeshift_cam_imu\n"
     return head + yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
 
 
-def imu_chain_text(outcome: Outcome, source: str) -> str:
+def imu_chain_yaml(outcome: CameraImuCalibration, source: str) -> str:
     """The IMU's noise as the recording has it, so that the folder is whole."""
-    chain = {"imu0": to_kalibr(outcome.calibrated, serial=outcome.serial)["imu0"]}
+    chain = {"imu0": to_kalibr(outcome.calibrated_rig, serial=outcome.serial)["imu0"]}
     return f"# as it came with share calibrate camera-imu {source}\n" + yaml.safe_dump(chain, sort_keys=False)
 
 
-def to_json(outcome: Outcome) -> dict[str, Any]:
+def report_values(outcome: CameraImuCalibration) -> dict[str, Any]:
     """Plain data."""
-    fit, verdict, before = outcome.fit, outcome.verdict, outcome.before
+    fit, verdict, comparison = outcome.fit, outcome.verdict, outcome.comparison
     return {
         "passed": verdict.passed,
         "reasons": list(verdict.reasons),
-        "pictures": outcome.pictures.looked,
-        "pictures_with_target": outcome.pictures.with_target,
-        "pictures_dropped": outcome.pictures.dropped,
+        "pictures": outcome.views.images_searched,
+        "pictures_with_target": outcome.views.with_target,
+        "pictures_dropped": outcome.views.dropped,
         "seconds": fit.state.curve.end_s,
         "T_cam_imu": [T.tolist() for T in outcome.T_cam_imu],
         "T_imu_cam0": fit.T_imu_cam0.tolist(),
         "timeshift_cam_imu": fit.shift_s,
-        "sigmas": _sigmas(fit.sigmas_of(fit.covariance)),
-        "sigmas_by_noise": _sigmas(fit.sigmas_of(fit.by_noise)),
-        "sigmas_by_cameras": None if fit.by_rig is None else _sigmas(fit.sigmas_of(fit.by_rig)),
-        "cameras_known_by": outcome.doubt.where,
+        "sigmas": _sigma_values(fit.axis_sigmas(fit.covariance)),
+        "sigmas_by_noise": _sigma_values(fit.axis_sigmas(fit.by_noise)),
+        "sigmas_by_cameras": None if fit.by_rig is None else _sigma_values(fit.axis_sigmas(fit.by_rig)),
+        "cameras_known_by": outcome.uncertainty.source,
         "covariance": fit.covariance.tolist(),
         "gravity": fit.state.gravity.tolist(),
         "gravity_norm": float(np.linalg.norm(fit.state.gravity)),
         "gyro_bias": fit.state.biases[:, :3].mean(axis=0).tolist(),
         "accel_bias": fit.state.biases[:, 3:].mean(axis=0).tolist(),
-        "turning_rms": verdict.turning.tolist(),
-        "moving_rms": verdict.moving.tolist(),
-        "residuals": _residuals(outcome),
-        "began": {"timeshift_cam_imu": fit.began.shift_s, "correlation": fit.began.correlation},
-        "given": None if before is None else vars(before) | {"far": before.far},
+        "turning_rms": verdict.rotation_rate_rms.tolist(),
+        "moving_rms": verdict.acceleration_rms.tolist(),
+        "residuals": _residual_values(outcome),
+        "began": {
+            "timeshift_cam_imu": fit.initial_alignment.shift_s,
+            "correlation": fit.initial_alignment.correlation,
+        },
+        "given": None if comparison is None else vars(comparison) | {"far": comparison.is_far},
     }
 
 
-def _sigmas(seven: F64) -> dict[str, Any]:
+def _sigma_values(sigmas: F64) -> dict[str, Any]:
     return {
-        "rotation_rad": seven[:3].tolist(),
-        "position_m": seven[3:6].tolist(),
-        "timeshift_s": float(seven[6]),
+        "rotation_rad": sigmas[:3].tolist(),
+        "position_m": sigmas[3:6].tolist(),
+        "timeshift_s": float(sigmas[6]),
     }
 
 
-def _residuals(outcome: Outcome) -> dict[str, Any]:
+def _residual_values(outcome: CameraImuCalibration) -> dict[str, Any]:
     fit, verdict = outcome.fit, outcome.verdict
     cameras = [
-        {"rms_px": rms, "corners": len(r), "corners_left_out": wrong}
-        for rms, r, wrong in zip(verdict.rms_px, fit.corners, verdict.wrong, strict=True)
+        {"rms_px": rms, "corners": len(r), "corners_left_out": outliers}
+        for rms, r, outliers in zip(verdict.rms_px, fit.corners, verdict.outlier_corners, strict=True)
     ]
-    rows = (("gyro", fit.gyro, fit.stated.gyro), ("accel", fit.accel, fit.stated.accel))
+    rows = (("gyro", fit.gyro, fit.stated_sigmas.gyro), ("accel", fit.accel, fit.stated_sigmas.accel))
     inertial = {
         name: {"rms": np.sqrt((r**2).mean(axis=0)).tolist(), "stated": stated, "samples": len(r)}
         for name, r, stated in rows

@@ -13,13 +13,13 @@ import numpy as np
 
 from share.errors import DataError
 from share.geometry import se3
-from share.geometry.se3 import rotation
+from share.geometry.se3 import best_rotation
 from share.types import F64, I64
 
-LEAST_TURN = np.radians(5.0)  # rms about the second axis; below, one direction is guessed
-_LEAST_MOTIONS = 10
-_ROUNDS = 10
-_CAUCHY = 2.5  # robust sigmas at which a motion begins to be doubted
+MIN_ROTATION_RAD = np.radians(5.0)  # rms about the second axis; below, one direction is guessed
+_MIN_MOTIONS = 10
+_ITERATIONS = 10
+_CAUCHY_SIGMAS = 2.5  # robust sigmas at which a motion begins to be doubted
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class HandEye:
 
     T_a_b: F64
     cov: F64
-    turning: F64
+    rotation_rms_by_axis: F64
     rotation_rms: float
     position_rms: float
     motions: int
@@ -41,109 +41,113 @@ def hand_eye(A: F64, B: F64) -> HandEye:
 
     Raises DataError for fewer than 10, and where the bodies turned about one axis only, or not at all.
     """
-    if A.shape != B.shape or len(A) < _LEAST_MOTIONS:
+    if A.shape != B.shape or len(A) < _MIN_MOTIONS:
         raise DataError(
-            f"hand-eye: {min(len(A), len(B))} motions, at least {_LEAST_MOTIONS} are needed; record longer"
+            f"hand-eye: {min(len(A), len(B))} motions, at least {_MIN_MOTIONS} are needed; record longer"
         )
     alpha, beta = se3.so3_log(A[:, :3, :3]), se3.so3_log(B[:, :3, :3])
-    turning = np.linalg.svd(alpha, compute_uv=False) / np.sqrt(len(alpha))
-    if turning[1] < LEAST_TURN:
-        most, next_most, least = np.degrees([*turning[:2], LEAST_TURN])
+    rotation_rms_by_axis = np.linalg.svd(alpha, compute_uv=False) / np.sqrt(len(alpha))
+    if rotation_rms_by_axis[1] < MIN_ROTATION_RAD:
+        largest, second, needed = np.degrees([*rotation_rms_by_axis[:2], MIN_ROTATION_RAD])
         raise DataError(
-            f"hand-eye: the bodies turned by {most:.1f} deg rms about one axis and by {next_most:.1f} deg "
-            f"about the next, {least:.0f} are needed; turn the device about two axes or more: nod, roll, "
+            f"hand-eye: the bodies turned by {largest:.1f} deg rms about one axis and by {second:.1f} deg "
+            f"about the next, {needed:.0f} are needed; turn the device about two axes or more: nod, roll, "
             "look around"
         )
-    R = _rotation(alpha, beta)
-    return _refined(A, B, se3.compose(R, _translation(A, B, R)), turning)
+    R = _initial_rotation(alpha, beta)
+    return _refine(A, B, se3.from_rt(R, _initial_translation(A, B, R)), rotation_rms_by_axis)
 
 
-def _rotation(alpha: F64, beta: F64) -> F64:
+def _initial_rotation(alpha: F64, beta: F64) -> F64:
     """(3, 3) that takes beta to alpha, both (N, 3)."""
     weight = np.ones(len(alpha))
-    for _ in range(_ROUNDS):
-        R = rotation((alpha * weight[:, None]).T @ beta)
-        weight = _weights(np.linalg.norm(alpha - beta @ R.T, axis=1))
+    for _ in range(_ITERATIONS):
+        R = best_rotation((alpha * weight[:, None]).T @ beta)
+        weight = _cauchy_weights(np.linalg.norm(alpha - beta @ R.T, axis=1))
     return R
 
 
-def _translation(A: F64, B: F64, R: F64) -> F64:
+def _initial_translation(A: F64, B: F64, R: F64) -> F64:
     """(3,) with (R_A - I) t = R t_B - t_A."""
     J, y = A[:, :3, :3] - np.eye(3), B[:, :3, 3] @ R.T - A[:, :3, 3]
     weight = np.ones(len(A))
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         JW = J * weight[:, None, None]
         t = np.linalg.solve(np.einsum("nij,nik->jk", JW, J), np.einsum("nij,ni->j", JW, y))
-        weight = _weights(np.linalg.norm(J @ t - y, axis=1))
+        weight = _cauchy_weights(np.linalg.norm(J @ t - y, axis=1))
     return np.asarray(t, np.float64)
 
 
-def _weights(size: F64) -> F64:
+def _cauchy_weights(size: F64) -> F64:
     """Cauchy's (N,), by residuals' sizes; their scale from the median."""
     scale = max(float(np.median(size)), 1e-12)
-    return np.asarray(1 / (1 + (size / (_CAUCHY * scale)) ** 2), np.float64)
+    return np.asarray(1 / (1 + (size / (_CAUCHY_SIGMAS * scale)) ** 2), np.float64)
 
 
-def _refined(A: F64, B: F64, X: F64, turning: F64) -> HandEye:
+def _refine(A: F64, B: F64, X: F64, rotation_rms_by_axis: F64) -> HandEye:
     """Both at once, by Gauss-Newton from X: turns and ways weighed by what is left of each, since far ways
     tell the rotation too. Exp(xi) at the right of X moves Log(B^-1 X^-1 A X) by xi - Ad(B^-1) xi."""
     J = np.eye(6) - se3.adjoint(se3.inverse(B))
     weight = np.ones(len(A))
-    for _ in range(_ROUNDS):
-        left = se3.log(se3.inverse(B) @ se3.inverse(X) @ A @ X)
-        rms = [float(np.sqrt(np.average((part**2).sum(1), weights=weight))) for part in np.split(left, 2, 1)]
+    for _ in range(_ITERATIONS):
+        residuals = se3.log(se3.inverse(B) @ se3.inverse(X) @ A @ X)
+        rms = [
+            float(np.sqrt(np.average((part**2).sum(1), weights=weight))) for part in np.split(residuals, 2, 1)
+        ]
         sigma = np.repeat(np.maximum(rms, 1e-12), 3) / np.sqrt(3)
-        weight = _weights(np.linalg.norm(left / sigma, axis=1))
+        weight = _cauchy_weights(np.linalg.norm(residuals / sigma, axis=1))
         JW = J / sigma[:, None] ** 2 * weight[:, None, None]
         cov = np.linalg.inv(np.einsum("nij,nik->jk", JW, J))
-        X = X @ se3.exp(-cov @ np.einsum("nij,ni->j", JW, left))
-    return HandEye(X, cov, turning, rms[0], rms[1], len(A))
+        X = X @ se3.exp(-cov @ np.einsum("nij,ni->j", JW, residuals))
+    return HandEye(X, cov, rotation_rms_by_axis, rms[0], rms[1], len(A))
 
 
 # ---- A mounting found otherwise, checked by hand-eye from the paths of both bodies.
 
-_SPAN_NS = 1_000_000_000  # of a motion: long enough to turn, short enough not to drift
-_APART = 4.0  # standard errors by which two ways may differ
+_MOTION_NS = 1_000_000_000  # of a motion: long enough to turn, short enough not to drift
+_MAX_SIGMAS = 4.0  # standard errors by which two ways may differ
 
 
 @dataclass(frozen=True, eq=False)
-class Check:
+class HandEyeCheck:
     """turned rad, shifted m: how far `found` is from what was to be checked; sigmas: that in standard errors
     of hand-eye (Mahalanobis over the square root of six)."""
 
-    found: HandEye
-    turned: float
-    shifted: float
+    hand_eye: HandEye
+    rotation_error_rad: float
+    translation_error_m: float
     sigmas: float
 
     @property
     def agrees(self) -> bool:
-        return self.sigmas < _APART
+        return self.sigmas < _MAX_SIGMAS
 
 
-def check(T_a_b: F64, stamps_ns: I64, T_a: F64, T_b: F64) -> Check:
+def check_mounting(T_a_b: F64, stamps_ns: I64, T_a: F64, T_b: F64) -> HandEyeCheck:
     """T_a_b (4, 4) by paths T_a, T_b (N, 4, 4) of both bodies at stamps (N,), each in its own world.
 
     Raises DataError where they are too short, or turn about one axis only.
     """
-    first, last = _motions(stamps_ns)
+    first, last = _motion_ends(stamps_ns)
     if not len(first):
         raise DataError("hand-eye: the two paths do not overlap by a second; are they of one recording?")
-    found = hand_eye(_between(T_a, first, last), _between(T_b, first, last))
-    error = se3.log(se3.inverse(found.T_a_b) @ T_a_b)
-    shared = max(1.0, _SPAN_NS / float(np.median(np.diff(stamps_ns))))  # motions that overlap tell the same
-    sigmas = np.sqrt(error @ np.linalg.solve(found.cov * shared, error) / len(error))
-    turned, shifted = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
-    return Check(found, float(turned), float(shifted), float(sigmas))
+    estimate = hand_eye(_relative_motions(T_a, first, last), _relative_motions(T_b, first, last))
+    error = se3.log(se3.inverse(estimate.T_a_b) @ T_a_b)
+    overlap_factor = max(
+        1.0, _MOTION_NS / float(np.median(np.diff(stamps_ns)))
+    )  # motions that overlap tell the same
+    sigmas = np.sqrt(error @ np.linalg.solve(estimate.cov * overlap_factor, error) / len(error))
+    rotation_error, translation_error = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+    return HandEyeCheck(estimate, float(rotation_error), float(translation_error), float(sigmas))
 
 
-def _motions(stamps_ns: I64) -> tuple[I64, I64]:
+def _motion_ends(stamps_ns: I64) -> tuple[I64, I64]:
     """Places (M,) where motions of about a second begin and end; none over a gap."""
-    last = np.searchsorted(stamps_ns, stamps_ns + _SPAN_NS)
+    last = np.searchsorted(stamps_ns, stamps_ns + _MOTION_NS)
     first = np.flatnonzero(last < len(stamps_ns))
-    near = stamps_ns[last[first]] - stamps_ns[first] < 1.5 * _SPAN_NS
+    near = stamps_ns[last[first]] - stamps_ns[first] < 1.5 * _MOTION_NS
     return first[near], last[first[near]]
 
 
-def _between(T: F64, first: I64, last: I64) -> F64:
+def _relative_motions(T: F64, first: I64, last: I64) -> F64:
     return np.asarray(se3.inverse(T[first]) @ T[last], np.float64)

@@ -16,20 +16,20 @@ from typing import NamedTuple
 import numpy as np
 
 from share.errors import DataError
-from share.lab.calibrate.allan import AllanCurve, scatter
+from share.lab.calibrate.allan import AllanCurve, variance_covariance
 from share.types import F64
 
-PARTS = ("quantisation", "density", "instability", "walk")  # c, N, B, K
-FLAT = 2 * np.log(2) / np.pi
-_SHORTEST = 8  # samples: below, filters and interpolation are more than c / tau^2
-_LEAST_POINTS = 8
-_ROUNDS = 6  # of weights that follow the model; settled after four
-_TOLD = 2.5  # sigmas by which a square must differ from nothing to be a number
-_BOUND = 1.645  # one-sided 95 %
-_HUGE = 1e-12  # of the largest weight, so that a model without noise can be weighed
+COEFFICIENTS = ("quantisation", "density", "instability", "walk")  # c, N, B, K
+FLICKER_FACTOR = 2 * np.log(2) / np.pi
+_MIN_AVERAGE = 8  # samples: below, filters and interpolation are more than c / tau^2
+_MIN_POINTS = 8
+_ITERATIONS = 6  # of weights that follow the model; settled after four
+_SIGNIFICANT_SIGMAS = 2.5  # sigmas by which a square must differ from nothing to be a number
+_BOUND_SIGMAS = 1.645  # one-sided 95 %
+_JITTER = 1e-12  # of the largest weight, so that a model without noise can be weighed
 
 
-class Figure(NamedTuple):
+class NoiseEstimate(NamedTuple):
     """value and its standard error; told: whether it differs from nothing. Where it does not, only `bound`
     is known: it is below that, by 95 %."""
 
@@ -39,7 +39,7 @@ class Figure(NamedTuple):
     bound: float
 
     @property
-    def cautious(self) -> float:
+    def conservative(self) -> float:
         """The value, or the bound where that is all."""
         return self.value if self.told else self.bound
 
@@ -56,10 +56,10 @@ class AxisNoise:
     lies at each averaging time of the curve, by 95 %; modelled (T,): as fitted, NaN for averages
     of fewer samples than are fitted."""
 
-    density: Figure
-    instability: Figure
-    walk: Figure
-    quantisation: Figure
+    density: NoiseEstimate
+    instability: NoiseEstimate
+    walk: NoiseEstimate
+    quantisation: NoiseEstimate
     squares: F64
     errors: F64
     low: F64
@@ -67,32 +67,36 @@ class AxisNoise:
     modelled: F64
 
 
-def fit(curve: AllanCurve, model_error: float = 0.02) -> tuple[AxisNoise, ...]:
+def fit_noise(curve: AllanCurve, model_error: float = 0.02) -> tuple[AxisNoise, ...]:
     """Each axis. model_error: of the variance, by which no real sensor is believed to follow the model.
 
     Raises DataError for a curve that is too short to fit.
     """
-    first = int(np.searchsorted(curve.sizes, _SHORTEST))
-    if len(curve.sizes) - first < _LEAST_POINTS:
+    first = int(np.searchsorted(curve.sizes, _MIN_AVERAGE))
+    if len(curve.sizes) - first < _MIN_POINTS:
         raise DataError("Allan deviation: the recording is too short to tell noise; record longer")
-    spread = scatter(curve.sizes, curve.lengths, curve.rate_hz)
-    return tuple(_axis(curve.taus, column**2, spread, first, model_error) for column in curve.deviation.T)
+    covariance = variance_covariance(curve.sizes, curve.segment_lengths, curve.rate_hz)
+    return tuple(
+        _fit_axis(curve.taus, column**2, covariance, first, model_error) for column in curve.deviation.T
+    )
 
 
-def _axis(taus: F64, variance: F64, spread: F64, first: int, model_error: float) -> AxisNoise:
-    A = np.stack([taus**-2, 1 / taus, np.full(len(taus), FLAT), taus / 3], axis=1)
+def _fit_axis(taus: F64, variance: F64, covariance: F64, first: int, model_error: float) -> AxisNoise:
+    A = np.stack([taus**-2, 1 / taus, np.full(len(taus), FLICKER_FACTOR), taus / 3], axis=1)
     if not variance[first:].all():
         raise DataError("Allan deviation: an axis does not change; is the sensor alive?")
-    weights = _Weights(A[first:], spread[:, :, first:, first:], model_error)
-    squares = _solve(weights, variance[first:])
+    weights = _NoiseWeights(A[first:], covariance[:, :, first:, first:], model_error)
+    squares = _fit_squares(weights, variance[first:])
     errors = weights.sigmas(squares)
-    figures = [_figure(squares[k], errors[k], weights.margin(squares, k)) for k in range(4)]
-    low, high = _interval(np.sqrt(variance), A, squares, spread)
+    estimates = [
+        _estimate_from_square(squares[k], errors[k], weights.bound_margin(squares, k)) for k in range(4)
+    ]
+    low, high = _confidence_interval(np.sqrt(variance), A, squares, covariance)
     return AxisNoise(
-        density=figures[1],
-        instability=figures[2],
-        walk=figures[3],
-        quantisation=_scaled(figures[0], 1 / np.sqrt(3)),
+        density=estimates[1],
+        instability=estimates[2],
+        walk=estimates[3],
+        quantisation=_scaled(estimates[0], 1 / np.sqrt(3)),
         squares=squares,
         errors=errors,
         low=low,
@@ -101,86 +105,90 @@ def _axis(taus: F64, variance: F64, spread: F64, first: int, model_error: float)
     )
 
 
-def together(axes: Sequence[AxisNoise], name: str) -> Figure:
+def combine_axes(axes: Sequence[AxisNoise], name: str) -> NoiseEstimate:
     """density, instability or walk of axes taken for alike: the root of the mean of their squares."""
-    k = PARTS.index(name)
+    k = COEFFICIENTS.index(name)
     squares = np.array([max(axis.squares[k], 0.0) for axis in axes])
     bounds = np.array([getattr(axis, name).bound ** 2 for axis in axes])
     sigma = np.linalg.norm([axis.errors[k] for axis in axes]) / len(axes)
-    return _figure(squares.mean(), float(sigma), float(np.linalg.norm(bounds - squares)) / len(axes))
+    return _estimate_from_square(
+        squares.mean(), float(sigma), float(np.linalg.norm(bounds - squares)) / len(axes)
+    )
 
 
-class _Weights(NamedTuple):
-    """A (T, 4): Allan variance of a unit of each square; spread (3, 3, T, T) of `scatter`."""
+class _NoiseWeights(NamedTuple):
+    """A (T, 4): Allan variance of a unit of each square; spread (3, 3, T, T) of `variance_covariance`."""
 
     A: F64
-    spread: F64
+    covariance: F64
     model_error: float
 
-    def root(self, squares: F64, model: F64) -> F64:
+    def cholesky(self, squares: F64, model: F64) -> F64:
         """Cholesky factor (T, T) of the variances' covariance: as the parts have it, at `model`'s level."""
-        parts = _parts(squares)
+        parts = _noise_squares(squares)
         ratio = model / (self.A[:, 1:] @ parts)
-        C = np.einsum("a,b,abij->ij", parts, parts, self.spread) * np.outer(ratio, ratio)
-        C += np.diag((self.model_error * model) ** 2 + _HUGE * np.diag(C))
+        C = np.einsum("a,b,abij->ij", parts, parts, self.covariance) * np.outer(ratio, ratio)
+        C += np.diag((self.model_error * model) ** 2 + _JITTER * np.diag(C))
         return np.asarray(np.linalg.cholesky(C), np.float64)
 
     def sigmas(self, squares: F64) -> F64:
         """(4,) standard errors, if the truth were `squares`."""
         from scipy.linalg import solve_triangular
 
-        model = np.maximum(self.A @ squares, 1e-3 * (self.A[:, 1:] @ _parts(squares)))
-        B = solve_triangular(self.root(squares, model), self.A, lower=True)
+        model = np.maximum(self.A @ squares, 1e-3 * (self.A[:, 1:] @ _noise_squares(squares)))
+        B = solve_triangular(self.cholesky(squares, model), self.A, lower=True)
         unit = np.linalg.norm(B, axis=0)
         return np.asarray(np.sqrt(np.diag(np.linalg.inv((B / unit).T @ (B / unit)))) / unit, np.float64)
 
-    def margin(self, squares: F64, k: int) -> float:
+    def bound_margin(self, squares: F64, k: int) -> float:
         """From square k to its bound: the truth that gives as little as was found in 5 % of recordings."""
-        supposed = squares.copy()
-        for _ in range(_ROUNDS):
-            supposed[k] = max(squares[k], 0.0) + _BOUND * self.sigmas(supposed)[k]
-        return float(supposed[k] - max(squares[k], 0.0))
+        assumed = squares.copy()
+        for _ in range(_ITERATIONS):
+            assumed[k] = max(squares[k], 0.0) + _BOUND_SIGMAS * self.sigmas(assumed)[k]
+        return float(assumed[k] - max(squares[k], 0.0))
 
 
-def _solve(weights: _Weights, variance: F64) -> F64:
+def _fit_squares(weights: _NoiseWeights, variance: F64) -> F64:
     """Squares (4,). The first weights are those of the measured curve, as if it were white."""
     from scipy.linalg import solve_triangular
     from scipy.optimize import nnls
 
-    signed = np.insert(weights.A, 1, -weights.A[:, 0], axis=1)  # c may have either sign
+    signed_design = np.insert(weights.A, 1, -weights.A[:, 0], axis=1)  # c may have either sign
     model, squares = variance, np.zeros(4)
-    for _ in range(_ROUNDS):
-        L = weights.root(squares, model)
-        B = solve_triangular(L, signed, lower=True)
+    for _ in range(_ITERATIONS):
+        L = weights.cholesky(squares, model)
+        B = solve_triangular(L, signed_design, lower=True)
         unit = np.linalg.norm(B, axis=0)
-        found = nnls(B / unit, solve_triangular(L, variance, lower=True))[0] / unit
-        squares = np.concatenate([[found[0] - found[1]], found[2:]])
+        solution = nnls(B / unit, solve_triangular(L, variance, lower=True))[0] / unit
+        squares = np.concatenate([[solution[0] - solution[1]], solution[2:]])
         model = np.maximum(weights.A @ squares, 1e-3 * variance)
     return squares
 
 
-def _parts(squares: F64) -> F64:
+def _noise_squares(squares: F64) -> F64:
     """N^2, B^2, K^2, by which variances scatter; white where c is all there is."""
     return squares[1:] if squares[1:].any() else np.array([1.0, 0.0, 0.0])
 
 
-def _interval(deviation: F64, A: F64, squares: F64, spread: F64) -> tuple[F64, F64]:
+def _confidence_interval(deviation: F64, A: F64, squares: F64, covariance: F64) -> tuple[F64, F64]:
     """(T,) each: 95 % about the measured deviation, by the chi-square of its equivalent degrees of freedom
     (NIST SP 1065, 5.3)."""
     from scipy.special import gammaincinv
 
-    parts = _parts(squares)
-    freedom = 2 * (A[:, 1:] @ parts) ** 2 / np.einsum("a,b,abii->i", parts, parts, spread)
+    parts = _noise_squares(squares)
+    freedom = 2 * (A[:, 1:] @ parts) ** 2 / np.einsum("a,b,abii->i", parts, parts, covariance)
     low, high = (deviation * np.sqrt(freedom / 2 / gammaincinv(freedom / 2, p)) for p in (0.975, 0.025))
     return low, high
 
 
-def _figure(square: float, sigma: float, margin: float) -> Figure:
+def _estimate_from_square(square: float, sigma: float, margin: float) -> NoiseEstimate:
     """Of the root of a fitted square; its error to first order. margin: from the square to the bound."""
     value, bound = float(np.sqrt(max(square, 0.0))), float(np.sqrt(max(square, 0.0) + margin))
-    told = bool(square > _TOLD * sigma)
-    return Figure(value, float(sigma) / (2 * value) if told else bound - value, told, bound)
+    is_significant = bool(square > _SIGNIFICANT_SIGMAS * sigma)
+    return NoiseEstimate(
+        value, float(sigma) / (2 * value) if is_significant else bound - value, is_significant, bound
+    )
 
 
-def _scaled(figure: Figure, by: float) -> Figure:
-    return Figure(figure.value * by, figure.sigma * by, figure.told, figure.bound * by)
+def _scaled(figure: NoiseEstimate, factor: float) -> NoiseEstimate:
+    return NoiseEstimate(figure.value * factor, figure.sigma * factor, figure.told, figure.bound * factor)

@@ -13,12 +13,12 @@ from share.files.yaml_file import read_yaml
 from share.geometry.camera import ImuNoise
 from share.recordings import tables
 from share.recordings.calibration import IMU_CHAIN, imu_noise
-from share.recordings.losses import Losses
+from share.recordings.losses import DataLosses
 from share.recordings.session import is_session, read_session
 from share.runtime.source import open_source
 from share.types import F64, I64, ImuBatch
 
-_KINDS = (
+_SUPPORTED = (
     "an .mcap recording, one of the RealSense SDK (.db3), SESSION/NAME, a folder with imu0/data.csv "
     "(EuRoC/ASL), or such a data.csv: t[ns],wx,wy,wz,ax,ay,az"
 )
@@ -35,91 +35,93 @@ class ImuTable:
     serial: str | None = None
 
 
-def read_imu(spec: str, told: Callable[[int, int], None] = lambda done, total: None) -> ImuTable:
-    """The samples of the recording that `spec` names. told: how many are read, of how many.
+def read_imu(source: str, on_progress: Callable[[int, int], None] = lambda done, total: None) -> ImuTable:
+    """The samples of the recording that `source` names. told: how many are read, of how many.
 
     Raises UsageError where it is none, DataError where it is damaged or has no IMU.
     """
-    path = Path(spec)
+    path = Path(source)
     if path.suffix == ".mcap" and path.is_file():
-        return _of_mcap(path.stem, path, told)
+        return _read_mcap(path.stem, path, on_progress)
     if path.suffix == ".db3" and path.is_file():
-        return _of_db3(path, told)
+        return _read_db3(path, on_progress)
     if is_session(path.parent) and not path.exists():
-        return _of_mcap(path.name, read_session(path.parent).recording(path.name), told)
-    for csv in imu_tables(path):
+        return _read_mcap(path.name, read_session(path.parent).recording(path.name), on_progress)
+    for csv in imu_csv_files(path):
         if csv.is_file():
-            losses = Losses()
+            losses = DataLosses()
             stamps, values = tables.read_table(csv, 7, losses=losses)
-            return _table(path.stem, stamps, values, lost=sum(losses.counts.values()))
+            return _clean_table(path.stem, stamps, values, unreadable=sum(losses.counts.values()))
     if not path.exists():
         raise UsageError(f"SOURCE {path}: no such file or folder")
-    raise UsageError(f"{spec}: is no recording of an IMU that SHARE reads: {_KINDS}")
+    raise UsageError(f"{source}: is no recording of an IMU that SHARE reads: {_SUPPORTED}")
 
 
-def imu_tables(path: Path) -> list[Path]:
+def imu_csv_files(path: Path) -> list[Path]:
     """Where the samples of a folder may be; a table itself."""
     if path.suffix == ".csv":
         return [path]
     return [path / "mav0" / "imu0" / "data.csv", path / "imu0" / "data.csv", path / "data.csv"]
 
 
-def _of_mcap(name: str, path: Path, told: Callable[[int, int], None]) -> ImuTable:
+def _read_mcap(name: str, path: Path, on_progress: Callable[[int, int], None]) -> ImuTable:
     from share.recordings.mcap.file import McapFile
     from share.recordings.mcap.imu import read_imu as read
     from share.recordings.mcap.reader import own_serial
 
-    file, losses = McapFile(path), Losses()
-    stamps, values = read(file, told, losses)
-    return _table(name, stamps, values, own_serial(file), sum(losses.counts.values()))
+    file, losses = McapFile(path), DataLosses()
+    stamps, values = read(file, on_progress, losses)
+    return _clean_table(name, stamps, values, own_serial(file), sum(losses.counts.values()))
 
 
-def _of_db3(path: Path, told: Callable[[int, int], None]) -> ImuTable:
-    from share.recordings.realsense import recorded_imu  # rosbags only where it is needed
+def _read_db3(path: Path, on_progress: Callable[[int, int], None]) -> ImuTable:
+    from share.recordings.realsense import read_recorded_imu  # rosbags only where it is needed
     from share.recordings.realsense_db3 import Db3
 
-    told(0, 1)
-    file, losses = Db3(path), Losses()
-    stamps, values = recorded_imu(file, losses)
-    table = _table(path.stem, stamps, values, file.serial, sum(losses.counts.values()))
-    told(1, 1)
+    on_progress(0, 1)
+    file, losses = Db3(path), DataLosses()
+    stamps, values = read_recorded_imu(file, losses)
+    table = _clean_table(path.stem, stamps, values, file.serial, sum(losses.counts.values()))
+    on_progress(1, 1)
     return table
 
 
-def _table(name: str, stamps_ns: I64, values: F64, serial: str | None = None, lost: int = 0) -> ImuTable:
+def _clean_table(
+    name: str, stamps_ns: I64, values: F64, serial: str | None = None, unreadable: int = 0
+) -> ImuTable:
     """lost: samples that could not even be read. Raises DataError where more than 5 % are damaged."""
     finite = np.asarray(np.isfinite(values).all(axis=1))
-    losses = Losses()
+    losses = DataLosses()
     for k in np.flatnonzero(~finite):
         losses.add("IMU samples", str(k), f"{name}: IMU sample {k + 1} is not finite")
     losses.check("IMU samples", len(finite))
     stamps_ns, values = stamps_ns[finite], values[finite]
     later = stamps_ns > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps_ns[:-1]]))
     imu = ImuBatch(stamps_ns[later], values[later, :3], values[later, 3:])
-    dropped = int(np.count_nonzero(~later)) + int(np.count_nonzero(~finite)) + lost
+    dropped = int(np.count_nonzero(~later)) + int(np.count_nonzero(~finite)) + unreadable
     return ImuTable(name, imu, dropped, serial)
 
 
 # ---- How noisy an IMU is, by a file or by the recording itself.
 
 
-def stated_noise(source: str, given: str | None, option: str) -> ImuNoise:
+def stated_noise(source: str, chain_path: str | None, option: str) -> ImuNoise:
     """Of what `option` gave (an IMU chain, or a folder with one), else as the source carries it.
 
     Raises UsageError or ConfigError.
     """
-    if given is not None:
-        chain = read_yaml(chain_file(given, option))
+    if chain_path is not None:
+        chain = read_yaml(chain_file(chain_path, option))
         if "imu0" not in chain:
-            raise UsageError(f"{option} {given}: has no imu0; give {IMU_CHAIN}, or a folder with one")
+            raise UsageError(f"{option} {chain_path}: has no imu0; give {IMU_CHAIN}, or a folder with one")
         return imu_noise(chain.section("imu0"), "update_rate")
-    noise = _own(Path(source))
+    noise = _source_noise(Path(source))
     if noise is None:
         raise UsageError(f"{source}: does not say how noisy the IMU is; give {option} DIR")
     return noise
 
 
-def _own(source: Path) -> ImuNoise | None:
+def _source_noise(source: Path) -> ImuNoise | None:
     """As the source says, with cameras or without: one that was recorded for its IMU alone has none."""
     if source.suffix == ".mcap" and source.is_file():
         from share.recordings.mcap.file import McapFile  # only where they are needed
@@ -127,16 +129,16 @@ def _own(source: Path) -> ImuNoise | None:
 
         rig = own_rig(McapFile(source), {}, needed=False)
         return None if rig is None else rig.imu
-    table = next((path for path in imu_tables(source) if path.is_file()), None)
+    table = next((path for path in imu_csv_files(source) if path.is_file()), None)
     if table is None:
         return open_source(str(source)).rig.imu
-    sheet = table.with_name("sensor.yaml")
-    return imu_noise(read_yaml(sheet), "rate_hz") if sheet.is_file() else None
+    sensor_file = table.with_name("sensor.yaml")
+    return imu_noise(read_yaml(sensor_file), "rate_hz") if sensor_file.is_file() else None
 
 
-def chain_file(given: str, option: str) -> Path:
+def chain_file(path_given: str, option: str) -> Path:
     """The IMU chain that `option` gave: it, or the one in that folder. Raises UsageError."""
-    path = Path(given) / IMU_CHAIN if Path(given).is_dir() else Path(given)
+    path = Path(path_given) / IMU_CHAIN if Path(path_given).is_dir() else Path(path_given)
     if not path.is_file():
-        raise UsageError(f"{option} {given}: has no {IMU_CHAIN}")
+        raise UsageError(f"{option} {path_given}: has no {IMU_CHAIN}")
     return path

@@ -15,7 +15,7 @@ import numpy as np
 
 from share.errors import ConfigError
 from share.files.yaml_file import Section, read_yaml
-from share.recordings.session import SESSION
+from share.recordings.session import SESSION_FILE
 from share.types import F64
 
 DICTIONARIES = ("4X4", "5X5", "6X6", "7X7")  # OpenCV's, each with 50, 100, 250 or 1000 markers
@@ -66,7 +66,7 @@ class AprilGrid:
     def corners(self) -> F64:
         """(4 N, 3) m, by id."""
         square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * self.tag_size
-        return _flat((self.tags[:, None] + square).reshape(-1, 2))
+        return _on_plane((self.tags[:, None] + square).reshape(-1, 2))
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,10 @@ class CharucoBoard:
             raise ValueError(
                 f"dictionary: '{self.dictionary}' is not known; one of DICT_4X4_50 .. DICT_7X7_1000"
             )
-        if len(self.marked) > known[self.dictionary]:
-            raise ValueError(f"dictionary: {self.dictionary} is too small for {len(self.marked)} markers")
+        if len(self.marker_squares) > known[self.dictionary]:
+            raise ValueError(
+                f"dictionary: {self.dictionary} is too small for {len(self.marker_squares)} markers"
+            )
 
     @property
     def extent(self) -> F64:
@@ -104,12 +106,12 @@ class CharucoBoard:
         return np.array([[0, 0], [self.squares_x * self.square, self.squares_y * self.square]])
 
     @property
-    def marked(self) -> F64:
+    def marker_squares(self) -> F64:
         """Lower left corner (M, 2) m of the white squares that carry markers, by marker id."""
         return self._squares(1)
 
     @property
-    def black(self) -> F64:
+    def black_squares(self) -> F64:
         """Lower left corner (B, 2) m of the black squares."""
         return self._squares(0)
 
@@ -117,19 +119,19 @@ class CharucoBoard:
     def corners(self) -> F64:
         """(N, 3) m, by id."""
         row, column = np.divmod(np.arange((self.squares_x - 1) * (self.squares_y - 1)), self.squares_x - 1)
-        return _flat(np.stack([column + 1, self.squares_y - 1 - row], axis=1) * self.square)
+        return _on_plane(np.stack([column + 1, self.squares_y - 1 - row], axis=1) * self.square)
 
     def _squares(self, parity: int) -> F64:
         row, column = np.divmod(np.arange(self.squares_x * self.squares_y), self.squares_x)
         chosen = (row + column) % 2 == parity
-        low: F64 = np.stack([column, self.squares_y - 1 - row], axis=1)[chosen] * self.square
-        return low
+        lower_left: F64 = np.stack([column, self.squares_y - 1 - row], axis=1)[chosen] * self.square
+        return lower_left
 
 
 Target: TypeAlias = AprilGrid | CharucoBoard
 
 
-def _flat(xy: F64) -> F64:
+def _on_plane(xy: F64) -> F64:
     return np.column_stack([xy, np.zeros(len(xy))])
 
 
@@ -173,7 +175,7 @@ T_WORLD_TARGET = "T_world_target"
 
 def read_target(path: Path) -> Target:
     """Raises ConfigError naming file and key."""
-    return target_of(read_yaml(path))
+    return target_from_section(read_yaml(path))
 
 
 def named_target(name: str) -> Target:
@@ -185,20 +187,20 @@ def named_target(name: str) -> Target:
     return read_target(Path(name))
 
 
-def target_of(section: Section) -> Target:
+def target_from_section(section: Section) -> Target:
     """The target of one mapping. Raises ConfigError naming where it stands and the key."""
     kind = section.text(_TYPE)
     if kind not in _KEYS:
         raise ConfigError(f"{section.where}: {_TYPE}: '{kind}' is not known; known: {', '.join(_KEYS)}")
     cls, names = _KEYS[kind]
-    beside = (_TYPE, T_WORLD_TARGET, *((_FIRST_TAG,) if cls is AprilGrid else ()))
-    if _FIRST_TAG in beside and section.number(_FIRST_TAG, 0.0):
+    other_keys = (_TYPE, T_WORLD_TARGET, *((_FIRST_TAG,) if cls is AprilGrid else ()))
+    if _FIRST_TAG in other_keys and section.number(_FIRST_TAG, 0.0):
         raise ConfigError(
             f"{section.where}: {_FIRST_TAG}: {section.get(_FIRST_TAG)} is not supported, tags must be "
             "numbered from 0; `share calibrate target` prints such a board"
         )
     for key in section.data:
-        if key not in names and key not in beside:
+        if key not in names and key not in other_keys:
             near = difflib.get_close_matches(str(key), names, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(names)}"
             raise ConfigError(f"{section.where}: unknown key '{key}'; {hint}")
@@ -212,15 +214,15 @@ def target_of(section: Section) -> Target:
 def session_target(folder: Path) -> tuple[Target, F64] | None:
     """The target in a session's room and T_world_target (4, 4), None where there is none. Raises
     ConfigError naming file and key."""
-    top = read_yaml(folder / SESSION)
+    top = read_yaml(folder / SESSION_FILE)
     if TARGET not in top:
         return None
     section = top.section(TARGET)
-    return target_of(section), section.pose(T_WORLD_TARGET)
+    return target_from_section(section), section.pose(T_WORLD_TARGET)
 
 
-def to_plain(target: Target) -> dict[str, Any]:
-    """As plain data for a YAML file, which `target_of` reads again."""
+def target_mapping(target: Target) -> dict[str, Any]:
+    """As plain data for a YAML file, which `target_from_section` reads again."""
     kind = next(kind for kind, (cls, _) in _KEYS.items() if isinstance(target, cls))
     return {_TYPE: kind} | {key: getattr(target, name) for key, name in _KEYS[kind][1].items()}
 

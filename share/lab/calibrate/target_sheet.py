@@ -29,11 +29,11 @@ PAPERS = {  # width and height, mm: ISO 216, and ANSI's
     "letter": (215.9, 279.4),
     "tabloid": (279.4, 431.8),
 }
-USUAL = {"aprilgrid": (6, 6), "charuco": (9, 7)}  # columns and rows
+DEFAULT_SIZES = {"aprilgrid": (6, 6), "charuco": (9, 7)}  # columns and rows
 MARGIN_MM = 10.0  # that no printer leaves white, and that detectors want
-FOOT_MM = 14.0  # under the target, for a ruler and a line of text
-_MARKER = 0.75  # of a square
-_CUSTOM = re.compile(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)")
+FOOTER_MM = 14.0  # under the target, for a ruler and a line of text
+_MARKER_SHARE = 0.75  # of a square
+_CUSTOM_PAPER = re.compile(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)")
 
 
 @dataclass(frozen=True)
@@ -44,78 +44,84 @@ class Sheet:
     width: float
     height: float
     left: float
-    low: float
+    bottom: float
 
 
-def sheet(kind: str, columns: int, rows: int, paper: str, edge_mm: float | None = None) -> Sheet:
-    """A target of a kind of `USUAL`, in the middle of the paper, which lies as suits it best.
+def make_sheet(kind: str, columns: int, rows: int, paper: str, edge_mm: float | None = None) -> Sheet:
+    """A target of a kind of `DEFAULT_SIZES`, in the middle of the paper, which lies as suits it best.
 
     paper: of `PAPERS`, or WxH in mm. edge_mm: of a tag or square; by default as many whole millimetres as
     fit, so that a ruler can tell whether it was printed true. Raises ValueError.
     """
-    across, up = _sides(board(kind, columns, rows, 1.0))
-    width, height = max((_size(paper), _size(paper)[::-1]), key=lambda size: _greatest(across, up, *size))
-    greatest = math.floor(10 * _greatest(across, up, width, height)) / 10
-    if greatest < 1:
+    width_edges, height_edges = _extent_sides(make_board(kind, columns, rows, 1.0))
+    width, height = max(
+        (_paper_size(paper), _paper_size(paper)[::-1]),
+        key=lambda size: _max_edge_mm(width_edges, height_edges, *size),
+    )
+    max_edge = math.floor(10 * _max_edge_mm(width_edges, height_edges, width, height)) / 10
+    if max_edge < 1:
         raise ValueError(f"{paper} is too small for {columns} x {rows}")
-    edge = math.floor(greatest) if edge_mm is None else edge_mm
-    if edge > greatest:
+    edge = math.floor(max_edge) if edge_mm is None else edge_mm
+    if edge > max_edge:
         board_mm = f"{columns} x {rows} of {edge:g} mm"
-        raise ValueError(f"{board_mm} do not fit on {paper}: {greatest:g} mm is the most there")
-    wide, high = across * edge, up * edge
-    left, low = (width - wide) / 2, FOOT_MM + (height - FOOT_MM - high) / 2
-    return Sheet(board(kind, columns, rows, edge / 1000), width, height, left, low)
+        raise ValueError(f"{board_mm} do not fit on {paper}: {max_edge:g} mm is the most there")
+    board_width, board_height = width_edges * edge, height_edges * edge
+    left, bottom = (width - board_width) / 2, FOOTER_MM + (height - FOOTER_MM - board_height) / 2
+    return Sheet(make_board(kind, columns, rows, edge / 1000), width, height, left, bottom)
 
 
-def board(kind: str, columns: int, rows: int, edge: float) -> Target:
+def make_board(kind: str, columns: int, rows: int, edge: float) -> Target:
     """edge: of a tag or square, m. Raises ValueError."""
     if kind == "aprilgrid":
         return AprilGrid(rows, columns, edge)
     markers = columns * rows // 2
     dictionary = "DICT_5X5_100" if markers <= 100 else "DICT_5X5_1000"
-    return CharucoBoard(columns, rows, edge, round(_MARKER * edge, 9), dictionary)
+    return CharucoBoard(columns, rows, edge, round(_MARKER_SHARE * edge, 9), dictionary)
 
 
-def _sides(target: Target) -> tuple[float, float]:
+def _extent_sides(target: Target) -> tuple[float, float]:
     low, high = target.extent
     across, up = (high - low).tolist()
     return across, up
 
 
-def _size(paper: str) -> tuple[float, float]:
+def _paper_size(paper: str) -> tuple[float, float]:
     names = {name.lower(): size for name, size in PAPERS.items()}
     if paper.lower() in names:
         return names[paper.lower()]
-    found = _CUSTOM.fullmatch(paper)
-    if found is None:
+    match = _CUSTOM_PAPER.fullmatch(paper)
+    if match is None:
         raise ValueError(f"'{paper}' is no paper; known: {', '.join(PAPERS)}, or WIDTHxHEIGHT in mm")
-    return float(found[1]), float(found[2])
+    return float(match[1]), float(match[2])
 
 
-def _greatest(across: float, up: float, width: float, height: float) -> float:
+def _max_edge_mm(width_edges: float, height_edges: float, width: float, height: float) -> float:
     """Edge, mm."""
-    return min((width - 2 * MARGIN_MM) / across, (height - 2 * MARGIN_MM - FOOT_MM) / up)
+    return min((width - 2 * MARGIN_MM) / width_edges, (height - 2 * MARGIN_MM - FOOTER_MM) / height_edges)
 
 
 _BORDER = {AprilGrid: 2, CharucoBoard: 1}  # cells around a marker's bits
 
 
-def ink(target: Target) -> F64:
+def black_rectangles(target: Target) -> F64:
     """Black rectangles (M, 4) m: x0, y0, x1, y1 in the target's frame. None overlap."""
     if isinstance(target, AprilGrid):
-        return np.concatenate([_tags(target), _joints(target)])
-    black = target.black
+        return np.concatenate([_tag_rectangles(target), _corner_squares(target)])
+    squares = target.black_squares
     inset = (target.square - target.marker) / 2
-    markers = [_printed(cells, low + inset, target.marker) for cells, low in _markers(target)]
-    return np.concatenate([np.hstack([black, black + target.square]), *markers])
+    markers = [
+        _marker_rectangles(cells, lower_left + inset, target.marker)
+        for cells, lower_left in _marker_cells(target)
+    ]
+    return np.concatenate([np.hstack([squares, squares + target.square]), *markers])
 
 
-def darkness(rectangles: F64, xs: F64, ys: F64) -> F64:
-    """Share of each texel that is black, (H, W) 0..1. rectangles: `ink`. xs (W + 1,), rising, and ys
-    (H + 1,), falling: borders between texels, m, so that row 0 is the top."""
-    across = _overlap(rectangles[:, 0], rectangles[:, 2], xs)
-    down = _overlap(rectangles[:, 1], rectangles[:, 3], ys[::-1])[:, ::-1]
-    out: F64 = down.T @ across
+def darkness_image(rectangles: F64, xs: F64, ys: F64) -> F64:
+    """Share of each texel that is black, (H, W) 0..1. rectangles: `black_rectangles`. xs (W + 1,), rising,
+    and ys (H + 1,), falling: borders between texels, m, so that row 0 is the top."""
+    cover_x = _overlap(rectangles[:, 0], rectangles[:, 2], xs)
+    cover_y = _overlap(rectangles[:, 1], rectangles[:, 3], ys[::-1])[:, ::-1]
+    out: F64 = cover_y.T @ cover_x
     return out
 
 
@@ -126,50 +132,52 @@ def _overlap(low: F64, high: F64, borders: F64) -> F64:
     return share
 
 
-def _tags(grid: AprilGrid) -> F64:
-    return np.concatenate([_printed(cells, low, grid.tag_size) for cells, low in _markers(grid)])
+def _tag_rectangles(grid: AprilGrid) -> F64:
+    return np.concatenate(
+        [_marker_rectangles(cells, low, grid.tag_size) for cells, low in _marker_cells(grid)]
+    )
 
 
-def _joints(grid: AprilGrid) -> F64:
+def _corner_squares(grid: AprilGrid) -> F64:
     """The black squares at the tags' corners."""
     row, column = np.divmod(np.arange((grid.rows + 1) * (grid.cols + 1)), grid.cols + 1)
     low = np.stack([column, row], axis=1) * (grid.tag_size + grid.gap) - grid.gap
     return np.hstack([low, low + grid.gap])
 
 
-def _markers(target: Target) -> list[tuple[np.ndarray, F64]]:
+def _marker_cells(target: Target) -> list[tuple[np.ndarray, F64]]:
     """Of each marker the cells (n, n), True for black, row 0 on top, and its lower left corner (2,) m,
     or that of its square."""
     april = isinstance(target, AprilGrid)
     name = "DICT_APRILTAG_36h11" if isinstance(target, AprilGrid) else target.dictionary
-    found = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
     border = _BORDER[type(target)]
-    n = found.markerSize + 2 * border
-    places = target.tags if isinstance(target, AprilGrid) else target.marked
+    n = dictionary.markerSize + 2 * border
+    places = target.tags if isinstance(target, AprilGrid) else target.marker_squares
     out = []
-    for number, low in enumerate(places):
-        cells = cv2.aruco.generateImageMarker(found, number, n, borderBits=border) < 128
-        out.append((np.rot90(cells, 2) if april else cells, low))  # Kalibr's tags stand on their heads
+    for number, lower_left in enumerate(places):
+        cells = cv2.aruco.generateImageMarker(dictionary, number, n, borderBits=border) < 128
+        out.append((np.rot90(cells, 2) if april else cells, lower_left))  # Kalibr's tags stand on their heads
     return out
 
 
-def _printed(cells: np.ndarray, low: F64, size: float) -> F64:
+def _marker_rectangles(cells: np.ndarray, lower_left: F64, size: float) -> F64:
     """Black rectangles (K, 4) m of a marker of `size` m: one for each run of black cells in a row."""
     n, out = len(cells), []
     for row, line in enumerate(cells):
         steps = np.flatnonzero(np.diff(np.pad(line.astype(int), 1)))
         out += [(a, n - 1 - row, b, n - row) for a, b in steps.reshape(-1, 2)]
-    return np.tile(low, 2) + np.array(out) * (size / n)
+    return np.tile(lower_left, 2) + np.array(out) * (size / n)
 
 
 # ---- A calibration target as a PDF to print, true to scale.
 
 _INCH = 25.4
-_RULER_MM, _SHORT_MM = 100.0, 50.0
-_WORDS_MM = 90.0  # beside it, with margins
+_RULER_MM, _SHORT_RULER_MM = 100.0, 50.0
+_FOOTER_TEXT_MM = 90.0  # beside it, with margins
 
 
-def pdf(sheet: Sheet) -> bytes:
+def sheet_pdf(sheet: Sheet) -> bytes:
     """One page, all in vectors."""
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.figure import Figure
@@ -177,15 +185,15 @@ def pdf(sheet: Sheet) -> bytes:
     figure = Figure(figsize=(sheet.width / _INCH, sheet.height / _INCH))
     page = figure.add_axes((0, 0, 1, 1), xlim=(0, sheet.width), ylim=(0, sheet.height))
     page.set_axis_off()
-    origin = (sheet.left, sheet.low) - 1000 * sheet.target.extent[0]
-    page.add_patch(_black(1000 * ink(sheet.target) + np.tile(origin, 2)))
-    _foot(page, sheet)
+    origin = (sheet.left, sheet.bottom) - 1000 * sheet.target.extent[0]
+    page.add_patch(_rectangles_patch(1000 * black_rectangles(sheet.target) + np.tile(origin, 2)))
+    _draw_footer(page, sheet)
     out = io.BytesIO()
-    FigureCanvasPdf(figure).print_pdf(out, metadata={"CreationDate": None, "Title": words(sheet)})
+    FigureCanvasPdf(figure).print_pdf(out, metadata={"CreationDate": None, "Title": describe_sheet(sheet)})
     return out.getvalue()
 
 
-def words(sheet: Sheet) -> str:
+def describe_sheet(sheet: Sheet) -> str:
     """What it is, for people."""
     target = sheet.target
     if isinstance(target, AprilGrid):
@@ -195,7 +203,7 @@ def words(sheet: Sheet) -> str:
     return f"charuco, {squares} squares of {edge:g} mm, {target.dictionary}"
 
 
-def _black(rectangles: F64) -> Any:
+def _rectangles_patch(rectangles: F64) -> Any:
     """Of (M, 4) mm: one path, so that neighbours show no seam."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
@@ -206,12 +214,12 @@ def _black(rectangles: F64) -> Any:
     return PathPatch(Path(points, codes), facecolor="black", linewidth=0)
 
 
-def _foot(page: Any, sheet: Sheet) -> None:
+def _draw_footer(page: Any, sheet: Sheet) -> None:
     """A ruler, and what it is for."""
-    long = _RULER_MM if sheet.width >= _RULER_MM + _WORDS_MM else _SHORT_MM
-    x, y = MARGIN_MM, FOOT_MM - 3
+    long = _RULER_MM if sheet.width >= _RULER_MM + _FOOTER_TEXT_MM else _SHORT_RULER_MM
+    x, y = MARGIN_MM, FOOTER_MM - 3
     page.plot([x, x + long], [y, y], color="black", linewidth=0.6, solid_capstyle="butt")
     for mark in np.arange(0, long + 1, 10):
         page.plot([x + mark] * 2, [y, y + 2], color="black", linewidth=0.3)
-    told = f"{words(sheet)}\nprint at 100 %; this ruler is {long:g} mm long"
-    page.text(x + long + 4, y, told, fontsize=7, va="center")
+    text = f"{describe_sheet(sheet)}\nprint at 100 %; this ruler is {long:g} mm long"
+    page.text(x + long + 4, y, text, fontsize=7, va="center")

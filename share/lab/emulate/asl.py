@@ -6,13 +6,13 @@ from pathlib import Path
 
 from share.errors import UsageError
 from share.lab.emulate.progress import Progress
-from share.lab.emulate.stage import Stage
-from share.recordings.convert import counting, to_euroc
-from share.recordings.session import SESSION
+from share.lab.emulate.stage import RoomStage
+from share.recordings.convert import stage_progress, to_euroc
+from share.recordings.session import SESSION_FILE
 from share.runtime.source import open_source
 
 
-def check_asl(stage: Stage) -> None:
+def check_asl(stage: RoomStage) -> None:
     """Raises UsageError where an agent has what such a folder has no place for."""
     for actor in stage.actors:
         if actor.device.clock.period_ns:
@@ -27,10 +27,10 @@ def to_asl(folder: Path, names: list[str], progress: Progress) -> None:
     """Each NAME.mcap of the session in `folder` to NAME/mav0; the truth is in there too."""
     for name in names:
         source = open_source(str(folder / name))
-        count = counting(progress, f"writing {name}/mav0", source.images_count)
+        count = stage_progress(progress, f"writing {name}/mav0", source.images_count)
         to_euroc(source, folder / f"{name}.asl", count)
         (folder / f"{name}.asl").rename(folder / name)
         (folder / f"{name}.mcap").unlink()
         (folder / "truth" / f"{name}.tum").unlink()
     (folder / "truth").rmdir()
-    (folder / SESSION).rename(folder / "emulation.yaml")
+    (folder / SESSION_FILE).rename(folder / "emulation.yaml")

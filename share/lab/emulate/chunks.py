@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from share.errors import DataError
-from share.files.reading import ARRAYS, read_bytes
+from share.files.reading import MAX_ARRAYS_BYTES, read_bytes
 from share.files.writing import atomic_write
 from share.recordings.images import EncodedImage
 from share.sensors.measurement import DEPTH, Measurement
@@ -17,7 +17,7 @@ from share.sensors.measurement import DEPTH, Measurement
 DEPTH_SCALE = 1000.0  # millimetres
 
 
-class Picture(msgspec.Struct, frozen=True, array_like=True):
+class EncodedPicture(msgspec.Struct, frozen=True, array_like=True):
     """One image as it will be recorded: JPEG or PNG."""
 
     stream: str
@@ -27,7 +27,7 @@ class Picture(msgspec.Struct, frozen=True, array_like=True):
     data: bytes
 
 
-def write_chunk(path: Path, pictures: list[Picture]) -> None:
+def write_chunk(path: Path, pictures: list[EncodedPicture]) -> None:
     """Whole or not at all. Raises as `atomic_write`."""
     atomic_write(path, msgspec.msgpack.encode(pictures))
 
@@ -35,13 +35,13 @@ def write_chunk(path: Path, pictures: list[Picture]) -> None:
 def read_chunk(path: Path) -> Iterator[Measurement]:
     """In the order in which they were written. Raises DataError if it is damaged."""
     try:
-        pictures = msgspec.msgpack.decode(read_bytes(path, ARRAYS), type=list[Picture])
+        pictures = msgspec.msgpack.decode(read_bytes(path, MAX_ARRAYS_BYTES), type=list[EncodedPicture])
     except (OSError, msgspec.DecodeError, msgspec.ValidationError) as error:
         raise DataError(f"{path}: is damaged ({error}); delete it and run the command again") from None
     for p in pictures:
-        yield Measurement(p.stream, p.stamp_ns, encoded(p, str(path)))
+        yield Measurement(p.stream, p.stamp_ns, encoded_image(p, str(path)))
 
 
-def encoded(p: Picture, where: str) -> EncodedImage:
+def encoded_image(p: EncodedPicture, where: str) -> EncodedImage:
     """As a reader has it. where: what an error names."""
     return EncodedImage(p.data, where, p.width, p.height, DEPTH_SCALE if p.stream == DEPTH else 0.0)

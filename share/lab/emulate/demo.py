@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.recipe import SessionRecipe
 
 MOTIONS = ("ar1=walk:speed=0.65", "ar2=walk:speed=0.55", "robot=robot:speed=0.3")
 AGENTS = tuple(motion.partition("=")[0] for motion in MOTIONS)
 PROFILE = "d435i:640x480@15"  # four processes share two cores: half of what the device can do
-SCENE, FALLBACK = "warehouse", "plain"
+DEFAULT_SCENE, FALLBACK_SCENE = "warehouse", "plain"
 
 
 def meeting_seed(scene: str) -> int:
     """Of a room in which all three soon look at the same things; in others 20 s may be too short for that."""
-    return 3 if scene == FALLBACK else 11
+    return 3 if scene == FALLBACK_SCENE else 11
 
 
-def recipe(scene: str, seconds: float, seed: int) -> Recipe:
+def recipe(scene: str, seconds: float, seed: int) -> SessionRecipe:
     """The same three for every scene."""
-    return Recipe(scene, MOTIONS, seconds, seed, profiles={"": PROFILE})
+    return SessionRecipe(scene, MOTIONS, seconds, seed, profiles={"": PROFILE})

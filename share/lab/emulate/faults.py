@@ -16,36 +16,36 @@ import numpy as np
 from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
 from share.lab.emulate import mover
-from share.lab.emulate.panel import Panel, drawn
+from share.lab.emulate.moving_panel import Panel, draw_panel
 from share.recordings.trajectory import Trajectory
 from share.sensors.measurement import IMU, Measurement
 from share.types import F32, F64, U8, Frame, ImuBatch
 
 Frames = list[Frame]
-Change = Callable[[Frames, Rig, Trajectory], Frames]
-Arriving = Callable[[Sequence[Measurement]], list[Measurement]]
+FrameFilter = Callable[[Frames, Rig, Trajectory], Frames]
+MeasurementFilter = Callable[[Sequence[Measurement]], list[Measurement]]
 
-_WHEN, _MOVER_WHEN, _MOVER_S = 0.4, 0.25, 10.0
-_DROPPED, _GAP = 0.2, 2.5  # gap: as the sequencer has it, times the usual step
-_BLIND_S, _WALL_S, _FADE_S = 2.0, 3.0, 0.5
-_STEP_S = 1.5
-_BAD_STAMPS = 0.02  # of images, for each sort
-_JUMP_NS, _BACK_NS = 40_000_000, 500_000_000
-_CLIPPED = 0.05  # of samples
-_BLUR_RAD = 3.0 * 0.008  # rad/s, s
+_FAULT_START, _MOVER_START, _MOVER_S = 0.4, 0.25, 10.0
+_DROP_SHARE, _GAP_FACTOR = 0.2, 2.5  # gap: as the sequencer has it, times the usual step
+_BLACK_S, _WALL_S, _FADE_S = 2.0, 3.0, 0.5
+_EXPOSURE_STEP_S = 1.5
+_BAD_STAMP_SHARE = 0.02  # of images, for each sort
+_STAMP_JUMP_NS, _STAMP_BACK_NS = 40_000_000, 500_000_000
+_CLIPPED_SHARE = 0.05  # of samples
+_MAX_BLUR_RAD = 3.0 * 0.008  # rad/s, s
 
 
 class Fault(NamedTuple):
     """does: for a person. change: of frames; arriving: of measurements before the sequencer orders them."""
 
-    does: str
-    change: Change | None = None
-    arriving: Arriving | None = None
+    description: str
+    change_frames: FrameFilter | None = None
+    change_measurements: MeasurementFilter | None = None
 
 
-def apply(fault: Fault, frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
+def apply_fault(fault: Fault, frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
     """What the tracker gets. truth: where the body was in the world, for what moves in it."""
-    return frames if fault.change is None else fault.change(frames, rig, truth)
+    return frames if fault.change_frames is None else fault.change_frames(frames, rig, truth)
 
 
 # ------------------------------------------------------------------ frames and stamps
@@ -53,35 +53,40 @@ def apply(fault: Fault, frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
 
 def drop20(frames: Frames, *_: object) -> Frames:
     """IMU samples of a lost frame come with the next, as from the sequencer."""
-    lost = np.random.default_rng(1).random(len(frames)) < _DROPPED
+    is_dropped = np.random.default_rng(1).random(len(frames)) < _DROP_SHARE
     usual = np.median(np.diff([frame.stamp_ns for frame in frames]))
     out: Frames = []
-    waiting: list[ImuBatch] = []
-    for frame, gone in zip(frames, lost, strict=True):
-        waiting.append(frame.imu)
-        if gone:
+    pending_imu: list[ImuBatch] = []
+    for frame, dropped in zip(frames, is_dropped, strict=True):
+        pending_imu.append(frame.imu)
+        if dropped:
             continue
         step = frame.stamp_ns - out[-1].stamp_ns if out else 0
-        gap = step if step > _GAP * usual else 0
-        out.append(replace(frame, index=len(out), imu=ImuBatch.empty().join(*waiting), gap_ns=gap))
-        waiting = []
+        gap = step if step > _GAP_FACTOR * usual else 0
+        out.append(replace(frame, index=len(out), imu=ImuBatch.empty().concatenate(*pending_imu), gap_ns=gap))
+        pending_imu = []
     return out
 
 
-def stamps(measurements: Sequence[Measurement]) -> list[Measurement]:
+def bad_stamps(measurements: Sequence[Measurement]) -> list[Measurement]:
     """The images of one frame share their fate: they are known by their number in their stream."""
     rng = np.random.default_rng(12)
-    fates = rng.choice(4, len(measurements), p=[1 - 3 * _BAD_STAMPS, *[_BAD_STAMPS] * 3])
-    jumps = _JUMP_NS * rng.choice([-1, 1], len(measurements))
-    so_far: dict[str, list[int]] = {}
+    error_kinds = rng.choice(4, len(measurements), p=[1 - 3 * _BAD_STAMP_SHARE, *[_BAD_STAMP_SHARE] * 3])
+    jumps = _STAMP_JUMP_NS * rng.choice([-1, 1], len(measurements))
+    stamps_seen: dict[str, list[int]] = {}
     out = []
     for m in measurements:
         if m.stream != IMU:
-            past = so_far.setdefault(m.stream, [])
+            past = stamps_seen.setdefault(m.stream, [])
             k = len(past)
             past.append(m.stamp_ns)
-            told = (m.stamp_ns, past[max(k - 1, 0)], m.stamp_ns - _BACK_NS, m.stamp_ns + int(jumps[k]))
-            m = Measurement(m.stream, told[fates[k]], m.payload)
+            stamps_by_kind = (
+                m.stamp_ns,
+                past[max(k - 1, 0)],
+                m.stamp_ns - _STAMP_BACK_NS,
+                m.stamp_ns + int(jumps[k]),
+            )
+            m = Measurement(m.stream, stamps_by_kind[error_kinds[k]], m.payload)
         out.append(m)
     return out
 
@@ -90,24 +95,24 @@ def stamps(measurements: Sequence[Measurement]) -> list[Measurement]:
 
 
 def black(frames: Frames, *_: object) -> Frames:
-    return _during(frames, _BLIND_S, lambda frame, _: _seen(frame, np.zeros_like))
+    return _change_during(frames, _BLACK_S, lambda frame, _: _change_images(frame, np.zeros_like))
 
 
 def covered(frames: Frames, *_: object) -> Frames:
     rng = np.random.default_rng(3)
 
     def dark(frame: Frame, _: float) -> Frame:
-        return _seen(frame, lambda image: _gray(4 + _noise(image, 2.0, rng)))
+        return _change_images(frame, lambda image: _gray(4 + _noise(image, 2.0, rng)))
 
-    return _during(frames, _BLIND_S, dark)
+    return _change_during(frames, _BLACK_S, dark)
 
 
 def exposure(frames: Frames, *_: object) -> Frames:
     gains = (1.0, 3.0, 1.0, 1 / 3)
 
     def lit(frame: Frame, s: float) -> Frame:
-        gain = np.float32(gains[int(s / _STEP_S) % 4])
-        return _seen(frame, lambda image: _gray(image * gain), keep_depth=True)
+        gain = np.float32(gains[int(s / _EXPOSURE_STEP_S) % 4])
+        return _change_images(frame, lambda image: _gray(image * gain), keep_depth=True)
 
     return [lit(frame, s) for frame, s in zip(frames, _seconds(frames), strict=True)]
 
@@ -116,78 +121,83 @@ def white_wall(frames: Frames, *_: object) -> Frames:
     rng = np.random.default_rng(4)
 
     def fade(frame: Frame, s: float) -> Frame:
-        left = 1 - 0.97 * min(1.0, s / _FADE_S, (_WALL_S - s) / _FADE_S)
-        return _seen(frame, lambda image: _gray(left * image + (1 - left) * 170 + _noise(image, 2.0, rng)))
+        contrast = 1 - 0.97 * min(1.0, s / _FADE_S, (_WALL_S - s) / _FADE_S)
+        return _change_images(
+            frame, lambda image: _gray(contrast * image + (1 - contrast) * 170 + _noise(image, 2.0, rng))
+        )
 
-    return _during(frames, _WALL_S, fade)
+    return _change_during(frames, _WALL_S, fade)
 
 
 def blur(frames: Frames, rig: Rig, *_: object) -> Frames:
     """Box blur along the way that the middle of the image goes by the gyro while it is exposed."""
-    imu = ImuBatch.empty().join(*(frame.imu for frame in frames))
+    imu = ImuBatch.empty().concatenate(*(frame.imu for frame in frames))
     fastest = np.quantile(np.linalg.norm(imu.gyro, axis=1), 0.99) if len(imu) else 0.0
     if fastest == 0:
         return frames
     turn = np.stack([np.interp(_stamps(frames), imu.stamps_ns, axis) for axis in imu.gyro.T], axis=1)
-    turn *= _BLUR_RAD / fastest  # rad, in the body
+    turn *= _MAX_BLUR_RAD / fastest  # rad, in the body
     in_cam = turn @ rig.T_body_cam0[:3, :3]
     R = np.eye(3) if rig.T_cam1_cam0 is None else rig.T_cam1_cam0[:3, :3]
     cams = (rig.cam0, in_cam), (rig.cam1 or rig.cam0, in_cam @ R.T)
-    return [_blurred(frame, [_smear(camera, w[k]) for camera, w in cams]) for k, frame in enumerate(frames)]
+    return [
+        _blur_frame(frame, [_blur_kernel(camera, w[k]) for camera, w in cams])
+        for k, frame in enumerate(frames)
+    ]
 
 
 # ------------------------------------------------------------------ IMU
 
 
 def imu_silent_1s(frames: Frames, *_: object) -> Frames:
-    return _during(frames, 1.0, lambda frame, _: _mute(frame))
+    return _change_during(frames, 1.0, lambda frame, _: _without_imu(frame))
 
 
 def imu_dead(frames: Frames, *_: object) -> Frames:
-    return _during(frames, np.inf, lambda frame, _: _mute(frame))
+    return _change_during(frames, np.inf, lambda frame, _: _without_imu(frame))
 
 
 def imu_never(frames: Frames, *_: object) -> Frames:
-    return [_mute(frame) for frame in frames]
+    return [_without_imu(frame) for frame in frames]
 
 
 def saturating(frames: Frames, *_: object) -> Frames:
     """Where any axis goes beyond what 5 % of the samples do, it stops."""
-    imu = ImuBatch.empty().join(*(frame.imu for frame in frames))
-    most = [np.quantile(np.abs(x).max(axis=1), 1 - _CLIPPED) for x in (imu.gyro, imu.accel)]
+    imu = ImuBatch.empty().concatenate(*(frame.imu for frame in frames))
+    limits = [np.quantile(np.abs(x).max(axis=1), 1 - _CLIPPED_SHARE) for x in (imu.gyro, imu.accel)]
 
     def clip(b: ImuBatch) -> ImuBatch:
-        return ImuBatch(b.stamps_ns, b.gyro.clip(-most[0], most[0]), b.accel.clip(-most[1], most[1]))
+        return ImuBatch(b.stamps_ns, b.gyro.clip(-limits[0], limits[0]), b.accel.clip(-limits[1], limits[1]))
 
     return [replace(frame, imu=clip(frame.imu)) for frame in frames]
 
 
 # ------------------------------------------------------------------ things that move by themselves
 
-_CARD, _LARGE = Panel(0.9, 1.4, seed=5), Panel(1.1, 1.4, seed=6)  # m
+_SMALL_PANEL, _LARGE_PANEL = Panel(0.9, 1.4, seed=5), Panel(1.1, 1.4, seed=6)  # m
 
 
-def mover_comes(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
-    return _moving(frames, rig, truth, _CARD, mover.coming)
+def panel_comes(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
+    return _with_panel(frames, rig, truth, _SMALL_PANEL, mover.path_comes)
 
 
-def mover_along(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
-    return _moving(frames, rig, truth, _CARD, mover.along)
+def panel_follows(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
+    return _with_panel(frames, rig, truth, _SMALL_PANEL, mover.path_follows)
 
 
-def mover_rests(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
+def panel_rests(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
     """Shows that what moves does harm, and not how it is drawn."""
-    return mover_starts(frames, rig, truth, speed=0.0)
+    return panel_starts(frames, rig, truth, speed=0.0)
 
 
-def mover_starts(frames: Frames, rig: Rig, truth: Trajectory, speed: float = 0.15) -> Frames:
+def panel_starts(frames: Frames, rig: Rig, truth: Trajectory, speed: float = 0.15) -> Frames:
     def path(t: F64, T_world_cam: F64, begin: float, last: float) -> F64:
-        return mover.starting(t, T_world_cam, rig.cam0, _LARGE, last, speed)
+        return mover.path_starts(t, T_world_cam, rig.cam0, _LARGE_PANEL, last, speed)
 
-    return _moving(frames, rig, truth, _LARGE, path)
+    return _with_panel(frames, rig, truth, _LARGE_PANEL, path)
 
 
-def _moving(
+def _with_panel(
     frames: Frames,
     rig: Rig,
     truth: Trajectory,
@@ -199,9 +209,9 @@ def _moving(
     t = _seconds(frames)
     T_body_panel = np.full((len(frames), 4, 4), np.nan)
     T_world_cam = T_world_body @ rig.T_body_cam0
-    T_world_panel = path(t[known], T_world_cam, float(_MOVER_WHEN * t[-1]), _MOVER_S)
+    T_world_panel = path(t[known], T_world_cam, float(_MOVER_START * t[-1]), _MOVER_S)
     T_body_panel[known] = rig.T_body_cam0 @ np.linalg.inv(T_world_cam) @ T_world_panel
-    return drawn(frames, rig, panel, T_body_panel)
+    return draw_panel(frames, rig, panel, T_body_panel)
 
 
 # ------------------------------------------------------------------ what they share
@@ -212,18 +222,18 @@ def _stamps(frames: Frames) -> np.ndarray:
 
 
 def _seconds(frames: Frames) -> F64:
-    at = _stamps(frames)
-    out: F64 = (at - at[0]) * 1e-9
+    stamps_ns = _stamps(frames)
+    out: F64 = (stamps_ns - stamps_ns[0]) * 1e-9
     return out
 
 
-def _during(frames: Frames, seconds: float, change: Callable[[Frame, float], Frame]) -> Frames:
-    """`change` is told the seconds since it began."""
-    since = _seconds(frames) - _WHEN * _seconds(frames)[-1]
+def _change_during(frames: Frames, seconds: float, change: Callable[[Frame, float], Frame]) -> Frames:
+    """`change_frames` is told the seconds since it began."""
+    since = _seconds(frames) - _FAULT_START * _seconds(frames)[-1]
     return [change(f, float(s)) if 0 <= s < seconds else f for f, s in zip(frames, since, strict=True)]
 
 
-def _seen(frame: Frame, change: Callable[[U8], U8], keep_depth: bool = False) -> Frame:
+def _change_images(frame: Frame, change: Callable[[U8], U8], keep_depth: bool = False) -> Frame:
     """Other images; and no depth, where there is nothing to see."""
     image1 = None if frame.image1 is None else change(frame.image1)
     depth = frame.depth if keep_depth or frame.depth is None else np.zeros_like(frame.depth)
@@ -239,24 +249,24 @@ def _noise(image: U8, sigma: float, rng: np.random.Generator) -> F32:
     return np.float32(sigma) * rng.standard_normal(image.shape, np.float32)
 
 
-def _mute(frame: Frame) -> Frame:
+def _without_imu(frame: Frame) -> Frame:
     return replace(frame, imu=ImuBatch.empty())
 
 
-def _smear(camera: Camera, turn: F64) -> F32:
+def _blur_kernel(camera: Camera, turn: F64) -> F32:
     """The kernel of a camera's turn (3,) rad: a line as long as the way of what is ahead."""
-    way = np.array([-turn[1] * camera.fx, turn[0] * camera.fy])
-    half = int(np.ceil(np.abs(way).max() / 2)) + 1
+    motion_px = np.array([-turn[1] * camera.fx, turn[0] * camera.fy])
+    half = int(np.ceil(np.abs(motion_px).max() / 2)) + 1
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     for along in np.linspace(-0.5, 0.5, 8 * half + 1):
-        x, y = half + along * way
+        x, y = half + along * motion_px
         i, j, u, v = int(x), int(y), x % 1, y % 1
         kernel[j : j + 2, i : i + 2] += np.outer([1 - v, v], [1 - u, u]).astype(np.float32)
     out: F32 = kernel / kernel.sum()
     return out
 
 
-def _blurred(frame: Frame, kernels: Sequence[F32]) -> Frame:
+def _blur_frame(frame: Frame, kernels: Sequence[F32]) -> Frame:
     def through(image: U8, kernel: F32) -> U8:
         return np.asarray(cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8)
 
@@ -269,7 +279,7 @@ FAULTS: dict[str, Fault] = {
     "drop20": Fault("20 % of the frames do not come", drop20),
     "stamps": Fault(
         "2 % of the images have the stamp of the one before, 2 % one 0.5 s back, 2 % one 40 ms off",
-        arriving=stamps,
+        change_measurements=bad_stamps,
     ),
     "black": Fault("2 s of black, no depth", black),
     "covered": Fault("2 s of dark noise, no depth", covered),
@@ -280,8 +290,8 @@ FAULTS: dict[str, Fault] = {
     "imu_dead": Fault("no IMU any more", imu_dead),
     "imu_never": Fault("no IMU at all", imu_never),
     "saturating": Fault("gyro and accelerometer end where 5 % of their samples are beyond", saturating),
-    "mover_rests": Fault("a panel that is part of the room, and stays: no fault at all", mover_rests),
-    "mover_comes": Fault("a panel comes in, stays 1 m before the camera for 10 s, to and fro", mover_comes),
-    "mover_starts": Fault("a panel that was part of the room goes off at 0.15 m/s for 10 s", mover_starts),
-    "mover_along": Fault("a panel goes along with the camera, fixed in its view, for 10 s", mover_along),
+    "mover_rests": Fault("a panel that is part of the room, and stays: no fault at all", panel_rests),
+    "mover_comes": Fault("a panel comes in, stays 1 m before the camera for 10 s, to and fro", panel_comes),
+    "mover_starts": Fault("a panel that was part of the room goes off at 0.15 m/s for 10 s", panel_starts),
+    "mover_along": Fault("a panel goes along with the camera, fixed in its view, for 10 s", panel_follows),
 }

@@ -8,64 +8,70 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.lab.emulate.panel import Panel, share_of_view
+from share.lab.emulate.moving_panel import Panel, share_of_view
 from share.types import F64
 
-_CROSS_S, _SWAY_S = 1.5, 4.0  # how long it takes to come in; a sway to and fro
-_AHEAD_M, _ASIDE_M, _SWAY_M = 1.0, 1.7, 0.3
-_ENOUGH, _MUCH = 0.4, 0.6  # share of the view that it should have, and not go beyond
-_CLEAR_M = 0.4  # how near it may come to the camera
+_ENTER_S, _SWAY_S = 1.5, 4.0  # how long it takes to come in; a sway to and fro
+_DISTANCE_M, _START_ASIDE_M, _SWAY_M = 1.0, 1.7, 0.3
+_TARGET_VIEW_SHARE, _MAX_VIEW_SHARE = 0.4, 0.6  # share of the view that it should have, and not go beyond
+_MIN_CLEARANCE_M = 0.4  # how near it may come to the camera
 _BEFORE_S, _AFTER_S = 3.0, 6.0  # of its starting to move it should be seen
 
 
-def coming(t: F64, T_world_cam: F64, begin: float, last: float) -> F64:
+def path_comes(t: F64, T_world_cam: F64, begin: float, last: float) -> F64:
     """T_world_panel (N, 4, 4) of who comes in from the left at `begin` (s) and for `last` seconds stays about
     1 m before the camera, going where it goes, to and fro: on a smooth path of its own through the world."""
-    ahead = _smooth(t, _level(T_world_cam[:, :3, 2]), 0.7)
-    centre = _smooth(t, T_world_cam[:, :3, 3], 0.7)
-    aside = _entering(t, begin, last) + _SWAY_M * np.sin(2 * np.pi * (t - begin) / _SWAY_S)
-    T = _facing(centre, _level(ahead), _AHEAD_M, aside)
+    ahead = _smoothed(t, _horizontal(T_world_cam[:, :3, 2]), 0.7)
+    centre = _smoothed(t, T_world_cam[:, :3, 3], 0.7)
+    aside = _enter_offset(t, begin, last) + _SWAY_M * np.sin(2 * np.pi * (t - begin) / _SWAY_S)
+    T = _upright_poses(centre, _horizontal(ahead), _DISTANCE_M, aside)
     T[(t < begin) | (t > begin + last)] = np.nan
     return T
 
 
-def along(t: F64, T_world_cam: F64, begin: float, last: float) -> F64:
+def path_follows(t: F64, T_world_cam: F64, begin: float, last: float) -> F64:
     """T_world_panel (N, 4, 4) of what moves as the camera does: at the left of its view, fixed, 1 m off."""
-    aside = _entering(t, begin, last) - 0.35
+    aside = _enter_offset(t, begin, last) - 0.35
     R, zero = np.tile(np.eye(3), (len(t), 1, 1)), np.zeros(len(t))
-    T = T_world_cam @ se3.compose(R, np.stack([aside, zero, zero + _AHEAD_M], axis=1))
+    T = T_world_cam @ se3.from_rt(R, np.stack([aside, zero, zero + _DISTANCE_M], axis=1))
     T[(t < begin) | (t > begin + last)] = np.nan
     return np.asarray(T, np.float64)
 
 
-def starting(t: F64, T_world_cam: F64, camera: Camera, panel: Panel, last: float, speed: float = 0.15) -> F64:
+def path_starts(
+    t: F64, T_world_cam: F64, camera: Camera, panel: Panel, last: float, speed: float = 0.15
+) -> F64:
     """T_world_panel (N, 4, 4) of what is part of the room until 30 to 55 % of the recording, then
     goes aside at `speed` (m/s) for `last` seconds, and rests: where and when it has some 40 % of the view.
     Raises ValueError where the camera leaves no place for it."""
-    best, found = -np.inf, None
-    for begin, T in _placings(t, T_world_cam):
-        gone = speed * (t - begin).clip(0, last)
+    best, best_path = -np.inf, None
+    for begin, T in _candidate_placements(t, T_world_cam):
+        moved = speed * (t - begin).clip(0, last)
         path = np.tile(T, (len(t), 1, 1))
-        path[:, :3, 3] += gone[:, None] * T[:3, 0]
-        if _clearance(panel, se3.inverse(path) @ T_world_cam) < _CLEAR_M:
+        path[:, :3, 3] += moved[:, None] * T[:3, 0]
+        if _clearance(panel, se3.inverse(path) @ T_world_cam) < _MIN_CLEARANCE_M:
             continue
         near = np.flatnonzero((t > begin - _BEFORE_S) & (t < begin + _AFTER_S))[::8]
-        seen = share_of_view(camera, panel, se3.inverse(T_world_cam[near]) @ path[near])
-        if (score := float((seen.clip(0, _ENOUGH) - 2 * (seen - _MUCH).clip(0)).mean())) > best:
-            best, found = score, path
-    if found is None:
+        view_share = share_of_view(camera, panel, se3.inverse(T_world_cam[near]) @ path[near])
+        if (
+            score := float(
+                (view_share.clip(0, _TARGET_VIEW_SHARE) - 2 * (view_share - _MAX_VIEW_SHARE).clip(0)).mean()
+            )
+        ) > best:
+            best, best_path = score, path
+    if best_path is None:
         raise ValueError("the camera leaves no place for a panel that it would not run into")
-    return found
+    return best_path
 
 
-def _placings(t: F64, T_world_cam: F64) -> Iterator[tuple[float, F64]]:
+def _candidate_placements(t: F64, T_world_cam: F64) -> Iterator[tuple[float, F64]]:
     """(when it starts, T_world_panel at rest): before where the camera is about then."""
     span = t[-1] - t[0]
     for begin in np.arange(t[0] + 0.3 * span, t[0] + 0.55 * span, 0.5):
         for k in np.searchsorted(t, begin + np.array([-1.5, 0.0, 1.5, 3.0])).clip(0, len(t) - 1):
-            ahead, eye = _level(T_world_cam[k : k + 1, :3, 2]), T_world_cam[k : k + 1, :3, 3]
+            ahead, eye = _horizontal(T_world_cam[k : k + 1, :3, 2]), T_world_cam[k : k + 1, :3, 3]
             for metres in (1.0, 1.4, 1.8):
-                yield float(begin), _facing(eye, ahead, metres, np.zeros(1))[0]
+                yield float(begin), _upright_poses(eye, ahead, metres, np.zeros(1))[0]
 
 
 def _clearance(panel: Panel, T_panel_cam: F64) -> float:
@@ -75,29 +81,29 @@ def _clearance(panel: Panel, T_panel_cam: F64) -> float:
     return float(np.linalg.norm(beyond, axis=1).min())
 
 
-def _entering(t: F64, begin: float, last: float) -> F64:
+def _enter_offset(t: F64, begin: float, last: float) -> F64:
     """m to the right: from the left in, and out again there."""
-    inside = np.minimum(t - begin, begin + last - t) / _CROSS_S
-    out: F64 = -_ASIDE_M * (1 - inside.clip(0, 1))
+    inside = np.minimum(t - begin, begin + last - t) / _ENTER_S
+    out: F64 = -_START_ASIDE_M * (1 - inside.clip(0, 1))
     return out
 
 
-def _facing(centre: F64, ahead: F64, metres: float, aside: F64) -> F64:
+def _upright_poses(centre: F64, ahead: F64, metres: float, aside: F64) -> F64:
     """T (N, 4, 4), upright, so far ahead of `centre` (N, 3) and to the right, back to `ahead`."""
     down = np.tile([0.0, 0.0, -1.0], (len(ahead), 1))
     right = np.cross(down, ahead)
     R = np.stack([right, down, ahead], axis=-1)
-    return se3.compose(R, centre + metres * ahead + aside[:, None] * right)
+    return se3.from_rt(R, centre + metres * ahead + aside[:, None] * right)
 
 
-def _level(ways: F64) -> F64:
+def _horizontal(directions: F64) -> F64:
     """Unit vectors (N, 3), their upright part taken off."""
-    flat = ways * (1.0, 1.0, 0.0)
+    flat = directions * (1.0, 1.0, 0.0)
     out: F64 = flat / np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-6)
     return out
 
 
-def _smooth(t: F64, values: F64, sigma: float) -> F64:
+def _smoothed(t: F64, values: F64, sigma: float) -> F64:
     """Gaussian mean of (N, 3) over time, s."""
     weights = np.exp(-0.5 * ((t[:, None] - t[None, :]) / sigma) ** 2)
     out: F64 = weights @ values / weights.sum(axis=1, keepdims=True)

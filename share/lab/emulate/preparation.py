@@ -9,78 +9,80 @@ from pathlib import Path
 from share.errors import UsageError
 from share.geometry.camera import Rig
 from share.lab.emulate import room_file
-from share.lab.emulate.motion.avatars import Avatar, shapes
-from share.lab.emulate.motion.plan import Agent, Plan, plan
-from share.lab.emulate.motion.spec import EurocSpec, parse
+from share.lab.emulate.motion.avatars import Avatar, avatar_shapes
+from share.lab.emulate.motion.motion_plan import MotionPlan, PlannedAgent, plan_motions
+from share.lab.emulate.motion.spec import EurocSpec, parse_motion
 from share.lab.emulate.motion.spline import SplinePath
 from share.lab.emulate.progress import Progress
-from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.recipe import SessionRecipe
 from share.lab.emulate.render import context
-from share.lab.emulate.sensor.device import Device, Pictures
-from share.lab.emulate.stage import Actor, Stage, within
-from share.lab.emulate.types import Path as Motion
+from share.lab.emulate.sensor.device import EmulatedDevice, PictureTimes
+from share.lab.emulate.stage import Actor, RoomStage, in_gaps
+from share.lab.emulate.types import MotionPath as Motion
 from share.lab.emulate.world.layout import Layout
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
 from share.sensors.profile_types import Profile
 from share.types import I64, AgentKind
 
-_GLTF = (".glb", ".gltf")
-_TAKEN = ("truth",)  # the name of a folder of the session
+_GLTF_SUFFIXES = (".glb", ".gltf")
+_RESERVED_NAMES = ("truth",)  # the name of a folder of the session
 _PROFILE, _EUROC_PROFILE = "d435i", "euroc"
 _DEPTH, _MONO = "rgbd", "mono"
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class PreparedSession:
     """layout: what stands in the room. notes: for a person."""
 
-    stage: Stage
+    stage: RoomStage
     layout: Layout
     notes: tuple[str, ...]
 
 
-def prepare(recipe: Recipe, room: Path, progress: Progress) -> Prepared:
+def prepare_session(recipe: SessionRecipe, room: Path, progress: Progress) -> PreparedSession:
     """The stage, whose room is to be kept in the folder `room`. Nothing is written.
 
     Raises UsageError, ConfigError or DataError for what cannot be made."""
     progress("planning", 0, 1)
     _check_first(recipe)
-    planned = plan(recipe.motions, furnish(recipe), recipe.seconds, recipe.seed)
-    _check_names(recipe, planned)
-    actors = tuple(_actor(agent, k, recipe) for k, agent in enumerate(planned.agents))
+    motion_plan = plan_motions(recipe.motions, make_layout(recipe), recipe.seconds, recipe.seed)
+    _check_names(recipe, motion_plan)
+    actors = tuple(_make_actor(agent, k, recipe) for k, agent in enumerate(motion_plan.agents))
     _check_lenses(recipe, actors)
-    notes = planned.notes + tuple(f"{a.name}: {note}" for a in planned.agents for note in a.notes)
+    notes = motion_plan.notes + tuple(f"{a.name}: {note}" for a in motion_plan.agents for note in a.notes)
     progress("planning", 1, 1)
-    return Prepared(Stage(room, actors), planned.layout, notes)
+    return PreparedSession(RoomStage(room, actors), motion_plan.layout, notes)
 
 
-def keep_room(prepared: Prepared, progress: Progress) -> None:
+def keep_room(prepared: PreparedSession, progress: Progress) -> None:
     """Draw the room's pictures and bake its light where the stage expects them, if they are not there yet."""
     progress("making the room", 0, 1)
     stage = prepared.stage
-    room_file.keep(prepared.layout, {actor.name: actor.shapes for actor in stage.actors}, stage.room)
+    room_file.save_room_once(
+        prepared.layout, {actor.name: actor.shapes for actor in stage.actors}, stage.room
+    )
     progress("making the room", 1, 1)
 
 
-def furnish(recipe: Recipe) -> Layout:
+def make_layout(recipe: SessionRecipe) -> Layout:
     """What stands where. Raises UsageError for an unknown scene or a size that it cannot have."""
     if recipe.scene == room_file.PLAIN:
-        from share.lab.emulate.plain.scene import layout as plain_layout
+        from share.lab.emulate.plain.scene import plain_layout
 
         return plain_layout(recipe.seed, recipe.size)
-    if recipe.scene.lower().endswith(_GLTF):
-        return _own_room(recipe)
-    from share.lab.emulate.world.scenes import SCENES, layout
+    if recipe.scene.lower().endswith(_GLTF_SUFFIXES):
+        return _gltf_layout(recipe)
+    from share.lab.emulate.world.scenes import SCENES, make_scene_layout
 
     if recipe.scene not in SCENES:
         known = (*SCENES, room_file.PLAIN)
         near = difflib.get_close_matches(recipe.scene, known, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}, or give a .glb file"
         raise UsageError(f"scene '{recipe.scene}' is not known; {hint}")
-    return layout(recipe.scene, recipe.seed, recipe.size)
+    return make_scene_layout(recipe.scene, recipe.seed, recipe.size)
 
 
-def _own_room(recipe: Recipe) -> Layout:
+def _gltf_layout(recipe: SessionRecipe) -> Layout:
     from share.lab.emulate.world.gltf import load_gltf
 
     if recipe.size is not None:
@@ -88,74 +90,74 @@ def _own_room(recipe: Recipe) -> Layout:
     return load_gltf(Path(recipe.scene))
 
 
-def _actor(agent: Agent, number: int, recipe: Recipe) -> Actor:
-    sensors = _chosen(recipe.sensors, agent.name) or _usual_sensors(agent)
-    made = _profile(agent, recipe)
-    rig = _mounted(made.rig(depth=sensors == _DEPTH), agent)
+def _make_actor(agent: PlannedAgent, number: int, recipe: SessionRecipe) -> Actor:
+    sensors = _option_for(recipe.sensors, agent.name) or _default_sensors(agent)
+    device_profile = _profile(agent, recipe)
+    rig = _recorded_rig(device_profile.rig(depth=sensors == _DEPTH), agent)
     if sensors == _MONO:
         rig = replace(rig, cam1=None, T_cam1_cam0=None)
     seed = (recipe.seed, 7, number)
-    path = _of_imu(agent, rig)
-    device = Device(made, recipe.effects, seed, agent.path.start_ns, (recipe.seed, 8))
-    pictures = _outside(device.pictures(agent.path.start_ns, agent.path.end_ns), agent.path.gaps)
+    path = _imu_path(agent, rig)
+    device = EmulatedDevice(device_profile, recipe.effects, seed, agent.path.start_ns, (recipe.seed, 8))
+    pictures = _without_gaps(device.picture_times(agent.path.start_ns, agent.path.end_ns), agent.path.gaps)
     if len(pictures) < 2:
         raise UsageError(f"{agent.name}: {agent.spec} leaves {len(pictures)} pictures; give it more time")
-    avatar = Avatar(agent.look, agent.path, agent.T_body_cam0)
-    look = shapes(agent.look, agent.path, (recipe.seed, 9, number))
-    return Actor(agent.name, agent.kind, rig, path, device, avatar, look, pictures)
+    avatar = Avatar(agent.body_kind, agent.path, agent.T_body_cam0)
+    body_shapes = avatar_shapes(agent.body_kind, agent.path, (recipe.seed, 9, number))
+    return Actor(agent.name, agent.kind, rig, path, device, avatar, body_shapes, pictures)
 
 
-def _profile(agent: Agent, recipe: Recipe) -> Profile:
+def _profile(agent: PlannedAgent, recipe: SessionRecipe) -> Profile:
     """`NAME` or `NAME:MODE`, as asked for, or what the motion was recorded with."""
-    _, spec = parse(agent.spec)
+    _, spec = parse_motion(agent.spec)
     usual = _EUROC_PROFILE if isinstance(spec, EurocSpec) else _PROFILE
-    return _opened(_chosen(recipe.profiles, agent.name) or usual)
+    return _read_profile(_option_for(recipe.profiles, agent.name) or usual)
 
 
-def _opened(words: str) -> Profile:
-    name, _, mode = words.partition(":")
-    return profile(name, mode or None)
+def _read_profile(spec: str) -> Profile:
+    name, _, mode = spec.partition(":")
+    return load_profile(name, mode or None)
 
 
-def _usual_sensors(agent: Agent) -> str:
+def _default_sensors(agent: PlannedAgent) -> str:
     """Depth helps a robot not to bump into things; a headset has the infrared pair."""
     simulated = agent.path.recorded is None
     return _DEPTH if agent.kind is AgentKind.ROBOT and simulated else "stereo"
 
 
-def _mounted(rig: Rig, agent: Agent) -> Rig:
+def _recorded_rig(rig: Rig, agent: PlannedAgent) -> Rig:
     """The cameras where the recorded rig had them, and its IMU's noise."""
     if agent.T_body_cam0 is not None:
         rig = replace(rig, T_body_cam0=agent.T_body_cam0)
     return rig if agent.imu is None else replace(rig, imu=agent.imu)
 
 
-def _of_imu(agent: Agent, rig: Rig) -> Motion:
+def _imu_path(agent: PlannedAgent, rig: Rig) -> Motion:
     """The path of the rig's IMU: where it sits otherwise than a simulated body, the camera still does not."""
-    if agent.like_camera and isinstance(agent.path, SplinePath):
-        return agent.path.turned(rig.T_body_cam0[:3, :3].T)
+    if agent.has_camera_axes and isinstance(agent.path, SplinePath):
+        return agent.path.with_axes(rig.T_body_cam0[:3, :3].T)
     return agent.path
 
 
-def _outside(pictures: Pictures, gaps: I64) -> Pictures:
+def _without_gaps(pictures: PictureTimes, gaps: I64) -> PictureTimes:
     """Without those taken where nobody knows the truth."""
-    known = ~within(gaps, pictures.true_ns)
-    return Pictures(pictures.index[known], pictures.true_ns[known], pictures.stamp_ns[known])
+    known = ~in_gaps(gaps, pictures.true_ns)
+    return PictureTimes(pictures.index[known], pictures.true_ns[known], pictures.stamp_ns[known])
 
 
-def _chosen(table: dict[str, str], name: str) -> str | None:
+def _option_for(table: dict[str, str], name: str) -> str | None:
     return table.get(name, table.get(""))
 
 
-def _check_first(recipe: Recipe) -> None:
+def _check_first(recipe: SessionRecipe) -> None:
     """What can be found wrong without a plan. Raises ConfigError; RenderError where nothing can be drawn."""
     for words in recipe.profiles.values():
-        _opened(words)
+        _read_profile(words)
     if recipe.scene != room_file.PLAIN:
-        context.create().release()
+        context.create_context().release()
 
 
-def _check_lenses(recipe: Recipe, actors: tuple[Actor, ...]) -> None:
+def _check_lenses(recipe: SessionRecipe, actors: tuple[Actor, ...]) -> None:
     for actor in actors:
         if recipe.scene == room_file.PLAIN and actor.rig.cam0.distortion:
             raise UsageError(
@@ -164,11 +166,11 @@ def _check_lenses(recipe: Recipe, actors: tuple[Actor, ...]) -> None:
             )
 
 
-def _check_names(recipe: Recipe, planned: Plan) -> None:
-    known = {agent.name for agent in planned.agents}
-    if taken := known.intersection(_TAKEN):
+def _check_names(recipe: SessionRecipe, motion_plan: MotionPlan) -> None:
+    known = {agent.name for agent in motion_plan.agents}
+    if reserved := known.intersection(_RESERVED_NAMES):
         raise UsageError(
-            f"an agent cannot be named '{taken.pop()}': the session's truth is in a folder of that name"
+            f"an agent cannot be named '{reserved.pop()}': the session's truth is in a folder of that name"
         )
     for table in (recipe.sensors, recipe.profiles):
         for name in table:

@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from share.errors import UsageError
-from share.files.reading import TABLE, read_bytes
-from share.lab.emulate.motion.spec import RecordedSpec, parse
+from share.files.reading import MAX_TABLE_BYTES, read_bytes
+from share.lab.emulate.motion.spec import RecordedSpec, parse_motion
 from share.lab.emulate.sensor.effects import Effects
 
 GENERATOR_VERSION = 2  # raise it when any picture, motion or file changes: cached sessions are made anew
 SENSORS = ("stereo", "rgbd", "mono")
 IMAGES = ("jpeg", "png")
-_DEPTHS, _TEXTS = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")  # FOLDER/mav0/imu0/data.csv
+_FOLDER_DEPTHS, _TEXT_SUFFIXES = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")  # FOLDER/mav0/imu0/data.csv
 
 
 @dataclass(frozen=True)
-class Recipe:
+class SessionRecipe:
     """scene: a name, or a glTF file. motions: `[NAME=]SPEC` each. size: of the room, m; None: the scene's
     own. sensors, profiles: one for all (key "") or by an agent's name; profiles may name a mode, as
     `d435i:848x480@30`. images: jpeg is quality 95; png keeps every gray level. Raises UsageError for what
@@ -48,7 +48,7 @@ class Recipe:
         if self.images not in IMAGES:
             raise UsageError(f"images '{self.images}' are not known; known: {', '.join(IMAGES)}")
 
-    def plain(self) -> dict[str, Any]:
+    def to_mapping(self) -> dict[str, Any]:
         """As plain data, for a person and for session.yaml."""
         out = asdict(self) | {"motions": list(self.motions), "generator_version": GENERATOR_VERSION}
         out["size"] = None if self.size is None else list(self.size)
@@ -58,15 +58,15 @@ class Recipe:
     def digest(self) -> str:
         """Twelve characters that differ where anything does, the user's own files included. Raises UsageError
         for a motion that cannot be understood."""
-        digest = hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode())
-        for path in self._own_files():
+        digest = hashlib.sha256(json.dumps(self.to_mapping(), sort_keys=True).encode())
+        for path in self._user_files():
             try:
-                digest.update(read_bytes(path, TABLE))
+                digest.update(read_bytes(path, MAX_TABLE_BYTES))
             except OSError as error:
                 raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
         return digest.hexdigest()[:12]
 
-    def _own_files(self) -> Iterator[Path]:
+    def _user_files(self) -> Iterator[Path]:
         """Scene and profiles where they are files, not ours by their names, and all of recorded motions
         but images."""
         for name in (self.scene, *self.profiles.values()):
@@ -74,12 +74,12 @@ class Recipe:
             if path.suffix and path.is_file():
                 yield path
         for text in self.motions:
-            _, spec = parse(text)
+            _, spec = parse_motion(text)
             if isinstance(spec, RecordedSpec):
-                yield from _tables(Path(spec.path))
+                yield from _text_files(Path(spec.path))
 
 
-def _tables(path: Path) -> list[Path]:
+def _text_files(path: Path) -> list[Path]:
     """The file, or what a recording's folder holds as text."""
-    found = [path] if path.is_file() else [p for depth in _DEPTHS for p in path.glob(depth)]
-    return sorted(p for p in found if p.is_file() and (p == path or p.suffix in _TEXTS))
+    candidates = [path] if path.is_file() else [p for depth in _FOLDER_DEPTHS for p in path.glob(depth)]
+    return sorted(p for p in candidates if p.is_file() and (p == path or p.suffix in _TEXT_SUFFIXES))

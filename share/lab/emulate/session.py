@@ -17,59 +17,62 @@ import numpy as np
 from share import __version__
 from share.errors import ShareError
 from share.files.arrays import read_array
-from share.files.writing import atomic_write, writable_dir, writing, xdg_folder
-from share.lab.calibrate.target import T_WORLD_TARGET, TARGET, to_plain
-from share.lab.emulate import shooting
+from share.files.writing import atomic_write, writable_dir, write_errors, xdg_folder
+from share.lab.calibrate.target import T_WORLD_TARGET, TARGET, target_mapping
+from share.lab.emulate import drawing
 from share.lab.emulate.asl import check_asl, to_asl
-from share.lab.emulate.growth import Growth
+from share.lab.emulate.drawing import ChunkJob
+from share.lab.emulate.partial_session import PartialSession
 from share.lab.emulate.plan_picture import draw_plan
-from share.lab.emulate.preparation import Prepared, keep_room, prepare
-from share.lab.emulate.progress import Progress, silent
-from share.lab.emulate.recipe import Recipe
-from share.lab.emulate.sensor.exposure import Shots
-from share.lab.emulate.shooting import Take
-from share.lab.emulate.stage import Actor, Stage
-from share.lab.emulate.takes import write_recording, write_truth
+from share.lab.emulate.preparation import PreparedSession, keep_room, prepare_session
+from share.lab.emulate.progress import Progress, no_progress
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.recordings import write_recording, write_truth
+from share.lab.emulate.sensor.exposure import ExposureSeries
+from share.lab.emulate.stage import Actor, RoomStage
 from share.lab.emulate.types import START_NS
 from share.recordings.calibration import to_kalibr
-from share.recordings.session import SCHEMA, SESSION
+from share.recordings.session import SCHEMA, SESSION_FILE
 from share.runtime.pool import Pool
 from share.types import F64
 
-PLAN = "plan.png"
-_FRAMES = 24  # of a chunk: what a break costs a process
-_BYTES = {"jpeg": 130_000, "png": 330_000}  # of an image, about; to see beforehand whether the disk will do
+PLAN_FILE = "plan.png"
+_CHUNK_FRAMES = 24  # of a chunk: what a break costs a process
+_IMAGE_BYTES = {
+    "jpeg": 130_000,
+    "png": 330_000,
+}  # of an image, about; to see beforehand whether the disk will do
 
 
 def make_session(
-    recipe: Recipe, out: Path, workers: int = 2, progress: Progress = silent, asl: bool = False
+    recipe: SessionRecipe, out: Path, workers: int = 2, progress: Progress = no_progress, asl: bool = False
 ) -> Path:
     """Make a session in the new folder `out` with `workers` processes; with `asl`, an EuRoC/ASL folder
     NAME/mav0 of each agent instead. What a break leaves is used by the next attempt at the same recipe.
 
     Raises UsageError where `out` exists, or for what cannot be made; ShareError where the disk is full.
     """
-    growth = Growth(out, recipe.digest)
-    growth.check_new()
-    prepared = prepare(recipe, growth.room, progress)
+    partial = PartialSession(out, recipe.digest)
+    partial.check_new()
+    prepared = prepare_session(recipe, partial.room, progress)
     if asl:
         check_asl(prepared.stage)
-    with growth, writing(out):
-        _check_space(growth, prepared.stage, recipe, copies=3 if asl else 2)
-        _make(recipe, prepared, growth, workers, progress)
+    with partial, write_errors(out):
+        _check_space(partial, prepared.stage, recipe, copies=3 if asl else 2)
+        _fill_session(recipe, prepared, partial, workers, progress)
         if asl:
-            to_asl(growth.session, [actor.name for actor in prepared.stage.actors], progress)
-        growth.finish()
+            to_asl(partial.session, [actor.name for actor in prepared.stage.actors], progress)
+        partial.finish()
     return out
 
 
-def cached_session(
-    recipe: Recipe, cache: Path | None = None, workers: int = 2, progress: Progress = silent
+def make_cached_session(
+    recipe: SessionRecipe, cache: Path | None = None, workers: int = 2, progress: Progress = no_progress
 ) -> Path:
     """The session of this recipe in `cache` (default: the user's), made if it is not there yet."""
     out = (default_cache() if cache is None else cache) / f"session-{recipe.digest}"
     if not out.exists():
-        with _lock(out.parent):
+        with _cache_lock(out.parent):
             if not out.exists():  # nobody else made it while we waited
                 make_session(recipe, out, workers, progress)
     return out
@@ -80,73 +83,83 @@ def default_cache() -> Path:
     return xdg_folder("XDG_CACHE_HOME", ".cache") / "share"
 
 
-def _make(recipe: Recipe, prepared: Prepared, growth: Growth, workers: int, progress: Progress) -> None:
+def _fill_session(
+    recipe: SessionRecipe, prepared: PreparedSession, growth: PartialSession, workers: int, progress: Progress
+) -> None:
     stage, folder = prepared.stage, growth.session
     keep_room(prepared, progress)
-    with Pool(workers, shooting.begin, (stage, recipe.images)) as pool:
-        exposures = [_exposures(pool, stage, who, growth.work, progress) for who in range(len(stage.actors))]
-        chunks = _shoot(pool, stage, exposures, growth, progress)
+    with Pool(workers, drawing.start_worker, (stage, recipe.images)) as pool:
+        exposures = [
+            _exposure_series(pool, stage, actor_index, growth.work, progress)
+            for actor_index in range(len(stage.actors))
+        ]
+        chunks = _draw_chunks(pool, stage, exposures, growth, progress)
     progress("writing recordings", 0, len(stage.actors))
     for k, (actor, files) in enumerate(zip(stage.actors, chunks, strict=True)):
         write_recording(actor, files, folder / f"{actor.name}.mcap")
         write_truth(actor, folder / "truth" / f"{actor.name}.tum")
         progress("writing recordings", k + 1, len(stage.actors))
-    draw_plan(folder / PLAN, prepared.layout, stage.actors)
-    atomic_write(folder / SESSION, _description(recipe, prepared))
+    draw_plan(folder / PLAN_FILE, prepared.layout, stage.actors)
+    atomic_write(folder / SESSION_FILE, _session_yaml(recipe, prepared))
 
 
-def _exposures(pool: Pool, stage: Stage, who: int, work: Path, progress: Progress) -> Shots:
+def _exposure_series(
+    pool: Pool, stage: RoomStage, actor_index: int, work: Path, progress: Progress
+) -> ExposureSeries:
     """How each of the actor's frames is exposed, from a quick look at some of them."""
-    actor, kept = stage.actors[who], work / f"{stage.actors[who].name}.brightness.npy"
-    jobs = shooting.looks(who, actor)
-    if kept.exists():
-        brightness = read_array(kept)
+    actor, brightness_file = (
+        stage.actors[actor_index],
+        work / f"{stage.actors[actor_index].name}.brightness.npy",
+    )
+    jobs = drawing.meter_jobs(actor_index, actor)
+    if brightness_file.exists():
+        brightness = read_array(brightness_file)
     else:
         values: dict[int, F64] = {}
-        for job, seen in pool.run(shooting.meter, jobs):
-            values[int(job.true_ns[0])] = seen
+        for job, brightness_part in pool.run(drawing.measure_brightness, jobs):
+            values[int(job.true_ns[0])] = brightness_part
             progress(f"metering {actor.name}", len(values), len(jobs))
         brightness = np.concatenate([values[key] for key in sorted(values)])
-        atomic_write(kept, _npy(brightness))
-    return shooting.exposed(actor, jobs, brightness)
+        atomic_write(brightness_file, _npy_bytes(brightness))
+    return drawing.exposure_series(actor, jobs, brightness)
 
 
-def _npy(values: F64) -> bytes:
+def _npy_bytes(values: F64) -> bytes:
     file = BytesIO()
     np.save(file, values)
     return file.getvalue()
 
 
-def _shoot(
-    pool: Pool, stage: Stage, exposures: list[Shots], growth: Growth, progress: Progress
+def _draw_chunks(
+    pool: Pool, stage: RoomStage, exposures: list[ExposureSeries], growth: PartialSession, progress: Progress
 ) -> list[list[Path]]:
     """The chunks of each actor, in order; those that are there already are not drawn again."""
     takes = [
-        _takes(actor, who, exposures[who], growth.frames(actor.name))
-        for who, actor in enumerate(stage.actors)
+        _make_takes(actor, actor_index, exposures[actor_index], growth.frames(actor.name))
+        for actor_index, actor in enumerate(stage.actors)
     ]
-    todo = [take for them in takes for take in them if not take.file.exists()]
+    todo = [take for actor_takes in takes for take in actor_takes if not take.file.exists()]
     total = sum(len(actor.pictures) for actor in stage.actors)
     done = total - sum(take.last - take.first for take in todo)
     progress("drawing images", done, total)
-    for take, _ in pool.run(shooting.shoot, todo):
+    for take, _ in pool.run(drawing.draw_chunk, todo):
         done += take.last - take.first
         progress("drawing images", done, total)
-    return [[take.file for take in them] for them in takes]
+    return [[take.file for take in actor_takes] for actor_takes in takes]
 
 
-def _takes(actor: Actor, who: int, shots: Shots, folder: Path) -> list[Take]:
+def _make_takes(actor: Actor, actor_index: int, shots: ExposureSeries, folder: Path) -> list[ChunkJob]:
     folder.mkdir(parents=True, exist_ok=True)
     count = len(actor.pictures)
-    spans = [(k, min(k + _FRAMES, count)) for k in range(0, count, _FRAMES)]
-    return [Take(who, a, b, folder / f"{a:06d}.chunk", shots.part(a, b)) for a, b in spans]
+    spans = [(k, min(k + _CHUNK_FRAMES, count)) for k in range(0, count, _CHUNK_FRAMES)]
+    return [ChunkJob(actor_index, a, b, folder / f"{a:06d}.chunk", shots.part(a, b)) for a, b in spans]
 
 
-def _check_space(growth: Growth, stage: Stage, recipe: Recipe, copies: int) -> None:
+def _check_space(growth: PartialSession, stage: RoomStage, recipe: SessionRecipe, copies: int) -> None:
     """Before hours are spent: so many copies of the images are there side by side at the end."""
     images = sum(2 * len(actor.pictures) for actor in stage.actors)
-    there = sum(chunk.stat().st_size for chunk in growth.drawn())
-    need, free = copies * images * _BYTES[recipe.images] - there, shutil.disk_usage(growth.work).free
+    existing = sum(chunk.stat().st_size for chunk in growth.drawn_chunks())
+    need, free = copies * images * _IMAGE_BYTES[recipe.images] - existing, shutil.disk_usage(growth.work).free
     if need > free:
         raise ShareError(
             f"{growth.out}: about {need / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free; "
@@ -154,14 +167,14 @@ def _check_space(growth: Growth, stage: Stage, recipe: Recipe, copies: int) -> N
         )
 
 
-def _first_shown_ns(actor: Actor) -> int:
+def _first_stamp_ns(actor: Actor) -> int:
     """What the device's clock shows at the session's first instant."""
     clock = actor.device.clock
-    shown = actor.path.start_ns + clock.offset_ns
-    return shown % clock.period_ns if clock.period_ns else shown
+    stamp = actor.path.start_ns + clock.offset_ns
+    return stamp % clock.period_ns if clock.period_ns else stamp
 
 
-def _description(recipe: Recipe, prepared: Prepared) -> str:
+def _session_yaml(recipe: SessionRecipe, prepared: PreparedSession) -> str:
     """session.yaml. A stamp in an agent's files is session time + clock_offset_ns."""
     import yaml
 
@@ -170,7 +183,7 @@ def _description(recipe: Recipe, prepared: Prepared) -> str:
             "kind": actor.kind.value,
             "sensors": actor.rig.kind,
             "rate_hz": actor.device.profile.rate_hz,
-            "clock_offset_ns": _first_shown_ns(actor) - START_NS,
+            "clock_offset_ns": _first_stamp_ns(actor) - START_NS,
             "calibration": to_kalibr(actor.rig),
         }
         for actor in prepared.stage.actors
@@ -178,17 +191,19 @@ def _description(recipe: Recipe, prepared: Prepared) -> str:
     provenance = {
         "generator": "share emulate",
         "share_version": __version__,
-        **recipe.plain(),
+        **recipe.to_mapping(),
         "notes": list(prepared.notes),
     }
     data = {"schema": SCHEMA, "provenance": provenance, "agents": agents}
-    if (placed := prepared.layout.target) is not None:
-        data[TARGET] = to_plain(placed.target) | {T_WORLD_TARGET: placed.T_world_target.tolist()}
+    if (placed_target := prepared.layout.target) is not None:
+        data[TARGET] = target_mapping(placed_target.target) | {
+            T_WORLD_TARGET: placed_target.T_world_target.tolist()
+        }
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 
 @contextmanager
-def _lock(cache: Path) -> Iterator[None]:
+def _cache_lock(cache: Path) -> Iterator[None]:
     """Only one process at a time makes what is to be kept there; others wait. The lock is on the folder
     itself, so nothing is left behind, and the system releases it if we are killed."""
     import fcntl

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.lab.emulate.motion.avatars import Avatar
-from share.lab.emulate.sensor.device import Device, Pictures
-from share.lab.emulate.types import Moment, Path
+from share.lab.emulate.sensor.device import EmulatedDevice, PictureTimes
+from share.lab.emulate.types import MotionPath, SceneInstant
 from share.lab.emulate.world.mesh import Shape
 from share.types import F64, I64, AgentKind
 
-_NEAR_M = 1.5  # what motion blur is reckoned for; nearer things blur more than their samples show
+_BLUR_DISTANCE_M = 1.5  # what motion blur is reckoned for; nearer things blur more than their samples show
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +27,11 @@ class Actor:
     name: str
     kind: AgentKind
     rig: Rig
-    path: Path
-    device: Device
+    path: MotionPath
+    device: EmulatedDevice
     avatar: Avatar
     shapes: tuple[Shape, ...]
-    pictures: Pictures
+    pictures: PictureTimes
 
     @property
     def clock_offset_ns(self) -> int:
@@ -40,76 +40,79 @@ class Actor:
 
     def in_gap(self, true_ns: I64) -> NDArray[np.bool_]:
         """At which of the times (N,) nobody knows where it is."""
-        return within(self.path.gaps, true_ns)
+        return in_gaps(self.path.gaps, true_ns)
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class ActorView:
     """One instant: where the body is (4, 4), and the parts of all others (P, 4, 4) by name."""
 
     T_world_body: F64
-    movers: dict[str, F64]
+    part_poses: dict[str, F64]
 
-    def by(self, T_body_cam: F64) -> Moment:
+    def camera_view(self, T_body_cam: F64) -> SceneInstant:
         """What one of the body's cameras sees of it."""
-        return Moment(self.T_world_body @ T_body_cam, self.movers)
+        return SceneInstant(self.T_world_body @ T_body_cam, self.part_poses)
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
-    """room: where it is kept, for `share.lab.emulate.shooting` to open."""
+class RoomStage:
+    """room: where it is kept, for `share.lab.emulate.drawing` to open."""
 
     room: FilePath
     actors: tuple[Actor, ...]
 
-    def sights(self, who: int, true_ns: I64) -> list[Sight]:
-        """All that actor number `who` may see at true times (N,), which are clipped to its path. Ask for
-        many at once: most of what it costs is paid once a call."""
-        actor = self.actors[who]
+    def views(self, actor_index: int, true_ns: I64) -> list[ActorView]:
+        """All that actor number `actor_index` may see at true times (N,), which are clipped to its path. Ask
+        for many at once: most of what it costs is paid once a call."""
+        actor = self.actors[actor_index]
         times = np.clip(true_ns, actor.path.start_ns, actor.path.end_ns)
-        others = self._others(who, times - actor.clock_offset_ns)
+        others = self._other_parts(actor_index, times - actor.clock_offset_ns)
         return [
-            Sight(T, {name: parts[k] for name, parts in others.items()})
+            ActorView(T, {name: parts[k] for name, parts in others.items()})
             for k, T in enumerate(actor.path.poses(times))
         ]
 
-    def motion_px(self, who: int, true_ns: I64, exposure_ms: F64) -> F64:
+    def motion_px(self, actor_index: int, true_ns: I64, exposure_ms: F64) -> F64:
         """How far things at _NEAR_M move in each picture (N,) during its exposure, px."""
-        actor = self.actors[who]
+        actor = self.actors[actor_index]
         half = (exposure_ms * 5e5).astype(np.int64)
         first, last = (
             actor.path.poses(np.clip(times, actor.path.start_ns, actor.path.end_ns))
             for times in (true_ns - half, true_ns + half)
         )
-        turned = se3.angle(np.swapaxes(first[:, :3, :3], 1, 2) @ last[:, :3, :3])
-        gone: F64 = np.linalg.norm(last[:, :3, 3] - first[:, :3, 3], axis=1)
-        return actor.rig.cam0.focal * (turned + gone / _NEAR_M)
+        turned = se3.rotation_angle(np.swapaxes(first[:, :3, :3], 1, 2) @ last[:, :3, :3])
+        moved: F64 = np.linalg.norm(last[:, :3, 3] - first[:, :3, 3], axis=1)
+        return actor.rig.cam0.focal * (turned + moved / _BLUR_DISTANCE_M)
 
-    def _others(self, who: int, session_ns: I64) -> dict[str, F64]:
-        """Parts (N, P, 4, 4) of all but `who`; before its path begins and after it ends, one stands still."""
+    def _other_parts(self, actor_index: int, session_ns: I64) -> dict[str, F64]:
+        """Parts (N, P, 4, 4) of all but `actor_index`; before its path begins and after it ends, one
+        stands still."""
         out = {}
         for k, actor in enumerate(self.actors):
-            if k != who:
-                there = session_ns + actor.clock_offset_ns
-                out[actor.name] = actor.avatar.parts(np.clip(there, actor.path.start_ns, actor.path.end_ns))
+            if k != actor_index:
+                own_ns = session_ns + actor.clock_offset_ns
+                out[actor.name] = actor.avatar.part_poses(
+                    np.clip(own_ns, actor.path.start_ns, actor.path.end_ns)
+                )
         return out
 
 
-def within(gaps: I64, true_ns: I64) -> NDArray[np.bool_]:
+def in_gaps(gaps: I64, true_ns: I64) -> NDArray[np.bool_]:
     """Which of the times (N,) lie in one of the gaps (G, 2), whose ends are known."""
     t = true_ns[:, None]
     out: NDArray[np.bool_] = np.any((t > gaps[:, 0]) & (t < gaps[:, 1]), axis=1)
     return out
 
 
-def T_body(rig: Rig, camera: str) -> F64:
+def T_body_camera(rig: Rig, camera: str) -> F64:
     """T_body_camera (4, 4) of cam0, cam1 or depth."""
     T_camera_cam0 = {"cam0": np.eye(4), "cam1": rig.T_cam1_cam0, "depth": rig.T_depth_cam0}[camera]
     assert T_camera_cam0 is not None
     return rig.T_body_cam0 @ se3.inverse(T_camera_cam0)
 
 
-def smaller(camera: Camera, factor: int) -> Camera:
+def downsized(camera: Camera, factor: int) -> Camera:
     """The same view in `factor` times fewer pixels each way."""
     return replace(
         camera,

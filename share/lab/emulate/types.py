@@ -41,7 +41,7 @@ class Mesh:
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class DrawableRoom:
     """A room ready to be drawn.
 
     size (3,) m. mesh: what does not move. pictures (L, P, P) uint8: albedo, one a layer. light_map
@@ -57,33 +57,33 @@ class Room:
     pictures: U8
     light_uv: F32
     light_map: U8
-    movers: dict[str, tuple[Mesh, ...]] = field(default_factory=dict)
+    agent_parts: dict[str, tuple[Mesh, ...]] = field(default_factory=dict)
     mover_light: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class SceneInstant:
     """What stands where at one instant. T_world_cam (4, 4); movers: by name, T_world_part (P, 4, 4).
     An agent does not list itself: it does not see itself."""
 
     T_world_cam: F64
-    movers: dict[str, F64] = field(default_factory=dict)
+    part_poses: dict[str, F64] = field(default_factory=dict)
 
 
-class Renderer(Protocol):
+class RoomRenderer(Protocol):
     """Draws one room. Made once a process; not safe for threads."""
 
-    def radiance(self, camera: Camera, moments: Sequence[Moment]) -> F32:
-        """Image (H, W) in linear gray levels 0..255, the mean over `moments`: one for a sharp image,
+    def radiance(self, camera: Camera, instants: Sequence[SceneInstant]) -> F32:
+        """Image (H, W) in linear gray levels 0..255, the mean over `instants`: one for a sharp image,
         several for one blurred by motion. Honours the camera's distortion; pixel centres at integers."""
         ...
 
-    def depth(self, camera: Camera, moment: Moment) -> F32:
+    def depth(self, camera: Camera, instant: SceneInstant) -> F32:
         """Exact depth (H, W) m along the optical axis through pixel centres, 0 where nothing is."""
         ...
 
 
-class Path(Protocol):
+class MotionPath(Protocol):
     """The true motion of one agent's body (its IMU frame), known at every instant of its span.
 
     start_ns, end_ns: in the agent's clock, both included. gaps (G, 2) ns: where nobody knows the truth
@@ -112,7 +112,7 @@ class Path(Protocol):
         both in the body frame; gravity is `GRAVITY` along -z of the world."""
         ...
 
-    def placed(self, T_world_old: F64) -> Path:
+    def transformed(self, T_world_old: F64) -> MotionPath:
         """The same motion elsewhere: turned about the vertical and shifted by T_world_old (4, 4)."""
         ...
 

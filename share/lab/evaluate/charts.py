@@ -19,7 +19,7 @@ from share.types import F64
 # ---- Figures of matplotlib as PNG files.
 
 
-def save(figure: Any, path: Path, dpi: int) -> None:
+def save_png(figure: Any, path: Path, dpi: int) -> None:
     """Whole or not at all, and its memory is given back. Raises as `atomic_write`."""
     from matplotlib import pyplot
 
@@ -31,9 +31,9 @@ def save(figure: Any, path: Path, dpi: int) -> None:
     atomic_write(path, data.getvalue())
 
 
-_NOTHING = Interval(float("nan"), float("nan"), float("nan"))
+_NO_INTERVAL = Interval(float("nan"), float("nan"), float("nan"))
 _COLOURS = ("#00798c", "#d1495b", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
-_ABREAST = 3  # panels
+_MAX_COLUMNS = 3  # panels
 
 
 def draw_bars(
@@ -52,24 +52,24 @@ def draw_bars(
     figure, axes = pyplot.subplots(
         len(panels), 1, figsize=(width, 2.6 * len(panels)), layout="constrained", sharex=True, squeeze=False
     )
-    at = np.arange(len(groups))
+    positions = np.arange(len(groups))
     for axis, (title, series) in zip(axes[:, 0], panels.items(), strict=True):
-        wide = 0.8 / len(series)
+        bar_width = 0.8 / len(series)
         for k, (name, values) in enumerate(series.items()):
-            offset = (k - (len(series) - 1) / 2) * wide
-            axis.bar(at + offset, values, wide, label=name, color=_COLOURS[k % len(_COLOURS)])
+            offset = (k - (len(series) - 1) / 2) * bar_width
+            axis.bar(positions + offset, values, bar_width, label=name, color=_COLOURS[k % len(_COLOURS)])
         if line is not None:
             axis.axhline(line, color="black", linewidth=1, linestyle="--")
         axis.set(title=title, ylabel=unit)
         axis.grid(axis="y", alpha=0.3)
         axis.set_axisbelow(True)
-    axes[-1, 0].set_xticks(at, groups, rotation=30, ha="right")
+    axes[-1, 0].set_xticks(positions, groups, rotation=30, ha="right")
     handles, names = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper right", ncols=len(names), fontsize=8)
-    save(figure, path, 110)
+    save_png(figure, path, 110)
 
 
-def draw_parts(
+def draw_ratios(
     path: Path, series: Mapping[str, Mapping[str, Interval]], base: str, names: Sequence[str]
 ) -> None:
     """PNG: for each of `series` a bar a measure, as parts of `base`, which is 1; whiskers are intervals.
@@ -79,26 +79,28 @@ def draw_parts(
     pyplot = _pyplot()
     measures = list(dict.fromkeys(name for values in series.values() for name in values))
     figure, axis = pyplot.subplots(figsize=(9, 0.5 + 0.5 * len(measures)), layout="constrained")
-    at, wide = np.arange(len(measures)), 0.8 / len(series)
+    positions, bar_width = np.arange(len(measures)), 0.8 / len(series)
     for k, (name, values) in enumerate(series.items()):
-        here = [values.get(measure, _NOTHING) for measure in measures]
-        value, low, high = (np.array([getattr(one, of) for one in here]) for of in ("value", "low", "high"))
-        off = np.nan_to_num(np.stack([value - low, high - value])).clip(0)
-        y = at + (k - (len(series) - 1) / 2) * wide
+        intervals = [values.get(measure, _NO_INTERVAL) for measure in measures]
+        value, low, high = (
+            np.array([getattr(one, of) for one in intervals]) for of in ("value", "low", "high")
+        )
+        whiskers = np.nan_to_num(np.stack([value - low, high - value])).clip(0)
+        y = positions + (k - (len(series) - 1) / 2) * bar_width
         colour = _COLOURS[names.index(name) % len(_COLOURS)]
-        axis.barh(y, value, wide, xerr=off, label=name, color=colour, ecolor="#555")
+        axis.barh(y, value, bar_width, xerr=whiskers, label=name, color=colour, ecolor="#555")
     axis.axvline(1, color="black", linewidth=1, linestyle="--")
-    axis.set_yticks(at, measures)
+    axis.set_yticks(positions, measures)
     axis.invert_yaxis()
     axis.set(xlabel=f"part of {base}", xlim=(0, None))
     axis.grid(axis="x", alpha=0.3)
     axis.set_axisbelow(True)
     figure.legend(loc="outside upper right", ncols=len(series), fontsize=8)
-    save(figure, path, 110)
+    save_png(figure, path, 110)
 
 
 def draw_lines(
-    path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]], across: str, units: Sequence[str]
+    path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]], x_label: str, units: Sequence[str]
 ) -> None:
     """PNG, a panel for each of `panels`, of one of `units`: {series: (x (N,), y (N,))}. across: what x is."""
     pyplot = _pyplot()
@@ -111,28 +113,30 @@ def draw_lines(
             axis.step(x, y, where="post", label=name, color=_COLOURS[names.index(name) % len(_COLOURS)])
         axis.set(title=title, ylabel=unit)
         axis.grid(alpha=0.3)
-    axes[-1, 0].set_xlabel(across)
+    axes[-1, 0].set_xlabel(x_label)
     handles = [pyplot.Line2D([], [], color=_COLOURS[k % len(_COLOURS)]) for k in range(len(names))]
     figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
-    save(figure, path, 110)
+    save_png(figure, path, 110)
 
 
-def draw_ways(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -> None:
+def draw_paths(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -> None:
     """PNG, a panel for each of `panels`, from above: {series: (its way (N, 2) m, dots on it (M, 2) m)}."""
     pyplot = _pyplot()
-    across = min(_ABREAST, len(panels))
-    down = -(-len(panels) // across)
-    wide, high = np.ptp(
-        [xy for series in panels.values() for way, _ in series.values() for xy in way], axis=0
+    columns = min(_MAX_COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    width, height = np.ptp(
+        [xy for series in panels.values() for path_xy, _ in series.values() for xy in path_xy], axis=0
     )
-    size = 3.2 * across, (3.0 * np.clip(high / max(wide, 1e-9), 0.3, 2) + 0.5) * down + 0.5
-    figure, axes = pyplot.subplots(down, across, figsize=size, layout="constrained", sharex=True, sharey=True)
+    size = 3.2 * columns, (3.0 * np.clip(height / max(width, 1e-9), 0.3, 2) + 0.5) * rows + 0.5
+    figure, axes = pyplot.subplots(
+        rows, columns, figsize=size, layout="constrained", sharex=True, sharey=True
+    )
     flat = np.atleast_1d(axes).ravel()
     names = list(dict.fromkeys(name for series in panels.values() for name in series))
     colours = {name: _COLOURS[k % len(_COLOURS)] for k, name in enumerate(names)}
     for axis, (title, series) in zip(flat, panels.items(), strict=False):
-        for name, (way, dots) in series.items():
-            axis.plot(*way.T, color=colours[name], linewidth=0.6, alpha=0.6)
+        for name, (path_xy, dots) in series.items():
+            axis.plot(*path_xy.T, color=colours[name], linewidth=0.6, alpha=0.6)
             axis.scatter(*dots.T, color=colours[name], s=9, alpha=0.35, linewidths=0)
         axis.set(title=title, aspect="equal")
         axis.grid(alpha=0.3)
@@ -142,14 +146,14 @@ def draw_ways(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -
     figure.supylabel("m")
     handles = [pyplot.Line2D([], [], color=colour, marker="o") for colour in colours.values()]
     figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
-    save(figure, path, 110)
+    save_png(figure, path, 110)
 
 
-def draw_heat(
+def draw_heat_maps(
     path: Path,
     maps: Mapping[str, NDArray[np.floating[Any]]],
-    down: tuple[str, Sequence[str]],
-    across: tuple[str, Sequence[str]],
+    y_axis: tuple[str, Sequence[str]],
+    x_axis: tuple[str, Sequence[str]],
 ) -> None:
     """PNG: a map for each of `maps`, (V, W) over V values down and W across, each with what it is of."""
     pyplot = _pyplot()
@@ -158,13 +162,13 @@ def draw_heat(
     )
     for axis, (title, cells) in zip(axes[0], maps.items(), strict=True):
         image = axis.imshow(cells, cmap="Blues", aspect="auto", origin="lower")
-        axis.set_xticks(range(len(across[1])), across[1])
-        axis.set_yticks(range(len(down[1])), down[1])
-        axis.set(xlabel=across[0], ylabel=down[0], title=title)
+        axis.set_xticks(range(len(x_axis[1])), x_axis[1])
+        axis.set_yticks(range(len(y_axis[1])), y_axis[1])
+        axis.set(xlabel=x_axis[0], ylabel=y_axis[0], title=title)
         for (i, j), cell in np.ndenumerate(cells):
             dark = np.isfinite(cell) and image.norm(cell) > 0.5
             axis.text(j, i, f"{cell:.3g}", ha="center", va="center", color="white" if dark else "black")
-    save(figure, path, 110)
+    save_png(figure, path, 110)
 
 
 def _pyplot() -> Any:
@@ -178,7 +182,7 @@ def _pyplot() -> Any:
 
 # ---- The trajectories of a run as one picture: seen from above, and height over time.
 
-_PATH_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
+_TRAJECTORY_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
 
 
 def draw_trajectories(
@@ -193,28 +197,34 @@ def draw_trajectories(
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, (above, error) = pyplot.subplots(
+    figure, (top_view, error) = pyplot.subplots(
         1, 2, figsize=(13, 6.2), width_ratios=(3, 2), layout="constrained"
     )
     start = min(truth.stamps_ns[0] for _, truth in agents.values())
-    for (name, (estimate, truth)), colour in zip(agents.items(), _PATH_COLOURS * len(agents), strict=False):
+    for (name, (estimate, truth)), colour in zip(
+        agents.items(), _TRAJECTORY_COLOURS * len(agents), strict=False
+    ):
         p = truth.T[:, :3, 3]
-        above.plot(p[:, 0], p[:, 1], color=colour, alpha=0.3, linewidth=5, solid_capstyle="round")
+        top_view.plot(p[:, 0], p[:, 1], color=colour, alpha=0.3, linewidth=5, solid_capstyle="round")
         if estimate is None:
             continue
         q = transform(T_truth_map, estimate.T[:, :3, 3])
-        above.plot(q[:, 0], q[:, 1], color=colour, linewidth=1.2, label=name)
-        above.plot(*q[0, :2], "o", color=colour, markersize=6)
+        top_view.plot(q[:, 0], q[:, 1], color=colour, linewidth=1.2, label=name)
+        top_view.plot(*q[0, :2], "o", color=colour, markersize=6)
         t = (estimate.stamps_ns - start) * 1e-9
-        at = np.array([np.interp(estimate.stamps_ns, truth.stamps_ns, p[:, k]) for k in range(3)]).T
-        error.plot(t, 100 * np.linalg.norm(q - at, axis=1), color=colour, linewidth=1.2, label=name)
-    above.set(title="from above: truth (broad), in the shared map (thin)", xlabel="x [m]", ylabel="y [m]")
-    above.set_aspect("equal")
+        true_positions = np.array(
+            [np.interp(estimate.stamps_ns, truth.stamps_ns, p[:, k]) for k in range(3)]
+        ).T
+        error.plot(
+            t, 100 * np.linalg.norm(q - true_positions, axis=1), color=colour, linewidth=1.2, label=name
+        )
+    top_view.set(title="from above: truth (broad), in the shared map (thin)", xlabel="x [m]", ylabel="y [m]")
+    top_view.set_aspect("equal")
     error.set(title="position error in the shared map", xlabel="time [s]", ylabel="cm")
     error.set_ylim(bottom=0)
-    for axes in (above, error):
+    for axes in (top_view, error):
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend()
     figure.suptitle(title)
-    save(figure, path, 110)
+    save_png(figure, path, 110)

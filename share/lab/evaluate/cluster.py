@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import TypeVar
 
-from share.errors import ShareError, UsageError, not_installed
+from share.errors import ShareError, UsageError, install_hint
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -20,7 +20,7 @@ class Cluster:
 
     def __init__(self, address: str) -> None:
         if importlib.util.find_spec("distributed") is None:
-            raise UsageError(f"--scheduler: {not_installed('distributed', 'cluster')}")
+            raise UsageError(f"--scheduler: {install_hint('distributed', 'cluster')}")
         from distributed import Client
 
         try:
@@ -29,7 +29,7 @@ class Cluster:
             raise UsageError(f"--scheduler {address}: nobody answers there: {error}") from None
 
     @property
-    def count(self) -> int:
+    def worker_count(self) -> int:
         """Of workers now; as if there were one where none has come yet."""
         return max(1, len(self._client.nthreads()))
 

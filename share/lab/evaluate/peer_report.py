@@ -12,8 +12,8 @@ import numpy as np
 
 from share import __version__
 from share.lab.evaluate.charts import draw_bars
-from share.lab.evaluate.peer_comparison import Row
-from share.lab.evaluate.report import bullets, csv_text, markdown_table, number, picture
+from share.lab.evaluate.peer_comparison import TrackerRow
+from share.lab.evaluate.report import bullets, csv_text, format_number, image_link, markdown_table
 from share.runtime.machine import describe_machine
 
 PROTOCOL = (
@@ -24,18 +24,18 @@ PROTOCOL = (
 )
 
 
-def csv_of(found: Sequence[Row]) -> str:
+def rows_csv(rows: Sequence[TrackerRow]) -> str:
     """A line a row."""
-    return csv_text([f.name for f in dataclasses.fields(Row)], map(dataclasses.astuple, found))
+    return csv_text([f.name for f in dataclasses.fields(TrackerRow)], map(dataclasses.astuple, rows))
 
 
-def markdown(found: Sequence[Row], lacking: Sequence[str]) -> str:
+def markdown(rows: Sequence[TrackerRow], missing: Sequence[str]) -> str:
     """The table, medians where there are several recordings, and the protocol."""
     head = ("recording", "tracker", "ATE cm", "most cm", "RPE 1 s cm", "°", "with a pose %")
     cpu = ("CPU ms a frame", "mean", "p99")
-    body = [_cells(row) for row in found]
-    if len({row.recording for row in found}) > 1:
-        body += [_cells(row) for row in _medians(found)]
+    body = [_cells(row) for row in rows]
+    if len({row.recording for row in rows}) > 1:
+        body += [_cells(row) for row in _medians(rows)]
     machine = describe_machine()
     lines = [
         "# Trackers side by side",
@@ -44,42 +44,44 @@ def markdown(found: Sequence[Row], lacking: Sequence[str]) -> str:
             (
                 *PROTOCOL,
                 f"machine: {machine['cpu']}, {machine['cores']} cores; SHARE {__version__}",
-                *(f"left out: {text}" for text in lacking),
+                *(f"left out: {text}" for text in missing),
             )
         ),
     ]
     return "\n\n".join(lines) + "\n"
 
 
-def _medians(found: Sequence[Row]) -> Iterator[Row]:
+def _medians(rows: Sequence[TrackerRow]) -> Iterator[TrackerRow]:
     """Of each tracker, over the recordings where it has figures."""
-    for tracker in dict.fromkeys(row.tracker for row in found):
-        mine = [row for row in found if row.tracker == tracker]
+    for tracker in dict.fromkeys(row.tracker for row in rows):
+        tracker_rows = [row for row in rows if row.tracker == tracker]
         values = [
             median(known)
-            if (known := [v for row in mine if not math.isnan(v := getattr(row, f.name))])
+            if (known := [v for row in tracker_rows if not math.isnan(v := getattr(row, f.name))])
             else math.nan
-            for f in dataclasses.fields(Row)[3:]
+            for f in dataclasses.fields(TrackerRow)[3:]
         ]
-        yield Row(f"median of {len(mine)}", tracker, sum(row.frames for row in mine), *values)
+        yield TrackerRow(
+            f"median of {len(tracker_rows)}", tracker, sum(row.frames for row in tracker_rows), *values
+        )
 
 
-def _cells(row: Row) -> list[str]:
-    cm = [number(value, ".2f") for value in (row.ate_cm, row.most_cm, row.rpe_1s_cm, row.rpe_1s_deg)]
-    cpu = [number(value, ".1f") for value in (row.cpu_ms, row.cpu_mean_ms, row.cpu_p99_ms)]
+def _cells(row: TrackerRow) -> list[str]:
+    cm = [format_number(value, ".2f") for value in (row.ate_cm, row.most_cm, row.rpe_1s_cm, row.rpe_1s_deg)]
+    cpu = [format_number(value, ".1f") for value in (row.cpu_ms, row.cpu_mean_ms, row.cpu_p99_ms)]
     return [row.recording, row.tracker, *cm, f"{100 * row.told:.1f}", *cpu]
 
 
-def draw(folder: Path, found: Sequence[Row]) -> str:
+def draw_comparison(folder: Path, rows: Sequence[TrackerRow]) -> str:
     """PNG files in `folder`; the Markdown that shows them."""
     recordings, trackers = (
-        list(dict.fromkeys(getattr(r, f) for r in found)) for f in ("recording", "tracker")
+        list(dict.fromkeys(getattr(r, f) for r in rows)) for f in ("recording", "tracker")
     )
-    by = {(row.recording, row.tracker): row for row in found}
+    row_of = {(row.recording, row.tracker): row for row in rows}
 
     def values(field: str) -> dict[str, list[float]]:
         return {
-            tracker: [getattr(by.get((one, tracker)), field, math.nan) for one in recordings]
+            tracker: [getattr(row_of.get((one, tracker)), field, math.nan) for one in recordings]
             for tracker in trackers
         }
 
@@ -89,7 +91,11 @@ def draw(folder: Path, found: Sequence[Row]) -> str:
         recordings,
         "cm",
     )
-    causal = {tracker: told for tracker, told in values("cpu_mean_ms").items() if not np.isnan(told).all()}
+    causal = {
+        tracker: values_ms
+        for tracker, values_ms in values("cpu_mean_ms").items()
+        if not np.isnan(values_ms).all()
+    }
     draw_bars(folder / "cpu.png", {"CPU a frame, mean": causal}, recordings, "ms")
-    errors, cpu = picture("Errors of each tracker", "errors.png"), picture("What they take", "cpu.png")
+    errors, cpu = image_link("Errors of each tracker", "errors.png"), image_link("What they take", "cpu.png")
     return f"{errors}\n\n{cpu}\n"

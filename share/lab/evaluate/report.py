@@ -13,19 +13,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from share.errors import DataError, UsageError
-from share.files.reading import SETTINGS, read_text
-from share.lab.evaluate.figures import AgentFigures, Conditions, RunFigures
+from share.files.reading import MAX_SETTINGS_BYTES, read_text
+from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 from share.lab.evaluate.statistics import (
     MEASURES,
-    Compared,
     Interval,
-    compare,
-    no_worse,
-    no_worse_on_average,
-    policies,
+    PolicyComparison,
+    compare_policies,
+    count_no_worse,
+    count_no_worse_on_average,
+    policy_names,
 )
 from share.lab.evaluate.trial import Trial
-from share.lab.train.score import read_scores, table
+from share.lab.train.score import read_scores, score_table
 
 # ---- Tables as text: CSV for a program, Markdown for a reader; what is not known is empty, or a dash.
 
@@ -57,81 +57,92 @@ def bullets(texts: Iterable[str]) -> str:
     return "\n".join(f"* {text[0].upper()}{text[1:]}." for text in texts)
 
 
-def picture(said: str, name: str) -> str:
+def image_link(caption: str, name: str) -> str:
     """Of Markdown, a paragraph of its own. name: of a file beside it."""
-    return f"![{said}]({name})"
+    return f"![{caption}]({name})"
 
 
-def number(value: float, form: str = ".3g") -> str:
+def format_number(value: float, form: str = ".3g") -> str:
     return "–" if math.isnan(value) else format(value, form)
 
 
 # ---- What else a report may hold, by who made it: settings that were tried, models of the error compared.
 
-SWEEP, HEAT = "sweep.md", "heat.png"
+SWEEP, HEAT_MAP = "sweep.md", "heat.png"
 
 
 @dataclass(frozen=True)
-class Annex:
+class ReportSection:
     """text: Markdown with a heading. pictures: PNG files that it shows, by the names that it has for them."""
 
     text: str
     pictures: dict[str, Path]
 
 
-def annex(path: Path, number: int) -> Annex:
+def read_section(path: Path, number: int) -> ReportSection:
     """Of a folder by `share evaluate sweep`, or a file by `share train compare --json`: a report's first or
-    `number`th. Raises UsageError for anything else, DataError for a damaged one."""
+    `format_number`th. Raises UsageError for anything else, DataError for a damaged one."""
     if path.is_file():
-        return Annex(f"## Models of the error: {path.stem}\n\n{table(read_scores(path))}\n", {})
+        return ReportSection(f"## Models of the error: {path.stem}\n\n{score_table(read_scores(path))}\n", {})
     if not (path / SWEEP).is_file():
         raise UsageError(
             f"--with {path}: give a folder by `share evaluate sweep`, "
             f"or a file by `share train compare --json`"
         )
-    heat = path / HEAT
-    text = f"## Settings tried: {path.name}\n\n{_text(path / SWEEP)}"
+    heat = path / HEAT_MAP
+    text = f"## Settings tried: {path.name}\n\n{_section_text(path / SWEEP)}"
     if not heat.is_file():
-        return Annex(text, {})
+        return ReportSection(text, {})
     name = f"heat-{number}.png"
-    return Annex(f"{text}\n{picture('Means over the first two settings', name)}\n", {name: heat})
+    return ReportSection(f"{text}\n{image_link('Means over the first two settings', name)}\n", {name: heat})
 
 
-def _text(path: Path) -> str:
+def _section_text(path: Path) -> str:
     try:
-        return read_text(path, SETTINGS)
+        return read_text(path, MAX_SETTINGS_BYTES)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise DataError(f"{path}: cannot be read: {reason}") from None
 
 
-_AGENT = [field.name for field in dataclasses.fields(AgentFigures)]
-_CONDITIONS = [field.name for field in dataclasses.fields(Conditions)]
-_RUN = ("in_one_map", "joint_ate_cm", "merges_requested", "merges_skipped", "merges_done", "merges_per_metre")
+_AGENT_COLUMNS = [field.name for field in dataclasses.fields(AgentMetrics)]
+_CONDITION_COLUMNS = [field.name for field in dataclasses.fields(Conditions)]
+_RUN_COLUMNS = (
+    "in_one_map",
+    "joint_ate_cm",
+    "merges_requested",
+    "merges_skipped",
+    "merges_done",
+    "merges_per_metre",
+)
 PROTOCOL = (
     "latency: mean over all frames' track_ms and all corrected_ms together; ms from a frame's arrival",
     "poses: causal, every frame that has one; truth interpolated at their stamps over at most 100 ms",
     "odom ATE: rms, SE3-aligned, each agent alone; map ATE: rms under one SE3 alignment for all in one map",
     "RPE: rms of poses in the map, from frame to frame and over 1 s, no alignment; docs/evaluation.md",
 )
-_DRAWN = (
+_INTERVAL_NOTE = (
     "In brackets: 95 % by drawing sessions again, each with all its runs; none where there is one session."
 )
 
 
-def agents_csv(runs: Iterable[RunFigures]) -> str:
+def agents_csv(runs: Iterable[RunMetrics]) -> str:
     """A line an agent and run."""
     return csv_text(
-        [*_CONDITIONS, *_AGENT],
-        ([*_conditions(run), *(getattr(agent, f) for f in _AGENT)] for run in runs for agent in run.agents),
+        [*_CONDITION_COLUMNS, *_AGENT_COLUMNS],
+        (
+            [*_condition_values(run), *(getattr(agent, f) for f in _AGENT_COLUMNS)]
+            for run in runs
+            for agent in run.agents
+        ),
     )
 
 
-def runs_csv(runs: Iterable[RunFigures]) -> str:
+def runs_csv(runs: Iterable[RunMetrics]) -> str:
     """A line a run."""
     return csv_text(
-        [*_CONDITIONS, *_RUN, "metres"],
-        ([*_conditions(run), *(getattr(run, f) for f in _RUN), run.metres] for run in runs),
+        [*_CONDITION_COLUMNS, *_RUN_COLUMNS, "metres"],
+        ([*_condition_values(run), *(getattr(run, f) for f in _RUN_COLUMNS), run.metres] for run in runs),
     )
 
 
@@ -145,55 +156,55 @@ def sweep_csv(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def sweep_markdown(
-    rows: Sequence[Mapping[str, Any]], runs: Sequence[RunFigures], trials: Sequence[Trial]
+    rows: Sequence[Mapping[str, Any]], runs: Sequence[RunMetrics], trials: Sequence[Trial]
 ) -> str:
     """The same for a reader, with intervals, and of what."""
-    titles = {measure.name: measure.titled for measure in MEASURES}
+    titles = {measure.name: measure.title for measure in MEASURES}
     head = [*rows[0]["settings"], "runs", *(titles[name] for name in rows[0]["means"])]
     body = [
-        [*row["settings"].values(), str(row["runs"]), *(_wide(m) for m in row["means"].values())]
+        [*row["settings"].values(), str(row["runs"]), *(_interval_cell(m) for m in row["means"].values())]
         for row in rows
     ]
-    return "\n\n".join([provenance(runs, trials), markdown_table([head, *body]), _DRAWN]) + "\n"
+    return "\n\n".join([provenance(runs, trials), markdown_table([head, *body]), _INTERVAL_NOTE]) + "\n"
 
 
-class Shown(NamedTuple):
+class ReportPictures(NamedTuple):
     """Markdown that shows pictures: of all policies compared, of every agent, of how a run goes."""
 
-    compared: str
+    comparison: str
     agents: str
-    course: str
+    timeline: str
 
 
-_NOTHING_SHOWN = Shown("", "", "")
+_NO_PICTURES = ReportPictures("", "", "")
 
 
 def markdown(
-    runs: Sequence[RunFigures],
+    runs: Sequence[RunMetrics],
     trials: Sequence[Trial],
     base: str,
     failed: Sequence[str] = (),
-    shown: Shown = _NOTHING_SHOWN,
+    pictures: ReportPictures = _NO_PICTURES,
 ) -> str:
     """All policies against `base`. failed: runs that came to nothing, by name."""
-    names = policies(runs)
+    names = policy_names(runs)
     parts = [
         "# Policies compared",
         provenance(runs, trials, failed),
         f"## Each policy, and as a part of `{base}`",
         _comparison(runs, names, base),
         "Values: means over all runs that have one. Parts: of pairs of runs of one session, link and seed; "
-        f"(n of N): not both have it in all pairs. {_DRAWN}",
-        shown.compared,
+        f"(n of N): not both have it in all pairs. {_INTERVAL_NOTE}",
+        pictures.comparison,
     ]
     others = [name for name in names if name != names[0]]
     if others:
-        parts += [f"## Errors by `{names[0]}`", *(_wins(runs, names[0], other) for other in others)]
-    parts += ["## Every agent", shown.agents, _every_agent(runs, names), shown.course]
+        parts += [f"## Errors by `{names[0]}`", *(_win_counts(runs, names[0], other) for other in others)]
+    parts += ["## Every agent", pictures.agents, _agent_table(runs, names), pictures.timeline]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def provenance(runs: Sequence[RunFigures], trials: Sequence[Trial], failed: Sequence[str] = ()) -> str:
+def provenance(runs: Sequence[RunMetrics], trials: Sequence[Trial], failed: Sequence[str] = ()) -> str:
     """What was played, where, when, by which code, and how it is scored: a Markdown list."""
     records = [trial.record for trial in trials]
     conditions = [run.conditions for run in runs]
@@ -201,25 +212,27 @@ def provenance(runs: Sequence[RunFigures], trials: Sequence[Trial], failed: Sequ
         f"{r['machine']['cpu']}, {r['machine']['cores']} cores, {r['machine']['system']}" for r in records
     }
     loads = [r["machine"]["load"] for r in records]
-    told = [
-        f"{len(runs)} runs in {_each(c.clock for c in conditions)}, "
+    lines = [
+        f"{len(runs)} runs in {_joined_names(c.clock for c in conditions)}, "
         f"{min(r['began'] for r in records)} to {max(r['began'] for r in records)}.",
         *([f"NOT played, and nowhere below: {', '.join(failed)}."] if failed else []),
-        f"Policies: {_each(c.policy for c in conditions)}; sessions: {_each(c.session for c in conditions)}; "
-        f"links: {_each(c.link or 'loopback' for c in conditions)}; "
-        f"seeds: {_each(str(c.seed) for c in conditions)}.",
+        f"Policies: {_joined_names(c.policy for c in conditions)}; "
+        f"sessions: "
+        f"{_joined_names(c.session for c in conditions)}; "
+        f"links: {_joined_names(c.link or 'loopback' for c in conditions)}; "
+        f"seeds: {_joined_names(str(c.seed) for c in conditions)}.",
         f"Machine: {'; '.join(sorted(machines))}; load before a run {min(loads):g} to {max(loads):g}.",
-        f"SHARE {_each(r['version'] for r in records)}, {_code(conditions)}; "
-        f"evaluations tell {_each(c.told for c in conditions)}.",
+        f"SHARE {_joined_names(r['version'] for r in records)}, {_code_states(conditions)}; "
+        f"evaluations tell {_joined_names(c.told for c in conditions)}.",
     ]
-    return "\n".join([*(f"* {line}" for line in told), bullets(PROTOCOL)])
+    return "\n".join([*(f"* {line}" for line in lines), bullets(PROTOCOL)])
 
 
-def _each(names: Iterable[str]) -> str:
+def _joined_names(names: Iterable[str]) -> str:
     return ", ".join(sorted(set(names)))
 
 
-def _code(conditions: Sequence[Conditions]) -> str:
+def _code_states(conditions: Sequence[Conditions]) -> str:
     """By which state of the code; runs of several may differ for that alone."""
     runs_by = Counter(c.code or "unknown" for c in conditions)
     if len(runs_by) == 1:
@@ -227,42 +240,42 @@ def _code(conditions: Sequence[Conditions]) -> str:
     return "SEVERAL STATES OF THE CODE: " + ", ".join(f"{code} ({n} runs)" for code, n in runs_by.items())
 
 
-def _comparison(runs: Sequence[RunFigures], names: Sequence[str], base: str) -> str:
-    found = {name: compare(runs, name, base) for name in names}
+def _comparison(runs: Sequence[RunMetrics], names: Sequence[str], base: str) -> str:
+    comparisons = {name: compare_policies(runs, name, base) for name in names}
     rows = [["", *names]]
     for k, measure in enumerate(MEASURES):
         cells = []
         for name in names:
-            one = found[name][k]
-            ratio = "" if name == base else f"; {_part(one)}"
-            cells.append(number(one.value.value) + ratio)
-        rows.append([measure.titled, *cells])
+            one = comparisons[name][k]
+            ratio = "" if name == base else f"; {_ratio_cell(one)}"
+            cells.append(format_number(one.value.value) + ratio)
+        rows.append([measure.title, *cells])
     return markdown_table(rows)
 
 
-def _wins(runs: Sequence[RunFigures], name: str, other: str) -> str:
-    better, of = no_worse(runs, name, other)
-    means, of_means = no_worse_on_average(runs, name, other)
-    told = f"in {better} of {of} runs of an agent (those in which it is in the map by both)"
-    return f"* no more than by `{other}` {told}, in {means} of {of_means} means of an agent on a session"
+def _win_counts(runs: Sequence[RunMetrics], name: str, other: str) -> str:
+    wins, total = count_no_worse(runs, name, other)
+    means, total_means = count_no_worse_on_average(runs, name, other)
+    text = f"in {wins} of {total} runs of an agent (those in which it is in the map by both)"
+    return f"* no more than by `{other}` {text}, in {means} of {total_means} means of an agent on a session"
 
 
-def _every_agent(runs: Sequence[RunFigures], names: Sequence[str]) -> str:
+def _agent_table(runs: Sequence[RunMetrics], names: Sequence[str]) -> str:
     rows = [["session", "agent", *(f"{name}: ms, cm" for name in names)]]
     for session in dict.fromkeys(run.conditions.session for run in runs):
         for agent in dict.fromkeys(
             a.agent for r in runs if r.conditions.session == session for a in r.agents
         ):
             cells = [
-                f"{number(mean_of(runs, name, session, agent, 'latency_ms'))}, "
-                f"{number(mean_of(runs, name, session, agent, 'ate_cm'))}"
+                f"{format_number(agent_mean(runs, name, session, agent, 'latency_ms'))}, "
+                f"{format_number(agent_mean(runs, name, session, agent, 'ate_cm'))}"
                 for name in names
             ]
             rows.append([session, agent, *cells])
     return markdown_table(rows)
 
 
-def mean_of(runs: Sequence[RunFigures], policy: str, session: str, agent: str, field: str) -> float:
+def agent_mean(runs: Sequence[RunMetrics], policy: str, session: str, agent: str, field: str) -> float:
     values = [
         getattr(one, field)
         for run in runs
@@ -274,22 +287,30 @@ def mean_of(runs: Sequence[RunFigures], policy: str, session: str, agent: str, f
     return sum(known) / len(known) if known else math.nan
 
 
-def _conditions(run: RunFigures) -> list[object]:
-    return [getattr(run.conditions, name) for name in _CONDITIONS]
+def _condition_values(run: RunMetrics) -> list[object]:
+    return [getattr(run.conditions, name) for name in _CONDITION_COLUMNS]
 
 
-def _part(of: Compared) -> str:
-    partly = f" ({of.pairs} of {of.of})" if 0 < of.pairs < of.of else ""
-    return _told(of.ratio, ".2f") + partly
+def _ratio_cell(comparison: PolicyComparison) -> str:
+    partly = (
+        f" ({comparison.pairs} of {comparison.total_pairs})"
+        if 0 < comparison.pairs < comparison.total_pairs
+        else ""
+    )
+    return _interval_text(comparison.ratio, ".2f") + partly
 
 
-def _wide(of: Interval) -> str:
-    return _told(of, ".3g")
+def _interval_cell(interval: Interval) -> str:
+    return _interval_text(interval, ".3g")
 
 
-def _told(of: Interval, form: str) -> str:
+def _interval_text(interval: Interval, number_format: str) -> str:
     """A dash where it is not known; alone where one session cannot say how sure it is."""
-    if math.isnan(of.value):
+    if math.isnan(interval.value):
         return "–"
-    between = "" if math.isnan(of.low) else f" [{of.low:{form}}, {of.high:{form}}]"
-    return f"{of.value:{form}}{between}"
+    bounds = (
+        ""
+        if math.isnan(interval.low)
+        else f" [{interval.low:{number_format}}, {interval.high:{number_format}}]"
+    )
+    return f"{interval.value:{number_format}}{bounds}"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from share.geometry import se3
-from share.lab.evaluate.figures import AgentFigures, RunFigures
+from share.lab.evaluate.run_metrics import AgentMetrics, RunMetrics
 from share.types import F64, I64
 
 # ---- How sure a mean over runs is, by drawing their sessions again.
@@ -37,35 +37,35 @@ class Interval(NamedTuple):
     high: float
 
 
-def mean(values: ArrayLike, sessions: Sequence[str], rng: np.random.Generator) -> Interval:
+def bootstrap_mean(values: ArrayLike, sessions: Sequence[str], rng: np.random.Generator) -> Interval:
     """Of values (N,) of runs on `sessions` (N), without those that are NaN; all NaN where none is left."""
     v = np.asarray(values, np.float64)
     return bootstrap_ratio(v, np.ones(len(v)), sessions, rng)
 
 
 def bootstrap_ratio(
-    over: ArrayLike, under: ArrayLike, sessions: Sequence[str], rng: np.random.Generator
+    numerator: ArrayLike, denominator: ArrayLike, sessions: Sequence[str], rng: np.random.Generator
 ) -> Interval:
     """sum(over) / sum(under), (N,) each, of pairs of runs on `sessions` (N); without pairs with a NaN."""
-    a, b = np.asarray(over, np.float64), np.asarray(under, np.float64)
+    a, b = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
     known = np.isfinite(a) & np.isfinite(b)
-    names, of = np.unique(np.array(sessions, str)[known], return_inverse=True)
+    names, session_index = np.unique(np.array(sessions, str)[known], return_inverse=True)
     count = len(names)
-    a, b = (np.bincount(of, values[known], count).astype(np.float64) for values in (a, b))
+    a, b = (np.bincount(session_index, values[known], count).astype(np.float64) for values in (a, b))
     if not b.sum():
         return Interval(math.nan, math.nan, math.nan)
     value = float(a.sum() / b.sum())
     if count == 1:
         return Interval(value, math.nan, math.nan)
-    drawn = rng.integers(count, size=(_DRAWS, count))
-    below = b[drawn].sum(1)
-    ratios: F64 = a[drawn].sum(1)[below != 0] / below[below != 0]
+    resampled = rng.integers(count, size=(_DRAWS, count))
+    denominators = b[resampled].sum(1)
+    ratios: F64 = a[resampled].sum(1)[denominators != 0] / denominators[denominators != 0]
     low, high = np.quantile(ratios, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
     return Interval(value, float(low), float(high))
 
 
 _SEED = 1  # of the draws, so that the same runs give the same table
-_DIGITS = 9  # in which two errors are compared
+_COMPARE_DIGITS = 9  # in which two errors are compared
 
 
 @dataclass(frozen=True)
@@ -74,48 +74,48 @@ class Measure:
 
     name: str
     unit: str
-    of: Callable[[RunFigures], float]
+    value_of: Callable[[RunMetrics], float]
 
     @property
-    def titled(self) -> str:
+    def title(self) -> str:
         """With its unit."""
         return f"{self.name}, {self.unit}" if self.unit else self.name
 
 
-def _mean(kind: str, value: Callable[[AgentFigures], float]) -> Callable[[RunFigures], float]:
+def _mean_over_kind(kind: str, value: Callable[[AgentMetrics], float]) -> Callable[[RunMetrics], float]:
     """Over agents of a kind that have it; NaN without any."""
 
-    def of(run: RunFigures) -> float:
-        values = [value(agent) for agent in run.of(kind)]
+    def mean_of_run(run: RunMetrics) -> float:
+        values = [value(agent) for agent in run.agents_of_kind(kind)]
         known = [v for v in values if not math.isnan(v)]
         return float(np.mean(known)) if known else math.nan
 
-    return of
+    return mean_of_run
 
 
 MEASURES = (
-    Measure("AR latency", "ms", _mean("ar", lambda a: a.latency_ms)),
-    Measure("AR frames", "ms", _mean("ar", lambda a: a.track_ms)),
-    Measure("AR frames over 20 ms", "%", _mean("ar", lambda a: 100 * a.over_20ms)),
-    Measure("AR corrections", "ms", _mean("ar", lambda a: a.corrected_ms)),
-    Measure("robot latency", "ms", _mean("robot", lambda a: a.latency_ms)),
+    Measure("AR latency", "ms", _mean_over_kind("ar", lambda a: a.latency_ms)),
+    Measure("AR frames", "ms", _mean_over_kind("ar", lambda a: a.track_ms)),
+    Measure("AR frames over 20 ms", "%", _mean_over_kind("ar", lambda a: 100 * a.over_20ms)),
+    Measure("AR corrections", "ms", _mean_over_kind("ar", lambda a: a.corrected_ms)),
+    Measure("robot latency", "ms", _mean_over_kind("robot", lambda a: a.latency_ms)),
     Measure("merges a metre", "1/m", lambda run: run.merges_per_metre),
-    Measure("AR ATE in the map", "cm", _mean("ar", lambda a: a.ate_cm)),
-    Measure("robot ATE in the map", "cm", _mean("robot", lambda a: a.ate_cm)),
-    Measure("AR error told", "cm", _mean("ar", lambda a: a.told_cm)),
-    Measure("robot error told", "cm", _mean("robot", lambda a: a.told_cm)),
+    Measure("AR ATE in the map", "cm", _mean_over_kind("ar", lambda a: a.ate_cm)),
+    Measure("robot ATE in the map", "cm", _mean_over_kind("robot", lambda a: a.ate_cm)),
+    Measure("AR error told", "cm", _mean_over_kind("ar", lambda a: a.told_cm)),
+    Measure("robot error told", "cm", _mean_over_kind("robot", lambda a: a.told_cm)),
     Measure("joint ATE", "cm", lambda run: run.joint_ate_cm),
-    Measure("AR RPE over 1 s", "cm", _mean("ar", lambda a: a.rpe_1s_cm)),
-    Measure("AR until in a shared map", "s", _mean("ar", lambda a: a.joined_s)),
+    Measure("AR RPE over 1 s", "cm", _mean_over_kind("ar", lambda a: a.rpe_1s_cm)),
+    Measure("AR until in a shared map", "s", _mean_over_kind("ar", lambda a: a.joined_s)),
     Measure("agents in one map", "", lambda run: float(run.in_one_map)),
-    Measure("AR keyframes sent", "Hz", _mean("ar", lambda a: a.rate_hz)),
-    Measure("AR QoE", "", _mean("ar", lambda a: a.qoe)),
-    Measure("robot QoE", "", _mean("robot", lambda a: a.qoe)),
+    Measure("AR keyframes sent", "Hz", _mean_over_kind("ar", lambda a: a.rate_hz)),
+    Measure("AR QoE", "", _mean_over_kind("ar", lambda a: a.qoe)),
+    Measure("robot QoE", "", _mean_over_kind("robot", lambda a: a.qoe)),
 )
 
 
 @dataclass(frozen=True)
-class Compared:
+class PolicyComparison:
     """One measure of one policy: over its runs, and as a part of the base's in the same runs.
 
     pairs: of `of` such pairs, in how many both have it.
@@ -125,31 +125,35 @@ class Compared:
     value: Interval
     ratio: Interval
     pairs: int
-    of: int
+    total_pairs: int
 
 
-def policies(runs: Sequence[RunFigures]) -> list[str]:
+def policy_names(runs: Sequence[RunMetrics]) -> list[str]:
     """In the order in which they come."""
     return list(dict.fromkeys(run.conditions.policy for run in runs))
 
 
-def compare(runs: Sequence[RunFigures], policy: str, base: str) -> list[Compared]:
+def compare_policies(runs: Sequence[RunMetrics], policy: str, base: str) -> list[PolicyComparison]:
     """`policy` against `base`, for each of `MEASURES`."""
-    mine, theirs = _by_place(runs, policy), _by_place(runs, base)
-    both = [place for place in mine if place in theirs]
+    mine, theirs = _by_conditions(runs, policy), _by_conditions(runs, base)
+    common = [place for place in mine if place in theirs]
     out = []
     for measure in MEASURES:
         rng = np.random.default_rng(_SEED)
-        value = mean([measure.of(run) for run in mine.values()], [session for session, _, _ in mine], rng)
-        over, under = (np.array([measure.of(runs[place]) for place in both]) for runs in (mine, theirs))
-        ratio = bootstrap_ratio(over, under, [session for session, _, _ in both], rng)
-        out.append(Compared(measure, value, ratio, int(np.isfinite(over + under).sum()), len(both)))
+        value = bootstrap_mean(
+            [measure.value_of(run) for run in mine.values()], [session for session, _, _ in mine], rng
+        )
+        over, under = (
+            np.array([measure.value_of(runs[place]) for place in common]) for runs in (mine, theirs)
+        )
+        ratio = bootstrap_ratio(over, under, [session for session, _, _ in common], rng)
+        out.append(PolicyComparison(measure, value, ratio, int(np.isfinite(over + under).sum()), len(common)))
     return out
 
 
-def no_worse(runs: Sequence[RunFigures], policy: str, other: str) -> tuple[int, int]:
+def count_no_worse(runs: Sequence[RunMetrics], policy: str, other: str) -> tuple[int, int]:
     """(in how many of agents' runs the ATE by `policy` is at most that by `other`, of how many)."""
-    mine, theirs = _by_place(runs, policy), _by_place(runs, other)
+    mine, theirs = _by_conditions(runs, policy), _by_conditions(runs, other)
     pairs = [
         (a.ate_cm, b.ate_cm)
         for place in mine
@@ -157,23 +161,25 @@ def no_worse(runs: Sequence[RunFigures], policy: str, other: str) -> tuple[int, 
         for a, b in zip(mine[place].agents, theirs[place].agents, strict=True)
     ]
     known = [(a, b) for a, b in pairs if not (math.isnan(a) or math.isnan(b))]
-    return sum(round(a, _DIGITS) <= round(b, _DIGITS) for a, b in known), len(known)
+    return sum(round(a, _COMPARE_DIGITS) <= round(b, _COMPARE_DIGITS) for a, b in known), len(known)
 
 
-def no_worse_on_average(runs: Sequence[RunFigures], policy: str, other: str) -> tuple[int, int]:
+def count_no_worse_on_average(runs: Sequence[RunMetrics], policy: str, other: str) -> tuple[int, int]:
     """The same of means over the runs of an agent on a session that both have."""
-    mine, theirs = _by_place(runs, policy), _by_place(runs, other)
+    mine, theirs = _by_conditions(runs, policy), _by_conditions(runs, other)
     sums: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for place in (place for place in mine if place in theirs):
         session, link, _ = place
         for a, b in zip(mine[place].agents, theirs[place].agents, strict=True):
             if not (math.isnan(a.ate_cm) or math.isnan(b.ate_cm)):
                 sums.setdefault((session, link, a.agent), []).append((a.ate_cm, b.ate_cm))
-    means = np.array([np.mean(pairs, axis=0) for pairs in sums.values()]).reshape(-1, 2).round(_DIGITS)
+    means = (
+        np.array([np.mean(pairs, axis=0) for pairs in sums.values()]).reshape(-1, 2).round(_COMPARE_DIGITS)
+    )
     return int((means[:, 0] <= means[:, 1]).sum()), len(means)
 
 
-def _by_place(runs: Sequence[RunFigures], policy: str) -> dict[tuple[str, str, int], RunFigures]:
+def _by_conditions(runs: Sequence[RunMetrics], policy: str) -> dict[tuple[str, str, int], RunMetrics]:
     """By what they share with runs of other policies."""
     return {
         (run.conditions.session, run.conditions.link, run.conditions.seed): run
@@ -206,29 +212,29 @@ class Deviations:
         return out
 
 
-def deviations(T_odom_body: F64, cov: F64, T_world_body: F64, stretch: I64) -> Deviations:
+def deviations(T_odom_body: F64, cov: F64, T_world_body: F64, segment: I64) -> Deviations:
     """Of told poses (N, 4, 4) with covariances (N, 6, 6), perturbed on the right, against the truth
     (N, 4, 4). stretch (N,): which unbroken stretch each belongs to."""
     T_odom_world = np.zeros_like(T_world_body)
-    for number in np.unique(stretch):
-        these = np.flatnonzero(stretch == number)
-        T_odom_world[these] = upright(T_odom_body[these[0]], T_world_body[these[0]])
+    for number in np.unique(segment):
+        rows = np.flatnonzero(segment == number)
+        T_odom_world[rows] = yaw_alignment(T_odom_body[rows[0]], T_world_body[rows[0]])
     true = T_odom_world @ T_world_body
     R = T_odom_body[:, :3, :3]
-    turned = se3.so3_log(R @ np.swapaxes(true[:, :3, :3], 1, 2))
-    errors = np.concatenate([turned, T_odom_body[:, :3, 3] - true[:, :3, 3]], axis=1)
+    rotation_errors = se3.so3_log(R @ np.swapaxes(true[:, :3, :3], 1, 2))
+    errors = np.concatenate([rotation_errors, T_odom_body[:, :3, 3] - true[:, :3, 3]], axis=1)
     axes = np.zeros((len(R), 6, 6))
     axes[:, :3, :3] = axes[:, 3:, 3:] = R
     return Deviations(errors, axes @ cov @ np.swapaxes(axes, 1, 2))
 
 
-def upright(T_odom_body: F64, T_world_body: F64) -> F64:
+def yaw_alignment(T_odom_body: F64, T_world_body: F64) -> F64:
     """T_odom_world (4, 4), a turn about the vertical and a shift, that makes the positions of the two poses
     equal and leaves no turn about the vertical between them."""
     R = T_odom_body[:3, :3] @ T_world_body[:3, :3].T
     yaw = np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
     turn = se3.so3_exp(np.array([0.0, 0.0, yaw]))
-    return se3.compose(turn, T_odom_body[:3, 3] - turn @ T_world_body[:3, 3])
+    return se3.from_rt(turn, T_odom_body[:3, 3] - turn @ T_world_body[:3, 3])
 
 
 def nees(errors: F64, cov: F64) -> F64:
@@ -236,15 +242,15 @@ def nees(errors: F64, cov: F64) -> F64:
     right. A covariance of nought makes it infinite."""
     scale = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     with np.errstate(divide="ignore", invalid="ignore"):
-        unit = errors / scale
+        normalised = errors / scale
         correlation = cov / (scale[:, :, None] * scale[:, None, :])
     known = np.isfinite(correlation).all(axis=(1, 2))
     out = np.full(len(errors), np.inf)
-    solved = np.linalg.solve(correlation[known], unit[known][:, :, None])[:, :, 0]
-    out[known] = (unit[known] * solved).sum(1)
+    solved = np.linalg.solve(correlation[known], normalised[known][:, :, None])[:, :, 0]
+    out[known] = (normalised[known] * solved).sum(1)
     return out
 
 
-def inside(errors: F64, sigmas: F64, times: float = 3.0) -> float:
+def share_within(errors: F64, sigmas: F64, sigma_factor: float = 3.0) -> float:
     """Share of errors (N, D), N >= 1, that are within so many sigmas (N, D) on each axis."""
-    return float((np.abs(errors) <= times * sigmas).all(axis=1).mean())
+    return float((np.abs(errors) <= sigma_factor * sigmas).all(axis=1).mean())

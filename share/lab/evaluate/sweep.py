@@ -15,9 +15,9 @@ import numpy as np
 from share.config import Config
 from share.errors import UsageError
 from share.lab.evaluate import statistics
-from share.lab.evaluate.campaign import Planned, check_names
-from share.lab.evaluate.figures import RunFigures
-from share.lab.evaluate.play import Terms
+from share.lab.evaluate.campaign import PlannedRun, check_unique_names
+from share.lab.evaluate.real_time import RunOptions
+from share.lab.evaluate.run_metrics import RunMetrics
 from share.lab.evaluate.statistics import MEASURES
 from share.plain_data import from_mapping, load_yaml, to_mapping
 from share.recordings.session import Session
@@ -46,14 +46,14 @@ class Axis:
     @classmethod
     def parse(cls, text: str) -> Axis:
         """`control.kp=0.2,0.8`, `control.kp=0.1:3`, `a.b+c.d=1,2`. Raises UsageError."""
-        name, found, said = text.partition("=")
+        name, separator, values_text = text.partition("=")
         names = tuple(name.split("+"))
-        if not found or not said or any(len(one.split(".")) != 2 for one in names):
+        if not separator or not values_text or any(len(one.split(".")) != 2 for one in names):
             raise UsageError(f"--set {text}: give SECTION.NAME=VALUE,VALUE… or SECTION.NAME=LOW:HIGH")
-        if ":" not in said:
-            return cls(names, tuple(said.split(",")))
+        if ":" not in values_text:
+            return cls(names, tuple(values_text.split(",")))
         try:
-            low, high = map(float, said.split(":"))
+            low, high = map(float, values_text.split(":"))
         except ValueError:
             raise UsageError(f"--set {text}: LOW:HIGH are two numbers") from None
         if not 0 <= low < high < math.inf:
@@ -77,7 +77,7 @@ def grid(axes: Sequence[Axis]) -> list[Point]:
     return list(dict.fromkeys(itertools.product(*(axis.values for axis in axes))))
 
 
-def drawn(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
+def random_points(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
     """`count` points; the same seed gives the same ones, and more of them the same first. Fewer where listed
     values make some of them one."""
     u = np.random.default_rng(seed).random((count, len(axes)))
@@ -85,7 +85,7 @@ def drawn(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
     return list(dict.fromkeys(points))
 
 
-def at(config: Config, axes: Sequence[Axis], point: Point) -> Config:
+def config_at(config: Config, axes: Sequence[Axis], point: Point) -> Config:
     """`config` but for the settings of `point`. Raises ConfigError naming the one that is wrong."""
     mapping: dict[str, Any] = to_mapping(config)
     for axis, value in zip(axes, point, strict=True):
@@ -95,21 +95,26 @@ def at(config: Config, axes: Sequence[Axis], point: Point) -> Config:
     return from_mapping(Config, mapping, "--set")
 
 
-def planned(
+def plan_sweep(
     sessions: Sequence[Session],
     axes: Sequence[Axis],
     points: Sequence[Point],
     seeds: Sequence[int],
-    terms: Terms,
+    terms: RunOptions,
     out: Path,
     config: Config,
-) -> list[tuple[Planned, Point]]:
+) -> list[tuple[PlannedRun, Point]]:
     """All runs, with their points. Raises UsageError, ConfigError."""
-    check_names(sessions)
-    made = {point: at(config, axes, point) for point in points}
+    check_unique_names(sessions)
+    configs = {point: config_at(config, axes, point) for point in points}
     return [
         (
-            Planned(session, replace(terms, seed=seed), out / _name(session, axes, point, seed), made[point]),
+            PlannedRun(
+                session,
+                replace(terms, seed=seed),
+                out / _run_name(session, axes, point, seed),
+                configs[point],
+            ),
             point,
         )
         for seed in seeds
@@ -118,35 +123,38 @@ def planned(
     ]
 
 
-def table(axes: Sequence[Axis], runs: Sequence[tuple[Point, RunFigures]]) -> list[dict[str, Any]]:
+def sweep_table(axes: Sequence[Axis], runs: Sequence[tuple[Point, RunMetrics]]) -> list[dict[str, Any]]:
     """A row a point, in the order in which they first come: its settings, how many runs, and of each measure
     the mean with its interval."""
     rows = []
     for point in dict.fromkeys(point for point, _ in runs):
-        mine = [run for of, run in runs if of == point]
+        point_runs = [run for of, run in runs if of == point]
         rng = np.random.default_rng(_SEED)
-        sessions = [run.conditions.session for run in mine]
-        means = {m.name: statistics.mean([m.of(run) for run in mine], sessions, rng) for m in MEASURES}
-        named = dict(zip((axis.name for axis in axes), point, strict=True))
-        rows.append({"settings": named, "runs": len(mine), "means": means})
+        sessions = [run.conditions.session for run in point_runs]
+        means = {
+            m.name: statistics.bootstrap_mean([m.value_of(run) for run in point_runs], sessions, rng)
+            for m in MEASURES
+        }
+        settings = dict(zip((axis.name for axis in axes), point, strict=True))
+        rows.append({"settings": settings, "runs": len(point_runs), "means": means})
     return rows
 
 
-def heat(axes: Sequence[Axis], rows: Sequence[Mapping[str, Any]], measure: str) -> np.ndarray[Any, Any]:
+def heat_map(axes: Sequence[Axis], rows: Sequence[Mapping[str, Any]], measure: str) -> np.ndarray[Any, Any]:
     """(V0, V1): the mean of a measure over the first two axes' values, and over all others."""
     first, second = axes[:2]
     out = np.full((len(first.values), len(second.values)), np.nan)
     for i, j in np.ndindex(out.shape):
-        here = [
+        means = [
             row["means"][measure].value
             for row in rows
             if row["settings"][first.name] == first.values[i]
             and row["settings"][second.name] == second.values[j]
         ]
-        out[i, j] = np.mean(here) if here else np.nan
+        out[i, j] = np.mean(means) if means else np.nan
     return out
 
 
-def _name(session: Session, axes: Sequence[Axis], point: Point, seed: int) -> str:
-    told = ";".join(f"{axis.name}={value}" for axis, value in zip(axes, point, strict=True))
-    return f"{session.folder.resolve().name}-{seed}-{hashlib.sha256(told.encode()).hexdigest()[:10]}"
+def _run_name(session: Session, axes: Sequence[Axis], point: Point, seed: int) -> str:
+    key_text = ";".join(f"{axis.name}={value}" for axis, value in zip(axes, point, strict=True))
+    return f"{session.folder.resolve().name}-{seed}-{hashlib.sha256(key_text.encode()).hexdigest()[:10]}"

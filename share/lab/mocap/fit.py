@@ -12,25 +12,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from share.errors import DataError, MisfitError
+from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
-from share.lab.mocap.batch import CHECK, Batch, Solved, node_covariances
-from share.lab.mocap.mocap import Mocap, check_imu, holes
+from share.lab.mocap.initialisation import initial_rotation, initial_state, nearest_axis_rotation, up_vector
 from share.lab.mocap.offset import coarse_offset
-from share.lab.mocap.residuals import Residuals, residuals
+from share.lab.mocap.problem import CHECK, BatchSolution, MocapImuProblem, node_covariances
+from share.lab.mocap.residuals import FitResiduals, compute_residuals
 from share.lab.mocap.scale import axis_scales
-from share.lab.mocap.start import first_state, hand_eye, standing, up_in
-from share.lab.mocap.state import FitOptions
+from share.lab.mocap.state import MocapFitOptions
+from share.lab.mocap.trajectory import MocapTrajectory, check_imu, find_gaps
 from share.types import F64, I64, ImuBatch
 
-_EDGE_NS = 50_000_000  # mocap this near to the ends is left out: the offset may yet carry it beyond
-_LEAST_S = 2.0
-_WORST_MM = 100.0  # a path farther than this from the mocap is not the same motion
+_END_MARGIN_NS = 50_000_000  # mocap this near to the ends is left out: the offset may yet carry it beyond
+_MIN_DURATION_S = 2.0
+_MAX_RMS_MM = 100.0  # a path farther than this from the mocap is not the same motion
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class MocapFit:
     """What was found. World: the mocap's, levelled: z up, same origin, same heading.
 
     stamps_ns (N,), IMU clock; T_world_body (N, 4, 4) of the IMU; velocity (N, 3) m/s, world;
@@ -53,17 +53,17 @@ class Fit:
     gyro_bias: F64
     accel_bias: F64
     gaps: I64
-    breaks: np.ndarray
+    is_break: np.ndarray
     R_mocap_world: F64
     T_body_mocap: F64
     offset_ns: int
     drift_ppm: float
     cov_shared: F64
     cov_poses: F64
-    too_long: F64
-    too_long_sigma: F64
-    strayed: float
-    residuals: Residuals
+    scale_error: F64
+    scale_error_sigma: F64
+    mounting_prior_sigmas: float
+    residuals: FitResiduals
     gravity: float
 
     @property
@@ -79,136 +79,144 @@ class Fit:
         return float(np.degrees(np.arccos(min(1.0, np.abs(self.R_mocap_world[:, 2]).max()))))
 
 
-def fit(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions | None = None) -> Fit:
+def fit_mocap(
+    imu: ImuBatch, noise: ImuNoise, mocap: MocapTrajectory, options: MocapFitOptions | None = None
+) -> MocapFit:
     """The path of the IMU over the time that both cover.
 
     Raises DataError for stamps out of order, holes in the IMU, no or too little overlap, a body that
     does not turn; MisfitError (a DataError) where the two do not tell of one motion.
     """
-    options = options or FitOptions()
+    options = options or MocapFitOptions()
     check_imu(imu)
-    inflated = _inflated(noise, options.imu_inflation)
+    inflated = _inflated_noise(noise, options.imu_inflation)
     coarse_ns = 0 if options.within_s == 0 else coarse_offset(imu, mocap, options.within_s)
-    near = _overlap(imu, mocap.shifted(coarse_ns)).thinned(round(1e9 / options.most_hz))
-    guess, bias = _mounting(imu, near, options)
-    turn = standing(up_in(near, imu, guess))
-    near = near.turned(turn)
-    nodes, breaks = _nodes(near, options)
-    batch = Batch(imu, inflated, _inner(near, nodes, breaks), breaks, guess, options)
-    return _report(batch, batch.settle(first_state(nodes, imu, near, guess, bias)), coarse_ns, turn)
-
-
-def _inflated(noise: ImuNoise, times: float) -> ImuNoise:
-    return replace(
-        noise,
-        gyro_density=noise.gyro_density * times,
-        accel_density=noise.accel_density * times,
-        gyro_walk=noise.gyro_walk * times,
-        accel_walk=noise.accel_walk * times,
+    overlap = _overlap(imu, mocap.shifted(coarse_ns)).thinned(round(1e9 / options.max_hz))
+    guess, bias = _initial_mounting(imu, overlap, options)
+    up_rotation = nearest_axis_rotation(up_vector(overlap, imu, guess))
+    overlap = overlap.rotated(up_rotation)
+    nodes, breaks = _node_stamps(overlap, options)
+    batch = MocapImuProblem(imu, inflated, _without_ends(overlap, nodes, breaks), breaks, guess, options)
+    return _make_fit(
+        batch, batch.solve_robustly(initial_state(nodes, imu, overlap, guess, bias)), coarse_ns, up_rotation
     )
 
 
-def _overlap(imu: ImuBatch, mocap: Mocap) -> Mocap:
+def _inflated_noise(noise: ImuNoise, factor: float) -> ImuNoise:
+    return replace(
+        noise,
+        gyro_density=noise.gyro_density * factor,
+        accel_density=noise.accel_density * factor,
+        gyro_walk=noise.gyro_walk * factor,
+        accel_walk=noise.accel_walk * factor,
+    )
+
+
+def _overlap(imu: ImuBatch, mocap: MocapTrajectory) -> MocapTrajectory:
     """The mocap while the IMU runs."""
     start = max(int(imu.stamps_ns[0]), int(mocap.stamps_ns[0]))
     end = min(int(imu.stamps_ns[-1]), int(mocap.stamps_ns[-1]))
-    if end - start < _LEAST_S * 1e9:
+    if end - start < _MIN_DURATION_S * 1e9:
         raise DataError(
-            f"mocap and IMU overlap by {max(end - start, 0) * 1e-9:.1f} s, at least {_LEAST_S:.0f} s "
+            f"mocap and IMU overlap by {max(end - start, 0) * 1e-9:.1f} s, at least {_MIN_DURATION_S:.0f} s "
             "are needed; are they of one recording?"
         )
     return mocap.between(start, end)
 
 
-def _mounting(imu: ImuBatch, mocap: Mocap, options: FitOptions) -> tuple[F64, F64]:
+def _initial_mounting(imu: ImuBatch, mocap: MocapTrajectory, options: MocapFitOptions) -> tuple[F64, F64]:
     """A first T_body_mocap (4, 4), and gyro bias (3,)."""
     if options.T_body_mocap is not None:
         return options.T_body_mocap, np.zeros(3)
-    R, bias = hand_eye(imu, mocap)
-    return se3.compose(R, np.zeros(3)), bias
+    R, bias = initial_rotation(imu, mocap)
+    return se3.from_rt(R, np.zeros(3)), bias
 
 
-def _nodes(mocap: Mocap, options: FitOptions) -> tuple[I64, np.ndarray]:
+def _node_stamps(mocap: MocapTrajectory, options: MocapFitOptions) -> tuple[I64, np.ndarray]:
     """Nodes (N,) ns at even times, none in holes that break the chain or in parts
     too short to stand alone; (N - 1,) bool: where it breaks."""
     step = round(options.node_s * 1e9)
     nodes = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] + 1, step)
-    longest = round(options.break_s * 1e9)
-    for start, end in holes(mocap.stamps_ns, longest):
+    longest = round(options.max_integrated_s * 1e9)
+    for start, end in find_gaps(mocap.stamps_ns, longest):
         nodes = nodes[(nodes <= start) | (nodes >= end)]
     parts = np.split(nodes, np.flatnonzero(np.diff(nodes) > longest) + 1)
-    parts = [part for part in parts if len(part) * step > _LEAST_S * 1e9]
+    parts = [part for part in parts if len(part) * step > _MIN_DURATION_S * 1e9]
     if not parts:
-        raise DataError(f"mocap: nowhere sees the body for {_LEAST_S:.0f} s; record again")
+        raise DataError(f"mocap: nowhere sees the body for {_MIN_DURATION_S:.0f} s; record again")
     nodes = np.concatenate(parts)
     return nodes, np.diff(nodes) > longest
 
 
-def _inner(mocap: Mocap, nodes: I64, breaks: np.ndarray) -> Mocap:
+def _without_ends(mocap: MocapTrajectory, nodes: I64, breaks: np.ndarray) -> MocapTrajectory:
     """The mocap, less what the offset may yet carry beyond the ends of the chain or of its parts."""
     t = mocap.stamps_ns
     ends = np.concatenate([nodes[:1], nodes[:-1][breaks], nodes[1:][breaks], nodes[-1:]])
-    near_end = np.abs(t[:, None] - ends).min(1) < _EDGE_NS
+    is_near_end = np.abs(t[:, None] - ends).min(1) < _END_MARGIN_NS
     inside = np.isin(np.searchsorted(nodes, t, "right") - 1, np.flatnonzero(~breaks))
-    keep = inside & ~near_end
-    return Mocap(t[keep], mocap.T[keep])
+    keep = inside & ~is_near_end
+    return MocapTrajectory(t[keep], mocap.T[keep])
 
 
-def _report(batch: Batch, solved: Solved, coarse_ns: int, turn: F64) -> Fit:
+def _make_fit(batch: MocapImuProblem, solved: BatchSolution, coarse_ns: int, turn: F64) -> MocapFit:
     state, options = solved.state, batch.options
-    trusted = solved.trusted
-    if trusted.mean() < 0.5:
-        raise MisfitError(_apart(f"{100 * (1 - trusted.mean()):.0f} % of the mocap's poses are elsewhere"))
-    dt = np.diff(state.stamps_ns)[~batch.breaks] * 1e-9
+    inliers = solved.is_inlier
+    if inliers.mean() < 0.5:
+        raise CalibrationMismatchError(
+            _misfit_text(f"{100 * (1 - inliers.mean()):.0f} % of the mocap's poses are elsewhere")
+        )
+    dt = np.diff(state.stamps_ns)[~batch.is_break] * 1e-9
     sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
-    off = np.linalg.norm((solved.seen.residual * sigma).reshape(-1, 2, 3), axis=2)
-    joined = solved.chain.without(batch.breaks)
-    left = residuals(joined, dt, options.imu_inflation, off[:, 1], off[:, 0], trusted, options.sigma_position)
-    if not left.position_mm < _WORST_MM:
-        raise MisfitError(_apart(f"{left.position_mm:.0f} mm rms are left"))
+    distances = np.linalg.norm((solved.observations.residual * sigma).reshape(-1, 2, 3), axis=2)
+    chain = solved.chain.without_breaks(batch.is_break)
+    fit_residuals = compute_residuals(
+        chain, dt, options.imu_inflation, distances[:, 1], distances[:, 0], inliers, options.sigma_position
+    )
+    if not fit_residuals.position_mm < _MAX_RMS_MM:
+        raise CalibrationMismatchError(_misfit_text(f"{fit_residuals.position_mm:.0f} mm rms are left"))
     offset_ns = coarse_ns + round(state.offset_s * 1e9)
-    at = state.in_imu_clock(batch.mocap.stamps_ns[trusted])
-    scales, scales_cov = axis_scales(solved, batch.mocap, options.sigma_position, batch.share)
+    inlier_stamps = state.in_imu_clock(batch.mocap.stamps_ns[inliers])
+    scales, scales_cov = axis_scales(solved, batch.mocap, options.sigma_position, batch.sample_weight)
     covs = node_covariances(solved.normal, solved.cov_shared)
-    return Fit(
+    return MocapFit(
         stamps_ns=state.stamps_ns,
-        T_world_body=se3.compose(state.R, state.p),
+        T_world_body=se3.from_rt(state.R, state.p),
         velocity=state.v,
         gyro_bias=state.gyro_bias,
         accel_bias=state.accel_bias,
-        gaps=holes(_closed(at, state.stamps_ns), round(options.bridge_s * 1e9)),
-        breaks=batch.breaks,
+        gaps=find_gaps(_with_ends(inlier_stamps, state.stamps_ns), round(options.max_bridged_s * 1e9)),
+        is_break=batch.is_break,
         R_mocap_world=turn.T @ state.R_mocap_world,
         T_body_mocap=state.T_body_mocap,
         offset_ns=offset_ns,
         drift_ppm=state.drift * 1e6,
         cov_shared=solved.cov_shared,
-        cov_poses=_right(state.R, covs[:, :6, :6]),
-        too_long=np.abs(turn.T) @ scales,
-        too_long_sigma=np.abs(turn.T) @ np.sqrt(np.diag(scales_cov)),
-        strayed=_strayed(state.T_body_mocap, options),
-        residuals=left,
+        cov_poses=_right_perturbed(state.R, covs[:, :6, :6]),
+        scale_error=np.abs(turn.T) @ scales,
+        scale_error_sigma=np.abs(turn.T) @ np.sqrt(np.diag(scales_cov)),
+        mounting_prior_sigmas=_mounting_prior_sigmas(state.T_body_mocap, options),
+        residuals=fit_residuals,
         gravity=options.gravity,
     )
 
 
-def _strayed(T_body_mocap: F64, options: FitOptions) -> float:
+def _mounting_prior_sigmas(T_body_mocap: F64, options: MocapFitOptions) -> float:
     if options.T_body_mocap is None:
         return 0.0
     error = se3.log(se3.inverse(options.T_body_mocap) @ T_body_mocap)
     return float(np.abs(error / np.repeat(options.guess_sigma, 3)).max())
 
 
-def _apart(what: str) -> str:
-    return f"mocap and IMU do not tell of one motion: {what}; {CHECK}"
+def _misfit_text(reason: str) -> str:
+    return f"mocap and IMU do not tell of one motion: {reason}; {CHECK}"
 
 
-def _closed(seen: I64, nodes: I64) -> I64:
+def _with_ends(stamps: I64, nodes: I64) -> I64:
     """Stamps of what was seen, with both ends of the path."""
-    return np.concatenate([nodes[:1], seen, nodes[-1:]])
+    return np.concatenate([nodes[:1], stamps, nodes[-1:]])
 
 
-def _right(R: F64, cov: F64) -> F64:
+def _right_perturbed(R: F64, cov: F64) -> F64:
     """Covariances (N, 6, 6) with positions in the world -> perturbations at the right of the pose."""
     J = np.tile(np.eye(6), (len(R), 1, 1))
     J[:, 3:, 3:] = R.swapaxes(1, 2)

@@ -21,35 +21,35 @@ from pathlib import Path
 import numpy as np
 
 from share.errors import DataError
-from share.lab.mocap import cells
-from share.lab.mocap.cells import numbers
-from share.lab.mocap.mocap import Mocap
+from share.lab.mocap import csv_cells
+from share.lab.mocap.csv_cells import number_columns
+from share.lab.mocap.trajectory import MocapTrajectory
 from share.recordings.tables import read_text
-from share.recordings.trajectory import poses
+from share.recordings.trajectory import make_poses
 from share.types import F64, I64
 
 _UNITS = {"meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3}
-_BODY = "Rigid Body"
+_RIGID_BODY = "Rigid Body"
 _CELLS = [("Rotation", axis) for axis in "XYZW"] + [("Position", axis) for axis in "XYZ"]
 
 
 @dataclass(frozen=True, eq=False)
-class _Export:
+class _MotiveExport:
     """about: what the first line says. head: rows of types, names, of rotation or position, and of axes, one
     cell a column. line: of the first row of data."""
 
     path: Path
-    about: dict[str, str]
+    header: dict[str, str]
     types: list[str]
     names: list[str]
     kinds: list[str]
-    axes: list[str]
+    axis_names: list[str]
     line: int
     rows: list[list[str]]
 
-    def metres(self) -> float:
+    def metres_per_unit(self) -> float:
         """In one unit of length."""
-        unit = self.about.get("Length Units", "")
+        unit = self.header.get("Length Units", "")
         if unit.lower() not in _UNITS:
             known = ", ".join(name.capitalize() for name in _UNITS)
             raise DataError(f"{self.path}, line 1: Length Units '{unit}' are not known; known: {known}")
@@ -57,13 +57,13 @@ class _Export:
 
     def columns(self) -> dict[str, list[int]]:
         """By body, where rotation X Y Z W and position X Y Z are."""
-        bodies = [name for kind, name in zip(self.types, self.names, strict=True) if kind == _BODY]
+        bodies = [name for kind, name in zip(self.types, self.names, strict=True) if kind == _RIGID_BODY]
         return {name: [self._column(name, *cell) for cell in _CELLS] for name in dict.fromkeys(bodies)}
 
     def _column(self, name: str, kind: str, axis: str) -> int:
-        found = zip(self.types, self.names, self.kinds, self.axes, strict=True)
+        headers = zip(self.types, self.names, self.kinds, self.axis_names, strict=True)
         try:
-            return list(found).index((_BODY, name, kind, axis))
+            return list(headers).index((_RIGID_BODY, name, kind, axis))
         except ValueError:
             raise DataError(
                 f"{self.path}, line {self.line - 1}: body '{name}' has no column {kind} {axis}; export with "
@@ -76,49 +76,56 @@ def is_motive(path: Path) -> bool:
     return read_text(path).lstrip().startswith("Format Version,")
 
 
-def read_motive(path: Path) -> dict[str, Mocap | None]:
+def read_motive(path: Path) -> dict[str, MocapTrajectory | None]:
     """By body, its poses where it was seen, None where it never was, in the axes of the file; stamps are its
     times, ns. Raises DataError naming file and line."""
-    export = _read(path)
-    scale, columns = export.metres(), export.columns()
+    export = _read_export(path)
+    scale, columns = export.metres_per_unit(), export.columns()
     if not columns:
         raise DataError(f"{path}: has no rigid body; export Rigid Bodies, not only markers or skeletons")
-    if export.about.get("Coordinate Space", "Global").lower() != "global":
+    if export.header.get("Coordinate Space", "Global").lower() != "global":
         raise DataError(f"{path}, line 1: Coordinate Space is not Global; export again with Global")
     stamps = _stamps(export)
-    return {name: _body(export, name, stamps, places, scale) for name, places in columns.items()}
+    return {name: _body_trajectory(export, name, stamps, places, scale) for name, places in columns.items()}
 
 
-def _read(path: Path) -> _Export:
-    rows = cells.rows(read_text(path).splitlines(), path)
-    place = next((k for k, row in enumerate(rows) if row[:1] == ["Frame"]), 0)
-    head = [row for row in rows[1:place] if any(row)]
-    if len(head) < 3 or place + 1 >= len(rows):
+def _read_export(path: Path) -> _MotiveExport:
+    rows = csv_cells.cell_rows(read_text(path).splitlines(), path)
+    header_row = next((k for k, row in enumerate(rows) if row[:1] == ["Frame"]), 0)
+    header_rows = [row for row in rows[1:header_row] if any(row)]
+    if len(header_rows) < 3 or header_row + 1 >= len(rows):
         raise DataError(
             f"{path}: expected rows of types, names and IDs, columns that begin with Frame, and data below; "
             "the file is cut short or was exported without its header"
         )
-    axes = rows[place]
-    types, names, kinds = ([*row, *[""] * len(axes)][: len(axes)] for row in (head[0], head[1], head[-1]))
-    about = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
-    data = [row for row in rows[place + 1 :] if any(row)]
-    return _Export(path, about, types, names, kinds, axes, place + 2, data)
+    axes = rows[header_row]
+    types, names, kinds = (
+        [*row, *[""] * len(axes)][: len(axes)] for row in (header_rows[0], header_rows[1], header_rows[-1])
+    )
+    header = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
+    data = [row for row in rows[header_row + 1 :] if any(row)]
+    return _MotiveExport(path, header, types, names, kinds, axes, header_row + 2, data)
 
 
-def _stamps(export: _Export) -> I64:
-    place = next((k for k, name in enumerate(export.axes) if name.startswith("Time (")), None)
-    if place is None:
+def _stamps(export: _MotiveExport) -> I64:
+    time_column = next((k for k, name in enumerate(export.axis_names) if name.startswith("Time (")), None)
+    if time_column is None:
         raise DataError(f"{export.path}, line {export.line - 1}: has no column Time (Seconds); export again")
-    seconds = numbers(export.path, export.line, export.rows, [place])[:, 0]
-    return cells.stamps(seconds, "time", export.path, export.line)
+    seconds = number_columns(export.path, export.line, export.rows, [time_column])[:, 0]
+    return csv_cells.stamp_column(seconds, "time", export.path, export.line)
 
 
-def _body(export: _Export, name: str, stamps: I64, places: list[int], scale: float) -> Mocap | None:
-    values: F64 = numbers(export.path, export.line, export.rows, places)
-    seen = np.isfinite(values).all(1) & (values[:, :4] != 0).any(1)
-    if seen.sum() < 2:
+def _body_trajectory(
+    export: _MotiveExport, name: str, stamps: I64, columns: list[int], scale: float
+) -> MocapTrajectory | None:
+    values: F64 = number_columns(export.path, export.line, export.rows, columns)
+    is_visible = np.isfinite(values).all(1) & (values[:, :4] != 0).any(1)
+    if is_visible.sum() < 2:
         return None
     try:
-        return Mocap(stamps[seen], poses(values[seen, 4:] * scale, values[seen, :4], export.path))
+        return MocapTrajectory(
+            stamps[is_visible],
+            make_poses(values[is_visible, 4:] * scale, values[is_visible, :4], export.path),
+        )
     except DataError as error:
         raise DataError(f"{export.path}: body '{name}': {error}") from None

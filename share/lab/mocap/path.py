@@ -14,7 +14,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.lab.mocap.factors import preintegrate
-from share.lab.mocap.fit import Fit
+from share.lab.mocap.fit import MocapFit
 from share.types import F64, I64, ImuBatch
 
 
@@ -22,32 +22,34 @@ from share.types import F64, I64, ImuBatch
 class FittedPath:
     """The path of `fit` at any stamp within its nodes. imu: the samples that were fitted."""
 
-    fit: Fit
+    fit: MocapFit
     imu: ImuBatch
 
-    def moving(self, stamps_ns: I64) -> tuple[F64, F64]:
+    def pose_and_velocity(self, stamps_ns: I64) -> tuple[F64, F64]:
         """T_fit_body (N, 4, 4) and velocity (N, 3) m/s, in the fit's world, at stamps within the nodes."""
         stamps, fit = stamps_ns, self.fit
         i = np.clip(np.searchsorted(fit.stamps_ns, stamps, "right") - 1, 0, len(fit.stamps_ns) - 2)
         span = (fit.stamps_ns[i + 1] - fit.stamps_ns[i])[:, None] * 1e-9
         s = (stamps - fit.stamps_ns[i])[:, None] * 1e-9 / span
-        T, v = self._carried(i, np.where(fit.breaks[i], fit.stamps_ns[i], stamps))
-        turn, miss, miss_v = (e[i] for e in self._missed)
-        R = T[:, :3, :3] @ se3.so3_exp((3 - 2 * s) * s**2 * turn)
-        p = T[:, :3, 3] + (3 - 2 * s) * s**2 * miss + (s - 1) * s**2 * span * miss_v
-        return se3.compose(R, p), v + 6 * s * (1 - s) * miss / span + (3 * s - 2) * s * miss_v
+        T, v = self._propagate(i, np.where(fit.is_break[i], fit.stamps_ns[i], stamps))
+        rotation_error, position_error, velocity_error = (e[i] for e in self._node_errors)
+        R = T[:, :3, :3] @ se3.so3_exp((3 - 2 * s) * s**2 * rotation_error)
+        p = T[:, :3, 3] + (3 - 2 * s) * s**2 * position_error + (s - 1) * s**2 * span * velocity_error
+        return se3.from_rt(R, p), v + 6 * s * (1 - s) * position_error / span + (
+            3 * s - 2
+        ) * s * velocity_error
 
     @cached_property
-    def _missed(self) -> tuple[F64, F64, F64]:
+    def _node_errors(self) -> tuple[F64, F64, F64]:
         """By how much every node is missed from the one before: rotation rad (N - 1, 3) at the right,
         position m and velocity m/s in the fit's world. Across a break nothing is carried, only closed."""
         fit = self.fit
         i = np.arange(len(fit.stamps_ns) - 1)
-        T, v = self._carried(i, np.where(fit.breaks, fit.stamps_ns[:-1], fit.stamps_ns[1:]))
-        turn = se3.so3_log(T[:, :3, :3].swapaxes(1, 2) @ fit.T_world_body[1:, :3, :3])
-        return turn, fit.T_world_body[1:, :3, 3] - T[:, :3, 3], fit.velocity[1:] - v
+        T, v = self._propagate(i, np.where(fit.is_break, fit.stamps_ns[:-1], fit.stamps_ns[1:]))
+        rotation_error = se3.so3_log(T[:, :3, :3].swapaxes(1, 2) @ fit.T_world_body[1:, :3, :3])
+        return rotation_error, fit.T_world_body[1:, :3, 3] - T[:, :3, 3], fit.velocity[1:] - v
 
-    def _carried(self, node: I64, stamps_ns: I64) -> tuple[F64, F64]:
+    def _propagate(self, node: I64, stamps_ns: I64) -> tuple[F64, F64]:
         """Pose (N, 4, 4) and velocity (N, 3) at stamps by the IMU alone, from the nodes given."""
         fit = self.fit
         inc = preintegrate(
@@ -57,4 +59,4 @@ class FittedPath:
         g = np.array([0.0, 0.0, -fit.gravity])
         R0 = T0[:, :3, :3]
         p = T0[:, :3, 3] + v0 * t + g * t**2 / 2 + (R0 @ inc.dp[..., None])[..., 0]
-        return se3.compose(R0 @ inc.dR, p), v0 + g * t + (R0 @ inc.dv[..., None])[..., 0]
+        return se3.from_rt(R0 @ inc.dR, p), v0 + g * t + (R0 @ inc.dv[..., None])[..., 0]

@@ -10,35 +10,35 @@ import numpy as np
 
 from share.errors import UsageError
 from share.files.yaml_file import read_yaml
-from share.lab.calibrate.handeye import Check
-from share.lab.mocap.fit import Fit
-from share.lab.mocap.verdict import doubts, sigmas, unsure
+from share.lab.calibrate.handeye import HandEyeCheck
+from share.lab.mocap.fit import MocapFit
+from share.lab.mocap.verdict import fit_warnings, mounting_warning, shared_sigmas
 from share.types import F64
 
-MOCAP = "mocap.yaml"
-_LEAST = 1e-4  # rad, m: no mounting is known better
+MOCAP_FILE = "mocap.yaml"
+_MIN_SIGMA = 1e-4  # rad, m: no mounting is known better
 
 
-def mocap_text(fit: Fit, name: str, truth: str) -> str:
+def mocap_yaml(fit: MocapFit, name: str, truth: str) -> str:
     """mocap.yaml."""
-    sigma = sigmas(fit)
+    sigma = shared_sigmas(fit)
     return "\n".join(
         [
             f"# share calibrate mocap: {name} with {truth}",
             "# p_body = T_body_mocap p_mocap: from the motion capture's body to the IMU",
             "T_body_mocap:",
-            *_matrix(fit.T_body_mocap),
+            *_matrix_lines(fit.T_body_mocap),
             "# p_mocap = R_mocap_world p_world: the world is level, z up",
             "R_mocap_world:",
-            *_matrix(fit.R_mocap_world),
+            *_matrix_lines(fit.R_mocap_world),
             f"up: {fit.up}  # the axis of the motion capture's world that is nearest to up; tilt: how near",
             f"tilt_deg: {fit.tilt_deg:.5f}",
             f"timeshift_imu_mocap: {fit.offset_ns * 1e-9:.9f}  # s, IMU's clock less mocap's, at mid-time",
             f"drift_ppm: {fit.drift_ppm:.3f}",
             "sigma:",
-            f"  rotation_deg: {_list(np.degrees(sigma[2:5]))}",
-            f"  position_m: {_list(sigma[5:8])}",
-            f"  tilt_deg: {_list(np.degrees(sigma[:2]))}",
+            f"  rotation_deg: {_yaml_list(np.degrees(sigma[2:5]))}",
+            f"  position_m: {_yaml_list(sigma[5:8])}",
+            f"  tilt_deg: {_yaml_list(np.degrees(sigma[:2]))}",
             f"  timeshift_s: {sigma[8]:.3e}",
             f"  drift_ppm: {sigma[9] * 1e6:.3f}",
             "",
@@ -49,18 +49,23 @@ def mocap_text(fit: Fit, name: str, truth: str) -> str:
 def read_mounting(path: Path) -> tuple[F64, tuple[float, float]]:
     """T_body_mocap (4, 4) of a mocap.yaml, or of the folder that has one; and how far off it may be, rad and
     m: twice the worst axis' sigma, as real recordings show. Raises UsageError, ConfigError."""
-    file = path / MOCAP if path.is_dir() else path
+    file = path / MOCAP_FILE if path.is_dir() else path
     if not file.is_file():
         raise UsageError(f"{file}: no such file; `share calibrate mocap` makes one")
     top = read_yaml(file)
     sigma = top.section("sigma")
     turn, shift = (max(sigma.numbers(key, (3,))) for key in ("rotation_deg", "position_m"))
-    return top.pose("T_body_mocap"), (max(2 * float(np.radians(turn)), _LEAST), max(2 * shift, _LEAST))
+    return top.pose("T_body_mocap"), (
+        max(2 * float(np.radians(turn)), _MIN_SIGMA),
+        max(2 * shift, _MIN_SIGMA),
+    )
 
 
-def mocap_json(fit: Fit, name: str, truth: str, checked: Check | None) -> dict[str, Any]:
+def report_values(
+    fit: MocapFit, name: str, truth: str, hand_eye_check: HandEyeCheck | None
+) -> dict[str, Any]:
     """mocap-report.json."""
-    sigma = sigmas(fit)
+    sigma = shared_sigmas(fit)
     return {
         "source": name,
         "truth": truth,
@@ -77,33 +82,33 @@ def mocap_json(fit: Fit, name: str, truth: str, checked: Check | None) -> dict[s
             "timeshift_s": float(sigma[8]),
             "drift_ppm": float(sigma[9] * 1e6),
         },
-        "too_long_percent": (100 * fit.too_long).tolist(),
-        "too_long_sigma_percent": (100 * fit.too_long_sigma).tolist(),
-        "unsure": unsure(fit),
-        "doubts": doubts(fit),
+        "too_long_percent": (100 * fit.scale_error).tolist(),
+        "too_long_sigma_percent": (100 * fit.scale_error_sigma).tolist(),
+        "unsure": mounting_warning(fit),
+        "doubts": fit_warnings(fit),
         "residuals": {
             k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(fit.residuals).items()
         },
-        "hand_eye": None if checked is None else _hand_eye(checked),
+        "hand_eye": None if hand_eye_check is None else _hand_eye_values(hand_eye_check),
     }
 
 
-def _hand_eye(checked: Check) -> dict[str, Any]:
-    found = checked.found
+def _hand_eye_values(hand_eye_check: HandEyeCheck) -> dict[str, Any]:
+    estimate = hand_eye_check.hand_eye
     return {
-        "T_body_mocap": found.T_a_b.tolist(),
-        "turned_deg": float(np.degrees(checked.turned)),
-        "shifted_m": checked.shifted,
-        "sigmas": checked.sigmas,
-        "agrees": checked.agrees,
-        "motions": found.motions,
-        "turning_deg": np.degrees(found.turning).tolist(),
+        "T_body_mocap": estimate.T_a_b.tolist(),
+        "turned_deg": float(np.degrees(hand_eye_check.rotation_error_rad)),
+        "shifted_m": hand_eye_check.translation_error_m,
+        "sigmas": hand_eye_check.sigmas,
+        "agrees": hand_eye_check.agrees,
+        "motions": estimate.motions,
+        "turning_deg": np.degrees(estimate.rotation_rms_by_axis).tolist(),
     }
 
 
-def _matrix(values: np.ndarray) -> list[str]:
-    return [f"- {_list(row)}" for row in values]
+def _matrix_lines(values: np.ndarray) -> list[str]:
+    return [f"- {_yaml_list(row)}" for row in values]
 
 
-def _list(values: np.ndarray) -> str:
+def _yaml_list(values: np.ndarray) -> str:
     return "[" + ", ".join(f"{value:.9g}" for value in values) + "]"

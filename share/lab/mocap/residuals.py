@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.lab.mocap.factors import Chain
+from share.lab.mocap.factors import ImuChain
 from share.types import F64
 
 
 @dataclass(frozen=True, eq=False)
-class Residuals:
+class FitResiduals:
     """position_mm, rotation_deg: rms distance of the path from the mocap samples that are not doubted;
     position_sigmas: the former in units of what was said of the mocap's noise; position_p95_mm,
     rotation_p95_deg of all. samples: how many there are; doubted: share of them.
@@ -33,24 +33,24 @@ class Residuals:
     accel: F64
 
 
-def residuals(
-    chain: Chain, dt: F64, inflation: float, apart: F64, turned: F64, trusted: np.ndarray, noise: float
-) -> Residuals:
+def compute_residuals(
+    chain: ImuChain, dt: F64, inflation: float, distances: F64, angles: F64, inliers: np.ndarray, noise: float
+) -> FitResiduals:
     """chain with intervals dt (M,) s, its noise inflated; apart (K,) m and turned (K,) rad from the mocap,
     whose noise is said to be so many m on each axis."""
-    pick = [0, 1, 2, 6, 7, 8]
-    sigma = np.sqrt(np.diagonal(chain.cov, axis1=1, axis2=2))[:, pick] / inflation
-    raw = chain.raw[:, pick]
+    rows = [0, 1, 2, 6, 7, 8]
+    sigma = np.sqrt(np.diagonal(chain.cov, axis1=1, axis2=2))[:, rows] / inflation
+    raw = chain.raw[:, rows]
     rates = _rms(raw / dt[:, None])
-    mm, deg = apart * 1e3, np.degrees(turned)
-    return Residuals(
-        position_mm=float(_rms(mm[trusted])),
-        rotation_deg=float(_rms(deg[trusted])),
-        position_sigmas=float(_rms(apart[trusted])) / (noise * np.sqrt(3)),
+    mm, deg = distances * 1e3, np.degrees(angles)
+    return FitResiduals(
+        position_mm=float(_rms(mm[inliers])),
+        rotation_deg=float(_rms(deg[inliers])),
+        position_sigmas=float(_rms(distances[inliers])) / (noise * np.sqrt(3)),
         position_p95_mm=float(np.percentile(mm, 95)),
         rotation_p95_deg=float(np.percentile(deg, 95)),
         samples=len(mm),
-        doubted=float(1 - trusted.mean()),
+        doubted=float(1 - inliers.mean()),
         imu_sigmas=_rms(raw / sigma),
         gyro=rates[:3],
         accel=rates[3:],

@@ -17,17 +17,17 @@ from typing import Any
 import numpy as np
 
 from share import __version__
-from share.files.json_file import known
+from share.files.json_file import nan_to_none
 from share.files.writing import atomic_write
 from share.geometry import se3
-from share.lab.evaluate.charts import save
-from share.lab.mocap.align import Aligned, level
-from share.lab.mocap.offset import WINDOW_NS, imu_turning, mocap_turning
-from share.lab.mocap.verdict import sigmas
+from share.lab.evaluate.charts import save_png
+from share.lab.mocap.align import AlignedDevice, common_level
+from share.lab.mocap.offset import WINDOW_NS, imu_rotations, mocap_rotations
+from share.lab.mocap.verdict import shared_sigmas
 from share.recordings.calibration import to_kalibr
-from share.recordings.convert import Told, counting, write_recording
+from share.recordings.convert import StageProgress, stage_progress, write_recording
 from share.recordings.recording import Source
-from share.recordings.session import SCHEMA, SESSION
+from share.recordings.session import SCHEMA, SESSION_FILE
 from share.recordings.trajectory import Trajectory, format_tum
 from share.types import F64, I64, AgentKind
 
@@ -35,7 +35,7 @@ REPORT, PICTURE = "align.json", "align.png"
 
 
 @dataclass(frozen=True, eq=False)
-class Device:
+class AlignedRecording:
     """One that was in the room. recording: the file that can be taken as it is; None: it is written anew.
     seen_in: the motion capture's file, and the body in it; told: recording, calibration and mounting as they
     were given. Both for a person."""
@@ -43,88 +43,95 @@ class Device:
     kind: AgentKind
     source: Source
     recording: Path | None
-    seen_in: str
-    told: Mapping[str, str]
-    aligned: Aligned
+    mocap_source: str
+    inputs: Mapping[str, str]
+    aligned: AlignedDevice
 
 
 def write_session(
-    folder: Path, devices: Mapping[str, Device], settings: Mapping[str, Any], told: Told
+    folder: Path,
+    devices: Mapping[str, AlignedRecording],
+    settings: Mapping[str, Any],
+    on_progress: StageProgress,
 ) -> dict[str, Any]:
     """Fills `folder`, which is there and empty. settings: of the fit, for its provenance. What was found, by
     device. Raises ShareError."""
-    R_mocap_world = level([device.aligned.fit for device in devices.values()])
-    truths = {name: _truth(device.aligned, R_mocap_world) for name, device in devices.items()}
+    R_mocap_world = common_level([device.aligned.fit for device in devices.values()])
+    truths = {name: _true_trajectory(device.aligned, R_mocap_world) for name, device in devices.items()}
     (folder / "truth").mkdir()
     for name, device in devices.items():
-        _record(device, folder / f"{name}.mcap", told)
+        _write_device_recording(device, folder / f"{name}.mcap", on_progress)
         atomic_write(folder / "truth" / f"{name}.tum", format_tum(truths[name]))
-    found: dict[str, Any] = known({name: found_of(device) for name, device in devices.items()})
+    results: dict[str, Any] = nan_to_none({name: device_result(device) for name, device in devices.items()})
     draw_alignment(folder / PICTURE, {name: (d.aligned, truths[name]) for name, d in devices.items()})
-    atomic_write(folder / REPORT, json.dumps(found, indent=1) + "\n")
-    atomic_write(folder / SESSION, _description(devices, found, settings))
-    return found
+    atomic_write(folder / REPORT, json.dumps(results, indent=1) + "\n")
+    atomic_write(folder / SESSION_FILE, _session_yaml(devices, results, settings))
+    return results
 
 
-def found_of(device: Device) -> dict[str, Any]:
+def device_result(device: AlignedRecording) -> dict[str, Any]:
     """Of one device, as plain data."""
     aligned, fit = device.aligned, device.aligned.fit
-    sigma, gaps = sigmas(fit), (fit.gaps - fit.stamps_ns[0]) * 1e-9
-    turn = se3.so3_log(fit.T_body_mocap[:3, :3])
+    sigma, gaps = shared_sigmas(fit), (fit.gaps - fit.stamps_ns[0]) * 1e-9
+    mounting_rotation = se3.so3_log(fit.T_body_mocap[:3, :3])
     return {
         "kind": device.kind.value,
         "source": device.source.name,
-        "mocap": device.seen_in,
+        "mocap": device.mocap_source,
         "offset_ns": aligned.offset_ns,
         "offset_sigma_ms": float(sigma[8] * 1e3),
         "drift_ppm": fit.drift_ppm,
         "correlation": aligned.peak.correlation,
-        "next_correlation": aligned.peak.rival,
+        "next_correlation": aligned.peak.next_correlation,
         "lead": aligned.peak.lead,
         "T_body_mocap": fit.T_body_mocap.tolist(),
-        "body_turned_deg": float(np.degrees(np.linalg.norm(turn))),
+        "body_turned_deg": float(np.degrees(np.linalg.norm(mounting_rotation))),
         "body_turned_sigma_deg": float(np.degrees(sigma[2:5].max())),
         "body_shifted_mm": float(np.linalg.norm(fit.T_body_mocap[:3, 3]) * 1e3),
         "body_shifted_sigma_mm": float(sigma[5:8].max() * 1e3),
         "up": fit.up,
         "tilt_deg": fit.tilt_deg,
-        "too_long_percent": (100 * fit.too_long).tolist(),
-        "too_long_sigma_percent": (100 * fit.too_long_sigma).tolist(),
+        "too_long_percent": (100 * fit.scale_error).tolist(),
+        "too_long_sigma_percent": (100 * fit.scale_error_sigma).tolist(),
         "left_mm": fit.residuals.position_mm,
         "left_deg": fit.residuals.rotation_deg,
         "left_sigmas": fit.residuals.position_sigmas,
         "doubted": fit.residuals.doubted,
         "truth_s": aligned.seconds,
         "gaps_s": gaps.tolist(),
-        "doubts": aligned.doubts,
+        "doubts": aligned.warnings,
     }
 
 
-def _truth(aligned: Aligned, R_mocap_world: np.ndarray) -> Trajectory:
+def _true_trajectory(aligned: AlignedDevice, R_mocap_world: np.ndarray) -> Trajectory:
     return Trajectory(aligned.stamps_ns, aligned.truth(R_mocap_world))
 
 
-def _record(device: Device, out: Path, told: Told) -> None:
+def _write_device_recording(device: AlignedRecording, out: Path, on_progress: StageProgress) -> None:
     """The recording under its new name: the same file where the disk allows it, else a copy."""
     stage = f"writing {out.stem}"
     if device.recording is None:
-        write_recording(device.source, out, None, counting(told, stage, device.source.images_count))
+        write_recording(
+            device.source, out, None, stage_progress(on_progress, stage, device.source.images_count)
+        )
         return
-    told(stage, 0, 1)
+    on_progress(stage, 0, 1)
     try:
         os.link(device.recording.resolve(), out)
     except OSError:  # another disk, or somebody else's file
         shutil.copyfile(device.recording, out)
-    told(stage, 1, 1)
+    on_progress(stage, 1, 1)
 
 
-def _origin(device: Device, found: dict[str, Any]) -> dict[str, Any]:
+def _device_provenance(device: AlignedRecording, result: dict[str, Any]) -> dict[str, Any]:
     """Where a device's part comes from, and how well its clock is known; the rest is in align.json."""
     known = ("offset_sigma_ms", "drift_ppm", "up", "truth_s")
-    return {**device.told, "mocap": device.seen_in, **{key: found[key] for key in known}}
+    return {**device.inputs, "mocap": device.mocap_source, **{key: result[key] for key in known}}
 
 
-def _description(devices: Mapping[str, Device], found: dict[str, Any], settings: Mapping[str, Any]) -> str:
+def _session_yaml(
+    devices: Mapping[str, AlignedRecording], results: dict[str, Any], settings: Mapping[str, Any]
+) -> str:
     """session.yaml."""
     import yaml
 
@@ -142,7 +149,7 @@ def _description(devices: Mapping[str, Device], found: dict[str, Any], settings:
         "generator": "share dataset align",
         "share_version": __version__,
         "settings": dict(settings),
-        "devices": {name: _origin(devices[name], one) for name, one in found.items()},
+        "devices": {name: _device_provenance(devices[name], one) for name, one in results.items()},
     }
     data = {"schema": SCHEMA, "provenance": provenance, "agents": agents}
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
@@ -151,11 +158,11 @@ def _description(devices: Mapping[str, Device], found: dict[str, Any], settings:
 # ---- Field recordings laid on a motion capture: the paths from above, and how both turn, by one clock.
 
 _COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
-_SHOWN_NS = 10 * 10**9  # of the turning: longer, and nobody sees whether they agree
-_HOLE_NS = 100_000_000  # farther apart, and no line joins two poses
+_PLOTTED_NS = 10 * 10**9  # of the turning: longer, and nobody sees whether they agree
+_GAP_NS = 100_000_000  # farther apart, and no line joins two poses
 
 
-def draw_alignment(path: Path, devices: Mapping[str, tuple[Aligned, Trajectory]]) -> None:
+def draw_alignment(path: Path, devices: Mapping[str, tuple[AlignedDevice, Trajectory]]) -> None:
     """PNG of {name: (device, its truth)}."""
     import matplotlib
 
@@ -164,42 +171,44 @@ def draw_alignment(path: Path, devices: Mapping[str, tuple[Aligned, Trajectory]]
 
     figure = pyplot.figure(figsize=(13, max(5.0, 1.9 * len(devices))), layout="constrained")
     grid = figure.add_gridspec(len(devices), 2, width_ratios=(2, 3))
-    above = figure.add_subplot(grid[:, 0])
+    top_view = figure.add_subplot(grid[:, 0])
     for k, (name, (aligned, truth)) in enumerate(devices.items()):
         colour = _COLOURS[k % len(_COLOURS)]
-        p = _broken(truth)
-        above.plot(p[:, 0], p[:, 1], color=colour, linewidth=1.2, label=f"{name}, {aligned.seconds:.1f} s")
-        above.plot(*p[0, :2], "o", color=colour)
-        _turning(figure.add_subplot(grid[k, 1]), name, aligned, colour)
-    above.set(title="truth from above", xlabel="x [m]", ylabel="y [m]")
-    above.set_aspect("equal", adjustable="datalim")
-    above.grid(alpha=0.3)
-    above.legend()
-    save(figure, path, 110)
+        p = _positions_with_gaps(truth)
+        top_view.plot(p[:, 0], p[:, 1], color=colour, linewidth=1.2, label=f"{name}, {aligned.seconds:.1f} s")
+        top_view.plot(*p[0, :2], "o", color=colour)
+        _draw_rotation_rates(figure.add_subplot(grid[k, 1]), name, aligned, colour)
+    top_view.set(title="truth from above", xlabel="x [m]", ylabel="y [m]")
+    top_view.set_aspect("equal", adjustable="datalim")
+    top_view.grid(alpha=0.3)
+    top_view.legend()
+    save_png(figure, path, 110)
 
 
-def _broken(truth: Trajectory) -> F64:
+def _positions_with_gaps(truth: Trajectory) -> F64:
     """Positions (N, 3), with NaN where the truth has a gap."""
-    return np.insert(truth.T[:, :3, 3], _after_holes(truth.stamps_ns), np.nan, axis=0)
+    return np.insert(truth.T[:, :3, 3], _after_gaps(truth.stamps_ns), np.nan, axis=0)
 
 
-def _after_holes(stamps_ns: I64) -> I64:
-    return np.flatnonzero(np.diff(stamps_ns) > _HOLE_NS) + 1
+def _after_gaps(stamps_ns: I64) -> I64:
+    return np.flatnonzero(np.diff(stamps_ns) > _GAP_NS) + 1
 
 
-def _turning(axes: Any, name: str, aligned: Aligned, colour: str) -> None:
+def _draw_rotation_rates(axes: Any, name: str, aligned: AlignedDevice, colour: str) -> None:
     """Both turning rates by the motion capture's clock, about when the device turned most."""
-    own, felt = _rate(*imu_turning(aligned.imu))
-    own = own - aligned.offset_ns
-    times, seen = _rate(*mocap_turning(aligned.mocap))
-    start = _busiest(times, seen)
-    for stamps, rate, look in (
-        (own, felt, {"color": colour, "linewidth": 2.5, "alpha": 0.5, "label": "gyro"}),
-        (times, seen, {"color": "black", "linewidth": 0.8, "label": "motion capture"}),
+    imu_times, imu_rates = _rotation_rates(*imu_rotations(aligned.imu))
+    imu_times = imu_times - aligned.offset_ns
+    times, mocap_rates = _rotation_rates(*mocap_rotations(aligned.mocap))
+    start = _most_varied_start(times, mocap_rates)
+    for stamps, rate, style in (
+        (imu_times, imu_rates, {"color": colour, "linewidth": 2.5, "alpha": 0.5, "label": "gyro"}),
+        (times, mocap_rates, {"color": "black", "linewidth": 0.8, "label": "motion capture"}),
     ):
-        keep = (stamps >= start) & (stamps <= start + _SHOWN_NS)
-        holes = _after_holes(stamps[keep])
-        axes.plot(np.insert(stamps[keep] * 1e-9, holes, np.nan), np.insert(rate[keep], holes, np.nan), **look)
+        keep = (stamps >= start) & (stamps <= start + _PLOTTED_NS)
+        holes = _after_gaps(stamps[keep])
+        axes.plot(
+            np.insert(stamps[keep] * 1e-9, holes, np.nan), np.insert(rate[keep], holes, np.nan), **style
+        )
     axes.set(title=name, ylabel="turning [rad/s]", xlabel="motion capture's clock [s]")
     axes.ticklabel_format(useOffset=False)
     axes.grid(alpha=0.3)
@@ -207,13 +216,13 @@ def _turning(axes: Any, name: str, aligned: Aligned, colour: str) -> None:
     axes.legend(loc="upper right", ncols=2, frameon=False)
 
 
-def _rate(stamps: I64, turned: F64) -> tuple[I64, F64]:
-    return stamps, np.linalg.norm(turned, axis=1) / (WINDOW_NS * 1e-9)
+def _rotation_rates(stamps: I64, rotations: F64) -> tuple[I64, F64]:
+    return stamps, np.linalg.norm(rotations, axis=1) / (WINDOW_NS * 1e-9)
 
 
-def _busiest(stamps: I64, rate: F64) -> int:
+def _most_varied_start(stamps: I64, rate: F64) -> int:
     """Where the stretch begins in which the rate varies most."""
-    width = max(1, int(np.searchsorted(stamps, stamps[0] + _SHOWN_NS)))
+    width = max(1, int(np.searchsorted(stamps, stamps[0] + _PLOTTED_NS)))
     first, second = (np.cumsum(np.append(0.0, values)) for values in (rate, rate**2))
     n = max(1, len(rate) - width)
     mean = (first[width : width + n] - first[:n]) / width

@@ -9,12 +9,12 @@ import numpy as np
 from share.geometry import se3
 from share.types import F64, I64
 
-NODE = 15  # rotation, position, velocity, gyro bias, accel bias
-SHARED = 10  # tilt, mocap body's rotation and position, time offset and drift
+NODE_SIZE = 15  # rotation, position, velocity, gyro bias, accel bias
+SHARED_SIZE = 10  # tilt, mocap body's rotation and position, time offset and drift
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class MocapImuState:
     """Nodes at stamps_ns (N,), IMU clock: R (N, 3, 3), p (N, 3) m, v (N, 3) m/s of the body in the
     levelled world, biases (N, 3).
 
@@ -37,17 +37,17 @@ class State:
 
     def in_imu_clock(self, stamps_ns: I64) -> I64:
         """Mocap's stamps (K,), the former offset taken off, as the IMU's clock would have them."""
-        late = self.offset_s * 1e9 + self.drift * (stamps_ns - self.middle_ns)
-        return np.asarray(stamps_ns + np.round(late).astype(np.int64), np.int64)
+        shift_ns = self.offset_s * 1e9 + self.drift * (stamps_ns - self.middle_ns)
+        return np.asarray(stamps_ns + np.round(shift_ns).astype(np.int64), np.int64)
 
     @property
     def R_mocap_world(self) -> F64:
         return se3.so3_exp(np.append(self.tilt, 0.0))
 
-    def moved(self, nodes: F64, shared: F64) -> State:
+    def updated(self, nodes: F64, shared: F64) -> MocapImuState:
         """Nodes (N, 15): rotations at the right, the others added. shared (10,): tilt added, the body's
         pose perturbed at the right, offset [s] and drift added."""
-        return State(
+        return MocapImuState(
             self.stamps_ns,
             self.R @ se3.so3_exp(nodes[:, :3]),
             self.p + nodes[:, 3:6],
@@ -66,7 +66,7 @@ class State:
 
 
 @dataclass(frozen=True, eq=False)
-class FitOptions:
+class MocapFitOptions:
     """How to fit.
 
     sigma_position m, sigma_rotation rad: noise of the mocap, for samples that err independently
@@ -84,8 +84,8 @@ class FitOptions:
     sigma_position: float = 0.002
     sigma_rotation: float = np.radians(0.3)
     independent_hz: float = 20.0
-    most_hz: float = 250.0
-    cauchy: float = 2.5
+    max_hz: float = 250.0
+    cauchy_sigmas: float = 2.5
     imu_inflation: float = 2.0
     within_s: float | None = 0.5
     offset_sigma: float = 0.02
@@ -94,6 +94,6 @@ class FitOptions:
     guess_sigma: tuple[float, float] = (np.radians(10.0), 0.3)
     gravity: float = 9.81
     node_s: float = 0.05
-    bridge_s: float = 0.5
-    break_s: float = 10.0
+    max_bridged_s: float = 0.5
+    max_integrated_s: float = 10.0
     max_iterations: int = 50

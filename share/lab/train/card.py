@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from share.lab.train.score import Score, table
+from share.lab.train.score import ErrorModelScore, score_table
 
 _LIMITS = (
     "It estimates the error of SHARE's own trackers over that window, not how far odometry has drifted.",
@@ -14,7 +14,7 @@ _LIMITS = (
 )
 
 
-def card(about: Mapping[str, Any], scores: Sequence[Score], size: int, origin: str) -> str:
+def model_card(about: Mapping[str, Any], scores: Sequence[ErrorModelScore], size: int, origin: str) -> str:
     """Markdown. about: of the model; scores: on rooms that it has not learnt from; size: bytes;
     origin: where its backbone comes from, empty if nobody says."""
     rooms, counts = about["rooms"], about["keyframes"]
@@ -31,7 +31,7 @@ def card(about: Mapping[str, Any], scores: Sequence[Score], size: int, origin: s
             "",
             "On the rooms of *test*:",
             "",
-            table(scores),
+            score_table(scores),
             "",
             *([f"* Its backbone is {origin}."] if origin else []),
             *(f"* {limit}" for limit in _LIMITS),

@@ -8,70 +8,76 @@ from collections.abc import Iterator
 import numpy as np
 
 from share.config import ControlConfig
-from share.lab.train.rivals import RIVALS, Rows, Say, Tell
-from share.lab.train.score import Score
-from share.lab.train.table import Collection
-from share.odometry.error_model.model import Network, estimate
-from share.scheduling.qoe import DELAY_MS, Needs, qoe
+from share.lab.train.baselines import BASELINES, KeyframeRows, Predictor, ShowProgress
+from share.lab.train.keyframe_table import LabelCollection
+from share.lab.train.score import ErrorModelScore
+from share.odometry.error_model.inference import OnnxSession, estimate_error
+from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe
 from share.types import F32, F64, AgentKind
 
-_TIMED = 200  # keyframes
+_TIMED_KEYFRAMES = 200  # keyframes
 
 
-def of_network(name: str, network: Network, rows: Rows) -> Score:
+def score_network(name: str, network: OnnxSession, rows: KeyframeRows) -> ErrorModelScore:
     """One by one, as on an agent."""
-    table, told, began = rows.table, [], time.thread_time()
+    table, estimates, cpu_start_s = rows.table, [], time.thread_time()
     for features in table.features():
-        told.append(estimate(network, features))
-    ms = 1e3 * (time.thread_time() - began) / max(len(told), 1)
-    low, high = (np.array([getattr(one, side) for one in told]) for side in ("low_cm", "high_cm"))
-    covered = float(((low <= table.error_cm) & (table.error_cm <= high)).mean())
-    return scored(name, np.array([one.error_cm for one in told]), table.error_cm, covered, ms)
+        estimates.append(estimate_error(network, features))
+    ms = 1e3 * (time.thread_time() - cpu_start_s) / max(len(estimates), 1)
+    low, high = (np.array([getattr(one, side) for one in estimates]) for side in ("low_cm", "high_cm"))
+    coverage = float(((low <= table.error_cm) & (table.error_cm <= high)).mean())
+    return score_predictions(
+        name, np.array([one.error_cm for one in estimates]), table.error_cm, coverage, ms
+    )
 
 
-def of_rivals(collection: Collection, deep: F32, seed: int, say: Say) -> Iterator[Score]:
+def score_baselines(
+    collection: LabelCollection, deep_features: F32, seed: int, on_progress: ShowProgress
+) -> Iterator[ErrorModelScore]:
     """Each taught on the rooms that ours is taught on, and tried where it is tried; as they are done."""
-    rows = Rows(collection.table, deep)
-    parts = {part: rows.take(collection.of(part)) for part in collection.parts}
-    learn, stop, test = parts["learn"], parts["stop"], parts["test"]
-    yield _mean(learn, test)
-    for name, rival in RIVALS.items():
-        say(f"{name}: learns")
-        tell = rival(learn, stop, seed, _of(name, say))
-        yield scored(name, tell(test), test.table.error_cm, ms=_timed(tell, test))
+    rows = KeyframeRows(collection.table, deep_features)
+    parts = {part: rows.take(collection.keyframes_of(part)) for part in collection.parts}
+    training, validation, test = parts["learn"], parts["stop"], parts["test"]
+    yield _score_constant_mean(training, test)
+    for name, train_baseline in BASELINES.items():
+        on_progress(f"{name}: learns")
+        predict = train_baseline(training, validation, seed, _with_name(name, on_progress))
+        yield score_predictions(name, predict(test), test.table.error_cm, ms=_ms_per_keyframe(predict, test))
 
 
-def scored(
-    name: str, told_cm: F64, error_cm: F32, covered: float = float("nan"), ms: float = float("nan")
-) -> Score:
+def score_predictions(
+    name: str, predicted_cm: F64, error_cm: F32, coverage: float = float("nan"), ms: float = float("nan")
+) -> ErrorModelScore:
     from scipy.stats import spearmanr
 
-    off = told_cm - error_cm
-    rank = float(spearmanr(told_cm, error_cm).statistic) if np.ptp(told_cm) else 0.0
-    rmse, mae = float(np.sqrt((off**2).mean())), float(np.abs(off).mean())
-    return Score(name, rmse, mae, rank, float(np.abs(_qoe(told_cm) - _qoe(error_cm)).mean()), covered, ms)
+    errors = predicted_cm - error_cm
+    rank = float(spearmanr(predicted_cm, error_cm).statistic) if np.ptp(predicted_cm) else 0.0
+    rmse, mae = float(np.sqrt((errors**2).mean())), float(np.abs(errors).mean())
+    return ErrorModelScore(
+        name, rmse, mae, rank, float(np.abs(_qoe(predicted_cm) - _qoe(error_cm)).mean()), coverage, ms
+    )
 
 
-def _of(name: str, say: Say) -> Say:
+def _with_name(name: str, say: ShowProgress) -> ShowProgress:
     return lambda how_far: say(f"{name}: {how_far}")
 
 
 def _qoe(error_cm: F64 | F32) -> F64:
     """Of a headset that waits for nothing: a delay would only make differences smaller."""
-    needs = Needs.of(ControlConfig(), AgentKind.AR)
-    return np.array([qoe(DELAY_MS, cm, needs) for cm in error_cm.tolist()])
+    needs = QoeParameters.from_config(ControlConfig(), AgentKind.AR)
+    return np.array([qoe(ACCEPTED_DELAY_MS, cm, needs) for cm in error_cm.tolist()])
 
 
-def _mean(learn: Rows, test: Rows) -> Score:
+def _score_constant_mean(training: KeyframeRows, test: KeyframeRows) -> ErrorModelScore:
     """Of who knows nothing of a keyframe."""
-    always = np.full(len(test.deep), float(learn.table.error_cm.mean()))
-    return scored("always the mean", always, test.table.error_cm)
+    constant = np.full(len(test.deep_features), float(training.table.error_cm.mean()))
+    return score_predictions("always the mean", constant, test.table.error_cm)
 
 
-def _timed(tell: Tell, rows: Rows) -> float:
+def _ms_per_keyframe(predict: Predictor, rows: KeyframeRows) -> float:
     """ms of CPU, one keyframe at a time."""
-    some = [rows.take(np.array([k])) for k in range(min(_TIMED, len(rows.deep)))]
-    began = time.process_time()
-    for one in some:
-        tell(one)
-    return 1e3 * (time.process_time() - began) / max(len(some), 1)
+    samples = [rows.take(np.array([k])) for k in range(min(_TIMED_KEYFRAMES, len(rows.deep_features)))]
+    cpu_start_s = time.process_time()
+    for one in samples:
+        predict(one)
+    return 1e3 * (time.process_time() - cpu_start_s) / max(len(samples), 1)

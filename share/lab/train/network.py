@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from share.odometry.error_model.features import NAMES, RECENT
+from share.odometry.error_model.inputs import RECENT_NAMES, SCALAR_NAMES
 
-DEEP, EMBEDDING, JOINED = 1280, 64, 96
-NUMBERS = len(NAMES) + len(RECENT)
-LOW, HIGH = 0.05, 0.95  # quantiles
+DEEP_SIZE, EMBEDDING_SIZE, JOINED_SIZE = 1280, 64, 96
+NUMBERS_SIZE = len(SCALAR_NAMES) + len(RECENT_NAMES)
+LOW_QUANTILE, HIGH_QUANTILE = 0.05, 0.95  # quantiles
 
 
 class Head(nn.Module):  # type: ignore[misc]
@@ -28,8 +28,10 @@ class Head(nn.Module):  # type: ignore[misc]
 
     def __init__(self, dropout: float = 0.0) -> None:
         super().__init__()
-        self.forgets = nn.Dropout(dropout)
-        self.visual = nn.Sequential(nn.Linear(DEEP, EMBEDDING), nn.ReLU(), nn.LayerNorm(EMBEDDING))
+        self.dropout = nn.Dropout(dropout)
+        self.visual = nn.Sequential(
+            nn.Linear(DEEP_SIZE, EMBEDDING_SIZE), nn.ReLU(), nn.LayerNorm(EMBEDDING_SIZE)
+        )
         self.spread = nn.Sequential(
             nn.Conv2d(3, 8, 3, stride=2, padding=1),
             nn.ReLU(),
@@ -38,13 +40,13 @@ class Head(nn.Module):  # type: ignore[misc]
             nn.AdaptiveAvgPool2d(1),
             nn.Flatten(),
         )
-        self.numbers = nn.Sequential(nn.Linear(NUMBERS, 16), nn.ReLU())
-        self.joined = nn.Sequential(nn.Linear(JOINED, 48), nn.ReLU(), nn.Linear(48, 3))
-        self.straight = nn.Linear(NUMBERS, 1)
+        self.numbers = nn.Sequential(nn.Linear(NUMBERS_SIZE, 16), nn.ReLU())
+        self.joined = nn.Sequential(nn.Linear(JOINED_SIZE, 48), nn.ReLU(), nn.Linear(48, 3))
+        self.straight = nn.Linear(NUMBERS_SIZE, 1)
 
     def join(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
         """(N, 96)."""
-        branches = (self.visual(self.forgets(deep)), self.spread(psd), self.numbers(numbers))
+        branches = (self.visual(self.dropout(deep)), self.spread(psd), self.numbers(numbers))
         return torch.cat(branches, dim=1)
 
     def forward(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
@@ -72,17 +74,21 @@ class Heads(nn.Module):  # type: ignore[misc]
         return torch.stack([head(deep, psd, numbers) for head in self.each])
 
 
-def loss(told: Tensor, log_error: Tensor) -> Tensor:
+def loss(predicted: Tensor, log_error: Tensor) -> Tensor:
     """told (..., N, 3) by `Head`, log_error (N,) of cm.
 
     What is expected is learnt by the Poisson deviance, whose least is the mean, and which minds large errors
     more than a logarithm and less than a square would; the interval by the pinball loss of its quantiles.
     """
-    expected, low, high = told.unbind(dim=-1)
+    expected, low, high = predicted.unbind(dim=-1)
     deviance = torch.exp(expected) - torch.exp(log_error) * expected
-    return deviance.mean() + _pinball(log_error - low, LOW) + _pinball(log_error - high, HIGH)
+    return (
+        deviance.mean()
+        + _pinball_loss(log_error - low, LOW_QUANTILE)
+        + _pinball_loss(log_error - high, HIGH_QUANTILE)
+    )
 
 
-def _pinball(above: Tensor, quantile: float) -> Tensor:
+def _pinball_loss(excess: Tensor, quantile: float) -> Tensor:
     """Koenker and Bassett 1978."""
-    return torch.maximum(quantile * above, (quantile - 1) * above).mean()
+    return torch.maximum(quantile * excess, (quantile - 1) * excess).mean()

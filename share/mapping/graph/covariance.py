@@ -14,15 +14,15 @@ import numpy as np
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.mapping.graph.edges import Edge, Edges
-from share.mapping.graph.edges import equations as plumb_equations
-from share.mapping.graph.optimiser import Equations, Minimum, weighted_jacobians
+from share.mapping.graph.edges import EdgeArrays, PoseEdge
+from share.mapping.graph.edges import gravity_equations as plumb_equations
+from share.mapping.graph.optimiser import NormalEquations, OptimisedPoses, weighted_jacobians
 from share.types import F64, I64
 
 # ---- The ways of least cost through a graph, from one pose to many (Dijkstra 1959).
 
 
-class Ways:
+class ShortestPaths:
     """n poses and E edges between them: ends a, b (E,), cost (E,) each, to be walked either way."""
 
     def __init__(self, n: int, a: I64, b: I64, cost: F64) -> None:
@@ -31,132 +31,135 @@ class Ways:
         e = len(a)
         ends, others = np.concatenate([a, b]), np.concatenate([b, a])
         leaving = csc_array((np.ones(2 * e), ends, np.arange(2 * e + 1)), shape=(n, 2 * e)).tocsr()
-        self._starts, way = leaving.indptr, leaving.indices  # sorted by where they leave, parallel ones kept
-        self._to, self._edge = others[way], way % max(e, 1)
-        self._cost = np.maximum(cost[self._edge], 1e-300)  # zero would be no edge
-        self._graph = csr_array((self._cost, self._to, self._starts), shape=(n, n))
+        self._starts, order = (
+            leaving.indptr,
+            leaving.indices,
+        )  # sorted by where they leave, parallel ones kept
+        self._targets, self._edge_index = others[order], order % max(e, 1)
+        self._cost = np.maximum(cost[self._edge_index], 1e-300)  # zero would be no edge
+        self._graph = csr_array((self._cost, self._targets, self._starts), shape=(n, n))
 
-    def before(self, start: int) -> I64:
+    def predecessors(self, start: int) -> I64:
         """The pose before each (n,) on the way to it from `start`; negative at the start and out of reach."""
         from scipy.sparse.csgraph import dijkstra
 
         return np.asarray(dijkstra(self._graph, indices=start, return_predecessors=True)[1], np.int64)
 
-    def edges(self, u: I64, v: I64) -> I64:
+    def cheapest_edges(self, u: I64, v: I64) -> I64:
         """Index (K,) of the cheapest edge between each u and v, which are neighbours."""
         count = self._starts[u + 1] - self._starts[u]
         first = np.cumsum(count) - count
         all_of_u = np.arange(count.sum()) + np.repeat(self._starts[u] - first, count)
-        arrives = self._to[all_of_u] == np.repeat(v, count)
+        arrives = self._targets[all_of_u] == np.repeat(v, count)
         fits, pair = all_of_u[arrives], np.repeat(np.arange(len(u)), count)[arrives]
         order = np.lexsort((self._cost[fits], pair))
         first_of_pair = order[np.searchsorted(pair[order], np.arange(len(u)))]
-        return np.asarray(self._edge[fits[first_of_pair]], np.int64)
+        return np.asarray(self._edge_index[fits[first_of_pair]], np.int64)
 
 
-def on_the_way(before: I64, goals: I64) -> I64:
+def poses_on_paths(predecessors: I64, goals: I64) -> I64:
     """All poses on the ways to `goals`, these included, the start not; rising."""
-    met = np.zeros(len(before), bool)
-    here = goals[before[goals] >= 0]
-    while len(here):
-        met[here] = True
-        here = before[here]
-        here = here[(before[here] >= 0) & ~met[here]]
-    return np.flatnonzero(met)
+    is_visited = np.zeros(len(predecessors), bool)
+    frontier = goals[predecessors[goals] >= 0]
+    while len(frontier):
+        is_visited[frontier] = True
+        frontier = predecessors[frontier]
+        frontier = frontier[(predecessors[frontier] >= 0) & ~is_visited[frontier]]
+    return np.flatnonzero(is_visited)
 
 
-Placed = Sequence[F64] | Mapping[int, F64] | F64  # poses (4, 4) by number
+PosesById = Sequence[F64] | Mapping[int, F64] | F64  # poses (4, 4) by number
 
 
-class Roads:
+class CovariancePaths:
     """The edges of a pose graph that grows and is thinned, by the poses that they touch."""
 
     def __init__(self) -> None:
-        self._touching: Counter[int] = Counter()  # edges, by the number of a pose
-        self._places: dict[int, int] = {}  # of the poses in the search, by number
-        self._free: list[int] = []
-        self._rows: dict[Edge, int] = {}
-        self._edges: list[Edge] = []
+        self._degree: Counter[int] = Counter()  # edges, by the number of a pose
+        self._slots: dict[int, int] = {}  # of the poses in the search, by number
+        self._free_slots: list[int] = []
+        self._rows: dict[PoseEdge, int] = {}
+        self._edges: list[PoseEdge] = []
         self._table = np.zeros((64, 3 + 16 + 36))  # places of a and b, spread, T_a_b, cov
-        self._ways: Ways | None = None  # None once an edge has come or gone
+        self._paths: ShortestPaths | None = None  # None once an edge has come or gone
 
-    def add(self, edge: Edge) -> None:
+    def add(self, edge: PoseEdge) -> None:
         """Raises ValueError if it is here already."""
         if edge in self._rows:
             raise ValueError(f"edge {edge.a} - {edge.b} is here already")
         for end in (edge.a, edge.b):
-            self._touching[end] += 1
-            if end not in self._places:
-                self._places[end] = self._free.pop() if self._free else len(self._places)
+            self._degree[end] += 1
+            if end not in self._slots:
+                self._slots[end] = self._free_slots.pop() if self._free_slots else len(self._slots)
         row = self._rows[edge] = len(self._edges)
         self._edges.append(edge)
         if row == len(self._table):
             self._table = np.concatenate([self._table, np.zeros_like(self._table)])
-        ends = self._places[edge.a], self._places[edge.b], edge.spread
+        ends = self._slots[edge.a], self._slots[edge.b], edge.cov_trace
         self._table[row] = np.concatenate([ends, edge.T_a_b.ravel(), edge.cov.ravel()])
-        self._ways = None
+        self._paths = None
 
-    def remove(self, edge: Edge) -> None:
+    def remove(self, edge: PoseEdge) -> None:
         """Raises KeyError if it is not here."""
         row, last = self._rows.pop(edge), self._edges.pop()
         if last is not edge:
             self._edges[row], self._rows[last] = last, row
             self._table[row] = self._table[len(self._edges)]
         for end in (edge.a, edge.b):
-            self._touching[end] -= 1
-            if not self._touching[end]:
-                del self._touching[end]
-                self._free.append(self._places.pop(end))
-        self._ways = None
+            self._degree[end] -= 1
+            if not self._degree[end]:
+                del self._degree[end]
+                self._free_slots.append(self._slots.pop(end))
+        self._paths = None
 
-    def known_from(self, start: int, goals: Sequence[int], poses: Placed) -> list[F64 | None]:
+    def covariances_from(self, start: int, goals: Sequence[int], poses: PosesById) -> list[F64 | None]:
         """Covariance (6, 6) of T_start_goal for each goal along the surest path from `start` to it, each
         step laid along the current `poses`; None where there is no path. One search serves all."""
-        if start not in self._places:
+        if start not in self._slots:
             return [np.zeros((6, 6)) if goal == start else None for goal in goals]
-        before = self._search().before(self._places[start])
-        paths = [self._path(before, start, goal) for goal in goals]
-        met = np.array(sorted({place for path in paths for place in path or ()}), np.int64)
-        steps = self._steps(before[met], met, start, poses)
+        predecessors = self._updated_paths().predecessors(self._slots[start])
+        paths = [self._path_slots(predecessors, start, goal) for goal in goals]
+        visited = np.array(sorted({place for path in paths for place in path or ()}), np.int64)
+        steps = self._step_covariances(predecessors[visited], visited, start, poses)
         known = [i for i, path in enumerate(paths) if path is not None]
-        sums = [steps[np.searchsorted(met, paths[i] or [])].sum(0) for i in known]
+        sums = [steps[np.searchsorted(visited, paths[i] or [])].sum(0) for i in known]
         out: list[F64 | None] = [None] * len(goals)
         if known:  # from perturbing `start` to perturbing the goal
-            there = np.array([poses[goals[i]] for i in known])
-            covs = se3.inverse_cov(se3.inverse(there) @ poses[start], np.array(sums))
+            goal_poses = np.array([poses[goals[i]] for i in known])
+            covs = se3.inverse_cov(se3.inverse(goal_poses) @ poses[start], np.array(sums))
             for i, cov in zip(known, covs, strict=True):
                 out[i] = cov
         return out
 
-    def _search(self) -> Ways:
-        if self._ways is None:
+    def _updated_paths(self) -> ShortestPaths:
+        if self._paths is None:
             a, b, spread = self._table[: len(self._edges), :3].T
-            size = len(self._places) + len(self._free)
-            self._ways = Ways(size, a.astype(np.int64), b.astype(np.int64), spread)
-        return self._ways
+            size = len(self._slots) + len(self._free_slots)
+            self._paths = ShortestPaths(size, a.astype(np.int64), b.astype(np.int64), spread)
+        return self._paths
 
-    def _path(self, before: I64, start: int, goal: int) -> list[int] | None:
+    def _path_slots(self, predecessors: I64, start: int, goal: int) -> list[int] | None:
         """Places on the way from `goal` back to `start`, the latter left out."""
-        here, home = self._places.get(goal, -1), self._places[start]
+        slot, start_slot = self._slots.get(goal, -1), self._slots[start]
         path: list[int] = []
-        while here != home:
-            if here < 0:
+        while slot != start_slot:
+            if slot < 0:
                 return None
-            path.append(here)
-            here = int(before[here])
+            path.append(slot)
+            slot = int(predecessors[slot])
         return path
 
-    def _steps(self, before: I64, met: I64, start: int, poses: Placed) -> F64:
+    def _step_covariances(self, predecessors: I64, visited: I64, start: int, poses: PosesById) -> F64:
         """Covariances (K, 6, 6) of the steps to places `met` from those before, perturbing T_start_start."""
-        rows = self._search().edges(before, met)
+        rows = self._updated_paths().cheapest_edges(predecessors, visited)
         table = self._table[rows]
-        onward = table[:, 1] == met
-        walked = zip([self._edges[row] for row in rows], onward, strict=True)
-        ends = [edge.b if ahead else edge.a for edge, ahead in walked]
+        is_forward = table[:, 1] == visited
+        directed_edges = zip([self._edges[row] for row in rows], is_forward, strict=True)
+        ends = [edge.b if is_forward_edge else edge.a for edge, is_forward_edge in directed_edges]
         T_a_b, cov = table[:, 3:19].reshape(-1, 4, 4), table[:, 19:].reshape(-1, 6, 6)
-        cov = np.where(onward[:, None, None], cov, se3.inverse_cov(T_a_b, cov))
-        there = np.array([poses[end] for end in ends]).reshape(-1, 4, 4)
-        return se3.inverse_cov(se3.inverse(poses[start]) @ there, cov)
+        cov = np.where(is_forward[:, None, None], cov, se3.inverse_cov(T_a_b, cov))
+        end_poses = np.array([poses[end] for end in ends]).reshape(-1, 4, 4)
+        return se3.inverse_cov(se3.inverse(poses[start]) @ end_poses, cov)
 
 
 # ---- How well poses are known from one of them: an upper bound that hardly exceeds the truth.
@@ -166,11 +169,18 @@ class Roads:
 # surest ways: once found, their edges are made dearer, and the next surest ways are added, until there are
 # enough edges.
 
-_LEAST_WEIGHT = 1e-9  # of a loop that all else speaks against, so that it can be divided by
-_UNKNOWN = 1e6 * np.eye(6)
+_MIN_WEIGHT = 1e-9  # of a loop that all else speaks against, so that it can be divided by
+_UNKNOWN_COV = 1e6 * np.eye(6)
 
 
-def covariances(edges: Edges, plumb: F64, at: Minimum, anchor: int, wanted: I64, config: GraphConfig) -> F64:
+def relative_covariances(
+    edges: EdgeArrays,
+    gravity_factors: F64,
+    result: OptimisedPoses,
+    anchor: int,
+    wanted: I64,
+    config: GraphConfig,
+) -> F64:
     """Covariances (K, 6, 6) of `wanted` (K,) of n poses relative to `anchor`, right perturbation.
 
     plumb (n, 3): see `share.mapping.graph.edges`; where there are any, tilts are relative to gravity.
@@ -178,37 +188,45 @@ def covariances(edges: Edges, plumb: F64, at: Minimum, anchor: int, wanted: I64,
     Every wanted pose must be joined to the anchor. Where edges differ so much in certainty (beyond some
     16 orders of magnitude) that nothing can be told, a sigma of 1000 rad and m says so.
     """
-    n, out = len(plumb), np.zeros((len(wanted), 6, 6))
-    free = np.flatnonzero(wanted != anchor)
-    if not len(free):
+    n, out = len(gravity_factors), np.zeros((len(wanted), 6, 6))
+    not_anchor = np.flatnonzero(wanted != anchor)
+    if not len(not_anchor):
         return out
-    weights = np.maximum(at.weights, _LEAST_WEIGHT)
-    part = _surest(n, edges, edges.spread / weights, anchor, wanted[free], config)
-    poses = np.unique(np.concatenate([edges.a[part], edges.b[part]]))
-    inside = edges[part].between(*(np.searchsorted(poses, end[part]) for end in (edges.a, edges.b)))
-    equations = Equations(len(poses), inside, int(np.searchsorted(poses, anchor)), at.free)
-    J = weighted_jacobians(at.at[part], weights[part], inside)
-    own = plumb_equations(at.poses[poses], plumb[poses])
-    out[free] = _blocks_of_inverse(equations.information(J, own), np.searchsorted(poses, wanted[free]))
+    weights = np.maximum(result.weights, _MIN_WEIGHT)
+    selected = _tightest_edges(n, edges, edges.cov_trace / weights, anchor, wanted[not_anchor], config)
+    poses = np.unique(np.concatenate([edges.a[selected], edges.b[selected]]))
+    local_edges = edges[selected].with_ends(
+        *(np.searchsorted(poses, end[selected]) for end in (edges.a, edges.b))
+    )
+    equations = NormalEquations(
+        len(poses), local_edges, int(np.searchsorted(poses, anchor)), result.gauge_projector
+    )
+    J = weighted_jacobians(result.residuals[selected], weights[selected], local_edges)
+    unary = plumb_equations(result.poses[poses], gravity_factors[poses])
+    out[not_anchor] = _inverse_diagonal_blocks(
+        equations.information_matrix(J, unary), np.searchsorted(poses, wanted[not_anchor])
+    )
     return out
 
 
-def _surest(n: int, edges: Edges, cost: F64, anchor: int, wanted: I64, config: GraphConfig) -> I64:
+def _tightest_edges(
+    n: int, edges: EdgeArrays, cost: F64, anchor: int, wanted: I64, config: GraphConfig
+) -> I64:
     """Indices of the edges on the surest ways from the anchor to the wanted poses."""
-    used, dear = np.zeros(len(edges), bool), cost.copy()
+    used, path_cost = np.zeros(len(edges), bool), cost.copy()
     for _ in range(config.covariance_rounds):
-        ways = Ways(n, edges.a, edges.b, dear)
-        before = ways.before(anchor)
-        met = on_the_way(before, wanted)
-        walked = ways.edges(before[met], met)
-        used[walked] = True
-        dear[walked] += 2 * cost[walked]
+        paths = ShortestPaths(n, edges.a, edges.b, path_cost)
+        predecessors = paths.predecessors(anchor)
+        visited = poses_on_paths(predecessors, wanted)
+        path_edges = paths.cheapest_edges(predecessors[visited], visited)
+        used[path_edges] = True
+        path_cost[path_edges] += 2 * cost[path_edges]
         if used.sum() >= config.covariance_edges:
             break
     return np.flatnonzero(used)
 
 
-def _blocks_of_inverse(information: Any, wanted: I64) -> F64:
+def _inverse_diagonal_blocks(information: Any, wanted: I64) -> F64:
     """Those on the diagonal (K, 6, 6)."""
     from scipy.sparse.linalg import splu
 
@@ -221,5 +239,5 @@ def _blocks_of_inverse(information: Any, wanted: I64) -> F64:
     blocks = factor.solve(right)[rows.ravel()].reshape(k, 6, k, 6)
     blocks = blocks[np.arange(k), :, np.arange(k)]
     blocks = (blocks + np.swapaxes(blocks, 1, 2)) / 2
-    told = np.linalg.eigvalsh(blocks)[:, 0] > 0
-    return np.where(told[:, None, None], blocks, _UNKNOWN)
+    is_positive = np.linalg.eigvalsh(blocks)[:, 0] > 0
+    return np.where(is_positive[:, None, None], blocks, _UNKNOWN_COV)

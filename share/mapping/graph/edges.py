@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.types import F64, I64, checked, checked_pose
+from share.types import F64, I64, checked_array, checked_pose
 
 # ---- How one pose was seen from another.
 
 
 @dataclass(frozen=True, eq=False)
-class Edge:
+class PoseEdge:
     """Pose b as measured from pose a: T_a_b (4, 4) and its covariance (6, 6), perturbed on the right."""
 
     a: int
@@ -32,69 +32,69 @@ class Edge:
         if self.a == self.b or min(self.a, self.b) < 0:
             raise ValueError(f"edge: {self.a} - {self.b} does not join two poses")
         object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
-        object.__setattr__(self, "cov", checked("cov", self.cov, (6, 6), np.float64))
+        object.__setattr__(self, "cov", checked_array("cov", self.cov, (6, 6), np.float64))
 
-    def reverse(self) -> Edge:
+    def reverse(self) -> PoseEdge:
         """The same, from the other end."""
-        return Edge(self.b, self.a, se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov))
+        return PoseEdge(self.b, self.a, se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov))
 
     @property
-    def spread(self) -> float:
+    def cov_trace(self) -> float:
         """Trace of the covariance: one number for how loose the edge is."""
         return float(self.cov.trace())
 
 
-_SUREST = 1e-5  # rad and m; no measurement is taken to be surer, so a singular covariance is no trouble
+_MIN_SIGMA = 1e-5  # rad and m; no measurement is taken to be surer, so a singular covariance is no trouble
 
 
 @dataclass(frozen=True, eq=False)
-class Edges:
+class EdgeArrays:
     """E edges: ends a, b (E,), T_b_a as measured (E, 4, 4), W (E, 6, 6), spread (E,) = trace of the
     covariance, is_loop (E,): judged robustly. Indexed like an array."""
 
     a: I64
     b: I64
     T_b_a: F64
-    W: F64
-    spread: F64
+    whitening: F64
+    cov_trace: F64
     is_loop: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.a)
 
-    def __getitem__(self, chosen: Any) -> Edges:
-        return Edges(
+    def __getitem__(self, chosen: Any) -> EdgeArrays:
+        return EdgeArrays(
             self.a[chosen],
             self.b[chosen],
             self.T_b_a[chosen],
-            self.W[chosen],
-            self.spread[chosen],
+            self.whitening[chosen],
+            self.cov_trace[chosen],
             self.is_loop[chosen],
         )
 
-    def between(self, a: I64, b: I64) -> Edges:
+    def with_ends(self, a: I64, b: I64) -> EdgeArrays:
         """The same measurements with their ends named otherwise."""
-        return Edges(a, b, self.T_b_a, self.W, self.spread, self.is_loop)
+        return EdgeArrays(a, b, self.T_b_a, self.whitening, self.cov_trace, self.is_loop)
 
-    def with_those(self, other: Edges) -> Edges:
-        return Edges(
+    def concatenate(self, other: EdgeArrays) -> EdgeArrays:
+        return EdgeArrays(
             np.concatenate([self.a, other.a]),
             np.concatenate([self.b, other.b]),
             np.concatenate([self.T_b_a, other.T_b_a]),
-            np.concatenate([self.W, other.W]),
-            np.concatenate([self.spread, other.spread]),
+            np.concatenate([self.whitening, other.whitening]),
+            np.concatenate([self.cov_trace, other.cov_trace]),
             np.concatenate([self.is_loop, other.is_loop]),
         )
 
     @staticmethod
-    def measured(ends: I64, T_a_b: F64, covs: F64, is_loop: NDArray[np.bool_]) -> Edges:
+    def from_measurements(ends: I64, T_a_b: F64, covs: F64, is_loop: NDArray[np.bool_]) -> EdgeArrays:
         """From ends (E, 2), T_a_b (E, 4, 4) and their covariances (E, 6, 6)."""
-        spread = np.maximum(np.trace(covs, axis1=1, axis2=2), _SUREST**2)
-        return Edges(ends[:, 0], ends[:, 1], se3.inverse(T_a_b), _whitening(covs), spread, is_loop)
+        cov_trace = np.maximum(np.trace(covs, axis1=1, axis2=2), _MIN_SIGMA**2)
+        return EdgeArrays(ends[:, 0], ends[:, 1], se3.inverse(T_a_b), _whitening(covs), cov_trace, is_loop)
 
 
 @dataclass(frozen=True, eq=False)
-class Residuals:
+class EdgeResiduals:
     """At some poses: T_a_b (E, 4, 4), xi (E, 6), whitened (E, 6), and its square chi2 (E,)."""
 
     T_a_b: F64
@@ -102,28 +102,28 @@ class Residuals:
     whitened: F64
     chi2: F64
 
-    def __getitem__(self, chosen: Any) -> Residuals:
-        return Residuals(self.T_a_b[chosen], self.xi[chosen], self.whitened[chosen], self.chi2[chosen])
+    def __getitem__(self, chosen: Any) -> EdgeResiduals:
+        return EdgeResiduals(self.T_a_b[chosen], self.xi[chosen], self.whitened[chosen], self.chi2[chosen])
 
 
 def _whitening(covs: F64) -> F64:
     """W (E, 6, 6) with W'W = cov^-1, for covariances (E, 6, 6)."""
     variances, axes = np.linalg.eigh(covs)
-    return np.asarray(np.swapaxes(axes, 1, 2) / np.sqrt(np.maximum(variances, _SUREST**2))[:, :, None])
+    return np.asarray(np.swapaxes(axes, 1, 2) / np.sqrt(np.maximum(variances, _MIN_SIGMA**2))[:, :, None])
 
 
-def residuals(poses: F64, edges: Edges) -> Residuals:
+def residuals(poses: F64, edges: EdgeArrays) -> EdgeResiduals:
     """Of all edges at poses (N, 4, 4)."""
     T_a_b = se3.inverse(poses)[edges.a] @ poses[edges.b]
     xi = _log(edges.T_b_a @ T_a_b)
-    whitened = (edges.W @ xi[:, :, None])[:, :, 0]
-    return Residuals(T_a_b, xi, whitened, np.asarray((whitened**2).sum(1)))
+    whitened = (edges.whitening @ xi[:, :, None])[:, :, 0]
+    return EdgeResiduals(T_a_b, xi, whitened, np.asarray((whitened**2).sum(1)))
 
 
-def jacobians(at: Residuals, edges: Edges) -> tuple[F64, F64]:
+def jacobians(residuals_at: EdgeResiduals, edges: EdgeArrays) -> tuple[F64, F64]:
     """Of the whitened residual by right perturbations of a and of b, each (E, 6, 6)."""
-    by_b = edges.W @ _right_jacobian_inverse(at.xi)
-    return -by_b @ se3.adjoint(se3.inverse(at.T_a_b)), by_b
+    by_b = edges.whitening @ _right_jacobian_inverse(residuals_at.xi)
+    return -by_b @ se3.adjoint(se3.inverse(residuals_at.T_a_b)), by_b
 
 
 def _right_jacobian_inverse(xi: F64) -> F64:
@@ -145,12 +145,12 @@ def _log(T: F64) -> F64:
     small = angle < 1e-4
     safe = np.where(small, 1.0, angle)
     phi = np.where(small, 0.5, safe / np.maximum(2 * sine, 1e-300))[:, None] * twice_sine
-    second = np.where(small, 1 / 12, (1 - safe / 2 / np.tan(safe / 2)) / safe**2)
-    turned = np.cross(phi, t)
-    xi = np.concatenate([phi, t - turned / 2 + second[:, None] * np.cross(phi, turned)], 1)
-    far = cosine < 0
-    if far.any():
-        xi[far] = se3.log(T[far])
+    coefficient = np.where(small, 1 / 12, (1 - safe / 2 / np.tan(safe / 2)) / safe**2)
+    phi_cross_t = np.cross(phi, t)
+    xi = np.concatenate([phi, t - phi_cross_t / 2 + coefficient[:, None] * np.cross(phi, phi_cross_t)], 1)
+    is_large = cosine < 0
+    if is_large.any():
+        xi[is_large] = se3.log(T[is_large])
     return xi
 
 
@@ -162,28 +162,28 @@ def _log(T: F64) -> F64:
 # Usenko et al., *Visual-Inertial Mapping with Non-Linear Factor Recovery*, RA-L 2020, the roll-pitch factor.
 
 
-def cost(poses: F64, plumb: F64) -> float:
+def gravity_cost(poses: F64, gravity_factors: F64) -> float:
     """Sum of the squared residuals at poses (N, 4, 4)."""
-    return float((_residual(poses, plumb) ** 2).sum())
+    return float((_gravity_residual(poses, gravity_factors) ** 2).sum())
 
 
-def equations(poses: F64, plumb: F64) -> tuple[F64, F64]:
+def gravity_equations(poses: F64, gravity_factors: F64) -> tuple[F64, F64]:
     """Slope (N, 6) and curvature (N, 6, 6) of half the cost by each pose's own perturbation."""
-    J = -(poses[:, :2, :3] @ se3.hat(plumb))
-    slope, curvature = np.zeros((len(poses), 6)), np.zeros((len(poses), 6, 6))
-    slope[:, :3] = (np.swapaxes(J, 1, 2) @ _residual(poses, plumb)[:, :, None])[:, :, 0]
-    curvature[:, :3, :3] = np.swapaxes(J, 1, 2) @ J
-    return slope, curvature
+    J = -(poses[:, :2, :3] @ se3.hat(gravity_factors))
+    gradient, hessian = np.zeros((len(poses), 6)), np.zeros((len(poses), 6, 6))
+    gradient[:, :3] = (np.swapaxes(J, 1, 2) @ _gravity_residual(poses, gravity_factors)[:, :, None])[:, :, 0]
+    hessian[:, :3, :3] = np.swapaxes(J, 1, 2) @ J
+    return gradient, hessian
 
 
-def tilting(pose: F64) -> F64:
+def tilt_projector(pose: F64) -> F64:
     """Projector (6, 6) of a perturbation of `pose` (4, 4) on its turns about level axes."""
-    level = pose[:2, :3]
+    horizontal_axes = pose[:2, :3]
     out = np.zeros((6, 6))
-    out[:3, :3] = level.T @ level
+    out[:3, :3] = horizontal_axes.T @ horizontal_axes
     return out
 
 
-def _residual(poses: F64, plumb: F64) -> F64:
+def _gravity_residual(poses: F64, gravity_factors: F64) -> F64:
     """(N, 2)."""
-    return np.asarray((poses[:, :2, :3] @ plumb[:, :, None])[:, :, 0])
+    return np.asarray((poses[:, :2, :3] @ gravity_factors[:, :, None])[:, :, 0])

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from share.config import GraphConfig
-from share.mapping.graph.covariance import covariances
-from share.mapping.graph.edges import Edges
-from share.mapping.graph.optimiser import chain_order, minimise
-from share.mapping.graph.updates import Change, Solution
+from share.mapping.graph.covariance import relative_covariances
+from share.mapping.graph.edges import EdgeArrays
+from share.mapping.graph.optimiser import chain_order, optimise
+from share.mapping.graph.updates import GraphSolution, GraphUpdate
 from share.types import F64, I64
 
 
-class Solver:
+class PoseGraphSolver:
     """All poses, by number, and the edges between them."""
 
     def __init__(self, config: GraphConfig) -> None:
@@ -28,23 +28,23 @@ class Solver:
 
     def clear(self) -> None:
         """Know nothing any more."""
-        nothing = Change.of({})
-        self._numbers = nothing.numbers  # rising
-        self._poses, self._plumb = nothing.poses, nothing.plumb
-        self._ids, self._edges = nothing.edge_ids, _edges_of(nothing)  # their ends are numbers
+        empty = GraphUpdate.from_edges({})
+        self._pose_ids = empty.pose_ids  # rising
+        self._poses, self._gravity_factors = empty.poses, empty.gravity_factors
+        self._edge_ids, self._edges = empty.edge_ids, _edge_arrays(empty)  # their ends are numbers
 
     def __len__(self) -> int:
-        return len(self._numbers)
+        return len(self._pose_ids)
 
-    def update(self, change: Change) -> None:
+    def update(self, change: GraphUpdate) -> None:
         """Take news in. Raises ValueError, and stays as it was, if an edge or a pose that should go is
         not known, if an edge's id is known already, or if an end of it is not there."""
-        numbers, poses, plumb = self._poses_after(change)
-        ids, edges = self._edges_after(change, numbers)
-        self._numbers, self._poses, self._plumb = numbers, poses, plumb
-        self._ids, self._edges = ids, edges
+        pose_ids, poses, gravity_factors = self._poses_after(change)
+        edge_ids, edges = self._edges_after(change, pose_ids)
+        self._pose_ids, self._poses, self._gravity_factors = pose_ids, poses, gravity_factors
+        self._edge_ids, self._edges = edge_ids, edges
 
-    def solve(self, anchor: int, wanted: Sequence[int] = ()) -> Solution:
+    def solve(self, anchor: int, wanted: Sequence[int] = ()) -> GraphSolution:
         """The most likely poses of all that is joined to pose `anchor`, which stays where it is and, where
         plumb lines are known, turns only to be upright.
 
@@ -52,84 +52,88 @@ class Solver:
         was, with the reason. Deterministic. Raises ValueError if the anchor is not known or a
         wanted pose is not joined to it.
         """
-        part, touching = self._part(anchor)
-        numbers, edges = self._numbers[part], self._edges[touching]
-        goals = _places(numbers, np.array(wanted, np.int64), f"joined to {anchor}")
-        local = edges.between(np.searchsorted(numbers, edges.a), np.searchsorted(numbers, edges.b))
-        order = chain_order(len(part), local[~local.is_loop])
+        component, component_edges = self._component(anchor)
+        pose_ids, edges = self._pose_ids[component], self._edges[component_edges]
+        goals = _indices(pose_ids, np.array(wanted, np.int64), f"joined to {anchor}")
+        local_edges = edges.with_ends(np.searchsorted(pose_ids, edges.a), np.searchsorted(pose_ids, edges.b))
+        order = chain_order(len(component), local_edges[~local_edges.is_loop])
         rank = np.argsort(order)
-        chained = local.between(rank[local.a], rank[local.b])
-        held = int(rank[np.searchsorted(numbers, anchor)])
-        plumb = self._plumb[part][order]
-        minimum = minimise(self._poses[part][order], plumb, chained, held, self._config)
+        ordered_edges = local_edges.with_ends(rank[local_edges.a], rank[local_edges.b])
+        anchor_index = int(rank[np.searchsorted(pose_ids, anchor)])
+        gravity_factors = self._gravity_factors[component][order]
+        minimum = optimise(
+            self._poses[component][order], gravity_factors, ordered_edges, anchor_index, self._config
+        )
         poses = minimum.poses[rank]
         if minimum.reason:
             goals = goals[:0]
         else:
-            self._poses = _replaced(self._poses, part, poses)
-        return Solution(
-            numbers,
+            self._poses = _with_poses(self._poses, component, poses)
+        return GraphSolution(
+            pose_ids,
             poses,
-            covariances(chained, plumb, minimum, held, rank[goals], self._config),
-            self._ids[touching][edges.is_loop],
-            minimum.at.chi2[edges.is_loop],
+            relative_covariances(
+                ordered_edges, gravity_factors, minimum, anchor_index, rank[goals], self._config
+            ),
+            self._edge_ids[component_edges][edges.is_loop],
+            minimum.residuals.chi2[edges.is_loop],
             minimum.iterations,
             minimum.reason,
         )
 
-    def _part(self, anchor: int) -> tuple[I64, I64]:
+    def _component(self, anchor: int) -> tuple[I64, I64]:
         """Places of the poses that are joined to `anchor`, and of the edges between them."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import connected_components
 
-        at = _places(self._numbers, np.array([anchor]), "known")[0]
-        a, b = np.searchsorted(self._numbers, self._edges.a), np.searchsorted(self._numbers, self._edges.b)
-        n = len(self._numbers)
+        anchor_index = _indices(self._pose_ids, np.array([anchor]), "known")[0]
+        a, b = np.searchsorted(self._pose_ids, self._edges.a), np.searchsorted(self._pose_ids, self._edges.b)
+        n = len(self._pose_ids)
         graph = csr_array((np.ones(len(a)), (a, b)), shape=(n, n))
         label = connected_components(graph, directed=False)[1]
-        return np.flatnonzero(label == label[at]), np.flatnonzero(label[a] == label[at])
+        return np.flatnonzero(label == label[anchor_index]), np.flatnonzero(label[a] == label[anchor_index])
 
-    def _poses_after(self, change: Change) -> tuple[I64, F64, F64]:
-        kept = np.ones(len(self._numbers), bool)
-        kept[_places(self._numbers, change.gone_poses, "known")] = False
-        numbers = np.union1d(self._numbers[kept], change.numbers)
-        poses, plumb = np.empty((len(numbers), 4, 4)), np.empty((len(numbers), 3))
-        for known, at, of_them in (
-            (self._numbers[kept], self._poses[kept], self._plumb[kept]),
-            (change.numbers, change.poses, change.plumb),
+    def _poses_after(self, change: GraphUpdate) -> tuple[I64, F64, F64]:
+        is_kept = np.ones(len(self._pose_ids), bool)
+        is_kept[_indices(self._pose_ids, change.removed_poses, "known")] = False
+        pose_ids = np.union1d(self._pose_ids[is_kept], change.pose_ids)
+        poses, gravity_factors = np.empty((len(pose_ids), 4, 4)), np.empty((len(pose_ids), 3))
+        for known_ids, known_poses, known_gravity in (
+            (self._pose_ids[is_kept], self._poses[is_kept], self._gravity_factors[is_kept]),
+            (change.pose_ids, change.poses, change.gravity_factors),
         ):
-            places = np.searchsorted(numbers, known)
-            poses[places], plumb[places] = at, of_them
-        return numbers, poses, plumb
+            indices = np.searchsorted(pose_ids, known_ids)
+            poses[indices], gravity_factors[indices] = known_poses, known_gravity
+        return pose_ids, poses, gravity_factors
 
-    def _edges_after(self, change: Change, numbers: I64) -> tuple[I64, Edges]:
-        _require(np.isin(change.gone_edges, self._ids), change.gone_edges, "edge", "is not known")
-        gone = np.isin(self._ids, change.gone_edges)
+    def _edges_after(self, change: GraphUpdate, pose_ids: I64) -> tuple[I64, EdgeArrays]:
+        _require(np.isin(change.removed_edges, self._edge_ids), change.removed_edges, "edge", "is not known")
+        is_removed = np.isin(self._edge_ids, change.removed_edges)
         for end in (self._edges.a, self._edges.b):
-            gone |= np.isin(end, change.gone_poses)
-        ids = np.concatenate([self._ids[~gone], change.edge_ids])
-        once = np.unique(ids, return_counts=True)
-        _require(once[1] == 1, once[0], "edge", "is known already")
-        _places(numbers, change.ends.ravel(), "known")
-        return ids, self._edges[~gone].with_those(_edges_of(change))
+            is_removed |= np.isin(end, change.removed_poses)
+        edge_ids = np.concatenate([self._edge_ids[~is_removed], change.edge_ids])
+        counts = np.unique(edge_ids, return_counts=True)
+        _require(counts[1] == 1, counts[0], "edge", "is known already")
+        _indices(pose_ids, change.ends.ravel(), "known")
+        return edge_ids, self._edges[~is_removed].concatenate(_edge_arrays(change))
 
 
-def _edges_of(change: Change) -> Edges:
-    return Edges.measured(change.ends, change.measured, change.covs, change.is_loop)
+def _edge_arrays(change: GraphUpdate) -> EdgeArrays:
+    return EdgeArrays.from_measurements(change.ends, change.T_a_b, change.covs, change.is_loop)
 
 
-def _replaced(poses: F64, places: I64, new: F64) -> F64:
+def _with_poses(poses: F64, indices: I64, new: F64) -> F64:
     poses = poses.copy()
-    poses[places] = new
+    poses[indices] = new
     return poses
 
 
-def _places(numbers: I64, wanted: I64, what: str) -> I64:
-    """Where `wanted` are in `numbers`, which rise. Raises ValueError if one is not there."""
-    _require(np.isin(wanted, numbers), wanted, "pose", f"is not {what}")
-    return np.searchsorted(numbers, wanted)
+def _indices(pose_ids: I64, wanted: I64, what: str) -> I64:
+    """Where `wanted` are in `pose_ids`, which rise. Raises ValueError if one is not there."""
+    _require(np.isin(wanted, pose_ids), wanted, "pose", f"is not {what}")
+    return np.searchsorted(pose_ids, wanted)
 
 
-def _require(fine: Any, which: I64, kind: str, why: str) -> None:
-    if not np.all(fine):
-        raise ValueError(f"{kind} {which[~fine][0]} {why}")
+def _require(is_valid: Any, ids: I64, kind: str, reason: str) -> None:
+    if not np.all(is_valid):
+        raise ValueError(f"{kind} {ids[~is_valid][0]} {reason}")

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.graph.edges import Edge
-from share.types import F64, I64, checked
+from share.mapping.graph.edges import PoseEdge
+from share.types import F64, I64, checked_array
 
 # ---- What goes to the solver and what comes back, as a few arrays: both cross to another process.
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class GraphUpdate:
     """News of the graph. What is gone goes first, and a gone pose takes its edges along.
 
     numbers (N,), poses (N, 4, 4), rigid: new ones, and known ones that lie elsewhere now; plumb (N, 3) of
@@ -32,61 +32,63 @@ class Change:
     perturbation. is_loop (E,): may be false, so it is judged robustly. gone_edges, gone_poses: ids.
     """
 
-    numbers: I64
+    pose_ids: I64
     poses: F64
-    plumb: F64
+    gravity_factors: F64
     edge_ids: I64
     ends: I64
-    measured: F64
+    T_a_b: F64
     covs: F64
     is_loop: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    gone_edges: I64
-    gone_poses: I64
+    removed_edges: I64
+    removed_poses: I64
 
     def __post_init__(self) -> None:
-        n, e = len(self.numbers), len(self.edge_ids)
+        n, e = len(self.pose_ids), len(self.edge_ids)
         shapes = {
-            "numbers": ((n,), np.int64),
+            "pose_ids": ((n,), np.int64),
             "poses": ((n, 4, 4), np.float64),
-            "plumb": ((n, 3), np.float64),
+            "gravity_factors": ((n, 3), np.float64),
             "edge_ids": ((e,), np.int64),
             "ends": ((e, 2), np.int64),
-            "measured": ((e, 4, 4), np.float64),
+            "T_a_b": ((e, 4, 4), np.float64),
             "covs": ((e, 6, 6), np.float64),
             "is_loop": ((e,), np.bool_),
-            "gone_edges": ((None,), np.int64),
-            "gone_poses": ((None,), np.int64),
+            "removed_edges": ((None,), np.int64),
+            "removed_poses": ((None,), np.int64),
         }
         for name, (shape, dtype) in shapes.items():
-            object.__setattr__(self, name, checked(name, getattr(self, name), shape, dtype))
+            object.__setattr__(self, name, checked_array(name, getattr(self, name), shape, dtype))
 
     @staticmethod
-    def of(
+    def from_edges(
         poses: Mapping[int, F64],
-        edges: Iterable[tuple[int, Edge, bool]] = (),
-        gone_edges: Iterable[int] = (),
-        gone_poses: Iterable[int] = (),
-        plumb: Mapping[int, F64] | None = None,
-    ) -> Change:
+        edges: Iterable[tuple[int, PoseEdge, bool]] = (),
+        removed_edges: Iterable[int] = (),
+        removed_poses: Iterable[int] = (),
+        gravity_factors: Mapping[int, F64] | None = None,
+    ) -> GraphUpdate:
         """From poses by number, and edges as (id, edge, may it be false). plumb: by number, of some of the
         poses."""
-        edges, plumb = list(edges), plumb or {}
-        return Change(
+        edges, gravity_factors = list(edges), gravity_factors or {}
+        return GraphUpdate(
             np.array(list(poses), np.int64),
             np.array(list(poses.values()) or np.zeros((0, 4, 4)), np.float64),
-            np.array([plumb.get(number, np.zeros(3)) for number in poses], np.float64).reshape(-1, 3),
+            np.array([gravity_factors.get(node_id, np.zeros(3)) for node_id in poses], np.float64).reshape(
+                -1, 3
+            ),
             np.array([i for i, _, _ in edges], np.int64),
             np.array([(edge.a, edge.b) for _, edge, _ in edges], np.int64).reshape(-1, 2),
             np.array([edge.T_a_b for _, edge, _ in edges], np.float64).reshape(-1, 4, 4),
             np.array([edge.cov for _, edge, _ in edges], np.float64).reshape(-1, 6, 6),
             np.array([loop for _, _, loop in edges], np.bool_),
-            np.array(list(gone_edges), np.int64),
-            np.array(list(gone_poses), np.int64),
+            np.array(list(removed_edges), np.int64),
+            np.array(list(removed_poses), np.int64),
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class GraphSolution:
     """One connected part, solved.
 
     numbers (N,), poses (N, 4, 4): rising, all of the part. covariances (K, 6, 6): of the poses asked
@@ -94,7 +96,7 @@ class Solution:
     loop_ids (L,), loop_chi2 (L,): squared Mahalanobis residual. reason: why it could not be solved, the poses
     are as they were and there are no covariances; empty if it was."""
 
-    numbers: I64
+    pose_ids: I64
     poses: F64
     covariances: F64
     loop_ids: I64
@@ -104,58 +106,69 @@ class Solution:
 
 
 @dataclass(frozen=True, eq=False)
-class Contracted:
+class ContractedEdges:
     """The edges that stand for those which touched a pose that is gone.
 
     odometry: all but the one that the others moved along; none where a chain ended. loops: one for each
     that was given, None where it would join the neighbour to itself.
     """
 
-    odometry: tuple[Edge, ...]
-    loops: tuple[Edge | None, ...]
+    odometry: tuple[PoseEdge, ...]
+    loops: tuple[PoseEdge | None, ...]
 
 
-def contract(x: int, odometry: Sequence[Edge], loops: Sequence[Edge], share: float = 0.5) -> Contracted:
+def contract_pose(
+    pose: int, odometry: Sequence[PoseEdge], loops: Sequence[PoseEdge], share: float = 0.5
+) -> ContractedEdges:
     """Take pose x out, given all the edges that touch it; they are gone then.
 
     share: of the information of the edge along which the others move, how much odometry is told;
     loops are told equal parts of the rest. Raises ValueError if x has no neighbour by odometry, or
     if an edge does not touch x.
     """
-    stray = [edge for edge in (*odometry, *loops) if x not in (edge.a, edge.b)]
-    if stray or not odometry:
-        raise ValueError(f"pose {x}: {'an edge does not touch it' if stray else 'no neighbour by odometry'}")
-    road = min(odometry, key=lambda edge: edge.spread)
-    y = road.a if road.b == x else road.b
-    others = [edge for edge in odometry if edge is not road and y not in (edge.a, edge.b)]
-    moving = [edge for edge in loops if y not in (edge.a, edge.b)]
-    to_odometry = share if moving else 1.0
+    unrelated = [edge for edge in (*odometry, *loops) if pose not in (edge.a, edge.b)]
+    if unrelated or not odometry:
+        raise ValueError(
+            f"pose {pose}: {'an edge does not touch it' if unrelated else 'no neighbour by odometry'}"
+        )
+    path_edge = min(odometry, key=lambda edge: edge.cov_trace)
+    neighbour = path_edge.a if path_edge.b == pose else path_edge.b
+    others = [edge for edge in odometry if edge is not path_edge and neighbour not in (edge.a, edge.b)]
+    moving_loops = [edge for edge in loops if neighbour not in (edge.a, edge.b)]
+    to_odometry = share if moving_loops else 1.0
     to_loops = 1 - share if others else 1.0
-    moved = {id(edge): _moved(edge, x, y, road, to_odometry / len(others)) for edge in others}
-    moved |= {id(edge): _moved(edge, x, y, road, to_loops / len(moving)) for edge in moving}
-    return Contracted(tuple(moved[id(edge)] for edge in others), tuple(moved.get(id(edge)) for edge in loops))
+    moved_edges = {
+        id(edge): _move_end(edge, pose, neighbour, path_edge, to_odometry / len(others)) for edge in others
+    }
+    moved_edges |= {
+        id(edge): _move_end(edge, pose, neighbour, path_edge, to_loops / len(moving_loops))
+        for edge in moving_loops
+    }
+    return ContractedEdges(
+        tuple(moved_edges[id(edge)] for edge in others), tuple(moved_edges.get(id(edge)) for edge in loops)
+    )
 
 
-def _moved(edge: Edge, x: int, y: int, road: Edge, share: float) -> Edge:
-    """`edge` with its end at x moved to y along `road`, of whose information it is told `share`."""
-    along = road if road.a == x else road.reverse()
-    lead = edge if edge.b == x else edge.reverse()
-    cov = se3.compose_cov(along.T_a_b, lead.cov, along.cov / share)
-    moved = Edge(lead.a, y, se3.orthonormal(lead.T_a_b @ along.T_a_b), cov)
-    return moved if edge.b == x else moved.reverse()
+def _move_end(edge: PoseEdge, old_end: int, new_end: int, path_edge: PoseEdge, share: float) -> PoseEdge:
+    """`edge` with its end at x moved to y along `path_edge`, of whose information it is told `share`."""
+    oriented_path = path_edge if path_edge.a == old_end else path_edge.reverse()
+    incoming = edge if edge.b == old_end else edge.reverse()
+    cov = se3.compose_cov(oriented_path.T_a_b, incoming.cov, oriented_path.cov / share)
+    result = PoseEdge(incoming.a, new_end, se3.orthonormal(incoming.T_a_b @ oriented_path.T_a_b), cov)
+    return result if edge.b == old_end else result.reverse()
 
 
-def fuse(edges: Sequence[Edge]) -> tuple[Edge, float]:
+def fuse_edges(edges: Sequence[PoseEdge]) -> tuple[PoseEdge, float]:
     """Edges that join the same two poses as one (their information added), and the chi-square by which
     they disagree, of 6 (K - 1) dof: where it is too large one of them is false. Directed as the first.
     Raises ValueError if they do not join the same two poses."""
     first = edges[0]
     if any({edge.a, edge.b} != {first.a, first.b} for edge in edges):
         raise ValueError("edges between different poses cannot be one")
-    alike = [edge if edge.a == first.a else edge.reverse() for edge in edges]
-    xi = se3.log(se3.inverse(first.T_a_b) @ np.array([edge.T_a_b for edge in alike]))
-    information = np.linalg.inv(np.array([edge.cov for edge in alike]))
+    aligned = [edge if edge.a == first.a else edge.reverse() for edge in edges]
+    xi = se3.log(se3.inverse(first.T_a_b) @ np.array([edge.T_a_b for edge in aligned]))
+    information = np.linalg.inv(np.array([edge.cov for edge in aligned]))
     cov = np.linalg.inv(information.sum(0))
     mean = cov @ np.einsum("kij,kj->i", information, xi)
     chi2 = np.einsum("ki,kij,kj->", xi - mean, information, xi - mean)
-    return Edge(first.a, first.b, se3.orthonormal(first.T_a_b @ se3.exp(mean)), cov), float(chi2)
+    return PoseEdge(first.a, first.b, se3.orthonormal(first.T_a_b @ se3.exp(mean)), cov), float(chi2)

@@ -11,31 +11,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.mapping.recognition.refinement import move
+from share.mapping.recognition.refinement import transfer_keypoints
 from share.types import F64
-from share.vision.matching import Pairs
+from share.vision.matching import DescriptorPairs
 
 
-def beside(pairs: Pairs, T_c_q: F64, y_q: F64, y_c: F64, radius: float) -> Pairs:
+def guided_pairs(pairs: DescriptorPairs, T_c_q: F64, y_q: F64, y_c: F64, radius: float) -> DescriptorPairs:
     """Those pairs that appear within `radius` (normalised coordinates) of where T_c_q (4, 4) moves them.
 
     y_q (N, 3), y_c (K, 3): keypoints with inverse depth, NaN if unknown. Whichever of the two has a
     depth is moved; a pair without any depth is left out.
     """
-    there, back = _moved(T_c_q, y_q), _moved(se3.inverse(T_c_q), y_c)
+    query_in_candidate, candidate_in_query = _transfer(T_c_q, y_q), _transfer(se3.inverse(T_c_q), y_c)
     for axis in (0, 1):  # by one coordinate after the other, since each leaves few pairs for the next
-        pairs = pairs.only(_near(there[axis][pairs.rows], y_c[:, axis][pairs.cols], radius))
-        pairs = pairs.only(_near(back[axis][pairs.cols], y_q[:, axis][pairs.rows], radius))
-    return pairs.only(np.isfinite(y_q[pairs.rows, 2]) | np.isfinite(y_c[pairs.cols, 2]))
+        pairs = pairs.keep(_is_near(query_in_candidate[axis][pairs.rows], y_c[:, axis][pairs.cols], radius))
+        pairs = pairs.keep(_is_near(candidate_in_query[axis][pairs.cols], y_q[:, axis][pairs.rows], radius))
+    return pairs.keep(np.isfinite(y_q[pairs.rows, 2]) | np.isfinite(y_c[pairs.cols, 2]))
 
 
-def _moved(T: F64, y: F64) -> F64:
+def _transfer(T: F64, y: F64) -> F64:
     """(3, N): NaN where the depth is unknown, infinite where it is behind the camera."""
-    out = move(T, y.T)
+    out = transfer_keypoints(T, y.T)
     out[:, np.isnan(out[2]) & np.isfinite(y[:, 2])] = np.inf
     return out
 
 
-def _near(a: F64, b: F64, radius: float) -> NDArray[np.bool_]:
+def _is_near(a: F64, b: F64, radius: float) -> NDArray[np.bool_]:
     """Not if they are known to be further apart."""
     return np.asarray(~(np.abs(a - b) > radius))

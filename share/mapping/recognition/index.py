@@ -25,14 +25,14 @@ from numpy.typing import NDArray
 
 from share.types import F32, F64, I64, U8
 
-_FRESH = 64  # keyframes looked through one by one, at most
-_DEAD = 0.25  # share of a page; beyond, it is written anew
-_READ = 64  # entries a stored keyframe, on average
-_READ_AT_LEAST, _READ_AT_MOST = 30_000, 400_000  # entries in all
-_FAN = 4  # pages that become one
+_MAX_UNPAGED = 64  # keyframes looked through one by one, at most
+_MAX_DEAD_SHARE = 0.25  # share of a page; beyond, it is written anew
+_ENTRIES_PER_KEYFRAME = 64  # entries a stored keyframe, on average
+_MIN_ENTRIES, _MAX_ENTRIES = 30_000, 400_000  # entries in all
+_PAGES_PER_MERGE = 4  # pages that become one
 
 
-class Candidate(NamedTuple):
+class PlaceCandidate(NamedTuple):
     """A stored keyframe and how alike it is; scores compare within one query only."""
 
     id: int
@@ -43,107 +43,113 @@ class PlaceIndex:
     """Keyframes by their descriptors. Ids are any distinct integers."""
 
     def __init__(self, seed: int, tables: int = 8, bits: int = 16) -> None:
-        if not (bits >= 1 and tables >= 1 and tables << bits <= MOST_WORDS):
+        if not (bits >= 1 and tables >= 1 and tables << bits <= MAX_WORDS):
             raise ValueError(
-                f"{tables} tables of {bits} bits: at least one of each, and {MOST_WORDS} words in all"
+                f"{tables} tables of {bits} bits: at least one of each, and {MAX_WORDS} words in all"
             )
         rng = np.random.default_rng(seed)
-        self._samples = np.stack([rng.choice(256, bits, replace=False) for _ in range(tables)])
-        self._held = np.zeros(tables << bits, np.int32)  # entries of each word
-        self._pages: list[Page] = []
-        self._fresh: dict[int, U32] = {}  # words of the newest keyframes
+        self._sampled_bits = np.stack([rng.choice(256, bits, replace=False) for _ in range(tables)])
+        self._word_counts = np.zeros(tables << bits, np.int32)  # entries of each word
+        self._pages: list[IndexPage] = []
+        self._unpaged: dict[int, U32] = {}  # words of the newest keyframes
 
     def __len__(self) -> int:
-        return len(self._fresh) + sum(int(page.alive.sum()) for page in self._pages)
+        return len(self._unpaged) + sum(int(page.is_alive.sum()) for page in self._pages)
 
     @property
     def nbytes(self) -> int:
         """Memory that the index holds."""
         arrays = [array for page in self._pages for array in (page.starts, page.slots)]
-        return sum(array.nbytes for array in (*arrays, *self._fresh.values(), self._held))
+        return sum(array.nbytes for array in (*arrays, *self._unpaged.values(), self._word_counts))
 
     def add(self, id: int, descriptors: U8) -> None:
         """Store the view (N, 32) of keyframe `id`."""
         words = self._words(descriptors)
-        np.add.at(self._held, words, np.int32(1))  # of another type, it is 30 times slower
-        self._fresh[id] = words
-        if len(self._fresh) == _FRESH:
-            self._pages.append(written(list(self._fresh), list(self._fresh.values()), len(self._held)))
-            self._fresh.clear()
-            self._join(_FAN)
+        np.add.at(self._word_counts, words, np.int32(1))  # of another type, it is 30 times slower
+        self._unpaged[id] = words
+        if len(self._unpaged) == _MAX_UNPAGED:
+            self._pages.append(
+                build_page(list(self._unpaged), list(self._unpaged.values()), len(self._word_counts))
+            )
+            self._unpaged.clear()
+            self._merge_pages(_PAGES_PER_MERGE)
 
     def remove(self, id: int) -> None:
         """Forget keyframe `id`. Raises KeyError if it is not stored."""
-        if id in self._fresh:
-            np.add.at(self._held, self._fresh.pop(id), np.int32(-1))
+        if id in self._unpaged:
+            np.add.at(self._word_counts, self._unpaged.pop(id), np.int32(-1))
             return
-        for number, page in enumerate(self._pages):
-            at = np.flatnonzero((page.ids == id) & page.alive)
-            if len(at):
-                page.alive[at] = False
-                if page.alive.mean() < 1 - _DEAD:
-                    self._rewrite(number)
+        for page_index, page in enumerate(self._pages):
+            row = np.flatnonzero((page.ids == id) & page.is_alive)
+            if len(row):
+                page.is_alive[row] = False
+                if page.is_alive.mean() < 1 - _MAX_DEAD_SHARE:
+                    self._compact_page(page_index)
                 return
         raise KeyError(f"keyframe {id} is not in the index")
 
-    def query(self, descriptors: U8, limit: int, exclude: Collection[int] = ()) -> list[Candidate]:
+    def query(self, descriptors: U8, limit: int, exclude: Collection[int] = ()) -> list[PlaceCandidate]:
         """Up to `limit` stored keyframes that share words with descriptors (N, 32), best first.
 
         A shared word counts log(n / df).
         """
         if not len(self) or not len(descriptors):
             return []
-        words, weights = self._weighted(descriptors)
+        words, weights = self._weight_words(descriptors)
         parts = [(page.ids, page.sizes, page.votes(words, weights)) for page in self._pages]
-        parts.append(self._fresh_part(words, weights))
+        parts.append(self._unpaged_votes(words, weights))
         ids, sizes, votes = (np.concatenate(column) for column in zip(*parts, strict=True))
         scores = votes / np.sqrt(np.maximum(1, sizes))
         scores[np.isin(ids, list(exclude))] = 0.0
         ranked = np.argsort(-scores, kind="stable")[:limit]
-        return [Candidate(int(ids[i]), float(scores[i])) for i in ranked if scores[i] > 0]
+        return [PlaceCandidate(int(ids[i]), float(scores[i])) for i in ranked if scores[i] > 0]
 
-    def _weighted(self, descriptors: U8) -> tuple[I64, F64]:
+    def _weight_words(self, descriptors: U8) -> tuple[I64, F64]:
         """The view's distinct words that may be read, and what each counts for."""
-        words, times = np.unique(self._words(descriptors).astype(np.int64), return_counts=True)
-        held = self._held[words]
-        rare_first = np.argsort(held, kind="stable")
+        words, term_counts = np.unique(self._words(descriptors).astype(np.int64), return_counts=True)
+        word_counts = self._word_counts[words]
+        rare_first = np.argsort(word_counts, kind="stable")
         n = len(self)
-        read = np.cumsum(held[rare_first]) <= np.clip(_READ * n, _READ_AT_LEAST, _READ_AT_MOST)
-        chosen = np.sort(rare_first[read & (held[rare_first] > 0)])
-        return words[chosen], times[chosen] * np.log((1 + n) / (1 + np.minimum(held[chosen], n)))
+        is_within_budget = np.cumsum(word_counts[rare_first]) <= np.clip(
+            _ENTRIES_PER_KEYFRAME * n, _MIN_ENTRIES, _MAX_ENTRIES
+        )
+        chosen = np.sort(rare_first[is_within_budget & (word_counts[rare_first] > 0)])
+        return words[chosen], term_counts[chosen] * np.log((1 + n) / (1 + np.minimum(word_counts[chosen], n)))
 
-    def _fresh_part(self, words: I64, weights: F64) -> tuple[I64, I64, F64]:
+    def _unpaged_votes(self, words: I64, weights: F64) -> tuple[I64, I64, F64]:
         """Ids, sizes and votes of the newest."""
-        worth: F32 = np.zeros(len(self._held), np.float32)
-        worth[words] = weights
-        held = self._fresh.values()
-        votes = np.array([worth[w].sum() for w in held], np.float64)
-        return np.array(list(self._fresh), np.int64), np.array([len(w) for w in held], np.int64), votes
+        word_weights: F32 = np.zeros(len(self._word_counts), np.float32)
+        word_weights[words] = weights
+        views = self._unpaged.values()
+        votes = np.array([word_weights[w].sum() for w in views], np.float64)
+        return np.array(list(self._unpaged), np.int64), np.array([len(w) for w in views], np.int64), votes
 
-    def _join(self, fan: int) -> None:
-        """The newest `fan` neighbours that fit and of which none is much larger become one page."""
-        for first in range(len(self._pages) - fan, -1, -1):
-            some = self._pages[first : first + fan]
-            if sum(map(len, some)) <= MOST and len(some[0]) <= 2 * len(some[-1]):
-                self._put(first, some, joined(some))
+    def _merge_pages(self, count: int) -> None:
+        """The newest `count` neighbours that fit and of which none is much larger become one page."""
+        for first in range(len(self._pages) - count, -1, -1):
+            pages = self._pages[first : first + count]
+            if sum(map(len, pages)) <= MAX_PAGE_KEYFRAMES and len(pages[0]) <= 2 * len(pages[-1]):
+                self._replace_pages(first, pages, merge_pages(pages))
                 return
 
-    def _rewrite(self, number: int) -> None:
+    def _compact_page(self, page_index: int) -> None:
         """Without the dead of this page."""
-        before = self._pages[number]
-        self._put(number, [before], before.living())
-        self._join(2)
+        page = self._pages[page_index]
+        self._replace_pages(page_index, [page], page.compact())
+        self._merge_pages(2)
 
-    def _put(self, first: int, before: list[Page], after: Page) -> None:
+    def _replace_pages(self, first: int, old: list[IndexPage], new: IndexPage) -> None:
         """In place of these pages; what is on none any more is held no longer."""
-        if sum(map(len, before)) > len(after):
-            self._held -= (sum(page.held() for page in before) - after.held()).astype(np.int32)
-        self._pages[first : first + len(before)] = [after] if len(after) else []
+        if sum(map(len, old)) > len(new):
+            self._word_counts -= (sum(page.word_counts() for page in old) - new.word_counts()).astype(
+                np.int32
+            )
+        self._pages[first : first + len(old)] = [new] if len(new) else []
 
     def _words(self, descriptors: U8) -> U32:
         """The words (N * tables,) of descriptors (N, 32): table number and sampled bits in one integer."""
-        tables, bits = self._samples.shape
-        sampled = np.unpackbits(descriptors, axis=1)[:, self._samples].astype(np.float32)
+        tables, bits = self._sampled_bits.shape
+        sampled = np.unpackbits(descriptors, axis=1)[:, self._sampled_bits].astype(np.float32)
         values = sampled @ (2.0 ** np.arange(bits)).astype(np.float32)  # exact up to 24 bits
         words: U32 = (
             values.astype(np.uint32) + (np.arange(tables, dtype=np.uint32) << np.uint32(bits))
@@ -156,13 +162,13 @@ class PlaceIndex:
 U32 = NDArray[np.uint32]
 
 _SLOT_BITS = 10
-MOST = 1 << _SLOT_BITS  # keyframes of a page
-MOST_WORDS = 1 << (32 - _SLOT_BITS)  # a word and a slot are sorted as one uint32
-_BLOCK = 1 << 16  # words joined at a time: fresh memory for all at once costs as much as the work
+MAX_PAGE_KEYFRAMES = 1 << _SLOT_BITS  # keyframes of a page
+MAX_WORDS = 1 << (32 - _SLOT_BITS)  # a word and a slot are sorted as one uint32
+_MERGE_BLOCK = 1 << 16  # words joined at a time: fresh memory for all at once costs as much as the work
 
 
 @dataclass(frozen=True, eq=False)
-class Page:
+class IndexPage:
     """Keyframes `ids` (n,), the descriptors that each has (n,), and who is still alive (n,).
 
     The keyframes that hold word w are slots[starts[w] : starts[w + 1]], numbers below n.
@@ -170,7 +176,7 @@ class Page:
 
     ids: I64
     sizes: I64
-    alive: NDArray[np.bool_]
+    is_alive: NDArray[np.bool_]
     starts: U32
     slots: NDArray[np.uint16]
 
@@ -181,58 +187,60 @@ class Page:
         """Sum of the weights (W,) of the words (W,) that each keyframe holds: (n,); none for the dead."""
         start, end = self.starts[words].astype(np.int64), self.starts[words + 1].astype(np.int64)
         count = end - start
-        at = np.repeat(start - np.cumsum(count) + count, count) + np.arange(count.sum())
-        found = np.bincount(self.slots[at], np.repeat(weights, count), len(self))
-        return np.where(self.alive, found, 0.0)
+        entries = np.repeat(start - np.cumsum(count) + count, count) + np.arange(count.sum())
+        votes = np.bincount(self.slots[entries], np.repeat(weights, count), len(self))
+        return np.where(self.is_alive, votes, 0.0)
 
-    def held(self) -> I64:
+    def word_counts(self) -> I64:
         """How many entries each word has, (words,)."""
         starts = self.starts.astype(np.int64)
         return starts[1:] - starts[:-1]
 
-    def living(self) -> Page:
+    def compact(self) -> IndexPage:
         """What is left of this page without its dead."""
-        if self.alive.all():
+        if self.is_alive.all():
             return self
-        kept = self.alive[self.slots]
+        kept = self.is_alive[self.slots]
         starts = np.zeros(1 + len(kept), np.uint32)
         np.cumsum(kept, out=starts[1:])
-        slots = (np.cumsum(self.alive) - 1).astype(np.uint16)[self.slots.compress(kept)]
-        return _page(self.ids[self.alive], self.sizes[self.alive], starts[self.starts], slots)
+        slots = (np.cumsum(self.is_alive) - 1).astype(np.uint16)[self.slots.compress(kept)]
+        return _new_page(self.ids[self.is_alive], self.sizes[self.is_alive], starts[self.starts], slots)
 
 
-def written(ids: Sequence[int], views: Sequence[U32], vocabulary: int) -> Page:
+def build_page(ids: Sequence[int], views: Sequence[U32], vocabulary: int) -> IndexPage:
     """A page of keyframes by their words, each (N,) below `vocabulary`."""
     keys = np.concatenate([words << _SLOT_BITS | np.uint32(slot) for slot, words in enumerate(views)])
     keys.sort()
     starts = np.zeros(vocabulary + 1, np.uint32)
     np.cumsum(np.bincount(keys >> _SLOT_BITS, minlength=vocabulary), out=starts[1:])
-    slots = (keys & (MOST - 1)).astype(np.uint16)
-    return _page(np.array(ids, np.int64), np.array([len(v) for v in views]), starts, slots)
+    slots = (keys & (MAX_PAGE_KEYFRAMES - 1)).astype(np.uint16)
+    return _new_page(np.array(ids, np.int64), np.array([len(v) for v in views]), starts, slots)
 
 
-def joined(pages: Sequence[Page]) -> Page:
+def merge_pages(pages: Sequence[IndexPage]) -> IndexPage:
     """One page of all that lives on several.
 
     Each has its entries in order already: under every word, the pages' runs go one behind the other.
     """
-    pages = [page.living() for page in pages]
+    pages = [page.compact() for page in pages]
     starts: U32 = np.zeros_like(pages[0].starts)
     for page in pages:
         starts += page.starts
     slots = np.empty(starts[-1], np.uint16)
-    first, ahead = 0, starts[:-1].astype(np.int64)  # other pages' entries that go before this one's
+    first_slot, offsets = 0, starts[:-1].astype(np.int64)  # other pages' entries that go before this one's
     for page in pages:
-        ahead -= page.starts[:-1]
-        for word in range(0, len(ahead), _BLOCK):
-            own = page.starts[word : word + _BLOCK + 1].astype(np.int64)
-            at = np.repeat(ahead[word : word + _BLOCK], np.diff(own)) + np.arange(own[0], own[-1])
-            slots[at] = page.slots[own[0] : own[-1]] + np.uint16(first)
-        ahead += page.starts[1:]
-        first += len(page)
+        offsets -= page.starts[:-1]
+        for word in range(0, len(offsets), _MERGE_BLOCK):
+            own = page.starts[word : word + _MERGE_BLOCK + 1].astype(np.int64)
+            positions = np.repeat(offsets[word : word + _MERGE_BLOCK], np.diff(own)) + np.arange(
+                own[0], own[-1]
+            )
+            slots[positions] = page.slots[own[0] : own[-1]] + np.uint16(first_slot)
+        offsets += page.starts[1:]
+        first_slot += len(page)
     ids, sizes = (np.concatenate([getattr(page, name) for page in pages]) for name in ("ids", "sizes"))
-    return _page(ids, sizes, starts, slots)
+    return _new_page(ids, sizes, starts, slots)
 
 
-def _page(ids: I64, sizes: I64, starts: U32, slots: NDArray[np.uint16]) -> Page:
-    return Page(ids, sizes, np.ones(len(ids), bool), starts, slots)
+def _new_page(ids: I64, sizes: I64, starts: U32, slots: NDArray[np.uint16]) -> IndexPage:
+    return IndexPage(ids, sizes, np.ones(len(ids), bool), starts, slots)

@@ -21,14 +21,14 @@ from share.geometry import se3
 from share.types import F64
 
 _RIDGE = 1e-6 * np.eye(6)  # keeps a hopeless set of matches solvable; its covariance says so
-_NEAREST = 0.1  # m before the camera
-_NOT_SEEN = 1e9  # squared distance of a match that one camera cannot see
-_UNKNOWN = 1e6  # variance that stands for "no depth", 1/m^2
-_SMALL = 1e-2  # rad and m; after a step so small, two plain ones follow
+_MIN_DEPTH_M = 0.1  # m before the camera
+_BEHIND_CAMERA_D2 = 1e9  # squared distance of a match that one camera cannot see
+_NO_DEPTH_VARIANCE = 1e6  # variance that stands for "no depth", 1/m^2
+_SMALL_STEP = 1e-2  # rad and m; after a step so small, two plain ones follow
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class KeypointNoise:
     """One sigma of a keypoint: `uv` in normalised coordinates, `rho` in 1/m."""
 
     uv: float
@@ -41,7 +41,7 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class RefinedPose:
     """T (4, 4), its covariance (6, 6) and the squared Mahalanobis distance (N,) of each match."""
 
     T: F64
@@ -49,18 +49,18 @@ class Refined:
     d2: F64
 
 
-def move(T: F64, y: F64) -> F64:
+def transfer_keypoints(T: F64, y: F64) -> F64:
     """y' = h(T, y) (3, N) for y (3, N) and T (4, 4), or one for each (4, 4, N); NaN for a point that is
     then behind the camera: it has no image, and for one without a depth."""
     T = T.reshape(4, 4, -1)
     u, v, rho = y
     out = T[:3, 0] * u + T[:3, 1] * v + T[:3, 2] + T[:3, 3] * rho  # the point, times rho
-    z = np.where(out[2] > _NEAREST * rho, out[2], np.nan)
+    z = np.where(out[2] > _MIN_DEPTH_M * rho, out[2], np.nan)
     out[2] = rho
     return np.asarray(out / z)
 
 
-def by_pose(moved: F64) -> F64:
+def pose_jacobian(moved: F64) -> F64:
     """dy'/dxi (6, 3, N) for Exp(xi) T, at y' = `moved` (3, N); xi is the first axis."""
     u, v, rho = moved
     out = np.zeros((6, *moved.shape))
@@ -72,47 +72,53 @@ def by_pose(moved: F64) -> F64:
     return out
 
 
-def by_keypoint(T: F64, y: F64, moved: F64) -> F64:
-    """dy'/dy (3, 3, N), y' = `moved` (3, N); y is the second axis. T as in `move`."""
-    into = T.reshape(4, 4, -1)[:3, [0, 1, 3]]
-    top = into.copy()
+def keypoint_jacobian(T: F64, y: F64, moved: F64) -> F64:
+    """dy'/dy (3, 3, N), y' = `moved` (3, N); y is the second axis. T as in `transfer_keypoints`."""
+    projection = T.reshape(4, 4, -1)[:3, [0, 1, 3]]
+    top = projection.copy()
     top[2] = np.array([[0.0], [0.0], [1.0]])
     z = y[2] / moved[2]  # of the point, times rho
-    return np.asarray((top - moved[:, None] * into[2]) / z)
+    return np.asarray((top - moved[:, None] * projection[2]) / z)
 
 
-def refine(
-    T_c_q: F64, y_q: F64, y_c: F64, noise_q: Noise, noise_c: Noise, gate: float, iterations: int = 10
-) -> Refined:
+def refine_pose(
+    T_c_q: F64,
+    y_q: F64,
+    y_c: F64,
+    noise_q: KeypointNoise,
+    noise_c: KeypointNoise,
+    gate: float,
+    iterations: int = 10,
+) -> RefinedPose:
     """Refine T_c_q (4, 4) from matched keypoints y_q, y_c (N, 3), each with at least one depth.
 
     Geman-McClure weights over all matches until the step is small, then plain least squares over those
     within `gate` (squared Mahalanobis). The covariance is that of the second pass, scaled by its
     residual variance; a scale below one is believed down to a quarter.
     """
-    problem = _Problem(y_q, y_c, noise_q, noise_c)
+    problem = _RefinementProblem(y_q, y_c, noise_q, noise_c)
     T, information = T_c_q, problem.information(T_c_q)
     for _ in range(iterations):
-        linear = problem.linear(T, information)
+        linear = problem.linearise(T, information)
         step = linear.step(1 / (1 + linear.d2 / gate) ** 2)
-        T = _moved_by(step, T)
-        if np.abs(step).max() < _SMALL:
+        T = _apply_twist(step, T)
+        if np.abs(step).max() < _SMALL_STEP:
             break
     information = problem.information(T)
     for _ in range(2):
-        linear = problem.linear(T, information)
-        inside = linear.d2 < gate
-        T = _moved_by(linear.step(inside), T)
-    freedom = max(1, int(problem.rows[inside].sum()) - 6)
-    variance = max(0.25, float(linear.d2[inside].sum()) / freedom)
-    to_right = se3.adjoint(se3.inverse(T))
-    cov = np.linalg.inv(linear.normal(inside)[:6, :6] + _RIDGE) * variance
+        linear = problem.linearise(T, information)
+        is_inlier = linear.d2 < gate
+        T = _apply_twist(linear.step(is_inlier), T)
+    dof = max(1, int(problem.residual_rows[is_inlier].sum()) - 6)
+    variance = max(0.25, float(linear.d2[is_inlier].sum()) / dof)
+    adjoint = se3.adjoint(se3.inverse(T))
+    cov = np.linalg.inv(linear.normal(is_inlier)[:6, :6] + _RIDGE) * variance
     d2 = np.empty(len(y_q))
     d2[problem.order] = linear.d2
-    return Refined(se3.orthonormal(T), to_right @ cov @ to_right.T, d2)
+    return RefinedPose(se3.orthonormal(T), adjoint @ cov @ adjoint.T, d2)
 
 
-def _moved_by(xi: F64, T: F64) -> F64:
+def _apply_twist(xi: F64, T: F64) -> F64:
     """Exp(xi) T to second order, and rigid: Cayley's map, in half the time."""
     X = np.zeros((4, 4))
     X[:3, :3], X[:3, 3] = se3.hat(xi[:3] / 2), xi[3:] / 2
@@ -120,7 +126,7 @@ def _moved_by(xi: F64, T: F64) -> F64:
 
 
 @dataclass(frozen=True, eq=False)
-class _Linear:
+class _LinearSystem:
     """Of each match [J r] (7, 3, N) by Exp(xi) T, the same times its information, and d2 (N,)."""
 
     Jr: F64
@@ -136,54 +142,56 @@ class _Linear:
         return np.asarray(np.linalg.solve(normal[:6, :6] + _RIDGE, normal[:6, 6]), np.float64)
 
 
-class _Problem:
+class _RefinementProblem:
     """Matches with a depth in q are moved into c, then the others from c into q."""
 
-    def __init__(self, y_q: F64, y_c: F64, noise_q: Noise, noise_c: Noise) -> None:
-        back = np.isnan(y_q[:, 2])
-        self.order = np.argsort(back, kind="stable")
-        self._counts = len(back) - int(back.sum()), int(back.sum())
-        source, target = np.where(back, (y_c.T, y_q.T), (y_q.T, y_c.T))[:, :, self.order]
+    def __init__(self, y_q: F64, y_c: F64, noise_q: KeypointNoise, noise_c: KeypointNoise) -> None:
+        is_backward = np.isnan(y_q[:, 2])
+        self.order = np.argsort(is_backward, kind="stable")
+        self._counts = len(is_backward) - int(is_backward.sum()), int(is_backward.sum())
+        source, target = np.where(is_backward, (y_c.T, y_q.T), (y_q.T, y_c.T))[:, :, self.order]
         unknown = np.isnan(target[2])
         target[2, unknown] = 0.0
         variances = np.stack([noise_q.variances, noise_c.variances], axis=1)
         self._source, self._noise_source = source, np.repeat(variances, self._counts, axis=1)
         self._target, self._noise_target = target, np.repeat(variances[:, ::-1], self._counts, axis=1)
-        self._noise_target[2, unknown] = _UNKNOWN
-        self.rows = 3.0 - unknown  # that each match measures
+        self._noise_target[2, unknown] = _NO_DEPTH_VARIANCE
+        self.residual_rows = 3.0 - unknown  # that each match measures
 
-    def _moves(self, T_c_q: F64) -> F64:
+    def _transforms(self, T_c_q: F64) -> F64:
         """Of each match, (4, 4, N)."""
         return np.repeat(np.stack([T_c_q, se3.inverse(T_c_q)], axis=2), self._counts, axis=2)
 
     def information(self, T_c_q: F64) -> F64:
         """Of every match's residual, (3, 3, N)."""
-        T = self._moves(T_c_q)
-        moved = move(T, self._source)
-        J = by_keypoint(T, self._source, moved)
+        T = self._transforms(T_c_q)
+        moved = transfer_keypoints(T, self._source)
+        J = keypoint_jacobian(T, self._source, moved)
         S = np.einsum("ikn,jkn->ijn", J * self._noise_source, J)
         S[[0, 1, 2], [0, 1, 2]] += self._noise_target
-        out = _inverse(S)
+        out = _inverse_symmetric(S)
         out[:, :, np.isnan(moved[2])] = 0.0
         return out
 
-    def linear(self, T_c_q: F64, information: F64) -> _Linear:
+    def linearise(self, T_c_q: F64, information: F64) -> _LinearSystem:
         """All is zero of a point behind the camera: its rows count for nothing."""
-        moved = move(self._moves(T_c_q), self._source)
-        behind = np.isnan(moved[2])
-        Jr = np.concatenate([by_pose(moved), (self._target - moved)[None]])
-        Jr[:, :, behind] = 0.0
-        there, back = self._counts
-        if back:  # (Exp(xi) T)^-1 = Exp(-Ad(T^-1) xi) T^-1
+        moved = transfer_keypoints(self._transforms(T_c_q), self._source)
+        is_behind = np.isnan(moved[2])
+        Jr = np.concatenate([pose_jacobian(moved), (self._target - moved)[None]])
+        Jr[:, :, is_behind] = 0.0
+        forward_count, backward_count = self._counts
+        if backward_count:  # (Exp(xi) T)^-1 = Exp(-Ad(T^-1) xi) T^-1
             Ad = se3.adjoint(se3.inverse(T_c_q))
-            Jr[:6, :, there:] = (-Ad.T @ Jr[:6, :, there:].reshape(6, -1)).reshape(6, 3, back)
+            Jr[:6, :, forward_count:] = (-Ad.T @ Jr[:6, :, forward_count:].reshape(6, -1)).reshape(
+                6, 3, backward_count
+            )
         WJr = np.einsum("ikn,jkn->jin", information, Jr)
         d2 = (Jr[6] * WJr[6]).sum(0)
-        d2[behind] = _NOT_SEEN
-        return _Linear(Jr, WJr, d2)
+        d2[is_behind] = _BEHIND_CAMERA_D2
+        return _LinearSystem(Jr, WJr, d2)
 
 
-def _inverse(S: F64) -> F64:
+def _inverse_symmetric(S: F64) -> F64:
     """Of symmetric matrices (3, 3, N), by their cofactors."""
     (a, b, c), (_, d, e), (_, _, f) = S
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d

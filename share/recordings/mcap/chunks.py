@@ -12,13 +12,13 @@ from typing import IO, Any
 
 from share.files.reading import MB
 
-MOST_CHUNK = 128 * MB  # unpacked; writers close one at 0.2 to 4 MB, or behind a single image
-MOST_HELD = 4 * MOST_CHUNK  # of messages of chunks that overlap in time
-_MOST_WINDOW = 27  # log2 of what zstd looks back
-_RECORD = 1 + 8  # bytes of a record's head: opcode, length
+MAX_CHUNK_BYTES = 128 * MB  # unpacked; writers close one at 0.2 to 4 MB, or behind a single image
+MAX_HELD_BYTES = 4 * MAX_CHUNK_BYTES  # of messages of chunks that overlap in time
+_MAX_WINDOW_LOG2 = 27  # log2 of what zstd looks back
+_RECORD_HEAD_BYTES = 1 + 8  # bytes of a record's head: opcode, length
 
 
-class Within:
+class BoundedFile:
     """A file that is asked for no more than it has: Python reserves what is asked for beforehand."""
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -31,49 +31,52 @@ class Within:
         return self._file.read(left if count < 0 else min(count, left))
 
 
-def records_of(chunk: Any) -> list[Any]:
+def chunk_records(chunk: Any) -> list[Any]:
     """The records in a chunk. Raises what `share.recordings.mcap.file.damage` lists."""
     from mcap.records import Chunk
     from mcap.stream_reader import CRCValidationError, breakup_chunk
 
-    data = _unpacked(chunk)
-    if chunk.uncompressed_crc and (found := zlib.crc32(data)) != chunk.uncompressed_crc:
-        raise CRCValidationError(chunk.uncompressed_crc, found, chunk)
+    data = _decompress(chunk)
+    if chunk.uncompressed_crc and (crc := zlib.crc32(data)) != chunk.uncompressed_crc:
+        raise CRCValidationError(chunk.uncompressed_crc, crc, chunk)
     plain = Chunk("", data, chunk.message_end_time, chunk.message_start_time, 0, len(data))
     return list(breakup_chunk(plain))
 
 
-def _unpacked(chunk: Any) -> bytes:
+def _decompress(chunk: Any) -> bytes:
     """Of the size that the chunk says, and no byte more while it is unpacked."""
     from mcap.exceptions import McapError, UnsupportedCompressionError
 
-    said = chunk.uncompressed_size
-    if said > MOST_CHUNK:
-        raise McapError(f"a chunk of {said / MB:,.0f} MB, more than {MOST_CHUNK / MB:g}")
+    declared_size = chunk.uncompressed_size
+    if declared_size > MAX_CHUNK_BYTES:
+        raise McapError(f"a chunk of {declared_size / MB:,.0f} MB, more than {MAX_CHUNK_BYTES / MB:g}")
     match chunk.compression:
         case "zstd":
-            data = _zstd(chunk.data, said)
+            data = _decompress_zstd(chunk.data, declared_size)
         case "lz4":
             import lz4.frame  # type: ignore[import-untyped]
 
-            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=said + 1)
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=declared_size + 1)
         case "":
             data = chunk.data
         case other:
             raise UnsupportedCompressionError(other)
-    if len(data) != said:
-        raise McapError(f"a chunk has not the {said} bytes that it says")
+    if len(data) != declared_size:
+        raise McapError(f"a chunk has not the {declared_size} bytes that it says")
     return data
 
 
-def _zstd(data: bytes, said: int) -> bytes:
+def _decompress_zstd(data: bytes, declared_size: int) -> bytes:
     import zstandard
     from mcap.exceptions import McapError
 
     head = zstandard.get_frame_parameters(data)
-    if head.content_size not in (said, zstandard.CONTENTSIZE_UNKNOWN) or head.window_size > 1 << _MOST_WINDOW:
-        raise McapError(f"a chunk of {said} bytes says inside that it has {head.content_size}")
-    return zstandard.ZstdDecompressor().decompress(data, max_output_size=said + 1)
+    if (
+        head.content_size not in (declared_size, zstandard.CONTENTSIZE_UNKNOWN)
+        or head.window_size > 1 << _MAX_WINDOW_LOG2
+    ):
+        raise McapError(f"a chunk of {declared_size} bytes says inside that it has {head.content_size}")
+    return zstandard.ZstdDecompressor().decompress(data, max_output_size=declared_size + 1)
 
 
 def read_summary(file: IO[bytes]) -> Any | None:
@@ -92,8 +95,8 @@ def read_summary(file: IO[bytes]) -> Any | None:
     if footer.summary_start == 0:
         return None
     file.seek(footer.summary_start)
-    summary = _collected(_records(file))
-    _check_places(summary, size)
+    summary = _collect_summary(_records(file))
+    _check_index_offsets(summary, size)
     return summary
 
 
@@ -101,10 +104,10 @@ def _records(file: IO[bytes]) -> Any:
     """From where `file` is, chunks as they are."""
     from mcap.stream_reader import StreamReader
 
-    return StreamReader(Within(file), skip_magic=True, emit_chunks=True, record_size_limit=2**30).records
+    return StreamReader(BoundedFile(file), skip_magic=True, emit_chunks=True, record_size_limit=2**30).records
 
 
-def _collected(records: Any) -> Any:
+def _collect_summary(records: Any) -> Any:
     from mcap import records as kinds
     from mcap.summary import Summary
 
@@ -124,7 +127,7 @@ def _collected(records: Any) -> Any:
     return summary
 
 
-def _check_places(summary: Any, size: int) -> None:
+def _check_index_offsets(summary: Any, size: int) -> None:
     """So that reading all of it is reading the file once."""
     from mcap.exceptions import McapError
 
@@ -133,7 +136,7 @@ def _check_places(summary: Any, size: int) -> None:
         index = chunk.chunk_start_offset + chunk.chunk_length
         after = index + chunk.message_index_length
         offsets = chunk.message_index_offsets
-        if chunk.chunk_start_offset < end or after > size or chunk.chunk_length < _RECORD:
+        if chunk.chunk_start_offset < end or after > size or chunk.chunk_length < _RECORD_HEAD_BYTES:
             raise McapError("its index leads out of the file, or to one chunk twice")
         if (
             any(not index <= offset < after for offset in offsets.values())

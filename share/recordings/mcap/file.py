@@ -14,8 +14,8 @@ import numpy as np
 
 from share.errors import DataError, UsageError
 from share.files.reading import open_regular
-from share.recordings.losses import Losses
-from share.recordings.mcap.chunks import MOST_HELD, Within, read_summary, records_of
+from share.recordings.losses import DataLosses
+from share.recordings.mcap.chunks import MAX_HELD_BYTES, BoundedFile, chunk_records, read_summary
 from share.types import I64
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -32,7 +32,7 @@ class Topic(NamedTuple):
     channels: tuple[int, ...]
 
 
-def damage() -> tuple[type[Exception], ...]:
+def damage_errors() -> tuple[type[Exception], ...]:
     """What the mcap library raises on a damaged file, and the system on a damaged disk."""
     import zstandard
     from mcap.exceptions import McapError
@@ -65,14 +65,14 @@ class McapFile:
     @cached_property
     def topics(self) -> dict[str, Topic]:
         """By name; only those in CDR."""
-        found: dict[str, Topic] = {}
+        topics: dict[str, Topic] = {}
         for channel in self._summary.channels.values():
             schema = self._summary.schemas.get(channel.schema_id)
             if channel.message_encoding == "cdr" and schema is not None:
-                known = found.get(channel.topic)
+                known = topics.get(channel.topic)
                 ids = (*known.channels, channel.id) if known else (channel.id,)
-                found[channel.topic] = Topic(channel.topic, schema.name, ids)
-        return found
+                topics[channel.topic] = Topic(channel.topic, schema.name, ids)
+        return topics
 
     @cached_property
     def log_times(self) -> dict[str, I64]:
@@ -84,7 +84,7 @@ class McapFile:
                     per_channel.setdefault(channel, []).append(self._read_index(file, offset))
         return {
             topic.name: np.sort(
-                np.concatenate([t for c in topic.channels for t in per_channel.get(c, [_NONE])])
+                np.concatenate([t for c in topic.channels for t in per_channel.get(c, [_NO_TIMES])])
             )
             for topic in self.topics.values()
         }
@@ -100,19 +100,19 @@ class McapFile:
         from mcap.records import Metadata
 
         places = {index.name: index.offset for index in self._summary.metadata_indexes}
-        found: dict[str, dict[str, str]] = {}
+        records: dict[str, dict[str, str]] = {}
         with open_regular(self.path) as file:
             for name, offset in places.items():
                 file.seek(offset + _RECORD_HEADER.size)
-                found[name] = Metadata.read(ReadDataStream(Within(file))).metadata
-        return found
+                records[name] = Metadata.read(ReadDataStream(BoundedFile(file))).metadata
+        return records
 
     def messages(
         self,
         topics: Iterable[str],
         start_ns: int | None = None,
         end_ns: int | None = None,
-        losses: Losses | None = None,
+        losses: DataLosses | None = None,
     ) -> Iterator[tuple[str, int, bytes]]:
         """(topic, log time, CDR bytes) in order of log time, within [start_ns, end_ns). losses: takes chunks
         that are damaged. Raises DataError where that is not given, or more than 5 % are."""
@@ -121,26 +121,28 @@ class McapFile:
         waiting: list[tuple[int, int, int, Any]] = [  # by time, then where it stands in the file
             (chunk.message_start_time, chunk.chunk_start_offset, -1, chunk)
             for chunk in self._summary.chunk_indexes
-            if chunk.message_end_time >= lo and chunk.message_start_time < hi and _has(chunk, channels)
+            if chunk.message_end_time >= lo
+            and chunk.message_start_time < hi
+            and _may_have_messages(chunk, channels)
         ]
         heapq.heapify(waiting)
-        total, held = len(waiting), 0
+        total, held_bytes = len(waiting), 0
         with open_regular(self.path) as file:
             while waiting:
                 at_ns, place, number, item = heapq.heappop(waiting)
                 if number >= 0:
-                    held -= len(item.data)
+                    held_bytes -= len(item.data)
                     yield channels[item.channel_id], at_ns, item.data
                     continue
-                for k, message in self._chunk(file, item, losses, total):
+                for k, message in self._chunk_messages(file, item, losses, total):
                     if message.channel_id in channels and lo <= message.log_time < hi:
-                        held += len(message.data)
+                        held_bytes += len(message.data)
                         heapq.heappush(waiting, (message.log_time, place, k, message))
-                if held > MOST_HELD:
-                    raise self._broken("too many of its chunks are of one time")
+                if held_bytes > MAX_HELD_BYTES:
+                    raise self._damaged_error("too many of its chunks are of one time")
 
-    def _chunk(
-        self, file: IO[bytes], index: Any, losses: Losses | None, total: int
+    def _chunk_messages(
+        self, file: IO[bytes], index: Any, losses: DataLosses | None, total: int
     ) -> Iterator[tuple[int, Any]]:
         """Messages of a chunk and their places in it."""
         from mcap.data_stream import ReadDataStream
@@ -148,12 +150,12 @@ class McapFile:
 
         try:
             file.seek(index.chunk_start_offset + _RECORD_HEADER.size)
-            records = records_of(Chunk.read(ReadDataStream(Within(file))))
-        except damage() as error:
-            broken = self._broken(str(error) or type(error).__name__)
+            records = chunk_records(Chunk.read(ReadDataStream(BoundedFile(file))))
+        except damage_errors() as error:
+            damaged = self._damaged_error(str(error) or type(error).__name__)
             if losses is None:
-                raise broken from None
-            losses.add(what := f"chunks of {self.path}", str(index.chunk_start_offset), str(broken))
+                raise damaged from None
+            losses.add(what := f"chunks of {self.path}", str(index.chunk_start_offset), str(damaged))
             losses.check(what, total)
             return
         yield from ((k, record) for k, record in enumerate(records) if isinstance(record, Message))
@@ -163,15 +165,15 @@ class McapFile:
         with open_regular(self.path) as file:
             try:
                 return read_summary(file)
-            except damage():  # OSError: it is shorter than a footer
-                raise self._broken("it has no end") from None
+            except damage_errors():  # OSError: it is shorter than a footer
+                raise self._damaged_error("it has no end") from None
 
     def _check_index(self) -> None:
         summary = self._summary
         if summary is None or (not summary.chunk_indexes and _message_count(summary) != 0):
-            raise self._broken("it has no index")
+            raise self._damaged_error("it has no index")
 
-    def _broken(self, reason: str) -> DataError:
+    def _damaged_error(self, reason: str) -> DataError:
         return DataError(
             f"{self.path}: is damaged or was not closed in good order ({reason}); "
             f"try `share dataset recover {self.path} --out GOOD.mcap`"
@@ -185,17 +187,17 @@ class McapFile:
             opcode, _ = _RECORD_HEADER.unpack_from(head)
             _, size = _INDEX_HEADER.unpack_from(head, _RECORD_HEADER.size)
         except struct.error:
-            raise self._broken("its index ends too soon") from None
-        data = Within(file).read(size)
+            raise self._damaged_error("its index ends too soon") from None
+        data = BoundedFile(file).read(size)
         if opcode != _MESSAGE_INDEX or len(data) != size or size % 16:
-            raise self._broken("its index is wrong")
+            raise self._damaged_error("its index is wrong")
         return np.frombuffer(data, "<i8").reshape(-1, 2)[:, 0].astype(np.int64)
 
 
-_NONE = np.zeros(0, np.int64)
+_NO_TIMES = np.zeros(0, np.int64)
 
 
-def _has(chunk: Any, channels: Mapping[int, str]) -> bool:
+def _may_have_messages(chunk: Any, channels: Mapping[int, str]) -> bool:
     """Whether a chunk may have messages of these; one without an index may have any."""
     return not chunk.message_index_offsets or any(id in channels for id in chunk.message_index_offsets)
 

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from share.errors import DataError
 from share.geometry.camera import Camera
-from share.recordings.images import EncodedImage, check_said, depth_metres, image_format
-from share.recordings.mcap import types as ros
+from share.recordings.images import EncodedImage, check_header_size, depth_metres, image_format
+from share.recordings.mcap import ros_messages as ros
 from share.types import F32
 
 MILLIMETRES = 1000.0  # 16UC1 depth is in mm, 32FC1 in m: ROS REP 118
 _CONFIG_HEADER = 12  # bytes of compressed_depth_image_transport's ConfigHeader before the PNG
-_FAR_M = 1e4  # m; no depth camera reads as far
+_MAX_DEPTH_M = 1e4  # m; no depth camera reads as far
 _TO_GRAY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
     "8UC3": cv2.COLOR_BGR2GRAY,
@@ -40,8 +40,8 @@ class RawImage:
     is_depth: bool
 
     def load(self) -> NDArray[Any]:
-        said, camera = self.message, self.camera
-        check_said(said.width, said.height, camera.width, camera.height, self.where)
+        message, camera = self.message, self.camera
+        check_header_size(message.width, message.height, camera.width, camera.height, self.where)
         return self._depth() if self.is_depth else self._gray()
 
     def _gray(self) -> NDArray[Any]:
@@ -67,7 +67,7 @@ class RawImage:
         if encoding != "32FC1":
             return depth_metres(pixels.astype(np.uint16), MILLIMETRES, self.where)
         metres = pixels.astype(np.float32)
-        return np.where((metres > 0) & (metres < _FAR_M), metres, np.float32(0))
+        return np.where((metres > 0) & (metres < _MAX_DEPTH_M), metres, np.float32(0))
 
     def _pixels(self, dtype: str, channels: int) -> NDArray[Any]:
         """(H, W, channels) without the padding at the end of rows. DataError if data is missing."""
@@ -80,7 +80,7 @@ class RawImage:
         return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
 
 
-def from_compressed(message: Any, where: str, camera: Camera, is_depth: bool) -> EncodedImage:
+def decode_compressed(message: Any, where: str, camera: Camera, is_depth: bool) -> EncodedImage:
     """A `CompressedImage`: JPEG or PNG; depth is a PNG, behind a header where its format says so."""
     data = message.data.tobytes()
     if is_depth:
@@ -91,22 +91,22 @@ def from_compressed(message: Any, where: str, camera: Camera, is_depth: bool) ->
     return EncodedImage(data, where, camera.width, camera.height, MILLIMETRES if is_depth else 0.0)
 
 
-def to_compressed(header: Any, data: bytes, is_depth: bool) -> Any:
+def encode_compressed(header: Any, data: bytes, is_depth: bool) -> Any:
     """JPEG or PNG bytes as they are. A 16-bit PNG of depth in mm gets image_transport's header."""
     kind = "png" if image_format(data) == "png" else "jpeg"
     if is_depth:
         data, kind = bytes(_CONFIG_HEADER) + data, "16UC1; compressedDepth png"
-    return ros.make(ros.COMPRESSED, header=header, format=kind, data=np.frombuffer(data, np.uint8))
+    return ros.make_message(ros.COMPRESSED, header=header, format=kind, data=np.frombuffer(data, np.uint8))
 
 
-def to_raw(header: Any, image: NDArray[Any]) -> Any:
+def encode_raw(header: Any, image: NDArray[Any]) -> Any:
     """(H, W) uint8 -> mono8; float32 m -> 16UC1 in mm where that loses nothing, else 32FC1."""
     if image.dtype == np.uint8:
         encoding = "mono8"
     else:
         encoding, image = _depth_encoding(image)
     image = np.ascontiguousarray(image)
-    return ros.make(
+    return ros.make_message(
         ros.IMAGE,
         header=header,
         height=image.shape[0],

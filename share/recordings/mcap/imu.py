@@ -9,8 +9,8 @@ from itertools import islice
 import numpy as np
 
 from share.errors import DataError
-from share.recordings.losses import Losses
-from share.recordings.mcap import types as ros
+from share.recordings.losses import DataLosses
+from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.file import McapFile
 from share.recordings.mcap.reader import guess_topic
 from share.sensors.measurement import IMU
@@ -20,63 +20,63 @@ from share.types import F64, I64
 _LITTLE_ENDIAN = 1  # in byte 1 of the encapsulation header (OMG DDSI-RTPS 10.2)
 _NUMBERS = 4 + 9 + 3 + 9 + 3 + 9  # doubles: orientation, rate, force, each with its covariance
 _RATE, _FORCE = slice(13, 16), slice(25, 28)
-_BATCH = 20_000
-_LOST = "IMU messages"
+_BATCH_MESSAGES = 20_000
+_LOSS_KIND = "IMU messages"
 
 
-def read_imu(file: McapFile, told: Callable[[int, int], None], losses: Losses) -> tuple[I64, F64]:
+def read_imu(file: McapFile, progress: Callable[[int, int], None], losses: DataLosses) -> tuple[I64, F64]:
     """Stamps (N,) ns, unwrapped, in the order of the log, and values (N, 6): rad/s, m/s^2. told: samples
     read, of how many. Raises DataError where there are none, or more than 5 % cannot be read."""
-    having = [n for n, t in file.topics.items() if t.kind == ros.IMU_MSG and len(file.log_times[n])]
-    topic = guess_topic(IMU, having)
+    imu_topics = [n for n, t in file.topics.items() if t.kind == ros.IMU_MSG and len(file.log_times[n])]
+    topic = guess_topic(IMU, imu_topics)
     if topic is None:
         raise DataError(f"{file.path}: has no IMU samples; its topics: {', '.join(file.topics) or 'none'}")
     total, stamps, values = len(file.log_times[topic]), [], []
     messages = (data for _, _, data in file.messages([topic], losses=losses))
     for batch in _batches(messages):
-        one, numbers = _unpacked(_readable(batch, f"{file.path}: {topic}", losses))
+        one, numbers = _parse_batch(_intact_messages(batch, f"{file.path}: {topic}", losses))
         stamps.append(one)
         values.append(numbers)
-        told(sum(map(len, stamps)), total)
-    losses.check(_LOST, total)
+        progress(sum(map(len, stamps)), total)
+    losses.check(_LOSS_KIND, total)
     if not stamps:
         raise DataError(f"{file.path}: {topic}: has no sample that can be read")
-    return unwrapped(np.concatenate(stamps)), np.concatenate(values)
+    return unwrap_stamps(np.concatenate(stamps)), np.concatenate(values)
 
 
-def unwrapped(stamps_ns: I64) -> I64:
+def unwrap_stamps(stamps_ns: I64) -> I64:
     """Stamps of a D4xx's counter, which begins anew every 71 minutes, as one time."""
     back = np.diff(stamps_ns, prepend=stamps_ns[:1]) < -WRAP_NS // 2
     return np.asarray(stamps_ns + WRAP_NS * np.cumsum(back), np.int64)
 
 
 def _batches(messages: Iterator[bytes]) -> Iterator[list[bytes]]:
-    while batch := list(islice(messages, _BATCH)):
+    while batch := list(islice(messages, _BATCH_MESSAGES)):
         yield batch
 
 
-def _readable(batch: list[bytes], where: str, losses: Losses) -> list[bytes]:
+def _intact_messages(batch: list[bytes], where: str, losses: DataLosses) -> list[bytes]:
     """Those that are sensor_msgs/Imu in little-endian CDR: stamp first, then the frame's name, of any length,
     then doubles to the end."""
-    good = [
+    intact = [
         data
         for data in batch
-        if len(data) >= 16 and data[1] & 1 == _LITTLE_ENDIAN and len(data) == _size(data)
+        if len(data) >= 16 and data[1] & 1 == _LITTLE_ENDIAN and len(data) == _expected_size(data)
     ]
-    for _ in range(len(batch) - len(good)):
-        why = f"{where}: a message is no sensor_msgs/Imu in little-endian CDR; record it anew"
-        losses.add(_LOST, f"{losses.counts.get(_LOST)}", why)
-    return good
+    for _ in range(len(batch) - len(intact)):
+        reason = f"{where}: a message is no sensor_msgs/Imu in little-endian CDR; record it anew"
+        losses.add(_LOSS_KIND, f"{losses.counts.get(_LOSS_KIND)}", reason)
+    return intact
 
 
-def _unpacked(batch: list[bytes]) -> tuple[I64, F64]:
+def _parse_batch(batch: list[bytes]) -> tuple[I64, F64]:
     heads = np.frombuffer(b"".join(data[4:12] for data in batch), "<u4").reshape(-1, 2).astype(np.int64)
     tails = np.frombuffer(b"".join(data[-8 * _NUMBERS :] for data in batch), "<f8").reshape(-1, _NUMBERS)
     values = np.concatenate([tails[:, _RATE], tails[:, _FORCE]], axis=1)
     return heads[:, 0] * 10**9 + heads[:, 1], values
 
 
-def _size(data: bytes) -> int:
+def _expected_size(data: bytes) -> int:
     """Of a message whose frame's name is as long as it says; doubles begin at a multiple of 8."""
     name_end = 12 + int.from_bytes(data[12:16], "little")
     return 4 + -(-name_end // 8) * 8 + 8 * _NUMBERS

@@ -18,25 +18,25 @@ import numpy as np
 from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.recordings.calibration import Calibration, said_of
-from share.recordings.losses import Losses
+from share.recordings.calibration import Calibration, config_errors
+from share.recordings.device_match import device_mismatch
+from share.recordings.losses import DataLosses
 from share.recordings.mcap import images as ros_images
 from share.recordings.mcap import rig as ros_rig
-from share.recordings.mcap import types as ros
-from share.recordings.mcap.file import McapFile, damage
-from share.recordings.recording import Source, Span, span_of
+from share.recordings.mcap import ros_messages as ros
+from share.recordings.mcap.file import McapFile, damage_errors
+from share.recordings.recording import Source, Span, select_span
 from share.recordings.trajectory import Trajectory, read_tum
-from share.recordings.unit import of_another
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, STREAMS, Measurement
 from share.types import F64, I64
 
-_IMAGES = (ros.IMAGE, ros.COMPRESSED)
-_NAMES = {  # parts of a topic's name; earlier ones are better
+_IMAGE_TYPES = (ros.IMAGE, ros.COMPRESSED)
+_TOPIC_HINTS = {  # parts of a topic's name; earlier ones are better
     CAM0: ("/cam0/", "/infra1/", "/left/", "/color/", "/rgb/", "/camera/image"),
     CAM1: ("/cam1/", "/infra2/", "/right/"),
     DEPTH: ("/depth/", "depth_to_color/", "depth_registered/"),
 }
-_SKEW_NS = 2 * 10**9  # log times and header stamps of a part that is read differ by less
+_MAX_SKEW_NS = 2 * 10**9  # log times and header stamps of a part that is read differ by less
 
 
 def open_mcap(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
@@ -61,18 +61,18 @@ class McapSource(Source):
         rig = calibration.rig if calibration else own
         if rig is None:
             raise ConfigError(f"{file.path}: carries no calibration; give one with --calib")
-        shown = rig if calibration else _seen(rig, topics)
-        self.name, self.rig = file.path.stem, _fit(shown, topics, file.path)
+        recorded_rig = rig if calibration else _recorded_rig(rig, topics)
+        self.name, self.rig = file.path.stem, _fit_rig(recorded_rig, topics, file.path)
         self._file, self._own, self.serial = file, own, own_serial(file)
-        self.losses = Losses()
-        cameras = ros_rig.cameras(self.rig)
+        self.losses = DataLosses()
+        cameras = ros_rig.rig_cameras(self.rig)
         used = {s for s in topics if s in cameras or (s == IMU and self.rig.imu)}
         self._topics = {s: topics[s] for s in used}
         self.notes = tuple(
             f"{topics[s]} is not used: the calibration has no {s}" for s in topics if s not in used
-        ) + tuple(f"has no images of {s}: done without" for s in ros_rig.cameras(rig) if s not in cameras)
-        if calibration and (wrong := of_another(calibration.serials, self.serial)):
-            self.notes += (wrong,)
+        ) + tuple(f"has no images of {s}: done without" for s in ros_rig.rig_cameras(rig) if s not in cameras)
+        if calibration and (warning := device_mismatch(calibration.serials, self.serial)):
+            self.notes += (warning,)
         self._span = self._find_span(frames)
 
     def stamps(self) -> dict[str, I64]:
@@ -86,17 +86,17 @@ class McapSource(Source):
     def measurements(self) -> Iterator[Measurement]:
         streams = {topic: stream for stream, topic in self._topics.items()}
         kinds = {topic: self._file.topics[topic].kind for topic in streams}
-        cameras = ros_rig.cameras(self.rig)
+        cameras = ros_rig.rig_cameras(self.rig)
         for topic, log_ns, data in self._file.messages(streams, *self._log_range, losses=self.losses):
             stream = streams[topic]
             try:
-                message = _decoded(self._file, data, kinds[topic], topic)
+                message = _decode(self._file, data, kinds[topic], topic)
                 stamp = ros.stamp_of(message)
                 lo, hi = self._span.limits(stream)
                 if not lo < stamp <= hi:
                     continue
                 payload = (
-                    _imu(message, f"{self._file.path}: {topic} at {stamp}")
+                    _imu_values(message, f"{self._file.path}: {topic} at {stamp}")
                     if stream == IMU
                     else self._image(message, topic, stamp, cameras[stream], stream)
                 )
@@ -131,10 +131,10 @@ class McapSource(Source):
             min(self._span.imu_from, self._span.image_from),
             max(self._span.imu_to, self._span.image_to),
         )
-        ever = 2**62
+        unbounded = 2**62
         return (
-            None if first <= -ever else max(0, first - _SKEW_NS),
-            None if last >= ever else last + _SKEW_NS,
+            None if first <= -unbounded else max(0, first - _MAX_SKEW_NS),
+            None if last >= unbounded else last + _MAX_SKEW_NS,
         )
 
     def _find_span(self, frames: slice | None) -> Span:
@@ -142,7 +142,7 @@ class McapSource(Source):
         if len(times) == 0:
             raise DataError(f"{self._file.path}: {self._topics[CAM0]} has no images")
         stamps = times if frames is None else self._header_stamps()
-        return span_of(stamps, frames, str(self._file.path), self.rig.timeshift_ns)
+        return select_span(stamps, frames, str(self._file.path), self.rig.timeshift_ns)
 
     def _header_stamps(self) -> I64:
         """Of cam0; one pass over its messages that decodes nothing but the stamp."""
@@ -154,7 +154,7 @@ class McapSource(Source):
     def _image(self, message: Any, topic: str, stamp: int, camera: Camera, stream: str) -> Any:
         where, is_depth = f"{self._file.path}: {topic} at {stamp}", stream == DEPTH
         if self._file.topics[topic].kind == ros.COMPRESSED:
-            return ros_images.from_compressed(message, where, camera, is_depth)
+            return ros_images.decode_compressed(message, where, camera, is_depth)
         return ros_images.RawImage(message, where, camera, is_depth)
 
 
@@ -164,25 +164,27 @@ def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
     Raises ConfigError if a named topic is missing, or if there is no cam0.
     """
     topics = {name: topic.kind for name, topic in file.topics.items() if len(file.log_times[name])}
-    found = {}
+    by_stream = {}
     for stream in STREAMS:
-        kinds = (ros.IMU_MSG,) if stream == IMU else _IMAGES
+        kinds = (ros.IMU_MSG,) if stream == IMU else _IMAGE_TYPES
         candidates = [name for name, kind in topics.items() if kind in kinds]
         topic = (
-            _named(named[stream], candidates, file) if stream in named else guess_topic(stream, candidates)
+            _named_topic(named[stream], candidates, file)
+            if stream in named
+            else guess_topic(stream, candidates)
         )
         if topic:
-            found[stream] = topic
-    if CAM0 not in found:
-        images = [name for name, kind in topics.items() if kind in _IMAGES]
+            by_stream[stream] = topic
+    if CAM0 not in by_stream:
+        images = [name for name, kind in topics.items() if kind in _IMAGE_TYPES]
         raise ConfigError(
             f"{file.path}: no topic is known to be cam0 (image topics: {', '.join(images) or 'none'}); "
             "name it as `rostopic` in a camchain file and give that with --calib"
         )
-    return found
+    return by_stream
 
 
-def _named(name: str, candidates: list[str], file: McapFile) -> str:
+def _named_topic(name: str, candidates: list[str], file: McapFile) -> str:
     for topic in (name, *(name + suffix for suffix in ros.SUFFIXES)):
         if topic in candidates:
             return topic
@@ -197,35 +199,35 @@ def guess_topic(stream: str, candidates: list[str]) -> str | None:
         )
     depth = [name for name in candidates if "depth" in name]
     pool = depth if stream == DEPTH else [name for name in candidates if name not in depth]
-    for hint in _NAMES[stream]:
-        having = [name for name in pool if hint in name + "/"]
-        if having:
-            return min(having, key=lambda name: (len(name), name))
+    for hint in _TOPIC_HINTS[stream]:
+        matching = [name for name in pool if hint in name + "/"]
+        if matching:
+            return min(matching, key=lambda name: (len(name), name))
     return None
 
 
 def own_rig(file: McapFile, topics: dict[str, str], needed: bool) -> Rig | None:
     """The rig that the recording carries in our record, else (if `needed`) in CameraInfo, else None."""
-    record = _record(file)
+    record = _rig_record(file)
     if "rig" in record:
-        return ros_rig.from_json(record["rig"], str(file.path))
-    return _rig_of_messages(file, topics) if needed else None
+        return ros_rig.rig_from_json(record["rig"], str(file.path))
+    return _rig_from_messages(file, topics) if needed else None
 
 
 def own_serial(file: McapFile) -> str | None:
     """Of the device, where the recording knows it."""
-    return _record(file).get("serial")
+    return _rig_record(file).get("serial")
 
 
-def _record(file: McapFile) -> dict[str, str]:
+def _rig_record(file: McapFile) -> dict[str, str]:
     """What we wrote of the device; empty where it is another's recording, or damaged."""
     try:
         return file.metadata(ros.RIG_RECORD)
-    except damage():
+    except damage_errors():
         return {}
 
 
-def _rig_of_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
+def _rig_from_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
     """From CameraInfo and /tf_static. An IMU cannot be: no message says how noisy it is."""
     infos: dict[str, Any] = {s: _camera_info(file, topics[s]) for s in (CAM0, CAM1, DEPTH) if s in topics}
     if infos[CAM0] is None:
@@ -239,13 +241,13 @@ def _rig_of_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
     if missing:
         raise ConfigError(f"{file.path}: {missing[0]} has no CameraInfo; give the calibration with --calib")
     where = str(file.path)
-    transforms = (_decoded(file, d, ros.TF, ros.TF_STATIC) for _, _, d in file.messages([ros.TF_STATIC]))
+    transforms = (_decode(file, d, ros.TF, ros.TF_STATIC) for _, _, d in file.messages([ros.TF_STATIC]))
     tree = ros_rig.FrameTree(transforms, where)
     cams = {s: ros_rig.from_camera_info(info, f"{where}: {topics[s]}") for s, info in infos.items()}
     T = {s: tree.find(info.header.frame_id, infos[CAM0].header.frame_id) for s, info in infos.items()}
     if any(pose is None for pose in T.values()):
         raise ConfigError(f"{where}: /tf_static does not say where the cameras sit; give --calib")
-    with said_of(where):
+    with config_errors(where):
         return Rig(cams[CAM0], np.eye(4), cams.get(CAM1), T.get(CAM1), cams.get(DEPTH), T.get(DEPTH))
 
 
@@ -257,23 +259,23 @@ def _camera_info(file: McapFile, topic: str) -> Any | None:
     if name not in file.topics:
         return None
     first = next(file.messages([name]), None)
-    return None if first is None else _decoded(file, first[2], ros.CAMERA_INFO, name)
+    return None if first is None else _decode(file, first[2], ros.CAMERA_INFO, name)
 
 
-def _seen(rig: Rig, topics: dict[str, str]) -> Rig:
+def _recorded_rig(rig: Rig, topics: dict[str, str]) -> Rig:
     """The rig that a recording carries, less a partner of cam0 that a broken camera never delivered, if
     something else that was recorded tells how far things are."""
-    have = [s for s in (CAM1, DEPTH, IMU) if s in topics]
-    if CAM1 not in topics and have:
+    recorded = [s for s in (CAM1, DEPTH, IMU) if s in topics]
+    if CAM1 not in topics and recorded:
         rig = replace(rig, cam1=None, T_cam1_cam0=None)
-    if DEPTH not in topics and have:
+    if DEPTH not in topics and recorded:
         rig = replace(rig, depth=None, T_depth_cam0=None)
     return rig
 
 
-def _fit(rig: Rig, topics: dict[str, str], path: Path) -> Rig:
+def _fit_rig(rig: Rig, topics: dict[str, str], path: Path) -> Rig:
     """The rig, less the IMU where none was recorded. ConfigError if it wants a camera that is missing."""
-    for stream in ros_rig.cameras(rig):
+    for stream in ros_rig.rig_cameras(rig):
         if stream not in topics:
             raise ConfigError(
                 f"{path}: the calibration has {stream}, the recording has not; give another --calib"
@@ -283,7 +285,7 @@ def _fit(rig: Rig, topics: dict[str, str], path: Path) -> Rig:
     return rig
 
 
-def _decoded(file: McapFile, data: bytes, kind: str, topic: str) -> Any:
+def _decode(file: McapFile, data: bytes, kind: str, topic: str) -> Any:
     """Raises DataError."""
     try:
         return ros.decode(data, kind)
@@ -291,7 +293,7 @@ def _decoded(file: McapFile, data: bytes, kind: str, topic: str) -> Any:
         raise DataError(f"{file.path}: {topic}: a message cannot be read ({error})") from None
 
 
-def _imu(message: Any, where: str) -> tuple[float, ...]:
+def _imu_values(message: Any, where: str) -> tuple[float, ...]:
     w, a = message.angular_velocity, message.linear_acceleration
     values = (w.x, w.y, w.z, a.x, a.y, a.z)
     if not math.isfinite(sum(values)):

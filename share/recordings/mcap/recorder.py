@@ -1,6 +1,7 @@
 """Recordings as MCAP with ROS 2 messages: Foxglove, rosbags and ROS 2 open them as they are.
 
-Topics are those of `share.recordings.mcap.types.TOPICS`. The file grows under a temporary name (`.part`) in
+Topics are those of `share.recordings.mcap.ros_messages.TOPICS`. The file grows under a temporary name
+(`.part`) in
 chunks of at most 256 kB (or one image), and gets its name when it is closed in good order. What a
 crash leaves in the `.part`, `share.recordings.mcap.recover` brings back.
 """
@@ -16,17 +17,17 @@ from typing import Any
 import numpy as np
 
 from share.errors import DataError, UsageError
-from share.files.writing import check_replaceable, fresh, sync_folder, writing
+from share.files.writing import check_replaceable, open_new, sync_folder, write_errors
 from share.geometry.camera import Rig
 from share.recordings.images import EncodedImage, encode_jpeg
 from share.recordings.mcap import images as ros_images
 from share.recordings.mcap import rig as ros_rig
-from share.recordings.mcap import types as ros
+from share.recordings.mcap import ros_messages as ros
 from share.sensors.measurement import DEPTH, IMU, Measurement
 from share.types import F64
 
 CHUNK_BYTES = 256 * 1024
-_FLUSH_NS = 10**9  # a crash costs at most this much
+_FLUSH_PERIOD_NS = 10**9  # a crash costs at most this much
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"
 _LATCHED = {  # transient local, so that a player hands it to those who come later
     "offered_qos_profiles": "- {history: 1, depth: 1, reliability: 1, durability: 1, "
@@ -35,12 +36,12 @@ _LATCHED = {  # transient local, so that a player hands it to those who come lat
 }
 
 
-def part_of(path: Path) -> Path:
+def part_path(path: Path) -> Path:
     """The name under which the recording `path` grows."""
     return path.with_name(path.name + ".part")
 
 
-def left_over(part: Path) -> UsageError:
+def leftover_error(part: Path) -> UsageError:
     """For who would overwrite the `.part` of another recording."""
     return UsageError(
         f"{part}: is left of a recording that was cut off (or one is going on there); save it with "
@@ -66,18 +67,18 @@ class Recorder:
     ) -> None:
         from mcap.writer import Writer
 
-        self.path, self.part = check_replaceable(path), part_of(path)
+        self.path, self.part = check_replaceable(path), part_path(path)
         self._rig, self._jpeg, self._durable = rig, jpeg, durable
         try:
-            self._file = self.part.open("xb") if durable else fresh(self.part)
+            self._file = self.part.open("xb") if durable else open_new(self.part)
         except FileExistsError:
-            raise left_over(self.part) from None
+            raise leftover_error(self.part) from None
         except OSError as error:
             raise UsageError(f"{self.part}: cannot be written: {error.strerror}") from None
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
         self._writer.start(profile="ros2", library="share")
-        about = {"rig": ros_rig.to_json(rig), "schema": "1"} | ({"serial": serial} if serial else {})
-        self._writer.add_metadata(ros.RIG_RECORD, about)
+        metadata = {"rig": ros_rig.rig_to_json(rig), "schema": "1"} | ({"serial": serial} if serial else {})
+        self._writer.add_metadata(ros.RIG_RECORD, metadata)
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._counts: dict[str, int] = {}
@@ -91,19 +92,19 @@ class Recorder:
         self._log_ns = stamp if log_ns is None else log_ns
         if not 0 <= stamp < 2**31 * 10**9:
             raise DataError(f"{self.path}: stamp {stamp} ns does not fit a ROS 2 message")
-        with writing(self.path):
+        with write_errors(self.path):
             if self._flushed_ns is None:
                 self._write_rig(stamp)
             if measurement.stream == IMU:
-                self._put(ros.TOPICS[IMU], _imu(stamp, measurement.payload))
+                self._write_message(ros.TOPICS[IMU], _imu_message(stamp, measurement.payload))
             else:
-                self._image(measurement.stream, stamp, measurement.payload)
-            if self._flushed_ns is None or self._log_ns - self._flushed_ns >= _FLUSH_NS:
+                self._write_image(measurement.stream, stamp, measurement.payload)
+            if self._flushed_ns is None or self._log_ns - self._flushed_ns >= _FLUSH_PERIOD_NS:
                 self._flush(self._log_ns)
 
     def close(self) -> None:
         """Finish the file and give it its name."""
-        with writing(self.path):
+        with write_errors(self.path):
             self._writer.finish()
             self._file.flush()
             os.fsync(self._file.fileno())
@@ -129,16 +130,16 @@ class Recorder:
         else:
             self.abort()
 
-    def _image(self, stream: str, stamp: int, image: Any) -> None:
-        header, is_depth, topic = ros.header(stamp, stream), stream == DEPTH, ros.TOPICS[stream]
-        data = self._encoded(image, is_depth)
+    def _write_image(self, stream: str, stamp: int, image: Any) -> None:
+        header, is_depth, topic = ros.make_header(stamp, stream), stream == DEPTH, ros.TOPICS[stream]
+        data = self._encode(image, is_depth)
         if data is None:
-            self._put(topic, ros_images.to_raw(header, image.load()))
+            self._write_message(topic, ros_images.encode_raw(header, image.load()))
         else:
             suffix = ros.SUFFIXES[is_depth]
-            self._put(topic + suffix, ros_images.to_compressed(header, data, is_depth))
+            self._write_message(topic + suffix, ros_images.encode_compressed(header, data, is_depth))
 
-    def _encoded(self, image: Any, is_depth: bool) -> bytes | None:
+    def _encode(self, image: Any, is_depth: bool) -> bytes | None:
         """Bytes that can be written as they are, or None where the pixels must be written raw."""
         if is_depth:
             mm = isinstance(image, EncodedImage) and image.depth_scale == ros_images.MILLIMETRES
@@ -148,22 +149,24 @@ class Recorder:
         return image.read() if isinstance(image, EncodedImage) else None
 
     def _write_rig(self, stamp: int) -> None:
-        for stream, camera in ros_rig.cameras(self._rig).items():
-            info = ros_rig.to_camera_info(camera, ros.header(stamp, stream))
-            self._put(ros.INFO_TOPICS[stream], info)
-        self._put(ros.TF_STATIC, ros_rig.to_tf(self._rig, stamp), _LATCHED)
+        for stream, camera in ros_rig.rig_cameras(self._rig).items():
+            info = ros_rig.to_camera_info(camera, ros.make_header(stamp, stream))
+            self._write_message(ros.INFO_TOPICS[stream], info)
+        self._write_message(ros.TF_STATIC, ros_rig.to_tf(self._rig, stamp), _LATCHED)
 
-    def _put(self, topic: str, message: Any, metadata: dict[str, str] | None = None) -> None:
+    def _write_message(self, topic: str, message: Any, metadata: dict[str, str] | None = None) -> None:
         if topic not in self._channels:
             kind = message.__msgtype__
             if kind not in self._schemas:
-                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", ros.schema(kind))
+                self._schemas[kind] = self._writer.register_schema(
+                    kind, "ros2msg", ros.message_definition(kind)
+                )
             self._channels[topic] = self._writer.register_channel(
                 topic, "cdr", self._schemas[kind], metadata or {}
             )
         number = self._counts[topic] = self._counts.get(topic, 0) + 1
-        at = self._log_ns
-        self._writer.add_message(self._channels[topic], at, ros.encode(message), at, number)
+        log_ns = self._log_ns
+        self._writer.add_message(self._channels[topic], log_ns, ros.encode(message), log_ns, number)
 
     def _flush(self, stamp: int) -> None:
         self._flushed_ns = stamp
@@ -172,19 +175,19 @@ class Recorder:
             os.fdatasync(self._file.fileno())
 
 
-_UNKNOWN = np.zeros(9)
+_UNKNOWN_COVARIANCE = np.zeros(9)
 _NO_ORIENTATION = np.array([-1.0, *[0.0] * 8])  # sensor_msgs/Imu: -1 says that there is none
 
 
-def _imu(stamp: int, sample: F64) -> Any:
+def _imu_message(stamp: int, sample: F64) -> Any:
     wx, wy, wz, ax, ay, az = (float(value) for value in sample)
-    return ros.make(
+    return ros.make_message(
         ros.IMU_MSG,
-        header=ros.header(stamp, ros_rig.BODY),
-        orientation=ros.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        header=ros.make_header(stamp, ros_rig.BODY),
+        orientation=ros.make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=_NO_ORIENTATION,
-        angular_velocity=ros.make("geometry_msgs/msg/Vector3", x=wx, y=wy, z=wz),
-        angular_velocity_covariance=_UNKNOWN,
-        linear_acceleration=ros.make("geometry_msgs/msg/Vector3", x=ax, y=ay, z=az),
-        linear_acceleration_covariance=_UNKNOWN,
+        angular_velocity=ros.make_message("geometry_msgs/msg/Vector3", x=wx, y=wy, z=wz),
+        angular_velocity_covariance=_UNKNOWN_COVARIANCE,
+        linear_acceleration=ros.make_message("geometry_msgs/msg/Vector3", x=ax, y=ay, z=az),
+        linear_acceleration_covariance=_UNKNOWN_COVARIANCE,
     )

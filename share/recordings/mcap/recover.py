@@ -14,8 +14,8 @@ from typing import IO, Any, BinaryIO, NamedTuple
 from share.errors import DataError, UsageError
 from share.files.reading import open_regular
 from share.files.writing import new_file
-from share.recordings.mcap.chunks import Within, records_of
-from share.recordings.mcap.file import check_magic, damage
+from share.recordings.mcap.chunks import BoundedFile, chunk_records
+from share.recordings.mcap.file import check_magic, damage_errors
 
 
 class Recovered(NamedTuple):
@@ -26,7 +26,7 @@ class Recovered(NamedTuple):
     reason: str
 
 
-def recover(path: Path, out: Path, progress: Callable[[int], None] = lambda _: None) -> Recovered:
+def recover_recording(path: Path, out: Path, progress: Callable[[int], None] = lambda _: None) -> Recovered:
     """Copy what is whole from `path` to `out`; `progress` is told how many more bytes are read.
 
     Raises UsageError for paths that cannot be used, DataError if nothing can be saved, ShareError if the disk
@@ -48,9 +48,9 @@ def _copy(file: BinaryIO, target: IO[bytes], progress: Callable[[int], None]) ->
     writer = Writer(target, chunk_size=256 * 1024)
     writer.start(profile="ros2", library="share")
     copier = _Copier(writer)
-    lost, reason = _copy_records(file, copier, progress)
+    lost_bytes, reason = _copy_records(file, copier, progress)
     writer.finish()
-    return Recovered(copier.counts, lost, reason)
+    return Recovered(copier.counts, lost_bytes, reason)
 
 
 def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], None]) -> tuple[int, str]:
@@ -59,27 +59,27 @@ def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], Non
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
-    records = StreamReader(Within(file), emit_chunks=True, record_size_limit=2**30).records
-    lost, reason, good = 0, "", 0
+    records = StreamReader(BoundedFile(file), emit_chunks=True, record_size_limit=2**30).records
+    lost_bytes, reason, intact_end = 0, "", 0
     while True:
         try:
             record = next(records, None)
-        except damage() as error:
-            return lost + os.fstat(file.fileno()).st_size - good, reason or _why(error)
+        except damage_errors() as error:
+            return lost_bytes + os.fstat(file.fileno()).st_size - intact_end, reason or _describe_error(error)
         if record is None:
-            return lost, reason
+            return lost_bytes, reason
         try:
-            for part in records_of(record) if isinstance(record, Chunk) else [record]:
+            for part in chunk_records(record) if isinstance(record, Chunk) else [record]:
                 copier.copy(part)
         except OSError:  # nothing is read here
             raise
-        except damage() as error:
-            lost, reason = lost + file.tell() - good, reason or _why(error)
-        progress(file.tell() - good)
-        good = file.tell()
+        except damage_errors() as error:
+            lost_bytes, reason = lost_bytes + file.tell() - intact_end, reason or _describe_error(error)
+        progress(file.tell() - intact_end)
+        intact_end = file.tell()
 
 
-def _why(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     if isinstance(error, OSError):
         return f"cannot be read any further: {error.strerror}"
     name = type(error).__name__

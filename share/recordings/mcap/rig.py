@@ -18,38 +18,38 @@ from share.files.json_file import parse_json
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.lens import EQUIDISTANT, RADTAN
-from share.recordings.mcap import types as ros
+from share.recordings.mcap import ros_messages as ros
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU
 from share.types import F64
 
 BODY = "body"
-_ROS = {RADTAN: "plumb_bob", EQUIDISTANT: "equidistant"}
-_RADTAN, _FISHEYE = ("plumb_bob", "none", ""), ("equidistant", "fisheye", "kannala_brandt")
+_ROS_MODELS = {RADTAN: "plumb_bob", EQUIDISTANT: "equidistant"}
+_RADTAN_NAMES, _FISHEYE_NAMES = ("plumb_bob", "none", ""), ("equidistant", "fisheye", "kannala_brandt")
 
 
-def cameras(rig: Rig) -> dict[str, Camera]:
+def rig_cameras(rig: Rig) -> dict[str, Camera]:
     """The cameras of a rig by stream."""
     return {k: c for k, c in ((CAM0, rig.cam0), (CAM1, rig.cam1), (DEPTH, rig.depth)) if c}
 
 
-def to_json(rig: Rig) -> str:
+def rig_to_json(rig: Rig) -> str:
     """Every number of the rig, exactly."""
     poses = {k: getattr(rig, k) for k in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0")}
     return json.dumps(
-        {name: _of_camera(camera) for name, camera in cameras(rig).items()}
+        {name: _camera_fields(camera) for name, camera in rig_cameras(rig).items()}
         | {name: T.tolist() for name, T in poses.items() if T is not None}
         | ({"imu": asdict(rig.imu)} if rig.imu else {})
         | ({"timeshift_s": rig.timeshift_s} if rig.timeshift_s else {})
     )
 
 
-def _of_camera(camera: Camera) -> dict[str, Any]:
+def _camera_fields(camera: Camera) -> dict[str, Any]:
     """The model only where it is not what it was when no record told it."""
     return {name: value for name, value in asdict(camera).items() if (name, value) != ("model", RADTAN)}
 
 
-def from_json(text: str, where: str) -> Rig:
-    """The rig that `to_json` wrote. Raises DataError."""
+def rig_from_json(text: str, where: str) -> Rig:
+    """The rig that `rig_to_json` wrote. Raises DataError."""
     try:
         data = parse_json(text)
         for name in (CAM0, CAM1, DEPTH):
@@ -64,18 +64,18 @@ def from_json(text: str, where: str) -> Rig:
 
 def to_camera_info(camera: Camera, header: Any) -> Any:
     D = np.array(camera.distortion or (0.0,) * 5)
-    if not camera.fisheye:  # ROS has five of plumb_bob, four of equidistant
+    if not camera.is_fisheye:  # ROS has five of plumb_bob, four of equidistant
         D = np.pad(D, (0, 5 - len(D)))
     P = np.hstack([camera.K, np.zeros((3, 1))])
-    roi = ros.make(
+    roi = ros.make_message(
         "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
     )
-    return ros.make(
+    return ros.make_message(
         ros.CAMERA_INFO,
         header=header,
         height=camera.height,
         width=camera.width,
-        distortion_model=_ROS[camera.model],
+        distortion_model=_ROS_MODELS[camera.model],
         d=D,
         k=camera.K.reshape(9),
         r=np.eye(3).reshape(9),
@@ -88,10 +88,10 @@ def to_camera_info(camera: Camera, header: Any) -> Any:
 
 def from_camera_info(info: Any, where: str) -> Camera:
     """Raises ConfigError for an uncalibrated camera or a distortion that we do not model."""
-    D, fisheye = tuple(float(d) for d in info.d), info.distortion_model in _FISHEYE
+    D, fisheye = tuple(float(d) for d in info.d), info.distortion_model in _FISHEYE_NAMES
     while len(D) > (4 if fisheye else 5) and D[-1] == 0:
         D = D[:-1]
-    if not fisheye and any(D) and (info.distortion_model not in _RADTAN or len(D) > 5):
+    if not fisheye and any(D) and (info.distortion_model not in _RADTAN_NAMES or len(D) > 5):
         raise ConfigError(
             f"{where}: distortion_model '{info.distortion_model}' is not supported; "
             f"supported: plumb_bob, equidistant, none"
@@ -112,20 +112,20 @@ def to_tf(rig: Rig, stamp_ns: int) -> Any:
     if rig.T_depth_cam0 is not None:
         edges[CAM0, DEPTH] = se3.inverse(rig.T_depth_cam0)
     transforms = [_transform(parent, child, T, stamp_ns) for (parent, child), T in edges.items()]
-    return ros.make(ros.TF, transforms=transforms)
+    return ros.make_message(ros.TF, transforms=transforms)
 
 
 def _transform(parent: str, child: str, T: F64, stamp_ns: int) -> Any:
     x, y, z = T[:3, 3].tolist()
     qx, qy, qz, qw = se3.quat_from_matrix(T[:3, :3]).tolist()
-    return ros.make(
+    return ros.make_message(
         "geometry_msgs/msg/TransformStamped",
-        header=ros.header(stamp_ns, parent),
+        header=ros.make_header(stamp_ns, parent),
         child_frame_id=child,
-        transform=ros.make(
+        transform=ros.make_message(
             "geometry_msgs/msg/Transform",
-            translation=ros.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=ros.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+            translation=ros.make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=ros.make_message("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
         ),
     )
 

@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_edt
 from share.geometry import se3
 from share.lab.emulate.motion import robot, walk
 from share.lab.emulate.motion.floor import Floor
-from share.lab.emulate.motion.together import Ground, Wish, move
+from share.lab.emulate.motion.planned_motion import FloorGraphs, MotionPreferences, plan_motion
 from share.lab.emulate.types import GRAVITY, START_NS
 
 BLOCKS = ((0, 0, 9, 0.6), (0, 5.4, 9, 6), (0, 2, 0.5, 4), (4, 2.6, 5.2, 3.4), (7, 3, 7.5, 3.5))
@@ -29,7 +29,7 @@ def floor(size=(9.0, 6.0), blocks=BLOCKS, step=0.1):
 
 @functools.cache
 def track(look, seed=1, speed=0.9, pauses=2.0):
-    _, found = move(Ground(floor()), Wish(look, speed, pauses), (), SECONDS, (seed,))
+    _, found = plan_motion(FloorGraphs(floor()), MotionPreferences(look, speed, pauses), (), SECONDS, (seed,))
     return found
 
 
@@ -37,12 +37,12 @@ def track(look, seed=1, speed=0.9, pauses=2.0):
 def person(seed=1, speed=0.9, turns=2.6):
     rng = np.random.default_rng(seed)
     things = rng.uniform((0, 0, 0.3), (9, 6, 2.3), (100, 3))
-    return walk.path_of(track("person", seed, speed), 1.7, turns, things, [], START_NS, rng)
+    return walk.headset_path(track("person", seed, speed), 1.7, turns, things, [], START_NS, rng)
 
 
 @functools.cache
 def driver(seed=1, vibration=0.4, speed=0.35):
-    return robot.path_of(track("robot", seed, speed), 0.35, vibration, START_NS, np.random.default_rng(seed))
+    return robot.imu_path(track("robot", seed, speed), 0.35, vibration, START_NS, np.random.default_rng(seed))
 
 
 def every(path, hz, seconds=None):
@@ -68,4 +68,4 @@ def integrated(path, hz, seconds):
     a = np.einsum("nij,nj->ni", R, force(fine)) - (0, 0, GRAVITY)
     v = path.velocity(stamps[:1]) + cumulative_simpson(a, x=fine, axis=0, initial=0)
     p = path.poses(stamps[:1])[:, :3, 3] + cumulative_simpson(v, x=fine, axis=0, initial=0)
-    return se3.compose(R[-1], p[-1])
+    return se3.from_rt(R[-1], p[-1])

@@ -5,11 +5,11 @@ import pytest
 
 from share.errors import UsageError
 from share.geometry import se3
-from share.lab.emulate.motion.board import STILL_S, exercise
-from share.lab.emulate.motion.plan import plan
-from share.lab.emulate.motion.spec import BoardSpec, parse
-from share.lab.emulate.world.scenes import layout
-from share.sensors.profile import profile
+from share.lab.emulate.motion.board import INITIAL_STILL_S, board_path
+from share.lab.emulate.motion.motion_plan import plan_motions
+from share.lab.emulate.motion.spec import BoardSpec, parse_motion
+from share.lab.emulate.world.scenes import make_scene_layout
+from share.sensors.profile import load_profile
 from share.types import AgentKind
 
 SECONDS = 40.0
@@ -17,7 +17,7 @@ SECONDS = 40.0
 
 @pytest.fixture(scope="module")
 def room():
-    return layout("board", 1)
+    return make_scene_layout("board", 1)
 
 
 def stamps(path, hz):
@@ -25,13 +25,13 @@ def stamps(path, hz):
 
 
 def exercised(room, seed=0, **options):
-    return exercise(room, BoardSpec(**options), SECONDS, np.random.default_rng((seed, 5)))
+    return board_path(room, BoardSpec(**options), SECONDS, np.random.default_rng((seed, 5)))
 
 
 def seen(room, path, rig, t):
     """Where both cameras see the corners (2, N, K, 2) px, NaN where they do not, of the IMU's own path."""
     points = se3.transform(room.target.T_world_target, room.target.target.corners)
-    path = path.turned(rig.T_body_cam0[:3, :3].T)
+    path = path.with_axes(rig.T_body_cam0[:3, :3].T)
     out = []
     for camera, T_body_cam in (
         (rig.cam0, rig.T_body_cam0),
@@ -41,7 +41,7 @@ def seen(room, path, rig, t):
         local = np.einsum("nij,kj->nki", T[:, :3, :3], points) + T[:, None, :3, 3]
         px = camera.project(local)
         ahead = np.hypot(*np.moveaxis(local[..., :2], -1, 0)) < 1.2 * local[..., 2]  # the lens model's range
-        px[~(camera.inside(px, 3) & ahead)] = np.nan
+        px[~(camera.is_inside(px, 3) & ahead)] = np.nan
         out.append(px)
     return np.stack(out)
 
@@ -49,7 +49,7 @@ def seen(room, path, rig, t):
 @pytest.mark.parametrize("name", ["d435i", "euroc"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_both_cameras_see_most_of_the_board_everywhere_in_the_image(room, name, seed):
-    rig = profile(name).rig()
+    rig = load_profile(name).rig()
     path = exercised(room, seed)
     px = seen(room, path, rig, stamps(path, 10))
     share = np.isfinite(px[..., 0]).mean(axis=2)
@@ -79,7 +79,7 @@ def test_all_axes_are_excited(room):
 
 def test_it_begins_at_rest(room):
     path = exercised(room)
-    gyro, force = path.inertial(path.start_ns + np.arange(0, round((STILL_S - 0.1) * 1e9), 10**7))
+    gyro, force = path.inertial(path.start_ns + np.arange(0, round((INITIAL_STILL_S - 0.1) * 1e9), 10**7))
     assert np.abs(gyro).max() < 1e-9
     assert np.abs(force - force[0]).max() < 1e-7
 
@@ -97,18 +97,20 @@ def test_turned_axes_feel_the_same_motion(room):
     path = exercised(room)
     R = se3.so3_exp(np.array([0.3, -1.2, 0.7]))
     t = stamps(path, 7)
-    turned = path.turned(R)
+    turned = path.with_axes(R)
     np.testing.assert_allclose(turned.poses(t)[:, :3, :3], path.poses(t)[:, :3, :3] @ R, atol=1e-12)
     for before, after in zip(path.inertial(t), turned.inertial(t), strict=True):
         np.testing.assert_allclose(after, before @ R, atol=1e-9)
 
 
 def test_a_plan_has_it(room):
-    found = plan(["cal=board:vigour=0.5,seconds=10"], room, SECONDS, 4)
+    found = plan_motions(["cal=board:vigour=0.5,seconds=10"], room, SECONDS, 4)
     (agent,) = found.agents
-    assert (agent.name, agent.kind, agent.like_camera) == ("cal", AgentKind.AR, True)
+    assert (agent.name, agent.kind, agent.has_camera_axes) == ("cal", AgentKind.AR, True)
     assert agent.path.end_ns - agent.path.start_ns == 10_000_000_000
-    again, other = (plan(["cal=board:vigour=0.5,seconds=10"], room, SECONDS, s).agents[0] for s in (4, 5))
+    again, other = (
+        plan_motions(["cal=board:vigour=0.5,seconds=10"], room, SECONDS, s).agents[0] for s in (4, 5)
+    )
     t = stamps(agent.path, 3)
     np.testing.assert_array_equal(agent.path.poses(t), again.path.poses(t))
     assert np.abs(agent.path.poses(t) - other.path.poses(t)).max() > 0.05
@@ -116,8 +118,8 @@ def test_a_plan_has_it(room):
 
 def test_what_cannot_be_is_said_in_one_line(room):
     with pytest.raises(UsageError, match="the whitewall has no calibration board; take --scene board"):
-        plan(["board:"], layout("whitewall", 1), 20, 1)
+        plan_motions(["board:"], make_scene_layout("whitewall", 1), 20, 1)
     with pytest.raises(UsageError, match="too small for distance=2"):
-        plan(["board:distance=2"], room, 20, 1)
+        plan_motions(["board:distance=2"], room, 20, 1)
     with pytest.raises(UsageError, match="vigour=9: expected"):
-        parse("board:vigour=9")
+        parse_motion("board:vigour=9")

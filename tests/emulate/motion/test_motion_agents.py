@@ -3,8 +3,8 @@ import pytest
 from motion_sim import driver, every, floor, person, track
 
 from share.lab.emulate.motion import walk
-from share.lab.emulate.motion.crowd import length_of
-from share.lab.emulate.motion.gait import steps_of
+from share.lab.emulate.motion.crowd import path_length
+from share.lab.emulate.motion.gait import step_phase
 from share.lab.emulate.motion.track import KNOT_S
 
 
@@ -19,7 +19,7 @@ def test_a_person_moves_like_one(seed, speed):
     assert 1.0 < quick.max() < 3.2
     assert (T[:, 2, 1] < -0.75).all()  # image down is world down: the head stays upright
     assert np.linalg.norm(force, axis=1).max() < 25
-    assert floor().at(T[:, :2, 3]).min() > 0.1
+    assert floor().clearance_at(T[:, :2, 3]).min() > 0.1
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -31,14 +31,14 @@ def test_all_stand_still_for_a_second(seed, motion):
     assert np.linalg.norm(np.ptp(T[:, :3, 3], axis=0)) < 0.02
     assert np.linalg.norm(rate, axis=1).max() < 0.05
     assert np.abs(np.linalg.norm(force, axis=1) - 9.81).max() < 0.15
-    assert length_of(path) > 2  # and then they go
+    assert path_length(path) > 2  # and then they go
 
 
 def test_steps_follow_the_walk_ratio():
-    phase, vigour = steps_of(np.full(2001, 1.4))
+    phase, vigour = step_phase(np.full(2001, 1.4))
     hz = phase[-1] / (2 * np.pi * 2000 * KNOT_S)
     assert hz == pytest.approx(1.89, abs=0.02) and vigour.min() == 1
-    assert steps_of(np.zeros(10))[0].max() == 0
+    assert step_phase(np.zeros(10))[0].max() == 0
 
 
 def test_the_head_bobs_at_the_step_rate():
@@ -87,12 +87,14 @@ def test_a_seed_is_a_motion():
 
 
 def test_looks_at_others():
-    from share.lab.emulate.motion.gaze import Seen
+    from share.lab.emulate.motion.gaze import GazeAgent
     from share.lab.emulate.types import START_NS
 
     own = track("person", 1)
-    other = Seen(own.xy + 2.0 * np.stack([np.cos(own.heading + 0.6), np.sin(own.heading + 0.6)], axis=1), 1.6)
-    path = walk.path_of(own, 1.7, 2.6, np.zeros((0, 3)), [other], START_NS, np.random.default_rng(1))
+    other = GazeAgent(
+        own.xy + 2.0 * np.stack([np.cos(own.heading + 0.6), np.sin(own.heading + 0.6)], axis=1), 1.6
+    )
+    path = walk.headset_path(own, 1.7, 2.6, np.zeros((0, 3)), [other], START_NS, np.random.default_rng(1))
     T = path.poses(START_NS + np.round(own.seconds * 1e9).astype(np.int64)[:-1])
     to = np.column_stack([other.xy[:-1], np.full(len(T), 1.6)]) - T[:, :3, 3]
     met = np.einsum("ni,ni->n", T[:, :3, 2], to / np.linalg.norm(to, axis=1, keepdims=True)) > 0.97

@@ -1,7 +1,7 @@
 import pytest
 
 from share.errors import UsageError
-from share.lab.emulate.motion.spec import EurocSpec, PaperSpec, RobotSpec, TumSpec, WalkSpec, parse
+from share.lab.emulate.motion.spec import EurocSpec, PaperSpec, RobotSpec, TumSpec, WalkSpec, parse_motion
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,7 @@ from share.lab.emulate.motion.spec import EurocSpec, PaperSpec, RobotSpec, TumSp
     ],
 )
 def test_specs_are_read(text, name, spec):
-    assert parse(text) == (name, spec)
+    assert parse_motion(text) == (name, spec)
 
 
 @pytest.mark.parametrize(
@@ -38,5 +38,5 @@ def test_specs_are_read(text, name, spec):
 )
 def test_what_is_wrong_is_named(text, says):
     with pytest.raises(UsageError) as caught:
-        parse(text)
+        parse_motion(text)
     assert says in str(caught.value) and "\n" not in str(caught.value)

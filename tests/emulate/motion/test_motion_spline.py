@@ -3,7 +3,7 @@ import pytest
 from motion_sim import driver, every, integrated, person
 
 from share.geometry import se3
-from share.lab.emulate.motion.spline import continuous, through
+from share.lab.emulate.motion.spline import continuous_quaternions, spline_through
 from share.lab.emulate.types import GRAVITY
 
 
@@ -13,7 +13,7 @@ def path(rng):
     p = np.stack([np.sin(t), np.cos(0.7 * t), 0.3 * np.sin(2 * t)], axis=1)
     phi = np.stack([2.5 * np.sin(0.9 * t), 1.5 * t, np.cos(t)], axis=1)  # passes angles beyond pi
     q = se3.quat_from_matrix(se3.so3_exp(phi))
-    return through(5_000_000_000, t, p, q * rng.choice([-1, 1], (len(t), 1)))
+    return spline_through(5_000_000_000, t, p, q * rng.choice([-1, 1], (len(t), 1)))
 
 
 @pytest.mark.parametrize("motion", [person, driver])
@@ -21,7 +21,7 @@ def test_inertial_readings_integrate_to_the_path(motion):
     path = motion()
     found, truth = integrated(path, 200, 10.0), path.poses(every(path, 1, 10.0)[-1:])[0]
     assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 1e-3
-    assert np.degrees(se3.angle(found[:3, :3].T @ truth[:3, :3])) < 0.01
+    assert np.degrees(se3.rotation_angle(found[:3, :3].T @ truth[:3, :3])) < 0.01
 
 
 def test_derivatives_are_those_of_the_poses(path):
@@ -45,33 +45,33 @@ def test_poses_are_rotations_and_pass_through_the_knots(path):
 
 
 def test_placed_moves_the_poses_and_changes_no_reading(path):
-    T = se3.compose(se3.so3_exp(np.array([0, 0, 2.2])), np.array([3.0, -1, 0.5]))
+    T = se3.from_rt(se3.so3_exp(np.array([0, 0, 2.2])), np.array([3.0, -1, 0.5]))
     stamps = every(path, 50)
-    moved = path.placed(T)
+    moved = path.transformed(T)
     assert np.allclose(moved.poses(stamps), T @ path.poses(stamps), atol=1e-12)
     for a, b in zip(moved.inertial(stamps), path.inertial(stamps), strict=True):
         assert np.allclose(a, b, atol=1e-9)
     with pytest.raises(ValueError, match="vertical"):
-        path.placed(se3.compose(se3.so3_exp(np.array([0.1, 0, 0])), np.zeros(3)))
+        path.transformed(se3.from_rt(se3.so3_exp(np.array([0.1, 0, 0])), np.zeros(3)))
 
 
 def test_a_part_is_the_same_motion_at_the_same_stamps(path):
     start, end = path.start_ns + 1_234_567_891, path.start_ns + 3_000_000_000
-    part = path.part(start, end)
+    part = path.cut(start, end)
     stamps = np.arange(start, end + 1, 33_333_333)
     assert np.allclose(part.poses(stamps), path.poses(stamps), atol=1e-12)
     with pytest.raises(ValueError, match="spans"):
         part.poses(np.array([start - 1]))
     with pytest.raises(ValueError, match="not within"):
-        path.part(start, path.end_ns + 1)
+        path.cut(start, path.end_ns + 1)
 
 
 def test_signs_of_quaternions_do_not_matter(rng):
     q = se3.quat_from_matrix(se3.so3_exp(np.linspace(0, 9, 100)[:, None] * np.array([0, 0.6, 0.8])))
-    mixed = continuous(3 * q * rng.choice([-1, 1], (100, 1)))
+    mixed = continuous_quaternions(3 * q * rng.choice([-1, 1], (100, 1)))
     assert (np.einsum("ni,ni->n", mixed[1:], mixed[:-1]) > 0.99).all()
 
 
 def test_too_few_knots_are_refused():
     with pytest.raises(ValueError, match="at least 6"):
-        through(0, np.arange(5.0), np.zeros((5, 3)), np.ones((5, 4)))
+        spline_through(0, np.arange(5.0), np.zeros((5, 3)), np.ones((5, 4)))

@@ -4,7 +4,7 @@ from motion_sim import every, person
 
 from share.errors import DataError
 from share.geometry import se3
-from share.lab.emulate.motion.tum import fitted, read_path
+from share.lab.emulate.motion.tum_path import fit_spline, read_tum_path
 from share.recordings.trajectory import Trajectory, format_tum
 
 
@@ -21,25 +21,25 @@ def samples():
 
 
 def test_clean_poses_come_back(tmp_path, samples):
-    path = read_path(write(tmp_path, *samples))
+    path = read_tum_path(write(tmp_path, *samples))
     T = path.poses(samples[0])
     assert np.linalg.norm(T[:, :3, 3] - samples[1][:, :3, 3], axis=1).max() < 2e-4
-    assert np.degrees(se3.angle(se3.inverse(T) @ samples[1])).max() < 0.02
+    assert np.degrees(se3.rotation_angle(se3.inverse(T) @ samples[1])).max() < 0.02
 
 
 def test_noise_is_smoothed_away(samples, rng):
     stamps, T = samples
     noisy = T @ se3.exp(rng.normal(0, [0.003] * 3 + [0.003] * 3, (len(T), 6)))
-    off = fitted(stamps, noisy).poses(stamps)[:, :3, 3] - T[:, :3, 3]
+    off = fit_spline(stamps, noisy).poses(stamps)[:, :3, 3] - T[:, :3, 3]
     assert np.sqrt((off**2).sum(1).mean()) < 0.6 * 0.003 * np.sqrt(3)
-    clean, found = person().inertial(stamps)[1], fitted(stamps, noisy).inertial(stamps)[1]
+    clean, found = person().inertial(stamps)[1], fit_spline(stamps, noisy).inertial(stamps)[1]
     assert np.sqrt(((clean - found) ** 2).sum(1).mean()) < 3.0  # two differences would make 70 m/s^2
 
 
 def test_gaps_stay_gaps_and_are_crossed_smoothly(samples):
     stamps, T = samples
     keep = (stamps < stamps[500]) | (stamps > stamps[600])
-    path = fitted(stamps[keep], T[keep])
+    path = fit_spline(stamps[keep], T[keep])
     assert path.gaps.tolist() == [[stamps[499], stamps[601]]]
     inside = stamps[500:601]
     assert np.linalg.norm(path.poses(inside)[:, :3, 3] - T[500:601, :3, 3], axis=1).max() < 0.3
@@ -47,7 +47,7 @@ def test_gaps_stay_gaps_and_are_crossed_smoothly(samples):
 
 
 def test_a_part_is_taken(tmp_path, samples):
-    path = read_path(write(tmp_path, *samples), start=2.0, seconds=5.0)
+    path = read_tum_path(write(tmp_path, *samples), start=2.0, seconds=5.0)
     assert path.start_ns == samples[0][200] and path.end_ns == samples[0][700]
 
 
@@ -63,7 +63,7 @@ def test_a_part_is_taken(tmp_path, samples):
 )
 def test_what_is_no_motion_is_refused_in_a_line(tmp_path, samples, spoil, says):
     with pytest.raises(DataError) as caught:
-        read_path(write(tmp_path, *spoil(*samples)))
+        read_tum_path(write(tmp_path, *spoil(*samples)))
     assert says in str(caught.value) and "path.tum" in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -72,7 +72,7 @@ def test_poses_that_are_none_are_refused(tmp_path, bad):
     file = tmp_path / "bad.tum"
     file.write_text("0.5 0 0 0 0 0 0 1\n" + bad + "\n")
     with pytest.raises(DataError, match=r"bad\.tum"):
-        read_path(file)
+        read_tum_path(file)
     file.write_text("0.5 0 0 0 0 0 0 1\n")
     with pytest.raises(DataError, match="nothing is left"):
-        read_path(file, start=5)
+        read_tum_path(file, start=5)

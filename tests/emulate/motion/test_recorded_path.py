@@ -8,15 +8,20 @@ import pytest
 
 from share.errors import DataError, ShareError, UsageError
 from share.geometry import se3
-from share.lab.emulate.motion import sources
+from share.lab.emulate.motion import recorded_sources
 from share.lab.emulate.motion.recorded import RecordedPath
-from share.lab.emulate.motion.sources import EUROC, TUMVI, Recording, open_recording
+from share.lab.emulate.motion.recorded_sources import (
+    EUROC_OPTIONS,
+    TUMVI_OPTIONS,
+    RecordedMotion,
+    open_recorded_motion,
+)
 from share.lab.emulate.types import GRAVITY
 
 
 @pytest.fixture(scope="module")
-def euroc(shared_data: Path) -> Recording:
-    return open_recording(shared_data / "motion/euroc/V1_02_medium", EUROC, 10.0, 12.0)
+def euroc(shared_data: Path) -> RecordedMotion:
+    return open_recorded_motion(shared_data / "motion/euroc/V1_02_medium", EUROC_OPTIONS, 10.0, 12.0)
 
 
 def rates_of(path: RecordedPath, stamps: np.ndarray, step_ns: int) -> np.ndarray:
@@ -25,8 +30,8 @@ def rates_of(path: RecordedPath, stamps: np.ndarray, step_ns: int) -> np.ndarray
     return turned / (2e-9 * step_ns)
 
 
-def test_the_real_imu_is_untouched(euroc: Recording, shared_data: Path) -> None:
-    stamps, values = sources.tables.read_table(shared_data / "motion/euroc/V1_02_medium/imu0.csv", 7)
+def test_the_real_imu_is_untouched(euroc: RecordedMotion, shared_data: Path) -> None:
+    stamps, values = recorded_sources.tables.read_table(shared_data / "motion/euroc/V1_02_medium/imu0.csv", 7)
     recorded = euroc.path.recorded
     at = np.searchsorted(stamps, recorded.stamps_ns)
     np.testing.assert_array_equal(stamps[at], recorded.stamps_ns)
@@ -34,7 +39,7 @@ def test_the_real_imu_is_untouched(euroc: Recording, shared_data: Path) -> None:
     assert len(recorded) == pytest.approx(12 * 200, abs=2)
 
 
-def test_the_path_is_what_its_imu_felt(euroc: Recording) -> None:
+def test_the_path_is_what_its_imu_felt(euroc: RecordedMotion) -> None:
     """Its derivatives are the readings, also across nodes; what is left is the closing error."""
     path = euroc.path
     stamps = np.arange(path.start_ns + 50_000_000, path.end_ns - 50_000_000, 7_000_003)
@@ -48,7 +53,7 @@ def test_the_path_is_what_its_imu_felt(euroc: Recording) -> None:
     assert np.abs((felt - force).mean(0)).max() < 0.01
 
 
-def test_path_and_velocity_are_continuous(euroc: Recording) -> None:
+def test_path_and_velocity_are_continuous(euroc: RecordedMotion) -> None:
     path = euroc.path
     nodes = path.fit.stamps_ns
     nodes = nodes[(nodes > path.start_ns) & (nodes < path.end_ns)]
@@ -63,7 +68,7 @@ def test_path_and_velocity_are_continuous(euroc: Recording) -> None:
     assert np.abs(moved - path.velocity(stamps)).max() < 0.01
 
 
-def test_the_fit_is_near_the_mocap_and_in_units_of_noise(euroc: Recording) -> None:
+def test_the_fit_is_near_the_mocap_and_in_units_of_noise(euroc: RecordedMotion) -> None:
     left = euroc.path.fit.residuals
     assert left.position_mm < 4
     assert left.imu_sigmas.max() < 2.5
@@ -73,23 +78,23 @@ def test_the_fit_is_near_the_mocap_and_in_units_of_noise(euroc: Recording) -> No
     np.testing.assert_allclose(euroc.T_body_cam0[:3, 3], (-0.0216401, -0.0646770, 0.0098107), atol=1e-6)
 
 
-def test_placed_elsewhere_it_moves_alike(euroc: Recording) -> None:
+def test_placed_elsewhere_it_moves_alike(euroc: RecordedMotion) -> None:
     path = euroc.path
     T = se3.exp(np.array([0, 0, 1.2, 3.0, -2.0, 0.5]))
-    moved = path.placed(T).part(path.start_ns + 10**9, path.end_ns)
+    moved = path.transformed(T).cut(path.start_ns + 10**9, path.end_ns)
     stamps = np.arange(moved.start_ns, moved.end_ns, 500_000_000)
     np.testing.assert_allclose(moved.poses(stamps), T @ path.poses(stamps), atol=1e-12)
     np.testing.assert_array_equal(moved.inertial(stamps), path.inertial(stamps))
     with pytest.raises(ValueError, match="span"):
         moved.poses(np.array([path.start_ns]))
     with pytest.raises(ValueError, match="vertical"):
-        path.placed(se3.exp(np.array([0.1, 0, 0, 0, 0, 0])))
+        path.transformed(se3.exp(np.array([0.1, 0, 0, 0, 0, 0])))
     with pytest.raises(ValueError, match="not within"):
-        moved.part(path.start_ns, path.end_ns)
+        moved.cut(path.start_ns, path.end_ns)
 
 
 def test_gaps_of_the_mocap_are_gaps_of_the_path(shared_data: Path) -> None:
-    path = open_recording(shared_data / "motion/tumvi/room2", TUMVI, 30.0, 14.0).path
+    path = open_recorded_motion(shared_data / "motion/tumvi/room2", TUMVI_OPTIONS, 30.0, 14.0).path
     seconds = (path.gaps - path.start_ns) * 1e-9
     np.testing.assert_allclose(seconds, [(3.41, 5.44), (12.11, 14.0)], atol=0.1)
     inside = np.arange(path.gaps[0, 0], path.gaps[0, 1], 20_000_000)
@@ -98,7 +103,7 @@ def test_gaps_of_the_mocap_are_gaps_of_the_path(shared_data: Path) -> None:
     assert speed.max() < 3
 
 
-def test_an_asl_folder_gives_the_same(euroc: Recording, shared_data: Path, tmp_path: Path) -> None:
+def test_an_asl_folder_gives_the_same(euroc: RecordedMotion, shared_data: Path, tmp_path: Path) -> None:
     plain, root = shared_data / "motion/euroc/V1_02_medium", tmp_path / "V1_02/mav0"
     for name, file in (
         ("imu0", "imu0.csv"),
@@ -115,7 +120,7 @@ def test_an_asl_folder_gives_the_same(euroc: Recording, shared_data: Path, tmp_p
         f"gyroscope_noise_density: {n.gyro_density}\naccelerometer_noise_density: {n.accel_density}\n"
         f"gyroscope_random_walk: {n.gyro_walk}\naccelerometer_random_walk: {n.accel_walk}\n"
     )
-    same = open_recording(tmp_path / "V1_02", EUROC, 10.0, 12.0)
+    same = open_recorded_motion(tmp_path / "V1_02", EUROC_OPTIONS, 10.0, 12.0)
     np.testing.assert_array_equal(same.path.fit.T_world_body, euroc.path.fit.T_world_body)
     np.testing.assert_array_equal(same.images_ns, euroc.images_ns)
     np.testing.assert_allclose(same.T_body_cam0, T, atol=1e-12)
@@ -134,8 +139,8 @@ def test_tumvis_own_folder_is_read_as_raw_mocap(shared_data: Path, tmp_path: Pat
         "accelerometer_noise_density: 0.0028\naccelerometer_random_walk: 0.00086\n"
         "gyroscope_noise_density: 0.00016\ngyroscope_random_walk: 2.2e-05\nupdate_rate: 200.0\n"
     )
-    own = open_recording(root, EUROC, 5.0, 8.0)
-    same = open_recording(plain, TUMVI, 5.0, 8.0)
+    own = open_recorded_motion(root, EUROC_OPTIONS, 5.0, 8.0)
+    same = open_recorded_motion(plain, TUMVI_OPTIONS, 5.0, 8.0)
     np.testing.assert_array_equal(own.path.fit.T_world_body, same.path.fit.T_world_body)
     np.testing.assert_array_equal(own.T_body_cam0, same.T_body_cam0)
     assert own.noise == same.noise
@@ -145,11 +150,11 @@ def test_tumvis_own_folder_is_read_as_raw_mocap(shared_data: Path, tmp_path: Pat
 @pytest.mark.parametrize(("start", "seconds"), [(200.0, None), (-1.0, 5.0), (10.0, 0.1)])
 def test_a_span_that_is_not_there(shared_data: Path, start: float, seconds: float | None) -> None:
     with pytest.raises(UsageError, match=r"of 83\.. s of IMU and truth"):
-        open_recording(shared_data / "motion/euroc/V1_02_medium", EUROC, start, seconds)
+        open_recorded_motion(shared_data / "motion/euroc/V1_02_medium", EUROC_OPTIONS, start, seconds)
 
 
 def test_the_end_is_the_end(shared_data: Path) -> None:
-    path = open_recording(shared_data / "motion/euroc/V1_02_medium", EUROC, 78.0, 60.0).path
+    path = open_recorded_motion(shared_data / "motion/euroc/V1_02_medium", EUROC_OPTIONS, 78.0, 60.0).path
     assert (path.end_ns - path.start_ns) * 1e-9 == pytest.approx(5.5, abs=0.1)
 
 
@@ -192,6 +197,6 @@ def test_bad_folders_say_what_is_wrong(shared_data: Path, tmp_path: Path, how: s
     shutil.copytree(shared_data / "motion/euroc/calib", tmp_path / "calib")
     broken(folder, how)
     with pytest.raises(ShareError, match=says) as caught:
-        open_recording(folder, EUROC, 0.0, 10.0)
+        open_recorded_motion(folder, EUROC_OPTIONS, 0.0, 10.0)
     assert "\n" not in str(caught.value)
     assert not isinstance(caught.value, DataError) or str(folder) in str(caught.value)

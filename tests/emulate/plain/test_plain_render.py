@@ -6,8 +6,8 @@ import pytest
 from plain_walk import CAMERA, MOTIONS, gray, poses
 
 from share.geometry.camera import Camera
-from share.geometry.se3 import compose, inverse, transform
-from share.lab.emulate.plain.render import Renderer
+from share.geometry.se3 import from_rt, inverse, transform
+from share.lab.emulate.plain.render import PlainRoomRenderer
 from share.lab.emulate.plain.room import make_room
 
 SECONDS = np.arange(0, 20, 0.05)
@@ -20,7 +20,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def renderer(room):
-    return Renderer(room, CAMERA)
+    return PlainRoomRenderer(room, CAMERA)
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +50,10 @@ def back_project(px, z, T_world_cam):
 
 def test_a_wall_seen_straight_on_has_its_distance_everywhere(room, renderer):
     ahead = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # looks along +x
-    _, depth = renderer.render(compose(ahead, np.array([3.0, 3.0, 2.6])))
+    _, depth = renderer.render(from_rt(ahead, np.array([3.0, 3.0, 2.6])))
     wall = np.isclose(depth, 6.0, atol=0.001)
     assert wall.mean() > 0.1
-    points = back_project(pixels(1), nearest(depth, pixels(1)), compose(ahead, np.array([3.0, 3, 2.6])))
+    points = back_project(pixels(1), nearest(depth, pixels(1)), from_rt(ahead, np.array([3.0, 3, 2.6])))
     assert points[:, 0].max() < room.size[0] + 0.001
 
 
@@ -79,7 +79,7 @@ def test_one_view_predicts_another(renderer, path):
         z = nearest(depth_i, px)
         in_j = transform(inverse(path[j]), back_project(px, z, path[i]))
         at = CAMERA.project(in_j)
-        seen = CAMERA.inside(at, 2)
+        seen = CAMERA.is_inside(at, 2)
         seen[seen] &= np.abs(bilinear(depth_j, at[seen]) / in_j[seen, 2] - 1) < 0.01
         assert seen.mean() > 0.5
         difference = bilinear(image_j, at[seen]).astype(float) - bilinear(image_i, px[seen])
@@ -99,7 +99,7 @@ def test_tracks_follow_the_exact_projection(renderer, who):
         z = 1 / bilinear(1 / depth, p)  # inverse depth is affine on a plane
         in_b = transform(inverse(path[k + 1]), back_project(p, z, path[k]))
         at = CAMERA.project(in_b)
-        good = (found[:, 0] > 0) & CAMERA.inside(at, 5) & (np.abs(z / nearest(depth, p) - 1) < 0.01)
+        good = (found[:, 0] > 0) & CAMERA.is_inside(at, 5) & (np.abs(z / nearest(depth, p) - 1) < 0.01)
         good &= np.abs(nearest(depth_b, at) / in_b[:, 2] - 1) < 0.02
         assert good.sum() > 100
         errors.extend(np.linalg.norm(q - at, axis=1)[good])
@@ -124,4 +124,4 @@ def test_statistics_are_near_a_real_images():
 
 def test_a_lens_or_too_many_faces_are_refused(room):
     with pytest.raises(ValueError, match="distortion"):
-        Renderer(room, Camera(64, 48, 40, 40, 31.5, 23.5, (0.1, 0, 0, 0)))
+        PlainRoomRenderer(room, Camera(64, 48, 40, 40, 31.5, 23.5, (0.1, 0, 0, 0)))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from share.geometry.camera import Camera
-from share.lab.emulate.render.context import missing
-from share.lab.emulate.types import Mesh, Room
+from share.lab.emulate.render.context import missing_reason
+from share.lab.emulate.types import DrawableRoom, Mesh
 
-WHY_NOT = missing()
+WHY_NOT = missing_reason()
 needs_opengl = pytest.mark.skipif(WHY_NOT is not None, reason=f"cannot draw here: {WHY_NOT}")
 
 SIZE = (9.0, 6.0, 4.0)
@@ -72,7 +72,7 @@ def pictures(rng: np.random.Generator, layers: int, size: int = 256) -> np.ndarr
     return out
 
 
-def furnished(boxes: int = 350, movers: dict[str, tuple[Mesh, ...]] | None = None) -> Room:
+def furnished(boxes: int = 350, movers: dict[str, tuple[Mesh, ...]] | None = None) -> DrawableRoom:
     """Boxes everywhere but in the middle, each with a picture, under light that varies softly."""
     rng = np.random.default_rng((4, boxes))
     size = np.array(SIZE)
@@ -84,15 +84,17 @@ def furnished(boxes: int = 350, movers: dict[str, tuple[Mesh, ...]] | None = Non
     mesh = joined(parts)
     light = cv2.resize(rng.uniform(60, 140, (8, 8)), (64, 64), interpolation=cv2.INTER_CUBIC)
     light_uv = (mesh.vertices[:, :2] / size[:2]).astype(np.float32)
-    return Room("boxes", 0, size, mesh, pictures(rng, 16), light_uv, light.astype(np.uint8), movers or {})
+    return DrawableRoom(
+        "boxes", 0, size, mesh, pictures(rng, 16), light_uv, light.astype(np.uint8), movers or {}
+    )
 
 
-def plain(picture: np.ndarray, movers: dict[str, tuple[Mesh, ...]] | None = None) -> Room:
+def plain(picture: np.ndarray, movers: dict[str, tuple[Mesh, ...]] | None = None) -> DrawableRoom:
     """An empty room with one picture a metre, evenly lit."""
     mesh = box(np.zeros(3), np.array(SIZE), 0, inside=True)
     light = np.full((4, 4), 100, np.uint8)
     light_uv = np.full((len(mesh.vertices), 2), 0.5, np.float32)
-    return Room("plain", 0, np.array(SIZE), mesh, picture[None], light_uv, light, movers or {})
+    return DrawableRoom("plain", 0, np.array(SIZE), mesh, picture[None], light_uv, light, movers or {})
 
 
 def checker(squares: int = 4, size: int = 256) -> np.ndarray:

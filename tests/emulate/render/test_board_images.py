@@ -8,13 +8,13 @@ from scipy.spatial.distance import pdist
 
 from share.geometry import se3
 from share.lab.calibrate.target import AprilGrid
-from share.lab.emulate.motion.board import exercise
+from share.lab.emulate.motion.board import board_path
 from share.lab.emulate.motion.spec import BoardSpec
 from share.lab.emulate.render.gl import GlRenderer
-from share.lab.emulate.types import Moment
-from share.lab.emulate.world.build import build
-from share.lab.emulate.world.scenes import layout
-from share.sensors.profile import profile
+from share.lab.emulate.types import SceneInstant
+from share.lab.emulate.world.build import build_room
+from share.lab.emulate.world.scenes import make_scene_layout
+from share.sensors.profile import load_profile
 
 pytestmark = needs_opengl
 FRAMES = 10
@@ -25,15 +25,15 @@ CLEAR_M = 0.009  # around a corner there is nothing but the corner
 def shots(request):
     """By profile: the camera, the target, gray images and where all corners are in them (F, K, 2) px."""
     scene, *profiles = request.param
-    room = layout(scene, 1)
-    renderer, made = GlRenderer(build(room)), {}
+    room = make_scene_layout(scene, 1)
+    renderer, made = GlRenderer(build_room(room)), {}
     for name in profiles:
-        rig = profile(name).rig()
-        path = exercise(room, BoardSpec(), 40.0, np.random.default_rng((1, 5)))
+        rig = load_profile(name).rig()
+        path = board_path(room, BoardSpec(), 40.0, np.random.default_rng((1, 5)))
         t = path.start_ns + np.linspace(3e9, 39e9, FRAMES).astype(np.int64)
-        T_world_cam = path.turned(rig.T_body_cam0[:3, :3].T).poses(t) @ rig.T_body_cam0
+        T_world_cam = path.with_axes(rig.T_body_cam0[:3, :3].T).poses(t) @ rig.T_body_cam0
         points = se3.transform(room.target.T_world_target, room.target.target.corners)
-        images = [renderer.radiance(rig.cam0, [Moment(T)]) for T in T_world_cam]
+        images = [renderer.radiance(rig.cam0, [SceneInstant(T)]) for T in T_world_cam]
         images = [np.rint(image * min(1, 230 / np.percentile(image, 98))).clip(0, 255) for image in images]
         true = [rig.cam0.project(se3.transform(se3.inverse(T), points)) for T in T_world_cam]
         made[name] = rig.cam0, room.target.target, [i.astype(np.uint8) for i in images], true
@@ -43,7 +43,7 @@ def shots(request):
 def found(camera, target, image, true):
     """Ids and refined places of the corners that OpenCV finds well inside the image."""
     ids = april_ids(image) if isinstance(target, AprilGrid) else charuco_ids(target, image)
-    ids = ids[camera.inside(true[ids], 12)]
+    ids = ids[camera.is_inside(true[ids], 12)]
     scale = pdist(true).min() / pdist(target.corners).min()  # px a metre, where the board is farthest
     reach = int(np.clip(CLEAR_M * scale, 2, 5))
     start = true[ids] + np.random.default_rng(1).uniform(

@@ -7,10 +7,10 @@ from test_gl_place import corners_of_walls, saddles
 
 from share.geometry.camera import Camera
 from share.geometry.se3 import inverse, transform
-from share.lab.emulate.render.fisheye import faces
+from share.lab.emulate.render.fisheye import fisheye_faces
 from share.lab.emulate.render.gl import GlRenderer
-from share.lab.emulate.sensor.photometry import vignette
-from share.lab.emulate.types import Moment
+from share.lab.emulate.sensor.photometry import vignetting_gain
+from share.lab.emulate.types import SceneInstant
 
 pytestmark = needs_opengl
 LENS = (0.00348, 0.000715, -0.00205, 0.000203)
@@ -22,10 +22,10 @@ def test_corners_are_where_they_project_on_every_face():
     renderer, errors, angles = GlRenderer(plain(checkered())), [], []
     for k in range(3):
         T = looking(0.4 + 2.1 * k, 0.15 * (k % 3 - 1), (1.6 + 0.1 * k, 1.5, 1.4))
-        image = renderer.radiance(FISHEYE, [Moment(T)])
+        image = renderer.radiance(FISHEYE, [SceneInstant(T)])
         points = transform(inverse(T), corners_of_walls(FISHEYE, T))
-        px = FISHEYE.project_all(points)
-        seen = FISHEYE.inside(np.nan_to_num(px, nan=-1.0), 9)
+        px = FISHEYE.project_wide(points)
+        seen = FISHEYE.is_inside(np.nan_to_num(px, nan=-1.0), 9)
         found = saddles(image, px[seen])
         ok = ~np.isnan(found[:, 0])
         errors.append((found - px[seen])[ok])
@@ -39,23 +39,25 @@ def test_corners_are_where_they_project_on_every_face():
 
 def test_depth_is_that_of_a_camera_without_a_lens():
     renderer, T = GlRenderer(furnished(30)), looking(0.3, 0.2)
-    depth = renderer.depth(FISHEYE, Moment(T))
+    depth = renderer.depth(FISHEYE, SceneInstant(T))
     x, y = np.meshgrid(np.arange(5, 395, 7), np.arange(5, 295, 7))
-    flat = renderer.depth(WIDE, Moment(T))[y, x].ravel()
+    flat = renderer.depth(WIDE, SceneInstant(T))[y, x].ravel()
     rays = WIDE.directions(np.column_stack([x.ravel(), y.ravel()]).astype(float))
-    px = np.rint(FISHEYE.project_all(rays)).astype(int)
+    px = np.rint(FISHEYE.project_wide(rays)).astype(int)
     assert np.median(np.abs(depth[px[:, 1], px[:, 0]] / flat - 1)) < 0.01  # to the nearest pixel
     behind = FISHEYE.directions(np.stack(np.meshgrid(np.arange(512.0), np.arange(512.0)), -1))[..., 2] < 0
     assert behind.any() and not depth[behind].any()
 
 
 def test_every_pixel_is_of_one_face():
-    shown = np.sum([face.shown for face in faces(FISHEYE)], axis=0)
+    shown = np.sum([face.pixel_mask for face in fisheye_faces(FISHEYE)], axis=0)
     assert (shown == 1).all()
     narrow = Camera(512, 512, 190.0, 190.0, 255.0, 255.0, (-0.3, 0.0, 0.0, 0.0), "equidistant")
-    assert (np.sum([face.shown for face in faces(narrow)], axis=0) == 0).any()  # beyond what the lens shows
+    assert (
+        np.sum([face.pixel_mask for face in fisheye_faces(narrow)], axis=0) == 0
+    ).any()  # beyond what the lens shows
 
 
 def test_the_corners_get_the_light_that_is_told():
-    light = vignette(FISHEYE, 0.5)
+    light = vignetting_gain(FISHEYE, 0.5)
     assert light[257, 255] > 0.999 and abs(light.min() - 0.5) < 0.01

@@ -6,7 +6,7 @@ from rendered import D435I, EUROC, SIZE, box, checker, furnished, looking, needs
 
 from share.geometry.camera import Camera
 from share.lab.emulate.render.gl import GlRenderer
-from share.lab.emulate.types import Moment, Room
+from share.lab.emulate.types import DrawableRoom, SceneInstant
 
 pytestmark = needs_opengl
 
@@ -19,9 +19,9 @@ def boxes():
 def test_gray_level_is_albedo_times_light():
     room = plain(np.full((64, 64), 120, np.uint8))
     for light in (25, 100, 240):
-        lit = Room(**vars(room) | {"light_map": np.full((4, 4), light, np.uint8)})
+        lit = DrawableRoom(**vars(room) | {"light_map": np.full((4, 4), light, np.uint8)})
         for camera in (D435I, EUROC):
-            image = GlRenderer(lit).radiance(camera, [Moment(looking(0.3))])
+            image = GlRenderer(lit).radiance(camera, [SceneInstant(looking(0.3))])
             assert image.shape == (camera.height, camera.width) and image.dtype == np.float32
             assert (
                 np.abs(image - 120 * light / 100).max() < 0.02
@@ -40,7 +40,7 @@ def test_no_alias_of_a_fine_pattern(camera):
     small = Camera(
         camera.width // 4, camera.height // 4, camera.fx / 16, camera.fy / 16, camera.cx / 4, camera.cy / 4
     )
-    image = GlRenderer(fine).radiance(small, [Moment(looking(0.7))])
+    image = GlRenderer(fine).radiance(small, [SceneInstant(looking(0.7))])
     assert np.abs(image - 125).max() < 8  # of a contrast of 75; nearest where most is left
     assert np.abs(image - 125).mean() < 0.3
 
@@ -49,7 +49,8 @@ def blurred(k: int, count: int, speed: float = 0.04):
     """`count` moments in the middles of equal parts of an exposure: a turn of `speed` rad with a shift."""
     at = (np.arange(count) + 0.5) / count - 0.5
     return [
-        Moment(looking(0.9 * k + speed * t, 0.1 + 0.3 * speed * t, (4.5 + 0.02 * t, 3.0, 1.6))) for t in at
+        SceneInstant(looking(0.9 * k + speed * t, 0.1 + 0.3 * speed * t, (4.5 + 0.02 * t, 3.0, 1.6)))
+        for t in at
     ]
 
 
@@ -71,7 +72,7 @@ def test_blur_through_a_lens(boxes):
 
 def test_a_pixel_is_the_mean_over_its_area(boxes):
     """The more samples, the nearer; three are nearly as good as many."""
-    still = Moment(looking(0.5))
+    still = SceneInstant(looking(0.5))
     reference = boxes.radiance(D435I, [still] * 128)
     images = {n: boxes.radiance(D435I, [still] * n) for n in (1, 4, 16)}
     rms = {n: float(np.sqrt(np.mean((image - reference) ** 2))) for n, image in images.items()}
@@ -88,10 +89,10 @@ def test_limbs_have_shape():
         T = looking(yaw, at=(SIZE[0] / 2, SIZE[1] / 2, 1.0))
         T_world_part = np.eye(4)
         T_world_part[:3, 3] = T[:3, 3] + T[:3, 2]
-        image = renderer.radiance(D435I, [Moment(T, {"someone": T_world_part[None]})])
+        image = renderer.radiance(D435I, [SceneInstant(T, {"someone": T_world_part[None]})])
         levels[yaw] = image[242, 319]
         turned = T_world_part.copy()  # the same cube, other corners first
         turned[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-        assert renderer.radiance(D435I, [Moment(T, {"someone": turned[None]})])[242, 319] == levels[yaw]
+        assert renderer.radiance(D435I, [SceneInstant(T, {"someone": turned[None]})])[242, 319] == levels[yaw]
     assert min(np.diff(sorted(levels.values()))) > 3
     assert 75 < np.mean(list(levels.values())) < 125

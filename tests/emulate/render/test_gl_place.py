@@ -8,7 +8,7 @@ from rendered import D435I, EUROC, OFF_CENTRE, SIZE, box, checker, furnished, lo
 from share.geometry.camera import rays
 from share.geometry.se3 import inverse, transform
 from share.lab.emulate.render.gl import GlRenderer
-from share.lab.emulate.types import Moment
+from share.lab.emulate.types import SceneInstant
 
 pytestmark = needs_opengl
 CAMERAS = pytest.mark.parametrize("camera", [D435I, OFF_CENTRE, EUROC], ids=["d435i", "off-centre", "euroc"])
@@ -49,13 +49,13 @@ def test_corners_are_where_they_project(camera):
     renderer, errors, edges = GlRenderer(plain(checker())), [], []
     for k in range(6):
         T = looking(0.4 + 1.1 * k, 0.15 * (k % 3 - 1), (4.1 + 0.1 * k, 2.9, 1.7))
-        image = renderer.radiance(camera, [Moment(T)])
+        image = renderer.radiance(camera, [SceneInstant(T)])
         px = camera.project(transform(inverse(T), corners_of_walls(camera, T)))
-        px = px[camera.inside(px, 9)]
+        px = px[camera.is_inside(px, 9)]
         found = saddles(image, px)
         ok = ~np.isnan(found[:, 0])
         errors.append((found - px)[ok])
-        edges.append(~camera.inside(px[ok], 60))
+        edges.append(~camera.is_inside(px[ok], 60))
     error, edge = np.concatenate(errors), np.concatenate(edges)
     assert len(error) > 60 and edge.sum() > 15
     assert np.sqrt((error**2).sum(1).mean()) < 0.05
@@ -104,7 +104,7 @@ def test_depth_is_exact(camera):
     renderer = GlRenderer(room)
     for yaw, pitch in ((0.3, 0.2), (3.6, -0.3)):
         T = looking(yaw, pitch)
-        depth = renderer.depth(camera, Moment(T))
+        depth = renderer.depth(camera, SceneInstant(T))
         exact, clear = exact_depth(room.mesh, camera, T)
         wrong = np.abs(depth - exact)[clear] > 1e-5
         assert clear.mean() > 0.999
@@ -113,14 +113,14 @@ def test_depth_is_exact(camera):
 
 def test_nothing_has_no_depth(boxes):
     outside = looking(0.0, 0.0, (40.0, 3.0, 1.6))
-    assert not boxes.depth(D435I, Moment(outside)).any()
-    assert not boxes.depth(EUROC, Moment(outside)).any()
-    assert not boxes.radiance(D435I, [Moment(outside)]).any()
+    assert not boxes.depth(D435I, SceneInstant(outside)).any()
+    assert not boxes.depth(EUROC, SceneInstant(outside)).any()
+    assert not boxes.radiance(D435I, [SceneInstant(outside)]).any()
 
 
 @CAMERAS
 def test_same_bytes_again(camera, boxes):
-    moments = [Moment(looking(0.1 + 0.01 * k)) for k in range(4)]
+    moments = [SceneInstant(looking(0.1 + 0.01 * k)) for k in range(4)]
     again = GlRenderer(furnished())
     for shot in (moments[:1], moments):
         first = boxes.radiance(camera, shot)
@@ -135,13 +135,13 @@ def test_tracks_follow_the_scene(camera):
     renderer, errors = GlRenderer(furnished(60)), []
     for k in range(6):
         T0, T1 = looking(0.9 * k, 0.05), looking(0.9 * k + 0.02, 0.06, (4.53, 3.02, 1.59))
-        before, after = (to_bytes(renderer.radiance(camera, [Moment(T)])) for T in (T0, T1))
+        before, after = (to_bytes(renderer.radiance(camera, [SceneInstant(T)])) for T in (T0, T1))
         px = cv2.goodFeaturesToTrack(before, 200, 0.01, 12).reshape(-1, 2)
-        depth = renderer.depth(camera, Moment(T0))
+        depth = renderer.depth(camera, SceneInstant(T0))
         z = depth[px[:, 1].astype(int), px[:, 0].astype(int)].astype(float)
         points = rays(camera.normalise(px.astype(float))) * z[:, None]
         true = camera.project(transform(inverse(T1) @ T0, points))
-        ok = smooth_around(depth, px) & camera.inside(true, 15)
+        ok = smooth_around(depth, px) & camera.is_inside(true, 15)
         found = track(before, after, px[ok], true[ok])
         errors.append(np.linalg.norm(found - true[ok], axis=1))
     error = np.concatenate(errors)
@@ -179,8 +179,8 @@ def test_movers_are_where_they_are(camera):
     seen, hidden = np.eye(4), np.eye(4)
     seen[:3, 3] = T[:3, 3] + (2.2, 0.3, -0.2)
     hidden[:3, 3] = T[:3, 3] + (4.0, 0.55, -0.36)  # behind the other, and smaller
-    alone, both = (Moment(T, {"someone": np.stack(parts)}) for parts in ((seen, seen), (seen, hidden)))
-    empty, one, two = (renderer.depth(camera, m) for m in (Moment(T), alone, both))
+    alone, both = (SceneInstant(T, {"someone": np.stack(parts)}) for parts in ((seen, seen), (seen, hidden)))
+    empty, one, two = (renderer.depth(camera, m) for m in (SceneInstant(T), alone, both))
     assert (one == two).all()
     u, v = camera.project(transform(inverse(T), seen[None, :3, 3] - (0.2, 0, 0)))[0].round().astype(int)
     assert one[v, u] == pytest.approx(2.0, abs=1e-6) and empty[v, u] == pytest.approx(4.5, abs=1e-6)
@@ -194,7 +194,7 @@ def test_movers_are_where_they_are(camera):
         [cv2.pointPolygonTest(hull, (float(x), float(y)), True) for x, y in zip(xs, ys, strict=True)]
     )
     assert (changed[ys, xs] == (side > 0))[np.abs(side) > 0.6].all()
-    images = [renderer.radiance(camera, [m]) for m in (Moment(T), alone, both)]
+    images = [renderer.radiance(camera, [m]) for m in (SceneInstant(T), alone, both)]
     assert np.array_equal(images[1], images[2])
     assert np.abs(images[1] - images[0])[cv2.erode(changed.astype(np.uint8), np.ones((3, 3))) == 1].min() > 1
     outside = cv2.dilate(changed.astype(np.uint8), np.ones((5, 5))) == 0
@@ -207,6 +207,6 @@ def test_a_box_hides_a_mover():
     renderer, T = GlRenderer(room), looking(1.0)
     behind = np.eye(4)
     behind[:3, 3] = T[:3, 3] + 30 * T[:3, 2]  # beyond the wall
-    for moment in (Moment(T, {"someone": behind[None]}), Moment(T)):
-        assert np.array_equal(renderer.depth(D435I, moment), renderer.depth(D435I, Moment(T)))
-        assert np.array_equal(renderer.radiance(D435I, [moment]), renderer.radiance(D435I, [Moment(T)]))
+    for moment in (SceneInstant(T, {"someone": behind[None]}), SceneInstant(T)):
+        assert np.array_equal(renderer.depth(D435I, moment), renderer.depth(D435I, SceneInstant(T)))
+        assert np.array_equal(renderer.radiance(D435I, [moment]), renderer.radiance(D435I, [SceneInstant(T)]))

@@ -7,8 +7,10 @@ import sys
 import pytest
 from rendered import needs_opengl
 
-ASK = "from share.lab.emulate.render.context import missing; print(missing())"
-DRAW = "from share.lab.emulate.render.context import create; print(create().info['GL_RENDERER'])"
+ASK = "from share.lab.emulate.render.context import missing_reason; print(missing_reason())"
+DRAW = (
+    "from share.lab.emulate.render.context import create_context as make; print(make().info['GL_RENDERER'])"
+)
 
 
 def answer(code, **environment):

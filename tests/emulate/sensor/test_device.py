@@ -7,10 +7,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from share.geometry import se3
-from share.lab.emulate.sensor.device import Device
-from share.lab.emulate.sensor.effects import NONE, Effects, parse
+from share.lab.emulate.sensor.device import EmulatedDevice
+from share.lab.emulate.sensor.effects import NO_EFFECTS, Effects, parse_effects
 from share.lab.emulate.types import GRAVITY
-from share.sensors.profile import profile
+from share.sensors.profile import load_profile
 from share.sensors.stamps import WRAP_NS
 from share.types import ImuBatch
 
@@ -99,7 +99,7 @@ def integrate(batch: ImuBatch, path: Loop):
         k3 = slope(state + h / 2 * k2, middle[k])
         state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(state + h * k3, known[k + 1]))
     T = path.poses(batch.stamps_ns[-1:])[0]
-    return np.linalg.norm(state[:, 4] - T[:3, 3]), np.rad2deg(se3.angle(T[:3, :3].T @ state[:, :3]))
+    return np.linalg.norm(state[:, 4] - T[:3, 3]), np.rad2deg(se3.rotation_angle(T[:3, :3].T @ state[:, :3]))
 
 
 @pytest.mark.parametrize(
@@ -107,8 +107,8 @@ def integrate(batch: ImuBatch, path: Loop):
 )
 def test_a_perfect_imu_integrated_from_the_true_start_ends_at_the_true_pose(name, rates):
     path = Loop()
-    device = Device(profile(name, None, *rates), NONE, (3,), START)
-    batch = device.imu(path).joined()
+    device = EmulatedDevice(load_profile(name, None, *rates), NO_EFFECTS, (3,), START)
+    batch = device.imu_streams(path).to_batch()
     ten = batch.stamps_ns <= batch.stamps_ns[0] + 10 * S
     metres, degrees = integrate(batch.take(ten), path)
     assert metres < 0.001 and degrees < 0.01
@@ -116,36 +116,40 @@ def test_a_perfect_imu_integrated_from_the_true_start_ends_at_the_true_pose(name
 
 def test_a_real_imu_does_not():
     path = Loop()
-    batch = Device(profile("d435i"), Effects(), (3,), START).imu(path).joined()
+    batch = EmulatedDevice(load_profile("d435i"), Effects(), (3,), START).imu_streams(path).to_batch()
     metres, degrees = integrate(batch, path)
     assert metres > 0.1 and degrees > 0.05
 
 
 def test_gyro_and_accel_are_streams_of_their_own_unless_the_device_joins_them():
-    streams = Device(profile("d435i"), NONE, (3,), START).imu(Loop())
+    streams = EmulatedDevice(load_profile("d435i"), NO_EFFECTS, (3,), START).imu_streams(Loop())
     assert np.unique(np.diff(streams.gyro_ns)).tolist() == [2_500_000]
     assert np.unique(np.diff(streams.accel_ns)).tolist() == [4_000_000]
     assert (streams.gyro_ns % 1000 == 0).all()
     assert len(np.intersect1d(streams.gyro_ns, streams.accel_ns)) == 0
-    joined = Device(profile("euroc"), NONE, (3,), START).imu(Loop())
+    joined = EmulatedDevice(load_profile("euroc"), NO_EFFECTS, (3,), START).imu_streams(Loop())
     assert np.array_equal(joined.gyro_ns, joined.accel_ns)
-    pictures = Device(profile("euroc"), NONE, (3,), START).pictures(START, START + S)
+    pictures = EmulatedDevice(load_profile("euroc"), NO_EFFECTS, (3,), START).picture_times(START, START + S)
     assert np.isin(pictures.stamp_ns, joined.gyro_ns).all()
 
 
 def test_a_recorded_imu_is_left_untouched(rng):
     stamps = START + np.arange(100) * 5_000_000
     recorded = ImuBatch(stamps, rng.normal(size=(100, 3)), rng.normal(size=(100, 3)))
-    batch = Device(profile("euroc"), Effects(), (3,), START).imu(Loop(recorded=recorded)).joined()
+    batch = (
+        EmulatedDevice(load_profile("euroc"), Effects(), (3,), START)
+        .imu_streams(Loop(recorded=recorded))
+        .to_batch()
+    )
     assert np.array_equal(batch.stamps_ns, stamps)
     assert np.array_equal(batch.gyro, recorded.gyro) and np.array_equal(batch.accel, recorded.accel)
 
 
 def test_time_offset_is_kalibrs_t_imu_is_t_cam_plus_shift():
     for shift in (8.0, -15.0):
-        pictures = Device(profile("euroc"), parse([f"time_offset_ms={shift}"]), (3,), START).pictures(
-            START, START + S
-        )
+        pictures = EmulatedDevice(
+            load_profile("euroc"), parse_effects([f"time_offset_ms={shift}"]), (3,), START
+        ).picture_times(START, START + S)
         assert np.array_equal(pictures.true_ns, pictures.stamp_ns + round(shift * 1e6))
 
 
@@ -153,7 +157,9 @@ def test_time_offset_is_kalibrs_t_imu_is_t_cam_plus_shift():
 def test_pictures_are_taken_and_stamped_later_than_the_clock_says_by_their_phase(name):
     """So that no IMU sample is of the moment of a picture."""
     whole, later = (
-        Device(profile(name), parse(["none", *more]), (3,), START).pictures(START, START + S)
+        EmulatedDevice(load_profile(name), parse_effects(["none", *more]), (3,), START).picture_times(
+            START, START + S
+        )
         for more in ([], ["camera_phase_ms=1.7"])
     )
     common = len(later) - 1
@@ -162,10 +168,14 @@ def test_pictures_are_taken_and_stamped_later_than_the_clock_says_by_their_phase
 
 
 def test_frames_keep_number_time_and_stamp_whatever_span_is_asked_for():
-    effects = parse(["drops=0.2", "drop_burst=2", "jitter_ms=1", "clock_drift_ppm=15", "clock_offset_ms=-3"])
-    device = Device(profile("d435i"), effects, (4,), START)
-    whole = device.pictures(START, START + 60 * S)
-    part = Device(profile("d435i"), effects, (4,), START).pictures(START + 20 * S, START + 30 * S)
+    effects = parse_effects(
+        ["drops=0.2", "drop_burst=2", "jitter_ms=1", "clock_drift_ppm=15", "clock_offset_ms=-3"]
+    )
+    device = EmulatedDevice(load_profile("d435i"), effects, (4,), START)
+    whole = device.picture_times(START, START + 60 * S)
+    part = EmulatedDevice(load_profile("d435i"), effects, (4,), START).picture_times(
+        START + 20 * S, START + 30 * S
+    )
     here = np.isin(whole.index, part.index)
     for name in ("index", "true_ns", "stamp_ns"):
         assert np.array_equal(getattr(whole, name)[here], getattr(part, name))
@@ -176,61 +186,70 @@ def test_frames_keep_number_time_and_stamp_whatever_span_is_asked_for():
 
 
 def test_two_devices_do_not_sample_at_the_same_moments():
-    a, b = (Device(profile("d435i"), NONE, (seed,), START).pictures(START, START + S) for seed in (1, 2))
+    a, b = (
+        EmulatedDevice(load_profile("d435i"), NO_EFFECTS, (seed,), START).picture_times(START, START + S)
+        for seed in (1, 2)
+    )
     assert abs(int(a.true_ns[0] - b.true_ns[0])) > 100_000
 
 
 def test_stamps_wrap_as_the_d4xx_does_and_truth_knows_when_they_were():
-    effects = parse(["none", "wrap=on", "clock_offset_ms=1.5"])
+    effects = parse_effects(["none", "wrap=on", "clock_offset_ms=1.5"])
     origin = START // WRAP_NS * WRAP_NS - 5 * S  # wraps after 5 s
-    device = Device(profile("d435i"), effects, (4,), origin)
-    pictures = device.pictures(origin, origin + 10 * S)
+    device = EmulatedDevice(load_profile("d435i"), effects, (4,), origin)
+    pictures = device.picture_times(origin, origin + 10 * S)
     assert pictures.stamp_ns.max() < WRAP_NS and (np.diff(pictures.stamp_ns) < 0).sum() == 1
     true_ns, repaired = device.truth_times(pictures)
     assert (np.diff(repaired) > 0).all()
     assert np.abs(true_ns - pictures.true_ns).max() < 1000
-    batch = device.imu(Loop(start_ns=origin, end_ns=origin + 10 * S)).joined()
+    batch = device.imu_streams(Loop(start_ns=origin, end_ns=origin + 10 * S)).to_batch()
     assert (np.diff(batch.stamps_ns) < 0).sum() == 1 and len(batch) > 3980
 
 
 def test_exposure_follows_the_light_and_off_leaves_it_alone():
     times = START + np.arange(300) * 33_333_333
     seen = np.full(300, 60.0)
-    device = Device(profile("d435i"), parse(["lamp_every_s=2"]), (4,), START, (9,))
-    shots = device.shots(times, seen)
+    device = EmulatedDevice(load_profile("d435i"), parse_effects(["lamp_every_s=2"]), (4,), START, (9,))
+    shots = device.exposures(times, seen)
     assert len(np.unique(shots.light)) > 3 and len(np.unique(shots.exposure_ms * shots.gain)) > 10
-    other = Device(profile("d435i"), parse(["lamp_every_s=2"]), (5,), START, (9,))
-    assert np.array_equal(other.shots(times, seen).light, shots.light)  # the room's lamps, not the device's
-    fixed = Device(profile("d435i"), parse(["exposure=off"]), (4,), START).shots(times, seen)
+    other = EmulatedDevice(load_profile("d435i"), parse_effects(["lamp_every_s=2"]), (5,), START, (9,))
+    assert np.array_equal(
+        other.exposures(times, seen).light, shots.light
+    )  # the room's lamps, not the device's
+    fixed = EmulatedDevice(load_profile("d435i"), parse_effects(["exposure=off"]), (4,), START).exposures(
+        times, seen
+    )
     assert (fixed.exposure_ms == 8.0).all() and (fixed.gain == 1).all() and (fixed.light == 1).all()
 
 
 def test_pictures_come_out_at_the_target_brightness():
-    device = Device(profile("d435i"), Effects(), (4,), START)
+    device = EmulatedDevice(load_profile("d435i"), Effects(), (4,), START)
     for radiance in (15.0, 60.0, 240.0):
-        shot = device.shots(np.array([START]), np.array([radiance]))[0]
-        picture = device.develop(np.full((480, 640), radiance, np.float32), 0, 0, shot)
+        shot = device.exposures(np.array([START]), np.array([radiance]))[0]
+        picture = device.develop_image(np.full((480, 640), radiance, np.float32), 0, 0, shot)
         assert abs(picture.mean() - 100) < 3
 
 
 def test_an_exposure_ends_before_the_next_picture():
-    dark = Device(profile("d435i", "640x480@90"), Effects(), (4,), START).shots(
+    dark = EmulatedDevice(load_profile("d435i", "640x480@90"), Effects(), (4,), START).exposures(
         np.array([START]), np.array([5.0])
     )
     assert dark.exposure_ms[0] == pytest.approx(10.0) and dark.gain[0] > 10
 
 
 def test_blur_off_draws_one_sharp_picture():
-    sharp = Device(profile("d435i"), parse(["blur=off"]), (4,), START)
-    blurred = Device(profile("d435i"), Effects(), (4,), START)
-    shot = blurred.shots(np.array([START]), np.array([60.0]))[0]
+    sharp = EmulatedDevice(load_profile("d435i"), parse_effects(["blur=off"]), (4,), START)
+    blurred = EmulatedDevice(load_profile("d435i"), Effects(), (4,), START)
+    shot = blurred.exposures(np.array([START]), np.array([60.0]))[0]
     assert len(sharp.blur_offsets(shot, 20.0)) == 1 and len(blurred.blur_offsets(shot, 20.0)) == 16
 
 
 def test_cameras_of_one_device_and_devices_differ_in_their_noise():
     even = np.full((480, 640), 100, np.float32)
-    a, b = (Device(profile("d435i"), Effects(), (seed,), START) for seed in (1, 2))
-    left = a.develop(even, 5, 0)
-    assert np.array_equal(left, Device(profile("d435i"), Effects(), (1,), START).develop(even, 5, 0))
-    assert (left != a.develop(even, 5, 1)).mean() > 0.4
-    assert (left != b.develop(even, 5, 0)).mean() > 0.4
+    a, b = (EmulatedDevice(load_profile("d435i"), Effects(), (seed,), START) for seed in (1, 2))
+    left = a.develop_image(even, 5, 0)
+    assert np.array_equal(
+        left, EmulatedDevice(load_profile("d435i"), Effects(), (1,), START).develop_image(even, 5, 0)
+    )
+    assert (left != a.develop_image(even, 5, 1)).mean() > 0.4
+    assert (left != b.develop_image(even, 5, 0)).mean() > 0.4

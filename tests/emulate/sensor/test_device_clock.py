@@ -1,19 +1,25 @@
 import numpy as np
 import pytest
 
-from share.lab.emulate.sensor.clock import DeviceClock, Stream, dropped, jitter, unwrapped
+from share.lab.emulate.sensor.clock import (
+    DeviceClock,
+    SampleStream,
+    dropped_mask,
+    stamp_jitter_ns,
+    unwrapped_stamps,
+)
 
 
 def test_a_stream_keeps_its_rate_and_is_the_same_in_every_span():
-    stream = Stream(30.0, 10**18 + 7)
-    index, true = stream.times(10**18, 10**18 + 3600 * 10**9)
+    stream = SampleStream(30.0, 10**18 + 7)
+    index, true = stream.sample_times(10**18, 10**18 + 3600 * 10**9)
     assert len(index) == 108_000
     assert true[0] == 10**18 + 7
     assert np.abs(true - (true[0] + index * 1e9 / 30)).max() < 200  # float64 spacing near 1e18 is 128
-    part, at = stream.times(int(true[500]), int(true[800]))
+    part, at = stream.sample_times(int(true[500]), int(true[800]))
     assert np.array_equal(part, np.arange(500, 801))
     assert np.array_equal(at, true[500:801])
-    assert len(stream.times(0, 10**9)[0]) == 0
+    assert len(stream.sample_times(0, 10**9)[0]) == 0
 
 
 def test_the_clock_gains_its_drift_and_wraps_at_32_bits_of_microseconds():
@@ -25,23 +31,23 @@ def test_the_clock_gains_its_drift_and_wraps_at_32_bits_of_microseconds():
     assert (shown % 1000 == 0).all()
     wrapped = DeviceClock(10**18, 5_000_000, 20.0, 1000, 32).read(true)
     assert (wrapped < 2**32 * 1000).all() and (np.diff(wrapped) < 0).sum() in (2, 3)
-    counted = unwrapped(wrapped, 2**32 * 1000)
+    counted = unwrapped_stamps(wrapped, 2**32 * 1000)
     assert np.array_equal(np.diff(counted), np.diff(shown))
 
 
 @pytest.mark.parametrize(("share", "burst"), [(0.02, 1.0), (0.1, 1.0), (0.1, 4.0), (0.5, 3.0)])
 def test_frames_drop_at_the_rate_and_in_the_bursts_asked_for(share: float, burst: float):
-    lost = dropped((3,), np.arange(200_000), share, burst)
+    lost = dropped_mask((3,), np.arange(200_000), share, burst)
     assert abs(lost.mean() / share - 1) < 0.05
     runs = lost.sum() / (np.diff(lost.astype(int)) == 1).sum()
     alone = burst / (1 - share)  # bursts that touch or overlap make longer ones
     assert burst * 0.95 < runs < alone * 1.6
-    assert np.array_equal(dropped((3,), np.arange(70_000, 70_100), share, burst), lost[70_000:70_100])
-    assert not dropped((3,), np.arange(100), 0.0, 1.0).any()
+    assert np.array_equal(dropped_mask((3,), np.arange(70_000, 70_100), share, burst), lost[70_000:70_100])
+    assert not dropped_mask((3,), np.arange(100), 0.0, 1.0).any()
 
 
 def test_jitter_has_its_sigma_and_never_lets_stamps_overtake():
-    error = jitter((1,), np.arange(50_000), 1e6, 30.0)
+    error = stamp_jitter_ns((1,), np.arange(50_000), 1e6, 30.0)
     assert abs(error.std() / 1e6 - 1) < 0.03
-    wild = jitter((1,), np.arange(50_000), 20e6, 30.0)
+    wild = stamp_jitter_ns((1,), np.arange(50_000), 20e6, 30.0)
     assert (np.diff(np.arange(50_000) * 1e9 / 30 + wild) > 0).all()

@@ -3,14 +3,14 @@ import dataclasses
 import pytest
 
 from share.errors import UsageError
-from share.lab.emulate.sensor.effects import NONE, Effects, parse
+from share.lab.emulate.sensor.effects import NO_EFFECTS, Effects, parse_effects
 
 
 def test_words_change_single_effects():
-    effects = parse(["noise=off", "drops=0.02", "time_offset_ms=-8"])
+    effects = parse_effects(["noise=off", "drops=0.02", "time_offset_ms=-8"])
     assert effects == Effects(noise=False, drops=0.02, time_offset_ms=-8.0)
-    assert parse(["none", "noise=on"]) == dataclasses.replace(NONE, noise=True)
-    assert not any(value is True for value in dataclasses.asdict(NONE).values())
+    assert parse_effects(["none", "noise=on"]) == dataclasses.replace(NO_EFFECTS, noise=True)
+    assert not any(value is True for value in dataclasses.asdict(NO_EFFECTS).values())
 
 
 @pytest.mark.parametrize(
@@ -28,7 +28,7 @@ def test_words_change_single_effects():
 )
 def test_what_makes_no_sense_is_refused_in_one_line(word: str, says: str):
     with pytest.raises(UsageError, match=r"^effect ") as refused:
-        parse([word])
+        parse_effects([word])
     assert says in str(refused.value) and "\n" not in str(refused.value)
 
 

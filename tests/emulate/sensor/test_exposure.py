@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from share.lab.emulate.sensor.exposure import auto_exposure, blur_offsets, lamp
+from share.lab.emulate.sensor.exposure import auto_exposure, blur_offsets, lamp_light
 from share.sensors.profile_types import ExposureModel
 
 MODEL = ExposureModel(target=100, delay_frames=2, damping=0.5, step=0.03, longest_ms=16)
@@ -44,14 +44,14 @@ def test_exposure_of_no_pictures():
 
 def test_lamps_switch_as_often_as_asked_whatever_is_asked_about():
     since = np.arange(0, 600 * 10**9, 10**8)
-    light = lamp((4,), since, 5.0, 1.5)
+    light = lamp_light((4,), since, 5.0, 1.5)
     switchings = (np.diff(light) != 0).sum()
     assert 90 < switchings < 150
     assert 2**-1.5 <= light.min() < 0.6 and 1.6 < light.max() <= 2**1.5
     assert light[0] == 1
     part = since[300:400]
-    assert np.array_equal(lamp((4,), part, 5.0, 1.5), light[300:400])
-    assert (lamp((4,), since, 0.0, 1.5) == 1).all()
+    assert np.array_equal(lamp_light((4,), part, 5.0, 1.5), light[300:400])
+    assert (lamp_light((4,), since, 0.0, 1.5) == 1).all()
 
 
 def test_blur_is_sampled_finely_enough_about_the_stamp():

@@ -3,15 +3,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from share.lab.emulate.sensor.exposure import Shot
-from share.lab.emulate.sensor.photometry import Imager, vignette
-from share.sensors.profile import profile
+from share.lab.emulate.sensor.exposure import Exposure
+from share.lab.emulate.sensor.photometry import Imager, vignetting_gain
+from share.sensors.profile import load_profile
 
-PROFILE = profile("d435i")
+PROFILE = load_profile("d435i")
 CAMERA = PROFILE.mode.cameras()[0]
 MODEL = PROFILE.emulation.camera
 EVEN = replace(MODEL, pixel_gain=0.0, pixel_offset_e=0.0)
-REFERENCE = Shot(MODEL.reference_ms)
+REFERENCE = Exposure(MODEL.reference_ms)
 
 
 def imager(model=MODEL, seed=(1, 0), noise=True, vignetting=False, blur=False):
@@ -82,12 +82,12 @@ def test_fixed_pattern_stays_while_noise_averages_out():
 
 
 def test_vignetting_is_one_in_the_middle_and_as_stated_in_the_corner():
-    light = vignette(CAMERA, 0.6)
+    light = vignetting_gain(CAMERA, 0.6)
     assert abs(light.max() - 1) < 1e-4
     corners = light[[0, 0, -1, -1], [0, -1, 0, -1]]
     assert abs(corners.min() - 0.6) < 1e-6 and corners.max() < 0.61
     assert (np.diff(light[240, 330:]) < 0).all()
-    assert (vignette(CAMERA, 1.0) == 1).all()
+    assert (vignetting_gain(CAMERA, 1.0) == 1).all()
 
 
 def test_the_lens_blurs_by_its_psf_and_keeps_the_light():

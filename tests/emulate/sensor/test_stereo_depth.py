@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from share.errors import ConfigError
-from share.lab.emulate.sensor.device import Device
-from share.lab.emulate.sensor.effects import parse
-from share.lab.emulate.sensor.exposure import Shot
-from share.sensors.profile import profile
+from share.lab.emulate.sensor.device import EmulatedDevice
+from share.lab.emulate.sensor.effects import parse_effects
+from share.lab.emulate.sensor.exposure import Exposure
+from share.sensors.profile import load_profile
 
-PROFILE = profile("d435i")
+PROFILE = load_profile("d435i")
 FOCAL_BASELINE = 385.0 * 0.05  # px m
-DEVICE = Device(PROFILE, parse(["vignetting=off", "lens_blur=off"]), (5,))
+DEVICE = EmulatedDevice(PROFILE, parse_effects(["vignetting=off", "lens_blur=off"]), (5,))
 INNER = (slice(20, -20), slice(90, -20))
 
 
@@ -55,7 +55,9 @@ def disparity_of(mm):
 @pytest.mark.parametrize("disparity", [3.3, 7.5, 20.2])
 def test_noise_and_holes_are_those_of_block_matching_from_bare_walls_to_rich_texture(disparity, rng):
     for frame, contrast in enumerate((1, 2, 3, 4, 8, 16, 40)):
-        left, right = (DEVICE.develop(p, frame, i) for i, p in enumerate(surface(rng, disparity, contrast)))
+        left, right = (
+            DEVICE.develop_image(p, frame, i) for i, p in enumerate(surface(rng, disparity, contrast))
+        )
         wall = np.full((480, 640), FOCAL_BASELINE / disparity, np.float32)
         holes_bm, sigma_bm = errors(matched(left, right), disparity)
         holes, sigma = errors(disparity_of(DEVICE.depth_mm(wall, left, frame)), disparity)
@@ -65,7 +67,7 @@ def test_noise_and_holes_are_those_of_block_matching_from_bare_walls_to_rich_tex
 
 
 def test_depth_noise_grows_with_the_square_of_depth(rng):
-    left = DEVICE.develop(surface(rng, 0.0, 20)[0], 0, 0)
+    left = DEVICE.develop_image(surface(rng, 0.0, 20)[0], 0, 0)
     sigma = []
     for z in (1.0, 2.0, 4.0):
         mm = DEVICE.depth_mm(np.full((480, 640), z, np.float32), left, 1)[INNER].astype(float)
@@ -76,7 +78,7 @@ def test_depth_noise_grows_with_the_square_of_depth(rng):
 
 @pytest.fixture
 def texture(rng):
-    return DEVICE.develop(surface(rng, 0.0, 30)[0], 0, 0)
+    return DEVICE.develop_image(surface(rng, 0.0, 30)[0], 0, 0)
 
 
 def test_a_near_thing_has_uncertain_edges_and_hides_what_lies_left_of_it(texture):
@@ -110,13 +112,13 @@ def test_too_near_too_far_and_nothing_are_not_measured(texture):
 
 def test_a_white_wall_is_a_hole_and_gain_makes_more_holes(rng):
     wall = np.full((480, 640), 2, np.float32)
-    bare = DEVICE.develop(np.full((480, 640), 100, np.float32), 0, 0)
+    bare = DEVICE.develop_image(np.full((480, 640), 100, np.float32), 0, 0)
     assert (DEVICE.depth_mm(wall, bare, 0) == 0).mean() > 0.95
     weak = surface(rng, 0.0, 4)[0]
     holes = []
     for gain in (1.0, 4.0):
-        shot = Shot(8.0 / gain, gain)  # the same gray levels from fewer electrons
-        holes.append((DEVICE.depth_mm(wall, DEVICE.develop(weak, 0, 0, shot), 0, shot) == 0).mean())
+        shot = Exposure(8.0 / gain, gain)  # the same gray levels from fewer electrons
+        holes.append((DEVICE.depth_mm(wall, DEVICE.develop_image(weak, 0, 0, shot), 0, shot) == 0).mean())
     assert holes[0] < 0.15 and holes[1] > 0.6
 
 
@@ -125,12 +127,12 @@ def test_depth_belongs_to_the_frame_not_to_the_order_of_calls(texture):
     first = DEVICE.depth_mm(depth, texture, 3)
     other = DEVICE.depth_mm(depth, texture, 4)
     assert np.array_equal(first, DEVICE.depth_mm(depth, texture, 3))
-    assert np.array_equal(first, Device(PROFILE, DEVICE.effects, (5,)).depth_mm(depth, texture, 3))
+    assert np.array_equal(first, EmulatedDevice(PROFILE, DEVICE.effects, (5,)).depth_mm(depth, texture, 3))
     assert (first != other).mean() > 0.5
 
 
 def test_without_noise_depth_is_exact_to_the_millimetre(texture):
-    exact = Device(PROFILE, parse(["depth_noise=off"]))
+    exact = EmulatedDevice(PROFILE, parse_effects(["depth_noise=off"]))
     depth = np.linspace(0.2, 11, 480 * 640, dtype=np.float32).reshape(480, 640)
     mm = exact.depth_mm(depth, texture, 0)
     inside = (depth >= 0.28) & (depth <= 10)
@@ -151,4 +153,4 @@ def test_the_model_is_quick_enough_for_recording(texture):
 
 def test_a_device_without_depth_says_so(texture):
     with pytest.raises(ConfigError, match="profile 'euroc': its device measures no depth"):
-        Device(profile("euroc")).depth_mm(np.ones((480, 752), np.float32), texture, 0)
+        EmulatedDevice(load_profile("euroc")).depth_mm(np.ones((480, 752), np.float32), texture, 0)

@@ -3,8 +3,8 @@
 import pytest
 from smallroom import small_room
 
-from share.lab.emulate.types import Room
-from share.lab.emulate.world.build import build
+from share.lab.emulate.types import DrawableRoom
+from share.lab.emulate.world.build import build_room
 from share.lab.emulate.world.layout import Layout
 
 
@@ -14,5 +14,5 @@ def small_layout() -> Layout:
 
 
 @pytest.fixture(scope="session")
-def built(small_layout: Layout) -> Room:
-    return build(small_layout)
+def built(small_layout: Layout) -> DrawableRoom:
+    return build_room(small_layout)

@@ -6,7 +6,7 @@ import numpy as np
 
 from share.lab.emulate.world.layout import Layout, Light, Piece
 from share.lab.emulate.world.materials import Material
-from share.lab.emulate.world.mesh import Shape, box, concat, cylinder, decal, panels
+from share.lab.emulate.world.mesh import Shape, box, concat_shapes, cylinder, decal, panels
 
 SIZE = (5.0, 4.0, 3.0)
 
@@ -18,7 +18,7 @@ def table(rng: np.random.Generator) -> Shape:
         for x in (0.0, 1.55)
         for y in (0.0, 0.75)
     ]
-    return concat([top, *legs])
+    return concat_shapes([top, *legs])
 
 
 def shell(rng: np.random.Generator) -> tuple[Piece, ...]:
@@ -37,7 +37,7 @@ def shell(rng: np.random.Generator) -> tuple[Piece, ...]:
 def small_room(seed: int = 1) -> Layout:
     rng = np.random.default_rng((seed, 77))
     pieces = (
-        Piece("table", table(rng).at(0.5, 0.5)),
+        Piece("table", table(rng).placed_at(0.5, 0.5)),
         Piece("box", box((3.0, 2.0, 0.0), (4.0, 3.0, 1.0), Material("cardboard"), rng)),
         Piece("pole", cylinder((1.0, 3.0, 0), 0.1, 3.0, Material("concrete"), Material("concrete"))),
         Piece(

@@ -5,15 +5,15 @@ import pytest
 
 from share.geometry import se3
 from share.lab.calibrate.target import AprilGrid, CharucoBoard
-from share.lab.emulate.world.furniture.board import BLACK, WHITE, sheet
-from share.lab.emulate.world.scenes import layout
+from share.lab.emulate.world.furniture.board import BLACK, WHITE, printed_sheet
+from share.lab.emulate.world.scenes import make_scene_layout
 
 TARGETS = [AprilGrid(), AprilGrid(5, 7, 0.08, 0.28), CharucoBoard()]
 
 
 def tiles(target):
     """Of each tile its picture, the place (2,) m of the picture's upper left corner, and m a texel."""
-    shape, _ = sheet(target)
+    shape, _ = printed_sheet(target)
     mesh, out = shape.mesh, []
     for k, material in enumerate(shape.materials):
         at = np.flatnonzero(mesh.layer == k)
@@ -52,25 +52,25 @@ def test_edges_of_the_usual_grid_lie_between_texels():
 
 @pytest.mark.parametrize(("name", "target"), [("board", AprilGrid()), ("charuco-board", CharucoBoard())])
 def test_the_board_stands_where_the_layout_says(name, target):
-    room = layout(name, 3)
+    room = make_scene_layout(name, 3)
     assert room.target.target == target
     board = next(piece for piece in room.shell if piece.name.startswith("board"))
     low, high = target.extent
     ends = np.array([(*low, 0), (*high, 0), (low[0], high[1], 0), (high[0], low[1], 0)])
     inside = se3.transform(room.target.T_world_target, ends)
-    assert (inside > board.bounds[0] - 1e-6).all()
-    assert (inside < board.bounds[1] + 1e-6).all()
+    assert (inside > board.bounding_box[0] - 1e-6).all()
+    assert (inside < board.bounding_box[1] + 1e-6).all()
     assert room.target.T_world_target[0, 2] > 0.9  # it looks into the room
     assert room.target.T_world_target[2, 1] > 0.9  # and stands upright
 
 
 def test_another_seed_places_it_otherwise():
-    poses = [layout("board", seed).target.T_world_target for seed in (1, 1, 2)]
+    poses = [make_scene_layout("board", seed).target.T_world_target for seed in (1, 1, 2)]
     np.testing.assert_array_equal(poses[0], poses[1])
-    assert np.degrees(se3.angle(se3.inverse(poses[0]) @ poses[2])) > 0.5
+    assert np.degrees(se3.rotation_angle(se3.inverse(poses[0]) @ poses[2])) > 0.5
 
 
 def test_no_path_removes_the_board():
-    room = layout("board", 1)
+    room = make_scene_layout("board", 1)
     left, _ = room.without(room.target.T_world_target[None, :3, 3], 0.5)
-    assert any(piece.name.startswith("board") for piece in left.everything)
+    assert any(piece.name.startswith("board") for piece in left.all_pieces)

@@ -11,7 +11,7 @@ from scipy.ndimage import label
 from share.errors import UsageError
 from share.lab.emulate.world.layout import Layout, Piece
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.emulate.world.scenes import SCENES, corridor, layout
+from share.lab.emulate.world.scenes import SCENES, corridor, make_scene_layout
 from share.types import F64
 
 CLEARANCE = 0.45  # m
@@ -22,12 +22,12 @@ ROOMS = ("warehouse", "firestation", "corridor-twins", "whitewall")
 
 @cache
 def rooms(name: str) -> list[Layout]:
-    return [layout(name, seed) for seed in SEEDS]
+    return [make_scene_layout(name, seed) for seed in SEEDS]
 
 
 def free_share(room: Layout) -> tuple[float, float]:
     """Share of the floor that is one connected place to walk, and the share of all free floor in it."""
-    distance, _, step = Occupancy.of(room, 0.1).floor_clearance(0.1, 1.9)
+    distance, _, step = Occupancy.from_layout(room, 0.1).floor_clearance(0.1, 1.9)
     places, _ = label(distance >= CLEARANCE)
     areas = np.bincount(places.ravel())[1:] * step**2
     return areas.max() / (room.size[0] * room.size[1]), areas.max() / areas.sum()
@@ -36,15 +36,15 @@ def free_share(room: Layout) -> tuple[float, float]:
 def described(room: Layout) -> list[tuple[str, bytes, bytes, bytes]]:
     return [
         (p.name, p.shape.mesh.vertices.tobytes(), p.shape.mesh.uv.tobytes(), repr(p.shape.materials).encode())
-        for p in room.everything
+        for p in room.all_pieces
     ]
 
 
 @pytest.mark.parametrize("name", ROOMS)
 def test_everything_is_inside_the_room(name: str) -> None:
     for room in rooms(name):
-        for piece in room.everything:
-            low, high = piece.bounds
+        for piece in room.all_pieces:
+            low, high = piece.bounding_box
             assert (low >= -2e-3).all(), (room.seed, piece.name)
             assert (high <= np.array(room.size) + 2e-3).all(), (room.seed, piece.name)
         for light in room.lights:
@@ -54,7 +54,7 @@ def test_everything_is_inside_the_room(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROOMS)
 def test_the_same_seed_gives_the_same_room_and_another_seed_another(name: str) -> None:
-    assert described(layout(name, 3)) == described(rooms(name)[3])
+    assert described(make_scene_layout(name, 3)) == described(rooms(name)[3])
     shapes = {tuple(described(room)) for room in rooms(name)}
     assert len(shapes) == len(SEEDS)
 
@@ -69,13 +69,13 @@ def test_solid_things_do_not_pass_through_each_other(name: str) -> None:
         solid = [p for p in room.pieces if p.solid]
         carriers = [p for p in room.shell if p.name.split()[0] in ("column", "girder", "pillar")]
         for i, piece in enumerate(solid):
-            clash = [p.name for p in solid[:i] + carriers if not apart(piece.bounds, p.bounds)]
+            clash = [p.name for p in solid[:i] + carriers if not apart(piece.bounding_box, p.bounding_box)]
             assert clash == [], (room.seed, piece.name)
 
 
 def touches_wall(piece: Piece, walls: F64) -> bool:
     """Whether a piece reaches one of the upright planes (W, 2): axis, place."""
-    return any(np.abs(piece.bounds[:, int(axis)] - at).min() < 0.02 for axis, at in walls)
+    return any(np.abs(piece.bounding_box[:, int(axis)] - at).min() < 0.02 for axis, at in walls)
 
 
 @pytest.mark.parametrize("name", ROOMS)
@@ -85,12 +85,12 @@ def test_nothing_floats(name: str) -> None:
         x, y, z = room.size
         walls = [(0, 0), (0, x), (1, 0), (1, y)]
         if name == "corridor-twins":
-            wide, end = corridor.widths(room.size)
+            wide, end = corridor.corridor_widths(room.size)
             walls += [(0, end), (0, x - end), (1, wide), (1, y - wide)]
         for piece in room.pieces:
-            low, high = piece.bounds[:, 2]
+            low, high = piece.bounding_box[:, 2]
             held = low < 0.025 or high > z - 0.02 or touches_wall(piece, np.array(walls))
-            assert held, (room.seed, piece.name, piece.bounds)
+            assert held, (room.seed, piece.name, piece.bounding_box)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_nothing_floats(name: str) -> None:
 )
 def test_one_can_walk_round(name: str, size: tuple[float, float, float] | None, least: float) -> None:
     for seed in range(4):
-        share, connected = free_share(layout(name, seed, size) if size else rooms(name)[seed])
+        share, connected = free_share(make_scene_layout(name, seed, size) if size else rooms(name)[seed])
         assert share >= least, seed
         assert connected > 0.97, seed
 
@@ -114,18 +114,18 @@ def test_one_can_walk_round(name: str, size: tuple[float, float, float] | None, 
 @pytest.mark.parametrize("name", ["warehouse", "firestation"])
 def test_one_can_walk_round_in_every_small_room(name: str) -> None:
     for seed in range(60):
-        share, connected = free_share(layout(name, seed, SMALL))
+        share, connected = free_share(make_scene_layout(name, seed, SMALL))
         assert share >= 0.35, seed
         assert connected > 0.97, seed
 
 
 @pytest.mark.slow
 def test_a_large_warehouse_holds_more_things_not_larger_ones() -> None:
-    small, large = rooms("warehouse")[1], layout("warehouse", 1, (18, 12, 6))
+    small, large = rooms("warehouse")[1], make_scene_layout("warehouse", 1, (18, 12, 6))
     racks = [[p for p in room.pieces if p.name.startswith("rack")] for room in (small, large)]
     assert len(large.pieces) > 1.8 * len(small.pieces)
     assert len(racks[1]) > len(racks[0])
-    assert max(np.ptp(p.bounds[:, :2], axis=0).max() for p in racks[1]) < 2.7
+    assert max(np.ptp(p.bounding_box[:, :2], axis=0).max() for p in racks[1]) < 2.7
     assert free_share(large)[0] > 0.35
 
 
@@ -133,8 +133,8 @@ def test_a_large_warehouse_holds_more_things_not_larger_ones() -> None:
 def test_the_corridors_are_twins(size: tuple[float, float, float] | None) -> None:
     """Every thing in the north corridor has its like in the south one, but for a few small ones."""
     for seed in range(4):
-        room = layout("corridor-twins", seed, size) if size else rooms("corridor-twins")[seed]
-        north, south, T = corridor.twins(room.size)
+        room = make_scene_layout("corridor-twins", seed, size) if size else rooms("corridor-twins")[seed]
+        north, south, T = corridor.twin_corridors(room.size)
         there, here = (contents(room, area) for area in (north, south))
         assert len(there) > 5
         unlike = [b for b in there if min_distance(turned(b, T), here) > 1e-3]
@@ -144,8 +144,8 @@ def test_the_corridors_are_twins(size: tuple[float, float, float] | None) -> Non
 
 
 def test_the_ends_of_the_corridors_differ() -> None:
-    room = layout("corridor-twins", 0)
-    (_, T), (wide, end) = corridor.twins(room.size)[1:], corridor.widths(room.size)
+    room = make_scene_layout("corridor-twins", 0)
+    (_, T), (wide, end) = corridor.twin_corridors(room.size)[1:], corridor.corridor_widths(room.size)
     x, y, _ = room.size
     west, east = (contents(room, np.array([(a, wide), (a + end, y - wide)])) for a in (0.0, x - end))
     assert max(min_distance(turned(b, T), east) for b in west) > 0.1
@@ -153,7 +153,7 @@ def test_the_ends_of_the_corridors_differ() -> None:
 
 def contents(room: Layout, area: F64) -> list[F64]:
     """Bounds of what stands and hangs in an area (2, 2) m of the floor."""
-    boxes = [p.bounds for p in room.pieces if p.solid]
+    boxes = [p.bounding_box for p in room.pieces if p.solid]
     return [b for b in boxes if (b.mean(0)[:2] >= area[0]).all() and (b.mean(0)[:2] <= area[1]).all()]
 
 
@@ -187,17 +187,17 @@ def test_there_is_much_less_in_a_fire_station_and_next_to_nothing_between_white_
 )
 def test_a_size_that_no_such_room_can_have(name: str, size: tuple[float, float, float]) -> None:
     with pytest.raises(UsageError, match=rf"a {name} cannot be .* m: give a size between .* m and .* m"):
-        layout(name, 0, size)
+        make_scene_layout(name, 0, size)
 
 
 def test_an_unknown_scene() -> None:
     with pytest.raises(UsageError, match="no scene is named 'attic'; there are: warehouse, firestation"):
-        layout("attic", 0)
+        make_scene_layout("attic", 0)
 
 
 def test_a_negative_seed() -> None:
     with pytest.raises(ValueError, match="seed -1"):
-        layout("whitewall", -1)
+        make_scene_layout("whitewall", -1)
 
 
 @pytest.mark.parametrize("name", ROOMS)
@@ -206,6 +206,6 @@ def test_the_limits_themselves_are_rooms(name: str, which: str) -> None:
     if (name, which) == ("warehouse", "largest"):
         pytest.skip("takes 10 s; a large warehouse is tested above")
     size = getattr(SCENES[name], which)
-    room = layout(name, 2, size)
+    room = make_scene_layout(name, 2, size)
     assert room.size == tuple(map(float, size))
     assert room.lights

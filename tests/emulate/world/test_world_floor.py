@@ -7,44 +7,44 @@ import pytest
 
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import box
-from share.lab.emulate.world.scenes.floor import clear, walkable
-from share.lab.emulate.world.scenes.plan import Plan
+from share.lab.emulate.world.scenes.floor import clear_floor, walkable_share
+from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder
 
 PAINT = Material("paint")
 
 
 @pytest.fixture
-def plan() -> Plan:
+def plan() -> LayoutBuilder:
     """An empty hall of 10 x 6 m."""
-    return Plan("hall", 0, (10.0, 6.0, 4.0), np.random.default_rng(0))
+    return LayoutBuilder("hall", 0, (10.0, 6.0, 4.0), np.random.default_rng(0))
 
 
-def test_an_empty_hall(plan: Plan) -> None:
+def test_an_empty_hall(plan: LayoutBuilder) -> None:
     """All but 0.45 m along the walls, to a cell of 0.1 m."""
-    assert walkable(plan) == pytest.approx((10 - 0.9) * (6 - 0.9) / 60, abs=0.03)
+    assert walkable_share(plan) == pytest.approx((10 - 0.9) * (6 - 0.9) / 60, abs=0.03)
 
 
-def test_only_what_stands_in_the_way_counts(plan: Plan) -> None:
-    empty = walkable(plan)
-    plan.lay("line", box((2, 2, 0), (8, 4, 0.02), PAINT), solid=True)  # below the feet
-    plan.lay("lamp", box((2, 2, 3), (8, 4, 3.2), PAINT), solid=True)  # above the head
-    plan.lay("shade", box((2, 2, 1), (8, 4, 1.2), PAINT))  # one walks through it
-    assert walkable(plan) == empty
-    plan.lay("van", box((2, 2, 0), (8, 4, 2), PAINT), solid=True)
-    assert walkable(plan) == pytest.approx(empty - 6.9 * 2.9 / 60, abs=0.03)
+def test_only_what_stands_in_the_way_counts(plan: LayoutBuilder) -> None:
+    empty = walkable_share(plan)
+    plan.add_unchecked("line", box((2, 2, 0), (8, 4, 0.02), PAINT), solid=True)  # below the feet
+    plan.add_unchecked("lamp", box((2, 2, 3), (8, 4, 3.2), PAINT), solid=True)  # above the head
+    plan.add_unchecked("shade", box((2, 2, 1), (8, 4, 1.2), PAINT))  # one walks through it
+    assert walkable_share(plan) == empty
+    plan.add_unchecked("van", box((2, 2, 0), (8, 4, 2), PAINT), solid=True)
+    assert walkable_share(plan) == pytest.approx(empty - 6.9 * 2.9 / 60, abs=0.03)
 
 
-def test_a_hall_cut_in_two_has_its_larger_half(plan: Plan) -> None:
-    plan.lay("wall", box((6, 0, 0), (6.2, 6, 2), PAINT), solid=True)
-    assert walkable(plan) == pytest.approx((6 - 0.9) * (6 - 0.9) / 60, abs=0.03)
+def test_a_hall_cut_in_two_has_its_larger_half(plan: LayoutBuilder) -> None:
+    plan.add_unchecked("wall", box((6, 0, 0), (6.2, 6, 2), PAINT), solid=True)
+    assert walkable_share(plan) == pytest.approx((6 - 0.9) * (6 - 0.9) / 60, abs=0.03)
 
 
-def test_the_last_things_of_these_names_go_until_there_is_floor_enough(plan: Plan) -> None:
+def test_the_last_things_of_these_names_go_until_there_is_floor_enough(plan: LayoutBuilder) -> None:
     for k in range(4):
-        plan.lay("gear", box((2 + 2 * k, 0, 0), (2.2 + 2 * k, 5.5, 2), PAINT), solid=True)
-    plan.lay("van", box((0, 5.6, 0), (0.2, 5.8, 2), PAINT), solid=True)
-    clear(plan, 0.3, {"gear"})
+        plan.add_unchecked("gear", box((2 + 2 * k, 0, 0), (2.2 + 2 * k, 5.5, 2), PAINT), solid=True)
+    plan.add_unchecked("van", box((0, 5.6, 0), (0.2, 5.8, 2), PAINT), solid=True)
+    clear_floor(plan, 0.3, {"gear"})
     assert [p.name for p in plan.pieces] == ["gear 0", "gear 1", "van 4"]
-    assert walkable(plan) >= 0.3
-    clear(plan, 0.99, {"gear"})
+    assert walkable_share(plan) >= 0.3
+    clear_floor(plan, 0.99, {"gear"})
     assert [p.name for p in plan.pieces] == ["van 4"]

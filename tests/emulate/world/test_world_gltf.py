@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from share.errors import DataError, UsageError
-from share.lab.emulate.world.build import build
+from share.lab.emulate.world.build import build_room
 from share.lab.emulate.world.gltf import load_gltf
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.emulate.world.pictures import draw_all
+from share.lab.emulate.world.pictures import draw_materials
 
 trimesh: Any = pytest.importorskip("trimesh")
 
@@ -62,22 +62,24 @@ def named(layout: Layout, name: str) -> Any:
 def test_y_up_becomes_z_up_with_the_corner_at_the_origin(hall: Layout) -> None:
     assert hall.name == "hall" and hall.size == pytest.approx((8, 6, 3))
     # x 1.5..2.5, y -1.5..-0.5 (up), z -1.5..-0.5 of the file: y of the room is -z
-    assert named(hall, "box").bounds == pytest.approx(np.array([[5.5, 3.5, 0], [6.5, 4.5, 1]]), abs=1e-6)
+    assert named(hall, "box").bounding_box == pytest.approx(
+        np.array([[5.5, 3.5, 0], [6.5, 4.5, 1]]), abs=1e-6
+    )
 
 
 def test_walls_face_inwards_and_things_outwards(hall: Layout) -> None:
     for name, sign in (("walls", -1), ("box", 1)):
         shape = named(hall, name).shape
-        away = shape.mesh.vertices - shape.bounds.mean(0)
+        away = shape.mesh.vertices - shape.bounding_box.mean(0)
         assert (sign * (away * shape.mesh.normals).sum(1) > 0).all()
         a, b, c = shape.mesh.triangles.swapaxes(0, 1)
         assert ((np.cross(b - a, c - a) * shape.mesh.normals[shape.mesh.faces[:, 0]]).sum(1) > 0).all()
 
 
 def test_colours_become_linear_gray(hall: Layout) -> None:
-    box = draw_all(named(hall, "box").shape.materials, 0)[0]
+    box = draw_materials(named(hall, "box").shape.materials, 0)[0]
     assert box.min() == box.max() == round((0.2126 + 0.7152) * 255)
-    quad = draw_all(named(hall, "quad").shape.materials, 0)[0]
+    quad = draw_materials(named(hall, "quad").shape.materials, 0)[0]
     assert quad[10].mean() == pytest.approx(0.503 * 255, abs=1.5)  # IEC 61966-2-1 of 188
     assert quad[-10].mean() == pytest.approx(0.0452 * 255, abs=1.5)  # of 60
 
@@ -90,10 +92,10 @@ def test_textures_are_upright(hall: Layout) -> None:
 
 
 def test_one_can_stand_in_it_and_it_is_lit(hall: Layout) -> None:
-    occupancy = Occupancy.of(hall)
+    occupancy = Occupancy.from_layout(hall)
     at = np.array([(4.0, 3.0, 1.5), (6.0, 4.0, 0.5)])
     assert occupancy.clearance(at) == pytest.approx([1.5, 0], abs=0.06)
-    room = build(hall)
+    room = build_room(hall)
     assert room.light_map.max() > 120 and np.median(room.light_map[room.light_map > 0]) > 40
 
 
@@ -102,7 +104,7 @@ def test_vertex_colours_are_kept_in_steps(tmp_path: Path) -> None:
     room.visual.vertex_colors = np.tile([128, 128, 128, 255], (8, 1))
     trimesh.Scene(room).export(tmp_path / "gray.glb")
     shape = load_gltf(tmp_path / "gray.glb").shell[0].shape
-    picture = draw_all(shape.materials, 0)[shape.mesh.layer[0]]
+    picture = draw_materials(shape.materials, 0)[shape.mesh.layer[0]]
     assert picture.mean() == pytest.approx(128, abs=9)
 
 

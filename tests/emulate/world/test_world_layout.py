@@ -10,7 +10,7 @@ import pytest
 from share.lab.emulate.world.layout import Layout, Piece
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import box
-from share.lab.emulate.world.proximity import distances, winding
+from share.lab.emulate.world.proximity import triangle_distances, winding_numbers
 
 
 def test_pieces_in_the_way_go_whole_and_are_named(small_layout: Layout) -> None:
@@ -42,7 +42,7 @@ def test_distance_of_points_from_a_triangle() -> None:
     triangle = np.array([[(0, 0, 0), (2, 0, 0), (0, 2, 0)]], float)
     points = np.array([(0.5, 0.5, 3), (-3, 0.5, 0), (3, -1, 0), (2, 2, 0), (1, 1, 0)], float)
     expected = [3, 3, np.sqrt(2), np.sqrt(2), 0]
-    assert distances(triangle, points)[:, 0] == pytest.approx(expected, abs=1e-12)
+    assert triangle_distances(triangle, points)[:, 0] == pytest.approx(expected, abs=1e-12)
 
 
 def test_winding_of_two_overlapping_boxes() -> None:
@@ -52,6 +52,6 @@ def test_winding_of_two_overlapping_boxes() -> None:
             box((1, 1, 1), (3, 3, 3), Material("wood")).mesh.triangles,
         ]
     ).astype(float)
-    assert winding(corners, np.array([(0.5, 0.5, 0.5), (1.5, 1.5, 1.5), (4, 4, 4)])) == pytest.approx(
+    assert winding_numbers(corners, np.array([(0.5, 0.5, 0.5), (1.5, 1.5, 1.5), (4, 4, 4)])) == pytest.approx(
         [1, 2, 0], abs=1e-9
     )

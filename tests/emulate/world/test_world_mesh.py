@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.lab.emulate.world.materials import KINDS, Material
+from share.lab.emulate.world.materials import MATERIAL_KINDS, Material
 from share.lab.emulate.world.mesh import (
-    PROUD,
+    DECAL_OFFSET_M,
     Shape,
     box,
-    concat,
+    concat_shapes,
     cylinder,
     decal,
     panels,
@@ -19,7 +19,7 @@ from share.lab.emulate.world.mesh import (
     quad,
     tube,
 )
-from share.lab.emulate.world.proximity import winding
+from share.lab.emulate.world.proximity import winding_numbers
 
 WOOD = Material("wood")  # one picture a metre
 BEND = [(np.sin(a), np.cos(a), 0.1 * a) for a in np.linspace(0, 3, 30)]  # a hose is bent softly
@@ -43,8 +43,8 @@ def volume(shape: Shape) -> float:
 def test_solids_are_closed_and_face_outwards(name: str) -> None:
     shape, inside, expected = SOLIDS[name]
     corners = shape.mesh.triangles.astype(float)
-    far = shape.bounds[1] + 1
-    assert winding(corners, np.array([inside, far])) == pytest.approx([1, 0], abs=1e-6)
+    far = shape.bounding_box[1] + 1
+    assert winding_numbers(corners, np.array([inside, far])) == pytest.approx([1, 0], abs=1e-6)
     if expected is not None:
         assert volume(shape) == pytest.approx(expected, rel=2e-3)  # 64 sides of a circle
 
@@ -62,7 +62,7 @@ def test_normals_are_those_of_the_faces(name: str) -> None:
 
 
 def test_box_bounds_are_exact() -> None:
-    assert box((1, 2, 3), (2, 4, 6), WOOD).bounds.tolist() == [[1, 2, 3], [2, 4, 6]]
+    assert box((1, 2, 3), (2, 4, 6), WOOD).bounding_box.tolist() == [[1, 2, 3], [2, 4, 6]]
 
 
 def test_box_takes_a_material_by_side_and_leaves_faces_out() -> None:
@@ -91,7 +91,7 @@ def test_box_takes_a_material_by_side_and_leaves_faces_out() -> None:
 )
 def test_surfaces_are_drawn_at_true_scale(shape: Shape) -> None:
     """Two metres of wall are one picture of brick, along and across: no stretching anywhere."""
-    mesh, metres = shape.mesh, KINDS["brick"].metres
+    mesh, metres = shape.mesh, MATERIAL_KINDS["brick"].metres
     for a, b in ((0, 1), (1, 2), (2, 0)):
         i, j = mesh.faces[:, a], mesh.faces[:, b]
         on_mesh = np.linalg.norm(mesh.vertices[i] - mesh.vertices[j], axis=1)
@@ -115,18 +115,18 @@ def test_pictures_stand_upright_and_are_not_mirrored() -> None:
 
 def test_decal_stands_proud_of_its_wall() -> None:
     mesh = decal((1, 2, 1), (-1, 0, 0), (0, 0, 1), Material("sign")).mesh
-    assert mesh.vertices[:, 1] == pytest.approx(2 + PROUD)
+    assert mesh.vertices[:, 1] == pytest.approx(2 + DECAL_OFFSET_M)
     assert mesh.normals[0].tolist() == [0, 1, 0]
 
 
 def test_concat_shares_materials_and_moves_keep_shapes() -> None:
-    one, two = box((0, 0, 0), (1, 1, 1), WOOD), box((2, 0, 0), (3, 1, 1), WOOD).at(0, 0, 5, np.pi / 2)
-    both = concat([one, two])
+    one, two = box((0, 0, 0), (1, 1, 1), WOOD), box((2, 0, 0), (3, 1, 1), WOOD).placed_at(0, 0, 5, np.pi / 2)
+    both = concat_shapes([one, two])
     assert both.materials == (WOOD,)
-    assert two.bounds == pytest.approx(np.array([[-1, 2, 5], [0, 3, 6]]), abs=1e-6)
+    assert two.bounding_box == pytest.approx(np.array([[-1, 2, 5], [0, 3, 6]]), abs=1e-6)
     assert volume(both) == pytest.approx(2)
     with pytest.raises(ValueError, match="no mesh"):
-        concat([])
+        concat_shapes([])
 
 
 def test_an_unknown_material_is_named() -> None:

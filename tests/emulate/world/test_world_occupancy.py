@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from share.lab.emulate.world.layout import Layout
-from share.lab.emulate.world.mesh import concat
-from share.lab.emulate.world.occupancy import STEP, Occupancy
-from share.lab.emulate.world.proximity import distances, winding
+from share.lab.emulate.world.mesh import concat_shapes
+from share.lab.emulate.world.occupancy import STEP_M, Occupancy
+from share.lab.emulate.world.proximity import triangle_distances, winding_numbers
 
 
 @pytest.fixture(scope="module")
 def occupancy(small_layout: Layout) -> Occupancy:
-    return Occupancy.of(small_layout)
+    return Occupancy.from_layout(small_layout)
 
 
 @pytest.mark.parametrize(
@@ -30,20 +30,20 @@ def occupancy(small_layout: Layout) -> Occupancy:
     ],
 )
 def test_known_distances(occupancy: Occupancy, point: tuple[float, float, float], expected: float) -> None:
-    assert occupancy.clearance(np.array([point]))[0] == pytest.approx(expected, abs=0.6 * STEP)
+    assert occupancy.clearance(np.array([point]))[0] == pytest.approx(expected, abs=0.6 * STEP_M)
 
 
 def test_everywhere_as_the_exact_distance_and_rarely_too_large(
     occupancy: Occupancy, small_layout: Layout, rng: np.random.Generator
 ) -> None:
     points = rng.uniform(0, 1, (400, 3)) * small_layout.size
-    shapes = [p.shape for p in small_layout.everything if p.solid]
-    corners = concat(shapes).mesh.triangles.astype(float)
-    held = np.max([winding(s.mesh.triangles.astype(float), points) for s in shapes], axis=0) > 0.5
-    exact = np.where(held, 0, distances(corners, points).min(1))
+    shapes = [p.shape for p in small_layout.all_pieces if p.solid]
+    corners = concat_shapes(shapes).mesh.triangles.astype(float)
+    held = np.max([winding_numbers(s.mesh.triangles.astype(float), points) for s in shapes], axis=0) > 0.5
+    exact = np.where(held, 0, triangle_distances(corners, points).min(1))
     error = occupancy.clearance(points) - exact
-    assert np.abs(error).max() < np.sqrt(3) * STEP
-    assert error.max() < STEP
+    assert np.abs(error).max() < np.sqrt(3) * STEP_M
+    assert error.max() < STEP_M
 
 
 def test_floor_clearance_is_for_the_height_of_the_body(occupancy: Occupancy) -> None:
@@ -56,8 +56,8 @@ def test_floor_clearance_is_for_the_height_of_the_body(occupancy: Occupancy) -> 
 
     assert at(person, 1.3, 0.9) == 0  # a person does not fit under the table
     assert at(robot, 1.3, 0.9) > 0.3  # a robot does
-    assert at(person, 2.5, 2.0) == pytest.approx(0.5, abs=0.6 * STEP)
-    assert at(person, 4.5, 2.5) == pytest.approx(0.5, abs=0.6 * STEP)
+    assert at(person, 2.5, 2.0) == pytest.approx(0.5, abs=0.6 * STEP_M)
+    assert at(person, 4.5, 2.5) == pytest.approx(0.5, abs=0.6 * STEP_M)
     assert robot.shape == (100, 80)
 
 

@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from share.lab.emulate.world.noise import cloud
-from share.lab.emulate.world.stats import (
+from share.lab.emulate.world.image_statistics import (
     HEIGHT,
     WIDTH,
-    comparable,
+    image_statistics,
     mean_statistics,
+    resize_to_standard,
     spectrum_slope,
-    statistics,
 )
+from share.lab.emulate.world.noise import cloud
 
 
 def squares(count: int) -> np.ndarray:
@@ -26,16 +26,16 @@ def squares(count: int) -> np.ndarray:
 
 
 def test_corners_of_squares_are_counted() -> None:
-    found = statistics(squares(15))
+    found = image_statistics(squares(15))
     assert found.fast == 60 and found.gftt == 60  # four each
     assert found.cells == 8 / 64  # one row of cells
-    assert statistics(squares(0)).fast == 0 and statistics(squares(0)).cells == 0
+    assert image_statistics(squares(0)).fast == 0 and image_statistics(squares(0)).cells == 0
 
 
 def test_brightness() -> None:
     image = np.full((HEIGHT, WIDTH), 50, np.uint8)
     image[:, 320:] = 150
-    found = statistics(image)
+    found = image_statistics(image)
     assert (found.mean, found.p5, found.p95, found.sharpness) == (100, 50, 150, 0)
 
 
@@ -48,8 +48,8 @@ def test_the_slope_of_noise_is_found() -> None:
 
 def test_only_images_of_one_size_compare() -> None:
     with pytest.raises(ValueError, match=r"expected \(480, 640\)"):
-        statistics(np.zeros((480, 752), np.uint8))
+        image_statistics(np.zeros((480, 752), np.uint8))
     wide = np.arange(752, dtype=np.uint8)[None].repeat(480, 0)
-    assert np.array_equal(comparable(wide), wide[:, 56:696])
-    assert comparable(np.zeros((960, 1280), np.uint8)).shape == (480, 640)
+    assert np.array_equal(resize_to_standard(wide), wide[:, 56:696])
+    assert resize_to_standard(np.zeros((960, 1280), np.uint8)).shape == (480, 640)
     assert mean_statistics([squares(0), squares(30)]).fast == 60

@@ -7,11 +7,11 @@ import pytest
 
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.emulate.world.views import looking, standing_views
+from share.lab.emulate.world.views import level_camera_pose, standing_views
 
 
 def test_views_are_upright_in_the_open_and_seeded(small_layout: Layout) -> None:
-    occupancy = Occupancy.of(small_layout)
+    occupancy = Occupancy.from_layout(small_layout)
     views = standing_views(occupancy, 1, 40)
     assert (occupancy.clearance(views[:, :3, 3]) > 0.25).all()
     assert views[:, 2, 0] == pytest.approx(0)  # the horizon is level
@@ -22,7 +22,7 @@ def test_views_are_upright_in_the_open_and_seeded(small_layout: Layout) -> None:
 
 
 def test_a_camera_looks_where_it_is_told() -> None:
-    T = looking((1, 2, 3), np.pi / 2, 0.3)
+    T = level_camera_pose((1, 2, 3), np.pi / 2, 0.3)
     assert T[:3, 2] == pytest.approx([0, np.cos(0.3), np.sin(0.3)])
     assert T[:3, 0] == pytest.approx([1, 0, 0]) and T[2, 1] < 0  # right, and down
 

@@ -17,11 +17,11 @@ from share.geometry import se3
 from share.types import F64, I64
 
 ORDER = 6
-EDGE = ORDER - 1  # knots more than there are segments
+EXTRA_KNOTS = ORDER - 1  # knots more than there are segments
 
 
 @cache
-def _matrix() -> F64:
+def _blending_matrix() -> F64:
     """(6, 6): powers of u in each of the cumulative blending functions (Qin, *General matrix representations
     for B-splines*, 2000)."""
     k = ORDER
@@ -40,11 +40,13 @@ def blending(u: F64, derivative: int) -> F64:
     """Cumulative weights (N, 6) at u (N,) in 0 .. 1, or their derivative by u."""
     powers = np.arange(ORDER)
     fall = np.array([factorial(n) / factorial(n - derivative) if n >= derivative else 0.0 for n in powers])
-    return np.asarray((fall * u[:, None] ** np.maximum(powers - derivative, 0)) @ _matrix().T, np.float64)
+    return np.asarray(
+        (fall * u[:, None] ** np.maximum(powers - derivative, 0)) @ _blending_matrix().T, np.float64
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class KnotSpan:
     """Where on a curve: segment (N,), whose knots are segment .. segment + 5, and u (N,) in it."""
 
     segment: I64
@@ -52,14 +54,14 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Turning:
+class RotationSample:
     """R (N, 3, 3) and rate (N, 3) rad/s, in the body. by (N, 6, 3, 3): phi of R Exp(phi) by each knot's;
     rate_by (N, 6, 3, 3)."""
 
     R: F64
     rate: F64
-    by: F64
-    rate_by: F64
+    by_knots: F64
+    rate_by_knots: F64
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,59 +75,61 @@ class Curve:
 
     @property
     def segments(self) -> int:
-        return len(self.p) - EDGE
+        return len(self.p) - EXTRA_KNOTS
 
     @property
     def end_s(self) -> float:
         """Seconds from the start that it covers."""
         return self.segments * self.step_s
 
-    def place(self, stamps_ns: I64, shift_s: float = 0.0) -> Place:
+    def locate(self, stamps_ns: I64, shift_s: float = 0.0) -> KnotSpan:
         """Of stamps (N,), shifted. What lies outside is told by the curve's ends."""
         t = ((stamps_ns - self.start_ns) * 1e-9 + shift_s) / self.step_s
         segment = np.clip(np.floor(t).astype(np.int64), 0, self.segments - 1)
-        return Place(segment, np.clip(t - segment, 0.0, 1.0))
+        return KnotSpan(segment, np.clip(t - segment, 0.0, 1.0))
 
-    def position(self, at: Place, derivative: int = 0) -> tuple[F64, F64]:
+    def position(self, spans: KnotSpan, derivative: int = 0) -> tuple[F64, F64]:
         """p (N, 3) in the world, or its derivative by time, and the weight (N, 6) of each knot in it."""
-        cumulative = blending(at.u, derivative) / self.step_s**derivative
-        weight = cumulative - np.concatenate([cumulative[:, 1:], np.zeros((len(at.u), 1))], axis=1)
-        knots = self.p[at.segment[:, None] + np.arange(ORDER)]
+        cumulative = blending(spans.u, derivative) / self.step_s**derivative
+        weight = cumulative - np.concatenate([cumulative[:, 1:], np.zeros((len(spans.u), 1))], axis=1)
+        knots = self.p[spans.segment[:, None] + np.arange(ORDER)]
         return np.einsum("nk,nki->ni", weight, knots), weight
 
-    def turning(self, at: Place) -> Turning:
-        between = se3.so3_log(self.R[:-1].swapaxes(1, 2) @ self.R[1:])
-        back = np.linalg.inv(se3.so3_right_jacobian(between))
-        pairs = at.segment[:, None] + np.arange(EDGE)
-        share = blending(at.u, 0)[:, 1:, None]
-        pace = blending(at.u, 1)[:, 1:, None, None] / self.step_s
-        step = between[pairs]
+    def rotation(self, spans: KnotSpan) -> RotationSample:
+        increments = se3.so3_log(self.R[:-1].swapaxes(1, 2) @ self.R[1:])
+        inverse_jacobians = np.linalg.inv(se3.so3_right_jacobian(increments))
+        pairs = spans.segment[:, None] + np.arange(EXTRA_KNOTS)
+        share = blending(spans.u, 0)[:, 1:, None]
+        share_rate = blending(spans.u, 1)[:, 1:, None, None] / self.step_s
+        step = increments[pairs]
         A = se3.so3_exp(share * step)
-        bent = se3.so3_right_jacobian(share * step) * share[..., None]
-        rate, rate_by = _rates(A, bent, pace, step)
-        after = _after(A)  # what turns follow each
-        by, rate_by = after[:, 1:] @ bent, after[:, 1:] @ rate_by
-        R = self.R[at.segment] @ after[:, 0].swapaxes(1, 2)
-        out = Turning(R, rate, _by_knots(by, back[pairs]), _by_knots(rate_by, back[pairs]))
-        out.by[:, 0] += after[:, 0]
+        jacobians = se3.so3_right_jacobian(share * step) * share[..., None]
+        rate, rate_by = _rates(A, jacobians, share_rate, step)
+        suffix_products = _suffix_products(A)  # what turns follow each
+        by, rate_by = suffix_products[:, 1:] @ jacobians, suffix_products[:, 1:] @ rate_by
+        R = self.R[spans.segment] @ suffix_products[:, 0].swapaxes(1, 2)
+        out = RotationSample(
+            R, rate, _by_knots(by, inverse_jacobians[pairs]), _by_knots(rate_by, inverse_jacobians[pairs])
+        )
+        out.by_knots[:, 0] += suffix_products[:, 0]
         return out
 
 
-def _rates(A: F64, bent: F64, pace: F64, step: F64) -> tuple[F64, F64]:
+def _rates(A: F64, jacobians: F64, share_rate: F64, step: F64) -> tuple[F64, F64]:
     """Rate (N, 3), and the derivatives (N, 5, 3, 3) of each turn's rate, where it ends, by its step."""
     rate, by = np.zeros((len(A), 3)), np.empty_like(A)
-    for j in range(EDGE):
-        carried = (A[:, j].swapaxes(1, 2) @ rate[..., None])[..., 0]
-        by[:, j] = se3.hat(carried) @ bent[:, j] + pace[:, j] * np.eye(3)
-        rate = carried + pace[:, j, 0] * step[:, j]
+    for j in range(EXTRA_KNOTS):
+        rotated_rate = (A[:, j].swapaxes(1, 2) @ rate[..., None])[..., 0]
+        by[:, j] = se3.hat(rotated_rate) @ jacobians[:, j] + share_rate[:, j] * np.eye(3)
+        rate = rotated_rate + share_rate[:, j, 0] * step[:, j]
     return rate, by
 
 
-def _after(A: F64) -> F64:
+def _suffix_products(A: F64) -> F64:
     """(N, 6, 3, 3): transposed products of A[j:] for j = 0 .. 5."""
     out = np.empty((len(A), ORDER, 3, 3))
-    out[:, EDGE] = np.eye(3)
-    for j in reversed(range(EDGE)):
+    out[:, EXTRA_KNOTS] = np.eye(3)
+    for j in reversed(range(EXTRA_KNOTS)):
         out[:, j] = out[:, j + 1] @ A[:, j].swapaxes(1, 2)
     return out
 

@@ -13,11 +13,11 @@ from share.types import F64, I64
 KNOTS = 6 * ORDER  # columns of one segment: of each of its knots rotation (3), position (3)
 MOUNT, SHIFT, GRAVITY = slice(0, 6), 6, slice(7, 10)  # of what all segments share
 SHARED = 10
-LOCAL = KNOTS + SHARED + 12  # and the biases (gyro, accel) at both ends of the segment's interval
+LOCAL_COLUMNS = KNOTS + SHARED + 12  # and the biases (gyro, accel) at both ends of the segment's interval
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class CameraImuState:
     """World: the target's frame. curve: of the IMU, in its clock; biases (M, 6) rad/s, m/s^2 at nodes every
     `per_node` segments, straight between them; T_imu_cam0 (4, 4); t_imu = t_cam + shift_s; gravity (3,)
     m/s^2, downwards."""
@@ -29,7 +29,7 @@ class State:
     shift_s: float
     gravity: F64
 
-    def moved(self, knots: F64, border: F64) -> State:
+    def updated(self, knots: F64, border: F64) -> CameraImuState:
         """By a step of the knots (K, 6) and of SHARED + 6 M others."""
         curve = replace(self.curve, R=self.curve.R @ se3.so3_exp(knots[:, :3]), p=self.curve.p + knots[:, 3:])
         return replace(
@@ -41,22 +41,24 @@ class State:
             gravity=self.gravity + border[GRAVITY],
         )
 
-    def node(self, segment: I64) -> I64:
+    def node_before(self, segment: I64) -> I64:
         """The bias node before each segment."""
         return segment // self.per_node
 
     def bias(self, segment: I64, u: F64) -> tuple[F64, F64]:
         """(N, 6), and the share (N,) of the node after."""
-        node = self.node(segment)
-        after = (segment - node * self.per_node + u) / self.per_node
-        return self.biases[node] * (1 - after[:, None]) + self.biases[node + 1] * after[:, None], after
+        node = self.node_before(segment)
+        share_after = (segment - node * self.per_node + u) / self.per_node
+        return self.biases[node] * (1 - share_after[:, None]) + self.biases[node + 1] * share_after[
+            :, None
+        ], share_after
 
 
-def nodes(segments: int, per_node: int) -> int:
+def node_count(segments: int, per_node: int) -> int:
     """How many bias nodes so many segments take."""
     return -(-segments // per_node) + 1
 
 
-def twist(R: F64, rate: F64, velocity: F64) -> F64:
+def body_twist(R: F64, rate: F64, velocity: F64) -> F64:
     """(N, 6): xi a second, of a body that moves in the world."""
     return np.concatenate([rate, np.einsum("nji,nj->ni", R, velocity)], axis=1)

@@ -14,39 +14,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.lab.emulate.motion import figures
-from share.lab.emulate.motion.figures import FIGURES
+from share.lab.emulate.motion import body_shapes
+from share.lab.emulate.motion.body_shapes import BODY_SHAPES
 from share.lab.emulate.motion.gait import WALK_RATIO
 from share.lab.emulate.motion.track import min_jerk
-from share.lab.emulate.motion.walk import CAMERA_AXES, LEVER, turn
-from share.lab.emulate.types import Path
+from share.lab.emulate.motion.walk import CAMERA_AXES, NECK_TO_HEADSET_M, axis_rotation
+from share.lab.emulate.types import MotionPath
 from share.lab.emulate.world.mesh import Shape
 from share.types import F64, I64
 
 _RATE_HZ = 50
-_SLOW_S = 0.35  # sigma of the trunk's smoothing
-_LOOKS = 0.35  # m/s: walking faster than this, the trunk rather follows the way than the eyes
+_TRUNK_SMOOTHING_S = 0.35  # sigma of the trunk's smoothing
+_GAZE_WEIGHT = 0.35  # m/s: walking faster than this, the trunk rather follows the way than the eyes
 _STEP_HZ = (0.8, 3.0)
-_WALKING = 0.45  # m/s, from which on one truly walks
-_LIFT_M = 0.11
-_ARMS = 0.55  # rad of swing at 1.4 m/s
-_HEIGHT_M = (1.3, 2.05)  # of a person, by how high the head is carried
+_WALKING_SPEED = 0.45  # m/s, from which on one truly walks
+_FOOT_LIFT_M = 0.11
+_ARM_SWING_RAD = 0.55  # rad of swing at 1.4 m/s
+_HEIGHT_RANGE_M = (1.3, 2.05)  # of a person, by how high the head is carried
 
 
-def shapes(look: str, path: Path, seed: tuple[int, ...]) -> tuple[Shape, ...]:
+def avatar_shapes(body_kind: str, path: MotionPath, seed: tuple[int, ...]) -> tuple[Shape, ...]:
     """The parts of an agent that looks as `person`, `robot` or `drone`, each in its own frame."""
-    return FIGURES[look](np.random.default_rng(seed), stature(look, path))
+    return BODY_SHAPES[body_kind](np.random.default_rng(seed), body_height(body_kind, path))
 
 
-def stature(look: str, path: Path) -> float:
+def body_height(body_kind: str, path: MotionPath) -> float:
     """Height (m) of a person whose head is carried so high; of a robot's camera."""
-    z = path.poses(_spread(path))[:, 2, 3]
-    if look != "person":
+    z = path.poses(_sample_stamps(path))[:, 2, 3]
+    if body_kind != "person":
         return float(np.median(z))
-    return float(np.clip(np.percentile(z, 90) / figures.EYE, *_HEIGHT_M))
+    return float(np.clip(np.percentile(z, 90) / body_shapes.EYE, *_HEIGHT_RANGE_M))
 
 
-def _spread(path: Path) -> I64:
+def _sample_stamps(path: MotionPath) -> I64:
     """Some stamps (200,) over a path; in integers, for a float does not hold them."""
     return path.start_ns + np.linspace(0, path.end_ns - path.start_ns, 200).astype(np.int64)
 
@@ -56,48 +56,49 @@ class Avatar:
     """The body of one agent along its path. T_body_cam0 (4, 4): how the camera sits on the path's body,
     which tells where it looks; None where the body has a camera's axes itself, as simulated ones have."""
 
-    look: str
-    path: Path
+    body_kind: str
+    path: MotionPath
     T_body_cam0: F64 | None = None
 
-    def parts(self, stamps_ns: I64) -> F64:
-        """T_world_part (N, P, 4, 4), in the order of `shapes`. Raises ValueError outside the path's span."""
-        return _BODIES[self.look](self, np.asarray(stamps_ns, np.int64))
+    def part_poses(self, stamps_ns: I64) -> F64:
+        """T_world_part (N, P, 4, 4), in the order of `avatar_shapes`. Raises ValueError outside the
+        path's span."""
+        return _PART_FUNCTIONS[self.body_kind](self, np.asarray(stamps_ns, np.int64))
 
-    def facing(self, stamps_ns: I64) -> F64:
+    def facing_poses(self, stamps_ns: I64) -> F64:
         """T_world_camera-place (N, 4, 4): where the body is, its axes ahead, left, up of its camera."""
         T = self.path.poses(stamps_ns)
         mount = np.eye(3) if self.T_body_cam0 is None else self.T_body_cam0[:3, :3]
-        return se3.compose(T[:, :3, :3] @ mount @ CAMERA_AXES.T, T[:, :3, 3])
+        return se3.from_rt(T[:, :3, :3] @ mount @ CAMERA_AXES.T, T[:, :3, 3])
 
 
-def _robot(avatar: Avatar, stamps: I64) -> F64:
-    T = avatar.facing(stamps)
-    R = turn(2, np.arctan2(T[:, 1, 0], T[:, 0, 0]))
-    return se3.compose(R, T[:, :3, 3] * (1, 1, 0))[:, None]
+def _robot_parts(avatar: Avatar, stamps: I64) -> F64:
+    T = avatar.facing_poses(stamps)
+    R = axis_rotation(2, np.arctan2(T[:, 1, 0], T[:, 0, 0]))
+    return se3.from_rt(R, T[:, :3, 3] * (1, 1, 0))[:, None]
 
 
-def _drone(avatar: Avatar, stamps: I64) -> F64:
+def _drone_parts(avatar: Avatar, stamps: I64) -> F64:
     """Upright on average, and tilted as the body tilts."""
-    up = avatar.facing(_spread(avatar.path))[:, 2, :3].mean(0)
+    up = avatar.facing_poses(_sample_stamps(avatar.path))[:, 2, :3].mean(0)
     up /= np.linalg.norm(up)
     ahead = np.cross((0.0, 1.0, 0.0), up)
     ahead /= np.linalg.norm(ahead)
     R = np.stack([ahead, np.cross(up, ahead), up], axis=1)
-    T = avatar.facing(stamps)
-    return se3.compose(T[:, :3, :3] @ R, T[:, :3, 3])[:, None]
+    T = avatar.facing_poses(stamps)
+    return se3.from_rt(T[:, :3, :3] @ R, T[:, :3, 3])[:, None]
 
 
-def _person(avatar: Avatar, stamps: I64) -> F64:
-    height = stature("person", avatar.path)
-    T = avatar.facing(stamps)
-    head = se3.compose(T[:, :3, :3], T[:, :3, 3] - figures.HEADSET_M * T[:, :3, 0])
-    walk = _Walk.of(avatar).at((stamps - avatar.path.start_ns) / 1e9)
-    hip = np.column_stack([walk.xy, np.minimum(figures.HIP * height, head[:, 2, 3] - 0.36 * height)])
-    trunk = _leaned(hip, head[:, :3, 3] - (0, 0, 0.13), walk.heading)
-    torso = se3.compose(trunk, hip)
-    arms = [_arm(torso, walk, height, side) for side in (1, -1)]
-    legs = [_leg(hip, walk, height, side) for side in (1, -1)]
+def _person_parts(avatar: Avatar, stamps: I64) -> F64:
+    height = body_height("person", avatar.path)
+    T = avatar.facing_poses(stamps)
+    head = se3.from_rt(T[:, :3, :3], T[:, :3, 3] - body_shapes.HEADSET_M * T[:, :3, 0])
+    walk = _TrunkMotion.from_avatar(avatar).interpolate((stamps - avatar.path.start_ns) / 1e9)
+    hip = np.column_stack([walk.xy, np.minimum(body_shapes.HIP * height, head[:, 2, 3] - 0.36 * height)])
+    trunk = _trunk_rotations(hip, head[:, :3, 3] - (0, 0, 0.13), walk.heading)
+    torso = se3.from_rt(trunk, hip)
+    arms = [_arm_poses(torso, walk, height, side) for side in (1, -1)]
+    legs = [_leg_poses(hip, walk, height, side) for side in (1, -1)]
     order = [
         head,
         torso,
@@ -107,11 +108,11 @@ def _person(avatar: Avatar, stamps: I64) -> F64:
     return np.stack(order, axis=1)
 
 
-_BODIES = {"person": _person, "robot": _robot, "drone": _drone}
+_PART_FUNCTIONS = {"person": _person_parts, "robot": _robot_parts, "drone": _drone_parts}
 
 
 @dataclass(frozen=True, eq=False)
-class _Walk:
+class _TrunkMotion:
     """How the trunk moves: xy (N, 2) m, heading (N,) rad, speed (N,) m/s, phase (N,) rad of a step."""
 
     seconds: F64
@@ -121,31 +122,31 @@ class _Walk:
     phase: F64
 
     @staticmethod
-    def of(avatar: Avatar) -> _Walk:
+    def from_avatar(avatar: Avatar) -> _TrunkMotion:
         from scipy.ndimage import gaussian_filter1d
 
         span = (avatar.path.end_ns - avatar.path.start_ns) / 1e9
         seconds = np.arange(int(span * _RATE_HZ) + 1) / _RATE_HZ
-        T = avatar.facing(avatar.path.start_ns + np.round(seconds * 1e9).astype(np.int64))
-        neck = T[:, :3, 3] - T[:, :3, :3] @ LEVER
-        sigma = _SLOW_S * _RATE_HZ
+        T = avatar.facing_poses(avatar.path.start_ns + np.round(seconds * 1e9).astype(np.int64))
+        neck = T[:, :3, 3] - T[:, :3, :3] @ NECK_TO_HEADSET_M
+        sigma = _TRUNK_SMOOTHING_S * _RATE_HZ
         xy = gaussian_filter1d(neck[:, :2], sigma, axis=0, mode="nearest")
         v = np.gradient(xy, 1 / _RATE_HZ, axis=0)
-        looks = T[:, :2, 0] / np.maximum(np.linalg.norm(T[:, :2, 0], axis=1, keepdims=True), 0.2)
-        way = gaussian_filter1d(v + _LOOKS * looks, sigma, axis=0, mode="nearest")
-        phase = np.unwrap(np.angle(-_band(neck[:, 2])))
-        heading = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
-        return _Walk(seconds, xy, heading, np.linalg.norm(v, axis=1), phase)
+        gaze = T[:, :2, 0] / np.maximum(np.linalg.norm(T[:, :2, 0], axis=1, keepdims=True), 0.2)
+        facing = gaussian_filter1d(v + _GAZE_WEIGHT * gaze, sigma, axis=0, mode="nearest")
+        phase = np.unwrap(np.angle(-_analytic_step_signal(neck[:, 2])))
+        heading = np.unwrap(np.arctan2(facing[:, 1], facing[:, 0]))
+        return _TrunkMotion(seconds, xy, heading, np.linalg.norm(v, axis=1), phase)
 
-    def at(self, seconds: F64) -> _Walk:
+    def interpolate(self, seconds: F64) -> _TrunkMotion:
         xy, *rest = (
             np.stack([np.interp(seconds, self.seconds, column) for column in np.atleast_2d(values.T)], axis=1)
             for values in (self.xy, self.heading, self.speed, self.phase)
         )
-        return _Walk(seconds, xy, *(r[:, 0] for r in rest))
+        return _TrunkMotion(seconds, xy, *(r[:, 0] for r in rest))
 
 
-def _band(z: F64) -> NDArray[np.complex128]:
+def _analytic_step_signal(z: F64) -> NDArray[np.complex128]:
     """The analytic signal of what is quick as steps are in z (N,): no negative frequencies."""
     spectrum = np.fft.rfft(z - z.mean())
     hz = np.fft.rfftfreq(len(z), 1 / _RATE_HZ)
@@ -153,7 +154,7 @@ def _band(z: F64) -> NDArray[np.complex128]:
     return np.fft.ifft(2 * spectrum, len(z))
 
 
-def _leaned(hip: F64, neck: F64, heading: F64) -> F64:
+def _trunk_rotations(hip: F64, neck: F64, heading: F64) -> F64:
     """Rotations (N, 3, 3) of a trunk that faces `heading` and reaches from hip to neck (N, 3) m."""
     up = neck - hip
     up /= np.linalg.norm(up, axis=1, keepdims=True)
@@ -162,49 +163,49 @@ def _leaned(hip: F64, neck: F64, heading: F64) -> F64:
     return np.stack([np.cross(left, up), left, up], axis=2)
 
 
-def _arm(torso: F64, walk: _Walk, height: float, side: int) -> tuple[F64, F64]:
+def _arm_poses(torso: F64, walk: _TrunkMotion, height: float, side: int) -> tuple[F64, F64]:
     """Upper arm and forearm; an arm swings with the opposite leg."""
-    swing = _ARMS * (walk.speed / 1.4).clip(0, 1.3) * _stride(walk, -side)
-    shoulder = np.array([0.0, side * figures.SHOULDERS * height, (figures.SHOULDER - 0.02) * height])
-    upper = _jointed(torso, shoulder, swing)
+    swing = _ARM_SWING_RAD * (walk.speed / 1.4).clip(0, 1.3) * _foot_position(walk, -side)
+    shoulder = np.array([0.0, side * body_shapes.SHOULDERS * height, (body_shapes.SHOULDER - 0.02) * height])
+    upper = _hang_limb(torso, shoulder, swing)
     bend = 0.25 + 0.5 * (swing.clip(0) + 0.2 * (walk.speed / 1.4).clip(0, 1))
-    return upper, _jointed(upper, np.array([0.0, 0.0, -figures.UPPER_ARM * height]), bend)
+    return upper, _hang_limb(upper, np.array([0.0, 0.0, -body_shapes.UPPER_ARM * height]), bend)
 
 
-def _stride(walk: _Walk, side: int) -> F64:
+def _foot_position(walk: _TrunkMotion, side: int) -> F64:
     """-1 .. 1: how far ahead the foot of a side is."""
     return side * np.cos(walk.phase / 2)
 
 
-def _leg(hip: F64, walk: _Walk, height: float, side: int) -> tuple[F64, F64, F64]:
+def _leg_poses(hip: F64, walk: _TrunkMotion, height: float, side: int) -> tuple[F64, F64, F64]:
     """Thigh, shin and foot: the foot stands while the body passes over it, then swings ahead."""
-    thigh, shin = figures.THIGH * height, figures.SHIN * height
-    level = turn(2, walk.heading)
-    joint = hip + level @ np.array([0.0, side * figures.HIPS * height, 0.0])
-    ankle_x, lift = _step(walk, side)
-    ahead, down = ankle_x, joint[:, 2] - figures.ANKLE * height - lift
+    thigh, shin = body_shapes.THIGH * height, body_shapes.SHIN * height
+    level = axis_rotation(2, walk.heading)
+    joint = hip + level @ np.array([0.0, side * body_shapes.HIPS * height, 0.0])
+    ankle_x, lift = _ankle_motion(walk, side)
+    ahead, down = ankle_x, joint[:, 2] - body_shapes.ANKLE * height - lift
     reach = np.hypot(ahead, down).clip(0.2, 0.999 * (thigh + shin))
     knee = np.pi - np.arccos(((thigh**2 + shin**2 - reach**2) / (2 * thigh * shin)).clip(-1, 1))
     inner = np.arccos(((thigh**2 + reach**2 - shin**2) / (2 * thigh * reach)).clip(-1, 1))
     up = np.arctan2(ahead, down) + inner
-    upper = se3.compose(level @ turn(1, -up), joint)
-    lower = _jointed(upper, np.array([0.0, 0.0, -thigh]), -knee)
+    upper = se3.from_rt(level @ axis_rotation(1, -up), joint)
+    lower = _hang_limb(upper, np.array([0.0, 0.0, -thigh]), -knee)
     ankle = lower[:, :3, 3] + lower[:, :3, :3] @ np.array([0.0, 0.0, -shin])
     toes_down = 3.0 * lift
-    return upper, lower, se3.compose(level @ turn(1, toes_down), ankle)
+    return upper, lower, se3.from_rt(level @ axis_rotation(1, toes_down), ankle)
 
 
-def _step(walk: _Walk, side: int) -> tuple[F64, F64]:
+def _ankle_motion(walk: _TrunkMotion, side: int) -> tuple[F64, F64]:
     """How far ahead of the hip the ankle is, and how far above the floor (N,) m."""
-    vigour = min_jerk(walk.speed / _WALKING)
+    vigour = min_jerk(walk.speed / _WALKING_SPEED)
     length = np.sqrt(WALK_RATIO * walk.speed) * vigour
     share = (walk.phase / (4 * np.pi) + (0.0 if side > 0 else 0.5)) % 1.0
     swing = min_jerk(2 * share - 1)
     ahead = length * np.where(share < 0.5, 0.5 - 2 * share, swing - 0.5)
-    return ahead, _LIFT_M * vigour * np.where(share < 0.5, 0.0, np.sin(2 * np.pi * share) ** 2)
+    return ahead, _FOOT_LIFT_M * vigour * np.where(share < 0.5, 0.0, np.sin(2 * np.pi * share) ** 2)
 
 
-def _jointed(parent: F64, joint: F64, angle: F64) -> F64:
+def _hang_limb(parent: F64, joint: F64, angle: F64) -> F64:
     """A limb (N, 4, 4) hung at `joint` (3,) m of its parent, turned ahead by `angle` (N,) rad."""
-    R = parent[:, :3, :3] @ turn(1, -angle)
-    return se3.compose(R, parent[:, :3, 3] + parent[:, :3, :3] @ joint)
+    R = parent[:, :3, :3] @ axis_rotation(1, -angle)
+    return se3.from_rt(R, parent[:, :3, 3] + parent[:, :3, :3] @ joint)

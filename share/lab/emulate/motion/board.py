@@ -15,67 +15,69 @@ import numpy as np
 from share.errors import UsageError
 from share.geometry import se3
 from share.lab.emulate.motion.spec import BoardSpec
-from share.lab.emulate.motion.spline import SplinePath, through
-from share.lab.emulate.motion.track import instants
+from share.lab.emulate.motion.spline import SplinePath, spline_through
+from share.lab.emulate.motion.track import knot_times
 from share.lab.emulate.types import START_NS
 from share.lab.emulate.world.layout import Layout, PlacedTarget
 from share.types import F64
 
-STILL_S = 1.5  # at the start, for the IMU
-_EASE_S = 2.0  # from rest to full speed
-_PAUSED = 0.5  # below this vigour, the device comes to rest every
+INITIAL_STILL_S = 1.5  # at the start, for the IMU
+_START_EASE_S = 2.0  # from rest to full speed
+_PAUSE_VIGOUR = 0.5  # below this vigour, the device comes to rest every
 _PAUSE_S = 3.0  # s
 _PERIODS = (1.2, 4.5)  # s, shortest and longest, at vigour 1
 _WAVES = 5
-_SLOWER = np.array([1.8, 1.8, 1.8, 1.0, 1.0, 1.0])  # times longer: an arm, against a wrist
-_NEARER = 1.8  # times nearer and farther than the usual distance, at most
-_AROUND, _ABOVE, _ROLL = np.radians((38.0, 30.0, 38.0))  # most, to either side
-_VIEW = np.array([0.80, 0.53])  # tangents from the middle of the image to its edges: D435i and EuRoC
-_EYE = 0.06  # m; how far the cameras are from the body at most
-_SPILL = 1.1  # the board may leave the image by so much
-_BODY = 0.15  # m; what carries the device keeps so far from walls
+_PERIOD_FACTORS = np.array([1.8, 1.8, 1.8, 1.0, 1.0, 1.0])  # times longer: an arm, against a wrist
+_DISTANCE_FACTOR = 1.8  # times nearer and farther than the usual distance, at most
+_MAX_AZIMUTH, _MAX_ELEVATION, _MAX_ROLL = np.radians((38.0, 30.0, 38.0))  # most, to either side
+_VIEW_TANGENTS = np.array([0.80, 0.53])  # tangents from the middle of the image to its edges: D435i and EuRoC
+_CAMERA_OFFSET_M = 0.06  # m; how far the cameras are from the body at most
+_MAX_OVERSHOOT = 1.1  # the board may leave the image by so much
+_WALL_CLEARANCE_M = 0.15  # m; what carries the device keeps so far from walls
 
 
-def exercise(layout: Layout, spec: BoardSpec, seconds: float, rng: np.random.Generator) -> SplinePath:
+def board_path(layout: Layout, spec: BoardSpec, seconds: float, rng: np.random.Generator) -> SplinePath:
     """The body's path before the room's board, the same for the same `rng`. Raises UsageError where the
     room has no board or no space for it."""
     if layout.target is None:
         raise UsageError(f"the {layout.name} has no calibration board; take --scene board")
-    t = instants(seconds)
-    T = layout.target.T_world_target @ _poses(layout.target, spec, t, rng)
-    if (T[:, :3, 3] < _BODY).any() or (T[:, :3, 3] > np.array(layout.size) - _BODY).any():
+    t = knot_times(seconds)
+    T = layout.target.T_world_target @ _target_poses(layout.target, spec, t, rng)
+    if (T[:, :3, 3] < _WALL_CLEARANCE_M).any() or (
+        T[:, :3, 3] > np.array(layout.size) - _WALL_CLEARANCE_M
+    ).any():
         raise UsageError(
             f"board: the room is too small for distance={spec.distance:g}; take less, or a larger --size"
         )
-    path = through(START_NS, t, T[:, :3, 3], se3.quat_from_matrix(T[:, :3, :3]))
+    path = spline_through(START_NS, t, T[:, :3, 3], se3.quat_from_matrix(T[:, :3, :3]))
     return replace(path, end_ns=START_NS + round(seconds * 1e9))
 
 
-def _poses(placed: PlacedTarget, spec: BoardSpec, t: F64, rng: np.random.Generator) -> F64:
+def _target_poses(target: PlacedTarget, spec: BoardSpec, t: F64, rng: np.random.Generator) -> F64:
     """T_target_body (M, 4, 4) at t (M,) s."""
-    around, above, along, across, down, roll = _signals(_progress(t, spec.vigour), rng)
-    distance = spec.distance * _NEARER**along
-    half = np.ptp(placed.target.extent, axis=0) / 2
-    aim = np.stack([across, down]) * _room(half, distance, _ROLL * roll)
-    R, p = _view(_AROUND * around, _ABOVE * above, distance, aim, _ROLL * roll)
-    return se3.compose(R, p + np.array([*placed.target.extent.mean(axis=0), 0.0]))
+    around, above, along, across, down, roll = _motion_signals(_exercise_progress(t, spec.vigour), rng)
+    distance = spec.distance * _DISTANCE_FACTOR**along
+    half = np.ptp(target.target.extent, axis=0) / 2
+    aim = np.stack([across, down]) * _aim_limits(half, distance, _MAX_ROLL * roll)
+    R, p = _looking_pose(_MAX_AZIMUTH * around, _MAX_ELEVATION * above, distance, aim, _MAX_ROLL * roll)
+    return se3.from_rt(R, p + np.array([*target.target.extent.mean(axis=0), 0.0]))
 
 
-def _progress(t: F64, vigour: float) -> F64:
+def _exercise_progress(t: F64, vigour: float) -> F64:
     """How far the exercise has come (M,) at t (M,), in seconds of one with vigour 1."""
-    x = ((t - STILL_S) / _EASE_S).clip(0, 1)
+    x = ((t - INITIAL_STILL_S) / _START_EASE_S).clip(0, 1)
     speed = vigour * x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3)  # smooth to the third derivative
-    if vigour < _PAUSED:
-        speed = speed * (1 - np.cos(2 * np.pi * (t - STILL_S) / _PAUSE_S)) ** 2 * (2 / 3)
+    if vigour < _PAUSE_VIGOUR:
+        speed = speed * (1 - np.cos(2 * np.pi * (t - INITIAL_STILL_S) / _PAUSE_S)) ** 2 * (2 / 3)
     return np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t))])
 
 
-def _signals(progress: F64, rng: np.random.Generator) -> F64:
+def _motion_signals(progress: F64, rng: np.random.Generator) -> F64:
     """Six signals (6, M) between -1 and 1, as often near the ends as in the middle. Their slow waves are
     as quick as the fast ones, so they are larger."""
     from scipy.special import erf
 
-    periods = np.geomspace(*_PERIODS, _WAVES) * _SLOWER[:, None] * rng.uniform(0.9, 1.1, (6, _WAVES))
+    periods = np.geomspace(*_PERIODS, _WAVES) * _PERIOD_FACTORS[:, None] * rng.uniform(0.9, 1.1, (6, _WAVES))
     phase = rng.uniform(0, 2 * np.pi, (6, _WAVES))
     waves = np.sin(2 * np.pi * progress[:, None, None] / periods + phase)
     normal = np.einsum("mkw,kw->km", waves, periods) / np.linalg.norm(periods, axis=1)[:, None]
@@ -83,25 +85,27 @@ def _signals(progress: F64, rng: np.random.Generator) -> F64:
     return out
 
 
-def _room(half: F64, distance: F64, roll: F64) -> F64:
+def _aim_limits(half: F64, distance: F64, roll: F64) -> F64:
     """How far (2, M) the middle of a board of half-size (2,) m may be from the middle of the image,
     tangents: what its size there leaves, and a little where it leaves nothing."""
     c, s = np.cos(roll), np.sqrt(np.sin(roll) ** 2 + 1e-2)  # |sin|, but smooth
     size = (half[:, None] * c + half[::-1, None] * s) / distance
-    left = _SPILL * _VIEW[:, None] - size - np.array([[_EYE], [0.0]]) / distance
-    room: F64 = (left + np.sqrt(left**2 + 0.05**2)) / 2
+    margin = (
+        _MAX_OVERSHOOT * _VIEW_TANGENTS[:, None] - size - np.array([[_CAMERA_OFFSET_M], [0.0]]) / distance
+    )
+    room: F64 = (margin + np.sqrt(margin**2 + 0.05**2)) / 2
     return room
 
 
-def _view(around: F64, above: F64, distance: F64, aim: F64, roll: F64) -> tuple[F64, F64]:
+def _looking_pose(around: F64, above: F64, distance: F64, aim: F64, roll: F64) -> tuple[F64, F64]:
     """Orientation (M, 3, 3) and place (M, 3) m of the body in a frame at the board's middle. aim (2, M):
     where the middle is to be seen, tangents."""
     facing = np.array([(1.0, 0, 0), (0, -1, 0), (0, 0, -1)])  # of one before the middle, looking at it
-    orbit = _turn(1, around) @ _turn(0, -above)
-    aside = _turn(0, np.arctan(aim[1])) @ _turn(1, -np.arctan(aim[0]))
-    return orbit @ facing @ _turn(2, roll) @ aside, orbit[:, :, 2] * distance[:, None]
+    orbit = _axis_rotation(1, around) @ _axis_rotation(0, -above)
+    aside = _axis_rotation(0, np.arctan(aim[1])) @ _axis_rotation(1, -np.arctan(aim[0]))
+    return orbit @ facing @ _axis_rotation(2, roll) @ aside, orbit[:, :, 2] * distance[:, None]
 
 
-def _turn(axis: int, angle: F64) -> F64:
+def _axis_rotation(axis: int, angle: F64) -> F64:
     """Rotations (M, 3, 3) about one axis."""
     return se3.so3_exp(angle[:, None] * np.eye(3)[axis])

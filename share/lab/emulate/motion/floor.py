@@ -9,8 +9,11 @@ import numpy as np
 from share.lab.emulate.world.occupancy import Occupancy
 from share.types import F64
 
-_LOW, _HIGH = 0.10, 1.95  # m: a step of less is walked over, a beam above is walked under
-_EVERY = 2  # voxels of the occupancy to one cell here
+_MIN_OBSTACLE_M, _MAX_OBSTACLE_M = (
+    0.10,
+    1.95,
+)  # m: a step of less is walked over, a beam above is walked under
+_VOXELS_PER_CELL = 2  # voxels of the occupancy to one cell here
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +25,7 @@ class Floor:
     step: float
     origin: float = 0.0
 
-    def at(self, xy: F64) -> F64:
+    def clearance_at(self, xy: F64) -> F64:
         """Clearance (N,) m at places (N, 2) m, bilinear; outside the grid as at its edge."""
         i, f = self._cells(xy)
         c = self.clearance
@@ -31,20 +34,22 @@ class Floor:
         out: F64 = low * (1 - f[:, 0]) + high * f[:, 0]
         return out
 
-    def away(self, xy: F64) -> F64:
+    def clearance_gradient(self, xy: F64) -> F64:
         """Gradient (N, 2) of the clearance: where to go to gain room."""
         h = self.step * np.eye(2)
-        return np.stack([self.at(xy + d) - self.at(xy - d) for d in h], axis=1) / (2 * self.step)
+        return np.stack([self.clearance_at(xy + d) - self.clearance_at(xy - d) for d in h], axis=1) / (
+            2 * self.step
+        )
 
     def _cells(self, xy: F64) -> tuple[np.ndarray, F64]:
-        most = np.array(self.clearance.shape) - 1
-        place = ((np.asarray(xy) - self.origin) / self.step).clip(0, most - 1e-9)
+        last_cell = np.array(self.clearance.shape) - 1
+        place = ((np.asarray(xy) - self.origin) / self.step).clip(0, last_cell - 1e-9)
         cell = place.astype(int)
         return cell, place - cell
 
 
-def floor_of(occupancy: Occupancy) -> Floor:
+def floor_from_occupancy(occupancy: Occupancy) -> Floor:
     """The floor of a room, for people and robots alike: under a table nobody goes."""
-    clearance, origin, step = occupancy.floor_clearance(_LOW, _HIGH)
-    grid = clearance[::_EVERY, ::_EVERY].astype(np.float64)
-    return Floor(grid, step * _EVERY, float(origin[0]))
+    clearance, origin, step = occupancy.floor_clearance(_MIN_OBSTACLE_M, _MAX_OBSTACLE_M)
+    grid = clearance[::_VOXELS_PER_CELL, ::_VOXELS_PER_CELL].astype(np.float64)
+    return Floor(grid, step * _VOXELS_PER_CELL, float(origin[0]))

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.lab.emulate.motion.track import KNOT_S, Track, wander
+from share.lab.emulate.motion.track import KNOT_S, PlanarTrack, random_wander
 from share.types import F64
 
 WALK_RATIO = 0.39  # m s
 _SPEEDS = (0.0, 0.7, 1.6, 2.2)  # m/s
-_BOB = (0.012, 0.0274, 0.0483, 0.055)  # m, peak to peak
-_SWAY = (0.05, 0.0699, 0.0385, 0.03)
+_BOB_M = (0.012, 0.0274, 0.0483, 0.055)  # m, peak to peak
+_SWAY_M = (0.05, 0.0699, 0.0385, 0.03)
 _JOLT_M, _JOLT_S = 0.0006, 0.020  # at 1.4 m/s: 0.6 mm, sigma 20 ms: 1.5 m/s^2
 _STANDING_M, _BREATH_M = 0.0025, 0.0012  # rms
 
@@ -31,26 +31,26 @@ class Gait:
 
     phase: F64
     vigour: F64
-    aside: F64
+    sideways: F64
     up: F64
 
 
-def gait_of(track: Track, rng: np.random.Generator) -> Gait:
+def make_gait(track: PlanarTrack, rng: np.random.Generator) -> Gait:
     """How a body walks along `track`."""
     v, t = track.speed, track.seconds
-    phase, vigour = steps_of(v, rate=1 + 0.02 * wander(rng, t, (2.0, 6.0)))
-    bob, sway = (np.interp(v, _SPEEDS, size) * vigour / 2 for size in (_BOB, _SWAY))
-    quiet = _STANDING_M * wander(rng, t, (1.8, 9.0), 6)
-    breath = _BREATH_M * wander(rng, t, (3.2, 4.4), 2)
+    phase, vigour = step_phase(v, rate=1 + 0.02 * random_wander(rng, t, (2.0, 6.0)))
+    bob, sway = (np.interp(v, _SPEEDS, size) * vigour / 2 for size in (_BOB_M, _SWAY_M))
+    quiet = _STANDING_M * random_wander(rng, t, (1.8, 9.0), 6)
+    breath = _BREATH_M * random_wander(rng, t, (3.2, 4.4), 2)
     return Gait(
         phase=phase,
         vigour=vigour,
-        aside=sway * np.sin(phase / 2) + quiet,
-        up=-bob * np.cos(phase) + breath - _jolts(phase, v, t),
+        sideways=sway * np.sin(phase / 2) + quiet,
+        up=-bob * np.cos(phase) + breath - _heel_strikes(phase, v, t),
     )
 
 
-def steps_of(speed: F64, rate: F64 | float = 1.0) -> tuple[F64, F64]:
+def step_phase(speed: F64, rate: F64 | float = 1.0) -> tuple[F64, F64]:
     """Phase (M,) rad and vigour (M,) of a body that goes at `speed` (M,) m/s, every KNOT_S."""
     v = speed.clip(0)
     vigour = (v / 0.45).clip(0, 1)
@@ -59,7 +59,7 @@ def steps_of(speed: F64, rate: F64 | float = 1.0) -> tuple[F64, F64]:
     return np.concatenate([[0.0], np.cumsum((turning[1:] + turning[:-1]) / 2)]) * KNOT_S, vigour
 
 
-def _jolts(phase: F64, speed: F64, seconds: F64) -> F64:
+def _heel_strikes(phase: F64, speed: F64, seconds: F64) -> F64:
     """Displacement (M,) m by heel strikes: smooth pulses, a little after each."""
     out = np.zeros(len(seconds))
     reach = round(5 * _JOLT_S / KNOT_S)

@@ -6,9 +6,9 @@ same lengths.
 
 from __future__ import annotations
 
-from share.lab.emulate.motion.crowd import Member
-from share.lab.emulate.motion.robot import STILL_S
-from share.lab.emulate.motion.together import Wish
+from share.lab.emulate.motion.crowd import SimulatedAgent
+from share.lab.emulate.motion.planned_motion import MotionPreferences
+from share.lab.emulate.motion.robot import INITIAL_STILL_S
 
 SECONDS = 60.0
 NAMES = ("user1", "user2", "robot")
@@ -20,21 +20,23 @@ LENGTHS_M: dict[int, tuple[float, float, float]] = {
     5: (37.67, 34.17, 23.09),
 }
 _HEIGHTS_M = (1.70, 1.62, 0.35)
-_STROLL, _DRIVE = 0.80, 0.32  # m/s; who has less far to go stands more, not slower
-_BENDS = {"person": 1.1, "robot": 1.3}  # times the mean speed: what bends cost must be made good
-_BEGIN_S = 2.4
+_MIN_WALK_SPEED, _MIN_DRIVE_SPEED = 0.80, 0.32  # m/s; who has less far to go stands more, not slower
+_BEND_FACTORS = {"person": 1.1, "robot": 1.3}  # times the mean speed: what bends cost must be made good
+_START_DELAY_S = 2.4
 
 
-def members(number: int) -> list[Member]:
+def paper_agents(number: int) -> list[SimulatedAgent]:
     """The three agents of one experiment. Raises KeyError for another number than 1 .. 5."""
     return [
-        _member(name, length, height)
+        _paper_agent(name, length, height)
         for name, length, height in zip(NAMES, LENGTHS_M[number], _HEIGHTS_M, strict=True)
     ]
 
 
-def _member(name: str, length: float, height: float) -> Member:
-    look = "robot" if name == "robot" else "person"
-    mean = _BENDS[look] * length / (SECONDS - STILL_S - _BEGIN_S)
-    wish = Wish(look, max(mean, _DRIVE if look == "robot" else _STROLL), 0.0)
-    return Member(name, wish, height, length=length)
+def _paper_agent(name: str, length: float, height: float) -> SimulatedAgent:
+    body_kind = "robot" if name == "robot" else "person"
+    mean = _BEND_FACTORS[body_kind] * length / (SECONDS - INITIAL_STILL_S - _START_DELAY_S)
+    preferences = MotionPreferences(
+        body_kind, max(mean, _MIN_DRIVE_SPEED if body_kind == "robot" else _MIN_WALK_SPEED), 0.0
+    )
+    return SimulatedAgent(name, preferences, height, length=length)

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from share.lab.mocap.factors import sampled
-from share.lab.mocap.fit import Fit
+from share.lab.mocap.factors import interpolate_samples
+from share.lab.mocap.fit import MocapFit
 from share.lab.mocap.path import FittedPath
 from share.types import F64, I64, ImuBatch
 
@@ -22,7 +22,7 @@ class RecordedPath:
     world lies in the path's.
     """
 
-    fit: Fit
+    fit: MocapFit
     imu: ImuBatch
     start_ns: int
     end_ns: int
@@ -43,34 +43,39 @@ class RecordedPath:
 
     def poses(self, stamps_ns: I64) -> F64:
         """T_world_body (N, 4, 4). Raises ValueError outside the span."""
-        return self.T_world_fit @ self._moving(stamps_ns)[0]
+        return self.T_world_fit @ self._pose_and_velocity(stamps_ns)[0]
 
     def velocity(self, stamps_ns: I64) -> F64:
         """Of the body in the world (N, 3) m/s. Raises ValueError outside the span."""
-        return np.asarray(self._moving(stamps_ns)[1] @ self.T_world_fit[:3, :3].T, np.float64)
+        return np.asarray(self._pose_and_velocity(stamps_ns)[1] @ self.T_world_fit[:3, :3].T, np.float64)
 
     def inertial(self, stamps_ns: I64) -> tuple[F64, F64]:
         """Angular rate (N, 3) rad/s and specific force (N, 3) m/s^2 as recorded, freed of their biases,
         linear between samples: the real IMU's noise is in them. Raises ValueError outside the span."""
-        stamps = self._within(stamps_ns)
-        gyro, accel = sampled(self.imu, stamps, self.imu.gyro), sampled(self.imu, stamps, self.imu.accel)
+        stamps = self._checked_stamps(stamps_ns)
+        gyro, accel = (
+            interpolate_samples(self.imu, stamps, self.imu.gyro),
+            interpolate_samples(self.imu, stamps, self.imu.accel),
+        )
         nodes = ImuBatch(self.fit.stamps_ns, self.fit.gyro_bias, self.fit.accel_bias)
-        return gyro - sampled(nodes, stamps, nodes.gyro), accel - sampled(nodes, stamps, nodes.accel)
+        return gyro - interpolate_samples(nodes, stamps, nodes.gyro), accel - interpolate_samples(
+            nodes, stamps, nodes.accel
+        )
 
-    def placed(self, T_world_old: F64) -> RecordedPath:
+    def transformed(self, T_world_old: F64) -> RecordedPath:
         """The same motion elsewhere: turned about the vertical and shifted by T_world_old (4, 4).
         Raises ValueError if it would tilt gravity."""
         if not np.allclose(T_world_old[2, :3], (0, 0, 1), atol=1e-9):
             raise ValueError("T_world_old: turns about more than the vertical")
         return replace(self, T_world_fit=T_world_old @ self.T_world_fit)
 
-    def part(self, start_ns: int, end_ns: int) -> RecordedPath:
+    def cut(self, start_ns: int, end_ns: int) -> RecordedPath:
         """The same motion between two stamps, which keep their meaning. Raises ValueError outside."""
         if not self.start_ns <= start_ns < end_ns <= self.end_ns:
             raise ValueError(f"{start_ns} .. {end_ns} ns: is not within {self.start_ns} .. {self.end_ns} ns")
         return replace(self, start_ns=start_ns, end_ns=end_ns)
 
-    def _within(self, stamps_ns: I64) -> I64:
+    def _checked_stamps(self, stamps_ns: I64) -> I64:
         stamps = np.asarray(stamps_ns, np.int64)
         if len(stamps) and not self.start_ns <= stamps.min() <= stamps.max() <= self.end_ns:
             raise ValueError(
@@ -80,9 +85,9 @@ class RecordedPath:
         return stamps
 
     @cached_property
-    def _between(self) -> FittedPath:
+    def _fitted_path(self) -> FittedPath:
         return FittedPath(self.fit, self.imu)
 
-    def _moving(self, stamps_ns: I64) -> tuple[F64, F64]:
+    def _pose_and_velocity(self, stamps_ns: I64) -> tuple[F64, F64]:
         """T_fit_body (N, 4, 4) and velocity (N, 3) in the fit's world."""
-        return self._between.moving(self._within(stamps_ns))
+        return self._fitted_path.pose_and_velocity(self._checked_stamps(stamps_ns))

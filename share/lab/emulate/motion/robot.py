@@ -13,111 +13,118 @@ import numpy as np
 
 from share.geometry import se3
 from share.lab.emulate.motion.floor import Floor
-from share.lab.emulate.motion.route import Rng, Way, arc_length, headings, smooth
-from share.lab.emulate.motion.schedule import Limits, smoothed
-from share.lab.emulate.motion.spline import SplinePath, through
-from share.lab.emulate.motion.track import KNOT_S, Track, instants
-from share.lab.emulate.motion.walk import CAMERA_AXES, turn
+from share.lab.emulate.motion.route import Rng, Route, arc_length, headings, smooth_route
+from share.lab.emulate.motion.schedule import MotionLimits, smooth_schedule
+from share.lab.emulate.motion.spline import SplinePath, spline_through
+from share.lab.emulate.motion.track import KNOT_S, PlanarTrack, knot_times
+from share.lab.emulate.motion.walk import CAMERA_AXES, axis_rotation
 from share.types import F64
 
 RADIUS = 0.20  # m: a TurtleBot 4 is 34 cm wide
-STILL_S = 1.3
-PITCH = 0.10  # rad, of the camera: a little upwards
-_ARM = 0.25  # m of way that a radian of turning in place counts as
-_DRIVEN = 0.9  # rad, a corner that it takes in a bend
-_TURN_STEP = 0.02  # rad
-_WHEELS_S = 0.08  # sigma: how slowly the wheels follow
-_DIVE = 0.010  # rad per m/s^2 of speeding up: the castors give
-_BAND_HZ = (6.0, 17.0, 45.0)  # lowest, strongest, highest of what wheels and floor do
+INITIAL_STILL_S = 1.3
+CAMERA_PITCH = 0.10  # rad, of the camera: a little upwards
+_PIVOT_LEVER_M = 0.25  # m of way that a radian of turning in place counts as
+_MAX_DRIVEN_CORNER = 0.9  # rad, a corner that it takes in a bend
+_PIVOT_STEP_RAD = 0.02  # rad
+_WHEEL_SMOOTHING_S = 0.08  # sigma: how slowly the wheels follow
+_PITCH_PER_ACCEL = 0.010  # rad per m/s^2 of speeding up: the castors give
+_RUMBLE_BAND_HZ = (6.0, 17.0, 45.0)  # lowest, strongest, highest of what wheels and floor do
 
 
-def limits(speed: float) -> Limits:
-    """Of a robot that cruises at `speed` m/s."""
-    return Limits(speed=1.15 * speed, turn=1.3, aside=0.4, gain=0.5)
-
-
-def way_of(floor: Floor, legs: Sequence[F64]) -> Way:
-    """Each leg of a tour as a smooth line; between them the robot turns in place, which goes on for
-    _ARM metres of way a radian."""
-    parts: list[Way] = []
-    for leg in _strung(legs):
-        xy = smooth(floor, leg, RADIUS)
-        heading = headings(xy)
-        bend = np.gradient(heading) / np.gradient(arc_length(xy))
-        if parts:
-            parts.append(_pivot(xy[0], parts[-1].heading[-1], heading[0]))
-            heading = heading + parts[-1].heading[-1] - heading[0]
-        bend[[0, -1]] = 1e3  # it stands where it turns
-        parts.append(Way(xy, arc_length(xy), heading, bend))
-    start, gone = 0.0, []
-    for part in parts:
-        gone.append(start + part.gone)
-        start = gone[-1][-1] + 1e-6
-    return Way(
-        np.concatenate([p.xy for p in parts]),
-        np.concatenate(gone),
-        np.concatenate([p.heading for p in parts]),
-        np.concatenate([p.bend for p in parts]),
+def motion_limits(speed: float) -> MotionLimits:
+    """Of a robot that cruises at `max_speed` m/s."""
+    return MotionLimits(
+        max_speed=1.15 * speed, max_rotation_rate=1.3, lateral_acceleration=0.4, acceleration=0.5
     )
 
 
-def track_of(way: Way, steps: F64, duration: float) -> Track:
+def route_from_legs(floor: Floor, legs: Sequence[F64]) -> Route:
+    """Each leg of a tour as a smooth line; between them the robot turns in place, which goes on for
+    _ARM metres of way a radian."""
+    parts: list[Route] = []
+    for leg in _merge_legs(legs):
+        xy = smooth_route(floor, leg, RADIUS)
+        heading = headings(xy)
+        bend = np.gradient(heading) / np.gradient(arc_length(xy))
+        if parts:
+            parts.append(_pivot_route(xy[0], parts[-1].heading[-1], heading[0]))
+            heading = heading + parts[-1].heading[-1] - heading[0]
+        bend[[0, -1]] = 1e3  # it stands where it turns
+        parts.append(Route(xy, arc_length(xy), heading, bend))
+    start, distances = 0.0, []
+    for part in parts:
+        distances.append(start + part.distance)
+        start = distances[-1][-1] + 1e-6
+    return Route(
+        np.concatenate([p.xy for p in parts]),
+        np.concatenate(distances),
+        np.concatenate([p.heading for p in parts]),
+        np.concatenate([p.curvature for p in parts]),
+    )
+
+
+def track_on_route(route: Route, steps: F64, duration: float) -> PlanarTrack:
     """The axle's motion: wheels that follow the schedule, and where that takes it."""
     from scipy.ndimage import gaussian_filter1d
 
-    seconds = instants(duration)
-    gone = smoothed(steps, seconds)
-    along = np.interp(gone, way.gone, arc_length(way.xy))
-    wanted = np.stack([along, np.interp(gone, way.gone, way.heading)])
-    wheels = gaussian_filter1d(np.gradient(wanted, KNOT_S, axis=1), _WHEELS_S / KNOT_S, mode="nearest")
+    seconds = knot_times(duration)
+    distance = smooth_schedule(steps, seconds)
+    along = np.interp(distance, route.distance, arc_length(route.xy))
+    target = np.stack([along, np.interp(distance, route.distance, route.heading)])
+    wheels = gaussian_filter1d(
+        np.gradient(target, KNOT_S, axis=1), _WHEEL_SMOOTHING_S / KNOT_S, mode="nearest"
+    )
     speed, turning = wheels
-    heading = way.heading[0] + _integral(turning)
-    xy = way.xy[0] + np.stack([_integral(speed * f(heading)) for f in (np.cos, np.sin)], axis=1)
-    return Track(seconds, xy, heading, speed)
+    heading = route.heading[0] + _integrate(turning)
+    xy = route.xy[0] + np.stack([_integrate(speed * f(heading)) for f in (np.cos, np.sin)], axis=1)
+    return PlanarTrack(seconds, xy, heading, speed)
 
 
-def path_of(track: Track, height: float, vibration: float, start_ns: int, rng: Rng) -> SplinePath:
+def imu_path(track: PlanarTrack, height: float, vibration: float, start_ns: int, rng: Rng) -> SplinePath:
     """The camera's IMU. height: m. vibration: m/s^2, rms of the vertical at 0.3 m/s."""
     strength = (np.abs(track.speed) / 0.3).clip(0, 3) ** 0.7 + 0.03  # fans never rest
-    shake = vibration * strength * np.stack([_rumble(len(track.seconds), rng) for _ in range(4)])
+    shake = vibration * strength * np.stack([_rumble_displacement(len(track.seconds), rng) for _ in range(4)])
     up, aside = shake[0], 0.3 * shake[1]
     pitch, roll = 3.0 * shake[2], 2.0 * shake[3]  # rad per m: of a wheel base of 0.3 m
     gain = np.gradient(track.speed, KNOT_S)
     left = np.stack([-np.sin(track.heading), np.cos(track.heading)], axis=1)
     p = np.column_stack([track.xy + aside[:, None] * left, height + up])
-    nose = PITCH + pitch + _DIVE * gain
-    R = turn(2, track.heading) @ turn(1, -nose) @ turn(0, roll)
-    return through(start_ns, track.seconds, p, se3.quat_from_matrix(R @ CAMERA_AXES))
+    nose = CAMERA_PITCH + pitch + _PITCH_PER_ACCEL * gain
+    R = axis_rotation(2, track.heading) @ axis_rotation(1, -nose) @ axis_rotation(0, roll)
+    return spline_through(start_ns, track.seconds, p, se3.quat_from_matrix(R @ CAMERA_AXES))
 
 
-def _strung(legs: Sequence[F64]) -> list[F64]:
+def _merge_legs(legs: Sequence[F64]) -> list[F64]:
     """Legs that go on in nearly the same direction as one: there it drives through."""
     out = [legs[0]]
     for leg in legs[1:]:
         before, after = out[-1][-1] - out[-1][-6:][0], leg[:6][-1] - leg[0]
-        if abs(np.angle(complex(*after) / complex(*before))) < _DRIVEN:
+        if abs(np.angle(complex(*after) / complex(*before))) < _MAX_DRIVEN_CORNER:
             out[-1] = np.concatenate([out[-1], leg[1:]])
         else:
             out.append(leg)
     return out
 
 
-def _pivot(xy: F64, before: float, after: float) -> Way:
+def _pivot_route(xy: F64, before: float, after: float) -> Route:
     """Turning in place, the short way."""
     angle = (after - before + np.pi) % (2 * np.pi) - np.pi
-    count = max(3, round(abs(angle) / _TURN_STEP))
+    count = max(3, round(abs(angle) / _PIVOT_STEP_RAD))
     heading = before + angle * np.linspace(0, 1, count)
-    bend = np.full(count, 1 / _ARM)
+    bend = np.full(count, 1 / _PIVOT_LEVER_M)
     bend[[0, -1]] = 1e3
-    return Way(
-        np.tile(xy, (count, 1)), _ARM * np.abs(heading - before) + 1e-6 * np.arange(count), heading, bend
+    return Route(
+        np.tile(xy, (count, 1)),
+        _PIVOT_LEVER_M * np.abs(heading - before) + 1e-6 * np.arange(count),
+        heading,
+        bend,
     )
 
 
-def _rumble(count: int, rng: Rng) -> F64:
+def _rumble_displacement(count: int, rng: Rng) -> F64:
     """Displacement (M,) m whose acceleration has rms 1 m/s^2, in a band with one soft resonance."""
     hz = np.fft.rfftfreq(count, KNOT_S)
-    low, peak, high = _BAND_HZ
+    low, peak, high = _RUMBLE_BAND_HZ
     shape = np.exp(-0.5 * (np.log(np.maximum(hz, 1e-3) / peak) / 0.5) ** 2) * (hz > low) * (hz < high)
     noise = shape * (rng.normal(size=len(hz)) + 1j * rng.normal(size=len(hz)))
     acceleration = np.fft.irfft(noise, count)
@@ -126,5 +133,5 @@ def _rumble(count: int, rng: Rng) -> F64:
     return moved
 
 
-def _integral(values: F64) -> F64:
+def _integrate(values: F64) -> F64:
     return np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2)]) * KNOT_S

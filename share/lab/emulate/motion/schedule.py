@@ -12,29 +12,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.lab.emulate.motion.route import Way
+from share.lab.emulate.motion.route import Route
 from share.types import F64
 
 STEP_S = 0.2
-_SPEEDS = 14  # that the search tells apart, besides standing
-_SUB = 2  # times within a step at which the others are looked at
+_SPEED_LEVELS = 14  # that the search tells apart, besides standing
+_SUBSTEPS = 2  # times within a step at which the others are looked at
 _FINE_S = 0.05
-_SMOOTH_S = 0.4  # sigma of the smoothing in time: a step of 1 m/s becomes 1 m/s^2 at most
+_SMOOTHING_S = 0.4  # sigma of the smoothing in time: a step of 1 m/s becomes 1 m/s^2 at most
 
 
 @dataclass(frozen=True)
-class Limits:
+class MotionLimits:
     """What a body can do. speed: m/s at most. turn: rad/s at most. aside: m/s^2 in a bend. gain: m/s^2
     of gaining and losing speed."""
 
-    speed: float
-    turn: float
-    aside: float
-    gain: float
+    max_speed: float
+    max_rotation_rate: float
+    lateral_acceleration: float
+    acceleration: float
 
 
 @dataclass(frozen=True, eq=False)
-class Other:
+class MovingObstacle:
     """One to keep `distance` m away from: where it is, xy (K, 2) m every STEP_S / 2 from the start; its
     last place counts for the time after."""
 
@@ -42,12 +42,15 @@ class Other:
     distance: float
 
 
-def speed_limit(way: Way, limits: Limits) -> F64:
+def speed_limit(route: Route, limits: MotionLimits) -> F64:
     """Most speed (N,) m/s at each place of the way, such that one can also brake for what comes."""
-    bend = np.abs(way.bend) + 1e-9
-    v: F64 = np.minimum(limits.speed, np.minimum(limits.turn / bend, np.sqrt(limits.aside / bend)))
+    bend = np.abs(route.curvature) + 1e-9
+    v: F64 = np.minimum(
+        limits.max_speed,
+        np.minimum(limits.max_rotation_rate / bend, np.sqrt(limits.lateral_acceleration / bend)),
+    )
     v = np.maximum(v, 0.05)
-    gain = 2 * limits.gain * np.diff(way.gone)
+    gain = 2 * limits.acceleration * np.diff(route.distance)
     for i in range(1, len(v)):
         v[i] = min(v[i], np.sqrt(v[i - 1] ** 2 + gain[i - 1]))
     for i in range(len(v) - 2, -1, -1):
@@ -55,11 +58,11 @@ def speed_limit(way: Way, limits: Limits) -> F64:
     return v
 
 
-def schedule(
-    way: Way,
-    most: F64,
-    wanted: F64,
-    others: Sequence[Other] = (),
+def plan_schedule(
+    route: Route,
+    speed_limits: F64,
+    target_speeds: F64,
+    others: Sequence[MovingObstacle] = (),
     end: float | None = None,
 ) -> F64 | None:
     """Metres along the way (T,) at the instants k * STEP_S, T = len(wanted) + 1; None if the others leave
@@ -68,57 +71,61 @@ def schedule(
     most (N,) m/s: speed limit at each place of the way; wanted (T - 1,) m/s: the speed one
     would like in each step. end: metres to have gone at the end, as nearly as possible.
     """
-    cell = float(most.max()) * STEP_S / _SPEEDS
-    place = np.arange(int(way.gone[-1] / cell) + 1) * cell
-    limit = np.interp(place, way.gone, most)
-    xy = np.stack([np.interp(place, way.gone, way.xy[:, k]) for k in range(2)], axis=1)
-    speeds = np.arange(_SPEEDS + 1) * (cell / STEP_S)
-    barred = np.where(speeds[:, None] <= np.maximum(limit, speeds[1] + 1e-9), 0.0, np.inf)
-    cost, back = np.full(len(place), np.inf), np.zeros((len(wanted), len(place)), np.int8)
+    cell = float(speed_limits.max()) * STEP_S / _SPEED_LEVELS
+    place = np.arange(int(route.distance[-1] / cell) + 1) * cell
+    limit = np.interp(place, route.distance, speed_limits)
+    xy = np.stack([np.interp(place, route.distance, route.xy[:, k]) for k in range(2)], axis=1)
+    speeds = np.arange(_SPEED_LEVELS + 1) * (cell / STEP_S)
+    is_forbidden = np.where(speeds[:, None] <= np.maximum(limit, speeds[1] + 1e-9), 0.0, np.inf)
+    cost, back = np.full(len(place), np.inf), np.zeros((len(target_speeds), len(place)), np.int8)
     cost[0], first, last = 0.0, 0, 1  # where one can be by now: in place[first:last]
-    for k, want in enumerate(wanted):
-        reach = min(last + _SPEEDS, len(place))
-        paid = np.full((len(speeds), reach - first), np.inf)
-        here = slice(first, last)
-        price = (speeds[:, None] - np.minimum(want, limit[here])) ** 2 + barred[:, here] + cost[here]
+    for k, target_speed in enumerate(target_speeds):
+        reach = min(last + _SPEED_LEVELS, len(place))
+        costs = np.full((len(speeds), reach - first), np.inf)
+        reachable = slice(first, last)
+        price = (
+            (speeds[:, None] - np.minimum(target_speed, limit[reachable])) ** 2
+            + is_forbidden[:, reachable]
+            + cost[reachable]
+        )
         for j in range(len(speeds)):
-            kept = min(last, reach - j) - first
-            paid[j, j : j + max(kept, 0)] = price[j, : max(kept, 0)]
-        back[k, first:reach] = np.argmin(paid, axis=0)
-        now = np.min(paid, axis=0)
-        now[_blocked(xy[first:reach], others, k + 1)] = np.inf
+            count = min(last, reach - j) - first
+            costs[j, j : j + max(count, 0)] = price[j, : max(count, 0)]
+        back[k, first:reach] = np.argmin(costs, axis=0)
+        now = np.min(costs, axis=0)
+        now[_blocked_mask(xy[first:reach], others, k + 1)] = np.inf
         cost[first:reach] = now
-        can = np.flatnonzero(np.isfinite(now))
-        if not len(can):
+        finite = np.flatnonzero(np.isfinite(now))
+        if not len(finite):
             return None
-        first, last = first + int(can[0]), first + int(can[-1]) + 1
+        first, last = first + int(finite[0]), first + int(finite[-1]) + 1
         cost[:first] = np.inf
     total = cost + (0 if end is None else 30 * (place - end) ** 2)
-    return _traced(back, int(np.argmin(total))) * cell
+    return _backtrack(back, int(np.argmin(total))) * cell
 
 
-def smoothed(steps: F64, seconds: F64) -> F64:
-    """Metres along the way (M,) at `seconds` (M,) of what `schedule` found, smooth in time."""
+def smooth_schedule(steps: F64, seconds: F64) -> F64:
+    """Metres along the way (M,) at `seconds` (M,) of what `plan_schedule` found, smooth in time."""
     from scipy.interpolate import make_interp_spline
     from scipy.ndimage import gaussian_filter1d
 
     fine = np.arange(0, (len(steps) - 1) * STEP_S + _FINE_S / 2, _FINE_S)
     rough = np.interp(fine, np.arange(len(steps)) * STEP_S, steps)
-    soft = gaussian_filter1d(rough, _SMOOTH_S / _FINE_S, mode="nearest")
+    soft = gaussian_filter1d(rough, _SMOOTHING_S / _FINE_S, mode="nearest")
     out: F64 = make_interp_spline(fine, soft, k=5)(seconds)
     return out.clip(steps[0], steps[-1])
 
 
-def _blocked(xy: F64, others: Sequence[Other], step: int) -> np.ndarray:
+def _blocked_mask(xy: F64, others: Sequence[MovingObstacle], step: int) -> np.ndarray:
     out = np.zeros(len(xy), bool)
     for other in others:
-        for k in range(_SUB * (step - 1) + 1, _SUB * step + 1):
-            there = other.xy[min(k, len(other.xy) - 1)]
-            out |= ((xy - there) ** 2).sum(axis=1) < other.distance**2
+        for k in range(_SUBSTEPS * (step - 1) + 1, _SUBSTEPS * step + 1):
+            position = other.xy[min(k, len(other.xy) - 1)]
+            out |= ((xy - position) ** 2).sum(axis=1) < other.distance**2
     return out
 
 
-def _traced(back: np.ndarray, end: int) -> F64:
+def _backtrack(back: np.ndarray, end: int) -> F64:
     places = [end]
     for row in back[::-1]:
         places.append(places[-1] - int(row[places[-1]]))

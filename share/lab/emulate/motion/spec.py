@@ -14,7 +14,7 @@ from share.errors import UsageError
 from share.plain_data import from_mapping
 from share.types import AgentKind
 
-LOOKS = ("person", "robot", "drone")
+BODY_KINDS = ("person", "robot", "drone")
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class RecordedSpec:
     def __post_init__(self) -> None:
         if not self.path:
             raise ValueError("says no folder or file")
-        _one_of("kind", self.kind, tuple(AgentKind))
-        _one_of("look", self.look, LOOKS)
-        _positive(self, "seconds")
+        _check_one_of("kind", self.kind, tuple(AgentKind))
+        _check_one_of("look", self.look, BODY_KINDS)
+        _check_positive(self, "seconds")
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ class WalkSpec:
     turns: float = 2.6
 
     def __post_init__(self) -> None:
-        _positive(self, "speed", "seconds", "height", "turns")
-        _within("speed", self.speed, 0.2, 2.0, "m/s")
-        _within("turns", self.turns, 0.5, 3.0, "rad/s")
-        _within("pauses", self.pauses, 0.0, 12.0, "a minute")
+        _check_positive(self, "speed", "seconds", "height", "turns")
+        _check_range("speed", self.speed, 0.2, 2.0, "m/s")
+        _check_range("turns", self.turns, 0.5, 3.0, "rad/s")
+        _check_range("pauses", self.pauses, 0.0, 12.0, "a minute")
         if self.height is not None:
-            _within("height", self.height, 1.2, 2.0, "m")
+            _check_range("height", self.height, 1.2, 2.0, "m")
 
 
 @dataclass(frozen=True)
@@ -86,11 +86,11 @@ class RobotSpec:
     vibration: float = 0.4
 
     def __post_init__(self) -> None:
-        _positive(self, "speed", "seconds", "height")
-        _within("speed", self.speed, 0.05, 1.0, "m/s")
-        _within("pauses", self.pauses, 0.0, 12.0, "a minute")
-        _within("height", self.height, 0.1, 1.5, "m")
-        _within("vibration", self.vibration, 0.0, 2.0, "m/s^2")
+        _check_positive(self, "speed", "seconds", "height")
+        _check_range("speed", self.speed, 0.05, 1.0, "m/s")
+        _check_range("pauses", self.pauses, 0.0, 12.0, "a minute")
+        _check_range("height", self.height, 0.1, 1.5, "m")
+        _check_range("vibration", self.vibration, 0.0, 2.0, "m/s^2")
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class BoardSpec:
     seconds: float | None = None
 
     def __post_init__(self) -> None:
-        _positive(self, "distance", "vigour", "seconds")
-        _within("distance", self.distance, 0.3, 3.0, "m")
-        _within("vigour", self.vigour, 0.1, 2.0, "times the usual speed")
+        _check_positive(self, "distance", "vigour", "seconds")
+        _check_range("distance", self.distance, 0.3, 3.0, "m")
+        _check_range("vigour", self.vigour, 0.1, 2.0, "times the usual speed")
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class PaperSpec:
 
 Spec: TypeAlias = EurocSpec | TumviSpec | TumSpec | WalkSpec | RobotSpec | BoardSpec | PaperSpec
 
-KINDS: dict[str, type[Spec]] = {
+SPEC_KINDS: dict[str, type[Spec]] = {
     "euroc": EurocSpec,
     "tumvi": TumviSpec,
     "tum": TumSpec,
@@ -128,36 +128,36 @@ KINDS: dict[str, type[Spec]] = {
     "paper": PaperSpec,
 }
 _NAME = re.compile(r"([^:=]*)=(.*)", re.DOTALL)
-_GOOD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}")
+_VALID_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}")
 _OPTION = re.compile(r"\s*([a-z_]+)=(.*)", re.DOTALL)
 
 
-def parse(text: str) -> tuple[str | None, Spec]:
+def parse_motion(text: str) -> tuple[str | None, Spec]:
     """(name or None, spec) of `NAME=SPEC` or `SPEC`. Raises UsageError naming what is wrong."""
     named = _NAME.fullmatch(text)
     name, spec = (named[1], named[2]) if named else (None, text)
-    if name is not None and not _GOOD_NAME.fullmatch(name):
+    if name is not None and not _VALID_NAME.fullmatch(name):
         raise UsageError(f"'{text}': '{name}' is no name; use letters, digits, '-' and '_', at most 32")
     kind, colon, rest = spec.partition(":")
-    if kind not in KINDS or not colon:
-        near = difflib.get_close_matches(kind, KINDS, n=1)
-        hint = f"did you mean '{near[0]}:'?" if near else "known: " + ", ".join(f"{k}:" for k in KINDS)
+    if kind not in SPEC_KINDS or not colon:
+        near = difflib.get_close_matches(kind, SPEC_KINDS, n=1)
+        hint = f"did you mean '{near[0]}:'?" if near else "known: " + ", ".join(f"{k}:" for k in SPEC_KINDS)
         raise UsageError(f"'{text}': '{kind}' is not a kind of motion; {hint}")
-    argument, options = _split(rest)
-    return name, _make(kind, argument, options, text)
+    argument, options = _split_options(rest)
+    return name, _make_spec(kind, argument, options, text)
 
 
-def _split(rest: str) -> tuple[str, dict[str, str]]:
+def _split_options(rest: str) -> tuple[str, dict[str, str]]:
     """`FOLDER,start=5,seconds=20` -> the folder, which may hold commas, and the options behind it."""
     parts, options = rest.split(","), {}
-    while parts and (found := _OPTION.fullmatch(parts[-1])):
-        options[found[1]] = found[2].strip()
+    while parts and (match := _OPTION.fullmatch(parts[-1])):
+        options[match[1]] = match[2].strip()
         parts.pop()
     return ",".join(parts), options
 
 
-def _make(kind: str, argument: str, options: dict[str, str], text: str) -> Spec:
-    cls = KINDS[kind]
+def _make_spec(kind: str, argument: str, options: dict[str, str], text: str) -> Spec:
+    cls = SPEC_KINDS[kind]
     if cls is PaperSpec:
         if argument not in ("1", "2", "3", "4", "5") or options:
             raise UsageError(
@@ -171,18 +171,18 @@ def _make(kind: str, argument: str, options: dict[str, str], text: str) -> Spec:
     return from_mapping(cls, options | ({"path": argument} if takes_path else {}), f"'{text}'")
 
 
-def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+def _check_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
         raise ValueError(f"{name} '{value}' is not known; known: {', '.join(known)}")
 
 
-def _positive(spec: object, *names: str) -> None:
+def _check_positive(spec: object, *names: str) -> None:
     for name in names:
         value = getattr(spec, name)
         if value is not None and not value > 0:
             raise ValueError(f"{name}={value:g} must be positive")
 
 
-def _within(name: str, value: float, low: float, high: float, unit: str) -> None:
+def _check_range(name: str, value: float, low: float, high: float, unit: str) -> None:
     if not low <= value <= high:
         raise ValueError(f"{name}={value:g}: expected {low:g} to {high:g} {unit}")

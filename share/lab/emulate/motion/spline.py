@@ -20,7 +20,7 @@ from share.geometry import se3
 from share.lab.emulate.types import GRAVITY
 from share.types import F64, I64, ImuBatch
 
-DEGREE = 5
+SPLINE_DEGREE = 5
 _NO_GAPS = np.zeros((0, 2), np.int64)
 
 
@@ -47,14 +47,14 @@ class SplinePath:
         s, ds = self.quaternion(t), self.quaternion(t, 1)
         force = self.position(t, 2) + np.array([0.0, 0.0, GRAVITY])
         R = se3.matrix_from_quat(s)
-        return rate(s, ds), np.einsum("nji,nj->ni", R, force)
+        return body_rates(s, ds), np.einsum("nji,nj->ni", R, force)
 
     def velocity(self, stamps_ns: I64) -> F64:
         """Of the body in the world (N, 3) m/s."""
         v: F64 = self.position(self._seconds(stamps_ns), 1)
         return v
 
-    def placed(self, T_world_old: F64) -> SplinePath:
+    def transformed(self, T_world_old: F64) -> SplinePath:
         """The same motion elsewhere: turned about the vertical and shifted by T_world_old (4, 4). Exact:
         both act on the coefficients alone. Raises ValueError if it would tilt gravity."""
         R, shift = T_world_old[:3, :3], T_world_old[:3, 3]
@@ -63,21 +63,23 @@ class SplinePath:
         turn = se3.quat_from_matrix(R)
         return replace(
             self,
-            position=_with(self.position, self.position.c @ R.T + shift),
-            quaternion=_with(self.quaternion, product(turn, self.quaternion.c)),
+            position=_with_coefficients(self.position, self.position.c @ R.T + shift),
+            quaternion=_with_coefficients(self.quaternion, quaternion_product(turn, self.quaternion.c)),
         )
 
-    def turned(self, R_body_new: F64) -> SplinePath:
+    def with_axes(self, R_body_new: F64) -> SplinePath:
         """The motion of a body at the same place whose axes are turned by R_body_new (3, 3). Exact."""
         turn = se3.quat_from_matrix(R_body_new)
-        return replace(self, quaternion=_with(self.quaternion, product(self.quaternion.c, turn)))
+        return replace(
+            self, quaternion=_with_coefficients(self.quaternion, quaternion_product(self.quaternion.c, turn))
+        )
 
-    def part(self, start_ns: int, end_ns: int) -> SplinePath:
+    def cut(self, start_ns: int, end_ns: int) -> SplinePath:
         """The same motion between two stamps, which keep their meaning. Raises ValueError outside."""
         if not self.start_ns <= start_ns < end_ns <= self.end_ns:
             raise ValueError(f"{start_ns} .. {end_ns} ns: is not within {self.start_ns} .. {self.end_ns} ns")
         shift = (start_ns - self.start_ns) / 1e9
-        moved = [_with(s, s.c, s.t - shift) for s in (self.position, self.quaternion)]
+        moved = [_with_coefficients(s, s.c, s.t - shift) for s in (self.position, self.quaternion)]
         keep = (self.gaps[:, 1] > start_ns) & (self.gaps[:, 0] < end_ns)
         return replace(
             self,
@@ -86,7 +88,7 @@ class SplinePath:
             position=moved[0],
             quaternion=moved[1],
             gaps=self.gaps[keep].clip(start_ns, end_ns),
-            recorded=_between(self.recorded, start_ns, end_ns),
+            recorded=_samples_between(self.recorded, start_ns, end_ns),
         )
 
     def _seconds(self, stamps_ns: I64) -> F64:
@@ -99,26 +101,26 @@ class SplinePath:
         return (stamps - self.start_ns) / 1e9
 
 
-def through(
+def spline_through(
     start_ns: int, seconds: F64, p: F64, q: F64, gaps: ArrayLike = (), recorded: ImuBatch | None = None
 ) -> SplinePath:
     """The spline through positions p (N, 3) m and quaternions q (N, 4) xyzw, of any signs, at `seconds`
     (N,), rising from 0. Raises ValueError for fewer than 6 knots."""
     from scipy.interpolate import make_interp_spline
 
-    if len(seconds) <= DEGREE:
-        raise ValueError(f"seconds: {len(seconds)} knots, at least {DEGREE + 1} are needed")
+    if len(seconds) <= SPLINE_DEGREE:
+        raise ValueError(f"seconds: {len(seconds)} knots, at least {SPLINE_DEGREE + 1} are needed")
     return SplinePath(
         start_ns=start_ns,
         end_ns=start_ns + int(np.floor(seconds[-1] * 1e9)),
-        position=make_interp_spline(seconds, p, k=DEGREE),
-        quaternion=make_interp_spline(seconds, continuous(q), k=DEGREE),
+        position=make_interp_spline(seconds, p, k=SPLINE_DEGREE),
+        quaternion=make_interp_spline(seconds, continuous_quaternions(q), k=SPLINE_DEGREE),
         gaps=np.asarray(gaps, np.int64).reshape(-1, 2),
         recorded=recorded,
     )
 
 
-def continuous(q: F64) -> F64:
+def continuous_quaternions(q: F64) -> F64:
     """Quaternions (N, 4) of unit length with signs such that neighbours are near each other."""
     q = q / np.linalg.norm(q, axis=1, keepdims=True)
     flips = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0, -1.0, 1.0)
@@ -126,26 +128,26 @@ def continuous(q: F64) -> F64:
     return out
 
 
-def rate(s: F64, ds: F64) -> F64:
+def body_rates(s: F64, ds: F64) -> F64:
     """Angular rate (N, 3) rad/s in the body frame, of quaternions s (N, 4) of any length and their
     derivatives."""
     conjugate = s * (-1.0, -1.0, -1.0, 1.0)
-    out: F64 = 2 * product(conjugate, ds)[..., :3] / np.sum(s * s, axis=-1, keepdims=True)
+    out: F64 = 2 * quaternion_product(conjugate, ds)[..., :3] / np.sum(s * s, axis=-1, keepdims=True)
     return out
 
 
-def product(a: F64, b: F64) -> F64:
+def quaternion_product(a: F64, b: F64) -> F64:
     """Hamilton product of quaternions (..., 4) xyzw."""
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
     vector = aw * bv + bw * av + np.cross(av, bv)
     return np.concatenate([vector, aw * bw - np.sum(av * bv, axis=-1, keepdims=True)], axis=-1)
 
 
-def _with(spline: Any, c: F64, t: F64 | None = None) -> Any:
+def _with_coefficients(spline: Any, c: F64, t: F64 | None = None) -> Any:
     return type(spline)(spline.t if t is None else t, c, spline.k)
 
 
-def _between(imu: ImuBatch | None, start_ns: int, end_ns: int) -> ImuBatch | None:
+def _samples_between(imu: ImuBatch | None, start_ns: int, end_ns: int) -> ImuBatch | None:
     if imu is None:
         return None
     keep = (imu.stamps_ns >= start_ns) & (imu.stamps_ns <= end_ns)

@@ -12,7 +12,7 @@ KNOT_S = 0.005  # between the knots of a path: carries motion up to 60 Hz
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class PlanarTrack:
     """seconds (M,) from 0 every KNOT_S; xy (M, 2) m; heading (M,) rad, without jumps; speed (M,) m/s."""
 
     seconds: F64
@@ -21,12 +21,14 @@ class Track:
     speed: F64
 
 
-def instants(duration: float) -> F64:
+def knot_times(duration: float) -> F64:
     """Seconds (M,) from 0, every KNOT_S, to at least `duration`."""
     return np.arange(int(np.ceil(duration / KNOT_S - 1e-9)) + 1, dtype=np.float64) * KNOT_S
 
 
-def wander(rng: np.random.Generator, seconds: F64, periods: tuple[float, float], waves: int = 4) -> F64:
+def random_wander(
+    rng: np.random.Generator, seconds: F64, periods: tuple[float, float], waves: int = 4
+) -> F64:
     """A signal (M,) that comes and goes with `periods` (shortest, longest) s, rms 1, never repeating."""
     rates = 2 * np.pi / rng.uniform(*periods, waves)
     phases = rng.uniform(0, 2 * np.pi, waves)

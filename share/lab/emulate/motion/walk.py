@@ -13,95 +13,110 @@ import numpy as np
 
 from share.geometry import se3
 from share.lab.emulate.motion.floor import Floor
-from share.lab.emulate.motion.gait import Gait, gait_of
-from share.lab.emulate.motion.gaze import Seen, look
-from share.lab.emulate.motion.route import Rng, Way, arc_length, headings, smooth
-from share.lab.emulate.motion.schedule import Limits, smoothed
-from share.lab.emulate.motion.spline import SplinePath, through
-from share.lab.emulate.motion.track import Track, instants, wander
+from share.lab.emulate.motion.gait import Gait, make_gait
+from share.lab.emulate.motion.gaze import GazeAgent, head_directions
+from share.lab.emulate.motion.route import Rng, Route, arc_length, headings, smooth_route
+from share.lab.emulate.motion.schedule import MotionLimits, smooth_schedule
+from share.lab.emulate.motion.spline import SplinePath, spline_through
+from share.lab.emulate.motion.track import PlanarTrack, knot_times, random_wander
 from share.types import F64
 
 RADIUS = 0.30  # m, of a body, arms hanging
-STILL_S = 1.3  # at the start, for the IMU
-LEVER = np.array([0.10, 0.0, 0.12])  # m, from the top of the neck to the headset: ahead, left, up
+INITIAL_STILL_S = 1.3  # at the start, for the IMU
+NECK_TO_HEADSET_M = np.array([0.10, 0.0, 0.12])  # m, from the top of the neck to the headset: ahead, left, up
 CAMERA_AXES = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # x right, y down, z ahead in (ahead, left, up)
-_TRUNK_S = 0.25  # sigma: how slowly the trunk turns into a bend,
+_TRUNK_SMOOTHING_S = 0.25  # sigma: how slowly the trunk turns into a bend,
 _TRUNK_RATE = 1.6  # rad/s, and how quickly at most
 
 
-def limits(speed: float) -> Limits:
-    """Of a person who likes to walk at `speed` m/s."""
-    return Limits(speed=1.25 * speed, turn=1.5, aside=2.0, gain=1.2)
+def motion_limits(speed: float) -> MotionLimits:
+    """Of a person who likes to walk at `max_speed` m/s."""
+    return MotionLimits(
+        max_speed=1.25 * speed, max_rotation_rate=1.5, lateral_acceleration=2.0, acceleration=1.2
+    )
 
 
-def way_of(floor: Floor, legs: Sequence[F64]) -> Way:
+def route_from_legs(floor: Floor, legs: Sequence[F64]) -> Route:
     """The smooth line that a person makes of the legs of a tour."""
     line = np.concatenate([legs[0], *(leg[1:] for leg in legs[1:])])
-    xy = smooth(floor, line, RADIUS)
-    gone, heading = arc_length(xy), headings(xy)
-    return Way(xy, gone, heading, np.gradient(heading) / np.gradient(gone))
+    xy = smooth_route(floor, line, RADIUS)
+    distances, heading = arc_length(xy), headings(xy)
+    return Route(xy, distances, heading, np.gradient(heading) / np.gradient(distances))
 
 
-def track_of(way: Way, steps: F64, duration: float) -> Track:
+def track_on_route(route: Route, steps: F64, duration: float) -> PlanarTrack:
     """The trunk's motion, for the places along the way of a schedule."""
     from scipy.ndimage import gaussian_filter1d
 
-    seconds = instants(duration)
-    gone = smoothed(steps, seconds)
+    seconds = knot_times(duration)
+    distance = smooth_schedule(steps, seconds)
     step = seconds[1]
-    xy, heading = (_at(gone, way.gone, values) for values in (way.xy, np.unwrap(way.heading)[:, None]))
-    turned = gaussian_filter1d(_followed(heading[:, 0], _TRUNK_RATE * step), _TRUNK_S / step, mode="nearest")
-    return Track(seconds, xy, turned, np.gradient(gone, step))
+    xy, heading = (
+        _interpolate(distance, route.distance, values)
+        for values in (route.xy, np.unwrap(route.heading)[:, None])
+    )
+    turned = gaussian_filter1d(
+        _rate_limited(heading[:, 0], _TRUNK_RATE * step), _TRUNK_SMOOTHING_S / step, mode="nearest"
+    )
+    return PlanarTrack(seconds, xy, turned, np.gradient(distance, step))
 
 
-def path_of(
-    track: Track,
+def headset_path(
+    track: PlanarTrack,
     height: float,
-    turns: float,
-    things: F64,
-    others: Sequence[Seen],
+    max_head_rate: float,
+    gaze_targets: F64,
+    others: Sequence[GazeAgent],
     start_ns: int,
     rng: Rng,
 ) -> SplinePath:
     """The headset's motion. height: m, of the eyes. turns: rad/s, of the quickest turn of the head.
     things (K, 3) m and others: what there is to look at."""
-    gait = gait_of(track, rng)
-    yaw, pitch = look(track, height, things, others, STILL_S, turns, rng)
-    R = _head(track.seconds, gait, yaw, pitch, rng)
+    gait = make_gait(track, rng)
+    yaw, pitch = head_directions(track, height, gaze_targets, others, INITIAL_STILL_S, max_head_rate, rng)
+    R = _head_rotations(track.seconds, gait, yaw, pitch, rng)
     left = np.stack([-np.sin(track.heading), np.cos(track.heading)], axis=1)
-    neck = np.column_stack([track.xy + gait.aside[:, None] * left, height - LEVER[2] + gait.up])
-    return through(start_ns, track.seconds, neck + R @ LEVER, se3.quat_from_matrix(R @ CAMERA_AXES))
+    neck = np.column_stack(
+        [track.xy + gait.sideways[:, None] * left, height - NECK_TO_HEADSET_M[2] + gait.up]
+    )
+    return spline_through(
+        start_ns, track.seconds, neck + R @ NECK_TO_HEADSET_M, se3.quat_from_matrix(R @ CAMERA_AXES)
+    )
 
 
-def _head(seconds: F64, gait: Gait, yaw: F64, pitch: F64, rng: Rng) -> F64:
+def _head_rotations(seconds: F64, gait: Gait, yaw: F64, pitch: F64, rng: Rng) -> F64:
     """Orientation (M, 3, 3) of the head (ahead, left, up): where one looks, the nods of the gait (the
     head pitches against the bob so that the eyes stay on their target; Hirasaki et al., Exp. Brain
     Res. 127, 1999), and what a head does at rest."""
-    rest = 0.004 * np.stack([wander(rng, seconds, (1.5, 6.0), 5) for _ in range(3)])
+    rest = 0.004 * np.stack([random_wander(rng, seconds, (1.5, 6.0), 5) for _ in range(3)])
     nod = 0.012 * gait.vigour * np.cos(gait.phase - 0.3)
     tilt = 0.010 * gait.vigour * np.sin(gait.phase / 2 + 0.4)
     swing = 0.018 * gait.vigour * np.cos(gait.phase / 2)
-    return turn(2, yaw + swing + rest[0]) @ turn(1, -(pitch + nod + rest[1])) @ turn(0, tilt + rest[2])
+    return (
+        axis_rotation(2, yaw + swing + rest[0])
+        @ axis_rotation(1, -(pitch + nod + rest[1]))
+        @ axis_rotation(0, tilt + rest[2])
+    )
 
 
-def turn(axis: int, angle: F64) -> F64:
+def axis_rotation(axis: int, angle: F64) -> F64:
     """Rotations (M, 3, 3) about one axis."""
     phi = np.zeros((len(angle), 3))
     phi[:, axis] = angle
     return se3.so3_exp(phi)
 
 
-def _followed(heading: F64, most: float) -> F64:
-    """`heading` (M,) rad, followed by at most `most` rad from one instant to the next."""
+def _rate_limited(heading: F64, max_step: float) -> F64:
+    """`heading` (M,) rad, followed by at most `max_step` rad from one instant to the next."""
     out = heading.tolist()
     for i in range(1, len(out)):
-        out[i] = out[i - 1] + min(most, max(-most, out[i] - out[i - 1]))
+        out[i] = out[i - 1] + min(max_step, max(-max_step, out[i] - out[i - 1]))
     return np.array(out)
 
 
-def _at(where: F64, gone: F64, values: F64) -> F64:
-    """values (N, D) given at `gone` (N,), at `where` (M,), smoothly."""
+def _interpolate(query: F64, distances: F64, values: F64) -> F64:
+    """values (N, D) given at `gone` (N,), at `query` (M,), smoothly."""
     from scipy.interpolate import make_interp_spline
 
-    out: F64 = make_interp_spline(gone, values, k=3)(where)
+    out: F64 = make_interp_spline(distances, values, k=3)(query)
     return out

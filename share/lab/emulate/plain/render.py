@@ -13,25 +13,25 @@ import numpy as np
 
 from share.geometry.camera import Camera
 from share.geometry.se3 import inverse, transform
-from share.lab.emulate.plain.room import LEVELS, TEXELS_PER_M, Room
+from share.lab.emulate.plain.room import LEVELS, TEXELS_PER_M, PlainRoom
 from share.types import F32, F64, U8
 
-_NEAR = 0.05  # m; nothing is nearer
+_MIN_DEPTH_M = 0.05  # m; nothing is nearer
 _ANISOTROPY = 0.6  # blur on slanted faces: 0 by the short side of a pixel's footprint, 1 by the long
 _MAX_FACES = 256  # a face fits in a byte
 
 
-class Renderer:
+class PlainRoomRenderer:
     """Pictures of one room by one undistorted camera. Not safe for threads: it reuses its buffers."""
 
-    def __init__(self, room: Room, camera: Camera) -> None:
+    def __init__(self, room: PlainRoom, camera: Camera) -> None:
         if camera.distortion:
             raise ValueError("camera: the plain renderer has no lens distortion")
         if len(room.origin) > _MAX_FACES:
             raise ValueError(f"room: {len(room.origin)} faces, at most {_MAX_FACES}")
         self._room, self._camera = room, camera
         self._pyramid = room.pyramid.pixels
-        self._corner, self._origin = _table(room.pyramid.corners), _table(room.origin)
+        self._corner, self._origin = _lookup_table(room.pyramid.corners), _lookup_table(room.origin)
         shape = (camera.height, camera.width)
         self._q, self._face = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
 
@@ -63,7 +63,7 @@ class Renderer:
         self._q.fill(0)
         for k, ray in enumerate(rays):
             for side in (0, 1):
-                _keep_larger(self._q, self._face, ray * np.float32(slopes[side, k]), 2 * k + side)
+                _update_nearest(self._q, self._face, ray * np.float32(slopes[side, k]), 2 * k + side)
 
     def _cast_box(self, b: int, rays: list[F32], centre: F64, window: tuple[slice, slice]) -> None:
         box = self._room.boxes[b]
@@ -92,25 +92,25 @@ class Renderer:
         corners = np.array(
             [[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         )
-        seen = transform(inverse(T_world_cam), corners)
-        if (seen[:, 2] < _NEAR).all():
+        corners_in_camera = transform(inverse(T_world_cam), corners)
+        if (corners_in_camera[:, 2] < _MIN_DEPTH_M).all():
             return None
-        if (seen[:, 2] < _NEAR).any():
+        if (corners_in_camera[:, 2] < _MIN_DEPTH_M).any():
             return slice(0, c.height), slice(0, c.width)
-        px = c.project(seen)
+        px = c.project(corners_in_camera)
         (left, top), (right, bottom) = np.floor(px.min(0)).astype(int), np.ceil(px.max(0)).astype(int) + 1
         rows, columns = slice(max(top, 0), min(bottom, c.height)), slice(max(left, 0), min(right, c.width))
         return (rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
 
     def _texture(self, rays: list[F32], depth: F32, centre: F64) -> U8:
         hit = [ray * depth + np.float32(x) for ray, x in zip(rays, centre, strict=True)]
-        axis = cv2.LUT(self._face, _AXIS)
+        axis = cv2.LUT(self._face, _FACE_AXIS)
         column, row = hit[0], -hit[2]
         np.copyto(column, hit[1], where=axis == 0)
         np.copyto(row, hit[1], where=axis == 2)
         level = self._level(depth, centre)
         whole = level.astype(np.uint8)
-        shrink = cv2.LUT(whole, _SHRINK)
+        shrink = cv2.LUT(whole, _LEVEL_SCALE)
         for k, at in enumerate((column, row)):
             at *= np.float32(TEXELS_PER_M)
             at += cv2.LUT(self._face, self._origin[k])
@@ -125,26 +125,26 @@ class Renderer:
         """log2 of a pixel's footprint in texels. On a plane at distance d the footprint is z / f
         by z^2 / (f d)."""
         room = self._room
-        away = np.abs(room.boxes.swapaxes(1, 2) - centre[:, None]).reshape(-1).clip(_NEAR)
+        away = np.abs(room.boxes.swapaxes(1, 2) - centre[:, None]).reshape(-1).clip(_MIN_DEPTH_M)
         scale = np.log2(TEXELS_PER_M / self._camera.fx) - _ANISOTROPY * np.log2(away)
         level = np.log2(depth)
         level *= np.float32(1 + _ANISOTROPY)
-        level += cv2.LUT(self._face, _table(scale[:, None].astype(np.float32))[0])
+        level += cv2.LUT(self._face, _lookup_table(scale[:, None].astype(np.float32))[0])
         return np.clip(level, 0, LEVELS - 1.001, out=level)
 
 
-def _keep_larger(q: F32, face: U8, candidate: F32, name: int) -> None:
+def _update_nearest(q: F32, face: U8, candidate: F32, name: int) -> None:
     larger = candidate > q
     np.copyto(q, candidate, where=larger)
     np.copyto(face, np.uint8(name), where=larger)
 
 
-def _table(values: F32) -> F32:
+def _lookup_table(values: F32) -> F32:
     """Columns of (N, C) as lookup tables by a byte: (C, 256)."""
     out = np.zeros((values.shape[1], 256), np.float32)
     out[:, : len(values)] = values.T
     return out
 
 
-_AXIS = (np.arange(256) % 6 // 2).astype(np.uint8)
-_SHRINK = (0.5 ** np.arange(256)).astype(np.float32)
+_FACE_AXIS = (np.arange(256) % 6 // 2).astype(np.uint8)
+_LEVEL_SCALE = (0.5 ** np.arange(256)).astype(np.float32)

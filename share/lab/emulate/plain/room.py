@@ -19,9 +19,11 @@ from share.types import F32, F64, U8
 
 TEXELS_PER_M = 250.0
 LEVELS = 6  # of the mip pyramid: level l has 2^-l of the resolution
-_PAD = 1 << (LEVELS - 1)  # texels repeated around a patch, so that no level bleeds into its neighbour
+_PATCH_PADDING = 1 << (
+    LEVELS - 1
+)  # texels repeated around a patch, so that no level bleeds into its neighbour
 _ATLAS_WIDTH = 4096
-_SHADE = (0.92, 1.0, 1.06)  # light falls a little differently on each axis
+_AXIS_SHADE = (0.92, 1.0, 1.06)  # light falls a little differently on each axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Pyramid:
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class PlainRoom:
     """boxes: (B, 2, 3) m, lower and upper corners. atlas: (H, W) uint8. origin: (6 B, 2) float32, the
     texel (column, row) of world (0, 0) in each face's picture (see `face_axes`)."""
 
@@ -51,26 +53,26 @@ class Room:
     @cached_property
     def pyramid(self) -> Pyramid:
         """The atlas as renderers want it, made once for all of them."""
-        return _pyramid(self.atlas)
+        return _make_pyramid(self.atlas)
 
 
-def make_room(seed: int, size: tuple[float, float, float] = (9.0, 6.0, 3.0)) -> Room:
+def make_room(seed: int, size: tuple[float, float, float] = (9.0, 6.0, 3.0)) -> PlainRoom:
     """Another room for every seed. Furniture keeps to a strip of 0.75 m along the walls, but for a
     column in the middle: between them one can walk."""
     rng = np.random.default_rng([seed, 1])
-    boxes = _boxes(rng, size)
-    pictures = [_picture(rng, boxes, face) for face in range(6 * len(boxes))]
-    atlas, corners = _pack(pictures)
-    return Room(boxes, atlas, _origins(boxes, corners))
+    boxes = _all_boxes(rng, size)
+    pictures = [_face_picture(rng, boxes, face) for face in range(6 * len(boxes))]
+    atlas, corners = _pack_atlas(pictures)
+    return PlainRoom(boxes, atlas, _face_origins(boxes, corners))
 
 
 def room_boxes(seed: int, size: tuple[float, float, float]) -> F64:
     """`make_room(seed, size).boxes`, without drawing its pictures."""
-    return _boxes(np.random.default_rng([seed, 1]), size)
+    return _all_boxes(np.random.default_rng([seed, 1]), size)
 
 
-def _boxes(rng: np.random.Generator, size: tuple[float, float, float]) -> F64:
-    return np.stack([np.array([(0, 0, 0), size]), _column(rng, size), *_furniture(rng, size)])
+def _all_boxes(rng: np.random.Generator, size: tuple[float, float, float]) -> F64:
+    return np.stack([np.array([(0, 0, 0), size]), _column_box(rng, size), *_furniture_boxes(rng, size)])
 
 
 def face_axes(face: int) -> tuple[int, int, int]:
@@ -78,13 +80,13 @@ def face_axes(face: int) -> tuple[int, int, int]:
     return ((0, 1, 2), (1, 0, 2), (2, 0, 1))[face % 6 // 2]
 
 
-def _column(rng: np.random.Generator, size: tuple[float, float, float]) -> F64:
+def _column_box(rng: np.random.Generator, size: tuple[float, float, float]) -> F64:
     half = rng.uniform(0.15, 0.22)
     x, y = np.array(size[:2]) / 2 + rng.uniform(-0.1, 0.1, 2)
     return np.array([(x - half, y - half, 0), (x + half, y + half, size[2])])
 
 
-def _furniture(rng: np.random.Generator, size: tuple[float, float, float]) -> list[F64]:
+def _furniture_boxes(rng: np.random.Generator, size: tuple[float, float, float]) -> list[F64]:
     """Shelves, cupboards and crates along the four walls, with gaps between them."""
     out = []
     for across, along in ((0, 1), (1, 0)):
@@ -103,15 +105,19 @@ def _furniture(rng: np.random.Generator, size: tuple[float, float, float]) -> li
     return out
 
 
-def _picture(rng: np.random.Generator, boxes: F64, face: int) -> U8:
+def _face_picture(rng: np.random.Generator, boxes: F64, face: int) -> U8:
     box, (across, along, up) = boxes[face // 6], face_axes(face)
     extent = (box[1] - box[0]) * TEXELS_PER_M
     size = (max(int(np.ceil(extent[up])), 8) + 1, max(int(np.ceil(extent[along])), 8) + 1)
     if face < 6:
-        draw = texture.wall if across < 2 else (texture.floor, texture.ceiling)[face % 2]
+        draw = (
+            texture.wall_texture if across < 2 else (texture.floor_texture, texture.ceiling_texture)[face % 2]
+        )
     else:
-        draw = texture.shelf if across < 2 and box[1, 2] > 1.5 and face >= 12 else texture.crate
-    picture = draw(rng, size, TEXELS_PER_M) * _SHADE[across]
+        draw = (
+            texture.shelf_texture if across < 2 and box[1, 2] > 1.5 and face >= 12 else texture.crate_texture
+        )
+    picture = draw(rng, size, TEXELS_PER_M) * _AXIS_SHADE[across]
     if face < 6:
         picture *= _corner_shadow(size)
     if across < 2 and (across + face) % 2 == (face < 6):
@@ -126,23 +132,28 @@ def _corner_shadow(size: tuple[int, int]) -> F32:
     return np.outer(*fall).astype(np.float32)
 
 
-def _pack(pictures: list[U8]) -> tuple[U8, list[tuple[int, int]]]:
+def _pack_atlas(pictures: list[U8]) -> tuple[U8, list[tuple[int, int]]]:
     """The atlas and the (column, row) of each picture in it: shelves, tallest first."""
     corners = [(0, 0)] * len(pictures)
     x = y = height = 0
     for i in sorted(range(len(pictures)), key=lambda i: -pictures[i].shape[0]):
-        h, w = ((n + 2 * _PAD + _PAD - 1) // _PAD * _PAD for n in pictures[i].shape)
+        h, w = (
+            (n + 2 * _PATCH_PADDING + _PATCH_PADDING - 1) // _PATCH_PADDING * _PATCH_PADDING
+            for n in pictures[i].shape
+        )
         if x + w > _ATLAS_WIDTH:
             x, y, height = 0, y + height, 0
-        corners[i], x, height = (x + _PAD, y + _PAD), x + w, max(height, h)
+        corners[i], x, height = (x + _PATCH_PADDING, y + _PATCH_PADDING), x + w, max(height, h)
     atlas = np.zeros((y + height, _ATLAS_WIDTH), np.uint8)
     for (cx, cy), picture in zip(corners, pictures, strict=True):
-        framed = cv2.copyMakeBorder(picture, _PAD, _PAD, _PAD, _PAD, cv2.BORDER_REPLICATE)
-        atlas[cy - _PAD :, cx - _PAD :][: framed.shape[0], : framed.shape[1]] = framed
+        framed = cv2.copyMakeBorder(
+            picture, _PATCH_PADDING, _PATCH_PADDING, _PATCH_PADDING, _PATCH_PADDING, cv2.BORDER_REPLICATE
+        )
+        atlas[cy - _PATCH_PADDING :, cx - _PATCH_PADDING :][: framed.shape[0], : framed.shape[1]] = framed
     return atlas, corners
 
 
-def _origins(boxes: F64, corners: list[tuple[int, int]]) -> F32:
+def _face_origins(boxes: F64, corners: list[tuple[int, int]]) -> F32:
     """Where world (0, 0) of each face's axes would lie in the atlas. Rows of upright faces run down."""
     out = np.zeros((len(corners), 2), np.float32)
     for face, (cx, cy) in enumerate(corners):
@@ -153,7 +164,7 @@ def _origins(boxes: F64, corners: list[tuple[int, int]]) -> F32:
     return out
 
 
-def _pyramid(atlas: U8) -> Pyramid:
+def _make_pyramid(atlas: U8) -> Pyramid:
     """Pixel x of level 0 is pixel x / 2 of level 1 (pyrDown keeps even pixels)."""
     levels = [atlas]
     for _ in range(LEVELS):

@@ -15,7 +15,7 @@ Size = tuple[int, int]
 Rng = np.random.Generator
 
 
-def clouds(rng: Rng, size: Size, amplitudes: dict[int, float]) -> F32:
+def cloud_noise(rng: Rng, size: Size, amplitudes: dict[int, float]) -> F32:
     """Smooth noise: {cell size in texels: standard deviation in gray levels}, summed."""
     out = np.zeros(size, np.float32)
     for cell, amplitude in amplitudes.items():
@@ -25,7 +25,7 @@ def clouds(rng: Rng, size: Size, amplitudes: dict[int, float]) -> F32:
     return out
 
 
-def courses(rng: Rng, size: Size, height: int, width: int, contrast: float, joint: float) -> F32:
+def brick_rows(rng: Rng, size: Size, height: int, width: int, contrast: float, joint: float) -> F32:
     """Bricks, tiles or planks: rows of `height`, cut at lengths about `width`, each with a gray of
     its own and dark joints."""
     out = np.zeros(size, np.float32)
@@ -41,7 +41,7 @@ def courses(rng: Rng, size: Size, height: int, width: int, contrast: float, join
     return out
 
 
-def marks(rng: Rng, surface: F32, per_m2: float, per_m: float) -> None:
+def draw_marks(rng: Rng, surface: F32, per_m2: float, per_m: float) -> None:
     """Stains and scratches of 1-6 cm, in place: what keeps a bare surface from being blank."""
     h, w = surface.shape
     for _ in range(int(per_m2 * h * w / per_m**2)):
@@ -51,10 +51,10 @@ def marks(rng: Rng, surface: F32, per_m2: float, per_m: float) -> None:
         cv2.ellipse(surface, at, half, float(rng.uniform(0, 180)), 0, 360, gray, -1)
 
 
-def poster(rng: Rng, size: Size) -> F32:
+def poster_texture(rng: Rng, size: Size) -> F32:
     """A printed sheet: shapes, lines and letters on a plain ground, in a frame."""
     h, w = size
-    ground = rng.uniform(60, 220) + clouds(rng, size, {32: 18, 8: 6})
+    ground = rng.uniform(60, 220) + cloud_noise(rng, size, {32: 18, 8: 6})
     sheet = ground.clip(0, 255).astype(np.uint8)  # OpenCV 5 writes letters on bytes only
     for _ in range(int(rng.integers(6, 13))):
         x, y = int(rng.integers(w)), int(rng.integers(h))
@@ -79,45 +79,45 @@ def poster(rng: Rng, size: Size) -> F32:
     return sheet.astype(np.float32)
 
 
-def hang(rng: Rng, wall: F32, count: int, smallest: float, largest: float, per_m: float) -> None:
+def hang_posters(rng: Rng, wall: F32, count: int, smallest: float, largest: float, per_m: float) -> None:
     """Put `count` posters of random sizes (m) on a wall, in place; later ones over earlier ones."""
     h, w = wall.shape
     for _ in range(count):
         ph, pw = (min(int(rng.uniform(smallest, largest) * per_m), n - 4) for n in (h, w))
         top, left = int(rng.integers(1, h - ph)), int(rng.integers(1, w - pw))
-        wall[top : top + ph, left : left + pw] = poster(rng, (ph, pw))
+        wall[top : top + ph, left : left + pw] = poster_texture(rng, (ph, pw))
 
 
-def wall(rng: Rng, size: Size, per_m: float) -> F32:
+def wall_texture(rng: Rng, size: Size, per_m: float) -> F32:
     """Plaster or brick with pictures and notices."""
-    out = rng.uniform(120, 170) + clouds(rng, size, {256: 14, 64: 7, 16: 4, 4: 3})
+    out = rng.uniform(120, 170) + cloud_noise(rng, size, {256: 14, 64: 7, 16: 4, 4: 3})
     if rng.random() < 0.5:
-        out += courses(rng, size, int(0.16 * per_m), int(0.4 * per_m), 9, 14)
-    marks(rng, out, 12, per_m)
-    hang(rng, out, int(0.8 * size[0] * size[1] / per_m**2), 0.25, 0.95, per_m)
+        out += brick_rows(rng, size, int(0.16 * per_m), int(0.4 * per_m), 9, 14)
+    draw_marks(rng, out, 12, per_m)
+    hang_posters(rng, out, int(0.8 * size[0] * size[1] / per_m**2), 0.25, 0.95, per_m)
     return out
 
 
-def floor(rng: Rng, size: Size, per_m: float) -> F32:
+def floor_texture(rng: Rng, size: Size, per_m: float) -> F32:
     """Planks with grain."""
-    out = rng.uniform(90, 130) + clouds(rng, size, {256: 10, 32: 6, 8: 5, 4: 4})
-    out += courses(rng, size, int(0.22 * per_m), int(1.3 * per_m), 14, 18)
-    marks(rng, out, 15, per_m)
+    out = rng.uniform(90, 130) + cloud_noise(rng, size, {256: 10, 32: 6, 8: 5, 4: 4})
+    out += brick_rows(rng, size, int(0.22 * per_m), int(1.3 * per_m), 14, 18)
+    draw_marks(rng, out, 15, per_m)
     return out
 
 
-def ceiling(rng: Rng, size: Size, per_m: float) -> F32:
+def ceiling_texture(rng: Rng, size: Size, per_m: float) -> F32:
     """Pale panels and lamps."""
-    out = 175 + clouds(rng, size, {256: 8, 32: 4, 8: 3})
-    out += courses(rng, size, int(0.6 * per_m), int(0.9 * per_m), 8, 30)
-    marks(rng, out, 8, per_m)
-    hang(rng, out, 12, 0.2, 0.5, per_m)
+    out = 175 + cloud_noise(rng, size, {256: 8, 32: 4, 8: 3})
+    out += brick_rows(rng, size, int(0.6 * per_m), int(0.9 * per_m), 8, 30)
+    draw_marks(rng, out, 8, per_m)
+    hang_posters(rng, out, 12, 0.2, 0.5, per_m)
     return out
 
 
-def shelf(rng: Rng, size: Size, per_m: float) -> F32:
+def shelf_texture(rng: Rng, size: Size, per_m: float) -> F32:
     """Boards with books and files of all widths between them."""
-    out = np.full(size, 60, np.float32) + clouds(rng, size, {16: 6, 4: 3})
+    out = np.full(size, 60, np.float32) + cloud_noise(rng, size, {16: 6, 4: 3})
     pitch, board = int(0.36 * per_m), max(int(0.03 * per_m), 2)
     for top in range(0, size[0], pitch):
         out[top : top + board] += 80
@@ -133,9 +133,9 @@ def shelf(rng: Rng, size: Size, per_m: float) -> F32:
     return out
 
 
-def crate(rng: Rng, size: Size, per_m: float) -> F32:
+def crate_texture(rng: Rng, size: Size, per_m: float) -> F32:
     """Boards with labels."""
-    out = rng.uniform(80, 170) + clouds(rng, size, {64: 12, 16: 6, 4: 4})
-    out += courses(rng, size, int(rng.uniform(0.1, 0.3) * per_m), int(0.7 * per_m), 14, 30)
-    hang(rng, out, max(1, int(2 * size[0] * size[1] / per_m**2)), 0.12, 0.35, per_m)
+    out = rng.uniform(80, 170) + cloud_noise(rng, size, {64: 12, 16: 6, 4: 4})
+    out += brick_rows(rng, size, int(rng.uniform(0.1, 0.3) * per_m), int(0.7 * per_m), 14, 30)
+    hang_posters(rng, out, max(1, int(2 * size[0] * size[1] / per_m**2)), 0.12, 0.35, per_m)
     return out

@@ -6,7 +6,7 @@ import ctypes
 import os
 from typing import Any
 
-from share.errors import not_installed
+from share.errors import install_hint
 from share.lab.emulate.render.errors import RenderError
 
 _VERSION = 430  # of OpenGL: storage buffers
@@ -25,35 +25,35 @@ _PACKAGES = {_EGL: "libegl1", _GL: "libgl1", "libEGL_mesa.so.0": "libegl-mesa0"}
 _DRIVERS = "libgl1-mesa-dri"
 
 
-def create() -> Any:
+def create_context() -> Any:
     """A moderngl context of this process. Raises RenderError."""
     os.environ.update(_ENVIRONMENT)
     try:
         import moderngl
     except ImportError:
-        raise RenderError(not_installed("moderngl", "emulate")) from None
+        raise RenderError(install_hint("moderngl", "emulate")) from None
     try:
         options: dict[str, Any] = {"backend": "egl", "libegl": _EGL, "libgl": _GL}
         return moderngl.create_context(require=_VERSION, standalone=True, **options)
     except Exception as e:  # moderngl and its loader raise nothing narrower
-        raise RenderError(f"cannot draw without a screen ({e}): {_remedy()}") from None
+        raise RenderError(f"cannot draw without a screen ({e}): {_install_hint()}") from None
 
 
-def missing() -> str | None:
+def missing_reason() -> str | None:
     """Why no room can be drawn on this machine, in one line; None where one can."""
     try:
-        create().release()
+        create_context().release()
     except RenderError as e:
         return str(e)
     return None
 
 
-def _remedy() -> str:
-    absent = [package for library, package in _PACKAGES.items() if not _loads(library)]
+def _install_hint() -> str:
+    absent = [package for library, package in _PACKAGES.items() if not _is_loadable(library)]
     return "apt install " + (" ".join(absent) or f"{_DRIVERS} (or another driver of OpenGL 4.3)")
 
 
-def _loads(library: str) -> bool:
+def _is_loadable(library: str) -> bool:
     try:
         ctypes.CDLL(library)
     except OSError:

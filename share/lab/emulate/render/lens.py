@@ -14,29 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry.camera import Camera, rays
-from share.lab.emulate.render.view import pixels
+from share.lab.emulate.render.view import pixel_centres
 from share.lab.emulate.types import I32
 from share.types import F32, F64
 
-MARGIN = 2  # px around what is seen, for interpolation
-_WIDEST = 3.0  # times the camera's own size: beyond it the model is used outside its range
-_EDGE = -1e-9  # how far outside its triangle a ray may pass, in sines
+MARGIN_PX = 2  # px around what is seen, for interpolation
+_MAX_WIDENING = 3.0  # times the camera's own size: beyond it the model is used outside its range
+_EDGE_TOLERANCE = -1e-9  # how far outside its triangle a ray may pass, in sines
 
 
 @dataclass(frozen=True, eq=False)
-class Lens:
+class LensResampler:
     """wide: the undistorted camera to draw. uv (H W, 2): normalised coordinates of the camera's pixels.
     place: where they are in the wide image, as OpenCV wants it."""
 
     camera: Camera
-    wide: Camera
+    wide_camera: Camera
     uv: F64
-    place: tuple[F32, F32]
+    sample_maps: tuple[F32, F32]
 
     def image(self, wide: F32) -> F32:
         """(H, W) as the lens shows it: by cubic interpolation, which hardly blurs what is drawn at least as
         finely as it is seen."""
-        out: F32 = np.maximum(cv2.remap(wide, *self.place, cv2.INTER_CUBIC), 0)
+        out: F32 = np.maximum(cv2.remap(wide, *self.sample_maps, cv2.INTER_CUBIC), 0)
         return out
 
     def depth(self, faces: I32, slopes: F64, corners: F64) -> F32:
@@ -45,40 +45,40 @@ class Lens:
         Of the triangles seen at the four pixels around a ray, the nearest that it really meets; where
         it meets none (a gap narrower than a pixel), the one of the nearest pixel.
         """
-        x, y = (m.astype(np.float64).ravel() for m in self.place)
+        x, y = (m.astype(np.float64).ravel() for m in self.sample_maps)
         r = rays(self.uv)
         best = np.zeros(len(r))
         for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
             face = faces[np.floor(y).astype(int) + dy, np.floor(x).astype(int) + dx]
-            q = np.where(_meets(r, corners[face]), (slopes[face] * r).sum(axis=1), 0.0)
+            q = np.where(_ray_hits_triangle(r, corners[face]), (slopes[face] * r).sum(axis=1), 0.0)
             best = np.maximum(best, q)
-        missed = best <= 0
-        nearest = faces[np.rint(y[missed]).astype(int), np.rint(x[missed]).astype(int)]
-        best[missed] = (slopes[nearest] * r[missed]).sum(axis=1)
+        no_hit = best <= 0
+        nearest = faces[np.rint(y[no_hit]).astype(int), np.rint(x[no_hit]).astype(int)]
+        best[no_hit] = (slopes[nearest] * r[no_hit]).sum(axis=1)
         depth = np.divide(1, best, out=np.zeros(len(r)), where=best > 0)
         return depth.reshape(self.camera.height, self.camera.width).astype(np.float32)
 
 
-def lens(camera: Camera, zoom: float = 1.0) -> Lens:
+def make_lens(camera: Camera, zoom: float = 1.0) -> LensResampler:
     """The lens of `camera`; the wide view has `zoom` times its pixels a radian, or more. Raises ValueError
     if the distortion has no inverse over the image."""
-    px = pixels(camera).reshape(-1, 2)
+    px = pixel_centres(camera).reshape(-1, 2)
     uv = camera.normalise(px)
     if not np.isfinite(uv).all() or np.abs(camera.distort(uv) - px).max() > 1e-3:
         raise ValueError("camera: its distortion cannot be undone over the whole image")
-    zoom *= max(1.0, _magnification(camera, uv))
+    zoom *= max(1.0, _max_magnification(camera, uv))
     fx, fy = camera.fx * zoom, camera.fy * zoom
     flat = uv * (fx, fy)
-    low, high = np.floor(flat.min(axis=0)) - MARGIN, np.ceil(flat.max(axis=0)) + MARGIN
+    low, high = np.floor(flat.min(axis=0)) - MARGIN_PX, np.ceil(flat.max(axis=0)) + MARGIN_PX
     width, height = (int(n) for n in high - low + 1)
-    if width * height > (_WIDEST * zoom) ** 2 * camera.width * camera.height:
+    if width * height > (_MAX_WIDENING * zoom) ** 2 * camera.width * camera.height:
         raise ValueError(f"camera: its distortion asks for {width}x{height} pixels to be drawn")
     wide = Camera(width, height, fx, fy, float(-low[0]), float(-low[1]))
     place = (flat - low).astype(np.float32).reshape(camera.height, camera.width, 2)
-    return Lens(camera, wide, uv, (place[..., 0].copy(), place[..., 1].copy()))
+    return LensResampler(camera, wide, uv, (place[..., 0].copy(), place[..., 1].copy()))
 
 
-def _magnification(camera: Camera, uv: F64) -> float:
+def _max_magnification(camera: Camera, uv: F64) -> float:
     """The most that the lens enlarges anywhere, 1 being its centre."""
     step = 1e-5
     columns = [(camera.distort(uv + d) - camera.distort(uv - d)) / (2 * step) for d in np.eye(2) * step]
@@ -86,15 +86,15 @@ def _magnification(camera: Camera, uv: F64) -> float:
     return float(np.linalg.norm(J[::97], ord=2, axis=(1, 2)).max())
 
 
-def _meets(r: F64, corners: F64) -> NDArray[np.bool_]:
+def _ray_hits_triangle(r: F64, corners: F64) -> NDArray[np.bool_]:
     """Which rays (N, 3) pass through their triangle (N, 3, 3)."""
-    sides = np.stack([_side(r, corners[:, i], corners[:, (i + 1) % 3]) for i in range(3)])
-    within = (sides >= _EDGE).all(axis=0) | (sides <= -_EDGE).all(axis=0)
-    met: NDArray[np.bool_] = within & (sides != 0).any(axis=0)
-    return met
+    sides = np.stack([_edge_side(r, corners[:, i], corners[:, (i + 1) % 3]) for i in range(3)])
+    within = (sides >= _EDGE_TOLERANCE).all(axis=0) | (sides <= -_EDGE_TOLERANCE).all(axis=0)
+    hits: NDArray[np.bool_] = within & (sides != 0).any(axis=0)
+    return hits
 
 
-def _side(r: F64, a: F64, b: F64) -> F64:
+def _edge_side(r: F64, a: F64, b: F64) -> F64:
     normal = np.cross(a, b)
     out: F64 = (normal * r).sum(axis=1) / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
     return out

@@ -7,9 +7,9 @@ that large coordinates cancel before they are rounded. Pictures are low-passed t
 
 from __future__ import annotations
 
-_LEVEL = -1.0  # of detail, against a sample as large as a pixel
+_MIP_BIAS = -1.0  # of detail, against a sample as large as a pixel
 
-_PLACE = """
+_PLACE_GLSL = """
 #version 430
 uniform mat3 turn;
 uniform vec3 origin;
@@ -18,7 +18,7 @@ in vec3 position;
 vec4 place() { return projection * vec4(turn * (position - origin), 1.0); }
 """
 
-ROOM_VERTEX = f"""{_PLACE}
+ROOM_VERTEX = f"""{_PLACE_GLSL}
 in vec2 uv;
 in float layer;
 in vec2 light_uv;
@@ -27,7 +27,7 @@ out vec2 light_at;
 void main() {{ gl_Position = place(); picture_at = vec3(uv, layer); light_at = light_uv; }}
 """
 
-MOVER_VERTEX = f"""{_PLACE}
+MOVER_VERTEX = f"""{_PLACE_GLSL}
 uniform vec3 lamp;
 uniform float light;
 in vec3 normal;
@@ -42,7 +42,7 @@ void main() {{
 }}
 """
 
-FACE_VERTEX = f"{_PLACE}void main() {{ gl_Position = place(); }}"
+FACE_VERTEX = f"{_PLACE_GLSL}void main() {{ gl_Position = place(); }}"
 
 
 # Picture times light.
@@ -55,7 +55,7 @@ in vec3 picture_at;
 in vec2 light_at;
 out float radiance;
 void main() {{
-    radiance = gain * texture(pictures, picture_at, {_LEVEL}).r * texture(light_map, light_at).r;
+    radiance = gain * texture(pictures, picture_at, {_MIP_BIAS}).r * texture(light_map, light_at).r;
 }}
 """
 
@@ -67,7 +67,7 @@ uniform float gain;
 in vec3 picture_at;
 in float shade;
 out float radiance;
-void main() {{ radiance = gain * texture(pictures, picture_at, {_LEVEL}).r * shade; }}
+void main() {{ radiance = gain * texture(pictures, picture_at, {_MIP_BIAS}).r * shade; }}
 """
 
 # On a plane, inverse depth is affine in normalised coordinates: nothing interpolated is as exact. Doubles,

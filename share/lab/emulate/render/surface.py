@@ -9,12 +9,12 @@ import numpy as np
 from share.lab.emulate.types import I32, Mesh
 from share.types import F64, I64
 
-CHUNK = 16  # triangles that are drawn or left out together
-_CELLS = 1023  # a side of the grid that the Z-order curve runs through
+CHUNK_TRIANGLES = 16  # triangles that are drawn or left out together
+_GRID_CELLS = 1023  # a side of the grid that the Z-order curve runs through
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class ChunkedSurface:
     """faces (C, CHUNK, 3): corners, neighbours together, filled up with empty triangles. corners
     (C, CHUNK, 3, 3) m; planes (C, CHUNK, 4): unit normal n and offset d, n . x = d; centre (C, 3) and
     radius (C,) m of a sphere around each chunk."""
@@ -26,12 +26,12 @@ class Surface:
     radius: F64
 
     @property
-    def sphere(self) -> tuple[F64, float]:
+    def bounding_sphere(self) -> tuple[F64, float]:
         """Around all of it: centre (3,), radius m."""
         low, high = self.corners.min(axis=(0, 1, 2)), self.corners.max(axis=(0, 1, 2))
         return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
-    def visible(self, planes: F64, T_surface_cam: F64) -> I64:
+    def visible_chunks(self, planes: F64, T_surface_cam: F64) -> I64:
         """Chunks that may be within `sides` (S, 3) of a view. Those whose far end is nearest come first:
         what they hide costs less then."""
         centre = (self.centre - T_surface_cam[:3, 3]) @ T_surface_cam[:3, :3]
@@ -39,7 +39,7 @@ class Surface:
         far = np.sqrt((centre[chunks] ** 2).sum(axis=1)) + self.radius[chunks]
         return chunks[np.argsort(far, kind="stable")]
 
-    def slopes(self, chunks: I64, T_surface_cam: F64) -> F64:
+    def inverse_depth_slopes(self, chunks: I64, T_surface_cam: F64) -> F64:
         """Of these chunks' triangles, (T, 3): inverse depth at normalised (u, v) is slope . (u, v, 1)."""
         planes = self.planes[chunks].reshape(-1, 4)
         distance = planes[:, 3] - planes[:, :3] @ T_surface_cam[:3, 3]
@@ -48,24 +48,24 @@ class Surface:
         return slopes
 
 
-def surface(mesh: Mesh) -> Surface:
+def chunked_surface(mesh: Mesh) -> ChunkedSurface:
     """`mesh` cut into chunks."""
-    faces = _along_curve(mesh)
-    filler = np.broadcast_to(faces[-1, 0], (-len(faces) % CHUNK, 3))
-    faces = np.ascontiguousarray(np.concatenate([faces, filler]).reshape(-1, CHUNK, 3), np.int32)
+    faces = _faces_in_z_order(mesh)
+    filler = np.broadcast_to(faces[-1, 0], (-len(faces) % CHUNK_TRIANGLES, 3))
+    faces = np.ascontiguousarray(np.concatenate([faces, filler]).reshape(-1, CHUNK_TRIANGLES, 3), np.int32)
     corners = mesh.vertices[faces].astype(np.float64)
     low, high = corners.min(axis=(1, 2)), corners.max(axis=(1, 2))
     radius = np.linalg.norm(high - low, axis=1) / 2
-    return Surface(faces, corners, _planes(corners), (low + high) / 2, radius)
+    return ChunkedSurface(faces, corners, _planes(corners), (low + high) / 2, radius)
 
 
-def _along_curve(mesh: Mesh) -> I32:
+def _faces_in_z_order(mesh: Mesh) -> I32:
     """Faces by the place of their centre along a Z-order curve (Morton 1966)."""
     centres = mesh.triangles.mean(axis=1)
     span = max(float(np.ptp(centres, axis=0).max()), 1e-6)
-    cells = ((centres - centres.min(axis=0)) / span * _CELLS).astype(np.int64)
+    cells = ((centres - centres.min(axis=0)) / span * _GRID_CELLS).astype(np.int64)
     code = np.zeros(len(cells), np.int64)
-    for bit in range(_CELLS.bit_length()):
+    for bit in range(_GRID_CELLS.bit_length()):
         for axis in range(3):
             code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     return mesh.faces[np.argsort(code, kind="stable")]

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from share.lab.emulate.sensor.draws import Seed, normal, uniform
+from share.lab.emulate.sensor.indexed_random import Seed, normal, uniform
 from share.types import I64
 
-_LONGEST_BURST = 64  # frames
-_IN_ORDER = 0.45  # of a period: how far a stamp may be off without overtaking the next
+_MAX_BURST_FRAMES = 64  # frames
+_MAX_JITTER_SHARE = 0.45  # of a period: how far a stamp may be off without overtaking the next
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class DeviceClock:
     def read(self, true_ns: I64) -> I64:
         """What the clock shows at true times (N,)."""
         since = true_ns - self.origin_ns
-        shown = true_ns + self.offset_ns + np.rint(since * (self.drift_ppm * 1e-6)).astype(np.int64)
-        ticks = shown // self.tick_ns
+        clock_ns = true_ns + self.offset_ns + np.rint(since * (self.drift_ppm * 1e-6)).astype(np.int64)
+        ticks = clock_ns // self.tick_ns
         if self.bits:
             ticks = ticks % (1 << self.bits)
         out: I64 = ticks * self.tick_ns
@@ -49,13 +49,13 @@ class DeviceClock:
 
 
 @dataclass(frozen=True)
-class Stream:
+class SampleStream:
     """Samples at `rate_hz`, the first at `first_ns` true time; sample k is the same in every span."""
 
     rate_hz: float
     first_ns: int
 
-    def times(self, start_ns: int, end_ns: int) -> tuple[I64, I64]:
+    def sample_times(self, start_ns: int, end_ns: int) -> tuple[I64, I64]:
         """(index, true_ns), each (N,), of the samples in [start, end], both included."""
         rate = self.rate_hz / 1e9
         low = max(0, int(np.ceil((start_ns - self.first_ns) * rate)) - 1)
@@ -71,7 +71,7 @@ def phase_ns(seed: Seed, rate_hz: float) -> int:
     return int(np.random.default_rng(seed).random() * 1e9 / rate_hz)
 
 
-def dropped(seed: Seed, index: I64, share: float, burst: float) -> np.ndarray:
+def dropped_mask(seed: Seed, index: I64, share: float, burst: float) -> np.ndarray:
     """Which frames (N,) bool are lost: `share` of them on average, in bursts of `burst` frames on average.
 
     A burst starts at any frame alike and lasts a geometrically distributed number of frames, up to 64;
@@ -79,16 +79,16 @@ def dropped(seed: Seed, index: I64, share: float, burst: float) -> np.ndarray:
     """
     if share <= 0 or len(index) == 0:
         return np.zeros(len(index), bool)
-    reach = np.arange(_LONGEST_BURST)
-    survive = (1 - 1 / burst) ** reach  # probability that a burst lasts longer than `reach` frames
-    first = max(0, int(index.min()) - _LONGEST_BURST)
+    reach = np.arange(_MAX_BURST_FRAMES)
+    survival = (1 - 1 / burst) ** reach  # probability that a burst lasts longer than `reach` frames
+    first = max(0, int(index.min()) - _MAX_BURST_FRAMES)
     frames = np.arange(first, int(index.max()) + 1)
-    begins = uniform((*seed, 0), frames) < _start_probability(share, survive)
+    is_burst_start = uniform((*seed, 0), frames) < _start_probability(share, survival)
     lasts = uniform((*seed, 1), frames)
-    lost = begins.copy()
-    for back in reach[1:][survive[1:] > 1e-9]:
-        lost[back:] |= begins[:-back] & (lasts[:-back] < survive[back])
-    out: np.ndarray = lost[index - first]
+    is_dropped = is_burst_start.copy()
+    for back in reach[1:][survival[1:] > 1e-9]:
+        is_dropped[back:] |= is_burst_start[:-back] & (lasts[:-back] < survival[back])
+    out: np.ndarray = is_dropped[index - first]
     return out
 
 
@@ -101,15 +101,15 @@ def _start_probability(share: float, survive: NDArray[Any]) -> float:
     return (low + high) / 2
 
 
-def jitter(seed: Seed, index: I64, sigma_ns: float, rate_hz: float) -> I64:
+def stamp_jitter_ns(seed: Seed, index: I64, sigma_ns: float, rate_hz: float) -> I64:
     """Error of each sample's stamp (N,) ns: normal, cut at 3 sigma and so that stamps stay in order."""
     if sigma_ns <= 0:
         return np.zeros(len(index), np.int64)
-    most = min(3 * sigma_ns, _IN_ORDER * 1e9 / rate_hz)
-    return np.rint(np.clip(normal(seed, index) * sigma_ns, -most, most)).astype(np.int64)
+    limit = min(3 * sigma_ns, _MAX_JITTER_SHARE * 1e9 / rate_hz)
+    return np.rint(np.clip(normal(seed, index) * sigma_ns, -limit, limit)).astype(np.int64)
 
 
-def unwrapped(stamps_ns: I64, period_ns: int) -> I64:
+def unwrapped_stamps(stamps_ns: I64, period_ns: int) -> I64:
     """Stamps (N,) of one stream in order, without the wraps of its counter."""
     if not period_ns:
         return stamps_ns

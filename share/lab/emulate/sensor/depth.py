@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 
 from share.errors import ConfigError
-from share.lab.emulate.sensor.draws import Seed
+from share.lab.emulate.sensor.indexed_random import Seed
 from share.sensors.profile_types import CameraModel, Profile
 from share.types import F32, U8
 
-_MARGIN = 512  # the bank of noise is larger than a picture by this
-_EDGE_PX = 1.5  # of disparity, within the reach of an edge; a slope has less
+_BANK_MARGIN = 512  # the bank of noise is larger than a picture by this
+_EDGE_DISPARITY_PX = 1.5  # of disparity, within the reach of an edge; a slope has less
 _ROUNDING = 1 / 12  # variance of a gray level that was rounded
 
 
@@ -34,56 +34,56 @@ class DepthSensor:
         facts, model = profile.device.depth, profile.emulation.depth
         if facts is None or model is None:
             raise ConfigError(f"profile '{profile.name}': its device measures no depth; use stereo, or d435i")
-        self._facts, self._model, self._seed, self._noise = facts, model, seed, noise
+        self._spec, self._model, self._seed, self._noise = facts, model, seed, noise
         self._camera_model = profile.emulation.camera
         camera = profile.mode.cameras()[0]
         self._focal_baseline = camera.fx * profile.baseline_m
-        self._bank = _bank((camera.height, camera.width), model.smooth_px, seed)
+        self._bank = _noise_bank((camera.height, camera.width), model.smooth_px, seed)
 
-    def read(self, depth: F32, left: U8, frame: int, gain: float = 1.0) -> np.ndarray:
+    def depth_reading(self, depth: F32, left_image: U8, frame: int, gain: float = 1.0) -> np.ndarray:
         """Exact depth (H, W) m, 0 = nothing there, and the left picture -> uint16 mm, 0 = no reading.
 
         gain: with which the picture was taken; its noise hides texture."""
-        near, far = self._facts.range_m
+        near, far = self._spec.range_m
         if not self._noise:
             return np.where((depth < near) | (depth > far), 0, depth * 1000 + 0.5).astype(np.uint16)
         first, second = self._read_bank(depth.shape, frame)
         exact = np.where(depth > 0, self._focal_baseline / np.maximum(depth, 1e-3), np.float32(0))
-        seen = self._matched(exact, second)
-        inverse_snr = self._inverse_snr(left, gain)
+        matched = self._matched_disparity(exact, second)
+        inverse_snr = self._inverse_snr(left_image, gain)
         sigma = cv2.sqrt(self._model.sigma_px**2 + (2 / self._model.window_px**2) * inverse_snr)
-        step = self._facts.step_px
-        disparity = np.rint((seen + sigma * first) * np.float32(1 / step)) * np.float32(step)
+        step = self._spec.step_px
+        disparity = np.rint((matched + sigma * first) * np.float32(1 / step)) * np.float32(step)
         threshold = self._model.hole_snr + self._model.hole_spread * second
         blank = inverse_snr * threshold * np.abs(threshold) > 1
-        hole = blank | self._hidden(seen) | (exact <= 0)
+        hole = blank | self._occluded(matched) | (exact <= 0)
         low, high = self._focal_baseline / far, self._focal_baseline / near
         hole |= (disparity < low) | (disparity > high)
         disparity[hole] = np.inf
         mm: np.ndarray = np.float32(self._focal_baseline * 1000) / disparity + np.float32(0.5)
         return mm.astype(np.uint16)
 
-    def _inverse_snr(self, left: U8, gain: float) -> F32:
+    def _inverse_snr(self, left_image: U8, gain: float) -> F32:
         """(s / g)^2 in the window about each pixel (H, W)."""
         size = (self._model.window_px, self._model.window_px)
-        slope = cv2.Sobel(left, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+        slope = cv2.Sobel(left_image, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
         energy = cv2.boxFilter(cv2.multiply(slope, slope), -1, size)
-        variance = noise_variance(cv2.blur(left, size), self._camera_model, gain)
+        variance = noise_variance(cv2.blur(left_image, size), self._camera_model, gain)
         clean = cv2.subtract(energy, 0.5 * variance)  # of a central difference of noise
         out: F32 = variance / np.maximum(clean, 0.01 * variance)
         return out
 
-    def _matched(self, disparity: F32, chance: F32) -> F32:
+    def _matched_disparity(self, disparity: F32, chance: F32) -> F32:
         """Disparity of what fills the window: near an edge the thing before it or what is behind, by the
         texture of both, here by chance; so edges wander by `edge_px` to either side."""
         kernel = np.ones((2 * self._model.edge_px + 1,) * 2, np.uint8)
         front, back = cv2.dilate(disparity, kernel), cv2.erode(disparity, kernel)
-        edge = cv2.subtract(front, back) > _EDGE_PX
+        edge = cv2.subtract(front, back) > _EDGE_DISPARITY_PX
         out = disparity.copy()
         out[edge] = np.where(chance[edge] > 0, front[edge], back[edge])
         return out
 
-    def _hidden(self, disparity: F32) -> np.ndarray:
+    def _occluded(self, disparity: F32) -> np.ndarray:
         """Which pixels (H, W) the right camera does not see: some pixel further right lands on the same
         place of its picture, or beyond; or they land outside it."""
         at = np.arange(disparity.shape[1], dtype=np.float32) - disparity  # column in the right picture
@@ -92,7 +92,7 @@ class DepthSensor:
         return hidden
 
     def _read_bank(self, shape: tuple[int, ...], frame: int) -> list[F32]:
-        places = np.random.default_rng((*self._seed, 1, frame)).integers(0, _MARGIN, (2, 2))
+        places = np.random.default_rng((*self._seed, 1, frame)).integers(0, _BANK_MARGIN, (2, 2))
         return [self._bank[top : top + shape[0], left : left + shape[1]] for top, left in places]
 
 
@@ -106,9 +106,9 @@ def noise_variance(gray: U8, model: CameraModel, gain: float) -> F32:
     return out
 
 
-def _bank(shape: tuple[int, int], smooth_px: float, seed: Seed) -> F32:
+def _noise_bank(shape: tuple[int, int], smooth_px: float, seed: Seed) -> F32:
     """Standard normal numbers that agree over `smooth_px` pixels, more than a picture needs."""
-    white = np.random.default_rng((*seed, 0)).standard_normal([n + _MARGIN for n in shape], np.float32)
+    white = np.random.default_rng((*seed, 0)).standard_normal([n + _BANK_MARGIN for n in shape], np.float32)
     smooth = cv2.GaussianBlur(white, (0, 0), smooth_px) if smooth_px else white
     out: F32 = (smooth / smooth.std()).astype(np.float32)
     return out

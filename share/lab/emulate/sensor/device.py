@@ -12,25 +12,35 @@ import numpy as np
 
 from share.lab.emulate.sensor import clock as clocks
 from share.lab.emulate.sensor import exposure as exposures
-from share.lab.emulate.sensor.clock import DeviceClock, Stream
+from share.lab.emulate.sensor.clock import DeviceClock, SampleStream
 from share.lab.emulate.sensor.depth import DepthSensor
-from share.lab.emulate.sensor.draws import Seed
 from share.lab.emulate.sensor.effects import Effects
-from share.lab.emulate.sensor.exposure import Shot, Shots
-from share.lab.emulate.sensor.imu import ImuStreams, measured
+from share.lab.emulate.sensor.exposure import Exposure, ExposureSeries
+from share.lab.emulate.sensor.imu import ImuStreams, measured_samples
+from share.lab.emulate.sensor.indexed_random import Seed
 from share.lab.emulate.sensor.photometry import Imager
-from share.lab.emulate.sensor.vibration import knocks, turning, vibration
-from share.lab.emulate.types import Path
-from share.sensors.profile_types import Inertial, Profile
+from share.lab.emulate.sensor.vibration import knock_acceleration, rotation_rates, vibration_acceleration
+from share.lab.emulate.types import MotionPath
+from share.sensors.profile_types import InertialFacts, Profile
 from share.types import F32, F64, I64, U8
 
-_READOUT = 0.9  # of a frame's time is what an exposure can take
+_MAX_EXPOSURE_SHARE = 0.9  # of a frame's time is what an exposure can take
 # streams of random numbers
-_PHASE, _DROPS, _JITTER, _LAMP, _CAMERA, _DEPTH, _GYRO, _ACCEL, _SHAKING = range(9)
+(
+    _PHASE_STREAM,
+    _DROP_STREAM,
+    _JITTER_STREAM,
+    _LAMP_STREAM,
+    _CAMERA_STREAM,
+    _DEPTH_STREAM,
+    _GYRO_STREAM,
+    _ACCEL_STREAM,
+    _VIBRATION_STREAM,
+) = range(9)
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class PictureTimes:
     """Frames that arrive: index (N,), when they are exposed (true time) and their stamps, both (N,) ns."""
 
     index: I64
@@ -41,7 +51,7 @@ class Pictures:
         return len(self.index)
 
 
-class Device:
+class EmulatedDevice:
     """A device of `profile` with `effects`.
 
     origin_ns: true time (the path's) at which it is switched on; frames count from there. seed: its own;
@@ -69,100 +79,115 @@ class Device:
 
     # -- pictures ----------------------------------------------------------------------------
 
-    def pictures(self, start_ns: int, end_ns: int) -> Pictures:
+    def picture_times(self, start_ns: int, end_ns: int) -> PictureTimes:
         """The frames exposed in [start, end] true time that are not dropped."""
         effects = self.effects
-        index, true = self._stream(self.profile.rate_hz, _CAMERA).times(start_ns, end_ns)
-        lost = clocks.dropped((*self._seed, _DROPS), index, effects.drops, effects.drop_burst)
-        index, true = index[~lost], true[~lost]
-        error = clocks.jitter(
-            (*self._seed, _JITTER, _CAMERA), index, effects.jitter_ms * 1e6, self.profile.rate_hz
+        index, true = self._stream(self.profile.rate_hz, _CAMERA_STREAM).sample_times(start_ns, end_ns)
+        is_dropped = clocks.dropped_mask(
+            (*self._seed, _DROP_STREAM), index, effects.drops, effects.drop_burst
         )
-        return Pictures(index, true, self.clock.read(true - round(effects.time_offset_ms * 1e6) + error))
+        index, true = index[~is_dropped], true[~is_dropped]
+        error = clocks.stamp_jitter_ns(
+            (*self._seed, _JITTER_STREAM, _CAMERA_STREAM),
+            index,
+            effects.jitter_ms * 1e6,
+            self.profile.rate_hz,
+        )
+        return PictureTimes(index, true, self.clock.read(true - round(effects.time_offset_ms * 1e6) + error))
 
-    def truth_times(self, pictures: Pictures) -> tuple[I64, I64]:
-        """(true_ns, stamp_ns), each (N,): when the clock shows the stamps of `pictures`, and these stamps
-        as a reader repairs them, without wraps."""
-        error = pictures.stamp_ns - self.clock.read(pictures.true_ns)
+    def truth_times(self, pictures: PictureTimes) -> tuple[I64, I64]:
+        """(true_ns, stamp_ns), each (N,): when the clock shows the stamps of `picture_times`, and these
+        stamps as a reader repairs them, without wraps."""
+        stamp_error = pictures.stamp_ns - self.clock.read(pictures.true_ns)
         if period := self.clock.period_ns:
-            error = (error + period // 2) % period - period // 2
-        return pictures.true_ns + error, clocks.unwrapped(pictures.stamp_ns, self.clock.period_ns)
+            stamp_error = (stamp_error + period // 2) % period - period // 2
+        return pictures.true_ns + stamp_error, clocks.unwrapped_stamps(
+            pictures.stamp_ns, self.clock.period_ns
+        )
 
-    def light(self, true_ns: I64) -> F64:
+    def lamp_light(self, true_ns: I64) -> F64:
         """Of the room's lamps (N,) at true times (N,), against what the room was made with."""
         effects = self.effects
         since = np.asarray(true_ns) - self._origin_ns
-        return exposures.lamp((*self._room_seed, _LAMP), since, effects.lamp_every_s, effects.lamp_stops)
+        return exposures.lamp_light(
+            (*self._room_seed, _LAMP_STREAM), since, effects.lamp_every_s, effects.lamp_stops
+        )
 
-    def shots(self, true_ns: I64, brightness: F64) -> Shots:
+    def exposures(self, true_ns: I64, brightness: F64) -> ExposureSeries:
         """How the pictures at true_ns (N,) are taken; brightness (N,): mean radiance of what they see."""
-        light, device = self.light(true_ns), self.profile.device
+        light, device = self.lamp_light(true_ns), self.profile.device
         model, reference = self.profile.emulation.exposure, self._reference_ms
         if not self.effects.exposure:
-            return Shots(np.full(len(light), reference), np.ones(len(light)), light)
-        seen = np.asarray(brightness, np.float64) * light * self._imagers[0].mean_response
-        least, most = device.exposure_ms
-        most = min(most, _READOUT * 1000 / self.profile.rate_hz)
-        time, gain = exposures.auto_exposure(seen, model, reference, (least, most), device.gain)
-        return Shots(time, gain, light)
+            return ExposureSeries(np.full(len(light), reference), np.ones(len(light)), light)
+        scene_brightness = np.asarray(brightness, np.float64) * light * self._imagers[0].mean_response
+        shortest, longest = device.exposure_ms
+        longest = min(longest, _MAX_EXPOSURE_SHARE * 1000 / self.profile.rate_hz)
+        time, gain = exposures.auto_exposure(
+            scene_brightness, model, reference, (shortest, longest), device.gain
+        )
+        return ExposureSeries(time, gain, light)
 
-    def blur_offsets(self, shot: Shot, pixels_of_motion: float) -> F64:
+    def blur_offsets(self, shot: Exposure, pixels_of_motion: float) -> F64:
         """Times (S,) s about a picture's at which to draw it; pixels_of_motion: most, in the exposure."""
         return exposures.blur_offsets(shot.exposure_ms, pixels_of_motion if self.effects.blur else 0.0)
 
-    def develop(self, radiance: F32, frame: int, camera: int, shot: Shot | None = None) -> U8:
+    def develop_image(self, radiance: F32, frame: int, camera: int, shot: Exposure | None = None) -> U8:
         """Radiance (H, W) float32 of camera 0 or 1 -> gray (H, W) uint8. frame: its `Pictures.index`.
         Without `shot`: the reference exposure."""
-        return self._imagers[camera].develop(radiance, frame, shot or Shot(self._reference_ms))
+        return self._imagers[camera].develop(radiance, frame, shot or Exposure(self._reference_ms))
 
-    def depth_mm(self, depth: F32, left: U8, frame: int, shot: Shot | None = None) -> np.ndarray:
+    def depth_mm(self, depth: F32, left_image: U8, frame: int, shot: Exposure | None = None) -> np.ndarray:
         """Exact depth (H, W) m and the developed left picture -> the device's, uint16 mm, 0 = none."""
-        return self._depth.read(depth, left, frame, shot.gain if shot else 1.0)
+        return self._depth.depth_reading(depth, left_image, frame, shot.gain if shot else 1.0)
 
     # -- IMU ---------------------------------------------------------------------------------
 
-    def imu(self, path: Path) -> ImuStreams:
+    def imu_streams(self, path: MotionPath) -> ImuStreams:
         """All IMU samples of the span of `path`: recorded ones untouched, else simulated. Stamps are the
         device clock's."""
         if path.recorded is not None:
             stamps = self.clock.read(path.recorded.stamps_ns)
             return ImuStreams(stamps, path.recorded.gyro, stamps, path.recorded.accel, self.clock.period_ns)
         facts = self.profile.device.imu
-        gyro_ns, gyro = self._inertial(path, facts.gyro, _GYRO, 0)
-        accel_ns, accel = self._inertial(path, facts.accel, _GYRO if facts.joined else _ACCEL, 1)
+        gyro_ns, gyro = self._sensor_samples(path, facts.gyro, _GYRO_STREAM, 0)
+        accel_ns, accel = self._sensor_samples(
+            path, facts.accel, _GYRO_STREAM if facts.joined else _ACCEL_STREAM, 1
+        )
         return ImuStreams(gyro_ns, gyro, accel_ns, accel, self.clock.period_ns)
 
-    def _inertial(self, path: Path, sensor: Inertial, stream: int, which: int) -> tuple[I64, F64]:
-        index, true = self._stream(sensor.rate_hz, stream).times(path.start_ns, path.end_ns)
+    def _sensor_samples(
+        self, path: MotionPath, sensor: InertialFacts, stream: int, sensor_index: int
+    ) -> tuple[I64, F64]:
+        index, true = self._stream(sensor.rate_hz, stream).sample_times(path.start_ns, path.end_ns)
         effects = self.effects
         errors = (effects.imu_noise, effects.imu_bias, effects.imu_limits)
-        shaken = path.inertial(true)[which] + self._shaking(true, which)
-        values = measured(shaken, sensor, (*self._seed, _GYRO, which), *errors)
+        with_vibration = path.inertial(true)[sensor_index] + self._vibration(true, sensor_index)
+        values = measured_samples(with_vibration, sensor, (*self._seed, _GYRO_STREAM, sensor_index), *errors)
         sigma_ns = effects.imu_jitter_ms * 1e6
-        error = clocks.jitter((*self._seed, _JITTER, stream), index, sigma_ns, sensor.rate_hz)
+        error = clocks.stamp_jitter_ns((*self._seed, _JITTER_STREAM, stream), index, sigma_ns, sensor.rate_hz)
         return self.clock.read(true + error), values
 
-    def _shaking(self, times_ns: I64, which: int) -> F64:
+    def _vibration(self, times_ns: I64, sensor_index: int) -> F64:
         """What vibration and knocks add to gyro (0) or accelerometer (1), (N, 3)."""
-        effects, seed = self.effects, (*self._seed, _SHAKING)
+        effects, seed = self.effects, (*self._seed, _VIBRATION_STREAM)
         seconds = np.asarray((times_ns - self._origin_ns) * 1e-9, np.float64)
         out = np.zeros((len(seconds), 3))
         if effects.vibration:
-            out += vibration(seconds, effects.vibration, seed)
+            out += vibration_acceleration(seconds, effects.vibration, seed)
         if effects.knocks:
-            out += knocks(seconds, effects.knocks, effects.knock_every_s, seed)
-        return out if which else turning(out)
+            out += knock_acceleration(seconds, effects.knocks, effects.knock_every_s, seed)
+        return out if sensor_index else rotation_rates(out)
 
     # -- parts -------------------------------------------------------------------------------
 
-    def _stream(self, rate_hz: float, stream: int) -> Stream:
+    def _stream(self, rate_hz: float, stream: int) -> SampleStream:
         """A free-running stream begins somewhere in its first period; a triggered one at the origin."""
         begin_ns = self._origin_ns
-        if stream == _CAMERA:
+        if stream == _CAMERA_STREAM:
             begin_ns += round(self.effects.camera_phase_ms * 1e6)
         if not self.profile.device.clock.triggered:
-            begin_ns += clocks.phase_ns((*self._seed, _PHASE, stream), rate_hz)
-        return Stream(rate_hz, begin_ns)
+            begin_ns += clocks.phase_ns((*self._seed, _PHASE_STREAM, stream), rate_hz)
+        return SampleStream(rate_hz, begin_ns)
 
     @property
     def _reference_ms(self) -> float:
@@ -175,7 +200,7 @@ class Device:
             Imager(
                 camera,
                 model,
-                (*self._seed, _CAMERA, i),
+                (*self._seed, _CAMERA_STREAM, i),
                 effects.noise,
                 effects.vignetting,
                 effects.lens_blur,
@@ -185,4 +210,4 @@ class Device:
 
     @cached_property
     def _depth(self) -> DepthSensor:
-        return DepthSensor(self.profile, (*self._seed, _DEPTH), self.effects.depth_noise)
+        return DepthSensor(self.profile, (*self._seed, _DEPTH_STREAM), self.effects.depth_noise)

@@ -14,7 +14,7 @@ from share.errors import UsageError
 
 @dataclass(frozen=True)
 class Effects:
-    """Each can be turned off or set. The defaults are a sound device; `NONE` is a perfect one.
+    """Each can be turned off or set. The defaults are a sound device; `NO_EFFECTS` is a perfect one.
 
     Signs: a picture taken at IMU time t is stamped t - time_offset_ms (Kalibr's timeshift_cam_imu:
     t_imu = t_cam + shift). A device's clock shows session time + clock_offset_ms, and gains
@@ -48,9 +48,9 @@ class Effects:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value, kind = getattr(self, field.name), _kind(field)
+            value, kind = getattr(self, field.name), _field_type(field)
             if type(value) is not kind and not (kind is float and type(value) is int):
-                raise UsageError(f"effect {field.name}: expected {_WORDS[kind]}, found {value!r}")
+                raise UsageError(f"effect {field.name}: expected {_TYPE_NAMES[kind]}, found {value!r}")
             if kind is float and not math.isfinite(value):
                 raise UsageError(f"effect {field.name}: {value} is not finite")
         for name, (low, high) in _LIMITS.items():
@@ -58,11 +58,11 @@ class Effects:
                 raise UsageError(f"effect {name}: {getattr(self, name):g} must lie in {low:g} .. {high:g}")
 
 
-def _kind(field: dataclasses.Field[Any]) -> type[bool] | type[float]:
+def _field_type(field: dataclasses.Field[Any]) -> type[bool] | type[float]:
     return bool if isinstance(field.default, bool) else float
 
 
-_WORDS: dict[type, str] = {bool: "on or off", float: "a number"}
+_TYPE_NAMES: dict[type, str] = {bool: "on or off", float: "a number"}
 _LIMITS: dict[str, tuple[float, float]] = {
     "lamp_every_s": (0, 1e6),
     "lamp_stops": (0, 6),
@@ -78,36 +78,36 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "clock_offset_ms": (-1e12, 1e12),
     "clock_drift_ppm": (-1000, 1000),
 }
-NONE = Effects(**{f.name: False for f in dataclasses.fields(Effects) if f.default is True})
+NO_EFFECTS = Effects(**{f.name: False for f in dataclasses.fields(Effects) if f.default is True})
 
 
-def parse(words: Iterable[str], base: Effects | None = None) -> Effects:
+def parse_effects(words: Iterable[str], base: Effects | None = None) -> Effects:
     """`base` with changes such as "noise=off", "drops=0.02", "time_offset_ms=-8" and "none" (a perfect
     device, then what follows). Raises UsageError naming the word and what is known."""
     effects = base or Effects()
     for word in words:
         if word == "none":
-            effects = NONE
+            effects = NO_EFFECTS
             continue
         name, _, text = word.partition("=")
-        effects = dataclasses.replace(effects, **{name: _value(name, text)})  # type: ignore[arg-type]
+        effects = dataclasses.replace(effects, **{name: _parse_value(name, text)})  # type: ignore[arg-type]
     return effects
 
 
-def _value(name: str, text: str) -> bool | float:
-    kinds = {field.name: _kind(field) for field in dataclasses.fields(Effects)}
+def _parse_value(name: str, text: str) -> bool | float:
+    kinds = {field.name: _field_type(field) for field in dataclasses.fields(Effects)}
     if name not in kinds:
         near = difflib.get_close_matches(name, kinds, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"known: none, {', '.join(kinds)}"
         raise UsageError(f"effect '{name}' is not known; {hint}")
     if kinds[name] is bool:
-        if text not in _SWITCH:
+        if text not in _SWITCH_VALUES:
             raise UsageError(f"effect {name}: expected {name}=on or {name}=off, found '{text}'")
-        return _SWITCH[text]
+        return _SWITCH_VALUES[text]
     try:
         return float(text)
     except ValueError:
         raise UsageError(f"effect {name}: expected a number, found '{text}'") from None
 
 
-_SWITCH = {"on": True, "off": False}
+_SWITCH_VALUES = {"on": True, "off": False}

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.lab.emulate.sensor.draws import Seed
+from share.lab.emulate.sensor.indexed_random import Seed
 from share.sensors.profile_types import ExposureModel
 from share.types import F64, I64
 
-_FEWEST_SAMPLES, _MOST_SAMPLES = 3, 16  # of one blurred picture
-_SHARP_PX = 0.3  # motion during the exposure that nobody sees
-_STEP_PX = 1.0  # motion between two samples of a blurred picture, each a pixel wide itself
+_MIN_BLUR_SAMPLES, _MAX_BLUR_SAMPLES = 3, 16  # of one blurred picture
+_SHARP_MOTION_PX = 0.3  # motion during the exposure that nobody sees
+_SAMPLE_STEP_PX = 1.0  # motion between two samples of a blurred picture, each a pixel wide itself
 
 
 @dataclass(frozen=True)
-class Shot:
+class Exposure:
     """How one picture is taken. light: of the lamps, against the room's own."""
 
     exposure_ms: float
@@ -25,7 +25,7 @@ class Shot:
 
 
 @dataclass(frozen=True, eq=False)
-class Shots:
+class ExposureSeries:
     """The same for a series: exposure_ms, gain, light, each (N,)."""
 
     exposure_ms: F64
@@ -35,13 +35,13 @@ class Shots:
     def __len__(self) -> int:
         return len(self.exposure_ms)
 
-    def part(self, first: int, last: int) -> Shots:
+    def part(self, first: int, last: int) -> ExposureSeries:
         """Those of pictures first .. last - 1."""
-        here = slice(first, last)
-        return Shots(self.exposure_ms[here], self.gain[here], self.light[here])
+        rows = slice(first, last)
+        return ExposureSeries(self.exposure_ms[rows], self.gain[rows], self.light[rows])
 
-    def __getitem__(self, i: int) -> Shot:
-        return Shot(float(self.exposure_ms[i]), float(self.gain[i]), float(self.light[i]))
+    def __getitem__(self, i: int) -> Exposure:
+        return Exposure(float(self.exposure_ms[i]), float(self.gain[i]), float(self.light[i]))
 
 
 def auto_exposure(
@@ -58,25 +58,25 @@ def auto_exposure(
     holds still within a step. The first picture is well exposed already: the device has been running.
     """
     longest = min(model.longest_ms, exposure_ms[1])
-    least, most = np.log([exposure_ms[0] * gain[0], longest * gain[1]])
-    digit = np.log1p(model.step)
+    log_min, log_max = np.log([exposure_ms[0] * gain[0], longest * gain[1]])
+    log_step = np.log1p(model.step)
     scene = np.log(np.maximum(brightness, 1e-3) / reference_ms)  # of gray = scene * exposure * gain, in logs
     product = np.empty(len(scene))
     now = np.log(model.target) - scene[0] if len(scene) else 0.0
     for k in range(len(scene)):
-        seen = k - 1 - model.delay_frames
-        if seen >= 0:
-            shown = min(scene[seen] + product[seen], np.log(255))
-            error = product[seen] + np.log(model.target) - shown - now
-            now += model.damping * error if abs(error) > digit else 0.0
-        now = np.clip(now, least, most)
-        product[k] = np.clip(np.rint(now / digit) * digit, least, most)
+        measured_frame = k - 1 - model.delay_frames
+        if measured_frame >= 0:
+            measured = min(scene[measured_frame] + product[measured_frame], np.log(255))
+            error = product[measured_frame] + np.log(model.target) - measured - now
+            now += model.damping * error if abs(error) > log_step else 0.0
+        now = np.clip(now, log_min, log_max)
+        product[k] = np.clip(np.rint(now / log_step) * log_step, log_min, log_max)
     total = np.exp(product)
     time = np.minimum(total, longest)
     return time, total / time
 
 
-def lamp(seed: Seed, since_ns: I64, every_s: float, stops: float) -> F64:
+def lamp_light(seed: Seed, since_ns: I64, every_s: float, stops: float) -> F64:
     """Light (N,) at times since the session's start: changes now and then by up to `stops` (a power of two).
 
     The times between are exponentially distributed; the light returns to 1 at every second switching.
@@ -84,10 +84,10 @@ def lamp(seed: Seed, since_ns: I64, every_s: float, stops: float) -> F64:
     if every_s <= 0 or len(since_ns) == 0:
         return np.ones(len(since_ns))
     count = int(since_ns.max() / 1e9 / every_s * 2) + 50
-    at = np.cumsum(np.random.default_rng((*seed, 0)).exponential(every_s, count)) * 1e9
+    switch_ns = np.cumsum(np.random.default_rng((*seed, 0)).exponential(every_s, count)) * 1e9
     level = 2.0 ** np.random.default_rng((*seed, 1)).uniform(-stops, stops, count)
-    passed = np.searchsorted(at, since_ns, side="right")
-    out: F64 = np.where(passed % 2 == 1, level[passed - 1], 1.0)
+    switchings = np.searchsorted(switch_ns, since_ns, side="right")
+    out: F64 = np.where(switchings % 2 == 1, level[switchings - 1], 1.0)
     return out
 
 
@@ -97,7 +97,7 @@ def blur_offsets(exposure_ms: float, pixels_of_motion: float) -> F64:
     pixels_of_motion: the fastest in the picture during the exposure. They are the middles of S equal parts,
     so that their mean is the integral by the midpoint rule. S is 1 below 0.3 px, else 3 to 16.
     """
-    if pixels_of_motion < _SHARP_PX:
+    if pixels_of_motion < _SHARP_MOTION_PX:
         return np.zeros(1)
-    samples = int(np.clip(np.ceil(pixels_of_motion / _STEP_PX), _FEWEST_SAMPLES, _MOST_SAMPLES))
+    samples = int(np.clip(np.ceil(pixels_of_motion / _SAMPLE_STEP_PX), _MIN_BLUR_SAMPLES, _MAX_BLUR_SAMPLES))
     return ((np.arange(samples) + 0.5) / samples - 0.5) * exposure_ms * 1e-3

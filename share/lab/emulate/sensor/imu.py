@@ -11,12 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.lab.emulate.sensor.clock import unwrapped
-from share.lab.emulate.sensor.draws import Seed
-from share.sensors.profile_types import Inertial
+from share.lab.emulate.sensor.clock import unwrapped_stamps
+from share.lab.emulate.sensor.indexed_random import Seed
+from share.sensors.profile_types import InertialFacts
 from share.types import F64, I64, ImuBatch
 
-Inertia = Callable[[I64], tuple[F64, F64]]  # stamps (N,) ns -> angular rate, specific force, each (N, 3)
+InertialMotion = Callable[
+    [I64], tuple[F64, F64]
+]  # stamps (N,) ns -> angular rate, specific force, each (N, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,27 +32,34 @@ class ImuStreams:
     accel: F64
     period_ns: int = 0
 
-    def joined(self) -> ImuBatch:
+    def to_batch(self) -> ImuBatch:
         """Six values at the gyroscope's stamps, the acceleration interpolated, as drivers do; without the
         stamps that lie outside the accelerometer's."""
         if not (len(self.gyro_ns) and len(self.accel_ns)):
             return ImuBatch.empty()
-        gyro_ns, accel_ns = self._counted()
+        gyro_ns, accel_ns = self._unwrapped()
         both = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
         at, known = gyro_ns[both] - accel_ns[0], accel_ns - accel_ns[0]  # float64 holds these exactly
         accel = np.stack([np.interp(at, known, column) for column in self.accel.T], axis=1)
         return ImuBatch(self.gyro_ns[both], self.gyro[both], accel)
 
-    def _counted(self) -> tuple[I64, I64]:
+    def _unwrapped(self) -> tuple[I64, I64]:
         """Stamps of both streams without wraps."""
-        gyro_ns, accel_ns = (unwrapped(stamps, self.period_ns) for stamps in (self.gyro_ns, self.accel_ns))
+        gyro_ns, accel_ns = (
+            unwrapped_stamps(stamps, self.period_ns) for stamps in (self.gyro_ns, self.accel_ns)
+        )
         if self.period_ns:  # the two start within a period of the slower: nearer than half a wrap
             accel_ns = accel_ns + self.period_ns * round((gyro_ns[0] - accel_ns[0]) / self.period_ns)
         return gyro_ns, accel_ns
 
 
-def measured(
-    perfect: F64, sensor: Inertial, seed: Seed, noise: bool = True, bias: bool = True, limits: bool = True
+def measured_samples(
+    perfect: F64,
+    sensor: InertialFacts,
+    seed: Seed,
+    noise: bool = True,
+    bias: bool = True,
+    limits: bool = True,
 ) -> F64:
     """(N, 3) of one sensor at its own rate, from the sample at which it was switched on, with its errors.
 
@@ -61,11 +70,11 @@ def measured(
         white = np.random.default_rng((*seed, 0)).standard_normal(perfect.shape)
         out += sensor.density * np.sqrt(sensor.rate_hz) * white
     if bias:
-        out += bias_of(sensor, len(perfect), seed)
-    return limited(out, sensor) if limits else out
+        out += bias_series(sensor, len(perfect), seed)
+    return saturate_and_quantise(out, sensor) if limits else out
 
 
-def bias_of(sensor: Inertial, n: int, seed: Seed) -> F64:
+def bias_series(sensor: InertialFacts, n: int, seed: Seed) -> F64:
     """Bias (n, 3): a start, uniform in +-sqrt(3) sigma; a random walk; and the Gauss-Markov part."""
     start = np.random.default_rng((*seed, 1)).uniform(-1, 1, 3) * np.sqrt(3) * sensor.start_bias
     steps = np.random.default_rng((*seed, 2)).standard_normal((n, 3)) * sensor.walk / np.sqrt(sensor.rate_hz)
@@ -73,7 +82,7 @@ def bias_of(sensor: Inertial, n: int, seed: Seed) -> F64:
     return bias + _gauss_markov(sensor, n, seed) if sensor.instability else bias
 
 
-def _gauss_markov(sensor: Inertial, n: int, seed: Seed) -> F64:
+def _gauss_markov(sensor: InertialFacts, n: int, seed: Seed) -> F64:
     """x_k = a x_{k-1} + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T): stationary from the start."""
     from scipy.signal import lfilter
 
@@ -84,7 +93,7 @@ def _gauss_markov(sensor: Inertial, n: int, seed: Seed) -> F64:
     return out
 
 
-def limited(values: F64, sensor: Inertial) -> F64:
+def saturate_and_quantise(values: F64, sensor: InertialFacts) -> F64:
     """Saturated at +-range, in whole digits of `step` (0: no digits)."""
     out: F64 = np.clip(values, -sensor.range, sensor.range)
     return np.rint(out / sensor.step) * sensor.step if sensor.step else out

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 
 from share.geometry.camera import Camera
-from share.lab.emulate.sensor.draws import Seed
-from share.lab.emulate.sensor.exposure import Shot
+from share.lab.emulate.sensor.exposure import Exposure
+from share.lab.emulate.sensor.indexed_random import Seed
 from share.sensors.profile_types import CameraModel
 from share.types import F32, U8
 
-_MARGIN = 512  # the bank is larger than a picture by this, so there are 512^2 places to read it at
+_BANK_MARGIN = 512  # the bank is larger than a picture by this, so there are 512^2 places to read it at
 
 
 class Imager:
@@ -29,47 +29,49 @@ class Imager:
         rng = np.random.default_rng((*seed, 0))
         self._model, self._seed, self._noise = model, seed, noise
         self._psf = model.psf_px if blur else 0.0
-        self._response = vignette(camera, model.corner_light) if vignetting else np.ones(shape, np.float32)
+        self._response = (
+            vignetting_gain(camera, model.corner_light) if vignetting else np.ones(shape, np.float32)
+        )
         if noise:
             self._response *= 1 + model.pixel_gain * rng.standard_normal(shape, np.float32)
             self._offset_e = model.pixel_offset_e * rng.standard_normal(shape, np.float32)
-            self._bank = rng.standard_normal([n + _MARGIN for n in shape], np.float32)
+            self._bank = rng.standard_normal([n + _BANK_MARGIN for n in shape], np.float32)
 
     @property
     def mean_response(self) -> float:
         """What the picture's mean loses to vignetting."""
         return float(self._response.mean())
 
-    def develop(self, radiance: F32, frame: int, shot: Shot) -> U8:
+    def develop(self, radiance: F32, frame: int, shot: Exposure) -> U8:
         """Radiance (H, W) float32, 0..255 and beyond -> gray levels (H, W) uint8."""
         exposed = shot.light * shot.gain * shot.exposure_ms / self._model.reference_ms
-        gray = cv2.multiply(self._soft(radiance), self._response, scale=exposed)
+        gray = cv2.multiply(self._blurred(radiance), self._response, scale=exposed)
         if self._noise:
-            gray = cv2.add(gray, self._noise_of(gray, frame, shot.gain))
+            gray = cv2.add(gray, self._noise_image(gray, frame, shot.gain))
         out: U8 = cv2.convertScaleAbs(np.maximum(gray, 0))  # rounds, saturates at 255
         return out
 
-    def _soft(self, radiance: F32) -> F32:
+    def _blurred(self, radiance: F32) -> F32:
         if self._psf <= 0:
             return radiance
         soft: F32 = cv2.GaussianBlur(radiance, (5, 5), self._psf, borderType=cv2.BORDER_REPLICATE)
         return soft
 
-    def _noise_of(self, gray: F32, frame: int, gain: float) -> F32:
+    def _noise_image(self, gray: F32, frame: int, gain: float) -> F32:
         K = 255 * gain / self._model.full_well_e
-        top, left = np.random.default_rng((*self._seed, 1, frame)).integers(0, _MARGIN, 2)
+        top, left = np.random.default_rng((*self._seed, 1, frame)).integers(0, _BANK_MARGIN, 2)
         white = self._bank[top : top + gray.shape[0], left : left + gray.shape[1]]
         sigma = cv2.sqrt(cv2.add(gray * K, (K * self._model.read_e) ** 2))
         out: F32 = cv2.add(cv2.multiply(white, sigma), self._offset_e * K)
         return out
 
 
-def vignette(camera: Camera, corner_light: float) -> F32:
+def vignetting_gain(camera: Camera, corner_light: float) -> F32:
     """Light (H, W) float32 against the middle's: cos(field angle)^n, n such that the corner farthest from the
     axis gets `corner_light`; of a fisheye lens by half that angle. n = 4 is the natural law; lenses are made
     to have less of it."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-    if camera.fisheye:  # sees beyond 90 degrees, where the law ends: half the angle in it
+    if camera.is_fisheye:  # sees beyond 90 degrees, where the law ends: half the angle in it
         cos = np.nan_to_num(camera.directions(grid.astype(np.float64))[..., 2], nan=-1.0)
         cos2 = np.maximum((1 + cos) / 2, 0.1)
     else:

@@ -9,36 +9,38 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.lab.emulate.sensor.draws import Seed
+from share.lab.emulate.sensor.indexed_random import Seed
 from share.types import F64
 
 _ROTORS, _ROTOR_HZ, _WANDER_HZ, _WANDER_S = 4, (70.0, 110.0), 4.0, 2.0
-_DOUBLE = 0.5  # amplitude of the double frequency
-_TURN = 0.03  # rad/s of turning for each m/s^2
+_HARMONIC_AMPLITUDE = 0.5  # amplitude of the double frequency
+_ROTATION_RATIO = 0.03  # rad/s of turning for each m/s^2
 _KNOCK_HZ, _KNOCK_S = (18.0, 40.0), 0.012  # of its oscillation; how fast it rises and dies
 _GRID_HZ = 4000.0  # on which a knock is derived
 
 
-def vibration(seconds: F64, rms: float, seed: Seed) -> F64:
+def vibration_acceleration(seconds: F64, rms: float, seed: Seed) -> F64:
     """Acceleration (N, 3) m/s^2 at these times (N,) s from the start, rms of each axis. The same at the same
     times, whatever others are asked for."""
     grid = np.arange(0.0, max(float(seconds.max(initial=0.0)), 0.0) + _WANDER_S, _WANDER_S / 20)
     out = np.zeros((len(seconds), 3))
-    kept = np.exp(-(grid[1] - grid[0]) / _WANDER_S) if len(grid) > 1 else 0.0
+    decay = np.exp(-(grid[1] - grid[0]) / _WANDER_S) if len(grid) > 1 else 0.0
     for rotor in range(_ROTORS):
         rng = np.random.default_rng((*seed, 0, rotor))
         base, phase = rng.uniform(*_ROTOR_HZ), rng.uniform(0, 2 * np.pi, (2, 3))
         direction = rng.standard_normal((2, 3))
-        wander = _gauss_markov(rng.standard_normal(len(grid)), kept) * _WANDER_HZ
+        wander = _gauss_markov(rng.standard_normal(len(grid)), decay) * _WANDER_HZ
         turns = np.concatenate([[0.0], np.cumsum((base + wander)[:-1] * np.diff(grid))])
         angle = 2 * np.pi * np.interp(seconds, grid, turns)[:, None]
-        out += direction[0] * np.sin(angle + phase[0]) + _DOUBLE * direction[1] * np.sin(2 * angle + phase[1])
-    usual = np.sqrt(_ROTORS * (1 + _DOUBLE**2) / 2)
-    shaken: F64 = rms / usual * out
-    return shaken
+        out += direction[0] * np.sin(angle + phase[0]) + _HARMONIC_AMPLITUDE * direction[1] * np.sin(
+            2 * angle + phase[1]
+        )
+    rms_unscaled = np.sqrt(_ROTORS * (1 + _HARMONIC_AMPLITUDE**2) / 2)
+    acceleration: F64 = rms / rms_unscaled * out
+    return acceleration
 
 
-def knocks(seconds: F64, peak: float, every_s: float, seed: Seed) -> F64:
+def knock_acceleration(seconds: F64, peak: float, every_s: float, seed: Seed) -> F64:
     """Acceleration (N, 3) m/s^2 at these times (N,) s: about `peak` each, at random times `every_s` apart."""
     rng = np.random.default_rng((*seed, 1))
     out, at, end = np.zeros((len(seconds), 3)), 0.0, float(seconds.max(initial=0.0))
@@ -52,15 +54,15 @@ def knocks(seconds: F64, peak: float, every_s: float, seed: Seed) -> F64:
     return out
 
 
-def turning(acceleration: F64) -> F64:
+def rotation_rates(acceleration: F64) -> F64:
     """rad/s (N, 3) that go with it: what shakes a body off its centre of mass turns it, too."""
-    return _TURN * np.roll(acceleration, 1, axis=1)
+    return _ROTATION_RATIO * np.roll(acceleration, 1, axis=1)
 
 
-def _gauss_markov(white: F64, kept: float) -> F64:
+def _gauss_markov(white: F64, decay: float) -> F64:
     from scipy.signal import lfilter
 
     white = white.copy()
-    white[1:] *= np.sqrt(1 - kept**2)
-    out: F64 = lfilter([1.0], [1.0, -kept], white)
+    white[1:] *= np.sqrt(1 - decay**2)
+    out: F64 = lfilter([1.0], [1.0, -decay], white)
     return out

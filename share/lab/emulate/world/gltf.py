@@ -14,22 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from share.errors import DataError, UsageError, not_installed
+from share.errors import DataError, UsageError, install_hint
 from share.lab.emulate.types import Mesh
-from share.lab.emulate.world.facing import faced
-from share.lab.emulate.world.gltf_file import MOST_TRIANGLES, read_gltf
+from share.lab.emulate.world.facing import face_inwards
+from share.lab.emulate.world.gltf_file import MAX_TRIANGLES, read_gltf
 from share.lab.emulate.world.layout import Layout, Light, Piece
-from share.lab.emulate.world.materials import Given
-from share.lab.emulate.world.mesh import Shape, concat
-from share.lab.emulate.world.noise import P
-from share.lab.emulate.world.pictures import BRIGHTEST, DARKEST
-from share.lab.emulate.world.rays import Scene
+from share.lab.emulate.world.materials import GivenMaterial
+from share.lab.emulate.world.mesh import Shape, concat_shapes
+from share.lab.emulate.world.noise import PICTURE_TEXELS
+from share.lab.emulate.world.pictures import MAX_ALBEDO, MIN_ALBEDO
+from share.lab.emulate.world.ray_casting import RayCaster
 from share.types import F32, F64, U8
 
-MOST_PICTURES = 400
-SMALLEST, LARGEST = 1.0, 200.0  # m, along any axis
-_ROWS = 256  # of a texture
-_STEPS = 16  # gray levels of vertex colours
+MAX_PICTURES = 400
+MIN_EXTENT_M, MAX_EXTENT_M = 1.0, 200.0  # m, along any axis
+_ROW_BLOCK = 256  # of a texture
+_GRAY_STEPS = 16  # gray levels of vertex colours
 _LAMP_PITCH = 2.5  # m
 _Z_UP = np.array([(1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1.0)])
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -42,43 +42,43 @@ def load_gltf(path: Path) -> Layout:
     if not path.is_file():
         raise UsageError(f"{path}: no such file")
     try:
-        pieces = _pieces(_read(path), path)
+        pieces = _room_pieces(_read_scene(path), path)
     except (DataError, UsageError):
         raise
     except Exception as error:  # trimesh and its decoders of pictures raise whatever they do
-        said = str(error).splitlines() or [type(error).__name__]
-        raise DataError(f"{path}: not a readable glTF 2.0 file: {said[0]:.200}") from None
-    low, high = concat([p.shape for p in pieces]).bounds
-    _check(path, pieces, high - low)
-    there = np.eye(4)
-    there[:3, 3] = -low
-    shapes = [p.shape.moved(there) for p in pieces]
-    meshes = faced([s.mesh for s in shapes], high - low)
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise DataError(f"{path}: not a readable glTF 2.0 file: {lines[0]:.200}") from None
+    low, high = concat_shapes([p.shape for p in pieces]).bounding_box
+    _check_size(path, pieces, high - low)
+    T_room_file = np.eye(4)
+    T_room_file[:3, 3] = -low
+    shapes = [p.shape.transformed(T_room_file) for p in pieces]
+    meshes = face_inwards([s.mesh for s in shapes], high - low)
     shell = tuple(Piece(p.name, replace(s, mesh=m)) for p, s, m in zip(pieces, shapes, meshes, strict=True))
     x, y, z = (high - low).tolist()
-    return Layout(path.stem, 0, (x, y, z), shell, (), _lamps(shell, high - low))
+    return Layout(path.stem, 0, (x, y, z), shell, (), _ceiling_lamps(shell, high - low))
 
 
-def _read(path: Path) -> Any:
+def _read_scene(path: Path) -> Any:
     try:
         import trimesh
     except ImportError:
-        raise UsageError(f"a glTF room: {not_installed('trimesh', 'emulate')}") from None
+        raise UsageError(f"a glTF room: {install_hint('trimesh', 'emulate')}") from None
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise UsageError(f"{path}: expected a glTF file (.gltf or .glb)")
     file = read_gltf(path)
     return trimesh.load_scene(BytesIO(file.data), path.suffix[1:].lower(), resolver=file.files)
 
 
-def _pieces(scene: Any, path: Path) -> list[Piece]:
-    pictures: dict[int, Given] = {}
+def _room_pieces(scene: Any, path: Path) -> list[Piece]:
+    pictures: dict[int, GivenMaterial] = {}
     out = []
     for node in sorted(scene.graph.nodes_geometry):
         T, name = scene.graph[node]
         geometry = scene.geometry[name]
         if not len(getattr(geometry, "faces", ())):
             continue  # points and lines
-        shape = _shape(geometry, _Z_UP @ np.asarray(T, float), pictures)
+        shape = _node_shape(geometry, _Z_UP @ np.asarray(T, float), pictures)
         if shape is not None:
             out.append(Piece(str(node), shape))
     if not out:
@@ -86,7 +86,7 @@ def _pieces(scene: Any, path: Path) -> list[Piece]:
     return out
 
 
-def _shape(geometry: Any, T: F64, pictures: dict[int, Given]) -> Shape | None:
+def _node_shape(geometry: Any, T: F64, pictures: dict[int, GivenMaterial]) -> Shape | None:
     """A node's triangles in the room, each with corners and a normal of its own; None where all of them
     are too thin to see."""
     corners = np.asarray(geometry.triangles, float) @ T[:3, :3].T + T[:3, 3]
@@ -94,24 +94,26 @@ def _shape(geometry: Any, T: F64, pictures: dict[int, Given]) -> Shape | None:
         corners = corners[:, ::-1]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1)
-    kept = length > 1e-10
-    if not kept.any() or not np.isfinite(corners).all():
+    is_visible = length > 1e-10
+    if not is_visible.any() or not np.isfinite(corners).all():
         return None
-    uv, layer, materials = _colours(geometry, pictures)
+    uv, layer, materials = _node_colours(geometry, pictures)
     if np.linalg.det(T[:3, :3]) < 0:
         uv = uv[:, ::-1]
-    n = int(kept.sum())
+    n = int(is_visible.sum())
     mesh = Mesh(
-        vertices=corners[kept].reshape(-1, 3).astype(np.float32),
-        normals=np.repeat(normal[kept] / length[kept, None], 3, axis=0).astype(np.float32),
-        uv=uv[kept].reshape(-1, 2).astype(np.float32),
-        layer=np.repeat(layer[kept], 3).astype(np.int32),
+        vertices=corners[is_visible].reshape(-1, 3).astype(np.float32),
+        normals=np.repeat(normal[is_visible] / length[is_visible, None], 3, axis=0).astype(np.float32),
+        uv=uv[is_visible].reshape(-1, 2).astype(np.float32),
+        layer=np.repeat(layer[is_visible], 3).astype(np.int32),
         faces=np.arange(3 * n, dtype=np.int32).reshape(-1, 3),
     )
     return Shape(mesh, materials)
 
 
-def _colours(geometry: Any, pictures: dict[int, Given]) -> tuple[F64, np.ndarray, tuple[Given, ...]]:
+def _node_colours(
+    geometry: Any, pictures: dict[int, GivenMaterial]
+) -> tuple[F64, np.ndarray, tuple[GivenMaterial, ...]]:
     """uv (F, 3, 2), layer (F,) and the pictures it counts into."""
     count, visual = len(geometry.faces), geometry.visual
     uv = np.zeros((count, 3, 2))
@@ -119,71 +121,80 @@ def _colours(geometry: Any, pictures: dict[int, Given]) -> tuple[F64, np.ndarray
         material = visual.material
         if getattr(material, "baseColorTexture", None) is not None and visual.uv is not None:
             uv = np.asarray(visual.uv, float)[geometry.faces] * (1, -1) + (0, 1)  # trimesh counts v upwards
-        return uv, np.zeros(count, int), (_picture(material, pictures),)
+        return uv, np.zeros(count, int), (_material_picture(material, pictures),)
     rgb = np.asarray(visual.face_colors, float)[:, :3] / 255  # COLOR_0 is linear
-    step = np.minimum((rgb @ _LUMINANCE * _STEPS).astype(int), _STEPS - 1)
-    grays = [_plain((k + 0.5) / _STEPS, pictures, -1 - k) for k in range(_STEPS)]
+    step = np.minimum((rgb @ _LUMINANCE * _GRAY_STEPS).astype(int), _GRAY_STEPS - 1)
+    grays = [_gray_picture((k + 0.5) / _GRAY_STEPS, pictures, -1 - k) for k in range(_GRAY_STEPS)]
     return uv, step, tuple(grays)
 
 
-def _picture(material: Any, pictures: dict[int, Given]) -> Given:
+def _material_picture(material: Any, pictures: dict[int, GivenMaterial]) -> GivenMaterial:
     """A material's base colour as a picture; the same material is drawn once."""
     key = id(material)
     if key not in pictures:
         factor = getattr(material, "baseColorFactor", None)
         gain = 1.0 if factor is None else float(np.asarray(factor, float)[:3] / 255 @ _LUMINANCE)
         texture = getattr(material, "baseColorTexture", None)
-        pictures[key] = Given(_albedo(np.full((P, P), gain) if texture is None else gain * _linear(texture)))
+        pictures[key] = GivenMaterial(
+            _to_albedo(
+                np.full((PICTURE_TEXELS, PICTURE_TEXELS), gain)
+                if texture is None
+                else gain * _linear_luminance(texture)
+            )
+        )
     return pictures[key]
 
 
-def _plain(level: float, pictures: dict[int, Given], key: int) -> Given:
+def _gray_picture(level: float, pictures: dict[int, GivenMaterial], key: int) -> GivenMaterial:
     if key not in pictures:
-        pictures[key] = Given(_albedo(np.full((P, P), level)))
+        pictures[key] = GivenMaterial(_to_albedo(np.full((PICTURE_TEXELS, PICTURE_TEXELS), level)))
     return pictures[key]
 
 
-def _linear(texture: Any) -> F32:
+def _linear_luminance(texture: Any) -> F32:
     """Luminance (P, P) 0..1 of an sRGB texture (IEC 61966-2-1)."""
     import cv2
 
     pixels = np.asarray(texture.convert("RGB"))
     light = np.empty(pixels.shape[:2])
-    for top in range(0, len(light), _ROWS):  # some at a time: 50 bytes a pixel
-        rgb = pixels[top : top + _ROWS].astype(np.float32) / 255
+    for top in range(0, len(light), _ROW_BLOCK):  # some at a time: 50 bytes a pixel
+        rgb = pixels[top : top + _ROW_BLOCK].astype(np.float32) / 255
         some = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ _LUMINANCE
-        light[top : top + _ROWS] = some
-    smaller = min(light.shape) >= P
-    how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(light.astype(np.float32), (P, P), interpolation=how), np.float32)
+        light[top : top + _ROW_BLOCK] = some
+    smaller = min(light.shape) >= PICTURE_TEXELS
+    interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    return np.asarray(
+        cv2.resize(light.astype(np.float32), (PICTURE_TEXELS, PICTURE_TEXELS), interpolation=interpolation),
+        np.float32,
+    )
 
 
-def _albedo(light: F64 | F32) -> U8:
-    out: U8 = (255 * light).clip(DARKEST, BRIGHTEST).round().astype(np.uint8)
+def _to_albedo(light: F64 | F32) -> U8:
+    out: U8 = (255 * light).clip(MIN_ALBEDO, MAX_ALBEDO).round().astype(np.uint8)
     return out
 
 
-def _check(path: Path, pieces: list[Piece], extent: F64) -> None:
+def _check_size(path: Path, pieces: list[Piece], extent: F64) -> None:
     triangles = sum(len(p.shape.mesh.faces) for p in pieces)
     pictures = len({m for p in pieces for m in p.shape.materials})
-    if extent.min() < SMALLEST or extent.max() > LARGEST:
+    if extent.min() < MIN_EXTENT_M or extent.max() > MAX_EXTENT_M:
         x, y, z = extent
         raise DataError(
             f"{path}: {x:.3g} x {y:.3g} x {z:.3g} m (z up) is no room: glTF is in metres with y up"
         )
-    if triangles > MOST_TRIANGLES:
-        raise DataError(f"{path}: {triangles} triangles, at most {MOST_TRIANGLES}: simplify it")
-    if pictures > MOST_PICTURES:
-        raise DataError(f"{path}: {pictures} materials, at most {MOST_PICTURES}: merge some")
+    if triangles > MAX_TRIANGLES:
+        raise DataError(f"{path}: {triangles} triangles, at most {MAX_TRIANGLES}: simplify it")
+    if pictures > MAX_PICTURES:
+        raise DataError(f"{path}: {pictures} materials, at most {MAX_PICTURES}: merge some")
 
 
-def _lamps(shell: tuple[Piece, ...], extent: F64) -> tuple[Light, ...]:
+def _ceiling_lamps(shell: tuple[Piece, ...], extent: F64) -> tuple[Light, ...]:
     """Panels 0.25 m under whatever is above the middle of the room's height, on a grid."""
-    scene = Scene(concat([p.shape for p in shell]).mesh.triangles)
+    scene = RayCaster(concat_shapes([p.shape for p in shell]).mesh.triangles)
     nx, ny = (max(1, round(float(e) / _LAMP_PITCH)) for e in extent[:2])
     x, y = np.meshgrid((np.arange(nx) + 0.5) / nx * extent[0], (np.arange(ny) + 0.5) / ny * extent[1])
     start = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, extent[2] / 2)]).astype(np.float32)
-    hit, weights = scene.first(start, np.tile(np.array([0, 0, 1], np.float32), (len(start), 1)))
+    hit, weights = scene.first_hits(start, np.tile(np.array([0, 0, 1], np.float32), (len(start), 1)))
     corners = scene.triangles[hit]
     top = np.where(hit >= 0, (corners[..., 2] * weights).sum(1), extent[2])
     heights = np.maximum(top - 0.25, (start[:, 2] + top) / 2)

@@ -17,22 +17,25 @@ from urllib.parse import unquote
 
 from share.errors import DataError
 from share.files.json_file import parse_json
-from share.files.reading import MB, inside, read_bytes
+from share.files.reading import MB, path_inside, read_bytes
 from share.recordings.images import image_header
 
-MOST_TRIANGLES = 300_000
-_MOST_BYTES = 500 * MB  # of all files together, of all views of them, of all arrays
-_MOST_JSON = 50 * MB
-_MOST_PARTS = 50_000  # of one kind: nodes, meshes, primitives, accessors …
-_MOST_CORNERS = 12 * MOST_TRIANGLES  # trimesh copies them for each part of a mesh
-_DEEPEST = 100  # nodes in each other
-_MOST_PIXELS, _ALL_PIXELS = 2**26, 2 * 10**8  # of a picture, of all: four bytes each when they are decoded
+MAX_TRIANGLES = 300_000
+_MAX_BYTES = 500 * MB  # of all files together, of all views of them, of all arrays
+_MAX_JSON_BYTES = 50 * MB
+_MAX_PARTS = 50_000  # of one kind: nodes, meshes, primitives, accessors …
+_MAX_CORNERS = 12 * MAX_TRIANGLES  # trimesh copies them for each part of a mesh
+_MAX_DEPTH = 100  # nodes in each other
+_MAX_PIXELS, _MAX_TOTAL_PIXELS = (
+    2**26,
+    2 * 10**8,
+)  # of a picture, of all: four bytes each when they are decoded
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _KINDS = ("accessors", "buffers", "bufferViews", "images", "materials", "meshes", "nodes", "textures")
-_WIDE = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}  # bytes of a componentType
-_ACROSS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}  # bytes of a componentType
+_TYPE_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _STRIP, _TRIANGLES = 5, 4
-_UNREAD = "image/ktx2"  # which trimesh leaves out
+_IGNORED_TYPE = "image/ktx2"  # which trimesh leaves out
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,21 +49,21 @@ class GltfFile:
 def read_gltf(path: Path) -> GltfFile:
     """Raises DataError that says what is wrong, or asks for too much."""
     try:
-        data = read_bytes(path, _MOST_BYTES)
+        data = read_bytes(path, _MAX_BYTES)
         text, binary = _chunks(data) if path.suffix.lower() == ".glb" else (data, b"")
-        if len(text) > _MOST_JSON:
+        if len(text) > _MAX_JSON_BYTES:
             raise ValueError(f"its description has {len(text) / MB:.0f} MB")
         tree = parse_json(text.decode("utf-8-sig"))
         if not isinstance(tree, dict):
             raise ValueError("its description is no object")
-        whole = _Whole(path, tree, binary)
-        whole.check()
-        return GltfFile(data, whole.files)
+        document = _GltfDocument(path, tree, binary)
+        document.check()
+        return GltfFile(data, document.files)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}: {error.filename}") from None
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, struct.error) as error:
-        said = str(error) if type(error) is ValueError else f"{type(error).__name__} {error}"
-        raise DataError(f"{path}: not a readable glTF 2.0 file: {said:.200}") from None
+        text_of_error = str(error) if type(error) is ValueError else f"{type(error).__name__} {error}"
+        raise DataError(f"{path}: not a readable glTF 2.0 file: {text_of_error:.200}") from None
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes]:
@@ -77,7 +80,7 @@ def _chunks(data: bytes) -> tuple[bytes, bytes]:
     return text, rest[8 : 8 + length]
 
 
-class _Whole:
+class _GltfDocument:
     """What the description says, and the bytes that it is about."""
 
     def __init__(self, path: Path, tree: dict[str, Any], binary: bytes) -> None:
@@ -88,7 +91,7 @@ class _Whole:
 
     def check(self) -> None:
         for kind in _KINDS:
-            _bounded(len(self._list(kind)), _MOST_PARTS, kind)
+            _check_at_most(len(self._list(kind)), _MAX_PARTS, kind)
         buffers = list(self._buffers())
         self._check_views(buffers)
         self._check_accessors()
@@ -96,96 +99,106 @@ class _Whole:
         self._check_nodes([self._triangles(mesh) for mesh in self._list("meshes")])
 
     def _list(self, kind: str) -> list[Any]:
-        found = self._tree.get(kind, [])
-        if not isinstance(found, list):
+        items = self._tree.get(kind, [])
+        if not isinstance(items, list):
             raise ValueError(f"its {kind} are no list")
-        return found
+        return items
 
     def _buffers(self) -> Iterator[bytes]:
         for buffer in self._list("buffers"):
-            yield self._binary if "uri" not in buffer else self._named(buffer["uri"])
+            yield self._binary if "uri" not in buffer else self._read_uri(buffer["uri"])
 
-    def _named(self, uri: str) -> bytes:
+    def _read_uri(self, uri: str) -> bytes:
         if "base64," in uri:
             try:
                 return base64.b64decode(uri.partition("base64,")[2])
             except binascii.Error:
                 raise ValueError("what it holds is damaged") from None
         if uri not in self.files:
-            left = _MOST_BYTES - sum(map(len, self.files.values()))
-            self.files[uri] = read_bytes(inside(self._path.parent, unquote(uri), str(self._path)), left)
+            remaining = _MAX_BYTES - sum(map(len, self.files.values()))
+            self.files[uri] = read_bytes(
+                path_inside(self._path.parent, unquote(uri), str(self._path)), remaining
+            )
         return self.files[uri]
 
     def _check_views(self, buffers: list[bytes]) -> None:
         """trimesh copies each."""
         total = 0
         for view in self._list("bufferViews"):
-            start, length = _count(view.get("byteOffset", 0)), _count(view["byteLength"])
+            start, length = _checked_count(view.get("byteOffset", 0)), _checked_count(view["byteLength"])
             total += length
-            _bounded(total, _MOST_BYTES, "bytes in views")
-            self._views.append(buffers[_count(view["buffer"])][start : start + length])
+            _check_at_most(total, _MAX_BYTES, "bytes in views")
+            self._views.append(buffers[_checked_count(view["buffer"])][start : start + length])
 
     def _check_accessors(self) -> None:
         total = 0
         for one in self._list("accessors"):
-            total += _count(one["count"]) * _WIDE[one["componentType"]] * _ACROSS[one["type"]]
-            _bounded(total, _MOST_BYTES, "bytes of numbers")
+            total += (
+                _checked_count(one["count"])
+                * _COMPONENT_BYTES[one["componentType"]]
+                * _TYPE_COMPONENTS[one["type"]]
+            )
+            _check_at_most(total, _MAX_BYTES, "bytes of numbers")
 
     def _check_pictures(self) -> None:
         total = 0
         for one in self._list("images"):
-            if one.get("mimeType") == _UNREAD or ("uri" not in one and "bufferView" not in one):
+            if one.get("mimeType") == _IGNORED_TYPE or ("uri" not in one and "bufferView" not in one):
                 continue
-            data = self._views[_count(one["bufferView"])] if "bufferView" in one else self._named(one["uri"])
+            data = (
+                self._views[_checked_count(one["bufferView"])]
+                if "bufferView" in one
+                else self._read_uri(one["uri"])
+            )
             if (header := image_header(data)) is None:
                 raise ValueError("a picture of it is damaged, or neither JPEG nor PNG")
             pixels = header.width * header.height
             total += pixels
-            if not 0 < pixels <= _MOST_PIXELS:
+            if not 0 < pixels <= _MAX_PIXELS:
                 raise ValueError(f"a picture of it is {header.width}x{header.height}")
-            _bounded(total, _ALL_PIXELS, "pixels")
+            _check_at_most(total, _MAX_TOTAL_PIXELS, "pixels")
 
     def _triangles(self, mesh: Any) -> int:
         self._parts += len(mesh["primitives"])
-        _bounded(self._parts, _MOST_PARTS, "primitives")
-        return sum(map(self._of_primitive, mesh["primitives"]))
+        _check_at_most(self._parts, _MAX_PARTS, "primitives")
+        return sum(map(self._primitive_triangles, mesh["primitives"]))
 
-    def _of_primitive(self, part: Any) -> int:
+    def _primitive_triangles(self, part: Any) -> int:
         accessors, mode = self._list("accessors"), part.get("mode", _TRIANGLES)
-        corners = count = _count(accessors[_count(part["attributes"]["POSITION"])]["count"])
+        corners = count = _checked_count(accessors[_checked_count(part["attributes"]["POSITION"])]["count"])
         if "indices" in part:
-            count = _count(accessors[_count(part["indices"])]["count"])
+            count = _checked_count(accessors[_checked_count(part["indices"])]["count"])
         self._corners += corners + count
-        _bounded(self._corners, _MOST_CORNERS, "corners in all meshes")
+        _check_at_most(self._corners, _MAX_CORNERS, "corners in all meshes")
         return {_TRIANGLES: count // 3, _STRIP: max(0, count - 2)}.get(mode, 0)
 
     def _check_nodes(self, triangles: list[int]) -> None:
         """Each is below one other at most, and shows a mesh anew."""
         nodes = self._list("nodes")
-        above: dict[int, int] = {}
+        parent_of: dict[int, int] = {}
         total = 0
         for number, node in enumerate(nodes):
             for child in node.get("children", ()):
-                if _count(child) in above or child >= len(nodes):
+                if _checked_count(child) in parent_of or child >= len(nodes):
                     raise ValueError(f"node {child} is below two others, or not there")
-                above[child] = number
+                parent_of[child] = number
             if "mesh" in node:
-                total += triangles[_count(node["mesh"])]
-                if total > MOST_TRIANGLES:
-                    raise ValueError(f"more than {MOST_TRIANGLES} triangles: simplify it")
+                total += triangles[_checked_count(node["mesh"])]
+                if total > MAX_TRIANGLES:
+                    raise ValueError(f"more than {MAX_TRIANGLES} triangles: simplify it")
         for number in range(len(nodes)):
-            at, depth = number, 0
-            while at in above:
-                at, depth = above[at], depth + 1
-                _bounded(depth, _DEEPEST, "nodes in each other")
+            ancestor, depth = number, 0
+            while ancestor in parent_of:
+                ancestor, depth = parent_of[ancestor], depth + 1
+                _check_at_most(depth, _MAX_DEPTH, "nodes in each other")
 
 
-def _count(value: Any) -> int:
+def _checked_count(value: Any) -> int:
     if type(value) is not int or value < 0:
         raise ValueError(f"{value!r:.40} where a count should be")
     return value
 
 
-def _bounded(value: int, most: int, what: str) -> None:
-    if value > most:
-        raise ValueError(f"it has {value:,} {what}, at most {most:,} are read")
+def _check_at_most(value: int, limit: int, noun: str) -> None:
+    if value > limit:
+        raise ValueError(f"it has {value:,} {noun}, at most {limit:,} are read")

@@ -8,7 +8,7 @@ import numpy as np
 
 from share.lab.calibrate.target import Target
 from share.lab.emulate.world.mesh import Shape
-from share.lab.emulate.world.proximity import within
+from share.lab.emulate.world.proximity import is_near_mesh
 from share.types import F64
 
 
@@ -22,9 +22,9 @@ class Piece:
     solid: bool = True
 
     @property
-    def bounds(self) -> F64:
+    def bounding_box(self) -> F64:
         """Lower and upper corner (2, 3) m."""
-        return self.shape.bounds
+        return self.shape.bounding_box
 
 
 @dataclass(frozen=True)
@@ -64,22 +64,24 @@ class Layout:
     target: PlacedTarget | None = None
 
     @property
-    def everything(self) -> tuple[Piece, ...]:
+    def all_pieces(self) -> tuple[Piece, ...]:
         """Shell and pieces."""
         return self.shell + self.pieces
 
     def without(self, positions: F64, clearance: float) -> tuple[Layout, tuple[str, ...]]:
         """The room without the solid pieces that come nearer than `clearance` m to any of `positions`
         (N, 3) m or hold one inside, and the names of what was removed. The shell always stays."""
-        blocked = [piece.solid and within(piece.shape.mesh, positions, clearance) for piece in self.pieces]
-        kept = tuple(p for p, gone in zip(self.pieces, blocked, strict=True) if not gone)
-        removed = tuple(p.name for p, gone in zip(self.pieces, blocked, strict=True) if gone)
-        return replace(self, pieces=kept), removed
+        blocked = [
+            piece.solid and is_near_mesh(piece.shape.mesh, positions, clearance) for piece in self.pieces
+        ]
+        remaining = tuple(p for p, is_removed in zip(self.pieces, blocked, strict=True) if not is_removed)
+        removed = tuple(p.name for p, is_removed in zip(self.pieces, blocked, strict=True) if is_removed)
+        return replace(self, pieces=remaining), removed
 
     def __post_init__(self) -> None:
-        names = [piece.name for piece in self.everything]
+        names = [piece.name for piece in self.all_pieces]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise ValueError(f"layout: two pieces are named '{twice}'")
-        if not all(np.isfinite(piece.bounds).all() for piece in self.everything):
+        if not all(np.isfinite(piece.bounding_box).all() for piece in self.all_pieces):
             raise ValueError("layout: a piece has corners that are not finite")

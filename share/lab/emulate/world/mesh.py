@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from share.lab.emulate.types import Mesh
-from share.lab.emulate.world.materials import Given, Material
+from share.lab.emulate.world.materials import GivenMaterial, Material
 from share.types import F64
 
 Rng = np.random.Generator
@@ -23,8 +23,8 @@ SIDES = ("-x", "+x", "-y", "+y", "bottom", "top")
 Skins = Material | Mapping[str, Material | None]  # one for all, or by side; "side" names the upright
 # ones, "all" whatever is not named; None leaves a face out
 
-PROUD = 0.003  # m; how far a decal stands off what it is put on
-_INSET = 0.004  # of a picture; keeps prints clear of their neighbours
+DECAL_OFFSET_M = 0.003  # m; how far a decal stands off what it is put on
+_PRINT_INSET = 0.004  # of a picture; keeps prints clear of their neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,25 +32,25 @@ class Shape:
     """A mesh whose `layer` counts into `materials`: its pictures are not drawn yet."""
 
     mesh: Mesh
-    materials: tuple[Material | Given, ...]
+    materials: tuple[Material | GivenMaterial, ...]
 
-    def moved(self, T: F64) -> Shape:
+    def transformed(self, T: F64) -> Shape:
         """The same elsewhere: rigid transform T (4, 4)."""
-        return replace(self, mesh=transformed(self.mesh, T))
+        return replace(self, mesh=transform_mesh(self.mesh, T))
 
-    def at(self, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Shape:
+    def placed_at(self, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Shape:
         """The same turned about the vertical by `yaw` rad, then shifted."""
         c, s = np.cos(yaw), np.sin(yaw)
-        return self.moved(np.array([(c, -s, 0, x), (s, c, 0, y), (0, 0, 1, z), (0, 0, 0, 1.0)]))
+        return self.transformed(np.array([(c, -s, 0, x), (s, c, 0, y), (0, 0, 1, z), (0, 0, 0, 1.0)]))
 
     @property
-    def bounds(self) -> F64:
+    def bounding_box(self) -> F64:
         """Lower and upper corner (2, 3) m."""
         v = self.mesh.vertices.astype(float)
         return np.stack([v.min(0), v.max(0)])
 
 
-def transformed(mesh: Mesh, T: F64) -> Mesh:
+def transform_mesh(mesh: Mesh, T: F64) -> Mesh:
     """`mesh` moved by the rigid transform T (4, 4)."""
     R, t = T[:3, :3], T[:3, 3]
     return replace(
@@ -60,15 +60,15 @@ def transformed(mesh: Mesh, T: F64) -> Mesh:
     )
 
 
-def concat(shapes: Sequence[Shape]) -> Shape:
+def concat_shapes(shapes: Sequence[Shape]) -> Shape:
     """All in one; equal materials are shared. Raises ValueError for none."""
     materials = tuple(dict.fromkeys(m for shape in shapes for m in shape.materials))
     number = {m: i for i, m in enumerate(materials)}
     layers = [np.array([number[m] for m in s.materials], np.int32)[s.mesh.layer] for s in shapes]
-    return Shape(replace(joined([s.mesh for s in shapes]), layer=np.concatenate(layers)), materials)
+    return Shape(replace(join_meshes([s.mesh for s in shapes]), layer=np.concatenate(layers)), materials)
 
 
-def joined(meshes: Sequence[Mesh]) -> Mesh:
+def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
     """Meshes that count into the same pictures, in one. Raises ValueError for none."""
     if not meshes:
         raise ValueError("no mesh to join")
@@ -89,15 +89,15 @@ def quad(
     front, which is where `along` x `up` points. A print fills it with its picture number `cell`."""
     a, u = np.asarray(along, float), np.asarray(up, float)
     corners = np.asarray(corner, float) + np.array([0 * a, a, a + u, u])
-    if skin.fitted:
-        uv = _cell(skin, cell)
+    if skin.is_fitted:
+        uv = _print_cell(skin, cell)
     else:
         width, height = np.sqrt(a @ a), np.sqrt(u @ u)
         shear = a @ u / width
         down = -np.sqrt(max(height**2 - shear**2, 0.0))
         flat = np.array([(0, 0), (width, 0), (width + shear, down), (shear, down)])
-        uv = flat / skin.extent + _shift(rng)
-    return _planar(corners, uv, skin)
+        uv = flat / skin.extent + _random_shift(rng)
+    return _planar_shape(corners, uv, skin)
 
 
 def decal(
@@ -107,11 +107,11 @@ def decal(
     skin: Material,
     rng: Rng | None = None,
     cell: int = 0,
-    proud: float = PROUD,
+    offset: float = DECAL_OFFSET_M,
 ) -> Shape:
-    """A `quad` that stands `proud` m off the surface that its corner lies on."""
+    """A `quad` that stands `offset` m off the surface that its corner lies on."""
     n = np.cross(np.asarray(along, float), np.asarray(up, float))
-    return quad(np.asarray(corner, float) + proud * n / np.linalg.norm(n), along, up, skin, rng, cell)
+    return quad(np.asarray(corner, float) + offset * n / np.linalg.norm(n), along, up, skin, rng, cell)
 
 
 def polygon(corners: ArrayLike, skin: Material, rng: Rng | None = None) -> Shape:
@@ -121,13 +121,13 @@ def polygon(corners: ArrayLike, skin: Material, rng: Rng | None = None) -> Shape
     n = np.cross(p[1] - p[0], p[2] - p[0])
     u = np.cross(n / np.linalg.norm(n), a)
     flat = np.stack([(p - p[0]) @ a, -(p - p[0]) @ u], axis=1)
-    if skin.fitted:
+    if skin.is_fitted:
         low, high = flat.min(0), flat.max(0)
-        corner = _cell(skin, 0)
+        corner = _print_cell(skin, 0)
         uv = corner[3] + (flat - low) / (high - low) * (corner[1] - corner[3])
     else:
-        uv = flat / skin.extent + _shift(rng)
-    return _planar(p, uv, skin)
+        uv = flat / skin.extent + _random_shift(rng)
+    return _planar_shape(p, uv, skin)
 
 
 def box(low: ArrayLike, high: ArrayLike, skins: Skins, rng: Rng | None = None, cell: int = 0) -> Shape:
@@ -145,8 +145,8 @@ def box(low: ArrayLike, high: ArrayLike, skins: Skins, rng: Rng | None = None, c
         "bottom": (lo + y, x, -y),
         "top": (lo + z, x, y),
     }
-    found = {side: _skin(skins, side) for side in SIDES}
-    return concat([quad(*faces[side], skin, rng, cell) for side, skin in found.items() if skin])
+    faces_found = {side: _side_material(skins, side) for side in SIDES}
+    return concat_shapes([quad(*faces[side], skin, rng, cell) for side, skin in faces_found.items() if skin])
 
 
 def prism(
@@ -156,14 +156,14 @@ def prism(
     p = np.asarray(outline, float)
     bottom, top = (np.column_stack([p, np.full(len(p), z)]) for z in (low, high))
     steps = np.roll(bottom, -1, axis=0) - bottom
-    start, shift = np.cumsum([0, *np.linalg.norm(steps, axis=1)]), _shift(rng)
+    start, shift = np.cumsum([0, *np.linalg.norm(steps, axis=1)]), _random_shift(rng)
     out = [
-        _shifted(quad(b, s, (0, 0, high - low), side), shift + np.array([u / (side.extent or 1), 0]))
+        _shift_uv(quad(b, s, (0, 0, high - low), side), shift + np.array([u / (side.extent or 1), 0]))
         for b, s, u in zip(bottom, steps, start, strict=False)
     ]
     if caps:
         out += [polygon(top, caps, rng), polygon(bottom[::-1], caps, rng)]
-    return concat(out)
+    return concat_shapes(out)
 
 
 def cylinder(
@@ -183,18 +183,18 @@ def cylinder(
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     low = np.column_stack([ring * radius, np.zeros(sides)])
     high = np.column_stack([ring * (radius if top is None else top), np.full(sides, height)])
-    pitch, shift = 2 * radius * np.sin(np.pi / sides), _shift(rng)
+    pitch, shift = 2 * radius * np.sin(np.pi / sides), _random_shift(rng)
     out = []
     for k in range(sides):
         corners = np.stack([low[k], low[k - sides + 1], high[k - sides + 1], high[k]])
         u = np.array([k, k + 1, k + 1, k]) * pitch
         v = -np.array([0, 0, height, height])
         uv = np.stack([u, v], axis=1) / (side.extent or 2 * np.pi * radius) + shift
-        out.append(_planar(corners, uv, side))
+        out.append(_planar_shape(corners, uv, side))
     if caps:
         out += [polygon(high, caps, rng)] if top != 0 else []
         out += [polygon(low[::-1], caps, rng)]
-    return concat(out).moved(_upright_to(axis, centre))
+    return concat_shapes(out).transformed(_axis_transform(axis, centre))
 
 
 def tube(path: ArrayLike, radius: float, skin: Material, sides: int = 8, rng: Rng | None = None) -> Shape:
@@ -214,16 +214,16 @@ def tube(path: ArrayLike, radius: float, skin: Material, sides: int = 8, rng: Rn
         np.cos(angle)[None, :, None] * across[:, None] + np.sin(angle)[None, :, None] * over[:, None]
     )
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
-    pitch, shift, extent = 2 * radius * np.sin(np.pi / sides), _shift(rng), skin.extent or 1.0
+    pitch, shift, extent = 2 * radius * np.sin(np.pi / sides), _random_shift(rng), skin.extent or 1.0
     out = []
     for i in range(len(p) - 1):
         for k in range(sides):
             j = (k + 1) % sides
             corners = np.stack([ring[i, k], ring[i, j], ring[i + 1, j], ring[i + 1, k]])
             u, v = np.array([k, k + 1, k + 1, k]) * pitch, -length[[i, i, i + 1, i + 1]]
-            out.append(_planar(corners, np.stack([u, v], axis=1) / extent + shift, skin))
+            out.append(_planar_shape(corners, np.stack([u, v], axis=1) / extent + shift, skin))
     ends = [polygon(ring[0, ::-1], skin, rng), polygon(ring[-1], skin, rng)]
-    return concat(out + ends)
+    return concat_shapes(out + ends)
 
 
 def panels(
@@ -233,7 +233,7 @@ def panels(
     large wall or floor that repeats nowhere. Joints show; give `pitch` what the building would have."""
     c, a, u = (np.asarray(v, float) for v in (corner, along, up))
     columns, rows = (max(1, round(float(np.linalg.norm(v)) / pitch)) for v in (a, u))
-    return concat(
+    return concat_shapes(
         [
             quad(
                 c + a * i / columns + u * j / rows,
@@ -248,36 +248,36 @@ def panels(
     )
 
 
-def _skin(skins: Skins, side: str) -> Material | None:
+def _side_material(skins: Skins, side: str) -> Material | None:
     if isinstance(skins, Material):
         return skins
     group = "all" if side in ("top", "bottom") else "side"
     return skins.get(side, skins.get(group, skins.get("all")))
 
 
-def _shift(rng: Rng | None) -> F64:
+def _random_shift(rng: Rng | None) -> F64:
     return np.zeros(2) if rng is None else rng.random(2)
 
 
-def _shifted(shape: Shape, uv: F64) -> Shape:
+def _shift_uv(shape: Shape, uv: F64) -> Shape:
     """Elsewhere in its picture; prints stay where they are."""
-    if shape.materials[0].fitted:
+    if shape.materials[0].is_fitted:
         return shape
     return replace(shape, mesh=replace(shape.mesh, uv=(shape.mesh.uv + uv).astype(np.float32)))
 
 
-def _cell(skin: Material, cell: int) -> F64:
+def _print_cell(skin: Material, cell: int) -> F64:
     """uv (4, 2) of print number `cell`: lower left, lower right, upper right, upper left."""
     n = skin.cells
     row, column = divmod(cell % (n * n), n)
-    low, high = _INSET, 1 - _INSET
+    low, high = _PRINT_INSET, 1 - _PRINT_INSET
     corners = np.array([(low, high), (high, high), (high, low), (low, low)])
     return np.asarray((corners + np.array([column, row])) / n)
 
 
-def _planar(corners: F64, uv: F64, skin: Material) -> Shape:
+def _planar_shape(corners: F64, uv: F64, skin: Material) -> Shape:
     """A convex planar face (N, 3) m as a fan of triangles."""
-    n = _cross(corners[1] - corners[0], corners[2] - corners[0])
+    n = _cross_product(corners[1] - corners[0], corners[2] - corners[0])
     count = len(corners)
     normals = np.empty((count, 3), np.float32)
     normals[:] = n / np.sqrt(n @ n)
@@ -291,13 +291,13 @@ def _planar(corners: F64, uv: F64, skin: Material) -> Shape:
     return Shape(mesh, (skin,))
 
 
-def _cross(a: F64, b: F64) -> F64:
+def _cross_product(a: F64, b: F64) -> F64:
     """Of two vectors (3,): np.cross costs ten times as much on so few numbers, and a room has 10^4 faces."""
     (x, y, z), (u, v, w) = a.tolist(), b.tolist()
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
-def _upright_to(axis: str, origin: ArrayLike) -> F64:
+def _axis_transform(axis: str, origin: ArrayLike) -> F64:
     """Takes +z to the named axis and 0 to `origin`."""
     T = np.eye(4)
     T[:3, :3] = {

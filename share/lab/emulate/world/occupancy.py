@@ -8,35 +8,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.lab.emulate.world.layout import Layout
-from share.lab.emulate.world.proximity import winding
+from share.lab.emulate.world.proximity import winding_numbers
 from share.types import F32, F64
 
-STEP = 0.05  # m
-_COARSE = 0.1  # m; for rooms of more than
-_MOST = 12_000_000  # voxels
-_SLICE = 200_000  # sample points at a time
-_BEHIND = 1e-4  # m
+STEP_M = 0.05  # m
+_COARSE_STEP_M = 0.1  # m; for rooms of more than
+_MAX_VOXELS = 12_000_000  # voxels
+_POINT_CHUNK = 200_000  # sample points at a time
+_SURFACE_OFFSET_M = 1e-4  # m
 
-Bools = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]
 
 
 class Occupancy:
     """Voxels of `step` m over a room. A voxel is solid where a triangle passes through it or a closed
     piece surrounds it; so is everything outside. Distances are exact to about a voxel's diagonal."""
 
-    def __init__(self, solid: Bools, step: float) -> None:
+    def __init__(self, solid: BoolArray, step: float) -> None:
         """solid: (X, Y, Z), voxel (0, 0, 0) at the origin."""
         self.solid, self.step = solid, step
 
     @classmethod
-    def of(cls, layout: Layout, step: float | None = None) -> Occupancy:
+    def from_layout(cls, layout: Layout, step: float | None = None) -> Occupancy:
         """The solid pieces of a layout, its shell and its bounds; steps of 0.05 m, in large halls 0.1 m."""
-        step = step or (STEP if np.prod(layout.size) / STEP**3 < _MOST else _COARSE)
+        step = step or (STEP_M if np.prod(layout.size) / STEP_M**3 < _MAX_VOXELS else _COARSE_STEP_M)
         shape = np.maximum(np.ceil(np.asarray(layout.size) / step - 1e-6).astype(int), 1)
         solid = np.zeros(shape, bool)
-        for piece in layout.everything:
+        for piece in layout.all_pieces:
             if piece.solid:
-                fill(solid, piece.shape.mesh.triangles.astype(float), step)
+                fill_voxels(solid, piece.shape.mesh.triangles.astype(float), step)
         return cls(solid, step)
 
     @property
@@ -57,10 +57,10 @@ class Occupancy:
         """Distance (N,) m of points (N, 3) from the nearest solid; 0 in it and outside the room."""
         from scipy.ndimage import map_coordinates
 
-        at = (np.asarray(points, float) / self.step - 0.5).T
+        voxels = (np.asarray(points, float) / self.step - 0.5).T
         inside = ((np.asarray(points) >= 0) & (np.asarray(points) <= self.size)).all(axis=1)
-        found = map_coordinates(self.distance, at, order=1, mode="nearest")
-        return np.where(inside, found, 0.0)
+        distances = map_coordinates(self.distance, voxels, order=1, mode="nearest")
+        return np.where(inside, distances, 0.0)
 
     def floor_clearance(self, low: float, high: float) -> tuple[F32, F64, float]:
         """For a body that stands between the heights `low` and `high` m: its distance (X, Y) m from the
@@ -76,20 +76,20 @@ class Occupancy:
         return grid.astype(np.float32), np.full(2, self.step / 2), self.step
 
 
-def fill(solid: Bools, triangles: F64, step: float) -> None:
+def fill_voxels(solid: BoolArray, triangles: F64, step: float) -> None:
     """Mark the voxels that triangles (F, 3, 3) m pass through or surround, in place."""
     low = np.floor(triangles.min((0, 1)) / step).astype(int) - 1
     high = np.ceil(triangles.max((0, 1)) / step).astype(int) + 1
-    own = np.zeros(high - low, bool)
-    _touch(own, triangles - low * step, step)
-    _surround(own, triangles, low, step)
+    local = np.zeros(high - low, bool)
+    _mark_surface(local, triangles - low * step, step)
+    _mark_inside(local, triangles, low, step)
     a, b = np.clip(low, 0, solid.shape), np.clip(high, 0, solid.shape)
-    there = tuple(slice(*ends) for ends in zip(a, b, strict=True))
-    here = tuple(slice(*ends) for ends in zip(a - low, b - low, strict=True))
-    solid[there] |= own[here]
+    target = tuple(slice(*ends) for ends in zip(a, b, strict=True))
+    source = tuple(slice(*ends) for ends in zip(a - low, b - low, strict=True))
+    solid[target] |= local[source]
 
 
-def _touch(own: Bools, triangles: F64, step: float) -> None:
+def _mark_surface(local: BoolArray, triangles: F64, step: float) -> None:
     """Mark voxels on the triangles, by points on them at most half a step apart, a little behind their
     front: a face on the border of two voxels is in the one that the solid fills."""
     a, b, c = triangles.swapaxes(0, 1)
@@ -97,23 +97,23 @@ def _touch(own: Bools, triangles: F64, step: float) -> None:
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     longest = np.linalg.norm(np.stack([b - a, c - b, a - c]), axis=2).max(0)
     count = np.maximum(np.ceil(longest / (0.5 * step)).astype(int), 1)
-    behind = triangles - _BEHIND * normal[:, None]
+    behind = triangles - _SURFACE_OFFSET_M * normal[:, None]
     for n in np.unique(count).tolist():
         i, j = np.nonzero(np.tri(n + 1, dtype=bool)[::-1])
         weights = np.stack([n - i - j, i, j], axis=1) / n
         weights = (1 - 1e-4) * weights + 1e-4 / 3
-        chosen = behind[count == n]
-        group = max(1, _SLICE // len(weights))
-        for k in range(0, len(chosen), group):
-            points = np.einsum("wk,fkd->fwd", weights, chosen[k : k + group]).reshape(-1, 3)
-            own[tuple(np.floor(points / step).astype(int).T)] = True
+        same_count = behind[count == n]
+        group = max(1, _POINT_CHUNK // len(weights))
+        for k in range(0, len(same_count), group):
+            points = np.einsum("wk,fkd->fwd", weights, same_count[k : k + group]).reshape(-1, 3)
+            local[tuple(np.floor(points / step).astype(int).T)] = True
 
 
-def _surround(own: Bools, triangles: F64, low: NDArray[np.int_], step: float) -> None:
+def _mark_inside(local: BoolArray, triangles: F64, low: NDArray[np.int_], step: float) -> None:
     """Mark the empty regions that lie inside the mesh."""
     from scipy.ndimage import find_objects, label
 
-    regions, _ = label(~own)
+    regions, _ = label(~local)
     outside = int(regions[0, 0, 0])
     for k, place in enumerate(find_objects(regions), start=1):
         if k == outside:
@@ -121,5 +121,5 @@ def _surround(own: Bools, triangles: F64, low: NDArray[np.int_], step: float) ->
         region = regions[place] == k
         cells = np.argwhere(region) + [part.start for part in place]
         middle = (cells[len(cells) // 2] + low + 0.5) * step
-        if winding(triangles, middle[None])[0] > 0.5:
-            own[place] |= region
+        if winding_numbers(triangles, middle[None])[0] > 0.5:
+            local[place] |= region

@@ -7,38 +7,38 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from share.lab.emulate.world.materials import KINDS, Given, Material
-from share.lab.emulate.world.noise import P
+from share.lab.emulate.world.materials import MATERIAL_KINDS, GivenMaterial, Material
+from share.lab.emulate.world.noise import PICTURE_TEXELS
 from share.lab.emulate.world.prints import PRINTS
 from share.lab.emulate.world.surfaces import SURFACES
 from share.types import F32, U8
 
-DARKEST, BRIGHTEST = 4, 250  # albedo; nothing is black or white
+MIN_ALBEDO, MAX_ALBEDO = 4, 250  # albedo; nothing is black or white
 
 
-def draw(material: Material | Given, seed: int) -> U8:
+def draw_material(material: Material | GivenMaterial, seed: int) -> U8:
     """The picture of one material in the room `seed`."""
-    if isinstance(material, Given):
+    if isinstance(material, GivenMaterial):
         return material.pixels
     rng = np.random.default_rng(
         (seed, zlib.crc32(material.kind.encode()), material.variant, len(material.text))
     )
-    kind = KINDS[material.kind]
-    mean = kind.gray + rng.normal(0, kind.spread) if material.gray is None else material.gray
-    if material.fitted:
-        sheet = _sheet(material, rng).astype(np.float32)
+    kind = MATERIAL_KINDS[material.kind]
+    mean = kind.gray + rng.normal(0, kind.gray_sigma) if material.gray is None else material.gray
+    if material.is_fitted:
+        sheet = _print_sheet(material, rng).astype(np.float32)
         own = float(sheet.mean())
         mean = own if material.gray is None else mean
         deviation = sheet - own
     else:
         deviation = SURFACES[material.kind](rng, material.extent)
-    picture: U8 = (mean + material.contrast * deviation).clip(DARKEST, BRIGHTEST).round().astype(np.uint8)
+    picture: U8 = (mean + material.contrast * deviation).clip(MIN_ALBEDO, MAX_ALBEDO).round().astype(np.uint8)
     return picture
 
 
-def draw_all(materials: Sequence[Material | Given], seed: int) -> U8:
+def draw_materials(materials: Sequence[Material | GivenMaterial], seed: int) -> U8:
     """Pictures (L, P, P), one for each material."""
-    return np.stack([draw(material, seed) for material in materials])
+    return np.stack([draw_material(material, seed) for material in materials])
 
 
 def mean_albedo(pictures: U8) -> F32:
@@ -46,8 +46,10 @@ def mean_albedo(pictures: U8) -> F32:
     return np.asarray(pictures[:, ::4, ::4].mean((1, 2)) / 255, np.float32)
 
 
-def _sheet(material: Material, rng: np.random.Generator) -> U8:
+def _print_sheet(material: Material, rng: np.random.Generator) -> U8:
     """All prints of one picture."""
     n = material.cells
-    rows = [[PRINTS[material.kind](rng, P // n, material.text) for _ in range(n)] for _ in range(n)]
+    rows = [
+        [PRINTS[material.kind](rng, PICTURE_TEXELS // n, material.text) for _ in range(n)] for _ in range(n)
+    ]
     return np.block(rows)

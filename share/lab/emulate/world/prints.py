@@ -17,17 +17,17 @@ _LETTERS = list("ABCDEFGHKLMNPRSTUVXYZ2345789")
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX)
 
 
-def _ground(rng: Rng, n: int, gray: float, soft: float = 8, fine: float = 2) -> U8:
+def _background(rng: Rng, n: int, gray: float, soft: float = 8, fine: float = 2) -> U8:
     """A plain ground with soft variation."""
     noise = soft * cloud(rng, 1.5, high=n / 8, size=n) + fine * cloud(rng, 0.4, low=n / 10, size=n)
     return (gray + noise).clip(4, 250).astype(np.uint8)
 
 
-def _words(rng: Rng, count: int) -> str:
+def _random_text(rng: Rng, count: int) -> str:
     return "".join(rng.choice(_LETTERS, count))
 
 
-def _write(
+def _write_text(
     rng: Rng, sheet: U8, text: str, box: tuple[int, int, int, int], gray: float, stroke: float = 0.09
 ) -> None:
     """`text` filling the box (x, y, width, height) in texels as well as it can."""
@@ -40,7 +40,7 @@ def _write(
     cv2.putText(sheet, text, at, font, scale, gray, thick, cv2.LINE_AA)
 
 
-def _lines(rng: Rng, sheet: U8, box: tuple[int, int, int, int], pitch: int, gray: float) -> None:
+def _text_lines(rng: Rng, sheet: U8, box: tuple[int, int, int, int], pitch: int, gray: float) -> None:
     """Lines of print too small to read: words as dashes."""
     x, y, w, h = box
     for top in range(y, y + h - pitch // 2, pitch):
@@ -53,7 +53,7 @@ def _lines(rng: Rng, sheet: U8, box: tuple[int, int, int, int], pitch: int, gray
 
 def poster(rng: Rng, n: int, text: str = "") -> U8:
     """Shapes, a picture and a title in a frame."""
-    sheet = _ground(rng, n, rng.uniform(60, 215), 16, 4)
+    sheet = _background(rng, n, rng.uniform(60, 215), 16, 4)
     for _ in range(int(rng.integers(4, 9))):
         x, y = rng.integers(0, n, 2).tolist()
         d = int(rng.uniform(0.05, 0.3) * n)
@@ -68,27 +68,31 @@ def poster(rng: Rng, n: int, text: str = "") -> U8:
             corners = (np.array([x, y]) + rng.integers(-d, d + 1, (3, 2))).astype(np.int32)
             cv2.fillConvexPoly(sheet, corners, gray, cv2.LINE_AA)
     ink = float(rng.choice([20, 235]))
-    _write(
-        rng, sheet, text or _words(rng, int(rng.integers(4, 9))), (n // 10, n // 14, 4 * n // 5, n // 6), ink
+    _write_text(
+        rng,
+        sheet,
+        text or _random_text(rng, int(rng.integers(4, 9))),
+        (n // 10, n // 14, 4 * n // 5, n // 6),
+        ink,
     )
-    _lines(rng, sheet, (n // 8, 3 * n // 4, n // 2, n // 6), max(n // 40, 4), ink)
+    _text_lines(rng, sheet, (n // 8, 3 * n // 4, n // 2, n // 6), max(n // 40, 4), ink)
     cv2.rectangle(sheet, (0, 0), (n - 1, n - 1), float(rng.uniform(10, 240)), max(n // 60, 2))
     return sheet
 
 
 def notice(rng: Rng, n: int, text: str = "") -> U8:
     """A sheet of paper: a heading, lines of text, perhaps a table."""
-    sheet = _ground(rng, n, rng.uniform(185, 225), 5, 1.5)
+    sheet = _background(rng, n, rng.uniform(185, 225), 5, 1.5)
     ink = float(rng.uniform(25, 70))
-    _write(rng, sheet, text or _words(rng, 7), (n // 8, n // 12, 3 * n // 4, n // 8), ink)
-    _lines(rng, sheet, (n // 8, n // 4, 3 * n // 4, n // 4), max(n // 36, 4), ink + 30)
+    _write_text(rng, sheet, text or _random_text(rng, 7), (n // 8, n // 12, 3 * n // 4, n // 8), ink)
+    _text_lines(rng, sheet, (n // 8, n // 4, 3 * n // 4, n // 4), max(n // 36, 4), ink + 30)
     if rng.random() < 0.5:
         for t in np.linspace(0.58, 0.9, 5):
             cv2.line(sheet, (n // 8, int(t * n)), (7 * n // 8, int(t * n)), ink, 1)
         for s in np.linspace(0.125, 0.875, int(rng.integers(3, 6))):
             cv2.line(sheet, (int(s * n), int(0.58 * n)), (int(s * n), int(0.9 * n)), ink, 1)
     else:
-        _lines(rng, sheet, (n // 8, 4 * n // 7, 3 * n // 4, n // 3), max(n // 36, 4), ink + 30)
+        _text_lines(rng, sheet, (n // 8, 4 * n // 7, 3 * n // 4, n // 3), max(n // 36, 4), ink + 30)
     return sheet
 
 
@@ -96,14 +100,14 @@ def sign(rng: Rng, n: int, text: str = "") -> U8:
     """A few large letters over a band, or an arrow."""
     dark = rng.random() < 0.5
     ground, ink = (rng.uniform(35, 90), 225.0) if dark else (rng.uniform(170, 220), 30.0)
-    sheet = _ground(rng, n, ground, 4, 1)
-    words = text or _words(rng, int(rng.integers(1, 4)))
+    sheet = _background(rng, n, ground, 4, 1)
+    words = text or _random_text(rng, int(rng.integers(1, 4)))
     if rng.random() < 0.4 and not text:
         tip = (n // 6, n // 3) if rng.random() < 0.5 else (5 * n // 6, n // 3)
         cv2.arrowedLine(sheet, (n - tip[0], tip[1]), tip, ink, n // 12, cv2.LINE_AA, 0, 0.35)
-        _write(rng, sheet, words, (n // 8, n // 2, 3 * n // 4, 3 * n // 8), ink)
+        _write_text(rng, sheet, words, (n // 8, n // 2, 3 * n // 4, 3 * n // 8), ink)
     else:
-        _write(rng, sheet, words, (n // 10, n // 8, 4 * n // 5, 5 * n // 8), ink)
+        _write_text(rng, sheet, words, (n // 10, n // 8, 4 * n // 5, 5 * n // 8), ink)
         cv2.rectangle(sheet, (0, 5 * n // 6), (n, n), float(rng.uniform(40, 200)), -1)
     cv2.rectangle(sheet, (0, 0), (n - 1, n - 1), ink, max(n // 40, 2))
     return sheet
@@ -111,20 +115,20 @@ def sign(rng: Rng, n: int, text: str = "") -> U8:
 
 def label(rng: Rng, n: int, text: str = "") -> U8:
     """A shipping label: bars, a number, lines."""
-    sheet = _ground(rng, n, rng.uniform(190, 230), 3, 1)
+    sheet = _background(rng, n, rng.uniform(190, 230), 3, 1)
     x = n // 10
     while x < 9 * n // 10:
         wide = int(rng.integers(1, max(n // 24, 3)))
         cv2.rectangle(sheet, (x, n // 2), (x + wide - 1, 4 * n // 5), 35.0, -1)
         x += wide + int(rng.integers(2, max(n // 20, 4)))
-    _write(rng, sheet, text or _words(rng, 6), (n // 10, n // 12, 4 * n // 5, n // 5), 30.0)
-    _lines(rng, sheet, (n // 10, n // 3, 3 * n // 5, n // 8), max(n // 20, 4), 60.0)
+    _write_text(rng, sheet, text or _random_text(rng, 6), (n // 10, n // 12, 4 * n // 5, n // 5), 30.0)
+    _text_lines(rng, sheet, (n // 10, n // 3, 3 * n // 5, n // 8), max(n // 20, 4), 60.0)
     return sheet
 
 
 def board(rng: Rng, n: int, text: str = "") -> U8:
     """A pin board with sheets that overlap."""
-    sheet = _ground(rng, n, rng.uniform(95, 135), 6, 8)
+    sheet = _background(rng, n, rng.uniform(95, 135), 6, 8)
     for _ in range(int(rng.integers(9, 17))):
         size = int(rng.uniform(0.12, 0.3) * n)
         paper = (poster if rng.random() < 0.4 else notice)(rng, size)[:, : int(size * rng.uniform(0.65, 1))]
@@ -134,9 +138,9 @@ def board(rng: Rng, n: int, text: str = "") -> U8:
     return sheet
 
 
-def _shelves(rng: Rng, n: int, rows: int, tallest: float, widths: tuple[float, float], odd: float) -> U8:
+def _shelf_rows(rng: Rng, n: int, rows: int, tallest: float, widths: tuple[float, float], odd: float) -> U8:
     """Upright things side by side on boards, of all heights, some missing."""
-    sheet = _ground(rng, n, 42, 6, 2)
+    sheet = _background(rng, n, 42, 6, 2)
     pitch = n // rows
     for foot in range(pitch - 1, n, pitch):
         x = 1
@@ -153,22 +157,22 @@ def _shelves(rng: Rng, n: int, rows: int, tallest: float, widths: tuple[float, f
                 cv2.line(sheet, (right, foot - tall), (right, foot), gray * 0.6, 1)
             x += wide
         cv2.rectangle(sheet, (0, foot - max(n // 90, 2)), (n, foot), float(rng.uniform(110, 160)), -1)
-    return _soft(sheet)
+    return _soften(sheet)
 
 
 def goods(rng: Rng, n: int, text: str = "") -> U8:
     """Small things on a shelf, from the front."""
-    return _shelves(rng, n, int(rng.integers(2, 4)), 0.85, (0.08, 0.25), 0.85)
+    return _shelf_rows(rng, n, int(rng.integers(2, 4)), 0.85, (0.08, 0.25), 0.85)
 
 
 def books(rng: Rng, n: int, text: str = "") -> U8:
     """Spines of files and books."""
-    return _shelves(rng, n, 2, 0.9, (0.03, 0.09), 0.93)
+    return _shelf_rows(rng, n, 2, 0.9, (0.03, 0.09), 0.93)
 
 
 def tools(rng: Rng, n: int, text: str = "") -> U8:
     """A wall of hanging tools."""
-    sheet = _ground(rng, n, rng.uniform(130, 170), 4, 2)
+    sheet = _background(rng, n, rng.uniform(130, 170), 4, 2)
     for x in range(n // 10, n, n // 7):
         for y in range(n // 12, n - n // 5, n // 4):
             if rng.random() < 0.2:
@@ -179,12 +183,12 @@ def tools(rng: Rng, n: int, text: str = "") -> U8:
             )
             head = (int(rng.uniform(0.01, 0.045) * n), int(rng.uniform(0.01, 0.03) * n))
             cv2.ellipse(sheet, (x, y), head, float(rng.uniform(0, 90)), 0, 360, gray, -1, cv2.LINE_AA)
-    return _soft(sheet)
+    return _soften(sheet)
 
 
 def gauge(rng: Rng, n: int, text: str = "") -> U8:
     """Dials, switches and lamps on a panel."""
-    sheet = _ground(rng, n, rng.uniform(80, 150), 4, 1)
+    sheet = _background(rng, n, rng.uniform(80, 150), 4, 1)
     step = n // 4
     for y in range(step // 2, n, step):
         for x in range(step // 2, n, step):
@@ -200,7 +204,7 @@ def gauge(rng: Rng, n: int, text: str = "") -> U8:
                     sheet, (x - r // 2, y - r), (x + r // 2, y + r), float(rng.choice([40, 200])), -1
                 )
             elif what == 2:
-                _lines(rng, sheet, (x - r, y - r, 2 * r, 2 * r), max(r // 3, 4), 30.0)
+                _text_lines(rng, sheet, (x - r, y - r, 2 * r, 2 * r), max(r // 3, 4), 30.0)
             else:
                 cv2.circle(sheet, (x, y), r // 2, float(rng.choice([30, 235])), -1, cv2.LINE_AA)
     cv2.rectangle(sheet, (0, 0), (n - 1, n - 1), 40.0, max(n // 60, 2))
@@ -210,7 +214,7 @@ def gauge(rng: Rng, n: int, text: str = "") -> U8:
 def door(rng: Rng, n: int, text: str = "") -> U8:
     """A door leaf in its frame: handle, a plate, perhaps a pane."""
     gray = rng.uniform(90, 180)
-    sheet = _ground(rng, n, gray, 4, 1)
+    sheet = _background(rng, n, gray, 4, 1)
     cv2.rectangle(sheet, (0, 0), (n - 1, n - 1), gray * 0.6, n // 16)
     cv2.rectangle(sheet, (n // 16, n // 24), (n - n // 16, n), gray * 0.45, 2)
     if rng.random() < 0.6:
@@ -225,7 +229,7 @@ def door(rng: Rng, n: int, text: str = "") -> U8:
 def locker(rng: Rng, n: int, text: str = "") -> U8:
     """Narrow doors with slots, a lock and a number."""
     gray = rng.uniform(90, 170)
-    sheet = _ground(rng, n, gray, 4, 1)
+    sheet = _background(rng, n, gray, 4, 1)
     wide = n // 3
     for k in range(3):
         x = k * wide
@@ -235,25 +239,25 @@ def locker(rng: Rng, n: int, text: str = "") -> U8:
         cv2.circle(sheet, (x + 5 * wide // 6, n // 2), n // 64, 40.0, -1, cv2.LINE_AA)
         plate = (x + wide // 3, n // 4, wide // 3, n // 16)
         cv2.rectangle(sheet, plate[:2], (plate[0] + plate[2], plate[1] + plate[3]), 215.0, -1)
-        _write(rng, sheet, text or str(rng.integers(10, 99)), plate, 30.0)
+        _write_text(rng, sheet, text or str(rng.integers(10, 99)), plate, 30.0)
     return sheet
 
 
 def shutter(rng: Rng, n: int, text: str = "") -> U8:
     """A roller door: slats, some dented, a bar at the bottom."""
     gray = rng.uniform(120, 175)
-    sheet = _ground(rng, n, gray, 5, 1)
+    sheet = _background(rng, n, gray, 5, 1)
     for y in range(0, n, n // 32):
         cv2.line(sheet, (0, y), (n, y), gray - rng.uniform(8, 22), 2)
     cv2.rectangle(sheet, (0, 15 * n // 16), (n, n), gray * 0.5, -1)
     if text:
-        _write(rng, sheet, text, (n // 4, n // 5, n // 2, n // 3), 45.0)
+        _write_text(rng, sheet, text, (n // 4, n // 5, n // 2, n // 3), 45.0)
     return sheet
 
 
 def window(rng: Rng, n: int, text: str = "") -> U8:
     """Bright panes between dark bars, something vague behind."""
-    sheet = _ground(rng, n, rng.uniform(195, 215), 18, 1)
+    sheet = _background(rng, n, rng.uniform(195, 215), 18, 1)
     for k in range(int(rng.integers(2, 4)) + 1):
         at = round(k * n / 3)
         cv2.line(sheet, (at, 0), (at, n), 70.0, n // 40)
@@ -264,17 +268,17 @@ def window(rng: Rng, n: int, text: str = "") -> U8:
 
 def screen(rng: Rng, n: int, text: str = "") -> U8:
     """A monitor: windows, lines, a curve."""
-    sheet = _ground(rng, n, rng.uniform(25, 60), 2, 0.5)
+    sheet = _background(rng, n, rng.uniform(25, 60), 2, 0.5)
     x, y = rng.integers(n // 12, n // 3, 2).tolist()
     cv2.rectangle(sheet, (x, y), (x + n // 2, y + n // 2), 170.0, -1)
-    _lines(rng, sheet, (x + n // 20, y + n // 12, n // 3, n // 3), max(n // 36, 4), 50.0)
+    _text_lines(rng, sheet, (x + n // 20, y + n // 12, n // 3, n // 3), max(n // 36, 4), 50.0)
     curve = np.stack([np.linspace(0, n - 1, 40), n * (0.85 + 0.04 * np.cumsum(rng.normal(0, 0.5, 40)))], 1)
     cv2.polylines(sheet, [curve.round().astype(np.int32)], False, 200.0, 2, cv2.LINE_AA)
     cv2.rectangle(sheet, (0, 0), (n - 1, n - 1), 15.0, n // 24)
     return sheet
 
 
-def _soft(sheet: U8) -> U8:
+def _soften(sheet: U8) -> U8:
     return np.asarray(cv2.GaussianBlur(sheet, (0, 0), 0.6), np.uint8)
 
 

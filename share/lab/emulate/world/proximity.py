@@ -7,24 +7,27 @@ import numpy as np
 from share.lab.emulate.types import Mesh
 from share.types import F64
 
-_CHUNK = 400_000  # point-triangle pairs at a time
+_PAIR_CHUNK = 400_000  # point-triangle pairs at a time
 
 
-def within(mesh: Mesh, points: F64, reach: float) -> bool:
+def is_near_mesh(mesh: Mesh, points: F64, reach: float) -> bool:
     """Whether any point (N, 3) m lies nearer than `reach` m to the mesh, or inside it."""
     low, high = mesh.vertices.min(0) - reach, mesh.vertices.max(0) + reach
     near = points[((points >= low) & (points <= high)).all(axis=1)]
     if not len(near):
         return False
     corners = mesh.triangles.astype(float)
-    step = max(1, _CHUNK // len(corners))
+    step = max(1, _PAIR_CHUNK // len(corners))
     return any(
-        bool((distances(corners, part).min(1) < reach).any() or (winding(corners, part) > 0.5).any())
+        bool(
+            (triangle_distances(corners, part).min(1) < reach).any()
+            or (winding_numbers(corners, part) > 0.5).any()
+        )
         for part in (near[i : i + step] for i in range(0, len(near), step))
     )
 
 
-def distances(corners: F64, points: F64) -> F64:
+def triangle_distances(corners: F64, points: F64) -> F64:
     """Distance (N, F) m of points (N, 3) from triangles (F, 3, 3): to the plane where a point's foot
     lies inside, else to the nearest edge."""
     p = points[:, None]
@@ -44,7 +47,7 @@ def distances(corners: F64, points: F64) -> F64:
     return np.where(inside, np.minimum(height, out), out)
 
 
-def winding(corners: F64, points: F64) -> F64:
+def winding_numbers(corners: F64, points: F64) -> F64:
     """How often the triangles (F, 3, 3) surround each point (N, 3): about 1 inside a closed solid, 0
     outside. Solid angles by van Oosterom & Strackee, IEEE TBME 30(2), 1983."""
     a, b, c = (corners[:, k] - points[:, None] for k in range(3))

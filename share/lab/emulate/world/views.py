@@ -7,8 +7,8 @@ import numpy as np
 from share.lab.emulate.world.occupancy import Occupancy
 from share.types import F64
 
-_ROOMY = 0.35  # m; from the nearest thing
-_FEET = 0.1  # m; above the floor itself
+_MIN_CLEARANCE_M = 0.35  # m; from the nearest thing
+_FLOOR_MARGIN_M = 0.1  # m; above the floor itself
 _PERSON, _ROBOT = (1.5, 1.75), 0.35  # m; heights of their cameras
 
 
@@ -17,16 +17,16 @@ def standing_views(occupancy: Occupancy, seed: int, count: int) -> F64:
     nobody can stand."""
     rng = np.random.default_rng((seed, 4))
     out = np.tile(np.eye(4), (count, 1, 1))
-    places = {robot: _places(occupancy, 0.5 if robot else 1.9) for robot in (False, True)}
+    places = {robot: _standing_places(occupancy, 0.5 if robot else 1.9) for robot in (False, True)}
     for k in range(count):
         robot = k % 4 == 3
         x, y = places[robot][rng.integers(len(places[robot]))]
         z, pitch = (_ROBOT, 0.15) if robot else (rng.uniform(*_PERSON), rng.uniform(-0.35, 0.15))
-        out[k] = looking((x, y, z), rng.uniform(0, 2 * np.pi), pitch)
+        out[k] = level_camera_pose((x, y, z), rng.uniform(0, 2 * np.pi), pitch)
     return out
 
 
-def looking(position: tuple[float, float, float], yaw: float, pitch: float) -> F64:
+def level_camera_pose(position: tuple[float, float, float], yaw: float, pitch: float) -> F64:
     """T_world_cam (4, 4) of a level camera: yaw from the x axis, pitch upwards, rad."""
     ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0])
@@ -36,9 +36,9 @@ def looking(position: tuple[float, float, float], yaw: float, pitch: float) -> F
     return T
 
 
-def _places(occupancy: Occupancy, tall: float) -> F64:
-    grid, origin, step = occupancy.floor_clearance(_FEET, tall)
-    cells = np.argwhere(grid > _ROOMY)
+def _standing_places(occupancy: Occupancy, tall: float) -> F64:
+    grid, origin, step = occupancy.floor_clearance(_FLOOR_MARGIN_M, tall)
+    cells = np.argwhere(grid > _MIN_CLEARANCE_M)
     if not len(cells):
         raise ValueError(f"room: nobody {tall} m tall can stand in it")
     return np.asarray(cells * step + origin)

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from share.lab.emulate.world.furniture.parts import block, pick, strut
-from share.lab.emulate.world.mesh import Rng, Shape, concat
+from share.lab.emulate.world.furniture.parts import box_on, pick_material, strut
+from share.lab.emulate.world.mesh import Rng, Shape, concat_shapes
 
 
-def leaning(rng: Rng, length: float) -> Shape:
+def leaning_ladder(rng: Rng, length: float) -> Shape:
     """A ladder of `length` m that leans at a wall in the plane y = 0, its feet 0.3 of that away."""
-    skin, foot = pick(rng, "galvanised"), -0.28 * length
+    skin, foot = pick_material(rng, "galvanised"), -0.28 * length
     top = (length**2 - foot**2) ** 0.5
     out = [strut((x, foot, 0.02), (x, -0.04, top), 0.03, skin, rng, 0.06) for x in (-0.2, 0.2)]
     for k in range(1, int(length / 0.28)):
         s = k * 0.28 / length
         y, z = foot + (-0.04 - foot) * s, 0.02 + (top - 0.02) * s
         out.append(strut((-0.17, y, z), (0.17, y, z), 0.03, skin, rng))
-    return concat(out)
+    return concat_shapes(out)
 
 
-def step(rng: Rng, height: float) -> Shape:
+def step_ladder(rng: Rng, height: float) -> Shape:
     """A step ladder that stands open, climbed from -y."""
-    skin, d = pick(rng, "galvanised"), 0.55 * height
+    skin, d = pick_material(rng, "galvanised"), 0.55 * height
     out = []
     for x in (-0.22, 0.22):
         out.append(strut((x, -d, 0.015), (x, -0.32 * height, height), 0.03, skin, rng, 0.06))
@@ -28,6 +28,6 @@ def step(rng: Rng, height: float) -> Shape:
     count = max(2, round(height / 0.25))
     for k in range(1, count):
         s = k / count
-        out.append(block((0, -d + 0.23 * height * s, height * s), (0.38, 0.1, 0.03), skin, rng))
-    out.append(block((0, -0.3 * height, height), (0.5, 0.28, 0.04), pick(rng, "plastic"), rng))
-    return concat(out)
+        out.append(box_on((0, -d + 0.23 * height * s, height * s), (0.38, 0.1, 0.03), skin, rng))
+    out.append(box_on((0, -0.3 * height, height), (0.5, 0.28, 0.04), pick_material(rng, "plastic"), rng))
+    return concat_shapes(out)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from share.lab.emulate.world.materials import Material
-from share.lab.emulate.world.mesh import Rng, Shape, box, concat, decal
+from share.lab.emulate.world.mesh import Rng, Shape, box, concat_shapes, decal
 
-Point = Sequence[float]
+Point3 = Sequence[float]
 
 # Pictures of each kind that one room owns; two where nothing is said. Few, so that they fit in memory.
 VARIANTS = {
@@ -24,31 +24,33 @@ VARIANTS = {
 }
 
 
-def pick(rng: Rng, kind: str) -> Material:
+def pick_material(rng: Rng, kind: str) -> Material:
     """One of the room's materials of this kind."""
     return Material(kind, int(rng.integers(VARIANTS.get(kind, 2))))
 
 
-def printed(rng: Rng, kind: str) -> tuple[Material, int]:
+def pick_print(rng: Rng, kind: str) -> tuple[Material, int]:
     """One of the room's prints of this kind, and which cell of its picture."""
-    skin = pick(rng, kind)
+    skin = pick_material(rng, kind)
     return skin, int(rng.integers(skin.cells**2))
 
 
-def front(rng: Rng, x: float, z: float, width: float, height: float, kind: str, y: float = 0.0) -> Shape:
+def front_print(
+    rng: Rng, x: float, z: float, width: float, height: float, kind: str, y: float = 0.0
+) -> Shape:
     """A print of this kind on a front in the plane `y`, lower left corner at (x, z)."""
-    skin, cell = printed(rng, kind)
+    skin, cell = pick_print(rng, kind)
     return decal((x, y, z), (width, 0, 0), (0, 0, height), skin, rng, cell)
 
 
-def block(middle: Point, size: Point, skin: Material, rng: Rng) -> Shape:
+def box_on(middle: Point3, size: Point3, skin: Material, rng: Rng) -> Shape:
     """A box by the middle of its underside (3,) m and its size (3,) m."""
     half = np.array([size[0] / 2, size[1] / 2, 0])
     low = np.asarray(middle, float) - half
     return box(low, low + np.asarray(size, float), skin, rng)
 
 
-def strut(start: Point, end: Point, thick: float, skin: Material, rng: Rng, wide: float = 0.0) -> Shape:
+def strut(start: Point3, end: Point3, thick: float, skin: Material, rng: Rng, wide: float = 0.0) -> Shape:
     """A straight bar from `start` to `end` (3,) m, of section `wide` or `thick` x `thick` m."""
     a, d = np.asarray(start, float), np.asarray(end, float) - np.asarray(start, float)
     length = float(np.linalg.norm(d))
@@ -58,21 +60,21 @@ def strut(start: Point, end: Point, thick: float, skin: Material, rng: Rng, wide
     T = np.eye(4)
     T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = x, np.cross(z, x), z, a
     half = (wide or thick) / 2
-    return box((-half, -thick / 2, 0), (half, thick / 2, length), skin, rng).moved(T)
+    return box((-half, -thick / 2, 0), (half, thick / 2, length), skin, rng).transformed(T)
 
 
-def posts(width: float, depth: float, height: float, thick: float, skin: Material, rng: Rng) -> Shape:
+def corner_posts(width: float, depth: float, height: float, thick: float, skin: Material, rng: Rng) -> Shape:
     """Four upright posts at the corners of a footprint with its back at y = 0."""
     at = [(x, y) for x in (-1, 1) for y in (-depth + thick / 2, -thick / 2)]
     reach = (width - thick) / 2
-    return concat([block((x * reach, y, 0), (thick, thick, height), skin, rng) for x, y in at])
+    return concat_shapes([box_on((x * reach, y, 0), (thick, thick, height), skin, rng) for x, y in at])
 
 
-def row(shapes: Sequence[Shape], gap: float) -> Shape:
+def side_by_side(shapes: Sequence[Shape], gap: float) -> Shape:
     """Things side by side with gaps between, their backs in one plane, the middle at x = 0."""
-    widths = [float(s.bounds[1, 0] - s.bounds[0, 0]) for s in shapes]
+    widths = [float(s.bounding_box[1, 0] - s.bounding_box[0, 0]) for s in shapes]
     at, out = -(sum(widths) + gap * (len(shapes) - 1)) / 2, []
     for shape, width in zip(shapes, widths, strict=True):
-        out.append(shape.at(at - float(shape.bounds[0, 0]), 0))
+        out.append(shape.placed_at(at - float(shape.bounding_box[0, 0]), 0))
         at += width + gap
-    return concat(out)
+    return concat_shapes(out)

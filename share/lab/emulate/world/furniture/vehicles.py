@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.lab.emulate.world.furniture.parts import block, pick, printed, strut
+from share.lab.emulate.world.furniture.parts import box_on, pick_material, pick_print, strut
 from share.lab.emulate.world.materials import Material
-from share.lab.emulate.world.mesh import Rng, Shape, box, concat, cylinder, decal, polygon, prism, quad
+from share.lab.emulate.world.mesh import Rng, Shape, box, concat_shapes, cylinder, decal, polygon, prism, quad
 
 _UPRIGHT = np.array([(0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1.0)])
 # an outline drawn as (y, z) and raised along +z comes to lie along x
@@ -14,12 +14,12 @@ _UPRIGHT = np.array([(0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1.0)])
 
 def _body(outline: list[tuple[float, float]], half: float, skin: Material, rng: Rng) -> Shape:
     """A body of constant section: outline (y, z) m, counter-clockwise as seen from +x."""
-    return prism(outline, -half, half, skin, skin, rng).moved(_UPRIGHT)
+    return prism(outline, -half, half, skin, skin, rng).transformed(_UPRIGHT)
 
 
 def _wheel(x: float, y: float, radius: float, wide: float, rng: Rng) -> Shape:
-    tyre, rim, out = Material("rubber"), pick(rng, "galvanised"), np.sign(x)
-    return concat(
+    tyre, rim, out = Material("rubber"), pick_material(rng, "galvanised"), np.sign(x)
+    return concat_shapes(
         [
             cylinder((x - wide / 2, y, radius), radius, wide, tyre, tyre, axis="x", sides=22, rng=rng),
             cylinder(
@@ -56,24 +56,26 @@ def _arch(x: float, y: float, radius: float) -> Shape:
     return polygon(ring + np.array([x + np.sign(x) * 0.004, 0, 0]), Material("rubber"))
 
 
-def _pane(x: float, y: float, z: float, wide: float, high: float, rng: Rng, kind: str = "glass") -> Shape:
+def _window_pane(
+    x: float, y: float, z: float, wide: float, high: float, rng: Rng, kind: str = "glass"
+) -> Shape:
     """A pane or plate on a side at x, from y - wide/2 to y + wide/2, from z up."""
     along = np.array([0, np.sign(x) * wide, 0])
-    skin = Material(kind) if kind == "glass" else printed(rng, kind)[0]
-    return decal(np.array([x, y, z]) - along / 2, along, (0, 0, high), skin, rng, proud=0.006)
+    skin = Material(kind) if kind == "glass" else pick_print(rng, kind)[0]
+    return decal(np.array([x, y, z]) - along / 2, along, (0, 0, high), skin, rng, offset=0.006)
 
 
 def _lights(half: float, y: float, z: float, rng: Rng) -> list[Shape]:
     """Head lamps, grille, bumper and plate of a nose in the plane y."""
     glass, skin = Material("plastic", 1, gray=215), Material("rubber")
-    out = [block((x * (half - 0.22), y - 0.015, z), (0.3, 0.03, 0.18), glass, rng) for x in (-1, 1)]
+    out = [box_on((x * (half - 0.22), y - 0.015, z), (0.3, 0.03, 0.18), glass, rng) for x in (-1, 1)]
     out.append(
         quad(
             (-half + 0.45, y - 0.006, z - 0.05), (2 * half - 0.9, 0, 0), (0, 0, 0.3), Material("grating"), rng
         )
     )
-    out.append(block((0, y - 0.03, z - 0.32), (2 * half - 0.06, 0.1, 0.22), skin, rng))
-    plate, cell = printed(rng, "sign")
+    out.append(box_on((0, y - 0.03, z - 0.32), (2 * half - 0.06, 0.1, 0.22), skin, rng))
+    plate, cell = pick_print(rng, "sign")
     out.append(decal((-0.26, y - 0.08, z - 0.27), (0.52, 0, 0), (0, 0, 0.11), plate, rng, cell))
     return out
 
@@ -88,60 +90,65 @@ def fire_engine(rng: Rng, length: float, width: float = 2.3) -> Shape:
     out = [
         _body(front_, half, paint, rng),
         box((-half, nose + cab + 0.06, 0.5), (half, -0.05, top + 0.12), paint, rng),
-        block((0, -length / 2, 0.32), (0.9, length - 0.5, 0.2), Material("rubber"), rng),
-        block((0, -0.025, 0.4), (width - 0.2, 0.05, 0.18), Material("stripes"), rng),
+        box_on((0, -length / 2, 0.32), (0.9, length - 0.5, 0.2), Material("rubber"), rng),
+        box_on((0, -0.025, 0.4), (width - 0.2, 0.05, 0.18), Material("stripes"), rng),
     ]
     slope = np.array([0, 0.35, top - 1.35])
     lean = np.array([-half + 0.1, nose, 1.35]) + 0.1 * slope
-    out.append(decal(lean, (2 * half - 0.2, 0, 0), 0.78 * slope, Material("glass"), rng, proud=0.008))
+    out.append(decal(lean, (2 * half - 0.2, 0, 0), 0.78 * slope, Material("glass"), rng, offset=0.008))
     radius = 0.46
     for x in (-half, half):
         out += [_arch(x, y, radius) for y in (nose + 0.85, -1.05)]
         out += [_wheel(x - np.sign(x) * 0.13, y, radius, 0.28, rng) for y in (nose + 0.85, -1.05)]
-        out += [_pane(x, nose + c, 1.4, 0.75, 0.75, rng) for c in (0.85, cab - 0.55)]
+        out += [_window_pane(x, nose + c, 1.4, 0.75, 0.75, rng) for c in (0.85, cab - 0.55)]
         out.append(
-            block((x + np.sign(x) * 0.04, nose + 1.4, 1.2), (0.06, 0.16, 0.03), pick(rng, "galvanised"), rng)
+            box_on(
+                (x + np.sign(x) * 0.04, nose + 1.4, 1.2),
+                (0.06, 0.16, 0.03),
+                pick_material(rng, "galvanised"),
+                rng,
+            )
         )
         wide = (length - cab - 0.4) / 3
         for k in range(3):
             y, low = nose + cab + 0.2 + (k + 0.5) * wide, (1.1 if k == 2 else 0.65)
-            out.append(_pane(x, y, low, wide - 0.1, top - 0.15 - low, rng, "shutter"))
+            out.append(_window_pane(x, y, low, wide - 0.1, top - 0.15 - low, rng, "shutter"))
         stripe = np.sign(x) * (cab - 0.1)
         start = nose + (0.05 if x > 0 else cab - 0.05)
-        out.append(decal((x, start, 1.08), (0, stripe, 0), (0, 0, 0.16), white, rng, proud=0.008))
+        out.append(decal((x, start, 1.08), (0, stripe, 0), (0, 0, 0.16), white, rng, offset=0.008))
         out.append(
-            block(
+            box_on(
                 (x * 0.85, -length * 0.3, top + 0.12),
                 (0.06, length * 0.5, 0.14),
-                pick(rng, "galvanised"),
+                pick_material(rng, "galvanised"),
                 rng,
             )
         )
-        out.append(block((x * 1.06, nose + 0.3, 1.5), (0.12, 0.06, 0.42), Material("rubber"), rng))
+        out.append(box_on((x * 1.06, nose + 0.3, 1.5), (0.12, 0.06, 0.42), Material("rubber"), rng))
     out += _lights(half, nose, 0.95, rng)
-    out.append(block((0, nose + 0.6, top), (1.5, 0.25, 0.16), Material("plastic", 2, gray=60), rng))
+    out.append(box_on((0, nose + 0.6, top), (1.5, 0.25, 0.16), Material("plastic", 2, gray=60), rng))
     out += _roof_ladder(rng, length * 0.56, -0.2, top + 0.2)
-    out += _rear(rng, half, top)
-    return concat(out)
+    out += _rear_parts(rng, half, top)
+    return concat_shapes(out)
 
 
 def _roof_ladder(rng: Rng, length: float, rear: float, z: float) -> list[Shape]:
-    skin = pick(rng, "galvanised")
+    skin = pick_material(rng, "galvanised")
     out = [strut((x, rear, z), (x, rear - length, z), 0.06, skin, rng) for x in (-0.25, 0.25)]
     count = int(length / 0.3)
     rungs = [rear - (k + 0.5) * length / count for k in range(count)]
     out += [strut((-0.22, y, z), (0.22, y, z), 0.03, skin, rng) for y in rungs]
     feet = [(x, rear - s * length) for x in (-0.25, 0.25) for s in (0.1, 0.9)]
-    return out + [block((x, y, z - 0.08), (0.05, 0.08, 0.05), skin, rng) for x, y in feet]
+    return out + [box_on((x, y, z - 0.08), (0.05, 0.08, 0.05), skin, rng) for x, y in feet]
 
 
-def _rear(rng: Rng, half: float, top: float) -> list[Shape]:
+def _rear_parts(rng: Rng, half: float, top: float) -> list[Shape]:
     """The shutter of the pump, its lamps, and the sign of the service."""
     wide = 2 * half - 0.7
-    skin, cell = printed(rng, "shutter")
-    out = [decal((wide / 2, -0.05, 0.9), (-wide, 0, 0), (0, 0, top - 1.1), skin, rng, cell, proud=0.006)]
+    skin, cell = pick_print(rng, "shutter")
+    out = [decal((wide / 2, -0.05, 0.9), (-wide, 0, 0), (0, 0, top - 1.1), skin, rng, cell, offset=0.006)]
     lamp = Material("plastic", 2, gray=60)
-    return out + [block((x * (half - 0.16), -0.035, 0.8), (0.16, 0.03, 0.4), lamp, rng) for x in (-1, 1)]
+    return out + [box_on((x * (half - 0.16), -0.035, 0.8), (0.16, 0.03, 0.4), lamp, rng) for x in (-1, 1)]
 
 
 def van(rng: Rng, length: float) -> Shape:
@@ -160,29 +167,29 @@ def van(rng: Rng, length: float) -> Shape:
     out = [_body(outline, half, paint, rng)]
     slope = np.array([0, 0.5, top - 1.1])
     low = np.array([-half + 0.1, nose + 0.75, 1.1]) + 0.08 * slope
-    out.append(decal(low, (2 * half - 0.2, 0, 0), 0.82 * slope, Material("glass"), rng, proud=0.008))
+    out.append(decal(low, (2 * half - 0.2, 0, 0), 0.82 * slope, Material("glass"), rng, offset=0.008))
     for x in (-half, half):
         out += [_arch(x, y, 0.33) for y in (nose + 0.75, -0.85)]
         out += [_wheel(x - np.sign(x) * 0.09, y, 0.33, 0.2, rng) for y in (nose + 0.75, -0.85)]
-        out.append(_pane(x, nose + 1.6, 1.12, 0.75, 0.55, rng))
+        out.append(_window_pane(x, nose + 1.6, 1.12, 0.75, 0.55, rng))
         seam = np.sign(x) * (length - 2.4)
         start = nose + 2.1 if x > 0 else -0.2
-        out.append(decal((x, start, 0.85), (0, seam, 0), (0, 0, 0.3), *_stripe(rng), proud=0.006))
+        out.append(decal((x, start, 0.85), (0, seam, 0), (0, 0, 0.3), *_stripe(rng), offset=0.006))
         out.append(
-            block((x + np.sign(x) * 0.03, nose + 1.9, 0.98), (0.05, 0.14, 0.03), Material("rubber"), rng)
+            box_on((x + np.sign(x) * 0.03, nose + 1.9, 0.98), (0.05, 0.14, 0.03), Material("rubber"), rng)
         )
-        out.append(block((x * 1.08, nose + 1.22, 1.12), (0.14, 0.08, 0.2), Material("rubber"), rng))
+        out.append(box_on((x * 1.08, nose + 1.22, 1.12), (0.14, 0.08, 0.2), Material("rubber"), rng))
     out += _lights(half, nose, 0.66, rng)
     lamp = Material("plastic", 2, gray=60)
-    out += [block((x * (half - 0.1), -0.035, 0.75), (0.12, 0.03, 0.45), lamp, rng) for x in (-1, 1)]
+    out += [box_on((x * (half - 0.1), -0.035, 0.75), (0.12, 0.03, 0.45), lamp, rng) for x in (-1, 1)]
     out += [
-        decal((x + 0.36, -0.05, 1.15), (-0.72, 0, 0), (0, 0, 0.6), Material("glass"), rng, proud=0.006)
+        decal((x + 0.36, -0.05, 1.15), (-0.72, 0, 0), (0, 0, 0.6), Material("glass"), rng, offset=0.006)
         for x in (-0.42, 0.42)
     ]
-    out.append(block((0, -0.03, 0.32), (2 * half - 0.1, 0.06, 0.18), Material("rubber"), rng))
-    return concat(out)
+    out.append(box_on((0, -0.03, 0.32), (2 * half - 0.1, 0.06, 0.18), Material("rubber"), rng))
+    return concat_shapes(out)
 
 
 def _stripe(rng: Rng) -> tuple[Material, Rng, int]:
-    skin, cell = printed(rng, "sign")
+    skin, cell = pick_print(rng, "sign")
     return skin, rng, cell

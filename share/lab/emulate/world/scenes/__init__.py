@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from share.lab.emulate.world.scenes.table import SCENES, Scene, layout
+from share.lab.emulate.world.scenes.registry import SCENES, SceneEntry, make_scene_layout
 
-__all__ = ["SCENES", "Scene", "layout"]
+__all__ = ["SCENES", "SceneEntry", "make_scene_layout"]

@@ -2,7 +2,7 @@
 
 The whole is a ring: the corridors run along x on both sides of the core, short passages join them at
 both ends. The south corridor is the north one turned by half a turn about the room's middle, so whoever
-walks round the ring sees the same twice; only what `_differences` adds tells them apart. The passages
+walks round the ring sees the same twice; only what `_add_differences` adds tells them apart. The passages
 differ.
 """
 
@@ -15,26 +15,26 @@ import numpy as np
 from share.lab.emulate.world.furniture import barrels, doors, hoses, lockers, pipes, shelving, signs, tables
 from share.lab.emulate.world.layout import Layout, Light, Piece
 from share.lab.emulate.world.materials import Material
-from share.lab.emulate.world.mesh import Shape, concat, decal, quad
+from share.lab.emulate.world.mesh import Shape, concat_shapes, decal, quad
 from share.lab.emulate.world.scenes import fill
-from share.lab.emulate.world.scenes.fill import Maker
-from share.lab.emulate.world.scenes.plan import Plan, Size, Wall, Walls, outer_walls
-from share.lab.emulate.world.scenes.shell import skirting, surface
+from share.lab.emulate.world.scenes.fill import ShapeMaker
+from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Size, Wall, Walls, outer_walls
+from share.lab.emulate.world.scenes.shell import add_skirting, wall_surface
 from share.types import F64
 
 
-def widths(size: Size) -> tuple[float, float]:
+def corridor_widths(size: Size) -> tuple[float, float]:
     """Of the corridors and of the passages at their ends, m."""
     return min(2.6, 0.37 * size[1]), min(2.8, 0.27 * size[0])
 
 
-def twins(size: Size) -> tuple[F64, F64, F64]:
+def twin_corridors(size: Size) -> tuple[F64, F64, F64]:
     """The two areas that look alike, and how they correspond: lower and upper corner (2, 2) m of the
     north and of the south corridor, and T_south_north (4, 4), which takes the one to the other."""
     x, y, _ = size
-    wide, end = widths(size)
-    north = np.array([(end, y - wide), (x - end, y)])
-    south = np.array([(end, 0), (x - end, wide)])
+    width, end = corridor_widths(size)
+    north = np.array([(end, y - width), (x - end, y)])
+    south = np.array([(end, 0), (x - end, width)])
     T = np.diag([-1.0, -1.0, 1.0, 1.0])
     T[:2, 3] = x, y
     return north, south, T
@@ -43,26 +43,28 @@ def twins(size: Size) -> tuple[F64, F64, F64]:
 def corridor_twins(seed: int, size: Size) -> Layout:
     """One corridor is furnished, then copied; the passages get furniture of their own."""
     rng = np.random.default_rng([seed, 14])
-    plan = Plan("corridor-twins", seed, size, rng)
-    _, _, T = twins(size)
+    plan = LayoutBuilder("corridor-twins", seed, size, rng)
+    _, _, T = twin_corridors(size)
     walls, inner = outer_walls(size), _core(size)
-    _shell(plan, walls, inner)
-    _threshold(plan)
-    made, lit = len(plan.pieces), len(plan.lights)
-    _corridor(plan, walls[0], inner[0])
-    plan.pieces += [_turned(p, T, len(plan.pieces) + k) for k, p in enumerate(plan.pieces[made:])]
-    plan.taken += [_turned_box(b, T) for b in plan.taken]
-    plan.lights += [_turned_light(light, T) for light in plan.lights[lit:]]
+    _build_shell(plan, walls, inner)
+    _add_thresholds(plan)
+    first_piece, first_light = len(plan.pieces), len(plan.lights)
+    _furnish_corridor(plan, walls[0], inner[0])
+    plan.pieces += [
+        _turned_piece(p, T, len(plan.pieces) + k) for k, p in enumerate(plan.pieces[first_piece:])
+    ]
+    plan.occupied_boxes += [_turned_box(b, T) for b in plan.occupied_boxes]
+    plan.lights += [_turned_light(light, T) for light in plan.lights[first_light:]]
     for outer, core in ((walls[1], inner[1]), (walls[3], inner[3])):
-        _passage(plan, outer, core)
-    _differences(plan, inner)
-    return plan.done(ambient=0.3)
+        _furnish_passage(plan, outer, core)
+    _add_differences(plan, inner)
+    return plan.to_layout(ambient=0.3)
 
 
 def _core(size: Size) -> Walls:
     """The walls of the core, seen from outside it: north, east, south, west."""
     x, y, z = size
-    wide, end = widths(size)
+    wide, end = corridor_widths(size)
     (west, south), (east, north) = (end, wide), (x - end, y - wide)
     return (
         Wall(east, north, np.pi, east - west, z),
@@ -72,67 +74,69 @@ def _core(size: Size) -> Walls:
     )
 
 
-def _shell(plan: Plan, outer: Walls, inner: Walls) -> None:
+def _build_shell(plan: LayoutBuilder, outer: Walls, inner: Walls) -> None:
     """One half of walls, floor and ceiling, and the same turned: nothing tells one half from the other."""
-    rng, (x, y, z), T = plan.rng, plan.size, twins(plan.size)[2]
+    rng, (x, y, z), T = plan.rng, plan.size, twin_corridors(plan.size)[2]
     paint = [(z, Material("plaster"))]
     floor = Material(str(rng.choice(["tiles", "planks", "carpet"])))
-    half = [surface(wall, paint, rng) for wall in outer[:2]]
+    half = [wall_surface(wall, paint, rng) for wall in outer[:2]]
     half.append(quad((0, y / 2, 0), (x, 0, 0), (0, y / 2, 0), floor, rng))
     half.append(quad((0, y, z), (x, 0, 0), (0, -y / 2, 0), Material("ceiling"), rng))
     for shape in half:
-        plan.build("shell", shape)
-        plan.build("shell", shape.moved(T))
-    sides = [surface(wall, paint, rng) for wall in inner[:2]]
-    plan.build("core", concat([*sides, *(s.moved(T) for s in sides), *_caps(plan)]))
-    skirting(plan, (*outer, *inner))
+        plan.add_to_shell("shell", shape)
+        plan.add_to_shell("shell", shape.transformed(T))
+    sides = [wall_surface(wall, paint, rng) for wall in inner[:2]]
+    plan.add_to_shell("core", concat_shapes([*sides, *(s.transformed(T) for s in sides), *_core_caps(plan)]))
+    add_skirting(plan, (*outer, *inner))
 
 
-def _caps(plan: Plan) -> list[Shape]:
+def _core_caps(plan: LayoutBuilder) -> list[Shape]:
     """Bottom and top of the core: nobody sees them, but with them it is closed, hence solid."""
-    (x, y, z), (wide, end) = plan.size, widths(plan.size)
+    (x, y, z), (wide, end) = plan.size, corridor_widths(plan.size)
     skin, long, short = Material("plaster"), (x - 2 * end, 0, 0), (0, y - 2 * wide, 0)
     return [quad((end, wide, z), long, short, skin), quad((end, wide, 0), short, long, skin)]
 
 
-def _threshold(plan: Plan) -> None:
+def _add_thresholds(plan: LayoutBuilder) -> None:
     """A metal strip in the floor of each passage, where the halves meet."""
-    (x, y, _), (_, end) = plan.size, widths(plan.size)
+    (x, y, _), (_, end) = plan.size, corridor_widths(plan.size)
     for left in (0.0, x - end):
-        strip = decal((left, y / 2 - 0.02, 0), (end, 0, 0), (0, 0.04, 0), Material("galvanised"), proud=0.002)
-        plan.lay("threshold", strip)
+        strip = decal(
+            (left, y / 2 - 0.02, 0), (end, 0, 0), (0, 0.04, 0), Material("galvanised"), offset=0.002
+        )
+        plan.add_unchecked("threshold", strip)
 
 
-def _corridor(plan: Plan, outer: Wall, inner: Wall) -> None:
+def _furnish_corridor(plan: LayoutBuilder, outer: Wall, inner: Wall) -> None:
     """Doors every 3 m on both sides, lamps, furniture along the outer wall."""
-    rng, (wide, end) = plan.rng, widths(plan.size)
+    rng, (wide, end) = plan.rng, corridor_widths(plan.size)
     length = inner.length
     count = max(2, int(length / 3.2))
     for k in range(count):
         at = length * (k + 0.5) / count
         if rng.random() < 0.8:
-            fill.centred(plan, outer, "door", doors.door(rng), end + at, 0.6)
+            fill.place_centred(plan, outer, "door", doors.door(rng), end + at, 0.6)
         if rng.random() < 0.5:
-            fill.centred(plan, inner, "door", doors.door(rng), at, 0.6)
+            fill.place_centred(plan, inner, "door", doors.door(rng), at, 0.6)
     strip = replace(outer, x=end, length=length)
-    fill.along(plan, strip, _FURNITURE, (0.3, 1.8))
+    fill.furnish_wall(plan, strip, _FURNITURE, (0.3, 1.8))
     for wall in (strip, inner):
-        fill.hang(plan, wall, _HANGINGS, int(0.9 * length), 2.0)
+        fill.hang_on_wall(plan, wall, _HANGINGS, int(0.9 * length), 2.0)
     xs = [end + length * (k + 0.5) / count for k in range(count)]
     fill.light_tubes(plan, xs, [plan.size[1] - wide / 2], 1.2, 0.0)
 
 
-_FURNITURE: dict[str, tuple[float, Maker]] = {
+_FURNITURE: dict[str, tuple[float, ShapeMaker]] = {
     "cupboard": (2, lambda r: shelving.cupboard(r, r.uniform(0.7, 1.2), 0.34, r.uniform(1.1, 1.9))),
     "bench": (2, lambda r: tables.bench(r, 1.3)),
     "chair": (2, tables.chair),
     "lockers": (1, lambda r: lockers.lockers(r, 3)),
     "radiator": (2, lambda r: pipes.radiator(r, 1.0)),
     "extinguisher": (1, hoses.extinguisher),
-    "bin": (1, barrels.bin_),
+    "bin": (1, barrels.waste_bin),
 }
 
-_HANGINGS: dict[str, tuple[float, Maker]] = {
+_HANGINGS: dict[str, tuple[float, ShapeMaker]] = {
     "poster": (3, signs.poster),
     "notice": (3, signs.notice),
     "sign": (2, signs.sign),
@@ -140,29 +144,31 @@ _HANGINGS: dict[str, tuple[float, Maker]] = {
 }
 
 
-def _passage(plan: Plan, outer: Wall, core: Wall) -> None:
+def _furnish_passage(plan: LayoutBuilder, outer: Wall, core: Wall) -> None:
     """An end of the ring: a window or a door, furniture of its own, a lamp."""
     rng = plan.rng
     if rng.random() < 0.5:
-        fill.daylight(plan, outer, outer.length / 2, 1.0, doors.window(rng, 1.5, 1.1), rng.uniform(0.2, 0.4))
+        fill.add_window(
+            plan, outer, outer.length / 2, 1.0, doors.window(rng, 1.5, 1.1), rng.uniform(0.2, 0.4)
+        )
     else:
-        fill.centred(plan, outer, "door", doors.door(rng), outer.length / 2, 0.8)
-    fill.along(plan, outer, _FURNITURE, (0.4, 1.6))
+        fill.place_centred(plan, outer, "door", doors.door(rng), outer.length / 2, 0.8)
+    fill.furnish_wall(plan, outer, _FURNITURE, (0.4, 1.6))
     for wall in (outer, core):
-        fill.hang(plan, wall, _HANGINGS, int(wall.length), 2.0)
-    x, y = outer.point(outer.length / 2, widths(plan.size)[1] / 2)
+        fill.hang_on_wall(plan, wall, _HANGINGS, int(wall.length), 2.0)
+    x, y = outer.point_before(outer.length / 2, corridor_widths(plan.size)[1] / 2)
     fill.light_tubes(plan, [x], [y], 1.2, 0.0)
 
 
-def _differences(plan: Plan, inner: Walls) -> None:
+def _add_differences(plan: LayoutBuilder, inner: Walls) -> None:
     """One small thing more on each side, so that the truth can be told by looking closely."""
     for wall in (inner[0], inner[2]):
-        fill.hang(plan, wall, {"notice": (1, signs.notice)}, 1, 1.7)
+        fill.hang_on_wall(plan, wall, {"notice": (1, signs.notice)}, 1, 1.7)
 
 
-def _turned(piece: Piece, T: F64, number: int) -> Piece:
+def _turned_piece(piece: Piece, T: F64, number: int) -> Piece:
     name = piece.name.rsplit(" ", 1)[0]
-    return Piece(f"{name} {number}", piece.shape.moved(T), piece.solid)
+    return Piece(f"{name} {number}", piece.shape.transformed(T), piece.solid)
 
 
 def _turned_box(box: F64, T: F64) -> F64:

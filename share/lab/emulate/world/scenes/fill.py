@@ -10,146 +10,170 @@ from share.lab.emulate.world.furniture import lamps, pipes
 from share.lab.emulate.world.layout import Light
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import Rng, Shape, box, decal
-from share.lab.emulate.world.scenes.plan import Plan, Wall
+from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Wall
 
-Maker = Callable[[Rng], Shape]
+ShapeMaker = Callable[[Rng], Shape]
 
-_STEP = 0.1  # m; how far something is moved on that finds no place
+_SEARCH_STEP_M = 0.1  # m; how far something is moved on that finds no place
 
 
-def choose(rng: Rng, weights: Mapping[str, float]) -> str:
+def choose_weighted(rng: Rng, weights: Mapping[str, float]) -> str:
     """One of the names, by weight."""
     share = np.array(list(weights.values()))
     return str(rng.choice(list(weights), p=share / share.sum()))
 
 
-def along(
-    plan: Plan,
+def furnish_wall(
+    plan: LayoutBuilder,
     wall: Wall,
-    makers: Mapping[str, tuple[float, Maker]],
+    makers: Mapping[str, tuple[float, ShapeMaker]],
     gaps: tuple[float, float],
-    until: float = 1.0,
+    end_share: float = 1.0,
 ) -> None:
     """Things with their backs to a wall, from left to right, with gaps (low, high) m between them, as
-    far as a share `until` of it. makers: by name, how often and how it is made."""
+    far as a share `end_share` of it. makers: by name, how often and how it is made."""
     rng, weights = plan.rng, {name: weight for name, (weight, _) in makers.items()}
-    at = rng.uniform(*gaps)
-    while at < until * wall.length - 0.3:
-        name = choose(rng, weights)
-        wide = place(plan, wall, name, makers[name][1](rng), at)
-        at += wide + rng.uniform(*gaps) if wide else 0.3
+    position = rng.uniform(*gaps)
+    while position < end_share * wall.length - 0.3:
+        name = choose_weighted(rng, weights)
+        width = place_on_wall(plan, wall, name, makers[name][1](rng), position)
+        position += width + rng.uniform(*gaps) if width else 0.3
 
 
-def place(plan: Plan, wall: Wall, name: str, shape: Shape, left: float, reach: float = 1.0) -> float:
-    """Put something at the first free place at or after `left` m, within `reach`; how far it reaches
+def place_on_wall(
+    plan: LayoutBuilder, wall: Wall, name: str, shape: Shape, left: float, search_m: float = 1.0
+) -> float:
+    """Put something at the first free place at or after `left` m, within `search_m`; how far it reaches
     from `left`, or 0 if there was none."""
-    wide = float(shape.bounds[1, 0] - shape.bounds[0, 0])
-    for shift in np.arange(0, reach, _STEP):
+    wide = float(shape.bounding_box[1, 0] - shape.bounding_box[0, 0])
+    for shift in np.arange(0, search_m, _SEARCH_STEP_M):
         if left + shift + wide > wall.length:
             return 0.0
-        middle = left + shift - float(shape.bounds[0, 0])
-        if plan.add(name, wall.put(shape, middle)):
+        middle = left + shift - float(shape.bounding_box[0, 0])
+        if plan.add_if_free(name, wall.place(shape, middle)):
             return wide + float(shift)
     return 0.0
 
 
-def centred(plan: Plan, wall: Wall, name: str, shape: Shape, at: float, clear: float = 0.0) -> bool:
+def place_centred(
+    plan: LayoutBuilder, wall: Wall, name: str, shape: Shape, position: float, clear: float = 0.0
+) -> bool:
     """Put something at a place along a wall, and keep `clear` m before it free of furniture."""
-    moved = wall.put(shape, at)
-    if not plan.add(name, moved):
+    moved = wall.place(shape, position)
+    if not plan.add_if_free(name, moved):
         return False
     if clear:
-        _, wide = shape.bounds[:, 0]
-        plan.reserve(wall.put(_keep(float(wide), clear), at).bounds)
+        _, wide = shape.bounding_box[:, 0]
+        plan.reserve(wall.place(_reserved_box(float(wide), clear), position).bounding_box)
     return True
 
 
-def _keep(half: float, clear: float) -> Shape:
+def _reserved_box(half: float, clear: float) -> Shape:
     """The place before something `half` m to each side of its middle."""
     return box((-half, -clear - 0.4, 0), (half, -0.4, 2.0), Material("paint"))
 
 
-def hang(plan: Plan, wall: Wall, makers: Mapping[str, tuple[float, Maker]], count: int, top: float) -> None:
+def hang_on_wall(
+    plan: LayoutBuilder, wall: Wall, makers: Mapping[str, tuple[float, ShapeMaker]], count: int, top: float
+) -> None:
     """`count` things on the free parts of a wall, their middles between 1.2 and `top` m; what finds no
     place in a few tries is left out."""
     rng, weights = plan.rng, {name: weight for name, (weight, _) in makers.items()}
     for _ in range(count):
-        name = choose(rng, weights)
+        name = choose_weighted(rng, weights)
         shape = makers[name][1](rng)
-        tall, wide = float(shape.bounds[1, 2]), float(shape.bounds[1, 0])
+        tall, wide = float(shape.bounding_box[1, 2]), float(shape.bounding_box[1, 0])
         if 2 * wide + 0.1 > wall.length:
             continue
         for _try in range(8):
             z = rng.uniform(1.2, max(top, 1.3)) - tall / 2
-            at = rng.uniform(wide + 0.05, wall.length - wide - 0.05)
-            if plan.add(name, wall.put(shape, at, z)):
+            position = rng.uniform(wide + 0.05, wall.length - wide - 0.05)
+            if plan.add_if_free(name, wall.place(shape, position, z)):
                 break
 
 
-def light_tubes(plan: Plan, xs: Sequence[float], ys: Sequence[float], length: float, drop: float) -> None:
+def light_tubes(
+    plan: LayoutBuilder, xs: Sequence[float], ys: Sequence[float], length: float, drop: float
+) -> None:
     """Fluorescent lamps along x at a grid of places; each a little brighter or darker, a few dead."""
     z, rng = plan.size[2], plan.rng
     for x in xs:
         for y in ys:
-            if plan.add("lamp", lamps.tube_lamp(rng, length, drop).at(x, y, z), solid=False):
+            if plan.add_if_free("lamp", lamps.tube_lamp(rng, length, drop).placed_at(x, y, z), solid=False):
                 power = rng.uniform(0.7, 1.3)
-                plan.lights.append(lamps.tube_light(x, y, z, length, drop, power, turned=False))
+                plan.lights.append(lamps.tube_light(x, y, z, length, drop, power, along_y=False))
 
 
-def light_bells(plan: Plan, xs: Sequence[float], ys: Sequence[float], drop: float) -> None:
+def light_bells(plan: LayoutBuilder, xs: Sequence[float], ys: Sequence[float], drop: float) -> None:
     """High-bay lamps at a grid of places."""
     z, rng = plan.size[2], plan.rng
     for x in xs:
         for y in ys:
-            if plan.add("lamp", lamps.bell(rng, drop).at(x, y, z), solid=False):
-                plan.lights.append(lamps.bell_light(x, y, z, drop, rng.uniform(0.7, 1.3)))
+            if plan.add_if_free("lamp", lamps.high_bay_lamp(rng, drop).placed_at(x, y, z), solid=False):
+                plan.lights.append(lamps.high_bay_light(x, y, z, drop, rng.uniform(0.7, 1.3)))
 
 
-def daylight(plan: Plan, wall: Wall, at: float, low: float, shape: Shape, power: float) -> bool:
-    """A window on a wall, its sill `low` m up, and the light that falls through it."""
-    if not plan.add("window", wall.put(shape, at, low)):
+def add_window(
+    plan: LayoutBuilder, wall: Wall, position: float, sill: float, shape: Shape, power: float
+) -> bool:
+    """A window on a wall, its sill `sill` m up, and the light that falls through it."""
+    if not plan.add_if_free("window", wall.place(shape, position, sill)):
         return False
-    width, height = float(np.ptp(shape.bounds[:, 0])), float(np.ptp(shape.bounds[:, 2]))
+    width, height = float(np.ptp(shape.bounding_box[:, 0])), float(np.ptp(shape.bounding_box[:, 2]))
     c, s = float(np.cos(wall.yaw)), float(np.sin(wall.yaw))
-    middle = (*wall.point(at, 0.12), low + height / 2)
+    middle = (*wall.point_before(position, 0.12), sill + height / 2)
     plan.lights.append(Light(middle, power, (width, height), (s, -c, 0.0)))
     return True
 
 
-def overhead(plan: Plan, count: int) -> None:
+def add_overhead_pipes(plan: LayoutBuilder, count: int) -> None:
     """Pipes and ducts along y under the ceiling, between girders and lamps, where there is room."""
     x, y, z = plan.size
     for _ in range(count):
         length = plan.rng.uniform(0.5, 0.97) * y
         if plan.rng.random() < 0.6:
-            shape, tall = pipes.run(plan.rng, length, int(plan.rng.integers(1, 4))), 0.45
+            shape, tall = pipes.pipe_run(plan.rng, length, int(plan.rng.integers(1, 4))), 0.45
         else:
             shape, tall = pipes.duct(plan.rng, length), 0.5
         for _try in range(12):
             at = plan.rng.uniform(0.1, x - 0.5), plan.rng.uniform(length / 2, y - length / 2)
-            if plan.add("pipes", shape.at(*at, z - tall, np.pi / 2), solid=False):
+            if plan.add_if_free("pipes", shape.placed_at(*at, z - tall, np.pi / 2), solid=False):
                 break
 
 
-def line(plan: Plan, start: tuple[float, float], end: tuple[float, float], wide: float = 0.08) -> None:
+def paint_line(
+    plan: LayoutBuilder, start: tuple[float, float], end: tuple[float, float], line_width: float = 0.08
+) -> None:
     """A painted line on the floor, along x or along y; those along y lie above those along x."""
     (x0, y0), (x1, y1) = start, end
     skin = Material("marking", int(plan.rng.integers(2)))
     if y0 == y1:
         shape = decal(
-            (min(x0, x1), y0 - wide / 2, 0), (abs(x1 - x0), 0, 0), (0, wide, 0), skin, plan.rng, proud=0.003
+            (min(x0, x1), y0 - line_width / 2, 0),
+            (abs(x1 - x0), 0, 0),
+            (0, line_width, 0),
+            skin,
+            plan.rng,
+            offset=0.003,
         )
     else:
         shape = decal(
-            (x0 - wide / 2, min(y0, y1), 0), (wide, 0, 0), (0, abs(y1 - y0), 0), skin, plan.rng, proud=0.004
+            (x0 - line_width / 2, min(y0, y1), 0),
+            (line_width, 0, 0),
+            (0, abs(y1 - y0), 0),
+            skin,
+            plan.rng,
+            offset=0.004,
         )
-    plan.lay("line", shape)
+    plan.add_unchecked("line", shape)
 
 
-def frame(plan: Plan, low: tuple[float, float], high: tuple[float, float], wide: float = 0.08) -> None:
+def paint_rectangle(
+    plan: LayoutBuilder, low: tuple[float, float], high: tuple[float, float], line_width: float = 0.08
+) -> None:
     """A rectangle of painted lines."""
     (x0, y0), (x1, y1) = low, high
     for y in (y0, y1):
-        line(plan, (x0, y), (x1, y), wide)
+        paint_line(plan, (x0, y), (x1, y), line_width)
     for x in (x0, x1):
-        line(plan, (x, y0), (x, y1), wide)
+        paint_line(plan, (x, y0), (x, y1), line_width)

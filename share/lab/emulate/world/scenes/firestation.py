@@ -20,98 +20,100 @@ from share.lab.emulate.world.furniture import (
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.scenes import fill, floor
-from share.lab.emulate.world.scenes.fill import Maker
-from share.lab.emulate.world.scenes.plan import Plan, Size, Wall, outer_walls
-from share.lab.emulate.world.scenes.shell import enclose, joints, skirting
+from share.lab.emulate.world.scenes.fill import ShapeMaker
+from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Size, Wall, outer_walls
+from share.lab.emulate.world.scenes.shell import add_floor_joints, add_skirting, build_enclosure
 
-_AISLE = 1.75  # m; round the vehicles
-_WALK = 0.3  # of the floor, at least, is left to walk on
+_AISLE_M = 1.75  # m; round the vehicles
+_MIN_WALKABLE = 0.3  # of the floor, at least, is left to walk on
 
 
 def firestation(seed: int, size: Size) -> Layout:
     """Vehicles that look at the roller doors of the east wall; gear along the other walls."""
     rng = np.random.default_rng([seed, 12])
-    plan = Plan("firestation", seed, size, rng)
+    plan = LayoutBuilder("firestation", seed, size, rng)
     walls = outer_walls(size)
-    _shell(plan, walls)
-    lanes = _lanes(size)
-    _doors(plan, walls[1], lanes)
-    _vehicles(plan, lanes)
-    fill.centred(plan, walls[3], "door", doors.door(rng), rng.uniform(1.2, size[1] - 1.2), 1.2)
+    _build_shell(plan, walls)
+    lanes = _lane_positions(size)
+    _add_doors(plan, walls[1], lanes)
+    _add_vehicles(plan, lanes)
+    fill.place_centred(plan, walls[3], "door", doors.door(rng), rng.uniform(1.2, size[1] - 1.2), 1.2)
     for wall in (walls[0], walls[2], walls[3]):
-        fill.along(plan, wall, _GEAR, (0.4, 1.7))
-        fill.hang(plan, wall, _HANGINGS, max(1, int(0.45 * wall.length)), 2.4)
-    _light(plan, walls)
-    floor.clear(plan, _WALK, _GEAR)
-    return plan.done(ambient=0.3)
+        fill.furnish_wall(plan, wall, _GEAR, (0.4, 1.7))
+        fill.hang_on_wall(plan, wall, _HANGINGS, max(1, int(0.45 * wall.length)), 2.4)
+    _add_lights(plan, walls)
+    floor.clear_floor(plan, _MIN_WALKABLE, _GEAR)
+    return plan.to_layout(ambient=0.3)
 
 
-def _shell(plan: Plan, walls: tuple[Wall, ...]) -> None:
+def _build_shell(plan: LayoutBuilder, walls: tuple[Wall, ...]) -> None:
     """Paint, darker up to the height of a shoulder; a smooth floor."""
     rng = plan.rng
     dado = Material("paint", 0, gray=float(rng.uniform(85, 125)))
     wall = Material("paint", 1, gray=float(rng.uniform(145, 170)))
     floor = Material("screed", 0, gray=float(rng.uniform(100, 135)), contrast=0.65)
-    enclose(
+    build_enclosure(
         plan, [(rng.uniform(1.1, 1.5), dado), (plan.size[2], wall)], floor, Material("paint", 0, gray=165)
     )
-    joints(plan)
-    skirting(plan, walls)
+    add_floor_joints(plan)
+    add_skirting(plan, walls)
 
 
-def _lanes(size: Size) -> list[float]:
+def _lane_positions(size: Size) -> list[float]:
     """The y of each vehicle's middle."""
     count = max(1, min(4, int((size[1] - 1.5) / 3.7)))
     return [size[1] * (k + 0.5) / count for k in range(count)]
 
 
-def _doors(plan: Plan, wall: Wall, lanes: list[float]) -> None:
+def _add_doors(plan: LayoutBuilder, wall: Wall, lanes: list[float]) -> None:
     height = min(3.0, plan.size[2] - 0.6)
     for y in lanes:
         width = min(2.9, wall.length / len(lanes) - 0.6)
-        fill.centred(plan, wall, "roller door", doors.roller(plan.rng, width, height), wall.length - y, 1.0)
+        fill.place_centred(
+            plan, wall, "roller door", doors.roller_door(plan.rng, width, height), wall.length - y, 1.0
+        )
 
 
-def _vehicles(plan: Plan, lanes: list[float]) -> None:
+def _add_vehicles(plan: LayoutBuilder, lanes: list[float]) -> None:
     """One a lane; the first always, in large halls a lane may be empty."""
     x, rng = plan.size[0], plan.rng
     for k, y in enumerate(lanes):
         if k and rng.random() < 0.25:
             continue
-        room = x - 2 * _AISLE - 0.9
+        room = x - 2 * _AISLE_M - 0.9
         if room > 5.5 and (k == 0 or rng.random() < 0.5):
             name, shape = "fire engine", vehicles.fire_engine(rng, min(rng.uniform(5.6, 7.2), room))
         elif rng.random() < 0.5:
             name, shape = "fire engine", vehicles.fire_engine(rng, min(rng.uniform(3.9, 4.3), room), 1.85)
         else:
             name, shape = "van", vehicles.van(rng, min(rng.uniform(3.9, 4.4), room))
-        length = float(np.ptp(shape.bounds[:, 1]))
+        length = float(np.ptp(shape.bounding_box[:, 1]))
         rear = (x - length) / 2 + rng.uniform(-0.15, 0.15)
         at = y + rng.uniform(-0.15, 0.15)
-        plan.add(name, shape.at(rear, at, 0, np.pi / 2))
-        half = float(shape.bounds[1, 0]) + 0.25
+        plan.add_if_free(name, shape.placed_at(rear, at, 0, np.pi / 2))
+        half = float(shape.bounding_box[1, 0]) + 0.25
         for side in (-half, half):
-            fill.line(plan, (rear - 0.3, at + side), (rear + length + 0.3, at + side), 0.1)
+            fill.paint_line(plan, (rear - 0.3, at + side), (rear + length + 0.3, at + side), 0.1)
 
 
-_GEAR: dict[str, tuple[float, Maker]] = {
+_GEAR: dict[str, tuple[float, ShapeMaker]] = {
     "lockers": (2, lambda r: lockers.lockers(r, int(r.integers(2, 6)))),
-    "gear": (2, lambda r: lockers.rail(r, int(r.integers(2, 5)))),
-    "hose rack": (1.5, lambda r: hoses.rack(r, r.uniform(1.3, 2.0), int(r.integers(2, 4)))),
-    "hoses": (1, lambda r: hoses.drying(r, int(r.integers(2, 5)), r.uniform(1.7, 2.2))),
-    "hose reel": (1, hoses.reel),
+    "gear": (2, lambda r: lockers.cloakroom(r, int(r.integers(2, 5)))),
+    "hose rack": (1.5, lambda r: hoses.hose_rack(r, r.uniform(1.3, 2.0), int(r.integers(2, 4)))),
+    "hoses": (1, lambda r: hoses.drying_hoses(r, int(r.integers(2, 5)), r.uniform(1.7, 2.2))),
+    "hose reel": (1, hoses.hose_reel),
     "bench": (1, lambda r: tables.bench(r, r.uniform(1.2, 2.0))),
     "extinguisher": (1, hoses.extinguisher),
     "workbench": (0.5, lambda r: tables.workbench(r, r.uniform(1.3, 1.8))),
     "cupboard": (0.3, lambda r: shelving.cupboard(r, 1.0, 0.36, 1.8)),
     "tool box": (0.5, small.tool_box),
-    "ladder": (0.5, lambda r: ladders.leaning(r, 2.0)),
+    "ladder": (0.5, lambda r: ladders.leaning_ladder(r, 2.0)),
     "cones": (0.7, small.cones),
     "radiator": (1, lambda r: pipes.radiator(r, r.uniform(0.8, 1.5))),
-    "bin": (0.5, barrels.bin_),
+    "bin": (0.5, barrels.waste_bin),
 }
 
-_HANGINGS: dict[str, tuple[float, Maker]] = {
+_HANGINGS: dict[str, tuple[float, ShapeMaker]] = {
     "sign": (2, signs.sign),
     "notice": (2, signs.notice),
     "pin board": (0.5, signs.pin_board),
@@ -119,7 +121,7 @@ _HANGINGS: dict[str, tuple[float, Maker]] = {
 }
 
 
-def _light(plan: Plan, walls: tuple[Wall, ...]) -> None:
+def _add_lights(plan: LayoutBuilder, walls: tuple[Wall, ...]) -> None:
     x, y, z = plan.size
     columns, rows, rng = max(2, round(x / 3.5)), max(2, round(y / 3.5)), plan.rng
     xs, ys = ([n * (k + 0.5) / c for k in range(c)] for n, c in ((x, columns), (y, rows)))
@@ -128,4 +130,4 @@ def _light(plan: Plan, walls: tuple[Wall, ...]) -> None:
         for k in range(int(wall.length / 3)):
             if rng.random() < 0.5:
                 shape = doors.window(rng, 1.6, 0.7)
-                fill.daylight(plan, wall, 1.5 + 3 * k, z - 1.15, shape, rng.uniform(0.5, 1.3))
+                fill.add_window(plan, wall, 1.5 + 3 * k, z - 1.15, shape, rng.uniform(0.5, 1.3))

@@ -1,0 +1,50 @@
+"""realsense[:SERIAL] to a feed of its samples, and to a SOURCE."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from share.cameras.feed import CameraFeed
+from share.cameras.live import MAX_WAITING_FRAMES, LiveSource
+from share.cameras.realsense.camera import RealSenseCamera
+from share.cameras.realsense.devices import parse_serial
+from share.cameras.realsense.streams import StreamRequest
+from share.cameras.sample_queue import NewestImageQueue, SampleQueue
+from share.config import SequencerConfig
+from share.recordings.calibration import Calibration
+from share.sensors.measurement import CAM0
+
+
+def make_feed(
+    spec: str,
+    request: StreamRequest,
+    config: SequencerConfig,
+    notify: Callable[[str], None],
+    queue: SampleQueue,
+) -> CameraFeed:
+    """What the camera delivers. It is not opened yet."""
+    return CameraFeed(
+        lambda serial, epoch: RealSenseCamera(request, serial, epoch=epoch, notify=notify),
+        parse_serial(spec),
+        request.rates_hz(),
+        config.max_jump_s,
+        notify,
+        queue,
+    )
+
+
+def open_live(
+    spec: str,
+    request: StreamRequest,
+    config: SequencerConfig,
+    notify: Callable[[str], None],
+    calibration: Calibration | None = None,
+) -> LiveSource:
+    """The camera as a source, with the factory's calibration or another.
+
+    Raises UsageError, ShareError, DataError.
+    """
+    rates = request.rates_hz()
+    queue = NewestImageQueue(MAX_WAITING_FRAMES * len(request.cameras))
+    feed = make_feed(spec, request, config, notify, queue)
+    return LiveSource(feed, rates[CAM0], calibration, request.imu_range())

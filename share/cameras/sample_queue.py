@@ -1,0 +1,113 @@
+"""Samples from a device's threads to the one that writes or tracks them: bounded, and nobody waits."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
+
+
+class SampleQueue:
+    """Policy `drop_new_image`: an image that finds the queue full is left out, with its partner of the same
+    stamp. Samples of the IMU are small, and left out only where `max_imu_samples` of them wait. `dropped`
+    counts by stream."""
+
+    def __init__(self, max_images: int = 60, max_imu_samples: int = 20_000) -> None:
+        self.dropped: dict[str, int] = {}
+        self._max_images, self._max_imu_samples = max_images, max_imu_samples
+        self._samples: deque[DeviceSample] = deque()
+        self._image_count = 0
+        self._accepted_ns = self._refused_ns = -1  # stamp of the last image that was let in, and was not
+        self._changed = threading.Condition()
+        self._is_closed = False
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    @property
+    def image_count(self) -> int:
+        """How many images wait."""
+        return self._image_count
+
+    def put(self, sample: DeviceSample) -> None:
+        """Never waits."""
+        with self._changed:
+            if self._is_closed or not self._has_room(sample):
+                self._drop(sample)
+                return
+            self._samples.append(sample)
+            self._image_count += _is_image(sample)
+            self._changed.notify()
+
+    def get(self, timeout_s: float) -> DeviceSample | None:
+        """The oldest sample; None after timeout_s, or when it is closed and empty."""
+        with self._changed:
+            if not self._samples and not self._is_closed:
+                self._changed.wait(timeout_s)
+            if not self._samples:
+                return None
+            sample = self._samples.popleft()
+            self._image_count -= _is_image(sample)
+            return sample
+
+    def close(self) -> None:
+        """Let nothing more in; what waits can still be taken."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
+    @property
+    def is_closed(self) -> bool:
+        """Nothing more is let in."""
+        return self._is_closed
+
+    @property
+    def is_drained(self) -> bool:
+        """Closed, and all taken."""
+        return self._is_closed and not self._samples
+
+    def _has_room(self, sample: DeviceSample) -> bool:
+        """Whether it is let in."""
+        if not _is_image(sample):
+            return len(self._samples) - self._image_count < self._max_imu_samples
+        return self._has_room_for_image(sample.stamp_ns)
+
+    def _has_room_for_image(self, stamp_ns: int) -> bool:
+        if stamp_ns == self._refused_ns or (
+            self._image_count >= self._max_images and stamp_ns != self._accepted_ns
+        ):
+            self._refused_ns = stamp_ns
+            return False
+        self._accepted_ns = stamp_ns
+        return True
+
+    def _drop(self, sample: DeviceSample) -> None:
+        self.dropped[sample.stream] = self.dropped.get(sample.stream, 0) + 1
+
+
+class NewestImageQueue(SampleQueue):
+    """Policy `drop_old_image`: an image that finds the queue full takes the place of the oldest, which goes
+    with its partners of the same stamp. So a tracker that is slower than its camera tracks the newest."""
+
+    def _has_room_for_image(self, stamp_ns: int) -> bool:
+        while self._image_count >= self._max_images:
+            oldest_ns = next(s.stamp_ns for s in self._samples if _is_image(s))
+            if oldest_ns == stamp_ns:  # its own partner
+                break
+            self._drop_images(oldest_ns)
+        return True
+
+    def _drop_images(self, stamp_ns: int) -> None:
+        remaining: deque[DeviceSample] = deque()
+        for sample in self._samples:
+            if _is_image(sample) and sample.stamp_ns == stamp_ns:
+                self._drop(sample)
+                self._image_count -= 1
+            else:
+                remaining.append(sample)
+        self._samples = remaining
+
+
+def _is_image(sample: DeviceSample) -> bool:
+    return sample.stream not in (ACCEL, GYRO)

@@ -1,0 +1,158 @@
+"""`share evaluate compare`: our tracker and those of others on the same recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from share.cli import options
+from share.cli.terminal import LiveLine
+from share.errors import DataError, ShareError, UsageError
+from share.lab.peer_trackers import PEERS
+
+if TYPE_CHECKING:
+    from share.lab.evaluate.peer_comparison import TrackerEntry, TrackerRow
+    from share.runtime.source import Source
+
+
+@click.command(short_help="Our tracker and those of others, on the same recordings.")
+@click.argument("sources", nargs=-1, required=True)
+@click.option(
+    "--peer",
+    "peers",
+    multiple=True,
+    metavar="NAME=PYTHON",
+    help=f"Interpreter that has {' or '.join(PEERS)}; may be repeated.  [default: the one that runs SHARE]",
+)
+@click.option(
+    "--vocabulary",
+    metavar="FILE",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="ORBvoc.txt, which ORB-SLAM3 needs and its package has not.",
+)
+@options.config
+@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
+def compare(
+    sources: tuple[str, ...],
+    peers: tuple[str, ...],
+    vocabulary: Path | None,
+    config_file: str | None,
+    out: Path,
+) -> None:
+    """Run SHARE's own tracker and those of others over the same recordings, score all by the truth, and
+    measure what they take of a processor. Each agent alone, no edge.
+
+    SOURCES are sessions, all of whose agents are run, or what `share track` takes, with a truth, stereo and
+    an IMU. Peers come from package registries, each in an environment of its own; one that is not there is
+    named and left out. In DIR: a row and a trajectory (TUM) a run, table.md, table.csv, report.html and
+    pictures. Broken off, the same command goes on where it stopped.
+
+    \b
+    Example:  python -m venv peers && peers/bin/pip install depthai==3.12.0
+              share evaluate compare room1 --peer basalt=peers/bin/python --out compared
+    """
+    settings = options.load_config(config_file)
+    from share.files.writing import writable_dir
+    from share.lab.evaluate.peer_comparison import tracker_entries
+
+    recordings = _open_recordings(sources)
+    entries, missing = tracker_entries(settings, peer_interpreters(peers), vocabulary)
+    jobs = [(name, contender) for name in recordings for contender in entries]
+    unsuitable = [(name, one) for name, one in jobs if not one.can_run(recordings[name])]
+    missing += [
+        f"{one.title} on {name}, which is {recordings[name].rig.kind}: others are run with stereo+imu"
+        for name, one in unsuitable
+    ]
+    for text in missing:
+        click.echo(f"left out: {text}", err=True)
+    writable_dir(out, "table.md", "table.csv", "report.html")
+    jobs = [job for job in jobs if job not in unsuitable]
+    rows_found, failed = _run_jobs(jobs, recordings, out)
+    if rows_found:
+        _write_report(out, rows_found, missing)
+    if failed:
+        raise ShareError(f"{failed} of {len(jobs)} runs failed; the same command runs them again")
+
+
+def _open_recordings(sources: tuple[str, ...]) -> dict[str, Source]:
+    """By name. Raises UsageError where there is no truth."""
+    from share.lab.evaluate.peer_comparison import check_truth
+    from share.runtime.source import open_source
+
+    opened = {name: open_source(path) for name, path in _named_recordings(sources)}
+    for name, source in opened.items():
+        check_truth(name, source)
+    return opened
+
+
+def _run_jobs(
+    jobs: Sequence[tuple[str, TrackerEntry]], recordings: Mapping[str, Source], out: Path
+) -> tuple[list[TrackerRow], int]:
+    """What is known, and how many failed, which is said."""
+    from share.lab.evaluate.peer_comparison import tracker_rows
+
+    live, rows_found, failed = LiveLine(), list["TrackerRow"](), 0
+    for number, (name, contender) in enumerate(jobs):
+        label = f"{number + 1} of {len(jobs)}: {name}: {contender.title}"
+        show = partial(_show_progress, live, label, recordings[name].images_count)
+        try:
+            rows_found += tracker_rows(name, recordings[name], contender, out, show)
+        except DataError as error:
+            live.print_line(f"share: {name}: {contender.title}: {error}")
+            failed += 1
+    live.end()
+    return rows_found, failed
+
+
+def _write_report(out: Path, rows_found: Sequence[TrackerRow], missing: Sequence[str]) -> None:
+    from share.files.writing import atomic_write
+    from share.lab.evaluate.html_page import html_page
+    from share.lab.evaluate.peer_report import draw_comparison, markdown, rows_csv
+
+    text = markdown(rows_found, missing)
+    atomic_write(out / "table.md", text)
+    atomic_write(out / "table.csv", rows_csv(rows_found))
+    atomic_write(
+        out / "report.html",
+        html_page("Trackers side by side", f"{text}\n{draw_comparison(out, rows_found)}", out),
+    )
+    click.echo(text)
+    click.echo(f"report: {out / 'report.html'}   tables: {out / 'table.md'}, {out / 'table.csv'}")
+
+
+def _show_progress(line: LiveLine, label: str, total: int, done: int) -> None:
+    line.write(f"{label}  {done} of {total} frames")
+
+
+def _named_recordings(sources: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+    """Name and what to open. Raises UsageError where two have one name."""
+    from share.recordings.session import is_session, read_session
+
+    named = []
+    for text in sources:
+        folder = Path(text)
+        if is_session(folder):
+            named += [
+                (f"{folder.resolve().name}/{name}", f"{text}/{name}") for name in read_session(folder).agents
+            ]
+        else:
+            named.append(("/".join(folder.resolve().parts[-2:]) if "/" in text else text, text))
+    names = [name for name, _ in named]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"two recordings are called {twice[0]}; rename a folder")
+    yield from named
+
+
+def peer_interpreters(peers: Sequence[str]) -> dict[str, Path]:
+    """By name of the peer, of texts NAME=PYTHON. Raises UsageError."""
+    interpreters = {}
+    for text in peers:
+        name, _, python = text.partition("=")
+        if name not in PEERS or not python:
+            raise UsageError(f"--peer {text}: give NAME=PYTHON, with a name of {', '.join(PEERS)}")
+        interpreters[name] = Path(python)
+    return interpreters

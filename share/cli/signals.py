@@ -1,0 +1,47 @@
+"""Signals that end a command unwind it: its children are ended, its temporary files removed."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator
+from types import FrameType
+
+_RETRY_S = 0.02
+_IMPORT_FILE = "<frozen importlib._bootstrap>"
+
+
+@contextlib.contextmanager
+def unwind_on_signal() -> Iterator[None]:
+    """Within, SIGINT raises KeyboardInterrupt, SIGTERM and SIGHUP SystemExit with the shells' exit code. One
+    that is ignored (nohup) stays so."""
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    caught = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, _unwind) for number in caught}
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def _unwind(number: int, frame: FrameType | None) -> None:
+    """Not while a module is imported, but a moment later: there some libraries make another error of it
+    (poselib: "cannot import the C++ backend"), and some places swallow it."""
+    if _is_importing(frame):
+        signal.signal(signal.SIGALRM, lambda _, later: _unwind(number, later))
+        signal.setitimer(signal.ITIMER_REAL, _RETRY_S)
+    elif number == signal.SIGINT:
+        raise KeyboardInterrupt
+    else:
+        sys.exit(128 + number)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORT_FILE:
+            return True
+        frame = frame.f_back
+    return False

@@ -1,0 +1,144 @@
+"""Corners of a target in pictures of a rig of cameras that is known, and what they tell of its pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.geometry import se3
+from share.geometry.camera import Camera
+from share.lab.calibrate.camera_bundle import BoardView, intrinsic_slices, shared_size
+from share.lab.calibrate.camera_initialisation import project_with_jacobians, transform_with_jacobian
+from share.lab.calibrate.target import Target
+from share.types import F64, I64
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """Of one camera: frame (C,) rising, points (C, 3) m on the target, px (C, 2)."""
+
+    frame: I64
+    points: F64
+    px: F64
+
+
+@dataclass(frozen=True, eq=False)
+class CornerObservations:
+    """stamps_ns (F,), camera's clock; of each camera what it is, T_cam_cam0 and its corners."""
+
+    stamps_ns: I64
+    cameras: tuple[Camera, ...]
+    mounts: tuple[F64, ...]
+    corners: tuple[Corners, ...]
+
+    def take(self, keep: np.ndarray) -> CornerObservations:
+        """Only frames of a mask (F,)."""
+        place = np.cumsum(keep) - 1
+        parts = [(one, keep[one.frame]) for one in self.corners]
+        corners = tuple(Corners(place[one.frame[k]], one.points[k], one.px[k]) for one, k in parts)
+        return CornerObservations(self.stamps_ns[keep], self.cameras, self.mounts, corners)
+
+
+def corner_observations(
+    stamps_ns: I64,
+    views: Sequence[BoardView],
+    target: Target,
+    cameras: Sequence[Camera],
+    T_cam1_cam0: F64 | None,
+) -> CornerObservations:
+    """Of views at stamps (F,). T_cam1_cam0: needed with two cameras."""
+    corners = []
+    for cam in range(len(cameras)):
+        detections = [view.detections[cam] for view in views]
+        frame = np.repeat(np.arange(len(views)), [len(one) for one in detections])
+        ids = np.concatenate([one.ids for one in detections]).astype(np.int64)
+        px = np.concatenate([one.px.reshape(-1, 2) for one in detections])
+        corners.append(Corners(frame, target.corners[ids], px))
+    mounts = (np.eye(4), T_cam1_cam0)[: len(cameras)]
+    return CornerObservations(stamps_ns, tuple(cameras), tuple(np.asarray(T) for T in mounts), tuple(corners))
+
+
+def corner_residuals(observations: CornerObservations, cam: int, T_target_cam0: F64) -> tuple[F64, F64]:
+    """Residuals (C, 2) px of a camera, seen less predicted, and the derivatives (C, 2, 6) of what is
+    predicted by eta of T_target_cam0 Exp(eta). Behind the camera it is NaN."""
+    corners, mount, points = (
+        observations.corners[cam],
+        observations.mounts[cam],
+        _points_in_cam0(observations, cam, T_target_cam0),
+    )
+    shifted = np.concatenate([se3.hat(points), np.broadcast_to(-np.eye(3), (len(points), 3, 3))], axis=2)
+    px, _, by = project_with_jacobians(observations.cameras[cam], se3.transform(mount, points))
+    return corners.px - px, by @ (mount[:3, :3] @ shifted)
+
+
+def rig_jacobian(observations: CornerObservations, cam: int, T_target_cam0: F64) -> F64:
+    """Derivatives (C, 2, S) of what `seen` predicts, by the intrinsics of each camera and, of two, xi of
+    T_cam1_cam0 Exp(xi): the order of `bundle.Solution`."""
+    points, by_mount = transform_with_jacobian(
+        observations.mounts[cam], _points_in_cam0(observations, cam, T_target_cam0)
+    )
+    _, by_intrinsics, by = project_with_jacobians(observations.cameras[cam], points)
+    out = np.zeros((len(points), 2, shared_size(observations.cameras)))
+    out[:, :, intrinsic_slices(observations.cameras)[cam]] = by_intrinsics
+    if cam == 1:
+        out[:, :, -6:] = by @ by_mount
+    return out
+
+
+def _points_in_cam0(observations: CornerObservations, cam: int, T_target_cam0: F64) -> F64:
+    """The points (C, 3) of a camera's corners."""
+    one = observations.corners[cam]
+    T = se3.inverse(T_target_cam0)[one.frame]
+    points: F64 = (T[:, :3, :3] @ one.points[..., None])[..., 0] + T[:, :3, 3]
+    return points
+
+
+@dataclass(frozen=True, eq=False)
+class PoseNormals:
+    """Normal equations of each frame's eta: H (F, 6, 6), g (F, 6); and the cost."""
+
+    H: F64
+    g: F64
+    cost: float
+
+
+def pose_normals(
+    observations: CornerObservations, T_target_cam0: F64, sigma_px: float, huber: float
+) -> PoseNormals:
+    """All corners, in units of sigma_px, with Huber's weights beyond `huber` of these."""
+    H, g, cost = np.zeros((len(T_target_cam0), 6, 6)), np.zeros((len(T_target_cam0), 6)), 0.0
+    for cam, one in enumerate(observations.corners):
+        if len(one.frame) == 0:
+            continue
+        r, J = corner_residuals(observations, cam, T_target_cam0)
+        d = np.linalg.norm(r, axis=1) / sigma_px
+        if np.isnan(d).any():
+            return PoseNormals(H, g, np.inf)
+        root = _root_weights(d, huber)[:, None] / sigma_px
+        A, b = J * root[..., None], r * root
+        first = np.flatnonzero(np.diff(one.frame, prepend=-1))
+        H[one.frame[first]] += np.add.reduceat(A.swapaxes(1, 2) @ A, first)
+        g[one.frame[first]] += np.add.reduceat((A.swapaxes(1, 2) @ b[..., None])[..., 0], first)
+        cost += float(np.where(d <= huber, d * d / 2, huber * (d - huber / 2)).sum())
+    return PoseNormals(H, g, cost)
+
+
+def rig_cross_terms(
+    observations: CornerObservations, T_target_cam0: F64, sigma_px: float, huber: float
+) -> F64:
+    """What the normal equations have between each frame's eta and the rig's own parameters, (F, 6, S), by
+    the weights of `pose_normals`."""
+    out = np.zeros((len(T_target_cam0), 6, shared_size(observations.cameras)))
+    for cam, one in enumerate(observations.corners):
+        r, J = corner_residuals(observations, cam, T_target_cam0)
+        weight = (_root_weights(np.linalg.norm(r, axis=1) / sigma_px, huber) / sigma_px) ** 2
+        crossed = J.swapaxes(1, 2) @ (rig_jacobian(observations, cam, T_target_cam0) * weight[:, None, None])
+        np.add.at(out, one.frame, crossed)
+    return out
+
+
+def _root_weights(d: F64, huber: float) -> F64:
+    """Of Huber's weights (C,) of corners that miss by d (C,) sigmas."""
+    return np.sqrt(np.minimum(1, huber / np.maximum(d, 1e-12)))

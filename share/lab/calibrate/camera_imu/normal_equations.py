@@ -1,0 +1,138 @@
+"""Normal equations of corners and IMU, segment by segment of the curve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from share.geometry import se3
+from share.lab.calibrate.camera_bundle import shared_size
+from share.lab.calibrate.camera_imu.corner_observations import (
+    CornerObservations,
+    pose_normals,
+    rig_cross_terms,
+)
+from share.lab.calibrate.camera_imu.spline import ORDER, Curve
+from share.lab.calibrate.camera_imu.state import (
+    GRAVITY,
+    KNOTS,
+    LOCAL_COLUMNS,
+    MOUNT,
+    SHARED,
+    SHIFT,
+    CameraImuState,
+    body_twist,
+)
+from share.types import F64, I64, ImuBatch
+
+_SHARED = slice(KNOTS, KNOTS + SHARED)
+
+
+@dataclass(frozen=True)
+class Sigmas:
+    """Of a corner's coordinate px, of a sample rad/s and m/s^2. huber: times px, where doubt begins."""
+
+    px: float
+    gyro: float
+    accel: float
+    huber: float = 2.5
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentNormals:
+    """Of S segments H (S, L, L) and g (S, L) by their own columns (LOCAL), and the whole cost."""
+
+    H: F64
+    g: F64
+    cost: float
+
+
+def segment_normals(
+    state: CameraImuState, observations: CornerObservations, imu: ImuBatch, sigmas: Sigmas
+) -> SegmentNormals:
+    """At a state. The cost is infinite where a corner would lie behind its camera."""
+    segments = state.curve.segments
+    out = SegmentNormals(
+        np.zeros((segments, LOCAL_COLUMNS, LOCAL_COLUMNS)), np.zeros((segments, LOCAL_COLUMNS)), 0.0
+    )
+    cost = _add_corners(out, state, observations, sigmas) + _add_imu(out, state, imu, sigmas)
+    return SegmentNormals(out.H, out.g, cost)
+
+
+def camera_poses(state: CameraImuState, stamps_ns: I64) -> F64:
+    """T_target_cam0 (F, 4, 4) at stamps (F,) of the camera's clock."""
+    spans = state.curve.locate(stamps_ns, state.shift_s)
+    return se3.from_rt(state.curve.rotation(spans).R, state.curve.position(spans)[0]) @ state.T_imu_cam0
+
+
+def pose_derivatives(state: CameraImuState, stamps_ns: I64) -> tuple[F64, F64, I64]:
+    """T_target_cam0 (F, 4, 4), its eta by local columns (F, 6, LOCAL), and the segments (F,)."""
+    curve, spans = state.curve, state.curve.locate(stamps_ns, state.shift_s)
+    rotation, (p, weight) = curve.rotation(spans), curve.position(spans)
+    J = np.zeros((len(spans.u), 6, LOCAL_COLUMNS))
+    knots = J[..., :KNOTS].reshape(len(spans.u), 6, ORDER, 6)  # a view
+    knots[:, :3, :, :3] = rotation.by_knots.transpose(0, 2, 1, 3)
+    knots[:, 3:, :, 3:] = rotation.R.swapaxes(1, 2)[:, :, None] * weight[:, None, :, None]
+    J[:, :, KNOTS + SHIFT] = body_twist(rotation.R, rotation.rate, curve.position(spans, 1)[0])
+    J = se3.adjoint(se3.inverse(state.T_imu_cam0)) @ J
+    J[:, :, _SHARED][:, :, MOUNT] = np.eye(6)
+    return se3.from_rt(rotation.R, p) @ state.T_imu_cam0, J, spans.segment
+
+
+def _add_corners(
+    out: SegmentNormals, state: CameraImuState, observations: CornerObservations, sigmas: Sigmas
+) -> float:
+    T, J, segment = pose_derivatives(state, observations.stamps_ns)
+    frames = pose_normals(observations, T, sigmas.px, sigmas.huber)
+    np.add.at(out.H, segment, J.swapaxes(1, 2) @ frames.H @ J)
+    np.add.at(out.g, segment, (J.swapaxes(1, 2) @ frames.g[..., None])[..., 0])
+    return frames.cost
+
+
+def rig_gradients(state: CameraImuState, observations: CornerObservations, sigmas: Sigmas) -> F64:
+    """By how much each segment's gradient (S, LOCAL) falls with the rig's own parameters, (S, LOCAL, P):
+    intrinsics and T_cam1_cam0, which are not sought."""
+    T, J, segment = pose_derivatives(state, observations.stamps_ns)
+    out: F64 = np.zeros((state.curve.segments, LOCAL_COLUMNS, shared_size(observations.cameras)))
+    np.add.at(out, segment, J.swapaxes(1, 2) @ rig_cross_terms(observations, T, sigmas.px, sigmas.huber))
+    return out
+
+
+def inertial_residuals(state: CameraImuState, imu: ImuBatch) -> tuple[F64, F64, I64]:
+    """Residuals (N, 6) of gyro and accel, measured less predicted, the derivatives (N, 6, LOCAL) of what is
+    predicted, and the segments (N,)."""
+    curve, spans = state.curve, state.curve.locate(imu.stamps_ns)
+    rotation, (a, weight) = curve.rotation(spans), curve.position(spans, 2)
+    bias, share_after = state.bias(spans.segment, spans.u)
+    R_world_body_T = rotation.R.swapaxes(1, 2)
+    force = (R_world_body_T @ (a - state.gravity)[..., None])[..., 0]
+    J = np.zeros((len(spans.u), 6, LOCAL_COLUMNS))
+    knots = J[..., :KNOTS].reshape(len(spans.u), 6, ORDER, 6)
+    knots[:, :3, :, :3] = rotation.rate_by_knots.transpose(0, 2, 1, 3)
+    knots[:, 3:, :, :3] = (se3.hat(force)[:, None] @ rotation.by_knots).transpose(0, 2, 1, 3)
+    knots[:, 3:, :, 3:] = R_world_body_T[:, :, None] * weight[:, None, :, None]
+    J[:, 3:, _SHARED][:, :, GRAVITY] = -R_world_body_T
+    J[:, :, -12:-6] = np.eye(6) * (1 - share_after)[:, None, None]
+    J[:, :, -6:] = np.eye(6) * share_after[:, None, None]
+    predicted = np.concatenate([rotation.rate, force], axis=1) + bias
+    return np.concatenate([imu.gyro, imu.accel], axis=1) - predicted, J, spans.segment
+
+
+def _add_imu(out: SegmentNormals, state: CameraImuState, imu: ImuBatch, sigmas: Sigmas) -> float:
+    r, J, segment = inertial_residuals(state, imu)
+    sigma = np.repeat([sigmas.gyro, sigmas.accel], 3)
+    r, J = r / sigma, J / sigma[:, None]
+    ends = np.searchsorted(segment, np.arange(state.curve.segments + 1))
+    for k, (first, last) in enumerate(pairwise(ends)):
+        A = J[first:last].reshape(-1, LOCAL_COLUMNS)
+        out.H[k] += A.T @ A
+        out.g[k] += A.T @ r[first:last].reshape(-1)
+    return float((r**2).sum() / 2)
+
+
+def on_curve_mask(curve: Curve, stamps_ns: I64, shift_s: float, margin_s: float) -> np.ndarray:
+    """Which stamps (N,), shifted, lie on the curve with a margin to its ends."""
+    t = (stamps_ns - curve.start_ns) * 1e-9 + shift_s
+    return np.asarray((t >= margin_s) & (t <= curve.end_s - margin_s))

@@ -1,0 +1,249 @@
+"""Who moves where in a room: from what a user asks for to paths that touch neither it nor each other.
+
+specs -> recorded motions are placed, what stands in their way leaves -> simulated ones go around them
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path as File
+
+import numpy as np
+
+from share.errors import UsageError
+from share.geometry.camera import ImuNoise
+from share.lab.emulate.motion import board, paper
+from share.lab.emulate.motion.crowd import SettledPath, SimulatedAgent, plan_crowd, settled_path
+from share.lab.emulate.motion.floor import Floor, floor_from_occupancy
+from share.lab.emulate.motion.placement import MIN_DISTANCE_M, PathToPlace, place_paths
+from share.lab.emulate.motion.planned_motion import PEOPLE_M, FloorGraphs, MotionPreferences
+from share.lab.emulate.motion.spec import (
+    BoardSpec,
+    EurocSpec,
+    PaperSpec,
+    RecordedSpec,
+    RobotSpec,
+    Spec,
+    TumSpec,
+    WalkSpec,
+    parse_motion,
+)
+from share.lab.emulate.motion.tum_path import read_tum_path
+from share.lab.emulate.types import MotionPath
+from share.lab.emulate.world.layout import Layout
+from share.lab.emulate.world.occupancy import Occupancy
+from share.types import F64, I64, AgentKind
+
+_MIN_SESSION_S, _MAX_SESSION_S = 3.0, 3600.0
+_GAZE_TARGETS = 150  # to look at
+_GAZE_TARGET_HEIGHTS_M = (0.3, 2.3)
+_EYE_HEIGHTS_M = (1.60, 1.75)
+_PAPER_SPACE_M = (9.0, 6.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedAgent:
+    """One who moves. look: what the others see of it, `person`, `robot` or `drone`.
+
+    T_body_cam0 (4, 4): how the camera sits on the body, where a recorded motion brings its own rig, else
+    None: the sensor's profile says (a simulated body is the profile's IMU). images_ns (M,): stamps of
+    the recorded images, where there are any; imu: noise of the recorded IMU. spec: what the user asked
+    for. notes: for a person. like_camera: the body has a camera's axes, x right, y down, z ahead.
+    """
+
+    name: str
+    kind: AgentKind
+    body_kind: str
+    path: MotionPath
+    spec: str
+    T_body_cam0: F64 | None = None
+    images_ns: I64 | None = None
+    imu: ImuNoise | None = None
+    notes: tuple[str, ...] = ()
+    has_camera_axes: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlan:
+    """layout: the room, less what stood in the way of recorded flights. Paths begin together: each
+    one's start_ns is the session's first instant, in a clock of its own. notes: for a person."""
+
+    layout: Layout
+    agents: tuple[PlannedAgent, ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _NamedSpec:
+    """One spec with the name of its agent and how the user wrote it."""
+
+    name: str
+    spec: Spec
+    text: str
+
+
+def plan_motions(specs: Sequence[str], layout: Layout, seconds: float, seed: int) -> MotionPlan:
+    """The agents of `specs` (`[NAME=]SPEC`) in the room, for `seconds`; the same every time for a seed.
+
+    Raises UsageError for a spec that cannot be understood, a name given twice, or paths for which the
+    room has no place, DataError for a recording that is damaged.
+    """
+    if not _MIN_SESSION_S <= seconds <= _MAX_SESSION_S:
+        raise UsageError(
+            f"{seconds:g} seconds: a session lasts {_MIN_SESSION_S:g} to {_MAX_SESSION_S:g} seconds"
+        )
+    requests = _named_specs(specs)
+    recorded = [_recorded_agent(a, seconds) for a in requests if isinstance(a.spec, RecordedSpec)]
+    paths_to_place = [PathToPlace(agent.name, agent.body_kind, agent.path) for agent in recorded]
+    layout, paths, notes = (
+        place_paths(layout, paths_to_place, (seed, 71)) if paths_to_place else (layout, [], [])
+    )
+    agents = [replace(agent, path=path) for agent, path in zip(recorded, paths, strict=True)]
+    agents += [
+        _board_agent(a, a.spec, layout, seconds, seed) for a in requests if isinstance(a.spec, BoardSpec)
+    ]
+    agents += _simulated_agents(requests, layout, [_settled(agent) for agent in agents], seconds, seed)
+    order = [name for a in requests for name in _agent_names(a)]
+    if any(isinstance(a.spec, PaperSpec) for a in requests) and seconds != paper.SECONDS:
+        notes = [*notes, f"an experiment of the paper lasts {paper.SECONDS:g} s"]
+    return MotionPlan(layout, tuple(sorted(agents, key=lambda a: order.index(a.name))), tuple(notes))
+
+
+def _named_specs(specs: Sequence[str]) -> list[_NamedSpec]:
+    """Specs with names: the user's, else the kind's with a number. Raises UsageError."""
+    if not specs:
+        raise UsageError("nobody moves; give at least one --motion, for example walk:")
+    requests: list[_NamedSpec] = []
+    for text in specs:
+        name, spec = parse_motion(text)
+        if isinstance(spec, PaperSpec) and (name or len(specs) > 1):
+            raise UsageError(
+                f"'{text}': paper:N brings its own three agents; give it alone and without a name"
+            )
+        requests.append(_NamedSpec(name or _free_name(text.partition(":")[0], requests), spec, text))
+    names = [name for a in requests for name in _agent_names(a)]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"two agents are named '{name}'; give each its own name")
+    return requests
+
+
+def _agent_names(request: _NamedSpec) -> tuple[str, ...]:
+    return paper.NAMES if isinstance(request.spec, PaperSpec) else (request.name,)
+
+
+def _free_name(kind: str, requests: Sequence[_NamedSpec]) -> str:
+    used = {a.name for a in requests}
+    return next(name for k in range(1, len(used) + 2) if (name := f"{kind}{k}") not in used)
+
+
+def _recorded_agent(request: _NamedSpec, seconds: float) -> PlannedAgent:
+    """A recording's motion where it was recorded, no longer than the session."""
+    spec = request.spec
+    assert isinstance(spec, RecordedSpec)
+    longest = min(seconds, spec.seconds or seconds)
+    kind = AgentKind(spec.kind)
+    if isinstance(spec, TumSpec):
+        path: MotionPath = read_tum_path(File(spec.path), spec.start, longest)
+        return PlannedAgent(
+            request.name, kind, spec.look, path, request.text, notes=_short_note(path, seconds)
+        )
+    from share.lab.emulate.motion import recorded_sources
+
+    options = (
+        recorded_sources.EUROC_OPTIONS if isinstance(spec, EurocSpec) else recorded_sources.TUMVI_OPTIONS
+    )
+    recording = recorded_sources.open_recorded_motion(File(spec.path), options, spec.start, longest)
+    notes = (*recording.notes, *_short_note(recording.path, seconds))
+    mount, stamps = recording.T_body_cam0, recording.images_ns
+    return PlannedAgent(
+        request.name, kind, spec.look, recording.path, request.text, mount, stamps, recording.noise, notes
+    )
+
+
+def _board_agent(
+    request: _NamedSpec, spec: BoardSpec, layout: Layout, seconds: float, seed: int
+) -> PlannedAgent:
+    """A device in a hand before the room's board; each name's motion is its own."""
+    rng = np.random.default_rng((seed, 74, zlib.crc32(request.name.encode())))
+    path = board.board_path(layout, spec, min(seconds, spec.seconds or seconds), rng)
+    notes = _short_note(path, seconds)
+    return PlannedAgent(
+        request.name, AgentKind.AR, "drone", path, request.text, notes=notes, has_camera_axes=True
+    )
+
+
+def _short_note(path: MotionPath, seconds: float) -> tuple[str, ...]:
+    lasts = (path.end_ns - path.start_ns) / 1e9
+    return (f"ends after {lasts:.1f} s",) if lasts < seconds - 0.5 else ()
+
+
+def _settled(agent: PlannedAgent) -> SettledPath:
+    return settled_path(agent.path, PEOPLE_M if agent.body_kind == "person" else MIN_DISTANCE_M)
+
+
+def _simulated_agents(
+    requests: Sequence[_NamedSpec], layout: Layout, settled: Sequence[SettledPath], seconds: float, seed: int
+) -> list[PlannedAgent]:
+    """People and robots, and the paper's three."""
+    members: list[SimulatedAgent] = []
+    texts: list[str] = []
+    rng = np.random.default_rng((seed, 72))
+    for a in requests:
+        own = _crowd_members(a, rng)
+        members += own
+        texts += [a.text] * len(own)
+    if not members:
+        return []
+    floor = floor_from_occupancy(Occupancy.from_layout(layout))
+    if any(isinstance(a.spec, PaperSpec) for a in requests):
+        floor, seconds = _floor_within(floor, _PAPER_SPACE_M), paper.SECONDS
+    paths = plan_crowd(FloorGraphs(floor), members, settled, _gaze_targets(layout, rng), seconds, (seed, 73))
+    kinds = {"person": AgentKind.AR, "robot": AgentKind.ROBOT}
+    return [
+        PlannedAgent(
+            m.name, kinds[m.preferences.body_kind], m.preferences.body_kind, path, text, has_camera_axes=True
+        )
+        for m, path, text in zip(members, paths, texts, strict=True)
+    ]
+
+
+def _crowd_members(request: _NamedSpec, rng: np.random.Generator) -> list[SimulatedAgent]:
+    spec = request.spec
+    if isinstance(spec, PaperSpec):
+        return paper.paper_agents(spec.number)
+    if isinstance(spec, WalkSpec):
+        height = spec.height or float(rng.uniform(*_EYE_HEIGHTS_M))
+        return [
+            SimulatedAgent(
+                request.name,
+                MotionPreferences("person", spec.speed, spec.pauses),
+                height,
+                max_head_rate=spec.turns,
+            )
+        ]
+    if isinstance(spec, RobotSpec):
+        preferences = MotionPreferences("robot", spec.speed, spec.pauses)
+        return [SimulatedAgent(request.name, preferences, spec.height, vibration=spec.vibration)]
+    return []
+
+
+def _floor_within(floor: Floor, size: tuple[float, float]) -> Floor:
+    """The part of a floor within `size` m of its corner: what lies beyond is as a wall."""
+    shape = np.array(floor.clearance.shape)
+    positions = [floor.origin + np.arange(n) * floor.step for n in shape]
+    beyond = np.minimum(size[0] - positions[0][:, None], size[1] - positions[1][None, :])
+    return replace(floor, clearance=np.minimum(floor.clearance, beyond.clip(0)))
+
+
+def _gaze_targets(layout: Layout, rng: np.random.Generator) -> F64:
+    """Points (K, 3) m of the furniture that draw a look."""
+    pieces = [p for p in layout.pieces if p.bounding_box[1, 2] > _GAZE_TARGET_HEIGHTS_M[0]]
+    if not pieces:
+        return rng.uniform((0, 0, 1.0), (*layout.size[:2], 1.8), (_GAZE_TARGETS, 3))
+    vertices_of = [pieces[i].shape.mesh.vertices for i in rng.integers(len(pieces), size=_GAZE_TARGETS)]
+    points = np.array([v[rng.integers(len(v))] for v in vertices_of], np.float64)
+    points[:, 2] = points[:, 2].clip(*_GAZE_TARGET_HEIGHTS_M)
+    return points

@@ -1,0 +1,208 @@
+"""Where in a room a given motion fits: turned about the vertical and shifted, as far from things as can be.
+
+Every yaw of a grid with every shift of a grid is tried against the distances of the room's voxels. What
+touches walls, floor or ceiling is out; among the rest, few places near furniture come first (it will
+have to leave), then room around, then places that others visit as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from share.errors import UsageError
+from share.geometry import se3
+from share.lab.emulate.types import MotionPath
+from share.lab.emulate.world.layout import Layout
+from share.lab.emulate.world.occupancy import Occupancy
+from share.types import F32, F64
+
+CLEARANCE_M = 0.25
+MIN_DISTANCE_M = 0.5  # between two at the same time
+_VOXEL_M = 0.1
+_YAWS = 24
+_SHIFT_M = 0.25
+_TIME_S = 0.1
+_MAX_POINTS = 400  # of a path that are looked at
+_AMPLE_CLEARANCE_M = 0.8  # more room than this is worth nothing
+_USUAL_HEIGHTS = {"person": 1.65, "robot": 0.35, "drone": 1.5}  # m, where such a body likes to be on average
+_BODY_HEIGHTS = {
+    "person": (0.35, 1.0),
+    "robot": (),
+    "drone": (),
+}  # m above the floor: what hangs below a head
+_MAX_CANDIDATES = 400  # places that are looked at closely
+
+
+@dataclass(frozen=True, eq=False)
+class PathToPlace:
+    """A motion that wants a place. look: what its body is; xyz (M, 3) m every _TIME_S from its start."""
+
+    name: str
+    body_kind: str
+    path: MotionPath
+
+    @property
+    def xyz(self) -> F64:
+        stamps = np.arange(self.path.start_ns, self.path.end_ns + 1, round(_TIME_S * 1e9))
+        return self.path.poses(stamps)[:, :3, 3]
+
+
+def place_paths(
+    layout: Layout, requests: Sequence[PathToPlace], seed: tuple[int, ...]
+) -> tuple[Layout, list[MotionPath], list[str]]:
+    """The room without the pieces that stood in the way, the guests' paths in it, and notes for a person.
+
+    Raises UsageError where a path is too large for the room, or keeps no distance to the others.
+    """
+    occupancy = Occupancy.from_layout(layout, _VOXEL_M)
+    shell_occupancy = Occupancy.from_layout(replace(layout, pieces=()), _VOXEL_M)
+    paths: list[MotionPath] = []
+    placed_paths: list[F64] = []
+    notes = []
+    for k, request in enumerate(requests):
+        rng = np.random.default_rng((*seed, k))
+        T = _find_place(layout, occupancy, shell_occupancy, request, placed_paths, rng)
+        paths.append(request.path.transformed(T))
+        placed_paths.append(se3.transform(T, request.xyz))
+    for request, xyz in zip(requests, placed_paths, strict=True):
+        layout, removed = layout.without(_body_points(xyz, request.body_kind), CLEARANCE_M - 0.05)
+        if removed:
+            notes.append(f"{request.name}: left out {', '.join(removed)}, which stood in its way")
+    return layout, paths, notes
+
+
+def _find_place(
+    layout: Layout,
+    occupancy: Occupancy,
+    shell_occupancy: Occupancy,
+    request: PathToPlace,
+    placed_paths: Sequence[F64],
+    rng: np.random.Generator,
+) -> F64:
+    xyz = request.xyz
+    middle = (xyz.min(0) + xyz.max(0)) / 2
+    visited = _distance_from_paths(shell_occupancy, placed_paths)
+    candidates: list[tuple[float, F64]] = []
+    for yaw in (np.arange(_YAWS) + rng.random()) * 2 * np.pi / _YAWS:
+        turned = _yaw_transform(yaw, middle)
+        p = se3.transform(turned, xyz)
+        shifts = _candidate_shifts(p, np.array(layout.size), request.body_kind)
+        if len(shifts):
+            scores = _shift_scores(p, shifts, occupancy, shell_occupancy, request.body_kind, visited)
+            scores = scores + 0.02 * rng.random(len(scores))
+            for i in np.argsort(-scores)[: _MAX_CANDIDATES // _YAWS * 2]:
+                if np.isfinite(scores[i]):
+                    T = turned.copy()
+                    T[:3, 3] += shifts[i]
+                    candidates.append((float(scores[i]), T))
+    if not candidates:
+        raise UsageError(_too_large_text(layout, request, xyz))
+    for _, T in sorted(candidates, key=lambda pair: -pair[0]):
+        if all(_min_distance(se3.transform(T, xyz), other) >= MIN_DISTANCE_M for other in placed_paths):
+            return T
+    raise UsageError(
+        f"{request.name}: wherever it is put in this room it "
+        f"comes nearer than {MIN_DISTANCE_M:g} "
+        f"m to another agent; "
+        "ask for a larger --size, or other start= times"
+    )
+
+
+def _yaw_transform(yaw: float, middle: F64) -> F64:
+    """Turns about the vertical through `middle`, and brings it to 0."""
+    R = se3.so3_exp(np.array([0.0, 0.0, yaw]))
+    return se3.from_rt(R, -R @ middle)
+
+
+def _candidate_shifts(p: F64, size: F64, body_kind: str) -> F64:
+    """Where the middle of a path p (M, 3) around 0 may go (S, 3) m, by its extents alone."""
+    low, high = CLEARANCE_M - p.min(0), size - CLEARANCE_M - p.max(0)
+    if (low > high).any():
+        return np.zeros((0, 3))
+    axes = [
+        np.linspace(a, b, max(1, round((b - a) / _SHIFT_M)) + 1)
+        for a, b in zip(low[:2], high[:2], strict=True)
+    ]
+    usual_height = np.clip(_USUAL_HEIGHTS[body_kind] - p[:, 2].mean(), low[2], high[2])
+    heights = (
+        [usual_height]
+        if body_kind != "drone"
+        else np.unique(np.clip(usual_height + np.array([-0.4, 0.0, 0.4]), low[2], high[2]))
+    )
+    return np.array([(x, y, z) for x in axes[0] for y in axes[1] for z in heights])
+
+
+def _shift_scores(
+    p: F64, shifts: F64, whole: Occupancy, shell: Occupancy, body_kind: str, visited: F64
+) -> F64:
+    """How good each shift (S, 3) is; -inf where the path would touch the shell."""
+    samples = p[:: max(1, len(p) // _MAX_POINTS)]
+    out = np.empty(len(shifts))
+    for i, shift in enumerate(shifts):
+        at = samples + shift
+        if _grid_values(shell.distance, at).min() < CLEARANCE_M:
+            out[i] = -np.inf
+            continue
+        room = _grid_values(whole.distance, _body_points(at, body_kind))
+        out[i] = (
+            -4 * (room < CLEARANCE_M).mean()
+            + room.clip(0, _AMPLE_CLEARANCE_M).mean()
+            - 0.3 * _grid_values(visited, at).mean()
+        )
+    return out
+
+
+def _body_points(xyz: F64, body_kind: str) -> F64:
+    """All of a body that must be free, not the head alone."""
+    lower = [np.column_stack([xyz[:, :2], np.full(len(xyz), z)]) for z in _BODY_HEIGHTS[body_kind]]
+    return np.concatenate([xyz, *lower])
+
+
+def _grid_values(grid: F64 | F32, points: F64) -> F64:
+    cells = np.floor(points / _VOXEL_M).astype(int)
+    i, j, k = np.clip(cells, 0, np.array(grid.shape) - 1).T
+    out: F64 = grid[i, j, k].astype(np.float64)
+    return out
+
+
+def _distance_from_paths(shell: Occupancy, settled: Sequence[F64]) -> F64:
+    """Horizontal distance (X, Y, 1) m of every place from where others pass, 0 everywhere if nobody does."""
+    from scipy.ndimage import distance_transform_edt
+
+    shape = shell.solid.shape[:2]
+    free = np.ones(shape, bool)
+    for xyz in settled:
+        i, j = np.floor(xyz[:, :2] / _VOXEL_M).astype(int).T
+        free[i.clip(0, shape[0] - 1), j.clip(0, shape[1] - 1)] = False
+    if free.all():
+        return np.zeros((*shape, 1))
+    return np.asarray(distance_transform_edt(free) * _VOXEL_M)[..., None]
+
+
+def _min_distance(a: F64, b: F64) -> float:
+    """Least distance (m) of two at the same times; who has ended stays."""
+    count = np.arange(max(len(a), len(b)))
+    d = a[np.minimum(count, len(a) - 1)] - b[np.minimum(count, len(b) - 1)]
+    return float(np.linalg.norm(d, axis=1).min())
+
+
+def _too_large_text(layout: Layout, request: PathToPlace, xyz: F64) -> str:
+    """One line: what the path needs, what there is, and what to ask for."""
+    extents = [
+        np.ptp(se3.transform(_yaw_transform(yaw, 0 * xyz[0]), xyz), axis=0)
+        for yaw in np.linspace(0, np.pi, 37)
+    ]
+    need = min(extents, key=lambda e: e[0] * e[1]) + 2 * CLEARANCE_M
+    x, y = sorted(need[:2], reverse=True)
+    room_size = " x ".join(f"{s:g}" for s in layout.size)
+    wide, deep = sorted(layout.size[:2], reverse=True)
+    sizes = zip((x, y, need[2]), (wide, deep, layout.size[2]), strict=True)
+    ask = ",".join(f"{max(np.ceil(v * 2 + 1) / 2, s):g}" for v, s in sizes)
+    return (
+        f"{request.name}: its path needs {x:.1f} x {y:.1f} x {need[2]:.1f} m of free room, "
+        f"{layout.name} is {room_size} m; "
+        f"ask for a larger --size, such as {ask}, or a shorter part (start=, seconds=)"
+    )

@@ -1,0 +1,355 @@
+"""A room in virtual time: real agents, a real edge and mapper, and between them networks, queues and costs.
+
+What is decided is decided by the machines themselves; how long it takes is drawn from what was measured. So
+a run says what latency would be on machines that nobody else uses, and the same seed gives the same run.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from typing import Any, Protocol
+
+import numpy as np
+
+from share.config import Config
+from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import MapChange
+from share.mapping.mapper import Mapper
+from share.mapping.recognition.verification import Verification
+from share.mapping.steps import MapEvent
+from share.metrics.frame_log import RunLog
+from share.net.channel import Channel, NetworkModel
+from share.protocol import agent_events as ev
+from share.protocol import edge_events as ed
+from share.protocol.agent import Agent
+from share.protocol.edge import Edge
+from share.types import F64, Keyframe, KeyframeCandidate, TrackState
+from share.wire.codec import Bytes, message_bytes
+from share.wire.messages import Hello, peer_id
+
+_MS = 1_000_000
+_TICK_MS = 50
+_RANDOM_BATCH = 1000  # random numbers
+
+
+@dataclass(frozen=True)
+class Delay:
+    """ms, lognormal: half of all take less than `p50`, 95 % less than `p95`."""
+
+    p50: float
+    p95: float
+
+    def draw_ns(self, normal: float) -> int:
+        """normal: drawn from a standard normal distribution."""
+        sigma = math.log(max(1.0, self.p95 / self.p50)) / 1.645
+        return round(self.p50 * math.exp(sigma * normal) * _MS)
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """ms, as they were measured: the least, the most, and what so many equal parts lie between."""
+
+    ms: tuple[float, ...]
+
+    def draw_ns(self, normal: float) -> int:
+        """normal: drawn from a standard normal distribution."""
+        below = 0.5 * (1 + math.erf(normal / math.sqrt(2)))
+        return round(float(np.interp(below * (len(self.ms) - 1), range(len(self.ms)), self.ms)) * _MS)
+
+
+# Of keyframes' work after a frame, none after half of them: 1,301 frames of four recordings.
+_SLICES = Sampled((*[0.0] * 11, 0.45, 2.2, 2.7, 3.5, 4.0, 4.7, 5.3, 5.6, 5.9, 8.2))
+
+
+@dataclass(frozen=True)
+class ProcessingDelays:
+    """Of a frame at the agent until its pose is out, of a keyframe from then until it may be sent, and of the
+    slice of keyframes' work that may come after any frame; of a message at the edge's front; of what its
+    mapper and its solver do. Defaults: docs/scheduling-figures.md."""
+
+    frame: Delay = Delay(4.3, 5.4)
+    keyframe: Delay = Delay(3.9, 4.7)
+    finish_keyframe: Delay | Sampled = _SLICES
+    receive: Delay = Delay(0.3, 1.0)
+    add: Delay = Delay(0.4, 0.8)
+    query: Delay = Delay(3.0, 5.0)
+    verify_accepted: Delay = Delay(4.0, 6.0)
+    verify_refused: Delay = Delay(2.0, 5.0)
+    check_loop: Delay = Delay(1.3, 10.0)
+    solve: Delay = Delay(14.0, 32.0)
+    apply_solution: Delay = Delay(2.2, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """A frame: when it comes in, where odometry says it is, how wrong that is, and what it shows others, if
+    it is offered as a keyframe. stamp_ns: of its sensor; None: as at_ns. breaks: odometry began anew."""
+
+    arrival_ns: int
+    T_odom_body: F64 | None
+    error_cm: float | None = None
+    candidate: KeyframeCandidate | None = None
+    stamp_ns: int | None = None
+    state: TrackState = TrackState.OK
+    new_segment: bool = False
+
+
+class AnyMapper(Protocol):
+    """`share.mapping.mapper.Mapper`, or `share.lab.evaluate.modelled_mapper.ModelledMapper`."""
+
+    def add_run(self, agent: str, hello: Hello) -> None: ...
+    def set_present(self, agent: str, is_present: bool) -> None: ...
+    def add_keyframe(self, agent: str, keyframe: Keyframe, is_extra: bool = False) -> list[MapEvent]: ...
+    def next_lookup(self) -> Any: ...
+    def next_solve(self) -> Any: ...
+    def finish_step(self, step: Any, result: Any, ms: float) -> list[MapEvent]: ...
+    def take_changes(self) -> tuple[MapChange, ...]: ...
+    def report(self) -> dict[str, Any]: ...
+
+
+class Simulation:
+    """Everybody in one room. agents: what each says of itself and sees, and its network. The clock of all
+    is the world's."""
+
+    def __init__(
+        self,
+        config: Config,
+        agents: Sequence[tuple[Hello, Iterator[TrackedFrame], NetworkModel]],
+        delays: ProcessingDelays,
+        seed: int,
+        mapper: AnyMapper | None = None,
+        on_effect: Callable[[str, ev.AgentEffect], None] = lambda name, effect: None,
+        on_record: Callable[[dict[str, Any]], None] = lambda fields: None,
+    ) -> None:
+        """mapper: by default a real one. watch: is told what every agent does, by name; record: what the edge
+        decides."""
+        self.now_ns = 0
+        self.stamps_ns: dict[KeyframeKey, int] = {}  # of the keyframes that the mapper has had
+        self.mapper_busy_ns = self.solver_busy_ns = 0  # that the mapper and the solver have worked
+        self.logs = {hello.name: RunLog() for hello, *_ in agents}
+        self.localised: dict[str, list[ev.LocalisedPose]] = {
+            hello.name: [] for hello, *_ in agents
+        }  # in a map
+        self._on_effect, self._on_record = on_effect, on_record
+        rng = np.random.default_rng(seed)
+        self._delays, self._random_normals = delays, _random_normals(rng)
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = count()
+        self._members: dict[bytes, _SimulatedAgent] = {}
+        for hello, frames, network in agents:
+            member = _SimulatedAgent(hello, Agent(hello, config), frames, network, rng.spawn(2))
+            self._members[member.peer] = member
+            self._schedule_next_frame(member)
+        self.edge = Edge(config, session=1)
+        self.mapper: AnyMapper = Mapper(config) if mapper is None else mapper
+        self._solver = PoseGraphSolver(config.graph)
+        self._inbox: deque[tuple[Delay, Callable[[], list[MapEvent]]]] = deque()  # the mapper's
+        self._is_busy = False  # the mapper's process
+        self._schedule(0, self._tick)
+
+    def run(self, until_s: float) -> None:
+        """Everything until then."""
+        end_ns = round(until_s * 1e9)
+        while self._events and self._events[0][0] <= end_ns:
+            self.now_ns, _, action = heapq.heappop(self._events)
+            action()
+
+    def reports(self) -> dict[str, dict[str, Any]]:
+        """What each agent's machine has counted, by name."""
+        return {member.name: member.machine.report() for member in self._members.values()}
+
+    def _schedule(self, delay_ns: int, action: Callable[[], None]) -> None:
+        heapq.heappush(self._events, (self.now_ns + delay_ns, next(self._order), action))
+
+    def _draw(self, cost: Delay | Sampled) -> int:
+        return cost.draw_ns(next(self._random_normals))
+
+    def _tick(self) -> None:
+        for member in self._members.values():
+            self._to_agent(member, ev.AgentTick())
+        self._to_edge(ed.EdgeTick())
+        self._schedule(_TICK_MS * _MS, self._tick)
+
+    # ------------------------------------------------------------------ agents
+
+    def _schedule_next_frame(self, member: _SimulatedAgent) -> None:
+        if (frame := next(member.incoming, None)) is not None:
+            self._schedule(max(0, frame.arrival_ns - self.now_ns), lambda: self._frame_arrived(member, frame))
+
+    def _frame_arrived(self, member: _SimulatedAgent, tracked: TrackedFrame) -> None:
+        """A frame waits until those before it are done, as in the agent's tracking thread."""
+        begin_ns = max(self.now_ns, member.busy_until_ns)
+        done_ns = begin_ns + self._draw(self._delays.frame)
+        member.busy_until_ns = done_ns
+        frame = ev.FrameTracked(
+            index=member.frames_count,
+            stamp_ns=tracked.arrival_ns if tracked.stamp_ns is None else tracked.stamp_ns,
+            arrived_ns=tracked.arrival_ns,
+            done_ns=done_ns,
+            state=tracked.state,
+            T_odom_body=tracked.T_odom_body,
+            is_keyframe=tracked.candidate is not None,
+            new_segment=tracked.new_segment or member.frames_count == 0,
+            error_cm=tracked.error_cm,
+        )
+        member.frames_count += 1
+        self._schedule(done_ns - self.now_ns, lambda: self._to_agent(member, frame))
+        if (candidate := tracked.candidate) is not None:
+            member.busy_until_ns += self._draw(self._delays.keyframe)
+            keyframe_event = ev.KeyframeMade(frame, candidate)
+            self._schedule(member.busy_until_ns - self.now_ns, lambda: self._to_agent(member, keyframe_event))
+        member.busy_until_ns += self._draw(self._delays.finish_keyframe)
+        self._schedule_next_frame(member)
+
+    def _to_agent(self, member: _SimulatedAgent, event: ev.AgentEvent) -> None:
+        log = self.logs[member.name]
+        for effect in member.machine.handle(event, self.now_ns):
+            self._on_effect(member.name, effect)
+            match effect:
+                case ev.SendToEdge():
+                    self._send_up(member, effect.frames)
+                case ev.LocalisedPose() if effect.T_map_odom is not None:
+                    self.localised[member.name].append(effect)
+                case ev.FrameDone():
+                    log.add(
+                        effect.stamp_ns, effect.track_ms, effect.state, effect.is_keyframe, effect.is_sent
+                    )
+                case ev.CorrectionApplied():
+                    if effect.stamp_ns is not None and effect.corrected_ms is not None:
+                        log.add_correction(effect.stamp_ns, effect.corrected_ms)
+
+    def _send_up(self, member: _SimulatedAgent, frames: Sequence[Bytes]) -> None:
+        arrival_ns = member.up.arrival_ns(message_bytes(frames), self.now_ns) + self._draw(
+            self._delays.receive
+        )
+        self._schedule(
+            arrival_ns - self.now_ns, lambda: self._to_edge(ed.PeerMessageReceived(member.peer, frames))
+        )
+
+    # ------------------------------------------------------------------ the edge
+
+    def _to_edge(self, event: ed.EdgeEvent) -> None:
+        for effect in self.edge.handle(event, self.now_ns):
+            match effect:
+                case ed.SendToPeer():
+                    self._send_down(effect)
+                case ed.AddRun() | ed.SetPresence() | ed.AddKeyframe():
+                    self._send_to_mapper(self._delays.add, partial(self._apply_to_mapper, effect))
+                case ed.WriteEvent():
+                    self._on_record(effect.fields)
+
+    def _send_down(self, effect: ed.SendToPeer) -> None:
+        member, frames = self._members[effect.peer_id], effect.frames
+        arrival_ns = member.down.arrival_ns(message_bytes(frames), self.now_ns)
+        self._schedule(
+            arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.EdgeMessageReceived(frames))
+        )
+
+    def _apply_to_mapper(self, message: ed.AddRun | ed.SetPresence | ed.AddKeyframe) -> list[MapEvent]:
+        if isinstance(message, ed.AddKeyframe):
+            self.stamps_ns[KeyframeKey(message.key, message.keyframe.id)] = message.keyframe.stamp_ns
+            return self.mapper.add_keyframe(message.key, message.keyframe, message.is_over_rate)
+        if isinstance(message, ed.SetPresence):
+            self.mapper.set_present(message.key, message.is_present)
+        else:
+            self.mapper.add_run(message.key, message.hello)
+        return []
+
+    # ---------------------------------------------------------------- the mapper, as in
+    # share.runtime.mapper_process
+
+    def _send_to_mapper(self, delay: Delay, action: Callable[[], list[MapEvent]]) -> None:
+        self._inbox.append((delay, action))
+        if not self._is_busy:
+            self._run_mapper_round()
+
+    def _run_mapper_round(self) -> None:
+        """One round: hear everything, hand a map to the solver, say what came of it, look something up."""
+        self._is_busy = True
+        findings, spent_ns = list[MapEvent](), 0
+        while self._inbox:
+            delay, action = self._inbox.popleft()
+            findings += action()
+            spent_ns += self._draw(delay)
+        self.mapper_busy_ns += spent_ns
+        self._start_solving(spent_ns)
+        self._schedule(spent_ns, lambda: self._send_findings(findings))
+        step = self.mapper.next_lookup()
+        if step is None:
+            self._schedule(spent_ns, self._mapper_idle)
+            return
+        result = _result_or_error(step.run)
+        step_ns = self._draw(self._delay_of(step, result))
+        self.mapper_busy_ns += step_ns
+        self._schedule(spent_ns + step_ns, lambda: self._step_done(step, result))
+
+    def _step_done(self, step: Any, result: object) -> None:
+        self._send_findings(self.mapper.finish_step(step, result, 0.0))
+        self._run_mapper_round()
+
+    def _mapper_idle(self) -> None:
+        self._is_busy = False
+        if self._inbox:
+            self._run_mapper_round()
+
+    def _start_solving(self, after_ns: int) -> None:
+        if (step := self.mapper.next_solve()) is not None:
+            result = _result_or_error(partial(step.run, self._solver))
+            apply_result = partial(self.mapper.finish_step, step, result, 0.0)
+            solve_ns = self._draw(self._delays.solve)
+            self.solver_busy_ns += solve_ns
+            self._schedule(
+                after_ns + solve_ns, lambda: self._send_to_mapper(self._delays.apply_solution, apply_result)
+            )
+
+    def _delay_of(self, step: Any, result: object) -> Delay:
+        if step.kind == "place":
+            return self._delays.query
+        verified, checked = self._delays.verify_accepted, self._delays.check_loop
+        if isinstance(result, Verification):
+            return Delay(verified.p50 + checked.p50, verified.p95 + checked.p95)
+        return self._delays.verify_refused
+
+    def _send_findings(self, findings: list[MapEvent]) -> None:
+        changes = self.mapper.take_changes()
+        if findings or changes:
+            self._to_edge(ed.MapperResult(tuple(findings), changes))
+
+
+def _random_normals(rng: np.random.Generator) -> Iterator[float]:
+    """One by one, drawn many at a time."""
+    while True:
+        yield from rng.standard_normal(_RANDOM_BATCH).tolist()
+
+
+def _result_or_error(action: Callable[[], object]) -> object:
+    """An exception is a result, as in the mapper's process."""
+    try:
+        return action()
+    except Exception as error:
+        return error
+
+
+class _SimulatedAgent:
+    """An agent, what it still has to see, and its network. busy_ns: until when it tracks what came so far."""
+
+    def __init__(
+        self,
+        hello: Hello,
+        machine: Agent,
+        incoming: Iterator[TrackedFrame],
+        network: NetworkModel,
+        rngs: list[np.random.Generator],
+    ) -> None:
+        self.name, self.peer = hello.name, peer_id(hello.run_id)
+        self.machine, self.incoming = machine, incoming
+        self.up = Channel(network.up, network.round_trip_ms, rngs[0])
+        self.down = Channel(network.down, network.round_trip_ms, rngs[1])
+        self.busy_until_ns = self.frames_count = 0

@@ -1,0 +1,259 @@
+"""A session in virtual time: what agents saw is tracked once, all else goes through
+`share.lab.evaluate.simulation`.
+
+The tracker, the agents' and the edge's machines and the mapper are the real ones, and odometry is the same to
+the last digit as in real time. How long things take is drawn (`ProcessingDelays`), so that neither this
+machine nor what else it does shows in a latency, and the same seed gives the same run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from share import __version__, config
+from share.config import Config, InertialConfig, SequencerConfig, TrackerConfig
+from share.errors import DataError, UsageError
+from share.files.json_file import own_format_errors, read_json
+from share.files.line_file import LineFile
+from share.files.writing import atomic_write, writable_dir
+from share.files.yaml_file import read_settings
+from share.geometry.camera import Rig
+from share.lab.evaluate.map_membership import MapMembership
+from share.lab.evaluate.real_time import Progress, RunOptions
+from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation, TrackedFrame
+from share.metrics.local_error import LocalError
+from share.net.emulated_link import LinkAssignment
+from share.odometry.error_model.network import open_error_model
+from share.plain_data import to_mapping
+from share.protocol import agent_events as ev
+from share.recordings.session import Session, read_session
+from share.runtime.agent_files import AgentFiles
+from share.runtime.error_estimators import (
+    ErrorEstimator,
+    GroundTruthError,
+    NoErrorEstimate,
+    SynchronousErrorModel,
+)
+from share.runtime.pipeline import make_source_tracker, read_frames
+from share.runtime.source import Source, open_source
+from share.sensors.sequencer import SequencerCounters
+from share.wire.messages import Hello
+
+_DRAIN_S = 2.0  # for what is under way when the last frame has come
+_SHOW_EVERY = 50  # frames of an agent
+_TRUE_ERROR = "truth"
+
+
+def play_in_virtual_time(
+    session: Session, seconds: float, options: RunOptions, out: Path, show: Callable[[Progress], None]
+) -> dict[str, Path]:
+    """As `share.lab.evaluate.real_time.play`, with the same files; those of processes (logs) are not there.
+
+    Raises UsageError where an agent's recording cannot be tracked or the policy is one that streams.
+    """
+    settings = read_settings(Path(options.config)) if options.config else Config()
+    settings = dataclasses.replace(settings, edge=dataclasses.replace(settings.edge, policy=options.policy))
+    if options.policy == config.STREAMED:
+        raise UsageError("policy streamed is not played in virtual time: its agents do not track")
+    error_source = _TRUE_ERROR if options.true_error else settings.agent.error_model
+    tracker_settings = settings.tracker, settings.inertial, settings.sequencer
+    tracked = _track_all(session.folder.resolve(), *tracker_settings, error_source)
+    links = LinkAssignment.parse(options.link)
+    links.check(session.agents)
+    start_ns = min(frames[0].arrival_ns for _, frames in tracked.values() if frames)
+    members = [
+        (
+            Hello(name, agent.kind, number + 1, tracked[name][0]),
+            _relative_frames(tracked[name][1], start_ns),
+            links.network_for(name),
+        )
+        for number, (name, agent) in enumerate(session.agents.items())
+    ]
+    folders = {name: out / name for name in session.agents}
+    observer = _RunWriter(folders, writable_dir(out / "edge"), show)
+    costs = ProcessingDelays() if options.costs is None else read_delays(Path(options.costs))
+    world = Simulation(
+        settings,
+        members,
+        costs,
+        options.seed,
+        on_effect=observer.write_effect,
+        on_record=observer.write_event,
+    )
+    world.run(seconds + _DRAIN_S)
+    observer.finish(world, settings)
+    return folders
+
+
+@lru_cache(maxsize=1)  # policies follow each other on one session
+def _track_all(
+    folder: Path,
+    tracker: TrackerConfig,
+    inertial: InertialConfig,
+    sequencer: SequencerConfig,
+    error_source: str,
+) -> dict[str, tuple[Rig, list[TrackedFrame]]]:
+    """What each agent's frames came to, by name; they come in at the session's own times, ns. told_by: who
+    says how wrong trackers are, the truth, a file with an error model, or nobody ("")."""
+    settings = Config(tracker=tracker, inertial=inertial, sequencer=sequencer)
+    session = read_session(folder)
+    return {
+        name: _track_agent(open_source(f"{folder}/{name}"), settings, agent.clock_offset_ns, error_source)
+        for name, agent in session.agents.items()
+    }
+
+
+def _track_agent(
+    source: Source, settings: Config, clock_offset_ns: int, error_source: str
+) -> tuple[Rig, list[TrackedFrame]]:
+    tracker, errors = make_source_tracker(source, settings), _error_estimator(source, error_source)
+    frames = []
+    for frame in read_frames(source, settings, SequencerCounters()):
+        result = tracker.track(frame)
+        error_cm = errors.update(frame, result)
+        frames.append(
+            TrackedFrame(
+                arrival_ns=frame.stamp_ns - clock_offset_ns,
+                T_odom_body=result.T_odom_body,
+                error_cm=error_cm,
+                candidate=errors.make_keyframe(frame, tracker) if result.keyframe_ready else None,
+                stamp_ns=frame.stamp_ns,
+                state=result.state,
+                new_segment=result.new_segment,
+            )
+        )
+    return source.rig, frames
+
+
+def _error_estimator(source: Source, error_source: str) -> ErrorEstimator:
+    truth = source.truth()
+    if error_source == _TRUE_ERROR:
+        return NoErrorEstimate() if truth is None else GroundTruthError(LocalError(truth))
+    return SynchronousErrorModel(open_error_model(error_source)) if error_source else NoErrorEstimate()
+
+
+def _relative_frames(frames: list[TrackedFrame], start_ns: int) -> Iterator[TrackedFrame]:
+    """Counted from the first frame of all."""
+    for frame in frames:
+        yield dataclasses.replace(frame, arrival_ns=frame.arrival_ns - start_ns)
+
+
+class _RunWriter:
+    """Writes what agents and edge would have written."""
+
+    def __init__(self, folders: dict[str, Path], edge: Path, show: Callable[[Progress], None]) -> None:
+        self._show, self._edge = show, edge
+        self._files = {name: AgentFiles(folder, _ignore_full_disk) for name, folder in folders.items()}
+        self._events = LineFile(edge / "events.jsonl", _ignore_full_disk)
+        self._frames = dict.fromkeys(folders, 0)
+        self._membership = MapMembership()
+        self._corrections = 0
+
+    def write_effect(self, name: str, effect: ev.AgentEffect) -> None:
+        files = self._files[name]
+        match effect:
+            case ev.LocalisedPose():
+                files.write_odom_pose(effect.stamp_ns, effect.T_odom_body)
+                if effect.T_map_odom is not None and effect.map_id is not None:
+                    files.write_map_pose(
+                        effect.stamp_ns, effect.T_map_odom @ effect.T_odom_body, effect.map_id
+                    )
+            case ev.FrameDone():
+                self._frames[name] += 1
+                if self._frames[name] % _SHOW_EVERY == 0:
+                    self._show_progress()
+
+    def write_event(self, fields: dict[str, Any]) -> None:
+        self._events.write(json.dumps(fields))
+        if fields["event"] == "correction":
+            self._membership.add_correction(fields["agent"], fields["map_id"])
+            self._corrections += 1
+
+    def finish(self, world: Simulation, settings: Config) -> None:
+        """The reports. Raises ShareError if the disk was full."""
+        common = {"version": __version__, "config": to_mapping(settings)}
+        for name, machine in world.reports().items():
+            counted = {key: machine[key] for key in ("corrections", "bytes_up", "bytes_down")}
+            unknown = dict.fromkeys(("cpu_ms_per_frame", "decode_ms_per_frame"))
+            report = {**world.logs[name].report(), **unknown, **counted, "protocol": machine, **common}
+            self._files[name].finish(world.logs[name], report)
+            self._files[name].release()
+        report = {**world.edge.report(world.mapper.report()), "series": world.edge.series()}
+        self._events.close()
+        atomic_write(self._edge / "edge.json", json.dumps(report, indent=2) + "\n")
+        self._events.check()
+
+    def _show_progress(self) -> None:
+        self._show(Progress(dict(self._frames), len(self._membership.sharing_agents), self._corrections))
+
+
+def _ignore_full_disk(text: str) -> None:
+    """A file that could not be written is said by its `check`, at the end."""
+
+
+# ---- How long things took in a run in real time, for runs in virtual time that are to be like it.
+
+_DEFAULT_DELAYS = ProcessingDelays()
+
+
+def read_delays(run: Path) -> ProcessingDelays:
+    """By the reports in `run`, a folder by `share evaluate run`: frames, queries, verifications, solutions.
+
+    What is not measured, keyframes' work at the agent and the edge's small steps, is as much slower or
+    quicker than usual as frames and verifications are. Raises UsageError or DataError.
+    """
+    edge, agents = run / "edge" / "edge.json", sorted(run.glob("*/report.json"))
+    if not edge.is_file() or not agents:
+        raise UsageError(f"--costs {run}: is not a run by `share evaluate run`")
+    with own_format_errors(run):
+        return _read_delays(edge, agents)
+
+
+def _read_delays(edge: Path, agents: Sequence[Path]) -> ProcessingDelays:
+    edge_report = read_json(edge)
+    frame = _mean_delay([read_json(path)["track_ms"] for path in agents], edge)
+    query, verify, solve = (
+        _mean_delay([edge_report.get(f"{kind}_ms", {})], edge) for kind in ("place", "verify", "solve")
+    )
+    agent_factor, edge_factor = (
+        frame.p50 / _DEFAULT_DELAYS.frame.p50,
+        verify.p50 / _DEFAULT_DELAYS.verify_accepted.p50,
+    )
+    return replace(
+        ProcessingDelays(
+            **{
+                name: _scaled(getattr(_DEFAULT_DELAYS, name), edge_factor)
+                for name in ("receive", "add", "check_loop", "apply_solution")
+            }
+        ),
+        frame=frame,
+        keyframe=_scaled(_DEFAULT_DELAYS.keyframe, agent_factor),
+        finish_keyframe=_slower(_DEFAULT_DELAYS.finish_keyframe, agent_factor),
+        query=query,
+        verify_accepted=verify,
+        verify_refused=verify,
+        solve=solve,
+    )
+
+
+def _mean_delay(summaries: Sequence[Mapping[str, Any]], where: Path) -> Delay:
+    """Of several, the mean of their percentiles."""
+    known = [one for one in summaries if one.get("n")]
+    if not known:
+        raise DataError(f"{where}: nothing was measured that costs could be taken from; play a longer run")
+    p50, p95 = (sum(float(one[name]) for one in known) / len(known) for name in ("p50", "p95"))
+    return Delay(p50, p95)
+
+
+def _scaled(cost: Delay, factor: float) -> Delay:
+    return Delay(factor * cost.p50, factor * cost.p95)
+
+
+def _slower(cost: Delay | Sampled, factor: float) -> Delay | Sampled:
+    return _scaled(cost, factor) if isinstance(cost, Delay) else Sampled(tuple(factor * ms for ms in cost.ms))

@@ -1,0 +1,64 @@
+"""The pipe between SHARE and a peer in another interpreter. Needs numpy alone: both ends use it.
+
+To the peer: a line of JSON, its calibration; then of every moment a line of JSON and the bytes of both
+images. Back: a line of JSON for each moment: T_world_body, null where it has no pose, and cpu_s. After the
+last one, a peer that mends its past may send one more line: stamps_ns and T_world_body of the trajectory as
+it takes it to be in the end. Numbers go as text that reads back to the same number.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class PeerFrame(NamedTuple):
+    """Both images (H, W) uint8 at stamp_ns; the IMU's stamps (N,) ns and samples (N, 6), gyro rad/s and
+    accelerometer m/s^2, since the moment before, up to the first after stamp_ns."""
+
+    stamp_ns: int
+    imu_ns: NDArray[np.int64]
+    imu: NDArray[np.float64]
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+
+
+def claim_stdout() -> IO[bytes]:
+    """This process's stdout, for answers alone; whatever else is printed goes to stderr from now on."""
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    return out
+
+
+def write_line(stream: IO[bytes], values: dict[str, Any]) -> None:
+    stream.write(json.dumps(values).encode() + b"\n")
+    stream.flush()
+
+
+def read_line(stream: IO[bytes]) -> dict[str, Any] | None:
+    """None at the end."""
+    line = stream.readline()
+    return json.loads(line) if line else None
+
+
+def write_frame(stream: IO[bytes], frame: PeerFrame) -> None:
+    images = (frame.left, frame.right)
+    head = {"stamp_ns": frame.stamp_ns, "imu_ns": frame.imu_ns.tolist(), "imu": frame.imu.tolist()}
+    write_line(stream, head | {"shapes": [image.shape for image in images]})
+    for image in images:
+        stream.write(image.tobytes())
+    stream.flush()
+
+
+def read_frame(stream: IO[bytes]) -> PeerFrame | None:
+    """None at the end."""
+    head = read_line(stream)
+    if head is None:
+        return None
+    images = [np.frombuffer(stream.read(h * w), np.uint8).reshape(h, w) for h, w in head["shapes"]]
+    imu = np.array(head["imu"], np.float64).reshape(-1, 6)
+    return PeerFrame(head["stamp_ns"], np.array(head["imu_ns"], np.int64), imu, *images)

@@ -1,0 +1,206 @@
+"""What else could estimate the error of a keyframe: the four that the paper compares its network with.
+
+Each is a function: taught on some keyframes, stopped by others, it says what error it expects of new ones;
+meanwhile how far it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from share.array_table import ArrayTable
+from share.lab.train.keyframe_table import KeyframeTable
+from share.types import F32, F64
+
+TREES = 70
+_BLOCKS = (2, 4)  # down and across, of each channel of a PSD: 24 numbers for the forest
+_MIN_CM = 0.01
+_EPOCHS, _PATIENCE, _BATCH = 100, 12, 256
+_CNN_EPOCHS, _CNN_PATIENCE = 24, 5  # each takes long: it sees pictures, where the others see what is known
+_CONTRAST_EPOCHS, _TEMPERATURE = 6, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeRows(ArrayTable):
+    """Keyframes, and deep (N, 1280) of each by the backbone."""
+
+    table: KeyframeTable
+    deep_features: F32
+
+
+Predictor = Callable[[KeyframeRows], F64]
+ShowProgress = Callable[[str], None]  # how far it is, for a person
+Baseline = Callable[
+    [KeyframeRows, KeyframeRows, int, ShowProgress], Predictor
+]  # learnt from, stopped by, seed
+
+
+def linear(
+    training: KeyframeRows, validation: KeyframeRows, seed: int, on_progress: ShowProgress
+) -> Predictor:
+    """Least squares on the eight scalars."""
+    from sklearn.linear_model import LinearRegression
+
+    model = LinearRegression().fit(training.table.scalars, training.table.error_cm)
+    return lambda rows: np.maximum(model.predict(rows.table.scalars), _MIN_CM)
+
+
+def forest(
+    training: KeyframeRows, validation: KeyframeRows, seed: int, on_progress: ShowProgress
+) -> Predictor:
+    """70 trees on 1312 numbers: 1280 of the backbone, 24 of the PSD, 8 scalars."""
+    from sklearn.ensemble import RandomForestRegressor
+
+    model = RandomForestRegressor(TREES, min_samples_leaf=3, max_features=0.3, random_state=seed, n_jobs=2)
+    model.fit(_forest_inputs(training), training.table.error_cm)
+    model.n_jobs = 1  # one keyframe at a time is not worth a pool
+    return lambda rows: np.maximum(model.predict(_forest_inputs(rows)), _MIN_CM)
+
+
+def perceptron(
+    training: KeyframeRows, validation: KeyframeRows, seed: int, on_progress: ShowProgress
+) -> Predictor:
+    """A head of two layers on the backbone, which sees the picture and nothing else."""
+    torch.manual_seed(seed)
+    mean, deviation = (
+        training.deep_features.mean(axis=0),
+        np.maximum(training.deep_features.std(axis=0), 1e-3),
+    )
+
+    def inputs(rows: KeyframeRows) -> Tensor:
+        return torch.from_numpy((rows.deep_features - mean) / deviation)
+
+    net = nn.Sequential(nn.Dropout(0.3), nn.Linear(1280, 128), nn.ReLU(), nn.Linear(128, 1))
+    _train(
+        net, (inputs(training), training), (inputs(validation), validation), _EPOCHS, _PATIENCE, on_progress
+    )
+    return lambda rows: _predict(net, inputs(rows))
+
+
+def contrastive(
+    training: KeyframeRows, validation: KeyframeRows, seed: int, on_progress: ShowProgress
+) -> Predictor:
+    """A small CNN of its own on the picture: first taught to put pictures of like errors side by side
+    (supervised contrast, the nearer in error the more alike; Zha et al. 2023), then to tell the error."""
+    torch.manual_seed(seed)
+    encoder, output_layer = _encoder(), nn.Linear(96, 1)
+    net = nn.Sequential(encoder, output_layer)
+    x, y = _half_size_pictures(training), torch.from_numpy(training.table.log_error)
+    optimiser = torch.optim.AdamW(encoder.parameters(), 1e-3, weight_decay=0.01)
+    for epoch in range(_CONTRAST_EPOCHS):
+        on_progress(f"contrast, epoch {epoch + 1} of {_CONTRAST_EPOCHS}")
+        for batch_rows in torch.randperm(len(x)).split(_BATCH):
+            optimiser.zero_grad()
+            _contrastive_loss(functional.normalize(encoder(x[batch_rows]), dim=1), y[batch_rows]).backward()
+            optimiser.step()
+    _train(
+        net,
+        (x, training),
+        (_half_size_pictures(validation), validation),
+        _CNN_EPOCHS,
+        _CNN_PATIENCE,
+        on_progress,
+    )
+    return lambda rows: _predict(net, _half_size_pictures(rows))
+
+
+BASELINES: dict[str, Baseline] = {
+    "linear regression": linear,
+    "random forest": forest,
+    "MLP head": perceptron,
+    "contrastive CNN": contrastive,
+}
+
+
+def _forest_inputs(rows: KeyframeRows) -> F32:
+    """(N, 1312)."""
+    psd = rows.table.psd
+    n, channels, down, across = psd.shape
+    blocks = psd.reshape(n, channels, _BLOCKS[0], down // _BLOCKS[0], _BLOCKS[1], across // _BLOCKS[1])
+    spread = blocks.mean(axis=(3, 5)).reshape(n, -1)
+    return np.concatenate([rows.deep_features, spread, rows.table.scalars], axis=1)
+
+
+def _half_size_pictures(rows: KeyframeRows) -> Tensor:
+    """Half as large: (N, 1, 64, 64)."""
+    x = torch.from_numpy(rows.table.picture).to(torch.float32)[:, None] / 127.5 - 1
+    return functional.avg_pool2d(x, 2)
+
+
+def _encoder() -> nn.Module:
+    layers: list[nn.Module] = []
+    for before, after in ((1, 16), (16, 32), (32, 64), (64, 96)):
+        layers += [nn.Conv2d(before, after, 3, 2, 1), nn.BatchNorm2d(after), nn.ReLU()]
+    return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten())
+
+
+def _contrastive_loss(z: Tensor, y: Tensor) -> Tensor:
+    """z (B, D) of length 1, y (B,): of each pair, against all that are as far from the first in y or further.
+
+    Of anchor i, all others in falling order of that: then those against which j stands are the ones up to j,
+    and to the last that is as far as j. So it takes B^2 log B, where the sum as it is written takes B^3.
+    """
+    others = ~torch.eye(len(z), dtype=torch.bool)
+    similarity = (z @ z.T / _TEMPERATURE)[others].view(len(z), -1)
+    distance = (y[:, None] - y[None]).abs()[others].view(len(z), -1)
+    distance, order = distance.sort(dim=1, descending=True)
+    similarity = similarity.gather(1, order)
+    last = torch.searchsorted(-distance, -distance, right=True) - 1
+    denominators = similarity.logcumsumexp(dim=1).gather(1, last)
+    return (denominators - similarity).mean()
+
+
+def _train(
+    net: nn.Module,
+    training: tuple[Tensor, KeyframeRows],
+    validation: tuple[Tensor, KeyframeRows],
+    epochs: int,
+    patience: int,
+    on_progress: ShowProgress,
+) -> None:
+    """By the Poisson deviance, as ours, until it gets no better where it stops."""
+    optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=0.05)
+    x, y = training[0], torch.from_numpy(training[1].table.error_cm)
+    validation_inputs, validation_errors = validation[0], torch.from_numpy(validation[1].table.error_cm)
+    best, best_weights, epochs_without_gain = float("inf"), _copy(net), 0
+    for epoch in range(epochs):
+        on_progress(f"epoch {epoch + 1} of {epochs} at most")
+        net.train()
+        for which in torch.randperm(len(x)).split(_BATCH):
+            optimiser.zero_grad()
+            _poisson_deviance(net(x[which])[:, 0], y[which]).backward()
+            optimiser.step()
+        net.eval()
+        with torch.no_grad():
+            validation_loss = float(
+                _poisson_deviance(
+                    torch.cat([net(some)[:, 0] for some in validation_inputs.split(_BATCH)]),
+                    validation_errors,
+                )
+            )
+        epochs_without_gain += 1
+        if validation_loss < best:
+            best, best_weights, epochs_without_gain = validation_loss, _copy(net), 0
+        if epochs_without_gain >= patience:
+            break
+    net.load_state_dict(best_weights)
+    net.eval()
+
+
+def _poisson_deviance(log_predicted: Tensor, error_cm: Tensor) -> Tensor:
+    return (torch.exp(log_predicted) - error_cm * log_predicted).mean()
+
+
+def _predict(net: nn.Module, x: Tensor) -> F64:
+    with torch.no_grad():
+        return np.concatenate([torch.exp(net(some)[:, 0]).numpy() for some in x.split(_BATCH)]).astype(float)
+
+
+def _copy(net: nn.Module) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in net.state_dict().items()}

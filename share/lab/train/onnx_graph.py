@@ -1,0 +1,143 @@
+"""The error model as ONNX: a backbone that is there already, and heads put onto it node by node.
+
+Written out by hand, because it is thirty nodes a head, and so that the file depends on nobody's exporter.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from share.lab.train.trained_heads import TrainedHeads
+from share.odometry.error_model.inference import OUTPUTS
+from share.odometry.error_model.inputs import INPUT_SHAPES
+from share.types import F32
+
+DEEP_OUTPUT = "deep"  # the backbone's last tensor (N, 1280)
+_HEAD_PREFIX = "head/"  # names of all that heads bring begin with it
+_INPUTS = {name: ("N", *shape) for name, shape in INPUT_SHAPES.items() if name != "picture"}
+_OUTPUT_SHAPES = {"log_error": ("N", 3), "embedding": ("N", 64), "distance": ("N",)}
+
+
+def with_heads(base: bytes, fitted: TrainedHeads) -> bytes:
+    """`base`, a model with a backbone and perhaps other heads, with these."""
+    model = onnx.load_model_from_string(base)
+    graph = model.graph
+    _strip_heads(graph)
+    nodes = _head_nodes(fitted)
+    graph.node.extend(nodes.all)
+    graph.initializer.extend(nodes.constants)
+    graph.input.extend(
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in _INPUTS.items()
+    )
+    graph.output.extend(
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, _OUTPUT_SHAPES[name]) for name in OUTPUTS
+    )
+    helper.set_model_props(model, {name: str(value) for name, value in fitted.about.items()})
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString())
+
+
+def backbone_id(base: bytes) -> str:
+    """The same for models that differ in their heads alone."""
+    graph = onnx.load_model_from_string(base).graph
+    _strip_heads(graph)
+    parts = (one.SerializeToString() for field in (graph.node, graph.initializer) for one in field)
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
+
+
+def origin(base: bytes) -> str:
+    """Where its backbone comes from, and by what licence; empty if nobody says."""
+    return str(onnx.load_model_from_string(base).doc_string)
+
+
+def _strip_heads(graph: Any) -> None:
+    """Of earlier heads; deep stays as an output, by which others are taught."""
+    for field in (graph.node, graph.initializer):
+        remaining = [one for one in field if not one.name.startswith(_HEAD_PREFIX)]
+        del field[:]
+        field.extend(remaining)
+    for field, names in ((graph.input, _INPUTS), (graph.output, OUTPUTS)):
+        remaining = [one for one in field if one.name not in names]
+        del field[:]
+        field.extend(remaining)
+
+
+class _NodeList:
+    """Nodes and constants, in order."""
+
+    def __init__(self) -> None:
+        self.all: list[Any] = []
+        self.constants: list[Any] = []
+
+    def add(self, kind: str, inputs: list[str], output: str = "", **attributes: Any) -> str:
+        """Its output."""
+        name = f"{_HEAD_PREFIX}{len(self.all)}"
+        self.all.append(helper.make_node(kind, inputs, [output or name], name, **attributes))
+        return output or name
+
+    def columns(self, x: str) -> list[str]:
+        """Three of them, (N, 1) each."""
+        name = f"{_HEAD_PREFIX}{len(self.all)}"
+        each = [f"{name}/{k}" for k in range(3)]
+        ones = self.constant(f"{name}/ones", np.ones(3, np.int64))
+        self.all.append(helper.make_node("Split", [x, ones], each, name, axis=1))
+        return each
+
+    def constant(self, name: str, value: Any) -> str:
+        name = name if name.startswith(_HEAD_PREFIX) else _HEAD_PREFIX + name
+        self.constants.append(numpy_helper.from_array(np.asarray(value), name))
+        return name
+
+
+class _HeadNodes:
+    """joined: (N, 96). told (N, 3): log of the error, and how far the interval's ends are from it."""
+
+    def __init__(self, nodes: _NodeList, number: int, weights: dict[str, F32], numbers: str) -> None:
+        self._nodes, self._number, self._weights = nodes, number, weights
+        visual = self._linear(DEEP_OUTPUT, "visual.0", relu=True)
+        norm = self._layer("visual.2")
+        self.embedding = nodes.add("LayerNormalization", [visual, *norm], axis=-1, epsilon=1e-5)
+        spread = self._conv(self._conv("psd", "spread.0"), "spread.2")
+        spread = nodes.add("Flatten", [nodes.add("GlobalAveragePool", [spread])])
+        numeric = self._linear(numbers, "numbers.0", relu=True)
+        self.joined = nodes.add("Concat", [self.embedding, spread, numeric], axis=1)
+        outputs = self._linear(self._linear(self.joined, "joined.0", relu=True), "joined.2")
+        correction, below, above = nodes.columns(outputs)
+        expected = nodes.add("Add", [correction, self._linear(numbers, "straight")])
+        widths = [nodes.add("Softplus", [side]) for side in (below, above)]
+        self.prediction = nodes.add("Concat", [expected, *widths], axis=1)
+
+    def _linear(self, x: str, layer: str, relu: bool = False) -> str:
+        y = self._nodes.add("Gemm", [x, *self._layer(layer)], transB=1)
+        return self._nodes.add("Relu", [y]) if relu else y
+
+    def _conv(self, x: str, layer: str) -> str:
+        shape: dict[str, Any] = {"kernel_shape": [3, 3], "strides": [2, 2], "pads": [1, 1, 1, 1]}
+        return self._nodes.add("Relu", [self._nodes.add("Conv", [x, *self._layer(layer)], **shape)])
+
+    def _layer(self, name: str) -> list[str]:
+        """Its weight and bias."""
+        names = [f"{name}.{what}" for what in ("weight", "bias")]
+        return [self._nodes.constant(f"{self._number}/{name}", self._weights[name]) for name in names]
+
+
+def _head_nodes(fitted: TrainedHeads) -> _NodeList:
+    """All heads, and what they say on average."""
+    nodes = _NodeList()
+    numbers = nodes.add("Concat", ["scalars", "recent"], axis=1)
+    heads = [_HeadNodes(nodes, k, weights, numbers) for k, weights in enumerate(fitted.heads)]
+    expected, below, above = nodes.columns(nodes.add("Mean", [head.prediction for head in heads]))
+    margin = nodes.constant("margin", np.array(fitted.margin, np.float32))
+    below, above = (nodes.add("Relu", [nodes.add("Add", [width, margin])]) for width in (below, above))
+    ends = nodes.add("Sub", [expected, below]), nodes.add("Add", [expected, above])
+    nodes.add("Concat", [expected, *ends], "log_error", axis=1)
+    nodes.add("Identity", [heads[0].embedding], "embedding")
+    offset = nodes.add("Sub", [heads[0].joined, nodes.constant("mean", fitted.mean)])
+    offset = nodes.add("MatMul", [offset, nodes.constant("whitening", fitted.whitening)])
+    nodes.add("ReduceL2", [offset], "distance", axes=[1], keepdims=0)
+    return nodes

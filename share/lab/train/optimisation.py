@@ -1,0 +1,161 @@
+"""Teaching the network: epochs until it gets no better on rooms that it does not learn from."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from share.errors import DataError
+from share.files.reading import MB, read_bytes
+from share.files.writing import atomic_write
+from share.lab.train.network import Heads, loss
+from share.types import F32
+
+_MAX_BYTES = 200 * MB  # of a checkpoint: four heads and their moments have 5
+ShowEpoch = Callable[[int, float, float], None]  # epoch, loss where it learns, loss where it stops
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """epochs at most; patience: without a gain, after which it ends. dropout: of what the backbone
+    says, since rooms are few, and many pictures are of the same one. heads: whose mean is told."""
+
+    epochs: int = 200
+    patience: int = 25
+    batch: int = 256
+    rate: float = 1e-3
+    decay: float = 0.05
+    dropout: float = 0.9
+    heads: int = 4
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """Of N keyframes: deep (N, 1280), by the backbone; psd as in `Features`; numbers (N, 22), its scalars
+    and recent; log_error (N,)."""
+
+    deep_features: F32
+    psd: F32
+    numbers: F32
+    log_error: F32
+
+    def tensors(self, device: torch.device) -> list[torch.Tensor]:
+        """In this order."""
+        return [torch.from_numpy(column).to(device) for column in self._columns()]
+
+    @property
+    def crc(self) -> int:
+        """The same for the same keyframes."""
+        return zlib.crc32(b"".join(column.tobytes() for column in self._columns()))
+
+    def _columns(self) -> list[F32]:
+        return [np.ascontiguousarray(getattr(self, f.name)) for f in dataclasses.fields(self)]
+
+
+@dataclass
+class _TrainingProgress:
+    epoch: int = 0
+    best: float = float("inf")
+    best_epoch: int = 0
+
+
+def train_heads(
+    training: Inputs, validation: Inputs, options: TrainingOptions, checkpoint: Path | None, show: ShowEpoch
+) -> Heads:
+    """The heads that do best on `validation`. checkpoint: a file to go on from, if it is of the same
+    keyframes and options, and to keep what has been learnt in, each epoch. On a GPU where there is one."""
+    torch.manual_seed(options.seed)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    heads = Heads(options.heads, options.dropout)
+    heads.to(device)
+    optimiser = torch.optim.AdamW(heads.parameters(), options.rate, weight_decay=options.decay)
+    progress, best = _TrainingProgress(), _copy(heads)
+    identity = {**dataclasses.asdict(options), "learn": training.crc, "stop": validation.crc}
+    if checkpoint is not None and checkpoint.is_file():
+        try:
+            saved = torch.load(
+                io.BytesIO(read_bytes(checkpoint, _MAX_BYTES)), map_location=device, weights_only=True
+            )
+            if saved["what"] == identity:
+                heads.load_state_dict(saved["heads"])
+                optimiser.load_state_dict(saved["optimiser"])
+                progress, best = _TrainingProgress(**saved["at"]), saved["best"]
+        except Exception as error:  # torch, pickle and zip each have their own
+            raise DataError(f"{checkpoint}: is damaged; remove it to begin anew ({error!r:.200})") from None
+    rows, validation_tensors = training.tensors(device), validation.tensors(device)
+    while progress.epoch < options.epochs and progress.epoch - progress.best_epoch < options.patience:
+        training_loss = _train_epoch(heads, optimiser, rows, options, progress.epoch)
+        validation_loss = _validation_loss(heads, validation_tensors)
+        progress.epoch += 1
+        if validation_loss < progress.best:
+            progress.best, progress.best_epoch, best = validation_loss, progress.epoch, _copy(heads)
+        show(progress.epoch, training_loss, validation_loss)
+        if checkpoint is not None:
+            _save_checkpoint(checkpoint, identity, heads, optimiser, progress, best)
+    heads.load_state_dict(best)
+    heads.cpu().eval()
+    return heads
+
+
+def _train_epoch(
+    heads: Heads,
+    optimiser: torch.optim.Optimizer,
+    rows: list[torch.Tensor],
+    options: TrainingOptions,
+    epoch: int,
+) -> float:
+    """In an order that the seed and the epoch decide, so that a run that goes on goes on as it would have."""
+    heads.train()
+    torch.manual_seed(options.seed * 100_003 + epoch)
+    order, total = torch.randperm(len(rows[0])), 0.0
+    for batch_rows in order.split(options.batch):
+        *inputs, log_error = (column[batch_rows.to(column.device)] for column in rows)
+        optimiser.zero_grad()
+        value = loss(heads(*inputs), log_error)
+        (options.heads * value).backward()  # each learns as it would alone
+        for head in heads.each:
+            torch.nn.utils.clip_grad_norm_(head.parameters(), 1.0)
+        optimiser.step()
+        total += value.item() * len(batch_rows)
+    return total / len(order)
+
+
+def _validation_loss(heads: Heads, rows: list[torch.Tensor]) -> float:
+    heads.eval()
+    with torch.no_grad():
+        return float(loss(heads(*rows[:-1]).mean(dim=0), rows[-1]))
+
+
+def _copy(heads: Heads) -> dict[str, torch.Tensor]:
+    return {name: value.detach().cpu().clone() for name, value in heads.state_dict().items()}
+
+
+def _save_checkpoint(
+    path: Path,
+    identity: dict[str, Any],
+    heads: Heads,
+    optimiser: torch.optim.Optimizer,
+    progress: _TrainingProgress,
+    best: dict[str, torch.Tensor],
+) -> None:
+    data = io.BytesIO()
+    torch.save(
+        {
+            "what": identity,
+            "heads": heads.state_dict(),
+            "optimiser": optimiser.state_dict(),
+            "at": dataclasses.asdict(progress),
+            "best": best,
+        },
+        data,
+    )
+    atomic_write(path, data.getvalue())

@@ -1,0 +1,89 @@
+"""How much larger one camera sees the same points than another: whose depths are wrong, relative to whose.
+
+Of a matched point both views know a depth. With T_c_q in the candidate's units, a query whose depths are all
+too large by e^l has inverse depths that are too small by it, so y' = h(T, (u, v, rho e^l)) has to meet y_c:
+the residual of `share.mapping.recognition.refinement`, with one unknown more. Both a wrong stereo baseline
+and a wrong focal length show here at once, from one pair of views. A pose that takes both as of one scale is
+off, by some mm for each percent and metre of depth: `Scale.pose_sensitivity` says how."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from share.geometry import se3
+from share.mapping.recognition.refinement import (
+    KeypointNoise,
+    keypoint_jacobian,
+    pose_jacobian,
+    transfer_keypoints,
+)
+from share.types import F64
+
+_MIN_MATCHES = 10  # matches with both depths: fewer say little
+_ITERATIONS = 2
+_MAX_LOG_SCALE = 1.0  # log scale; beyond, the matches are none
+_RIDGE = 1e-6 * np.eye(7)
+
+
+class DepthScale(NamedTuple):
+    """log: of the query's depths over the candidate's; sigma: of log. lean (6,): where T_c_q goes, perturbed
+    on the left, by each unit of log that is taken into account; None where not known."""
+
+    log: float
+    sigma: float
+    pose_sensitivity: F64 | None = None
+
+    def reverse(self) -> DepthScale:
+        """The same, from the other end, but for the lean."""
+        return DepthScale(-self.log, self.sigma)
+
+
+def relative_depth_scale(
+    T_c_q: F64, y_q: F64, y_c: F64, noise_q: KeypointNoise, noise_c: KeypointNoise, gate: float
+) -> DepthScale | None:
+    """Of cameras, from T_c_q (4, 4) as refined and matched keypoints y_q, y_c (N, 3), NaN where a depth is
+    unknown. gate: squared Mahalanobis distance of an inlier. None where too few matches have both depths.
+    Raises LinAlgError where they determine nothing."""
+    has_both_depths = np.isfinite(y_q[:, 2]) & np.isfinite(y_c[:, 2])
+    source, target = y_q[has_both_depths].T, y_c[has_both_depths].T
+    T, log_scale = T_c_q, 0.0
+    for _ in range(_ITERATIONS):
+        J, information, residual = _linearise(T, log_scale, source, target, noise_q, noise_c)
+        WJ = information @ J
+        d2 = (residual * (information @ residual[:, :, None])[:, :, 0]).sum(1)
+        is_inlier = d2 < gate
+        if is_inlier.sum() < _MIN_MATCHES:
+            return None
+        J, WJ, residual = J[is_inlier], WJ[is_inlier], residual[is_inlier]
+        J, WJ = J.reshape(-1, 7), WJ.reshape(-1, 7)
+        normal = J.T @ WJ + _RIDGE
+        step = np.linalg.solve(normal, WJ.T @ residual.ravel())
+        T, log_scale = se3.exp(step[:6]) @ T, log_scale + float(step[6])
+    if not abs(log_scale) < _MAX_LOG_SCALE:
+        return None
+    variance = max(1.0, float(d2[is_inlier].sum()) / max(1, 3 * int(is_inlier.sum()) - 7))
+    pose_sensitivity = -np.linalg.solve(normal[:6, :6], normal[:6, 6])
+    return DepthScale(log_scale, float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance)), pose_sensitivity)
+
+
+def _linearise(
+    T: F64, log_scale: float, source: F64, target: F64, noise_q: KeypointNoise, noise_c: KeypointNoise
+) -> tuple[F64, F64, F64]:
+    """J (N, 3, 7), information (N, 3, 3) and residual (N, 3); no information of a point behind the camera."""
+    y = source.copy()
+    y[2] *= np.exp(log_scale)
+    moved = transfer_keypoints(T, y)
+    K = keypoint_jacobian(T, y, moved)  # (3, 3, N)
+    J = np.concatenate([pose_jacobian(moved), (K[:, 2] * y[2])[None]]).transpose(2, 1, 0)
+    keypoint_jacobian_t = K.transpose(2, 0, 1)
+    covariance = (keypoint_jacobian_t * noise_q.variances) @ keypoint_jacobian_t.swapaxes(1, 2) + np.diag(
+        noise_c.variances
+    )
+    residual = (target - moved).T
+    is_visible = np.isfinite(moved.sum(0))
+    J, residual = np.where(is_visible[:, None, None], J, 0.0), np.where(is_visible[:, None], residual, 0.0)
+    information = np.zeros_like(covariance)
+    information[is_visible] = np.linalg.inv(covariance[is_visible])
+    return J, information, residual

@@ -1,0 +1,62 @@
+"""An agent's guard against its edge: what the edge sent and the agent has not taken yet is bounded.
+
+The agent looks itself, whenever it receives (`share.net.connection_guard` does the same for an edge).
+"""
+
+from __future__ import annotations
+
+from share.net import tcp
+from share.net.backlog import Backlog, BacklogLimits
+
+
+class AgentConnectionGuard:
+    """Of one connection at a time."""
+
+    def __init__(self, limits: BacklogLimits) -> None:
+        self._limits = limits
+        self._connection: tuple[int, int] | None = None  # descriptor and cookie
+        self._backlog = Backlog(0.0)
+
+    def set_connection(self, descriptor: int, now_s: float) -> None:
+        """To an edge, perhaps another than before."""
+        cookie = tcp.socket_cookie(descriptor)
+        self._connection = None if cookie is None else (descriptor, cookie)
+        self._backlog = Backlog(now_s)
+
+    def deliver(self, size: int, parts: int, now_s: float) -> None:
+        """A message of so many bytes on the wire, in so many parts, was received."""
+        self._backlog.deliver(size, parts, 1, now_s)
+
+    def check(self) -> str | None:
+        """What is too much of what waits; then the connection is broken off."""
+        if self._connection is None:
+            return None
+        read = tcp.bytes_read(self._connection[0]) if self._is_open() else None
+        if read is None:
+            self._connection = None
+            return None
+        self._backlog.update_read(*read)
+        if self._backlog.exceeds(self._limits):
+            return self._abort(
+                "many small messages" if self._backlog.has_small_parts else "more than may wait"
+            )
+        return None
+
+    def check_empty(self) -> str | None:
+        """There is no message now: what was read before the last time is at most a part of one. As
+        `check`."""
+        backlog = self._backlog
+        if self._connection is not None and backlog.marked_bytes > self._limits.message_bytes:
+            return self._abort("a message that does not end")
+        backlog.classify_commands()
+        backlog.mark()
+        return None
+
+    def _is_open(self) -> bool:
+        return self._connection is not None and tcp.socket_cookie(self._connection[0]) == self._connection[1]
+
+    def _abort(self, reason: str) -> str:
+        if self._connection is not None:
+            tcp.abort(*self._connection)
+        self._connection = None
+        return reason

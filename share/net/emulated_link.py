@@ -1,0 +1,140 @@
+"""An agent's link through an emulated network (`share.net.channel`), for experiments on one machine."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from share.errors import UsageError
+from share.files.yaml_file import read_yaml
+from share.net.channel import NETWORK_PRESETS, Channel, NetworkModel
+from share.net.transport import LINGER_MS, QUEUE_MESSAGES, AgentLink
+from share.plain_data import from_mapping
+from share.wire.codec import Bytes, message_bytes
+
+_NS_PER_MS = 1_000_000
+
+
+def load_network(name: str) -> NetworkModel:
+    """By its name, or of a YAML file {up: {mbps, delay_ms, jitter_ms, loss, burst}, down: {…}}. Raises
+    UsageError, ConfigError."""
+    if name in NETWORK_PRESETS:
+        return NETWORK_PRESETS[name]
+    path = Path(name)
+    if not path.is_file():
+        raise UsageError(f"--link: '{name}' is no file and none of {', '.join(NETWORK_PRESETS)}")
+    return from_mapping(NetworkModel, read_yaml(path).data, str(path))
+
+
+class EmulatedLink:
+    """`AgentLink` around another. What is sent is handed on once it would have arrived, and what arrives is
+    handed out once it would have: while `receive` waits, which may return early for that. Same seed, same
+    delays."""
+
+    def __init__(self, link: AgentLink, network: NetworkModel, seed: int) -> None:
+        self._link = link
+        up, down = np.random.default_rng(seed).spawn(2)
+        self._up = Channel(network.up, network.round_trip_ms, up)
+        self._down = Channel(network.down, network.round_trip_ms, down)
+        self._outbound: deque[tuple[int, Sequence[Bytes]]] = deque()  # in order, with when they arrive
+        self._inbound: deque[tuple[int, list[bytes]]] = deque()
+
+    def send(self, frames: Sequence[Bytes]) -> bool:
+        self._forward_due()
+        if len(self._outbound) >= QUEUE_MESSAGES:
+            return False
+        self._outbound.append((self._up.arrival_ns(message_bytes(frames), time.monotonic_ns()), frames))
+        return True
+
+    def receive(self, timeout_ms: int) -> list[bytes] | None:
+        end_ns = time.monotonic_ns() + timeout_ms * _NS_PER_MS
+        while True:
+            self._forward_due()
+            now_ns = time.monotonic_ns()
+            if self._inbound and self._inbound[0][0] <= now_ns:
+                return self._inbound.popleft()[1]
+            next_ns = min([end_ns, *(queue[0][0] for queue in (self._outbound, self._inbound) if queue)])
+            if 0 < next_ns - now_ns < _NS_PER_MS:  # the link below counts in milliseconds
+                time.sleep((next_ns - now_ns) * 1e-9)
+                continue
+            message = self._link.receive(max(0, next_ns - now_ns) // _NS_PER_MS)
+            if message is None:
+                return None  # time is up, something goes on, or it was woken
+            at_ns = self._down.arrival_ns(message_bytes(message), time.monotonic_ns())
+            self._inbound.append((at_ns, message))
+
+    def trouble(self) -> str | None:
+        return self._link.trouble()
+
+    def poll_connected(self) -> bool:
+        return self._link.poll_connected()
+
+    def wake(self) -> None:
+        self._link.wake()
+
+    def close(self) -> None:
+        end_ns = time.monotonic_ns() + LINGER_MS * _NS_PER_MS
+        while self._outbound and self._outbound[0][0] < end_ns:
+            time.sleep(max(0, self._outbound[0][0] - time.monotonic_ns()) * 1e-9)
+            self._forward_due()
+        self._link.close()
+
+    def _forward_due(self) -> None:
+        """What has arrived at the edge by now; if there is none, it is lost."""
+        while self._outbound and self._outbound[0][0] <= time.monotonic_ns():
+            self._link.send(self._outbound.popleft()[1])
+
+
+# ---- Which emulated network each agent of a session goes through, as a person writes it.
+
+
+@dataclass(frozen=True)
+class LinkAssignment:
+    """Names or files. usual: for who has none of its own; None: this machine's own. own: by agent."""
+
+    default: str | None
+    per_agent: Mapping[str, str]
+
+    @classmethod
+    def parse(cls, text: str | None) -> LinkAssignment:
+        """`wifi5`, all; `wifi5,bob=wifi-busy`, all but Bob; `bob=far.yaml`, Bob alone.
+
+        Raises UsageError or ConfigError where one of them is no network.
+        """
+        if text is None:
+            return cls(None, {})
+        if text in NETWORK_PRESETS or Path(text).is_file():  # a file's name may have any character
+            pairs = [("", text)]
+        else:
+            pairs = [_parse_pair(part.strip()) for part in text.split(",")]
+        for _, name in pairs:
+            load_network(name)
+        agents = [agent for agent, _ in pairs]
+        if duplicates := [agent for agent in agents if agents.count(agent) > 1]:
+            raise UsageError(f"--link: two for {duplicates[0] or 'all'}; give one, and others as AGENT=LINK")
+        per_agent = dict(pairs)
+        return cls(per_agent.pop("", None), per_agent)
+
+    def check(self, agents: Collection[str]) -> None:
+        """Raises UsageError where a link is that of an agent who is not there."""
+        if unknown := [name for name in self.per_agent if name not in agents]:
+            raise UsageError(f"--link: no agent is called '{unknown[0]}'; there are {', '.join(agents)}")
+
+    def name_for(self, agent: str) -> str | None:
+        return self.per_agent.get(agent, self.default)
+
+    def network_for(self, agent: str) -> NetworkModel:
+        """One without limits where it has no link."""
+        name = self.name_for(agent)
+        return NetworkModel() if name is None else load_network(name)
+
+
+def _parse_pair(part: str) -> tuple[str, str]:
+    """An agent, "" for all, and its network."""
+    agent, separator, name = part.partition("=")
+    return (agent, name) if separator else ("", part)

@@ -1,0 +1,242 @@
+"""What the last seconds were like, since the error of the last seconds is what is to be told.
+
+A keyframe shows how well its tracker fares now; what was lost three seconds ago, in the dark, is still lost.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from share.odometry.error_model.history import RecentMotion
+from share.types import F32, U8, FeatureStatistics, TrackState, checked_array
+from share.vision.corners import cell_indices
+
+# ---- Eight numbers of a keyframe: how its image looks, and how its tracker fares.
+#
+# Source: SHARE, IMWUT 10(3) 97, 2026; what it leaves open is settled in docs/error-model.md.
+
+SCALAR_NAMES = (
+    "brightness",
+    "contrast",
+    "entropy",
+    "laplacian variance",
+    "keypoints",
+    "matches",
+    "active map points",
+    "tracking score",
+)
+COUNT_SCALE = 200  # features or points that count as 1
+_MIN_SIGMA_CM, _SIGMA_DECADES = 0.01, 4.0  # the tracker's own sigma: 0, and what makes 1
+
+
+def scalar_features(thumbnail: U8, statistics: FeatureStatistics, sigma_cm: float) -> F32:
+    """(8,) as `SCALAR_NAMES`, each about 0 to 1. small (240, 320): the image, scaled. sigma_cm: what the
+    tracker says itself of its error (`Odometer`)."""
+    inlier_count = int(statistics.inlier.sum())
+    mean, deviation = _moments(thumbnail)
+    _, laplacian = _moments(cv2.Laplacian(thumbnail, cv2.CV_16S))
+    return np.array(
+        [
+            mean / 255,
+            deviation / 128,
+            _entropy(thumbnail) / 8,
+            math.log10(1 + laplacian**2) / 4,
+            _log_count(statistics.expected),
+            inlier_count / max(statistics.expected, inlier_count, 1),
+            _log_count(statistics.mapped),
+            tracking_score(sigma_cm),
+        ],
+        np.float32,
+    )
+
+
+def _moments(image: NDArray[np.generic]) -> tuple[float, float]:
+    """Mean and standard deviation."""
+    mean, deviation = cv2.meanStdDev(image)
+    return float(mean[0, 0]), float(deviation[0, 0])
+
+
+def _entropy(image: U8) -> float:
+    """Of its gray levels, bits."""
+    count = cv2.calcHist([image], [0], None, [256], [0, 256])
+    p = count[count > 0] / image.size
+    return float(-(p * np.log2(p)).sum())
+
+
+def tracking_score(sigma_cm: float) -> float:
+    """The tracking score: 0 for one that is sure of itself, 1 for a metre."""
+    return math.log10(max(sigma_cm, _MIN_SIGMA_CM) / _MIN_SIGMA_CM) / _SIGMA_DECADES
+
+
+def _log_count(count: int) -> float:
+    return math.log1p(count) / math.log1p(COUNT_SCALE)
+
+
+# ---- Where in the image there is something to hold on to: the point spatial distribution (PSD).
+#
+# A grid over cam0's image with three channels: how strong a corner each cell has, how many features there the
+# pose rests on, and how near they are. Source: SHARE, IMWUT 10(3) 97, 2026; scales: docs/error-model.md.
+
+PSD_GRID = (16, 12)  # cells across and down, whatever the camera
+PSD_CHANNELS = 3
+CELL_PX = 20  # in the image in which corners are sought
+_CORNER_BLOCK_PX = 3  # px, of a corner there
+_MIN_EIGENVALUE, _CORNER_DECADES = 1e-5, 4.0  # of a corner's least eigenvalue: 0, and what makes 1
+_FEATURES_PER_CELL = 4  # features in a cell that count as 1
+_MIN_DEPTH_M = 0.5  # counts as 1
+
+
+def point_distribution(thumbnail: U8, statistics: FeatureStatistics, size: tuple[int, int]) -> F32:
+    """(3, 12, 16): strength of the strongest corner, features that were believed, their mean inverse depth;
+    all from 0, for nothing, to 1.
+
+    small (240, 320): the image, scaled so that a cell has `CELL_PX`; size: width and height that it had, in
+    which footing is.
+    """
+    count = PSD_GRID[0] * PSD_GRID[1]
+    px, inverse = statistics.px[statistics.inlier], 1 / statistics.depth[statistics.inlier]
+    cell, is_known = cell_indices(px, size, PSD_GRID), np.isfinite(inverse)
+    inlier_count = np.bincount(cell, minlength=count)
+    total = np.bincount(cell[is_known], inverse[is_known].clip(0, 1 / _MIN_DEPTH_M), count)
+    mean_inverse = total / np.maximum(np.bincount(cell[is_known], minlength=count), 1)
+    shape = (PSD_GRID[1], PSD_GRID[0])
+    return np.stack(
+        [
+            _corner_strength(thumbnail),
+            np.minimum(inlier_count / _FEATURES_PER_CELL, 1).reshape(shape).astype(np.float32),
+            (mean_inverse * _MIN_DEPTH_M).reshape(shape).astype(np.float32),
+        ]
+    )
+
+
+def _corner_strength(thumbnail: U8) -> F32:
+    """(12, 16), by the logarithm of the least eigenvalue (Shi and Tomasi 1994)."""
+    eigenvalue = cv2.cornerMinEigenVal(thumbnail, _CORNER_BLOCK_PX)
+    strongest = eigenvalue.reshape(PSD_GRID[1], CELL_PX, PSD_GRID[0], CELL_PX).max(axis=(1, 3))
+    out: F32 = (
+        (np.log10(np.maximum(strongest, _MIN_EIGENVALUE) / _MIN_EIGENVALUE) / _CORNER_DECADES)
+        .clip(0, 1)
+        .astype(np.float32)
+    )
+    return out
+
+
+RECENT_NAMES = (
+    "mean score",
+    "least score",
+    "most score",
+    "way",
+    "turn",
+    "mean surprise",
+    "most surprise",
+    "refused",
+    "mean matches",
+    "least matches",
+    "weak",
+    "blind",
+    "deaf",
+    "gap",
+)
+_BLIND_STATES = (TrackState.INERTIAL_ONLY, TrackState.LOST)
+_PATH_SCALE_M, _ROTATION_SCALE_RAD = 5.0, 5.0  # count as 1
+_NIS_SCALE = 100.0  # squared sigmas, the same
+_GAP_SCALE_S, _MIN_GAP_S = 5.0, 0.1  # between two frames: 1, and where the logarithm begins
+
+
+def recent_features(motion: RecentMotion) -> F32:
+    """(14,) as `RECENT_NAMES`, each about 0 to 1: the tracking score (`scalar_features`) of the keyframes;
+    how far the body
+    went and turned; and of the frames, how surprised the tracker was, what share of the features it found it
+    refused, how many it believed, in what share of them it was weak, blind (the IMU alone, or lost) and
+    deaf (without an IMU), and the longest time between two."""
+    scores = [tracking_score(sigma_cm) for sigma_cm in motion.sigmas_cm]
+    frames = motion.frames
+    stamps_ns, found_count, inlier_count = (np.array([outcome[k] for outcome in frames]) for k in (0, 3, 4))
+    log_nis = np.log1p([outcome.median_nis for outcome in frames]) / math.log1p(_NIS_SCALE)
+    rejected = np.where(found_count > 0, np.maximum(0, 1 - inlier_count / np.maximum(found_count, 1)), 0)
+    matches = np.log1p(inlier_count) / math.log1p(COUNT_SCALE)
+    gap_s = np.diff(stamps_ns).max(initial=0) * 1e-9
+    flags = [(f.state is TrackState.WEAK, f.state in _BLIND_STATES, not f.has_imu) for f in frames]
+    return np.array(
+        [
+            np.mean(scores),
+            min(scores),
+            max(scores),
+            motion.path_m / _PATH_SCALE_M,
+            motion.rotation_rad / _ROTATION_SCALE_RAD,
+            log_nis.mean(),
+            log_nis.max(),
+            rejected.mean(),
+            matches.mean(),
+            matches.min(),
+            *np.mean(flags, axis=0),
+            math.log1p(gap_s / _MIN_GAP_S) / math.log1p(_GAP_SCALE_S / _MIN_GAP_S),
+        ],
+        np.float32,
+    )
+
+
+# ---- What the error model is told of a keyframe: the same code makes it for training and on the agent.
+
+PICTURE_PX = 128  # across and down: the whole image, whatever its shape
+INPUT_SHAPES = {
+    "picture": (PICTURE_PX, PICTURE_PX),
+    "psd": (PSD_CHANNELS, PSD_GRID[1], PSD_GRID[0]),
+    "scalars": (len(SCALAR_NAMES),),
+    "recent": (len(RECENT_NAMES),),
+}
+_THUMBNAIL_SIZE = (PSD_GRID[0] * CELL_PX, PSD_GRID[1] * CELL_PX)  # 320 x 240
+
+
+def input_dtype(name: str) -> type[np.generic]:
+    """Of the numbers in this one of `INPUT_SHAPES`."""
+    return np.uint8 if name == "picture" else np.float32
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModelInput:
+    """picture (128, 128) uint8, psd (3, 12, 16), scalars (8,) and recent (14,) float32."""
+
+    picture: U8
+    psd: F32
+    scalars: F32
+    recent: F32
+
+    def __post_init__(self) -> None:
+        for name, shape in INPUT_SHAPES.items():
+            object.__setattr__(self, name, checked_array(name, getattr(self, name), shape, input_dtype(name)))
+
+    def arrays_by_name(self) -> dict[str, NDArray[Any]]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def error_model_input(image: U8, statistics: FeatureStatistics, motion: RecentMotion) -> ErrorModelInput:
+    """Of a keyframe: its image of cam0 (H, W), what its pose stands on, and how its tracker fared of late."""
+    thumbnail = _resized(image, _THUMBNAIL_SIZE)
+    distribution = point_distribution(thumbnail, statistics, (image.shape[1], image.shape[0]))
+    return ErrorModelInput(
+        _to_picture(thumbnail),
+        distribution,
+        scalar_features(thumbnail, statistics, motion.sigma_cm),
+        recent_features(motion),
+    )
+
+
+def input_picture(image: U8) -> U8:
+    """That of `ErrorModelInput`, by itself, of an image (H, W)."""
+    return _to_picture(_resized(image, _THUMBNAIL_SIZE))
+
+
+def _to_picture(thumbnail: U8) -> U8:
+    return _resized(thumbnail, INPUT_SHAPES["picture"])
+
+
+def _resized(image: U8, size: tuple[int, ...]) -> U8:
+    """Each pixel the mean of what it covers."""
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

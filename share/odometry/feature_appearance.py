@@ -1,0 +1,108 @@
+"""What the features of the state look like, in the order in which the state has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.array_table import ArrayTable
+from share.geometry.camera import Camera
+from share.odometry.track_result import median
+from share.types import F32, F64, I64, U8
+from share.vision import patches
+from share.vision.patches import Patches
+
+_YOUNG_FRAMES = 10  # frames
+_DRIFT_GAIN = 0.2  # of a residual that is added to a lag
+_MIN_DRIFT_PX, _MIN_DRIFT_RATIO = (
+    0.5,
+    5.0,
+)  # a lag of this size, and so many times the least ones, is a motion of its own
+_MIN_FEATURES = 12  # features that say something of each other
+_SLANT_SIGMA = 0.4  # tangent of a surface's slant, one sigma of the room's surfaces
+_MIN_RHO = 0.05  # 1/m; slants of what is further do not show
+_GRAY_NOISE = 12.0  # gray levels: more than an image's noise, because a patch repeats its own errors
+_SLANT_GAIN = 0.3  # of what a frame says is taken: its errors are much like the next one's
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance(ArrayTable):
+    """patch of N features. spread (N, 2, 2): d ray / d px in the image that saw them first. slant (N, 2):
+    d rho / d px there, of the surface, upright within a sigma of 1 / sqrt(upright (N,)). px (N, 2): where
+    each was seen last; lag (N, 2): px by which it has lately run away from where the others say it should
+    be. age (N,): frames in which it was seen."""
+
+    patch: Patches
+    ray_per_px: F64
+    slant: F64
+    slant_information: F64
+    last_px: F32
+    drift_px: F64
+    age: I64
+
+
+def extract_appearance(image: U8, camera: Camera, px: F32, ray: F64, rho: F64) -> Appearance:
+    """Of new features at px (N, 2) of the image, on rays (N, 2), at inverse depths (N,)."""
+    n = len(px)
+    ray_per_px = np.asarray(np.linalg.inv(camera.jacobian(ray)), np.float64)
+    sigma = _SLANT_SIGMA * np.maximum(rho, _MIN_RHO) / camera.focal
+    age = np.zeros(n, np.int64)
+    zeros = np.zeros((n, 2))
+    return Appearance(patches.extract(image, px), ray_per_px, zeros, 1 / sigma**2, px, zeros.copy(), age)
+
+
+def update_slant(appearance: Appearance, indices: I64, samples: F32, px_per_rho: F64) -> None:
+    """From how the patches of features `indices` (M,) look where they were found: see
+    `patches.slant_evidence`."""
+    information, step = patches.slant_evidence(appearance.patch.take(indices), samples, px_per_rho)
+    information, step = information / _GRAY_NOISE**2, step / _GRAY_NOISE**2
+    prior = appearance.slant_information[indices, None]
+    total = information + prior[:, :, None] * np.eye(2)
+    pull = step - prior * appearance.slant[indices]
+    appearance.slant[indices] += _SLANT_GAIN * np.linalg.solve(total, pull[:, :, None])[:, :, 0]
+
+
+def drifting_features(appearance: Appearance, indices: I64, residual: F64) -> NDArray[np.bool_]:
+    """Which of features `indices` (M,) move on their own. residual (M, 2): px from where they were expected.
+
+    What moves slowly passes every gate, a little off each time and always the same way, and drags the pose
+    along. The quarter that lags least stands still, and what it has in common is the pose's own error.
+    """
+    if len(indices) < _MIN_FEATURES:
+        return np.zeros(len(indices), bool)
+    drift, quarter = appearance.drift_px[indices], len(indices) // 4
+    still = np.argpartition(np.hypot(drift[:, 0], drift[:, 1]), quarter)[: quarter + 1]
+    relative = residual - [median(axis) for axis in residual[still].T]
+    appearance.drift_px[indices] = drift = drift + _DRIFT_GAIN * (relative - drift)
+    speed = np.hypot(drift[:, 0], drift[:, 1])
+    out: NDArray[np.bool_] = speed > max(
+        _MIN_DRIFT_PX, _MIN_DRIFT_RATIO * float(np.partition(speed, quarter)[quarter])
+    )
+    return out
+
+
+def is_stereo_due(appearance: Appearance) -> NDArray[np.bool_]:
+    """Which of these a second camera is asked for: young ones always, for their depth, others by turns."""
+    out: NDArray[np.bool_] = (appearance.age < _YOUNG_FRAMES) | (staggered_age(appearance) % 4 == 0)
+    return out
+
+
+def staggered_age(appearance: Appearance) -> I64:
+    """(N,) counts frames, each feature from another number: by it features take turns."""
+    out: I64 = appearance.age + np.arange(len(appearance.age))
+    return out
+
+
+def empty_appearance() -> Appearance:
+    pairs, one = np.zeros((0, 2)), np.zeros(0)
+    return Appearance(
+        patches.empty_patches(),
+        np.zeros((0, 2, 2)),
+        pairs,
+        one,
+        pairs.astype(np.float32),
+        pairs,
+        one.astype(np.int64),
+    )

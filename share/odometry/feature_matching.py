@@ -1,0 +1,347 @@
+"""Features of the state in the images of a frame: expected where the filter says, found by their patches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.array_table import ArrayTable
+from share.config import InertialConfig
+from share.geometry import se3
+from share.geometry.camera import Camera, Rig, rays
+from share.odometry.feature_appearance import Appearance, is_stereo_due
+from share.odometry.state import FilterState
+from share.types import F32, F64, I64, U8, Frame
+from share.vision import optical_flow, patches
+
+_BORDER_PX = 6.0
+_MAX_FLOW_ERROR_PX = 1.5  # how far the way by the image before may be from what the first patch says
+_MAX_MISSING_SHARE = (
+    0.15  # of the features in view that are not found: then they are followed from the image before
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StereoMatches:
+    """Features number which (M,) in cam1, and where each was found: at (M, 2), normalised."""
+
+    feature: I64
+    at: F64
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureMatches:
+    """Of all N features in cam0: where each was found, px (N, 2) and at (N, 2) normalised, NaN elsewhere, and
+    whether it was, and, for others to say, went its own way; expected (N, 2) px and uv (N, 2) normalised, NaN
+    behind the camera; what patches look like there,
+    warp (N, 2, 2) px by px, and by how many px of its first image a feature moves for one unit more of
+    inverse depth, along (N, 2). samples (N, S): see `patches.AlignedPatches`. right: in cam1."""
+
+    px: F32
+    at: F64
+    is_found: NDArray[np.bool_]
+    is_dynamic: NDArray[np.bool_]
+    predicted_px: F64
+    predicted_uv: F64
+    warp: F64
+    px_per_rho: F64
+    samples: F32
+    cam1: StereoMatches | None = None
+
+    def in_view_count(self, camera: Camera) -> int:
+        """How many should be in view."""
+        return int(camera.is_inside(self.predicted_px, 0.0).sum())
+
+
+def match_features(
+    frame: Frame, rig: Rig, state: FilterState, appearance: Appearance, config: InertialConfig, start: int = 0
+) -> FeatureMatches:
+    """Those from number `start` on in the images of a frame, both in one pass; in cam1 only those whose turn
+    it is."""
+    n = len(state.feature_ids)
+    indices = np.arange(start, n)
+    images: tuple[U8, ...] = (frame.image0,)
+    cameras, cam0_count = [rig.cam0], len(indices)
+    if frame.image1 is not None and rig.cam1 is not None and not start:
+        images, cameras = (frame.image0, frame.image1), [rig.cam0, rig.cam1]
+        indices = np.concatenate([indices, np.flatnonzero(is_stereo_due(appearance))])
+    in_cam1 = np.arange(len(indices)) >= cam0_count
+    T = rig.T_cam1_cam0 if len(cameras) > 1 else None
+    patch = predict_patches(
+        state, indices, appearance.ray_per_px[indices], appearance.slant[indices], T, in_cam1
+    )
+    parts = [slice(0, cam0_count), slice(cam0_count, None)][: len(cameras)]
+    expected = np.concatenate([c.distort(patch.uv[part]) for c, part in zip(cameras, parts, strict=True)])
+    jacobian = np.concatenate([c.jacobian(patch.uv[part]) for c, part in zip(cameras, parts, strict=True)])
+    warp = jacobian @ patch.warp
+    inside = np.concatenate(
+        [c.is_inside(expected[part], _BORDER_PX) for c, part in zip(cameras, parts, strict=True)]
+    )
+    to_align = np.flatnonzero(inside)
+    cam0_patch = PatchPrediction(patch.uv[:cam0_count], patch.warp[:cam0_count], patch.J_rho[:cam0_count])
+    out = _no_matches(n, indices[:cam0_count], expected[:cam0_count], cam0_patch, warp[:cam0_count])
+    if len(to_align) == 0:
+        return out
+    cam0_to_align = int(np.searchsorted(to_align, cam0_count))
+    px = expected[to_align]
+    aligned = patches.align(
+        images, cam0_to_align, appearance.patch.kernels[indices[to_align]], px, warp[to_align]
+    )
+    accepted = _is_match(aligned, px, config, config.reach_px)
+    predicted_px = patch.uv[to_align] + _solved(jacobian[to_align], aligned.px - px)
+    for camera, part in zip(cameras, (slice(0, cam0_to_align), slice(cam0_to_align, None)), strict=False):
+        if camera.is_fisheye:  # whose pixels are not as much of (x/z, y/z) a few px on
+            predicted_px[part] = camera.normalise(
+                aligned.px[part].astype(np.float64), patch.uv[to_align[part]]
+            )
+        elif camera.distortion:
+            predicted_px[part] += _solved(
+                jacobian[to_align[part]], aligned.px[part] - camera.distort(predicted_px[part])
+            )
+        if camera.is_bounded:  # it may have strayed to where there is no ray
+            accepted[part] &= camera.has_normalised(aligned.px[part].astype(np.float64))
+    _store(
+        out,
+        indices[to_align[:cam0_to_align]],
+        aligned,
+        predicted_px[:cam0_to_align],
+        accepted[:cam0_to_align],
+        slice(0, cam0_to_align),
+    )
+    if len(cameras) == 1:
+        return out
+    number = indices[to_align[cam0_to_align:]]
+    cam1_accepted = np.flatnonzero(accepted[cam0_to_align:] & out.is_found[number])
+    return replace(
+        out, cam1=StereoMatches(number[cam1_accepted], predicted_px[cam0_to_align:][cam1_accepted])
+    )
+
+
+def match_by_flow(
+    previous: U8,
+    image: U8,
+    camera: Camera,
+    appearance: Appearance,
+    matches: FeatureMatches,
+    config: InertialConfig,
+) -> None:
+    """Where many of cam0 were not found, these are followed from the image before to wherever they went."""
+    inside = camera.is_inside(matches.predicted_px, _BORDER_PX)
+    missing = np.flatnonzero(~matches.is_found & inside)
+    if len(missing) <= _MAX_MISSING_SHARE * inside.sum():
+        return
+    guess = matches.predicted_px[missing].astype(np.float32)
+    px, ok = optical_flow.track_points(
+        previous, image, appearance.last_px[missing], guess, window=15, levels=2, back_check_px=1.0
+    )
+    missing, about = missing[ok], px[ok].astype(np.float64)
+    if len(missing) == 0:
+        return
+    aligned = patches.align(
+        (image,), len(missing), appearance.patch.kernels[missing], about, matches.warp[missing]
+    )
+    start_px = camera.normalise(aligned.px.astype(np.float64))
+    accepted = _is_match(aligned, about, config, _MAX_FLOW_ERROR_PX) & np.isfinite(start_px).all(axis=1)
+    _store(matches, missing, aligned, start_px, accepted, slice(None))
+
+
+def _no_matches(n: int, indices: I64, predicted_px: F64, patch: PatchPrediction, warp: F64) -> FeatureMatches:
+    """Of n features, where `which` (M,) are to be looked for."""
+    all_px, uv, px_per_rho = predicted_px, patch.uv, _px_per_rho(patch)
+    if len(indices) < n:
+        all_px, uv, px_per_rho = (
+            _spread(value, indices, np.full((n, 2), np.nan)) for value in (all_px, uv, px_per_rho)
+        )
+        warp = _spread(warp, indices, np.zeros((n, 2, 2)))
+    none, samples = np.zeros(n, bool), np.zeros((n, len(patches.OFFSETS)), np.float32)
+    px = np.where(np.isnan(all_px), -1e6, all_px).astype(np.float32)
+    return FeatureMatches(
+        px, np.full((n, 2), np.nan), none, none.copy(), all_px, uv, warp, px_per_rho, samples
+    )
+
+
+def _spread(values: F64, which: I64, into: F64) -> F64:
+    into[which] = values
+    return into
+
+
+def _solved(J: F64, b: F64) -> F64:
+    """x (N, 2) with J x = b of (N, 2, 2) and (N, 2); not finite where J has no inverse."""
+    (p, q), (r, s) = np.moveaxis(J, 0, 2)
+    x, y = b.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out: F64 = np.stack([s * x - q * y, p * y - r * x], axis=1) / (p * s - q * r)[:, None]
+    return out
+
+
+def _px_per_rho(patch: PatchPrediction) -> F64:
+    """px (N, 2) of the first image by which a feature moves for one unit more of inverse depth."""
+    out = _solved(patch.warp, patch.J_rho)
+    return np.where(np.isfinite(out), out, 0.0)
+
+
+def _is_match(
+    aligned: patches.AlignedPatches, px: F64, config: InertialConfig, reach_px: float
+) -> NDArray[np.bool_]:
+    """Which are what was looked for, near px (N, 2)."""
+    distance = np.hypot(*(aligned.px - px).T)
+    converged = (aligned.last_step < config.settled_px) & (distance < reach_px)
+    out: NDArray[np.bool_] = converged & (aligned.correlation > config.alike)
+    return out
+
+
+def _store(
+    out: FeatureMatches,
+    indices: I64,
+    aligned: patches.AlignedPatches,
+    at: F64,
+    accepted: NDArray[np.bool_],
+    part: slice,
+) -> None:
+    out.px[indices], out.is_found[indices], out.samples[indices] = (
+        aligned.px[part],
+        accepted,
+        aligned.samples[part],
+    )
+    out.at[indices[accepted]] = at[accepted]
+
+
+# ---- What the cameras should see of the features, and how that depends on every part of the state.
+#
+# A feature at inverse depth rho on the ray f of its host is q = f + rho p in any frame's homogeneous
+# coordinates: nothing here divides by rho, so a feature may be infinitely far (Civera et al. 2008).
+
+_MIN_DEPTH = 0.02  # homogeneous depth below which nothing is seen
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction(ArrayTable):
+    """Of N features: uv (N, 2) normalised coordinates, NaN behind the camera; and its derivatives by the
+    body's pose (N, 2, 6), the extrinsic (N, 2, 6), inverse depth (N, 2). That by the host's pose is the
+    negative of that by the body's: only their difference is ever seen."""
+
+    uv: F64
+    H_pose: F64
+    H_extrinsic: F64
+    H_rho: F64
+
+
+def predict(
+    state: FilterState, indices: I64, T_cam1_cam0: F64 | None = None, in_cam1: NDArray[np.bool_] | None = None
+) -> Prediction:
+    """What cam0 should see of the features at indices `which` (N,). With T_right_left (4, 4) cam1, or only of
+    those that are `right` (N,)."""
+    f, rho, anchor = rays(state.ray[indices]), state.rho[indices], state.anchor[indices]
+    T_odom_anchor = state.keyframe_poses @ state.T_body_cam
+    T_cam_odom = se3.inverse(state.T @ state.T_body_cam)
+    R_odom_anchor, t_odom_anchor = T_odom_anchor[anchor, :3, :3], T_odom_anchor[anchor, :3, 3]
+    R, t = T_cam_odom[:3, :3], T_cam_odom[:3, 3]
+    q_odom = (R_odom_anchor @ f[:, :, None])[:, :, 0] + rho[:, None] * t_odom_anchor
+    q = q_odom @ R.T + rho[:, None] * t
+    H_rho = t_odom_anchor @ R.T + t
+    uv, D, H_rho = _project_with_jacobians(q, rho, H_rho, T_cam1_cam0, in_cam1)
+    DR = D @ R
+    H_extrinsic = pose_jacobian(DR @ R_odom_anchor, f, rho) - pose_jacobian(D, q, rho)
+    return Prediction(uv, -pose_jacobian(DR, q_odom, rho), H_extrinsic, H_rho)
+
+
+def in_image_plane(predicted: Prediction, camera: Camera, mask: NDArray[np.bool_]) -> Prediction:
+    """Those that are `mask` (N,), a fisheye camera's, in its image plane: see `Camera.evened`."""
+    uv, H_pose, H_extrinsic, H_rho = (
+        part.copy() for part in (predicted.uv, predicted.H_pose, predicted.H_extrinsic, predicted.H_rho)
+    )
+    J = camera.jacobian(uv[mask]) / np.array([[camera.fx], [camera.fy]])
+    uv[mask] = camera.to_image_plane(uv[mask])
+    H_pose[mask], H_extrinsic[mask] = J @ H_pose[mask], J @ H_extrinsic[mask]
+    H_rho[mask] = (J @ H_rho[mask, :, None])[:, :, 0]
+    return Prediction(uv, H_pose, H_extrinsic, H_rho)
+
+
+@dataclass(frozen=True, eq=False)
+class PatchPrediction(ArrayTable):
+    """Where to look for N features, and as what: uv (N, 2) normalised coordinates, NaN behind the camera;
+    warp (N, 2, 2), how these change with the pixel of the host: what a patch looks like; by_rho (N, 2), with
+    inverse depth."""
+
+    uv: F64
+    warp: F64
+    J_rho: F64
+
+
+def predict_patches(
+    state: FilterState,
+    indices: I64,
+    ray_per_px: F64,
+    slant: F64,
+    T_cam1_cam0: F64 | None = None,
+    in_cam1: NDArray[np.bool_] | None = None,
+) -> PatchPrediction:
+    """As `predict`. spread (N, 2, 2): d ray / d px of the host. slant (N, 2): d rho / d px, of the
+    surface."""
+    rho, T = state.rho[indices], anchors_in_camera(state, indices)
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    q = (R @ rays(state.ray[indices])[:, :, None])[:, :, 0] + rho[:, None] * t
+    uv, D, J_rho = _project_with_jacobians(q, rho, t, T_cam1_cam0, in_cam1)
+    return PatchPrediction(uv, (D @ R)[:, :, :2] @ ray_per_px + J_rho[:, :, None] * slant[:, None, :], J_rho)
+
+
+def _project_with_jacobians(
+    q: F64, rho: F64, q_by_rho: F64, T_cam1_cam0: F64 | None, in_cam1: NDArray[np.bool_] | None
+) -> tuple[F64, F64, F64]:
+    """Of points q (N, 3) in cam0, which inverse depth moves by by_rho (N, 3): uv (N, 2), its derivative
+    (N, 2, 3) by q, and (N, 2) by inverse depth."""
+    if T_cam1_cam0 is None:
+        uv, D = _project(q)
+        return uv, D, (D @ q_by_rho[:, :, None])[:, :, 0]
+    R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
+    if in_cam1 is None:
+        uv, D = _project(q @ R.T + rho[:, None] * t)
+        D_q = D @ R
+        return uv, D_q, (D_q @ q_by_rho[:, :, None])[:, :, 0] + D @ t
+    q_cam = q.copy()
+    q_cam[in_cam1] = q[in_cam1] @ R.T + rho[in_cam1, None] * t
+    uv, D = _project(q_cam)
+    shift_term = D[in_cam1] @ t
+    D[in_cam1] = D[in_cam1] @ R
+    J_rho = (D @ q_by_rho[:, :, None])[:, :, 0]
+    J_rho[in_cam1] += shift_term
+    return uv, D, J_rho
+
+
+def is_in_view(
+    state: FilterState, camera: Camera, keyframe_index: int, ray: F64, rho: F64
+) -> NDArray[np.bool_]:
+    """Which of what keyframe number `keyframe_index` sees on rays (N, 2), inverse depth rho (N,), cam0 has in
+    view."""
+    T = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses[keyframe_index] @ state.T_body_cam
+    uv, _ = _project(rays(ray) @ T[:3, :3].T + rho[:, None] * T[:3, 3])
+    return np.asarray(camera.is_inside(np.nan_to_num(camera.distort(uv), nan=-1e6)), bool)
+
+
+def anchors_in_camera(state: FilterState, indices: I64 | slice = slice(None)) -> F64:
+    """T_cam_host (N, 4, 4): from cam0 of the hosts of features `which` (N,), all by default, to cam0 now."""
+    T_cam_anchor = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses @ state.T_body_cam
+    out: F64 = T_cam_anchor[state.anchor[indices]]
+    return out
+
+
+def pose_jacobian(D: F64, q: F64, rho: F64) -> F64:
+    """D [-hat(q) | rho I], (N, K, 6): what Exp(xi) does to q (N, 3), seen through D (N, K, 3) or (K, 3)."""
+    out = np.empty((len(q), D.shape[-2], 6))
+    x, y, z = q[:, 0, None], q[:, 1, None], q[:, 2, None]
+    a, b, c = D[..., 0], D[..., 1], D[..., 2]
+    out[:, :, 0], out[:, :, 1], out[:, :, 2] = y * c - z * b, z * a - x * c, x * b - y * a
+    np.multiply(D, rho[:, None, None], out=out[:, :, 3:])
+    return out
+
+
+def _project(q: F64) -> tuple[F64, F64]:
+    """(x, y) / z of (N, 3) and the derivative (N, 2, 3)."""
+    z = np.where(q[:, 2] > _MIN_DEPTH, q[:, 2], np.nan)
+    uv = q[:, :2] / z[:, None]
+    D = np.zeros((len(q), 2, 3))
+    D[:, 0, 0] = D[:, 1, 1] = 1 / z
+    D[:, :, 2] = -uv / z[:, None]
+    return uv, D

@@ -1,0 +1,229 @@
+"""The mapper's process: it looks keyframes up itself, and has a process of its own for the pose graph."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeVar
+
+from share.config import Config, GraphConfig
+from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.map_changes import StoredMap
+from share.mapping.mapper import Mapper
+from share.mapping.steps import MapEvent, SolveStep
+from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, MapperResult, SetCredential, SetPresence
+from share.protocol.edge_records import FairQueue
+from share.runtime.worker_process import END, Inbox, WorkerProcess
+from share.startup import HeapTrimmer
+from share.timing import Backoff
+
+T = TypeVar("T")
+
+_REPORT_S = 1.0
+_SAVE_POSES_S = 5.0  # between two keepings of where everything lies
+
+
+@dataclass(frozen=True, eq=False)
+class RestoreMap:
+    """To the mapper, before anything else: what an earlier life of the edge knew."""
+
+    stored_map: StoredMap
+
+
+@dataclass(frozen=True)
+class MapperReport:
+    """The mapper's report, every second, and at the end. solving_s: for how long the solver has been at what
+    it does now."""
+
+    report: dict[str, Any]
+    solving_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class MapRestored:
+    """Everything of `RestoreMap` has been taken in: it was not what is in the file that a later death is
+    of."""
+
+
+@dataclass(frozen=True)
+class SolverDied:
+    """For a person: how it ended, and when the next begins."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class _SolverProcessDied:
+    """The solver's process has died."""
+
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class _SolveResult:
+    result: object
+    ms: float
+
+
+def run_mapper(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
+    """For a `WorkerProcess`: takes Restore, Join, Speaks, Present, Add and Forget, until END; answers Found,
+    Mapped, Restored and SolverLost."""
+    _MapperProcess(inbox, answer, settings).run()
+
+
+class _MapperProcess:
+    def __init__(self, inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
+        self._inbox, self._answer, self._settings = inbox, answer, settings
+        self._mapper = Mapper(settings)
+        self._backoff = Backoff(time.monotonic_ns())
+        self._solver = self._new_solver(0.0)
+        self._is_restoring = False
+        self._running_solve: SolveStep | None = None
+        self._solve_start_s = 0.0
+        self._keyframe_queue = FairQueue[AddKeyframe]()
+        self._findings: list[MapEvent] = []
+        self._report_due_s = self._poses_due_s = 0.0
+        self._has_new_poses = False
+        self._heap = HeapTrimmer()
+        self._is_ended = False
+
+    def run(self) -> None:
+        try:
+            self._loop()
+        finally:  # whatever ended us: a process does not end while one of its own goes on
+            self._solver.close()
+        self._answer(
+            MapperResult(tuple(self._findings), (*self._mapper.take_changes(), self._mapper.current_poses()))
+        )
+        self._answer(MapperReport(self._mapper.report()))
+
+    def _loop(self) -> None:
+        step = None
+        while not self._is_ended:
+            for message in self._receive(wait=step is None and not self._keyframe_queue):
+                self._handle(message)
+            self._add_keyframes()
+            self._send_to_solver()
+            self._publish()
+            step = self._guarded("place", self._mapper.next_lookup, None)
+            if self._is_restoring:  # the views have been gone through by now
+                self._is_restoring = False
+                self._answer(MapRestored())
+            if step is not None:
+                self._findings += self._mapper.finish_step(step, *_run_timed(step.run))
+
+    def _receive(self, wait: bool) -> Iterator[Any]:
+        """What is in the inbox; if `wait`, at least one message, unless none comes for a while."""
+        try:
+            yield self._inbox.get(wait, _REPORT_S if wait else None)
+            while True:
+                yield self._inbox.get_nowait()
+        except queue.Empty:
+            return
+
+    def _handle(self, message: Any) -> None:
+        match message:
+            case RestoreMap():
+                self._mapper.restore(message.stored_map)
+                self._is_restoring = True
+            case AddRun():
+                self._mapper.add_run(message.key, message.hello, message.credential)
+            case SetCredential():
+                self._mapper.set_credential(message.key, message.credential)
+            case SetPresence():
+                self._mapper.set_present(message.key, message.is_present)
+            case DropRun():
+                self._guarded("forget", partial(self._mapper.remove_run, message.key), None)
+            case AddKeyframe():
+                self._keyframe_queue.add(self._mapper.agent_name(message.key), message)
+            case _SolveResult():
+                self._finish_solve(message.result, message.ms)
+            case _SolverProcessDied():
+                self._restart_solver(message.reason)
+            case _ if message is END:
+                self._is_ended = True
+
+    def _add_keyframes(self) -> None:
+        """Keyframes that wait; at the end all of them."""
+        start_s = time.perf_counter()
+        while True:
+            spent_ms = 0.0 if self._is_ended else 1e3 * (time.perf_counter() - start_s)
+            if (add := self._keyframe_queue.take_next(spent_ms)) is None:
+                return
+            work = partial(self._mapper.add_keyframe, add.key, add.keyframe, add.is_over_rate)
+            self._findings += self._guarded("keyframe", work, [], add.key)
+
+    def _guarded(self, step: str, work: Callable[[], T], default: T, agent: str | None = None) -> T:
+        """A fault of ours costs this message or step, never the process: the map file would bring it back."""
+        try:
+            return work()
+        except Exception as error:
+            self._findings += self._mapper.report_failure(step, error, agent)
+            return default
+
+    def _send_to_solver(self) -> None:
+        step = self._guarded("solve", self._mapper.next_solve, None)
+        if step is not None:
+            self._running_solve, self._solve_start_s = step, time.monotonic()
+            self._solver.send(step)
+
+    def _finish_solve(self, result: object, ms: float) -> None:
+        step, self._running_solve = self._running_solve, None
+        self._has_new_poses = True
+        if step is not None:
+            self._findings += self._mapper.finish_step(step, result, ms)
+
+    def _new_solver(self, start_delay_s: float) -> WorkerProcess:
+        arguments = (self._settings.graph,)
+        return WorkerProcess(
+            "solver", run_solver, arguments, self._inbox.put, self._post_solver_died, start_delay_s
+        )
+
+    def _post_solver_died(self, reason: str) -> None:
+        """From another thread."""
+        self._inbox.put(_SolverProcessDied(reason))
+
+    def _restart_solver(self, reason: str) -> None:
+        """It costs the solution that it was at, and telling it all again."""
+        self._solver.close()
+        pause_s = self._backoff.record_failure(time.monotonic_ns())
+        self._answer(SolverDied(f"its process {reason}; a new one begins in {pause_s:g} s"))
+        self._solver = self._new_solver(pause_s)
+        self._mapper.reset_solver()
+        self._finish_solve(RuntimeError(f"the solver {reason}"), 0.0)
+
+    def _publish(self) -> None:
+        changes = self._mapper.take_changes()
+        if self._has_new_poses and time.monotonic() >= self._poses_due_s:
+            self._has_new_poses, self._poses_due_s = False, time.monotonic() + _SAVE_POSES_S
+            changes = (*changes, self._mapper.current_poses())
+        emptied = self._mapper.take_empty_runs()
+        if self._findings or changes or emptied:
+            self._answer(MapperResult(tuple(self._findings), changes, emptied))
+            self._findings = []
+        if time.monotonic() >= self._report_due_s:
+            self._report_due_s = time.monotonic() + _REPORT_S
+            solving_s = 0.0 if self._running_solve is None else time.monotonic() - self._solve_start_s
+            self._answer(MapperReport(self._mapper.report(), solving_s))
+            self._heap.trim_if_due(time.monotonic())
+
+
+def run_solver(inbox: Inbox, answer: Callable[[Any], None], settings: GraphConfig) -> None:
+    """For a `WorkerProcess`: takes Solve, answers with what came of it, until END."""
+    solver, heap = PoseGraphSolver(settings), HeapTrimmer()
+    while (step := inbox.get()) is not END:
+        answer(_SolveResult(*_run_timed(partial(step.run, solver))))
+        heap.trim_if_due(time.monotonic())
+
+
+def _run_timed(work: Callable[[], object]) -> tuple[object, float]:
+    start_s = time.perf_counter()
+    result: object
+    try:
+        result = work()
+    except Exception as error:  # a step that fails costs its keyframe, never the edge
+        result = error
+    return result, 1e3 * (time.perf_counter() - start_s)

@@ -1,0 +1,101 @@
+"""What the edge is doing, over HTTP: health, metrics, the report, and a page for people (docs/status.md)."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import Any
+
+from share.runtime import status_metrics
+from share.runtime.status_page import PAGE
+from share.runtime.web import Response, WebServer, text_response
+
+CACHE_S = 0.1  # an answer is given again so long: however many ask, the edge is asked ten times a second
+
+
+class StatusServer:
+    """Serves at `address`, HOST:PORT or a PORT of this machine alone, until closed.
+
+    report: the edge's report as in edge.json, and of now `trouble`, a list of what is wrong, `last_solve_s`
+    and `uptime_s`, so far as there are such. It is called from the server's own thread; if it fails, that
+    is answered, and told once. Raises UsageError or TransportError as `WebServer`.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        report: Callable[[], dict[str, Any]],
+        notify: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
+    ) -> None:
+        self._get_report, self._notify = report, notify
+        self._start_s = time.monotonic()
+        self._cache: dict[str, tuple[float, Response]] = {}
+        self._failed = False
+        self._server = WebServer(address, self._respond)
+
+    @property
+    def endpoint(self) -> str:
+        """HOST:PORT really bound."""
+        return self._server.endpoint
+
+    def close(self) -> None:
+        """Frees the address. May be repeated."""
+        self._server.close()
+
+    def _respond(self, path: str) -> Response:
+        if path == "/":
+            return _PAGE
+        if path not in _REPORTS:
+            return text_response(HTTPStatus.NOT_FOUND, f"there are / {' '.join(_REPORTS)}")
+        cached_s, response = self._cache.get(path, (-CACHE_S, None))
+        if response is None or time.monotonic() - cached_s > CACHE_S:
+            response = self._render(path)
+            self._cache[path] = time.monotonic(), response
+        return response
+
+    def _render(self, path: str) -> Response:
+        try:
+            return _REPORTS[path](
+                {"uptime_s": round(time.monotonic() - self._start_s, 3), **self._get_report()}
+            )
+        except Exception as error:  # whatever is wrong with a report, the edge goes on
+            text = " ".join(f"no report: {type(error).__name__}: {error}".split())
+            if not self._failed:
+                self._notify(f"status: {text}")
+            self._failed = True
+            return text_response(HTTPStatus.INTERNAL_SERVER_ERROR, text)
+
+
+def _health(report: dict[str, Any]) -> Response:
+    """503 where something is wrong, for whoever restarts or balances and does not read on."""
+    trouble = list(report.get("trouble") or ())
+    agents = report.get("agents", {}).items()
+    health: dict[str, Any] = {
+        "status": "trouble" if trouble else "ok",
+        "trouble": trouble,
+        "refused": list(report.get("refused") or ()),
+        "agents": sorted(name for name, agent in agents if not agent.get("gone")),
+        **{key: report[key] for key in ("uptime_s", "waiting", "last_solve_s") if key in report},
+    }
+    return _json(HTTPStatus.SERVICE_UNAVAILABLE if trouble else HTTPStatus.OK, health)
+
+
+def _metrics(report: dict[str, Any]) -> Response:
+    body, media_type = status_metrics.render_metrics(report)
+    return Response(HTTPStatus.OK, media_type, body)
+
+
+def _snapshot(report: dict[str, Any]) -> Response:
+    return _json(HTTPStatus.OK, report)
+
+
+def _json(status: HTTPStatus, value: Any) -> Response:
+    """Raises ValueError where a number is not finite: that is no JSON."""
+    return Response(status, "application/json", json.dumps(value, allow_nan=False).encode() + b"\n")
+
+
+_PAGE = Response(HTTPStatus.OK, "text/html; charset=utf-8", PAGE.encode())
+_REPORTS = {"/health": _health, "/metrics": _metrics, "/snapshot.json": _snapshot}

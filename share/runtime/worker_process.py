@@ -1,0 +1,134 @@
+"""A process of our own that does heavy work while this one goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import signal
+import threading
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+from share import startup
+from share.spawning import SPAWN_CONTEXT
+
+Inbox = queue.SimpleQueue[Any]
+Work = Callable[..., None]  # (inbox, answer, *arguments); ends when it takes END from the inbox
+END = None
+_TIMEOUT_S = 5.0
+
+
+class WorkerProcess:
+    """Runs `work(inbox, answer, *arguments)` in a spawned process.
+
+    `send` never waits. Answers go to `on_answer`, from a thread; `on_death` is called once, from that
+    thread, if
+    the process ends without being asked to. It ends with this one, however this one ends. after_s: it is
+    started so much later, and gets then what was sent meanwhile (`share.timing`).
+    """
+
+    def __init__(
+        self,
+        name: str,
+        work: Work,
+        arguments: tuple[Any, ...],
+        on_answer: Callable[[Any], None],
+        on_death: Callable[[str], None],
+        start_delay_s: float = 0.0,
+    ) -> None:
+        self.name = name
+        self._on_answer, self._on_death = on_answer, on_death
+        self._closing = threading.Event()
+        self._starting = threading.Lock()
+        self._start_error: str | None = None  # why it could not be started
+        self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._parent_end, self._child_end = SPAWN_CONTEXT.Pipe()
+        self._process = SPAWN_CONTEXT.Process(
+            target=_run_child, args=(self._child_end, work, arguments), name=name
+        )
+        if start_delay_s <= 0.0:
+            self._start()
+        sender = threading.Thread(target=self._send_loop, args=(start_delay_s,), daemon=True)
+        self._threads = [sender, threading.Thread(target=self._receive_loop, daemon=True)]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def pid(self) -> int | None:
+        """None before it is started."""
+        return self._process.pid
+
+    def _start(self) -> None:
+        """Unless it was closed before it began."""
+        with self._starting:
+            if not self._closing.is_set():
+                try:
+                    self._process.start()
+                except OSError as error:  # no memory, too many processes
+                    self._start_error = error.strerror or str(error)
+            self._child_end.close()
+
+    def send(self, message: Any) -> None:
+        self._outbox.put(message)
+
+    def close(self) -> None:
+        """Everything sent is worked on first, but not for longer than a few seconds."""
+        with self._starting:
+            self._closing.set()
+        self._outbox.put(END)
+        if self._process.pid is not None:
+            self._process.join(_TIMEOUT_S)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join()
+        for thread in self._threads:
+            thread.join(_TIMEOUT_S)
+        self._parent_end.close()
+
+    def _send_loop(self, start_delay_s: float) -> None:
+        if start_delay_s > 0.0:
+            self._closing.wait(start_delay_s)
+            self._start()
+        while True:
+            message = self._outbox.get()
+            try:
+                self._parent_end.send(message)
+            except OSError:  # it has died: `_receive_loop` says so
+                return
+            if message is END:
+                return
+
+    def _receive_loop(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                self._on_answer(self._parent_end.recv())
+        if not self._closing.is_set():
+            self._outbox.put(END)
+            self._on_death(self._describe_exit())
+
+    def _describe_exit(self) -> str:
+        if self._start_error is not None:
+            return f"could not be started: {self._start_error}"
+        self._process.join(_TIMEOUT_S)
+        code = self._process.exitcode
+        if code is not None and code < 0:
+            return f"was ended by {signal.Signals(-code).name}"
+        return f"ended with exit code {code}"
+
+
+def _run_child(connection: Connection, work: Work, arguments: tuple[Any, ...]) -> None:
+    """The first thing that the process does."""
+    startup.prepare_process()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all: the parent ends us in order
+    inbox: Inbox = queue.SimpleQueue()
+    threading.Thread(target=_fill_inbox, args=(connection, inbox), daemon=True).start()
+    with contextlib.suppress(BrokenPipeError):  # the parent is gone
+        work(inbox, connection.send, *arguments)
+
+
+def _fill_inbox(connection: Connection, inbox: Inbox) -> None:
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            inbox.put(connection.recv())
+    inbox.put(END)
