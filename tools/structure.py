@@ -1,0 +1,193 @@
+"""The size and shape of the house in figures, as Markdown or JSON.
+
+    python tools/structure.py [--json] [--trace SESSION]
+
+Lines, files and modules of product (`share` without `share.lab`) and laboratory, modules with a single
+importer, class names used twice, configuration keys, size of the pages. --trace: of a session with at least
+two agents, tracked and played in virtual time: how many packages, modules and functions one frame enters in
+the tracker, and one keyframe in the mapper (medians).
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import json
+import statistics
+import sys
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--trace", type=Path, metavar="SESSION")
+    options = parser.parse_args()
+    sys.path.insert(0, str(ROOT))
+    figures = count_tree() | ({} if options.trace is None else trace(options.trace))
+    if options.json:
+        print(json.dumps(figures, indent=2))
+    else:
+        print(
+            "\n".join(
+                ["| what | |", "|---|---|", *(f"| {name} | {value} |" for name, value in figures.items())]
+            )
+        )
+
+
+def count_tree() -> dict[str, int]:
+    modules = {module_name(path): path for path in sorted((ROOT / "share").rglob("*.py"))}
+    trees = {name: ast.parse(path.read_text()) for name, path in modules.items()}
+    lines = {name: len(path.read_text().splitlines()) for name, path in modules.items()}
+    lab = {name for name in modules if name.startswith("share.lab")}
+    importers = defaultdict(set)
+    for name, tree in trees.items():
+        for target in imported(tree, modules.keys()):
+            importers[target].add(name)
+    classes = Counter(
+        node.name for tree in trees.values() for node in tree.body if isinstance(node, ast.ClassDef)
+    )
+    return {
+        "product: lines": sum(n for name, n in lines.items() if name not in lab),
+        "product: modules": sum(bool(n) for name, n in lines.items() if name not in lab),
+        "laboratory: lines": sum(lines[name] for name in lab),
+        "laboratory: modules": sum(bool(lines[name]) for name in lab),
+        "modules over 400 lines": sum(n > 400 for n in lines.values()),
+        "modules with one importer": sum(len(names) == 1 for names in importers.values()),
+        "class names used twice or more": sum(n > 1 for n in classes.values()),
+        "configuration keys": configuration_keys(),
+        "pages: kB": sum(path.stat().st_size for path in (ROOT / "docs").rglob("*.md")) // 1000,
+        "tests: lines": sum(len(p.read_text().splitlines()) for p in (ROOT / "tests").rglob("*.py")),
+        "tools: lines": sum(len(p.read_text().splitlines()) for p in (ROOT / "tools").rglob("*.py")),
+    }
+
+
+def module_name(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imported(tree: ast.Module, known: Any) -> Iterator[str]:
+    """Modules of ours that this one imports, at any place."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                if full in known:
+                    yield full
+                elif node.module in known:
+                    yield node.module
+
+
+def configuration_keys() -> int:
+    from share.config import Config
+
+    return sum(len(dataclasses.fields(getattr(Config(), field.name))) for field in dataclasses.fields(Config))
+
+
+class Recorder:
+    """The functions of `share` that are entered while it is on."""
+
+    def __init__(self) -> None:
+        self.entered: set[tuple[str, str]] = set()
+
+    def __call__(self, frame: FrameType, event: str, argument: object) -> None:
+        path = frame.f_code.co_filename
+        if event == "call" and "/share/" in path and not frame.f_code.co_name.startswith("<"):
+            self.entered.add((path.partition("/share/")[2], frame.f_code.co_qualname))
+
+    @contextmanager
+    def on(self) -> Iterator[None]:
+        sys.setprofile(self)
+        try:
+            yield
+        finally:
+            sys.setprofile(None)
+
+
+def trace(session: Path) -> dict[str, int]:
+    return medians("one frame", trace_frames(session)) | medians("one keyframe", trace_keyframes(session))
+
+
+def medians(what: str, entered: list[set[tuple[str, str]]]) -> dict[str, int]:
+    """Of packages, modules and functions."""
+    kinds: dict[str, Callable[[tuple[str, str]], object]] = {
+        "packages": lambda call: call[0].rpartition("/")[0],
+        "modules": lambda call: call[0],
+        "functions": lambda call: call,
+    }
+    return {
+        f"{what} enters: {kind}": round(statistics.median(len({key(c) for c in calls}) for calls in entered))
+        for kind, key in kinds.items()
+    }
+
+
+def trace_frames(session: Path) -> list[set[tuple[str, str]]]:
+    """Of each frame of the first agent, once it has a pose."""
+    from share.config import Config
+    from share.recordings.session import read_session
+    from share.runtime.pipeline import make_source_tracker, read_frames
+    from share.runtime.source import open_source
+    from share.sensors.sequencer import SequencerCounters
+
+    source, config = open_source(str(session / next(iter(read_session(session).agents)))), Config()
+    tracker, out = make_source_tracker(source, config), []
+    for frame in read_frames(source, config, SequencerCounters()):
+        recorder = Recorder()
+        with recorder.on():
+            result = tracker.track(frame)
+        if result.state.has_pose:
+            out.append(recorder.entered)
+    return out
+
+
+def trace_keyframes(session: Path) -> list[set[tuple[str, str]]]:
+    """Of each keyframe: all steps of the mapper until the next one comes."""
+    from share.lab.evaluate.real_time import RunOptions
+    from share.lab.evaluate.virtual_time import play_in_virtual_time
+    from share.mapping.mapper import Mapper
+    from share.mapping.steps import QueryStep, SolveStep, VerifyStep
+    from share.recordings.session import read_session
+
+    out: list[set[tuple[str, str]]] = []
+
+    def recorded(owner: type, name: str) -> None:
+        method = getattr(owner, name)
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            if name == "add_keyframe":
+                out.append(set())
+            recorder = Recorder()
+            with recorder.on():
+                result = method(*arguments, **named)
+            if out:
+                out[-1] |= recorder.entered
+            return result
+
+        setattr(owner, name, call)
+
+    for name in ("add_keyframe", "next_lookup", "next_solve", "finish_step"):
+        recorded(Mapper, name)
+    for step in (QueryStep, VerifyStep, SolveStep):
+        recorded(step, "run")
+    with tempfile.TemporaryDirectory() as folder:
+        play_in_virtual_time(
+            read_session(session),
+            60.0,
+            RunOptions("share", virtual=True),
+            Path(folder),
+            lambda progress: None,
+        )
+    return out
+
+
+if __name__ == "__main__":
+    main()
