@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from share.config import InertialConfig, TrackerConfig
 from share.geometry import se3
 from share.geometry.camera import ImuBias, ImuNoise, Rig
-from share.odometry import feature_matching, filter, outliers, relocalisation
+from share.odometry import feature_matching, filter, outliers, relocalisation, state_augmentation
 from share.odometry.feature_appearance import Appearance
 from share.odometry.imu_buffer import ImuBuffer, constant_velocity_samples, fill_clipped, mean_angular_rate
 from share.odometry.imu_outliers import ImuInflation
@@ -33,7 +33,7 @@ from share.odometry.initialisation import (
 from share.odometry.keyframes import KeyframeScheduler
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.mono_initialisation import MonoWindow, gyro_only_samples, start_mono_window
-from share.odometry.outliers import DivergenceMonitor, ImageImuConsistency, is_plausible
+from share.odometry.health import DivergenceMonitor, ImageImuConsistency, is_plausible
 from share.odometry.relocalisation import LocalMap
 from share.odometry.state import FilterState
 from share.odometry.tilt_realignment import TiltRealignment
@@ -358,7 +358,9 @@ class InertialTracker:
             filter.update(s, rows, HP, S)
         elif accepted.any():
             row_pairs = np.flatnonzero(np.repeat(accepted, 2))
-            filter.update(s, rows.take(accepted), HP.take(row_pairs, axis=0), filter.submatrix(S, row_pairs))
+            filter.update(
+                s, rows.take(accepted), HP.take(row_pairs, axis=0), state_augmentation.submatrix(S, row_pairs)
+            )
         inliers[rows.feature[~accepted]] = False
         return inliers
 

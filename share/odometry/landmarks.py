@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.odometry import feature_appearance, feature_matching, filter, outliers
+from share.odometry import feature_appearance, feature_matching, filter, outliers, state_augmentation
 from share.odometry.depth_prior import DepthPrior, prior_from_neighbours
 from share.odometry.dormant_features import DormantFeatures
 from share.odometry.feature_appearance import Appearance
@@ -56,7 +56,7 @@ class LandmarkMap:
 
     def add_keyframe(self, rate: F64) -> int:
         """The frame just tracked: its pose. Its id."""
-        filter.add_keyframe(self.state, self._next_keyframe, rate)
+        state_augmentation.add_keyframe(self.state, self._next_keyframe, rate)
         self._next_keyframe += 1
         return self._next_keyframe - 1
 
@@ -264,7 +264,7 @@ class LandmarkMap:
         self._next_feature += len(ids)
         prior = prior.take(is_usable)
         old_count = len(s.feature_ids)
-        filter.add_features(
+        state_augmentation.add_features(
             s,
             ids,
             np.full(len(ids), anchor),
@@ -317,7 +317,9 @@ class LandmarkMap:
         dormant = self._dormant.nearby(s, self._rig.cam0, config.recall_m, config.recall_rad, config.recall)
         if dormant is None:
             return np.zeros((0, 2), np.float32)
-        filter.add_features(s, dormant.ids, dormant.anchor, dormant.ray, dormant.rho, dormant.sigma)
+        state_augmentation.add_features(
+            s, dormant.ids, dormant.anchor, dormant.ray, dormant.rho, dormant.sigma
+        )
         self.appearance = self.appearance.concatenate(dormant.appearance)
         recognised = self._is_recognised(frame, rate, old_count)
         self._dormant.reactivate(s.feature_ids[recognised][old_count:])
@@ -340,7 +342,7 @@ class LandmarkMap:
     def keep_features(self, keep: NDArray[np.bool_]) -> None:
         """The other features (N,) are forgotten."""
         if not keep.all():
-            filter.keep_features(self.state, keep)
+            state_augmentation.keep_features(self.state, keep)
             self.appearance = self.appearance.take(keep)
 
     def drop_dormant(self) -> None:
@@ -370,4 +372,4 @@ class LandmarkMap:
             return
         self._dormant.drop_keyframes(s.keyframe_ids[leave])
         self.appearance = self.appearance.take(~leave[s.anchor])
-        filter.drop_keyframes(s, s.keyframe_ids[leave])
+        state_augmentation.drop_keyframes(s, s.keyframe_ids[leave])
