@@ -169,7 +169,7 @@ class InertialTracker:
         """Of the own frame of the keyframe that is due; where none is, of the frame just tracked, one with a
         pose."""
         assert self._landmarks is not None
-        return self._keyframes.footing or self._landmarks.feature_statistics()
+        return self._keyframes.statistics or self._landmarks.feature_statistics()
 
     def reset_after_failure(self, frame: Frame) -> None:
         """Something failed in or after `frame`, the last: the filter may be in any state."""
