@@ -28,8 +28,8 @@ from share.types import F64, I64, ImuBatch
 # Initial values by single shooting.
 #
 # The IMU propagates the first frame's state to all others, which depend on its tilt, its velocity and the
-# biases. In these and in the depths, the constraint that rays intersect is nearly linear (Dong-Si and Mourikis
-# 2012): a few rounds of weighted least squares converge from any start.
+# biases. In these and in the depths, the constraint that rays intersect is nearly linear (Dong-Si and
+# Mourikis 2012): a few rounds of weighted least squares converge from any start.
 
 IMU_STATE_SIZE = EXTRINSIC.start  # columns of pose, velocity and biases
 _START_SCALES = (100.0, 30.0, 10.0, 5.0, 3.0, 3.0)  # sigmas, round by round; larger residuals weigh less
