@@ -113,6 +113,6 @@ def backbone_features(network: OnnxSession, pictures: U8) -> F32:
             if output.shape != (len(batch), _BACKBONE_SIZE):
                 raise ValueError(f"its deep is {output.shape}, expected {(len(batch), _BACKBONE_SIZE)}")
         except Exception as error:
-            raise DataError(f"the model has no error model's backbone: {_first_line(error)}") from None
+            raise DataError(f"the model has no backbone of an error model: {_first_line(error)}") from None
         out.append(output)
     return np.concatenate(out) if out else np.zeros((0, _BACKBONE_SIZE), np.float32)
