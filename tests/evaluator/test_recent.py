@@ -21,14 +21,14 @@ def told(*frames: FrameOutcome, sigmas_cm=(1.0,), way_m=0.0, turn_rad=0.0) -> di
 
 def test_where_all_is_well_nothing_is_told():
     fine = told(FINE, sigmas_cm=(0.0,))
-    believed = [fine.pop(f"{what} matches") for what in ("mean", "least")]
+    believed = [fine.pop(f"{what} matches") for what in ("mean", "minimum")]
     assert set(fine.values()) == {0.0}
     assert believed == pytest.approx([math.log(51) / math.log(201)] * 2)
 
 
 def test_how_sure_it_was_of_itself():
     now = told(sigmas_cm=(0.01, 100.0, 1.0))
-    assert [now[f"{what} score"] for what in ("mean", "least", "most")] == pytest.approx([0.5, 0, 1])
+    assert [now[f"{what} score"] for what in ("mean", "minimum", "maximum")] == pytest.approx([0.5, 0, 1])
 
 
 def test_how_far_it_went_and_turned():
