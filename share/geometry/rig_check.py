@@ -45,7 +45,7 @@ def _rig_problems(rig: Rig) -> Iterator[str]:
         yield "one camera alone gives no scale; stereo, depth or an IMU is needed"
     for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1), ("depth", rig.depth)):
         if camera is not None:
-            yield from (f"{name}: {why}" for why in _lens_problems(camera))
+            yield from (f"{name}: {problem}" for problem in _lens_problems(camera))
     if rig.cam1 is not None and rig.T_cam1_cam0 is not None:
         yield from _stereo_problems(rig.cam0, rig.cam1, rig.T_cam1_cam0)
     if rig.depth is not None and rig.T_depth_cam0 is not None:

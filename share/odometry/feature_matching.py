@@ -140,14 +140,14 @@ def match_by_flow(
     px, ok = optical_flow.track_points(
         previous, image, appearance.last_px[missing], guess, window=15, levels=2, back_check_px=1.0
     )
-    missing, about = missing[ok], px[ok].astype(np.float64)
+    missing, flow_px = missing[ok], px[ok].astype(np.float64)
     if len(missing) == 0:
         return
     aligned = patches.align(
-        (image,), len(missing), appearance.patch.kernels[missing], about, matches.warp[missing]
+        (image,), len(missing), appearance.patch.kernels[missing], flow_px, matches.warp[missing]
     )
     start_px = camera.normalise(aligned.px.astype(np.float64))
-    accepted = _is_match(aligned, about, config, _MAX_FLOW_ERROR_PX) & np.isfinite(start_px).all(axis=1)
+    accepted = _is_match(aligned, flow_px, config, _MAX_FLOW_ERROR_PX) & np.isfinite(start_px).all(axis=1)
     _store(matches, missing, aligned, start_px, accepted, slice(None))
 
 
@@ -156,9 +156,9 @@ def _no_matches(n: int, indices: I64, predicted_px: F64, patch: PatchPrediction,
     all_px, uv, px_per_rho = predicted_px, patch.uv, _px_per_rho(patch)
     if len(indices) < n:
         all_px, uv, px_per_rho = (
-            _spread(value, indices, np.full((n, 2), np.nan)) for value in (all_px, uv, px_per_rho)
+            _scatter(value, indices, np.full((n, 2), np.nan)) for value in (all_px, uv, px_per_rho)
         )
-        warp = _spread(warp, indices, np.zeros((n, 2, 2)))
+        warp = _scatter(warp, indices, np.zeros((n, 2, 2)))
     none, samples = np.zeros(n, bool), np.zeros((n, len(patches.OFFSETS)), np.float32)
     px = np.where(np.isnan(all_px), -1e6, all_px).astype(np.float32)
     return FeatureMatches(
@@ -166,9 +166,9 @@ def _no_matches(n: int, indices: I64, predicted_px: F64, patch: PatchPrediction,
     )
 
 
-def _spread(values: F64, which: I64, into: F64) -> F64:
-    into[which] = values
-    return into
+def _scatter(values: F64, indices: I64, out: F64) -> F64:
+    out[indices] = values
+    return out
 
 
 def _solved(J: F64, b: F64) -> F64:
@@ -205,11 +205,9 @@ def _store(
     accepted: NDArray[np.bool_],
     part: slice,
 ) -> None:
-    out.px[indices], out.is_found[indices], out.samples[indices] = (
-        aligned.px[part],
-        accepted,
-        aligned.samples[part],
-    )
+    out.px[indices] = aligned.px[part]
+    out.is_found[indices] = accepted
+    out.samples[indices] = aligned.samples[part]
     out.at[indices[accepted]] = at[accepted]
 
 

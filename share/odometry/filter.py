@@ -31,9 +31,7 @@ from share.odometry.state import (
 )
 from share.types import F64, I64, ImuBatch
 
-CALIBRATION = slice(
-    EXTRINSIC.start, CORE_SIZE
-)  # columns of the core that measurements depend on, besides poses
+CALIBRATION = slice(EXTRINSIC.start, CORE_SIZE)  # extrinsic and time offset
 _TILT_AND_VELOCITY = np.array([0, 1, 6, 7, 8])  # columns
 # rad^2, (m/s)^2 of these: with a larger variance, single precision does not suffice.
 _SINGLE_PRECISION_VARIANCE = np.array([3e-4, 3e-4, 1e-2, 1e-2, 1e-2])

@@ -101,8 +101,8 @@ class _RestartWindow:
     def is_over(self) -> bool:
         """Whether enough samples are accepted, or the window is full."""
         count = sum(self.accepted)
-        sure = count >= _CERTAIN_CHAIN and count >= _CERTAIN_SHARE * len(self.stamps)
-        return sure or len(self.stamps) >= _MAX_RESTART
+        is_certain = count >= _CERTAIN_CHAIN and count >= _CERTAIN_SHARE * len(self.stamps)
+        return is_certain or len(self.stamps) >= _MAX_RESTART
 
 
 class ImuOutlierDetector:

@@ -88,10 +88,10 @@ def _cumulative_rotations(R: F64, steps: F64) -> F64:
 
     By doubling: after k rounds each is the product of up to 2^k steps.
     """
-    out, reach = np.concatenate([R[None], steps]), 1
-    while reach < len(out):
-        out[reach:] = out[:-reach] @ out[reach:]
-        reach *= 2
+    out, stride = np.concatenate([R[None], steps]), 1
+    while stride < len(out):
+        out[stride:] = out[:-stride] @ out[stride:]
+        stride *= 2
     return out
 
 

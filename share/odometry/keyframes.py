@@ -73,10 +73,8 @@ class LastPublishedKeyframe:
 
     def update(self, s: FilterState, keyframe_id: int) -> None:
         """Make the keyframe with this id the last published one."""
-        self.keyframe_id, self._T_odom_body = (
-            keyframe_id,
-            s.keyframe_poses[filter.keyframe_index(s, keyframe_id)],
-        )
+        self.keyframe_id = keyframe_id
+        self._T_odom_body = s.keyframe_poses[filter.keyframe_index(s, keyframe_id)]
 
     def motion_to(self, s: FilterState, k: int, new_segment: bool) -> tuple[F64, F64]:
         """Return T_last_body (4, 4) of keyframe k and its covariance (6, 6), by the present state.

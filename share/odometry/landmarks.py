@@ -169,10 +169,8 @@ class LandmarkMap:
             used_in_cam1 = used[stereo.feature]
             cam1_indices = stereo.feature[used_in_cam1]
             in_cam1 = np.arange(len(indices) + len(cam1_indices)) >= len(indices)
-            indices, measured_uv = (
-                np.concatenate([indices, cam1_indices]),
-                np.concatenate([measured_uv, stereo.at[used_in_cam1]]),
-            )
+            indices = np.concatenate([indices, cam1_indices])
+            measured_uv = np.concatenate([measured_uv, stereo.at[used_in_cam1]])
         order = np.argsort(self.state.anchor[indices], kind="stable")
         in_cam1 = None if in_cam1 is None else in_cam1[order]
         return self._with_inflated_noise(

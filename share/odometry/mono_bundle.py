@@ -67,12 +67,10 @@ class ShootingSolver:
         features: int,
         depth: float,
     ) -> None:
-        self._first, self._propagate, self._observations, self._prior_depth = (
-            first,
-            propagate,
-            observations,
-            depth,
-        )
+        self._first = first
+        self._propagate = propagate
+        self._observations = observations
+        self._prior_depth = depth
         self._prior = inverse(first.cov[:IMU_STATE_SIZE, :IMU_STATE_SIZE])
         self.state, self.depth = first, np.full(features, depth)
         self.T, self.v, self._J_first = self._propagated()
@@ -100,8 +98,8 @@ class ShootingSolver:
 
         A residual is the distance across the observed ray, divided by the present depth.
         """
-        s, cams = self._observations, self.T @ self.state.T_body_cam
-        frame, anchor, ray = cams[s.frame], cams[s.anchor], rays(s.ray)[:, :, None]
+        s, T_odom_cam = self._observations, self.T @ self.state.T_body_cam
+        frame, anchor, ray = T_odom_cam[s.frame], T_odom_cam[s.anchor], rays(s.ray)[:, :, None]
         direction = anchor[:, :3, :3] @ ray
         point = direction[:, :, 0] * self.depth[s.feature, None] + anchor[:, :3, 3]
         R_cam_odom = frame[:, :3, :3].transpose(0, 2, 1)
@@ -362,11 +360,9 @@ class _BundleProblem:
             np.eye(1) / m.room_log_sigma**2,
         )
         share = self.means.rho * np.exp(-room)
-        J_rho, J_room, r = (
-            np.exp(-room) / m.feature_spread,
-            -share / m.feature_spread,
-            (1 - share) / m.feature_spread,
-        )
+        J_rho = np.exp(-room) / m.feature_spread
+        J_room = -share / m.feature_spread
+        r = (1 - share) / m.feature_spread
         out.A[out.room_column, out.room_column] += J_room @ J_room
         out.b[out.room_column] += J_room @ r
         out.cross[out.room_column] += J_room * J_rho
@@ -391,10 +387,8 @@ class _BundleProblem:
         shared = (J * J_rho[:, :, None]).sum(axis=1).T
         for h in np.unique(anchor).tolist():
             rows = anchor == h
-            columns, J_rows = (
-                np.r_[out.pose_columns(k), out.pose_columns(h), offset_columns],
-                J[rows].reshape(-1, 18),
-            )
+            columns = np.r_[out.pose_columns(k), out.pose_columns(h), offset_columns]
+            J_rows = J[rows].reshape(-1, 18)
             out.A[np.ix_(columns, columns)] += J_rows.T @ J_rows
             out.b[columns] += J_rows.T @ r[rows].ravel()
             out.cross[np.ix_(columns, indices[rows])] += shared[:, rows]
@@ -404,11 +398,9 @@ class _BundleProblem:
 
         The derivatives: by pose, anchor's pose and image error (M, 2, 18), and by inverse depth (M, 2).
         """
-        observations, sigma, state = (
-            self._observations[k],
-            self._model.sigma,
-            self._state_of_frame(k, self.means.image_offsets[k]),
-        )
+        observations = self._observations[k]
+        sigma = self._model.sigma
+        state = self._state_of_frame(k, self.means.image_offsets[k])
         predicted = feature_matching.predict(state, observations.feature)
         J_pose = predicted.H_pose / sigma
         J = np.concatenate([J_pose, -J_pose, J_pose @ se3.adjoint(state.T)], axis=2)

@@ -107,10 +107,8 @@ class MonoWindow:
         indices = np.searchsorted(solution.feature_ids, s.feature_ids)
         poses = (FRAME_SIZE * frame[:, None] + np.arange(6)).ravel()
         columns = np.r_[last : last + FRAME_SIZE + 6, poses, last + FRAME_SIZE + 6 + indices]
-        calibration, fitted = (
-            slice(EXTRINSIC.start, CORE_SIZE),
-            np.r_[0 : EXTRINSIC.start, CORE_SIZE : s.size],
-        )
+        calibration = slice(EXTRINSIC.start, CORE_SIZE)
+        fitted = np.r_[0 : EXTRINSIC.start, CORE_SIZE : s.size]
         s.cov = np.zeros((s.size, s.size))
         s.cov[np.ix_(fitted, fitted)] = solution.cov[np.ix_(columns, columns)]
         s.cov[calibration, calibration] = self._first.cov[calibration, calibration]

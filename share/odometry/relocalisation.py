@@ -249,9 +249,9 @@ def _match_keyframe(
     )
     points = keyframe.view.points[with_depth[pairs[:, 1]]].astype(np.float64)
     points, matched_uv = se3.transform(keyframe.T_odom_cam, points), uv[pairs[:, 0]]
-    rough = ransac_pose(points, matched_uv, focal, config.ransac_px, seed)
-    if rough is None:
+    initial = ransac_pose(points, matched_uv, focal, config.ransac_px, seed)
+    if initial is None:
         return None
     return refine_pose(
-        rough.T, points, matched_uv, focal, np.full(len(points), config.noise_px), config.gate_sigma
+        initial.T, points, matched_uv, focal, np.full(len(points), config.noise_px), config.gate_sigma
     )

@@ -106,8 +106,6 @@ def _insert_zeros(cov: F64, start: int, count: int) -> F64:
     n = len(cov)
     out = np.zeros((n + count, n + count))
     out[:start, :start], out[:start, start + count :] = cov[:start, :start], cov[:start, start:]
-    out[start + count :, :start], out[start + count :, start + count :] = (
-        cov[start:, :start],
-        cov[start:, start:],
-    )
+    out[start + count :, :start] = cov[start:, :start]
+    out[start + count :, start + count :] = cov[start:, start:]
     return out

@@ -63,7 +63,7 @@ class VisualTracker:
         self._map = LocalMap(config.max_keyframes)
         self._tracks = _NO_TRACKS
         self._found_tracks = _NO_TRACKS  # in the last frame, outliers included
-        self._sought_count = 0  # tracked into the last frame
+        self._tracked_count = 0  # tracked into the last frame
         self._image: U8 | None = None
         self._stamp_ns = 0
         self._T_odom_cam: F64 | None = None  # of the last accepted pose
@@ -143,8 +143,8 @@ class VisualTracker:
         points = np.where(rows[:, None] >= 0, self._map.points[rows], np.nan)
         z = se3.transform(se3.inverse(self._T_odom_cam), points)[:, 2]
         is_inlier = np.arange(len(rows)) < len(self._tracks.ids)
-        sought_count, known_count = max(self._sought_count, len(rows)), len(self._map.ids)
-        return FeatureStatistics(tracks.px, is_inlier, z, sought_count, known_count)
+        tracked_count, known_count = max(self._tracked_count, len(rows)), len(self._map.ids)
+        return FeatureStatistics(tracks.px, is_inlier, z, tracked_count, known_count)
 
     def _all_found_tracks(self) -> _Tracks:
         """Return the tracks of the last frame: inliers, then outliers."""
@@ -189,7 +189,7 @@ class VisualTracker:
         guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
         px, found = optical_flow.track_points(self._image, image, tracks.px, guess, levels=2)
         found &= self._rig.cam0.has_normalised(px.astype(np.float64))
-        self._found_tracks, self._sought_count = _Tracks(tracks.ids, px).take(found), len(tracks.ids)
+        self._found_tracks, self._tracked_count = _Tracks(tracks.ids, px).take(found), len(tracks.ids)
         return self._found_tracks
 
     def _project(self, T_cam_odom: F64, rows: I64) -> F64:
@@ -201,11 +201,11 @@ class VisualTracker:
         config, focal = self._config, self._rig.cam0.focal
         points = self._map.points[self._map.row_indices(tracks.ids)]
         uv = self._rig.cam0.normalise(tracks.px.astype(np.float64))
-        rough = ransac_pose(points, uv, focal, config.ransac_px, self._seed)
-        if rough is None or rough.inliers.sum() < config.min_inliers:
+        initial = ransac_pose(points, uv, focal, config.ransac_px, self._seed)
+        if initial is None or initial.inliers.sum() < config.min_inliers:
             return None, _NO_TRACKS
         sigma = np.full(len(points), config.noise_px)
-        best = refine_pose(rough.T, points, uv, focal, sigma, config.gate_sigma)
+        best = refine_pose(initial.T, points, uv, focal, sigma, config.gate_sigma)
         if best.inliers.sum() < config.min_inliers:
             return None, _NO_TRACKS
         return best, tracks.take(best.inliers)
@@ -224,11 +224,9 @@ class VisualTracker:
         anchor = self._map.add_keyframe(frame.image0, self._T_odom_cam)
         self._add_corners(frame, anchor)
         spacing = self._spacing
-        spacing.stamp_ns, spacing.T, spacing.feature_count = (
-            frame.stamp_ns,
-            self._T_odom_cam,
-            len(self._tracks.ids),
-        )
+        spacing.stamp_ns = frame.stamp_ns
+        spacing.T = self._T_odom_cam
+        spacing.feature_count = len(self._tracks.ids)
         self._new_segment, self._keyframe_pending = new_segment, False
 
     def _reobserve(self, frame: Frame) -> None:

@@ -69,12 +69,7 @@ def _peaks(image: U8) -> tuple[I64, F32]:
     strength = cv2.cornerMinEigenVal(image, _BLOCK_PX)
     local_max = cv2.dilate(strength, np.ones((_SUPPRESSION_PX, _SUPPRESSION_PX), np.uint8))
     peak = (strength == local_max) & (strength > _MIN_EIGENVALUE)
-    peak[:_BORDER_PX], peak[-_BORDER_PX:], peak[:, :_BORDER_PX], peak[:, -_BORDER_PX:] = (
-        False,
-        False,
-        False,
-        False,
-    )
+    peak[:_BORDER_PX] = peak[-_BORDER_PX:] = peak[:, :_BORDER_PX] = peak[:, -_BORDER_PX:] = False
     found = cv2.findNonZero(peak.view(np.uint8))  # five times as fast as np.nonzero
     px = np.zeros((0, 2), np.int64) if found is None else found.reshape(-1, 2).astype(np.int64)
     return px, strength[px[:, 1], px[:, 0]]

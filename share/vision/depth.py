@@ -57,8 +57,10 @@ def _sample(depth: F32, px: F64) -> F64:
     """Return the bilinear depth at (N, 2) px, NaN outside or beside a NaN."""
     xy = np.nan_to_num(px, nan=-10.0).astype(np.float32).reshape(-1, 1, 2)
     x, y = np.ascontiguousarray(xy[..., 0]), np.ascontiguousarray(xy[..., 1])
-    seen = cv2.remap(depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
-    return np.asarray(seen, np.float64).reshape(-1)
+    sampled = cv2.remap(
+        depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan")
+    )
+    return np.asarray(sampled, np.float64).reshape(-1)
 
 
 def _back_project(rig: Rig, px: F64, z: F64) -> F64:

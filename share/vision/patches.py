@@ -107,7 +107,7 @@ def align(
     px: F64,
     warp: F64,
     max_steps: int = 4,
-    settled_px: float = 0.02,
+    convergence_px: float = 0.02,
 ) -> AlignedPatches:
     """Align patches with kernels (N, 3, S) from px (N, 2), warped by (N, 2, 2): d px here / d px in the
     patch.
@@ -138,7 +138,7 @@ def align(
         at[active] -= move
         step_px = np.hypot(move[:, 0], move[:, 1])
         last_step[active] = step_px
-        active = active[(step_px > settled_px) & np.isfinite(step_px)]
+        active = active[(step_px > convergence_px) & np.isfinite(step_px)]
     return AlignedPatches(at, correlation, last_step, samples)
 
 

@@ -87,9 +87,8 @@ def _limit_memory() -> None:
     import onnxruntime as ort
 
     memory = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
-    ort.create_and_register_allocator(
-        memory, ort.OrtArenaCfg(_MAX_MEMORY_BYTES, -1, -1, -1)
-    )  # -1: the default
+    arena = ort.OrtArenaCfg(_MAX_MEMORY_BYTES, -1, -1, -1)  # -1: the default
+    ort.create_and_register_allocator(memory, arena)
 
 
 def _first_line(error: Exception) -> str:
