@@ -24,6 +24,7 @@ from share.odometry.state import (
     CORE_SIZE,
     EXTRINSIC,
     GYRO_BIAS,
+    IMU_STATE_SIZE,
     POSE,
     TIMESHIFT,
     VELOCITY,
@@ -35,7 +36,6 @@ CALIBRATION = slice(EXTRINSIC.start, CORE_SIZE)  # extrinsic and time offset
 _TILT_AND_VELOCITY = np.array([0, 1, 6, 7, 8])  # columns
 # rad^2, (m/s)^2 of these: with a larger variance, single precision does not suffice.
 _SINGLE_PRECISION_VARIANCE = np.array([3e-4, 3e-4, 1e-2, 1e-2, 1e-2])
-_IMU_STATE_SIZE = 15  # columns that propagation changes
 _MIN_VARIANCE = 1e-10  # rounding error of differences of covariances
 CORRELATION_INFLATION = 16.0  # frames for which a correlated error lasts; chosen by NEES
 FloatArray = NDArray[np.floating[Any]]  # in double or in single precision
@@ -69,10 +69,10 @@ def propagate(state: FilterState, imu: ImuBatch, to_ns: int, noise: ImuNoise, gr
     """
     motion = integrate(state.T, state.v, state.bg, state.ba, imu, state.stamp_ns, to_ns, noise, gravity)
     F, P = motion.transition, state.cov
-    own = F @ P[:_IMU_STATE_SIZE, :_IMU_STATE_SIZE] @ F.T + motion.noise_cov
-    P[:_IMU_STATE_SIZE, :_IMU_STATE_SIZE] = (own + own.T) / 2
-    P[:_IMU_STATE_SIZE, _IMU_STATE_SIZE:] = F @ P[:_IMU_STATE_SIZE, _IMU_STATE_SIZE:]
-    P[_IMU_STATE_SIZE:, :_IMU_STATE_SIZE] = P[:_IMU_STATE_SIZE, _IMU_STATE_SIZE:].T
+    own = F @ P[:IMU_STATE_SIZE, :IMU_STATE_SIZE] @ F.T + motion.noise_cov
+    P[:IMU_STATE_SIZE, :IMU_STATE_SIZE] = (own + own.T) / 2
+    P[:IMU_STATE_SIZE, IMU_STATE_SIZE:] = F @ P[:IMU_STATE_SIZE, IMU_STATE_SIZE:]
+    P[IMU_STATE_SIZE:, :IMU_STATE_SIZE] = P[:IMU_STATE_SIZE, IMU_STATE_SIZE:].T
     state.T, state.v, state.stamp_ns = motion.T, motion.v, to_ns
     return motion.rate
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
+from share.odometry.state import IMU_STATE_SIZE
 from share.types import F64, ImuBatch
-
-_IMU_STATE_SIZE = 15  # pose, velocity, biases
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +117,7 @@ def _impulse_responses(R: F64, v: F64, p: F64, remaining: F64, g: F64) -> F64:
 
 def _transition(response: F64, dt: F64, g: F64) -> F64:
     T = float(dt.sum())
-    out = np.eye(_IMU_STATE_SIZE)
+    out = np.eye(IMU_STATE_SIZE)
     out[3:6, 0:3], out[6:9, 0:3] = g * (T**2 / 2), g * T
     out[3, 6] = out[4, 7] = out[5, 8] = T
     out[:9, 9:] = (dt @ response.reshape(-1, 54)).reshape(9, 6)
@@ -130,9 +129,9 @@ def _noise_cov(response: F64, dt: F64, imu: ImuNoise) -> F64:
     density = np.repeat([imu.gyro_density, imu.accel_density], 3)
     weighted = response * (np.sqrt(dt)[:, None, None] * density)
     flat = weighted.transpose(1, 0, 2).reshape(9, -1)
-    out = np.zeros((_IMU_STATE_SIZE, _IMU_STATE_SIZE))
+    out = np.zeros((IMU_STATE_SIZE, IMU_STATE_SIZE))
     out[:9, :9] = flat @ flat.T
-    walks = np.arange(9, _IMU_STATE_SIZE)
+    walks = np.arange(9, IMU_STATE_SIZE)
     out[walks, walks] = T * np.repeat([imu.gyro_walk**2, imu.accel_walk**2], 3)
     return out
 

@@ -22,6 +22,7 @@ POSE = slice(0, 6)
 VELOCITY = slice(6, 9)
 GYRO_BIAS = slice(9, 12)
 ACCEL_BIAS = slice(12, 15)
+IMU_STATE_SIZE = 15  # columns that IMU propagation changes
 EXTRINSIC = slice(15, 21)
 TIMESHIFT = 21
 CORE_SIZE = 22
