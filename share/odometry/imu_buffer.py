@@ -132,6 +132,11 @@ def constant_velocity_samples(state: FilterState, rate: F64, to_ns: int, gravity
     return ImuBatch(stamps, np.tile(rate + state.bg, (2, 1)), np.tile(force + state.ba, (2, 1)))
 
 
+def gyro_only_samples(state: FilterState, imu: ImuBatch, to_ns: int, gravity: float) -> ImuBatch:
+    """Return samples of a body that turns as measured, at constant velocity."""
+    return constant_velocity_samples(state, imu.gyro.mean(axis=0) - state.bg, to_ns, gravity)
+
+
 def mean_angular_rate(before: F64, after: F64, dt_ns: int) -> F64:
     """Return the mean rate (3,) rad/s, in the body, between two poses (4, 4)."""
     out: F64 = se3.so3_log(before[:3, :3].T @ after[:3, :3]) / max(dt_ns * 1e-9, 1e-3)

@@ -12,7 +12,6 @@ from share.geometry.camera import Camera, ImuNoise, rays
 from share.odometry import filter, mono_bundle
 from share.odometry.depth_prior import FEATURE_SPREAD, MEAN_RHO, ROOM_LOG_SIGMA
 from share.odometry.feature_matching import anchors_in_camera
-from share.odometry.imu_buffer import constant_velocity_samples
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.mono_bundle import BundleModel, BundleSolution, WindowFrame
 from share.odometry.normal_equations import FRAME_SIZE
@@ -136,8 +135,3 @@ def _fix_gauge(state: FilterState) -> None:
     H[0, 0] = H[1, 1] = 1
     H[2, state.features_start :] = 1 / len(state.feature_ids)
     filter.scalar_update(state, np.zeros(3), H, _GAUGE_SIGMA)
-
-
-def gyro_only_samples(state: FilterState, imu: ImuBatch, to_ns: int, gravity: float) -> ImuBatch:
-    """Return samples of a body that turns as measured, at constant velocity."""
-    return constant_velocity_samples(state, imu.gyro.mean(axis=0) - state.bg, to_ns, gravity)
