@@ -1,8 +1,8 @@
-"""Pose of a camera from matches of which some are wrong: consensus over minimal solutions.
+"""Pose of a camera from matches with outliers: RANSAC over minimal solutions.
 
-By poselib (P3P in LO-RANSAC, Larsson 2020). PyPI has none for Linux on aarch64, such as a Raspberry Pi's;
-there OpenCV searches (USAC; Ivashechkin, Barath, Matas: USACv20, 2020): as surely, a fifth less exactly, in
-five times the time. `share doctor` says which it is.
+By poselib (P3P in LO-RANSAC, Larsson 2020). PyPI has no poselib for Linux on aarch64, such as a Raspberry Pi;
+there OpenCV is used (USAC; Ivashechkin, Barath, Matas: USACv20, 2020): as robust, a fifth less accurate, in
+five times the time. `share doctor` shows which is used.
 """
 
 from __future__ import annotations
@@ -21,16 +21,19 @@ try:
 except ModuleNotFoundError:
     poselib = None
 
-_MIN_MATCHES = 4  # matches: three for the pose, one to choose among its solutions
+_MIN_MATCHES = 4  # three for the pose, one to choose among its solutions
 _NO_POSE = np.full((4, 4), np.nan)
 PoseAndInliers = tuple[F64, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
 class RansacOptions:
-    """Of a search. best_first: the matches are in the order of trust, which finds a consensus sooner (PROSAC,
-    Chum and Matas, CVPR 2005). confidence: that some sample had no wrong match. OpenCV knows no least number
-    of iterations."""
+    """Options of RANSAC.
+
+    best_first: the matches are sorted by quality, so that a consensus is found sooner (PROSAC, Chum and
+    Matas, CVPR 2005). confidence: probability that some sample had no outlier. OpenCV has no minimum of
+    iterations.
+    """
 
     threshold_px: float
     seed: int
@@ -41,14 +44,16 @@ class RansacOptions:
 
 
 def absolute_pose(points: F64, uv: F64, focal: float, options: RansacOptions) -> PoseAndInliers:
-    """T_cam_world (4, 4), not finite where there is none, and the inliers (N,). The same for the same seed.
+    """Return T_cam_world (4, 4), not finite without a solution, and the inliers (N,). Deterministic for a
+    given seed.
 
-    points: (N, 3) m, world. uv: (N, 2) normalised; focal turns them into px for the threshold.
+    points: (N, 3) m, world. uv: (N, 2) normalised; focal converts them to px for the threshold.
     """
     return (by_opencv if poselib is None else by_poselib)(points, uv, focal, options)
 
 
 def by_poselib(points: F64, uv: F64, focal: float, options: RansacOptions) -> PoseAndInliers:
+    """Return as `absolute_pose`, by poselib."""
     camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
     settings = {
         "max_reproj_error": options.threshold_px,
@@ -63,6 +68,7 @@ def by_poselib(points: F64, uv: F64, focal: float, options: RansacOptions) -> Po
 
 
 def by_opencv(points: F64, uv: F64, focal: float, options: RansacOptions) -> PoseAndInliers:
+    """Return as `absolute_pose`, by OpenCV."""
     inlier = np.zeros(len(points), bool)
     if len(points) < _MIN_MATCHES:
         return _NO_POSE, inlier
@@ -80,7 +86,7 @@ def by_opencv(points: F64, uv: F64, focal: float, options: RansacOptions) -> Pos
 
 
 def _usac_params(options: RansacOptions, focal: float) -> cv2.UsacParams:
-    """Of normalised image coordinates."""
+    """Return OpenCV's parameters for normalised image coordinates."""
     params = cv2.UsacParams()
     params.threshold = options.threshold_px / focal
     params.randomGeneratorState = options.seed % 2**31

@@ -1,7 +1,6 @@
-"""Cameras with a radial-tangential or a fisheye lens, and the rig that holds them.
+"""Cameras with a radial-tangential or a fisheye lens, IMU noise and bias, and the rig that holds them.
 
-Pixel centres are at integers: the centre of the top-left pixel is (0, 0). `share.geometry.lens` has the
-lenses.
+Pixel centres are at integers: the centre of the top-left pixel is (0, 0). Lens models: `share.geometry.lens`.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ from share.geometry.lens import COEFFICIENT_COUNTS, EQUIDISTANT, RADTAN, Equidis
 from share.types import F64, checked_array, checked_pose
 
 MAX_TIMESHIFT_S = 1.0
-BASELINE_RANGE_M = (0.005, 2.0)  # of two cameras that see one room
-MAX_PIXELS = 10**8  # of an image: beyond any camera's
-_FOCAL_RANGE_PX = (1.0, 1e5)  # shorter or longer, and what is divided or multiplied by it is noise
-_MAX_PRINCIPAL_POINT_PX = 1e6  # the principal point, which may lie outside the image, from its corner
+BASELINE_RANGE_M = (0.005, 2.0)
+MAX_PIXELS = 10**8  # of an image
+_FOCAL_RANGE_PX = (1.0, 1e5)  # beyond, rounding errors dominate
+_MAX_PRINCIPAL_POINT_PX = 1e6  # from the corner; the principal point may lie outside the image
 _MAX_NOISE, _MAX_RATE_HZ = 1e3, 1e5  # of an IMU
 _MAX_GYRO_BIAS, _MAX_ACCEL_BIAS = 0.5, 3.0  # rad/s, m/s^2
-MOST_APART_M = 1e3  # of what sits on one body, also in millimetres, of which `rig_check` says more
-_RIGID = 1e-6  # what is off by less stays to the last digit
-_MAX_DISTORTION = 1e4  # of a coefficient; k3 of a lens with a narrow view is some hundreds
+MOST_APART_M = 1e3  # of sensors on one body, also if given in millimetres, which `rig_check` reports
+_RIGID = 1e-6  # a transform nearer to rigid than this is not changed
+_MAX_DISTORTION = 1e4  # of a coefficient; k3 of a narrow lens is some hundreds
 
 
 def rays(uv: F64) -> F64:
-    """Points (N, 3) at depth 1 on the rays through normalised coordinates (N, 2)."""
+    """Return points (N, 3) at depth 1 on the rays through normalised coordinates (N, 2)."""
     return np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
 
 
@@ -40,8 +39,11 @@ def _alternatives(counts: tuple[int, ...]) -> str:
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels; `distortion` is () or (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) of the `model`
-    radtan, (k1, k2, k3, k4) of equidistant."""
+    """Intrinsics in pixels, and distortion.
+
+    distortion: () or (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) of the `model` radtan, (k1, k2, k3, k4) of
+    equidistant. Raises ValueError for values that no camera has.
+    """
 
     width: int
     height: int
@@ -60,49 +62,59 @@ class Camera:
         if self.width <= 0 or self.height <= 0:
             raise ValueError(f"resolution: {self.width}x{self.height} is not positive")
         if self.width * self.height > MAX_PIXELS:
-            raise ValueError(f"resolution: {self.width}x{self.height} is more than a camera has")
+            raise ValueError(
+                f"resolution: {self.width}x{self.height} is above the maximum of {MAX_PIXELS:g} pixels"
+            )
         if not (self.fx > 0 and self.fy > 0):
             raise ValueError(f"intrinsics: focal lengths {self.fx}, {self.fy} must be positive")
         if len(self.distortion) not in (counts := COEFFICIENT_COUNTS[self.model]):
             raise ValueError(
-                f"distortion: {len(self.distortion)} "
-                f"coefficients, "
+                f"distortion: {len(self.distortion)} coefficients, "
                 f"expected {_alternatives(counts)} of {self.model}"
             )
         if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all():
             raise ValueError("intrinsics: has values that are not finite")
         shortest, longest = _FOCAL_RANGE_PX
         if not shortest <= min(self.fx, self.fy) <= max(self.fx, self.fy) <= longest:
-            raise ValueError(f"intrinsics: focal lengths {self.fx:g}, {self.fy:g} px are no camera's")
+            raise ValueError(
+                f"intrinsics: focal lengths {self.fx:g}, {self.fy:g} px are not within {shortest:g} to "
+                f"{longest:g}"
+            )
         if max(abs(self.cx), abs(self.cy)) > _MAX_PRINCIPAL_POINT_PX:
-            raise ValueError(f"intrinsics: principal point {self.cx:g}, {self.cy:g} px is no camera's")
+            raise ValueError(
+                f"intrinsics: principal point {self.cx:g}, {self.cy:g} px is beyond "
+                f"{_MAX_PRINCIPAL_POINT_PX:g}"
+            )
         if max(map(abs, self.distortion), default=0.0) > _MAX_DISTORTION:
-            raise ValueError(f"distortion: coefficients beyond {_MAX_DISTORTION:g} are no lens's")
+            raise ValueError(f"distortion: has coefficients beyond {_MAX_DISTORTION:g}")
 
     @property
     def K(self) -> F64:
-        """The 3x3 matrix of intrinsics."""
+        """The intrinsic matrix (3, 3)."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     @property
     def lens(self) -> Radtan | Equidistant | None:
-        """None without distortion."""
+        """The lens model; None without distortion."""
         return lens_model(self.model, self.distortion) if self.distortion else None
 
     @property
     def is_fisheye(self) -> bool:
-        """Whether a pixel is much more of the normalised coordinates at the edge than in the middle."""
+        """Whether the size of a pixel in normalised coordinates grows much off the axis."""
         return self.model == EQUIDISTANT
 
     @property
     def is_bounded(self) -> bool:
-        """Whether the lens's range may end within the image: there pixels have no normalised coordinates."""
+        """Whether pixels of the image may have no normalised coordinates, because the lens model's range
+        ends before."""
         return self.is_fisheye or ((distortion := self.lens) is not None and distortion.limit < math.inf)
 
     @property
     def field_of_view_rad(self) -> tuple[float, float]:
-        """Across and upright: 2 atan(size / 2 f), as without distortion; of a fisheye lens as it has it, as
-        far as there are normalised coordinates."""
+        """Horizontal and vertical field of view: 2 atan(size / 2 f), without distortion.
+
+        Of a fisheye lens with its distortion, as far as there are normalised coordinates.
+        """
         if isinstance(distortion := self.lens, Equidistant):
             sides = np.array([[self.width / (2 * self.fx), 0.0], [0.0, self.height / (2 * self.fy)]])
             half = np.arccos(distortion.directions(sides)[:, 2])
@@ -112,17 +124,18 @@ class Camera:
 
     @property
     def focal(self) -> float:
-        """Mean focal length, px: turns an error in normalised coordinates into pixels."""
+        """Mean focal length, px: converts an error in normalised coordinates to pixels."""
         return (self.fx + self.fy) / 2
 
     def project(self, points: F64) -> F64:
-        """Points (..., 3) in the camera frame -> pixels (..., 2). What has no normalised coordinates gives
-        NaN: behind the camera, beyond the lens's range."""
+        """Points (..., 3) in the camera frame -> pixels (..., 2); NaN behind the camera and beyond the
+        lens's range."""
         z = np.where(points[..., 2:] > 1e-6, points[..., 2:], np.nan)
         return self.distort(points[..., :2] / z)
 
     def project_wide(self, points: F64) -> F64:
-        """The same, also of what a fisheye lens sees that has none; NaN beyond the lens's range."""
+        """Like `project`, but also beyond the normalised coordinates of a fisheye lens; NaN beyond its
+        range."""
         if not isinstance(distortion := self.lens, Equidistant):
             return self.project(points)
         return distortion.distort_points(points) * (self.fx, self.fy) + (self.cx, self.cy)
@@ -135,14 +148,14 @@ class Camera:
 
     def normalise(self, px: F64, guess: F64 | None = None) -> F64:
         """Pixels (..., 2) -> undistorted normalised coordinates (x/z, y/z), to 1e-9 inside the image; NaN
-        beyond the lens's range. about: where they nearly are, from which it is found sooner."""
+        beyond the lens's range. guess: initial values, for fewer iterations."""
         observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion:
             return observed
         return lens_model(self.model, self.distortion).undistort(observed, guess)
 
     def directions(self, px: F64) -> F64:
-        """Pixels (..., 2) -> unit vectors (..., 3) in the camera frame, also of what has no normalised
+        """Pixels (..., 2) -> unit vectors (..., 3) in the camera frame, also without normalised
         coordinates; NaN beyond the lens's range."""
         observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
         if (distortion := self.lens) is not None:
@@ -158,25 +171,26 @@ class Camera:
         return scale * lens_model(self.model, self.distortion).jacobian(uv)
 
     def to_image_plane(self, uv: F64) -> F64:
-        """Normalised coordinates (..., 2) to such of which a pixel is as much, 1 / focal, all over the image:
-        of a fisheye lens those in its image plane, of others the same."""
+        """Normalised coordinates (..., 2) -> coordinates in which a pixel is 1 / focal everywhere: those
+        of the image plane for a fisheye lens, unchanged for others."""
         return lens_model(self.model, self.distortion).distort(uv) if self.is_fisheye else uv
 
     def has_normalised(self, px: F64) -> NDArray[np.bool_]:
-        """Which pixels (..., 2) have normalised coordinates."""
+        """Return which pixels (..., 2) have normalised coordinates."""
         if not self.is_bounded:
             return np.ones(px.shape[:-1], bool)
         return np.asarray(np.isfinite(self.normalise(px)).all(axis=-1))
 
     def is_inside(self, px: F64, border: float = 0.0) -> np.ndarray:
-        """Which pixels (..., 2) lie in the image, at least `border` px from its edge."""
+        """Return which pixels (..., 2) lie in the image, at least `border` px from its edge."""
         upper = (self.width - 1 - border, self.height - 1 - border)
         return np.asarray(((px >= border) & (px <= upper)).all(axis=-1))
 
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """Continuous-time noise: densities in rad/s/sqrt(Hz), m/s^2/sqrt(Hz); walks per Kalibr."""
+    """Continuous-time noise: densities in rad/s/sqrt(Hz), m/s^2/sqrt(Hz); random walks as in Kalibr.
+    Raises ValueError for values that no IMU has."""
 
     gyro_density: float
     accel_density: float
@@ -189,13 +203,13 @@ class ImuNoise:
         if not all(0 <= value < np.inf for value in values):
             raise ValueError("IMU: has noise or a rate that is negative or not finite")
         if max(values[:4]) > _MAX_NOISE or self.rate_hz > _MAX_RATE_HZ:
-            raise ValueError(f"IMU: noise beyond {_MAX_NOISE:g} or a rate beyond {_MAX_RATE_HZ:g} Hz is none")
+            raise ValueError(f"IMU: has noise beyond {_MAX_NOISE:g} or a rate beyond {_MAX_RATE_HZ:g} Hz")
 
 
 @dataclass(frozen=True, eq=False)
 class ImuBias:
-    """What an IMU adds to what it measures, as known before or after a run: gyro rad/s, accel m/s^2 (3,),
-    with a standard deviation for the axes of each. Raises ValueError for what no IMU has."""
+    """Bias of an IMU, known before or after a run: gyro rad/s, accel m/s^2 (3,), with a standard deviation
+    for the axes of each. Raises ValueError for values that no IMU has."""
 
     gyro: F64
     accel: F64
@@ -210,14 +224,14 @@ class ImuBias:
             ("accelerometer", max(np.abs(self.accel).max(), self.accel_sigma), _MAX_ACCEL_BIAS),
         ):
             if not value <= limit:
-                raise ValueError(f"IMU: a bias of the {name} beyond {limit:g} is none")
+                raise ValueError(f"IMU: has a {name} bias beyond {limit:g}")
         if not (self.gyro_sigma > 0 and self.accel_sigma > 0):
-            raise ValueError("IMU: a bias is never known exactly")
+            raise ValueError("IMU: the sigma of a bias must be positive")
 
 
 def _extrinsics(name: str, value: F64) -> F64:
-    """As `checked_pose`, of what sits on one body. A calibration may be rounded to three digits, whose
-    products and inverses are no rigid transforms: it is the nearest one."""
+    """Return the nearest rigid transform, because a calibration may be rounded to three digits. Raises
+    ValueError as `checked_pose`."""
     T = checked_pose(name, value, MOST_APART_M)
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() <= _RIGID:
@@ -227,11 +241,11 @@ def _extrinsics(name: str, value: F64) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """All cameras of one agent in its body frame (the IMU's; cam0's where there is no IMU).
+    """All cameras of one agent in its body frame (the IMU's; cam0's without an IMU).
 
     cam1 makes it stereo, depth makes it RGB-D; a depth camera need not be registered to cam0. timeshift_s:
-    IMU time less camera time, s, at most 1 s; what the camera stamps t happened when the IMU stamped
-    t + timeshift_s (Kalibr's timeshift_cam_imu).
+    IMU time minus camera time, s, at most 1 s; what the camera stamps t happened when the IMU stamped t +
+    timeshift_s (Kalibr's timeshift_cam_imu).
     """
 
     cam0: Camera
@@ -245,9 +259,9 @@ class Rig:
 
     def __post_init__(self) -> None:
         if (self.cam1 is None) != (self.T_cam1_cam0 is None):
-            raise ValueError("cam1: needs its extrinsics T_cam1_cam0, and the other way round")
+            raise ValueError("cam1 and its extrinsics T_cam1_cam0 must be given together")
         if (self.depth is None) != (self.T_depth_cam0 is None):
-            raise ValueError("depth: needs its extrinsics T_depth_cam0, and the other way round")
+            raise ValueError("depth and its extrinsics T_depth_cam0 must be given together")
         for name in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0"):
             T = getattr(self, name)
             if T is not None:
@@ -261,12 +275,12 @@ class Rig:
             raise ValueError(f"timeshift_s: {self.timeshift_s} is not within {MAX_TIMESHIFT_S:g} s")
 
     def without_imu(self) -> Rig:
-        """The same cameras where no IMU was recorded: the body is cam0."""
+        """Return the same cameras without an IMU: the body is cam0."""
         return replace(self, imu=None, T_body_cam0=np.eye(4), timeshift_s=0.0)
 
     @property
     def kind(self) -> str:
-        """`stereo`, `rgbd` or `mono`, with `+imu` where there is one."""
+        """`stereo`, `rgbd` or `mono`, with `+imu` if there is an IMU."""
         cameras = "stereo" if self.cam1 else "rgbd" if self.depth else "mono"
         return cameras + ("+imu" if self.imu else "")
 
@@ -277,5 +291,5 @@ class Rig:
 
     @property
     def baseline(self) -> float:
-        """Distance of cam0 and cam1, m; 0 without cam1."""
+        """Distance between cam0 and cam1, m; 0 without cam1."""
         return 0.0 if self.T_cam1_cam0 is None else float(np.linalg.norm(self.T_cam1_cam0[:3, 3]))

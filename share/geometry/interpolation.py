@@ -1,4 +1,4 @@
-"""Truth at the stamps of an estimate. A trajectory is (stamps_ns (N,) int64 rising, T (N, 4, 4))."""
+"""Ground truth at the stamps of an estimate. A trajectory is (stamps_ns (N,) int64 rising, T (N, 4, 4))."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from share.types import F64, I64
 
 Trajectory = tuple[I64, F64]
 
-MAX_GAP_NS = 100_000_000  # truth is never interpolated across more than this; room truth comes at >= 20 Hz
+MAX_GAP_NS = 100_000_000  # truth is not interpolated across more; motion capture has >= 20 Hz
 
 
 def associate(estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS) -> tuple[I64, F64, F64]:
-    """(stamps_ns, T_estimate, T_truth) at every stamp of the estimate where the truth is known.
+    """Return (stamps_ns, T_estimate, T_truth) at every stamp of the estimate where the truth is known.
 
-    Known is: at a sample of the truth, or between two that are at most `max_gap_ns` apart; never
-    outside its span. Raises ValueError where a trajectory is not one (shapes, stamps not rising).
+    It is known at a sample, or between two that are at most `max_gap_ns` apart. Raises ValueError for a wrong
+    shape or stamps that do not rise.
     """
     stamps, T_estimate = _checked("estimate", estimate)
     truth_ns, T_truth = _checked("truth", truth)
@@ -26,9 +26,9 @@ def associate(estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP
 
 
 def interpolate(stamps_ns: I64, T: F64, at_ns: I64, max_gap_ns: int = MAX_GAP_NS) -> tuple[np.ndarray, F64]:
-    """(known (M,) bool, poses (K, 4, 4) at the K known of the M stamps `at_ns`).
+    """Return (known (M,) bool, poses (K, 4, 4) at the K known of the M stamps `at_ns`).
 
-    Position on the straight line between two samples, rotation on the great arc (slerp).
+    Positions are interpolated linearly, rotations by slerp.
     """
     if len(stamps_ns) == 0:
         return np.zeros(len(at_ns), bool), np.zeros((0, 4, 4))
@@ -46,10 +46,10 @@ def interpolate(stamps_ns: I64, T: F64, at_ns: I64, max_gap_ns: int = MAX_GAP_NS
 
 
 def require_poses(n: int, minimum: int, metric: str) -> None:
-    """Raises DataError where fewer than `minimum` associated poses leave nothing to measure."""
+    """Raise DataError if fewer than `minimum` of the poses are associated."""
     if n < minimum:
         raise DataError(
-            f"{metric}: {n} poses of the estimate have a truth at their time, at least {minimum} are needed; "
+            f"{metric}: {n} poses of the estimate have a ground truth, at least {minimum} are needed; "
             "check that both use the same clock"
         )
 

@@ -1,9 +1,9 @@
-"""How a lens bends rays: from normalised coordinates (x/z, y/z) to those in the image plane, and back.
+"""Lens models: from normalised coordinates (x/z, y/z) to those in the image plane, and back.
 
 Radial-tangential: OpenCV's plumb-bob model k1 k2 p1 p2 [k3] (Brown 1966), Kalibr's `radtan` and EuRoC's
 `radial-tangential`. Equidistant: k1 k2 k3 k4 of Kannala and Brandt (A generic camera model, PAMI 2006),
-OpenCV's fisheye model. A ray beyond the range in which a model grows with the angle gives NaN: it would fold
-back into the image.
+OpenCV's fisheye model. A ray beyond the angle up to which a model is monotonic gives NaN: it would fold back
+into the image.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 from share.types import F64
 
 RADTAN, EQUIDISTANT = "radtan", "equidistant"
-COEFFICIENT_COUNTS = {RADTAN: (0, 4, 5), EQUIDISTANT: (4,)}  # of coefficients
-# Off the axis of a fisheye lens, beyond which a tracker uses nothing: (x/z, y/z) ends at 90 degrees, and here
-# a pixel is 15 times as much of it as in the middle.
+COEFFICIENT_COUNTS = {RADTAN: (0, 4, 5), EQUIDISTANT: (4,)}
+# Angle from the axis of a fisheye lens up to which normalised coordinates are used: they end at 90 degrees,
+# and here a pixel is 15 times as large in them as on the axis.
 MAX_FIELD_DEG = 75.0
-_MIN_SQUARED_RADIUS = 1e-8  # of a squared radius: below it limits are taken
-_MAX_ITERATIONS, _ANGLE_TOLERANCE = 60, 1e-12  # of Newton's method for an angle
+_MIN_SQUARED_RADIUS = 1e-8  # below it the limits for a radius of 0 are used
+_MAX_ITERATIONS, _ANGLE_TOLERANCE = 60, 1e-12  # of Newton's method; rad
 
 
 @dataclass(frozen=True)
 class Radtan:
-    """limit: of |uv|, beyond which the radial polynomial falls; inf for most lenses."""
+    """limit: largest |uv| up to which the radial polynomial rises; inf for most lenses."""
 
     coefficients: tuple[float, ...]
     limit: float
@@ -51,7 +51,7 @@ class Radtan:
         return out
 
     def jacobian(self, uv: F64) -> F64:
-        """d(bent)/d(uv), (..., 2, 2)."""
+        """d(distorted)/d(uv), (..., 2, 2)."""
         k1, k2, p1, p2, k3 = self._padded_coefficients()
         x, y = uv[..., 0], uv[..., 1]
         r2 = x * x + y * y
@@ -64,22 +64,21 @@ class Radtan:
         return J
 
     def undistort(self, distorted: F64, guess: F64 | None = None) -> F64:
-        """The inverse of `distort`, to 1e-9 inside the image. about: where they nearly are, from which it is
-        found sooner."""
+        """The inverse of `distort`, to 1e-9 inside the image. guess: initial values, for fewer iterations."""
         uv = (distorted if guess is None else guess).copy()
-        if self.limit < math.inf and guess is None:  # begin inside, where there is a way
+        if self.limit < math.inf and guess is None:  # begin inside the limit
             r = np.hypot(uv[..., 0], uv[..., 1])[..., None]
             uv *= np.minimum(1, 0.9 * self.limit / np.maximum(r, 1e-12))
-        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # a lens that no glass has
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # absurd coefficients
             converged = self._newton(distorted, uv, guess is not None)
-            if self.limit < math.inf or not converged:  # what fell into the fold, or found no way
+            if self.limit < math.inf or not converged:  # beyond the limit, or not converged
                 error = np.abs(distorted - self._distort(uv)).max(axis=-1)
                 uv[~(((uv**2).sum(axis=-1) <= self.limit**2) & (error < 1e-6))] = np.nan
         return uv
 
     def _newton(self, distorted: F64, uv: F64, is_near: bool) -> bool:
-        """Move uv (..., 2) to where its image is bent (..., 2); whether all of them arrived. near: they are
-        nearly there, so that the first derivative will do."""
+        """Move uv (..., 2) in place until it maps to `distorted`. Return whether all converged. is_near:
+        keep the first derivative."""
         for k in range(8):  # converges quadratically inside the image
             if k == 0 or not is_near:
                 J = self.jacobian(uv)
@@ -87,7 +86,7 @@ class Radtan:
             r = distorted - self._distort(uv)
             uv[..., 0] += J[..., 1, 1] * r[..., 0] - J[..., 0, 1] * r[..., 1]
             uv[..., 1] += J[..., 0, 0] * r[..., 1] - J[..., 1, 0] * r[..., 0]
-            if np.nanmax(np.abs(r), initial=0.0) < 1e-6:  # so the step leaves about its square
+            if np.nanmax(np.abs(r), initial=0.0) < 1e-6:  # the error after the step is about its square
                 return True
         return False
 
@@ -97,7 +96,7 @@ class Radtan:
         return self.distort(points[..., :2] / z)
 
     def point_jacobian(self, points: F64) -> F64:
-        """d(bent)/d(point), (..., 2, 3); NaN behind the camera."""
+        """d(distorted)/d(point), (..., 2, 3); NaN behind the camera."""
         z = np.where(points[..., 2] > 1e-6, points[..., 2], np.nan)
         uv = points[..., :2] / z[..., None]
         into = np.zeros((*points.shape[:-1], 2, 3))
@@ -106,7 +105,7 @@ class Radtan:
         return self.jacobian(uv) @ into
 
     def coefficient_jacobian(self, points: F64) -> F64:
-        """d(bent)/d(k1, k2, p1, p2, k3) at points (..., 3), (..., 2, 5), or without k3 (..., 2, 4)."""
+        """d(distorted)/d(k1, k2, p1, p2, k3) at points (..., 3), (..., 2, 5), or without k3 (..., 2, 4)."""
         uv = points[..., :2] / points[..., 2:]
         x, y = uv[..., 0], uv[..., 1]
         r2 = x * x + y * y
@@ -118,7 +117,7 @@ class Radtan:
         return np.asarray(out[..., : max(len(self.coefficients), 4)])
 
     def directions(self, distorted: F64) -> F64:
-        """Image plane (..., 2) -> unit vectors (..., 3) to what is seen there."""
+        """Image plane (..., 2) -> unit vectors (..., 3) along the rays."""
         uv = self.undistort(distorted)
         ray = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
         return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
@@ -130,15 +129,17 @@ class Radtan:
 
 @dataclass(frozen=True)
 class Equidistant:
-    """limit: of the angle from the axis, rad, up to which it grows; at most pi. Normalised coordinates are of
-    rays up to WIDEST_DEG only, `distort_points` and `directions` are of all."""
+    """limit: angle from the axis, rad, at most pi, up to which the radius rises.
+
+    Normalised coordinates end at `MAX_FIELD_DEG`; `distort_points` and `directions` do not.
+    """
 
     coefficients: tuple[float, ...]
     limit: float
 
     @property
     def max_field_rad(self) -> float:
-        """rad off the axis, up to which there are normalised coordinates."""
+        """Angle from the axis up to which there are normalised coordinates."""
         return min(self.limit, math.radians(MAX_FIELD_DEG))
 
     def distort(self, uv: F64) -> F64:
@@ -150,7 +151,7 @@ class Equidistant:
         return np.asarray(uv * scale[..., None])
 
     def jacobian(self, uv: F64) -> F64:
-        """d(bent)/d(uv), (..., 2, 2)."""
+        """d(distorted)/d(uv), (..., 2, 2)."""
         r2 = (uv**2).sum(axis=-1)
         theta = np.arctan(np.sqrt(r2))
         scale = self._scale_of_radius(self._distorted_angle(theta), r2)
@@ -164,7 +165,7 @@ class Equidistant:
         return np.asarray(out)
 
     def undistort(self, distorted: F64, guess: F64 | None = None) -> F64:
-        """The inverse of `distort`, to 1e-9. about: is not needed."""
+        """The inverse of `distort`, to 1e-9. guess: not used."""
         radius = np.hypot(distorted[..., 0], distorted[..., 1])
         theta = self._solve_angle(radius, self.max_field_rad)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -178,7 +179,7 @@ class Equidistant:
         return np.asarray(points[..., :2] * self._scale(points, theta, across)[..., None])
 
     def point_jacobian(self, points: F64) -> F64:
-        """d(bent)/d(point), (..., 2, 3)."""
+        """d(distorted)/d(point), (..., 2, 3)."""
         theta, across = self._polar(points)
         z, d2 = points[..., 2], (points**2).sum(axis=-1)
         scale, slope = self._scale(points, theta, across), self._angle_derivative(theta)
@@ -194,7 +195,7 @@ class Equidistant:
         return out
 
     def coefficient_jacobian(self, points: F64) -> F64:
-        """d(bent)/d(k1, k2, k3, k4) at points (..., 3), (..., 2, 4)."""
+        """d(distorted)/d(k1, k2, k3, k4) at points (..., 3), (..., 2, 4)."""
         theta, across = self._polar(points)
         with np.errstate(divide="ignore", invalid="ignore"):
             direction = np.where(across[..., None] > 0, points[..., :2] / across[..., None], 0.0)
@@ -202,7 +203,7 @@ class Equidistant:
         return np.asarray(direction[..., :, None] * powers[..., None, :])
 
     def directions(self, distorted: F64) -> F64:
-        """Image plane (..., 2) -> unit vectors (..., 3) to what is seen there; NaN beyond `limit`."""
+        """Image plane (..., 2) -> unit vectors (..., 3) along the rays; NaN beyond `limit`."""
         radius = np.hypot(distorted[..., 0], distorted[..., 1])
         theta = self._solve_angle(radius, self.limit)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -225,22 +226,24 @@ class Equidistant:
         return np.where(r2 < _MIN_SQUARED_RADIUS, 1 + r2 * (self.coefficients[0] - 1 / 3), out)
 
     def _polar(self, points: F64) -> tuple[F64, F64]:
-        """The angle off the axis (...), rad, and the distance from it (...); NaN beyond `limit`."""
+        """Return the angle from the axis (...), rad, NaN beyond `limit`, and the distance from it (...)."""
         across = np.hypot(points[..., 0], points[..., 1])
         theta = np.arctan2(across, points[..., 2])
         return np.where(theta > self.limit, np.nan, theta), across
 
     def _scale(self, points: F64, theta: F64, across: F64) -> F64:
-        """(...) of what the coordinates across the axis are multiplied by."""
+        """Return the factor (...) of the coordinates across the axis."""
         ahead = (across < 1e-6 * np.abs(points[..., 2])) & (theta < 1)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(ahead, 1 / points[..., 2], self._distorted_angle(theta) / across)
 
     def _solve_angle(self, radius: F64, max_angle: float) -> F64:
-        """rad (...) off the axis of what is seen at a radius (...) in the image plane; NaN beyond
+        """Return the angle (...) rad from the axis at a radius (...) in the image plane; NaN beyond
         `max_angle`.
-        Newton's method between 0 and `max_angle`, where the radius grows with the angle; the interval is
-        halved where a step would leave it or is more than half of the one before."""
+
+        Newton's method between 0 and `max_angle`, where the radius is monotonic; the interval is halved where
+        a step would leave it or is more than half of the one before.
+        """
         end = float(self._distorted_angle(np.asarray(max_angle)))
         radius_inside = np.where(radius <= end, radius, np.nan)
         low, high = np.zeros_like(radius_inside), np.full_like(radius_inside, max_angle)
@@ -260,7 +263,7 @@ class Equidistant:
 
 @lru_cache(maxsize=64)
 def lens_model(model: str, coefficients: tuple[float, ...]) -> Radtan | Equidistant:
-    """The lens of a model of `COEFFICIENT_COUNTS` with as many coefficients as that says, but not none."""
+    """Return the lens of a model of `COEFFICIENT_COUNTS`, with at least one coefficient."""
     if model == RADTAN:
         k1, k2, _, _, *k3 = coefficients
         return Radtan(coefficients, math.sqrt(_first_root([3 * k1, 5 * k2, *(7 * k for k in k3)])))
@@ -269,12 +272,12 @@ def lens_model(model: str, coefficients: tuple[float, ...]) -> Radtan | Equidist
 
 
 def _first_root(by_power: list[float]) -> float:
-    """The least s > 0 with 1 + by_power[0] s + by_power[1] s^2 + ... = 0; inf where there is none."""
+    """Return the least s > 0 with 1 + by_power[0] s + by_power[1] s^2 + ... = 0; inf without one."""
     while by_power and by_power[-1] == 0:
         by_power = by_power[:-1]
     if not by_power:
         return math.inf
-    # 1 / s is a root of the reversed polynomial, which begins with 1 and so loses none to small coefficients
+    # 1 / s is a root of the reversed polynomial, whose leading coefficient of 1 keeps small ones harmless
     roots = np.roots([1.0, *by_power])
     real: NDArray[np.float64] = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(1 / real.max()) if len(real) else math.inf

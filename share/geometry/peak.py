@@ -1,4 +1,4 @@
-"""Where a curve that is known at steps has its top."""
+"""Subsample peak of a sampled curve."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from share.types import F64
 
 
 def subsample_peak(score: F64, i: int) -> float:
-    """Top of the parabola through score[i - 1 : i + 2], in steps from i, at most half of one; 0 at an end of
-    the curve and where it does not bend down."""
+    """Return the peak of the parabola through score[i - 1 : i + 2], in steps from i, at most half a step;
+    0 at an end of the curve and where it is not concave."""
     if not 0 < i < len(score) - 1:
         return 0.0
     left, middle, right = score[i - 1 : i + 2]

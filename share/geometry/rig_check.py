@@ -1,6 +1,7 @@
-"""What a tracker needs of a rig, beyond what cameras and IMUs can be at all (`share.geometry.camera`).
+"""Check a rig for what a tracker needs, beyond what `share.geometry.camera` demands of cameras and IMUs.
 
-A rig that lacks it is a mistake in a calibration: it would give no poses, or wrong ones."""
+A rig that fails has a mistake in its calibration: it would give no poses, or wrong ones.
+"""
 
 from __future__ import annotations
 
@@ -14,30 +15,28 @@ from share.geometry.camera import BASELINE_RANGE_M, Camera, ImuNoise, Rig, rays
 from share.geometry.lens import MAX_FIELD_DEG
 from share.types import F64
 
-_MIN_SIDE_PX = 32  # of an image's side: less holds no features
-_FIELD_RANGE_DEG = (5.0, 170.0)  # from edge to edge, as the lens has it
-_MAX_ASPECT = 2.0  # times that a pixel may be longer than wide, or a camera's focal length than another's
-_GRID = (17, 13)  # of pixels that a lens is tried at
-_ROUND_TRIP_PX = 0.5  # of the way there and back
-_MAX_FOLDED, _MIN_OVERLAP = (
-    0.1,
-    0.2,
-)  # parts of an image: that may have no ray; that another camera has to see
-_MIN_USABLE = 0.4  # part of a fisheye lens's image that has to be of use
-_OVERLAP_DEPTHS_M = (1.0, 5.0)  # what is held before two cameras
-_MAX_ROLL_DEG = 30.0  # by which two images may be turned against each other
+_MIN_SIDE_PX = 32  # of an image
+_FIELD_RANGE_DEG = (5.0, 170.0)  # from edge to edge
+_MAX_ASPECT = 2.0  # ratio of fx and fy, and of the focal lengths of two cameras
+_GRID = (17, 13)  # pixels at which a lens is checked
+_ROUND_TRIP_PX = 0.5  # error of normalising and distorting
+_MAX_FOLDED = 0.1  # part of an image without a ray
+_MIN_OVERLAP = 0.2  # part of an image that the other camera must see
+_MIN_USABLE = 0.4  # part of a fisheye lens's image within `MAX_FIELD_DEG`
+_OVERLAP_DEPTHS_M = (1.0, 5.0)  # at which the overlap of two cameras is computed
+_MAX_ROLL_DEG = 30.0  # between two cameras
 _MAX_LEVER_M = 10.0  # from the IMU to the camera
-_DENSITY_RANGE = {"gyroscope": (1e-7, 1.0), "accelerometer": (1e-6, 10.0)}  # rad/s, m/s^2, both by sqrt(Hz)
+_DENSITY_RANGE = {"gyroscope": (1e-7, 1.0), "accelerometer": (1e-6, 10.0)}  # rad/s, m/s^2 by sqrt(Hz)
 _MAX_WALK = 1.0
 
 
 def rig_problem(rig: Rig) -> str | None:
-    """Why no tracker can use this rig, and how to mend it; None if one can."""
+    """Return why no tracker can use this rig, and how to repair it; None if one can."""
     return next(_rig_problems(rig), None)
 
 
 def lens_problem(camera: Camera) -> str | None:
-    """The same of one camera."""
+    """Return why no tracker can use this camera, and how to repair it; None if one can."""
     return next(_lens_problems(camera), None)
 
 
@@ -46,7 +45,7 @@ def _rig_problems(rig: Rig) -> Iterator[str]:
         yield "one camera alone gives no scale; stereo, depth or an IMU is needed"
     for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1), ("depth", rig.depth)):
         if camera is not None:
-            yield from (f"{name}: {why}" for why in _lens_problems(camera))
+            yield from (f"{name}: {problem}" for problem in _lens_problems(camera))
     if rig.cam1 is not None and rig.T_cam1_cam0 is not None:
         yield from _stereo_problems(rig.cam0, rig.cam1, rig.T_cam1_cam0)
     if rig.depth is not None and rig.T_depth_cam0 is not None:
@@ -58,56 +57,57 @@ def _rig_problems(rig: Rig) -> Iterator[str]:
 def _lens_problems(camera: Camera) -> Iterator[str]:
     size = f"{camera.width}x{camera.height}"
     if min(camera.width, camera.height) < _MIN_SIDE_PX:
-        yield f"images of {size} px hold no features; at least {_MIN_SIDE_PX} px a side are needed"
+        yield f"images of {size} px hold no features; use at least {_MIN_SIDE_PX} px a side"
     if not 0 <= camera.cx < camera.width or not 0 <= camera.cy < camera.height:
         yield (
             f"the principal point {camera.cx:g}, {camera.cy:g} lies outside an image of {size}; is the "
             "calibration of another resolution?"
         )
     if not 1 / _MAX_ASPECT <= camera.fx / camera.fy <= _MAX_ASPECT:
-        yield f"focal lengths {camera.fx:g} and {camera.fy:g} px: pixels are nearly square; calibrate again"
+        yield (
+            f"focal lengths {camera.fx:g} and {camera.fy:g} px differ, but pixels are nearly square; "
+            "calibrate again"
+        )
     with np.errstate(all="ignore"):
         uv, is_valid = _round_trip(camera)
-    if camera.is_fisheye and (beyond := _is_beyond_field(camera)).any():  # of no use, and no fault
+    if camera.is_fisheye and (beyond := _is_beyond_field(camera)).any():  # not used, and not wrong
         if 1 - beyond.mean() < _MIN_USABLE:
             yield (
-                f"{100 * beyond.mean():.0f} % of its image lie "
-                f"beyond {MAX_FIELD_DEG:g} "
-                f"degrees off the axis, "
-                "where nothing is tracked; focal lengths are in pixels of the images that are recorded"
+                f"{100 * beyond.mean():.0f} % of its image lie beyond {MAX_FIELD_DEG:g} degrees off the "
+                "axis, where nothing is tracked; give focal lengths in pixels of the recorded images"
             )
             return
         uv, is_valid = uv[~beyond], is_valid[~beyond]
     folded = 1 - is_valid.mean()
     if folded > _MAX_FOLDED:
         yield (
-            f"its distortion folds {100 * folded:.0f} % of the image; calibrate again, with boards in the "
-            "corners"
+            f"its distortion folds {100 * folded:.0f} % of the image; calibrate again, with the board in the "
+            "corners of the image"
         )
         return
     across, (lowest, highest) = _field_deg(uv[is_valid]), _FIELD_RANGE_DEG
     if not lowest <= across.min() <= across.max() <= highest:
         yield (
-            f"it would see {across[0]:.3g} by {across[1]:.3g} degrees, not {lowest:g} to {highest:g}; focal "
-            "lengths are in pixels of the images that are recorded"
+            f"its field of view is {across[0]:.3g} by {across[1]:.3g} degrees, not within {lowest:g} to "
+            f"{highest:g}; give focal lengths in pixels of the recorded images"
         )
 
 
 def _pixel_grid(camera: Camera) -> F64:
-    """(N, 2) all over the image."""
+    """Return pixels (N, 2) all over the image."""
     x, y = np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1])
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def _is_beyond_field(camera: Camera) -> NDArray[np.bool_]:
-    """Which of the pixels that are tried have a ray, but no normalised coordinates."""
+    """Return which pixels of the grid have a ray, but no normalised coordinates."""
     z = camera.directions(_pixel_grid(camera))[:, 2]
     return np.asarray(z < np.cos(np.radians(MAX_FIELD_DEG)))
 
 
 def _round_trip(camera: Camera) -> tuple[F64, NDArray[np.bool_]]:
-    """Of pixels all over the image their normalised coordinates (N, 2), and which (N,) really are: the same
-    way up as in the middle, and back to where they came from."""
+    """Return the normalised coordinates (N, 2) of the pixel grid, and which (N,) are valid: not mirrored,
+    and mapped back to the pixel."""
     px = _pixel_grid(camera)
     uv = camera.normalise(px)
     back = np.abs(camera.distort(uv) - px).max(axis=1)
@@ -116,42 +116,45 @@ def _round_trip(camera: Camera) -> tuple[F64, NDArray[np.bool_]]:
 
 
 def _field_deg(uv: F64) -> F64:
-    """Across and upright (2,), degrees: what the rays (N, 2) span."""
+    """Return the horizontal and vertical angle (2,), degrees, that the rays (N, 2) span."""
     out: F64 = np.degrees(np.ptp(np.arctan(uv), axis=0))
     return out
 
 
 def _stereo_problems(cam0: Camera, cam1: Camera, T_cam1_cam0: F64) -> Iterator[str]:
     if not 1 / _MAX_ASPECT <= cam0.focal / cam1.focal <= _MAX_ASPECT:
-        yield f"cam1: focal length {cam1.focal:g} px, but {cam0.focal:g} of cam0; they must look alike"
+        yield (
+            f"cam1: focal length {cam1.focal:g} px, but {cam0.focal:g} px in cam0; both need similar lenses "
+            "and resolutions"
+        )
     shared = _overlap(cam0, cam1, T_cam1_cam0)
     if shared < _MIN_OVERLAP:
         yield (
-            f"T_cam1_cam0: cam1 sees {100 * shared:.0f} % of what cam0 sees; look whether it takes "
-            "coordinates of cam0 to cam1, and not the other way round"
+            f"T_cam1_cam0: cam1 sees {100 * shared:.0f} % of what cam0 sees; check that it takes coordinates "
+            "of cam0 to cam1, not the inverse"
         )
     roll = abs(np.degrees(np.arctan2(T_cam1_cam0[1, 0], T_cam1_cam0[0, 0])))
     if roll > _MAX_ROLL_DEG:
         yield (
-            f"T_cam1_cam0: cam1's images are turned by {roll:.0f} degrees against cam0's; turn them upright, "
-            "and their calibration"
+            f"T_cam1_cam0: cam1's images are turned by {roll:.0f} degrees against cam0's; rotate them and "
+            "their calibration"
         )
 
 
 def _depth_problems(cam0: Camera, depth: Camera, T_depth_cam0: F64) -> Iterator[str]:
     apart = float(np.linalg.norm(T_depth_cam0[:3, 3]))
     if apart > BASELINE_RANGE_M[1]:
-        yield f"T_depth_cam0: the depth camera is {apart:g} m from cam0; translations are in metres"
+        yield f"T_depth_cam0: the depth camera is {apart:g} m from cam0; give translations in metres"
     shared = _overlap(cam0, depth, T_depth_cam0)
     if shared < _MIN_OVERLAP:
         yield (
-            f"T_depth_cam0: the depth camera sees {100 * shared:.0f} % of what cam0 sees; look whether it "
-            "takes coordinates of cam0 to the depth camera"
+            f"T_depth_cam0: the depth camera sees {100 * shared:.0f} % of what cam0 sees; check that it "
+            "takes coordinates of cam0 to the depth camera, not the inverse"
         )
 
 
 def _overlap(camera: Camera, other: Camera, T_other_camera: F64) -> float:
-    """The part of the camera's image that the other sees, where things are neither near nor far."""
+    """Return the part of the camera's image that the other camera sees, at the better of two depths."""
     with np.errstate(all="ignore"):
         uv, known = _round_trip(camera)
         other_uv, valid = _round_trip(other)
@@ -171,17 +174,13 @@ def _imu_problems(imu: ImuNoise, lever_m: float) -> Iterator[str]:
         lowest, highest = _DENSITY_RANGE[name]
         if not lowest <= density <= highest:
             yield (
-                f"IMU: {name}_noise_density {density:g} is no sensor's, which has {lowest:g} to {highest:g}; "
+                f"IMU: {name}_noise_density {density:g} is not within {lowest:g} to {highest:g}; "
                 "calibrate it with `share calibrate imu`"
             )
     if max(imu.gyro_walk, imu.accel_walk) > _MAX_WALK:
-        yield (
-            f"IMU: a random walk above {_MAX_WALK:g} is no sensor's; calibrate it with `share calibrate imu`"
-        )
+        yield (f"IMU: a random walk is above {_MAX_WALK:g}; calibrate it with `share calibrate imu`")
     if lever_m > _MAX_LEVER_M:
         yield (
-            f"T_cam_imu: the camera is {lever_m:g} m from the "
-            f"IMU, more than {_MAX_LEVER_M:g}; "
-            f"translations are "
-            "in metres"
+            f"T_cam_imu: the camera is {lever_m:g} m from the IMU, more than {_MAX_LEVER_M:g}; give "
+            "translations in metres"
         )

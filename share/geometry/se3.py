@@ -13,7 +13,7 @@ import numpy as np
 from share.types import F64
 
 _EYE: F64 = np.eye(3)
-_SMALL = 1e-6  # rad; below, Taylor series replace sin(x)/x and its kin
+_SMALL = 1e-6  # rad; below, Taylor series replace sin(x)/x and the like
 
 
 def hat(v: F64) -> F64:
@@ -49,8 +49,8 @@ def so3_exp(phi: F64) -> F64:
 
 
 def so3_log(R: F64) -> F64:
-    """Inverse of `so3_exp`, angle in [0, pi]: (..., 3, 3) -> (..., 3). Goes by the quaternion, so
-    that it is exact near pi too."""
+    """Inverse of `so3_exp`, angle in [0, pi]: (..., 3, 3) -> (..., 3). By the quaternion, so that it is
+    accurate near pi."""
     q = quat_from_matrix(R)
     q = np.where(q[..., 3:] < 0, -q, q)
     n = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
@@ -87,7 +87,7 @@ def quat_from_matrix(R: F64) -> F64:
 
 
 def matrix_from_quat(q: F64) -> F64:
-    """Rotations (..., 3, 3) of quaternions (..., 4) in order x y z w, normalised here."""
+    """Rotations (..., 3, 3) of quaternions (..., 4), x y z w, which need not be normalised."""
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     K = hat(q[..., :3])
     return _EYE + 2 * (q[..., 3, None, None] * K + K @ K)
@@ -141,7 +141,7 @@ def adjoint(T: F64) -> F64:
 
 
 def compose_cov(T_b_c: F64, cov_a_b: F64, cov_b_c: F64) -> F64:
-    """Covariance of T_a_b T_b_c, the two being independent (Barfoot eq. 7.286, right form)."""
+    """Covariance of T_a_b T_b_c with independent errors (Barfoot eq. 7.286, right form)."""
     Ad = adjoint(inverse(T_b_c))
     return Ad @ cov_a_b @ np.swapaxes(Ad, -1, -2) + cov_b_c
 
@@ -153,9 +153,9 @@ def inverse_cov(T_a_b: F64, cov: F64) -> F64:
 
 
 def position_sigma(cov: F64) -> float:
-    """One sigma of a position, m: the root of the trace of the translation in cov (6, 6).
+    """Return the position sigma, m: the root of the trace of the translation block of cov (6, 6).
 
-    What rounding took below 0 is 0; NaN stays NaN.
+    Negative rounding errors give 0; NaN gives NaN.
     """
     return float(np.sqrt(np.maximum(cov[3:, 3:].trace(), 0.0)))
 
@@ -174,8 +174,11 @@ def rotation_angle(R: F64) -> F64:
 
 
 def pairwise_distances(T: F64, others: F64) -> tuple[F64, F64]:
-    """How far poses (N, 4, 4) are from others (M, 4, 4), m and rad, (N, M) each. For many at a time: what is
-    less than some 1e-8 of how far they are from the origin, or 1e-8 rad, is rounding."""
+    """Return the distances of poses (N, 4, 4) from others (M, 4, 4), m and rad, (N, M) each.
+
+    Fast for many poses. Values below some 1e-8 of the distance from the origin, or 1e-8 rad, are rounding
+    errors.
+    """
     p, q = T[:, :3, 3], others[:, :3, 3]
     square = (p**2).sum(axis=1)[:, None] + (q**2).sum(axis=1) - 2 * p @ q.T
     cosine2 = T[:, :3, :3].reshape(-1, 9) @ others[:, :3, :3].reshape(-1, 9).T - 1
@@ -186,9 +189,6 @@ def orthonormal(T: F64) -> F64:
     """The rigid transform nearest to T (..., 4, 4): removes drift of repeated products."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     return from_rt(U @ Vt, T[..., :3, 3])
-
-
-# ---- Rigid alignment of two point sets.
 
 
 def umeyama(source: F64, target: F64) -> F64:
@@ -205,7 +205,10 @@ def umeyama(source: F64, target: F64) -> F64:
 
 
 def best_rotation(M: F64) -> F64:
-    """The rotation R (3, 3) that maximises trace(R' M): of M = sum target source', what turns sources best to
-    targets. Source: Umeyama, eq. 40 and 43."""
+    """Return the rotation R (3, 3) that maximises trace(R' M); for M = sum target source', the best
+    alignment.
+
+    Source: Umeyama, eq. 40 and 43.
+    """
     U, _, Vt = np.linalg.svd(M)
     return np.asarray(U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt)

@@ -1,8 +1,9 @@
-"""How far new features may be where neither stereo nor a depth camera tells: about as far as what is seen
-near them.
+"""Initial inverse depth of new features where neither stereo nor a depth camera measures it: about that of
+the features near them.
 
-What they share with their neighbours is the scale, and if the filter is unsure of that it stays as
-unsure: a hundred independent guesses would fix the scale at whatever rooms are like on average."""
+New features share the scale error of their neighbours, and are as uncertain of it: treated as independent
+guesses, a hundred of them would fix the scale at that of an average room.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +18,20 @@ from share.odometry.state import FilterState
 from share.types import F32, F64
 
 MEAN_RHO = 0.4  # 1/m, where nothing is known
-ROOM_LOG_SIGMA = 0.8  # by how much rooms differ, sigma of the logarithm
-FEATURE_SPREAD = 0.5  # of an inverse depth, by which a feature may differ from the others
-_MIN_NEIGHBOURS = 8  # features that tell how far the room is
-_NEIGHBOUR_PX = 30.0  # that count all alike
+ROOM_LOG_SIGMA = 0.8  # sigma of the logarithm of a room's inverse depth
+FEATURE_SPREAD = 0.5  # sigma of a feature's inverse depth, relative to the room's
+_MIN_NEIGHBOURS = 8  # features in the state; with fewer the prior is that of an unknown room
+_NEIGHBOUR_PX = 30.0  # features nearer than this weigh about the same
 _MIN_RHO = 0.03  # 1/m
 
 
 @dataclass(frozen=True, eq=False)
 class DepthPrior(ArrayTable):
-    """Inverse depths (N,) 1/m. Their errors: sigma (N,) of their own; like (N, M), how those of the M
-    features of the state come in, M = 0 where they do not; common (N,), one that they share among
-    themselves."""
+    """Inverse depths rho (N,) 1/m and their errors.
+
+    sigma (N,): independent error of each. J_existing (N, M): derivative by the inverse depths of the M
+    features of the state, M = 0 where there is no dependence. common_sigma (N,): an error that all N share.
+    """
 
     rho: F64
     sigma: F64
@@ -37,7 +40,8 @@ class DepthPrior(ArrayTable):
 
 
 def prior_from_neighbours(state: FilterState, px: F32, known_px: F32) -> DepthPrior:
-    """Of features at px (N, 2) of the newest keyframe's image, where the state's are at known_px (M, 2)."""
+    """Return the prior of features at px (N, 2) in the newest keyframe's image, where the state's features
+    are at known_px (M, 2)."""
     N, M = len(px), len(state.feature_ids)
     if M < _MIN_NEIGHBOURS:
         ones = np.ones(N)
@@ -59,7 +63,8 @@ def prior_from_neighbours(state: FilterState, px: F32, known_px: F32) -> DepthPr
 
 
 def current_rho(state: FilterState) -> F64:
-    """1/m (M,) of the state's features, along cam0's axis where it is now; 0.03 at least."""
+    """Return the inverse depths (M,) 1/m of the state's features along cam0's axis in its present pose; at
+    least 0.03."""
     T = anchors_in_camera(state)
     z = (T[:, 2, :3] * rays(state.ray)).sum(axis=1) + state.rho * T[:, 2, 3]
     out: F64 = np.maximum(state.rho, _MIN_RHO) / np.maximum(z, 0.1)

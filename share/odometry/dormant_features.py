@@ -1,4 +1,4 @@
-"""Features that are out of sight, kept with the keyframes that saw them first until these are seen again."""
+"""Dormant features: features out of view, kept with their anchor keyframes until they are in view again."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from share.odometry.feature_appearance import Appearance
 from share.odometry.state import FilterState
 from share.types import F64, I64
 
-_MAX_RELATIVE_SIGMA = 0.1  # relative sigma of an inverse depth worth remembering
-_SIGMA_INFLATION = 1.5  # times the sigma that it had: what it shared with the pose is lost
-_MAX_PER_KEYFRAME = 40  # of a keyframe
+_MAX_RELATIVE_SIGMA = 0.1  # relative sigma of an inverse depth that is kept
+_SIGMA_INFLATION = 1.5  # times its sigma, because its correlation with the poses is lost
+_MAX_PER_KEYFRAME = 40  # features
 
 
 @dataclass(frozen=True, eq=False)
 class DormantTable(ArrayTable):
-    """Features: ids (N,), number of the host (N,), rays (N, 2), inverse depths and sigmas (N,), looks."""
+    """N features: ids (N,), index of the anchor (N,), rays (N, 2), inverse depths and sigmas (N,) 1/m,
+    appearance."""
 
     ids: I64
     anchor: I64
@@ -33,16 +34,16 @@ class DormantTable(ArrayTable):
 
 
 class DormantFeatures:
-    """By keyframe id. Memory is bounded by the keyframes of the state."""
+    """Dormant features by the id of their anchor keyframe. Memory is bounded by the number of keyframes in
+    the state."""
 
     def __init__(self) -> None:
-        self._by_keyframe: dict[int, list[DormantTable]] = {}  # in the order in which they fell asleep
-        self._unsorted: list[
-            tuple[I64, DormantTable]
-        ] = []  # ids of their hosts; sorted only where somebody asks
+        self._by_keyframe: dict[int, list[DormantTable]] = {}  # oldest first
+        # Anchor ids and features, grouped by keyframe only when needed.
+        self._unsorted: list[tuple[I64, DormantTable]] = []
 
     def deactivate(self, state: FilterState, appearance: Appearance, indices: I64) -> None:
-        """Remember features number `indices` of the state if their depth is known."""
+        """Keep features `indices` of the state if their depth is well known."""
         sigma = _SIGMA_INFLATION * np.sqrt(state.rho_variance[indices])
         is_known = (sigma < _MAX_RELATIVE_SIGMA * np.abs(state.rho[indices])) | (sigma < 0.003)
         is_known &= appearance.age[indices] >= 5
@@ -60,7 +61,7 @@ class DormantFeatures:
             self._unsorted.append((state.keyframe_ids[anchors], dormant))
 
     def _group_by_keyframe(self) -> None:
-        """By keyframe."""
+        """Move `_unsorted` into `_by_keyframe`."""
         if not self._unsorted:
             return
         keys = np.concatenate([keys for keys, _ in self._unsorted])
@@ -70,7 +71,7 @@ class DormantFeatures:
             self._by_keyframe.setdefault(key, []).append(new.take(keys == key))
 
     def _most_certain(self, keyframe: int) -> DormantTable | None:
-        """Of one keyframe."""
+        """Return the dormant features of one keyframe, reduced to the most certain ones; None without any."""
         if keyframe not in self._by_keyframe:
             return None
         first, *others = self._by_keyframe[keyframe]
@@ -82,11 +83,12 @@ class DormantFeatures:
         return dormant
 
     def has_features(self, keyframe_ids: I64) -> NDArray[np.bool_]:
-        """Of which keyframes (K,) there are any."""
+        """Return which keyframes (K,) have dormant features."""
         self._group_by_keyframe()
         return np.isin(keyframe_ids, list(self._by_keyframe))
 
     def drop_keyframes(self, keyframe_ids: I64) -> None:
+        """Forget the features of these keyframes."""
         self._group_by_keyframe()
         for keyframe_id in keyframe_ids.tolist():
             self._by_keyframe.pop(keyframe_id, None)
@@ -94,8 +96,12 @@ class DormantFeatures:
     def nearby(
         self, state: FilterState, camera: Camera, max_m: float, max_rad: float, max_count: int
     ) -> DormantTable | None:
-        """Those that the camera should see of the keyframes that look from about here, the nearest ones first
-        until there are `max_count`; their hosts are numbers in the state. None where there are none."""
+        """Return features that the camera should see, from keyframes within `max_m` and `max_rad` of the
+        body's pose.
+
+        The nearest keyframes come first, until there are `max_count` features. `anchor` is the index in the
+        state. None without any.
+        """
         self._group_by_keyframe()
         (distance,), (angle,) = se3.pairwise_distances(state.T[None], state.keyframe_poses)
         out: list[DormantTable] = []
@@ -116,7 +122,7 @@ class DormantFeatures:
         return out[0].concatenate(*out[1:]) if out else None
 
     def reactivate(self, ids: I64) -> None:
-        """These are features of the state again."""
+        """Remove the features with these ids: they are in the state again."""
         self._group_by_keyframe()
         reactivated = set(ids.tolist())
         for keyframe, parts in list(self._by_keyframe.items()):

@@ -1,4 +1,4 @@
-"""What the features of the state look like, in the order in which the state has them."""
+"""Appearance of the state's features, in the order of the state."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from share.types import F32, F64, I64, U8
 from share.vision import patches
 from share.vision.patches import Patches
 
-_YOUNG_FRAMES = 10  # frames
-_DRIFT_GAIN = 0.2  # of a residual that is added to a lag
-_MIN_DRIFT_PX, _MIN_DRIFT_RATIO = (
-    0.5,
-    5.0,
-)  # a lag of this size, and so many times the least ones, is a motion of its own
-_MIN_FEATURES = 12  # features that say something of each other
+_YOUNG_FRAMES = 10  # a feature of fewer frames is matched in cam1 in every frame
+_DRIFT_GAIN = 0.2  # of the exponential mean of a feature's residual
+_MIN_DRIFT_PX = 0.5  # a drift above this,
+_MIN_DRIFT_RATIO = 5.0  # and above this many times the first quartile of all, is a feature's own motion
+_MIN_FEATURES = 12  # fewer cannot be compared with each other
 _SLANT_SIGMA = 0.4  # tangent of a surface's slant, one sigma of the room's surfaces
-_MIN_RHO = 0.05  # 1/m; slants of what is further do not show
-_GRAY_NOISE = 12.0  # gray levels: more than an image's noise, because a patch repeats its own errors
-_SLANT_GAIN = 0.3  # of what a frame says is taken: its errors are much like the next one's
+_MIN_RHO = 0.05  # 1/m; the slant of what is further away does not show
+_GRAY_NOISE = 12.0  # gray levels: more than an image's noise, because a patch repeats its errors
+_SLANT_GAIN = 0.3  # part of a frame's correction that is applied: errors of successive frames correlate
 
 
 @dataclass(frozen=True, eq=False)
 class Appearance(ArrayTable):
-    """patch of N features. spread (N, 2, 2): d ray / d px in the image that saw them first. slant (N, 2):
-    d rho / d px there, of the surface, upright within a sigma of 1 / sqrt(upright (N,)). px (N, 2): where
-    each was seen last; lag (N, 2): px by which it has lately run away from where the others say it should
-    be. age (N,): frames in which it was seen."""
+    """Appearance of N features.
+
+    patch: from the image in which each was first seen. ray_per_px (N, 2, 2): d ray / d px in that image.
+    slant (N, 2): d rho / d px there, of the surface, with slant_information (N,), the inverse variance of a
+    prior of 0. last_px (N, 2): the last position in an image. drift_px (N, 2): exponential mean of its
+    residual relative to static features. age (N,): frames in which it was seen.
+    """
 
     patch: Patches
     ray_per_px: F64
@@ -44,7 +45,8 @@ class Appearance(ArrayTable):
 
 
 def extract_appearance(image: U8, camera: Camera, px: F32, ray: F64, rho: F64) -> Appearance:
-    """Of new features at px (N, 2) of the image, on rays (N, 2), at inverse depths (N,)."""
+    """Return the appearance of new features at px (N, 2) of the image, on rays (N, 2), at inverse depths (N,)
+    1/m."""
     n = len(px)
     ray_per_px = np.asarray(np.linalg.inv(camera.jacobian(ray)), np.float64)
     sigma = _SLANT_SIGMA * np.maximum(rho, _MIN_RHO) / camera.focal
@@ -54,7 +56,7 @@ def extract_appearance(image: U8, camera: Camera, px: F32, ray: F64, rho: F64) -
 
 
 def update_slant(appearance: Appearance, indices: I64, samples: F32, px_per_rho: F64) -> None:
-    """From how the patches of features `indices` (M,) look where they were found: see
+    """Update the slant of features `indices` (M,) in place from the samples at which they were matched: see
     `patches.slant_evidence`."""
     information, step = patches.slant_evidence(appearance.patch.take(indices), samples, px_per_rho)
     information, step = information / _GRAY_NOISE**2, step / _GRAY_NOISE**2
@@ -65,10 +67,11 @@ def update_slant(appearance: Appearance, indices: I64, samples: F32, px_per_rho:
 
 
 def drifting_features(appearance: Appearance, indices: I64, residual: F64) -> NDArray[np.bool_]:
-    """Which of features `indices` (M,) move on their own. residual (M, 2): px from where they were expected.
+    """Return which of features `indices` (M,) move by themselves, and update their drift. residual (M, 2):
+    px, measured minus predicted.
 
-    What moves slowly passes every gate, a little off each time and always the same way, and drags the pose
-    along. The quarter that lags least stands still, and what it has in common is the pose's own error.
+    A slow mover passes every gate, a little off each time in the same direction, and drags the pose along.
+    The quarter with the least drift counts as static; its median residual is the pose's error.
     """
     if len(indices) < _MIN_FEATURES:
         return np.zeros(len(indices), bool)
@@ -84,13 +87,14 @@ def drifting_features(appearance: Appearance, indices: I64, residual: F64) -> ND
 
 
 def is_stereo_due(appearance: Appearance) -> NDArray[np.bool_]:
-    """Which of these a second camera is asked for: young ones always, for their depth, others by turns."""
+    """Return which features (N,) to match in cam1: young ones in every frame, for their depth, others in
+    every fourth."""
     out: NDArray[np.bool_] = (appearance.age < _YOUNG_FRAMES) | (staggered_age(appearance) % 4 == 0)
     return out
 
 
 def staggered_age(appearance: Appearance) -> I64:
-    """(N,) counts frames, each feature from another number: by it features take turns."""
+    """Return frame counts (N,) with another offset for each feature, by which features take turns."""
     out: I64 = appearance.age + np.arange(len(appearance.age))
     return out
 

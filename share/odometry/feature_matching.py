@@ -1,4 +1,4 @@
-"""Features of the state in the images of a frame: expected where the filter says, found by their patches."""
+"""Match the state's features in the images of a frame: predict their positions, then align their patches."""
 
 from __future__ import annotations
 
@@ -17,15 +17,13 @@ from share.types import F32, F64, I64, U8, Frame
 from share.vision import optical_flow, patches
 
 _BORDER_PX = 6.0
-_MAX_FLOW_ERROR_PX = 1.5  # how far the way by the image before may be from what the first patch says
-_MAX_MISSING_SHARE = (
-    0.15  # of the features in view that are not found: then they are followed from the image before
-)
+_MAX_FLOW_ERROR_PX = 1.5  # between the position by optical flow and by alignment of the patch
+_MAX_MISSING_SHARE = 0.15  # of the features in view; if more are missing, they are tracked by optical flow
 
 
 @dataclass(frozen=True, eq=False)
 class StereoMatches:
-    """Features number which (M,) in cam1, and where each was found: at (M, 2), normalised."""
+    """Indices (M,) of the features found in cam1, and their normalised coordinates `at` (M, 2)."""
 
     feature: I64
     at: F64
@@ -33,11 +31,14 @@ class StereoMatches:
 
 @dataclass(frozen=True, eq=False)
 class FeatureMatches:
-    """Of all N features in cam0: where each was found, px (N, 2) and at (N, 2) normalised, NaN elsewhere, and
-    whether it was, and, for others to say, went its own way; expected (N, 2) px and uv (N, 2) normalised, NaN
-    behind the camera; what patches look like there,
-    warp (N, 2, 2) px by px, and by how many px of its first image a feature moves for one unit more of
-    inverse depth, along (N, 2). samples (N, S): see `patches.AlignedPatches`. right: in cam1."""
+    """Matches of all N features in cam0.
+
+    px (N, 2) and at (N, 2): measured position, in pixels and normalised; `at` is NaN where is_found (N,) is
+    False. is_dynamic (N,): set later, by `LandmarkMap`. predicted_px, predicted_uv (N, 2): predicted
+    position, NaN behind the camera. warp (N, 2, 2): d px / d px of the first image. px_per_rho (N, 2):
+    derivative of the position in the first image by inverse depth. samples (N, S): see
+    `patches.AlignedPatches`. cam1: matches in cam1.
+    """
 
     px: F32
     at: F64
@@ -51,15 +52,15 @@ class FeatureMatches:
     cam1: StereoMatches | None = None
 
     def in_view_count(self, camera: Camera) -> int:
-        """How many should be in view."""
+        """Return the number of features predicted in view."""
         return int(camera.is_inside(self.predicted_px, 0.0).sum())
 
 
 def match_features(
     frame: Frame, rig: Rig, state: FilterState, appearance: Appearance, config: InertialConfig, start: int = 0
 ) -> FeatureMatches:
-    """Those from number `start` on in the images of a frame, both in one pass; in cam1 only those whose turn
-    it is."""
+    """Match the features from index `start` on in the images of a frame, both in one pass; in cam1 only those
+    that are due."""
     n = len(state.feature_ids)
     indices = np.arange(start, n)
     images: tuple[U8, ...] = (frame.image0,)
@@ -92,7 +93,7 @@ def match_features(
     accepted = _is_match(aligned, px, config, config.reach_px)
     predicted_px = patch.uv[to_align] + _solved(jacobian[to_align], aligned.px - px)
     for camera, part in zip(cameras, (slice(0, cam0_to_align), slice(cam0_to_align, None)), strict=False):
-        if camera.is_fisheye:  # whose pixels are not as much of (x/z, y/z) a few px on
+        if camera.is_fisheye:  # the Jacobian changes within a few px
             predicted_px[part] = camera.normalise(
                 aligned.px[part].astype(np.float64), patch.uv[to_align[part]]
             )
@@ -100,7 +101,7 @@ def match_features(
             predicted_px[part] += _solved(
                 jacobian[to_align[part]], aligned.px[part] - camera.distort(predicted_px[part])
             )
-        if camera.is_bounded:  # it may have strayed to where there is no ray
+        if camera.is_bounded:  # the aligned position may have no normalised coordinates
             accepted[part] &= camera.has_normalised(aligned.px[part].astype(np.float64))
     _store(
         out,
@@ -127,7 +128,10 @@ def match_by_flow(
     matches: FeatureMatches,
     config: InertialConfig,
 ) -> None:
-    """Where many of cam0 were not found, these are followed from the image before to wherever they went."""
+    """Track the missing features from the previous image by optical flow, if many are missing in cam0.
+
+    Updates `matches` in place.
+    """
     inside = camera.is_inside(matches.predicted_px, _BORDER_PX)
     missing = np.flatnonzero(~matches.is_found & inside)
     if len(missing) <= _MAX_MISSING_SHARE * inside.sum():
@@ -136,25 +140,25 @@ def match_by_flow(
     px, ok = optical_flow.track_points(
         previous, image, appearance.last_px[missing], guess, window=15, levels=2, back_check_px=1.0
     )
-    missing, about = missing[ok], px[ok].astype(np.float64)
+    missing, flow_px = missing[ok], px[ok].astype(np.float64)
     if len(missing) == 0:
         return
     aligned = patches.align(
-        (image,), len(missing), appearance.patch.kernels[missing], about, matches.warp[missing]
+        (image,), len(missing), appearance.patch.kernels[missing], flow_px, matches.warp[missing]
     )
     start_px = camera.normalise(aligned.px.astype(np.float64))
-    accepted = _is_match(aligned, about, config, _MAX_FLOW_ERROR_PX) & np.isfinite(start_px).all(axis=1)
+    accepted = _is_match(aligned, flow_px, config, _MAX_FLOW_ERROR_PX) & np.isfinite(start_px).all(axis=1)
     _store(matches, missing, aligned, start_px, accepted, slice(None))
 
 
 def _no_matches(n: int, indices: I64, predicted_px: F64, patch: PatchPrediction, warp: F64) -> FeatureMatches:
-    """Of n features, where `which` (M,) are to be looked for."""
+    """Return matches of n features, none found yet; `indices` (M,) have a prediction."""
     all_px, uv, px_per_rho = predicted_px, patch.uv, _px_per_rho(patch)
     if len(indices) < n:
         all_px, uv, px_per_rho = (
-            _spread(value, indices, np.full((n, 2), np.nan)) for value in (all_px, uv, px_per_rho)
+            _scatter(value, indices, np.full((n, 2), np.nan)) for value in (all_px, uv, px_per_rho)
         )
-        warp = _spread(warp, indices, np.zeros((n, 2, 2)))
+        warp = _scatter(warp, indices, np.zeros((n, 2, 2)))
     none, samples = np.zeros(n, bool), np.zeros((n, len(patches.OFFSETS)), np.float32)
     px = np.where(np.isnan(all_px), -1e6, all_px).astype(np.float32)
     return FeatureMatches(
@@ -162,13 +166,13 @@ def _no_matches(n: int, indices: I64, predicted_px: F64, patch: PatchPrediction,
     )
 
 
-def _spread(values: F64, which: I64, into: F64) -> F64:
-    into[which] = values
-    return into
+def _scatter(values: F64, indices: I64, out: F64) -> F64:
+    out[indices] = values
+    return out
 
 
 def _solved(J: F64, b: F64) -> F64:
-    """x (N, 2) with J x = b of (N, 2, 2) and (N, 2); not finite where J has no inverse."""
+    """Return x (N, 2) with J x = b for J (N, 2, 2), b (N, 2); not finite where J is singular."""
     (p, q), (r, s) = np.moveaxis(J, 0, 2)
     x, y = b.T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -177,7 +181,8 @@ def _solved(J: F64, b: F64) -> F64:
 
 
 def _px_per_rho(patch: PatchPrediction) -> F64:
-    """px (N, 2) of the first image by which a feature moves for one unit more of inverse depth."""
+    """Return the derivative (N, 2) px of the position in the first image by inverse depth; 0 where it is not
+    finite."""
     out = _solved(patch.warp, patch.J_rho)
     return np.where(np.isfinite(out), out, 0.0)
 
@@ -185,7 +190,7 @@ def _px_per_rho(patch: PatchPrediction) -> F64:
 def _is_match(
     aligned: patches.AlignedPatches, px: F64, config: InertialConfig, reach_px: float
 ) -> NDArray[np.bool_]:
-    """Which are what was looked for, near px (N, 2)."""
+    """Return which alignments (N,) converged within `reach_px` of px (N, 2) with enough correlation."""
     distance = np.hypot(*(aligned.px - px).T)
     converged = (aligned.last_step < config.settled_px) & (distance < reach_px)
     out: NDArray[np.bool_] = converged & (aligned.correlation > config.alike)
@@ -200,27 +205,28 @@ def _store(
     accepted: NDArray[np.bool_],
     part: slice,
 ) -> None:
-    out.px[indices], out.is_found[indices], out.samples[indices] = (
-        aligned.px[part],
-        accepted,
-        aligned.samples[part],
-    )
+    out.px[indices] = aligned.px[part]
+    out.is_found[indices] = accepted
+    out.samples[indices] = aligned.samples[part]
     out.at[indices[accepted]] = at[accepted]
 
 
-# ---- What the cameras should see of the features, and how that depends on every part of the state.
+# Predicted positions of features, and their derivatives by the state.
 #
-# A feature at inverse depth rho on the ray f of its host is q = f + rho p in any frame's homogeneous
-# coordinates: nothing here divides by rho, so a feature may be infinitely far (Civera et al. 2008).
+# A feature at inverse depth rho on the ray f of its anchor is q = f + rho p in the homogeneous coordinates of
+# any frame: nothing here divides by rho, so a feature may be infinitely far away (Civera et al. 2008).
 
-_MIN_DEPTH = 0.02  # homogeneous depth below which nothing is seen
+_MIN_DEPTH = 0.02  # homogeneous depth; below it a point counts as behind the camera
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction(ArrayTable):
-    """Of N features: uv (N, 2) normalised coordinates, NaN behind the camera; and its derivatives by the
-    body's pose (N, 2, 6), the extrinsic (N, 2, 6), inverse depth (N, 2). That by the host's pose is the
-    negative of that by the body's: only their difference is ever seen."""
+    """Predicted positions of N features and their derivatives.
+
+    uv (N, 2): normalised coordinates, NaN behind the camera. Derivatives by the body's pose (N, 2, 6), the
+    extrinsic (N, 2, 6), the inverse depth (N, 2). The derivative by the anchor's pose is the negative of that
+    by the body's: only their difference is observable.
+    """
 
     uv: F64
     H_pose: F64
@@ -231,8 +237,10 @@ class Prediction(ArrayTable):
 def predict(
     state: FilterState, indices: I64, T_cam1_cam0: F64 | None = None, in_cam1: NDArray[np.bool_] | None = None
 ) -> Prediction:
-    """What cam0 should see of the features at indices `which` (N,). With T_right_left (4, 4) cam1, or only of
-    those that are `right` (N,)."""
+    """Predict features `indices` (N,) in cam0.
+
+    With T_cam1_cam0 (4, 4): in cam1, or in cam1 only where in_cam1 (N,) is True.
+    """
     f, rho, anchor = rays(state.ray[indices]), state.rho[indices], state.anchor[indices]
     T_odom_anchor = state.keyframe_poses @ state.T_body_cam
     T_cam_odom = se3.inverse(state.T @ state.T_body_cam)
@@ -248,7 +256,8 @@ def predict(
 
 
 def in_image_plane(predicted: Prediction, camera: Camera, mask: NDArray[np.bool_]) -> Prediction:
-    """Those that are `mask` (N,), a fisheye camera's, in its image plane: see `Camera.evened`."""
+    """Return the prediction with the features in `mask` (N,) in the image plane of `camera`, a fisheye: see
+    `Camera.to_image_plane`."""
     uv, H_pose, H_extrinsic, H_rho = (
         part.copy() for part in (predicted.uv, predicted.H_pose, predicted.H_extrinsic, predicted.H_rho)
     )
@@ -261,9 +270,11 @@ def in_image_plane(predicted: Prediction, camera: Camera, mask: NDArray[np.bool_
 
 @dataclass(frozen=True, eq=False)
 class PatchPrediction(ArrayTable):
-    """Where to look for N features, and as what: uv (N, 2) normalised coordinates, NaN behind the camera;
-    warp (N, 2, 2), how these change with the pixel of the host: what a patch looks like; by_rho (N, 2), with
-    inverse depth."""
+    """Predicted position and shape of N patches.
+
+    uv (N, 2): normalised coordinates, NaN behind the camera. warp (N, 2, 2): d uv / d px of the anchor's
+    image. J_rho (N, 2): d uv / d inverse depth.
+    """
 
     uv: F64
     warp: F64
@@ -278,8 +289,10 @@ def predict_patches(
     T_cam1_cam0: F64 | None = None,
     in_cam1: NDArray[np.bool_] | None = None,
 ) -> PatchPrediction:
-    """As `predict`. spread (N, 2, 2): d ray / d px of the host. slant (N, 2): d rho / d px, of the
-    surface."""
+    """Predict the patches of features `indices` (N,); T_cam1_cam0 and in_cam1 as in `predict`.
+
+    ray_per_px (N, 2, 2): d ray / d px in the anchor's image. slant (N, 2): d rho / d px of the surface.
+    """
     rho, T = state.rho[indices], anchors_in_camera(state, indices)
     R, t = T[:, :3, :3], T[:, :3, 3]
     q = (R @ rays(state.ray[indices])[:, :, None])[:, :, 0] + rho[:, None] * t
@@ -290,8 +303,10 @@ def predict_patches(
 def _project_with_jacobians(
     q: F64, rho: F64, q_by_rho: F64, T_cam1_cam0: F64 | None, in_cam1: NDArray[np.bool_] | None
 ) -> tuple[F64, F64, F64]:
-    """Of points q (N, 3) in cam0, which inverse depth moves by by_rho (N, 3): uv (N, 2), its derivative
-    (N, 2, 3) by q, and (N, 2) by inverse depth."""
+    """Project points q (N, 3) in cam0, with derivative q_by_rho (N, 3) by inverse depth.
+
+    Return uv (N, 2), d uv / d q (N, 2, 3) and d uv / d inverse depth (N, 2).
+    """
     if T_cam1_cam0 is None:
         uv, D = _project(q)
         return uv, D, (D @ q_by_rho[:, :, None])[:, :, 0]
@@ -313,22 +328,23 @@ def _project_with_jacobians(
 def is_in_view(
     state: FilterState, camera: Camera, keyframe_index: int, ray: F64, rho: F64
 ) -> NDArray[np.bool_]:
-    """Which of what keyframe number `keyframe_index` sees on rays (N, 2), inverse depth rho (N,), cam0 has in
-    view."""
+    """Return which points (N,) on rays (N, 2) of keyframe `keyframe_index`, at inverse depths (N,), are in
+    cam0's view."""
     T = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses[keyframe_index] @ state.T_body_cam
     uv, _ = _project(rays(ray) @ T[:3, :3].T + rho[:, None] * T[:3, 3])
     return np.asarray(camera.is_inside(np.nan_to_num(camera.distort(uv), nan=-1e6)), bool)
 
 
 def anchors_in_camera(state: FilterState, indices: I64 | slice = slice(None)) -> F64:
-    """T_cam_host (N, 4, 4): from cam0 of the hosts of features `which` (N,), all by default, to cam0 now."""
+    """Return T_cam_anchor (N, 4, 4): from cam0 of the anchor of each feature in `indices` to cam0 now."""
     T_cam_anchor = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses @ state.T_body_cam
     out: F64 = T_cam_anchor[state.anchor[indices]]
     return out
 
 
 def pose_jacobian(D: F64, q: F64, rho: F64) -> F64:
-    """D [-hat(q) | rho I], (N, K, 6): what Exp(xi) does to q (N, 3), seen through D (N, K, 3) or (K, 3)."""
+    """Return D [-hat(q) | rho I] (N, K, 6): the derivative of q (N, 3) by xi of Exp(xi), times D (N, K, 3) or
+    (K, 3)."""
     out = np.empty((len(q), D.shape[-2], 6))
     x, y, z = q[:, 0, None], q[:, 1, None], q[:, 2, None]
     a, b, c = D[..., 0], D[..., 1], D[..., 2]
@@ -338,7 +354,7 @@ def pose_jacobian(D: F64, q: F64, rho: F64) -> F64:
 
 
 def _project(q: F64) -> tuple[F64, F64]:
-    """(x, y) / z of (N, 3) and the derivative (N, 2, 3)."""
+    """Return (x, y) / z of (N, 3) and the derivative (N, 2, 3); NaN behind the camera."""
     z = np.where(q[:, 2] > _MIN_DEPTH, q[:, 2], np.nan)
     uv = q[:, :2] / z[:, None]
     D = np.zeros((len(q), 2, 3))

@@ -1,15 +1,19 @@
-"""Samples that no body's motion leads to: runs of wrong ones, of any length up to a fifth of a second.
+"""Reject IMU samples that no motion of a body explains: runs of wrong samples, up to a fifth of a second
+long.
 
-`share.sensors.imu_check` leaves out what is surely a glitch: up to three samples with neighbours on both
-sides. Here nothing waits for what comes after, so that what is doubted may be true: a blow looks the same at
-first. Who doubts takes the IMU as silent meanwhile, and is as unsure as if either could be.
+`share.sensors.imu_check` removes certain glitches: up to three samples with neighbours on both sides. This
+detector does not wait for later samples, so a rejected sample may be true: a knock looks the same at first.
+Therefore the filter treats the IMU as missing meanwhile, and inflates its covariance for either case.
 
-A sample is held against the one before it. The first of all, and the first after a gap, has none: the samples
-that came with it are held against one another, and the longest chain in which each may follow the one before
-is believed. Those of the next frames may outvote it: then what was believed is taken back."""
+A sample is compared with the accepted one before it. The first sample of all, and the first after a gap, has
+none: the samples that came with it are compared with one another, and the longest chain in which each may
+follow the one before is accepted. Samples of the next frames may form a longer chain: then accepted samples
+are retracted.
+"""
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -19,42 +23,42 @@ from numpy.typing import NDArray
 
 from share.types import F64, I64
 
-_RECENT_STEPS = 20  # steps that tell how a body moves
-_STEP_RATIO = 4.0  # as far as the farthest of them, or as many of them as lie between,
-_STEP_MARGIN = np.repeat(
-    [0.7, 12.0], 3
-)  # and this, rad/s and m/s^2: no body moves farther from one to the next.
-# Of 195,000 samples of seven drones and hand-held recordings (EuRoC, TUM-VI) none has more than 0.35 and 3.9.
-_INFLATION_MARGIN = np.repeat(
-    [0.4, 5.0], 3
-)  # with this a sample is believed, and the filter unsure by as much
-_INFLATION_NS = 50_000_000  # over so long
-_SUSPECT_RATIO, _SUSPECT_MARGIN = (
-    2.0,
-    np.repeat([0.1, 2.0], 3),
-)  # the same of what may be wrong, if images say so too,
-_SUSPECT_NS = 200_000_000  # for so long after
-_NOMINAL_STEP_NS = 5_000_000  # 200 Hz; what is added is for samples so far apart, and grows with the distance
-_MAX_GAP_NS = 25_000_000  # samples further apart say nothing of each other
-_MAX_RUN_NS = 200_000_000  # of a run; what lasts longer is how things are now
+_RECENT_STEPS = 20  # steps between accepted samples that describe the present motion
+# A sample is rejected if its step exceeds ratio * (largest recent step) + margin (rad/s, m/s^2). Of 195,000
+# samples of seven drones and hand-held recordings (EuRoC, TUM-VI) none exceeds margins of 0.35 and 3.9.
+_STEP_RATIO = 4.0  # or the number of sample periods since the last accepted sample, if that is more
+_STEP_MARGIN = np.repeat([0.7, 12.0], 3)
+# An accepted sample whose step exceeds ratio * (largest recent step) + this margin inflates the covariance
+# by its step over `_INFLATION_NS`.
+_INFLATION_MARGIN = np.repeat([0.4, 5.0], 3)  # rad/s, m/s^2
+_INFLATION_NS = 50_000_000
+# An accepted sample beyond these is suspect: images may still show it to be wrong.
+_SUSPECT_RATIO = 2.0
+_SUSPECT_MARGIN = np.repeat([0.1, 2.0], 3)  # rad/s, m/s^2
+_SUSPECT_NS = 200_000_000  # for which a sample stays suspect
+_NOMINAL_STEP_NS = 5_000_000  # 200 Hz: the margins are for this sample period, and grow with the period
+_MAX_GAP_NS = 25_000_000  # samples further apart cannot be compared
+_MAX_RUN_NS = 200_000_000  # a longer run of outliers is the new state of the IMU
 _HISTORY_NS = 5_000_000_000
-_MAX_HISTORY = 4096  # an IMU gives fewer in that time
+_MAX_HISTORY = 4096  # rejected samples; an IMU gives fewer in that time
 _NO_AXES = np.zeros(6, np.bool_)
-_MIN_CHAIN = 3  # samples in a chain: fewer are held against what was before the gap, too
-_MAX_NOISE_STEP = _STEP_MARGIN / _STEP_RATIO  # steps up to this may be so, where there were none before
-_CERTAIN_CHAIN = 12  # samples in a chain, and
-_CERTAIN_SHARE = 2 / 3  # of all since the beginning: it is over
-_MAX_RESTART, _MAX_CHAIN_WINDOW = (
-    40,
-    64,
-)  # samples that a beginning has at most, and with those of the next frame
-_MAX_TURN_RAD, _MAX_SPEED_M_S = 0.3, 3.0  # that a body may have turned or gained without anybody knowing
+_MIN_CHAIN = 3  # a shorter chain is also compared with the last sample before the gap
+_MAX_NOISE_STEP = _STEP_MARGIN / _STEP_RATIO  # the largest recent step assumed where none is known
+_CERTAIN_CHAIN = 12  # accepted samples that end a restart,
+_CERTAIN_SHARE = 2 / 3  # if they are this share of its samples
+_MAX_RESTART = 40  # samples of a restart
+_MAX_CHAIN_WINDOW = 64  # samples of a restart, with those of the newest frame
+_MAX_TURN_RAD = 0.3  # bound of the inflation of attitude
+_MAX_SPEED_M_S = 3.0  # bound of the inflation of velocity
 
 
 @dataclass(frozen=True, eq=False)
 class ImuInflation:
-    """axes (6,): gyro, then accelerometer, of which samples were left out. turn rad, speed m/s: by how much
-    what is believed may be wrong."""
+    """Inflation for an interval with rejected or suspect samples.
+
+    rejected_axes (6,): gyro, then accelerometer, with rejected samples. turn_rad, speed_m_s: by how much
+    attitude and velocity may be wrong.
+    """
 
     rejected_axes: NDArray[np.bool_]
     turn_rad: float
@@ -63,7 +67,8 @@ class ImuInflation:
 
 @dataclass(frozen=True, eq=False)
 class _RejectedSample:
-    """A sample that is doubted: on which axes (6,) it is left out; by how much it is off (6,), how long."""
+    """A rejected, suspect or retracted sample: the axes (6,) to ignore, its deviation (6,) and how long
+    that may last."""
 
     stamp_ns: int
     axes: NDArray[np.bool_]
@@ -73,8 +78,11 @@ class _RejectedSample:
 
 @dataclass(eq=False)
 class _RestartWindow:
-    """Samples since the first one, or since the first after a gap: their stamps, values (6,), and which are
-    believed. before: stamp and value of the last that was believed before the gap, if there was one."""
+    """Samples since the first one, or since the first after a gap: stamps, values (6,), and which are
+    accepted.
+
+    before_gap: stamp and value of the last accepted sample before the gap, if there was one.
+    """
 
     before_gap: tuple[int, F64] | None
     stamps: list[int] = field(default_factory=list)
@@ -91,47 +99,49 @@ class _RestartWindow:
 
     @property
     def is_over(self) -> bool:
-        """Whether what is believed is so for sure, or as sure as it gets."""
+        """Whether enough samples are accepted, or the window is full."""
         count = sum(self.accepted)
-        sure = count >= _CERTAIN_CHAIN and count >= _CERTAIN_SHARE * len(self.stamps)
-        return sure or len(self.stamps) >= _MAX_RESTART
+        is_certain = count >= _CERTAIN_CHAIN and count >= _CERTAIN_SHARE * len(self.stamps)
+        return is_certain or len(self.stamps) >= _MAX_RESTART
 
 
 class ImuOutlierDetector:
-    """Fed with samples in order of time, a frame at a time. `rejected_count`: how many were doubted.
-    `retracted_ns`:
-    stamps of those that were believed with earlier frames, and since the last one are not."""
+    """Takes samples in order of time, frame by frame.
+
+    rejected_count: samples rejected so far. retracted_ns: stamps of samples accepted with earlier frames and
+    rejected by the last call.
+    """
 
     def __init__(self) -> None:
         self.rejected_count = 0
         self.retracted_ns: list[int] = []
-        self._accepted_ns, self._accepted_value = 0, np.zeros(6)  # of the last that was believed
-        self._recent_steps = np.zeros((0, 6))  # the last few between such
-        self._newest: tuple[int, F64] | None = None  # of any
-        self._step_ns = 0  # from the one before to that
-        self._run_steps: deque[F64] = deque(
-            maxlen=_RECENT_STEPS
-        )  # steps, of the doubted too, while a run goes on
-        self._run_start_ns: int | None = None  # of its first sample,
-        self._run_end_ns = 0  # and of its last so far
+        self._accepted_ns = 0  # of the last accepted sample
+        self._accepted_value = np.zeros(6)
+        self._recent_steps = np.zeros((0, 6))  # between the last accepted samples
+        self._newest: tuple[int, F64] | None = None  # accepted or not
+        self._step_ns = 0  # between the newest sample and the one before
+        self._run_steps: deque[F64] = deque(maxlen=_RECENT_STEPS)  # of all samples, during a run of outliers
+        self._run_start_ns: int | None = None
+        self._run_end_ns = 0
         self._rejected: deque[_RejectedSample] = deque(maxlen=_MAX_HISTORY)
         self._restart_window: _RestartWindow | None = None
-        self._suspect_ns: int | None = None  # the last sample that is believed, but odd
+        self._suspect_ns: int | None = None  # of the last suspect sample
 
     @property
     def newest_ns(self) -> int:
-        """Stamp of the newest sample, believed or not; before there is one, before all."""
+        """The stamp of the newest sample, accepted or not; before all stamps without samples."""
         return -(2**62) if self._newest is None else self._newest[0]
 
     def copy(self) -> ImuOutlierDetector:
-        """That goes its own way from here."""
-        out = ImuOutlierDetector()
-        out.__dict__.update(self.__dict__, _run=self._run_steps.copy(), _left=self._rejected.copy())
+        """Return an independent copy."""
+        out = copy.copy(self)
+        out._run_steps, out._rejected = self._run_steps.copy(), self._rejected.copy()
         out._restart_window = self._restart_window and self._restart_window.copy()
         return out
 
     def accepted_mask(self, stamps_ns: I64, values: F64) -> NDArray[np.bool_] | None:
-        """Which of samples (N,), (N, 6) gyro and accelerometer, are; None: all. Time is linear in N."""
+        """Return which of the samples (N,), (N, 6) gyro and accelerometer, are accepted; None if all are.
+        Linear time."""
         self.retracted_ns = []
         if len(values) == 0:
             return None
@@ -143,7 +153,7 @@ class ImuOutlierDetector:
             steps[0] = values[0] - self._accepted_value
             np.abs(steps, out=steps)
             suspect = (steps > _SUSPECT_MARGIN).any()
-            if not suspect or (steps <= _STEP_MARGIN).all():  # as nearly always
+            if not suspect or (steps <= _STEP_MARGIN).all():  # the common case
                 if suspect:
                     self._flag_suspects(stamps_ns, steps)
                 self._recent_steps = np.concatenate([self._recent_steps, steps])[-_RECENT_STEPS:]
@@ -162,7 +172,7 @@ class ImuOutlierDetector:
             if self._newest is None:
                 self._restart_window = _RestartWindow(None)
             elif stamp_ns - self._newest[0] > _MAX_GAP_NS:
-                is_gap = 0 < self._step_ns <= _MAX_GAP_NS  # and not as far as they always are
+                is_gap = 0 < self._step_ns <= _MAX_GAP_NS  # else samples are always this far apart
                 self._restart_window = _RestartWindow(
                     (self._accepted_ns, self._accepted_value) if is_gap else None
                 )
@@ -176,7 +186,7 @@ class ImuOutlierDetector:
         return None if accepted.all() else accepted
 
     def inflation(self, from_ns: int, to_ns: int) -> ImuInflation | None:
-        """What of the samples in [from_ns, to_ns) is doubted, if any is."""
+        """Return the inflation for rejected or suspect samples in [from_ns, to_ns); None without any."""
         rejected = [sample for sample in self._rejected if from_ns <= sample.stamp_ns < to_ns]
         if not rejected:
             return None
@@ -186,24 +196,24 @@ class ImuOutlierDetector:
         return ImuInflation(axes, min(turn, _MAX_TURN_RAD), min(speed, _MAX_SPEED_M_S))
 
     def is_suspect(self, now_ns: int) -> bool:
-        """Whether one of the last samples that were believed may be wrong all the same."""
+        """Return whether a recent accepted sample may be wrong."""
         return self._suspect_ns is not None and now_ns - self._suspect_ns < _SUSPECT_NS
 
     def _flag_suspects(self, stamps_ns: I64, steps: F64) -> None:
-        """Whether one of these steps (N, 6) is odd."""
+        """Flag each of these samples, with steps (N, 6), that is suspect."""
         recent = np.concatenate([self._recent_steps, steps])
         for k, step in enumerate(steps, len(self._recent_steps)):
             recent_max = recent[max(0, k - _RECENT_STEPS) : k].max(axis=0, initial=0.0)
             self._flag_if_suspect(int(stamps_ns[k - len(self._recent_steps)]), step, recent_max)
 
     def _check_restart(self, window: _RestartWindow, stamps_ns: I64, values: F64) -> NDArray[np.bool_]:
-        """Which of these samples, that go on with a beginning, are believed."""
+        """Return which of these samples, which continue a restart, are accepted."""
         known_count = len(window.stamps)
         stamps = np.concatenate([np.array(window.stamps, np.int64), stamps_ns])
         all_values = np.array([*window.values, *values])
         chain, steps = self._longest_chain(stamps, all_values, window.before_gap)
         in_chain = [n for n in chain if n < known_count]
-        first = in_chain[-1] if in_chain else chain[0]  # how things are, from here on
+        first = in_chain[-1] if in_chain else chain[0]  # the samples after this one are compared with it
         accepted = np.zeros(len(values), np.bool_)
         before_gap = None if known_count else window.before_gap
         if before_gap and self._contradicts_gap(
@@ -236,10 +246,11 @@ class ImuOutlierDetector:
     def _longest_chain(
         self, stamps: I64, values: F64, before_gap: tuple[int, F64] | None
     ) -> tuple[list[int], F64]:
-        """Numbers of the samples in the longest chain, and steps (K, 6) that tell how a body moves."""
+        """Return the indices of the samples in the longest chain, and the recent steps (K, 6) by which it
+        was found."""
         steps = self._recent_steps
         chains = _longest_chains(stamps, values, steps.max(axis=0, initial=0.0))
-        if len(steps) == 0 and len(chains[0]) < len(values):  # not even noise is known
+        if len(steps) == 0 and len(chains[0]) < len(values):  # no recent steps: use the median step
             typical_step = np.median(np.abs(np.diff(values, axis=0)), axis=0).clip(max=_MAX_NOISE_STEP)
             steps = typical_step[None]
             chains = _longest_chains(stamps, values, typical_step)
@@ -250,8 +261,11 @@ class ImuOutlierDetector:
         return chains[0], steps
 
     def _contradicts_gap(self, before_gap: tuple[int, F64], stamp_ns: int, value: F64, count: int) -> bool:
-        """Whether `rejected_count` samples after a gap, the first of them this one, cannot be, for what was
-        before it. Where they can, and are odd, the filter is unsure of the time of the gap."""
+        """Return whether a chain of `count` samples, the first with this value, is impossible after the
+        sample before the gap.
+
+        If it is possible but suspect, the covariance is inflated for the duration of the gap.
+        """
         gap_ns = stamp_ns - before_gap[0]
         step, recent_max = np.abs(value - before_gap[1]), self._recent_steps.max(axis=0, initial=0.0)
         scale = gap_ns / _NOMINAL_STEP_NS if count >= _MIN_CHAIN else max(1.0, gap_ns / _INFLATION_NS)
@@ -261,7 +275,8 @@ class ImuOutlierDetector:
         return False
 
     def _reject(self, stamps_ns: I64, values: F64, reference: F64) -> None:
-        """These (N,), (N, 6), that cannot be neighbours of one with the value `reference` (6,)."""
+        """Reject samples (N,), (N, 6) that cannot be neighbours of a sample with the value `reference`
+        (6,)."""
         for stamp_ns, value in zip(stamps_ns.tolist(), values, strict=True):
             deviation = np.abs(value - reference)
             outlier_axes = deviation / _STEP_MARGIN >= min(1.0, (deviation / _STEP_MARGIN).max())
@@ -273,7 +288,8 @@ class ImuOutlierDetector:
             )
 
     def _retract(self, window: _RestartWindow, chain: Iterable[int], reference: F64, now_ns: int) -> None:
-        """What was believed and is not in the chain: the filter has heard it, and is unsure from now on."""
+        """Retract the accepted samples that are not in the chain. The filter has used them, so its
+        covariance is inflated from `now_ns` on."""
         for n in {n for n, accepted in enumerate(window.accepted) if accepted}.difference(chain):
             window.accepted[n] = False
             self.retracted_ns.append(window.stamps[n])
@@ -286,6 +302,7 @@ class ImuOutlierDetector:
             )
 
     def _check_sample(self, stamp_ns: int, newest: tuple[int, F64] | None, value: F64) -> bool:
+        """Return whether the sample is accepted."""
         assert newest is not None
         self._note_newest(stamp_ns, value)
         step_ns = stamp_ns - newest[0]
@@ -316,7 +333,8 @@ class ImuOutlierDetector:
     def _flag_if_suspect(
         self, stamp_ns: int, step: F64, recent_max: F64, duration_ns: int = _INFLATION_NS
     ) -> None:
-        """A sample that is believed, whose step (6,) is long beside those before it."""
+        """Flag an accepted sample with a step (6,) that is long beside the recent ones, and inflate if it
+        is very long."""
         if (step > _SUSPECT_RATIO * recent_max + _SUSPECT_MARGIN).any():
             self._suspect_ns = stamp_ns
             if (inflated_axes := step > _STEP_RATIO * recent_max + _INFLATION_MARGIN).any():
@@ -325,13 +343,13 @@ class ImuOutlierDetector:
                 )
 
     def _restart_from(self, stamp_ns: int, value: F64, steps: F64) -> None:
-        """As things are from this sample on."""
+        """Accept this sample, with `steps` as the recent ones; a run of outliers ends."""
         self._accepted_ns, self._accepted_value, self._recent_steps = stamp_ns, value, steps
         self._run_start_ns = None
         self._run_steps.clear()
 
     def _extend_run(self, stamp_ns: int, value: F64, step: F64) -> None:
-        """As expected; but a run of samples of which some lie right by chance goes on."""
+        """Accept this sample; a run of outliers, some of which fit by chance, goes on."""
         if self._run_start_ns is None or stamp_ns - self._run_end_ns > _MAX_GAP_NS:
             self._restart_from(
                 stamp_ns, value, np.concatenate([self._recent_steps, step[None]])[-_RECENT_STEPS:]
@@ -341,14 +359,17 @@ class ImuOutlierDetector:
 
 
 def _end_before_gap(stamps_ns: I64, first: int, max_count: int) -> int:
-    """Past the samples from number `first` on that have no gap between them, and are at most so many."""
+    """Return the end of the samples from index `first` on without a gap between them, at most `max_count`
+    of them."""
     near = np.diff(stamps_ns[first : first + max_count]) <= _MAX_GAP_NS
     return first + 1 + (len(near) if near.all() else int(near.argmin()))
 
 
 def _longest_chains(stamps_ns: I64, values: F64, recent_max: F64) -> list[list[int]]:
-    """Of samples (N,), (N, 6) the longest chains, by numbers, in which each may follow the one before; lately
-    (6,): as `ImuOutlierDetector` knows it of the samples before these. Time goes with N^2."""
+    """Return the longest chains of samples (N,), (N, 6), by index, in which each may follow the one before.
+
+    recent_max (6,): the largest recent step before these samples. Time grows with N^2.
+    """
     count = len(values)
     length, previous, max_step = np.ones(count, np.int64), np.full(count, -1), np.tile(recent_max, (count, 1))
     for n in range(1, count):

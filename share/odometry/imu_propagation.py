@@ -1,8 +1,8 @@
-"""From IMU samples to motion: means, transition and noise of one interval, in closed form.
+"""Integrate IMU samples over one interval: means, transition and noise covariance, in closed form.
 
-Under the error of `share.odometry.state` the transition knows the means only where biases
-enter, so it is sums over the samples, not a product of matrices. Source: Barrau & Bonnabel (2017);
-derived in docs/vio.md.
+With the error of `share.odometry.state`, the transition depends on the means only through the biases, so it
+is a sum over the samples, not a product of matrices. Source: Barrau & Bonnabel (2017); derived in
+docs/vio.md.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
+from share.odometry.state import IMU_STATE_SIZE
 from share.types import F64, ImuBatch
-
-_IMU_STATE_SIZE = 15  # pose, velocity, biases
 
 
 @dataclass(frozen=True, eq=False)
 class ImuPropagation:
-    """At the end of the interval: T (4, 4), v (3,), bias-free rate (3,) rad/s in the body. transition,
-    noise (15, 15) of the errors of pose, velocity and biases."""
+    """The end of the interval: T (4, 4), v (3,), bias-free rate (3,) rad/s in the body.
+
+    transition, noise_cov (15, 15): of the errors of pose, velocity and biases.
+    """
 
     T: F64
     v: F64
@@ -34,8 +35,11 @@ class ImuPropagation:
 def integrate(
     T: F64, v: F64, bg: F64, ba: F64, imu: ImuBatch, from_ns: int, to_ns: int, noise: ImuNoise, gravity: float
 ) -> ImuPropagation:
-    """Motion over (from_ns, to_ns) by the trapezoidal rule. imu: samples about the interval, in order; the
-    first and last are held where they do not reach its ends. Raises ValueError without any."""
+    """Integrate over (from_ns, to_ns) by the trapezoidal rule.
+
+    imu: samples about the interval, in order; the first and last are held where they do not reach its ends.
+    Raises ValueError without samples.
+    """
     dt, gyro, accel = _intervals(imu, from_ns, to_ns)
     gyro, accel, dt_column = gyro - bg, accel - ba, dt[:, None]
     half_turn = se3.so3_exp(gyro * (dt_column / 2))
@@ -46,7 +50,7 @@ def integrate(
     v_at = _cumulative_sums(v, a * dt_column)
     p_at = _cumulative_sums(T[:3, 3], v_at[:-1] * dt_column + a * (dt_column**2 / 2))
     v_mid, p_mid = (v_at[1:] + v_at[:-1]) / 2, (p_at[1:] + p_at[:-1]) / 2
-    remaining = float(dt.sum()) - (np.cumsum(dt) - dt / 2)  # from the middle of each part to the end
+    remaining = float(dt.sum()) - (np.cumsum(dt) - dt / 2)  # s, from the middle of each step to the end
     response = _impulse_responses(middle, v_mid, p_mid, remaining[:, None], g)
     return ImuPropagation(
         se3.from_rt(R[-1], p_at[-1]),
@@ -58,7 +62,8 @@ def integrate(
 
 
 def _intervals(imu: ImuBatch, from_ns: int, to_ns: int) -> tuple[F64, F64, F64]:
-    """dt (N,) s between the samples inside, and both ends; mean rate and force (N, 3) over each."""
+    """Return the lengths dt (N,) s between the samples inside and both ends, and the mean rate and force
+    (N, 3) of each."""
     if len(imu) == 0:
         raise ValueError("imu: no samples")
     seconds = (imu.stamps_ns - from_ns) * 1e-9
@@ -78,26 +83,29 @@ def _intervals(imu: ImuBatch, from_ns: int, to_ns: int) -> tuple[F64, F64, F64]:
 
 
 def _cumulative_rotations(R: F64, steps: F64) -> F64:
-    """R and what it becomes by each of the steps (N, 3, 3): (N + 1, 3, 3). By doubling: after k rounds each
-    is the product of up to 2^k of them."""
-    out, reach = np.concatenate([R[None], steps]), 1
-    while reach < len(out):
-        out[reach:] = out[:-reach] @ out[reach:]
-        reach *= 2
+    """Return R and its products with successive steps (N, 3, 3): (N + 1, 3, 3).
+
+    By doubling: after k rounds each is the product of up to 2^k steps.
+    """
+    out, stride = np.concatenate([R[None], steps]), 1
+    while stride < len(out):
+        out[stride:] = out[:-stride] @ out[stride:]
+        stride *= 2
     return out
 
 
 def _cumulative_sums(first: F64, steps: F64) -> F64:
-    """(3,) and what it becomes by each of the steps (N, 3): (N + 1, 3)."""
+    """Return `first` (3,) and its sums with successive steps (N, 3): (N + 1, 3)."""
     return np.cumsum(np.concatenate([first[None], steps]), axis=0)
 
 
 def _impulse_responses(R: F64, v: F64, p: F64, remaining: F64, g: F64) -> F64:
-    """What an impulse of gyro and of accel error in each part does to (phi, rho, nu) at the end, (N, 9, 6).
+    """Return the derivatives (N, 9, 6) of the final (phi, rho, nu) by an impulse of gyro and accelerometer
+    error in each step.
 
-    phi' = -R w; rho' = nu - [p] R w; nu' = [g] phi - [v] R w - R a; the rest of the way, left (N, 1) s, is
-    phi = const, nu = [g] phi t, rho = nu t + [g] phi t^2 / 2: as if turned about where a body in free fall
-    would be then.
+    phi' = -R w; rho' = nu - [p] R w; nu' = [g] phi - [v] R w - R a. In the remaining time (N, 1) s, phi =
+    const, nu = [g] phi t, rho = nu t + [g] phi t^2 / 2: a rotation about the point where a body in free fall
+    would then be.
     """
     falling = np.concatenate([p + v * remaining + g * (remaining**2 / 2), v + g * remaining])
     levers = se3.hat(falling).reshape(2, -1, 3, 3) @ R
@@ -109,7 +117,7 @@ def _impulse_responses(R: F64, v: F64, p: F64, remaining: F64, g: F64) -> F64:
 
 def _transition(response: F64, dt: F64, g: F64) -> F64:
     T = float(dt.sum())
-    out = np.eye(_IMU_STATE_SIZE)
+    out = np.eye(IMU_STATE_SIZE)
     out[3:6, 0:3], out[6:9, 0:3] = g * (T**2 / 2), g * T
     out[3, 6] = out[4, 7] = out[5, 8] = T
     out[:9, 9:] = (dt @ response.reshape(-1, 54)).reshape(9, 6)
@@ -121,21 +129,21 @@ def _noise_cov(response: F64, dt: F64, imu: ImuNoise) -> F64:
     density = np.repeat([imu.gyro_density, imu.accel_density], 3)
     weighted = response * (np.sqrt(dt)[:, None, None] * density)
     flat = weighted.transpose(1, 0, 2).reshape(9, -1)
-    out = np.zeros((_IMU_STATE_SIZE, _IMU_STATE_SIZE))
+    out = np.zeros((IMU_STATE_SIZE, IMU_STATE_SIZE))
     out[:9, :9] = flat @ flat.T
-    walks = np.arange(9, _IMU_STATE_SIZE)
+    walks = np.arange(9, IMU_STATE_SIZE)
     out[walks, walks] = T * np.repeat([imu.gyro_walk**2, imu.accel_walk**2], 3)
     return out
 
 
-# ---- How loud the IMU is taken to be.
+# IMU noise: scaled, raised by vibration, and for axes without samples.
 
-_BLOCK_LENGTHS_S = 0.005, 0.01, 0.015, 0.02  # of samples whose means are compared
-_DIFFERENCE_VARIANCE = 20.0  # by which third differences have more variance than what is white
+_BLOCK_LENGTHS_S = 0.005, 0.01, 0.015, 0.02  # blocks of samples whose means are compared
+_DIFFERENCE_VARIANCE = 20.0  # variance of third differences of white noise, relative to its own
 
 
 def scaled_noise(imu: ImuNoise, noise_scale: float) -> ImuNoise:
-    """Densities and walks so many times as large."""
+    """Return densities and walks times `noise_scale`."""
     return ImuNoise(
         imu.gyro_density * noise_scale,
         imu.accel_density * noise_scale,
@@ -146,22 +154,21 @@ def scaled_noise(imu: ImuNoise, noise_scale: float) -> ImuNoise:
 
 
 def noise_with_vibration(imu: ImuNoise, samples: ImuBatch) -> ImuNoise:
-    """Densities no smaller than those that the samples themselves show.
+    """Return densities raised to those that the samples show.
 
-    What shakes a body faster than its IMU is sampled is noise to who integrates the samples. The body's own
-    motion is smooth beside it: third differences of means over blocks of b seconds hold 20 times the variance
-    of white noise in them, and of a motion of frequency f only (2 sin(pi f b))^6. White noise shows the same
-    density by any b; of a vibration longer blocks show less, as an integral holds less of it; of a motion
-    they show more. So the least counts.
+    Vibration faster than the sampling is noise to the integration. A body's own motion is smooth: third
+    differences of means over blocks of b seconds contain 20 times the variance of white noise, and of a
+    motion of frequency f only (2 sin(pi f b))^6. White noise shows the same density for every b, vibration
+    less for longer blocks, as its integral is smaller, motion more. So the minimum over the blocks is taken.
     """
     if len(samples) < 2:
         return imu
     step_s = (samples.stamps_ns[-1] - samples.stamps_ns[0]) * 1e-9 / (len(samples) - 1)
     sums = np.zeros((len(samples) + 1, 6))
     np.cumsum(np.concatenate([samples.gyro, samples.accel], axis=1), axis=0, out=sums[1:])
-    densities = []  # squared densities
+    densities = []  # squared
     for block in {max(1, round(block_s / step_s)) for block_s in _BLOCK_LENGTHS_S}:
-        fourth = _fourth_differences(sums, block)  # of the sums: third ones of the means, times block
+        fourth = _fourth_differences(sums, block)  # of the sums: third differences of the means, times block
         if (count := len(fourth)) > block:
             densities.append(
                 np.einsum("na,na->a", fourth, fourth) * (step_s / (_DIFFERENCE_VARIANCE * count * block))
@@ -177,7 +184,7 @@ def noise_with_vibration(imu: ImuNoise, samples: ImuBatch) -> ImuNoise:
 
 
 def _fourth_differences(x: F64, by: int) -> F64:
-    """Of (N, 6), between rows `by` apart: (N - 4 by, 6)."""
+    """Return the fourth differences (N - 4 by, 6) of x (N, 6), between rows `by` apart."""
     out = x
     for _ in range(4):
         out = out[by:] - out[:-by]
@@ -185,7 +192,8 @@ def _fourth_differences(x: F64, by: int) -> F64:
 
 
 def noise_without_axes(imu: ImuNoise, constant_velocity: ImuNoise, axes: NDArray[np.bool_]) -> ImuNoise:
-    """Of an IMU of whose axes (6,), gyro then accelerometer, some say nothing."""
+    """Return the noise with the densities of `constant_velocity` for the sensors that have an axis in
+    `axes` (6,), gyro then accelerometer."""
     if not axes.any():
         return imu
     return replace(

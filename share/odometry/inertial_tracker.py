@@ -1,26 +1,24 @@
-"""Odometry by cameras and IMU: a headset's own.
+"""Odometry by cameras and IMU.
 
-A frame's way: IMU -> propagate -> where features should be -> find them by their patches -> gate ->
-update. After its pose is out, a keyframe (`keyframes`).
-Without the IMU the body is taken to go on as it does, without sight the IMU carries it for a while.
+A frame: propagate by the IMU -> predict the features -> match their patches -> gate -> update. The work of
+keyframes (`keyframes`) is done after the pose is published. Without IMU samples the body is taken to keep its
+velocity; without features the IMU carries the pose for a while.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from share.config import InertialConfig, TrackerConfig
 from share.geometry import se3
-from share.geometry.camera import ImuBias, ImuNoise, Rig
-from share.odometry import feature_matching, filter, outliers, relocalisation
+from share.geometry.camera import ImuBias, Rig
+from share.odometry import feature_matching, filter, relocalisation
 from share.odometry.feature_appearance import Appearance
-from share.odometry.imu_buffer import ImuBuffer, constant_velocity_samples, fill_clipped, mean_angular_rate
-from share.odometry.imu_outliers import ImuInflation
-from share.odometry.imu_propagation import integrate, noise_with_vibration, noise_without_axes, scaled_noise
+from share.odometry.health import DivergenceMonitor, ImageImuConsistency, is_plausible
+from share.odometry.imu_buffer import mean_angular_rate
+from share.odometry.imu_predictor import ImuPredictor
 from share.odometry.initialisation import (
     estimated_bias,
     has_converged,
@@ -32,27 +30,19 @@ from share.odometry.initialisation import (
 )
 from share.odometry.keyframes import KeyframeScheduler
 from share.odometry.landmarks import LandmarkMap
-from share.odometry.mono_initialisation import MonoWindow, gyro_only_samples, start_mono_window
-from share.odometry.outliers import DivergenceMonitor, ImageImuConsistency, is_plausible
+from share.odometry.mono_initialisation import MonoWindow, start_mono_window
 from share.odometry.relocalisation import LocalMap
 from share.odometry.state import FilterState
 from share.odometry.tilt_realignment import TiltRealignment
-from share.odometry.track_result import TrackResult, finite_median, median
+from share.odometry.track_result import TrackResult, finite_median
+from share.odometry.visual_update import VisualUpdate
 from share.types import F64, FeatureStatistics, Frame, ImuBatch, KeyframeCandidate, TrackState, WaitReason
 from share.vision import corners
 from share.vision.orb import measures_depth
 
-_RELINEARISE_PX = 1.0  # median residual, from which derivatives are taken anew
-_MIN_ACCEPTED_SHARE, _MIN_CONSENSUS_SHARE = (
-    0.3,
-    0.7,
-)  # of what is found: believed by the filter; agreeing among itself
-_LONG_GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modelled for,
-_GAP_INFLATION = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it that believes nobody
-_MAX_REST_RATE, _ZERO_VELOCITY_SIGMA = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
-_MAX_REST_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
-_MAX_IMU_WAIT_FRAMES = 10  # frames without a sample of the IMU, after which we begin without
-_MAX_UP_SIGMA_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
+_LONG_GAP_NS = 250_000_000  # between frames; integration over more is worse than the IMU's noise model says
+_MAX_IMU_WAIT_FRAMES = 10  # without an IMU sample, after which the tracker begins without IMU
+_MAX_UP_SIGMA_RAD = np.radians(3.0)  # tilt sigma up to which the up direction is published
 
 
 class InertialTracker:
@@ -66,47 +56,40 @@ class InertialTracker:
         seed: int = 0,
         bias: ImuBias | None = None,
     ) -> None:
-        """bias: of the IMU, where a run before has learnt it."""
+        """bias: of the IMU, as estimated by an earlier run. Raises ValueError without an IMU."""
         if rig.imu is None:
-            raise ValueError("without an IMU there is VisualTracker")
+            raise ValueError("the rig has no IMU; use VisualTracker")
         self._rig, self._config = rig, config
         self._bias = unknown_bias(config) if bias is None else bias
-        self._noise = scaled_noise(rig.imu, config.imu_noise)
-        self._constant_velocity = ImuNoise(
-            config.turning_noise, config.moving_noise, 0.0, 0.0, rig.imu.rate_hz
-        )
-        self._common_cov = np.diag(np.repeat([config.common_rad**2, config.common_m**2], 3))
-        self._imu_buffer = ImuBuffer()
+        self._imu = ImuPredictor(rig.imu, config)
+        self._visual_update = VisualUpdate(rig.cam0, config)
         self._landmarks: LandmarkMap | None = None
-        self._mono_window: MonoWindow | None = None  # of a single camera, until its scale is known
+        self._mono_window: MonoWindow | None = None  # of a single camera, until the scale is known
         self._last_frame: Frame | None = None
         self._stamp_ns = 0
-        self._is_finished = True  # what there was to do after the last frame
-        self._rate = np.zeros(3)
+        self._is_finished = True  # `finish_keyframe` was called after the last frame
         self._divergence = DivergenceMonitor(config.weak, config.blind)
-        self._consistency, self._nis = ImageImuConsistency(), np.zeros(0)  # of the frame
-        self._imu_wait_frames = 0  # frames, for the IMU
+        self._consistency = ImageImuConsistency()
+        self._imu_wait_frames = 0  # without an IMU sample
         self._start_ns, self._start_position = 0, np.zeros(3)
         self._has_published = False
-        self._knows_up = False  # the IMU said so
-        self._new_segment = False  # the next keyframe begins one
-        self._keyframes, self._realignment = (
-            KeyframeScheduler(rig, config, tracker_config.view_features),
-            TiltRealignment(),
-        )
-        self._local_map = LocalMap(tracker_config.max_keyframes)  # where to look for oneself when LOST
+        self._knows_up = False  # the state began with IMU samples
+        self._new_segment = False  # the next keyframe begins a segment
+        self._keyframes = KeyframeScheduler(rig, config, tracker_config.view_features)
+        self._realignment = TiltRealignment()
+        self._local_map = LocalMap(tracker_config.max_keyframes)  # for relocalisation
         self._tracker_config, self._seed = tracker_config, seed
         self._round_robin = relocalisation.RoundRobin(tracker_config.relocalise_hosts)
         self._lost_ns: int | None = None
 
     @property
     def state(self) -> FilterState | None:
-        """The filter's; for those who look into it."""
+        """The filter's state; None before the start and while LOST."""
         return self._landmarks.state if self._landmarks else None
 
     @property
     def bias(self) -> ImuBias | None:
-        """Of the IMU, as the filter knows it now; None where that is not worth remembering."""
+        """The estimated IMU bias; None where it is not worth storing."""
         if self._landmarks is None or not (
             self._has_published and self._knows_up and self._consistency.is_consistent
         ):
@@ -115,13 +98,13 @@ class InertialTracker:
 
     @property
     def appearance(self) -> Appearance | None:
-        """Of the state's features."""
+        """The appearance of the state's features."""
         return self._landmarks.appearance if self._landmarks else None
 
     def track(self, frame: Frame) -> TrackResult:
-        """The pose of this frame, causal. Frames must come with rising stamps."""
+        """Return the causal pose of this frame. Frames must come with rising stamps."""
         self.finish_keyframe()
-        self._imu_buffer.add(frame.imu)
+        self._imu.buffer.add(frame.imu)
         result = (
             self._initialise(frame) if self._landmarks is None else self._track_frame(frame, self._landmarks)
         )
@@ -129,92 +112,86 @@ class InertialTracker:
         return result
 
     def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
-        """What there is to show to others; call it where `track` said so of this frame. It is of this frame,
-        or of one shortly before, whose view was made meanwhile."""
+        """Return the keyframe to publish; call it where `track` says that one is ready.
+
+        It is this frame's, or that of a frame shortly before, whose view is complete by now.
+        """
         assert self._landmarks is not None
         new_segment, self._new_segment = self._new_segment, False
-        view, T, tilt_sigma, T_previous_body, cov, frames_ago = self._keyframes.publish(
-            self._landmarks, new_segment
-        )
-        up = T[2, :3] if self._knows_up and tilt_sigma < _MAX_UP_SIGMA_RAD else np.zeros(3)
-        sigma = tilt_sigma / np.sqrt(2)
+        published = self._keyframes.publish(self._landmarks, new_segment)
+        knows_up = self._knows_up and published.tilt_sigma < _MAX_UP_SIGMA_RAD
         return KeyframeCandidate(
-            self._realignment.published_pose(T),
-            T_previous_body,
-            cov,
-            up,
-            sigma,
-            view,
+            self._realignment.published_pose(published.T_odom_body),
+            published.T_previous_body,
+            published.cov,
+            published.T_odom_body[2, :3] if knows_up else np.zeros(3),
+            published.tilt_sigma / np.sqrt(2),
+            published.view,
             new_segment,
-            frames_ago,
+            published.frames_ago,
         )
 
     def finish_keyframe(self) -> None:
-        """A slice of what keyframes leave to do, and nobody waits for: new features, and places to find
-        oneself by. For when the pose, and the candidate if there is one, are on their way; else the next
-        `track` does it first."""
+        """Run a slice of the pending keyframe work: view, new features, the local map.
+
+        Call it when the pose, and the candidate if there is one, are sent; otherwise the next `track` calls
+        it first.
+        """
         if self._landmarks is None or self._last_frame is None or self._is_finished:
             return
         self._is_finished = True
-        s, offered = (
-            self._landmarks.state,
-            self._keyframes.process_pending(self._landmarks, self._last_frame, self._rate),
-        )
+        s = self._landmarks.state
+        offered = self._keyframes.process_pending(self._landmarks, self._last_frame, self._imu.rate)
         if offered is not None and not self._divergence.is_suspected:
             T_odom_body = s.keyframe_poses[filter.keyframe_index(s, offered.keyframe_id)]
             self._local_map.add_keyframe(offered.frame.image0, T_odom_body @ s.T_body_cam)
             self._local_map.set_view(offered.view)
 
     def feature_statistics(self) -> FeatureStatistics:
-        """Of the own frame of the keyframe that is due; where none is, of the frame just tracked, one with a
-        pose."""
+        """Return the statistics of the frame of the keyframe that is ready; without one, of the frame just
+        tracked, which must have a pose."""
         assert self._landmarks is not None
-        return self._keyframes.footing or self._landmarks.feature_statistics()
+        return self._keyframes.statistics or self._landmarks.feature_statistics()
 
     def reset_after_failure(self, frame: Frame) -> None:
-        """Something failed in or after `frame`, the last: the filter may be in any state."""
+        """Start again: something failed in or after `frame`, the last, and the state may be corrupt."""
         self._mono_window = None
         self._declare_lost(frame)
         self._last_frame, self._stamp_ns = frame, frame.stamp_ns
 
     @property
     def rejected_imu_samples(self) -> int:
-        """How many samples of the IMU were not believed."""
-        return self._imu_buffer.rejected_count
+        """The number of IMU samples rejected."""
+        return self._imu.buffer.rejected_count
 
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
-        """T_odom_body (4, 4) at a time after the last frame's, IMU time: for renderers, between frames.
+        """Return T_odom_body (4, 4) at a time after the last frame's, IMU time, for renderers between frames;
+        None without a pose.
 
-        imu: samples that came since that frame, if there are any. From the last one on the body is taken to
-        turn and to accelerate as it did then. None where there is no pose to go on from.
+        imu: samples since that frame. After the last one the body is taken to turn and accelerate as it did
+        then.
         """
         if self._landmarks is None or not self._has_published:
             return None
-        s, samples = self._landmarks.state, self._imu_buffer.extended(imu or ImuBatch.empty())
-        silent_ns, gravity = round(self._config.silent_s * 1e9), self._config.gravity
-        measured = samples.between(s.stamp_ns, min(t_ns, samples.last_ns), silent_ns)
-        imu_until = constant_velocity_samples(s, self._rate, t_ns, gravity) if measured is None else measured
-        propagated = integrate(s.T, s.v, s.bg, s.ba, imu_until, s.stamp_ns, t_ns, self._noise, gravity)
-        return self._realignment.published_pose(propagated.T)
-
-    # ------------------------------------------------------------------ the usual frame
+        T_odom_body = self._imu.pose_at(self._landmarks.state, t_ns, imu or ImuBatch.empty())
+        return self._realignment.published_pose(T_odom_body)
 
     def _track_frame(self, frame: Frame, landmarks: LandmarkMap) -> TrackResult:
-        T_before, imu = landmarks.state.T, self._imu_until_image(frame, landmarks.state)
-        inflation = self._imu_buffer.inflation(
-            landmarks.state.stamp_ns, self._image_ns(frame, landmarks.state)
-        )
-        has_rejected = inflation is not None and bool(inflation.rejected_axes.any())
+        T_before = landmarks.state.T
         interval_s = (frame.stamp_ns - self._stamp_ns) * 1e-9
-        has_gyro = self._propagate(frame, landmarks.state, imu, inflation)
+        image_ns = frame.stamp_ns + round(landmarks.state.timeshift_s * 1e9)  # IMU time
+        imu = self._imu.predict(landmarks.state, image_ns, gyro_only=self._mono_window is not None)
         landmarks.begin_frame(interval_s)
-        matches, inliers = self._match_features(frame, landmarks)
-        has_imu = imu is not None and not (has_rejected and self._has_published)
-        if has_gyro and self._mono_window is None:
-            self._consistency.add(self._nis, interval_s)
+        matches = self._match_features(frame, landmarks)
+        is_after_gap = frame.stamp_ns - self._stamp_ns > _LONG_GAP_NS
+        is_suspect = self._imu.buffer.is_suspect(landmarks.state.stamp_ns)
+        inliers, nis = self._visual_update.apply(landmarks, matches, self._imu.rate, is_after_gap, is_suspect)
+        has_imu = imu.has_samples and not (imu.has_rejected and self._has_published)
+        if imu.has_gyro and self._mono_window is None:
+            self._consistency.add(nis, interval_s)
         landmarks.record_frame(matches, inliers)
-        if not has_gyro:
-            self._rate = mean_angular_rate(T_before, landmarks.state.T, frame.stamp_ns - self._stamp_ns)
+        if not imu.has_gyro:
+            self._imu.rate = mean_angular_rate(T_before, landmarks.state.T, frame.stamp_ns - self._stamp_ns)
         count = int(inliers.sum())
         textured = count >= self._config.blind or corners.count_fast(frame.image0) >= self._config.weak
         self._divergence.add(
@@ -228,24 +205,23 @@ class InertialTracker:
         wants_keyframe = textured and self._keyframes.wants_keyframe(frame.stamp_ns, landmarks.state.T, count)
         if state is TrackState.INITIALISING:
             if wants_keyframe:
-                self._keyframes.add_at_once(frame, landmarks, self._rate)
+                self._keyframes.add_at_once(frame, landmarks, self._imu.rate)
             if not self._solve_scale(frame, landmarks, wants_keyframe):
                 return self._waiting_result(landmarks.state)
             state, wants_keyframe = TrackState.OK, True
         result = self._publish(frame, landmarks, state, wants_keyframe, count)
         return replace(
-            result, found_count=int((matches.is_found | inliers).sum()), median_nis=finite_median(self._nis)
+            result, found_count=int((matches.is_found | inliers).sum()), median_nis=finite_median(nis)
         )
 
     def _solve_scale(self, frame: Frame, landmarks: LandmarkMap, is_keyframe: bool) -> bool:
-        """Whether what a single camera saw since the beginning has told it the scale, and all that poses
-        need."""
+        """Return whether a single camera's window gives the scale, and the state has converged."""
         window, s = self._mono_window, landmarks.state
         if window is None or not (is_keyframe or window.wants_frame(s.stamp_ns)):
             return False
-        imu = self._imu_buffer.between(window.last_ns, s.stamp_ns, round(self._config.silent_s * 1e9))
+        imu = self._imu.samples(window.last_ns, s.stamp_ns)
         if imu is None or window.is_full or measures_depth(frame, self._rig):
-            self._landmarks = self._mono_window = None  # begin anew
+            self._landmarks = self._mono_window = None  # start again
             return False
         return window.try_solve(landmarks, imu, is_keyframe) and has_converged(s)
 
@@ -262,16 +238,14 @@ class InertialTracker:
         pose, cov = self._published_pose(s), filter.pose_cov(s)
         if wants_keyframe or is_first:
             publish = not is_first and self._keyframes.may_publish(frame.stamp_ns)
-            self._keyframes.add(frame, landmarks, self._rate, count < self._config.weak, publish)
+            self._keyframes.add(frame, landmarks, self._imu.rate, count < self._config.weak, publish)
             if is_first:
                 self._keyframes.publish_at_once(landmarks)
         is_ready = self._keyframes.is_ready
         return TrackResult(state, pose, is_ready, count, new_segment, cov, self._consistency.is_consistent)
 
-    def _match_features(
-        self, frame: Frame, landmarks: LandmarkMap
-    ) -> tuple[feature_matching.FeatureMatches, NDArray[np.bool_]]:
-        """Where cam0 shows the features, and which (N,) were seen and believed."""
+    def _match_features(self, frame: Frame, landmarks: LandmarkMap) -> feature_matching.FeatureMatches:
+        """Return the matches of the features, with dynamic ones marked."""
         matches = feature_matching.match_features(
             frame, self._rig, landmarks.state, landmarks.appearance, self._config
         )
@@ -284,109 +258,8 @@ class InertialTracker:
                 matches,
                 self._config,
             )
-        landmarks.mark_dynamic(matches, self._rate)
-        return matches, self._update(frame, landmarks, matches)
-
-    def _imu_until_image(self, frame: Frame, s: FilterState) -> ImuBatch | None:
-        """What the IMU said until the image was taken; None if it was silent."""
-        to_ns = self._image_ns(frame, s)
-        if to_ns <= s.stamp_ns:
-            return ImuBatch.empty()
-        return self._imu_buffer.between(s.stamp_ns, to_ns, round(self._config.silent_s * 1e9))
-
-    def _propagate(
-        self, frame: Frame, s: FilterState, imu: ImuBatch | None, inflation: ImuInflation | None
-    ) -> bool:
-        """To when the image was taken; without an IMU, as the body went before. Whether the IMU measured how
-        it turns. doubt: of these samples."""
-        to_ns, gravity = self._image_ns(frame, s), self._config.gravity
-        if to_ns <= s.stamp_ns:
-            return True
-        if imu is None:
-            filter.propagate(
-                s,
-                constant_velocity_samples(s, self._rate, to_ns, gravity),
-                to_ns,
-                self._constant_velocity,
-                gravity,
-            )
-            return False
-        if self._mono_window is not None:
-            noise = noise_without_axes(self._noise, self._constant_velocity, np.arange(6) >= 3)
-            self._rate = filter.propagate(s, gyro_only_samples(s, imu, to_ns, gravity), to_ns, noise, gravity)
-            return True
-        is_clipped = self._imu_buffer.is_clipped(imu)
-        silent_axes = is_clipped if inflation is None else is_clipped | inflation.rejected_axes
-        noise = noise_with_vibration(self._noise, self._imu_buffer.latest(to_ns))
-        noise = noise_without_axes(noise, self._constant_velocity, silent_axes)
-        imu = fill_clipped(imu, is_clipped[:3], self._rate + s.bg)
-        self._rate = filter.propagate(s, imu, to_ns, noise, gravity)
-        if inflation is not None:
-            filter.inflate(s, inflation.turn_rad, 0.0, inflation.speed_m_s)
-            return not silent_axes[:3].any()
-        is_slow = np.linalg.norm(self._rate) < _MAX_REST_RATE and np.linalg.norm(s.v) < _MAX_REST_M_S
-        if is_slow and self._imu_buffer.is_still(to_ns):
-            filter.zero_velocity_update(s, _ZERO_VELOCITY_SIGMA, self._config.gate)
-        return not silent_axes[:3].any()
-
-    def _image_ns(self, frame: Frame, s: FilterState) -> int:
-        """When the image was taken, IMU time."""
-        return frame.stamp_ns + round(s.timeshift_s * 1e9)
-
-    def _update(
-        self, frame: Frame, landmarks: LandmarkMap, matches: feature_matching.FeatureMatches
-    ) -> NDArray[np.bool_]:
-        """Which features (N,) were seen and believed."""
-        s = landmarks.state
-
-        def make_rows() -> filter.FeatureMeasurements:
-            return landmarks.frame_measurements(matches, self._rate)
-
-        inliers, self._nis = matches.is_found & ~matches.is_dynamic, np.zeros(0)
-        rows = make_rows()
-        if len(rows.feature) == 0:
-            return inliers
-        rows, accepted, HP, S = self._gated(s, rows, make_rows)
-        is_after_gap = frame.stamp_ns - self._stamp_ns > _LONG_GAP_NS
-        if (
-            (is_after_gap and accepted.mean() < _MIN_ACCEPTED_SHARE)
-            or (self._imu_buffer.is_suspect(s.stamp_ns) and accepted.mean() < _MIN_CONSENSUS_SHARE)
-        ) and self._images_agree(s, matches):
-            filter.inflate(s, *_GAP_INFLATION)
-            rows, accepted, HP, S = self._gated(s, rows, make_rows)
-        if accepted.all():
-            filter.update(s, rows, HP, S)
-        elif accepted.any():
-            row_pairs = np.flatnonzero(np.repeat(accepted, 2))
-            filter.update(s, rows.take(accepted), HP.take(row_pairs, axis=0), filter.submatrix(S, row_pairs))
-        inliers[rows.feature[~accepted]] = False
-        return inliers
-
-    def _gated(
-        self,
-        s: FilterState,
-        rows: filter.FeatureMeasurements,
-        make_rows: Callable[[], filter.FeatureMeasurements],
-    ) -> tuple[filter.FeatureMeasurements, NDArray[np.bool_], filter.FloatArray, filter.FloatArray]:
-        """Rows at the best linearisation, which of them the filter believes, and its
-        `ekf.innovation_covariance`."""
-        if median(np.abs(rows.residual).ravel()) * self._rig.cam0.focal > _RELINEARISE_PX:
-            rows = filter.relinearised_rows(s, make_rows, self._common_cov)
-        HP, S = filter.innovation_covariance(s, rows, self._common_cov)
-        self._nis = filter.nis(rows, S)
-        accepted = np.ones(len(s.feature_ids), bool)
-        accepted[rows.feature[self._nis >= self._config.gate]] = False  # one camera's doubt is enough
-        return rows, accepted[rows.feature], HP, S
-
-    def _images_agree(self, s: FilterState, matches: feature_matching.FeatureMatches) -> bool:
-        """Whether nearly all that cam0 shows agrees among itself."""
-        indices = np.flatnonzero(matches.is_found & ~matches.is_dynamic)
-        if len(indices) < self._config.weak:
-            return False
-        return bool(
-            outliers.consensus_inliers(s, indices, matches.px[indices], self._rig.cam0).mean()
-            > _MIN_CONSENSUS_SHARE
-        )
+        landmarks.mark_dynamic(matches, self._imu.rate)
+        return matches
 
     def _track_state(self, s: FilterState, count: int, has_imu: bool) -> TrackState:
         config = self._config
@@ -401,7 +274,8 @@ class InertialTracker:
         return TrackState.OK if count >= config.weak else TrackState.WEAK
 
     def _is_publishable(self, s: FilterState) -> bool:
-        """For a first pose. What moves in the view must not be all that the velocity is known by."""
+        """Return whether a first pose can be published. The velocity must not rest on dynamic features
+        alone."""
         waited_s = (s.stamp_ns - self._start_ns) * 1e-9
         return self._is_static() and is_publishable(s, waited_s, self._new_segment)
 
@@ -419,21 +293,21 @@ class InertialTracker:
         return TrackResult(TrackState.INITIALISING, None, waiting_for=reason)
 
     def _published_pose(self, s: FilterState) -> F64:
-        """At the frame's stamp, IMU time: the state is where the image was taken."""
+        """Return the pose at the frame's stamp, IMU time; the state is at the time of the image."""
         if s.timeshift_s == 0:
             return self._realignment.published_pose(s.T)
-        return self._realignment.published_pose(se3.exp(-filter.twist(s, self._rate) * s.timeshift_s) @ s.T)
-
-    # ------------------------------------------------------------------ beginnings and losses
+        T_odom_body = se3.exp(-filter.twist(s, self._imu.rate) * s.timeshift_s) @ s.T
+        return self._realignment.published_pose(T_odom_body)
 
     def _initialise(self, frame: Frame) -> TrackResult:
-        """At odom's origin, z up. After a loss, where the map says; at last anew."""
+        """Start at odom's origin, z up. After a loss, at the relocalised pose; after `new_stretch_s`, in a
+        new segment."""
         T_found = self._relocalise(frame)
         waiting_state = TrackState.INITIALISING if self._lost_ns is None else TrackState.LOST
         lost_ns = 0 if self._lost_ns is None else frame.stamp_ns - self._lost_ns
         if T_found is None and 0 < lost_ns < self._tracker_config.new_stretch_s * 1e9:
             return TrackResult(waiting_state, None)
-        state = state_from_imu(frame.stamp_ns, self._imu_buffer.samples, self._rig, self._config, self._bias)
+        state = state_from_imu(frame.stamp_ns, self._imu.buffer.samples, self._rig, self._config, self._bias)
         self._imu_wait_frames += state is None
         self._knows_up = state is not None
         if state is None and self._imu_wait_frames >= _MAX_IMU_WAIT_FRAMES:
@@ -443,16 +317,14 @@ class InertialTracker:
         if T_found is not None:
             state.T = T_found @ se3.inverse(self._rig.T_body_cam0)
         landmarks = LandmarkMap(state, self._rig, self._config)
-        self._rate = (
-            self._imu_buffer.samples.gyro[-1] - state.bg if len(self._imu_buffer.samples) else np.zeros(3)
-        )
-        self._keyframes.add_at_once(frame, landmarks, self._rate)
+        self._imu.restart(state)
+        self._keyframes.add_at_once(frame, landmarks, self._imu.rate)
         if len(state.feature_ids) < self._config.weak:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.VIEW)
         self._landmarks, self._has_published = landmarks, False
         self._start_ns, self._start_position = state.stamp_ns, state.T[:3, 3].copy()  # by the IMU's clock
         self._mono_window = start_mono_window(
-            state, self._rig.cam0, self._noise, self._config, self._common_cov
+            state, self._rig.cam0, self._imu.noise, self._config, self._visual_update.common_cov
         )
         self._new_segment = T_found is None
         if T_found is None:
@@ -463,16 +335,16 @@ class InertialTracker:
         return self._publish(frame, landmarks, TrackState.OK, True, len(state.feature_ids))
 
     def _declare_lost(self, frame: Frame) -> TrackResult:
-        """What is left of the filter is worth nothing."""
+        """Discard the filter."""
         self._landmarks, self._divergence = None, DivergenceMonitor(self._config.weak, self._config.blind)
         self._keyframes.reset()
-        if self._mono_window is not None:  # there was nothing to lose
+        if self._mono_window is not None:  # no pose was published yet
             return TrackResult(TrackState.INITIALISING, None, waiting_for=WaitReason.SCALE)
         self._has_published, self._lost_ns = False, frame.stamp_ns
         return TrackResult(TrackState.LOST, None)
 
     def _relocalise(self, frame: Frame) -> F64 | None:
-        """T_odom_cam (4, 4) of a LOST frame by its ORB features."""
+        """Return T_odom_cam (4, 4) of a LOST frame by its ORB features; None if it is not found."""
         if self._lost_ns is None or not self._local_map.keyframes:
             return None
         batch = self._round_robin.next_batch(sorted(self._local_map.keyframes, reverse=True))

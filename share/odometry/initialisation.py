@@ -1,7 +1,7 @@
-"""A first state from nothing but IMU samples: at rest or in motion, as sure as these allow.
+"""A first state from IMU samples, at rest or in motion, with the covariance that they allow.
 
-There is no start-up of its own. The filter's errors are right-invariant, so it converges from a tilt of
-tens of degrees and a velocity of metres a second (Barrau & Bonnabel 2017).
+There is no separate start-up. The filter's errors are right-invariant, so it converges from a tilt of tens of
+degrees and a velocity of metres per second (Barrau & Bonnabel 2017).
 """
 
 from __future__ import annotations
@@ -28,22 +28,25 @@ from share.types import F64, ImuBatch, WaitReason
 
 MIN_IMU_S = 0.05  # of IMU samples
 _AVERAGING_S = 0.5
-_UNKNOWN_TILT_RAD, _GAUGE_SIGMA = 1.0, 1e-4  # rad; of what defines odom
-_STILL_SPEED_SIGMA, _MOVING_SPEED_SIGMA = 0.1, 1.0  # velocity that is not there, or may be
-_MAX_STILL_ACCEL_STD, _MAX_STILL_RATE = (
-    0.15,
-    0.05,
-)  # m/s^2, rad/s: standard deviation and mean of a body at rest
-_STILL_FORCE_SIGMA, _MOVING_FORCE_SIGMA = 0.03, 1.5  # m/s^2, what a mean force has beside gravity and bias
-_STILL_RATE_SIGMA = 0.005  # rad/s, the same of a mean rate
+_UNKNOWN_TILT_RAD = 1.0
+_GAUGE_SIGMA = 1e-4  # rad, m: of position and heading, which define odom
+_STILL_SPEED_SIGMA = 0.1  # m/s, of a body at rest
+_MOVING_SPEED_SIGMA = 1.0  # m/s, of a body in motion
+_MAX_STILL_ACCEL_STD = 0.15  # m/s^2, standard deviation at rest
+_MAX_STILL_RATE = 0.05  # rad/s, mean plus standard deviation at rest
+_STILL_FORCE_SIGMA = 0.03  # m/s^2, of the mean force less gravity and bias, at rest
+_MOVING_FORCE_SIGMA = 1.5  # m/s^2, the same in motion
+_STILL_RATE_SIGMA = 0.005  # rad/s, of the mean rate less bias, at rest
 _RATE_GATE, _FORCE_GATE = 16.3, 10.8  # chi-square, 3 and 1 degrees of freedom, 0.1 %
 
 
 def state_from_imu(
     stamp_ns: int, imu: ImuBatch, rig: Rig, config: InertialConfig, bias: ImuBias
 ) -> FilterState | None:
-    """Body at odom's origin, z up, at the time of the last samples; None before there are enough. bias: as it
-    is known before; it is left aside where samples at rest contradict it."""
+    """Return a state at odom's origin, z up, at the time of the image; None with too few samples.
+
+    bias: as known before; it is ignored where samples at rest contradict it.
+    """
     if len(imu) < 2 or (imu.stamps_ns[-1] - imu.stamps_ns[0]) < MIN_IMU_S * 1e9:
         return None
     recent = imu.stamps_ns >= imu.stamps_ns[-1] - round(_AVERAGING_S * 1e9)
@@ -61,21 +64,21 @@ def state_from_imu(
 
 
 def state_from_camera(stamp_ns: int, rig: Rig, config: InertialConfig, bias: ImuBias) -> FilterState:
-    """For a body whose IMU says nothing: up is where the top of the image is, more or less."""
+    """Return a state for a body without IMU samples: up is the top of the image."""
     up = rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
     T = align_to_gravity(up, rig.T_body_cam0[:3, 2])
     sigma = _initial_sigmas(False, bias, config)
-    sigma[0:2] = _GAUGE_SIGMA  # a body that coasts tells nothing of gravity
+    sigma[0:2] = _GAUGE_SIGMA  # constant velocity says nothing of gravity
     return _state_at_image(stamp_ns, T, rig, bias, sigma)
 
 
 def unknown_bias(config: InertialConfig) -> ImuBias:
-    """Of an IMU that nobody knows."""
+    """Return a bias of 0 with the configured sigmas."""
     return ImuBias(np.zeros(3), np.zeros(3), config.gyro_bias, config.accel_bias)
 
 
 def _state_at_image(stamp_ns: int, T: F64, rig: Rig, bias: ImuBias, sigma: F64) -> FilterState:
-    """When the image with this stamp was taken, by the IMU's clock."""
+    """Return the state at the time of the image with this stamp, by the IMU's clock."""
     image_ns = stamp_ns + rig.timeshift_ns
     state = initial_state(image_ns, T, np.zeros(3), bias.gyro, bias.accel, rig.T_body_cam0, sigma)
     state.timeshift_s = rig.timeshift_s
@@ -88,8 +91,8 @@ def _is_still(gyro: F64, accel: F64) -> bool:
 
 
 def _contradicts_rest(bias: ImuBias, force: F64, rate: F64, g: float) -> bool:
-    """Whether the mean force and rate (3,) of a body at rest cannot come of this bias: the IMU is another by
-    now, or was calibrated since."""
+    """Return whether the mean force and rate (3,) of a body at rest are inconsistent with the bias:
+    another IMU, or a new calibration."""
     rate_nis = ((rate - bias.gyro) ** 2).sum() / (bias.gyro_sigma**2 + _STILL_RATE_SIGMA**2)
     force_nis = (np.linalg.norm(force - bias.accel) - g) ** 2 / (bias.accel_sigma**2 + _STILL_FORCE_SIGMA**2)
     return bool(rate_nis > _RATE_GATE or force_nis > _FORCE_GATE)
@@ -106,7 +109,7 @@ def _initial_sigmas(is_still: bool, bias: ImuBias, config: InertialConfig) -> F6
 
 
 def _update_with_force(state: FilterState, force: F64, sigma: float, g: float) -> None:
-    """Mean specific force = R' g + bias: a tilt and a bias that look alike are tied to each other."""
+    """Update with mean specific force = R' g + bias; tilt and accelerometer bias become correlated."""
     z = np.array([0.0, 0.0, g])
     Rt = state.T[:3, :3].T
     H = np.zeros((3, state.size))
@@ -120,48 +123,49 @@ def _update_with_rate(state: FilterState, rate: F64) -> None:
     filter.scalar_update(state, rate - state.bg, H, _STILL_RATE_SIGMA)
 
 
-# ---- When a filter that has begun knows enough: for a first pose, and for its biases to be remembered.
+# Convergence: when the state suffices for a first pose, and its biases are worth storing.
 
-_MAX_TILT_SIGMA_RAD, _MAX_SPEED_SIGMA_M_S = np.radians(3.0), 0.3  # sigmas
-_MAX_TILT_DRIFT_M_S, _MAX_TILT_WAIT_S = (
-    0.03,
-    0.9,
-)  # a tilt carries nobody off faster than this; or he has waited so long
-_LEARNT_SIGMA_RATIO = 0.3  # of the sigma that a bias has which nobody knows
+_MAX_TILT_SIGMA_RAD = np.radians(3.0)
+_MAX_SPEED_SIGMA_M_S = 0.3
+_MAX_TILT_DRIFT_M_S = 0.03  # drift by the uncertain tilt: with more, the first pose waits,
+_MAX_TILT_WAIT_S = 0.9  # for so long
+_LEARNT_SIGMA_RATIO = 0.3  # of an unknown bias's sigma
 
 
 def tilt_sigma(s: FilterState, columns: slice = POSE) -> float:
-    """Sigma of what is up, rad; of the pose that has these columns."""
+    """Return the sigma, rad, of the up direction of the pose with these columns."""
     return float(np.sqrt(s.cov[columns.start, columns.start] + s.cov[columns.start + 1, columns.start + 1]))
 
 
 def has_converged(s: FilterState) -> bool:
-    """Tilt and velocity are known; a bias of the accelerometer alone (`accel_bias`) leaves 2.5 degrees."""
+    """Return whether tilt and velocity are known; an accelerometer bias of `accel_bias` alone leaves 2.5
+    degrees."""
     return tilt_sigma(s) < _MAX_TILT_SIGMA_RAD and bool(
         np.sqrt(np.trace(s.cov[VELOCITY, VELOCITY])) < _MAX_SPEED_SIGMA_M_S
     )
 
 
 def is_publishable(s: FilterState, waited_s: float, new_segment: bool) -> bool:
-    """Whether a first pose is, `waited_s` after the filter began; anew: so does odom.
+    """Return whether a first pose can be published, `waited_s` after the filter began. new_segment: odom
+    begins with it.
 
-    Who begins at rest is told it at once. Who begins at a run would be told a path that climbs or sinks by
-    the tilt that a bias looks like, until turning has parted the two: mostly within a second, for which he
-    is made to wait. One who goes straight on is told then.
+    A body at rest gets its pose at once. The path of a moving body would climb or sink by the tilt that looks
+    like a bias, until rotation separates the two, mostly within a second: its pose waits for that, at most
+    `_MAX_TILT_WAIT_S`, which a body that moves straight on needs.
     """
     drifts = tilt_sigma(s) * np.linalg.norm(s.v) > _MAX_TILT_DRIFT_M_S
     return has_converged(s) and not (drifts and new_segment and waited_s < _MAX_TILT_WAIT_S)
 
 
 def waiting_for(s: FilterState) -> WaitReason:
-    """What a pose that is not told yet waits for."""
+    """Return what the first pose waits for."""
     return (
         WaitReason.SPEED if tilt_sigma(s) < _MAX_TILT_SIGMA_RAD and not has_converged(s) else WaitReason.TILT
     )
 
 
 def estimated_bias(s: FilterState, config: InertialConfig) -> ImuBias | None:
-    """Of the IMU; None where the filter knows hardly more of it than when it began, or what no IMU has."""
+    """Return the estimated bias; None where it is hardly better known than at the start, or implausible."""
     gyro, accel = (
         float(np.sqrt(np.diag(s.cov[columns, columns]).max())) for columns in (GYRO_BIAS, ACCEL_BIAS)
     )
@@ -175,21 +179,23 @@ def estimated_bias(s: FilterState, config: InertialConfig) -> ImuBias | None:
         return None
 
 
-# ---- Which way is up, from an accelerometer that is nearly at rest.
+# The up direction by an accelerometer nearly at rest, for the tracker without IMU.
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
-MIN_SAMPLES, REST_SAMPLES = 20, 60  # samples by which rest is judged
-MAX_SAMPLES = 200  # samples that a guess in motion is averaged over
+MIN_SAMPLES = 20  # with fewer there is no estimate
+REST_SAMPLES = 60  # the newest ones, by which rest is detected
+MAX_SAMPLES = 200  # averaged for an estimate in motion
 GRAVITY_TOLERANCE = 0.08  # of gravity; the zero of an uncalibrated BMI055, a D435i's, is up to 0.07 off
-MAX_ACCEL_STD = 0.6  # m/s^2, standard deviation: a headset worn by somebody who stands, motors idling
+MAX_ACCEL_STD = 0.6  # m/s^2, standard deviation: a headset on a standing person, motors idling
 MAX_MEAN_RATE = 0.15  # rad/s
-UP_SIGMA_RAD = float(np.radians(3.0))  # of up, for as long as nothing corrects it
+UP_SIGMA_RAD = float(np.radians(3.0))  # of up, as nothing corrects it
 
 
 class GravityEstimator:
-    """The mean specific force is up, if the body turns little, shakes little, and its size is gravity's.
+    """Up is the mean specific force, if the body hardly turns or shakes and the force has the size of
+    gravity.
 
-    A body that starts in motion measures its own acceleration too: 1 m/s^2 tilts "up" by 6 degrees.
+    A body that starts in motion measures its acceleration too: 1 m/s^2 tilts "up" by 6 degrees.
     """
 
     def __init__(self, max_frames: int = 10) -> None:
@@ -199,18 +205,18 @@ class GravityEstimator:
 
     @property
     def has_timed_out(self) -> bool:
-        """The IMU stayed silent, or the body was never at rest: begin without knowing up."""
+        """Whether the IMU was silent, or the body not at rest, for too long: begin without knowing up."""
         return self._frames >= self._max_frames
 
     def add(self, imu: ImuBatch) -> F64 | None:
-        """Unit vector up in the body frame (3,) once it is known, else None."""
+        """Add samples of a frame. Return the unit vector up (3,) in the body frame, None while unknown."""
         self._imu = np.concatenate([self._imu, np.hstack([imu.gyro, imu.accel])])[-MAX_SAMPLES:]
         self._frames += 1
         newest = self._imu[-REST_SAMPLES:]
         return _mean_direction(newest) if len(newest) >= MIN_SAMPLES and _is_at_rest(newest) else None
 
     def mean_direction(self) -> F64 | None:
-        """The direction of the mean specific force, at rest or not; None with too few samples."""
+        """Return the direction of the mean specific force, at rest or not; None with too few samples."""
         return _mean_direction(self._imu) if len(self._imu) >= MIN_SAMPLES else None
 
 
@@ -223,14 +229,14 @@ def _is_at_rest(imu: F64) -> bool:
 
 
 def _mean_direction(imu: F64) -> F64 | None:
-    """Unit mean of the accelerations in (N, 6); None in free fall."""
+    """Return the unit mean of the accelerations in (N, 6); None in free fall."""
     mean = imu[:, 3:].mean(axis=0)
     magnitude = float(np.linalg.norm(mean))
     return mean / magnitude if magnitude > 0.5 * STANDARD_GRAVITY else None
 
 
 def align_to_gravity(up: F64, forward: F64) -> F64:
-    """T_odom_body (4, 4) at the origin with `up` along z and `forward` as near to x as that allows.
+    """Return T_odom_body (4, 4) at the origin with `up` along z and `forward` as near to x as possible.
 
     up, forward: (3,) in the body frame, not parallel.
     """

@@ -1,4 +1,5 @@
-"""What a single camera sees until its scale is known: kept for a while, and fitted again and again."""
+"""Scale initialisation of a single camera: keep a window of frames, and fit it repeatedly until the scale
+is known."""
 
 from __future__ import annotations
 
@@ -11,33 +12,27 @@ from share.geometry.camera import Camera, ImuNoise, rays
 from share.odometry import filter, mono_bundle
 from share.odometry.depth_prior import FEATURE_SPREAD, MEAN_RHO, ROOM_LOG_SIGMA
 from share.odometry.feature_matching import anchors_in_camera
-from share.odometry.imu_buffer import constant_velocity_samples
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.mono_bundle import BundleModel, BundleSolution, WindowFrame
 from share.odometry.normal_equations import FRAME_SIZE
 from share.odometry.state import CORE_SIZE, EXTRINSIC, FilterState
 from share.types import F64, ImuBatch
 
-_FRAME_GAP_NS = 90_000_000  # between shots that are no keyframes
-_SOLVE_PERIOD, _MIN_FRAMES = 4, 12  # shots from one fit to the next, and before the first
-_MIN_PARALLAX_PX = (
-    2.0  # of a quarter of the features at least, beside what turning does: less is not worth a fit
-)
+_FRAME_GAP_NS = 90_000_000  # minimum between frames of the window that are no keyframes
+_SOLVE_PERIOD = 4  # frames between fits
+_MIN_FRAMES = 12  # before the first fit
+_MIN_PARALLAX_PX = 2.0  # of at least a quarter of the features, without rotation, for a fit
 _MAX_WINDOW_NS = 2_500_000_000
-_NOISE_SCALE = (
-    2.0  # times the sigma of a coordinate: what a patch is off by stays, sights are no news each time
-)
-_MAX_SCALE_SIGMA, _MIN_BASELINE_PX, _MAX_COST = (
-    0.03,
-    15.0,
-    1.0,
-)  # a fit's scale, how far it came as an image shows it, and its cost
-_UNKNOWN_SCALE_SIGMA = 0.1  # relative sigma of scale
+_NOISE_SCALE = 2.0  # of a coordinate's sigma, because errors of a patch last from frame to frame
+_MAX_SCALE_SIGMA = 0.03  # relative, for a fit to be accepted,
+_MIN_BASELINE_PX = 15.0  # baseline over depth, times the focal length,
+_MAX_COST = 1.0  # and mean cost of an observation, squared sigmas
+_UNKNOWN_SCALE_SIGMA = 0.1  # relative
 _GAUGE_SIGMA = 1e-3  # rad, 1/m
 
 
 class MonoWindow:
-    """Shots since the beginning, which was a keyframe."""
+    """Frames since the first keyframe."""
 
     def __init__(
         self, first: FilterState, camera: Camera, noise: ImuNoise, config: InertialConfig, common_cov: F64
@@ -52,21 +47,24 @@ class MonoWindow:
 
     @property
     def is_full(self) -> bool:
-        """Nothing has come of it."""
+        """Whether no fit was accepted in `_MAX_WINDOW_NS`."""
         return self.last_ns - self._frames[0].stamp_ns > _MAX_WINDOW_NS
 
     @property
     def last_ns(self) -> int:
-        """IMU time of the last shot."""
+        """IMU time of the last frame."""
         return self._frames[-1].stamp_ns
 
     def wants_frame(self, stamp_ns: int) -> bool:
-        """Whether it is time for a shot."""
+        """Return whether it is time for another frame."""
         return stamp_ns - self.last_ns > _FRAME_GAP_NS
 
     def try_solve(self, landmarks: LandmarkMap, imu: ImuBatch, is_keyframe: bool) -> bool:
-        """After the frame just tracked, with the IMU since the last shot; anchored: as newest keyframe.
-        Whether the scale is known now; then the scene is set to what was fitted."""
+        """Add the frame just tracked, with the IMU samples since the last, and fit if it is time.
+
+        A fit that is good enough replaces state and covariance. Return whether the scale is known.
+        is_keyframe: the frame is the newest keyframe.
+        """
         uv = self._camera.normalise(landmarks.appearance.last_px.astype(np.float64))
         self._add(landmarks.state, imu, uv, is_keyframe)
         n = len(self._frames)
@@ -89,7 +87,8 @@ class MonoWindow:
         )
 
     def _parallax_px(self, s: FilterState, uv: F64) -> float:
-        """How far features have moved since their keyframes saw them, less what turning did."""
+        """Return the motion of features since their anchors saw them, without the effect of rotation: the
+        third quartile."""
         q = (anchors_in_camera(s)[:, :3, :3] @ rays(s.ray)[:, :, None])[:, :, 0]
         distance = np.linalg.norm(
             self._camera.to_image_plane(q[:, :2] / q[:, 2:]) - self._camera.to_image_plane(uv), axis=1
@@ -107,10 +106,8 @@ class MonoWindow:
         indices = np.searchsorted(solution.feature_ids, s.feature_ids)
         poses = (FRAME_SIZE * frame[:, None] + np.arange(6)).ravel()
         columns = np.r_[last : last + FRAME_SIZE + 6, poses, last + FRAME_SIZE + 6 + indices]
-        calibration, fitted = (
-            slice(EXTRINSIC.start, CORE_SIZE),
-            np.r_[0 : EXTRINSIC.start, CORE_SIZE : s.size],
-        )
+        calibration = slice(EXTRINSIC.start, CORE_SIZE)
+        fitted = np.r_[0 : EXTRINSIC.start, CORE_SIZE : s.size]
         s.cov = np.zeros((s.size, s.size))
         s.cov[np.ix_(fitted, fitted)] = solution.cov[np.ix_(columns, columns)]
         s.cov[calibration, calibration] = self._first.cov[calibration, calibration]
@@ -121,8 +118,11 @@ class MonoWindow:
 def start_mono_window(
     first: FilterState, camera: Camera, noise: ImuNoise, config: InertialConfig, common_cov: F64
 ) -> MonoWindow | None:
-    """None where depth was measured. Else the filter goes by camera and gyro until the window is solved:
-    up, and how far the room is, are as they are."""
+    """Return a window where depth is unknown, None where it was measured.
+
+    Until the window is solved the filter uses camera and gyro only; tilt and the mean inverse depth are
+    fixed.
+    """
     if filter.scale_sigma(first) < _UNKNOWN_SCALE_SIGMA:
         return None
     window = MonoWindow(first, camera, noise, config, common_cov)
@@ -135,8 +135,3 @@ def _fix_gauge(state: FilterState) -> None:
     H[0, 0] = H[1, 1] = 1
     H[2, state.features_start :] = 1 / len(state.feature_ids)
     filter.scalar_update(state, np.zeros(3), H, _GAUGE_SIGMA)
-
-
-def gyro_only_samples(state: FilterState, imu: ImuBatch, to_ns: int, gravity: float) -> ImuBatch:
-    """What an IMU would say of a body that turns as this one did and keeps its velocity."""
-    return constant_velocity_samples(state, imu.gyro.mean(axis=0) - state.bg, to_ns, gravity)

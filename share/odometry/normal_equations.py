@@ -1,4 +1,4 @@
-"""Normal equations of a window of shots, whose features meet nothing but shots (Schur's complement)."""
+"""Normal equations of a window of frames and features, solved by the Schur complement of the features."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from share.types import F64, I64
 
-FRAME_SIZE = 9  # columns of a shot: pose and velocity
+FRAME_SIZE = 9  # columns of a frame: pose and velocity
 
 
 def inverse(A: F64) -> F64:
@@ -14,8 +14,9 @@ def inverse(A: F64) -> F64:
 
 
 class BundleNormalEquations:
-    """A (D, D), b (D,) of what is shared: shots, 6 of biases, the room, 6 of each image; cross (D, N),
-    depth (N,), b_rho (N,) of features' inverse depths. cost: the sum of squares."""
+    """A (D, D), b (D,) of frames, 6 of the biases, the room's inverse depth, 6 of each image's error;
+    cross (D, N), rho_information (N,), b_rho (N,) of the features' inverse depths. cost: the sum of
+    squares."""
 
     def __init__(self, frames: int, features: int) -> None:
         self.bias_columns = slice(FRAME_SIZE * frames, FRAME_SIZE * frames + 6)
@@ -26,23 +27,23 @@ class BundleNormalEquations:
         self.cost = 0.0
 
     def pose_columns(self, k: int) -> I64:
-        """Columns of the pose of shot number k,"""
+        """Return the columns of the pose of frame k."""
         return np.arange(FRAME_SIZE * k, FRAME_SIZE * k + 6)
 
     def offset_columns(self, k: int) -> I64:
-        """and of what its image is off by."""
+        """Return the columns of the image error of frame k."""
         return np.arange(self.room_column + 1 + 6 * k, self.room_column + 7 + 6 * k)
 
     def add(self, columns: I64, J: F64, r: F64, W: F64) -> None:
-        """Residuals r (m,) of information W (m, m), of which J (m, n) times columns `columns` (n,) is taken
-        away."""
+        """Add residuals r (m,) with information W (m, m), of which a step J (m, n) in `columns` (n,) is
+        subtracted."""
         weighted = J.T @ W
         self.A[np.ix_(columns, columns)] += weighted @ J
         self.b[columns] += weighted @ r
         self.cost += float(r @ W @ r)
 
     def step(self, damping: float) -> tuple[F64, F64]:
-        """By how much all that is shared (D,) and inverse depths (N,) should move (Marquardt 1963)."""
+        """Return the steps of the shared unknowns (D,) and of the inverse depths (N,) (Marquardt 1963)."""
         damped = self.rho_information * (1 + damping)
         eliminated = self.cross / damped
         A = self.A + damping * np.diag(np.diag(self.A)) - eliminated @ self.cross.T
@@ -50,7 +51,7 @@ class BundleNormalEquations:
         return x, (self.b_rho - self.cross.T @ x) / damped
 
     def covariance(self) -> F64:
-        """Of shots, biases and features."""
+        """Return the covariance of frames, biases and features."""
         eliminated = self.cross / self.rho_information
         P = inverse(self.A - eliminated @ self.cross.T)[: self.room_column, : self.room_column]
         cross_cov = -P @ eliminated[: self.room_column]

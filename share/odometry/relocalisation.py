@@ -1,4 +1,4 @@
-"""The agent's own small map: keyframes it has been at, and the points it first saw from them."""
+"""An agent's local map of keyframes and points, and relocalisation in it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from share.vision.mask import UNIFORM_FIELD_DEG, field_mask
 from share.vision.matching import match_descriptors
 from share.vision.orb import detect_orb
 
-# ---- Pose of a camera from points whose place is known: consensus, then weighted least squares.
+# Pose of a camera from known points: RANSAC, then weighted least squares.
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,8 @@ class PoseEstimate:
 
 
 def ransac_pose(points: F64, uv: F64, focal: float, threshold_px: float, seed: int) -> PoseEstimate | None:
-    """`absolute_pose` of points (N, 3) m, world, seen at uv (N, 2); None without a model."""
+    """Return the pose of `absolute_pose` by points (N, 3) m, world, seen at uv (N, 2), with a unit
+    covariance; None without a model."""
     if len(points) < 4:
         return None
     T, inliers = absolute_pose(points, uv, focal, RansacOptions(threshold_px, seed))
@@ -40,11 +41,10 @@ def ransac_pose(points: F64, uv: F64, focal: float, threshold_px: float, seed: i
 def refine_pose(
     T: F64, points: F64, uv: F64, focal: float, sigma_px: F64, gate_px: float, iterations: int = 8
 ) -> PoseEstimate:
-    """Gauss-Newton on reprojection errors with Cauchy weights, from T_cam_world.
+    """Refine T_cam_world by Gauss-Newton on reprojection errors with Cauchy weights.
 
-    sigma_px (N,): standard deviation of each observation. Points that end further than `gate_px`
-    sigmas away are no inliers. The covariance is scaled by the inliers' own residuals, never
-    below what `sigma_px` promises.
+    sigma_px (N,): standard deviation of each observation. Points beyond `gate_px` sigmas are outliers. The
+    covariance is scaled up by the inliers' residuals, never down.
     """
     scale = focal / sigma_px
     for _ in range(iterations):
@@ -64,17 +64,17 @@ def refine_pose(
 
 
 def _normal_equations(r: F64, J: F64, w: F64) -> tuple[F64, F64]:
-    """sum w J'J (6, 6), never quite singular, and sum w J'r (6,)."""
+    """Return sum w J'J (6, 6), regularised, and sum w J'r (6,)."""
     flat = J.reshape(-1, 6)
     weighted = flat * np.repeat(w, 2)[:, None]
     return weighted.T @ flat + 1e-9 * np.eye(6), weighted.T @ r.ravel()
 
 
 def reprojection_residuals(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F64, F64]:
-    """Residuals (N, 2) = scale (projection - uv), and d/d(xi) (N, 2, 6) for T Exp(xi).
+    """Return residuals (N, 2) = scale (projection - uv), and their derivatives (N, 2, 6) by xi of T Exp(xi).
 
-    With p_c = R p + t, T Exp(xi) moves it by R (rho - p x phi). So a row d of D R, where D is the
-    derivative of the projection, becomes [p x d | d].
+    With p_c = R p + t, T Exp(xi) moves it by R (rho - p x phi). So a row d of D R, where D is the derivative
+    of the projection, becomes [p x d | d].
     """
     R = T[:3, :3]
     p = points @ R.T + T[:3, 3]
@@ -92,9 +92,10 @@ def reprojection_residuals(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F6
 
 @dataclass(frozen=True, eq=False)
 class LocalKeyframe:
-    """An image the local map holds on to: its patches are what a point looks like.
+    """A keyframe of the local map: its image, in which patches of points are found, its pose T_odom_cam (4,
+    4), and its ORB view.
 
-    view: its ORB features, for relocalisation; None until they are made.
+    view: for relocalisation; None until it is made.
     """
 
     image: U8
@@ -103,9 +104,9 @@ class LocalKeyframe:
 
 
 class LocalMap:
-    """Points in odom, each hosted by the keyframe that saw it first. Memory is bounded.
+    """Points in odom, each anchored in the keyframe that saw it first. Memory is bounded.
 
-    Points have stable ids; a point is gone when its host is dropped.
+    Points have stable ids; a point is dropped with its anchor. The tracker with IMU uses only the keyframes.
     """
 
     def __init__(self, max_keyframes: int) -> None:
@@ -119,7 +120,8 @@ class LocalMap:
         self.anchor_px: F32 = np.zeros((0, 2), np.float32)
 
     def add_keyframe(self, image: U8, T_odom_cam: F64) -> int:
-        """Its number. Where the map is full, the keyframe nearest to another one makes room."""
+        """Add a keyframe and return its number. If the map is full, the most redundant keyframe is
+        dropped."""
         if len(self.keyframes) >= self._max_keyframes:
             self._drop_keyframe(self._most_redundant())
         keyframe_id = self._next_keyframe
@@ -128,12 +130,12 @@ class LocalMap:
         return keyframe_id
 
     def set_view(self, view: View) -> None:
-        """The features of the newest keyframe."""
+        """Set the view of the newest keyframe."""
         newest = self._next_keyframe - 1
         self.keyframes[newest] = replace(self.keyframes[newest], view=view)
 
     def add_points(self, anchor: int, points: F64, px: F32) -> I64:
-        """Ids (N,) of new points (N, 3) m in odom, seen at px (N, 2) in keyframe `anchor`."""
+        """Add points (N, 3) m in odom, seen at px (N, 2) in keyframe `anchor`. Return their ids (N,)."""
         ids = np.arange(self._next_id, self._next_id + len(points))
         self._next_id += len(points)
         self.ids = np.concatenate([self.ids, ids])
@@ -143,7 +145,7 @@ class LocalMap:
         return ids
 
     def row_indices(self, ids: I64) -> I64:
-        """Row of each point, -1 where it is gone."""
+        """Return the row of each point, -1 where it was dropped."""
         row = np.searchsorted(self.ids, ids)
         row = np.minimum(row, max(len(self.ids) - 1, 0))
         is_known = self.ids[row] == ids if len(self.ids) else np.zeros(len(ids), bool)
@@ -152,14 +154,14 @@ class LocalMap:
     def visible_points(
         self, T_cam_odom: F64, camera: Camera, anchors: list[int], border: float = 12.0
     ) -> tuple[I64, F32]:
-        """Rows and predicted px of the points of `anchors` that the camera should see."""
+        """Return rows and predicted px of the points of `anchors` in the camera's view."""
         rows = np.flatnonzero(np.isin(self.anchors, anchors))
         px = camera.project(se3.transform(T_cam_odom, self.points[rows]))
         inside = camera.is_inside(np.nan_to_num(px, nan=-1e6), border)
         return rows[inside], px[inside].astype(np.float32)
 
     def keyframes_near(self, T_odom_cam: F64, max_m: float, max_rad: float) -> list[int]:
-        """Keyframes seen from about here, nearest first; one metre weighs as much as one radian."""
+        """Return keyframes within `max_m` and `max_rad`, nearest first; one metre counts as one radian."""
         numbers = np.array(sorted(self.keyframes), np.int64)
         if len(numbers) == 0:
             return []
@@ -172,7 +174,7 @@ class LocalMap:
         return np.stack([self.keyframes[int(n)].T_odom_cam for n in numbers])
 
     def _most_redundant(self) -> int:
-        """The older keyframe of the closest pair."""
+        """Return the older keyframe of the closest pair."""
         numbers = np.array(sorted(self.keyframes), np.int64)
         poses = self._poses(numbers)
         distance, angle = se3.pairwise_distances(poses[:-1], poses)  # the newest is never dropped
@@ -187,25 +189,25 @@ class LocalMap:
         self.anchors, self.anchor_px = self.anchors[keep], self.anchor_px[keep]
 
 
-# ---- Finding oneself again among keyframes one has been at.
+# Relocalisation in the keyframes of the local map.
 
-MAX_HAMMING_BITS = 64  # of 256 bits
-MATCH_RATIO = 0.8  # the best match must be so much nearer than the second (Lowe 2004)
+MAX_HAMMING_BITS = 64  # of 256
+MATCH_RATIO = 0.8  # of the best distance to the second best (Lowe 2004)
 
 
 class RoundRobin:
-    """Some of the keyframes at a frame, others at the next: looking at all of them would make a live
-    camera's frames late. count: at a time."""
+    """Takes turns among keyframes, `batch_size` a frame: matching all of them would delay a live camera's
+    frames."""
 
     def __init__(self, batch_size: int) -> None:
         self._batch_size, self._offset = batch_size, 0
 
     def reset(self) -> None:
-        """Lost anew."""
+        """Start again from the first."""
         self._offset = 0
 
     def next_batch(self, numbers: Sequence[int]) -> Sequence[int]:
-        """Of `numbers`, the likeliest first, those whose turn it is."""
+        """Return the next batch of `numbers`, which are sorted by likelihood."""
         first = self._offset % max(len(numbers), 1)
         self._offset += self._batch_size
         return numbers[first : first + self._batch_size]
@@ -214,9 +216,10 @@ class RoundRobin:
 def relocalise(
     keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, config: TrackerConfig, seed: int
 ) -> F64 | None:
-    """T_odom_cam (4, 4) of the frame by its ORB features, from the keyframe that most of them agree with.
+    """Return T_odom_cam (4, 4) of the frame by its ORB features and the keyframe with the most inliers; None
+    without enough.
 
-    Twice as many inliers are asked for as tracking needs: nothing else vouches for the answer.
+    It takes twice as many inliers as tracking, because nothing else confirms the pose.
     """
     px, descriptors = detect_orb(
         frame.image0, config.view_features, mask=field_mask(rig.cam0, UNIFORM_FIELD_DEG)
@@ -246,9 +249,9 @@ def _match_keyframe(
     )
     points = keyframe.view.points[with_depth[pairs[:, 1]]].astype(np.float64)
     points, matched_uv = se3.transform(keyframe.T_odom_cam, points), uv[pairs[:, 0]]
-    rough = ransac_pose(points, matched_uv, focal, config.ransac_px, seed)
-    if rough is None:
+    initial = ransac_pose(points, matched_uv, focal, config.ransac_px, seed)
+    if initial is None:
         return None
     return refine_pose(
-        rough.T, points, matched_uv, focal, np.full(len(points), config.noise_px), config.gate_sigma
+        initial.T, points, matched_uv, focal, np.full(len(points), config.noise_px), config.gate_sigma
     )

@@ -1,12 +1,12 @@
-"""What the filter knows: means, and one covariance over the errors of all of them.
+"""The state of the filter: means, and one covariance of all errors.
 
-Errors of poses and velocity are on the left, in odom (the right-invariant error of Barrau & Bonnabel
-2017): R = Exp(phi) R_mean, p = Exp(phi) p_mean + rho, v = Exp(phi) v_mean + nu. What nobody can observe,
-a turn of everything about the vertical and a shift of everything, is then the same direction of the
-error whatever the means are, so no linearisation point can make the filter believe that it saw it.
+Errors of poses and velocity are on the left, in odom (the right-invariant error of Barrau & Bonnabel 2017): R
+= Exp(phi) R_mean, p = Exp(phi) p_mean + rho, v = Exp(phi) v_mean + nu. The unobservable directions, a
+rotation of everything about the vertical and a translation of everything, then do not depend on the means, so
+no linearisation point makes the filter gain false information about them.
 
-Columns of the covariance: body pose 6 | velocity 3 | gyro bias 3 | accel bias 3 | T_body_cam 6 (on
-the right) | time offset 1 | keyframe poses 6 each | inverse depths 1 each.
+Columns of the covariance: body pose 6 | velocity 3 | gyro bias 3 | accel bias 3 | T_body_cam 6 (on the right)
+| time offset 1 | keyframe poses 6 each | inverse depths 1 each.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ POSE = slice(0, 6)
 VELOCITY = slice(6, 9)
 GYRO_BIAS = slice(9, 12)
 ACCEL_BIAS = slice(12, 15)
+IMU_STATE_SIZE = 15  # columns that IMU propagation changes
 EXTRINSIC = slice(15, 21)
 TIMESHIFT = 21
 CORE_SIZE = 22
@@ -29,12 +30,14 @@ CORE_SIZE = 22
 
 @dataclass(eq=False)
 class FilterState:
-    """stamp_ns: IMU time of the body's mean. T (4, 4) T_odom_body; v (3,) m/s in odom; bg rad/s, ba m/s^2
-    (3,) in the body; T_body_cam (4, 4); offset_s: IMU time less camera time.
+    """Means and covariance.
 
-    keyframes (K,) ids with poses (K, 4, 4) T_odom_body. Features: ids (N,), host (N,) index into
-    keyframes, ray (N, 2) normalised coordinates in the host's cam0, by definition exact: a feature is
-    what is there; rho (N,) inverse depth along the host's axis, 1/m. cov (22 + 6 K + N, same).
+    stamp_ns: IMU time. T (4, 4) T_odom_body; v (3,) m/s in odom; bg rad/s, ba m/s^2 (3,) in the body;
+    T_body_cam (4, 4); timeshift_s: IMU time minus camera time.
+
+    keyframe_ids (K,), keyframe_poses (K, 4, 4) T_odom_body. feature_ids (N,); anchor (N,): index of the
+    keyframe; ray (N, 2): normalised coordinates in the anchor's cam0, exact by definition; rho (N,): inverse
+    depth along the anchor's axis, 1/m. cov (22 + 6 K + N, same).
     """
 
     stamp_ns: int
@@ -63,28 +66,28 @@ class FilterState:
 
     @property
     def rho_variance(self) -> F64:
-        """(N,) 1/m^2."""
+        """Variances (N,) 1/m^2 of the inverse depths."""
         return np.diag(self.cov)[self.features_start :]
 
     def means(self) -> tuple[Any, ...]:
-        """All but the covariance, for `restore`."""
+        """Return the means, without the covariance, for `restore`."""
         calibration = self.bg, self.ba, self.T_body_cam, self.timeshift_s
         return self.T, self.v, *calibration, self.keyframe_poses, self.rho
 
     def restore(self, means: tuple[Any, ...]) -> None:
-        """What `means` gave. Steps of the filter replace arrays and never write into them."""
+        """Restore what `means` returned. Filter steps replace arrays and never write into them."""
         self.T, self.v, self.bg, self.ba, self.T_body_cam, self.timeshift_s = means[:6]
         self.keyframe_poses, self.rho = means[6:]
 
     def keyframe_columns(self, k: int) -> slice:
-        """Columns of keyframe number k of `keyframe_poses`."""
+        """Return the columns of the pose of keyframe k."""
         return slice(CORE_SIZE + 6 * k, CORE_SIZE + 6 * k + 6)
 
 
 def initial_state(
     stamp_ns: int, T: F64, v: F64, bg: F64, ba: F64, T_body_cam: F64, sigma: F64
 ) -> FilterState:
-    """A state without keyframes; sigma (22,): standard deviations of the core, uncorrelated."""
+    """Return a state without keyframes. sigma (22,): standard deviations of the core, uncorrelated."""
     none = np.zeros(0, np.int64)
     return FilterState(
         stamp_ns,

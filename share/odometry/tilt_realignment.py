@@ -1,10 +1,10 @@
-"""Where in odom the body is told to be when the filter learns what is up.
+"""Keep published positions continuous when the filter's tilt estimate improves.
 
-At rest, a tilt and a bias of the accelerometer cannot be told apart; only turning and speeding up part
-them. When that comes, the filter turns all it knows about the place where it began: nothing has moved, but
-a body that has gone 5 m since would be told to jump by 9 cm a degree. So poses are told as if it had turned
-about the body: up is right at once, and the body stays where it was. What a pose is relative to any other
-that the filter holds is not touched.
+At rest, a tilt and an accelerometer bias cannot be distinguished; rotation and acceleration separate them.
+Then the filter rotates all it has estimated about the place where it began: the body has not moved, but at 5
+m from there its position would jump by 9 cm per degree. So poses are published as if that rotation were about
+the body: up is right at once, and the position does not change. Poses relative to others in the filter are
+not affected.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _Z_AXIS = 2
 
 
 class TiltRealignment:
-    """shift (3,) m: added to the filter's positions, whatever its keyframes are by now."""
+    """offset (3,) m: added to the filter's positions."""
 
     def __init__(self) -> None:
         self.offset = np.zeros(3)
@@ -27,26 +27,27 @@ class TiltRealignment:
         self._keyframe_ids, self._rotations = np.zeros(0, np.int64), np.zeros((0, 3, 3))
 
     def start(self, s: FilterState, pivot_position: F64, new_segment: bool) -> None:
-        """Poses are told from `s` on, by a filter that began at `pivot_position` (3,). anew: so does odom."""
+        """Begin with the state `s` of a filter that began at `pivot_position` (3,). new_segment: odom
+        begins too."""
         self.offset = np.zeros(3) if new_segment else self.offset
         self._pivot_position = pivot_position
         self._store_rotations(s)
 
     def update(self, s: FilterState) -> None:
-        """Whatever has been learnt since the last call."""
+        """Compensate the rotation since the last call."""
         R, before = s.keyframe_poses[:, :3, :3], self._rotations
         if not np.array_equal(self._keyframe_ids, s.keyframe_ids):
             _, old_rows, new_rows = np.intersect1d(self._keyframe_ids, s.keyframe_ids, return_indices=True)
             R, before = R[new_rows], before[old_rows]
         if len(R):
             turned = _small_rotation((R @ before.swapaxes(1, 2)).mean(axis=0))
-            turned[_Z_AXIS] = 0.0  # about the vertical nothing is ever learnt; what turns keeps its place
+            turned[_Z_AXIS] = 0.0  # heading is unobservable
             arm = s.T[:3, 3] - self._pivot_position
             self.offset = self.offset - (arm - se3.so3_exp(-turned) @ arm)
         self._store_rotations(s)
 
     def published_pose(self, T: F64) -> F64:
-        """T_odom_body (4, 4), as others are told it, of a pose by the filter."""
+        """Return T_odom_body (4, 4) to publish for a pose of the filter."""
         out = T.copy()
         out[:3, 3] += self.offset
         return out
@@ -56,7 +57,8 @@ class TiltRealignment:
 
 
 def _small_rotation(R: F64) -> F64:
-    """rad (3,) of a rotation R (3, 3) by less than a right angle: half of what R - R' has is its sine."""
+    """Return the rotation vector (3,) rad of R (3, 3), less than a right angle: (R - R') / 2 holds its
+    sine."""
     sines = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
     sine = float(np.linalg.norm(sines))
     return sines * (np.arcsin(min(sine, 1.0)) / sine) if sine > 1e-9 else sines

@@ -1,4 +1,4 @@
-"""What a tracker says of a frame."""
+"""The result of a frame."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from share.types import F64, TrackState, WaitReason
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """What one frame came to. T_odom_body is None where there is no pose to be had.
+    """The result of one frame. T_odom_body is None where there is no pose.
 
-    keyframe: this frame became one, or one before it whose view is made by now: the tracker's
-    `keyframe_ready` gives what that shows. points: how many the pose
-    rests on. new_stretch: odometry broke before this keyframe. cov (6, 6): of T_odom_body, perturbed on the
-    right, where the tracker knows it. sound: False while images and IMU contradict each other. waits: for
-    what, where there is no pose yet. found: how many features were, also those that were not believed.
-    surprise: median squared distance of the features from where they were expected, in sigmas, 0 without any.
+    keyframe_ready: a keyframe is ready, of this frame or of one before; `make_keyframe` returns it.
+    inlier_count: features that the pose is based on. new_segment: odometry began anew before this frame. cov
+    (6, 6): of T_odom_body, perturbed on the right, where the tracker knows it. is_consistent: False while
+    images and IMU contradict each other. waiting_for: where there is no pose yet. found_count: features
+    found, outliers included. median_nis: over the features; 0 without any.
     """
 
     state: TrackState
@@ -34,16 +33,14 @@ class TrackResult:
 
 
 def finite_median(nis: F64) -> float:
-    """The median of squared distances (N,), NaN unknown, in sigmas; 0 without any."""
+    """Return the median of the finite values (N,); 0 without any."""
     finite = nis[np.isfinite(nis)]
     return median(finite) if len(finite) else 0.0
 
 
-# ---- The median, as numpy has it, for the few dozen numbers that a frame asks of: a fifth of its time.
-
-
 def median(values: F64) -> float:
-    """Of (N,), at least one; NaN if one of them is."""
+    """Return the median of (N,), N >= 1, as `np.median`, but five times as fast for a few dozen values;
+    NaN if one is."""
     half, odd = divmod(len(values), 2)
     part = np.partition(values, (half if odd else half - 1, half, -1))
     if np.isnan(part[-1]):

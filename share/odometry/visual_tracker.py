@@ -1,10 +1,8 @@
-"""Odometry by cameras alone: stereo or RGB-D. The fallback when an IMU dies, and the whole tracker
-where there is none.
+"""Odometry by cameras alone, stereo or RGB-D; for rigs without IMU.
 
-A frame's way: predict -> follow -> pose -> (keyframe: look again for old points -> refine -> add
-corners). What other agents need of a keyframe is made after its pose is out. Points keep the place
-that their first keyframe gave them; what holds drift down is that points of earlier keyframes are
-looked for again, by the patch that was seen first.
+A frame: predict -> track points -> pose -> (keyframe: match points of earlier keyframes -> refine -> add
+corners). What is published of a keyframe is made after its pose. Points keep the position that their first
+keyframe gave them; matching points of earlier keyframes again, by their first patch, keeps drift low.
 """
 
 from __future__ import annotations
@@ -37,8 +35,8 @@ from share.vision import corners, optical_flow
 from share.vision.mask import UNIFORM_FIELD_DEG, field_mask
 from share.vision.orb import make_view, measure_depth
 
-MIN_NCC = 0.8  # NCC below which a re-found patch is another thing
-MIN_POINTS_TO_MATCH = 8  # fewer points of an old keyframe are not worth an image pyramid
+MIN_NCC = 0.8  # of a patch matched in an earlier keyframe
+MIN_POINTS_TO_MATCH = 8  # of an earlier keyframe; fewer are not worth an image pyramid
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,33 +54,32 @@ class VisualTracker:
     """Feed frames in order to `track`. Deterministic: the same frames give the same poses."""
 
     def __init__(self, rig: Rig, config: TrackerConfig, seed: int = 0) -> None:
+        """Raises ValueError for a rig without stereo and depth."""
         if rig.cam1 is None and rig.depth is None:
-            raise ValueError("a camera alone gives no scale: stereo or depth is needed")
+            raise ValueError("one camera alone gives no scale; stereo or depth is needed")
         self._rig, self._config, self._seed = rig, config, seed
         self._T_cam_body = se3.inverse(rig.T_body_cam0)
         self._gravity_estimator = initialisation.GravityEstimator() if rig.imu else None
         self._map = LocalMap(config.max_keyframes)
         self._tracks = _NO_TRACKS
-        self._found_tracks, self._sought_count = (
-            _NO_TRACKS,
-            0,
-        )  # in the last frame, of so many that were followed
+        self._found_tracks = _NO_TRACKS  # in the last frame, outliers included
+        self._tracked_count = 0  # tracked into the last frame
         self._image: U8 | None = None
         self._stamp_ns = 0
-        self._T_odom_cam: F64 | None = None  # last believed pose
+        self._T_odom_cam: F64 | None = None  # of the last accepted pose
         self._velocity = np.zeros(6)  # body twist of the camera, rad/s and m/s
         self._cov = np.zeros((6, 6))  # of the last pose against the local map, camera frame
         c = config
         self._spacing = KeyframeSpacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_tracked)
         self._new_segment = True  # of the last keyframe
-        self._T_last_published = np.eye(4)  # T_odom_body of the last keyframe that others were told of
+        self._T_last_published = np.eye(4)  # T_odom_body of the last published keyframe
         self._keyframe_pending = False  # the last frame is to become a keyframe of the local map
         self._offered: tuple[Frame, View] | None = None
         self._lost_since_ns: int | None = None
         self._round_robin = relocalisation.RoundRobin(config.relocalise_hosts)
 
     def track(self, frame: Frame) -> TrackResult:
-        """The pose of this frame, causal. Frames must come with rising stamps."""
+        """Return the causal pose of this frame. Frames must come with rising stamps."""
         self.finish_keyframe()
         if self._T_odom_cam is None:
             result = self._initialise(frame)
@@ -91,14 +88,15 @@ class VisualTracker:
         else:
             result = self._track_frame(frame, self._T_odom_cam)
         if self._rig.imu and not len(frame.imu) and result.state is TrackState.OK:
-            result = replace(result, state=TrackState.VISION_ONLY)  # the IMU is silent: let it be seen
+            result = replace(result, state=TrackState.VISION_ONLY)  # the IMU is silent
         self._image, self._stamp_ns = frame.image0, frame.stamp_ns
         return result
 
     def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
-        """Make the frame just tracked a keyframe; call it where `track` said so. What it shows to others.
+        """Return the frame just tracked as a keyframe to publish; call it where `track` says that one is
+        ready.
 
-        Apart from `track`, because a headset should have its pose before this is computed.
+        It is separate from `track` so that a headset has its pose before.
         """
         view = make_view(frame, self._rig, self._config.view_features)
         new_segment = self._new_segment and not self._keyframe_pending
@@ -112,61 +110,57 @@ class VisualTracker:
         )
 
     def finish_keyframe(self) -> None:
-        """See `InertialTracker.finish_keyframe`."""
+        """Add the last keyframe to the local map; see `InertialTracker.finish_keyframe`."""
         if self._offered is None:
             return
         (frame, view), self._offered = self._offered, None
-        self._T_last_published = (
-            self._T_odom_body()
-        )  # only now: before, making its candidate might have failed
+        self._T_last_published = self._T_odom_body()  # not before: making its candidate might have failed
         if self._keyframe_pending:
             self._add_keyframe(frame)
         self._map.set_view(view)
 
     def reset_after_failure(self, frame: Frame) -> None:
-        """Something failed in or after `frame`, the last: where it is now is not known."""
+        """Declare LOST: something failed in or after `frame`, the last."""
         self._declare_lost(frame)
         self._tracks, self._offered, self._keyframe_pending = _NO_TRACKS, None, False
         self._image, self._stamp_ns = frame.image0, frame.stamp_ns
 
     @property
     def rejected_imu_samples(self) -> int:
-        """How many samples of an IMU were not believed: none is used."""
+        """0: no IMU is used."""
         return 0
 
     @property
     def bias(self) -> ImuBias | None:
-        """Of an IMU: none is used."""
+        """None: no IMU is used."""
         return None
 
     def feature_statistics(self) -> FeatureStatistics:
-        """Of the frame just tracked, one with a pose."""
+        """Return the statistics of the frame just tracked, which must have a pose."""
         assert self._T_odom_cam is not None
         tracks = self._all_found_tracks()
         rows = self._map.row_indices(tracks.ids)
         points = np.where(rows[:, None] >= 0, self._map.points[rows], np.nan)
         z = se3.transform(se3.inverse(self._T_odom_cam), points)[:, 2]
         is_inlier = np.arange(len(rows)) < len(self._tracks.ids)
-        sought_count, known_count = max(self._sought_count, len(rows)), len(self._map.ids)
-        return FeatureStatistics(tracks.px, is_inlier, z, sought_count, known_count)
+        tracked_count, known_count = max(self._tracked_count, len(rows)), len(self._map.ids)
+        return FeatureStatistics(tracks.px, is_inlier, z, tracked_count, known_count)
 
     def _all_found_tracks(self) -> _Tracks:
-        """Of the last frame: those that were believed, then the others."""
+        """Return the tracks of the last frame: inliers, then outliers."""
         return self._tracks.concatenate(
             self._found_tracks.take(~np.isin(self._found_tracks.ids, self._tracks.ids))
         )
 
     def _median_nis(self, tracks: _Tracks) -> float:
-        """See `TrackResult`."""
+        """Return `TrackResult.median_nis`."""
         assert self._T_odom_cam is not None
         expected = self._project(se3.inverse(self._T_odom_cam), self._map.row_indices(tracks.ids))
         return finite_median((((tracks.px - expected) / self._config.noise_px) ** 2).sum(axis=1))
 
-    # ------------------------------------------------------------------ the usual frame
-
     def _track_frame(self, frame: Frame, T_last: F64) -> TrackResult:
         dt = (frame.stamp_ns - self._stamp_ns) * 1e-9
-        # Over a gap the last velocity says nothing.
+        # After a gap the last velocity does not hold.
         T_predicted = T_last if frame.gap_ns else T_last @ se3.exp(self._velocity * dt)
         tracks = self._follow_tracks(frame.image0, T_predicted)
         estimate, tracks = self._estimate_pose(tracks)
@@ -195,56 +189,51 @@ class VisualTracker:
         guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
         px, found = optical_flow.track_points(self._image, image, tracks.px, guess, levels=2)
         found &= self._rig.cam0.has_normalised(px.astype(np.float64))
-        self._found_tracks, self._sought_count = _Tracks(tracks.ids, px).take(found), len(tracks.ids)
+        self._found_tracks, self._tracked_count = _Tracks(tracks.ids, px).take(found), len(tracks.ids)
         return self._found_tracks
 
     def _project(self, T_cam_odom: F64, rows: I64) -> F64:
-        """Where the map's points should be seen, (N, 2) px, NaN behind the camera."""
+        """Return predicted px (N, 2) of points of the map, NaN behind the camera."""
         return self._rig.cam0.project(se3.transform(T_cam_odom, self._map.points[rows]))
 
     def _estimate_pose(self, tracks: _Tracks) -> tuple[PoseEstimate | None, _Tracks]:
-        """Pose T_cam_odom from tracks; the tracks that agree with it."""
+        """Return the pose T_cam_odom, None without enough inliers, and the inlier tracks."""
         config, focal = self._config, self._rig.cam0.focal
         points = self._map.points[self._map.row_indices(tracks.ids)]
         uv = self._rig.cam0.normalise(tracks.px.astype(np.float64))
-        rough = ransac_pose(points, uv, focal, config.ransac_px, self._seed)
-        if rough is None or rough.inliers.sum() < config.min_inliers:
+        initial = ransac_pose(points, uv, focal, config.ransac_px, self._seed)
+        if initial is None or initial.inliers.sum() < config.min_inliers:
             return None, _NO_TRACKS
         sigma = np.full(len(points), config.noise_px)
-        best = refine_pose(rough.T, points, uv, focal, sigma, config.gate_sigma)
+        best = refine_pose(initial.T, points, uv, focal, sigma, config.gate_sigma)
         if best.inliers.sum() < config.min_inliers:
             return None, _NO_TRACKS
         return best, tracks.take(best.inliers)
 
     def _is_plausible(self, T_last: F64, estimate: PoseEstimate, dt: float) -> bool:
-        """Finite, and no faster than a person or robot can be."""
+        """Return whether the pose is finite, and the motion no faster than a person or robot."""
         if dt <= 0 or not np.isfinite(estimate.T).all():
             return False
         motion = se3.log(se3.inverse(T_last) @ se3.inverse(estimate.T)) / dt
         slow = np.linalg.norm(motion[3:]) < self._config.max_speed_m_s
         return bool(slow and np.linalg.norm(motion[:3]) < self._config.max_turn_rad_s)
 
-    # ------------------------------------------------------------------ keyframes
-
     def _add_keyframe(self, frame: Frame, new_segment: bool = False) -> None:
-        """Make this frame a keyframe of the local map, and its free corners points."""
+        """Add this frame to the local map as a keyframe, with points at free corners."""
         assert self._T_odom_cam is not None
         anchor = self._map.add_keyframe(frame.image0, self._T_odom_cam)
         self._add_corners(frame, anchor)
         spacing = self._spacing
-        spacing.stamp_ns, spacing.T, spacing.feature_count = (
-            frame.stamp_ns,
-            self._T_odom_cam,
-            len(self._tracks.ids),
-        )
+        spacing.stamp_ns = frame.stamp_ns
+        spacing.T = self._T_odom_cam
+        spacing.feature_count = len(self._tracks.ids)
         self._new_segment, self._keyframe_pending = new_segment, False
 
     def _reobserve(self, frame: Frame) -> None:
-        """Take up points of earlier keyframes that lie where they should.
+        """Match points of earlier keyframes near their prediction, and refine the pose.
 
-        Those that do not would pull odometry back over all it has drifted since, in one frame: a
-        jump that a headset shows and that the edge's map takes for motion. Closing loops is the
-        edge's business.
+        Matches further away would correct all drift since then in one frame: a jump that a headset shows and
+        that the edge's map takes for motion. The edge closes loops.
         """
         config = self._config
         assert self._T_odom_cam is not None
@@ -266,11 +255,11 @@ class VisualTracker:
 
     def _match_patches(self, image: U8, anchor: int, rows: I64, guess: F32) -> _Tracks:
         source = self._map.keyframes[anchor].image
-        host_px = self._map.anchor_px[rows]
+        anchor_px = self._map.anchor_px[rows]
         px, found = optical_flow.track_points(
-            source, image, host_px, guess, window=15, levels=1, back_check_px=None
+            source, image, anchor_px, guess, window=15, levels=1, back_check_px=None
         )
-        found &= optical_flow.ncc(source, image, host_px, px) > MIN_NCC
+        found &= optical_flow.ncc(source, image, anchor_px, px) > MIN_NCC
         found &= self._rig.cam0.has_normalised(px.astype(np.float64))
         return _Tracks(self._map.ids[rows], px).take(found)
 
@@ -286,10 +275,8 @@ class VisualTracker:
         ids = self._map.add_points(anchor, points, px[known])
         self._tracks = self._tracks.concatenate(_Tracks(ids, px[known]))
 
-    # ------------------------------------------------------------------ beginnings and losses
-
     def _initialise(self, frame: Frame) -> TrackResult:
-        """The first keyframe defines odom: body at the origin, z up as far as that is known."""
+        """Make the first keyframe, which defines odom: body at the origin, z up as far as known."""
         up = self._gravity_estimator.add(frame.imu) if self._gravity_estimator else None
         if self._gravity_estimator and up is None and not self._gravity_estimator.has_timed_out:
             return TrackResult(TrackState.INITIALISING, None, waiting_for=WaitReason.TILT)
@@ -312,7 +299,7 @@ class VisualTracker:
         self._round_robin.reset()
 
     def _relocalise(self, frame: Frame) -> TrackResult:
-        """Find ourselves in the local map; after a while, begin a new stretch where we were lost."""
+        """Relocalise in the local map; after `new_stretch_s`, begin a new segment at the last pose."""
         assert self._lost_since_ns is not None
         config = self._config
         T_found = relocalisation.relocalise(self._next_keyframes(), frame, self._rig, config, self._seed)
@@ -327,13 +314,13 @@ class VisualTracker:
             self._map, self._tracks = LocalMap(config.max_keyframes), _NO_TRACKS
         self._add_keyframe(frame, new_segment=T_found is None)
         if len(self._tracks.ids) < config.min_inliers:
-            self._map = old_map  # nothing to see here either: keep what may be found again
+            self._map = old_map  # no features here either: keep the map for relocalisation
             return TrackResult(TrackState.LOST, None)
         self._lost_since_ns = None
         return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids), T_found is None)
 
     def _next_keyframes(self) -> list[LocalKeyframe]:
-        """Of the local map's keyframes, nearest to where we were first."""
+        """Return the next batch of the local map's keyframes, nearest to the last pose first."""
         assert self._T_odom_cam is not None
         nearest = self._map.keyframes_near(self._T_odom_cam, np.inf, np.inf)
         return [self._map.keyframes[n] for n in self._round_robin.next_batch(nearest)]

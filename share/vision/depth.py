@@ -1,4 +1,4 @@
-"""Depth of image points: from a depth camera that need not be registered, or from a stereo pair."""
+"""Depth of image points, from a depth camera that need not be registered, or from a stereo pair."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8
 from share.vision import optical_flow
 
-EDGE_RATIO = 0.05  # relative depth step within 3x3 px that marks an object's edge
+EDGE_RATIO = 0.05  # relative depth step within 3 x 3 px at an object's edge
 MIN_DEPTH, MAX_DEPTH = 0.2, 12.0  # m
-_DEFAULT_DEPTH_M = 3.0  # m, a guess
+_DEFAULT_DEPTH_M = 3.0  # initial guess
 
 
 def from_depth_camera(depth: F32, rig: Rig, uv: F64) -> F64:
-    """Depth (N,) m along cam0's axis of normalised points `uv` (N, 2); NaN where there is none.
+    """Return the depth (N,) m along cam0's axis of normalised points uv (N, 2); NaN where there is none.
 
-    The depth camera looks from elsewhere, so which of its pixels answers depends on the depth
-    itself: we guess, look, and go on with what we saw. A fixed point is right if it projects back
-    onto the point asked for; several guesses find it behind a near edge too.
+    Which pixel of the depth camera shows a point depends on its depth, because the camera is elsewhere:
+    iterate from a guess. A fixed point is right if it projects back onto the point in cam0; several guesses
+    also find it behind a near edge.
     """
     assert rig.depth is not None and rig.T_depth_cam0 is not None
     if len(uv) == 0:
@@ -45,20 +45,22 @@ def from_depth_camera(depth: F32, rig: Rig, uv: F64) -> F64:
 
 
 def _without_edges(depth: F32) -> F32:
-    """Depth with holes and object edges set to NaN: an interpolated edge is a point in mid-air."""
+    """Return the depth with NaN at holes and edges of objects: an interpolated edge is a point in mid-air."""
     filled = np.where((depth > MIN_DEPTH) & (depth < MAX_DEPTH), depth, np.float32(0))
-    low = cv2.erode(filled, np.ones((3, 3), np.uint8))  # a hole makes it 0
+    low = cv2.erode(filled, np.ones((3, 3), np.uint8))  # 0 beside a hole
     high = cv2.dilate(filled, np.ones((3, 3), np.uint8))
     out: F32 = np.where((low > 0) & (high - low < EDGE_RATIO * high), filled, np.float32("nan"))
     return out
 
 
 def _sample(depth: F32, px: F64) -> F64:
-    """Bilinear depth at (N, 2) px, NaN outside or beside a NaN."""
+    """Return the bilinear depth at (N, 2) px, NaN outside or beside a NaN."""
     xy = np.nan_to_num(px, nan=-10.0).astype(np.float32).reshape(-1, 1, 2)
     x, y = np.ascontiguousarray(xy[..., 0]), np.ascontiguousarray(xy[..., 1])
-    seen = cv2.remap(depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
-    return np.asarray(seen, np.float64).reshape(-1)
+    sampled = cv2.remap(
+        depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan")
+    )
+    return np.asarray(sampled, np.float64).reshape(-1)
 
 
 def _back_project(rig: Rig, px: F64, z: F64) -> F64:
@@ -68,10 +70,10 @@ def _back_project(rig: Rig, px: F64, z: F64) -> F64:
 
 
 def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
-    """Depth (N,) m in cam0 of points `px` (N, 2) by following them into cam1; NaN where that fails.
+    """Return the depth (N,) m in cam0 of points px (N, 2) by tracking them into cam1; NaN where that fails.
 
-    guess_m (N,): expected depths, NaN unknown. A match must lie on its epipolar line (1.5 px), in
-    front of both cameras, and look alike (NCC 0.8).
+    guess_m (N,): expected depths, NaN unknown. A match must lie on its epipolar line (1.5 px), in front of
+    both cameras, with an NCC of 0.8.
     """
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
     out = np.full(len(px), np.nan)
@@ -79,7 +81,7 @@ def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64
         return out
     ray = rays(uv)
     expected = np.full(len(px), np.nan) if guess_m is None else guess_m
-    for fallback in (_DEFAULT_DEPTH_M, 1.2):  # a second try where nothing was expected
+    for fallback in (_DEFAULT_DEPTH_M, 1.2):  # the second where no depth was expected
         todo = np.flatnonzero(np.isnan(out) & (np.isnan(expected) | (fallback == _DEFAULT_DEPTH_M)))
         if len(todo) == 0:
             break
@@ -98,10 +100,10 @@ def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64
 
 
 def _triangulate(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
-    """Depth in cam0 that best explains uv1 on the epipolar line, and the distance from it in px, NaN where
-    cam1 cannot see it.
+    """Return the depth in cam0 that best explains uv1, and the distance from the epipolar line in px, NaN
+    where cam1 cannot see it.
 
-    With p1 = z R r0 + t, uv1 p1_z = p1_xy is two equations linear in z; we take their least squares.
+    With p1 = z R r0 + t, uv1 p1_z = p1_xy is two equations linear in z; this is their least-squares solution.
     """
     assert rig.T_cam1_cam0 is not None and rig.cam1 is not None
     a, t = rays0 @ rig.T_cam1_cam0[:3, :3].T, rig.T_cam1_cam0[:3, 3]
@@ -116,9 +118,11 @@ def _triangulate(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
 
 
 def disparity_per_rho(rig: Rig, uv: F64, rho: F64) -> F64:
-    """px (N,) by which points on rays uv (N, 2), at inverse depths (N,), move in cam1 for 1/m more. Of a
-    fisheye lens they move less the farther off the axis they are; of others this takes it as it is in the
-    middle."""
+    """Return the derivative (N,) px of the position in cam1 by inverse depth, of points on rays uv (N, 2) at
+    inverse depths (N,).
+
+    Of a fisheye lens it falls off the axis; of other lenses the value on the axis is used for all.
+    """
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
     if not rig.cam1.is_fisheye:
         return np.full(len(uv), rig.cam1.focal * rig.baseline)

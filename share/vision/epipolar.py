@@ -1,4 +1,4 @@
-"""How far image points are, by looking along their epipolar lines in the other image of a pair."""
+"""Depth of image points by a search along their epipolar lines in the other image of a stereo pair."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from share.vision.depth import disparity_per_rho
 from share.vision.patches import sample
 
 _MIN_DEPTH_M = 0.3
-_STEP_PX = 1.5  # between places on the line
+_STEP_PX = 1.5  # between positions on the line
 _AXIS = np.arange(-4, 5, dtype=np.float32)
 _OFFSETS: F32 = np.stack(np.meshgrid(_AXIS, _AXIS), axis=-1).reshape(-1, 2)
-_MIN_CORRELATION, _MIN_PEAK_MARGIN = (
-    0.75,
-    0.03,
-)  # correlation of the best place, and by how much it beats the others
-_PEAK_WIDTH = 3  # places: what is nearer to the best is the same peak
+_MIN_CORRELATION = 0.75  # of the best position
+_MIN_PEAK_MARGIN = 0.03  # of its correlation over that of any other peak
+_PEAK_WIDTH = 3  # positions nearer than this belong to the same peak
 
 
 def search_depth(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64) -> F64:
-    """Depth (N,) m in cam0, to a pixel of disparity, of points px (N, 2) at normalised uv (N, 2); NaN where
-    no place on the line is alike, or more than one: repeated things, edges along the line."""
+    """Return the depth (N,) m in cam0, to a pixel of disparity, of points px (N, 2) at normalised uv (N, 2).
+
+    NaN where no position on the line matches, or more than one does: repeated texture, edges along the line.
+    """
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
     if len(px) == 0:
         return np.zeros(0)
     scale = rig.cam0.focal * rig.baseline
     rho = np.arange(0.0, scale / _MIN_DEPTH_M, _STEP_PX) / scale
-    if rig.cam1.is_fisheye:  # steps of as many px at the edge, where they are more of inverse depth
+    if rig.cam1.is_fisheye:  # a step of 1.5 px is more inverse depth off the axis
         rho = rho * (scale / np.maximum(disparity_per_rho(rig, uv, np.zeros(len(uv))), 0.02 * scale))[:, None]
     score = _correlations(image0, image1, rig, px, uv, rho)
     best = score.argmax(axis=1)
@@ -43,8 +43,8 @@ def search_depth(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64) -> F64:
 
 
 def _correlations(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, rho: F64) -> F32:
-    """Correlation (N, K) of each patch with that at each inverse depth (K,), or its own (N, K); -1 outside
-    the image."""
+    """Return the correlation (N, K) of each patch at each inverse depth, (K,) or (N, K); -1 outside the
+    image."""
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
     R, t = rig.T_cam1_cam0[:3, :3], rig.T_cam1_cam0[:3, 3]
     q = (rays(uv) @ R.T)[:, None] + rho[..., None] * t
@@ -58,7 +58,7 @@ def _correlations(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, rho: F64) 
 
 
 def _patches(image: U8, px: F32) -> F32:
-    """(N, S) of zero mean and unit norm."""
+    """Return patches (N, S) of zero mean and unit norm."""
     gray = sample(image, px[:, :1] + _OFFSETS[:, 0], px[:, 1:] + _OFFSETS[:, 1])
     gray = gray - gray.mean(axis=1, keepdims=True)
     out: F32 = gray / np.maximum(np.linalg.norm(gray, axis=1, keepdims=True), np.float32(1e-3))

@@ -1,4 +1,5 @@
-"""What of an image is looked at: where the lens's range ends, and no more than so far off the axis."""
+"""Masks of the part of an image that is used: within the range of the lens, and within an angle from its
+axis."""
 
 from __future__ import annotations
 
@@ -10,15 +11,15 @@ from share.geometry.camera import Camera
 from share.geometry.lens import MAX_FIELD_DEG
 from share.types import U8
 
-# For others, and for a tracker without an IMU, all points are equally good; here a pixel is four times as
-# much of (x/z, y/z) as in the middle.
+# Limit for views and for a tracker without an IMU, which weigh all points alike: here a pixel is four times
+# as large in (x/z, y/z) as on the axis.
 UNIFORM_FIELD_DEG = 60.0
 
 
 @lru_cache(maxsize=8)
 def field_mask(camera: Camera, max_deg: float = MAX_FIELD_DEG) -> U8 | None:
-    """A mask (H, W), 255 up to so many degrees off the axis, where there are normalised coordinates; None,
-    which is all, of a lens whose range does not end."""
+    """Return a mask (H, W), 255 within `max_deg` of the axis and the range of the lens; None, for all, of
+    an unbounded lens."""
     if not camera.is_bounded:
         return None
     px = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)

@@ -1,4 +1,4 @@
-"""Which ORB keypoint of one view is which of another."""
+"""Match ORB descriptors of two views."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from share.types import I64, U8
 
-_BLOCK_ROWS = 50  # at a time, so that what is in between stays in the cache
+_BLOCK_ROWS = 50  # so that intermediate results stay in the cache
 
 
 class DescriptorPairs(NamedTuple):
-    """Possible matches: rows (M,) of the one view, cols (M,) of the other, and differing bits (M,)."""
+    """Possible matches: rows (M,) of one view, cols (M,) of the other, and differing bits (M,)."""
 
     rows: I64
     cols: I64
@@ -25,12 +25,12 @@ class DescriptorPairs(NamedTuple):
 
 
 def hamming_matrix(a: U8, b: U8) -> NDArray[np.uint16]:
-    """Differing bits (N, K) of every descriptor in a (N, 32) with every one in b (K, 32)."""
+    """Return the differing bits (N, K) of every descriptor in a (N, 32) with every one in b (K, 32)."""
     words_a, words_b = (np.ascontiguousarray(np.ascontiguousarray(x).view(np.uint64).T) for x in (a, b))
     out = np.empty((len(a), len(b)), np.uint16)
     for start in range(0, len(a), _BLOCK_ROWS):
         differ = (x[start : start + _BLOCK_ROWS, None] ^ y for x, y in zip(words_a, words_b, strict=True))
-        first, *others, last = (np.bitwise_count(d) for d in differ)  # 64 at most in a byte
+        first, *others, last = (np.bitwise_count(d) for d in differ)  # at most 64, in a byte
         for count in others:
             first += count
         np.add(first, last, out=out[start : start + _BLOCK_ROWS], dtype=np.uint16)
@@ -38,27 +38,27 @@ def hamming_matrix(a: U8, b: U8) -> NDArray[np.uint16]:
 
 
 def hamming_rowwise(a: U8, b: U8) -> I64:
-    """Differing bits (N,) of descriptors a (N, 32) and b (N, 32), each with its own."""
+    """Return the differing bits (N,) of descriptors a (N, 32) and b (N, 32), row by row."""
     differ = np.ascontiguousarray(a).view(np.uint64) ^ np.ascontiguousarray(b).view(np.uint64)
     return np.asarray(np.bitwise_count(differ).sum(1, dtype=np.int64))
 
 
 def pairs_within(distance: NDArray[np.uint16], max_bits: int) -> DescriptorPairs:
-    """All pairs of a distance matrix (N, K) that differ in at most `max_bits`."""
+    """Return all pairs of a distance matrix (N, K) that differ in at most `max_bits`."""
     at = np.flatnonzero(distance <= max_bits)
     rows, cols = np.divmod(at, distance.shape[1])
     return DescriptorPairs(rows, cols, distance.ravel()[at])
 
 
 def mutual_best(pairs: DescriptorPairs) -> DescriptorPairs:
-    """Those that are the best of their row and of their column, the most alike first."""
+    """Return the pairs that are best of their row and of their column, the most similar first."""
     order = np.argsort(pairs.bits, kind="stable")
     ranked = DescriptorPairs(pairs.rows[order], pairs.cols[order], pairs.bits[order])
     return ranked.keep(_is_first(ranked.rows) & _is_first(ranked.cols))
 
 
 def _is_first(ids: I64) -> NDArray[np.bool_]:
-    """Which (M,) appear for the first time."""
+    """Return which entries (M,) are the first with their value."""
     number = np.arange(len(ids))
     first = np.empty(ids.max(initial=-1) + 1, np.int64)
     first[ids[::-1]] = number[::-1]  # of several, numpy keeps the last
@@ -66,10 +66,10 @@ def _is_first(ids: I64) -> NDArray[np.bool_]:
 
 
 def match_descriptors(query: U8, candidate: U8, max_distance: int, ratio: float) -> I64:
-    """Mutual nearest neighbours: indices (M, 2) into query (N, 32) and candidate (K, 32) descriptors.
+    """Return mutual nearest neighbours: indices (M, 2) into query (N, 32) and candidate (K, 32) descriptors.
 
-    A pair stays if its Hamming distance is at most `max_distance` bits and less than `ratio` times
-    that of the runner-up, seen from either side (Lowe, IJCV 2004, section 7.1).
+    A pair is kept if its Hamming distance is at most `max_distance` bits and less than `ratio` times that of
+    the second best on either side (Lowe, IJCV 2004, section 7.1).
     """
     if len(query) < 2 or len(candidate) < 2:
         return np.zeros((0, 2), np.int64)

@@ -1,5 +1,4 @@
-"""Following points from one image to another by their patches (Lucas and Kanade 1981; pyramid:
-Bouguet 2000)."""
+"""Track points from one image to another by their patches (Lucas and Kanade 1981; pyramid: Bouguet 2000)."""
 
 from __future__ import annotations
 
@@ -22,10 +21,10 @@ def track_points(
     levels: int = 3,
     back_check_px: float | None = 0.5,
 ) -> tuple[F32, NDArray[np.bool_]]:
-    """Where the patches round `px` (N, 2) of `source` lie in `target`, and which were found.
+    """Return the positions in `target` of the patches round px (N, 2) of `source`, and which were found.
 
-    guess (N, 2): where to begin. A point is found if it is inside the image and following it back
-    ends within `back_check_px` of where it came from; None where the caller has a better check.
+    guess (N, 2): initial positions. A point is found if it is inside the image and tracking it back ends
+    within `back_check_px` of its start; None: no such check.
     """
     if len(px) == 0:
         return guess.copy(), np.zeros(0, bool)
@@ -33,7 +32,7 @@ def track_points(
     height, width = target.shape
     found = ok
     if back_check_px is not None:
-        # The way back begins at its own end, so one level is enough to see whether it agrees.
+        # The initial position is the right one, so one level is enough.
         back, ok_back = _lucas_kanade(target, source, forward, px, window, 0)
         found = ok & ok_back & (np.linalg.norm(back - px, axis=1) <= back_check_px)
     found &= ((forward >= 1) & (forward <= (width - 2, height - 2))).all(axis=1)
@@ -58,7 +57,8 @@ def _lucas_kanade(
 
 
 def ncc(source: U8, target: U8, px: F32, found_px: F32, half: int = 5) -> F32:
-    """Normalised cross-correlation (N,) of the (2 half + 1)^2 patches: 1 is alike up to gain and bias."""
+    """Return the normalised cross-correlation (N,) of the (2 half + 1)^2 patches: 1 if equal up to gain
+    and bias."""
     if len(px) == 0:
         return np.zeros(0, np.float32)
     a, b = _patches(source, px, half), _patches(target, found_px, half)
@@ -70,7 +70,7 @@ def ncc(source: U8, target: U8, px: F32, found_px: F32, half: int = 5) -> F32:
 
 
 def _patches(image: U8, px: F32, half: int) -> F32:
-    """Bilinear patches (N, (2 half + 1)^2) round `px`, in one remap."""
+    """Return bilinear patches (N, (2 half + 1)^2) round px (N, 2), in one remap."""
     offset = np.arange(-half, half + 1, dtype=np.float32)
     dx, dy = np.meshgrid(offset, offset)
     x = px[:, :1].astype(np.float32) + dx.ravel()

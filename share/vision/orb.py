@@ -1,4 +1,4 @@
-"""What a keyframe shows to other agents: ORB features spread over the image, with their depth."""
+"""Views of keyframes: ORB features spread over the image, with their depth."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from share.vision import depth as depths
 from share.vision.corners import spread_order
 from share.vision.mask import UNIFORM_FIELD_DEG, field_mask
 
-_GRID = 8, 6  # cells of the image, over which features are spread
-_NEIGHBOUR_PX = 4.0  # of a known point, where nothing measures depth: as deep
+_GRID = 8, 6  # cells across and down, over which features are spread
+_NEIGHBOUR_PX = 4.0  # where no depth is measured, a feature this near to a known point has its depth
 
 
 def measures_depth(frame: Frame, rig: Rig) -> bool:
-    """Whether stereo or a depth camera says how far things are."""
+    """Return whether stereo or a depth camera measures depth."""
     return (frame.depth is not None and rig.depth is not None) or (
         frame.image1 is not None and rig.cam1 is not None
     )
 
 
 def measure_depth(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
-    """Depth (N,) m in cam0 of image points, from whatever the frame carries; NaN where unknown. guess_m (N,):
-    about how far they are, if that is known."""
+    """Return the depth (N,) m in cam0 of image points, from stereo or a depth camera; NaN where unknown.
+    guess_m (N,): expected depths."""
     if frame.depth is not None and rig.depth is not None:
         return depths.from_depth_camera(frame.depth, rig, uv)
     if frame.image1 is not None and rig.cam1 is not None:
@@ -33,9 +33,11 @@ def measure_depth(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None 
 
 
 class ViewBuilder:
-    """A view, made in steps that take about equally long, for who cannot wait for all of them at once. known:
-    px (M, 2) and depth (M,) m of points whose neighbours will not be much nearer or further; where the frame
-    measures nothing, only what is right beside them has a depth."""
+    """Builds a view in steps of about equal time.
+
+    known_depths: px (M, 2) and depth (M,) m of points, used as initial depths of features near them; where
+    the frame measures no depth, only features right beside them have one.
+    """
 
     def __init__(
         self, frame: Frame, rig: Rig, count: int, known_depths: tuple[F32, F64] | None = None
@@ -46,24 +48,24 @@ class ViewBuilder:
         self._measured = np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32)
 
     def detect(self) -> None:
-        """The first step."""
+        """Take the first step: keypoints."""
         mask = field_mask(self._rig.cam0, UNIFORM_FIELD_DEG)
         self._keypoints = _detect(self._frame.image0, self._count, mask)
 
     def describe(self) -> None:
-        """The second."""
+        """Take the second step: descriptors."""
         if self._keypoints is None:
             self.detect()
         self._features = _describe(self._frame.image0, self._keypoints or [])
 
     def measure_half(self) -> None:
-        """Half of the third, for who has the time now. After `describe`."""
+        """Take half of the third step, the depths. Call it after `describe`."""
         assert self._features is not None
         px, _ = self._features
         self._measured = self._points(px[: len(px) // 2])
 
     def finish(self) -> View:
-        """The third, with those before it where they were not made."""
+        """Take the steps that are left and return the view."""
         if self._features is None:
             self.describe()
         assert self._features is not None
@@ -73,7 +75,8 @@ class ViewBuilder:
         return View(uv, points, descriptors)
 
     def _points(self, px: F32) -> tuple[F32, F32]:
-        """Of px (N, 2): normalised coordinates (N, 2), and where they are (N, 3) m, NaN unknown."""
+        """Return normalised coordinates (N, 2) and points (N, 3) m of px (N, 2); NaN where depth is
+        unknown."""
         rig, known = self._rig, self._known_depths
         uv = rig.cam0.normalise(px.astype(np.float64))
         if known is not None and not measures_depth(self._frame, rig):
@@ -84,12 +87,13 @@ class ViewBuilder:
 
 
 def make_view(frame: Frame, rig: Rig, count: int = 500) -> View:
-    """ORB features (Rublee et al. 2011) of cam0 with 3D points where the frame gives depth."""
+    """Return a view of ORB features (Rublee et al. 2011) of cam0, with 3-D points where the frame measures
+    depth."""
     return ViewBuilder(frame, rig, count).finish()
 
 
 def _nearest_depth(px: F32, known_px: F32, known_m: F64, within_px: float = np.inf) -> F64:
-    """Depth (N,) m of the known point next to each; NaN where there is none within so many px."""
+    """Return the depth (N,) m of the nearest known point; NaN where there is none within `within_px`."""
     if len(known_px) == 0:
         return np.full(len(px), np.nan)
     squared_px = (px**2).sum(axis=1)[:, None] - 2 * px @ known_px.T + (known_px**2).sum(axis=1)
@@ -98,16 +102,16 @@ def _nearest_depth(px: F32, known_px: F32, known_m: F64, within_px: float = np.i
 
 
 def detect_orb(image: U8, count: int, mask: U8 | None = None) -> tuple[F32, U8]:
-    """Up to `count` ORB keypoints (N, 2) px and descriptors (N, 32), strongest first in each cell. within
-    (H, W): a mask of where to look.
+    """Return up to `count` ORB keypoints (N, 2) px and descriptors (N, 32), spread over the image. mask (H,
+    W): 255 where they may be.
 
-    OpenCV's detector alone crowds them on the strongest texture; pose from a crowd is weak.
+    OpenCV's detector alone crowds them on the strongest texture, which gives poor poses.
     """
     return _describe(image, _detect(image, count, mask))
 
 
 def _detect(image: U8, count: int, mask: U8 | None = None) -> list[cv2.KeyPoint]:
-    """The `count` that spread best over the image."""
+    """Return the `count` keypoints that are spread best over the image."""
     keypoints = _detector(3 * count).detect(image, mask)
     if not keypoints:
         return []

@@ -1,9 +1,8 @@
-"""What a feature looks like: the patch round it in the image that saw it first, and finding it again to a
-tenth of a pixel.
+"""Patches of features from the image that saw them first, and their alignment to a tenth of a pixel.
 
-Every later image is compared with that first patch, so that tracks do not creep. Inverse-compositional
-alignment (Baker & Matthews 2004): derivatives are the patch's own, made once; the patch is warped as its
-place in the room predicts, which leaves a shift to be found. Gain and bias of the light do not matter.
+Every later image is aligned with that first patch, so that tracks do not drift. Inverse-compositional
+alignment (Baker & Matthews 2004): the derivatives are those of the patch, computed once; the patch is warped
+as predicted, so that only a shift is estimated. It is invariant to gain and bias.
 """
 
 from __future__ import annotations
@@ -21,17 +20,22 @@ _SIDE = 2 * HALF_SIZE + 1
 _AXIS = np.arange(-HALF_SIZE, HALF_SIZE + 1, dtype=np.float32)
 OFFSETS: F32 = np.stack(np.meshgrid(_AXIS, _AXIS), axis=-1).reshape(-1, 2)  # (S, 2) px, x and y
 _MEAN: F32 = np.full(_SIDE**2, 1 / _SIDE**2, np.float32)
-_MIN_CONTRAST = 1e-3  # gray levels: a patch with less contrast is nothing
-_MAX_REMAP_ROWS = 30_000  # of what cv2.remap gives at a time (SHRT_MAX)
+_MIN_CONTRAST = 1e-3  # norm of gray levels, below which a patch has no texture
+_MAX_REMAP_ROWS = 30_000  # of the output of cv2.remap (SHRT_MAX)
 
 
 @dataclass(frozen=True, eq=False)
 class Patches(ArrayTable):
-    """N patches of S samples. contrast (N,): the norm that gray levels had; inverse (N, 2, 2): of the normal
-    matrix of their derivatives. probe (N, 3, S): `gray`, and what gives the shift: times samples of zero mean
-    and unit norm, how alike they are and how far off, px. bend (N, 4, S): gray levels that come of a patch's
-    sides moving apart, less what a shift explains: along x the more, the further right and the further down
-    in it, then along y. rigid (N, 4, 4): products of these with each other; at_rest (N, 4): with `gray`."""
+    """N patches of S samples, and what their alignment needs.
+
+    contrast (N,): norm of the gray levels. inverse_hessian (N, 2, 2): of the shift. kernels (N, 3, S):
+    `gray`, and the inverse-compositional steps; times samples of zero mean and unit norm they give the
+    correlation and the shift, px.
+
+    bend (N, 4, S): derivatives of the samples by the linear part of the warp, without what a shift explains:
+    along x by the px to the right and down, then along y. rigid (N, 4, 4): bend times bend; at_rest (N, 4):
+    bend times `gray`.
+    """
 
     contrast: F32
     inverse_hessian: F32
@@ -45,12 +49,12 @@ class Patches(ArrayTable):
 
     @property
     def gray(self) -> F32:
-        """(N, S) zero mean, unit norm."""
+        """The samples (N, S), zero mean, unit norm."""
         return self.kernels[:, 0]
 
     @property
     def sigma_px(self) -> F32:
-        """(N,) error of a shift for one gray level of noise, in the worse direction."""
+        """The shift error (N,) px by one gray level of noise, in the worst direction."""
         out: F32 = np.sqrt(np.linalg.eigvalsh(self.inverse_hessian)[:, 1])
         return out
 
@@ -62,7 +66,7 @@ def empty_patches() -> Patches:
 
 
 def extract(image: U8, px: F32) -> Patches:
-    """The patches round px (N, 2)."""
+    """Return the patches round px (N, 2)."""
     if len(px) == 0:
         return empty_patches()
     axis = np.arange(-HALF_SIZE - 1, HALF_SIZE + 2, dtype=np.float32)
@@ -87,9 +91,8 @@ def extract(image: U8, px: F32) -> Patches:
 
 @dataclass(frozen=True, eq=False)
 class AlignedPatches:
-    """px (N, 2) where the patches are; alike (N,): normalised correlation there, 1 at best; step (N,): px
-    of the last correction, small where it settled. samples (N, S): what was last seen, zero mean, unit
-    norm."""
+    """px (N, 2): aligned positions. correlation (N,): 1 at best. last_step (N,): px of the last
+    correction, small if converged. samples (N, S): the last samples, zero mean, unit norm."""
 
     px: F32
     correlation: F32
@@ -104,11 +107,13 @@ def align(
     px: F64,
     warp: F64,
     max_steps: int = 4,
-    settled_px: float = 0.02,
+    convergence_px: float = 0.02,
 ) -> AlignedPatches:
-    """From px (N, 2), the patches, of which probe (N, 3, S) tells, being warped by (N, 2, 2): d px here /
-    d px there. At most `max_steps` steps.
-    The first so many are sought in the first of one or two images, the others in the second."""
+    """Align patches with kernels (N, 3, S) from px (N, 2), warped by (N, 2, 2): d px here / d px in the
+    patch.
+
+    The first `cam0_count` are aligned in the first of one or two images, the others in the second.
+    """
     n, all_kernels = len(kernels), kernels
     at, W = px.astype(np.float32), warp.astype(np.float32)
     correlation, last_step = np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
@@ -133,12 +138,12 @@ def align(
         at[active] -= move
         step_px = np.hypot(move[:, 0], move[:, 1])
         last_step[active] = step_px
-        active = active[(step_px > settled_px) & np.isfinite(step_px)]
+        active = active[(step_px > convergence_px) & np.isfinite(step_px)]
     return AlignedPatches(at, correlation, last_step, samples)
 
 
 def _sampled(images: tuple[U8, ...], cam0_count: int, x: F32, y: F32) -> F32:
-    """Gray levels (N, S), of the first so many in the first image."""
+    """Return gray levels (N, S), the first `cam0_count` from the first image."""
     if cam0_count >= len(x):
         return sample(images[0], x, y)
     if cam0_count == 0:
@@ -149,19 +154,21 @@ def _sampled(images: tuple[U8, ...], cam0_count: int, x: F32, y: F32) -> F32:
 
 
 def slant_evidence(patches: Patches, samples: F32, px_per_rho: F64) -> tuple[F64, F64]:
-    """What patches say of the slant of their surfaces: information (N, 2, 2) and its product with the step
-    (N, 2), for one gray level of noise. along (N, 2): px of the patch by which its middle moves for one
-    unit more of inverse depth; the step is the change of inverse depth by px of the patch. samples (N, S):
-    what `align` saw last."""
+    """Return the information (N, 2, 2) of the slant of the patches' surfaces, and its product with the step
+    (N, 2), for one gray level of noise.
+
+    px_per_rho (N, 2): derivative of the position in the patch by inverse depth. samples (N, S): from `align`.
+    The step is a change of d inverse depth / d px of the patch.
+    """
     n = len(px_per_rho)
-    by = np.zeros((n, 2, 4))  # of px across and px down, through px along x and y
+    by = np.zeros((n, 2, 4))  # derivative of the warp's linear part by the slant
     by[:, 0, 0::2] = by[:, 1, 1::2] = px_per_rho
     residual = ((patches.bend @ samples[:, :, None])[:, :, 0] - patches.at_rest) * patches.contrast[:, None]
     return by @ patches.rigid @ by.transpose(0, 2, 1), -(by @ residual[:, :, None])[:, :, 0]
 
 
 def sample(image: U8, x: F32, y: F32) -> F32:
-    """Bilinear gray levels at (N, S) places."""
+    """Return bilinear gray levels at places x, y (N, S)."""
     if len(x) > _MAX_REMAP_ROWS:
         parts = [slice(k, k + _MAX_REMAP_ROWS) for k in range(0, len(x), _MAX_REMAP_ROWS)]
         return np.concatenate([sample(image, x[part], y[part]) for part in parts])
@@ -176,7 +183,7 @@ def sample(image: U8, x: F32, y: F32) -> F32:
 
 
 def _normalised(gray: F32) -> tuple[F32, F32]:
-    """Zero mean, unit norm (N, S), and the norm (N,)."""
+    """Return gray levels (N, S) of zero mean and unit norm, and the norm (N,)."""
     gray = gray - (gray @ _MEAN)[:, None]
     norm = np.sqrt(np.einsum("ns,ns->n", gray, gray))
     gray /= np.maximum(norm, _MIN_CONTRAST)[:, None]

@@ -28,11 +28,11 @@ def test_labels_of_a_session(share, plain_session, tmp_path):
     known = np.isfinite(labels.error_cm)
     assert not known[labels.stamps_ns < labels.stamps_ns[0] + 2.4e9].any()  # half a window first
     assert (labels.error_cm[known] < 1).all()
-    assert labels.about["imu"] and not labels.recent[:, RECENT_NAMES.index("deaf")].any()
+    assert labels.about["imu"] and not labels.recent[:, RECENT_NAMES.index("no IMU")].any()
 
     assert share(*arguments, "--without-imu").code == 0  # beside the others
     bare = read_labels(out / clean.name.replace("-0", "-without-imu-0"))
-    assert not bare.about["imu"] and bare.recent[:, RECENT_NAMES.index("deaf")].all()
+    assert not bare.about["imu"] and bare.recent[:, RECENT_NAMES.index("no IMU")].all()
     assert np.nanmedian(bare.error_cm) < 2
 
     made = {path: path.stat().st_mtime_ns for path in out.iterdir() if "without" not in path.name}

@@ -126,6 +126,7 @@ def test_looking_ahead_changes_nothing() -> None:
     samples.add(batch(values[:98]))
     ahead = samples.extended(batch(values[98:110], 98))
     assert (ahead.rejected_count, samples.rejected_count) == (4, 0)
+    assert samples.inflation(98 * STEP, 110 * STEP) is None
     samples.add(batch(values[98:110], 98))
     assert samples.rejected_count == 4
 

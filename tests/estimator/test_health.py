@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.odometry.outliers import DivergenceMonitor, ImageImuConsistency
+from share.odometry.health import DivergenceMonitor, ImageImuConsistency
 
 FRAME_S = 1 / 30
 MANY = 60  # features

@@ -6,8 +6,9 @@ from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
 from share.geometry import se3
 from share.odometry import filter
-from share.odometry.mono_bundle import IMU_STATE_SIZE, BundleModel, WindowFrame, motion_error, solve_bundle
-from share.odometry.state import ACCEL_BIAS, CORE_SIZE, GYRO_BIAS, VELOCITY, initial_state
+from share.odometry.mono_bundle import BundleModel, WindowFrame, solve_bundle
+from share.odometry.mono_shooting import motion_error
+from share.odometry.state import ACCEL_BIAS, CORE_SIZE, GYRO_BIAS, IMU_STATE_SIZE, VELOCITY, initial_state
 
 SIGMA, SHOTS, STEP_S, KEYFRAMES, EACH = 0.5 / CAMERA.focal, 16, 0.12, (0, 6), 50
 MODEL = BundleModel(NOISE, GRAVITY, SIGMA, 1e-12 * np.eye(6), 0.4, 0.8, 0.5)

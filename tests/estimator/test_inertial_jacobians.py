@@ -8,7 +8,7 @@ import pytest
 from imu_world import GRAVITY, NOISE, Path, imu_of, rig
 
 from share.geometry import se3
-from share.odometry import feature_matching, filter
+from share.odometry import feature_matching, filter, state_augmentation
 from share.odometry.imu_propagation import integrate
 from share.odometry.state import CORE_SIZE, TIMESHIFT, initial_state
 
@@ -32,8 +32,8 @@ def state():
     )
     for k in range(2):
         s.T = T[k]
-        filter.add_keyframe(s, 10 + k, np.array([0.1, 0.2, -0.3]))
-        filter.add_features(
+        state_augmentation.add_keyframe(s, 10 + k, np.array([0.1, 0.2, -0.3]))
+        state_augmentation.add_features(
             s,
             np.arange(5) + 5 * k,
             np.full(5, k),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from imu_world import CAMERA, rig
 
-from share.odometry import feature_matching, filter, outliers
+from share.odometry import feature_matching, filter, outliers, state_augmentation
 from share.odometry.state import CORE_SIZE, VELOCITY, initial_state
 
 RIG, SIZE = rig(), (CAMERA.width, CAMERA.height)
@@ -18,10 +18,12 @@ def state():
     rng, sigma = np.random.default_rng(1), np.full(CORE_SIZE, 1e-4)
     sigma[VELOCITY] = 0.01
     s = initial_state(0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), RIG.T_body_cam0, sigma)
-    host = filter.add_keyframe(s, 0, np.zeros(3))
+    host = state_augmentation.add_keyframe(s, 0, np.zeros(3))
     px = np.stack(np.meshgrid(np.linspace(40, SIZE[0] - 40, 10), np.linspace(40, SIZE[1] - 40, 10)), -1)
     ray = RIG.cam0.normalise(px.reshape(-1, 2))
-    filter.add_features(s, np.arange(N), np.full(N, host), ray, rng.uniform(0.2, 1.0, N), np.full(N, 1e-3))
+    state_augmentation.add_features(
+        s, np.arange(N), np.full(N, host), ray, rng.uniform(0.2, 1.0, N), np.full(N, 1e-3)
+    )
     s.cov[:6, :6] += np.diag(np.repeat([1e-3, 2e-3], 3) ** 2)
     return s
 

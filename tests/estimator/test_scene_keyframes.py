@@ -24,6 +24,6 @@ def test_those_that_others_are_told_of_stay(plain_session, held):
     for _ in range(6):  # all at one place
         keyframe = scene.add_keyframe(STILL)
         scene.admit_features(frame, keyframe, scene.find_corners(frame, scene.occupied_px())[:10])
-        scene.forget(held)
+        scene.drop_keyframes(held)
     assert set(held) | {4, 5} <= set(state.keyframe_ids.tolist())
     assert len(state.keyframe_ids) == max(2, len(held) + 2)

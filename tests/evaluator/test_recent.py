@@ -21,24 +21,24 @@ def told(*frames: FrameOutcome, sigmas_cm=(1.0,), way_m=0.0, turn_rad=0.0) -> di
 
 def test_where_all_is_well_nothing_is_told():
     fine = told(FINE, sigmas_cm=(0.0,))
-    believed = [fine.pop(f"{what} matches") for what in ("mean", "least")]
+    believed = [fine.pop(f"{what} matches") for what in ("mean", "minimum")]
     assert set(fine.values()) == {0.0}
     assert believed == pytest.approx([math.log(51) / math.log(201)] * 2)
 
 
 def test_how_sure_it_was_of_itself():
     now = told(sigmas_cm=(0.01, 100.0, 1.0))
-    assert [now[f"{what} score"] for what in ("mean", "least", "most")] == pytest.approx([0.5, 0, 1])
+    assert [now[f"{what} score"] for what in ("mean", "minimum", "maximum")] == pytest.approx([0.5, 0, 1])
 
 
 def test_how_far_it_went_and_turned():
     moved = told(way_m=2.5, turn_rad=1.0)
-    assert (moved["way"], moved["turn"]) == pytest.approx((0.5, 0.2))
+    assert (moved["path"], moved["rotation"]) == pytest.approx((0.5, 0.2))
 
 
 def test_a_surprise_between_keyframes_is_told():
     now = told(FINE, FINE._replace(median_nis=100.0), FINE, FINE)
-    assert (now["mean surprise"], now["most surprise"]) == pytest.approx((0.25, 1))
+    assert (now["mean NIS"], now["maximum NIS"]) == pytest.approx((0.25, 1))
 
 
 def test_what_was_found_and_not_believed():
@@ -48,23 +48,23 @@ def test_what_was_found_and_not_believed():
         FINE._replace(found_count=0, inlier_count=0),
         FINE,
     )
-    assert now["refused"] == pytest.approx((1 + 0.5) / 4)
-    assert now["least matches"] == 0
+    assert now["rejected"] == pytest.approx((1 + 0.5) / 4)
+    assert now["minimum matches"] == 0
 
 
 def test_more_believed_than_found_is_not_less_than_none_refused():
     """The visual tracker takes up old points after it has the pose."""
-    assert told(FINE._replace(inlier_count=80))["refused"] == 0
+    assert told(FINE._replace(inlier_count=80))["rejected"] == 0
 
 
 def test_in_what_state_it_was():
     states = (TrackState.WEAK, TrackState.INERTIAL_ONLY, TrackState.LOST, TrackState.OK)
     now = told(*(FINE._replace(state=state) for state in states))
-    assert (now["weak"], now["blind"], now["deaf"]) == (0.25, 0.5, 0)
+    assert (now["weak"], now["blind"], now["no IMU"]) == (0.25, 0.5, 0)
 
 
 def test_without_an_imu_it_was_deaf():
-    assert told(FINE, FINE._replace(has_imu=False))["deaf"] == 0.5
+    assert told(FINE, FINE._replace(has_imu=False))["no IMU"] == 0.5
 
 
 def test_the_longest_time_without_a_frame():

@@ -1,4 +1,4 @@
-"""What a tracker went through in its last seconds, by what it says: how far, how sure, how surprised."""
+"""An agent's tracking over the last seconds: motion, its uncertainty, and the outcome of each frame."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from share.geometry.se3 import compose_cov, position_sigma, rotation_angle
 from share.metrics.local_error import WINDOW_S
 from share.types import F64, KeyframeCandidate, TrackState
 
-MOST_AGO = 8  # frames, of a keyframe that is told of: those that are kept to know its own
+MOST_AGO = 8  # frames kept, to find that of a keyframe published later
 
 
 class FrameOutcome(NamedTuple):
-    """How a tracker fared with a frame: whether an IMU was heard, its state, how many features it found and
-    how many it believed, and how surprised it was (`estimator.result`)."""
+    """How a frame was tracked: with IMU samples or not, its state, features found and inliers, and the
+    median NIS (`TrackResult`)."""
 
     stamp_ns: int
     has_imu: bool
@@ -27,9 +27,11 @@ class FrameOutcome(NamedTuple):
 
 
 class RecentMotion(NamedTuple):
-    """Since the window or, if later, the stretch began. frames: all, the last one being the keyframe.
-    way_m, turn_rad: from keyframe to keyframe. sigmas_cm: by each keyframe, the last one now, one sigma of
-    the position after the motion of the window before it."""
+    """Motion since the window began or, if later, the segment.
+
+    frames: all, the last being the keyframe's. path_m, rotation_rad: sums over the motions between keyframes.
+    sigmas_cm: at each keyframe, the last one now, the position sigma of the motion in the window before it.
+    """
 
     frames: tuple[FrameOutcome, ...]
     path_m: float
@@ -38,37 +40,38 @@ class RecentMotion(NamedTuple):
 
     @property
     def sigma_cm(self) -> float:
-        """Now."""
+        """The sigma at the last keyframe."""
         return self.sigmas_cm[-1]
 
 
 class MotionHistory:
-    """Of one agent, frame by frame; window_s as that of the error that is to be told."""
+    """The history of one agent, frame by frame. window_s: the window of the tracking error that the error
+    model estimates."""
 
     def __init__(self, window_s: float = WINDOW_S) -> None:
         self._window_ns = round(window_s * 1e9)
         self._frames: deque[FrameOutcome] = deque()
-        self._motions: deque[tuple[int, F64, F64]] = deque()  # when, T_last_this, its covariance
-        self._sigmas: deque[tuple[int, float]] = deque()  # when, cm
+        self._motions: deque[tuple[int, F64, F64]] = deque()  # stamp_ns, T_previous_this, its covariance
+        self._sigmas: deque[tuple[int, float]] = deque()  # stamp_ns, cm
 
     def add_frame(self, outcome: FrameOutcome) -> None:
-        """Another one, with a pose or without."""
+        """Add a frame, with a pose or without."""
         self._frames.append(outcome)
-        while (
-            self._frames[0].stamp_ns <= outcome.stamp_ns - 2 * self._window_ns
-        ):  # a keyframe may be told late
+        # Two windows, because a keyframe may be published some frames later.
+        while self._frames[0].stamp_ns <= outcome.stamp_ns - 2 * self._window_ns:
             self._frames.popleft()
 
     def add_keyframe(self, stamp_ns: int, candidate: KeyframeCandidate) -> RecentMotion:
-        """The frame with this stamp, the last one or one shortly before, has become one."""
-        begun_ns = stamp_ns - self._window_ns + 1
-        if candidate.new_segment or not self._sigmas:  # no keyframe yet to go on from
+        """Add the keyframe with this stamp, that of the last frame or of one shortly before. Return the
+        motion up to it."""
+        start_ns = stamp_ns - self._window_ns + 1
+        if candidate.new_segment or not self._sigmas:  # no keyframe yet to continue from
             self._motions.clear()
             self._sigmas.clear()
-            begun_ns = stamp_ns
+            start_ns = stamp_ns
         else:
             self._motions.append((stamp_ns, candidate.T_previous_body, candidate.cov))
-        while self._frames and self._frames[0].stamp_ns < begun_ns:
+        while self._frames and self._frames[0].stamp_ns < start_ns:
             self._frames.popleft()
         for entries in (self._motions, self._sigmas):
             while entries and entries[0][0] <= stamp_ns - self._window_ns:
@@ -80,5 +83,5 @@ class MotionHistory:
             rotation_rad += float(rotation_angle(T[:3, :3]))
             cov = compose_cov(T, cov, step_cov)
         self._sigmas.append((stamp_ns, 100 * position_sigma(cov)))
-        frames = tuple(fared for fared in self._frames if fared.stamp_ns <= stamp_ns)
+        frames = tuple(outcome for outcome in self._frames if outcome.stamp_ns <= stamp_ns)
         return RecentMotion(frames, path_m, rotation_rad, tuple(sigma for _, sigma in self._sigmas))

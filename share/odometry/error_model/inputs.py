@@ -1,6 +1,8 @@
-"""What the last seconds were like, since the error of the last seconds is what is to be told.
+"""Inputs of the error model, made by the same code for training and on the agent.
 
-A keyframe shows how well its tracker fares now; what was lost three seconds ago, in the dark, is still lost.
+Source: SHARE, IMWUT 10(3) 97, 2026; scales and what it leaves open: docs/error-model.md. Besides the paper's
+inputs there is the tracking of the last seconds, because the error of the last seconds is estimated: a
+keyframe shows how well its tracker works now, not what it lost in the dark three seconds ago.
 """
 
 from __future__ import annotations
@@ -17,9 +19,7 @@ from share.odometry.error_model.history import RecentMotion
 from share.types import F32, U8, FeatureStatistics, TrackState, checked_array
 from share.vision.corners import cell_indices
 
-# ---- Eight numbers of a keyframe: how its image looks, and how its tracker fares.
-#
-# Source: SHARE, IMWUT 10(3) 97, 2026; what it leaves open is settled in docs/error-model.md.
+# Scalars of a keyframe: of its image and of its tracking.
 
 SCALAR_NAMES = (
     "brightness",
@@ -31,13 +31,15 @@ SCALAR_NAMES = (
     "active map points",
     "tracking score",
 )
-COUNT_SCALE = 200  # features or points that count as 1
-_MIN_SIGMA_CM, _SIGMA_DECADES = 0.01, 4.0  # the tracker's own sigma: 0, and what makes 1
+COUNT_SCALE = 200  # features or points, for a value of 1
+_MIN_SIGMA_CM, _SIGMA_DECADES = 0.01, 4.0  # the filter's sigma for a value of 0, and the decades from 0 to 1
 
 
 def scalar_features(thumbnail: U8, statistics: FeatureStatistics, sigma_cm: float) -> F32:
-    """(8,) as `SCALAR_NAMES`, each about 0 to 1. small (240, 320): the image, scaled. sigma_cm: what the
-    tracker says itself of its error (`Odometer`)."""
+    """Return the scalars (8,) named in `SCALAR_NAMES`, each about 0 to 1.
+
+    thumbnail (240, 320): the image, scaled. sigma_cm: the filter's sigma of its error (`RecentMotion`).
+    """
     inlier_count = int(statistics.inlier.sum())
     mean, deviation = _moments(thumbnail)
     _, laplacian = _moments(cv2.Laplacian(thumbnail, cv2.CV_16S))
@@ -57,20 +59,20 @@ def scalar_features(thumbnail: U8, statistics: FeatureStatistics, sigma_cm: floa
 
 
 def _moments(image: NDArray[np.generic]) -> tuple[float, float]:
-    """Mean and standard deviation."""
+    """Return mean and standard deviation."""
     mean, deviation = cv2.meanStdDev(image)
     return float(mean[0, 0]), float(deviation[0, 0])
 
 
 def _entropy(image: U8) -> float:
-    """Of its gray levels, bits."""
+    """Return the entropy of its gray levels, bits."""
     count = cv2.calcHist([image], [0], None, [256], [0, 256])
     p = count[count > 0] / image.size
     return float(-(p * np.log2(p)).sum())
 
 
 def tracking_score(sigma_cm: float) -> float:
-    """The tracking score: 0 for one that is sure of itself, 1 for a metre."""
+    """Return the tracking score: 0 for a sigma of 0.1 mm, 1 for 1 m, logarithmic."""
     return math.log10(max(sigma_cm, _MIN_SIGMA_CM) / _MIN_SIGMA_CM) / _SIGMA_DECADES
 
 
@@ -78,26 +80,23 @@ def _log_count(count: int) -> float:
     return math.log1p(count) / math.log1p(COUNT_SCALE)
 
 
-# ---- Where in the image there is something to hold on to: the point spatial distribution (PSD).
-#
-# A grid over cam0's image with three channels: how strong a corner each cell has, how many features there the
-# pose rests on, and how near they are. Source: SHARE, IMWUT 10(3) 97, 2026; scales: docs/error-model.md.
+# The point spatial distribution (PSD): a grid over cam0's image.
 
 PSD_GRID = (16, 12)  # cells across and down, whatever the camera
 PSD_CHANNELS = 3
-CELL_PX = 20  # in the image in which corners are sought
-_CORNER_BLOCK_PX = 3  # px, of a corner there
-_MIN_EIGENVALUE, _CORNER_DECADES = 1e-5, 4.0  # of a corner's least eigenvalue: 0, and what makes 1
-_FEATURES_PER_CELL = 4  # features in a cell that count as 1
-_MIN_DEPTH_M = 0.5  # counts as 1
+CELL_PX = 20  # of the thumbnail
+_CORNER_BLOCK_PX = 3
+_MIN_EIGENVALUE, _CORNER_DECADES = 1e-5, 4.0  # least eigenvalue for a value of 0, and the decades from 0 to 1
+_FEATURES_PER_CELL = 4  # for a value of 1
+_MIN_DEPTH_M = 0.5  # for a value of 1
 
 
 def point_distribution(thumbnail: U8, statistics: FeatureStatistics, size: tuple[int, int]) -> F32:
-    """(3, 12, 16): strength of the strongest corner, features that were believed, their mean inverse depth;
-    all from 0, for nothing, to 1.
+    """Return the PSD (3, 12, 16): strength of the strongest corner, number of inliers, their mean inverse
+    depth, each 0 to 1.
 
-    small (240, 320): the image, scaled so that a cell has `CELL_PX`; size: width and height that it had, in
-    which footing is.
+    thumbnail (240, 320): the image, scaled so that a cell has `CELL_PX`. size: width and height of the image
+    itself, in which `statistics` has its px.
     """
     count = PSD_GRID[0] * PSD_GRID[1]
     px, inverse = statistics.px[statistics.inlier], 1 / statistics.depth[statistics.inlier]
@@ -116,7 +115,7 @@ def point_distribution(thumbnail: U8, statistics: FeatureStatistics, size: tuple
 
 
 def _corner_strength(thumbnail: U8) -> F32:
-    """(12, 16), by the logarithm of the least eigenvalue (Shi and Tomasi 1994)."""
+    """Return (12, 16), by the logarithm of the least eigenvalue (Shi and Tomasi 1994)."""
     eigenvalue = cv2.cornerMinEigenVal(thumbnail, _CORNER_BLOCK_PX)
     strongest = eigenvalue.reshape(PSD_GRID[1], CELL_PX, PSD_GRID[0], CELL_PX).max(axis=(1, 3))
     out: F32 = (
@@ -127,34 +126,37 @@ def _corner_strength(thumbnail: U8) -> F32:
     return out
 
 
+# The tracking of the last seconds.
+
 RECENT_NAMES = (
     "mean score",
-    "least score",
-    "most score",
-    "way",
-    "turn",
-    "mean surprise",
-    "most surprise",
-    "refused",
+    "minimum score",
+    "maximum score",
+    "path",
+    "rotation",
+    "mean NIS",
+    "maximum NIS",
+    "rejected",
     "mean matches",
-    "least matches",
+    "minimum matches",
     "weak",
     "blind",
-    "deaf",
+    "no IMU",
     "gap",
 )
 _BLIND_STATES = (TrackState.INERTIAL_ONLY, TrackState.LOST)
-_PATH_SCALE_M, _ROTATION_SCALE_RAD = 5.0, 5.0  # count as 1
-_NIS_SCALE = 100.0  # squared sigmas, the same
-_GAP_SCALE_S, _MIN_GAP_S = 5.0, 0.1  # between two frames: 1, and where the logarithm begins
+_PATH_SCALE_M, _ROTATION_SCALE_RAD = 5.0, 5.0  # for a value of 1
+_NIS_SCALE = 100.0  # squared sigmas, for a value of 1
+_GAP_SCALE_S, _MIN_GAP_S = 5.0, 0.1  # for a value of 1, and the scale of the logarithm
 
 
 def recent_features(motion: RecentMotion) -> F32:
-    """(14,) as `RECENT_NAMES`, each about 0 to 1: the tracking score (`scalar_features`) of the keyframes;
-    how far the body
-    went and turned; and of the frames, how surprised the tracker was, what share of the features it found it
-    refused, how many it believed, in what share of them it was weak, blind (the IMU alone, or lost) and
-    deaf (without an IMU), and the longest time between two."""
+    """Return the features (14,) named in `RECENT_NAMES`, each about 0 to 1.
+
+    Of keyframes: the tracking score (`scalar_features`), path and rotation. Of frames: the median NIS, the
+    share of features rejected, the number of inliers, the shares of frames that were weak, blind (IMU only,
+    or LOST) and without IMU, and the longest time between two frames.
+    """
     scores = [tracking_score(sigma_cm) for sigma_cm in motion.sigmas_cm]
     frames = motion.frames
     stamps_ns, found_count, inlier_count = (np.array([outcome[k] for outcome in frames]) for k in (0, 3, 4))
@@ -182,7 +184,7 @@ def recent_features(motion: RecentMotion) -> F32:
     )
 
 
-# ---- What the error model is told of a keyframe: the same code makes it for training and on the agent.
+# The complete input.
 
 PICTURE_PX = 128  # across and down: the whole image, whatever its shape
 INPUT_SHAPES = {
@@ -195,7 +197,7 @@ _THUMBNAIL_SIZE = (PSD_GRID[0] * CELL_PX, PSD_GRID[1] * CELL_PX)  # 320 x 240
 
 
 def input_dtype(name: str) -> type[np.generic]:
-    """Of the numbers in this one of `INPUT_SHAPES`."""
+    """Return the data type of this entry of `INPUT_SHAPES`."""
     return np.uint8 if name == "picture" else np.float32
 
 
@@ -217,7 +219,7 @@ class ErrorModelInput:
 
 
 def error_model_input(image: U8, statistics: FeatureStatistics, motion: RecentMotion) -> ErrorModelInput:
-    """Of a keyframe: its image of cam0 (H, W), what its pose stands on, and how its tracker fared of late."""
+    """Return the input for a keyframe: image of cam0 (H, W), its feature statistics and the recent motion."""
     thumbnail = _resized(image, _THUMBNAIL_SIZE)
     distribution = point_distribution(thumbnail, statistics, (image.shape[1], image.shape[0]))
     return ErrorModelInput(
@@ -229,7 +231,7 @@ def error_model_input(image: U8, statistics: FeatureStatistics, motion: RecentMo
 
 
 def input_picture(image: U8) -> U8:
-    """That of `ErrorModelInput`, by itself, of an image (H, W)."""
+    """Return the picture of `ErrorModelInput` for an image (H, W)."""
     return _to_picture(_resized(image, _THUMBNAIL_SIZE))
 
 
@@ -238,5 +240,5 @@ def _to_picture(thumbnail: U8) -> U8:
 
 
 def _resized(image: U8, size: tuple[int, ...]) -> U8:
-    """Each pixel the mean of what it covers."""
+    """Return the image resized by averaging the area of each pixel."""
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

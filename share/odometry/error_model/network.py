@@ -1,7 +1,7 @@
-"""Networks as ONNX files, run by onnxruntime on one thread: two are slower on cores that others want, too.
+"""Networks as ONNX files, run by onnxruntime on one thread, because agents need the other cores.
 
-A file from anywhere is looked through before the runtime sees it (`onnx_header`), and an error model is tried
-once: what it takes and tells is known before anything relies on it.
+A file from anywhere is checked before the runtime reads it (`check_model`), and an error model is run once on
+zeros, so that its inputs and outputs are known to be right.
 """
 
 from __future__ import annotations
@@ -25,66 +25,70 @@ if TYPE_CHECKING:
 
 SHIPPED_MODEL = Path(__file__).with_name("error_model.onnx")
 _BATCH_SIZE, _BACKBONE_SIZE = 32, 1280
-_MAX_BYTES = 100 * MB  # ours has 4; one that an agent can run beside its tracker has not many more
-_MAX_MEMORY_BYTES = 1000 * MB  # ours takes 20, and 300 where a batch goes through it
+_MAX_BYTES = 100 * MB  # of a file; the shipped model has 4
+_MAX_MEMORY_BYTES = 1000 * MB  # of all networks; the shipped model takes 20, and 300 for a batch
 _OUTPUT_SHAPES = {"log_error": (1, 3), "embedding": (1, 64), "distance": (1,)}
 
 
 def read_model(path: Path) -> bytes:
-    """A file that may be a network. Raises DataError that says what is wrong with it."""
+    """Return the bytes of an ONNX file. Raises DataError that says what is wrong with it."""
     try:
         data = read_bytes(path, _MAX_BYTES)
         check_model(data)
         return data
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise DataError(f"{path}: is no network that can be run: {reason}") from None
+        raise DataError(f"{path}: not a usable ONNX network: {reason}") from None
 
 
 def open_network(model: bytes, name: str = "the model") -> OnnxSession:
-    """What is in a file. name: what an error calls it. Raises DataError that says what is wrong with it."""
+    """Return a session of the network in `model`. name: used in errors. Raises DataError that says what is
+    wrong."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what is wrong is said once, by DataError
+    options.log_severity_level = 4  # DataError carries the message
     _limit_memory()
     options.add_session_config_entry("session.use_env_allocators", "1")
     try:
         network: OnnxSession = onnxruntime.InferenceSession(
             model, options, providers=["CPUExecutionProvider"]
         )
-    except Exception as error:  # a class of its own for each reason
-        raise DataError(f"{name}: is no network that can be run: {_first_line(error)}") from None
+    except Exception as error:  # onnxruntime has a class for each reason
+        raise DataError(f"{name}: not a usable ONNX network: {_first_line(error)}") from None
     return network
 
 
 def open_error_model(source: str) -> OnnxSession:
-    """The one that comes with SHARE (`shipped`), or a file. Raises DataError."""
+    """Return a session of the model shipped with SHARE (`shipped`) or of a file. Raises DataError."""
     path = SHIPPED_MODEL if source == "shipped" else Path(source)
     network = open_network(read_model(path), str(path))
     try:
         input_names = {spec.name for spec in network.get_inputs()}
         inputs = {name: np.zeros((1, *shape), input_dtype(name)) for name, shape in INPUT_SHAPES.items()}
         if input_names != inputs.keys():
-            raise ValueError(f"it takes {', '.join(sorted(input_names))}, not {', '.join(sorted(inputs))}")
+            expected = ", ".join(sorted(inputs))
+            raise ValueError(f"its inputs are {', '.join(sorted(input_names))}, expected {expected}")
         for name, value in zip(OUTPUTS, network.run(OUTPUTS, inputs), strict=True):
             if value.shape != _OUTPUT_SHAPES[name] or value.dtype != np.float32:
                 raise ValueError(
-                    f"its {name} is {value.shape} of {value.dtype}, not {_OUTPUT_SHAPES[name]} of float32"
+                    f"its {name} is {value.shape} {value.dtype}, expected {_OUTPUT_SHAPES[name]} float32"
                 )
     except Exception as error:
-        raise DataError(f"{path}: is no error model: {_first_line(error)}") from None
+        raise DataError(f"{path}: not an error model: {_first_line(error)}") from None
     return network
 
 
 @cache
 def _limit_memory() -> None:
-    """Of all networks of this process together: weights that are added row to column make any size."""
+    """Limit the memory of all networks of this process together: weights broadcast against each other can
+    make any size."""
     import onnxruntime as ort
 
     memory = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
-    ort.create_and_register_allocator(memory, ort.OrtArenaCfg(_MAX_MEMORY_BYTES, -1, -1, -1))  # -1: as it is
+    arena = ort.OrtArenaCfg(_MAX_MEMORY_BYTES, -1, -1, -1)  # -1: the default
+    ort.create_and_register_allocator(memory, arena)
 
 
 def _first_line(error: Exception) -> str:
@@ -92,7 +96,8 @@ def _first_line(error: Exception) -> str:
 
 
 def backbone_features(network: OnnxSession, pictures: U8) -> F32:
-    """What the backbone of an error model makes of pictures (N, 128, 128): (N, 1280). Raises DataError."""
+    """Return the output (N, 1280) of an error model's backbone for pictures (N, 128, 128). Raises
+    DataError."""
     out = []
     for start in range(0, len(pictures), _BATCH_SIZE):
         batch = pictures[start : start + _BATCH_SIZE]
@@ -105,7 +110,7 @@ def backbone_features(network: OnnxSession, pictures: U8) -> F32:
         try:
             output = np.asarray(network.run(["deep"], inputs)[0], np.float32)
             if output.shape != (len(batch), _BACKBONE_SIZE):
-                raise ValueError(f"its deep is {output.shape}, not {(len(batch), _BACKBONE_SIZE)}")
+                raise ValueError(f"its deep is {output.shape}, expected {(len(batch), _BACKBONE_SIZE)}")
         except Exception as error:
             raise DataError(f"the model has no backbone of an error model: {_first_line(error)}") from None
         out.append(output)

@@ -1,0 +1,93 @@
+"""Health of the filter: do images and IMU agree, has it diverged, is its state plausible?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.config import InertialConfig
+from share.odometry import filter
+from share.odometry.state import FilterState
+from share.odometry.track_result import median
+from share.types import F64
+
+_SETTLING_S = 1.0  # after its start, in which a filter converges
+_MIN_DURATION_S = 1.0  # of frames after that, before an inconsistency is reported
+_AVERAGING_S = 5.0  # of the exponential mean
+_MIN_MEASUREMENTS = 25  # features in a frame; with fewer it is ignored
+_MAX_MEDIAN_NIS = 0.8  # 0.05 to 0.6 where the calibration is right
+_MAX_EMPTY_FRAMES = 3  # frames in which almost no feature is found where it should be
+_MAX_REJECTED_S = 1.0  # time in which almost every feature is rejected
+_MAX_INTERVAL_S = 0.2  # the most that one frame adds to it
+
+
+class ImageImuConsistency:
+    """Detects a camera that is rotated or shifted against its calibration, or whose clock is off, by the mean
+    of the median NIS.
+
+    Such a camera is tracked all the same: all features lie a little beside their prediction, frame after
+    frame, and none is rejected. With 5 degrees and 5 cm the median rises to 1.2 to 3 (docs/vio.md).
+    """
+
+    def __init__(self) -> None:
+        self._mean, self._seconds = 0.0, 0.0
+
+    def add(self, nis: F64, interval_s: float) -> None:
+        """Add `filter.nis` (M,) of a frame's features, `interval_s` after the frame before."""
+        if len(nis) < _MIN_MEASUREMENTS:
+            return
+        self._seconds += interval_s
+        measured_s = self._seconds - _SETTLING_S
+        if measured_s <= 0:
+            return
+        gain = min(interval_s / min(measured_s, _AVERAGING_S), 1.0)
+        self._mean += gain * (median(nis) - self._mean)
+
+    @property
+    def is_consistent(self) -> bool:
+        """False where images and IMU contradict each other."""
+        return self._seconds < _SETTLING_S + _MIN_DURATION_S or self._mean < _MAX_MEDIAN_NIS
+
+
+class DivergenceMonitor:
+    """Detects a wrong filter: textured images that show almost none of the features that should be in view,
+    or for long none that the filter accepts.
+
+    Features that have left the view do not count.
+    """
+
+    def __init__(self, weak: int, blind: int) -> None:
+        """With fewer than `weak` features in view a frame says little; fewer than `blind` found or
+        accepted count as none."""
+        self._weak, self._blind = weak, blind
+        self._empty_frames, self._rejected_s = 0, 0.0
+
+    def add(
+        self, textured: bool, in_view: int, found_count: int, inlier_count: int, interval_s: float
+    ) -> None:
+        """Add a frame, `interval_s` after the one before.
+
+        textured: the image shows something. `in_view` features should be in view, `found_count` were found,
+        `inlier_count` were accepted as well.
+        """
+        if textured and in_view >= self._weak:
+            self._empty_frames = self._empty_frames + 1 if found_count < self._blind else 0
+        if in_view >= self._blind:  # else all were rejected in the frame before, and are gone
+            rejected = textured and inlier_count < self._blind
+            self._rejected_s = self._rejected_s + min(interval_s, _MAX_INTERVAL_S) if rejected else 0.0
+
+    @property
+    def is_suspected(self) -> bool:
+        """True from the first such frame on."""
+        return self._empty_frames > 0 or self._rejected_s > 0
+
+    @property
+    def has_diverged(self) -> bool:
+        """True after too many such frames."""
+        return self._empty_frames >= _MAX_EMPTY_FRAMES or self._rejected_s > _MAX_REJECTED_S
+
+
+def is_plausible(s: FilterState, config: InertialConfig) -> bool:
+    """Return whether the state is finite, no faster than a person or robot, and its drift since the newest
+    keyframe below `lost_m`."""
+    finite = np.isfinite(s.T).all() and np.isfinite(s.v).all() and np.isfinite(s.cov).all()
+    return bool(finite and np.linalg.norm(s.v) < config.max_speed_m_s and filter.drift_m(s) < config.lost_m)
