@@ -22,6 +22,7 @@ class State:
     keyframe_poses: np.ndarray = field(
         default_factory=lambda: np.stack([at(x) for x in (1.0, 2.0, 3.0, 4.0, 5.0)])
     )
+    stamp_ns: int = 0
 
     def moved(self, T_new_old: np.ndarray, some: slice = slice(None)) -> State:
         """The body, and these keyframes."""
@@ -103,4 +104,17 @@ def test_after_a_loss_odom_is_the_same_and_anew_it_is_not(pivot):
     pivot.start(State(), BEGAN, new_segment=False)
     assert (pivot.offset == shift).all()
     pivot.start(State(), BEGAN, new_segment=True)
+    assert (pivot.offset == 0).all()
+
+
+def test_the_position_returns_to_the_filters_at_a_centimetre_a_second(pivot):
+    learnt = State().moved(turned((0.0, 0.05, 0.0)))
+    pivot.update(learnt)
+    off_m = np.linalg.norm(pivot.offset)
+    for frame in range(1, 31):
+        learnt.stamp_ns = frame * 10**9 // 30
+        pivot.update(learnt)
+    assert np.linalg.norm(pivot.offset) == pytest.approx(off_m - 0.01, abs=1e-9)
+    learnt.stamp_ns = 60 * 10**9
+    pivot.update(learnt)
     assert (pivot.offset == 0).all()
