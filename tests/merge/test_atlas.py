@@ -59,7 +59,7 @@ def test_two_agents_are_joined_to_truth(ann: Walker, bob: Walker) -> None:
     for x in near_loops(ann, bob, rng) + near_loops(bob, bob, rng):
         decisions.append(atlas.propose(x))
         applied += settle(atlas)
-    assert "would join two maps, 1 of 5 places that say so: waits" in decisions[0].reason
+    assert "would merge two maps, 1 of 5 required places agree: pending" in decisions[0].reason
     joining = [k for k, d in enumerate(decisions) if d.joined_maps]
     assert joining == [4]  # every one of these loops is at a place of its own
     assert decisions[4].joined_maps == ("ann/0", "bob/0")
@@ -334,10 +334,10 @@ def test_a_false_join_is_taken_out_once_better_evidence_is_there(ann: Walker, bo
         others.append(atlas.propose(x))
         settle(atlas)
     assert "contradicts the map" in first.reason
-    assert "1 places (weight 0.38) say so, 4 places needed" in first.reason
+    assert "1 places (weight 0.38) support it, 4 places needed" in first.reason
     assert not (first.dropped or second.dropped or third.dropped)
     assert set(fourth.dropped) == set(false)
-    assert "taken out: ann:0 - bob:13, ann:4 - bob:17" in fourth.reason
+    assert "loops removed: ann:0 - bob:13, ann:4 - bob:17" in fourth.reason
     assert fourth.joined_maps == ("ann/0", "bob/0")
     assert len(fourth.added) == 4
     assert all(d.accepted for d in others)
@@ -353,7 +353,7 @@ def test_what_stands_is_not_taken_out_by_hardly_more(ann: Walker, bob: Walker) -
     settle(atlas)
     true = [replace(x, found_share=0.58) for x in near_loops(ann, bob, np.random.default_rng(0))]
     fourth = [atlas.propose(x) for x in true[:4]][-1]
-    assert "4 places (weight 1.35) say so, 5 places (weight 1.06) do not" in fourth.reason
+    assert "4 places (weight 1.35) support it, 5 places (weight 1.06) oppose it" in fourth.reason
     assert not fourth.accepted
 
 
@@ -377,7 +377,7 @@ def test_two_stories_of_like_weight_join_nothing(ann: Walker, bob: Walker) -> No
             assert not atlas.propose(x).accepted
         decisions = [atlas.propose(x) for x in true]
         assert decisions[-1].accepted == joined
-        assert joined or "another story has 4 places" in decisions[-1].reason
+        assert joined or "a competing hypothesis has 4 places" in decisions[-1].reason
 
 
 def test_views_that_lack_what_both_should_show_join_nothing(ann: Walker, bob: Walker) -> None:
