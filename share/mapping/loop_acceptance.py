@@ -72,7 +72,8 @@ class LoopAcceptance:
         ):
             return LoopDecision(False, f"loop {loop}: these keyframes have a loop already")
         if self._graph.odometry.are_neighbours(a, b, min_gap):
-            return LoopDecision(False, f"loop {loop}: less than {min_gap} keyframes apart by odometry")
+            gap = f"less than {min_gap} keyframes apart"
+            return LoopDecision(False, f"loop {loop}: neighbours by odometry, {gap}")
         if self._graph.is_same_map(a, b):
             return self._decide_within_map(loop)
         return self._decide_join(self._overlap_check.with_found_share(loop))

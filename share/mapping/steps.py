@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.config import PlaceConfig
-from share.mapping.atlas import SolveJob
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.graph.updates import GraphSolution
+from share.mapping.map_solving import SolveJob
 from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
 from share.types import F64, Correction

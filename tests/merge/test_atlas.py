@@ -160,7 +160,7 @@ def test_of_small_maps_fewer_places_are_enough_but_never_one_keyframe() -> None:
     ann, bob = Walker("ann", 1, 5, turn=0.5), Walker("bob", 2, 5, turn=0.5)
     rng = np.random.default_rng(0)
     atlas = atlas_of(ann, bob)
-    assert "0 of 1 places" in atlas.propose(far_loop(ann, 0, bob, 4, rng)).reason
+    assert "0 of 1 required places" in atlas.propose(far_loop(ann, 0, bob, 4, rng)).reason
     for i in (1, 2, 3):
         assert not atlas.propose(loop(ann, i, bob, 1, rng)).accepted
     assert atlas.propose(loop(ann, 1, bob, 2, rng)).joined_maps == ("ann/0", "bob/0")
@@ -185,7 +185,7 @@ def test_in_a_map_a_wrong_loop_contradicts_it(ann: Walker) -> None:
     assert not decision.accepted
     assert "contradicts the map" in decision.reason
     assert atlas.propose(right).accepted
-    assert "joined already" in atlas.propose(right.reverse()).reason
+    assert "have a loop already" in atlas.propose(right.reverse()).reason
 
 
 def test_neighbours_are_odometrys_business(ann: Walker) -> None:
@@ -294,7 +294,7 @@ def test_a_solution_of_a_map_that_was_joined_meanwhile_is_left_aside(ann: Walker
     before = poses(atlas, ann, bob)
     applied = atlas.apply_solution(*result)
     assert applied.corrections == {}
-    assert "joined or split" in applied.reason
+    assert "merged or split" in applied.reason
     assert np.array_equal(poses(atlas, ann, bob), before)
     assert atlas.due_maps() == ["ann/0"]
     assert settle(atlas)[0].corrections.keys() == {"ann", "bob"}
@@ -386,7 +386,7 @@ def test_views_that_lack_what_both_should_show_join_nothing(ann: Walker, bob: Wa
         atlas = atlas_of(ann, bob)
         decisions = [atlas.propose(replace(x, found_share=found)) for x in true]
         assert any(d.joined_maps for d in decisions) == joined
-    assert "only 44% of what both should show is found" in atlas_says(ann, bob, true, 0.44)
+    assert "only 44% of the points in both views are found" in atlas_says(ann, bob, true, 0.44)
 
 
 def atlas_says(ann: Walker, bob: Walker, loops: list[Loop], found: float) -> str:
@@ -422,7 +422,7 @@ def test_a_loop_that_the_solved_map_speaks_against_is_dropped(ann: Walker, bob: 
     wrong = loop(ann, 30, bob, 8, rng, WRONG)
     assert atlas.propose(wrong).accepted
     reasons = [applied.reason for applied in settle(atlas)]
-    assert "dropped loops at odds with it: ann:30 - bob:8" in reasons[0]
+    assert "outlier loops removed: ann:30 - bob:8" in reasons[0]
     assert wrong not in atlas.loops
     assert error(poses(atlas, ann, bob), truth(ann, bob)) < 0.06
 
