@@ -14,10 +14,11 @@ import numpy as np
 
 from share.config import MergeConfig
 from share.mapping.agents.agreement import AgentStanding
-from share.mapping.agents.covariance_scales import inflate_covariance, make_gravity_factor
+from share.mapping.agents.covariance_scales import inflate_covariance
 from share.mapping.agents.quarantine import Quarantine, QuarantineChange
 from share.mapping.corrections import LocalisationGate
 from share.mapping.culling import KeyframeCulling, OdometryLink, RemovedKeyframe, reconnect, remove_keyframe
+from share.mapping.graph.gravity import make_gravity_factor
 from share.mapping.graph.updates import GraphSolution
 from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
@@ -259,7 +260,7 @@ class Atlas:
         return removed
 
     def propose(self, loop: Loop) -> LoopDecision:
-        """Decide on a verified loop of candidate a and query b. Raises ValueError if a keyframe is unknown."""
+        """Decide on a verified loop from candidate a to query b. Raises ValueError for unknown keyframes."""
         if reason := self._quarantine.separation_reason(loop):
             return LoopDecision(False, f"loop {loop}: {reason}")
         decision = self._loop_acceptance.decide(loop)

@@ -28,7 +28,7 @@ import numpy as np
 from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.agents.pairwise import ComparisonEquations
-from share.types import F64, I64, Keyframe
+from share.types import F64, I64
 
 # ---- No agent is believed to be surer than a good one can be, whatever it says.
 
@@ -40,13 +40,6 @@ def inflate_covariance(config: MergeConfig, T_ref_body: F64, cov: F64) -> F64:
     rad2 = np.radians(config.odometry_floor_deg) ** 2 + (config.odometry_floor_per_rad * angle_rad) ** 2
     m2 = config.odometry_floor_m**2 + (config.odometry_floor_per_m * length_m) ** 2
     return config.odometry_scale**2 * cov + np.diag([rad2] * 3 + [m2] * 3)
-
-
-def make_gravity_factor(config: MergeConfig, keyframe: Keyframe) -> F64:
-    """See `share.mapping.graph.edges`: no camera sits on its IMU better than it was calibrated."""
-    norm = float(np.linalg.norm(keyframe.up))
-    sigma = np.hypot(keyframe.up_sigma, np.radians(config.gravity_floor_deg))
-    return keyframe.up / (norm * sigma) if norm else np.zeros(3)
 
 
 # ---- How sure agents are of their odometry, beside each other, by what they say and as far as it is
