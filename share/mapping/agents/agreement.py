@@ -1,11 +1,12 @@
-"""Which agents agree on scale, calibration and how sure they are, and which must not move others.
+"""Which agents agree on scale, calibration and covariances, and which must not affect others' maps.
 
-Every two agents are compared by the loops between them (`share.mapping.agents.pairwise`), by all of them
-and by the newest, for who is right at first may be wrong later. What differs both significantly and by more
-than does no harm is a disagreement. Of several agents the one that disagrees with most is set apart, as in
-pairwise consistency (Mangelson et al., ICRA 2018), with agents for loops; of two, nobody can say which is
-wrong, and they keep a map each. An agent is a subject here, all runs of a name
-(`share.mapping.agents.identities`)."""
+Every two agents are compared by the loops between them (`share.mapping.agents.pairwise`), by all loops and by
+the newest, since an agent may become wrong. A disagreement is a difference that is significant and large
+enough to matter. Among several agents the one that disagrees with most is quarantined, as in pairwise
+consistency (Mangelson et al., ICRA 2018) with agents for loops. Of two agents it is undetermined which is
+wrong; the pair is disputed, and each keeps its own map. All runs of a name are one agent here
+(`share.mapping.agents.identities`).
+"""
 
 from __future__ import annotations
 
@@ -40,29 +41,32 @@ from share.mapping.graph.edges import PoseEdge
 from share.mapping.recognition.depth_scale import DepthScale
 from share.types import F64
 
-_MAX_LOOPS = 32  # loops kept of two stretches
+_MAX_LOOPS = 32  # kept of two segments
 _MAX_SCALES = 160
-_MAX_ROTATION_RAD = np.radians(1.5)  # rad, less does no harm
-_MAX_NIS = 3.0  # beyond what honest agents are too sure
-_MIN_DEPTH_SCALES, _MIN_LOOPS = 3, 8  # loops before a comparison by points, or by ways, says anything
-_RECENT_DEPTH_SCALES, _RECENT_LOOPS = 6, 12  # newest loops that are looked at on their own
-_MIN_INLIER_SHARE = 0.6  # of the loops must fit, or they are of more than one place
-_END_SEVERITY = 0.6  # a disagreement ends below this part of what began it
-_APPLY_SIGMAS, _KEEP_SIGMAS = (
-    2.5,
-    1.25,
-)  # sigmas from which on, and down to which, a scale is taken into account
-_MIN_SCALE_CHANGE = 0.001  # log scale that it has to change by
-_ENDED_SEGMENTS: SegmentPair = (-1, -1)  # newest loops of stretches that are gone
+_MAX_ROTATION_RAD = np.radians(1.5)  # harmless below
+_MAX_NIS = 3.0  # larger than that of good agents that understate their covariances
+_MIN_DEPTH_SCALES = 3  # loops for a comparison of depths
+_MIN_LOOPS = 8  # loops for a comparison of paths
+_RECENT_DEPTH_SCALES = 6  # newest loops that are compared separately
+_RECENT_LOOPS = 12
+_MIN_INLIER_SHARE = 0.6  # of the loops; with fewer they are of more than one place
+_END_SEVERITY = 0.6  # a disagreement begins at 1 and ends below this
+_APPLY_SIGMAS = 2.5  # significance at which a scale is corrected
+_KEEP_SIGMAS = 1.25  # significance down to which it stays corrected
+_MIN_SCALE_CHANGE = 0.001  # log scale
+_ENDED_SEGMENTS: SegmentPair = (-1, -1)  # key of the newest loops of removed segments
 
 
 @dataclass(frozen=True)
 class AgentStanding:
-    """Of an agent, for people. state: `agrees`, `set apart`, `disputed` or `unknown`. log_scale, sigma: of
-    its depths against the others'; put_right: what of it is taken out; nis: see
-    `share.mapping.agents.pairwise`; None where not known. doubt: the most that is held against it and
-    another; 1 begins a disagreement. widened: by what the variances of its odometry are multiplied, for it is
-    too sure of them."""
+    """How an agent agrees with the others, as reported.
+
+    state: `agrees`, `set apart` (quarantined), `disputed` or `unknown`. log_scale, sigma: of its depths
+    relative to the others'; put_right: the part that is corrected. nis: of its loops, see
+    `share.mapping.agents.pairwise`; None where unknown. doubt: severity of its worst contradiction with
+    another agent; a disagreement begins at 1. widened: factor on the variances of its odometry, which it
+    understates.
+    """
 
     state: str = "unknown"
     reason: str = ""
@@ -76,7 +80,9 @@ class AgentStanding:
 
 @dataclass(eq=False)
 class _SegmentPairLoops:
-    """Loops of two stretches. ways, newest: as all of them say, and the newest. news: since then."""
+    """Loops of two segments, compared by all of them and by the newest. new_loops: since the last
+    comparison.
+    """
 
     loops: list[InterAgentLoop] = field(default_factory=list)
     comparison: OdometryComparison | None = None
@@ -86,22 +92,25 @@ class _SegmentPairLoops:
 
 @dataclass(eq=False)
 class _AgentPair:
-    """Of two agents, the lesser first. met: by stretches, those that are gone as one. scales: of more loops,
-    by which what does no harm is put right."""
+    """Comparison of two agents, in alphabetical order.
+
+    by_segments: loops by pair of segments; those of ended segments are pooled. depth_scales: of more loops
+    than are kept in by_segments.
+    """
 
     by_segments: dict[SegmentPair, _SegmentPairLoops] = field(default_factory=dict)
     depth_scales: deque[DepthScale] = field(default_factory=lambda: deque(maxlen=_MAX_SCALES))
     depth_scale: ScalarEstimate | None = None
-    recent_depth_scale: ScalarEstimate | None = None  # of the newest of `depth_scales`
-    pooled_depth_scale: ScalarEstimate | None = None  # of all of them
-    severity: float = 0.0  # 1 begins a disagreement
+    recent_depth_scale: ScalarEstimate | None = None  # from the newest of `depth_scales`
+    pooled_depth_scale: ScalarEstimate | None = None  # from all of them
+    severity: float = 0.0  # a disagreement begins at 1
     disagrees: bool = False
     reason_second: str = ""  # of the second, against the first
     reason_first: str = ""  # of the first, against the second
 
     @property
     def nis(self) -> float | None:
-        """The most that loops of two stretches say; None where they are too few."""
+        """Largest value over pairs of segments; None with too few loops."""
         return max(
             (
                 segment_loops.comparison.nis
@@ -116,9 +125,12 @@ AgentNames = tuple[str, str]
 
 
 class AgentAgreement:
-    """Of all agents, which are told by their runs. tolerance: log scale that does no harm. apart: agents
-    that must not move others. disputed: pairs of which nobody can say who is wrong. scale: log of how much
-    too long the metres of each are, so far as that is sure; 0 where it is not there."""
+    """Agreement of all agents, which are given by their runs.
+
+    tolerance: log scale that does no harm. quarantined: agents that must not affect others. disputed: pairs
+    in which it is undetermined who is wrong. log_scales: log of how much too long each agent's metres are,
+    where significant; else missing.
+    """
 
     def __init__(self, tolerance: float) -> None:
         self.quarantined: frozenset[str] = frozenset()
@@ -131,12 +143,13 @@ class AgentAgreement:
         self._pairs: dict[AgentNames, _AgentPair] = {}
 
     def add_run(self, run: str, name: str, credential: str | None = "") -> None:
-        """A run of the agent of this name comes; what is held against the name is held against the run.
-        voice: see `Subjects.speaks`."""
+        """Register a run of the agent of this name; what is known of the name applies to it. credential: see
+        `AgentIdentities.set_credential`.
+        """
         self.identities.add_run(run, name, self.quarantined.union(*self.disputed), credential)
 
     def add_step(self, run: str, node_id: int, previous_id: int | None, T_ref_body: F64, cov: F64) -> None:
-        """A new node, by odometry from the one before; None: it begins a stretch."""
+        """Add a node, by odometry from the previous one; None: it begins a segment."""
         previous = None if previous_id is None else self._accumulated.get(previous_id)
         self._accumulated[node_id] = (
             AccumulatedOdometry.origin() if previous is None else previous.with_step(T_ref_body, cov)
@@ -145,16 +158,19 @@ class AgentAgreement:
             self._covariance_scales.add_step(self.identities.identity(run), T_ref_body, cov)
 
     def log_scale(self, run: str) -> float:
-        """See `scale`."""
+        """Log of how much too long the run's metres are, where significant; else 0."""
         return self.log_scales.get(self.identities.identity(run), 0.0)
 
     def covariance_scale(self, run: str) -> float:
-        """By what the variances of its odometry have to be multiplied to be believed."""
+        """Factor on the variances of the run's odometry."""
         return self._covariance_scales.scales.get(self.identities.identity(run), 1.0)
 
     def remove_nodes(self, node_ids: Collection[int], live: Container[int]) -> None:
-        """Nodes that are taken out. live: stretches that have others. What loops of those that have not said
-        stays only so far as it decides who agrees: a disagreement does not end because its loops went."""
+        """Remove nodes. live: segments that still have nodes.
+
+        Loops of other segments stay as evidence of agreement only: a disagreement does not end because its
+        loops were removed.
+        """
         for node_id in node_ids:
             self._accumulated.pop(node_id, None)
         removed_pairs = set[SegmentPair]()
@@ -175,8 +191,9 @@ class AgentAgreement:
         self._covariance_scales.drop_evidence(sorted(removed_pairs))
 
     def remove_run(self, run: str) -> None:
-        """A run of which nothing is left, and that will not come back. With the last of an agent's goes all
-        that is known of it, but for what is held against its name."""
+        """Forget a run that will not return. With an agent's last run all but its name's reputation is
+        forgotten.
+        """
         removed = self.identities.remove_run(run, self.quarantined, frozenset[str]().union(*self.disputed))
         if removed is None:
             return
@@ -194,9 +211,10 @@ class AgentAgreement:
         scale: DepthScale | None,
         tilt: tuple[float, float] | None,
     ) -> bool:
-        """A verified loop between two agents' runs, `edge` between its nodes; scale, tilt: see
-        `InterAgentLoop`.
-        Returns whether who is apart, or disputed, has changed."""
+        """Add a verified loop between two agents' runs; `edge` connects its nodes.
+
+        scale, tilt: see `InterAgentLoop`. Returns whether the quarantined or disputed agents have changed.
+        """
         first, second = (self.identities.identity(run) for run in agents)
         if self.identities.name(first) == self.identities.name(second):
             return False
@@ -223,26 +241,27 @@ class AgentAgreement:
         return changed
 
     def separation_reason(self, first_runs: Collection[str], second_runs: Collection[str]) -> str:
-        """Why these must not come into one map with those; empty if nothing is known against it."""
+        """Why these agents must not share a map with those; empty if they may."""
         for a in map(self.identities.identity, first_runs):
             for b in map(self.identities.identity, second_runs):
                 if a != b and ({a, b} & self.quarantined or frozenset((a, b)) in self.disputed):
-                    return f"{a} and {b} are kept apart"
+                    return f"{a} and {b} are kept in separate maps"
         return ""
 
     def unverified_reason(self, first_runs: Collection[str], second_runs: Collection[str]) -> str:
-        """Why these must not come into one map with those before one of them was compared; empty if they
-        may."""
+        """Why these agents must not share a map with those before one of them is compared; empty if they
+        may.
+        """
         identities = {self.identities.identity(run) for run in (*first_runs, *second_runs)}
         unverified = self.identities.unverified & identities if len(identities) > 1 else set[str]()
         return (
-            f"{min(unverified)} has to be compared first, {self._unverified_cause(min(unverified))}"
+            f"{min(unverified)} must be compared first: {self._unverified_cause(min(unverified))}"
             if unverified
             else ""
         )
 
     def standing(self, run: str) -> AgentStanding:
-        """How it stands with the others."""
+        """Return how the run's agent agrees with the others."""
         agent = self.identities.identity(run)
         pairs = {names: pair for names, pair in self._pairs.items() if agent in names}
         disagreeing = [(names, pair) for names, pair in pairs.items() if pair.disagrees]
@@ -255,11 +274,11 @@ class AgentAgreement:
         elif any(frozenset(names) in self.disputed for names, _ in disagreeing):
             state, reason = (
                 "disputed",
-                f"{_contradiction_text(agent, disagreeing)}; nobody can say which of the two is wrong",
+                f"{_contradiction_text(agent, disagreeing)}; undetermined which of the two is wrong",
             )
         elif agent in self.identities.unverified:
-            state, reason = "unknown", f"not compared with the others {self._unverified_cause(agent)}"
-        doubt = max((pair.severity for pair in pairs.values()), default=0.0)
+            state, reason = "unknown", f"not compared with the others yet: {self._unverified_cause(agent)}"
+        worst = max((pair.severity for pair in pairs.values()), default=0.0)
         return AgentStanding(
             state,
             reason,
@@ -267,20 +286,22 @@ class AgentAgreement:
             sigma,
             self.log_scales.get(agent, 0.0),
             nis,
-            doubt,
+            worst,
             self.covariance_scale(agent),
         )
 
     def _unverified_cause(self, unverified: str) -> str:
         if unverified in self.identities.suspected:
-            return "since an earlier run of its name was kept apart"
-        return "since the edge was started again"
+            return "an earlier run of its name was kept in a separate map"
+        return "the edge has restarted"
 
     def contradictions(self) -> dict[AgentNames, float]:
-        """What is held against every two agents that met, the lesser first; 1 begins a disagreement."""
+        """Severity of the contradictions of each compared pair, names in order; a disagreement begins at
+        1.
+        """
         return {names: pair.severity for names, pair in self._pairs.items()}
 
-    # ------------------------------------------------------------ two agents
+    # Comparison of two agents
 
     def _compare(self, pair: _AgentPair, names: AgentNames, segment_pair: SegmentPair) -> None:
         segment_loops = pair.by_segments[segment_pair]
@@ -322,7 +343,7 @@ class AgentAgreement:
                 and segment_loops.comparison is not None
                 and not self.quarantined & {*names}
             ):
-                with suppress(np.linalg.LinAlgError):  # of absurd numbers, which say nothing
+                with suppress(np.linalg.LinAlgError):  # absurd numbers are no evidence
                     self._covariance_scales.set_evidence(
                         segment_pair, names, equations_of_pair, segment_loops.comparison.weights
                     )
@@ -333,8 +354,10 @@ class AgentAgreement:
         )
 
     def _mark_verified(self, pair: _AgentPair, names: AgentNames) -> None:
-        """Who was to be compared has been, if the other is not under suspicion itself. What was wrong with a
-        name before may have been its way, so there depths are not enough."""
+        """Mark agents of the pair as compared, unless the other is itself suspect.
+
+        An earlier run of a suspected name may have had a wrong path, so depths alone are not enough for it.
+        """
         has_comparison = any(
             segment_loops.comparison is not None for segment_loops in pair.by_segments.values()
         )
@@ -356,22 +379,22 @@ class AgentAgreement:
         if comparison.inlier_share >= _MIN_INLIER_SHARE:
             out.append(
                 scale_contradiction(
-                    comparison.path_scale, self._tolerance, "its way is {} % {}", ("longer", "shorter")
+                    comparison.path_scale, self._tolerance, "its path is {} % {}", ("longer", "shorter")
                 )
             )
             rotation_text = (
-                f"its camera is turned by {np.degrees(comparison.camera_rotation.value):.1f} "
-                f"degrees against what it says"
+                f"its camera is rotated by {np.degrees(comparison.camera_rotation.value):.1f} "
+                f"degrees against its calibration"
             )
             out.append(
                 (severity(comparison.camera_rotation, _MAX_ROTATION_RAD), rotation_text, rotation_text)
             )
-        text = f"loops are off by {comparison.nis:.1f} times the variance that it claims"
+        text = f"its loops deviate by {comparison.nis:.1f} times the variance that it states"
         out.append((comparison.nis / _MAX_NIS, text, text))
         return out
 
     def _severity(self, segment_loops: _SegmentPairLoops) -> float:
-        """By its ways."""
+        """Severity of the contradictions between the two paths."""
         return max(
             (
                 s
@@ -390,18 +413,21 @@ class AgentAgreement:
             and pair.depth_scale.sigma < self._tolerance / 2
         )
 
-    # ------------------------------------------------------------ all agents
+    # Quarantine and scales of all agents
 
     def _update_quarantine(self) -> bool:
-        """Who is apart: whoever is outvoted by every voice that those may have whose voice is not known; one
-        of a name that was set apart before is a suspect. Whether that has changed."""
+        """Recompute the quarantined and disputed agents; return whether they changed.
+
+        Quarantined are those outvoted under every assumption on unknown credentials. Agents with a
+        quarantined earlier run are suspects.
+        """
         disagreeing = {frozenset(names) for names, pair in self._pairs.items() if pair.disagrees}
         agreeing = [names for names, pair in self._pairs.items() if self._is_agreed(pair)]
         agents = {name for names in self._pairs for name in names}
         suspects = {name for name in agents if self.identities.had_quarantined_run(name, self.quarantined)}
         quarantined = frozenset(agents)
         for credentials in self.identities.credential_hypotheses(agents):
-            if quarantined:  # else no other way can change that
+            if quarantined:  # else the result stays empty
                 quarantined &= outvoted_agents(disagreeing, agreeing, credentials, suspects)
         previous = self.quarantined, self.disputed
         self.quarantined = quarantined
@@ -410,7 +436,7 @@ class AgentAgreement:
         return previous != (self.quarantined, self.disputed)
 
     def _update_scales(self) -> None:
-        """What is sure of everybody's scale; nothing of those kept apart, for their maps are theirs."""
+        """Update the significant log scales. Separated agents are left out, since their maps are separate."""
         separated = self.quarantined.union(*self.disputed)
         known = self._estimate_scales(separated)
         for agent in sorted(known.keys() | self.log_scales.keys()):
@@ -421,8 +447,10 @@ class AgentAgreement:
                 self.log_scales[agent] = new
 
     def _estimate_scales(self, excluded: Collection[str] = ()) -> Mapping[str, tuple[float, float]]:
-        """Log scale of every agent's depths against the median of those that are not apart, by least squares
-        over all pairs but those with somebody who is left out; and its sigma."""
+        """Log scale of each agent's depths relative to the median of those not quarantined, with its sigma.
+
+        Least squares over all pairs without an excluded agent.
+        """
         gauges_by_pair = (
             (names, pair.pooled_depth_scale)
             for names, pair in self._pairs.items()
@@ -443,24 +471,28 @@ class AgentAgreement:
             for agent in agents
             if agent not in self.quarantined
         }
-        x -= np.median([*by_credential.values()] or x)  # a voice counts once
+        x -= np.median([*by_credential.values()] or x)  # one value per credential
         sigma = np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))
         return {name: (float(x[i]), float(sigma[i])) for name, i in column.items()}
 
 
 def _compare_paths(
-    segment_loops: _SegmentPairLoops, widths: tuple[float, float]
+    segment_loops: _SegmentPairLoops, covariance_scales: tuple[float, float]
 ) -> ComparisonEquations | None:
-    """Of all of its loops; None where they are too few, or absurd numbers leave no solution. widths: by what
-    either's claims alone are widened, see `solve_comparison`."""
+    """Compare by all loops of two segments and by the newest; return the equations of all.
+
+    None with too few loops, or where absurd numbers leave no solution. covariance_scales: see
+    `solve_comparison`.
+    """
     segment_loops.comparison = segment_loops.recent_comparison = None
     if len(segment_loops.loops) < _MIN_LOOPS:
         return None
     with suppress(np.linalg.LinAlgError):
         equations_of_pair = comparison_equations(segment_loops.loops)
-        segment_loops.comparison = solve_comparison(equations_of_pair, widths)
+        segment_loops.comparison = solve_comparison(equations_of_pair, covariance_scales)
         if len(segment_loops.loops) > _RECENT_LOOPS:
-            segment_loops.recent_comparison = compare_odometry(segment_loops.loops[-_RECENT_LOOPS:], widths)
+            newest = segment_loops.loops[-_RECENT_LOOPS:]
+            segment_loops.recent_comparison = compare_odometry(newest, covariance_scales)
         return equations_of_pair
     return None
 
@@ -470,7 +502,7 @@ def _pool_scales(scales: Collection[DepthScale]) -> ScalarEstimate | None:
 
 
 def _contradiction_text(agent: str, disagreeing: list[tuple[AgentNames, _AgentPair]]) -> str:
-    """From the pairs in which it disagrees."""
+    """Text of the agent's contradictions in these pairs."""
     texts = []
     for (first, second), pair in disagreeing:
         other, text = (first, pair.reason_second) if agent == second else (second, pair.reason_first)
@@ -479,7 +511,7 @@ def _contradiction_text(agent: str, disagreeing: list[tuple[AgentNames, _AgentPa
 
 
 def _most_redundant_loop(loops: list[InterAgentLoop]) -> int:
-    """Of the two loops that are most alike by where they end, the older."""
+    """Index of the older of the two loops whose ends are closest."""
     positions = np.array([(w.a.index, w.b.index) for w in loops])
     distance = np.abs(positions[:, None] - positions[None]).sum(2).astype(float)
     np.fill_diagonal(distance, np.inf)
