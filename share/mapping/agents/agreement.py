@@ -10,51 +10,23 @@ wrong; the pair is disputed, and each keeps its own map. All runs of a name are 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Collection, Container, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
+from share.mapping.agents.agent_pair import AgentPair
 from share.mapping.agents.covariance_scales import CovarianceClaims, CovarianceScales, SegmentPair
-from share.mapping.agents.identities import (
-    AgentIdentities,
-    first_of_each_kind,
-    gravity_contradictions,
-    outvoted_agents,
-    scale_contradiction,
-    severity,
-)
-from share.mapping.agents.pairwise import (
-    AccumulatedOdometry,
-    ComparisonEquations,
-    InterAgentLoop,
-    OdometryComparison,
-    ScalarEstimate,
-    compare_odometry,
-    comparison_equations,
-    robust_depth_scale,
-    solve_comparison,
-)
+from share.mapping.agents.identities import AgentIdentities, outvoted_agents
+from share.mapping.agents.pairwise import AccumulatedOdometry, InterAgentLoop
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.recognition.depth_scale import DepthScale
 from share.types import F64
 
-_MAX_LOOPS = 32  # kept of two segments
-_MAX_SCALES = 160
-_MAX_ROTATION_RAD = np.radians(1.5)  # harmless below
-_MAX_NIS = 3.0  # larger than that of good agents that understate their covariances
-_MIN_DEPTH_SCALES = 3  # loops for a comparison of depths
-_MIN_LOOPS = 8  # loops for a comparison of paths
-_RECENT_DEPTH_SCALES = 6  # newest loops that are compared separately
-_RECENT_LOOPS = 12
-_MIN_INLIER_SHARE = 0.6  # of the loops; with fewer they are of more than one place
-_END_SEVERITY = 0.6  # a disagreement begins at 1 and ends below this
 _APPLY_SIGMAS = 2.5  # significance at which a scale is corrected
 _KEEP_SIGMAS = 1.25  # significance down to which it stays corrected
 _MIN_SCALE_CHANGE = 0.001  # log scale
-_ENDED_SEGMENTS: SegmentPair = (-1, -1)  # key of the newest loops of removed segments
 
 
 @dataclass(frozen=True)
@@ -78,49 +50,6 @@ class AgentStanding:
     widened: float = 1.0
 
 
-@dataclass(eq=False)
-class _SegmentPairLoops:
-    """Loops of two segments, compared by all of them and by the newest. new_loops: since the last
-    comparison.
-    """
-
-    loops: list[InterAgentLoop] = field(default_factory=list)
-    comparison: OdometryComparison | None = None
-    recent_comparison: OdometryComparison | None = None
-    new_loops: int = 0
-
-
-@dataclass(eq=False)
-class _AgentPair:
-    """Comparison of two agents, in alphabetical order.
-
-    by_segments: loops by pair of segments; those of ended segments are pooled. depth_scales: of more loops
-    than are kept in by_segments.
-    """
-
-    by_segments: dict[SegmentPair, _SegmentPairLoops] = field(default_factory=dict)
-    depth_scales: deque[DepthScale] = field(default_factory=lambda: deque(maxlen=_MAX_SCALES))
-    depth_scale: ScalarEstimate | None = None
-    recent_depth_scale: ScalarEstimate | None = None  # from the newest of `depth_scales`
-    pooled_depth_scale: ScalarEstimate | None = None  # from all of them
-    severity: float = 0.0  # a disagreement begins at 1
-    disagrees: bool = False
-    reason_second: str = ""  # of the second, against the first
-    reason_first: str = ""  # of the first, against the second
-
-    @property
-    def nis(self) -> float | None:
-        """Largest value over pairs of segments; None with too few loops."""
-        return max(
-            (
-                segment_loops.comparison.nis
-                for segment_loops in self.by_segments.values()
-                if segment_loops.comparison is not None
-            ),
-            default=None,
-        )
-
-
 AgentNames = tuple[str, str]
 
 
@@ -140,7 +69,7 @@ class AgentAgreement:
         self._covariance_scales = CovarianceScales(CovarianceClaims())
         self._tolerance = tolerance
         self._accumulated: dict[int, AccumulatedOdometry] = {}
-        self._pairs: dict[AgentNames, _AgentPair] = {}
+        self._pairs: dict[AgentNames, AgentPair] = {}
 
     def add_run(self, run: str, name: str, credential: str | None = "") -> None:
         """Register a run of the agent of this name; what is known of the name applies to it. credential: see
@@ -173,22 +102,8 @@ class AgentAgreement:
         """
         for node_id in node_ids:
             self._accumulated.pop(node_id, None)
-        removed_pairs = set[SegmentPair]()
-        for pair in self._pairs.values():
-            if ended_pairs := {
-                m for m in pair.by_segments if m != _ENDED_SEGMENTS and not (m[0] in live and m[1] in live)
-            }:
-                removed_pairs |= ended_pairs
-                ended_loops = [
-                    pair.by_segments.get(_ENDED_SEGMENTS, _SegmentPairLoops()),
-                    *(pair.by_segments.pop(segment_pair) for segment_pair in sorted(ended_pairs)),
-                ]
-                loops = [w for segment_loops in ended_loops for w in segment_loops.loops][-_MAX_LOOPS:]
-                most_severe = max(ended_loops, key=self._severity) if pair.disagrees else _SegmentPairLoops()
-                pair.by_segments[_ENDED_SEGMENTS] = _SegmentPairLoops(
-                    loops, most_severe.comparison, most_severe.recent_comparison
-                )
-        self._covariance_scales.drop_evidence(sorted(removed_pairs))
+        ended = set[SegmentPair]().union(*[pair.end_segments(live) for pair in self._pairs.values()])
+        self._covariance_scales.drop_evidence(sorted(ended))
 
     def remove_run(self, run: str) -> None:
         """Forget a run that will not return. With an agent's last run all but its name's reputation is
@@ -221,19 +136,11 @@ class AgentAgreement:
         if first > second:
             first, second, segments, edge = second, first, segments[::-1], edge.reverse()
             scale = None if scale is None else scale.reverse()
-        pair = self._pairs.setdefault((first, second), _AgentPair())
+        pair = self._pairs.setdefault((first, second), AgentPair(self._tolerance))
         self._covariance_scales.link(first, second)
-        segment_loops = pair.by_segments.setdefault(segments, _SegmentPairLoops())
         a, b = self._accumulated[edge.a], self._accumulated[edge.b]
-        segment_loops.loops.append(InterAgentLoop(a, b, edge.T_a_b, edge.cov, scale, tilt))
-        if scale is not None:
-            pair.depth_scales.append(scale)
-        if len(segment_loops.loops) > _MAX_LOOPS:
-            del segment_loops.loops[_most_redundant_loop(segment_loops.loops)]
-        segment_loops.new_loops += 1
-        if segment_loops.new_loops * 6 < len(segment_loops.loops):
+        if not pair.add_loop(segments, InterAgentLoop(a, b, edge.T_a_b, edge.cov, scale, tilt)):
             return False
-        segment_loops.new_loops = 0
         did_disagree = pair.disagrees
         self._compare(pair, (first, second), segments)
         changed = self._update_quarantine() if pair.disagrees or did_disagree else False
@@ -267,7 +174,7 @@ class AgentAgreement:
         disagreeing = [(names, pair) for names, pair in pairs.items() if pair.disagrees]
         nis = max((pair.nis for pair in pairs.values() if pair.nis is not None), default=None)
         log, sigma = self._estimate_scales().get(agent, (None, None))
-        state = "agrees" if any(self._is_agreed(pair) for pair in pairs.values()) else "unknown"
+        state = "agrees" if any(pair.agrees for pair in pairs.values()) else "unknown"
         reason = ""
         if agent in self.quarantined:
             state, reason = "set apart", _contradiction_text(agent, disagreeing) + ": check its calibration"
@@ -301,119 +208,28 @@ class AgentAgreement:
         """
         return {names: pair.severity for names, pair in self._pairs.items()}
 
-    # Comparison of two agents
-
-    def _compare(self, pair: _AgentPair, names: AgentNames, segment_pair: SegmentPair) -> None:
-        segment_loops = pair.by_segments[segment_pair]
-        all_loops = [w for one in pair.by_segments.values() for w in one.loops]
-        scales = [w.depth_scale for w in all_loops if w.depth_scale is not None]
-        pair.depth_scale = _pool_scales(scales)
-        pair.recent_depth_scale = (
-            _pool_scales(list(pair.depth_scales)[-_RECENT_DEPTH_SCALES:])
-            if len(scales) > _RECENT_DEPTH_SCALES
-            else None
-        )
-        pair.pooled_depth_scale = _pool_scales(pair.depth_scales)
-        equations_of_pair = _compare_paths(
-            segment_loops,
-            (self._covariance_scales.claims(names[0]), self._covariance_scales.claims(names[1])),
-        )
-        contradictions = [
-            *self._depth_contradictions(pair),
-            *gravity_contradictions(all_loops),
-            *gravity_contradictions(segment_loops.loops[-_MIN_LOOPS:]),
-        ]
-        for one in pair.by_segments.values():
-            contradictions += [
-                *self._path_contradictions(one.comparison),
-                *self._path_contradictions(one.recent_comparison),
-            ]
-        pair.severity = max((severity for severity, _, _ in contradictions), default=0.0)
-        pair.disagrees = pair.severity >= (_END_SEVERITY if pair.disagrees else 1.0)
+    def _compare(self, pair: AgentPair, names: AgentNames, segment_pair: SegmentPair) -> None:
+        claims = self._covariance_scales.claims(names[0]), self._covariance_scales.claims(names[1])
+        equations = pair.compare(segment_pair, claims)
         if pair.disagrees:
             self._covariance_scales.drop_evidence(pair.by_segments)
-        else:
-            if _ENDED_SEGMENTS in pair.by_segments:
-                pair.by_segments[_ENDED_SEGMENTS].comparison = pair.by_segments[
-                    _ENDED_SEGMENTS
-                ].recent_comparison = None
-            self._mark_verified(pair, names)
-            if (
-                equations_of_pair is not None
-                and segment_loops.comparison is not None
-                and not self.quarantined & {*names}
-            ):
-                with suppress(np.linalg.LinAlgError):  # absurd numbers are no evidence
-                    self._covariance_scales.set_evidence(
-                        segment_pair, names, equations_of_pair, segment_loops.comparison.weights
-                    )
-        reported = sorted((f for f in contradictions if f[0] >= _END_SEVERITY), reverse=True)
-        pair.reason_second, pair.reason_first = (
-            first_of_each_kind([t for _, t, _ in reported]),
-            first_of_each_kind([t for *_, t in reported]),
-        )
+            return
+        self._mark_verified(pair, names)
+        comparison = pair.by_segments[segment_pair].comparison
+        if equations is not None and comparison is not None and not self.quarantined & {*names}:
+            with suppress(np.linalg.LinAlgError):  # absurd numbers are no evidence
+                self._covariance_scales.set_evidence(segment_pair, names, equations, comparison.weights)
 
-    def _mark_verified(self, pair: _AgentPair, names: AgentNames) -> None:
+    def _mark_verified(self, pair: AgentPair, names: AgentNames) -> None:
         """Mark agents of the pair as compared, unless the other is itself suspect.
 
         An earlier run of a suspected name may have had a wrong path, so depths alone are not enough for it.
         """
-        has_comparison = any(
-            segment_loops.comparison is not None for segment_loops in pair.by_segments.values()
-        )
         for one, other in (names, names[::-1]):
             was_suspected = one in self.identities.suspected
             is_suspect = other in self.quarantined or (was_suspected and other in self.identities.unverified)
-            if not is_suspect and (has_comparison or (self._is_agreed(pair) and not was_suspected)):
+            if not is_suspect and (pair.has_path_comparison or (pair.agrees and not was_suspected)):
                 self.identities.mark_verified(one)
-
-    def _depth_contradictions(self, pair: _AgentPair) -> list[tuple[float, str, str]]:
-        estimates = [points for points in (pair.depth_scale, pair.recent_depth_scale) if points is not None]
-        words = "its depths are {} % {}", ("larger", "smaller")
-        return [scale_contradiction(points, self._tolerance, *words) for points in estimates]
-
-    def _path_contradictions(self, comparison: OdometryComparison | None) -> list[tuple[float, str, str]]:
-        if comparison is None:
-            return []
-        out = []
-        if comparison.inlier_share >= _MIN_INLIER_SHARE:
-            out.append(
-                scale_contradiction(
-                    comparison.path_scale, self._tolerance, "its path is {} % {}", ("longer", "shorter")
-                )
-            )
-            rotation_text = (
-                f"its camera is rotated by {np.degrees(comparison.camera_rotation.value):.1f} "
-                f"degrees against its calibration"
-            )
-            out.append(
-                (severity(comparison.camera_rotation, _MAX_ROTATION_RAD), rotation_text, rotation_text)
-            )
-        text = f"its loops deviate by {comparison.nis:.1f} times the variance that it states"
-        out.append((comparison.nis / _MAX_NIS, text, text))
-        return out
-
-    def _severity(self, segment_loops: _SegmentPairLoops) -> float:
-        """Severity of the contradictions between the two paths."""
-        return max(
-            (
-                s
-                for s, _, _ in (
-                    *self._path_contradictions(segment_loops.comparison),
-                    *self._path_contradictions(segment_loops.recent_comparison),
-                )
-            ),
-            default=0.0,
-        )
-
-    def _is_agreed(self, pair: _AgentPair) -> bool:
-        return (
-            not pair.disagrees
-            and pair.depth_scale is not None
-            and pair.depth_scale.sigma < self._tolerance / 2
-        )
-
-    # Quarantine and scales of all agents
 
     def _update_quarantine(self) -> bool:
         """Recompute the quarantined and disputed agents; return whether they changed.
@@ -422,7 +238,7 @@ class AgentAgreement:
         quarantined earlier run are suspects.
         """
         disagreeing = {frozenset(names) for names, pair in self._pairs.items() if pair.disagrees}
-        agreeing = [names for names, pair in self._pairs.items() if self._is_agreed(pair)]
+        agreeing = [names for names, pair in self._pairs.items() if pair.agrees]
         agents = {name for names in self._pairs for name in names}
         suspects = {name for name in agents if self.identities.had_quarantined_run(name, self.quarantined)}
         quarantined = frozenset(agents)
@@ -451,20 +267,20 @@ class AgentAgreement:
 
         Least squares over all pairs without an excluded agent.
         """
-        gauges_by_pair = (
+        estimates = (
             (names, pair.pooled_depth_scale)
             for names, pair in self._pairs.items()
             if not {*names} & {*excluded}
         )
-        known = [(names, gauge) for names, gauge in gauges_by_pair if gauge is not None]
+        known = [(names, scale) for names, scale in estimates if scale is not None]
         agents = sorted({name for names, _ in known for name in names})
         if not agents:
             return {}
         column = {name: i for i, name in enumerate(agents)}
         J, z = np.zeros((len(known), len(agents))), np.zeros(len(known))
-        for row, ((a, b), points) in enumerate(known):
-            J[row, column[a]], J[row, column[b]] = -1 / points.sigma, 1 / points.sigma
-            z[row] = points.value / points.sigma
+        for row, ((a, b), scale) in enumerate(known):
+            J[row, column[a]], J[row, column[b]] = -1 / scale.sigma, 1 / scale.sigma
+            z[row] = scale.value / scale.sigma
         x = np.linalg.pinv(J) @ z
         by_credential = {
             self.identities.credential(agent): x[column[agent]]
@@ -476,44 +292,10 @@ class AgentAgreement:
         return {name: (float(x[i]), float(sigma[i])) for name, i in column.items()}
 
 
-def _compare_paths(
-    segment_loops: _SegmentPairLoops, covariance_scales: tuple[float, float]
-) -> ComparisonEquations | None:
-    """Compare by all loops of two segments and by the newest; return the equations of all.
-
-    None with too few loops, or where absurd numbers leave no solution. covariance_scales: see
-    `solve_comparison`.
-    """
-    segment_loops.comparison = segment_loops.recent_comparison = None
-    if len(segment_loops.loops) < _MIN_LOOPS:
-        return None
-    with suppress(np.linalg.LinAlgError):
-        equations_of_pair = comparison_equations(segment_loops.loops)
-        segment_loops.comparison = solve_comparison(equations_of_pair, covariance_scales)
-        if len(segment_loops.loops) > _RECENT_LOOPS:
-            newest = segment_loops.loops[-_RECENT_LOOPS:]
-            segment_loops.recent_comparison = compare_odometry(newest, covariance_scales)
-        return equations_of_pair
-    return None
-
-
-def _pool_scales(scales: Collection[DepthScale]) -> ScalarEstimate | None:
-    return robust_depth_scale(list(scales)) if len(scales) >= _MIN_DEPTH_SCALES else None
-
-
-def _contradiction_text(agent: str, disagreeing: list[tuple[AgentNames, _AgentPair]]) -> str:
+def _contradiction_text(agent: str, disagreeing: list[tuple[AgentNames, AgentPair]]) -> str:
     """Text of the agent's contradictions in these pairs."""
     texts = []
     for (first, second), pair in disagreeing:
         other, text = (first, pair.reason_second) if agent == second else (second, pair.reason_first)
         texts.append(f"against {other} {text}")
     return "; ".join(texts)
-
-
-def _most_redundant_loop(loops: list[InterAgentLoop]) -> int:
-    """Index of the older of the two loops whose ends are closest."""
-    positions = np.array([(w.a.index, w.b.index) for w in loops])
-    distance = np.abs(positions[:, None] - positions[None]).sum(2).astype(float)
-    np.fill_diagonal(distance, np.inf)
-    first, second = np.unravel_index(int(distance.argmin()), distance.shape)
-    return int(min(first, second))

@@ -11,66 +11,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 
-import numpy as np
-
-from share.mapping.agents.pairwise import InterAgentLoop, ScalarEstimate
-from share.mapping.graph.edges import PoseEdge
-from share.types import F64
-
-# Contradictions between two agents
-
-_MIN_SIGMAS = 4.5  # significance of a disagreement: none by chance in thousands of comparisons
-_MAX_TILT_RAD = np.radians(1.0)  # harmless below
-_MIN_LOOPS = 8  # with known up directions
-
-# Severity, a disagreement begins at 1; text about the second agent, and about the first.
-Contradiction = tuple[float, str, str]
-
-
-def tilt_between(
-    up_a: F64, sigma_a: float, up_b: F64, sigma_b: float, edge: PoseEdge
-) -> tuple[float, float] | None:
-    """Angle between two up directions (3,) across a loop, and its sigma, rad; None if one is unknown."""
-    if not up_a.any() or not up_b.any():
-        return None
-    up_b_in_a = edge.T_a_b[:3, :3] @ up_b
-    cross = np.linalg.norm(np.cross(up_a, up_b_in_a)) / np.linalg.norm(up_a) / np.linalg.norm(up_b)
-    sigma = np.sqrt(sigma_a**2 + sigma_b**2 + np.trace(edge.cov[:3, :3]) / 3)
-    return float(np.arcsin(min(1.0, float(cross)))), float(sigma)
-
-
-def gravity_contradictions(loops: list[InterAgentLoop]) -> list[Contradiction]:
-    """Contradiction between the two agents' up directions, if enough loops know them."""
-    known = np.array([w.tilt for w in loops if w.tilt is not None]).reshape(-1, 2)
-    if len(known) < _MIN_LOOPS:
-        return []
-    angle, sigmas = float(np.median(known[:, 0])), float(np.median(known[:, 0] / known[:, 1]))
-    text = f"its up direction is {np.degrees(angle):.1f} degrees off"
-    return [(min(angle / _MAX_TILT_RAD, sigmas / _MIN_SIGMAS), text, text)]
-
-
-def severity(estimate: ScalarEstimate, tolerance: float) -> float:
-    """Severity 1 is reached at the tolerance or at the required significance, whichever comes later."""
-    return min(abs(estimate.value) / tolerance, estimate.significance / _MIN_SIGMAS)
-
-
-def scale_contradiction(
-    estimate: ScalarEstimate, tolerance: float, text: str, words: tuple[str, str]
-) -> Contradiction:
-    """Contradiction in scale, with the text for either agent; `text` has places for the size and one of
-    `words`.
-    """
-    size = f"{100 * abs(np.expm1(estimate.value)):.1f} ± {100 * np.exp(estimate.value) * estimate.sigma:.1f}"
-    more, less = (text.format(size, word) for word in words)
-    return (severity(estimate, tolerance), *((more, less) if estimate.value > 0 else (less, more)))
-
-
-def first_of_each_kind(texts: list[str]) -> str:
-    """Keep the first text of each kind, by its first two words."""
-    kinds = {" ".join(text.split()[:2]): text for text in reversed(texts)}
-    return ", ".join(text for text in texts if text in kinds.values())
-
-
 # Votes: each credential counts once.
 
 Credentials = Mapping[str, str | None]

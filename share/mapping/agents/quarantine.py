@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from share.geometry import se3
+from share.mapping.agents.agent_pair import tilt_between
 from share.mapping.agents.agreement import AgentAgreement, AgentStanding
-from share.mapping.agents.identities import tilt_between
 from share.mapping.culling import RemovedKeyframe
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision
