@@ -36,8 +36,7 @@ from share.types import F64, Keyframe
 class RestoredKeyframe:
     """A keyframe of an earlier session.
 
-    T_ref_body (4, 4), cov (6, 6): of the step that leads to it, as the agent sent it (is_as_sent) or as the
-    pose graph used it.
+    T_ref_body (4, 4), cov (6, 6): of the step that leads to it, as sent (is_as_sent) or as the graph used it.
     """
 
     key: KeyframeKey

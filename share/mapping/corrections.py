@@ -34,8 +34,7 @@ class CorrectionFilter:
     def should_send(self, agent: str, correction: Correction) -> bool:
         """Return whether to send `correction`; if so, it counts as sent.
 
-        It is sent if it answers a keyframe, names another map, or moves odom by more than 1 mm or 0.02
-        degrees.
+        It must answer a keyframe, name another map, or move odom by more than 1 mm or 0.02 degrees.
         """
         last_sent = self._last_sent.get(agent)
         if last_sent is not None and not _has_changed(last_sent, correction):
@@ -68,7 +67,7 @@ class LocalisationGate:
     """State of the gate for each segment. Segments and reference segments are given by their indices."""
 
     def __init__(self, enter_m: float, patience: int) -> None:
-        """An agent enters another map once its sigma is below `enter_m`, or after `patience` keyframes with
+        """Agents enter another map once sigma is below `enter_m`, or after `patience` keyframes with
         loops.
         """
         self._enter_m, self._patience = enter_m, patience
@@ -91,9 +90,7 @@ class LocalisationGate:
         return segment in self._published and self._published[segment][0] == reference_segment
 
     def published_cov(self, segment: int, reference_segment: int) -> F64 | None:
-        """Last covariance (6, 6) of T_map_odom; None if unknown or if the map is not published to the
-        segment.
-        """
+        """Last covariance (6, 6) of T_map_odom; None if unknown or if the map is not published."""
         published, cov = self._published.get(segment, (None, None))
         return cov if published == reference_segment else None
 
@@ -109,8 +106,7 @@ class LocalisationGate:
     ) -> dict[int, float]:
         """Apply a solution of a map: publish it to the segments that may enter.
 
-        reference_segment, map_segments: of the solved map. Returns the sigma (m) of each segment that has to
-        wait.
+        Returns the sigma (m) of each segment that has to wait.
         """
         entering: dict[int, list[int]] = {}
         for s in uncertainties:

@@ -156,9 +156,7 @@ def _pairwise_distance(poses: F64, scale_m: float, scale_rad: float) -> F64:
 
 
 def _row_blocks(count: int) -> list[slice]:
-    """Slices of rows: temporaries for thousands of rows at once would take five times the memory of the
-    result.
-    """
+    """Slices of rows: temporaries for all rows at once would take five times the result's memory."""
     return [slice(k, k + _BLOCK_ROWS) for k in range(0, count, _BLOCK_ROWS)]
 
 
@@ -216,8 +214,7 @@ class KeyframeCulling:
     def choose(self, count: int) -> list[int]:
         """Return up to `count` node ids to remove.
 
-        Newest keyframes of absent runs, and something of each map without a present agent, are kept if
-        possible.
+        If possible, absent runs keep their newest keyframes, and maps without a present agent keep something.
         """
         for reserve in ReturnReserve:
             if len(chosen := self._choose_with(count, reserve)) >= count:
@@ -268,9 +265,7 @@ class KeyframeCulling:
         removed: dict[int, None],
         max_distance: float = np.inf,
     ) -> None:
-        """Add to `removed` the redundant nodes of one map within the quotas, while pairs are closer than
-        `max_distance`.
-        """
+        """Add redundant nodes of one map to `removed`, within the quotas, closer than `max_distance`."""
         graph, c = self._graph, self._config
         node_ids = [n for s in segments for n in graph.odometry.segments[s].nodes if n not in removed]
         owners = [None if n in protected else self._agent_name(n) for n in node_ids]

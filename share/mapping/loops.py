@@ -31,8 +31,7 @@ class KeyframeKey(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A verified relative pose: body of keyframe b in that of a, T_a_b (4, 4), with cov (6, 6) and inlier
-    count.
+    """A verified relative pose of two keyframes: T_a_b (4, 4) of their bodies, cov (6, 6), inlier count.
 
     found_share: share of the points visible in both views that both views show
     (`share.mapping.recognition.missing_points`); None if not computed.

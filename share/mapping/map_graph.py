@@ -139,17 +139,14 @@ class MapGraph:
     ) -> int:
         """Add a keyframe and return its node id.
 
-        cov (6, 6): of its step from the previous one, inflated; gravity_factor (3,). rank: that of a segment
-        which it begins.
+        cov (6, 6): of its step, inflated; gravity_factor (3,). rank: that of a segment which it begins.
         """
         node_id = self.odometry.add_keyframe(agent, keyframe, rank)
         self.add_node(node_id, keyframe.T_ref_body, cov, gravity_factor)
         return node_id
 
     def add_node(self, node_id: int, T_ref_body: F64, cov: F64, gravity_factor: F64) -> None:
-        """Give a new node its pose by odometry as sent, and connect it to the previous node of its segment,
-        if any.
-        """
+        """Pose a new node by odometry as sent, and connect it to the previous node of its segment, if any."""
         node, previous = self.odometry.nodes[node_id], self.odometry.previous_node(node_id)
         agent = self.odometry.segments[node.segment].agent
         T_ref_body = rescale_translation(T_ref_body, self.log_scales.get(agent, 0.0))
@@ -328,8 +325,8 @@ class MapGraph:
         return se3.inverse(self.poses[a]) @ self.poses[b]
 
     def relative_estimates(self, a: int, goals: Sequence[int]) -> RelativePose:
-        """Poses (N, 4, 4) of the goals relative to node a, with covariances along the shortest-covariance
-        paths.
+        """Poses (N, 4, 4) of the goals relative to node a, with covariances along the paths of least
+        covariance.
 
         Raises ValueError if a goal is in another map.
         """

@@ -33,9 +33,7 @@ def stored_link(link: OdometryLink) -> SaveLink:
 
 
 def removal_changes(removed: Iterable[RemovedKeyframe]) -> list[MapChange]:
-    """Convert removals to changes, in the order in which they happened: a link may lead to a keyframe that
-    goes next.
-    """
+    """Convert removals to changes, in their order: a link may lead to a keyframe that goes next."""
     changes: list[MapChange] = []
     for keyframe in removed:
         if keyframe.link is not None:

@@ -125,11 +125,9 @@ class MapSolving:
     def _segments_wanting_covariance(
         self, reference_segment: int, segments: Sequence[int]
     ) -> tuple[int, ...]:
-        """Segments whose covariance is needed: of agents that are answered, or whose pose in this map is
-        unpublished.
+        """Segments that need a covariance: of agents that are answered, or unpublished in this map.
 
-        Absent agents that would enter the map are left out; one that was in it before a restart is answered
-        when it returns.
+        Absent agents that would enter the map are left out; those in it before a restart are not.
         """
         odometry = self._graph.odometry
         return tuple(
@@ -186,9 +184,7 @@ class MapSolving:
             graph.propagate(n for n in graph.odometry.segments[segment].nodes if n > last)
 
     def _update_gate(self, job: SolveJob, solution: GraphSolution) -> dict[str, float]:
-        """Pass the new covariances to the localisation gate. Return the sigma (m) of each agent that has to
-        wait.
-        """
+        """Pass the new covariances to the localisation gate. Return the sigma (m) of agents that wait."""
         odometry, nodes = self._graph.odometry, self._graph.odometry.nodes
         covariances = dict(zip(job.covariance_nodes, solution.covariances, strict=True))
         answered_ids = dict(job.answered_ids)

@@ -139,8 +139,7 @@ class Mapper:
     def _map_rank(self, agent: str, is_reference: bool = False) -> int:
         """Rank of a new segment: lower ranks keep their map in a merge.
 
-        A headset's wearer would notice if the map moved, so others merge into headsets' maps; all merge into
-        restored maps.
+        Headsets' maps stay, as their wearers would notice a jump; restored maps come before both.
         """
         hello = self._hellos.get(agent)  # None: missing in a damaged file
         is_headset = hello is not None and qoe_form(self._config, hello) is AgentKind.AR

@@ -79,8 +79,7 @@ class OverlapCheck:
     def review_joins(self, node_id: int, allowed_share: float) -> Iterator[tuple[tuple[int, int], float]]:
         """Compare a new node with each segment whose merge with the node's segment is on probation.
 
-        allowed_share: share of a view that may be missing. Yields the two segments and the CUSUM of the
-        merge.
+        allowed_share: share of a view that may be missing. Yields both segments and the CUSUM.
         """
         segment = self._graph.odometry.nodes[node_id].segment
         for pair, probation in list(self._probations.items()):
@@ -138,9 +137,7 @@ class OverlapCheck:
 
 
 def cusum(previous: float, comparison: MissingRegions, allowed_share: float) -> float:
-    """Cumulative sum, floored at 0, of the missing share beyond `allowed_share` (Page's CUSUM, Biometrika
-    1954).
-    """
+    """Sum, floored at 0, of the missing share beyond `allowed_share` (Page's CUSUM, Biometrika 1954)."""
     return max(0.0, previous + comparison.missing_share - allowed_share)
 
 

@@ -65,9 +65,7 @@ def qoe_form(config: Config, hello: Hello) -> AgentKind:
 
 
 def service_kind(config: Config, hello: Hello) -> AgentKind:
-    """Kind that decides the agent's share of look-ups; all agents count as AR under policies that treat them
-    alike.
-    """
+    """Kind that sets the agent's share of look-ups; AR for all under policies that treat agents alike."""
     if POLICIES[config.edge.policy].treats_alike:
         return AgentKind.AR
     return qoe_form(config, hello)
@@ -155,8 +153,7 @@ _FAR_RAD = 1.0
 def rank_candidates(graph: MapGraph, node_id: int, others: Sequence[int]) -> list[int]:
     """Sort candidates: those in larger maps first, so that agents end up in one map.
 
-    Last are those that this keyframe cannot see according to its map; they are tried too, since the map may
-    be wrong.
+    Last, but tried too, are those that this keyframe cannot see according to its map, which may be wrong.
     """
     nodes = graph.odometry.nodes
     sizes: Counter[int] = Counter()

@@ -58,8 +58,6 @@ def _reconnect(keyframe: StoredKeyframe, edge: SaveLink, previous: StoredKeyfram
 
 
 def _with_edge(keyframe: StoredKeyframe, edge: SaveLink) -> StoredKeyframe:
-    """Return the keyframe as if its agent had sent this edge: the covariance is still the agent's, not the
-    graph's.
-    """
+    """Return the keyframe as if its agent had sent this edge: the covariance is not yet inflated."""
     sent = replace(keyframe.keyframe, reference=edge.reference, T_ref_body=edge.T_ref_body, cov=edge.cov)
     return replace(keyframe, keyframe=sent)

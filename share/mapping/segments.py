@@ -139,8 +139,8 @@ class OdometrySegments:
         return self._neighbour(node_id, +1)
 
     def are_neighbours(self, a: int, b: int, min_gap: int) -> bool:
-        """Return whether a and b are fewer than `min_gap` keyframes apart on one segment, where odometry is
-        better than a loop.
+        """Return whether a and b are too close on one segment for a loop: fewer than `min_gap` keyframes
+        apart.
         """
         first, second = self.nodes[a], self.nodes[b]
         return first.segment == second.segment and abs(first.ordinal - second.ordinal) < min_gap
@@ -155,9 +155,7 @@ class OdometrySegments:
 
 
 class AgentRuns:
-    """Runs by agent name, and which runs are connected. An unregistered run is present under its own id as
-    name.
-    """
+    """Runs by agent name, and which runs are connected. An unregistered run is present under its own id."""
 
     def __init__(self) -> None:
         self._name_by_run: dict[str, str] = {}

@@ -247,9 +247,7 @@ def severity(estimate: ScalarEstimate, tolerance: float) -> float:
 def scale_contradiction(
     estimate: ScalarEstimate, tolerance: float, text: str, words: tuple[str, str]
 ) -> Contradiction:
-    """Contradiction in scale, with the text for either agent; `text` has places for the size and one of
-    `words`.
-    """
+    """Contradiction in scale, with either agent's text; `text` has places for the size and a word."""
     size = f"{100 * abs(np.expm1(estimate.value)):.1f} ± {100 * np.exp(estimate.value) * estimate.sigma:.1f}"
     more, less = (text.format(size, word) for word in words)
     return (severity(estimate, tolerance), *((more, less) if estimate.value > 0 else (less, more)))

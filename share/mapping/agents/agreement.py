@@ -95,10 +95,8 @@ class AgentAgreement:
         return self._covariance_scales.scales.get(self.identities.identity(run), 1.0)
 
     def remove_nodes(self, node_ids: Collection[int], live: Container[int]) -> None:
-        """Remove nodes. live: segments that still have nodes.
-
-        Loops of other segments stay as evidence of agreement only: a disagreement does not end because its
-        loops were removed.
+        """Remove nodes. live: segments that still have nodes; see `AgentPair.end_segments` for the loops of
+        others.
         """
         for node_id in node_ids:
             self._accumulated.pop(node_id, None)
@@ -106,9 +104,7 @@ class AgentAgreement:
         self._covariance_scales.drop_evidence(sorted(ended))
 
     def remove_run(self, run: str) -> None:
-        """Forget a run that will not return. With an agent's last run all but its name's reputation is
-        forgotten.
-        """
+        """Forget a run that will not return; after an agent's last run only suspicion of its name stays."""
         removed = self.identities.remove_run(run, self.quarantined, frozenset[str]().union(*self.disputed))
         if removed is None:
             return
@@ -156,9 +152,7 @@ class AgentAgreement:
         return ""
 
     def unverified_reason(self, first_runs: Collection[str], second_runs: Collection[str]) -> str:
-        """Why these agents must not share a map with those before one of them is compared; empty if they
-        may.
-        """
+        """Why an agent must be compared before these share a map with those; empty if none must."""
         identities = {self.identities.identity(run) for run in (*first_runs, *second_runs)}
         unverified = self.identities.unverified & identities if len(identities) > 1 else set[str]()
         return (
@@ -203,9 +197,7 @@ class AgentAgreement:
         return "the edge has restarted"
 
     def contradictions(self) -> dict[AgentNames, float]:
-        """Severity of the contradictions of each compared pair, names in order; a disagreement begins at
-        1.
-        """
+        """Severity of the contradictions of each pair (names in order); 1 begins a disagreement."""
         return {names: pair.severity for names, pair in self._pairs.items()}
 
     def _compare(self, pair: AgentPair, names: AgentNames, segment_pair: SegmentPair) -> None:

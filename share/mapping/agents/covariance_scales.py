@@ -33,8 +33,7 @@ from share.types import F64, I64
 def inflate_covariance(config: MergeConfig, T_ref_body: F64, cov: F64) -> F64:
     """Covariance (6, 6) of an odometry step as the graph uses it.
 
-    Agents understate it, so it is scaled; a floor that grows with the step is added, better than which no
-    agent is.
+    Agents understate it, so it is scaled; a floor that grows with the step is added.
     """
     angle_rad, length_m = float(se3.rotation_angle(T_ref_body)), float(np.linalg.norm(T_ref_body[:3, 3]))
     rad2 = np.radians(config.odometry_floor_deg) ** 2 + (config.odometry_floor_per_rad * angle_rad) ** 2

@@ -97,9 +97,7 @@ class AgentIdentities:
         self.suspected.discard(identity)
 
     def mark_unverified(self, runs: Collection[str]) -> None:
-        """Group these runs of an earlier session, of which nothing else is known, into one unverified
-        identity per name.
-        """
+        """Group these runs of an earlier session into one unverified identity per name."""
         for run in runs:
             self.add_run(run, run, ())
         known = [(run, self.name(run)) for run in self._identity_by_run]
@@ -121,8 +119,7 @@ class AgentIdentities:
     def remove_run(self, run: str, quarantined: Collection[str], disputed: Collection[str]) -> str | None:
         """Forget a run; return its identity if that was its last run.
 
-        quarantined, disputed: current identities. Suspicion of the identity passes to the next run of its
-        name.
+        quarantined, disputed: current identities. Suspicion passes to the next run of the name.
         """
         identity = self.identity(run)
         runs = self._runs.get(identity, [run])
@@ -174,9 +171,7 @@ class AgentIdentities:
         return self._runs.get(identity, [identity])[-1]
 
     def had_quarantined_run(self, run: str, quarantined: Iterable[str]) -> bool:
-        """Return whether another identity of the run's name is or was quarantined. quarantined: current
-        ones.
-        """
+        """Return whether another identity of the run's name was quarantined, or is in `quarantined`."""
         return self.shares_name_with_any(run, quarantined) or self._suspect_names.get(self.name(run), False)
 
     def shares_name_with_any(self, run: str, others: Iterable[str]) -> bool:

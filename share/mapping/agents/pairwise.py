@@ -40,9 +40,7 @@ _MIN_SCALE_SIGMA = 0.003  # of log scales: no two agents are calibrated better
 
 @dataclass(frozen=True, eq=False)
 class AccumulatedOdometry:
-    """Odometry from the start of a segment to its keyframe `index`: T (4, 4) with cov (6, 6), left
-    perturbation.
-    """
+    """Odometry from a segment's start to its keyframe `index`: T (4, 4), cov (6, 6), left perturbation."""
 
     index: int
     T: F64
@@ -125,9 +123,7 @@ class ComparisonEquations:
 
 
 def robust_depth_scale(scales: Sequence[DepthScale]) -> ScalarEstimate:
-    """Robust mean of at least one log scale. sigma: from their scatter where that exceeds their own
-    sigmas.
-    """
+    """Robust mean of at least one log scale. sigma: from their scatter if that is larger."""
     logs, variance = np.array([s.log for s in scales]), np.array([s.sigma for s in scales]) ** 2
     variance = variance + _LOG_SCALE_FLOOR**2
     mean, weight = float(np.median(logs)), np.ones(len(logs))
@@ -147,9 +143,7 @@ def robust_depth_scale(scales: Sequence[DepthScale]) -> ScalarEstimate:
 def compare_odometry(
     loops: Sequence[InterAgentLoop], covariance_scales: tuple[float, float] = _AS_STATED
 ) -> OdometryComparison:
-    """Compare by at least three loops between the same two segments. covariance_scales: see
-    `solve_comparison`.
-    """
+    """Compare by at least three loops of the same two segments: see `solve_comparison`."""
     return solve_comparison(comparison_equations(loops), covariance_scales)
 
 

@@ -29,9 +29,7 @@ _MAX_WITHDRAWN = 2000  # newest withdrawn loops
 
 @dataclass(frozen=True, eq=False)
 class QuarantineChange:
-    """Agents whose standing has changed, and the loops removed (dropped) or accepted again (added) because of
-    it.
-    """
+    """Agents with a new standing, and the loops removed (dropped) or accepted again (added) because of it."""
 
     standings: dict[str, AgentStanding] = field(default_factory=dict)
     dropped: tuple[Loop, ...] = ()
@@ -106,9 +104,7 @@ class Quarantine:
         return tuple(n for s in segments if s.agent in separated for n in s.nodes) if separated else ()
 
     def separation_reason(self, loop: Loop) -> str:
-        """Why the loop must not be accepted: it would connect agents that must be separate; empty if it may
-        be.
-        """
+        """Why the loop must not be accepted: it would connect agents kept in separate maps; else empty."""
         reference_segments = self._graph.reference_segment(loop.a), self._graph.reference_segment(loop.b)
         if reference_segments[0] == reference_segments[1]:
             return ""
@@ -154,7 +150,7 @@ class Quarantine:
                 graph.rescale_odometry(agent, *scales)
 
     def suspect_restored(self) -> None:
-        """Mark agents outside the largest map of a restored session as unverified: some may have been
+        """Mark agents outside a restored session's largest map as unverified: they may have been
         quarantined.
         """
         identities = self.agreement.identities
@@ -168,8 +164,8 @@ class Quarantine:
         identities.mark_unverified(set[str]().union(*maps) - trusted)
 
     def _split_maps(self) -> tuple[Loop, ...]:
-        """Remove loops until no map has two agents that must be separate: first those between them, then the
-        fewest others.
+        """Remove loops until separated agents share no map: first loops between them, then the fewest
+        others.
         """
         graph, segments = self._graph, self._graph.odometry.segments
         before = list(graph.reference_segments)

@@ -35,8 +35,8 @@ class ShortestPaths:
         self._graph = csr_array((self._cost, self._targets, self._starts), shape=(n, n))
 
     def predecessors(self, start: int) -> I64:
-        """Return the pose before each (n,) on the path from `start`; negative for the start and unreachable
-        poses.
+        """Return the pose before each (n,) on its path from `start`; negative for the start and unreachable
+        ones.
         """
         from scipy.sparse.csgraph import dijkstra
 
@@ -110,8 +110,7 @@ class CovariancePaths:
         self._paths = None
 
     def covariances_from(self, start: int, goals: Sequence[int], poses: PosesById) -> list[F64 | None]:
-        """Covariance (6, 6) of T_start_goal for each goal, along the path of least covariance; None without a
-        path.
+        """Covariance (6, 6) of T_start_goal for each goal, along the path of least covariance; or None.
 
         Each step is placed at the current `poses`. One search serves all goals.
         """

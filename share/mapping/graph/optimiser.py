@@ -125,7 +125,7 @@ def _gauss_newton_step(
 def _triggs_correction(
     J: tuple[F64, F64], residuals_at: EdgeResiduals, weights: F64, edges: EdgeArrays
 ) -> tuple[tuple[F64, F64], F64]:
-    """Soften the Jacobians along each loop's residual, where the kernel bends away; return also by how much
+    """Soften the Jacobians along each loop's residual, where the kernel bends away; return also the factor
     (E,).
 
     Without it the last millimetres take many steps (Triggs et al., section 4.3). Loops in the non-convex part

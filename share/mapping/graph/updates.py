@@ -146,9 +146,7 @@ def contract_pose(
 
 
 def _move_end(edge: PoseEdge, old_end: int, new_end: int, path_edge: PoseEdge, share: float) -> PoseEdge:
-    """Move an end of `edge` from `old_end` to `new_end` along `path_edge`, with `share` of the latter's
-    information.
-    """
+    """Move an end of `edge` along `path_edge`, with `share` of the latter's information."""
     oriented_path = path_edge if path_edge.a == old_end else path_edge.reverse()
     incoming = edge if edge.b == old_end else edge.reverse()
     cov = se3.compose_cov(oriented_path.T_a_b, incoming.cov, oriented_path.cov / share)

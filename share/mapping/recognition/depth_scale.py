@@ -31,8 +31,7 @@ _RIDGE = 1e-6 * np.eye(7)
 class DepthScale(NamedTuple):
     """Log of the query's depths over the candidate's, with its sigma.
 
-    pose_sensitivity (6,): change of T_c_q, perturbed on the left, per unit of log that is corrected; None if
-    unknown.
+    pose_sensitivity (6,): left perturbation of T_c_q per unit of log that is corrected; None if unknown.
     """
 
     log: float

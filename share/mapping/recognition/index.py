@@ -124,9 +124,7 @@ class PlaceIndex:
         return np.array(list(self._unpaged), np.int64), np.array([len(w) for w in views], np.int64), votes
 
     def _merge_pages(self, count: int) -> None:
-        """Merge the newest `count` adjacent pages that fit in one page and of which the first is not much
-        larger.
-        """
+        """Merge the newest `count` adjacent pages that fit in one, the first at most twice the last."""
         for first in range(len(self._pages) - count, -1, -1):
             pages = self._pages[first : first + count]
             if sum(map(len, pages)) <= MAX_PAGE_KEYFRAMES and len(pages[0]) <= 2 * len(pages[-1]):

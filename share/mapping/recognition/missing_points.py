@@ -45,9 +45,7 @@ class MissingPoints(NamedTuple):
 
 
 class MissingRegions(NamedTuple):
-    """Points of both views that should be visible in the other, and how many are in patches without any
-    found.
-    """
+    """Points of both views that should be visible in the other, and those in patches without any found."""
 
     visible: int
     missing: int
@@ -81,9 +79,7 @@ def missing_regions(query: CameraView, candidate: CameraView, T_c_q: F64) -> Mis
 
 
 class _ExpectedPoints(NamedTuple):
-    """Points of one view that should be visible in the other: position there (N, 2), and whether found
-    (N,).
-    """
+    """Points of one view that should be visible in the other: position there (N, 2), is_found (N,)."""
 
     uv: F64
     is_found: NDArray[np.bool_]

@@ -32,8 +32,7 @@ RANSAC_CONFIDENCE = 0.99  # per direction; the two seldom fail alike
 class CameraView:
     """A view with its camera.
 
-    focal of cam0 [px]; T_body_cam0 (4, 4); up (3,): against gravity in the body frame, zeros if unknown (as
-    in `Keyframe.up`).
+    focal of cam0 [px]; T_body_cam0 (4, 4); up (3,): against gravity in the body frame, zeros if unknown.
     """
 
     view: View
@@ -98,8 +97,7 @@ def verify(
 class _PoseFit:
     """A refined pose T_c_q of the cameras with its covariance.
 
-    guided_matches: keypoint pairs near the projection, (M, 3) each; inliers_q, inliers_c (N, 3): those that
-    agree with the pose.
+    guided_matches: keypoint pairs near the projection, (M, 3) each; inliers_q, inliers_c (N, 3).
     """
 
     T: F64
