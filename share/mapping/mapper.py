@@ -139,7 +139,7 @@ class Mapper:
     def _map_rank(self, agent: str, is_reference: bool = False) -> int:
         """Rank of a new segment: lower ranks keep their map in a merge.
 
-        Headsets' maps stay, as their wearers would notice a jump; restored maps come before both.
+        Headsets' maps stay, as their wearers would notice a jump; restored maps come first.
         """
         hello = self._hellos.get(agent)  # None: missing in a damaged file
         is_headset = hello is not None and qoe_form(self._config, hello) is AgentKind.AR
