@@ -195,7 +195,7 @@ _SAME_PLACE_DISTANCE = 1.0  # in the measure of `redundant`
 
 
 class ReturnReserve(Enum):
-    """What is kept for the return of absent agents, most first.
+    """Keyframes kept for the return of absent agents, most first.
 
     NEWEST_AND_MAP: their newest keyframes and something of their map; MAP_ONLY: only the latter.
     """

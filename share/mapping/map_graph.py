@@ -53,6 +53,7 @@ class GraphEdges:
         return edge_id
 
     def remove(self, edge_id: int) -> None:
+        """Remove an edge, and its loop if it has one."""
         edge = self.by_id.pop(edge_id)
         self.loops.pop(edge_id, None)
         for end in (edge.a, edge.b):

@@ -18,7 +18,7 @@ from share.types import Correction
 
 @dataclass(frozen=True, eq=False)
 class AppliedSolution:
-    """What a solution changed.
+    """Changes made by a solution.
 
     corrections: by agent. added, dropped: loops accepted or removed because of it. waiting_sigma_m: agents
     whose correction the localisation gate holds back, with the sigma (m) of their position.

@@ -1,4 +1,4 @@
-"""What the mapper counts for its reports: loops and merges of each run, steps and their durations."""
+"""Counters for the mapper's reports: loops and merges of each run, steps and their durations."""
 
 from __future__ import annotations
 

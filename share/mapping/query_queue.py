@@ -116,7 +116,8 @@ class QueryQueue:
     def next_query(self) -> int | None:
         """Take the newest waiting keyframe of the agent whose turn it is, or None.
 
-        Among the agents with the newest keyframes, it is the turn of the one that waited longest.
+        Among the agents with the newest keyframes, it is the turn of the one that waited longest, weighted by
+        kind.
         """
         if not self._waiting:
             return None

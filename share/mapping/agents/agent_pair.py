@@ -108,12 +108,12 @@ class AgentPair:
 
     @property
     def has_path_comparison(self) -> bool:
-        """Whether loops of two segments were enough to compare the paths."""
+        """True if two segments have enough loops to compare the paths."""
         return any(segment_loops.comparison is not None for segment_loops in self.by_segments.values())
 
     @property
     def agrees(self) -> bool:
-        """Whether the depths are known to agree, and nothing contradicts."""
+        """True if the depths are known to agree and nothing contradicts."""
         depth_scale = self._depth_scale
         return not self.disagrees and depth_scale is not None and depth_scale.sigma < self._tolerance / 2
 

@@ -25,7 +25,7 @@ def outvoted_agents(
     """Agents that most others disagree with, found one after the other.
 
     disagreeing, agreeing: pairs of agents. Of equals a suspect is chosen, then the agent with fewer that
-    agree. The search ends where several credentials are equal.
+    agree. The search ends where agents with different credentials rank equal.
     """
     supporters, out, remaining = _count_votes(agreeing, credentials), set[str](), set(disagreeing)
     while remaining:
@@ -141,6 +141,7 @@ class AgentIdentities:
         return identity
 
     def identity(self, run: str) -> str:
+        """Identity of a run; an unregistered run is its own."""
         return self._identity_by_run.get(run, run)
 
     def name(self, run: str) -> str:

@@ -139,6 +139,7 @@ class _LinearSystem:
         return np.asarray(self.Jr.reshape(7, -1) @ (self.WJr * weight).reshape(7, -1).T)
 
     def step(self, weight: NDArray[Any]) -> F64:
+        """Gauss-Newton step (6,) of matches weighted by (N,)."""
         normal = self.normal(weight)
         return np.asarray(np.linalg.solve(normal[:6, :6] + _RIDGE, normal[:6, 6]), np.float64)
 
