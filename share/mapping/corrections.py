@@ -1,9 +1,9 @@
-"""How surely the map knows where each agent's odometry lies in it, and whether he hears of it.
+"""Which corrections an agent is sent: the localisation gate and the filter of small changes.
 
-Who comes into another's map is not told where he is there while that is known badly. A join by a few loops at
-one spot can be turned by degrees, which further loops put right within seconds; until then his own map
-goes on. Those who were in one map together hear of the new one together. Nobody waits for more than so many
-keyframes with loops: in a large hall, far from where its map began, nothing is known to a few centimetres.
+Localisation gate: an agent whose map merged into another is not sent its pose there while that is uncertain.
+A merge by a few loops at one spot can be wrong by degrees, which further loops correct within seconds; until
+then the agent keeps its own map. Agents that shared a map enter the new one together. The wait is bounded by
+a number of keyframes with loops: in a large hall, far from the reference, no pose is known to centimetres.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ import numpy as np
 from share.geometry import se3
 from share.types import F64, Correction
 
-# ---- Which corrections an agent has to be told: those that move it, or that it waits for.
-
-_MIN_SHIFT_M, _MIN_ROTATION_RAD = (
-    1e-3,
-    float(np.radians(0.02)),
-)  # what moves an agent less, it does not notice
+# Changes below both are not noticeable.
+_MIN_SHIFT_M = 1e-3
+_MIN_ROTATION_RAD = float(np.radians(0.02))
 
 
 class CorrectionFilter:
-    """What every agent was told last. `agent` names one run of an agent."""
+    """Remembers the last correction sent to each run, and passes those that matter."""
 
     def __init__(self) -> None:
         self._last_sent: dict[str, Correction] = {}
 
     def remove_agent(self, agent: str) -> None:
+        """Forget a run."""
         self._last_sent.pop(agent, None)
 
     def should_send(self, agent: str, correction: Correction) -> bool:
-        """Whether it has to be sent; if so, it counts as told. It answers a keyframe, names another map, or
-        moves odom by more than a millimetre or 0.02 degrees."""
+        """Return whether to send `correction`; if so, it counts as sent.
+
+        It must answer a keyframe, name another map, or move odom by more than 1 mm or 0.02 degrees.
+        """
         last_sent = self._last_sent.get(agent)
         if last_sent is not None and not _has_changed(last_sent, correction):
             return False
@@ -52,8 +52,11 @@ def _has_changed(last_sent: Correction, new: Correction) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PlacementUncertainty:
-    """cov (6, 6): of T_map_odom. spread_m: 1 sigma (root of the trace) of where the agent is. answers: his
-    keyframe from which a loop is new in this solution, None if there is none."""
+    """Uncertainty of an agent's pose in a map.
+
+    cov (6, 6): of T_map_odom. sigma_m: root of the trace of the position covariance, m. answered_id: the
+    agent's keyframe with a loop that is new in this solution, or None.
+    """
 
     cov: F64
     sigma_m: float
@@ -61,41 +64,39 @@ class PlacementUncertainty:
 
 
 class LocalisationGate:
-    """Of stretches, by their numbers; maps by their founders'."""
+    """State of the gate for each segment. Segments and reference segments are given by their indices."""
 
     def __init__(self, enter_m: float, patience: int) -> None:
-        """enter_m: who is known worse waits before another map, for at most so many keyframes with loops."""
+        """Agents enter another map once sigma is below `enter_m`, or after `patience` keyframes with
+        loops.
+        """
         self._enter_m, self._patience = enter_m, patience
-        self._published: dict[
-            int, tuple[int, F64 | None]
-        ] = {}  # founder of the map he was told of, cov there
-        self._waited_for: dict[
-            tuple[int, int], set[tuple[int, int]]
-        ] = {}  # keyframes, by map left and entered
+        # By segment: reference segment of the published map, and the covariance there.
+        self._published: dict[int, tuple[int, F64 | None]] = {}
+        # By map left and map entered: (segment, keyframe) with loops since the merge.
+        self._waited: dict[tuple[int, int], set[tuple[int, int]]] = {}
 
     def restore(self, segment: int, reference_segment: int) -> None:
-        """An earlier life has told him of this map; how surely he is known there is yet to be found."""
+        """An earlier session published this map to the segment; its covariance there is not known yet."""
         self._published[segment] = (reference_segment, None)
 
     def forget(self, segments: Collection[int]) -> None:
-        """These have no keyframes any more."""
+        """Forget segments without keyframes."""
         for segment in segments:
             self._published.pop(segment, None)
 
     def is_published(self, segment: int, reference_segment: int) -> bool:
-        """Whether he has heard of this map."""
+        """Return whether the segment's agent was sent a correction in this map."""
         return segment in self._published and self._published[segment][0] == reference_segment
 
     def published_cov(self, segment: int, reference_segment: int) -> F64 | None:
-        """cov (6, 6) of T_map_odom, as last found; None if it was not, or he has not heard of this map."""
-        known, cov = self._published.get(segment, (None, None))
-        return cov if known == reference_segment else None
+        """Last covariance (6, 6) of T_map_odom; None if unknown or if the map is not published."""
+        published, cov = self._published.get(segment, (None, None))
+        return cov if published == reference_segment else None
 
     def forget_waits(self, segments: Collection[int]) -> None:
-        """A join that took these in was undone: if it is made again, it is waited for anew."""
-        self._waited_for = {
-            pair: waited_for for pair, waited_for in self._waited_for.items() if pair[0] not in segments
-        }
+        """Restart the wait of these segments, whose merge was undone."""
+        self._waited = {pair: waited for pair, waited in self._waited.items() if pair[0] not in segments}
 
     def update(
         self,
@@ -103,14 +104,15 @@ class LocalisationGate:
         map_segments: Collection[int],
         uncertainties: Mapping[int, PlacementUncertainty],
     ) -> dict[int, float]:
-        """What a solution of a map, of these stretches, says of those whom it was asked for. Returns who
-        waits: his spread, m."""
+        """Apply a solution of a map: publish it to the segments that may enter.
+
+        Returns the sigma (m) of each segment that has to wait.
+        """
         entering: dict[int, list[int]] = {}
         for s in uncertainties:
             previous_map = self._published[s][0] if s in self._published else s
-            if (
-                s != reference_segment and previous_map != reference_segment and previous_map in map_segments
-            ):  # else the map that he knows is none
+            enters = reference_segment not in (s, previous_map)
+            if enters and previous_map in map_segments:  # else the published map no longer exists
                 entering.setdefault(previous_map, []).append(s)
         waiting_groups = (
             group
@@ -119,7 +121,7 @@ class LocalisationGate:
         )
         waiting = [s for group in waiting_groups for s in group]
         self._published |= {
-            s: (reference_segment, at.cov) for s, at in uncertainties.items() if s not in waiting
+            s: (reference_segment, known.cov) for s, known in uncertainties.items() if s not in waiting
         }
         return {s: uncertainties[s].sigma_m for s in waiting}
 
@@ -130,9 +132,9 @@ class LocalisationGate:
         uncertainties: Mapping[int, PlacementUncertainty],
         entering: list[int],
     ) -> bool:
-        """Those who come from one map; counted."""
+        """Decide for the segments that enter from one map, and count their keyframes with loops."""
         if max(uncertainties[s].sigma_m for s in entering) <= self._enter_m:
             return False
-        waited = self._waited_for.setdefault((previous_map, reference_segment), set())
+        waited = self._waited.setdefault((previous_map, reference_segment), set())
         waited.update((s, key) for s in entering if (key := uncertainties[s].answered_id) is not None)
         return len(waited) <= self._patience

@@ -1,10 +1,12 @@
-"""Which keyframes go where there are too many: fair between names, and what is over before what goes on.
+"""Culling: which redundant keyframes to remove, and how to remove them.
 
-The unit is the name, not the run: nobody has more by starting again and again. All names that are away count
-as one beside those that are heard: any number of them takes no more of these than one would. Of a name that
-has to give go, in this order: what looks like another keyframe in maps that are over, the same in the others,
-whole maps that are over, the smallest first, and then what is most alike. A map is over where nobody walks in
-it any more and only one name ever did.
+The keyframes that stay cover the same views. Odometry and loops of a removed keyframe move to its neighbour
+(`share.mapping.graph.updates`), so their information stays, slightly less certain.
+
+Quotas are per agent name, not per run: restarts gain nothing. All absent names together count as one name
+beside those present. A name gives in this order: keyframes that resemble others in finished maps, the same in
+ongoing maps, whole finished maps from the smallest, then the most redundant of the rest. A map is finished if
+none of its agents is present and it has keyframes of one name only.
 """
 
 from __future__ import annotations
@@ -26,19 +28,17 @@ from share.mapping.map_graph import MapGraph
 from share.mapping.segments import AgentRuns, Node, fair_quotas
 from share.types import F64, Keyframe
 
-# ---- Fewer keyframes, the same room: those that show what others show as well are taken out.
-#
-# What is left covers the same views; odometry and loops of a keyframe that goes are moved to its neighbour
-# (`share.mapping.graph.updates`), so what was known stays known, a little less surely.
-
 _BLOCK_ROWS = 256
-_NO_NEIGHBOUR_DISTANCE = 1e9  # as unlike as that is who has no other beside it
+_NO_NEIGHBOUR_DISTANCE = 1e9  # of a pose without others
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryLink:
-    """The odometry edge that leads to keyframe `key` now, from keyframe `reference` of the same agent; None:
-    it is the first of its stretch now, and T_ref_body (4, 4) is its T_odom_body. cov (6, 6): of it."""
+    """The odometry edge that now leads to keyframe `key` from keyframe `reference` of the same agent.
+
+    reference None: the keyframe is now the first of its segment, and T_ref_body (4, 4) is its T_odom_body.
+    cov (6, 6): of T_ref_body.
+    """
 
     key: KeyframeKey
     reference: KeyframeKey | None
@@ -48,7 +48,7 @@ class OdometryLink:
 
 @dataclass(frozen=True, eq=False)
 class RemovedKeyframe:
-    """A keyframe that is gone, what leads to the one after it now, and loops that were moved elsewhere."""
+    """A removed keyframe, the edge that now leads to the next one, and its loops at their new ends."""
 
     node_id: int
     key: KeyframeKey
@@ -64,11 +64,11 @@ def redundant(
     scale_rad: float,
     max_distance: float,
 ) -> list[int]:
-    """Which of poses (N, 4, 4) to take out: again and again one of the two that are most alike, the one that
-    has the nearer second neighbour, while they are no less alike than `max_distance`.
+    """Select poses (N, 4, 4) to remove, by index, in order of removal.
 
-    whose: of each pose; of those of None none goes. due: how many go of each name; counted down. Two poses
-    are as unlike as |shift| / apart_m + angle / apart_rad.
+    Repeatedly takes one of the closest pair, the one whose second neighbour is nearer, while the pair is
+    closer than `max_distance`. Distance of two poses: |shift| / scale_m + angle / scale_rad. owners: name of
+    each pose; None: must stay. quotas: removals of each name; counted down.
     """
     distance = _pairwise_distance(poses, scale_m, scale_rad)
     np.fill_diagonal(distance, np.inf)
@@ -93,18 +93,18 @@ def redundant(
 
 
 def bridge_odometry(T_odom_previous: F64, lost_steps: int, keyframe: Keyframe) -> tuple[F64, F64]:
-    """T_before_body (4, 4) of a keyframe whose reference is not there any more, from one before it on its
-    stretch, and its covariance (6, 6). lost: how many steps lie between that and the reference.
+    """T_previous_body (4, 4), with covariance (6, 6), of a keyframe whose reference was removed.
 
-    Both stand in one odometry, so their relative pose is known: T_odom_before^-1 T_odom_body. Of the steps in
-    between nothing is left; each is taken to be as uncertain as the step that is known.
+    T_odom_previous: an earlier keyframe of the segment, `lost_steps` before the reference. Both are in one
+    odometry frame, so their relative pose is T_odom_previous^-1 T_odom_body. The covariances of the steps
+    between are gone; each is given that of the known step.
     """
     cov: F64 = se3.compose_cov(keyframe.T_ref_body, max(1, lost_steps) * keyframe.cov, keyframe.cov)
     return se3.orthonormal(se3.inverse(T_odom_previous) @ keyframe.T_odom_body), (cov + cov.T) / 2
 
 
 def reconnect(agent: str, keyframe: Keyframe, previous: Node | None) -> OdometryLink:
-    """The odometry edge to such a keyframe from the newest that is left of its stretch, if one is."""
+    """Odometry edge to such a keyframe from the newest one left on its segment, if any."""
     key = KeyframeKey(agent, keyframe.id)
     if previous is None:
         return OdometryLink(key, None, keyframe.T_odom_body, keyframe.cov)
@@ -116,9 +116,11 @@ def reconnect(agent: str, keyframe: Keyframe, previous: Node | None) -> Odometry
 
 
 def remove_keyframe(graph: MapGraph, node_id: int, max_loops: int) -> RemovedKeyframe:
-    """Of a keyframe with an odometry neighbour; one without takes its loops along. No keyframe is given
-    more than `max_loops` loops, but for the last between two stretches. `chart.find_maps` is due
-    afterwards."""
+    """Remove a keyframe and move its odometry and loops to a neighbour on its segment.
+
+    Without such a neighbour its loops are removed. No keyframe receives more than `max_loops` loops, except
+    the last loop between two segments. Call `graph.update_maps` afterwards.
+    """
     segments, edges = graph.odometry, graph.edges
     key, previous, following = (
         segments.nodes[node_id].key,
@@ -154,12 +156,12 @@ def _pairwise_distance(poses: F64, scale_m: float, scale_rad: float) -> F64:
 
 
 def _row_blocks(count: int) -> list[slice]:
-    """Of rows: what is made on the way for all of thousands at once would take five times the result."""
+    """Slices of rows: temporaries for all rows at once would take five times the result's memory."""
     return [slice(k, k + _BLOCK_ROWS) for k in range(0, count, _BLOCK_ROWS)]
 
 
 def _two_nearest(distance: F64) -> F64:
-    """Of each row, (N, 2); inf where there are none."""
+    """Two least distances of each row, (N, 2); inf where missing."""
     if distance.shape[1] < 2:
         return np.full((len(distance), 2), np.inf)
     return np.partition(distance, 1, axis=1)[:, :2].copy()
@@ -174,7 +176,7 @@ def _odometry_link(graph: MapGraph, previous: int | None, node_id: int) -> Odome
 
 
 def _move_loop(graph: MapGraph, old: Loop, edge: PoseEdge, max_loops: int) -> Loop | None:
-    """The loop at its new ends; None where there is one already, or enough."""
+    """Add the loop at its new ends; return None where they have one already, or enough."""
     edges, nodes = graph.edges, graph.odometry.nodes
     loops_at_a, loops_at_b = (
         {n for n in edges.incident(end) if n in edges.loops} for end in (edge.a, edge.b)
@@ -188,13 +190,15 @@ def _move_loop(graph: MapGraph, old: Loop, edge: PoseEdge, max_loops: int) -> Lo
     return loop
 
 
-_ABSENT_AGENTS = ""  # no name
-_SAME_PLACE_DISTANCE = 1.0  # nearer than this in the measure of `redundant` two keyframes are of one place
+_ABSENT_AGENTS = ""  # not a valid name
+_SAME_PLACE_DISTANCE = 1.0  # in the measure of `redundant`
 
 
 class ReturnReserve(Enum):
-    """What stays for the return of who is away, the most first: its newest keyframes, and something of its
-    map; only this; nothing."""
+    """Keyframes kept for the return of absent agents, most first.
+
+    NEWEST_AND_MAP: their newest keyframes and something of their map; MAP_ONLY: only the latter.
+    """
 
     NEWEST_AND_MAP = auto()
     MAP_ONLY = auto()
@@ -202,21 +206,23 @@ class ReturnReserve(Enum):
 
 
 class KeyframeCulling:
-    """Of one chart."""
+    """Chooses the keyframes of one graph to remove."""
 
     def __init__(self, config: MergeConfig, graph: MapGraph, runs: AgentRuns) -> None:
         self._config, self._graph, self._runs = config, graph, runs
 
     def choose(self, count: int) -> list[int]:
-        """Numbers of so many keyframes, if there are as many that may go. The newest of a run that is away
-        stay for its return, and something of a map in which nobody is heard, if there is another way."""
+        """Return up to `count` node ids to remove.
+
+        If possible, absent runs keep their newest keyframes, and maps without a present agent keep something.
+        """
         for reserve in ReturnReserve:
             if len(chosen := self._choose_with(count, reserve)) >= count:
                 break
         return chosen
 
     def is_removable(self, node_id: int) -> bool:
-        """Whether a keyframe can be taken out now."""
+        """Return whether a keyframe can be removed now."""
         graph = self._graph
         segment = graph.odometry.nodes[node_id].segment
         nodes, reference_segment = graph.odometry.segments[segment].nodes, graph.reference_segments[segment]
@@ -259,8 +265,7 @@ class KeyframeCulling:
         removed: dict[int, None],
         max_distance: float = np.inf,
     ) -> None:
-        """Into `removed`, of one map and those that may go, as many of each name as are due, while two are
-        more alike than `max_distance`."""
+        """Add redundant nodes of one map to `removed`, within the quotas, closer than `max_distance`."""
         graph, c = self._graph, self._config
         node_ids = [n for s in segments for n in graph.odometry.segments[s].nodes if n not in removed]
         owners = [None if n in protected else self._agent_name(n) for n in node_ids]
@@ -295,8 +300,9 @@ class KeyframeCulling:
         return out + fair_quotas(held_counts, removable, out.pop(_ABSENT_AGENTS, 0), presence_order)
 
     def _protected(self, reference_segments: Iterable[int], reserve: ReturnReserve) -> set[int]:
-        """The newest of every agent that walks on, and of these maps what holds their gauge, or them
-        together."""
+        """Nodes that must stay: the newest of each growing segment, the anchors of these maps, and a node of
+        each segment that connects a map.
+        """
         graph, odometry = self._graph, self._graph.odometry
         out = {graph.anchor(reference_segment) for reference_segment in reference_segments}
         for segment in odometry.live_segments:
@@ -308,17 +314,17 @@ class KeyframeCulling:
         return out
 
     def _segments_by_map(self) -> dict[int, list[int]]:
-        """Stretches by the founder of their map, the largest map first; of maps alike the newest."""
+        """Segments by reference segment of their map, the largest map first, among equals the newest."""
         graph, maps = self._graph, dict[int, list[int]]()
         for segment in sorted(graph.odometry.live_segments, reverse=True):
             maps.setdefault(graph.reference_segments[segment], []).append(segment)
-        return dict(sorted(maps.items(), key=lambda one: -sum(map(self._segment_size, one[1]))))
+        return dict(sorted(maps.items(), key=lambda item: -sum(map(self._segment_size, item[1]))))
 
     def _segment_size(self, segment: int) -> int:
         return len(self._graph.odometry.segments[segment].nodes)
 
     def _is_finished(self, segments: Sequence[int], reserve: ReturnReserve) -> bool:
-        """Whether nobody walks in the map of these any more and only one name ever did."""
+        """Return whether no segment of the map grows and all are of one name."""
         agents = {self._graph.odometry.segments[s].agent for s in segments}
         if reserve is ReturnReserve.MAP_ONLY:
             reserve = ReturnReserve.NEWEST_AND_MAP
@@ -326,8 +332,7 @@ class KeyframeCulling:
         return has_one_name and not any(self._is_growing(s, reserve) for s in segments)
 
     def _is_growing(self, segment: int, reserve: ReturnReserve) -> bool:
-        """Whether keyframes come to this stretch, or would if its agent came back and is awaited, which has
-        not begun another run."""
+        """Return whether the segment gets keyframes, or may once its agent returns."""
         agent, runs = self._graph.odometry.segments[segment].agent, self._runs
         is_gone = runs.is_superseded if reserve is ReturnReserve.NEWEST_AND_MAP else runs.is_absent
         return not is_gone(agent) and self._graph.odometry.current_segment(agent) == segment

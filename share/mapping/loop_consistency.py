@@ -1,8 +1,8 @@
-"""What loops that tell one story are worth together.
+"""Weight of a set of consistent loops, and the loops and segments that hold a map together.
 
-Neighbouring views of one spot are one witness, not many, so places are counted. And copies match worse than
-the place itself: of what two views should share if they stand as the loop says, they share less. A story
-weighs its places times the square of that share.
+Neighbouring views of one spot are not independent, so places are counted, not loops. Places that only look
+alike share fewer points than views of one place, so a set weighs its places times the square of its mean
+found share.
 """
 
 from __future__ import annotations
@@ -17,13 +17,16 @@ from share.mapping.loops import Loop, count_distinct
 from share.mapping.map_graph import MapGraph
 from share.types import F64, I64
 
-_DEFAULT_FOUND_SHARE = 0.5  # found where nobody has looked: what most true loops have
+_DEFAULT_FOUND_SHARE = 0.5  # where not computed: that of most true loops
 
 
 @dataclass(frozen=True)
 class LoopEvidence:
-    """Of a story, as seen from near: at how many places, the mean share that was found, and how many
-    keyframes there are on either side, the lesser (one view can fool us many times)."""
+    """Evidence of a set of consistent loops whose two views are near each other.
+
+    places: number of places; found_share: mean share of common points found; keyframes: number of keyframes
+    on the side that has fewer, since one misleading view can produce many false loops.
+    """
 
     places: int = 0
     found_share: float = 0.0
@@ -38,13 +41,13 @@ class LoopEvidence:
 
 
 def is_near(loop: Loop, config: MergeConfig) -> bool:
-    """Whether both views were from about the same spot: copies are told apart from near, if at all."""
-    away, turned = loop.view_offset
-    return away <= config.near_m and turned <= config.near_rad
+    """Return whether both views are from about the same spot: only those distinguish look-alike places."""
+    distance_m, angle_rad = loop.view_offset
+    return distance_m <= config.near_m and angle_rad <= config.near_rad
 
 
 def weigh_loops(loops: Sequence[Loop], graph: MapGraph, config: MergeConfig) -> LoopEvidence:
-    """Places are counted on either side, the lesser; loops that were not seen from near say nothing."""
+    """Weigh `loops`. Places are counted per segment, the least counts; loops of distant views are ignored."""
     near_loops = [loop for loop in loops if is_near(loop, config)]
     if not near_loops:
         return LoopEvidence()
@@ -62,19 +65,21 @@ def weigh_loops(loops: Sequence[Loop], graph: MapGraph, config: MergeConfig) -> 
 
 
 def count_places(poses: Sequence[F64], config: MergeConfig, max_count: int | None = None) -> int:
-    """How many places these poses (4, 4) are; counted no further than `max_count`."""
+    """Count the places of poses (4, 4), up to `max_count`."""
     return count_distinct(np.array(poses), config.place_m, config.place_rad, max_count)
 
 
-# ---- The fewest loops that would have to be false for two stretches not to belong together.
+# Connectivity of a map: which loops, and which segments, it cannot do without.
 
 
 def minimum_cut(pairs: Sequence[tuple[int, int]], start: int, goal: int) -> list[int]:
-    """Indices of the pairs (loops, by the stretches that they tie) without which no way leads from
-    `start` to `goal`: a minimum cut (Ford and Fulkerson 1956). Raises ValueError if start is goal.
+    """Return indices of the fewest pairs without which no path leads from `start` to `goal`.
+
+    pairs: loops, by the two segments that each connects. A minimum cut (Ford and Fulkerson 1956). Raises
+    ValueError if start is goal.
     """
     if start == goal:
-        raise ValueError("a stretch cannot be cut from itself")
+        raise ValueError("start and goal of a cut must be two segments")
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -94,12 +99,11 @@ def minimum_cut(pairs: Sequence[tuple[int, int]], start: int, goal: int) -> list
     return [int(i) for i in np.flatnonzero(is_reachable[ends[:, 0]] != is_reachable[ends[:, 1]])]
 
 
-# ---- Which stretches hold a map together.
-
-
 def articulation_segments(segment_pairs: Iterable[tuple[int, int]]) -> set[int]:
-    """Stretches without which others of their map were not tied any more: the articulation points of the
-    graph of `segment_pairs` (Hopcroft and Tarjan, CACM 1973)."""
+    """Return the segments without which the rest of their map would be disconnected.
+
+    They are the articulation points of the graph of `segment_pairs` (Hopcroft and Tarjan, CACM 1973).
+    """
     neighbours: dict[int, list[int]] = {}
     for a, b in segment_pairs:
         if a != b:

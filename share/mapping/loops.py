@@ -1,8 +1,8 @@
-"""When a loop may be believed: against the map that it closes, or against a second witness.
+"""Loops between keyframes, and the test whether two loops agree.
 
-Two loops between the same two maps must tell the same story: T_a1_b1 = T_a1_a2 T_a2_b2 T_b2_b1, to
-within their own covariances and that of the ways a1 - a2 and b2 - b1. Source: pairwise consistency,
-Mangelson et al., ICRA 2018.
+Two loops between the same two maps are consistent if T_a1_b1 = T_a1_a2 T_a2_b2 T_b2_b1 within their
+covariances and those of the paths a1 - a2 and b2 - b1. Source: pairwise consistency, Mangelson et al., ICRA
+2018.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from share.types import F64, checked_array, checked_pose
 
 
 class KeyframeKey(NamedTuple):
-    """A keyframe: whose, and its number. `agent` names one run of an agent: ids begin anew with each."""
+    """Identity of a keyframe. `agent` names one run of an agent; ids start again with each run."""
 
     agent: str
     id: int
@@ -31,10 +31,11 @@ class KeyframeKey(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Body of keyframe b as seen from that of a: T_a_b (4, 4), cov (6, 6), and the inliers behind it.
+    """A verified relative pose of two keyframes: T_a_b (4, 4) of their bodies, cov (6, 6), inlier count.
 
-    found: of the points that both views should then show, the share that they do
-    (`share.mapping.recognition.missing_points`); None where nobody has looked."""
+    found_share: share of the points visible in both views that both views show
+    (`share.mapping.recognition.missing_points`); None if not computed.
+    """
 
     a: KeyframeKey
     b: KeyframeKey
@@ -49,16 +50,16 @@ class Loop:
 
     @cached_property
     def keyframes(self) -> frozenset[KeyframeKey]:
-        """The two keyframes, whichever way round."""
+        """The two keyframes, unordered."""
         return frozenset((self.a, self.b))
 
     @cached_property
     def view_offset(self) -> tuple[float, float]:
-        """The two views, m and rad."""
+        """Distance (m) and angle (rad) between the two views."""
         return float(np.linalg.norm(self.T_a_b[:3, 3])), float(se3.rotation_angle(self.T_a_b))
 
     def reverse(self) -> Loop:
-        """The same, from the other end; made once, for a loop that waits is asked for it again and again."""
+        """Return the loop from b to a. Cached, since a pending loop is reversed again and again."""
         return self._cached_reverse
 
     @cached_property
@@ -72,7 +73,7 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """A relative pose T (..., 4, 4) and its covariance (..., 6, 6), or many of them."""
+    """A relative pose T (..., 4, 4) with its covariance (..., 6, 6); a batch is iterable."""
 
     T: F64
     cov: F64
@@ -81,13 +82,13 @@ class RelativePose:
         return RelativePose(self.T @ other.T, se3.compose_cov(other.T, self.cov, other.cov))
 
     def __iter__(self) -> Iterator[RelativePose]:
-        """Each of many."""
+        """Iterate over the poses of a batch."""
         return (RelativePose(T, cov) for T, cov in zip(self.T, self.cov, strict=True))
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """How far two statements about one relative pose lie apart."""
+    """Difference between two estimates of one relative pose."""
 
     chi2: float
     distance_m: float
@@ -98,20 +99,22 @@ class Disagreement:
 
 
 def inverse_pose(pose: RelativePose) -> RelativePose:
-    """The same, from the other end."""
+    """Return T_b_a for T_a_b, with its covariance."""
     return RelativePose(se3.inverse(pose.T), se3.inverse_cov(pose.T, pose.cov))
 
 
 def disagreement(first: RelativePose, second: RelativePose) -> Disagreement:
-    """Of two independent estimates of the same pose."""
+    """Compare two independent estimates of the same pose."""
     xi, chi2 = _difference(first, second)
     metres, radians = np.linalg.norm(xi[3:]), np.linalg.norm(xi[:3])
     return Disagreement(float(chi2), float(metres), float(np.degrees(radians)))
 
 
 def pairwise_chi2(first: Loop, a1_a2: RelativePose, second: Sequence[Loop], b2_b1: RelativePose) -> F64:
-    """By how much each of N loops disagrees with the first (N,), given the ways (N, ...) between their ends
-    on either side."""
+    """Return the chi-square (N,) of each loop in `second` against `first`.
+
+    a1_a2, b2_b1: relative poses (N, ...) between their ends on either side.
+    """
     measured = RelativePose(
         np.array([loop.T_a_b for loop in second]), np.array([loop.cov for loop in second])
     )
@@ -119,18 +122,21 @@ def pairwise_chi2(first: Loop, a1_a2: RelativePose, second: Sequence[Loop], b2_b
 
 
 def _difference(first: RelativePose, second: RelativePose) -> tuple[F64, F64]:
-    """xi (..., 6) from the one to the other, and its squared Mahalanobis length (...)."""
+    """Return xi (..., 6) from `first` to `second` and its squared Mahalanobis length (...)."""
     xi = se3.log(se3.inverse(first.T) @ second.T)
     weighted = np.linalg.solve(first.cov + second.cov, xi[..., None])[..., 0]
     return xi, np.asarray((xi * weighted).sum(-1))
 
 
-# ---- How many places a set of poses is: neighbouring views of one spot are one witness, not many.
+# Places: neighbouring views of one spot count once.
 
 
 def count_distinct(poses: F64, distance_m: float, angle_rad: float, max_count: int | None = None) -> int:
-    """Of poses (N, 4, 4), as many as lie further than this, or are turned by more, from each one that
-    was counted before it. With `max_count` counting ends there."""
+    """Count distinct places among poses (N, 4, 4), greedily.
+
+    A pose is a new place if it is farther than `distance_m`, or rotated by more than `angle_rad`, from every
+    place counted before. Counting stops at `max_count`.
+    """
     count = 0
     while len(poses) and count != max_count:
         count += 1
@@ -139,12 +145,12 @@ def count_distinct(poses: F64, distance_m: float, angle_rad: float, max_count: i
 
 
 def is_near_any(T: F64, poses: Sequence[F64], within_m: float, within_rad: float) -> bool:
-    """Whether pose T (4, 4) lies as near as this to one of the others."""
+    """Return whether pose T (4, 4) is within both limits of any of `poses`."""
     return len(poses) > 0 and bool(_is_near(T, np.array(poses), within_m, within_rad).any())
 
 
 def _is_near(T: F64, poses: F64, within_m: float, within_rad: float) -> NDArray[np.bool_]:
-    """Which of poses (N, 4, 4) lie as near as this to T (4, 4); T itself does, whatever was rounded."""
+    """Mask of poses (N, 4, 4) within both limits of T (4, 4). T itself always is, despite rounding."""
     shift = poses[:, :3, 3] - T[:3, 3]
     cosine = (poses[:, :3, :3].reshape(-1, 9) @ T[:3, :3].ravel() - 1) / 2
     near = ((shift**2).sum(1) <= within_m**2) & (cosine >= min(np.cos(within_rad), 1 - 1e-9))

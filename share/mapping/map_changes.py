@@ -1,8 +1,8 @@
-"""What the edge wants kept of its map: changes, one after the other, and what is found again.
+"""Changes of the map that the map file keeps, and the map read back from it.
 
-A list of changes is kept as a whole or not at all (`share.store.map_store`). What is `StoredMap` says again
-what the changes said, so that the atlas can be built anew from it: keyframes and the odometry edges
-that lead to them, loops, the newest solution.
+A list of changes is stored as a whole or not at all (`share.store.map_store`). `StoredMap` is the sum of the
+changes, from which the atlas is rebuilt: keyframes with the odometry edges that lead to them, loops, the
+newest solution.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from share.wire.messages import Hello
 
 @dataclass(frozen=True, eq=False)
 class SaveRun:
-    """One run of one agent. key: names it everywhere here. Comes before its keyframes. voice: the public key
-    that speaks for it; "": none did; None: it may be any."""
+    """A run of an agent; comes before its keyframes. run_key: names it in all changes.
+
+    credential: the public key that authenticated it; "": no key; None: unknown.
+    """
 
     run_key: str
     hello: Hello
@@ -30,7 +32,7 @@ class SaveRun:
 
 @dataclass(frozen=True)
 class SaveCredential:
-    """Who speaks for a run that is kept, from now on: a public key; "": no key."""
+    """Replaces the credential of a stored run: a public key; "": no key."""
 
     run_key: str
     credential: str
@@ -38,9 +40,8 @@ class SaveCredential:
 
 @dataclass(frozen=True, eq=False)
 class SaveKeyframe:
-    """A keyframe of a run.
-
-    Numbers of a run rise; one that is not above all before was kept already, or retired, and changes nothing.
+    """A keyframe of a run. Ids of a run ascend; one that is not above all earlier ones is already stored or
+    removed, and is ignored.
     """
 
     run_key: str
@@ -53,8 +54,11 @@ class SaveKeyframe:
 
 @dataclass(frozen=True, eq=False)
 class StoredKeyframe(SaveKeyframe):
-    """Found again. stretch: `key/n`, the n-th of its run; a keyframe without a reference begins one.
-    ordinal: how many came before it there, retired ones too, if they were not its newest."""
+    """A keyframe read back. segment_name: `run_key/n`, the n-th of its run.
+
+    A keyframe without a reference begins a segment. ordinal: number of keyframes before it there, including
+    removed ones unless they were the newest.
+    """
 
     segment_name: str
     ordinal: int
@@ -62,11 +66,11 @@ class StoredKeyframe(SaveKeyframe):
 
 @dataclass(frozen=True, eq=False)
 class SaveLink:
-    """The odometry edge that leads to a keyframe from now on: those before it were retired.
+    """Replaces the odometry edge that leads to a keyframe, after earlier keyframes were removed.
 
-    reference: number of a keyframe of the same run, or -1: it is the first of its stretch now, and
-    T_ref_body (4, 4) is its T_odom_body. cov (6, 6): of T_ref_body, as the pose graph uses it, not as
-    the agent said it.
+    reference: id of a keyframe of the same run, or -1: the keyframe is now the first of its segment and
+    T_ref_body (4, 4) is its T_odom_body. cov (6, 6): of T_ref_body, as the pose graph uses it, not as the
+    agent sent it.
     """
 
     key: KeyframeKey
@@ -76,21 +80,21 @@ class SaveLink:
 
     def __post_init__(self) -> None:
         if not -1 <= self.reference < self.key.id:
-            raise ValueError(f"reference: {self.reference} must lie in -1 .. {self.key.id - 1}")
+            raise ValueError(f"reference: {self.reference} must be in -1 .. {self.key.id - 1}")
         object.__setattr__(self, "T_ref_body", checked_pose("T_ref_body", self.T_ref_body))
         object.__setattr__(self, "cov", checked_cov("cov", self.cov))
 
 
 @dataclass(frozen=True, eq=False)
 class SaveLoop:
-    """An accepted loop. Several may tie the same two keyframes."""
+    """An accepted loop. Several may connect the same two keyframes."""
 
     loop: Loop
 
 
 @dataclass(frozen=True)
 class RemoveLoops:
-    """All loops between these two keyframes, whichever way round."""
+    """Removes all loops between these two keyframes, in either direction."""
 
     a: KeyframeKey
     b: KeyframeKey
@@ -98,22 +102,24 @@ class RemoveLoops:
 
 @dataclass(frozen=True)
 class RemoveKeyframes:
-    """Keyframes that go, with their links and loops. Their numbers are never asked for again."""
+    """Removes keyframes with their links and loops. Their ids are never requested again."""
 
     keys: tuple[KeyframeKey, ...]
 
 
 @dataclass(frozen=True)
 class RemoveRun:
-    """A run of which nothing is left goes, with its name. Nothing of it comes afterwards."""
+    """Removes a run without keyframes, with its name. No change of it follows."""
 
     run_key: str
 
 
 @dataclass(frozen=True, eq=False)
 class SavePoses:
-    """The newest solution; it takes the place of the one before. T_map_body (N, 4, 4) of `keys`, each in
-    the map that `map_ids` names."""
+    """The newest solution, which replaces the one before.
+
+    T_map_body (N, 4, 4) of `keys`, each in the map that `map_ids` names.
+    """
 
     keys: tuple[KeyframeKey, ...]
     T_map_body: F64
@@ -122,7 +128,7 @@ class SavePoses:
     def __post_init__(self) -> None:
         n = len(self.keys)
         if len(self.map_ids) != n:
-            raise ValueError(f"maps: {len(self.map_ids)} names for {n} keyframes")
+            raise ValueError(f"map_ids: {len(self.map_ids)} names for {n} keyframes")
         object.__setattr__(
             self, "T_map_body", checked_array("T_map_body", self.T_map_body, (n, 4, 4), np.float64)
         )
@@ -143,12 +149,11 @@ MapChange = (
 
 @dataclass(frozen=True, eq=False)
 class StoredMap:
-    """What is found again.
+    """The map read back from a file.
 
-    runs, stretches (names), keyframes: in the order in which they came, stretches also without
-    keyframes by now. links: for keyframes whose odometry edge is no longer the one that they came with.
-    loops: oldest first. next_keyframe: of each run, one above all that it ever had here. complaints: what
-    is missing, a line each.
+    runs, segments (names), keyframes: in order of arrival; segments may be empty. links: for keyframes whose
+    odometry edge was replaced. loops: oldest first. next_ids: for each run, an id above all it ever had here.
+    problems: what is missing, a line each.
     """
 
     runs: tuple[SaveRun, ...] = ()
@@ -162,12 +167,12 @@ class StoredMap:
 
 
 def with_unknown_credentials(kept: StoredMap) -> StoredMap:
-    """For an edge that uses keys: a run for which none spoke may be anybody's."""
+    """Mark runs without a credential as unknown, for an edge that uses keys."""
     return replace(kept, runs=tuple(replace(run, credential=run.credential or None) for run in kept.runs))
 
 
 def odometry_link(keyframe: SaveKeyframe, links: Mapping[KeyframeKey, SaveLink]) -> SaveLink:
-    """The odometry edge that leads to a keyframe: its link, or what it came with."""
+    """Return the odometry edge that leads to a keyframe: its link, or else the one it was sent with."""
     sent = keyframe.keyframe
     return links.get(keyframe.keyframe_key) or SaveLink(
         keyframe.keyframe_key, sent.reference, sent.T_ref_body, sent.cov
@@ -175,10 +180,10 @@ def odometry_link(keyframe: SaveKeyframe, links: Mapping[KeyframeKey, SaveLink])
 
 
 def map_poses(kept: StoredMap) -> dict[KeyframeKey, tuple[str, F64]]:
-    """Map and T_map_body (4, 4) of every keyframe.
+    """Map name and T_map_body (4, 4) of every keyframe.
 
-    One that came after the newest solution follows its reference; a stretch that no solution speaks of is
-    a map of its own, where its odometry says.
+    A keyframe newer than the solution follows its reference. A segment without a solution is a map of its
+    own, posed by odometry.
     """
     solved = {} if kept.poses is None else _poses_by_key(kept.poses)
     out: dict[KeyframeKey, tuple[str, F64]] = {}

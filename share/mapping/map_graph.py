@@ -1,8 +1,8 @@
-"""Where everything lies: poses by map, the edges between them, and which stretches are one map.
+"""The map graph: poses, edges, and which segments form one map.
 
-A map is a set of stretches that loops connect; it is named after its founder, the first to have come of
-those of the least rank. The founder's oldest keyframe stays where its odometry says: that
-is the gauge. Maps are derived from the loops alone, so taking a loop back takes its join back.
+A map is a set of segments connected by loops. Its reference segment is the one of least rank, among equals
+the oldest; it gives the map its name, and its oldest keyframe stays where its odometry put it (the gauge).
+Maps follow from the loops alone, so removing a loop undoes its merge.
 """
 
 from __future__ import annotations
@@ -22,27 +22,26 @@ from share.mapping.loops import KeyframeKey, Loop, RelativePose
 from share.mapping.segments import OdometrySegments
 from share.types import F64, Keyframe
 
-# ---- The edges of the pose graph by number, and what of it the solver does not know yet.
-
 
 class GraphEdges:
-    """Odometry and loops between numbered poses."""
+    """Odometry and loop edges between node ids, and what of them the solver has not received yet."""
 
     def __init__(self) -> None:
         self.covariance_paths = CovariancePaths()
         self.by_id: dict[int, PoseEdge] = {}
-        self.loops: dict[int, Loop] = {}  # of those edges that are loops, oldest first
+        self.loops: dict[int, Loop] = {}  # by edge id, oldest first
         self._incident: dict[int, set[int]] = {}
         self._next_id = 0
-        self.is_reset = True  # the solver knows nothing yet
-        self._pending_edges: set[int] = set()  # edges that the solver does not have
-        self._sent_nodes: set[int] = set()  # poses that the solver has
-        self._moved_nodes: set[int] = set()  # poses that it has otherwise, or not at all
-        self._removed_edges: set[int] = set()  # edges that it has, but should not
-        self._removed_nodes: set[int] = set()  # poses that it has, but should not
+        self.is_reset = True  # the next update contains the whole graph
+        self._sent_nodes: set[int] = set()  # nodes that the solver has
+        # Not sent to the solver yet:
+        self._pending_edges: set[int] = set()
+        self._moved_nodes: set[int] = set()  # new or moved
+        self._removed_edges: set[int] = set()
+        self._removed_nodes: set[int] = set()
 
     def add(self, edge: PoseEdge, loop: Loop | None = None) -> int:
-        """The number of the new edge; with a loop, it may be false."""
+        """Add an edge and return its id. With a loop, the solver treats it as a possible outlier."""
         edge_id, self._next_id = self._next_id, self._next_id + 1
         self.by_id[edge_id] = edge
         self._pending_edges.add(edge_id)
@@ -54,6 +53,7 @@ class GraphEdges:
         return edge_id
 
     def remove(self, edge_id: int) -> None:
+        """Remove an edge, and its loop if it has one."""
         edge = self.by_id.pop(edge_id)
         self.loops.pop(edge_id, None)
         for end in (edge.a, edge.b):
@@ -65,15 +65,15 @@ class GraphEdges:
             self._removed_edges.add(edge_id)
 
     def incident(self, node_id: int) -> list[int]:
-        """Edges that end there, oldest first."""
+        """Ids of the edges that end at a node, oldest first."""
         return sorted(self._incident.get(node_id, ()))
 
     def mark_moved(self, node_ids: Iterable[int]) -> None:
-        """These lie elsewhere than the solver would think."""
+        """Mark nodes whose poses differ from the solver's."""
         self._moved_nodes.update(node_ids)
 
     def remove_node(self, node_id: int) -> None:
-        """A pose without edges goes."""
+        """Remove a node that has no edges."""
         self._incident.pop(node_id, None)
         self._moved_nodes.discard(node_id)
         if node_id in self._sent_nodes:
@@ -81,8 +81,10 @@ class GraphEdges:
             self._removed_nodes.add(node_id)
 
     def take_update(self, poses: Mapping[int, F64], gravity_factors: Mapping[int, F64]) -> GraphUpdate:
-        """All that the solver has not been told yet; it is taken as told. poses: of all numbers, as is
-        plumb (`share.mapping.graph.edges`)."""
+        """Return all changes since the last call and count them as sent.
+
+        poses, gravity_factors: of all node ids (`share.mapping.graph.gravity`).
+        """
         edges = [(n, self.by_id[n], n in self.loops) for n in sorted(self._pending_edges)]
         update = GraphUpdate.from_edges(
             {node_id: poses[node_id] for node_id in sorted(self._moved_nodes)},
@@ -98,7 +100,7 @@ class GraphEdges:
         return update
 
     def reset(self) -> None:
-        """The solver has lost everything."""
+        """Count everything as not sent: the solver lost its state."""
         self.is_reset = True
         self._pending_edges = set(self.by_id)
         self._moved_nodes |= self._sent_nodes
@@ -107,15 +109,19 @@ class GraphEdges:
 
 
 def rescale_translation(T: F64, log_scale: float) -> F64:
-    """T (4, 4) whose way was too long by this."""
+    """Divide the translation of T (4, 4) by exp(log_scale)."""
     return se3.from_rt(T[:3, :3], T[:3, 3] * np.exp(-log_scale)) if log_scale else T
 
 
 class MapGraph:
-    """poses: T_map_body (4, 4) of every node, by its number. plumb: which way is up there, if it is known
-    (`share.mapping.graph.edges`). founder: of the map of each stretch. parted: stretches that were left in
-    another map when loops were taken back, since somebody last asked. scale: log of what each agent's
-    odometry is shortened by; width: by what its variances are multiplied; nothing where it is not there."""
+    """Nodes, edges and maps.
+
+    poses: T_map_body (4, 4) by node id. gravity_factors: up direction over its sigma, where known
+    (`share.mapping.graph.gravity`). reference_segments: for each segment the reference segment of its map.
+    split_segments: segments that changed map because loops were removed; the reader clears it. log_scales:
+    log of the factor by which each agent's odometry is too long; covariance_scales: factor on its variances;
+    agents without an entry have 0 and 1.
+    """
 
     def __init__(self) -> None:
         self.odometry = OdometrySegments()
@@ -124,23 +130,24 @@ class MapGraph:
         self.gravity_factors: dict[int, F64] = {}
         self.reference_segments: list[int] = []
         self.split_segments: set[int] = set()
-        self.loop_counts: Counter[tuple[int, int]] = Counter()  # loops by the two stretches that they tie
+        self.loop_counts: Counter[tuple[int, int]] = Counter()  # by pair of segments, the older first
         self.log_scales: dict[str, float] = {}
         self.covariance_scales: dict[str, float] = {}
-        self.unsolved_maps: dict[int, None] = {}  # founders of maps with news, the oldest first
+        self.unsolved_maps: dict[int, None] = {}  # reference segments, longest unsolved first
 
     def add_keyframe(
         self, agent: str, keyframe: Keyframe, cov: F64, gravity_factor: F64, rank: int = 0
     ) -> int:
-        """The number of the new node. cov (6, 6): of its step from the one before, as it is believed; so is
-        plumb (3,). rank: of a stretch that it begins."""
+        """Add a keyframe and return its node id.
+
+        cov (6, 6): of its step, inflated; gravity_factor (3,). rank: that of a segment which it begins.
+        """
         node_id = self.odometry.add_keyframe(agent, keyframe, rank)
         self.add_node(node_id, keyframe.T_ref_body, cov, gravity_factor)
         return node_id
 
     def add_node(self, node_id: int, T_ref_body: F64, cov: F64, gravity_factor: F64) -> None:
-        """Give a new node its pose, by odometry as its agent told it, and tie it to the one before it, if
-        there is one."""
+        """Pose a new node by odometry as sent, and connect it to the previous node of its segment, if any."""
         node, previous = self.odometry.nodes[node_id], self.odometry.previous_node(node_id)
         agent = self.odometry.segments[node.segment].agent
         T_ref_body = rescale_translation(T_ref_body, self.log_scales.get(agent, 0.0))
@@ -157,16 +164,16 @@ class MapGraph:
         self.edges.mark_moved([node_id])
 
     def remove_node(self, node_id: int) -> None:
-        """A node without edges goes."""
+        """Remove a node that has no edges."""
         self.edges.remove_node(node_id)
         self.odometry.remove_node(node_id)
         del self.poses[node_id]
         self.gravity_factors.pop(node_id, None)
 
-    # ------------------------------------------------------------ changes
+    # Changes
 
     def add_loop(self, loop: Loop) -> None:
-        """Two maps that it ties are one from now on."""
+        """Add a loop; the maps of its ends become one."""
         a, b = self.loop_nodes(loop)
         self.add_loop_edge(PoseEdge(a, b, loop.T_a_b, loop.cov), loop)
         if not self.is_same_map(a, b):
@@ -176,12 +183,12 @@ class MapGraph:
         )
 
     def add_loop_edge(self, edge: PoseEdge, loop: Loop) -> None:
-        """A loop as an edge; if it ties what no other does, `update_maps` is due."""
+        """Add a loop as an edge. Call `update_maps` afterwards if it connects two maps."""
         self.edges.add(edge, loop)
         self.loop_counts[self.segment_pair(edge)] += 1
 
     def remove_loop_edge(self, edge_id: int) -> None:
-        """Take a loop's edge out; if it was the last of its bond, `update_maps` is due."""
+        """Remove a loop's edge. Call `update_maps` afterwards if it was the last between its segments."""
         pair = self.segment_pair(self.edges.by_id[edge_id])
         self.loop_counts[pair] -= 1
         if not self.loop_counts[pair]:
@@ -189,7 +196,7 @@ class MapGraph:
         self.edges.remove(edge_id)
 
     def drop_loops(self, edge_ids: Sequence[int]) -> tuple[Loop, ...]:
-        """Take loops, by their edges' numbers, back, and the joins that hung on them."""
+        """Remove loops by edge id and undo the merges that depended on them. Return the loops."""
         dropped = tuple(self.edges.loops[n] for n in edge_ids)
         touched_maps = {self.reference_segment(key) for loop in dropped for key in (loop.a, loop.b)}
         segments = [s for reference_segment in touched_maps for s in self.map_segments(reference_segment)]
@@ -207,22 +214,21 @@ class MapGraph:
         return dropped
 
     def align_maps(self, loop: Loop) -> None:
-        """Of the two maps that it would tie, move that of the lesser founder rigidly to where it says."""
+        """Move the map of lower precedence rigidly to where the loop puts it."""
         if self.rank(self.reference_segment(loop.a)) > self.rank(self.reference_segment(loop.b)):
             loop = loop.reverse()
         a, b = self.loop_nodes(loop)
         self.move_map(self.reference_segment(loop.b), self.poses[a] @ loop.T_a_b @ se3.inverse(self.poses[b]))
 
     def move_map(self, reference_segment: int, T: F64) -> None:
-        """The whole map, rigidly, by T (4, 4) from the left."""
+        """Transform a whole map rigidly by T (4, 4) from the left."""
         node_ids = self.map_nodes(reference_segment)
         moved = se3.orthonormal(T @ np.array([self.poses[n] for n in node_ids]))
         self.poses.update(zip(node_ids, moved, strict=True))
         self.edges.mark_moved(node_ids)
 
     def rescale_odometry(self, agent: str, log_scale: float, covariance_scale: float) -> None:
-        """All odometry of this agent is to be shortened by log, and its variances multiplied by width; its
-        maps are due."""
+        """Set an agent's log scale and covariance scale; its maps need to be solved again."""
         log_change, covariance_ratio = (
             log_scale - self.log_scales.get(agent, 0.0),
             covariance_scale / self.covariance_scales.get(agent, 1.0),
@@ -244,21 +250,21 @@ class MapGraph:
             self.unsolved_maps.setdefault(self.reference_segments[segment_index])
 
     def propagate(self, node_ids: Iterable[int]) -> None:
-        """These go where odometry takes them from the ones before them."""
+        """Pose nodes, in order, by odometry from the previous ones."""
         for node_id in node_ids:
             previous = self.odometry.previous_node(node_id)
             if previous is not None:
                 T = self.poses[previous] @ self.odometry_edge(previous, node_id).T_a_b
                 self.poses[node_id] = se3.orthonormal(T)
 
-    # ------------------------------------------------------------ looking things up
+    # Queries
 
     def loop_nodes(self, loop: Loop) -> tuple[int, int]:
-        """The nodes of its keyframes. Raises ValueError if one is unknown."""
+        """Nodes of a loop's keyframes. Raises ValueError if one is unknown."""
         return self.odometry.node_id(loop.a), self.odometry.node_id(loop.b)
 
     def odometry_edge(self, previous: int, node_id: int) -> PoseEdge:
-        """The odometry edge from a node to the next of its stretch."""
+        """Odometry edge from a node to the next one of its segment."""
         _, edge = self._find_odometry_edge(previous, node_id)
         return edge if edge.a == previous else edge.reverse()
 
@@ -267,7 +273,7 @@ class MapGraph:
             edge = self.edges.by_id[edge_id]
             if edge_id not in self.edges.loops and previous in (edge.a, edge.b):
                 return edge_id, edge
-        raise ValueError(f"odometry does not lead from node {previous} to {node_id}")
+        raise ValueError(f"no odometry edge from node {previous} to {node_id}")
 
     def segment(self, key: KeyframeKey) -> int:
         return self.odometry.nodes[self.odometry.node_id(key)].segment
@@ -280,27 +286,24 @@ class MapGraph:
         return self.reference_segments[segment_a] == self.reference_segments[segment_b]
 
     def map_id(self, segment: int) -> str:
-        """Of the map that this stretch is in."""
-        lost = segment >= len(
-            self.reference_segments
-        )  # of a damaged file that has none of its keyframes, nor later ones
-        return self.odometry.segments[segment if lost else self.reference_segments[segment]].name
+        """Name of the map that contains a segment."""
+        # A damaged file may lack all keyframes of the newest segments.
+        is_known = segment < len(self.reference_segments)
+        return self.odometry.segments[self.reference_segments[segment] if is_known else segment].name
 
     def find_map(self, map_id: str) -> int:
-        """The founder of a map. Raises ValueError if there is none of that name."""
-        for reference_segment in {
-            self.reference_segments[segment] for segment in self.odometry.live_segments
-        }:
+        """Reference segment of the map of this name. Raises ValueError if there is none."""
+        for reference_segment in {self.reference_segments[s] for s in self.odometry.live_segments}:
             if self.odometry.segments[reference_segment].name == map_id:
                 return reference_segment
         raise ValueError(f"there is no map {map_id}")
 
     def rank(self, segment: int) -> tuple[int, int]:
-        """Of the stretches of a map, the least founds it."""
+        """Order of precedence: the segment with the least value is the reference of its map."""
         return self.odometry.segments[segment].rank, segment
 
     def map_segments(self, reference_segment: int) -> list[int]:
-        """Those of a map that have keyframes, its founder first, if that has any."""
+        """Segments of a map that have keyframes, in order of precedence."""
         return sorted(
             (s for s in self.odometry.live_segments if self.reference_segments[s] == reference_segment),
             key=self.rank,
@@ -310,20 +313,24 @@ class MapGraph:
         return [n for s in self.map_segments(reference_segment) for n in self.odometry.segments[s].nodes]
 
     def anchor(self, reference_segment: int) -> int:
-        """The keyframe that holds the gauge of a map."""
+        """Node that fixes the gauge of a map."""
         return self.odometry.segments[reference_segment].nodes[0]
 
     def T_map_odom(self, node_id: int) -> F64:
-        """T_map_odom (4, 4) as this node has it."""
+        """T_map_odom (4, 4) at this node."""
         T_odom_body = self.odometry.nodes[node_id].T_odom_body
         return se3.orthonormal(self.poses[node_id] @ se3.inverse(T_odom_body))
 
     def relative_pose(self, a: int, b: int) -> F64:
-        """T_a_b (4, 4) of two nodes of a map."""
+        """T_a_b (4, 4) of two nodes of one map."""
         return se3.inverse(self.poses[a]) @ self.poses[b]
 
     def relative_estimates(self, a: int, goals: Sequence[int]) -> RelativePose:
-        """Poses (N, 4, 4) of the goals in node a of the same map, as the map has them now."""
+        """Poses (N, 4, 4) of the goals relative to node a, with covariances along the paths of least
+        covariance.
+
+        Raises ValueError if a goal is in another map.
+        """
         covs = self.edges.covariance_paths.covariances_from(a, goals, self.poses)
         for goal, cov in zip(goals, covs, strict=True):
             if cov is None:
@@ -333,12 +340,12 @@ class MapGraph:
         )
 
     def segment_pair(self, edge: PoseEdge) -> tuple[int, int]:
-        """The stretches at its ends, the older first."""
+        """The segments at an edge's ends, the older first."""
         a, b = (self.odometry.nodes[end].segment for end in (edge.a, edge.b))
         return (a, b) if a < b else (b, a)
 
     def update_maps(self) -> None:
-        """Every stretch's founder, from the loops: the connected parts."""
+        """Recompute the reference segment of every segment: the connected components of the loops."""
         root = list(range(len(self.reference_segments)))
 
         def find(i: int) -> int:

@@ -1,4 +1,4 @@
-"""What of the mapper's map is to be kept, and what is found again, each as the other side has it."""
+"""Conversions between the mapper's keyframes and the records that the map file keeps."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from share.mapping.map_changes import (
 
 
 def restored_keyframe(stored: StoredKeyframe, links: Mapping[KeyframeKey, SaveLink]) -> RestoredKeyframe:
+    """Convert a stored keyframe with its odometry edge to the atlas's form."""
     edge, as_sent = odometry_link(stored, links), stored.keyframe_key not in links
     sent = stored.keyframe
     return RestoredKeyframe(
@@ -26,12 +27,13 @@ def restored_keyframe(stored: StoredKeyframe, links: Mapping[KeyframeKey, SaveLi
 
 
 def stored_link(link: OdometryLink) -> SaveLink:
+    """Convert an odometry link to the record that the map file keeps."""
     reference = -1 if link.reference is None else link.reference.id
     return SaveLink(link.key, reference, link.T_ref_body, link.cov)
 
 
 def removal_changes(removed: Iterable[RemovedKeyframe]) -> list[MapChange]:
-    """In the order in which they happened: a link may lead to one that goes next."""
+    """Convert removals to changes, in their order: a link may lead to a keyframe that goes next."""
     changes: list[MapChange] = []
     for keyframe in removed:
         if keyframe.link is not None:

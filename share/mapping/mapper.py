@@ -1,110 +1,94 @@
-"""A keyframe's way through the edge's map: place query -> verify -> believe? -> solve -> correct.
+"""The mapper: keyframes in, corrections out. Query -> verify -> accept loop -> solve -> correct.
 
-The mapper decides what comes next; each slow step is a frozen value that somebody else runs. Looking
-keyframes up and solving go on side by side, one of each at a time; what comes while a map is solved is
-solved together, once.
+The mapper decides what comes next; each slow step is a frozen value that the caller runs. Look-ups and
+solving run side by side, one step of each at a time. Changes that arrive while a map is being solved are
+solved together afterwards.
 """
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from typing import Any
 
 from share.config import Config
 from share.errors import describe_exception
 from share.mapping.agents.quarantine import QuarantineChange
-from share.mapping.atlas import AppliedSolution, Atlas
+from share.mapping.atlas import Atlas
 from share.mapping.corrections import CorrectionFilter
 from share.mapping.graph.updates import GraphSolution
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import MapChange, RemoveLoops, SaveLoop, SavePoses, StoredKeyframe, StoredMap
 from share.mapping.map_news import removal_changes, restored_keyframe, stored_link
+from share.mapping.map_solving import AppliedSolution
+from share.mapping.mapper_counters import MapperCounters
 from share.mapping.query_queue import CandidateSearch, QueryQueue, SearchBudget, qoe_form, service_kind
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
 from share.mapping.steps import LookupStep, MapEvent, QueryStep, SolveStep, Step, VerifyStep, map_assignment
-from share.metrics.frame_log import summary
 from share.scheduling.merge_gate import MergeGate
 from share.types import AgentKind, Keyframe
 from share.wire.messages import Hello
 
-_MAX_STEP_TIMES = 5000  # of each kind of step that a report is about: the newest
-_CULL_MARGIN = 1.05  # so much above the bound before it is asked which keyframes may go
+_CULL_MARGIN = 1.05  # share of `max_keyframes` at which keyframes to remove are chosen
 _REMOVED_PER_KEYFRAME = 2
-_RETRY_INTERVAL = 4
-
-
-@dataclass
-class _RunCounters:
-    """Of one agent."""
-
-    loops_tried: int = 0
-    merges: Counter[str] = field(default_factory=Counter)  # requested, skipped, done
-    newest_id: int = -1  # keyframe that came
+_RETRY_INTERVAL = 4  # every fourth look-up includes keyframes of agents that are kept apart
 
 
 class Mapper:
-    """The maps of all agents. `agent` names one run of an agent everywhere here."""
+    """The maps of all agents. `agent` always names one run of an agent."""
 
     def __init__(self, config: Config) -> None:
         place = config.place
         self._config = config
         self._index = PlaceIndex(place.index_seed, place.tables, place.hash_bits)
         self._hellos: dict[str, Hello] = {}
-        self._camera_views: dict[int, CameraView] = {}  # by the number of a keyframe in atlas and index
+        self._camera_views: dict[int, CameraView] = {}  # by node id
         self._atlas = Atlas(config.merge, self._camera_views)
-        self._unindexed: list[tuple[int, StoredKeyframe]] = []  # restored
+        self._unindexed: list[tuple[int, StoredKeyframe]] = []  # restored keyframes
         self._queries = QueryQueue(config.edge)
         self._merge_gate = MergeGate(config.control, config.edge.policy)
         self._correction_filter = CorrectionFilter()
-        self._reported_waits: set[tuple[str, str]] = set()  # who has been said to wait to hear of which map
+        self._reported_waits: set[tuple[str, str]] = set()  # (run, map) of corrections reported as held back
         self._search_budget = SearchBudget.from_config(config)
         self._search: CandidateSearch | None = None
-        self._query: QueryStep | None = None  # that the search is about
         self._is_looking_up = self._is_solving = False
-        self._to_remove: list[int] = []  # keyframes that go next
-        self._cull_threshold = 0.0  # so many before it is asked again which may go
+        self._to_remove: list[int] = []  # nodes
+        self._cull_threshold = 0.0  # number of keyframes at which removable ones are chosen again
         self._changes: list[MapChange] = []
-        self._counters: dict[str, _RunCounters] = {}
-        self._removed_runs_counters = _RunCounters()  # of runs that are forgotten
+        self._counters = MapperCounters()
         self._empty_runs: list[KeyframeKey] = []
-        self._step_ms = {kind: deque[float](maxlen=_MAX_STEP_TIMES) for kind in ("place", "verify", "solve")}
-        self._counts: Counter[str] = Counter()
 
     def add_run(self, agent: str, hello: Hello, credential: str | None = "") -> None:
-        """A run of an agent, before its first keyframe. voice: see `KeepRun`."""
+        """Register a run of an agent, before its first keyframe. credential: see `SaveRun`."""
         self._hellos[agent] = hello
-        self._counters[agent] = _RunCounters()
+        self._counters.add_run(agent)
         self._atlas.add_run(agent, hello.name, credential)
 
     def set_credential(self, agent: str, credential: str) -> None:
-        """See `Speaks`."""
+        """Replace the credential of a run: see `SaveCredential`."""
         self._atlas.add_run(agent, self.agent_name(agent), credential)
 
     def agent_name(self, agent: str) -> str:
-        """Of the agent whose run it is."""
+        """Name of the agent whose run it is."""
         return self._hellos[agent].name if agent in self._hellos else agent
 
     def set_present(self, agent: str, is_present: bool) -> None:
-        """Nobody waits for a run that is not heard."""
+        """Set whether the run's agent is connected."""
         self._atlas.set_present(agent, is_present)
 
     def remove_run(self, agent: str) -> None:
-        """A run of which nothing is left, and that will not come back."""
+        """Forget a run without keyframes that will not return."""
         self._atlas.remove_run(agent)
         self._queries.remove_agent(agent)
         self._correction_filter.remove_agent(agent)
         self._reported_waits = {(run, map_id) for run, map_id in self._reported_waits if run != agent}
         del self._hellos[agent]
-        counters = self._counters.pop(agent)
-        self._removed_runs_counters.loops_tried += counters.loops_tried
-        self._removed_runs_counters.merges += counters.merges
+        self._counters.remove_run(agent)
 
     def add_keyframe(self, agent: str, keyframe: Keyframe, is_extra: bool = False) -> list[MapEvent]:
-        """A keyframe, in order, each once. is_extra: see `Add`."""
-        self._counters[agent].newest_id = keyframe.id
+        """Add a keyframe; each once, in order. is_extra: looked up only when nothing else waits."""
+        self._counters.runs[agent].newest_id = keyframe.id
         keyframe, link = self._atlas.reconnect(agent, keyframe)
         self._changes += [] if link is None else [stored_link(link)]
         node_id = self._atlas.add_keyframe(agent, keyframe, rank=self._map_rank(agent))
@@ -116,8 +100,11 @@ class Mapper:
         return events
 
     def restore(self, kept: StoredMap) -> None:
-        """What an earlier life of the edge knew, before anything else comes. Maps keep their founders, also
-        before headsets that come now. The views are gone through when one is first looked up."""
+        """Restore the map of an earlier session, before anything else is added.
+
+        Restored maps keep their reference segments, also before headsets that come now. Their views are
+        indexed at the first look-up.
+        """
         for run in kept.runs:
             self.add_run(run.run_key, run.hello, run.credential)
             self.set_present(run.run_key, False)
@@ -133,9 +120,9 @@ class Mapper:
         node_ids = self._atlas.restore(segments, restored, kept.loops, poses)
         self._unindexed = list(zip(node_ids, kept.keyframes, strict=True))
         for stored in kept.keyframes:
-            account = self._counters.get(stored.run_key)  # a damaged file may have lost its run
-            if account is not None:
-                account.newest_id = max(account.newest_id, stored.keyframe.id)
+            counters = self._counters.runs.get(stored.run_key)  # None: missing in a damaged file
+            if counters is not None:
+                counters.newest_id = max(counters.newest_id, stored.keyframe.id)
 
     def _index_restored(self) -> None:
         for node_id, stored in self._unindexed:
@@ -150,9 +137,11 @@ class Mapper:
         self._index.add(node_id, keyframe.view.descriptors)
 
     def _map_rank(self, agent: str, is_reference: bool = False) -> int:
-        """Who wears a headset sees a map move, so it is the others' maps that come to his; all come to one
-        that an earlier life had."""
-        hello = self._hellos.get(agent)  # a damaged file may have lost it
+        """Rank of a new segment: lower ranks keep their map in a merge.
+
+        Headsets' maps stay, as their wearers would notice a jump; restored maps come first.
+        """
+        hello = self._hellos.get(agent)  # None: missing in a damaged file
         is_headset = hello is not None and qoe_form(self._config, hello) is AgentKind.AR
         return (0 if is_headset else 1) + (0 if is_reference else 2)
 
@@ -161,10 +150,10 @@ class Mapper:
         assert T is not None and map_id is not None
         return map_assignment(agent, map_id, T, keyframe.id)
 
-    # ------------------------------------------------------------------ what to work on
+    # Steps: what to do next, and what follows from the result
 
     def next_lookup(self) -> LookupStep | None:
-        """The next step of looking a keyframe up; None if there is none, or one is under way."""
+        """Next step of looking up a keyframe; None if there is none or one is running."""
         if self._is_looking_up:
             return None
         self._index_restored()
@@ -176,28 +165,27 @@ class Mapper:
         return step
 
     def _next_query_id(self) -> int | None:
-        """One that was passed over is looked up only where it may join maps: it is late for an answer."""
+        """Next keyframe to look up. Skipped ones, too late for an answer, only serve to merge maps."""
         node_id = self._queries.next_query()
         return (
             self._queries.next_skipped() if node_id is None and len(self._atlas.map_sizes()) > 1 else node_id
         )
 
     def next_solve(self) -> SolveStep | None:
-        """The next map to be solved; None if there is none, or one is under way."""
+        """Next map to solve; None if there is none or one is running."""
         for map_id in [] if self._is_solving else self._atlas.due_maps():
             try:
                 job = self._atlas.make_job(map_id)
-            except Exception:  # it costs this map its solution, not the others theirs
-                self._counts["failed_jobs"] += 1
+            except Exception:  # only this map stays unsolved
+                self._counters.failed_steps += 1
                 continue
             self._is_solving = True
             return SolveStep(job)
         return None
 
     def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
-        """What follows from a step's result; an exception as the result costs that step only."""
-        self._step_ms[step.kind].append(ms)
-        self._counts[step.kind] += 1
+        """Apply a step's result. An exception as the result fails that step only."""
+        self._counters.add_step(step.kind, ms)
         if isinstance(step, SolveStep):
             self._is_solving = False
         else:
@@ -208,10 +196,10 @@ class Mapper:
             return self._step_failed(step, error)
 
     def _handle_result(self, step: Step, result: Any) -> list[MapEvent]:
-        """What the result leads to. Raises what the step raised."""
+        """Apply the result, or raise it if it is an exception."""
         match step:
             case QueryStep() if isinstance(result, list):
-                self._begin_search(step, [c.id for c in result])
+                self._begin_search(step.node_id, [c.id for c in result])
                 return self._review_joins(step.node_id)
             case VerifyStep() if isinstance(result, Verification | Refusal):
                 return self._handle_verification(step, result)
@@ -226,86 +214,80 @@ class Mapper:
         return self.report_failure(step.kind, error, agent)
 
     def report_failure(self, what: str, error: Exception, agent: str | None = None) -> list[MapEvent]:
-        """It is counted and said; the map goes on without what raised `error`. agent: that it is about."""
-        self._counts["failed_jobs"] += 1
+        """Count and report an error; the map goes on without the step. agent: the run concerned."""
+        self._counters.failed_steps += 1
         agent = next(iter(self._hellos), None) if agent is None else agent
         return (
             [] if agent is None else [MapEvent(agent, "job failed", f"{what}: {describe_exception(error)}")]
         )
 
     def reset_solver(self) -> None:
-        """The solver knows nothing any more."""
+        """The solver process lost its state."""
         self._atlas.reset_solver()
 
     @property
     def removed_count(self) -> int:
-        """Keyframes, since the beginning."""
-        return self._counts["taken_out"]
+        """Keyframes removed since the start."""
+        return self._counters.removed_keyframes
 
     def take_changes(self) -> tuple[MapChange, ...]:
-        """What has to be kept since the last call."""
+        """Return the changes to store since the last call."""
         changes, self._changes = tuple(self._changes), []
         return changes
 
     def take_empty_runs(self) -> tuple[KeyframeKey, ...]:
-        """Runs of which nothing is left since the last call, each with the newest keyframe that came."""
+        """Return the runs without keyframes since the last call, each with its newest keyframe."""
         empty_runs, self._empty_runs = tuple(self._empty_runs), []
         return empty_runs
 
     def current_poses(self) -> SavePoses:
-        """Where everything lies now."""
+        """Return the current poses of all keyframes."""
         keys, T_map_body, maps = self._atlas.all_poses()
         return SavePoses(keys, T_map_body, maps)
 
-    # ------------------------------------------------------------------ steps
+    # Place queries and verification
 
     def _make_query(self, node_id: int) -> QueryStep:
         excluded = self._atlas.neighbours(node_id)
-        if node_id % _RETRY_INTERVAL:  # what is kept apart is looked up seldom: it may agree by now
+        if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
             excluded += self._atlas.separated_keyframes(node_id)
         return QueryStep(
             self._index, node_id, self._camera_views[node_id], self._config.place.candidates, excluded
         )
 
-    def _begin_search(self, query: QueryStep, candidates: list[int]) -> None:
+    def _begin_search(self, node_id: int, candidates: list[int]) -> None:
         if self._queries.is_hurried:
-            candidates = self._atlas.rank_candidates(
-                query.node_id, [n for n in candidates if n in self._camera_views]
-            )
-        self._query, self._search = query, CandidateSearch(query.node_id, candidates, self._search_budget)
+            known = [n for n in candidates if n in self._camera_views]
+            candidates = self._atlas.rank_candidates(node_id, known)
+        self._search = CandidateSearch(node_id, candidates, self._search_budget)
 
     def _next_verify(self) -> VerifyStep | None:
-        """Those that have been taken out meanwhile are passed over."""
-        search, query = self._search, self._query
-        while search is not None and query is not None:
-            candidate = search.next_candidate(self._queries.is_hurried)
-            if candidate is None:
-                break
-            if {query.node_id, candidate} <= self._camera_views.keys():
-                candidate_view = self._camera_views[candidate]
-                return VerifyStep(
-                    query.node_id, query.camera_view, candidate, candidate_view, self._config.place
-                )
-        self._search = self._query = None
+        """Next candidate of the current search whose keyframe still exists."""
+        search, views = self._search, self._camera_views
+        while search and (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
+            if {search.node_id, candidate} <= views.keys():
+                query_view, candidate_view = views[search.node_id], views[candidate]
+                return VerifyStep(search.node_id, query_view, candidate, candidate_view, self._config.place)
+        self._search = None
         return None
 
     def _handle_verification(self, step: VerifyStep, outcome: Verification | Refusal) -> list[MapEvent]:
         if not {step.node_id, step.candidate_id} <= self._camera_views.keys():
-            return []  # taken out meanwhile
+            return []  # removed meanwhile
         a, b = self._atlas.key(step.candidate_id), self._atlas.key(step.node_id)
-        account = self._counters[b.agent]
-        account.loops_tried += 1
+        counters = self._counters.runs[b.agent]
+        counters.loops_tried += 1
         if isinstance(outcome, Refusal):
             return [MapEvent(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
         if self._search is not None and not self._atlas.are_separated(a.agent, b.agent):
             self._search.count_verified()
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
-        account.merges["requested"] += 1
+        counters.merges["requested"] += 1
         volume = self._merge_gate.overlap_volume(
             self._hellos[a.agent].rig, self._hellos[b.agent].rig, loop.T_a_b
         )
         if objection := self._merge_gate.skip_reason(volume, self._atlas.map_id(a) == self._atlas.map_id(b)):
-            account.merges["skipped"] += 1
+            counters.merges["skipped"] += 1
             return [MapEvent(b.agent, "merge skipped", f"loop {loop}: {objection}")]
         change = self._atlas.compare_agents(loop, outcome.depth_scale)
         events = self._quarantine_events(change)
@@ -314,20 +296,20 @@ class Mapper:
         self._record_loops(decision)
         if not decision.accepted:
             return [*events, MapEvent(b.agent, "loop not taken", reason)]
-        account.merges["done"] += 1
+        counters.merges["done"] += 1
         self._merge_gate.record_merge(volume)
         undone_events = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
         accepted = MapEvent(b.agent, "maps joined" if decision.joined_maps else "loop accepted", reason)
         return [*events, *undone_events, accepted]
 
     def _quarantine_events(self, change: QuarantineChange) -> list[MapEvent]:
-        """Who disagrees with the others since now, or no longer."""
+        """Events for agents whose standing changed; records the loops removed or added by it."""
         removals = (RemoveLoops(loop.a, loop.b) for loop in change.dropped)
         self._changes += [*removals, *map(SaveLoop, change.added)]
         return [
             MapEvent(agent, standing.state, standing.reason)
             if standing.state in ("set apart", "disputed")
-            else MapEvent(agent, "agrees again", "its claims fit the others'")
+            else MapEvent(agent, "agrees again", "consistent with the others again")
             for agent, standing in change.standings.items()
         ]
 
@@ -348,24 +330,28 @@ class Mapper:
         ]
         map_id = step.job.map_id
         waiting = [
-            MapEvent(agent, "not told yet", f"map {map_id} knows it to {100 * m:.0f} cm only")
-            for agent, m in applied.waiting_sigma_m.items()
+            MapEvent(
+                agent, "not told yet", f"its position in map {map_id} is known to {100 * sigma_m:.0f} cm"
+            )
+            for agent, sigma_m in applied.waiting_sigma_m.items()
             if (agent, map_id) not in self._reported_waits
         ]
         self._reported_waits |= {(agent, map_id) for agent in applied.waiting_sigma_m}
         return sent + waiting
 
+    # Bookkeeping
+
     def _record_loops(self, outcome: LoopDecision | AppliedSolution) -> None:
-        """The loops that are believed since, and those that are no longer, are to be kept so."""
+        """Record accepted and removed loops as changes to store."""
         self._changes += [RemoveLoops(loop.a, loop.b) for loop in outcome.dropped]
         self._changes += [SaveLoop(loop) for loop in outcome.added]
 
     def _cull_keyframes(self) -> None:
-        """Two keyframes go while one comes: all at once would hold the others up."""
+        """Remove two keyframes for each that arrives: all at once would delay the others."""
         max_keyframes = self._config.edge.max_keyframes
         if not self._to_remove and len(self._atlas) > max(max_keyframes * _CULL_MARGIN, self._cull_threshold):
             self._to_remove = self._atlas.choose_redundant(len(self._atlas) - max_keyframes)
-            # Where nothing may go, it is not asked each time.
+            # Where no keyframe is removable, do not search for one each time.
             self._cull_threshold = 0.0 if self._to_remove else len(self._atlas) * _CULL_MARGIN
         if not self._to_remove:
             return
@@ -375,50 +361,38 @@ class Mapper:
         for keyframe in removed:
             self._index.remove(keyframe.node_id)
             del self._camera_views[keyframe.node_id]
-        self._counts["taken_out"] += len(removed)
+        self._counters.removed_keyframes += len(removed)
         self._changes += removal_changes(removed)
         empty_runs = {
             keyframe.key.agent for keyframe in removed if self._atlas.is_run_gone(keyframe.key.agent)
         }
         self._empty_runs += [
-            KeyframeKey(agent, self._counters[agent].newest_id) for agent in sorted(empty_runs)
+            KeyframeKey(agent, self._counters.runs[agent].newest_id) for agent in sorted(empty_runs)
         ]
 
-    # ------------------------------------------------------------------ report
-
     def report(self) -> dict[str, Any]:
-        """edge.json's fields of the whole, and under `agents` those of each run."""
-        all_counters = [*self._counters.values(), self._removed_runs_counters]
-        merges = _merge_counts(sum((counters.merges for counters in all_counters), Counter()))
+        """Return the mapper's fields of edge.json, and under `agents` those of each run."""
+        counters, merges = self._counters, self._counters.merges
         return {
-            "agents": {agent: self._run_report(agent) for agent in self._counters},
+            "agents": {agent: self._run_report(agent) for agent in counters.runs},
             "loops": {
-                "tried": sum(counters.loops_tried for counters in all_counters),
+                "tried": counters.loops_tried,
                 "accepted": merges["done"],
                 "waiting": len(self._atlas.pending),
                 "in_map": len(self._atlas.loops),
             },
             "merges": merges,
             "maps": self._atlas.map_sizes(),
-            "taken_out": self._counts["taken_out"],
+            "taken_out": counters.removed_keyframes,
             "waiting": len(self._queries),
-            "failed_jobs": self._counts["failed_jobs"],
-            **{
-                f"{k}_ms": {**summary(list(ms)).report(), "n": self._counts[k]}
-                for k, ms in self._step_ms.items()
-            },
+            "failed_jobs": counters.failed_steps,
+            **counters.step_report(),
         }
 
     def _run_report(self, agent: str) -> dict[str, Any]:
-        counters = self._counters[agent]
         return {
-            "loops": {"tried": counters.loops_tried, "accepted": counters.merges["done"]},
-            "merges": _merge_counts(counters.merges),
+            **self._counters.runs[agent].report(),
             "queries_skipped": self._queries.skipped[agent],
             "map_id": self._atlas.current_map_id(agent),
             "consistency": asdict(self._atlas.standing(agent)),
         }
-
-
-def _merge_counts(merges: Counter[str]) -> dict[str, int]:
-    return {outcome: merges[outcome] for outcome in ("requested", "skipped", "done")}

@@ -1,10 +1,11 @@
-"""Whether two maps look alike wherever they overlap, not only where somebody recognised something.
+"""Overlap check: do two maps look alike wherever they overlap, not only where places were recognised?
 
-A copy of a room is recognised as well as the room, so loops alone speak for it. What speaks against it are
-views that, by the map, should show the same and do not: things are gone
-(`share.mapping.recognition.missing_points`). Nobody proposes those, so they are looked for: before two maps
-are joined, in all of their overlap, and after that for as long as the join is on probation, wherever an agent
-comes to where the other has been."""
+A copy of a room matches as well as the room itself, so loops alone support a false merge. The evidence
+against it is in pairs of views that, by the map, should show the same and do not
+(`share.mapping.recognition.missing_points`). Place recognition never proposes such pairs, so they are
+searched for: before a merge in the whole overlap, and during the probation of a merge wherever an agent comes
+near views of the other map.
+"""
 
 from __future__ import annotations
 
@@ -21,24 +22,28 @@ from share.mapping.recognition.missing_points import MissingRegions, missing_poi
 from share.mapping.recognition.verification import CameraView
 from share.types import F64
 
-_NEAR_M, _NEAR_RAD = 1.0, 0.5  # of one spot: views this near ought to look alike
-_MIN_POINTS = 20  # a pair of views that share fewer says nothing
-_MAX_PAIRS = 40  # looked at before a join
-_PROBATION_VIEWS = 40  # views after a join, without a doubt at the last of them
-_SAME_M, _SAME_RAD = 0.02, 0.01  # a pair that has moved by less is not looked at again
+# Views within both are from one spot and should look alike.
+_NEAR_M = 1.0
+_NEAR_RAD = 0.5
+_MIN_POINTS = 20  # visible in a pair of views; below, the pair is not informative
+_MAX_PAIRS = 40  # compared before a merge
+_PROBATION_VIEWS = 40  # compared after a merge; probation ends then if the CUSUM is zero
+# A pair that moved by less is not compared again.
+_SAME_M = 0.02
+_SAME_RAD = 0.01
 _MAX_CACHED = 4000  # pairs
 
 
 @dataclass(eq=False)
 class JoinProbation:
-    """Of a join between two stretches. doubt: see the function."""
+    """Probation of a merge between two segments. cusum: see `cusum`."""
 
     cusum: float = 0.0
     view_count: int = 0
 
 
 class OverlapCheck:
-    """Of one chart. sights: what each node saw, as far as it is known."""
+    """Overlap check of one graph. camera_views: by node id, as far as known."""
 
     def __init__(self, graph: MapGraph, camera_views: Mapping[int, CameraView]) -> None:
         self._graph, self._camera_views = graph, camera_views
@@ -46,15 +51,17 @@ class OverlapCheck:
         self._probations: dict[tuple[int, int], JoinProbation] = {}
 
     def with_found_share(self, loop: Loop) -> Loop:
-        """With what is found of it, if both its views are known."""
+        """Return the loop with its found share, if both views are known."""
         a, b = (self._camera_views.get(n) for n in self._graph.loop_nodes(loop))
         if loop.found_share is not None or a is None or b is None:
             return loop
         return replace(loop, found_share=1 - missing_points(b, a, loop.T_a_b).missing_share)
 
     def compare_overlap(self, loop: Loop) -> list[MissingRegions]:
-        """Of two maps (in one map: two stretches), if they lay as the loop says: pairs of views from about
-        one spot, each view in one of them, in the order of b's."""
+        """Compare the overlap of two maps (within one map: of two segments), placed as the loop says.
+
+        Pairs views from about the same spot, each view once; in the order of b's nodes.
+        """
         graph, (a, b) = self._graph, self._graph.loop_nodes(loop)
         nodes_a, nodes_b = (self._with_views(self._nodes_on_side(n, graph.is_same_map(a, b))) for n in (a, b))
         if not nodes_a or not nodes_b:
@@ -66,12 +73,14 @@ class OverlapCheck:
         return [comparison for _, comparison in sorted(_informative(comparisons, _MAX_PAIRS))]
 
     def begin_probation(self, loop: Loop) -> None:
-        """A join that this loop made is on probation."""
+        """Put the merge that this loop made on probation."""
         self._probations[self._segment_pair(loop)] = JoinProbation()
 
     def review_joins(self, node_id: int, allowed_share: float) -> Iterator[tuple[tuple[int, int], float]]:
-        """A new node: for each stretch to which its own was joined not long ago, where it comes to what that
-        has seen, the join as both stretches, and its doubt. allowed: share of a view that may be gone."""
+        """Compare a new node with each segment whose merge with the node's segment is on probation.
+
+        allowed_share: share of a view that may be missing. Yields both segments and the CUSUM.
+        """
         segment = self._graph.odometry.nodes[node_id].segment
         for pair, probation in list(self._probations.items()):
             if segment in pair and self._is_one_map(pair):
@@ -85,7 +94,7 @@ class OverlapCheck:
                     self._probations.pop(pair, None)
 
     def end_probation(self, pair: tuple[int, int]) -> None:
-        """The join of these stretches is undone."""
+        """Forget a merge that was undone."""
         self._probations.pop(pair, None)
 
     def _nodes_on_side(self, node_id: int, is_one_segment: bool) -> list[int]:
@@ -102,7 +111,7 @@ class OverlapCheck:
         return self._graph.reference_segments[pair[0]] == self._graph.reference_segments[pair[1]]
 
     def _compare_nearest(self, node_id: int, segment: int) -> MissingRegions | None:
-        """What the nearest view of this stretch shows of what the node shows, if it is near enough."""
+        """Compare the node with the nearest view of the segment that is near enough and informative."""
         nodes = self._with_views(self._graph.odometry.segments[segment].nodes)
         if not nodes or node_id not in self._camera_views:
             return None
@@ -115,7 +124,7 @@ class OverlapCheck:
         return [n for n in nodes if n in self._camera_views]
 
     def _compare_views(self, a: int, b: int, T_a_b: F64) -> MissingRegions:
-        """Remembered, for the same pairs are asked for whenever another loop tells the same story."""
+        """Cached: the same pairs are compared again for every further loop of a hypothesis."""
         if (cached := self._cache.get((a, b))) is not None:
             offset = se3.inverse(cached[0]) @ T_a_b
             if np.linalg.norm(offset[:3, 3]) < _SAME_M and se3.rotation_angle(offset) < _SAME_RAD:
@@ -128,15 +137,14 @@ class OverlapCheck:
 
 
 def cusum(previous: float, comparison: MissingRegions, allowed_share: float) -> float:
-    """What was gone beyond the share that is allowed, summed up over views as long as it is above 0 (Page's
-    CUSUM, Biometrika 1954)."""
+    """Sum, floored at 0, of the missing share beyond `allowed_share` (Page's CUSUM, Biometrika 1954)."""
     return max(0.0, previous + comparison.missing_share - allowed_share)
 
 
 def _informative(
     comparisons: Iterator[tuple[int, MissingRegions]], limit: int
 ) -> list[tuple[int, MissingRegions]]:
-    """The first of those that say something."""
+    """The first `limit` comparisons with enough visible points."""
     return list(
         itertools.islice(
             (comparison for comparison in comparisons if comparison[1].visible >= _MIN_POINTS), limit
@@ -145,8 +153,10 @@ def _informative(
 
 
 def _near_pairs(poses_a: F64, poses_b: F64) -> Iterator[tuple[int, int, F64]]:
-    """Pairs of poses x (N, 4, 4), y (K, 4, 4) from about one spot, as i, j, T_x_y; nearest first, each pose
-    in one of them."""
+    """Yield pairs of poses a (N, 4, 4), b (K, 4, 4) from about one spot as i, j, T_a_b.
+
+    Nearest first, each pose in at most one pair.
+    """
     a, b = poses_a[:, :3, 3], poses_b[:, :3, 3]
     square = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
     rows, cols = np.nonzero(square < _NEAR_M**2)

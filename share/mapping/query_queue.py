@@ -1,4 +1,4 @@
-"""Whose keyframe is looked up next: fair between agents, headsets before robots, the newest first."""
+"""Which keyframe is looked up next: fair between agents, headsets before robots, the newest first."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from share.scheduling.qoe import QoeParameters
 from share.types import F64, AgentKind
 from share.wire.messages import Hello
 
-# ---- Which candidates for a keyframe's place are tried: as many as are worth it, fewer while others wait.
-
 
 class SearchBudget(NamedTuple):
-    """enough: verified candidates after which the rest is left alone. While others wait one is, and no more
-    than `max_tried_hurried` are tried."""
+    """Limits of the verification of one keyframe's candidates.
+
+    max_verified: accepted candidates after which the rest is skipped. While other queries wait it is one, and
+    at most `max_tried_hurried` are tried.
+    """
 
     max_verified: int
     max_tried_hurried: int
@@ -32,8 +33,7 @@ class SearchBudget(NamedTuple):
 
 
 class CandidateSearch:
-    """For the place of keyframe `node_id`; candidates: best first. What comes to wait meanwhile hurries
-    it."""
+    """Candidates of keyframe `node_id`, best first, tried within a budget."""
 
     def __init__(self, node_id: int, candidates: Iterable[int], budget: SearchBudget) -> None:
         self.node_id = node_id
@@ -41,7 +41,7 @@ class CandidateSearch:
         self._tried_count = self._verified_count = 0
 
     def next_candidate(self, is_hurried: bool) -> int | None:
-        """The candidate to try now; None when there are no more, or enough."""
+        """Return the next candidate to verify; None when there are none left or the budget is spent."""
         max_tried = self._budget.max_tried_hurried if is_hurried else self._tried_count + 1
         max_verified = 1 if is_hurried else self._budget.max_verified
         if not self._remaining or self._tried_count >= max_tried or self._verified_count >= max_verified:
@@ -50,35 +50,32 @@ class CandidateSearch:
         return self._remaining.popleft()
 
     def count_verified(self) -> None:
-        """The last one is it."""
+        """Count the last candidate as verified."""
         self._verified_count += 1
 
 
-_NEWEST_CONSIDERED = (
-    4  # so many newest keyframes are looked up before others: who waits too long is answered too late
-)
+_NEWEST_CONSIDERED = 4  # agents with the newest keyframes; older ones would be answered too late
 _TURN_WEIGHT = {AgentKind.AR: 4, AgentKind.ROBOT: 1}  # a robot waits four times as many turns as a headset
-_MAX_SKIPPED = 100  # passed over, the newest: those that may still be looked up when nothing else waits
+_MAX_SKIPPED = 100  # newest skipped keyframes, which may be looked up when nothing waits
 
 
 def qoe_form(config: Config, hello: Hello) -> AgentKind:
-    """By its needs, not by what it is."""
+    """Kind of QoE that the agent needs: set by the configuration, by default its own kind."""
     return QoeParameters.from_config(config.control, hello.kind, hello.name).form
 
 
 def service_kind(config: Config, hello: Hello) -> AgentKind:
-    """By its form; by a policy that takes agents alike, as anybody."""
+    """Kind that sets the agent's share of look-ups; AR for all under policies that treat agents alike."""
     if POLICIES[config.edge.policy].treats_alike:
         return AgentKind.AR
     return qoe_form(config, hello)
 
 
 class QueryQueue:
-    """Keyframes that wait to be looked up, at most `edge.max_waiting`, and `each_waiting` of an agent: what
-    waits longer is answered when nobody asks any more.
+    """Keyframes that wait to be looked up: at most `edge.max_waiting`, and `edge.each_waiting` of an agent.
 
-    One too many: the oldest, of this agent or of the one with most of them, is passed over (policy
-    skip_oldest_query).
+    Beyond that the oldest one, of this agent or of the one with most, is skipped (policy skip_oldest_query):
+    an answer that late is of no use.
     """
 
     def __init__(self, config: EdgeConfig) -> None:
@@ -86,7 +83,7 @@ class QueryQueue:
         self._config = config
         self._waiting: dict[str, deque[int]] = {}
         self._weights: dict[str, int] = {}
-        self._last_turn: dict[str, int] = {}  # when, in turns
+        self._last_turn: dict[str, int] = {}  # number of each agent's last turn
         self._turn = 0
         self._skipped_ids = deque[int](maxlen=_MAX_SKIPPED)
 
@@ -95,16 +92,16 @@ class QueryQueue:
 
     @property
     def is_hurried(self) -> bool:
-        """So many wait that the one at hand should soon be done."""
+        """Return whether so many wait that the current search should end soon."""
         return len(self) >= self._config.hurry_waiting
 
     def remove_agent(self, agent: str) -> None:
-        """Nothing of it waits."""
+        """Forget an agent and its waiting keyframes."""
         for per_agent in (self.skipped, self._waiting, self._weights, self._last_turn):
             per_agent.pop(agent, None)
 
     def add(self, agent: str, kind: AgentKind, node_id: int, is_extra: bool = False) -> None:
-        """is_extra: it is passed over at once."""
+        """Add a keyframe; with is_extra it is skipped at once."""
         if is_extra:
             self._mark_skipped(agent, node_id)
             return
@@ -117,7 +114,11 @@ class QueryQueue:
             self._skip_oldest(max(self._waiting, key=lambda name: len(self._waiting[name])))
 
     def next_query(self) -> int | None:
-        """Of the newest keyframes, that of the agent that has waited longest for its turn; None without."""
+        """Take the newest waiting keyframe of the agent whose turn it is, or None.
+
+        Among the agents with the newest keyframes, it is the turn of the one that waited longest, weighted by
+        kind.
+        """
         if not self._waiting:
             return None
         self._turn += 1
@@ -127,7 +128,7 @@ class QueryQueue:
         return self._pop(agent, is_oldest=False)
 
     def next_skipped(self) -> int | None:
-        """Of those that were passed over, the newest; None without."""
+        """Take the newest skipped keyframe, or None."""
         return self._skipped_ids.pop() if self._skipped_ids else None
 
     def _skip_oldest(self, agent: str) -> None:
@@ -145,14 +146,16 @@ class QueryQueue:
         return node_id
 
 
-# ---- Which look-alikes of a keyframe to try first where there is no time to try them all.
-
-_FAR_M, _FAR_RAD = 4.0, 1.0  # views of one map further apart than this, or turned more, seldom share enough
+# Views of one map beyond either seldom share enough points.
+_FAR_M = 4.0
+_FAR_RAD = 1.0
 
 
 def rank_candidates(graph: MapGraph, node_id: int, others: Sequence[int]) -> list[int]:
-    """`others`, of which those of larger maps come first, for agents are to end up in one; last those that
-    this keyframe cannot see if its map is right. Where it is wrong they are still tried, but later."""
+    """Sort candidates: those in larger maps first, so that agents end up in one map.
+
+    Last, but tried too, are those that this keyframe cannot see according to its map, which may be wrong.
+    """
     nodes = graph.odometry.nodes
     sizes: Counter[int] = Counter()
     for segment, reference_segment in zip(graph.odometry.segments, graph.reference_segments, strict=True):

@@ -1,4 +1,4 @@
-"""Keyframes whose reference is lost, tied to what is left of their stretch."""
+"""Repair of stored keyframes whose reference keyframe is missing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from share.mapping.map_changes import SaveLink, StoredKeyframe, odometry_link
 
 @dataclass(frozen=True, eq=False)
 class Repaired:
-    """keyframes, links: with every reference there. tied: keyframes whose edge was made anew."""
+    """keyframes, links: with every reference present. reconnected_count: keyframes whose edge was rebuilt."""
 
     keyframes: tuple[StoredKeyframe, ...]
     links: dict[KeyframeKey, SaveLink]
@@ -20,11 +20,11 @@ class Repaired:
 
 
 def repair_references(keyframes: Sequence[StoredKeyframe], links: Mapping[KeyframeKey, SaveLink]) -> Repaired:
-    """Tie each keyframe whose reference is not there to the nearest before it on the same stretch.
+    """Connect each keyframe without its reference to the nearest earlier one on its segment.
 
-    keyframes: in the order in which they came. Both stand in one odometry, so their relative pose is known:
-    T_ref_body = T_odom_ref^-1 T_odom_body. Of the steps in between nothing is left; each is taken to be as
-    uncertain as the step that is known. With none before it, a keyframe begins its stretch.
+    keyframes: in order of arrival. Both are in one odometry frame, so T_ref_body = T_odom_ref^-1 T_odom_body.
+    Each missing step is given the covariance of the known one. A keyframe without an earlier one begins its
+    segment.
     """
     out: list[StoredKeyframe] = []
     current_links = dict(links)
@@ -58,6 +58,6 @@ def _reconnect(keyframe: StoredKeyframe, edge: SaveLink, previous: StoredKeyfram
 
 
 def _with_edge(keyframe: StoredKeyframe, edge: SaveLink) -> StoredKeyframe:
-    """As if its agent had said so: the covariance is still the agent's, not yet the graph's."""
+    """Return the keyframe as if its agent had sent this edge: the covariance is not yet inflated."""
     sent = replace(keyframe.keyframe, reference=edge.reference, T_ref_body=edge.T_ref_body, cov=edge.cov)
     return replace(keyframe, keyframe=sent)

@@ -1,4 +1,4 @@
-"""What the agents said of themselves: keyframes on stretches of unbroken odometry."""
+"""Odometry segments as the agents sent them, and the runs of each agent."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from share.types import F64, Keyframe
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A keyframe of a stretch. T_odom_body (4, 4): where its agent took itself to be. ordinal: how many
-    came before it there."""
+    """A keyframe of a segment.
+
+    T_odom_body (4, 4): its pose by the agent's odometry. ordinal: number of keyframes before it on the
+    segment, removed ones included.
+    """
 
     key: KeyframeKey
     segment: int
@@ -24,8 +27,11 @@ class Node:
 
 @dataclass(eq=False)
 class Segment:
-    """nodes: their numbers, rising. name: `agent/n`, the n-th of this agent. rank: of a map's stretches the
-    least founds it, the oldest of those that are alike. count: of all it ever had."""
+    """A segment of one agent's odometry.
+
+    nodes: node ids, ascending. name: `agent/n`, the n-th of this agent. rank: the segment of the least rank,
+    among equals the oldest, is the reference of a map. total_count: keyframes it ever had.
+    """
 
     agent: str
     name: str
@@ -35,8 +41,10 @@ class Segment:
 
 
 class OdometrySegments:
-    """Nodes by number, in the order of arrival, and the stretches that they make up, oldest first; live:
-    those that have nodes."""
+    """Nodes by id, in order of arrival, and the segments that they form, oldest first.
+
+    live_segments: those that still have nodes.
+    """
 
     def __init__(self) -> None:
         self.nodes: dict[int, Node] = {}
@@ -44,13 +52,16 @@ class OdometrySegments:
         self.live_segments: dict[int, None] = {}
         self._next_id = 0
         self._node_ids: dict[KeyframeKey, int] = {}
-        self._current: dict[str, int] = {}  # agent -> stretch that it is on
-        self._segment_counts: dict[str, int] = {}  # agent -> how many stretches
+        self._current: dict[str, int] = {}  # current segment of each agent
+        self._segment_counts: dict[str, int] = {}  # segments of each agent so far
 
     def add_keyframe(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
-        """The number of the new node. rank: of a stretch that it begins. Where all of its stretch was taken
-        out, that goes on with it. Raises ValueError for a keyframe known already, or one whose reference is
-        unknown: the caller applies each once and in order."""
+        """Add a keyframe and return its node id. rank: that of a segment which it begins.
+
+        If all keyframes of the agent's current segment were removed, the keyframe continues it. Raises
+        ValueError for a duplicate or an unknown reference: the caller applies each keyframe once and in
+        order.
+        """
         key = KeyframeKey(agent, keyframe.id)
         if key in self._node_ids:
             raise ValueError(f"keyframe {key} was added before")
@@ -62,7 +73,7 @@ class OdometrySegments:
         return self.append_node(key, previous.segment, keyframe.T_odom_body)
 
     def new_segment(self, agent: str, rank: int = 0) -> int:
-        """A new stretch of this agent, which is on it from now on."""
+        """Begin a segment, which becomes the agent's current one, and return its index."""
         count = self._segment_counts.get(agent, 0)
         self._segment_counts[agent] = count + 1
         self._current[agent] = len(self.segments)
@@ -72,20 +83,19 @@ class OdometrySegments:
     def append_node(
         self, key: KeyframeKey, segment: int, T_odom_body: F64, ordinal: int | None = None
     ) -> int:
-        """The number of a new node at the end of a stretch."""
-        segment_record = self.segments[segment]
+        """Append a node to a segment and return its id."""
+        target = self.segments[segment]
+        ordinal = target.total_count if ordinal is None else ordinal
         node_id, self._next_id = self._next_id, self._next_id + 1
-        self.nodes[node_id] = Node(
-            key, segment, segment_record.total_count if ordinal is None else ordinal, T_odom_body
-        )
-        segment_record.nodes.append(node_id)
+        self.nodes[node_id] = Node(key, segment, ordinal, T_odom_body)
+        target.nodes.append(node_id)
         self.live_segments[segment] = None
-        segment_record.total_count = self.nodes[node_id].ordinal + 1
+        target.total_count = ordinal + 1
         self._node_ids[key] = node_id
         return node_id
 
     def remove_node(self, node_id: int) -> None:
-        """Forget a node; its stretch goes on without it."""
+        """Remove a node; its segment continues without it."""
         node = self.nodes.pop(node_id)
         nodes = self.segments[node.segment].nodes
         nodes.remove(node_id)
@@ -94,71 +104,74 @@ class OdometrySegments:
         del self._node_ids[node.key]
 
     def remove_agent(self, agent: str) -> None:
-        """An agent that has no nodes any more. Its stretches stay as numbers without any."""
+        """Forget an agent without nodes. Its segments keep their indices."""
         self._current.pop(agent, None)
         self._segment_counts.pop(agent, None)
 
     def newest_node(self, agent: str) -> int | None:
-        """The newest node of the agent's present stretch."""
+        """Newest node of the agent's current segment, or None."""
         nodes = self.segments[self._current[agent]].nodes if agent in self._current else []
         return nodes[-1] if nodes else None
 
     def has_nodes(self, agent: str) -> bool:
-        """Whether a node of the agent is left, on any of its stretches."""
+        """Return whether the agent has nodes on any segment."""
         return any(self.segments[segment].agent == agent for segment in self.live_segments)
 
     def has_keyframe(self, key: KeyframeKey) -> bool:
         return key in self._node_ids
 
     def node_id(self, key: KeyframeKey) -> int:
-        """Raises ValueError if no such keyframe is there."""
+        """Return the node of a keyframe. Raises ValueError if it is unknown."""
         if key not in self._node_ids:
             raise ValueError(f"keyframe {key} is not known")
         return self._node_ids[key]
 
     def current_segment(self, agent: str) -> int | None:
-        """The stretch that the agent is on now."""
+        """The segment to which the agent's keyframes are appended; None before its first."""
         return self._current.get(agent)
 
     def previous_node(self, node_id: int) -> int | None:
-        """The node before this one on its stretch; None for the first."""
+        """Node before this one on its segment; None for the first."""
         return self._neighbour(node_id, -1)
 
     def next_node(self, node_id: int) -> int | None:
-        """The node after this one on its stretch; None for the newest."""
+        """Node after this one on its segment; None for the newest."""
         return self._neighbour(node_id, +1)
 
-    def are_neighbours(self, a: int, b: int, disagreement: int) -> bool:
-        """Fewer than `disagreement` keyframes apart on one stretch, so that odometry knows their pose
-        best."""
+    def are_neighbours(self, a: int, b: int, min_gap: int) -> bool:
+        """Return whether a and b are too close on one segment for a loop: fewer than `min_gap` keyframes
+        apart.
+        """
         first, second = self.nodes[a], self.nodes[b]
-        return first.segment == second.segment and abs(first.ordinal - second.ordinal) < disagreement
+        return first.segment == second.segment and abs(first.ordinal - second.ordinal) < min_gap
 
     def _neighbour(self, node_id: int, step: int) -> int | None:
         nodes = self.segments[self.nodes[node_id].segment].nodes
-        at = bisect_left(nodes, node_id) + step
-        return nodes[at] if 0 <= at < len(nodes) else None
+        i = bisect_left(nodes, node_id) + step
+        return nodes[i] if 0 <= i < len(nodes) else None
 
 
-# ---- Whose each run is, and which run of a name is its present one.
+# Runs of each agent: which are connected, and which is the current one of a name.
 
 
 class AgentRuns:
-    """Runs by name. A run that nobody has introduced is its own name's, and present."""
+    """Runs by agent name, and which runs are connected. An unregistered run is present under its own id."""
 
     def __init__(self) -> None:
         self._name_by_run: dict[str, str] = {}
-        self._present_run: dict[str, str] = {}  # run of each name, the one heard of longest ago first
+        self._present_run: dict[str, str] = {}  # current run of each name, by when it last connected
         self._absent: set[str] = set()
 
     def add(self, run: str, name: str) -> None:
-        """A new run: it is its name's present one from now on."""
+        """Register a new run, which becomes the current one of its name."""
         self._name_by_run[run] = name
         self.set_present(run, True)
 
     def set_present(self, run: str, is_present: bool) -> bool:
-        """Whether it is heard; returns whether that is news. An older run that comes back is its name's
-        present one again."""
+        """Set whether a run is connected; return whether that changed.
+
+        A run that reconnects becomes the current one of its name again.
+        """
         was_absent = run in self._absent
         if not is_present:
             self._absent.add(run)
@@ -170,7 +183,7 @@ class AgentRuns:
         return was_absent
 
     def remove(self, run: str) -> None:
-        """Nothing of it is left."""
+        """Forget a run."""
         name = self._name_by_run.pop(run, run)
         self._absent.discard(run)
         if self._present_run.get(name) == run:
@@ -185,28 +198,29 @@ class AgentRuns:
         return run in self._absent
 
     def is_name_absent(self, name: str) -> bool:
-        """Whether none of its runs is heard."""
+        """Return whether the current run of this name is not connected."""
         return self._present_run.get(name, name) in self._absent
 
     def is_superseded(self, run: str) -> bool:
-        """Whether it is not heard, and another run of its name has come after it."""
+        """Return whether the run is not connected and its name has a newer run."""
         return run in self._absent and self._present_run.get(self.name(run), run) != run
 
     def presence_order(self) -> dict[str, int]:
-        """Of each name, when its present run came or came back: in the order of these numbers."""
-        return {name: at for at, name in enumerate(self._present_run)}
+        """Rank of each name by when its current run last connected, oldest first."""
+        return {name: i for i, name in enumerate(self._present_run)}
 
 
 def fair_quotas(
     counts: Counter[str], limits: Counter[str], count: int, presence_order: Mapping[str, int]
 ) -> Counter[str]:
-    """How many of `total_count` each name gives: again and again the one that holds most, of several the one
-    heard of longest ago. So nobody who holds no more than a fair share gives anything.
+    """Split `count` removals among names: one at a time from the name that holds most.
 
-    held: keyframes of each name. most: that it can give. heard_of: as `Owners.presence_order`.
+    Ties go to the name that connected longest ago. A name that holds no more than a fair share gives nothing.
+    counts: keyframes of each name; limits: how many each can give; presence_order: from
+    `AgentRuns.presence_order`.
     """
     out = Counter[str]()
     for _ in range(min(count, limits.total())):
         candidates = (name for name in counts if out[name] < limits[name])
-        out[max(candidates, key=lambda one: (counts[one] - out[one], -presence_order.get(one, -1)))] += 1
+        out[max(candidates, key=lambda name: (counts[name] - out[name], -presence_order.get(name, -1)))] += 1
     return out

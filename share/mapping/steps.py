@@ -1,4 +1,4 @@
-"""The slow steps of mapping, as frozen values: whoever runs them hands the result back to the mapper."""
+"""The slow steps of mapping as frozen values, which the caller runs; results go back to the mapper."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.config import PlaceConfig
-from share.mapping.atlas import SolveJob
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.graph.updates import GraphSolution
+from share.mapping.map_solving import SolveJob
 from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
 from share.types import F64, Correction
@@ -17,7 +17,7 @@ from share.types import F64, Correction
 
 @dataclass(frozen=True, eq=False)
 class QueryStep:
-    """Which stored keyframes look like this one?"""
+    """Find stored keyframes that look like this one."""
 
     index: PlaceIndex
     node_id: int
@@ -32,7 +32,7 @@ class QueryStep:
 
 @dataclass(frozen=True, eq=False)
 class VerifyStep:
-    """Is this the place of that candidate?"""
+    """Verify one candidate: relative pose, or a refusal."""
 
     node_id: int
     query_view: CameraView
@@ -47,7 +47,7 @@ class VerifyStep:
 
 @dataclass(frozen=True, eq=False)
 class SolveStep:
-    """Where was everybody?"""
+    """Optimise one map."""
 
     job: SolveJob
     kind: str = "solve"
@@ -63,12 +63,9 @@ LookupStep = QueryStep | VerifyStep
 Step = QueryStep | VerifyStep | SolveStep
 
 
-# ---- What the mapper decides, and tells the edge.
-
-
 @dataclass(frozen=True, eq=False)
 class MapEvent:
-    """Something decided about an agent's run, why, and the correction that follows, if one does."""
+    """A decision about an agent's run with its reason, and the correction that follows, if any."""
 
     agent: str
     event: str
@@ -79,9 +76,12 @@ class MapEvent:
 def map_assignment(
     agent: str, map_id: str, T_map_odom: F64, about_id: int, cov: F64 | None = None
 ) -> MapEvent:
-    """Which map a run is in, before anything moves it there. A map is named after what founded it. about: a
-    keyframe of the stretch. cov (6, 6): of T_map_odom; exact where it is the map's own gauge."""
-    verb = "founds" if map_id.startswith(f"{agent}/") else "is in"
+    """Event that assigns a run to a map. A map is named after its reference segment.
+
+    about_id: a keyframe of the run's segment. cov (6, 6): of T_map_odom; None where it is exact, since the
+    segment defines the map's frame.
+    """
+    verb = "starts" if map_id.startswith(f"{agent}/") else "is in"
     return MapEvent(
         agent,
         "correction",

@@ -32,8 +32,8 @@ def life(session: int, poses: int, solves: int) -> dict[str, Any]:
         tell(1, m.Bye())
         tell(1, hello_of("ann", 1))
     tell(9, m.Evaluation(0, 1.0, None))
-    mapper._counts["solve"] = solves
-    mapper._removed_runs_counters.loops_tried = solves
+    mapper._counters.steps["solve"] = solves
+    mapper._counters._removed_runs.loops_tried = solves
     return edge.report(mapper.report())
 
 

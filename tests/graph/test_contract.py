@@ -75,9 +75,9 @@ def test_an_end_of_a_chain_is_dropped() -> None:
 
 
 def test_what_cannot_be_contracted_is_refused() -> None:
-    with pytest.raises(ValueError, match="no neighbour by odometry"):
+    with pytest.raises(ValueError, match="no odometry edge"):
         contract_pose(5, [], [random_edge(1, 5, 0)])
-    with pytest.raises(ValueError, match="does not touch it"):
+    with pytest.raises(ValueError, match="does not end at it"):
         contract_pose(5, [random_edge(1, 2, 0)], [])
 
 
@@ -92,7 +92,7 @@ def test_parallel_loops_become_one() -> None:
     assert 0.9 < chi2 / (6 * 399) < 1.1
     wrong = PoseEdge(0, 1, edges[0].T_a_b @ se3.exp(np.full(6, 0.2)), LOOP)
     assert fuse_edges([edges[0], wrong])[1] > 100
-    with pytest.raises(ValueError, match="different poses"):
+    with pytest.raises(ValueError, match="the same two poses"):
         fuse_edges([edges[0], random_edge(0, 2, 0)])
 
 

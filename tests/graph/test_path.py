@@ -53,7 +53,7 @@ def test_edges_come_and_go() -> None:
             agree(roads, edges, room, 199 - k, rng.choice(200, 6).tolist())
     with pytest.raises(KeyError):
         roads.remove(out[0])
-    with pytest.raises(ValueError, match="is here already"):
+    with pytest.raises(ValueError, match="was added before"):
         roads.add(edges[0])
 
 

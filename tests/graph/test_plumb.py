@@ -8,7 +8,7 @@ from rooms import Room, simulate
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.mapping.graph import edges
+from share.mapping.graph import gravity
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.graph.updates import GraphSolution, GraphUpdate
 from share.types import F64
@@ -44,14 +44,16 @@ def test_slope_and_curvature_are_the_cost_s() -> None:
     rng = np.random.default_rng(3)
     poses = se3.exp(rng.normal(0, 0.4, (5, 6)))
     lines = np.concatenate([rng.normal(0, 1, (4, 3)), np.zeros((1, 3))])
-    slope, curvature = edges.gravity_equations(poses, lines)
+    slope, curvature = gravity.gravity_equations(poses, lines)
     step, numeric = 1e-5, np.zeros((5, 6))
     for k in range(5):
         for j in range(6):
             there, back = poses.copy(), poses.copy()
             xi = step * np.eye(6)[j]
             there[k], back[k] = poses[k] @ se3.exp(xi), poses[k] @ se3.exp(-xi)
-            numeric[k, j] = (edges.gravity_cost(there, lines) - edges.gravity_cost(back, lines)) / (4 * step)
+            numeric[k, j] = (gravity.gravity_cost(there, lines) - gravity.gravity_cost(back, lines)) / (
+                4 * step
+            )
     assert slope == pytest.approx(numeric, abs=1e-8)
     assert np.linalg.eigvalsh(curvature).min() > -1e-12
     assert not slope[4].any() and not curvature[4].any()

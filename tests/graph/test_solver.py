@@ -260,7 +260,7 @@ def test_news_that_do_not_fit_are_refused_and_change_nothing() -> None:
         assert len(solver) == 2
     with pytest.raises(ValueError, match="pose 7 is not known"):
         solver.solve(7)
-    with pytest.raises(ValueError, match="pose 7 is not joined to 0"):
+    with pytest.raises(ValueError, match="pose 7 is not connected to 0"):
         solver.solve(0, [7])
     with pytest.raises(ValueError, match="poses"):
         GraphUpdate.from_edges({0: np.eye(3)})
@@ -295,5 +295,5 @@ def test_a_straight_chain_with_one_loop_in_closed_form() -> None:
 
 
 def test_an_edge_joins_two_poses() -> None:
-    with pytest.raises(ValueError, match="does not join two poses"):
+    with pytest.raises(ValueError, match="needs two different poses"):
         PoseEdge(1, 1, np.eye(4), LOOP)

@@ -6,10 +6,11 @@ import numpy as np
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.mapping.atlas import AppliedSolution, Atlas, SolveJob
+from share.mapping.atlas import Atlas
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.graph.updates import GraphSolution
 from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.map_solving import AppliedSolution, SolveJob
 from share.types import F64, Keyframe, View
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))

@@ -59,7 +59,7 @@ def test_two_agents_are_joined_to_truth(ann: Walker, bob: Walker) -> None:
     for x in near_loops(ann, bob, rng) + near_loops(bob, bob, rng):
         decisions.append(atlas.propose(x))
         applied += settle(atlas)
-    assert "would join two maps, 1 of 5 places that say so: waits" in decisions[0].reason
+    assert "would merge two maps, 1 of 5 required places agree: pending" in decisions[0].reason
     joining = [k for k, d in enumerate(decisions) if d.joined_maps]
     assert joining == [4]  # every one of these loops is at a place of its own
     assert decisions[4].joined_maps == ("ann/0", "bob/0")
@@ -160,7 +160,7 @@ def test_of_small_maps_fewer_places_are_enough_but_never_one_keyframe() -> None:
     ann, bob = Walker("ann", 1, 5, turn=0.5), Walker("bob", 2, 5, turn=0.5)
     rng = np.random.default_rng(0)
     atlas = atlas_of(ann, bob)
-    assert "0 of 1 places" in atlas.propose(far_loop(ann, 0, bob, 4, rng)).reason
+    assert "0 of 1 required places" in atlas.propose(far_loop(ann, 0, bob, 4, rng)).reason
     for i in (1, 2, 3):
         assert not atlas.propose(loop(ann, i, bob, 1, rng)).accepted
     assert atlas.propose(loop(ann, 1, bob, 2, rng)).joined_maps == ("ann/0", "bob/0")
@@ -185,7 +185,7 @@ def test_in_a_map_a_wrong_loop_contradicts_it(ann: Walker) -> None:
     assert not decision.accepted
     assert "contradicts the map" in decision.reason
     assert atlas.propose(right).accepted
-    assert "joined already" in atlas.propose(right.reverse()).reason
+    assert "have a loop already" in atlas.propose(right.reverse()).reason
 
 
 def test_neighbours_are_odometrys_business(ann: Walker) -> None:
@@ -294,7 +294,7 @@ def test_a_solution_of_a_map_that_was_joined_meanwhile_is_left_aside(ann: Walker
     before = poses(atlas, ann, bob)
     applied = atlas.apply_solution(*result)
     assert applied.corrections == {}
-    assert "joined or split" in applied.reason
+    assert "merged or split" in applied.reason
     assert np.array_equal(poses(atlas, ann, bob), before)
     assert atlas.due_maps() == ["ann/0"]
     assert settle(atlas)[0].corrections.keys() == {"ann", "bob"}
@@ -334,10 +334,10 @@ def test_a_false_join_is_taken_out_once_better_evidence_is_there(ann: Walker, bo
         others.append(atlas.propose(x))
         settle(atlas)
     assert "contradicts the map" in first.reason
-    assert "1 places (weight 0.38) say so, 4 places needed" in first.reason
+    assert "1 places (weight 0.38) support it, 4 places needed" in first.reason
     assert not (first.dropped or second.dropped or third.dropped)
     assert set(fourth.dropped) == set(false)
-    assert "taken out: ann:0 - bob:13, ann:4 - bob:17" in fourth.reason
+    assert "loops removed: ann:0 - bob:13, ann:4 - bob:17" in fourth.reason
     assert fourth.joined_maps == ("ann/0", "bob/0")
     assert len(fourth.added) == 4
     assert all(d.accepted for d in others)
@@ -353,7 +353,7 @@ def test_what_stands_is_not_taken_out_by_hardly_more(ann: Walker, bob: Walker) -
     settle(atlas)
     true = [replace(x, found_share=0.58) for x in near_loops(ann, bob, np.random.default_rng(0))]
     fourth = [atlas.propose(x) for x in true[:4]][-1]
-    assert "4 places (weight 1.35) say so, 5 places (weight 1.06) do not" in fourth.reason
+    assert "4 places (weight 1.35) support it, 5 places (weight 1.06) oppose it" in fourth.reason
     assert not fourth.accepted
 
 
@@ -377,7 +377,7 @@ def test_two_stories_of_like_weight_join_nothing(ann: Walker, bob: Walker) -> No
             assert not atlas.propose(x).accepted
         decisions = [atlas.propose(x) for x in true]
         assert decisions[-1].accepted == joined
-        assert joined or "another story has 4 places" in decisions[-1].reason
+        assert joined or "a competing hypothesis has 4 places" in decisions[-1].reason
 
 
 def test_views_that_lack_what_both_should_show_join_nothing(ann: Walker, bob: Walker) -> None:
@@ -386,7 +386,7 @@ def test_views_that_lack_what_both_should_show_join_nothing(ann: Walker, bob: Wa
         atlas = atlas_of(ann, bob)
         decisions = [atlas.propose(replace(x, found_share=found)) for x in true]
         assert any(d.joined_maps for d in decisions) == joined
-    assert "only 44% of what both should show is found" in atlas_says(ann, bob, true, 0.44)
+    assert "only 44% of the points in both views are found" in atlas_says(ann, bob, true, 0.44)
 
 
 def atlas_says(ann: Walker, bob: Walker, loops: list[Loop], found: float) -> str:
@@ -422,7 +422,7 @@ def test_a_loop_that_the_solved_map_speaks_against_is_dropped(ann: Walker, bob: 
     wrong = loop(ann, 30, bob, 8, rng, WRONG)
     assert atlas.propose(wrong).accepted
     reasons = [applied.reason for applied in settle(atlas)]
-    assert "dropped loops at odds with it: ann:30 - bob:8" in reasons[0]
+    assert "outlier loops removed: ann:30 - bob:8" in reasons[0]
     assert wrong not in atlas.loops
     assert error(poses(atlas, ann, bob), truth(ann, bob)) < 0.06
 

@@ -170,7 +170,7 @@ def again(tied: bool) -> tuple[Atlas, list]:
 @pytest.mark.parametrize("log", [0.0, 0.05])
 def test_after_a_restart_who_was_not_in_the_common_map_is_compared_before_he_comes_into_it(tied, log):
     atlas, loops = again(tied)
-    assert "since the edge was started again" in atlas.standing("eve").reason
+    assert "the edge has restarted" in atlas.standing("eve").reason
     said = [atlas.propose(loop) for loop in loops[:4]]
     assert not any(decision.accepted for decision in said)
     assert all("compared first" in decision.reason for decision in said)
@@ -184,4 +184,4 @@ def test_after_a_restart_who_was_not_in_the_common_map_is_compared_before_he_com
     assert met_again[-1] == (log == 0.0)
     assert atlas.standing("eve").state == ("agrees" if log == 0.0 else "disputed")
     assert atlas.standing("bob").state == "unknown"
-    assert ("started again" in atlas.standing("bob").reason) != tied
+    assert ("edge has restarted" in atlas.standing("bob").reason) != tied

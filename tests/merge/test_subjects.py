@@ -299,7 +299,7 @@ def test_who_is_doubted_since_the_edge_was_started_again_is_proven_by_another_wh
     town.agreement.identities.mark_unverified({"ann-1", "bob-1"})
     for run in ("ann-2", "bob-2"):
         town.enter(run)
-    assert "started again" in town.agreement.unverified_reason(["ann-2"], ["bob-2"])
+    assert "edge has restarted" in town.agreement.unverified_reason(["ann-2"], ["bob-2"])
     town.meet("ann-2", "bob-2", 1.0, 10)
     assert not town.agreement.unverified_reason(["ann-2"], ["bob-2"])
 

@@ -1,68 +1,44 @@
-"""Which agents agree on scale, calibration and how sure they are, and which must not move others.
+"""Which agents agree on scale, calibration and covariances, and which must not affect others' maps.
 
-Every two agents are compared by the loops between them (`share.mapping.agents.pairwise`), by all of them
-and by the newest, for who is right at first may be wrong later. What differs both significantly and by more
-than does no harm is a disagreement. Of several agents the one that disagrees with most is set apart, as in
-pairwise consistency (Mangelson et al., ICRA 2018), with agents for loops; of two, nobody can say which is
-wrong, and they keep a map each. An agent is a subject here, all runs of a name
-(`share.mapping.agents.identities`)."""
+Every two agents are compared by the loops between them (`share.mapping.agents.pairwise`), by all loops and by
+the newest, since an agent may become wrong. A disagreement is a difference that is significant and large
+enough to matter. Among several agents the one that disagrees with most is quarantined, as in pairwise
+consistency (Mangelson et al., ICRA 2018) with agents for loops. Of two agents it is undetermined which is
+wrong; the pair is disputed, and each keeps its own map. All runs of a name are one agent here
+(`share.mapping.agents.identities`).
+"""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Collection, Container, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
+from share.mapping.agents.agent_pair import AgentPair
 from share.mapping.agents.covariance_scales import CovarianceClaims, CovarianceScales, SegmentPair
-from share.mapping.agents.identities import (
-    AgentIdentities,
-    first_of_each_kind,
-    gravity_contradictions,
-    outvoted_agents,
-    scale_contradiction,
-    severity,
-)
-from share.mapping.agents.pairwise import (
-    AccumulatedOdometry,
-    ComparisonEquations,
-    InterAgentLoop,
-    OdometryComparison,
-    ScalarEstimate,
-    compare_odometry,
-    comparison_equations,
-    robust_depth_scale,
-    solve_comparison,
-)
+from share.mapping.agents.identities import AgentIdentities, outvoted_agents
+from share.mapping.agents.pairwise import AccumulatedOdometry, InterAgentLoop
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.recognition.depth_scale import DepthScale
 from share.types import F64
 
-_MAX_LOOPS = 32  # loops kept of two stretches
-_MAX_SCALES = 160
-_MAX_ROTATION_RAD = np.radians(1.5)  # rad, less does no harm
-_MAX_NIS = 3.0  # beyond what honest agents are too sure
-_MIN_DEPTH_SCALES, _MIN_LOOPS = 3, 8  # loops before a comparison by points, or by ways, says anything
-_RECENT_DEPTH_SCALES, _RECENT_LOOPS = 6, 12  # newest loops that are looked at on their own
-_MIN_INLIER_SHARE = 0.6  # of the loops must fit, or they are of more than one place
-_END_SEVERITY = 0.6  # a disagreement ends below this part of what began it
-_APPLY_SIGMAS, _KEEP_SIGMAS = (
-    2.5,
-    1.25,
-)  # sigmas from which on, and down to which, a scale is taken into account
-_MIN_SCALE_CHANGE = 0.001  # log scale that it has to change by
-_ENDED_SEGMENTS: SegmentPair = (-1, -1)  # newest loops of stretches that are gone
+_APPLY_SIGMAS = 2.5  # significance at which a scale is corrected
+_KEEP_SIGMAS = 1.25  # significance down to which it stays corrected
+_MIN_SCALE_CHANGE = 0.001  # log scale
 
 
 @dataclass(frozen=True)
 class AgentStanding:
-    """Of an agent, for people. state: `agrees`, `set apart`, `disputed` or `unknown`. log_scale, sigma: of
-    its depths against the others'; put_right: what of it is taken out; nis: see
-    `share.mapping.agents.pairwise`; None where not known. doubt: the most that is held against it and
-    another; 1 begins a disagreement. widened: by what the variances of its odometry are multiplied, for it is
-    too sure of them."""
+    """How an agent agrees with the others, as reported.
+
+    state: `agrees`, `set apart` (quarantined), `disputed` or `unknown`. log_scale, sigma: of its depths
+    relative to the others'; put_right: the part that is corrected. nis: of its loops, see
+    `share.mapping.agents.pairwise`; None where unknown. doubt: severity of its worst contradiction with
+    another agent; a disagreement begins at 1. widened: factor on the variances of its odometry, which it
+    understates.
+    """
 
     state: str = "unknown"
     reason: str = ""
@@ -74,51 +50,16 @@ class AgentStanding:
     widened: float = 1.0
 
 
-@dataclass(eq=False)
-class _SegmentPairLoops:
-    """Loops of two stretches. ways, newest: as all of them say, and the newest. news: since then."""
-
-    loops: list[InterAgentLoop] = field(default_factory=list)
-    comparison: OdometryComparison | None = None
-    recent_comparison: OdometryComparison | None = None
-    new_loops: int = 0
-
-
-@dataclass(eq=False)
-class _AgentPair:
-    """Of two agents, the lesser first. met: by stretches, those that are gone as one. scales: of more loops,
-    by which what does no harm is put right."""
-
-    by_segments: dict[SegmentPair, _SegmentPairLoops] = field(default_factory=dict)
-    depth_scales: deque[DepthScale] = field(default_factory=lambda: deque(maxlen=_MAX_SCALES))
-    depth_scale: ScalarEstimate | None = None
-    recent_depth_scale: ScalarEstimate | None = None  # of the newest of `depth_scales`
-    pooled_depth_scale: ScalarEstimate | None = None  # of all of them
-    severity: float = 0.0  # 1 begins a disagreement
-    disagrees: bool = False
-    reason_second: str = ""  # of the second, against the first
-    reason_first: str = ""  # of the first, against the second
-
-    @property
-    def nis(self) -> float | None:
-        """The most that loops of two stretches say; None where they are too few."""
-        return max(
-            (
-                segment_loops.comparison.nis
-                for segment_loops in self.by_segments.values()
-                if segment_loops.comparison is not None
-            ),
-            default=None,
-        )
-
-
 AgentNames = tuple[str, str]
 
 
 class AgentAgreement:
-    """Of all agents, which are told by their runs. tolerance: log scale that does no harm. apart: agents
-    that must not move others. disputed: pairs of which nobody can say who is wrong. scale: log of how much
-    too long the metres of each are, so far as that is sure; 0 where it is not there."""
+    """Agreement of all agents, which are given by their runs.
+
+    tolerance: log scale that does no harm. quarantined: agents that must not affect others. disputed: pairs
+    in which it is undetermined who is wrong. log_scales: log of how much too long each agent's metres are,
+    where significant; else missing.
+    """
 
     def __init__(self, tolerance: float) -> None:
         self.quarantined: frozenset[str] = frozenset()
@@ -128,15 +69,16 @@ class AgentAgreement:
         self._covariance_scales = CovarianceScales(CovarianceClaims())
         self._tolerance = tolerance
         self._accumulated: dict[int, AccumulatedOdometry] = {}
-        self._pairs: dict[AgentNames, _AgentPair] = {}
+        self._pairs: dict[AgentNames, AgentPair] = {}
 
     def add_run(self, run: str, name: str, credential: str | None = "") -> None:
-        """A run of the agent of this name comes; what is held against the name is held against the run.
-        voice: see `Subjects.speaks`."""
+        """Register a run of the agent of this name; what is known of the name applies to it. credential: see
+        `AgentIdentities.set_credential`.
+        """
         self.identities.add_run(run, name, self.quarantined.union(*self.disputed), credential)
 
     def add_step(self, run: str, node_id: int, previous_id: int | None, T_ref_body: F64, cov: F64) -> None:
-        """A new node, by odometry from the one before; None: it begins a stretch."""
+        """Add a node, by odometry from the previous one; None: it begins a segment."""
         previous = None if previous_id is None else self._accumulated.get(previous_id)
         self._accumulated[node_id] = (
             AccumulatedOdometry.origin() if previous is None else previous.with_step(T_ref_body, cov)
@@ -145,38 +87,24 @@ class AgentAgreement:
             self._covariance_scales.add_step(self.identities.identity(run), T_ref_body, cov)
 
     def log_scale(self, run: str) -> float:
-        """See `scale`."""
+        """Log of how much too long the run's metres are, where significant; else 0."""
         return self.log_scales.get(self.identities.identity(run), 0.0)
 
     def covariance_scale(self, run: str) -> float:
-        """By what the variances of its odometry have to be multiplied to be believed."""
+        """Factor on the variances of the run's odometry."""
         return self._covariance_scales.scales.get(self.identities.identity(run), 1.0)
 
     def remove_nodes(self, node_ids: Collection[int], live: Container[int]) -> None:
-        """Nodes that are taken out. live: stretches that have others. What loops of those that have not said
-        stays only so far as it decides who agrees: a disagreement does not end because its loops went."""
+        """Remove nodes. live: segments that still have nodes; see `AgentPair.end_segments` for the loops of
+        others.
+        """
         for node_id in node_ids:
             self._accumulated.pop(node_id, None)
-        removed_pairs = set[SegmentPair]()
-        for pair in self._pairs.values():
-            if ended_pairs := {
-                m for m in pair.by_segments if m != _ENDED_SEGMENTS and not (m[0] in live and m[1] in live)
-            }:
-                removed_pairs |= ended_pairs
-                ended_loops = [
-                    pair.by_segments.get(_ENDED_SEGMENTS, _SegmentPairLoops()),
-                    *(pair.by_segments.pop(segment_pair) for segment_pair in sorted(ended_pairs)),
-                ]
-                loops = [w for segment_loops in ended_loops for w in segment_loops.loops][-_MAX_LOOPS:]
-                most_severe = max(ended_loops, key=self._severity) if pair.disagrees else _SegmentPairLoops()
-                pair.by_segments[_ENDED_SEGMENTS] = _SegmentPairLoops(
-                    loops, most_severe.comparison, most_severe.recent_comparison
-                )
-        self._covariance_scales.drop_evidence(sorted(removed_pairs))
+        ended = set[SegmentPair]().union(*[pair.end_segments(live) for pair in self._pairs.values()])
+        self._covariance_scales.drop_evidence(sorted(ended))
 
     def remove_run(self, run: str) -> None:
-        """A run of which nothing is left, and that will not come back. With the last of an agent's goes all
-        that is known of it, but for what is held against its name."""
+        """Forget a run that will not return; after an agent's last run only suspicion of its name stays."""
         removed = self.identities.remove_run(run, self.quarantined, frozenset[str]().union(*self.disputed))
         if removed is None:
             return
@@ -194,28 +122,21 @@ class AgentAgreement:
         scale: DepthScale | None,
         tilt: tuple[float, float] | None,
     ) -> bool:
-        """A verified loop between two agents' runs, `edge` between its nodes; scale, tilt: see
-        `InterAgentLoop`.
-        Returns whether who is apart, or disputed, has changed."""
+        """Add a verified loop between two agents' runs; `edge` connects its nodes.
+
+        scale, tilt: see `InterAgentLoop`. Returns whether the quarantined or disputed agents have changed.
+        """
         first, second = (self.identities.identity(run) for run in agents)
         if self.identities.name(first) == self.identities.name(second):
             return False
         if first > second:
             first, second, segments, edge = second, first, segments[::-1], edge.reverse()
             scale = None if scale is None else scale.reverse()
-        pair = self._pairs.setdefault((first, second), _AgentPair())
+        pair = self._pairs.setdefault((first, second), AgentPair(self._tolerance))
         self._covariance_scales.link(first, second)
-        segment_loops = pair.by_segments.setdefault(segments, _SegmentPairLoops())
         a, b = self._accumulated[edge.a], self._accumulated[edge.b]
-        segment_loops.loops.append(InterAgentLoop(a, b, edge.T_a_b, edge.cov, scale, tilt))
-        if scale is not None:
-            pair.depth_scales.append(scale)
-        if len(segment_loops.loops) > _MAX_LOOPS:
-            del segment_loops.loops[_most_redundant_loop(segment_loops.loops)]
-        segment_loops.new_loops += 1
-        if segment_loops.new_loops * 6 < len(segment_loops.loops):
+        if not pair.add_loop(segments, InterAgentLoop(a, b, edge.T_a_b, edge.cov, scale, tilt)):
             return False
-        segment_loops.new_loops = 0
         did_disagree = pair.disagrees
         self._compare(pair, (first, second), segments)
         changed = self._update_quarantine() if pair.disagrees or did_disagree else False
@@ -223,43 +144,42 @@ class AgentAgreement:
         return changed
 
     def separation_reason(self, first_runs: Collection[str], second_runs: Collection[str]) -> str:
-        """Why these must not come into one map with those; empty if nothing is known against it."""
+        """Why these agents must not share a map with those; empty if they may."""
         for a in map(self.identities.identity, first_runs):
             for b in map(self.identities.identity, second_runs):
                 if a != b and ({a, b} & self.quarantined or frozenset((a, b)) in self.disputed):
-                    return f"{a} and {b} are kept apart"
+                    return f"{a} and {b} are kept in separate maps"
         return ""
 
     def unverified_reason(self, first_runs: Collection[str], second_runs: Collection[str]) -> str:
-        """Why these must not come into one map with those before one of them was compared; empty if they
-        may."""
+        """Why an agent must be compared before these share a map with those; empty if none must."""
         identities = {self.identities.identity(run) for run in (*first_runs, *second_runs)}
         unverified = self.identities.unverified & identities if len(identities) > 1 else set[str]()
         return (
-            f"{min(unverified)} has to be compared first, {self._unverified_cause(min(unverified))}"
+            f"{min(unverified)} must be compared first: {self._unverified_cause(min(unverified))}"
             if unverified
             else ""
         )
 
     def standing(self, run: str) -> AgentStanding:
-        """How it stands with the others."""
+        """Return how the run's agent agrees with the others."""
         agent = self.identities.identity(run)
         pairs = {names: pair for names, pair in self._pairs.items() if agent in names}
         disagreeing = [(names, pair) for names, pair in pairs.items() if pair.disagrees]
         nis = max((pair.nis for pair in pairs.values() if pair.nis is not None), default=None)
         log, sigma = self._estimate_scales().get(agent, (None, None))
-        state = "agrees" if any(self._is_agreed(pair) for pair in pairs.values()) else "unknown"
+        state = "agrees" if any(pair.agrees for pair in pairs.values()) else "unknown"
         reason = ""
         if agent in self.quarantined:
             state, reason = "set apart", _contradiction_text(agent, disagreeing) + ": check its calibration"
         elif any(frozenset(names) in self.disputed for names, _ in disagreeing):
             state, reason = (
                 "disputed",
-                f"{_contradiction_text(agent, disagreeing)}; nobody can say which of the two is wrong",
+                f"{_contradiction_text(agent, disagreeing)}; undetermined which of the two is wrong",
             )
         elif agent in self.identities.unverified:
-            state, reason = "unknown", f"not compared with the others {self._unverified_cause(agent)}"
-        doubt = max((pair.severity for pair in pairs.values()), default=0.0)
+            state, reason = "unknown", f"not compared with the others yet: {self._unverified_cause(agent)}"
+        worst = max((pair.severity for pair in pairs.values()), default=0.0)
         return AgentStanding(
             state,
             reason,
@@ -267,141 +187,55 @@ class AgentAgreement:
             sigma,
             self.log_scales.get(agent, 0.0),
             nis,
-            doubt,
+            worst,
             self.covariance_scale(agent),
         )
 
     def _unverified_cause(self, unverified: str) -> str:
         if unverified in self.identities.suspected:
-            return "since an earlier run of its name was kept apart"
-        return "since the edge was started again"
+            return "an earlier run of its name was kept in a separate map"
+        return "the edge has restarted"
 
     def contradictions(self) -> dict[AgentNames, float]:
-        """What is held against every two agents that met, the lesser first; 1 begins a disagreement."""
+        """Severity of the contradictions of each pair (names in order); 1 begins a disagreement."""
         return {names: pair.severity for names, pair in self._pairs.items()}
 
-    # ------------------------------------------------------------ two agents
-
-    def _compare(self, pair: _AgentPair, names: AgentNames, segment_pair: SegmentPair) -> None:
-        segment_loops = pair.by_segments[segment_pair]
-        all_loops = [w for one in pair.by_segments.values() for w in one.loops]
-        scales = [w.depth_scale for w in all_loops if w.depth_scale is not None]
-        pair.depth_scale = _pool_scales(scales)
-        pair.recent_depth_scale = (
-            _pool_scales(list(pair.depth_scales)[-_RECENT_DEPTH_SCALES:])
-            if len(scales) > _RECENT_DEPTH_SCALES
-            else None
-        )
-        pair.pooled_depth_scale = _pool_scales(pair.depth_scales)
-        equations_of_pair = _compare_paths(
-            segment_loops,
-            (self._covariance_scales.claims(names[0]), self._covariance_scales.claims(names[1])),
-        )
-        contradictions = [
-            *self._depth_contradictions(pair),
-            *gravity_contradictions(all_loops),
-            *gravity_contradictions(segment_loops.loops[-_MIN_LOOPS:]),
-        ]
-        for one in pair.by_segments.values():
-            contradictions += [
-                *self._path_contradictions(one.comparison),
-                *self._path_contradictions(one.recent_comparison),
-            ]
-        pair.severity = max((severity for severity, _, _ in contradictions), default=0.0)
-        pair.disagrees = pair.severity >= (_END_SEVERITY if pair.disagrees else 1.0)
+    def _compare(self, pair: AgentPair, names: AgentNames, segment_pair: SegmentPair) -> None:
+        claims = self._covariance_scales.claims(names[0]), self._covariance_scales.claims(names[1])
+        equations = pair.compare(segment_pair, claims)
         if pair.disagrees:
             self._covariance_scales.drop_evidence(pair.by_segments)
-        else:
-            if _ENDED_SEGMENTS in pair.by_segments:
-                pair.by_segments[_ENDED_SEGMENTS].comparison = pair.by_segments[
-                    _ENDED_SEGMENTS
-                ].recent_comparison = None
-            self._mark_verified(pair, names)
-            if (
-                equations_of_pair is not None
-                and segment_loops.comparison is not None
-                and not self.quarantined & {*names}
-            ):
-                with suppress(np.linalg.LinAlgError):  # of absurd numbers, which say nothing
-                    self._covariance_scales.set_evidence(
-                        segment_pair, names, equations_of_pair, segment_loops.comparison.weights
-                    )
-        reported = sorted((f for f in contradictions if f[0] >= _END_SEVERITY), reverse=True)
-        pair.reason_second, pair.reason_first = (
-            first_of_each_kind([t for _, t, _ in reported]),
-            first_of_each_kind([t for *_, t in reported]),
-        )
+            return
+        self._mark_verified(pair, names)
+        comparison = pair.by_segments[segment_pair].comparison
+        if equations is not None and comparison is not None and not self.quarantined & {*names}:
+            with suppress(np.linalg.LinAlgError):  # absurd numbers are no evidence
+                self._covariance_scales.set_evidence(segment_pair, names, equations, comparison.weights)
 
-    def _mark_verified(self, pair: _AgentPair, names: AgentNames) -> None:
-        """Who was to be compared has been, if the other is not under suspicion itself. What was wrong with a
-        name before may have been its way, so there depths are not enough."""
-        has_comparison = any(
-            segment_loops.comparison is not None for segment_loops in pair.by_segments.values()
-        )
+    def _mark_verified(self, pair: AgentPair, names: AgentNames) -> None:
+        """Mark agents of the pair as compared, unless the other is itself suspect.
+
+        An earlier run of a suspected name may have had a wrong path, so depths alone are not enough for it.
+        """
         for one, other in (names, names[::-1]):
             was_suspected = one in self.identities.suspected
             is_suspect = other in self.quarantined or (was_suspected and other in self.identities.unverified)
-            if not is_suspect and (has_comparison or (self._is_agreed(pair) and not was_suspected)):
+            if not is_suspect and (pair.has_path_comparison or (pair.agrees and not was_suspected)):
                 self.identities.mark_verified(one)
 
-    def _depth_contradictions(self, pair: _AgentPair) -> list[tuple[float, str, str]]:
-        estimates = [points for points in (pair.depth_scale, pair.recent_depth_scale) if points is not None]
-        words = "its depths are {} % {}", ("larger", "smaller")
-        return [scale_contradiction(points, self._tolerance, *words) for points in estimates]
-
-    def _path_contradictions(self, comparison: OdometryComparison | None) -> list[tuple[float, str, str]]:
-        if comparison is None:
-            return []
-        out = []
-        if comparison.inlier_share >= _MIN_INLIER_SHARE:
-            out.append(
-                scale_contradiction(
-                    comparison.path_scale, self._tolerance, "its way is {} % {}", ("longer", "shorter")
-                )
-            )
-            rotation_text = (
-                f"its camera is turned by {np.degrees(comparison.camera_rotation.value):.1f} "
-                f"degrees against what it says"
-            )
-            out.append(
-                (severity(comparison.camera_rotation, _MAX_ROTATION_RAD), rotation_text, rotation_text)
-            )
-        text = f"loops are off by {comparison.nis:.1f} times the variance that it claims"
-        out.append((comparison.nis / _MAX_NIS, text, text))
-        return out
-
-    def _severity(self, segment_loops: _SegmentPairLoops) -> float:
-        """By its ways."""
-        return max(
-            (
-                s
-                for s, _, _ in (
-                    *self._path_contradictions(segment_loops.comparison),
-                    *self._path_contradictions(segment_loops.recent_comparison),
-                )
-            ),
-            default=0.0,
-        )
-
-    def _is_agreed(self, pair: _AgentPair) -> bool:
-        return (
-            not pair.disagrees
-            and pair.depth_scale is not None
-            and pair.depth_scale.sigma < self._tolerance / 2
-        )
-
-    # ------------------------------------------------------------ all agents
-
     def _update_quarantine(self) -> bool:
-        """Who is apart: whoever is outvoted by every voice that those may have whose voice is not known; one
-        of a name that was set apart before is a suspect. Whether that has changed."""
+        """Recompute the quarantined and disputed agents; return whether they changed.
+
+        Quarantined are those outvoted under every assumption on unknown credentials. Agents with a
+        quarantined earlier run are suspects.
+        """
         disagreeing = {frozenset(names) for names, pair in self._pairs.items() if pair.disagrees}
-        agreeing = [names for names, pair in self._pairs.items() if self._is_agreed(pair)]
+        agreeing = [names for names, pair in self._pairs.items() if pair.agrees]
         agents = {name for names in self._pairs for name in names}
         suspects = {name for name in agents if self.identities.had_quarantined_run(name, self.quarantined)}
         quarantined = frozenset(agents)
         for credentials in self.identities.credential_hypotheses(agents):
-            if quarantined:  # else no other way can change that
+            if quarantined:  # else the result stays empty
                 quarantined &= outvoted_agents(disagreeing, agreeing, credentials, suspects)
         previous = self.quarantined, self.disputed
         self.quarantined = quarantined
@@ -410,7 +244,7 @@ class AgentAgreement:
         return previous != (self.quarantined, self.disputed)
 
     def _update_scales(self) -> None:
-        """What is sure of everybody's scale; nothing of those kept apart, for their maps are theirs."""
+        """Update the significant log scales. Separated agents are left out, since their maps are separate."""
         separated = self.quarantined.union(*self.disputed)
         known = self._estimate_scales(separated)
         for agent in sorted(known.keys() | self.log_scales.keys()):
@@ -421,67 +255,39 @@ class AgentAgreement:
                 self.log_scales[agent] = new
 
     def _estimate_scales(self, excluded: Collection[str] = ()) -> Mapping[str, tuple[float, float]]:
-        """Log scale of every agent's depths against the median of those that are not apart, by least squares
-        over all pairs but those with somebody who is left out; and its sigma."""
-        gauges_by_pair = (
+        """Log scale of each agent's depths relative to the median of those not quarantined, with its sigma.
+
+        Least squares over all pairs without an excluded agent.
+        """
+        estimates = (
             (names, pair.pooled_depth_scale)
             for names, pair in self._pairs.items()
             if not {*names} & {*excluded}
         )
-        known = [(names, gauge) for names, gauge in gauges_by_pair if gauge is not None]
+        known = [(names, scale) for names, scale in estimates if scale is not None]
         agents = sorted({name for names, _ in known for name in names})
         if not agents:
             return {}
         column = {name: i for i, name in enumerate(agents)}
         J, z = np.zeros((len(known), len(agents))), np.zeros(len(known))
-        for row, ((a, b), points) in enumerate(known):
-            J[row, column[a]], J[row, column[b]] = -1 / points.sigma, 1 / points.sigma
-            z[row] = points.value / points.sigma
+        for row, ((a, b), scale) in enumerate(known):
+            J[row, column[a]], J[row, column[b]] = -1 / scale.sigma, 1 / scale.sigma
+            z[row] = scale.value / scale.sigma
         x = np.linalg.pinv(J) @ z
         by_credential = {
             self.identities.credential(agent): x[column[agent]]
             for agent in agents
             if agent not in self.quarantined
         }
-        x -= np.median([*by_credential.values()] or x)  # a voice counts once
+        x -= np.median([*by_credential.values()] or x)  # one value per credential
         sigma = np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))
         return {name: (float(x[i]), float(sigma[i])) for name, i in column.items()}
 
 
-def _compare_paths(
-    segment_loops: _SegmentPairLoops, widths: tuple[float, float]
-) -> ComparisonEquations | None:
-    """Of all of its loops; None where they are too few, or absurd numbers leave no solution. widths: by what
-    either's claims alone are widened, see `solve_comparison`."""
-    segment_loops.comparison = segment_loops.recent_comparison = None
-    if len(segment_loops.loops) < _MIN_LOOPS:
-        return None
-    with suppress(np.linalg.LinAlgError):
-        equations_of_pair = comparison_equations(segment_loops.loops)
-        segment_loops.comparison = solve_comparison(equations_of_pair, widths)
-        if len(segment_loops.loops) > _RECENT_LOOPS:
-            segment_loops.recent_comparison = compare_odometry(segment_loops.loops[-_RECENT_LOOPS:], widths)
-        return equations_of_pair
-    return None
-
-
-def _pool_scales(scales: Collection[DepthScale]) -> ScalarEstimate | None:
-    return robust_depth_scale(list(scales)) if len(scales) >= _MIN_DEPTH_SCALES else None
-
-
-def _contradiction_text(agent: str, disagreeing: list[tuple[AgentNames, _AgentPair]]) -> str:
-    """From the pairs in which it disagrees."""
+def _contradiction_text(agent: str, disagreeing: list[tuple[AgentNames, AgentPair]]) -> str:
+    """Text of the agent's contradictions in these pairs."""
     texts = []
     for (first, second), pair in disagreeing:
         other, text = (first, pair.reason_second) if agent == second else (second, pair.reason_first)
         texts.append(f"against {other} {text}")
     return "; ".join(texts)
-
-
-def _most_redundant_loop(loops: list[InterAgentLoop]) -> int:
-    """Of the two loops that are most alike by where they end, the older."""
-    positions = np.array([(w.a.index, w.b.index) for w in loops])
-    distance = np.abs(positions[:, None] - positions[None]).sum(2).astype(float)
-    np.fill_diagonal(distance, np.inf)
-    first, second = np.unravel_index(int(distance.argmin()), distance.shape)
-    return int(min(first, second))

@@ -1,20 +1,19 @@
-"""How much too sure agents are of their odometry, as the loops between them tell.
+"""Estimates by how much agents understate the covariances of their odometry, from the loops between them.
 
-With the loops' equations (`share.mapping.agents.pairwise`) and f_a, f_b, g the factors by which the
-variances of either walk and of the loops are really larger than claimed,
+With the loops' equations (`share.mapping.agents.pairwise`) and f_a, f_b, g the factors by which the variances
+of either random walk and of the loops exceed the stated ones,
 
     cov(xi) = f_a W_a + f_b W_b + g S,    xi = J G + noise,
 
-which is a model of variance components. With P the inverse covariance that leaves no G, and y = xi,
+a variance-components model. With P the inverse covariance that projects out G, and y = xi,
 
     q_k = y' P V_k P y,    F_kl = tr(P V_k P V_l),    E q = F (f_a, f_b, g)
 
-whatever factors P was made with, so what all pairs say simply adds up; at the solution it is restricted
-maximum likelihood. F is in units of degrees of freedom over f^2, so a prior of n degrees of freedom is n more
-of them: of few loops the factors are as before any, 1, or above where an agent claims to be much surer than
-any other (`CovarianceClaims`). Nobody is believed to be less sure than it says.
-Source: C. R. Rao, *Estimation of variance and covariance components: MINQUE theory*, J. Multivariate Analysis
-1, 1971; Patterson and Thompson, *Biometrika* 58, 1971.
+for any factors in P, so the equations of all pairs add up; at the solution this is restricted maximum
+likelihood. F is in degrees of freedom over f^2, so a prior of n degrees of freedom adds n of them: with few
+loops the factors stay at 1, or higher for an agent that states much less than the others
+(`CovarianceClaims`). No factor below 1 is applied. Source: C. R. Rao, *Estimation of variance and covariance
+components: MINQUE theory*, J. Multivariate Analysis 1, 1971; Patterson and Thompson, *Biometrika* 58, 1971.
 """
 
 from __future__ import annotations
@@ -28,45 +27,35 @@ import numpy as np
 from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.agents.pairwise import ComparisonEquations
-from share.types import F64, I64, Keyframe
-
-# ---- No agent is believed to be surer than a good one can be, whatever it says.
+from share.types import F64, I64
 
 
 def inflate_covariance(config: MergeConfig, T_ref_body: F64, cov: F64) -> F64:
-    """The covariance (6, 6) of a step, as it is believed: agents are surer of themselves than they should be;
-    none is surer than the floor, which grows with the step."""
+    """Covariance (6, 6) of an odometry step as the graph uses it.
+
+    Agents understate it, so it is scaled; a floor that grows with the step is added.
+    """
     angle_rad, length_m = float(se3.rotation_angle(T_ref_body)), float(np.linalg.norm(T_ref_body[:3, 3]))
     rad2 = np.radians(config.odometry_floor_deg) ** 2 + (config.odometry_floor_per_rad * angle_rad) ** 2
     m2 = config.odometry_floor_m**2 + (config.odometry_floor_per_m * length_m) ** 2
     return config.odometry_scale**2 * cov + np.diag([rad2] * 3 + [m2] * 3)
 
 
-def make_gravity_factor(config: MergeConfig, keyframe: Keyframe) -> F64:
-    """See `share.mapping.graph.edges`: no camera sits on its IMU better than it was calibrated."""
-    norm = float(np.linalg.norm(keyframe.up))
-    sigma = np.hypot(keyframe.up_sigma, np.radians(config.gravity_floor_deg))
-    return keyframe.up / (norm * sigma) if norm else np.zeros(3)
-
-
-# ---- How sure agents are of their odometry, beside each other, by what they say and as far as it is
-# believed.
-#
-# Nothing shows in loops yet when two maps are joined, and who is surest bends the others. So until loops
-# tell, nobody is believed to be much surer than the surest of the others: by variances of its steps over
-# their size, in the median, for position and for turn. The covariances come here as they are believed, with
-# their floors (`share.mapping.agents.covariance_scales`): a claim far below a floor counts as the floor, and
-# is widened from there.
-
-_MAX_STEPS = 64  # of each agent: the newest
+_MAX_STEPS = 64  # newest of each agent
 _MIN_STEPS = 8
-_CLAIM_TOLERANCE = 2.25  # variance: 1.5 sigma, as honest agents differ by how they move
-_MAX_CLAIM_SCALE = 100.0  # variance: words alone say no more
-_LEVER_M = 1.0  # m: a turn of 1 rad is a step of this
+_CLAIM_TOLERANCE = 2.25  # variance (1.5 sigma), by which good agents differ as they move differently
+_MAX_CLAIM_SCALE = 100.0  # variance; without evidence from loops no more is applied
+_LEVER_M = 1.0  # length of a step equivalent to a rotation of 1 rad
 
 
 class CovarianceClaims:
-    """Of agents, by what they say of their steps."""
+    """Compares the covariances that agents state for their steps.
+
+    Before loops give evidence, the agent that states the least would bend the others in a merge. So until
+    then no agent counts as much more certain than the best of the others, by the median variance of its steps
+    over their size, for position and rotation. Covariances come here inflated (`inflate_covariance`): a claim
+    far below the floor counts as the floor.
+    """
 
     def __init__(self) -> None:
         self._steps: dict[str, deque[tuple[float, float]]] = {}
@@ -76,11 +65,11 @@ class CovarianceClaims:
 
     @property
     def known_agents(self) -> set[str]:
-        """Of whom enough is known."""
+        """Agents with enough steps."""
         return set(self._medians)
 
     def add_step(self, agent: str, T_ref_body: F64, cov: F64) -> bool:
-        """A step (4, 4) and its covariance (6, 6). Whether what it claims is known anew."""
+        """Add a step (4, 4) with its covariance (6, 6); return whether the agent's median changed."""
         size = float(np.linalg.norm(T_ref_body[:3, 3]) + _LEVER_M * se3.rotation_angle(T_ref_body))
         rotation_variance, position_variance = float(np.trace(cov[:3, :3])), float(np.trace(cov[3:, 3:]))
         if not min(size, rotation_variance, position_variance) > 0:
@@ -93,12 +82,12 @@ class CovarianceClaims:
         return True
 
     def link(self, first: str, second: str) -> None:
-        """There is a loop between them: from now on they are measured by each other."""
+        """Compare these agents from now on: there is a loop between them."""
         self._linked.setdefault(first, set()).add(second)
         self._linked.setdefault(second, set()).add(first)
 
     def remove_agent(self, agent: str) -> None:
-        """Nothing is left of it."""
+        """Forget an agent."""
         self._steps.pop(agent, None)
         self._medians.pop(agent, None)
         self._excluded.discard(agent)
@@ -106,12 +95,12 @@ class CovarianceClaims:
             self._linked[other].discard(agent)
 
     def exclude(self, agents: Collection[str]) -> bool:
-        """Nobody is measured by these, from now on. Whether that is news."""
+        """Compare no agent with these; return whether the set changed."""
         previous, self._excluded = self._excluded, set(agents)
         return previous != self._excluded
 
     def min_scale(self, agent: str) -> float:
-        """By what its variances have to be multiplied at least; 1 where it says nothing unusual."""
+        """Least factor on the agent's variances; 1 where they are not unusual."""
         linked = self._linked.get(agent, set()) - self._excluded
         others = [self._medians[name] for name in linked if name in self._medians]
         if agent not in self._medians or not others:
@@ -121,21 +110,25 @@ class CovarianceClaims:
         return min(max(1.0, ratio / _CLAIM_TOLERANCE), _MAX_CLAIM_SCALE)
 
 
-_MIN_LOOP_WEIGHT = 0.4  # weight that a loop must have: what is false says nothing of odometry
-_MIN_LOOPS = 8  # such loops
-_PRIOR_DOF = 4.0  # of an agent
-_LOOP_PRIOR_SCALE, _LOOP_PRIOR_DOF = 1.7, 12.0  # honest loops are a little too sure, see `consistency`
+_MIN_LOOP_WEIGHT = 0.4  # false loops are no evidence on odometry
+_MIN_LOOPS = 8
+_PRIOR_DOF = 4.0  # of an agent's factor
+_LOOP_PRIOR_SCALE = 1.7  # true loops understate their variance a little
+_LOOP_PRIOR_DOF = 12.0
 _MIN_SCALE, _MAX_SCALE = 0.25, 1e4
-_APPLY_ABOVE, _KEEP_ABOVE = 2.0, 1.5  # variance from which on, and down to which, it is taken into account
-_MIN_CHANGE_RATIO = 1.25  # by what part it has to change
+_APPLY_ABOVE = 2.0  # factor at which it is applied
+_KEEP_ABOVE = 1.5  # factor down to which it stays applied
+_MIN_CHANGE_RATIO = 1.25
 
-SegmentPair = tuple[int, int]  # two stretches
+SegmentPair = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class _VarianceEvidence:
-    """By loops of two stretches, of agents a and b: q (3,), F (3, 3), of either walk and of the loops, made
-    with these factors (3,)."""
+    """Evidence of the loops of two segments, of agents a and b.
+
+    q (3,), F (3, 3): of either random walk and of the loops, computed at the factors linearised_at (3,).
+    """
 
     agents: tuple[str, str]
     q: F64
@@ -144,22 +137,22 @@ class _VarianceEvidence:
 
 
 class CovarianceScales:
-    """factor: of each agent's variances of odometry; 1 where it is not there."""
+    """scales: factor on the variances of each agent's odometry; 1 where missing."""
 
     def __init__(self, claims: CovarianceClaims) -> None:
         self.scales: dict[str, float] = {}
         self._claims = claims
-        self._estimates: dict[str, float] = {}  # as estimated
+        self._estimates: dict[str, float] = {}  # before thresholds
         self._loop_scales: dict[SegmentPair, float] = {}
         self._evidence: dict[SegmentPair, _VarianceEvidence] = {}
 
     def add_step(self, agent: str, T_ref_body: F64, cov: F64) -> None:
-        """A step (4, 4) of its odometry, with its covariance (6, 6)."""
+        """Add a step (4, 4) of an agent's odometry with its covariance (6, 6)."""
         if self._claims.add_step(agent, T_ref_body, cov):
             self._estimate()
 
     def claims(self, agent: str) -> float:
-        """See `Claims.least`."""
+        """Least factor of the agent: see `CovarianceClaims.min_scale`."""
         return self._claims.min_scale(agent)
 
     def link(self, first: str, second: str) -> None:
@@ -169,8 +162,10 @@ class CovarianceScales:
     def set_evidence(
         self, segment_pair: SegmentPair, agents: tuple[str, str], equations: ComparisonEquations, weights: F64
     ) -> None:
-        """What loops of two stretches say by now, of weight (N,) each; it takes the place of what they said
-        before. Raises LinAlgError where absurd numbers leave no solution."""
+        """Replace the evidence of two segments by that of their loops, of weight (N,) each.
+
+        Raises LinAlgError where absurd numbers leave no solution.
+        """
         self.link(*agents)
         inliers = np.flatnonzero(weights > _MIN_LOOP_WEIGHT)
         if len(inliers) < _MIN_LOOPS:
@@ -184,7 +179,7 @@ class CovarianceScales:
         self._estimate()
 
     def drop_evidence(self, segment_pairs: Iterable[SegmentPair]) -> None:
-        """What these loops say is of two worlds, or of what is gone."""
+        """Drop the evidence of these segments: their odometries contradict, or are removed."""
         dropped = [
             segment_pair
             for segment_pair in segment_pairs
@@ -194,7 +189,7 @@ class CovarianceScales:
             self._estimate()
 
     def exclude(self, agents: Collection[str]) -> None:
-        """What these and others say of each other is of two worlds; nobody is measured by what they claim."""
+        """Drop the evidence of these agents, and compare no claims with theirs."""
         if self._claims.exclude(agents):
             self._estimate()
         self.drop_evidence(
@@ -206,7 +201,7 @@ class CovarianceScales:
         )
 
     def remove_agent(self, agent: str) -> None:
-        """Nothing is left of it."""
+        """Forget an agent."""
         self._evidence = {
             segment_pair: evidence
             for segment_pair, evidence in self._evidence.items()

@@ -1,18 +1,17 @@
-"""Whether two agents' odometries and depths are of one world, by the loops between them.
+"""Comparison of two agents' odometry and depths, by the loops between them.
 
-Every loop i between keyframes a of one stretch and b of another measures where the other odometry lies in
-the one: Z = T_a T_a_b T_b^-1, as T_a, T_b are known since the starts of their stretches. If both tell the
-truth all Z are one pose G, but for noise: of the loop, and of either odometry's random walk, which loops have
-in common as far as both have walked. In left perturbations, xi = log(Z G^-1), that walk simply adds up:
+Each loop i between keyframes a of one segment and b of another measures the pose of the second odometry frame
+in the first: Z = T_a T_a_b T_b^-1, with T_a, T_b relative to the starts of their segments. If both agents are
+right, all Z equal one pose G, up to the noise of the loops and the random walks of both odometries, which two
+loops share as far as both have walked. In left perturbations, xi = log(Z G^-1), the walks simply add up:
 
     cov(xi_i, xi_j) = P_a(min) + Ad_G P_b(min) Ad_G' + [i = j] Ad_(G T_b) S_i Ad_(G T_b)',   P(k) = sum to k
 
-What agents may be wrong about are further unknowns of these equations: a path that is longer by e^l than the
-other's moves xi by -l times where the loop is, a camera that is turned on its body by phi turns it by
-Ad_(G T_b) (phi, 0). Generalised least squares gives each with its sigma; loops are under a Cauchy kernel, for
-some are false. The noise that is left for a loop, per degree of freedom, in the median, says whether the
-covariances are too sure.
-Source: Barfoot, *State Estimation for Robotics* (2017), chapters 5 and 8.
+Possible errors of the agents are further unknowns of these equations: a path longer by e^l than the other's
+moves xi by -l times the position of the loop; a camera rotated on its body by phi rotates it by Ad_(G T_b)
+(phi, 0). Generalised least squares estimates each with its sigma; loops are under a Cauchy kernel, since some
+are false. The median residual noise of the loops, per degree of freedom, shows whether the covariances are
+too small. Source: Barfoot, *State Estimation for Robotics* (2017), chapters 5 and 8.
 """
 
 from __future__ import annotations
@@ -26,23 +25,22 @@ from share.geometry import se3
 from share.mapping.recognition.depth_scale import DepthScale
 from share.types import F64, I64
 
-_ODOMETRY_SIGMA_SCALE = 2.0  # honest agents' sigmas of odometry are up to this much too small,
-_LOOP_SIGMA_SCALE = 1.3  # those of loops this much
-_CAUCHY_WIDTH_SQUARED = 12.0  # squared width of the kernel, of 6 dof
+_ODOMETRY_SIGMA_SCALE = 2.0  # by which the odometry sigmas of good agents are too small at most
+_LOOP_SIGMA_SCALE = 1.3  # the same for loops
+_CAUCHY_WIDTH_SQUARED = 12.0  # of 6 dof
 _IRLS_ITERATIONS = 6
-_CHI2_6DOF_MEDIAN = 5.35  # of chi-square with 6 dof
-_PRIOR_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1])  # log scale, rad: only so that two loops have a solution
+_CHI2_6DOF_MEDIAN = 5.35
+_PRIOR_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1])  # log scale, rad; so that two loops have a solution
 _MAD_PER_SIGMA = 0.6745  # median of |x| of a standard normal distribution
-_MIN_INLIER_WEIGHT = 0.3  # weight of a loop below which it does not fit
-_LOG_SCALE_FLOOR = 0.004  # of the log scale of one loop's points, beside what it says: occlusions, pixels
-_AS_CLAIMED = (1.0, 1.0)
-_MIN_SCALE_SIGMA = 0.003  # of honest agents' log scales: no two are calibrated better
+_MIN_INLIER_WEIGHT = 0.3  # of a loop that fits
+_LOG_SCALE_FLOOR = 0.004  # added sigma of one loop's depth scale: occlusions, pixels
+_AS_STATED = (1.0, 1.0)
+_MIN_SCALE_SIGMA = 0.003  # of log scales: no two agents are calibrated better
 
 
 @dataclass(frozen=True, eq=False)
 class AccumulatedOdometry:
-    """Where odometry has come: keyframe k of a stretch at T (4, 4) since its start, cov (6, 6) of its left
-    perturbation."""
+    """Odometry from a segment's start to its keyframe `index`: T (4, 4), cov (6, 6), left perturbation."""
 
     index: int
     T: F64
@@ -50,11 +48,11 @@ class AccumulatedOdometry:
 
     @staticmethod
     def origin() -> AccumulatedOdometry:
-        """At the first keyframe of a stretch."""
+        """At the first keyframe of a segment."""
         return AccumulatedOdometry(0, np.eye(4), np.zeros((6, 6)))
 
     def with_step(self, T_ref_body: F64, cov: F64) -> AccumulatedOdometry:
-        """One step further; cov (6, 6): of the step, right perturbation."""
+        """Append a step with cov (6, 6), right perturbation."""
         T = se3.orthonormal(self.T @ T_ref_body)
         Ad = se3.adjoint(T)
         return AccumulatedOdometry(self.index + 1, T, self.cov + Ad @ cov @ Ad.T)
@@ -62,8 +60,11 @@ class AccumulatedOdometry:
 
 @dataclass(frozen=True, eq=False)
 class InterAgentLoop:
-    """A loop as evidence: T_a_b (4, 4), cov (6, 6), between what either side has walked. scale: of b's depths
-    over a's. tilt: (angle between both ups, its sigma), rad; None where gravity is not known."""
+    """A loop between two agents: T_a_b (4, 4), cov (6, 6), and the accumulated odometry of both ends.
+
+    depth_scale: of b's depths relative to a's. tilt: angle between both up directions and its sigma, rad;
+    None where gravity is unknown.
+    """
 
     a: AccumulatedOdometry
     b: AccumulatedOdometry
@@ -75,7 +76,7 @@ class InterAgentLoop:
 
 @dataclass(frozen=True)
 class ScalarEstimate:
-    """Of n loops."""
+    """An estimate from `count` loops."""
 
     value: float
     sigma: float
@@ -83,15 +84,17 @@ class ScalarEstimate:
 
     @property
     def significance(self) -> float:
-        """In sigmas."""
+        """Absolute value in sigmas."""
         return abs(self.value) / self.sigma
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryComparison:
-    """Of b with a. points: log scale of b's depths; path: log of how much longer its way is. turn: of its
-    camera on its body, rad. nis: of the loops' noise beyond all this, 1 if covariances are right.
-    weight (N,): of each loop under the kernel."""
+    """Comparison of b with a.
+
+    path_scale: log of how much longer b's path is. camera_rotation: of the camera on its body, rad. nis: of
+    the loops' remaining noise, 1 if covariances are right. weights (N,): of the loops under the kernel.
+    """
 
     path_scale: ScalarEstimate
     camera_rotation: ScalarEstimate
@@ -106,9 +109,11 @@ class OdometryComparison:
 
 @dataclass(frozen=True, eq=False)
 class ComparisonEquations:
-    """Of N loops between two stretches: xi (N, 6); J (N, 6, 10), how it moves with G, the path's log scale
-    and the camera's turn; and what adds up to its covariance, as claimed: either walk (N, 6, N, 6), each
-    loop's own noise (N, 6, 6)."""
+    """Equations of N loops between two segments.
+
+    xi (N, 6); J (N, 6, 10): derivative by G, the path's log scale and the camera's rotation; and the parts of
+    the covariance, as stated by the agents: either random walk (N, 6, N, 6), each loop's own noise (N, 6, 6).
+    """
 
     xi: F64
     J: F64
@@ -118,33 +123,32 @@ class ComparisonEquations:
 
 
 def robust_depth_scale(scales: Sequence[DepthScale]) -> ScalarEstimate:
-    """Robust mean of log scales, at least one. sigma: as they are spread, where that is more than said."""
+    """Robust mean of at least one log scale. sigma: from their scatter if that is larger."""
     logs, variance = np.array([s.log for s in scales]), np.array([s.sigma for s in scales]) ** 2
     variance = variance + _LOG_SCALE_FLOOR**2
     mean, weight = float(np.median(logs)), np.ones(len(logs))
-    mad_variance = float(np.median(np.abs(logs - mean)) / _MAD_PER_SIGMA) ** 2  # variance
+    mad_variance = float(np.median(np.abs(logs - mean)) / _MAD_PER_SIGMA) ** 2
     variance = variance * max(1.0, mad_variance / float(np.median(variance)))
     for _ in range(_IRLS_ITERATIONS):
         weight = 1 / (1 + (logs - mean) ** 2 / (4 * variance))
         mean = float((weight * logs / variance).sum() / (weight / variance).sum())
     information = weight / variance
-    spread = float((information**2 * (logs - mean) ** 2).sum()) ** 0.5 / float(
-        information.sum()
-    )  # Huber's sandwich
+    scatter = float((information**2 * (logs - mean) ** 2).sum()) ** 0.5
+    spread = scatter / float(information.sum())  # Huber's sandwich
     return ScalarEstimate(
         mean, float(np.hypot(max(information.sum() ** -0.5, spread), _MIN_SCALE_SIGMA)), len(logs)
     )
 
 
 def compare_odometry(
-    loops: Sequence[InterAgentLoop], widths: tuple[float, float] = _AS_CLAIMED
+    loops: Sequence[InterAgentLoop], covariance_scales: tuple[float, float] = _AS_STATED
 ) -> OdometryComparison:
-    """Of at least three loops between the same two stretches. widths: see `solve_comparison`."""
-    return solve_comparison(comparison_equations(loops), widths)
+    """Compare by at least three loops of the same two segments: see `solve_comparison`."""
+    return solve_comparison(comparison_equations(loops), covariance_scales)
 
 
 def comparison_equations(loops: Sequence[InterAgentLoop]) -> ComparisonEquations:
-    """Of loops between the same two stretches, about the middle of where they are."""
+    """Equations of loops between the same two segments, about the centre of their positions."""
     T_a, T_b, T_a_b = (np.array(x) for x in zip(*((w.a.T, w.b.T, w.T_a_b) for w in loops), strict=True))
     T_centre = np.eye(4)
     T_centre[:3, 3] = -(T_a @ T_a_b)[:, :3, 3].mean(0)
@@ -163,14 +167,14 @@ def comparison_equations(loops: Sequence[InterAgentLoop]) -> ComparisonEquations
 
 
 def _consensus_pose(Z: F64) -> F64:
-    """The one of N poses that most others agree with."""
+    """The one of N poses that agrees with most others."""
     xi = se3.log((Z[:, None] @ se3.inverse(Z)[None]).reshape(-1, 4, 4)).reshape(len(Z), len(Z), 6)
     distance = np.minimum(1.0, np.linalg.norm(xi * (10, 10, 10, 1, 1, 1), axis=2))
     return np.asarray(Z[distance.sum(1).argmin()])
 
 
 def _shared_walk_cov(accumulated: Sequence[AccumulatedOdometry], Ad: F64) -> F64:
-    """What N loops have in common of one side's walk (N, 6, N, 6), since the first of them."""
+    """Covariance (N, 6, N, 6) that N loops share through one side's random walk since the first of them."""
     indices: I64 = np.array([w.index for w in accumulated])
     P = np.array([w.cov for w in accumulated])
     P = Ad @ (P - P[indices.argmin()]) @ Ad.T
@@ -179,7 +183,7 @@ def _shared_walk_cov(accumulated: Sequence[AccumulatedOdometry], Ad: F64) -> F64
 
 
 def _jacobian(T_b: F64) -> F64:
-    """How xi (N, 6) moves with G, the path's log scale and the camera's turn: (N, 6, 10)."""
+    """Derivative (N, 6, 10) of xi by G, the path's log scale and the camera's rotation."""
     out = np.zeros((len(T_b), 6, 10))
     out[:, :, :6] = np.eye(6)
     out[:, 3:, 6] = -T_b[:, :3, 3]
@@ -188,49 +192,49 @@ def _jacobian(T_b: F64) -> F64:
 
 
 def solve_comparison(
-    equations: ComparisonEquations, widths: tuple[float, float] = _AS_CLAIMED
+    equations: ComparisonEquations, covariance_scales: tuple[float, float] = _AS_STATED
 ) -> OdometryComparison:
-    """What the agents are wrong about. widths: by what the variances of either walk are multiplied where the
-    camera's turn is told, for the noise of an agent that is too sure passes for one at few places. Its way it
-    is held to as it claims: one that is too long and too sure bends the others, and is found out sooner so.
-    Raises LinAlgError where absurd numbers leave no solution."""
-    weighted_residual = _solved(equations, _AS_CLAIMED)
-    return (
-        weighted_residual
-        if widths == _AS_CLAIMED
-        else replace(weighted_residual, camera_rotation=_solved(equations, widths).camera_rotation)
-    )
+    """Estimate the differences between two agents.
+
+    covariance_scales: factors on the variances of either random walk in the estimate of the camera's
+    rotation; otherwise, with loops at few places, the noise of an agent that understates its covariance looks
+    like a rotation. The path scale uses the stated covariances: a path that is too long and too certain bends
+    other maps, and is detected sooner. Raises LinAlgError where absurd numbers leave no solution.
+    """
+    as_stated = _solve(equations, _AS_STATED)
+    if covariance_scales == _AS_STATED:
+        return as_stated
+    return replace(as_stated, camera_rotation=_solve(equations, covariance_scales).camera_rotation)
 
 
-def _solved(e: ComparisonEquations, widths: tuple[float, float]) -> OdometryComparison:
+def _solve(e: ComparisonEquations, covariance_scales: tuple[float, float]) -> OdometryComparison:
     xi, J, n = e.xi, e.J, len(e.xi)
-    walk, own = (
-        _ODOMETRY_SIGMA_SCALE**2 * (widths[0] * e.walk_cov_a + widths[1] * e.walk_cov_b),
-        _LOOP_SIGMA_SCALE**2 * e.loop_cov,
-    )
+    scale_a, scale_b = covariance_scales
+    walk_cov = _ODOMETRY_SIGMA_SCALE**2 * (scale_a * e.walk_cov_a + scale_b * e.walk_cov_b)
+    loop_cov = _LOOP_SIGMA_SCALE**2 * e.loop_cov
     rows, prior = J.reshape(6 * n, 10), np.zeros((10, 10))
     prior[range(6, 10), range(6, 10)] = _PRIOR_SIGMAS**-2
-    information, weight = np.linalg.inv(own), np.ones(n)
+    loop_information, weight = np.linalg.inv(loop_cov), np.ones(n)
     for _ in range(_IRLS_ITERATIONS):
-        C = walk.copy()
-        C[range(n), :, range(n)] += own / weight[:, None, None]
-        inverse = np.linalg.inv(C.reshape(6 * n, 6 * n))
-        normal = rows.T @ inverse @ rows + prior
-        theta = np.linalg.solve(normal, rows.T @ inverse @ xi.ravel())
-        left = xi.ravel() - rows @ theta
-        told = (inverse @ left).reshape(n, 6)
-        noise = (own @ told[:, :, None])[:, :, 0] / weight[:, None]
-        chi2 = np.einsum("ni,nij,nj->n", noise, information, noise)
+        C = walk_cov.copy()
+        C[range(n), :, range(n)] += loop_cov / weight[:, None, None]
+        information = np.linalg.inv(C.reshape(6 * n, 6 * n))
+        normal = rows.T @ information @ rows + prior
+        theta = np.linalg.solve(normal, rows.T @ information @ xi.ravel())
+        residual = xi.ravel() - rows @ theta
+        weighted = (information @ residual).reshape(n, 6)
+        noise = (loop_cov @ weighted[:, :, None])[:, :, 0] / weight[:, None]  # the loops' part of it
+        chi2 = np.einsum("ni,nij,nj->n", noise, loop_information, noise)
         weight = 1 / (1 + chi2 / _CAUCHY_WIDTH_SQUARED)
     nis = float(np.median(chi2)) / _CHI2_6DOF_MEDIAN
-    misfit = float(left @ inverse @ left) / max(1, 6 * n - 10)  # of loops and ways: a wrong model shows here
+    misfit = float(residual @ information @ residual) / max(1, 6 * n - 10)  # shows a wrong model
     cov = np.linalg.inv(normal) * max(1.0, nis, misfit)
-    turn = theta[7:]
-    chi = max(1e-6, float(turn @ np.linalg.solve(cov[7:, 7:], turn))) ** 0.5
-    size = float(np.linalg.norm(turn))
+    rotation = theta[7:]
+    chi = max(1e-6, float(rotation @ np.linalg.solve(cov[7:, 7:], rotation))) ** 0.5
+    angle = float(np.linalg.norm(rotation))
     return OdometryComparison(
         ScalarEstimate(float(theta[6]), float(np.sqrt(cov[6, 6])), n),
-        ScalarEstimate(size, size / chi if size else 1.0, n),
+        ScalarEstimate(angle, angle / chi if angle else 1.0, n),
         nis,
         weight,
     )

@@ -1,5 +1,7 @@
-"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late;
-metres that are a little too long or too short are put right, and variances that are too small widened."""
+"""Keeps agents that disagree with the others out of their maps, or takes them out when the evidence is late.
+
+Small scale errors are corrected, and understated variances enlarged.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from share.geometry import se3
+from share.mapping.agents.agent_pair import tilt_between
 from share.mapping.agents.agreement import AgentAgreement, AgentStanding
-from share.mapping.agents.identities import tilt_between
 from share.mapping.culling import RemovedKeyframe
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision
@@ -21,14 +23,13 @@ from share.mapping.recognition.depth_scale import DepthScale
 from share.mapping.recognition.verification import CameraView
 from share.types import F64
 
-_MIN_LOOP_SUPPORT = 12  # loops between two stretches: fewer may be there only because a map was bent
-_MAX_WITHDRAWN = 2000  # loops that were taken back: the newest are kept in mind
+_MIN_LOOP_SUPPORT = 12  # loops between two segments; fewer may fit only because a map was bent
+_MAX_WITHDRAWN = 2000  # newest withdrawn loops
 
 
 @dataclass(frozen=True, eq=False)
 class QuarantineChange:
-    """Agents whose standing with the others has changed, and how it is now; dropped: loops that are taken
-    back because of it; tied: loops that had been, and are believed again."""
+    """Agents with a new standing, and the loops removed (dropped) or accepted again (added) because of it."""
 
     standings: dict[str, AgentStanding] = field(default_factory=dict)
     dropped: tuple[Loop, ...] = ()
@@ -36,7 +37,7 @@ class QuarantineChange:
 
 
 class Quarantine:
-    """Of one chart. sights: what each node saw."""
+    """Quarantine in one graph. camera_views: by node id."""
 
     def __init__(
         self,
@@ -50,41 +51,40 @@ class Quarantine:
         self._withdrawn: list[Loop] = []
 
     def add_run(self, run: str, name: str, credential: str | None = "") -> None:
-        """A run of the agent of this name comes: what is known of the name holds for it."""
+        """Register a run of the agent of this name."""
         self.agreement.add_run(run, name, credential)
 
     def remove_run(self, run: str) -> None:
-        """Nothing is left of it, and it will not come back."""
+        """Forget a run without keyframes that will not return."""
         self.agreement.remove_run(run)
         self._graph.log_scales.pop(run, None)
         self._graph.covariance_scales.pop(run, None)
 
     def add_step(self, node_id: int, T_ref_body: F64, cov: F64) -> None:
-        """A new node, by odometry from the one before on its stretch."""
+        """Add a node, by odometry from the previous one of its segment."""
         odometry = self._graph.odometry
         agent = odometry.nodes[node_id].key.agent
         self.agreement.add_step(agent, node_id, odometry.previous_node(node_id), T_ref_body, cov)
         self._apply_scales()
 
     def add_loop(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
-        """A verified loop says how its agents agree; scale: of b's depths over a's. Those who do no longer
-        are parted."""
+        """Compare the agents of a verified loop, and split maps of agents that no longer agree.
+
+        depth_scale: of b's depths relative to a's.
+        """
         agents = loop.a.agent, loop.b.agent
         if agents[0] == agents[1]:
             return QuarantineChange()
         a, b = self._graph.loop_nodes(loop)
         edge = PoseEdge(a, b, loop.T_a_b, loop.cov)
         segments = self._graph.segment(loop.a), self._graph.segment(loop.b)
-        before, unverified = (
-            (self.agreement.quarantined, self.agreement.disputed),
-            self.agreement.identities.unverified,
-        )
+        before, unverified = self._separated(), self.agreement.identities.unverified
         unverified_before = len(unverified)
         changed = self.agreement.add_loop(agents, segments, edge, depth_scale, self._tilt(edge))
         self._apply_scales()
         if not changed and len(unverified) == unverified_before:
             return QuarantineChange()
-        after = self.agreement.quarantined, self.agreement.disputed
+        after = self._separated()
         affected = map(
             self.agreement.identities.newest_run, (before[0] ^ after[0]).union(*(before[1] ^ after[1]))
         )
@@ -93,15 +93,18 @@ class Quarantine:
         added, undone = self._reconsider_withdrawn()
         return QuarantineChange(standings, (*dropped, *undone), added)
 
+    def _separated(self) -> tuple[frozenset[str], frozenset[frozenset[str]]]:
+        return self.agreement.quarantined, self.agreement.disputed
+
     def quarantined_nodes(self, agent: str) -> tuple[int, ...]:
-        """Nodes of agents that must not come into one map with this one."""
+        """Nodes of agents that must not share a map with this one."""
         odometry = self._graph.odometry
         segments = [odometry.segments[segment] for segment in sorted(odometry.live_segments)]
         separated = {s.agent for s in segments if self.agreement.separation_reason([agent], [s.agent])}
         return tuple(n for s in segments if s.agent in separated for n in s.nodes) if separated else ()
 
     def separation_reason(self, loop: Loop) -> str:
-        """Why it must not be believed: it would tie agents that are kept apart; empty if it would not."""
+        """Why the loop must not be accepted: it would connect agents kept in separate maps; else empty."""
         reference_segments = self._graph.reference_segment(loop.a), self._graph.reference_segment(loop.b)
         if reference_segments[0] == reference_segments[1]:
             return ""
@@ -113,8 +116,10 @@ class Quarantine:
         ) or self.agreement.separation_reason(first_agents, second_agents)
 
     def rescale_loop(self, loop: Loop, depth_scale: DepthScale | None) -> Loop:
-        """As it is in true metres, so far as they are known. scale: of b's depths over a's, by which T_a_b
-        leans."""
+        """Correct a loop for the agents' scales, where known.
+
+        depth_scale: of b's depths relative to a's; its pose sensitivity corrects T_a_b.
+        """
         log_scale_a, log_scale_b = (self._log_scale(key.agent) for key in (loop.a, loop.b))
         if depth_scale is None or depth_scale.pose_sensitivity is None or not (log_scale_a or log_scale_b):
             return loop
@@ -124,7 +129,7 @@ class Quarantine:
         return replace(loop, T_a_b=se3.orthonormal(T))
 
     def to_agent_scale(self, removed: RemovedKeyframe) -> RemovedKeyframe:
-        """What is kept of an agent's odometry is in its own metres, and not widened."""
+        """Convert a removal to the agent's own metres and covariances, in which odometry is stored."""
         link = removed.link
         if link is None or link.reference is None:
             return removed
@@ -145,7 +150,9 @@ class Quarantine:
                 graph.rescale_odometry(agent, *scales)
 
     def suspect_restored(self) -> None:
-        """An earlier life's map. Who was set apart is not known, but he was not in the map of most agents."""
+        """Mark agents outside a restored session's largest map as unverified: they may have been
+        quarantined.
+        """
         identities = self.agreement.identities
         maps = [
             self._agents_in_map(reference_segment)
@@ -157,8 +164,9 @@ class Quarantine:
         identities.mark_unverified(set[str]().union(*maps) - trusted)
 
     def _split_maps(self) -> tuple[Loop, ...]:
-        """Take back what ties agents that are kept apart: first the loops between them, then the fewest
-        others, until no map has two of them."""
+        """Remove loops until separated agents share no map: first loops between them, then the fewest
+        others.
+        """
         graph, segments = self._graph, self._graph.odometry.segments
         before = list(graph.reference_segments)
         loops_between = [
@@ -175,8 +183,10 @@ class Quarantine:
         return dropped
 
     def _weak_loops(self, reference_segments: Sequence[int], maps: Collection[int]) -> list[int]:
-        """Loops of other agents of the maps that were parted, by their edges' numbers, where they are few:
-        what fitted a bent map has to stand without it."""
+        """Edge ids of the loops between other agents of split maps where these are few.
+
+        Loops that fitted a bent map have to be confirmed without it.
+        """
         graph, segments = self._graph, self._graph.odometry.segments
         out = []
         for edge_id in graph.edges.loops:
@@ -187,9 +197,10 @@ class Quarantine:
         return out
 
     def _reconsider_withdrawn(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
-        """Loops that were taken back and that nothing forbids any more are judged anew: those that are
-        believed, and those that are not because of them. The others wait on, as long as their keyframes are
-        there."""
+        """Decide again on withdrawn loops that are no longer forbidden; return those added and those dropped.
+
+        Others stay withdrawn while their keyframes exist.
+        """
         odometry, decisions, still_withdrawn = self._graph.odometry, list[LoopDecision](), list[Loop]()
         for loop in self._withdrawn:
             if not (odometry.has_keyframe(loop.a) and odometry.has_keyframe(loop.b)):
@@ -215,6 +226,6 @@ class Quarantine:
         return tilt_between(a, self._gravity_sigma(edge.a), b, self._gravity_sigma(edge.b), edge)
 
     def _gravity_sigma(self, node_id: int) -> float:
-        """rad, as it is believed; large where up is not known."""
+        """Sigma of the up direction, rad, with its floor; pi where unknown."""
         factor = self._graph.gravity_factors.get(node_id)
         return float(np.pi) if factor is None else 1 / float(np.linalg.norm(factor))

@@ -1,7 +1,7 @@
-"""How well is one pose known from another? By the surest way through the graph between them.
+"""Relative covariances of poses, along the paths of least covariance through the graph.
 
-The covariance along any one path is an upper bound of what the whole graph knows, and it costs no
-factorisation. It is what a new loop has to agree with.
+The covariance along any path is an upper bound of that in the whole graph, without a factorisation. New loops
+are tested against it.
 """
 
 from __future__ import annotations
@@ -15,15 +15,13 @@ import numpy as np
 from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.graph.edges import EdgeArrays, PoseEdge
-from share.mapping.graph.edges import gravity_equations as plumb_equations
+from share.mapping.graph.gravity import gravity_equations
 from share.mapping.graph.optimiser import NormalEquations, OptimisedPoses, weighted_jacobians
 from share.types import F64, I64
 
-# ---- The ways of least cost through a graph, from one pose to many (Dijkstra 1959).
-
 
 class ShortestPaths:
-    """n poses and E edges between them: ends a, b (E,), cost (E,) each, to be walked either way."""
+    """Shortest paths (Dijkstra 1959) among n poses with E undirected edges: ends a, b (E,), cost (E,)."""
 
     def __init__(self, n: int, a: I64, b: I64, cost: F64) -> None:
         from scipy.sparse import csc_array, csr_array
@@ -31,22 +29,21 @@ class ShortestPaths:
         e = len(a)
         ends, others = np.concatenate([a, b]), np.concatenate([b, a])
         leaving = csc_array((np.ones(2 * e), ends, np.arange(2 * e + 1)), shape=(n, 2 * e)).tocsr()
-        self._starts, order = (
-            leaving.indptr,
-            leaving.indices,
-        )  # sorted by where they leave, parallel ones kept
+        self._starts, order = leaving.indptr, leaving.indices  # sorted by start; parallel edges are kept
         self._targets, self._edge_index = others[order], order % max(e, 1)
-        self._cost = np.maximum(cost[self._edge_index], 1e-300)  # zero would be no edge
+        self._cost = np.maximum(cost[self._edge_index], 1e-300)  # zero would mean no edge
         self._graph = csr_array((self._cost, self._targets, self._starts), shape=(n, n))
 
     def predecessors(self, start: int) -> I64:
-        """The pose before each (n,) on the way to it from `start`; negative at the start and out of reach."""
+        """Return the pose before each (n,) on its path from `start`; negative for the start and unreachable
+        ones.
+        """
         from scipy.sparse.csgraph import dijkstra
 
         return np.asarray(dijkstra(self._graph, indices=start, return_predecessors=True)[1], np.int64)
 
     def cheapest_edges(self, u: I64, v: I64) -> I64:
-        """Index (K,) of the cheapest edge between each u and v, which are neighbours."""
+        """Return the index (K,) of the cheapest edge between each pair of neighbours u, v (K,)."""
         count = self._starts[u + 1] - self._starts[u]
         first = np.cumsum(count) - count
         all_of_u = np.arange(count.sum()) + np.repeat(self._starts[u] - first, count)
@@ -58,7 +55,7 @@ class ShortestPaths:
 
 
 def poses_on_paths(predecessors: I64, goals: I64) -> I64:
-    """All poses on the ways to `goals`, these included, the start not; rising."""
+    """Return all poses on the paths to `goals`, ascending; the goals are included, the start is not."""
     is_visited = np.zeros(len(predecessors), bool)
     frontier = goals[predecessors[goals] >= 0]
     while len(frontier):
@@ -68,25 +65,25 @@ def poses_on_paths(predecessors: I64, goals: I64) -> I64:
     return np.flatnonzero(is_visited)
 
 
-PosesById = Sequence[F64] | Mapping[int, F64] | F64  # poses (4, 4) by number
+PosesById = Sequence[F64] | Mapping[int, F64] | F64  # poses (4, 4) by id
 
 
 class CovariancePaths:
-    """The edges of a pose graph that grows and is thinned, by the poses that they touch."""
+    """Edges of a changing pose graph, and covariances along its shortest paths."""
 
     def __init__(self) -> None:
-        self._degree: Counter[int] = Counter()  # edges, by the number of a pose
-        self._slots: dict[int, int] = {}  # of the poses in the search, by number
+        self._degree: Counter[int] = Counter()  # number of edges of each pose
+        self._slots: dict[int, int] = {}  # index of each pose in the search
         self._free_slots: list[int] = []
         self._rows: dict[PoseEdge, int] = {}
         self._edges: list[PoseEdge] = []
-        self._table = np.zeros((64, 3 + 16 + 36))  # places of a and b, spread, T_a_b, cov
-        self._paths: ShortestPaths | None = None  # None once an edge has come or gone
+        self._table = np.zeros((64, 3 + 16 + 36))  # slots of a and b, cov_trace, T_a_b, cov
+        self._paths: ShortestPaths | None = None  # None: edges have changed
 
     def add(self, edge: PoseEdge) -> None:
-        """Raises ValueError if it is here already."""
+        """Add an edge. Raises ValueError for a duplicate."""
         if edge in self._rows:
-            raise ValueError(f"edge {edge.a} - {edge.b} is here already")
+            raise ValueError(f"edge {edge.a} - {edge.b} was added before")
         for end in (edge.a, edge.b):
             self._degree[end] += 1
             if end not in self._slots:
@@ -100,7 +97,7 @@ class CovariancePaths:
         self._paths = None
 
     def remove(self, edge: PoseEdge) -> None:
-        """Raises KeyError if it is not here."""
+        """Remove an edge. Raises KeyError if it is missing."""
         row, last = self._rows.pop(edge), self._edges.pop()
         if last is not edge:
             self._edges[row], self._rows[last] = last, row
@@ -113,13 +110,15 @@ class CovariancePaths:
         self._paths = None
 
     def covariances_from(self, start: int, goals: Sequence[int], poses: PosesById) -> list[F64 | None]:
-        """Covariance (6, 6) of T_start_goal for each goal along the surest path from `start` to it, each
-        step laid along the current `poses`; None where there is no path. One search serves all."""
+        """Covariance (6, 6) of T_start_goal for each goal, along the path of least covariance; or None.
+
+        Each step is placed at the current `poses`. One search serves all goals.
+        """
         if start not in self._slots:
             return [np.zeros((6, 6)) if goal == start else None for goal in goals]
         predecessors = self._updated_paths().predecessors(self._slots[start])
         paths = [self._path_slots(predecessors, start, goal) for goal in goals]
-        visited = np.array(sorted({place for path in paths for place in path or ()}), np.int64)
+        visited = np.array(sorted({slot for path in paths for slot in path or ()}), np.int64)
         steps = self._step_covariances(predecessors[visited], visited, start, poses)
         known = [i for i, path in enumerate(paths) if path is not None]
         sums = [steps[np.searchsorted(visited, paths[i] or [])].sum(0) for i in known]
@@ -133,13 +132,13 @@ class CovariancePaths:
 
     def _updated_paths(self) -> ShortestPaths:
         if self._paths is None:
-            a, b, spread = self._table[: len(self._edges), :3].T
+            a, b, cov_trace = self._table[: len(self._edges), :3].T
             size = len(self._slots) + len(self._free_slots)
-            self._paths = ShortestPaths(size, a.astype(np.int64), b.astype(np.int64), spread)
+            self._paths = ShortestPaths(size, a.astype(np.int64), b.astype(np.int64), cov_trace)
         return self._paths
 
     def _path_slots(self, predecessors: I64, start: int, goal: int) -> list[int] | None:
-        """Places on the way from `goal` back to `start`, the latter left out."""
+        """Slots on the path from `goal` back to `start`, the latter excluded; None without a path."""
         slot, start_slot = self._slots.get(goal, -1), self._slots[start]
         path: list[int] = []
         while slot != start_slot:
@@ -150,7 +149,7 @@ class CovariancePaths:
         return path
 
     def _step_covariances(self, predecessors: I64, visited: I64, start: int, poses: PosesById) -> F64:
-        """Covariances (K, 6, 6) of the steps to places `met` from those before, perturbing T_start_start."""
+        """Covariances (K, 6, 6) of the steps from `predecessors` to `visited`, perturbing T_start_start."""
         rows = self._updated_paths().cheapest_edges(predecessors, visited)
         table = self._table[rows]
         is_forward = table[:, 1] == visited
@@ -162,14 +161,14 @@ class CovariancePaths:
         return se3.inverse_cov(se3.inverse(poses[start]) @ end_poses, cov)
 
 
-# ---- How well poses are known from one of them: an upper bound that hardly exceeds the truth.
+# Covariances of solved poses: a tight upper bound
 #
-# The exact covariance costs a factorisation of the whole graph. But what is left out of a graph can only have
-# told more, so the covariance in a part of it is an upper bound. The part that says most is that along the
-# surest ways: once found, their edges are made dearer, and the next surest ways are added, until there are
+# The exact covariance costs a factorisation of the whole graph. Edges left out could only add information, so
+# the covariance in a subgraph is an upper bound. The most informative subgraph is that of the paths of least
+# covariance: once found, the cost of their edges is raised and the next paths are added, until there are
 # enough edges.
 
-_MIN_WEIGHT = 1e-9  # of a loop that all else speaks against, so that it can be divided by
+_MIN_WEIGHT = 1e-9  # of a loop, to divide by
 _UNKNOWN_COV = 1e6 * np.eye(6)
 
 
@@ -183,10 +182,9 @@ def relative_covariances(
 ) -> F64:
     """Covariances (K, 6, 6) of `wanted` (K,) of n poses relative to `anchor`, right perturbation.
 
-    plumb (n, 3): see `share.mapping.graph.edges`; where there are any, tilts are relative to gravity.
-
-    Every wanted pose must be joined to the anchor. Where edges differ so much in certainty (beyond some
-    16 orders of magnitude) that nothing can be told, a sigma of 1000 rad and m says so.
+    gravity_factors (n, 3): where there are any, tilts are relative to gravity. Every wanted pose must be
+    connected to the anchor. Where edges differ too much in certainty (beyond some 16 orders of magnitude) to
+    give a result, a sigma of 1000 rad and m says so.
     """
     n, out = len(gravity_factors), np.zeros((len(wanted), 6, 6))
     not_anchor = np.flatnonzero(wanted != anchor)
@@ -202,7 +200,7 @@ def relative_covariances(
         len(poses), local_edges, int(np.searchsorted(poses, anchor)), result.gauge_projector
     )
     J = weighted_jacobians(result.residuals[selected], weights[selected], local_edges)
-    unary = plumb_equations(result.poses[poses], gravity_factors[poses])
+    unary = gravity_equations(result.poses[poses], gravity_factors[poses])
     out[not_anchor] = _inverse_diagonal_blocks(
         equations.information_matrix(J, unary), np.searchsorted(poses, wanted[not_anchor])
     )
@@ -212,7 +210,7 @@ def relative_covariances(
 def _tightest_edges(
     n: int, edges: EdgeArrays, cost: F64, anchor: int, wanted: I64, config: GraphConfig
 ) -> I64:
-    """Indices of the edges on the surest ways from the anchor to the wanted poses."""
+    """Indices of the edges on the paths of least covariance from the anchor to the wanted poses."""
     used, path_cost = np.zeros(len(edges), bool), cost.copy()
     for _ in range(config.covariance_rounds):
         paths = ShortestPaths(n, edges.a, edges.b, path_cost)
@@ -227,7 +225,7 @@ def _tightest_edges(
 
 
 def _inverse_diagonal_blocks(information: Any, wanted: I64) -> F64:
-    """Those on the diagonal (K, 6, 6)."""
+    """Diagonal blocks (K, 6, 6) of the inverse at `wanted`."""
     from scipy.sparse.linalg import splu
 
     symmetric = {"SymmetricMode": True}

@@ -1,8 +1,8 @@
-"""The edges of a pose graph as arrays: residuals and their derivatives, all in one batch.
+"""Edges of a pose graph: residuals and Jacobians of all of them at once.
 
-xi = log(measured^-1 T_a^-1 T_b), perturbations on the right, whitened by W with W'W = cov^-1.
-Source: Barfoot, *State Estimation for Robotics* (2017), ch. 7; Grisetti et al., *A Tutorial on
-Graph-Based SLAM*, 2010.
+xi = log(measured^-1 T_a^-1 T_b), perturbations on the right, whitened by W with W'W = cov^-1. Source:
+Barfoot, *State Estimation for Robotics* (2017), ch. 7; Grisetti et al., *A Tutorial on Graph-Based SLAM*,
+2010.
 """
 
 from __future__ import annotations
@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from share.geometry import se3
 from share.types import F64, I64, checked_array, checked_pose
 
-# ---- How one pose was seen from another.
-
 
 @dataclass(frozen=True, eq=False)
 class PoseEdge:
-    """Pose b as measured from pose a: T_a_b (4, 4) and its covariance (6, 6), perturbed on the right."""
+    """A measured relative pose T_a_b (4, 4) with its covariance (6, 6), right perturbation."""
 
     a: int
     b: int
@@ -30,27 +28,30 @@ class PoseEdge:
 
     def __post_init__(self) -> None:
         if self.a == self.b or min(self.a, self.b) < 0:
-            raise ValueError(f"edge: {self.a} - {self.b} does not join two poses")
+            raise ValueError(f"edge {self.a} - {self.b}: needs two different poses, numbered from 0")
         object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
         object.__setattr__(self, "cov", checked_array("cov", self.cov, (6, 6), np.float64))
 
     def reverse(self) -> PoseEdge:
-        """The same, from the other end."""
+        """Return the edge from b to a."""
         return PoseEdge(self.b, self.a, se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov))
 
     @property
     def cov_trace(self) -> float:
-        """Trace of the covariance: one number for how loose the edge is."""
+        """Trace of the covariance, a scalar measure of uncertainty."""
         return float(self.cov.trace())
 
 
-_MIN_SIGMA = 1e-5  # rad and m; no measurement is taken to be surer, so a singular covariance is no trouble
+_MIN_SIGMA = 1e-5  # rad and m; a floor, so that singular covariances are harmless
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeArrays:
-    """E edges: ends a, b (E,), T_b_a as measured (E, 4, 4), W (E, 6, 6), spread (E,) = trace of the
-    covariance, is_loop (E,): judged robustly. Indexed like an array."""
+    """E edges, indexed like an array.
+
+    Ends a, b (E,); measured T_b_a (E, 4, 4); whitening W (E, 6, 6); cov_trace (E,); is_loop (E,): under the
+    robust kernel.
+    """
 
     a: I64
     b: I64
@@ -73,7 +74,7 @@ class EdgeArrays:
         )
 
     def with_ends(self, a: I64, b: I64) -> EdgeArrays:
-        """The same measurements with their ends named otherwise."""
+        """The same measurements with other indices of their ends."""
         return EdgeArrays(a, b, self.T_b_a, self.whitening, self.cov_trace, self.is_loop)
 
     def concatenate(self, other: EdgeArrays) -> EdgeArrays:
@@ -88,14 +89,14 @@ class EdgeArrays:
 
     @staticmethod
     def from_measurements(ends: I64, T_a_b: F64, covs: F64, is_loop: NDArray[np.bool_]) -> EdgeArrays:
-        """From ends (E, 2), T_a_b (E, 4, 4) and their covariances (E, 6, 6)."""
+        """From ends (E, 2), T_a_b (E, 4, 4) and covariances (E, 6, 6)."""
         cov_trace = np.maximum(np.trace(covs, axis1=1, axis2=2), _MIN_SIGMA**2)
         return EdgeArrays(ends[:, 0], ends[:, 1], se3.inverse(T_a_b), _whitening(covs), cov_trace, is_loop)
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeResiduals:
-    """At some poses: T_a_b (E, 4, 4), xi (E, 6), whitened (E, 6), and its square chi2 (E,)."""
+    """Residuals at given poses: T_a_b (E, 4, 4), xi (E, 6), whitened (E, 6), its square chi2 (E,)."""
 
     T_a_b: F64
     xi: F64
@@ -107,13 +108,13 @@ class EdgeResiduals:
 
 
 def _whitening(covs: F64) -> F64:
-    """W (E, 6, 6) with W'W = cov^-1, for covariances (E, 6, 6)."""
+    """W (E, 6, 6) with W'W = cov^-1 for covariances (E, 6, 6)."""
     variances, axes = np.linalg.eigh(covs)
     return np.asarray(np.swapaxes(axes, 1, 2) / np.sqrt(np.maximum(variances, _MIN_SIGMA**2))[:, :, None])
 
 
 def residuals(poses: F64, edges: EdgeArrays) -> EdgeResiduals:
-    """Of all edges at poses (N, 4, 4)."""
+    """Residuals of all edges at poses (N, 4, 4)."""
     T_a_b = se3.inverse(poses)[edges.a] @ poses[edges.b]
     xi = _log(edges.T_b_a @ T_a_b)
     whitened = (edges.whitening @ xi[:, :, None])[:, :, 0]
@@ -121,13 +122,13 @@ def residuals(poses: F64, edges: EdgeArrays) -> EdgeResiduals:
 
 
 def jacobians(residuals_at: EdgeResiduals, edges: EdgeArrays) -> tuple[F64, F64]:
-    """Of the whitened residual by right perturbations of a and of b, each (E, 6, 6)."""
+    """Jacobians of the whitened residuals by right perturbations of a and of b, each (E, 6, 6)."""
     by_b = edges.whitening @ _right_jacobian_inverse(residuals_at.xi)
     return -by_b @ se3.adjoint(se3.inverse(residuals_at.T_a_b)), by_b
 
 
 def _right_jacobian_inverse(xi: F64) -> F64:
-    """(E, 6) -> (E, 6, 6): 1 + ad/2 + ad^2/12 (Barfoot eq. 7.79); the next term is ad^4/720."""
+    """Map xi (E, 6) to 1 + ad/2 + ad^2/12 (E, 6, 6) (Barfoot eq. 7.79); the next term is ad^4/720."""
     ad = np.zeros((len(xi), 6, 6))
     ad[:, :3, :3] = ad[:, 3:, 3:] = se3.hat(xi[:, :3])
     ad[:, 3:, :3] = se3.hat(xi[:, 3:])
@@ -135,8 +136,10 @@ def _right_jacobian_inverse(xi: F64) -> F64:
 
 
 def _log(T: F64) -> F64:
-    """`se3.log`, (E, 4, 4) -> (E, 6), at a tenth of its cost for angles below a right one; the others,
-    of false loops mostly, are left to it."""
+    """`se3.log`, (E, 4, 4) -> (E, 6), in a tenth of the time below 90 degrees.
+
+    Larger angles, mostly of false loops, go to `se3.log`.
+    """
     R, t = T[:, :3, :3], T[:, :3, 3]
     twice_sine = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1)
     sine = np.linalg.norm(twice_sine, axis=1) / 2
@@ -152,38 +155,3 @@ def _log(T: F64) -> F64:
     if is_large.any():
         xi[is_large] = se3.log(T[is_large])
     return xi
-
-
-# ---- Which way is up at a pose, as its agent's IMU knows it: what a plumb line says there.
-#
-# plumb (N, 3): the unit vector against gravity in the body, divided by its sigma (rad), zeros where unknown.
-# z of the map is up, so the whitened residual of a pose with rotation R is what is not vertical of it: the
-# first two rows of R plumb. Of a perturbation Exp(xi) on the right its derivative is -(R [plumb]x). Source:
-# Usenko et al., *Visual-Inertial Mapping with Non-Linear Factor Recovery*, RA-L 2020, the roll-pitch factor.
-
-
-def gravity_cost(poses: F64, gravity_factors: F64) -> float:
-    """Sum of the squared residuals at poses (N, 4, 4)."""
-    return float((_gravity_residual(poses, gravity_factors) ** 2).sum())
-
-
-def gravity_equations(poses: F64, gravity_factors: F64) -> tuple[F64, F64]:
-    """Slope (N, 6) and curvature (N, 6, 6) of half the cost by each pose's own perturbation."""
-    J = -(poses[:, :2, :3] @ se3.hat(gravity_factors))
-    gradient, hessian = np.zeros((len(poses), 6)), np.zeros((len(poses), 6, 6))
-    gradient[:, :3] = (np.swapaxes(J, 1, 2) @ _gravity_residual(poses, gravity_factors)[:, :, None])[:, :, 0]
-    hessian[:, :3, :3] = np.swapaxes(J, 1, 2) @ J
-    return gradient, hessian
-
-
-def tilt_projector(pose: F64) -> F64:
-    """Projector (6, 6) of a perturbation of `pose` (4, 4) on its turns about level axes."""
-    horizontal_axes = pose[:2, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = horizontal_axes.T @ horizontal_axes
-    return out
-
-
-def _gravity_residual(poses: F64, gravity_factors: F64) -> F64:
-    """(N, 2)."""
-    return np.asarray((poses[:, :2, :3] @ gravity_factors[:, :, None])[:, :, 0])

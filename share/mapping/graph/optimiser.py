@@ -1,10 +1,13 @@
-"""One Gauss-Newton step of a pose graph, by conjugate gradients.
+"""Levenberg-Marquardt on a pose graph, with conjugate-gradient steps.
 
-The agents' own odometry makes long chains; the equations along them are block tridiagonal and solved
-in a millisecond. They, with every other edge's information added at both its ends, precondition
-the whole; what the loops couple is left to the iterations: some 40, however many loops there are. A
-factorisation of the whole fills in instead. Source: Dellaert et al., *Subgraph-preconditioned
-Conjugate Gradients for Large Scale SLAM*, IROS 2010.
+Odometry is Gaussian; loops are under a Cauchy kernel, so that a false loop does not bend the map. Source:
+Triggs et al., *Bundle Adjustment: A Modern Synthesis*, 2000; Cauchy against 30 % false loops:
+docs/edge-map.md.
+
+Odometry makes long chains, whose equations are block tridiagonal and solved in a millisecond. With the
+information of all other edges added at both ends, they precondition the whole system; the coupling by loops
+is left to some 40 iterations, however many loops there are, where a factorisation would fill in. Source:
+Dellaert et al., *Subgraph-preconditioned Conjugate Gradients for Large Scale SLAM*, IROS 2010.
 """
 
 from __future__ import annotations
@@ -16,26 +19,23 @@ import numpy as np
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.mapping.graph.edges import EdgeArrays, EdgeResiduals, jacobians, residuals, tilt_projector
-from share.mapping.graph.edges import gravity_cost as plumb_cost
-from share.mapping.graph.edges import gravity_equations as plumb_equations
+from share.mapping.graph.edges import EdgeArrays, EdgeResiduals, jacobians, residuals
+from share.mapping.graph.gravity import gravity_cost, gravity_equations, tilt_projector
 from share.types import F64, I64
 
-# ---- Levenberg-Marquardt on re-weighted least squares: the most likely poses of one connected part.
-#
-# Odometry is Gaussian; loops are under a Cauchy kernel, since one false loop must not bend the map. Source:
-# Triggs et al., *Bundle Adjustment: A Modern Synthesis*, 2000; Cauchy against 30 % false loops:
-# docs/edge-map.md.
-
-_INITIAL_DAMPING, _MAX_DAMPING = 1e-4, 1e8
-_MIN_CURVATURE = 0.5  # of a loop along its residual, beside that across; 0.3 overshot at times
+_INITIAL_DAMPING = 1e-4
+_MAX_DAMPING = 1e8
+_MIN_CURVATURE = 0.5  # along a loop's residual, relative to that across; 0.3 overshot at times
+MAX_CG_ITERATIONS = 300  # if they end early, the step is still downhill
 
 
 @dataclass(frozen=True, eq=False)
 class OptimisedPoses:
-    """poses (N, 4, 4). free (6, 6): what the held pose may do, a projector. at: the residuals there. weights
-    (E,): what the kernel leaves of each edge's information. reason: why there is no minimum and the poses
-    are as they were, or empty."""
+    """poses (N, 4, 4) and their residuals.
+
+    gauge_projector (6, 6): how the anchor may move. weights (E,): factor of the kernel on each edge's
+    information. reason: why there is no minimum, and poses are unchanged; or empty.
+    """
 
     poses: F64
     gauge_projector: F64
@@ -48,8 +48,10 @@ class OptimisedPoses:
 def optimise(
     poses: F64, gravity_factors: F64, edges: EdgeArrays, anchor_index: int, config: GraphConfig
 ) -> OptimisedPoses:
-    """From poses (N, 4, 4), in `chain_order`, with `share.mapping.graph.edges` (N, 3) each. Pose `held`
-    stays, to the bit where no plumb line is known; where one is, it tilts about its place. Deterministic."""
+    """Optimise poses (N, 4, 4), in `chain_order`, with gravity factors (N, 3). Deterministic.
+
+    The anchor stays, to the bit without gravity factors; with any, it tilts in place.
+    """
     with np.errstate(all="ignore"):
         return _levenberg_marquardt(poses, gravity_factors, edges, anchor_index, config)
 
@@ -61,11 +63,11 @@ def _levenberg_marquardt(
     gauge_projector = tilt_projector(poses[anchor_index]) if gravity_factors.any() else np.zeros((6, 6))
 
     def cost_of(at: EdgeResiduals, poses: F64) -> float:
-        return _robust_cost(at, edges, config) + plumb_cost(poses, gravity_factors)
+        return _robust_cost(at, edges, config) + gravity_cost(poses, gravity_factors)
 
     cost = cost_of(current, poses)
     if not np.isfinite(cost):
-        reason = "the error is not finite to begin with"
+        reason = "the cost of the initial poses is not finite"
         return OptimisedPoses(
             poses, gauge_projector, current, _cauchy_weights(current, edges, config), 0, reason
         )
@@ -77,12 +79,12 @@ def _levenberg_marquardt(
     ):
         iterations += 1
         step = _gauss_newton_step(
-            equations, current, edges, plumb_equations(poses, gravity_factors), damping, config
+            equations, current, edges, gravity_equations(poses, gravity_factors), damping, config
         )
         trial_poses = poses @ se3.exp(step)
         trial = residuals(trial_poses, edges)
         trial_cost = cost_of(trial, trial_poses)
-        if not trial_cost <= cost:  # nor if it is not finite
+        if not trial_cost <= cost:  # also rejects a cost that is not finite
             damping = max(10 * damping, _INITIAL_DAMPING)
             continue
         gain, cost, poses, current = cost - trial_cost, trial_cost, trial_poses, trial
@@ -95,7 +97,7 @@ def _levenberg_marquardt(
 
 
 def weighted_jacobians(residuals_at: EdgeResiduals, weights: F64, edges: EdgeArrays) -> tuple[F64, F64]:
-    """By a and by b, each (E, 6, 6), so that the sum of their squares is the information."""
+    """Jacobians by a and b, each (E, 6, 6), scaled so that J'J is the information."""
     root = np.sqrt(weights)[:, None, None]
     by_a, by_b = jacobians(residuals_at, edges)
     return by_a * root, by_b * root
@@ -123,9 +125,12 @@ def _gauss_newton_step(
 def _triggs_correction(
     J: tuple[F64, F64], residuals_at: EdgeResiduals, weights: F64, edges: EdgeArrays
 ) -> tuple[tuple[F64, F64], F64]:
-    """Jacobians less stiff along each loop's residual, where the kernel bends away, and by how much (E,):
-    without that the last millimetres take many steps (Triggs et al., section 4.3). Not for loops so
-    far off that the kernel is not convex there: they need it stiff."""
+    """Soften the Jacobians along each loop's residual, where the kernel bends away; return also the factor
+    (E,).
+
+    Without it the last millimetres take many steps (Triggs et al., section 4.3). Loops in the non-convex part
+    of the kernel are left as they are.
+    """
     is_convex = edges.is_loop & (weights > 0.5)
     softness = np.where(is_convex, np.sqrt(np.maximum(2 * weights - 1, _MIN_CURVATURE)), 1.0)
     along = residuals_at.whitened / np.sqrt(np.maximum(residuals_at.chi2, 1e-300))[:, None]
@@ -135,7 +140,7 @@ def _triggs_correction(
 
 
 def _cauchy_weights(residuals_at: EdgeResiduals, edges: EdgeArrays, config: GraphConfig) -> F64:
-    """Of Cauchy's kernel: 1 / (1 + chi2 / width^2) for loops."""
+    """Weights of the Cauchy kernel: 1 / (1 + chi2 / width^2) for loops, else 1."""
     return np.where(edges.is_loop, 1 / (1 + residuals_at.chi2 / config.cauchy**2), 1.0)
 
 
@@ -146,11 +151,8 @@ def _robust_cost(residuals_at: EdgeResiduals, edges: EdgeArrays, config: GraphCo
     )
 
 
-MAX_CG_ITERATIONS = 300  # of conjugate gradients; where they end early the step is still downhill
-
-
 def chain_order(n: int, odometry: EdgeArrays) -> I64:
-    """Which of n poses comes k-th (n,), so that neighbours by odometry are neighbours, but where it forks."""
+    """Order (n,) of the poses in which odometry neighbours are adjacent, except at forks."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -160,8 +162,10 @@ def chain_order(n: int, odometry: EdgeArrays) -> I64:
 
 
 class NormalEquations:
-    """What stays the same while the edges of n poses, in `chain_order`, are linearised again and
-    again: which block goes where. Pose `held` moves only as projector `gauge_projector` (6, 6) lets it."""
+    """Sparsity pattern of the normal equations of n poses in `chain_order`, for repeated linearisation.
+
+    The anchor moves only as `gauge_projector` (6, 6) allows.
+    """
 
     def __init__(self, n: int, edges: EdgeArrays, anchor_index: int, gauge_projector: F64) -> None:
         from scipy.sparse import csr_array
@@ -191,11 +195,11 @@ class NormalEquations:
         damping: float,
         tolerance: float,
     ) -> F64:
-        """The perturbations (n, 6) that solve the equations with their diagonal raised by `damping`.
+        """Return the perturbations (n, 6) that solve the equations with the diagonal raised by `damping`.
 
-        J: two (E, 6, 6); whitened (E, 6). own: slope (n, 6) and curvature (n, 6, 6) of what each pose knows
-        without an edge. tolerance: of the equations' residual, relative. Raises np.linalg.LinAlgError if
-        the chains cannot be solved.
+        J: two (E, 6, 6); whitened (E, 6). unary: gradient (n, 6) and Hessian (n, 6, 6) of the poses' own
+        factors. tolerance: relative, of the residual. Raises np.linalg.LinAlgError if the chains cannot be
+        factorised.
         """
         from scipy.sparse.linalg import LinearOperator, cg
 
@@ -208,7 +212,7 @@ class NormalEquations:
         return np.asarray(step.reshape(-1, 6))
 
     def information_matrix(self, J: tuple[F64, F64], unary: tuple[F64, F64]) -> Any:
-        """J'J as a sparse matrix (6 n, 6 n), the identity where the held pose is not free."""
+        """J'J as a sparse matrix (6 n, 6 n), the identity where the anchor is fixed."""
         _, diagonal, coupling = self._blocks(J, np.zeros((len(J[0]), 6)), unary)
         matrix = self._sparse_matrix(diagonal, coupling).tocsc()
         matrix.sum_duplicates()
@@ -221,7 +225,7 @@ class NormalEquations:
         return bsr_array((blocks, self._columns, self._starts), shape=(6 * self._n,) * 2)
 
     def _blocks(self, J: tuple[F64, F64], whitened: F64, unary: tuple[F64, F64]) -> tuple[F64, F64, F64]:
-        """J'r (n, 6), and of J'J the blocks on the diagonal (n, 6, 6) and at every (a, b) (E, 6, 6)."""
+        """J'r (n, 6), and of J'J the diagonal blocks (n, 6, 6) and those at every (a, b) (E, 6, 6)."""
         stacked = np.concatenate(J)
         stacked[self._at_anchor] = stacked[self._at_anchor] @ self._gauge_projector
         transposed = np.swapaxes(stacked, 1, 2)
@@ -237,7 +241,7 @@ class NormalEquations:
         return gradient, diagonal, transposed[:e] @ stacked[e:]
 
     def _chain_band(self, diagonal: F64, coupling: F64) -> F64:
-        """LAPACK's lower band (12, 6 n) of the blocks on the diagonal and next to it."""
+        """Lower band (12, 6 n), as of LAPACK, of the blocks on and next to the diagonal."""
         forward = np.swapaxes(coupling[self._forward], 1, 2)
         subdiagonal = self._couple @ np.concatenate([forward, coupling[self._backward]]).reshape(-1, 36)
         columns = np.concatenate([diagonal, subdiagonal.reshape(-1, 6, 6)], 1)
@@ -252,7 +256,7 @@ def _factorise_band(band: F64) -> F64:
 
     factor, info = dpbtrf(band, lower=1)
     if info:
-        raise np.linalg.LinAlgError("the chains' equations have no solution")
+        raise np.linalg.LinAlgError("the equations along the odometry chains are not positive definite")
     return np.asarray(factor)
 
 

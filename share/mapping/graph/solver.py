@@ -1,7 +1,6 @@
-"""The pose graphs of all maps, kept solved: the solver is told only what is new.
+"""Incremental pose-graph solver: it receives only changes, and starts from the last solution.
 
-Every solution starts from the one before. It runs in one thread and needs no clock; what it costs:
-docs/edge-map.md.
+Runs in one thread, without a clock. Cost: docs/edge-map.md.
 """
 
 from __future__ import annotations
@@ -20,41 +19,43 @@ from share.types import F64, I64
 
 
 class PoseGraphSolver:
-    """All poses, by number, and the edges between them."""
+    """All poses, by id, and the edges between them, of all maps."""
 
     def __init__(self, config: GraphConfig) -> None:
         self._config = config
         self.clear()
 
     def clear(self) -> None:
-        """Know nothing any more."""
+        """Forget everything."""
         empty = GraphUpdate.from_edges({})
-        self._pose_ids = empty.pose_ids  # rising
+        self._pose_ids = empty.pose_ids  # ascending
         self._poses, self._gravity_factors = empty.poses, empty.gravity_factors
-        self._edge_ids, self._edges = empty.edge_ids, _edge_arrays(empty)  # their ends are numbers
+        self._edge_ids, self._edges = empty.edge_ids, _edge_arrays(empty)  # ends are pose ids
 
     def __len__(self) -> int:
         return len(self._pose_ids)
 
     def update(self, change: GraphUpdate) -> None:
-        """Take news in. Raises ValueError, and stays as it was, if an edge or a pose that should go is
-        not known, if an edge's id is known already, or if an end of it is not there."""
+        """Apply changes.
+
+        Raises ValueError, and stays unchanged, for an unknown edge or pose to remove, a duplicate edge id, or
+        an edge with an unknown end.
+        """
         pose_ids, poses, gravity_factors = self._poses_after(change)
         edge_ids, edges = self._edges_after(change, pose_ids)
         self._pose_ids, self._poses, self._gravity_factors = pose_ids, poses, gravity_factors
         self._edge_ids, self._edges = edge_ids, edges
 
     def solve(self, anchor: int, wanted: Sequence[int] = ()) -> GraphSolution:
-        """The most likely poses of all that is joined to pose `anchor`, which stays where it is and, where
-        plumb lines are known, turns only to be upright.
+        """Return the most likely poses of the component of pose `anchor`.
 
-        wanted: the poses whose covariances are asked for. What cannot be solved comes back as it
-        was, with the reason. Deterministic. Raises ValueError if the anchor is not known or a
-        wanted pose is not joined to it.
+        The anchor stays, except that it turns upright where gravity factors are known. wanted: poses whose
+        covariances are returned. An unsolvable component is returned unchanged, with the reason.
+        Deterministic. Raises ValueError if the anchor is unknown or a wanted pose is not connected to it.
         """
         component, component_edges = self._component(anchor)
         pose_ids, edges = self._pose_ids[component], self._edges[component_edges]
-        goals = _indices(pose_ids, np.array(wanted, np.int64), f"joined to {anchor}")
+        goals = _indices(pose_ids, np.array(wanted, np.int64), f"connected to {anchor}")
         local_edges = edges.with_ends(np.searchsorted(pose_ids, edges.a), np.searchsorted(pose_ids, edges.b))
         order = chain_order(len(component), local_edges[~local_edges.is_loop])
         rank = np.argsort(order)
@@ -82,7 +83,7 @@ class PoseGraphSolver:
         )
 
     def _component(self, anchor: int) -> tuple[I64, I64]:
-        """Places of the poses that are joined to `anchor`, and of the edges between them."""
+        """Indices of the poses connected to `anchor`, and of the edges between them."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import connected_components
 
@@ -129,7 +130,7 @@ def _with_poses(poses: F64, indices: I64, new: F64) -> F64:
 
 
 def _indices(pose_ids: I64, wanted: I64, what: str) -> I64:
-    """Where `wanted` are in `pose_ids`, which rise. Raises ValueError if one is not there."""
+    """Indices of `wanted` in the ascending `pose_ids`. Raises ValueError if one is missing."""
     _require(np.isin(wanted, pose_ids), wanted, "pose", f"is not {what}")
     return np.searchsorted(pose_ids, wanted)
 

@@ -1,11 +1,10 @@
-"""Taking a pose out of the graph, so that the map stays bounded.
+"""Messages to and from the solver, and the removal of a pose from the graph.
 
-Of the odometry a - x - b one edge a - b stays; loops that end at x move to its neighbour along the
-surer of the two. The odometry edge e that they move along then speaks several times: in every
-moved loop, and in a - b. Each is told a share of its information, the shares sum to one, so
-nothing is counted twice: it is as if x were split into as many poses that know nothing of each
-other, and what is left out of a graph can only have told more. Source of the idea: covariance
-intersection; Julier and Uhlmann, *A Non-divergent Estimation Algorithm*, ACC 1997.
+Of the odometry a - x - b one edge a - b stays when x is removed; loops at x move to its neighbour along the
+more certain of the two edges. That edge e then enters several edges: every moved loop, and a - b. Each gets a
+share of its information and the shares sum to one, so nothing is counted twice, as if x were split into
+unconnected copies; omitting connections is conservative. Source of the idea: covariance intersection; Julier
+and Uhlmann, *A Non-divergent Estimation Algorithm*, ACC 1997.
 """
 
 from __future__ import annotations
@@ -19,17 +18,15 @@ from share.geometry import se3
 from share.mapping.graph.edges import PoseEdge
 from share.types import F64, I64, checked_array
 
-# ---- What goes to the solver and what comes back, as a few arrays: both cross to another process.
-
 
 @dataclass(frozen=True, eq=False)
 class GraphUpdate:
-    """News of the graph. What is gone goes first, and a gone pose takes its edges along.
+    """Changes of the graph, as arrays that can cross to another process. Removals apply first; a removed pose
+    takes its edges along.
 
-    numbers (N,), poses (N, 4, 4), rigid: new ones, and known ones that lie elsewhere now; plumb (N, 3) of
-    each, see `share.mapping.graph.edges`. edge_ids (E,),
-    ends (E, 2), measured (E, 4, 4), covs (E, 6, 6): new edges, T_a_b with ends (a, b), right
-    perturbation. is_loop (E,): may be false, so it is judged robustly. gone_edges, gone_poses: ids.
+    pose_ids (N,), poses (N, 4, 4), gravity_factors (N, 3): new or moved poses. edge_ids (E,), ends (E, 2) as
+    (a, b), T_a_b (E, 4, 4), covs (E, 6, 6), right perturbation: new edges. is_loop (E,): under the robust
+    kernel. removed_edges, removed_poses: ids.
     """
 
     pose_ids: I64
@@ -68,8 +65,7 @@ class GraphUpdate:
         removed_poses: Iterable[int] = (),
         gravity_factors: Mapping[int, F64] | None = None,
     ) -> GraphUpdate:
-        """From poses by number, and edges as (id, edge, may it be false). plumb: by number, of some of the
-        poses."""
+        """From poses by id and edges as (id, edge, is_loop). gravity_factors: by id, of some of the poses."""
         edges, gravity_factors = list(edges), gravity_factors or {}
         return GraphUpdate(
             np.array(list(poses), np.int64),
@@ -89,12 +85,13 @@ class GraphUpdate:
 
 @dataclass(frozen=True, eq=False)
 class GraphSolution:
-    """One connected part, solved.
+    """Solution of one connected component.
 
-    numbers (N,), poses (N, 4, 4): rising, all of the part. covariances (K, 6, 6): of the poses asked
-    for relative to the anchor, right perturbation, never too small (`share.mapping.graph.covariance`).
-    loop_ids (L,), loop_chi2 (L,): squared Mahalanobis residual. reason: why it could not be solved, the poses
-    are as they were and there are no covariances; empty if it was."""
+    pose_ids (N,), ascending, poses (N, 4, 4). covariances (K, 6, 6): of the wanted poses relative to the
+    anchor, right perturbation, upper bounds (`share.mapping.graph.covariance`). loop_ids (L,), loop_chi2
+    (L,): squared Mahalanobis residual. reason: why it is not solved; then poses are unchanged and there are
+    no covariances; empty if solved.
+    """
 
     pose_ids: I64
     poses: F64
@@ -107,10 +104,10 @@ class GraphSolution:
 
 @dataclass(frozen=True, eq=False)
 class ContractedEdges:
-    """The edges that stand for those which touched a pose that is gone.
+    """Edges that replace those of a removed pose.
 
-    odometry: all but the one that the others moved along; none where a chain ended. loops: one for each
-    that was given, None where it would join the neighbour to itself.
+    odometry: all but the one along which the others moved; none at the end of a chain. loops: one for each
+    given, None where both ends would be the same pose.
     """
 
     odometry: tuple[PoseEdge, ...]
@@ -120,16 +117,15 @@ class ContractedEdges:
 def contract_pose(
     pose: int, odometry: Sequence[PoseEdge], loops: Sequence[PoseEdge], share: float = 0.5
 ) -> ContractedEdges:
-    """Take pose x out, given all the edges that touch it; they are gone then.
+    """Return the edges that replace all `odometry` and `loops` edges at `pose`.
 
-    share: of the information of the edge along which the others move, how much odometry is told;
-    loops are told equal parts of the rest. Raises ValueError if x has no neighbour by odometry, or
-    if an edge does not touch x.
+    share: share of the information of the edge along which others move that goes to odometry; loops share the
+    rest equally. Raises ValueError if the pose has no odometry edge, or if an edge does not end at it.
     """
     unrelated = [edge for edge in (*odometry, *loops) if pose not in (edge.a, edge.b)]
     if unrelated or not odometry:
         raise ValueError(
-            f"pose {pose}: {'an edge does not touch it' if unrelated else 'no neighbour by odometry'}"
+            f"pose {pose}: {'an edge does not end at it' if unrelated else 'it has no odometry edge'}"
         )
     path_edge = min(odometry, key=lambda edge: edge.cov_trace)
     neighbour = path_edge.a if path_edge.b == pose else path_edge.b
@@ -150,7 +146,7 @@ def contract_pose(
 
 
 def _move_end(edge: PoseEdge, old_end: int, new_end: int, path_edge: PoseEdge, share: float) -> PoseEdge:
-    """`edge` with its end at x moved to y along `path_edge`, of whose information it is told `share`."""
+    """Move an end of `edge` along `path_edge`, with `share` of the latter's information."""
     oriented_path = path_edge if path_edge.a == old_end else path_edge.reverse()
     incoming = edge if edge.b == old_end else edge.reverse()
     cov = se3.compose_cov(oriented_path.T_a_b, incoming.cov, oriented_path.cov / share)
@@ -159,12 +155,14 @@ def _move_end(edge: PoseEdge, old_end: int, new_end: int, path_edge: PoseEdge, s
 
 
 def fuse_edges(edges: Sequence[PoseEdge]) -> tuple[PoseEdge, float]:
-    """Edges that join the same two poses as one (their information added), and the chi-square by which
-    they disagree, of 6 (K - 1) dof: where it is too large one of them is false. Directed as the first.
-    Raises ValueError if they do not join the same two poses."""
+    """Fuse edges between the same two poses; return the fused edge and the chi-square of 6 (K - 1) dof.
+
+    Directed as the first. A large chi-square means that one of them is false. Raises ValueError if they do
+    not connect the same two poses.
+    """
     first = edges[0]
     if any({edge.a, edge.b} != {first.a, first.b} for edge in edges):
-        raise ValueError("edges between different poses cannot be one")
+        raise ValueError("edges to fuse must connect the same two poses")
     aligned = [edge if edge.a == first.a else edge.reverse() for edge in edges]
     xi = se3.log(se3.inverse(first.T_a_b) @ np.array([edge.T_a_b for edge in aligned]))
     information = np.linalg.inv(np.array([edge.cov for edge in aligned]))

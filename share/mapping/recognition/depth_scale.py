@@ -1,10 +1,11 @@
-"""How much larger one camera sees the same points than another: whose depths are wrong, relative to whose.
+"""Relative scale of two cameras' depths, from one pair of views.
 
-Of a matched point both views know a depth. With T_c_q in the candidate's units, a query whose depths are all
-too large by e^l has inverse depths that are too small by it, so y' = h(T, (u, v, rho e^l)) has to meet y_c:
-the residual of `share.mapping.recognition.refinement`, with one unknown more. Both a wrong stereo baseline
-and a wrong focal length show here at once, from one pair of views. A pose that takes both as of one scale is
-off, by some mm for each percent and metre of depth: `Scale.pose_sensitivity` says how."""
+Both views know the depth of a matched point. If all depths of the query are too large by e^l, its inverse
+depths are too small by it, so y' = h(T, (u, v, rho e^l)) has to match y_c: the residual of
+`share.mapping.recognition.refinement` with one more unknown. A wrong stereo baseline and a wrong focal length
+both show here. A pose estimated as if both had one scale is off by some mm per percent and metre of depth:
+see `DepthScale.pose_sensitivity`.
+"""
 
 from __future__ import annotations
 
@@ -21,31 +22,35 @@ from share.mapping.recognition.refinement import (
 )
 from share.types import F64
 
-_MIN_MATCHES = 10  # matches with both depths: fewer say little
+_MIN_MATCHES = 10  # with both depths
 _ITERATIONS = 2
-_MAX_LOG_SCALE = 1.0  # log scale; beyond, the matches are none
+_MAX_LOG_SCALE = 1.0  # beyond, the matches are wrong
 _RIDGE = 1e-6 * np.eye(7)
 
 
 class DepthScale(NamedTuple):
-    """log: of the query's depths over the candidate's; sigma: of log. lean (6,): where T_c_q goes, perturbed
-    on the left, by each unit of log that is taken into account; None where not known."""
+    """Log of the query's depths over the candidate's, with its sigma.
+
+    pose_sensitivity (6,): left perturbation of T_c_q per unit of log that is corrected; None if unknown.
+    """
 
     log: float
     sigma: float
     pose_sensitivity: F64 | None = None
 
     def reverse(self) -> DepthScale:
-        """The same, from the other end, but for the lean."""
+        """Return the scale with query and candidate exchanged; the pose sensitivity is dropped."""
         return DepthScale(-self.log, self.sigma)
 
 
 def relative_depth_scale(
     T_c_q: F64, y_q: F64, y_c: F64, noise_q: KeypointNoise, noise_c: KeypointNoise, gate: float
 ) -> DepthScale | None:
-    """Of cameras, from T_c_q (4, 4) as refined and matched keypoints y_q, y_c (N, 3), NaN where a depth is
-    unknown. gate: squared Mahalanobis distance of an inlier. None where too few matches have both depths.
-    Raises LinAlgError where they determine nothing."""
+    """Relative depth scale from the refined T_c_q (4, 4) of the cameras and matches y_q, y_c (N, 3).
+
+    Depths are NaN where unknown. gate: squared Mahalanobis distance of an inlier. None where too few matches
+    have both depths. Raises LinAlgError where they do not determine it.
+    """
     has_both_depths = np.isfinite(y_q[:, 2]) & np.isfinite(y_c[:, 2])
     source, target = y_q[has_both_depths].T, y_c[has_both_depths].T
     T, log_scale = T_c_q, 0.0
@@ -71,16 +76,14 @@ def relative_depth_scale(
 def _linearise(
     T: F64, log_scale: float, source: F64, target: F64, noise_q: KeypointNoise, noise_c: KeypointNoise
 ) -> tuple[F64, F64, F64]:
-    """J (N, 3, 7), information (N, 3, 3) and residual (N, 3); no information of a point behind the camera."""
+    """J (N, 3, 7), information (N, 3, 3) and residual (N, 3); zero for points behind the camera."""
     y = source.copy()
     y[2] *= np.exp(log_scale)
     moved = transfer_keypoints(T, y)
     K = keypoint_jacobian(T, y, moved)  # (3, 3, N)
     J = np.concatenate([pose_jacobian(moved), (K[:, 2] * y[2])[None]]).transpose(2, 1, 0)
-    keypoint_jacobian_t = K.transpose(2, 0, 1)
-    covariance = (keypoint_jacobian_t * noise_q.variances) @ keypoint_jacobian_t.swapaxes(1, 2) + np.diag(
-        noise_c.variances
-    )
+    dy = K.transpose(2, 0, 1)
+    covariance = (dy * noise_q.variances) @ dy.swapaxes(1, 2) + np.diag(noise_c.variances)
     residual = (target - moved).T
     is_visible = np.isfinite(moved.sum(0))
     J, residual = np.where(is_visible[:, None, None], J, 0.0), np.where(is_visible[:, None], residual, 0.0)

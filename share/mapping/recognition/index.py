@@ -1,17 +1,16 @@
-"""Which stored views look like this one: an inverted index over hashed ORB descriptors.
+"""Place recognition: an inverted index over hashed ORB descriptors.
 
-Each of `tables` hash functions reads `bits` of a descriptor's 256: a word. Two descriptors that
-differ in d bits share the word with probability (1 - d/256)^bits, so the tables together are a
-vocabulary of words that needs no training. Sources: bit-sampling locality-sensitive hashing, Indyk
-and Motwani, STOC 1998; scoring by tf-idf, Sivic and Zisserman, ICCV 2003.
+Each of `tables` hash functions reads `bits` of a descriptor's 256: a word. Two descriptors that differ in d
+bits share a word with probability (1 - d/256)^bits, so the tables form a vocabulary that needs no training.
+Sources: bit-sampling locality-sensitive hashing, Indyk and Motwani, STOC 1998; tf-idf scoring, Sivic and
+Zisserman, ICCV 2003.
 
-A query reads the entries of rare words first and stops at 64 a stored keyframe, 400,000 in all: what is
-everywhere says little, costs most, and misleads (stop words, Sivic and Zisserman). So the time of a
-query hardly grows with the map.
+A query reads the entries of rare words first and stops at 64 per stored keyframe, 400,000 in all: frequent
+words say little, cost most, and mislead (stop words, Sivic and Zisserman). So query time hardly grows with
+the map.
 
-The newest keyframes are looked through one by one. They are then written on a page, and four pages of
-like size become one (a log-structured merge tree that ends at a page's size, so that no `add` takes
-long).
+The newest keyframes are compared one by one. They are then written to a page, and four pages of similar size
+are merged (a log-structured merge tree, up to a maximum page size, so that no `add` takes long).
 """
 
 from __future__ import annotations
@@ -25,31 +24,31 @@ from numpy.typing import NDArray
 
 from share.types import F32, F64, I64, U8
 
-_MAX_UNPAGED = 64  # keyframes looked through one by one, at most
-_MAX_DEAD_SHARE = 0.25  # share of a page; beyond, it is written anew
-_ENTRIES_PER_KEYFRAME = 64  # entries a stored keyframe, on average
-_MIN_ENTRIES, _MAX_ENTRIES = 30_000, 400_000  # entries in all
-_PAGES_PER_MERGE = 4  # pages that become one
+_MAX_UNPAGED = 64  # keyframes compared one by one
+_MAX_DEAD_SHARE = 0.25  # removed keyframes of a page; beyond, it is rewritten
+_ENTRIES_PER_KEYFRAME = 64  # entries that a query reads, per stored keyframe
+_MIN_ENTRIES, _MAX_ENTRIES = 30_000, 400_000  # limits on all entries that a query reads
+_PAGES_PER_MERGE = 4
 
 
 class PlaceCandidate(NamedTuple):
-    """A stored keyframe and how alike it is; scores compare within one query only."""
+    """A similar keyframe. Scores compare within one query only."""
 
     id: int
     score: float
 
 
 class PlaceIndex:
-    """Keyframes by their descriptors. Ids are any distinct integers."""
+    """Index of keyframes by their descriptors. Ids are any distinct integers."""
 
     def __init__(self, seed: int, tables: int = 8, bits: int = 16) -> None:
         if not (bits >= 1 and tables >= 1 and tables << bits <= MAX_WORDS):
             raise ValueError(
-                f"{tables} tables of {bits} bits: at least one of each, and {MAX_WORDS} words in all"
+                f"tables {tables}, bits {bits}: need at least 1 each, and tables * 2^bits <= {MAX_WORDS}"
             )
         rng = np.random.default_rng(seed)
         self._sampled_bits = np.stack([rng.choice(256, bits, replace=False) for _ in range(tables)])
-        self._word_counts = np.zeros(tables << bits, np.int32)  # entries of each word
+        self._word_counts = np.zeros(tables << bits, np.int32)
         self._pages: list[IndexPage] = []
         self._unpaged: dict[int, U32] = {}  # words of the newest keyframes
 
@@ -58,14 +57,14 @@ class PlaceIndex:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the index holds."""
+        """Memory of the index, bytes."""
         arrays = [array for page in self._pages for array in (page.starts, page.slots)]
         return sum(array.nbytes for array in (*arrays, *self._unpaged.values(), self._word_counts))
 
     def add(self, id: int, descriptors: U8) -> None:
-        """Store the view (N, 32) of keyframe `id`."""
+        """Add keyframe `id` with its descriptors (N, 32)."""
         words = self._words(descriptors)
-        np.add.at(self._word_counts, words, np.int32(1))  # of another type, it is 30 times slower
+        np.add.at(self._word_counts, words, np.int32(1))  # another dtype is 30 times slower
         self._unpaged[id] = words
         if len(self._unpaged) == _MAX_UNPAGED:
             self._pages.append(
@@ -75,7 +74,7 @@ class PlaceIndex:
             self._merge_pages(_PAGES_PER_MERGE)
 
     def remove(self, id: int) -> None:
-        """Forget keyframe `id`. Raises KeyError if it is not stored."""
+        """Remove keyframe `id`. Raises KeyError if it is not stored."""
         if id in self._unpaged:
             np.add.at(self._word_counts, self._unpaged.pop(id), np.int32(-1))
             return
@@ -91,7 +90,7 @@ class PlaceIndex:
     def query(self, descriptors: U8, limit: int, exclude: Collection[int] = ()) -> list[PlaceCandidate]:
         """Up to `limit` stored keyframes that share words with descriptors (N, 32), best first.
 
-        A shared word counts log(n / df).
+        A shared word scores log(n / df).
         """
         if not len(self) or not len(descriptors):
             return []
@@ -105,7 +104,7 @@ class PlaceIndex:
         return [PlaceCandidate(int(ids[i]), float(scores[i])) for i in ranked if scores[i] > 0]
 
     def _weight_words(self, descriptors: U8) -> tuple[I64, F64]:
-        """The view's distinct words that may be read, and what each counts for."""
+        """Distinct words of the view within the budget of entries, and their weights."""
         words, term_counts = np.unique(self._words(descriptors).astype(np.int64), return_counts=True)
         word_counts = self._word_counts[words]
         rare_first = np.argsort(word_counts, kind="stable")
@@ -117,7 +116,7 @@ class PlaceIndex:
         return words[chosen], term_counts[chosen] * np.log((1 + n) / (1 + np.minimum(word_counts[chosen], n)))
 
     def _unpaged_votes(self, words: I64, weights: F64) -> tuple[I64, I64, F64]:
-        """Ids, sizes and votes of the newest."""
+        """Ids, sizes and votes of the newest keyframes."""
         word_weights: F32 = np.zeros(len(self._word_counts), np.float32)
         word_weights[words] = weights
         views = self._unpaged.values()
@@ -125,7 +124,7 @@ class PlaceIndex:
         return np.array(list(self._unpaged), np.int64), np.array([len(w) for w in views], np.int64), votes
 
     def _merge_pages(self, count: int) -> None:
-        """The newest `count` neighbours that fit and of which none is much larger become one page."""
+        """Merge the newest `count` adjacent pages that fit in one, the first at most twice the last."""
         for first in range(len(self._pages) - count, -1, -1):
             pages = self._pages[first : first + count]
             if sum(map(len, pages)) <= MAX_PAGE_KEYFRAMES and len(pages[0]) <= 2 * len(pages[-1]):
@@ -133,13 +132,13 @@ class PlaceIndex:
                 return
 
     def _compact_page(self, page_index: int) -> None:
-        """Without the dead of this page."""
+        """Drop the removed keyframes of a page."""
         page = self._pages[page_index]
         self._replace_pages(page_index, [page], page.compact())
         self._merge_pages(2)
 
     def _replace_pages(self, first: int, old: list[IndexPage], new: IndexPage) -> None:
-        """In place of these pages; what is on none any more is held no longer."""
+        """Put `new` in place of pages `old`, and subtract the words of dropped keyframes."""
         if sum(map(len, old)) > len(new):
             self._word_counts -= (sum(page.word_counts() for page in old) - new.word_counts()).astype(
                 np.int32
@@ -147,7 +146,7 @@ class PlaceIndex:
         self._pages[first : first + len(old)] = [new] if len(new) else []
 
     def _words(self, descriptors: U8) -> U32:
-        """The words (N * tables,) of descriptors (N, 32): table number and sampled bits in one integer."""
+        """Words (N * tables,) of descriptors (N, 32): table number and sampled bits in one integer."""
         tables, bits = self._sampled_bits.shape
         sampled = np.unpackbits(descriptors, axis=1)[:, self._sampled_bits].astype(np.float32)
         values = sampled @ (2.0 ** np.arange(bits)).astype(np.float32)  # exact up to 24 bits
@@ -157,21 +156,19 @@ class PlaceIndex:
         return words
 
 
-# ---- A page of the inverted index: which of up to a thousand keyframes hold a word.
-
 U32 = NDArray[np.uint32]
 
 _SLOT_BITS = 10
-MAX_PAGE_KEYFRAMES = 1 << _SLOT_BITS  # keyframes of a page
-MAX_WORDS = 1 << (32 - _SLOT_BITS)  # a word and a slot are sorted as one uint32
-_MERGE_BLOCK = 1 << 16  # words joined at a time: fresh memory for all at once costs as much as the work
+MAX_PAGE_KEYFRAMES = 1 << _SLOT_BITS
+MAX_WORDS = 1 << (32 - _SLOT_BITS)  # word and slot are sorted as one uint32
+_MERGE_BLOCK = 1 << 16  # words merged at a time: allocating for all at once doubles the time
 
 
 @dataclass(frozen=True, eq=False)
 class IndexPage:
-    """Keyframes `ids` (n,), the descriptors that each has (n,), and who is still alive (n,).
+    """Up to 1024 keyframes: ids (n,), number of words of each (n,), and which are not removed (n,).
 
-    The keyframes that hold word w are slots[starts[w] : starts[w + 1]], numbers below n.
+    The keyframes with word w are slots[starts[w] : starts[w + 1]], indices below n.
     """
 
     ids: I64
@@ -184,7 +181,7 @@ class IndexPage:
         return len(self.ids)
 
     def votes(self, words: I64, weights: F64) -> F64:
-        """Sum of the weights (W,) of the words (W,) that each keyframe holds: (n,); none for the dead."""
+        """Sum of the weights (W,) of the given words (W,) in each keyframe, (n,); 0 for removed ones."""
         start, end = self.starts[words].astype(np.int64), self.starts[words + 1].astype(np.int64)
         count = end - start
         entries = np.repeat(start - np.cumsum(count) + count, count) + np.arange(count.sum())
@@ -192,12 +189,12 @@ class IndexPage:
         return np.where(self.is_alive, votes, 0.0)
 
     def word_counts(self) -> I64:
-        """How many entries each word has, (words,)."""
+        """Number of entries of each word, (words,)."""
         starts = self.starts.astype(np.int64)
         return starts[1:] - starts[:-1]
 
     def compact(self) -> IndexPage:
-        """What is left of this page without its dead."""
+        """Return the page without removed keyframes."""
         if self.is_alive.all():
             return self
         kept = self.is_alive[self.slots]
@@ -208,7 +205,7 @@ class IndexPage:
 
 
 def build_page(ids: Sequence[int], views: Sequence[U32], vocabulary: int) -> IndexPage:
-    """A page of keyframes by their words, each (N,) below `vocabulary`."""
+    """Build a page from keyframes by their words, each (N,) below `vocabulary`."""
     keys = np.concatenate([words << _SLOT_BITS | np.uint32(slot) for slot, words in enumerate(views)])
     keys.sort()
     starts = np.zeros(vocabulary + 1, np.uint32)
@@ -218,16 +215,16 @@ def build_page(ids: Sequence[int], views: Sequence[U32], vocabulary: int) -> Ind
 
 
 def merge_pages(pages: Sequence[IndexPage]) -> IndexPage:
-    """One page of all that lives on several.
+    """Merge pages, dropping removed keyframes.
 
-    Each has its entries in order already: under every word, the pages' runs go one behind the other.
+    Entries are sorted by word already: under each word the pages' runs are concatenated.
     """
     pages = [page.compact() for page in pages]
     starts: U32 = np.zeros_like(pages[0].starts)
     for page in pages:
         starts += page.starts
     slots = np.empty(starts[-1], np.uint16)
-    first_slot, offsets = 0, starts[:-1].astype(np.int64)  # other pages' entries that go before this one's
+    first_slot, offsets = 0, starts[:-1].astype(np.int64)  # entries of earlier pages under each word
     for page in pages:
         offsets -= page.starts[:-1]
         for word in range(0, len(offsets), _MERGE_BLOCK):

@@ -1,10 +1,9 @@
-"""What ought to be seen, if two views stand as verification says, and is not.
+"""Which points of one view are missing in the other, if the two stand as verification says.
 
-Two places that look alike share most points, but not all: what only one of them has is missing in the
-other. Single points are missing anywhere (detectors miss them, things hide each other); where all points of
-a patch of the image are missing, a *thing* is gone: a poster, a door, a box. In one pair of views even that
-proves little, so this is evidence to be added up over many pairs, not a verdict. docs/places.md has its
-distributions.
+Two places that look alike share most points, but what only one of them has is missing in the other. Single
+points are missing anywhere (missed detections, occlusion); where all points of a patch of the image are
+missing, a *thing* is missing: a poster, a door, a box. One pair of views proves little, so the evidence is
+summed over many pairs. Distributions: docs/places.md.
 """
 
 from __future__ import annotations
@@ -21,45 +20,44 @@ from share.mapping.recognition.verification import CameraView
 from share.types import F64, I64
 from share.vision.matching import hamming_rowwise
 
-_FOUND_PX = 6.0  # a point is found if one as like as this lies beside where it should be
-_REGION_FOUND_PX = 15.0  # a thing is still there if it has moved by this: the map may have drifted
-_MAX_BITS = 90
-_OCCLUDER_PX = 40.0  # whose depth says whether something may hide the point
-_BORDER_SHARE = 0.03  # of the image's sides; a detector finds nothing at its border
-_OCCLUSION_RATIO, _OCCLUSION_RHO = (
-    1.2,
-    0.02,
-)  # share, and 1/m, by which all around is nearer than a hidden point
-_REGION_RAD = 0.1  # a patch of the image, so far around a point,
-_MIN_REGION_POINTS = 10  # in which so many ought to be seen: if none is, a thing is gone
+_FOUND_PX = 6.0  # radius within which a point is found
+_REGION_FOUND_PX = 15.0  # the same for patches: the map may have drifted
+_MAX_BITS = 90  # descriptor distance of a found point
+_OCCLUDER_PX = 40.0  # radius of the keypoints that may occlude a point
+_BORDER_SHARE = 0.03  # of each side of the image, where the detector finds nothing
+# A point is occluded if all keypoints around it have inverse depths above ratio * rho + offset.
+_OCCLUSION_RATIO = 1.2
+_OCCLUSION_RHO = 0.02  # 1/m
+_REGION_RAD = 0.1  # radius of a patch
+_MIN_REGION_POINTS = 10  # visible points in a patch: if none is found, the patch is missing
 
 
 class MissingPoints(NamedTuple):
-    """Points of both views that the other ought to show, and those of them that it does."""
+    """Points of both views that should be visible in the other, and how many are found."""
 
     visible: int
     found: int
 
     @property
     def missing_share(self) -> float:
-        """Of the visible ones, that are not found; 0 if none is visible."""
+        """Share of the visible points that are not found; 0 if none is visible."""
         return 1 - self.found / self.visible if self.visible else 0.0
 
 
 class MissingRegions(NamedTuple):
-    """Points of both views that the other ought to show, and those amid a patch of which it shows none."""
+    """Points of both views that should be visible in the other, and those in patches without any found."""
 
     visible: int
     missing: int
 
     @property
     def missing_share(self) -> float:
-        """0 if none is visible."""
+        """Share of the visible points in missing patches; 0 if none is visible."""
         return self.missing / self.visible if self.visible else 0.0
 
 
 def missing_points(query: CameraView, candidate: CameraView, T_c_q: F64) -> MissingPoints:
-    """With T_c_q (4, 4): the query's body in the candidate's body frame."""
+    """Count visible and found points, given T_c_q (4, 4): the query's body in the candidate's body frame."""
     in_candidate, in_query = _expected_both_ways(query, candidate, T_c_q, _FOUND_PX)
     return MissingPoints(
         len(in_candidate.is_found) + len(in_query.is_found),
@@ -68,9 +66,10 @@ def missing_points(query: CameraView, candidate: CameraView, T_c_q: F64) -> Miss
 
 
 def missing_regions(query: CameraView, candidate: CameraView, T_c_q: F64) -> MissingRegions:
-    """The same, of whole things: from about one spot, and within 1 m say little else is gone in a true pair.
+    """Count visible points and those in missing patches.
 
-    From further apart things hide each other that no keypoint tells of.
+    For views from about one spot: within 1 m little else is missing in a true pair. Farther apart, things
+    occlude each other without a keypoint to show it.
     """
     in_candidate, in_query = _expected_both_ways(query, candidate, T_c_q, _REGION_FOUND_PX)
     return MissingRegions(
@@ -80,7 +79,7 @@ def missing_regions(query: CameraView, candidate: CameraView, T_c_q: F64) -> Mis
 
 
 class _ExpectedPoints(NamedTuple):
-    """Points of one view that the other camera ought to see: where (N, 2), and whether it does (N,)."""
+    """Points of one view that should be visible in the other: position there (N, 2), is_found (N,)."""
 
     uv: F64
     is_found: NDArray[np.bool_]
@@ -106,14 +105,14 @@ def _expected_points(T: F64, source: CameraView, target: CameraView, reach_px: f
     bits = hamming_rowwise(source.view.descriptors[inside[rows]], target.view.descriptors[cols])
     is_found = np.zeros(len(inside), bool)
     is_found[rows[(px < reach_px) & (bits <= _MAX_BITS)]] = True
-    nearby_rho = np.full(len(inside), np.inf)  # least inverse depth of those near it
+    nearby_rho = np.full(len(inside), np.inf)  # least inverse depth of keypoints around
     np.fmin.at(nearby_rho, rows, target_keypoints[cols, 2])
     is_visible = nearby_rho <= _OCCLUSION_RATIO * moved[:, 2] + _OCCLUSION_RHO
     return _ExpectedPoints(moved[is_visible, :2], is_found[is_visible])
 
 
 def _count_in_missing_regions(expected: _ExpectedPoints) -> int:
-    """How many points are amid others of which none is found."""
+    """Count points in patches without a found point."""
     missing_uv = expected.uv[~expected.is_found]
     is_isolated = ~_is_within(missing_uv, expected.uv[expected.is_found], _REGION_RAD).any(1)
     is_in_region = _is_within(missing_uv[is_isolated], missing_uv, _REGION_RAD).sum(1) >= _MIN_REGION_POINTS
@@ -121,19 +120,19 @@ def _count_in_missing_regions(expected: _ExpectedPoints) -> int:
 
 
 def _is_within(a: F64, b: F64, radius: float) -> NDArray[np.bool_]:
-    """Which of a (N, 2) and b (K, 2) lie nearer than reach to each other (N, K)."""
+    """Mask (N, K) of points a (N, 2) and b (K, 2) nearer than `radius`."""
     square = (a[:, :1] - b[:, 0]) ** 2 + (a[:, 1:] - b[:, 1]) ** 2
     return np.asarray(square < radius**2)
 
 
 def _is_inside(moved: F64, target: F64) -> NDArray[np.bool_]:
-    """Within the part of the image where the target has keypoints; not if it has no image (NaN)."""
+    """Mask of points in the part of the image where the target has keypoints; False for NaN."""
     low, high = target[:, :2].min(0), target[:, :2].max(0)
     margin = _BORDER_SHARE * (high - low)
     return np.asarray(((moved[:, :2] > low + margin) & (moved[:, :2] < high - margin)).all(1))
 
 
 def _near_pairs(a: F64, b: F64) -> tuple[I64, I64, F64]:
-    """Which of a (N, 2) and b (K, 2) are near, pixels: rows, columns, distances (M,)."""
+    """Pairs of points a (N, 2) and b (K, 2), pixels, that are near: rows, columns, distances (M,)."""
     distances = KDTree(a).sparse_distance_matrix(KDTree(b), _OCCLUDER_PX, output_type="ndarray")
     return distances["i"], distances["j"], distances["v"]

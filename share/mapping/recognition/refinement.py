@@ -1,12 +1,11 @@
-"""The relative pose of two cameras that see the same points, refined, with an honest covariance.
+"""Refinement of the relative pose of two cameras from matched keypoints with inverse depths.
 
-A keypoint is y = (u, v, rho): where it is seen (normalised coordinates) and its inverse depth
-[1/m], NaN if unknown. Moving it into the other camera gives y' = h(T, y), and h(T, y_q) - y_c has
-the covariance N + J N J' with J = dh/dy: noise of both detections and of both depths is counted
-once. That is why a match with two depths enters as one residual of three rows, not as two
-reprojection errors of two (the four are dependent; summing them would claim twice the
-information). Source: the inverse-depth form of Civera et al., T-RO 24(5), 2008; robust
-Gauss-Newton after Barfoot (2017), section 5.3.
+A keypoint is y = (u, v, rho): normalised image coordinates and inverse depth [1/m], NaN if unknown. Projected
+into the other camera it is y' = h(T, y), and h(T, y_q) - y_c has the covariance N + J N J' with J = dh/dy:
+the noise of both detections and both depths counts once. So a match with two depths is one residual of three
+rows, not two reprojection errors of two (the four are dependent; their sum would claim twice the
+information). Source: the inverse-depth form of Civera et al., T-RO 24(5), 2008; robust Gauss-Newton after
+Barfoot (2017), section 5.3.
 """
 
 from __future__ import annotations
@@ -20,29 +19,29 @@ from numpy.typing import NDArray
 from share.geometry import se3
 from share.types import F64
 
-_RIDGE = 1e-6 * np.eye(6)  # keeps a hopeless set of matches solvable; its covariance says so
-_MIN_DEPTH_M = 0.1  # m before the camera
+_RIDGE = 1e-6 * np.eye(6)  # keeps a degenerate set of matches solvable; its covariance is huge
+_MIN_DEPTH_M = 0.1  # in front of the camera
 _BEHIND_CAMERA_D2 = 1e9  # squared distance of a match that one camera cannot see
-_NO_DEPTH_VARIANCE = 1e6  # variance that stands for "no depth", 1/m^2
-_SMALL_STEP = 1e-2  # rad and m; after a step so small, two plain ones follow
+_NO_DEPTH_VARIANCE = 1e6  # stands for "no depth", 1/m^2
+_SMALL_STEP = 1e-2  # rad and m; below, two unweighted steps follow
 
 
 @dataclass(frozen=True, eq=False)
 class KeypointNoise:
-    """One sigma of a keypoint: `uv` in normalised coordinates, `rho` in 1/m."""
+    """Sigmas of a keypoint: `uv` in normalised coordinates, `rho` in 1/m."""
 
     uv: float
     rho: float
 
     @property
     def variances(self) -> F64:
-        """(3,), of u, v and rho."""
+        """Variances of u, v and rho, (3,)."""
         return np.array([self.uv, self.uv, self.rho]) ** 2
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """T (4, 4), its covariance (6, 6) and the squared Mahalanobis distance (N,) of each match."""
+    """T (4, 4), its covariance (6, 6), and the squared Mahalanobis distance (N,) of each match."""
 
     T: F64
     cov: F64
@@ -50,8 +49,10 @@ class RefinedPose:
 
 
 def transfer_keypoints(T: F64, y: F64) -> F64:
-    """y' = h(T, y) (3, N) for y (3, N) and T (4, 4), or one for each (4, 4, N); NaN for a point that is
-    then behind the camera: it has no image, and for one without a depth."""
+    """y' = h(T, y) (3, N) for y (3, N) and T (4, 4), or one T for each (4, 4, N).
+
+    NaN for points behind the camera or without a depth.
+    """
     T = T.reshape(4, 4, -1)
     u, v, rho = y
     out = T[:3, 0] * u + T[:3, 1] * v + T[:3, 2] + T[:3, 3] * rho  # the point, times rho
@@ -90,11 +91,11 @@ def refine_pose(
     gate: float,
     iterations: int = 10,
 ) -> RefinedPose:
-    """Refine T_c_q (4, 4) from matched keypoints y_q, y_c (N, 3), each with at least one depth.
+    """Refine T_c_q (4, 4) from matched keypoints y_q, y_c (N, 3), each pair with at least one depth.
 
-    Geman-McClure weights over all matches until the step is small, then plain least squares over those
-    within `gate` (squared Mahalanobis). The covariance is that of the second pass, scaled by its
-    residual variance; a scale below one is believed down to a quarter.
+    Geman-McClure weights over all matches until the step is small, then plain least squares over those within
+    `gate` (squared Mahalanobis). The covariance is that of the second pass, scaled by its residual variance,
+    at least a quarter.
     """
     problem = _RefinementProblem(y_q, y_c, noise_q, noise_c)
     T, information = T_c_q, problem.information(T_c_q)
@@ -127,7 +128,7 @@ def _apply_twist(xi: F64, T: F64) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class _LinearSystem:
-    """Of each match [J r] (7, 3, N) by Exp(xi) T, the same times its information, and d2 (N,)."""
+    """For each match [J r] (7, 3, N) by Exp(xi) T, the same times its information, and d2 (N,)."""
 
     Jr: F64
     WJr: F64
@@ -138,12 +139,13 @@ class _LinearSystem:
         return np.asarray(self.Jr.reshape(7, -1) @ (self.WJr * weight).reshape(7, -1).T)
 
     def step(self, weight: NDArray[Any]) -> F64:
+        """Gauss-Newton step (6,) of matches weighted by (N,)."""
         normal = self.normal(weight)
         return np.asarray(np.linalg.solve(normal[:6, :6] + _RIDGE, normal[:6, 6]), np.float64)
 
 
 class _RefinementProblem:
-    """Matches with a depth in q are moved into c, then the others from c into q."""
+    """Projects matches with a depth in q into c, the others from c into q."""
 
     def __init__(self, y_q: F64, y_c: F64, noise_q: KeypointNoise, noise_c: KeypointNoise) -> None:
         is_backward = np.isnan(y_q[:, 2])
@@ -156,14 +158,14 @@ class _RefinementProblem:
         self._source, self._noise_source = source, np.repeat(variances, self._counts, axis=1)
         self._target, self._noise_target = target, np.repeat(variances[:, ::-1], self._counts, axis=1)
         self._noise_target[2, unknown] = _NO_DEPTH_VARIANCE
-        self.residual_rows = 3.0 - unknown  # that each match measures
+        self.residual_rows = 3.0 - unknown  # of each match
 
     def _transforms(self, T_c_q: F64) -> F64:
-        """Of each match, (4, 4, N)."""
+        """Transform of each match, (4, 4, N)."""
         return np.repeat(np.stack([T_c_q, se3.inverse(T_c_q)], axis=2), self._counts, axis=2)
 
     def information(self, T_c_q: F64) -> F64:
-        """Of every match's residual, (3, 3, N)."""
+        """Information of each match's residual, (3, 3, N)."""
         T = self._transforms(T_c_q)
         moved = transfer_keypoints(T, self._source)
         J = keypoint_jacobian(T, self._source, moved)
@@ -174,7 +176,7 @@ class _RefinementProblem:
         return out
 
     def linearise(self, T_c_q: F64, information: F64) -> _LinearSystem:
-        """All is zero of a point behind the camera: its rows count for nothing."""
+        """Linearise at T_c_q. Rows of points behind the camera are zero."""
         moved = transfer_keypoints(self._transforms(T_c_q), self._source)
         is_behind = np.isnan(moved[2])
         Jr = np.concatenate([pose_jacobian(moved), (self._target - moved)[None]])
@@ -192,7 +194,7 @@ class _RefinementProblem:
 
 
 def _inverse_symmetric(S: F64) -> F64:
-    """Of symmetric matrices (3, 3, N), by their cofactors."""
+    """Inverse of symmetric matrices (3, 3, N), by cofactors."""
     (a, b, c), (_, d, e), (_, _, f) = S
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
     D, E, F = a * f - c * c, b * c - a * e, a * d - b * b

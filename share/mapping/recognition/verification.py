@@ -1,8 +1,7 @@
-"""Is this the same place, and where does the one camera stand as seen from the other?
+"""Verification of a candidate: the relative pose of two views, or the reason why there is none.
 
-Two views agree if descriptors match, if either view's 3D points give a pose in the other's image,
-if the two poses are the same one, and if the result does not contradict gravity. Every refusal
-says which of these failed and by how much.
+Descriptors have to match, either view's 3D points have to give a pose in the other's image (PnP), both poses
+have to agree, and the result must not contradict gravity. A refusal says which check failed and by how much.
 """
 
 from __future__ import annotations
@@ -22,19 +21,18 @@ from share.mapping.recognition.refinement import KeypointNoise, refine_pose
 from share.types import F64, View
 from share.vision.matching import DescriptorPairs, hamming_matrix, mutual_best, pairs_within
 
-_MIN_DEPTH_M, _MAX_DEPTH_M = 0.05, 1000.0  # m; a depth outside says nothing
+_MIN_DEPTH_M, _MAX_DEPTH_M = 0.05, 1000.0  # other depths count as unknown
 
 
-MIN_RANSAC_ITERATIONS = 50  # of each consensus: one wrong place costs more than a millisecond
-RANSAC_CONFIDENCE = 0.99  # of each consensus; the two directions seldom err alike
+MIN_RANSAC_ITERATIONS = 50  # per direction: a wrong place costs more than a millisecond
+RANSAC_CONFIDENCE = 0.99  # per direction; the two seldom fail alike
 
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """A view, and what must be known of who saw it.
+    """A view with its camera.
 
-    focal of cam0 [px]; T_body_cam0 (4, 4); up (3,): against gravity in the body frame, zeros if
-    unknown (as in `Keyframe.up`).
+    focal of cam0 [px]; T_body_cam0 (4, 4); up (3,): against gravity in the body frame, zeros if unknown.
     """
 
     view: View
@@ -44,7 +42,7 @@ class CameraView:
 
     @property
     def keypoints(self) -> F64:
-        """Keypoints (N, 3): u, v and inverse depth [1/m], NaN where depth is unknown or absurd."""
+        """Keypoints (N, 3): u, v and inverse depth [1/m], NaN where depth is unknown or out of range."""
         uv, z = self.view.uv.astype(np.float64), self.view.points[:, 2].astype(np.float64)
         z[~((z > _MIN_DEPTH_M) & (z < _MAX_DEPTH_M))] = np.nan
         return np.column_stack([uv, 1 / z])
@@ -52,10 +50,10 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """T_c_q (4, 4): body of the query in the body frame of the candidate; cov (6, 6) of it.
+    """T_c_q (4, 4): body of the query in the body frame of the candidate; cov (6, 6): its covariance.
 
-    matches: descriptor pairs; inliers: those that agree with the pose. scale: of the query's depths over the
-    candidate's; None where too few points have both.
+    matches: descriptor pairs; inliers: those that agree with the pose. depth_scale: of the query's depths
+    relative to the candidate's; None where too few points have both.
     """
 
     T_c_q: F64
@@ -71,21 +69,21 @@ class Verification:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why not, for a person: "17 inliers of 25 needed"."""
+    """Why there is no pose, e.g. "17 inliers of 25 needed"."""
 
     reason: str
 
 
 class _RefusedError(Exception):
-    """A check that did not pass; its text is the reason."""
+    """A failed check; the text is the reason."""
 
 
 def verify(
     query: CameraView, candidate: CameraView, config: PlaceConfig, seed: int = 0
 ) -> Verification | Refusal:
-    """The pose of the query's body in the candidate's body frame, or why there is none.
+    """Return the pose of the query's body in the candidate's body frame, or why there is none.
 
-    Deterministic for a given seed. Does not raise on any two valid views.
+    Deterministic for a given seed. Does not raise for any two valid views.
     """
     try:
         return _verify_or_raise(query, candidate, config, seed)
@@ -97,8 +95,10 @@ def verify(
 
 @dataclass(frozen=True, eq=False)
 class _PoseFit:
-    """What a rough pose becomes: T_c_q of the cameras, its covariance, the matches beside it (M, 3), (M, 3),
-    and those of them, y_q, y_c (N, 3), that are inliers."""
+    """A refined pose T_c_q of the cameras with its covariance.
+
+    guided_matches: keypoint pairs near the projection, (M, 3) each; inliers_q, inliers_c (N, 3).
+    """
 
     T: F64
     cov: F64
@@ -130,7 +130,7 @@ def _verify_or_raise(
     noises = _keypoint_noise(query, config), _keypoint_noise(candidate, config)
     has_gravity = bool(query.up.any() and candidate.up.any())
     if not has_gravity and len(initial_poses) > 1:
-        raise _RefusedError("the two directions differ, and no gravity decides")
+        raise _RefusedError("the two directions give different poses, and gravity is unknown")
     fit = _best_fit(_refine_poses(initial_poses, candidate_pairs, y_q, y_c, noises, config), config)
     _require_count(fit.inliers, config.min_inliers, "inliers")
     for y, side in ((fit.inliers_q, "query"), (fit.inliers_c, "candidate")):
@@ -148,7 +148,7 @@ def _verify_or_raise(
 def _depth_scale(
     fit: _PoseFit, noises: tuple[KeypointNoise, KeypointNoise], config: PlaceConfig, T_body_cam_c: F64
 ) -> DepthScale | None:
-    """None where the matches do not tell: a pose may be told all the same."""
+    """Depth scale, or None where the matches do not determine it."""
     try:
         depth_scale = relative_depth_scale(fit.T, *fit.guided_matches, *noises, config.inlier_chi2)
     except np.linalg.LinAlgError:
@@ -170,16 +170,14 @@ def _refine_poses(
     noises: tuple[KeypointNoise, KeypointNoise],
     config: PlaceConfig,
 ) -> list[_PoseFit]:
-    """What the rough poses become, but for those that have too few matches to matter."""
+    """Refine the initial poses, except those with too few matches to compete."""
     radius = noises[0].uv / config.sigma_px * config.guided_px
     matched = [
         (mutual_best(guided_pairs(candidate_pairs, initial_pose, y_q, y_c, radius)), initial_pose)
         for initial_pose in initial_poses
     ]
     matched.sort(key=lambda found: -len(found[0].rows))
-    _require_count(
-        len(matched[0][0].rows), config.min_inliers, "matches beside where the pose moves the points"
-    )
+    _require_count(len(matched[0][0].rows), config.min_inliers, "matches near the projected points")
     fits: list[_PoseFit] = []
     for pairs, initial_pose in matched:
         if not fits or len(pairs.rows) > config.rival_share * max(fit.inliers for fit in fits):
@@ -190,14 +188,14 @@ def _refine_poses(
 def _refine_matches(
     initial_pose: F64, y_q: F64, y_c: F64, noises: tuple[KeypointNoise, KeypointNoise], config: PlaceConfig
 ) -> _PoseFit:
-    """The pose from matched keypoints, and which of them agree with it."""
+    """Refine the pose by matched keypoints, and select the inliers."""
     refined = refine_pose(initial_pose, y_q, y_c, *noises, config.inlier_chi2)
     is_inlier = refined.d2 < config.inlier_chi2
     return _PoseFit(refined.T, refined.cov, (y_q, y_c), y_q[is_inlier], y_c[is_inlier])
 
 
 def _best_fit(fits: list[_PoseFit], config: PlaceConfig) -> _PoseFit:
-    """The one with most inliers; another pose with nearly as many forbids any."""
+    """Return the fit with most inliers. Raises if a different pose has nearly as many."""
     best, *others = sorted(fits, key=lambda fit: -fit.inliers)
     for other in others:
         if other.inliers > config.rival_share * best.inliers and _poses_differ(
@@ -215,10 +213,10 @@ def _require_count(count: int, needed: int, what: str) -> None:
 def _two_way_poses(
     y_q: F64, y_c: F64, focal_q: float, focal_c: float, config: PlaceConfig, seed: int
 ) -> list[F64]:
-    """T_c_q by the query's points in the candidate's image and by the reverse: one if they agree.
+    """T_c_q by the query's points in the candidate's image and by the reverse; one pose if both agree.
 
-    Of a flat scene two poses look nearly alike (Schweighofer and Pinz, PAMI 2006); the two directions
-    seldom fall for the same wrong one, if only one of them trusts the order of the matches.
+    For a flat scene two poses look nearly alike (Schweighofer and Pinz, PAMI 2006). The two directions seldom
+    choose the same wrong one if only one of them uses the order of the matches.
     """
     forward = _absolute_pose(y_q, y_c, focal_c, "query's", config, seed, config.ransac_iterations, True)
     iterations = config.reverse_iterations
@@ -229,18 +227,16 @@ def _two_way_poses(
 
 
 def _median_depth(y_q: F64, y_c: F64) -> float:
-    """Median, m."""
+    """Median depth, m."""
     rho = np.concatenate([y_q[:, 2], y_c[:, 2]])
     rho = rho[np.isfinite(rho)]
-    return float(1 / np.partition(rho, len(rho) // 2)[len(rho) // 2])  # a fourth of np.nanmedian's time
+    return float(1 / np.partition(rho, len(rho) // 2)[len(rho) // 2])  # a quarter of np.nanmedian's time
 
 
 def _poses_differ(a: F64, b: F64, depth: float, config: PlaceConfig) -> bool:
     difference = se3.inverse(a) @ b
-    metres, degrees = (
-        float(np.linalg.norm(difference[:3, 3])),
-        float(np.degrees(se3.rotation_angle(difference))),
-    )
+    metres = float(np.linalg.norm(difference[:3, 3]))
+    degrees = float(np.degrees(se3.rotation_angle(difference)))
     return metres > config.agree_depth_ratio * depth or degrees > config.agree_deg
 
 
@@ -254,15 +250,15 @@ def _absolute_pose(
     iterations: int,
     best_first: bool,
 ) -> F64:
-    """T_target_source from 3D points of the source seen by the target."""
+    """T_target_source from 3D points of the source and their projections in the target."""
     known = np.isfinite(source[:, 2])
     _require_count(int(known.sum()), config.min_consensus, f"matches with the {side} depth")
     y = source[known]
     points, observed = rays(y[:, :2]) / y[:, 2:], target[known, :2]
-    terms = RansacOptions(
+    options = RansacOptions(
         config.ransac_px, seed, MIN_RANSAC_ITERATIONS, iterations, best_first, RANSAC_CONFIDENCE
     )
-    T, inliers = absolute_pose(points, observed, focal, terms)
+    T, inliers = absolute_pose(points, observed, focal, options)
     _require_count(int(inliers.sum()), config.min_consensus, f"inliers of the {side} points")
     if not np.isfinite(T).all():
         raise _RefusedError(f"no pose from the {side} points")
@@ -270,7 +266,7 @@ def _absolute_pose(
 
 
 def _check_spread(y: F64, side: str, config: PlaceConfig) -> None:
-    """The narrow side of the cloud of inliers: a pose from one corner or one line is not to be trusted."""
+    """Refuse inliers in one corner or on one line: they do not determine a pose."""
     centred = y[:, :2] - y[:, :2].mean(0)
     narrow_sigma = float(np.linalg.svd(centred, compute_uv=False)[-1] / np.sqrt(len(y) - 1))
     if narrow_sigma < config.min_spread:
@@ -280,14 +276,14 @@ def _check_spread(y: F64, side: str, config: PlaceConfig) -> None:
 
 
 def _check_uncertainty(cov: F64, max_deg: float) -> None:
-    """Inliers can be many and yet leave the pose loose; most wrong poses that pass the rest show here."""
+    """Refuse an uncertain pose; most wrong poses that pass the other checks fail here."""
     degrees = float(np.degrees(np.sqrt(np.trace(cov[:3, :3]))))
     if degrees > max_deg:
         raise _RefusedError(f"pose uncertain by {degrees:.2f}°, {max_deg:.2f}° allowed")
 
 
 def _check_gravity(T_c_q: F64, query: CameraView, candidate: CameraView, config: PlaceConfig) -> None:
-    up_q, up_c = (s.T_body_cam0[:3, :3].T @ s.up for s in (query, candidate))
+    up_q, up_c = (view.T_body_cam0[:3, :3].T @ view.up for view in (query, candidate))
     cosine = float((T_c_q[:3, :3] @ up_q) @ up_c / (np.linalg.norm(up_q) * np.linalg.norm(up_c)))
     degrees = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     if degrees > config.gravity_deg:
@@ -301,5 +297,5 @@ def _between_bodies(T_c_q: F64, cov: F64, T_body_cam_q: F64, T_body_cam_c: F64) 
 
 
 def _covariance_floor(config: PlaceConfig) -> Any:
-    """What many inliers do not average away: calibration, depth bias, rolling shutter."""
+    """Errors that many inliers do not average out: calibration, depth bias, rolling shutter."""
     return np.diag([np.radians(config.floor_deg) ** 2] * 3 + [config.floor_m**2] * 3)

@@ -1,0 +1,78 @@
+"""Counters for the mapper's reports: loops and merges of each run, steps and their durations."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from share.metrics.frame_log import summary
+
+_MAX_STEP_TIMES = 5000  # newest durations of each kind of step in a report
+
+
+@dataclass
+class RunCounters:
+    """Counters of one run. merges: `requested`, `skipped`, `done`. newest_id: its newest keyframe."""
+
+    loops_tried: int = 0
+    merges: Counter[str] = field(default_factory=Counter)
+    newest_id: int = -1
+
+    def report(self) -> dict[str, Any]:
+        """The run's fields of edge.json."""
+        return {
+            "loops": {"tried": self.loops_tried, "accepted": self.merges["done"]},
+            "merges": merge_counts(self.merges),
+        }
+
+
+class MapperCounters:
+    """runs: by run. steps: finished steps by kind. removed_keyframes, failed_steps: since the start."""
+
+    def __init__(self) -> None:
+        self.runs: dict[str, RunCounters] = {}
+        self.steps: Counter[str] = Counter()
+        self.removed_keyframes = self.failed_steps = 0
+        self._removed_runs = RunCounters()
+        self._step_ms = {kind: deque[float](maxlen=_MAX_STEP_TIMES) for kind in ("place", "verify", "solve")}
+
+    def add_run(self, agent: str) -> None:
+        """Begin to count for a run."""
+        self.runs[agent] = RunCounters()
+
+    def remove_run(self, agent: str) -> None:
+        """Forget a run; its loops and merges stay in the totals."""
+        counters = self.runs.pop(agent)
+        self._removed_runs.loops_tried += counters.loops_tried
+        self._removed_runs.merges += counters.merges
+
+    def add_step(self, kind: str, ms: float) -> None:
+        """Count a finished step that took `ms`."""
+        self._step_ms[kind].append(ms)
+        self.steps[kind] += 1
+
+    @property
+    def loops_tried(self) -> int:
+        """Verified candidates of all runs, accepted or refused."""
+        return sum(counters.loops_tried for counters in self._all_runs())
+
+    @property
+    def merges(self) -> dict[str, int]:
+        """Merges of all runs by outcome."""
+        return merge_counts(sum((counters.merges for counters in self._all_runs()), Counter()))
+
+    def step_report(self) -> dict[str, Any]:
+        """Durations and number of steps: `place_ms`, `verify_ms`, `solve_ms`."""
+        return {
+            f"{kind}_ms": {**summary(list(ms)).report(), "n": self.steps[kind]}
+            for kind, ms in self._step_ms.items()
+        }
+
+    def _all_runs(self) -> list[RunCounters]:
+        return [*self.runs.values(), self._removed_runs]
+
+
+def merge_counts(merges: Counter[str]) -> dict[str, int]:
+    """Counts of all outcomes, zeros included."""
+    return {outcome: merges[outcome] for outcome in ("requested", "skipped", "done")}
