@@ -73,7 +73,7 @@ def made(share, room) -> Path:
             "dataset", "align", *room.recordings, "--mocap", room.folder / "vicon.csv", *told, "--out", out
         )
         assert done.code == 0
-        assert all("the motion tells the body to" in line for line in done.err.splitlines())  # 12 s are few
+        assert all("the motion determines the mounting to" in line for line in done.err.splitlines())  # 12 s are few
         assert json.loads(done.out) == read_json(out / "align.json")
     return out
 
@@ -231,7 +231,7 @@ def test_wrong_use_is_one_line_and_leaves_nothing(share, room, tmp_path):
     assert "there is no device 'eve'" in refused(2, bob, *csv, "--body", "eve=BOB")
     assert "--kind cat" in refused(2, bob, *csv, "--kind", "cat")
     assert "has no motion capture" in refused(2, bob, *csv_of_ann)
-    assert "no such file of motion capture" in refused(2, bob, "--mocap", room.folder / "no.csv")
+    assert "no such motion capture file" in refused(2, bob, "--mocap", room.folder / "no.csv")
     assert "`share calibrate mocap` makes one" in refused(2, bob, *csv, "--mounting", tmp_path)
     assert "is given twice" in refused(2, bob, bob, *csv)
     assert "name of a folder" in refused(2, f"truth={room.folder / 'bob.mcap'}", *csv)

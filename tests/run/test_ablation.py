@@ -87,7 +87,7 @@ def test_what_a_dead_worker_had_done_of_its_job_is_taken(done):
 def test_a_run_of_a_session_that_was_made_anew_is_not_taken(done):
     path = done.session.folder / "session.yaml"
     path.write_text(path.read_text().replace("seed: 3", "seed: 4"))
-    with pytest.raises(UsageError, match=r"room was generated again since, with another truth; play it again"):
+    with pytest.raises(UsageError, match="room was generated again since, with another truth; play it"):
         list(run_all([done], lambda number, now: None))
 
 

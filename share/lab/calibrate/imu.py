@@ -19,9 +19,8 @@ MIN_REST_S = 60.0
 _QUIET_QUANTILE = 0.2  # the quietest fifth gives the sensor's noise
 _MAX_NOISE_SCALE = 2.0  # times that noise within a second: more is a knock
 _MAX_SHIFT_SIGMAS = 6.0  # standard errors of the difference of two means
-_MAX_SMOOTHING = (
-    6.0  # ratio of the means' scatter to that by successive samples, which a sensor's filter smooths
-)
+# Largest scatter of means over that of successive samples, whose white noise a sensor's filter hides.
+_MAX_SMOOTHING = 6.0
 _MARGIN_WINDOWS = 2  # around a disturbance, left out too
 _MAX_GYRO_NOISE = 0.05  # rad/s: noisier than any IMU at rest
 _MAX_ACCEL_NOISE = 0.5  # m/s^2, likewise
