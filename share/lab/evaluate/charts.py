@@ -45,7 +45,7 @@ def draw_bars(
 
     `line`: a level to draw across.
     """
-    pyplot = _pyplot()
+    pyplot = agg_pyplot()
     width = max(6.0, 0.16 * len(groups) * max(map(len, panels.values())) + 2)
     figure, axes = pyplot.subplots(
         len(panels), 1, figsize=(width, 2.6 * len(panels)), layout="constrained", sharex=True, squeeze=False
@@ -74,7 +74,7 @@ def draw_ratios(
 
     `names`: all series that have a colour in any picture, so that each keeps its own.
     """
-    pyplot = _pyplot()
+    pyplot = agg_pyplot()
     measures = list(dict.fromkeys(name for values in series.values() for name in values))
     figure, axis = pyplot.subplots(figsize=(9, 0.5 + 0.5 * len(measures)), layout="constrained")
     positions, bar_width = np.arange(len(measures)), 0.8 / len(series)
@@ -101,7 +101,7 @@ def draw_lines(
     path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]], x_label: str, units: Sequence[str]
 ) -> None:
     """Write a PNG with a panel for each of `panels`, in one of `units` each: {series: (x (N,), y (N,))}."""
-    pyplot = _pyplot()
+    pyplot = agg_pyplot()
     figure, axes = pyplot.subplots(
         len(panels), 1, figsize=(9, 2.4 * len(panels)), layout="constrained", sharex=True, squeeze=False
     )
@@ -120,7 +120,7 @@ def draw_lines(
 def draw_paths(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -> None:
     """Write a PNG of paths from above, a panel for each of `panels`: {series: (path (N, 2) m, dots (M, 2)
     m)}."""
-    pyplot = _pyplot()
+    pyplot = agg_pyplot()
     columns = min(_MAX_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     width, height = np.ptp(
@@ -156,7 +156,7 @@ def draw_heat_maps(
 ) -> None:
     """Write a PNG with a heat map for each of `maps`: (V, W) over V values of y_axis and W of x_axis,
     (label, values) each."""
-    pyplot = _pyplot()
+    pyplot = agg_pyplot()
     figure, axes = pyplot.subplots(
         1, len(maps), figsize=(1 + 3.2 * len(maps), 3.4), layout="constrained", squeeze=False
     )
@@ -171,7 +171,8 @@ def draw_heat_maps(
     save_png(figure, path, 110)
 
 
-def _pyplot() -> Any:
+def agg_pyplot() -> Any:
+    """Return matplotlib's pyplot, which draws to files only."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -180,7 +181,7 @@ def _pyplot() -> Any:
     return pyplot
 
 
-_TRAJECTORY_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
+AGENT_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
 
 
 def draw_trajectories(
@@ -194,18 +195,12 @@ def draw_trajectories(
     agents: {name: (poses in the shared map or None, truth)}. T_truth_map (4, 4) aligns the map with the
     truth.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
+    pyplot = agg_pyplot()
     figure, (top_view, error) = pyplot.subplots(
         1, 2, figsize=(13, 6.2), width_ratios=(3, 2), layout="constrained"
     )
     start = min(truth.stamps_ns[0] for _, truth in agents.values())
-    for (name, (estimate, truth)), colour in zip(
-        agents.items(), _TRAJECTORY_COLOURS * len(agents), strict=False
-    ):
+    for (name, (estimate, truth)), colour in zip(agents.items(), AGENT_COLOURS * len(agents), strict=False):
         p = truth.T[:, :3, 3]
         top_view.plot(p[:, 0], p[:, 1], color=colour, alpha=0.3, linewidth=5, solid_capstyle="round")
         if estimate is None:

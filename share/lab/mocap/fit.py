@@ -16,7 +16,7 @@ from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.lab.mocap.initialisation import initial_rotation, initial_state, nearest_axis_rotation, up_vector
-from share.lab.mocap.offset import coarse_offset
+from share.lab.mocap.offset import find_offset
 from share.lab.mocap.problem import CHECK, BatchSolution, MocapImuProblem, node_covariances
 from share.lab.mocap.residuals import FitResiduals, compute_residuals
 from share.lab.mocap.scale import axis_scales
@@ -88,7 +88,7 @@ def fit_mocap(
     options = options or MocapFitOptions()
     check_imu(imu)
     inflated = _inflated_noise(noise, options.imu_inflation)
-    coarse_ns = 0 if options.within_s == 0 else coarse_offset(imu, mocap, options.within_s)
+    coarse_ns = 0 if options.within_s == 0 else find_offset(imu, mocap, options.within_s).offset_ns
     overlap = _overlap(imu, mocap.shifted(coarse_ns)).thinned(round(1e9 / options.max_hz))
     guess, bias = _initial_mounting(imu, overlap, options)
     up_rotation = nearest_axis_rotation(up_vector(overlap, imu, guess))

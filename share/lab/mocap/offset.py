@@ -37,11 +37,6 @@ class OffsetPeak:
     lead: float
 
 
-def coarse_offset(imu: ImuBatch, mocap: MocapTrajectory, within_s: float | None) -> int:
-    """Return the offset of `find_offset`."""
-    return find_offset(imu, mocap, within_s).offset_ns
-
-
 def find_offset(imu: ImuBatch, mocap: MocapTrajectory, within_s: float | None) -> OffsetPeak:
     """Find the offset with the best correlation. within_s: search range; None: all offsets with an overlap of
     5 s (or nearly all of the shorter).

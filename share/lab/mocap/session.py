@@ -20,7 +20,7 @@ from share import __version__
 from share.files.json_file import nan_to_none
 from share.files.writing import atomic_write
 from share.geometry import se3
-from share.lab.evaluate.charts import save_png
+from share.lab.evaluate.charts import AGENT_COLOURS, agg_pyplot, save_png
 from share.lab.mocap.align import AlignedDevice, common_level
 from share.lab.mocap.offset import WINDOW_NS, imu_rotations, mocap_rotations
 from share.lab.mocap.verdict import shared_sigmas
@@ -157,23 +157,17 @@ def _session_yaml(
 
 # Picture: paths from above, and rotation rates of IMU and mocap in one clock.
 
-_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
 _PLOTTED_NS = 10 * 10**9  # of the rotation rates; in a longer plot their agreement is not visible
 _GAP_NS = 100_000_000  # no line across longer gaps
 
 
 def draw_alignment(path: Path, devices: Mapping[str, tuple[AlignedDevice, Trajectory]]) -> None:
     """Write a PNG of {name: (device, its truth)}."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure = pyplot.figure(figsize=(13, max(5.0, 1.9 * len(devices))), layout="constrained")
+    figure = agg_pyplot().figure(figsize=(13, max(5.0, 1.9 * len(devices))), layout="constrained")
     grid = figure.add_gridspec(len(devices), 2, width_ratios=(2, 3))
     top_view = figure.add_subplot(grid[:, 0])
     for k, (name, (aligned, truth)) in enumerate(devices.items()):
-        colour = _COLOURS[k % len(_COLOURS)]
+        colour = AGENT_COLOURS[k % len(AGENT_COLOURS)]
         p = _positions_with_gaps(truth)
         top_view.plot(p[:, 0], p[:, 1], color=colour, linewidth=1.2, label=f"{name}, {aligned.seconds:.1f} s")
         top_view.plot(*p[0, :2], "o", color=colour)
