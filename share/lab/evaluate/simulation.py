@@ -1,4 +1,4 @@
-"""Discrete-event simulation of a room: real agents, edge and mapper, joined by simulated networks, queues and
+"""Discrete-event simulation of a room: real agents, edge and mapper with simulated networks, queues and
 delays.
 
 The state machines make all decisions; how long each step takes is drawn from measured distributions.

@@ -33,16 +33,20 @@ _MAX_RMS_MM = 100.0  # a path farther from the mocap is another motion
 class MocapFit:
     """Result of a fit. World: the mocap's, levelled: z up, same origin, same heading.
 
-    stamps_ns (N,), IMU clock; T_world_body (N, 4, 4) of the IMU; velocity (N, 3) m/s, world; gyro_bias,
-    accel_bias (N, 3). gaps (G, 2) ns, IMU clock: mocap gaps longer than are bridged. is_break (N - 1,) bool:
-    nothing joins this node to the next. R_mocap_world (3, 3): from the levelled world to the mocap's, which
-    is turned by a quarter or a half where another axis than z is `up`. T_body_mocap (4, 4). offset_ns: IMU
-    clock minus mocap clock, in the middle of the path; drift_ppm: its growth, microseconds a second.
-    cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; on the right), offset s,
-    drift. cov_poses (N, 6, 6): of T_world_body, perturbed on the right. scale_error (3,): excess length of
-    the mocap's x, y, z over the accelerometer's (0.01: 1 %), not corrected; scale_error_sigma (3,).
-    mounting_prior_sigmas: deviation of T_body_mocap from its guess on the worst axis, in sigmas of the guess;
-    0 without one.
+    * stamps_ns (N,), IMU clock; T_world_body (N, 4, 4) of the IMU; velocity (N, 3) m/s, world; gyro_bias,
+      accel_bias (N, 3).
+    * gaps (G, 2) ns, IMU clock: mocap gaps longer than are bridged. is_break (N - 1,) bool: nothing joins
+      this node to the next.
+    * R_mocap_world (3, 3): from the levelled world to the mocap's; with a quarter or half turn where another
+      axis than z is `up`.
+    * T_body_mocap (4, 4). offset_ns: IMU clock minus mocap clock, in the middle of the path; drift_ppm: its
+      growth, microseconds a second.
+    * cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; on the right), offset s,
+      drift. cov_poses (N, 6, 6): of T_world_body, perturbed on the right.
+    * scale_error (3,): by how much the mocap's x, y, z are too long by the accelerometer (0.01: 1 %), not
+      corrected; scale_error_sigma (3,).
+    * mounting_prior_sigmas: deviation of T_body_mocap from its guess on the worst axis, in sigmas of the
+      guess; 0 without one.
     """
 
     stamps_ns: I64
