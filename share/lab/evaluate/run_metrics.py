@@ -29,8 +29,8 @@ class AgentMetrics:
 
     * latency_ms and its parts: docs/evaluation.md.
     * odom_ate_cm: of odom_n frames, SE3-aligned alone.
-    * ate_cm: of the in_map frames with a pose in the shared map, one alignment for all agents in it; NaN for an
-      agent outside it.
+    * ate_cm: of the in_map frames with a pose in the shared map, one alignment for all agents in it; NaN for
+      an agent outside it.
     * rpe_*: rms over *_n pairs of poses in the map, from frame to frame and over 1 s.
     * metres: path length. joined_s: from the first agent's start until it shared a map.
     * qoe: mean over evaluations. told_cm: rms of the agent's estimated errors.

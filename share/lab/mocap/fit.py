@@ -41,8 +41,8 @@ class MocapFit:
       axis than z is `up`.
     * T_body_mocap (4, 4). offset_ns: IMU clock minus mocap clock, in the middle of the path; drift_ppm: its
       growth, microseconds a second.
-    * cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; on the right), offset s,
-      drift. cov_poses (N, 6, 6): of T_world_body, perturbed on the right.
+    * cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; on the right), offset
+      s, drift. cov_poses (N, 6, 6): of T_world_body, perturbed on the right.
     * scale_error (3,): by how much the mocap's x, y, z are too long by the accelerometer (0.01: 1 %), not
       corrected; scale_error_sigma (3,).
     * mounting_prior_sigmas: deviation of T_body_mocap from its guess on the worst axis, in sigmas of the

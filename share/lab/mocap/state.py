@@ -68,11 +68,13 @@ class MocapFitOptions:
     """Options of a fit.
 
     * sigma_position m, sigma_rotation rad: noise of mocap samples with independent errors at independent_hz;
-      denser samples get less weight each, and are thinned to max_hz. cauchy_sigmas: scale of Cauchy's weights.
+      denser samples get less weight each, and are thinned to max_hz. cauchy_sigmas: scale of Cauchy's
+      weights.
     * imu_inflation: factor on the data sheet's noise.
-    * within_s: largest offset of the clocks, None for any, 0 for one clock. offset_sigma s: of the offset after
-      that. drift_sigma: of the clocks' relative rate (1e-4: 100 ppm).
-    * T_body_mocap (4, 4): a guess, needed only for a body that turns about one axis; with guess_sigma (rad, m).
+    * within_s: largest offset of the clocks, None for any, 0 for one clock. offset_sigma s: of the offset
+      after that. drift_sigma: of the clocks' relative rate (1e-4: 100 ppm).
+    * T_body_mocap (4, 4): a guess, needed only for a body that turns about one axis; with guess_sigma (rad,
+      m).
     * gravity m/s^2. node_s: time between nodes.
     * max_bridged_s: longest mocap gap in which the path is trusted to the IMU. max_integrated_s: longest gap
       across which the IMU is integrated at all.
