@@ -178,6 +178,7 @@ class ModelledMapper:
         return step
 
     def next_solve(self) -> ModelledStep | None:
+        """Return the solve of the next map to be solved, None while one runs or without one."""
         if self._is_solving or not self._maps_to_solve:
             return None
         name = next(iter(self._maps_to_solve))

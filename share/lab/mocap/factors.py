@@ -134,7 +134,7 @@ def mocap_observations(
 
 
 def _rotate(R: F64, v: F64) -> F64:
-    """R (N, 3, 3) times v (N, 3)."""
+    """Return R (N, 3, 3) times v (N, 3)."""
     out: F64 = (R @ v[..., None])[..., 0]
     return out
 

@@ -104,7 +104,8 @@ def read_vicon(path: Path, rotations: str = "helical") -> dict[str, MocapTraject
 
 
 def _body_name(cell: str) -> str:
-    """`Global Angle Ann:Ann` -> `Ann`; a segment named differently from its subject keeps both names."""
+    """Return a body's name: `Global Angle Ann:Ann` -> `Ann`. A segment named differently from its subject
+    keeps both names."""
     name = cell.strip().removeprefix("Global Angle ").strip()
     subject, _, segment = name.partition(":")
     return subject if segment in ("", subject) else name

@@ -52,8 +52,8 @@ def arrow_system(segments: SegmentNormals, state: CameraImuState) -> ArrowSystem
 
 
 def gather_gradient(g: F64, state: CameraImuState) -> tuple[F64, F64]:
-    """Sum gradients by local columns, (S, LOCAL, ...), into those of the knots (6 K, ...) and of the
-    border (B, ...)."""
+    """Sum gradients by local columns, (S, LOCAL_COLUMNS, ...), into those of the knots (6 K, ...) and of
+    the border (B, ...)."""
     S, K, more = state.curve.segments, len(state.curve.p), g.shape[2:]
     knots, border = np.zeros((K, 6, *more)), np.zeros((SHARED + state.biases.size, *more))
     for a in range(ORDER):

@@ -1,4 +1,4 @@
-"""Normal equations of corners and IMU, segment by segment of the curve."""
+"""Normal equations of corners and IMU, segment by segment of the curve; L = LOCAL_COLUMNS."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Sigmas:
 
 @dataclass(frozen=True, eq=False)
 class SegmentNormals:
-    """Of S segments H (S, L, L) and g (S, L) by local columns (LOCAL_COLUMNS), and the total cost."""
+    """Of S segments H (S, L, L) and g (S, L) by local columns, and the total cost."""
 
     H: F64
     g: F64
@@ -70,7 +70,7 @@ def camera_poses(state: CameraImuState, stamps_ns: I64) -> F64:
 
 
 def pose_derivatives(state: CameraImuState, stamps_ns: I64) -> tuple[F64, F64, I64]:
-    """Return T_target_cam0 (F, 4, 4), the derivatives of its eta by local columns (F, 6, LOCAL), and the
+    """Return T_target_cam0 (F, 4, 4), the derivatives of its eta by local columns (F, 6, L), and the
     segments (F,)."""
     curve, spans = state.curve, state.curve.locate(stamps_ns, state.shift_s)
     rotation, (p, weight) = curve.rotation(spans), curve.position(spans)
@@ -95,8 +95,8 @@ def _add_corners(
 
 
 def rig_gradients(state: CameraImuState, observations: CornerObservations, sigmas: Sigmas) -> F64:
-    """Return by how much each segment's gradient (S, LOCAL) falls per unit of the rig's parameters, (S,
-    LOCAL, P): intrinsics and T_cam1_cam0, which are fixed."""
+    """Return by how much each segment's gradient (S, L) falls per unit of the rig's parameters, (S,
+    L, P): intrinsics and T_cam1_cam0, which are fixed."""
     T, J, segment = pose_derivatives(state, observations.stamps_ns)
     out: F64 = np.zeros((state.curve.segments, LOCAL_COLUMNS, shared_size(observations.cameras)))
     np.add.at(out, segment, J.swapaxes(1, 2) @ rig_cross_terms(observations, T, sigmas.px, sigmas.huber))
@@ -104,7 +104,7 @@ def rig_gradients(state: CameraImuState, observations: CornerObservations, sigma
 
 
 def inertial_residuals(state: CameraImuState, imu: ImuBatch) -> tuple[F64, F64, I64]:
-    """Return residuals (N, 6) of gyro and accel, measured minus predicted, the derivatives (N, 6, LOCAL)
+    """Return residuals (N, 6) of gyro and accel, measured minus predicted, the derivatives (N, 6, L)
     of the prediction, and the segments (N,)."""
     curve, spans = state.curve, state.curve.locate(imu.stamps_ns)
     rotation, (a, weight) = curve.rotation(spans), curve.position(spans, 2)
