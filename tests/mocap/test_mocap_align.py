@@ -174,7 +174,7 @@ def test_poses_that_lag_behind_their_turning_are_doubted(done) -> None:
     T = mocap.interpolate(t - 20_000_000)
     T[:, :3, :3] = mocap.interpolate(t)[:, :3, :3]
     found = align_device(record_imu(Motion(3), 14), NOISE, MocapTrajectory(t, T), ANYWHERE)
-    assert any("be wrong by that" in doubt for doubt in found.warnings)
+    assert any("be wrong by as much" in doubt for doubt in found.warnings)
 
 
 @pytest.mark.slow
