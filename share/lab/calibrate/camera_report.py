@@ -127,11 +127,8 @@ def report_values(outcome: CameraCalibration) -> dict[str, Any]:
 
 def _camera_values(outcome: CameraCalibration, cam: int) -> dict[str, Any]:
     state = outcome.solution.state
-    camera, cover, sigmas = (
-        state.cameras[cam],
-        outcome.coverages[cam],
-        outcome.solution.sigmas[state.intrinsic_slices[cam]],
-    )
+    camera, cover = state.cameras[cam], outcome.coverages[cam]
+    sigmas = outcome.solution.sigmas[state.intrinsic_slices[cam]]
     return {
         "lens": camera.model,
         "parameters": dict(zip(parameter_names(camera), intrinsics(camera).tolist(), strict=True)),

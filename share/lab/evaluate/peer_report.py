@@ -75,9 +75,8 @@ def _cells(row: TrackerRow) -> list[str]:
 
 def draw_comparison(folder: Path, rows: Sequence[TrackerRow]) -> str:
     """Write PNG files to `folder`; return the Markdown that shows them."""
-    recordings, trackers = (
-        list(dict.fromkeys(getattr(r, f) for r in rows)) for f in ("recording", "tracker")
-    )
+    recordings = list(dict.fromkeys(row.recording for row in rows))
+    trackers = list(dict.fromkeys(row.tracker for row in rows))
     row_of = {(row.recording, row.tracker): row for row in rows}
 
     def values(field: str) -> dict[str, list[float]]:
@@ -98,8 +97,6 @@ def draw_comparison(folder: Path, rows: Sequence[TrackerRow]) -> str:
         if not np.isnan(values_ms).all()
     }
     draw_bars(folder / "cpu.png", {"mean CPU per frame": causal}, recordings, "ms")
-    errors, cpu = (
-        image_link("Errors of each tracker", "errors.png"),
-        image_link("CPU time of each tracker", "cpu.png"),
-    )
+    errors = image_link("Errors of each tracker", "errors.png")
+    cpu = image_link("CPU time of each tracker", "cpu.png")
     return f"{errors}\n\n{cpu}\n"

@@ -67,10 +67,8 @@ def _agent_metrics(
     edge: dict[str, Any],
     joined_s: float,
 ) -> AgentMetrics:
-    report, in_map = (
-        score.report,
-        None if session_score.joint is None else session_score.joint.agents.get(name),
-    )
+    report = score.report
+    in_map = None if session_score.joint is None else session_score.joint.agents.get(name)
     track, corrected = report["track_ms"], report["corrected_ms"]
     frame, second = _rpe(score, rpe_frames), _rpe(score, rpe_time)
     span_s = float(score.truth.stamps_ns[-1] - score.truth.stamps_ns[0]) / 1e9

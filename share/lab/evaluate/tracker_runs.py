@@ -158,10 +158,8 @@ def peer_frames(source: Source) -> Iterator[PeerFrame]:
         (m.stamp_ns - source.rig.timeshift_ns, m.payload) for m in source.measurements() if m.stream == IMU
     ]
     samples.sort(key=lambda sample: sample[0])
-    stamps, values = (
-        np.array([t for t, _ in samples], np.int64),
-        np.array([v for _, v in samples], np.float64),
-    )
+    stamps = np.array([t for t, _ in samples], np.int64)
+    values = np.array([v for _, v in samples], np.float64)
     done = 0
     for frame in read_frames(source, Config(), SequencerCounters()):
         end = int(np.searchsorted(stamps, frame.stamp_ns, "right")) + 1

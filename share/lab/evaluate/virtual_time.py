@@ -227,10 +227,8 @@ def _read_delays(edge: Path, agents: Sequence[Path]) -> ProcessingDelays:
     query, verify, solve = (
         _mean_delay([edge_report.get(f"{kind}_ms", {})], edge) for kind in ("place", "verify", "solve")
     )
-    agent_factor, edge_factor = (
-        frame.p50 / _DEFAULT_DELAYS.frame.p50,
-        verify.p50 / _DEFAULT_DELAYS.verify_accepted.p50,
-    )
+    agent_factor = frame.p50 / _DEFAULT_DELAYS.frame.p50
+    edge_factor = verify.p50 / _DEFAULT_DELAYS.verify_accepted.p50
     return replace(
         ProcessingDelays(
             **{

@@ -99,10 +99,8 @@ def _scale_error_text(fit: MocapFit, max_error: float) -> str | None:
     if errors[k] <= max_error:
         return None
     size = f"{100 * errors[k]:.1f} ± {100 * fit.scale_error_sigma[k]:.1f} %"
-    where, direction = (
-        f"along its {'xyz'[k]} axis the motion capture",
-        "longer" if fit.scale_error[k] > 0 else "shorter",
-    )
+    where = f"along its {'xyz'[k]} axis the motion capture"
+    direction = "longer" if fit.scale_error[k] > 0 else "shorter"
     if fit.scale_error[k] < -1:
         return f"{where} moves opposite to the accelerometer"
     return f"{where}'s paths are {size} {direction} than the accelerometer's"

@@ -63,11 +63,8 @@ def corner_observations(
 def corner_residuals(observations: CornerObservations, cam: int, T_target_cam0: F64) -> tuple[F64, F64]:
     """Return a camera's residuals (C, 2) px, measured minus predicted, and the derivatives (C, 2, 6) of
     the prediction by eta of T_target_cam0 Exp(eta). NaN behind the camera."""
-    corners, mount, points = (
-        observations.corners[cam],
-        observations.mounts[cam],
-        _points_in_cam0(observations, cam, T_target_cam0),
-    )
+    corners, mount = observations.corners[cam], observations.mounts[cam]
+    points = _points_in_cam0(observations, cam, T_target_cam0)
     shifted = np.concatenate([se3.hat(points), np.broadcast_to(-np.eye(3), (len(points), 3, 3))], axis=2)
     px, _, by = project_with_jacobians(observations.cameras[cam], se3.transform(mount, points))
     return corners.px - px, by @ (mount[:3, :3] @ shifted)
