@@ -217,7 +217,7 @@ def test_epipolar_lines_tell_a_pair_that_sits_otherwise(rng: np.random.Generator
     covers = [Coverage(np.full(COVER_GRID, 5), np.zeros((20, 2)), np.linspace(0.5, 1.0, 20))] * 2
     assert judge_cameras(solution, covers, views).passed
     (reason,) = judge_cameras(solution, covers, late).reasons
-    assert reason.startswith("the pair: half of the corners are 3.")
+    assert reason.startswith("stereo pair: median distance of corners from their epipolar lines is 3.")
 
 
 def test_a_board_that_never_leans_is_refused(rng: np.random.Generator) -> None:
@@ -233,7 +233,7 @@ def test_a_board_that_never_leans_is_refused(rng: np.random.Generator) -> None:
 
 
 def test_too_few_views_are_refused(rng: np.random.Generator) -> None:
-    with pytest.raises(ValueError, match="3 views of the target; 4 are needed"):
+    with pytest.raises(ValueError, match="3 views of the target; at least 4 are needed"):
         calibrate_cameras(_views(rng, 0.1, count=3), GRID, SIZE)
 
 
@@ -263,7 +263,7 @@ def test_what_is_missing_is_said_in_words() -> None:
     facing = se3.exp(np.array([[np.pi, 0, 0, 0, 0, 0.8]]))
     said = coverage([np.array([[300.0, 200.0]])], facing, GRID, SIZE).gaps
     assert "no view reaches the image's upper right corner" in said
-    assert "all views are from one distance: go nearer and farther" in said
+    assert "all views are from one distance: move nearer and farther" in said
 
 
 @pytest.mark.parametrize(("ids", "told"), [(range(8), False), (range(9), False), (range(10), True)])
@@ -288,4 +288,4 @@ def test_a_view_that_a_camera_does_not_see_covers_nothing() -> None:
     poses = se3.exp(np.array([[np.pi, 0, 0, 0, 0, 0.8], [np.pi, 0.9, 0, 0, 0, 1.6]]))
     covered = coverage([np.array([[300.0, 200.0]]), np.empty((0, 2))], poses, GRID, SIZE)
     assert len(covered.distances) == len(covered.tilts) == 1
-    assert "all views are from one distance: go nearer and farther" in covered.gaps
+    assert "all views are from one distance: move nearer and farther" in covered.gaps

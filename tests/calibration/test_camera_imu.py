@@ -172,7 +172,7 @@ def test_an_imu_noisier_than_stated_makes_sigmas_larger_and_fails(
     noisy = calibrated(run)
     assert noisy.sigma_shift > 3 * found.sigma_shift
     assert noisy.sigmas.gyro == pytest.approx(20 * noisy.stated_sigmas.gyro, rel=0.2)
-    assert any("gyroscope's residuals" in reason for reason in judge_camera_imu(noisy).reasons)
+    assert any("gyroscope: residuals" in reason for reason in judge_camera_imu(noisy).reasons)
 
 
 def test_a_gyro_that_errs_in_scale_has_larger_sigmas(dance: Recorded, found: CameraImuFit) -> None:
@@ -196,18 +196,18 @@ def test_turning_about_one_axis_alone_is_refused() -> None:
 
 
 def test_the_imu_of_another_recording_is_refused(dance: Recorded) -> None:
-    with pytest.raises(CalibrationMismatchError, match="turn nowhere alike"):
+    with pytest.raises(CalibrationMismatchError, match="match at no time offset"):
         calibrated(replace(dance, imu=record(Dance(8), 12.0, hz=6.0).imu))
 
 
 def test_an_imu_with_a_hole_is_refused(dance: Recorded) -> None:
     t = (dance.imu.stamps_ns - START_NS) * 1e-9
-    with pytest.raises(DataError, match=r"nothing for 0\.\d+ s"):
+    with pytest.raises(DataError, match=r"no samples for 0\.\d+ s"):
         calibrated(replace(dance, imu=dance.imu.take((t < 5) | (t > 5.3))))
 
 
 def test_too_few_pictures_are_refused(dance: Recorded) -> None:
-    with pytest.raises(DataError, match="pairs of successive pictures"):
+    with pytest.raises(DataError, match="pairs of successive images"):
         calibrated(replace(dance, stamps_ns=dance.stamps_ns[:20], views=dance.views[:20]))
 
 

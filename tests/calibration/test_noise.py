@@ -127,7 +127,7 @@ def test_a_gap_costs_as_much_as_it_should():
 
 
 def test_a_dead_axis_and_a_few_samples_are_refused():
-    with pytest.raises(DataError, match="is the sensor alive"):
+    with pytest.raises(DataError, match="does the sensor work"):
         fit_noise(allan_deviation(np.zeros((10_000, 1)), 100.0))
     with pytest.raises(DataError, match="too short"):
         fit_noise(allan_deviation(np.random.default_rng(0).standard_normal((100, 1)), 100.0))

@@ -52,7 +52,7 @@ def test_a_knock_ends_the_rest():
 
 
 def test_a_device_in_a_hand_is_refused():
-    with pytest.raises(DataError, match=r"at rest for 0 s of 200 s.*leave it alone"):
+    with pytest.raises(DataError, match=r"at rest for 0 s of 200 s.*do not touch it"):
         find_rest(handled(still(200), 0, 200), RATE_HZ)
 
 

@@ -113,7 +113,7 @@ def test_what_is_not_to_be_believed_does_not_replace_what_was(
         (out / name).write_text("a good one")
     again = share(*asked, out)
     assert again.code == 1 and again.err.count("\n") == 1
-    assert "kalibr_imucam_chain.failed.yaml is written; kalibr_imucam_chain.yaml is kept" in again.err
+    assert "kalibr_imucam_chain.failed.yaml is written; the existing kalibr_imucam_chain.yaml" in again.err
     assert [(out / name).read_text() for name in good] == ["a good one"] * 3
     failed = (out / "kalibr_imucam_chain.failed.yaml").read_text()
     assert "FAILED, see camera-report.failed.json" in failed

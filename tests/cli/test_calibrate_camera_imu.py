@@ -109,8 +109,8 @@ def test_what_is_not_to_be_believed_fails_and_leaves_what_was_there(
     parts = [np.array(told[f"sigmas{part}"]["rotation_rad"]) for part in ("", "_by_noise", "_by_cameras")]
     np.testing.assert_allclose(parts[0] ** 2, parts[1] ** 2 + parts[2] ** 2)
     assert "kalibr_imu_chain.yaml is of other noise and is kept; used was that of --imu" in kept
-    assert "not to be believed" in failed and "gyroscope's residuals" in failed
-    assert "kalibr_imucam_chain.failed.yaml is written; kalibr_imucam_chain.yaml is kept" in failed
+    assert "not to be believed" in failed and "gyroscope: residuals" in failed
+    assert "kalibr_imucam_chain.failed.yaml is written; the existing kalibr_imucam_chain.yaml" in failed
     assert "time offset: +12." in done.out and "kalibr_imucam_chain.failed.yaml" in done.out
     assert "FAILED" in (tmp_path / "kalibr_imucam_chain.failed.yaml").read_text()
     assert {name: (tmp_path / name).read_text() for name in before} == before
@@ -133,6 +133,6 @@ def test_wrong_use_is_one_line_and_leaves_nothing(
     (tmp_path / "still" / "imu0").symlink_to(dance / "imu0")
     cv2.imwrite(str(tmp_path / "still" / "cam0" / "1.png"), np.full((300, 400), 90, np.uint8))
     known = (*board, *imu, "--camera", dance / "bare.yaml")
-    assert "no board in 1 pictures" in refused(1, tmp_path / "still", *known)
+    assert "no board in 1 images" in refused(1, tmp_path / "still", *known)
     cv2.imwrite(str(tmp_path / "still" / "cam0" / "1.png"), np.full((36, 48), 90, np.uint8))
-    assert "calibrate it as it records" in refused(1, tmp_path / "still", *known)
+    assert "calibrate it at the recorded size" in refused(1, tmp_path / "still", *known)

@@ -148,7 +148,7 @@ def test_wrong_use_is_one_line(share, room, tmp_path):
 
     imu, truth = room / "imu.csv", room / "mocap.tum"
     assert "give --calib DIR" in refused(2, imu, "--truth", truth)
-    assert "no such file of motion capture" in refused(2, imu, "--truth", room / "no.tum", "--calib", room)
+    assert "no such motion capture file" in refused(2, imu, "--truth", room / "no.tum", "--calib", room)
     assert "--track" in refused(2, imu, "--truth", truth, "--calib", room, "--track", room / "no.tum")
     assert "kalibr_imu_chain.yaml" in refused(2, imu, "--truth", truth, "--calib", tmp_path)
 

@@ -16,7 +16,7 @@ def test_the_yaml_file_is_of_what_is_printed(share, tmp_path):
 def test_what_does_not_fit_is_said_and_nothing_written(share, tmp_path):
     done = share("calibrate", "target", "--size", 40, "--out", tmp_path / "b.pdf")
     assert done.code == 2
-    assert "23.4 mm is the most there" in done.err
+    assert "at most 23.4 mm fit" in done.err
     assert not list(tmp_path.iterdir())
 
 

@@ -73,7 +73,7 @@ def made(share, room) -> Path:
             "dataset", "align", *room.recordings, "--mocap", room.folder / "vicon.csv", *told, "--out", out
         )
         assert done.code == 0
-        assert all("the motion tells the body to" in line for line in done.err.splitlines())  # 12 s are few
+        assert all("determines the mounting to" in line for line in done.err.splitlines())  # 12 s are few
         assert json.loads(done.out) == read_json(out / "align.json")
     return out
 
@@ -231,11 +231,11 @@ def test_wrong_use_is_one_line_and_leaves_nothing(share, room, tmp_path):
     assert "there is no device 'eve'" in refused(2, bob, *csv, "--body", "eve=BOB")
     assert "--kind cat" in refused(2, bob, *csv, "--kind", "cat")
     assert "has no motion capture" in refused(2, bob, *csv_of_ann)
-    assert "no such file of motion capture" in refused(2, bob, "--mocap", room.folder / "no.csv")
+    assert "no such motion capture file" in refused(2, bob, "--mocap", room.folder / "no.csv")
     assert "`share calibrate mocap` makes one" in refused(2, bob, *csv, "--mounting", tmp_path)
     assert "is given twice" in refused(2, bob, bob, *csv)
     assert "name of a folder" in refused(2, f"truth={room.folder / 'bob.mcap'}", *csv)
-    assert "bob: which time of the motion capture is which" in refused(1, bob, *csv, "--body", "bob=Headset1")
+    assert "bob: the time offset of motion capture" in refused(1, bob, *csv, "--body", "bob=Headset1")
 
 
 def test_nothing_is_written_over(share, room, made):
@@ -268,7 +268,7 @@ def test_a_real_recording_against_what_is_no_raw_motion_capture(share, shared_da
     options = ("--mocap", tmp_path / "seen.csv", "--sigma-mm", "1.5", "--json", "--out", tmp_path / "made")
     done = share("dataset", "align", f"ann={folder}", *options)
     found = json.loads(done.out)["ann"]
-    assert done.code == 0 and "neither smoothed nor an estimate" in done.err
+    assert done.code == 0 and "neither smoothed nor estimated" in done.err
     assert abs(found["offset_ns"] - away) < 10_000_000 and found["lead"] > 100
     assert found["body_turned_deg"] == pytest.approx(0.28, abs=0.05) and found["left_mm"] < 1.5
     assert share("dataset", "info", tmp_path / "made" / "ann").code == 0

@@ -77,11 +77,11 @@ def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session,
     models = tmp_path / "models.json"
     models.write_text('[{"name": "ours", "rmse_cm": 1, "mae_cm": 1, "rank": 1, "qoe_off": 0}]')
     assert evaluate(*arguments, "--with", models).code == 0  # there is nothing left to play
-    assert "Models of the error" in (out / "report.html").read_text()
+    assert "Error models" in (out / "report.html").read_text()
     assert (run / "run.json").stat().st_mtime_ns == before
     other = evaluate(*(word for word in arguments if word != "--true-error"))
     assert other.code == 2
-    assert "was played on other terms" in other.err
+    assert "was played with other options" in other.err
 
 
 @pytest.mark.slow
@@ -104,7 +104,7 @@ def test_what_is_wrong_is_said_before_anything_is_played(evaluate, plain_session
         (("run", tmp_path, "--out", tmp_path / "r"), "has no session.yaml; give a session"),
         (("run", tmp_path / "nosuch", "--out", tmp_path / "r"), "there is no such folder; give a session"),
         (("score", tmp_path), "has no run.json"),
-        (("ablation", plain_session, plain_session, "--out", tmp_path / "r"), "two sessions are called"),
+        (("ablation", plain_session, plain_session, "--out", tmp_path / "r"), "two sessions have the name"),
     ):
         done = evaluate(*arguments)
         assert done.code in (1, 2)
@@ -116,7 +116,7 @@ def test_what_is_wrong_is_said_before_anything_is_played(evaluate, plain_session
         shutil.copy(path, bare)
     done = evaluate("run", bare, "--out", tmp_path / "r")
     assert done.code == 2
-    assert "without the truth of all agents nothing can be scored" in done.err
+    assert "scoring needs the truth of all agents" in done.err
     assert not (tmp_path / "r").exists()
 
 

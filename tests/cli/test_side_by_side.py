@@ -68,7 +68,7 @@ def test_all_are_scored_alike_and_kept(compare, plain_session, tmp_path):
     assert len(rows) == 7  # three agents by us, those with stereo by the peer, and by the peer in the end
     assert "left out: Idler 1 on " in done.err
     name = plain_session.name
-    ours, idle, end = (rows[f"{name}/ar1", key] for key in (SHARE, "Idler 1", "Idler 1, in the end"))
+    ours, idle, end = (rows[f"{name}/ar1", key] for key in (SHARE, "Idler 1", "Idler 1, final trajectory"))
     frames = int(ours["frames"])
     assert float(ours["ate_cm"]) < 1 < float(idle["ate_cm"])
     tracked = (frames - 3) / frames  # and after the last one comes no IMU sample
@@ -106,7 +106,7 @@ def test_a_peer_that_breaks_leaves_the_others_their_rows(compare, plain_session,
     peer = idler(tmp_path, breaks=5)
     done = compare(f"{plain_session}/ar1", "--peer", f"basalt={peer}", "--out", out)
     assert done.code == 1
-    assert "Idler 1: the peer ended at frame 5; see " in done.err
+    assert "Idler 1: the peer process ended at frame 5; see " in done.err
     assert "1 of 2 runs failed; the same command runs them again" in done.err
     assert [tracker for _, tracker in rows_of(out)] == [SHARE]
     (log,) = out.glob("*.log")
@@ -135,4 +135,4 @@ def test_without_a_truth_nobody_can_be_told_from_another(compare, plain_session,
         shutil.copy(path, bare)
     done = compare(f"{bare}/ar1", "--out", tmp_path / "compared")
     assert done.code == 2
-    assert "comes without a truth" in done.err
+    assert "has no ground truth" in done.err

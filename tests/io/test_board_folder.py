@@ -47,7 +47,7 @@ def test_where_pictures_are_missing_it_is_said_how_to_do_without(tmp_path: Path)
         board_views.open_rig_images(str(tmp_path / "mono"), str(tmp_path / "stereo.yaml"))
     flat = written(tmp_path / "flat", "1.png")
     with pytest.raises(
-        UsageError, match=r"flat: has pictures, but no cam0 .*; give a folder with cam0/\*\.png"
+        UsageError, match=r"flat: has images, but no folder cam0; give a folder with cam0/\*\.png"
     ):
         open_board_images(str(flat), ("cam0",))
 
@@ -69,5 +69,5 @@ def test_pictures_that_are_not_later_are_counted(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("name", ["row", "1.5", "12345678901234567890"])
 def test_a_name_that_is_no_stamp_is_refused(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    with pytest.raises(DataError, match="dance: pictures without stamps; name them cam0/STAMP"):
+    with pytest.raises(DataError, match="dance: images have no stamps; name them cam0/STAMP"):
         stamped(monkeypatch, "10", name)

@@ -39,5 +39,5 @@ def test_what_a_dead_worker_had_is_done_by_another(tmp_path):
 
 @pytest.mark.slow
 def test_where_nobody_answers_is_said():
-    with pytest.raises(UsageError, match=r"--scheduler tcp://127\.0\.0\.1:1: nobody answers there"):
+    with pytest.raises(UsageError, match=r"--scheduler tcp://127\.0\.0\.1:1: no answer from"):
         Cluster("tcp://127.0.0.1:1")

@@ -101,7 +101,7 @@ def test_samples_out_of_order_are_dropped_and_counted(tmp_path):
 
 def test_what_has_no_imu_is_refused(tmp_path):
     make_tum(tmp_path / "tum")
-    with pytest.raises(UsageError, match="no recording of an IMU that SHARE reads"):
+    with pytest.raises(UsageError, match="not an IMU recording that SHARE reads"):
         read_imu(str(tmp_path / "tum"))
     with pytest.raises(UsageError, match="no such file"):
         read_imu(str(tmp_path / "nothing"))

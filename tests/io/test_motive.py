@@ -84,7 +84,7 @@ def test_a_body_that_was_never_there_is_known_but_not_seen(tmp_path):
         ("X,Y,Z,W", "X,Y,Z,", "line 8: body 'Ann' has no column Rotation W; export with Rotation Type Quat"),
         ("Rigid Body", "Bone", "has no rigid body; export Rigid Bodies"),
         ("Time (Seconds)", "Clock", "line 8: has no column Time"),
-        ("\n2,0.016667", "\n2,0.008333", "line 11: its time does not follow"),
+        ("\n2,0.016667", "\n2,0.008333", "line 11: its time is not later"),
         (",1.75,", ",1e308,", "line 9: '1e308' is not a number"),
         ("0,0.000000,", "0,0.000000," + "9" * 200_000, "line 9: field larger than field limit"),
         (",1.75,", ",high,", "line 9: 'high' is not a number"),

@@ -36,7 +36,7 @@ def recorded(path: Path, rig: Rig) -> Path:
 def test_a_recording_of_an_imu_alone_says_it(tmp_path: Path) -> None:
     assert stated_noise(str(recorded(tmp_path / "a.mcap", RIG)), None, "--calib") == NOISE
     silent = recorded(tmp_path / "b.mcap", replace(RIG, imu=None))
-    with pytest.raises(UsageError, match=r"b\.mcap: does not say how noisy the IMU is; give --calib DIR"):
+    with pytest.raises(UsageError, match=r"b\.mcap: does not state the IMU's noise; give --calib DIR"):
         stated_noise(str(silent), None, "--calib")
 
 
@@ -44,7 +44,7 @@ def test_a_recording_of_an_imu_alone_says_it(tmp_path: Path) -> None:
 def test_a_folder_says_it_or_that_it_does_not(tmp_path: Path, where: str) -> None:
     (tmp_path / where).mkdir(parents=True, exist_ok=True)
     (tmp_path / where / "data.csv").write_text("1000,0,0,0,0,0,9.8\n")
-    with pytest.raises(UsageError, match="does not say how noisy the IMU is; give --imu DIR"):
+    with pytest.raises(UsageError, match="does not state the IMU's noise; give --imu DIR"):
         stated_noise(str(tmp_path), None, "--imu")
     (tmp_path / where / "sensor.yaml").write_text(SHEET)
     assert stated_noise(str(tmp_path), None, "--imu") == NOISE

@@ -11,7 +11,7 @@ from share.geometry import se3
 from share.lab.mocap import factors
 from share.lab.mocap.factors import preintegrate
 from share.lab.mocap.initialisation import initial_rotation
-from share.lab.mocap.offset import coarse_offset
+from share.lab.mocap.offset import find_offset
 from share.lab.mocap.problem import node_covariances, normal_equations, solve_bordered
 from share.lab.mocap.state import NODE_SIZE, SHARED_SIZE, MocapImuState
 from share.types import F64, I64, ImuBatch
@@ -139,14 +139,14 @@ def test_clocks_are_brought_together(offset_s: float) -> None:
     offset_ns = round(offset_s * 1e9)
     motion = Motion(2)
     imu, mocap = record_imu(motion, 40), record_mocap(motion, 25, offset_ns)
-    assert coarse_offset(imu, mocap, None) == pytest.approx(offset_ns, abs=5 * MS)
+    assert find_offset(imu, mocap, None).offset_ns == pytest.approx(offset_ns, abs=5 * MS)
 
 
 def test_clocks_farther_apart_than_was_said_are_not_searched() -> None:
     motion = Motion(2)
     imu, mocap = record_imu(motion, 40), record_mocap(motion, 25, 7_000 * MS)
-    with pytest.raises(CalibrationMismatchError, match="nowhere alike"):
-        coarse_offset(imu, mocap, 0.5)
+    with pytest.raises(CalibrationMismatchError, match="match at no time offset"):
+        find_offset(imu, mocap, 0.5)
 
 
 def test_hand_eye_starts_within_a_degree() -> None:

@@ -30,13 +30,13 @@ def test_policies_take_turns_at_being_first():
         *("a-equal-1", "a-share-1", "a-covins-g-1"),
         *("b-share-1", "b-covins-g-1", "b-equal-1"),
     ]
-    assert {(run.terms.policy, run.terms.link, run.terms.seed) for run in runs[-1:]} == {
+    assert {(run.options.policy, run.options.link, run.options.seed) for run in runs[-1:]} == {
         ("equal", "wifi5", 1)
     }
 
 
 def test_two_sessions_of_one_name_would_share_their_runs():
-    with pytest.raises(UsageError, match="two sessions are called room"):
+    with pytest.raises(UsageError, match="two sessions have the name room"):
         plan_policies([session("x/room"), session("y/room")], ("share",), [0], TERMS, Path("out"))
 
 
@@ -87,7 +87,7 @@ def test_what_a_dead_worker_had_done_of_its_job_is_taken(done):
 def test_a_run_of_a_session_that_was_made_anew_is_not_taken(done):
     path = done.session.folder / "session.yaml"
     path.write_text(path.read_text().replace("seed: 3", "seed: 4"))
-    with pytest.raises(UsageError, match=r"room was made anew since, with another truth; play it again"):
+    with pytest.raises(UsageError, match="room was generated again since, with another truth; play it"):
         list(run_all([done], lambda number, now: None))
 
 
@@ -102,7 +102,7 @@ def test_a_run_of_before_a_setting_was_there_is_taken(done):
 
     settings["control"]["kp"] = 7.0
     (one.out / "config.yaml").write_text(yaml.safe_dump(settings))
-    with pytest.raises(UsageError, match="was played on other terms or settings"):
+    with pytest.raises(UsageError, match="was played with other options or settings"):
         list(run_all([one], lambda number, now: None))
 
 

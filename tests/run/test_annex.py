@@ -24,7 +24,7 @@ def test_models_of_the_error(tmp_path):
     assert math.isnan(first.ms)
     assert second == SCORES[1]
     made = read_section(file, 1)
-    assert made.text.startswith("## Models of the error: scores\n")
+    assert made.text.startswith("## Error models: scores\n")
     assert "| ours | 1.500 | 0.500 | 0.80 | 0.100 | 90 % | 1.20 |" in made.text
     assert made.pictures == {}
 
@@ -40,13 +40,13 @@ def test_scores_that_are_damaged_are_named(tmp_path, text):
 def test_settings_tried(tmp_path):
     folder = tmp_path / "gains"
     folder.mkdir()
-    with pytest.raises(UsageError, match="give a folder by `share evaluate sweep`"):
+    with pytest.raises(UsageError, match="give a folder of `share evaluate sweep`"):
         read_section(folder, 1)
     (folder / "sweep.md").write_text("| control.kp |\n|---|\n| 0.8 |\n")
     assert read_section(folder, 1).pictures == {}
     (folder / "heat.png").write_bytes(b"")
     made = read_section(folder, 2)
     text, shown = made.text.split("\n![")
-    assert text == "## Settings tried: gains\n\n| control.kp |\n|---|\n| 0.8 |\n"
+    assert text == "## Settings swept: gains\n\n| control.kp |\n|---|\n| 0.8 |\n"
     assert shown == "Means over the first two settings](heat-2.png)\n"
     assert made.pictures == {"heat-2.png": folder / "heat.png"}

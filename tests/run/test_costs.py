@@ -46,10 +46,10 @@ def test_what_was_measured_and_the_rest_in_proportion(tmp_path):
 
 
 def test_what_is_not_there_is_said(tmp_path):
-    with pytest.raises(UsageError, match="is not a run by"):
+    with pytest.raises(UsageError, match="not a folder of"):
         read_delays(tmp_path)
     folder = run(tmp_path, solved=0)
-    with pytest.raises(DataError, match="nothing was measured"):
+    with pytest.raises(DataError, match="has no measured delays"):
         read_delays(folder)
     (folder / "ann" / "report.json").write_text("{")
     with pytest.raises(ShareError, match="is damaged"):

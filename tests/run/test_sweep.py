@@ -30,7 +30,7 @@ def test_what_cannot_be_read_is_said(text):
 
 def test_a_grid_is_every_combination():
     assert grid([KP, KI]) == [(p, i) for p in ("0.2", "0.8") for i in ("0", "0.1", "1e-3")]
-    with pytest.raises(UsageError, match="a range is for --random N"):
+    with pytest.raises(UsageError, match="a range needs --random N"):
         grid([Axis.parse("control.kp=1:2")])
 
 
@@ -68,7 +68,7 @@ def test_every_run_has_a_folder_of_its_own():
         sessions, [KP, KI], grid([KP, KI]), range(2), RunOptions("share"), Path("out"), Config()
     )
     assert len({one.out for one, _ in runs}) == len(runs) == 2 * 6 * 2
-    assert {one.terms.seed for one, _ in runs} == {0, 1}
+    assert {one.options.seed for one, _ in runs} == {0, 1}
     assert all(one.config.control.kp == float(point[0]) for one, point in runs)
     again = plan_sweep(sessions, [KP], grid([KP]), range(1), RunOptions("share"), Path("out"), Config())
     assert not {one.out for one, _ in again} & {one.out for one, _ in runs}  # of another sweep

@@ -1,7 +1,7 @@
-"""Allan deviation of a sensor at rest, over stretches without gaps.
+"""Allan deviation of a sensor at rest, over segments without gaps.
 
 Source: IEEE Std 952-1997, annex C; the overlapping estimator of Howe, Allan and Barnes 1981 (NIST SP 1065,
-5.2.4). What the curve tells: `share.lab.calibrate.imu_noise`.
+5.2.4). Noise from the curve: `share.lab.calibrate.imu_noise`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _STARTS_PER_AVERAGE = 16
 
 @dataclass(frozen=True, eq=False)
 class AllanCurve:
-    """sizes (T,): samples in an average; deviation (T, A) in the unit of the samples, A axes.
-    lengths (S,): samples of each stretch; rate_hz of the samples."""
+    """sizes (T,): samples in an average. deviation (T, A) in the unit of the samples, A axes.
+    segment_lengths (S,): samples of each segment. rate_hz: of the samples."""
 
     sizes: I64
     deviation: F64
@@ -30,22 +30,22 @@ class AllanCurve:
 
     @property
     def taus(self) -> F64:
-        """(T,) s that an average lasts."""
+        """(T,) averaging times, s."""
         return np.asarray(self.sizes / self.rate_hz, np.float64)
 
     @property
     def clusters(self) -> I64:
-        """(T,) independent averages, side by side: in each stretch as many as fit, less those that have
-        no neighbour."""
+        """(T,) numbers of independent, adjacent averages: in each segment as many as fit, if at least two."""
         averages = self.segment_lengths // self.sizes[:, None]
         return np.asarray(np.where(averages >= 2, averages, 0).sum(axis=1), np.int64)
 
 
 def allan_deviation(samples: F64 | Sequence[F64], rate_hz: float, per_octave: int = 4) -> AllanCurve:
-    """Of samples (N, A) at `rate_hz`, or of several stretches of them with gaps between: no difference is
-    taken across a gap. Over averages of one sample up to a quarter of the longest stretch.
+    """Return the Allan deviation of samples (N, A) at `rate_hz`, or of several segments with gaps between
+    them.
 
-    Raises DataError where no stretch has 100 samples, or for values that are not finite.
+    No difference spans a gap. Averages of one sample up to a quarter of the longest segment. Raises DataError
+    where no segment has 100 samples, or for values that are not finite.
     """
     segments_given = [samples] if isinstance(samples, np.ndarray) else samples
     segments = [np.asarray(one, np.float64) for one in segments_given if len(one) >= 2]
@@ -66,23 +66,24 @@ def allan_deviation(samples: F64 | Sequence[F64], rate_hz: float, per_octave: in
 
 
 def _running_sum(samples: F64) -> F64:
-    """Running sum (N + 1, A) of samples (N, A) less their mean, which tells nothing."""
+    """Return the running sum (N + 1, A) of samples (N, A) minus their mean, which does not matter."""
     sums = np.cumsum(samples - samples.mean(axis=0), axis=0)
     return np.concatenate([np.zeros((1, samples.shape[1])), sums])
 
 
 def _squared_differences(theta: F64, sizes: I64) -> F64:
-    """(T, A + 1): sum of squared second differences of the running sum at each size, and their number."""
+    """Return (T, A + 1): sums of squared second differences of the running sum at each size, and their
+    number."""
     out = np.zeros((len(sizes), theta.shape[1] + 1))
     for row, m in zip(out, sizes, strict=True):
         if 2 * m < len(theta):
-            step = max(1, m // _STARTS_PER_AVERAGE)  # starts closer than that tell nothing new
+            step = max(1, m // _STARTS_PER_AVERAGE)  # denser starts add no information
             second = theta[2 * m :: step] - 2 * theta[m:-m:step] + theta[: -2 * m : step]
             row[:-1], row[-1] = (second**2).sum(axis=0), len(second)
     return out
 
 
-# ---- How much Allan variances of one recording scatter, and how alike.
+# Covariance of the Allan variances of one recording.
 #
 # A running sum of samples with white noise, flicker noise and a random walk has stationary second
 # differences, whose covariances follow from one function of the lag (a generalised covariance: Matheron 1973)
@@ -91,9 +92,10 @@ def _squared_differences(theta: F64, sizes: I64) -> F64:
 #
 # and a mean of squares of normal values has the covariance 2 sum R(k)^2 / n^2 (Isserlis). That gives the
 # equivalent degrees of freedom of NIST SP 1065, 5.4, for any mixture of the three, and the covariance between
-# averaging times, which fits usually leave out: neighbours are nearly copies.
+# averaging times, which fits usually ignore: neighbours are nearly copies.
 
-_WIDE_LAGS, _CORNER_LAGS = 65, 33  # lags over all of a sum, and about each of its nine corners
+_WIDE_LAGS = 65  # lags over all of a sum
+_CORNER_LAGS = 33  # lags about each of its nine corners
 _SECOND_DIFFERENCE = np.array([1.0, -2.0, 1.0])
 
 
@@ -113,8 +115,8 @@ _NOISE_MODELS: tuple[Callable[[F64], F64], ...] = (_white, _flicker, _walk)
 
 
 def variance_covariance(sizes: I64, lengths: I64, rate_hz: float) -> F64:
-    """(3, 3, T, T): with squares p = (N^2, B^2, K^2) of one axis, sum_ab p_a p_b out[a, b] is the covariance
-    of its Allan variances at T sizes, from stretches of `segment_lengths` (S,) samples."""
+    """Return (3, 3, T, T): with squares p = (N^2, B^2, K^2) of an axis, sum_ab p_a p_b out[a, b] is the
+    covariance of its Allan variances at T sizes, over segments of `lengths` (S,) samples."""
     out = np.zeros((3, 3, len(sizes), len(sizes)))
     for i, m in enumerate(sizes):
         for j, n in enumerate(sizes[: i + 1]):
@@ -123,7 +125,7 @@ def variance_covariance(sizes: I64, lengths: I64, rate_hz: float) -> F64:
 
 
 def _pair_covariance(m: int, n: int, lengths: I64, dt: float) -> F64:
-    """(3, 3) of the variances at m and n samples."""
+    """Return (3, 3) of the variances at m and n samples."""
     corners = np.arange(3)[:, None] * m - np.arange(3) * n
     k, weight = _lags(corners, m, n)
     h = np.abs(k[:, None, None] - corners) * dt
@@ -137,7 +139,7 @@ def _pair_covariance(m: int, n: int, lengths: I64, dt: float) -> F64:
 
 
 def _lags(corners: I64, m: int, n: int) -> tuple[I64, F64]:
-    """Whole lags, close where the covariance has corners, and how many each stands for."""
+    """Return integer lags, dense where the covariance has corners, and how many lags each stands for."""
     reach, near = 2 * (m + n), 2 * min(m, n)
     corner_lags = corners.reshape(-1, 1) + np.linspace(-near, near, _CORNER_LAGS)
     wide_lags = m - n + np.linspace(-reach, reach, _WIDE_LAGS)
@@ -147,7 +149,7 @@ def _lags(corners: I64, m: int, n: int) -> tuple[I64, F64]:
 
 
 def _lag_counts(k: I64, lengths: I64, m: int, n: int) -> tuple[F64, float]:
-    """At how many places each lag is found, over all stretches; the product of the numbers of differences."""
+    """Return how often each lag occurs over all segments, and the product of the numbers of differences."""
     of_m, of_n = np.maximum(lengths + 1 - 2 * m, 0), np.maximum(lengths + 1 - 2 * n, 0)
     lag = k[:, None]
     count = np.clip(np.minimum(of_m, of_n - lag) - np.maximum(0, -lag), 0, None).sum(axis=1)

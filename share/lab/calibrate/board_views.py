@@ -1,4 +1,4 @@
-"""Pictures of a calibration target, from a recording or from a folder of images."""
+"""Views of a calibration target, from a recording or from a folder of images."""
 
 from __future__ import annotations
 
@@ -24,14 +24,16 @@ from share.sensors.measurement import CAM0, CAM1
 from share.types import F64, I64, U8
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-_MAX_PAIR_GAP_NS = 2_000_000  # stamps of two pictures taken at once
+_MAX_PAIR_GAP_NS = 2_000_000  # between stamps of one stereo pair
 
 
 @dataclass(frozen=True, eq=False)
 class BoardImages:
-    """count: of cam0's; rig: the calibration so far, if the source has one; read: name and images of each,
-    which of a recording is the stamp of the first camera's, ns; said: the calibration that was given; serial:
-    of the device that took them, else of the one that the calibration is of."""
+    """Images of a target. count: of cam0's. rig: the calibration so far, if the source has one.
+
+    read_images: yields name and images of each set; in a recording the name is the first camera's stamp, ns.
+    given_calibration: as given. serial: of the recording device, else of the calibration.
+    """
 
     count: int
     rig: Rig | None
@@ -43,16 +45,15 @@ class BoardImages:
 def open_board_images(
     source: str, cameras: Sequence[str], calib: str | None = None, mono_hint: str = "give --camera cam0"
 ) -> BoardImages:
-    """A recording, or a folder with cam0/*.png and, for stereo, cam1/*.png of the same names (.jpg too).
+    """Open a recording, or a folder with cam0/*.png and, for stereo, cam1/*.png of equal names (.jpg too).
 
-    eyes: which cameras; alone: how a person may ask for cam0 alone. Raises UsageError, ConfigError or
-    DataError.
+    mono_hint: how to ask for cam0 alone. Raises UsageError, ConfigError or DataError.
     """
     folder, given = Path(source), read_given_calibration(calib)
     if any((folder / CAM0).glob("*")) and not (folder / CAM0 / "data.csv").exists():
         return _folder_images(folder, cameras, given, mono_hint)
     if _image_files(folder) and not any(reader.matches(folder) for reader in READERS):
-        raise UsageError(f"{source}: has pictures, but no cam0 with them; give a folder with cam0/*.png")
+        raise UsageError(f"{source}: has images, but no folder cam0; give a folder with cam0/*.png")
     opened = open_source(source, calib)
     if CAM1 in cameras and opened.rig.cam1 is None:
         raise UsageError(f"{source}: has no cam1; {mono_hint}")
@@ -83,7 +84,7 @@ def _folder_images(
             if len(cameras) > 1
             else f"in {cameras[0]}"
         )
-        raise DataError(f"{folder}: has no pictures {requirement}")
+        raise DataError(f"{folder}: has no images {requirement}")
 
     def read() -> Iterator[tuple[str, tuple[U8, ...]]]:
         for name in names:
@@ -93,12 +94,12 @@ def _folder_images(
 
 
 def _only_serial(calibration: Calibration | None) -> str | None:
-    """The device that a calibration is of, where it names just one."""
+    """Return the device of a calibration, if it names exactly one."""
     return calibration.serials[0] if calibration is not None and len(calibration.serials) == 1 else None
 
 
 def _image_files(folder: Path) -> dict[str, Path]:
-    """By their names, in the order of numbers: 99 goes before 100."""
+    """Return image files by name, in numeric order: 99 before 100."""
     paths = [path for path in folder.glob("*") if path.suffix.lower() in _IMAGE_SUFFIXES]
     return {path.stem: path for path in sorted(paths, key=lambda path: (len(path.stem), path.stem))}
 
@@ -111,11 +112,10 @@ def find_views(
     workers: int = 1,
     fisheye: bool = False,
 ) -> tuple[list[BoardView], list[tuple[int, int]]]:
-    """Views of every `every`-th picture, also empty ones, and each camera's size. Finding a board takes
-    some hundredths of a second: `workers` processes share that.
+    """Return the views of every `every`-th image, empty ones included, and each camera's image size.
 
-    told: how many are done, of how many. fisheye: what the lenses are. Raises DataError where pictures of a
-    camera differ in size.
+    Detecting a board takes some hundredths of a second, in `workers` processes. on_progress(done, total):
+    images. Raises DataError where images of a camera differ in size.
     """
     sizes: list[tuple[int, int]] = []
     views: dict[int, BoardView] = {}
@@ -136,24 +136,22 @@ class _ImageJob:
 
 
 def _image_jobs(board_images: BoardImages, every: int, sizes: list[tuple[int, int]]) -> Iterator[_ImageJob]:
-    """Fills `sizes`. Raises DataError."""
+    """Yield jobs, and fill `sizes`. Raises DataError."""
     for k, (name, images) in enumerate(board_images.read_images()):
         if k % every:
             continue
         image_sizes = [(image.shape[1], image.shape[0]) for image in images]
         sizes.extend(image_sizes[len(sizes) :])
         if image_sizes != sizes:
-            raise DataError(
-                f"picture {name}: is {image_sizes}, the first was {sizes}; give pictures of one size"
-            )
+            raise DataError(f"image {name}: is {image_sizes}, the first was {sizes}; give images of one size")
         yield _ImageJob(k, name, images)
 
 
 def _detect_all(
     jobs: Iterator[_ImageJob], detector_arguments: tuple[Target, bool], workers: int
 ) -> Iterator[tuple[_ImageJob, tuple[Detection, ...]]]:
-    """Every job and what its images show, as they are done."""
-    if workers == 1:  # a process of its own takes a second to begin
+    """Yield every job with its detections, in order of completion."""
+    if workers == 1:  # starting a process takes a second
         _start_worker(*detector_arguments)
         yield from ((job, _detections(job)) for job in jobs)
         return
@@ -161,7 +159,7 @@ def _detect_all(
         yield from pool.run(_detections, jobs)
 
 
-_detect_in_worker: Callable[[U8], Detection] | None = None  # of a process
+_detect_in_worker: Callable[[U8], Detection] | None = None  # one per process
 
 
 def _start_worker(target: Target, fisheye: bool) -> None:
@@ -174,15 +172,15 @@ def _detections(job: _ImageJob) -> tuple[Detection, ...]:
     return tuple(_detect_in_worker(image) for image in job.images)
 
 
-# ---- Pictures of a calibration target with their stamps, from a recording whose cameras are known.
+# Views with stamps, from a rig whose cameras are calibrated.
 
 _MONO_HINT = "for one camera, give --camera a camchain without cam1"
 
 
 @dataclass(frozen=True, eq=False)
 class RigImages:
-    """rig: the cameras; before: T_imu_cam0 (4, 4) as it was given, if it was; doubt: how well the cameras are
-    known."""
+    """Images from a calibrated rig. given_T_imu_cam0 (4, 4): as given, if it was. uncertainty: of the
+    cameras."""
 
     name: str
     images: BoardImages
@@ -192,13 +190,16 @@ class RigImages:
 
 
 def open_rig_images(source: str, camera: str | None) -> RigImages:
-    """Of a recording, or a folder with cam0/STAMP.png. camera: a camchain or a folder with one, in place
-    of the source's own. Raises UsageError, ConfigError or DataError."""
+    """Open a recording, or a folder with cam0/STAMP.png. camera: a camchain, or a folder with one, in place
+    of the source's own.
+
+    Raises UsageError, ConfigError or DataError.
+    """
     path = None if camera is None else _camchain_file(camera)
     chain = None if path is None else str(path)
     first = open_board_images(source, (CAM0,), chain)
     if first.rig is None:
-        raise UsageError(f"{source}: does not say what its cameras are like; give --camera FILE")
+        raise UsageError(f"{source}: has no camera calibration; give --camera FILE")
     for name, cam in (("cam0", first.rig.cam0), ("cam1", first.rig.cam1)):
         if cam is not None and (why := rig_check.lens_problem(cam)) is not None:
             raise UsageError(f"{source if chain is None else chain}: {name}: {why}")
@@ -211,7 +212,8 @@ def open_rig_images(source: str, camera: str | None) -> RigImages:
 
 
 def _camchain_file(camera: str) -> Path:
-    """The file alone: with the IMU's beside it, a reader asks for extrinsics that are yet to be found."""
+    """Return the camchain alone: with the IMU chain beside it, a reader would need extrinsics, which are
+    yet unknown."""
     path = Path(camera) / CAMCHAIN if Path(camera).is_dir() else Path(camera)
     if not path.is_file():
         raise UsageError(f"--camera {camera}: no such file, or no {CAMCHAIN} in it")
@@ -219,8 +221,8 @@ def _camchain_file(camera: str) -> Path:
 
 
 class StampedViews(NamedTuple):
-    """stamps (F,) ns, rising, and views with at least one corner; looked: how many pictures were looked at;
-    dropped: how many show the board, but their stamps are not later than the one before."""
+    """stamps (F,) ns, rising, and views with at least one corner. images_searched: their number. dropped:
+    images that show the board, with stamps not later than the one before."""
 
     stamps: I64
     views: list[BoardView]
@@ -235,7 +237,7 @@ class StampedViews(NamedTuple):
 def find_stamped_views(
     source: RigImages, target: Target, every: int, on_progress: Callable[[int, int], None], workers: int = 1
 ) -> StampedViews:
-    """told: how many are done, of how many. Raises DataError."""
+    """Return the views with stamps. on_progress(done, total): images. Raises DataError."""
     views, sizes = find_views(source.images, target, every, on_progress, workers, source.rig.cam0.is_fisheye)
     cameras = [camera for camera in (source.rig.cam0, source.rig.cam1) if camera is not None]
     for cam, (size, camera) in enumerate(zip(sizes, cameras, strict=False)):
@@ -243,10 +245,10 @@ def find_stamped_views(
     with_target = [view for view in views if any(len(one) for one in view.detections)]
     if not with_target:
         raise DataError(
-            f"{source.name}: no board in {len(views)} pictures; is --target the board that was shown?"
+            f"{source.name}: no board in {len(views)} images; is --target the board that was shown?"
         )
     if not all(view.name.isdecimal() and int(view.name) < 2**63 for view in with_target):
-        raise DataError(f"{source.name}: pictures without stamps; name them cam0/STAMP.png, STAMP in ns")
+        raise DataError(f"{source.name}: images have no stamps; name them cam0/STAMP.png, STAMP in ns")
     stamps = np.array([int(view.name) for view in with_target], np.int64)
     later = stamps > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps[:-1]]))
     kept_views = [view for view, keep in zip(with_target, later, strict=True) if keep]
@@ -256,6 +258,6 @@ def find_stamped_views(
 def _check_size(name: str, cam: int, size: tuple[int, int], camera: Camera) -> None:
     if size != (camera.width, camera.height):
         raise DataError(
-            f"{name}: cam{cam}'s pictures are {size[0]}x{size[1]}, its calibration is of "
-            f"{camera.width}x{camera.height}; calibrate it as it records"
+            f"{name}: cam{cam}'s images are {size[0]}x{size[1]}, its calibration is for "
+            f"{camera.width}x{camera.height}; calibrate it at the recorded size"
         )

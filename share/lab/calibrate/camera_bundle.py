@@ -1,9 +1,9 @@
 """Calibration of one or two cameras from views of a flat target, by bundle adjustment.
 
-Found together: fx fy cx cy and the lens's coefficients of each camera, T_cam1_cam0 and a pose of the target
-in each view. Levenberg-Marquardt on the corners' reprojection errors; the poses, each of which meets only its
-own view, are eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern synthesis, 2000,
-section 6.1). Huber's weights hold back corners that were found wrongly.
+Estimated together: fx fy cx cy and the lens coefficients of each camera, T_cam1_cam0 and the target's pose in
+each view. Levenberg-Marquardt on the corners' reprojection errors with Huber weights; the poses, each coupled
+to its own view only, are eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern
+synthesis, 2000, section 6.1).
 """
 
 from __future__ import annotations
@@ -30,22 +30,25 @@ from share.lab.calibrate.corners import Detection, robust_sigma
 from share.lab.calibrate.target import Target
 from share.types import F64
 
-# ---- How far parameters that many views tell together may be off, also where a view's residuals err
-# together.
-
 
 def jackknife(H: F64, g: F64) -> F64:
-    """Covariance (S, S) of what V views tell together by H (V, S, S) and g (V, S) each, by how far it moves
-    without each of them (MacKinnon, Nielsen and Webb, *Cluster-robust inference*, 2023: CV3). Of few views
-    it knows few directions."""
+    """Return the covariance (S, S) of parameters that V views determine together by H (V, S, S) and g (V, S)
+    each, from how far the solution moves without each view (MacKinnon, Nielsen and Webb, *Cluster-robust
+    inference*, 2023: CV3).
+
+    With few views it has low rank.
+    """
     moved = np.linalg.solve(H.sum(axis=0) - H, g[..., None])[..., 0]
     out: F64 = (1 - 1 / len(H)) * moved.T @ moved
     return out
 
 
 def enclosing_covariance(one: F64, other: F64) -> F64:
-    """A covariance (S, S) in no direction below `one`, which is positive definite, nor below `other`: where
-    `one` is a unit ball, the principal axes of `other` that are shorter than 1 are made 1."""
+    """Return a covariance (S, S) that is in no direction below `one`, which is positive definite, nor below
+    `other`.
+
+    Where `one` is the unit ball, principal axes of `other` shorter than 1 become 1.
+    """
     root = np.linalg.cholesky(one)
     whitened = np.linalg.solve(root, np.linalg.solve(root, other).T)
     squares, axes = np.linalg.eigh((whitened + whitened.T) / 2)
@@ -56,14 +59,15 @@ def enclosing_covariance(one: F64, other: F64) -> F64:
 
 MIN_VIEWS = 4
 _MAX_ITERATIONS = 60
-_HUBER_SIGMAS = 2.5  # times the residuals' own spread
-_K3_SIGMAS = 3.0  # sigmas from 0 at which a fifth coefficient is told
-_MIN_RELATIVE_DECREASE = 1e-9  # relative fall of the cost at which it has arrived
+_HUBER_SIGMAS = 2.5  # times the residuals' robust sigma
+_K3_SIGMAS = 3.0  # k3 this far from 0 is significant
+_MIN_RELATIVE_DECREASE = 1e-9  # of the cost: converged below
 
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """One look at the target: corners of each camera, in the order of the cameras; none is an empty one."""
+    """One view of the target: the corners of each camera, in the order of the cameras, empty where it sees
+    none."""
 
     name: str
     detections: tuple[Detection, ...]
@@ -71,7 +75,7 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class CameraBundleState:
-    """What is sought. T_cam0_target: (V, 4, 4)."""
+    """The estimated state. T_cam0_target: (V, 4, 4)."""
 
     cameras: tuple[Camera, ...]
     T_cam1_cam0: F64
@@ -85,11 +89,13 @@ class CameraBundleState:
 
 @dataclass(frozen=True, eq=False)
 class CameraBundleSolution:
-    """`state`, with two covariances (S, S) of the intrinsics of each camera, see
-    `projection.parameter_names`, and, of
-    two, xi of T_cam1_cam0 Exp(xi): `independent`, if corners err so; `by_views`, as views contradict one
-    another. Of each view and camera the residuals (N, 2) px, seen less predicted; sigma_px: noise of a
-    coordinate."""
+    """The solution, with two covariances (S, S) of the shared parameters: each camera's intrinsics
+    (`camera_initialisation.parameter_names`) and, with two cameras, xi of T_cam1_cam0 Exp(xi).
+
+    `independent`: for independent corner errors. `by_views`: from how views contradict each other.
+    `residuals`: of each view and camera (N, 2) px, measured minus predicted. `sigma_px`: noise of a
+    coordinate.
+    """
 
     state: CameraBundleState
     independent: F64
@@ -99,30 +105,33 @@ class CameraBundleSolution:
 
     @property
     def covariance(self) -> F64:
-        """(S, S): in each direction the larger of both. Corners of a view err together: by a bent board, by
-        blur, by what a detector makes of a slant."""
+        """(S, S): in each direction the larger of both.
+
+        Corner errors within a view are correlated: by a bent board, by blur, by the detector's bias on
+        slanted boards.
+        """
         return enclosing_covariance(self.independent, self.by_views)
 
     @property
     def sigmas(self) -> F64:
-        """(S,): one sigma of each."""
+        """(S,): standard deviations."""
         return np.sqrt(np.diag(self.covariance))
 
 
 def calibrate_cameras(
     views: Sequence[BoardView], target: Target, size: tuple[int, int], model: str = RADTAN
 ) -> CameraBundleSolution:
-    """From views each of which `start.has_enough_corners` corners of one camera tell. size: (width, height)
-    of an image.
-    model: of the lenses. Radtan's k3 is taken where it is told, `_K3_SIGMAS` sigmas from 0 in one camera at
-    least, and a tracker can use it.
+    """Calibrate cameras from views each with enough corners for one camera (`has_enough_corners`).
 
-    Raises ValueError where the views are too few, or do not tell what is sought.
+    size: (width, height) of an image. model: of the lenses. Radtan's k3 is kept where it is significant,
+    `_K3_SIGMAS` sigmas from 0 in at least one camera, and the lens stays valid for tracking.
+
+    Raises ValueError where there are too few views, or they do not determine the parameters.
     """
     cams = len(views[0].detections) if views else 0
     single_solutions = [_calibrate_single(views, target, size, cam, model) for cam in range(cams)]
     if cams == 0:
-        raise ValueError("no view of the target")
+        raise ValueError("no view shows the target")
     initial = single_solutions[0][0]
     if cams == 2:
         initial = _initial_stereo(
@@ -135,7 +144,7 @@ def calibrate_cameras(
 def _with_k3(
     without_k3: CameraBundleSolution, views: Sequence[BoardView], target: Target
 ) -> CameraBundleSolution:
-    """The solution with a fifth coefficient, where it tells that one; else as it is."""
+    """Return the solution with k3 where that is significant and valid, else `without_k3`."""
     extended = [replace(camera, distortion=(*camera.distortion, 0.0)) for camera in without_k3.state.cameras]
     try:
         with_k3 = _solve(views, target, replace(without_k3.state, cameras=tuple(extended)))
@@ -152,7 +161,7 @@ def _with_k3(
 def reprojection_residuals(
     state: CameraBundleState, views: Sequence[BoardView], target: Target
 ) -> tuple[tuple[F64, ...], ...]:
-    """Of each view and camera the residuals (N, 2) px, seen less predicted."""
+    """Return residuals (N, 2) px of each view and camera, measured minus predicted."""
     return tuple(
         tuple(_linearise(state, view, k, cam, target)[0] for cam in range(len(state.cameras)))
         for k, view in enumerate(views)
@@ -160,27 +169,27 @@ def reprojection_residuals(
 
 
 def refit(state: CameraBundleState, views: Sequence[BoardView], target: Target) -> CameraBundleState:
-    """Poses of other views by cameras that are known: intrinsics and T_cam1_cam0 stay."""
+    """Estimate the target's poses in other views with fixed intrinsics and T_cam1_cam0."""
     poses = np.stack([_initial_pose(state, view, target) for view in views])
     return _solve(views, target, replace(state, T_cam0_target=poses), cameras_fixed=True).state
 
 
 def _board_points(view: BoardView, cam: int, target: Target) -> F64:
-    """Corners (N, 2) m on the target that a camera sees."""
+    """Return the corners (N, 2) m on the target that a camera sees."""
     return target.corners[view.detections[cam].ids, :2]
 
 
 def _calibrate_single(
     views: Sequence[BoardView], target: Target, size: tuple[int, int], cam: int, model: str
 ) -> tuple[CameraBundleState, list[int]]:
-    """One camera by itself, and which views it has."""
+    """Calibrate one camera alone; return its state and the rows of its views."""
     view_rows = [
         k
         for k, view in enumerate(views)
         if camera_initialisation.has_enough_corners(_board_points(view, cam, target))
     ]
     if len(view_rows) < MIN_VIEWS:
-        raise ValueError(f"cam{cam}: {len(view_rows)} views of the target; {MIN_VIEWS} are needed at least")
+        raise ValueError(f"cam{cam}: {len(view_rows)} views of the target; at least {MIN_VIEWS} are needed")
     camera_views = [BoardView(views[k].name, (views[k].detections[cam],)) for k in view_rows]
     boards = [_board_points(view, 0, target) for view in camera_views]
     initial_camera = (
@@ -199,7 +208,7 @@ def _calibrate_single(
 def _initial_stereo(
     singles: list[CameraBundleState], view_rows: list[list[int]], count: int
 ) -> CameraBundleState:
-    """Both cameras, where each begins where it ended alone."""
+    """Return initial values of both cameras from their single calibrations."""
     first, second = (
         dict(zip(k, s.T_cam0_target, strict=True)) for s, k in zip(singles, view_rows, strict=True)
     )
@@ -224,7 +233,7 @@ def _initial_pose(state: CameraBundleState, view: BoardView, target: Target) -> 
 def _linearise(
     state: CameraBundleState, view: BoardView, k: int, cam: int, target: Target
 ) -> tuple[F64, F64, F64, F64]:
-    """Residuals (N, 2) and the derivatives of what is predicted, by intrinsics (N, 2, I), by xi of
+    """Return residuals (N, 2) and derivatives of the prediction by intrinsics (N, 2, I), by xi of
     T_cam1_cam0 and by xi of T_cam0_target (N, 2, 6)."""
     detection = view.detections[cam]
     points, jacobian_pose = transform_with_jacobian(state.T_cam0_target[k], target.corners[detection.ids])
@@ -242,7 +251,8 @@ def _linearise(
 
 
 def _linearise_view(state: CameraBundleState, view: BoardView, k: int, target: Target) -> tuple[F64, F64]:
-    """Residuals (M, 2) of one view and derivatives (M, 2, S + 6): shared parameters, then its pose."""
+    """Return residuals (M, 2) of a view and derivatives (M, 2, S + 6) by shared parameters, then by its
+    pose."""
     cams = len(state.cameras)
     size = shared_size(state.cameras)
     rs, Js = [], []
@@ -259,20 +269,20 @@ def _linearise_view(state: CameraBundleState, view: BoardView, k: int, target: T
 
 
 def intrinsic_slices(cameras: Sequence[Camera]) -> tuple[slice, ...]:
-    """Where each camera's intrinsics are among the parameters that the views share."""
+    """Return where each camera's intrinsics are among the shared parameters."""
     ends = np.cumsum([0, *(len(parameter_names(camera)) for camera in cameras)]).tolist()
     return tuple(slice(a, b) for a, b in pairwise(ends))
 
 
 def shared_size(cameras: Sequence[Camera]) -> int:
-    """How many parameters the views share: intrinsics of each camera, and xi of T_cam1_cam0."""
+    """Return the number of shared parameters: intrinsics of each camera, and xi of T_cam1_cam0."""
     return int(intrinsic_slices(cameras)[-1].stop) + 6 * (len(cameras) - 1)
 
 
 def _solve(
     views: Sequence[BoardView], target: Target, state: CameraBundleState, cameras_fixed: bool = False
 ) -> CameraBundleSolution:
-    """Levenberg-Marquardt; the spread that Huber's weights go by is fixed in each of three runs."""
+    """Levenberg-Marquardt in three runs; each fixes the scale of Huber's weights."""
     for _ in range(3):
         blocks = [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
         limit = _HUBER_SIGMAS * robust_sigma(np.concatenate([r for r, _ in blocks]))
@@ -310,7 +320,7 @@ def _cost(blocks: list[tuple[F64, F64]], limit: float) -> float:
 
 
 def _normal_equations(block: tuple[F64, F64], limit: float) -> tuple[F64, F64]:
-    """H (S + 6, S + 6) and g (S + 6,) of one view, weighted by Huber."""
+    """Return H (S + 6, S + 6) and g (S + 6,) of one view, with Huber weights."""
     r, J = block
     root = np.sqrt(np.minimum(1, limit / np.maximum(np.linalg.norm(r, axis=1), 1e-12)))[:, None]
     A, b = (J * root[..., None]).reshape(-1, J.shape[2]), (r * root).reshape(-1)
@@ -320,7 +330,7 @@ def _normal_equations(block: tuple[F64, F64], limit: float) -> tuple[F64, F64]:
 def _solve_step(
     blocks: list[tuple[F64, F64]], limit: float, damping: float, cameras_fixed: bool
 ) -> tuple[F64, F64]:
-    """Of the shared parameters (S,) and of the poses (V, 6)."""
+    """Return the step of the shared parameters (S,) and of the poses (V, 6)."""
     H, g = _view_normal_equations(blocks, limit)
     S = H.shape[1] - 6
     reduced, back_substitution = _schur_complement(H, g, damping)
@@ -333,14 +343,14 @@ def _solve_step(
 
 
 def _view_normal_equations(blocks: list[tuple[F64, F64]], limit: float) -> tuple[F64, F64]:
-    """`_normal_equations` of each view: H (V, S + 6, S + 6) and g (V, S + 6)."""
+    """Return `_normal_equations` of all views: H (V, S + 6, S + 6) and g (V, S + 6)."""
     H, g = zip(*(_normal_equations(block, limit) for block in blocks), strict=True)
     return np.stack(H), np.stack(g)
 
 
 def _schur_complement(H: F64, g: F64, damping: float) -> tuple[F64, F64]:
-    """What each view tells of the shared parameters, its pose left free: H and g beside it, (V, S, S + 1);
-    and by how much its pose follows them, with where it goes by itself, (V, 6, S + 1)."""
+    """Eliminate each view's pose: return H and g of the shared parameters side by side, (V, S, S + 1), and
+    the back substitution of the pose by them, with its own step last, (V, 6, S + 1)."""
     S = H.shape[1] - 6
     Hpp = H[:, S:, S:] * (1 + damping * np.eye(6))
     back_substitution = np.linalg.solve(Hpp, np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
@@ -350,7 +360,7 @@ def _schur_complement(H: F64, g: F64, damping: float) -> tuple[F64, F64]:
 
 
 def _updated_state(state: CameraBundleState, shared: F64, poses: F64) -> CameraBundleState | None:
-    """None where a step leads to no camera."""
+    """Return the state after a step, None where that is no valid camera."""
     try:
         cameras = tuple(
             camera_from_parameters(intrinsics(camera) + shared[part], camera)

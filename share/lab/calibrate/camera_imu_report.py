@@ -1,4 +1,4 @@
-"""What `share calibrate camera-imu` leaves behind: Kalibr's chains, a report."""
+"""Output of `share calibrate camera-imu`: Kalibr's chains, a report and a chart of residuals."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ from share.lab.calibrate.corners import inlier_mask
 from share.recordings.calibration import Calibration, to_kalibr
 from share.types import F64, I64
 
-# ---- The residuals of a camera-IMU calibration over time, as a picture.
-
 _COLOURS = ("#00798c", "#d1495b", "#edae49")
 
 
 def residual_chart(fit: CameraImuFit, title: str) -> bytes:
-    """PNG: RMS of each picture's corners that were kept, and the residuals of gyroscope and accelerometer
-    with three sigmas of what they are said to have."""
+    """Return a PNG: RMS of each image's inlier corners, and the residuals of gyroscope and accelerometer
+    with three sigmas of the stated noise."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -57,7 +55,7 @@ def _draw_corners(panel: Any, fit: CameraImuFit) -> None:
         count = np.bincount(frames, minlength=size)
         rms = np.sqrt(np.bincount(frames, (r[inliers] ** 2).sum(axis=1), size) / np.maximum(count, 1))
         panel.plot(t[count > 0], rms[count > 0], ".", markersize=3, color=_COLOURS[cam], label=f"cam{cam}")
-    panel.set(ylabel="px", ylim=(0, None), title="corners, RMS of each picture")
+    panel.set(ylabel="px", ylim=(0, None), title="corners, RMS of each image")
     panel.legend(loc="upper right", fontsize=8)
     panel.grid(alpha=0.3)
 
@@ -78,9 +76,9 @@ REPORT, PICTURE = "camera-imu-report.json", "camera-imu-report.png"
 
 @dataclass(frozen=True, eq=False)
 class CameraImuCalibration:
-    """All that is told of one calibration. rig: the cameras as they were known, doubt: how well; before: how
-    T_imu_cam0 that was given compares; pictures: what was looked at; said: the cameras' calibration that was
-    given; serial: of the device."""
+    """All results of one calibration. rig: the calibrated cameras, with their uncertainty. comparison:
+    with a given T_imu_cam0. views: the images searched. given_calibration: of the cameras, as given.
+    serial: of the device."""
 
     fit: CameraImuFit
     verdict: CameraImuVerdict
@@ -106,8 +104,10 @@ class CameraImuCalibration:
 
 
 def camchain_yaml(outcome: CameraImuCalibration, source: str, report: str) -> str:
-    """Kalibr's camchain-imucam: intrinsics as they were, T_cam_imu and timeshift_cam_imu of each camera.
-    report: the name of the file that says why it failed."""
+    """Return Kalibr's camchain-imucam: intrinsics unchanged, T_cam_imu and timeshift_cam_imu of each camera.
+
+    report: name of the file with the reasons of a failure.
+    """
     chain = to_kalibr(outcome.calibrated_rig, outcome.given_calibration, outcome.serial)
     del chain["imu0"]
     for cam, T in enumerate(outcome.T_cam_imu):
@@ -118,13 +118,13 @@ def camchain_yaml(outcome: CameraImuCalibration, source: str, report: str) -> st
 
 
 def imu_chain_yaml(outcome: CameraImuCalibration, source: str) -> str:
-    """The IMU's noise as the recording has it, so that the folder is whole."""
+    """Return the IMU's noise as the recording states it, so that the folder is complete."""
     chain = {"imu0": to_kalibr(outcome.calibrated_rig, serial=outcome.serial)["imu0"]}
-    return f"# as it came with share calibrate camera-imu {source}\n" + yaml.safe_dump(chain, sort_keys=False)
+    return f"# unchanged by share calibrate camera-imu {source}\n" + yaml.safe_dump(chain, sort_keys=False)
 
 
 def report_values(outcome: CameraImuCalibration) -> dict[str, Any]:
-    """Plain data."""
+    """Return the report as plain data."""
     fit, verdict, comparison = outcome.fit, outcome.verdict, outcome.comparison
     return {
         "passed": verdict.passed,

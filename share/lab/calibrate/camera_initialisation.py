@@ -1,9 +1,9 @@
-"""Where the calibration begins: Zhang's closed form on homographies, without distortion.
+"""Initial values of a camera calibration: Zhang's closed form on homographies, without distortion.
 
-Each view of a flat target gives a homography H = K [r1 r2 t]; that r1 and r2 are orthonormal makes two
-equations linear in 1/fx^2 and 1/fy^2 when the principal point is taken at the image's middle (Zhang, A
-flexible new technique for camera calibration, PAMI 2000; the fixed middle as in Bouguet's toolbox). OpenCV
-only fits the homographies: normalised least squares, which there is no reason to write again.
+Each view of a flat target gives a homography H = K [r1 r2 t]. That r1 and r2 are orthonormal gives two
+equations linear in 1/fx^2 and 1/fy^2 with the principal point at the image's centre (Zhang, A flexible new
+technique for camera calibration, PAMI 2000; the fixed centre as in Bouguet's toolbox). OpenCV fits the
+homographies by normalised least squares.
 """
 
 from __future__ import annotations
@@ -20,20 +20,23 @@ from share.geometry.se3 import hat
 from share.types import F64
 
 MIN_CORNERS = 6
-_FISHEYE_FOCALS, _FISHEYE_TRIALS = (0.15, 1.5), 48  # focal lengths over the image's longer side
-_MIN_SINGULAR_RATIO = 1e-3  # of the largest singular value
+_FISHEYE_FOCALS = (0.15, 1.5)  # range of trial focal lengths over the image's longer side
+_FISHEYE_TRIALS = 48
+_MIN_SINGULAR_RATIO = 1e-3  # of the smallest singular value to the largest
 
 
 def initial_pinhole(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[int, int]) -> Camera:
-    """A camera without distortion from views of corners (N, 2) m and (N, 2) px. Raises ValueError where the
-    views do not tell its focal lengths."""
+    """Return a camera without distortion from views of corners (N, 2) m and (N, 2) px.
+
+    Raises ValueError where the views do not determine its focal lengths.
+    """
     middle = (np.array(size) - 1) / 2
     rows = [_focal_equations(homography(xy, px - middle)) for xy, px in zip(boards, pixels, strict=True)]
     A, b = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     inverse_squares = np.linalg.lstsq(A, b, rcond=None)[0]
     if not (np.isfinite(inverse_squares).all() and (inverse_squares > 0).all()):
         raise ValueError(
-            "the views do not tell the focal length: tilt the board against the camera; or is --target "
+            "the views do not determine the focal length: tilt the board against the camera; or is --target "
             "another board?"
         )
     fx, fy = inverse_squares**-0.5
@@ -41,7 +44,8 @@ def initial_pinhole(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[in
 
 
 def board_pose(camera: Camera, board: F64, px: F64) -> F64:
-    """T_cam_target (4, 4) of one view, closed form: [r1 r2 t] of the homography of normalised corners."""
+    """Return T_cam_target (4, 4) of one view in closed form: [r1 r2 t] of the homography of normalised
+    corners."""
     if camera.is_fisheye:
         return _pose_from_rays(camera.directions(px), board)
     H = homography(board, camera.normalise(px))
@@ -53,8 +57,11 @@ def board_pose(camera: Camera, board: F64, px: F64) -> F64:
 
 
 def initial_fisheye(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[int, int]) -> Camera:
-    """A fisheye camera without coefficients, its axis in the image's middle, from the same: of many focal
-    lengths the one by which the boards are flattest. Raises ValueError where none will do."""
+    """Return a fisheye camera without coefficients, its axis at the image's centre: the best of many trial
+    focal lengths.
+
+    Raises ValueError where none fits.
+    """
     best, lowest_cost = None, np.inf
     for f in np.geomspace(*_FISHEYE_FOCALS, _FISHEYE_TRIALS) * max(size):
         middle = (np.array(size) - 1) / 2
@@ -66,13 +73,14 @@ def initial_fisheye(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[in
             best, lowest_cost = camera, cost
     if best is None:
         raise ValueError(
-            "the views do not tell the focal length of a fisheye lens; is --target another board?"
+            "the views do not determine the focal length of a fisheye lens; is --target another board?"
         )
     return best
 
 
 def _reprojection_errors(camera: Camera, board: F64, px: F64) -> F64:
-    """(N,) by how much corners miss where a pose has them; inf where there is none."""
+    """Return the distances (N,) px of corners from their projections by a pose fitted to them; inf where
+    there is none."""
     if np.isnan(camera.directions(px)).any():
         return np.full(len(px), np.inf)
     T = board_pose(camera, board, px)
@@ -82,8 +90,10 @@ def _reprojection_errors(camera: Camera, board: F64, px: F64) -> F64:
 
 
 def _pose_from_rays(ray: F64, board: F64) -> F64:
-    """T_cam_target (4, 4) of unit vectors (N, 3), NaN unknown, to corners (N, 2) m: the direct linear
-    transform of ray x (H xy1) = 0, which also holds behind the camera."""
+    """Return T_cam_target (4, 4) from unit vectors (N, 3), NaN where unknown, to corners (N, 2) m.
+
+    Direct linear transform of ray x (H xy1) = 0, which holds behind the camera too.
+    """
     known = np.isfinite(ray).all(axis=1)
     ray, xy = ray[known], board[known]
     middle, scale = xy.mean(axis=0), float(xy.std())
@@ -101,8 +111,11 @@ def _pose_from_rays(ray: F64, board: F64) -> F64:
 
 
 def has_enough_corners(board: F64) -> bool:
-    """Whether corners (N, 2) m tell a homography: `MIN_CORNERS` of them, and neither all nor all but one on
-    one line. By the rank of the direct linear transform from the board to itself."""
+    """Return whether corners (N, 2) m determine a homography: at least `MIN_CORNERS`, and neither all nor all
+    but one on one line.
+
+    By the rank of the direct linear transform from the board to itself.
+    """
     if len(board) < MIN_CORNERS:
         return False
     points = np.column_stack([(board - board.mean(axis=0)) / board.std(), np.ones(len(board))])
@@ -113,7 +126,7 @@ def has_enough_corners(board: F64) -> bool:
 
 
 def homography(board: F64, image: F64) -> F64:
-    """(3, 3) from (N, 2) on the board to (N, 2) in the image, to scale, by least squares."""
+    """Return H (3, 3) from (N, 2) on the board to (N, 2) in the image, up to scale, by least squares."""
     H, _ = cv2.findHomography(np.ascontiguousarray(board), np.ascontiguousarray(image))
     if H is None:
         raise ValueError("the corners of a view lie on one line")
@@ -121,41 +134,43 @@ def homography(board: F64, image: F64) -> F64:
 
 
 def _focal_equations(H: F64) -> tuple[F64, F64]:
-    """A (2, 2), b (2,) of A (1/fx^2, 1/fy^2) = b: r1 . r2 = 0 and |r1| = |r2|, of one length."""
+    """Return A (2, 2), b (2,) of A (1/fx^2, 1/fy^2) = b: r1 . r2 = 0 and |r1| = |r2|."""
     H = H / np.linalg.norm(H[:, 0])
     (a, b), (c, d), (e, f) = H[:, :2]
     A = np.array([[a * b, c * d], [a * a - b * b, c * c - d * d]])
     return A, -np.array([e * f, e * e - f * f])
 
 
-# ---- Projection of a target's corners by a lens, and all its derivatives.
-#
-# Models and order of the coefficients as in `share.geometry.lens`: fx fy cx cy, then k1 k2 p1 p2 [k3] of
+# Projection with derivatives. Parameters as in `share.geometry.lens`: fx fy cx cy, then k1 k2 p1 p2 [k3] of
 # radtan, k1 k2 k3 k4 of equidistant.
 
 _RADTAN_NAMES, _EQUIDISTANT_NAMES = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
 
 
 def parameter_names(camera: Camera) -> tuple[str, ...]:
-    """Of its parameters, in order: as many as are sought with it."""
+    """Return the names of a camera's estimated parameters, in order."""
     coefficients = _EQUIDISTANT_NAMES if camera.model == EQUIDISTANT else _RADTAN_NAMES
     return "fx", "fy", "cx", "cy", *coefficients[: max(len(camera.distortion), 4)]
 
 
 def intrinsics(camera: Camera) -> F64:
-    """(I,): those of `parameter_names`."""
+    """Return the values (I,) of `parameter_names`."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *(camera.distortion or (0.0,) * 4)])
 
 
 def camera_from_parameters(parameters: F64, template: Camera) -> Camera:
-    """The camera of `parameters` (I,) with the images and the model of another. Raises ValueError."""
+    """Return a camera with `parameters` (I,) and the template's image size and lens model. Raises
+    ValueError."""
     fx, fy, cx, cy, *distortion = (float(value) for value in parameters)
     return Camera(template.width, template.height, fx, fy, cx, cy, tuple(distortion), template.model)
 
 
 def project_with_jacobians(camera: Camera, points: F64) -> tuple[F64, F64, F64]:
-    """Points (N, 3) in the camera frame -> px (N, 2), d px / d intrinsics (N, 2, I) and d px / d points
-    (N, 2, 3). What is out of the lens's range gives NaN: behind the camera, unless it is a fisheye."""
+    """Project points (N, 3) of the camera frame: px (N, 2), d px / d intrinsics (N, 2, I), d px / d points
+    (N, 2, 3).
+
+    NaN out of the lens's range: behind the camera, unless it is a fisheye.
+    """
     lens = lens_model(camera.model, camera.distortion or (0.0,) * 4)
     if not camera.is_fisheye:
         points = np.where(points[:, 2:] > 1e-6, points, np.nan)
@@ -172,8 +187,8 @@ def project_with_jacobians(camera: Camera, points: F64) -> tuple[F64, F64, F64]:
 
 
 def transform_with_jacobian(T: F64, points: F64) -> tuple[F64, F64]:
-    """T_a_b (..., 4, 4), points (..., 3) in b -> those in a, and their derivatives (..., 3, 6) by xi of
-    T Exp(xi)."""
+    """Transform points (..., 3) of frame b by T_a_b (..., 4, 4); return also the derivatives (..., 3, 6)
+    by xi of T_a_b Exp(xi)."""
     R = T[..., :3, :3]
     transformed = (R @ points[..., None])[..., 0] + T[..., :3, 3]
     return transformed, np.concatenate([-R @ hat(points), np.broadcast_to(R, (*points.shape, 3))], axis=-1)

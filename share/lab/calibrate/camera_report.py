@@ -1,4 +1,5 @@
-"""What `share calibrate camera` leaves behind: Kalibr's chain, a report, a picture."""
+"""Output of `share calibrate camera`: Kalibr's camchain, a report and a picture; and reading the report's
+covariance back."""
 
 from __future__ import annotations
 
@@ -26,14 +27,17 @@ from share.recordings.calibration import CAMCHAIN, Calibration, imu_noise, to_ka
 from share.types import F64
 
 REPORT, PICTURE = "camera-report.json", "camera-report.png"
-_MAX_ARROWS = 1500  # more hide each other
+_MAX_ARROWS = 1500  # more overlap
 
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """All that is told of one calibration. before: the cameras that the source came with; seen: views with
-    the target among all pictures looked at; pair_before_px: as the verdict's, by `previous_rig`; said: the
-    calibration that was given; serial: of the device."""
+    """All results of one calibration.
+
+    `previous_rig`: the cameras before; `previous_epipolar_px`: their median epipolar distance.
+    `views_with_target`: of all images searched. `given_calibration`: as given by the user. `serial`: of the
+    device.
+    """
 
     views: Sequence[BoardView]
     solution: CameraBundleSolution
@@ -46,20 +50,20 @@ class CameraCalibration:
     serial: str | None = None
 
     def corners_of(self, cam: int) -> tuple[F64, F64, np.ndarray]:
-        """Corners (N, 2) px of a camera, their residuals (N, 2) and which (N,) were kept."""
+        """Return a camera's corners (N, 2) px, their residuals (N, 2) and the inlier mask (N,)."""
         r = camera_residuals(self.solution, cam)
         px = np.concatenate([view.detections[cam].px for view in self.views])
         return px, r, inlier_mask(r, self.solution.sigma_px)
 
     def model_radius(self, cam: int) -> float | None:
-        """`corners.model_radius` of a camera, from its principal point."""
+        """Return `corners.model_radius` of a camera about its principal point."""
         px, _, inliers = self.corners_of(cam)
         camera = self.solution.state.cameras[cam]
         return model_radius(px, np.array([camera.cx, camera.cy]), inliers)
 
     @property
     def rig(self) -> Rig:
-        """The new cameras; where the body's IMU sits on cam0 is kept from before."""
+        """The new cameras; the pose of cam0 on the IMU is kept."""
         state = self.solution.state
         has_two = len(state.cameras) == 2
         rig = self.previous_rig or Rig(cam0=state.cameras[0], T_body_cam0=np.eye(4))
@@ -72,8 +76,11 @@ class CameraCalibration:
 
 
 def camchain_yaml(outcome: CameraCalibration, source: str, report: str) -> str:
-    """The camchain, with what was given of how the cameras sit on an IMU. The IMU's own noise is of another
-    file, `share calibrate imu` writes it. report: the name of the file that says why it failed."""
+    """Return the camchain, with the given extrinsics to the IMU. The IMU's noise is in another file, by
+    `share calibrate imu`.
+
+    `report`: name of the file with the reasons of a failure.
+    """
     kalibr = to_kalibr(outcome.rig, outcome.given_calibration, outcome.serial)
     chain = {key: value for key, value in kalibr.items() if key != "imu0"}
     if "T_cam_imu" in chain["cam0"] and "cam1" in chain:  # by the new pair
@@ -86,8 +93,10 @@ def camchain_yaml(outcome: CameraCalibration, source: str, report: str) -> str:
 
 
 def report_values(outcome: CameraCalibration) -> dict[str, Any]:
-    """Plain data: verdict, each camera, the mounting, each view. covariance: of the parameters of each camera
-    and, of two, xi of T_cam1_cam0 Exp(xi)."""
+    """Return plain data: verdict, each camera, extrinsics, each view.
+
+    covariance: of each camera's parameters and, with two, xi of T_cam1_cam0 Exp(xi).
+    """
     verdict = outcome.verdict
     out: dict[str, Any] = {
         "passed": verdict.passed,
@@ -118,11 +127,8 @@ def report_values(outcome: CameraCalibration) -> dict[str, Any]:
 
 def _camera_values(outcome: CameraCalibration, cam: int) -> dict[str, Any]:
     state = outcome.solution.state
-    camera, cover, sigmas = (
-        state.cameras[cam],
-        outcome.coverages[cam],
-        outcome.solution.sigmas[state.intrinsic_slices[cam]],
-    )
+    camera, cover = state.cameras[cam], outcome.coverages[cam]
+    sigmas = outcome.solution.sigmas[state.intrinsic_slices[cam]]
     return {
         "lens": camera.model,
         "parameters": dict(zip(parameter_names(camera), intrinsics(camera).tolist(), strict=True)),
@@ -137,9 +143,9 @@ def _camera_values(outcome: CameraCalibration, cam: int) -> dict[str, Any]:
 
 
 def parameter_table(outcome: CameraCalibration) -> list[list[str]]:
-    """Rows for a terminal: each parameter with its sigma, beside what was before."""
+    """Return rows for a terminal: each parameter with its sigma, beside the previous value."""
     state, previous_rig = outcome.solution.state, outcome.previous_rig
-    rows = [["", "", "found", "sigma", *(["before", "change"] if previous_rig else [])]]
+    rows = [["", "", "value", "sigma", *(["before", "change"] if previous_rig else [])]]
     previous_cameras = (previous_rig.cam0, previous_rig.cam1) if previous_rig else (None, None)
     for cam, camera in enumerate(state.cameras):
         previous, sigmas = previous_cameras[cam], outcome.solution.sigmas[state.intrinsic_slices[cam]]
@@ -182,8 +188,8 @@ def _baseline(outcome: CameraCalibration) -> list[str]:
 
 
 def residual_chart(outcome: CameraCalibration, title: str) -> bytes:
-    """PNG: of each camera where corners were seen and which way they miss (times 100), how the residuals
-    scatter, and the RMS of each view."""
+    """Return a PNG: of each camera the corners with their residuals (times 100), the residuals' scatter,
+    and the RMS of each view."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -222,7 +228,7 @@ def _draw_corners(panel: Any, outcome: CameraCalibration, cam: int) -> None:
             color="#d1495b",
             lw=1,
         )
-    panel.set(title=f"cam{cam}: {coverage.share:.0%} of the image; residuals × 100, × left out")
+    panel.set(title=f"cam{cam}: {coverage.share:.0%} of the image; residuals × 100, crosses: outliers")
 
 
 def _draw_scatter(panel: Any, outcome: CameraCalibration, cam: int) -> None:
@@ -230,9 +236,8 @@ def _draw_scatter(panel: Any, outcome: CameraCalibration, cam: int) -> None:
     limit = 6 * outcome.solution.sigma_px
     panel.plot(*r.T, ".", markersize=2, color="#00798c", alpha=0.4)
     title = (
-        f"{verdict.rms_px[cam]:.3f} px RMS, "
-        f"{verdict.rms_all_px[cam]:.3f} "
-        f"with {verdict.outlier_corners[cam]} left out"
+        f"{verdict.rms_px[cam]:.3f} px RMS, {verdict.rms_all_px[cam]:.3f} "
+        f"with {verdict.outlier_corners[cam]} outliers"
     )
     panel.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="px", title=title)
     panel.grid(alpha=0.3)
@@ -244,79 +249,83 @@ def _draw_views(panel: Any, outcome: CameraCalibration, cam: int) -> None:
         "#d1495b" if is_outlier else "#00798c" for is_outlier in outcome.verdict.is_outlier_view[:, cam]
     ]
     panel.bar(np.arange(len(rms)), np.nan_to_num(rms), color=colours)
-    panel.set(title="each view's RMS, outliers red", xlabel="view", ylabel="px")
+    panel.set(title="RMS of each view, outliers red", xlabel="view", ylabel="px")
     panel.set_ylim(0, 1.2 * float(np.nanpercentile(rms, 95)) + 0.05)
 
 
-# ---- Files of an earlier calibration in the folder that a new one writes to: none that is better is lost.
+# Files of an earlier calibration in the output folder are never replaced by a failed one.
 
 _FAILED_SUFFIX = ".failed"
 
 
 def output_paths(out: Path, passed: bool, *names: str) -> tuple[Path, ...]:
-    """Where files of one calibration go: under their names in `out`; or, if it is not to be believed and any
-    of them is there already, all beside them, as NAME.failed.EXT."""
+    """Return where to write files: under their names in `out`; or all as NAME.failed.EXT, if the calibration
+    failed and one of them exists.
+
+    A failed calibration never replaces an earlier one.
+    """
     paths = tuple(out / name for name in names)
     keeps_previous = not passed and any(path.exists() for path in paths)
     return tuple(failed_path(path) for path in paths) if keeps_previous else paths
 
 
 def failed_path(path: Path) -> Path:
-    """NAME.failed.EXT."""
+    """Return NAME.failed.EXT."""
     return path.with_name(path.stem + _FAILED_SUFFIX + path.suffix)
 
 
 def written_message(chain: Path) -> str:
-    """What `output_paths` came to for a camchain, for a person."""
+    """Return a message about where `output_paths` put a camchain."""
     return f"{chain} is written" + (
-        "" if chain.name == CAMCHAIN else f"; {CAMCHAIN} is kept as it was, and its report"
+        "" if chain.name == CAMCHAIN else f"; the existing {CAMCHAIN} and its report are kept"
     )
 
 
 def has_noise(chain: Path, noise: ImuNoise) -> bool:
-    """Whether an IMU chain, which is there, is of this noise."""
+    """Return whether an existing IMU chain has this noise."""
     try:
         return imu_noise(read_yaml(chain).section("imu0"), "update_rate") == noise
-    except ConfigError:  # damaged, and perhaps the only one of its kind
+    except ConfigError:  # damaged, but perhaps the only copy
         return False
 
 
 def has_target(file: Path, target: Target) -> bool:
-    """Whether a target's file, which is there, is of this target."""
+    """Return whether an existing target file is of this target."""
     try:
         return read_target(file) == target
     except ConfigError:
         return False
 
 
-# ---- How far the cameras of a camchain may be off, by what `share calibrate camera` left beside it.
+# Uncertainty of a camchain's cameras, from the report of `share calibrate camera` beside it.
 
-_TOLERANCE = 1e-9  # what a file may do to a number
+_TOLERANCE = 1e-9  # of numbers written to a file and read back
 
 
 @dataclass(frozen=True, eq=False)
 class RigUncertainty:
-    """covariance (P, P) in the order of `bundle.CameraBundleSolution`, None where nobody told it; where: the
-    report that did, or why none; passed: whether that report believes its cameras."""
+    """How well cameras are known. `covariance` (P, P) in the order of `CameraBundleSolution`, None where
+    unknown. `source`: the report, or why there is none. `passed`: whether that calibration passed."""
 
     covariance: F64 | None
     source: str
     passed: bool = True
 
 
-UNKNOWN_UNCERTAINTY = RigUncertainty(None, "the recording's own calibration does not tell it")
+UNKNOWN_UNCERTAINTY = RigUncertainty(None, "the recording's calibration has no covariance")
 
 
 def read_rig_uncertainty(chain: Path, rig: Rig) -> RigUncertainty:
-    """Of the cameras `rig` that were read from `chain`. A report that is of others tells nothing of them.
+    """Read the uncertainty of the cameras `rig`, which come from `chain`, from the report beside it. A report
+    of other cameras is ignored.
 
-    Raises DataError for one that is damaged.
+    Raises DataError for a damaged report.
     """
     report = chain.with_name(REPORT)
     for path in (report, failed_path(report)):
         if path.is_file() and (uncertainty := _read_uncertainty(path, rig)):
             return uncertainty
-    return RigUncertainty(None, f"beside {chain} is no {REPORT} of these cameras")
+    return RigUncertainty(None, f"no {REPORT} of these cameras beside {chain}")
 
 
 def _read_uncertainty(path: Path, rig: Rig) -> RigUncertainty | None:
@@ -343,7 +352,7 @@ def _cameras(rig: Rig) -> list[Camera]:
 
 
 def _is_same_rig(report: dict[str, Any], rig: Rig) -> bool:
-    """Whether a report is of these very numbers."""
+    """Return whether a report is of exactly these cameras."""
     cameras = _cameras(rig)
     if len(report["cameras"]) != len(cameras):
         return False

@@ -1,4 +1,5 @@
-"""Whether a calibration may be believed, and why not."""
+"""Check a camera calibration: does it pass, and if not, what to do. Also coverage and choice of views, and
+epipolar distances."""
 
 from __future__ import annotations
 
@@ -17,14 +18,14 @@ from share.lab.calibrate.target import Target
 from share.types import F64, I64
 
 _MAX_OUTLIER_SHARE = 0.05
-_OUTLIER_MADS = 5.0  # times the spread of the views' RMS
-_MAD = 1.4826
+_OUTLIER_MADS = 5.0
+_MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
 
 
 @dataclass(frozen=True)
 class CameraLimits:
-    """What passes. rms_px: of the corners that are kept; focal: sigma over focal length; covered: of the
-    image's cells; views: at least; pair_px: from epipolar lines."""
+    """Limits to pass. rms_px: of inlier corners. epipolar_px: median distance from epipolar lines.
+    focal_sigma_ratio: sigma over focal length. coverage: of the image's cells, at least. views: at least."""
 
     rms_px: float = 0.5
     epipolar_px: float = 0.3
@@ -35,10 +36,12 @@ class CameraLimits:
 
 @dataclass(frozen=True, eq=False)
 class CameraVerdict:
-    """reasons: what fails, none where it passes; rms_px: of each camera, of the corners kept; rms_all_px: of
-    all; wrong: how many were not kept; view_rms (V, cameras) px, NaN where a camera saw nothing, and which
-    of these are outlying; pair_px: that half of what both cameras saw lies from its epipolar lines, None of
-    one."""
+    """reasons: of a failure, empty if it passes. rms_px of each camera's inlier corners, rms_all_px of all;
+    number of outlier corners.
+
+    view_rms (V, cameras) px, NaN where a camera saw no corner, and which of these are outliers. epipolar_px:
+    median distance of common corners from their epipolar lines, None with one camera.
+    """
 
     reasons: tuple[str, ...]
     rms_px: tuple[float, ...]
@@ -50,7 +53,7 @@ class CameraVerdict:
 
     @property
     def outlier_views(self) -> tuple[int, ...]:
-        """Rows of views that outlie in any camera."""
+        """Rows of views that are outliers in any camera."""
         return tuple(np.flatnonzero(self.is_outlier_view.any(axis=1)).tolist())
 
     @property
@@ -64,8 +67,10 @@ def judge_cameras(
     stereo_views: Sequence[BoardView] = (),
     limits: CameraLimits = CameraLimits(),
 ) -> CameraVerdict:
-    """Of a solution and what each camera's views cover. pairs: all views in which two cameras saw the board,
-    also those that had no part in the solution."""
+    """Check a solution and the coverage of each camera's views.
+
+    stereo_views: all views in which two cameras saw the board, used in the solution or not.
+    """
     cams = range(len(solution.state.cameras))
     view_rms = np.array([[corners.rms(view[cam]) for cam in cams] for view in solution.residuals])
     residuals_of = [camera_residuals(solution, cam) for cam in cams]
@@ -90,10 +95,8 @@ def judge_cameras(
     )
     if epipolar_px is not None and not epipolar_px <= limits.epipolar_px:
         reasons.append(
-            f"the pair: half of the "
-            f"corners are {epipolar_px:.2f} "
-            f"px or more off their epipolar lines, at most "
-            f"{limits.epipolar_px:g}: do both cameras expose at once, is one loose?"
+            f"stereo pair: median distance of corners from their epipolar lines is {epipolar_px:.2f} px, at "
+            f"most {limits.epipolar_px:g} allowed: do both cameras expose at once, is one loose?"
         )
     return CameraVerdict(
         tuple(reasons), rms, rms_all, outliers, view_rms, _outlier_views(view_rms), epipolar_px
@@ -113,38 +116,36 @@ def _failures(
         out.append(f"cam{cam}: {views} views, {limits.views} needed")
     if not rms <= limits.rms_px:
         out.append(
-            f"cam{cam}: {rms:.2f} px RMS, at most {limits.rms_px:g}: blur, a bent board or a wrong --target"
+            f"cam{cam}: {rms:.2f} px RMS, at most {limits.rms_px:g} allowed: are the images blurred, the "
+            "board bent, or --target wrong?"
         )
     if unfit > _MAX_OUTLIER_SHARE * corners:
         out.append(
             f"cam{cam}: {unfit} of {corners} corners do not fit within {limits.rms_px:g} px, at most "
-            f"{_MAX_OUTLIER_SHARE:.0%}"
+            f"{_MAX_OUTLIER_SHARE:.0%} allowed"
         )
     if not focal_sigma_ratio <= limits.focal_sigma_ratio:
         out.append(
-            f"cam{cam}: focal length known to {focal_sigma_ratio:.2%}, "
-            f"{limits.focal_sigma_ratio:.2%} "
-            f"needed: tilt the board more"
+            f"cam{cam}: focal length known to {focal_sigma_ratio:.2%}, {limits.focal_sigma_ratio:.2%} "
+            "needed: tilt the board more"
         )
     return out
 
 
 def camera_residuals(solution: CameraBundleSolution, cam: int) -> F64:
-    """(N, 2) px of a camera, over all views."""
+    """Return a camera's residuals (N, 2) px over all views."""
     return np.concatenate([view[cam] for view in solution.residuals])
 
 
 def _outlier_views(view_rms: F64) -> NDArray[np.bool_]:
-    """Whose RMS (V, cameras) is beyond median + 5 MAD of a camera's."""
+    """Return which RMS (V, cameras) are beyond median + 5 MAD of their camera."""
     middle = np.nanmedian(view_rms, axis=0)
     spread = _MAD * np.nanmedian(np.abs(view_rms - middle), axis=0)
     return np.asarray(view_rms > middle + _OUTLIER_MADS * spread)
 
 
-# ---- What the views of a target cover, what is missing, and which of many views to take.
-#
-# Intrinsics are told by corners in all of the image, by boards that lean to each side (else focal length and
-# distance are one), and by near and far ones.
+# Coverage and choice of views. Intrinsics need corners in the whole image, boards tilted to each side (else
+# focal length and distance are not separable), and near and far boards.
 
 CELL_GRID = (6, 8)  # rows and columns of cells in which corners are counted
 _REGION_NAMES = (
@@ -153,14 +154,14 @@ _REGION_NAMES = (
     ("lower left corner", "lower edge", "lower right corner"),
 )
 _MIN_TILT_DEG = 15.0
-_TILT_WEIGHT = 3.0  # of how a board lies, in cells
-_TIME_WEIGHT = 10.0  # of its stretch of the recording: neighbours are nearly copies, and err alike
+_TILT_WEIGHT = 3.0  # of tilt and size, relative to one cell
+_TIME_WEIGHT = 10.0  # of the part of the recording: neighbours are nearly copies with equal errors
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Of one camera and the V views that it sees. cells: corners in each cell of `CELL_GRID`; leans (V, 2):
-    the board's lean about the image's y and x, rad; distances (V,): m."""
+    """Coverage by one camera's V views. cells: corners in each cell of `CELL_GRID`. tilts (V, 2): of the
+    board about the image's y and x, rad. distances (V,): m."""
 
     cells: I64
     tilts: F64
@@ -168,12 +169,12 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """Of the cells that hold a corner."""
+        """Fraction of the cells with a corner."""
         return float((self.cells > 0).mean())
 
     @property
     def gaps(self) -> tuple[str, ...]:
-        """In words, what a person should show the camera."""
+        """Views that are missing, as instructions for a person."""
         regions = self.cells.reshape(3, 2, 8)
         columns = (slice(0, 2), slice(2, 6), slice(6, 8))
         empty = [
@@ -189,23 +190,24 @@ class Coverage:
                 if not is_tilted.any():
                     out.append(f"no view with the board's {name} side {_MIN_TILT_DEG:.0f} degrees nearer")
         if self.distances.max() < 1.3 * self.distances.min():
-            out.append("all views are from one distance: go nearer and farther")
+            out.append("all views are from one distance: move nearer and farther")
         return tuple(out)
 
 
 def coverage(pixels: Sequence[F64], T_cam_target: F64, target: Target, size: tuple[int, int]) -> Coverage:
-    """Of the corners (N, 2) px of each view, and its pose (V, 4, 4); what it does not see does not count."""
+    """Return the coverage by corners (N, 2) px of each view and its pose (V, 4, 4); empty views do not
+    count."""
     T_cam_target = T_cam_target[[len(px) > 0 for px in pixels]]
     middle = np.append(target.extent.mean(axis=0), 0)
     centres = T_cam_target[:, :3, :3] @ middle + T_cam_target[:, :3, 3]
-    normal = -T_cam_target[:, :3, 2]  # away from who looks
+    normal = -T_cam_target[:, :3, 2]  # away from the viewer
     tilts = np.arctan2(normal[:, :2], normal[:, 2:])
     cells = np.bincount(cell_numbers(np.concatenate(pixels), size), minlength=CELL_GRID[0] * CELL_GRID[1])
     return Coverage(cells.reshape(CELL_GRID), tilts, np.linalg.norm(centres, axis=1))
 
 
 def cell_numbers(px: F64, size: tuple[int, int]) -> I64:
-    """Number of the cell (N,) of each pixel (N, 2), along rows."""
+    """Return the number of the cell (N,) of each pixel (N, 2), along rows."""
     column, row = np.clip(px / size * CELL_GRID[::-1], 0, np.array(CELL_GRID[::-1]) - 1).astype(np.int64).T
     return np.asarray(row * CELL_GRID[1] + column, np.int64)
 
@@ -213,12 +215,13 @@ def cell_numbers(px: F64, size: tuple[int, int]) -> I64:
 def choose_views(
     views: Sequence[BoardView], target: Target, size: tuple[int, int], max_views: int
 ) -> list[int]:
-    """Which views, rising, at most `max_views`: one after another the one that adds most of what is still
-    rare, cells of the image, ways a board lies in it, stretches of the recording (views are in its order)."""
+    """Return rows of at most `max_views` views, rising. Greedy: each time the view that adds most of what
+    is still rare among image cells, board tilts, board sizes and parts of the recording (`views` are in
+    its order)."""
     view_classes = [_view_classes(view, target, size) for view in views]
     for k, classes in enumerate(view_classes):
         if classes:
-            classes["stretch", k * max_views // len(views)] = _TIME_WEIGHT
+            classes["time", k * max_views // len(views)] = _TIME_WEIGHT
     counts: dict[object, int] = {}
     chosen_rows: list[int] = []
     left = [k for k, classes in enumerate(view_classes) if classes]
@@ -235,7 +238,8 @@ def choose_views(
 
 
 def _view_classes(view: BoardView, target: Target, size: tuple[int, int]) -> dict[object, float]:
-    """What a view has to say, with weights: cells, and classes of lean and size by its homography."""
+    """Return what a view contributes, with weights: its cells, and classes of tilt and size by its
+    homography."""
     out: dict[object, float] = {}
     for cam, detection in enumerate(view.detections):
         board = target.corners[detection.ids, :2]
@@ -246,21 +250,23 @@ def _view_classes(view: BoardView, target: Target, size: tuple[int, int]) -> dic
         H = homography(board, (detection.px - np.array(size) / 2) / max(size))
         H = H / H[2, 2]
         tilt = np.clip(np.round(H[2, :2] / 0.25), -2, 2).astype(int)
-        out[cam, "lean", *tilt.tolist()] = _TILT_WEIGHT
+        out[cam, "tilt", *tilt.tolist()] = _TILT_WEIGHT
         out[cam, "size", round(np.log2(abs(np.linalg.det(H[:2, :2]))))] = _TILT_WEIGHT
     return out
 
 
-# ---- How well two cameras agree on where a corner can be, whatever the board is like.
-#
-# A corner of cam0 leaves a line on which cam1 must see it (Hartley and Zisserman, Multiple View Geometry,
-# 9.2). By how much it misses that line says nothing of the board's shape or pose, so pictures that had no
-# part in the calibration are a check of it, too. It is what stereo matching suffers from: rows that are off.
+# Epipolar distances. A corner of cam0 defines a line on which cam1 must see it (Hartley and Zisserman,
+# Multiple View Geometry, 9.2). The distance from that line does not depend on the board's shape or pose, so
+# images that were not used in the calibration check it too. It is also the row error that stereo matching
+# suffers from.
 
 
 def epipolar_distances(cam0: Camera, cam1: Camera, T_cam1_cam0: F64, views: Sequence[BoardView]) -> F64:
-    """(N,) px of cam1 without its distortion, signed: each corner that both saw, from the line on which
-    cam0's puts it. Of fisheye lenses px of the image, of those corners that have normalised coordinates."""
+    """Return signed distances (N,), undistorted px of cam1, of corners that both cameras saw from their
+    epipolar lines.
+
+    For fisheye lenses: px of the image, for corners with normalised coordinates only.
+    """
     pairs = [_common_corners(view) for view in views]
     px0, px1 = (np.concatenate([pair[cam] for pair in pairs] or [np.empty((0, 2))]) for cam in (0, 1))
     lines = rays(cam0.normalise(px0)) @ (hat(T_cam1_cam0[:3, 3]) @ T_cam1_cam0[:3, :3]).T
@@ -279,13 +285,13 @@ def epipolar_distances(cam0: Camera, cam1: Camera, T_cam1_cam0: F64, views: Sequ
 
 
 def median_epipolar_px(cam0: Camera, cam1: Camera, T_cam1_cam0: F64, views: Sequence[BoardView]) -> float:
-    """px that half of the corners stay within: a few that were found wrongly change nothing. NaN of none."""
+    """Return the median distance, px, which a few wrong corners do not change. NaN without common corners."""
     distances = np.abs(epipolar_distances(cam0, cam1, T_cam1_cam0, views))
     return float(np.median(distances)) if len(distances) else float("nan")
 
 
 def _common_corners(view: BoardView) -> tuple[F64, F64]:
-    """Where cam0 and cam1 saw the same corners, (N, 2) px each."""
+    """Return the pixels (N, 2) of cam0 and of cam1 of the corners that both saw."""
     one, other = view.detections
     _, rows0, rows1 = np.intersect1d(one.ids, other.ids, assume_unique=True, return_indices=True)
     return one.px[rows0], other.px[rows1]

@@ -1,7 +1,7 @@
-"""Corners of a calibration target in an image, by their ids.
+"""Detect corners of a calibration target in an image, with their ids.
 
-OpenCV finds and reads the markers; which corner is which, and how an AprilGrid's are refined, is written down
-in docs/calibration-boards.md. Partial views are well: every corner that is seen counts on its own.
+OpenCV detects the markers; corner ids and the refinement of an AprilGrid's corners:
+docs/calibration-boards.md. Partial views are fine: every visible corner counts.
 """
 
 from __future__ import annotations
@@ -17,16 +17,14 @@ from numpy.typing import NDArray
 from share.lab.calibrate.target import AprilGrid, CharucoBoard, Target
 from share.types import F64, I64, U8
 
-_CORNER_ORDER = [1, 0, 3, 2]  # OpenCV's corners of a tag in the order of ours
-_HALF_WINDOW = (
-    0.4  # of the gap: half the window in which a corner is refined; more of it sees the next corner
-)
-_MIN_TAGS = 6  # tags; four make a homography, and one of them may be wrong
+_CORNER_ORDER = [1, 0, 3, 2]  # OpenCV's corners of a tag in the order of AprilGrid's
+_HALF_WINDOW = 0.4  # half the refinement window over the gap; a larger one contains the next corner
+_MIN_TAGS = 6  # four make a homography, and one of them may be wrong
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """ids (N,): rows of `target.corners`, rising, each once; px (N, 2): where they are, of centres at
+    """ids (N,): rows of `target.corners`, rising, unique. px (N, 2): pixel coordinates, pixel centres at
     integers."""
 
     ids: I64
@@ -37,8 +35,8 @@ class Detection:
 
 
 def detector(target: Target, fisheye: bool = False) -> Callable[[U8], Detection]:
-    """What finds this target's corners in a gray image (H, W), of a fisheye lens or not; none found is an
-    empty Detection."""
+    """Return a function that detects this target's corners in a gray image (H, W) of a fisheye lens or
+    not; empty if none."""
     return (
         _aprilgrid_detector(target, fisheye) if isinstance(target, AprilGrid) else _charuco_detector(target)
     )
@@ -48,7 +46,7 @@ def _aprilgrid_detector(grid: AprilGrid, fisheye: bool) -> Callable[[U8], Detect
     options = cv2.aruco.DetectorParameters()
     options.markerBorderBits = 2
     options.errorCorrectionRate = 1.0  # 5 bits: any two tags of the family differ in 11
-    options.perspectiveRemovePixelPerCell = 8  # these three find a sixth more of the tags on EuRoC's boards
+    options.perspectiveRemovePixelPerCell = 8  # these three detect a sixth more tags on EuRoC's boards
     options.perspectiveRemoveIgnoredMarginPerCell = 0.3
     options.minMarkerDistanceRate = 0.01
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -61,15 +59,18 @@ def _aprilgrid_detector(grid: AprilGrid, fisheye: bool) -> Callable[[U8], Detect
         found = np.asarray(tags).reshape(-1)
         px = np.asarray(quads, np.float32).reshape(-1, 4, 2)[:, _CORNER_ORDER]
         found, px = _unique_tags(found, px, grid.rows * grid.cols)
-        there = np.ones(len(found), bool) if fisheye else _are_consistent(grid.tags[found], px)
-        return _refined_corners(image, grid, 4 * found[there, None] + np.arange(4), px[there])
+        is_valid = np.ones(len(found), bool) if fisheye else _are_consistent(grid.tags[found], px)
+        return _refined_corners(image, grid, 4 * found[is_valid, None] + np.arange(4), px[is_valid])
 
     return find
 
 
 def _unique_tags(tag_ids: np.ndarray, px: np.ndarray, tags: int) -> tuple[np.ndarray, np.ndarray]:
-    """Tags (N,) and their corners (N, 4, 2) px, each once. One that is large is found at several thresholds:
-    its largest outline is its border. One in two places is not believed."""
+    """Return each tag (N,) once, with its corners (N, 4, 2) px.
+
+    A large tag is detected at several thresholds; its largest outline is its border. A tag detected in two
+    places is rejected.
+    """
     middle = px.mean(axis=1)
     sides = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2).mean(axis=1)
     keep = []
@@ -82,8 +83,11 @@ def _unique_tags(tag_ids: np.ndarray, px: np.ndarray, tags: int) -> tuple[np.nda
 
 
 def _are_consistent(tags: F64, px: np.ndarray) -> np.ndarray:
-    """Which tags (N, 2) m, seen with corners (N, 4, 2) px, lie where the others say: within half a tag of a
-    homography. Lenses bend by less; a tag read wrongly lies elsewhere. Too few to tell by are believed."""
+    """Return which tags (N, 2) m, with corners (N, 4, 2) px, lie within half a tag of a common homography.
+
+    Lens distortion is smaller than that; a misread tag lies elsewhere. With too few tags to check, all are
+    kept.
+    """
     if len(tags) < _MIN_TAGS:
         return np.ones(len(tags), bool)
     half = np.median(np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2)) / 2
@@ -92,11 +96,12 @@ def _are_consistent(tags: F64, px: np.ndarray) -> np.ndarray:
 
 
 def _refined_corners(image: U8, grid: AprilGrid, ids: I64, px: np.ndarray) -> Detection:
-    """Tags (N, 4) of corners (N, 4, 2), where their edges meet.
+    """Refine the corners (N, 4, 2) px of tags with corner ids (N, 4), where their edges meet.
 
-    A quad often reaches into the black square at its corner, by more than a window. So each corner is looked
-    for a second time, from where its neighbours say it is. These err, too, at the border of a board that a
-    lens bends: where that leads to no saddle, the first is taken, if it is one and no other corner is meant.
+    A quad often reaches into the black square at its corner, by more than a window. So each corner is refined
+    a second time, from its prediction by its neighbours. Predictions err too, at the border of a board under
+    strong distortion: where the second is no saddle, the first is taken, if it is a saddle and near the
+    prediction.
     """
     shortest = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2).min(axis=1, initial=np.inf)
     halves = np.repeat(np.round(_HALF_WINDOW * grid.tag_spacing * shortest).astype(int), 4)
@@ -133,55 +138,59 @@ def _no_detection() -> Detection:
     return Detection(np.empty(0, np.int64), np.empty((0, 2)))
 
 
-# ---- What residuals of corners (N, 2) px say: how much they scatter, and which were found wrongly.
+# Robust statistics of residuals (N, 2) px.
 
-MIN_SIGMA_PX = 0.01  # px: below this corners are not found, whatever the residuals say
-_INLIER_SIGMAS = 5.0  # sigmas beyond which a corner counts as found wrongly
-_MIN_EXCESS = 15  # corners, left out more than kept, tell where a lens is no longer of its model
+MIN_SIGMA_PX = 0.01  # no detection is more precise, whatever the residuals
+_INLIER_SIGMAS = 5.0
+_MIN_EXCESS = 15  # outliers in excess of inliers that show where the lens model does not fit
 
 
 def robust_sigma(residuals: F64) -> float:
-    """Of one coordinate, px, by the median distance: 1.1774 sigma of two normal ones."""
+    """Return sigma of one coordinate, px, from the median distance: 1.1774 sigma for two normal
+    coordinates."""
     return max(float(np.median(np.linalg.norm(residuals, axis=1))) / 1.1774, MIN_SIGMA_PX)
 
 
 def inlier_mask(residuals: F64, sigma_px: float) -> NDArray[np.bool_]:
-    """Which (N,) are of corners that were not found wrongly. sigma_px: of one coordinate."""
+    """Return which corners (N,) are inliers. sigma_px: of one coordinate."""
     return np.asarray(np.linalg.norm(residuals, axis=1) <= _INLIER_SIGMAS * sigma_px)
 
 
 def count_outliers(residuals: F64, sigma_px: float, min_px: float) -> int:
-    """How many are beyond what is kept and beyond `min_px`: near the camera corners are found so well that
-    those of a board far away look wrong beside them, and are none the worse."""
+    """Return the number of outliers beyond `min_px`: near corners are so precise that far ones look like
+    outliers beside them, but are good enough."""
     is_far = np.linalg.norm(residuals, axis=1) > min_px
     return int((is_far & ~inlier_mask(residuals, sigma_px)).sum())
 
 
 def rms(residuals: F64) -> float:
-    """Of the distances, px; NaN of none."""
+    """Return the rms distance, px; NaN of none."""
     return float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else float("nan")
 
 
 def model_radius(px: F64, centre: F64, inliers: NDArray[np.bool_]) -> float | None:
-    """px from the `centre` (2,) beyond which corners (N, 2) px were mostly not kept (N,): there the lens is
-    not of its model. The place at which those that were not outnumber the others most; None where by few."""
+    """Return the radius, px from the `centre` (2,), beyond which most corners (N, 2) px are outliers (N,):
+    there the lens model does not fit.
+
+    It is where outliers outnumber inliers most; None if by few.
+    """
     distances = np.linalg.norm(px - centre, axis=1)
     by_distance = np.argsort(-distances, kind="stable")
-    excess = np.cumsum(np.where(inliers[by_distance], -1, 1))  # left out than kept, beyond each
+    excess = np.cumsum(np.where(inliers[by_distance], -1, 1))  # outliers minus inliers from each outwards
     edge = int(excess.argmax()) if len(excess) else 0
     return float(distances[by_distance[edge]]) if len(excess) and excess[edge] >= _MIN_EXCESS else None
 
 
-# ---- Corners where four fields meet, two dark and two bright: saddles of brightness.
+# Corners where two dark and two bright fields meet: saddles of brightness.
 
-_MIN_HALF_WINDOW_PX = 2  # half a window below this refines nothing
+_MIN_HALF_WINDOW_PX = 2  # a smaller window refines nothing
 _STOP_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
-_CIRCLE_SAMPLES = 16  # places on a circle, an even number
+_CIRCLE_SAMPLES = 16  # even
 
 
 def refine_corners(image: U8, px: np.ndarray, half_windows: I64) -> F64:
-    """Corners (N, 2) moved to the saddle in a window of 2 half + 1; NaN where it leaves its window or the
-    image, or is too small."""
+    """Move corners (N, 2) to the saddle in a window of 2 half + 1; NaN where one leaves its window or the
+    image, or the window is too small."""
     limits = np.array(image.shape[::-1]) - 1 - half_windows[:, None]
     fits = ((px >= half_windows[:, None]) & (px <= limits)).all(axis=1) & (
         half_windows >= _MIN_HALF_WINDOW_PX
@@ -192,14 +201,17 @@ def refine_corners(image: U8, px: np.ndarray, half_windows: I64) -> F64:
         start = np.ascontiguousarray(px[rows], np.float32)
         moved = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), _STOP_CRITERIA).reshape(-1, 2)
         step = np.linalg.norm(moved - start, axis=1)
-        is_moved = (step > 0) & (step < half)  # OpenCV gives the start itself where it would go too far
+        is_moved = (step > 0) & (step < half)  # OpenCV returns the start where it would go too far
         out[rows] = np.where(is_moved[:, None], moved, np.nan)
     return out
 
 
 def saddle_mask(image: U8, px: F64, radii: I64) -> np.ndarray:
-    """Which (N,) of corners (N, 2) look the same when turned by half a turn, by brightness on circles of
-    `radii` (N,) px: a saddle does, in any perspective; the corner of one dark field does not. No NaN does."""
+    """Return which corners (N, 2) are saddles: their brightness on circles of `radii` (N,) px is the same
+    after half a turn.
+
+    A saddle's is, in any perspective; that of a single dark corner is not. False for NaN.
+    """
     out, known = np.zeros(len(px), bool), np.isfinite(px).all(axis=1)
     if not known.any():
         return out
@@ -210,43 +222,44 @@ def saddle_mask(image: U8, px: F64, radii: I64) -> np.ndarray:
     opposite = np.roll(brightness, _CIRCLE_SAMPLES // 2, axis=1)
     even_part = (brightness + opposite) / 2
     even = ((even_part - even_part.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
-    odd = ((brightness - opposite) ** 2).sum(axis=1) / 4
-    out[known] = odd < even
+    odd_part = ((brightness - opposite) ** 2).sum(axis=1) / 4
+    out[known] = odd_part < even
     return out
 
 
-# ---- Where corners of a flat board lie by what was found around them: a homography each, of its nearest
-# others.
+# Prediction of a corner on a flat board by a homography of its nearest found neighbours.
 #
-# Some of the others may have been found wrongly, so each homography is the least median of squares over
-# homographies of four (Rousseeuw 1984), then least squares over those that it explains. All corners at once:
-# a board has more than a hundred of them, in every picture.
+# Some neighbours may be wrong, so each homography is the least median of squares over homographies of four
+# (Rousseeuw 1984), then least squares over its inliers. Vectorised over all corners: a board has more than a
+# hundred, in every image.
 
-MAX_NEIGHBOURS, MIN_NEIGHBOURS = 12, 6  # neighbours
-_SAMPLES = 64  # where two fifths were found wrongly, one of them is without these, 99 of 100 times
-_INLIER_MEDIANS = 2.5 * 1.4826  # of the median distance, as Rousseeuw and Leroy have it
+MAX_NEIGHBOURS = 12
+MIN_NEIGHBOURS = 6
+_SAMPLES = 64  # with 40 % outliers, at least one quadruple has none with probability 99 %
+_INLIER_MEDIANS = 2.5 * 1.4826  # inlier threshold over the median distance (Rousseeuw and Leroy)
 _GAUSS_NEWTON_STEPS = 2
 _REGULARISATION = 1e-10
-_MIN_INLIER_PX = 0.05  # what no corner is better known than
+_MIN_INLIER_PX = 0.05  # no corner is more precise
 
 
 def predict_from_neighbours(board: F64, px: F64) -> F64:
-    """Where each corner (N, 2) m is, by others of px (N, 2), NaN not found; NaN if these are too few."""
+    """Predict each corner (N, 2) m in the image from other corners px (N, 2), NaN if not found; NaN where
+    those are too few."""
     neighbours = _nearest_found(board, np.asarray(np.isfinite(px).all(axis=1)))
     if neighbours.shape[1] < MIN_NEIGHBOURS:
         return np.full(px.shape, np.nan)
-    board_xy = board[neighbours] - board[:, None]  # each corner is the origin of its own
+    board_xy = board[neighbours] - board[:, None]  # relative to the predicted corner
     board_xy /= np.abs(board_xy).max(axis=(1, 2), keepdims=True)
     middle = px[neighbours].mean(axis=1)
     image_xy = px[neighbours] - middle[:, None]
-    with np.errstate(all="ignore"):  # three of four on one line; tags that lie anywhere
+    with np.errstate(all="ignore"):  # three of four on one line; misplaced tags
         H = _refit_homography(_least_median_homography(board_xy, image_xy), board_xy, image_xy)
         out: F64 = H[:, :2, 2] / H[:, 2:, 2] + middle
     return out
 
 
 def _nearest_found(board: F64, is_found: np.ndarray) -> I64:
-    """Of each corner the nearest others that were found, (N, up to MOST)."""
+    """Return the nearest found other corners of each corner, (N, up to MAX_NEIGHBOURS)."""
     squares = ((board[:, None] - board) ** 2).sum(axis=2)
     squares[:, ~is_found] = np.inf
     np.fill_diagonal(squares, np.inf)
@@ -256,12 +269,13 @@ def _nearest_found(board: F64, is_found: np.ndarray) -> I64:
 
 @cache
 def _quadruples(count: int) -> I64:
-    """Which four of `count`, (_FOURS, 4), always the same."""
+    """Return fixed random quadruples of `count`, (_SAMPLES, 4)."""
     return np.random.default_rng(0).random((_SAMPLES, count)).argsort(axis=1)[:, :4]
 
 
 def _least_median_homography(board_xy: F64, image_xy: F64) -> F64:
-    """(N, 3, 3) from (N, M, 2) to (N, M, 2): of all fours the one that half of the others agree with best."""
+    """Return H (N, 3, 3) from (N, M, 2) to (N, M, 2): of all quadruples' the one with the least median
+    distance."""
     fours = _quadruples(board_xy.shape[1])
     H = _basis(image_xy[:, fours]) @ _adjugate(_basis(board_xy[:, fours]))
     H = H / np.abs(H).max(axis=(2, 3), keepdims=True)
@@ -272,8 +286,8 @@ def _least_median_homography(board_xy: F64, image_xy: F64) -> F64:
 
 
 def _basis(points: F64) -> F64:
-    """(..., 3, 3) that takes the unit vectors and their sum to four points (..., 4, 2), to scale (Semple and
-    Kneebone, *Algebraic projective geometry*)."""
+    """Return (..., 3, 3) that takes the unit vectors and their sum to four points (..., 4, 2), up to scale
+    (Semple and Kneebone, *Algebraic projective geometry*)."""
     columns = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1).swapaxes(-1, -2)
     three, last = columns[..., :3], columns[..., 3:]
     out: F64 = three * (_adjugate(three) @ last).swapaxes(-1, -2)
@@ -281,20 +295,20 @@ def _basis(points: F64) -> F64:
 
 
 def _adjugate(A: F64) -> F64:
-    """(..., 3, 3): the inverse times the determinant."""
+    """Return (..., 3, 3): the inverse times the determinant."""
     a, b, c = A[..., 0], A[..., 1], A[..., 2]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
 
 
 def _apply_homography(H: F64, points: F64) -> F64:
-    """(..., M, 2) of points (..., M, 2)."""
+    """Return (..., M, 2) of points (..., M, 2)."""
     homogeneous = points @ H[..., :2].swapaxes(-1, -2) + H[..., None, :, 2]
     out: F64 = homogeneous[..., :2] / homogeneous[..., 2:]
     return out
 
 
 def _refit_homography(H: F64, board_xy: F64, image_xy: F64) -> F64:
-    """Gauss-Newton on the pixels of those that H (N, 3, 3) explains."""
+    """Refine H (N, 3, 3) by Gauss-Newton on the pixels of its inliers."""
     distances = np.linalg.norm(_apply_homography(H, board_xy) - image_xy, axis=2)
     limit = (
         _INLIER_MEDIANS
@@ -314,14 +328,15 @@ def _refit_homography(H: F64, board_xy: F64, image_xy: F64) -> F64:
 
 
 def _regularised(A: F64) -> F64:
-    """(N, 8, 8) with which something can be solved, also where a board is none and nothing fits."""
+    """Return solvable (N, 8, 8), also for degenerate boards where no corner fits."""
     size = np.trace(A, axis1=1, axis2=2)[:, None, None]
     out: F64 = np.where(np.isfinite(size) & (size > 0), A + _REGULARISATION * size * np.eye(8), np.eye(8))
     return out
 
 
 def _linearise(H: F64, board_xy: F64, image_xy: F64) -> tuple[F64, F64]:
-    """Derivatives (N, M, 2, 8) of what H, whose last number is 1, predicts, and what is left (N, M, 2)."""
+    """Return derivatives (N, M, 2, 8) of the prediction by H, whose last element is 1, and residuals (N,
+    M, 2)."""
     points = np.concatenate([board_xy, np.ones((*board_xy.shape[:2], 1))], axis=2)
     homogeneous = points @ H.swapaxes(1, 2)
     px, scaled = homogeneous[..., :2] / homogeneous[..., 2:], points / homogeneous[..., 2:]

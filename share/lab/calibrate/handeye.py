@@ -1,8 +1,8 @@
-"""How two bodies that move as one sit on each other: A X = X B.
+"""Hand-eye calibration of two rigidly joined bodies: A X = X B.
 
 A are motions of one body, B the same motions of the other, each in its own frame; no common world is needed.
-Start: rotation, then translation (Park and Martin, *Robot sensor calibration: solving AX = XB on the
-Euclidean group*, IEEE TRA 10(5), 1994); then both at once. All with Cauchy weights.
+Initial values: rotation, then translation (Park and Martin, *Robot sensor calibration: solving AX = XB on the
+Euclidean group*, IEEE TRA 10(5), 1994); then both together. All with Cauchy weights.
 """
 
 from __future__ import annotations
@@ -16,17 +16,20 @@ from share.geometry import se3
 from share.geometry.se3 import best_rotation
 from share.types import F64, I64
 
-MIN_ROTATION_RAD = np.radians(5.0)  # rms about the second axis; below, one direction is guessed
+MIN_ROTATION_RAD = np.radians(5.0)  # rms about the second axis; below, one direction is unobservable
 _MIN_MOTIONS = 10
 _ITERATIONS = 10
-_CAUCHY_SIGMAS = 2.5  # robust sigmas at which a motion begins to be doubted
+_CAUCHY_SIGMAS = 2.5  # scale of Cauchy's weights, robust sigmas
 
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """T_a_b (4, 4) takes coordinates of body b to body a; cov (6, 6) of it, perturbed at the right (rotation
-    rad, translation m), taking motions for independent. turning (3,): rms rotation rad of the motions about
-    their principal axes, largest first. rotation_rms rad, position_rms m: of what is left, weighted."""
+    """T_a_b (4, 4) with cov (6, 6), perturbed on the right (rotation rad, translation m), for independent
+    motions.
+
+    rotation_rms_by_axis (3,): rms rotation, rad, of the motions about their principal axes, largest first.
+    rotation_rms rad, position_rms m: weighted residuals.
+    """
 
     T_a_b: F64
     cov: F64
@@ -37,9 +40,10 @@ class HandEye:
 
 
 def hand_eye(A: F64, B: F64) -> HandEye:
-    """Of motions A, B (N, 4, 4): T_a(i)_a(j) and T_b(i)_b(j).
+    """Solve for T_a_b from motions A, B (N, 4, 4): T_a(i)_a(j) and T_b(i)_b(j).
 
-    Raises DataError for fewer than 10, and where the bodies turned about one axis only, or not at all.
+    Raises DataError for fewer than 10 motions, and where the bodies turned about one axis only, or not at
+    all.
     """
     if A.shape != B.shape or len(A) < _MIN_MOTIONS:
         raise DataError(
@@ -59,7 +63,7 @@ def hand_eye(A: F64, B: F64) -> HandEye:
 
 
 def _initial_rotation(alpha: F64, beta: F64) -> F64:
-    """(3, 3) that takes beta to alpha, both (N, 3)."""
+    """Return R (3, 3) that takes beta to alpha, both (N, 3)."""
     weight = np.ones(len(alpha))
     for _ in range(_ITERATIONS):
         R = best_rotation((alpha * weight[:, None]).T @ beta)
@@ -68,7 +72,7 @@ def _initial_rotation(alpha: F64, beta: F64) -> F64:
 
 
 def _initial_translation(A: F64, B: F64, R: F64) -> F64:
-    """(3,) with (R_A - I) t = R t_B - t_A."""
+    """Return t (3,) with (R_A - I) t = R t_B - t_A."""
     J, y = A[:, :3, :3] - np.eye(3), B[:, :3, 3] @ R.T - A[:, :3, 3]
     weight = np.ones(len(A))
     for _ in range(_ITERATIONS):
@@ -79,14 +83,16 @@ def _initial_translation(A: F64, B: F64, R: F64) -> F64:
 
 
 def _cauchy_weights(size: F64) -> F64:
-    """Cauchy's (N,), by residuals' sizes; their scale from the median."""
+    """Return Cauchy weights (N,) of residual norms, scaled by their median."""
     scale = max(float(np.median(size)), 1e-12)
     return np.asarray(1 / (1 + (size / (_CAUCHY_SIGMAS * scale)) ** 2), np.float64)
 
 
 def _refine(A: F64, B: F64, X: F64, rotation_rms_by_axis: F64) -> HandEye:
-    """Both at once, by Gauss-Newton from X: turns and ways weighed by what is left of each, since far ways
-    tell the rotation too. Exp(xi) at the right of X moves Log(B^-1 X^-1 A X) by xi - Ad(B^-1) xi."""
+    """Refine rotation and translation together by Gauss-Newton from X, each weighted by its residuals.
+
+    Exp(xi) on the right of X changes Log(B^-1 X^-1 A X) by xi - Ad(B^-1) xi.
+    """
     J = np.eye(6) - se3.adjoint(se3.inverse(B))
     weight = np.ones(len(A))
     for _ in range(_ITERATIONS):
@@ -102,16 +108,16 @@ def _refine(A: F64, B: F64, X: F64, rotation_rms_by_axis: F64) -> HandEye:
     return HandEye(X, cov, rotation_rms_by_axis, rms[0], rms[1], len(A))
 
 
-# ---- A mounting found otherwise, checked by hand-eye from the paths of both bodies.
+# Check of a mounting from another source by hand-eye.
 
-_MOTION_NS = 1_000_000_000  # of a motion: long enough to turn, short enough not to drift
-_MAX_SIGMAS = 4.0  # standard errors by which two ways may differ
+_MOTION_NS = 1_000_000_000  # duration of a motion: long enough to turn, short enough not to drift
+_MAX_SIGMAS = 4.0  # of the difference
 
 
 @dataclass(frozen=True, eq=False)
 class HandEyeCheck:
-    """turned rad, shifted m: how far `found` is from what was to be checked; sigmas: that in standard errors
-    of hand-eye (Mahalanobis over the square root of six)."""
+    """Difference of a mounting from the hand-eye estimate, rad and m; sigmas: in standard errors of
+    hand-eye (Mahalanobis distance over the square root of six)."""
 
     hand_eye: HandEye
     rotation_error_rad: float
@@ -124,25 +130,24 @@ class HandEyeCheck:
 
 
 def check_mounting(T_a_b: F64, stamps_ns: I64, T_a: F64, T_b: F64) -> HandEyeCheck:
-    """T_a_b (4, 4) by paths T_a, T_b (N, 4, 4) of both bodies at stamps (N,), each in its own world.
+    """Check T_a_b (4, 4) by paths T_a, T_b (N, 4, 4) of both bodies at stamps (N,), each in its own world.
 
-    Raises DataError where they are too short, or turn about one axis only.
+    Raises DataError where the paths are too short, or turn about one axis only.
     """
     first, last = _motion_ends(stamps_ns)
     if not len(first):
-        raise DataError("hand-eye: the two paths do not overlap by a second; are they of one recording?")
+        raise DataError("hand-eye: the two paths overlap by less than a second; are they of one recording?")
     estimate = hand_eye(_relative_motions(T_a, first, last), _relative_motions(T_b, first, last))
     error = se3.log(se3.inverse(estimate.T_a_b) @ T_a_b)
-    overlap_factor = max(
-        1.0, _MOTION_NS / float(np.median(np.diff(stamps_ns)))
-    )  # motions that overlap tell the same
+    # overlapping motions are not independent
+    overlap_factor = max(1.0, _MOTION_NS / float(np.median(np.diff(stamps_ns))))
     sigmas = np.sqrt(error @ np.linalg.solve(estimate.cov * overlap_factor, error) / len(error))
     rotation_error, translation_error = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
     return HandEyeCheck(estimate, float(rotation_error), float(translation_error), float(sigmas))
 
 
 def _motion_ends(stamps_ns: I64) -> tuple[I64, I64]:
-    """Places (M,) where motions of about a second begin and end; none over a gap."""
+    """Return the indices (M,) where motions of about a second begin and end; none spans a gap."""
     last = np.searchsorted(stamps_ns, stamps_ns + _MOTION_NS)
     first = np.flatnonzero(last < len(stamps_ns))
     near = stamps_ns[last[first]] - stamps_ns[first] < 1.5 * _MOTION_NS

@@ -1,4 +1,4 @@
-"""What an IMU is like, from a recording at rest: rate, gaps, biases and noise of each axis."""
+"""Characteristics of an IMU from a recording at rest: rate, gaps, biases and noise of each axis."""
 
 from __future__ import annotations
 
@@ -11,27 +11,25 @@ from share.lab.calibrate.allan import AllanCurve, allan_deviation
 from share.lab.calibrate.imu_noise import AxisNoise, NoiseEstimate, combine_axes, fit_noise
 from share.types import F64, I64, ImuBatch
 
-# ---- Which part of an IMU's recording is at rest, judged by the sensor's own noise.
-#
-# At rest the means of neighbouring seconds differ by little more than white noise makes them differ; a hand,
-# or a step beside the table, moves them by far more. No figure of the device is needed.
+# Detection of rest by the sensor's own noise: at rest the means of neighbouring seconds differ by little more
+# than white noise explains; a hand, or a step beside the table, moves them far more. No data sheet is needed.
 
 WINDOW_S = 1.0
 MIN_REST_S = 60.0
-_QUIET_QUANTILE = 0.2  # the quietest fifth tells how noisy the sensor is
-_MAX_NOISE_SCALE = 2.0  # times that noise within a second: a knock
+_QUIET_QUANTILE = 0.2  # the quietest fifth gives the sensor's noise
+_MAX_NOISE_SCALE = 2.0  # times that noise within a second: more is a knock
 _MAX_SHIFT_SIGMAS = 6.0  # standard errors of the difference of two means
-_MAX_SMOOTHING = (
-    6.0  # times more than successive samples tell may they differ: a sensor's filter hides white noise
-)
-_MARGIN_WINDOWS = 2  # seconds about a disturbance that are left out too
-_MAX_GYRO_NOISE, _MAX_ACCEL_NOISE = 0.05, 0.5  # rad/s, m/s^2: noisier than any IMU at rest
+# Largest scatter of means over that of successive samples, whose white noise a sensor's filter hides.
+_MAX_SMOOTHING = 6.0
+_MARGIN_WINDOWS = 2  # around a disturbance, left out too
+_MAX_GYRO_NOISE = 0.05  # rad/s: noisier than any IMU at rest
+_MAX_ACCEL_NOISE = 0.5  # m/s^2, likewise
 
 
 def find_rest(imu: ImuBatch, rate_hz: float) -> slice:
-    """The longest stretch of samples at rest, in whole seconds.
+    """Return the longest run of samples at rest, in whole seconds.
 
-    Raises DataError if that is less than a minute, and says why.
+    Raises DataError if that is less than a minute.
     """
     n = round(WINDOW_S * rate_hz)
     is_calm = _calm_windows(imu.gyro, n, _MAX_GYRO_NOISE) & _calm_windows(imu.accel, n, _MAX_ACCEL_NOISE)
@@ -39,13 +37,14 @@ def find_rest(imu: ImuBatch, rate_hz: float) -> slice:
     if end - start < MIN_REST_S:
         raise DataError(
             f"IMU: at rest for {end - start} s of {len(is_calm)} s, at least {MIN_REST_S:.0f} s are needed; "
-            "put the device on a stone floor or a heavy table, start recording, and leave it alone"
+            "put the device on a stone floor or a heavy table, start recording, and do not touch it"
         )
     return slice(start * n, len(imu) if end == len(is_calm) else end * n)
 
 
 def _calm_windows(values: F64, n: int, max_noise: float) -> np.ndarray:
-    """(W,) bool: windows of n samples of values (N, 3) that are like the quietest, and not near others."""
+    """Return (W,) bool: windows of n samples of values (N, 3) as calm as the quietest, and not near
+    disturbed ones."""
     count = len(values) // n
     windows = values[: count * n].reshape(count, n, 3)
     noise = windows.std(axis=1)
@@ -64,21 +63,23 @@ def _calm_windows(values: F64, n: int, max_noise: float) -> np.ndarray:
 
 
 def _step_scale(step: F64, white: F64) -> F64:
-    """(3,) scale of the steps (W - 1, 3) between means: their median, if white noise explains it."""
+    """Return the scale (3,) of the steps (W - 1, 3) between means: their median, if white noise explains
+    it."""
     observed = 1.4826 * np.median(step, axis=0) if len(step) else white
     return np.asarray(np.clip(observed, white, _MAX_SMOOTHING * white), np.float64)
 
 
 def _white_noise(windows: F64, quiet_noise: F64) -> F64:
-    """(3,) standard deviation of a sample by the differences of successive ones, which slow motion does not
-    raise, in the quietest windows; at least a thousandth of the scatter, where digits hide the noise."""
+    """Return the standard deviation (3,) of a sample from differences of successive samples, which slow
+    motion does not raise, in the quietest windows; at least a thousandth of the scatter, where
+    quantisation hides the noise."""
     difference_noise = np.diff(windows, axis=1).std(axis=1) / np.sqrt(2)
     calm = np.quantile(difference_noise, _QUIET_QUANTILE, axis=0) if len(difference_noise) else quiet_noise
     return np.maximum(calm, quiet_noise / 1000)
 
 
 def _longest_run(calm: np.ndarray) -> tuple[int, int]:
-    """First and end of the longest run of True."""
+    """Return start and end of the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], calm.astype(int), [0]])))
     runs = edges.reshape(-1, 2)
     if not len(runs):
@@ -87,28 +88,28 @@ def _longest_run(calm: np.ndarray) -> tuple[int, int]:
     return int(first), int(end)
 
 
-_MAX_BRIDGED_GAP = 5  # samples that may be missing in a row; a straight line takes their place
-_MAX_BRIDGED_SHARE = 0.01  # of all: more, and the lines would lower the noise
+_MAX_BRIDGED_GAP = 5  # missing samples in a row that are interpolated
+_MAX_BRIDGED_SHARE = 0.01  # of all samples: more would lower the noise
 _MIN_HZ = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class SensorNoise:
-    """Gyroscope or accelerometer. mean (3,): over the rest, u; curve, and a fit of each of its axes."""
+    """Gyroscope or accelerometer: mean (3,) at rest, in its unit; Allan curve; noise of each axis."""
 
     mean: F64
     curve: AllanCurve
     axes: tuple[AxisNoise, ...]
 
     def combined(self, name: str) -> NoiseEstimate:
-        """density, instability or walk of the three axes as one, as a filter takes them."""
+        """Return density, instability or walk of the three axes combined, as a filter uses them."""
         return combine_axes(self.axes, name)
 
 
 @dataclass(frozen=True, eq=False)
 class ImuCharacteristics:
-    """start_s, rest_s: where the rest begins in the recording, and how long it is, of total_s. missing:
-    samples lost in it, in `gaps` places, of which `cuts` were too long to be bridged."""
+    """start_s, rest_s: start and duration of the rest in a recording of total_s. missing: samples lost in
+    it, in `gaps` places, of which `unbridged_gaps` were too long to interpolate."""
 
     rate_hz: float
     start_s: float
@@ -123,7 +124,8 @@ class ImuCharacteristics:
 
 
 def characterise(imu: ImuBatch, model_error: float = 0.02) -> ImuCharacteristics:
-    """From samples in order of time. Raises DataError where they do not rest, or are too few."""
+    """Characterise an IMU by samples in order of time. Raises DataError where they are not at rest, or too
+    few."""
     rate_hz = _measured_rate_hz(imu.stamps_ns)
     at_rest = imu.take(find_rest(imu, rate_hz))
     steps = np.rint(np.diff(at_rest.stamps_ns) * 1e-9 * rate_hz).astype(np.int64)
@@ -154,7 +156,7 @@ def characterise(imu: ImuBatch, model_error: float = 0.02) -> ImuCharacteristics
 
 
 def _measured_rate_hz(stamps_ns: I64) -> float:
-    """Hz: of the steps that are no gaps, their mean, which jitter does not move."""
+    """Return the rate by the mean of the steps that are no gaps; jitter does not change it."""
     if len(stamps_ns) < 100:
         raise DataError(f"IMU: {len(stamps_ns)} samples; record an hour at rest")
     steps = np.diff(stamps_ns)
@@ -165,7 +167,8 @@ def _measured_rate_hz(stamps_ns: I64) -> float:
 
 
 def _fill_gaps(values: F64, missing_after: I64) -> F64:
-    """values (N, 3) with `lost` (N,) samples after each, but the last, filled in on a straight line."""
+    """Return values (N, 3) with `missing_after` (N,) samples after each but the last interpolated
+    linearly."""
     missing_after = np.append(missing_after[:-1], 0)
     if not missing_after.any():
         return values

@@ -2,9 +2,9 @@
 
     sigma^2(tau) = c / tau^2 + N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3        (IEEE Std 952-1997, annex C)
 
-c is 3 Q^2 where digits are coarse, and less than nothing where a sensor's filter, or a driver that
-interpolates, has smoothed the samples; both vanish as 1 / tau^2. The fit is generalised least squares with
-the covariance that the model itself gives to the variances (`share.lab.calibrate.allan`), no part below zero.
+c is 3 Q^2 where digits are coarse, and negative where a sensor's filter, or an interpolating driver, has
+smoothed the samples; both fall as 1 / tau^2. The fit is generalised least squares with the variances'
+covariance under the model itself (`share.lab.calibrate.allan`), no other term below zero.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from share.types import F64
 
 COEFFICIENTS = ("quantisation", "density", "instability", "walk")  # c, N, B, K
 FLICKER_FACTOR = 2 * np.log(2) / np.pi
-_MIN_AVERAGE = 8  # samples: below, filters and interpolation are more than c / tau^2
+_MIN_AVERAGE = 8  # samples: below, filters and interpolation add more than c / tau^2
 _MIN_POINTS = 8
-_ITERATIONS = 6  # of weights that follow the model; settled after four
-_SIGNIFICANT_SIGMAS = 2.5  # sigmas by which a square must differ from nothing to be a number
+_ITERATIONS = 6  # of reweighting; converged after four
+_SIGNIFICANT_SIGMAS = 2.5  # a square this many sigmas from 0 is significant
 _BOUND_SIGMAS = 1.645  # one-sided 95 %
-_JITTER = 1e-12  # of the largest weight, so that a model without noise can be weighed
+_JITTER = 1e-12  # of the variances, so that a model without noise can be factored
 
 
 class NoiseEstimate(NamedTuple):
-    """value and its standard error; told: whether it differs from nothing. Where it does not, only `bound`
-    is known: it is below that, by 95 %."""
+    """A value and its standard error. told: whether it is significant. If not, it is below `bound` with 95
+    % confidence, and no more is known."""
 
     value: float
     sigma: float
@@ -40,21 +40,24 @@ class NoiseEstimate(NamedTuple):
 
     @property
     def conservative(self) -> float:
-        """The value, or the bound where that is all."""
+        """The value, or the bound if it is not significant."""
         return self.value if self.told else self.bound
 
     @property
     def text(self) -> str:
-        """For a person."""
+        """Text for readers."""
         return f"{self.value:.3g} ± {self.sigma:.1g}" if self.told else f"< {self.bound:.2g}"
 
 
 @dataclass(frozen=True, eq=False)
 class AxisNoise:
-    """Of one axis; u is its unit. density u/sqrt(Hz); instability u; walk u/s/sqrt(Hz); quantisation u s.
-    squares (4,): c, N^2, B^2, K^2 as fitted, errors (4,) of these. low, high (T,): where the true deviation
-    lies at each averaging time of the curve, by 95 %; modelled (T,): as fitted, NaN for averages
-    of fewer samples than are fitted."""
+    """Noise of one axis in its unit u: density u/sqrt(Hz); instability u; walk u/s/sqrt(Hz); quantisation u
+    s.
+
+    squares (4,): c, N^2, B^2, K^2 as fitted, with standard errors (4,). low, high (T,): 95 % interval of the
+    true deviation at each averaging time of the curve. modelled (T,): the fit, NaN for averages of fewer
+    samples than are fitted.
+    """
 
     density: NoiseEstimate
     instability: NoiseEstimate
@@ -68,13 +71,14 @@ class AxisNoise:
 
 
 def fit_noise(curve: AllanCurve, model_error: float = 0.02) -> tuple[AxisNoise, ...]:
-    """Each axis. model_error: of the variance, by which no real sensor is believed to follow the model.
+    """Fit each axis. model_error: relative error of the model's variance, since no real sensor follows it
+    exactly.
 
     Raises DataError for a curve that is too short to fit.
     """
     first = int(np.searchsorted(curve.sizes, _MIN_AVERAGE))
     if len(curve.sizes) - first < _MIN_POINTS:
-        raise DataError("Allan deviation: the recording is too short to tell noise; record longer")
+        raise DataError("Allan deviation: the recording is too short to estimate noise; record longer")
     covariance = variance_covariance(curve.sizes, curve.segment_lengths, curve.rate_hz)
     return tuple(
         _fit_axis(curve.taus, column**2, covariance, first, model_error) for column in curve.deviation.T
@@ -84,7 +88,7 @@ def fit_noise(curve: AllanCurve, model_error: float = 0.02) -> tuple[AxisNoise, 
 def _fit_axis(taus: F64, variance: F64, covariance: F64, first: int, model_error: float) -> AxisNoise:
     A = np.stack([taus**-2, 1 / taus, np.full(len(taus), FLICKER_FACTOR), taus / 3], axis=1)
     if not variance[first:].all():
-        raise DataError("Allan deviation: an axis does not change; is the sensor alive?")
+        raise DataError("Allan deviation: an axis has constant samples; does the sensor work?")
     weights = _NoiseWeights(A[first:], covariance[:, :, first:, first:], model_error)
     squares = _fit_squares(weights, variance[first:])
     errors = weights.sigmas(squares)
@@ -106,7 +110,7 @@ def _fit_axis(taus: F64, variance: F64, covariance: F64, first: int, model_error
 
 
 def combine_axes(axes: Sequence[AxisNoise], name: str) -> NoiseEstimate:
-    """density, instability or walk of axes taken for alike: the root of the mean of their squares."""
+    """Return density, instability or walk of axes taken as equal: the root mean of their squares."""
     k = COEFFICIENTS.index(name)
     squares = np.array([max(axis.squares[k], 0.0) for axis in axes])
     bounds = np.array([getattr(axis, name).bound ** 2 for axis in axes])
@@ -117,14 +121,14 @@ def combine_axes(axes: Sequence[AxisNoise], name: str) -> NoiseEstimate:
 
 
 class _NoiseWeights(NamedTuple):
-    """A (T, 4): Allan variance of a unit of each square; spread (3, 3, T, T) of `variance_covariance`."""
+    """A (T, 4): Allan variance per unit of each square. covariance (3, 3, T, T): of `variance_covariance`."""
 
     A: F64
     covariance: F64
     model_error: float
 
     def cholesky(self, squares: F64, model: F64) -> F64:
-        """Cholesky factor (T, T) of the variances' covariance: as the parts have it, at `model`'s level."""
+        """Return the Cholesky factor (T, T) of the variances' covariance, scaled to the variances `model`."""
         parts = _noise_squares(squares)
         ratio = model / (self.A[:, 1:] @ parts)
         C = np.einsum("a,b,abij->ij", parts, parts, self.covariance) * np.outer(ratio, ratio)
@@ -132,7 +136,7 @@ class _NoiseWeights(NamedTuple):
         return np.asarray(np.linalg.cholesky(C), np.float64)
 
     def sigmas(self, squares: F64) -> F64:
-        """(4,) standard errors, if the truth were `squares`."""
+        """Return standard errors (4,), if the truth were `squares`."""
         from scipy.linalg import solve_triangular
 
         model = np.maximum(self.A @ squares, 1e-3 * (self.A[:, 1:] @ _noise_squares(squares)))
@@ -141,7 +145,8 @@ class _NoiseWeights(NamedTuple):
         return np.asarray(np.sqrt(np.diag(np.linalg.inv((B / unit).T @ (B / unit)))) / unit, np.float64)
 
     def bound_margin(self, squares: F64, k: int) -> float:
-        """From square k to its bound: the truth that gives as little as was found in 5 % of recordings."""
+        """Return the distance from square k to its bound: the truth that gives as little as was estimated
+        in 5 % of recordings."""
         assumed = squares.copy()
         for _ in range(_ITERATIONS):
             assumed[k] = max(squares[k], 0.0) + _BOUND_SIGMAS * self.sigmas(assumed)[k]
@@ -149,7 +154,7 @@ class _NoiseWeights(NamedTuple):
 
 
 def _fit_squares(weights: _NoiseWeights, variance: F64) -> F64:
-    """Squares (4,). The first weights are those of the measured curve, as if it were white."""
+    """Return the squares (4,). The first weights are those of the measured curve, as if it were white."""
     from scipy.linalg import solve_triangular
     from scipy.optimize import nnls
 
@@ -166,13 +171,13 @@ def _fit_squares(weights: _NoiseWeights, variance: F64) -> F64:
 
 
 def _noise_squares(squares: F64) -> F64:
-    """N^2, B^2, K^2, by which variances scatter; white where c is all there is."""
+    """Return N^2, B^2, K^2, which determine the variances' scatter; white noise where c is the only term."""
     return squares[1:] if squares[1:].any() else np.array([1.0, 0.0, 0.0])
 
 
 def _confidence_interval(deviation: F64, A: F64, squares: F64, covariance: F64) -> tuple[F64, F64]:
-    """(T,) each: 95 % about the measured deviation, by the chi-square of its equivalent degrees of freedom
-    (NIST SP 1065, 5.3)."""
+    """Return the 95 % interval (T,) each of the measured deviation, by the chi-square distribution of its
+    equivalent degrees of freedom (NIST SP 1065, 5.3)."""
     from scipy.special import gammaincinv
 
     parts = _noise_squares(squares)
@@ -182,7 +187,7 @@ def _confidence_interval(deviation: F64, A: F64, squares: F64, covariance: F64) 
 
 
 def _estimate_from_square(square: float, sigma: float, margin: float) -> NoiseEstimate:
-    """Of the root of a fitted square; its error to first order. margin: from the square to the bound."""
+    """Return the root of a fitted square with its first-order error. margin: from the square to its bound."""
     value, bound = float(np.sqrt(max(square, 0.0))), float(np.sqrt(max(square, 0.0) + margin))
     is_significant = bool(square > _SIGNIFICANT_SIGMAS * sigma)
     return NoiseEstimate(

@@ -1,4 +1,4 @@
-"""What `share calibrate imu` leaves behind: Kalibr's IMU chain, and all that was found as JSON."""
+"""Output of `share calibrate imu`: Kalibr's IMU chain, a JSON report and an Allan deviation chart."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STANDARD_GRAVITY = 9.80665
 
 
 class NoiseRow(NamedTuple):
-    """One figure of one sensor: of each axis, of all as one, and as the profile has it, if it does."""
+    """One quantity of one sensor: of each axis, of all axes combined, and of the profile, if it has it."""
 
     sensor: str
     quantity: str
@@ -34,12 +34,12 @@ class NoiseRow(NamedTuple):
 
     @property
     def ratio_to_profile(self) -> float | None:
-        """How many times the stated; None where one of the two is not known."""
+        """Ratio of the estimate to the profile's value; None where one of the two is unknown."""
         return self.combined.value / self.profile_value if self.profile_value and self.combined.told else None
 
 
 def noise_rows(characteristics: ImuCharacteristics, profile: Profile | None) -> list[NoiseRow]:
-    """N, B and K of the gyroscope and of the accelerometer."""
+    """Return rows of N, B and K of the gyroscope and of the accelerometer."""
     out = []
     for name, sensor in ((GYRO, characteristics.gyro), (ACCEL, characteristics.accel)):
         profile_values = profile_noise(profile, name)
@@ -52,20 +52,20 @@ def noise_rows(characteristics: ImuCharacteristics, profile: Profile | None) -> 
 
 
 def profile_noise(profile: Profile | None, sensor: str) -> dict[str, float]:
-    """density, with what its digits add, and walk by a profile; nothing without one."""
+    """Return a profile's density, with quantisation noise added, and walk; empty without a profile."""
     if profile is None:
         return {}
     imu = profile.device.imu
     spec: InertialFacts = imu.gyro if sensor == GYRO else imu.accel
-    digits = spec.step**2 / 12 / spec.rate_hz  # evenly spread within a digit, as white as the samples
+    digits = spec.step**2 / 12 / spec.rate_hz  # uniform within a digit, white
     return {"density": float(np.sqrt(spec.density**2 + digits)), "walk": spec.kalibr_walk}
 
 
 def imu_chain_yaml(
     characteristics: ImuCharacteristics, name: str, inflate: float, serial: str | None = None
 ) -> str:
-    """kalibr_imu_chain.yaml, as `share.recordings.calibration` and Kalibr read it. inflate: times the
-    measured; serial: of the device."""
+    """Return kalibr_imu_chain.yaml, as `share.recordings.calibration` and Kalibr read it. inflate: factor
+    on the estimates. serial: of the device."""
     lines = [
         f"# share calibrate imu: {name}, {characteristics.rest_s:.0f} s at rest",
         "# " + ("as measured" if inflate == 1 else f"{inflate:g} times what was measured (--inflate)"),
@@ -74,27 +74,23 @@ def imu_chain_yaml(
     for sensor, noise in ((ACCEL, characteristics.accel), (GYRO, characteristics.gyro)):
         for figure, key in (("density", "noise_density"), ("walk", "random_walk")):
             estimate, unit = noise.combined(figure), UNITS[sensor][figure]
-            lines.append(
-                f"  {sensor}_{key}: "
-                f"{estimate.conservative * inflate:.4e} "
-                f" # {unit}, {_uncertainty_text(estimate)}"
-            )
-    serial_lines = (
-        [f"  {SERIAL}: {json.dumps(serial)}"] if serial else []
-    )  # quoted, or YAML makes it a number
+            value = estimate.conservative * inflate
+            lines.append(f"  {sensor}_{key}: {value:.4e}  # {unit}, {_uncertainty_text(estimate)}")
+    # quoted, or YAML reads it as a number
+    serial_lines = [f"  {SERIAL}: {json.dumps(serial)}"] if serial else []
     return "\n".join([*lines, f"  update_rate: {characteristics.rate_hz:.3f}", *serial_lines, ""])
 
 
 def _uncertainty_text(figure: NoiseEstimate) -> str:
     if figure.told:
         return f"+- {100 * figure.sigma / figure.value:.1f} %"
-    return "an upper bound (95 %): the recording does not tell it"
+    return "upper bound (95 %): not significant in this recording"
 
 
 def report_values(
     characteristics: ImuCharacteristics, name: str, profile: Profile | None, inflate: float
 ) -> dict[str, Any]:
-    """All of it. Figures are as measured, without `inflate`."""
+    """Return the report as plain data; estimates are without `inflate`."""
     return {
         "source": name,
         "rate_hz": characteristics.rate_hz,
@@ -114,7 +110,7 @@ def report_values(
 
 
 def gravity_norm(characteristics: ImuCharacteristics) -> float:
-    """Norm of the mean specific force, m/s^2."""
+    """Return the norm of the mean specific force, m/s^2."""
     return float(np.linalg.norm(characteristics.accel.mean))
 
 
@@ -138,13 +134,13 @@ def _axis_values(noise: AxisNoise) -> dict[str, Any]:
     return figures | {key: getattr(noise, key).tolist() for key in ("low", "high", "modelled")}
 
 
-# ---- The Allan deviation of an IMU as a picture: seen, how sure, fitted, and stated.
+# Chart of the Allan deviation: measured, confidence interval, fit, and the profile's.
 
 _COLOURS = ("#00798c", "#d1495b", "#edae49")
 
 
 def allan_chart(characteristics: ImuCharacteristics, profile: Profile | None, title: str) -> bytes:
-    """PNG: gyroscope and accelerometer side by side, three axes each."""
+    """Return a PNG: gyroscope and accelerometer side by side, three axes each."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -161,7 +157,7 @@ def allan_chart(characteristics: ImuCharacteristics, profile: Profile | None, ti
         )
         panel.set_xscale("log")
         panel.set_yscale("log")
-        for axis in (panel.xaxis, panel.yaxis):  # in plain digits: the frozen program has no fonts for powers
+        for axis in (panel.xaxis, panel.yaxis):  # plain digits: the frozen program has no fonts for powers
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter("")
         panel.grid(which="both", alpha=0.25)

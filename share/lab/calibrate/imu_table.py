@@ -1,4 +1,4 @@
-"""All IMU samples of a recording in one table, whether it has cameras or not."""
+"""Read all IMU samples of a recording, with or without cameras, and the noise that it states."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _SUPPORTED = (
 
 @dataclass(frozen=True, eq=False)
 class ImuTable:
-    """imu: samples in order of time; dropped: such as were damaged or not later than the one before; serial:
-    of the device, where it is known."""
+    """imu: samples in order of time. dropped: number of samples that were damaged or not later than the
+    one before. serial: of the device, where known."""
 
     name: str
     imu: ImuBatch
@@ -36,9 +36,9 @@ class ImuTable:
 
 
 def read_imu(source: str, on_progress: Callable[[int, int], None] = lambda done, total: None) -> ImuTable:
-    """The samples of the recording that `source` names. told: how many are read, of how many.
+    """Read the samples of the recording named `source`. on_progress(done, total): samples read.
 
-    Raises UsageError where it is none, DataError where it is damaged or has no IMU.
+    Raises UsageError where it is no recording, DataError where it is damaged or has no IMU.
     """
     path = Path(source)
     if path.suffix == ".mcap" and path.is_file():
@@ -54,11 +54,11 @@ def read_imu(source: str, on_progress: Callable[[int, int], None] = lambda done,
             return _clean_table(path.stem, stamps, values, unreadable=sum(losses.counts.values()))
     if not path.exists():
         raise UsageError(f"SOURCE {path}: no such file or folder")
-    raise UsageError(f"{source}: is no recording of an IMU that SHARE reads: {_SUPPORTED}")
+    raise UsageError(f"{source}: is not an IMU recording that SHARE reads; give {_SUPPORTED}")
 
 
 def imu_csv_files(path: Path) -> list[Path]:
-    """Where the samples of a folder may be; a table itself."""
+    """Return where the samples of a folder may be; a table itself."""
     if path.suffix == ".csv":
         return [path]
     return [path / "mav0" / "imu0" / "data.csv", path / "imu0" / "data.csv", path / "data.csv"]
@@ -75,7 +75,7 @@ def _read_mcap(name: str, path: Path, on_progress: Callable[[int, int], None]) -
 
 
 def _read_db3(path: Path, on_progress: Callable[[int, int], None]) -> ImuTable:
-    from share.recordings.realsense import read_recorded_imu  # rosbags only where it is needed
+    from share.recordings.realsense import read_recorded_imu  # rosbags is imported only where needed
     from share.recordings.realsense_db3 import Db3
 
     on_progress(0, 1)
@@ -89,7 +89,8 @@ def _read_db3(path: Path, on_progress: Callable[[int, int], None]) -> ImuTable:
 def _clean_table(
     name: str, stamps_ns: I64, values: F64, serial: str | None = None, unreadable: int = 0
 ) -> ImuTable:
-    """lost: samples that could not even be read. Raises DataError where more than 5 % are damaged."""
+    """Return the valid samples. unreadable: samples lost before. Raises DataError where more than 5 % are
+    damaged."""
     finite = np.asarray(np.isfinite(values).all(axis=1))
     losses = DataLosses()
     for k in np.flatnonzero(~finite):
@@ -102,11 +103,8 @@ def _clean_table(
     return ImuTable(name, imu, dropped, serial)
 
 
-# ---- How noisy an IMU is, by a file or by the recording itself.
-
-
 def stated_noise(source: str, chain_path: str | None, option: str) -> ImuNoise:
-    """Of what `option` gave (an IMU chain, or a folder with one), else as the source carries it.
+    """Return the noise from the IMU chain, or the folder with one, that `option` gave, else from the source.
 
     Raises UsageError or ConfigError.
     """
@@ -117,14 +115,14 @@ def stated_noise(source: str, chain_path: str | None, option: str) -> ImuNoise:
         return imu_noise(chain.section("imu0"), "update_rate")
     noise = _source_noise(Path(source))
     if noise is None:
-        raise UsageError(f"{source}: does not say how noisy the IMU is; give {option} DIR")
+        raise UsageError(f"{source}: does not state the IMU's noise; give {option} DIR")
     return noise
 
 
 def _source_noise(source: Path) -> ImuNoise | None:
-    """As the source says, with cameras or without: one that was recorded for its IMU alone has none."""
+    """Return the noise that the source states, None where it states none, as a recording of the IMU alone."""
     if source.suffix == ".mcap" and source.is_file():
-        from share.recordings.mcap.file import McapFile  # only where they are needed
+        from share.recordings.mcap.file import McapFile  # imported only where needed
         from share.recordings.mcap.reader import own_rig
 
         rig = own_rig(McapFile(source), {}, needed=False)
@@ -137,7 +135,7 @@ def _source_noise(source: Path) -> ImuNoise | None:
 
 
 def chain_file(path_given: str, option: str) -> Path:
-    """The IMU chain that `option` gave: it, or the one in that folder. Raises UsageError."""
+    """Return the IMU chain that `option` gave: the file, or that in the folder. Raises UsageError."""
     path = Path(path_given) / IMU_CHAIN if Path(path_given).is_dir() else Path(path_given)
     if not path.is_file():
         raise UsageError(f"{option} {path_given}: has no {IMU_CHAIN}")

@@ -1,7 +1,7 @@
-"""Calibration targets: where the corners of an AprilGrid or a ChArUco board lie.
+"""Calibration targets: the corners of an AprilGrid or a ChArUco board, and their YAML files.
 
-Frame of every target: on the board, x to the right, y up, z out of the board towards who looks at it, m.
-A corner's id is its row in `corners`, and the same in every detection of it.
+Frame of every target: on the board, x to the right, y up, z out of the board towards the viewer, m. A
+corner's id is its row in `corners`, and the same in every detection.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from share.types import F64
 
 DICTIONARIES = ("4X4", "5X5", "6X6", "7X7")  # OpenCV's, each with 50, 100, 250 or 1000 markers
 COUNTS = (50, 100, 250, 1000)
-APRIL_TAGS = 587  # of the family 36h11
+APRIL_TAGS = 587  # in the family 36h11
 
 
 @dataclass(frozen=True)
 class AprilGrid:
-    """Kalibr's `aprilgrid`: tags of the family 36h11 with a border of two cells, and black squares that
-    touch their corners (Furgale et al., IROS 2013; tags: Olson, ICRA 2011).
+    """Kalibr's `aprilgrid`: tags of the family 36h11 with a border of two cells, and black squares that touch
+    their corners (Furgale et al., IROS 2013; tags: Olson, ICRA 2011).
 
-    tag_size: outer edge of a tag, m. tag_spacing: width of the gap between tags over tag_size. Tag ids
-    count from the lower left, along rows, upwards. Origin: the lower left corner of tag 0. Corner ids are
-    4 tag + 0, 1, 2, 3 for lower left, lower right, upper right, upper left. Raises ValueError.
+    tag_size: outer edge of a tag, m. tag_spacing: width of the gap between tags over tag_size. Tag ids count
+    from the lower left, along rows, upwards. Origin: the lower left corner of tag 0. Corner ids are 4 tag +
+    0, 1, 2, 3 for lower left, lower right, upper right, upper left. Raises ValueError.
     """
 
     rows: int = 6
@@ -41,18 +41,18 @@ class AprilGrid:
     def __post_init__(self) -> None:
         _positive(self, "rows", "cols", "tag_size", "tag_spacing")
         if self.rows * self.cols > APRIL_TAGS:
-            raise ValueError(f"{self.rows} x {self.cols} tags: the family 36h11 has {APRIL_TAGS}")
+            raise ValueError(f"{self.rows} x {self.cols} tags: the family 36h11 has only {APRIL_TAGS}")
         if self.tag_spacing >= 1:
-            raise ValueError(f"tag_spacing: {self.tag_spacing:g} is a share of the tag's size, below 1")
+            raise ValueError(f"tag_spacing: {self.tag_spacing:g} must be below 1, a fraction of tag_size")
 
     @property
     def gap(self) -> float:
-        """Between tags, and the edge of the black squares, m."""
+        """Gap between tags, and the edge of the black squares, m."""
         return self.tag_size * self.tag_spacing
 
     @property
     def extent(self) -> F64:
-        """Lower left and upper right corner (2, 2) m of what is printed black."""
+        """Lower left and upper right corner (2, 2) m of the black area."""
         upper = np.array([self.cols, self.rows]) * (self.tag_size + self.gap)
         return np.array([[-self.gap, -self.gap], upper])
 
@@ -73,9 +73,9 @@ class AprilGrid:
 class CharucoBoard:
     """OpenCV's ChArUco board (pattern of 4.6 and later: the upper left square is black).
 
-    squares_x, squares_y: of the chessboard; square and marker: their edges, m; dictionary: as OpenCV has
-    it, e.g. DICT_5X5_100. Origin: the board's lower left corner. Corner ids are OpenCV's: the inner
-    corners of the chessboard from the upper left, along rows, downwards. Raises ValueError.
+    squares_x, squares_y: of the chessboard. square, marker: edges, m. dictionary: OpenCV's name, e.g.
+    DICT_5X5_100. Origin: the board's lower left corner. Corner ids are OpenCV's: the inner corners of the
+    chessboard from the upper left, along rows, downwards. Raises ValueError.
     """
 
     squares_x: int = 9
@@ -142,9 +142,9 @@ def _positive(target: Target, *names: str) -> None:
             raise ValueError(f"{name}: {value:g} must be positive")
 
 
-# ---- Calibration targets in YAML, under Kalibr's names; also the `target` of a session.
+# Targets in YAML, with Kalibr's keys; also the `target` of a session.
 #
-# target_type: aprilgrid          target_type: charuco     (ours: Kalibr knows none)
+# target_type: aprilgrid          target_type: charuco     (SHARE's: Kalibr has no such target)
 # tagCols: 6                      squaresX: 9
 # tagRows: 6                      squaresY: 7
 # tagSize: 0.088    # m           squareSize: 0.08         # m
@@ -168,27 +168,27 @@ _KEYS: dict[str, tuple[type[Target], dict[str, str]]] = {
     ),
 }
 _TYPE = "target_type"
-_FIRST_TAG = "codeOffset"  # Kalibr's, of an aprilgrid: the number of its first tag
-TARGET = "target"  # of a session.yaml: the target that stands in its room, and there beside its keys
-T_WORLD_TARGET = "T_world_target"
+_FIRST_TAG = "codeOffset"  # Kalibr's key of an aprilgrid: the number of its first tag
+TARGET = "target"  # key of a session.yaml: the target in its room
+T_WORLD_TARGET = "T_world_target"  # key beside those of the target in a session.yaml
 
 
 def read_target(path: Path) -> Target:
-    """Raises ConfigError naming file and key."""
+    """Read a target file. Raises ConfigError with file and key."""
     return target_from_section(read_yaml(path))
 
 
 def named_target(name: str) -> Target:
-    """`aprilgrid` or `charuco` of the usual sizes, or a YAML file. Raises ConfigError."""
+    """Return `aprilgrid` or `charuco` of the usual size, or read a YAML file. Raises ConfigError."""
     if name in _KEYS:
         return _KEYS[name][0]()
     if not Path(name).is_file():
-        raise ConfigError(f"--target {name}: no such file, and none of {', '.join(_KEYS)}")
+        raise ConfigError(f"--target {name}: no such file; give one, or one of {', '.join(_KEYS)}")
     return read_target(Path(name))
 
 
 def target_from_section(section: Section) -> Target:
-    """The target of one mapping. Raises ConfigError naming where it stands and the key."""
+    """Return the target of a YAML mapping. Raises ConfigError with its place and the key."""
     kind = section.text(_TYPE)
     if kind not in _KEYS:
         raise ConfigError(f"{section.where}: {_TYPE}: '{kind}' is not known; known: {', '.join(_KEYS)}")
@@ -196,8 +196,8 @@ def target_from_section(section: Section) -> Target:
     other_keys = (_TYPE, T_WORLD_TARGET, *((_FIRST_TAG,) if cls is AprilGrid else ()))
     if _FIRST_TAG in other_keys and section.number(_FIRST_TAG, 0.0):
         raise ConfigError(
-            f"{section.where}: {_FIRST_TAG}: {section.get(_FIRST_TAG)} is not supported, tags must be "
-            "numbered from 0; `share calibrate target` prints such a board"
+            f"{section.where}: {_FIRST_TAG}: {section.get(_FIRST_TAG)} is not supported; tags must be "
+            "numbered from 0, as on a board by `share calibrate target`"
         )
     for key in section.data:
         if key not in names and key not in other_keys:
@@ -212,8 +212,8 @@ def target_from_section(section: Section) -> Target:
 
 
 def session_target(folder: Path) -> tuple[Target, F64] | None:
-    """The target in a session's room and T_world_target (4, 4), None where there is none. Raises
-    ConfigError naming file and key."""
+    """Return the target in a session's room and T_world_target (4, 4), None without one. Raises
+    ConfigError with file and key."""
     top = read_yaml(folder / SESSION_FILE)
     if TARGET not in top:
         return None
@@ -222,7 +222,7 @@ def session_target(folder: Path) -> tuple[Target, F64] | None:
 
 
 def target_mapping(target: Target) -> dict[str, Any]:
-    """As plain data for a YAML file, which `target_from_section` reads again."""
+    """Return plain data for a YAML file; the inverse of `target_from_section`."""
     kind = next(kind for kind, (cls, _) in _KEYS.items() if isinstance(target, cls))
     return {_TYPE: kind} | {key: getattr(target, name) for key, name in _KEYS[kind][1].items()}
 

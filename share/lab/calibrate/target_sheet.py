@@ -1,7 +1,8 @@
-"""What is printed on a calibration target, as black rectangles, and gray pictures of it.
+"""A calibration target on a sheet of paper: its layout, its black rectangles, gray images of it, and a PDF to
+print.
 
-Everything on a target is a rectangle along its axes, so a picture is exact: each texel is the share of
-it that is black, and that is a product of two overlaps.
+Everything on a target is an axis-aligned rectangle, so an image is exact: the black fraction of a texel is a
+product of two overlaps.
 """
 
 from __future__ import annotations
@@ -18,9 +19,7 @@ import numpy as np
 from share.lab.calibrate.target import AprilGrid, CharucoBoard, Target
 from share.types import F64
 
-# ---- A calibration target on a sheet of paper: as large as it may be, and where it lies.
-
-PAPERS = {  # width and height, mm: ISO 216, and ANSI's
+PAPERS = {  # width and height, mm: ISO 216 and ANSI
     "A4": (210.0, 297.0),
     "A3": (297.0, 420.0),
     "A2": (420.0, 594.0),
@@ -30,15 +29,16 @@ PAPERS = {  # width and height, mm: ISO 216, and ANSI's
     "tabloid": (279.4, 431.8),
 }
 DEFAULT_SIZES = {"aprilgrid": (6, 6), "charuco": (9, 7)}  # columns and rows
-MARGIN_MM = 10.0  # that no printer leaves white, and that detectors want
+MARGIN_MM = 10.0  # white border that printers and detectors need
 FOOTER_MM = 14.0  # under the target, for a ruler and a line of text
-_MARKER_SHARE = 0.75  # of a square
+_MARKER_SHARE = 0.75  # of a square's edge
 _CUSTOM_PAPER = re.compile(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)")
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """mm. width, height: of the paper. left, low: from its lower left to that of what is black."""
+    """A target on paper, mm. width, height: of the paper. left, bottom: from its lower left corner to that
+    of the black area."""
 
     target: Target
     width: float
@@ -48,10 +48,11 @@ class Sheet:
 
 
 def make_sheet(kind: str, columns: int, rows: int, paper: str, edge_mm: float | None = None) -> Sheet:
-    """A target of a kind of `DEFAULT_SIZES`, in the middle of the paper, which lies as suits it best.
+    """Return a target of a kind of `DEFAULT_SIZES` in the middle of the paper, portrait or landscape as fits
+    best.
 
-    paper: of `PAPERS`, or WxH in mm. edge_mm: of a tag or square; by default as many whole millimetres as
-    fit, so that a ruler can tell whether it was printed true. Raises ValueError.
+    paper: of `PAPERS`, or WxH in mm. edge_mm: of a tag or square; by default the largest whole millimetres
+    that fit, so that a ruler can check the print. Raises ValueError.
     """
     width_edges, height_edges = _extent_sides(make_board(kind, columns, rows, 1.0))
     width, height = max(
@@ -64,14 +65,14 @@ def make_sheet(kind: str, columns: int, rows: int, paper: str, edge_mm: float | 
     edge = math.floor(max_edge) if edge_mm is None else edge_mm
     if edge > max_edge:
         board_mm = f"{columns} x {rows} of {edge:g} mm"
-        raise ValueError(f"{board_mm} do not fit on {paper}: {max_edge:g} mm is the most there")
+        raise ValueError(f"{board_mm} do not fit on {paper}: at most {max_edge:g} mm fit")
     board_width, board_height = width_edges * edge, height_edges * edge
     left, bottom = (width - board_width) / 2, FOOTER_MM + (height - FOOTER_MM - board_height) / 2
     return Sheet(make_board(kind, columns, rows, edge / 1000), width, height, left, bottom)
 
 
 def make_board(kind: str, columns: int, rows: int, edge: float) -> Target:
-    """edge: of a tag or square, m. Raises ValueError."""
+    """Return a target; edge: of a tag or square, m. Raises ValueError."""
     if kind == "aprilgrid":
         return AprilGrid(rows, columns, edge)
     markers = columns * rows // 2
@@ -91,12 +92,12 @@ def _paper_size(paper: str) -> tuple[float, float]:
         return names[paper.lower()]
     match = _CUSTOM_PAPER.fullmatch(paper)
     if match is None:
-        raise ValueError(f"'{paper}' is no paper; known: {', '.join(PAPERS)}, or WIDTHxHEIGHT in mm")
+        raise ValueError(f"'{paper}' is not a paper size; known: {', '.join(PAPERS)}, or WIDTHxHEIGHT in mm")
     return float(match[1]), float(match[2])
 
 
 def _max_edge_mm(width_edges: float, height_edges: float, width: float, height: float) -> float:
-    """Edge, mm."""
+    """Return the largest edge that fits, mm."""
     return min((width - 2 * MARGIN_MM) / width_edges, (height - 2 * MARGIN_MM - FOOTER_MM) / height_edges)
 
 
@@ -104,7 +105,7 @@ _BORDER = {AprilGrid: 2, CharucoBoard: 1}  # cells around a marker's bits
 
 
 def black_rectangles(target: Target) -> F64:
-    """Black rectangles (M, 4) m: x0, y0, x1, y1 in the target's frame. None overlap."""
+    """Return the black rectangles (M, 4) m, without overlaps: x0, y0, x1, y1 in the target's frame."""
     if isinstance(target, AprilGrid):
         return np.concatenate([_tag_rectangles(target), _corner_squares(target)])
     squares = target.black_squares
@@ -117,8 +118,10 @@ def black_rectangles(target: Target) -> F64:
 
 
 def darkness_image(rectangles: F64, xs: F64, ys: F64) -> F64:
-    """Share of each texel that is black, (H, W) 0..1. rectangles: `black_rectangles`. xs (W + 1,), rising,
-    and ys (H + 1,), falling: borders between texels, m, so that row 0 is the top."""
+    """Return the black fraction of each texel, (H, W) 0..1, from `black_rectangles`.
+
+    xs (W + 1,), rising, and ys (H + 1,), falling: borders between texels, m, so that row 0 is the top.
+    """
     cover_x = _overlap(rectangles[:, 0], rectangles[:, 2], xs)
     cover_y = _overlap(rectangles[:, 1], rectangles[:, 3], ys[::-1])[:, ::-1]
     out: F64 = cover_y.T @ cover_x
@@ -126,7 +129,7 @@ def darkness_image(rectangles: F64, xs: F64, ys: F64) -> F64:
 
 
 def _overlap(low: F64, high: F64, borders: F64) -> F64:
-    """Share of each interval between `borders` (N + 1,) that low..high (M,) covers, (M, N)."""
+    """Return the fraction of each interval between `borders` (N + 1,) that low..high (M,) covers, (M, N)."""
     reach = np.minimum(high[:, None], borders[1:]) - np.maximum(low[:, None], borders[:-1])
     share: F64 = np.maximum(reach, 0) / np.diff(borders)
     return share
@@ -139,15 +142,15 @@ def _tag_rectangles(grid: AprilGrid) -> F64:
 
 
 def _corner_squares(grid: AprilGrid) -> F64:
-    """The black squares at the tags' corners."""
+    """Return the black squares at the tags' corners."""
     row, column = np.divmod(np.arange((grid.rows + 1) * (grid.cols + 1)), grid.cols + 1)
     low = np.stack([column, row], axis=1) * (grid.tag_size + grid.gap) - grid.gap
     return np.hstack([low, low + grid.gap])
 
 
 def _marker_cells(target: Target) -> list[tuple[np.ndarray, F64]]:
-    """Of each marker the cells (n, n), True for black, row 0 on top, and its lower left corner (2,) m,
-    or that of its square."""
+    """Return of each marker the cells (n, n), True for black, row 0 on top, and its (or its square's)
+    lower left corner (2,) m."""
     april = isinstance(target, AprilGrid)
     name = "DICT_APRILTAG_36h11" if isinstance(target, AprilGrid) else target.dictionary
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
@@ -157,12 +160,12 @@ def _marker_cells(target: Target) -> list[tuple[np.ndarray, F64]]:
     out = []
     for number, lower_left in enumerate(places):
         cells = cv2.aruco.generateImageMarker(dictionary, number, n, borderBits=border) < 128
-        out.append((np.rot90(cells, 2) if april else cells, lower_left))  # Kalibr's tags stand on their heads
+        out.append((np.rot90(cells, 2) if april else cells, lower_left))  # Kalibr's tags are upside down
     return out
 
 
 def _marker_rectangles(cells: np.ndarray, lower_left: F64, size: float) -> F64:
-    """Black rectangles (K, 4) m of a marker of `size` m: one for each run of black cells in a row."""
+    """Return black rectangles (K, 4) m of a marker of `size` m: one for each run of black cells in a row."""
     n, out = len(cells), []
     for row, line in enumerate(cells):
         steps = np.flatnonzero(np.diff(np.pad(line.astype(int), 1)))
@@ -170,15 +173,14 @@ def _marker_rectangles(cells: np.ndarray, lower_left: F64, size: float) -> F64:
     return np.tile(lower_left, 2) + np.array(out) * (size / n)
 
 
-# ---- A calibration target as a PDF to print, true to scale.
-
-_INCH = 25.4
-_RULER_MM, _SHORT_RULER_MM = 100.0, 50.0
-_FOOTER_TEXT_MM = 90.0  # beside it, with margins
+_INCH = 25.4  # mm
+_RULER_MM = 100.0
+_SHORT_RULER_MM = 50.0  # where the paper is too narrow for the other
+_FOOTER_TEXT_MM = 90.0  # beside the ruler, with margins
 
 
 def sheet_pdf(sheet: Sheet) -> bytes:
-    """One page, all in vectors."""
+    """Return a one-page PDF, all in vectors."""
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.figure import Figure
 
@@ -194,7 +196,7 @@ def sheet_pdf(sheet: Sheet) -> bytes:
 
 
 def describe_sheet(sheet: Sheet) -> str:
-    """What it is, for people."""
+    """Describe the target for readers."""
     target = sheet.target
     if isinstance(target, AprilGrid):
         edge, gap = 1000 * target.tag_size, 1000 * target.gap
@@ -204,7 +206,7 @@ def describe_sheet(sheet: Sheet) -> str:
 
 
 def _rectangles_patch(rectangles: F64) -> Any:
-    """Of (M, 4) mm: one path, so that neighbours show no seam."""
+    """Return rectangles (M, 4) mm as one path, so that neighbours show no seam."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -215,7 +217,7 @@ def _rectangles_patch(rectangles: F64) -> Any:
 
 
 def _draw_footer(page: Any, sheet: Sheet) -> None:
-    """A ruler, and what it is for."""
+    """Draw a ruler and a line of text."""
     long = _RULER_MM if sheet.width >= _RULER_MM + _FOOTER_TEXT_MM else _SHORT_RULER_MM
     x, y = MARGIN_MM, FOOTER_MM - 3
     page.plot([x, x + long], [y, y], color="black", linewidth=0.6, solid_capstyle="butt")

@@ -1,4 +1,4 @@
-"""Runs that are planned together: those that are there are taken, the others are played."""
+"""Runs that are planned together: finished ones are read, the others are played."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from share.recordings.session import Session
 from share.runtime.pool import Pool
 
 TrialResult = Trial | ShareError
-ShowRun = Callable[[int, Progress | None], None]  # which of the runs, and how far it is
+ShowRun = Callable[[int, Progress | None], None]  # number of the run, and its progress
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
-    """One run, by which settings, and in which folder it is or will be."""
+    """One run: its session, options, settings and folder."""
 
     session: Session
-    terms: RunOptions
+    options: RunOptions
     out: Path
     config: Config
 
@@ -39,11 +39,11 @@ class PlannedRun:
         return (self.out / RUN_FILE).is_file()
 
 
-SessionJob = list[PlannedRun]  # of one session, which is tracked once for all
+SessionJob = list[PlannedRun]  # runs of one session, which is tracked once for all of them
 
 
 class WorkerPool(Protocol):
-    """As `share.runtime.pool.Pool`."""
+    """The interface of `share.runtime.pool.Pool`."""
 
     @property
     def worker_count(self) -> int: ...
@@ -54,24 +54,24 @@ class WorkerPool(Protocol):
 
 
 def check_unique_names(sessions: Sequence[Session]) -> None:
-    """Raises UsageError where two have one name, since their runs would."""
+    """Raise UsageError where two sessions have one name, since their runs would."""
     names = [session.folder.resolve().name for session in sessions]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise UsageError(f"two sessions are called {twice[0]}; rename a folder")
+        raise UsageError(f"two sessions have the name {twice[0]}; rename a folder")
 
 
 def worker_pool(workers: int) -> AbstractContextManager[WorkerPool] | None:
-    """So many processes on this machine; None: one run after the other."""
+    """Return a pool of `workers` processes on this machine, None for one."""
     return None if workers == 1 else Pool(workers, startup.prepare_process, ())
 
 
 def run_all(
     runs: Sequence[PlannedRun], show: ShowRun, workers: AbstractContextManager[WorkerPool] | None = None
 ) -> Iterator[tuple[PlannedRun, TrialResult]]:
-    """What is not done yet is played; each of `runs` with what came of it.
+    """Play the runs that are not done; yield each of `runs` with its result.
 
-    workers: play sessions side by side, which only virtual time stands. Raises UsageError where a run is
-    there that was on other terms.
+    `workers`: play sessions in parallel, in virtual time only. Raises UsageError where a finished run was
+    played with other options or settings.
     """
     ready = {run.out: _read_matching_trial(run) for run in runs if run.is_done}
     yield from ((run, ready[run.out]) for run in runs if run.out in ready)
@@ -90,7 +90,7 @@ def run_all(
 
 
 def split_jobs(runs: Sequence[PlannedRun], workers: int) -> list[SessionJob]:
-    """By session, and each session in as many parts as it takes for nobody to stand idle."""
+    """Return jobs by session, each session split into as many parts as keep all workers busy."""
     by_session = sorted(runs, key=lambda one: str(one.session.folder))
     sessions = [list(group) for _, group in groupby(by_session, key=lambda one: one.session.folder)]
     parts = -(-workers // max(1, len(sessions)))
@@ -110,11 +110,12 @@ def play_job(job: SessionJob) -> list[TrialResult]:
 
 
 def _play_run(run: PlannedRun, show: Callable[[Progress], None]) -> TrialResult:
-    """A run that fails is no reason not to play the next. Who does a dead worker's job takes what it left."""
+    """Play a run, or read it if another worker that died had finished it. A failure is returned, so that
+    the next run is played."""
     if run.is_done:
         return _read_matching_trial(run)
     try:
-        return run_trial(run.session, run.terms, run.config, run.out, show)
+        return run_trial(run.session, run.options, run.config, run.out, show)
     except (UsageError, DataError):
         raise
     except ShareError as error:
@@ -122,31 +123,32 @@ def _play_run(run: PlannedRun, show: Callable[[Progress], None]) -> TrialResult:
 
 
 def _read_matching_trial(run: PlannedRun) -> Trial:
-    """A setting that the run did not know yet counts as it is shipped."""
+    """Read a finished run. Settings that did not exist when it was played count as their defaults.
+
+    Raises UsageError where its session, options or settings differ.
+    """
     trial = read_trial(run.out)
-    text = settings_yaml(run.config, run.terms.seed)
+    text = settings_yaml(run.config, run.options.seed)
     settings = read_settings(run.out / SETTINGS_FILE)
     actual = trial.session.folder.resolve(), trial.options, settings
-    expected = run.session.folder.resolve(), run.terms, load_config(text)
+    expected = run.session.folder.resolve(), run.options, load_config(text)
     if actual != expected:
-        raise UsageError(f"{trial.folder}: was played on other terms or settings; give another --out")
+        raise UsageError(f"{trial.folder}: was played with other options or settings; give another --out")
     return trial
-
-
-# ---- Every policy on every session with every seed, in turn, so that a noisy machine treats all alike.
 
 
 def plan_policies(
     sessions: Sequence[Session],
     policies: Sequence[str],
     seeds: Sequence[int],
-    terms: RunOptions,
+    options: RunOptions,
     out: Path,
     config: Config | None = None,
 ) -> list[PlannedRun]:
-    """All runs in order: of a session, the policies follow each other, each time another one first.
+    """Return all runs in order. On each session the policies follow each other, every time starting with
+    another one, so that a noisy machine treats all alike.
 
-    config: by default, every setting as it is shipped. Raises UsageError where two sessions have one name.
+    `config`: defaults if None. Raises UsageError where two sessions have one name.
     """
     check_unique_names(sessions)
     policies = list(dict.fromkeys(policies))
@@ -155,6 +157,6 @@ def plan_policies(
         for k in range(len(policies)):
             policy = policies[(round_number + k) % len(policies)]
             name = f"{session.folder.resolve().name}-{policy}-{seed}"
-            options = replace(terms, policy=policy, seed=seed)
-            runs.append(PlannedRun(session, options, out / name, Config() if config is None else config))
+            run_options = replace(options, policy=policy, seed=seed)
+            runs.append(PlannedRun(session, run_options, out / name, Config() if config is None else config))
     return runs

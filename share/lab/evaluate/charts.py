@@ -1,4 +1,4 @@
-"""Figures of an evaluation: bars, parts of a base and their intervals, lines, ways from above, heat maps."""
+"""Charts of an evaluation as PNG files: bars, ratios with intervals, lines, paths from above, heat maps."""
 
 from __future__ import annotations
 
@@ -16,11 +16,9 @@ from share.lab.evaluate.statistics import Interval
 from share.recordings.trajectory import Trajectory
 from share.types import F64
 
-# ---- Figures of matplotlib as PNG files.
-
 
 def save_png(figure: Any, path: Path, dpi: int) -> None:
-    """Whole or not at all, and its memory is given back. Raises as `atomic_write`."""
+    """Write a matplotlib figure, complete or not at all, and close it. Raises as `atomic_write`."""
     from matplotlib import pyplot
 
     try:
@@ -43,11 +41,11 @@ def draw_bars(
     unit: str,
     line: float | None = None,
 ) -> None:
-    """PNG, a panel for each of `panels`: {series: a value for each of `groups`}; NaN is left out.
+    """Write a PNG with a panel for each of `panels`: {series: a value for each of `groups`}; NaN is left out.
 
-    line: a level to be told from, drawn across.
+    `line`: a level to draw across.
     """
-    pyplot = _pyplot()
+    pyplot = agg_pyplot()
     width = max(6.0, 0.16 * len(groups) * max(map(len, panels.values())) + 2)
     figure, axes = pyplot.subplots(
         len(panels), 1, figsize=(width, 2.6 * len(panels)), layout="constrained", sharex=True, squeeze=False
@@ -72,11 +70,11 @@ def draw_bars(
 def draw_ratios(
     path: Path, series: Mapping[str, Mapping[str, Interval]], base: str, names: Sequence[str]
 ) -> None:
-    """PNG: for each of `series` a bar a measure, as parts of `base`, which is 1; whiskers are intervals.
+    """Write a PNG with a bar per measure for each of `series`, as ratios to `base`; whiskers are intervals.
 
-    names: of all that have a colour, those of `series` among them, so that they have it in every picture.
+    `names`: all series that have a colour in any picture, so that each keeps its own.
     """
-    pyplot = _pyplot()
+    pyplot = agg_pyplot()
     measures = list(dict.fromkeys(name for values in series.values() for name in values))
     figure, axis = pyplot.subplots(figsize=(9, 0.5 + 0.5 * len(measures)), layout="constrained")
     positions, bar_width = np.arange(len(measures)), 0.8 / len(series)
@@ -92,7 +90,7 @@ def draw_ratios(
     axis.axvline(1, color="black", linewidth=1, linestyle="--")
     axis.set_yticks(positions, measures)
     axis.invert_yaxis()
-    axis.set(xlabel=f"part of {base}", xlim=(0, None))
+    axis.set(xlabel=f"ratio to {base}", xlim=(0, None))
     axis.grid(axis="x", alpha=0.3)
     axis.set_axisbelow(True)
     figure.legend(loc="outside upper right", ncols=len(series), fontsize=8)
@@ -102,8 +100,8 @@ def draw_ratios(
 def draw_lines(
     path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]], x_label: str, units: Sequence[str]
 ) -> None:
-    """PNG, a panel for each of `panels`, of one of `units`: {series: (x (N,), y (N,))}. across: what x is."""
-    pyplot = _pyplot()
+    """Write a PNG with a panel for each of `panels`, in one of `units` each: {series: (x (N,), y (N,))}."""
+    pyplot = agg_pyplot()
     figure, axes = pyplot.subplots(
         len(panels), 1, figsize=(9, 2.4 * len(panels)), layout="constrained", sharex=True, squeeze=False
     )
@@ -120,8 +118,9 @@ def draw_lines(
 
 
 def draw_paths(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -> None:
-    """PNG, a panel for each of `panels`, from above: {series: (its way (N, 2) m, dots on it (M, 2) m)}."""
-    pyplot = _pyplot()
+    """Write a PNG of paths from above, a panel for each of `panels`: {series: (path (N, 2) m, dots (M, 2)
+    m)}."""
+    pyplot = agg_pyplot()
     columns = min(_MAX_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     width, height = np.ptp(
@@ -155,8 +154,9 @@ def draw_heat_maps(
     y_axis: tuple[str, Sequence[str]],
     x_axis: tuple[str, Sequence[str]],
 ) -> None:
-    """PNG: a map for each of `maps`, (V, W) over V values down and W across, each with what it is of."""
-    pyplot = _pyplot()
+    """Write a PNG with a heat map for each of `maps`: (V, W) over V values of y_axis and W of x_axis,
+    (label, values) each."""
+    pyplot = agg_pyplot()
     figure, axes = pyplot.subplots(
         1, len(maps), figsize=(1 + 3.2 * len(maps), 3.4), layout="constrained", squeeze=False
     )
@@ -171,7 +171,8 @@ def draw_heat_maps(
     save_png(figure, path, 110)
 
 
-def _pyplot() -> Any:
+def agg_pyplot() -> Any:
+    """Return matplotlib's pyplot, which draws to files only."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -180,9 +181,7 @@ def _pyplot() -> Any:
     return pyplot
 
 
-# ---- The trajectories of a run as one picture: seen from above, and height over time.
-
-_TRAJECTORY_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
+AGENT_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
 
 
 def draw_trajectories(
@@ -191,19 +190,17 @@ def draw_trajectories(
     T_truth_map: F64,
     title: str,
 ) -> None:
-    """PNG of {name: (poses in the shared map or None, truth)}; T_truth_map (4, 4) lays one on the other."""
-    import matplotlib
+    """Write a PNG of a run from above, and of the position errors over time.
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
+    agents: {name: (poses in the shared map or None, truth)}. T_truth_map (4, 4) aligns the map with the
+    truth.
+    """
+    pyplot = agg_pyplot()
     figure, (top_view, error) = pyplot.subplots(
         1, 2, figsize=(13, 6.2), width_ratios=(3, 2), layout="constrained"
     )
     start = min(truth.stamps_ns[0] for _, truth in agents.values())
-    for (name, (estimate, truth)), colour in zip(
-        agents.items(), _TRAJECTORY_COLOURS * len(agents), strict=False
-    ):
+    for (name, (estimate, truth)), colour in zip(agents.items(), AGENT_COLOURS * len(agents), strict=False):
         p = truth.T[:, :3, 3]
         top_view.plot(p[:, 0], p[:, 1], color=colour, alpha=0.3, linewidth=5, solid_capstyle="round")
         if estimate is None:
@@ -218,7 +215,7 @@ def draw_trajectories(
         error.plot(
             t, 100 * np.linalg.norm(q - true_positions, axis=1), color=colour, linewidth=1.2, label=name
         )
-    top_view.set(title="from above: truth (broad), in the shared map (thin)", xlabel="x [m]", ylabel="y [m]")
+    top_view.set(title="from above: truth (broad), shared map (thin)", xlabel="x [m]", ylabel="y [m]")
     top_view.set_aspect("equal")
     error.set(title="position error in the shared map", xlabel="time [s]", ylabel="cm")
     error.set_ylim(bottom=0)

@@ -1,4 +1,4 @@
-"""Jobs on other machines, by dask.distributed: a worker that dies has its jobs done by another."""
+"""Run jobs on other machines by dask.distributed. Jobs of a worker that dies go to another worker."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ _CONNECT_S = 10
 
 
 class Cluster:
-    """As `share.runtime.pool.Pool`, where a scheduler listens at `address`. Workers need SHARE, and the same
-    files at the same paths."""
+    """A pool with the interface of `share.runtime.pool.Pool`, on the dask scheduler at `address`.
+
+    Workers need SHARE, and the same files at the same paths.
+    """
 
     def __init__(self, address: str) -> None:
         if importlib.util.find_spec("distributed") is None:
@@ -26,15 +28,15 @@ class Cluster:
         try:
             self._client = Client(address, timeout=_CONNECT_S)
         except (OSError, ValueError) as error:
-            raise UsageError(f"--scheduler {address}: nobody answers there: {error}") from None
+            raise UsageError(f"--scheduler {address}: no answer from a dask scheduler: {error}") from None
 
     @property
     def worker_count(self) -> int:
-        """Of workers now; as if there were one where none has come yet."""
+        """The number of workers now; 1 while none has connected."""
         return max(1, len(self._client.nthreads()))
 
     def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
-        """Every job with `work(job)`, in the order in which they are done. Raises what a job raised."""
+        """Yield every job with `work(job)`, in order of completion. Raises what a job raised."""
         from distributed import KilledWorker, as_completed
 
         running = {self._client.submit(work, job, pure=False): job for job in jobs}
@@ -43,7 +45,7 @@ class Cluster:
                 yield running[future], future.result()
         except KilledWorker:
             raise ShareError(
-                "a run has ended several workers, one after the other; is their memory short?"
+                "a run has ended several workers, one after the other; do they have enough memory?"
             ) from None
         finally:
             self._client.cancel(list(running))

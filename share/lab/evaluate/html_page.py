@@ -1,4 +1,4 @@
-"""A report as one HTML page that opens offline: its text, in Markdown, with its pictures inside."""
+"""A report as one HTML page that opens offline, with its pictures embedded."""
 
 from __future__ import annotations
 
@@ -26,10 +26,12 @@ _PICTURE = re.compile(r'<p><img alt="([^"]*)" src="([^"]*)" ?/?></p>')
 
 
 def html_page(title: str, text: str, folder: Path) -> str:
-    """HTML. text: Markdown, whose own HTML is shown, not taken; its pictures are PNG files in `folder`,
-    each a paragraph of its own, with what is said of it below."""
+    """Return HTML of a Markdown text. HTML in the text is escaped.
+
+    Pictures are PNG files in `folder`, each a paragraph of its own; its alt text becomes the caption.
+    """
     from markdown import markdown
-    from markdown.extensions.tables import TableExtension  # by its class, so that a freezer sees it
+    from markdown.extensions.tables import TableExtension  # imported by class, so that a freezer sees it
 
     body = markdown(html.escape(text, quote=False), extensions=[TableExtension()])
     body = _PICTURE.sub(partial(_figure_html, folder), body)

@@ -1,11 +1,13 @@
-"""A mapper that knows the truth, in place of one that recognises it: several times as quick.
+"""A mapper that draws recognition and solved poses from the ground truth. Several times as fast as the real
+one.
 
-In virtual time (`share.lab.evaluate.simulation`) it answers as `share.mapping.mapper.Mapper` does: whose
-turn it
-is, what is skipped and what is solved are decided by the same code, but whether two views are verified is
-drawn by how much they overlap, and where a solved map has an agent is the truth and an error that is drawn.
-What it leaves out: views that never match, walls between views, loops that are wrong, and how a map gets
-better with what it knows."""
+In virtual time (`share.lab.evaluate.simulation`) it takes the place of `share.mapping.mapper.Mapper`. The
+same code as there decides which keyframe is looked up next, which loops are skipped and which map is solved.
+Whether two views are verified is drawn from their overlap; the pose of an agent in a solved map is the truth
+plus a drawn error.
+
+Not modelled: views that never match, walls between views, wrong loops, and a map that improves as it grows.
+"""
 
 from __future__ import annotations
 
@@ -30,20 +32,20 @@ from share.scheduling.overlap import Frustum, SampledFrustum, overlap_volumes
 from share.types import F64, Correction, Keyframe
 from share.wire.messages import Hello
 
-_COARSE_M = 1.0  # between the points by which overlap is found here
+_COARSE_M = 1.0  # sampling interval of the overlap
 _COV = np.diag([1e-5] * 3 + [1e-4] * 3)
-_CACHE_SIZE = 50_000  # keyframes, each with all of one agent: some 100 MB
+_CACHE_SIZE = 50_000  # pairs of a keyframe and an agent: some 100 MB
 
 
 @dataclass(frozen=True)
 class RecognitionModel:
-    """Of recognition, in parts of a view's volume, and of a solved map. Defaults: docs/scheduling.md.
+    """Parameters of the drawn recognition and of a solved map. Defaults: docs/scheduling.md.
 
-    half, width: two views that share `half_overlap` are verified every second time, by a logistic curve
-    `logistic_width`
-    wide. blur: error of the overlap by which candidates are ranked; strange: so many of all keyframes look
-    alike by chance. sigma_m: error of a solved pose on each axis, sigma_rad: about the vertical. witnesses:
-    verified pairs of keyframes that join two maps.
+    Overlaps are fractions of a view's volume. Two views that share `half_overlap` are verified with
+    probability 1/2, by a logistic curve of width `logistic_width`. `overlap_noise`: sigma of the overlap by
+    which candidates are ranked. `false_match_rate`: fraction of all keyframes that look alike by chance.
+    `sigma_m`, `sigma_rad`: error of a solved pose on each axis, and about the vertical. `supporting_loops`:
+    verified pairs of keyframes that merge two maps.
     """
 
     half_overlap: float = 0.5
@@ -56,14 +58,15 @@ class RecognitionModel:
 
 
 class GroundTruth:
-    """Where everybody's keyframes are, sent or not, and what they have in common. It is the same in all runs
-    in a room, and best passed from one to the next: what was worked out once is remembered.
+    """True poses of all agents' keyframes, sent or not, and their overlaps.
+
+    Equal in all runs in a room: pass one instance from run to run, it caches the overlaps.
     """
 
     def __init__(
         self, near_m: float, far_m: float, rigs: Mapping[str, Rig], T_world_body: Mapping[str, F64]
     ) -> None:
-        """By agent, T_world_body (N, 4, 4). near_m, far_m: of what cameras see."""
+        """Take T_world_body (N, 4, 4) by agent; cameras see from near_m to far_m."""
         self.T_world_body = T_world_body
         self._T_world_cam = {name: T @ rigs[name].T_body_cam0 for name, T in T_world_body.items()}
         self._view_volumes = {
@@ -73,14 +76,15 @@ class GroundTruth:
         self.overlap = lru_cache(_CACHE_SIZE)(self._overlap)
 
     def _overlap(self, agent: str, k: int, other: str) -> F64:
-        """Overlap of the agent's keyframe k with each of another's (N,), in parts of its view's volume."""
+        """Return the overlap (N,) of the agent's keyframe k with each of `other`'s, as fractions of its
+        view's volume."""
         one, two, T = self._view_volumes[agent], self._view_volumes[other], self._T_world_cam
         return overlap_volumes(one, T[agent][k], two, T[other]) / one.frustum.volume
 
 
 @dataclass(frozen=True)
 class ModelledStep:
-    """To be run by whoever keeps the time. candidate: for kind `verify`."""
+    """A step that the keeper of the clock runs. `candidate`: of kind `verify` only."""
 
     kind: str
     number: int
@@ -93,7 +97,7 @@ class ModelledStep:
 
 @dataclass
 class _StoredKeyframe:
-    """k: which of the agent's keyframes in truth."""
+    """A keyframe in the map. `truth_index`: its row in the agent's ground truth."""
 
     agent: str
     keyframe: Keyframe
@@ -103,8 +107,8 @@ class _StoredKeyframe:
 
 @dataclass
 class _AgentState:
-    """Of one agent. numbers, ks: of its keyframes. told: the map that it was last corrected into. answer: its
-    newest keyframe that a loop came from, -1 none."""
+    """State of one run. `published_map`: the map of its last correction. `newest_looped_keyframe`: id of
+    its newest keyframe with an accepted loop that no correction answers yet, -1 without one."""
 
     hello: Hello
     keyframe_numbers: list[int] = field(default_factory=list)
@@ -116,7 +120,10 @@ class _AgentState:
 
 
 class ModelledMapper:
-    """which: of an agent's keyframes in truth, by its name and the stamp of a keyframe."""
+    """Answer as `Mapper` does, from the ground truth.
+
+    `truth_index(name, stamp_ns)` gives the row of an agent's keyframe in its ground truth.
+    """
 
     def __init__(
         self,
@@ -136,16 +143,16 @@ class ModelledMapper:
         self._budget = SearchBudget.from_config(config)
         self._search: CandidateSearch | None = None
         self._is_searching = self._is_solving = False
-        self._maps_to_solve: dict[str, None] = {}  # maps
-        self._verified_pairs: dict[frozenset[str], int] = {}  # verified ones between two maps
+        self._maps_to_solve: dict[str, None] = {}
+        self._verified_pairs: dict[frozenset[str], int] = {}  # verified loops between two maps
 
-    # ------------------------------------------------------------------ as share.mapping.mapper.Mapper
+    # The interface of share.mapping.mapper.Mapper.
 
     def add_run(self, agent: str, hello: Hello) -> None:
         self._agents[agent] = _AgentState(hello)
 
     def set_present(self, agent: str, is_present: bool) -> None:
-        """Everybody is told at once here, so it does not matter."""
+        """Do nothing: presence does not matter here, all agents get corrections at once."""
 
     def add_keyframe(self, agent: str, keyframe: Keyframe, is_extra: bool = False) -> list[MapEvent]:
         run, number = self._agents[agent], len(self._stored)
@@ -171,6 +178,7 @@ class ModelledMapper:
         return step
 
     def next_solve(self) -> ModelledStep | None:
+        """Return the solve of the next map to be solved, None while one runs or without one."""
         if self._is_solving or not self._maps_to_solve:
             return None
         name = next(iter(self._maps_to_solve))
@@ -208,15 +216,16 @@ class ModelledMapper:
             "maps": dict(Counter(self._agents[stored.agent].map_id for stored in self._stored)),
         }
 
-    # ------------------------------------------------------------------ what is drawn
+    # The drawn recognition and solution.
 
     def _overlap(self, number: int, run: _AgentState) -> F64:
-        """Overlap, in parts of its view, of a keyframe with each of an agent in truth (N,)."""
+        """Return the overlap (N,) of a keyframe's view with each true keyframe of an agent, as fractions
+        of that view."""
         mine = self._stored[number]
         return self._truth.overlap(self._agents[mine.agent].hello.name, mine.truth_index, run.hello.name)
 
     def _candidates(self, number: int) -> list[int]:
-        """Best first."""
+        """Return candidates for a keyframe, best first."""
         agent, gap = self._stored[number].agent, self._config.merge.min_loop_gap
         ranked: list[tuple[float, int]] = []
         for other, run in self._agents.items():
@@ -226,7 +235,7 @@ class ModelledMapper:
             overlaps += self._model.overlap_noise * self._rng.standard_normal(len(numbers))
             overlaps[self._rng.random(len(overlaps)) < self._model.false_match_rate] += 0.5
             end = len(numbers)
-            if other == agent:  # odometry's business
+            if other == agent:  # keyframes this close are joined by odometry
                 end = max(0, self._stored[number].keyframe.id - gap)
             best = np.argsort(-overlaps[:end])[: self._config.place.candidates]
             ranked += [(float(overlaps[i]), numbers[i]) for i in best if numbers[i] != number]
@@ -269,7 +278,7 @@ class ModelledMapper:
         return [MapEvent(b.agent, "loop accepted", "drawn")]
 
     def _try_join_maps(self, one: _AgentState, other: _AgentState) -> bool:
-        """Whether there are enough that say so; the younger map then goes."""
+        """Merge the maps of two agents if enough loops support it; the younger map is absorbed."""
         pair = frozenset((one.map_id, other.map_id))
         self._verified_pairs[pair] = self._verified_pairs.get(pair, 0) + 1
         if self._verified_pairs[pair] < self._model.supporting_loops:
@@ -281,7 +290,7 @@ class ModelledMapper:
         return True
 
     def _corrections(self, name: str, answered: Mapping[str, int]) -> list[MapEvent]:
-        """Corrections of those that are answered or have come from another map."""
+        """Return corrections for agents that have an answer due or whose map was absorbed."""
         return [
             MapEvent(agent, "correction", "solved", self._correction(run, answered.get(agent, -1)))
             for agent, run in self._agents.items()

@@ -1,4 +1,5 @@
-"""Our tracker and those of others on the same recordings: a row of figures each, kept as it comes."""
+"""Compare SHARE's tracker with peers on the same recordings: a row of metrics each, stored as it is
+computed."""
 
 from __future__ import annotations
 
@@ -28,12 +29,13 @@ from share.recordings.trajectory import Trajectory, format_tum
 from share.runtime.machine import describe_machine
 from share.runtime.source import Source
 
-_FINAL_SUFFIX = ", in the end"
+_FINAL_SUFFIX = ", final trajectory"
 
 
 @dataclass(frozen=True)
 class TrackerRow:
-    """One tracker on one recording. told: share of the frames that have a pose. NaN: not known."""
+    """Metrics of one tracker on one recording; NaN where unknown. `told`: fraction of the frames with a
+    pose. `most_cm`: largest position error."""
 
     recording: str
     tracker: str
@@ -50,9 +52,11 @@ class TrackerRow:
 
 @dataclass(frozen=True)
 class TrackerEntry:
-    """key: in names of files. title: for a reader. about: plain data that says which one it is. fits: whether
-    it can be run on a recording. run: given one, a file for what else it says, and whom to tell how many
-    frames are done."""
+    """A tracker to compare. `key`: in file names. `title`: for readers. `identity`: plain data that
+    identifies it.
+
+    `run(source, log, show)`: run it with a file for its log; `show` gets the number of frames done.
+    """
 
     key: str
     title: str
@@ -64,8 +68,10 @@ class TrackerEntry:
 def tracker_entries(
     settings: Config, pythons: Mapping[str, Path], vocabulary: Path | None
 ) -> tuple[list[TrackerEntry], list[str]]:
-    """Ours first; and why a peer is left out, with what to do. pythons: interpreters, by name of `PEERS`; by
-    default, the one that runs this."""
+    """Return SHARE's tracker, then the peers; and why a peer is left out, with what to do.
+
+    `pythons`: interpreters by key of `PEERS`; this process's by default.
+    """
     entries = [
         TrackerEntry(
             "share",
@@ -84,7 +90,7 @@ def tracker_entries(
                 f"{peer.title}: {python} does not have it; {peer.install}, then --peer {key}=DIR/bin/python"
             )
         elif peer.needs_vocabulary and vocabulary is None:
-            missing.append(f"{peer.title}: needs the vocabulary of its authors: --vocabulary ORBvoc.txt")
+            missing.append(f"{peer.title}: needs its authors' vocabulary: give --vocabulary ORBvoc.txt")
         else:
             options_given = {"vocabulary": str(vocabulary)} if peer.needs_vocabulary else {}
             options = [word for name, value in options_given.items() for word in (f"--{name}", value)]
@@ -100,18 +106,20 @@ def _run_peer(command: list[str], source: Source, log: Path, show: Callable[[int
 
 
 def tracker_rows(
-    name: str, source: Source, contender: TrackerEntry, out: Path, show: Callable[[int], None]
+    name: str, source: Source, tracker: TrackerEntry, out: Path, show: Callable[[int], None]
 ) -> Iterator[TrackerRow]:
-    """Of one contender on the recording that is called `name`; from `out`, if they are there. Raises
-    UsageError where they are there and of something else, DataError where it fails."""
-    stem = out / f"{name.replace('/', '-')}-{contender.key}"
-    file, made_by = stem.with_suffix(".json"), _provenance(source, contender)
+    """Yield the rows of one tracker on the recording called `name`; read from `out` if already there.
+
+    Raises UsageError where the stored rows are of something else, DataError where the tracker fails.
+    """
+    stem = out / f"{name.replace('/', '-')}-{tracker.key}"
+    file, made_by = stem.with_suffix(".json"), _provenance(source, tracker)
     if not file.exists():
-        run = contender.run(source, stem.with_suffix(".log"), show)
-        new_rows = [score_tracker(name, contender.title, source, run.trajectory, run.cpu_ms)]
+        run = tracker.run(source, stem.with_suffix(".log"), show)
+        new_rows = [score_tracker(name, tracker.title, source, run.trajectory, run.cpu_ms)]
         atomic_write(stem.with_suffix(".tum"), format_tum(run.trajectory))
         if run.final is not None:
-            new_rows.append(score_tracker(name, contender.title + _FINAL_SUFFIX, source, run.final, []))
+            new_rows.append(score_tracker(name, tracker.title + _FINAL_SUFFIX, source, run.final, []))
             atomic_write(stem.with_name(f"{stem.name}-end.tum"), format_tum(run.final))
         document = {
             "made_by": made_by,
@@ -129,24 +137,24 @@ def tracker_rows(
         raise DataError(f"{file}: is damaged: {error!r}; remove it") from None
 
 
-def _provenance(source: Source, contender: TrackerEntry) -> dict[str, Any]:
-    """As it comes back from JSON."""
+def _provenance(source: Source, tracker: TrackerEntry) -> dict[str, Any]:
+    """Return what the rows depend on, as it reads back from JSON."""
     provenance: dict[str, Any] = to_plain(
-        {"recording": source.name, "tracker": contender.title, **contender.identity}
+        {"recording": source.name, "tracker": tracker.title, **tracker.identity}
     )
     return provenance
 
 
 def check_truth(name: str, source: Source) -> None:
-    """Raises UsageError without a truth."""
+    """Raise UsageError where the recording has no ground truth."""
     if source.truth() is None:
-        raise UsageError(f"{name}: comes without a truth, so nobody can be told from another")
+        raise UsageError(f"{name}: has no ground truth; trackers cannot be compared on it")
 
 
 def score_tracker(
     name: str, tracker: str, source: Source, estimate: Trajectory, cpu_ms: Sequence[float]
 ) -> TrackerRow:
-    """NaN where there are too few poses with a truth to speak of any."""
+    """Return a row; errors are NaN where too few poses have a truth."""
     truth = source.truth()
     assert truth is not None  # see `check_truth`
     errors = (math.nan,) * 4

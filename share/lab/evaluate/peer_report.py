@@ -17,22 +17,23 @@ from share.lab.evaluate.report import bullets, csv_text, format_number, image_li
 from share.runtime.machine import describe_machine
 
 PROTOCOL = (
-    "causal poses of all frames, as each tracker told them at the time; truth interpolated at their stamps",
-    "ATE: rms under one SE3 alignment; RPE: rms over 1 s, without one; docs/evaluation.md",
-    "CPU: process time of all threads, decoding apart; ours with its keyframes",
-    "'in the end': not causal, the trajectory by the map that a tracker has when all is over",
+    "causal poses of all frames, as each tracker gave them at the time; truth interpolated at their stamps",
+    "ATE: rms under one SE3 alignment; RPE: rms over 1 s, no alignment; docs/evaluation.md",
+    "CPU: process time of all threads, without decoding; SHARE's includes its keyframes",
+    "'final trajectory': not causal; the trajectory by the tracker's final map",
 )
 
 
 def rows_csv(rows: Sequence[TrackerRow]) -> str:
-    """A line a row."""
+    """Return a line per row."""
     return csv_text([f.name for f in dataclasses.fields(TrackerRow)], map(dataclasses.astuple, rows))
 
 
 def markdown(rows: Sequence[TrackerRow], missing: Sequence[str]) -> str:
-    """The table, medians where there are several recordings, and the protocol."""
-    head = ("recording", "tracker", "ATE cm", "most cm", "RPE 1 s cm", "°", "with a pose %")
-    cpu = ("CPU ms a frame", "mean", "p99")
+    """Return the table, with medians where there are several recordings, and the protocol. `missing`: why
+    trackers were left out."""
+    head = ("recording", "tracker", "ATE cm", "max cm", "RPE 1 s cm", "RPE 1 s °", "tracked %")
+    cpu = ("CPU ms per frame: median", "mean", "p99")
     body = [_cells(row) for row in rows]
     if len({row.recording for row in rows}) > 1:
         body += [_cells(row) for row in _medians(rows)]
@@ -52,7 +53,7 @@ def markdown(rows: Sequence[TrackerRow], missing: Sequence[str]) -> str:
 
 
 def _medians(rows: Sequence[TrackerRow]) -> Iterator[TrackerRow]:
-    """Of each tracker, over the recordings where it has figures."""
+    """Yield a row per tracker: medians over the recordings where it has values."""
     for tracker in dict.fromkeys(row.tracker for row in rows):
         tracker_rows = [row for row in rows if row.tracker == tracker]
         values = [
@@ -73,10 +74,9 @@ def _cells(row: TrackerRow) -> list[str]:
 
 
 def draw_comparison(folder: Path, rows: Sequence[TrackerRow]) -> str:
-    """PNG files in `folder`; the Markdown that shows them."""
-    recordings, trackers = (
-        list(dict.fromkeys(getattr(r, f) for r in rows)) for f in ("recording", "tracker")
-    )
+    """Write PNG files to `folder`; return the Markdown that shows them."""
+    recordings = list(dict.fromkeys(row.recording for row in rows))
+    trackers = list(dict.fromkeys(row.tracker for row in rows))
     row_of = {(row.recording, row.tracker): row for row in rows}
 
     def values(field: str) -> dict[str, list[float]]:
@@ -96,6 +96,7 @@ def draw_comparison(folder: Path, rows: Sequence[TrackerRow]) -> str:
         for tracker, values_ms in values("cpu_mean_ms").items()
         if not np.isnan(values_ms).all()
     }
-    draw_bars(folder / "cpu.png", {"CPU a frame, mean": causal}, recordings, "ms")
-    errors, cpu = image_link("Errors of each tracker", "errors.png"), image_link("What they take", "cpu.png")
+    draw_bars(folder / "cpu.png", {"mean CPU per frame": causal}, recordings, "ms")
+    errors = image_link("Errors of each tracker", "errors.png")
+    cpu = image_link("CPU time of each tracker", "cpu.png")
     return f"{errors}\n\n{cpu}\n"

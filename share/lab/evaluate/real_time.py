@@ -1,4 +1,8 @@
-"""A session in real time on this machine: an edge and an agent per recording, as processes of their own."""
+"""Play a session in real time on this machine: an edge and one agent per recording, each in a process of its
+own.
+
+Also scores what the agents of a session left, against their ground truth.
+"""
 
 from __future__ import annotations
 
@@ -26,16 +30,16 @@ from share.recordings.session import Session
 from share.recordings.trajectory import Trajectory, read_tum
 from share.runtime.child_commands import running_child, stop_child
 
-EDGE_START_TIMEOUT_S = 20.0  # how long the edge may take until it listens
-AGENT_GRACE_S = 60.0  # how much longer than its recording an agent may take
-_POLL_S = 0.5  # between two looks at what a run has come to
-_EDGE_NICENESS = 10  # niceness: a tenth of an agent's part of a core that both want
+EDGE_START_TIMEOUT_S = 20.0  # until the edge listens
+AGENT_GRACE_S = 60.0  # how much longer than its recording an agent may run
+_POLL_S = 0.5
+_EDGE_NICENESS = 10  # on a shared core, about a tenth of an agent's time
 Processes = dict[str, subprocess.Popen[bytes]]
 
 
 @dataclass(frozen=True)
 class Progress:
-    """For the live line: frames per agent, agents that share a map with another, corrections sent."""
+    """Progress of a run, for the live line: frames per agent, agents that share a map, corrections sent."""
 
     frames: dict[str, int]
     joined: int
@@ -48,12 +52,14 @@ class Progress:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """On which a session is played. link: emulated networks, as `LinkAssignment` reads them; seed: of what
-    they do.
-    true_error: agents tell the edge how wrong they are by the truth. virtual: in virtual time
-    (`share.lab.evaluate.virtual_time`), where things take as long as in the run in folder `costs`.
-    agents_first:
-    the edge gets what the agents leave of this machine, as if they had their own. config: a file, for all."""
+    """How to play a session.
+
+    `link`: emulated networks, in the syntax of `LinkAssignment`. `seed`: of the networks' random numbers.
+    `true_error`: agents send their true tracking error in place of an estimate. `virtual`: play in virtual
+    time (`share.lab.evaluate.virtual_time`), with delays measured in the run in folder `costs`, if given.
+    `agents_first`: run the edge at low priority, so that it takes only the CPU time that the agents leave.
+    `config`: a configuration file for edge and agents.
+    """
 
     policy: str
     link: str | None = None
@@ -65,11 +71,12 @@ class RunOptions:
     config: str | None = None
 
     def edge_arguments(self) -> tuple[str, ...]:
-        """What `share edge` is told."""
+        """Return arguments of `share edge`."""
         return ("--policy", self.policy, *self._config_arguments())
 
     def agent_arguments(self, number: int, link: str | None) -> tuple[str, ...]:
-        """What `share agent` is told, each another seed. link: its own."""
+        """Return arguments of `share agent` number `number` on its `link`. Each agent has a different link
+        seed."""
         link_arguments = (
             () if link is None else ("--link", link, "--link-seed", str(1000 * self.seed + number))
         )
@@ -83,9 +90,10 @@ class RunOptions:
 def play_in_real_time(
     session: Session, seconds: float, options: RunOptions, out: Path, show: Callable[[Progress], None]
 ) -> dict[str, Path]:
-    """Runs `session` in real time. The folder of each agent's files, by name.
+    """Run `session` in real time and return the folder of each agent's files, by name.
 
-    Raises ShareError naming the process that failed and what it said last, UsageError for a link of nobody.
+    Raises ShareError with the process that failed and the last line of its log, UsageError for a link of an
+    unknown agent.
     """
     links = LinkAssignment.parse(options.link)
     links.check(session.agents)
@@ -96,7 +104,7 @@ def play_in_real_time(
         bind = ("--bind", "tcp://127.0.0.1:0", "--out", str(out / "edge"), *options.edge_arguments())
         edge = stack.enter_context(running_child(logs["edge"], "edge", *bind))
         if options.agents_first:
-            os.setpriority(os.PRIO_PROCESS, edge.pid, _EDGE_NICENESS)  # before it has processes of its own
+            os.setpriority(os.PRIO_PROCESS, edge.pid, _EDGE_NICENESS)  # before it starts child processes
         address = _wait_for_address(edge, logs["edge"])
         agents: Processes = {}
         for number, (name, agent) in enumerate(session.agents.items()):
@@ -119,7 +127,7 @@ def play_in_real_time(
 
 
 def _wait_for_address(edge: subprocess.Popen[bytes], log: Path) -> str:
-    """Where the edge listens, as it says itself."""
+    """Return the address that the edge logs. Raises ShareError if it does not start."""
     deadline = time.monotonic() + EDGE_START_TIMEOUT_S
     while time.monotonic() < deadline:
         match = re.search(r"listening on (tcp://\S+?),", _log_text(log))
@@ -132,21 +140,20 @@ def _wait_for_address(edge: subprocess.Popen[bytes], log: Path) -> str:
 
 
 def _watch(agents: Processes, monitor: _RunMonitor, limit_s: float, show: Callable[[Progress], None]) -> None:
-    """Until every agent has ended, or one has failed."""
+    """Wait until all agents have ended or one has failed. Raises ShareError after `limit_s`."""
     deadline = time.monotonic() + limit_s
     while any(process.poll() is None for process in agents.values()):
         if any(process.poll() for process in agents.values()):
             return
         if time.monotonic() > deadline:
-            raise ShareError(f"the agents have not ended {AGENT_GRACE_S:g} s after their recordings")
+            raise ShareError(f"agents still run {AGENT_GRACE_S:g} s after the end of their recordings")
         show(monitor.progress())
         time.sleep(_POLL_S)
     show(monitor.progress())
 
 
 class _RunMonitor:
-    """How far a run is, by what its files have grown; it costs the processes that are measured next to
-    nothing, however long they go on."""
+    """Follow a run by the growth of its output files, at next to no cost for the measured processes."""
 
     def __init__(self, folders: dict[str, Path], events: Path) -> None:
         self._odometry = {
@@ -169,19 +176,20 @@ class _RunMonitor:
 
 def _last_line(log: Path) -> str:
     lines = [line for line in _log_text(log).splitlines() if line.strip()]
-    return lines[-1] if lines else "it said nothing"
+    return lines[-1] if lines else "its log is empty"
 
 
 def _log_text(log: Path) -> str:
     return read_bytes(log, MAX_LOG_BYTES).decode(errors="replace")
 
 
-# ---- What agents of one session came to, against their truth: for `share demo` and `share evaluate`.
+# Scores of a session's agents against the ground truth.
 
 
 @dataclass(frozen=True, eq=False)
 class AgentScore:
-    """odometry: ATE of odom.tum alone, SE3-aligned. report: its report.json. map: its map.tum."""
+    """An agent's `report.json`, the ATE of its odom.tum (SE3-aligned, None with too few poses), its
+    map.tum and its ground truth."""
 
     report: dict[str, Any]
     odometry: Ate | None
@@ -191,15 +199,18 @@ class AgentScore:
 
 @dataclass(frozen=True, eq=False)
 class SessionScore:
-    """joint: map.tum of all agents in the largest map, one alignment; None where no two are in one, since
-    everybody has a map of its own from its first moments on. An agent that plays alone is all there are."""
+    """Scores of all agents. `joint`: ATE of map.tum of all agents in the largest map under one alignment.
+
+    `joint` is None where no two agents share a map, since each has a map of its own from the start; a session
+    of one agent is scored alone.
+    """
 
     agents: dict[str, AgentScore]
     joint: JointAte | None
 
 
 def score_session(session: Session, folders: dict[str, Path]) -> SessionScore:
-    """Reads what `share agent --out` left in `folders`. Raises DataError on damaged files."""
+    """Score the files that `share agent --out` left in `folders`. Raises DataError on damaged files."""
     agents = {}
     for name, folder in folders.items():
         truth = read_tum(session.folder / "truth" / f"{name}.tum")
@@ -221,7 +232,7 @@ def _ate(estimate: Trajectory | None, truth: Trajectory) -> Ate | None:
 
 
 def _joint_ate(agents: dict[str, AgentScore]) -> JointAte | None:
-    """Of the map that most agents were in when their last pose was told."""
+    """Return the joint ATE of the map that most agents were in at their last published pose."""
     members: dict[str, list[str]] = {}
     for name, agent in agents.items():
         if agent.map is not None:

@@ -1,4 +1,4 @@
-"""Figures of trials as text: CSV for a program, Markdown for a reader."""
+"""Results of trials as text: CSV for programs, Markdown for readers."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from share.lab.evaluate.statistics import (
 from share.lab.evaluate.trial import Trial
 from share.lab.train.score import read_scores, score_table
 
-# ---- Tables as text: CSV for a program, Markdown for a reader; what is not known is empty, or a dash.
+# Tables as text. Unknown values are empty in CSV, a dash in Markdown.
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Numbers to six digits."""
+    """Return CSV; floats with six digits, NaN as an empty cell."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(head)
@@ -47,18 +47,18 @@ def _cell(value: object) -> object:
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """The first of `rows` is its head."""
+    """Return a Markdown table; the first of `rows` is its head."""
     head, *body = rows
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *body))
 
 
 def bullets(texts: Iterable[str]) -> str:
-    """A Markdown list of sentences."""
+    """Return a Markdown list of sentences."""
     return "\n".join(f"* {text[0].upper()}{text[1:]}." for text in texts)
 
 
 def image_link(caption: str, name: str) -> str:
-    """Of Markdown, a paragraph of its own. name: of a file beside it."""
+    """Return a Markdown image paragraph; `name`: a file beside the text."""
     return f"![{caption}]({name})"
 
 
@@ -66,31 +66,35 @@ def format_number(value: float, form: str = ".3g") -> str:
     return "–" if math.isnan(value) else format(value, form)
 
 
-# ---- What else a report may hold, by who made it: settings that were tried, models of the error compared.
+# Extra sections of a report: sweeps of settings, comparisons of error models.
 
 SWEEP, HEAT_MAP = "sweep.md", "heat.png"
 
 
 @dataclass(frozen=True)
 class ReportSection:
-    """text: Markdown with a heading. pictures: PNG files that it shows, by the names that it has for them."""
+    """An extra section of a report. `text`: Markdown with a heading. `pictures`: PNG files by the names
+    under which the text shows them."""
 
     text: str
     pictures: dict[str, Path]
 
 
 def read_section(path: Path, number: int) -> ReportSection:
-    """Of a folder by `share evaluate sweep`, or a file by `share train compare --json`: a report's first or
-    `format_number`th. Raises UsageError for anything else, DataError for a damaged one."""
+    """Read an extra section, the report's `number`th, from a folder of `share evaluate sweep` or a file of
+    `share train compare --json`.
+
+    Raises UsageError for anything else, DataError for a damaged one.
+    """
     if path.is_file():
-        return ReportSection(f"## Models of the error: {path.stem}\n\n{score_table(read_scores(path))}\n", {})
+        return ReportSection(f"## Error models: {path.stem}\n\n{score_table(read_scores(path))}\n", {})
     if not (path / SWEEP).is_file():
         raise UsageError(
-            f"--with {path}: give a folder by `share evaluate sweep`, "
-            f"or a file by `share train compare --json`"
+            f"--with {path}: give a folder of `share evaluate sweep`, "
+            "or a file of `share train compare --json`"
         )
     heat = path / HEAT_MAP
-    text = f"## Settings tried: {path.name}\n\n{_section_text(path / SWEEP)}"
+    text = f"## Settings swept: {path.name}\n\n{_section_text(path / SWEEP)}"
     if not heat.is_file():
         return ReportSection(text, {})
     name = f"heat-{number}.png"
@@ -116,18 +120,19 @@ _RUN_COLUMNS = (
     "merges_per_metre",
 )
 PROTOCOL = (
-    "latency: mean over all frames' track_ms and all corrected_ms together; ms from a frame's arrival",
-    "poses: causal, every frame that has one; truth interpolated at their stamps over at most 100 ms",
-    "odom ATE: rms, SE3-aligned, each agent alone; map ATE: rms under one SE3 alignment for all in one map",
+    "latency: mean over the track_ms of all frames and all corrected_ms together; ms from a frame's arrival",
+    "poses: causal, of all tracked frames; truth interpolated at their stamps over at most 100 ms",
+    "odom ATE: rms, each agent SE3-aligned alone; map ATE: rms, one SE3 alignment for all agents in a map",
     "RPE: rms of poses in the map, from frame to frame and over 1 s, no alignment; docs/evaluation.md",
 )
 _INTERVAL_NOTE = (
-    "In brackets: 95 % by drawing sessions again, each with all its runs; none where there is one session."
+    "In brackets: 95 % confidence intervals by bootstrap over sessions, each with all its runs; "
+    "none with one session."
 )
 
 
 def agents_csv(runs: Iterable[RunMetrics]) -> str:
-    """A line an agent and run."""
+    """Return a line per agent and run."""
     return csv_text(
         [*_CONDITION_COLUMNS, *_AGENT_COLUMNS],
         (
@@ -139,7 +144,7 @@ def agents_csv(runs: Iterable[RunMetrics]) -> str:
 
 
 def runs_csv(runs: Iterable[RunMetrics]) -> str:
-    """A line a run."""
+    """Return a line per run."""
     return csv_text(
         [*_CONDITION_COLUMNS, *_RUN_COLUMNS, "metres"],
         ([*_condition_values(run), *(getattr(run, f) for f in _RUN_COLUMNS), run.metres] for run in runs),
@@ -147,7 +152,7 @@ def runs_csv(runs: Iterable[RunMetrics]) -> str:
 
 
 def sweep_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """A line a point; rows: by `share.lab.evaluate.sweep.table`."""
+    """Return a line per point; `rows` as from `share.lab.evaluate.sweep.sweep_table`."""
     head = [*rows[0]["settings"], "runs", *rows[0]["means"]]
     return csv_text(
         head,
@@ -158,7 +163,7 @@ def sweep_csv(rows: Sequence[Mapping[str, Any]]) -> str:
 def sweep_markdown(
     rows: Sequence[Mapping[str, Any]], runs: Sequence[RunMetrics], trials: Sequence[Trial]
 ) -> str:
-    """The same for a reader, with intervals, and of what."""
+    """Return the sweep's provenance and table, with intervals, as Markdown."""
     titles = {measure.name: measure.title for measure in MEASURES}
     head = [*rows[0]["settings"], "runs", *(titles[name] for name in rows[0]["means"])]
     body = [
@@ -169,7 +174,7 @@ def sweep_markdown(
 
 
 class ReportPictures(NamedTuple):
-    """Markdown that shows pictures: of all policies compared, of every agent, of how a run goes."""
+    """Markdown that shows the pictures: of the policies compared, of every agent, and of a run over time."""
 
     comparison: str
     agents: str
@@ -186,26 +191,26 @@ def markdown(
     failed: Sequence[str] = (),
     pictures: ReportPictures = _NO_PICTURES,
 ) -> str:
-    """All policies against `base`. failed: runs that came to nothing, by name."""
+    """Return the report: all policies against `base`. `failed`: names of runs that failed."""
     names = policy_names(runs)
     parts = [
         "# Policies compared",
         provenance(runs, trials, failed),
-        f"## Each policy, and as a part of `{base}`",
+        f"## Each policy, and its ratio to `{base}`",
         _comparison(runs, names, base),
-        "Values: means over all runs that have one. Parts: of pairs of runs of one session, link and seed; "
-        f"(n of N): not both have it in all pairs. {_INTERVAL_NOTE}",
+        "Values: means over runs that have one. Ratios: over pairs of runs of equal session, link, seed; "
+        f"(n of N): only n of N pairs have both values. {_INTERVAL_NOTE}",
         pictures.comparison,
     ]
     others = [name for name in names if name != names[0]]
     if others:
-        parts += [f"## Errors by `{names[0]}`", *(_win_counts(runs, names[0], other) for other in others)]
+        parts += [f"## Errors with `{names[0]}`", *(_win_counts(runs, names[0], other) for other in others)]
     parts += ["## Every agent", pictures.agents, _agent_table(runs, names), pictures.timeline]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def provenance(runs: Sequence[RunMetrics], trials: Sequence[Trial], failed: Sequence[str] = ()) -> str:
-    """What was played, where, when, by which code, and how it is scored: a Markdown list."""
+    """Return a Markdown list: what was played, where, when, by which code, and how it is scored."""
     records = [trial.record for trial in trials]
     conditions = [run.conditions for run in runs]
     machines = {
@@ -215,15 +220,14 @@ def provenance(runs: Sequence[RunMetrics], trials: Sequence[Trial], failed: Sequ
     lines = [
         f"{len(runs)} runs in {_joined_names(c.clock for c in conditions)}, "
         f"{min(r['began'] for r in records)} to {max(r['began'] for r in records)}.",
-        *([f"NOT played, and nowhere below: {', '.join(failed)}."] if failed else []),
+        *([f"FAILED, and not in this report: {', '.join(failed)}."] if failed else []),
         f"Policies: {_joined_names(c.policy for c in conditions)}; "
-        f"sessions: "
-        f"{_joined_names(c.session for c in conditions)}; "
+        f"sessions: {_joined_names(c.session for c in conditions)}; "
         f"links: {_joined_names(c.link or 'loopback' for c in conditions)}; "
         f"seeds: {_joined_names(str(c.seed) for c in conditions)}.",
-        f"Machine: {'; '.join(sorted(machines))}; load before a run {min(loads):g} to {max(loads):g}.",
+        f"Machine: {'; '.join(sorted(machines))}; load before a run: {min(loads):g} to {max(loads):g}.",
         f"SHARE {_joined_names(r['version'] for r in records)}, {_code_states(conditions)}; "
-        f"evaluations tell {_joined_names(c.told for c in conditions)}.",
+        f"estimated errors from {_joined_names(c.told for c in conditions)}.",
     ]
     return "\n".join([*(f"* {line}" for line in lines), bullets(PROTOCOL)])
 
@@ -233,7 +237,8 @@ def _joined_names(names: Iterable[str]) -> str:
 
 
 def _code_states(conditions: Sequence[Conditions]) -> str:
-    """By which state of the code; runs of several may differ for that alone."""
+    """Return the state of the code, or a warning that runs are of several states, which may differ for
+    that alone."""
     runs_by = Counter(c.code or "unknown" for c in conditions)
     if len(runs_by) == 1:
         return f"code {next(iter(runs_by))}"
@@ -256,8 +261,10 @@ def _comparison(runs: Sequence[RunMetrics], names: Sequence[str], base: str) -> 
 def _win_counts(runs: Sequence[RunMetrics], name: str, other: str) -> str:
     wins, total = count_no_worse(runs, name, other)
     means, total_means = count_no_worse_on_average(runs, name, other)
-    text = f"in {wins} of {total} runs of an agent (those in which it is in the map by both)"
-    return f"* no more than by `{other}` {text}, in {means} of {total_means} means of an agent on a session"
+    return (
+        f"* at most those with `{other}` in {wins} of {total} runs of an agent (in the shared map with "
+        f"both), and in {means} of {total_means} means over an agent's runs on a session"
+    )
 
 
 def _agent_table(runs: Sequence[RunMetrics], names: Sequence[str]) -> str:
@@ -276,6 +283,7 @@ def _agent_table(runs: Sequence[RunMetrics], names: Sequence[str]) -> str:
 
 
 def agent_mean(runs: Sequence[RunMetrics], policy: str, session: str, agent: str, field: str) -> float:
+    """Return the mean of a field of an agent over the runs of a policy on a session, NaN without any."""
     values = [
         getattr(one, field)
         for run in runs
@@ -305,7 +313,7 @@ def _interval_cell(interval: Interval) -> str:
 
 
 def _interval_text(interval: Interval, number_format: str) -> str:
-    """A dash where it is not known; alone where one session cannot say how sure it is."""
+    """Return value and interval; a dash for NaN, no interval where it is unknown (one session)."""
     if math.isnan(interval.value):
         return "–"
     bounds = (

@@ -1,4 +1,4 @@
-"""Figures of trials as pictures: latency, errors, what each policy saves, how a run goes."""
+"""Pictures of trials: latency, errors, ratios of policies, runs over time."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _RATIO_MEASURES = (
 def draw_report(
     folder: Path, runs: Sequence[RunMetrics], trials: Sequence[Trial], base: str
 ) -> ReportPictures:
-    """PNG files in `folder`. trials: as `runs`, in order."""
+    """Write PNG files to `folder`; return the Markdown that shows them. trials: in the order of `runs`."""
     names, sessions = policy_names(runs), list(dict.fromkeys(run.conditions.session for run in runs))
     agents = list(dict.fromkeys(agent.agent for run in runs for agent in run.agents))
     for file, field, unit, line in (
@@ -61,7 +61,7 @@ def draw_report(
 def _draw_ratios(folder: Path, runs: Sequence[RunMetrics], names: Sequence[str], base: str) -> str:
     compared = {
         name: {
-            one.measure.name: one.ratio
+            one.measure.label or one.measure.name: one.ratio
             for one in compare_policies(runs, name, base)
             if one.measure.name in _RATIO_MEASURES
         }
@@ -71,7 +71,7 @@ def _draw_ratios(folder: Path, runs: Sequence[RunMetrics], names: Sequence[str],
     if not compared:
         return ""
     draw_ratios(folder / "parts.png", compared, base, names)
-    return _image_links({f"What each policy comes to, as a part of {base}; whiskers: 95 %": "parts.png"})
+    return _image_links({f"Each policy's ratio to {base}; whiskers: 95 % confidence": "parts.png"})
 
 
 def _image_links(files: Mapping[str, str]) -> str:
@@ -79,7 +79,7 @@ def _image_links(files: Mapping[str, str]) -> str:
 
 
 def draw_sessions(folder: Path, trials: Sequence[Trial]) -> list[Path]:
-    """PNG files in `folder`, three a session: its runs over time, by the names of their folders."""
+    """Write three PNG files a session to `folder`: its runs over time, named after their folders."""
     by_session: dict[Path, dict[str, Trial]] = {}
     for trial in trials:
         by_session.setdefault(trial.session.folder, {})[trial.folder.resolve().name] = trial
@@ -91,7 +91,7 @@ def draw_sessions(folder: Path, trials: Sequence[Trial]) -> list[Path]:
 
 
 def _draw_timeline(folder: Path, trials: Sequence[Trial]) -> str:
-    """Of the first session, with its first seed, by every policy."""
+    """Draw the first session with its first seed, by every policy."""
     first = trials[0]
     same = {
         trial.options.policy: trial
@@ -103,7 +103,7 @@ def _draw_timeline(folder: Path, trials: Sequence[Trial]) -> str:
 
 
 def _draw_over_time(folder: Path, prefix: str, trials: Mapping[str, Trial]) -> dict[str, Path]:
-    """Runs of one session, by name: QoE and rates, and merges; by what is to be said of each."""
+    """Draw QoE, rates and merges of runs of one session, by name; return the files by caption."""
     session = next(iter(trials.values())).session
     session_name = session.folder.name
     traces_of = {name: traces(trial) for name, trial in trials.items()}
@@ -122,22 +122,20 @@ def _draw_over_time(folder: Path, prefix: str, trials: Mapping[str, Trial]) -> d
     draw_lines(over_time, panels, "s", units)
     merges_of = {name: merge_locations(trial) for name, trial in trials.items()}
     counted = {name: (of.metres, np.arange(1.0, len(of.metres) + 1)) for name, of in merges_of.items()}
-    draw_lines(merges_file, {f"merges on {session_name}": counted}, "m that all agents have gone", [""])
+    draw_lines(merges_file, {f"merges on {session_name}": counted}, "path of all agents [m]", [""])
     top_views = {
         f"{name}: {len(merges_of[name].metres)} merges": _top_view(trial, merges_of[name])
         for name, trial in trials.items()
     }
     draw_paths(top_view_file, top_views)
     return {
-        f"QoE, and the rate that the edge allows, over time: {session_name}": over_time,
-        f"Merges along the way: {session_name}": merges_file,
-        f"Where they were, from "
-        f"above: {session_name}; a "
-        f"dot is a merge that an agent's keyframe led to": top_view_file,
+        f"QoE and allowed keyframe rate over time: {session_name}": over_time,
+        f"Merges over distance: {session_name}": merges_file,
+        f"Paths and merges from above: {session_name}; dots: merges after an agent's keyframe": top_view_file,
     }
 
 
 def _top_view(trial: Trial, merges: MergeLocations) -> dict[str, tuple[F64, F64]]:
-    """By agent: its way (N, 2), and where it was at its merges (M, 2), m."""
+    """Return by agent its path (N, 2) and its positions at its merges (M, 2), m."""
     paths = {name: truth.T[:, :2, 3] for name, truth in ground_truths(trial).items()}
     return {name: (path, merges.xy.get(name, path[:0])) for name, path in paths.items()}

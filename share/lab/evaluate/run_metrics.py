@@ -1,4 +1,4 @@
-"""What one run of a session came to: a row of figures for each agent, and one for all."""
+"""Metrics of one run of a session: a row for each agent, and one for the run."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Conditions:
-    """Under which a session was played; runs that differ in the policy alone are compared.
+    """Under which conditions a session was played. Runs that differ in the policy alone are compared.
 
-    clock: in real or virtual time. told: what the edge took for an agent's error. code: which state of
-    SHARE's (`share.runtime.machine`), empty where that is not known.
+    `clock`: real or virtual time. `told`: source of the agents' estimated errors. `code`: digest of SHARE's
+    code (`share.runtime.machine`), empty where unknown.
     """
 
     session: str
@@ -25,13 +25,15 @@ class Conditions:
 
 @dataclass(frozen=True)
 class AgentMetrics:
-    """Of one agent in one run; NaN is what could not be measured.
+    """Metrics of one agent in one run; NaN where not measured.
 
-    latency_ms and its parts: docs/evaluation.md. odom_ate_cm: of odom_n frames, alone, SE3-aligned. ate_cm:
-    of the in_map frames that have a pose in the shared map, one alignment for all who are in it; NaN for who
-    did not come into it. rpe_*: of poses in the map, rms of *_n pairs, from frame to frame and over 1 s.
-    metres: how far it went. joined_s: since the first agent came, until it shared a map. qoe: mean over
-    evaluations; told_cm: rms of the errors that they told.
+    * latency_ms and its parts: docs/evaluation.md.
+    * odom_ate_cm: of odom_n frames, SE3-aligned alone.
+    * ate_cm: of the in_map frames with a pose in the shared map, one alignment for all agents in it; NaN for
+      an agent outside it.
+    * rpe_*: rms over *_n pairs of poses in the map, from frame to frame and over 1 s.
+    * metres: path length. joined_s: from the first agent's start until it shared a map.
+    * qoe: mean over evaluations. told_cm: rms of the agent's estimated errors.
     """
 
     agent: str
@@ -73,7 +75,8 @@ class AgentMetrics:
 
 @dataclass(frozen=True)
 class RunMetrics:
-    """joint_ate_cm: over all frames of those in the largest map, one alignment. Merges as the edge counts."""
+    """Metrics of a run. joint_ate_cm: over all frames of the agents in the largest map, one alignment.
+    Merges as counted by the edge."""
 
     conditions: Conditions
     agents: tuple[AgentMetrics, ...]
@@ -85,7 +88,7 @@ class RunMetrics:
 
     @property
     def metres(self) -> float:
-        """Of all agents together."""
+        """Path length of all agents together."""
         return sum(agent.metres for agent in self.agents)
 
     @property

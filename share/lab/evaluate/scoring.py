@@ -1,4 +1,4 @@
-"""The figures of a trial, from the files that its agents and its edge left."""
+"""Metrics of a trial, from the files of its agents and its edge."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from share.types import F64
 
 
 def run_metrics(trial: Trial) -> RunMetrics:
-    """Raises DataError on damaged files."""
+    """Return the metrics of a trial. Raises DataError on damaged files."""
     with own_format_errors(trial.folder):
         return _run_metrics(trial)
 
@@ -39,13 +39,13 @@ def _run_metrics(trial: Trial) -> RunMetrics:
         for name, one in session_score.agents.items()
     )
     merges = edge.get("merges", {})
-    terms = trial.options
+    options = trial.options
     return RunMetrics(
         Conditions(
             trial.session.folder.name,
-            terms.policy,
-            terms.link or "",
-            terms.seed,
+            options.policy,
+            options.link or "",
+            options.seed,
             trial.clock,
             trial.error_source,
             trial.record.get("code") or "",
@@ -67,10 +67,8 @@ def _agent_metrics(
     edge: dict[str, Any],
     joined_s: float,
 ) -> AgentMetrics:
-    report, in_map = (
-        score.report,
-        None if session_score.joint is None else session_score.joint.agents.get(name),
-    )
+    report = score.report
+    in_map = None if session_score.joint is None else session_score.joint.agents.get(name)
     track, corrected = report["track_ms"], report["corrected_ms"]
     frame, second = _rpe(score, rpe_frames), _rpe(score, rpe_time)
     span_s = float(score.truth.stamps_ns[-1] - score.truth.stamps_ns[0]) / 1e9
@@ -115,7 +113,7 @@ def _agent_metrics(
 
 
 class _RpeSummary(NamedTuple):
-    """RPE: rms, over n pairs."""
+    """RPE: rms over n pairs."""
 
     cm: float
     degrees: float
@@ -133,7 +131,7 @@ def _rpe(score: AgentScore, measure: Callable[[Trajectory, Trajectory], Rpe]) ->
 
 
 def _join_times(events: Path) -> dict[str, float]:
-    """When each agent was first in one map with another, s since the first of all came to the edge."""
+    """Return when each agent first shared a map with another, s since the first agent joined the edge."""
     first_s: float | None = None
     membership = MapMembership()
     joined: dict[str, float] = {}
@@ -152,7 +150,7 @@ def _rmse_cm(ate: Ate | None) -> float:
 
 
 def _mean(values: F64) -> float:
-    """Of those that are known."""
+    """Return the mean without NaN; NaN of none."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else math.nan
 
@@ -161,15 +159,15 @@ def _nan_if_none(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-# ---- How a run went over time: QoE, rates and merges, from the files that its edge left.
+# A run over time: QoE, rates and merges, from the files of its edge.
 
 _MERGE_EVENTS = ("loop accepted", "maps joined")
 
 
 @dataclass(frozen=True, eq=False)
 class AgentTrace:
-    """Of one agent, at its E evaluations: seconds (E,) since the edge began, qoe (E,), rate_hz (E,), NaN
-    where there was no limit, error_cm (E,) as it told it, NaN where it had no estimate."""
+    """An agent's E evaluations: seconds (E,) since the edge started, qoe (E,), rate_hz (E,), NaN where
+    unlimited, and error_cm (E,), its estimated error, NaN without one."""
 
     seconds: F64
     qoe: F64
@@ -178,12 +176,12 @@ class AgentTrace:
 
     @classmethod
     def from_series(cls, series: dict[str, list[float | None]]) -> AgentTrace:
-        """From an agent's part of the `series` in edge.json."""
+        """Read an agent's part of `series` in edge.json."""
         return cls(*(_nan_array(series.get(key, [])) for key in ("t_s", "qoe", "rate_hz", "error_cm")))
 
 
 def traces(trial: Trial) -> dict[str, AgentTrace]:
-    """By agent. Raises DataError on damaged files."""
+    """Return the traces by agent. Raises DataError on damaged files."""
     path = trial.folder / "edge" / "edge.json"
     with own_format_errors(path):
         series = read_json(path)["series"]
@@ -191,21 +189,22 @@ def traces(trial: Trial) -> dict[str, AgentTrace]:
 
 
 def first_join_s(events: list[dict[str, Any]]) -> float:
-    """When the first agent joined the edge, by the edge's clock: where the truth begins. 0 if none did."""
+    """Return when the first agent joined the edge, s of the edge's clock, which is where the truth starts;
+    0 if none did."""
     return next((e["t_s"] for e in events if e["event"] == "joined the edge"), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class MergeLocations:
-    """metres (M,): how far all agents together had gone by each. xy: where each agent was at those that its
-    keyframes led to, m (K, 2), by agent."""
+    """Where M merges were done. metres (M,): distance travelled by all agents together until each. xy: by
+    agent, its position m (K, 2) at the merges that its keyframes led to."""
 
     metres: F64
     xy: dict[str, F64]
 
 
 def merge_locations(trial: Trial) -> MergeLocations:
-    """Where they were done. Raises DataError on damaged files."""
+    """Return where merges were done. Raises DataError on damaged files."""
     path = trial.folder / "edge" / "events.jsonl"
     with own_format_errors(path):
         return _merge_locations(trial, read_json_lines(path))
@@ -221,7 +220,7 @@ def _merge_locations(trial: Trial, events: list[dict[str, Any]]) -> MergeLocatio
     first_ns = min(truth.stamps_ns[0] - offsets_ns[name] for name, truth in ground_truth.items())
     travelled_m, xy = np.zeros(len(done_s)), {}
     for name, truth in ground_truth.items():
-        # in real time all recordings begin at once, in virtual time when they did
+        # in real time all recordings start together, in virtual time at their recorded times
         start_ns = first_ns + offsets_ns[name] if trial.options.virtual else truth.stamps_ns[0]
         seconds = (truth.stamps_ns - start_ns) * 1e-9
         travelled_m += np.interp(done_s, seconds, truth.travelled_m)
@@ -231,7 +230,7 @@ def _merge_locations(trial: Trial, events: list[dict[str, Any]]) -> MergeLocatio
 
 
 def ground_truths(trial: Trial) -> dict[str, Trajectory]:
-    """By agent, each by its own clock. Raises DataError."""
+    """Return each agent's ground truth by its own clock. Raises DataError on damaged files."""
     folder = trial.session.folder / "truth"
     return {name: read_tum(folder / f"{name}.tum") for name in trial.session.agents}
 

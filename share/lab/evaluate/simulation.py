@@ -1,7 +1,8 @@
-"""A room in virtual time: real agents, a real edge and mapper, and between them networks, queues and costs.
+"""Discrete-event simulation of a room: real agents, edge and mapper with simulated networks, queues and
+delays.
 
-What is decided is decided by the machines themselves; how long it takes is drawn from what was measured. So
-a run says what latency would be on machines that nobody else uses, and the same seed gives the same run.
+The state machines make all decisions; how long each step takes is drawn from measured distributions.
+Latencies are thus those of otherwise idle machines, and a run is deterministic for a given seed.
 """
 
 from __future__ import annotations
@@ -36,43 +37,46 @@ from share.wire.messages import Hello, peer_id
 
 _MS = 1_000_000
 _TICK_MS = 50
-_RANDOM_BATCH = 1000  # random numbers
+_RANDOM_BATCH = 1000
 
 
 @dataclass(frozen=True)
 class Delay:
-    """ms, lognormal: half of all take less than `p50`, 95 % less than `p95`."""
+    """Lognormal delay, ms: half of all draws are below `p50`, 95 % below `p95`."""
 
     p50: float
     p95: float
 
     def draw_ns(self, normal: float) -> int:
-        """normal: drawn from a standard normal distribution."""
+        """Return a delay, ns, for `normal`, a draw from the standard normal distribution."""
         sigma = math.log(max(1.0, self.p95 / self.p50)) / 1.645
         return round(self.p50 * math.exp(sigma * normal) * _MS)
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """ms, as they were measured: the least, the most, and what so many equal parts lie between."""
+    """Measured delay, ms: `ms` are quantiles at equal steps, from the minimum to the maximum."""
 
     ms: tuple[float, ...]
 
     def draw_ns(self, normal: float) -> int:
-        """normal: drawn from a standard normal distribution."""
+        """Return a delay, ns, for `normal`, a draw from the standard normal distribution."""
         below = 0.5 * (1 + math.erf(normal / math.sqrt(2)))
         return round(float(np.interp(below * (len(self.ms) - 1), range(len(self.ms)), self.ms)) * _MS)
 
 
-# Of keyframes' work after a frame, none after half of them: 1,301 frames of four recordings.
+# Keyframe work after a frame, ms; none after half of the frames. Measured on 1,301 frames of four recordings.
 _SLICES = Sampled((*[0.0] * 11, 0.45, 2.2, 2.7, 3.5, 4.0, 4.7, 5.3, 5.6, 5.9, 8.2))
 
 
 @dataclass(frozen=True)
 class ProcessingDelays:
-    """Of a frame at the agent until its pose is out, of a keyframe from then until it may be sent, and of the
-    slice of keyframes' work that may come after any frame; of a message at the edge's front; of what its
-    mapper and its solver do. Defaults: docs/scheduling-figures.md."""
+    """Delays of each processing step. Defaults: docs/scheduling-figures.md.
+
+    Agent: `frame`: from a frame to its published pose; `keyframe`: from there until its keyframe may be sent;
+    `finish_keyframe`: slice of keyframe work that may follow any frame. Edge: `receive`: a message at the
+    front; the rest: steps of mapper and solver.
+    """
 
     frame: Delay = Delay(4.3, 5.4)
     keyframe: Delay = Delay(3.9, 4.7)
@@ -89,8 +93,11 @@ class ProcessingDelays:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """A frame: when it comes in, where odometry says it is, how wrong that is, and what it shows others, if
-    it is offered as a keyframe. stamp_ns: of its sensor; None: as at_ns. breaks: odometry began anew."""
+    """A tracked frame: its arrival time, odometry pose and tracking error, and its keyframe candidate, if
+    any.
+
+    `stamp_ns`: the sensor's stamp, None for `arrival_ns`. `new_segment`: odometry began anew with this frame.
+    """
 
     arrival_ns: int
     T_odom_body: F64 | None
@@ -115,8 +122,7 @@ class AnyMapper(Protocol):
 
 
 class Simulation:
-    """Everybody in one room. agents: what each says of itself and sees, and its network. The clock of all
-    is the world's."""
+    """A simulated room. All agents share the simulation's clock."""
 
     def __init__(
         self,
@@ -128,15 +134,16 @@ class Simulation:
         on_effect: Callable[[str, ev.AgentEffect], None] = lambda name, effect: None,
         on_record: Callable[[dict[str, Any]], None] = lambda fields: None,
     ) -> None:
-        """mapper: by default a real one. watch: is told what every agent does, by name; record: what the edge
-        decides."""
+        """Take each agent's hello, frames and network. `mapper`: a real one by default.
+
+        `on_effect(name, effect)` is called for every effect of an agent, `on_record(fields)` for every event
+        that the edge records.
+        """
         self.now_ns = 0
-        self.stamps_ns: dict[KeyframeKey, int] = {}  # of the keyframes that the mapper has had
-        self.mapper_busy_ns = self.solver_busy_ns = 0  # that the mapper and the solver have worked
+        self.stamps_ns: dict[KeyframeKey, int] = {}  # of keyframes that reached the mapper
+        self.mapper_busy_ns = self.solver_busy_ns = 0
         self.logs = {hello.name: RunLog() for hello, *_ in agents}
-        self.localised: dict[str, list[ev.LocalisedPose]] = {
-            hello.name: [] for hello, *_ in agents
-        }  # in a map
+        self.localised: dict[str, list[ev.LocalisedPose]] = {hello.name: [] for hello, *_ in agents}
         self._on_effect, self._on_record = on_effect, on_record
         rng = np.random.default_rng(seed)
         self._delays, self._random_normals = delays, _random_normals(rng)
@@ -150,19 +157,19 @@ class Simulation:
         self.edge = Edge(config, session=1)
         self.mapper: AnyMapper = Mapper(config) if mapper is None else mapper
         self._solver = PoseGraphSolver(config.graph)
-        self._inbox: deque[tuple[Delay, Callable[[], list[MapEvent]]]] = deque()  # the mapper's
-        self._is_busy = False  # the mapper's process
+        self._inbox: deque[tuple[Delay, Callable[[], list[MapEvent]]]] = deque()  # of the mapper process
+        self._is_busy = False  # the mapper process
         self._schedule(0, self._tick)
 
     def run(self, until_s: float) -> None:
-        """Everything until then."""
+        """Process all events until `until_s`."""
         end_ns = round(until_s * 1e9)
         while self._events and self._events[0][0] <= end_ns:
             self.now_ns, _, action = heapq.heappop(self._events)
             action()
 
     def reports(self) -> dict[str, dict[str, Any]]:
-        """What each agent's machine has counted, by name."""
+        """Return each agent's protocol report, by name."""
         return {member.name: member.machine.report() for member in self._members.values()}
 
     def _schedule(self, delay_ns: int, action: Callable[[], None]) -> None:
@@ -177,14 +184,15 @@ class Simulation:
         self._to_edge(ed.EdgeTick())
         self._schedule(_TICK_MS * _MS, self._tick)
 
-    # ------------------------------------------------------------------ agents
+    # Agents.
 
     def _schedule_next_frame(self, member: _SimulatedAgent) -> None:
         if (frame := next(member.incoming, None)) is not None:
             self._schedule(max(0, frame.arrival_ns - self.now_ns), lambda: self._frame_arrived(member, frame))
 
     def _frame_arrived(self, member: _SimulatedAgent, tracked: TrackedFrame) -> None:
-        """A frame waits until those before it are done, as in the agent's tracking thread."""
+        """Schedule the results of a frame, which waits until earlier frames are done, as in the agent's
+        tracking thread."""
         begin_ns = max(self.now_ns, member.busy_until_ns)
         done_ns = begin_ns + self._draw(self._delays.frame)
         member.busy_until_ns = done_ns
@@ -233,7 +241,7 @@ class Simulation:
             arrival_ns - self.now_ns, lambda: self._to_edge(ed.PeerMessageReceived(member.peer, frames))
         )
 
-    # ------------------------------------------------------------------ the edge
+    # The edge.
 
     def _to_edge(self, event: ed.EdgeEvent) -> None:
         for effect in self.edge.handle(event, self.now_ns):
@@ -262,8 +270,7 @@ class Simulation:
             self.mapper.add_run(message.key, message.hello)
         return []
 
-    # ---------------------------------------------------------------- the mapper, as in
-    # share.runtime.mapper_process
+    # The mapper process, as in share.runtime.mapper_process.
 
     def _send_to_mapper(self, delay: Delay, action: Callable[[], list[MapEvent]]) -> None:
         self._inbox.append((delay, action))
@@ -271,7 +278,7 @@ class Simulation:
             self._run_mapper_round()
 
     def _run_mapper_round(self) -> None:
-        """One round: hear everything, hand a map to the solver, say what came of it, look something up."""
+        """Run one round: apply all messages, start a solve, send the results, do one lookup step."""
         self._is_busy = True
         findings, spent_ns = list[MapEvent](), 0
         while self._inbox:
@@ -324,13 +331,13 @@ class Simulation:
 
 
 def _random_normals(rng: np.random.Generator) -> Iterator[float]:
-    """One by one, drawn many at a time."""
+    """Yield standard normal numbers one by one, drawn in batches."""
     while True:
         yield from rng.standard_normal(_RANDOM_BATCH).tolist()
 
 
 def _result_or_error(action: Callable[[], object]) -> object:
-    """An exception is a result, as in the mapper's process."""
+    """Return the result of `action`, or its exception, as the mapper process does."""
     try:
         return action()
     except Exception as error:
@@ -338,7 +345,8 @@ def _result_or_error(action: Callable[[], object]) -> object:
 
 
 class _SimulatedAgent:
-    """An agent, what it still has to see, and its network. busy_ns: until when it tracks what came so far."""
+    """An agent, its remaining frames and its network. `busy_until_ns`: when it has tracked all frames that
+    arrived so far."""
 
     def __init__(
         self,

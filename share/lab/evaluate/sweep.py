@@ -1,4 +1,4 @@
-"""Settings tried one after the other: a grid of them, or points that are drawn."""
+"""Sweeps of settings: a grid, or randomly drawn points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from share.plain_data import from_mapping, load_yaml, to_mapping
 from share.recordings.session import Session
 
 _SEED = 20261123
-Point = tuple[str, ...]  # a value of each axis, as YAML has it
+Point = tuple[str, ...]  # a value of each axis, in YAML
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Axis:
 
     @classmethod
     def parse(cls, text: str) -> Axis:
-        """`control.kp=0.2,0.8`, `control.kp=0.1:3`, `a.b+c.d=1,2`. Raises UsageError."""
+        """Parse `control.kp=0.2,0.8`, `control.kp=0.1:3` or `a.b+c.d=1,2`. Raises UsageError."""
         name, separator, values_text = text.partition("=")
         names = tuple(name.split("+"))
         if not separator or not values_text or any(len(one.split(".")) != 2 for one in names):
@@ -55,13 +55,13 @@ class Axis:
         try:
             low, high = map(float, values_text.split(":"))
         except ValueError:
-            raise UsageError(f"--set {text}: LOW:HIGH are two numbers") from None
+            raise UsageError(f"--set {text}: LOW and HIGH must be numbers") from None
         if not 0 <= low < high < math.inf:
-            raise UsageError(f"--set {text}: LOW must be below HIGH, and neither negative")
+            raise UsageError(f"--set {text}: LOW must be below HIGH, and both at least 0")
         return cls(names, (), low, high)
 
     def draw(self, u: float) -> str:
-        """At u, from 0 to 1: evenly, or by the logarithm where that is within a range."""
+        """Return the value at u in 0..1: uniform, or log-uniform within a range above 0."""
         if self.values:
             return self.values[min(int(u * len(self.values)), len(self.values) - 1)]
         if self.low > 0:
@@ -70,23 +70,25 @@ class Axis:
 
 
 def grid(axes: Sequence[Axis]) -> list[Point]:
-    """Every combination, once. Raises UsageError where an axis is a range."""
+    """Return every combination, once. Raises UsageError where an axis is a range."""
     for axis in axes:
         if axis.is_range:
-            raise UsageError(f"--set {axis.name}: a range is for --random N; give values for a grid")
+            raise UsageError(f"--set {axis.name}: a range needs --random N; give values for a grid")
     return list(dict.fromkeys(itertools.product(*(axis.values for axis in axes))))
 
 
 def random_points(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
-    """`count` points; the same seed gives the same ones, and more of them the same first. Fewer where listed
-    values make some of them one."""
+    """Return `count` points, fewer where listed values make some of them equal.
+
+    Deterministic for a given seed; a larger count extends the list.
+    """
     u = np.random.default_rng(seed).random((count, len(axes)))
     points = (tuple(axis.draw(x) for axis, x in zip(axes, row, strict=True)) for row in u.tolist())
     return list(dict.fromkeys(points))
 
 
 def config_at(config: Config, axes: Sequence[Axis], point: Point) -> Config:
-    """`config` but for the settings of `point`. Raises ConfigError naming the one that is wrong."""
+    """Return `config` with the settings of `point`. Raises ConfigError with the name of a wrong one."""
     mapping: dict[str, Any] = to_mapping(config)
     for axis, value in zip(axes, point, strict=True):
         for name in axis.names:
@@ -100,18 +102,18 @@ def plan_sweep(
     axes: Sequence[Axis],
     points: Sequence[Point],
     seeds: Sequence[int],
-    terms: RunOptions,
+    options: RunOptions,
     out: Path,
     config: Config,
 ) -> list[tuple[PlannedRun, Point]]:
-    """All runs, with their points. Raises UsageError, ConfigError."""
+    """Return all runs, with their points. Raises UsageError, ConfigError."""
     check_unique_names(sessions)
     configs = {point: config_at(config, axes, point) for point in points}
     return [
         (
             PlannedRun(
                 session,
-                replace(terms, seed=seed),
+                replace(options, seed=seed),
                 out / _run_name(session, axes, point, seed),
                 configs[point],
             ),
@@ -124,8 +126,8 @@ def plan_sweep(
 
 
 def sweep_table(axes: Sequence[Axis], runs: Sequence[tuple[Point, RunMetrics]]) -> list[dict[str, Any]]:
-    """A row a point, in the order in which they first come: its settings, how many runs, and of each measure
-    the mean with its interval."""
+    """Return a row per point, in order of appearance: its settings, the number of runs, and the mean of
+    each measure with its interval."""
     rows = []
     for point in dict.fromkeys(point for point, _ in runs):
         point_runs = [run for of, run in runs if of == point]
@@ -141,7 +143,7 @@ def sweep_table(axes: Sequence[Axis], runs: Sequence[tuple[Point, RunMetrics]]) 
 
 
 def heat_map(axes: Sequence[Axis], rows: Sequence[Mapping[str, Any]], measure: str) -> np.ndarray[Any, Any]:
-    """(V0, V1): the mean of a measure over the first two axes' values, and over all others."""
+    """Return (V0, V1): the mean of a measure by the first two axes' values, over all others."""
     first, second = axes[:2]
     out = np.full((len(first.values), len(second.values)), np.nan)
     for i, j in np.ndindex(out.shape):

@@ -1,4 +1,4 @@
-"""Trackers over one agent's recording: ours, and those of others, in interpreters of their own."""
+"""Run trackers over one agent's recording: SHARE's in this process, peers in interpreters of their own."""
 
 from __future__ import annotations
 
@@ -32,8 +32,11 @@ ShowFrames = Callable[[int], None]  # frames done
 
 @dataclass
 class TrackerRun:
-    """Of the frames with a pose: stamps and causal T_world_body. CPU ms of each frame but the first, which
-    sets up. final: the trajectory as the tracker takes it to be in the end, of one that mends its past."""
+    """Stamps and causal T_world_body of the frames with a pose, and CPU ms of every frame but the first,
+    which sets up.
+
+    `final`: the trajectory by the tracker's final map, if it corrects past poses.
+    """
 
     stamps: list[int] = field(default_factory=list)
     poses: list[F64] = field(default_factory=list)
@@ -52,7 +55,7 @@ class TrackerRun:
 
 
 def peer_version(peer: PeerTracker, python: Path) -> str | None:
-    """What the peer calls itself, None where that interpreter cannot run it."""
+    """Return the peer's name and version, None where that interpreter cannot run it."""
     try:
         process = subprocess.run([python, peer.path, "--version"], capture_output=True, check=False)
     except OSError:
@@ -61,7 +64,7 @@ def peer_version(peer: PeerTracker, python: Path) -> str | None:
 
 
 def run_share(source: Source, settings: Config, show: ShowFrames = lambda done: None) -> TrackerRun:
-    """Decoding is not counted; a frame's keyframe, if it became one, is."""
+    """Run SHARE's tracker. CPU time includes a frame's keyframe, not its decoding."""
     tracker, run = make_source_tracker(source, settings), TrackerRun()
     for frame in read_frames(source, settings, SequencerCounters()):
         cpu_start_s = time.process_time()
@@ -78,8 +81,10 @@ def run_share(source: Source, settings: Config, show: ShowFrames = lambda done: 
 def run_peer(
     source: Source, command: Sequence[str], log: Path | None = None, show: ShowFrames = lambda done: None
 ) -> TrackerRun:
-    """Every frame in turn through a process that speaks as `peer_wire` says, at its own pace. log: a file for
-    what else it says. Raises DataError if it fails, UsageError where the rig is not stereo with an IMU."""
+    """Pass all frames in turn through a peer process that speaks `peer_wire`. `log`: file for its stderr.
+
+    Raises DataError if it fails, UsageError where the rig is not stereo with an IMU.
+    """
     run, calibration_values = TrackerRun(), rig_calibration(source)
     err = None if log is None else open_new(log)
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=err) as peer:
@@ -97,7 +102,7 @@ def run_peer(
             final = read_line(peer.stdout)
         except BrokenPipeError:
             where = "above" if log is None else str(log)
-            raise DataError(f"the peer ended at frame {len(run.cpu_ms)}; see {where}") from None
+            raise DataError(f"the peer process ended at frame {len(run.cpu_ms)}; see {where}") from None
         finally:
             if err is not None:
                 err.close()
@@ -108,18 +113,20 @@ def run_peer(
 
 
 def can_run_peers(source: Source) -> bool:
-    """Whether peers can be run on it: it is stereo with an IMU, whatever else it has."""
+    """Return whether peers can run on the recording: stereo with an IMU."""
     return source.rig.cam1 is not None and source.rig.imu is not None
 
 
 def rig_calibration(source: Source) -> dict[str, Any]:
-    """The rig in plain numbers. R_rectified_cam0: from cam0 to where it looks once both images are rectified.
-    Raises UsageError where it is not stereo with an IMU."""
+    """Return the rig as plain data. `R_rectified_cam0`: from cam0 to the rectified cam0.
+
+    Raises UsageError where the rig is not stereo with an IMU, or has fisheye lenses.
+    """
     rig = source.rig
     if rig.cam1 is None or rig.T_cam1_cam0 is None or rig.imu is None:
-        raise UsageError(f"{source.name}: is {rig.kind}; other trackers are run with stereo+imu")
+        raise UsageError(f"{source.name}: is {rig.kind}; other trackers need stereo+imu")
     if rig.cam0.is_fisheye or rig.cam1.is_fisheye:
-        raise UsageError(f"{source.name}: has a fisheye lens; other trackers are run with radtan or none")
+        raise UsageError(f"{source.name}: has a fisheye lens; other trackers need radtan or no distortion")
     T_body_cam1 = rig.T_body_cam0 @ se3.inverse(rig.T_cam1_cam0)
     return {
         "cameras": [_camera(rig.cam0, rig.T_body_cam0), _camera(rig.cam1, T_body_cam1)],
@@ -130,14 +137,14 @@ def rig_calibration(source: Source) -> dict[str, Any]:
 
 
 def _camera(camera: Camera, T_body_cam: F64) -> dict[str, Any]:
-    """distortion: k1, k2, p1, p2, k3, or fewer."""
+    """Return a camera as plain data. `distortion`: k1, k2, p1, p2, k3, or fewer."""
     size = {"width": camera.width, "height": camera.height}
     distortion = list(camera.distortion)
     return size | {"K": camera.K.tolist(), "distortion": distortion, "T_body_cam": T_body_cam.tolist()}
 
 
 def _rectifying_rotation(cam0: Camera, cam1: Camera, T_cam1_cam0: F64) -> F64:
-    """(3, 3)."""
+    """Return R_rectified_cam0 (3, 3)."""
     (K0, D0), (K1, D1) = ((c.K, np.array([*c.distortion, *[0.0] * 5][:5])) for c in (cam0, cam1))
     size, R, t = (cam0.width, cam0.height), T_cam1_cam0[:3, :3].copy(), T_cam1_cam0[:3, 3:].copy()
     rectified = cv2.stereoRectify(K0, D0, K1, D1, size, R, t, flags=cv2.CALIB_ZERO_DISPARITY, alpha=-1)
@@ -145,15 +152,14 @@ def _rectifying_rotation(cam0: Camera, cam1: Camera, T_cam1_cam0: F64) -> F64:
 
 
 def peer_frames(source: Source) -> Iterator[PeerFrame]:
-    """All frames with both images, up to the last that an IMU sample comes after. Time is the cameras'."""
+    """Yield all frames with both images, up to the last that an IMU sample follows. Stamps are in the
+    cameras' clock."""
     samples = [
         (m.stamp_ns - source.rig.timeshift_ns, m.payload) for m in source.measurements() if m.stream == IMU
     ]
     samples.sort(key=lambda sample: sample[0])
-    stamps, values = (
-        np.array([t for t, _ in samples], np.int64),
-        np.array([v for _, v in samples], np.float64),
-    )
+    stamps = np.array([t for t, _ in samples], np.int64)
+    values = np.array([v for _, v in samples], np.float64)
     done = 0
     for frame in read_frames(source, Config(), SequencerCounters()):
         end = int(np.searchsorted(stamps, frame.stamp_ns, "right")) + 1

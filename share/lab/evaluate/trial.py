@@ -1,6 +1,7 @@
-"""A trial: a session played on stated terms, kept with what is needed to do it again.
+"""A trial: one run of a session, kept with all that is needed to repeat it.
 
-Its folder holds what the agents and the edge left, `config.yaml` (the settings in effect) and `run.json`.
+Its folder holds the files of the agents and of the edge, `config.yaml` (the effective settings) and
+`run.json`.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _OPTION_NAMES = [field.name for field in dataclasses.fields(RunOptions) if field
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One that is over. record: run.json."""
+    """A finished trial. `record`: the contents of run.json."""
 
     folder: Path
     session: Session
@@ -43,35 +44,35 @@ class Trial:
 
     @property
     def folders(self) -> dict[str, Path]:
-        """Of each agent's files, by name."""
+        """Folder of each agent's files, by name."""
         return {name: self.folder / name for name in self.session.agents}
 
     @property
     def clock(self) -> str:
-        """By which time it was played, for a reader."""
+        """The clock by which it was played, for readers."""
         if self.options.virtual:
             return "virtual time" + (
-                f", as long as in {Path(self.options.costs).name}" if self.options.costs else ""
+                f", delays of {Path(self.options.costs).name}" if self.options.costs else ""
             )
         return "real time" + (", agents first" if self.options.agents_first else "")
 
     @property
     def error_source(self) -> str:
-        """What the edge takes for an agent's error, for a reader."""
+        """The source of the agents' estimated errors, for readers."""
         model = self.record.get("error_model")
         if self.options.true_error:
             return "the true error"
-        return f"what the error model says ({Path(model).name})" if model else "odometry's sigma"
+        return f"the error model ({Path(model).name})" if model else "odometry's sigma"
 
 
 def run_trial(
     session: Session, options: RunOptions, config: Config, out: Path, show: Callable[[Progress], None]
 ) -> Trial:
-    """Plays it. `out` is whole or not there. config: for all; what it draws is drawn by the seed of
+    """Play a session. `out` is complete or absent. The scheduler's random numbers follow the seed of
     `options`.
 
-    Raises UsageError where `out` is there already or the session has no truth, ShareError where an agent or
-    the edge fails.
+    Raises UsageError where `out` exists or the session has no truth, ShareError where an agent or the edge
+    fails.
     """
     seconds = _duration_s(session)
     with new_folder(out) as work:
@@ -99,10 +100,11 @@ def run_trial(
 
 
 def read_trial(folder: Path) -> Trial:
-    """Raises UsageError or DataError where `folder` is not one that is over, or its session is another."""
+    """Read a finished trial. Raises UsageError or DataError where `folder` is none, or its session has
+    changed."""
     path = folder / RUN_FILE
     if not path.is_file():
-        raise UsageError(f"{folder}: has no {RUN_FILE}; it is not a run by `share evaluate run`")
+        raise UsageError(f"{folder}: has no {RUN_FILE}; not a folder of `share evaluate run`")
     record = read_json(path)
     try:
         options = from_mapping(
@@ -112,19 +114,21 @@ def read_trial(folder: Path) -> Trial:
         raise DataError(f"{path}: is damaged: {error}") from None
     session, texts = record.get("session"), [record.get(name) for name in ("error_model", "code")]
     if not isinstance(session, str) or not all(isinstance(one, str | None) for one in texts):
-        raise DataError(f"{path}: is damaged: session, error_model or code is no text")
+        raise DataError(f"{path}: is damaged: session, error_model or code is not text")
     if not Path(session).is_dir():
-        raise UsageError(f"{path}: its session {session} is not there any more, and with it the truth")
+        raise UsageError(
+            f"{path}: its session {session}, which has the truth, does not exist any more; restore it"
+        )
     opened = read_session(Path(session))
     if record.get("provenance", to_plain(opened.provenance)) != to_plain(opened.provenance):
         raise UsageError(
-            f"{path}: its session {session} was made anew since, with another truth; play it again"
+            f"{path}: its session {session} was generated again since, with another truth; play it again"
         )
     return Trial(folder, opened, options, record)
 
 
 def settings_yaml(config: Config, seed: int) -> str:
-    """The text of config.yaml: `config`, with draws of the scheduler of their own for each seed."""
+    """Return the text of config.yaml: `config`, with the scheduler's seeds shifted by `seed`."""
     import yaml
 
     control = config.control
@@ -136,12 +140,12 @@ def settings_yaml(config: Config, seed: int) -> str:
 
 
 def _duration_s(session: Session) -> float:
-    """From the first image of all to the last, by the session's clock."""
+    """Return the time from the first image of all agents to the last, by the session's clock."""
     first, last = [], []
     for name, agent in session.agents.items():
         path = session.folder / "truth" / f"{name}.tum"
         if not path.is_file():
-            raise UsageError(f"{path}: no such file; without the truth of all agents nothing can be scored")
+            raise UsageError(f"{path}: no such file; scoring needs the truth of all agents")
         stamps_ns = open_source(f"{session.folder}/{name}").stamps()[CAM0]
         first.append(int(stamps_ns[0]) - agent.clock_offset_ns)
         last.append(int(stamps_ns.max()) - agent.clock_offset_ns)

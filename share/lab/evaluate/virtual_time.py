@@ -1,9 +1,9 @@
-"""A session in virtual time: what agents saw is tracked once, all else goes through
+"""Play a session in virtual time: each agent is tracked once, the rest runs in
 `share.lab.evaluate.simulation`.
 
-The tracker, the agents' and the edge's machines and the mapper are the real ones, and odometry is the same to
-the last digit as in real time. How long things take is drawn (`ProcessingDelays`), so that neither this
-machine nor what else it does shows in a latency, and the same seed gives the same run.
+Tracker, agent and edge state machines and mapper are the real ones; odometry equals that of a real-time run
+to the last digit. Processing delays are drawn (`ProcessingDelays`), so latencies do not depend on this
+machine or its load, and a run is deterministic for a given seed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from share.runtime.source import Source, open_source
 from share.sensors.sequencer import SequencerCounters
 from share.wire.messages import Hello
 
-_DRAIN_S = 2.0  # for what is under way when the last frame has come
+_DRAIN_S = 2.0  # after the last frame, for messages still under way
 _SHOW_EVERY = 50  # frames of an agent
 _TRUE_ERROR = "truth"
 
@@ -53,14 +53,17 @@ _TRUE_ERROR = "truth"
 def play_in_virtual_time(
     session: Session, seconds: float, options: RunOptions, out: Path, show: Callable[[Progress], None]
 ) -> dict[str, Path]:
-    """As `share.lab.evaluate.real_time.play`, with the same files; those of processes (logs) are not there.
+    """Play `session` as `share.lab.evaluate.real_time.play_in_real_time` does, with the same files except the
+    processes' logs.
 
-    Raises UsageError where an agent's recording cannot be tracked or the policy is one that streams.
+    Raises UsageError where a recording cannot be tracked or the policy is `streamed`.
     """
     settings = read_settings(Path(options.config)) if options.config else Config()
     settings = dataclasses.replace(settings, edge=dataclasses.replace(settings.edge, policy=options.policy))
     if options.policy == config.STREAMED:
-        raise UsageError("policy streamed is not played in virtual time: its agents do not track")
+        raise UsageError(
+            "policy streamed cannot be played in virtual time: its agents do not track; leave out --virtual"
+        )
     error_source = _TRUE_ERROR if options.true_error else settings.agent.error_model
     tracker_settings = settings.tracker, settings.inertial, settings.sequencer
     tracked = _track_all(session.folder.resolve(), *tracker_settings, error_source)
@@ -99,8 +102,10 @@ def _track_all(
     sequencer: SequencerConfig,
     error_source: str,
 ) -> dict[str, tuple[Rig, list[TrackedFrame]]]:
-    """What each agent's frames came to, by name; they come in at the session's own times, ns. told_by: who
-    says how wrong trackers are, the truth, a file with an error model, or nobody ("")."""
+    """Return rig and tracked frames of each agent, by name; `arrival_ns` is in the session's clock.
+
+    `error_source`: where tracking errors come from: "truth", the file of an error model, or "" for none.
+    """
     settings = Config(tracker=tracker, inertial=inertial, sequencer=sequencer)
     session = read_session(folder)
     return {
@@ -139,13 +144,13 @@ def _error_estimator(source: Source, error_source: str) -> ErrorEstimator:
 
 
 def _relative_frames(frames: list[TrackedFrame], start_ns: int) -> Iterator[TrackedFrame]:
-    """Counted from the first frame of all."""
+    """Yield the frames with `arrival_ns` relative to `start_ns`."""
     for frame in frames:
         yield dataclasses.replace(frame, arrival_ns=frame.arrival_ns - start_ns)
 
 
 class _RunWriter:
-    """Writes what agents and edge would have written."""
+    """Write the files that real agents and a real edge would write."""
 
     def __init__(self, folders: dict[str, Path], edge: Path, show: Callable[[Progress], None]) -> None:
         self._show, self._edge = show, edge
@@ -176,7 +181,7 @@ class _RunWriter:
             self._corrections += 1
 
     def finish(self, world: Simulation, settings: Config) -> None:
-        """The reports. Raises ShareError if the disk was full."""
+        """Write the reports. Raises ShareError if the disk was full."""
         common = {"version": __version__, "config": to_mapping(settings)}
         for name, machine in world.reports().items():
             counted = {key: machine[key] for key in ("corrections", "bytes_up", "bytes_down")}
@@ -194,23 +199,24 @@ class _RunWriter:
 
 
 def _ignore_full_disk(text: str) -> None:
-    """A file that could not be written is said by its `check`, at the end."""
+    """Ignore a failed write: the file's `check` reports it at the end."""
 
 
-# ---- How long things took in a run in real time, for runs in virtual time that are to be like it.
+# Delays measured in a real-time run, for runs in virtual time.
 
 _DEFAULT_DELAYS = ProcessingDelays()
 
 
 def read_delays(run: Path) -> ProcessingDelays:
-    """By the reports in `run`, a folder by `share evaluate run`: frames, queries, verifications, solutions.
+    """Read the delays of frames, queries, verifications and solutions from the reports in `run`, a folder of
+    `share evaluate run`.
 
-    What is not measured, keyframes' work at the agent and the edge's small steps, is as much slower or
-    quicker than usual as frames and verifications are. Raises UsageError or DataError.
+    Delays that are not measured are the defaults times a factor: the agent's keyframe work by that of frames,
+    the edge's small steps by that of verifications. Raises UsageError or DataError.
     """
     edge, agents = run / "edge" / "edge.json", sorted(run.glob("*/report.json"))
     if not edge.is_file() or not agents:
-        raise UsageError(f"--costs {run}: is not a run by `share evaluate run`")
+        raise UsageError(f"--costs {run}: not a folder of `share evaluate run`")
     with own_format_errors(run):
         return _read_delays(edge, agents)
 
@@ -221,10 +227,8 @@ def _read_delays(edge: Path, agents: Sequence[Path]) -> ProcessingDelays:
     query, verify, solve = (
         _mean_delay([edge_report.get(f"{kind}_ms", {})], edge) for kind in ("place", "verify", "solve")
     )
-    agent_factor, edge_factor = (
-        frame.p50 / _DEFAULT_DELAYS.frame.p50,
-        verify.p50 / _DEFAULT_DELAYS.verify_accepted.p50,
-    )
+    agent_factor = frame.p50 / _DEFAULT_DELAYS.frame.p50
+    edge_factor = verify.p50 / _DEFAULT_DELAYS.verify_accepted.p50
     return replace(
         ProcessingDelays(
             **{
@@ -243,10 +247,10 @@ def _read_delays(edge: Path, agents: Sequence[Path]) -> ProcessingDelays:
 
 
 def _mean_delay(summaries: Sequence[Mapping[str, Any]], where: Path) -> Delay:
-    """Of several, the mean of their percentiles."""
+    """Return the means of several summaries' percentiles."""
     known = [one for one in summaries if one.get("n")]
     if not known:
-        raise DataError(f"{where}: nothing was measured that costs could be taken from; play a longer run")
+        raise DataError(f"{where}: has no measured delays; play a longer run")
     p50, p95 = (sum(float(one[name]) for one in known) / len(known) for name in ("p50", "p95"))
     return Delay(p50, p95)
 

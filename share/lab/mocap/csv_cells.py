@@ -1,4 +1,4 @@
-"""The cells of a motion capture's export as numbers."""
+"""Cells of a motion capture's CSV export as numbers."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from share.errors import DataError
 from share.recordings.tables import MAX_STAMP_NS
 from share.types import F64, I64
 
-_MAX_VALUE = 1e15  # of a number in a cell, whatever its unit
+_MAX_VALUE = 1e15  # in any unit
 
 
 def cell_rows(lines: Sequence[str], path: Path, line: int = 1, delimiter: str = ",") -> list[list[str]]:
-    """The cells of a file's lines, without the blanks around them. line: of the first. Raises DataError
-    naming file and line."""
+    """Return the stripped cells of a file's lines. line: number of the first. Raises DataError with file
+    and line."""
     reader = csv.reader(lines, delimiter=delimiter)
     try:
         return [[cell.strip() for cell in row] for row in reader]
@@ -26,8 +26,11 @@ def cell_rows(lines: Sequence[str], path: Path, line: int = 1, delimiter: str = 
 
 
 def number_columns(path: Path, line: int, table: Sequence[Sequence[str]], columns: Sequence[int]) -> F64:
-    """Those columns (N, len(columns)) of a table's rows, NaN where a cell is empty or the row ends before
-    it. line: of the first row. A number may have a decimal comma. Raises DataError naming file and line."""
+    """Return columns (N, len(columns)) of a table's rows, NaN where a cell is empty or missing. line: of the
+    first row.
+
+    A number may have a decimal comma. Raises DataError with file and line.
+    """
     cells = [[decimal_point(row[k]) or "nan" if k < len(row) else "nan" for k in columns] for row in table]
     try:
         values = np.array(cells, np.float64).reshape(len(table), len(columns))
@@ -47,16 +50,18 @@ def number_columns(path: Path, line: int, table: Sequence[Sequence[str]], column
 
 
 def decimal_point(number: str) -> str:
-    """With a decimal point, where some countries' exports have a comma."""
+    """Return a number's text with a decimal point in place of a comma."""
     return number.strip().replace(",", ".")
 
 
 def stamp_column(seconds: F64, label: str, path: Path, line: int) -> I64:
-    """(N,) ns of rows, the first in that line. Raises DataError naming file and line where one is not after
-    the one before. what: this is called in the file."""
+    """Return stamps (N,) ns of rows, the first in `line`. label: the column's name in the file.
+
+    Raises DataError with file and line where one is not later than the one before.
+    """
     known = np.abs(seconds) < MAX_STAMP_NS * 1e-9
     bad = np.flatnonzero(~known | (np.diff(seconds, prepend=-np.inf) <= 0))
     if len(bad):
         where = f"{path}, line {line + int(bad[0])}"
-        raise DataError(f"{where}: its {label} does not follow the one before; export again")
+        raise DataError(f"{where}: its {label} is not later than the one before; export again")
     return np.asarray(np.round(seconds * 1e9), np.int64)

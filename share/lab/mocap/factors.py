@@ -1,8 +1,8 @@
-"""The two kinds of measurement, linearised at a state: the IMU between nodes, the mocap at its own times.
+"""Linearised factors: IMU preintegration between nodes, and mocap poses at their own times.
 
-Residuals are divided by their noise. Sources: Forster et al. 2017, eq. 45 and 69 (IMU); the mocap's
-is that of hand-eye calibration with a common time offset (Furgale et al., *Unified Temporal and
-Spatial Calibration*, IROS 2013), written for nodes instead of splines.
+Residuals are divided by their noise. Sources: Forster et al. 2017, eq. 45 and 69 (IMU); the mocap factor is
+hand-eye calibration with a common time offset (Furgale et al., *Unified Temporal and Spatial Calibration*,
+IROS 2013), for nodes instead of splines.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from share.types import F64, I64, ImuBatch
 
 @dataclass(frozen=True, eq=False)
 class ImuChain:
-    """IMU residuals between nodes: whitened (M, 15) and their derivatives by the node before and after
-    (M, 15, 15). raw (M, 9) and cov (M, 9, 9): rotation rad, position m, velocity m/s."""
+    """IMU residuals between nodes: whitened (M, 15) and their derivatives by the node before and after (M,
+    15, 15). raw (M, 9) and cov (M, 9, 9): rotation rad, position m, velocity m/s."""
 
     residual: F64
     jacobian_before: F64
@@ -29,15 +29,15 @@ class ImuChain:
     cov: F64
 
     def without_breaks(self, is_break: np.ndarray) -> ImuChain:
-        """Only intervals that the IMU joins."""
+        """Return only the intervals that the IMU joins."""
         fields = (self.residual, self.jacobian_before, self.jacobian_after, self.raw, self.cov)
         return ImuChain(*(field[~is_break] for field in fields))
 
 
 @dataclass(frozen=True, eq=False)
 class MocapObservations:
-    """Mocap residuals (K, 6), rotation then position, by their sigma; derivatives by the node before
-    (K, 6, 15) and by the shared unknowns (K, 6, 10). node (K,): index of that node."""
+    """Mocap residuals (K, 6), rotation then position, over their sigma; derivatives by the node before (K,
+    6, 15) and by the shared unknowns (K, 6, 10). node (K,): index of that node."""
 
     residual: F64
     jacobian_node: F64
@@ -52,12 +52,13 @@ def gravity_vector(gravity: float) -> F64:
 def imu_chain(
     state: MocapImuState, imu: ImuBatch, noise: ImuNoise, gravity: float, is_break: np.ndarray
 ) -> ImuChain:
-    """Residuals of consecutive nodes. broken (N - 1,) bool: no IMU across; only the biases walk on."""
+    """Return residuals of consecutive nodes. is_break (N - 1,) bool: no IMU across; only the biases'
+    random walk."""
     t = state.stamps_ns
     end = np.where(is_break, t[:-1] + 1, t[1:])  # nothing to integrate across a break
     inc = preintegrate(imu, t[:-1], end, state.gyro_bias[:-1], state.accel_bias[:-1], noise)
     raw, before, after = _imu_residual(state, inc, gravity_vector(gravity))
-    cov = inc.cov + np.eye(9) * 1e-14  # what midpoint steps cannot resolve
+    cov = inc.cov + np.eye(9) * 1e-14  # integration error of midpoint steps
     whitening = np.linalg.inv(np.linalg.cholesky(cov))
     whitening[is_break] = 0.0
     out = np.zeros((len(raw), NODE_SIZE))
@@ -73,7 +74,7 @@ def imu_chain(
 
 
 def _imu_residual(state: MocapImuState, inc: PreintegratedImu, g: F64) -> tuple[F64, F64, F64]:
-    """(M, 9) and its derivatives (M, 9, 15) by the node before and the node after."""
+    """Return residuals (M, 9) and their derivatives (M, 9, 15) by the node before and the node after."""
     t = inc.dt[:, None]
     R0, R1 = state.R[:-1], state.R[1:]
     R0_transposed = R0.swapaxes(1, 2)
@@ -95,8 +96,8 @@ def _imu_residual(state: MocapImuState, inc: PreintegratedImu, g: F64) -> tuple[
 def mocap_observations(
     state: MocapImuState, imu: ImuBatch, gravity: float, stamps_ns: I64, T_mocap: F64, sigma: F64
 ) -> MocapObservations:
-    """Residuals of mocap poses T_mocap (K, 4, 4) at stamps_ns (K,) + the offset, which must lie within
-    the nodes. sigma (6,): rad, m. Each is tied to the node before it by the IMU between them."""
+    """Return residuals of mocap poses T_mocap (K, 4, 4) at stamps_ns (K,) + offset, which must lie within
+    the nodes. sigma (6,): rad, m. Each is predicted by the IMU from the node before it."""
     imu_stamps = state.in_imu_clock(stamps_ns)
     i = np.clip(np.searchsorted(state.stamps_ns, imu_stamps, "right") - 1, 0, len(state.p) - 2)
     inc = preintegrate(imu, state.stamps_ns[i], imu_stamps, state.gyro_bias[i], state.accel_bias[i])
@@ -110,7 +111,7 @@ def mocap_observations(
     Jinv = np.linalg.inv(se3.so3_right_jacobian(turn))
     residual = np.concatenate([turn, marker @ R_wl.T - T_mocap[:, :3, 3]], axis=1)
 
-    rotation_jacobian = np.zeros((len(t), 3, NODE_SIZE))  # how the node turns the body at the sample's time
+    rotation_jacobian = np.zeros((len(t), 3, NODE_SIZE))  # of the body at the sample's time, by the node
     rotation_jacobian[:, :, :3] = inc.dR.swapaxes(1, 2)
     rotation_jacobian[:, :, 9:] = inc.bias_jacobian[:, :3]
     lever = -R @ se3.hat(arm)
@@ -133,13 +134,12 @@ def mocap_observations(
 
 
 def _rotate(R: F64, v: F64) -> F64:
-    """R (N, 3, 3) times v (N, 3)."""
+    """Return R (N, 3, 3) times v (N, 3)."""
     out: F64 = (R @ v[..., None])[..., 0]
     return out
 
 
-# ---- IMU preintegration over many intervals at once: what the body did, free of where it stood and how
-# fast.
+# IMU preintegration over many intervals at once.
 #
 # Rate and specific force are linear between samples; each step is a midpoint rule. Source: Forster, Carlone,
 # Dellaert, Scaramuzza, *On-Manifold Preintegration for Real-Time Visual-Inertial Odometry*, TRO 33(1), 2017,
@@ -148,12 +148,12 @@ def _rotate(R: F64, v: F64) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class PreintegratedImu:
-    """Motion over N intervals as its IMU saw it: dt (N,) s; dR (N, 3, 3), dp (N, 3) m, dv (N, 3) m/s
-    in the body frame at the interval's start, gravity left out.
+    """Preintegrated motion over N intervals: dt (N,) s; dR (N, 3, 3), dp (N, 3) m, dv (N, 3) m/s in the body
+    frame at the interval's start, without gravity.
 
-    by_bias (N, 9, 6): derivative of (rotation at the right of dR, dp, dv) by (gyro, accel bias).
-    cov (N, 9, 9): covariance of the same nine by the IMU's white noise.
-    rate_end (N, 3): rad/s, bias-free, at the end of each interval.
+    bias_jacobian (N, 9, 6): derivative of (rotation on the right of dR, dp, dv) by (gyro, accel bias). cov
+    (N, 9, 9): of the same nine by the IMU's white noise. rate_end (N, 3): rad/s, bias-free, at the end of
+    each interval.
     """
 
     dt: F64
@@ -168,7 +168,7 @@ class PreintegratedImu:
 def preintegrate(
     imu: ImuBatch, start_ns: I64, end_ns: I64, gyro_bias: F64, accel_bias: F64, noise: ImuNoise | None = None
 ) -> PreintegratedImu:
-    """Increments over [start_ns, end_ns] (N,), each within the samples, with biases (N, 3) taken off.
+    """Preintegrate over [start_ns, end_ns] (N,), each within the samples, with biases (N, 3) subtracted.
 
     Without `noise` the covariance stays zero (and costs nothing).
     """
@@ -197,15 +197,15 @@ def preintegrate(
 
 
 def interpolate_samples(imu: ImuBatch, stamps_ns: I64, values: F64) -> F64:
-    """A column block (S, 3) of `imu`, linear between samples, at stamps (...,) -> (..., 3)."""
-    origin = imu.stamps_ns[0]  # floats hold nanoseconds since the start, not since 1970
+    """Interpolate values (S, 3) of `imu` linearly at stamps (...,): (..., 3)."""
+    origin = imu.stamps_ns[0]  # floats are exact for nanoseconds since the start, not since 1970
     query_s, samples_s = (stamps_ns - origin).astype(float), (imu.stamps_ns - origin).astype(float)
     return np.stack([np.interp(query_s, samples_s, values[:, i]) for i in range(3)], axis=-1)
 
 
 def _integration_grid(samples_ns: I64, start_ns: I64, end_ns: I64) -> tuple[I64, F64]:
-    """Start, the samples within, end of every interval, padded by repeating the end: (N, K + 1) ns,
-    and the steps between (N, K) s. A step of 0 s changes nothing."""
+    """Return start, the samples within, and end of every interval, padded by repeating the end: (N, K + 1)
+    ns, and the steps between (N, K) s. A step of 0 s changes nothing."""
     first = np.searchsorted(samples_ns, start_ns, "right")
     inside = np.searchsorted(samples_ns, end_ns, "left") - first
     k = np.arange(max(0, int(inside.max(initial=0))))
@@ -216,7 +216,8 @@ def _integration_grid(samples_ns: I64, start_ns: I64, end_ns: I64) -> tuple[I64,
 
 
 def _linearise_step(dR: F64, half: F64, w: F64, a: F64, t: F64) -> tuple[F64, F64]:
-    """One step's derivatives by (rotation, p, v) before it, (N, 9, 9), and by the biases, (N, 9, 6)."""
+    """Return one step's derivatives by (rotation, p, v) before it, (N, 9, 9), and by the biases, (N, 9,
+    6)."""
     n, eye, t = len(dR), np.eye(3), t[..., None]
     push = dR @ half
     by_rotation = -dR @ se3.hat((half @ a[..., None])[..., 0]) * t
@@ -233,7 +234,7 @@ def _linearise_step(dR: F64, half: F64, w: F64, a: F64, t: F64) -> tuple[F64, F6
 
 
 def _step_noise(B: F64, t: F64, noise: ImuNoise) -> F64:
-    """What white noise adds in one step: a mean over t has variance density^2 / t."""
+    """Return the covariance that white noise adds in one step: a mean over t has variance density^2 / t."""
     density = np.repeat([noise.gyro_density, noise.accel_density], 3) ** 2
     per_step = density / np.where(t > 0, t, 1.0)
     return np.asarray((B * per_step[:, None]) @ B.swapaxes(1, 2), np.float64)

@@ -1,4 +1,4 @@
-"""A motion capture's poses from a file: TUM, CSV as EuRoC and TUM-VI have it, Vicon's or Motive's export."""
+"""Read a motion capture's poses: TUM, CSV of EuRoC and TUM-VI, exports of Vicon and Motive."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _IDENTITY_POSE = (0, 0, 0, 0, 0, 0, 1)  # x y z qx qy qz qw
 
 
 def read_mocap(path: Path, allow_unseen: bool = True) -> MocapTrajectory:
-    """`.csv`: t[ns], x y z, qw qx qy qz, and more that is not read; else TUM: t[s] x y z qx qy qz qw.
+    """Read `.csv`: t[ns], x y z, qw qx qy qz, further columns ignored; else TUM: t[s] x y z qx qy qz qw.
 
-    unseen: rows with NaN, or a quaternion of zeros, are the body not seen, a gap; else they are damage.
-    Raises UsageError without such a file, DataError that names it for what is damaged.
+    allow_unseen: rows with NaN or a zero quaternion are gaps; else they are errors. Raises UsageError where
+    there is no such file, DataError with its name for a damaged one.
     """
     if not path.is_file():
-        raise UsageError(f"{path}: no such file of motion capture")
+        raise UsageError(f"{path}: no such motion capture file")
     if path.suffix.lower() == ".csv":
         stamps, values = tables.read_table(path, 8, nan=allow_unseen)
         values = values[:, [0, 1, 2, 4, 5, 6, 3]]
@@ -32,8 +32,8 @@ def read_mocap(path: Path, allow_unseen: bool = True) -> MocapTrajectory:
         stamps, values = read_tum_table(path, nan=allow_unseen)
     is_visible = ~np.isnan(values).any(1) & (values[:, 3:] != 0).any(1) | (not allow_unseen)
     if not is_visible.any():
-        raise DataError(f"{path}: the body was never seen: no pose, NaN and zeros only")
-    values[~is_visible] = _IDENTITY_POSE  # still there, so that a complaint counts the poses of the file
+        raise DataError(f"{path}: the body was never seen: all poses are NaN or zero")
+    values[~is_visible] = _IDENTITY_POSE  # keeps the row numbers in errors
     try:
         return MocapTrajectory(stamps[is_visible], make_poses(values[:, :3], values[:, 3:], path)[is_visible])
     except DataError as error:
@@ -41,8 +41,8 @@ def read_mocap(path: Path, allow_unseen: bool = True) -> MocapTrajectory:
 
 
 def read_bodies(path: Path, rotations: str = "helical") -> Mapping[str, MocapTrajectory | None]:
-    """All rigid bodies of a file by their names, None for one that was never seen; "" in a file that tells of
-    one without naming it.
+    """Read all rigid bodies of a file by name, None for one that was never seen; "" where the file does not
+    name its only body.
 
     rotations: as for `read_vicon`. Raises as `read_mocap`.
     """
@@ -57,8 +57,11 @@ def read_bodies(path: Path, rotations: str = "helical") -> Mapping[str, MocapTra
 def pick_body(
     file: str, bodies: Mapping[str, MocapTrajectory | None], body_wanted: str | None, device: str, option: str
 ) -> tuple[str, MocapTrajectory]:
-    """Which of the bodies in a file a device is, and its poses: the one wanted, else the one of the device's
-    name, else the only one that the file names. option: how a person may say which. Raises UsageError."""
+    """Return name and poses of the body that a device is: the one wanted, else the one of the device's name,
+    else the only one.
+
+    option: how a user may name it. Raises UsageError.
+    """
     matches = [
         body for body in bodies if body.lower() == (device if body_wanted is None else body_wanted).lower()
     ]
@@ -68,10 +71,8 @@ def pick_body(
         poses_found = bodies[matches[0]]
         if poses_found is None:
             raise UsageError(
-                f"{file}: body '{matches[0]}' "
-                f"is in the file but "
-                f"was never seen; record again with its markers "
-                f"in sight, or name another ({option})"
+                f"{file}: body '{matches[0]}' is in the file but was never seen; record again with its "
+                f"markers in view, or name another ({option})"
             )
         return matches[0], poses_found
     listed = ", ".join(bodies) if any(bodies) else "one without a name"

@@ -1,9 +1,9 @@
-"""Motion capture and IMU of one body in one batch: where the IMU really was.
+"""Batch fit of motion capture and IMU of one body: the IMU's true path.
 
-Mocap alone is noisy, its body is not the IMU's, its world not quite level, its clock another. So all
-are solved for at once: pose, velocity and biases at nodes, IMU preintegrated between them, mocap
-poses at their own times, robust, through an unknown tilt, mounting and delay. The mathematics and
-what it attains: docs/mocap-fit.md.
+Mocap alone is noisy, its body is not the IMU's, its world is not quite level, its clock is another. So all
+are estimated together: pose, velocity and biases at nodes, IMU preintegration between them, mocap poses at
+their own times with robust weights, through an unknown tilt, mounting and time offset. Mathematics and
+accuracy: docs/mocap-fit.md.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.lab.mocap.initialisation import initial_rotation, initial_state, nearest_axis_rotation, up_vector
-from share.lab.mocap.offset import coarse_offset
+from share.lab.mocap.offset import find_offset
 from share.lab.mocap.problem import CHECK, BatchSolution, MocapImuProblem, node_covariances
 from share.lab.mocap.residuals import FitResiduals, compute_residuals
 from share.lab.mocap.scale import axis_scales
@@ -24,27 +24,29 @@ from share.lab.mocap.state import MocapFitOptions
 from share.lab.mocap.trajectory import MocapTrajectory, check_imu, find_gaps
 from share.types import F64, I64, ImuBatch
 
-_END_MARGIN_NS = 50_000_000  # mocap this near to the ends is left out: the offset may yet carry it beyond
+_END_MARGIN_NS = 50_000_000  # mocap nearer to the ends is left out: the final offset may shift it beyond
 _MIN_DURATION_S = 2.0
-_MAX_RMS_MM = 100.0  # a path farther than this from the mocap is not the same motion
+_MAX_RMS_MM = 100.0  # a path farther from the mocap is another motion
 
 
 @dataclass(frozen=True, eq=False)
 class MocapFit:
-    """What was found. World: the mocap's, levelled: z up, same origin, same heading.
+    """Result of a fit. World: the mocap's, levelled: z up, same origin, same heading.
 
-    stamps_ns (N,), IMU clock; T_world_body (N, 4, 4) of the IMU; velocity (N, 3) m/s, world;
-    gyro_bias, accel_bias (N, 3). gaps (G, 2) ns, IMU clock: where the mocap says nothing for longer
-    than is bridged. breaks (N - 1,) bool: nothing joins this node to the next.
-    R_mocap_world (3, 3): from the levelled world to the mocap's, which lies on its side where that has
-    another axis `up` than z.
-    T_body_mocap (4, 4). offset_ns: IMU clock minus mocap clock, in the middle of the path; drift_ppm: by
-    how much it grows, microseconds a second.
-    cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; at the right), offset
-    s, drift. cov_poses (N, 6, 6): of T_world_body, perturbed at the right.
-    too_long (3,): by how much the mocap's x, y, z are too long for the accelerometer (0.01: 1 %), which is
-    not taken off; too_long_sigma (3,). strayed: by how many of its sigmas T_body_mocap has left the guess
-    on its worst axis, 0 without one.
+    * stamps_ns (N,), IMU clock; T_world_body (N, 4, 4) of the IMU; velocity (N, 3) m/s, world; gyro_bias,
+      accel_bias (N, 3).
+    * gaps (G, 2) ns, IMU clock: mocap gaps longer than are bridged. is_break (N - 1,) bool: nothing joins
+      this node to the next.
+    * R_mocap_world (3, 3): from the levelled world to the mocap's; with a quarter or half turn where another
+      axis than z is `up`.
+    * T_body_mocap (4, 4). offset_ns: IMU clock minus mocap clock, in the middle of the path; drift_ppm: its
+      growth, microseconds a second.
+    * cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; on the right), offset
+      s, drift. cov_poses (N, 6, 6): of T_world_body, perturbed on the right.
+    * scale_error (3,): by how much the mocap's x, y, z are too long by the accelerometer (0.01: 1 %), not
+      corrected; scale_error_sigma (3,).
+    * mounting_prior_sigmas: deviation of T_body_mocap from its guess on the worst axis, in sigmas of the
+      guess; 0 without one.
     """
 
     stamps_ns: I64
@@ -68,29 +70,29 @@ class MocapFit:
 
     @property
     def up(self) -> str:
-        """The axis of the mocap's world that is nearest to up, such as "z" or "-y"."""
+        """The axis of the mocap's world nearest to vertical, such as "z" or "-y"."""
         up = self.R_mocap_world[:, 2]
         k = int(np.abs(up).argmax())
         return ("-" if up[k] < 0 else "") + "xyz"[k]
 
     @property
     def tilt_deg(self) -> float:
-        """How far that axis is from the vertical."""
+        """Angle of that axis to the vertical."""
         return float(np.degrees(np.arccos(min(1.0, np.abs(self.R_mocap_world[:, 2]).max()))))
 
 
 def fit_mocap(
     imu: ImuBatch, noise: ImuNoise, mocap: MocapTrajectory, options: MocapFitOptions | None = None
 ) -> MocapFit:
-    """The path of the IMU over the time that both cover.
+    """Fit the IMU's path over the time that both cover.
 
-    Raises DataError for stamps out of order, holes in the IMU, no or too little overlap, a body that
-    does not turn; MisfitError (a DataError) where the two do not tell of one motion.
+    Raises DataError for unordered stamps, gaps in the IMU, too little overlap, a body that does not turn;
+    CalibrationMismatchError (a DataError) where the two are not of one motion.
     """
     options = options or MocapFitOptions()
     check_imu(imu)
     inflated = _inflated_noise(noise, options.imu_inflation)
-    coarse_ns = 0 if options.within_s == 0 else coarse_offset(imu, mocap, options.within_s)
+    coarse_ns = 0 if options.within_s == 0 else find_offset(imu, mocap, options.within_s).offset_ns
     overlap = _overlap(imu, mocap.shifted(coarse_ns)).thinned(round(1e9 / options.max_hz))
     guess, bias = _initial_mounting(imu, overlap, options)
     up_rotation = nearest_axis_rotation(up_vector(overlap, imu, guess))
@@ -113,7 +115,7 @@ def _inflated_noise(noise: ImuNoise, factor: float) -> ImuNoise:
 
 
 def _overlap(imu: ImuBatch, mocap: MocapTrajectory) -> MocapTrajectory:
-    """The mocap while the IMU runs."""
+    """Return the mocap while the IMU runs."""
     start = max(int(imu.stamps_ns[0]), int(mocap.stamps_ns[0]))
     end = min(int(imu.stamps_ns[-1]), int(mocap.stamps_ns[-1]))
     if end - start < _MIN_DURATION_S * 1e9:
@@ -125,7 +127,7 @@ def _overlap(imu: ImuBatch, mocap: MocapTrajectory) -> MocapTrajectory:
 
 
 def _initial_mounting(imu: ImuBatch, mocap: MocapTrajectory, options: MocapFitOptions) -> tuple[F64, F64]:
-    """A first T_body_mocap (4, 4), and gyro bias (3,)."""
+    """Return a first T_body_mocap (4, 4), and gyro bias (3,)."""
     if options.T_body_mocap is not None:
         return options.T_body_mocap, np.zeros(3)
     R, bias = initial_rotation(imu, mocap)
@@ -133,8 +135,8 @@ def _initial_mounting(imu: ImuBatch, mocap: MocapTrajectory, options: MocapFitOp
 
 
 def _node_stamps(mocap: MocapTrajectory, options: MocapFitOptions) -> tuple[I64, np.ndarray]:
-    """Nodes (N,) ns at even times, none in holes that break the chain or in parts
-    too short to stand alone; (N - 1,) bool: where it breaks."""
+    """Return evenly spaced nodes (N,) ns, none in gaps that break the chain or in parts too short to fit,
+    and (N - 1,) bool: where the chain breaks."""
     step = round(options.node_s * 1e9)
     nodes = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] + 1, step)
     longest = round(options.max_integrated_s * 1e9)
@@ -143,13 +145,16 @@ def _node_stamps(mocap: MocapTrajectory, options: MocapFitOptions) -> tuple[I64,
     parts = np.split(nodes, np.flatnonzero(np.diff(nodes) > longest) + 1)
     parts = [part for part in parts if len(part) * step > _MIN_DURATION_S * 1e9]
     if not parts:
-        raise DataError(f"mocap: nowhere sees the body for {_MIN_DURATION_S:.0f} s; record again")
+        raise DataError(
+            f"mocap: the body is never seen for {_MIN_DURATION_S:.0f} s without a gap; record again"
+        )
     nodes = np.concatenate(parts)
     return nodes, np.diff(nodes) > longest
 
 
 def _without_ends(mocap: MocapTrajectory, nodes: I64, breaks: np.ndarray) -> MocapTrajectory:
-    """The mocap, less what the offset may yet carry beyond the ends of the chain or of its parts."""
+    """Return the mocap without samples that the final offset may shift beyond the ends of the chain or of
+    its parts."""
     t = mocap.stamps_ns
     ends = np.concatenate([nodes[:1], nodes[:-1][breaks], nodes[1:][breaks], nodes[-1:]])
     is_near_end = np.abs(t[:, None] - ends).min(1) < _END_MARGIN_NS
@@ -163,7 +168,7 @@ def _make_fit(batch: MocapImuProblem, solved: BatchSolution, coarse_ns: int, tur
     inliers = solved.is_inlier
     if inliers.mean() < 0.5:
         raise CalibrationMismatchError(
-            _misfit_text(f"{100 * (1 - inliers.mean()):.0f} % of the mocap's poses are elsewhere")
+            _misfit_text(f"{100 * (1 - inliers.mean()):.0f} % of the mocap's poses are outliers")
         )
     dt = np.diff(state.stamps_ns)[~batch.is_break] * 1e-9
     sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
@@ -173,7 +178,7 @@ def _make_fit(batch: MocapImuProblem, solved: BatchSolution, coarse_ns: int, tur
         chain, dt, options.imu_inflation, distances[:, 1], distances[:, 0], inliers, options.sigma_position
     )
     if not fit_residuals.position_mm < _MAX_RMS_MM:
-        raise CalibrationMismatchError(_misfit_text(f"{fit_residuals.position_mm:.0f} mm rms are left"))
+        raise CalibrationMismatchError(_misfit_text(f"{fit_residuals.position_mm:.0f} mm rms residual"))
     offset_ns = coarse_ns + round(state.offset_s * 1e9)
     inlier_stamps = state.in_imu_clock(batch.mocap.stamps_ns[inliers])
     scales, scales_cov = axis_scales(solved, batch.mocap, options.sigma_position, batch.sample_weight)
@@ -208,16 +213,17 @@ def _mounting_prior_sigmas(T_body_mocap: F64, options: MocapFitOptions) -> float
 
 
 def _misfit_text(reason: str) -> str:
-    return f"mocap and IMU do not tell of one motion: {reason}; {CHECK}"
+    return f"mocap and IMU are not of one motion: {reason}; {CHECK}"
 
 
 def _with_ends(stamps: I64, nodes: I64) -> I64:
-    """Stamps of what was seen, with both ends of the path."""
+    """Return the stamps with both ends of the path."""
     return np.concatenate([nodes[:1], stamps, nodes[-1:]])
 
 
 def _right_perturbed(R: F64, cov: F64) -> F64:
-    """Covariances (N, 6, 6) with positions in the world -> perturbations at the right of the pose."""
+    """Return covariances (N, 6, 6), given with positions in the world, as perturbations on the right of
+    the pose."""
     J = np.tile(np.eye(6), (len(R), 1, 1))
     J[:, 3:, 3:] = R.swapaxes(1, 2)
     return np.asarray(J @ cov @ J.swapaxes(1, 2), np.float64)

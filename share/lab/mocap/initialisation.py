@@ -1,4 +1,4 @@
-"""A first guess for the fit, in closed form: how the mocap body sits, where up is, where the nodes are."""
+"""Initial values of the fit in closed form: mounting, vertical, nodes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _MIN_ROTATION_RATE = 0.05  # rad/s rms about the second axis
 
 
 def initial_rotation(imu: ImuBatch, mocap: MocapTrajectory) -> tuple[F64, F64]:
-    """R_body_mocap (3, 3) and gyro bias (3,) rad/s: what takes the mocap's turns to the gyro's
-    (Park and Martin, *Robot sensor calibration*, IEEE TRA 10(5), 1994, with the bias as the shift).
+    """Return R_body_mocap (3, 3) and gyro bias (3,) rad/s that map the mocap's rotations to the gyro's (Park
+    and Martin, *Robot sensor calibration*, IEEE TRA 10(5), 1994, with the bias as the shift).
 
     Raises DataError if the body turned about one axis only.
     """
@@ -33,11 +33,11 @@ def initial_rotation(imu: ImuBatch, mocap: MocapTrajectory) -> tuple[F64, F64]:
     )
     if rms_by_axis[1] < _MIN_ROTATION_RATE * WINDOW_NS * 1e-9:
         raise DataError(
-            "mocap and IMU: the body turned about one axis only, so how the mocap's body sits on it cannot "
-            "be found; turn it about two axes, or give T_body_mocap (share dataset align: --mounting)"
+            "mocap and IMU: the body turned about one axis only, which does not determine the mounting; turn "
+            "it about two axes, or give T_body_mocap (share dataset align: --mounting)"
         )
-    is_inlier = np.abs(np.linalg.norm(mocap_turns, axis=1) - np.linalg.norm(imu_turns, axis=1))
-    is_inlier = is_inlier <= 3 * np.median(is_inlier)  # an outlier of the mocap turns by something else
+    errors = np.abs(np.linalg.norm(mocap_turns, axis=1) - np.linalg.norm(imu_turns, axis=1))
+    is_inlier = errors <= 3 * np.median(errors)
     T = umeyama(mocap_turns[is_inlier], imu_turns[is_inlier])
     return T[:3, :3], T[:3, 3] / (WINDOW_NS * 1e-9)
 
@@ -45,8 +45,11 @@ def initial_rotation(imu: ImuBatch, mocap: MocapTrajectory) -> tuple[F64, F64]:
 def initial_state(
     nodes_ns: I64, imu: ImuBatch, mocap: MocapTrajectory, T_body_mocap: F64, gyro_bias: F64
 ) -> MocapImuState:
-    """Nodes on the mocap's path, turned by the gyro where the mocap has a hole. up is the mean specific
-    force: over a recording that ends at the speed at which it began, nothing else is left of it."""
+    """Return nodes on the mocap's path, with rotations by the gyro in its gaps.
+
+    Up is the mean specific force: over a recording that starts and ends at one velocity, accelerations
+    cancel.
+    """
     n = len(nodes_ns)
     T_world_body = mocap.interpolate(nodes_ns) @ se3.inverse(T_body_mocap)
     bias = np.tile(gyro_bias, (n, 1))
@@ -61,20 +64,20 @@ def initial_state(
 
 
 def up_vector(mocap: MocapTrajectory, imu: ImuBatch, T_body_mocap: F64) -> F64:
-    """(3,) in the mocap's world: the usual specific force, m/s^2, whatever outliers there are."""
+    """Return the median specific force (3,), m/s^2, in the mocap's world; robust to outliers."""
     R_world_body = mocap.T[:, :3, :3] @ T_body_mocap[:3, :3].T
     return np.asarray(np.median(_world_forces(R_world_body, imu, mocap.stamps_ns), axis=0), np.float64)
 
 
 def _world_forces(R_world_body: F64, imu: ImuBatch, stamps_ns: I64) -> F64:
-    """Specific force (N, 3) in the world, m/s^2."""
+    """Return the specific force (N, 3) in the world, m/s^2."""
     force = interpolate_samples(imu, stamps_ns, imu.accel)
     return np.asarray((R_world_body @ force[..., None])[..., 0], np.float64)
 
 
 def nearest_axis_rotation(up: F64) -> F64:
-    """(3, 3), the turn by a quarter or a half that makes of the axis nearest to `up` (3,) the z axis. Motion
-    captures with y up are usual, and so far from it a tilt is no small turn."""
+    """Return the rotation (3, 3) by a quarter or half turn that takes the axis nearest to `up` (3,) to z.
+    Mocap worlds with y up are common, too far from z for a small tilt."""
     k = int(np.abs(up).argmax())
     axis = np.sign(up[k]) * np.eye(3)[k]
     if k == 2:
@@ -83,14 +86,14 @@ def nearest_axis_rotation(up: F64) -> F64:
 
 
 def tilt_from_up(up: F64) -> F64:
-    """(2,) with Exp(tilt_x, tilt_y, 0) taking z to `up` (3,), of any length."""
+    """Return the tilt (2,) with Exp(tilt_x, tilt_y, 0) taking z to `up` (3,), of any length."""
     axis = np.array([-up[1], up[0]])  # z x up
     sine = float(np.linalg.norm(axis))
     return axis / sine * np.arctan2(sine, up[2]) if sine > 1e-12 else np.zeros(2)
 
 
 def _propagate_by_gyro(T: F64, is_known: np.ndarray, imu: ImuBatch, stamps_ns: I64, bias: F64) -> None:
-    """Rotations of T (N, 4, 4) that are not known, from the node before each; in place."""
+    """Fill in rotations of T (N, 4, 4) that are unknown, from the node before each; in place."""
     unknown = np.flatnonzero(~is_known[1:]) + 1
     inc = preintegrate(imu, stamps_ns[unknown - 1], stamps_ns[unknown], bias[unknown], 0 * bias[unknown])
     for i, dR in zip(unknown, inc.dR, strict=True):

@@ -1,16 +1,16 @@
-"""Rigid bodies of a CSV export by OptiTrack's Motive (format 1.2 and later).
+"""Read rigid bodies from a CSV export of OptiTrack's Motive (format 1.2 and later).
 
     Format Version,1.23,Take Name,…,Rotation Type,Quaternion,Length Units,Meters,Coordinate Space,Global
 
-    ,Type,Rigid Body,Rigid Body,…             also markers and bones, which are not read
+    ,Type,Rigid Body,Rigid Body,…             also markers and bones, which are ignored
     ,Name,Headset1,Headset1,…
     ,ID,"4A…","4A…",…
     ,,Rotation,Rotation,Rotation,Rotation,Position,…
     Frame,Time (Seconds),X,Y,Z,W,X,…
     0,0.000000,0.12,…                         empty cells where a body is not seen
 
-Some versions leave the words Type, Name, ID out, some have a row Parent, some a column of time codes.
-Source: docs.optitrack.com, *Data Export: CSV*. Which axis is up is chosen at the export and not in the file.
+Some versions leave out the words Type, Name, ID, some have a row Parent, some a column of time codes. Source:
+docs.optitrack.com, *Data Export: CSV*. The up axis is chosen at the export and not in the file.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _CELLS = [("Rotation", axis) for axis in "XYZW"] + [("Position", axis) for axis 
 
 @dataclass(frozen=True, eq=False)
 class _MotiveExport:
-    """about: what the first line says. head: rows of types, names, of rotation or position, and of axes, one
-    cell a column. line: of the first row of data."""
+    """header: of the first line. types, names, kinds (rotation or position), axis_names: a cell per
+    column. line: number of the first data row."""
 
     path: Path
     header: dict[str, str]
@@ -48,7 +48,7 @@ class _MotiveExport:
     rows: list[list[str]]
 
     def metres_per_unit(self) -> float:
-        """In one unit of length."""
+        """Return the file's unit of length, m."""
         unit = self.header.get("Length Units", "")
         if unit.lower() not in _UNITS:
             known = ", ".join(name.capitalize() for name in _UNITS)
@@ -56,7 +56,7 @@ class _MotiveExport:
         return _UNITS[unit.lower()]
 
     def columns(self) -> dict[str, list[int]]:
-        """By body, where rotation X Y Z W and position X Y Z are."""
+        """Return by body the columns of rotation X Y Z W and position X Y Z."""
         bodies = [name for kind, name in zip(self.types, self.names, strict=True) if kind == _RIGID_BODY]
         return {name: [self._column(name, *cell) for cell in _CELLS] for name in dict.fromkeys(bodies)}
 
@@ -72,13 +72,16 @@ class _MotiveExport:
 
 
 def is_motive(path: Path) -> bool:
-    """Whether it begins as Motive's exports do."""
+    """Return whether a file begins as Motive's exports do."""
     return read_text(path).lstrip().startswith("Format Version,")
 
 
 def read_motive(path: Path) -> dict[str, MocapTrajectory | None]:
-    """By body, its poses where it was seen, None where it never was, in the axes of the file; stamps are its
-    times, ns. Raises DataError naming file and line."""
+    """Read each body's poses in the file's axes, None for one that was never seen; stamps are the file's
+    times, ns.
+
+    Raises DataError with file and line.
+    """
     export = _read_export(path)
     scale, columns = export.metres_per_unit(), export.columns()
     if not columns:

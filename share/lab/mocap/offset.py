@@ -1,8 +1,8 @@
-"""Which time of one clock is which of another: where the turning of mocap body and IMU look alike.
+"""Time offset of two clocks by correlating the rotation of mocap body and IMU.
 
-The angle turned through in a short window is the same for every part of a rigid body, whatever its
-frame. Its masked normalised correlation over all lags (Padfield, *Masked Object Registration in the
-Fourier Domain*, IEEE TIP 21(5), 2012, eq. 10) has its peak at the offset.
+The angle turned in a short window is equal for all parts of a rigid body, whatever their frames. Its masked
+normalised correlation over all lags (Padfield, *Masked Object Registration in the Fourier Domain*, IEEE TIP
+21(5), 2012, eq. 10) peaks at the offset.
 """
 
 from __future__ import annotations
@@ -22,15 +22,14 @@ WINDOW_NS = 100_000_000
 _OFFSET_STEP_NS = 10_000_000
 _MIN_OVERLAP_S = 5.0
 _MIN_CORRELATION = 0.6
-_INDEPENDENT_NS = 500_000_000  # turning keeps its pace about so long: what counts as one independent sample
-_PEAK_WIDTH_NS = 250_000_000  # a second peak nearer than that belongs to the first
+_INDEPENDENT_NS = 500_000_000  # correlation time of the rotation rate
+_PEAK_WIDTH_NS = 250_000_000  # peaks nearer than this are one
 
 
 @dataclass(frozen=True)
 class OffsetPeak:
-    """offset_ns: IMU clock minus mocap clock, to a few ms. correlation: there; rival: at the next best
-    peak, 0 without one. lead: by how much the one explains the turning better than the other, as the
-    logarithm of a ratio of likelihoods."""
+    """offset_ns: IMU clock minus mocap clock, to a few ms. correlation: there; next_correlation: at the
+    next best peak, 0 without one. lead: log likelihood ratio of the two peaks."""
 
     offset_ns: int
     correlation: float
@@ -38,20 +37,15 @@ class OffsetPeak:
     lead: float
 
 
-def coarse_offset(imu: ImuBatch, mocap: MocapTrajectory, within_s: float | None) -> int:
-    """`find_offset`, the offset alone."""
-    return find_offset(imu, mocap, within_s).offset_ns
-
-
 def find_offset(imu: ImuBatch, mocap: MocapTrajectory, within_s: float | None) -> OffsetPeak:
-    """Where the two turn alike. within_s: search no farther than that; None: all offsets by which the two
-    overlap by 5 s (or by the whole of the shorter).
+    """Find the offset with the best correlation. within_s: search range; None: all offsets with an overlap of
+    5 s (or nearly all of the shorter).
 
-    Raises MisfitError if nowhere do the two turn alike.
+    Raises CalibrationMismatchError if the rotations match at no offset.
     """
     a, a_ok, a_start = _angles_on_grid(*imu_rotations(imu))
     b, b_ok, b_start = _angles_on_grid(*mocap_rotations(mocap))
-    is_plausible = b <= 1.5 * a.max()  # the body never turned faster: an outlier of the mocap did
+    is_plausible = b <= 1.5 * a.max()  # faster rotations are mocap outliers
     b, b_ok = b * is_plausible, b_ok * is_plausible
     score, count = _masked_correlation(a, a_ok, b, b_ok)
     lags = np.arange(len(score)) - (len(b) - 1)  # a[i + lag] belongs to b[i]
@@ -60,8 +54,9 @@ def find_offset(imu: ImuBatch, mocap: MocapTrajectory, within_s: float | None) -
         score = np.where(np.abs(offsets) <= within_s * 1e9, score, -1.0)
     if score.max() < _MIN_CORRELATION:
         raise CalibrationMismatchError(
-            f"mocap and IMU turn nowhere alike (correlation {score.max():.2f} of {_MIN_CORRELATION} "
-            "needed); are both of one recording, the clocks as near as was said, and does the body turn?"
+            f"the rotations of mocap and IMU match at no time offset (correlation {score.max():.2f}, "
+            f"{_MIN_CORRELATION} needed); are both of one recording, the clocks as close as stated, and does "
+            "the body turn?"
         )
     evidence = _log_evidence(score, count)
     best = int(np.where(score >= _MIN_CORRELATION, evidence, -1.0).argmax())
@@ -75,14 +70,14 @@ def find_offset(imu: ImuBatch, mocap: MocapTrajectory, within_s: float | None) -
 
 
 def _log_evidence(score: F64, count: F64) -> F64:
-    """How much likelier (logarithm) each lag makes what was seen than no relation at all would: of a
-    Gaussian pair, -n/2 log(1 - r^2), for n independent samples."""
+    """Return each lag's log likelihood ratio to no relation: of a Gaussian pair, -n/2 log(1 - r^2), for n
+    independent samples."""
     alike = np.clip(score, 0.0, 0.999999)
     return np.asarray(-0.5 * count * (_OFFSET_STEP_NS / _INDEPENDENT_NS) * np.log1p(-(alike**2)), np.float64)
 
 
 def _next_peak(score: F64, evidence: F64, best: int) -> int | None:
-    """The lag of the next best peak."""
+    """Return the lag of the next best peak."""
     is_peak = (score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:]) & (score[1:-1] > 0)
     peaks = np.flatnonzero(is_peak) + 1
     peaks = peaks[np.abs(peaks - best) * _OFFSET_STEP_NS > _PEAK_WIDTH_NS]
@@ -90,7 +85,7 @@ def _next_peak(score: F64, evidence: F64, best: int) -> int | None:
 
 
 def imu_rotations(imu: ImuBatch) -> tuple[I64, F64]:
-    """Centres (N,) ns of windows and the rotation vectors (N, 3) rad turned in them, body frame."""
+    """Return centres (N,) ns of windows and the rotation vectors (N, 3) rad in them, body frame."""
     start = np.arange(imu.stamps_ns[0], imu.stamps_ns[-1] - WINDOW_NS, _OFFSET_STEP_NS)
     zero = np.zeros((len(start), 3))
     increments = preintegrate(imu, start, start + WINDOW_NS, zero, zero).dR
@@ -98,7 +93,7 @@ def imu_rotations(imu: ImuBatch) -> tuple[I64, F64]:
 
 
 def mocap_rotations(mocap: MocapTrajectory) -> tuple[I64, F64]:
-    """As `imu_rotations`, in the mocap body's frame; windows without a hole only."""
+    """Return the same in the mocap body's frame, for windows without a gap."""
     start = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] - WINDOW_NS, _OFFSET_STEP_NS)
     start = start[mocap.is_covered(start) & mocap.is_covered(start + WINDOW_NS)]
     R0, R1 = mocap.interpolate(start)[:, :3, :3], mocap.interpolate(start + WINDOW_NS)[:, :3, :3]
@@ -106,7 +101,7 @@ def mocap_rotations(mocap: MocapTrajectory) -> tuple[I64, F64]:
 
 
 def _angles_on_grid(stamps: I64, rotations: F64) -> tuple[F64, F64, int]:
-    """Angles on an even grid, 0 where unknown; 1 where known; the grid's first stamp."""
+    """Return angles on an even grid, 0 where unknown; a mask, 1 where known; and the grid's first stamp."""
     if len(stamps) == 0:
         return np.zeros(1), np.zeros(1), 0
     cells = (stamps - stamps[0]) // _OFFSET_STEP_NS
@@ -116,8 +111,8 @@ def _angles_on_grid(stamps: I64, rotations: F64) -> tuple[F64, F64, int]:
 
 
 def _masked_correlation(a: F64, a_ok: F64, b: F64, b_ok: F64) -> tuple[F64, F64]:
-    """Pearson correlation of what overlaps, for every lag of b against a, -1 where too little does; and how
-    many samples that is."""
+    """Return the Pearson correlation of the overlap for every lag of b against a, -1 where that is too
+    short, and its number of samples."""
     size = len(a) + len(b) - 1
 
     def correlate(x: F64, y: F64) -> F64:

@@ -1,8 +1,8 @@
-"""What a fit says of the time between its nodes.
+"""The fitted path between its nodes.
 
-Between two nodes the path is the IMU's own, freed of its bias, from the node before; what it misses
-the node after by, in place and in speed, is spread over the way by a cubic (Hermite), so that the path
-and its velocity are continuous and still shake as the IMU shook.
+Between two nodes the path is the IMU's bias-corrected motion from the node before. Its error in position and
+velocity at the node after is spread over the interval by a cubic (Hermite), so that path and velocity are
+continuous and keep the IMU's vibration.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ class FittedPath:
     imu: ImuBatch
 
     def pose_and_velocity(self, stamps_ns: I64) -> tuple[F64, F64]:
-        """T_fit_body (N, 4, 4) and velocity (N, 3) m/s, in the fit's world, at stamps within the nodes."""
+        """Return T_world_body (N, 4, 4) and velocity (N, 3) m/s, in the fit's world, at stamps within the
+        nodes."""
         stamps, fit = stamps_ns, self.fit
         i = np.clip(np.searchsorted(fit.stamps_ns, stamps, "right") - 1, 0, len(fit.stamps_ns) - 2)
         span = (fit.stamps_ns[i + 1] - fit.stamps_ns[i])[:, None] * 1e-9
@@ -41,8 +42,9 @@ class FittedPath:
 
     @cached_property
     def _node_errors(self) -> tuple[F64, F64, F64]:
-        """By how much every node is missed from the one before: rotation rad (N - 1, 3) at the right,
-        position m and velocity m/s in the fit's world. Across a break nothing is carried, only closed."""
+        """Errors of every node's prediction from the one before: rotation rad (N - 1, 3) on the right,
+        position m and velocity m/s in the fit's world. Across a break there is no prediction, only the
+        difference."""
         fit = self.fit
         i = np.arange(len(fit.stamps_ns) - 1)
         T, v = self._propagate(i, np.where(fit.is_break, fit.stamps_ns[:-1], fit.stamps_ns[1:]))
@@ -50,7 +52,7 @@ class FittedPath:
         return rotation_error, fit.T_world_body[1:, :3, 3] - T[:, :3, 3], fit.velocity[1:] - v
 
     def _propagate(self, node: I64, stamps_ns: I64) -> tuple[F64, F64]:
-        """Pose (N, 4, 4) and velocity (N, 3) at stamps by the IMU alone, from the nodes given."""
+        """Return pose (N, 4, 4) and velocity (N, 3) at stamps by the IMU alone, from the given nodes."""
         fit = self.fit
         inc = preintegrate(
             self.imu, fit.stamps_ns[node], stamps_ns, fit.gyro_bias[node], fit.accel_bias[node]

@@ -1,4 +1,4 @@
-"""Least squares over all nodes at once, by Levenberg and Marquardt with a robust mocap."""
+"""Least squares over all nodes by Levenberg-Marquardt, with robust weights of the mocap."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from share.lab.mocap.state import NODE_SIZE, SHARED_SIZE, MocapFitOptions, Mocap
 from share.lab.mocap.trajectory import MocapTrajectory
 from share.types import F64, ImuBatch
 
-_BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: no IMU is worse; only holds what no motion shows
-_TILT_SIGMA = 1.0  # rad: none to speak of
+_BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: larger than any IMU's; holds unobservable biases only
+_TILT_SIGMA = 1.0  # rad: practically no prior
 CHECK = (
     "check units (m, rad/s, m/s^2), the order of quaternions (TUM: qx qy qz qw; .csv: qw qx qy qz), and that "
     "both are of one body"
 )
-MIN_INLIER_WEIGHT = 0.2  # weight of a sample that counts as seen
-_CONVERGED = 1e-6  # of the cost: far below what one sigma of anything costs
+MIN_INLIER_WEIGHT = 0.2
+_CONVERGED = 1e-6  # relative decrease of the cost, far below the effect of one sigma
 
 
 @dataclass(frozen=True, eq=False)
 class BatchSolution:
-    """The best state, what it was judged by, and its weights (K,) of the mocap samples, 0..1."""
+    """The solution: state, residuals, weights (K,) of the mocap samples, 0..1, and normal equations there."""
 
     state: MocapImuState
     chain: ImuChain
@@ -37,14 +37,14 @@ class BatchSolution:
 
     @property
     def is_inlier(self) -> np.ndarray:
-        """(K,) bool: samples that count as seen."""
+        """(K,) bool: inlier samples."""
         return np.asarray(self.weight > MIN_INLIER_WEIGHT, bool)
 
 
 @dataclass(frozen=True, eq=False)
 class MocapImuProblem:
-    """One problem: the IMU with its (inflated) noise, the mocap in the IMU's clock, where the chain of
-    nodes is broken, and a first T_body_mocap (4, 4)."""
+    """The IMU with its (inflated) noise, the mocap in the IMU's clock, the chain's breaks, and a first
+    T_body_mocap (4, 4)."""
 
     imu: ImuBatch
     noise: ImuNoise
@@ -54,8 +54,8 @@ class MocapImuProblem:
     options: MocapFitOptions
 
     def solve_robustly(self, state: MocapImuState) -> BatchSolution:
-        """`minimise`, then again by the trusted samples alone: of those that are elsewhere each pulls but a
-        little, but seconds of them all pull one way. Weights are of all samples."""
+        """Minimise, then again with the inliers only: a single outlier pulls little, but seconds of them
+        all pull in one direction. The weights returned are of all samples."""
         solved = self.minimise(state)
         inliers = solved.is_inlier
         if inliers.all() or inliers.mean() < 0.5:
@@ -68,7 +68,7 @@ class MocapImuProblem:
         return replace(solved, observations=observations, weight=self._weight(observations))
 
     def minimise(self, state: MocapImuState) -> BatchSolution:
-        """From `state` downhill until the cost stands still. Raises MisfitError if it never does."""
+        """Minimise the cost from `state`. Raises CalibrationMismatchError if it does not converge."""
         chain, observations, cost = self._evaluate(state)
         damping = 1e-4
         for _ in range(self.options.max_iterations):
@@ -96,14 +96,14 @@ class MocapImuProblem:
 
     @property
     def sample_weight(self) -> float:
-        """What one mocap sample counts for: samples denser than they err independently share."""
+        """Weight of one mocap sample: samples denser than independent ones share a weight of 1."""
         return min(1.0, self.options.independent_hz * self.mocap.spacing_ns * 1e-9)
 
     def _sigma(self) -> F64:
         return np.repeat([self.options.sigma_rotation, self.options.sigma_position], 3)
 
     def _weight(self, observations: MocapObservations) -> F64:
-        """Cauchy's, of the mean square of the six: (K,)."""
+        """Return Cauchy weights (K,) by the mean square of the six residuals."""
         return np.asarray(
             1 / (1 + (observations.residual**2).mean(1) / self.options.cauchy_sigmas**2), np.float64
         )
@@ -138,7 +138,7 @@ class MocapImuProblem:
         return out
 
     def _prior_information(self) -> F64:
-        """Information (10,) of the first guess; without one from the user, hardly any."""
+        """Return the information (10,) of the first guess, nearly zero without a guess by the user."""
         rotation, position = (3.0, 3.0) if self.options.T_body_mocap is None else self.options.guess_sigma
         sigma = (
             [_TILT_SIGMA] * 2
@@ -149,14 +149,14 @@ class MocapImuProblem:
         return np.array(sigma) ** -2
 
     def _prior_deviation(self, state: MocapImuState) -> F64:
-        """How far (10,) the shared unknowns are from the first guess."""
+        """Return the deviation (10,) of the shared unknowns from the first guess."""
         out = np.zeros(SHARED_SIZE)
         out[:2], out[8], out[9] = state.tilt, state.offset_s, state.drift
         out[2:8] = se3.log(se3.inverse(self.initial_T_body_mocap) @ state.T_body_mocap)
         return out
 
 
-# ---- Normal equations of a chain of nodes that also shares a few unknowns: a band with a border.
+# Normal equations of a chain of nodes with a few shared unknowns: a band with a border.
 #
 # The band is factored once (Cholesky), the border is eliminated by its Schur complement: linear in the number
 # of nodes. Source: Golub and Van Loan, *Matrix Computations*, 4th ed., 4.3.5 and 3.2.
@@ -178,8 +178,8 @@ class BorderedNormals:
 def normal_equations(
     chain: ImuChain, observations: MocapObservations, weight: F64, prior: F64, prior_deviation: F64, n: int
 ) -> BorderedNormals:
-    """Of all residuals; weight (K,) for the mocap's; prior (10,): information of the shared unknowns'
-    first guess, off_prior (10,): how far they have moved from it."""
+    """Return the normal equations of all residuals. weight (K,): of the mocap's. prior (10,): information
+    of the first guess of the shared unknowns; prior_deviation (10,): deviation from it."""
     J0, J1, r = chain.jacobian_before, chain.jacobian_after, chain.residual[..., None]
     diagonal, b = np.zeros((n, NODE_SIZE, NODE_SIZE)), np.zeros((n, NODE_SIZE))
     diagonal[:-1] += J0.swapaxes(1, 2) @ J0
@@ -191,7 +191,7 @@ def normal_equations(
         [observations.jacobian_node, observations.jacobian_shared, observations.residual[..., None]], axis=2
     )
     J = J * np.sqrt(weight)[:, None, None]
-    nodes, first = np.unique(observations.node, return_index=True)  # samples come in the order of nodes
+    nodes, first = np.unique(observations.node, return_index=True)  # samples are in the order of nodes
     products = np.add.reduceat(J.swapaxes(1, 2) @ J, first, axis=0)
     shared = products[:, NODE_SIZE:-1, NODE_SIZE:].sum(0)
     diagonal[nodes] += products[:, :NODE_SIZE, :NODE_SIZE]
@@ -205,8 +205,8 @@ def normal_equations(
 
 
 def solve_bordered(normal: BorderedNormals, damping: float) -> tuple[F64, F64, F64]:
-    """Steps (N, 15) and (10,), and the covariance (10, 10) of the shared unknowns, with every diagonal
-    element raised by the factor 1 + damping (Marquardt 1963). Raises LinAlgError if not positive."""
+    """Return steps (N, 15) and (10,), and the covariance (10, 10) of the shared unknowns, with diagonals
+    raised by the factor 1 + damping (Marquardt 1963). Raises LinAlgError if not positive definite."""
     from scipy.linalg import cho_solve_banded, cholesky_banded
 
     n = len(normal.diagonal)
@@ -225,7 +225,7 @@ def solve_bordered(normal: BorderedNormals, damping: float) -> tuple[F64, F64, F
 
 
 def _banded(normal: BorderedNormals, damping: float) -> F64:
-    """Lower band of the nodes' part: element (r, c) at [r - c, c]."""
+    """Return the lower band of the nodes' part: element (r, c) at [r - c, c]."""
     n = len(normal.diagonal)
     out = np.zeros((2 * NODE_SIZE, n, NODE_SIZE))
     for c in range(NODE_SIZE):
@@ -236,8 +236,8 @@ def _banded(normal: BorderedNormals, damping: float) -> F64:
 
 
 def node_covariances(normal: BorderedNormals, cov_shared: F64) -> F64:
-    """Marginal covariances (N, 15, 15) of the nodes: the band's own by a forward and a backward
-    elimination, plus what the shared unknowns' uncertainty adds."""
+    """Return marginal covariances (N, 15, 15) of the nodes: the band's by forward and backward
+    elimination, plus the effect of the shared unknowns' uncertainty."""
     from scipy.linalg import cho_solve_banded, cholesky_banded
 
     n = len(normal.diagonal)

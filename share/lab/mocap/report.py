@@ -1,4 +1,4 @@
-"""What `share calibrate mocap` leaves behind, and reading it back."""
+"""Output of `share calibrate mocap`, and reading the mounting back."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from share.lab.mocap.verdict import fit_warnings, mounting_warning, shared_sigma
 from share.types import F64
 
 MOCAP_FILE = "mocap.yaml"
-_MIN_SIGMA = 1e-4  # rad, m: no mounting is known better
+_MIN_SIGMA = 1e-4  # rad, m: no mounting is more precise
 
 
 def mocap_yaml(fit: MocapFit, name: str, truth: str) -> str:
-    """mocap.yaml."""
+    """Return the text of mocap.yaml."""
     sigma = shared_sigmas(fit)
     return "\n".join(
         [
@@ -31,9 +31,9 @@ def mocap_yaml(fit: MocapFit, name: str, truth: str) -> str:
             "# p_mocap = R_mocap_world p_world: the world is level, z up",
             "R_mocap_world:",
             *_matrix_lines(fit.R_mocap_world),
-            f"up: {fit.up}  # the axis of the motion capture's world that is nearest to up; tilt: how near",
+            f"up: {fit.up}  # axis of the motion capture's world nearest to vertical; tilt: its angle to it",
             f"tilt_deg: {fit.tilt_deg:.5f}",
-            f"timeshift_imu_mocap: {fit.offset_ns * 1e-9:.9f}  # s, IMU's clock less mocap's, at mid-time",
+            f"timeshift_imu_mocap: {fit.offset_ns * 1e-9:.9f}  # s, IMU's clock minus mocap's, at mid-time",
             f"drift_ppm: {fit.drift_ppm:.3f}",
             "sigma:",
             f"  rotation_deg: {_yaml_list(np.degrees(sigma[2:5]))}",
@@ -47,8 +47,11 @@ def mocap_yaml(fit: MocapFit, name: str, truth: str) -> str:
 
 
 def read_mounting(path: Path) -> tuple[F64, tuple[float, float]]:
-    """T_body_mocap (4, 4) of a mocap.yaml, or of the folder that has one; and how far off it may be, rad and
-    m: twice the worst axis' sigma, as real recordings show. Raises UsageError, ConfigError."""
+    """Read T_body_mocap (4, 4) from a mocap.yaml or the folder with it, and its uncertainty, rad and m: twice
+    the worst axis' sigma, as real recordings show.
+
+    Raises UsageError, ConfigError.
+    """
     file = path / MOCAP_FILE if path.is_dir() else path
     if not file.is_file():
         raise UsageError(f"{file}: no such file; `share calibrate mocap` makes one")
@@ -64,7 +67,7 @@ def read_mounting(path: Path) -> tuple[F64, tuple[float, float]]:
 def report_values(
     fit: MocapFit, name: str, truth: str, hand_eye_check: HandEyeCheck | None
 ) -> dict[str, Any]:
-    """mocap-report.json."""
+    """Return the contents of mocap-report.json."""
     sigma = shared_sigmas(fit)
     return {
         "source": name,

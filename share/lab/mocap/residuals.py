@@ -1,4 +1,4 @@
-"""How well a fit fits: what is left of each measurement."""
+"""Statistics of a fit's residuals."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from share.types import F64
 
 @dataclass(frozen=True, eq=False)
 class FitResiduals:
-    """position_mm, rotation_deg: rms distance of the path from the mocap samples that are not doubted;
-    position_sigmas: the former in units of what was said of the mocap's noise; position_p95_mm,
-    rotation_p95_deg of all. samples: how many there are; doubted: share of them.
+    """position_mm, rotation_deg: rms distance of the path from the inlier mocap samples. position_sigmas: the
+    former in units of the stated mocap noise. position_p95_mm, rotation_p95_deg: of all samples. samples:
+    their number. doubted: outlier fraction.
 
-    imu_sigmas (6,): rms residual of the turn (x, y, z) and the change of velocity (x, y, z) between
-    nodes, in units of what the data sheet's noise explains. gyro (3,) rad/s, accel (3,) m/s^2: the same
-    as mean rates, so the gyro against the fitted rotation.
+    imu_sigmas (6,): rms residual of rotation (x, y, z) and velocity change (x, y, z) between nodes, in units
+    of the data sheet's noise. gyro (3,) rad/s, accel (3,) m/s^2: the same as mean rates.
     """
 
     position_mm: float
@@ -36,8 +35,8 @@ class FitResiduals:
 def compute_residuals(
     chain: ImuChain, dt: F64, inflation: float, distances: F64, angles: F64, inliers: np.ndarray, noise: float
 ) -> FitResiduals:
-    """chain with intervals dt (M,) s, its noise inflated; apart (K,) m and turned (K,) rad from the mocap,
-    whose noise is said to be so many m on each axis."""
+    """Return statistics of a chain with intervals dt (M,) s and inflated noise, and of distances (K,) m
+    and angles (K,) rad from the mocap. noise: stated sigma of the mocap on each axis, m."""
     rows = [0, 1, 2, 6, 7, 8]
     sigma = np.sqrt(np.diagonal(chain.cov, axis1=1, axis2=2))[:, rows] / inflation
     raw = chain.raw[:, rows]

@@ -1,8 +1,8 @@
-"""Whether the accelerometer finds the mocap's ways as long as the mocap does, along each of its axes.
+"""Compare the scale of the mocap's axes with the accelerometer.
 
-One more unknown an axis, for which the fit was not solved: a step of Gauss and Newton from where it ended,
-all other unknowns free (the Schur complement of the three). An axis that is mirrored shows as a scale far
-from 1 even where so little goes along it that the path comes together all the same.
+One unknown per axis that the fit did not have: a Gauss-Newton step from its solution with all other unknowns
+free (the Schur complement of the three). A mirrored axis shows as a scale far from 1 even where the path
+moves so little along it that the fit converges.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from share.types import F64
 def axis_scales(
     solved: BatchSolution, mocap: MocapTrajectory, sigma: float, sample_weight: float
 ) -> tuple[F64, F64]:
-    """By how much positions (3,) along the axes of the mocap's world are too long, 0.01: 1 %, and the
-    covariance (3, 3). sigma m: noise of a position; share: what one sample counts for."""
-    p = mocap.T[:, :3, 3] + solved.observations.residual[:, 3:] * sigma  # as fitted: noise has no length
+    """Return by how much positions along the axes of the mocap's world are too long, (3,), 0.01: 1 %, and
+    the covariance (3, 3). sigma m: noise of a position. sample_weight: of one sample."""
+    # positions as fitted, since noise would bias the scale
+    p = mocap.T[:, :3, 3] + solved.observations.residual[:, 3:] * sigma
     p = p - p.mean(0)
     J = np.zeros((len(p), 6, 3))
     J[:, 3:] = -p[:, None] * np.eye(3) / sigma
@@ -41,5 +42,6 @@ def axis_scales(
 
 
 def _response(normal: BorderedNormals, nodes: F64, shared: F64) -> tuple[F64, F64]:
-    """How all others give way, (N, 15) and (10,), to a pull of `nodes` (N, 15) and `shared` (10,)."""
+    """Return the response, (N, 15) and (10,), of all other unknowns to a gradient of `nodes` (N, 15) and
+    `shared` (10,)."""
     return solve_bordered(replace(normal, b_nodes=nodes, b_shared=shared), 0.0)[:2]

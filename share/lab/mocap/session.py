@@ -1,7 +1,7 @@
-"""A session out of what was recorded in the field: recordings, truths, what was found, a picture.
+"""Write a session from field recordings: recordings, ground truths, results of the alignment, a picture.
 
-A device's stamps stay as they are, in its recording and in its truth; `clock_offset_ns` says what they
-are by the motion capture's clock, which is the session's.
+Stamps in a device's recording and truth stay in its own clock; `clock_offset_ns` relates them to the motion
+capture's clock, which is the session's.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from share import __version__
 from share.files.json_file import nan_to_none
 from share.files.writing import atomic_write
 from share.geometry import se3
-from share.lab.evaluate.charts import save_png
+from share.lab.evaluate.charts import AGENT_COLOURS, agg_pyplot, save_png
 from share.lab.mocap.align import AlignedDevice, common_level
 from share.lab.mocap.offset import WINDOW_NS, imu_rotations, mocap_rotations
 from share.lab.mocap.verdict import shared_sigmas
@@ -36,9 +36,9 @@ REPORT, PICTURE = "align.json", "align.png"
 
 @dataclass(frozen=True, eq=False)
 class AlignedRecording:
-    """One that was in the room. recording: the file that can be taken as it is; None: it is written anew.
-    seen_in: the motion capture's file, and the body in it; told: recording, calibration and mounting as they
-    were given. Both for a person."""
+    """One device in the room. recording: a file that can be used unchanged, None to write it anew.
+    mocap_source: the motion capture's file and body, for readers. inputs: recording, calibration and
+    mounting as given, for readers."""
 
     kind: AgentKind
     source: Source
@@ -54,8 +54,8 @@ def write_session(
     settings: Mapping[str, Any],
     on_progress: StageProgress,
 ) -> dict[str, Any]:
-    """Fills `folder`, which is there and empty. settings: of the fit, for its provenance. What was found, by
-    device. Raises ShareError."""
+    """Fill the empty `folder`; return the results by device. settings: of the fit, for the provenance.
+    Raises ShareError."""
     R_mocap_world = common_level([device.aligned.fit for device in devices.values()])
     truths = {name: _true_trajectory(device.aligned, R_mocap_world) for name, device in devices.items()}
     (folder / "truth").mkdir()
@@ -70,7 +70,7 @@ def write_session(
 
 
 def device_result(device: AlignedRecording) -> dict[str, Any]:
-    """Of one device, as plain data."""
+    """Return the results of one device as plain data."""
     aligned, fit = device.aligned, device.aligned.fit
     sigma, gaps = shared_sigmas(fit), (fit.gaps - fit.stamps_ns[0]) * 1e-9
     mounting_rotation = se3.so3_log(fit.T_body_mocap[:3, :3])
@@ -108,7 +108,7 @@ def _true_trajectory(aligned: AlignedDevice, R_mocap_world: np.ndarray) -> Traje
 
 
 def _write_device_recording(device: AlignedRecording, out: Path, on_progress: StageProgress) -> None:
-    """The recording under its new name: the same file where the disk allows it, else a copy."""
+    """Link the recording under its new name, or copy it where the disk does not allow links."""
     stage = f"writing {out.stem}"
     if device.recording is None:
         write_recording(
@@ -118,13 +118,13 @@ def _write_device_recording(device: AlignedRecording, out: Path, on_progress: St
     on_progress(stage, 0, 1)
     try:
         os.link(device.recording.resolve(), out)
-    except OSError:  # another disk, or somebody else's file
+    except OSError:  # another disk, or another owner's file
         shutil.copyfile(device.recording, out)
     on_progress(stage, 1, 1)
 
 
 def _device_provenance(device: AlignedRecording, result: dict[str, Any]) -> dict[str, Any]:
-    """Where a device's part comes from, and how well its clock is known; the rest is in align.json."""
+    """Return a device's inputs and the accuracy of its clock; the rest is in align.json."""
     known = ("offset_sigma_ms", "drift_ppm", "up", "truth_s")
     return {**device.inputs, "mocap": device.mocap_source, **{key: result[key] for key in known}}
 
@@ -132,7 +132,7 @@ def _device_provenance(device: AlignedRecording, result: dict[str, Any]) -> dict
 def _session_yaml(
     devices: Mapping[str, AlignedRecording], results: dict[str, Any], settings: Mapping[str, Any]
 ) -> str:
-    """session.yaml."""
+    """Return the text of session.yaml."""
     import yaml
 
     agents = {
@@ -155,25 +155,19 @@ def _session_yaml(
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 
-# ---- Field recordings laid on a motion capture: the paths from above, and how both turn, by one clock.
+# Picture: paths from above, and rotation rates of IMU and mocap in one clock.
 
-_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
-_PLOTTED_NS = 10 * 10**9  # of the turning: longer, and nobody sees whether they agree
-_GAP_NS = 100_000_000  # farther apart, and no line joins two poses
+_PLOTTED_NS = 10 * 10**9  # of the rotation rates; in a longer plot their agreement is not visible
+_GAP_NS = 100_000_000  # no line across longer gaps
 
 
 def draw_alignment(path: Path, devices: Mapping[str, tuple[AlignedDevice, Trajectory]]) -> None:
-    """PNG of {name: (device, its truth)}."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure = pyplot.figure(figsize=(13, max(5.0, 1.9 * len(devices))), layout="constrained")
+    """Write a PNG of {name: (device, its truth)}."""
+    figure = agg_pyplot().figure(figsize=(13, max(5.0, 1.9 * len(devices))), layout="constrained")
     grid = figure.add_gridspec(len(devices), 2, width_ratios=(2, 3))
     top_view = figure.add_subplot(grid[:, 0])
     for k, (name, (aligned, truth)) in enumerate(devices.items()):
-        colour = _COLOURS[k % len(_COLOURS)]
+        colour = AGENT_COLOURS[k % len(AGENT_COLOURS)]
         p = _positions_with_gaps(truth)
         top_view.plot(p[:, 0], p[:, 1], color=colour, linewidth=1.2, label=f"{name}, {aligned.seconds:.1f} s")
         top_view.plot(*p[0, :2], "o", color=colour)
@@ -186,7 +180,7 @@ def draw_alignment(path: Path, devices: Mapping[str, tuple[AlignedDevice, Trajec
 
 
 def _positions_with_gaps(truth: Trajectory) -> F64:
-    """Positions (N, 3), with NaN where the truth has a gap."""
+    """Return positions (N, 3), with NaN where the truth has a gap."""
     return np.insert(truth.T[:, :3, 3], _after_gaps(truth.stamps_ns), np.nan, axis=0)
 
 
@@ -195,7 +189,7 @@ def _after_gaps(stamps_ns: I64) -> I64:
 
 
 def _draw_rotation_rates(axes: Any, name: str, aligned: AlignedDevice, colour: str) -> None:
-    """Both turning rates by the motion capture's clock, about when the device turned most."""
+    """Draw both rotation rates in the motion capture's clock, where they vary most."""
     imu_times, imu_rates = _rotation_rates(*imu_rotations(aligned.imu))
     imu_times = imu_times - aligned.offset_ns
     times, mocap_rates = _rotation_rates(*mocap_rotations(aligned.mocap))
@@ -209,7 +203,7 @@ def _draw_rotation_rates(axes: Any, name: str, aligned: AlignedDevice, colour: s
         axes.plot(
             np.insert(stamps[keep] * 1e-9, holes, np.nan), np.insert(rate[keep], holes, np.nan), **style
         )
-    axes.set(title=name, ylabel="turning [rad/s]", xlabel="motion capture's clock [s]")
+    axes.set(title=name, ylabel="rotation rate [rad/s]", xlabel="motion capture's clock [s]")
     axes.ticklabel_format(useOffset=False)
     axes.grid(alpha=0.3)
     axes.set_ylim(0, 1.35 * axes.get_ylim()[1])  # room for the legend
@@ -221,7 +215,7 @@ def _rotation_rates(stamps: I64, rotations: F64) -> tuple[I64, F64]:
 
 
 def _most_varied_start(stamps: I64, rate: F64) -> int:
-    """Where the stretch begins in which the rate varies most."""
+    """Return the start of the window in which the rate varies most."""
     width = max(1, int(np.searchsorted(stamps, stamps[0] + _PLOTTED_NS)))
     first, second = (np.cumsum(np.append(0.0, values)) for values in (rate, rate**2))
     n = max(1, len(rate) - width)

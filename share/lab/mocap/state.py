@@ -1,4 +1,5 @@
-"""What the fit solves for: the body at every node, and how mocap and IMU lie to each other."""
+"""The unknowns of the fit: the body at every node, and the relation of mocap and IMU; and the fit's
+options."""
 
 from __future__ import annotations
 
@@ -15,12 +16,12 @@ SHARED_SIZE = 10  # tilt, mocap body's rotation and position, time offset and dr
 
 @dataclass(frozen=True, eq=False)
 class MocapImuState:
-    """Nodes at stamps_ns (N,), IMU clock: R (N, 3, 3), p (N, 3) m, v (N, 3) m/s of the body in the
-    levelled world, biases (N, 3).
+    """Nodes at stamps_ns (N,), IMU clock: R (N, 3, 3), p (N, 3) m, v (N, 3) m/s of the body in the levelled
+    world, biases (N, 3).
 
-    tilt (2,): R_mocap_world = Exp(tilt_x, tilt_y, 0), so that levelling turns nothing about the
-    vertical. T_body_mocap (4, 4). offset_s: IMU clock minus mocap clock at middle_ns, in addition to
-    what was taken off before; drift: by how much it grows, seconds a second.
+    tilt (2,): R_mocap_world = Exp(tilt_x, tilt_y, 0), without rotation about the vertical. T_body_mocap (4,
+    4). offset_s: IMU clock minus mocap clock at middle_ns, after the coarse offset was removed; drift: its
+    growth, seconds a second.
     """
 
     stamps_ns: I64
@@ -36,7 +37,7 @@ class MocapImuState:
     drift: float = 0.0
 
     def in_imu_clock(self, stamps_ns: I64) -> I64:
-        """Mocap's stamps (K,), the former offset taken off, as the IMU's clock would have them."""
+        """Return mocap stamps (K,), coarse offset removed, in the IMU's clock."""
         shift_ns = self.offset_s * 1e9 + self.drift * (stamps_ns - self.middle_ns)
         return np.asarray(stamps_ns + np.round(shift_ns).astype(np.int64), np.int64)
 
@@ -45,8 +46,8 @@ class MocapImuState:
         return se3.so3_exp(np.append(self.tilt, 0.0))
 
     def updated(self, nodes: F64, shared: F64) -> MocapImuState:
-        """Nodes (N, 15): rotations at the right, the others added. shared (10,): tilt added, the body's
-        pose perturbed at the right, offset [s] and drift added."""
+        """Return the state after a step. nodes (N, 15): rotations on the right, the others added. shared
+        (10,): tilt added, T_body_mocap perturbed on the right, offset [s] and drift added."""
         return MocapImuState(
             self.stamps_ns,
             self.R @ se3.so3_exp(nodes[:, :3]),
@@ -62,23 +63,21 @@ class MocapImuState:
         )
 
 
-# ---- What a user of the fit may choose.
-
-
 @dataclass(frozen=True, eq=False)
 class MocapFitOptions:
-    """How to fit.
+    """Options of a fit.
 
-    sigma_position m, sigma_rotation rad: noise of the mocap, for samples that err independently
-    independent_hz times a second; denser ones count for less each, and more than most_hz are not taken.
-    cauchy: in sigmas, where a sample
-    begins to be doubted. imu_inflation: times the data sheet's noise.
-    within_s: how far apart the clocks may be, None for any distance, 0 for one clock; offset_sigma s:
-    how far the offset may still be from there; drift_sigma: how much one clock may run faster than
-    the other (1e-4: 100 ppm).
-    T_body_mocap (4, 4): a guess, needed only for a body that turns about one axis; then with
-    guess_sigma (rad, m). gravity m/s^2. node_s: time between nodes. bridge_s: longest hole in the mocap
-    where the IMU's word is taken; break_s: longest that it is integrated across at all.
+    * sigma_position m, sigma_rotation rad: noise of mocap samples with independent errors at independent_hz;
+      denser samples get less weight each, and are thinned to max_hz. cauchy_sigmas: scale of Cauchy's
+      weights.
+    * imu_inflation: factor on the data sheet's noise.
+    * within_s: largest offset of the clocks, None for any, 0 for one clock. offset_sigma s: of the offset
+      after that. drift_sigma: of the clocks' relative rate (1e-4: 100 ppm).
+    * T_body_mocap (4, 4): a guess, needed only for a body that turns about one axis; with guess_sigma (rad,
+      m).
+    * gravity m/s^2. node_s: time between nodes.
+    * max_bridged_s: longest mocap gap in which the path is trusted to the IMU. max_integrated_s: longest gap
+      across which the IMU is integrated at all.
     """
 
     sigma_position: float = 0.002

@@ -1,4 +1,4 @@
-"""Rigid bodies of a CSV export by Vicon's Tracker or Nexus.
+"""Read rigid bodies from a CSV export of Vicon's Tracker or Nexus.
 
     Objects                                   or Segments
     100                                       frames a second
@@ -7,8 +7,8 @@
     ,,deg,deg,deg,mm,mm,mm,deg,…              units
     1,0,0.12,…                                empty cells where a body is not seen
 
-Other blocks (markers, devices) may stand before or after, divided by an empty line. Between cells are commas
-or semicolons; with these a number may have a decimal comma.
+Other blocks (markers, devices) may precede or follow, separated by an empty line. Cells are separated by
+commas or semicolons; with semicolons a number may have a decimal comma.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _HEADER_LINES = 5  # lines of a block before its data
 
 
 def _rotations_from_xyz(angles: F64) -> F64:
-    """(N, 3) rad: about x, then the new y, then the new z."""
+    """Return rotations from angles (N, 3) rad about x, then the new y, then the new z."""
     Rx, Ry, Rz = (se3.so3_exp(angles[:, k : k + 1] * np.eye(3)[k]) for k in range(3))
     return Rx @ Ry @ Rz
 
@@ -45,7 +45,7 @@ ROTATIONS: dict[str, Callable[[F64], F64]] = {"helical": se3.so3_exp, "xyz": _ro
 
 @dataclass(frozen=True, eq=False)
 class _ViconBlock:
-    """The cells of a block's head, and its numbers (N, C), NaN where a cell is empty. line: of its title."""
+    """Header rows of a block, and its values (N, C), NaN where a cell is empty. line: of its title."""
 
     path: Path
     line: int
@@ -53,7 +53,7 @@ class _ViconBlock:
     values: F64
 
     def column(self, start: int, name: str) -> int:
-        """Which one is called `name` of those of the body that begins at `start`."""
+        """Return the column called `name` of the body that begins at column `start`."""
         bodies, named = self.header_rows[2], self.header_rows[3]
         end = next((k for k in range(start + 1, len(bodies)) if bodies[k]), len(named))
         for k in range(start, min(end, len(named))):
@@ -65,7 +65,7 @@ class _ViconBlock:
         )
 
     def in_si(self, columns: list[int]) -> F64:
-        """Values (N, len(columns)) in m and rad."""
+        """Return values (N, len(columns)) in m and rad."""
         units = [self.header_rows[4][k].lower() if k < len(self.header_rows[4]) else "" for k in columns]
         for unit in units:
             if unit not in _UNITS:
@@ -77,15 +77,17 @@ class _ViconBlock:
 
 
 def is_vicon(path: Path) -> bool:
-    """Whether its first line with anything in it is the title of a block."""
+    """Return whether a file's first line with text is the title of a Vicon block."""
     first = next((line for line in read_text(path).splitlines() if line.strip(" ,;")), "")
     return first.strip(" ,;") in (*_BLOCKS, *_OTHER_BLOCKS)
 
 
 def read_vicon(path: Path, rotations: str = "helical") -> dict[str, MocapTrajectory | None]:
-    """By body, its poses where it was seen, None where it never was; stamps are frame / rate, ns. rotations:
-    what three columns of rotation are, one of ROTATIONS; four are a quaternion. Raises DataError naming file
-    and line."""
+    """Read each body's poses, None for one that was never seen; stamps are frame / rate, ns.
+
+    rotations: convention of three rotation columns, one of ROTATIONS; four are a quaternion. Raises DataError
+    with file and line.
+    """
     block = _read_block(path)
     stamps = _stamps(block)
     out: dict[str, MocapTrajectory | None] = {}
@@ -102,7 +104,8 @@ def read_vicon(path: Path, rotations: str = "helical") -> dict[str, MocapTraject
 
 
 def _body_name(cell: str) -> str:
-    """`Global Angle Ann:Ann` -> `Ann`; a segment that is named otherwise than its subject keeps both."""
+    """Return a body's name: `Global Angle Ann:Ann` -> `Ann`. A segment named differently from its subject
+    keeps both names."""
     name = cell.strip().removeprefix("Global Angle ").strip()
     subject, _, segment = name.partition(":")
     return subject if segment in ("", subject) else name
@@ -120,7 +123,7 @@ def _read_block(path: Path) -> _ViconBlock:
     if len(rows) <= _HEADER_LINES or rows[3][0].lower() != "frame":
         raise DataError(
             f"{path}, line {start + 1}: {titles[start]}: expected a rate, names, columns that begin with "
-            "Frame, units and data below it; the file is cut short or of another make"
+            "Frame, units and data below it; the file is cut short or of another format"
         )
     values = number_columns(path, start + 1 + _HEADER_LINES, rows[_HEADER_LINES:], range(len(rows[3])))
     return _ViconBlock(path, start + 1, rows[:_HEADER_LINES], values)
@@ -132,20 +135,19 @@ def _stamps(block: _ViconBlock) -> I64:
     except (ValueError, IndexError):
         rate = 0.0
     if not 1e-3 < rate < 1e5:
-        raise DataError(f"{block.path}, line {block.line + 1}: expected the frames a second")
+        raise DataError(f"{block.path}, line {block.line + 1}: expected the frame rate, Hz")
     return csv_cells.stamp_column(block.values[:, 0] / rate, "frame", block.path, block.line + _HEADER_LINES)
 
 
 def _body_poses(block: _ViconBlock, start: int, rotations: str) -> tuple[F64, np.ndarray]:
-    """T (M, 4, 4) where the body is seen, and which of the rows (N,) those are."""
+    """Return T (M, 4, 4) where the body is seen, and the mask (N,) of those rows."""
     p = block.in_si([block.column(start, name) for name in ("TX", "TY", "TZ")])
     quaternion = any(name.upper() == "RW" for name in block.header_rows[3])
     names = ("RX", "RY", "RZ", "RW") if quaternion else ("RX", "RY", "RZ")
     columns = [block.column(start, name) for name in names]
     rotations_raw = block.values[:, columns] if quaternion else block.in_si(columns)
-    is_visible = (
-        np.isfinite(p).all(1) & np.isfinite(rotations_raw).all(1) & (p != 0).any(1)
-    )  # some versions write zeros
+    is_not_zero = (p != 0).any(1)  # some versions write zeros where a body is not seen
+    is_visible = np.isfinite(p).all(1) & np.isfinite(rotations_raw).all(1) & is_not_zero
     if quaternion:
         return make_poses(p[is_visible], rotations_raw[is_visible], block.path), is_visible
     check_position_range(p[is_visible], block.path)

@@ -1,7 +1,7 @@
-"""Trackers of others, each at the end of a pipe in an interpreter of its own.
+"""Other trackers, each run in an interpreter of its own at the end of a pipe.
 
-`basalt.py` and `orbslam3.py` are scripts: they need their peer's package and numpy, nothing of SHARE, so that
-a peer's requirements never meet ours. `peer_wire.py` is what both ends of the pipe use.
+`basalt.py` and `orbslam3.py` are scripts that need their tracker's package and numpy but nothing of SHARE, so
+that requirements never conflict. Both ends of the pipe use `peer_wire.py`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class PeerTracker:
-    """title: for a reader. package: as pip takes it. vocabulary: it needs a file that its package has not."""
+    """`title`: for readers. `package`: requirement for pip. `needs_vocabulary`: it needs a file that its
+    package lacks."""
 
     title: str
     package: str

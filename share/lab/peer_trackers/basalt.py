@@ -1,11 +1,10 @@
-"""Basalt, as the wheel `depthai` has it (node BasaltVIO, on the host, no camera), at the end of a pipe.
+"""Basalt from the wheel `depthai` (node BasaltVIO, on the host, no camera) at the end of a pipe.
 
     PYTHON share/lab/peer_trackers/basalt.py [--version]
 
-`share evaluate compare` runs it, in the interpreter of an environment with `depthai`; see peer_wire. One
-moment at a time: the next comes when the pose of this one has gone out, so nothing is dropped, and a pose is
-of the moment asked for (the node does not stamp it). Settings: as shipped. Calibration, IMU noise: the
-recording's.
+`share evaluate compare` runs it in the interpreter of an environment with `depthai`; see peer_wire. It takes
+one frame at a time and answers before it reads the next, so none is dropped and each pose is of the frame
+just sent (the node does not stamp it). Settings: as shipped. Calibration, IMU noise: the recording's.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ STARTUP_S, TIMEOUT = 1.0, timedelta(seconds=60)
 
 
 class Basalt:
-    """calibration: see `share.lab.evaluate.tracker_runs.calibration`."""
+    """Basalt on a rig. `calibration`: see `share.lab.evaluate.tracker_runs.rig_calibration`."""
 
     def __init__(self, calibration: dict[str, Any]) -> None:
         cameras = calibration["cameras"]
@@ -57,7 +56,7 @@ class Basalt:
         self.frame_count = 0
 
     def pose(self, peer_frame: PeerFrame, start_ns: int) -> tuple[F64, float]:
-        """T_world_body, and the CPU time it took, s, of all threads. Stamps are told less zero_ns."""
+        """Return T_world_body and the CPU time, s, of all threads. Stamps are sent relative to start_ns."""
         images = ((self.left, LEFT, peer_frame.left), (self.right, RIGHT, peer_frame.right))
         frames = [
             (queue, self._image_frame(s, image, peer_frame.stamp_ns - start_ns)) for queue, s, image in images
@@ -67,13 +66,13 @@ class Basalt:
         cpu_start_s = time.process_time()
         for queue, frame in frames:
             queue.send(frame)
-        if self.frame_count == 0:  # what the IMU says before the node has set itself up is lost
+        if self.frame_count == 0:  # IMU samples sent before the node is set up are lost
             self.calibration_requested.wait()
             time.sleep(STARTUP_S)
         self.imu.send(samples)
         answer = self.out.get(TIMEOUT)
         if answer is None:
-            raise TimeoutError(f"no pose of moment {self.frame_count} within {TIMEOUT.seconds} s")
+            raise TimeoutError(f"no pose of frame {self.frame_count} within {TIMEOUT.seconds} s")
         self.frame_count += 1
         return pose_matrix(answer) @ self.T_flu_body, time.process_time() - cpu_start_s
 
@@ -91,9 +90,9 @@ class Basalt:
 
 
 def calibration_handler(cameras: list[dict[str, Any]]) -> Any:
-    """The cameras as `depthai` writes them down: cm, 14 coefficients of which radtan's five come first.
+    """Return the cameras as a `depthai` calibration: cm, 14 coefficients of which radtan's five come first.
 
-    Raises ValueError if the library reads other places of the cameras out of it than were put in.
+    Raises ValueError if the library reads back other camera poses than were set.
     """
     out = dai.CalibrationHandler()
     for socket, camera in zip((LEFT, RIGHT), cameras, strict=True):
@@ -108,25 +107,26 @@ def calibration_handler(cameras: list[dict[str, Any]]) -> Any:
         read_back = np.array(out.getCameraToImuExtrinsics(socket, True))
         read_back[:3, 3] /= CM
         if np.abs(read_back - T).max() > 1e-6:
-            raise ValueError(f"{socket}: depthai places it at {read_back.tolist()}, not {T.tolist()}")
+            raise ValueError(f"{socket}: depthai has its pose as {read_back.tolist()}, not {T.tolist()}")
     return out
 
 
 def extrinsic_arguments(T: F64) -> tuple[list[list[float]], list[float], list[float]]:
-    """Rotation, and translation in cm, as measured and as designed."""
+    """Return rotation, and translation in cm, as measured and as designed."""
     t = (CM * T[:3, 3]).tolist()
     return T[:3, :3].tolist(), t, t
 
 
 def set_imu_noise(node: Any, imu: dict[str, float]) -> None:
-    """The node takes the root of what it is given as the density; biases walk as its library has it."""
+    """Set the IMU noise. The node takes the square root of its argument as the density; bias walks stay as
+    shipped."""
     node.setImuUpdateRate(round(imu["rate_hz"]))
     node.setGyroNoiseStd([imu["gyro_density"] ** 2] * 3)
     node.setAccelNoiseStd([imu["accel_density"] ** 2] * 3)
 
 
 def imu_message(stamps_ns: NDArray[np.int64], values: F64) -> Any:
-    """One message with all samples."""
+    """Return one message with all samples."""
     packets = []
     for stamp, sample in zip(stamps_ns.tolist(), values.tolist(), strict=True):
         packet = dai.IMUPacket()
@@ -144,7 +144,7 @@ def imu_message(stamps_ns: NDArray[np.int64], values: F64) -> Any:
 
 
 def pose_matrix(transform: Any) -> F64:
-    """(4, 4)."""
+    """Return (4, 4)."""
     q, t = transform.getQuaternion(), transform.getTranslation()
     x, y, z, w = np.array([q.qx, q.qy, q.qz, q.qw]) / np.linalg.norm([q.qx, q.qy, q.qz, q.qw])
     T = np.eye(4)
@@ -158,11 +158,10 @@ def pose_matrix(transform: Any) -> F64:
 
 
 def intercept_calibration(handler: Any) -> tuple[threading.Event, Any]:
-    """The node asks its camera for the calibration, and there is no camera: from now on this process answers
-    in its place, with `handler`. An event, set when it has asked, and what has to be kept until the end.
-    Linux on x86-64.
+    """Answer the node's request for its camera's calibration with `handler`, since there is no camera.
 
-    The library's function is overwritten by a jump to ours; nothing else of it is changed.
+    Return an event, set when it has asked, and objects to keep alive until the end. Overwrites the start of
+    one library function by a jump; nothing else is changed. Linux on x86-64 only.
     """
     requested = threading.Event()
     maps = Path("/proc/self/maps").read_text().split("\n")
@@ -185,7 +184,7 @@ def intercept_calibration(handler: Any) -> tuple[threading.Event, Any]:
 
 
 def patch_function(function: Any, replacement: Any) -> None:
-    """Write `mov rax, by; jmp rax` where the function begins."""
+    """Write `mov rax, replacement; jmp rax` at the start of a function."""
     address, target = (ctypes.cast(f, ctypes.c_void_p).value or 0 for f in (function, replacement))
     page = address // mmap.PAGESIZE * mmap.PAGESIZE
     protect = ctypes.CDLL(None, use_errno=True).mprotect

@@ -1,10 +1,10 @@
-"""ORB-SLAM3, as the wheel `pyorbslam3` has it (stereo and IMU, no viewer), at the end of a pipe.
+"""ORB-SLAM3 from the wheel `pyorbslam3` (stereo and IMU, no viewer) at the end of a pipe.
 
     PYTHON share/lab/peer_trackers/orbslam3.py --version | --vocabulary FILE
 
-`share evaluate compare` runs it, in the interpreter of an environment with `pyorbslam3`; see peer_wire.
-FILE: ORBvoc.txt of its authors. Its map is made in threads beside the tracker, so moments are taken no sooner
-than they were recorded; nothing is dropped. Features and thresholds: those of its authors' EuRoC example.
+`share evaluate compare` runs it in the interpreter of an environment with `pyorbslam3`; see peer_wire. FILE:
+ORBvoc.txt of its authors. Its mapping runs in threads beside the tracker, so frames are read no sooner than
+they were recorded; none is dropped. Features and thresholds: the authors' EuRoC example.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Viewer.ViewpointF: 500.0
 
 
 def settings_yaml(calibration: dict[str, Any]) -> str:
-    """Its YAML. It rectifies the images itself, by OpenCV's `stereoRectify`."""
+    """Return ORB-SLAM3's settings. It rectifies the images itself, by OpenCV's `stereoRectify`."""
     left, right = calibration["cameras"]
     imu, T_left, T_right = calibration["imu"], *(np.array(c["T_body_cam"]) for c in (left, right))
     numbers = {
@@ -82,13 +82,13 @@ def _camera(name: str, camera: dict[str, Any]) -> dict[str, float]:
 
 
 class ImuQueue:
-    """Of the IMU, as they are wanted: all after the frame before, up to this one."""
+    """IMU samples for each frame: all after the previous frame, up to this one."""
 
     def __init__(self) -> None:
         self._pending = np.zeros((0, 7))
 
     def take_until(self, frame: PeerFrame, start_ns: int) -> F64:
-        """(N, 7): seconds since zero_ns, gyro rad/s, accelerometer m/s^2."""
+        """Return (N, 7): seconds since start_ns, gyro rad/s, accelerometer m/s^2."""
         new = np.column_stack([1e-9 * (frame.imu_ns - start_ns), frame.imu])
         samples = np.concatenate([self._pending, new])
         count = int(np.searchsorted(samples[:, 0], 1e-9 * (frame.stamp_ns - start_ns), "right"))
@@ -97,7 +97,8 @@ class ImuQueue:
 
 
 def paced_frames() -> Iterator[tuple[PeerFrame, float]]:
-    """None of them sooner after the first than it was recorded; with the CPU time that reading it took, s."""
+    """Yield frames no sooner after the first than they were recorded, with the CPU time, s, that reading
+    each took."""
     first_ns, began, cpu_start_s = None, 0.0, time.thread_time()
     while (frame := read_frame(sys.stdin.buffer)) is not None:
         read_cpu_s = time.thread_time() - cpu_start_s
@@ -109,7 +110,7 @@ def paced_frames() -> Iterator[tuple[PeerFrame, float]]:
 
 
 def final_trajectory(slam: Any, folder: Path, start_ns: int) -> dict[str, Any]:
-    """The trajectory of the body by the map as it is in the end."""
+    """Return the trajectory of the body by the final map."""
     file = folder / "final.txt"
     slam.save_trajectory_euroc(str(file))
     rows = np.loadtxt(file, ndmin=2) if file.exists() and file.stat().st_size else np.zeros((0, 8))
@@ -118,7 +119,7 @@ def final_trajectory(slam: Any, folder: Path, start_ns: int) -> dict[str, Any]:
 
 
 def _pose_matrix(t: F64, q: F64) -> F64:
-    """(4, 4); q: x y z w."""
+    """Return (4, 4); q: x y z w."""
     x, y, z, w = q / np.linalg.norm(q)
     T = np.eye(4)
     T[:3, :3] = [
@@ -131,7 +132,7 @@ def _pose_matrix(t: F64, q: F64) -> F64:
 
 
 def track_all(slam: Any, calibration: dict[str, Any]) -> int:
-    """An answer for each moment; when time began, ns."""
+    """Answer every frame; return the time origin, ns."""
     T_rect_body = np.linalg.inv(calibration["cameras"][0]["T_body_cam"])
     T_rect_body[:3] = np.array(calibration["R_rectified_cam0"]) @ T_rect_body[:3]
     samples, start_ns, cpu_start_s = ImuQueue(), None, time.process_time()
@@ -144,7 +145,7 @@ def track_all(slam: Any, calibration: dict[str, Any]) -> int:
             imu=samples.take_until(frame, start_ns),
         )
         T = result.pose_wc @ T_rect_body if result.pose_valid else None
-        cpu_s = time.process_time() - cpu_start_s - read_cpu_s  # its map's threads as well
+        cpu_s = time.process_time() - cpu_start_s - read_cpu_s  # of all threads, mapping included
         cpu_start_s = time.process_time()
         write_line(ANSWER_STREAM, {"T_world_body": None if T is None else T.tolist(), "cpu_s": cpu_s})
     return start_ns or 0

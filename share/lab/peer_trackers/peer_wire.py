@@ -1,9 +1,9 @@
-"""The pipe between SHARE and a peer in another interpreter. Needs numpy alone: both ends use it.
+"""The pipe between SHARE and a peer tracker in another interpreter. Both ends use it; it needs numpy only.
 
-To the peer: a line of JSON, its calibration; then of every moment a line of JSON and the bytes of both
-images. Back: a line of JSON for each moment: T_world_body, null where it has no pose, and cpu_s. After the
-last one, a peer that mends its past may send one more line: stamps_ns and T_world_body of the trajectory as
-it takes it to be in the end. Numbers go as text that reads back to the same number.
+To the peer: a line of JSON with the calibration, then for every frame a line of JSON and the bytes of both
+images. From the peer: a line of JSON for each frame: T_world_body, null without a pose, and cpu_s. After the
+last one, a peer that corrects its past poses may send one more line: stamps_ns and T_world_body of its final
+trajectory. Numbers are text that reads back exactly.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 
 class PeerFrame(NamedTuple):
-    """Both images (H, W) uint8 at stamp_ns; the IMU's stamps (N,) ns and samples (N, 6), gyro rad/s and
-    accelerometer m/s^2, since the moment before, up to the first after stamp_ns."""
+    """Both images (H, W) uint8 at stamp_ns; IMU stamps (N,) ns and samples (N, 6), gyro rad/s and
+    accelerometer m/s^2, since the previous frame, up to the first after stamp_ns."""
 
     stamp_ns: int
     imu_ns: NDArray[np.int64]
@@ -28,7 +28,7 @@ class PeerFrame(NamedTuple):
 
 
 def claim_stdout() -> IO[bytes]:
-    """This process's stdout, for answers alone; whatever else is printed goes to stderr from now on."""
+    """Return this process's stdout, for answers only; whatever else is printed goes to stderr from now on."""
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     return out
@@ -40,7 +40,7 @@ def write_line(stream: IO[bytes], values: dict[str, Any]) -> None:
 
 
 def read_line(stream: IO[bytes]) -> dict[str, Any] | None:
-    """None at the end."""
+    """Read a line; None at the end of the stream."""
     line = stream.readline()
     return json.loads(line) if line else None
 
@@ -55,7 +55,7 @@ def write_frame(stream: IO[bytes], frame: PeerFrame) -> None:
 
 
 def read_frame(stream: IO[bytes]) -> PeerFrame | None:
-    """None at the end."""
+    """Read a frame; None at the end of the stream."""
     head = read_line(stream)
     if head is None:
         return None

@@ -1,7 +1,7 @@
-"""The arrow: knots that meet only their neighbours, and a border that meets all.
+"""Solve an arrowhead system: knots coupled to their neighbours only, and a border coupled to all knots.
 
-The banded part is factored by Cholesky; the border follows by the Schur complement (Triggs et al., *Bundle
-adjustment: a modern synthesis*, 2000, 6.1).
+Banded Cholesky factorisation; the border by the Schur complement (Triggs et al., *Bundle adjustment: a modern
+synthesis*, 2000, 6.1).
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ _UNDERFLOW = 1e-150
 
 @dataclass(frozen=True, eq=False)
 class ArrowSystem:
-    """band (36, 6 K): LAPACK's upper form of the knots' block; edge (6 K, B); corner (B, B); g of both."""
+    """band (36, 6 K): LAPACK's upper form of the knots' block; edge (6 K, B); corner (B, B); gradients of
+    both."""
 
     band: F64
     edge: F64
@@ -31,7 +32,7 @@ class ArrowSystem:
 
 
 def arrow_system(segments: SegmentNormals, state: CameraImuState) -> ArrowSystem:
-    """Of all segments together. B = SHARED + 6 M."""
+    """Assemble all segments; B = SHARED + 6 M."""
     S, K = state.curve.segments, len(state.curve.p)
     border = SHARED + state.biases.size
     blocks, edge = np.zeros((K, ORDER, 6, 6)), np.zeros((K, 6, border))
@@ -51,8 +52,8 @@ def arrow_system(segments: SegmentNormals, state: CameraImuState) -> ArrowSystem
 
 
 def gather_gradient(g: F64, state: CameraImuState) -> tuple[F64, F64]:
-    """What segments have by their own columns, (S, LOCAL, ...), of the knots (6 K, ...) and of the border
-    (B, ...)."""
+    """Sum gradients by local columns, (S, LOCAL_COLUMNS, ...), into those of the knots (6 K, ...) and of
+    the border (B, ...)."""
     S, K, more = state.curve.segments, len(state.curve.p), g.shape[2:]
     knots, border = np.zeros((K, 6, *more)), np.zeros((SHARED + state.biases.size, *more))
     for a in range(ORDER):
@@ -63,7 +64,7 @@ def gather_gradient(g: F64, state: CameraImuState) -> tuple[F64, F64]:
 
 
 def _bias_intervals(state: CameraImuState) -> list[tuple[slice, np.ndarray]]:
-    """Segments of each interval of the biases, and the border's columns that they know."""
+    """Return the segments of each bias interval, and the border's columns that they involve."""
     per, shared = state.per_node, np.arange(SHARED)
     starts = range(0, state.curve.segments, per)
     ends = [min(start + per, state.curve.segments) for start in starts]
@@ -75,13 +76,13 @@ def _bias_intervals(state: CameraImuState) -> list[tuple[slice, np.ndarray]]:
 
 
 def _banded(blocks: F64) -> F64:
-    """Blocks (K, 6, 6, 6), from each knot to itself and the five after it, as LAPACK's upper band."""
+    """Return blocks (K, 6, 6, 6), from each knot to itself and the five after it, as LAPACK's upper band."""
     K = len(blocks)
     out = np.zeros((_BAND_ROWS, 6 * K))
     for ahead in range(ORDER):
         for i in range(6):
             for j in range(6):
-                off = 6 * ahead + j - i  # which diagonal
+                off = 6 * ahead + j - i  # the diagonal
                 if off >= 0 and ahead < K:
                     out[_BAND_ROWS - 1 - off, 6 * ahead + j :: 6][: K - ahead] = blocks[
                         : K - ahead, ahead, i, j
@@ -90,17 +91,18 @@ def _banded(blocks: F64) -> F64:
 
 
 def solve_arrow(system: ArrowSystem, damping: float) -> tuple[F64, F64, F64]:
-    """Step of the knots (K, 6) and of the border (B,), and the border's covariance (B, B), its diagonal
-    made larger by `damping` of itself. Raises np.linalg.LinAlgError where something is not told at all."""
+    """Return the step of the knots (K, 6) and of the border (B,), and the border's covariance (B, B), with
+    diagonals raised by the factor 1 + damping.
+
+    Raises np.linalg.LinAlgError where an unknown is not observable.
+    """
     from scipy.linalg import cho_solve_banded, cholesky_banded
 
     band = system.band.copy()
     band[-1] *= 1 + damping
     factor = (cholesky_banded(band), False)
     eliminated = cho_solve_banded(factor, np.column_stack([system.edge, system.g_knots]))
-    eliminated[np.abs(eliminated) < _UNDERFLOW] = (
-        0  # far from a bias node they fade, and denormal numbers are slow
-    )
+    eliminated[np.abs(eliminated) < _UNDERFLOW] = 0  # far from a bias node; denormal numbers are slow
     corner = system.corner + damping * np.diag(np.diag(system.corner))
     covariance = np.linalg.inv(corner - system.edge.T @ eliminated[:, :-1])
     step = covariance @ (system.g_border - system.edge.T @ eliminated[:, -1])
@@ -112,7 +114,8 @@ def solve_arrow(system: ArrowSystem, damping: float) -> tuple[F64, F64, F64]:
 
 
 def border_steps(system: ArrowSystem, knots: F64, border: F64) -> F64:
-    """The border's steps (B, G) for G other gradients, of the knots (6 K, G) and of the border (B, G)."""
+    """Return the border's steps (B, G) for G other gradients, of the knots (6 K, G) and of the border (B,
+    G)."""
     from scipy.linalg import cho_solve_banded, cholesky_banded
 
     eliminated = cho_solve_banded(

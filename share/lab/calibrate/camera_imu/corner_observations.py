@@ -1,4 +1,4 @@
-"""Corners of a target in pictures of a rig of cameras that is known, and what they tell of its pose."""
+"""Target corners in the images of a calibrated rig, and their residuals and normal equations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from share.types import F64, I64
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """Of one camera: frame (C,) rising, points (C, 3) m on the target, px (C, 2)."""
+    """Corners of one camera: frame (C,) rising, points (C, 3) m on the target, px (C, 2)."""
 
     frame: I64
     points: F64
@@ -26,7 +26,7 @@ class Corners:
 
 @dataclass(frozen=True, eq=False)
 class CornerObservations:
-    """stamps_ns (F,), camera's clock; of each camera what it is, T_cam_cam0 and its corners."""
+    """Frames at stamps_ns (F,) of the cameras' clock; of each camera its model, T_cam_cam0 and corners."""
 
     stamps_ns: I64
     cameras: tuple[Camera, ...]
@@ -34,7 +34,7 @@ class CornerObservations:
     corners: tuple[Corners, ...]
 
     def take(self, keep: np.ndarray) -> CornerObservations:
-        """Only frames of a mask (F,)."""
+        """Return only the frames of a mask (F,)."""
         place = np.cumsum(keep) - 1
         parts = [(one, keep[one.frame]) for one in self.corners]
         corners = tuple(Corners(place[one.frame[k]], one.points[k], one.px[k]) for one, k in parts)
@@ -48,7 +48,7 @@ def corner_observations(
     cameras: Sequence[Camera],
     T_cam1_cam0: F64 | None,
 ) -> CornerObservations:
-    """Of views at stamps (F,). T_cam1_cam0: needed with two cameras."""
+    """Return the corners of views at stamps (F,). T_cam1_cam0: needed with two cameras."""
     corners = []
     for cam in range(len(cameras)):
         detections = [view.detections[cam] for view in views]
@@ -61,21 +61,19 @@ def corner_observations(
 
 
 def corner_residuals(observations: CornerObservations, cam: int, T_target_cam0: F64) -> tuple[F64, F64]:
-    """Residuals (C, 2) px of a camera, seen less predicted, and the derivatives (C, 2, 6) of what is
-    predicted by eta of T_target_cam0 Exp(eta). Behind the camera it is NaN."""
-    corners, mount, points = (
-        observations.corners[cam],
-        observations.mounts[cam],
-        _points_in_cam0(observations, cam, T_target_cam0),
-    )
+    """Return a camera's residuals (C, 2) px, measured minus predicted, and the derivatives (C, 2, 6) of
+    the prediction by eta of T_target_cam0 Exp(eta). NaN behind the camera."""
+    corners, mount = observations.corners[cam], observations.mounts[cam]
+    points = _points_in_cam0(observations, cam, T_target_cam0)
     shifted = np.concatenate([se3.hat(points), np.broadcast_to(-np.eye(3), (len(points), 3, 3))], axis=2)
     px, _, by = project_with_jacobians(observations.cameras[cam], se3.transform(mount, points))
     return corners.px - px, by @ (mount[:3, :3] @ shifted)
 
 
 def rig_jacobian(observations: CornerObservations, cam: int, T_target_cam0: F64) -> F64:
-    """Derivatives (C, 2, S) of what `seen` predicts, by the intrinsics of each camera and, of two, xi of
-    T_cam1_cam0 Exp(xi): the order of `bundle.Solution`."""
+    """Return derivatives (C, 2, S) of the prediction of `corner_residuals` by the rig's parameters:
+    intrinsics of each camera and, with two, xi of T_cam1_cam0 Exp(xi), in the order of
+    `CameraBundleSolution`."""
     points, by_mount = transform_with_jacobian(
         observations.mounts[cam], _points_in_cam0(observations, cam, T_target_cam0)
     )
@@ -88,7 +86,7 @@ def rig_jacobian(observations: CornerObservations, cam: int, T_target_cam0: F64)
 
 
 def _points_in_cam0(observations: CornerObservations, cam: int, T_target_cam0: F64) -> F64:
-    """The points (C, 3) of a camera's corners."""
+    """Return a camera's corner points (C, 3) in the cam0 frame."""
     one = observations.corners[cam]
     T = se3.inverse(T_target_cam0)[one.frame]
     points: F64 = (T[:, :3, :3] @ one.points[..., None])[..., 0] + T[:, :3, 3]
@@ -97,7 +95,7 @@ def _points_in_cam0(observations: CornerObservations, cam: int, T_target_cam0: F
 
 @dataclass(frozen=True, eq=False)
 class PoseNormals:
-    """Normal equations of each frame's eta: H (F, 6, 6), g (F, 6); and the cost."""
+    """Normal equations of each frame's eta, H (F, 6, 6), g (F, 6), and the cost."""
 
     H: F64
     g: F64
@@ -107,7 +105,8 @@ class PoseNormals:
 def pose_normals(
     observations: CornerObservations, T_target_cam0: F64, sigma_px: float, huber: float
 ) -> PoseNormals:
-    """All corners, in units of sigma_px, with Huber's weights beyond `huber` of these."""
+    """Return the normal equations of all corners, whitened by sigma_px, with Huber weights beyond `huber`
+    sigmas."""
     H, g, cost = np.zeros((len(T_target_cam0), 6, 6)), np.zeros((len(T_target_cam0), 6)), 0.0
     for cam, one in enumerate(observations.corners):
         if len(one.frame) == 0:
@@ -128,8 +127,8 @@ def pose_normals(
 def rig_cross_terms(
     observations: CornerObservations, T_target_cam0: F64, sigma_px: float, huber: float
 ) -> F64:
-    """What the normal equations have between each frame's eta and the rig's own parameters, (F, 6, S), by
-    the weights of `pose_normals`."""
+    """Return the cross terms (F, 6, S) of the normal equations between each frame's eta and the rig's
+    parameters, with the weights of `pose_normals`."""
     out = np.zeros((len(T_target_cam0), 6, shared_size(observations.cameras)))
     for cam, one in enumerate(observations.corners):
         r, J = corner_residuals(observations, cam, T_target_cam0)
@@ -140,5 +139,5 @@ def rig_cross_terms(
 
 
 def _root_weights(d: F64, huber: float) -> F64:
-    """Of Huber's weights (C,) of corners that miss by d (C,) sigmas."""
+    """Return the square roots of Huber's weights (C,) for residuals of d (C,) sigmas."""
     return np.sqrt(np.minimum(1, huber / np.maximum(d, 1e-12)))

@@ -1,7 +1,8 @@
-"""Camera and IMU on one curve: where the cameras sit on the IMU, and how far their clocks are apart.
+"""Extrinsics and time offset of camera and IMU, by a batch fit of a continuous-time trajectory.
 
 Method: Furgale, Rehder, Siegwart, *Unified temporal and spatial calibration for multi-sensor systems* (IROS
-2013), with splines as in spline.py. Levenberg-Marquardt; the spread that corners are weighed by is found.
+2013), with the splines of spline.py. Levenberg-Marquardt; the sigmas of corners and IMU are estimated from
+residuals.
 """
 
 from __future__ import annotations
@@ -29,17 +30,20 @@ from share.lab.calibrate.camera_imu.state import SHIFT, CameraImuState
 from share.lab.calibrate.target import Target
 from share.types import F64, I64, ImuBatch
 
-_MAX_IMU_GAP_NS = 100_000_000  # longer without an IMU sample, and the curve goes its own way
+_MAX_IMU_GAP_NS = 100_000_000  # in a longer gap the curve is not determined
 _INITIAL_SIGMA_PX = 1.0
 _ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class CameraImuFit:
-    """What was found. Of T_imu_cam0 Exp(xi) and the shift two covariances (7, 7): by_noise of corners and
-    IMU; by_rig of what intrinsics and T_cam1_cam0 may be off, None where nobody told that. sigmas: what
-    residuals were judged by; stated: as the IMU's file has them. of each camera corners (C, 2) px and their
-    frames (C,); gyro, accel (N, 3): residuals. stamps_ns: of pictures, camera's clock; imu: samples used."""
+    """Result of a fit.
+
+    Two covariances (7, 7) of xi in T_imu_cam0 Exp(xi) and the time shift: `by_noise` of corners and IMU;
+    `by_rig` of the uncertainty of intrinsics and T_cam1_cam0, None where that is unknown. `sigmas`: as
+    estimated; `stated_sigmas`: by the IMU's file. `corners`: residuals (C, 2) px of each camera; `gyro`,
+    `accel` (N, 3): residuals. `imu`: the samples used.
+    """
 
     state: CameraImuState
     by_noise: F64
@@ -63,7 +67,7 @@ class CameraImuFit:
 
     @property
     def covariance(self) -> F64:
-        """(7, 7): both together. Other pictures told the rig, so they are independent."""
+        """(7, 7): the sum of both. The rig was calibrated from other images, so they are independent."""
         return self.by_noise if self.by_rig is None else self.by_noise + self.by_rig
 
     @property
@@ -81,7 +85,7 @@ class CameraImuFit:
         return float(self.axis_sigmas(self.covariance)[SHIFT])
 
     def axis_sigmas(self, covariance: F64) -> F64:
-        """(7,) rad, m, s, along the IMU's axes, of one of the covariances (7, 7)."""
+        """Return sigmas (7,) along the IMU's axes, rad, m, s, of a covariance (7, 7)."""
         turn = np.eye(7)
         turn[:3, :3] = turn[3:6, 3:6] = self.T_imu_cam0[:3, :3]
         return np.sqrt(np.diag(turn @ covariance @ turn.T))
@@ -98,11 +102,14 @@ def fit_camera_imu(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     rig_covariance: F64 | None = None,
 ) -> CameraImuFit:
-    """From views at stamps (F,) rising and the IMU of one recording; intrinsics and T_cam1_cam0 are `rig`'s,
-    with a covariance (P, P) in the order of `bundle.Solution` where it is known. told: rounds done, of how
-    many.
+    """Fit views at stamps (F,), rising, and the IMU of one recording. Intrinsics and T_cam1_cam0 of `rig` are
+    fixed.
 
-    Raises DataError where something is missing or not told, MisfitError where the two are not of one motion.
+    within_s: largest offset of the clocks. rig_covariance (P, P): of `rig`, in the order of
+    `CameraBundleSolution`, if known. on_progress(done, total): rounds.
+
+    Raises DataError where something is missing or not observable, CalibrationMismatchError where camera and
+    IMU do not have one motion.
     """
     cameras = tuple(c for c in (rig.cam0, rig.cam1) if c is not None)[
         : len(views[0].detections) if views else 0
@@ -134,9 +141,9 @@ def fit_camera_imu(
 
 
 def _samples_on_curve(imu: ImuBatch, state: CameraImuState) -> ImuBatch:
-    """Samples on the curve. Raises DataError for a hole among them."""
+    """Return the samples on the curve. Raises DataError for a gap among them."""
     used = imu.take(on_curve_mask(state.curve, imu.stamps_ns, 0.0, 0.0))
     longest = int(np.diff(used.stamps_ns).max(initial=0))
     if longest > _MAX_IMU_GAP_NS:
-        raise DataError(f"IMU: nothing for {longest * 1e-9:.2f} s while the board was seen; record it again")
+        raise DataError(f"IMU: no samples for {longest * 1e-9:.2f} s while the board was seen; record again")
     return used

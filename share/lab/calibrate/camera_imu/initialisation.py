@@ -1,8 +1,8 @@
-"""Where it begins, with no guess from anybody: poses of the board, clocks, the mounting's rotation, gravity.
+"""Initial values without any guess: poses of the board, time offset, rotation of the extrinsics, gravity.
 
-Camera and IMU turn as one, so their rates differ by a rotation and a bias at the right offset of the clocks.
-For each offset the best rotation is closed form (Umeyama, PAMI 1991, eq. 40), and how well it fits is the
-correlation of two series of vectors, which has its peak at the offset.
+Camera and IMU are one rigid body, so at the right time offset their angular rates differ by a rotation and a
+bias. For each offset the best rotation has a closed form (Umeyama, PAMI 1991, eq. 40); the correlation of the
+two rate series peaks at the right offset.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from share.lab.calibrate.camera_imu.state import CameraImuState, node_count
 from share.lab.calibrate.target import Target
 from share.types import F64, I64, ImuBatch
 
-KNOT_STEP_S = 0.02  # between knots: carries what a hand does, up to 10 Hz and more
-BIAS_NODE_S = 5.0  # between nodes of the biases
-END_MARGIN_S = 0.05  # pictures nearer to the ends are left out: the offset may yet carry them beyond
-_LAG_S = 0.005
-_MAX_PAIR_GAP_S = 0.25  # pictures farther apart do not tell a rate
+KNOT_STEP_S = 0.02  # between knots: follows hand motion, up to 10 Hz and more
+BIAS_NODE_S = 5.0  # between bias nodes
+END_MARGIN_S = 0.05  # images nearer to the ends are left out: the final offset may shift them beyond
+_LAG_S = 0.005  # between the time offsets tried
+_MAX_PAIR_GAP_S = 0.25  # between two images that give a rate
 _MIN_PAIRS = 50
 _MIN_CORRELATION = 0.6
-_MIN_SECOND_AXIS_RATE = 0.05  # rad/s rms about the second axis; below, the mounting cannot be told
+_MIN_SECOND_AXIS_RATE = 0.05  # rad/s rms about the second axis; below, the extrinsics are not observable
 _ITERATIONS = 8
 
 
 def initial_poses(
     views: Sequence[BoardView], target: Target, cameras: Sequence[Camera], mounts: Sequence[F64]
 ) -> tuple[F64, np.ndarray]:
-    """T_target_cam0 (F, 4, 4) by homographies, each of the camera that sees most; and which views (F,) have
-    enough corners for one."""
+    """Return T_target_cam0 (F, 4, 4) by homographies, each from the camera that sees most corners, and
+    which views (F,) have enough corners for one."""
     out, has_pose = np.tile(np.eye(4), (len(views), 1, 1)), np.zeros(len(views), bool)
     for k, view in enumerate(views):
         cam = int(np.argmax([len(one) for one in view.detections]))
@@ -52,7 +52,7 @@ def initial_poses(
 
 
 def refine_poses(observations: CornerObservations, T: F64, sigma_px: float = 1.0) -> F64:
-    """Each frame by itself, by Gauss-Newton."""
+    """Refine each frame's pose alone, by Gauss-Newton."""
     for _ in range(_ITERATIONS):
         step = pose_normals(observations, T, sigma_px, 2.5)
         if not np.isfinite(step.cost):
@@ -64,8 +64,8 @@ def refine_poses(observations: CornerObservations, T: F64, sigma_px: float = 1.0
 
 @dataclass(frozen=True, eq=False)
 class ClockAlignment:
-    """t_imu = t_cam + shift_s; R_imu_cam0 (3, 3); gyro's bias (3,) rad/s; correlation, 1 where they turn
-    exactly alike."""
+    """t_imu = t_cam + shift_s; R_imu_cam0 (3, 3); gyro_bias (3,) rad/s; correlation of the rates, 1 for a
+    perfect match."""
 
     shift_s: float
     R_imu_cam0: F64
@@ -74,26 +74,24 @@ class ClockAlignment:
 
 
 def align_clocks(stamps_ns: I64, T: F64, imu: ImuBatch, within_s: float) -> ClockAlignment:
-    """By poses T (F, 4, 4) of cam0 at stamps (F,). Offsets up to within_s are looked at.
+    """Align the clocks by poses T (F, 4, 4) of cam0 at stamps (F,), for offsets up to within_s.
 
-    Raises DataError where the pictures are too few or the rig turned about one axis only, MisfitError where
-    camera and IMU turn nowhere alike.
+    Raises DataError where there are too few images or the rig turned about one axis only,
+    CalibrationMismatchError where the rates match at no offset.
     """
     first = np.flatnonzero(np.diff(stamps_ns) < _MAX_PAIR_GAP_S * 1e9)
     if len(first) < _MIN_PAIRS:
         raise DataError(
-            f"the board is seen in {len(first)} pairs of successive pictures, {_MIN_PAIRS} are needed: "
-            "keep it in view, and look at every picture"
+            f"the board is seen in {len(first)} pairs of successive images, {_MIN_PAIRS} are needed: "
+            "keep it in view, and use every image"
         )
     span = (stamps_ns[first + 1] - stamps_ns[first])[:, None] * 1e-9
     rates = se3.so3_log(T[first, :3, :3].swapaxes(1, 2) @ T[first + 1, :3, :3]) / span
     rms_by_axis = np.linalg.svd(rates - rates.mean(axis=0), compute_uv=False) / np.sqrt(len(rates))
     if rms_by_axis[1] < _MIN_SECOND_AXIS_RATE:
         raise DataError(
-            f"the rig turned by {rms_by_axis[0]:.2f} rad/s rms "
-            f"about one axis and "
-            f"{rms_by_axis[1]:.2f} about the "
-            f"next, {_MIN_SECOND_AXIS_RATE} are needed: nod, roll and look around"
+            f"the rig turned by {rms_by_axis[0]:.2f} rad/s rms about one axis and {rms_by_axis[1]:.2f} about "
+            f"the next, {_MIN_SECOND_AXIS_RATE} are needed: nod, roll and look around"
         )
     mean_rates = _MeanRates(imu)
     lags = np.arange(-within_s, within_s + _LAG_S / 2, _LAG_S)
@@ -102,8 +100,9 @@ def align_clocks(stamps_ns: I64, T: F64, imu: ImuBatch, within_s: float) -> Cloc
     best = int(correlations.argmax())
     if correlations[best] < _MIN_CORRELATION:
         raise CalibrationMismatchError(
-            f"camera and IMU turn nowhere alike (correlation {correlations[best]:.2f} of {_MIN_CORRELATION} "
-            f"needed, clocks up to {within_s:g} s apart): are both of one device, and the IMU in rad/s?"
+            f"the rotation rates of camera and IMU match at no time offset up to {within_s:g} s (correlation "
+            f"{correlations[best]:.2f}, {_MIN_CORRELATION} needed): are both of one device, and the IMU in "
+            "rad/s?"
         )
     shift = float(lags[best] + subsample_peak(correlations, best) * _LAG_S)
     gyro = mean_rates.rates(*ends, shift)
@@ -112,7 +111,7 @@ def align_clocks(stamps_ns: I64, T: F64, imu: ImuBatch, within_s: float) -> Cloc
 
 
 class _MeanRates:
-    """The gyro's rates, averaged between any two times."""
+    """Mean gyro rates between any two times."""
 
     def __init__(self, imu: ImuBatch) -> None:
         self._start = imu.stamps_ns[0]
@@ -121,30 +120,30 @@ class _MeanRates:
         self._sum = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
     def rates(self, from_ns: I64, to_ns: I64, shift_s: float) -> F64:
-        """(N, 3) rad/s from stamps to stamps (N,), both shifted."""
+        """Return (N, 3) rad/s between stamps (N,), both shifted."""
         a, b = ((stamps - self._start) * 1e-9 + shift_s for stamps in (from_ns, to_ns))
         turn = [np.interp(b, self._t, one) - np.interp(a, self._t, one) for one in self._sum.T]
         return np.asarray(np.stack(turn, axis=1) / (b - a)[:, None], np.float64)
 
 
 def _rate_correlation(camera: F64, gyro: F64) -> tuple[float, F64]:
-    """Correlation of rates (N, 3) where the camera's are turned best, and that rotation (3, 3)."""
+    """Return the correlation of rates (N, 3) with the camera's rotated best, and that rotation (3, 3)."""
     a, b = camera - camera.mean(axis=0), gyro - gyro.mean(axis=0)
     R = best_rotation(b.T @ a)
     return float((b * (a @ R.T)).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-300)), R
 
 
 def initial_state(stamps_ns: I64, T: F64, imu: ImuBatch, alignment: ClockAlignment) -> CameraImuState:
-    """Knots by straight lines between the poses T (F, 4, 4) of cam0, which begins at the IMU's own place."""
+    """Return a state with knots interpolated between the poses T (F, 4, 4) of cam0, which starts at the
+    IMU's position."""
     shifted: I64 = stamps_ns + round(alignment.shift_s * 1e9)
     begin = max(int(shifted[0]) - round(2 * END_MARGIN_S * 1e9), int(imu.stamps_ns[0]))
     end = min(int(shifted[-1]) + round(2 * END_MARGIN_S * 1e9), int(imu.stamps_ns[-1]))
     segments = int((end - begin) * 1e-9 / KNOT_STEP_S)
     if segments * KNOT_STEP_S < 1:
-        raise DataError("IMU and pictures of the board have less than a second in common")
-    knot_times: F64 = (
-        np.arange(segments + EXTRA_KNOTS, dtype=np.float64) - (EXTRA_KNOTS - 1) / 2
-    ) * KNOT_STEP_S  # where each weighs most
+        raise DataError("IMU and images of the board overlap by less than a second; record both together")
+    knots: F64 = np.arange(segments + EXTRA_KNOTS, dtype=np.float64)
+    knot_times: F64 = (knots - (EXTRA_KNOTS - 1) / 2) * KNOT_STEP_S  # where each has its largest weight
     t = np.asarray((shifted - begin) * 1e-9, np.float64)
     R = _interpolated_rotations(t, T[:, :3, :3] @ alignment.R_imu_cam0.T, knot_times)
     p = np.stack([np.interp(knot_times, t, column) for column in T[:, :3, 3].T], axis=1)
@@ -158,7 +157,7 @@ def initial_state(stamps_ns: I64, T: F64, imu: ImuBatch, alignment: ClockAlignme
 
 
 def _interpolated_rotations(t: F64, R: F64, times: F64) -> F64:
-    """Rotations (K, 3, 3) at times (K,), from R (N, 3, 3) at t (N,) rising."""
+    """Return rotations (K, 3, 3) at times (K,), from R (N, 3, 3) at t (N,), rising."""
     from scipy.spatial.transform import Rotation, Slerp
 
     return np.asarray(Slerp(t, Rotation.from_matrix(R))(np.clip(times, t[0], t[-1])).as_matrix(), np.float64)

@@ -1,4 +1,4 @@
-"""Normal equations of corners and IMU, segment by segment of the curve."""
+"""Normal equations of corners and IMU, segment by segment of the curve; L = LOCAL_COLUMNS."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ _SHARED = slice(KNOTS, KNOTS + SHARED)
 
 @dataclass(frozen=True)
 class Sigmas:
-    """Of a corner's coordinate px, of a sample rad/s and m/s^2. huber: times px, where doubt begins."""
+    """Sigmas of a corner coordinate, px, and of IMU samples, rad/s and m/s^2. huber: threshold of corners,
+    in sigmas."""
 
     px: float
     gyro: float
@@ -42,7 +43,7 @@ class Sigmas:
 
 @dataclass(frozen=True, eq=False)
 class SegmentNormals:
-    """Of S segments H (S, L, L) and g (S, L) by their own columns (LOCAL), and the whole cost."""
+    """Of S segments H (S, L, L) and g (S, L) by local columns, and the total cost."""
 
     H: F64
     g: F64
@@ -52,7 +53,8 @@ class SegmentNormals:
 def segment_normals(
     state: CameraImuState, observations: CornerObservations, imu: ImuBatch, sigmas: Sigmas
 ) -> SegmentNormals:
-    """At a state. The cost is infinite where a corner would lie behind its camera."""
+    """Return the normal equations at a state. The cost is infinite where a corner would lie behind its
+    camera."""
     segments = state.curve.segments
     out = SegmentNormals(
         np.zeros((segments, LOCAL_COLUMNS, LOCAL_COLUMNS)), np.zeros((segments, LOCAL_COLUMNS)), 0.0
@@ -62,13 +64,14 @@ def segment_normals(
 
 
 def camera_poses(state: CameraImuState, stamps_ns: I64) -> F64:
-    """T_target_cam0 (F, 4, 4) at stamps (F,) of the camera's clock."""
+    """Return T_target_cam0 (F, 4, 4) at stamps (F,) of the camera's clock."""
     spans = state.curve.locate(stamps_ns, state.shift_s)
     return se3.from_rt(state.curve.rotation(spans).R, state.curve.position(spans)[0]) @ state.T_imu_cam0
 
 
 def pose_derivatives(state: CameraImuState, stamps_ns: I64) -> tuple[F64, F64, I64]:
-    """T_target_cam0 (F, 4, 4), its eta by local columns (F, 6, LOCAL), and the segments (F,)."""
+    """Return T_target_cam0 (F, 4, 4), the derivatives of its eta by local columns (F, 6, L), and the
+    segments (F,)."""
     curve, spans = state.curve, state.curve.locate(stamps_ns, state.shift_s)
     rotation, (p, weight) = curve.rotation(spans), curve.position(spans)
     J = np.zeros((len(spans.u), 6, LOCAL_COLUMNS))
@@ -92,8 +95,8 @@ def _add_corners(
 
 
 def rig_gradients(state: CameraImuState, observations: CornerObservations, sigmas: Sigmas) -> F64:
-    """By how much each segment's gradient (S, LOCAL) falls with the rig's own parameters, (S, LOCAL, P):
-    intrinsics and T_cam1_cam0, which are not sought."""
+    """Return by how much each segment's gradient (S, L) falls per unit of the rig's parameters, (S,
+    L, P): intrinsics and T_cam1_cam0, which are fixed."""
     T, J, segment = pose_derivatives(state, observations.stamps_ns)
     out: F64 = np.zeros((state.curve.segments, LOCAL_COLUMNS, shared_size(observations.cameras)))
     np.add.at(out, segment, J.swapaxes(1, 2) @ rig_cross_terms(observations, T, sigmas.px, sigmas.huber))
@@ -101,8 +104,8 @@ def rig_gradients(state: CameraImuState, observations: CornerObservations, sigma
 
 
 def inertial_residuals(state: CameraImuState, imu: ImuBatch) -> tuple[F64, F64, I64]:
-    """Residuals (N, 6) of gyro and accel, measured less predicted, the derivatives (N, 6, LOCAL) of what is
-    predicted, and the segments (N,)."""
+    """Return residuals (N, 6) of gyro and accel, measured minus predicted, the derivatives (N, 6, L)
+    of the prediction, and the segments (N,)."""
     curve, spans = state.curve, state.curve.locate(imu.stamps_ns)
     rotation, (a, weight) = curve.rotation(spans), curve.position(spans, 2)
     bias, share_after = state.bias(spans.segment, spans.u)
@@ -133,6 +136,6 @@ def _add_imu(out: SegmentNormals, state: CameraImuState, imu: ImuBatch, sigmas: 
 
 
 def on_curve_mask(curve: Curve, stamps_ns: I64, shift_s: float, margin_s: float) -> np.ndarray:
-    """Which stamps (N,), shifted, lie on the curve with a margin to its ends."""
+    """Return which stamps (N,), shifted, lie on the curve with a margin to its ends."""
     t = (stamps_ns - curve.start_ns) * 1e-9 + shift_s
     return np.asarray((t >= margin_s) & (t <= curve.end_s - margin_s))

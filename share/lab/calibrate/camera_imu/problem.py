@@ -1,4 +1,4 @@
-"""Least squares over a whole recording, by Levenberg and Marquardt, and how large its residuals are."""
+"""Least squares over a whole recording by Levenberg-Marquardt, its residuals and covariance."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from share.lab.calibrate.camera_imu.state import SHARED, CameraImuState
 from share.lab.calibrate.corners import MIN_SIGMA_PX, robust_sigma
 from share.types import F64, I64, ImuBatch
 
-_BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: no IMU is worse
+_BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: larger than any IMU's
 _MIN_WALK = 1e-7
 _MAX_ITERATIONS = 30
-_MIN_RELATIVE_DECREASE = 1e-7  # relative fall of the cost at which it has arrived
-_SLOW_WINDOW_NS = 200_000_000  # means over so long show errors that are not noise
+_MIN_RELATIVE_DECREASE = 1e-7  # of the cost: converged below
+_SLOW_WINDOW_NS = 200_000_000  # means over this show errors that are not white
 
 
 @dataclass(frozen=True, eq=False)
 class CameraImuProblem:
-    """One problem: corners, the IMU while they were seen, and its stated noise."""
+    """Corners, the IMU samples meanwhile, and the IMU's stated noise."""
 
     observations: CornerObservations
     imu: ImuBatch
     noise: ImuNoise
 
     def stated_sigmas(self) -> Sigmas:
-        """A sample's noise, by the density that the IMU's file has and the rate that the samples have."""
+        """Return the sigmas of samples by the stated noise density and the sample rate."""
         root = float(np.sqrt(1e9 / np.median(np.diff(self.imu.stamps_ns))))
         return Sigmas(MIN_SIGMA_PX, self.noise.gyro_density * root, self.noise.accel_density * root)
 
     def optimise(self, state: CameraImuState, sigmas: Sigmas) -> CameraImuState:
-        """Downhill until the cost stands still. Raises MisfitError where it never does."""
+        """Minimise the cost. Raises CalibrationMismatchError where it does not converge."""
         damping, (system, cost) = 1e-5, self._linear_system(state, sigmas)
         if not np.isfinite(cost):
             raise CalibrationMismatchError(
@@ -64,9 +64,8 @@ class CameraImuProblem:
             if has_converged:
                 return state
         raise CalibrationMismatchError(
-            f"camera and IMU: no solution "
-            f"after {_MAX_ITERATIONS} "
-            f"steps; are --target, --camera and --imu of this rig?"
+            f"camera and IMU: no solution after {_MAX_ITERATIONS} steps; "
+            "are --target, --camera and --imu of this rig?"
         )
 
     def _linear_system(self, state: CameraImuState, sigmas: Sigmas) -> tuple[ArrowSystem, float]:
@@ -75,7 +74,8 @@ class CameraImuProblem:
         return system, segments.cost + self._add_bias_factors(state, system)
 
     def _add_bias_factors(self, state: CameraImuState, system: ArrowSystem) -> float:
-        """Adds what holds the biases: their first node hardly, each next one by the walk. The cost."""
+        """Add the biases' factors, a weak prior on the first node and random walks between nodes; return
+        their cost."""
         walk = np.repeat([self.noise.gyro_walk, self.noise.accel_walk], 3)
         weight = 1 / (np.maximum(walk, _MIN_WALK) ** 2 * BIAS_NODE_S)
         g = system.g_border[SHARED:].reshape(-1, 6)  # a view
@@ -95,30 +95,30 @@ class CameraImuProblem:
         return float(((state.biases[0] / _BIAS_SIGMA) ** 2).sum() + (weight * steps**2).sum()) / 2
 
     def residual_sigmas(self, state: CameraImuState, stated: Sigmas) -> Sigmas:
-        """What residuals show: of corners as it is, of the IMU where it is more than stated."""
+        """Return sigmas estimated from residuals; of the IMU at least the stated ones."""
         px = robust_sigma(np.concatenate(self.corner_residuals(state)))
         gyro, accel = (conservative_rms(self.imu.stamps_ns, part) for part in self.inertial_residuals(state))
         return Sigmas(px, max(gyro, stated.gyro), max(accel, stated.accel))
 
     def corner_residuals(self, state: CameraImuState) -> tuple[F64, ...]:
-        """Of each camera (C, 2) px, seen less predicted."""
+        """Return residuals (C, 2) px of each camera, measured minus predicted."""
         T = normal_equations.camera_poses(state, self.observations.stamps_ns)
         return tuple(
             corner_residuals(self.observations, cam, T)[0] for cam in range(len(self.observations.cameras))
         )
 
     def inertial_residuals(self, state: CameraImuState) -> tuple[F64, F64]:
-        """gyro, accel (N, 3), measured less predicted."""
+        """Return residuals of gyro, accel (N, 3), measured minus predicted."""
         residuals = normal_equations.inertial_residuals(state, self.imu)[0]
         return residuals[:, :3], residuals[:, 3:]
 
     def covariance(self, state: CameraImuState, sigmas: Sigmas) -> F64:
-        """(7, 7) of the mounting and the shift, if intrinsics and T_cam1_cam0 are exact."""
+        """Return the covariance (7, 7) of extrinsics and time shift for exact intrinsics and T_cam1_cam0."""
         return _solve_or_raise(self._linear_system(state, sigmas)[0], 0.0)[2][:7, :7]
 
     def rig_sensitivity(self, state: CameraImuState, sigmas: Sigmas) -> F64:
-        """(7, P): where mounting and shift go if the rig's own parameters, in the order of
-        `bundle.Solution`, are moved by one each."""
+        """Return (7, P): derivatives of extrinsics and time shift by the rig's parameters, in the order of
+        `CameraBundleSolution`."""
         gradients = normal_equations.rig_gradients(state, self.observations, sigmas)
         return -border_steps(self._linear_system(state, sigmas)[0], *gather_gradient(gradients, state))[:7]
 
@@ -128,13 +128,15 @@ def _solve_or_raise(system: ArrowSystem, damping: float) -> tuple[F64, F64, F64]
         return solve_arrow(system, damping)
     except np.linalg.LinAlgError:
         raise DataError(
-            "camera and IMU: the recording does not tell the motion; move and turn more"
+            "camera and IMU: the recording does not determine the motion; move and turn more"
         ) from None
 
 
 def low_frequency_rms(stamps_ns: I64, residuals: F64) -> float:
-    """Of residuals (N, 3) the rms of means over 0.2 s, times the root of how many are in each: the same as
-    their own rms where they are white, and more where scale, axes or the board are not as taken to be."""
+    """Return the rms of means over 0.2 s of residuals (N, 3), times the root of the number in each.
+
+    Equal to their rms if they are white; larger where scale, axes or the board are not as assumed.
+    """
     window = (stamps_ns - stamps_ns[0]) // _SLOW_WINDOW_NS
     count = np.maximum(np.bincount(window), 1)
     sums = np.stack([np.bincount(window, column) for column in residuals.T])
@@ -142,5 +144,5 @@ def low_frequency_rms(stamps_ns: I64, residuals: F64) -> float:
 
 
 def conservative_rms(stamps_ns: I64, residuals: F64) -> float:
-    """The larger of their rms and of `low_frequency_rms`: what one sample is to be believed."""
+    """Return the larger of the rms and of `low_frequency_rms`."""
     return max(float(np.sqrt((residuals**2).mean())), low_frequency_rms(stamps_ns, residuals))

@@ -1,4 +1,4 @@
-"""What is sought, and in which order."""
+"""The estimated state, and the order of its parameters."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from share.geometry import se3
 from share.lab.calibrate.camera_imu.spline import ORDER, Curve
 from share.types import F64, I64
 
-KNOTS = 6 * ORDER  # columns of one segment: of each of its knots rotation (3), position (3)
-MOUNT, SHIFT, GRAVITY = slice(0, 6), 6, slice(7, 10)  # of what all segments share
+KNOTS = 6 * ORDER  # columns of one segment: rotation (3) and position (3) of each of its knots
+MOUNT, SHIFT, GRAVITY = slice(0, 6), 6, slice(7, 10)  # among the SHARED columns of all segments
 SHARED = 10
 LOCAL_COLUMNS = KNOTS + SHARED + 12  # and the biases (gyro, accel) at both ends of the segment's interval
 
 
 @dataclass(frozen=True, eq=False)
 class CameraImuState:
-    """World: the target's frame. curve: of the IMU, in its clock; biases (M, 6) rad/s, m/s^2 at nodes every
-    `per_node` segments, straight between them; T_imu_cam0 (4, 4); t_imu = t_cam + shift_s; gravity (3,)
-    m/s^2, downwards."""
+    """State in the target's frame as world.
+
+    curve: of the IMU, in its clock. biases (M, 6) rad/s, m/s^2: at nodes every `per_node` segments, linear
+    between them. T_imu_cam0 (4, 4). t_imu = t_cam + shift_s. gravity (3,) m/s^2, downwards.
+    """
 
     curve: Curve
     biases: F64
@@ -30,7 +32,7 @@ class CameraImuState:
     gravity: F64
 
     def updated(self, knots: F64, border: F64) -> CameraImuState:
-        """By a step of the knots (K, 6) and of SHARED + 6 M others."""
+        """Return the state after a step of the knots (K, 6) and of the SHARED + 6 M others."""
         curve = replace(self.curve, R=self.curve.R @ se3.so3_exp(knots[:, :3]), p=self.curve.p + knots[:, 3:])
         return replace(
             self,
@@ -42,11 +44,11 @@ class CameraImuState:
         )
 
     def node_before(self, segment: I64) -> I64:
-        """The bias node before each segment."""
+        """Return the bias node before each segment."""
         return segment // self.per_node
 
     def bias(self, segment: I64, u: F64) -> tuple[F64, F64]:
-        """(N, 6), and the share (N,) of the node after."""
+        """Return biases (N, 6), and the weight (N,) of the node after."""
         node = self.node_before(segment)
         share_after = (segment - node * self.per_node + u) / self.per_node
         return self.biases[node] * (1 - share_after[:, None]) + self.biases[node + 1] * share_after[
@@ -55,10 +57,10 @@ class CameraImuState:
 
 
 def node_count(segments: int, per_node: int) -> int:
-    """How many bias nodes so many segments take."""
+    """Return the number of bias nodes of a curve."""
     return -(-segments // per_node) + 1
 
 
 def body_twist(R: F64, rate: F64, velocity: F64) -> F64:
-    """(N, 6): xi a second, of a body that moves in the world."""
+    """Return the body's twist (N, 6), xi per second, of a motion in the world."""
     return np.concatenate([rate, np.einsum("nji,nj->ni", R, velocity)], axis=1)

@@ -1,4 +1,4 @@
-"""Whether a calibration of cameras and IMU may be believed, and what to do where not."""
+"""Check a camera-IMU calibration: does it pass, and if not, what to do."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from share.lab.calibrate.camera_imu.problem import conservative_rms
 from share.types import F64
 
 _STANDARD_GRAVITY = 9.80665
-_NEAR_DEG, _NEAR_MM = 1.0, 5.0  # as one unit of distance between two mountings
-_FAR_UNITS = 4.0  # of these: worth a word
+_NEAR_DEG = 1.0  # one unit of distance between two mountings
+_NEAR_MM = 5.0  # likewise
+_FAR_UNITS = 4.0  # more is reported
 
 
 @dataclass(frozen=True)
 class CameraImuLimits:
-    """What passes. rms_px: of corners kept; wrong: share of those not; imu: residuals over stated noise;
-    gravity m/s^2: off the standard; turning rad/s, moving m/s^2: rms about and along the least moved axis;
-    the rest: one sigma of the result."""
+    """Limits to pass. rms_px: of inlier corners. outlier_share: of corners. imu_noise_ratio: residuals
+    over stated noise. gravity, m/s^2: error of its norm. rotation_rate_rms rad/s, acceleration_rms m/s^2:
+    at least, about and along the least excited axis. The rest: sigmas of the result."""
 
     rms_px: float = 1.0
     outlier_share: float = 0.05
@@ -36,9 +37,9 @@ class CameraImuLimits:
 
 @dataclass(frozen=True, eq=False)
 class CameraImuVerdict:
-    """reasons: what fails, none where it passes. rms_px and wrong corners of each camera; turning (3,) rad/s
-    and moving (3,) m/s^2: rms by principal axes, largest first; gyro, accel: residuals, the rms of all or
-    of slow ones, over stated."""
+    """reasons: of a failure, empty if it passes. rms_px and outlier corners of each camera.
+    rotation_rate_rms (3,) rad/s, acceleration_rms (3,) m/s^2: by principal axes, largest first. Noise
+    ratios: residuals' `conservative_rms` over stated noise."""
 
     reasons: tuple[str, ...]
     rms_px: tuple[float, ...]
@@ -54,7 +55,7 @@ class CameraImuVerdict:
 
 
 def judge_camera_imu(fit: CameraImuFit, limits: CameraImuLimits = CameraImuLimits()) -> CameraImuVerdict:
-    """Of a fit."""
+    """Check a fit against the limits."""
     inliers = [corners.inlier_mask(r, fit.sigmas.px) for r in fit.corners]
     rms = tuple(corners.rms(r[k]) for r, k in zip(fit.corners, inliers, strict=True))
     outliers = tuple(int((~k).sum()) for k in inliers)
@@ -82,14 +83,14 @@ def _corner_failures(fit: CameraImuFit, rms: tuple[float, ...], limits: CameraIm
     for cam, residuals in enumerate(fit.corners):
         if len(residuals) and not rms[cam] <= limits.rms_px:
             out.append(
-                f"cam{cam}: {rms[cam]:.2f} px RMS, at most {limits.rms_px:g}: blur, or --target or "
-                "intrinsics of something else"
+                f"cam{cam}: {rms[cam]:.2f} px RMS, at most {limits.rms_px:g} allowed: are the images "
+                "blurred, or --target or the intrinsics wrong?"
             )
         unfit = corners.count_outliers(residuals, fit.sigmas.px, limits.rms_px)
         if unfit > limits.outlier_share * len(residuals):
             out.append(
                 f"cam{cam}: {unfit} of {len(residuals)} corners do not fit within {limits.rms_px:g} px, at "
-                f"most {limits.outlier_share:.0%}"
+                f"most {limits.outlier_share:.0%} allowed"
             )
     return out
 
@@ -98,37 +99,29 @@ def _motion_failures(turning: F64, moving: F64, limits: CameraImuLimits) -> list
     out = []
     if turning[2] < limits.rotation_rate_rms:
         out.append(
-            f"turned by {turning[2]:.2f} "
-            f"rad/s rms about one axis, "
-            f"{limits.rotation_rate_rms:g} needed about each: "
-            "nod, roll and look around"
+            f"turned by {turning[2]:.2f} rad/s rms about one axis, {limits.rotation_rate_rms:g} needed "
+            "about each: nod, roll and look around"
         )
     if moving[2] < limits.acceleration_rms:
         out.append(
-            f"accelerated by {moving[2]:.2f} m/s^2 rms along one "
-            f"axis, {limits.acceleration_rms:g} "
-            f"needed along each: "
-            "move to and fro, up and down, near and far"
+            f"accelerated by {moving[2]:.2f} m/s^2 rms along one axis, {limits.acceleration_rms:g} needed "
+            "along each: move to and fro, up and down, near and far"
         )
     return out
 
 
 def _imu_failures(gyro: float, accel: float, gravity: F64, limits: CameraImuLimits) -> list[str]:
     out = [
-        f"{name}'s residuals are {times:.1f} times its stated "
-        f"noise, at most "
-        f"{limits.imu_noise_ratio:g}: is --imu of "
-        "this device, the IMU fixed to the cameras, the board as large as --target says?"
+        f"{name}: residuals are {times:.1f} times the stated noise, at most {limits.imu_noise_ratio:g} "
+        "allowed: is --imu of this device, the IMU fixed to the cameras, the board's size as in --target?"
         for name, times in (("gyroscope", gyro), ("accelerometer", accel))
         if not times <= limits.imu_noise_ratio
     ]
     deviation = float(np.linalg.norm(gravity)) - _STANDARD_GRAVITY
     if not abs(deviation) <= limits.gravity:
         out.append(
-            f"gravity comes out {deviation:+.2f} m/s^2 off "
-            f"{_STANDARD_GRAVITY:g}, at "
-            f"most {limits.gravity:g}: "
-            "the accelerometer's scale, or its units"
+            f"gravity differs by {deviation:+.2f} m/s^2 from {_STANDARD_GRAVITY:g}, at most "
+            f"{limits.gravity:g} allowed: check the accelerometer's scale and units"
         )
     return out
 
@@ -150,14 +143,14 @@ def _sigma_failures(fit: CameraImuFit, limits: CameraImuLimits) -> list[str]:
 
 
 def largest_sigmas(sigmas: F64) -> tuple[float, float, float]:
-    """The largest of seven sigmas: deg, mm, ms."""
+    """Return the largest of seven sigmas: deg, mm, ms."""
     return float(np.degrees(sigmas[:3]).max()), 1e3 * float(sigmas[3:6].max()), 1e3 * float(sigmas[6])
 
 
 @dataclass(frozen=True)
 class MountingComparison:
-    """How far found mounting and given one are apart; inverted: the inverse of the given one is what was
-    found."""
+    """Difference of the estimated extrinsics from the given ones. inverted: the inverse of the given ones
+    matches."""
 
     turned_deg: float
     shifted_mm: float
@@ -169,7 +162,7 @@ class MountingComparison:
 
 
 def compare_mountings(T_imu_cam0: F64, other: F64) -> MountingComparison:
-    """The mounting that was found with T_imu_cam0 (4, 4) as a file has it."""
+    """Compare the estimated T_imu_cam0 (4, 4) with that of a file."""
     straight, inverse = _difference(T_imu_cam0, other), _difference(T_imu_cam0, se3.inverse(other))
     inverted = _distance_units(*straight) > 1 and _distance_units(*inverse) < min(
         _FAR_UNITS, _distance_units(*straight) / 3
@@ -178,7 +171,7 @@ def compare_mountings(T_imu_cam0: F64, other: F64) -> MountingComparison:
 
 
 def _difference(T: F64, other: F64) -> tuple[float, float]:
-    """deg, mm."""
+    """Return the difference, deg and mm."""
     distance = np.linalg.norm(T[:3, 3] - other[:3, 3])
     return float(np.degrees(se3.rotation_angle(T[:3, :3].T @ other[:3, :3]))), 1e3 * float(distance)
 
