@@ -61,7 +61,7 @@ sbom: install $(FREEZE)/installed
 	$(PIP) -e '.[release]'
 	$(BIN)/python tools/sbom.py $(FREEZE)/python dist/share.cdx.json
 licenses: install $(FREEZE)/installed
-	$(BIN)/python tools/licenses.py $(FREEZE)/python docs/licenses.md
+	$(BIN)/python tools/licenses.py $(FREEZE)/python docs/lookup/licenses.md
 audit: install
 	$(PIP) -e '.[release]'
 	@for one in $(LOCKS)/*.txt; do echo "$$one"; $(BIN)/pip-audit --strict --disable-pip --require-hashes -r $$one || exit 1; done

@@ -2,7 +2,7 @@
 
 Under the error of `share.odometry.state` the transition knows the means only where biases
 enter, so it is sums over the samples, not a product of matrices. Source: Barrau & Bonnabel (2017);
-derived in docs/vio.md.
+derived in docs/understand/odometry.md.
 """
 
 from __future__ import annotations

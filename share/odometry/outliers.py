@@ -154,7 +154,7 @@ _MAX_MEDIAN_NIS = 0.8  # of the median squared Mahalanobis distance, which is 0.
 class ImageImuConsistency:
     """A camera that is turned or shifted against its calibration, or whose clock is off, is tracked all the
     same, a little beside where the IMU says, all features alike, frame after frame: none is refused for it.
-    With 5 degrees and 5 cm the median rises to 1.2 to 3 (docs/vio.md)."""
+    With 5 degrees and 5 cm the median rises to 1.2 to 3 (docs/understand/odometry.md)."""
 
     def __init__(self) -> None:
         self._mean, self._seconds = 0.0, 0.0

@@ -44,7 +44,7 @@ def strongest(
     image: U8, occupied_px: F32, count: int, spacing: float, quality: float = 0.005, mask: U8 | None = None
 ) -> F32:
     """As `detect`, wherever they are: those down to `quality` times the best. Few good ones are worth more
-    than many where no IMU helps (0.5 cm less in the kitchen of docs/tracking.md)."""
+    than many where no IMU helps (0.5 cm less in the kitchen of docs/understand/odometry-without-imu.md)."""
     if count <= 0:
         return np.zeros((0, 2), np.float32)
     free = _free_mask(occupied_px, spacing, image.shape)

@@ -1,7 +1,7 @@
 """Corners of a calibration target in an image, by their ids.
 
 OpenCV finds and reads the markers; which corner is which, and how an AprilGrid's are refined, is written down
-in docs/calibration-boards.md. Partial views are well: every corner that is seen counts on its own.
+in docs/do/calibration-boards.md. Partial views are well: every corner that is seen counts on its own.
 """
 
 from __future__ import annotations

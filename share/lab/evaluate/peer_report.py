@@ -18,7 +18,7 @@ from share.runtime.machine import describe_machine
 
 PROTOCOL = (
     "causal poses of all frames, as each tracker told them at the time; truth interpolated at their stamps",
-    "ATE: rms under one SE3 alignment; RPE: rms over 1 s, without one; docs/evaluation.md",
+    "ATE: rms under one SE3 alignment; RPE: rms over 1 s, without one; docs/do/evaluate.md",
     "CPU: process time of all threads, decoding apart; ours with its keyframes",
     "'in the end': not causal, the trajectory by the map that a tracker has when all is over",
 )

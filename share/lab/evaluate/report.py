@@ -119,7 +119,7 @@ PROTOCOL = (
     "latency: mean over all frames' track_ms and all corrected_ms together; ms from a frame's arrival",
     "poses: causal, every frame that has one; truth interpolated at their stamps over at most 100 ms",
     "odom ATE: rms, SE3-aligned, each agent alone; map ATE: rms under one SE3 alignment for all in one map",
-    "RPE: rms of poses in the map, from frame to frame and over 1 s, no alignment; docs/evaluation.md",
+    "RPE: rms of poses in the map, from frame to frame and over 1 s, no alignment; docs/do/evaluate.md",
 )
 _INTERVAL_NOTE = (
     "In brackets: 95 % by drawing sessions again, each with all its runs; none where there is one session."

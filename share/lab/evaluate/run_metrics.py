@@ -27,7 +27,7 @@ class Conditions:
 class AgentMetrics:
     """Of one agent in one run; NaN is what could not be measured.
 
-    latency_ms and its parts: docs/evaluation.md. odom_ate_cm: of odom_n frames, alone, SE3-aligned. ate_cm:
+    latency_ms and its parts: docs/do/evaluate.md. odom_ate_cm: of odom_n frames, alone, SE3-aligned. ate_cm:
     of the in_map frames that have a pose in the shared map, one alignment for all who are in it; NaN for who
     did not come into it. rpe_*: of poses in the map, rms of *_n pairs, from frame to frame and over 1 s.
     metres: how far it went. joined_s: since the first agent came, until it shared a map. qoe: mean over

@@ -72,7 +72,7 @@ _SLICES = Sampled((*[0.0] * 11, 0.45, 2.2, 2.7, 3.5, 4.0, 4.7, 5.3, 5.6, 5.9, 8.
 class ProcessingDelays:
     """Of a frame at the agent until its pose is out, of a keyframe from then until it may be sent, and of the
     slice of keyframes' work that may come after any frame; of a message at the edge's front; of what its
-    mapper and its solver do. Defaults: docs/scheduling-figures.md."""
+    mapper and its solver do. Defaults: docs/lab/scheduling-figures.md."""
 
     frame: Delay = Delay(4.3, 5.4)
     keyframe: Delay = Delay(3.9, 4.7)

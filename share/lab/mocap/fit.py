@@ -3,7 +3,7 @@
 Mocap alone is noisy, its body is not the IMU's, its world not quite level, its clock another. So all
 are solved for at once: pose, velocity and biases at nodes, IMU preintegrated between them, mocap
 poses at their own times, robust, through an unknown tilt, mounting and delay. The mathematics and
-what it attains: docs/mocap-fit.md.
+what it attains: docs/understand/mocap-fit.md.
 """
 
 from __future__ import annotations

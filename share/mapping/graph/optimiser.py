@@ -25,7 +25,7 @@ from share.types import F64, I64
 #
 # Odometry is Gaussian; loops are under a Cauchy kernel, since one false loop must not bend the map. Source:
 # Triggs et al., *Bundle Adjustment: A Modern Synthesis*, 2000; Cauchy against 30 % false loops:
-# docs/edge-map.md.
+# docs/understand/mapping.md.
 
 _INITIAL_DAMPING, _MAX_DAMPING = 1e-4, 1e8
 _MIN_CURVATURE = 0.5  # of a loop along its residual, beside that across; 0.3 overshot at times

@@ -1,7 +1,7 @@
 """The pose graphs of all maps, kept solved: the solver is told only what is new.
 
 Every solution starts from the one before. It runs in one thread and needs no clock; what it costs:
-docs/edge-map.md.
+docs/understand/mapping.md.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from share.vision.corners import cell_indices
 
 # ---- Eight numbers of a keyframe: how its image looks, and how its tracker fares.
 #
-# Source: SHARE, IMWUT 10(3) 97, 2026; what it leaves open is settled in docs/error-model.md.
+# Source: SHARE, IMWUT 10(3) 97, 2026; what it leaves open is settled in docs/understand/error-model.md.
 
 SCALAR_NAMES = (
     "brightness",
@@ -81,7 +81,7 @@ def _log_count(count: int) -> float:
 # ---- Where in the image there is something to hold on to: the point spatial distribution (PSD).
 #
 # A grid over cam0's image with three channels: how strong a corner each cell has, how many features there the
-# pose rests on, and how near they are. Source: SHARE, IMWUT 10(3) 97, 2026; scales: docs/error-model.md.
+# pose rests on, and how near they are. Source: SHARE, IMWUT 10(3) 97, 2026; scales: docs/understand/error-model.md.
 
 PSD_GRID = (16, 12)  # cells across and down, whatever the camera
 PSD_CHANNELS = 3
