@@ -1,4 +1,4 @@
-"""The table of settings in docs/lookup/configuration.md, made from share/config.py: names, defaults, comments.
+"""The table of settings in docs/lookup/configuration.md, from share/config.py: names, defaults, comments.
 
 python tools/config_table.py            print it
 python tools/config_table.py --write    put it into docs/lookup/configuration.md, below its marker

@@ -8,7 +8,7 @@
 
 The set: two rooms, in each two headsets and a robot for 30 s, over wifi5 by `share` and by `covins-g`, two
 seeds, as shipped. Sessions are made once and kept (--cache). In virtual time nothing depends on how busy this
-machine is; how quick it is, `make bench` says. The history: docs/lab/results/regression.jsonl. A figure is held
+machine is; how quick it is, `make bench` says. History: docs/lab/results/regression.jsonl. A figure is held
 against its median over all lines since it was accepted (by name, or `all`), so that many small steps down are
 seen as one large one.
 """

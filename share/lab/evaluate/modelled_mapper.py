@@ -37,7 +37,8 @@ _CACHE_SIZE = 50_000  # keyframes, each with all of one agent: some 100 MB
 
 @dataclass(frozen=True)
 class RecognitionModel:
-    """Of recognition, in parts of a view's volume, and of a solved map. Defaults: docs/understand/scheduling.md.
+    """Of recognition, in parts of a view's volume, and of a solved map. Defaults:
+    docs/understand/scheduling.md.
 
     half, width: two views that share `half_overlap` are verified every second time, by a logistic curve
     `logistic_width`

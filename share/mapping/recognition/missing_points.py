@@ -3,8 +3,8 @@
 Two places that look alike share most points, but not all: what only one of them has is missing in the
 other. Single points are missing anywhere (detectors miss them, things hide each other); where all points of
 a patch of the image are missing, a *thing* is gone: a poster, a door, a box. In one pair of views even that
-proves little, so this is evidence to be added up over many pairs, not a verdict. docs/understand/place-recognition.md has its
-distributions.
+proves little, so this is evidence to be added up over many pairs, not a verdict. Distributions:
+docs/understand/place-recognition.md.
 """
 
 from __future__ import annotations

@@ -81,7 +81,8 @@ def _log_count(count: int) -> float:
 # ---- Where in the image there is something to hold on to: the point spatial distribution (PSD).
 #
 # A grid over cam0's image with three channels: how strong a corner each cell has, how many features there the
-# pose rests on, and how near they are. Source: SHARE, IMWUT 10(3) 97, 2026; scales: docs/understand/error-model.md.
+# pose rests on, and how near they are. Source: SHARE, IMWUT 10(3) 97, 2026; scales:
+# docs/understand/error-model.md.
 
 PSD_GRID = (16, 12)  # cells across and down, whatever the camera
 PSD_CHANNELS = 3
