@@ -158,6 +158,15 @@ def test_modules_and_classes_that_a_page_cites_exist(page: Path, known_names: se
     assert classes - known_names - NOT_OURS == set(), page.name
 
 
+def test_the_site_lists_every_page() -> None:
+    """Needs no MkDocs; `make docs` builds the site and checks its links strictly."""
+    listed = re.findall(
+        r"^ +- (?:.+: )?([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), flags=re.MULTILINE
+    )
+    pages = [p.relative_to(DOCS) for p in DOCS.rglob("*.md")]
+    assert sorted(listed) == sorted(str(p) for p in pages if "results" not in p.parts)
+
+
 def test_every_picture_of_docs_is_shown_on_a_page() -> None:
     text = "".join(page.read_text() for page in PAGES)
     pictures = [p for ext in ("jpg", "png", "svg") for p in DOCS.rglob(f"*.{ext}")]
