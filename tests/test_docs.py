@@ -146,7 +146,7 @@ def exists(dotted: str) -> bool:
 
 
 @pytest.mark.parametrize("page", CITING, ids=lambda p: str(p.relative_to(ROOT)))
-def test_modules_and_classes_that_a_page_cites_exist(page: Path, known_names: set[str]) -> None:
+def test_modules_classes_and_attributes_that_a_page_cites_exist(page: Path, known_names: set[str]) -> None:
     code = re.findall(r"`([^`\n]+)`", prose(page.read_text()))
     dotted = {c for c in code if re.fullmatch(r"share(\.[a-z_0-9]+)+(\.[A-Z]\w*)?", c)}
     for name in dotted - NOT_MODULES:
@@ -154,7 +154,8 @@ def test_modules_and_classes_that_a_page_cites_exist(page: Path, known_names: se
         assert exists(name) or (exists(module) and last in known_names), f"{page.name}: {name}"
     for path in {c for c in code if re.fullmatch(r"(share|tools|tests)/[a-z\d_/.-]+", c)}:
         assert (ROOT / path).exists(), f"{page.name}: {path}"
-    classes = {c.split("(")[0].split(".")[0] for c in code if re.match(r"[A-Z][a-z]+[A-Z]\w*(\.\w+)?$", c)}
+    cited = [c.split(".") for c in code if re.fullmatch(r"[A-Z][a-z]+[A-Z]\w*(\.[a-z]\w+)?", c)]
+    classes = {name for words in cited for name in words}
     assert classes - known_names - NOT_OURS == set(), page.name
 
 
