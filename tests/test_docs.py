@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import builtins
 import re
 import runpy
 from pathlib import Path
@@ -20,7 +18,6 @@ PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("*/README.md
 CITING = [page for page in PAGES if page.name != "renamed.md" and "results" not in page.parts]
 NOT_MODULES = {"share.x.y", "share.rig"}  # an example; a record in MCAP files
 NOT_OURS = {"AprilGrid", "ChArUco", "BasaltVIO", "CameraInfo", "CompressedImage", "MemoryError"}
-IMPORTS = (ast.Import, ast.ImportFrom)
 TOOL: dict[str, Any] = runpy.run_path(str(ROOT / "tools" / "config_table.py"))
 COMMANDS = (DOCS / "lookup" / "commands.md").read_text()
 
@@ -117,46 +114,32 @@ def test_fenced_code_has_a_language_and_none_is_indented(page: Path) -> None:
     assert re.findall(r"\n\n( {4}\S.*)", prose(text)) == []
 
 
-def modules() -> dict[str, ast.Module]:
-    """The syntax trees of share/ and tools/, by path."""
-    files = [p for folder in ("share", "tools") for p in (ROOT / folder).rglob("*.py")]
-    return {str(p.relative_to(ROOT)): ast.parse(p.read_text()) for p in files}
-
-
 @pytest.fixture(scope="module")
-def known_names() -> set[str]:
-    """Classes and module-level names of share/ and tools/, and what they import."""
-    names = set(dir(builtins))
-    for tree in modules().values():
-        names |= {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef | ast.FunctionDef)}
-        names |= {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-        names |= {
-            a.asname or a.name.split(".")[0]
-            for n in ast.walk(tree)
-            if isinstance(n, IMPORTS)
-            for a in n.names
-        }
-    return names
+def sources() -> dict[str, str]:
+    """The texts of share/ and tools/, by module name."""
+    files = [p for folder in ("share", "tools") for p in (ROOT / folder).rglob("*.py")]
+    names = {p: ".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for p in files}
+    return {name: path.read_text() for path, name in names.items()}
 
 
-def exists(dotted: str) -> bool:
-    """Whether `share.x.y` is a module or package, or a name in one."""
-    path = ROOT.joinpath(*dotted.split("."))
-    return path.is_dir() or path.with_suffix(".py").exists()
+def defines(text: str, name: str) -> bool:
+    """Whether a line of this source defines a class, function, variable or field of that name."""
+    return bool(re.search(rf"^\s*(?:(?:class|def) {name}\b|(?:self\.)?{name}(?:: | = ))", text, re.MULTILINE))
 
 
 @pytest.mark.parametrize("page", CITING, ids=lambda p: str(p.relative_to(ROOT)))
-def test_modules_classes_and_attributes_that_a_page_cites_exist(page: Path, known_names: set[str]) -> None:
+def test_modules_classes_and_attributes_that_a_page_cites_exist(page: Path, sources: dict[str, str]) -> None:
     code = re.findall(r"`([^`\n]+)`", prose(page.read_text()))
-    dotted = {c for c in code if re.fullmatch(r"share(\.[a-z_0-9]+)+(\.[A-Z]\w*)?", c)}
-    for name in dotted - NOT_MODULES:
+    for name in {c for c in code if re.fullmatch(r"share(\.\w+)+", c)} - NOT_MODULES:
         module, _, last = name.rpartition(".")
-        assert exists(name) or (exists(module) and last in known_names), f"{page.name}: {name}"
+        assert name in sources or defines(sources.get(module, ""), last), f"{page.name}: {name}"
     for path in {c for c in code if re.fullmatch(r"(share|tools|tests)/[a-z\d_/.-]+", c)}:
         assert (ROOT / path).exists(), f"{page.name}: {path}"
-    cited = [c.split(".") for c in code if re.fullmatch(r"[A-Z][a-z]+[A-Z]\w*(\.[a-z]\w+)?", c)]
-    classes = {name for words in cited for name in words}
-    assert classes - known_names - NOT_OURS == set(), page.name
+    for cited in {c for c in code if re.fullmatch(r"[A-Z][a-z]+[A-Z]\w*(\.[a-z]\w+)?", c)} - NOT_OURS:
+        owner, _, attribute = cited.partition(".")
+        homes = [text for text in sources.values() if defines(text, owner)]
+        assert homes, f"{page.name}: {cited}"
+        assert not attribute or any(defines(text, attribute) for text in homes), f"{page.name}: {cited}"
 
 
 def test_the_site_lists_every_page() -> None:
