@@ -17,7 +17,15 @@ DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("*/README.md")])
 CITING = [page for page in PAGES if page.name != "renamed.md" and "results" not in page.parts]
 NOT_MODULES = {"share.x.y", "share.rig"}  # an example; a record in MCAP files
-NOT_OURS = {"AprilGrid", "ChArUco", "BasaltVIO", "CameraInfo", "CompressedImage", "MemoryError"}
+NOT_OURS = {
+    "AprilGrid",
+    "ChArUco",
+    "BasaltVIO",
+    "CameraInfo",
+    "CompressedImage",
+    "MemoryError",
+    "RecursionError",
+}
 TOOL: dict[str, Any] = runpy.run_path(str(ROOT / "tools" / "config_table.py"))
 COMMANDS = (DOCS / "lookup" / "commands.md").read_text()
 
@@ -124,7 +132,9 @@ def sources() -> dict[str, str]:
 
 def defines(text: str, name: str) -> bool:
     """Whether a line of this source defines a class, function, variable or field of that name."""
-    return bool(re.search(rf"^\s*(?:(?:class|def) {name}\b|(?:self\.)?{name}(?:: | = ))", text, re.MULTILINE))
+    return name in text and bool(
+        re.search(rf"^\s*(?:(?:class|def) {name}\b|(?:self\.)?{name}(?:: | = ))", text, re.MULTILINE)
+    )
 
 
 @pytest.mark.parametrize("page", CITING, ids=lambda p: str(p.relative_to(ROOT)))
