@@ -3,7 +3,7 @@ PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: install demo test lint type bench slow torture soak train-test freeze lock sbom licenses audit vio-figures
+.PHONY: install demo test lint type bench slow torture soak train-test freeze lock sbom licenses audit vio-figures docs
 
 install: .venv/installed
 .venv/installed: setup.cfg pyproject.toml
@@ -34,6 +34,10 @@ type: install
 	$(BIN)/mypy
 bench: install
 	$(BIN)/python tools/bench.py
+docs: install  # the site, into build/site; once installed it needs no network
+	@$(BIN)/python -c "import material" 2>/dev/null || $(PIP) -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(BIN)/pytest tests/test_docs.py
 vio-figures: install
 	$(BIN)/python tools/measure_vio.py
 # The frozen program is built in an environment of its own, of exactly what the lock file says.
@@ -61,7 +65,7 @@ sbom: install $(FREEZE)/installed
 	$(PIP) -e '.[release]'
 	$(BIN)/python tools/sbom.py $(FREEZE)/python dist/share.cdx.json
 licenses: install $(FREEZE)/installed
-	$(BIN)/python tools/licenses.py $(FREEZE)/python docs/licenses.md
+	$(BIN)/python tools/licenses.py $(FREEZE)/python docs/lookup/licenses.md
 audit: install
 	$(PIP) -e '.[release]'
 	@for one in $(LOCKS)/*.txt; do echo "$$one"; $(BIN)/pip-audit --strict --disable-pip --require-hashes -r $$one || exit 1; done

@@ -200,7 +200,7 @@ class ClockConfig:
     least_of: int = 64  # exchanges among which the least delay is sought
     gate_sigma: float = 4.0  # an exchange further off is not believed
     step_after: int = 5  # but so many in a row are: the clock was set
-    claim_ms: float = 1.0  # an offset less sure than this is not told as a number (docs/sync.md)
+    claim_ms: float = 1.0  # an offset less sure than this is not told as a number (docs/do/sync.md)
 
     def __post_init__(self) -> None:
         _require_positive(self, "noise_us", "drift_ppm", "least_of", "gate_sigma", "step_after", "claim_ms")
@@ -301,7 +301,7 @@ class AgentQoe:
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """How agents are rated, what they may send, what is merged (docs/scheduling.md)."""
+    """How agents are rated, what they may send, what is merged (docs/understand/scheduling.md)."""
 
     ar_beta: float = 0.015  # 1/ms, of delay beyond 20 ms
     ar_gamma: float = 3.6  # cm, of accuracy

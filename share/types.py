@@ -1,4 +1,4 @@
-"""The frozen values that every layer speaks. Frames and units follow docs/architecture.md.
+"""The frozen values that every layer speaks. Frames and units follow docs/understand/architecture.md.
 
 Arrays are validated for shape and dtype and made read-only on construction, so a value can be
 handed to another thread without a copy. Poses are 4x4 matrices `T_a_b` with p_a = T_a_b p_b;

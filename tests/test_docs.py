@@ -13,9 +13,21 @@ import pytest
 from share.cli.main import cli
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("*/README.md")])
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("*/README.md")])
+CITING = [page for page in PAGES if page.name != "renamed.md" and "results" not in page.parts]
+NOT_MODULES = {"share.x.y", "share.rig"}  # an example; a record in MCAP files
+NOT_OURS = {
+    "AprilGrid",
+    "ChArUco",
+    "BasaltVIO",
+    "CameraInfo",
+    "CompressedImage",
+    "MemoryError",
+    "RecursionError",
+}
 TOOL: dict[str, Any] = runpy.run_path(str(ROOT / "tools" / "config_table.py"))
-COMMANDS = (ROOT / "docs" / "commands.md").read_text()
+COMMANDS = (DOCS / "lookup" / "commands.md").read_text()
 
 
 def commands(group: click.Group, name: str = "share") -> dict[str, click.Command]:
@@ -30,7 +42,7 @@ def commands(group: click.Group, name: str = "share") -> dict[str, click.Command
 
 
 def documented() -> dict[str, str]:
-    """The sections of docs/commands.md that are about one command, by its full name."""
+    """The sections of docs/lookup/commands.md that are about one command, by its full name."""
     parts = re.split(r"^## `(share [a-z -]+)`\n", COMMANDS, flags=re.MULTILINE)[1:]
     return dict(zip(parts[::2], parts[1::2], strict=True))
 
@@ -39,9 +51,20 @@ def options(command: click.Command) -> set[str]:
     return {max(p.opts, key=len) for p in command.params if isinstance(p, click.Option)}
 
 
+def prose(text: str) -> str:
+    """The text without fenced code."""
+    return re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def links(text: str) -> list[str]:
+    """Targets of Markdown links and of src, srcset and href."""
+    text = re.sub(r"`[^`\n]*`", "", prose(text))
+    return re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'(?:src|srcset|href)="([^"]+)"', text)
+
+
 def anchors(page: Path) -> set[str]:
     """As GitHub makes them of headings."""
-    headings = re.findall(r"^#+ (.+)$", page.read_text(), flags=re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", prose(page.read_text()), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
 
 
@@ -69,9 +92,7 @@ def test_table_has_every_key_and_its_default() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
-    prose = re.sub(r"(?m)^ {4}.*$|`[^`]*`", "", page.read_text())
-    targets = re.findall(r"\]\(([^)\s]+)\)", prose) + re.findall(r'(?:src|srcset|href)="([^"]+)"', prose)
-    for target in targets:
+    for target in links(page.read_text()):
         if re.match(r"https?://", target):
             continue
         name, _, anchor = target.partition("#")
@@ -81,13 +102,68 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 def test_every_page_of_docs_can_be_reached_from_the_readme() -> None:
-    text = (ROOT / "README.md").read_text()
-    assert [p.name for p in (ROOT / "docs").glob("*.md") if f"docs/{p.name}" not in text] == []
+    reached, waiting = set(), [ROOT / "README.md"]
+    while waiting:
+        page = waiting.pop()
+        if page not in reached:
+            reached.add(page)
+            targets = [t.partition("#")[0] for t in links(page.read_text())]
+            waiting += [(page.parent / t).resolve() for t in targets if t.endswith(".md") and "://" not in t]
+    assert [str(p.relative_to(ROOT)) for p in DOCS.rglob("*.md") if p not in reached] == [
+        "docs/index.md"  # the site's front page; on a code host the README is
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_fenced_code_has_a_language_and_none_is_indented(page: Path) -> None:
+    text = page.read_text()
+    openings = re.findall(r"^```(.*)$", text, flags=re.MULTILINE)
+    assert len(openings) % 2 == 0 and all(openings[::2]) and not any(openings[1::2])
+    assert re.findall(r"\n\n( {4}\S.*)", prose(text)) == []
+
+
+@pytest.fixture(scope="module")
+def sources() -> dict[str, str]:
+    """The texts of share/ and tools/, by module name."""
+    files = [p for folder in ("share", "tools") for p in (ROOT / folder).rglob("*.py")]
+    names = {p: ".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for p in files}
+    return {name: path.read_text() for path, name in names.items()}
+
+
+def defines(text: str, name: str) -> bool:
+    """Whether a line of this source defines a class, function, variable or field of that name."""
+    return name in text and bool(
+        re.search(rf"^\s*(?:(?:class|def) {name}\b|(?:self\.)?{name}(?:: | = ))", text, re.MULTILINE)
+    )
+
+
+@pytest.mark.parametrize("page", CITING, ids=lambda p: str(p.relative_to(ROOT)))
+def test_modules_classes_and_attributes_that_a_page_cites_exist(page: Path, sources: dict[str, str]) -> None:
+    code = re.findall(r"`([^`\n]+)`", prose(page.read_text()))
+    for name in {c for c in code if re.fullmatch(r"share(\.\w+)+", c)} - NOT_MODULES:
+        module, _, last = name.rpartition(".")
+        assert name in sources or defines(sources.get(module, ""), last), f"{page.name}: {name}"
+    for path in {c for c in code if re.fullmatch(r"(share|tools|tests)/[a-z\d_/.-]+", c)}:
+        assert (ROOT / path).exists(), f"{page.name}: {path}"
+    for cited in {c for c in code if re.fullmatch(r"[A-Z][a-z]+[A-Z]\w*(\.[a-z]\w+)?", c)} - NOT_OURS:
+        owner, _, attribute = cited.partition(".")
+        homes = [text for text in sources.values() if defines(text, owner)]
+        assert homes, f"{page.name}: {cited}"
+        assert not attribute or any(defines(text, attribute) for text in homes), f"{page.name}: {cited}"
+
+
+def test_the_site_lists_every_page() -> None:
+    """Needs no MkDocs; `make docs` builds the site and checks its links strictly."""
+    listed = re.findall(
+        r"^ +- (?:.+: )?([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), flags=re.MULTILINE
+    )
+    pages = [p.relative_to(DOCS) for p in DOCS.rglob("*.md")]
+    assert sorted(listed) == sorted(str(p) for p in pages if "results" not in p.parts)
 
 
 def test_every_picture_of_docs_is_shown_on_a_page() -> None:
     text = "".join(page.read_text() for page in PAGES)
-    pictures = [p for ext in ("jpg", "png", "svg") for p in (ROOT / "docs").rglob(f"*.{ext}")]
+    pictures = [p for ext in ("jpg", "png", "svg") for p in DOCS.rglob(f"*.{ext}")]
     assert pictures and [p.name for p in pictures if p.name not in text] == []
 
 
@@ -103,10 +179,11 @@ def test_commands_page_has_every_option_and_no_other(name: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_examples_use_options_that_exist(page: Path) -> None:
-    """Every indented line that is a command, after a prompt or not; `share agent: …` is one that answers."""
+    """Every fenced line that is a command, after a prompt or not; `share agent: …` is one that answers."""
     known = commands(cli)
     text = page.read_text().replace("\\\n", " ")
-    for line in re.findall(r"^ {4}(?:\w*\$ )?(share (?!\w+: ).+)$", text, flags=re.MULTILINE):
+    code = "\n".join(re.findall(r"^```\w+\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL))
+    for line in re.findall(r"^(?:\w*\$ )?(share (?!\w+: ).+)$", code, flags=re.MULTILINE):
         line = re.split(r"\s{2,}#|\s&", line)[0]
         name = max((n for n in known if f"{line} ".startswith(f"{n} ")), key=len, default=None)
         assert name or re.match(r"share (--|[a-z]+ --help)", line), f"{page.name}: {line}"

@@ -1,7 +1,7 @@
-"""The table of settings in docs/configuration.md, made from share/config.py: names, defaults, comments.
+"""The table of settings in docs/lookup/configuration.md, from share/config.py: names, defaults, comments.
 
 python tools/config_table.py            print it
-python tools/config_table.py --write    put it into docs/configuration.md, below its marker
+python tools/config_table.py --write    put it into docs/lookup/configuration.md, below its marker
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "share" / "config.py"
-PAGE = ROOT / "docs" / "configuration.md"
+PAGE = ROOT / "docs" / "lookup" / "configuration.md"
 MARKER = "<!-- Below: made by tools/config_table.py from share/config.py. Change it there. -->\n"
 
 # By how a name ends; the first that fits.

@@ -1,4 +1,4 @@
-"""Puts the frozen program onto a device, as services that start on boot. See docs/deployment.md."""
+"""Puts the frozen program onto a device, as services that start on boot. See docs/do/deploy.md."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from share.net.transport import parse_address
 
 DIST = Path(__file__).resolve().parents[1] / "dist" / "share"
 PROFILES = {"ar": "d435i-n100-headset", "robot": "d435i-turtlebot4", "": "laptop-edge"}  # by KIND
-NO_SETTINGS = "# Settings of SHARE on this device: docs/configuration.md\n{}\n"
+NO_SETTINGS = "# Settings of SHARE on this device: docs/lookup/configuration.md\n{}\n"
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def common(command: Callable[..., None]) -> Callable[..., None]:
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 def cli() -> None:
-    """Put SHARE onto a device, as a service that starts on boot, or the program alone: docs/deployment.md.
+    """Put SHARE onto a device, as a service that starts on boot, or the program alone: docs/do/deploy.md.
 
     \b
     Example:  tools/deploy program pi@headset1
@@ -113,7 +113,7 @@ def edge(bind: str | None, http: str | None, **others: Any) -> None:
 @cli.command()
 @common
 def sync(**others: Any) -> None:
-    """The time of a room: the service share-sync, on the edge's machine (docs/sync.md).
+    """The time of a room: the service share-sync, on the edge's machine (docs/do/sync.md).
 
     \b
     Example:  tools/deploy sync me@laptop

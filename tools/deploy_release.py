@@ -80,7 +80,7 @@ def _members(folder: Path) -> list[tuple[str, Path | bytes]]:
 def _at_boot(profile: str) -> bytes:
     """What such a computer is set to."""
     host = load_host_profile(profile).host
-    head = f"# Of SHARE, for {profile}: docs/deployment.md"
+    head = f"# Of SHARE, for {profile}: docs/do/deploy.md"
     return "".join(
         f"{line}\n" for line in (head, *checks.tmpfiles_lines(host.cpu_governor, host.usbfs_mb))
     ).encode()

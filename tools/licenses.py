@@ -1,4 +1,4 @@
-"""The licences of what the frozen program is built from: docs/licenses.md.
+"""The licences of what the frozen program is built from: docs/lookup/licenses.md.
 
     python tools/licenses.py PYTHON PAGE
 

@@ -88,7 +88,7 @@ class _Agent:
             except zmq.Again:
                 return
             _, code, scalars, _ = msgspec.msgpack.decode(frames[0])
-            match code:  # docs/wire.md
+            match code:  # docs/lookup/wire.md
                 case 16:  # Welcome
                     self.welcome = True
                 case 17:  # Refused

@@ -3,7 +3,7 @@
     python tools/measure_load.py [--agents 3 6 12 24 32 48] [--seconds 40] [--out out/load]
 
 Writes load.json to --out and prints a Markdown table. CPU is that of the edge's three processes, in seconds
-per second; agents share the machine. The first 10 s are not counted. docs/edge-load.md has the figures.
+per second; agents share the machine. The first 10 s are not counted. docs/lab/edge-load.md has the figures.
 """
 
 from __future__ import annotations

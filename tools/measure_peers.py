@@ -4,7 +4,7 @@
     python tools/measure_peers.py --peer basalt=DIR/bin/python [--only NAME] [--seeds 101,102,103]
 
 `share evaluate compare` on the sequences of measure_vio, which are made where they are not there. Runs are
-kept in --out; docs/peers.md has a table and says what is not fair in it.
+kept in --out; docs/do/compare-trackers.md has a table and says what is not fair in it.
 """
 
 from __future__ import annotations

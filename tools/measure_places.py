@@ -2,10 +2,10 @@
 
     python tools/measure_places.py --data FOLDER [--emulated] [--far 2000] [--picture FILE.png]
 
-FOLDER holds the stereo keyframes and the RGB-D kitchen of docs/edge-map.md. True pairs are nearer than 1 m
-and 30 degrees; an accepted pose is wrong by more than 0.25 m or 5 degrees. Of the pairs that are not true,
---far are tried and stand for all. --emulated: warehouse, firestation and corridor-twins as well (made once,
-which takes minutes).
+FOLDER holds the stereo keyframes and the RGB-D kitchen of docs/understand/mapping.md. True pairs are nearer
+than 1 m and 30 degrees; an accepted pose is wrong by more than 0.25 m or 5 degrees. Of the pairs that are not
+true, --far are tried and stand for all. --emulated: warehouse, firestation and corridor-twins as well (made
+once, which takes minutes).
 """
 
 from __future__ import annotations

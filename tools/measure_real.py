@@ -6,7 +6,7 @@ Causal poses, as `share track` makes them. Needs the recordings in --data.
 `pairs`: 50 stereo pictures of EuRoC V1_01, 0.05 to 7 s apart, with the whole IMU. All go through the tracker
 in order; of every two neighbours the relative motion is compared with the truth's. Allowed are 2 % of the way
 and 1 cm. The truth is the Vicon body's, which is not quite the IMU's: `error` is against the truth moved onto
-the IMU, as fitted over the whole recording (docs/mocap-fit.md), `as given` against the truth as it is.
+the IMU, as fitted over all of it (docs/understand/mocap-fit.md), `as given` against the truth as it is.
 `kitchen`: 500 RGB-D pictures, no IMU.
 `rooms`: TUM-VI's hand-held motion and real IMU; pictures are emulated over the path of the IMU, as fitted to
 the motion capture. `fitted`: against that path. `raw`: against the motion capture as recorded, its clock
@@ -182,7 +182,7 @@ def pair_of(a: Seen, b: Seen) -> Pair:
 
 
 def kitchen(options: argparse.Namespace) -> Iterator[str]:
-    """ATE of the whole and of its halves, which is what docs/tracking.md tells."""
+    """ATE of the whole and of its halves, which is what docs/understand/odometry-without-imu.md tells."""
     folder = there(options.data / "real" / "redkitchen_0000_0499")
     yield "| frames | ATE, cm | without inertial tracker | tracked | lost, s |\n|---|---|---|---|---|"
     for frames, before in KITCHEN.items():

@@ -8,7 +8,7 @@
 
 The set: two rooms, in each two headsets and a robot for 30 s, over wifi5 by `share` and by `covins-g`, two
 seeds, as shipped. Sessions are made once and kept (--cache). In virtual time nothing depends on how busy this
-machine is; how quick it is, `make bench` says. The history: docs/results/regression.jsonl. A figure is held
+machine is; how quick it is, `make bench` says. History: docs/lab/results/regression.jsonl. A figure is held
 against its median over all lines since it was accepted (by name, or `all`), so that many small steps down are
 seen as one large one.
 """
@@ -53,7 +53,7 @@ from share.lab.evaluate.statistics import MEASURES, policy_names  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402
 from share.runtime.machine import describe_machine  # noqa: E402
 
-HISTORY = Path(__file__).resolve().parents[1] / "docs" / "results" / "regression.jsonl"
+HISTORY = Path(__file__).resolve().parents[1] / "docs" / "lab" / "results" / "regression.jsonl"
 _WHO = ("ar1=walk:", "ar2=walk:speed=1.2", "robot=robot:")
 _PROFILES = {"": "d435i:640x480@15"}
 SET = tuple(

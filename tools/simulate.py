@@ -5,8 +5,8 @@
 
 Two headsets and a robot, a minute in an emulated warehouse (keyframes as in tools/measure_load.py, odometry
 that drifts, frames at 30 Hz, evaluations with the true error). Prints a Markdown table: means over seeds of
-latency (as docs/evaluation.md has it) and its parts, keyframes sent, merges, and where agents took themselves
-to be in the map that they shared, cm rms, causal, one alignment of a map for all.
+latency (as docs/do/evaluate.md has it) and its parts, keyframes sent, merges, and where agents took
+themselves to be in the map that they shared, cm rms, causal, one alignment of a map for all.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The frozen program without what its libraries bring and SHARE never uses. Figures: docs/freezing.md."""
+"""The frozen program without what its libraries bring and SHARE never uses. Figures: docs/do/freeze.md."""
 
 from __future__ import annotations
 

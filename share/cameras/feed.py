@@ -246,7 +246,7 @@ def _describe_clocks(placed_by_arrival: Mapping[str, int]) -> str:
     return (
         f"{host_streams} carry the "
         f"host's clock, {device_streams} "
-        f"the camera's: kernel patch missing, see docs/capture.md"
+        f"the camera's: kernel patch missing, see docs/do/record.md"
     )
 
 
@@ -290,7 +290,7 @@ class RateMeter:
 
 
 def feed_report(processor: SampleProcessor, dropped: Mapping[str, int], watchdog: Watchdog) -> dict[str, Any]:
-    """What came, was repaired and lost, as plain data (docs/capture.md)."""
+    """What came, was repaired and lost, as plain data (docs/do/record.md)."""
     streams = {
         name: {
             "samples": gaps.samples,

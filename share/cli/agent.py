@@ -54,7 +54,9 @@ if TYPE_CHECKING:
 @camera_options.camera_options
 @click.option("--out", metavar="DIR", help="Write odom.tum, map.tum, latency.csv and report.json here.")
 @click.option(
-    "--poses", metavar="udp://H:P", help="Send every pose to a program that listens there (docs/poses.md)."
+    "--poses",
+    metavar="udp://H:P",
+    help="Send every pose to a program that listens there (docs/do/integrate.md).",
 )
 @options.config
 @options.verbose

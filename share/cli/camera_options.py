@@ -154,7 +154,7 @@ def camera_summary(report: dict[str, Any]) -> list[str]:
     streams = camera_report["streams"].values()
     counts = [f"{name} {sum(one[name] for one in streams)}" for name in ("missing", "dropped", "backward")]
     lines = [
-        f"camera: {', '.join([*counts, *filter(None, [camera_events(camera_report)])])} (docs/capture.md)"
+        f"camera: {', '.join([*counts, *filter(None, [camera_events(camera_report)])])} (docs/do/record.md)"
     ]
     if (known := report.get("imu_bias", {}).get("from")) is not None:
         lines.append(f"imu bias: from the run of {known}")

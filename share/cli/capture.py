@@ -104,6 +104,6 @@ def _summary(report: dict[str, Any]) -> str:
     ]
     if report["foreign"]:
         lines.append(
-            f"{report['foreign']} stamps are of the host's clock, not of the camera's: see docs/capture.md"
+            f"{report['foreign']} stamps are of the host's clock, not of the camera's: see docs/do/record.md"
         )
     return "\n".join([*lines, f"{report['out']} ({report['ended']})"])

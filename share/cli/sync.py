@@ -48,7 +48,8 @@ def server(bind: str, stratum: int) -> None:
     """Tell others the time of this machine by NTP (RFC 5905), until Ctrl-C.
 
     Its own clock is what is told, whether or not anybody corrects it: all who follow it agree. `share sync
-    check` says what their chrony.conf must say. Where chronyd runs here, it can serve for good: docs/sync.md.
+    check` says what their chrony.conf must say. Where chronyd runs here, it can serve for good:
+    docs/do/sync.md.
 
     \b
     Example:  share sync server --bind 0.0.0.0:11123

@@ -86,7 +86,7 @@ _MAX_OFFSET_M, _MAX_OFFSET_RAD = (
 )  # units of one model differ by millimetres and a degree or two
 _MAX_BASELINE_ERROR = 0.05  # relative
 _SERIAL_CHECK = "serial number"
-_CALIBRATE_FIX = "calibrate again: docs/data.md says which files; give the folder with --calib"
+_CALIBRATE_FIX = "calibrate again: docs/lookup/data.md says which files; give the folder with --calib"
 
 
 def check_calibration(

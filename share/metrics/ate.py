@@ -2,7 +2,7 @@
 
 Source: Sturm et al., *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012, eq. 3;
 Zhang & Scaramuzza, *A Tutorial on Quantitative Trajectory Evaluation*, IROS 2018. Protocol:
-docs/evaluation.md.
+docs/do/evaluate.md.
 """
 
 from __future__ import annotations

@@ -216,7 +216,7 @@ class RunLog:
         return self.frames().csv_chunks()
 
     def report(self) -> dict[str, Any]:
-        """The fields of report.json that come from frames alone (docs/architecture.md)."""
+        """The fields of report.json that come from frames alone (docs/understand/architecture.md)."""
         rows = self.frames()
         frames = len(rows)
         parts = latency(rows.track_ms, rows.corrected_ms)
@@ -242,7 +242,7 @@ class RunLog:
         }
 
 
-# ---- Latency as every table means it (docs/architecture.md; docs/evaluation.md).
+# ---- Latency as every table means it (docs/understand/architecture.md; docs/do/evaluate.md).
 
 NOTICEABLE_LATENCY_MS = 20.0  # a headset wearer notices more
 

@@ -1,7 +1,7 @@
 """Relative pose error: drift over one frame, or over a stretch of time.
 
 Source: Sturm et al., IROS 2012, eq. 1-2: E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) for truth Q, estimate P.
-Needs no alignment. Protocol: docs/evaluation.md.
+Needs no alignment. Protocol: docs/do/evaluate.md.
 """
 
 from __future__ import annotations

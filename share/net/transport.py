@@ -148,7 +148,7 @@ def check_keys(target: Address, keys: AgentKeys | EdgeKeys | None) -> Address:
     if keys is None and not target.local:
         raise UsageError(
             f"{target}: other machines are not spoken to without keys; make them with `share keys generate` "
-            "(docs/deployment-keys.md), or use tcp://127.0.0.1"
+            "(docs/do/keys.md), or use tcp://127.0.0.1"
         )
     return target
 

@@ -2,7 +2,7 @@
 
 With the error of `share.odometry.state`, the transition depends on the means only through the biases, so it
 is a sum over the samples, not a product of matrices. Source: Barrau & Bonnabel (2017); derived in
-docs/vio.md.
+docs/understand/odometry.md.
 """
 
 from __future__ import annotations

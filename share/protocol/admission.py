@@ -16,7 +16,7 @@ from share.wire.messages import Hello, peer_id, public_tag
 # ---- How much one agent may make the mapper work, whatever runs it begins.
 
 # Of every keypoint the mapper's work is about the same, and of a keyframe without any as of so many
-# (docs/robustness.md). An agent of the shipped settings sends keyframes of 500, at most 5 a second
+# (docs/understand/robustness.md). An agent of the shipped settings sends keyframes of 500, at most 5 a second
 # (control.rate_max_hz), and to a new edge at once what its ledger holds, 600. Twice that rate is taken in,
 # and 700 at once.
 _BASE_COST = 250

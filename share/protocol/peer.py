@@ -143,8 +143,9 @@ _MAX_JUMP_M, _MAX_JUMP_M_S = (
     2.0,
     10.0,
 )  # further than this, and so much more a second, nobody moves between keyframes
-# T_ref_body is of what the filter knows now, T_odom_body of what it knew then (docs/edge-map.md): of honest
-# agents these differ by up to 3 cm after 8 s and 6 m, and by 2.7 degrees while a headset learns what is up.
+# T_ref_body is of what the filter knows now, T_odom_body of what it knew then (docs/understand/mapping.md):
+# of honest agents these differ by up to 3 cm after 8 s and 6 m, and by 2.7 degrees while a headset learns
+# what is up.
 _MAX_MISMATCH_M, _MISMATCH_PER_M, _MAX_MISMATCH_RAD = 0.3, 0.05, float(np.radians(12.0))
 _MIN_REFUSALS, _RECENT_S = 10, 10.0  # refused messages that are worth a person's while, and for how long
 _OVERLOAD_SHOWN_S = 2.0  # that it is said of an agent that its keyframes were not taken in

@@ -2,7 +2,7 @@
 
 The body is the IMU's frame where there is an IMU, else cam0's. Cameras are pinhole with
 radial-tangential or equidistant (fisheye) distortion or none; other models are refused by name. The files
-are written down in docs/data.md.
+are written down in docs/lookup/data.md.
 """
 
 from __future__ import annotations

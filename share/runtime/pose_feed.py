@@ -1,4 +1,4 @@
-"""Poses for another program, as they come: a UDP datagram of JSON for each frame (docs/poses.md).
+"""Poses for another program, as they come: a UDP datagram of JSON for each frame (docs/do/integrate.md).
 
 Nobody has to listen, and nobody who listens slowly can hold the agent up: what does not get through is gone,
 and the next pose is newer.

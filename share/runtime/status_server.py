@@ -1,4 +1,4 @@
-"""What the edge is doing, over HTTP: health, metrics, the report, and a page for people (docs/status.md)."""
+"""What the edge is doing, over HTTP: health, metrics, the report, and a page (docs/lookup/status.md)."""
 
 from __future__ import annotations
 

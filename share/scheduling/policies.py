@@ -1,6 +1,6 @@
 """Who may send how much, and whether merges are gated: one class a policy.
 
-Source: SHARE, IMWUT 10(3) 97, 2026, and what it is compared with there; see docs/scheduling.md.
+Source: SHARE, IMWUT 10(3) 97, 2026, and what it is compared with there; see docs/understand/scheduling.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Quality of experience: what an agent's delay and error are worth to whom it serves.
 
 QoE = exp(-beta P) (1 - exp(-gamma Q)): a penalty P for what is missed most, and what a quality Q gains, ever
-less the more there is of it. Source: SHARE, IMWUT 10(3) 97, 2026; defaults and why: docs/scheduling.md.
+less the more there is of it. Source: SHARE, IMWUT 10(3) 97, 2026; defaults and why:
+docs/understand/scheduling.md.
 """
 
 from __future__ import annotations

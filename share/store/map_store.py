@@ -1,4 +1,4 @@
-"""The edge's map on disk: one SQLite file with a log (WAL), and one writer. Read docs/map-file.md."""
+"""The edge's map on disk: one SQLite file with a log (WAL), and one writer. Read docs/lookup/map-file.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages to frames of bytes and back; docs/wire.md has the byte layout.
+"""Messages to frames of bytes and back; docs/lookup/wire.md has the byte layout.
 
 The first frame is a small msgpack header: wire version, message code, scalar fields, and dtype and
 shape of each array. Every array follows as a frame of its own, little-endian, C order, not copied.

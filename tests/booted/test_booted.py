@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -95,7 +96,7 @@ def test_an_edge_that_is_killed_comes_back_with_its_map_and_its_agent(running):
 
 
 def test_the_units_leave_as_little_open_as_the_page_says(running):
-    page = (ROOT / "docs/deployment.md").read_text()
+    page = " ".join((ROOT / "docs/do/deploy.md").read_text().split())
     for unit, told in (("share-agent@ann", "3.8 of 10 for the agent"), ("share-edge", "3.1 for the edge")):
         said = running.run(f"systemd-analyze security --no-pager {unit} | tail -1").out
         assert told in page
@@ -141,9 +142,9 @@ def test_a_sudo_that_asks_for_a_password_is_one_line(running, deploy):
 
 
 def test_taken_away_as_the_page_says_nothing_is_left(running):
-    page = (ROOT / "docs/deployment.md").read_text()
-    lines = page.partition("**Take it away**")[2].partition("\n## ")[0].splitlines()
-    running.run("\n".join(line.strip() for line in lines if line.startswith("    ")))
+    page = (ROOT / "docs/do/deploy.md").read_text()
+    section = page.partition("**Take it away**")[2].partition("\n## ")[0]
+    running.run("\n".join(re.findall(r"```bash\n(.*?)```", section, flags=re.DOTALL)))
     left = "/opt/share /etc/share /var/lib/share /usr/local/bin/share /etc/*/*share* /etc/systemd/*/share-*"
     assert running.run(f"ls -d {left}").out == ""
     assert running.run("systemctl list-units --all 'share-*' -q").out == ""

@@ -156,7 +156,7 @@ def test_wrong_use_is_one_line(share, room, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "turned", "mm"), [("V1_01_easy", 0.28, 5), ("V1_02_medium", 1.41, 5)])
 def test_real_recordings(share, shared_data, tmp_path, name, turned, mm):
-    """As docs/mocap-fit.md has them."""
+    """As docs/understand/mocap-fit.md has them."""
     motion = shared_data / "motion" / "euroc"
     calib, folder = motion / "calib", motion / name
     truth = folder / "groundtruth.csv"

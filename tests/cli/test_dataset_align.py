@@ -258,7 +258,7 @@ def test_a_mounting_is_read_back(tmp_path):
 @pytest.mark.slow
 def test_a_real_recording_against_what_is_no_raw_motion_capture(share, shared_data, tmp_path):
     """EuRoC's truth is an estimate by the same IMU: its body is found as the Vicon's is known to sit
-    (docs/mocap-fit.md), its clock to some ms, and that is said."""
+    (docs/understand/mocap-fit.md), its clock to some ms, and that is said."""
     folder = shared_data / "real" / "euroc_v1_01_keyframes"
     lines = (folder / "mav0" / "state_groundtruth_estimate0" / "data.csv").read_text().splitlines()[1:]
     rows = (line.split(",") for line in lines)

@@ -14,7 +14,7 @@ def test_a_camera_to_which_nothing_happened_is_not_spoken_of() -> None:
     report = feed_report(SampleProcessor(RATES, 10.0), {}, Watchdog(0, RATES))
     assert camera_events(report) == ""
     assert camera_summary({"camera": report}) == [
-        "camera: missing 0, dropped 0, backward 0 (docs/capture.md)"
+        "camera: missing 0, dropped 0, backward 0 (docs/do/record.md)"
     ]
 
 

@@ -149,7 +149,7 @@ def test_a_robot_makes_room_for_a_headset_at_an_edge_that_is_busy() -> None:
 
 
 def test_where_keyframes_alone_make_the_delay_all_rates_rise() -> None:
-    """As the paper has it, who is worse off sends more: docs/scheduling.md says what that means."""
+    """As the paper has it, who is worse off sends more: see docs/understand/scheduling.md."""
     rates = settled(lambda rates, agent: (20 + 2000 / (26 - sum(rates.values())), 0.4))
     assert min(rates.values()) > 9
 

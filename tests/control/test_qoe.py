@@ -75,7 +75,7 @@ def test_default_needs_are_about_met_where_they_should_be() -> None:
 
 
 def test_the_table_of_the_documentation_is_so() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "scheduling.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "understand" / "scheduling.md").read_text()
     table = text.split("<!-- QoE by default")[1].split("\n\n")[1].splitlines()
     ar, robot = (QoeParameters.from_config(ControlConfig(), kind) for kind in (AgentKind.AR, AgentKind.ROBOT))
     points = [(ar, d) for d in (10, 20, 50, 100, 200)] + [(robot, d) for d in (20, 100, 200, 500, 1000)]

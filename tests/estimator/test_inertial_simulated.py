@@ -5,7 +5,8 @@ import pytest
 from imu_simulation import SHIPPED, Setup, run
 
 MISSES = pytest.mark.xfail(
-    strict=True, reason="what lasts in a pixel's error is white to the filter: see docs/vio.md"
+    strict=True,
+    reason="what lasts in a pixel's error is white to the filter: see docs/understand/odometry.md",
 )
 BANDS = {6: (1.37, 5.04), 50: (2.36, 3.72)}  # of the mean of N chi-square values, 3 dof, 95 %
 

@@ -146,7 +146,7 @@ def test_nothing_is_in_it_that_no_command_needs(program):
 
 def test_it_stays_small(program):
     sizes = (path.lstat().st_size for path in program.parent.rglob("*") if not path.is_dir())
-    assert sum(sizes) < 300 * MB  # what is in it, and what is not: docs/freezing.md
+    assert sum(sizes) < 300 * MB  # what is in it, and what is not: docs/do/freeze.md
 
 
 def test_every_library_in_it_loads(program):

@@ -58,7 +58,7 @@ def test_images_by_the_hosts_clock_do_not_cost_the_imu(tmp_path: Path) -> None:
     assert 0.8 * 10**9 < stamps["cam0"][0] < 3 * 10**9
     assert bench.said == [
         "cam0, cam1 carry the host's clock, accel, gyro the camera's: "
-        "kernel patch missing, see docs/capture.md"
+        "kernel patch missing, see docs/do/record.md"
     ]
 
 

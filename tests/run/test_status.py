@@ -206,7 +206,7 @@ def test_names_and_units_are_as_prometheus_wants_them():
 
 
 def test_every_metric_is_in_the_documentation():
-    page = (Path(__file__).parents[2] / "docs" / "status.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "lookup" / "status.md").read_text()
     assert [
         r.name for r in status_metrics.METRICS if f"`{r.name.removeprefix('share_edge_')}`" not in page
     ] == []

@@ -73,7 +73,7 @@ def read(path: Path) -> tuple[dict[str, Any], list[Recorded]]:
 
 
 class Corpus:
-    """Recorded messages by kind. A kind that was not recorded is made up from its layout in docs/wire.md."""
+    """Recorded messages by kind. A kind that was not recorded is made up by docs/lookup/wire.md."""
 
     def __init__(self, path: Path) -> None:
         self.by_kind: dict[str, list[Message]] = defaultdict(list)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-Message = list[bytes]  # frame 0 is the header, as docs/wire.md has it
+Message = list[bytes]  # frame 0 is the header, as docs/lookup/wire.md has it
 
 MORE, LONG, COMMAND = 1, 2, 4
 MOST_NESTED = 50  # that `unpack` follows

@@ -1,4 +1,4 @@
-"""Follows docs/tutorial.md word by word, with cameras of software, and can write back what was shown.
+"""Follows docs/start/first-room.md word by word, with cameras of software, and can write back what was shown.
 
 PYTHONPATH=tests python tests/tutorial/follow.py --at DIR --write
 """
@@ -23,7 +23,7 @@ from page import MACHINES, Block, Step, blocks, renewed  # noqa: E402
 
 from share.cli.terminal import Stages  # noqa: E402
 
-PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
+PAGE = Path(__file__).parents[2] / "docs" / "start" / "first-room.md"
 LIMIT_S = 1500.0  # of one command
 ADDRESS = ("192.168.1.10", "127.0.0.1")  # the laptop's, on the page and here
 PERSON_S = 3.0  # what comes after a server was started is not typed sooner

@@ -1,7 +1,7 @@
-"""docs/tutorial.md as what is typed on which machine, and what was shown there.
+"""docs/start/first-room.md as what is typed on which machine, and what was shown there.
 
-In an indented block, `MACHINE$ words` is typed; a line that ends in a backslash goes on in the next. What
-follows up to the next one was shown. Within a block each machine goes on by itself; blocks follow each other.
+In a fenced block, `MACHINE$ words` is typed; a line that ends in a backslash continues in the next. What
+follows up to the next prompt was shown. Within a block machines run in parallel; blocks run in sequence.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 MACHINES = ("laptop", "headset", "robot")
-_INDENT = "    "
+_FENCE = "```"
 _TYPED = re.compile(rf"({'|'.join(MACHINES)})\$ (.*)")
 
 
@@ -36,7 +36,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Block:
-    """Lines `start` to `end` - 1 of the page."""
+    """Lines `start` to `end` - 1 of the page, between two fences."""
 
     start: int
     end: int
@@ -49,20 +49,12 @@ def blocks(text: str) -> list[Block]:
 
 
 def _blocks(lines: Sequence[str]) -> Iterator[Block]:
-    k = 0
-    while k < len(lines):
-        end = k
-        while end < len(lines) and (lines[end].startswith(_INDENT) or (end > k and _goes_on(lines, end))):
-            end += 1
-        inside = [line.removeprefix(_INDENT) for line in lines[k:end]]
+    fences = [k for k, line in enumerate(lines) if line.startswith(_FENCE)]
+    assert len(fences) % 2 == 0, "a fence is not closed"
+    for opening, closing in zip(fences[::2], fences[1::2], strict=True):
+        inside = lines[opening + 1 : closing]
         if any(map(_TYPED.match, inside)):
-            yield Block(k, end, tuple(_steps(inside)))
-        k = max(end, k + 1)
-
-
-def _goes_on(lines: Sequence[str], k: int) -> bool:
-    """An empty line inside of a block."""
-    return not lines[k].strip() and any(line.startswith(_INDENT) for line in lines[k + 1 : k + 2])
+            yield Block(opening + 1, closing, tuple(_steps(inside)))
 
 
 def _steps(lines: Sequence[str]) -> Iterator[Step]:
@@ -84,7 +76,5 @@ def renewed(text: str, walked: Sequence[tuple[Block, Sequence[Step]]]) -> str:
     """The page with what these steps showed in place of what stood there."""
     lines = text.splitlines()
     for block, steps in reversed(walked):
-        lines[block.start : block.end] = [
-            f"{_INDENT}{line}".rstrip() for step in steps for line in step.lines
-        ]
+        lines[block.start : block.end] = [line.rstrip() for step in steps for line in step.lines]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""docs/tutorial.md, word by word: half an hour, most of it in real time."""
+"""docs/start/first-room.md, word by word: half an hour, most of it in real time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/tutorial.md is read as people read it."""
+"""docs/start/first-room.md is read as people read it."""
 
 from __future__ import annotations
 
@@ -7,20 +7,26 @@ from page import blocks, renewed
 
 PAGE = """# Title
 
-    git clone somewhere
+```bash
+git clone somewhere
+```
 
 Then:
 
-    laptop$ one \\
-    --more
-    shown
+```console
+laptop$ one \\
+--more
+shown
 
-    shown below an empty line
-    robot$ two
+shown below an empty line
+robot$ two
+```
 
 Text.
 
-    headset$ three
+```console
+headset$ three
+```
 """
 
 
@@ -37,7 +43,7 @@ def test_what_was_shown_is_put_there_and_nothing_else_changes() -> None:
     first, second = blocks(PAGE)
     assert renewed(PAGE, [(first, first.steps), (second, second.steps)]) == PAGE
     quiet = [(first, [type(step)(step.machine, step.typed) for step in first.steps])]
-    assert renewed(PAGE, quiet) == PAGE.replace("    shown\n\n    shown below an empty line\n", "")
+    assert renewed(PAGE, quiet) == PAGE.replace("shown\n\nshown below an empty line\n", "")
 
 
 def test_machines_are_shells_with_jobs_and_copy_from_each_other(tmp_path) -> None:

@@ -214,7 +214,7 @@ make_keys() { # RELEASE UNIT: this machine's pair, once
 }
 
 show_key() {
-    say "this machine's public key, which the other side wants (docs/deployment-keys.md):"
+    say "this machine's public key, which the other side wants (docs/do/keys.md):"
     cat "$ETC"/keys/*.public || :
 }
 

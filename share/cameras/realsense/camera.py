@@ -24,7 +24,7 @@ _WAIT_MS = 100
 _DEFAULT_DEPTH_UNIT_M = 0.001
 _UNKNOWN_DOTS_WARNING = (
     "emitter interleaved: images do not tell which of them have dots, so all are kept: kernel patch missing, "
-    "see docs/capture.md"
+    "see docs/do/record.md"
 )
 _DOTS_WARNING = (
     "the emitter is on though it was switched off: its dots spoil tracking; plug the camera in anew"

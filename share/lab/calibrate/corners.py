@@ -1,7 +1,7 @@
 """Detect corners of a calibration target in an image, with their ids.
 
 OpenCV detects the markers; corner ids and the refinement of an AprilGrid's corners:
-docs/calibration-boards.md. Partial views are fine: every visible corner counts.
+docs/do/calibration-boards.md. Partial views are fine: every visible corner counts.
 """
 
 from __future__ import annotations

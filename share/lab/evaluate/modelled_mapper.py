@@ -39,7 +39,7 @@ _CACHE_SIZE = 50_000  # pairs of a keyframe and an agent: some 100 MB
 
 @dataclass(frozen=True)
 class RecognitionModel:
-    """Parameters of the drawn recognition and of a solved map. Defaults: docs/scheduling.md.
+    """Parameters of the drawn recognition and of a solved map. Defaults: docs/understand/scheduling.md.
 
     Overlaps are fractions of a view's volume. Two views that share `half_overlap` are verified with
     probability 1/2, by a logistic curve of width `logistic_width`. `overlap_noise`: sigma of the overlap by

@@ -18,7 +18,7 @@ from share.runtime.machine import describe_machine
 
 PROTOCOL = (
     "causal poses of all frames, as each tracker gave them at the time; truth interpolated at their stamps",
-    "ATE: rms under one SE3 alignment; RPE: rms over 1 s, no alignment; docs/evaluation.md",
+    "ATE: rms under one SE3 alignment; RPE: rms over 1 s, no alignment; docs/do/evaluate.md",
     "CPU: process time of all threads, without decoding; SHARE's includes its keyframes",
     "'final trajectory': not causal; the trajectory by the tracker's final map",
 )

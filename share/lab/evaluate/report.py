@@ -123,7 +123,7 @@ PROTOCOL = (
     "latency: mean over the track_ms of all frames and all corrected_ms together; ms from a frame's arrival",
     "poses: causal, of all tracked frames; truth interpolated at their stamps over at most 100 ms",
     "odom ATE: rms, each agent SE3-aligned alone; map ATE: rms, one SE3 alignment for all agents in a map",
-    "RPE: rms of poses in the map, from frame to frame and over 1 s, no alignment; docs/evaluation.md",
+    "RPE: rms of poses in the map, from frame to frame and over 1 s, no alignment; docs/do/evaluate.md",
 )
 _INTERVAL_NOTE = (
     "In brackets: 95 % confidence intervals by bootstrap over sessions, each with all its runs; "

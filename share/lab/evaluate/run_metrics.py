@@ -27,7 +27,7 @@ class Conditions:
 class AgentMetrics:
     """Metrics of one agent in one run; NaN where not measured.
 
-    * latency_ms and its parts: docs/evaluation.md.
+    * latency_ms and its parts: docs/do/evaluate.md.
     * odom_ate_cm: of odom_n frames, SE3-aligned alone.
     * ate_cm: of the in_map frames with a pose in the shared map, one alignment for all agents in it; NaN for
       an agent outside it.

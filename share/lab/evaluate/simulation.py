@@ -71,7 +71,7 @@ _SLICES = Sampled((*[0.0] * 11, 0.45, 2.2, 2.7, 3.5, 4.0, 4.7, 5.3, 5.6, 5.9, 8.
 
 @dataclass(frozen=True)
 class ProcessingDelays:
-    """Delays of each processing step. Defaults: docs/scheduling-figures.md.
+    """Delays of each processing step. Defaults: docs/lab/scheduling-figures.md.
 
     Agent: `frame`: from a frame to its published pose; `keyframe`: from there until its keyframe may be sent;
     `finish_keyframe`: slice of keyframe work that may follow any frame. Edge: `receive`: a message at the

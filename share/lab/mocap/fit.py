@@ -3,7 +3,7 @@
 Mocap alone is noisy, its body is not the IMU's, its world is not quite level, its clock is another. So all
 are estimated together: pose, velocity and biases at nodes, IMU preintegration between them, mocap poses at
 their own times with robust weights, through an unknown tilt, mounting and time offset. Mathematics and
-accuracy: docs/mocap-fit.md.
+accuracy: docs/understand/mocap-fit.md.
 """
 
 from __future__ import annotations

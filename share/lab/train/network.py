@@ -2,7 +2,7 @@
 
 Three branches are joined: what the picture looks like (by a backbone that stays as it is), where there are
 points, and numbers. Source: SHARE, IMWUT 10(3) 97, 2026; that these are also of the last seconds is ours
-(docs/error-model.md).
+(docs/understand/error-model.md).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Odometry is Gaussian; loops are under a Cauchy kernel, so that a false loop does not bend the map. Source:
 Triggs et al., *Bundle Adjustment: A Modern Synthesis*, 2000; Cauchy against 30 % false loops:
-docs/edge-map.md.
+docs/understand/mapping.md.
 
 Odometry makes long chains, whose equations are block tridiagonal and solved in a millisecond. With the
 information of all other edges added at both ends, they precondition the whole system; the coupling by loops

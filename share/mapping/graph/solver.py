@@ -1,6 +1,6 @@
 """Incremental pose-graph solver: it receives only changes, and starts from the last solution.
 
-Runs in one thread, without a clock. Cost: docs/edge-map.md.
+Runs in one thread, without a clock. Cost: docs/understand/mapping.md.
 """
 
 from __future__ import annotations

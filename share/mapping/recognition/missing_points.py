@@ -3,7 +3,7 @@
 Two places that look alike share most points, but what only one of them has is missing in the other. Single
 points are missing anywhere (missed detections, occlusion); where all points of a patch of the image are
 missing, a *thing* is missing: a poster, a door, a box. One pair of views proves little, so the evidence is
-summed over many pairs. Distributions: docs/places.md.
+summed over many pairs. Distributions: docs/understand/place-recognition.md.
 """
 
 from __future__ import annotations

@@ -31,8 +31,8 @@ from share.types import F64, I64, ImuBatch
 _MARGIN_S = 5.0  # fitted before and after what is asked for: the ends of a batch are known least
 _MIN_SPAN_S = 1.0
 
-# Figures: docs/mocap-fit.md. EuRoC's truth is an estimate from this very IMU and its clock; TUM-VI's, and
-# EuRoC's raw vicon0, are what cameras saw.
+# Figures: docs/understand/mocap-fit.md. EuRoC's truth is an estimate from this very IMU and its clock;
+# TUM-VI's, and EuRoC's raw vicon0, are what cameras saw.
 EUROC_OPTIONS = MocapFitOptions(
     sigma_position=0.0015,
     sigma_rotation=np.radians(0.3),

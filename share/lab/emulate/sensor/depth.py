@@ -1,7 +1,7 @@
 """Depth as a D435i's stereo matching gives it: errors of disparity that depend on texture, and holes.
 
-The model follows block matching (docs/sensors.md compares the two). A window of n pixels with mean squared
-horizontal gradient g^2 and gray noise s in both pictures gives disparity to
+The model follows block matching (docs/understand/sensors.md compares the two). A window of n pixels with mean
+squared horizontal gradient g^2 and gray noise s in both pictures gives disparity to
 
     sigma^2 = floor^2 + 2 s^2 / (n g^2)          (least squares; Gruen 1985)
 
