@@ -25,7 +25,8 @@ class ImageImuConsistency:
     of the median NIS.
 
     Such a camera is tracked all the same: all features lie a little beside their prediction, frame after
-    frame, and none is rejected. With 5 degrees and 5 cm the median rises to 1.2 to 3 (docs/understand/odometry.md).
+    frame, and none is rejected. With 5 degrees and 5 cm the median rises to 1.2 to 3
+    (docs/understand/odometry.md).
     """
 
     def __init__(self) -> None:

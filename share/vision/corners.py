@@ -45,7 +45,8 @@ def strongest(
 ) -> F32:
     """Return corners as `detect` does, but not spread: those down to `quality` times the best.
 
-    Without an IMU a few good corners are better than many (0.5 cm less in the kitchen of docs/understand/odometry-without-imu.md).
+    Without an IMU a few good corners are better than many (0.5 cm less in the kitchen of
+    docs/understand/odometry-without-imu.md).
     """
     if count <= 0:
         return np.zeros((0, 2), np.float32)

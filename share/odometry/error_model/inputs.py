@@ -1,6 +1,7 @@
 """Inputs of the error model, made by the same code for training and on the agent.
 
-Source: SHARE, IMWUT 10(3) 97, 2026; scales and what it leaves open: docs/understand/error-model.md. Besides the paper's
+Source: SHARE, IMWUT 10(3) 97, 2026; scales and what it leaves open: docs/understand/error-model.md. Besides
+the paper's
 inputs there is the tracking of the last seconds, because the error of the last seconds is estimated: a
 keyframe shows how well its tracker works now, not what it lost in the dark three seconds ago.
 """
