@@ -95,9 +95,9 @@ def cli() -> None:
     merges the agents' maps and sends each agent corrections.
 
     \b
-    Try it:     share demo
-    Or a run:   share edge &
-                share agent RECORDING --name ann --kind ar --edge tcp://127.0.0.1:5555 --out out/ann
+    Try it:   share demo
+    A run:    share edge &
+              share agent RECORDING --name ann --kind ar --edge tcp://127.0.0.1:5555 --out out/ann
     """
 
 

@@ -374,7 +374,7 @@ def test_out_that_cannot_be_written(room, share, tmp_path, monkeypatch):
             (["track", source, "--report", tmp_path], "is a folder; give the name of a file"),
             (["track", source, "--out", below], "is not a folder, or lies below a file"),
             (["track", source, "--out", f"{proc}/T.tum"], "cannot be written to: No such file"),
-            (["track", source, "--out", below.parent, "--report", below.parent], "is --out too"),
+            (["track", source, "--out", below.parent, "--report", below.parent], "is the same file as --out"),
             (["track", room / "ar1.mcap", "--out", room / "ar1.mcap"], "is the source itself"),
             (as_agent(source, tmp_path / "file"), "is not a folder, or lies below a file"),
             (as_agent(source, below), "is not a folder, or lies below a file"),
@@ -602,7 +602,7 @@ def test_an_edge_that_never_answers(room, share, tmp_path):
     assert (report["bytes_up"], report["protocol"]["sent"]) == (0, 0)  # no link took anything
     assert _not_late(done.err) == [
         "share agent: no edge answers yet; tracking goes on alone",
-        f"share: no edge ever answered at {NOBODY}; is `share edge` running there?",
+        f"share: no edge answered at {NOBODY}; is `share edge` running there?",
     ]
     assert sorted(os.listdir(tmp_path / "out")) == ["latency.csv", "map.tum", "odom.tum", "report.json"]
     assert (tmp_path / "out" / "map.tum").read_bytes() == b""
@@ -655,8 +655,8 @@ def test_what_an_edge_never_acknowledged_is_said(room, share, tmp_path):
     assert f"\n{made} keyframes: {sent} sent, 1 acknowledged, 0 corrections, " in done.out
     assert done.err.splitlines() == [
         "share agent: connected to the edge",
-        f"share agent: the edge never acknowledged {left} keyframes: it has {left} of them, but not in its "
-        "map's file; can it write that? It says why not",
+        f"share agent: the edge did not acknowledge {left} keyframes: it received {left} of them but could "
+        "not store them in its map file; see the edge's log",
     ]
 
 
@@ -758,7 +758,7 @@ def test_an_agent_whose_disk_is_full_tracks_on(room, tmp_path):
 def test_an_agent_of_no_kind(share, more):
     done = share("agent", "realsense", "--name", "a", "--edge", NOBODY, *more)
     assert (done.code, done.out) == (2, "")
-    assert done.err.startswith("share: --kind: who is served, ar or robot?")
+    assert done.err.startswith("share: --kind is required: ar (headset) or robot")
     assert done.err.count("\n") == 1
 
 

@@ -159,7 +159,7 @@ def test_motives_export_with_y_up_gives_the_same(share, room, made, tmp_path):
     """Another clock, which begins with its first frame; the same session."""
     told = ("--mocap", room.folder / "take.csv", "--json", "--out", tmp_path / "made")
     done = share("dataset", "align", room.recordings[1], *told)
-    assert done.code == 0 and "bob: the motion capture has y up; in the session z is" in done.err
+    assert done.code == 0 and "bob: the motion capture's up axis is y; the session's is z" in done.err
     found, was = json.loads(done.out)["bob"], read_json(made / "align.json")["bob"]
     assert found["up"] == "y" and was["up"] == "z"
     assert abs(found["offset_ns"] - was["offset_ns"] - round(FIRST * 1e9 / MOCAP_HZ)) < 50_000

@@ -183,7 +183,7 @@ def test_virtual_runs_go_side_by_side(evaluate, plain_session, tmp_path):
     assert halves[0] == halves[1]  # whichever process played them
     refused = evaluate("ablation", twin, "--workers", 2, "--out", out)
     assert refused.code == 2
-    assert "goes with --virtual" in refused.err
+    assert "needs --virtual" in refused.err
 
 
 @pytest.mark.slow
