@@ -59,9 +59,9 @@ def test_nobody_without_a_home_is_remembered(monkeypatch: pytest.MonkeyPatch) ->
     ["", ".", "..", "../../etc/passwd", "/etc/passwd", "a/b", "a\\b", "a\0b", "a\nb", "é", ".a", "1" * 65],
 )
 def test_no_serial_number_leads_out_of_the_folder(serial: str) -> None:
-    with pytest.raises(DataError, match="is no serial number"):
+    with pytest.raises(DataError, match="not a valid serial number"):
         load_bias(serial)
-    with pytest.raises(DataError, match="is no serial number"):
+    with pytest.raises(DataError, match="not a valid serial number"):
         save_bias(serial, WHAT)
     assert not bias_folder().exists()
 
