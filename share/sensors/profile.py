@@ -121,7 +121,7 @@ def _find_file(name: str) -> Path:
         return Path(name)
     known = shipped_profiles()
     if name not in known:
-        raise ConfigError(f"unknown profile '{name}'; give one of {', '.join(known)}, or a .yaml file")
+        raise ConfigError(f"profile '{name}' is not known; known: {', '.join(known)}, or give a .yaml file")
     return known[name]
 
 
@@ -134,7 +134,7 @@ def _find_mode(device: DeviceFacts, text: str) -> tuple[CameraMode, float]:
                 if not rate or rate == f"{hz:g}":
                     return mode, hz
     known = (f"{m.width}x{m.height}@{'/'.join(f'{hz:g}' for hz in m.rates_hz)}" for m in device.modes)
-    raise ValueError(f"unknown mode '{text}'; modes: {', '.join(known)}")
+    raise ValueError(f"mode '{text}' is not known; known: {', '.join(known)}")
 
 
 def _with_rate(sensor: InertialFacts, hz: float | None, name: str) -> InertialFacts:

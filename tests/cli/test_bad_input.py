@@ -438,8 +438,8 @@ def test_out_where_a_pipe_lies(room, share, tmp_path):
     pipe, source = tmp_path / "T.tum" / "T.tum", room / "ar1"
     with untouched(tmp_path), within(20):
         for arguments, said in (
-            (["track", source, "--out", pipe], "T.tum: is a pipe that nobody reads"),
-            (["track", source, "--report", pipe], "T.tum: is a pipe that nobody reads"),
+            (["track", source, "--out", pipe], "T.tum: is a pipe without a reader"),
+            (["track", source, "--report", pipe], "T.tum: is a pipe without a reader"),
             *((as_agent(source, tmp_path / name), f"{name}: is a pipe, where") for name in names[3:]),
             *(([*EDGE, tmp_path / name], f"{name}: is a pipe, where") for name in names[1:3]),
             (["dataset", "convert", source, "--format", "mcap", "--out", pipe], "T.tum: is a pipe, where"),

@@ -287,7 +287,7 @@ def test_a_message_is_one_line_whatever_it_quotes():
 
 @pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/../../x", "a\0b", "", "x" * 300, "a/" * 600])
 def test_paths_in_files_stay_in_their_folder(tmp_path, name):
-    with pytest.raises(DataError, match="is no name of a file below"):
+    with pytest.raises(DataError, match="is not a file name below"):
         path_inside(tmp_path, name, "x.csv, line 1")
     assert path_inside(tmp_path, "rgb/1.png", "") == tmp_path / "rgb/1.png"
 
@@ -301,7 +301,7 @@ def test_names_of_agents_in_a_session(tmp_path, name):
     for calibration in ("../calib.yaml", "/etc/passwd"):
         text = f"schema: 1\nagents: {{ann: {{kind: ar, calibration: {calibration}}}}}\n"
         (tmp_path / "session.yaml").write_text(text)
-        with pytest.raises(DataError, match="is no name of a file below"):
+        with pytest.raises(DataError, match="is not a file name below"):
             read_session(tmp_path)
 
 
@@ -331,7 +331,7 @@ def test_nothing_is_written_through_a_link_in_the_folder(tmp_path):
 
 def test_calibration_folders_and_reports_are_read_like_all_else(tmp_path):
     (tmp_path / "r.json").write_text(json.dumps([1]))
-    with pytest.raises(DataError, match="no JSON object"):
+    with pytest.raises(DataError, match="not a JSON object"):
         read_json(tmp_path / "r.json")
     with pytest.raises(ConfigError):
         read_calibration(tmp_path)

@@ -87,11 +87,11 @@ def test_with_depth_the_rig_is_the_left_camera_with_depth_registered_to_it():
     [
         (
             ("d455",),
-            "unknown profile 'd455'; give one of d435i-n100-headset, d435i-turtlebot4, d435i, euroc,",
+            "profile 'd455' is not known; known: d435i-n100-headset, d435i-turtlebot4, d435i, euroc,",
         ),
         (("no/such.yaml",), "no/such.yaml: no such profile file"),
-        (("d435i", "640x400"), "unknown mode '640x400'; modes: 640x480@30/15/60/90, 848x480@"),
-        (("d435i", "640x480@25"), "unknown mode '640x480@25'"),
+        (("d435i", "640x400"), "mode '640x400' is not known; known: 640x480@30/15/60/90, 848x480@"),
+        (("d435i", "640x480@25"), "mode '640x480@25' is not known"),
         (("d435i", None, 300.0), "gyro: rate_hz: 300 is not one of 200, 400"),
     ],
 )
@@ -115,7 +115,7 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
             "device: depth: range_m: 10, 0.28: expected 0 < near < far",
         ),
         ("width: 640", "width: 0", "device: modes[0]: resolution: 0x480 is not positive"),
-        ("default_mode: 640x480@30", "default_mode: 9x9", "mine.yaml: unknown mode '9x9'"),
+        ("default_mode: 640x480@30", "default_mode: 9x9", "mine.yaml: mode '9x9' is not known"),
         (
             "cpu_governor: performance",
             "cpu_governor: perfomance",
@@ -144,7 +144,11 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
             "rates_hz: []",
             "device: modes[0]: rates_hz: []: each must be above 0",
         ),
-        ("rates_hz: [200, 400]", "rates_hz: [-1, 400]", "device: imu: gyro: rates_hz: [-1, 400]: each must be"),
+        (
+            "rates_hz: [200, 400]",
+            "rates_hz: [-1, 400]",
+            "device: imu: gyro: rates_hz: [-1, 400]: each must be",
+        ),
         ("[[1, 0, 0, -0.00552]", "[[2, 0, 0, -0.00552]", "device: T_imu_cam0: is not a rigid transform"),
     ],
 )
