@@ -231,7 +231,7 @@ def _agent_kind(text: str) -> Any:
     from share.types import AgentKind
 
     if text not in list(AgentKind):
-        raise UsageError(f"--kind: '{text}' is not known; known: {', '.join(AgentKind)}")
+        raise UsageError(f"--kind {text} is not known; known: {', '.join(AgentKind)}")
     return AgentKind(text)
 
 

@@ -228,7 +228,7 @@ def test_a_truth_that_is_cut_short(share, tmp_path):
         done = share(*as_track(recording, tmp_path / "out"))
     said, failed = done.err.splitlines()  # the five frames of this recording show nothing
     assert "groundtruth.txt, line 4: 2 of 8 columns; the line is cut short" in said
-    assert said.startswith("share: kitchen: left out, since damaged: 1 of the lines of ")
+    assert said.startswith("share: kitchen: skipped as damaged: 1 of the lines of ")
     assert (done.code, "none of its 5 frames could be tracked" in failed) == (1, True)
 
 
@@ -268,7 +268,7 @@ CALIBRATIONS = {
     "no YAML": ("cam0: [", "not valid YAML"),
     "a list": ("- 1", "expected keys and values, found list"),
     "empty": ("", "expected keys and values, found nothing"),
-    "no extrinsics": (CAMCHAIN.replace("T_cn_cnm1", "T_unknown"), "has no extrinsics to cam0; add T_cn_cnm1"),
+    "no extrinsics": (CAMCHAIN.replace("T_cn_cnm1", "T_unknown"), "no extrinsics to cam0; add T_cn_cnm1"),
     "not rigid": (CAMCHAIN.replace("[0, 0, 1, 0]", "[0, 0, 2, 0]"), "T_cn_cnm1: is not a rigid transform"),
     "NaN": (CAMCHAIN.replace("320.4", ".nan"), "intrinsics: has values that are not finite"),
     "negative focal length": (CAMCHAIN.replace("[385", "[-385"), "cam0"),
@@ -474,7 +474,7 @@ def test_track_of_a_damaged_image(damaged, share, tmp_path):
     done = share(*as_track(damaged, tmp_path / "out"))
     assert done.code == 0
     (said,) = done.err.splitlines()
-    assert "left out, since damaged: 1 of the frames; the first: " in said
+    assert "skipped as damaged: 1 of the frames; the first: " in said
     assert f"{damaged}/mav0/cam1/data/" in said
     assert "the image is cut short or damaged" in said
 
@@ -493,7 +493,7 @@ def test_streams_that_are_not_used_are_named(stereo, share, tmp_path):
     (tmp_path / "camchain.yaml").write_text(CAMCHAIN)
     done = share("track", recording, "--calib", tmp_path / "camchain.yaml")
     assert done.code == 0
-    assert done.err == "share: stereo: imu0 is not used: the calibration does not have it\n"
+    assert done.err == "share: stereo: imu0 is not used: the calibration has no imu0\n"
 
 
 def test_ctrl_c_on_track(stereo, tmp_path):

@@ -103,7 +103,7 @@ GOOD0 = f"  T_cam_imu: {matrix(T_CAM0_IMU)}\n"
     ("text", "complaint"),
     [
         (chain(), "cam0: has no extrinsics to the IMU; add T_cam_imu"),
-        (chain(GOOD0, ""), "cam1: has no extrinsics to cam0; add T_cn_cnm1"),
+        (chain(GOOD0, ""), "cam1: no extrinsics to cam0; add T_cn_cnm1"),
         (chain(f"  T_cam_imu: {BAD}\n"), "cam0: T_cam_imu: is not a rigid transform"),
         (chain("  T_cam_imu: [[1, 0, 0], [0, 1, 0]]\n"), "T_cam_imu: expected a 4x4 matrix, found 6"),
         (chain(GOOD0).replace("radtan", "fov"), "'fov' is not supported; supported: radtan, .*equidistant"),
@@ -149,7 +149,7 @@ def test_timeshift_is_the_cameras_mean(tmp_path, camchain, seconds):
 @pytest.mark.parametrize(
     ("camchain", "complaint"),
     [
-        (chain(SHIFT0.format(20)), "cam0: timeshift_cam_imu: 20 s is more than 1 s; it is given in seconds"),
+        (chain(SHIFT0.format(20)), "cam0: timeshift_cam_imu: 20 s is more than 1 s; give it in seconds"),
         (chain(SHIFT0.format(".nan")), "cam0: timeshift_cam_imu: has values that are not finite"),
         (chain(SHIFT0.format("late")), "cam0: timeshift_cam_imu: expected numbers, found .'late'."),
         (

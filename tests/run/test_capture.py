@@ -154,7 +154,7 @@ def test_what_a_power_cut_left_is_not_overwritten(tmp_path: Path) -> None:
 def test_of_two_recordings_of_one_name_the_second_is_refused(tmp_path: Path) -> None:
     rig = WANTED.profile.rig()
     with Recorder(tmp_path / "a.mcap", rig, durable=True) as first:
-        with pytest.raises(UsageError, match="or one is going on there"):
+        with pytest.raises(UsageError, match="or is still running"):
             Recorder(tmp_path / "a.mcap", rig, durable=True)
         first.write(Measurement("imu", 10**9, np.zeros(6)))
     assert len(read_imu(str(tmp_path / "a.mcap")).imu.stamps_ns) == 1

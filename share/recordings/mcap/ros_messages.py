@@ -23,14 +23,14 @@ RIG_RECORD = "share.rig"  # name of the MCAP metadata record with the exact cali
 
 @cache
 def typestore() -> Any:
-    """rosbags' types of ROS 2 Jazzy."""
+    """Return rosbags' type store of ROS 2 Jazzy."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def make_message(name: str, **fields: Any) -> Any:
-    """A message of type `name`."""
+    """Return a message of type `name`."""
     return typestore().types[name](**fields)
 
 
@@ -41,7 +41,7 @@ def make_header(stamp_ns: int, frame_id: str) -> Any:
 
 
 def stamp_of(message: Any) -> int:
-    """Integer nanoseconds of a message's header."""
+    """Return the stamp of a message's header, ns."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
@@ -55,5 +55,5 @@ def decode(data: bytes, name: str) -> Any:
 
 
 def message_definition(name: str) -> bytes:
-    """The definition text of a message type, encoding `ros2msg`."""
+    """Return the definition of a message type, encoding `ros2msg`."""
     return str(typestore().generate_msgdef(name, ros_version=2)[0]).encode()
