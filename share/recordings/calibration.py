@@ -199,8 +199,8 @@ def _read_distortion(section: Section) -> tuple[tuple[float, ...], str]:
     model = lens_model(name)
     if model is None:
         raise ConfigError(
-            f"{section.where}: distortion_model '{name}' is not supported; calibrate with one of "
-            f"{', '.join(_MODELS)}, none"
+            f"{section.where}: distortion_model '{name}' is not supported; supported: {', '.join(_MODELS)}, "
+            "none (calibrate again with one of these)"
         )
     key = "distortion_coeffs" if "distortion_coeffs" in section else "distortion_coefficients"
     return tuple(section.numbers(key, tuple(n for n in COEFFICIENT_COUNTS[model] if n))), model

@@ -248,7 +248,7 @@ def test_names_that_are_no_recording(command, room, share, tmp_path):
     for source, said in (
         (note, "none of the recordings that SHARE reads"),
         (room, f"is a session; name one of its agents: {room}/ar1, {room}/ar2, {room}/robot"),
-        (room / "bob", "has no agent 'bob'; it has ar1, ar2, robot"),
+        (room / "bob", "no agent 'bob'; agents: ar1, ar2, robot"),
         ("realsense", "RealSense camera"),  # none is attached, or the SDK is not here
     ):
         assert said in complaint(share(*command(source, tmp_path / "out")), 2)

@@ -108,7 +108,7 @@ def test_what_is_not_to_be_believed_fails_and_leaves_what_was_there(
     told = json.loads((tmp_path / "camera-imu-report.failed.json").read_text())
     parts = [np.array(told[f"sigmas{part}"]["rotation_rad"]) for part in ("", "_by_noise", "_by_cameras")]
     np.testing.assert_allclose(parts[0] ** 2, parts[1] ** 2 + parts[2] ** 2)
-    assert "kalibr_imu_chain.yaml is of other noise and is kept; used was that of --imu" in kept
+    assert "kalibr_imu_chain.yaml has other noise than was used (that of --imu" in kept
     assert "unreliable result" in failed and "gyroscope's residuals" in failed
     assert "kalibr_imucam_chain.failed.yaml is written; kalibr_imucam_chain.yaml is kept" in failed
     assert "time offset: +12." in done.out and "kalibr_imucam_chain.failed.yaml" in done.out

@@ -227,8 +227,8 @@ def test_wrong_use_is_one_line_and_leaves_nothing(share, room, tmp_path):
     assert "no body for 'ann' (give --body ann=BODY); it has Headset1, BOB" in refused(2, ann, *csv)
     assert "no body 'Hat'" in refused(2, ann, *csv, "--body", "ann=Hat")
     both = refused(2, ann, bob, *csv, "--body", "ann=bob")
-    assert "its body 'BOB' cannot be both ann and bob; give each its own by --body bob=BODY" in both
-    assert "there is no device 'eve'" in refused(2, bob, *csv, "--body", "eve=BOB")
+    assert "body 'BOB' cannot be both ann and bob; give --body bob=BODY" in both
+    assert "no device 'eve'" in refused(2, bob, *csv, "--body", "eve=BOB")
     assert "--kind cat" in refused(2, bob, *csv, "--kind", "cat")
     assert "has no motion capture" in refused(2, bob, *csv_of_ann)
     assert "no such file of motion capture" in refused(2, bob, "--mocap", room.folder / "no.csv")

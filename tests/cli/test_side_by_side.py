@@ -117,7 +117,7 @@ def test_a_peer_that_breaks_leaves_the_others_their_rows(compare, plain_session,
     ("arguments", "said"),
     [
         (("--peer", "basalt"), "--peer basalt: give NAME=PYTHON"),
-        (("--peer", "slam=python"), "with a name of basalt, orbslam3"),
+        (("--peer", "slam=python"), "where NAME is basalt or orbslam3"),
         (("--vocabulary", "/nowhere"), "does not exist"),
     ],
 )

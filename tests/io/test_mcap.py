@@ -85,7 +85,7 @@ def test_asl_folder_comes_back(tmp_path):
     assert_same(frames(source), frames(back))
     np.testing.assert_allclose(back.rig.T_cam1_cam0, source.rig.T_cam1_cam0, atol=1e-12)
     np.testing.assert_allclose(back.truth().T, source.truth().T, atol=1e-9)
-    with pytest.raises(UsageError, match="no place for depth"):
+    with pytest.raises(UsageError, match="cannot hold depth"):
         to_euroc(open_source(str(make_tum(tmp_path / "rgbd"))), tmp_path / "x", nothing)
     assert not (tmp_path / "x").exists()
     shifted = dataclasses.replace(source, rig=dataclasses.replace(source.rig, timeshift_s=0.02))

@@ -100,7 +100,7 @@ def test_tum_truth_is_that_of_the_camera_it_names(tum):
     cam0 = open_source(str(tum)).truth()
     np.testing.assert_allclose(depth_camera.T[:, 0, 3] - cam0.T[:, 0, 3], 0.025, atol=1e-12)
     yaml.write_text(yaml.read_text().replace("truth_frame: cam0", "truth_frame: imu"))
-    with pytest.raises(ConfigError, match="truth_frame 'imu' is unknown"):
+    with pytest.raises(ConfigError, match="truth_frame 'imu' is not known"):
         open_source(str(tum)).truth()
 
 
@@ -170,7 +170,7 @@ DAMAGE = {
         r"cam1/data\.csv, line .* out of order; sort.*5 of 6",
     ),
     "NaN stamps": (_nan_stamps, DataError, r"line 2: stamp 'nan'.*2 of 6 lines of .* too many to skip"),
-    "names lead out": (_names_lead_out, DataError, r"line 2: '\.\./\.\./x\.png' is no name of a file below"),
+    "names lead out": (_names_lead_out, DataError, r"line 2: '\.\./\.\./x\.png' is not a file name below"),
     "no list": (lambda r: (r / "mav0/cam0/data.csv").unlink(), DataError, r"data\.csv: no such file"),
     "empty list": (lambda r: (r / "mav0/cam0/data.csv").write_text(""), DataError, "has no data"),
     "no images": (
@@ -230,7 +230,7 @@ def test_one_damaged_line_of_a_truth_costs_itself(request, file):
 def test_files_that_a_list_names_stay_in_its_folder(tum):
     (tum / "rgb.txt").write_text("10.0 ../../../etc/passwd\n10.033333 /etc/passwd\n10.066667 rgb/2.jpg\n")
     with pytest.raises(
-        DataError, match=r"rgb\.txt, line 1: '\.\./\.\./\.\./etc/passwd' is no name of a file below"
+        DataError, match=r"rgb\.txt, line 1: '\.\./\.\./\.\./etc/passwd' is not a file name below"
     ):
         open_source(str(tum))
 

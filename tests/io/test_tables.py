@@ -114,5 +114,5 @@ def test_a_quaternion_beyond_all_numbers_is_one_damaged_line(tmp_path):
     path, losses = tmp_path / "truth.tum", DataLosses()
     path.write_text("\n".join(lines))
     assert len(read_tum(path, losses).stamps_ns) == 39
-    with pytest.raises(DataError, match="pose 8: quaternion has length inf"):
+    with pytest.raises(DataError, match="pose 8: quaternion norm is inf"):
         read_tum(path)
