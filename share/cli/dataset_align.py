@@ -144,7 +144,7 @@ def _recordings_by_device(recordings: tuple[str, ...]) -> dict[str, str]:
     """Return the recording of each device, by its name. Raises UsageError."""
     for text in recordings:
         if "=" not in text:
-            raise UsageError(f"{text}: write NAME=RECORDING, such as ann={text}")
+            raise UsageError(f"{text}: give NAME=RECORDING, such as ann={text}")
     out = options.values_by_name("RECORDING", recordings)
     for name in out:
         options.agent_name(name)
