@@ -175,7 +175,7 @@ def _connector(address: str, run_id: int, keys: AgentKeys | None) -> Callable[[]
 
 
 def _error_estimator(
-    source: Source, settings: Config, true_error: bool, say: Callable[[str], None]
+    source: Source, settings: Config, true_error: bool, print_line: Callable[[str], None]
 ) -> ErrorEstimator | None:
     """Return the estimator of the tracking error, None if it is off. Raises UsageError, DataError."""
     if true_error:
@@ -185,7 +185,7 @@ def _error_estimator(
     from share.odometry.error_model.network import open_error_model
     from share.runtime.error_estimators import BackgroundErrorModel
 
-    return BackgroundErrorModel(open_error_model(settings.agent.error_model), say)
+    return BackgroundErrorModel(open_error_model(settings.agent.error_model), print_line)
 
 
 def _true_error(source: Source) -> ErrorEstimator:

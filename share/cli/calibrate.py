@@ -16,8 +16,7 @@ from share.cli.calibrate_target import target
 def calibrate() -> None:
     """Calibrate a device's cameras and IMU, and how they and a motion capture's body are mounted.
 
-    A device gets its calibration in this order: target, camera, imu, camera-imu. Or take the factory's
-    with realsense.
+    Order of use: target, camera, imu, camera-imu. Or write the factory's calibration with realsense.
 
     \b
     Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine

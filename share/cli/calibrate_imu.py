@@ -40,8 +40,8 @@ _SYMBOLS = {"density": "N", "instability": "B", "walk": "K"}
 def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_json: bool) -> None:
     """Estimate white noise, bias instability and bias random walk of an IMU by Allan deviation.
 
-    SOURCE is a recording of the IMU at rest: ten minutes suffice for the white noise, the rest needs three
-    hours.
+    SOURCE is a recording of the IMU at rest: ten minutes suffice for the white noise, instability and random
+    walk need three hours.
 
     \b
     Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine
@@ -95,10 +95,9 @@ def _summary(characteristics: ImuCharacteristics, rows: list[NoiseRow], dropped:
     norm, bias = gravity_norm(characteristics), ", ".join(f"{b:+.5f}" for b in characteristics.gyro.mean)
     return "\n".join(
         [
-            f"{characteristics.rest_s:.0f} s at rest of "
-            f"{characteristics.total_s:.0f} s, "
-            f"{characteristics.rate_hz:.2f} Hz; "
-            f"{characteristics.missing} samples lost in {characteristics.gaps} gaps, {dropped} out of order",
+            f"{characteristics.rest_s:.0f} s at rest of {characteristics.total_s:.0f} s, "
+            f"{characteristics.rate_hz:.2f} Hz; {characteristics.missing} samples lost in "
+            f"{characteristics.gaps} gaps, {dropped} out of order",
             "",
             aligned_table([heads, *([_row_name(row), row.unit, *_cells(row)][: len(heads)] for row in rows)]),
             "",

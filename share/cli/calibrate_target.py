@@ -16,12 +16,17 @@ from share.errors import UsageError
 )  # fmt: skip
 @click.option(
     "--paper", metavar="P", default="A4", show_default=True,
-    help="A4 to A0, letter, tabloid, or WIDTHxHEIGHT in mm.",
+    help="Paper: A4 to A0, letter, tabloid, or WIDTHxHEIGHT in mm.",
 )  # fmt: skip
 @click.option(
-    "--columns", type=click.IntRange(1), metavar="N", help="Columns of tags or squares.  [default: 6, 9]"
+    "--columns",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Columns of the board.  [default: 6 tags or 9 squares]",
 )
-@click.option("--rows", type=click.IntRange(1), metavar="N", help="Rows of tags or squares.  [default: 6, 7]")
+@click.option(
+    "--rows", type=click.IntRange(1), metavar="N", help="Rows of the board.  [default: 6 tags or 7 squares]"
+)
 @click.option(
     "--size", type=click.FloatRange(0, min_open=True), metavar="MM",
     help="Edge of a tag or square, mm.  [default: the largest whole mm that fit]",

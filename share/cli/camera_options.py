@@ -82,11 +82,11 @@ def open_source(
     frames: slice | None,
     camera: CameraOptions,
     settings: Config,
-    say: Callable[[str], None],
+    print_line: Callable[[str], None],
 ) -> Source:
     """Open a recording or a live camera; a camera is closed when the command ends.
 
-    say: prints a line when the camera is lost, found again and so on.
+    print_line: called with a line when the camera is lost, found again and so on.
     Raises UsageError, ConfigError, DataError, ShareError.
     """
     from share.cameras.realsense.devices import is_camera
@@ -100,7 +100,8 @@ def open_source(
     from share.cameras.realsense.source import open_live
     from share.runtime.source import read_given_calibration
 
-    live = open_live(source, camera.camera_request(), settings.sequencer, say, read_given_calibration(calib))
+    calibration = read_given_calibration(calib)
+    live = open_live(source, camera.camera_request(), settings.sequencer, print_line, calibration)
     click.get_current_context().with_resource(closing(live))
     return live
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     type=click.FloatRange(min=0),
     default=2.0,
     show_default=True,
-    help="Stop when less than this is free on the disk.",
+    help="Stop when less than this is free on the disk, GB.",
 )
 @options.as_json
 def capture(

@@ -46,8 +46,8 @@ def compare(
     """Run SHARE's tracker and others over the same recordings; compare their errors against ground truth and
     their CPU time. Each agent runs alone, without an edge.
 
-    SOURCES are sessions (all agents are run) or sources as of `share track`, with ground truth, stereo and
-    IMU. Other trackers are installed from package registries, each in its own environment; one that is
+    SOURCES are sessions (all agents are run) or sources that `share track` takes, with ground truth, stereo
+    and IMU. Other trackers are installed from package registries, each in its own environment; one that is
     missing is named and skipped. DIR gets a row and a trajectory (TUM) per run, table.md, table.csv,
     report.html and pictures. An interrupted command continues when it is run again.
 

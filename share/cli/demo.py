@@ -30,7 +30,7 @@ class _Seconds(click.FloatRange):
 
 
 @click.command()
-@click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True, help="Length of the run.")
+@click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True, help="Length of the run, s.")
 @click.option(
     "--policy",
     type=click.Choice(POLICY_NAMES),
@@ -92,8 +92,8 @@ def demo(
     with Stages() as stages:
         session = read_session(make_cached_session(recipe(room, seconds, seed), progress=stages))
     live = LiveLine()
-    terms = RunOptions(policy, link, seed, true_error, config=config_file, agents_first=True)
-    folders = play_in_real_time(session, seconds, terms, folder, lambda now: live.write(str(now)))
+    run_terms = RunOptions(policy, link, seed, true_error, config=config_file, agents_first=True)
+    folders = play_in_real_time(session, seconds, run_terms, folder, lambda now: live.write(str(now)))
     live.end()
     result = score_session(session, folders)
     click.echo(_score_table(result, policy == STREAMED))

@@ -44,7 +44,7 @@ class _Size(click.ParamType[tuple[float, ...]]):
     help="An agent and its motion; see below. May be repeated.",
 )
 @click.option("--out", required=True, metavar="SESSION", help="A new folder.")
-@click.option("--seconds", type=float, default=30, show_default=True, help="Length of the session.")
+@click.option("--seconds", type=float, default=30, show_default=True, help="Length of the session, s.")
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the room and the noise."
 )

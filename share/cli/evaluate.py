@@ -80,16 +80,14 @@ def run(
     from share.recordings.session import read_session
 
     opened, live = read_session(session), LiveLine()
-    config, terms = (
-        load_run_config(config_file, options_given, [opened]),
-        RunOptions(policy, seed=seed, **options_given),
-    )
-    trial = run_trial(opened, terms, config, out, lambda now: live.write(str(now)))
+    config = load_run_config(config_file, options_given, [opened])
+    run_terms = RunOptions(policy, seed=seed, **options_given)
+    trial = run_trial(opened, run_terms, config, out, lambda now: live.write(str(now)))
     live.end()
     click.echo(run_table(run_metrics(trial)))
 
 
-@evaluate.command(short_help="Errors, latency, merges and QoE of runs.")
+@evaluate.command(short_help="Score runs: errors, latency, merges, QoE.")
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--csv",
@@ -201,10 +199,8 @@ def ablation(
     )
     writable_dir(out, "agents.csv", "runs.csv", "report.md", "report.html")
     trials_by_folder = play_runs(planned_runs, worker_pool(workers), lambda one: one.out.name)
-    trials, failed = (
-        list(trials_by_folder.values()),
-        [one.out.name for one in planned_runs if one.out not in trials_by_folder],
-    )
+    trials = list(trials_by_folder.values())
+    failed = [one.out.name for one in planned_runs if one.out not in trials_by_folder]
     if trials:
         _write_report(out, trials, failed, sections)
     check_none_failed(len(trials), len(planned_runs))

@@ -22,10 +22,12 @@ calib = click.option(
     help="Kalibr camchain file, or a folder with kalibr_imucam_chain.yaml and kalibr_imu_chain.yaml; "
     "overrides the calibration in the source.",
 )
-config = click.option("--config", "config_file", metavar="FILE", help="YAML file with settings.")
+config = click.option(
+    "--config", "config_file", metavar="FILE", help="YAML file with settings (docs/configuration.md)."
+)
 verbose = click.option("-v", "--verbose", is_flag=True, help="Print more.")
 keys = click.option(
-    "--keys", metavar="DIR", help="Folder of this machine's keys (default: ~/.config/share/keys)."
+    "--keys", metavar="DIR", help="Folder of this machine's keys.  [default: ~/.config/share/keys]"
 )
 out_folder = click.option(
     "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Output folder."

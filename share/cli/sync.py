@@ -69,11 +69,11 @@ def server(bind: str, stratum: int) -> None:
     live = LiveLine()
     with closing(StampedSocket.bind(host)) as link:
         times = TimeServer(stratum, clock_precision())
-        say, show = (
-            (lambda text: live.print_line(f"share sync: {text}")),
-            (lambda: live.write(_counts_text(times))),
-        )
-        run = TimeServerRun(link, times, say, show)
+
+        def print_line(text: str) -> None:
+            live.print_line(f"share sync: {text}")
+
+        run = TimeServerRun(link, times, print_line, lambda: live.write(_counts_text(times)))
         with stop_on_signal(run.stop):
             _print_server(HostPort(host.name, link.port), stratum, link.has_kernel_stamps)
             run.run()

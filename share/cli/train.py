@@ -117,11 +117,8 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
     from share.lab.train.training import train_model
     from share.odometry.error_model.network import backbone_features, open_network, read_model
 
-    collection, live, base_model = (
-        collect_labels(labels, seed),
-        LiveLine(),
-        read_model(_base_model_file(base)),
-    )
+    collection, live = collect_labels(labels, seed), LiveLine()
+    base_model = read_model(_base_model_file(base))
     writable_dir(out)
     live.write(f"computing backbone features of {len(collection.table.error_cm)} images")
     deep_features = backbone_features(open_network(base_model), collection.table.picture)

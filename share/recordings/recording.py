@@ -81,7 +81,7 @@ class Span(NamedTuple):
         return (self.imu_from, self.imu_to) if stream == IMU else (self.image_from, self.image_to)
 
 
-_UNBOUNDED = 2**62
+UNBOUNDED_NS = 2**62  # limit of a span without an end
 
 
 def select_span(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> Span:
@@ -90,18 +90,18 @@ def select_span(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int =
     imu_shift_ns: IMU time minus camera time. Raises UsageError if nothing is left or the slice has a step.
     """
     if frames is None:
-        return Span(-_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, _UNBOUNDED)
+        return Span(-UNBOUNDED_NS, UNBOUNDED_NS, -UNBOUNDED_NS, UNBOUNDED_NS)
     first, last, step = frames.indices(len(cam0))
     if step != 1 or first >= last:
         requested = ":".join("" if end is None else str(end) for end in (frames.start, frames.stop))
         raise UsageError(f"{where}: --frames {requested} selects nothing; it has {len(cam0)} frames")
-    previous_ns = int(cam0[first - 1]) if first else -_UNBOUNDED
+    previous_ns = int(cam0[first - 1]) if first else -UNBOUNDED_NS
     last_ns = int(cam0[last - 1])
     return Span(
-        image_from=(previous_ns + int(cam0[first])) // 2 if first else -_UNBOUNDED,
-        image_to=(last_ns + int(cam0[last])) // 2 if last < len(cam0) else _UNBOUNDED,
+        image_from=(previous_ns + int(cam0[first])) // 2 if first else -UNBOUNDED_NS,
+        image_to=(last_ns + int(cam0[last])) // 2 if last < len(cam0) else UNBOUNDED_NS,
         imu_from=previous_ns + imu_shift_ns,
-        imu_to=last_ns + imu_shift_ns if last < len(cam0) else _UNBOUNDED,
+        imu_to=last_ns + imu_shift_ns if last < len(cam0) else UNBOUNDED_NS,
     )
 
 

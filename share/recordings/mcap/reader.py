@@ -25,7 +25,7 @@ from share.recordings.mcap import images as ros_images
 from share.recordings.mcap import rig as ros_rig
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.file import McapFile, damage_errors
-from share.recordings.recording import Source, Span, select_span
+from share.recordings.recording import UNBOUNDED_NS, Source, Span, select_span
 from share.recordings.trajectory import Trajectory, read_tum
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, STREAMS, Measurement
 from share.types import F64, I64
@@ -129,14 +129,11 @@ class McapSource(Source):
 
     @property
     def _log_range(self) -> tuple[int | None, int | None]:
-        first, last = (
-            min(self._span.imu_from, self._span.image_from),
-            max(self._span.imu_to, self._span.image_to),
-        )
-        unbounded = 2**62
+        first = min(self._span.imu_from, self._span.image_from)
+        last = max(self._span.imu_to, self._span.image_to)
         return (
-            None if first <= -unbounded else max(0, first - _MAX_SKEW_NS),
-            None if last >= unbounded else last + _MAX_SKEW_NS,
+            None if first <= -UNBOUNDED_NS else max(0, first - _MAX_SKEW_NS),
+            None if last >= UNBOUNDED_NS else last + _MAX_SKEW_NS,
         )
 
     def _find_span(self, frames: slice | None) -> Span:
