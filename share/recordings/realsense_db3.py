@@ -25,7 +25,6 @@ from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 
 STREAMS = {"Infrared_1": CAM0, "Infrared_2": CAM1, "Depth_0": DEPTH, "Accel_0": ACCEL, "Gyro_0": GYRO}
 _DATA_SUFFIXES = ("/imu/data", "/image/data/compressed", "/image/data/compressedDepth")
-_DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport's ConfigHeader before the PNG
 _HARDWARE_CLOCK = "Hardware Clock"
 _COLUMNS = {"topics": ("id", "name"), "messages": ("id", "topic_id", "timestamp", "data")}  # of rosbag2
 _MAX_TOPICS, _MAX_NAME_LENGTH = 10_000, 500  # the SDK writes 100 topics with names of 60 characters
@@ -188,4 +187,4 @@ def _decode_payload(stream: str, blob: bytes | None) -> Any:
             raise ValueError("its values are not finite")
         return [v.x, v.y, v.z]
     image = ros.decode(blob, ros.COMPRESSED).data.tobytes()
-    return image[_DEPTH_HEADER:] if stream == DEPTH else image
+    return image[ros.DEPTH_HEADER_BYTES :] if stream == DEPTH else image

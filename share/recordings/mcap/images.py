@@ -16,7 +16,6 @@ from share.recordings.mcap import ros_messages as ros
 from share.types import F32
 
 MILLIMETRES = 1000.0  # 16UC1 depth is in mm, 32FC1 in m: ROS REP 118
-_CONFIG_HEADER = 12  # bytes of compressed_depth_image_transport's ConfigHeader before the PNG
 _MAX_DEPTH_M = 1e4  # beyond any depth camera
 _TO_GRAY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
@@ -87,7 +86,7 @@ def decode_compressed(message: Any, where: str, camera: Camera, is_depth: bool) 
         if "rvl" in message.format.lower():
             raise DataError(f"{where}: RVL depth is not supported; record depth as PNG or raw")
         if "compressedDepth" in message.format:
-            data = data[_CONFIG_HEADER:]
+            data = data[ros.DEPTH_HEADER_BYTES :]
     return EncodedImage(data, where, camera.width, camera.height, MILLIMETRES if is_depth else 0.0)
 
 
@@ -95,7 +94,7 @@ def encode_compressed(header: Any, data: bytes, is_depth: bool) -> Any:
     """Make a `CompressedImage` of JPEG or PNG bytes; depth (16-bit PNG, mm) gets image_transport's header."""
     kind = "png" if image_format(data) == "png" else "jpeg"
     if is_depth:
-        data, kind = bytes(_CONFIG_HEADER) + data, "16UC1; compressedDepth png"
+        data, kind = bytes(ros.DEPTH_HEADER_BYTES) + data, "16UC1; compressedDepth png"
     return ros.make_message(ros.COMPRESSED, header=header, format=kind, data=np.frombuffer(data, np.uint8))
 
 

@@ -17,6 +17,7 @@ TF_STATIC = "/tf_static"
 TOPICS = {CAM0: "/cam0/image_raw", CAM1: "/cam1/image_raw", DEPTH: "/depth/image_raw", IMU: "/imu0"}
 INFO_TOPICS = {stream: f"/{stream}/camera_info" for stream in (CAM0, CAM1, DEPTH)}
 SUFFIXES = ("/compressed", "/compressedDepth")  # of image_transport
+DEPTH_HEADER_BYTES = 12  # compressed_depth_image_transport's ConfigHeader, before the PNG
 
 RIG_RECORD = "share.rig"  # name of the MCAP metadata record with the exact calibration
 
