@@ -187,9 +187,8 @@ def _named_topic(name: str, candidates: list[str], file: McapFile) -> str:
     for topic in (name, *(name + suffix for suffix in ros.SUFFIXES)):
         if topic in candidates:
             return topic
-    raise ConfigError(
-        f"{file.path}: has no topic {name}, which the calibration names; topics: {', '.join(candidates)}"
-    )
+    known = ", ".join(candidates) or "none"
+    raise ConfigError(f"{file.path}: has no topic {name}, which the calibration names; topics: {known}")
 
 
 def guess_topic(stream: str, candidates: list[str]) -> str | None:
