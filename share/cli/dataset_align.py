@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from share.lab.mocap.state import MocapFitOptions
     from share.lab.mocap.trajectory import MocapTrajectory
 
-_CLOCK_COLUMNS = ("device", "offset s", "± ms", "drift ppm", "corr.", "next")
+_CLOCK_COLUMNS = ("device", "offset s", "± ms", "drift ppm", "corr.", "next corr.")
 _MOUNTING_COLUMNS = ("body deg", "±", "body mm", "±", "up", "tilt deg")
 _RESIDUAL_COLUMNS = ("rms mm", "rms deg", "outliers %", "gaps", "truth s")
 

@@ -10,7 +10,7 @@ from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 _LATENCY_COLUMNS = ("", "latency", "frames", "50 %", "95 %", "99 %", "> 20 ms")
 _CORRECTED_COLUMNS = ("corrected", "50 %", "95 %", "99 %", "of")
 _ERROR_COLUMNS = ("", "odom ATE", "of", "map ATE", "of", "RPE frame", "", "RPE 1 s", "", "of")
-_SHARING_COLUMNS = ("in a map", "sent", "up", "down", "QoE", "reported")
+_SHARING_COLUMNS = ("in a map", "sent", "up", "down", "QoE", "reported error")
 
 
 def run_table(run: RunMetrics) -> str:

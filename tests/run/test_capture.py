@@ -146,7 +146,9 @@ def test_what_a_power_cut_left_is_not_overwritten(tmp_path: Path) -> None:
     part, out = tmp_path / "a.mcap.part", tmp_path / "a.mcap"
     part.write_bytes(b"dear")
     run = Capture(CameraFeed(_never, None, WANTED.rates_hz(), 10.0, print, SampleQueue()), out, 0.0, print)
-    with pytest.raises(UsageError, match=rf"a\.mcap\.part: is left .* recover {part} --out {out}`, or give"):
+    with pytest.raises(
+        UsageError, match=rf"a\.mcap\.part: belongs to .* recover {part} --out {out}`, or give"
+    ):
         run.run()
     assert part.read_bytes() == b"dear"
 
