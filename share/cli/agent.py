@@ -1,4 +1,4 @@
-"""`share agent`: one agent at sensor rate."""
+"""`share agent`: track one agent at sensor rate and connect it to an edge."""
 
 from __future__ import annotations
 
@@ -28,35 +28,35 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("source")
-@click.option("--name", required=True, help="What this agent is called; unique at its edge.")
+@click.option("--name", required=True, help="Name of this agent, unique at its edge.")
 @click.option(
     "--kind",
     type=click.Choice(["ar", "robot"]),
-    help="What this agent is: a headset (ar) or a robot.  [default: the role of --profile]",
+    help="Kind of agent: ar (headset) or robot.  [default: the role in --profile]",
 )
-@click.option("--edge", "address", metavar="tcp://H:P", required=True, help="Where the edge listens.")
+@click.option("--edge", "address", metavar="tcp://H:P", required=True, help="Address of the edge.")
 @options.keys
 @click.option(
     "--server-key",
     metavar="FILE|KEY",
-    help="Public key of the edge; needed for an edge on another machine. Turns on encryption.",
+    help="Public key of the edge; required for an edge on another machine. Turns on encryption.",
 )
 @click.option(
-    "--link", metavar="NAME|FILE", help="Talk through an emulated network: wifi5, wifi-busy, a file."
+    "--link", metavar="NAME|FILE", help="Emulate a network to the edge: wifi5, wifi-busy or a YAML file."
 )
+@click.option("--link-seed", type=int, default=0, show_default=True, help="Seed of its delays and losses.")
+@click.option("--streamed", is_flag=True, help="Send raw frames and let the edge track (policy streamed).")
 @click.option(
-    "--link-seed", type=int, default=0, show_default=True, help="Of that network's delays and losses."
+    "--true-error", is_flag=True, help="Report the error against ground truth to the edge, for experiments."
 )
-@click.option("--streamed", is_flag=True, help="Send raw frames; the edge tracks (policy streamed).")
-@click.option("--true-error", is_flag=True, help="Tell the edge the true error of tracking, for experiments.")
 @options.calib
 @options.frames
 @camera_options.camera_options
-@click.option("--out", metavar="DIR", help="Write odom.tum, map.tum, latency.csv and report.json here.")
+@click.option("--out", metavar="DIR", help="Folder for odom.tum, map.tum, latency.csv and report.json.")
 @click.option(
     "--poses",
     metavar="udp://H:P",
-    help="Send every pose to a program that listens there (docs/do/integrate.md).",
+    help="Send every pose to a program at this address (docs/do/integrate.md).",
 )
 @options.config
 @options.verbose
@@ -81,11 +81,12 @@ def agent(
     verbose: bool,
     as_json: bool,
 ) -> None:
-    """Track one agent at sensor rate, send keyframes to an edge, and take its corrections.
+    """Track one agent at sensor rate, send keyframes to an edge, and apply its corrections.
 
-    The agent never waits for the edge: without it, odometry goes on unchanged, and the edge is
-    joined whenever it answers. Exit code 1 if it never did. SOURCE is a recording, which is played at
-    its own pace, or realsense[:SERIAL], a camera, until Ctrl-C.
+    SOURCE is a recording, played at its own rate, or a camera (realsense[:SERIAL]), until Ctrl-C.
+
+    The agent never waits for the edge: without it, odometry goes on unchanged, and the agent connects as
+    soon as the edge answers. Exit code 1 if it never answers.
 
     \b
     Example:  share agent rec/kitchen --name ann --kind ar --edge tcp://127.0.0.1:5555 --out out/ann
@@ -98,7 +99,7 @@ def agent(
     from share.wire.messages import Hello
 
     if streamed and true_error:
-        raise UsageError("--true-error: is of an agent that tracks itself; leave out --streamed, or this")
+        raise UsageError("--true-error does not go with --streamed, where the edge tracks; leave out one")
     agent_kind = _agent_kind(kind, camera.profile_name)
     run_id = secrets.randbits(63)
     connect_edge = _connector(address, run_id, _agent_keys(keys, server_key))
@@ -134,38 +135,41 @@ def agent(
     if not run.report["protocol"]["edge_sessions"]:
         if (refusal := run.report["protocol"]["refusal"]) is not None:
             raise ShareError(f"the edge at {address} refuses '{hello.name}': {refusal}")
-        raise ShareError(f"no edge ever answered at {address}; {run.trouble or _NO_EDGE_HINT}")
+        raise ShareError(f"no edge answered at {address}; {run.trouble or _NO_EDGE_HINT}")
 
 
 _NO_EDGE_HINT = "is `share edge` running there?"
 
 
 def _agent_keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
-    """None without --server-key. Raises UsageError."""
+    """Return the keys of this machine and the edge, None without --server-key. Raises UsageError."""
     from share.net.keys import agent_keys
 
     if server_key is None:
         if folder is not None:
-            raise UsageError("--keys: goes with --server-key, the public key of the edge")
+            raise UsageError("--keys needs --server-key, the public key of the edge")
         return None
     return agent_keys(None if folder is None else Path(folder), server_key)
 
 
 def _agent_kind(kind_given: str | None, profile_name: str | None) -> AgentKind:
-    """As given, or what the computer of that profile is for. Raises UsageError, ConfigError."""
+    """Return the kind given, or else the role in the profile. Raises UsageError, ConfigError."""
     from share.sensors.profile import load_host_profile
     from share.types import AgentKind
 
     role = kind_given or ("" if profile_name is None else load_host_profile(profile_name).role)
     if role not in set(AgentKind):
         raise UsageError(
-            "--kind: who is served, ar or robot? Say it, or name a --profile that does: d435i-n100-headset"
+            "--kind is required: ar (headset) or robot; or give a --profile with a role: d435i-n100-headset"
         )
     return AgentKind(role)
 
 
 def _connector(address: str, run_id: int, keys: AgentKeys | None) -> Callable[[], AgentLink]:
-    """What connects to the edge. Raises UsageError for an address that is none, or wants keys."""
+    """Return a function that connects to the edge.
+
+    Raises UsageError for an invalid address, or for one that needs keys.
+    """
     from share.net.transport import check_keys, connect, parse_address
 
     check_keys(parse_address(address), keys)
@@ -173,9 +177,9 @@ def _connector(address: str, run_id: int, keys: AgentKeys | None) -> Callable[[]
 
 
 def _error_estimator(
-    source: Source, settings: Config, true_error: bool, say: Callable[[str], None]
+    source: Source, settings: Config, true_error: bool, print_line: Callable[[str], None]
 ) -> ErrorEstimator | None:
-    """Who tells how wrong the tracker is. Raises UsageError, DataError."""
+    """Return the estimator of the tracking error, None if it is off. Raises UsageError, DataError."""
     if true_error:
         return _true_error(source)
     if not settings.agent.error_model:
@@ -183,40 +187,40 @@ def _error_estimator(
     from share.odometry.error_model.network import open_error_model
     from share.runtime.error_estimators import BackgroundErrorModel
 
-    return BackgroundErrorModel(open_error_model(settings.agent.error_model), say)
+    return BackgroundErrorModel(open_error_model(settings.agent.error_model), print_line)
 
 
 def _true_error(source: Source) -> ErrorEstimator:
-    """Raises UsageError where nobody knows it."""
+    """Return the error against ground truth. Raises UsageError if the source has no ground truth."""
     from share.metrics.local_error import LocalError
     from share.runtime.error_estimators import GroundTruthError
 
     truth = source.truth()
     if truth is None:
         raise UsageError(
-            "--true-error: this source comes without a truth; SESSION/NAME has one in truth/NAME.tum"
+            "--true-error: this source has no ground truth; SESSION/NAME keeps its own in truth/NAME.tum"
         )
     return GroundTruthError(LocalError(truth))
 
 
-def _emulated_link(dial: Callable[[], AgentLink], name: str, seed: int) -> Callable[[], AgentLink]:
-    """`connect_edge`, with an emulated network around the link. Raises UsageError, ConfigError."""
+def _emulated_link(connect_edge: Callable[[], AgentLink], name: str, seed: int) -> Callable[[], AgentLink]:
+    """Return `connect_edge` with an emulated network around its link. Raises UsageError, ConfigError."""
     from share.net.emulated_link import EmulatedLink, load_network
 
     link_network = load_network(name)
-    return lambda: EmulatedLink(dial(), link_network, seed)
+    return lambda: EmulatedLink(connect_edge(), link_network, seed)
 
 
 class _AgentLine(LiveLine):
-    """How far the run is, written over; and what is said, on lines of its own."""
+    """The live line of `share agent`; messages go on lines of their own."""
 
     def __init__(self, streamed: bool) -> None:
         super().__init__()
         self._streamed, self._total = streamed, 0
-        self._feed: CameraFeed | None = None  # of a live camera
+        self._feed: CameraFeed | None = None  # None for a recording
 
     def watch_source(self, source: Source) -> None:
-        """Whose frames are shown."""
+        """Set the source whose progress is shown."""
         self._feed, self._total = getattr(source, "feed", None), source.images_count
 
     def show(self, status: LiveStatus) -> None:
@@ -225,7 +229,7 @@ class _AgentLine(LiveLine):
         r = status.report()
         rtt = "  –  " if r["rtt_ms"] is None else f"{r['rtt_ms']:.1f} ms"
         counts = (
-            f"streamed {r['streamed']} answered {r['answered']} left out {r['drop_frame']} rtt {rtt}"
+            f"streamed {r['streamed']} answered {r['answered']} dropped {r['drop_frame']} rtt {rtt}"
             if self._streamed
             else f"sent {r['sent']} acknowledged {r['acknowledged']} corrections {r['corrections']} "
             f"rtt {rtt} map {r['map_id'] or '–'}"
@@ -245,22 +249,22 @@ def _summary(run: AgentRun) -> str:
     traffic = f"{r['bytes_up'] / 1e6:.2f} MB up, {r['bytes_down'] / 1e6:.3f} MB down"
     lines = [f"{r['tracked']} of {r['frames']} frames tracked, lost for {r['lost_s']:.1f} s"]
     if "untracked" in r:
-        lines += [f"{r['untracked']} more frames had no answer of the edge, {traffic}"]
+        lines += [f"{r['untracked']} more frames without an answer of the edge, {traffic}"]
     else:
         lines += [_keyframes_text(r, traffic)]
     if r["drop_late"]:
-        lines.append(f"{r['drop_late']} more frames came too late and were left out")
+        lines.append(f"{r['drop_late']} more frames dropped to keep up")
     if r["frames_late"]:
         lines.append(f"{r['frames_late']} poses were late, by up to {r['latest_s']:.1f} s")
     if p95 is not None:
-        lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (95 %: {p95:.1f} ms)")
+        lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (p95 {p95:.1f} ms)")
     if r["clock"]["uncertainty_ms"] is not None:
         lines.append(f"clock of the edge: {_clock_text(r['clock'])}")
     return "\n".join([*lines, *camera_options.camera_summary(r)])
 
 
 def _keyframes_text(r: dict[str, Any], traffic: str) -> str:
-    """What the link took of them, and what the edge has acknowledged."""
+    """Return how many keyframes were made, sent and acknowledged."""
     protocol, count = r["protocol"], r["keyframes"]
     if not protocol["edge_sessions"]:
         return f"no edge answered: {_count_text(count)} not sent"
@@ -270,7 +274,7 @@ def _keyframes_text(r: dict[str, Any], traffic: str) -> str:
 
 
 def _unacknowledged_text(run: AgentRun, name: str, finish_s: float) -> str | None:
-    """How many keyframes an edge that was there has not acknowledged, and why as far as the agent knows."""
+    """Return how many keyframes the edge did not acknowledge and why, as far as known; None if none."""
     protocol = run.report["protocol"]
     count = protocol["unacknowledged"]
     if not count or not protocol["edge_sessions"]:
@@ -281,13 +285,12 @@ def _unacknowledged_text(run: AgentRun, name: str, finish_s: float) -> str | Non
         why = run.trouble or "the edge is silent"
     elif protocol["held"]:
         why = (
-            f"it has {protocol['held']} of them, but not in "
-            f"its map's file; can it "
-            f"write that? It says why not"
+            f"it received {protocol['held']} of them but could not store them in its map file; "
+            "see the edge's log"
         )
     else:
-        why = f"it did not answer within agent.finish_s, {finish_s:g} s"
-    return f"the edge never acknowledged {_count_text(count)}: {why}"
+        why = f"no answer within agent.finish_s ({finish_s:g} s)"
+    return f"the edge did not acknowledge {_count_text(count)}: {why}"
 
 
 def _count_text(keyframes: int) -> str:
@@ -297,6 +300,6 @@ def _count_text(keyframes: int) -> str:
 def _clock_text(c: dict[str, Any]) -> str:
     uncertainty = f"±{c['uncertainty_ms']:.3g} ms"
     if c["claim"]:
-        return f"{c['offset_ms']:+.3f} ms from this one's, {uncertainty}"
-    bound = f"more than clock.claim_ms, {c['claim_ms']:g}"
-    return f"offset too uncertain ({uncertainty}, {bound}); latencies are by this machine's clock alone"
+        return f"{c['offset_ms']:+.3f} ms from this machine's, {uncertainty}"
+    bound = f"more than clock.claim_ms ({c['claim_ms']:g})"
+    return f"offset too uncertain ({uncertainty}, {bound}); latencies use this machine's clock alone"

@@ -1,4 +1,4 @@
-"""`share calibrate`: what a device's sensors are like, one command each."""
+"""`share calibrate`: the group of calibration commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from share.cli.calibrate_target import target
 
 @click.group()
 def calibrate() -> None:
-    """Find out what a device's cameras and IMU are like.
+    """Calibrate a device's cameras and IMU, and how they and a motion capture's body are mounted.
+
+    Order of use: target, camera, imu, camera-imu. Or write the factory's calibration with realsense.
 
     \b
     Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine

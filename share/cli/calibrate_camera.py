@@ -1,4 +1,4 @@
-"""`share calibrate camera`: intrinsics of one or two cameras, and how they sit to each other."""
+"""`share calibrate camera`: intrinsics of one or two cameras, and the extrinsics of a pair."""
 
 from __future__ import annotations
 
@@ -20,21 +20,24 @@ if TYPE_CHECKING:
     from share.lab.calibrate.target import Target
 
 
-@click.command(short_help="Intrinsics of one or two cameras from views of a board.")
+@click.command(short_help="Calibrate one or two cameras from views of a board.")
 @click.argument("source")
 @options.target
-@click.option("--camera", type=click.Choice(["cam0", "both"]), default="both", show_default=True)
+@click.option(
+    "--camera", type=click.Choice(["cam0", "both"]), default="both", show_default=True,
+    help="Calibrate cam0 only, or cam0 and cam1.",
+)  # fmt: skip
 @click.option(
     "--every", type=click.IntRange(1), default=1, show_default=True, metavar="N",
-    help="Look at each N-th picture.",
+    help="Use every N-th image.",
 )  # fmt: skip
 @click.option(
     "--views", "max_views", type=click.IntRange(4), default=60, show_default=True, metavar="N",
-    help="Use the N views that together tell most.",
+    help="Use the N most informative views.",
 )  # fmt: skip
 @click.option(
     "--lens", "model", type=click.Choice(["radtan", "equidistant"]), default="radtan", show_default=True,
-    help="Radial-tangential, or the fisheye model of Kannala and Brandt.",
+    help="Lens model: radial-tangential, or Kannala and Brandt's fisheye model (equidistant).",
 )  # fmt: skip
 @options.calib
 @options.workers
@@ -52,12 +55,13 @@ def camera(
     out: Path,
     as_json: bool,
 ) -> None:
-    """Find focal lengths, principal point and distortion of a camera or a stereo pair, and how the pair sits,
-    from a recording of a calibration board or a folder with cam0/*.png and cam1/*.png.
+    """Estimate focal lengths, principal point, distortion and stereo extrinsics of one or two cameras.
 
-    A radtan lens has its fifth coefficient, k3, where the views tell it.
-    Exit code 1 where the result is not to be believed; the files are written all the same. A camchain and a
-    report that are in DIR are then kept.
+    SOURCE is a recording of a calibration board, or a folder with cam0/*.png and cam1/*.png. The fifth
+    coefficient of a radtan lens, k3, is estimated if the views determine it.
+
+    Exit code 1 if the result is unreliable. If DIR holds an earlier result, that is kept, and the unreliable
+    one is written as NAME.failed.EXT.
 
     \b
     Example:  share calibrate camera board.mcap --target aprilgrid --out calib/mine
@@ -74,9 +78,7 @@ def camera(
     target = named_target(target_name)
     pictures = open_board_images(source, ("cam0", "cam1") if camera == "both" else ("cam0",), calib)
     if pictures.given_calibration is not None:
-        to_kalibr(
-            pictures.given_calibration.rig, pictures.given_calibration
-        )  # what is kept of it must be sound: said before the work
+        to_kalibr(pictures.given_calibration.rig, pictures.given_calibration)  # check it before the work
     options.warn_other_device(source, pictures.given_calibration, pictures.serial)
     writable_dir(out, CAMCHAIN, REPORT, PICTURE)
     outcome = _calibrate(source, pictures, target, every, max_views, model, workers)
@@ -89,7 +91,7 @@ def camera(
     click.echo(text if as_json else _summary(outcome, files))
     if not outcome.verdict.passed:
         raise ShareError(
-            f"{source}: not to be believed ({written_message(chain)}): " + "; ".join(outcome.verdict.reasons)
+            f"{source}: unreliable result ({written_message(chain)}): " + "; ".join(outcome.verdict.reasons)
         )
 
 
@@ -108,7 +110,8 @@ def _calibrate(
         )
         if len(set(sizes)) > 1:
             raise DataError(
-                f"{source}: pictures of {sizes[0]} and {sizes[1]}; calibrate one with --camera cam0"
+                f"{source}: the cameras have images of different sizes, {sizes[0]} and {sizes[1]}; calibrate "
+                "one with --camera cam0"
             )
         with_target = [
             view
@@ -117,7 +120,7 @@ def _calibrate(
         ]
         if not with_target:
             raise DataError(
-                f"{source}: no board in {len(views)} pictures; is --target the board that was shown?"
+                f"{source}: no board found in {len(views)} images; check that --target is the board shown"
             )
         used = [with_target[k] for k in choose_views(with_target, target, sizes[0], max_views)]
         stages("calibrating", 0, 1)
@@ -145,36 +148,32 @@ def _summary(outcome: CameraCalibration, files: tuple[Path, ...]) -> str:
 
     verdict = outcome.verdict
     lines = [
-        f"{len(outcome.views)} views of {outcome.views_with_target} that show the board",
+        f"{len(outcome.views)} of {outcome.views_with_target} views with the board used",
         "",
         aligned_table(parameter_table(outcome)),
         "",
     ]
     for cam, cover in enumerate(outcome.coverages):
         lines.append(
-            f"cam{cam}: {verdict.rms_px[cam]:.3f} px RMS, {verdict.rms_all_px[cam]:.3f} with the "
-            f"{verdict.outlier_corners[cam]} corners that are left out; "
-            f"corners in {cover.share:.0%} of the image"
+            f"cam{cam}: {verdict.rms_px[cam]:.3f} px RMS, {verdict.rms_all_px[cam]:.3f} with its "
+            f"{verdict.outlier_corners[cam]} outlier corners; corners cover {cover.share:.0%} of the image"
         )
         lines += [f"  {what}" for what in cover.gaps]
         if (radius := outcome.model_radius(cam)) is not None:
             lines.append(
-                f"  most corners beyond {radius:.0f} px of the principal point do not fit: there the lens is "
-                "not of this model"
+                f"  most corners beyond {radius:.0f} px from the principal point do not fit the lens model"
             )
     if verdict.epipolar_px is not None:
         previous_text = (
             ""
             if outcome.previous_epipolar_px is None
-            else f" ({outcome.previous_epipolar_px:.3f} px by the one before)"
+            else f" ({outcome.previous_epipolar_px:.3f} px with the previous calibration)"
         )
         lines.append(
-            f"the pair: half of the corners "
-            f"within {verdict.epipolar_px:.3f} "
-            f"px of their epipolar line{previous_text}"
+            f"stereo pair: median distance to the epipolar line {verdict.epipolar_px:.3f} px{previous_text}"
         )
     if verdict.outlier_views:
         names = ", ".join(outcome.views[k].name for k in verdict.outlier_views[:6])
         more = ", …" if len(verdict.outlier_views) > 6 else ""
-        lines.append(f"{len(verdict.outlier_views)} views fit worse than the rest: {names}{more}")
+        lines.append(f"{len(verdict.outlier_views)} views fit worse than the others: {names}{more}")
     return "\n".join([*lines, f"{files[0].parent}: {', '.join(path.name for path in files)}"])

@@ -1,4 +1,4 @@
-"""`share calibrate camera-imu`: where cameras sit on an IMU, and how far their clocks are apart."""
+"""`share calibrate camera-imu`: extrinsics of cameras and IMU, and the offset of their clocks."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
     from share.lab.calibrate.camera_imu_report import CameraImuCalibration
     from share.types import F64
 
-_WARN_NOISE_RATIO = 2.0  # times the stated noise: worth a word
+_WARN_NOISE_RATIO = 2.0  # residuals above this many times the stated noise give a warning
 
 
-@click.command("camera-imu", short_help="Where cameras sit on an IMU, and the offset of their clocks.")
+@click.command("camera-imu", short_help="Calibrate camera-IMU extrinsics and time offset.")
 @click.argument("source")
 @options.target
 @click.option(
     "--camera", metavar="CALIB.yaml",
-    help="The cameras, by share calibrate camera: a camchain file or a folder with one.",
+    help="The cameras: a camchain file by share calibrate camera, or its folder.  [default: SOURCE's]",
 )  # fmt: skip
 @click.option(
     "--imu", metavar="IMU.yaml",
-    help="The IMU's noise, by share calibrate imu: that file or a folder with it.",
+    help="The IMU's noise: a file by share calibrate imu, or its folder.  [default: SOURCE's]",
 )  # fmt: skip
 @click.option(
     "--every", type=click.IntRange(1), default=1, show_default=True, metavar="N",
-    help="Look at each N-th picture.",
+    help="Use every N-th image.",
 )  # fmt: skip
 @click.option(
     "--within", "max_offset_s", type=click.FloatRange(0.01, 1.0), default=0.5, show_default=True, metavar="S",
-    help="How far apart the clocks may be, s.",
+    help="Largest time offset to search, s.",
 )  # fmt: skip
 @options.workers
 @options.out_folder
@@ -57,11 +57,12 @@ def camera_imu(
     out: Path,
     as_json: bool,
 ) -> None:
-    """Find T_cam_imu of each camera and the time offset of camera and IMU, from a minute in which a rig was
-    turned and moved before a calibration board. What is not given is taken from the recording.
+    """Estimate T_cam_imu of each camera and the time offset between camera and IMU.
 
-    Exit code 1 where the result is not to be believed; the files are written all the same. An IMU chain that
-    is in DIR is kept, and so is a camchain then.
+    SOURCE is a recording of about a minute in which the rig was rotated and moved before a calibration board.
+
+    Exit code 1 if the result is unreliable. If DIR holds an earlier result, that is kept, and the unreliable
+    one is written as NAME.failed.EXT. An IMU chain in DIR is always kept.
 
     \b
     Example:  share calibrate camera-imu dance.mcap --target board.yaml --camera calib/mine \\
@@ -94,8 +95,10 @@ def camera_imu(
         as_given = None if imu is None else read_yaml_text(chain_file(imu, "--imu"))
         atomic_write(imu_chain, as_given or report.imu_chain_yaml(outcome, source))
     elif not has_noise(imu_chain, noise):
-        used = "the recording's own" if imu is None else f"that of --imu {imu}"
-        warnings.append(f"{imu_chain} is of other noise and is kept; used was {used}; --imu {out} uses it")
+        used = "the recording's" if imu is None else f"that of --imu {imu}"
+        warnings.append(
+            f"{imu_chain} has other noise than was used ({used}) and is kept; to use it, give --imu {out}"
+        )
     atomic_write(report_file, text + "\n")
     atomic_write(picture, residual_chart(outcome.fit, f"{source}: {verdict}"))
     click.echo(text if as_json else _summary(outcome, (chain, imu_chain, report_file, picture)))
@@ -103,7 +106,7 @@ def camera_imu(
         click.echo(f"share: {source}: {warning}", err=True)
     if not outcome.verdict.passed:
         reasons = "; ".join(outcome.verdict.reasons)
-        raise ShareError(f"{source}: not to be believed ({written_message(chain)}): {reasons}")
+        raise ShareError(f"{source}: unreliable result ({written_message(chain)}): {reasons}")
 
 
 def _calibrate(
@@ -126,7 +129,7 @@ def _calibrate(
     with Stages() as stages:
         table = read_imu(source, partial(stages, "reading the IMU"))
         if not len(table.imu):
-            raise DataError(f"{source}: has no IMU")
+            raise DataError(f"{source}: no IMU samples in the recording")
         views = find_stamped_views(pictures, target, every, partial(stages, "looking for the board"), workers)
         result = fit_camera_imu(
             views.stamps, views.views, target, pictures.rig, table.imu, noise, max_offset_s,
@@ -165,7 +168,7 @@ def _summary(outcome: CameraImuCalibration, files: tuple[Path, ...]) -> str:
     ]
     shift = f"{fit.shift_s * 1e3:+.3f} ± {fit.sigma_shift * 1e3:.3f} ms"
     lines = [
-        f"{outcome.views.with_target} of {outcome.views.images_searched} pictures show the board, "
+        f"{outcome.views.with_target} of {outcome.views.images_searched} images show the board, "
         f"{fit.state.curve.end_s:.1f} s",
         "",
         aligned_table(rows),
@@ -174,16 +177,15 @@ def _summary(outcome: CameraImuCalibration, files: tuple[Path, ...]) -> str:
         f"time offset: {shift} (t_imu = t_cam + offset)",
         _camera_sigmas_text(outcome),
         *(
-            f"cam{cam}: {rms:.3f} px RMS, {wrong} of {len(r)} corners left out"
+            f"cam{cam}: {rms:.3f} px RMS, {wrong} of {len(r)} corners are outliers"
             for cam, (rms, wrong, r) in enumerate(
                 zip(verdict.rms_px, verdict.outlier_corners, fit.corners, strict=True)
             )
         ),
-        f"gyroscope: residuals {verdict.gyro_noise_ratio:.2f} times its stated noise; turned by "
+        f"gyroscope: residuals {verdict.gyro_noise_ratio:.2f} times the stated noise; rotation rate "
         f"{_comma_list(verdict.rotation_rate_rms)} rad/s rms",
-        f"accelerometer: {verdict.accel_noise_ratio:.2f} times; "
-        f"moved by {_comma_list(verdict.acceleration_rms)} "
-        f"m/s^2 rms; "
+        f"accelerometer: residuals {verdict.accel_noise_ratio:.2f} times the stated noise; acceleration "
+        f"{_comma_list(verdict.acceleration_rms)} m/s^2 rms; "
         f"gravity {np.linalg.norm(fit.state.gravity):.4f} m/s^2",
         f"{files[0].parent}: {', '.join(path.name for path in files)}",
     ]
@@ -191,16 +193,16 @@ def _summary(outcome: CameraImuCalibration, files: tuple[Path, ...]) -> str:
 
 
 def _camera_sigmas_text(outcome: CameraImuCalibration) -> str:
-    """What of the sigmas comes from the cameras' own."""
+    """Return how much of the sigmas comes from the uncertainty of the camera calibration."""
     from share.lab.calibrate.camera_imu.verdict import largest_sigmas
 
     fit, uncertainty = outcome.fit, outcome.uncertainty
     if fit.by_rig is None:
-        return f"cameras: taken as exact, the sigmas leave their errors out ({uncertainty.source})"
+        return f"cameras: taken as exact; the sigmas do not include their errors ({uncertainty.source})"
     deg, mm, ms = largest_sigmas(fit.axis_sigmas(fit.by_rig))
     return (
-        f"cameras: as well known as {uncertainty.source} says; of the sigmas that is up to "
-        f"{deg:.3f} deg, {mm:.2f} mm, {ms:.3f} ms"
+        f"cameras: uncertainty of {uncertainty.source}; it contributes up to {deg:.3f} deg, {mm:.2f} mm, "
+        f"{ms:.3f} ms to the sigmas"
     )
 
 
@@ -213,18 +215,16 @@ def _comma_list(values: F64) -> str:
 
 
 def _warnings(outcome: CameraImuCalibration) -> list[str]:
-    """What a person ought to know before believing it: a line each."""
+    """Return warnings about the result, one per line."""
     verdict = outcome.verdict
     out = _comparison_warnings(outcome.comparison)
     if not outcome.uncertainty.passed:
-        out.append(f"{outcome.uncertainty.source} does not believe these cameras; calibrate them again first")
+        out.append(f"{outcome.uncertainty.source} calls these cameras unreliable; calibrate them again first")
     if dropped := outcome.views.dropped:
-        out.append(
-            f"{dropped} pictures of the board are left out: their stamps are not later than those before"
-        )
+        out.append(f"{dropped} images of the board were skipped: their stamps do not increase")
     return out + [
-        f"{name} errs by {times:.1f} times its stated noise: scale, axes, or the board's size; the sigmas "
-        "take that into account"
+        f"{name} residuals are {times:.1f} times the stated noise (scale, axes or the board's size may be "
+        "wrong); the sigmas are scaled accordingly"
         for name, times in (
             ("gyroscope", verdict.gyro_noise_ratio),
             ("accelerometer", verdict.accel_noise_ratio),
@@ -234,19 +234,17 @@ def _warnings(outcome: CameraImuCalibration) -> list[str]:
 
 
 def _comparison_warnings(comparison: MountingComparison | None) -> list[str]:
-    """How the calibration that was there before compares."""
+    """Return warnings about the difference to the calibration that was given."""
     if comparison is None:
         return []
     if comparison.inverted:
         return [
-            "the extrinsics that were given are inverted: what stands there as T_cam_imu is T_imu_cam, or "
-            "the other way round; the new file has it right"
+            "the given extrinsics are inverted: T_cam_imu holds T_imu_cam, or the reverse; the new file is "
+            "right"
         ]
     if comparison.is_far:
         return [
-            f"cam0 sits {comparison.shifted_mm:.0f} mm and "
-            f"{comparison.turned_deg:.1f} "
-            f"deg from where the given "
-            "calibration has it"
+            f"cam0 is {comparison.shifted_mm:.0f} mm and {comparison.turned_deg:.1f} deg from its pose in "
+            "the given calibration"
         ]
     return []

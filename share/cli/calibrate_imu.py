@@ -1,4 +1,4 @@
-"""`share calibrate imu`: noise and bias of an IMU, from a recording at rest."""
+"""`share calibrate imu`: estimate noise and bias of an IMU from a recording at rest."""
 
 from __future__ import annotations
 
@@ -16,25 +16,32 @@ if TYPE_CHECKING:
     from share.lab.calibrate.imu import ImuCharacteristics
     from share.lab.calibrate.imu_report import NoiseRow
 
-_WARN_RATIO = 2.0  # times the profile's figure, or part of it: worth a word
+_WARN_RATIO = 2.0  # a figure beyond this factor of the profile's, up or down, gives a warning
 _SYMBOLS = {"density": "N", "instability": "B", "walk": "K"}
 
 
-@click.command(short_help="Noise and bias of an IMU, from a recording at rest.")
+@click.command(short_help="Estimate IMU noise and bias from a recording at rest.")
 @click.argument("source")
-@click.option("--profile", "profile_name", metavar="P", help="Compare with this device's data sheet: d435i.")
+@click.option(
+    "--profile",
+    "profile_name",
+    metavar="P",
+    help="Compare with the data sheet in this profile, such as d435i.",
+)
 @click.option(
     "--inflate",
     type=click.FloatRange(min=1),
     default=1.0,
     show_default=True,
-    help="Times the measured noise that is written for a filter to believe.",
+    help="Multiply the measured noise by this in the file for the filter.",
 )
 @options.out_folder
 @options.as_json
 def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_json: bool) -> None:
-    """Measure white noise, bias instability and bias random walk of an IMU (Allan deviation) from a recording
-    in which it lay still: ten minutes for the white noise, three hours for the rest.
+    """Estimate white noise, bias instability and bias random walk of an IMU by Allan deviation.
+
+    SOURCE is a recording of the IMU at rest: ten minutes suffice for the white noise, instability and random
+    walk need three hours.
 
     \b
     Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine
@@ -88,18 +95,17 @@ def _summary(characteristics: ImuCharacteristics, rows: list[NoiseRow], dropped:
     norm, bias = gravity_norm(characteristics), ", ".join(f"{b:+.5f}" for b in characteristics.gyro.mean)
     return "\n".join(
         [
-            f"{characteristics.rest_s:.0f} s at rest of "
-            f"{characteristics.total_s:.0f} s, "
-            f"{characteristics.rate_hz:.2f} Hz; "
-            f"{characteristics.missing} samples lost in {characteristics.gaps} gaps, {dropped} out of order",
+            f"{characteristics.rest_s:.0f} s at rest of {characteristics.total_s:.0f} s, "
+            f"{characteristics.rate_hz:.2f} Hz; {characteristics.missing} samples lost in "
+            f"{characteristics.gaps} gaps, {dropped} out of order",
             "",
             aligned_table([heads, *([_row_name(row), row.unit, *_cells(row)][: len(heads)] for row in rows)]),
             "",
             "N: white noise, B: bias instability, K: random walk of the bias",
-            "± one sigma; < where the recording does not tell it, by 95 %",
-            f"gyroscope's bias: {bias} rad/s",
-            f"accelerometer's mean: {norm:.4f} m/s^2, {100 * (norm / STANDARD_GRAVITY - 1):+.2f} % off "
-            "standard gravity (scale and bias: one pose does not tell them apart)",
+            "± one sigma; < 95 % upper bound where the recording is too short to measure it",
+            f"gyroscope bias: {bias} rad/s",
+            f"accelerometer mean: {norm:.4f} m/s^2, {100 * (norm / STANDARD_GRAVITY - 1):+.2f} % off "
+            "standard gravity (scale and bias, which one orientation cannot separate)",
         ]
     )
 
@@ -115,31 +121,26 @@ def _cells(row: NoiseRow) -> list[str]:
 
 
 def _warnings(characteristics: ImuCharacteristics, rows: list[NoiseRow]) -> list[str]:
-    """What a person ought to know before believing it: a line each."""
+    """Return warnings about the result, one per line."""
     out = []
     if characteristics.total_s - characteristics.rest_s > 10:
         out.append(
-            f"it was moved; what is used is the rest from {characteristics.start_s:.0f} to "
-            f"{characteristics.start_s + characteristics.rest_s:.0f} s after its start"
+            f"the IMU was moved; only its rest from {characteristics.start_s:.0f} to "
+            f"{characteristics.start_s + characteristics.rest_s:.0f} s is used"
         )
     if characteristics.unbridged_gaps:
         out.append(
-            f"{characteristics.unbridged_gaps} gaps are too "
-            f"long to be bridged: averages "
-            f"do not go across them"
+            f"{characteristics.unbridged_gaps} gaps are too long to interpolate; no average spans them"
         )
     for row in rows:
         if row.ratio_to_profile is not None and not 1 / _WARN_RATIO <= row.ratio_to_profile <= _WARN_RATIO:
             out.append(
-                f"{_row_name(row)} is "
-                f"{row.ratio_to_profile:.2g} times "
-                f"the profile's {row.profile_value:.2g} {row.unit}"
+                f"{_row_name(row)} is {row.ratio_to_profile:.2g} times the profile's "
+                f"{row.profile_value:.2g} {row.unit}"
             )
         if row.quantity == "walk" and not row.combined.told:
             out.append(
-                f"{_row_name(row)} is not told by "
-                f"{characteristics.rest_s / 60:.0f} "
-                f"min; the file has an upper bound, "
-                "three hours would tell"
+                f"{_row_name(row)} cannot be measured in {characteristics.rest_s / 60:.0f} min; the file has "
+                "an upper bound; record three hours to measure it"
             )
     return out

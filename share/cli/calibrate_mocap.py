@@ -1,4 +1,4 @@
-"""`share calibrate mocap`: how a motion capture's body sits on a device."""
+"""`share calibrate mocap`: where a motion capture's rigid body is on a device, and its clock offset."""
 
 from __future__ import annotations
 
@@ -20,34 +20,33 @@ if TYPE_CHECKING:
     from share.types import F64
 
 
-@click.command(short_help="How a motion capture's body sits on a device, and its clock.")
+@click.command(short_help="Calibrate a motion capture's body and clock to a device.")
 @click.argument("source")
 @click.option(
     "--truth",
     required=True,
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="What the motion capture saw: Vicon's or Motive's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
+    help="Motion capture file: Vicon's or Motive's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
 )
 @click.option(
     "--body",
     metavar="BODY",
-    help="Which rigid body of the file.  [default: the one of the source's name, or the only one]",
+    help="Rigid body in that file.  [default: the one with the source's name, or the only one]",
 )
 @options.rotations
 @click.option(
     "--calib",
     metavar="FILE",
-    help="The IMU's noise, by share calibrate imu: kalibr_imu_chain.yaml, or a folder with it; overrides "
-    "what the source carries.",
+    help="The IMU's noise: kalibr_imu_chain.yaml by share calibrate imu, or its folder.  [default: SOURCE's]",
 )
 @click.option(
     "--track",
     metavar="T.tum",
     type=click.Path(path_type=Path),
-    help="Poses of the device by share track, to check with.",
+    help="Poses of the device by share track, to check the result.",
 )
-@click.option("--one-clock", is_flag=True, help="Both were stamped by one clock.")
+@click.option("--one-clock", is_flag=True, help="Device and motion capture share one clock.")
 @click.option(
     "--within",
     "max_offset_s",
@@ -55,7 +54,7 @@ if TYPE_CHECKING:
     default=0.5,
     show_default=True,
     metavar="S",
-    help="How far apart the clocks may be, s.",
+    help="Largest clock offset to search, s.",
 )
 @options.sigma_mm
 @options.out_folder
@@ -73,8 +72,10 @@ def mocap(
     out: Path,
     as_json: bool,
 ) -> None:
-    """Find where a motion capture's body sits on the IMU, how far its world is from level, and how far its
-    clock from the device's, from a minute of motion that both recorded.
+    """Estimate the pose of a motion capture's body in the IMU frame, the tilt of its world, and the offset
+    and drift of its clock.
+
+    SOURCE and --truth are recordings of the same motion, about a minute long.
 
     \b
     Example:  share calibrate mocap walk.mcap --truth walk.vicon.tum --out calib/mine
@@ -108,7 +109,7 @@ def mocap(
     for warning in fit_warnings(result):
         click.echo(f"share: {source}: {warning}", err=True)
     if hand_eye_check and not hand_eye_check.agrees:
-        click.echo(f"share: {track}: does not agree with the fit; is it of this recording?", err=True)
+        click.echo(f"share: {track} contradicts the fit; check that it is of this recording", err=True)
 
 
 def _check_with_track(result: MocapFit, track: Path, trajectory: MocapTrajectory) -> HandEyeCheck:
@@ -133,21 +134,17 @@ def _summary(result: MocapFit, hand_eye_check: HandEyeCheck | None) -> str:
     rotation_deg = np.degrees(se3.so3_log(T[:3, :3]))
     lines = [
         f"body rotation   {_triple_text(rotation_deg, np.degrees(sigma[2:5]), 2)} deg (rotation vector)",
-        f"body position   {_triple_text(T[:3, 3] * 1e3, sigma[5:8] * 1e3, 1)} mm, in the IMU's frame",
-        f"world tilt      {result.tilt_deg:.3f} ± {np.degrees(sigma[:2].max()):.3f} deg, its {result.up} up",
-        f"clock           IMU's less mocap's {result.offset_ns * 1e-6:+.2f} ± {sigma[8] * 1e3:.2f} ms, "
+        f"body position   {_triple_text(T[:3, 3] * 1e3, sigma[5:8] * 1e3, 1)} mm, in the IMU frame",
+        f"world tilt      {result.tilt_deg:.3f} ± {np.degrees(sigma[:2].max()):.3f} deg, up axis {result.up}",
+        f"clock           IMU minus mocap {result.offset_ns * 1e-6:+.2f} ± {sigma[8] * 1e3:.2f} ms, "
         f"drift {result.drift_ppm:+.1f} ± {sigma[9] * 1e6:.1f} ppm",
-        f"left            {residuals.position_mm:.1f} mm, "
-        f"{residuals.rotation_deg:.2f} "
-        f"deg rms of {residuals.samples} "
-        f"poses, {100 * residuals.doubted:.1f} % doubted",
+        f"residuals       {residuals.position_mm:.1f} mm, {residuals.rotation_deg:.2f} deg rms of "
+        f"{residuals.samples} poses, {100 * residuals.doubted:.1f} % outliers",
     ]
     if hand_eye_check:
         lines.append(
-            f"hand-eye        by the track: {np.degrees(hand_eye_check.rotation_error_rad):.2f} deg and "
-            f"{hand_eye_check.translation_error_m * 1e3:.1f} mm "
-            f"from that, {hand_eye_check.sigmas:.1f} "
-            f"standard errors"
+            f"hand-eye        differs by {np.degrees(hand_eye_check.rotation_error_rad):.2f} deg and "
+            f"{hand_eye_check.translation_error_m * 1e3:.1f} mm, {hand_eye_check.sigmas:.1f} standard errors"
         )
     return "\n".join(lines)
 

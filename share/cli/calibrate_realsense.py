@@ -1,4 +1,4 @@
-"""`share calibrate realsense`: the calibration that the factory measured, as a file."""
+"""`share calibrate realsense`: write the factory calibration of a RealSense to files."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from share.cli import camera_options, options
 from share.errors import UsageError
 
 
-@click.command(short_help="The factory calibration of an attached RealSense, as files.")
+@click.command(short_help="Write the factory calibration of an attached RealSense.")
 @click.argument("serial", required=False)
 @camera_options.profile
 @camera_options.mode
-@click.option("--depth", is_flag=True, help="Also of the depth stream.")
+@click.option("--depth", is_flag=True, help="Include the depth stream.")
 @options.out_folder
 def realsense(serial: str | None, profile_name: str | None, mode: str | None, depth: bool, out: Path) -> None:
-    """Write the calibration that the factory stored in the camera, for --calib. SERIAL: which camera, where
-    several are attached. The factory measures no IMU noise: the profile's is written. Files that are there
-    are not overwritten.
+    """Write the factory calibration stored in a RealSense camera, for use with --calib.
+
+    SERIAL selects the camera if several are attached. The factory does not measure IMU noise: the profile's
+    is written. Existing files are not overwritten.
 
     \b
     Example:  share calibrate realsense --out calib/mine
@@ -32,7 +33,7 @@ def realsense(serial: str | None, profile_name: str | None, mode: str | None, de
 
     for path in (out / CAMCHAIN, out / IMU_CHAIN):
         if path.exists():
-            raise UsageError(f"{path}: exists and is not overwritten; give another --out")
+            raise UsageError(f"{path} exists and is not overwritten; give another --out")
     request = StreamRequest(load_profile(profile_name or camera_options.PROFILE, mode), depth=depth)
     with RealSenseCamera(request, serial) as camera:
         rig, serial_found = camera.rig, camera.serial
@@ -44,4 +45,4 @@ def realsense(serial: str | None, profile_name: str | None, mode: str | None, de
         atomic_write(out / name, text)
     size = f"{rig.cam0.width}x{rig.cam0.height}, f {rig.cam0.fx:.1f} {rig.cam0.fy:.1f} px"
     click.echo(f"{out}: {provenance}: {size}, baseline {100 * rig.baseline:.2f} cm")
-    click.echo("the IMU's noise is the profile's: the factory measures none, `share calibrate imu` does")
+    click.echo("IMU noise: from the profile; measure it with `share calibrate imu`")

@@ -1,4 +1,4 @@
-"""A live camera in place of a recording: its options, and how it is opened."""
+"""Options of a live camera, opening it, and its part of live lines and summaries."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ profile = click.option(
     "--profile",
     "profile_name",
     metavar="P",
-    help=f"Kind of camera: a profile's name or file.  [default: {PROFILE}]",
+    help=f"Camera profile: its name or YAML file.  [default: {PROFILE}]",
 )
-mode = click.option("--mode", metavar="WxH[@HZ]", help="Image size and rate; default: the profile's.")
+mode = click.option("--mode", metavar="WxH[@HZ]", help="Image size and rate.  [default: the profile's]")
 sensors = click.option(
     "--sensors",
     type=click.Choice(["stereo", "rgbd"]),
-    help="Of a camera: infrared pair, or left image and depth.  [default: stereo]",
+    help="Streams of a live camera: infrared pair, or left image and depth.  [default: stereo]",
 )
 
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """What was asked of a live camera; None: nothing."""
+    """The camera options given; None where one was not."""
 
     profile_name: str | None
     mode: str | None
     sensors: str | None
 
     def camera_request(self) -> StreamRequest:
-        """Raises ConfigError for an unknown profile or mode."""
+        """Return the streams to ask of the camera. Raises ConfigError for an unknown profile or mode."""
         from share.cameras.realsense.streams import StreamRequest
         from share.sensors.profile import load_profile
 
@@ -57,17 +57,17 @@ class CameraOptions:
         )
 
     def check_unused(self, source: str) -> None:
-        """Raises UsageError where a recording was asked for what only a camera has."""
+        """Raise UsageError if any camera option was given with a recording."""
         named = {"--profile": self.profile_name, "--mode": self.mode, "--sensors": self.sensors}
         options_given = ", ".join(option for option, value in named.items() if value is not None)
         if options_given:
             raise UsageError(
-                f"{source}: {options_given} goes with a live camera (realsense) only; leave it out"
+                f"{source}: {options_given} works only with a live camera (SOURCE realsense); leave it out"
             )
 
 
 def camera_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command the options of a live camera, as `camera: Asked`."""
+    """Add the options of a live camera to a command, which gets them as `camera: CameraOptions`."""
 
     @functools.wraps(command)
     def with_camera(*args: Any, profile_name: str, mode: str, sensors: str, **options: Any) -> None:
@@ -82,10 +82,11 @@ def open_source(
     frames: slice | None,
     camera: CameraOptions,
     settings: Config,
-    say: Callable[[str], None],
+    print_line: Callable[[str], None],
 ) -> Source:
-    """A recording or a live camera, which is let go when the command ends. `say` is told what happens to it.
+    """Open a recording or a live camera; a camera is closed when the command ends.
 
+    print_line: called with a line when the camera is lost, found again and so on.
     Raises UsageError, ConfigError, DataError, ShareError.
     """
     from share.cameras.realsense.devices import is_camera
@@ -95,17 +96,18 @@ def open_source(
         camera.check_unused(source)
         return open_source(source, calib, frames)
     if frames is not None:
-        raise UsageError("--frames: goes with a recording, not with a live camera")
+        raise UsageError("--frames works only with a recording, not with a live camera; leave it out")
     from share.cameras.realsense.source import open_live
     from share.runtime.source import read_given_calibration
 
-    live = open_live(source, camera.camera_request(), settings.sequencer, say, read_given_calibration(calib))
+    calibration = read_given_calibration(calib)
+    live = open_live(source, camera.camera_request(), settings.sequencer, print_line, calibration)
     click.get_current_context().with_resource(closing(live))
     return live
 
 
 class TrackLine:
-    """The live line of `share track`, once a second."""
+    """The live line of `share track` on a camera, updated once a second."""
 
     def __init__(self, feed: CameraFeed, line: LiveLine) -> None:
         self._feed, self._line, self._frames = feed, line, 0
@@ -114,13 +116,13 @@ class TrackLine:
     def __call__(self, result: TrackResult) -> None:
         self._frames += 1
         if self._once_a_second.fire_if_due(time.monotonic_ns()):
-            waiting_text = "" if result.waiting_for is None else f", waits for {result.waiting_for.text}"
+            waiting_text = "" if result.waiting_for is None else f", waiting for {result.waiting_for.text}"
             camera = f"camera {self._feed.status()}"
             self._line.write(f"{self._frames} frames  tracking {result.state}{waiting_text}  {camera}")
 
 
 def camera_status_text(feed: CameraFeed | None) -> str:
-    """A live camera's part of the agent's line; nothing without one."""
+    """Return the camera's part of the agent's live line; empty without a camera."""
     if feed is None:
         return ""
     status = feed.status()
@@ -141,13 +143,13 @@ _CAMERA_EVENTS = (
 
 
 def camera_events(report: dict[str, Any]) -> str:
-    """What happened to the camera, without what never did; of its report."""
+    """Return the non-zero event counts of a camera's report, and its health at the end unless OK."""
     events = [f"{name.replace('_', ' ')} {report[name]}" for name in _CAMERA_EVENTS if report[name]]
     return ", ".join([*events, *([] if report["health"] == "OK" else [f"{report['health']} at the end"])])
 
 
 def camera_summary(report: dict[str, Any]) -> list[str]:
-    """Of a run's report: lines on its camera, none if it had none."""
+    """Return the lines on the camera of a run's report; none if it had no camera."""
     if "camera" not in report:
         return []
     camera_report = report["camera"]

@@ -1,4 +1,4 @@
-"""`share capture`: record a headset or robot."""
+"""`share capture`: record the camera and IMU of a headset or robot."""
 
 from __future__ import annotations
 
@@ -19,22 +19,24 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("source", default="realsense")
 @camera_options.profile
-@click.option("--out", required=True, metavar="REC.mcap", type=click.Path(path_type=Path), help="Recording.")
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after so long.")
+@click.option(
+    "--out", required=True, metavar="REC.mcap", type=click.Path(path_type=Path), help="Recording to write."
+)
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this time, s.")
 @camera_options.mode
 @click.option(
     "--calib",
     metavar="DIR",
-    help="Your calibration of this camera, to be recorded in place of the factory's.",
+    help="Record this calibration of the camera instead of the factory's.",
 )
-@click.option("--depth", is_flag=True, help="Record depth too.")
-@click.option("--imu-only", is_flag=True, help="No images: for `share calibrate imu`.")
+@click.option("--depth", is_flag=True, help="Record depth as well.")
+@click.option("--imu-only", is_flag=True, help="Record no images, as `share calibrate imu` needs.")
 @click.option(
     "--min-free-gb",
     type=click.FloatRange(min=0),
     default=2.0,
     show_default=True,
-    help="Of the disk, this much stays free.",
+    help="Stop when less than this is free on the disk, GB.",
 )
 @options.as_json
 def capture(
@@ -49,9 +51,10 @@ def capture(
     min_free_gb: float,
     as_json: bool,
 ) -> None:
-    """Record a camera with its IMU, calibration and serial number until Ctrl-C, as MCAP.
+    """Record a camera, its IMU, calibration and serial number as MCAP, until Ctrl-C.
 
-    SOURCE is realsense or realsense:SERIAL. After a power cut, `share dataset recover` mends the .part.
+    SOURCE is realsense or realsense:SERIAL. After a power cut, REC.mcap.part is left: `share dataset recover`
+    makes a recording of it.
 
     \b
     Example:  share capture --out walk.mcap --seconds 60
@@ -66,9 +69,11 @@ def capture(
     from share.sensors.profile import load_profile
 
     if depth and imu_only:
-        raise UsageError("--depth, --imu-only: give one of them")
+        raise UsageError("--depth and --imu-only exclude each other; give one of them")
     if calib is not None and imu_only:
-        raise UsageError("--calib, --imu-only: give one of them; there are no images to be calibrated")
+        raise UsageError(
+            "--calib and --imu-only exclude each other: no images are recorded; give one of them"
+        )
     request = StreamRequest(
         load_profile(profile_name or camera_options.PROFILE, mode), images=not imu_only, depth=depth
     )
@@ -100,10 +105,11 @@ def _summary(report: dict[str, Any]) -> str:
     notes = camera_options.camera_events(report)
     lines = [
         aligned_table([head, *rows]),
-        f"{report['imu']} IMU samples joined" + (f"; {notes}" if notes else ""),
+        f"{report['imu']} IMU samples" + (f"; {notes}" if notes else ""),
     ]
     if report["foreign"]:
         lines.append(
-            f"{report['foreign']} stamps are of the host's clock, not of the camera's: see docs/do/record.md"
+            f"{report['foreign']} samples have stamps of the host's clock, not the camera's: "
+            "see docs/do/record.md"
         )
     return "\n".join([*lines, f"{report['out']} ({report['ended']})"])

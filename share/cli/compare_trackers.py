@@ -1,4 +1,4 @@
-"""`share evaluate compare`: our tracker and those of others on the same recordings."""
+"""`share evaluate compare`: run SHARE's tracker and others on the same recordings."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
     from share.runtime.source import Source
 
 
-@click.command(short_help="Our tracker and those of others, on the same recordings.")
+@click.command(short_help="Compare SHARE's tracker with others.")
 @click.argument("sources", nargs=-1, required=True)
 @click.option(
     "--peer",
     "peers",
     multiple=True,
     metavar="NAME=PYTHON",
-    help=f"Interpreter that has {' or '.join(PEERS)}; may be repeated.  [default: the one that runs SHARE]",
+    help=f"Python with {' or '.join(PEERS)} installed; may be repeated.  [default: the one running SHARE]",
 )
 @click.option(
     "--vocabulary",
     metavar="FILE",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="ORBvoc.txt, which ORB-SLAM3 needs and its package has not.",
+    help="ORBvoc.txt, which ORB-SLAM3 needs and its package lacks.",
 )
 @options.config
-@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
+@options.out_folder
 def compare(
     sources: tuple[str, ...],
     peers: tuple[str, ...],
@@ -43,13 +43,13 @@ def compare(
     config_file: str | None,
     out: Path,
 ) -> None:
-    """Run SHARE's own tracker and those of others over the same recordings, score all by the truth, and
-    measure what they take of a processor. Each agent alone, no edge.
+    """Run SHARE's tracker and others over the same recordings; compare their errors against ground truth and
+    their CPU time. Each agent runs alone, without an edge.
 
-    SOURCES are sessions, all of whose agents are run, or what `share track` takes, with a truth, stereo and
-    an IMU. Peers come from package registries, each in an environment of its own; one that is not there is
-    named and left out. In DIR: a row and a trajectory (TUM) a run, table.md, table.csv, report.html and
-    pictures. Broken off, the same command goes on where it stopped.
+    SOURCES are sessions (all agents are run) or sources that `share track` takes, with ground truth, stereo
+    and IMU. Other trackers are installed from package registries, each in its own environment; one that is
+    missing is named and skipped. DIR gets a row and a trajectory (TUM) per run, table.md, table.csv,
+    report.html and pictures. An interrupted command continues when it is run again.
 
     \b
     Example:  python -m venv peers && peers/bin/pip install depthai==3.12.0
@@ -61,25 +61,27 @@ def compare(
 
     recordings = _open_recordings(sources)
     entries, missing = tracker_entries(settings, peer_interpreters(peers), vocabulary)
-    jobs = [(name, contender) for name in recordings for contender in entries]
+    jobs = [(name, entry) for name in recordings for entry in entries]
     unsuitable = [(name, one) for name, one in jobs if not one.can_run(recordings[name])]
     missing += [
-        f"{one.title} on {name}, which is {recordings[name].rig.kind}: others are run with stereo+imu"
+        f"{one.title} on {name}, which is {recordings[name].rig.kind}: other trackers need stereo+imu"
         for name, one in unsuitable
     ]
     for text in missing:
-        click.echo(f"left out: {text}", err=True)
+        click.echo(f"skipped: {text}", err=True)
     writable_dir(out, "table.md", "table.csv", "report.html")
     jobs = [job for job in jobs if job not in unsuitable]
     rows_found, failed = _run_jobs(jobs, recordings, out)
     if rows_found:
         _write_report(out, rows_found, missing)
     if failed:
-        raise ShareError(f"{failed} of {len(jobs)} runs failed; the same command runs them again")
+        raise ShareError(
+            f"{failed} of {len(jobs)} runs failed; run the same command again to repeat only those"
+        )
 
 
 def _open_recordings(sources: tuple[str, ...]) -> dict[str, Source]:
-    """By name. Raises UsageError where there is no truth."""
+    """Open the recordings, by name. Raises UsageError for one without ground truth."""
     from share.lab.evaluate.peer_comparison import check_truth
     from share.runtime.source import open_source
 
@@ -92,17 +94,17 @@ def _open_recordings(sources: tuple[str, ...]) -> dict[str, Source]:
 def _run_jobs(
     jobs: Sequence[tuple[str, TrackerEntry]], recordings: Mapping[str, Source], out: Path
 ) -> tuple[list[TrackerRow], int]:
-    """What is known, and how many failed, which is said."""
+    """Return the rows of all runs that succeeded and the number that failed; print why they failed."""
     from share.lab.evaluate.peer_comparison import tracker_rows
 
     live, rows_found, failed = LiveLine(), list["TrackerRow"](), 0
-    for number, (name, contender) in enumerate(jobs):
-        label = f"{number + 1} of {len(jobs)}: {name}: {contender.title}"
+    for number, (name, entry) in enumerate(jobs):
+        label = f"{number + 1} of {len(jobs)}: {name}: {entry.title}"
         show = partial(_show_progress, live, label, recordings[name].images_count)
         try:
-            rows_found += tracker_rows(name, recordings[name], contender, out, show)
+            rows_found += tracker_rows(name, recordings[name], entry, out, show)
         except DataError as error:
-            live.print_line(f"share: {name}: {contender.title}: {error}")
+            live.print_line(f"share: {name}: {entry.title}: {error}")
             failed += 1
     live.end()
     return rows_found, failed
@@ -129,7 +131,7 @@ def _show_progress(line: LiveLine, label: str, total: int, done: int) -> None:
 
 
 def _named_recordings(sources: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-    """Name and what to open. Raises UsageError where two have one name."""
+    """Yield name and path of each recording. Raises UsageError if two have the same name."""
     from share.recordings.session import is_session, read_session
 
     named = []
@@ -143,16 +145,16 @@ def _named_recordings(sources: tuple[str, ...]) -> Iterator[tuple[str, str]]:
             named.append(("/".join(folder.resolve().parts[-2:]) if "/" in text else text, text))
     names = [name for name, _ in named]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise UsageError(f"two recordings are called {twice[0]}; rename a folder")
+        raise UsageError(f"two recordings are named {twice[0]}; rename a folder")
     yield from named
 
 
 def peer_interpreters(peers: Sequence[str]) -> dict[str, Path]:
-    """By name of the peer, of texts NAME=PYTHON. Raises UsageError."""
+    """Parse NAME=PYTHON texts; return the interpreter by tracker name. Raises UsageError."""
     interpreters = {}
     for text in peers:
         name, _, python = text.partition("=")
         if name not in PEERS or not python:
-            raise UsageError(f"--peer {text}: give NAME=PYTHON, with a name of {', '.join(PEERS)}")
+            raise UsageError(f"--peer {text}: give NAME=PYTHON, where NAME is {' or '.join(PEERS)}")
         interpreters[name] = Path(python)
     return interpreters

@@ -1,4 +1,4 @@
-"""`share dataset`: look into, convert, recover and align recordings; look into and export maps."""
+"""`share dataset`: inspect, convert, recover and align recordings; inspect and export maps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from share.errors import UsageError
 
 @click.group()
 def dataset() -> None:
-    """Look into, convert, recover and align recordings; look into and export maps.
+    """Inspect, convert, recover and align recordings; inspect and export maps.
 
     \b
     Example:  share dataset info rec/kitchen
@@ -26,13 +26,13 @@ dataset.add_command(dataset_align.align)
 dataset.add_command(dataset_map.export)
 
 
-@dataset.command(short_help="Say what is in a recording, or in a map.")
+@dataset.command(short_help="Describe a recording or a map.")
 @click.argument("source")
 @options.calib
 @options.frames
 @options.as_json
 def info(source: str, calib: str | None, frames: slice | None, as_json: bool) -> None:
-    """Say what is in a recording: streams, rates, gaps, calibration, truth; or in an edge's map.
+    """Describe a recording (streams, rates, gaps, calibration, ground truth) or an edge's map.
 
     \b
     Example:  share dataset info rec/kitchen
@@ -45,7 +45,7 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
 
     if is_map(Path(source)):
         if calib or frames:
-            raise UsageError(f"{source}: is a map; --calib and --frames are for recordings")
+            raise UsageError(f"{source} is a map; --calib and --frames work only with recordings")
         map_info = dataset_map.map_info(Path(source))
         click.echo(json.dumps(map_info) if as_json else dataset_map.map_info_text(map_info))
         return
@@ -55,23 +55,32 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
 
 @dataset.command(short_help="Write a recording as MCAP or as an EuRoC/ASL folder.")
 @click.argument("source")
-@click.option("--out", required=True, metavar="PATH", help="X.mcap, or a new folder with --format euroc.")
+@click.option(
+    "--out", required=True, metavar="PATH", help="X.mcap to write, or a new folder with --format euroc."
+)
 @options.calib
 @options.frames
 @click.option(
     "--jpeg",
     type=click.IntRange(1, 100),
     metavar="QUALITY",
-    help="Compress gray images to JPEG (1-100). Without it images stay as they are, byte for byte.",
+    help="Compress gray images as JPEG of this quality.  [default: keep images as they are, byte for byte]",
 )
-@click.option("--format", "kind", type=click.Choice(["mcap", "euroc"]), default="mcap", show_default=True)
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(["mcap", "euroc"]),
+    default="mcap",
+    show_default=True,
+    help="Format to write.",
+)
 def convert(
     source: str, out: str, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
 ) -> None:
     """Write a recording as MCAP (ROS 2 messages) or as an EuRoC/ASL folder.
 
-    The calibration goes with it. A true trajectory is written beside X.mcap as X.truth.tum, where
-    every command finds it again. If anything fails, nothing is left behind.
+    The calibration is written too. A ground-truth trajectory goes beside X.mcap as X.truth.tum, where all
+    commands find it. On failure nothing is left behind.
 
     \b
     Example:  share dataset convert rec/kitchen --out kitchen.mcap --frames 0:250
@@ -82,7 +91,7 @@ def convert(
 
     out_file = Path(out)
     if kind == "euroc" and jpeg is not None:
-        raise UsageError("--jpeg: goes with --format mcap only")
+        raise UsageError("--jpeg works only with --format mcap; leave it out")
     if kind == "mcap":
         _check_mcap(check_replaceable(out_file), source)
     opened = open_source(source, calib, frames)
@@ -96,14 +105,14 @@ def convert(
     click.echo(f"{out_file}: {opened.images_count} frames")
 
 
-@dataset.command(short_help="Save what is whole of a broken recording.")
+@dataset.command(short_help="Recover a recording that was cut off.")
 @click.argument("broken")
-@click.option("--out", required=True, metavar="GOOD.mcap", help="Where the recovered recording goes.")
+@click.option("--out", required=True, metavar="GOOD.mcap", help="Recording to write.")
 @options.as_json
 def recover(broken: str, out: str, as_json: bool) -> None:
-    """Save what is whole of an MCAP recording that was cut off (a crash, a power cut, a full disk).
+    """Recover all intact messages of an MCAP recording that was cut off (a crash, a power cut, a full disk).
 
-    A recording in progress is called X.mcap.part; after a crash that is the file to recover.
+    A recording in progress is named X.mcap.part; after a crash, that is the file to recover.
 
     \b
     Example:  share dataset recover walk.mcap.part --out walk.mcap
@@ -121,18 +130,18 @@ def recover(broken: str, out: str, as_json: bool) -> None:
 
 def _check_mcap(out: Path, source: str) -> None:
     if out.suffix != ".mcap":
-        raise UsageError(f"--out {out}: the name of a recording ends in .mcap")
+        raise UsageError(f"--out {out}: give a name that ends in .mcap")
     if out.exists() and Path(source).exists() and out.samefile(source):
-        raise UsageError(f"--out {out}: is the source itself; give another name")
+        raise UsageError(f"--out {out} is the source itself; give another name")
 
 
 def _recovery_text(broken: Path, out: Path, result: Any) -> str:
-    lines = [f"{out}: {sum(result.messages.values())} messages saved"]
+    lines = [f"{out}: {sum(result.messages.values())} messages recovered"]
     lines += [f"  {topic:<34} {count:>8}" for topic, count in sorted(result.messages.items())]
     if result.reason:
         lines.append(f"lost: {result.lost_bytes} bytes ({result.reason})")
     if not result.lost_bytes:
-        lines.append(f"all that {broken} has is saved: it can be deleted")
+        lines.append(f"nothing was lost: {broken} can be deleted")
     return "\n".join(lines)
 
 
@@ -150,7 +159,7 @@ def _description_text(d: dict[str, Any]) -> str:
     if "baseline_m" in d["calibration"]:
         lines.append(f"  baseline {100 * d['calibration']['baseline_m']:.2f} cm")
     if shift := d["calibration"].get("timeshift_s", 0.0):
-        lines.append(f"  IMU time less camera time {1e3 * shift:.3f} ms")
+        lines.append(f"  IMU time minus camera time {1e3 * shift:.3f} ms")
     truth = d["truth"]
     lines.append(
         f"  truth  {truth['poses']} poses, {truth['length_m']:.2f} m in {truth['duration_s']:.1f} s"

@@ -1,4 +1,4 @@
-"""`share dataset align`: recordings of several devices and a motion capture become one session."""
+"""`share dataset align`: make a session of recordings of several devices and a motion capture."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from share.lab.mocap.state import MocapFitOptions
     from share.lab.mocap.trajectory import MocapTrajectory
 
-_CLOCK_COLUMNS = ("device", "offset s", "± ms", "drift ppm", "alike", "next")
+_CLOCK_COLUMNS = ("device", "offset s", "± ms", "drift ppm", "corr.", "next corr.")
 _MOUNTING_COLUMNS = ("body deg", "±", "body mm", "±", "up", "tilt deg")
-_RESIDUAL_COLUMNS = ("left mm", "left deg", "doubted %", "gaps", "truth s")
+_RESIDUAL_COLUMNS = ("rms mm", "rms deg", "outliers %", "gaps", "truth s")
 
 
 @click.command(short_help="Make a session of field recordings and a motion capture.")
@@ -32,38 +32,38 @@ _RESIDUAL_COLUMNS = ("left mm", "left deg", "doubted %", "gaps", "truth s")
     multiple=True,
     required=True,
     metavar="[NAME=]FILE",
-    help="What the motion capture saw: Vicon's or Motive's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
+    help="Motion capture file: Vicon's or Motive's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
 )
 @click.option(
     "--body",
     "bodies",
     multiple=True,
     metavar="[NAME=]BODY",
-    help="Which rigid body a device is.  [default: the one of its name, or the only one]",
+    help="Rigid body of a device.  [default: the one with the device's name, or the only one]",
 )
 @click.option(
-    "--kind", "kinds", multiple=True, metavar="[NAME=]ar|robot", help="What a device is.  [default: ar]"
+    "--kind", "kinds", multiple=True, metavar="[NAME=]ar|robot", help="Kind of a device.  [default: ar]"
 )
 @click.option(
     "--calib",
     "calibs",
     multiple=True,
     metavar="[NAME=]FILE",
-    help="As for share track, for a device or all; its recording is then written anew.",
+    help="Calibration of a device, or of all, as for share track; the recording is then rewritten with it.",
 )
 @click.option(
     "--mounting",
     "mountings",
     multiple=True,
     metavar="[NAME=]DIR",
-    help="By share calibrate mocap: how a body sits on a device that turns about one axis only.",
+    help="Folder by share calibrate mocap, needed for a device that turns about one axis only.",
 )
 @options.rotations
 @click.option(
     "--within",
     type=click.FloatRange(min=0.01),
     metavar="S",
-    help="How far apart the clocks may be, s.  [default: as far as they like]",
+    help="Largest clock offset to search, s.  [default: no limit]",
 )
 @options.sigma_mm
 @click.option(
@@ -72,7 +72,7 @@ _RESIDUAL_COLUMNS = ("left mm", "left deg", "doubted %", "gaps", "truth s")
     default=0.5,
     show_default=True,
     metavar="S",
-    help="Holes of the motion capture up to this long are left to the IMU; longer ones stay holes.",
+    help="Fill gaps of the motion capture up to this long by the IMU, s; longer gaps get no truth.",
 )
 @click.option(
     "--out", required=True, metavar="SESSION", type=click.Path(path_type=Path), help="A new folder."
@@ -89,12 +89,13 @@ def align(
     as_json: bool,
     **fitting: Any,
 ) -> None:
-    """Make one session, as `share evaluate` takes it, of recordings of several devices and what a motion
-    capture saw of them. No clocks need agree: the offset of each is found from how device and body turn,
-    and refused where that is not clear.
+    """Make one session for `share evaluate` from recordings of several devices and a motion capture of them.
 
-    The truth of each is the path of its IMU that agrees with the motion capture and with the IMU; where the
-    motion capture was blind for longer than --bridge, there is none.
+    The clocks need not agree: the offset of each device is estimated from the rotation rates of device and
+    body, and refused where it is ambiguous.
+
+    The ground truth of a device is the trajectory of its IMU that fits both motion capture and IMU; where the
+    motion capture has a gap longer than --bridge, there is none.
 
     \b
     Example:  share dataset align ann=ann.mcap bob=bob.mcap --mocap vicon.csv \\
@@ -131,16 +132,16 @@ def align(
         for line in (*_axis_warnings(one), *one["doubts"]):
             click.echo(f"share: {name}: {line}", err=True)
     if not as_json:
-        click.echo(f"{out}: ready; `share evaluate run {out} --virtual --out RUN` plays it")
+        click.echo(f"{out}: ready; play it: share evaluate run {out} --virtual --out RUN")
 
 
 def _fit_settings(rotations: str, within: float | None, sigma_mm: float, bridge: float) -> dict[str, Any]:
-    """For the session's provenance."""
+    """Return the settings of the fit, for the session's provenance."""
     return {"rotations": rotations, "within_s": within, "sigma_mm": sigma_mm, "bridge_s": bridge}
 
 
 def _recordings_by_device(recordings: tuple[str, ...]) -> dict[str, str]:
-    """The recording of each device, by its name."""
+    """Return the recording of each device, by its name. Raises UsageError."""
     for text in recordings:
         if "=" not in text:
             raise UsageError(f"{text}: give NAME=RECORDING, such as ann={text}")
@@ -148,23 +149,23 @@ def _recordings_by_device(recordings: tuple[str, ...]) -> dict[str, str]:
     for name in out:
         options.agent_name(name)
         if name == "truth":
-            raise UsageError("truth: is the name of a folder of the session; give the device another")
+            raise UsageError("truth is the name of a folder of the session; give the device another name")
     return out
 
 
 def _values_by_device(names: dict[str, str], option: str, values: tuple[str, ...]) -> dict[str, str]:
-    """What an option says of each device, by its name; of all others under ""."""
+    """Return an option's value by device; the value for all others under "". Raises UsageError."""
     out = options.values_by_name(option, values)
     for name in out:
         if name and name not in names:
-            raise UsageError(f"{option} {name}=: there is no device '{name}'; there are {', '.join(names)}")
+            raise UsageError(f"{option} {name}=: no device '{name}'; devices: {', '.join(names)}")
     return out
 
 
 def _trajectories(
     names: dict[str, str], files: dict[str, str], bodies: dict[str, str], rotations: str
 ) -> dict[str, tuple[str, MocapTrajectory]]:
-    """By device: file and body for a person, and what the motion capture saw of it."""
+    """Return by device a label (file and body) and its motion-capture trajectory. Raises UsageError."""
     from share.lab.mocap.files import pick_body, read_bodies
 
     bodies_of = {file: read_bodies(Path(file), rotations) for file in dict.fromkeys(files.values())}
@@ -173,14 +174,16 @@ def _trajectories(
     for name in names:
         file = files.get(name, files.get("", ""))
         if not file:
-            raise UsageError(f"{name}: has no motion capture; give --mocap {name}=FILE, or FILE for all")
+            raise UsageError(
+                f"{name} has no motion capture; give --mocap {name}=FILE, or --mocap FILE for all"
+            )
         body_wanted = bodies.get(name, bodies.get(""))
         body, trajectory = pick_body(file, bodies_of[file], body_wanted, name, f"--body {name}=BODY")
         if (other := device_of_body.setdefault((Path(file).resolve(), body), name)) != name:
-            both = f"body '{body}'" if body else "one body"
+            both = f"body '{body}'" if body else "its only body"
             raise UsageError(
-                f"{file}: its {both} cannot be both {other} and {name}; give each its own by "
-                f"--body {name}=BODY or --mocap {name}=FILE"
+                f"{file}: {both} cannot be both {other} and {name}; give --body {name}=BODY or "
+                f"--mocap {name}=FILE"
             )
         out[name] = (f"{file} {body}".strip(), trajectory)
     return out
@@ -206,7 +209,9 @@ def _fit_device(
     source = open_source(recording, calib)
     options.print_notes(source)
     if source.rig.imu is None:
-        raise UsageError(f"{recording}: has no IMU, or its calibration has none; align goes by the gyro")
+        raise UsageError(
+            f"{recording} or its calibration has no IMU; `share dataset align` needs the gyroscope"
+        )
     device_options = _with_mounting(fit_options, value_of("--mounting"))
     imu = read_imu(recording, lambda done, total: stages(f"reading {name}", done, total)).imu
     stages(f"fitting {name}", 0, 1)
@@ -226,7 +231,7 @@ def _agent_kind(text: str) -> Any:
     from share.types import AgentKind
 
     if text not in list(AgentKind):
-        raise UsageError(f"--kind {text}: is not known; known: {', '.join(AgentKind)}")
+        raise UsageError(f"--kind {text} is not known; known: {', '.join(AgentKind)}")
     return AgentKind(text)
 
 
@@ -240,11 +245,11 @@ def _with_mounting(fit_options: MocapFitOptions, mounting: str | None) -> MocapF
 
 
 def _axis_warnings(one: dict[str, Any]) -> list[str]:
-    return [] if one["up"] == "z" else [f"the motion capture has {one['up']} up; in the session z is"]
+    return [] if one["up"] == "z" else [f"the motion capture's up axis is {one['up']}; the session's is z"]
 
 
 def _result_table(results: dict[str, Any]) -> str:
-    """A line a device."""
+    """Return a table with a line per device."""
     rows = [
         [
             name,

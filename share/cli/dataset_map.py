@@ -1,4 +1,4 @@
-"""`share dataset` for the edge's map: what is in it, and its export."""
+"""`share dataset info` and `export` for the edge's map."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from share.errors import UsageError
 @click.option("--out", required=True, metavar="DIR", help="A new folder.")
 @options.as_json
 def export(map_file: str, out: str, as_json: bool) -> None:
-    """Write an edge's map for other programs: trajectories, points, loops.
+    """Export the trajectories, points and loops of an edge's map for other programs.
 
-    DIR gets NAME.tum for each agent, points.ply and loops.csv; if there are several maps, each gets a folder
-    of its own. An edge may be running with the map.
+    DIR gets NAME.tum for each agent, points.ply and loops.csv; if MAP holds several maps, each gets its own
+    folder. The edge may be running.
 
     \b
     Example:  share dataset export room.sqlite --out room
@@ -48,7 +48,7 @@ def export(map_file: str, out: str, as_json: bool) -> None:
 
 
 def map_info(path: Path) -> dict[str, Any]:
-    """Of a map file. Raises ShareError."""
+    """Describe a map file. Raises ShareError."""
     from share.store.export import describe_map
     from share.store.map_store import MapStore
 
@@ -56,16 +56,15 @@ def map_info(path: Path) -> dict[str, Any]:
 
 
 def map_info_text(d: dict[str, Any]) -> str:
-    """For a person."""
+    """Return `map_info` as text."""
     lines = [f"{d['name']}: map, schema {d['schema']}, {d['bytes'] / 1e6:.1f} MB"]
     for name, agent in d["agents"].items():
         removed = agent["next_keyframe"] - agent["keyframes"]
-        segments_text = f", {agent['stretches']} stretches" if agent["stretches"] > 1 else ""
+        segments_text = f", {agent['stretches']} segments" if agent["stretches"] > 1 else ""
         lines.append(
-            f"  {name:<10} {agent['kind']:<6} "
-            f"{agent['keyframes']:>6} "
-            f"keyframes, {removed} gone{segments_text}"
+            f"  {name:<10} {agent['kind']:<6} {agent['keyframes']:>6} keyframes, {removed} removed"
+            f"{segments_text}"
         )
     lines += [f"  map {name}: {count} keyframes" for name, count in d["maps"].items()]
-    lines.append(f"  {d['loops']} loops, {d['solved']} keyframes in the newest solution")
+    lines.append(f"  {d['loops']} loops, {d['solved']} keyframes in the latest solution")
     return "\n".join(lines + [f"  damage: {line}" for line in d["damage"]])

@@ -1,4 +1,4 @@
-"""`share demo`: the whole system on this machine."""
+"""`share demo`: run the whole system on this machine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class _Seconds(click.FloatRange):
-    """Refuses NaN too, which is below no least and above no greatest."""
+    """A range that also refuses NaN, which compares with neither bound."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         number = float(super().convert(value, param, ctx))
@@ -30,18 +30,28 @@ class _Seconds(click.FloatRange):
 
 
 @click.command()
-@click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True)
-@click.option("--policy", type=click.Choice(POLICY_NAMES), default=POLICY_NAMES[0], show_default=True)
+@click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True, help="Length of the run, s.")
+@click.option(
+    "--policy",
+    type=click.Choice(POLICY_NAMES),
+    default=POLICY_NAMES[0],
+    show_default=True,
+    help="How keyframe rates are set.",
+)
 @click.option(
     "--link",
     metavar="LINK[,AGENT=LINK…]",
-    help="Through emulated networks, as share agent --link; one for all, or an agent its own.",
+    help="Emulated network, as share agent --link: one for all agents, or one per agent.",
 )
-@click.option("--true-error", is_flag=True, help="Agents tell the edge their true error, as share agent.")
+@click.option(
+    "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
+)
 @options.config
-@click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Everything it leaves.")
-@click.option("--scene", help="Which kind of room (see share emulate --help).  [default: warehouse]")
-@click.option("--seed", type=click.IntRange(0), help="Which room.  [default: one where they soon meet]")
+@click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Output folder.")
+@click.option("--scene", help="Kind of room (see share emulate --help).  [default: warehouse]")
+@click.option(
+    "--seed", type=click.IntRange(0), help="Seed of the room.  [default: one where agents meet soon]"
+)
 def demo(
     seconds: float,
     policy: str,
@@ -52,19 +62,21 @@ def demo(
     scene: str | None,
     seed: int | None,
 ) -> None:
-    """The whole system on this machine, nothing else needed.
+    """Try the whole system on this machine; nothing else is needed.
 
-    Makes a room with two headset wearers and a robot (kept for the next time), plays it in real
-    time through an edge and three agents, each a process of its own, and shows how well the agents
-    knew where they were in the map that they came to share.
+    Makes a virtual room with two headset wearers and a robot (cached for the next time), plays it in real
+    time to an edge and three agents, each its own process, and shows how accurately the agents knew their
+    poses in the shared map.
 
     \b
     Example:  share demo --seconds 30 --out /tmp/demo
     """
     folder = Path(out)
-    options.load_config(config_file)  # what is wrong with this and the link is said before anything is made
+    options.load_config(config_file)  # check it and the link before the room is made
     if policy == STREAMED and true_error:
-        raise UsageError("--true-error: is of agents that track themselves; leave it out by policy streamed")
+        raise UsageError(
+            "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
+        )
     from share.files.writing import writable_dir
     from share.lab.emulate.demo import AGENTS, meeting_seed, recipe
     from share.lab.emulate.session import make_cached_session
@@ -80,20 +92,19 @@ def demo(
     with Stages() as stages:
         session = read_session(make_cached_session(recipe(room, seconds, seed), progress=stages))
     live = LiveLine()
-    terms = RunOptions(policy, link, seed, true_error, config=config_file, agents_first=True)
-    folders = play_in_real_time(session, seconds, terms, folder, lambda now: live.write(str(now)))
+    run_terms = RunOptions(policy, link, seed, true_error, config=config_file, agents_first=True)
+    folders = play_in_real_time(session, seconds, run_terms, folder, lambda now: live.write(str(now)))
     live.end()
     result = score_session(session, folders)
     click.echo(_score_table(result, policy == STREAMED))
     if core_count() <= len(folders):
         warning = (
-            f"{len(folders)} agents and the edge shared "
-            f"{core_count()} cores, so "
-            f"frames waited for one another"
+            f"{len(folders)} agents and the edge shared {core_count()} cores, so frames waited; on separate "
+            "machines they would not"
         )
-        click.echo(f"{warning}; on machines of their own they do not")
+        click.echo(warning)
     picture = folder / "trajectories.png"
-    picture.unlink(missing_ok=True)  # of an earlier demo
+    picture.unlink(missing_ok=True)  # left by an earlier demo
     if result.joint is not None:
         from share.lab.evaluate.charts import draw_trajectories
 
@@ -104,7 +115,7 @@ def demo(
 
 
 def _renderable_scene(scene: str | None) -> str:
-    """The scene asked for; else the usual one, or the plain one where there is no OpenGL."""
+    """Return the scene given, or the default; the plain one where OpenGL is missing."""
     from share.lab.emulate.demo import DEFAULT_SCENE, FALLBACK_SCENE
     from share.lab.emulate.render.context import missing_reason
 
@@ -112,7 +123,7 @@ def _renderable_scene(scene: str | None) -> str:
         return scene
     missing_renderer = missing_reason()
     if missing_renderer is not None:
-        click.echo(f"share: the plain room, because {missing_renderer}", err=True)
+        click.echo(f"share: using the plain room, because {missing_renderer}", err=True)
     return DEFAULT_SCENE if missing_renderer is None else FALLBACK_SCENE
 
 
@@ -152,7 +163,7 @@ def _score_table(result: SessionScore, streamed: bool) -> str:
     lines = aligned_table(rows).splitlines()
     if streamed:
         untracked = ", ".join(f"{name} {agent.report['untracked']}" for name, agent in result.agents.items())
-        note = f"each tracked alone by the edge; frames without an answer: {untracked}"
+        note = f"the edge tracked each agent alone; frames without an answer: {untracked}"
         return "\n".join([*lines, "", note])
     members = len(joint)
     verdict = (

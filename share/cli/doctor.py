@@ -1,4 +1,4 @@
-"""`share doctor`: what is missing on this device, and how to mend it."""
+"""`share doctor`: check this device, and say how to fix what is missing."""
 
 from __future__ import annotations
 
@@ -22,13 +22,19 @@ if TYPE_CHECKING:
     default="d435i",
     show_default=True,
     metavar="NAME|FILE",
-    help="What is wanted here: d435i-n100-headset, d435i-turtlebot4, laptop-edge, your own file.",
+    help="What this device should be: d435i, d435i-n100-headset, d435i-turtlebot4, laptop-edge, or a file.",
 )
-@click.option("--calib", metavar="DIR", help="The calibration of this device.")
-@click.option("--edge", "address", metavar="tcp://H:P", help="An edge to try.")
+@click.option("--calib", metavar="DIR", help="Calibration of this device to check.")
+@click.option("--edge", "address", metavar="tcp://H:P", help="Edge to connect to.")
 @options.keys
 @click.option("--server-key", metavar="FILE|KEY", help="Public key of that edge.")
-@click.option("--out", default=".", show_default=True, metavar="DIR", help="Where recordings will go.")
+@click.option(
+    "--out",
+    default=".",
+    show_default=True,
+    metavar="DIR",
+    help="Folder for recordings, whose disk is checked.",
+)
 @options.as_json
 def doctor(
     profile: str,
@@ -39,9 +45,9 @@ def doctor(
     out: str,
     as_json: bool,
 ) -> None:
-    """Look at camera, computer, clock, keys and edge, and say what to mend. Nothing is changed.
+    """Check camera, calibration, computer, clock, keys and edge, and say what to fix. Changes nothing.
 
-    Exit code 1 if anything is FAIL; WARN works, but not as well as it could; SKIPPED could not be seen.
+    FAIL will not work (exit code 1); WARN works, but not as well as it could; SKIPPED could not be checked.
 
     \b
     Example:  share doctor --profile d435i-n100-headset --calib calib/d435i
@@ -69,7 +75,7 @@ def doctor(
     failed = failures(findings)
     click.echo(_report_json(host.name, findings, not failed) if as_json else _findings_text(findings))
     if failed:
-        raise ShareError(f"doctor: {len(failed)} FAIL: {', '.join(one.name for one in failed)}")
+        raise ShareError(f"doctor: {len(failed)} checks failed: {', '.join(one.name for one in failed)}")
 
 
 def _report_json(profile: str, findings: Sequence[CheckResult], is_ok: bool) -> str:

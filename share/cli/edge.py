@@ -1,4 +1,4 @@
-"""`share edge`: the server of a room."""
+"""`share edge`: run the server of a room."""
 
 from __future__ import annotations
 
@@ -13,22 +13,33 @@ from share.config import POLICY_NAMES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.cli.saying import Stderr
+    from share.cli.stderr import Stderr
     from share.net.keys import EdgeKeys
     from share.store.map_store import MapStore
 
 
 @click.command()
-@click.option("--bind", default="tcp://127.0.0.1:5555", show_default=True, metavar="tcp://H:P")
+@click.option(
+    "--bind",
+    default="tcp://127.0.0.1:5555",
+    show_default=True,
+    metavar="tcp://H:P",
+    help="Address to listen on.",
+)
 @click.option(
     "--policy",
     type=click.Choice(POLICY_NAMES),
-    help="Whom the edge serves how much. By default share; covins-g: every keyframe is sent and merged.",
+    help="How keyframe rates are set; covins-g: every keyframe is sent.  [default: edge.policy of --config, "
+    "else share]",
 )
 @options.keys
-@click.option("--map", "map_file", metavar="FILE", help="Keep the map here, and go on with what is in it.")
-@click.option("--http", metavar="[H:]P", help="Serve /, /health, /metrics and /snapshot.json here.")
-@click.option("--out", metavar="DIR", help="Write events.jsonl and edge.json here.")
+@click.option(
+    "--map", "map_file", metavar="FILE", help="Keep the map in this file; continue with what it holds."
+)
+@click.option(
+    "--http", metavar="[H:]P", help="Serve a status page, /health, /metrics and /snapshot.json here."
+)
+@click.option("--out", metavar="DIR", help="Folder for events.jsonl and edge.json.")
 @options.config
 @options.verbose
 @options.as_json
@@ -43,12 +54,12 @@ def edge(
     verbose: bool,
     as_json: bool,
 ) -> None:
-    """Join the maps of all agents and send corrections back. Ctrl-C ends it.
+    """Merge the maps of all agents and send corrections, until Ctrl-C.
 
-    Says when agents come and go and when maps are joined; with -v, every decision and its reason.
-    To be reached from other machines it needs keys: see `share keys --help`.
+    Prints when agents connect and leave and when maps merge; with -v, every decision and its reason.
+    Agents on other machines need keys: see `share keys --help`.
 
-    With --map, what it has acknowledged survives whatever ends it; started again, it goes on there.
+    With --map, every keyframe that the edge acknowledged survives a crash; the next start continues there.
 
     \b
     Example:  share edge --bind tcp://127.0.0.1:5555 --map room.sqlite --http 8080 --out out/edge
@@ -57,7 +68,7 @@ def edge(
     from contextlib import ExitStack, closing
     from dataclasses import replace
 
-    from share.cli.saying import Stderr
+    from share.cli.stderr import Stderr
     from share.net.transport import bind as bind_link
     from share.net.transport import parse_address
     from share.runtime.edge import EdgeRun
@@ -70,7 +81,7 @@ def edge(
         settings = replace(settings, edge=replace(settings.edge, policy=policy))
     is_streamed = settings.edge.policy == STREAMED
     if is_streamed and map_file is not None:
-        raise UsageError("--map: there is none by policy streamed; leave it out, or take another policy")
+        raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
     max_message_bytes = MAX_IMAGE_BYTES if is_streamed else MAX_FRAME_BYTES
     folder = None if out is None else Path(out)
     runs: list[EdgeRun] = []
@@ -78,9 +89,9 @@ def edge(
         stderr = stack.enter_context(closing(Stderr()))
         link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
         status = None
-        if http is not None:  # before any process is started: the port may be in use
+        if http is not None:  # before any process starts: the port may be in use
             status = stack.enter_context(
-                closing(StatusServer(http, lambda: runs[0].report() if runs else {}, stderr.tell))
+                closing(StatusServer(http, lambda: runs[0].report() if runs else {}, stderr.print_line))
             )
         store = None if map_file is None else stack.enter_context(_open_map(stderr, Path(map_file)))
         run = stack.enter_context(
@@ -88,16 +99,19 @@ def edge(
         )
         runs.append(run)
         with stop_on_signal(run.stop):
-            stderr.tell(f"listening on {link.endpoint}, policy {settings.edge.policy}")
-            _say_keys(stderr, edge_key_pair)
+            stderr.print_line(f"listening on {link.endpoint}, policy {settings.edge.policy}")
+            _print_keys(stderr, edge_key_pair)
             if status is not None:
-                stderr.tell(f"status at http://{status.endpoint}/")
+                stderr.print_line(f"status at http://{status.endpoint}/")
             report = run.run()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
 def _edge_keys(folder: str | None, local: bool) -> EdgeKeys | None:
-    """Those of --keys; for a network, else of the default folder, if there are any. Raises UsageError."""
+    """Return the keys in --keys, or those in the default folder if the edge is on a network.
+
+    None if there are none. Raises UsageError.
+    """
     from share.net.keys import default_folder, edge_keys, has_pair
 
     if folder is None and (local or not has_pair(default_folder())):
@@ -106,30 +120,36 @@ def _edge_keys(folder: str | None, local: bool) -> EdgeKeys | None:
 
 
 def _open_map(stderr: Stderr, path: Path) -> MapStore:
-    """Says what is in it, and what is wrong with it. Raises UsageError, ShareError."""
+    """Open the map file; print what it holds and what is damaged. Raises UsageError, ShareError."""
     from share.store.map_store import MapStore
 
     store = MapStore.open(path)
     map_state = store.opened_map()
     for complaint in map_state.problems:
-        stderr.tell(f"map {path}: {complaint}")
+        stderr.print_line(f"map {path}: {complaint}")
     if not store.writable:
-        stderr.tell(f"map {path}: {store.read_only_reason}; what is in it is used, nothing new is kept")
+        stderr.print_line(
+            f"map {path}: {store.read_only_reason}; it is used as it is, and nothing new is stored"
+        )
     counts = (
         f"{len(map_state.keyframes)} keyframes of {len(map_state.runs)} runs, {len(map_state.loops)} loops"
     )
-    stderr.tell(f"map {path}: {counts}")
+    stderr.print_line(f"map {path}: {counts}")
     return store
 
 
-def _say_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
+def _print_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
     if keys is not None:
         names = ", ".join(sorted(keys.allowed.names_by_key().values()))
-        stderr.tell(f"public key '{keys.own.public}'; authorized: {names or 'nobody yet'}")
+        stderr.print_line(f"public key '{keys.own.public}'; authorized: {names or 'none yet'}")
 
 
-_SHOWN_EVENTS = {"joined the edge", "left", "back", "silent", "refused"}
-_SHOWN_EVENTS |= {
+_SHOWN_EVENTS = {  # without -v
+    "joined the edge",
+    "left",
+    "back",
+    "silent",
+    "refused",
     "not let in",
     "maps joined",
     "merge undone",
@@ -137,19 +157,21 @@ _SHOWN_EVENTS |= {
     "not written",
     "mapper lost",
     "solver lost",
+    "odometry doubted",
+    "map",
+    "tracking lost",
 }
-_SHOWN_EVENTS |= {"odometry doubted", "map", "tracking lost"}
 
 
 def _print_event(stderr: Stderr, event: dict[str, Any], verbose: bool) -> None:
     if verbose or event["event"] in _SHOWN_EVENTS:
         agent = f" {event['agent']}:" if event["agent"] else ""
-        stderr.tell(f"{event['t_s']:9.3f} s {event['event']}:{agent} {event['reason']}")
+        stderr.print_line(f"{event['t_s']:9.3f} s {event['event']}:{agent} {event['reason']}")
 
 
 def _summary(report: dict[str, Any]) -> str:
     lines = [_agent_summary(name, agent) for name, agent in report["agents"].items()]
-    if loops := report.get("loops"):  # the mapper has reported
+    if loops := report.get("loops"):  # absent until the mapper has reported
         done = report["merges"]["done"]
         lines.append(f"loops: {loops['tried']} tried, {loops['accepted']} accepted; {done} merges")
     return "\n".join(lines)
@@ -159,6 +181,6 @@ def _agent_summary(name: str, a: dict[str, Any]) -> str:
     up = f"{a['bytes_up'] / 1e6:.2f} MB up"
     if "frames_streamed" in a:
         done = f"{a['frames_tracked']} of {a['frames_streamed']} frames tracked"
-        return f"{name}: {done}, {a['frames_dropped']} left out, {up}"
+        return f"{name}: {done}, {a['frames_dropped']} dropped, {up}"
     where = a.get("map_id") or "none yet"
     return f"{name}: {a['keyframes']} keyframes, {a['corrections']} corrections, {up}, in map {where}"

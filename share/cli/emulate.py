@@ -1,4 +1,4 @@
-"""`share emulate`: virtual rooms that carry real motion."""
+"""`share emulate`: make recordings of agents in a virtual room."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _Size(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--scene",
     required=True,
-    help="warehouse, firestation, corridor-twins, whitewall, board, charuco-board, plain, or a .glb file.",
+    help="Room: warehouse, firestation, corridor-twins, whitewall, board, charuco-board, plain, a .glb file.",
 )
 @click.option(
     "--motion",
@@ -41,40 +41,51 @@ class _Size(click.ParamType[tuple[float, ...]]):
     multiple=True,
     required=True,
     metavar="[NAME=]SPEC",
-    help="Who moves, and how; see below. May be repeated.",
+    help="An agent and its motion; see below. May be repeated.",
 )
 @click.option("--out", required=True, metavar="SESSION", help="A new folder.")
-@click.option("--seconds", type=float, default=30, show_default=True, help="How long the session lasts.")
+@click.option("--seconds", type=float, default=30, show_default=True, help="Length of the session, s.")
 @click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Another room, other noise."
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the room and the noise."
 )
-@click.option("--size", type=_Size(), metavar="LxWxH", help="Of the room, in metres.  [default: the scene's]")
+@click.option("--size", type=_Size(), metavar="LxWxH", help="Size of the room, m.  [default: the scene's]")
 @click.option(
     "--profile",
     "profiles",
     multiple=True,
     metavar="[NAME=]PROFILE[:MODE]",
-    help="Which device records: d435i, euroc or a YAML file; mode as 848x480@30.",
+    help="Device that records: d435i, euroc or a YAML file; MODE such as 848x480@30.",
 )
 @click.option(
     "--sensors",
     multiple=True,
     metavar="[NAME=]stereo|rgbd|mono",
-    help="Infrared pair, left image and depth, or left image alone.  [default: stereo; rgbd for robot:]",
+    help="Infrared pair, left image and depth, or left image only.  [default: stereo; rgbd for robot:]",
 )
 @click.option(
     "--effect",
     "effects",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Of the sensors: none, noise=off, blur=off, drops=0.02, jitter_ms=1, time_offset_ms=5 …",
+    help="Sensor errors: none, noise=off, blur=off, drops=0.02, jitter_ms=1, time_offset_ms=5, …",
 )
-@click.option("--images", type=click.Choice(["jpeg", "png"]), help="[default: jpeg, for --format euroc png]")
 @click.option(
-    "--format", "form", type=click.Choice(["session", "euroc"]), default="session", show_default=True
+    "--images",
+    type=click.Choice(["jpeg", "png"]),
+    help="Image compression.  [default: jpeg; png for --format euroc]",
+)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["session", "euroc"]),
+    default="session",
+    show_default=True,
+    help="A session of SHARE, or EuRoC/ASL folders.",
 )
 @options.as_json
-@click.option("--workers", type=click.IntRange(1, 64), default=_WORKERS, show_default=True, help="Processes.")
+@click.option(
+    "--workers", type=click.IntRange(1, 64), default=_WORKERS, show_default=True, help="Processes to use."
+)
 def emulate(
     scene: str,
     motions: tuple[str, ...],
@@ -90,19 +101,19 @@ def emulate(
     as_json: bool,
     workers: int,
 ) -> None:
-    """Record agents that move through a virtual room.
+    """Make recordings of agents that move through a virtual room, with ground truth.
 
-    The room is drawn for the motion, the motion is real or simulated, and each agent's device sees,
-    measures and errs as a real one does. The session that comes out is as one from the field, with the
-    truth beside it. If it is broken off, the same command goes on where it stopped.
+    The motion is real or simulated, the room is generated around it, and each agent's device has the noise
+    and errors of a real one. The session has the format of one from the field. An interrupted command
+    continues when it is run again.
 
     \b
     Motions:  walk:[speed=0.9,…]        a person with a headset
               robot:[speed=0.35,…]      a robot with two wheels
               paper:1 .. paper:5        two people and a robot, 60 s, in 9x6x4 m
-              board:[vigour=1,…]        a device in a hand, before a calibration board
-              euroc:FOLDER[,start=S]    real IMU and motion of a EuRoC recording
-              tumvi:FOLDER[,start=S]    the same of a TUM-VI recording
+              board:[vigour=1,…]        a hand-held device before a calibration board
+              euroc:FOLDER[,start=S]    real IMU and motion of an EuRoC recording
+              tumvi:FOLDER[,start=S]    real IMU and motion of a TUM-VI recording
               tum:FILE                  poses of a file; the IMU is simulated
     \b
     Example:  share emulate --scene warehouse --motion ann=walk: --motion bob=walk: --out room1
@@ -131,7 +142,7 @@ def emulate(
 
 
 def _describe_session(folder: Path, euroc: bool) -> dict[str, Any]:
-    """What is in the new folder, as plain data."""
+    """Return what the new folder holds, as plain data."""
     from share.files.yaml_file import read_yaml
     from share.recordings.describe import describe_recording
     from share.runtime.source import open_source
@@ -145,7 +156,7 @@ def _describe_session(folder: Path, euroc: bool) -> dict[str, Any]:
 
 
 def _description_text(description: dict[str, Any]) -> str:
-    """A line an agent."""
+    """Return the session's notes and a line per agent."""
     lines = list(description["provenance"]["notes"])
     for name, agent in description["agents"].items():
         frames, truth = agent["streams"]["cam0"], agent["truth"]

@@ -1,4 +1,4 @@
-"""`share evaluate`: sessions played on stated terms, scored, and policies compared."""
+"""`share evaluate`: play sessions, score them, compare policies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import click
 from share.cli import options
 from share.cli.compare_trackers import compare
 from share.cli.evaluate_sweep import sweep
-from share.cli.playing import check_none_failed, many_run_options, play_runs
+from share.cli.many_runs import check_none_failed, many_run_options, play_runs
 from share.cli.run_options import load_run_config, run_options
 from share.cli.run_table import run_table
 from share.cli.terminal import LiveLine
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from share.lab.evaluate.report import ReportSection
     from share.lab.evaluate.trial import Trial
 
-BASE_POLICY = "covins-g"  # what the others are told as a part of
+BASE_POLICY = "covins-g"  # the policy to which the others are compared
 
 
 @click.group()
 def evaluate() -> None:
-    """Play sessions on stated terms, score them, and compare policies.
+    """Play sessions, score them, and compare policies, settings and trackers.
 
     \b
     Example:  share emulate --scene warehouse --motion paper:1 --seconds 60 --out room1
@@ -42,11 +42,19 @@ evaluate.add_command(sweep)
 evaluate.add_command(compare)
 
 
-@evaluate.command(short_help="Play a session, and keep everything.")
+@evaluate.command(short_help="Play a session and keep all outputs.")
 @click.argument("session", type=click.Path(path_type=Path))
-@click.option("--policy", type=click.Choice(POLICY_NAMES), default=POLICY_NAMES[0], show_default=True)
+@click.option(
+    "--policy",
+    type=click.Choice(POLICY_NAMES),
+    default=POLICY_NAMES[0],
+    show_default=True,
+    help="How keyframe rates are set.",
+)
 @run_options
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of link and scheduler.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of link and scheduler."
+)
 @options.config
 @click.option("--out", required=True, metavar="RUN", type=click.Path(path_type=Path), help="A new folder.")
 def run(
@@ -57,11 +65,11 @@ def run(
     out: Path,
     **options_given: Any,
 ) -> None:
-    """Play SESSION in real time: an edge and its agents, each a process of its own. Or, with --virtual, by
-    the same trackers and machines in virtual time, whatever else this machine does.
+    """Play SESSION in real time with an edge and its agents, each its own process; or, with --virtual, with
+    the same trackers and state machines in virtual time, independent of this machine's load.
 
-    RUN holds what they leave, the settings in effect and what else is needed to play it again. It is
-    whole or not there: a run that is broken off leaves nothing.
+    RUN gets all outputs, the effective settings and whatever else a repetition needs. An interrupted run
+    leaves nothing.
 
     \b
     Example:  share evaluate run room1 --policy covins-g --link wifi5 --out runs/covins
@@ -72,27 +80,31 @@ def run(
     from share.recordings.session import read_session
 
     opened, live = read_session(session), LiveLine()
-    config, terms = (
-        load_run_config(config_file, options_given, [opened]),
-        RunOptions(policy, seed=seed, **options_given),
-    )
-    trial = run_trial(opened, terms, config, out, lambda now: live.write(str(now)))
+    config = load_run_config(config_file, options_given, [opened])
+    run_terms = RunOptions(policy, seed=seed, **options_given)
+    trial = run_trial(opened, run_terms, config, out, lambda now: live.write(str(now)))
     live.end()
     click.echo(run_table(run_metrics(trial)))
 
 
-@evaluate.command(short_help="Errors, latency, merges and QoE of runs.")
+@evaluate.command(short_help="Score runs: errors, latency, merges, QoE.")
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--csv", "csv_file", metavar="FILE", type=click.Path(path_type=Path), help="A line an agent.")
+@click.option(
+    "--csv",
+    "csv_file",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="CSV file with a line per agent.",
+)
 @click.option(
     "--plots",
     metavar="DIR",
     type=click.Path(path_type=Path),
-    help="QoE and rates over time, merges on the way.",
+    help="Folder for charts: QoE and rates over time, merges over distance.",
 )
 @options.as_json
 def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_json: bool) -> None:
-    """Score RUNS, folders by `share evaluate run`, against the truth of their sessions.
+    """Score RUNS, folders by `share evaluate run`, against the ground truth of their sessions.
 
     \b
     Example:  share evaluate score runs/* --plots plots
@@ -130,14 +142,14 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_
         click.echo(f"\npictures: {', '.join(map(str, pictures))}")
 
 
-@evaluate.command(short_help="All policies on sessions, in turn, compared.")
+@evaluate.command(short_help="Compare policies on sessions.")
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--policy",
     "policies_given",
     type=click.Choice(POLICY_NAMES),
     multiple=True,
-    help="May be repeated.  [default: all that share a map]",
+    help="A policy to compare; may be repeated.  [default: all that share a map]",
 )
 @run_options
 @many_run_options
@@ -147,10 +159,10 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_
     multiple=True,
     metavar="PATH",
     type=click.Path(path_type=Path, exists=True),
-    help="What else the report is to show: a folder by `evaluate sweep`, a file by `train compare --json`.",
+    help="Add to the report: a folder by `evaluate sweep`, or a file by `train compare --json`.",
 )
 @options.config
-@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
+@options.out_folder
 def ablation(
     sessions: tuple[Path, ...],
     policies_given: tuple[str, ...],
@@ -161,17 +173,17 @@ def ablation(
     out: Path,
     **options_given: Any,
 ) -> None:
-    """Play SESSIONS by each policy with each seed, and compare the policies.
+    """Play SESSIONS with each policy and each seed, and compare the policies.
 
-    Policies follow each other on each session, so that a machine that slows down does so for all. In DIR:
-    a folder a run, report.html (opens offline), report.md, agents.csv, runs.csv and pictures. Broken off,
-    the same command goes on where it stopped.
+    The policies take turns on each session, so that a slower machine affects all alike. DIR gets a folder
+    per run, report.html (opens offline), report.md, agents.csv, runs.csv and pictures. An interrupted command
+    continues when it is run again.
 
     \b
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
     """
     if workers > 1 and not options_given["virtual"]:
-        raise UsageError("--workers: runs in real time would slow each other down; it goes with --virtual")
+        raise UsageError("--workers needs --virtual: parallel runs in real time would slow each other down")
     from share.files.writing import writable_dir
     from share.lab.evaluate.campaign import plan_policies, worker_pool
     from share.lab.evaluate.real_time import RunOptions
@@ -187,10 +199,8 @@ def ablation(
     )
     writable_dir(out, "agents.csv", "runs.csv", "report.md", "report.html")
     trials_by_folder = play_runs(planned_runs, worker_pool(workers), lambda one: one.out.name)
-    trials, failed = (
-        list(trials_by_folder.values()),
-        [one.out.name for one in planned_runs if one.out not in trials_by_folder],
-    )
+    trials = list(trials_by_folder.values())
+    failed = [one.out.name for one in planned_runs if one.out not in trials_by_folder]
     if trials:
         _write_report(out, trials, failed, sections)
     check_none_failed(len(trials), len(planned_runs))

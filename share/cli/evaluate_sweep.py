@@ -1,4 +1,4 @@
-"""`share evaluate sweep`: which settings serve agents best."""
+"""`share evaluate sweep`: play sessions with many settings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.playing import check_none_failed, many_run_options, play_runs
+from share.cli.many_runs import check_none_failed, many_run_options, play_runs
 from share.cli.run_options import load_run_config, run_options
 from share.config import POLICY_NAMES
 from share.errors import UsageError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges a metre", "AR QoE")
 
 
-@click.command(short_help="Settings tried one after the other, on sessions.")
+@click.command(short_help="Compare settings on sessions.")
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--set",
@@ -28,17 +28,24 @@ _HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges a metre", "AR Q
     multiple=True,
     required=True,
     metavar="NAME=VALUES",
-    help="SECTION.NAME=V,V… or, with --random, =LOW:HIGH; A.B+C.D=V,V… share a value. May be repeated.",
+    help="SECTION.NAME=V,V,… or, with --random, =LOW:HIGH. A.B+C.D=V,… gives two settings the same value. "
+    "May be repeated.",
 )
 @click.option(
-    "--random", "count", type=click.IntRange(1), help="So many points, drawn, in place of the grid."
+    "--random", "count", type=click.IntRange(1), help="Draw this many random points instead of a grid."
 )
-@click.option("--policy", type=click.Choice(POLICY_NAMES), default=POLICY_NAMES[0], show_default=True)
+@click.option(
+    "--policy",
+    type=click.Choice(POLICY_NAMES),
+    default=POLICY_NAMES[0],
+    show_default=True,
+    help="How keyframe rates are set.",
+)
 @run_options
 @many_run_options
-@click.option("--scheduler", metavar="tcp://H:P", help="Of a dask cluster whose workers play (--virtual).")
+@click.option("--scheduler", metavar="tcp://H:P", help="Dask cluster that plays the runs (needs --virtual).")
 @options.config
-@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
+@options.out_folder
 def sweep(
     sessions: tuple[Path, ...],
     axis_texts: tuple[str, ...],
@@ -51,17 +58,17 @@ def sweep(
     out: Path,
     **options_given: Any,
 ) -> None:
-    """Play SESSIONS at each point of a grid of settings, or at points that are drawn.
+    """Play SESSIONS at each point of a grid of settings, or at random points.
 
-    In DIR: a folder a run, sweep.csv, sweep.md, and heat maps over the first two settings of a grid. Each
-    run is kept as it comes; broken off, the same command goes on where it stopped.
+    DIR gets a folder per run, sweep.csv, sweep.md, and heat maps over the first two settings of a grid. An
+    interrupted command continues when it is run again.
 
     \b
     Example:  share evaluate sweep room1 --virtual --set control.kp=0.2,0.8 --set control.ki=0,0.1 --out s
     """
     if (workers > 1 or scheduler) and not options_given["virtual"]:
         which = "--scheduler" if scheduler else "--workers"
-        raise UsageError(f"{which}: runs in real time would slow each other down; it goes with --virtual")
+        raise UsageError(f"{which} needs --virtual: parallel runs in real time would slow each other down")
     from share.files.writing import writable_dir
     from share.lab.evaluate.campaign import worker_pool
     from share.lab.evaluate.cluster import Cluster

@@ -1,4 +1,4 @@
-"""`share keys`: who may connect to an edge from another machine."""
+"""`share keys`: manage the keys with which other machines connect to an edge."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from share.cli import options
 
 @click.group()
 def keys() -> None:
-    """Make keys, and say which agents an edge lets in.
+    """Generate keys, and authorize the agents that may connect to an edge.
 
     \b
     Both machines:  share keys generate
@@ -26,13 +26,13 @@ def keys() -> None:
     """
 
 
-@keys.command(short_help="Make this machine's key pair.")
-@click.option("--name", help="What it is called; the name of this machine by default.")
+@keys.command(short_help="Generate this machine's key pair.")
+@click.option("--name", help="Name of the key pair.  [default: this machine's name]")
 @options.keys
 def generate(name: str | None, keys: str | None) -> None:
-    """Make this machine's key pair, once, and print the public key.
+    """Generate this machine's key pair and print the public key.
 
-    NAME.public may go anywhere; NAME.secret stays where it is. A pair that is there is never replaced.
+    NAME.public may be copied anywhere; NAME.secret must stay on this machine. An existing pair is kept.
 
     \b
     Example:  share keys generate
@@ -45,7 +45,7 @@ def generate(name: str | None, keys: str | None) -> None:
     click.echo(pair.public)
 
 
-@keys.command(short_help="Let an agent in.")
+@keys.command(short_help="Allow an agent to connect.")
 @click.argument("name")
 @click.argument("public_key", metavar="KEY|FILE")
 @click.option(
@@ -53,14 +53,14 @@ def generate(name: str | None, keys: str | None) -> None:
     "agents",
     multiple=True,
     metavar="AGENT",
-    help="An agent that may run there, where that is not called NAME; may be given several times.",
+    help="Name of an agent on that machine, if not NAME; may be repeated.",
 )
 @options.keys
 def authorize(name: str, public_key: str, agents: tuple[str, ...], keys: str | None) -> None:
-    """Let an agent in, by the public key of its machine: the text in single quotes, or NAME.public.
+    """Allow an agent to connect, by the public key of its machine: the text in single quotes, or NAME.public.
 
-    NAME is the machine's. Its key speaks for the agent of that name, or for those given with --agent, and
-    for no other. An edge that is running lets it in at its next attempt, within about a second.
+    NAME is the machine's name. Its key is valid for the agent of that name, or for those given with --agent,
+    and for no other. A running edge accepts the agent's next attempt, within about a second.
 
     \b
     Example:  share keys authorize ann ann.public
@@ -71,11 +71,11 @@ def authorize(name: str, public_key: str, agents: tuple[str, ...], keys: str | N
     store.authorize(_key_folder(keys), name, store.public_key(public_key), agents)
 
 
-@keys.command(short_help="Let an agent in no more.")
+@keys.command(short_help="Withdraw a machine's authorization.")
 @click.argument("name")
 @options.keys
 def revoke(name: str, keys: str | None) -> None:
-    """Let an agent in no more. An edge that is running throws it out at once.
+    """Withdraw the authorization of machine NAME. A running edge disconnects its agents at once.
 
     \b
     Example:  share keys revoke ann
@@ -85,11 +85,11 @@ def revoke(name: str, keys: str | None) -> None:
     drop(_key_folder(keys), name)
 
 
-@keys.command("list", short_help="Print this machine's public key and who is let in.")
+@keys.command("list", short_help="List this machine's public key and the authorized ones.")
 @options.keys
 @options.as_json
 def list_keys(keys: str | None, as_json: bool) -> None:
-    """Print this machine's public key and who is let in.
+    """List this machine's public key and the authorized ones.
 
     \b
     Example:  share keys list

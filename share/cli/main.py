@@ -1,4 +1,4 @@
-"""`share`: one command line. Commands are imported when they are called, so `--help` is quick."""
+"""The command line `share`. A command's module is imported when it is called, so that `--help` is quick."""
 
 from __future__ import annotations
 
@@ -18,30 +18,42 @@ from share import __version__  # noqa: E402
 from share.cli.signals import unwind_on_signal  # noqa: E402
 from share.errors import ShareError, UsageError, one_line  # noqa: E402
 
-# name: (module, attribute, one line of help). Literal, so that a freezer sees every module.
+# name: (module, attribute, one line of help). A literal table, so that a freezer sees every module.
 COMMANDS = {
-    "demo": ("share.cli.demo", "demo", "The whole system on this machine, nothing else needed."),
-    "capture": ("share.cli.capture", "capture", "Record a headset or robot."),
-    "track": ("share.cli.track", "track", "Track one agent, without an edge, as fast as it goes."),
-    "agent": ("share.cli.agent", "agent", "Track one agent at sensor rate and share its map."),
-    "edge": ("share.cli.edge", "edge", "Join the maps of all agents and send corrections back."),
-    "dataset": ("share.cli.dataset", "dataset", "Look into, convert and recover recordings; export maps."),
-    "sync": ("share.cli.sync", "sync", "One clock for all machines of a room, and how well they agree."),
-    "doctor": ("share.cli.doctor", "doctor", "What is missing on this device, and how to mend it."),
-    "emulate": ("share.cli.emulate", "emulate", "Record agents that move through a virtual room."),
-    "evaluate": ("share.cli.evaluate", "evaluate", "Play sessions on stated terms, score and compare them."),
-    "train": ("share.cli.train", "train", "Teach the model that estimates a tracker's error."),
+    "demo": ("share.cli.demo", "demo", "Try the whole system on this machine; nothing else is needed."),
+    "capture": ("share.cli.capture", "capture", "Record the camera and IMU of a headset or robot."),
+    "track": ("share.cli.track", "track", "Track one agent over a recording or camera, without an edge."),
+    "agent": ("share.cli.agent", "agent", "Run one agent: track at sensor rate, send keyframes to an edge."),
+    "edge": ("share.cli.edge", "edge", "Run the server: merge all agents' maps, send corrections."),
+    "dataset": (
+        "share.cli.dataset",
+        "dataset",
+        "Inspect, convert, recover and align recordings; export maps.",
+    ),
+    "sync": ("share.cli.sync", "sync", "Give all machines of a room one clock, and check it."),
+    "doctor": ("share.cli.doctor", "doctor", "Check this device, and say how to fix what is missing."),
+    "emulate": (
+        "share.cli.emulate",
+        "emulate",
+        "Make recordings of agents that move through a virtual room.",
+    ),
+    "evaluate": (
+        "share.cli.evaluate",
+        "evaluate",
+        "Play sessions, score them, compare policies and trackers.",
+    ),
+    "train": ("share.cli.train", "train", "Train the model that estimates the tracking error."),
     "calibrate": (
         "share.cli.calibrate",
         "calibrate",
-        "Find out what a device's cameras and IMU are like.",
+        "Calibrate a device's cameras, IMU and motion-capture body.",
     ),
-    "keys": ("share.cli.keys", "keys", "Who may connect to an edge from another machine."),
+    "keys": ("share.cli.keys", "keys", "Manage the keys with which other machines connect to an edge."),
 }
 
 
 class _LazyGroup(click.Group):
-    """A group whose commands are modules that are not imported until one is called."""
+    """A click group that imports a command's module when that command is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -64,7 +76,7 @@ class _LazyGroup(click.Group):
         try:
             with unwind_on_signal():
                 return super().invoke(ctx)
-        except KeyboardInterrupt:  # click would put an empty line before ours
+        except KeyboardInterrupt:  # click would print an empty line first
             raise _InterruptedError("interrupted") from None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -77,7 +89,10 @@ class _LazyGroup(click.Group):
 )
 @click.version_option(__version__, prog_name="share")
 def cli() -> None:
-    """SHARE: several people in AR headsets and robots track themselves in one shared map.
+    """SHARE: AR headsets and robots localise themselves in one shared map.
+
+    Each agent tracks its own pose from camera and IMU and sends keyframes to one edge server. The edge
+    merges the agents' maps and sends each agent corrections.
 
     \b
     Try it:   share demo
@@ -87,18 +102,21 @@ def cli() -> None:
 
 
 class _InterruptedError(ShareError):
-    """By Ctrl-C. The exit code is what shells give for SIGINT."""
+    """Ctrl-C. Exit code 130, as shells give for SIGINT."""
 
     exit_code = 130
 
 
 def _suggestion(name: str) -> str:
     near = difflib.get_close_matches(name, COMMANDS, n=1)
-    return f"did you mean '{near[0]}'?" if near else f"there are {', '.join(COMMANDS)}"
+    return f"did you mean '{near[0]}'?" if near else f"commands: {', '.join(COMMANDS)}"
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The one place that turns an error into a line and an exit code. arguments: of the process if None."""
+    """Run a command; turn every error into one line on stderr and an exit code, here and nowhere else.
+
+    arguments: those of the process if None.
+    """
     try:
         code = cli.main(arguments, prog_name="share", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
@@ -113,17 +131,17 @@ def main(arguments: list[str] | None = None) -> None:
         _exit_with(error.format_message().replace("\n", " ") + hint, error.exit_code)
     except (KeyboardInterrupt, click.Abort):
         _exit_with("interrupted", 130)
-    except BrokenPipeError:  # the reader of our output went away; nothing is left to tell it
+    except BrokenPipeError:  # the reader of our output is gone
         sys.stderr.close()
         sys.exit(1)
-    except OSError as error:  # what nobody foresaw: files have been checked, so most likely stdout
-        with contextlib.suppress(OSError):  # or Python would try again at its end, and complain itself
+    except OSError as error:  # files were checked before, so most likely stdout
+        with contextlib.suppress(OSError):  # or Python flushes it again at exit, with a message of its own
             sys.stdout.close()
         _exit_with(f"{error.filename or 'cannot write the output'}: {error.strerror or error}", 1)
 
 
 def _exit_with(text: str, code: int) -> None:
-    with contextlib.suppress(OSError):  # its terminal may be gone
+    with contextlib.suppress(OSError):  # the terminal may be gone
         click.echo(f"share: {one_line(text)}", err=True)
     sys.exit(code)
 

@@ -1,4 +1,4 @@
-"""Options that several commands share, and the parsing of what they hold."""
+"""Options that several commands share, and the parsing of their values."""
 
 from __future__ import annotations
 
@@ -20,19 +20,21 @@ calib = click.option(
     "--calib",
     metavar="FILE",
     help="Kalibr camchain file, or a folder with kalibr_imucam_chain.yaml and kalibr_imu_chain.yaml; "
-    "overrides what the source carries.",
+    "overrides the calibration in the source.",
 )
-config = click.option("--config", "config_file", metavar="FILE", help="YAML file of settings.")
-verbose = click.option("-v", "--verbose", is_flag=True, help="Say more.")
+config = click.option(
+    "--config", "config_file", metavar="FILE", help="YAML file with settings (docs/lookup/configuration.md)."
+)
+verbose = click.option("-v", "--verbose", is_flag=True, help="Print more.")
 keys = click.option(
-    "--keys", metavar="DIR", help="Folder of this machine's keys (default: ~/.config/share/keys)."
+    "--keys", metavar="DIR", help="Folder of this machine's keys.  [default: ~/.config/share/keys]"
 )
 out_folder = click.option(
-    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where the files go."
+    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Output folder."
 )
 target = click.option(
     "--target", "target_name", required=True, metavar="T",
-    help="The board: aprilgrid or charuco of the usual sizes, or its YAML file.",
+    help="The board: aprilgrid or charuco in the usual size, or its YAML file.",
 )  # fmt: skip
 
 
@@ -43,21 +45,25 @@ def _cores() -> int:
 
 
 workers = click.option(
-    "--workers", type=click.IntRange(1, 64), default=_cores, show_default="one a core", help="Processes."
+    "--workers",
+    type=click.IntRange(1, 64),
+    default=_cores,
+    show_default="one per core",
+    help="Processes to use.",
 )
 sigma_mm = click.option(
     "--sigma-mm",
     type=click.FloatRange(min=0.01),
     default=2.0,
     show_default=True,
-    help="Noise of the motion capture.",
+    help="Position noise of the motion capture, 1 sigma, mm.",
 )
 rotations = click.option(
     "--rotations",
     type=click.Choice(["helical", "xyz"]),
     default="helical",
     show_default=True,
-    help="What RX, RY, RZ of Vicon's CSV are, where there is no RW.",
+    help="Meaning of RX, RY, RZ in a Vicon CSV without RW: rotation vector (helical) or Euler angles (xyz).",
 )
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
@@ -75,13 +81,11 @@ class _Frames(click.ParamType[slice]):
         return slice(start, stop)
 
 
-frames = click.option(
-    "--frames", type=_Frames(), help="Only frames A to B-1, counted by camera images (0:250)."
-)
+frames = click.option("--frames", type=_Frames(), help="Use only camera frames A to B-1, such as 0:250.")
 
 
 def load_config(path: str | None) -> Config:
-    """The settings of a YAML file, or the defaults. Raises ConfigError or UsageError."""
+    """Read settings from a YAML file; the defaults without one. Raises ConfigError, UsageError."""
     from share.config import Config
     from share.files.yaml_file import read_settings
 
@@ -89,7 +93,7 @@ def load_config(path: str | None) -> Config:
 
 
 def agent_name(value: str) -> str:
-    """A name that can be a file's, as Unicode composes it (NFC). Raises UsageError."""
+    """Check that a name can be a file name; return it in Unicode form NFC. Raises UsageError."""
     from share.recordings.session import AGENT_NAME_RULE, is_agent_name
 
     name = normalize("NFC", value)
@@ -99,30 +103,33 @@ def agent_name(value: str) -> str:
 
 
 def values_by_name(option: str, values: tuple[str, ...]) -> dict[str, str]:
-    """`NAME=VALUE` by its name, a bare VALUE, which is for everybody, by ""."""
+    """Return VALUE by NAME for each `NAME=VALUE`; a bare VALUE, which is for all names, under "".
+
+    Raises UsageError for a repeated name.
+    """
     out: dict[str, str] = {}
     for word in values:
         name, _, value = word.partition("=") if "=" in word else ("", "", word)
         if name in out:
-            raise UsageError(f"{option} is given twice for {name or 'everybody'}; give one of them")
+            raise UsageError(f"{option} is given twice for {name or 'all'}; give it once")
         out[name] = value
     return out
 
 
 def print_notes(source: Source) -> None:
-    """What a person should know of a recording, such as streams that are not used: a line each on stderr."""
+    """Print the notes on a recording, such as unused streams, on stderr, one per line."""
     for note in source.notes:
         click.echo(f"share: {source.name}: {note}", err=True)
 
 
 def print_losses(source: Source) -> None:
-    """What of a recording could not be read: a line a kind on stderr."""
+    """Print what could not be read of a recording on stderr, one line per kind of loss."""
     for line in source.losses.lines():
         click.echo(f"share: {source.name}: {one_line(line)}", err=True)
 
 
 def warn_other_device(name: str, given_calibration: Calibration | None, serial: str | None) -> None:
-    """That a calibration which was given is of another device, on stderr, if it is."""
+    """Warn on stderr if the calibration given belongs to another device."""
     from share.recordings.device_match import device_mismatch
 
     if given_calibration is not None and (wrong := device_mismatch(given_calibration.serials, serial)):
@@ -130,6 +137,6 @@ def warn_other_device(name: str, given_calibration: Calibration | None, serial: 
 
 
 def print_counters(counters: dict[str, int]) -> None:
-    """What the sequencer met, on stderr: one line, without what never happened."""
+    """Print the sequencer's non-zero counters on one line on stderr."""
     counts_text = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counters.items() if count)
-    click.echo(f"sequencer: {counts_text or 'nothing'}", err=True)
+    click.echo(f"sequencer: {counts_text or 'nothing to report'}", err=True)

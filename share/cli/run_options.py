@@ -1,4 +1,4 @@
-"""The terms on which `share evaluate` plays a session, as options."""
+"""The options that say how `share evaluate` plays a session."""
 
 from __future__ import annotations
 
@@ -19,23 +19,27 @@ _RUN_OPTIONS = (
     click.option(
         "--link",
         metavar="LINK[,AGENT=LINK…]",
-        help="Through emulated networks, as share agent --link; one for all, or an agent its own.",
-    ),
-    click.option("--true-error", is_flag=True, help="Agents tell the edge their true error."),
-    click.option(
-        "--virtual", is_flag=True, help="In virtual time: tracked once, how long things take is drawn."
+        help="Emulated network, as share agent --link: one for all agents, or one per agent.",
     ),
     click.option(
-        "--costs", metavar="RUN", help="With --virtual: things take as long as in this run in real time."
+        "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
     ),
     click.option(
-        "--agents-first", is_flag=True, help="The edge gets what agents leave, as if they had own machines."
+        "--virtual", is_flag=True, help="Play in virtual time: track once, draw the durations from a seed."
+    ),
+    click.option(
+        "--costs", metavar="RUN", help="With --virtual: take the durations from this real-time run."
+    ),
+    click.option(
+        "--agents-first",
+        is_flag=True,
+        help="Run the edge at lower CPU priority, as if agents had machines of their own.",
     ),
 )
 
 
 def run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The options on which any run is played; by name as fields of `share.lab.evaluate.real_time.Terms`."""
+    """Add these options to a command; their names are fields of `share.lab.evaluate.real_time.RunOptions`."""
     for option in reversed(_RUN_OPTIONS):
         command = option(command)
     return command
@@ -44,7 +48,10 @@ def run_options(command: Callable[..., None]) -> Callable[..., None]:
 def load_run_config(
     config_file: str | None, options_given: dict[str, Any], sessions: Sequence[Session]
 ) -> Config:
-    """What is wrong with them or with the terms is said before anything is played."""
+    """Read the settings and check them and the run options before anything is played.
+
+    Raises ConfigError, UsageError.
+    """
     from share.net.emulated_link import LinkAssignment
 
     config, links = options.load_config(config_file), LinkAssignment.parse(options_given["link"])
@@ -54,6 +61,6 @@ def load_run_config(
         from share.lab.evaluate.virtual_time import read_delays
 
         if not options_given["virtual"]:
-            raise UsageError("--costs: in real time things take as long as they take; it goes with --virtual")
+            raise UsageError("--costs needs --virtual: in real time, durations are as they are")
         read_delays(Path(options_given["costs"]))
     return config

@@ -1,4 +1,4 @@
-"""The figures of one run, for a person."""
+"""The metrics of one run as text tables."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 _LATENCY_COLUMNS = ("", "latency", "frames", "50 %", "95 %", "99 %", "> 20 ms")
 _CORRECTED_COLUMNS = ("corrected", "50 %", "95 %", "99 %", "of")
 _ERROR_COLUMNS = ("", "odom ATE", "of", "map ATE", "of", "RPE frame", "", "RPE 1 s", "", "of")
-_SHARING_COLUMNS = ("in a map", "sent", "up", "down", "QoE", "told")
+_SHARING_COLUMNS = ("in a map", "sent", "up", "down", "QoE", "reported error")
 
 
 def run_table(run: RunMetrics) -> str:
-    """One run for a person: latency, then errors and what was shared, a line an agent each."""
+    """Return two tables with a line per agent, latency and then errors and sharing, and the merges."""
     latency = aligned_table(
         [(*_LATENCY_COLUMNS, *_CORRECTED_COLUMNS), *(_latency_cells(agent) for agent in run.agents)]
     )
@@ -22,7 +22,7 @@ def run_table(run: RunMetrics) -> str:
         [(*_ERROR_COLUMNS, *_SHARING_COLUMNS), *(_error_cells(agent) for agent in run.agents)]
     )
     merges = (
-        f"merges: {run.merges_requested} wanted, {run.merges_skipped} skipped, {run.merges_done} done, "
+        f"merges: {run.merges_requested} requested, {run.merges_skipped} skipped, {run.merges_done} done, "
         f"{_value_text(run.merges_per_metre, 'a metre', 2)} over {run.metres:.0f} m"
     )
     joined_text = f"{run.in_one_map} of {len(run.agents)} agents in one map"
@@ -66,7 +66,7 @@ def _error_cells(agent: AgentMetrics) -> tuple[str, ...]:
 def _title(conditions: Conditions) -> str:
     c = conditions
     where = f"{c.session}: policy {c.policy}, {c.link or 'loopback'}, seed {c.seed}"
-    return f"{where}; in {c.clock}, evaluations tell {c.told}"
+    return f"{where}; in {c.clock}, evaluations report {c.told}"
 
 
 def _value_text(value: float, unit: str, digits: int = 1) -> str:

@@ -1,4 +1,4 @@
-"""Signals that end a command unwind it: its children are ended, its temporary files removed."""
+"""Make signals that end a command unwind it, so that its children end and its temporary files go."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ _IMPORT_FILE = "<frozen importlib._bootstrap>"
 
 @contextlib.contextmanager
 def unwind_on_signal() -> Iterator[None]:
-    """Within, SIGINT raises KeyboardInterrupt, SIGTERM and SIGHUP SystemExit with the shells' exit code. One
-    that is ignored (nohup) stays so."""
+    """Within the block, SIGINT raises KeyboardInterrupt; SIGTERM and SIGHUP raise SystemExit(128 + number).
+
+    A signal that is ignored (nohup) stays ignored.
+    """
     numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
     caught = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
     before = {number: signal.signal(number, _unwind) for number in caught}
@@ -28,8 +30,11 @@ def unwind_on_signal() -> Iterator[None]:
 
 
 def _unwind(number: int, frame: FrameType | None) -> None:
-    """Not while a module is imported, but a moment later: there some libraries make another error of it
-    (poselib: "cannot import the C++ backend"), and some places swallow it."""
+    """Raise; during an import, a moment later.
+
+    There, some libraries turn the exception into another (poselib: "cannot import the C++ backend"), and
+    some swallow it.
+    """
     if _is_importing(frame):
         signal.signal(signal.SIGALRM, lambda _, later: _unwind(number, later))
         signal.setitimer(signal.ITIMER_REAL, _RETRY_S)

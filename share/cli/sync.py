@@ -1,4 +1,4 @@
-"""`share sync`: one clock for all machines of a room, and a look at how well they agree."""
+"""`share sync`: give all machines of a room one clock, and check how well they agree."""
 
 from __future__ import annotations
 
@@ -23,33 +23,38 @@ PORT = 11123  # NTP's own, 123, needs root
 
 @click.group()
 def sync() -> None:
-    """Give a room without internet one time, and see how well its machines agree with it.
+    """Give all machines of a room without internet one clock, and check how well they agree.
 
     \b
     The edge's machine:  share sync server
     Each device:         share sync check 192.168.1.10
-                         which says what to tell chrony where the clocks differ
+                         prints lines for chrony.conf if the clocks differ
 
     \b
     Example:  share sync check 192.168.1.10 --limit-ms 1
     """
 
 
-@sync.command(short_help="Tell others the time of this machine.")
-@click.option("--bind", default=f"0.0.0.0:{PORT}", show_default=True, metavar="HOST:PORT")
+@sync.command(short_help="Serve this machine's time to others.")
+@click.option(
+    "--bind",
+    default=f"0.0.0.0:{PORT}",
+    show_default=True,
+    metavar="HOST:PORT",
+    help="Address to listen on.",
+)
 @click.option(
     "--stratum",
     type=click.IntRange(1, 15),
     default=10,
     show_default=True,
-    help="How far from a true clock this one is said to be.",
+    help="NTP stratum to announce: distance from a reference clock.",
 )
 def server(bind: str, stratum: int) -> None:
-    """Tell others the time of this machine by NTP (RFC 5905), until Ctrl-C.
+    """Serve this machine's time to others by NTP (RFC 5905), until Ctrl-C.
 
-    Its own clock is what is told, whether or not anybody corrects it: all who follow it agree. `share sync
-    check` says what their chrony.conf must say. Where chronyd runs here, it can serve for good:
-    docs/do/sync.md.
+    The time is this machine's own, corrected or not: all machines that follow it agree. `share sync check`
+    prints the lines for their chrony.conf. If chronyd runs here, it can serve permanently: docs/do/sync.md.
 
     \b
     Example:  share sync server --bind 0.0.0.0:11123
@@ -64,11 +69,11 @@ def server(bind: str, stratum: int) -> None:
     live = LiveLine()
     with closing(StampedSocket.bind(host)) as link:
         times = TimeServer(stratum, clock_precision())
-        say, show = (
-            (lambda text: live.print_line(f"share sync: {text}")),
-            (lambda: live.write(_counts_text(times))),
-        )
-        run = TimeServerRun(link, times, say, show)
+
+        def print_line(text: str) -> None:
+            live.print_line(f"share sync: {text}")
+
+        run = TimeServerRun(link, times, print_line, lambda: live.write(_counts_text(times)))
         with stop_on_signal(run.stop):
             _print_server(HostPort(host.name, link.port), stratum, link.has_kernel_stamps)
             run.run()
@@ -80,11 +85,9 @@ def _print_server(address: HostPort, stratum: int, by_kernel: bool) -> None:
     from share.devices.chrony import follow_lines
     from share.net.udp import HostPort
 
-    stamps = "by the kernel" if by_kernel else "by this program, which is less exact"
-    click.echo(f"telling this machine's own time at {address} (UDP); arrivals are stamped {stamps}", err=True)
-    click.echo(
-        f"stratum {stratum}, reference 127.127.1.1: this machine's own clock, none better behind it", err=True
-    )
+    stamps = "by the kernel" if by_kernel else "by this program, which is less precise"
+    click.echo(f"serving this machine's time at {address} (UDP); requests are timestamped {stamps}", err=True)
+    click.echo(f"stratum {stratum}, reference 127.127.1.1 (this machine's own clock)", err=True)
     click.echo(f"clients' chrony.conf: {follow_lines(HostPort('THIS-MACHINE', address.port))[0]}", err=True)
 
 
@@ -93,30 +96,28 @@ def _counts_text(times: TimeServer) -> str:
     clients = f"clients: {times.clients}" + (
         "" if times.last_client is None else f" (last {times.last_client})"
     )
-    return (
-        f"answered: {c['answered']}, {clients}, asked too often: {c['limited']}, no questions: {c['ignored']}"
-    )
+    return f"answered: {c['answered']}, {clients}, rate-limited: {c['limited']}, invalid: {c['ignored']}"
 
 
-@sync.command(short_help="Say how far the clocks of others are from this one.")
+@sync.command(short_help="Measure the clock offsets of other machines.")
 @click.argument("hosts", nargs=-1, metavar="[HOSTS]")
 @click.option(
-    "--count", type=click.IntRange(1, 1000), default=8, show_default=True, help="Questions to each."
+    "--count", type=click.IntRange(1, 1000), default=8, show_default=True, help="Requests per host."
 )
 @click.option(
     "--limit-ms",
     type=click.FloatRange(0, min_open=True),
     default=1.0,
     show_default=True,
-    help="How far apart clocks may be at the worst.",
+    help="Largest allowed |offset| + uncertainty.",
 )
 @options.as_json
 def check(hosts: tuple[str, ...], count: int, limit_ms: float, as_json: bool) -> None:
-    """Ask time servers how far their clocks are from this machine's, and how sure that is.
+    """Measure the offset of time servers' clocks from this machine's, with its uncertainty.
 
-    Offset is theirs minus this one, ± the most that it can be wrong by. Exit code 1 if both together are more
-    than --limit-ms for any. HOSTS are HOST or HOST:PORT; the port is 11123 if none is given, that of `share
-    sync server` (ntpd and chronyd have 123). Without HOSTS: what this machine's own chronyd says of itself.
+    The offset is theirs minus ours, ± its largest possible error. Exit code 1 if the two together exceed
+    --limit-ms for any host. HOSTS are HOST or HOST:PORT; the default port is 11123, that of `share sync
+    server` (ntpd and chronyd use 123). Without HOSTS, the state of this machine's chronyd is reported.
 
     \b
     Example:  share sync check 192.168.1.10 192.168.1.20:123
@@ -132,15 +133,15 @@ def check(hosts: tuple[str, ...], count: int, limit_ms: float, as_json: bool) ->
         rows = [chrony_row]
     else:
         raise UsageError(
-            "no HOST is given, and no chronyd runs on this machine; give the machine that "
-            "`share sync server` runs on, such as 192.168.1.10"
+            "no HOST given and no chronyd runs on this machine; give the host that runs `share sync server`, "
+            "such as 192.168.1.10"
         )
     click.echo(json.dumps(_report_values(rows, limit_ms)) if as_json else _table(rows))
     _check_rows(rows, limit_ms)
 
 
 def _check_rows(rows: Sequence[ClockCheck], limit_ms: float) -> None:
-    """Raises ShareError where not all is well."""
+    """Print notes and advice. Raises ShareError if any clock is wrong."""
     for row in rows:
         if row.note:
             click.echo(f"{row.name}: {row.note}", err=True)
@@ -156,7 +157,7 @@ def _check_rows(rows: Sequence[ClockCheck], limit_ms: float) -> None:
     for row in failed:
         click.echo(f"{row.name}: {row.wrong}", err=True)
     raise ShareError(
-        f"{len(failed)} of {len(rows)} clocks are not known to be within {limit_ms:g} ms; see above"
+        f"{len(failed)} of {len(rows)} clocks are not proven to be within {limit_ms:g} ms; see above"
     )
 
 
@@ -164,7 +165,7 @@ def _print_chrony_advice(host: HostPort) -> None:
     from share.devices.chrony import follow_lines
 
     click.echo(
-        "to follow it: install chrony, put this at the end of /etc/chrony/chrony.conf, restart it:", err=True
+        "to follow it: install chrony, append this to /etc/chrony/chrony.conf, restart chrony:", err=True
     )
     for line in follow_lines(host):
         click.echo(f"    {line}", err=True)

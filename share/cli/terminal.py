@@ -1,4 +1,4 @@
-"""A progress bar on stderr, silent when that is not a terminal."""
+"""Progress bars and a live line on stderr, silent when it is not a terminal."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from contextlib import ExitStack, contextmanager
 
 import click
 
-from share.cli.saying import Stderr
+from share.cli.stderr import Stderr
 
 
 @contextmanager
 def progress(total: int, label: str) -> Iterator[Callable[[int], None]]:
-    """Gives a function that is told how much more of `total` is done."""
+    """Yield a function to call with each increment of `total` that is done."""
     if not sys.stderr.isatty():
         yield lambda done: None
         return
@@ -23,8 +23,10 @@ def progress(total: int, label: str) -> Iterator[Callable[[int], None]]:
 
 
 class LiveLine:
-    """One line on a terminal that is written over, cut where that ends; where stderr is none, nothing. A
-    terminal that is gone or held ends and delays nothing."""
+    """One line that is overwritten in place, cut to the terminal's width; nothing if stderr is no terminal.
+
+    A terminal that is gone or held neither ends nor delays the command.
+    """
 
     def __init__(self) -> None:
         self._stderr = Stderr()
@@ -32,27 +34,27 @@ class LiveLine:
 
     def write(self, text: str) -> None:
         if self.is_terminal:
-            self._stderr.tell("\r\x1b[K" + text[: _columns()], nl=False)
+            self._stderr.write("\r\x1b[K" + text[: _columns()])
             self._is_open = True
 
     def end(self) -> None:
-        """Leaves the line as it is; what follows begins on a new one. Waits a moment until all is written."""
-        self._leave()
+        """Keep the line as it is and start a new one. Waits a moment until all is written."""
+        self._break_line()
         self._stderr.flush()
 
     def print_line(self, text: str) -> None:
-        """A line of its own on stderr, terminal or not."""
-        self._leave()
-        self._stderr.tell(text)
+        """Print a line of its own on stderr, terminal or not."""
+        self._break_line()
+        self._stderr.print_line(text)
 
-    def _leave(self) -> None:
+    def _break_line(self) -> None:
         if self._is_open:
-            self._stderr.tell("")
+            self._stderr.print_line("")
         self._is_open = False
 
 
 def _columns() -> int | None:
-    """That fit into a line of the terminal; None if it does not tell."""
+    """Return the terminal's width; None if it is unknown."""
     try:
         return os.get_terminal_size(sys.stderr.fileno()).columns or None
     except (OSError, ValueError):
@@ -60,8 +62,7 @@ def _columns() -> int | None:
 
 
 class Stages:
-    """A bar for each stage of a longer task, one after the other. Call it with (stage, done, total)
-    inside its block."""
+    """A progress bar per stage of a task, one at a time. Call with (stage, done, total) within its block."""
 
     def __init__(self) -> None:
         self._stage, self._done = "", 0

@@ -1,4 +1,4 @@
-"""`share track`: one agent, no edge."""
+"""`share track`: track one agent without an edge."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from share.runtime.offline_tracking import TrackingOutput
     from share.runtime.source import Source
 
-_LONG_INIT_S = 1.0  # a first pose that needs no word
+_LONG_INIT_S = 1.0  # a first pose later than this is reported
 
 
 @click.command()
 @click.argument("source")
 @options.calib
 @options.frames
-@click.option("--out", metavar="T.tum", help="Write the causal poses of the body in odom here.")
-@click.option("--report", "report_file", metavar="R.json", help="Write the report here.")
+@click.option("--out", metavar="T.tum", help="File for the causal poses of the body in odom (TUM format).")
+@click.option("--report", "report_file", metavar="R.json", help="File for the report (JSON).")
 @camera_options.camera_options
 @options.config
 @options.verbose
@@ -41,11 +41,11 @@ def track(
     verbose: bool,
     as_json: bool,
 ) -> None:
-    """Track one agent over a recording, without an edge, as fast as it goes; or a camera until Ctrl-C.
+    """Track one agent without an edge: a recording as fast as possible, or a camera until Ctrl-C.
 
     SOURCE is an EuRoC/ASL folder, a TUM RGB-D folder with camera.yaml, an .mcap or .db3 recording,
-    SESSION/NAME or realsense[:SERIAL]. The same recording always gives the same poses, to the last
-    digit. A frame that could not be tracked has no line in T.tum.
+    SESSION/NAME, or realsense[:SERIAL]. A recording gives the same poses every time, to the last digit. A
+    frame without a pose has no line in T.tum.
 
     \b
     Example:  share track rec/kitchen --out kitchen.tum --report kitchen.json
@@ -63,14 +63,14 @@ def track(
     )
     options.print_notes(opened)
     output_files = _output_files(paths_given, source)
-    truth = opened.truth()  # if it is damaged, better now than after tracking
+    truth = opened.truth()  # read now: if it is damaged, fail before tracking
     run = _run_tracker(opened, settings, line)
     line.end()
     options.print_losses(opened)
     if not len(run.trajectory.stamps_ns):
         raise DataError(
-            f"{opened.name}: none of its {run.report['frames']} frames could be tracked; are they dark, "
-            "blurred or bare, or is the calibration another camera's?"
+            f"{opened.name}: none of its {run.report['frames']} frames could be tracked; check that images "
+            "are bright, sharp and textured, and that the calibration is of this camera."
             + "".join(
                 f" {line}." for line in [*_wait_text(run.report), *camera_options.camera_summary(run.report)]
             )
@@ -86,21 +86,24 @@ def track(
 
 
 def _output_files(paths_given: dict[str, str | None], source: str) -> dict[str, Path]:
-    """The files to write, by option. Raises UsageError if one cannot be, or would take another's place."""
+    """Return the files to write, by option.
+
+    Raises UsageError if one cannot be written, or would overwrite the source or the other.
+    """
     from share.files.writing import check_writable, is_special
 
     files = {option: check_writable(Path(name)) for option, name in paths_given.items() if name is not None}
     for option, path in files.items():
         if path.exists() and Path(source).exists() and path.samefile(source):
-            raise UsageError(f"{option} {path}: is the source itself; give another name")
+            raise UsageError(f"{option} {path} is the source itself; give another name")
     paths = [path.resolve() for path in files.values() if not is_special(path)]
     if len(paths) != len(set(paths)):
-        raise UsageError(f"--report {files['--report']}: is --out too; give another name")
+        raise UsageError(f"--report {files['--report']} is the same file as --out; give another name")
     return files
 
 
 def _run_tracker(opened: Source, settings: Config, line: LiveLine) -> TrackingOutput:
-    """All of a recording, or of a camera until somebody ends it."""
+    """Track a whole recording, or a camera until a signal ends it."""
     from share.cameras.live import LiveSource
     from share.runtime.offline_tracking import track
     from share.runtime.signals import stop_on_signal
@@ -116,7 +119,7 @@ def _run_tracker(opened: Source, settings: Config, line: LiveLine) -> TrackingOu
 
 
 def _wait_text(report: dict[str, Any]) -> list[str]:
-    """For what, for most of the time without a pose."""
+    """Return what the tracker waited for most of the time without a pose; nothing if it did not wait."""
     from share.types import WaitReason
 
     frames = report["waited"]
@@ -127,19 +130,19 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
     lines = [
         f"{report['tracked']} of {report['frames']} frames tracked, {report['keyframes']} keyframes, "
         f"lost for {report['lost_s']:.1f} s",
-        f"{report['cpu_ms_per_frame']:.1f} ms CPU a frame, "
-        f"and {report['decode_ms_per_frame']:.1f} ms to decode it",
+        f"{report['cpu_ms_per_frame']:.1f} ms CPU per frame, "
+        f"plus {report['decode_ms_per_frame']:.1f} ms to decode it",
     ]
     if report["init_s"] > _LONG_INIT_S:
         lines.append(". ".join([f"the first pose came after {report['init_s']:.1f} s", *_wait_text(report)]))
     if report["contradicted"]:
         lines.append(
-            f"images and IMU contradict each other in {report['contradicted']} frames: see whether the "
-            "camera sits on the IMU as the calibration says, and whether their clocks agree"
+            f"images and IMU contradict each other in {report['contradicted']} frames: check that camera and "
+            "IMU are mounted as the calibration says, and that their clocks agree"
         )
     if report["stretches"] > 1:
         lines.append(
-            f"odometry broke: {report['stretches']} stretches, whose poses do not compare with each other"
+            f"tracking was lost: {report['stretches']} odometry segments, each in a frame of its own"
         )
     if ate:
         lines.append(

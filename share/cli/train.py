@@ -1,4 +1,4 @@
-"""`share train`: the model that estimates a tracker's error, from recordings with truth to a file to ship."""
+"""`share train`: train the model that estimates the tracking error, from recordings with ground truth."""
 
 from __future__ import annotations
 
@@ -18,34 +18,42 @@ _BASE_OPTION = click.option(
     "--base",
     metavar="FILE",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="A model whose backbone is taken.  [default: the one that comes with SHARE]",
+    help="Model whose backbone is used.  [default: the one shipped with SHARE]",
 )
 
 
 @click.group()
 def train() -> None:
-    """Teach the error model how wrong a tracker is.
+    """Train the error model, which estimates the tracking error of a keyframe.
 
     \b
     Example:  share emulate --scene warehouse --motion ar=walk: --seconds 30 --seed 1 --out rooms/w1
               share train labels rooms/* --runs 4 --out labels
+              share train fit labels --out fit
+              share train export fit --labels labels --out error_model.onnx
     """
 
 
-@train.command(short_help="Run the tracker over sessions with truth, and keep how wrong it was.")
+@train.command(short_help="Run the tracker over sessions and record its errors.")
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--runs",
     type=click.IntRange(1, 1000),
     default=4,
     show_default=True,
-    help="Of each agent: one as recorded, the others spoiled (dark, blurred, frames missing …).",
+    help="Runs per agent: one as recorded, the others degraded (dark, blurred, frames missing, …).",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of what is spoiled.")
-@click.option("--without-imu", is_flag=True, help="As if they had none: stereo or depth alone.")
-@click.option("--workers", type=click.IntRange(1, 64), default=2, show_default=True, help="Runs at a time.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the degradation.")
+@click.option("--without-imu", is_flag=True, help="Ignore the IMU: stereo or depth only.")
+@click.option("--workers", type=click.IntRange(1, 64), default=2, show_default=True, help="Runs in parallel.")
 @options.config
-@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="A file a run.")
+@click.option(
+    "--out",
+    required=True,
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Output folder; gets a file per run.",
+)
 def labels(
     sessions: tuple[Path, ...],
     runs: int,
@@ -55,11 +63,11 @@ def labels(
     config_file: str | None,
     out: Path,
 ) -> None:
-    """Run our own tracker over each agent of SESSIONS, as recorded and spoiled, and write what each keyframe
-    looked like and how wrong the tracker was.
+    """Run the tracker over each agent of SESSIONS, as recorded and degraded; write the inputs of the error
+    model and the true error of each keyframe.
 
-    The error is that of the positions of the last 5 s, laid over the truth (SE3), rms in cm. What is there
-    already is not made again, so the same command goes on where it was broken off.
+    The error is that of the positions of the last 5 s after SE3 alignment to the ground truth, rms, cm. Runs
+    already in DIR are kept, so an interrupted command continues when it is run again.
 
     \b
     Example:  share train labels rooms/* --runs 8 --out labels
@@ -71,7 +79,7 @@ def labels(
 
     jobs = plan_label_runs([read_session(folder) for folder in sessions], runs, seed, not without_imu, out)
     writable_dir(out)
-    errors = []  # not what they are of: pictures of hundreds of runs would fill the memory
+    errors = []  # the errors only: the pictures of hundreds of runs would fill the memory
     for job, run_labels in make_labels(jobs, config, workers):
         errors.append(run_labels.error_cm)
         live.write(f"{len(errors)} of {len(jobs)} runs: {job.out.name}, {len(run_labels)} keyframes")
@@ -80,21 +88,21 @@ def labels(
     click.echo(f"labels: {out}")
 
 
-@train.command(short_help="Teach a network on labels.")
+@train.command(short_help="Train the error model on labels.")
 @click.argument("labels", metavar="LABELS", type=click.Path(path_type=Path))
-@click.option("--epochs", type=click.IntRange(1), default=200, show_default=True, help="At most.")
 @click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the split, and of chance."
+    "--epochs", type=click.IntRange(1), default=200, show_default=True, help="Largest number of epochs."
+)
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the split and the training."
 )
 @_BASE_OPTION
-@click.option(
-    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where it is kept."
-)
+@options.out_folder
 def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> None:
-    """Teach the head of the error model on LABELS, a folder by `share train labels`: minutes on a CPU, the
-    GPU where there is one. Rooms are split: to learn from, to stop by, to calibrate intervals, to test.
+    """Train the head of the error model on LABELS, a folder by `share train labels`: minutes on a CPU; a GPU
+    is used if there is one. Rooms are split into training, early stopping, calibration of intervals and test.
 
-    Broken off, the same command goes on where it stopped. Needs `pip install share-slam[train]`.
+    An interrupted command continues when it is run again. Needs `pip install share-slam[train]`.
 
     \b
     Example:  share train fit labels --out fit
@@ -109,17 +117,14 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
     from share.lab.train.training import train_model
     from share.odometry.error_model.network import backbone_features, open_network, read_model
 
-    collection, live, base_model = (
-        collect_labels(labels, seed),
-        LiveLine(),
-        read_model(_base_model_file(base)),
-    )
+    collection, live = collect_labels(labels, seed), LiveLine()
+    base_model = read_model(_base_model_file(base))
     writable_dir(out)
-    live.write(f"{len(collection.table.error_cm)} pictures go through the backbone")
+    live.write(f"computing backbone features of {len(collection.table.error_cm)} images")
     deep_features = backbone_features(open_network(base_model), collection.table.picture)
 
-    def show(epoch: int, learnt: float, stopped: float) -> None:
-        live.write(f"epoch {epoch}: loss {learnt:.4f} where it learns, {stopped:.4f} where it stops")
+    def show(epoch: int, training_loss: float, stopping_loss: float) -> None:
+        live.write(f"epoch {epoch}: training loss {training_loss:.4f}, stopping loss {stopping_loss:.4f}")
 
     fit_options = TrainingOptions(epochs=epochs, seed=seed)
     backbone = backbone_id(base_model)
@@ -131,16 +136,22 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
     click.echo(f"fit: {out / 'fit.npz'}")
 
 
-@train.command(short_help="A model to ship, with its card.")
+@train.command(short_help="Write the trained model and its model card.")
 @click.argument("fitted", metavar="FIT", type=click.Path(path_type=Path))
 @click.option(
-    "--labels", required=True, metavar="LABELS", type=click.Path(path_type=Path), help="It was taught on."
+    "--labels",
+    required=True,
+    metavar="LABELS",
+    type=click.Path(path_type=Path),
+    help="The labels it was trained on.",
 )
 @_BASE_OPTION
-@click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="An .onnx file.")
+@click.option(
+    "--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="ONNX file to write."
+)
 def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
-    """Put the head in FIT, a folder by `share train fit`, onto the backbone, and write a model card beside it
-    with how it does on the rooms that were kept for the test.
+    """Join the head in FIT, a folder by `share train fit`, to the backbone; write the model, and beside it a
+    model card with its results on the test rooms.
 
     \b
     Example:  share train export fit --labels labels --out error_model.onnx
@@ -162,7 +173,7 @@ def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
     click.echo(f"model: {out}   card: {out.with_suffix('.md')}")
 
 
-@train.command(short_help="A model against four others, on rooms that none has learnt from.")
+@train.command(short_help="Compare the trained model with four others on the test rooms.")
 @click.argument("labels", metavar="LABELS", type=click.Path(path_type=Path))
 @click.option(
     "--fit",
@@ -170,13 +181,13 @@ def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
     required=True,
     metavar="FIT",
     type=click.Path(path_type=Path),
-    help="By train fit.",
+    help="Folder by share train fit.",
 )
 @_BASE_OPTION
 @options.as_json
 def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> None:
-    """Teach linear regression, a random forest, an MLP and a contrastive CNN on the rooms that the network in
-    FIT was taught on, and try all of them on those that were kept for the test.
+    """Train linear regression, a random forest, an MLP and a contrastive CNN on the training rooms of the
+    network in FIT, and score all of them on the test rooms.
 
     \b
     Example:  share train compare labels --fit fit
@@ -187,7 +198,7 @@ def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> Non
     from share.lab.train.score import score_table, scores_json
 
     live = LiveLine()
-    live.write("pictures go through the backbone")
+    live.write("computing backbone features")
     assembled = assemble(fitted, labels, _base_model_file(base))
     seed, scores = assembled.fitted.about["options"]["seed"], []
     for score in score_baselines(assembled.collection, assembled.deep_features, seed, live.write):
@@ -206,7 +217,7 @@ def _base_model_file(model_given: Path | None) -> Path:
     from share.odometry.error_model.network import SHIPPED_MODEL
 
     if model_given is None and not SHIPPED_MODEL.is_file():
-        raise UsageError("--base: SHARE comes with no model yet; make a backbone with tools/make_backbone.py")
+        raise UsageError("--base is required: this SHARE ships no model; see tools/make_backbone.py")
     return model_given or SHIPPED_MODEL
 
 

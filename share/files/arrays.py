@@ -1,4 +1,4 @@
-"""NumPy's files (.npz, .npy) from anywhere: what they unpack to is known before anything is unpacked."""
+"""Read untrusted NumPy files (.npz, .npy): sizes and types are checked before anything is unpacked."""
 
 from __future__ import annotations
 
@@ -14,36 +14,39 @@ from numpy.typing import NDArray
 from share.errors import DataError
 from share.files.reading import MAX_ARRAYS_BYTES, read_bytes
 
-_MAX_ARRAYS = 2000  # in an archive; the weights of a fit have 100
-_PLAIN_KINDS = "biufU"  # kinds of dtype; objects would be code
+_MAX_ARRAYS = 2000  # per archive; the weights of a fit have 100
+_PLAIN_KINDS = "biufU"  # kinds of dtype; objects are excluded: unpickling them runs code
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def read_arrays(path: Path, objection: str, max_bytes: int = MAX_ARRAYS_BYTES) -> dict[str, NDArray[Any]]:
-    """Those of an archive, by name. most: bytes, packed and unpacked. otherwise: what to say of a file that
-    is none (`is no file of labels`). Raises DataError that names it."""
+    """Return the arrays of an archive, by name.
+
+    objection: what the error says of any other file (`is not a file of labels`). max_bytes: limit of the
+    packed and of the unpacked size. Raises DataError that names the file.
+    """
     try:
         with zipfile.ZipFile(io.BytesIO(read_bytes(path, max_bytes))) as archive:
             entries = archive.infolist()
             total = sum(one.file_size for one in entries)
             if len(entries) > _MAX_ARRAYS or total > max_bytes:
-                raise ValueError(f"{len(entries)} arrays that unpack to {total / 1e6:,.1f} MB are too much")
+                raise ValueError(f"too large: {len(entries)} arrays that unpack to {total / 1e6:,.1f} MB")
             return {one.filename.removesuffix(".npy"): _read_entry(archive, one) for one in entries}
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except Exception as error:  # zip, zlib and numpy each have their own
+    except Exception as error:  # zip, zlib and numpy raise different kinds
         raise DataError(f"{path}: {objection}, or damaged: {error!r:.200}") from None
 
 
 def read_array(path: Path, max_bytes: int = MAX_ARRAYS_BYTES) -> NDArray[Any]:
-    """That of one .npy file. Raises DataError that names it."""
+    """Return the array of a .npy file. Raises DataError that names the file."""
     try:
         data = read_bytes(path, max_bytes)
         return _read_checked(io.BytesIO(data), len(data))
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:
-        raise DataError(f"{path}: is no array, or damaged: {error!r:.200}") from None
+        raise DataError(f"{path}: is not an array file, or damaged: {error!r:.200}") from None
 
 
 def _read_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
@@ -52,11 +55,11 @@ def _read_entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]
 
 
 def _read_checked(file: IO[bytes], size: int) -> NDArray[Any]:
-    """size: bytes of the file, header and all. Raises what numpy does, ValueError, KeyError."""
+    """Read one array. size: bytes, header included. Raises ValueError, KeyError, numpy's errors."""
     shape, by_column, dtype = _HEADER_READERS[np.lib.format.read_magic(file)](file)
     if dtype.kind not in _PLAIN_KINDS or dtype.hasobject:
-        raise ValueError(f"an array of {dtype}")
+        raise ValueError(f"unsupported array type {dtype}")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != size - file.tell():
-        raise ValueError(f"an array that says that it is {shape} of {dtype} has {size - file.tell()} bytes")
+        raise ValueError(f"header says {shape} of {dtype}, but the array has {size - file.tell()} bytes")
     data = np.frombuffer(file.read(), dtype)
-    return data.reshape(shape, order="F" if by_column else "C").copy()  # one that can be written to
+    return data.reshape(shape, order="F" if by_column else "C").copy()  # writable

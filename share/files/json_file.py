@@ -1,4 +1,4 @@
-"""JSON that our own commands write, and read again."""
+"""Read JSON files that SHARE's own commands wrote."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from share.files.reading import MAX_EVENTS_BYTES, MAX_REPORT_BYTES, read_text
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """One object, the whole file. Raises DataError that names it."""
+    """Read a file with one JSON object. Raises DataError that names the file."""
     return _parse_object(_read_text(path, MAX_REPORT_BYTES), str(path))
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """An object a line; the last one may still be being written, and is then left out.
+    """Read a file with one JSON object per line, without an incomplete last line (still being written).
 
     Raises DataError that names file and line.
     """
@@ -29,27 +29,26 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """As json.loads; a number that is none, or beyond what a float holds, is refused. Raises ValueError."""
+    """Parse JSON strictly: NaN, infinities and numbers beyond float range are errors. Raises ValueError."""
     try:
         return json.loads(
             text, parse_constant=_raise_not_a_number, parse_float=_parse_float, parse_int=_parse_int
         )
     except RecursionError:
-        raise ValueError("lists in lists without end") from None
+        raise ValueError("nested too deeply") from None
 
 
 @contextlib.contextmanager
 def own_format_errors(path: Path) -> Iterator[None]:
-    """What a file of ours holds is taken for what it should be: errors that come of its being something else
-    become a DataError that names `path`."""
+    """Within the block, errors from unexpected contents of a file become a DataError that names `path`."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, ArithmeticError) as error:
-        raise DataError(f"{path}: is damaged, or by another SHARE: {error!r:.200}") from None
+        raise DataError(f"{path}: is damaged, or of another version of SHARE: {error!r:.200}") from None
 
 
 def nan_to_none(value: Any) -> Any:
-    """Plain data for JSON, which knows no NaN: None in its place."""
+    """Return plain data with None for NaN, which JSON lacks."""
     match value:
         case float() if math.isnan(value):
             return None
@@ -62,12 +61,12 @@ def nan_to_none(value: Any) -> Any:
 
 
 def to_plain(value: Any) -> Any:
-    """As it comes back from JSON, in which what that does not know is text."""
+    """Return value as it would come back from JSON; unknown types become text."""
     return json.loads(json.dumps(value, default=str))
 
 
 def none_to_nan(row: dict[str, Any]) -> dict[str, Any]:
-    """What `nan_to_none` made of a row of numbers, as it was."""
+    """Undo `nan_to_none` on a row of numbers."""
     return {name: math.nan if value is None else value for name, value in row.items()}
 
 
@@ -86,12 +85,12 @@ def _parse_object(text: str, where: str) -> dict[str, Any]:
     except ValueError as error:
         raise DataError(f"{where}: is damaged: {error}") from None
     if not isinstance(value, dict):
-        raise DataError(f"{where}: is damaged: it is no JSON object")
+        raise DataError(f"{where}: is damaged: it is not a JSON object")
     return value
 
 
 def _raise_not_a_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a valid number")
 
 
 def _parse_float(text: str) -> float:
@@ -106,4 +105,4 @@ def _parse_int(text: str) -> int:
     return int(text)
 
 
-_MAX_DIGITS = 40  # more than any stamp or count has, and a float holds it
+_MAX_DIGITS = 40  # more than any stamp or count has; fits a float

@@ -1,4 +1,4 @@
-"""Lines that a live run puts down and reads once more at its end, so that they take no memory meanwhile."""
+"""Text files that a live run appends to and reads back at its end, so that the lines take no memory."""
 
 from __future__ import annotations
 
@@ -14,22 +14,21 @@ from share.errors import ShareError
 from share.files.reading import MB, open_regular
 from share.files.writing import open_new
 
-# ---- A text file that a live run appends to, and that never ends the run: a full disk is said once.
-
 
 class LineFile:
-    """Every line is in the system's hands when `write` returns, so a crash loses none.
+    """A text file that a live run appends to. A write error never ends the run.
 
-    After the first line that cannot be written (disk full, quota), `notify` is told once and nothing
-    more is tried: what is there stays, in whole lines.
+    Every line is with the operating system when `write` returns, so a crash of the process loses none. After
+    the first line that cannot be written (disk full, quota), `notify` is called once and nothing more is
+    written; the file keeps its complete lines.
     """
 
     def __init__(
         self, path: Path, notify: Callable[[str], None], open_file: Callable[[Path], IO[bytes]] = open_new
     ) -> None:
-        """opened: makes the file; may raise OSError."""
+        """open_file: creates the file; may raise OSError."""
         self.path, self._notify = path, notify
-        self.written_bytes = 0  # of whole lines
+        self.written_bytes = 0  # in complete lines
         self._file: IO[str] | None = None
         self._failure = ""
         try:
@@ -38,7 +37,7 @@ class LineFile:
             self._fail(error)
 
     def write(self, line: str) -> None:
-        """One line, without its end."""
+        """Append a line, given without its end."""
         if self._file is None:
             return
         try:
@@ -53,30 +52,29 @@ class LineFile:
             self._file = None
 
     def check(self) -> None:
-        """Raises ShareError if a line is missing."""
+        """Raise ShareError if a line is missing."""
         if self._failure:
             raise ShareError(f"{self.path}: is not complete: {self._failure}")
 
     def _fail(self, error: OSError) -> None:
         self._failure = error.strerror or str(error)
         if self._file is not None:
-            with contextlib.suppress(OSError):  # what it still holds cannot be written either
+            with contextlib.suppress(OSError):  # its buffer cannot be written either
                 self._file.close()
             self._file = None
-            with contextlib.suppress(OSError):  # a device has no end to cut off
+            with contextlib.suppress(OSError):  # a device cannot be truncated
                 os.truncate(self.path, self.written_bytes)
         self._notify(f"{self.path}: cannot be written: {self._failure}; the run goes on without it")
 
 
-_VAR_TMP = Path("/var/tmp")  # /tmp may lie in memory
-_READ_BYTES = 1 << 20  # bytes
+_VAR_TMP = Path("/var/tmp")  # /tmp may be in memory
+_READ_BYTES = 1 << 20  # per read
 
 
 class Spool:
-    """As `LineFile`, made by the first line, and readable while it is open, even if it was removed.
+    """A `LineFile` created with its first line, and readable while it is open, even after its removal.
 
-    path None: a file without a name in the system's folder of temporary ones, of which nothing is left
-    however the run ends.
+    path None: an unnamed temporary file, of which nothing is left however the run ends.
     """
 
     def __init__(self, path: Path | None, notify: Callable[[str], None]) -> None:
@@ -85,14 +83,14 @@ class Spool:
         self._read_handle: int | None = None  # a handle of the same file
 
     def write(self, line: str) -> None:
-        """One line, without its end."""
+        """Append a line, given without its end."""
         if self._file is None:
-            shown_path = _temp_folder() / "share (without a name)" if self._path is None else self._path
+            shown_path = _temp_folder() / "share (unnamed)" if self._path is None else self._path
             self._file = LineFile(shown_path, self._notify, self._open_file)
         self._file.write(line)
 
     def read(self) -> Iterator[str]:
-        """Lines in order, but for those that could not be written. Raises ShareError if the disk fails."""
+        """Yield all lines that were written, in order. Raises ShareError if the disk fails."""
         if self._file is None or self._read_handle is None:
             return
         offset, partial_line = 0, b""
@@ -105,7 +103,7 @@ class Spool:
             yield from (line.decode() for line in lines)
 
     def check(self) -> None:
-        """Raises ShareError if a line is missing."""
+        """Raise ShareError if a line is missing."""
         if self._file is not None:
             self._file.check()
 
@@ -131,7 +129,7 @@ class Spool:
         except OSError as error:
             raise ShareError(f"{self._file.path}: cannot be read: {error.strerror}") from None
         if not part:
-            raise ShareError(f"{self._file.path}: somebody cut it off while it was written")
+            raise ShareError(f"{self._file.path}: was truncated by another process while it was written")
         return part
 
 
@@ -139,21 +137,21 @@ def _temp_folder() -> Path:
     return _VAR_TMP if os.access(_VAR_TMP, os.W_OK) else Path(tempfile.gettempdir())
 
 
-# ---- A text file that another process is writing, read as it grows.
-
-_MAX_READ_BYTES = 10 * MB  # the rest the next time
+_MAX_READ_BYTES = 10 * MB  # per call of GrowingFile.new_lines
 
 
 class GrowingFile:
-    """Its lines, each once. partial: the name that it has until it is whole; what has the other name before
-    that is of earlier."""
+    """A text file that another process is writing: yields each line once.
+
+    partial: its name until it is complete; before that, a file of the final name is an older one.
+    """
 
     def __init__(self, path: Path, partial: Path | None = None) -> None:
         self._path, self._partial = path, partial
-        self._read_bytes = 0  # bytes
+        self._read_bytes = 0
 
     def new_lines(self) -> list[str]:
-        """Whole lines that have come since the last time; none while there is no file."""
+        """Return the complete lines since the last call; none while there is no file."""
         new = b"" if self._partial is None else self._read_new(self._partial)
         if not new and (self._partial is None or self._read_bytes):
             new = self._read_new(self._path)

@@ -1,20 +1,21 @@
-"""What an ONNX file asks for, before a runtime sees it. Pure: bytes in, names out.
+"""Check an untrusted ONNX file before a runtime loads it. Pure: works on bytes.
 
-Only those parts of the protocol buffer are looked at that matter (onnx.proto: ModelProto, GraphProto,
-NodeProto, AttributeProto, TensorProto). Layers whose output is at most about as large as input and weights
-are let through; those that loop, branch, call or make tensors of any size out of a few bytes are not.
+Parses only the parts of the protocol buffer that matter (onnx.proto: ModelProto, GraphProto, NodeProto,
+AttributeProto, TensorProto). Allows layers whose output is at most about as large as input and weights;
+refuses layers that loop, branch, call, or make large tensors from a few bytes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-_GRAPH, _FUNCTIONS = 7, 25  # of a model
-_NODE, _INITIALIZER, _SPARSE_INITIALIZER = 1, 5, 15  # of a graph
-_TYPE, _ATTRIBUTE, _DOMAIN = 4, 5, 7  # of a node
-_TENSOR, _GRAPH_OF, _TENSORS, _GRAPHS, _SPARSE, _SPARSES = 5, 6, 10, 11, 22, 23  # of an attribute
-_EXTERNAL, _LOCATION = 13, 14  # of a tensor
-_BYTES, _FIXED = 2, {1: 8, 5: 4}  # wire types, and how long those of one length are
+# field numbers
+_GRAPH, _FUNCTIONS = 7, 25  # ModelProto
+_NODE, _INITIALIZER, _SPARSE_INITIALIZER = 1, 5, 15  # GraphProto
+_TYPE, _ATTRIBUTE, _DOMAIN = 4, 5, 7  # NodeProto
+_TENSOR, _GRAPH_OF, _TENSORS, _GRAPHS, _SPARSE, _SPARSES = 5, 6, 10, 11, 22, 23  # AttributeProto
+_EXTERNAL, _LOCATION = 13, 14  # TensorProto
+_BYTES, _FIXED = 2, {1: 8, 5: 4}  # wire types: length-delimited; fixed length, bytes by type
 _MAX_NODES = 20_000
 _DOMAINS = (b"", b"ai.onnx")
 
@@ -34,7 +35,7 @@ ALLOWED_LAYERS = frozenset((
 
 
 def check_model(data: bytes) -> None:
-    """Raises ValueError that says what of a model is not let through, or that it is none."""
+    """Raise ValueError that says why a file is not an allowed model."""
     try:
         parts = list(_fields(data))
         graphs = [value for number, value in parts if number == _GRAPH]
@@ -44,7 +45,7 @@ def check_model(data: bytes) -> None:
             raise ValueError("it defines functions")
         _check_graph(graphs[0])
     except IndexError:
-        raise ValueError("it is no protocol buffer, or cut short") from None
+        raise ValueError("it is not a protocol buffer, or cut short") from None
 
 
 def _check_graph(graph: bytes) -> None:
@@ -72,7 +73,7 @@ def _check_node(node: bytes) -> None:
             _check_attribute(_checked_bytes(value))
     if domain not in _DOMAINS or kind.decode(errors="replace") not in ALLOWED_LAYERS:
         name = b".".join((domain, kind) if domain else (kind,)).decode(errors="replace")
-        raise ValueError(f"its layer '{name:.60}' is none that an error model may have")
+        raise ValueError(f"its layer '{name:.60}' is not allowed in an error model")
 
 
 def _check_attribute(attribute: bytes) -> None:
@@ -80,23 +81,23 @@ def _check_attribute(attribute: bytes) -> None:
         if number in (_TENSOR, _TENSORS):
             _check_tensor(_checked_bytes(value))
         elif number in (_GRAPH_OF, _GRAPHS, _SPARSE, _SPARSES):
-            raise ValueError("a layer of it holds a graph, or sparse numbers")
+            raise ValueError("one of its layers holds a graph or sparse numbers")
 
 
 def _check_tensor(tensor: bytes) -> None:
     for number, value in _fields(tensor):
         if number == _EXTERNAL or (number == _LOCATION and value != 0):
-            raise ValueError("its weights lie in other files; save it with its weights inside")
+            raise ValueError("its weights are in other files; save the model with its weights inside")
 
 
 def _checked_bytes(value: bytes | int) -> bytes:
     if not isinstance(value, bytes):
-        raise ValueError("it is no protocol buffer, or damaged")
+        raise ValueError("it is not a protocol buffer, or damaged")
     return value
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, bytes | int]]:
-    """Number and value of each. Raises IndexError where they are cut short, ValueError."""
+    """Yield number and value of each field. Raises IndexError if one is cut short, ValueError."""
     offset = 0
     while offset < len(data):
         key, offset = _varint(data, offset)
@@ -110,7 +111,7 @@ def _fields(data: bytes) -> Iterator[tuple[int, bytes | int]]:
         elif wire in _FIXED:
             length = _FIXED[wire]
         else:
-            raise ValueError("it is no protocol buffer, or damaged")
+            raise ValueError("it is not a protocol buffer, or damaged")
         if length > len(data) - offset:
             raise IndexError
         yield number, data[offset : offset + length]
@@ -125,4 +126,4 @@ def _varint(data: bytes, offset: int) -> tuple[int, int]:
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
             return value, offset
-    raise ValueError("it is no protocol buffer, or damaged")
+    raise ValueError("it is not a protocol buffer, or damaged")

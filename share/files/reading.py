@@ -1,7 +1,7 @@
-"""Opening files that others wrote: regular ones only, and no larger than their kind ever is.
+"""Open untrusted files for reading: regular files only, of a limited size.
 
-A pipe would wait for ever, a device may never end, and a size is known before a byte is read. A link to a
-regular file is one. Everything that is refused here is an OSError, as if the system had refused it.
+A pipe would block, a device may never end. A link to a regular file is allowed. Every refusal is an OSError,
+as if from the operating system.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import BinaryIO
 from share.errors import DataError
 
 MB = 10**6
-MAX_SETTINGS_BYTES = 2 * MB  # YAML that a person or a calibration wrote; ours with all provenance has 0.1
-MAX_TABLE_BYTES = 4000 * MB  # of numbers as text: half a day of a 1 kHz IMU
-MAX_REPORT_BYTES = 100 * MB  # one JSON object that our own commands wrote; of a day of eight agents 30
-MAX_EVENTS_BYTES = 1000 * MB  # a JSON object a line; the events of a day
-MAX_KEYS_BYTES = 10 * MB  # public keys, a line each: 100,000 machines
-MAX_ARRAYS_BYTES = 2000 * MB  # labels of a run, weights; a run of an hour at 5 keyframes a second has 300
-MAX_LOG_BYTES = 100 * MB  # what a child process said
+MAX_SETTINGS_BYTES = 2 * MB  # YAML of settings or a calibration; ours with full provenance has 0.1
+MAX_TABLE_BYTES = 4000 * MB  # numbers as text: half a day of a 1 kHz IMU
+MAX_REPORT_BYTES = 100 * MB  # one JSON object of our own commands; a day of eight agents has 30
+MAX_EVENTS_BYTES = 1000 * MB  # one JSON object per line: the events of a day
+MAX_KEYS_BYTES = 10 * MB  # public keys, one per line: 100,000 machines
+MAX_ARRAYS_BYTES = 2000 * MB  # labels of a run, weights; an hour at 5 keyframes a second has 300
+MAX_LOG_BYTES = 100 * MB  # output of a child process
 _OPEN_FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY
 _KIND_TEXTS = {
     stat.S_IFDIR: "it is a folder",
@@ -33,16 +33,15 @@ _KIND_TEXTS = {
 
 
 def open_regular(path: Path, max_bytes: int | None = None) -> BinaryIO:
-    """The file, for reading. most: bytes that it may have. Raises OSError, also where it is no regular file
-    or is larger."""
+    """Open a file for reading. Raises OSError, also if it is not a regular file or larger than max_bytes."""
     try:
         handle = os.open(path, _OPEN_FLAGS)
     except OSError as error:
-        if error.errno == errno.ENXIO:  # what open(2) says of a socket
+        if error.errno == errno.ENXIO:  # from open(2) of a socket
             raise _not_regular_error(path, stat.S_IFSOCK) from None
         raise
     except ValueError:  # a NUL in its name
-        raise OSError(errno.EINVAL, "its name is none that a file can have", repr(str(path))) from None
+        raise OSError(errno.EINVAL, "its name is not a valid file name", repr(str(path))) from None
     try:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
@@ -56,10 +55,10 @@ def open_regular(path: Path, max_bytes: int | None = None) -> BinaryIO:
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:
-    """All of a file of at most so many bytes. Raises OSError."""
+    """Read a whole file of at most max_bytes. Raises OSError."""
     with open_regular(path, max_bytes) as file:
-        data = file.read(os.fstat(file.fileno()).st_size + 1)  # Python reserves what is asked for
-        while more := file.read(MB):  # it grows, or is one of /proc, which have no size
+        data = file.read(os.fstat(file.fileno()).st_size + 1)  # Python allocates the size asked for
+        while more := file.read(MB):  # it is growing, or in /proc, where sizes are 0
             data += more
             if len(data) > max_bytes:
                 raise _too_large_error(path, len(data), max_bytes)
@@ -67,42 +66,42 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
 
 
 def read_text(path: Path, max_bytes: int, encoding: str = "utf-8") -> str:
-    """Likewise, with \\n at the end of every line. Raises OSError, UnicodeDecodeError."""
+    """Read a whole text file, with \\n line ends. Raises OSError, UnicodeDecodeError."""
     return read_bytes(path, max_bytes).decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
 
 
 def is_sparse(path: Path) -> bool:
-    """Whether a file is nearly all holes: it says a size that takes no disk. File systems that pack what is
-    in a file do not get as far. Raises OSError."""
+    """Return whether a file is nearly all holes: its size is far beyond its disk blocks, more than a
+    compressing file system reaches. Raises OSError."""
     status = os.stat(path)
     return status.st_size > MB + _MAX_COMPRESSION * _BLOCK_BYTES * status.st_blocks
 
 
-_BLOCK_BYTES, _MAX_COMPRESSION = 512, 50
+_BLOCK_BYTES = 512  # unit of st_blocks
+_MAX_COMPRESSION = 50  # by a file system
 
 
 def _not_regular_error(path: Path, kind: int) -> OSError:
-    what = _KIND_TEXTS.get(kind, "it is of a kind of its own")
+    what = _KIND_TEXTS.get(kind, "it is of an unknown kind")
     return OSError(errno.EINVAL, f"{what}, not a regular file", str(path))
 
 
 def _too_large_error(path: Path, size: int, max_bytes: int) -> OSError:
     size_text, limit_text = (f"{n / MB:,.1f} MB" for n in (size, max_bytes))
-    return OSError(errno.EFBIG, f"it has {size_text}, a file of this kind may have {limit_text}", str(path))
+    return OSError(errno.EFBIG, f"it has {size_text}; the limit for this kind is {limit_text}", str(path))
 
 
-# ---- Paths that a file tells of: they stay in that file's folder.
-
-_MAX_PATH_BYTES = 1000  # bytes of a path, 255 of a name: what file systems take
+_MAX_PATH_BYTES = 1000  # of a path; 255 of a name: limits of file systems
 
 
 def path_inside(folder: Path, name: str, where: str) -> Path:
-    """The file that `where` calls `name`, below `folder`. Raises DataError for a name that leads out of it.
+    """Return the path of file `name`, which file `where` lists, below `folder`.
 
-    Links in the folder are followed: who made the folder may keep the images on another disk.
+    Raises DataError for a name that leads out of the folder. Links in the folder are followed: its owner may
+    keep the images on another disk.
     """
     parts = PurePosixPath(name).parts
     leads_out = name.startswith("/") or ".." in parts or "\0" in name or not parts
     if leads_out or len(name.encode()) > _MAX_PATH_BYTES or max(len(part.encode()) for part in parts) > 255:
-        raise DataError(f"{where}: '{name:.80}' is no name of a file below {folder}")
+        raise DataError(f"{where}: '{name:.80}' is not a file name below {folder}")
     return folder / name

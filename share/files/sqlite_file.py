@@ -1,4 +1,4 @@
-"""SQLite files from anywhere, for reading: nothing in them is run, rows and searches are bounded."""
+"""Read untrusted SQLite files: nothing in them is run; sizes of rows and costs of queries are bounded."""
 
 from __future__ import annotations
 
@@ -9,48 +9,51 @@ from urllib.parse import quote
 
 from share.files.reading import is_sparse, open_regular
 
-_STEPS_PER_CHECK = 10_000  # of SQLite's steps, between two counts of them: some 0.1 ms
-_MIN_STEPS, _STEPS_PER_BYTE = (
-    10**8,
-    100,
-)  # before a row is given: seconds, and more where there is more to look through
+_STEPS_PER_CHECK = 10_000  # of SQLite's virtual machine, between two checks: some 0.1 ms
+_MIN_STEPS = 10**8  # allowed per query, whatever the file's size: seconds
+_STEPS_PER_BYTE = 100  # allowed more per byte of the file
 _CACHE_KB = 8000
 
 
 def limit_untrusted(connection: sqlite3.Connection, max_row_bytes: int) -> None:
-    """Before anything is read. most_bytes: of a row, and so of a blob. Raises sqlite3.Error."""
+    """Make a connection safe for an untrusted file; call before reading. Raises sqlite3.Error.
+
+    max_row_bytes: limit of a row, and so of a blob.
+    """
     connection.execute("PRAGMA trusted_schema = OFF")
     connection.execute("PRAGMA cell_size_check = ON")
     connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max_row_bytes)
 
 
 def wal_path(path: Path) -> Path:
-    """Where SQLite keeps what is committed, but not yet in the file."""
+    """Return the file of SQLite's write-ahead log: committed changes that are not yet in the database."""
     return path.with_name(path.name + "-wal")
 
 
 def shm_path(path: Path) -> Path:
-    """What SQLite looks up in that log, shared between processes."""
+    """Return the file of the index of SQLite's write-ahead log, which processes share."""
     return path.with_name(path.name + "-shm")
 
 
 def read_only_uri(path: Path) -> str:
-    """Its URI. Without a log nobody writes, and no file beside it is needed."""
+    """Return the URI for reading a database. Without a log it has no writer, and needs no file beside it."""
     mode = "mode=ro" if wal_path(path).exists() else "immutable=1"
     return f"file:{quote(str(path.resolve()))}?{mode}"
 
 
 class UntrustedDatabase:
-    """Tables of one file; columns: those that each must have, by table. Raises OSError for what is no regular
-    file, sqlite3.Error for what is no database of such tables: each a plain one, whose first column is the
-    number of its rows and no column of which is computed."""
+    """A database file opened for reading. columns: the columns that each table must have.
+
+    Raises OSError if it is not a regular file, sqlite3.Error if it is not a database with these tables. Each
+    must be a plain table with the first column as its integer primary key and no computed column.
+    """
 
     def __init__(self, path: Path, columns: Mapping[str, tuple[str, ...]], max_row_bytes: int) -> None:
         for file in (path, wal_path(path)):
             if file == path or file.is_symlink() or file.exists():
                 open_regular(file).close()
                 if is_sparse(file):
-                    raise sqlite3.DatabaseError("it is nearly all holes")
+                    raise sqlite3.DatabaseError("it is nearly all holes (sparse)")
         self._connection = sqlite3.connect(read_only_uri(path), uri=True, isolation_level=None)
         self._max_steps = _MIN_STEPS + _STEPS_PER_BYTE * path.stat().st_size
         self._steps = 0
@@ -68,7 +71,7 @@ class UntrustedDatabase:
         self._connection.close()
 
     def rows(self, query: str, *values: int) -> sqlite3.Cursor:
-        """Raises sqlite3.Error, also in the course of it."""
+        """Run a query. Raises sqlite3.Error, also while rows are read."""
         self._steps = 0
         return self._connection.execute(query, values)
 
@@ -79,7 +82,7 @@ class UntrustedDatabase:
     def _check_table(self, table: str, names: tuple[str, ...]) -> None:
         kinds = self.rows(f"SELECT type, sql FROM sqlite_schema WHERE name = '{table}'").fetchall()
         if [(kind, str(sql).upper().split()[:2]) for kind, sql in kinds] != [("table", ["CREATE", "TABLE"])]:
-            raise sqlite3.DatabaseError(f"no table {table} as it should be")
+            raise sqlite3.DatabaseError(f"table {table} is missing, or not a plain table")
         columns = self.rows(f"PRAGMA table_xinfo({table})").fetchall()
         if any(hidden for *_, hidden in columns):
             raise sqlite3.DatabaseError(f"a column of {table} is computed")

@@ -1,4 +1,4 @@
-"""Writing files so that nobody ever finds half of one, and finding out first whether we may."""
+"""Write files atomically, and check beforehand that they can be written."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from share.errors import ShareError, UsageError
 
 
 def atomic_write(path: Path, data: bytes | str) -> None:
-    """Write beside `path`, make it durable, then take its name: `path` is old or new, never between.
+    """Write a temporary file beside `path`, sync it to disk, then rename it: `path` is always old or new.
 
-    A link of that name is replaced, not followed: who can put one into our folder has no say over what else
-    we write. A device, and a pipe that `check_writable` has opened, are simply written to. Raises UsageError
-    for another pipe and if the folder cannot be written to, ShareError if the disk is full or fails.
+    A link of that name is replaced, not followed, so that a link planted in the folder cannot redirect the
+    write. A device, and a pipe that `check_writable` has opened, are written to directly. Raises UsageError
+    for another pipe or if the folder is not writable, ShareError if the disk is full or fails.
     """
     content = data.encode() if isinstance(data, str) else data
     if is_special(path):
@@ -50,7 +50,7 @@ def _write_durably(handle: int, name: str, content: bytes) -> None:
 
 @contextlib.contextmanager
 def write_errors(path: Path) -> Iterator[None]:
-    """Says a full disk and its like in one line: OSError inside becomes a ShareError that names `path`."""
+    """Within the block, an OSError (disk full) becomes a ShareError that names `path`."""
     try:
         yield
     except OSError as error:
@@ -58,8 +58,8 @@ def write_errors(path: Path) -> Iterator[None]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make a rename in `folder` durable, where the system can."""
-    with contextlib.suppress(OSError):  # not every file system opens folders
+    """Make a rename in `folder` durable, if the file system can."""
+    with contextlib.suppress(OSError):  # some file systems cannot open folders
         handle = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(handle)
@@ -68,9 +68,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_writable(path: Path) -> Path:
-    """`path`, which a person named, if a file of that name can be made (its folder may have to be made).
+    """Return `path` if it can be written; create its folder if needed. Else raise UsageError.
 
-    It may be a device, or a pipe that somebody reads. Else UsageError.
+    It may also be a device, or a pipe with a reader.
     """
     if path.is_dir():
         raise UsageError(f"{path}: is a folder; give the name of a file")
@@ -82,7 +82,7 @@ def check_writable(path: Path) -> Path:
 
 
 def check_replaceable(path: Path) -> Path:
-    """`path`, if it is a file or nothing, and so can be replaced by one. Else UsageError."""
+    """Return `path` if a file can replace it: it is a file or does not exist. Else raise UsageError."""
     if is_special(path):
         raise _blocked_path_error(path)
     return check_writable(path)
@@ -92,8 +92,10 @@ _pipes: dict[tuple[int, int], int] = {}  # open for writing, by device and inode
 
 
 def _open_pipe(path: Path) -> None:
-    """It stays open from here on: a reader takes the close of its last writer for the end. Raises UsageError
-    where nobody reads it, for which open(2) would wait."""
+    """Open a pipe for writing and keep it open: its reader takes the close of the last writer for the end.
+
+    Raises UsageError if it has no reader, for which open(2) would wait.
+    """
     if not path.is_fifo():
         raise UsageError(f"{path}: is {_kind_text(path)}; give the name of a file")
     if (file_id := _file_id(path)) in _pipes:
@@ -102,7 +104,7 @@ def _open_pipe(path: Path) -> None:
         handle = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
         problem = (
-            "that nobody reads" if error.errno == errno.ENXIO else f"and cannot be opened: {error.strerror}"
+            "without a reader" if error.errno == errno.ENXIO else f"and cannot be opened: {error.strerror}"
         )
         raise UsageError(f"{path}: is a pipe {problem}; give the name of a file") from None
     os.set_blocking(handle, True)  # its reader may be slow
@@ -133,26 +135,30 @@ def _blocked_path_error(path: Path) -> UsageError:
 
 
 def _kind_text(path: Path) -> str:
-    """A name for what is no file."""
+    """Return the kind of a special file."""
     return "a pipe" if path.is_fifo() else "a socket" if path.is_socket() else "a device"
 
 
 def is_special(path: Path) -> bool:
-    """Whether it is a device or a pipe (/dev/null, /dev/stdout), which must not be replaced by a file. A link
-    to one is not, but for those of the system."""
+    """Return whether `path` is a device or a pipe (/dev/null, /dev/stdout), which a file must not replace.
+
+    False for a link to one, unless the system made it (/dev/stdout).
+    """
     if path.is_symlink() and not _is_system_path(path):
         return False
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def _is_system_path(path: Path) -> bool:
-    """Whether the system made it, as /dev/stdout, which is a link."""
+    """Return whether `path` is in /dev or /proc, where the system makes the links."""
     return path.absolute().parts[1:2] in (("dev",), ("proc",))
 
 
 def open_new(path: Path) -> IO[bytes]:
-    """A new, empty file in the place of what had that name: neither a link there nor another name of the same
-    file is written through. A device is opened as it is. Raises OSError, also for a pipe."""
+    """Create an empty file at `path`, replacing what is there; never write through a link or hard link.
+
+    A device is opened as it is. Raises OSError, also for a pipe.
+    """
     if path.is_char_device() and is_special(path):
         return path.open("wb")
     if is_special(path):
@@ -166,10 +172,10 @@ _NEW_FILE_FLAGS = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOE
 
 
 def lock_folder(folder: Path) -> int:
-    """Make `folder` (as `writable_dir`) and lock it for one run: two must not write the same files.
+    """Create `folder` (as `writable_dir`) and lock it, so that two runs do not write the same files.
 
-    Returns a handle; closing it, or the end of the process, gives the folder free. Raises UsageError
-    while another run has it.
+    Returns a handle; closing it, or the end of the process, releases the lock. Raises UsageError if another
+    run holds it.
     """
     import fcntl
 
@@ -183,9 +189,9 @@ def lock_folder(folder: Path) -> int:
 
 
 def writable_dir(path: Path, *names: str) -> Path:
-    """`path`, made if need be and tried with a file of its own. Else UsageError.
+    """Create the folder `path` if needed, check that it is writable, and return it. Else raise UsageError.
 
-    names: of what will be written there, and so is a file or nothing.
+    names: files that will be written there; each must be a file or not exist.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -209,10 +215,9 @@ def _umask() -> int:
 
 @contextlib.contextmanager
 def new_file(out: Path) -> Iterator[IO[bytes]]:
-    """A file beside `out` to write into; it is made durable and becomes `out` when the block is done. On
-    error: nothing.
+    """Yield a temporary file that becomes `out`, synced to disk, at the end of the block. On error, no file.
 
-    Raises UsageError if `out` is there or cannot be made; ShareError if the disk is full or fails.
+    Raises UsageError if `out` exists or cannot be created, ShareError if the disk is full or fails.
     """
     if check_replaceable(out).exists():
         raise UsageError(f"{out}: exists and is not overwritten; give a new name")
@@ -231,9 +236,9 @@ def new_file(out: Path) -> Iterator[IO[bytes]]:
 
 @contextlib.contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """A folder beside `out` to write into; it becomes `out` when the block is done. On error: nothing.
+    """Yield a temporary folder that becomes `out` at the end of the block. On error, no folder.
 
-    Raises UsageError if there is something in `out`; ShareError if the disk is full or fails.
+    Raises UsageError if `out` is not empty, ShareError if the disk is full or fails.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is not an empty folder; give a new name")
@@ -249,7 +254,7 @@ def new_folder(out: Path) -> Iterator[Path]:
 
 
 def xdg_folder(variable: str, default: str) -> Path:
-    """What the environment's `variable` says, or that folder of the user's home (XDG Base Directory
-    Specification). Raises RuntimeError where nobody has a home."""
+    """Return the folder in environment `variable`, else `default` in the user's home (XDG Base Directory
+    Specification). Raises RuntimeError without a home."""
     folder = os.environ.get(variable, "")
     return Path(folder) if os.path.isabs(folder) else Path.home() / default

@@ -1,4 +1,4 @@
-"""A mapping of a YAML file that knows where it stands, so that every complaint names file and key."""
+"""Typed reading of YAML files; every error names the file and the key."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from share.types import F64, checked_pose
 
 
 class Section:
-    """One mapping of a YAML file. Every reader raises ConfigError naming file and key."""
+    """One mapping of a YAML file. where: file and key. Every reader raises ConfigError that names both."""
 
     def __init__(self, data: Any, where: str) -> None:
         if not isinstance(data, dict):
@@ -63,7 +63,7 @@ class Section:
         return self._numbers(key, value)
 
     def pose(self, key: str) -> F64:
-        """A rigid 4x4: rows, 16 numbers, or OpenCV's {rows, cols, data}."""
+        """Read a rigid 4x4 transform: rows, 16 numbers, or OpenCV's {rows, cols, data}."""
         value = self.get(key)
         if isinstance(value, dict):
             value = value.get("data")
@@ -89,7 +89,7 @@ class Section:
 
 
 def read_yaml_text(path: Path) -> str:
-    """What a YAML file says. Raises ConfigError."""
+    """Read the text of a YAML file. Raises ConfigError."""
     try:
         return read_text(path, MAX_SETTINGS_BYTES, "utf-8-sig")  # some editors begin with a byte-order mark
     except FileNotFoundError:
@@ -101,7 +101,7 @@ def read_yaml_text(path: Path) -> str:
 
 
 def read_yaml(path: Path) -> Section:
-    """The top mapping of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, `!!opencv-matrix`). Raises
+    """Read the top mapping of a YAML file, including OpenCV's (`%YAML:1.0`, `!!opencv-matrix`). Raises
     ConfigError."""
     text = read_yaml_text(path)
     lines = text.replace("!!opencv-matrix", "").split("\n")
@@ -114,15 +114,17 @@ def _describe_value(value: Any) -> str:
     return "nothing" if value is None else f"{type(value).__name__} {value!r:.40}"
 
 
-# ---- A section of a YAML file to a frozen dataclass: its fields are the keys, its types what they may
-# hold.
+# ---- Sections as frozen dataclasses
 
 T = TypeVar("T")
 
 
 def read_dataclass(cls: type[T], section: Section) -> T:
-    """`section` as the dataclass `cls`, recursively. A key without a field, a missing one without a
-    default and a value of another type are a ConfigError naming file and key; so is what `cls` refuses."""
+    """Read `section` as dataclass `cls`, recursively: fields are the keys, their types are checked.
+
+    Raises ConfigError for an unknown key, a missing key without default, a value of another type, and for any
+    ValueError of `cls`.
+    """
     hints = typing.get_type_hints(cls)
     for key in section.data:
         if key not in hints:
@@ -158,7 +160,7 @@ def _read_value(hint: Any, section: Section, key: str) -> Any:
 
 
 def _read_items(kinds: tuple[Any, ...], section: Section, key: str) -> tuple[Any, ...]:
-    """tuple[X, ...] or tuple[X, X]: a list; each entry is read as if it were a key of its own."""
+    """Read a list as tuple[X, ...] or tuple[X, X]; each entry is read like a key."""
     data = section.get(key)
     length = None if kinds[-1] is Ellipsis else len(kinds)
     if not isinstance(data, list) or length not in (None, len(data)):
@@ -195,11 +197,8 @@ _SCALAR_READERS: dict[Any, Callable[[Section, str], Any]] = {
 }
 
 
-# ---- A file of settings.
-
-
 def read_settings(path: Path) -> Config:
-    """Raises ConfigError that names the key and what would be right, UsageError."""
+    """Read a file of settings. Raises ConfigError that names the key and the valid values, UsageError."""
     try:
         text = read_text(path, MAX_SETTINGS_BYTES)
     except (OSError, UnicodeDecodeError) as error:

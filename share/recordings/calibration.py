@@ -1,8 +1,7 @@
-"""Calibration files to a `Rig`: Kalibr's chains, EuRoC's sensor.yaml, and camera.yaml of RGB-D folders.
+"""Read and write calibration files: Kalibr's chains, EuRoC's sensor.yaml, camera.yaml of RGB-D folders.
 
-The body is the IMU's frame where there is an IMU, else cam0's. Cameras are pinhole with
-radial-tangential or equidistant (fisheye) distortion or none; other models are refused by name. The files
-are written down in docs/lookup/data.md.
+The body is the IMU's frame, or cam0's if there is no IMU. Cameras are pinhole with radial-tangential,
+equidistant (fisheye) or no distortion; other models are refused by name. docs/lookup/data.md specifies the files.
 """
 
 from __future__ import annotations
@@ -25,18 +24,21 @@ from share.types import F64
 
 CAMCHAIN = "kalibr_imucam_chain.yaml"
 IMU_CHAIN = "kalibr_imu_chain.yaml"
-_MODELS = dict.fromkeys(("radtan", "radial-tangential", "plumb_bob"), RADTAN)  # by their names in files
+_MODELS = dict.fromkeys(("radtan", "radial-tangential", "plumb_bob"), RADTAN)  # by name in files
 _MODELS |= dict.fromkeys(("equidistant", "kannala_brandt", "fisheye"), EQUIDISTANT)
 TIMESHIFT = "timeshift_cam_imu"
 SERIAL = "serial"
-_MAX_TIMESHIFT_SPREAD_S = 1e-3  # timeshifts of two cameras that look together
-_DEFAULT_DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres, as ROS and RealSense have it
+_MAX_TIMESHIFT_SPREAD_S = 1e-3  # between the timeshifts of synchronised cameras
+_DEFAULT_DEPTH_SCALE = 1000.0  # units per metre: 16-bit depth in mm, as in ROS and RealSense
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A rig and what else its file says. topics: stream -> ROS topic; depth_scale: units per metre; eyes: of
-    cam0 and cam1, as they were read; serials: of the devices that it says it is of, each once."""
+    """A rig and what else its file states.
+
+    where: the file. depth_scale: units per metre. topics: ROS topic by stream. camera_sections: of cam0 and
+    cam1, as read. serials: distinct serial numbers of the devices that the file names.
+    """
 
     rig: Rig
     where: str
@@ -47,7 +49,7 @@ class Calibration:
 
     @property
     def T_imu_cam0(self) -> F64 | None:
-        """(4, 4) as the file says, also without an IMU chain beside it. Raises ConfigError."""
+        """(4, 4) as the file states it, even without an IMU chain; None if absent. Raises ConfigError."""
         has_extrinsics = (
             self.camera_sections and {"T_cam_imu", "T_imu_cam"} & self.camera_sections[0].data.keys()
         )
@@ -55,12 +57,12 @@ class Calibration:
 
     @property
     def timeshift_s(self) -> float:
-        """IMU time less camera time, s, likewise. Raises ConfigError."""
+        """IMU time minus camera time, s, as the file states it. Raises ConfigError."""
         return _mean_timeshift_s(self.camera_sections)
 
 
 def read_calibration(path: Path) -> Calibration:
-    """A Kalibr camchain file, a folder with both Kalibr chains, or a camera.yaml. Raises ConfigError."""
+    """Read a Kalibr camchain file, a folder with Kalibr's chains, or a camera.yaml. Raises ConfigError."""
     if path.is_dir():
         if not (path / CAMCHAIN).exists():
             raise ConfigError(f"{path}: has no {CAMCHAIN}; give a Kalibr camchain file or a folder with one")
@@ -71,12 +73,12 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def read_kalibr(path: Path, imu_path: Path | None = None) -> Calibration:
-    """Kalibr's camchain and, if given, IMU chain. Without the latter the rig has no IMU, body = cam0."""
+    """Read Kalibr's camchain and IMU chain. Without the latter the rig has no IMU, and body = cam0."""
     return calibration_from_kalibr(read_yaml(path), read_yaml(imu_path).section("imu0") if imu_path else None)
 
 
 def calibration_from_kalibr(chain: Section, imu: Section | None) -> Calibration:
-    """The rig of a camchain (cam0, cam1 and, ours alone, depth) and an IMU chain's imu0."""
+    """Make a calibration of a camchain (cam0, cam1 and, our extension, depth) and an IMU chain's imu0."""
     cams = {name: chain.section(name) for name in ("cam0", "cam1", "depth") if name in chain}
     cam0 = chain.section("cam0")
     camera_sections = tuple(cams[name] for name in ("cam0", "cam1") if name in cams)
@@ -102,7 +104,10 @@ def calibration_from_kalibr(chain: Section, imu: Section | None) -> Calibration:
 
 
 def read_serials(sections: Iterable[Section]) -> tuple[str, ...]:
-    """Of which devices they say to be, each once (ours alone: Kalibr reads past it). Raises ConfigError."""
+    """Return the distinct serial numbers in sections (our extension, which Kalibr ignores).
+
+    Raises ConfigError.
+    """
     values = (_read_serial(section) for section in sections if section.data.get(SERIAL) not in (None, ""))
     return tuple(dict.fromkeys(values))
 
@@ -110,15 +115,15 @@ def read_serials(sections: Iterable[Section]) -> tuple[str, ...]:
 def _read_serial(section: Section) -> str:
     serial = section.get(SERIAL)
     if not isinstance(serial, str):
-        raise ConfigError(f"{section.where}: {SERIAL}: put it in quotes, else YAML takes it for a number")
+        raise ConfigError(f"{section.where}: {SERIAL}: put it in quotes; YAML reads it as a number")
     if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", serial):
-        raise ConfigError(f"{section.where}: {SERIAL}: {serial!r:.40} is no serial number; leave it out")
+        raise ConfigError(f"{section.where}: {SERIAL}: {serial!r:.40} is not a serial number; leave it out")
     return serial
 
 
 @contextlib.contextmanager
 def config_errors(where: str) -> Iterator[None]:
-    """What a camera or a rig cannot be is a ConfigError, with where it was found."""
+    """Within the block, a ValueError of a camera or rig becomes a ConfigError that names `where`."""
     try:
         yield
     except ValueError as error:
@@ -126,7 +131,7 @@ def config_errors(where: str) -> Iterator[None]:
 
 
 def read_camera_yaml(path: Path) -> Calibration:
-    """camera.yaml of a TUM RGB-D folder: one colour camera and its depth, registered or not."""
+    """Read camera.yaml of a TUM RGB-D folder: a colour camera and its depth, registered or not."""
     top = read_yaml(path)
     cam0 = _read_camera(top)
     if "depth_intrinsics" in top:
@@ -135,14 +140,14 @@ def read_camera_yaml(path: Path) -> Calibration:
             top, "depth_resolution" if "depth_resolution" in top else "resolution"
         )
         depth, T = _make_camera(top, width, height, (fx, fy, cx, cy)), top.pose("T_depth_cam0")
-    else:  # registered: depth lies on the pixels of the undistorted colour image
+    else:  # registered: depth has the pixels of the undistorted colour image
         depth, T = replace(cam0, distortion=(), model=RADTAN), np.eye(4)
     rig = Rig(cam0=cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=T)
     return Calibration(rig, str(path), top.number("depth_scale", positive=True), camera_sections=(top,))
 
 
 def read_asl_calibration(cam0: Path, cam1: Path | None, imu0: Path | None) -> Calibration:
-    """sensor.yaml files of an ASL folder. T_BS of every sensor is taken into the IMU's frame."""
+    """Read the sensor.yaml files of an ASL folder. Every sensor's T_BS is converted to the IMU's frame."""
     section = read_yaml(cam0)
     T_b_cam0 = section.pose("T_BS")
     rig = Rig(cam0=_read_camera(section), T_body_cam0=np.eye(4))
@@ -187,7 +192,7 @@ def _read_resolution(section: Section, key: str) -> tuple[int, int]:
 
 
 def _read_distortion(section: Section) -> tuple[tuple[float, ...], str]:
-    """Coefficients and model."""
+    """Return distortion coefficients and lens model."""
     name = section.text("distortion_model", "none")
     if name == "none":
         return (), RADTAN
@@ -202,12 +207,12 @@ def _read_distortion(section: Section) -> tuple[tuple[float, ...], str]:
 
 
 def lens_model(name: str) -> str | None:
-    """The model (`share.geometry.lens`) that files give this name; None where there is none."""
+    """Return the lens model (`share.geometry.lens`) by its name in files; None if unknown."""
     return _MODELS.get(name)
 
 
 def imu_noise(section: Section, rate: str) -> ImuNoise:
-    """An IMU's noise by Kalibr's keys; `rate` is the key of its rate in Hz. Raises ConfigError."""
+    """Read an IMU's noise under Kalibr's keys. rate: the key of its rate, Hz. Raises ConfigError."""
 
     def positive(key: str) -> float:
         return section.number(key, positive=True)
@@ -225,21 +230,21 @@ def imu_noise(section: Section, rate: str) -> ImuNoise:
 
 
 def kalibr_T_imu_cam(cam: Section) -> F64:
-    """`T_cam_imu` takes IMU coordinates to the camera (Kalibr's own); `T_imu_cam` the other way."""
+    """Return T_imu_cam (4, 4) from `T_cam_imu` (Kalibr's: IMU coordinates to camera) or `T_imu_cam`."""
     if "T_cam_imu" in cam:
         return se3.inverse(cam.pose("T_cam_imu"))
     if "T_imu_cam" in cam:
         return cam.pose("T_imu_cam")
-    raise ConfigError(f"{cam.where}: has no extrinsics to the IMU; add T_cam_imu (or T_imu_cam)")
+    raise ConfigError(f"{cam.where}: no extrinsics to the IMU; add T_cam_imu or T_imu_cam")
 
 
 def _mean_timeshift_s(cams: Sequence[Section]) -> float:
-    """IMU time less camera time, s: the mean of what the cameras say, 0 where they say nothing."""
+    """Return IMU time minus camera time, s: the mean of the cameras' values, 0 without any."""
     shifts = [_read_timeshift_s(cam) for cam in cams if TIMESHIFT in cam]
     if shifts and max(shifts) - min(shifts) > _MAX_TIMESHIFT_SPREAD_S:
         raise ConfigError(
-            f"{cams[-1].where}: {TIMESHIFT}: {shifts[-1]:g} s, but {shifts[0]:g} s of cam0; both look at "
-            f"the same time, so these must agree within {_MAX_TIMESHIFT_SPREAD_S:g} s"
+            f"{cams[-1].where}: {TIMESHIFT}: {shifts[-1]:g} s, but {shifts[0]:g} s for cam0; the cameras are "
+            f"synchronised, so these must agree within {_MAX_TIMESHIFT_SPREAD_S:g} s"
         )
     return float(np.mean(shifts)) if shifts else 0.0
 
@@ -248,36 +253,36 @@ def _read_timeshift_s(cam: Section) -> float:
     shift = cam.number(TIMESHIFT)
     if abs(shift) > MAX_TIMESHIFT_S:
         raise ConfigError(
-            f"{cam.where}: {TIMESHIFT}: {shift:g} s is more than {MAX_TIMESHIFT_S:g} s; "
-            "it is given in seconds"
+            f"{cam.where}: {TIMESHIFT}: {shift:g} s is more than {MAX_TIMESHIFT_S:g} s; give it in seconds"
         )
     return shift
 
 
 def _kalibr_T_cam1_cam0(cam0: Section, cam1: Section) -> F64:
-    """`T_cn_cnm1` takes coordinates of the previous camera, cam0, to cam1; else by way of the IMU."""
+    """Return T_cam1_cam0 (4, 4) from `T_cn_cnm1` (coordinates of cam0, the previous camera, to cam1), else
+    from both cameras' extrinsics to the IMU."""
     if "T_cn_cnm1" in cam1:
         return cam1.pose("T_cn_cnm1")
     if not ({"T_cam_imu", "T_imu_cam"} & cam1.data.keys()):
-        raise ConfigError(f"{cam1.where}: has no extrinsics to cam0; add T_cn_cnm1, T_cam_imu or T_imu_cam")
+        raise ConfigError(f"{cam1.where}: no extrinsics to cam0; add T_cn_cnm1, T_cam_imu or T_imu_cam")
     return se3.inverse(kalibr_T_imu_cam(cam1)) @ kalibr_T_imu_cam(cam0)
 
 
-# ---- A rig written under Kalibr's names, as `share.recordings.calibration` reads it.
+# ---- Writing
 
 
 def to_kalibr(rig: Rig, original: Calibration | None = None, serial: str | None = None) -> dict[str, Any]:
-    """cam0, cam1, depth (ours) and imu0 of the rig, as plain data for a YAML file.
+    """Return cam0, cam1, depth (our extension) and imu0 of a rig as plain data for a YAML file.
 
-    said: what the rig was known by before. Of that is kept what no Rig holds: topics, depth_scale and, for a
-    rig without IMU, how cam0 sits on one and how late their clock is. serial: of the device, in each section:
-    Kalibr takes every key at the top for a camera. Raises ConfigError.
+    original: the rig's earlier calibration, of which everything that a Rig does not hold is kept: topics,
+    depth_scale and, for a rig without IMU, cam0's extrinsics to one and the timeshift. serial: of the device,
+    written into each section, as Kalibr takes every top-level key for a camera. Raises ConfigError.
     """
     original = original or Calibration(rig, "")
     T_imu_cam0, shift_s = (
         (original.T_imu_cam0, original.timeshift_s) if rig.imu is None else (rig.T_body_cam0, rig.timeshift_s)
     )
-    shift = {TIMESHIFT: shift_s} if shift_s else {}  # 0 is what its absence means
+    shift = {TIMESHIFT: shift_s} if shift_s else {}  # absent means 0
     out = {"cam0": _kalibr_camera(rig.cam0) | shift}
     if T_imu_cam0 is not None:
         out["cam0"]["T_cam_imu"] = se3.inverse(T_imu_cam0).tolist()
@@ -296,8 +301,10 @@ def to_kalibr(rig: Rig, original: Calibration | None = None, serial: str | None 
 
 
 def kalibr_texts(rig: Rig, remark: str, serial: str | None = None) -> dict[str, str]:
-    """Both of Kalibr's chains, by the names of their files; one where the rig has no IMU. remark: a line;
-    serial: of the device."""
+    """Return the texts of Kalibr's two chains by file name; only the camchain if the rig has no IMU.
+
+    remark: a comment line for the top. serial: of the device.
+    """
     import yaml
 
     data = to_kalibr(rig, serial=serial)

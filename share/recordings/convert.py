@@ -1,4 +1,4 @@
-"""A source to a recording of ours, or to an EuRoC/ASL folder. Encoded images are copied, not recoded."""
+"""Convert a source to MCAP or to an EuRoC/ASL folder. Encoded images are copied, not re-encoded."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from share.sensors.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
 from share.types import F64
 
 Progress = Callable[[int], None]
-StageProgress = Callable[[str, int, int], None]  # stage, done, of how many
+StageProgress = Callable[[str, int, int], None]  # stage, done, total
 
 
 def stage_progress(report: StageProgress, stage: str, total: int) -> Progress:
-    """What is told how much more is done, and tells how much is."""
+    """Return a `Progress` that adds up increments and reports them as a stage of `total`."""
     done = 0
 
     def more(count: int) -> None:
@@ -37,9 +37,9 @@ def stage_progress(report: StageProgress, stage: str, total: int) -> Progress:
 
 
 def to_mcap(source: Source, out: Path, jpeg: int | None, progress: Progress) -> None:
-    """Write `out`, and the truth, if known, as NAME.truth.tum beside it. On error: nothing.
+    """Write `out`, and the ground truth, if known, as NAME.truth.tum beside it. On error, nothing is left.
 
-    jpeg: quality to compress gray images to, None to keep them. progress: told of each cam0 image.
+    jpeg: quality for compressing gray images, None to keep them. progress: called with 1 per cam0 image.
     """
     write_recording(source, out, jpeg, progress)
     truth = source.truth()
@@ -48,7 +48,7 @@ def to_mcap(source: Source, out: Path, jpeg: int | None, progress: Progress) -> 
 
 
 def write_recording(source: Source, out: Path, jpeg: int | None, progress: Progress) -> None:
-    """`to_mcap` without the truth."""
+    """Write `out` without the ground truth; else as `to_mcap`."""
     check_replaceable(out)
     try:
         with Recorder(out, source.rig, jpeg, serial=source.serial) as recorder:
@@ -60,18 +60,20 @@ def write_recording(source: Source, out: Path, jpeg: int | None, progress: Progr
 
 
 def to_euroc(source: Source, out: Path, progress: Progress) -> None:
-    """Write a stereo or mono source as `out`/mav0. On error: nothing. Raises UsageError."""
+    """Write a stereo or mono source as `out`/mav0. On error, nothing is left. Raises UsageError."""
     if source.rig.depth:
-        raise UsageError("--format euroc: an ASL folder has no place for depth images; use mcap")
+        raise UsageError("--format euroc: an ASL folder cannot hold depth images; use --format mcap")
     if source.rig.timeshift_s:
-        raise UsageError("--format euroc: an ASL folder has no place for the cameras' timeshift; use mcap")
+        raise UsageError(
+            "--format euroc: an ASL folder cannot hold the cameras' timeshift; use --format mcap"
+        )
     with new_folder(out) as work:
         _write_asl(source, work / "mav0", progress)
 
 
 def _intact_measurements(source: Source, progress: Progress) -> Iterator[Measurement]:
-    """All measurements but images that are damaged; of each camera they are decoded until one is whole, to
-    find a wrong size before the end."""
+    """Yield all measurements except damaged images. The first images of each camera are decoded until one is
+    intact, to find a wrong size early."""
     verified = set()
     for measurement in source.measurements():
         stream, image = measurement.stream, measurement.payload
@@ -123,7 +125,7 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def _write_image(folder: Path, stamp: int, image: LazyImage) -> str:
-    """As it is if encoded, else PNG."""
+    """Write an image, as it is if encoded, else as PNG; return its name."""
     data = image.read() if isinstance(image, EncodedImage) else encode_png(image.load())
     name = f"{stamp}.{image_format(data)}"
     (folder / name).write_bytes(data)

@@ -1,4 +1,4 @@
-"""What is in a recording, as plain data: `share dataset info`."""
+"""Describe a recording as plain data, for `share dataset info`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from share.geometry.camera import Camera, Rig
 from share.recordings.recording import Source
 from share.types import I64
 
-_GAP_FACTOR = 2.5  # as the sequencer's
+_GAP_FACTOR = 2.5  # of the median step; as the sequencer's
 
 
 def describe_recording(source: Source) -> dict[str, Any]:
-    """Streams with counts, rates and gaps; calibration; truth. Reads stamps only, no images."""
+    """Return streams with counts, rates and gaps, the calibration and ground truth. Reads no images."""
     stamps = source.stamps()
     first = min((int(s[0]) for s in stamps.values() if len(s)), default=0)
     last = max((int(s.max()) for s in stamps.values() if len(s)), default=0)
@@ -32,7 +32,7 @@ def describe_recording(source: Source) -> dict[str, Any]:
 
 
 def describe_stream(stamps: I64) -> dict[str, Any]:
-    """Count, median rate, gaps longer than 2.5 median steps, stamps that repeat or go back."""
+    """Return count, median rate, gaps longer than 2.5 median steps, repeated and decreasing stamps."""
     steps = np.diff(stamps)
     forward = steps[steps > 0]
     median = float(np.median(forward)) if len(forward) else 0.0
@@ -48,7 +48,7 @@ def describe_stream(stamps: I64) -> dict[str, Any]:
 
 
 def describe_rig(rig: Rig) -> dict[str, Any]:
-    """Cameras and IMU in short: resolution, focal length, field of view, baseline."""
+    """Return the cameras (resolution, intrinsics, field of view, baseline) and the IMU of a rig."""
     cameras = {"cam0": rig.cam0, "cam1": rig.cam1, "depth": rig.depth}
     out: dict[str, Any] = {name: _camera(camera) for name, camera in cameras.items() if camera}
     if rig.cam1:

@@ -1,4 +1,4 @@
-"""Of which device a calibration is, and whether that is the one at hand: no two units are alike."""
+"""Check that a calibration belongs to the device at hand: units of one model differ."""
 
 from __future__ import annotations
 
@@ -9,21 +9,24 @@ from share.geometry.camera import Camera, Rig
 
 
 def device_mismatch(named_serials: Sequence[str], serial: str | None) -> str | None:
-    """A line where a calibration is of another device than `serial`; None where it is of that one, or where
-    nobody knows. said: the serial numbers that it names, each once."""
+    """Return a warning if a calibration is of another device than `serial`; None if it is not, or unknown.
+
+    named_serials: the distinct serial numbers that the calibration names.
+    """
     others = [one for one in named_serials if one != serial]
     if not others or not serial:
         return None
     return (
-        f"the calibration is of device {', '.join(others)}, this is {serial}: poses will be less exact; "
-        "give its own with --calib, or leave it out for the one that the device brings"
+        f"the calibration is of device {', '.join(others)}, this is {serial}: poses will be less accurate; "
+        "give the calibration of this device with --calib, or leave it out for the device's own"
     )
 
 
 def fit_to_device(calibrated: Rig, device_rig: Rig) -> Rig:
-    """A calibration less the cameras that are not read. own: what the device says of itself, as it is read.
+    """Return a calibration without the cameras that the device does not deliver.
 
-    Raises ValueError where an image has another size than the calibration's."""
+    device_rig: the device's own calibration of the streams in use. Raises ValueError for an image size that
+    differs from the calibration's."""
     for name in ("cam0", "cam1", "depth"):
         calibrated_camera, device_camera = getattr(calibrated, name), getattr(device_rig, name)
         if (
@@ -32,8 +35,7 @@ def fit_to_device(calibrated: Rig, device_rig: Rig) -> Rig:
             and _size(calibrated_camera) != _size(device_camera)
         ):
             raise ValueError(
-                f"its {name} is {_size(calibrated_camera)}, the camera sends "
-                f"{_size(device_camera)}; add "
+                f"its {name} is {_size(calibrated_camera)}, the camera sends {_size(device_camera)}; add "
                 f"--mode {_size(calibrated_camera)}"
             )
     if device_rig.cam1 is None:
@@ -42,7 +44,7 @@ def fit_to_device(calibrated: Rig, device_rig: Rig) -> Rig:
 
 
 def uncalibrated_sensors(calibrated: Rig, device_rig: Rig) -> tuple[str, ...]:
-    """A line for each camera, and the IMU, that is read and not in the calibration."""
+    """Return a note for each sensor that the device delivers and the calibration lacks."""
     names = [
         name
         for name in ("cam1", "depth", "imu")

@@ -1,4 +1,4 @@
-"""EuRoC / ASL folders: mav0/{cam0,cam1,imu0}/{data.csv,sensor.yaml,data/} and a ground truth.
+"""Read EuRoC/ASL folders: mav0/{cam0,cam1,imu0}/{data.csv,sensor.yaml,data/} and ground truth.
 
 Format: Burri et al., *The EuRoC micro aerial vehicle datasets*, IJRR 35(10), 2016.
 """
@@ -32,7 +32,7 @@ def is_euroc(path: Path) -> bool:
 
 
 def open_euroc(path: Path, calibration: Calibration | None, frames: slice | None) -> FolderSource:
-    """The recording in `path` (holds mav0, or is it). Raises DataError, ConfigError, UsageError."""
+    """Open the recording in `path` (mav0 or its parent). Raises DataError, ConfigError, UsageError."""
     root = path / "mav0" if (path / "mav0").is_dir() else path
     rig = fit_rig_to_folder(_own_rig(root) if calibration is None else calibration.rig, root)
     losses = DataLosses()
@@ -48,11 +48,11 @@ def open_euroc(path: Path, calibration: Calibration | None, frames: slice | None
 
 
 def fit_rig_to_folder(rig: Rig, root: Path) -> Rig:
-    """The rig, less the IMU where the folder has none. ConfigError if it wants a camera that is missing."""
+    """Return the rig, without the IMU if the folder has none. Raises ConfigError if a camera is missing."""
     missing = "cam1" if rig.cam1 and not (root / CAM1).is_dir() else "depth" if rig.depth else ""
     if missing:
         raise ConfigError(
-            f"{root}: the calibration has {missing}, the recording has not; give another --calib"
+            f"{root}: the calibration has {missing}, the recording does not; give another --calib"
         )
     if rig.imu and not (root / "imu0").is_dir():
         return rig.without_imu()
@@ -67,7 +67,7 @@ def _own_rig(root: Path) -> Rig:
 
 
 def _images(folder: Path, camera: Camera, losses: DataLosses) -> list[tuple[int, LazyImage]]:
-    """data.csv's images that are there."""
+    """Return stamp and image of each line of data.csv whose file exists."""
     listing, data = folder / "data.csv", folder / "data"
 
     def parse(fields: list[str], where: str) -> tuple[int, str]:
@@ -80,8 +80,10 @@ def _images(folder: Path, camera: Camera, losses: DataLosses) -> list[tuple[int,
 
 
 def existing_images(folder: Path, names: list[str], listing: Path, losses: DataLosses) -> set[str]:
-    """Which of the images `names` are in `folder`: better found now than in mid-run. Raises DataError where
-    more than 5 % are missing."""
+    """Return which of the images `names` exist in `folder`; missing ones go to `losses`.
+
+    Raises DataError if more than 5 % are missing.
+    """
     existing = set(os.listdir(folder)) if folder.is_dir() else set()
     kind = f"images of {listing}"
     for name in (name for name in names if name not in existing):
@@ -101,7 +103,7 @@ def _truth(root: Path, rig: Rig, losses: DataLosses) -> Trajectory | None:
 
 
 def _T_sensor_body(root: Path, truth: Path, rig: Rig) -> F64:
-    """From the body of our rig (IMU, or cam0) to the sensor that the truth tells of."""
+    """Return the pose (4, 4) of our rig's body (IMU or cam0) in the frame of the ground truth's sensor."""
 
     def T_bs(folder: Path) -> F64:
         file = folder / "sensor.yaml"
@@ -114,4 +116,4 @@ def _notes(root: Path, rig: Rig) -> tuple[str, ...]:
     unused = [
         name for name, used in ((CAM1, rig.cam1), ("imu0", rig.imu)) if (root / name).is_dir() and not used
     ]
-    return tuple(f"{name} is not used: the calibration does not have it" for name in unused)
+    return tuple(f"{name} is not used: the calibration has no {name}" for name in unused)

@@ -1,8 +1,7 @@
-"""Encoded images to arrays: gray uint8, or depth as float32 metres. Damage is found, never shown.
+"""Decode images to gray uint8 or depth float32 m; a damaged image raises, and is never returned.
 
-Nothing is decoded before its header says that it is as large as it should be. libjpeg fills a truncated
-image with gray and goes on, so end markers are looked for first; PNG checksums are verified, because a
-decoder may hand out half a depth map.
+An image is decoded only if its header states the expected size. libjpeg fills a truncated image with gray, so
+end markers are checked first; PNG checksums are verified, because a decoder may return half a depth map.
 """
 
 from __future__ import annotations
@@ -22,21 +21,21 @@ from share.geometry.camera import MAX_PIXELS, Camera
 from share.sensors.sequencer import UndecodedFrame
 from share.types import F32, U8, Frame
 
-_ADVICE = "record or copy it again, or take it out of the list"
-_TAIL_BYTES = 64  # bytes in which an end marker may be followed by padding
+_ADVICE = "record or copy it again, or remove it from the list"
+_TAIL_BYTES = 64  # where the end marker must be; padding may follow it
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_MAX_BYTES_PER_PIXEL = 16  # of a file for each pixel: four channels of 16 bits, twice
+_MAX_BYTES_PER_PIXEL = 16  # of a file: twice four channels of 16 bits
 _MAX_SCANS = 200  # of a JPEG; progressive ones have ten, and each costs as much as a whole image
 
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is said once, by DataError
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # DataError reports what is wrong
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodedImage:
-    """A JPEG or PNG in a file (`data` is its path) or in memory (bytes), with where it came from.
+    """A JPEG or PNG in a file (`data` is its path) or in memory (bytes). where: its name in errors.
 
-    width, height: what the calibration says. depth_scale: units per metre of a 16-bit depth PNG,
-    0 for a gray or colour image.
+    width, height: of the calibration. depth_scale: units per metre of a 16-bit depth PNG, 0 for a gray or
+    colour image.
     """
 
     data: Path | bytes
@@ -46,15 +45,14 @@ class EncodedImage:
     depth_scale: float = 0.0
 
     def read(self) -> bytes:
-        """The encoded bytes. Raises DataError if the file is missing or the image is cut short."""
+        """Return the encoded bytes. Raises DataError if the file is missing or the image is cut short."""
         max_bytes = _MAX_BYTES_PER_PIXEL * self.width * self.height + MB
         data = self.data if isinstance(self.data, bytes) else _read_file(self.data, max_bytes)
         check_complete(data, self.where)
         return data
 
     def check(self) -> None:
-        """Raises DataError unless it is whole and of the calibration's size, as far as that is known without
-        its pixels."""
+        """Raise DataError unless the image is complete and of the calibration's size, without decoding it."""
         header = _checked_header(self.read(), self.where)
         check_header_size(header.width, header.height, self.width, self.height, self.where)
 
@@ -81,12 +79,12 @@ class ArrayImage:
 
 
 def file_image(path: Path, camera: Camera, depth_scale: float = 0.0) -> EncodedImage:
-    """A lazily read image file of `camera`."""
+    """Return an image file of `camera`, to be read on demand."""
     return EncodedImage(path, str(path), camera.width, camera.height, depth_scale)
 
 
 def decode_frame(undecoded: UndecodedFrame) -> Frame:
-    """Decode the images of a bundle. Raises DataError naming the image that is damaged."""
+    """Decode the images of a frame. Raises DataError that names a damaged image."""
     return Frame(
         stamp_ns=undecoded.stamp_ns,
         index=undecoded.index,
@@ -99,12 +97,12 @@ def decode_frame(undecoded: UndecodedFrame) -> Frame:
 
 
 def decode_gray(data: bytes, where: str) -> U8:
-    """JPEG or PNG, gray or colour -> (H, W) uint8."""
+    """Decode a JPEG or PNG, gray or colour, to (H, W) uint8. Raises DataError."""
     return np.asarray(_decode(data, cv2.IMREAD_GRAYSCALE, where), np.uint8)
 
 
 def decode_depth(data: bytes, depth_scale: float, where: str) -> F32:
-    """16-bit PNG -> (H, W) float32 m, 0 = no reading."""
+    """Decode a 16-bit PNG to (H, W) float32, m, 0 = no reading. Raises DataError."""
     if not _checked_header(data, where).is_depth:
         raise DataError(f"{where}: depth must have one 16-bit channel and be a PNG; {_ADVICE}")
     return depth_metres(_decode(data, cv2.IMREAD_UNCHANGED, where), depth_scale, where)
@@ -114,8 +112,8 @@ def _decode(data: bytes, flags: int, where: str) -> NDArray[Any]:
     header = _checked_header(data, where)
     if not 0 < header.width * header.height <= MAX_PIXELS or header.scans > _MAX_SCANS:
         raise DataError(
-            f"{where}: says that it has {header.width}x{header.height} pixels in {header.scans} scans, "
-            f"which no camera takes; {_ADVICE}"
+            f"{where}: the header claims {header.width}x{header.height} pixels in {header.scans} scans, more "
+            f"than any camera takes; {_ADVICE}"
         )
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -134,35 +132,35 @@ def _checked_header(data: bytes, where: str) -> ImageHeader:
 
 
 def depth_metres(raw: NDArray[Any], depth_scale: float, where: str) -> F32:
-    """(H, W) uint16 -> float32 m."""
+    """Convert (H, W) uint16 to float32, m. Raises DataError."""
     if raw.ndim != 2 or raw.dtype != np.uint16:
         raise DataError(f"{where}: depth must have one 16-bit channel, found {raw.dtype} {raw.shape}")
     return np.asarray(raw / np.float32(depth_scale), np.float32)
 
 
 def encode_jpeg(image: U8, quality: int) -> bytes:
-    """(H, W) uint8 -> JPEG."""
+    """Encode (H, W) uint8 as JPEG."""
     return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
 
 
 def image_format(data: bytes) -> str:
-    """`png` or `jpg`."""
+    """Return `png` or `jpg`."""
     return "png" if data[:8] == _PNG_MAGIC else "jpg"
 
 
 def encode_png(image: U8) -> bytes:
-    """(H, W) uint8 -> PNG, lossless."""
+    """Encode (H, W) uint8 as PNG, lossless."""
     return bytes(cv2.imencode(".png", image)[1])
 
 
 def check_size(image: NDArray[Any], width: int, height: int, where: str) -> NDArray[Any]:
-    """`image` if it is as large as the calibration says, else MisfitError."""
+    """Return `image` if it has the calibration's size, else raise CalibrationMismatchError."""
     check_header_size(image.shape[1], image.shape[0], width, height, where)
     return image
 
 
 def check_header_size(found_width: int, found_height: int, width: int, height: int, where: str) -> None:
-    """Raises MisfitError for an image of another size than the calibration's; its pixels are not touched."""
+    """Raise CalibrationMismatchError for a size other than the calibration's."""
     if (found_width, found_height) != (width, height):
         raise CalibrationMismatchError(
             f"{where}: is {found_width}x{found_height}, but the calibration is for {width}x{height}; "
@@ -171,7 +169,7 @@ def check_header_size(found_width: int, found_height: int, width: int, height: i
 
 
 def check_complete(data: bytes, where: str) -> None:
-    """Raises DataError unless `data` is a JPEG or PNG from its first marker to its last."""
+    """Raise DataError unless `data` is a JPEG or PNG with its first and its last marker."""
     if data[:2] == b"\xff\xd8":
         complete = b"\xff\xd9" in data[-_TAIL_BYTES:]
     elif data[:8] == _PNG_MAGIC:
@@ -185,7 +183,7 @@ def check_complete(data: bytes, where: str) -> None:
 
 
 def _is_png_intact(data: bytes) -> bool:
-    """Whether every chunk's CRC holds (PNG specification, 5.3)."""
+    """Return whether every chunk's CRC is right (PNG specification, 5.3)."""
     offset = 8
     while offset + 12 <= len(data):
         end = offset + 8 + int.from_bytes(data[offset : offset + 4], "big")
@@ -198,7 +196,7 @@ def _is_png_intact(data: bytes) -> bool:
 
 
 def read_picture(path: Path) -> bytes:
-    """A picture without a calibration that says how large it is. Raises DataError."""
+    """Read the bytes of a picture of any size. Raises DataError."""
     return _read_file(path, _MAX_BYTES_PER_PIXEL * MAX_PIXELS)
 
 
@@ -211,14 +209,10 @@ def _read_file(path: Path, max_bytes: int) -> bytes:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-# ---- What a JPEG or PNG says it is, before a decoder sees it. Pure: bytes in, numbers out.
+# ---- Headers of JPEG and PNG, parsed before a decoder sees the image
 
-_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {
-    0xC4,
-    0xC8,
-    0xCC,
-}  # frames; the others are tables (ITU T.81, B.1.1.3)
-_BARE_MARKERS = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a length
+_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # those are tables (ITU T.81, B.1.1.3)
+_BARE_MARKERS = frozenset((0x01, *range(0xD0, 0xD9)))  # without a length
 _SEQUENTIAL_MARKERS = frozenset((0xC0, 0xC1))
 _END_MARKER = 0xD9
 _SCAN_MARKER = b"\xff\xda"
@@ -226,8 +220,8 @@ _GRAY_16 = (16, 0)  # bits, colour type (PNG 11.2.2)
 
 
 class ImageHeader(NamedTuple):
-    """width, height in pixels; is_depth: a PNG with one channel of 16 bits; scans: passes over a JPEG's
-    image that decoding takes, at most."""
+    """width, height: px. is_depth: a PNG with one 16-bit channel. scans: most passes over a JPEG's image that
+    decoding takes."""
 
     width: int
     height: int
@@ -236,7 +230,7 @@ class ImageHeader(NamedTuple):
 
 
 def image_header(data: bytes) -> ImageHeader | None:
-    """None where it does not say, or is neither."""
+    """Parse the header of a JPEG or PNG; None if damaged, or of another format."""
     return (
         _png_header(data)
         if data[:8] == _PNG_MAGIC
@@ -254,7 +248,7 @@ def _png_header(data: bytes) -> ImageHeader | None:
 
 
 def _jpeg_header(data: bytes) -> ImageHeader | None:
-    """From its segments up to the first scan, among which there is one frame header."""
+    """Parse the segments up to the first scan; exactly one of them must be a frame header."""
     offset, frame = 2, 0
     while offset + 10 <= len(data) and data[offset] == 0xFF:
         marker = data[offset + 1]
@@ -274,8 +268,8 @@ def _jpeg_header(data: bytes) -> ImageHeader | None:
 
 
 def _jpeg_frame_header(data: bytes, frame: int, scan: int) -> ImageHeader:
-    """One scan is all there is where it has all components of a frame that is not progressive: a decoder
-    stops there. Else scans are counted, which takes a moment."""
+    """Parse the frame header at `frame`. If the first scan, at `scan`, has all components of a sequential
+    frame, a decoder reads only that one; else the scans are counted, which takes a moment."""
     height, width = (int.from_bytes(data[k : k + 2], "big") for k in (frame + 5, frame + 7))
     is_single_scan = data[frame + 1] in _SEQUENTIAL_MARKERS and data[frame + 9] == data[scan + 4]
     return ImageHeader(width, height, False, 1 if is_single_scan else data.count(_SCAN_MARKER))

@@ -1,4 +1,4 @@
-"""The SDK's recordings as a SOURCE: infrared images, depth and IMU, repaired as those of a live camera."""
+"""Read RealSense SDK recordings (.db3): infrared, depth and IMU, repaired as those of a live camera."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from share.sensors.profile import load_profile
 from share.sensors.sample_processor import ACCEL, GYRO, SampleProcessor
 from share.types import F64, I64, checked_pose
 
-_UNIT_RANGE_M, _RATE_RANGE_HZ = (1e-6, 1.0), (0.1, 1e5)
-_DEFAULT_PROFILE = "d435i"  # its IMU is believed where the recording says nothing of one
+_UNIT_RANGE_M = (1e-6, 1.0)  # valid depth units
+_RATE_RANGE_HZ = (0.1, 1e5)  # valid stream rates
+_DEFAULT_PROFILE = "d435i"  # for the IMU, whose extrinsics and noise the SDK does not record
 _DEFAULT_PROFILE_NOTE = (
-    f"does not say where the IMU sits and how noisy it is: "
-    f"taken from profile "
-    f"{_DEFAULT_PROFILE}, or give --calib"
+    f"the recording has no IMU extrinsics and noise; using those of profile {_DEFAULT_PROFILE}; give --calib "
+    "for this device's own"
 )
 
 
 def open_db3(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
-    """The recording in `path`. Raises UsageError, DataError."""
+    """Open the recording in `path`. Raises UsageError, DataError."""
     file = Db3(path)
     if CAM0 not in file.streams:
         raise UsageError(
-            f"{path}: has no left infrared images (Infrared 1), compressed as the SDK does it; record them"
+            f"{path}: has no compressed left infrared images (Infrared 1); record with that stream"
         )
     if calibration is not None:
         warning = device_mismatch(calibration.serials, file.serial)
@@ -50,13 +50,15 @@ def open_db3(path: Path, calibration: Calibration | None, frames: slice | None) 
 
 
 class RealSenseRecording(Source):
-    """The streams of the file that the rig has."""
+    """An SDK recording with the streams of its rig."""
 
     def __init__(self, file: Db3, rig: Rig, notes: tuple[str, ...], frames: slice | None) -> None:
         self.name, self.rig, self.notes, self.serial = file.path.stem, rig, notes, file.serial
         self._file, self._cameras = file, rig_cameras(rig)
         if missing := sorted(self._cameras.keys() - file.streams.keys()):
-            raise UsageError(f"{file.path}: has no {missing[0]}, which the calibration has")
+            raise UsageError(
+                f"{file.path}: the calibration has {missing[0]}, the recording does not; give another --calib"
+            )
         unit = f"{file.streams.get(DEPTH, '').rpartition('/')[0]}/option/Depth_Units/value"
         self._depth_scale = 1 / file.read_number(unit, None, 0.001, *_UNIT_RANGE_M)
         self._span = select_span(self._all_stamps[CAM0], frames, str(file.path), rig.timeshift_ns)
@@ -101,8 +103,10 @@ class RealSenseRecording(Source):
 def repair_samples(
     file: Db3, streams: Collection[str], images: bool, losses: DataLosses
 ) -> Iterator[Measurement]:
-    """These streams of the file as a live camera's: in one time that goes forward, accel and gyro joined.
-    images: with pixels. losses: takes what is damaged. Raises DataError."""
+    """Yield the measurements of `streams`, repaired as a live camera's (`SampleProcessor`).
+
+    images: with pixels. losses: gets damaged samples. Raises DataError.
+    """
     rates = {
         name: file.read_number(f"{file.streams[name]}/info", "fps", 30.0, *_RATE_RANGE_HZ) for name in streams
     }
@@ -113,8 +117,10 @@ def repair_samples(
 
 
 def read_recorded_imu(file: Db3, losses: DataLosses) -> tuple[I64, F64]:
-    """Stamps (N,) ns and (N, 6) wx wy wz ax ay az, rad/s and m/s^2. losses: takes what is damaged. Raises
-    DataError."""
+    """Return IMU stamps (N,) ns and values (N, 6) wx wy wz ax ay az, rad/s and m/s^2.
+
+    losses: gets damaged samples. Raises DataError.
+    """
     if missing := [name for name in (ACCEL, GYRO) if name not in file.streams]:
         raise DataError(f"{file.path}: has no {' and no '.join(missing)}; record both")
     samples = [(m.stamp_ns, m.payload) for m in repair_samples(file, (ACCEL, GYRO), False, losses)]
@@ -125,7 +131,7 @@ def read_recorded_imu(file: Db3, losses: DataLosses) -> tuple[I64, F64]:
 
 
 def read_recorded_rig(file: Db3) -> Rig:
-    """Lenses and baseline as recorded; the IMU, if there is one, of a profile. Raises DataError."""
+    """Return the rig: cameras as recorded, the IMU, if any, as in the default profile. Raises DataError."""
     lenses = {name: _read_camera(file, name) for name in (CAM0, CAM1, DEPTH) if name in file.streams}
     rig: dict[str, Any] = {"cam0": lenses[CAM0], "T_body_cam0": np.eye(4)}
     for name in (CAM1, DEPTH):
@@ -157,7 +163,7 @@ def _read_camera(file: Db3, stream: str) -> Camera:
 
 
 def _read_extrinsics(file: Db3, stream: str) -> F64:
-    """T_stream_reference (4, 4), one reference for the whole device. The rotation is column by column."""
+    """Read T_stream_reference (4, 4); all streams share the reference. The rotation is stored by columns."""
     fields = file.text_fields(file.find_topic(f"{file.streams[stream]}/tf/ref_"))
     try:
         T = np.eye(4)

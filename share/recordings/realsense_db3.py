@@ -1,7 +1,7 @@
-"""A recording by the maker's SDK (2.58 and later: `.db3`, a rosbag2 in SQLite), read without the SDK.
+"""Read files of the RealSense SDK (2.58 and later: `.db3`, a rosbag2 in SQLite) without the SDK.
 
-The SDK's own playback is not used: it plays in threads that may hang, and not the same twice. Stamps are
-those of the metadata beside each sample, as the device gave them; the table's are the time since it began.
+The SDK's playback runs in threads that may hang and is not repeatable. Stamps are those of the metadata
+beside each sample, as the device gave them; those of the table count from the start of the recording.
 """
 
 from __future__ import annotations
@@ -25,16 +25,15 @@ from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 
 STREAMS = {"Infrared_1": CAM0, "Infrared_2": CAM1, "Depth_0": DEPTH, "Accel_0": ACCEL, "Gyro_0": GYRO}
 _DATA_SUFFIXES = ("/imu/data", "/image/data/compressed", "/image/data/compressedDepth")
-_DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport's ConfigHeader before the PNG
 _HARDWARE_CLOCK = "Hardware Clock"
-_COLUMNS = {"topics": ("id", "name"), "messages": ("id", "topic_id", "timestamp", "data")}  # rosbag2's
-_MAX_TOPICS, _MAX_NAME_LENGTH = 10_000, 500  # the SDK writes 100 of 60 characters
-_MAX_MESSAGE_BYTES = 64 * MB  # of bytes; four times as much as a raw image of 8 megapixels
+_COLUMNS = {"topics": ("id", "name"), "messages": ("id", "topic_id", "timestamp", "data")}  # of rosbag2
+_MAX_TOPICS, _MAX_NAME_LENGTH = 10_000, 500  # the SDK writes 100 topics with names of 60 characters
+_MAX_MESSAGE_BYTES = 64 * MB  # four times a raw 16-bit image of 8 megapixels
 _MAX_ROW_BYTES = 4 * _MAX_MESSAGE_BYTES
 
 
 class Db3:
-    """`streams`: by our name, the folder of its topics. Raises DataError for a file that is none."""
+    """One file. streams: topic folder by stream. Raises DataError if it is not such a file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -45,15 +44,17 @@ class Db3:
 
     @property
     def serial(self) -> str | None:
-        """Of the device."""
+        """Serial number of the device; None if unknown."""
         serial = self.text_fields("/device_0/info").get("Serial Number")
         return serial if serial is not None and re.fullmatch(r"[\w-]{1,64}", serial) else None
 
     def read_number(
         self, topic: str, key: str | None, default: float, minimum: float, maximum: float
     ) -> float:
-        """What `told` says by `key`, or all of it; `default` where it says nothing. Raises DataError where it
-        is no number from `minimum` to `maximum`."""
+        """Return the number under `key` of a text topic, or the whole text as a number if key is None.
+
+        `default` if it is missing. Raises DataError if it is not a number from `minimum` to `maximum`.
+        """
         fields = self.text_fields(topic)
         text = next(iter(fields), None) if key is None else fields.get(key)
         try:
@@ -62,27 +63,30 @@ class Db3:
             value = math.nan
         if not minimum <= value <= maximum:
             raise DataError(
-                f"{self.path}: {topic}: '{text:.40}' is no number from {minimum:g} to {maximum:g}"
+                f"{self.path}: {topic}: '{text:.40}' is not a number from {minimum:g} to {maximum:g}"
             )
         return value
 
     def text_fields(self, topic: str) -> dict[str, str]:
-        """What a text such as `key=value;key=value` says, empty if it is not there."""
+        """Return the fields of a text topic, `key=value;key=value`; empty if it is missing."""
         query = f"SELECT {_DATA_OR_NULL} FROM messages NOT INDEXED WHERE topic_id = ? ORDER BY id LIMIT 1"
         for (data,) in self._rows(query, self._topic_ids.get(topic, -1)):
             return self._parse_text(data)
         return {}
 
     def find_topic(self, prefix: str) -> str:
-        """The first topic whose name begins so. Raises DataError if there is none."""
+        """Return the first topic whose name starts with `prefix`. Raises DataError if there is none."""
         for name in sorted(self._topic_ids):
             if name.startswith(prefix):
                 return name
-        raise DataError(f"{self.path}: has no {prefix}, which the SDK writes")
+        raise DataError(f"{self.path}: has no topic {prefix}, which the SDK always writes")
 
     def samples(self, losses: DataLosses, images: bool = True) -> Iterator[DeviceSample]:
-        """All of them as they came; those that are damaged go to `losses`. images: with pixels, encoded; else
-        an image's payload is None. Raises DataError where more than 5 % of a stream are damaged."""
+        """Yield all samples in the order of recording; damaged ones go to `losses`.
+
+        images: with encoded pixels; else an image's payload is None. Raises DataError if more than 5 % of a
+        stream are damaged.
+        """
         data = {self._topic_ids[name]: stream for stream, name in self._data_topics.items()}
         metadata = {
             self._topic_ids[self.find_topic(_metadata_topic(name))]: s
@@ -107,7 +111,7 @@ class Db3:
                 sample = self._make_sample(
                     stream, waiting.pop(stream, None), with_payload, self._parse_text(blob), at_ns
                 )
-            except DataError as error:  # it costs itself
+            except DataError as error:  # skip this sample only
                 losses.add(f"samples of {stream}", str(row), str(error))
                 continue
             yield sample
@@ -115,7 +119,7 @@ class Db3:
             losses.check(f"samples of {stream}", count)
 
     def _read_topic_ids(self) -> dict[str, int]:
-        """Their numbers by name."""
+        """Return the topics' ids by name."""
         query = (
             f"SELECT id, name FROM topics NOT INDEXED "
             f"WHERE typeof(name) = 'text' AND length(name) <= {_MAX_NAME_LENGTH} LIMIT {_MAX_TOPICS}"
@@ -125,7 +129,7 @@ class Db3:
     def _make_sample(
         self, stream: str, blob: bytes | None, with_payload: bool, metadata: dict[str, str], at_ns: int
     ) -> DeviceSample:
-        """whole: with what was recorded, not only when."""
+        """Decode a sample. with_payload: else its payload is None. Raises DataError."""
         try:
             return DeviceSample(
                 stream=stream,
@@ -135,7 +139,7 @@ class Db3:
                 number=None if stream in (ACCEL, GYRO) else _checked_int(int(metadata["Frame number"])),
                 is_device_clock=metadata["timestamp_domain"] == _HARDWARE_CLOCK,
             )
-        except Exception as error:  # rosbags raises many kinds on bytes that are no such message
+        except Exception as error:  # rosbags raises many kinds on invalid bytes
             raise DataError(f"{self.path}: a sample of {stream} cannot be read ({error!r})") from None
 
     def _parse_text(self, blob: bytes) -> dict[str, str]:
@@ -153,7 +157,7 @@ class Db3:
             raise DataError(f"{self.path}: cannot be read: {error.strerror}") from None
         except (sqlite3.Error, MemoryError, OverflowError, UnicodeError) as error:
             raise DataError(
-                f"{self.path}: is no recording of the RealSense SDK, or damaged: {error}"
+                f"{self.path}: is not a recording of the RealSense SDK, or damaged: {error}"
             ) from None
 
 
@@ -161,26 +165,26 @@ _DATA_OR_NULL = f"CASE WHEN typeof(data) = 'blob' AND length(data) <= {_MAX_MESS
 
 
 def _checked_int(number: Any) -> int:
-    """A stamp, or number of a frame. Raises ValueError."""
+    """Return a stamp or frame number. Raises ValueError if it is out of range."""
     if type(number) is not int or abs(number) >= MAX_STAMP_NS:
         raise ValueError(f"{number!r:.40} is out of range")
     return number
 
 
 def _metadata_topic(data: str) -> str:
-    """The topic with the stamps of the samples in topic `data`."""
+    """Return the topic with the metadata of the samples in topic `data`."""
     return data[: data.rindex("/data")] + "/metadata"
 
 
 def _decode_payload(stream: str, blob: bytes | None) -> Any:
-    """Raises ValueError and what rosbags does."""
+    """Decode a message: (x, y, z) of an IMU, or an encoded image. Raises ValueError, rosbags' errors."""
     if blob is None:
-        raise ValueError("its data are missing, or too large")
+        raise ValueError("its data is missing or too large")
     if stream in (ACCEL, GYRO):
         message = ros.decode(blob, ros.IMU_MSG)
         v = message.linear_acceleration if stream == ACCEL else message.angular_velocity
         if not all(map(math.isfinite, (v.x, v.y, v.z))):
-            raise ValueError("it is not finite")
+            raise ValueError("its values are not finite")
         return [v.x, v.y, v.z]
     image = ros.decode(blob, ros.COMPRESSED).data.tobytes()
-    return image[_DEPTH_HEADER:] if stream == DEPTH else image
+    return image[ros.DEPTH_HEADER_BYTES :] if stream == DEPTH else image

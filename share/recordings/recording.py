@@ -1,4 +1,4 @@
-"""What every reader gives: a rig, streams of measurements, perhaps a true trajectory."""
+"""The interface of all recordings and cameras: a rig, streams of measurements, perhaps ground truth."""
 
 from __future__ import annotations
 
@@ -21,38 +21,40 @@ from share.types import F64, I64
 
 
 class Source(ABC):
-    """One agent's recording, or its camera. `rig` decides which streams there are; `notes` are for people;
-    `serial` is the number of the device, None where nobody knows."""
+    """One agent's recording, or its camera.
+
+    rig: decides which streams there are. notes: lines to print. serial: of the device, None if unknown.
+    """
 
     name: str
     rig: Rig
     notes: tuple[str, ...]
     serial: str | None = None
-    imu_range = ImuRange()  # of the widest usual sensor, where nobody says which it is
-    reports_silence = False  # whether a person is told by it that a stream has stopped
+    imu_range = ImuRange()  # by default that of the widest common sensor
+    reports_silence = False  # whether the source itself reports a stream that has stopped
 
     @abstractmethod
     def stamps(self) -> dict[str, I64]:
-        """Stamps (N,) ns of every stream, as recorded."""
+        """Return the recorded stamps (N,) ns of every stream."""
 
     @abstractmethod
     def measurements(self) -> Iterator[Measurement]:
-        """All samples, roughly in order of time; `share.sensors.sequencer` merges them."""
+        """Yield all samples, roughly in order of time; `share.sensors.sequencer` merges them."""
 
     @abstractmethod
     def truth(self) -> Trajectory | None:
-        """True poses of the body in the world, if the recording has them."""
+        """Return the true poses of the body in the world, None if unknown."""
 
     def stop(self) -> None:  # noqa: B027 -- a recording ends by itself
         """Ask a live camera to end, from any thread or signal handler."""
 
     @cached_property
     def losses(self) -> DataLosses:
-        """What could not be read so far and was left out."""
+        """What could not be read so far and was skipped."""
         return DataLosses()
 
     def report(self) -> dict[str, Any]:
-        """What a live camera met, for report.json."""
+        """Return a live camera's events, for report.json."""
         return {}
 
     @property
@@ -61,14 +63,14 @@ class Source(ABC):
 
     @cached_property
     def rate_hz(self) -> float:
-        """Frame rate, from the median step of cam0; 0 with fewer than two images."""
+        """Frame rate, Hz, from the median step of cam0; 0 with fewer than two images."""
         steps = np.diff(self.stamps()[CAM0])
         steps = steps[steps > 0]
         return float(1e9 / np.median(steps)) if len(steps) else 0.0
 
 
 class Span(NamedTuple):
-    """A part of a recording: images in (image_from, image_to], IMU samples in (imu_from, imu_to]."""
+    """A part of a recording, ns: images in (image_from, image_to], IMU samples in (imu_from, imu_to]."""
 
     image_from: int
     image_to: int
@@ -79,34 +81,33 @@ class Span(NamedTuple):
         return (self.imu_from, self.imu_to) if stream == IMU else (self.image_from, self.image_to)
 
 
-_UNBOUNDED = 2**62
+UNBOUNDED_NS = 2**62  # limit of a span without an end
 
 
 def select_span(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> Span:
-    """The span of cam0's images number `frames`, with the IMU samples since the image before them, whose
-    stamps are imu_shift_ns later than those of images taken with them.
+    """Return the span of cam0's images number `frames`, with the IMU samples since the image before them.
 
-    Raises UsageError if nothing is left or the slice has a step.
+    imu_shift_ns: IMU time minus camera time. Raises UsageError if nothing is left or the slice has a step.
     """
     if frames is None:
-        return Span(-_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, _UNBOUNDED)
+        return Span(-UNBOUNDED_NS, UNBOUNDED_NS, -UNBOUNDED_NS, UNBOUNDED_NS)
     first, last, step = frames.indices(len(cam0))
     if step != 1 or first >= last:
         requested = ":".join("" if end is None else str(end) for end in (frames.start, frames.stop))
         raise UsageError(f"{where}: --frames {requested} selects nothing; it has {len(cam0)} frames")
-    previous_ns = int(cam0[first - 1]) if first else -_UNBOUNDED
+    previous_ns = int(cam0[first - 1]) if first else -UNBOUNDED_NS
     last_ns = int(cam0[last - 1])
     return Span(
-        image_from=(previous_ns + int(cam0[first])) // 2 if first else -_UNBOUNDED,
-        image_to=(last_ns + int(cam0[last])) // 2 if last < len(cam0) else _UNBOUNDED,
+        image_from=(previous_ns + int(cam0[first])) // 2 if first else -UNBOUNDED_NS,
+        image_to=(last_ns + int(cam0[last])) // 2 if last < len(cam0) else UNBOUNDED_NS,
         imu_from=previous_ns + imu_shift_ns,
-        imu_to=last_ns + imu_shift_ns if last < len(cam0) else _UNBOUNDED,
+        imu_to=last_ns + imu_shift_ns if last < len(cam0) else UNBOUNDED_NS,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class FolderSource(Source):
-    """A recording whose stamps are all known: image lists and an IMU table (stamps (N,), values (N, 6))."""
+    """A recording in files: lists of images, and an IMU table (stamps (N,) ns, values (N, 6))."""
 
     name: str
     rig: Rig
@@ -129,7 +130,7 @@ class FolderSource(Source):
         return self.read_truth()
 
     def slice_frames(self, frames: slice | None) -> FolderSource:
-        """The same recording, only the frames number `frames` of cam0."""
+        """Return this recording with only the frames number `frames` of cam0."""
         if not self.images[CAM0]:
             raise DataError(f"{self.name}: has no images")
         span = select_span(self.stamps()[CAM0], frames, self.name, self.rig.timeshift_ns)

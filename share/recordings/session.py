@@ -1,8 +1,8 @@
-"""A session: several agents in one place at one time, in one folder.
+"""Read a session: a folder with the recordings of several agents in one place at one time.
 
 session.yaml     agents, kinds, sensors, calibration, clock offsets, provenance
-NAME.mcap        one recording an agent
-truth/NAME.tum   pose of the body in the world, if known
+NAME.mcap        the recording of each agent
+truth/NAME.tum   poses of its body in the world, if known
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from share.types import AgentKind
 SESSION_FILE = "session.yaml"
 SCHEMA = 1
 AGENT_NAME_RULE = "1 to 64 letters, digits, '_', '-' or '.'"
-_MAX_OFFSET_NS = 2**62  # of a clock's offset
+_MAX_OFFSET_NS = 2**62
 _AGENT_KEYS = ("kind", "sensors", "rate_hz", "clock_offset_ns", "calibration")
 
 
 @dataclass(frozen=True, eq=False)
 class SessionAgent:
-    """sensors: the rig's kind, e.g. `stereo+imu`. A stamp in its files is session time + clock_offset_ns.
-    calibration: None where the recording's own is to be used."""
+    """One agent of a session. sensors: the rig's kind, e.g. `stereo+imu`. clock_offset_ns: stamps in its
+    files minus session time. calibration: None to use the recording's own."""
 
     kind: AgentKind
     sensors: str
@@ -40,16 +40,16 @@ class SessionAgent:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """agents by name; provenance: where it comes from, plain values for a person and a paper."""
+    """A session. agents: by name. provenance: how it was made, as plain values."""
 
     folder: Path
     agents: dict[str, SessionAgent]
     provenance: dict[str, Any]
 
     def recording(self, name: str) -> Path:
-        """The recording of agent `name`. Raises UsageError if there is none."""
+        """Return the recording of agent `name`. Raises UsageError if there is none."""
         if name not in self.agents:
-            raise UsageError(f"{self.folder}: has no agent '{name}'; it has {', '.join(self.agents)}")
+            raise UsageError(f"{self.folder}: no agent '{name}'; agents: {', '.join(self.agents)}")
         recording = self.folder / f"{name}.mcap"
         if not recording.is_file():
             raise UsageError(f"{recording}: no such file, although {self.folder / SESSION_FILE} names it")
@@ -57,7 +57,7 @@ class Session:
 
 
 def is_agent_name(text: str) -> bool:
-    """Whether it can be an agent's, and so a file's."""
+    """Return whether `text` is a valid agent name, and so a valid file name."""
     try:
         checked_name(text)
     except ValueError:
@@ -70,17 +70,17 @@ def is_session(folder: Path) -> bool:
 
 
 def read_session(folder: Path) -> Session:
-    """Raises ConfigError naming the key that is wrong, UsageError where it is no session."""
+    """Read a session. Raises ConfigError that names a wrong key, UsageError if it is not a session."""
     if not is_session(folder):
         what = f"has no {SESSION_FILE}" if folder.is_dir() else "there is no such folder"
-        raise UsageError(f"{folder}: {what}; give a session, by `share emulate` or `share dataset align`")
+        raise UsageError(f"{folder}: {what}; give a session made by `share emulate` or `share dataset align`")
     top = read_yaml(folder / SESSION_FILE)
     schema = top.number("schema")
     if schema != SCHEMA:
         raise ConfigError(f"{top.where}: schema {schema:g} is not known; this SHARE reads schema {SCHEMA}")
     agents = top.section("agents")
     if not agents.data:
-        raise ConfigError(f"{agents.where}: names nobody")
+        raise ConfigError(f"{agents.where}: lists no agents")
     provenance = top.section("provenance").data if "provenance" in top else {}
     session_agents = {
         _checked_agent_name(name, agents.where): _read_agent(agents.section(name), folder)
@@ -90,9 +90,9 @@ def read_session(folder: Path) -> Session:
 
 
 def _checked_agent_name(name: Any, where: str) -> str:
-    """That of an agent, which its files have too. Raises ConfigError."""
+    """Return an agent's name. Raises ConfigError if it cannot be a file name."""
     if not isinstance(name, str | int) or not is_agent_name(str(name)):
-        raise ConfigError(f"{where}: '{name!s:.80}' is no name of an agent: use {AGENT_NAME_RULE}")
+        raise ConfigError(f"{where}: '{name!s:.80}' is not a valid agent name; use {AGENT_NAME_RULE}")
     return str(name)
 
 
@@ -116,7 +116,7 @@ def _read_agent(section: Section, folder: Path) -> SessionAgent:
 
 
 def _read_agent_calibration(section: Section, folder: Path) -> Calibration:
-    """A file or folder below the session's, or Kalibr's chains written out: cam0, cam1, depth, imu0."""
+    """Read `calibration`: a path in the session's folder, or Kalibr's sections (cam0, cam1, depth, imu0)."""
     if isinstance(section.get("calibration"), str):
         return read_calibration(path_inside(folder, section.text("calibration"), section.where))
     chain = section.section("calibration")

@@ -1,5 +1,4 @@
-"""CSV and TXT tables of a dataset: read by numpy, and when that fails, line by line. A damaged line costs
-itself, or is said to be to blame."""
+"""Read CSV and TXT tables of datasets: with numpy, or, if that fails, line by line to find bad lines."""
 
 from __future__ import annotations
 
@@ -20,19 +19,19 @@ from share.recordings.losses import DataLosses
 from share.types import F64, I64
 
 Row = TypeVar("Row", bound=tuple[Any, ...])
-MAX_STAMP_NS = 2**62  # of a stamp, to either side: 146 years, and differences still fit 64 bits
-_PROBE_BYTES = 4096  # bytes in which a binary file shows itself
+MAX_STAMP_NS = 2**62  # of either sign: 146 years; differences still fit 64 bits
+_PROBE_BYTES = 4096  # searched for a NUL, the sign of a binary file
 
 
 def read_text(path: Path) -> str:
-    """The text of a file. Raises DataError if it is missing, unreadable or binary."""
+    """Read the text of a file. Raises DataError if it is missing, unreadable or binary."""
     try:
-        with reading.open_regular(path, MAX_TABLE_BYTES) as file:  # before all of it is in memory
+        with reading.open_regular(path, MAX_TABLE_BYTES) as file:  # probe before reading all of it
             binary = b"\0" in file.read(_PROBE_BYTES)
-        # spreadsheets begin with a byte-order mark
+        # utf-8-sig: spreadsheets write a byte-order mark
         text = "" if binary else reading.read_text(path, MAX_TABLE_BYTES, "utf-8-sig")
     except FileNotFoundError:
-        raise DataError(f"{path}: no such file; the recording is not complete") from None
+        raise DataError(f"{path}: no such file; the recording is incomplete") from None
     except UnicodeDecodeError:
         raise DataError(f"{path}: is not a text file; the recording is damaged") from None
     except OSError as error:
@@ -45,10 +44,10 @@ def read_text(path: Path) -> str:
 def read_rows(
     path: Path, separator: str | None, columns: int, losses: DataLosses | None = None
 ) -> Iterator[tuple[int, list[str]]]:
-    """(line number, fields) of every line that is not empty or a comment.
+    """Yield (line number, fields) of every line that is not empty or a comment.
 
-    separator: "," or None for white space. A line with fewer than `columns` fields is a DataError, or goes to
-    `losses`.
+    separator: "," or None for white space. A line with fewer than `columns` fields goes to `losses`; without
+    losses it raises DataError.
     """
     has_data = False
     for number, line in _data_lines(path):
@@ -60,7 +59,7 @@ def read_rows(
         _count_loss(losses, path, number, f"{len(fields)} of {columns} columns; the line is cut short, "
               "copy the file again or delete the line")  # fmt: skip
     if not has_data:
-        raise DataError(f"{path}: has no data; the recording is empty or not complete")
+        raise DataError(f"{path}: has no data; the recording is empty or incomplete")
 
 
 def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -71,7 +70,7 @@ def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _count_loss(losses: DataLosses | None, path: Path, line: int, reason: str) -> None:
-    """One line of a table. Raises DataError where nothing may be lost."""
+    """Count a bad line. Raises DataError if losses is None."""
     where = f"{path}, line {line}"
     if losses is None:
         raise DataError(f"{where}: {reason}")
@@ -85,10 +84,10 @@ def parse_rows(
     parse: Callable[[list[str], str], Row],
     losses: DataLosses | None = None,
 ) -> tuple[I64, list[Row]]:
-    """What `parse` makes of each line's fields, in order; its first item is the stamp: stamps (N,) and all.
+    """Parse the fields of each line; return stamps (N,) and the rows, whose first item is the stamp.
 
-    A line that it refuses (DataError) and one whose stamp is out of order with most others go to `losses`
-    where that is given. Raises DataError where it is not, or more than 5 % are lost.
+    Lines that `parse` refuses (DataError) and lines out of order go to `losses`. Raises DataError if losses
+    is None, or more than 5 % are lost.
     """
     parsed_rows, lines = [], []
     for number, fields in read_rows(path, separator, columns, losses):
@@ -106,24 +105,25 @@ def parse_rows(
 def ordered_mask(
     path: Path, stamps: I64, lines: Sequence[int], losses: DataLosses | None
 ) -> NDArray[np.bool_]:
-    """Which rows (N,) stay if as few as possible are left out so that no stamp is smaller than the one before
-    it. Equal ones may pass: the sequencer drops and counts them. Raises DataError where none may be lost."""
+    """Return the largest set of rows (N,) whose stamps never decrease; the others go to `losses`.
+
+    Equal stamps stay: the sequencer drops and counts them. Raises DataError if rows are out of order and
+    losses is None.
+    """
     decreasing = np.flatnonzero(stamps[1:] < stamps[:-1])
     if len(decreasing) == 0:
         return np.ones(len(stamps), np.bool_)
     ordered = longest_nondecreasing(stamps)
     for i in [int(decreasing[0]) + 1] if losses is None else np.flatnonzero(~ordered):
-        reason = (
-            f"stamp {stamps[i]} ns is earlier than the line before or later than those after; sort the file"
-        )
-        _count_loss(losses, path, lines[int(i)], f"{reason} by its first column")
+        reason = f"stamp {stamps[i]} ns is out of order; sort the file by its first column"
+        _count_loss(losses, path, lines[int(i)], reason)
     return ordered
 
 
 def longest_nondecreasing(stamps: I64) -> NDArray[np.bool_]:
-    """Which (N,) belong to a longest part that never falls (Schensted 1961)."""
-    ends: list[int] = []  # smallest last stamp of a part of each length
-    ends_at: list[int] = []  # and where it stands
+    """Return the members (N,) of a longest non-decreasing subsequence (Schensted 1961)."""
+    ends: list[int] = []  # smallest last stamp of a subsequence of each length
+    ends_at: list[int] = []  # and its index
     before = np.full(len(stamps), -1)
     for i, stamp in enumerate(stamps.tolist()):
         k = bisect_right(ends, stamp)
@@ -147,11 +147,11 @@ def _check_losses(path: Path, losses: DataLosses | None, valid_count: int) -> No
 def read_table(
     path: Path, columns: int, nan: bool = False, losses: DataLosses | None = None
 ) -> tuple[I64, F64]:
-    """A CSV of integer nanoseconds and numbers: stamps (N,) and the next columns - 1 as (N, columns - 1).
+    """Read a CSV of integer nanoseconds and numbers; return stamps (N,) and values (N, columns - 1).
 
-    nan: values may be NaN, or empty. A short line, a stamp or value that is no finite number, and a stamp
-    that goes back cost their line and go to `losses`. Raises DataError naming file and line where that is not
-    given, or more than 5 % are lost.
+    nan: values may be NaN or empty. Lines that are short, out of order, or have a stamp or value that is not
+    a finite number go to `losses`. Raises DataError that names file and line if losses is None, or more than
+    5 % are lost.
     """
     dtype = [("stamp", np.int64), *((f"c{i}", np.float64) for i in range(1, columns))]
     lines = read_text(path).splitlines()
@@ -173,7 +173,7 @@ def _is_in_stamp_range(stamps: I64) -> bool:
 
 
 def _read_slowly(path: Path, columns: int, nan: bool, losses: DataLosses | None) -> tuple[I64, F64]:
-    """As `read_table`, line by line: finds what is wrong and says where."""
+    """Read as `read_table`, line by line, to find the bad ones."""
 
     def parse(fields: list[str], where: str) -> tuple[int, list[float]]:
         stamp = parse_ns(fields[0], where)
@@ -184,7 +184,7 @@ def _read_slowly(path: Path, columns: int, nan: bool, losses: DataLosses | None)
 
 
 def parse_ns(text: str, where: str) -> int:
-    """Integer nanoseconds. Exponents and fractions are refused: they have lost digits."""
+    """Parse integer nanoseconds; exponents and fractions are refused, as they have lost digits."""
     try:
         stamp = int(text)
     except ValueError:
@@ -193,8 +193,7 @@ def parse_ns(text: str, where: str) -> int:
 
 
 def parse_seconds(text: str, where: str) -> int:
-    """Decimal seconds, with an exponent or not, to integer nanoseconds without going through a float (digits
-    past ns are cut)."""
+    """Parse decimal seconds, with or without exponent, to integer nanoseconds without floats; truncates."""
     if "e" in text.lower():
         return _parse_exponent_seconds(text, where)
     seconds, _, fraction = text.partition(".")
@@ -206,12 +205,12 @@ def parse_seconds(text: str, where: str) -> int:
 
 
 def _parse_exponent_seconds(text: str, where: str) -> int:
-    """As `parse_seconds`, of 1.4e+09."""
+    """Parse seconds with an exponent, such as 1.4e+09."""
     try:
         seconds = Decimal(text)
     except InvalidOperation:
         raise DataError(f"{where}: stamp '{text:.40}' is not a time in seconds") from None
-    if not -(10**10) < seconds < 10**10:  # before it is made whole: 1e999999 has a million digits
+    if not -(10**10) < seconds < 10**10:  # check before int(): 1e999999 has a million digits
         raise DataError(f"{where}: stamp {text:.40} is out of range")
     return _checked_stamp(int(seconds * 10**9), text, where)
 
@@ -223,7 +222,7 @@ def _checked_stamp(stamp_ns: int, text: str, where: str) -> int:
 
 
 def parse_number(text: str, where: str, nan: bool = False) -> float:
-    """A finite number; with `nan` also NaN, which nothing is too."""
+    """Parse a finite number. nan: NaN and an empty text are allowed, as NaN."""
     if nan and not text:
         return math.nan
     try:

@@ -1,7 +1,7 @@
-"""Trajectories as TUM files: `t[s] x y z qx qy qz qw`, one pose a line.
+"""Read and write trajectories as TUM files: `t[s] x y z qx qy qz qw`, one pose per line.
 
-Stamps go from integer nanoseconds to nine decimals and back without a float between: they are exact.
-Poses are rounded to nine decimals; the same trajectory always gives the same bytes.
+Stamps are exact: integer nanoseconds are written as nine decimals and read back without floats. Poses are
+rounded to nine decimals. Deterministic: equal trajectories give equal bytes.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from share.recordings import tables
 from share.recordings.losses import DataLosses
 from share.types import F64, I64
 
-MAX_POSITION_M = 1e7  # of a place: a truth by satellite counts from the middle of the earth
-_MAX_NORM_ERROR = 0.05  # what the length of a quaternion may be off 1
+MAX_POSITION_M = 1e7  # from the origin; satellite ground truth counts from the centre of the earth
+_MAX_NORM_ERROR = 0.05  # of a quaternion: |norm - 1|
 
 
 class Trajectory(NamedTuple):
-    """Poses T (N, 4, 4) at stamps_ns (N,), rising."""
+    """Poses T (N, 4, 4) at stamps_ns (N,), which do not decrease."""
 
     stamps_ns: I64
     T: F64
 
     @property
     def travelled_m(self) -> F64:
-        """m (N,), how far it has gone by each pose; [0] without any."""
+        """Distance travelled until each pose (N,), m; [0] without poses."""
         steps = np.linalg.norm(np.diff(self.T[:, :3, 3], axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     @property
     def length_m(self) -> float:
-        """The length of its way."""
+        """Length of the path, m."""
         return float(self.travelled_m[-1])
 
 
 def format_pose(stamp_ns: int, T: F64) -> str:
-    """One line of a TUM file, without line end; poses to nine decimals (1 nm)."""
+    """Return one line of a TUM file, without line end; nine decimals (1 nm)."""
     return f"{format_seconds(stamp_ns)} {_format_numbers([*T[:3, 3], *se3.quat_from_matrix(T[:3, :3])])}"
 
 
 def format_tum(trajectory: Trajectory) -> str:
-    """The text of a TUM file."""
+    """Return the text of a TUM file."""
     q = se3.quat_from_matrix(trajectory.T[:, :3, :3])
     numbers = np.concatenate([trajectory.T[:, :3, 3], q], axis=1).tolist()
     stamps = map(format_seconds, trajectory.stamps_ns.tolist())
@@ -53,14 +53,16 @@ def format_tum(trajectory: Trajectory) -> str:
 
 
 def read_tum(path: Path, losses: DataLosses | None = None) -> Trajectory:
-    """losses: takes the lines that are damaged. Raises DataError naming file and line, where that is not
-    given or more than 5 % are."""
+    """Read a TUM file. losses: gets damaged lines.
+
+    Raises DataError that names file and line if losses is None, or more than 5 % are damaged.
+    """
     stamps_ns, numbers = read_tum_table(path, losses=losses)
     return make_trajectory(stamps_ns, numbers[:, :3], numbers[:, 3:], path, losses)
 
 
 def read_tum_table(path: Path, nan: bool = False, losses: DataLosses | None = None) -> tuple[I64, F64]:
-    """Stamps (N,) ns, and x y z qx qy qz qw (N, 7). nan: these may be NaN. Raises DataError likewise."""
+    """Read stamps (N,) ns and x y z qx qy qz qw (N, 7). nan: these may be NaN. Raises as `read_tum`."""
 
     def parse(fields: list[str], where: str) -> tuple[int, list[float]]:
         stamp = tables.parse_seconds(fields[0], where)
@@ -71,46 +73,48 @@ def read_tum_table(path: Path, nan: bool = False, losses: DataLosses | None = No
 
 
 def make_trajectory(stamps_ns: I64, p: F64, q: F64, path: Path, losses: DataLosses | None) -> Trajectory:
-    """Poses of rows (N, 3) m and quaternions (N, 4) xyzw; rows that are no pose of a body go to `losses`.
-    Raises DataError likewise."""
+    """Make a trajectory of positions (N, 3) m and quaternions (N, 4) xyzw; invalid poses go to `losses`.
+
+    Raises as `read_tum`.
+    """
     if losses is None:
         return Trajectory(stamps_ns, make_poses(p, q, path))
     norms = _norms(q)
     valid = (np.abs(norms - 1) <= _MAX_NORM_ERROR) & (np.abs(p) <= MAX_POSITION_M).all(1)
     for i in np.flatnonzero(~valid):
-        reason = f"quaternion has length {norms[i]:.3g}, or it is farther than {MAX_POSITION_M:g} m"
+        reason = f"quaternion norm is {norms[i]:.3g}, or position beyond {MAX_POSITION_M:g} m"
         losses.add(f"poses of {path}", str(stamps_ns[i]), f"{path}: pose at {stamps_ns[i]} ns: {reason}")
     losses.check(f"poses of {path}", len(valid))
     return Trajectory(stamps_ns[valid], make_poses(p[valid], q[valid], path))
 
 
 def make_poses(p: F64, q: F64, path: Path) -> F64:
-    """(N, 3) m and quaternions (N, 4) xyzw -> (N, 4, 4). DataError where a quaternion is no rotation."""
+    """Return poses (N, 4, 4) of positions (N, 3) m and quaternions (N, 4) xyzw. Raises DataError."""
     norms = _norms(q)
     invalid = np.flatnonzero(~(np.abs(norms - 1) <= _MAX_NORM_ERROR))
     if len(invalid):
         raise DataError(
-            f"{path}: pose {invalid[0] + 1}: quaternion has length {norms[invalid[0]]:.3g}, expected 1"
+            f"{path}: pose {invalid[0] + 1}: quaternion norm is {norms[invalid[0]]:.3g}, expected 1"
         )
     check_position_range(p, path)
     return se3.from_quat(p, q)
 
 
 def check_position_range(p: F64, path: Path) -> None:
-    """Raises DataError where a position (N, 3), m, is beyond any room."""
+    """Raise DataError if a position (N, 3), m, is out of range."""
     if (far := np.flatnonzero(~(np.abs(p) <= MAX_POSITION_M).all(1))).size:
         raise DataError(f"{path}: pose {far[0] + 1}: is farther than {MAX_POSITION_M:g} m from the origin")
 
 
 def _norms(q: F64) -> F64:
-    """(N,) of rows (N, 4) that may hold anything."""
+    """Return the norms (N,) of rows (N, 4) with any values."""
     with np.errstate(over="ignore"):
         out: F64 = np.linalg.norm(q, axis=1)
     return out
 
 
 def format_seconds(stamp_ns: int) -> str:
-    """Integer nanoseconds as decimal seconds with nine decimals."""
+    """Format integer nanoseconds as seconds with nine decimals."""
     seconds, fraction = divmod(abs(stamp_ns), 10**9)
     return f"{'-' if stamp_ns < 0 else ''}{seconds}.{fraction:09d}"
 

@@ -1,8 +1,8 @@
-"""TUM RGB-D folders: rgb.txt and depth.txt, or associations.txt, with a camera.yaml of ours.
+"""Read TUM RGB-D folders: rgb.txt and depth.txt, or associations.txt, with our camera.yaml.
 
-Colour and depth are two lists with stamps of their own. They are paired here, by associations.txt or
-by the nearest stamp within 20 ms (as the benchmark does), and the depth image takes the stamp of its
-colour image. Format: Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems*, IROS 2012.
+Colour and depth images have different stamps. They are paired by associations.txt, or by the nearest stamp
+within 20 ms (as the benchmark does); the depth image gets the stamp of its colour image. Format: Sturm et
+al., *A benchmark for the evaluation of RGB-D SLAM systems*, IROS 2012.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def is_tum(path: Path) -> bool:
 
 
 def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) -> FolderSource:
-    """The recording in `path`. Raises DataError, ConfigError, UsageError."""
+    """Open the recording in `path`. Raises DataError, ConfigError, UsageError."""
     own = path / CAMERA_FILE
     if calibration is None:
         calibration = read_camera_yaml(own)
@@ -44,7 +44,7 @@ def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) 
     if rig.depth is None:
         raise ConfigError(f"{calibration.where}: has no depth camera, but {path} is an RGB-D recording")
     if rig.cam1:
-        raise ConfigError(f"{path}: the calibration has cam1, the recording has not; give another --calib")
+        raise ConfigError(f"{path}: the calibration has cam1, the recording does not; give another --calib")
     depth = rig.depth
     rig = Rig(cam0=rig.cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=rig.T_depth_cam0)
     losses = DataLosses()
@@ -72,7 +72,9 @@ def _read_pairs(path: Path, losses: DataLosses) -> tuple[list[ImagePair], tuple[
         if unpaired:
             note = (f"{unpaired} of {len(colour)} colour images have no depth image within 20 ms",)
     if not pairs:
-        raise DataError(f"{listing}: no colour image has a depth image within 20 ms; are both of one clock?")
+        raise DataError(
+            f"{listing}: no colour image has a depth image within 20 ms; check that both use one clock"
+        )
     for column in (1, 2):
         existing = _existing_files(path, [str(pair[column]) for pair in pairs], listing, losses)
         pairs = [pair for pair in pairs if pair[column] in existing]
@@ -80,7 +82,7 @@ def _read_pairs(path: Path, losses: DataLosses) -> tuple[list[ImagePair], tuple[
 
 
 def _read_associations(listing: Path, losses: DataLosses) -> list[ImagePair]:
-    """`t colour t depth`, or the other way round (told by the folder's name)."""
+    """Read lines `t colour t depth`, or with depth first (recognised by the folder's name)."""
 
     def parse(fields: list[str], where: str) -> ImagePair:
         stamp, colour, other, depth = fields[:4]
@@ -102,7 +104,7 @@ def _read_list(listing: Path, losses: DataLosses) -> list[tuple[int, str]]:
 
 
 def _pair_nearest(colour: list[tuple[int, str]], depth: list[tuple[int, str]]) -> list[ImagePair]:
-    """Every colour image with the depth image nearest in time; a depth image serves once."""
+    """Pair every colour image with the depth image nearest in time; each depth image is used once."""
     stamps = np.array([stamp for stamp, _ in depth], np.int64)
     pairs, used = [], -1
     for stamp, file in colour:
@@ -117,7 +119,7 @@ def _pair_nearest(colour: list[tuple[int, str]], depth: list[tuple[int, str]]) -
 
 
 def _existing_files(path: Path, files: list[str], listing: Path, losses: DataLosses) -> set[str]:
-    """Which of `files` are there. Raises DataError where many are not."""
+    """Return which of `files` exist. Raises DataError if more than 5 % are missing."""
     by_folder: dict[Path, list[str]] = {}
     for file in files:
         by_folder.setdefault((path / file).parent, []).append(Path(file).name)
@@ -135,13 +137,14 @@ def _truth(path: Path, rig: Rig, losses: DataLosses) -> Trajectory | None:
 
 
 def _T_truth_cam0(path: Path, rig: Rig) -> F64:
-    """groundtruth.txt tells of the camera that camera.yaml names as `truth_frame`: cam0 or depth.
+    """Return the pose (4, 4) of cam0 in the frame of groundtruth.txt, `truth_frame` in camera.yaml.
 
-    Unsaid, it is the depth camera where that is one of its own: then the truth comes of depth fusion.
+    That is cam0 or depth. The default is depth if it is separate from cam0: then the truth comes from depth
+    fusion.
     """
     default = "cam0" if rig.T_depth_cam0 is None or np.allclose(rig.T_depth_cam0, np.eye(4)) else "depth"
     camera = path / CAMERA_FILE
     frame = read_yaml(camera).text("truth_frame", default) if camera.exists() else default
     if frame not in ("cam0", "depth"):
-        raise ConfigError(f"{camera}: truth_frame '{frame}' is unknown; known: cam0, depth")
+        raise ConfigError(f"{camera}: truth_frame '{frame}' is not known; known: cam0, depth")
     return np.eye(4) if frame == "cam0" or rig.T_depth_cam0 is None else rig.T_depth_cam0

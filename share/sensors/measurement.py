@@ -1,4 +1,4 @@
-"""What sensors deliver, one sample at a time, before it is merged into frames."""
+"""Samples of single sensors, before the sequencer merges them into frames."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ ImuSample = Sequence[float]  # six: gyro rad/s, accel m/s^2, body frame
 
 
 class LazyImage(Protocol):
-    """An image that is decoded when someone asks, so that decoding is timed apart or skipped."""
+    """An image that is decoded on demand, so that decoding can be timed separately or skipped."""
 
     def load(self) -> NDArray[Any]:
-        """(H, W) uint8 gray, or (H, W) float32 depth in m with 0 = no reading. Raises DataError."""
+        """Decode to (H, W) uint8 gray, or (H, W) float32 depth, m, 0 = no reading. Raises DataError."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """One sample of one stream: cam0, cam1 and depth carry a LazyImage, imu an ImuSample."""
+    """One sample of one stream. payload: a LazyImage for cam0, cam1 and depth, an ImuSample for imu."""
 
     stream: str
     stamp_ns: int

@@ -1,4 +1,4 @@
-"""Firmware profiles: one YAML file per sensor and host, shipped in firmware_profiles/ or one's own."""
+"""Load firmware profiles: one YAML file per sensor and host, shipped in firmware_profiles/ or the user's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from share.sensors.profile_types import CameraMode, DeviceFacts, Emulation, Host
 
 @dataclass(frozen=True, eq=False)
 class _ProfileFile:
-    """The top of a profile file. role: what the computer does: ar, robot, edge; "" where any may."""
+    """The top level of a profile file. role: of the computer: ar, robot, edge; "" for any."""
 
     name: str
     host: HostFacts
@@ -25,7 +25,7 @@ class _ProfileFile:
         if self.role not in _ROLES:
             raise ValueError(f"role: '{self.role}' is not one of {', '.join(_ROLES[1:])}")
         if (self.device is None) != (self.emulation is None):
-            raise ValueError("device and emulation: give both, or neither, or a device by its name")
+            raise ValueError("device and emulation: give both, neither, or the name of a shipped device")
 
 
 _ROLES = ("", "ar", "robot", "edge")
@@ -33,7 +33,7 @@ _ROLES = ("", "ar", "robot", "edge")
 
 @dataclass(frozen=True, eq=False)
 class HostProfile:
-    """How one computer is to be set. sensor: what is plugged into it; None at an edge."""
+    """The settings of one computer. sensor: the device plugged into it; None for an edge."""
 
     name: str
     role: str
@@ -47,16 +47,15 @@ def load_profile(
     gyro_hz: float | None = None,
     accel_hz: float | None = None,
 ) -> Profile:
-    """A shipped profile by name (`d435i`, `euroc`) or a file (ends in .yaml or holds a `/`).
+    """Load a shipped profile by name (`d435i`, `euroc`), or a file (ends in .yaml or contains a `/`).
 
-    mode: "640x480@30" or "640x480" (then the first rate), default the file's; gyro_hz, accel_hz:
-    another of the rates that the device offers. Raises ConfigError in one line that says what is
-    known.
+    mode: "640x480@30", or "640x480" for that mode's first rate; default: the file's. gyro_hz, accel_hz:
+    another rate that the device offers. Raises ConfigError that lists the valid choices.
     """
     path = _find_file(str(name_or_file))
     file = _read_file(path)
     if file.device is None or file.emulation is None:
-        raise ConfigError(f"profile '{file.name}' has no device; give one that has, such as d435i")
+        raise ConfigError(f"profile '{file.name}' has no device; give one with a device, such as d435i")
     try:
         chosen, rate_hz = _find_mode(file.device, mode or file.device.default_mode)
         imu = file.device.imu
@@ -71,29 +70,29 @@ def load_profile(
 
 
 def load_host_profile(name_or_file: str | Path) -> HostProfile:
-    """A profile as that of a computer, with its device if it has one. Raises ConfigError."""
+    """Load the profile of a computer, with its device if it has one. Raises ConfigError."""
     file = _read_file(_find_file(str(name_or_file)))
     sensor = None if file.device is None else load_profile(name_or_file)
     return HostProfile(file.name, file.role, file.host, sensor)
 
 
 def _read_file(path: Path) -> _ProfileFile:
-    """A `device` that is a name stands for the device and the emulation of that shipped profile."""
+    """Read a profile file. A `device` given by name takes device and emulation of that shipped profile."""
     top = read_yaml(path)
     if isinstance(name := top.data.get("device"), str):
         if "emulation" in top:
-            raise ConfigError(f"{path}: emulation: comes with device '{name}'; leave one of them out")
+            raise ConfigError(f"{path}: emulation: device '{name}' has its own; leave one of them out")
         base = read_yaml(shipped_profiles()[name]) if name in shipped_profiles() else Section({}, "")
         if not isinstance(base.data.get("device"), dict):
             raise ConfigError(
-                f"{path}: device: '{name}' is no shipped profile that describes one, such as d435i"
+                f"{path}: device: '{name}' is not a shipped profile with a device, such as d435i"
             )
         top = Section(top.data | {key: base.section(key).data for key in ("device", "emulation")}, top.where)
     return read_dataclass(_ProfileFile, top)
 
 
 def shipped_profiles() -> dict[str, Path]:
-    """The profiles that come with SHARE, by name. Raises ConfigError where the folder is missing."""
+    """Return the files of the shipped profiles, by name. Raises ConfigError if the folder is missing."""
     for folder in _profile_folders():
         profiles = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
         if profiles:
@@ -104,7 +103,7 @@ def shipped_profiles() -> dict[str, Path]:
 
 
 def _profile_folders() -> list[Path]:
-    """In a frozen bundle, in the source tree, in a wheel (beside the package, and as its data)."""
+    """Return where the folder may be: in a frozen bundle, the source tree, or a wheel (package or data)."""
     package = Path(__file__).resolve().parents[1]
     bundle = getattr(sys, "_MEIPASS", None)
     roots = ([Path(bundle)] if bundle else []) + [
@@ -127,7 +126,7 @@ def _find_file(name: str) -> Path:
 
 
 def _find_mode(device: DeviceFacts, text: str) -> tuple[CameraMode, float]:
-    """The mode and rate that `text` names."""
+    """Return the mode and rate that `text` names. Raises ValueError."""
     size, _, rate = text.partition("@")
     for mode in device.modes:
         if size == f"{mode.width}x{mode.height}":

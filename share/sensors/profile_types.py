@@ -1,7 +1,7 @@
-"""What a firmware profile says: what a device is and does, its host, and what the emulator adds.
+"""Contents of a firmware profile: the device, its host, and the emulator's error models of the device.
 
-The fields are the keys of the YAML files in firmware_profiles/ (see `share.sensors.profile`). "u" is rad/s
-for a gyroscope and m/s^2 for an accelerometer.
+The fields are the keys of the YAML files in firmware_profiles/ (see `share.sensors.profile`). The unit "u" is
+rad/s for a gyroscope, m/s^2 for an accelerometer.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from share.types import F64
 
 @dataclass(frozen=True)
 class InertialFacts:
-    """Three alike axes of a gyroscope or an accelerometer, and one of the rates that it offers.
+    """A gyroscope or accelerometer with three equal axes, at one of the rates that it offers.
 
-    density u/sqrt(Hz) and walk u/s/sqrt(Hz): white noise and bias random walk (IEEE Std 952, Kalibr's
-    model). instability u, instability_s: sigma and correlation time of a first-order Gauss-Markov part
-    of the bias. start_bias u: sigma of the bias at switch-on. range u: what saturates; step u: one digit.
+    density, u/sqrt(Hz), and walk, u/s/sqrt(Hz): white noise and bias random walk (IEEE Std 952, Kalibr's
+    model). instability, u, and instability_s: sigma and correlation time of a first-order Gauss-Markov part
+    of the bias. start_bias, u: sigma of the bias at power-on. range, u: saturation. step, u: resolution.
     """
 
     rate_hz: float
@@ -46,13 +46,13 @@ class InertialFacts:
 
     @property
     def kalibr_walk(self) -> float:
-        """The random walk that grows as this bias does over times shorter than instability_s."""
+        """The random walk that grows as fast as this bias over times shorter than instability_s."""
         return float(np.hypot(self.walk, self.instability * np.sqrt(2 / self.instability_s)))
 
 
 @dataclass(frozen=True)
 class ImuFacts:
-    """joined: one stream with both sensors, sampled together; else two with stamps of their own."""
+    """An IMU. joined: one stream with both sensors, sampled together; else two streams with own stamps."""
 
     model: str
     joined: bool
@@ -61,13 +61,13 @@ class ImuFacts:
 
     def __post_init__(self) -> None:
         if self.joined and self.gyro.rate_hz != self.accel.rate_hz:
-            raise ValueError("joined: needs one rate for gyro and accel")
+            raise ValueError("joined: gyro and accel must have the same rate")
 
 
 @dataclass(frozen=True)
 class LensFacts:
-    """intrinsics: fx fy cx cy, px; distortion: none or k1 k2 p1 p2 [k3] of model radtan, k1 k2 k3 k4 of
-    equidistant."""
+    """A lens. intrinsics: fx fy cx cy, px. distortion: empty, k1 k2 p1 p2 [k3] for model radtan, or
+    k1 k2 k3 k4 for equidistant."""
 
     intrinsics: tuple[float, float, float, float]
     distortion: tuple[float, ...] = ()
@@ -76,7 +76,7 @@ class LensFacts:
 
 @dataclass(frozen=True)
 class CameraMode:
-    """One image size of both cameras, and the rates that it comes at."""
+    """One image size of both cameras, and its frame rates."""
 
     width: int
     height: int
@@ -89,7 +89,7 @@ class CameraMode:
         self.cameras()
 
     def cameras(self) -> tuple[Camera, Camera]:
-        """Both cameras. Raises ValueError where a lens is none."""
+        """Return both cameras. Raises ValueError for an invalid lens."""
         size = (self.width, self.height)
         left, right = (
             Camera(*size, *eye.intrinsics, eye.distortion, eye.model) for eye in (self.cam0, self.cam1)
@@ -99,7 +99,7 @@ class CameraMode:
 
 @dataclass(frozen=True)
 class DepthFacts:
-    """Depth by stereo matching on the device, in the left camera. step_px: smallest step of disparity."""
+    """Depth by stereo matching on the device, in the left camera. step_px: resolution of disparity."""
 
     range_m: tuple[float, float]
     step_px: float
@@ -107,13 +107,13 @@ class DepthFacts:
     def __post_init__(self) -> None:
         _check_positive(self, "step_px")
         if not 0 < self.range_m[0] < self.range_m[1]:
-            raise ValueError(f"range_m: {_format_numbers(self.range_m)} is not near < far")
+            raise ValueError(f"range_m: {_format_numbers(self.range_m)}: expected 0 < near < far")
 
 
 @dataclass(frozen=True)
 class ClockFacts:
-    """tick_ns: what the device counts in. bits: width of the counter, 0 = does not wrap. triggered: one
-    clock starts every sample, so pictures fall on IMU samples; else each stream runs freely."""
+    """The device's clock. tick_ns: resolution. bits: width of the counter, 0: never wraps. triggered: one
+    clock triggers all sensors, so images coincide with IMU samples; else each stream runs freely."""
 
     tick_ns: int
     bits: int = 0
@@ -127,9 +127,9 @@ class ClockFacts:
 
 @dataclass(frozen=True, eq=False)
 class DeviceFacts:
-    """The sensor itself. firmware: known to be good; firmware_oldest: below it the device is not to be
-    trusted (none where there is no such thing). exposure_ms and gain: least and most. emitter: how
-    infrared dots are to be set. T_imu_cam0, T_imu_cam1 (4, 4)."""
+    """The sensor. firmware: versions known to be good; firmware_oldest: older ones are unreliable (both empty
+    for a device without firmware). exposure_ms, gain: (min, max). emitter: how the infrared projector is set.
+    T_imu_cam0, T_imu_cam1 (4, 4)."""
 
     model: str
     firmware: tuple[str, ...]
@@ -154,13 +154,13 @@ class DeviceFacts:
         for name in ("exposure_ms", "gain"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
-                raise ValueError(f"{name}: {low:g}, {high:g} is not least and most")
+                raise ValueError(f"{name}: {low:g}, {high:g}: expected 0 < min <= max")
 
 
 @dataclass(frozen=True)
 class HostFacts:
-    """How the computer at the sensor is to be set. cpu_governor: "" = leave it. usbfs_mb: memory for USB
-    transfers, 0 = leave it."""
+    """Settings of the computer at the sensor. cpu_governor: "" = any. usbfs_mb: memory for USB transfers,
+    0 = any."""
 
     cpu_governor: str
     usb_autosuspend: bool
@@ -177,10 +177,10 @@ class HostFacts:
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Emulated imager at gain 1. full_well_e: electrons at gray level 255. read_e, pixel_offset_e:
-    electrons rms, in time and over the pixels; pixel_gain: relative rms over the pixels. corner_light:
-    light in the image's corner over that in the middle. psf_px: sigma of the lens's blur.
-    reference_ms: the exposure at which a radiance becomes the same gray level."""
+    """Emulated imager at gain 1. full_well_e: electrons at gray level 255. read_e, pixel_offset_e: noise over
+    time and over pixels, electrons rms; pixel_gain: relative, rms over pixels. corner_light: brightness in
+    the corner relative to the centre. psf_px: sigma of the lens blur. reference_ms: the exposure at which a
+    radiance gives the gray level of the same value."""
 
     full_well_e: float
     read_e: float
@@ -199,9 +199,9 @@ class CameraModel:
 
 @dataclass(frozen=True)
 class ExposureModel:
-    """Auto exposure. target: mean gray level. delay_frames: from a picture to what follows from it.
-    damping: share of the way (in stops) that is gone at once. step: smallest change, relative.
-    longest_ms: it lengthens the exposure so far, then raises the gain."""
+    """Auto exposure. target: mean gray level. delay_frames: from an image to its effect. damping: fraction of
+    the error (in stops) corrected at once. step: smallest relative change. longest_ms: longest exposure;
+    beyond it the gain rises."""
 
     target: float
     delay_frames: int
@@ -217,10 +217,10 @@ class ExposureModel:
 
 @dataclass(frozen=True)
 class DepthModel:
-    """Errors of stereo matching, as block matching has them. sigma_px: of disparity where texture is
-    plenty. window_px: side of the matcher's window. hole_snr: gradient over noise at which half of the
-    pixels find no match; hole_spread: sigma of that limit. smooth_px: sigma of the blur over which errors
-    agree. edge_px: how far edges of things wander."""
+    """Errors of block-matching stereo. sigma_px: disparity noise on rich texture. window_px: side of the
+    matching window. hole_snr: gradient over noise at which half of the pixels have no match; hole_spread:
+    sigma of that limit. smooth_px: correlation length (blur sigma) of errors. edge_px: displacement of object
+    edges."""
 
     sigma_px: float
     window_px: int
@@ -236,7 +236,7 @@ class DepthModel:
 
 @dataclass(frozen=True)
 class Emulation:
-    """What a true device has and its maker does not state, as the emulator assumes it."""
+    """Properties that data sheets do not state, as the emulator assumes them."""
 
     camera: CameraModel
     exposure: ExposureModel
@@ -245,7 +245,7 @@ class Emulation:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """One sensor and its host, with one image size and rate chosen."""
+    """One sensor and its host, at one image size and rate."""
 
     name: str
     device: DeviceFacts
@@ -255,9 +255,9 @@ class Profile:
     rate_hz: float
 
     def rig(self, depth: bool = False) -> Rig:
-        """Stereo (or left image and depth registered to it) and the IMU's noise, body = IMU.
+        """Return the stereo rig (or left image with registered depth) and IMU noise; body = IMU.
 
-        Raises ConfigError where depth is asked of a device without."""
+        Raises ConfigError if depth is asked of a device without depth."""
         left, right = self.mode.cameras()
         imu = self.device.imu
         noise = ImuNoise(
@@ -271,27 +271,25 @@ class Profile:
             except ValueError as error:
                 raise ConfigError(f"profile '{self.name}': {error}") from None
         if self.device.depth is None:
-            raise ConfigError(f"profile '{self.name}': its device measures no depth; use stereo, or d435i")
+            raise ConfigError(f"profile '{self.name}': the device has no depth; use stereo, or d435i")
         return replace(base, depth=replace(left, distortion=(), model=RADTAN), T_depth_cam0=np.eye(4))
 
     @property
     def baseline_m(self) -> float:
-        """Distance of the two cameras, m."""
+        """Distance between the two cameras, m."""
         return float(np.linalg.norm((inverse(self.device.T_imu_cam1) @ self.device.T_imu_cam0)[:3, 3]))
 
 
 _EMITTERS = ("off", "on", "interleaved", "none")
 _GOVERNORS = ("performance", "powersave", "ondemand", "conservative", "schedutil", "userspace")
-_MAX_USBFS_MB = 2047  # of the kernel
-
-
-_MAX_RATE_HZ = 10_000.0  # Hz; above it somebody has mistaken the unit
+_MAX_USBFS_MB = 2047  # the kernel's limit
+_MAX_RATE_HZ = 10_000.0  # anything above is a mistaken unit
 
 
 def _check_rates(rates_hz: tuple[float, ...]) -> None:
     if not rates_hz or not all(0 < hz <= _MAX_RATE_HZ for hz in rates_hz):
         raise ValueError(
-            f"rates_hz: [{_format_numbers(rates_hz)}] must be rates above 0, up to {_MAX_RATE_HZ:g} Hz"
+            f"rates_hz: [{_format_numbers(rates_hz)}]: each must be above 0 and at most {_MAX_RATE_HZ:g} Hz"
         )
 
 

@@ -1,4 +1,4 @@
-"""Samples as a device gives them to measurements in one time that only goes forward."""
+"""Turn a device's raw samples into measurements on one clock that only goes forward."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from share.sensors.measurement import IMU, Measurement
 from share.sensors.stamps import ClockRestartDetector, GapCounter, StampRepair
 
 ACCEL, GYRO = "accel", "gyro"
-_MAX_ACCEL_GAP_STEPS = 3.5  # expected steps of the accelerometer over which it is not interpolated
-_PLACED_HISTORY = 8  # placed stamps that are remembered, so that a pair stays one
-_DEVICE_CLOCK_WAIT_NS = 10**9  # so long samples of the host's clock wait for one of the device's
+_MAX_ACCEL_GAP_STEPS = 3.5  # accelerometer steps; no interpolation over more
+_PLACED_HISTORY = 8  # stamps placed by arrival that are kept, so that both images of a pair get the same one
+_DEVICE_CLOCK_WAIT_NS = 10**9  # how long host-stamped samples wait for a device-stamped one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeviceSample:
-    """One sample as it left the device. payload: a LazyImage, or three values of accel or gyro.
+    """One sample as the device delivered it. payload: a LazyImage, or three values of accel or gyro.
 
-    number: of the frame, as the device counts, None if it does not. hardware: whether the stamp is of the
-    device's own clock. arrived_ns: on the host's monotonic clock. epoch: how often the device was
-    opened before; its clock may have begun anew.
+    number: the device's frame number, None if it has none. is_device_clock: stamp_ns is of the device's
+    clock, else of the host's. arrived_ns: on the host's monotonic clock. epoch: how often the device was
+    opened before; its clock may have restarted.
     """
 
     stream: str
@@ -36,48 +36,44 @@ class DeviceSample:
 
 @dataclass
 class _Clock:
-    """Of one epoch: the repair of its stamps, and what turns them into the time of the recording."""
+    """The stamp repair of one epoch, and the offset from its stamps to the recording's time."""
 
     repair: StampRepair
     offset_ns: int = 0
 
 
 class SampleProcessor:
-    """Repairs stamps, joins accel and gyro, counts. Pure: no clock but what the samples say.
+    """Repairs stamps, joins accel and gyro, counts losses. Pure: no clock but the samples' own.
 
-    After a reconnection, and where the device's clock begins anew without one (`restarts`), a new stretch
-    begins and time goes on by as much as the host's clock went on. `host_stamped` counts samples
-    whose stamps are not of the device's clock: they are used, but a person has to know; `wraps`, `jumps`,
-    `strays` and `past` are those of `StampRepair`; `streams` has the gaps of every stream of the device.
+    After a reconnection, or when the device's clock restarts without one (`restarts`), a new segment begins,
+    and time advances by as much as the host's clock did. `host_stamped` counts samples whose stamps are of
+    the host's clock: they are used, but reported. `streams` has a `GapCounter` for each stream.
 
-    The two clocks never meet in one repair. Among samples of the device's clock those of the host's are
-    placed by when they arrived (`placed_by_arrival`, by stream); where the device has no clock, the host's
-    is time.
+    One repair never mixes the two clocks. Among device-stamped samples, a host-stamped one is placed by its
+    arrival (`placed_by_arrival`, by stream); if the device has no clock, the host's is used for all.
     """
 
     def __init__(self, rates_hz: Mapping[str, float], max_jump_s: float) -> None:
-        """rates_hz: of every stream that is expected."""
+        """rates_hz: expected rate of each stream. max_jump_s: as for `StampRepair`."""
         self.host_stamped = self.segments = self.restarts = 0
         self.placed_by_arrival = dict.fromkeys(rates_hz, 0)
         self.streams = {stream: GapCounter(rate) for stream, rate in rates_hz.items()}
         gap_s = _MAX_ACCEL_GAP_STEPS / rates_hz.get(ACCEL, 1.0)
         self.imu_interpolator = ImuInterpolator(int(gap_s * 1e9))
         self._max_jump_s = max_jump_s
-        self._time_source: tuple[int, bool] | None = (
-            None  # of time: epoch, and whether it is the device's clock
-        )
+        self._time_source: tuple[int, bool] | None = None  # epoch, is_device_clock
         self._clocks: list[_Clock] = []
-        self._waiting: list[DeviceSample] = []  # of the host's clock, until the device's is known
+        self._waiting: list[DeviceSample] = []  # host-stamped, until a device-stamped one comes
         self._recent_placed: deque[tuple[int, int]] = deque(
             maxlen=_PLACED_HISTORY
-        )  # (stamp, where it was placed)
+        )  # (raw stamp, placed stamp)
         self._restart_detector = ClockRestartDetector()
         self._newest: tuple[int, int] | None = None  # (stamp, arrived) of the newest sample
 
     def feed(self, sample: DeviceSample) -> Iterator[Measurement]:
-        """What may now be used: mostly this sample, perhaps none or several."""
+        """Add a sample; yield the measurements that are now ready: usually one, none or several."""
         if sample.stream not in self.streams or (self._time_source and sample.epoch < self._time_source[0]):
-            return  # not asked for, or left over from before a reconnection
+            return  # unexpected stream, or left over from before a reconnection
         self.host_stamped += not sample.is_device_clock
         if sample.is_device_clock or (self._time_source is not None and not self._time_source[1]):
             yield from self._process_timed(sample)
@@ -89,13 +85,13 @@ class SampleProcessor:
                 yield from self.flush()
 
     def flush(self) -> Iterator[Measurement]:
-        """No sample of the device's clock comes: those that waited for one go by the host's."""
+        """Give up waiting for the device's clock: use the host's for all waiting samples."""
         waiting, self._waiting = self._waiting, []
         for sample in waiting:
             yield from self._process_timed(sample)
 
     def _process_timed(self, sample: DeviceSample) -> Iterator[Measurement]:
-        """A sample of the clock that is time."""
+        """Process a sample stamped by the clock in use."""
         if (sample.epoch, sample.is_device_clock) != self._time_source:
             self._start_segment(sample)
         clock = self._clocks[-1]
@@ -106,9 +102,9 @@ class SampleProcessor:
             self._reject(sample)
 
     def _place_by_arrival(self, sample: DeviceSample, last_ns: int, arrived_ns: int) -> Iterator[Measurement]:
-        """As long after the newest sample of the device's clock as it arrived after that."""
+        """Stamp a sample as long after the latest device-stamped one as it arrived after that."""
         stamp = next((placed for raw, placed in self._recent_placed if raw == sample.stamp_ns), None)
-        if stamp is None:  # else its partner was placed there
+        if stamp is None:  # else take the stamp of its partner image
             stamp = last_ns + sample.arrived_ns - arrived_ns
             self._recent_placed.append((sample.stamp_ns, stamp))
         if self.streams[sample.stream].feed(stamp, sample.number):
@@ -121,7 +117,7 @@ class SampleProcessor:
         return ((stamp + clock.offset_ns, usable) for stamp, usable in clock.repair.feed(raw))
 
     def counts(self) -> dict[str, int]:
-        """What was repaired or left out, by name."""
+        """Return the counts of repaired and rejected samples, by name."""
         repairs = [clock.repair for clock in self._clocks]
         names = ("wraps", "jumps", "strays", "past")
         out = {name: sum(getattr(repair, name) for repair in repairs) for name in names}
@@ -138,12 +134,12 @@ class SampleProcessor:
             clock.offset_ns = stamp + (sample.arrived_ns - arrived) - sample.stamp_ns
         self._clocks.append(clock)
         self._time_source = (sample.epoch, sample.is_device_clock)
-        self._waiting = []  # from before the device's clock was known
+        self._waiting = []  # their stamps are of another clock
         self._restart_detector.accept()
         self.segments += 1
 
     def _reject(self, sample: DeviceSample) -> None:
-        """Its stamp lies in the past. Where that goes on, the next sample begins a new stretch."""
+        """Count a stamp in the past. If stamps stay in the past, the next sample begins a new segment."""
         if self._restart_detector.reject(sample.stream, sample.stamp_ns):
             self.restarts += 1
             self._start_segment(sample)
@@ -158,7 +154,7 @@ class SampleProcessor:
         yield from self._deliver(stamp, sample)
 
     def _deliver(self, stamp: int, sample: DeviceSample) -> Iterator[Measurement]:
-        """A sample in order: an image as it is, the IMU's joined."""
+        """Yield the measurements of a sample in order: an image as it is, IMU samples joined."""
         if sample.stream == GYRO:
             joined = self.imu_interpolator.add_gyro(stamp, sample.payload)
         elif sample.stream == ACCEL:
@@ -169,30 +165,30 @@ class SampleProcessor:
         yield from (Measurement(IMU, joined_stamp, values) for joined_stamp, values in joined)
 
 
-# ---- Accelerometer and gyroscope with stamps of their own to one IMU stream, at the gyroscope's stamps.
+# ---- Joining accelerometer and gyroscope
 
 Vector3 = Sequence[float]
 Vector6 = list[float]
 
 
 class ImuInterpolator:
-    """Linear interpolation of the accelerometer between its neighbours; nothing is extrapolated.
+    """Joins both into one IMU stream: the accelerometer is interpolated linearly at the gyroscope's stamps.
 
-    A gyroscope sample waits for the next accelerometer sample. Where the accelerometer has a gap longer
-    than most_gap_ns, the samples in it are left out, so that a gap stays one. `interpolated` and `unmatched`
-    (left
-    out: no accelerometer on both sides) count samples. Each stream must come in order; the two may be
-    out of step. At most most_wait_ns of the gyroscope is kept waiting.
+    Nothing is extrapolated: a gyroscope sample waits for the next accelerometer sample, max_wait_ns at most.
+    Gyroscope samples in an accelerometer gap longer than max_gap_ns are dropped. `interpolated` counts joined
+    samples, `unmatched` dropped ones. Each stream must be in order; the two may be out of step.
     """
 
     def __init__(self, max_gap_ns: int, max_wait_ns: int = 10**9) -> None:
         self.interpolated = self.unmatched = 0
         self._max_gap_ns, self._max_wait_ns = max_gap_ns, max_wait_ns
-        self._waiting_gyro: deque[tuple[int, Vector3]] = deque()  # gyro, later than the accel before
-        self._accel: deque[tuple[int, Vector3]] = deque()  # the last one that is used up, and later ones
+        self._waiting_gyro: deque[tuple[int, Vector3]] = deque()
+        self._accel: deque[tuple[int, Vector3]] = (
+            deque()
+        )  # the last one before the waiting gyro, and later ones
 
     def add_gyro(self, stamp_ns: int, rates: Vector3) -> Iterator[tuple[int, Vector6]]:
-        """Feed one sample (3,) rad/s; gives (stamp_ns, (wx wy wz ax ay az)) of all that can be joined."""
+        """Add a sample (3,) rad/s; yield (stamp_ns, (wx wy wz ax ay az)) for each sample now joined."""
         self._waiting_gyro.append((stamp_ns, rates))
         while stamp_ns - self._waiting_gyro[0][0] > self._max_wait_ns:
             self._waiting_gyro.popleft()
@@ -200,7 +196,7 @@ class ImuInterpolator:
         yield from self._interpolate_ready()
 
     def add_accel(self, stamp_ns: int, force: Vector3) -> Iterator[tuple[int, Vector6]]:
-        """Feed one sample (3,) m/s^2; gives what `add_gyro` gives."""
+        """Add a sample (3,) m/s^2; yield as `add_gyro`."""
         self._accel.append((stamp_ns, force))
         while not self._waiting_gyro and self._accel[0][0] < stamp_ns - self._max_wait_ns:
             self._accel.popleft()
@@ -219,7 +215,7 @@ class ImuInterpolator:
                 yield stamp, [*rates, *force]
 
     def _interpolate_accel(self, stamp: int) -> Vector6 | None:
-        """The accelerometer at `stamp`, None outside of its samples or in a gap."""
+        """Return the acceleration at `stamp`; None outside of the samples or in a gap."""
         before, a = self._accel[0]
         if before == stamp:
             return list(a)

@@ -1,8 +1,8 @@
-"""Streams of measurements to frames: one pure iterator, the same for a file and for a live camera.
+"""Merge streams of measurements into frames: one pure iterator for recordings and live cameras.
 
-A frame goes out as soon as it is whole: its partner image is there and the IMU has reached its
-stamp. Its IMU samples end with the first that is not before it, so that motion can be interpolated to
-the moment of the image. Nothing waits for a wall clock: the time of the newest measurement is the only clock.
+A frame is yielded as soon as it is complete: its partner image is there, and the IMU has reached its stamp.
+Its IMU samples end with the first one at or after the stamp, so that motion can be interpolated to the image.
+Nothing waits for a wall clock: the stamp of the newest measurement is the only time.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from share.sensors.stamps import StampRepair
 from share.types import ImuBatch
 
 _DEFAULT_IMU_RANGE = ImuRange()
-_DEAD_FACTOR = 10  # a stream silent for so many times what a frame waits is not waited for any more
+_DEAD_FACTOR = 10  # a stream silent for this many times a frame's longest wait is no longer waited for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UndecodedFrame:
-    """A `Frame` whose images are not decoded yet. index counts the bundles of this iterator from 0."""
+    """A `Frame` whose images are not decoded yet. index: counts this iterator's frames from 0."""
 
     stamp_ns: int
     index: int
@@ -41,25 +41,25 @@ class UndecodedFrame:
 
 @dataclass
 class SequencerCounters:
-    """What happened to the measurements so far; for reports, and for a state that a person sees."""
+    """Counts of measurements and what happened to them, for reports."""
 
     frames: int = 0
-    imu_samples: int = 0  # handed out with frames
+    imu_samples: int = 0  # in frames
     gaps: int = 0  # frames with gap_ns set
-    duplicates: int = 0  # dropped: the stamp was there already
-    backward: int = 0  # dropped: older than what its stream had reached
+    duplicates: int = 0  # dropped: repeated stamp
+    backward: int = 0  # dropped: older than its stream
     unpaired: int = 0  # dropped: images without a partner within sync_tolerance_ms
-    imu_silent: int = 0  # frames that no IMU sample reaches although the rig has an IMU
-    imu_dropped: int = 0  # samples longer than max_jump_s before their frame
-    imu_out_of_range: int = 0  # dropped: beyond what the sensor can measure, or not finite
-    imu_spikes: int = 0  # dropped: up to three samples in a row far from those around them
+    imu_silent: int = 0  # frames without IMU samples although the rig has an IMU
+    imu_dropped: int = 0  # samples more than max_jump_s before their frame
+    imu_out_of_range: int = 0  # dropped: beyond the sensor's range, or not finite
+    imu_spikes: int = 0  # dropped: runs of up to three samples far from their neighbours
     wraps: int = 0
     jumps: int = 0
     strays: int = 0
 
 
 def rig_streams(rig: Rig) -> tuple[str, ...]:
-    """The streams that a rig's frames are made of."""
+    """Return the streams of a rig's frames."""
     options = ((CAM0, True), (CAM1, rig.cam1), (DEPTH, rig.depth), (IMU, rig.imu))
     return tuple(name for name, is_present in options if is_present)
 
@@ -73,16 +73,16 @@ def sequence_frames(
     imu_shift_ns: int = 0,
     imu_range: ImuRange = _DEFAULT_IMU_RANGE,
 ) -> Iterator[UndecodedFrame]:
-    """Merge by time. `streams` as `rig_streams` gives them; rate_hz: the frame rate, 0 if unknown;
-    imu_shift_ns: IMU time less camera time, by which a frame's IMU samples are later stamped than it;
-    imu_range: beyond which a sample is none (`share.sensors.imu_check`).
+    """Merge measurements into frames by time.
 
-    Every frame has its partner image: cam1, or depth where there is no cam1; depth beside cam1 may be
-    missing. A partner that is dead (silent for _DEAD times what a frame waits) is done without where the
-    IMU or depth is alive.
+    streams: as from `rig_streams`. rate_hz: the frame rate, 0 if unknown. imu_shift_ns: IMU time minus camera
+    time. imu_range: samples beyond it are dropped (`share.sensors.imu_check`).
 
-    Streams may be out of step with each other by up to imu_silent_ms, and within themselves by
-    reorder_ms: such disorder does not change the bundles. Memory is bounded by these times.
+    Every frame has its partner image: cam1, or depth if there is no cam1; depth beside cam1 may be missing.
+    Frames go without a dead partner (silent _DEAD_FACTOR times the longest wait) if IMU or depth is alive.
+
+    Streams may be out of step by up to imu_silent_ms, and out of order within themselves by reorder_ms,
+    without any effect on the frames. Memory is bounded by these times.
     """
     repair = StampRepair(config.max_jump_s)
     merger = _Merger(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
@@ -106,25 +106,25 @@ def _update_counters(repair: StampRepair, counters: SequencerCounters, merger: _
 
 
 class _Buffer:
-    """One stream's samples that wait: (stamp, payload) in order of time."""
+    """Waiting samples (stamp, payload) of one stream, in order of time."""
 
     def __init__(self, reorder_ns: int) -> None:
         self.items: list[tuple[int, Any]] = []
         self.newest = -(2**62)
-        self.consumed_until = -(2**62)  # nothing up to here is accepted any more
-        self.was_dead = False  # was dead when all ended
+        self.consumed_until = -(2**62)  # samples up to here are rejected
+        self.was_dead = False  # at the end of all streams
         self._reorder_ns = reorder_ns
 
     @property
     def complete_until(self) -> int:
-        """Everything up to here has come, unless the stream is more disordered than we allow."""
+        """Every sample up to this stamp has come, if disorder stays within reorder_ms."""
         return self.newest - self._reorder_ns
 
     def accepts(self, stamp: int) -> bool:
         return stamp >= self.complete_until and stamp > self.consumed_until
 
     def insert(self, stamp: int, payload: Any) -> bool:
-        """Whether it was new."""
+        """Insert a sample in order; return False if the stamp is there already."""
         if stamp > self.newest:
             self.items.append((stamp, payload))
             self.newest = stamp
@@ -136,12 +136,12 @@ class _Buffer:
         return True
 
     def first_from(self, stamp: int) -> int | None:
-        """The stamp of the first item that waits and is not before `stamp`."""
+        """Return the stamp of the first waiting sample at or after `stamp`; None if there is none."""
         index = bisect_left(self.items, stamp, key=itemgetter(0))
         return self.items[index][0] if index < len(self.items) else None
 
     def pop_until(self, stamp: int) -> list[tuple[int, Any]]:
-        """Take everything with a stamp up to `stamp`."""
+        """Remove and return all samples up to `stamp`."""
         self.consumed_until = max(self.consumed_until, stamp)
         count = bisect_right(self.items, stamp, key=itemgetter(0))
         out, self.items = self.items[:count], self.items[count:]
@@ -149,6 +149,8 @@ class _Buffer:
 
 
 class _Merger:
+    """The state of `sequence_frames`: buffers of all streams, and which frames are complete."""
+
     def __init__(
         self,
         streams: Collection[str],
@@ -185,15 +187,15 @@ class _Merger:
         self._first_ns = min(self._first_ns, stamp)
 
     def finish(self) -> None:
-        """No more will come: whatever waits is as whole as it gets."""
+        """Mark the end of all streams: waiting frames will get nothing more."""
         for buffer in self.buffers.values():
             buffer.was_dead = self._is_dead(buffer)
         for buffer in self.buffers.values():
             buffer.newest = self._newest_ns = 2**62
 
     def ready_frames(self) -> Iterator[UndecodedFrame]:
-        """The bundles that are whole, in order of time."""
-        while self._images.items and self._is_settled(self._images.items[0][0]):
+        """Yield the frames that are complete, in order of time."""
+        while self._images.items and self._is_final(self._images.items[0][0]):
             stamp, image0 = self._images.items[0]
             self._images.pop_until(stamp)
             partners = [self._take_partner(buffer, stamp) for buffer in self._partners]
@@ -204,15 +206,15 @@ class _Merger:
         self._drop_old()
 
     def _is_incomplete(self, partners: list[Any]) -> bool:
-        """Whether the frame lacks an image that it needs: the first partner, unless that one is dead and
-        something else tells how far things are."""
+        """Return whether the frame lacks its first partner image, and that stream is alive or nothing else
+        gives scale (depth, IMU)."""
         if not partners or partners[0] is not None:
             return False
         other = partners[-1] is not None or (self._imu is not None and not self._is_dead(self._imu))
         return not (other and self._is_dead(self._partners[0]))
 
-    def _is_settled(self, stamp: int) -> bool:
-        """Whether waiting longer can change nothing in the frame at `stamp`, or has lasted too long."""
+    def _is_final(self, stamp: int) -> bool:
+        """Return whether nothing can still change the frame at `stamp`, or it has waited too long."""
         if self._newest_ns >= stamp + self._wait_ns + self._tolerance_ns + self._imu_ahead_ns:
             return True
         return (
@@ -222,7 +224,7 @@ class _Merger:
         )
 
     def _has_partner(self, buffer: _Buffer, stamp: int) -> bool:
-        """The partner is there, or it will not come any more."""
+        """Return whether the partner image is there, or can no longer come."""
         if buffer.complete_until > stamp + self._tolerance_ns:
             return True
         if self._is_dead(buffer):
@@ -233,7 +235,7 @@ class _Merger:
         )
 
     def _has_imu_until(self, stamp: int) -> bool:
-        """The first sample from `stamp` on is there, and none can come before it."""
+        """Return whether the first IMU sample at or after `stamp` is there, and no earlier one can come."""
         imu = self._imu
         if imu is None or imu.consumed_until >= stamp:
             return True
@@ -241,14 +243,14 @@ class _Merger:
         return (first is not None and imu.complete_until >= first) or self._is_dead(imu)
 
     def _is_dead(self, buffer: _Buffer) -> bool:
-        """It is silent for so long that nobody waits for it any more."""
+        """Return whether a stream has been silent for too long to wait for it."""
         return (
             buffer.was_dead
             or self._newest_ns - max(buffer.newest, self._first_ns) > _DEAD_FACTOR * self._wait_ns
         )
 
     def _take_partner(self, buffer: _Buffer, stamp: int) -> Any | None:
-        """The first image within the tolerance. Those before it have missed their frame."""
+        """Remove and return the first image within the tolerance; drop earlier ones, which are unpaired."""
         self._counters.unpaired += len(buffer.pop_until(stamp - self._tolerance_ns - 1))
         if buffer.items and buffer.items[0][0] <= stamp + self._tolerance_ns:
             return buffer.pop_until(buffer.items[0][0])[0][1]
@@ -273,12 +275,12 @@ class _Merger:
         return frame
 
     def _take_imu(self, stamp: int) -> ImuBatch:
-        """Samples since the frame before, until the first that is not before `stamp`."""
+        """Return the samples since the previous frame, up to the first at or after `stamp`."""
         imu = self._imu
         if imu is None:
             return ImuBatch.empty()
         self._counters.imu_dropped += len(imu.pop_until(stamp - self._max_jump_ns))
-        if imu.consumed_until >= stamp:  # the frame before has the first after both
+        if imu.consumed_until >= stamp:  # the previous frame has the first sample after both
             return ImuBatch.empty()
         first = imu.first_from(stamp)
         batch = self._valid_samples(
@@ -289,7 +291,7 @@ class _Merger:
         return batch
 
     def _valid_samples(self, samples: list[tuple[int, Any]]) -> ImuBatch:
-        """Those that are measurements."""
+        """Return the samples that pass the IMU check."""
         if not samples:
             return ImuBatch.empty()
         stamps, table = np.array([s for s, _ in samples], np.int64), np.array([v for _, v in samples], float)
@@ -301,7 +303,7 @@ class _Merger:
         return ImuBatch(stamps, table[:, :3], table[:, 3:])
 
     def _drop_old(self) -> None:
-        """Drop what no frame can want any more, so that a stream without frames does not fill memory."""
+        """Drop samples too old for any frame, so that streams without frames do not fill memory."""
         oldest = self._newest_ns - 2 * (self._wait_ns + self._tolerance_ns) - self._imu_ahead_ns
         for buffer in self._partners:
             if buffer.items and buffer.items[0][0] < oldest:

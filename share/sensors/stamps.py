@@ -1,8 +1,4 @@
-"""Stamps as a device gives them to one time that only goes forward.
-
-Repairs the wrap of the D4xx's 32-bit microsecond counter; believes a jump forward once several
-measurements agree on it; drops single stamps that are far off. All streams share one clock.
-"""
+"""Repair a device's stamps: counter wraps, jumps, stray stamps, restarts and gaps."""
 
 from __future__ import annotations
 
@@ -11,15 +7,16 @@ from collections.abc import Iterator
 from share.sensors.measurement import Measurement
 
 WRAP_NS = 2**32 * 1000  # 4294.967296 s
-_MIN_AGREEING = 3  # measurements that must agree before a jump is believed
-_MAX_CONTRADICTING = 100  # measurements from before it, after which a jump without witnesses is a stray stamp
+_MIN_AGREEING = 3  # measurements that must agree before a jump is accepted
+_MAX_CONTRADICTING = 100  # measurements from before a jump, after which the jump is taken for stray stamps
 
 
 class StampRepair:
-    """Pure state: feed measurements, get (stamp_ns, measurement) with `stamp_ns` unwrapped.
+    """Unwraps stamps into one time that only goes forward. All streams share one clock.
 
-    `wraps`, `jumps`, `strays` (single stamps far off) and `past` (stamps further back than
-    max_jump_s that no wrap explains) count what was done.
+    Repairs the wrap of the D4xx's 32-bit microsecond counter, accepts a jump forward once several
+    measurements agree on it, and drops single stamps that are far off. Counts `wraps`, `jumps`, `strays`
+    (single stamps far off) and `past` (stamps more than max_jump_s back that no wrap explains).
     """
 
     def __init__(self, max_jump_s: float) -> None:
@@ -30,7 +27,10 @@ class StampRepair:
         self._contradictions_left = 0
 
     def feed(self, measurement: Measurement) -> Iterator[tuple[int, Measurement]]:
-        """What may now be used: nothing, this measurement, or a jump's witnesses with it."""
+        """Add a measurement; yield (repaired stamp, measurement) of those now accepted.
+
+        That is none, this one, or all that agree on a jump.
+        """
         if self._latest_ns is None:
             self._latest_ns = measurement.stamp_ns
         stamp = self._unwrap(measurement.stamp_ns, self._latest_ns)
@@ -46,12 +46,12 @@ class StampRepair:
             yield stamp, measurement
 
     def flush(self) -> Iterator[tuple[int, Measurement]]:
-        """At the end of the stream nothing can contradict the suspects any more: a last jump."""
+        """At the end of the stream, accept a jump that is still pending."""
         if self._jump_candidates:
             yield from self._accept_jump()
 
     def _unwrap(self, raw: int, latest: int) -> int:
-        """`raw` plus as many wraps as bring it near; unchanged in the epoch if none does."""
+        """Return `raw` plus the number of wraps that brings it near `latest`; unchanged if none does."""
         stamp = raw + self.wraps * WRAP_NS
         if abs(stamp - latest) <= self._max_jump_ns:
             return stamp
@@ -84,16 +84,16 @@ class StampRepair:
         self._jump_candidates = []
 
 
-# ---- Of one stream: what is missing, and what comes in the wrong order.
+# ---- Gaps of a stream
 
-_GAP_FACTOR = 1.5  # times the expected step: something is missing
+_GAP_FACTOR = 1.5  # a longer step, in expected steps, is a gap
 
 
 class GapCounter:
-    """Feed stamps, and frame numbers where the device gives them.
+    """Counts the samples of one stream, and what is missing.
 
-    Counts `samples` (in order), `gaps` (steps longer than expected), `missing` (by frame number where
-    given, else as many as fit into the gap), `backward` (not later than the last; to be left out).
+    `samples`: in order. `gaps`: steps longer than expected. `missing`: by frame number if known, else as many
+    as fit into the gap. `backward`: not later than the previous one; these must be dropped.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -114,7 +114,7 @@ class GapCounter:
         return (self.last_ns - self.first_ns) * 1e-9
 
     def feed(self, stamp_ns: int, number: int | None = None) -> bool:
-        """Whether the sample is in order and may be used."""
+        """Count a sample; return whether it is in order. number: the frame number if the device has one."""
         if self.last_ns is not None:
             step = stamp_ns - self.last_ns
             if step <= 0:
@@ -135,26 +135,29 @@ class GapCounter:
         self.gaps += is_gap or missing > 0
 
 
-# ---- A device's clock that began anew without a word: nothing but stamps from the past, in order.
+# ---- Restart of a device's clock
 
-_MIN_RESTART_NS = 250_000_000  # of nothing but the past; a burst of late or doubled samples is shorter
+_MIN_RESTART_NS = 250_000_000  # of past stamps only; bursts of late or repeated samples are shorter
 
 
 class ClockRestartDetector:
-    """Tell it of every sample whether its stamp could be used. Pure: no clock but the samples' own."""
+    """Detects that a device's clock restarted unannounced: past stamps only, in order, for a while.
+
+    Call `accept` or `reject` for every sample. Pure: no clock but the samples' own.
+    """
 
     def __init__(self) -> None:
-        self._first_ns: dict[str, int] = {}  # by stream, of the stamps that were refused
+        self._first_ns: dict[str, int] = {}  # of the rejected stamps in order, by stream
         self._last_ns: dict[str, int] = {}
 
     def accept(self) -> None:
-        """Time goes on as it did."""
+        """Record a usable stamp: the clock has not restarted."""
         self._first_ns.clear()
         self._last_ns.clear()
 
     def reject(self, stream: str, stamp_ns: int) -> bool:
-        """A stamp that lies before what its stream had reached. Whether the clock has begun anew."""
+        """Record a stamp before its stream's latest; return whether the clock has restarted."""
         if stamp_ns <= self._last_ns.get(stream, stamp_ns - 1):
-            self._first_ns[stream] = stamp_ns  # back again: it counts from here
+            self._first_ns[stream] = stamp_ns  # back once more: count from here
         self._last_ns[stream] = stamp_ns
         return stamp_ns - self._first_ns.setdefault(stream, stamp_ns) >= _MIN_RESTART_NS

@@ -1,4 +1,4 @@
-"""What to do when a device falls silent. It has no clock: the time is told with every call (ns)."""
+"""Decide what to do when a device falls silent. Pure: every call is given the time, ns."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from enum import Enum
 from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.sensors.sample_processor import ACCEL, GYRO
 
-_MAX_FAILED_CONNECTIONS = 2  # connections after a reset in which a stream never came: then it is broken
+_MAX_FAILED_CONNECTIONS = 2  # connections after a reset without a needed stream: then the device is broken
 
 
 class Action(Enum):
-    """What the watchdog asks for."""
+    """What the watchdog asks its caller to do."""
 
     NOTHING = "nothing"
-    RESET = "reset"  # the device by its hardware, once; then reconnect
-    GO_WITHOUT = "go without"  # say what stays silent; go on without it
-    RECOVERED = "heard again"  # say that it is back
-    RECONNECT = "reconnect"  # look for the device by its serial number
-    GIVE_UP = "give up"  # what is needed has never come: say so, and end
+    RESET = "reset"  # reset the hardware, once per run; then reconnect
+    GO_WITHOUT = "go without"  # report the silent streams; continue without them
+    RECOVERED = "recovered"  # report that the streams are back
+    RECONNECT = "reconnect"  # find the device by its serial number
+    GIVE_UP = "give up"  # a needed stream never came: report it, and end
 
 
 class Health(Enum):
-    """What a person sees."""
+    """State of the device, as reported."""
 
     OK = "OK"
     VISION_ONLY = "VISION_ONLY"
@@ -32,20 +32,25 @@ class Health(Enum):
 
 
 def is_sufficient(streams: Collection[str], needs_image: bool = True) -> bool:
-    """Whether one can go on with these: the left eye, and what tells how far things are. sees: else it is the
-    IMU alone that is wanted."""
+    """Return whether tracking works with these streams: the left image and a source of scale.
+
+    needs_image: False if only the IMU is recorded.
+    """
     imu = ACCEL in streams and GYRO in streams
     return CAM0 in streams and (imu or CAM1 in streams or DEPTH in streams) if needs_image else imu
 
 
 class Watchdog:
-    """Some streams silent for twice silent_ms while others come: one reset in a run; then they are done
-    without if the rest is `is_sufficient` (`VISION_ONLY`: the IMU; `DEGRADED`: others), else reconnect. All
-    silent
-    for silent_ms, or a device that is gone: reconnect, again and again. What is needed and has never come,
-    not in _IN_VAIN connections after the reset either, will not come: give up. Silence is not counted in the
-    first warm_up_ms after a connection, nor at a tick that comes late: who has slept cannot know. `silent`
-    names the streams of the last action; `resets` and `reconnections` are counted.
+    """Watches for silent streams and chooses an `Action` at every tick.
+
+    Some streams silent for 2 silent_ms while others deliver: reset the device once per run; after that, go
+    without them if the rest `is_sufficient` (`VISION_ONLY`: without the IMU, `DEGRADED`: without others),
+    else reconnect. All silent for silent_ms, or the device gone: reconnect until it is back. A needed stream
+    that never came, nor in _MAX_FAILED_CONNECTIONS connections after the reset: give up.
+
+    Silence does not count in the first warm_up_ms after a connection, nor at a late tick, when the process
+    itself may have been suspended. `silent`: the streams of the last action. `resets` and `reconnections`
+    count.
     """
 
     def __init__(
@@ -57,7 +62,7 @@ class Watchdog:
         retry_ms: float = 1000.0,
         reset_ms: float = 3000.0,
     ) -> None:
-        """streams: that are expected; reset_ms: what a device needs after its reset."""
+        """streams: the expected ones. retry_ms: between reconnections. reset_ms: what a reset takes."""
         self.health, self.silent = Health.OK, tuple[str, ...]()
         self.resets = 0
         self._connections = self._failed_connections = 0
@@ -75,31 +80,31 @@ class Watchdog:
 
     @property
     def excluded(self) -> tuple[str, ...]:
-        """Streams that are done without."""
+        """Streams that the run continues without."""
         return tuple(name for name in self._last_sample_ns if name in self._excluded)
 
     def record_connect(self, now_ns: int) -> None:
-        """The device delivers, or is about to."""
+        """Record that the device is connected."""
         self.health = Health.OK
         self._connections += 1
         self._reset_timers(now_ns)
 
     def record_disconnect(self, now_ns: int) -> None:
-        """The device is gone, or cannot be opened."""
+        """Record that the device is gone, or cannot be opened."""
         self._set_away(now_ns + self._retry_ns)
 
     def record_sample(self, stream: str, now_ns: int) -> None:
-        """A sample of the stream came."""
+        """Record a sample of a stream."""
         if stream in self._last_sample_ns:
             self._delivered.add(stream)
             self._last_sample_ns[stream] = max(self._last_sample_ns[stream], now_ns)
 
     def tick(self, now_ns: int) -> Action:
-        """What to do now."""
+        """Return what to do now."""
         was_late, self._tick_ns = now_ns - self._tick_ns > self._silent_ns // 2, now_ns
         if self.health is Health.AWAY:
             return self._retry(now_ns)
-        self._is_late = was_late and not self._is_late  # but who is always late must judge all the same
+        self._is_late = was_late and not self._is_late  # skip one late tick, not every one
         return Action.NOTHING if self._is_late else self._evaluate(now_ns)
 
     def _reset_timers(self, now_ns: int) -> None:
@@ -123,10 +128,10 @@ class Watchdog:
         silent = {name for name, age in ages.items() if age > self._silent_ns}
         if recovered := self._excluded - silent:
             return self._recover(recovered)
-        if len(silent) == len(ages):  # where all fall silent, it is gone
+        if len(silent) == len(ages):  # all silent: the device is gone
             self._set_silent(silent - self._excluded)
             return self._reconnect(now_ns, is_device_gone=bool(self._delivered))
-        # what is pulled out falls silent stream by stream, since queues differ: so the others must go on
+        # an unplugged device falls silent stream by stream, as queues differ: so require that others deliver
         long_silent = {name for name in silent if ages[name] > 2 * self._silent_ns}
         if long_silent <= self._excluded or min(ages.values()) > self._silent_ns // 2:
             return Action.NOTHING
@@ -141,7 +146,10 @@ class Watchdog:
         self.silent = tuple(name for name in self._last_sample_ns if name in silent)
 
     def _reconnect(self, now_ns: int, is_device_gone: bool) -> Action:
-        """gone: the device as a whole, which has delivered before."""
+        """Reconnect; reset or give up if a silent stream never delivered.
+
+        is_device_gone: the whole device, which has delivered before.
+        """
         if not is_device_gone and not set(self.silent) <= self._delivered:
             if self.resets == 0:
                 return self._reset(now_ns)

@@ -12,7 +12,7 @@ TOLD = {
 }  # fmt: skip
 
 KEYS = "not let in: the edge there wants keys"
-UNSAFE = "but not in its map's file; can it write that? It says why not"
+UNSAFE = "could not store them in its map file; see the edge's log"
 
 
 def report(**told):
@@ -22,11 +22,11 @@ def report(**told):
 @pytest.mark.parametrize(
     ("told", "trouble", "why"),
     [
-        ({}, None, "it did not answer within agent.finish_s, 5 s"),
+        ({}, None, "no answer within agent.finish_s (5 s)"),
         (
             {"held": 4},
             None,
-            f"it has 4 of them, {UNSAFE}",
+            f"it received 4 of them but {UNSAFE}",
         ),
         ({"connected": False}, None, "the edge is silent"),
         ({"connected": False}, KEYS, KEYS),
@@ -35,7 +35,7 @@ def report(**told):
 )
 def test_why_keyframes_were_never_acknowledged(told, trouble, why):
     run = SimpleNamespace(report=report(**told), trouble=trouble)
-    assert _unacknowledged_text(run, "ann", 5.0) == f"the edge never acknowledged 5 keyframes: {why}"
+    assert _unacknowledged_text(run, "ann", 5.0) == f"the edge did not acknowledge 5 keyframes: {why}"
 
 
 @pytest.mark.parametrize("told", [{"unacknowledged": 0}, {"edge_sessions": 0}])

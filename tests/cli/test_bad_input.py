@@ -228,7 +228,7 @@ def test_a_truth_that_is_cut_short(share, tmp_path):
         done = share(*as_track(recording, tmp_path / "out"))
     said, failed = done.err.splitlines()  # the five frames of this recording show nothing
     assert "groundtruth.txt, line 4: 2 of 8 columns; the line is cut short" in said
-    assert said.startswith("share: kitchen: left out, since damaged: 1 of the lines of ")
+    assert said.startswith("share: kitchen: skipped as damaged: 1 of the lines of ")
     assert (done.code, "none of its 5 frames could be tracked" in failed) == (1, True)
 
 
@@ -248,7 +248,7 @@ def test_names_that_are_no_recording(command, room, share, tmp_path):
     for source, said in (
         (note, "none of the recordings that SHARE reads"),
         (room, f"is a session; name one of its agents: {room}/ar1, {room}/ar2, {room}/robot"),
-        (room / "bob", "has no agent 'bob'; it has ar1, ar2, robot"),
+        (room / "bob", "no agent 'bob'; agents: ar1, ar2, robot"),
         ("realsense", "RealSense camera"),  # none is attached, or the SDK is not here
     ):
         assert said in complaint(share(*command(source, tmp_path / "out")), 2)
@@ -268,7 +268,7 @@ CALIBRATIONS = {
     "no YAML": ("cam0: [", "not valid YAML"),
     "a list": ("- 1", "expected keys and values, found list"),
     "empty": ("", "expected keys and values, found nothing"),
-    "no extrinsics": (CAMCHAIN.replace("T_cn_cnm1", "T_unknown"), "has no extrinsics to cam0; add T_cn_cnm1"),
+    "no extrinsics": (CAMCHAIN.replace("T_cn_cnm1", "T_unknown"), "no extrinsics to cam0; add T_cn_cnm1"),
     "not rigid": (CAMCHAIN.replace("[0, 0, 1, 0]", "[0, 0, 2, 0]"), "T_cn_cnm1: is not a rigid transform"),
     "NaN": (CAMCHAIN.replace("320.4", ".nan"), "intrinsics: has values that are not finite"),
     "negative focal length": (CAMCHAIN.replace("[385", "[-385"), "cam0"),
@@ -374,7 +374,7 @@ def test_out_that_cannot_be_written(room, share, tmp_path, monkeypatch):
             (["track", source, "--report", tmp_path], "is a folder; give the name of a file"),
             (["track", source, "--out", below], "is not a folder, or lies below a file"),
             (["track", source, "--out", f"{proc}/T.tum"], "cannot be written to: No such file"),
-            (["track", source, "--out", below.parent, "--report", below.parent], "is --out too"),
+            (["track", source, "--out", below.parent, "--report", below.parent], "is the same file as --out"),
             (["track", room / "ar1.mcap", "--out", room / "ar1.mcap"], "is the source itself"),
             (as_agent(source, tmp_path / "file"), "is not a folder, or lies below a file"),
             (as_agent(source, below), "is not a folder, or lies below a file"),
@@ -438,8 +438,8 @@ def test_out_where_a_pipe_lies(room, share, tmp_path):
     pipe, source = tmp_path / "T.tum" / "T.tum", room / "ar1"
     with untouched(tmp_path), within(20):
         for arguments, said in (
-            (["track", source, "--out", pipe], "T.tum: is a pipe that nobody reads"),
-            (["track", source, "--report", pipe], "T.tum: is a pipe that nobody reads"),
+            (["track", source, "--out", pipe], "T.tum: is a pipe without a reader"),
+            (["track", source, "--report", pipe], "T.tum: is a pipe without a reader"),
             *((as_agent(source, tmp_path / name), f"{name}: is a pipe, where") for name in names[3:]),
             *(([*EDGE, tmp_path / name], f"{name}: is a pipe, where") for name in names[1:3]),
             (["dataset", "convert", source, "--format", "mcap", "--out", pipe], "T.tum: is a pipe, where"),
@@ -474,7 +474,7 @@ def test_track_of_a_damaged_image(damaged, share, tmp_path):
     done = share(*as_track(damaged, tmp_path / "out"))
     assert done.code == 0
     (said,) = done.err.splitlines()
-    assert "left out, since damaged: 1 of the frames; the first: " in said
+    assert "skipped as damaged: 1 of the frames; the first: " in said
     assert f"{damaged}/mav0/cam1/data/" in said
     assert "the image is cut short or damaged" in said
 
@@ -493,7 +493,7 @@ def test_streams_that_are_not_used_are_named(stereo, share, tmp_path):
     (tmp_path / "camchain.yaml").write_text(CAMCHAIN)
     done = share("track", recording, "--calib", tmp_path / "camchain.yaml")
     assert done.code == 0
-    assert done.err == "share: stereo: imu0 is not used: the calibration does not have it\n"
+    assert done.err == "share: stereo: imu0 is not used: the calibration has no imu0\n"
 
 
 def test_ctrl_c_on_track(stereo, tmp_path):
@@ -602,7 +602,7 @@ def test_an_edge_that_never_answers(room, share, tmp_path):
     assert (report["bytes_up"], report["protocol"]["sent"]) == (0, 0)  # no link took anything
     assert _not_late(done.err) == [
         "share agent: no edge answers yet; tracking goes on alone",
-        f"share: no edge ever answered at {NOBODY}; is `share edge` running there?",
+        f"share: no edge answered at {NOBODY}; is `share edge` running there?",
     ]
     assert sorted(os.listdir(tmp_path / "out")) == ["latency.csv", "map.tum", "odom.tum", "report.json"]
     assert (tmp_path / "out" / "map.tum").read_bytes() == b""
@@ -655,8 +655,8 @@ def test_what_an_edge_never_acknowledged_is_said(room, share, tmp_path):
     assert f"\n{made} keyframes: {sent} sent, 1 acknowledged, 0 corrections, " in done.out
     assert done.err.splitlines() == [
         "share agent: connected to the edge",
-        f"share agent: the edge never acknowledged {left} keyframes: it has {left} of them, but not in its "
-        "map's file; can it write that? It says why not",
+        f"share agent: the edge did not acknowledge {left} keyframes: it received {left} of them but could "
+        "not store them in its map file; see the edge's log",
     ]
 
 
@@ -758,7 +758,7 @@ def test_an_agent_whose_disk_is_full_tracks_on(room, tmp_path):
 def test_an_agent_of_no_kind(share, more):
     done = share("agent", "realsense", "--name", "a", "--edge", NOBODY, *more)
     assert (done.code, done.out) == (2, "")
-    assert done.err.startswith("share: --kind: who is served, ar or robot?")
+    assert done.err.startswith("share: --kind is required: ar (headset) or robot")
     assert done.err.count("\n") == 1
 
 

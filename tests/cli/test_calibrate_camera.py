@@ -28,7 +28,7 @@ def test_pictures_without_a_board_are_one_line_and_leave_nothing(
         "--out", tmp_path / "out",
     )  # fmt: skip
     assert done.code == 1
-    assert "no board in 1 pictures" in done.err and done.err.count("\n") == 1
+    assert "no board found in 1 images" in done.err and done.err.count("\n") == 1
     assert not list((tmp_path / "out").glob("*"))
 
 

@@ -57,7 +57,7 @@ def test_mounting_and_offset_are_found_and_an_inverted_one_is_said(
 ) -> None:
     done = share(*asked(dance, tmp_path, "--json", camera="camera.yaml"))
     assert done.code == 0, done.err
-    assert "the extrinsics that were given are inverted" in done.err and done.err.count("\n") == 1
+    assert "the given extrinsics are inverted" in done.err and done.err.count("\n") == 1
     rig = read_calibration(tmp_path).rig  # both chains, as `share track --calib` reads them
     off = se3.log(se3.inverse(rig.T_body_cam0) @ T_IMU_CAM0)
     assert np.degrees(np.linalg.norm(off[:3])) < 0.1 and np.linalg.norm(off[3:]) < 2e-3
@@ -102,14 +102,14 @@ def test_what_is_not_to_be_believed_fails_and_leaves_what_was_there(
     done = share(*asked(dance, tmp_path, "--imu", tmp_path / "proud.yaml", camera=str(known)))
     assert done.code == 1
     doubted, kept, failed = done.err.splitlines()
-    assert "camera-report.json does not believe these cameras" in doubted
-    assert f"cameras: as well known as {known / 'camera-report.json'} says" in done.out
+    assert "camera-report.json calls these cameras unreliable" in doubted
+    assert f"cameras: uncertainty of {known / 'camera-report.json'};" in done.out
     assert "position known to 2." in failed and "calibrate the cameras better first" in failed
     told = json.loads((tmp_path / "camera-imu-report.failed.json").read_text())
     parts = [np.array(told[f"sigmas{part}"]["rotation_rad"]) for part in ("", "_by_noise", "_by_cameras")]
     np.testing.assert_allclose(parts[0] ** 2, parts[1] ** 2 + parts[2] ** 2)
-    assert "kalibr_imu_chain.yaml is of other noise and is kept; used was that of --imu" in kept
-    assert "not to be believed" in failed and "gyroscope: residuals" in failed
+    assert "kalibr_imu_chain.yaml has other noise than was used (that of --imu" in kept
+    assert "unreliable result" in failed and "gyroscope: residuals" in failed
     assert "kalibr_imucam_chain.failed.yaml is written; the existing kalibr_imucam_chain.yaml" in failed
     assert "time offset: +12." in done.out and "kalibr_imucam_chain.failed.yaml" in done.out
     assert "FAILED" in (tmp_path / "kalibr_imucam_chain.failed.yaml").read_text()

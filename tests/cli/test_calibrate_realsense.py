@@ -72,7 +72,7 @@ def test_a_camera_that_is_not_there_is_said_and_nothing_is_written(
 def test_what_only_a_camera_has_is_not_for_a_recording(share: Callable[..., Done], tmp_path: Path) -> None:
     done = share("track", tmp_path, "--sensors", "rgbd")
     assert done.code == 2
-    assert "--sensors goes with a live camera" in done.err
+    assert "--sensors works only with a live camera" in done.err
     done = share("track", "realsense", "--frames", "0:10")
     assert done.code == 2
     assert "--frames" in done.err

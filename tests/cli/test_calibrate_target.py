@@ -36,6 +36,6 @@ def test_a_size_that_was_mended_is_kept(share, tmp_path):
     (tmp_path / "b.pdf").unlink()
     done = share(*asked)
     assert done.code == 2 and done.err.count("\n") == 1
-    assert "its size was mended, and is kept; give another --out" in done.err
+    assert "its size was corrected, and is kept; give another --out" in done.err
     assert (tmp_path / "b.yaml").read_text() == mended and "calipers" in mended
     assert not (tmp_path / "b.pdf").exists()

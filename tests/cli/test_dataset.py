@@ -67,7 +67,7 @@ def test_convert_and_recover(walk, tmp_path):
     assert json.loads(good("info", saved, "--json"))["streams"]["cam0"]["count"] == 6
     assert "exists and is not overwritten" in bad(2, "recover", first, "--out", saved)
     whole = good("recover", second, "--out", tmp_path / "whole.mcap")
-    assert whole.splitlines()[-1] == f"all that {second} has is saved: it can be deleted"
+    assert whole.splitlines()[-1] == f"nothing was lost: {second} can be deleted"
 
 
 def test_convert_to_euroc_and_jpeg(walk, tmp_path):

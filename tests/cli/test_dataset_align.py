@@ -159,7 +159,7 @@ def test_motives_export_with_y_up_gives_the_same(share, room, made, tmp_path):
     """Another clock, which begins with its first frame; the same session."""
     told = ("--mocap", room.folder / "take.csv", "--json", "--out", tmp_path / "made")
     done = share("dataset", "align", room.recordings[1], *told)
-    assert done.code == 0 and "bob: the motion capture has y up; in the session z is" in done.err
+    assert done.code == 0 and "bob: the motion capture's up axis is y; the session's is z" in done.err
     found, was = json.loads(done.out)["bob"], read_json(made / "align.json")["bob"]
     assert found["up"] == "y" and was["up"] == "z"
     assert abs(found["offset_ns"] - was["offset_ns"] - round(FIRST * 1e9 / MOCAP_HZ)) < 50_000
@@ -227,8 +227,8 @@ def test_wrong_use_is_one_line_and_leaves_nothing(share, room, tmp_path):
     assert "no body for 'ann' (give --body ann=BODY); it has Headset1, BOB" in refused(2, ann, *csv)
     assert "no body 'Hat'" in refused(2, ann, *csv, "--body", "ann=Hat")
     both = refused(2, ann, bob, *csv, "--body", "ann=bob")
-    assert "its body 'BOB' cannot be both ann and bob; give each its own by --body bob=BODY" in both
-    assert "there is no device 'eve'" in refused(2, bob, *csv, "--body", "eve=BOB")
+    assert "body 'BOB' cannot be both ann and bob; give --body bob=BODY" in both
+    assert "no device 'eve'" in refused(2, bob, *csv, "--body", "eve=BOB")
     assert "--kind cat" in refused(2, bob, *csv, "--kind", "cat")
     assert "has no motion capture" in refused(2, bob, *csv_of_ann)
     assert "no such motion capture file" in refused(2, bob, "--mocap", room.folder / "no.csv")

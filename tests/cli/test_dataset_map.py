@@ -21,9 +21,9 @@ def room(tmp_path):
 def test_info(room):
     text = good("info", room)
     assert text.startswith("room.sqlite: map, schema 3, 0.3 MB\n")
-    assert "  bob        ar         20 keyframes, 0 gone\n" in text
+    assert "  bob        ar         20 keyframes, 0 removed\n" in text
     assert "  map ann-0001/0: 40 keyframes\n" in text
-    assert "  5 loops, 40 keyframes in the newest solution\n" in text
+    assert "  5 loops, 40 keyframes in the latest solution\n" in text
     data = json.loads(good("info", room, "--json"))
     assert data["agents"]["ann"]["next_keyframe"] == 20
     assert data["damage"] == []

@@ -80,7 +80,7 @@ TYPED = {
     "whose profile": (["--profile", "bob=d435i"], "'bob' is not one of the agents: walk1"),
     "two profiles": (
         ["--profile", "d435i", "--profile", "euroc"],
-        "--profile is given twice for everybody; give one of them",
+        "--profile is given twice for all; give it once",
     ),
     "sensors": (["--sensors", "lidar"], "sensors 'lidar' are not known; known: stereo, rgbd, mono"),
     "whose sensors": (["--sensors", "bob=rgbd"], "'bob' is not one of the agents: walk1"),

@@ -46,7 +46,7 @@ def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session,
 
     scored = evaluate("score", run, "--csv", tmp_path / "one.csv", "--plots", tmp_path / "plots")
     assert scored.code == 0, scored.err
-    assert "policy covins-g, loopback, seed 0; in real time, evaluations tell the true error" in scored.out
+    assert "policy covins-g, loopback, seed 0; in real time, evaluations report the true error" in scored.out
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {
         f"{plain_session.name}-over-time.png",
         f"{plain_session.name}-merges.png",
@@ -183,7 +183,7 @@ def test_virtual_runs_go_side_by_side(evaluate, plain_session, tmp_path):
     assert halves[0] == halves[1]  # whichever process played them
     refused = evaluate("ablation", twin, "--workers", 2, "--out", out)
     assert refused.code == 2
-    assert "goes with --virtual" in refused.err
+    assert "needs --virtual" in refused.err
 
 
 @pytest.mark.slow

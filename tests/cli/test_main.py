@@ -108,7 +108,7 @@ def test_no_arguments_is_the_help_and_wrong_use(capsys):
     [
         ("trak", "no command 'trak'; did you mean 'track'?"),
         ("Edge", "no command 'Edge'; did you mean 'edge'?"),
-        ("xyz", "no command 'xyz'; there are demo, capture, track, agent, edge, dataset"),
+        ("xyz", "no command 'xyz'; commands: demo, capture, track, agent, edge, dataset"),
         ("--bogus", "No such option '--bogus'"),
         ("dataset inf", "No such command 'inf'. Did you mean 'info'?"),
         ("track", "Missing argument 'SOURCE'"),
@@ -119,7 +119,7 @@ def test_no_arguments_is_the_help_and_wrong_use(capsys):
         ("track x --frames 5:5", "'5:5' is not a range of frames"),
         ("track x --frames=-5:", "'-5:' is not a range of frames"),
         ("agent x --kind ar --edge tcp://localhost:1", "Missing option '--name'"),
-        ("agent x --name a --edge tcp://localhost:1", "--kind: who is served"),
+        ("agent x --name a --edge tcp://localhost:1", "--kind is required: ar (headset) or robot"),
         ("agent x --name a --kind ar", "Missing option '--edge'"),
         ("agent x --name a --kind car --edge tcp://localhost:1", "'car' is not one of 'ar', 'robot'"),
         ("edge --policy best", "'best' is not"),

@@ -107,7 +107,7 @@ def test_a_peer_that_breaks_leaves_the_others_their_rows(compare, plain_session,
     done = compare(f"{plain_session}/ar1", "--peer", f"basalt={peer}", "--out", out)
     assert done.code == 1
     assert "Idler 1: the peer process ended at frame 5; see " in done.err
-    assert "1 of 2 runs failed; the same command runs them again" in done.err
+    assert "1 of 2 runs failed; run the same command again" in done.err
     assert [tracker for _, tracker in rows_of(out)] == [SHARE]
     (log,) = out.glob("*.log")
     assert "begins" in log.read_text()
@@ -117,7 +117,7 @@ def test_a_peer_that_breaks_leaves_the_others_their_rows(compare, plain_session,
     ("arguments", "said"),
     [
         (("--peer", "basalt"), "--peer basalt: give NAME=PYTHON"),
-        (("--peer", "slam=python"), "with a name of basalt, orbslam3"),
+        (("--peer", "slam=python"), "where NAME is basalt or orbslam3"),
         (("--vocabulary", "/nowhere"), "does not exist"),
     ],
 )

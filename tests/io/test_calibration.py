@@ -102,8 +102,8 @@ GOOD0 = f"  T_cam_imu: {matrix(T_CAM0_IMU)}\n"
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (chain(), "cam0: has no extrinsics to the IMU; add T_cam_imu"),
-        (chain(GOOD0, ""), "cam1: has no extrinsics to cam0; add T_cn_cnm1"),
+        (chain(), "cam0: no extrinsics to the IMU; add T_cam_imu"),
+        (chain(GOOD0, ""), "cam1: no extrinsics to cam0; add T_cn_cnm1"),
         (chain(f"  T_cam_imu: {BAD}\n"), "cam0: T_cam_imu: is not a rigid transform"),
         (chain("  T_cam_imu: [[1, 0, 0], [0, 1, 0]]\n"), "T_cam_imu: expected a 4x4 matrix, found 6"),
         (chain(GOOD0).replace("radtan", "fov"), "'fov' is not supported; supported: radtan, .*equidistant"),
@@ -149,12 +149,12 @@ def test_timeshift_is_the_cameras_mean(tmp_path, camchain, seconds):
 @pytest.mark.parametrize(
     ("camchain", "complaint"),
     [
-        (chain(SHIFT0.format(20)), "cam0: timeshift_cam_imu: 20 s is more than 1 s; it is given in seconds"),
+        (chain(SHIFT0.format(20)), "cam0: timeshift_cam_imu: 20 s is more than 1 s; give it in seconds"),
         (chain(SHIFT0.format(".nan")), "cam0: timeshift_cam_imu: has values that are not finite"),
         (chain(SHIFT0.format("late")), "cam0: timeshift_cam_imu: expected numbers, found .'late'."),
         (
             chain(SHIFT0.format(0.004), SHIFT1.format(0.0055)),
-            "cam1: timeshift_cam_imu: 0.0055 s, but 0.004 s of cam0; .* must agree within 0.001 s",
+            "cam1: timeshift_cam_imu: 0.0055 s, but 0.004 s for cam0; .* must agree within 0.001 s",
         ),
     ],
 )
@@ -191,7 +191,7 @@ def test_the_device_is_told_in_every_section_and_never_at_the_top(tmp_path):
     with pytest.raises(ConfigError, match=f"{IMU_CHAIN}: imu0: serial: put it in quotes"):
         read_calibration(tmp_path)
     (tmp_path / IMU_CHAIN).write_text(chain_of_another.replace("'0456'", "'a b'"))
-    with pytest.raises(ConfigError, match=f"{IMU_CHAIN}: imu0: serial: 'a b' is no serial number"):
+    with pytest.raises(ConfigError, match=f"{IMU_CHAIN}: imu0: serial: 'a b' is not a serial number"):
         read_calibration(tmp_path)
     (tmp_path / IMU_CHAIN).write_text(chain_of_another.replace("'0456'", ""))
     assert read_calibration(tmp_path).serials == ("0123",)

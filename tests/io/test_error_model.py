@@ -99,19 +99,19 @@ def test_one_that_says_no_number(tmp_path, says):
 BRANCH = field(1, "body") + field(6, field(1, node("Identity", ["x"], "y"))) + field(20, 5)
 EXTERNAL = field(13, field(1, "location") + field(2, "../../../etc/passwd")) + field(14, 1)
 LAYERS = {
-    "a loop": ([node("Loop", ["n"], "y", BRANCH)], [], "a layer of it holds a graph"),
-    "a loop without a body": ([node("Loop", ["n"], "y")], [], "'Loop' is none that an error model may have"),
+    "a loop": ([node("Loop", ["n"], "y", BRANCH)], [], "one of its layers holds a graph"),
+    "a loop without a body": ([node("Loop", ["n"], "y")], [], "'Loop' is not allowed in an error model"),
     "a size out of nothing": (
         [node("ConstantOfShape", ["big"], "y")],
         [ints("big", [10**12])],
         "'ConstantOfShape'",
     ),
     "of another domain": ([node("Relu", ["scalars"], "y", domain="evil")], [], "'evil.Relu'"),
-    "weights elsewhere": ([], [tensor("w", [1], (), EXTERNAL)], "its weights lie in other files"),
+    "weights elsewhere": ([], [tensor("w", [1], (), EXTERNAL)], "its weights are in other files"),
     "weights elsewhere, in a layer": (
         [node("Constant", [], "y", field(1, "value") + field(5, tensor("w", [1], (), EXTERNAL)))],
         [],
-        "its weights lie in other files",
+        "its weights are in other files",
     ),
 }  # fmt: skip
 
@@ -167,6 +167,6 @@ def test_a_model_that_is_no_file(tmp_path, kind):
     else:
         special(path, kind)
     began = time.process_time()
-    with pytest.raises(ShareError, match=r"not a regular file|a file of this kind may have"):
+    with pytest.raises(ShareError, match=r"not a regular file|the limit for this kind is"):
         read_model(path)
     assert time.process_time() - began < 5

@@ -94,7 +94,7 @@ def reading(path: Path) -> Iterator[int]:
 
 def test_a_pipe_that_a_person_names_needs_a_reader(tmp_path):
     os.mkfifo(path := tmp_path / "poses")
-    with pytest.raises(UsageError, match="poses: is a pipe that nobody reads; give the name of a file"):
+    with pytest.raises(UsageError, match="poses: is a pipe without a reader; give the name of a file"):
         check_writable(path)
     special(socket := tmp_path / "socket", "socket")
     with pytest.raises(UsageError, match="socket: is a socket; give the name of a file"):

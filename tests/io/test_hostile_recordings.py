@@ -65,7 +65,7 @@ def test_a_chunk_is_unpacked_no_further_than_it_says(tmp_path, compression, said
     with pytest.raises(damage_errors()):
         chunk_records(Chunk(compression, data, 10, 0, 0, said))
     (tmp_path / "x.mcap").write_bytes(_chunk(compression, data, said))
-    with pytest.raises(DataError, match="holds no complete message"):
+    with pytest.raises(DataError, match="has no complete message"):
         recover_recording(tmp_path / "x.mcap", tmp_path / "y.mcap")
     with pytest.raises(ShareError):
         list(open_source(str(tmp_path / "x.mcap")).measurements())

@@ -79,7 +79,7 @@ def test_messages_are_read_as_rosbags_writes_them(frame):
     assert len(fast._intact_messages([ros.encode(message)[:-8], ros.encode(message)], "here", losses)) == 1
     losses.check("IMU messages", 2)
     assert not fast._intact_messages([ros.encode(message)[:-8]], "here", losses)
-    with pytest.raises(DataError, match="here: a message is no sensor_msgs/Imu"):
+    with pytest.raises(DataError, match="here: a message is not sensor_msgs/Imu"):
         losses.check("IMU messages", 3)
 
 

@@ -53,7 +53,7 @@ def test_a_body_that_is_not_seen_is_a_gap(
     ("text", "said"),
     [
         (TUM.replace("4 0 0 0 1", "inf 0 0 0 1"), "line 2: 'inf' is not finite"),
-        (TUM.replace("4 0 0 0 1", "4 0 0 0 2"), "pose 2: quaternion has length 2"),
+        (TUM.replace("4 0 0 0 1", "4 0 0 0 2"), "pose 2: quaternion norm is 2"),
         ("1 0 0 0 0 0 0 0\n" + TUM.replace("1.2 1 2 5 0 0 0 1", "1.2 1 2 5 0 0 0 2"), "pose 4: quaternion"),
         ("1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "the body was never seen"),
     ],

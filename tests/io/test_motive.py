@@ -89,7 +89,7 @@ def test_a_body_that_was_never_there_is_known_but_not_seen(tmp_path):
         ("0,0.000000,", "0,0.000000," + "9" * 200_000, "line 9: field larger than field limit"),
         (",1.75,", ",high,", "line 9: 'high' is not a number"),
         ("Frame,Time", "Time,Frame", "was exported without its header"),
-        ("0,0.000000,", "0,0.000000,9", "pose 1: quaternion has length"),
+        ("0,0.000000,", "0,0.000000,9", "pose 1: quaternion norm is"),
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(tmp_path, old, new, said):

@@ -78,7 +78,7 @@ def test_with_depth_the_rig_is_the_left_camera_with_depth_registered_to_it():
     rig = load_profile("d435i").rig(depth=True)
     assert rig.kind == "rgbd+imu" and rig.cam1 is None
     assert rig.depth == rig.cam0 and np.array_equal(rig.T_depth_cam0, np.eye(4))
-    with pytest.raises(ConfigError, match="profile 'euroc': its device measures no depth"):
+    with pytest.raises(ConfigError, match="profile 'euroc': the device has no depth"):
         load_profile("euroc").rig(depth=True)
 
 
@@ -112,7 +112,7 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
         (
             "range_m: [0.28, 10.0]",
             "range_m: [10.0, 0.28]",
-            "device: depth: range_m: 10, 0.28 is not near < far",
+            "device: depth: range_m: 10, 0.28: expected 0 < near < far",
         ),
         ("width: 640", "width: 0", "device: modes[0]: resolution: 0x480 is not positive"),
         ("default_mode: 640x480@30", "default_mode: 9x9", "mine.yaml: mode '9x9' is not known"),
@@ -137,14 +137,18 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
         (
             "rates_hz: [30, 15, 60, 90]",
             "rates_hz: [0, 30]",
-            "modes[0]: rates_hz: [0, 30] must be rates above 0",
+            "modes[0]: rates_hz: [0, 30]: each must be above 0",
         ),
         (
             "rates_hz: [30, 15, 60, 90]",
             "rates_hz: []",
-            "device: modes[0]: rates_hz: [] must be rates above 0",
+            "device: modes[0]: rates_hz: []: each must be above 0",
         ),
-        ("rates_hz: [200, 400]", "rates_hz: [-1, 400]", "device: imu: gyro: rates_hz: [-1, 400] must be"),
+        (
+            "rates_hz: [200, 400]",
+            "rates_hz: [-1, 400]",
+            "device: imu: gyro: rates_hz: [-1, 400]: each must be",
+        ),
         ("[[1, 0, 0, -0.00552]", "[[2, 0, 0, -0.00552]", "device: T_imu_cam0: is not a rigid transform"),
     ],
 )
@@ -184,7 +188,7 @@ def test_a_device_by_a_name_that_describes_none(name: str, tmp_path: Path):
     host = "{cpu_governor: performance, usb_autosuspend: false, usbfs_mb: 0}"
     mine.write_text(f"name: mine\ndevice: {name}\nhost: {host}\n")
     with pytest.raises(
-        ConfigError, match=f"^{mine}: device: '{name}' is no shipped profile that describes one"
+        ConfigError, match=f"^{mine}: device: '{name}' is not a shipped profile with a device"
     ):
         load_host_profile(mine)
 

@@ -58,7 +58,7 @@ def test_any_cut_is_refused_and_recovered(tmp_path):
         saved_before = len(back)
     assert result.lost_bytes < 400_000
     (tmp_path / "nothing.mcap").write_bytes(data[:60])
-    with pytest.raises(DataError, match="holds no complete message"):
+    with pytest.raises(DataError, match="has no complete message"):
         recover_recording(tmp_path / "nothing.mcap", tmp_path / "no.mcap")
     assert not list(tmp_path.glob("no.mcap*"))
 
@@ -72,7 +72,7 @@ def test_a_flipped_bit_costs_one_chunk(tmp_path):
     source = open_source(str(broken))
     read = list(source.measurements())
     (said,) = source.losses.lines()
-    assert said.startswith(f"left out, since damaged: 1 of the chunks of {broken}; the first: ")
+    assert said.startswith(f"skipped as damaged: 1 of the chunks of {broken}; the first: ")
     assert "share dataset recover" in said
     result = recover_recording(broken, tmp_path / "good.mcap")
     assert result.reason

@@ -74,7 +74,7 @@ def test_what_is_wrong_with_session_yaml(session, old, new, complaint):
 
 
 def test_unknown_and_missing_agents(session):
-    with pytest.raises(UsageError, match="has no agent 'eve'; it has ann, rob"):
+    with pytest.raises(UsageError, match="no agent 'eve'; agents: ann, rob"):
         open_source(f"{session}/eve")
     (session / "rob.mcap").unlink()
     with pytest.raises(UsageError, match=r"rob\.mcap: no such file, although"):

@@ -51,7 +51,7 @@ def test_a_file_that_was_cut_off_meanwhile_is_said(tmp_path: Path) -> None:
     spool = Spool(tmp_path / "x.partial", print)
     spool.write("one")
     os.truncate(tmp_path / "x.partial", 2)
-    with pytest.raises(ShareError, match="somebody cut it off"):
+    with pytest.raises(ShareError, match="was truncated by another process"):
         list(spool.read())
     spool.close()
 

@@ -82,7 +82,7 @@ def test_a_device_that_says_what_is_no_serial_number_costs_a_line_each_time() ->
     run.save(LEARNT)
     assert run.bias is None
     assert len(said) == 2
-    assert all("is no serial number" in line for line in said)
+    assert all("not a valid serial number" in line for line in said)
 
 
 def test_a_folder_that_cannot_be_made_does_not_end_the_run(

@@ -146,7 +146,9 @@ def test_what_a_power_cut_left_is_not_overwritten(tmp_path: Path) -> None:
     part, out = tmp_path / "a.mcap.part", tmp_path / "a.mcap"
     part.write_bytes(b"dear")
     run = Capture(CameraFeed(_never, None, WANTED.rates_hz(), 10.0, print, SampleQueue()), out, 0.0, print)
-    with pytest.raises(UsageError, match=rf"a\.mcap\.part: is left .* recover {part} --out {out}`, or give"):
+    with pytest.raises(
+        UsageError, match=rf"a\.mcap\.part: belongs to .* recover {part} --out {out}`, or give"
+    ):
         run.run()
     assert part.read_bytes() == b"dear"
 
@@ -154,7 +156,7 @@ def test_what_a_power_cut_left_is_not_overwritten(tmp_path: Path) -> None:
 def test_of_two_recordings_of_one_name_the_second_is_refused(tmp_path: Path) -> None:
     rig = WANTED.profile.rig()
     with Recorder(tmp_path / "a.mcap", rig, durable=True) as first:
-        with pytest.raises(UsageError, match="or one is going on there"):
+        with pytest.raises(UsageError, match="or is still running"):
             Recorder(tmp_path / "a.mcap", rig, durable=True)
         first.write(Measurement("imu", 10**9, np.zeros(6)))
     assert len(read_imu(str(tmp_path / "a.mcap")).imu.stamps_ns) == 1

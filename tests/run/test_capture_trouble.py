@@ -115,7 +115,7 @@ def test_what_tells_distance_too_and_never_comes_costs_one_reset_and_the_rest_go
     assert bench.said[-1] == f"{missing}: still silent; DEGRADED: goes on without"
     assert bench.report["health"] == "DEGRADED"
     source, counters = open_source(str(tmp_path / "a.mcap")), SequencerCounters()
-    assert source.notes == (f"has no images of {missing}: done without",)
+    assert source.notes == (f"has no images of {missing}: continuing without",)
     assert source.rig.kind == ("stereo+imu" if missing == "depth" else "mono+imu")
     frames = list(read_frames(source, Config(), counters))
     assert len(frames) >= bench.report["streams"]["cam0"]["samples"] - 2  # a pair cut by the reset

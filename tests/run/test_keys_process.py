@@ -98,7 +98,7 @@ def test_one_line_each(tmp_path: Path) -> None:
         ),
         (
             ("agent", "x", "--name", "a", "--kind", "ar", "--edge", "tcp://127.0.0.1:1", "--keys", "k"),
-            "--keys: goes with --server-key",
+            "--keys needs --server-key",
         ),
         (("keys", "authorize", "ann", "nothing", "--keys", str(tmp_path)), "neither a file nor a public key"),
         (("keys", "revoke", "ann", "--keys", str(tmp_path)), "'ann' is not authorized; there is nobody"),

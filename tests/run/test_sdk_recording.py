@@ -148,4 +148,4 @@ def test_a_file_that_is_none_is_said_in_a_line(share: Callable[..., Done], tmp_p
     for name in ("a.db3", "b.db3"):
         done = share("dataset", "info", tmp_path / name)
         assert (done.code, done.out, done.err.count("\n")) == (1, "", 1)
-        assert "no recording of the RealSense SDK" in done.err
+        assert "not a recording of the RealSense SDK" in done.err

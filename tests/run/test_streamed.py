@@ -159,15 +159,15 @@ def test_who_does_not_fit_is_told_so(plain_session: Path, tmp_path: Path) -> Non
 BAD = {
     "a map": (
         ("edge", "--policy", "streamed", "--map", "room.sqlite"),
-        "--map: there is none by policy streamed; leave it out, or take another policy",
+        "--map: policy streamed builds no map; leave it out, or choose another policy",
     ),
     "an error to tell": (
         ("agent", "x", "--name=a", "--kind=ar", "--edge=tcp://127.0.0.1:1", "--streamed", "--true-error"),
-        "--true-error: is of an agent that tracks itself; leave out --streamed, or this",
+        "--true-error does not go with --streamed, where the edge tracks; leave out one",
     ),
     "errors to tell": (
         ("demo", "--policy", "streamed", "--true-error", "--out", "out"),
-        "--true-error: is of agents that track themselves; leave it out by policy streamed",
+        "--true-error does not go with --policy streamed, where the edge tracks; leave out one",
     ),
 }  # fmt: skip
 
@@ -191,7 +191,7 @@ def test_the_whole_demo(plain_cache: Path, tmp_path: Path) -> None:
         env={**os.environ, "XDG_CACHE_HOME": str(plain_cache)},
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert "each tracked alone by the edge; frames without an answer: ar1 " in done.stdout
+    assert "the edge tracked each agent alone; frames without an answer: ar1 " in done.stdout
     for name in ("ar1", "ar2", "robot"):
         report = report_of(tmp_path, name)
         assert report["frames"] + report["untracked"] == FRAMES

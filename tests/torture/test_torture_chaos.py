@@ -329,7 +329,7 @@ def test_read_only_map(tmp_path: Path, results: Path) -> None:
         remount("ro")
         room.restart_edge()
         time.sleep(5.0)
-        result.expect("nothing new is kept" in room.edge.said, f"not said: {room.edge.said[-300:]}")
+        result.expect("nothing new is stored" in room.edge.said, f"not said: {room.edge.said[-300:]}")
         room.honest.finish()
         room.strays += harness.family(room.edge.process.pid)
         code = room.edge.interrupt()

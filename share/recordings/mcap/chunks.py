@@ -1,7 +1,7 @@
-"""Chunks of an MCAP file, and its summary, read so that no declared size is believed.
+"""Read the chunks and the summary of an untrusted MCAP file: every declared size and offset is checked.
 
-A few kilobytes of zstd or lz4 can stand for gigabytes, a record may claim to be longer than its file, and an
-index may lead anywhere, many times: all of it is bounded by what the file itself has.
+A few kilobytes of zstd or lz4 can unpack to gigabytes, a record may claim to be longer than its file, and an
+index may point anywhere, many times. The file's own size bounds all of it.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import IO, Any
 
 from share.files.reading import MB
 
-MAX_CHUNK_BYTES = 128 * MB  # unpacked; writers close one at 0.2 to 4 MB, or behind a single image
-MAX_HELD_BYTES = 4 * MAX_CHUNK_BYTES  # of messages of chunks that overlap in time
-_MAX_WINDOW_LOG2 = 27  # log2 of what zstd looks back
-_RECORD_HEAD_BYTES = 1 + 8  # bytes of a record's head: opcode, length
+MAX_CHUNK_BYTES = 128 * MB  # unpacked; writers close a chunk at 0.2 to 4 MB, or after a single image
+MAX_HELD_BYTES = 4 * MAX_CHUNK_BYTES  # messages in memory of chunks that overlap in time
+_MAX_WINDOW_LOG2 = 27  # zstd window, log2 of bytes
+_RECORD_HEAD_BYTES = 1 + 8  # opcode, length
 
 
 class BoundedFile:
-    """A file that is asked for no more than it has: Python reserves what is asked for beforehand."""
+    """A file whose reads are limited to what is left: Python allocates the size asked for beforehand."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -32,7 +32,7 @@ class BoundedFile:
 
 
 def chunk_records(chunk: Any) -> list[Any]:
-    """The records in a chunk. Raises what `share.recordings.mcap.file.damage` lists."""
+    """Return the records in a chunk. Raises the errors in `share.recordings.mcap.file.damage_errors`."""
     from mcap.records import Chunk
     from mcap.stream_reader import CRCValidationError, breakup_chunk
 
@@ -44,12 +44,12 @@ def chunk_records(chunk: Any) -> list[Any]:
 
 
 def _decompress(chunk: Any) -> bytes:
-    """Of the size that the chunk says, and no byte more while it is unpacked."""
+    """Unpack a chunk to exactly its declared size; never hold more than that."""
     from mcap.exceptions import McapError, UnsupportedCompressionError
 
     declared_size = chunk.uncompressed_size
     if declared_size > MAX_CHUNK_BYTES:
-        raise McapError(f"a chunk of {declared_size / MB:,.0f} MB, more than {MAX_CHUNK_BYTES / MB:g}")
+        raise McapError(f"a chunk has {declared_size / MB:,.0f} MB, the limit is {MAX_CHUNK_BYTES / MB:g}")
     match chunk.compression:
         case "zstd":
             data = _decompress_zstd(chunk.data, declared_size)
@@ -62,7 +62,7 @@ def _decompress(chunk: Any) -> bytes:
         case other:
             raise UnsupportedCompressionError(other)
     if len(data) != declared_size:
-        raise McapError(f"a chunk has not the {declared_size} bytes that it says")
+        raise McapError(f"a chunk does not unpack to its declared {declared_size} bytes")
     return data
 
 
@@ -75,13 +75,15 @@ def _decompress_zstd(data: bytes, declared_size: int) -> bytes:
         head.content_size not in (declared_size, zstandard.CONTENTSIZE_UNKNOWN)
         or head.window_size > 1 << _MAX_WINDOW_LOG2
     ):
-        raise McapError(f"a chunk of {declared_size} bytes says inside that it has {head.content_size}")
+        raise McapError(f"a chunk declares {declared_size} bytes, its zstd frame {head.content_size}")
     return zstandard.ZstdDecompressor().decompress(data, max_output_size=declared_size + 1)
 
 
 def read_summary(file: IO[bytes]) -> Any | None:
-    """The summary at the end, None where it has none. Raises what `damage` lists; McapError also for chunks
-    that overlap in the file or lie outside it."""
+    """Return the summary at the end of a file; None if it has none.
+
+    Raises the errors in `damage_errors`; McapError also for chunks that overlap or lie outside the file.
+    """
     from mcap.exceptions import McapError
     from mcap.reader import FOOTER_SIZE
     from mcap.records import Footer
@@ -101,7 +103,7 @@ def read_summary(file: IO[bytes]) -> Any | None:
 
 
 def _records(file: IO[bytes]) -> Any:
-    """From where `file` is, chunks as they are."""
+    """Iterate over the records from the position of `file`; chunks are not unpacked."""
     from mcap.stream_reader import StreamReader
 
     return StreamReader(BoundedFile(file), skip_magic=True, emit_chunks=True, record_size_limit=2**30).records
@@ -128,7 +130,7 @@ def _collect_summary(records: Any) -> Any:
 
 
 def _check_index_offsets(summary: Any, size: int) -> None:
-    """So that reading all of it is reading the file once."""
+    """Raise McapError unless reading all chunks reads each byte of the file at most once."""
     from mcap.exceptions import McapError
 
     end = 0
@@ -137,10 +139,10 @@ def _check_index_offsets(summary: Any, size: int) -> None:
         after = index + chunk.message_index_length
         offsets = chunk.message_index_offsets
         if chunk.chunk_start_offset < end or after > size or chunk.chunk_length < _RECORD_HEAD_BYTES:
-            raise McapError("its index leads out of the file, or to one chunk twice")
+            raise McapError("its index points out of the file, or to one chunk twice")
         if (
             any(not index <= offset < after for offset in offsets.values())
             or offsets.keys() - summary.channels
         ):
-            raise McapError("its index leads to no messages of its chunks")
+            raise McapError("its index points to messages outside of its chunks")
         end = after

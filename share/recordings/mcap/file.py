@@ -1,4 +1,4 @@
-"""One MCAP file, read by its index: never more than a few chunks in memory."""
+"""Read an MCAP file by its index, with only a few chunks in memory."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _INDEX_HEADER = struct.Struct("<HI")  # channel id, bytes of entries
 
 
 class Topic(NamedTuple):
-    """kind: ROS message type, e.g. sensor_msgs/msg/Image."""
+    """A topic. kind: ROS message type, e.g. sensor_msgs/msg/Image. channels: their ids."""
 
     name: str
     kind: str
@@ -33,7 +33,7 @@ class Topic(NamedTuple):
 
 
 def damage_errors() -> tuple[type[Exception], ...]:
-    """What the mcap library raises on a damaged file, and the system on a damaged disk."""
+    """Return the exceptions that the mcap library raises on a damaged file, and the system on a bad disk."""
     import zstandard
     from mcap.exceptions import McapError
     from mcap.stream_reader import CRCValidationError
@@ -44,7 +44,7 @@ def damage_errors() -> tuple[type[Exception], ...]:
 
 
 def check_magic(path: Path) -> None:
-    """Raises UsageError for a file that cannot be read, DataError for one that is no MCAP."""
+    """Raise UsageError if a file cannot be read, DataError if it is not an MCAP file."""
     try:
         with open_regular(path) as file:
             head = file.read(len(MAGIC))
@@ -55,7 +55,7 @@ def check_magic(path: Path) -> None:
 
 
 class McapFile:
-    """Opened anew for every pass. Raises DataError if it was not closed in good order or is damaged."""
+    """An MCAP file; every pass opens it again. Raises DataError if damaged or not closed properly."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -64,7 +64,7 @@ class McapFile:
 
     @cached_property
     def topics(self) -> dict[str, Topic]:
-        """By name; only those in CDR."""
+        """Topics by name, those in CDR encoding only."""
         topics: dict[str, Topic] = {}
         for channel in self._summary.channels.values():
             schema = self._summary.schemas.get(channel.schema_id)
@@ -76,7 +76,7 @@ class McapFile:
 
     @cached_property
     def log_times(self) -> dict[str, I64]:
-        """Stamps (N,) ns of each topic's messages as logged, in order; read from the index alone."""
+        """Sorted log times (N,) ns of each topic's messages, read from the index alone."""
         per_channel: dict[int, list[I64]] = {}
         with open_regular(self.path) as file:
             for chunk in self._summary.chunk_indexes:
@@ -90,12 +90,12 @@ class McapFile:
         }
 
     def metadata(self, name: str) -> dict[str, str]:
-        """The metadata record `name`, or {}."""
+        """Return the metadata record `name`, or {}."""
         return dict(self._metadata.get(name, {}))
 
     @cached_property
     def _metadata(self) -> dict[str, dict[str, str]]:
-        """By name; of several the last."""
+        """Metadata records by name; the last of several."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Metadata
 
@@ -114,11 +114,15 @@ class McapFile:
         end_ns: int | None = None,
         losses: DataLosses | None = None,
     ) -> Iterator[tuple[str, int, bytes]]:
-        """(topic, log time, CDR bytes) in order of log time, within [start_ns, end_ns). losses: takes chunks
-        that are damaged. Raises DataError where that is not given, or more than 5 % are."""
+        """Yield (topic, log time, CDR bytes) in order of log time, within [start_ns, end_ns).
+
+        losses: gets damaged chunks. Raises DataError if losses is None, or more than 5 % are damaged.
+        """
         channels = {id: name for name in topics if name in self.topics for id in self.topics[name].channels}
         lo, hi = start_ns or 0, 2**64 if end_ns is None else end_ns
-        waiting: list[tuple[int, int, int, Any]] = [  # by time, then where it stands in the file
+        waiting: list[
+            tuple[int, int, int, Any]
+        ] = [  # chunks and messages, by time, then by place in the file
             (chunk.message_start_time, chunk.chunk_start_offset, -1, chunk)
             for chunk in self._summary.chunk_indexes
             if chunk.message_end_time >= lo
@@ -139,12 +143,12 @@ class McapFile:
                         held_bytes += len(message.data)
                         heapq.heappush(waiting, (message.log_time, place, k, message))
                 if held_bytes > MAX_HELD_BYTES:
-                    raise self._damaged_error("too many of its chunks are of one time")
+                    raise self._damaged_error("too many of its chunks overlap in time")
 
     def _chunk_messages(
         self, file: IO[bytes], index: Any, losses: DataLosses | None, total: int
     ) -> Iterator[tuple[int, Any]]:
-        """Messages of a chunk and their places in it."""
+        """Yield the messages of a chunk, each with its index in it."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Chunk, Message
 
@@ -165,8 +169,8 @@ class McapFile:
         with open_regular(self.path) as file:
             try:
                 return read_summary(file)
-            except damage_errors():  # OSError: it is shorter than a footer
-                raise self._damaged_error("it has no end") from None
+            except damage_errors():  # OSError: the file is shorter than a footer
+                raise self._damaged_error("its end is missing") from None
 
     def _check_index(self) -> None:
         summary = self._summary
@@ -175,19 +179,19 @@ class McapFile:
 
     def _damaged_error(self, reason: str) -> DataError:
         return DataError(
-            f"{self.path}: is damaged or was not closed in good order ({reason}); "
+            f"{self.path}: is damaged or was not closed properly ({reason}); "
             f"try `share dataset recover {self.path} --out GOOD.mcap`"
         )
 
     def _read_index(self, file: IO[bytes], offset: int) -> I64:
-        """Log times of one MessageIndex record (MCAP specification, op 0x07)."""
+        """Read the log times of a MessageIndex record (MCAP specification, op 0x07)."""
         file.seek(offset)
         head = file.read(_RECORD_HEADER.size + _INDEX_HEADER.size)
         try:
             opcode, _ = _RECORD_HEADER.unpack_from(head)
             _, size = _INDEX_HEADER.unpack_from(head, _RECORD_HEADER.size)
         except struct.error:
-            raise self._damaged_error("its index ends too soon") from None
+            raise self._damaged_error("its index is cut short") from None
         data = BoundedFile(file).read(size)
         if opcode != _MESSAGE_INDEX or len(data) != size or size % 16:
             raise self._damaged_error("its index is wrong")
@@ -198,7 +202,7 @@ _NO_TIMES = np.zeros(0, np.int64)
 
 
 def _may_have_messages(chunk: Any, channels: Mapping[int, str]) -> bool:
-    """Whether a chunk may have messages of these; one without an index may have any."""
+    """Return whether a chunk may have messages of `channels`; one without an index may have any."""
     return not chunk.message_index_offsets or any(id in channels for id in chunk.message_index_offsets)
 
 

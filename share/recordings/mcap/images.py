@@ -1,4 +1,4 @@
-"""Images in ROS 2 messages: `sensor_msgs/Image` and `CompressedImage`, to lazy images and back."""
+"""Convert ROS 2 messages `sensor_msgs/Image` and `CompressedImage` to lazy images and back."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from share.recordings.mcap import ros_messages as ros
 from share.types import F32
 
 MILLIMETRES = 1000.0  # 16UC1 depth is in mm, 32FC1 in m: ROS REP 118
-_CONFIG_HEADER = 12  # bytes of compressed_depth_image_transport's ConfigHeader before the PNG
-_MAX_DEPTH_M = 1e4  # m; no depth camera reads as far
+_MAX_DEPTH_M = 1e4  # beyond any depth camera
 _TO_GRAY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
     "8UC3": cv2.COLOR_BGR2GRAY,
@@ -32,7 +31,7 @@ _DEPTH_TYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawImage:
-    """A `sensor_msgs/Image`; converted when loaded."""
+    """A `sensor_msgs/Image`, converted when loaded."""
 
     message: Any
     where: str
@@ -70,7 +69,7 @@ class RawImage:
         return np.where((metres > 0) & (metres < _MAX_DEPTH_M), metres, np.float32(0))
 
     def _pixels(self, dtype: str, channels: int) -> NDArray[Any]:
-        """(H, W, channels) without the padding at the end of rows. DataError if data is missing."""
+        """Return (H, W, channels) without the padding of rows. Raises DataError if data is missing."""
         height, width, step = self.message.height, self.message.width, self.message.step
         row = width * channels * np.dtype(dtype).itemsize
         data = np.ascontiguousarray(self.message.data)
@@ -81,26 +80,26 @@ class RawImage:
 
 
 def decode_compressed(message: Any, where: str, camera: Camera, is_depth: bool) -> EncodedImage:
-    """A `CompressedImage`: JPEG or PNG; depth is a PNG, behind a header where its format says so."""
+    """Convert a `CompressedImage`: JPEG or PNG; depth is a PNG, after a header if its format says so."""
     data = message.data.tobytes()
     if is_depth:
         if "rvl" in message.format.lower():
             raise DataError(f"{where}: RVL depth is not supported; record depth as PNG or raw")
         if "compressedDepth" in message.format:
-            data = data[_CONFIG_HEADER:]
+            data = data[ros.DEPTH_HEADER_BYTES :]
     return EncodedImage(data, where, camera.width, camera.height, MILLIMETRES if is_depth else 0.0)
 
 
 def encode_compressed(header: Any, data: bytes, is_depth: bool) -> Any:
-    """JPEG or PNG bytes as they are. A 16-bit PNG of depth in mm gets image_transport's header."""
+    """Make a `CompressedImage` of JPEG or PNG bytes; depth (16-bit PNG, mm) gets image_transport's header."""
     kind = "png" if image_format(data) == "png" else "jpeg"
     if is_depth:
-        data, kind = bytes(_CONFIG_HEADER) + data, "16UC1; compressedDepth png"
+        data, kind = bytes(ros.DEPTH_HEADER_BYTES) + data, "16UC1; compressedDepth png"
     return ros.make_message(ros.COMPRESSED, header=header, format=kind, data=np.frombuffer(data, np.uint8))
 
 
 def encode_raw(header: Any, image: NDArray[Any]) -> Any:
-    """(H, W) uint8 -> mono8; float32 m -> 16UC1 in mm where that loses nothing, else 32FC1."""
+    """Make an `Image`: (H, W) uint8 as mono8; float32 m as 16UC1 mm if that is exact, else 32FC1."""
     if image.dtype == np.uint8:
         encoding = "mono8"
     else:

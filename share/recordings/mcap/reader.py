@@ -1,7 +1,7 @@
-"""MCAP recordings with ROS 2 messages, ours and others', as a Source.
+"""Read MCAP recordings with ROS 2 messages, ours and others', as a Source.
 
-Which topic is which stream is told by the calibration's `rostopic`, else by the topic's name. The
-rig is our own record of it, else CameraInfo and /tf_static; --calib goes before both.
+The calibration's `rostopic` assigns topics to streams, else the topics' names do. The rig comes from --calib,
+else from our own record in the file, else from CameraInfo and /tf_static.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from share.recordings.mcap import images as ros_images
 from share.recordings.mcap import rig as ros_rig
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.file import McapFile, damage_errors
-from share.recordings.recording import Source, Span, select_span
+from share.recordings.recording import UNBOUNDED_NS, Source, Span, select_span
 from share.recordings.trajectory import Trajectory, read_tum
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, STREAMS, Measurement
 from share.types import F64, I64
 
 _IMAGE_TYPES = (ros.IMAGE, ros.COMPRESSED)
-_TOPIC_HINTS = {  # parts of a topic's name; earlier ones are better
+_TOPIC_HINTS = {  # parts of a topic's name, best first
     CAM0: ("/cam0/", "/infra1/", "/left/", "/color/", "/rgb/", "/camera/image"),
     CAM1: ("/cam1/", "/infra2/", "/right/"),
     DEPTH: ("/depth/", "depth_to_color/", "depth_registered/"),
 }
-_MAX_SKEW_NS = 2 * 10**9  # log times and header stamps of a part that is read differ by less
+_MAX_SKEW_NS = 2 * 10**9  # between log times and header stamps, when only a part is read
 
 
 def open_mcap(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
-    """The recording in `path`. Raises UsageError, DataError, ConfigError."""
+    """Open the recording in `path`. Raises UsageError, DataError, ConfigError."""
     file = McapFile(path)
     topics = find_topics(file, calibration.topics if calibration else {})
     own = own_rig(file, topics, calibration is None)
@@ -48,7 +48,7 @@ def open_mcap(path: Path, calibration: Calibration | None, frames: slice | None)
 
 
 class McapSource(Source):
-    """The streams of `topics` (stream -> topic) that the rig has."""
+    """An MCAP recording with those streams of `topics` (stream -> topic) that the rig has."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class McapSource(Source):
     ) -> None:
         rig = calibration.rig if calibration else own
         if rig is None:
-            raise ConfigError(f"{file.path}: carries no calibration; give one with --calib")
+            raise ConfigError(f"{file.path}: contains no calibration; give one with --calib")
         recorded_rig = rig if calibration else _recorded_rig(rig, topics)
         self.name, self.rig = file.path.stem, _fit_rig(recorded_rig, topics, file.path)
         self._file, self._own, self.serial = file, own, own_serial(file)
@@ -70,13 +70,15 @@ class McapSource(Source):
         self._topics = {s: topics[s] for s in used}
         self.notes = tuple(
             f"{topics[s]} is not used: the calibration has no {s}" for s in topics if s not in used
-        ) + tuple(f"has no images of {s}: done without" for s in ros_rig.rig_cameras(rig) if s not in cameras)
+        ) + tuple(
+            f"has no images of {s}: continuing without" for s in ros_rig.rig_cameras(rig) if s not in cameras
+        )
         if calibration and (warning := device_mismatch(calibration.serials, self.serial)):
             self.notes += (warning,)
         self._span = self._find_span(frames)
 
     def stamps(self) -> dict[str, I64]:
-        """Log times, which are the stamps in our recordings and near them in others'."""
+        """Return log times, which equal the stamps in our recordings and are close to them in others'."""
         out = {}
         for stream in (s for s in STREAMS if s in self._topics):
             times, (lo, hi) = self._file.log_times[self._topics[stream]], self._span.limits(stream)
@@ -100,7 +102,7 @@ class McapSource(Source):
                     if stream == IMU
                     else self._image(message, topic, stamp, cameras[stream], stream)
                 )
-            except DataError as error:  # it costs itself
+            except DataError as error:  # skip this message only
                 self.losses.add(f"messages of {topic}", str(log_ns), str(error))
                 continue
             yield Measurement(stream, stamp, payload)
@@ -119,7 +121,7 @@ class McapSource(Source):
 
     @cached_property
     def _T_recorded_body(self) -> F64:
-        """From our body to the recording's: they differ where only one of the two has an IMU."""
+        """Pose (4, 4) of our body in the recording's: they differ if only one of the two rigs has an IMU."""
         own = self._own
         if own is None or (own.imu is None) == (self.rig.imu is None):
             return np.eye(4)
@@ -127,14 +129,11 @@ class McapSource(Source):
 
     @property
     def _log_range(self) -> tuple[int | None, int | None]:
-        first, last = (
-            min(self._span.imu_from, self._span.image_from),
-            max(self._span.imu_to, self._span.image_to),
-        )
-        unbounded = 2**62
+        first = min(self._span.imu_from, self._span.image_from)
+        last = max(self._span.imu_to, self._span.image_to)
         return (
-            None if first <= -unbounded else max(0, first - _MAX_SKEW_NS),
-            None if last >= unbounded else last + _MAX_SKEW_NS,
+            None if first <= -UNBOUNDED_NS else max(0, first - _MAX_SKEW_NS),
+            None if last >= UNBOUNDED_NS else last + _MAX_SKEW_NS,
         )
 
     def _find_span(self, frames: slice | None) -> Span:
@@ -145,7 +144,7 @@ class McapSource(Source):
         return select_span(stamps, frames, str(self._file.path), self.rig.timeshift_ns)
 
     def _header_stamps(self) -> I64:
-        """Of cam0; one pass over its messages that decodes nothing but the stamp."""
+        """Return cam0's sorted header stamps (N,) ns, by one pass that decodes nothing else."""
         messages = self._file.messages([self._topics[CAM0]], losses=self.losses)
         heads = (data[4:12] for _, _, data in messages if len(data) >= 12)
         pairs = np.frombuffer(b"".join(heads), "<u4").reshape(-1, 2).astype(np.int64)
@@ -159,7 +158,7 @@ class McapSource(Source):
 
 
 def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
-    """Stream -> topic: as `named` (with or without image_transport's suffix), else by name.
+    """Return the topic of each stream: as `named` (with or without image_transport's suffix), else by hints.
 
     Raises ConfigError if a named topic is missing, or if there is no cam0.
     """
@@ -178,7 +177,7 @@ def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
     if CAM0 not in by_stream:
         images = [name for name, kind in topics.items() if kind in _IMAGE_TYPES]
         raise ConfigError(
-            f"{file.path}: no topic is known to be cam0 (image topics: {', '.join(images) or 'none'}); "
+            f"{file.path}: cannot tell which topic is cam0 (image topics: {', '.join(images) or 'none'}); "
             "name it as `rostopic` in a camchain file and give that with --calib"
         )
     return by_stream
@@ -188,11 +187,12 @@ def _named_topic(name: str, candidates: list[str], file: McapFile) -> str:
     for topic in (name, *(name + suffix for suffix in ros.SUFFIXES)):
         if topic in candidates:
             return topic
-    raise ConfigError(f"{file.path}: has no topic {name} as the calibration names it; it has {candidates}")
+    known = ", ".join(candidates) or "none"
+    raise ConfigError(f"{file.path}: has no topic {name}, which the calibration names; topics: {known}")
 
 
 def guess_topic(stream: str, candidates: list[str]) -> str | None:
-    """The shortest candidate with the best hint; for an IMU the only one, or one named imu."""
+    """Return the shortest candidate with the best hint; for an IMU one named imu, or the shortest."""
     if stream == IMU:
         return min(
             candidates, key=lambda name: (not name.endswith(("/imu0", "/imu")), len(name), name), default=None
@@ -207,7 +207,7 @@ def guess_topic(stream: str, candidates: list[str]) -> str | None:
 
 
 def own_rig(file: McapFile, topics: dict[str, str], needed: bool) -> Rig | None:
-    """The rig that the recording carries in our record, else (if `needed`) in CameraInfo, else None."""
+    """Return the rig in our record of the file, else (if `needed`) that of CameraInfo; None if unknown."""
     record = _rig_record(file)
     if "rig" in record:
         return ros_rig.rig_from_json(record["rig"], str(file.path))
@@ -215,12 +215,12 @@ def own_rig(file: McapFile, topics: dict[str, str], needed: bool) -> Rig | None:
 
 
 def own_serial(file: McapFile) -> str | None:
-    """Of the device, where the recording knows it."""
+    """Return the device's serial number; None if unknown."""
     return _rig_record(file).get("serial")
 
 
 def _rig_record(file: McapFile) -> dict[str, str]:
-    """What we wrote of the device; empty where it is another's recording, or damaged."""
+    """Return our metadata record of the device; empty for other recordings, or if damaged."""
     try:
         return file.metadata(ros.RIG_RECORD)
     except damage_errors():
@@ -228,14 +228,17 @@ def _rig_record(file: McapFile) -> dict[str, str]:
 
 
 def _rig_from_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
-    """From CameraInfo and /tf_static. An IMU cannot be: no message says how noisy it is."""
+    """Return the rig of CameraInfo and /tf_static, None without cam0's CameraInfo.
+
+    Raises ConfigError for a recording with an IMU, whose noise no message states.
+    """
     infos: dict[str, Any] = {s: _camera_info(file, topics[s]) for s in (CAM0, CAM1, DEPTH) if s in topics}
     if infos[CAM0] is None:
         return None
     if IMU in topics:
         raise ConfigError(
-            f"{file.path}: {topics[IMU]} comes without the IMU's noise and extrinsics; "
-            "give a folder with both Kalibr chains with --calib, or a camchain alone to do without the IMU"
+            f"{file.path}: noise and extrinsics of IMU {topics[IMU]} are missing; give a folder with both "
+            "Kalibr chains with --calib, or only a camchain to track without the IMU"
         )
     missing = [topics[s] for s, info in infos.items() if info is None]
     if missing:
@@ -246,13 +249,13 @@ def _rig_from_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
     cams = {s: ros_rig.from_camera_info(info, f"{where}: {topics[s]}") for s, info in infos.items()}
     T = {s: tree.find(info.header.frame_id, infos[CAM0].header.frame_id) for s, info in infos.items()}
     if any(pose is None for pose in T.values()):
-        raise ConfigError(f"{where}: /tf_static does not say where the cameras sit; give --calib")
+        raise ConfigError(f"{where}: /tf_static lacks the extrinsics of the cameras; give --calib")
     with config_errors(where):
         return Rig(cams[CAM0], np.eye(4), cams.get(CAM1), T.get(CAM1), cams.get(DEPTH), T.get(DEPTH))
 
 
 def _camera_info(file: McapFile, topic: str) -> Any | None:
-    """The first CameraInfo beside an image topic."""
+    """Return the first CameraInfo of an image topic; None if there is none."""
     for suffix in ros.SUFFIXES:
         topic = topic.removesuffix(suffix)
     name = topic.rpartition("/")[0] + "/camera_info"
@@ -263,8 +266,8 @@ def _camera_info(file: McapFile, topic: str) -> Any | None:
 
 
 def _recorded_rig(rig: Rig, topics: dict[str, str]) -> Rig:
-    """The rig that a recording carries, less a partner of cam0 that a broken camera never delivered, if
-    something else that was recorded tells how far things are."""
+    """Return the rig without a partner of cam0 that was never recorded (broken camera), if another stream
+    that gives scale was."""
     recorded = [s for s in (CAM1, DEPTH, IMU) if s in topics]
     if CAM1 not in topics and recorded:
         rig = replace(rig, cam1=None, T_cam1_cam0=None)
@@ -274,11 +277,11 @@ def _recorded_rig(rig: Rig, topics: dict[str, str]) -> Rig:
 
 
 def _fit_rig(rig: Rig, topics: dict[str, str], path: Path) -> Rig:
-    """The rig, less the IMU where none was recorded. ConfigError if it wants a camera that is missing."""
+    """Return the rig, without the IMU if none was recorded. Raises ConfigError if a camera is missing."""
     for stream in ros_rig.rig_cameras(rig):
         if stream not in topics:
             raise ConfigError(
-                f"{path}: the calibration has {stream}, the recording has not; give another --calib"
+                f"{path}: the calibration has {stream}, the recording does not; give another --calib"
             )
     if rig.imu and IMU not in topics:
         return rig.without_imu()
@@ -286,10 +289,10 @@ def _fit_rig(rig: Rig, topics: dict[str, str], path: Path) -> Rig:
 
 
 def _decode(file: McapFile, data: bytes, kind: str, topic: str) -> Any:
-    """Raises DataError."""
+    """Decode a message. Raises DataError."""
     try:
         return ros.decode(data, kind)
-    except Exception as error:  # rosbags raises many kinds on bytes that are no such message
+    except Exception as error:  # rosbags raises many kinds on invalid bytes
         raise DataError(f"{file.path}: {topic}: a message cannot be read ({error})") from None
 
 
@@ -297,12 +300,12 @@ def _imu_values(message: Any, where: str) -> tuple[float, ...]:
     w, a = message.angular_velocity, message.linear_acceleration
     values = (w.x, w.y, w.z, a.x, a.y, a.z)
     if not math.isfinite(sum(values)):
-        raise DataError(f"{where}: the sample is not finite")
+        raise DataError(f"{where}: the sample has values that are not finite")
     return values
 
 
 def truth_path(recording: Path) -> Path | None:
-    """truth/NAME.tum of a session, or NAME.truth.tum beside the recording."""
+    """Return truth/NAME.tum of a session, or NAME.truth.tum beside the recording; None if neither exists."""
     beside = recording.with_name(recording.stem + ".truth.tum")
     paths = (recording.parent / "truth" / f"{recording.stem}.tum", beside)
     return next((path for path in paths if path.is_file()), None)

@@ -1,9 +1,8 @@
-"""Recordings as MCAP with ROS 2 messages: Foxglove, rosbags and ROS 2 open them as they are.
+"""Write MCAP recordings with ROS 2 messages, which Foxglove, rosbags and ROS 2 open as they are.
 
-Topics are those of `share.recordings.mcap.ros_messages.TOPICS`. The file grows under a temporary name
-(`.part`) in
-chunks of at most 256 kB (or one image), and gets its name when it is closed in good order. What a
-crash leaves in the `.part`, `share.recordings.mcap.recover` brings back.
+Topics are those of `share.recordings.mcap.ros_messages.TOPICS`. The file grows as NAME.part, in chunks of at
+most 256 kB (or one image), and gets its name when it is closed. After a crash,
+`share.recordings.mcap.recover` recovers the `.part`.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from share.sensors.measurement import DEPTH, IMU, Measurement
 from share.types import F64
 
 CHUNK_BYTES = 256 * 1024
-_FLUSH_PERIOD_NS = 10**9  # a crash costs at most this much
+_FLUSH_PERIOD_NS = 10**9  # a crash loses at most this much
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"
-_LATCHED = {  # transient local, so that a player hands it to those who come later
+_LATCHED = {  # transient local: a player sends it to late subscribers too
     "offered_qos_profiles": "- {history: 1, depth: 1, reliability: 1, durability: 1, "
     f"deadline: {_FOREVER}, lifespan: {_FOREVER}, liveliness: 1, "
     f"liveliness_lease_duration: {_FOREVER}, avoid_ros_namespace_conventions: false}}\n"
@@ -37,14 +36,14 @@ _LATCHED = {  # transient local, so that a player hands it to those who come lat
 
 
 def part_path(path: Path) -> Path:
-    """The name under which the recording `path` grows."""
+    """Return the name of recording `path` while it grows."""
     return path.with_name(path.name + ".part")
 
 
 def leftover_error(part: Path) -> UsageError:
-    """For who would overwrite the `.part` of another recording."""
+    """Return the error for a recording that would overwrite another one's `.part`."""
     return UsageError(
-        f"{part}: is left of a recording that was cut off (or one is going on there); save it with "
+        f"{part}: belongs to a recording that was cut off, or is still running; recover it with "
         f"`share dataset recover {part} --out {part.with_suffix('')}`, or give a new name"
     )
 
@@ -52,9 +51,10 @@ def leftover_error(part: Path) -> UsageError:
 class Recorder:
     """Writes measurements to an MCAP file. Context manager; an exception inside leaves the `.part`.
 
-    jpeg: quality to which gray images are compressed; None keeps encoded images byte for byte and
-    raw ones raw. durable: of what cannot be made again: survives a power cut, at the price of one fdatasync
-    a second, and overwrites no `.part`. serial: of the device. Raises UsageError if the file cannot be made.
+    jpeg: quality for compressing gray images; None keeps encoded images byte for byte and raw ones raw.
+    durable: for recordings that cannot be repeated: survive a power cut, at the price of one fdatasync per
+    second, and never overwrite a `.part`. serial: of the device. Raises UsageError if the file cannot be
+    created.
     """
 
     def __init__(
@@ -86,8 +86,8 @@ class Recorder:
         self._log_ns = 0
 
     def write(self, measurement: Measurement, log_ns: int | None = None) -> None:
-        """Append one measurement. log_ns: what readers sort by, where the stamps wrap; else the stamp.
-        Raises DataError for a stamp before 1970 or after 2038, ShareError if the disk is full."""
+        """Append one measurement. log_ns: the time by which readers sort, for stamps that wrap; default: the
+        stamp. Raises DataError for a stamp before 1970 or after 2038, ShareError if the disk is full."""
         stamp = measurement.stamp_ns
         self._log_ns = stamp if log_ns is None else log_ns
         if not 0 <= stamp < 2**31 * 10**9:
@@ -103,7 +103,7 @@ class Recorder:
                 self._flush(self._log_ns)
 
     def close(self) -> None:
-        """Finish the file and give it its name."""
+        """Finish the file and rename it from `.part`."""
         with write_errors(self.path):
             self._writer.finish()
             self._file.flush()
@@ -113,8 +113,8 @@ class Recorder:
         sync_folder(self.path.parent)
 
     def abort(self) -> None:
-        """Stop here; the `.part` stays, with all that was written."""
-        with contextlib.suppress(OSError):  # a full disk has been told already
+        """Stop; the `.part` stays, with all that was written."""
+        with contextlib.suppress(OSError):  # a full disk has been reported already
             self._writer.flush()
         with contextlib.suppress(OSError):
             self._file.close()
@@ -140,7 +140,7 @@ class Recorder:
             self._write_message(topic + suffix, ros_images.encode_compressed(header, data, is_depth))
 
     def _encode(self, image: Any, is_depth: bool) -> bytes | None:
-        """Bytes that can be written as they are, or None where the pixels must be written raw."""
+        """Return the encoded image; None to write raw pixels."""
         if is_depth:
             mm = isinstance(image, EncodedImage) and image.depth_scale == ros_images.MILLIMETRES
             return image.read() if mm else None
@@ -176,7 +176,7 @@ class Recorder:
 
 
 _UNKNOWN_COVARIANCE = np.zeros(9)
-_NO_ORIENTATION = np.array([-1.0, *[0.0] * 8])  # sensor_msgs/Imu: -1 says that there is none
+_NO_ORIENTATION = np.array([-1.0, *[0.0] * 8])  # sensor_msgs/Imu: -1 marks a missing orientation
 
 
 def _imu_message(stamp: int, sample: F64) -> Any:

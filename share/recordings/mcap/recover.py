@@ -1,7 +1,7 @@
-"""Recordings that were cut off: every message that is still whole goes into a good file.
+"""Recover MCAP recordings that were cut off: copy every intact message to a new file.
 
-A file that was not closed has no index, and its last chunk may be half written. It is read from the
-start, record by record, as far as it goes.
+A file that was not closed has no index, and its last chunk may be incomplete. It is read from the start,
+record by record, as far as possible.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from share.recordings.mcap.file import check_magic, damage_errors
 
 
 class Recovered(NamedTuple):
-    """messages by topic; bytes that could not be read; why (empty: nothing was lost)."""
+    """messages: count by topic. lost_bytes: not readable. reason: why, empty if nothing was lost."""
 
     messages: dict[str, int]
     lost_bytes: int
@@ -27,18 +27,18 @@ class Recovered(NamedTuple):
 
 
 def recover_recording(path: Path, out: Path, progress: Callable[[int], None] = lambda _: None) -> Recovered:
-    """Copy what is whole from `path` to `out`; `progress` is told how many more bytes are read.
+    """Copy all intact messages from `path` to `out`. progress: called with each number of bytes read.
 
-    Raises UsageError for paths that cannot be used, DataError if nothing can be saved, ShareError if the disk
-    of `out` is full or fails.
+    Raises UsageError for unusable paths, DataError if nothing can be recovered, ShareError if the disk of
+    `out` is full or fails.
     """
     check_magic(path)
     if out.exists() and out.samefile(path):
-        raise UsageError(f"--out {out}: is the broken file itself; give another name")
+        raise UsageError(f"--out {out} is the broken file itself; give another name")
     with open_regular(path) as file, new_file(out) as target:
         result = _copy(file, target, progress)
         if not result.messages:
-            raise DataError(f"{path}: holds no complete message ({result.reason or 'it is empty'})")
+            raise DataError(f"{path}: has no complete message ({result.reason or 'it is empty'})")
     return result
 
 
@@ -54,8 +54,10 @@ def _copy(file: BinaryIO, target: IO[bytes], progress: Callable[[int], None]) ->
 
 
 def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], None]) -> tuple[int, str]:
-    """Up to the first record that is broken or cannot be read; of a chunk that is broken inside only that is
-    left out. Raises OSError where the copy cannot be written."""
+    """Copy up to the first damaged record; return the bytes lost and why. A chunk damaged inside is skipped.
+
+    Raises OSError if the copy cannot be written.
+    """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
@@ -71,7 +73,7 @@ def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], Non
         try:
             for part in chunk_records(record) if isinstance(record, Chunk) else [record]:
                 copier.copy(part)
-        except OSError:  # nothing is read here
+        except OSError:  # from writing: nothing is read here
             raise
         except damage_errors() as error:
             lost_bytes, reason = lost_bytes + file.tell() - intact_end, reason or _describe_error(error)
@@ -81,13 +83,13 @@ def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], Non
 
 def _describe_error(error: Exception) -> str:
     if isinstance(error, OSError):
-        return f"cannot be read any further: {error.strerror}"
+        return f"reading failed: {error.strerror}"
     name = type(error).__name__
-    return "the file ends too soon" if name == "EndOfFile" else f"damaged: {str(error) or name}"
+    return "the file is cut short" if name == "EndOfFile" else f"damaged: {str(error) or name}"
 
 
 class _Copier:
-    """Writes schemas, channels, metadata and messages under the numbers of the new file."""
+    """Writes schemas, channels, metadata and messages with the ids of the new file."""
 
     def __init__(self, writer: Any) -> None:
         self._writer = writer

@@ -1,7 +1,7 @@
-"""A rig in ROS 2 messages: CameraInfo for each camera, /tf_static for where they sit.
+"""Convert a rig to ROS 2 messages and back: CameraInfo for each camera, /tf_static for the extrinsics.
 
-Our recordings carry the rig a second time, as JSON in an MCAP metadata record: exact to the last
-digit and with the IMU's noise, for which ROS has no message.
+Our recordings also contain the rig as JSON in an MCAP metadata record: exact to the last digit, and with the
+IMU's noise, for which ROS has no message.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _RADTAN_NAMES, _FISHEYE_NAMES = ("plumb_bob", "none", ""), ("equidistant", "fish
 
 
 def rig_cameras(rig: Rig) -> dict[str, Camera]:
-    """The cameras of a rig by stream."""
+    """Return the cameras of a rig, by stream."""
     return {k: c for k, c in ((CAM0, rig.cam0), (CAM1, rig.cam1), (DEPTH, rig.depth)) if c}
 
 
 def rig_to_json(rig: Rig) -> str:
-    """Every number of the rig, exactly."""
+    """Return a rig as JSON, with all numbers exact."""
     poses = {k: getattr(rig, k) for k in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0")}
     return json.dumps(
         {name: _camera_fields(camera) for name, camera in rig_cameras(rig).items()}
@@ -44,12 +44,12 @@ def rig_to_json(rig: Rig) -> str:
 
 
 def _camera_fields(camera: Camera) -> dict[str, Any]:
-    """The model only where it is not what it was when no record told it."""
+    """Return a camera's fields, without model radtan, which older records imply."""
     return {name: value for name, value in asdict(camera).items() if (name, value) != ("model", RADTAN)}
 
 
 def rig_from_json(text: str, where: str) -> Rig:
-    """The rig that `rig_to_json` wrote. Raises DataError."""
+    """Return the rig that `rig_to_json` wrote. Raises DataError."""
     try:
         data = parse_json(text)
         for name in (CAM0, CAM1, DEPTH):
@@ -63,8 +63,9 @@ def rig_from_json(text: str, where: str) -> Rig:
 
 
 def to_camera_info(camera: Camera, header: Any) -> Any:
+    """Return a camera as CameraInfo."""
     D = np.array(camera.distortion or (0.0,) * 5)
-    if not camera.is_fisheye:  # ROS has five of plumb_bob, four of equidistant
+    if not camera.is_fisheye:  # ROS has five coefficients for plumb_bob, four for equidistant
         D = np.pad(D, (0, 5 - len(D)))
     P = np.hstack([camera.K, np.zeros((3, 1))])
     roi = ros.make_message(
@@ -87,14 +88,14 @@ def to_camera_info(camera: Camera, header: Any) -> Any:
 
 
 def from_camera_info(info: Any, where: str) -> Camera:
-    """Raises ConfigError for an uncalibrated camera or a distortion that we do not model."""
+    """Return the camera of a CameraInfo. Raises ConfigError if uncalibrated, or of an unsupported model."""
     D, fisheye = tuple(float(d) for d in info.d), info.distortion_model in _FISHEYE_NAMES
     while len(D) > (4 if fisheye else 5) and D[-1] == 0:
         D = D[:-1]
     if not fisheye and any(D) and (info.distortion_model not in _RADTAN_NAMES or len(D) > 5):
         raise ConfigError(
             f"{where}: distortion_model '{info.distortion_model}' is not supported; "
-            f"supported: plumb_bob, equidistant, none"
+            "supported: plumb_bob, equidistant, none"
         )
     fx, _, cx, _, fy, cy, *_ = (float(k) for k in info.k)
     model = EQUIDISTANT if fisheye else RADTAN
@@ -105,7 +106,7 @@ def from_camera_info(info: Any, where: str) -> Camera:
 
 
 def to_tf(rig: Rig, stamp_ns: int) -> Any:
-    """body -> cam0 -> cam1, depth."""
+    """Return the extrinsics of a rig as transforms body -> cam0 -> cam1, depth."""
     edges = {(BODY, CAM0): rig.T_body_cam0}
     if rig.T_cam1_cam0 is not None:
         edges[CAM0, CAM1] = se3.inverse(rig.T_cam1_cam0)
@@ -134,20 +135,20 @@ class FrameTree:
     """Static transforms between named frames."""
 
     def __init__(self, messages: Iterable[Any], where: str) -> None:
-        """Raises DataError for a transform that is none."""
+        """messages: TFMessages. Raises DataError for a transform that is not rigid."""
         self._edges: dict[str, list[tuple[str, F64]]] = {}
         for transform in (t for message in messages for t in message.transforms):
             parent, child = transform.header.frame_id.lstrip("/"), transform.child_frame_id.lstrip("/")
             p, q = transform.transform.translation, transform.transform.rotation
             quaternion = np.array([q.x, q.y, q.z, q.w])
             if not abs(np.linalg.norm(quaternion) - 1) < 1e-3 or not np.isfinite([p.x, p.y, p.z]).all():
-                raise DataError(f"{where}: {parent} to {child} is no rigid transform; give --calib")
+                raise DataError(f"{where}: {parent} to {child} is not a rigid transform; give --calib")
             T = se3.from_quat(np.array([p.x, p.y, p.z]), quaternion)
             self._edges.setdefault(parent, []).append((child, T))
             self._edges.setdefault(child, []).append((parent, se3.inverse(T)))
 
     def find(self, a: str, b: str) -> F64 | None:
-        """T_a_b (4, 4), or None where nothing connects the two."""
+        """Return T_a_b (4, 4); None if nothing connects the two."""
         reached, todo = {a.lstrip("/"): np.eye(4)}, [a.lstrip("/")]
         while todo:
             frame = todo.pop()

@@ -17,20 +17,21 @@ TF_STATIC = "/tf_static"
 TOPICS = {CAM0: "/cam0/image_raw", CAM1: "/cam1/image_raw", DEPTH: "/depth/image_raw", IMU: "/imu0"}
 INFO_TOPICS = {stream: f"/{stream}/camera_info" for stream in (CAM0, CAM1, DEPTH)}
 SUFFIXES = ("/compressed", "/compressedDepth")  # of image_transport
+DEPTH_HEADER_BYTES = 12  # compressed_depth_image_transport's ConfigHeader, before the PNG
 
 RIG_RECORD = "share.rig"  # name of the MCAP metadata record with the exact calibration
 
 
 @cache
 def typestore() -> Any:
-    """rosbags' types of ROS 2 Jazzy."""
+    """Return rosbags' type store of ROS 2 Jazzy."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def make_message(name: str, **fields: Any) -> Any:
-    """A message of type `name`."""
+    """Return a message of type `name`."""
     return typestore().types[name](**fields)
 
 
@@ -41,7 +42,7 @@ def make_header(stamp_ns: int, frame_id: str) -> Any:
 
 
 def stamp_of(message: Any) -> int:
-    """Integer nanoseconds of a message's header."""
+    """Return the stamp of a message's header, ns."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
@@ -55,5 +56,5 @@ def decode(data: bytes, name: str) -> Any:
 
 
 def message_definition(name: str) -> bytes:
-    """The definition text of a message type, encoding `ros2msg`."""
+    """Return the definition of a message type, encoding `ros2msg`."""
     return str(typestore().generate_msgdef(name, ros_version=2)[0]).encode()

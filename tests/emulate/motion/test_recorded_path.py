@@ -185,7 +185,7 @@ def broken(folder: Path, how: str) -> None:
     [
         ("order", "line 102: .*sort"),
         ("nan", "line 101: 'nan' is not finite"),
-        ("zero", "pose 100: quaternion has length 0"),
+        ("zero", "pose 100: quaternion norm is 0"),
         ("apart", "do not overlap"),
         ("gone", "no recorded motion is here"),
         ("no calibration", "no such file"),

@@ -1,4 +1,4 @@
-"""Many runs, one after the other or side by side, with a live line: for the tables of `share evaluate`."""
+"""Many runs of `share evaluate`, in sequence or in parallel, with a live line."""
 
 from __future__ import annotations
 
@@ -18,19 +18,25 @@ if TYPE_CHECKING:
     from share.lab.evaluate.trial import Trial
 
 _MANY_RUN_OPTIONS = (
-    click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …"),
+    click.option(
+        "--seeds",
+        type=click.IntRange(1),
+        default=1,
+        show_default=True,
+        help="Number of seeds (0, 1, …), each a run.",
+    ),
     click.option(
         "--workers",
         type=click.IntRange(1, 64),
         default=1,
         show_default=True,
-        help="Processes that play (--virtual).",
+        help="Runs in parallel; more than 1 needs --virtual.",
     ),
 )
 
 
 def many_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """How many seeds, and sessions at a time."""
+    """Add --seeds and --workers to a command."""
     for option in reversed(_MANY_RUN_OPTIONS):
         command = option(command)
     return command
@@ -41,7 +47,7 @@ def play_runs(
     workers: AbstractContextManager[WorkerPool] | None,
     label_of: Callable[[PlannedRun], str],
 ) -> dict[Path, Trial]:
-    """By folder, in the order of `runs`, those that did not fail; the others are said."""
+    """Play runs; return those that succeeded, by folder, in the order of `runs`. Print why others failed."""
     from share.lab.evaluate.campaign import run_all
 
     live, done = LiveLine(), dict[Path, "Trial"]()
@@ -59,6 +65,8 @@ def play_runs(
 
 
 def check_none_failed(succeeded: int, total: int) -> None:
-    """Raises ShareError where runs have failed."""
+    """Raise ShareError if any run failed."""
     if succeeded < total:
-        raise ShareError(f"{total - succeeded} of {total} runs failed; the same command plays them again")
+        raise ShareError(
+            f"{total - succeeded} of {total} runs failed; run the same command again to repeat only those"
+        )

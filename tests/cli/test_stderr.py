@@ -1,4 +1,4 @@
-"""What is said on stderr holds nothing up, whoever reads it or does not."""
+"""Writing to stderr blocks nothing, whether or not the output is read."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from share.cli import saying
-from share.cli.saying import Stderr
+from share.cli import stderr as stderr_module
+from share.cli.stderr import Stderr
 from share.cli.terminal import LiveLine
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -42,20 +42,20 @@ def read(handle: int, until: bytes) -> bytes:
     return data
 
 
-def test_a_reader_that_stops_delays_nothing_and_is_told_what_it_missed(
+def test_a_reader_that_stops_delays_nothing_and_is_shown_how_many_lines_it_missed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(saying, "MOST", 50)
+    monkeypatch.setattr(stderr_module, "MAX_PENDING_LINES", 50)
     with pipe(monkeypatch) as (reader, _):
         stderr, began = Stderr(), time.monotonic()
         for i in range(200):
-            stderr.tell(f"{i} {'x' * 200}")
+            stderr.print_line(f"{i} {'x' * 200}")
         stderr.flush(0.05)
         assert time.monotonic() - began < 1.0
         assert b"0 xxx" in read(reader, b"\n49 ")
         stderr.flush()
-        stderr.tell("again")
-        assert b"lines were left out" in read(reader, b"again\n")
+        stderr.print_line("again")
+        assert b"lines were dropped" in read(reader, b"again\n")
 
 
 def test_lines_come_in_their_order_and_are_there_after_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
