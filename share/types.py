@@ -273,7 +273,7 @@ class FeatureStatistics:
         _set_fields(
             self,
             px=checked_array("px", self.px, (n, 2), np.float32),
-            believed=checked_array("believed", self.inlier, (n,), np.bool_),
+            inlier=checked_array("inlier", self.inlier, (n,), np.bool_),
             depth=checked_array("depth", self.depth, (n,), np.float64, finite=False),
         )
 
@@ -334,7 +334,7 @@ class KeyframeCandidate:
         _set_fields(
             self,
             T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
-            T_last_body=checked_pose("T_last_body", self.T_previous_body),
+            T_previous_body=checked_pose("T_previous_body", self.T_previous_body),
             cov=checked_cov("cov", self.cov),
             up=checked_up("up", self.up),
             up_sigma=checked_sigma("up_sigma", self.up_sigma),
@@ -350,7 +350,7 @@ class Keyframe:
     of odometry begins. T_odom_body (4, 4): where the agent took itself to be, by which a correction
     moves its odometry; T_ref_body is surer, since an estimator learns of the past too.
     up (3,): unit vector against gravity in the body frame, zeros if unknown; up_sigma: of both its
-    angles, rad. follows: id of the keyframe to be applied before this one, -1 for none; at least the
+    angles, rad. predecessor: id of the keyframe to be applied before this one, -1 for none; at least the
     reference, and more where a new stretch begins, so that a reordering network cannot overtake with it.
     """
 
@@ -363,16 +363,16 @@ class Keyframe:
     up: F64
     up_sigma: float
     view: View
-    follows: int = -1
+    predecessor: int = -1
 
     def __post_init__(self) -> None:
         checked_id("id", self.id)
         checked_stamp("stamp_ns", self.stamp_ns)
         if not -1 <= self.reference < self.id:
             raise ValueError(f"reference: {self.reference} must lie in -1 .. {self.id - 1}")
-        _set_fields(self, follows=max(self.reference, self.follows))
-        if not self.follows < self.id:
-            raise ValueError(f"follows: {self.follows} must lie in -1 .. {self.id - 1}")
+        _set_fields(self, predecessor=max(self.reference, self.predecessor))
+        if not self.predecessor < self.id:
+            raise ValueError(f"predecessor: {self.predecessor} must lie in -1 .. {self.id - 1}")
         _set_fields(
             self,
             T_ref_body=checked_pose("T_ref_body", self.T_ref_body, MAX_ODOM_M),
@@ -388,23 +388,23 @@ class Correction:
     """The edge's word on where an agent's odometry lies in the shared map.
 
     map_id: names the map; a pose is comparable only with poses in the same map. revision: rises
-    with every correction to this agent. about: id of a keyframe of the stretch of odometry that it is about.
-    answers: id of the agent's keyframe that led to it, or -1 when another agent's did.
+    with every correction to this agent. segment_keyframe: id of a keyframe of the stretch of odometry that it is about.
+    answered_keyframe: id of the agent's keyframe that led to it, or -1 when another agent's did.
     """
 
     T_map_odom: F64
     cov: F64
     map_id: str
     revision: int
-    about: int
-    answers: int = -1
+    segment_keyframe: int
+    answered_keyframe: int = -1
 
     def __post_init__(self) -> None:
         if not (0 < len(self.map_id) <= MAX_MAP_ID_LENGTH and self.map_id.isprintable()):
             raise ValueError(f"map_id: 1 to {MAX_MAP_ID_LENGTH} printable characters")
         checked_id("revision", self.revision)
-        checked_id("about", self.about)
-        checked_id("answers", self.answers, minimum=-1)
+        checked_id("segment_keyframe", self.segment_keyframe)
+        checked_id("answered_keyframe", self.answered_keyframe, minimum=-1)
         _set_fields(
             self,
             T_map_odom=checked_pose("T_map_odom", self.T_map_odom),

@@ -128,17 +128,17 @@ def _say_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
         stderr.tell(f"public key '{keys.own.public}'; authorized: {names or 'nobody yet'}")
 
 
-_SHOWN_EVENTS = {"joined the edge", "left", "back", "silent", "refused"}
+_SHOWN_EVENTS = {"agent joined", "left", "reconnected", "silent", "refused"}
 _SHOWN_EVENTS |= {
     "not let in",
-    "maps joined",
+    "maps merged",
     "merge undone",
-    "job failed",
+    "step failed",
     "not written",
     "mapper lost",
     "solver lost",
 }
-_SHOWN_EVENTS |= {"odometry doubted", "map", "tracking lost"}
+_SHOWN_EVENTS |= {"odometry suspect", "map", "tracking lost"}
 
 
 def _print_event(stderr: Stderr, event: dict[str, Any], verbose: bool) -> None:

@@ -75,7 +75,7 @@ def track(
                 f" {line}." for line in [*_wait_text(run.report), *camera_options.camera_summary(run.report)]
             )
         )
-    ate = trajectory_accuracy(run, truth) if run.report["stretches"] == 1 else None
+    ate = trajectory_accuracy(run, truth) if run.report["segments"] == 1 else None
     report = {**run.report, "ate_m": ate.rmse if ate else None}
     texts = {"--out": format_tum(run.trajectory), "--report": json.dumps(report, indent=2) + "\n"}
     for option, path in output_files.items():
@@ -119,7 +119,7 @@ def _wait_text(report: dict[str, Any]) -> list[str]:
     """For what, for most of the time without a pose."""
     from share.types import WaitReason
 
-    frames = report["waited"]
+    frames = report["waiting_frames"]
     return [f"The tracker waited for {WaitReason(max(frames, key=frames.get)).text}"] if frames else []
 
 
@@ -132,14 +132,14 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
     ]
     if report["init_s"] > _LONG_INIT_S:
         lines.append(". ".join([f"the first pose came after {report['init_s']:.1f} s", *_wait_text(report)]))
-    if report["contradicted"]:
+    if report["inconsistent_frames"]:
         lines.append(
-            f"images and IMU contradict each other in {report['contradicted']} frames: see whether the "
-            "camera sits on the IMU as the calibration says, and whether their clocks agree"
+            f"images and IMU contradict each other in {report['inconsistent_frames']} frames: see whether "
+            "the camera sits on the IMU as the calibration says, and whether their clocks agree"
         )
-    if report["stretches"] > 1:
+    if report["segments"] > 1:
         lines.append(
-            f"odometry broke: {report['stretches']} stretches, whose poses do not compare with each other"
+            f"odometry broke: {report['segments']} stretches, whose poses do not compare with each other"
         )
     if ate:
         lines.append(

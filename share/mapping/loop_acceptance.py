@@ -85,7 +85,7 @@ class LoopAcceptance:
                 self._overlap_check.end_probation((a, b))
                 dropped = self._graph.drop_loops(self._separating_loops(a, b))
                 first, second = (self._graph.odometry.segments[s].name for s in (a, b))
-                reason = f"what {first} and {second} should share is gone (doubt {cusum_value:.1f})"
+                reason = f"what {first} and {second} should share is missing (CUSUM {cusum_value:.1f})"
                 return LoopDecision(True, f"{reason}; {dropped_text(dropped)}", dropped=dropped)
         return None
 
@@ -151,7 +151,7 @@ class LoopAcceptance:
         consistent = self._consistent_loops(loop, self.pending)
         if not consistent:
             self._add_pending(self._overlap_check.with_found_share(loop))
-            return LoopDecision(False, f"{reason}: waits for a witness")
+            return LoopDecision(False, f"{reason}: pending, needs a supporting loop")
         return self._accept([*consistent, loop], f"{reason}: agrees with {consistent[-1]}")
 
     def _decide_contradiction(self, loop: Loop, reason: str) -> LoopDecision:
@@ -165,12 +165,12 @@ class LoopAcceptance:
         consistent = [*self._consistent_loops(loop, self.contradicting), loop]
         self.contradicting = [*self.contradicting, loop][-self._config.max_pending :]
         c, evidence = self._config, self._weigh(consistent)
-        reason = f"{reason}; {evidence} say so"
+        reason = f"{reason}; {evidence} supporting"
         if evidence.places < c.rebel_places:
             return LoopDecision(False, f"{reason}, {c.rebel_places} places needed")
         existing_ids = self._separating_loops(a, b)
         existing = self._weigh_existing(existing_ids)
-        reason = f"{reason}, {existing} do not"
+        reason = f"{reason}, {existing} opposing"
         if evidence.weight <= c.rebel_weight * existing.weight:
             return LoopDecision(False, f"{reason}, more weight needed")
         if objection := self._overlap_objection(loop):
@@ -208,8 +208,8 @@ class LoopAcceptance:
     def _decide_join(self, loop: Loop) -> LoopDecision:
         consistent = [*self._consistent_loops(loop, self.pending), loop]
         evidence, min_places = self._weigh_unambiguous(consistent), self._min_places(loop)
-        reason = f"loop {loop}: would join two maps, {evidence.places} of {min_places} places that say so"
-        objection = "" if evidence.places >= min_places and evidence.keyframes >= 2 else ": waits"
+        reason = f"loop {loop}: {evidence.places} of {min_places} required places agree"
+        objection = "" if evidence.places >= min_places and evidence.keyframes >= 2 else ": pending"
         objection = objection or self._join_objection(loop, evidence) or self._overlap_objection(loop)
         if objection:
             self._add_pending(loop)
@@ -220,24 +220,26 @@ class LoopAcceptance:
         """Why a story that is told at enough places may yet be of a copy; empty if nothing says so."""
         c = self._config
         if evidence.found_share < c.join_found:
-            return f", but only {evidence.found_share:.0%} of what both should show is found: waits"
+            return f", but only {evidence.found_share:.0%} of what both should show is found: pending"
         max_weight = c.rival_weight * evidence.weight
         competing = self._competing_hypothesis(loop, max_weight)
-        return f"; another story has {competing}: waits" if competing.weight > max_weight else ""
+        return f"; a competing hypothesis has {competing}: pending" if competing.weight > max_weight else ""
 
     def _overlap_objection(self, loop: Loop) -> str:
         """What the overlap of both maps has against it, whatever was recognised; empty if nothing."""
         comparisons, c = self._overlap_check.compare_overlap(loop), self._config
         if len(comparisons) < c.overlap_pairs:
-            return f", but only {len(comparisons)} views overlap: waits"
+            return f", but only {len(comparisons)} views overlap: pending"
         missing_share = sum(comparison.missing_share for comparison in comparisons) / max(1, len(comparisons))
         if missing_share > c.overlap_gone:
-            return f", but {missing_share:.0%} of the {len(comparisons)} views that overlap is gone: waits"
+            return (
+                f", but {missing_share:.0%} of the {len(comparisons)} overlapping views is missing: pending"
+            )
         cusums = itertools.accumulate(
             comparisons, lambda d, look: cusum(d, look, c.overlap_gone), initial=0.0
         )
         if (worst := max(cusums)) > c.undo_doubt:
-            return f", but views in a row show things gone (doubt {worst:.1f}): waits"
+            return f", but successive views lack structure (CUSUM {worst:.1f}): pending"
         return ""
 
     def _min_places(self, loop: Loop) -> int:
@@ -353,9 +355,9 @@ def _has_moved(before: F64, now: F64) -> bool:
 def dropped_text(loops: Sequence[Loop]) -> str:
     """For a reason."""
     named = ", ".join(map(str, loops[:_MAX_NAMED]))
-    return f"taken out: {named}" + (f" and {len(loops) - _MAX_NAMED} more" if len(loops) > _MAX_NAMED else "")
+    return f"removed: {named}" + (f" and {len(loops) - _MAX_NAMED} more" if len(loops) > _MAX_NAMED else "")
 
 
 def pending_text(loops: Sequence[Loop]) -> str:
     """For a reason."""
-    return f", {len(loops)} that waited fit too" if loops else ""
+    return f", {len(loops)} pending loops fit too" if loops else ""

@@ -34,6 +34,10 @@ _MAX_STEP_TIMES = 5000  # of each kind of step that a report is about: the newes
 _CULL_MARGIN = 1.05  # so much above the bound before it is asked which keyframes may go
 _REMOVED_PER_KEYFRAME = 2
 _RETRY_INTERVAL = 4
+_QUARANTINE_EVENTS = {
+    "set apart": "agent quarantined",
+    "disputed": "agents disputed",
+}  # by `AgentStanding.state`
 
 
 @dataclass
@@ -188,7 +192,7 @@ class Mapper:
             try:
                 job = self._atlas.make_job(map_id)
             except Exception:  # it costs this map its solution, not the others theirs
-                self._counts["failed_jobs"] += 1
+                self._counts["failed_steps"] += 1
                 continue
             self._is_solving = True
             return SolveStep(job)
@@ -227,10 +231,10 @@ class Mapper:
 
     def report_failure(self, what: str, error: Exception, agent: str | None = None) -> list[MapEvent]:
         """It is counted and said; the map goes on without what raised `error`. agent: that it is about."""
-        self._counts["failed_jobs"] += 1
+        self._counts["failed_steps"] += 1
         agent = next(iter(self._hellos), None) if agent is None else agent
         return (
-            [] if agent is None else [MapEvent(agent, "job failed", f"{what}: {describe_exception(error)}")]
+            [] if agent is None else [MapEvent(agent, "step failed", f"{what}: {describe_exception(error)}")]
         )
 
     def reset_solver(self) -> None:
@@ -240,7 +244,7 @@ class Mapper:
     @property
     def removed_count(self) -> int:
         """Keyframes, since the beginning."""
-        return self._counts["taken_out"]
+        return self._counts["removed_keyframes"]
 
     def take_changes(self) -> tuple[MapChange, ...]:
         """What has to be kept since the last call."""
@@ -313,11 +317,11 @@ class Mapper:
         reason = f"{decision.reason} ({outcome.reason})"
         self._record_loops(decision)
         if not decision.accepted:
-            return [*events, MapEvent(b.agent, "loop not taken", reason)]
+            return [*events, MapEvent(b.agent, "loop not accepted", reason)]
         account.merges["done"] += 1
         self._merge_gate.record_merge(volume)
         undone_events = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
-        accepted = MapEvent(b.agent, "maps joined" if decision.joined_maps else "loop accepted", reason)
+        accepted = MapEvent(b.agent, "maps merged" if decision.joined_maps else "loop accepted", reason)
         return [*events, *undone_events, accepted]
 
     def _quarantine_events(self, change: QuarantineChange) -> list[MapEvent]:
@@ -325,9 +329,9 @@ class Mapper:
         removals = (RemoveLoops(loop.a, loop.b) for loop in change.dropped)
         self._changes += [*removals, *map(SaveLoop, change.added)]
         return [
-            MapEvent(agent, standing.state, standing.reason)
-            if standing.state in ("set apart", "disputed")
-            else MapEvent(agent, "agrees again", "its claims fit the others'")
+            MapEvent(agent, _QUARANTINE_EVENTS[standing.state], standing.reason)
+            if standing.state in _QUARANTINE_EVENTS
+            else MapEvent(agent, "quarantine lifted", "its odometry agrees with the others'")
             for agent, standing in change.standings.items()
         ]
 
@@ -348,7 +352,7 @@ class Mapper:
         ]
         map_id = step.job.map_id
         waiting = [
-            MapEvent(agent, "not told yet", f"map {map_id} knows it to {100 * m:.0f} cm only")
+            MapEvent(agent, "correction held back", f"map {map_id} locates it to {100 * m:.0f} cm only")
             for agent, m in applied.waiting_sigma_m.items()
             if (agent, map_id) not in self._reported_waits
         ]
@@ -375,7 +379,7 @@ class Mapper:
         for keyframe in removed:
             self._index.remove(keyframe.node_id)
             del self._camera_views[keyframe.node_id]
-        self._counts["taken_out"] += len(removed)
+        self._counts["removed_keyframes"] += len(removed)
         self._changes += removal_changes(removed)
         empty_runs = {
             keyframe.key.agent for keyframe in removed if self._atlas.is_run_gone(keyframe.key.agent)
@@ -400,9 +404,9 @@ class Mapper:
             },
             "merges": merges,
             "maps": self._atlas.map_sizes(),
-            "taken_out": self._counts["taken_out"],
+            "removed_keyframes": self._counts["removed_keyframes"],
             "waiting": len(self._queries),
-            "failed_jobs": self._counts["failed_jobs"],
+            "failed_steps": self._counts["failed_steps"],
             **{
                 f"{k}_ms": {**summary(list(ms)).report(), "n": self._counts[k]}
                 for k, ms in self._step_ms.items()

@@ -81,7 +81,7 @@ def map_assignment(
 ) -> MapEvent:
     """Which map a run is in, before anything moves it there. A map is named after what founded it. about: a
     keyframe of the stretch. cov (6, 6): of T_map_odom; exact where it is the map's own gauge."""
-    verb = "founds" if map_id.startswith(f"{agent}/") else "is in"
+    verb = "starts" if map_id.startswith(f"{agent}/") else "is in"
     return MapEvent(
         agent,
         "correction",

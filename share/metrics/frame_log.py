@@ -227,9 +227,9 @@ class RunLog:
             "keyframes": int(rows.keyframe.sum()),
             "sent": sent,
             "lost_s": rows.lost_s,
-            "stretches": self.segments,
-            "contradicted": self.inconsistent_frames,
-            "imu_doubted": self.imu_outliers,
+            "segments": self.segments,
+            "inconsistent_frames": self.inconsistent_frames,
+            "imu_outliers": self.imu_outliers,
             "track_ms": parts.track_ms.report(),
             "corrected_ms": parts.corrected_ms.report(),
             "latency_ms": parts.latency_ms.report(),
@@ -238,7 +238,7 @@ class RunLog:
             "decode_ms_per_frame": 1e3 * self.decode_s / frames if frames else None,
             "rate_hz": sent / rows.span_s if rows.span_s else None,
             "init_s": rows.init_s,
-            "waited": {str(reason): frames for reason, frames in self.waiting_frames.items()},
+            "waiting_frames": {str(reason): frames for reason, frames in self.waiting_frames.items()},
         }
 
 

@@ -97,9 +97,9 @@ class Admission:
         """Why this run cannot be taken in, for a person; None if it can. event: brought `hello`."""
         if not event.is_authorised_for(hello.name):
             return name_objection(hello.name, event.allowed_names or ())
-        if hello.streams and not self._tracks_agents:
+        if hello.streams_frames and not self._tracks_agents:
             return "this edge tracks nobody: start it with --policy streamed, or the agent without --streamed"
-        if self._tracks_agents and not hello.streams:
+        if self._tracks_agents and not hello.streams_frames:
             return "this edge tracks its agents (policy streamed): start the agent with --streamed"
         if (existing := peers.get(event.peer_id)) is not None:
             same_name = existing.hello.name == hello.name

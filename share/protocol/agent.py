@@ -41,7 +41,7 @@ _MIN_RATE_HZ = (
 class Agent:
     """One run of one agent. `hello` is repeated until an edge welcomes it.
 
-    It is given FrameTracked and KeyframeMade, or where `hello.streams`, FrameArrived.
+    It is given FrameTracked and KeyframeMade, or where `hello.streams_frames`, FrameArrived.
     """
 
     def __init__(self, hello: m.Hello, config: Config) -> None:
@@ -56,10 +56,10 @@ class Agent:
         self._localisation = MapLocalisation(config.agent)
         self._recent_frames: deque[ev.FrameTracked] = deque(maxlen=_RECENT_FRAMES)
         self._self_evaluation = SelfEvaluation(config.agent.tell_placement)
-        self._streamer = FrameStreamer(config.stream) if hello.streams else None
+        self._streamer = FrameStreamer(config.stream) if hello.streams_frames else None
         self._pings = PingTracker(link, config.clock)
         self._hello_timer = PeriodicTimer(link.hello_s)
-        self._status_reporter = StatusReporter(link.ping_s, hello.streams)
+        self._status_reporter = StatusReporter(link.ping_s, hello.streams_frames)
         self._is_connected = False
         self._sessions = EdgeSessions()
         self._refusal: str | None = None  # the edge's last
@@ -295,20 +295,20 @@ class Agent:
         if not self._validator.accepts_correction(correction, now_ns):
             return
         is_current = (
-            self._is_connected and correction.about >= self._keyframe_chain.first_of_segment
+            self._is_connected and correction.segment_keyframe >= self._keyframe_chain.first_of_segment
         )  # of odometry
         if not (is_current and self._sessions.accept_revision(correction.revision)):
             self._counts["corrections_stale"] += 1
             return
         self._counts["corrections"] += 1
-        self._self_evaluation.drift.correct(correction.answers)
-        entry, corrected_ms = self._ledger.record_correction(correction.answers, now_ns)
+        self._self_evaluation.drift.correct(correction.answered_keyframe)
+        entry, corrected_ms = self._ledger.record_correction(correction.answered_keyframe, now_ns)
         self._effects.append(self._localisation.apply_correction(correction, entry, corrected_ms, now_ns))
 
     def _on_remote_result(self, result: m.RemoteTrackingResult, streamer: FrameStreamer, now_ns: int) -> None:
         frame = streamer.take_result(result, now_ns)
         if frame is not None:
-            self._effects.append(ev.FrameTrackedRemotely(frame, result.sound, result.waits))
+            self._effects.append(ev.FrameTrackedRemotely(frame, result.is_consistent, result.waiting_for))
             self._on_frame_tracked(frame, now_ns)
 
     def _on_pong(self, pong: m.Pong, now_ns: int) -> None:
@@ -393,7 +393,7 @@ class Agent:
 
     @property
     def _offline_text(self) -> str:
-        return "nobody tracks this agent" if self._streamer else "tracking goes on alone"
+        return "no tracking without the edge" if self._streamer else "tracking continues without the edge"
 
     def _print(self, text: str) -> None:
         if (line := self._line_limiter.admit(text, self._now_ns)) is not None:

@@ -125,13 +125,16 @@ class KeyframeLedger:
         Returns whether it is believed: what says more than was sent in this life of the edge is of an
         earlier one, or a lie.
         """
-        if ack.next_keyframe > self._max_sent_id + 1 or max(ack.held, default=-1) > self._max_ever_sent_id:
+        if (
+            ack.next_keyframe > self._max_sent_id + 1
+            or max(ack.buffered, default=-1) > self._max_ever_sent_id
+        ):
             self.counts["bad_acks"] += 1
             return False
         while self._pending and (first := next(iter(self._pending))) < ack.next_keyframe:
             self._acknowledged[first] = self._pending.pop(first)
             self.counts["acknowledged"] += 1
-        self._buffered_at_edge = frozenset(ack.held)
+        self._buffered_at_edge = frozenset(ack.buffered)
         max_buffered = max(self._buffered_at_edge, default=-1)
         if max_buffered in self._pending:  # it was under way when this life of the edge began
             self._max_sent_id = max(self._max_sent_id, max_buffered)
@@ -157,7 +160,7 @@ class KeyframeLedger:
         self._pending = {k: v for k, v in entries.items() if k >= welcome.next_keyframe}
         self._max_sent_id = welcome.next_keyframe - 1
         first = next(iter(self._pending.values()), None)
-        if first and first.keyframe.follows >= welcome.next_keyframe:
+        if first and first.keyframe.predecessor >= welcome.next_keyframe:
             first.keyframe = _detach(first)
         for entry in self._pending.values():
             entry.attempts = 0
@@ -190,11 +193,11 @@ class KeyframeLedger:
 def _rebase(keyframe: Keyframe, dropped: Keyframe) -> Keyframe:
     """`make_keyframe` relative to what the dropped one, its predecessor, was relative to."""
     if keyframe.reference != dropped.id:  # a stretch of its own
-        return replace(keyframe, follows=dropped.follows)
+        return replace(keyframe, predecessor=dropped.predecessor)
     return replace(
         keyframe,
         reference=dropped.reference,
-        follows=dropped.follows,
+        predecessor=dropped.predecessor,
         T_ref_body=dropped.T_ref_body @ keyframe.T_ref_body,
         cov=compose_cov(keyframe.T_ref_body, dropped.cov, keyframe.cov),
     )
@@ -202,7 +205,7 @@ def _rebase(keyframe: Keyframe, dropped: Keyframe) -> Keyframe:
 
 def _detach(entry: LedgerEntry) -> Keyframe:
     """The keyframe at the beginning of a stretch, for an edge that has nothing before it."""
-    return replace(entry.keyframe, reference=-1, follows=-1, T_ref_body=entry.keyframe.T_odom_body)
+    return replace(entry.keyframe, reference=-1, predecessor=-1, T_ref_body=entry.keyframe.T_odom_body)
 
 
 # ---- From candidates to keyframes: numbers, relative poses, and the covariance of what is left out.
@@ -246,7 +249,7 @@ class KeyframeChain:
             up=candidate.up,
             up_sigma=candidate.up_sigma,
             view=candidate.view,
-            follows=self.next_id - 1,
+            predecessor=self.next_id - 1,
         )
         self.next_id += 1
         self._has_reference = True

@@ -126,7 +126,7 @@ class Edge:
                 self._send(event.peer_id, pong)
             case wire.Bye() if peer:
                 peer.status.leave()
-                self._mark_gone(peer, "left", "said bye", now_ns)
+                self._mark_gone(peer, "left", "sent bye", now_ns)
             case _ if peer:
                 self._on_agent_message(event.peer_id, peer, message, now_ns)
             case _:  # from a stranger
@@ -199,20 +199,20 @@ class Edge:
         peer.is_gone = False
         self._registry.make_latest(peer)
         self._effects.append(ed.SetPresence(peer.key, True))
-        self._record_throttled(now_ns, "back", peer, "is heard again")
+        self._record_throttled(now_ns, "reconnected", peer, "sends again")
 
     def _supersede(self, name: str, now_ns: int) -> None:
         """A run of this name comes: one that is present has been silent for so long that it lost the name."""
         for other in self._registry.values():
             if not other.is_gone and other.hello.name == name:
-                self._mark_gone(other, "silent", "another run has its name now", now_ns)
+                self._mark_gone(other, "silent", "name taken by a newer run", now_ns)
 
     def _check_silence(self, now_ns: int) -> None:
         for peer in self._registry.values():
             if not peer.is_gone and now_ns - peer.last_received_ns > seconds_to_ns(
                 self._config.edge.silent_s
             ):
-                self._mark_gone(peer, "silent", f"nothing heard for {self._config.edge.silent_s:g} s", now_ns)
+                self._mark_gone(peer, "silent", f"no message for {self._config.edge.silent_s:g} s", now_ns)
 
     def _mark_gone(self, peer: Peer, event: str, reason: str, now_ns: int) -> None:
         peer.is_gone = True
@@ -239,7 +239,7 @@ class Edge:
             self._add_run(peer_id, Peer(hello, key, now_ns, credential=event.credential))
             self._rate_scheduler.begin_run(hello.name)
             description = f"{hello.kind} '{hello.name}'"
-            self._record_throttled(now_ns, "joined the edge", self._registry[peer_id], description)
+            self._record_throttled(now_ns, "agent joined", self._registry[peer_id], description)
         self._welcome(peer_id, self._registry[peer_id], now_ns)
 
     def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello, now_ns: int) -> str | None:
@@ -319,7 +319,7 @@ class Edge:
             return
         if problem:
             peer.suspect_keyframes.add(problem, now_ns)
-            self._record_throttled(now_ns, "odometry doubted", peer, problem)
+            self._record_throttled(now_ns, "odometry suspect", peer, problem)
         assert peer.odometry_base is not None
         self._save(*run, SaveKeyframe(peer.key, keyframe))
         is_over_rate = self._quota.is_over_rate(peer.hello.name, now_ns)
@@ -349,7 +349,7 @@ class Edge:
             return
         peer = self._registry[peer_id]
         if finding.correction is None:
-            recorder = self._record_throttled if finding.event == "job failed" else self._record
+            recorder = self._record_throttled if finding.event == "step failed" else self._record
             recorder(now_ns, finding.event, peer, finding.reason)
             return
         peer.last_finding = finding
@@ -365,7 +365,11 @@ class Edge:
         peer.counts["corrections"] += 1
         correction = replace(finding.correction, revision=peer.revision)
         self._send(peer_id, correction)
-        fields = {"map_id": correction.map_id, "revision": peer.revision, "answers": correction.answers}
+        fields = {
+            "map_id": correction.map_id,
+            "revision": peer.revision,
+            "answers": correction.answered_keyframe,
+        }
         recorder = self._record_throttled if is_repeat else self._record
         recorder(now_ns, finding.event, peer, finding.reason, **fields)
 
@@ -422,7 +426,7 @@ class Edge:
                 | agent_reports.get(peer.key, {})
                 for peer in self._registry.values()
             },
-            "strangers": dict(self._unjoined.counts),
+            "unjoined": dict(self._unjoined.counts),
             "refused": refusal_warnings(self._registry.values(), self._unjoined, now_ns),
             "internal_errors": self._internal_errors,
             "forgotten_runs": self._registry.forgotten_count,

@@ -99,7 +99,7 @@ _LOOP_COUNTS = (("loops", "tried"), ("loops", "accepted"))
 _TOTAL_COUNTS = (
     *_LOOP_COUNTS,
     *_MERGE_COUNTS,
-    *((name,) for name in ("taken_out", "failed_jobs", "internal_errors", "forgotten_runs")),
+    *((name,) for name in ("removed_keyframes", "failed_steps", "internal_errors", "forgotten_runs")),
     *((f"{kind}_ms", "n") for kind in ("place", "verify", "solve")),
 )
 _AGENT_COUNTS = (
@@ -107,7 +107,7 @@ _AGENT_COUNTS = (
     *_MERGE_COUNTS,
     *((name,) for name in ("keyframes", "poses", "evaluations", "corrections", "bytes_up", "bytes_down")),
     *((name,) for name in ("bad_messages", "unexpected", "queries_skipped", "refused_messages")),
-    ("doubted_keyframes",),
+    ("suspect_keyframes",),
 )
 _MAX_RUNS = 4096  # that are remembered
 
@@ -139,10 +139,10 @@ class SessionTotals:
             name: _add_counts(agent, self._agent_reports.get(agent["run"], {}), _AGENT_COUNTS)
             for name, agent in report["agents"].items()
         }
-        previous = self._previous["strangers"]
-        out["strangers"] = {
-            what: report["strangers"].get(what, 0) + previous.get(what, 0)
-            for what in sorted({*report["strangers"], *previous})
+        previous = self._previous["unjoined"]
+        out["unjoined"] = {
+            what: report["unjoined"].get(what, 0) + previous.get(what, 0)
+            for what in sorted({*report["unjoined"], *previous})
         }
         return out
 

@@ -80,11 +80,11 @@ class ReorderBuffer:
         waiting = self._waiting.get(keyframe.id)
         if waiting is not None:
             self.duplicates += 1
-        if waiting is None or keyframe.follows < waiting.follows:
+        if waiting is None or keyframe.predecessor < waiting.predecessor:
             self._waiting[keyframe.id] = keyframe
 
     def _next_applicable(self) -> Keyframe | None:
-        ready = (k for k in sorted(self._waiting) if self._waiting[k].follows < self.next_keyframe)
+        ready = (k for k in sorted(self._waiting) if self._waiting[k].predecessor < self.next_keyframe)
         first = next(ready, None)
         return None if first is None else self._waiting[first]
 
@@ -93,7 +93,7 @@ class ReorderBuffer:
 
 SILENT_S = 0.7  # an agent says something twice a second; after this what it said is not shown as its state
 SILENT = "SILENT"
-_NOT_RECEIVED = "not heard since the map was taken up again"
+_NOT_RECEIVED = "no message since the map was restored"
 
 
 class PeerStatus:
@@ -222,7 +222,7 @@ class RefusedMessages:
 class SuspectKeyframes(RefusedMessages):
     """Keyframes that were taken in, but not as they came."""
 
-    label = "keyframes doubted"
+    label = "suspect keyframes"
 
 
 @dataclass
@@ -293,9 +293,9 @@ class Peer:
                     f"keyframe {keyframe.id} refers to {keyframe.reference}, which is not the last"
                 )
             if jump_m := self.odometry_base.jump_m(keyframe):
-                problem = f"keyframe {keyframe.id} is {jump_m:.0f} m from the one before: a new stretch"
+                problem = f"keyframe {keyframe.id} is {jump_m:.0f} m from the one before: new segment"
             elif contradiction := self.odometry_base.contradiction(keyframe):
-                problem = f"keyframe {keyframe.id}: {contradiction}: a new stretch"
+                problem = f"keyframe {keyframe.id}: {contradiction}: new segment"
             if problem:
                 keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body)
         self.odometry_base = OdometryBase.from_keyframe(keyframe)
@@ -318,8 +318,8 @@ class Peer:
             **{name: self.counts[name] for name in _REPORTED_COUNTS},
             "refused_messages": self.refusals.count,
             "last_refusal": self.refusals.reason or None,
-            "doubted_keyframes": self.suspect_keyframes.count,
-            "last_doubt": self.suspect_keyframes.reason or None,
+            "suspect_keyframes": self.suspect_keyframes.count,
+            "last_suspicion": self.suspect_keyframes.reason or None,
         }
 
 

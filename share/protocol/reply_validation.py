@@ -46,24 +46,26 @@ class ReplyValidator:
         if self._reports_unsent("a welcome", now_ns, welcome.next_keyframe - 1):
             return False
         if self._sessions.is_unsolicited(welcome.session):
-            self.report_invalid("the edge sent a welcome that nobody asked for; it is not believed", now_ns)
+            self.report_invalid("the edge sent a welcome without a hello; ignored", now_ns)
             return False
         return True
 
     def accepts_correction(self, correction: Correction, now_ns: int) -> bool:
         """Whether it speaks of keyframes that the edge can have."""
-        return not self._reports_unsent("a correction", now_ns, correction.about, correction.answers)
+        return not self._reports_unsent(
+            "a correction", now_ns, correction.segment_keyframe, correction.answered_keyframe
+        )
 
     def take_ack(self, ack: m.Ack, now_ns: int) -> None:
         """Into the ledger, which refuses what an earlier life of the edge says, too: that is no lie."""
         if not self._ledger.acknowledge(ack):
-            self._reports_unsent("an acknowledgement", now_ns, ack.next_keyframe - 1, *ack.held)
+            self._reports_unsent("an acknowledgement", now_ns, ack.next_keyframe - 1, *ack.buffered)
 
     def _reports_unsent(self, message_name: str, now_ns: int, *keyframes: int) -> bool:
         unsent = max(keyframes, default=-1) >= self._ledger.next_unsent_id
         if unsent:
             self.report_invalid(
-                f"the edge sent {message_name} of keyframes that were never sent; it is not believed", now_ns
+                f"the edge sent {message_name} of keyframes that were never sent; ignored", now_ns
             )
         return unsent
 

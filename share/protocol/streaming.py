@@ -132,7 +132,7 @@ class FrameStreamer:
         sent = self._window.take_answered(result.index)
         if sent is None:
             self._counts["late"] += 1
-            self._segment_broken = self._segment_broken or result.new_stretch  # so is what comes after it
+            self._segment_broken = self._segment_broken or result.new_segment  # so is what comes after it
             return None
         self._counts["answered"] += 1
         starts_segment = self._segment_broken and result.state.has_pose
@@ -144,9 +144,9 @@ class FrameStreamer:
             done_ns=now_ns,
             state=result.state,
             T_odom_body=result.T_odom_body,
-            is_keyframe=result.keyframe,
-            new_segment=result.new_stretch or starts_segment,
-            waiting_for=result.waits,
+            is_keyframe=result.is_keyframe,
+            new_segment=result.new_segment or starts_segment,
+            waiting_for=result.waiting_for,
         )
 
     def report(self) -> dict[str, int]:

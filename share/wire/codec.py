@@ -207,8 +207,8 @@ def _pose_field(path: str, optional: bool = False) -> _ArrayField:
     return _ArrayField(path, "<f8", (4, 4), optional)
 
 
-def _build_hello(*, name: str, kind: AgentKind, run_id: int, streams: bool, **rig: Any) -> m.Hello:
-    return m.Hello(name, kind, run_id, Rig(**rig), streams)
+def _build_hello(*, name: str, kind: AgentKind, run_id: int, streams_frames: bool, **rig: Any) -> m.Hello:
+    return m.Hello(name, kind, run_id, Rig(**rig), streams_frames)
 
 
 def _build_keyframe(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
@@ -226,7 +226,9 @@ _LAYOUTS: dict[type, _Layout] = {
     m.Hello: _Layout(
         1,
         _build_hello,
-        _ScalarFields.from_fields(name=Name, kind=AgentKind, run_id=Int64, streams=bool, **_RIG_FIELDS),
+        _ScalarFields.from_fields(
+            name=Name, kind=AgentKind, run_id=Int64, streams_frames=bool, **_RIG_FIELDS
+        ),
         (
             _pose_field("rig.T_body_cam0"),
             _pose_field("rig.T_cam1_cam0", optional=True),
@@ -242,7 +244,9 @@ _LAYOUTS: dict[type, _Layout] = {
     Keyframe: _Layout(
         3,
         _build_keyframe,
-        _ScalarFields.from_fields(id=Int64, reference=Int64, stamp_ns=Int64, follows=Int64, up_sigma=float),
+        _ScalarFields.from_fields(
+            id=Int64, reference=Int64, stamp_ns=Int64, predecessor=Int64, up_sigma=float
+        ),
         (
             _pose_field("T_ref_body"),
             _ArrayField("cov", "<f8", (6, 6)),
@@ -276,11 +280,13 @@ _LAYOUTS: dict[type, _Layout] = {
     ),
     m.Welcome: _Layout(16, m.Welcome, _ScalarFields.from_fields(session=Int64, next_keyframe=Int64)),
     m.Refused: _Layout(17, m.Refused, _ScalarFields.from_fields(reason=Text)),
-    m.Ack: _Layout(18, m.Ack, _ScalarFields.from_fields(next_keyframe=Int64, held=Ids)),
+    m.Ack: _Layout(18, m.Ack, _ScalarFields.from_fields(next_keyframe=Int64, buffered=Ids)),
     Correction: _Layout(
         19,
         Correction,
-        _ScalarFields.from_fields(map_id=MapId, revision=Int64, about=Int64, answers=Int64),
+        _ScalarFields.from_fields(
+            map_id=MapId, revision=Int64, segment_keyframe=Int64, answered_keyframe=Int64
+        ),
         (_pose_field("T_map_odom"), _ArrayField("cov", "<f8", (6, 6))),
     ),
     m.Rate: _Layout(20, m.Rate, _ScalarFields.from_fields(hz=float)),
@@ -298,10 +304,10 @@ _LAYOUTS: dict[type, _Layout] = {
             index=Int64,
             stamp_ns=Int64,
             state=TrackState,
-            keyframe=bool,
-            new_stretch=bool,
-            sound=bool,
-            waits=WaitReason | None,
+            is_keyframe=bool,
+            new_segment=bool,
+            is_consistent=bool,
+            waiting_for=WaitReason | None,
         ),
         (_pose_field("T_odom_body", optional=True),),
     ),

@@ -61,14 +61,14 @@ class Hello:
     """First message of a run, repeated until welcomed.
 
     run_id: 64 random bits, the run's secret: they are its `peer_id` too, and only the edge learns them.
-    rig: the agent's calibration, by which the edge knows what it sees. streams: it does not track itself but
+    rig: the agent's calibration, by which the edge knows what it sees. streams_frames: it does not track itself but
     sends what its sensors see."""
 
     name: str
     kind: AgentKind
     run_id: int
     rig: Rig
-    streams: bool = False
+    streams_frames: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", checked_name(self.name))
@@ -167,17 +167,17 @@ class Refused:
 class Ack:
     """Nothing below `next_keyframe` is wanted any more: it was applied, or dropped by the agent.
 
-    Those in `held` have arrived and wait for a gap to close.
+    Those in `buffered` have arrived and wait for a gap to close.
     """
 
     next_keyframe: int
-    held: tuple[int, ...] = ()
+    buffered: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        for id_ in (self.next_keyframe, *self.held):
+        for id_ in (self.next_keyframe, *self.buffered):
             checked_id("keyframe ids", id_)
-        if len(self.held) > MAX_BUFFERED:
-            raise ValueError(f"held: {len(self.held)} ids, at most {MAX_BUFFERED}")
+        if len(self.buffered) > MAX_BUFFERED:
+            raise ValueError(f"buffered: {len(self.buffered)} ids, at most {MAX_BUFFERED}")
 
 
 @dataclass(frozen=True)
@@ -218,10 +218,10 @@ class RemoteTrackingResult:
     stamp_ns: int
     state: TrackState
     T_odom_body: F64 | None
-    keyframe: bool = False
-    new_stretch: bool = False
-    sound: bool = True
-    waits: WaitReason | None = None
+    is_keyframe: bool = False
+    new_segment: bool = False
+    is_consistent: bool = True
+    waiting_for: WaitReason | None = None
 
     def __post_init__(self) -> None:
         checked_id("index", self.index)

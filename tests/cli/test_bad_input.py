@@ -601,7 +601,7 @@ def test_an_edge_that_never_answers(room, share, tmp_path):
     assert report["keyframes"] == 1
     assert (report["bytes_up"], report["protocol"]["sent"]) == (0, 0)  # no link took anything
     assert _not_late(done.err) == [
-        "share agent: no edge answers yet; tracking goes on alone",
+        "share agent: no edge answers yet; tracking continues without the edge",
         f"share: no edge ever answered at {NOBODY}; is `share edge` running there?",
     ]
     assert sorted(os.listdir(tmp_path / "out")) == ["latency.csv", "map.tum", "odom.tum", "report.json"]

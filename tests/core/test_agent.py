@@ -78,13 +78,13 @@ def test_says_hello_until_welcomed() -> None:
 def test_an_edge_that_never_answers_is_said_once() -> None:
     agent = Agent(HELLO, Config())
     lines = [line for t in range(100) for line in said(handle(agent, ev.AgentTick(), t * 100 * MS))]
-    assert lines == ["no edge answers yet; tracking goes on alone"]
+    assert lines == ["no edge answers yet; tracking continues without the edge"]
 
 
 def test_silence_and_return_are_said_once_each() -> None:
     agent = welcomed()
     effects = [x for t in range(1, 100) for x in handle(agent, ev.AgentTick(), t * 100 * MS)]
-    assert said(effects) == ["the edge is silent; tracking goes on alone"]
+    assert said(effects) == ["the edge is silent; tracking continues without the edge"]
     assert len(only(m.Hello, effects, messages=True)) == pytest.approx(14, abs=1)
     assert said(tell(agent, m.Welcome(SESSION, 0), 10 * S)) == ["the edge is back"]
     assert agent.report()["connected"]
@@ -103,7 +103,9 @@ def test_a_taken_name_ends_the_run_with_the_edges_reason() -> None:
 
 def test_a_refusal_by_a_restarted_edge_does_not_end_the_run() -> None:
     agent = welcomed()
-    assert said(tell(agent, m.Refused("full"), S)) == ["the edge refuses 'ann': full; tracking goes on alone"]
+    assert said(tell(agent, m.Refused("full"), S)) == [
+        "the edge refuses 'ann': full; tracking continues without the edge"
+    ]
     hellos = [
         t for t in range(11, 80) if only(m.Hello, handle(agent, ev.AgentTick(), t * 100 * MS), messages=True)
     ]

@@ -234,7 +234,7 @@ def test_bye_is_heard_once() -> None:
 def test_no_tracker_begins_for_who_cannot_come_back() -> None:
     edge = TrackingEdge(Config(), 7, capacity=TrackingCapacity(1, "it is small"))
     for k, name in enumerate(("ann", "bob")):
-        hello = replace(hello_of(name, k, AgentKind.AR), streams=True)
+        hello = replace(hello_of(name, k, AgentKind.AR), streams_frames=True)
         assert of(tell(edge, k, hello), ed.StartTracker)
         tell(edge, k, m.Bye())
     assert of(tell(edge, 0, m.Ping(1, 1)), ed.StartTracker)

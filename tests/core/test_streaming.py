@@ -25,7 +25,7 @@ from share.wire.codec import decode, encode
 
 MS = 1_000_000
 CONFIG = Config(edge=EdgeConfig(policy="streamed"), stream=StreamConfig(window=3))
-HELLO = replace(hello_of("ann", 7), streams=True)
+HELLO = replace(hello_of("ann", 7), streams_frames=True)
 PEER = m.peer_id(7)
 
 
@@ -190,7 +190,7 @@ def test_without_an_edge_it_goes_on_and_says_so() -> None:
     wire.cut = True
     wire.play(300, first=5)
     wire.run(4500)
-    assert wire.said[1:] == ["the edge is silent; nobody tracks this agent"]
+    assert wire.said[1:] == ["the edge is silent; no tracking without the edge"]
     wire.cut = False
     wire.run(12_000)
     report = wire.agent.report()
@@ -270,7 +270,7 @@ def test_a_goodbye_waits_for_the_last_pose_and_ends_the_tracker() -> None:
     ],
 )
 def test_who_does_not_fit_is_refused(edge: Edge, streams: bool, said: str) -> None:
-    wire = Wire(edge=edge, agent=Agent(replace(HELLO, streams=streams), CONFIG))
+    wire = Wire(edge=edge, agent=Agent(replace(HELLO, streams_frames=streams), CONFIG))
     wire.run(200)
     (fail,) = wire.of(ev.FailRun)
     assert said in str(fail.error)
@@ -293,7 +293,7 @@ def test_a_stream_that_is_none_of_ours_changes_nothing() -> None:
     wire.to_edge(ed.PeerMessageReceived(PEER, encoded(m.Evaluation(0, 1.0, None))))
     wire.to_edge(ed.PeerMessageReceived(m.peer_id(9), encoded(frame(0))))
     report = wire.edge.report({})
-    assert report["agents"]["ann"]["unexpected"] == report["strangers"]["unexpected"] == 1
+    assert report["agents"]["ann"]["unexpected"] == report["unjoined"]["unexpected"] == 1
     alone = Agent(hello_of("bob", 8), Config())
     effects = alone.handle(
         ev.EdgeMessageReceived(encoded(m.RemoteTrackingResult(0, 0, TrackState.LOST, None))), 0
@@ -312,7 +312,7 @@ def encoded(message: m.Message) -> list[bytes]:
 
 def greeted(edge: Edge, number: int, now_ms: int = 0) -> tuple[list[m.Message], list[ed.EdgeEffect]]:
     """What agent `number` is told when it says hello, and all else that follows."""
-    hello = replace(hello_of(f"agent{number}", 100 + number), streams=True)
+    hello = replace(hello_of(f"agent{number}", 100 + number), streams_frames=True)
     effects = edge.handle(ed.PeerMessageReceived(m.peer_id(100 + number), encode(hello)), now_ms * MS)
     down = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
     return down, effects
@@ -341,7 +341,7 @@ def test_a_rig_that_no_tracker_can_use_is_refused_at_hello():
         (replace(rig, T_body_cam0=se3.from_rt(np.eye(3), np.array([0, 0, 400.0]))), "400 m from the IMU"),
     ]
     for k, (rig, says) in enumerate(refused):
-        hello = replace(hello_of(f"agent{k}", 100 + k), streams=True, rig=rig)
+        hello = replace(hello_of(f"agent{k}", 100 + k), streams_frames=True, rig=rig)
         effects = edge.handle(ed.PeerMessageReceived(m.peer_id(100 + k), encode(hello)), 0)
         assert not [e for e in effects if isinstance(e, ed.StartTracker)]
         [told] = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
@@ -354,7 +354,7 @@ def test_large_images_need_more_room():
     large = Rig(Camera(3800, 2400, 3000.0, 3000.0, 1900.0, 1200.0), np.eye(4), imu=NOISE)
     begun, refused = 0, []
     for k in range(12):
-        hello = replace(hello_of(f"agent{k}", 100 + k), streams=True, rig=large)
+        hello = replace(hello_of(f"agent{k}", 100 + k), streams_frames=True, rig=large)
         effects = edge.handle(ed.PeerMessageReceived(m.peer_id(100 + k), encode(hello)), 0)
         begun += sum(isinstance(e, ed.StartTracker) for e in effects)
         refused += [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
@@ -370,7 +370,7 @@ def test_a_stretch_that_begins_with_a_frame_nobody_waits_for_any_more_begins_wit
     for k in range(2):
         streaming.add_frame(ev.FrameArrived(frame(k), 0), is_connected=True)
         streaming.next_frame(2000 * MS * k)  # by then nobody waits for the first
-    late = m.RemoteTrackingResult(0, 0, TrackState.OK, pose(0), new_stretch=True)
+    late = m.RemoteTrackingResult(0, 0, TrackState.OK, pose(0), new_segment=True)
     assert streaming.take_result(late, 2000 * MS) is None
     answer = streaming.take_result(m.RemoteTrackingResult(1, 33 * MS, TrackState.OK, pose(1)), 2001 * MS)
     assert answer is not None

@@ -59,7 +59,7 @@ def test_two_agents_are_joined_to_truth(ann: Walker, bob: Walker) -> None:
     for x in near_loops(ann, bob, rng) + near_loops(bob, bob, rng):
         decisions.append(atlas.propose(x))
         applied += settle(atlas)
-    assert "would join two maps, 1 of 5 places that say so: waits" in decisions[0].reason
+    assert "1 of 5 required places agree: pending" in decisions[0].reason
     joining = [k for k, d in enumerate(decisions) if d.joined_maps]
     assert joining == [4]  # every one of these loops is at a place of its own
     assert decisions[4].joined_maps == ("ann/0", "bob/0")
@@ -116,8 +116,8 @@ def test_correction_brings_odometry_into_the_map(ann: Walker, bob: Walker) -> No
     last = KeyframeKey("bob", 59)
     assert correction.T_map_odom @ bob.T_odom_body[-1] == pytest.approx(atlas.pose(last), abs=1e-9)
     assert correction.T_map_odom == pytest.approx(atlas.T_map_odom("bob"))
-    assert (correction.map_id, correction.revision, correction.answers) == ("ann/0", 0, 56)
-    assert applied.corrections["ann"].answers == -1
+    assert (correction.map_id, correction.revision, correction.answered_keyframe) == ("ann/0", 0, 56)
+    assert applied.corrections["ann"].answered_keyframe == -1
     # what is uncertain is where bob is, to a few centimetres, not the far-off origin of his odometry
     cov = se3.inverse_cov(se3.inverse(bob.T_odom_body[-1]), correction.cov)
     assert 0.001 < np.sqrt(np.trace(cov[3:, 3:])) < 0.2
@@ -160,7 +160,7 @@ def test_of_small_maps_fewer_places_are_enough_but_never_one_keyframe() -> None:
     ann, bob = Walker("ann", 1, 5, turn=0.5), Walker("bob", 2, 5, turn=0.5)
     rng = np.random.default_rng(0)
     atlas = atlas_of(ann, bob)
-    assert "0 of 1 places" in atlas.propose(far_loop(ann, 0, bob, 4, rng)).reason
+    assert "0 of 1 required places" in atlas.propose(far_loop(ann, 0, bob, 4, rng)).reason
     for i in (1, 2, 3):
         assert not atlas.propose(loop(ann, i, bob, 1, rng)).accepted
     assert atlas.propose(loop(ann, 1, bob, 2, rng)).joined_maps == ("ann/0", "bob/0")
@@ -334,10 +334,10 @@ def test_a_false_join_is_taken_out_once_better_evidence_is_there(ann: Walker, bo
         others.append(atlas.propose(x))
         settle(atlas)
     assert "contradicts the map" in first.reason
-    assert "1 places (weight 0.38) say so, 4 places needed" in first.reason
+    assert "1 places (weight 0.38) supporting, 4 places needed" in first.reason
     assert not (first.dropped or second.dropped or third.dropped)
     assert set(fourth.dropped) == set(false)
-    assert "taken out: ann:0 - bob:13, ann:4 - bob:17" in fourth.reason
+    assert "removed: ann:0 - bob:13, ann:4 - bob:17" in fourth.reason
     assert fourth.joined_maps == ("ann/0", "bob/0")
     assert len(fourth.added) == 4
     assert all(d.accepted for d in others)
@@ -353,7 +353,7 @@ def test_what_stands_is_not_taken_out_by_hardly_more(ann: Walker, bob: Walker) -
     settle(atlas)
     true = [replace(x, found_share=0.58) for x in near_loops(ann, bob, np.random.default_rng(0))]
     fourth = [atlas.propose(x) for x in true[:4]][-1]
-    assert "4 places (weight 1.35) say so, 5 places (weight 1.06) do not" in fourth.reason
+    assert "4 places (weight 1.35) supporting, 5 places (weight 1.06) opposing" in fourth.reason
     assert not fourth.accepted
 
 
@@ -377,7 +377,7 @@ def test_two_stories_of_like_weight_join_nothing(ann: Walker, bob: Walker) -> No
             assert not atlas.propose(x).accepted
         decisions = [atlas.propose(x) for x in true]
         assert decisions[-1].accepted == joined
-        assert joined or "another story has 4 places" in decisions[-1].reason
+        assert joined or "a competing hypothesis has 4 places" in decisions[-1].reason
 
 
 def test_views_that_lack_what_both_should_show_join_nothing(ann: Walker, bob: Walker) -> None:

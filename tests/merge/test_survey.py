@@ -98,7 +98,7 @@ def test_what_is_recognised_does_not_hide_what_is_gone() -> None:
     room.walk(0, 20)
     decision = room.propose(room.loops(range(0, 6)))[-1]
     assert not decision.accepted
-    assert "of the 20 views that overlap is gone: waits" in decision.reason
+    assert "of the 20 overlapping views is missing: pending" in decision.reason
 
 
 def test_a_join_is_undone_where_the_copy_ends() -> None:
@@ -109,7 +109,7 @@ def test_a_join_is_undone_where_the_copy_ends() -> None:
     assert room.propose(room.loops(range(0, 12, 3)))[-1].accepted
     (undone,) = room.walk(12, 40)
     assert {str(x) for x in undone.dropped} == {"a:0 - b:0", "a:3 - b:3", "a:6 - b:6", "a:9 - b:9"}
-    assert "what a/0 and b/0 should share is gone" in undone.reason
+    assert "what a/0 and b/0 should share is missing" in undone.reason
     assert "a:0 - b:0, a:3 - b:3, a:6 - b:6 and 1 more" in undone.reason
     assert sorted(room.atlas.map_sizes().values()) == [40, 40]
     again = room.propose(room.loops(range(1, 13, 3)))[-1]  # the same story, by others who were there

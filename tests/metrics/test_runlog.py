@@ -107,7 +107,7 @@ def test_what_does_not_come_of_rows_is_told_too() -> None:
         log.add_result(waits is None, waits is not None, waits)
     told = log.report()
     assert (told["cpu_ms_per_frame"], told["decode_ms_per_frame"]) == (500.0, 250.0)
-    assert (told["stretches"], told["contradicted"], told["waited"]) == (1, 1, {"imu": 2})
+    assert (told["segments"], told["inconsistent_frames"], told["waiting_frames"]) == (1, 1, {"imu": 2})
 
 
 def test_an_hour_of_frames_takes_no_memory(tmp_path: Path) -> None:

@@ -60,8 +60,8 @@ EXAMPLES: list[m.Message] = [
     m.Pong(1, 1, 2, 3, 2**62),
     frame(True),
     frame(False),
-    m.RemoteTrackingResult(4, 10**18, TrackState.OK, POSE, keyframe=True),
-    m.RemoteTrackingResult(5, 10**18, TrackState.INITIALISING, None, waits=WaitReason.TILT),
+    m.RemoteTrackingResult(4, 10**18, TrackState.OK, POSE, is_keyframe=True),
+    m.RemoteTrackingResult(5, 10**18, TrackState.INITIALISING, None, waiting_for=WaitReason.TILT),
 ]
 
 
@@ -160,7 +160,7 @@ BAD = {
     "is not a rigid transform": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), *T_FRAMES],
     "not finite": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
     "Invalid enum value 'LOSTER'": [header(V, 2, (1, "LOSTER", -1), [("<f8", (4, 4))]), *T_FRAMES],
-    "follows: 9": [header(V, 3, (7, -1, 0, 9, 0.0), codec_table := [
+    "predecessor: 9": [header(V, 3, (7, -1, 0, 9, 0.0), codec_table := [
         ("<f8", (4, 4)), ("<f8", (6, 6)), ("<f8", (4, 4)), ("<f8", (3,)),
         ("<f4", (0, 2)), ("<f4", (0, 3)), ("|u1", (0, 32))]),
         POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],

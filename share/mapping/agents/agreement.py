@@ -227,7 +227,7 @@ class AgentAgreement:
         for a in map(self.identities.identity, first_runs):
             for b in map(self.identities.identity, second_runs):
                 if a != b and ({a, b} & self.quarantined or frozenset((a, b)) in self.disputed):
-                    return f"{a} and {b} are kept apart"
+                    return f"{a} and {b} are quarantined from each other"
         return ""
 
     def unverified_reason(self, first_runs: Collection[str], second_runs: Collection[str]) -> str:
@@ -255,7 +255,7 @@ class AgentAgreement:
         elif any(frozenset(names) in self.disputed for names, _ in disagreeing):
             state, reason = (
                 "disputed",
-                f"{_contradiction_text(agent, disagreeing)}; nobody can say which of the two is wrong",
+                f"{_contradiction_text(agent, disagreeing)}; undetermined which of the two is wrong",
             )
         elif agent in self.identities.unverified:
             state, reason = "unknown", f"not compared with the others {self._unverified_cause(agent)}"
@@ -273,7 +273,7 @@ class AgentAgreement:
 
     def _unverified_cause(self, unverified: str) -> str:
         if unverified in self.identities.suspected:
-            return "since an earlier run of its name was kept apart"
+            return "since an earlier run of its name was quarantined"
         return "since the edge was started again"
 
     def contradictions(self) -> dict[AgentNames, float]:
@@ -356,17 +356,17 @@ class AgentAgreement:
         if comparison.inlier_share >= _MIN_INLIER_SHARE:
             out.append(
                 scale_contradiction(
-                    comparison.path_scale, self._tolerance, "its way is {} % {}", ("longer", "shorter")
+                    comparison.path_scale, self._tolerance, "its path is {} % {}", ("longer", "shorter")
                 )
             )
             rotation_text = (
-                f"its camera is turned by {np.degrees(comparison.camera_rotation.value):.1f} "
-                f"degrees against what it says"
+                f"its camera is rotated by {np.degrees(comparison.camera_rotation.value):.1f} "
+                f"degrees against its calibration"
             )
             out.append(
                 (severity(comparison.camera_rotation, _MAX_ROTATION_RAD), rotation_text, rotation_text)
             )
-        text = f"loops are off by {comparison.nis:.1f} times the variance that it claims"
+        text = f"loops are off by {comparison.nis:.1f} times its stated variance"
         out.append((comparison.nis / _MAX_NIS, text, text))
         return out
 
