@@ -387,9 +387,9 @@ class Keyframe:
 class Correction:
     """The edge's word on where an agent's odometry lies in the shared map.
 
-    map_id: names the map; a pose is comparable only with poses in the same map. revision: rises
-    with every correction to this agent. segment_keyframe: id of a keyframe of the stretch of odometry that it is about.
-    answered_keyframe: id of the agent's keyframe that led to it, or -1 when another agent's did.
+    map_id: names the map; poses are comparable only within one map. revision: rises with every correction
+    to this agent. segment_keyframe: id of a keyframe of the odometry segment that it applies to.
+    answered_keyframe: id of the agent's keyframe that led to it; -1 if another agent's did.
     """
 
     T_map_odom: F64

@@ -54,7 +54,7 @@ def test_a_key_speaks_for_its_names_only() -> None:
     edge = Edge(Config(), 7)
     (refused,) = sent(tell(edge, hello_of("ann", SECRET), EVE))
     assert isinstance(refused, m.Refused)
-    assert "speaks for 'eve', 'mallory', not for 'ann'" in refused.reason
+    assert "authorized for 'eve', 'mallory', not for 'ann'" in refused.reason
     assert "share keys authorize" in refused.reason
     (welcome,) = sent(tell(edge, hello_of("eve", SECRET), EVE))
     assert isinstance(welcome, m.Welcome)

@@ -100,5 +100,5 @@ def test_the_holding_area_is_bounded() -> None:
 
 @pytest.mark.parametrize("hold", [0, MAX_BUFFERED + 1])
 def test_hold_must_fit_an_ack(hold: int) -> None:
-    with pytest.raises(ValueError, match="hold"):
+    with pytest.raises(ValueError, match="capacity"):
         ReorderBuffer(capacity=hold)

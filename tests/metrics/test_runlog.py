@@ -131,5 +131,5 @@ def test_a_line_that_somebody_changed_is_said() -> None:
     log = RunLog(lines)
     log.add(5, 2.0, TrackState.OK, False)
     lines.write("5,what,,OK,0,0")
-    with pytest.raises(DataError, match="the run's own latencies were changed by somebody"):
+    with pytest.raises(DataError, match="the log of this run's frames was changed during the run"):
         log.report()

@@ -150,7 +150,7 @@ def test_who_does_not_fit_is_told_so(plain_session: Path, tmp_path: Path) -> Non
     streams = start_agent(tmp_path, "bob", plain_session / "ar1", address, "--streamed")
     assert streams.wait(60) == 2
     assert streams.said == (
-        "share: the edge refuses 'bob': this edge tracks nobody: start it with --policy streamed, "
+        "share: the edge refuses 'bob': this edge does not track agents: start it with --policy streamed, "
         "or the agent without --streamed\n"
     )
     maps.interrupt()
