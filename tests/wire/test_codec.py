@@ -164,7 +164,7 @@ BAD = {
         ("<f8", (4, 4)), ("<f8", (6, 6)), ("<f8", (4, 4)), ("<f8", (3,)),
         ("<f4", (0, 2)), ("<f4", (0, 3)), ("|u1", (0, 32))]),
         POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
-    "up_sigma: -0.1 is no standard deviation": [header(V, 3, (7, -1, 0, 6, -0.1), codec_table),
+    "up_sigma: -0.1 is outside 0 .. 1e+06": [header(V, 3, (7, -1, 0, 6, -0.1), codec_table),
         POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
     "view.uv: <f4 of shape (2001, 2)": [header(V, 3, (7, -1, 0, 6, 0.0), [
         *codec_table[:4], ("<f4", (2001, 2)), *codec_table[5:]]),
