@@ -45,7 +45,7 @@ def exit_with_parent(parent: int, from_main_thread: bool = True) -> None:
 
 
 def is_main_thread() -> bool:
-    """Return whether the caller is the main thread, whose children the kernel kills only with the process."""
+    """Return whether this is the main thread: the kernel kills its children only when the process ends."""
     return threading.current_thread() is threading.main_thread()
 
 

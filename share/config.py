@@ -247,7 +247,7 @@ class MergeConfig:
     overlap_gone: float = 0.06  # largest share of the common points that may be missing
     undo_doubt: float = 0.6  # CUSUM of the missing share above that; more forbids or undoes a merge
     rival_weight: float = 0.5  # a competing hypothesis with more than this share of the weight blocks a merge
-    enter_m: float = 0.05  # an agent whose map position is less certain (1 sigma) waits for its correction
+    enter_m: float = 0.05  # an agent with a larger map position sigma waits for its correction
     enter_patience: int = 20  # but at most for this many of its keyframes with loops
     rebel_places: int = 4  # contradicting loops split a map from this many places on
     rebel_weight: float = 1.4  # and from this multiple of the existing loops' weight on
@@ -326,7 +326,7 @@ class ControlConfig:
     near_m: float = 0.3  # near plane of the view frusta
     far_m: float = 5.0  # far plane of the view frusta
     interval_m: float = 0.5  # spacing of the points at which overlap is sampled
-    merges: int = 20  # completed merges, with whose mean overlap a new one is compared (N)
+    merges: int = 20  # completed merges in the mean overlap that a new one is compared with (N)
     eagerness: float = 1.5  # a merge has this probability times its overlap over their mean (alpha_m)
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Multiprocessing context whose processes end with their parent and leave terminal signals to it.
+"""Multiprocessing context: its processes end with their parent and leave terminal signals to it.
 
 A parent that ends in good order kills the ones it has not closed rather than wait for them as multiprocessing
 does: a signal may have ended it before it recorded them.

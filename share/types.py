@@ -37,7 +37,7 @@ MAX_STAMP_NS = 2**62  # either side of 0: 146 years; differences fit 64 bits
 
 
 class AgentKind(StrEnum):
-    """Kind of agent: a headset (AR), whose wearer notices 20 ms of lag, or a robot."""
+    """Kind of agent: a headset (AR; its wearer notices 20 ms of lag) or a robot."""
 
     AR = "ar"
     ROBOT = "robot"

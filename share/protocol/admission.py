@@ -235,7 +235,7 @@ class RunRegistry(Mapping[bytes, Peer]):
             self._empty_runs[run.key] = -1
 
     def mark_empty(self, runs: Iterable[KeyframeKey]) -> None:
-        """Record that the map has nothing left of these runs, whose keyframes up to these it has seen."""
+        """Record that the map has nothing left of these runs. Values: newest keyframes it has seen."""
         self._empty_runs.update(runs)
 
     def removable(self) -> list[Peer]:

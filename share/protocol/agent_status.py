@@ -188,7 +188,7 @@ class DriftEstimator:
         self._motions: deque[tuple[int, int, F64, F64]] = deque()  # keyframe id, time, T_last_this, cov
 
     def add_keyframe(self, keyframe: Keyframe, sent_ns: int) -> None:
-        """Add a sent keyframe. One without a reference starts a segment, whose drift is zero."""
+        """Add a sent keyframe. One without a reference starts a segment with zero drift."""
         if keyframe.reference < 0 or self._since_ns is None:
             self._motions.clear()
             self._since_ns = sent_ns

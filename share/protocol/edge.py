@@ -82,7 +82,7 @@ class Edge:
         self._record_throttled(now_ns, "internal error", peer, reason)
 
     def _dispatch(self, event: ed.EdgeEvent, now_ns: int) -> None:
-        # before a hello of one of them, whose keyframes would count as known
+        # first: after a hello, the keyframes of a forgotten run would count as known
         self._forget_empty_runs(now_ns)
         match event:
             case ed.PeerMessageReceived():
@@ -203,7 +203,7 @@ class Edge:
         self._record_throttled(now_ns, "reconnected", peer, "sends again")
 
     def _supersede(self, name: str, now_ns: int) -> None:
-        """Mark present runs of this name as gone: they lost it by silence, and a new one takes it."""
+        """Mark present runs of this name as gone: they were silent too long, and a new run takes it."""
         for other in self._registry.values():
             if not other.is_gone and other.hello.name == name:
                 self._mark_gone(other, "silent", "name taken by a newer run", now_ns)

@@ -38,7 +38,7 @@ class Exchange:
     @property
     def unverified_ns(self) -> int:
         """Twice the error bound of `offset_ns` if one of the other side's two times is forged: the other
-        time was read within the exchange, whose length our clock has measured."""
+        time was read within the exchange, and our clock has measured its length."""
         return (self.returned_ns - self.sent_ns) + (self.replied_ns - self.received_ns)
 
     @property

@@ -109,7 +109,7 @@ _MAX_RUNS = 4096  # remembered
 
 
 class SessionTotals:
-    """Totals over restarts of the mapper, whose counts start at 0 each time."""
+    """Totals over restarts of the mapper, which counts from 0 each time."""
 
     def __init__(self) -> None:
         self._previous: Mapping[str, Any] = {}

@@ -77,7 +77,7 @@ class MapLocalisation:
         self._segment = 0  # number of the odometry segment
 
     def begin_segment(self) -> None:
-        """Start a new odometry segment, whose place in the map is unknown."""
+        """Start a new odometry segment. Its place in the map is unknown."""
         self.map_frame.reset()
         self._segment += 1
 

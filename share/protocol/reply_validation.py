@@ -66,7 +66,7 @@ class ReplyValidator:
         return unsent
 
 
-_MAX_SESSIONS = 16  # remembered sessions, whose messages may still be in flight
+_MAX_SESSIONS = 16  # remembered sessions: their messages may still be in flight
 _MAX_REORDERING = (
     1000  # corrections that a network may reorder; a larger step back is a restart of the counter
 )

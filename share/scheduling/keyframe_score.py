@@ -1,4 +1,4 @@
-"""Score of keyframe candidates under a rate limit: prefer those whose place is recognised more often."""
+"""Score of keyframe candidates under a rate limit: prefer places that are recognised more often."""
 
 from __future__ import annotations
 

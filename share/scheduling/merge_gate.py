@@ -1,4 +1,4 @@
-"""The merge gate: skips merges whose view overlap is small compared with that of previous merges.
+"""The merge gate: skips merges with little view overlap compared with previous merges.
 
 P_skip = max(0, 1 - alpha_m V_new / V), V the mean overlap of the last N completed merges. Source: SHARE,
 IMWUT 10(3) 97, 2026.

@@ -106,7 +106,9 @@ def test_a_run_whose_name_was_taken_from_its_key_is_refused() -> None:
     edge = Edge(Config(), 7)
     assert refusal(tell(edge, 1, hello_of("zoe", 1), 0, ["zoe"])) is None
     assert not of(tell(edge, 1, keyframe(0), 1, ["yan"]), ed.SendToPeer)  # so it is silent, and says hello
-    why = "its key is authorized for 'yan', not for 'zoe'; on the edge run: share keys authorize … --agent zoe"
+    why = (
+        "its key is authorized for 'yan', not for 'zoe'; on the edge run: share keys authorize … --agent zoe"
+    )
     assert refusal(tell(edge, 1, hello_of("zoe", 1), 2, ["yan"])) == why
     zoe = edge.report({})["agents"]["zoe"]
     assert (zoe["keyframes"], zoe["refused_messages"]) == (0, 0)  # whoever it was, it was not zoe

@@ -16,7 +16,8 @@ def keyframe(id_: int, predecessor: int | None = None, reference: int | None = N
     """By default relative to its predecessor, as an agent's keyframes are."""
     predecessor = id_ - 1 if predecessor is None else predecessor
     reference = predecessor if reference is None else reference
-    return Keyframe(id_, reference, id_, np.eye(4), np.eye(6), np.eye(4), np.zeros(3), 0.0, EMPTY, predecessor)
+    eye = np.eye(4)
+    return Keyframe(id_, reference, id_, eye, np.eye(6), eye, np.zeros(3), 0.0, EMPTY, predecessor)
 
 
 def ids(keyframes: list[Keyframe]) -> list[int]:
