@@ -1,4 +1,4 @@
-"""Where `share` and `python -m share` begin: Ctrl-C is looked after before anything heavy is imported."""
+"""Entry point of `share` and `python -m share`. It handles Ctrl-C before anything heavy is imported."""
 
 import os
 import signal
@@ -6,8 +6,8 @@ from types import FrameType
 
 
 def run() -> None:
-    """The command line. Until a command has begun, Ctrl-C ends the program with one line."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where a script has it ignored
+    """Run the command line. Until a command has started, Ctrl-C ends the program with one line."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if a script ignores it
         signal.signal(signal.SIGINT, handle_interrupt)
     from share.cli.main import main
 
@@ -15,7 +15,7 @@ def run() -> None:
 
 
 def handle_interrupt(signal_number: int, frame: FrameType | None) -> None:
-    """Exit code 130, as shells give it for SIGINT."""
+    """Exit with code 130, the shells' code for SIGINT."""
     os.write(2, b"share: interrupted\n")
     os._exit(130)
 

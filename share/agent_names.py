@@ -1,5 +1,5 @@
-"""What an agent may be called: it stands in lines that a person reads, so no name can look like more than a
-name, or like no name at all."""
+"""Rules for agent names. Names appear in lines that people read, so none may be invisible or look like other
+text."""
 
 from __future__ import annotations
 
@@ -10,31 +10,29 @@ from share.types import MAX_NAME_LENGTH
 
 NAME_RULE = f"1 to {MAX_NAME_LENGTH} letters, digits, '-_.+@#()' and single spaces between them"
 _PUNCTUATION = "-_.+@#()"
-# Signs that Unicode counts among the letters: they repeat or lengthen one, as in Japanese and Thai names.
-# All others of their kind look like quotation marks, colons or accents.
+# Unicode modifier letters that repeat or lengthen a letter, as in Japanese and Thai names. All others look
+# like quotation marks, colons or accents.
 _LETTER_MODIFIERS = "々〻ゝゞヽヾーｰๆໆ"
-# Letters and marks that show nothing, or a quotation mark (saltillo).
+# Letters and marks that are invisible, or look like a quotation mark (saltillo).
 _INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180d\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef\ua78b\ua78c]"
 )
 
 
 def checked_name(name: str) -> str:
-    """`name` as Unicode composes it (NFC), so that names that look alike by their accents are alike.
+    """Return `name` composed (NFC), so that names with the same accents are equal.
 
-    Raises ValueError if no agent may be called so, which does not quote it."""
+    Raises ValueError, whose text does not quote it, if the name is not allowed."""
     name = normalize("NFC", name)
     if not 0 < len(name) <= MAX_NAME_LENGTH:
         raise ValueError(f"name: {len(name)} characters; use {NAME_RULE}")
-    previous = (
-        " "  # kinds of the character before, and of the marks on it: letter, mark, digit, space or other
-    )
+    previous = " "  # class of the previous character, with its marks
     for character in name:
         kind = _character_class(character)
-        if kind == "M" and previous in ("L", "LM"):  # two marks, as Indic and Thai names have them
+        if kind == "M" and previous in ("L", "LM"):  # up to two marks, as in Indic and Thai names
             kind = previous + "M"
         if kind in (None, "M") or (kind == " " and previous == " "):
-            raise ValueError(f"name: not with U+{ord(character):04X} there; use {NAME_RULE}")
+            raise ValueError(f"name: U+{ord(character):04X} is not allowed there; use {NAME_RULE}")
         previous = kind
     if previous == " ":
         raise ValueError(f"name: ends in a space; use {NAME_RULE}")
@@ -42,7 +40,7 @@ def checked_name(name: str) -> str:
 
 
 def _character_class(character: str) -> str | None:
-    """L, M, N, space or "."; None if it is in no name."""
+    """Return L (letter), M (mark), N (digit), space or "." (punctuation); None if not allowed."""
     if character in _PUNCTUATION:
         return "."
     if character == " ":

@@ -1,4 +1,4 @@
-"""Tables as dataclasses of arrays with one row an item: rows chosen, tables put together."""
+"""Tables as dataclasses of arrays with one row per item: selection and concatenation of rows."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from share.types import I64
 
 @dataclass(frozen=True, eq=False)
 class ArrayTable:
-    """Every field is an array (N, ...) or Columns of N rows."""
+    """Base class. Every field is an array (N, ...) or an ArrayTable of N rows."""
 
     def take(self, rows: NDArray[np.bool_] | I64) -> Self:
-        """These rows, by a mask (N,) or by their numbers."""
+        """Return these rows, by a mask (N,) or by indices."""
         indices = np.flatnonzero(rows) if rows.dtype == np.bool_ else np.asarray(rows, np.int64)
         return type(self)(*[_take_rows(getattr(self, name), indices) for name in _field_names(type(self))])
 
     def concatenate(self, *others: Self) -> Self:
-        """All rows, one table after the other."""
+        """Return the rows of all tables in order."""
         tables = (self, *others)
         return type(self)(
             *[_concatenate([getattr(t, name) for t in tables]) for name in _field_names(type(self))]
         )
 
 
-_FIELD_NAMES: dict[type[ArrayTable], tuple[str, ...]] = {}  # looked up once
+_FIELD_NAMES: dict[type[ArrayTable], tuple[str, ...]] = {}  # cache
 
 
 def _field_names(table: type[ArrayTable]) -> tuple[str, ...]:

@@ -1,13 +1,11 @@
 """Child processes that end with their parent, however it ends: killed, crashed or in good order.
 
-Every process that SHARE starts is started through here: one of its own commands with `child_environment()`, a
-worker of multiprocessing by `share.spawning.SPAWN`, a fork that calls `exit_with_parent` itself. The first
-thing that
-the child does, before it imports anything heavy, is to ask the kernel to be killed when its parent dies
-(PR_SET_PDEATHSIG), and then to look whether the parent has died meanwhile. The kernel takes the *thread*
-that started the child for its parent. So a child that was started by another than the main thread, which
-may end long before its process, and one on a system without that request, looks at its parent's number
-every 0.2 s instead.
+Every process that SHARE starts uses this module: SHARE commands by `child_environment`, multiprocessing
+workers by `share.spawning.SPAWN_CONTEXT`, forks by calling `exit_with_parent`. Before it imports anything
+heavy, the child asks the kernel to kill it when its parent dies (PR_SET_PDEATHSIG), then checks that the
+parent is still alive. The kernel takes the *thread* that started the child for its parent. So a child
+started by another than the main thread, which may end long before its process, polls its parent's process
+id every 0.2 s instead, and so does one on a system without PR_SET_PDEATHSIG.
 """
 
 from __future__ import annotations
@@ -24,19 +22,21 @@ _POLL_S = 0.2
 
 
 def child_environment() -> dict[str, str]:
-    """For `subprocess.Popen` of one of SHARE's own commands."""
+    """Return the environment for `subprocess.Popen` of a SHARE command."""
     return {**os.environ, _PARENT_VARIABLE: f"{os.getpid()}:{is_main_thread():d}"}
 
 
 def exit_with_starter() -> None:
-    """The first thing that a SHARE command does: it ends with the SHARE process that started it, if any."""
+    """Make this process end with the SHARE process that started it, if any. Called first by every command."""
     parent, _, from_main_thread = os.environ.pop(_PARENT_VARIABLE, "").partition(":")
     if parent.isdecimal():
         exit_with_parent(int(parent), from_main_thread == "1")
 
 
 def exit_with_parent(parent: int, from_main_thread: bool = True) -> None:
-    """This process ends with its parent. parent: its process id. kernel: its main thread started this one."""
+    """Make this process end with its parent.
+
+    parent: its process id. from_main_thread: its main thread started this process."""
     has_death_signal = from_main_thread and _request_death_signal()
     if os.getppid() != parent:
         os._exit(1)
@@ -45,12 +45,12 @@ def exit_with_parent(parent: int, from_main_thread: bool = True) -> None:
 
 
 def is_main_thread() -> bool:
-    """Whether the main thread asks: what it starts has this process for its parent, to the kernel too."""
+    """Return whether this is the main thread: the kernel kills its children only when the process ends."""
     return threading.current_thread() is threading.main_thread()
 
 
 def _request_death_signal() -> bool:
-    """Whether the kernel has agreed to kill this process when its parent ends."""
+    """Ask the kernel to kill this process when its parent ends. Return whether it agreed."""
     if sys.platform != "linux":
         return False
     import ctypes

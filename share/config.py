@@ -1,4 +1,4 @@
-"""Every tunable of SHARE, its unit and its default. The effective configuration is written beside the
+"""The configuration: every key with its unit and default. The effective configuration is written beside the
 results of every run.
 """
 
@@ -12,13 +12,13 @@ from share.plain_data import from_mapping, load_yaml
 
 @dataclass(frozen=True)
 class SequencerConfig:
-    """How streams are merged by time."""
+    """Merging of streams by time."""
 
-    sync_tolerance_ms: float = 5.0  # cameras of one frame lie within this
-    imu_silent_ms: float = 100.0  # a frame waits this long (stream time) for partners and IMU samples
-    reorder_ms: float = 0.0  # disorder within one stream that is put right; delays frames by as much
+    sync_tolerance_ms: float = 5.0  # largest difference of the stamps of one frame's cameras
+    imu_silent_ms: float = 100.0  # longest wait of a frame for partner images and IMU samples, in stream time
+    reorder_ms: float = 0.0  # disorder within a stream that is corrected; delays frames by as much
     gap_factor: float = 2.5  # a step longer than this many frame intervals is a gap
-    max_jump_s: float = 10.0  # a longer step needs three witnesses to be believed, backward never is
+    max_jump_s: float = 10.0  # a longer step is accepted after three consistent samples; a backward one never
 
     def __post_init__(self) -> None:
         _require_positive(self, "imu_silent_ms", "gap_factor", "max_jump_s")
@@ -28,27 +28,27 @@ class SequencerConfig:
 class TrackerConfig:
     """Tracking by camera alone (`share.odometry.visual_tracker`)."""
 
-    corners: int = 250  # points tracked at a time
+    corners: int = 250  # features tracked at once
     spacing_px: float = 14.0  # least distance between corners
     view_features: int = 500  # ORB features of a keyframe, for other agents and for relocalisation
-    noise_px: float = 1.0  # standard deviation of one tracked corner
-    ransac_px: float = 3.0  # reprojection error up to which a point belongs to the consensus
-    gate_sigma: float = 3.0  # an observation further off is an outlier
-    min_inliers: int = 15  # points that agree with a pose; fewer: LOST
+    noise_px: float = 1.0  # standard deviation of a tracked corner
+    ransac_px: float = 3.0  # reprojection error of a RANSAC inlier
+    gate_sigma: float = 3.0  # a measurement further off is an outlier
+    min_inliers: int = 15  # features that agree with a pose; fewer: LOST
     weak_inliers: int = 40  # fewer: WEAK
-    keyframe_m: float = 0.15  # a keyframe after this much motion since the last one,
-    keyframe_rad: float = 0.15  # or this much turning,
-    keyframe_tracked: float = 0.6  # or when fewer than this part of its points are left
-    keyframe_gap_s: float = 0.1  # but never sooner
-    max_keyframes: int = 60  # of the local map; a full one drops the keyframe nearest to another
-    reobserve_hosts: int = 6  # earlier keyframes whose points are looked for again
-    reobserve_m: float = 1.0  # which of them: no further away than this,
-    reobserve_rad: float = 0.5  # and turned by no more than this
-    reobserve_px: float = 3.0  # and are taken up again if found so near to where they should be
-    relocalise_hosts: int = 8  # keyframes of the local map that a LOST frame is compared with
-    new_stretch_s: float = 3.0  # LOST this long: odometry begins anew
-    max_speed_m_s: float = 5.0  # a pose that implies more is not believed
-    max_turn_rad_s: float = 12.0  # the same, for turning
+    keyframe_m: float = 0.15  # motion since the last keyframe that triggers a new one
+    keyframe_rad: float = 0.15  # rotation since the last keyframe that triggers a new one
+    keyframe_tracked: float = 0.6  # a smaller share of its features still tracked triggers one too
+    keyframe_gap_s: float = 0.1  # least time between keyframes
+    max_keyframes: int = 60  # of the local map; a full one drops the keyframe closest to another
+    reobserve_hosts: int = 6  # earlier keyframes whose points are searched for again
+    reobserve_m: float = 1.0  # largest distance to such a keyframe
+    reobserve_rad: float = 0.5  # largest rotation to such a keyframe
+    reobserve_px: float = 3.0  # largest distance between the predicted and the found position of such a point
+    relocalise_hosts: int = 8  # keyframes of the local map that a LOST frame is matched with
+    new_stretch_s: float = 3.0  # LOST for this long: odometry starts a new segment
+    max_speed_m_s: float = 5.0  # a pose that implies a higher speed is rejected
+    max_turn_rad_s: float = 12.0  # a pose that implies a higher angular rate is rejected
 
     def __post_init__(self) -> None:
         _require_positive(self, "corners", "spacing_px", "view_features", "noise_px", "ransac_px")
@@ -59,39 +59,39 @@ class TrackerConfig:
 class InertialConfig:
     """Tracking by cameras and IMU (`share.odometry`)."""
 
-    features: int = 80  # followed at a time
-    spacing_px: float = 18.0  # least distance between new ones
-    sigma_px: float = 0.15  # of a feature found again, anew in every image,
-    lasting_px: float = 0.3  # and of what is wrong with it for longer: edges, patches seen from elsewhere;
-    stereo_px: float = 0.25  # of a new feature's disparity
-    common_rad: float = 1e-3  # error of an image that all its features share: its blur, its time
+    features: int = 80  # features tracked at once
+    spacing_px: float = 18.0  # least distance between new features
+    sigma_px: float = 0.15  # noise of a feature's position, independent in each image
+    lasting_px: float = 0.3  # persistent error of a feature: edges, patches seen from elsewhere
+    stereo_px: float = 0.25  # noise of a new feature's disparity
+    common_rad: float = 1e-3  # error of an image that all its features share (blur, time offset)
     common_m: float = 1e-4  # the same, as a shift of the camera
-    gate: float = 12.0  # squared Mahalanobis distance, 2 degrees of freedom, beyond which a sight is refused
-    alike: float = 0.85  # correlation with the first patch below which a feature is not seen
-    settled_px: float = 0.3  # a last correction larger than this is no find
-    reach_px: float = 4.0  # how far alignment may wander from where a feature was expected
-    imu_noise: float = 2.0  # times what the IMU's data sheet says
-    gyro_bias: float = 0.02  # rad/s, to begin with
-    accel_bias: float = 0.3  # m/s^2, the same
-    extrinsic_rad: float = 1e-5  # what is not known of the camera's place on the body; small: taken as it is
+    gate: float = 12.0  # squared Mahalanobis distance (2 dof) above which a measurement is rejected
+    alike: float = 0.85  # correlation with the first patch below which a feature is not found
+    settled_px: float = 0.3  # alignment has converged if its last step is smaller than this
+    reach_px: float = 4.0  # largest distance of an alignment from the predicted position
+    imu_noise: float = 2.0  # multiple of the IMU's data-sheet noise
+    gyro_bias: float = 0.02  # rad/s, initial standard deviation
+    accel_bias: float = 0.3  # m/s^2, initial standard deviation
+    extrinsic_rad: float = 1e-5  # standard deviation of the camera-to-body rotation; small: as calibrated
     extrinsic_m: float = 1e-5  # the same, of its position
-    offset_s: float = 1e-6  # the same of its time against the IMU's
+    offset_s: float = 1e-6  # the same, of its time offset to the IMU
     gravity: float = 9.81  # m/s^2
-    keyframe_m: float = 0.25  # a keyframe after this much motion since the last one,
-    keyframe_rad: float = 0.35  # or this much turning,
-    keyframe_seen: float = 0.8  # or when fewer than this part of its features are seen
-    keyframe_gap_s: float = 0.1  # but never sooner
+    keyframe_m: float = 0.25  # motion since the last keyframe that triggers a new one
+    keyframe_rad: float = 0.35  # rotation since the last keyframe that triggers a new one
+    keyframe_seen: float = 0.8  # a smaller share of its features in use triggers one too
+    keyframe_gap_s: float = 0.1  # least time between keyframes
     max_keyframes: int = 20  # in the state
-    recall: int = 80  # features of earlier keyframes looked for again at a keyframe,
-    recall_m: float = 1.5  # of keyframes no further away than this
-    recall_rad: float = 0.7  # and turned by no more than this
-    weak: int = 25  # features seen; fewer: WEAK
-    blind: int = 6  # fewer: INERTIAL_ONLY
-    max_speed_m_s: float = 8.0  # a state that is faster is LOST
-    lost_m: float = 0.5  # sigma of a position since the last sight that is LOST
-    silent_s: float = 0.1  # an IMU that says nothing for longer is taken as silent
-    turning_noise: float = 0.5  # rad/s/sqrt(Hz), how a body's turning may change meanwhile
-    moving_noise: float = 1.0  # m/s^2/sqrt(Hz), the same of its velocity
+    recall: int = 80  # features of earlier keyframes that a keyframe searches for again
+    recall_m: float = 1.5  # largest distance to such a keyframe
+    recall_rad: float = 0.7  # largest rotation to such a keyframe
+    weak: int = 25  # features in use; fewer: WEAK
+    blind: int = 6  # features in use; fewer: INERTIAL_ONLY
+    max_speed_m_s: float = 8.0  # a faster state is LOST
+    lost_m: float = 0.5  # position sigma since the last measurement at which the state is LOST
+    silent_s: float = 0.1  # the IMU counts as silent after this long without a sample
+    turning_noise: float = 0.5  # rad/s/sqrt(Hz), process noise of the angular rate while the IMU is silent
+    moving_noise: float = 1.0  # m/s^2/sqrt(Hz), process noise of the velocity while the IMU is silent
 
     def __post_init__(self) -> None:
         _require_positive(self, "features", "spacing_px", "sigma_px", "gate", "imu_noise", "gravity")
@@ -100,33 +100,33 @@ class InertialConfig:
 
 @dataclass(frozen=True)
 class PlaceConfig:
-    """When two views are taken for the same place."""
+    """Verification that two views show the same place."""
 
     candidates: int = 8  # keyframes verified per query, best first
-    enough: int = 3  # verified ones after which the rest is left alone
+    enough: int = 3  # verified candidates after which the search ends
     tables: int = 8  # hash tables of the index
-    hash_bits: int = 16  # descriptor bits that make a word in each of them
-    index_seed: int = 1  # which bits
-    max_distance_bits: int = 64  # of 256: a match of two descriptors
-    min_matches: int = 20  # mutual nearest neighbours, before any geometry
-    ransac_px: float = 6.0  # reprojection error of a rough pose's inlier
+    hash_bits: int = 16  # descriptor bits that form a word in each table
+    index_seed: int = 1  # seed for the choice of these bits
+    max_distance_bits: int = 64  # largest Hamming distance of a match, of 256
+    min_matches: int = 20  # mutual nearest neighbours required before geometry is tried
+    ransac_px: float = 6.0  # reprojection error of a RANSAC inlier
     ransac_iterations: int = 300  # at most, best matches first
-    reverse_iterations: int = 900  # the same, of the reverse direction, in no order
-    min_consensus: int = 8  # inliers of a rough pose: one view's 3D points in the other's image
-    guided_bits: int = 80  # a match beside where the rough pose moves the point may differ in so many bits
-    guided_px: float = 15.0  # what "beside" is
-    agree_depth_ratio: float = 0.05  # poses are the same if positions differ less than this times the depth
-    agree_deg: float = 2.5  # … and rotations less than this
+    reverse_iterations: int = 900  # the same, of the reverse direction, in random order
+    min_consensus: int = 8  # RANSAC inliers: 3-D points of one view in the other's image
+    guided_bits: int = 80  # largest Hamming distance of a match found near its predicted position
+    guided_px: float = 15.0  # largest distance from the predicted position of such a match
+    agree_depth_ratio: float = 0.05  # poses are equal if positions differ by less than this times the depth
+    agree_deg: float = 2.5  # and their rotations by less than this
     rival_share: float = 0.5  # another pose with more than this share of the inliers: refused
     sigma_px: float = 1.5  # standard deviation of a keypoint
     sigma_inverse_depth: float = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
-    inlier_chi2: float = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 dof)
+    inlier_chi2: float = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 degrees of freedom)
     min_inliers: int = 20  # after refinement; fewer: refused
-    min_direction_inliers: int = 10  # of them, those that know the query's depth; and the candidate's
-    max_sigma_deg: float = 0.5  # a pose more uncertain than this is refused
+    min_direction_inliers: int = 10  # the same, per direction: with the query's depths, with the candidate's
+    max_sigma_deg: float = 0.5  # a pose with a larger standard deviation is refused
     min_spread: float = 0.05  # narrow side (1 sigma) of the inliers, normalised coordinates
-    gravity_deg: float = 6.0  # rotation must keep "up" within this, where both views know it
-    floor_deg: float = 0.1  # added to what the residuals say: what inliers do not average away
+    gravity_deg: float = 6.0  # largest difference of the two gravity directions, where both are known
+    floor_deg: float = 0.1  # added to the covariance: errors that inliers do not average out
     floor_m: float = 0.005  # the same, for the position
 
     def __post_init__(self) -> None:
@@ -139,17 +139,17 @@ class PlaceConfig:
 
 @dataclass(frozen=True)
 class AgentConfig:
-    """What an agent keeps, sends and makes of corrections."""
+    """The agent: keyframes, corrections, error model."""
 
-    keep_keyframes: int = 600  # that an agent remembers, sent ones too: a restarted edge is given them again
-    late_ms: float = 0.0  # a frame that is later when its turn comes is left out; 0: none is
+    keep_keyframes: int = 600  # keyframes kept, sent ones included, to resend to a restarted edge
+    late_ms: float = 0.0  # frames later than this are skipped; 0: none
     rate_burst: float = 2.0  # keyframes that may be saved up under a rate limit
-    blend_jump_m: float = 0.05  # a correction that moves the body further, or turns it more,
-    blend_jump_rad: float = 0.02  # is blended in
-    blend_s: float = 0.5  # over this time
-    finish_s: float = 5.0  # how long the end of a run waits for acknowledgements
-    error_model: str = "shipped"  # how wrong the tracker is: this, a file, or "" for odometry's sigma
-    tell_placement: bool = True  # the edge is told how unsurely the map placed this agent, too
+    blend_jump_m: float = 0.05  # a correction that moves the body further is blended in
+    blend_jump_rad: float = 0.02  # a correction that rotates it further is blended in
+    blend_s: float = 0.5  # duration of the blend
+    finish_s: float = 5.0  # longest wait for acknowledgements at the end of a run
+    error_model: str = "shipped"  # error model: shipped, a file, or "" for odometry's covariance
+    tell_placement: bool = True  # add the agent's map position sigma to the error sent to the edge
 
     def __post_init__(self) -> None:
         _require_positive(self, "keep_keyframes", "blend_s")
@@ -161,16 +161,16 @@ class AgentConfig:
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """The rhythm of an agent's talk with its edge."""
+    """Timing of the link between agent and edge."""
 
-    hello_s: float = 0.5  # between hellos, until welcomed
-    refused_s: float = 5.0  # a refused agent that already runs asks again after this
-    ping_s: float = 0.5  # between pings
-    silent_s: float = 3.0  # nothing heard for this long: the edge is taken as gone
+    hello_s: float = 0.5  # interval of hellos, until welcomed
+    refused_s: float = 5.0  # a running agent that was refused asks again after this
+    ping_s: float = 0.5  # interval of pings
+    silent_s: float = 3.0  # no message for this long: the edge counts as gone
     window: int = 16  # keyframes in flight
-    resend_s: float = 1.0  # first wait for an acknowledgement; doubles
-    resend_max_s: float = 8.0  # the longest wait it doubles to
-    gap_s: float = 0.1  # the same, for a keyframe that later ones have overtaken
+    resend_s: float = 1.0  # first wait for an acknowledgement; doubles with each resend
+    resend_max_s: float = 8.0  # longest wait
+    gap_s: float = 0.1  # first wait for a keyframe that later ones have overtaken
 
     def __post_init__(self) -> None:
         _require_positive(self, "hello_s", "ping_s", "silent_s", "window", "resend_s", "resend_max_s")
@@ -178,11 +178,11 @@ class LinkConfig:
 
 @dataclass(frozen=True)
 class StreamConfig:
-    """How agents that do not track themselves send frames to the edge that does (policy streamed)."""
+    """Streaming of frames to an edge that tracks them (policy streamed)."""
 
-    window: int = 3  # frames of an agent under way; of others the newest waits. As many wait for a tracker
-    patience_s: float = 1.0  # a frame without an answer for this long has none
-    begin_s: float = 20.0  # a recording is not played before the edge can track it, but then it is
+    window: int = 3  # frames in flight per agent, and as many at its tracker; beyond, the newest waits
+    patience_s: float = 1.0  # a frame without an answer for this long counts as unanswered
+    begin_s: float = 20.0  # longest wait of a recording for the edge's tracker before it plays
 
     def __post_init__(self) -> None:
         _require_positive(self, "window", "patience_s")
@@ -190,17 +190,17 @@ class StreamConfig:
 
 @dataclass(frozen=True)
 class ClockConfig:
-    """The filter of the edge's clock against the agent's."""
+    """The filter of the edge's clock relative to the agent's."""
 
-    noise_us: float = 20.0  # standard deviation of an exchange that met no queue
-    asymmetry: float = 0.5  # one-way error of an exchange per delay beyond the least; 0.5 is all of it
+    noise_us: float = 20.0  # standard deviation of an exchange that was not queued
+    asymmetry: float = 0.5  # error of an offset as a share of the delay above the minimum; 0.5 is the bound
     offset_walk_us: float = 4.0  # random walk of the offset, per sqrt(s)
     drift_walk_ppm: float = 0.05  # random walk of the drift, per sqrt(s)
-    drift_ppm: float = 100.0  # standard deviation of the drift before anything is known
-    least_of: int = 64  # exchanges among which the least delay is sought
-    gate_sigma: float = 4.0  # an exchange further off is not believed
-    step_after: int = 5  # but so many in a row are: the clock was set
-    claim_ms: float = 1.0  # an offset less sure than this is not told as a number (docs/do/sync.md)
+    drift_ppm: float = 100.0  # initial standard deviation of the drift
+    least_of: int = 64  # recent exchanges among which the minimum delay is taken
+    gate_sigma: float = 4.0  # an exchange further off is rejected
+    step_after: int = 5  # rejected exchanges in a row after which the filter restarts: the clock was set
+    claim_ms: float = 1.0  # an offset with a larger uncertainty is not reported (docs/do/sync.md)
 
     def __post_init__(self) -> None:
         _require_positive(self, "noise_us", "drift_ppm", "least_of", "gate_sigma", "step_after", "claim_ms")
@@ -208,15 +208,15 @@ class ClockConfig:
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """How the pose graph is solved."""
+    """Solution of the pose graph."""
 
     cauchy: float = 3.0  # whitened residual (6 dof: 2.4 is usual) at which a loop begins to lose weight
-    max_iterations: int = 30  # of Levenberg-Marquardt; the next solution goes on where one stopped
+    max_iterations: int = 30  # of Levenberg-Marquardt; the next solution continues from the result
     relative_tolerance: float = 1e-6  # of the cost, between two iterations
-    step_tolerance: float = 3e-3  # rad and m; solved once no pose is moved by more
-    inner_tolerance: float = 3e-2  # of the residual of a step's equations, relative
-    covariance_edges: int = 250  # the surest, by which covariances are told; more: tighter and slower
-    covariance_rounds: int = 16  # of looking for surest ways, at most
+    step_tolerance: float = 3e-3  # rad and m; converged once no pose moves by more
+    inner_tolerance: float = 3e-2  # relative residual of the linear system of a step
+    covariance_edges: int = 250  # surest edges used for covariances; more: tighter and slower
+    covariance_rounds: int = 16  # rounds of the search for shortest covariance paths, at most
 
     def __post_init__(self) -> None:
         _require_positive(self, *(setting.name for setting in fields(self)))
@@ -224,35 +224,35 @@ class GraphConfig:
 
 @dataclass(frozen=True)
 class MergeConfig:
-    """What is believed before a loop may move a map."""
+    """Acceptance of loops and merging of maps."""
 
-    min_loop_gap: int = 10  # keyframes of one stretch nearer than this are odometry's business
+    min_loop_gap: int = 10  # keyframes of one segment closer than this make no loop
     agree_chi2: float = 22.5  # two loops agree, or a loop fits the map (99.9 %, 6 dof)
-    surprise_chi2: float = 200.0  # beyond this a loop contradicts the map whatever witnesses say
-    odometry_scale: float = 1.0  # agents' sigmas are this much too small
+    surprise_chi2: float = 200.0  # above this a loop contradicts the map whatever supporting loops there are
+    odometry_scale: float = 1.0  # agents' standard deviations are too small by this factor
     odometry_floor_deg: float = 0.002  # per edge, added in quadrature
     odometry_floor_m: float = 0.0002  # the same, for the position
-    odometry_floor_per_rad: float = 0.0005  # the same, a part of what the edge turns,
-    odometry_floor_per_m: float = 0.003  # and of what it moves: no agent is surer of itself
-    gravity_floor_deg: float = 0.1  # the same, of an agent's up: what its calibration may be wrong
-    most_loops: int = 10  # of a keyframe, when those of others that are taken out are moved to it
-    max_pending: int = 200  # loops that wait for a witness; the oldest is dropped
-    place_m: float = 0.5  # views further apart than this,
-    place_rad: float = 0.35  # or turned by more, are of different places
-    near_m: float = 2.5  # two views further apart than this,
-    near_rad: float = 0.8  # or turned by more, are no witnesses for a join
-    join_places: int = 2  # at so many places maps must fit to be joined; of a smaller map, at all but one
-    join_found: float = 0.3  # of the points that two views should share, so many must be found, on average
-    overlap_pairs: int = 0  # so many pairs of views from one spot must tell whether two maps look alike
-    overlap_gone: float = 0.06  # of what they should share, no more may be things that are gone
-    undo_doubt: float = 0.6  # what is gone beyond that, summed over views: more forbids or undoes a join
-    rival_weight: float = 0.5  # no contradicting story may weigh more than this part of the one that joins
-    enter_m: float = 0.05  # who is known worse than this (1 sigma) waits to hear of another's map,
-    enter_patience: int = 20  # but for so many of his keyframes that found loops at most
-    rebel_places: int = 4  # so many places at least, that weigh more than what stands, take a map apart
-    rebel_weight: float = 1.4  # by how many times they have to weigh more
-    scale_tolerance: float = 0.015  # agents whose depths or ways differ by more (1.5 %) keep apart
-    drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
+    odometry_floor_per_rad: float = 0.0005  # the same, per rad that the edge rotates
+    odometry_floor_per_m: float = 0.003  # the same, per m that the edge moves
+    gravity_floor_deg: float = 0.1  # the same, of a gravity factor: error of the IMU calibration
+    most_loops: int = 10  # loops of a keyframe that loops of removed keyframes may be moved to
+    max_pending: int = 200  # pending loops; the oldest is dropped
+    place_m: float = 0.5  # views further apart than this are different places
+    place_rad: float = 0.35  # views rotated further than this are different places
+    near_m: float = 2.5  # views further apart than this do not support a merge
+    near_rad: float = 0.8  # views rotated further than this do not support a merge
+    join_places: int = 2  # places that must agree before maps merge; of a smaller map, all but one
+    join_found: float = 0.3  # share of the common points that must be found, on average
+    overlap_pairs: int = 0  # least number of overlapping view pairs for the overlap check
+    overlap_gone: float = 0.06  # largest share of the common points that may be missing
+    undo_doubt: float = 0.6  # CUSUM of the missing share above that; more forbids or undoes a merge
+    rival_weight: float = 0.5  # a competing hypothesis with more than this share of the weight blocks a merge
+    enter_m: float = 0.05  # an agent with a larger map position sigma waits for its correction
+    enter_patience: int = 20  # but at most for this many of its keyframes with loops
+    rebel_places: int = 4  # contradicting loops split a map from this many places on
+    rebel_weight: float = 1.4  # and from this multiple of the existing loops' weight on
+    scale_tolerance: float = 0.015  # agents whose depths or path lengths differ by more are quarantined
+    drop_chi2: float = 1000.0  # loops with a larger chi-squared after a solution are dropped
 
     def __post_init__(self) -> None:
         _require_positive(self, "min_loop_gap", "most_loops", "max_pending")
@@ -264,17 +264,17 @@ POLICY_NAMES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # s
 
 @dataclass(frozen=True)
 class EdgeConfig:
-    """How the edge serves its agents."""
+    """Limits of the edge."""
 
-    policy: str = "share"  # what `share edge --policy` says goes before it
-    silent_s: float = 3.0  # nothing heard of an agent for this long: it is taken as gone
-    name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
-    max_agents: int = 64  # present at a time; more are refused
-    max_keyframes: int = 2000  # kept; beyond, who holds most gives, first what has others like it
-    max_waiting: int = 12  # keyframes that queue to be looked up; beyond, the oldest is only stored
+    policy: str = "share"  # overridden by `share edge --policy`
+    silent_s: float = 3.0  # no message of an agent for this long: it counts as gone
+    name_hold_s: float = 3.0  # a name stays in use for this long after its agent's last message
+    max_agents: int = 64  # present at once; more are refused
+    max_keyframes: int = 2000  # kept; beyond, the agent with most gives up redundant ones first
+    max_waiting: int = 12  # queued queries; beyond, the oldest keyframe is only stored
     each_waiting: int = 3  # the same, of one agent
-    hurry_waiting: int = 1  # so many queue: the look-up at hand tries fewer candidates,
-    hurry_candidates: int = 3  # at most these, and one that is verified is enough
+    hurry_waiting: int = 1  # with this many queued, a query verifies fewer candidates
+    hurry_candidates: int = 3  # at most these, and the first verified one ends the search
 
     def __post_init__(self) -> None:
         if self.policy not in POLICY_NAMES:
@@ -285,7 +285,7 @@ class EdgeConfig:
 
 @dataclass(frozen=True)
 class AgentQoe:
-    """What one agent needs, under its name in `control.agents`; None is what its form has."""
+    """QoE parameters of one agent, under its name in `control.agents`; None: the default of its form."""
 
     form: str | None = None  # ar or robot; None: its kind
     beta: float | None = None
@@ -301,33 +301,33 @@ class AgentQoe:
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """How agents are rated, what they may send, what is merged (docs/understand/scheduling.md)."""
+    """QoE, keyframe rates and the merge gate (docs/understand/scheduling.md)."""
 
-    ar_beta: float = 0.015  # 1/ms, of delay beyond 20 ms
+    ar_beta: float = 0.015  # 1/ms, of delay above 20 ms
     ar_gamma: float = 3.6  # cm, of accuracy
-    ar_target: float = 0.93  # QoE that is aimed at
-    robot_beta: float = 3.0  # cm, of accuracy short of 1/cm
+    ar_target: float = 0.93  # target QoE
+    robot_beta: float = 3.0  # cm, of accuracy below 1/cm
     robot_gamma: float = 400.0  # ms, of 1 / (delay + theta)
-    robot_theta_ms: float = 20.0  # a delay well below this is as good as none
-    robot_target: float = 0.9  # QoE that is aimed at
-    signed_penalty: bool = False  # what is better than asked for raises QoE beyond 1, as the paper prints it
+    robot_theta_ms: float = 20.0  # delays well below this are equally good
+    robot_target: float = 0.9  # target QoE
+    signed_penalty: bool = False  # allow negative penalties, with QoE above 1, as printed in the paper
     agents: dict[str, AgentQoe] = field(default_factory=dict)  # NAME: {form, beta, gamma, theta_ms, target}
-    attribution: bool = True  # a QoE that is short because of delay lowers the rate, unlike in the paper
+    attribution: bool = True  # a QoE that is low because of delay lowers the rate, unlike in the paper
     kp: float = 0.8  # Hz per evaluation, of an error of 1 in QoE
     ki: float = 0.15  # the same, of an error of 1 for a second
     kd: float = 0.2  # the same, of an error that grows by 1 in a second
-    alpha: float = 0.3  # weight of the newest slope of the error, of 1
-    integral_max_hz: float = 0.1  # the integral's part of a step, at most
-    rate_min_hz: float = 1.5  # keyframes an agent may always send
-    rate_max_hz: float = 5.0  # and the most it may; its rate to begin with
-    gap_s: float = 5.0  # no evaluation for longer: the error's slope is forgotten, its integral held
+    alpha: float = 0.3  # weight of the newest derivative of the error, of 1
+    integral_max_hz: float = 0.1  # bound of the integral term
+    rate_min_hz: float = 1.5  # lowest rate of an agent
+    rate_max_hz: float = 5.0  # highest rate of an agent, and its initial one
+    gap_s: float = 5.0  # without an evaluation for longer, the derivative is reset and the integral held
     random_seed: int = 1  # of policy random
-    gate_seed: int = 1  # of which merges are skipped
-    near_m: float = 0.3  # what a camera sees is reckoned from here
-    far_m: float = 5.0  # to here, its field of view as calibrated
-    interval_m: float = 0.5  # between points at which overlap is sampled
-    merges: int = 20  # completed ones, with whose mean overlap a new one is compared
-    eagerness: float = 1.5  # a merge is done with this chance, times its overlap as a part of their mean
+    gate_seed: int = 1  # of the merge gate
+    near_m: float = 0.3  # near plane of the view frusta
+    far_m: float = 5.0  # far plane of the view frusta
+    interval_m: float = 0.5  # spacing of the points at which overlap is sampled
+    merges: int = 20  # completed merges in the mean overlap that a new one is compared with (N)
+    eagerness: float = 1.5  # a merge has this probability times its overlap over their mean (alpha_m)
 
     def __post_init__(self) -> None:
         _require_positive(self, "ar_gamma", "robot_gamma", "robot_theta_ms", "rate_min_hz", "merges")
@@ -340,7 +340,7 @@ class ControlConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """The whole; one section per part."""
+    """The whole configuration, one section per part."""
 
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     inertial: InertialConfig = field(default_factory=InertialConfig)
@@ -363,6 +363,6 @@ def _require_positive(config: Any, *names: str) -> None:
 
 
 def load_config(text: str, where: str = "configuration") -> Config:
-    """A `Config` from YAML text. Raises ConfigError naming the key and what would be right."""
+    """Return a `Config` from YAML text. Raises ConfigError naming the key and the remedy."""
     data = load_yaml(text, where)
     return from_mapping(Config, {} if data is None else data, where)

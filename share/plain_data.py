@@ -1,7 +1,4 @@
-"""Plain data to frozen dataclasses and back, strictly.
-
-An unknown key is refused by its full name, with the nearest known one.
-"""
+"""Strict conversion of plain data to frozen dataclasses and back, and strict YAML."""
 
 from __future__ import annotations
 
@@ -15,11 +12,14 @@ from typing import Any, TypeVar
 from share.errors import ConfigError
 
 T = TypeVar("T")
-_MAX_NUMBER = 1e9  # no setting means anything beyond; NaN and infinity are refused with it
+_MAX_NUMBER = 1e9  # larger than any meaningful setting; the check also rejects NaN and infinity
 
 
 def from_mapping(cls: type[T], data: Any, where: str) -> T:
-    """The dataclass `cls` from a mapping, recursively; absent keys keep theirs. Raises ConfigError."""
+    """Return the dataclass `cls` from a mapping, recursively; absent keys take their defaults.
+
+    where: names the source in errors. Raises ConfigError; for an unknown key it names the closest known
+    one."""
     if not isinstance(data, dict):
         raise ConfigError(f"{where}: expected a mapping of settings, found {type(data).__name__}")
     hints = typing.get_type_hints(cls)
@@ -41,7 +41,7 @@ def from_mapping(cls: type[T], data: Any, where: str) -> T:
 
 
 def to_mapping(config: Any) -> dict[str, Any]:
-    """Plain data of a configuration, for a report."""
+    """Return a configuration as plain data."""
     return dataclasses.asdict(config)
 
 
@@ -66,8 +66,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
 
 
 def load_yaml(text: str, where: str) -> Any:
-    """As yaml.safe_load, but it refuses a key that stands there twice and what would take more time or
-    memory than a file of settings needs. Raises ConfigError."""
+    """Return the data of YAML text, as yaml.safe_load, but with duplicate keys refused and size limits
+    (`share.strict_yaml`). Raises ConfigError."""
     import yaml
 
     from share.strict_yaml import StrictLoader

@@ -1,14 +1,14 @@
-"""Processes of multiprocessing that end with their parent, and leave a terminal's signals to it.
+"""Multiprocessing context: its processes end with their parent and leave terminal signals to it.
 
-A parent that ends in good order does not wait for those that it has not closed, as multiprocessing would: a
-signal may have come before anybody knew of them.
+A parent that ends in good order kills the ones it has not closed rather than wait for them as multiprocessing
+does: a signal may have ended it before it recorded them.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import multiprocessing.util  # before `_kill_remaining` is registered, so that it is called before theirs
+import multiprocessing.util  # registers its exit handler before `_kill_remaining`, which so runs first
 import os
 import signal
 from collections.abc import Iterator, Mapping
@@ -17,16 +17,12 @@ from typing import Any
 
 from share import child_processes
 
-_TERMINAL_SIGNALS = {signal.SIGINT, signal.SIGHUP}  # a terminal sends them to all: the parent handles them
-_DEFERRED_SIGNALS = {
-    *_TERMINAL_SIGNALS,
-    signal.SIGTERM,
-    signal.SIGALRM,
-}  # until they can be handled; ALRM: `share.cli.signals`
+_TERMINAL_SIGNALS = {signal.SIGINT, signal.SIGHUP}  # sent to the whole process group: the parent handles them
+_DEFERRED_SIGNALS = {*_TERMINAL_SIGNALS, signal.SIGTERM, signal.SIGALRM}  # SIGALRM: `share.cli.signals`
 
 
 def _initialise_child(parent: int, from_main_thread: bool) -> None:
-    """Called while a spawned process is told what it is to do, before that imports anything."""
+    """Set up a spawned process while it unpickles its task, before that imports anything."""
     child_processes.exit_with_parent(parent, from_main_thread)
     for number in _TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
@@ -34,7 +30,7 @@ def _initialise_child(parent: int, from_main_thread: bool) -> None:
 
 
 class _ChildInitialiser:
-    """Pickled before all else of a process: to read it is to call `_initialise_child`."""
+    """Pickled first of a process: unpickling it calls `_initialise_child`."""
 
     def __reduce__(self) -> Any:
         return _initialise_child, (os.getpid(), child_processes.is_main_thread())
@@ -42,9 +38,10 @@ class _ChildInitialiser:
 
 @contextlib.contextmanager
 def signals_deferred() -> Iterator[None]:
-    """Signals are handled after the block: a child that is left half started writes a traceback. The mask is
-    inherited by the child and holds back this thread alone; another thread may take a signal, which Python
-    then handles in the main thread."""
+    """Defer signals until after the block, since a half-started child would print a traceback.
+
+    The child inherits the mask. The mask covers this thread only; another thread may receive a signal, which
+    Python then handles in the main thread, so handlers are replaced too."""
     received: list[int] = []
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, _DEFERRED_SIGNALS)
     handlers = (
@@ -73,7 +70,7 @@ def _restore_process(initialiser: None, process_type: type[_Process], state: Map
 
 
 class _Process(SpawnProcess):
-    """It ignores SIGINT and SIGHUP from its first instruction: a terminal sends them to the whole group."""
+    """Ignores SIGINT and SIGHUP, which a terminal sends to the whole group, from its start."""
 
     def start(self) -> None:
         with signals_deferred():

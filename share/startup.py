@@ -1,7 +1,7 @@
-"""How every SHARE process is set up, before numpy is imported: the one place for it.
+"""Setup of every SHARE process, before numpy is imported.
 
-Measured on a 752x480 stereo frame: one thread per library is fastest on a busy small computer, and
-keeping big temporaries from going back to the kernel took a frame from 6.5 to 4.5 ms.
+Measured on a 752x480 stereo frame: one thread per library is fastest on a busy small computer, and keeping
+large temporaries in the heap instead of returning them to the kernel took a frame from 6.5 to 4.5 ms.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _TRIM_S = 60.0
 
 
 def prepare_process() -> None:
-    """Ends with the SHARE process that started it, if one did; thread counts and malloc thresholds. What the
-    user set in the environment stays."""
+    """Make the process end with the SHARE process that started it, and set thread counts and malloc
+    thresholds. Variables that the user has set stay."""
     child_processes.exit_with_starter()
     for name in _THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
@@ -38,17 +38,17 @@ def prepare_process() -> None:
 
 
 class HeapTrimmer:
-    """Of a process that runs for hours. What `prepare_process` keeps from going back to the kernel lies ever
-    more
-    scattered among what is in use, so memory would grow though nothing is held: once a minute, what is free
-    goes back (a millisecond, and a slower frame after it)."""
+    """Returns free heap memory to the kernel once a minute, for processes that run for hours.
+
+    With the thresholds of `prepare_process` free memory fragments and the process would grow without a leak.
+    A trim takes 1 ms and makes the next frame slower."""
 
     def __init__(self) -> None:
         self._trim = _glibc_function("malloc_trim")
         self._due_s: float | None = None
 
     def trim_if_due(self, now_s: float) -> None:
-        """To be called often, with a monotonic time."""
+        """Trim once a minute. Call often; now_s: monotonic."""
         if self._due_s is not None and now_s < self._due_s:
             return
         if self._due_s is not None and self._trim is not None:
@@ -57,7 +57,7 @@ class HeapTrimmer:
 
 
 def _glibc_function(name: str) -> Callable[..., Any] | None:
-    """None with another C library."""
+    """Return the function, or None with another C library."""
     if sys.platform != "linux":
         return None
     import ctypes

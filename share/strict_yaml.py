@@ -1,8 +1,8 @@
-"""A YAML loader for files of settings from anywhere: each key once, and bounds on what a file may ask for.
+"""YAML loader for untrusted settings files: unique keys and limits on depth, size and numbers.
 
-An alias counts as all that it stands for, since whoever goes through the result meets it again and again:
-ten lists of ten aliases each are 10^10 values. Written numbers are bounded too: Python reads an integer of a
-million digits in minutes.
+An alias counts as all values that it stands for, since a walk over the result visits them each time: ten
+nested levels of ten aliases are 10^10 values. The length of numbers is limited: Python takes minutes to read
+an integer of a million digits.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-_MAX_DEPTH = 40  # lists and mappings in each other; a session with its recipe has 8
+_MAX_DEPTH = 40  # nested lists and mappings; a session with its recipe has 8
 _MAX_VALUES = 200_000  # values, aliases counted in full; a session of ten agents has 5,000
 _MAX_NUMBER_LENGTH = 60  # characters of a number or a date
 _MERGE_TAG = "tag:yaml.org,2002:merge"  # of `<<`
@@ -20,12 +20,12 @@ _BOUNDED_TAGS = ("int", "float", "timestamp", "bool")
 
 
 class StrictLoader(yaml.SafeLoader):
-    """Raises yaml.MarkedYAMLError for what it refuses."""
+    """Safe loader with limits. Raises yaml.MarkedYAMLError."""
 
     def __init__(self, stream: Any) -> None:
         super().__init__(stream)
         self._depth = self._values = 0
-        self._sizes: dict[str, int] = {}  # values below each anchor that is complete
+        self._sizes: dict[str, int] = {}  # values below each complete anchor
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event = self.peek_event()  # type: ignore[no-untyped-call]
@@ -48,31 +48,31 @@ class StrictLoader(yaml.SafeLoader):
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE_TAG:
                 if (key.tag, key.value) in seen:
-                    raise _error(f"key '{key.value}' for the second time", key.start_mark)
+                    raise _error(f"duplicate key '{key.value}'", key.start_mark)
                 seen.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 
     def _count_values(self, values: int, event: Any) -> None:
         self._values += values
         if self._values > _MAX_VALUES:
-            raise _error(f"has more than {_MAX_VALUES:,} values, aliases counted in full", event.start_mark)
+            raise _error(f"more than {_MAX_VALUES:,} values, aliases counted in full", event.start_mark)
 
     def _alias_size(self, event: Any) -> int:
         if event.anchor in self.anchors and event.anchor not in self._sizes:
-            raise _error(f"alias '{event.anchor}' stands within what it stands for", event.start_mark)
-        return self._sizes.get(event.anchor, 1)  # one that is not known is refused by PyYAML
+            raise _error(f"alias '{event.anchor}' contains itself", event.start_mark)
+        return self._sizes.get(event.anchor, 1)  # PyYAML refuses unknown ones
 
 
 def _bounded_constructor(constructor: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """A constructor of numbers or dates that raises nothing but yaml.MarkedYAMLError."""
+    """Return a constructor of numbers or dates that raises only yaml.MarkedYAMLError."""
 
     def construct_bounded(self: Any, node: Any) -> Any:
         if isinstance(node, yaml.ScalarNode) and len(node.value) > _MAX_NUMBER_LENGTH:
-            raise _error(f"a number of {len(node.value)} characters", node.start_mark)
+            raise _error(f"number of {len(node.value)} characters is too long", node.start_mark)
         try:
             return constructor(self, node)
         except (ValueError, OverflowError, IndexError, KeyError, AttributeError):
-            raise _error(f"'{node.value}' is not what its tag says", node.start_mark) from None
+            raise _error(f"'{node.value}' does not match its tag", node.start_mark) from None
 
     return construct_bounded
 

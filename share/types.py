@@ -1,9 +1,8 @@
-"""The frozen values that every layer speaks. Frames and units follow docs/understand/architecture.md.
+"""Frozen value types used by all layers. Frames and units: docs/understand/architecture.md.
 
-Arrays are validated for shape and dtype and made read-only on construction, so a value can be
-handed to another thread without a copy. Poses are 4x4 matrices `T_a_b` with p_a = T_a_b p_b;
-covariances are 6x6 over (rotation [rad], translation [m]), perturbed on the right:
-T = T_mean Exp(xi) (see `share.geometry.se3`).
+Arrays are checked for shape and dtype and made read-only on construction, so a value can be handed to
+another thread without a copy. Poses are 4x4 matrices `T_a_b` with p_a = T_a_b p_b; covariances are 6x6 over
+(rotation [rad], translation [m]), perturbed on the right: T = T_mean Exp(xi) (see `share.geometry.se3`).
 """
 
 from __future__ import annotations
@@ -22,34 +21,30 @@ I64 = NDArray[np.int64]
 
 DESCRIPTOR_BYTES = 32  # ORB: 256 bits
 
-# Limits of value. Whatever exceeds them is refused where the value is made, so that nothing computed from it
-# overflows: not a room, not a sensor, not a run of any length gets near them.
+# Limits, checked on construction so that no computation overflows. No real room, sensor or run comes near
+# them.
 MAX_KEYPOINTS = 2000  # per keyframe
 MAX_NAME_LENGTH = 64  # characters, of an agent's name
-MAX_MAP_ID_LENGTH = (
-    MAX_NAME_LENGTH + 32
-)  # characters: a run's key has at most 17 more than its name, a segment's number 11
+MAX_MAP_ID_LENGTH = MAX_NAME_LENGTH + 32  # a run key has up to 17 characters more, a segment number up to 11
 MAX_POSITION_M = 1e5  # m, of a position or a landmark
-MAX_ODOM_M = 1e4  # m, of odometry from its origin: poses in maps, which are made of several, stay below MAX_M
-MAX_UV = 1e3  # of normalised image coordinates: 89.9 degrees off the axis
+MAX_ODOM_M = 1e4  # m from the odometry origin; map poses, composed of several, stay below MAX_POSITION_M
+MAX_UV = 1e3  # normalised image coordinates: 89.9 degrees off the axis
 MAX_ID = 2**31 - 1  # of keyframes, frames and revisions: 13 years at 5 Hz
-MAX_GYRO_RAD_S, MAX_ACCEL_M_S2 = (
-    1e3,
-    1e4,
-)  # of an IMU's samples: twenty times what the widest usual sensor can measure
-MAX_SIGMA = 1e6  # of anything, in its unit
-MAX_STAMP_NS = 2**62  # either way of 0: 146 years; differences fit 64 bits
+MAX_GYRO_RAD_S = 1e3  # twenty times the range of the widest common gyroscope
+MAX_ACCEL_M_S2 = 1e4  # twenty times that of the widest common accelerometer
+MAX_SIGMA = 1e6  # of any quantity, in its unit
+MAX_STAMP_NS = 2**62  # either side of 0: 146 years; differences fit 64 bits
 
 
 class AgentKind(StrEnum):
-    """Who is served: a headset wearer notices 20 ms of lag, a robot does not."""
+    """Kind of agent: a headset (AR; its wearer notices 20 ms of lag) or a robot."""
 
     AR = "ar"
     ROBOT = "robot"
 
 
 class TrackState(StrEnum):
-    """What an agent knows of its own pose. Only OK, WEAK, VISION_ONLY and INERTIAL_ONLY carry one."""
+    """State of an agent's tracking. All but INITIALISING and LOST have a pose."""
 
     INITIALISING = "INITIALISING"
     OK = "OK"
@@ -64,7 +59,7 @@ class TrackState(StrEnum):
 
 
 class WaitReason(StrEnum):
-    """What a tracker still has to know before it tells a pose."""
+    """What a tracker needs before its first pose."""
 
     IMU = "imu"
     VIEW = "view"
@@ -74,14 +69,14 @@ class WaitReason(StrEnum):
 
     @property
     def text(self) -> str:
-        """For a person, after "waits for"."""
+        """For a person, after "waiting for"."""
         return _WAIT_TEXTS[self]
 
 
 _WAIT_TEXTS = {
     WaitReason.IMU: "the IMU's first samples",
-    WaitReason.VIEW: "something to see",
-    WaitReason.TILT: "what is up",
+    WaitReason.VIEW: "features in view",
+    WaitReason.TILT: "the direction of gravity",
     WaitReason.SPEED: "its velocity",
     WaitReason.SCALE: "the scale: move the camera",
 }
@@ -90,7 +85,7 @@ _WAIT_TEXTS = {
 def checked_array(
     name: str, value: ArrayLike, shape: tuple[int | None, ...], dtype: DTypeLike, finite: bool = True
 ) -> NDArray[Any]:
-    """`value` as a read-only array of `dtype`; None in `shape` admits any length.
+    """Return `value` as a read-only array of `dtype`; None in `shape` admits any length.
 
     Raises ValueError naming the field if the shape differs or (unless `finite=False`) a value is
     not finite.
@@ -112,8 +107,8 @@ def _shape_matches(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> 
 
 
 def checked_pose(name: str, value: ArrayLike, max_m: float = MAX_POSITION_M) -> F64:
-    """`value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (1e-3), or if its
-    translation exceeds `max_m`."""
+    """Return `value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (tolerance
+    1e-3) or its translation exceeds `max_m`."""
     T = checked_array(name, value, (4, 4), np.float64)
     rows = T.tolist()
     if not _is_rigid(*rows):
@@ -124,34 +119,35 @@ def checked_pose(name: str, value: ArrayLike, max_m: float = MAX_POSITION_M) -> 
 
 
 def checked_id(name: str, value: int, minimum: int = 0) -> int:
-    """`value`, from `minimum` to MAX_ID. Raises ValueError."""
+    """Return `value`. Raises ValueError outside `minimum` .. MAX_ID."""
     if not minimum <= value <= MAX_ID:
         raise ValueError(f"{name}: {value} is outside {minimum} .. {MAX_ID}")
     return value
 
 
 def checked_stamp(name: str, value: int) -> int:
-    """`value` in ns, at most MAX_STAMP_NS either way. Raises ValueError."""
+    """Return `value`, ns. Raises ValueError beyond ±MAX_STAMP_NS."""
     if abs(value) > MAX_STAMP_NS:
         raise ValueError(f"{name}: {value} ns is beyond any clock")
     return value
 
 
 def checked_up(name: str, value: ArrayLike) -> F64:
-    """`value` as a read-only unit vector (3,), or zeros where it is unknown. Raises ValueError (1e-3)."""
+    """Return `value` as a read-only unit vector (3,), or zeros if unknown. Raises ValueError (tolerance
+    1e-3)."""
     up = checked_array(name, value, (3,), np.float64)
     x, y, z = up.tolist()
     if any(up) and not abs(x * x + y * y + z * z - 1) <= 1e-3:
-        raise ValueError(f"{name}: is no unit vector")
+        raise ValueError(f"{name}: is not a unit vector")
     return up
 
 
 def _is_rigid(x: list[float], y: list[float], z: list[float], bottom: list[float]) -> bool:
-    """By the rows of T (4, 4), finite. In plain floats, as every pose of every message comes by here: of so
-    few numbers numpy takes several times as long."""
+    """Return whether the rows of T (4, 4), finite, are a rigid transform. Plain floats: every pose of every
+    message is checked, and numpy takes several times as long for so few numbers."""
     (a, b, c, _), (d, e, f, _), (g, h, i, _), (p, q, r, s) = x, y, z, bottom
     return (
-        # R R' = 1; squares first, which are within the bound only where nothing below overflows
+        # R R' = 1; squares first: once they are bounded nothing below overflows
         abs(a * a + b * b + c * c - 1) <= 1e-3
         and abs(d * d + e * e + f * f - 1) <= 1e-3
         and abs(g * g + h * h + i * i - 1) <= 1e-3
@@ -164,27 +160,27 @@ def _is_rigid(x: list[float], y: list[float], z: list[float], bottom: list[float
 
 
 def checked_cov(name: str, value: ArrayLike) -> F64:
-    """`value` as a read-only covariance (6, 6). Raises ValueError unless symmetric and not negative:
-    one that is neither would stop the solver for everybody in the map."""
+    """Return `value` as a read-only covariance (6, 6). Raises ValueError unless symmetric and positive
+    semidefinite: another one would stop the solver for the whole map."""
     cov = checked_array(name, value, (6, 6), np.float64)
     size = np.abs(cov).max()
     if size > 1e12 or np.abs(cov - cov.T).max() > 1e-6 * size:
-        raise ValueError(f"{name}: is not symmetric, or beyond all measure")
+        raise ValueError(f"{name}: is not symmetric, or exceeds 1e12")
     if size and np.linalg.eigvalsh(cov)[0] < -1e-9 * size:
         raise ValueError(f"{name}: has a negative variance")
     return cov
 
 
 def checked_sigma(name: str, value: float) -> float:
-    """`value` as a float. Raises ValueError if it is negative or exceeds MAX_SIGMA."""
+    """Return `value` as a float. Raises ValueError if it is negative or exceeds MAX_SIGMA."""
     sigma = float(value)
     if not 0 <= sigma <= MAX_SIGMA:
-        raise ValueError(f"{name}: {sigma} is no standard deviation")
+        raise ValueError(f"{name}: {sigma} is outside 0 .. {MAX_SIGMA:g}")
     return sigma
 
 
 def _set_fields(obj: object, **values: object) -> None:
-    """Replace fields of a frozen dataclass during its own __post_init__."""
+    """Replace fields of a frozen dataclass in its __post_init__."""
     for key, value in values.items():
         object.__setattr__(obj, key, value)
 
@@ -210,11 +206,11 @@ class ImuBatch:
         return len(self.stamps_ns)
 
     def take(self, selection: slice | I64 | NDArray[np.bool_]) -> ImuBatch:
-        """These samples, by numbers or a mask (N,)."""
+        """Return these samples, by slice, indices or mask (N,)."""
         return ImuBatch._from_checked(self.stamps_ns[selection], self.gyro[selection], self.accel[selection])
 
     def concatenate(self, *others: ImuBatch) -> ImuBatch:
-        """All samples, one batch after the other."""
+        """Return the samples of all batches in order."""
         parts = (self, *others)
         return ImuBatch._from_checked(
             np.concatenate([part.stamps_ns for part in parts]),
@@ -224,7 +220,7 @@ class ImuBatch:
 
     @staticmethod
     def _from_checked(stamps_ns: I64, gyro: F64, accel: F64) -> ImuBatch:
-        """Of what has been in batches before, and was checked then."""
+        """Return a batch of arrays that come from checked batches."""
         out = object.__new__(ImuBatch)
         for array in (stamps_ns, gyro, accel):
             array.flags.writeable = False
@@ -238,11 +234,11 @@ class ImuBatch:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One moment of all cameras, and the IMU samples since those of the previous frame, until the first that
-    is not before this one.
+    """Images of all cameras at one time, and the IMU samples since the previous frame, up to the first one
+    not before this frame.
 
     image0, image1: (H, W) uint8. depth: (Hd, Wd) float32 m in the depth camera, 0 = no reading.
-    gap_ns: time since the previous frame where that is longer than the stream's rate explains, else 0.
+    gap_ns: time since the previous frame if that is longer than the stream's rate explains, else 0.
     """
 
     stamp_ns: int
@@ -256,10 +252,10 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FeatureStatistics:
-    """What the pose of a frame stands on: the features that its tracker found in cam0's image.
+    """The features that the tracker found in cam0's image, input of the error model.
 
-    px (N, 2) float32. believed (N,) bool: those that agreed with the pose. depth (N,) m in cam0, NaN unknown.
-    sought: how many should have been in view. known: how many points of the tracker's map have a depth.
+    px (N, 2) float32. inlier (N,) bool. depth (N,): m in cam0, NaN if unknown. expected: number of features
+    that should have been in view. mapped: number of the tracker's landmarks with a depth.
     """
 
     px: F32
@@ -273,14 +269,14 @@ class FeatureStatistics:
         _set_fields(
             self,
             px=checked_array("px", self.px, (n, 2), np.float32),
-            believed=checked_array("believed", self.inlier, (n,), np.bool_),
+            inlier=checked_array("inlier", self.inlier, (n,), np.bool_),
             depth=checked_array("depth", self.depth, (n,), np.float64, finite=False),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one camera image looks like to another agent: enough to recognise and verify a place.
+    """The features of a keyframe from which another agent's keyframe recognises and verifies the place.
 
     uv (N, 2) float32: undistorted normalised coordinates (x/z, y/z) in cam0. points (N, 3)
     float32: m, in cam0, NaN rows where depth is unknown. descriptors (N, 32) uint8: ORB.
@@ -301,9 +297,9 @@ class View:
             descriptors=checked_array("descriptors", self.descriptors, (n, DESCRIPTOR_BYTES), np.uint8),
         )
         if (np.abs(self.uv) > MAX_UV).any():
-            raise ValueError(f"uv: exceeds {MAX_UV:g}")
+            raise ValueError(f"uv: values beyond {MAX_UV:g}")
         if (np.abs(self.points) > MAX_POSITION_M).any():  # NaN does not
-            raise ValueError(f"points: are more than {MAX_POSITION_M:g} m away (unknown depth is NaN)")
+            raise ValueError(f"points: more than {MAX_POSITION_M:g} m away (use NaN for unknown depth)")
 
     def __len__(self) -> int:
         return len(self.uv)
@@ -311,14 +307,13 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeCandidate:
-    """A keyframe as the tracker offers it, before it is decided whether it is sent.
+    """A keyframe that the tracker offers, before the rate decides whether it is sent.
 
-    T_odom_body (4, 4). T_last_body (4, 4): the motion since the previous candidate as it is known by now,
-    which the difference of the two T_odom_body was when each was told; of the first of a stretch it is
-    T_odom_body. cov (6, 6): of T_last_body. up (3,): unit vector against gravity in the body frame, zeros
-    if unknown; up_sigma: of both its angles, rad. new_stretch: odometry broke before this keyframe, so
-    nothing relates it to the ones before. frames_ago: how many frames have been tracked since its own, while
-    its view was made.
+    T_odom_body (4, 4): as published. T_previous_body (4, 4): motion since the previous candidate by the
+    filter's present estimate, which may differ from that of the two published T_odom_body; for the first of a
+    segment it is T_odom_body. cov (6, 6): of T_previous_body. up (3,): unit vector against gravity in the
+    body frame, zeros if unknown; up_sigma: of both its angles, rad. new_segment: odometry broke before this
+    keyframe. frames_ago: frames tracked since its own, while its view was extracted.
     """
 
     T_odom_body: F64
@@ -334,7 +329,7 @@ class KeyframeCandidate:
         _set_fields(
             self,
             T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
-            T_last_body=checked_pose("T_last_body", self.T_previous_body),
+            T_previous_body=checked_pose("T_previous_body", self.T_previous_body),
             cov=checked_cov("cov", self.cov),
             up=checked_up("up", self.up),
             up_sigma=checked_sigma("up_sigma", self.up_sigma),
@@ -343,15 +338,15 @@ class KeyframeCandidate:
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """What an agent sends: where it was, relative to its previous sent keyframe, and what it saw.
+    """A keyframe on the wire: its pose relative to the previous sent keyframe, and its view.
 
-    id: per agent run, rising from 0. reference: id of the sent keyframe that T_ref_body (4, 4) and
-    its covariance (6, 6) are relative to, or -1: then T_ref_body is T_odom_body and a new stretch
-    of odometry begins. T_odom_body (4, 4): where the agent took itself to be, by which a correction
-    moves its odometry; T_ref_body is surer, since an estimator learns of the past too.
-    up (3,): unit vector against gravity in the body frame, zeros if unknown; up_sigma: of both its
-    angles, rad. follows: id of the keyframe to be applied before this one, -1 for none; at least the
-    reference, and more where a new stretch begins, so that a reordering network cannot overtake with it.
+    id: per agent run, rising from 0. reference: id of the sent keyframe to which T_ref_body (4, 4) and its
+    covariance cov (6, 6) are relative, or -1: T_ref_body is T_odom_body and an odometry segment starts.
+    T_odom_body (4, 4): the published odometry pose, by which a correction moves odometry; T_ref_body is more
+    accurate, since the filter later improves its past. up (3,): unit vector against gravity in the body
+    frame, zeros if unknown; up_sigma: of both its angles, rad. predecessor: id of the keyframe to apply
+    before this one, -1 for none; at least the reference, and more at the start of a segment, so that a
+    reordering network cannot make it overtake.
     """
 
     id: int
@@ -363,16 +358,16 @@ class Keyframe:
     up: F64
     up_sigma: float
     view: View
-    follows: int = -1
+    predecessor: int = -1
 
     def __post_init__(self) -> None:
         checked_id("id", self.id)
         checked_stamp("stamp_ns", self.stamp_ns)
         if not -1 <= self.reference < self.id:
             raise ValueError(f"reference: {self.reference} must lie in -1 .. {self.id - 1}")
-        _set_fields(self, follows=max(self.reference, self.follows))
-        if not self.follows < self.id:
-            raise ValueError(f"follows: {self.follows} must lie in -1 .. {self.id - 1}")
+        _set_fields(self, predecessor=max(self.reference, self.predecessor))
+        if not self.predecessor < self.id:
+            raise ValueError(f"predecessor: {self.predecessor} must lie in -1 .. {self.id - 1}")
         _set_fields(
             self,
             T_ref_body=checked_pose("T_ref_body", self.T_ref_body, MAX_ODOM_M),
@@ -385,26 +380,26 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """The edge's word on where an agent's odometry lies in the shared map.
+    """The pose T_map_odom (4, 4) of an agent's odometry in the shared map, with its covariance (6, 6).
 
-    map_id: names the map; a pose is comparable only with poses in the same map. revision: rises
-    with every correction to this agent. about: id of a keyframe of the stretch of odometry that it is about.
-    answers: id of the agent's keyframe that led to it, or -1 when another agent's did.
+    map_id: names the map; poses are comparable only within one map. revision: rises with every correction
+    to this agent. segment_keyframe: id of a keyframe of the odometry segment that it applies to.
+    answered_keyframe: id of the agent's keyframe that led to it; -1 if another agent's did.
     """
 
     T_map_odom: F64
     cov: F64
     map_id: str
     revision: int
-    about: int
-    answers: int = -1
+    segment_keyframe: int
+    answered_keyframe: int = -1
 
     def __post_init__(self) -> None:
         if not (0 < len(self.map_id) <= MAX_MAP_ID_LENGTH and self.map_id.isprintable()):
             raise ValueError(f"map_id: 1 to {MAX_MAP_ID_LENGTH} printable characters")
         checked_id("revision", self.revision)
-        checked_id("about", self.about)
-        checked_id("answers", self.answers, minimum=-1)
+        checked_id("segment_keyframe", self.segment_keyframe)
+        checked_id("answered_keyframe", self.answered_keyframe, minimum=-1)
         _set_fields(
             self,
             T_map_odom=checked_pose("T_map_odom", self.T_map_odom),

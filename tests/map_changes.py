@@ -100,6 +100,6 @@ def _keyframe(k: StoredKeyframe) -> tuple[object, ...]:
         (k.segment_name, k.ordinal),
         own.reference,
         own.stamp_ns,
-        own.follows,
+        own.predecessor,
         *(a.tobytes() for a in arrays),
     )

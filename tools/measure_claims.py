@@ -175,12 +175,14 @@ def played(made: KeyframeSet, lie: Lie | None, config: Config, seed: int = 0) ->
     }
     room = _Room(spans_ns, config, members, ProcessingDelays(), seed, mapper=mapper, on_record=records.append)
     room.run((ends_ns - began_ns) * 1e-9 + 3.0)
-    apart = [r for r in records if r["event"] in ("set apart", "disputed", "agrees again")]
+    apart = [
+        r for r in records if r["event"] in ("agent quarantined", "agents disputed", "quarantine lifted")
+    ]
     runs = mapper.runs
     judged = [runs[name] for name in (made.agents if lie == Lie() else honest)]
     report = room.edge.report(room.mapper.report())
-    if report["failed_jobs"]:
-        raise ShareError(f"{report['failed_jobs']} jobs of the mapper failed")
+    if report["failed_steps"]:
+        raise ShareError(f"{report['failed_steps']} steps of the mapper failed")
     return Outcome(
         _final(made, mapper, {runs[name]: name for name in honest}),
         _causal(made, room, honest, began_ns),

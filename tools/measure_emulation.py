@@ -81,14 +81,14 @@ def replanned(about: Row) -> MotionPlan:
 def tracked(source: Source) -> Row:
     """By cameras alone, causal."""
     run = track(source, Config(), lambda _: None)
-    whole = run.report["stretches"] == 1
+    whole = run.report["segments"] == 1
     found = trajectory_accuracy(run, source.truth()) if whole else None
     return {
         "track_frames": run.report["frames"],
         "track_tracked": run.report["tracked"],
         "track_init_s": run.report["init_s"],
         "track_lost_s": _round(run.report["lost_s"]),
-        "track_stretches": run.report["stretches"],
+        "track_stretches": run.report["segments"],
         "track_ate_cm": _round(100 * found.rmse) if found else None,
         "track_worst_cm": _round(100 * found.max) if found else None,
     }

@@ -182,7 +182,7 @@ def scored(run: Run, truth: Trajectory) -> Row:
         "states": {state: _percent(count, len(run.frames)) for state, count in states.items()},
         "init_s": report["init_s"] and round(report["init_s"], 2),
         "lost_s": round(report["lost_s"], 2),
-        "stretches": report["stretches"],
+        "stretches": report["segments"],
         "scored": _percent(len(longest.results), report["tracked"]) if longest else 0.0,
         "wrong_ok": _percent(wrong, len(run.frames)),
         "cpu_ms": round(report["track_ms"]["p50"], 1),

@@ -168,7 +168,7 @@ def _of_edge(report: Row, size: int) -> Row:
     steps = {name: report[name] for name in ("place_ms", "verify_ms", "solve_ms")}
     maps = sum(size > 0 for size in report["maps"].values())
     counts = {"file_mb": size / 1e6, "looked_up": 1 - skipped / max(1, keyframes), "maps": maps}
-    return counts | steps | {"loops": report["loops"], "taken_out": report["taken_out"]}
+    return counts | steps | {"loops": report["loops"], "removed_keyframes": report["removed_keyframes"]}
 
 
 def cells_of(row: Row) -> list[str]:

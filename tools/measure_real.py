@@ -189,7 +189,7 @@ def kitchen(options: argparse.Namespace) -> Iterator[str]:
         first, last = map(int, frames.split(":"))
         source = open_source(str(folder), frames=slice(first, last))
         run = track(source, Config(), lambda _: None)
-        found = trajectory_accuracy(run, source.truth()) if run.report["stretches"] == 1 else None
+        found = trajectory_accuracy(run, source.truth()) if run.report["segments"] == 1 else None
         error = f"{100 * found.rmse:.2f}" if found else "broke"
         tracked = f"{run.report['tracked']} of {run.report['frames']}"
         yield f"| {frames} | {error} | {before} | {tracked} | {run.report['lost_s']:.1f} |"
@@ -218,7 +218,7 @@ def room_session(folder: Path, options: argparse.Namespace) -> Source:
 def room_row(run: TrackingOutput, source: Source, raw: Trajectory) -> str:
     report, truth = run.report, source.truth()
     assert truth is not None  # an emulated session has one
-    if report["stretches"] == 1:
+    if report["segments"] == 1:
         found, given = ate(run.trajectory, truth), ate(run.trajectory, raw)
         bare = ate(on_mocap(run.trajectory, raw), raw)
         errors = " | ".join(f"{100 * m:.2f}" for m in (found.rmse, given.rmse, bare.rmse, bare.max))
@@ -227,7 +227,7 @@ def room_row(run: TrackingOutput, source: Source, raw: Trajectory) -> str:
     known, _ = interpolate(*raw, source.stamps()["cam0"])
     blind_s = (~known).sum() / source.rate_hz
     tracked = f"{report['tracked']} of {report['frames']}"
-    return f"{errors} | {tracked} | {report['stretches']} | {report['lost_s']:.1f} | {blind_s:.1f}"
+    return f"{errors} | {tracked} | {report['segments']} | {report['lost_s']:.1f} | {blind_s:.1f}"
 
 
 def on_mocap(estimate: Trajectory, raw: Trajectory) -> Trajectory:

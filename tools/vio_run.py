@@ -103,7 +103,7 @@ def figures(source: Source, told: Told, found: Series) -> dict[str, Any]:
         "states": {str(state): int(frames.in_state(state).sum()) / len(frames) for state in TrackState},
         "lost_s": report["lost_s"],
         "init_s": report["init_s"],
-        "new_stretches": max(report["stretches"] - 1, 0),
+        "new_stretches": max(report["segments"] - 1, 0),
         "track_ms": _percentile(told.track_ms, 50),
         "track_p99_ms": _percentile(told.track_ms, 99),
         "keyframes": report["keyframes"],

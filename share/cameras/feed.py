@@ -305,7 +305,7 @@ def feed_report(processor: SampleProcessor, dropped: Mapping[str, int], watchdog
     return {
         "streams": streams,
         "imu": processor.imu_interpolator.interpolated,
-        "stretches": processor.segments,
+        "segments": processor.segments,
         "reconnections": watchdog.reconnections,
         "resets": watchdog.resets,
         "health": watchdog.health.value,

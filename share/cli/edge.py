@@ -145,19 +145,19 @@ def _print_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
 
 
 _SHOWN_EVENTS = {  # without -v
-    "joined the edge",
+    "agent joined",
     "left",
-    "back",
+    "reconnected",
     "silent",
     "refused",
     "not let in",
-    "maps joined",
+    "maps merged",
     "merge undone",
-    "job failed",
+    "step failed",
     "not written",
     "mapper lost",
     "solver lost",
-    "odometry doubted",
+    "odometry suspect",
     "map",
     "tracking lost",
 }

@@ -75,7 +75,7 @@ def track(
                 f" {line}." for line in [*_wait_text(run.report), *camera_options.camera_summary(run.report)]
             )
         )
-    ate = trajectory_accuracy(run, truth) if run.report["stretches"] == 1 else None
+    ate = trajectory_accuracy(run, truth) if run.report["segments"] == 1 else None
     report = {**run.report, "ate_m": ate.rmse if ate else None}
     texts = {"--out": format_tum(run.trajectory), "--report": json.dumps(report, indent=2) + "\n"}
     for option, path in output_files.items():
@@ -122,7 +122,7 @@ def _wait_text(report: dict[str, Any]) -> list[str]:
     """Return what the tracker waited for most of the time without a pose; nothing if it did not wait."""
     from share.types import WaitReason
 
-    frames = report["waited"]
+    frames = report["waiting_frames"]
     return [f"The tracker waited for {WaitReason(max(frames, key=frames.get)).text}"] if frames else []
 
 
@@ -135,15 +135,14 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
     ]
     if report["init_s"] > _LONG_INIT_S:
         lines.append(". ".join([f"the first pose came after {report['init_s']:.1f} s", *_wait_text(report)]))
-    if report["contradicted"]:
+    if report["inconsistent_frames"]:
         lines.append(
-            f"images and IMU contradict each other in {report['contradicted']} frames: check that camera and "
+            f"images and IMU contradict each other in "
+            f"{report['inconsistent_frames']} frames: check that camera and "
             "IMU are mounted as the calibration says, and that their clocks agree"
         )
-    if report["stretches"] > 1:
-        lines.append(
-            f"tracking was lost: {report['stretches']} odometry segments, each in a frame of its own"
-        )
+    if report["segments"] > 1:
+        lines.append(f"tracking was lost: {report['segments']} odometry segments, each in a frame of its own")
     if ate:
         lines.append(
             f"ATE {100 * ate.rmse:.2f} cm rms, {100 * ate.max:.2f} cm at most "

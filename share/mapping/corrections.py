@@ -44,7 +44,7 @@ class CorrectionFilter:
 
 
 def _has_changed(last_sent: Correction, new: Correction) -> bool:
-    if new.answers >= 0 or new.map_id != last_sent.map_id:
+    if new.answered_keyframe >= 0 or new.map_id != last_sent.map_id:
         return True
     moved = se3.inverse(last_sent.T_map_odom) @ new.T_map_odom
     return bool(np.linalg.norm(moved[:3, 3]) > _MIN_SHIFT_M or se3.rotation_angle(moved) > _MIN_ROTATION_RAD)

@@ -33,6 +33,7 @@ from share.wire.messages import Hello
 _CULL_MARGIN = 1.05  # share of `max_keyframes` at which keyframes to remove are chosen
 _REMOVED_PER_KEYFRAME = 2
 _RETRY_INTERVAL = 4  # every fourth look-up includes keyframes of agents that are kept apart
+_QUARANTINE_EVENTS = {"set apart": "agent quarantined", "disputed": "agents disputed"}  # by their state
 
 
 class Mapper:
@@ -218,7 +219,7 @@ class Mapper:
         self._counters.failed_steps += 1
         agent = next(iter(self._hellos), None) if agent is None else agent
         return (
-            [] if agent is None else [MapEvent(agent, "job failed", f"{what}: {describe_exception(error)}")]
+            [] if agent is None else [MapEvent(agent, "step failed", f"{what}: {describe_exception(error)}")]
         )
 
     def reset_solver(self) -> None:
@@ -295,11 +296,11 @@ class Mapper:
         reason = f"{decision.reason} ({outcome.reason})"
         self._record_loops(decision)
         if not decision.accepted:
-            return [*events, MapEvent(b.agent, "loop not taken", reason)]
+            return [*events, MapEvent(b.agent, "loop not accepted", reason)]
         counters.merges["done"] += 1
         self._merge_gate.record_merge(volume)
         undone_events = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
-        accepted = MapEvent(b.agent, "maps joined" if decision.joined_maps else "loop accepted", reason)
+        accepted = MapEvent(b.agent, "maps merged" if decision.joined_maps else "loop accepted", reason)
         return [*events, *undone_events, accepted]
 
     def _quarantine_events(self, change: QuarantineChange) -> list[MapEvent]:
@@ -307,9 +308,9 @@ class Mapper:
         removals = (RemoveLoops(loop.a, loop.b) for loop in change.dropped)
         self._changes += [*removals, *map(SaveLoop, change.added)]
         return [
-            MapEvent(agent, standing.state, standing.reason)
-            if standing.state in ("set apart", "disputed")
-            else MapEvent(agent, "agrees again", "consistent with the others again")
+            MapEvent(agent, _QUARANTINE_EVENTS[standing.state], standing.reason)
+            if standing.state in _QUARANTINE_EVENTS
+            else MapEvent(agent, "quarantine lifted", "consistent with the others again")
             for agent, standing in change.standings.items()
         ]
 
@@ -331,7 +332,9 @@ class Mapper:
         map_id = step.job.map_id
         waiting = [
             MapEvent(
-                agent, "not told yet", f"its position in map {map_id} is known to {100 * sigma_m:.0f} cm"
+                agent,
+                "correction held back",
+                f"its position in map {map_id} is known to {100 * sigma_m:.0f} cm",
             )
             for agent, sigma_m in applied.waiting_sigma_m.items()
             if (agent, map_id) not in self._reported_waits
@@ -383,9 +386,9 @@ class Mapper:
             },
             "merges": merges,
             "maps": self._atlas.map_sizes(),
-            "taken_out": counters.removed_keyframes,
+            "removed_keyframes": counters.removed_keyframes,
             "waiting": len(self._queries),
-            "failed_jobs": counters.failed_steps,
+            "failed_steps": counters.failed_steps,
             **counters.step_report(),
         }
 

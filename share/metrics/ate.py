@@ -1,4 +1,4 @@
-"""Absolute trajectory error: how far the estimate lies from the truth, once laid over it.
+"""Absolute trajectory error (ATE): position error of an estimate after alignment with the truth.
 
 Source: Sturm et al., *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012, eq. 3;
 Zhang & Scaramuzza, *A Tutorial on Quantitative Trajectory Evaluation*, IROS 2018. Protocol:
@@ -19,7 +19,7 @@ from share.types import F64
 
 Alignment = Literal["se3", "origin", "none"]
 
-_MIN_POSES = {"se3": 3, "origin": 1, "none": 1}  # associated poses without which there is no alignment
+_MIN_POSES = {"se3": 3, "origin": 1, "none": 1}  # associated poses that an alignment needs
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Ate:
 
 @dataclass(frozen=True, eq=False)
 class JointAte:
-    """Of all agents' frames together, and of each agent, all under the one alignment of `joint`."""
+    """ATE over all agents' frames and of each agent, under the one alignment of `joint`."""
 
     joint: Ate
     agents: dict[str, Ate]
@@ -48,8 +48,8 @@ def ate(
     alignment: Alignment = "se3",
     max_gap_ns: int = MAX_GAP_NS,
 ) -> Ate:
-    """ATE of one trajectory. `se3`: least squares over all positions; `origin`: first poses made
-    equal; `none`: as given. Raises DataError where too few poses have a truth at their time."""
+    """Return the ATE of one trajectory. Alignment `se3`: least squares over all positions; `origin`: first
+    poses made equal; `none`: as given. Raises DataError if too few poses have a truth at their time."""
     _, T_est, T_truth = associate(estimate, truth, max_gap_ns)
     require_poses(len(T_est), _MIN_POSES[alignment], "ATE")
     T = _fit_alignment(T_est, T_truth, alignment)
@@ -61,10 +61,11 @@ def joint_ate(
     alignment: Literal["se3", "none"] = "se3",
     max_gap_ns: int = MAX_GAP_NS,
 ) -> JointAte:
-    """ATE of agents in one map: {name: (estimate, truth)}, one alignment over all their frames.
+    """Return the ATE of agents in one map: {name: (estimate, truth)}, one alignment over all their frames, so
+    that a wrongly merged agent shows.
 
-    An agent that was joined wrongly therefore shows. One without an associated pose is left out of
-    `agents`. Raises DataError where all together are too few.
+    An agent without an associated pose is left out of `agents`. Raises DataError if all poses together are
+    too few.
     """
     associated = {name: associate(*pair, max_gap_ns)[1:] for name, pair in pairs.items()}
     associated = {name: pair for name, pair in associated.items() if len(pair[0])}
@@ -78,7 +79,7 @@ def joint_ate(
 
 
 def position_errors(T_truth_est: F64, T_est: F64, T_truth: F64) -> F64:
-    """Distances (N,) m of associated poses (N, 4, 4) under an alignment (4, 4)."""
+    """Return distances (N,), m, of associated poses (N, 4, 4) under an alignment (4, 4)."""
     out: F64 = np.linalg.norm(transform(T_truth_est, T_est[:, :3, 3]) - T_truth[:, :3, 3], axis=1)
     return out
 
@@ -96,12 +97,9 @@ def _make_ate(statistics: ErrorStatistics, T: F64) -> Ate:
     return Ate(statistics.rmse, statistics.mean, statistics.median, statistics.max, statistics.n, T)
 
 
-# ---- How a set of errors is summed up.
-
-
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Of n errors, in their unit."""
+    """Statistics of n errors, in their unit."""
 
     rmse: float
     mean: float
@@ -111,7 +109,7 @@ class ErrorStatistics:
 
 
 def error_statistics(errors: F64) -> ErrorStatistics:
-    """Of errors (N,), N >= 1, none negative."""
+    """Return statistics of errors (N,), N >= 1, non-negative."""
     return ErrorStatistics(
         rmse=float(np.sqrt(np.mean(errors**2))),
         mean=float(errors.mean()),

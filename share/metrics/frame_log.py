@@ -1,7 +1,7 @@
-"""The frames of a run in columns, and the lines that they are kept as while it lasts.
+"""The log of an agent's frames during a run, latency.csv and the frame part of report.json.
 
-A line is one of latency.csv, with all digits of its numbers. What is only known later, the time to the
-correction, is a line of its own: it has the frame's stamp and no state.
+While the run lasts, a frame is a line as in latency.csv with all digits. A correction, known later, is a
+line of its own with the frame's stamp and no state.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LINE_DTYPE = np.dtype(
         *(("state", "S14"), ("keyframe", "i1"), ("sent", "i1")),
     ]
 )
-_CHUNK_LINES = 65_536  # lines
+_CHUNK_LINES = 65_536
 
 
 def frame_line(stamp_ns: int, track_ms: float, state: TrackState, keyframe: bool, sent: bool) -> str:
@@ -40,8 +40,8 @@ def correction_line(stamp_ns: int, corrected_ms: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class FrameTable:
-    """N frames in order of their stamps: each (N,). state: names of `TrackState`, as bytes.
-    corrected_ms: NaN where no correction came of the frame."""
+    """N frames in order of their stamps, all columns (N,). state: names of `TrackState`, as bytes.
+    corrected_ms: NaN without a correction."""
 
     stamp_ns: I64
     track_ms: F64
@@ -54,7 +54,7 @@ class FrameTable:
         return len(self.stamp_ns)
 
     def in_state(self, state: TrackState) -> NDArray[np.bool_]:
-        """Which frames were in that state."""
+        """Return a mask (N,) of the frames in that state."""
         mask: NDArray[np.bool_] = self.state == state.encode()
         return mask
 
@@ -75,12 +75,12 @@ class FrameTable:
 
     @property
     def init_s(self) -> float | None:
-        """From the first frame to the first with a pose; None if there was none."""
+        """From the first frame to the first with a pose; None without one."""
         first = np.flatnonzero(self.has_pose)[:1]
         return int(self.stamp_ns[first[0]] - self.stamp_ns[0]) * 1e-9 if first.size else None
 
     def csv_chunks(self) -> Iterator[str]:
-        """latency.csv, in parts of whole lines."""
+        """Yield latency.csv in parts of whole lines."""
         yield CSV_HEADER + "\n"
         columns = (self.stamp_ns, self.track_ms, self.corrected_ms, self.state, self.keyframe, self.sent)
         for k in range(0, len(self), _CHUNK_LINES):
@@ -96,18 +96,18 @@ def _csv_line(
 
 
 def read_frames(lines: Iterable[str]) -> FrameTable:
-    """Of the lines, the first of which is CSV_HEADER, where there are any. Raises DataError."""
+    """Return the frames in these lines, the first of which is CSV_HEADER. Raises DataError if they are
+    damaged."""
     rows = _parse(lines)
-    rows = rows[np.argsort(rows["stamp_ns"], kind="stable")]  # of one stamp: as they came
+    rows = rows[np.argsort(rows["stamp_ns"], kind="stable")]  # same stamp: in order of arrival
     is_frame = rows["state"] != b""
     frames, corrections = rows[is_frame], rows[~is_frame]
-    frame_counts = np.cumsum(is_frame)[~is_frame]  # how many frames, in this order, of each correction
+    frame_counts = np.cumsum(is_frame)[~is_frame]  # frames before each correction
     corrections, frame_counts = corrections[frame_counts > 0], frame_counts[frame_counts > 0]
     matches = frames["stamp_ns"][frame_counts - 1] == corrections["stamp_ns"]
     corrected_ms = np.ascontiguousarray(frames["corrected_ms"])
-    corrected_ms[frame_counts[matches] - 1] = corrections["corrected_ms"][
-        matches
-    ]  # of several of a frame, the last
+    # the last of several corrections of a frame wins
+    corrected_ms[frame_counts[matches] - 1] = corrections["corrected_ms"][matches]
     return FrameTable(
         np.ascontiguousarray(frames["stamp_ns"]),
         np.ascontiguousarray(frames["track_ms"]),
@@ -119,32 +119,29 @@ def read_frames(lines: Iterable[str]) -> FrameTable:
 
 
 def _parse(lines: Iterable[str]) -> NDArray[Any]:
-    """As many of _LINE, a part at a time: parsing takes several times the memory of what is parsed."""
+    """Return the lines as rows of _LINE_DTYPE. Parsed in chunks: parsing takes several times their memory."""
     rest = itertools.islice(lines, 1, None)
     parts = [np.empty(0, _LINE_DTYPE)]
     try:
         while chunk := list(itertools.islice(rest, _CHUNK_LINES)):
             parts.append(np.loadtxt(chunk, _LINE_DTYPE, delimiter=",", ndmin=1, comments=None))
     except ValueError as error:
-        raise DataError(f"the run's own latencies were changed by somebody: {error}") from None
+        raise DataError(f"the log of this run's frames was changed during the run: {error}") from None
     return np.concatenate(parts)
 
 
-# ---- What happened to every frame of one agent's run, and the report that comes of it.
-
-
 class LineStore(Protocol):
-    """Where the lines of a run go, and come from again."""
+    """Storage of a run's lines."""
 
     def write(self, line: str) -> None:
-        """One more, without its end."""
+        """Append a line, given without its end."""
 
     def read(self) -> Iterable[str]:
-        """All of them, in order."""
+        """Return all lines in order."""
 
 
 class MemoryLineStore:
-    """For runs that end before that matters."""
+    """Keeps the lines in memory, for short runs."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
@@ -158,26 +155,24 @@ class MemoryLineStore:
 
 @dataclass
 class RunLog:
-    """Frames as their fate becomes known; corrections come later, and name the frame by its stamp.
+    """Collects frames as they are done, and corrections later, which name a frame by its stamp.
 
-    Nothing of a frame is kept but its line in `lines`: a run of hours takes no more memory than one of
-    seconds, until its report is made.
+    A frame is kept only as a line in `lines`, so memory does not grow with the run until the report is made.
     """
 
     lines: LineStore = field(default_factory=MemoryLineStore)
     cpu_s: float = 0.0  # process CPU time of the tracking pipeline
     decode_s: float = 0.0  # CPU time of image decoding
-    inconsistent_frames: int = 0  # frames in which images and IMU told of different motions
-    waiting_frames: Counter[WaitReason] = field(
-        default_factory=Counter
-    )  # frames, by what was still waited for
-    segments: int = 0  # of unbroken odometry; poses of different ones do not compare
-    imu_outliers: int = 0  # samples of the IMU that the tracker did not believe
+    inconsistent_frames: int = 0  # frames in which images and IMU disagree about the motion
+    # frames without a first pose, by what the tracker waited for
+    waiting_frames: Counter[WaitReason] = field(default_factory=Counter)
+    segments: int = 0  # of odometry; poses of different segments are not comparable
+    imu_outliers: int = 0  # IMU samples that the tracker rejected
     _frames: int = 0
-    _has_header: bool = False  # the first line, the columns' names, is written
+    _has_header: bool = False  # CSV_HEADER is written
 
     def __len__(self) -> int:
-        """How many frames."""
+        """Number of frames."""
         return self._frames
 
     def add(
@@ -187,8 +182,8 @@ class RunLog:
         self._frames += 1
 
     def add_result(self, new_segment: bool, is_consistent: bool, waiting_for: WaitReason | None) -> None:
-        """Of a frame: whether odometry broke before it, whether images and IMU agree, and what is still
-        waited for; None: nothing."""
+        """Add a frame's result: whether it starts a segment, whether images and IMU agree, and what the
+        tracker waits for, None if nothing."""
         self.segments += new_segment
         self.inconsistent_frames += not is_consistent
         if waiting_for is not None:
@@ -198,7 +193,7 @@ class RunLog:
         self.decode_s += cpu_s
 
     def add_correction(self, stamp_ns: int, corrected_ms: float) -> None:
-        """Of a frame that was added; a later mark of the same frame replaces this one."""
+        """Add a correction of a frame that was added; a later one of the same frame replaces it."""
         self._write(correction_line(stamp_ns, corrected_ms))
 
     def _write(self, line: str) -> None:
@@ -208,15 +203,15 @@ class RunLog:
         self.lines.write(line)
 
     def frames(self) -> FrameTable:
-        """In order of time, which is not the order in which their fate was known."""
+        """Return the frames in order of their stamps."""
         return read_frames(self.lines.read())
 
     def csv_chunks(self) -> Iterator[str]:
-        """The whole of latency.csv, in parts."""
+        """Yield latency.csv in parts of whole lines."""
         return self.frames().csv_chunks()
 
     def report(self) -> dict[str, Any]:
-        """The fields of report.json that come from frames alone (docs/understand/architecture.md)."""
+        """Return the fields of report.json that come from frames alone (docs/understand/architecture.md)."""
         rows = self.frames()
         frames = len(rows)
         parts = latency(rows.track_ms, rows.corrected_ms)
@@ -227,9 +222,9 @@ class RunLog:
             "keyframes": int(rows.keyframe.sum()),
             "sent": sent,
             "lost_s": rows.lost_s,
-            "stretches": self.segments,
-            "contradicted": self.inconsistent_frames,
-            "imu_doubted": self.imu_outliers,
+            "segments": self.segments,
+            "inconsistent_frames": self.inconsistent_frames,
+            "imu_outliers": self.imu_outliers,
             "track_ms": parts.track_ms.report(),
             "corrected_ms": parts.corrected_ms.report(),
             "latency_ms": parts.latency_ms.report(),
@@ -238,34 +233,33 @@ class RunLog:
             "decode_ms_per_frame": 1e3 * self.decode_s / frames if frames else None,
             "rate_hz": sent / rows.span_s if rows.span_s else None,
             "init_s": rows.init_s,
-            "waited": {str(reason): frames for reason, frames in self.waiting_frames.items()},
+            "waiting_frames": {str(reason): frames for reason, frames in self.waiting_frames.items()},
         }
 
 
-# ---- Latency as every table means it (docs/understand/architecture.md; docs/do/evaluate.md).
-
+# Latency as in all tables (docs/understand/architecture.md, docs/do/evaluate.md).
 NOTICEABLE_LATENCY_MS = 20.0  # a headset wearer notices more
 
 
 class ReplayQueue:
-    """How long a frame of a recording would wait if frames came at the recording's pace: for what the one
-    before left to do."""
+    """Models the queue of a recording played in real time: how long a frame would wait for the work on the
+    previous one."""
 
     def __init__(self) -> None:
         self._stamp_ns, self._busy_ms = 0, 0.0
 
     def wait_ms(self, stamp_ns: int) -> float:
-        """Of the next frame."""
+        """Return the waiting time of the next frame, ms."""
         return max(0.0, self._busy_ms - (stamp_ns - self._stamp_ns) * 1e-6)
 
     def finish_frame(self, stamp_ns: int, busy_ms: float) -> None:
-        """busy_ms: from when the frame came until all work on it was done, its wait included."""
+        """Record a frame. busy_ms: from its arrival until all work on it was done, waiting included."""
         self._stamp_ns, self._busy_ms = stamp_ns, busy_ms
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Of n values; all NaN where n is 0. Percentiles interpolate linearly."""
+    """Statistics of n values; all NaN if n is 0. Percentiles interpolate linearly."""
 
     n: int
     mean: float
@@ -275,13 +269,13 @@ class Summary:
     max: float
 
     def report(self) -> dict[str, float | None]:
-        """For JSON, which knows no NaN: None instead."""
+        """Return a mapping for JSON, with None for NaN."""
         return {k: None if math.isnan(v) else v for k, v in dataclasses.asdict(self).items()}
 
 
 @dataclass(frozen=True)
 class Latency:
-    """Of one agent over a run, ms. over_20ms: share of frames (0..1) whose track_ms exceeds 20."""
+    """Latency of one agent over a run, ms. over_20ms: share of frames (0..1) with track_ms over 20."""
 
     track_ms: Summary
     corrected_ms: Summary
@@ -290,10 +284,10 @@ class Latency:
 
 
 def summary(values: ArrayLike) -> Summary:
-    """Of values (N,), N >= 0. Raises ValueError where one is not finite."""
+    """Return statistics of values (N,), N >= 0. Raises ValueError if one is not finite."""
     v = np.asarray(values, np.float64)
     if not np.isfinite(v).all():
-        raise ValueError("summary: has values that are not finite")
+        raise ValueError("summary: non-finite values")
     if v.size == 0:
         return Summary(0, math.nan, math.nan, math.nan, math.nan, math.nan)
     p50, p95, p99 = map(float, np.percentile(v, [50, 95, 99]))
@@ -301,10 +295,11 @@ def summary(values: ArrayLike) -> Summary:
 
 
 def latency(track_ms: ArrayLike, corrected_ms: ArrayLike) -> Latency:
-    """track_ms: of every frame; corrected_ms: of every corrected frame (NaN: was not corrected).
+    """Return the latency of an agent. track_ms: of every frame. corrected_ms: of corrected frames; NaN
+    entries are ignored.
 
-    An agent's latency is the mean over the multiset of both: a frame that was corrected counts twice,
-    once for its local pose and once for its place in the shared map.
+    `latency_ms` is over both together: a corrected frame counts twice, once for its local pose and once for
+    its pose in the shared map.
     """
     track = np.asarray(track_ms, np.float64)
     corrected = np.asarray(corrected_ms, np.float64)

@@ -1,7 +1,7 @@
-"""How wrong an agent's odometry is of late, by its truth: what the error model is to tell without one.
+"""Local error of odometry against the truth: the quantity that the error model estimates without truth.
 
-The causal poses of the last seconds are laid over the truth (SE3, positions alone), and the error is their
-rms: what a wearer sees slip, not what has been lost since the beginning.
+The causal poses of the last seconds are aligned with the truth (SE3, positions only); the error is their
+RMS. It measures present drift, not the drift accumulated since the start.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from share.geometry.se3 import transform, umeyama
 from share.types import F64
 
 WINDOW_S = 5.0
-_MIN_POSES = 10  # poses; and no less than half the window
+_MIN_POSES = 10  # and they must span half the window
 
 
 class LocalError:
-    """Of one agent; truth: poses of its body in a room, at stamps of its clock."""
+    """Local error of one agent. truth: poses of its body at stamps of its clock."""
 
     def __init__(self, truth: Trajectory, window_s: float = WINDOW_S) -> None:
         self._truth, self._window_ns = truth, round(window_s * 1e9)
-        self._window: deque[tuple[int, F64, F64]] = deque()  # stamp, position told, position in truth
+        self._window: deque[tuple[int, F64, F64]] = deque()  # stamp ns, estimated position, true position
 
     def update(self, stamp_ns: int, T_odom_body: F64 | None, new_segment: bool = False) -> float | None:
-        """cm, after another frame. None without a pose or a truth now, or where there are too few of late."""
+        """Add a frame; return the error in cm. None without a pose or truth, or with too few in the
+        window."""
         if new_segment:
             self._window.clear()
         while self._window and self._window[0][0] < stamp_ns - self._window_ns:

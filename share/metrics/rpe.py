@@ -1,4 +1,4 @@
-"""Relative pose error: drift over one frame, or over a stretch of time.
+"""Relative pose error (RPE): drift over one frame, or over a span of time.
 
 Source: Sturm et al., IROS 2012, eq. 1-2: E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) for truth Q, estimate P.
 Needs no alignment. Protocol: docs/do/evaluate.md.
@@ -28,9 +28,10 @@ class Rpe:
 def rpe_frames(
     estimate: Trajectory, truth: Trajectory, max_step_ns: int = 200_000_000, max_gap_ns: int = MAX_GAP_NS
 ) -> Rpe:
-    """RPE from each frame to the next. A step longer than `max_step_ns` (lost, no truth) is left out.
+    """Return the RPE from each frame to the next. Steps longer than `max_step_ns` (lost, no truth) are left
+    out.
 
-    Raises DataError where no pair is left.
+    Raises DataError if no pair is left.
     """
     stamps, T_est, T_truth = associate(estimate, truth, max_gap_ns)
     i = np.flatnonzero(np.diff(stamps) <= max_step_ns)
@@ -44,13 +45,13 @@ def rpe_time(
     tolerance_ns: int = 20_000_000,
     max_gap_ns: int = MAX_GAP_NS,
 ) -> Rpe:
-    """RPE from each frame to the frame nearest to `delta_ns` later, at most `tolerance_ns` off.
+    """Return the RPE from each frame to the frame nearest to `delta_ns` later, within `tolerance_ns`.
 
-    Raises DataError where no pair is left.
+    Raises DataError if no pair is left.
     """
     stamps, T_est, T_truth = associate(estimate, truth, max_gap_ns)
     if len(stamps) == 0:
-        raise DataError("RPE: no pose of the estimate has a truth at its time")
+        raise DataError("RPE: no estimated pose has a truth at its time")
     j = _nearest(stamps, stamps + delta_ns)
     i = np.flatnonzero(np.abs(stamps[j] - stamps - delta_ns) <= tolerance_ns)
     return _rpe(T_est, T_truth, i, j[i], f"over {delta_ns / 1e9:g} s")
@@ -65,7 +66,7 @@ def _nearest(stamps: I64, queries_ns: I64) -> I64:
 
 def _rpe(T_est: F64, T_truth: F64, i: I64, j: I64, label: str) -> Rpe:
     if len(i) == 0:
-        raise DataError(f"RPE {label}: no pair of poses of the estimate has a truth at both times")
+        raise DataError(f"RPE {label}: no pair of estimated poses has a truth at both times")
     moved_est = inverse(T_est[i]) @ T_est[j]
     moved_truth = inverse(T_truth[i]) @ T_truth[j]
     E = inverse(moved_truth) @ moved_est

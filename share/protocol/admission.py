@@ -1,4 +1,4 @@
-"""Which runs of agents the edge takes in, and what it calls them."""
+"""Admission at the edge: limits on keyframes and new runs, and the registry of known runs."""
 
 from __future__ import annotations
 
@@ -13,24 +13,29 @@ from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
 from share.types import Keyframe
 from share.wire.messages import Hello, peer_id, public_tag
 
-# ---- How much one agent may make the mapper work, whatever runs it begins.
-
-# Of every keypoint the mapper's work is about the same, and of a keyframe without any as of so many
-# (docs/understand/robustness.md). An agent of the shipped settings sends keyframes of 500, at most 5 a second
-# (control.rate_max_hz), and to a new edge at once what its ledger holds, 600. Twice that rate is taken in,
-# and 700 at once.
+# Keyframe quota: the mapper work that one agent may cause, over all its runs.
+#
+# The work grows with the keypoints; a keyframe without any costs as much as _BASE_COST of them
+# (docs/understand/robustness.md). With the default settings an agent sends keyframes of 500 keypoints, at
+# most 5 a
+# second (control.rate_max_hz), and resends up to 600 at once to a new edge. Twice that rate and 700 at once
+# are accepted.
 _BASE_COST = 250
 _KEYFRAME_COST = 500 + _BASE_COST
-_COST_HZ, _COST_BURST = 10.0 * _KEYFRAME_COST, 700.0 * _KEYFRAME_COST
-_SEGMENT_FACTOR = 20  # times: what begins a stretch of odometry stays in the mapper for as long as it runs
+_COST_HZ = 10.0 * _KEYFRAME_COST
+_COST_BURST = 700.0 * _KEYFRAME_COST
+_SEGMENT_FACTOR = 20  # a keyframe that starts a segment costs this much more: the mapper never forgets one
 _OVERLOAD_TEXT = (
-    f"keyframes come with more than {_COST_HZ / _KEYFRAME_COST * 500:.0f} keypoints a second: the rest waits"
+    f"more than {_COST_HZ / _KEYFRAME_COST * 500:.0f} keypoints a second: further keyframes are deferred"
 )
-_RATE_SLACK, _RATE_BURST = 1.2, 10.0  # rates arrive a little uneven
+_RATE_SLACK = 1.2  # keyframes arrive unevenly
+_RATE_BURST = 10.0  # keyframes
 
 
 class KeyframeQuota:
-    """Of each name. most_hz: keyframes a second that an agent may send; None: any number."""
+    """Limits the keyframes of each agent name.
+
+    max_rate_hz: keyframes a second that the policy grants at most; None: unlimited."""
 
     def __init__(self, max_rate_hz: float | None) -> None:
         self._cost_buckets = TokenBuckets(_COST_BURST, _COST_HZ)
@@ -39,27 +44,30 @@ class KeyframeQuota:
         )
 
     def objection(self, name: str, keyframe: Keyframe, now_ns: int) -> str | None:
-        """Why this keyframe is not taken in now; None: it is, and counts."""
+        """Return why this keyframe is not accepted now; None if it is, and charge its cost."""
         cost = (len(keyframe.view.uv) + _BASE_COST) * (1 if keyframe.reference >= 0 else _SEGMENT_FACTOR)
         return None if self._cost_buckets.bucket(name, now_ns).take(now_ns, cost=cost) else _OVERLOAD_TEXT
 
     def is_over_rate(self, name: str, now_ns: int) -> bool:
-        """Whether this keyframe, which is taken in, is more than its agent was ever asked for."""
+        """Return whether this accepted keyframe exceeds the highest rate that an agent may have."""
         return not self._rate_buckets.bucket(name, now_ns).take(now_ns)
 
 
-# New runs that are taken in: each stays in the report, and in the map once it has a keyframe. Of one name as
-# many as somebody starts who tries things out; of all names of a key, one full room at once; of all, two.
-_NAME_BURST, _NAME_HZ = 8.0, 0.1
-_CREDENTIAL_BURST, _CREDENTIAL_HZ = 32.0, 0.25
-_EDGE_BURST, _EDGE_HZ = 128.0, 2.0
-_SILENT_S = 0.6  # an agent pings every half second
+# Limits on new runs: each stays in the report, and in the map once it has a keyframe. One name: as many as a
+# person starts while trying things out; one key: a full room at once; the edge: two rooms.
+_NAME_BURST = 8.0
+_NAME_HZ = 0.1
+_CREDENTIAL_BURST = 32.0
+_CREDENTIAL_HZ = 0.25
+_EDGE_BURST = 128.0
+_EDGE_HZ = 2.0
+_SILENT_S = 0.6  # an agent pings every 0.5 s
 
 
 class NewRunLimits:
-    """How often new runs may come, of each name, of all names of a key, and of the whole edge.
+    """Limits the rate of new runs per name, per credential and for the whole edge.
 
-    voice: of the key that says hello (`PeerMessageReceived`); "" where no keys are used."""
+    credential: as in `PeerMessageReceived`; "" without keys."""
 
     def __init__(self) -> None:
         self._total = TokenBucket(_EDGE_BURST, _EDGE_HZ)
@@ -67,7 +75,7 @@ class NewRunLimits:
         self._by_credential = TokenBuckets(_CREDENTIAL_BURST, _CREDENTIAL_HZ)
 
     def objection(self, name: str, credential: str, now_ns: int) -> str | None:
-        """Why no new run of this name may come now, and when one may; None if one may."""
+        """Return why this name may not start a new run now, and when it may; None if it may."""
         if wait_s := self._by_name.bucket(name, now_ns).wait_s(now_ns):
             return f"too many new runs of '{name}': try again in {ceil(wait_s)} s"
         if credential and (wait_s := self._by_credential.bucket(credential, now_ns).wait_s(now_ns)):
@@ -77,7 +85,7 @@ class NewRunLimits:
         return None
 
     def record(self, name: str, credential: str, now_ns: int) -> None:
-        """A new run of this name, to which there was no objection."""
+        """Count a new run of this name that `objection` allowed."""
         self._total.take(now_ns)
         self._by_name.bucket(name, now_ns).take(now_ns)
         if credential:
@@ -85,7 +93,9 @@ class NewRunLimits:
 
 
 class Admission:
-    """tracks: whether this edge tracks its agents, which then stream."""
+    """Decides whether a run may join.
+
+    tracks_agents: the edge tracks its agents (policy streamed), so agents must stream frames."""
 
     def __init__(self, config: EdgeConfig, tracks_agents: bool) -> None:
         self._config, self._tracks_agents = config, tracks_agents
@@ -94,34 +104,38 @@ class Admission:
     def objection(
         self, event: PeerMessageReceived, hello: Hello, peers: Mapping[bytes, Peer], now_ns: int
     ) -> str | None:
-        """Why this run cannot be taken in, for a person; None if it can. event: brought `hello`."""
+        """Return why this run may not join, for a person; None if it may. event: carried `hello`."""
         if not event.is_authorised_for(hello.name):
             return name_objection(hello.name, event.allowed_names or ())
-        if hello.streams and not self._tracks_agents:
-            return "this edge tracks nobody: start it with --policy streamed, or the agent without --streamed"
-        if self._tracks_agents and not hello.streams:
+        if hello.streams_frames and not self._tracks_agents:
+            remedy = "start it with --policy streamed, or the agent without --streamed"
+            return f"this edge does not track agents: {remedy}"
+        if self._tracks_agents and not hello.streams_frames:
             return "this edge tracks its agents (policy streamed): start the agent with --streamed"
         if (existing := peers.get(event.peer_id)) is not None:
             same_name = existing.hello.name == hello.name
             return (
-                None if same_name else f"this run's number is in use by '{existing.hello.name}'; start again"
+                None
+                if same_name
+                else f"this run id is in use by '{existing.hello.name}'; start the agent again"
             )
         capacity_objection = self.capacity_objection(hello, peers, now_ns)
         return capacity_objection or self._new_run_limits.objection(hello.name, event.credential, now_ns)
 
     def record_join(self, event: PeerMessageReceived, hello: Hello, now_ns: int) -> None:
-        """This new run was taken in."""
+        """Count a run that has joined."""
         self._new_run_limits.record(hello.name, event.credential, now_ns)
 
     def is_name_stale(self, name: str, peers: Mapping[bytes, Peer], now_ns: int) -> bool:
-        """Whether a run of this name is silent, perhaps for ever: its agent was killed and starts again."""
+        """Return whether the present run of this name is silent: its agent may have been killed and
+        restarted."""
         received_ns = [
             peer.last_received_ns for peer in peers.values() if not peer.is_gone and peer.hello.name == name
         ]
         return bool(received_ns) and now_ns - max(received_ns) > seconds_to_ns(_SILENT_S)
 
     def capacity_objection(self, hello: Hello, peers: Mapping[bytes, Peer], now_ns: int) -> str | None:
-        """Why a run that is not present cannot be, beside those that are; None if it can."""
+        """Return why an absent run may not become present beside the others; None if it may."""
         present = [peer for peer in peers.values() if not peer.is_gone]
         for peer in present:
             if peer.hello.name == hello.name and now_ns - peer.last_received_ns < seconds_to_ns(
@@ -129,12 +143,12 @@ class Admission:
             ):
                 return f"the name '{hello.name}' is in use by another agent; choose another with --name"
         if len(present) >= self._config.max_agents:
-            return f"the edge serves {len(present)} agents already, as many as it may (edge.max_agents)"
+            return f"the edge already serves {len(present)} agents, its limit (edge.max_agents)"
         return None
 
 
 def new_run_key(hello: Hello, used_keys: Collection[str]) -> str:
-    """Names the run to everybody: as much of its public tag as sets it apart from other runs of that name."""
+    """Return the public key of a run: its name and enough of its public tag to be unique."""
     digits, tag = 4, public_tag(hello.run_id)
     while (key := f"{hello.name}-{tag[:digits]}") in used_keys:
         digits += 1
@@ -142,33 +156,30 @@ def new_run_key(hello: Hello, used_keys: Collection[str]) -> str:
 
 
 def name_objection(name: str, allowed_names: Collection[str]) -> str:
-    """Why who may speak for `allowed_names` is refused as `name`."""
-    allowed = ", ".join(f"'{one}'" for one in sorted(allowed_names)) or "nobody"
+    """Return why a peer authorised for `allowed_names` is refused as `name`, with the remedy."""
+    allowed = ", ".join(f"'{one}'" for one in sorted(allowed_names)) or "no agent"
     return (
-        f"its key speaks for {allowed}, not for '{name}'; at the edge: share keys authorize … --agent {name}"
+        f"its key is authorized for {allowed}, not for '{name}'; on the edge run: "
+        f"share keys authorize … --agent {name}"
     )
 
 
-# ---- The runs of agents that an edge knows, also those that are over.
-
-_MAX_IDLE = 256  # gone without a keyframe; the oldest is forgotten
-_MAX_FORGOTTEN = (
-    65_536  # runs that are known to have been forgotten; of the others nobody was heard for hours
-)
+# Registry of the runs that an edge knows, ended ones included.
+_MAX_IDLE = 256  # runs that left without a keyframe; beyond, the oldest is forgotten
+_MAX_FORGOTTEN = 65_536  # forgotten runs that are still recognised; older ones have been silent for hours
 
 
 class RunRegistry(Mapping[bytes, Peer]):
-    """By who speaks for them on the link. Each has a key, which names it everywhere else, and of each name
-    the one that came or came back last is that agent's present one."""
+    """Runs by their peer id on the link. Each run has a key that names it everywhere else; the run of a name
+    that joined or came back last is the latest."""
 
     def __init__(self) -> None:
         self._peers: dict[bytes, Peer] = {}
         self._peer_id_by_key: dict[str, bytes] = {}
-        self._runs_by_name: dict[str, dict[str, Peer]] = {}  # by key, the present one last
-        # runs of which the map has nothing any more, and their newest keyframe
-        self._empty_runs: dict[str, int] = {}
+        self._runs_by_name: dict[str, dict[str, Peer]] = {}  # by key, the latest last
+        self._empty_runs: dict[str, int] = {}  # runs without anything in the map: their newest keyframe
         self._forgotten_ids: dict[bytes, None] = {}
-        self.forgotten_count = 0  # how many, since the edge began
+        self.forgotten_count = 0  # since the edge started
 
     def __getitem__(self, peer_id: bytes) -> Peer:
         return self._peers[peer_id]
@@ -181,33 +192,33 @@ class RunRegistry(Mapping[bytes, Peer]):
 
     @property
     def peer_id_by_key(self) -> Mapping[str, bytes]:
-        """Who speaks for each run."""
+        """Peer id of each run."""
         return self._peer_id_by_key
 
     def is_latest(self, peer: Peer) -> bool:
-        """Whether no other run of that name came, or came back, after it."""
+        """Return whether no other run of its name joined or came back later."""
         return next(reversed(self._runs_by_name[peer.hello.name])) == peer.key
 
     def label(self, peer: Peer) -> str:
-        """Of this run in reports: its name, if it is the latest of that; else also the end of its key, behind
-        a character that is in no name, so that no name can be taken for it."""
+        """Return the run's label in reports: its name if it is the latest, else name/tag. No name contains
+        "/"."""
         name = peer.hello.name
         return name if self.is_latest(peer) else f"{name}/{peer.key.removeprefix(f'{name}-')}"
 
     def add(self, peer_id: bytes, peer: Peer) -> None:
-        """It is its name's present one from now on."""
+        """Add a run; it becomes the latest of its name."""
         self._peers[peer_id] = peer
         self._peer_id_by_key[peer.key] = peer_id
         self.make_latest(peer)
 
     def make_latest(self, peer: Peer) -> None:
-        """It is its name's present one again."""
+        """Make a known run the latest of its name."""
         runs = self._runs_by_name.setdefault(peer.hello.name, {})
         runs.pop(peer.key, None)
         runs[peer.key] = peer
 
     def restore(self, run: RestoredRun) -> None:
-        """One of an earlier life: it is not here, but may go on where it was."""
+        """Add a run of an earlier session. It is absent, and may resume where it was."""
         next_keyframe = run.next_keyframe
         peer = Peer(
             run.hello,
@@ -225,11 +236,11 @@ class RunRegistry(Mapping[bytes, Peer]):
             self._empty_runs[run.key] = -1
 
     def mark_empty(self, runs: Iterable[KeyframeKey]) -> None:
-        """The map has nothing of these any more, that has had their keyframes up to those."""
+        """Record that the map has nothing left of these runs. Values: newest keyframes it has seen."""
         self._empty_runs.update(runs)
 
     def removable(self) -> list[Peer]:
-        """Runs that are gone and of which nothing is left. One that has come back meanwhile is kept."""
+        """Return absent runs that the map has nothing of. A run that has come back is kept."""
         out = []
         for key, newest in list(self._empty_runs.items()):
             peer = self._peers[self._peer_id_by_key[key]] if key in self._peer_id_by_key else None
@@ -240,7 +251,7 @@ class RunRegistry(Mapping[bytes, Peer]):
         return out
 
     def forget(self, peer: Peer) -> bool:
-        """For good; returns whether it was its name's present one."""
+        """Remove a run for good. Return whether it was the latest of its name."""
         peer_id = self._peer_id_by_key.pop(peer.key)
         del self._peers[peer_id]
         self._empty_runs.pop(peer.key, None)
@@ -256,12 +267,13 @@ class RunRegistry(Mapping[bytes, Peer]):
         return was_latest
 
     def was_forgotten(self, peer_id: bytes) -> bool:
-        """Whether this run was, in this life of the edge: keyframes that were acknowledged are not known."""
+        """Return whether this session has forgotten the run, and with it the keyframes that it
+        acknowledged."""
         return peer_id in self._forgotten_ids
 
     def forget_idle(self) -> tuple[Peer, bool] | None:
-        """Who joins again and again without a keyframe fills no memory: the run that is forgotten now, if one
-        is, and whether it was its name's present one."""
+        """Forget the oldest of too many runs without a keyframe. Return it and whether it was the latest of
+        its name, or None."""
         idle = [(peer.last_received_ns, peer_id) for peer_id, peer in self._peers.items() if peer.is_idle]
         if len(idle) < _MAX_IDLE:
             return None

@@ -1,7 +1,7 @@
-"""The agent's side of the protocol, without sockets, threads or a clock of its own.
+"""The agent's side of the protocol as a state machine, without sockets, threads or clock.
 
-`handle` takes one event and the time, and returns what is to be done. The same events at the same times
-give the same effects. Odometry passes through untouched: the edge only moves the map under it.
+`Agent.handle` takes one event and the time and returns effects, deterministically. Odometry passes through
+unchanged: the edge only moves the map under it.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _COUNTERS = (
     *("corrections", "corrections_stale"),
 )
 _LEDGER_COUNTERS = ("sent", "resent", "acknowledged", "drop_oldest_acknowledged", "drop_oldest", "bad_acks")
-_RECENT_FRAMES = 8  # frames: a candidate is of one of the last few
+_RECENT_FRAMES = 8  # frames among which a candidate's own is found
 _MIN_RATE_HZ = (
-    0.1  # keyframes that an edge cannot forbid: without any it would learn of no reason to allow more
+    0.1  # keyframe rate that an edge cannot undercut: without keyframes it could not evaluate again
 )
 
 
 class Agent:
     """One run of one agent. `hello` is repeated until an edge welcomes it.
 
-    It is given FrameTracked and KeyframeMade, or where `hello.streams`, FrameArrived.
+    It takes `FrameTracked` and `KeyframeMade`, or `FrameArrived` where `hello.streams_frames`.
     """
 
     def __init__(self, hello: m.Hello, config: Config) -> None:
@@ -56,15 +56,15 @@ class Agent:
         self._localisation = MapLocalisation(config.agent)
         self._recent_frames: deque[ev.FrameTracked] = deque(maxlen=_RECENT_FRAMES)
         self._self_evaluation = SelfEvaluation(config.agent.tell_placement)
-        self._streamer = FrameStreamer(config.stream) if hello.streams else None
+        self._streamer = FrameStreamer(config.stream) if hello.streams_frames else None
         self._pings = PingTracker(link, config.clock)
         self._hello_timer = PeriodicTimer(link.hello_s)
-        self._status_reporter = StatusReporter(link.ping_s, hello.streams)
+        self._status_reporter = StatusReporter(link.ping_s, hello.streams_frames)
         self._is_connected = False
         self._sessions = EdgeSessions()
-        self._refusal: str | None = None  # the edge's last
+        self._refusal: str | None = None  # last reason that the edge gave
         self._silence_limit_ns = seconds_to_ns(link.silent_s)
-        self._last_received_ns: int | None = None  # or when waiting for the edge began
+        self._last_received_ns: int | None = None  # or the first event
         self._silence_reported = False
         self._version_probe = EdgeVersionProbe()
         self._line_limiter = LineLimiter()
@@ -76,7 +76,7 @@ class Agent:
         self._effects: list[ev.AgentEffect] = []
 
     def handle(self, event: ev.AgentEvent, now_ns: int) -> list[ev.AgentEffect]:
-        """What to do about `event` at `now_ns` (host monotonic clock, never falling)."""
+        """Return the effects of `event` at `now_ns` (host monotonic clock, never falling)."""
         if isinstance(event, ev.SendFailed):
             self._on_send_failed(event.effect)
         if self._ended:
@@ -98,7 +98,7 @@ class Agent:
             case ev.InputFinished():
                 self._status_reporter.finish()
                 self._finish_deadline_ns = now_ns + seconds_to_ns(self._config.agent.finish_s)
-            case ev.Connected():  # whether it knows us, its welcome says sooner than a ping's answer
+            case ev.Connected():  # a welcome tells sooner than a pong whether this edge knows us
                 self._version_probe.mark_reached()
                 self._send_hello(now_ns)
             case ev.AgentTick():
@@ -108,16 +108,16 @@ class Agent:
         return self._effects
 
     def pending_effects(self) -> list[ev.AgentEffect]:
-        """What the newest event had led to before its handling failed."""
+        """Return the effects of the newest event up to where its handling failed."""
         return self._effects
 
     @property
     def is_connected(self) -> bool:
-        """To an edge that has welcomed it and is not silent."""
+        """Whether an edge has welcomed it and is not silent."""
         return self._is_connected
 
     def report(self) -> dict[str, Any]:
-        """Counters and the present state, as plain data."""
+        """Return counters and the present state as plain data."""
         return {
             **{name: self._counts[name] for name in _COUNTERS},
             "bad_messages": self._validator.bad_messages,
@@ -137,11 +137,11 @@ class Agent:
         }
 
     def status(self, now_ns: int) -> m.Status:
-        """What it knows of its own state at `now_ns`."""
+        """Return the agent's status at `now_ns`."""
         return self._status_reporter.status(now_ns)
 
     def clock_estimate(self, now_ns: int) -> ClockEstimate:
-        """What may be said of the edge's clock at `now_ns`."""
+        """Return the estimate of the edge's clock at `now_ns`."""
         return ClockEstimate.from_filter(self._pings.clock, now_ns, self._config.clock.claim_ms)
 
     # ------------------------------------------------------------ frames
@@ -166,12 +166,11 @@ class Agent:
             self._offer_candidate(frame, candidate, now_ns)
 
     def _offer_candidate(self, frame: ev.FrameTracked, candidate: KeyframeCandidate, now_ns: int) -> None:
-        """Makes a keyframe of a candidate that came with `map_frame`, if the rate allows (drop_rate)."""
+        """Make a keyframe of the candidate that came with `frame`, if the rate allows (else drop_rate)."""
         source_frame = self._recent_frames[-1 - candidate.frames_ago]
         self._counts["candidates"] += 1
-        self._self_evaluation.add_processing_time(
-            (now_ns - frame.arrived_ns) / 1e6
-        )  # a view that is made later delays nobody
+        # since the newest frame: extracting the view of an earlier frame delays no pose
+        self._self_evaluation.add_processing_time((now_ns - frame.arrived_ns) / 1e6)
         self._keyframe_chain.extend(candidate)
         sent = self._bucket.take(now_ns, self._keyframe_score.is_above_median(candidate.view))
         if sent:
@@ -184,7 +183,8 @@ class Agent:
     def _add_keyframe(
         self, keyframe: Keyframe, frame: ev.FrameTracked, error_cm: float | None, now_ns: int
     ) -> None:
-        """A keyframe made of `map_frame`, and how wrong odometry is by now, where that is known."""
+        """Queue a keyframe of `frame` and send its evaluation. error_cm: expected error now; None:
+        unknown."""
         self._ledger.add(LedgerEntry(keyframe, frame.index, frame.arrived_ns))
         self._self_evaluation.drift.add_keyframe(keyframe, frame.arrived_ns)
         if self._is_connected and (clock := self._pings.clock).rtt_ms is not None:
@@ -211,14 +211,14 @@ class Agent:
             ev.FrameDone(frame.stamp_ns, frame.track_ms, frame.state, frame.is_keyframe, sent)
         )
 
-    # ------------------------------------------------------------ what the edge says
+    # ------------------------------------------------------------ messages from the edge
 
     def _on_received(self, event: ev.EdgeMessageReceived, now_ns: int) -> None:
         self._counts["bytes_down"] += message_bytes(event.frames)
         try:
             message = self._decode(event.frames)
         except WireError as error:
-            self._validator.report_invalid(f"a message from the edge is not understood: {error}", now_ns)
+            self._validator.report_invalid(f"invalid message from the edge: {error}", now_ns)
             return
         if message is None:
             return
@@ -239,11 +239,12 @@ class Agent:
             case m.RemoteTrackingResult() if self._streamer:
                 self._on_remote_result(message, self._streamer, now_ns)
             case _:
-                description = f"a {type(message).__name__}, which is not for this agent"
+                description = f"a {type(message).__name__}, which this agent does not expect"
                 self._validator.report_invalid(f"the edge sent {description}", now_ns)
 
     def _decode(self, frames: Sequence[Bytes]) -> m.Message | None:
-        """None for what an edge of an older version says, of which a person is told. Raises WireError."""
+        """Decode a message. Print a line and return None for an edge of an older version. Raises
+        WireError."""
         try:
             return decode(frames)
         except VersionError as error:
@@ -261,7 +262,7 @@ class Agent:
             self._begin_session(welcome, now_ns)
         elif was_disconnected:
             self._ledger.resume(welcome)
-            self._print("the edge is back")
+            self._print("reconnected to the edge")
 
     def _begin_session(self, welcome: m.Welcome, now_ns: int) -> None:
         is_restart = self._sessions.session is not None
@@ -272,9 +273,9 @@ class Agent:
         pending = self._ledger.begin_session(welcome)
         if is_restart and self._streamer:
             self._streamer.reset()
-            self._print("the edge has restarted; it begins tracking anew")
+            self._print("the edge has restarted; tracking starts again")
         elif is_restart:
-            self._print(f"the edge has restarted; it is sent {pending} keyframes again")
+            self._print(f"the edge has restarted; {pending} keyframes are resent")
         else:
             self._print("connected to the edge")
 
@@ -295,20 +296,20 @@ class Agent:
         if not self._validator.accepts_correction(correction, now_ns):
             return
         is_current = (
-            self._is_connected and correction.about >= self._keyframe_chain.first_of_segment
-        )  # of odometry
+            self._is_connected and correction.segment_keyframe >= self._keyframe_chain.first_of_segment
+        )
         if not (is_current and self._sessions.accept_revision(correction.revision)):
             self._counts["corrections_stale"] += 1
             return
         self._counts["corrections"] += 1
-        self._self_evaluation.drift.correct(correction.answers)
-        entry, corrected_ms = self._ledger.record_correction(correction.answers, now_ns)
+        self._self_evaluation.drift.correct(correction.answered_keyframe)
+        entry, corrected_ms = self._ledger.record_correction(correction.answered_keyframe, now_ns)
         self._effects.append(self._localisation.apply_correction(correction, entry, corrected_ms, now_ns))
 
     def _on_remote_result(self, result: m.RemoteTrackingResult, streamer: FrameStreamer, now_ns: int) -> None:
         frame = streamer.take_result(result, now_ns)
         if frame is not None:
-            self._effects.append(ev.FrameTrackedRemotely(frame, result.sound, result.waits))
+            self._effects.append(ev.FrameTrackedRemotely(frame, result.is_consistent, result.waiting_for))
             self._on_frame_tracked(frame, now_ns)
 
     def _on_pong(self, pong: m.Pong, now_ns: int) -> None:
@@ -319,7 +320,7 @@ class Agent:
             return
         self._pings.measure(pong, now_ns)
 
-    # ------------------------------------------------------------ what is due
+    # ------------------------------------------------------------ messages to the edge
 
     def _send_due(self, now_ns: int) -> None:
         self._check_silence(now_ns)
@@ -337,7 +338,7 @@ class Agent:
 
     @property
     def _is_done(self) -> bool:
-        """Nothing is waited for."""
+        """Whether nothing is pending."""
         return not self._ledger.pending and (self._streamer is None or self._streamer.is_idle)
 
     def _send_hello(self, now_ns: int) -> None:
@@ -393,7 +394,7 @@ class Agent:
 
     @property
     def _offline_text(self) -> str:
-        return "nobody tracks this agent" if self._streamer else "tracking goes on alone"
+        return "no tracking without the edge" if self._streamer else "tracking continues without the edge"
 
     def _print(self, text: str) -> None:
         if (line := self._line_limiter.admit(text, self._now_ns)) is not None:

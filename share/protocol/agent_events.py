@@ -1,5 +1,5 @@
-"""What the agent is told (events) and what it wants done (effects). All times are host monotonic ns
-unless they are called `stamp_ns`: those are the frame's, in the sensor's clock."""
+"""Events and effects of the agent's state machine. Times are host monotonic ns, except `stamp_ns`: the
+frame's stamp in the sensor's clock."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from share.wire.messages import Status
 
 @dataclass(frozen=True, eq=False)
 class FrameTracked:
-    """The tracker has a frame's pose. T_odom_body (4, 4) where the state has one.
+    """The tracker has processed a frame. T_odom_body (4, 4) where the state has a pose.
 
-    arrived_ns, done_ns: when the frame came in and its pose was known. keyframe: it is to become one, and
-    `KeyframeMade` follows; new_stretch: odometry broke before it. error_cm: expected position error,
-    where somebody estimates it. waits: for what the tracker waits before it tells a pose.
+    arrived_ns, done_ns: when the frame arrived and when its pose was known. is_keyframe: it becomes a
+    keyframe and `KeyframeMade` follows. new_segment: odometry broke before it. error_cm: expected position
+    error; None without an error model. waiting_for: what the tracker needs before its first pose.
     """
 
     index: int
@@ -41,7 +41,7 @@ class FrameTracked:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeMade:
-    """What a tracked frame shows to others: made after its pose was out. candidate: None if that failed."""
+    """The keyframe candidate of a tracked frame, made after its pose was published; None if that failed."""
 
     frame: FrameTracked
     candidate: KeyframeCandidate | None
@@ -49,7 +49,7 @@ class KeyframeMade:
 
 @dataclass(frozen=True, eq=False)
 class FrameArrived:
-    """A frame for the edge to track, with the IMU samples since the one before; when it came in."""
+    """A frame for the edge to track, with the IMU samples since the one before. arrived_ns: its arrival."""
 
     frame: Frame
     arrived_ns: int
@@ -57,7 +57,7 @@ class FrameArrived:
 
 @dataclass(frozen=True, eq=False)
 class SendFailed:
-    """The link could not take this message or frame: nothing of it is sent."""
+    """The link refused this message or frame: nothing of it was sent."""
 
     effect: SendToEdge | SendFrameToEdge
 
@@ -71,13 +71,15 @@ class EdgeMessageReceived:
 
 @dataclass(frozen=True)
 class Connected:
-    """The link has reached an edge, perhaps another life of it."""
+    """The link has reached an edge, perhaps a restarted one."""
 
 
 @dataclass(frozen=True)
 class AgentTick:
-    """Time has passed; every 50 ms is often enough. image_ns: when the newest image came that is not tracked
-    yet, None where none waits. trouble: what is wrong with the sensors, for a person; empty: nothing."""
+    """Time has passed; every 50 ms suffices.
+
+    waiting_image_ns: arrival of the newest image that is not tracked yet; None without one. sensor_trouble:
+    a sensor fault, for a person; empty without one."""
 
     waiting_image_ns: int | None = None
     sensor_trouble: str = ""
@@ -104,8 +106,8 @@ AgentEvent = (
 
 @dataclass(frozen=True, eq=False)
 class SendToEdge:
-    """Hand these frames to the link; if it does not take them, `SendFailed` is the answer. keyframe: the id,
-    if they are one."""
+    """Hand these frames to the link; answer `SendFailed` if it refuses them. keyframe_id: None for messages
+    that are no keyframe."""
 
     frames: Sequence[Bytes]
     keyframe_id: int | None = None
@@ -113,7 +115,7 @@ class SendToEdge:
 
 @dataclass(frozen=True, eq=False)
 class SendFrameToEdge:
-    """The same for a frame to be tracked."""
+    """Hand the frame `index`, which the edge is to track, to the link; answer `SendFailed` if it refuses."""
 
     index: int
     frames: Sequence[Bytes]
@@ -121,7 +123,7 @@ class SendFrameToEdge:
 
 @dataclass(frozen=True, eq=False)
 class FrameTrackedRemotely:
-    """The edge has tracked a frame; `FrameDone` follows. frame: as for one that is tracked here."""
+    """The edge has tracked a frame; `FrameDone` follows. frame: as for a frame tracked on the agent."""
 
     frame: FrameTracked
     is_consistent: bool
@@ -130,8 +132,8 @@ class FrameTrackedRemotely:
 
 @dataclass(frozen=True, eq=False)
 class LocalisedPose:
-    """Where the agent is. arrived_ns: when its frame came in. stretch: grows where odometry begins anew.
-    T_map_odom: in force at this moment (blended), None before a correction."""
+    """The agent's pose. arrived_ns: arrival of its frame. segment: number of the odometry segment, rising.
+    T_map_odom (4, 4): in force now (blended); None before the first correction."""
 
     index: int
     stamp_ns: int
@@ -147,9 +149,9 @@ class LocalisedPose:
 class CorrectionApplied:
     """A correction is in force, or being blended in, from now on.
 
-    keyframe, frame, stamp_ns: the keyframe that it answers and its frame, None where it answers none that is
-    remembered. corrected_ms: from that frame's arrival to now, for the first correction only, and
-    not for keyframes that a restarted edge was given again.
+    keyframe_id, frame_index, stamp_ns: the keyframe that it answers and its frame; None where it answers no
+    remembered keyframe. corrected_ms: from that frame's arrival to now; None but for the first correction of
+    a keyframe, and for keyframes resent to a restarted edge.
     """
 
     keyframe_id: int | None
@@ -163,10 +165,9 @@ class CorrectionApplied:
 
 @dataclass(frozen=True)
 class FrameDone:
-    """One per frame, once it is known whether it is sent; so a candidate's comes once its keyframe is made,
-    or that has failed.
+    """One per frame, once it is known whether the frame is sent; for a candidate after `KeyframeMade`.
 
-    keyframe: the tracker offered it as one. sent: it was given a keyframe id.
+    is_keyframe: the tracker offered it as one. is_sent: it was given a keyframe id.
     """
 
     stamp_ns: int
@@ -178,8 +179,8 @@ class FrameDone:
 
 @dataclass(frozen=True)
 class StatusReport:
-    """What the agent says of its own state now, twice a second and where it changes. stamp_ns: of the newest
-    frame, None before the first. idle: no frame was tracked of late, so no FrameDone says so."""
+    """The agent's status, twice a second and on change. stamp_ns: of the newest frame; None before the first.
+    is_stale: no frame was tracked recently, so no `FrameDone` carries the state."""
 
     status: Status
     stamp_ns: int | None
@@ -202,7 +203,7 @@ class FailRun:
 
 @dataclass(frozen=True)
 class CloseLink:
-    """Everything is done: close the link."""
+    """The run is over: close the link."""
 
 
 AgentEffect = (

@@ -1,4 +1,4 @@
-"""What an agent knows of its own state at any moment, also while no frame comes."""
+"""The agent's reports on itself: status (also without frames), delay and expected error."""
 
 from __future__ import annotations
 
@@ -23,28 +23,26 @@ from share.wire.messages import (
     Status,
 )
 
-STALE_S = 0.4  # without a tracked frame, or three usual intervals: the last pose says nothing of now
-_MAX_INTERVAL_S = (
-    0.2  # an interval that is usual; so what is stale is said within a second, however slow all is
-)
-LATE_S = 0.5  # a pose that is later than this after its image is said to be late
-_MIN_CHANGE_S = 0.1  # changes are said at once, but not oftener
+STALE_S = 0.4  # s without a tracked frame (or three frame intervals, if longer): the last pose is stale
+_MAX_INTERVAL_S = 0.2  # cap of the averaged frame interval, so that staleness is reported within a second
+LATE_S = 0.5  # a pose later than this after its image is reported as late
+_MIN_CHANGE_S = 0.1  # least time between two reports of a change
 _STATE_TEXTS = {
-    TrackState.WEAK: "few points in view",
+    TrackState.WEAK: "few features in view",
     TrackState.VISION_ONLY: "no IMU sample for {:.1f} s",
-    TrackState.INERTIAL_ONLY: "nothing in view for {:.1f} s",
+    TrackState.INERTIAL_ONLY: "no features in view for {:.1f} s",
     TrackState.LOST: "lost for {:.1f} s",
 }
 
 
 class StatusReporter:
-    """Fed with frames and ticks, it answers with a `Status`: each period, and at once where that changes.
+    """Makes a `Status` of frames and ticks, each period and on change.
 
-    A state with a pose becomes LOST where no frame is tracked for long. All times are the agent's clock, ns.
+    A state with a pose becomes LOST when it is stale. All times are the agent's clock, ns.
     """
 
     def __init__(self, period_s: float, streams: bool) -> None:
-        """streams: the edge tracks, not this agent."""
+        """streams: the edge does the tracking."""
         self._timer = PeriodicTimer(period_s)
         self._slow_text = "the edge does not answer" if streams else "this machine is too slow"
         self._began_ns: int | None = None
@@ -54,20 +52,20 @@ class StatusReporter:
         self._pose_ns: int | None = None  # arrival of the newest frame with a pose
         self._tracked_ns: int | None = None  # when the newest frame was done
         self._stamp_ns: int | None = None  # of the newest frame
-        self._frame_interval_ns: float | None = None  # between frames
+        self._frame_interval_ns: float | None = None  # average
         self._latency_ns = 0
-        self._sensor_trouble = ""  # with the sensors
+        self._sensor_trouble = ""
         self._is_finished = False
         self._last_sent: tuple[TrackState, bool] | None = None
         self._last_sent_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Ages count from here until there is a pose."""
+        """Set the time from which the pose age counts until there is a pose."""
         if self._began_ns is None:
             self._began_ns = self._since_ns = now_ns
 
     def add_image(self, arrived_ns: int) -> None:
-        """An image, tracked or not."""
+        """Record the arrival of an image, tracked or not."""
         self._image_ns = max(arrived_ns, self._image_ns or arrived_ns)
 
     def add_tick(self, tick: AgentTick) -> None:
@@ -76,7 +74,7 @@ class StatusReporter:
             self.add_image(tick.waiting_image_ns)
 
     def add_frame(self, frame: FrameTracked, now_ns: int) -> None:
-        """A frame is done, with a pose or without."""
+        """Record a frame that is done, with or without a pose."""
         if self._tracked_ns is not None:
             self._frame_interval_ns = exponential_average(
                 self._frame_interval_ns, min(now_ns - self._tracked_ns, seconds_to_ns(_MAX_INTERVAL_S))
@@ -90,15 +88,15 @@ class StatusReporter:
             self._pose_ns = frame.arrived_ns
 
     def finish(self) -> None:
-        """No frame will follow."""
+        """Record that no frame follows."""
         self._is_finished = True
 
     def has_just_begun(self, now_ns: int, within_ns: int) -> bool:
-        """Whether little is lost where the run ends now: no frame, or it began so lately."""
+        """Return whether ending the run now loses little: no frame yet, or begun at most `within_ns` ago."""
         return self._stamp_ns is None or now_ns - (self._began_ns or 0) <= within_ns
 
     def is_stale(self, now_ns: int) -> bool:
-        """Whether no frame was tracked for so long that the last pose says nothing of now."""
+        """Return whether no frame was tracked for so long that the last pose is stale."""
         since_ns = now_ns - (self._began_ns or 0 if self._tracked_ns is None else self._tracked_ns)
         return not self._is_finished and since_ns > max(
             seconds_to_ns(STALE_S), 3 * (self._frame_interval_ns or 0)
@@ -112,7 +110,7 @@ class StatusReporter:
         return Status(state, self._age_ms(now_ns), reason[:MAX_REASON_LENGTH])
 
     def due_report(self, now_ns: int) -> StatusReport | None:
-        """The status, where it is to be said now."""
+        """Return the status if a report is due, else None."""
         status = self.status(now_ns)
         kind = status.state, bool(status.reason)
         if kind != self._last_sent and now_ns - self._last_sent_ns >= seconds_to_ns(_MIN_CHANGE_S):
@@ -135,28 +133,26 @@ class StatusReporter:
 
     def _state_text(self, now_ns: int) -> str:
         if self._is_finished:
-            return "no more frames follow"
+            return "no more frames"
         if self._latency_ns > seconds_to_ns(LATE_S):
             return f"poses are {self._latency_ns / SECOND_NS:.1f} s late: {self._slow_text}"
         if self._state is TrackState.INITIALISING:
-            return "" if self._waiting_for is None else f"waits for {self._waiting_for.text}"
+            return "" if self._waiting_for is None else f"waiting for {self._waiting_for.text}"
         return _STATE_TEXTS.get(self._state, "").format((now_ns - self._since_ns) / SECOND_NS)
 
 
-# ---- What an agent tells the edge of its own delay and error with each keyframe.
-
-
 class SelfEvaluation:
-    """`drift` grows with odometry and is answered by corrections."""
+    """Estimates the delay and error that the agent reports with each keyframe. `drift` grows with odometry
+    and is reset by corrections."""
 
     def __init__(self, include_map_sigma: bool) -> None:
-        """tell_placement: what the map is unsure of this agent's place counts too."""
+        """include_map_sigma: add the standard deviation of the agent's position in the map to the error."""
         self.drift = DriftEstimator()
         self._include_map_sigma = include_map_sigma
-        self._processing_ms: float | None = None  # from a frame's arrival to its keyframe, of late
+        self._processing_ms: float | None = None  # average, from a frame's arrival to its candidate
 
     def add_processing_time(self, ms: float) -> None:
-        """A frame became a candidate so long after it came."""
+        """Add the time from a frame's arrival to its candidate, ms."""
         self._processing_ms = exponential_average(self._processing_ms, ms)
 
     def evaluation(
@@ -168,7 +164,9 @@ class SelfEvaluation:
         map_frame: BlendedMapFrame,
         now_ns: int,
     ) -> Evaluation:
-        """local_cm: as for `Drift.expected_cm`. Bounded by what the wire carries."""
+        """Return the evaluation to send with `keyframe`, within the bounds of the wire.
+
+        local_cm: as in `DriftEstimator.expected_cm`."""
         error_cm = self.drift.expected_cm(local_cm, now_ns)
         if error_cm is not None and T_odom_body is not None and self._include_map_sigma:
             error_cm = math.hypot(error_cm, map_frame.sigma_cm(T_odom_body))
@@ -178,20 +176,19 @@ class SelfEvaluation:
         return Evaluation(keyframe, delay_ms, error_cm)
 
 
-# ---- How far odometry has gone astray since the map last set it right: what more keyframes can mend.
-
-_MAX_MOTIONS = 100  # keyframes since the last that was answered; older motion is summed up
+_MAX_MOTIONS = 100  # keyframes since the last answered one; the motion of older ones is merged
 
 
 class DriftEstimator:
-    """Of one agent, from one answered keyframe to the next. Times are of the agent's clock, ns."""
+    """Expected drift of odometry since the newest keyframe that a correction answered. Times: agent's clock,
+    ns."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None
-        self._motions: deque[tuple[int, int, F64, F64]] = deque()  # keyframe, when, T_last_this, cov
+        self._motions: deque[tuple[int, int, F64, F64]] = deque()  # keyframe id, time, T_last_this, cov
 
     def add_keyframe(self, keyframe: Keyframe, sent_ns: int) -> None:
-        """A keyframe is on its way; one without a reference begins a stretch, which is sure of itself."""
+        """Add a sent keyframe. One without a reference starts a segment with zero drift."""
         if keyframe.reference < 0 or self._since_ns is None:
             self._motions.clear()
             self._since_ns = sent_ns
@@ -205,15 +202,15 @@ class DriftEstimator:
             self._motions.appendleft((second, second_ns, T, compose_cov(T, cov, added_cov)))
 
     def correct(self, keyframe: int) -> None:
-        """The map has placed this one, and with it what came after."""
+        """Drop the drift up to this keyframe, which a correction answers."""
         while self._motions and self._motions[0][0] <= keyframe:
             self._since_ns = self._motions.popleft()[1]
 
     def expected_cm(self, local_cm: float | None, now_ns: int) -> float | None:
-        """cm, of the newest sent keyframe's position; None before the first.
+        """Return the expected position error of the newest sent keyframe, cm; None before the first.
 
-        local_cm: the error that odometry makes within `WINDOW_S` (`share.metrics.local_error`); it strays
-        as a random walk does. None: by the covariances that odometry itself tells.
+        local_cm: error of odometry within `WINDOW_S` (`share.metrics.local_error`), scaled as a random walk.
+        None: use the covariances of odometry.
         """
         if self._since_ns is None:
             return None

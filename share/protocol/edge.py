@@ -1,8 +1,8 @@
-"""The edge as a state machine: who speaks to it, what it answers, and when a keyframe is safe.
+"""The edge's side of the protocol as a state machine: admission, acknowledgements, corrections.
 
-It sees no socket, thread, disk or clock: `handle(event, now_ns)` answers effects, `share.runtime.edge`
-carries them out. What keyframes mean is the mapper's business (`share.mapping.mapper`), which has a process
-of its own and answers with findings; what must survive a crash goes to the keeper, which answers once it has.
+It uses no socket, thread, disk or clock: `Edge.handle` returns effects, which `share.runtime.edge` carries
+out. The mapper (`share.mapping.mapper`) runs in its own process and answers with findings; the map writer
+stores what must survive a crash and answers once it is on the disk.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from share.wire.codec import WIRE_VERSION, decode, encode
 
 
 class Edge:
-    """All agents of one room. `session` names this life of the edge, so that agents notice a new one.
+    """Serves all agents of one room.
 
-    keeps: what is applied is acknowledged only once it is `ChangesSaved`. known: runs of earlier lives.
-    began_ns: times in records count from here (default: the first event).
+    session: names this start of the edge, so that agents notice a restart. has_store: acknowledge a keyframe
+    only after `ChangesSaved`. restored: runs of earlier sessions. began_ns: origin of the times in records
+    (default: the first event).
     """
 
     tracks_agents: ClassVar[bool] = False  # agents stream: `share.protocol.remote_tracking`
@@ -61,9 +62,9 @@ class Edge:
             self._registry.restore(run)
 
     def handle(self, event: ed.EdgeEvent, now_ns: int) -> list[ed.EdgeEffect]:
-        """What `event` leads to. `now_ns` is the edge's clock and never goes back.
+        """Return the effects of `event`. now_ns: the edge's clock, never falling.
 
-        An exception, which is a fault of ours, costs this event only: it is counted and said."""
+        An exception is a bug of ours and costs this event only: it is counted and recorded."""
         self._event_log.start(now_ns)
         self._effects, self._now_ns = [], now_ns
         try:
@@ -81,9 +82,8 @@ class Edge:
         self._record_throttled(now_ns, "internal error", peer, reason)
 
     def _dispatch(self, event: ed.EdgeEvent, now_ns: int) -> None:
-        self._forget_empty_runs(
-            now_ns
-        )  # before one of them says hello: its keyframes would be taken as known
+        # first: after a hello, the keyframes of a forgotten run would count as known
+        self._forget_empty_runs(now_ns)
         match event:
             case ed.PeerMessageReceived():
                 self._on_message(event, now_ns)
@@ -121,29 +121,30 @@ class Edge:
         match message:
             case wire.Hello():
                 self._on_hello(event, message, now_ns)
-            case wire.Ping():  # a stranger's too: our session tells it to say hello
+            case wire.Ping():  # of an unjoined peer too: the session tells it to send a hello
                 pong = wire.Pong(message.sequence, message.sent_ns, now_ns, now_ns, self._session)
                 self._send(event.peer_id, pong)
             case wire.Bye() if peer:
                 peer.status.leave()
-                self._mark_gone(peer, "left", "said bye", now_ns)
+                self._mark_gone(peer, "left", "sent bye", now_ns)
             case _ if peer:
                 self._on_agent_message(event.peer_id, peer, message, now_ns)
-            case _:  # from a stranger
+            case _:  # of an unjoined peer
                 self._count_unexpected(None, message, now_ns)
 
     def _on_foreign_credential(
         self, event: ed.PeerMessageReceived, name: str, message: wire.Message, now_ns: int
     ) -> None:
-        """A key speaks for a run whose name is not its own, or was taken from it. It is answered who asks."""
-        self._count_bad_message(None, f"a key that does not speak for '{name}' used its run", now_ns)
+        """Refuse a credential that is not, or no longer, authorised for the run's name. Only a hello is
+        answered."""
+        self._count_bad_message(None, f"a key that is not authorized for '{name}' used its run", now_ns)
         if isinstance(message, wire.Hello):
             reason = name_objection(name, event.allowed_names or ())
             self._send(event.peer_id, wire.Refused(reason))
             self._record_throttled(now_ns, "refused", None, reason)
 
     def _on_agent_message(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
-        """What an agent says of itself."""
+        """Handle a message of a joined agent."""
         match message:
             case Keyframe():
                 self._on_keyframe(peer, message, now_ns)
@@ -154,12 +155,12 @@ class Edge:
                 peer.status.update(message, now_ns)
             case wire.Evaluation():
                 self._on_evaluation(peer_id, peer, message, now_ns)
-            case _:  # not this agent's word
+            case _:  # a downlink message
                 self._count_unexpected(peer, message, now_ns)
 
     def _count_unexpected(self, peer: Peer | None, message: wire.Message, now_ns: int) -> None:
         self._peer_or_unjoined(peer).counts["unexpected"] += 1
-        detail = "before its hello" if peer is None else "which is not an agent's to send"
+        detail = "before its hello" if peer is None else "which agents must not send"
         self._peer_or_unjoined(peer).refusals.add(f"a {type(message).__name__} {detail}", now_ns)
 
     def _on_other_version(self, peer_id: bytes, error: VersionError, now_ns: int) -> None:
@@ -168,7 +169,7 @@ class Edge:
             self._refuse(peer_id, reason, now_ns, error.version)
 
     def _count_bad_message(self, peer: Peer | None, reason: str, now_ns: int) -> None:
-        """Counts a bad message; says the first of each peer."""
+        """Count a bad message; record the first of each peer."""
         counts = self._peer_or_unjoined(peer).counts
         counts["bad_messages"] += 1
         self._peer_or_unjoined(peer).refusals.add(reason, now_ns)
@@ -176,12 +177,12 @@ class Edge:
             self._record(now_ns, "bad message", peer, reason)
 
     def _ensure_present(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> bool:
-        """Whether it is present now. Who was gone comes back only where its name and a place are free."""
+        """Return whether the run is present. One that left is readmitted if its name and a place are free."""
         if peer.is_gone:
-            if isinstance(message, wire.Bye):  # said again, or late
+            if isinstance(message, wire.Bye):  # repeated or late
                 return False
             if (reason := self._capacity_objection(peer, now_ns)) is not None:
-                if isinstance(message, wire.Hello | wire.Ping):  # not each of many keyframes is answered
+                if isinstance(message, wire.Hello | wire.Ping):  # keyframes are not answered one by one
                     self._refuse(peer_id, reason, now_ns)
                 else:
                     peer.refusals.add(reason, now_ns)
@@ -191,7 +192,7 @@ class Edge:
         return True
 
     def _capacity_objection(self, peer: Peer, now_ns: int) -> str | None:
-        """Why a run that is gone cannot come back; None if it can."""
+        """Return why a run that left may not come back; None if it may."""
         return self._admission.capacity_objection(peer.hello, self._registry, now_ns)
 
     def _readmit(self, peer: Peer, now_ns: int) -> None:
@@ -199,20 +200,20 @@ class Edge:
         peer.is_gone = False
         self._registry.make_latest(peer)
         self._effects.append(ed.SetPresence(peer.key, True))
-        self._record_throttled(now_ns, "back", peer, "is heard again")
+        self._record_throttled(now_ns, "reconnected", peer, "sends again")
 
     def _supersede(self, name: str, now_ns: int) -> None:
-        """A run of this name comes: one that is present has been silent for so long that it lost the name."""
+        """Mark present runs of this name as gone: they were silent too long, and a new run takes it."""
         for other in self._registry.values():
             if not other.is_gone and other.hello.name == name:
-                self._mark_gone(other, "silent", "another run has its name now", now_ns)
+                self._mark_gone(other, "silent", "name taken by a newer run", now_ns)
 
     def _check_silence(self, now_ns: int) -> None:
         for peer in self._registry.values():
             if not peer.is_gone and now_ns - peer.last_received_ns > seconds_to_ns(
                 self._config.edge.silent_s
             ):
-                self._mark_gone(peer, "silent", f"nothing heard for {self._config.edge.silent_s:g} s", now_ns)
+                self._mark_gone(peer, "silent", f"no message for {self._config.edge.silent_s:g} s", now_ns)
 
     def _mark_gone(self, peer: Peer, event: str, reason: str, now_ns: int) -> None:
         peer.is_gone = True
@@ -220,11 +221,11 @@ class Edge:
         self._effects.append(ed.SetPresence(peer.key, False))
         self._record_throttled(now_ns, event, peer, reason)
 
-    # ------------------------------------------------------------------ coming in
+    # ------------------------------------------------------------------ joining and leaving
 
     def _on_hello(self, event: ed.PeerMessageReceived, hello: wire.Hello, now_ns: int) -> None:
-        """Welcome a new run or a known one; refuse a name that somebody else is using, once that is sure: who
-        gets no answer says hello again."""
+        """Welcome a new or known run, or refuse it. No answer while the name's present run may be dead: the
+        agent repeats its hello."""
         peer_id = event.peer_id
         if (reason := self._objection(event, hello, now_ns)) is not None:
             if not self._admission.is_name_stale(hello.name, self._registry, now_ns):
@@ -239,12 +240,12 @@ class Edge:
             self._add_run(peer_id, Peer(hello, key, now_ns, credential=event.credential))
             self._rate_scheduler.begin_run(hello.name)
             description = f"{hello.kind} '{hello.name}'"
-            self._record_throttled(now_ns, "joined the edge", self._registry[peer_id], description)
+            self._record_throttled(now_ns, "agent joined", self._registry[peer_id], description)
         self._welcome(peer_id, self._registry[peer_id], now_ns)
 
     def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello, now_ns: int) -> str | None:
         if self._registry.was_forgotten(event.peer_id):
-            return f"this run of '{hello.name}' was forgotten while it was away: start the agent again"
+            return f"this run of '{hello.name}' was forgotten during its absence: start the agent again"
         return self._admission.objection(event, hello, self._registry, now_ns)
 
     def _refuse(self, peer_id: bytes, reason: str, now_ns: int, version: int = WIRE_VERSION) -> None:
@@ -253,7 +254,7 @@ class Edge:
         self._record_throttled(now_ns, "refused", None, reason)
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
-        """Who says hello has lost the edge: whatever was on its way to him may be gone, or was not taken."""
+        """Send a welcome, and the last correction again: a hello means that the agent may have missed it."""
         peer.is_welcomed = True
         self._send(peer_id, wire.Welcome(self._session, peer.durable_below))
         if peer.last_finding is not None:
@@ -264,7 +265,7 @@ class Edge:
         self._effects.append(ed.AddRun(peer.key, peer.hello, peer.credential or ""))
 
     def _set_credential(self, peer: Peer, credential: str) -> None:
-        """By another key than before, or by one that was not known."""
+        """Record the credential of a run, which has changed or was unknown."""
         peer.credential = credential
         self._effects.append(ed.SetCredential(peer.key, credential))
         if peer.odometry_base is not None:
@@ -274,10 +275,10 @@ class Edge:
         for peer in self._registry.removable():
             self._forget(peer, self._registry.forget(peer))
             self._save(RemoveRun(peer.key))
-            self._record_throttled(now_ns, "forgotten", peer, f"nothing is left of its run {peer.key}")
+            self._record_throttled(now_ns, "forgotten", peer, f"the map has nothing left of run {peer.key}")
 
     def _forget(self, peer: Peer, was_latest: bool) -> None:
-        """Of a run of which there is nothing."""
+        """Drop the state of a forgotten run."""
         self._effects.append(ed.DropRun(peer.key))
         if was_latest:
             self._rate_scheduler.forget(peer.hello.name)
@@ -291,12 +292,12 @@ class Edge:
             self._apply(peer, ready, now_ns)
             self._durability.add_keyframe(peer, ready.id)
         self._acknowledge(*self._durability.take_durable())
-        if not applicable:  # the others are acknowledged once they are safe
+        if not applicable:  # applied ones are acknowledged once they are durable
             self._acknowledge(peer)
 
     def _reorder(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> list[Keyframe]:
-        """What can be applied now; nothing of an agent that sends more than is taken in."""
-        if peer.reorder_buffer.is_new(keyframe.id):  # else it costs nothing
+        """Return the keyframes that can be applied now; none if the agent exceeds its quota."""
+        if peer.reorder_buffer.is_new(keyframe.id):  # duplicates cost nothing
             name = peer.hello.name
             reason = peer.overload_reason() or self._quota.objection(name, keyframe, now_ns)
             if reason is not None:
@@ -310,7 +311,7 @@ class Edge:
             return []
 
     def _apply(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> None:
-        # no run without a keyframe is kept
+        # a run is stored with its first keyframe
         run = (SaveRun(peer.key, peer.hello, peer.credential),) if peer.odometry_base is None else ()
         try:
             keyframe, problem = peer.sanitise(keyframe)
@@ -319,7 +320,7 @@ class Edge:
             return
         if problem:
             peer.suspect_keyframes.add(problem, now_ns)
-            self._record_throttled(now_ns, "odometry doubted", peer, problem)
+            self._record_throttled(now_ns, "odometry suspect", peer, problem)
         assert peer.odometry_base is not None
         self._save(*run, SaveKeyframe(peer.key, keyframe))
         is_over_rate = self._quota.is_over_rate(peer.hello.name, now_ns)
@@ -330,7 +331,7 @@ class Edge:
             self._effects.append(effect)
 
     def _acknowledge(self, *peers: Peer) -> None:
-        """What is safe of them by now."""
+        """Acknowledge the durable keyframes of these peers."""
         for peer in peers:
             self._send(self._registry.peer_id_by_key[peer.key], peer.reorder_buffer.ack(peer.durable_below))
 
@@ -344,32 +345,36 @@ class Edge:
     # ------------------------------------------------------------------ the map
 
     def _on_finding(self, finding: MapEvent, now_ns: int) -> None:
-        """Write down what the mapper decided, and send what follows from it."""
-        if (peer_id := self._registry.peer_id_by_key.get(finding.agent)) is None:  # forgotten meanwhile
+        """Record a decision of the mapper, and send its correction if there is one."""
+        if (peer_id := self._registry.peer_id_by_key.get(finding.agent)) is None:  # forgotten in the meantime
             return
         peer = self._registry[peer_id]
         if finding.correction is None:
-            recorder = self._record_throttled if finding.event == "job failed" else self._record
+            recorder = self._record_throttled if finding.event == "step failed" else self._record
             recorder(now_ns, finding.event, peer, finding.reason)
             return
         peer.last_finding = finding
-        if not peer.is_gone and peer.is_welcomed:  # who has not been greeted takes us for our predecessor
+        if not peer.is_gone and peer.is_welcomed:  # before the welcome it takes us for the session before
             self._send_correction(peer_id, peer, finding, now_ns)
 
     def _send_correction(
         self, peer_id: bytes, peer: Peer, finding: MapEvent, now_ns: int, is_repeat: bool = False
     ) -> None:
-        """again: as it asked for it, so that it is not said each time."""
+        """Send a correction. is_repeat: sent again at the agent's request, so its record is throttled."""
         assert finding.correction is not None
         peer.revision += 1
         peer.counts["corrections"] += 1
         correction = replace(finding.correction, revision=peer.revision)
         self._send(peer_id, correction)
-        fields = {"map_id": correction.map_id, "revision": peer.revision, "answers": correction.answers}
+        fields = {
+            "map_id": correction.map_id,
+            "revision": peer.revision,
+            "answers": correction.answered_keyframe,
+        }
         recorder = self._record_throttled if is_repeat else self._record
         recorder(now_ns, finding.event, peer, finding.reason, **fields)
 
-    # ------------------------------------------------------------------ going out
+    # ------------------------------------------------------------------ sending, records, reports
 
     def _send(self, peer_id: bytes, message: wire.DownlinkMessage, version: int = WIRE_VERSION) -> None:
         frames = encode(message, version)
@@ -388,19 +393,19 @@ class Edge:
     def _record_throttled(
         self, now_ns: int, event: str, peer: Peer | None, reason: str, **fields: Any
     ) -> None:
-        """For what a peer can cause at any rate."""
+        """Record an event that a peer can cause at any rate."""
         agent = peer.hello.name if peer else None
         if (effect := self._event_log.throttled_event(now_ns, event, agent, reason, **fields)) is not None:
             self._effects.append(effect)
 
     def series(self) -> dict[str, Any]:
-        """Of every agent, its evaluations and what came of them (`share.scheduling.policies`)."""
+        """Return each agent's evaluations with QoE and rate (`RateScheduler.series`)."""
         return {
             peer.hello.name: self._rate_scheduler.series(peer.hello.name) for peer in self._registry.values()
         }
 
     def _peer_report(self, peer: Peer) -> dict[str, Any]:
-        """What is known of it beside what was heard."""
+        """Return the report fields of a run that do not come from its messages."""
         is_latest = self._registry.is_latest(peer)
         return (
             self._rate_scheduler.report(peer.hello.name)
@@ -409,8 +414,8 @@ class Edge:
         )
 
     def report(self, map_report: dict[str, Any]) -> dict[str, Any]:
-        """edge.json: per agent and in all, but for `series`. mapped: the mapper's report, whose `agents` are
-        by run. An agent stands under its name, its earlier runs as `Runs.label` has them."""
+        """Return edge.json without `series`. map_report: of the mapper, whose `agents` are by run key. Runs
+        go by `RunRegistry.label`."""
         agent_reports, now_ns = map_report.get("agents", {}), self._now_ns
         return {
             "session": self._session,
@@ -422,7 +427,7 @@ class Edge:
                 | agent_reports.get(peer.key, {})
                 for peer in self._registry.values()
             },
-            "strangers": dict(self._unjoined.counts),
+            "unjoined": dict(self._unjoined.counts),
             "refused": refusal_warnings(self._registry.values(), self._unjoined, now_ns),
             "internal_errors": self._internal_errors,
             "forgotten_runs": self._registry.forgotten_count,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,11 @@ from share.timing import SECOND_NS, PeriodicTimer
 from share.types import F64
 from share.wire.messages import Ping, Pong
 
-# ---- One question and its answer between two clocks: what it tells of the one against the other.
-
 
 @dataclass(frozen=True)
 class Exchange:
-    """sent, back: by the clock of who asks; received, replied: by that of who answers (RFC 5905, section
-    8: T1, T4 and T2, T3). All ns."""
+    """One request and reply between two clocks, ns (RFC 5905, section 8). sent_ns (T1), returned_ns (T4): by
+    our clock. received_ns (T2), replied_ns (T3): by the other."""
 
     sent_ns: int
     received_ns: int
@@ -28,45 +26,44 @@ class Exchange:
 
     @property
     def offset_ns(self) -> int:
-        """The other clock minus the own, to the half ns below; wrong by at most half of `delay_ns`,
-        namely by half of what the way there took longer than the way back."""
+        """Other clock minus ours, rounded down. Its error is half the difference of the two path delays, at
+        most half of `delay_ns`."""
         return ((self.received_ns - self.sent_ns) + (self.replied_ns - self.returned_ns)) // 2
 
     @property
     def delay_ns(self) -> int:
-        """Time on the way, both ways. Negative only if a clock was set meanwhile."""
+        """Round trip delay on the network. Negative only if a clock was set in between."""
         return (self.returned_ns - self.sent_ns) - (self.replied_ns - self.received_ns)
 
     @property
     def unverified_ns(self) -> int:
-        """Twice what `offset_ns` can be wrong by if one of the two times of the other clock is made up: that
-        one was read within the exchange, which the own clock has timed, is all that it cannot feign."""
+        """Twice the error bound of `offset_ns` if one of the other side's two times is forged: the other
+        time was read within the exchange, and our clock has measured its length."""
         return (self.returned_ns - self.sent_ns) + (self.replied_ns - self.received_ns)
 
     @property
     def is_valid(self) -> bool:
-        """Whether it can be of clocks that nobody set meanwhile."""
+        """Whether the times are consistent with clocks that were not set in between."""
         return self.returned_ns >= self.sent_ns and self.replied_ns >= self.received_ns and self.delay_ns >= 0
 
 
 _SMOOTHING = 1 / 8  # RFC 6298, section 2
-MAX_OFFSET_NS = 10 * 365 * 86_400 * SECOND_NS  # clocks that begin at start-up: no machine is up for longer
-_MIN_AGREEING = 3  # exchanges that agree before a clock is believed: its stamps must advance as ours do
-_MIN_EXCHANGES = 8  # exchanges before the quickest of them counts as one that met no queue
+MAX_OFFSET_NS = 10 * 365 * 86_400 * SECOND_NS  # clocks start at boot: no machine has run for longer
+_MIN_AGREEING = 3  # agreeing exchanges before a clock is accepted: its stamps must advance as ours do
+_MIN_EXCHANGES = 8  # exchanges before the fastest counts as free of queueing
 
 
 def exponential_average(average: float | None, sample: float) -> float:
-    """As the round trip time of TCP is."""
+    """Return the new average, smoothed as the round trip time of TCP."""
     return sample if average is None else average + _SMOOTHING * (sample - average)
 
 
 class ClockFilter:
-    """A Kalman filter over [offset (us), drift (us/s = ppm)] of edge time minus agent time.
+    """Kalman filter over [offset (us), drift (us/s = ppm)] of edge time minus agent time.
 
-    Measurement: RFC 5905, section 8. An exchange that took longer than the quickest recent one
-    waited in a queue, and how that wait was shared out between the ways is unknown: its variance
-    grows with the square of the excess. A constant asymmetry of the path cannot be seen by any
-    such filter and is not in `sigma_ns`; `asymmetry_ns` bounds it.
+    Measurement: RFC 5905, section 8. An exchange slower than the fastest recent one was queued, on an unknown
+    part of the path: its variance grows with the square of the excess. No such filter observes a constant
+    asymmetry of the path: it is not in `sigma_ns`, but bounded by `asymmetry_ns`.
     """
 
     def __init__(self, config: ClockConfig) -> None:
@@ -77,29 +74,26 @@ class ClockFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets everything: another clock."""
+        """Drop all state, for another clock."""
         self.accepted = 0
         self.rejected = 0
         self.steps = 0
         self.rtt_ms: float | None = None
         self._filter: Any = None
-        self._base_ns = 0  # the state is relative to this offset, so that it stays small
+        self._base_ns = 0  # the filtered offset is relative to this, so that it stays small
         self._updated_ns = 0
         self._recent_rtt_ns: deque[int] = deque(maxlen=self._config.least_of)
         self._recent_unverified_ns: deque[int] = deque(maxlen=self._config.least_of)
         self._consecutive_rejects = 0
-        self._agreeing_exchanges = 0  # exchanges since the clock was last set
+        self._agreeing_exchanges = 0  # since the clock was last set
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether so many exchanges agree that it is a clock at all."""
+        """Whether enough exchanges agree to accept the clock."""
         return self._agreeing_exchanges >= _MIN_AGREEING
 
     def update(self, sent_ns: int, received_ns: int, replied_ns: int, returned_ns: int) -> bool:
-        """One exchange: sent and back by the agent's clock, received and replied by the edge's.
-
-        Returns whether it was believed.
-        """
+        """Add an exchange; times as in `Exchange`. Return whether it was accepted."""
         exchange = Exchange(sent_ns, received_ns, replied_ns, returned_ns)
         if not exchange.is_valid or abs(exchange.offset_ns) > MAX_OFFSET_NS:
             self.rejected += 1
@@ -116,14 +110,14 @@ class ClockFilter:
         return self._gated_update(offset_ns, middle_ns, variance)
 
     def offset_ns(self, now_ns: int) -> int | None:
-        """Edge time minus agent time at the agent's `now_ns`; None before the first exchange."""
+        """Return edge time minus agent time at the agent's `now_ns`; None before the first exchange."""
         if self._filter is None:
             return None
         offset_us, drift_ppm = self._filter.x
         return self._base_ns + round(float(offset_us + drift_ppm * self._elapsed_s(now_ns)) * 1e3)
 
     def sigma_ns(self, now_ns: int) -> float | None:
-        """Standard deviation of `offset_ns`."""
+        """Return the standard deviation of `offset_ns`; None before the first exchange."""
         if self._filter is None:
             return None
         P = self._predict(now_ns)[1]
@@ -131,9 +125,10 @@ class ClockFilter:
 
     @property
     def asymmetry_ns(self) -> int | None:
-        """What `offset_ns` can be wrong by unseen, rounded up; None before the first exchange. It is half of
-        the least sum, among recent exchanges, of the round trip by our own clock and the time that the edge
-        says it held the question. Added, so that an edge that says it held it for long makes this more."""
+        """Bound of the unobservable error of `offset_ns`, rounded up; None before the first exchange.
+
+        Half of the least `Exchange.unverified_ns` among recent exchanges. The edge's stated holding time is
+        added, so that an edge that overstates it enlarges the bound."""
         return -(-min(self._recent_unverified_ns) // 2) if self._recent_unverified_ns else None
 
     @property
@@ -141,7 +136,7 @@ class ClockFilter:
         return None if self._filter is None else float(self._filter.x[1])
 
     def report(self) -> dict[str, Any]:
-        """Plain data; the offset is that of the last exchange."""
+        """Return plain data, with the offset at the last exchange."""
         sigma_ns = self.sigma_ns(self._updated_ns)
         return {
             "rtt_ms": self.rtt_ms,
@@ -152,7 +147,8 @@ class ClockFilter:
         }
 
     def _variance(self, rtt_ns: int) -> float:
-        """us^2. Half the round trip is the most that an exchange can be wrong by (RFC 5905, section 8)."""
+        """Return the variance of an offset, us^2. Its error is at most half the round trip (RFC 5905,
+        section 8)."""
         has_enough = len(self._recent_rtt_ns) >= _MIN_EXCHANGES
         excess_us = (rtt_ns - (min(self._recent_rtt_ns) if has_enough else 0)) / 1e3
         return self._config.noise_us**2 + (self._config.asymmetry * excess_us) ** 2
@@ -189,7 +185,7 @@ class ClockFilter:
         return False
 
     def _predict(self, now_ns: int) -> tuple[F64, F64]:
-        """State and covariance at `now_ns`: random walks of the offset and of its drift."""
+        """Return state (2,) and covariance (2, 2) at `now_ns`, with random walks of offset and drift."""
         dt = max(0.0, self._elapsed_s(now_ns))
         F = np.array([[1.0, dt], [0.0, 1.0]])
         q, r = self._config.offset_walk_us**2, self._config.drift_walk_ppm**2
@@ -200,42 +196,32 @@ class ClockFilter:
         return (now_ns - self._updated_ns) / SECOND_NS
 
 
-# ---- Whether an agent may say how far the edge's clock is off, and so compare the stamps of two machines.
-#
-# Nothing that is called latency or delay needs it: `track_ms`, `corrected_ms` and the delay of an evaluation
-# are each a difference of two times of the agent's own clock, and a round trip is the agent's time less what
-# the edge's clock says that it kept the question. What begins by one clock and ends by the other, such as the
-# way there alone, is known no better than the offset.
-
-
 @dataclass(frozen=True)
 class ClockEstimate:
-    """Of the edge's monotonic clock minus the agent's, ms. sigma_ms: standard deviation by the filter;
-    asymmetry_ms: half of the least recent round trip by the agent's own clock, which no filter sees and no
-    word of the edge makes smaller; None before exchanges that agree. offset_ms: None too where it is not
-    claimed."""
+    """The edge's monotonic clock minus the agent's, ms, if known well enough to compare stamps of two
+    machines.
+
+    sigma_ms: standard deviation by the filter. asymmetry_ms: bound of the error that no filter observes, by
+    the agent's clock alone. Both None until the clock is confirmed; offset_ms also if it is not reliable.
+
+    No latency or delay needs it: `track_ms`, `corrected_ms` and the delay of an evaluation are differences of
+    the agent's clock, and a round trip is one less the edge's holding time. Only one-way delays depend on it.
+    """
 
     offset_ms: float | None
     sigma_ms: float | None
     asymmetry_ms: float | None
-    claim_ms: float  # setting `clock.claim_ms`
+    claim_ms: float  # config `clock.claim_ms`
 
     @classmethod
     def from_filter(cls, clock: ClockFilter, now_ns: int, claim_ms: float) -> ClockEstimate:
-        """At `now_ns`: what was not asked for long is known less."""
-        offset_ns, sigma_ns, asymmetry_ns = (
-            clock.offset_ns(now_ns),
-            clock.sigma_ns(now_ns),
-            clock.asymmetry_ns,
-        )
+        """Return the estimate at `now_ns`; its sigma grows with the time since the last exchange."""
+        offset_ns, sigma_ns = clock.offset_ns(now_ns), clock.sigma_ns(now_ns)
+        asymmetry_ns = clock.asymmetry_ns
         if not clock.is_confirmed or offset_ns is None or sigma_ns is None or asymmetry_ns is None:
             return cls(None, None, None, claim_ms)
         estimate = cls(offset_ns / 1e6, sigma_ns / 1e6, asymmetry_ns / 1e6, claim_ms)
-        return (
-            estimate
-            if estimate.is_reliable
-            else cls(None, estimate.sigma_ms, estimate.asymmetry_ms, claim_ms)
-        )
+        return estimate if estimate.is_reliable else replace(estimate, offset_ms=None)
 
     @property
     def uncertainty_ms(self) -> float | None:
@@ -248,17 +234,15 @@ class ClockEstimate:
         return self.uncertainty_ms is not None and self.uncertainty_ms <= self.claim_ms
 
     def report(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         return {**asdict(self), "uncertainty_ms": self.uncertainty_ms, "claim": self.is_reliable}
 
-
-# ---- Pings of an agent and what their answers tell: the round trip, and the edge's clock.
 
 _MAX_IN_FLIGHT = 16
 
 
 class PingTracker:
-    """`clock` is that of the edge's present life."""
+    """Sends pings and feeds the pongs to `clock`, the filter of the present edge session."""
 
     def __init__(self, link: LinkConfig, clock: ClockConfig) -> None:
         self.clock = ClockFilter(clock)
@@ -267,7 +251,7 @@ class PingTracker:
         self._in_flight: deque[Ping] = deque(maxlen=_MAX_IN_FLIGHT)
 
     def due_ping(self, now_ns: int) -> Ping | None:
-        """The ping that goes now."""
+        """Return the ping to send now; None if none is due."""
         if not self._timer.fire_if_due(now_ns):
             return None
         self._sequence += 1
@@ -275,7 +259,7 @@ class PingTracker:
         return self._in_flight[-1]
 
     def take_answer(self, pong: Pong) -> bool:
-        """Whether it answers a ping that waits; that waits no longer."""
+        """Remove the ping that this pong answers from those in flight. Return whether there was one."""
         ping = Ping(pong.sequence, pong.sent_ns)
         is_pending = ping in self._in_flight
         if is_pending:
@@ -283,10 +267,10 @@ class PingTracker:
         return is_pending
 
     def measure(self, pong: Pong, now_ns: int) -> None:
-        """An answer, which came at `now_ns`, of the present life."""
+        """Add a pong of the present session, received at `now_ns`, to the clock filter."""
         self.clock.update(pong.sent_ns, pong.received_ns, pong.replied_ns, now_ns)
 
     def begin_session(self) -> None:
-        """A new life of the edge: another clock."""
+        """Start over for a new edge session, which has another clock."""
         self.clock.reset()
         self._in_flight.clear()

@@ -1,5 +1,5 @@
-"""What the edge is told (events) and what it wants done (effects): of its agents, its mapper, its keeper, and
-of trackers, where it tracks agents that stream."""
+"""Events and effects of the edge's state machine: peers, the mapper, the map writer, and the trackers of
+streamed agents."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from share.wire.codec import Bytes
 
 @dataclass(frozen=True)
 class PeerMessageReceived:
-    """A message, still bytes, from the peer that the transport knows by this id.
+    """An undecoded message of a peer, by its transport id.
 
-    names: of the agents that its key may speak for; None where no keys are used. voice: that key; ""
-    without."""
+    allowed_names: agents that its credential is authorised for; None without keys. credential: its public
+    key; "" without keys."""
 
     peer_id: bytes
     frames: Sequence[Bytes]
@@ -36,18 +36,17 @@ class PeerMessageReceived:
 
 @dataclass(frozen=True)
 class MapperResult:
-    """What the mapper has decided, and what of it must survive a crash."""
+    """Decisions of the mapper, and the changes that must survive a crash. empty_runs: runs that the map has
+    nothing left of, each with its newest received keyframe."""
 
     findings: Sequence[MapEvent]
     changes: Sequence[MapChange] = ()
-    empty_runs: Sequence[
-        KeyframeKey
-    ] = ()  # runs of which nothing is left, each with its newest keyframe that came
+    empty_runs: Sequence[KeyframeKey] = ()
 
 
 @dataclass(frozen=True)
 class ChangesSaved:
-    """Everything up to this ticket will be there after a crash."""
+    """All changes up to this ticket are stored."""
 
     ticket: int
 
@@ -57,7 +56,7 @@ class EdgeTick:
     """Time has passed."""
 
 
-# ---------------------------------------------------------------- of a tracker
+# ---------------------------------------------------------------- events of trackers
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ class TrackerAnswered:
 
 @dataclass(frozen=True)
 class TrackerLost:
-    """The tracker has died; how, for a person."""
+    """The tracker process has died. reason: for a person."""
 
     key: str
     generation: int
@@ -96,8 +95,8 @@ class SendToPeer:
 
 @dataclass(frozen=True)
 class AddRun:
-    """To the mapper: a run of an agent, before its first keyframe. voice: the key that speaks for it, and has
-    one vote with all its names; "": the name has a vote of its own."""
+    """To the mapper: a new run, before its first keyframe. credential: its public key; all names of one key
+    count as one identity. "": the name is an identity of its own."""
 
     key: str
     hello: wire.Hello
@@ -106,7 +105,7 @@ class AddRun:
 
 @dataclass(frozen=True)
 class SetCredential:
-    """To the mapper: who speaks for a run from now on; voice: as of `AddRun`."""
+    """To the mapper: the credential of a run from now on, as in `AddRun`."""
 
     key: str
     credential: str
@@ -114,8 +113,8 @@ class SetCredential:
 
 @dataclass(frozen=True)
 class AddKeyframe:
-    """To the mapper: the next keyframe of a run, each once and in order. is_extra: more than its agent may
-    send; it is looked up only when nothing else waits, and maps may be joined by it."""
+    """To the mapper: the next keyframe of a run, each once and in order. is_over_rate: beyond the agent's
+    rate; it is queried only while nothing else waits, and may still merge maps."""
 
     key: str
     keyframe: Keyframe
@@ -124,7 +123,7 @@ class AddKeyframe:
 
 @dataclass(frozen=True)
 class SetPresence:
-    """To the mapper: a run is heard, or no longer. Whoever joins is; a run of an earlier life is not yet."""
+    """To the mapper: a run became present or absent. New runs are present, restored ones absent at first."""
 
     key: str
     is_present: bool
@@ -132,14 +131,14 @@ class SetPresence:
 
 @dataclass(frozen=True)
 class DropRun:
-    """To the mapper: nothing is left of this run, and it will not come back."""
+    """To the mapper: the run is forgotten and cannot come back."""
 
     key: str
 
 
 @dataclass(frozen=True)
 class SaveChanges:
-    """Make this safe, and answer with `ChangesSaved`. Tickets rise."""
+    """Store these changes and answer `ChangesSaved`. Tickets rise."""
 
     ticket: int
     changes: tuple[MapChange, ...]
@@ -152,12 +151,13 @@ class WriteEvent:
     fields: dict[str, Any]
 
 
-# ---------------------------------------------------------------- for a tracker
+# ---------------------------------------------------------------- effects for trackers
 
 
 @dataclass(frozen=True, eq=False)
 class StartTracker:
-    """A tracker for this rig; it answers `TrackerReady`. life: how many this agent has had before."""
+    """Start a tracker for this rig; it answers `TrackerReady`. generation: number of earlier trackers of the
+    run."""
 
     key: str
     generation: int
@@ -166,7 +166,7 @@ class StartTracker:
 
 @dataclass(frozen=True, eq=False)
 class TrackFrame:
-    """The next frame of this agent; it is answered by `TrackerAnswered`."""
+    """Track the next frame of this run; the answer is `TrackerAnswered`."""
 
     key: str
     frame: Frame
@@ -174,7 +174,7 @@ class TrackFrame:
 
 @dataclass(frozen=True)
 class StopTracker:
-    """Its tracker is not needed any more."""
+    """Stop the tracker of this run."""
 
     key: str
 

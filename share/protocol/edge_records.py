@@ -1,4 +1,4 @@
-"""What an edge has counted, over all lives of its mapper."""
+"""The edge's bookkeeping: event log, durability of keyframes, totals over mapper restarts, fair queue."""
 
 from __future__ import annotations
 
@@ -11,25 +11,21 @@ from share.protocol.edge_events import SaveChanges, WriteEvent
 from share.protocol.peer import Peer
 from share.timing import Throttle
 
-# ---- What the edge writes down: a decision, its reason, and when; what a peer can cause at any rate,
-# seldom.
-
-_EVENT_HZ, _EVENT_BURST = 1.0, 20.0  # records of one kind that one agent can cause,
-_SUSTAINED_HZ, _SUSTAINED_BURST = 1 / 60, 200.0  # and those if it goes on causing them
+# Limits on the events of one kind that one agent can cause: short-term, and sustained.
+_EVENT_HZ, _EVENT_BURST = 1.0, 20.0
+_SUSTAINED_HZ, _SUSTAINED_BURST = 1 / 60, 200.0
 
 
 class EventLog:
-    """began_ns: times count from here; None: from the first event."""
+    """Makes the lines of events.jsonl. began_ns: origin of their times; None: the first event."""
 
     def __init__(self, began_ns: int | None) -> None:
         self._began_ns = began_ns
-        self._throttle, self._sustained = (
-            Throttle(_EVENT_HZ, _EVENT_BURST),
-            Throttle(_SUSTAINED_HZ, _SUSTAINED_BURST),
-        )
+        self._throttle = Throttle(_EVENT_HZ, _EVENT_BURST)
+        self._sustained = Throttle(_SUSTAINED_HZ, _SUSTAINED_BURST)
 
     def start(self, now_ns: int) -> None:
-        """An event has come."""
+        """Set the time origin, if not set."""
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
 
     def elapsed_s(self, now_ns: int) -> float:
@@ -43,7 +39,8 @@ class EventLog:
     def throttled_event(
         self, now_ns: int, kind: str, agent: str | None, reason: str, **fields: Any
     ) -> WriteEvent | None:
-        """None where so many of this kind and agent have just been written; the next one counts them."""
+        """Return the event, or None beyond the limits of its kind and agent; the next one counts those left
+        out."""
         suppressed = self._throttle.admit((kind, agent), now_ns)
         if suppressed is None:
             return None
@@ -54,32 +51,31 @@ class EventLog:
         return self.event(now_ns, kind, agent, f"{reason}{more}", **fields)
 
 
-# ---- When a keyframe is safe, so that it may be acknowledged: once what was to be kept with it is kept.
-
-
 class DurabilityTracker:
-    """Of all agents of an edge. keeps: what is applied is safe once it is kept; else at once."""
+    """Determines when the keyframes of all agents are durable and may be acknowledged: once their changes are
+    stored, or at once without a store."""
 
     def __init__(self, has_store: bool) -> None:
         self._has_store = has_store
-        self._ticket = 0  # of the newest that is to be kept
-        self._saved_ticket = 0  # the newest ticket that is kept
-        self._pending: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
+        self._ticket = 0  # newest issued
+        self._saved_ticket = 0  # newest stored
+        self._pending: deque[tuple[int, Peer, int]] = deque()  # ticket, peer, its `durable_below` once stored
 
     def save(self, changes: tuple[MapChange, ...]) -> SaveChanges | None:
-        """These are to be kept, after all before them; None where nothing is."""
+        """Return the effect that stores these changes; None without changes or store."""
         if not self._has_store or not changes:
             return None
         self._ticket += 1
         return SaveChanges(self._ticket, changes)
 
     def add_keyframe(self, peer: Peer, keyframe: int) -> None:
-        """A keyframe of this peer: it is safe with the newest that is to be kept."""
+        """Add an applied keyframe, which becomes durable with the newest ticket."""
         peer.pending_saves += 1
         self._pending.append((self._ticket, peer, keyframe + 1))
 
     def mark_saved(self, ticket: int) -> list[Peer]:
-        """All up to this ticket is kept. Returns whose keyframes are safe by that."""
+        """Record that all changes up to this ticket are stored. Return the peers with newly durable
+        keyframes."""
         self._saved_ticket = max(self._saved_ticket, ticket)
         peers = {}
         while self._pending and self._pending[0][0] <= ticket:
@@ -90,16 +86,16 @@ class DurabilityTracker:
         return list(peers.values())
 
     def take_durable(self) -> list[Peer]:
-        """The same, of what waits for nothing that is not kept yet."""
+        """Return the peers with newly durable keyframes that wait for no ticket."""
         return self.mark_saved(self._saved_ticket if self._has_store else self._ticket)
 
 
-_MERGE_COUNTS = tuple(("merges", what) for what in ("requested", "skipped", "done"))
+_MERGE_COUNTS = (("merges", "requested"), ("merges", "skipped"), ("merges", "done"))
 _LOOP_COUNTS = (("loops", "tried"), ("loops", "accepted"))
 _TOTAL_COUNTS = (
     *_LOOP_COUNTS,
     *_MERGE_COUNTS,
-    *((name,) for name in ("taken_out", "failed_jobs", "internal_errors", "forgotten_runs")),
+    *((name,) for name in ("removed_keyframes", "failed_steps", "internal_errors", "forgotten_runs")),
     *((f"{kind}_ms", "n") for kind in ("place", "verify", "solve")),
 )
 _AGENT_COUNTS = (
@@ -107,22 +103,20 @@ _AGENT_COUNTS = (
     *_MERGE_COUNTS,
     *((name,) for name in ("keyframes", "poses", "evaluations", "corrections", "bytes_up", "bytes_down")),
     *((name,) for name in ("bad_messages", "unexpected", "queries_skipped", "refused_messages")),
-    ("doubted_keyframes",),
+    ("suspect_keyframes",),
 )
-_MAX_RUNS = 4096  # that are remembered
+_MAX_RUNS = 4096  # remembered
 
 
 class SessionTotals:
-    """A life begins to count at 0; `with_totals` goes on where the one before it ended."""
+    """Totals over restarts of the mapper, which counts from 0 each time."""
 
     def __init__(self) -> None:
         self._previous: Mapping[str, Any] = {}
-        self._agent_reports: dict[
-            str, Mapping[str, Any]
-        ] = {}  # of agents, also those that the last life did not hear
+        self._agent_reports: dict[str, Mapping[str, Any]] = {}  # by run key, the most recent last
 
     def add_session(self, report: Mapping[str, Any]) -> None:
-        """A life's last report, with what was `with_totals`."""
+        """Add the last report of a mapper that has ended, as returned by `with_totals`."""
         self._previous = report
         for agent in report["agents"].values():
             self._agent_reports.pop(agent["run"], None)
@@ -131,7 +125,8 @@ class SessionTotals:
             del self._agent_reports[run]
 
     def with_totals(self, report: Mapping[str, Any]) -> dict[str, Any]:
-        """A life's report, with the counts of those before it. An agent's are those of the same run."""
+        """Return the present mapper's report plus the counts of earlier ones; of agents, those of the same
+        run."""
         if not self._previous:
             return dict(report)
         out = _add_counts(report, self._previous, _TOTAL_COUNTS)
@@ -139,10 +134,10 @@ class SessionTotals:
             name: _add_counts(agent, self._agent_reports.get(agent["run"], {}), _AGENT_COUNTS)
             for name, agent in report["agents"].items()
         }
-        previous = self._previous["strangers"]
-        out["strangers"] = {
-            what: report["strangers"].get(what, 0) + previous.get(what, 0)
-            for what in sorted({*report["strangers"], *previous})
+        previous = self._previous["unjoined"]
+        out["unjoined"] = {
+            name: report["unjoined"].get(name, 0) + previous.get(name, 0)
+            for name in sorted({*report["unjoined"], *previous})
         }
         return out
 
@@ -173,18 +168,17 @@ def _count_at(report: Mapping[str, Any], path: tuple[str, ...]) -> int:
     return int(value)
 
 
-# ---- Keyframes that wait to be taken into the map, of each name in turn: who sends many waits for itself.
-
 T = TypeVar("T")
 
-_MAX_ADD_MS = 10.0  # that keyframes are taken in before one is looked up
+_MAX_ADD_MS = 10.0  # spent on adding keyframes before one is queried
 
 
 class FairQueue(Generic[T]):
-    """In order of arrival of each name."""
+    """Keyframes that wait to be added to the map: names take turns, each in order of arrival, so that an
+    agent that sends many delays only itself."""
 
     def __init__(self) -> None:
-        self._queues: dict[str, deque[T]] = {}  # whose turn is next first
+        self._queues: dict[str, deque[T]] = {}  # by name, next in turn first
 
     def __len__(self) -> int:
         return sum(map(len, self._queues.values()))
@@ -193,8 +187,8 @@ class FairQueue(Generic[T]):
         self._queues.setdefault(name, deque()).append(item)
 
     def take_next(self, spent_ms: float = 0.0) -> T | None:
-        """What is taken in now. spent_ms: on those before it, since a keyframe was last looked up. None:
-        there is nothing, or it is time to look one up."""
+        """Return the next item; None if there is none, or if `spent_ms` (on items since the last query)
+        calls for a query."""
         if not self._queues or spent_ms >= _MAX_ADD_MS:
             return None
         name = next(iter(self._queues))

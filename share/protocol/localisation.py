@@ -1,4 +1,4 @@
-"""Where odometry lies in the map, as an application may use it: without jumps."""
+"""The agent's pose in the map: T_map_odom without jumps, and the pose messages made with it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from share.wire import messages as m
 class BlendedMapFrame:
     """T_map_odom (4, 4) in force. Large changes are blended in along the geodesic of SE(3).
 
-    How large a change is, is judged where the body is: a small turn moves what is far from the
-    origin of odometry a long way.
+    The size of a change is judged at the body: far from the odometry origin a small rotation moves it far.
     """
 
     def __init__(self, config: AgentConfig) -> None:
@@ -26,11 +25,11 @@ class BlendedMapFrame:
         self._config = config
         self._target: F64 | None = None
         self._cov: F64 = np.zeros((6, 6))  # of the target
-        self._blend_xi: F64 = np.zeros(6)  # from the target back to what was in force when the blend began
+        self._blend_xi: F64 = np.zeros(6)  # from the target to the transform in force when the blend began
         self._blend_start_ns = 0
 
     def transform(self, now_ns: int) -> F64 | None:
-        """T_map_odom at this time, None before the first correction."""
+        """Return T_map_odom (4, 4) at `now_ns`; None before the first correction."""
         if self._target is None:
             return None
         remaining = 1 - (now_ns - self._blend_start_ns) / (self._config.blend_s * SECOND_NS)
@@ -39,14 +38,15 @@ class BlendedMapFrame:
         return self._target @ se3.exp(min(remaining, 1.0) * self._blend_xi)
 
     def sigma_cm(self, T_odom_body: F64) -> float:
-        """cm, how unsure the body's place in the map is because that of odometry is; 0 without one."""
+        """Return the standard deviation of the body's map position due to T_map_odom, cm; 0 without a
+        correction."""
         if self._target is None:
             return 0.0
         cov = se3.compose_cov(T_odom_body, self._cov, np.zeros((6, 6)))
         return 100 * se3.position_sigma(cov)
 
     def apply(self, correction: Correction, T_odom_body: F64, now_ns: int) -> bool:
-        """A new target from now on. Returns whether it lies in another map."""
+        """Set a new target. Return whether it is in another map."""
         T_map_odom, map_id = correction.T_map_odom, correction.map_id
         current, same_map = self.transform(now_ns), map_id == self.map_id
         blend = current is not None and same_map and self._is_large(current, T_map_odom, T_odom_body)
@@ -58,7 +58,7 @@ class BlendedMapFrame:
         return not same_map
 
     def reset(self) -> None:
-        """Odometry broke: nothing is known until the next correction."""
+        """Forget the transform: odometry broke."""
         self._target = None
 
     def _is_large(self, T_old: F64, T_new: F64, T_odom_body: F64) -> bool:
@@ -67,25 +67,22 @@ class BlendedMapFrame:
         return bool(shift > self._config.blend_jump_m or turn > self._config.blend_jump_rad)
 
 
-# ---- Where an agent is: by its odometry, and by the map under it.
-
-
 class MapLocalisation:
-    """Of one agent. T_odom_body (4, 4): the newest, None before the first pose. frame: where odometry lies
-    in the map."""
+    """Pose of one agent in odom and in the map. T_odom_body (4, 4): the newest; None before the first
+    pose."""
 
     def __init__(self, config: AgentConfig) -> None:
         self.T_odom_body: F64 | None = None
         self.map_frame = BlendedMapFrame(config)
-        self._segment = 0  # of odometry, in the order in which they began
+        self._segment = 0  # number of the odometry segment
 
     def begin_segment(self) -> None:
-        """Odometry begins anew, and nothing is known of where it lies."""
+        """Start a new odometry segment. Its place in the map is unknown."""
         self.map_frame.reset()
         self._segment += 1
 
     def localise(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> ev.LocalisedPose:
-        """With the pose of a frame that has one."""
+        """Return the localised pose of a frame that has one. T_odom_body (4, 4)."""
         self.T_odom_body = T_odom_body
         return ev.LocalisedPose(
             frame.index,
@@ -101,7 +98,7 @@ class MapLocalisation:
     def apply_correction(
         self, correction: Correction, entry: LedgerEntry | None, corrected_ms: float | None, now_ns: int
     ) -> ev.CorrectionApplied:
-        """By one that is believed. entry: of the keyframe that it answers; corrected_ms: as there."""
+        """Apply a valid correction. entry, corrected_ms: from `KeyframeLedger.record_correction`."""
         T_odom_body = correction.T_map_odom if self.T_odom_body is None else self.T_odom_body
         new_map = self.map_frame.apply(correction, T_odom_body, now_ns)
         return ev.CorrectionApplied(
@@ -118,8 +115,8 @@ class MapLocalisation:
 def pose_update(
     frame: ev.FrameTracked, T_odom_body: F64, last: LedgerEntry | None, first_of_segment: int
 ) -> m.PoseUpdate:
-    """Relative to the last keyframe that the edge has, if it is of the present stretch. first_of_stretch: the
-    lowest number that a keyframe of it may have."""
+    """Return the pose relative to the last acknowledged keyframe `last`, or in odom if that is of an earlier
+    segment. first_of_segment: lowest keyframe id of the present one."""
     if last is None or last.keyframe.id < first_of_segment:
         return m.PoseUpdate(frame.stamp_ns, frame.state, -1, T_odom_body)
     T_keyframe_body = inverse(last.keyframe.T_odom_body) @ T_odom_body

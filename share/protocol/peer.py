@@ -1,4 +1,4 @@
-"""One run of one agent, as the edge knows it."""
+"""One run of one agent at the edge: reordering, status, checks of its keyframes, restoring."""
 
 from __future__ import annotations
 
@@ -17,22 +17,20 @@ from share.timing import SECOND_NS, seconds_to_ns
 from share.types import F64, Keyframe, TrackState
 from share.wire.messages import MAX_BUFFERED, Ack, Hello, Status
 
-# ---- Keyframes of one agent, from any order of arrival into the order in which they were made.
-
-MAX_ID_GAP = 1_000_000  # ids that an agent may have dropped since the last: two days alone at 5 Hz
+MAX_ID_GAP = 1_000_000  # ids that an agent may have dropped since the last one: two days at 5 Hz
 
 
 class ReorderBuffer:
-    """Yields each keyframe once, after the one that it follows; holds a bounded number back.
+    """Releases each keyframe of a run once, after its predecessor; buffers a bounded number.
 
-    Ids that the agent dropped are skipped: the first keyframe after them says so by what it follows.
-    Of two versions of a waiting keyframe the one that follows the lower id is the later.
+    Ids that the agent dropped are skipped: the predecessor of the next keyframe shows them. Of two versions
+    of a buffered keyframe the one with the lower predecessor is the newer.
     """
 
     def __init__(self, next_keyframe: int = 0, capacity: int = 64) -> None:
-        """next_keyframe: one more than the last id already applied. hold: at most MAX_HELD."""
+        """next_keyframe: one more than the last applied id. capacity: 1 to MAX_BUFFERED."""
         if not 1 <= capacity <= MAX_BUFFERED:
-            raise ValueError(f"hold: {capacity} is outside 1 .. {MAX_BUFFERED}")
+            raise ValueError(f"capacity: {capacity} is outside 1 .. {MAX_BUFFERED}")
         self.next_keyframe = next_keyframe
         self.duplicates = 0
         self.evicted = 0
@@ -40,19 +38,19 @@ class ReorderBuffer:
         self._waiting: dict[int, Keyframe] = {}
 
     def clear(self) -> None:
-        """What is held back was not acknowledged: the agent sends it again."""
+        """Drop buffered keyframes, which are not acknowledged: the agent resends them."""
         self._waiting.clear()
 
     def is_new(self, keyframe_id: int) -> bool:
-        """Whether no keyframe of that id has been applied, or waits."""
+        """Return whether no keyframe of that id has been applied or is buffered."""
         return keyframe_id >= self.next_keyframe and keyframe_id not in self._waiting
 
     def push(self, keyframe: Keyframe) -> list[Keyframe]:
-        """The keyframes, rising by id, that can be applied now that this one is here.
+        """Add a keyframe; return those that can be applied now, rising by id.
 
-        Raises ValueError if its id leaps by more than MAX_STEP."""
+        Raises ValueError if its id jumps by more than MAX_ID_GAP."""
         if keyframe.id > self.next_keyframe + MAX_ID_GAP:
-            raise ValueError(f"keyframe {keyframe.id}: its id leaps; {self.next_keyframe} is expected")
+            raise ValueError(f"keyframe {keyframe.id}: id jumps; expected about {self.next_keyframe}")
         if keyframe.id < self.next_keyframe:
             self.duplicates += 1
             return []
@@ -63,14 +61,14 @@ class ReorderBuffer:
             self.next_keyframe = applicable.id + 1
             self._waiting = {k: v for k, v in self._waiting.items() if k > applicable.id}
         if len(self._waiting) > self._capacity:
-            del self._waiting[max(self._waiting)]  # drop_newest: the agent sends it again
+            del self._waiting[max(self._waiting)]  # drop_newest: the agent resends it
             self.evicted += 1
         return ready
 
     def ack(self, durable_below: int | None = None) -> Ack:
-        """What to answer to every keyframe, duplicates too: their acknowledgement may have been lost.
+        """Return the answer to any keyframe, duplicates too: their acknowledgement may have been lost.
 
-        safe: applied keyframes from this number on are only held yet (default: all are safe).
+        durable_below: applied keyframes from this id on count as buffered (default: none).
         """
         durable_below = self.next_keyframe if durable_below is None else durable_below
         applied = range(durable_below, min(self.next_keyframe, durable_below + MAX_BUFFERED))
@@ -80,29 +78,27 @@ class ReorderBuffer:
         waiting = self._waiting.get(keyframe.id)
         if waiting is not None:
             self.duplicates += 1
-        if waiting is None or keyframe.follows < waiting.follows:
+        if waiting is None or keyframe.predecessor < waiting.predecessor:
             self._waiting[keyframe.id] = keyframe
 
     def _next_applicable(self) -> Keyframe | None:
-        ready = (k for k in sorted(self._waiting) if self._waiting[k].follows < self.next_keyframe)
+        ready = (k for k in sorted(self._waiting) if self._waiting[k].predecessor < self.next_keyframe)
         first = next(ready, None)
         return None if first is None else self._waiting[first]
 
 
-# ---- What an agent last said of its own state, and how old that is by the edge's clock.
-
-SILENT_S = 0.7  # an agent says something twice a second; after this what it said is not shown as its state
+SILENT_S = 0.7  # agents report twice a second; after this the last report is no longer shown as the state
 SILENT = "SILENT"
-_NOT_RECEIVED = "not heard since the map was taken up again"
+_NOT_RECEIVED = "no message since the map was restored"
 
 
 class PeerStatus:
-    """Fed with what the agent says; `report` is true of the moment that it is asked for."""
+    """An agent's last reported state and its age by the edge's clock."""
 
     def __init__(self) -> None:
         self.state = TrackState.INITIALISING
         self._reason = ""
-        self._age_ms: float | None = None  # of the newest pose, when `_age_at_ns` was
+        self._age_ms: float | None = None  # of the newest pose at `_age_at_ns`
         self._age_at_ns = 0
         self._has_left = False
 
@@ -111,7 +107,7 @@ class PeerStatus:
         self._age_ms, self._age_at_ns = status.pose_age_ms, now_ns
 
     def add_pose(self, state: TrackState, now_ns: int) -> None:
-        """A pose has come. It is about as old as the newest was when the agent last said how old that was."""
+        """Record a pose message. Its pose is about as old as the newest was at the last status."""
         if state is not self.state:
             self._reason = ""
         self.state, self._has_left = state, False
@@ -119,12 +115,12 @@ class PeerStatus:
             self._age_at_ns = now_ns
 
     def leave(self) -> None:
-        """It said bye: its silence is no news."""
+        """Record a bye: silence is expected from now on."""
         self._has_left = True
 
     def report(self, now_ns: int, last_received_ns: int | None) -> dict[str, Any]:
-        """Plain data. state: SILENT where nothing was heard for SILENT_S. pose_age_ms: None if never told.
-        heard_ns: when the agent was last heard; None: not in this life of the edge."""
+        """Return plain data. state: SILENT without a message for SILENT_S. pose_age_ms: None if never
+        reported. last_received_ns: time of the last message; None: none in this session."""
         if last_received_ns is None:
             return {"state": SILENT, "reason": _NOT_RECEIVED, "pose_age_ms": None, "heard_s": None}
         silent_ns = max(0, now_ns - last_received_ns)
@@ -139,18 +135,20 @@ class PeerStatus:
         }
 
 
-_MAX_JUMP_M, _MAX_JUMP_M_S = (
-    2.0,
-    10.0,
-)  # further than this, and so much more a second, nobody moves between keyframes
-# T_ref_body is of what the filter knows now, T_odom_body of what it knew then (docs/understand/mapping.md):
-# of honest agents these differ by up to 3 cm after 8 s and 6 m, and by 2.7 degrees while a headset learns
-# what is up.
-_MAX_MISMATCH_M, _MISMATCH_PER_M, _MAX_MISMATCH_RAD = 0.3, 0.05, float(np.radians(12.0))
-_MIN_REFUSALS, _RECENT_S = 10, 10.0  # refused messages that are worth a person's while, and for how long
-_OVERLOAD_SHOWN_S = 2.0  # that it is said of an agent that its keyframes were not taken in
-_MAX_PENDING_SAVES = 256  # keyframes that may wait for the disk: an agent has 16 under way
-_MAX_VARIANCE = 100.0  # rad^2, m^2: says nothing; more would only upset the solver
+_MAX_JUMP_M = 2.0  # largest plausible motion between keyframes,
+_MAX_JUMP_M_S = 10.0  # plus this for each second in between
+# T_ref_body is the filter's present estimate, T_odom_body its estimate then (docs/understand/mapping.md):
+# measured on
+# correct agents they differ by up to 3 cm after 8 s and 6 m, and by 2.7 degrees while a headset's tilt
+# converges.
+_MAX_MISMATCH_M = 0.3
+_MISMATCH_PER_M = 0.05  # added for each m of motion
+_MAX_MISMATCH_RAD = float(np.radians(12.0))
+_MIN_REFUSALS = 10  # refused messages before a warning
+_RECENT_S = 10.0  # since the newest of them, while the warning is shown
+_OVERLOAD_SHOWN_S = 2.0  # how long a status shows that keyframes were deferred
+_MAX_PENDING_SAVES = 256  # keyframes that may wait for the disk; an agent has 16 in flight
+_MAX_VARIANCE = 100.0  # rad^2, m^2: as good as unknown; more would make the solver ill-conditioned
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,32 +164,30 @@ class OdometryBase:
         return cls(keyframe.id, keyframe.stamp_ns, keyframe.T_odom_body)
 
     def jump_m(self, keyframe: Keyframe) -> float:
-        """How far (m) the keyframe is from here, if nobody can have moved so far meanwhile, else 0."""
+        """Return the distance to the keyframe, m, if no agent can move so far in that time, else 0."""
         distance_m = float(np.linalg.norm(keyframe.T_ref_body[:3, 3]))
         elapsed_s = max(0, keyframe.stamp_ns - self.stamp_ns) / SECOND_NS
         return distance_m if distance_m > _MAX_JUMP_M + _MAX_JUMP_M_S * elapsed_s else 0.0
 
     def contradiction(self, keyframe: Keyframe) -> str | None:
-        """How far T_ref_body of the keyframe lies from what its T_odom_body and this one say, if that is more
-        than a filter learns of the past meanwhile."""
+        """Return a text on how far the keyframe's T_ref_body differs from the relative pose of the two
+        T_odom_body; None if a filter's later estimate of the past can explain it."""
         T_ref_body = se3.inverse(self.T_odom_body) @ keyframe.T_odom_body
         T = se3.inverse(keyframe.T_ref_body) @ T_ref_body
         mismatch_m, mismatch_rad = float(np.linalg.norm(T[:3, 3])), float(se3.rotation_angle(T))
         step_m = float(np.linalg.norm(keyframe.T_ref_body[:3, 3]))
         if mismatch_m <= _MAX_MISMATCH_M + _MISMATCH_PER_M * step_m and mismatch_rad <= _MAX_MISMATCH_RAD:
             return None
-        return (
-            f"its step and its two poses "
-            f"differ by {mismatch_m:.2g} "
-            f"m and {np.degrees(mismatch_rad):.2g} degrees"
-        )
+        mismatch_deg = np.degrees(mismatch_rad)
+        return f"its motion and its two poses differ by {mismatch_m:.2g} m and {mismatch_deg:.2g} degrees"
 
 
 @dataclass(frozen=True, eq=False)
 class RestoredRun:
-    """A run that an earlier life of the edge kept. foot: its last keyframe, None without any.
-    next_keyframe: the number that is asked for. finding: where it is in the map, to be told at once.
-    voice: as of `KeepRun`."""
+    """A run stored by an earlier session of the edge.
+
+    odometry_base: its last keyframe; None without one. next_keyframe: id that the edge asks for.
+    last_finding: its correction, sent with the welcome. credential: as in `SaveRun`."""
 
     key: str
     hello: Hello
@@ -203,7 +199,7 @@ class RestoredRun:
 
 @dataclass
 class RefusedMessages:
-    """Messages of a peer that were not accepted: how many, and why and when the newest was not."""
+    """Count of a peer's refused messages, with reason and time of the newest."""
 
     count: int = 0
     reason: str = ""
@@ -214,21 +210,21 @@ class RefusedMessages:
         self.count, self.reason, self.last_ns = self.count + 1, reason, now_ns
 
     def warning_line(self, now_ns: int) -> str | None:
-        """For a person, while it happens again and again."""
+        """Return a warning for a person while refusals recur, else None."""
         if self.count < _MIN_REFUSALS or now_ns - self.last_ns > _RECENT_S * SECOND_NS:
             return None
         return f"{self.count} {self.label}, the last: {self.reason}"
 
 
 class SuspectKeyframes(RefusedMessages):
-    """Keyframes that were taken in, but not as they came."""
+    """Count of keyframes that were accepted only after a change."""
 
-    label = "keyframes doubted"
+    label = "suspect keyframes"
 
 
 @dataclass
 class OverloadNotice:
-    """Keyframes that were not taken in, since there were too many, and are sent again."""
+    """Notice that keyframes were deferred for overload; the agent resends them."""
 
     reason: str = ""
     last_ns: int = 0
@@ -237,7 +233,7 @@ class OverloadNotice:
         self.reason, self.last_ns = reason, now_ns
 
     def annotate(self, status: dict[str, Any], now_ns: int) -> dict[str, Any]:
-        """`status` with the reason, while that is news."""
+        """Return `status` with the reason added while it is recent."""
         if not self.reason or now_ns - self.last_ns > _OVERLOAD_SHOWN_S * SECOND_NS:
             return status
         return {**status, "reason": "; ".join(filter(None, (status["reason"], self.reason)))}
@@ -245,11 +241,11 @@ class OverloadNotice:
 
 @dataclass
 class Peer:
-    """safe: all its keyframes below this number will be there after a crash, and so are acknowledged.
-    unsafe: how many are applied and not safe yet. voice: as of `KeepRun`."""
+    """A run of an agent. durable_below: keyframes below this id are stored, and so acknowledged.
+    pending_saves: number of keyframes applied but not stored yet. credential: as in `SaveRun`."""
 
     hello: Hello
-    key: str  # names this run: the name, and some of the run id
+    key: str  # `new_run_key`
     last_received_ns: int
     reorder_buffer: ReorderBuffer = field(default_factory=ReorderBuffer)
     durable_below: int = 0
@@ -261,19 +257,19 @@ class Peer:
     overload: OverloadNotice = field(default_factory=OverloadNotice)
     revision: int = 0
     is_gone: bool = False
-    last_finding: MapEvent | None = None  # the newest correction; who has been away may not have got it
-    is_welcomed: bool = True  # in this life of the edge
-    has_sent: bool = True  # likewise
+    last_finding: MapEvent | None = None  # newest correction, repeated with a welcome
+    is_welcomed: bool = True  # in this session of the edge
+    has_sent: bool = True  # a message in this session
     pending_saves: int = 0
     credential: str | None = ""
 
     @property
     def is_idle(self) -> bool:
-        """Whether it is gone and never sent a keyframe."""
+        """Whether it left without ever sending a keyframe."""
         return self.is_gone and self.reorder_buffer.next_keyframe == 0
 
     def overload_reason(self) -> str | None:
-        """Why no other keyframe is applied now; None if one may be."""
+        """Return why no further keyframe is accepted now; None if one is."""
         return (
             f"{self.pending_saves} keyframes wait for the disk"
             if self.pending_saves >= _MAX_PENDING_SAVES
@@ -281,34 +277,34 @@ class Peer:
         )
 
     def sanitise(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
-        """The next keyframe in order as the map may have it, and what was wrong with it.
+        """Return the next keyframe as the map accepts it, and what was wrong with it, None if nothing.
 
-        The step of one that leaps, or whose step is not that between its two poses, is not believed: it
-        begins a stretch, in the same odom. A covariance beyond all measure is bounded.
-        Raises ValueError where what it refers to is not the keyframe before it.
+        One with an implausible jump, or with a motion that contradicts its two poses, starts a segment in the
+        same odom. An excessive covariance is bounded. Raises ValueError if its reference is not the last
+        keyframe.
         """
         problem = None
         if keyframe.reference >= 0:
             if self.odometry_base is None or keyframe.reference != self.odometry_base.id:
                 raise ValueError(
-                    f"keyframe {keyframe.id} refers to {keyframe.reference}, which is not the last"
+                    f"keyframe {keyframe.id} refers to {keyframe.reference}, not to the last one"
                 )
             if jump_m := self.odometry_base.jump_m(keyframe):
-                problem = f"keyframe {keyframe.id} is {jump_m:.0f} m from the one before: a new stretch"
+                problem = f"keyframe {keyframe.id} is {jump_m:.0f} m from the previous one: new segment"
             elif contradiction := self.odometry_base.contradiction(keyframe):
-                problem = f"keyframe {keyframe.id}: {contradiction}: a new stretch"
+                problem = f"keyframe {keyframe.id}: {contradiction}: new segment"
             if problem:
                 keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body)
         self.odometry_base = OdometryBase.from_keyframe(keyframe)
         if (max_variance := float(keyframe.cov.diagonal().max())) > _MAX_VARIANCE:
             problem = (
-                problem or f"keyframe {keyframe.id} has a variance of {max_variance:.0e}; taken as unknown"
+                problem or f"keyframe {keyframe.id} has a variance of {max_variance:.0e}; treated as unknown"
             )
             keyframe = replace(keyframe, cov=keyframe.cov * (_MAX_VARIANCE / max_variance))
         return keyframe, problem
 
     def report(self, now_ns: int) -> dict[str, Any]:
-        """edge.json's fields of one run, as far as it was heard."""
+        """Return the fields of edge.json that come from the run's messages."""
         return {
             "kind": str(self.hello.kind),
             "run": self.key,
@@ -319,14 +315,14 @@ class Peer:
             **{name: self.counts[name] for name in _REPORTED_COUNTS},
             "refused_messages": self.refusals.count,
             "last_refusal": self.refusals.reason or None,
-            "doubted_keyframes": self.suspect_keyframes.count,
-            "last_doubt": self.suspect_keyframes.reason or None,
+            "suspect_keyframes": self.suspect_keyframes.count,
+            "last_suspicion": self.suspect_keyframes.reason or None,
         }
 
 
 @dataclass
 class UnjoinedPeers:
-    """Peers that have not joined, all as one."""
+    """Counts of all peers that have not joined, together."""
 
     counts: Counter[str] = field(default_factory=Counter)
     refusals: RefusedMessages = field(default_factory=RefusedMessages)
@@ -345,7 +341,7 @@ _REPORTED_COUNTS = (
 
 
 def refusal_warnings(peers: Iterable[Peer], unjoined: UnjoinedPeers, now_ns: int) -> list[str]:
-    """Who sends again and again what is refused or doubted: a line each."""
+    """Return a warning line for each sender whose messages or keyframes keep being refused or suspect."""
     by_sender: dict[str, list[RefusedMessages]] = {}
     for peer in peers:
         by_sender.setdefault(f"agent '{peer.hello.name}'", []).extend((peer.refusals, peer.suspect_keyframes))
@@ -359,10 +355,11 @@ def refusal_warnings(peers: Iterable[Peer], unjoined: UnjoinedPeers, now_ns: int
 
 
 def restored_runs(stored: StoredMap, position_sigma_m: float) -> list[RestoredRun]:
-    """Of all earlier lives. What comes after a run's last keyframe that is there is asked for. known_m: how
-    surely such a run's place in another's map is known until that is solved anew, 1 sigma.
+    """Return the runs of all earlier sessions; each continues after its last stored keyframe.
 
-    Who was in a map that loops have joined to another since poses were kept is told once that is solved.
+    position_sigma_m: standard deviation of a run's position in another agent's map until that is solved
+    again. Runs in maps that loops have merged since the poses were stored get their correction from that
+    solution.
     """
     cov = np.diag([0.0, 0.0, 0.0, *[position_sigma_m**2 / 3] * 3])
     last = {keyframe.run_key: keyframe.keyframe for keyframe in stored.keyframes}
@@ -403,6 +400,6 @@ def restored_runs(stored: StoredMap, position_sigma_m: float) -> list[RestoredRu
 
 
 def _merged_maps(loops: Iterable[Loop], map_of: Mapping[KeyframeKey, str]) -> set[str]:
-    """Maps that loops tie to others."""
+    """Return the maps that loops connect to others."""
     ends = ({map_of[key] for key in (loop.a, loop.b) if key in map_of} for loop in loops)
     return set[str]().union(*(maps for maps in ends if len(maps) > 1))

@@ -1,6 +1,6 @@
-"""The edge that tracks its agents, each alone, from what they stream: policy `frames_streamed`.
+"""The edge of policy `streamed`: it tracks each agent alone, from the frames that the agent streams.
 
-It has no map. An agent is welcomed once its tracker is ready, so that its first frames are not lost.
+It has no map. An agent is welcomed once its tracker is ready, so that no first frames are lost.
 """
 
 from __future__ import annotations
@@ -29,13 +29,12 @@ from share.types import Frame
 from share.wire import messages as wire
 from share.wire.messages import RemoteTrackingResult
 
-# ---- An agent that the edge tracks: its frames, its tracker's answers, and lives of that tracker. A part
-# of `share.protocol.edge`; trackers are processes of `share.runtime.tracker_processes`.
-
 
 @dataclass
 class RemoteTracker:
-    """is_ready: its tracker can track. streamed, tracked: frames that came, and that were answered."""
+    """The tracker of one run: its frames, answers and restarts. Trackers are processes of
+    `share.runtime.tracker_processes`. generation: number of earlier ones. frames_streamed: received;
+    frames_tracked: answered."""
 
     key: str
     rig: Rig
@@ -45,22 +44,22 @@ class RemoteTracker:
     is_ready: bool = False
     frames_streamed: int = 0
     frames_tracked: int = 0
-    _has_answered: bool = field(default=False)  # in this life
+    _has_answered: bool = field(default=False)  # in this generation
 
     def start(self) -> Sequence[TrackerEffect]:
-        """A tracker, if it has none."""
+        """Start a tracker, if none is running."""
         if self.is_running:
             return ()
         self.is_running, self._has_answered = True, False
         return (StartTracker(self.key, self.generation, self.rig),)
 
     def stop(self) -> Sequence[TrackerEffect]:
-        """It is gone: none is needed."""
+        """Stop the tracker, if one is running."""
         was_running = self._reset()
         return (StopTracker(self.key),) if was_running else ()
 
     def offer_frame(self, frame: Frame, now_ns: int) -> Sequence[TrackerEffect]:
-        """What goes to the tracker. Raises ValueError if the frame is not of this rig."""
+        """Queue a frame. Raises ValueError if its images do not fit the rig."""
         self._check_frame(frame)
         self.frames_streamed += 1
         self.frame_window.offer(frame, now_ns)
@@ -73,12 +72,12 @@ class RemoteTracker:
         return self._next_frame(now_ns)
 
     def record_loss(self) -> bool:
-        """Its tracker has died. Whether another may do better: this one had answered."""
+        """Record that the tracker died. Return whether to restart it: only if it had answered a frame."""
         self._reset()
         return self._has_answered
 
     def report(self) -> dict[str, int]:
-        """For edge.json; dropped: for newer ones, or with a tracker that died."""
+        """Return counts for edge.json. frames_dropped: for newer ones, or lost with a tracker that died."""
         dropped = self.frame_window.dropped + self.frame_window.unanswered
         return {
             "frames_streamed": self.frames_streamed,
@@ -91,7 +90,7 @@ class RemoteTracker:
         return () if frame is None else (TrackFrame(self.key, frame),)
 
     def _reset(self) -> bool:
-        """Whether one was running."""
+        """Forget the running tracker. Return whether there was one."""
         was_running, self.is_running, self.is_ready = self.is_running, False, False
         self.frame_window.clear()
         self.generation += was_running
@@ -106,7 +105,7 @@ class RemoteTracker:
             have, want = None if image is None else image.shape, _image_shape(camera)
             if have != want:
                 raise ValueError(
-                    f"frame {frame.index}: {name} is {_shape_text(have)}, its camera {_shape_text(want)}"
+                    f"frame {frame.index}: {name} is {_shape_text(have)}, the rig says {_shape_text(want)}"
                 )
 
 
@@ -120,35 +119,34 @@ def _shape_text(shape: tuple[int, ...] | None) -> str:
 
 @dataclass(frozen=True)
 class TrackingCapacity:
-    """How many agents can be tracked at a time, and of what that comes, for a person. bytes: of memory, for
-    all their trackers; None: not known."""
+    """Number of agents that can be tracked at once, and the reason for a person. memory_bytes: for all
+    trackers together; None: unknown."""
 
     max_agents: int
     reason: str
     memory_bytes: int | None = None
 
     def objection(self, others: Sequence[Rig], rig: Rig) -> str | None:
-        """Why one more cannot be tracked beside the others; the first always can."""
+        """Return why `rig` cannot be tracked beside the others; None if it can. The first always can."""
         if others and len(others) >= self.max_agents:
             limit = f"{self.max_agents} streamed agent{'' if self.max_agents == 1 else 's'}"
             return f"this machine can track {limit}: {self.reason}; wait until one leaves"
         required = sum(tracker_bytes(each) for each in (*others, rig))
         if others and self.memory_bytes is not None and required > self.memory_bytes:
             size = f"{rig.cam0.width}x{rig.cam0.height}"
-            return (
-                f"no memory to track images of {size} beside the others: {self.reason}; wait until one leaves"
-            )
+            return f"not enough memory to track another {size} stream: {self.reason}; wait until one leaves"
         return None
 
 
 def tracker_bytes(rig: Rig) -> int:
-    """Memory of a tracker's process: 112 MB at 640x480 after 5 s, 320 MB at 3800x2400."""
+    """Return the memory of a tracker process, bytes. Measured: 112 MB at 640x480 after 5 s, 320 MB at
+    3800x2400."""
     return 100_000_000 + 32 * rig.cam0.width * rig.cam0.height
 
 
 class TrackingEdge(Edge):
-    """Beside the effects of `Edge`, but for those to the mapper and the keeper: BeginTracking, Track and
-    EndTracking; it is told Ready, Answered and Lost. room: an agent beyond it is refused."""
+    """An `Edge` without mapper and map writer. It emits `TrackerEffect` and takes `TrackerEvent`. capacity:
+    agents beyond it are refused; None: no limit."""
 
     tracks_agents: ClassVar[bool] = True
 
@@ -173,7 +171,7 @@ class TrackingEdge(Edge):
         event: TrackerReady | TrackerAnswered | TrackerLost,
         now_ns: int,
     ) -> None:
-        """Its tracker says so."""
+        """Handle an event of the run's present tracker."""
         peer = self._registry[peer_id]
         match event:
             case TrackerReady():
@@ -186,12 +184,12 @@ class TrackingEdge(Edge):
             case TrackerLost():
                 should_restart = tracker.record_loss()
                 self._record(
-                    now_ns, "tracking lost", peer, f"its process {event.reason}; odometry begins anew"
+                    now_ns, "tracking lost", peer, f"its process {event.reason}; odometry starts again"
                 )
                 if should_restart:
                     self._emit(tracker.start())
-                else:  # it says hello again after a while
-                    self._send(peer_id, wire.Refused(f"the process that is to track it {event.reason}"))
+                else:  # it sends a hello again after a while
+                    self._send(peer_id, wire.Refused(f"its tracking process {event.reason}"))
 
     def _on_agent_message(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
         if isinstance(message, wire.Status):
@@ -218,7 +216,7 @@ class TrackingEdge(Edge):
         )
 
     def _tracking_objection(self, key: str | None, rig: Rig) -> str | None:
-        """Why no tracker can begin for this run, or for a new one, if none can."""
+        """Return why no tracker can start for this run (key None: a new run); None if one can."""
         running = [
             tracker.rig for other, tracker in self._trackers.items() if tracker.is_running and other != key
         ]
@@ -234,7 +232,7 @@ class TrackingEdge(Edge):
         del self._trackers[peer.key]
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
-        """Now, or as soon as its tracker is ready."""
+        """Send the welcome now, or as soon as the tracker is ready."""
         tracker = self._trackers[peer.key]
         self._emit(tracker.start())
         if tracker.is_ready:

@@ -1,4 +1,4 @@
-"""Which messages of an edge can be true: an agent believes no others, whoever the edge is."""
+"""Plausibility checks on an edge's messages, and limits on the lines that its faults may print."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from share.wire import messages as m
 
 
 class ReplyValidator:
-    """Of one agent, by its ledger and the lives of the edge that it knows.
+    """Checks the messages of an edge against the agent's ledger and the edge sessions that it knows.
 
-    What is not believed is counted, and each kind is said once.
+    Rejected messages are counted; each kind is printed once.
     """
 
     def __init__(
@@ -24,59 +24,59 @@ class ReplyValidator:
         line_limiter: LineLimiter,
         print_line: Callable[[str], None],
     ) -> None:
-        """lines: limits what is said; say: is told a line that may be."""
+        """line_limiter: limits the lines given to `print_line`."""
         self.bad_messages = 0
-        self._ledger, self._sessions, self._line_limiter, self._print_line = (
-            ledger,
-            sessions,
-            line_limiter,
-            print_line,
-        )
+        self._ledger, self._sessions = ledger, sessions
+        self._line_limiter, self._print_line = line_limiter, print_line
 
     def report_invalid(self, text: str, now_ns: int) -> None:
-        """A message that no edge should send."""
+        """Count a message that no edge should send, and print it if new."""
         self.bad_messages += 1
         if (line := self._line_limiter.admit_once(text, now_ns)) is not None:
             self._print_line(line)
 
     def accepts_welcome(self, welcome: m.Welcome, now_ns: int) -> bool:
-        """Whether this welcome is of the present life of the edge, or of a new one that was asked."""
+        """Return whether this welcome is of the present session, or of a new one that was asked for."""
         if self._sessions.is_past(welcome.session):
             return False
         if self._reports_unsent("a welcome", now_ns, welcome.next_keyframe - 1):
             return False
         if self._sessions.is_unsolicited(welcome.session):
-            self.report_invalid("the edge sent a welcome that nobody asked for; it is not believed", now_ns)
+            self.report_invalid("the edge sent a welcome without a hello; ignored", now_ns)
             return False
         return True
 
     def accepts_correction(self, correction: Correction, now_ns: int) -> bool:
-        """Whether it speaks of keyframes that the edge can have."""
-        return not self._reports_unsent("a correction", now_ns, correction.about, correction.answers)
+        """Return whether it refers to keyframes that the edge can have."""
+        return not self._reports_unsent(
+            "a correction", now_ns, correction.segment_keyframe, correction.answered_keyframe
+        )
 
     def take_ack(self, ack: m.Ack, now_ns: int) -> None:
-        """Into the ledger, which refuses what an earlier life of the edge says, too: that is no lie."""
+        """Apply an acknowledgement to the ledger. One of an earlier session is rejected, but is no fault."""
         if not self._ledger.acknowledge(ack):
-            self._reports_unsent("an acknowledgement", now_ns, ack.next_keyframe - 1, *ack.held)
+            self._reports_unsent("an acknowledgement", now_ns, ack.next_keyframe - 1, *ack.buffered)
 
     def _reports_unsent(self, message_name: str, now_ns: int, *keyframes: int) -> bool:
         unsent = max(keyframes, default=-1) >= self._ledger.next_unsent_id
         if unsent:
             self.report_invalid(
-                f"the edge sent {message_name} of keyframes that were never sent; it is not believed", now_ns
+                f"the edge sent {message_name} of keyframes that were never sent; ignored", now_ns
             )
         return unsent
 
 
-# ---- Lives of the edge as an agent sees them: which is the present one, and how far its corrections are.
-
-_MAX_SESSIONS = 16  # earlier lives, whose messages may still be on their way
-_MAX_REORDERING = 1000  # corrections that a network may deliver in another order; a longer step back is none
+_MAX_SESSIONS = 16  # remembered sessions: their messages may still be in flight
+_MAX_REORDERING = (
+    1000  # corrections that a network may reorder; a larger step back is a restart of the counter
+)
 
 
 class EdgeSessions:
-    """`session` numbers the present life, None before the first. A life begins with the answer to a hello, so
-    an edge that names new ones unasked cannot make the agent begin anew with each message."""
+    """Sessions of the edge as the agent sees them. session: the present one; None before the first.
+
+    A session starts with the answer to a hello, so an edge that names new sessions unasked cannot reset the
+    agent with each message."""
 
     def __init__(self) -> None:
         self.session: int | None = None
@@ -85,15 +85,15 @@ class EdgeSessions:
         self._welcome_expected = False
 
     def __len__(self) -> int:
-        """How many there were, of those remembered."""
+        """Number of remembered sessions."""
         return len(self._recent)
 
     def expect_welcome(self) -> None:
-        """A hello is on its way."""
+        """Record that a hello was sent."""
         self._welcome_expected = True
 
     def is_past(self, session: int) -> bool:
-        """Whether a message of it was overtaken on its way by one of a later life."""
+        """Return whether a message of this session was overtaken by one of a later session."""
         return session != self.session and session in self._recent
 
     def is_unsolicited(self, session: int) -> bool:
@@ -104,30 +104,30 @@ class EdgeSessions:
         self._recent.append(session)
 
     def accept_revision(self, revision: int) -> bool:
-        """Whether a correction is newer than all before; takes note of it. By serial number arithmetic, as in
-        RFC 1982: one absurd revision does not make all that follow it old."""
+        """Record a revision; return whether it is newer than all before. Serial number arithmetic as in RFC
+        1982: one absurd revision does not make all later ones old."""
         newer = revision > self.revision or revision < self.revision - _MAX_REORDERING
         if newer:
             self.revision = revision
         return newer
 
 
-# ---- Lines for a person, so few that nobody who causes them can fill a terminal or a log.
-
-_LINE_BURST, _LINE_HZ = 20.0, 0.2  # lines at once, and then one each 5 s
-_MAX_REMEMBERED_LINES = 16  # complaints
-_MAX_LINE_LENGTH = 300
-_QUIET_NS = 60_000_000_000
+# Limits on lines for a person, so that a peer cannot fill a terminal or a log.
+_LINE_BURST = 20.0  # lines at once
+_LINE_HZ = 0.2  # and one each 5 s after that
+_MAX_REMEMBERED_LINES = 16
+_MAX_LINE_LENGTH = 300  # characters
+_QUIET_NS = 60_000_000_000  # a fault absent for this long is new again
 
 
 class FaultDeduplicator:
-    """Of a trouble that comes and goes: whether it is to be said."""
+    """Decides whether a fault that comes and goes is reported again."""
 
     def __init__(self) -> None:
-        self._last_seen_ns: dict[str, int] = {}  # when it was last there
+        self._last_seen_ns: dict[str, int] = {}  # by text
 
     def is_new(self, text: str, now_ns: int) -> bool:
-        """It is there: True the first time, and where it had been gone for a minute."""
+        """Record a fault. Return True the first time, and after it was absent for a minute."""
         last_ns = self._last_seen_ns.pop(text, None)
         self._last_seen_ns[text] = now_ns
         if len(self._last_seen_ns) > _MAX_REMEMBERED_LINES:
@@ -136,7 +136,7 @@ class FaultDeduplicator:
 
 
 class LineLimiter:
-    """What may be said now. What was left out is counted, and told with the next line."""
+    """Limits the rate of lines. Suppressed lines are counted in the next one."""
 
     def __init__(self) -> None:
         self._bucket = TokenBucket(_LINE_BURST)
@@ -145,16 +145,16 @@ class LineLimiter:
         self._suppressed = 0
 
     def admit(self, text: str, now_ns: int) -> str | None:
-        """The line in printable characters; None where it is left out."""
+        """Return the line in printable characters; None if it is suppressed."""
         if not self._bucket.take(now_ns):
             self._suppressed += 1
             return None
         suppressed, self._suppressed = self._suppressed, 0
         line = "".join(c if c.isprintable() else "?" for c in text[:_MAX_LINE_LENGTH])
-        return f"{line} ({suppressed} lines before this were left out)" if suppressed else line
+        return f"{line} ({suppressed} lines before this were suppressed)" if suppressed else line
 
     def admit_once(self, text: str, now_ns: int) -> str | None:
-        """The same; None too where this was said lately."""
+        """Return the line as `admit` does; None too if it is among the recent ones."""
         if text in self._recent_lines:
             return None
         self._recent_lines.append(text)

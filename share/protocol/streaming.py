@@ -1,4 +1,4 @@
-"""Frames on their way to somebody who answers them in order: few under way, and the newest waits."""
+"""Frames streamed to a peer that answers them in order: a bounded window, in which the newest frame waits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from share.wire.messages import MAX_IMU_SAMPLES, RemoteTrackingResult
 
 @dataclass(frozen=True, eq=False)
 class InFlightFrame:
-    """A frame under way: when it came, and when it went."""
+    """A frame that was sent and is not answered."""
 
     frame: Frame
     arrived_ns: int
@@ -23,14 +23,14 @@ class InFlightFrame:
 
 
 class FrameWindow:
-    """At most `capacity` frames under way. Of those that find no room the newest waits, the older is dropped
-    (policy `drop_frame`); what the IMU said meanwhile goes with the next, the newest MAX_SAMPLES of it."""
+    """At most `capacity` frames in flight. Of frames beyond, the newest waits and older ones are dropped
+    (policy drop_frame); their IMU samples go with the next frame, at most MAX_IMU_SAMPLES, the newest."""
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._in_flight: deque[InFlightFrame] = deque()
-        self._waiting: tuple[Frame, int] | None = None  # and when it came
-        self._skipped_imu = ImuBatch.empty()  # of frames that did not go, since the last that went
+        self._waiting: tuple[Frame, int] | None = None  # a frame and its arrival, ns
+        self._skipped_imu = ImuBatch.empty()  # of frames not sent since the last that was
         self.dropped = 0
         self.unanswered = 0
 
@@ -39,18 +39,19 @@ class FrameWindow:
         return not self._in_flight and self._waiting is None
 
     def offer(self, frame: Frame, arrived_ns: int) -> None:
-        """The newest frame; `next` says when it goes."""
+        """Add the newest frame; `take_next` returns it when it may be sent."""
         if self._waiting is not None:
             self.dropped += 1
             self.skip(self._waiting[0])
         self._waiting = frame, arrived_ns
 
     def skip(self, frame: Frame) -> None:
-        """This one does not go."""
+        """Do not send this frame; keep its IMU samples for the next."""
         self._skipped_imu = self._skipped_imu.concatenate(frame.imu).take(slice(-MAX_IMU_SAMPLES, None))
 
     def take_next(self, now_ns: int) -> Frame | None:
-        """The frame that goes now, with all that the IMU said since the last that went."""
+        """Return the frame to send now, with all IMU samples since the last sent frame; None if there is
+        none."""
         if self._waiting is None or len(self._in_flight) >= self._capacity:
             return None
         (frame, arrived_ns), self._waiting = self._waiting, None
@@ -61,22 +62,22 @@ class FrameWindow:
         return frame
 
     def cancel(self, index: int) -> None:
-        """The newest, number `index`, could not go after all."""
+        """Take back the newest sent frame, number `index`: the link refused it."""
         if self._in_flight and self._in_flight[-1].frame.index == index:
             self.skip(self._in_flight.pop().frame)
 
     def take_answered(self, index: int) -> InFlightFrame | None:
-        """The frame, if it was still waited for. Those that went before it will not be answered any more."""
+        """Return the answered frame if it is in flight. Frames sent before it count as unanswered."""
         self._discard_while(lambda sent: sent.frame.index < index)
         is_in_flight = self._in_flight and self._in_flight[0].frame.index == index
         return self._in_flight.popleft() if is_in_flight else None
 
     def expire(self, before_ns: int) -> None:
-        """No answer is expected any more to what went before then."""
+        """Give up on frames sent before this time."""
         self._discard_while(lambda sent: sent.sent_ns < before_ns)
 
     def clear(self) -> None:
-        """Nor to anything under way."""
+        """Give up on all frames in flight."""
         self._discard_while(lambda sent: True)
 
     def _discard_while(self, is_lost: Callable[[InFlightFrame], bool]) -> None:
@@ -85,17 +86,15 @@ class FrameWindow:
             self.unanswered += 1
 
 
-# ---- An agent that does not track itself: its frames go up, poses come back.
-
-
 class FrameStreamer:
-    """Which frames go, and what became of them. One that gets no answer was not tracked."""
+    """The agent's side of remote tracking: frames up, poses down. A frame without an answer was not
+    tracked."""
 
     def __init__(self, config: StreamConfig) -> None:
         self._timeout_ns = seconds_to_ns(config.patience_s)
         self._window = FrameWindow(config.window)
         self._counts: Counter[str] = Counter()
-        self._segment_broken = False  # what comes is of another odometry, though no frame has said so yet
+        self._segment_broken = False  # the next pose starts a segment
 
     @property
     def is_idle(self) -> bool:
@@ -110,29 +109,29 @@ class FrameStreamer:
             self._window.skip(event.frame)
 
     def next_frame(self, now_ns: int) -> Frame | None:
-        """The frame that goes up now."""
+        """Return the frame to send now; None if there is none."""
         self._window.expire(now_ns - self._timeout_ns)
         frame = self._window.take_next(now_ns)
         self._counts["streamed"] += frame is not None
         return frame
 
     def cancel(self, index: int) -> None:
-        """The link did not take it."""
+        """Record that the link refused frame `index`."""
         self._counts["drop_link"] += 1
         self._counts["streamed"] -= 1
         self._window.cancel(index)
 
     def reset(self) -> None:
-        """It knows nothing of what is under way, and its odometry begins anew."""
+        """Start over with a new edge session: frames in flight are lost and odometry starts a segment."""
         self._window.clear()
         self._segment_broken = True
 
     def take_result(self, result: RemoteTrackingResult, now_ns: int) -> ev.FrameTracked | None:
-        """The frame that was answered; None if it is not waited for any more."""
+        """Return the tracked frame that this result answers; None if it is too late."""
         sent = self._window.take_answered(result.index)
         if sent is None:
             self._counts["late"] += 1
-            self._segment_broken = self._segment_broken or result.new_stretch  # so is what comes after it
+            self._segment_broken = self._segment_broken or result.new_segment  # for the next pose
             return None
         self._counts["answered"] += 1
         starts_segment = self._segment_broken and result.state.has_pose
@@ -144,13 +143,13 @@ class FrameStreamer:
             done_ns=now_ns,
             state=result.state,
             T_odom_body=result.T_odom_body,
-            is_keyframe=result.keyframe,
-            new_segment=result.new_stretch or starts_segment,
-            waiting_for=result.waits,
+            is_keyframe=result.is_keyframe,
+            new_segment=result.new_segment or starts_segment,
+            waiting_for=result.waiting_for,
         )
 
     def report(self) -> dict[str, int]:
-        """Frames: how many came, went, were answered; were dropped for a newer one, for want of an edge or of
-        room in the link, and went but were not answered in time."""
+        """Return counts of frames. drop_frame: dropped for a newer one; drop_link: no edge, or a full link;
+        unanswered: sent, but not answered in time."""
         named = {name: self._counts[name] for name in ("arrived", "streamed", "answered", "drop_link")}
         return named | {"drop_frame": self._window.dropped, "unanswered": self._window.unanswered}

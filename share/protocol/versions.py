@@ -1,8 +1,7 @@
-"""Agents and edges of different releases: each learns which wire version the other speaks, and says in one
-line which is to be upgraded. Neither takes the other's messages.
+"""Wire version mismatch between agent and edge: each finds the other's version and says which to upgrade.
 
-An edge refuses whoever speaks another version, in a message of that version. An older edge answers nothing;
-its agent finds out by pings of older versions, of which such an edge answers that of its own.
+An edge refuses a peer of another version, in a message of that version. An older edge does not answer; the
+agent finds its version by pings of older versions, of which such an edge answers its own.
 """
 
 from __future__ import annotations
@@ -16,60 +15,57 @@ from share.timing import Throttle
 from share.wire.codec import OLDEST_VERSION, WIRE_VERSION, Bytes, decode, encode, message_code
 from share.wire.messages import Ping, Pong
 
-_REFUSE_HZ = 0.5  # an agent of another version is answered at most so often
-_MAX_UNANSWERED = 2  # hellos without an answer before older versions are tried
+_REFUSE_HZ = 0.5  # refusals a second per peer, at most
+_MAX_UNANSWERED = 2  # unanswered hellos before older versions are tried
 _OLDER_VERSIONS = range(OLDEST_VERSION, WIRE_VERSION)
 
 
 def upgrade_advice(edge_version: int, agent_version: int) -> str:
-    """By their wire versions."""
+    """Return which side to upgrade, by their wire versions."""
     return "upgrade the agent" if agent_version < edge_version else "upgrade the edge"
 
 
 class VersionRefusals:
-    """At the edge: what is said to peers of other wire versions."""
+    """The edge's refusals of peers with other wire versions."""
 
     def __init__(self) -> None:
         self._throttle = Throttle(_REFUSE_HZ, 1.0)
 
     def refusal(self, peer_id: bytes, error: VersionError, now_ns: int) -> str | None:
-        """The line to refuse it by; None where it has just been said, or where this was a ping.
+        """Return the reason for a refusal; None if it was just sent, or for a ping.
 
-        A ping of an older version is a newer agent's question, whose answer would be that this is an edge of
-        that version.
+        A ping of an older version is a newer agent's probe: an answer would mean an edge of that version.
         """
         if error.code == message_code(Ping) or self._throttle.admit(peer_id, now_ns) is None:
             return None
         own_text = f"this edge is SHARE {__version__} (wire {WIRE_VERSION})"
         return (
-            f"{own_text}, this agent "
-            f"speaks wire {error.version}: "
+            f"{own_text}, this agent speaks wire {error.version}: "
             f"{upgrade_advice(WIRE_VERSION, error.version)}"
         )
 
 
 class EdgeVersionProbe:
-    """At the agent: finds out the wire version of an edge that does not answer it."""
+    """The agent's probe for the wire version of an edge that does not answer."""
 
     def __init__(self) -> None:
-        self._is_reached = False  # the link, an edge
-        self._hello_count = 0  # hellos since then, or since it last answered
-        self._pings: deque[tuple[int, Ping]] = deque(
-            maxlen=4 * len(_OLDER_VERSIONS)
-        )  # under way, with their versions
+        self._is_reached = False  # the link has reached an edge
+        self._hello_count = 0  # since then, or since the last answer
+        # version and ping, in flight
+        self._pings: deque[tuple[int, Ping]] = deque(maxlen=4 * len(_OLDER_VERSIONS))
         self._reported: int | None = None
 
     def mark_reached(self) -> None:
-        """The link has reached an edge, perhaps another one."""
+        """Record that the link has reached an edge, perhaps another one."""
         self._is_reached, self._hello_count = True, 0
 
     def mark_answered(self) -> None:
-        """The edge speaks our version."""
+        """Record that the edge speaks our version."""
         self._hello_count, self._reported = 0, None
         self._pings.clear()
 
     def pings(self, now_ns: int) -> list[list[Bytes]]:
-        """What is to be sent with a hello: nothing at first, then a ping of each older version."""
+        """Return what to send with a hello: nothing at first, then a ping of each older version."""
         self._hello_count += self._is_reached
         if self._hello_count <= _MAX_UNANSWERED:
             return []
@@ -78,9 +74,9 @@ class EdgeVersionProbe:
         return [encode(ping, version) for version, ping in pings]
 
     def check_message(self, frames: Sequence[Bytes], error: VersionError) -> str | None:
-        """What to say, once, of a message of another version; None where it answers no ping.
+        """Return the line to print for a message of an older version, once; None if it answers no ping.
 
-        Raises WireError where it is none of an older version that can be understood.
+        Raises WireError if it is no pong of an older version.
         """
         if error.version not in _OLDER_VERSIONS:
             raise error
@@ -95,6 +91,6 @@ class EdgeVersionProbe:
 
 
 def older_edge_text(version: int) -> str:
-    """For a person at the agent."""
+    """Return the agent's line for an edge of an older version."""
     own_text = f"this SHARE {__version__} wire {WIRE_VERSION}"
     return f"the edge speaks wire {version}, {own_text}: {upgrade_advice(version, WIRE_VERSION)}"

@@ -1,7 +1,8 @@
 """Read and write calibration files: Kalibr's chains, EuRoC's sensor.yaml, camera.yaml of RGB-D folders.
 
 The body is the IMU's frame, or cam0's if there is no IMU. Cameras are pinhole with radial-tangential,
-equidistant (fisheye) or no distortion; other models are refused by name. docs/lookup/data.md specifies the files.
+equidistant (fisheye) or no distortion; other models are refused by name. docs/lookup/data.md specifies the
+files.
 """
 
 from __future__ import annotations

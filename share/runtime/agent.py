@@ -118,7 +118,9 @@ class AgentRun:
             pose_feed,
         )
         self._late_dropper = LateFrameDropper(settings.agent.late_ms)
-        self._lateness_monitor = LatenessMonitor(notify, "the edge" if hello.streams else "this machine")
+        self._lateness_monitor = LatenessMonitor(
+            notify, "the edge" if hello.streams_frames else "this machine"
+        )
         self._counters = SequencerCounters()
         self._link = connect()  # last: whatever is wrong with the above has been said by now
         self._shared = _Shared()

@@ -32,7 +32,7 @@ METRICS = (
     MetricSpec("share_edge_waiting_keyframes", "Keyframes that wait to be looked up.", "waiting"),
     MetricSpec("share_edge_last_solve_age_seconds", "Time since poses were solved for.", "last_solve_s"),
     MetricSpec("share_edge_troubles", "What is wrong now; /health says what.", "trouble"),
-    MetricSpec("share_edge_failed_jobs_total", "Jobs that raised an error.", "failed_jobs"),
+    MetricSpec("share_edge_failed_jobs_total", "Jobs that raised an error.", "failed_steps"),
     MetricSpec(
         "share_edge_refused_handshakes_total", "Attempts to connect without a key.", "refused_handshakes"
     ),
@@ -65,10 +65,10 @@ METRICS = (
         "share_edge_queries_skipped_total", "Keyframes not looked up.", "queries_skipped", *_PER_AGENT
     ),
     MetricSpec(
-        "share_edge_stranger_bytes_total", "Bytes from peers that are no agents.", "strangers.bytes_up"
+        "share_edge_stranger_bytes_total", "Bytes from peers that are no agents.", "unjoined.bytes_up"
     ),
     MetricSpec(
-        "share_edge_stranger_bad_messages_total", "Malformed, from such peers.", "strangers.bad_messages"
+        "share_edge_stranger_bad_messages_total", "Malformed, from such peers.", "unjoined.bad_messages"
     ),
 )
 _INFO = ("share_edge_agent_info", "What an agent is now; always 1.", ("agent", "kind", "state", "map"))

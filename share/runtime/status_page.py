@@ -126,7 +126,7 @@ function show(now) {
   const about = [`up ${lasted(now.uptime_s)}`];
   if (now.waiting !== undefined) about.push(`waiting ${shown(now.waiting)}`);
   if (typeof now.last_solve_s === "number") about.push(`solved ${lasted(now.last_solve_s)} ago`);
-  if (now.failed_jobs) about.push(`failed jobs ${now.failed_jobs}`);
+  if (now.failed_steps) about.push(`failed steps ${now.failed_steps}`);
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
   const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
   table("agents",

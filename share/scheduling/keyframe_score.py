@@ -1,4 +1,4 @@
-"""Which keyframes to send where not all may be: those from which a place is found more likely than usual."""
+"""Score of keyframe candidates under a rate limit: prefer places that are recognised more often."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 
 from share.types import View
 
-_WINDOW = 20  # candidates, with which one is compared
-_MAX_DEPTH_M = 20.0  # farther than this is no better
+_WINDOW = 20  # recent candidates with which one is compared
+_MAX_DEPTH_M = 20.0  # depth beyond which the score does not grow
 
 
 def median_depth_m(view: View) -> float:
-    """Median distance of its points in front of the camera; 0 without points.
+    """Return the median depth of a view's points, m; 0 without points.
 
-    Who sees far sees what others have seen too; a view of what is near is found again from there only.
+    A view of distant structure overlaps with views from elsewhere; a close-up is recognised from the same
+    spot only.
     """
     depth = view.points[:, 2]
     valid = depth[np.isfinite(depth)]
@@ -24,13 +25,13 @@ def median_depth_m(view: View) -> float:
 
 
 class KeyframeScore:
-    """Of the candidates of one agent."""
+    """Scores the candidates of one agent."""
 
     def __init__(self) -> None:
         self._recent_scores: deque[float] = deque(maxlen=_WINDOW)
 
     def is_above_median(self, view: View) -> bool:
-        """Whether it is worth no less than half of those of late."""
+        """Return whether the view scores at least the median of the recent ones, itself included."""
         score = median_depth_m(view)
         self._recent_scores.append(score)
         return score >= median(self._recent_scores)

@@ -1,4 +1,8 @@
-"""Which verified loops are merged, judged from two poses: those that overlap as others did."""
+"""The merge gate: skips merges with little view overlap compared with previous merges.
+
+P_skip = max(0, 1 - alpha_m V_new / V), V the mean overlap of the last N completed merges. Source: SHARE,
+IMWUT 10(3) 97, 2026.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +17,10 @@ from share.scheduling.overlap import Frustum, SampledFrustum, overlap_volumes
 from share.scheduling.policies import POLICIES
 from share.types import F64
 
-# ---- Which merges are skipped: those whose overlap is small against that of the merges before.
-#
-# P_skip = max(0, 1 - alpha_m V_new / V), V the mean overlap of the last N completed merges. Source: SHARE,
-# IMWUT 10(3) 97, 2026.
-
 
 @dataclass(frozen=True)
 class MergeGateState:
-    """eagerness: alpha_m; last: N. volumes: overlaps of merges that were completed, m^3, oldest first."""
+    """eagerness: alpha_m. window: N. overlap_volumes: of the last completed merges, m^3, oldest first."""
 
     eagerness: float
     window: int
@@ -32,13 +31,13 @@ class MergeGateState:
         return cls(config.eagerness, config.merges)
 
     def after_merge(self, volume: float) -> MergeGateState:
-        """After a merge with this overlap."""
+        """Return the state after a merge with this overlap, m^3."""
         return MergeGateState(self.eagerness, self.window, (*self.overlap_volumes, volume)[-self.window :])
 
     def skip_probability(self, volume: float, same_map: bool) -> float:
-        """Of a merge with this overlap, m^3. joined: the two sides are in one map already.
+        """Return P_skip of a merge with this overlap, m^3. same_map: both sides are in one map already.
 
-        0 for maps that are not joined yet, and where nothing was merged that it could be compared with.
+        0 between two maps, and without completed merges.
         """
         total = sum(self.overlap_volumes)
         if not same_map or total <= 0:
@@ -46,15 +45,15 @@ class MergeGateState:
         return max(0.0, 1 - self.eagerness * volume * len(self.overlap_volumes) / total)
 
     def should_skip(self, volume: float, same_map: bool, draw: float) -> bool:
-        """Whether it is left out. draw: uniform in [0, 1), the caller's."""
+        """Return whether to skip the merge. draw: uniform in [0, 1)."""
         return draw < self.skip_probability(volume, same_map)
 
 
-_CACHED_CAMERAS = 64  # remembered: agents have few sorts of them
+_CACHED_CAMERAS = 64  # sampled frusta kept; agents have few kinds of camera
 
 
 class MergeGate:
-    """Of one edge, by its policy; one that gates nothing lets everything through."""
+    """The merge gate of one edge. It skips nothing if the policy has no gate."""
 
     def __init__(self, config: ControlConfig, policy: str) -> None:
         self._is_enabled = POLICIES[policy].has_merge_gate
@@ -68,7 +67,8 @@ class MergeGate:
         self._sampled_frustum = sampled_frustum
 
     def overlap_volume(self, a: Rig, b: Rig, T_a_b: F64) -> float:
-        """m^3 that cam0 of both agents see; b's body stands at T_a_b (4, 4) as seen from a's."""
+        """Return the volume that cam0 of both agents see, m^3; 0 without a gate. T_a_b (4, 4): of their
+        bodies."""
         if not self._is_enabled:
             return 0.0
         T_a_camb = T_a_b @ b.T_body_cam0
@@ -79,15 +79,13 @@ class MergeGate:
         )
 
     def skip_reason(self, volume: float, same_map: bool) -> str:
-        """Why a merge with this overlap is skipped, for a person; empty if it is not. joined: the two are in
-        one map already."""
+        """Return why a merge with this overlap is skipped, for a person; empty if it is not. same_map: both
+        sides are in one map already."""
         if not self._is_enabled or not self._state.should_skip(volume, same_map, float(self._rng.random())):
             return ""
         probability = self._state.skip_probability(volume, same_map)
-        return (
-            f"would add little: views overlap by {volume:.1f} m³, skipped with a chance of {probability:.0%}"
-        )
+        return f"small gain: views overlap by {volume:.1f} m³, skipped with probability {probability:.0%}"
 
     def record_merge(self, volume: float) -> None:
-        """A merge with this overlap was done."""
+        """Record a completed merge with this overlap, m^3."""
         self._state = self._state.after_merge(volume)

@@ -1,10 +1,10 @@
-"""How much two views have in common, from poses and fields of view alone: frusta on grids of points.
+"""Overlap of two view frusta from poses and fields of view alone, by grid sampling.
 
-The grid belongs to the frustum and moves with the camera: points ((i + 1/2) delta, (j + 1/2) delta) in layers
-of equal depth, delta or a little less, from near to far; those that lie in the frustum count, each for an
-equal part of its volume. V_overlap is the mean of what a's points in b tell, and b's points in a. So
-overlap(a, b) = overlap(b, a), a frustum overlaps itself wholly, and the world's origin does not matter.
-Source: SHARE, IMWUT 10(3) 97, 2026, which leaves the grid open.
+The grid is fixed to the camera: points ((i + 1/2) delta, (j + 1/2) delta) in layers of equal depth, delta or
+slightly less apart, from near to far. Points inside the frustum count, each for an equal part of its volume.
+V_overlap is the mean of two estimates, by a's points in b and by b's points in a, so it is symmetric, a
+frustum overlaps itself completely, and the world's origin does not matter. Source: SHARE, IMWUT 10(3) 97,
+2026, which leaves the grid open.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from share.geometry.camera import Camera
 from share.geometry.se3 import inverse
 from share.types import F64, I64
 
-_MAX_FIELD_RAD = math.radians(160)  # beyond, it is no pinhole
-_MIN_SAMPLES, _MAX_SAMPLES = 3, 80  # points along half a side and along the depth, whatever their interval
-_BORDER_TOLERANCE_M = 1e-9  # a point on the border is inside, on whatever side rounding puts it
+_MAX_FIELD_RAD = math.radians(160)  # a wider field of view is clipped: it is no pinhole
+_MIN_SAMPLES, _MAX_SAMPLES = 3, 80  # points along half a side and along the depth, whatever the interval
+_BORDER_TOLERANCE_M = 1e-9  # a point on the border counts as inside, in spite of rounding
 
 
 @dataclass(frozen=True)
 class Frustum:
-    """What a camera sees, in its frame: near_m <= z <= far_m; |x|, |y| up to tan(half the field of view) z.
+    """View frustum in the camera frame: near_m <= z <= far_m, |x| and |y| up to tan(half field of view) z.
 
     Raises ValueError if a field of view is not between 0 and pi, or not 0 <= near_m < far_m.
     """
@@ -39,17 +39,17 @@ class Frustum:
         if not (0 < self.horizontal_rad < math.pi and 0 < self.vertical_rad < math.pi):
             raise ValueError("frustum: fields of view must be between 0 and pi")
         if not 0 <= self.near_m < self.far_m:
-            raise ValueError(f"frustum: from {self.near_m} to {self.far_m} m is no depth")
+            raise ValueError(f"frustum: near {self.near_m} m must be at least 0 and below far {self.far_m} m")
 
     @classmethod
     def from_camera(cls, camera: Camera, near_m: float, far_m: float) -> Frustum:
-        """By its focal lengths and the size of its image, as if centred and without distortion."""
+        """Return the frustum by focal lengths and image size, ignoring principal point and distortion."""
         horizontal, vertical = camera.field_of_view_rad
         return cls(min(horizontal, _MAX_FIELD_RAD), min(vertical, _MAX_FIELD_RAD), near_m, far_m)
 
     @property
     def slopes(self) -> tuple[float, float]:
-        """Most of |x| / z and of |y| / z."""
+        """Largest |x| / z and |y| / z."""
         return math.tan(self.horizontal_rad / 2), math.tan(self.vertical_rad / 2)
 
     @property
@@ -60,7 +60,7 @@ class Frustum:
 
     @property
     def planes(self) -> F64:
-        """(6, 4): a point p (homogeneous) is inside where all of planes @ p, distances in m, are >= 0."""
+        """(6, 4): a homogeneous point p is inside if all distances planes @ p, m, are >= 0."""
         sx, sy = self.slopes
         sides = np.array([[-1, 0, sx, 0], [1, 0, sx, 0], [0, -1, sy, 0], [0, 1, sy, 0]])
         ends = np.array([[0, 0, 1, -self.near_m], [0, 0, -1, self.far_m]])
@@ -68,7 +68,7 @@ class Frustum:
 
     @property
     def bounding_sphere(self) -> tuple[float, float]:
-        """z of the centre and radius of the least sphere around it, m."""
+        """z of the centre and radius of the smallest enclosing sphere, m."""
         sx, sy = self.slopes
         square = 1 + sx**2 + sy**2
         z = min(self.far_m, square * (self.far_m + self.near_m) / 2)
@@ -76,7 +76,7 @@ class Frustum:
 
 
 class SampledFrustum:
-    """What views of one camera see: a frustum, sampled about `interval_m` apart."""
+    """The frustum of one camera with sample points about `interval_m` apart."""
 
     def __init__(self, frustum: Frustum, interval_m: float) -> None:
         self.frustum = frustum
@@ -85,8 +85,10 @@ class SampledFrustum:
         self.centre, self.radius = frustum.bounding_sphere
 
     def volume_inside(self, other: SampledFrustum, T_other_self: F64) -> F64:
-        """How much of it, m^3, lies in `other`, from where it stands at T_other_self (N, 4, 4): (N,)."""
-        planes = (other.planes @ T_other_self).transpose(1, 0, 2)  # (6, N, 4): first, so that min is quick
+        """Return its volume inside `other`, m^3 (N,), for poses T_other_self (N, 4, 4)."""
+        planes = (other.planes @ T_other_self).transpose(
+            1, 0, 2
+        )  # (6, N, 4): planes first, so that min is fast
         distances = (planes.reshape(-1, 4) @ self.points).reshape(6, len(T_other_self), -1)
         count: I64 = np.count_nonzero(distances.min(axis=0) >= -_BORDER_TOLERANCE_M, axis=-1)
         volume: F64 = count * (self.frustum.volume / self.points.shape[1])
@@ -94,7 +96,7 @@ class SampledFrustum:
 
 
 def overlap_volumes(a: SampledFrustum, T_w_a: F64, b: SampledFrustum, T_w_b: F64) -> F64:
-    """V_overlap, m^3, of one view T_w_a (4, 4) of camera a with each view T_w_b (N, 4, 4) of b: (N,).
+    """Return V_overlap, m^3 (N,), of one view T_w_a (4, 4) of camera a with views T_w_b (N, 4, 4) of b.
 
     Poses are of cameras, z forward, in one frame.
     """
@@ -108,15 +110,15 @@ def overlap_volumes(a: SampledFrustum, T_w_a: F64, b: SampledFrustum, T_w_b: F64
 
 
 def ious(a: SampledFrustum, T_w_a: F64, b: SampledFrustum, T_w_b: F64) -> F64:
-    """V_overlap / V_union, 0 to 1, for the same: (N,)."""
+    """Return V_overlap / V_union (N,), 0 to 1; parameters as in `overlap_volumes`."""
     overlap = overlap_volumes(a, T_w_a, b, T_w_b)
     iou: F64 = overlap / (a.frustum.volume + b.frustum.volume - overlap)
     return iou
 
 
 def _sample_points(frustum: Frustum, interval_m: float) -> F64:
-    """Homogeneous points (4, M), M > 0. Where the interval is too wide or too narrow for the frustum, it is
-    changed: whatever an agent's calibration says, there are some points, and not too many."""
+    """Return homogeneous points (4, M), M > 0. The interval is clipped, so that M is bounded whatever an
+    agent's calibration is."""
     depth = frustum.far_m - frustum.near_m
     sizes = np.array([s * frustum.far_m for s in frustum.slopes] + [depth])
     steps = np.clip(interval_m, sizes / _MAX_SAMPLES, sizes / _MIN_SAMPLES)

@@ -1,11 +1,11 @@
-"""The controller of an agent's keyframe rate, one step per evaluation.
+"""PID controller of an agent's keyframe rate, one step per evaluation.
 
     e = Q* - Q;  P = Kp e;  I = clip(I + Ki e dt, +-I_max)
     d = alpha (e - e_prev)/dt + (1 - alpha) d_prev;  D = Kd d
     R = clip(R_prev + P + I + D, R_min, R_max)
 
 Source: SHARE, IMWUT 10(3) 97, 2026. Filtered derivative and bounded integral: Astrom and Hagglund,
-*Advanced PID Control* (2006). Every step adds to R, so an error that stays takes the rate to a bound.
+*Advanced PID Control* (2006). Each step adds to R, so a persistent error drives the rate to a bound.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from share.config import ControlConfig
 
 @dataclass(frozen=True)
 class PidGains:
-    """kp Hz, ki Hz/s, kd Hz s, per unit of QoE; alpha 0 .. 1; a dt beyond gap_s is a gap."""
+    """kp Hz, ki Hz/s, kd Hz s, per unit of QoE; alpha 0 .. 1; a dt above gap_s is a gap."""
 
     kp: float
     ki: float
@@ -35,7 +35,8 @@ class PidGains:
 
 @dataclass(frozen=True)
 class PidState:
-    """Of one agent after an evaluation. integral_hz: I; slope: d, 1/s; seen_ns: when; None: none so far."""
+    """State of one agent after an evaluation. integral_hz: I. derivative: d, 1/s. updated_ns: time of the
+    evaluation; None before the first."""
 
     rate_hz: float
     error: float = 0.0
@@ -45,9 +46,9 @@ class PidState:
 
 
 def step(state: PidState, error: float, now_ns: int, gains: PidGains) -> PidState:
-    """After an evaluation at `now_ns` whose QoE is short of the target by `error` (finite).
+    """Return the state after an evaluation at `now_ns`. error: target minus QoE, finite.
 
-    The first evaluation, one that is not after the last, and one after a gap tell no slope: d = 0, I is held.
+    The first evaluation, one with dt <= 0 and one after a gap have no derivative: d = 0, I is held.
     """
     dt = 0.0 if state.updated_ns is None else (now_ns - state.updated_ns) / 1e9
     integral, derivative = state.integral_hz, 0.0

@@ -1,6 +1,6 @@
-"""Who may send how much, and whether merges are gated: one class a policy.
+"""Scheduling policies: the keyframe rate of each agent, and whether merges are gated. One class a policy.
 
-Source: SHARE, IMWUT 10(3) 97, 2026, and what it is compared with there; see docs/understand/scheduling.md.
+Source: SHARE, IMWUT 10(3) 97, 2026, and its baselines; see docs/understand/scheduling.md.
 """
 
 from __future__ import annotations
@@ -20,28 +20,26 @@ from share.timing import RingBuffer
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
-# ---- The delay that an agent has whatever it sends: the least of late.
-#
-# Source: LEDBAT (RFC 6817, 3.4.2 and 4.2), which takes what a delay is above that for a queue's. Minima of
-# single minutes, the newest ten: who has come to a worse network is measured by the better one no longer.
-
 _MINUTE_NS = 60_000_000_000
-_BASE_DELAY_MINUTES = 10  # minutes
+_BASE_DELAY_MINUTES = 10  # after a change to a slower network the old minimum expires
 
 
 @dataclass(frozen=True)
 class BaseDelay:
-    """Of one agent. minima: ms by minute; none before the first delay."""
+    """Base delay of one agent: the minimum of the last minutes, which does not depend on what it sends.
+
+    minima: ms by minute. Source: LEDBAT (RFC 6817, 3.4.2 and 4.2), which attributes delay above it to
+    queues."""
 
     minima: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def ms(self) -> float:
-        """inf where nothing was heard."""
+        """The base delay, ms; inf before the first delay."""
         return min(self.minima.values(), default=math.inf)
 
     def with_delay(self, delay_ms: float, now_ns: int) -> BaseDelay:
-        """With one more, heard at `now_ns`."""
+        """Return the base delay with one more measurement, at `now_ns`."""
         minute = now_ns // _MINUTE_NS
         minima = {
             old_minute: minimum
@@ -52,16 +50,15 @@ class BaseDelay:
         return BaseDelay(minima)
 
 
-_FULL_DROP_MS = 1000.0  # a delay at which `linear` lets nothing pass but the least rate
+_FULL_DROP_MS = 1000.0  # delay at which `linear` allows only the minimum rate
 
 
 class Policy:
-    """Of one edge. It answers each evaluation of an agent with the rate that holds from then on.
+    """Sets the keyframe rate of each agent of one edge, one evaluation at a time.
 
-    gated: merges that would add little are skipped (`share.scheduling.merge_gate`). alike: headsets are not
-    served
-    before robots. limits: no agent is asked for more than `rate_max_hz`. raw: agents send what their sensors
-    see, the edge tracks each alone, nothing is shared.
+    has_merge_gate: merges with a small gain are skipped (`share.scheduling.merge_gate`). treats_alike:
+    headsets have no priority over robots. limits_rate: no rate exceeds `rate_max_hz`. streams_frames: agents
+    send raw frames, the edge tracks each alone, nothing is shared.
     """
 
     has_merge_gate: ClassVar[bool] = False
@@ -75,14 +72,15 @@ class Policy:
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
     ) -> float | None:
-        """Hz at which `agent` may send keyframes; None: no limit, as before its first evaluation.
+        """Return the rate in Hz at which `agent` may send keyframes; None: no limit, as before its first
+        evaluation.
 
-        delay_ms, error_cm: as for `qoe`. now_ns: of one clock for all, when the evaluation arrived.
+        delay_ms, error_cm: as in `qoe`. now_ns: arrival of the evaluation, by the edge's clock.
         """
         return None
 
     def forget(self, agent: str) -> None:
-        """It is gone; one of its name begins anew."""
+        """Drop the state of an agent; a later run of its name starts anew."""
 
 
 class CovinsGPolicy(Policy):
@@ -92,15 +90,15 @@ class CovinsGPolicy(Policy):
 
 
 class StreamedPolicy(Policy):
-    """No sharing: what agents would be without an own tracker and without each other."""
+    """No sharing: agents stream frames and the edge tracks each alone."""
 
     streams_frames = True
 
 
 class LinearPolicy(Policy):
-    """Of the highest rate, a part is dropped that grows with the delay: none at 20 ms, all at 1 s.
+    """The drop rate grows linearly with the delay: 0 at 20 ms, 1 at 1 s.
 
-    Never below the least rate: only who sends is evaluated, so who may send nothing would be silent for good.
+    Never below `rate_min_hz`: an agent that may send nothing would never be evaluated again.
     """
 
     has_merge_gate = True
@@ -113,10 +111,10 @@ class LinearPolicy(Policy):
 
 
 class SharePolicy(Policy):
-    """A PID controller for each agent takes its QoE to what it needs.
+    """A PID controller per agent drives its QoE to its target.
 
-    With `attribution`, a QoE that is short because of delay lowers the rate: more keyframes would add to it.
-    But not because of a delay that the agent has at any rate, of which 20 ms count.
+    With `attribution`, a QoE that is low because of delay lowers the rate, since more keyframes would add to
+    the delay. Of the base delay, which no rate avoids, at most 20 ms count.
     """
 
     has_merge_gate = True
@@ -147,7 +145,7 @@ class SharePolicy(Policy):
         self._base_delays.pop(agent, None)
 
     def _avoidable_delay_ms(self, agent: str, delay_ms: float, now_ns: int) -> float:
-        """ms, without what of the least delay of late is beyond 20 ms."""
+        """Return the delay without the part of the base delay above 20 ms."""
         base = self._base_delays[agent] = self._base_delays.get(agent, BaseDelay()).with_delay(
             delay_ms, now_ns
         )
@@ -158,7 +156,7 @@ class SharePolicy(Policy):
 
 
 class EqualPolicy(SharePolicy):
-    """As `SharePolicy`, but all are taken for headset wearers."""
+    """As `SharePolicy`, with the AR form of QoE for every agent."""
 
     treats_alike = True
 
@@ -167,8 +165,8 @@ class EqualPolicy(SharePolicy):
 
 
 class RandomPolicy(SharePolicy):
-    """As `SharePolicy`, with gains drawn from 0 to twice what is set, by `random_seed`, the same for all
-    agents."""
+    """As `SharePolicy`, with gains drawn uniformly from 0 to twice the configured ones by `random_seed`, the
+    same for all agents."""
 
     def __init__(self, config: ControlConfig) -> None:
         super().__init__(config)
@@ -188,13 +186,11 @@ POLICIES: dict[str, type[Policy]] = {
 }
 
 
-# ---- Who may send how many keyframes, and how it came to that: a policy, and what it has decided so far.
-
-_MAX_SERIES = 5000  # evaluations of an agent in a report, the newest: an hour at more than one a second
+_MAX_SERIES = 5000  # newest evaluations of an agent in a report: an hour at more than one a second
 
 
 class RatedEvaluation(NamedTuple):
-    """An evaluation, what it came to, and the rate since then; None where there is no limit."""
+    """An evaluation, its QoE, and the rate set by it; None: no limit."""
 
     t_s: float | None
     delay_ms: float | None
@@ -204,30 +200,30 @@ class RatedEvaluation(NamedTuple):
 
 
 class RateScheduler:
-    """Of one edge. Agents are known by their names here: a new run of one begins anew."""
+    """A policy and the history of its decisions, for one edge. Agents go by name; a new run starts anew."""
 
     REPORT_FIELDS: ClassVar = ("rate_hz", "qoe")
 
     def __init__(self, config: ControlConfig, policy: str) -> None:
         self._config, self._policy = config, POLICIES[policy](config)
-        self.max_rate_hz = config.rate_max_hz if self._policy.limits_rate else None  # that any agent may send
-        self._history: dict[str, RingBuffer] = {}  # of all runs of that name
-        self._latest: dict[str, RatedEvaluation] = {}  # of the present one
+        self.max_rate_hz = config.rate_max_hz if self._policy.limits_rate else None  # None: no limit
+        self._history: dict[str, RingBuffer] = {}  # of all runs of a name
+        self._latest: dict[str, RatedEvaluation] = {}  # of the present run
 
     def begin_run(self, agent: str) -> None:
-        """A new run; it may send as much as it likes until it is evaluated."""
+        """Start a new run of an agent, without a limit until its first evaluation."""
         self._policy.forget(agent)
         self._latest.pop(agent, None)
 
     def forget(self, agent: str) -> None:
-        """Nothing is remembered of that name."""
+        """Drop all state and history of a name."""
         self.begin_run(agent)
         self._history.pop(agent, None)
 
     def evaluate(
         self, agent: str, kind: AgentKind, evaluation: Evaluation, now_ns: int, t_s: float
     ) -> float | None:
-        """The rate, Hz, that is to be told; None without a limit. t_s: the time, for the report."""
+        """Return the rate to send to the agent, Hz; None: no limit. t_s: time for the report."""
         rate_hz = self._policy.rate(agent, kind, evaluation.delay_ms, evaluation.error_cm, now_ns)
         value = qoe(
             evaluation.delay_ms, evaluation.error_cm, QoeParameters.from_config(self._config, kind, agent)
@@ -240,12 +236,12 @@ class RateScheduler:
         return rate_hz
 
     def report(self, agent: str) -> dict[str, Any]:
-        """edge.json's `rate_hz` and `qoe`, the newest of its present run."""
+        """Return `rate_hz` and `qoe` for edge.json, the newest of the present run."""
         rated = self._latest.get(agent)
         return {name: None if rated is None else getattr(rated, name) for name in self.REPORT_FIELDS}
 
     def series(self, agent: str) -> dict[str, list[float | None]]:
-        """edge.json's `series`: a list for each column of `RatedEvaluation`."""
+        """Return `series` for edge.json: a list for each field of `RatedEvaluation`."""
         rated = self._history.get(agent, RingBuffer(len(RatedEvaluation._fields), 0))
         return {name: rated.column(k) for k, name in enumerate(RatedEvaluation._fields)}
 

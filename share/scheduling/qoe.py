@@ -1,8 +1,7 @@
-"""Quality of experience: what an agent's delay and error are worth to whom it serves.
+"""Quality of experience (QoE) of an agent, from its delay and error.
 
-QoE = exp(-beta P) (1 - exp(-gamma Q)): a penalty P for what is missed most, and what a quality Q gains, ever
-less the more there is of it. Source: SHARE, IMWUT 10(3) 97, 2026; defaults and why:
-docs/understand/scheduling.md.
+QoE = exp(-beta P) (1 - exp(-gamma Q)): a penalty P, and a quality Q with diminishing returns. Source: SHARE,
+IMWUT 10(3) 97, 2026; the defaults and their reasons: docs/understand/scheduling.md.
 """
 
 from __future__ import annotations
@@ -14,16 +13,16 @@ from typing import NamedTuple
 from share.config import AgentQoe, ControlConfig
 from share.types import AgentKind
 
-ACCEPTED_DELAY_MS = 20.0  # d0: of lag, a headset's wearer notices no less
+ACCEPTED_DELAY_MS = 20.0  # d0: a headset wearer does not notice less
 REFERENCE_ACCURACY = 1.0  # a0, 1/cm
-MIN_ERROR_CM = 0.05  # no estimate is believed to be better
+MIN_ERROR_CM = 0.05  # smaller estimates count as this
 _MAX_EXPONENT = 700.0  # exp of it is still finite
 
 
 @dataclass(frozen=True)
 class QoeParameters:
-    """Of one agent. form AR: beta in 1/ms, gamma in cm, theta without meaning; form ROBOT: beta in cm,
-    gamma in ms, theta_ms > 0. target: the QoE that is aimed at. signed: P may be negative."""
+    """QoE parameters of one agent. Form AR: beta in 1/ms, gamma in cm, theta_ms unused; form ROBOT: beta in
+    cm, gamma in ms, theta_ms > 0. target: Q*. signed: P may be negative."""
 
     form: AgentKind
     beta: float
@@ -34,7 +33,7 @@ class QoeParameters:
 
     @classmethod
     def from_config(cls, config: ControlConfig, kind: AgentKind, agent: str = "") -> QoeParameters:
-        """What `config` says of this agent by name, and of its form where it says nothing."""
+        """Return the parameters of an agent: its entry in `control.agents`, else the defaults of its form."""
         override = config.agents.get(agent, AgentQoe())
         form = AgentKind(override.form or kind)
         ar = form is AgentKind.AR
@@ -49,34 +48,34 @@ class QoeParameters:
 
 
 def accuracy(error_cm: float | None) -> float:
-    """1/cm, at most 20. Without an estimate (None): a0, as of an error of 1 cm."""
+    """Return the accuracy a, 1/cm, at most 20. error_cm None (unknown): a0."""
     return REFERENCE_ACCURACY if error_cm is None else 1.0 / max(error_cm, MIN_ERROR_CM)
 
 
 class QoeFactors(NamedTuple):
-    """What is left of an experience by its delay, and by its error; their product is its QoE."""
+    """The factors of a QoE due to delay and to error; their product is the QoE."""
 
     delay: float
     error: float
 
     @property
     def error_attribution(self) -> float:
-        """How much of what is missing is the error's rather than the delay's: from -1, all is the delay's, to
-        1, by their logarithms."""
+        """Share of the QoE deficit due to error rather than delay, by logarithms: -1 all delay, 1 all
+        error."""
         delay, error = (-math.log(max(math.exp(-_MAX_EXPONENT), min(1.0, factor))) for factor in self)
         return (error - delay) / (error + delay) if error + delay else 0.0
 
 
 def qoe(delay_ms: float, error_cm: float | None, parameters: QoeParameters) -> float:
-    """0 to 1, falling with both. With `needs.signed` it is the printed form, which has no upper bound.
+    """Return the QoE, 0 to 1, decreasing in both. With `parameters.signed` it has no upper bound.
 
-    delay_ms: what the agent sees, round trip and processing of a keyframe, >= 0; error_cm: see `accuracy`.
+    delay_ms: as in `Evaluation`, >= 0. error_cm: as in `accuracy`.
     """
     return math.prod(qoe_factors(delay_ms, error_cm, parameters))
 
 
 def qoe_factors(delay_ms: float, error_cm: float | None, parameters: QoeParameters) -> QoeFactors:
-    """The two of `qoe`."""
+    """Return the two factors of `qoe`."""
     if parameters.form is AgentKind.AR:
         penalty, quality = delay_ms - ACCEPTED_DELAY_MS, accuracy(error_cm)
     else:

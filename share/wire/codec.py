@@ -1,8 +1,8 @@
-"""Messages to frames of bytes and back; docs/lookup/wire.md has the byte layout.
+"""Encode messages to byte frames and decode them; the layout is in docs/lookup/wire.md.
 
-The first frame is a small msgpack header: wire version, message code, scalar fields, and dtype and
-shape of each array. Every array follows as a frame of its own, little-endian, C order, not copied.
-Nothing is allocated for a declared size before the bytes that fill it are seen to be there.
+The first frame is a small msgpack header: wire version, message code, scalar fields, and dtype and shape of
+each array. Each array follows in its own frame, little-endian, C order, not copied. A declared size is
+compared with the bytes received before anything is allocated.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from share.types import (
 from share.wire import messages as m
 
 WIRE_VERSION = 5
-OLDEST_VERSION = 2  # from which on messages that tell versions, those of FROZEN, are what they are now
+OLDEST_VERSION = 2  # the STABLE_MESSAGES have not changed since
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 8
-MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message but Frame
-MAX_IMAGE_BYTES = 4 * 1920 * 1200  # the largest of that: a depth image
+MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # largest array of all messages but Frame
+MAX_IMAGE_BYTES = 4 * 1920 * 1200  # largest array of a Frame: a depth image
 
 Bytes = bytes | memoryview
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -65,7 +65,7 @@ _DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "<i8", "|u1")}
 
 
 class _VersionHeader(msgspec.Struct, array_like=True):
-    """The beginning of every header, of this and of all other versions."""
+    """The start of a header, the same in all versions."""
 
     version: int
     code: Any = None
@@ -85,7 +85,7 @@ _decode_header = msgspec.msgpack.Decoder(_Header).decode
 
 @dataclass(frozen=True)
 class _ScalarFields:
-    """Scalar fields by their paths, checked alike on the way out and in."""
+    """Scalar fields by attribute path, checked both when encoding and when decoding."""
 
     names: tuple[str, ...]
     getters: tuple[Callable[[object], Any], ...]
@@ -111,8 +111,8 @@ class _ScalarFields:
 
 @dataclass(frozen=True)
 class _ArrayField:
-    """One array field; `None` in the shape is a length that the message chooses, up to `most`. One that is
-    optional and not there has the shape (0,)."""
+    """One array field. None in the shape: any length up to `max_length`. An absent optional array has the
+    shape (0,)."""
 
     path: str
     dtype: str
@@ -146,7 +146,7 @@ class _ArrayField:
             raise ValueError(f"{self.path}: {data.nbytes} bytes, its shape needs {size}")
         if not size:
             return None if self._is_absent(shape) else np.empty(shape, _DTYPES[dtype])
-        # a short frame lies unaligned in its message: only then is it copied
+        # copied only if unaligned, as short frames are in their message
         array = np.frombuffer(data, _DTYPES[dtype]).reshape(shape)
         return array if array.flags.aligned else array.copy()
 
@@ -176,22 +176,22 @@ def _build_frame(*, stamps_ns: I64, gyro: F64, accel: F64, **fields: Any) -> Fra
     for name in ("stamp_ns", "gap_ns"):
         checked_stamp(name, fields[name])
     if len(stamps_ns) and not -MAX_STAMP_NS <= stamps_ns.min() <= stamps_ns.max() <= MAX_STAMP_NS:
-        raise ValueError("stamps_ns: are beyond any clock")
+        raise ValueError(f"stamps_ns: outside ±{MAX_STAMP_NS}")
     imu = ImuBatch(stamps_ns, gyro, accel)
     if not (stamps_ns[1:] > stamps_ns[:-1]).all():
-        raise ValueError("stamps_ns: do not rise")
+        raise ValueError("stamps_ns: not strictly increasing")
     for name, samples, limit in (("gyro", gyro, MAX_GYRO_RAD_S), ("accel", accel, MAX_ACCEL_M_S2)):
         if np.abs(samples).max(initial=0.0) > limit:
-            raise ValueError(f"{name}: has values beyond {limit:g}, which no IMU measures")
+            raise ValueError(f"{name}: values beyond {limit:g}, the limit of any IMU")
     depth: F32 | None = fields["depth"]
     if depth is not None and not (np.isfinite(depth) & (depth >= 0)).all():
-        raise ValueError("depth: has values that are negative or not finite")
+        raise ValueError("depth: negative or non-finite values")
     return Frame(**fields, imu=imu)
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """How one type of message lies on the wire."""
+    """Layout of one message type on the wire."""
 
     code: int
     build: Callable[..., m.Message]
@@ -207,15 +207,15 @@ def _pose_field(path: str, optional: bool = False) -> _ArrayField:
     return _ArrayField(path, "<f8", (4, 4), optional)
 
 
-def _build_hello(*, name: str, kind: AgentKind, run_id: int, streams: bool, **rig: Any) -> m.Hello:
-    return m.Hello(name, kind, run_id, Rig(**rig), streams)
+def _build_hello(*, name: str, kind: AgentKind, run_id: int, streams_frames: bool, **rig: Any) -> m.Hello:
+    return m.Hello(name, kind, run_id, Rig(**rig), streams_frames)
 
 
 def _build_keyframe(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
     return Keyframe(**fields, view=View(uv, points, descriptors))
 
 
-_RIG_FIELDS: dict[str, Any] = {  # as maps by the names of their fields, checked by their own types
+_RIG_FIELDS: dict[str, Any] = {  # sent as maps by field name, checked by their types
     "rig.cam0": Camera,
     "rig.cam1": Camera | None,
     "rig.depth": Camera | None,
@@ -226,7 +226,9 @@ _LAYOUTS: dict[type, _Layout] = {
     m.Hello: _Layout(
         1,
         _build_hello,
-        _ScalarFields.from_fields(name=Name, kind=AgentKind, run_id=Int64, streams=bool, **_RIG_FIELDS),
+        _ScalarFields.from_fields(
+            name=Name, kind=AgentKind, run_id=Int64, streams_frames=bool, **_RIG_FIELDS
+        ),
         (
             _pose_field("rig.T_body_cam0"),
             _pose_field("rig.T_cam1_cam0", optional=True),
@@ -242,7 +244,9 @@ _LAYOUTS: dict[type, _Layout] = {
     Keyframe: _Layout(
         3,
         _build_keyframe,
-        _ScalarFields.from_fields(id=Int64, reference=Int64, stamp_ns=Int64, follows=Int64, up_sigma=float),
+        _ScalarFields.from_fields(
+            id=Int64, reference=Int64, stamp_ns=Int64, predecessor=Int64, up_sigma=float
+        ),
         (
             _pose_field("T_ref_body"),
             _ArrayField("cov", "<f8", (6, 6)),
@@ -276,11 +280,13 @@ _LAYOUTS: dict[type, _Layout] = {
     ),
     m.Welcome: _Layout(16, m.Welcome, _ScalarFields.from_fields(session=Int64, next_keyframe=Int64)),
     m.Refused: _Layout(17, m.Refused, _ScalarFields.from_fields(reason=Text)),
-    m.Ack: _Layout(18, m.Ack, _ScalarFields.from_fields(next_keyframe=Int64, held=Ids)),
+    m.Ack: _Layout(18, m.Ack, _ScalarFields.from_fields(next_keyframe=Int64, buffered=Ids)),
     Correction: _Layout(
         19,
         Correction,
-        _ScalarFields.from_fields(map_id=MapId, revision=Int64, about=Int64, answers=Int64),
+        _ScalarFields.from_fields(
+            map_id=MapId, revision=Int64, segment_keyframe=Int64, answered_keyframe=Int64
+        ),
         (_pose_field("T_map_odom"), _ArrayField("cov", "<f8", (6, 6))),
     ),
     m.Rate: _Layout(20, m.Rate, _ScalarFields.from_fields(hz=float)),
@@ -298,30 +304,26 @@ _LAYOUTS: dict[type, _Layout] = {
             index=Int64,
             stamp_ns=Int64,
             state=TrackState,
-            keyframe=bool,
-            new_stretch=bool,
-            sound=bool,
-            waits=WaitReason | None,
+            is_keyframe=bool,
+            new_segment=bool,
+            is_consistent=bool,
+            waiting_for=WaitReason | None,
         ),
         (_pose_field("T_odom_body", optional=True),),
     ),
 }
 _LAYOUT_BY_CODE = {layout.code: (cls, layout) for cls, layout in _LAYOUTS.items()}
-STABLE_MESSAGES = (
-    m.Ping,
-    m.Pong,
-    m.Refused,
-)  # the same in all versions, so that two of them can tell each other
+STABLE_MESSAGES = (m.Ping, m.Pong, m.Refused)  # the same since OLDEST_VERSION: peers find a mismatch by them
 
-# Everything that msgspec, numpy and the validation of our own types raise on bad bytes.
+# All that msgspec, numpy and our own validation raise on bad bytes.
 _DECODE_ERRORS = (msgspec.MsgspecError, ValueError, OverflowError, RecursionError)
 
 
 def encode(message: m.Message, version: int | None = None) -> list[Bytes]:
-    """Frames of a message; array frames are views on its (read-only) arrays. version: ours, or another one
-    for a message of FROZEN.
+    """Return the frames of a message; array frames are views of its (read-only) arrays.
 
-    Raises WireError if a field does not fit the wire, so that what is sent can always be decoded.
+    version: another than ours only for STABLE_MESSAGES. Raises WireError if a field does not fit the wire, so
+    every sent message can be decoded.
     """
     version = WIRE_VERSION if version is None else version
     assert version == WIRE_VERSION or isinstance(message, STABLE_MESSAGES)
@@ -337,8 +339,10 @@ def encode(message: m.Message, version: int | None = None) -> list[Bytes]:
 
 
 def decode(frames: Sequence[Bytes], versions: Sequence[int] = (WIRE_VERSION,)) -> m.Message:
-    """The message in `frames`; its arrays may be read-only views on them. versions: for what was kept, those
-    in which its kind has not changed. Raises WireError only, VersionError for any other version."""
+    """Return the message in `frames`; its arrays may be read-only views of them.
+
+    versions: accepted ones; stored messages may have several. Raises VersionError for others, else WireError.
+    """
     if not frames:
         raise WireError("empty message")
     if memoryview(frames[0]).nbytes > MAX_HEADER_BYTES:
@@ -358,11 +362,11 @@ def decode(frames: Sequence[Bytes], versions: Sequence[int] = (WIRE_VERSION,)) -
 
 
 def message_bytes(frames: Sequence[Bytes]) -> int:
-    """Bytes of a message, without what the transport adds (ZMTP: 2 or 9 bytes a frame)."""
+    """Return the size of a message without the transport's overhead (ZMTP: 2 or 9 bytes a frame)."""
     return sum([memoryview(frame).nbytes for frame in frames])
 
 
-# A peer's own text in an error, as repr quotes it: of any length, its end would be cut off with the line's.
+# A peer's text in an error, as repr quotes it. It may have any length, so it is cut before the line is.
 _QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""")
 _MAX_QUOTED = 40  # characters
 
@@ -373,8 +377,7 @@ def _shorten_quote(match: re.Match[str]) -> str:
 
 
 def _wire_error(where: str, error: Exception) -> WireError:
-    """One short printable line: what of `error` is the peer's own text is cut, and quoted so that its end is
-    seen."""
+    """Return a WireError of one short printable line; quotes of the peer's text are cut but stay closed."""
     text = _QUOTED.sub(_shorten_quote, str(error))
     line = "".join(c if c.isprintable() else "?" for c in f"{where}: {text}")
     return WireError(line[:200])
@@ -388,7 +391,7 @@ def _check_version(header: _VersionHeader, versions: Sequence[int]) -> None:
 
 
 def message_code(message_type: type[m.Message]) -> int:
-    """By which a header says that its message is of this kind."""
+    """Return the code of a message type in headers."""
     return _LAYOUTS[message_type].code
 
 

@@ -1,7 +1,7 @@
-"""The messages between agent and edge, as frozen dataclasses. `share.wire.codec` gives them bytes.
+"""The messages between agent and edge, as frozen dataclasses. `share.wire.codec` encodes them.
 
-Stamps are nanoseconds of the sender's own clock. A peer is known to the transport by its run id,
-so no message repeats who sent it.
+Stamps are nanoseconds of the sender's clock. The transport knows a peer by its run id, so messages do not
+carry their sender.
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ from share.types import (
 )
 
 MAX_RATE_HZ = 1000.0
-MAX_BUFFERED = 256  # ids in one Ack: the most keyframes that may wait at the edge for a gap to close
-MAX_TEXT_LENGTH = 512  # characters of anything a person reads
-MAX_REASON_LENGTH = 120  # characters of why an agent is in its state
+MAX_BUFFERED = 256  # ids in one Ack: keyframes buffered at the edge
+MAX_TEXT_LENGTH = 512  # characters of a text for a person
+MAX_REASON_LENGTH = 120  # characters of `Status.reason`
 MAX_POSE_AGE_MS = 1e9  # 11 days
 MAX_IMAGE_SIDE = 8192  # px, of an image
-MAX_IMU_SAMPLES = 20_000  # of an IMU, in one frame
+MAX_IMU_SAMPLES = 20_000  # in one frame
 MAX_DELAY_MS = 1e7  # three hours
-MAX_ERROR_CM = 1e7  # 100 km, as far as a pose may be
+MAX_ERROR_CM = 1e7  # 100 km, the limit of a pose
 PEER_ID_BYTES = 8
 
 
 def peer_id(run_id: int) -> bytes:
-    """The PEER_BYTES by which the transport of the edge knows the agent of this run.
+    """Return the PEER_ID_BYTES by which the edge's transport knows the agent of this run.
 
-    Whoever knows them can speak for the run, so they are random and shown to nobody but the edge."""
+    They are the run's secret: a peer that knows them can send as this run."""
     return run_id.to_bytes(PEER_ID_BYTES, "big", signed=True)
 
 
 def public_tag(run_id: int) -> str:
-    """16 hexadecimal digits that name a run to everybody and do not tell its `run_id`."""
+    """Return 16 hexadecimal digits that name a run publicly without revealing its `run_id`."""
     return hashlib.sha256(peer_id(run_id)).hexdigest()[:16]
 
 
 def _check_image_size(camera: Camera) -> None:
     if max(camera.width, camera.height) > MAX_IMAGE_SIDE:
-        raise ValueError(f"image: {camera.width}x{camera.height} px is more than {MAX_IMAGE_SIDE} a side")
+        raise ValueError(f"image: {camera.width}x{camera.height} px exceeds {MAX_IMAGE_SIDE} px a side")
 
 
 # ---------------------------------------------------------------- up: agent -> edge
@@ -60,15 +60,14 @@ def _check_image_size(camera: Camera) -> None:
 class Hello:
     """First message of a run, repeated until welcomed.
 
-    run_id: 64 random bits, the run's secret: they are its `peer_id` too, and only the edge learns them.
-    rig: the agent's calibration, by which the edge knows what it sees. streams: it does not track itself but
-    sends what its sensors see."""
+    run_id: 64 random bits, the run's secret and its `peer_id`; only the edge learns them. rig: the agent's
+    calibration. streams_frames: it sends frames and the edge tracks them."""
 
     name: str
     kind: AgentKind
     run_id: int
     rig: Rig
-    streams: bool = False
+    streams_frames: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", checked_name(self.name))
@@ -79,7 +78,8 @@ class Hello:
 
 @dataclass(frozen=True, eq=False)
 class PoseUpdate:
-    """Every frame: body in the body frame of sent keyframe `keyframe`, or in odom where it is -1."""
+    """Sent for every frame: the body's pose (4, 4) relative to the sent keyframe `keyframe`, or in odom if
+    -1."""
 
     stamp_ns: int
     state: TrackState
@@ -94,7 +94,8 @@ class PoseUpdate:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Per keyframe: the delay the agent sees (RTT + processing, ms) and its estimated error (cm)."""
+    """Sent per keyframe: the delay that the agent measures (round trip + processing) and its expected error;
+    None: unknown."""
 
     keyframe: int
     delay_ms: float
@@ -110,8 +111,8 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Status:
-    """Twice a second, and at once where it changes, also while no frame comes. pose_age_ms: since the newest
-    frame with a pose arrived, or the run began. reason: why it is so, for a person; empty: all is well."""
+    """Sent twice a second and on change, also without frames. pose_age_ms: since the newest frame with a pose
+    arrived, or since the run began. reason: cause of the state, for a person; empty if all is well."""
 
     state: TrackState
     pose_age_ms: float
@@ -143,7 +144,8 @@ class Bye:
 
 @dataclass(frozen=True)
 class Welcome:
-    """`session` names this life of the edge; the agent goes on at keyframe `next_keyframe`."""
+    """The edge accepts the run. session: this start of the edge; the agent continues at keyframe
+    `next_keyframe`."""
 
     session: int
     next_keyframe: int
@@ -154,7 +156,7 @@ class Welcome:
 
 @dataclass(frozen=True)
 class Refused:
-    """The edge will not have this agent; `reason` is for a person."""
+    """The edge does not accept this agent. reason: for a person."""
 
     reason: str
 
@@ -165,24 +167,24 @@ class Refused:
 
 @dataclass(frozen=True)
 class Ack:
-    """Nothing below `next_keyframe` is wanted any more: it was applied, or dropped by the agent.
+    """All keyframes below `next_keyframe` are done: applied and stored, or dropped by the agent.
 
-    Those in `held` have arrived and wait for a gap to close.
+    buffered: ids that have arrived and wait for a gap to close or for the disk.
     """
 
     next_keyframe: int
-    held: tuple[int, ...] = ()
+    buffered: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        for id_ in (self.next_keyframe, *self.held):
+        for id_ in (self.next_keyframe, *self.buffered):
             checked_id("keyframe ids", id_)
-        if len(self.held) > MAX_BUFFERED:
-            raise ValueError(f"held: {len(self.held)} ids, at most {MAX_BUFFERED}")
+        if len(self.buffered) > MAX_BUFFERED:
+            raise ValueError(f"buffered: {len(self.buffered)} ids, at most {MAX_BUFFERED}")
 
 
 @dataclass(frozen=True)
 class Rate:
-    """Keyframes per second that the agent may send."""
+    """Keyframes a second that the agent may send."""
 
     hz: float
 
@@ -193,9 +195,10 @@ class Rate:
 
 @dataclass(frozen=True)
 class Pong:
-    """The four-stamp exchange of RFC 5905, section 8: sent by the agent, received and replied here.
+    """Answer to a ping, with the four stamps of RFC 5905, section 8: `sent_ns` by the agent's clock, the
+    others by the edge's.
 
-    Every ping is answered, a stranger's too: `session` tells it that it must say hello again.
+    Every ping is answered, also of an unjoined peer: by `session` it sees that it has to send a hello again.
     """
 
     sequence: int
@@ -211,23 +214,24 @@ class Pong:
 
 @dataclass(frozen=True, eq=False)
 class RemoteTrackingResult:
-    """What a streamed frame came to: its index and stamp, and of the tracker's result what an agent uses
-    (`share.odometry.track_result`). T_odom_body (4, 4) where the state has a pose."""
+    """Tracking result of a streamed frame: fields as in `share.odometry.track_result.TrackResult`.
+    T_odom_body (4, 4) if and only if the state has a pose. is_keyframe: the tracker would make it a
+    keyframe."""
 
     index: int
     stamp_ns: int
     state: TrackState
     T_odom_body: F64 | None
-    keyframe: bool = False
-    new_stretch: bool = False
-    sound: bool = True
-    waits: WaitReason | None = None
+    is_keyframe: bool = False
+    new_segment: bool = False
+    is_consistent: bool = True
+    waiting_for: WaitReason | None = None
 
     def __post_init__(self) -> None:
         checked_id("index", self.index)
         checked_stamp("stamp_ns", self.stamp_ns)
         if (self.T_odom_body is not None) != self.state.has_pose:
-            raise ValueError(f"T_odom_body: goes with a state that has a pose, not with {self.state}")
+            raise ValueError(f"T_odom_body: required with a pose, not allowed without; state is {self.state}")
         if self.T_odom_body is not None:
             object.__setattr__(self, "T_odom_body", checked_pose("T_odom_body", self.T_odom_body))
 

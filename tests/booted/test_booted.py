@@ -84,7 +84,7 @@ def test_all_of_it_starts_on_boot(running):
     assert running.run(UP).out.split() == ["active"] * 3
     joined(running)
     before = running.run("journalctl -b -1 -u share-edge -o cat").out
-    assert "joined the edge: ann" in before  # what happened before a power cut is not lost
+    assert "agent joined: ann" in before  # what happened before a power cut is not lost
 
 
 def test_an_edge_that_is_killed_comes_back_with_its_map_and_its_agent(running):
@@ -154,7 +154,7 @@ def test_taken_away_as_the_page_says_nothing_is_left(running):
 def joined(device: Machine) -> None:
     """The edge of this start says that ann is there."""
     since = '--since @$(date -d "$(systemctl show -P ActiveEnterTimestamp share-edge)" +%s)'
-    wait(lambda: "joined the edge: ann" in device.run(f"journalctl -u share-edge -o cat {since}").out)
+    wait(lambda: "agent joined: ann" in device.run(f"journalctl -u share-edge -o cat {since}").out)
 
 
 def wait(until: Callable[[], bool], seconds: float = 30) -> None:

@@ -78,15 +78,15 @@ def test_says_hello_until_welcomed() -> None:
 def test_an_edge_that_never_answers_is_said_once() -> None:
     agent = Agent(HELLO, Config())
     lines = [line for t in range(100) for line in said(handle(agent, ev.AgentTick(), t * 100 * MS))]
-    assert lines == ["no edge answers yet; tracking goes on alone"]
+    assert lines == ["no edge answers yet; tracking continues without the edge"]
 
 
 def test_silence_and_return_are_said_once_each() -> None:
     agent = welcomed()
     effects = [x for t in range(1, 100) for x in handle(agent, ev.AgentTick(), t * 100 * MS)]
-    assert said(effects) == ["the edge is silent; tracking goes on alone"]
+    assert said(effects) == ["the edge is silent; tracking continues without the edge"]
     assert len(only(m.Hello, effects, messages=True)) == pytest.approx(14, abs=1)
-    assert said(tell(agent, m.Welcome(SESSION, 0), 10 * S)) == ["the edge is back"]
+    assert said(tell(agent, m.Welcome(SESSION, 0), 10 * S)) == ["reconnected to the edge"]
     assert agent.report()["connected"]
     assert agent.report()["edge_sessions"] == 1
 
@@ -103,7 +103,9 @@ def test_a_taken_name_ends_the_run_with_the_edges_reason() -> None:
 
 def test_a_refusal_by_a_restarted_edge_does_not_end_the_run() -> None:
     agent = welcomed()
-    assert said(tell(agent, m.Refused("full"), S)) == ["the edge refuses 'ann': full; tracking goes on alone"]
+    assert said(tell(agent, m.Refused("full"), S)) == [
+        "the edge refuses 'ann': full; tracking continues without the edge"
+    ]
     hellos = [
         t for t in range(11, 80) if only(m.Hello, handle(agent, ev.AgentTick(), t * 100 * MS), messages=True)
     ]
@@ -118,14 +120,14 @@ def test_bad_messages_are_counted_and_said_once_a_kind() -> None:
         lines += said(handle(agent, ev.EdgeMessageReceived(frames), S))
     assert agent.report()["bad_messages"] == 5
     assert len(lines) == 3
-    assert lines[-1] == "the edge sent a Bye, which is not for this agent"
+    assert lines[-1] == "the edge sent a Bye, which this agent does not expect"
 
 
 def test_another_wire_version_is_said_in_words() -> None:
     agent = Agent(HELLO, Config())
     newer = b"\x94\x09\x01\x90\x90"
     assert said(handle(agent, ev.EdgeMessageReceived([newer]), 0)) == [
-        "a message from the edge is not understood: "
+        "invalid message from the edge: "
         f"header: peer speaks wire 9, this SHARE wire {WIRE_VERSION}: upgrade the older one"
     ]
 
@@ -139,7 +141,7 @@ def test_a_pong_of_another_session_brings_hello_and_then_everything_held() -> No
     effects = tell(agent, m.Pong(ping.sequence, ping.sent_ns, 1, 2, SESSION + 1), 501 * MS)
     assert only(m.Hello, effects, messages=True)
     effects = tell(agent, m.Welcome(SESSION + 1, 0), 502 * MS)
-    assert said(effects) == ["the edge has restarted; it is sent 3 keyframes again"]
+    assert said(effects) == ["the edge has restarted; 3 keyframes are resent"]
     assert [k.id for k in only(Keyframe, effects, messages=True)] == [0, 1, 2]
     assert tell(agent, m.Welcome(SESSION, 0), 503 * MS) == []  # overtaken on its way
 

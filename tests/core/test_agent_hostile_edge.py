@@ -129,7 +129,7 @@ def test_a_welcome_that_acknowledges_everything_for_ever_does_not_silence_an_age
     agent = Agent(HELLO, Config())
     handle(agent, ev.AgentTick(), 0)
     [line] = said(tell(agent, m.Welcome(7, MAX_ID), 0))
-    assert line == "the edge sent a welcome of keyframes that were never sent; it is not believed"
+    assert line == "the edge sent a welcome of keyframes that were never sent; ignored"
     assert not agent.is_connected
     tell(agent, m.Ack(MAX_ID), 0)
     tell(agent, m.Welcome(7, 0), 0)
@@ -140,7 +140,7 @@ def test_a_welcome_that_acknowledges_everything_for_ever_does_not_silence_an_age
 def test_an_acknowledgement_beyond_what_was_sent_is_counted_and_said_once() -> None:
     agent, now = welcomed(20)
     lines = said([e for _ in range(9) for e in tell(agent, m.Ack(MAX_ID), now)])
-    assert lines == ["the edge sent an acknowledgement of keyframes that were never sent; it is not believed"]
+    assert lines == ["the edge sent an acknowledgement of keyframes that were never sent; ignored"]
     report = agent.report()
     assert (report["acknowledged"], report["open"], report["bad_acks"], report["bad_messages"]) == (
         0,
@@ -185,7 +185,7 @@ def test_lives_that_nobody_asked_for_are_not_begun() -> None:
     agent, now = welcomed(20)
     effects = [e for k in range(100, 300) for e in tell(agent, m.Welcome(k, 0), now)]
     assert agent.report()["edge_sessions"] == 1
-    assert said(effects) == ["the edge sent a welcome that nobody asked for; it is not believed"]
+    assert said(effects) == ["the edge sent a welcome without a hello; ignored"]
 
 
 def test_a_refusal_long_after_the_beginning_ends_nothing() -> None:
@@ -194,7 +194,7 @@ def test_a_refusal_long_after_the_beginning_ends_nothing() -> None:
         handle(agent, frame, frame.done_ns)
     now = frames[-1].done_ns
     lines = said([e for k in range(100) for e in tell(agent, m.Refused(f"no {k}\x1b[2J"), now + k * MS)])
-    assert lines[0] == "the edge refuses 'ann': no 0?[2J; tracking goes on alone"
+    assert lines[0] == "the edge refuses 'ann': no 0?[2J; tracking continues without the edge"
     assert len(lines) <= 20
     assert odometry(handle(agent, tracked(101), now + S))
 

@@ -163,7 +163,7 @@ def test_an_edge_without_memory_is_given_all_that_is_held() -> None:
     check_applied(second.applied, walk)
     lines = [effect.text for effect in run.effects if isinstance(effect, ev.PrintLine)]
     assert lines[0] == "connected to the edge"
-    assert lines[1].startswith("the edge has restarted; it is sent ")
+    assert lines[1].startswith("the edge has restarted; ")
 
 
 def odometry(run: World) -> list[bytes]:

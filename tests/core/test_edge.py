@@ -72,8 +72,8 @@ def test_every_refusal_has_a_reason(joined):
     for record in joined.records:
         assert record["reason"], record
     kinds = Counter(r["event"] for r in joined.records)
-    assert kinds["maps joined"] == 1
-    assert kinds["loop not taken"] >= 1  # the first witness waits
+    assert kinds["maps merged"] == 1
+    assert kinds["loop not accepted"] >= 1  # the first witness waits
 
 
 def test_the_report_counts_what_happened(joined):
@@ -83,7 +83,7 @@ def test_the_report_counts_what_happened(joined):
     assert ann["poses"] > 0
     assert report["loops"]["accepted"] == sum(a["loops"]["accepted"] for a in report["agents"].values()) > 0
     assert report["place_ms"]["n"] == 48
-    assert report["failed_jobs"] == 0
+    assert report["failed_steps"] == 0
     assert sum(report["maps"].values()) == 48
 
 
@@ -91,7 +91,7 @@ def test_other_rooms_are_never_joined():
     apart = Town([Person("ann", ROOM, 0.0, 11), Person("bob", walls(2), 0.0, 22)])
     apart.walk(20)
     assert len(apart.edge.report()["maps"]) == 2
-    assert not [r for r in apart.records if r["event"] == "maps joined"]
+    assert not [r for r in apart.records if r["event"] == "maps merged"]
 
 
 def test_same_events_same_effects():
@@ -213,7 +213,7 @@ def test_strangers_get_a_pong_and_nothing_else():
     pong = sent(tell(edge, 5, m.Ping(3, 42), 9), m.Pong)
     assert pong == [m.Pong(3, 42, 9 * MS, 9 * MS, 7)]
     assert not sent(tell(edge, 5, m.Evaluation(0, 1.0, None)), m.Message)
-    assert edge.report({})["strangers"]["unexpected"] == 1
+    assert edge.report({})["unjoined"]["unexpected"] == 1
 
 
 def test_malformed_messages_are_counted_and_said_once():
@@ -235,7 +235,7 @@ def test_a_keyframe_is_applied_once_and_in_order():
     tell(edge, 11, hello(run_id=11))
     acks = [sent(tell(edge, 11, entries[k]), m.Ack)[0] for k in (1, 0, 1, 3, 2)]
     assert [ack.next_keyframe for ack in acks] == [0, 2, 2, 2, 4]
-    assert acks[0].held == (1,)
+    assert acks[0].buffered == (1,)
     assert edge.report({})["agents"]["ann"]["keyframes"] == 4
 
 
@@ -247,9 +247,9 @@ def test_a_step_that_fails_costs_its_keyframe_only():
     mapper.add_keyframe("ann-000b", both.keyframes("ann")[0])
     look = mapper.next_lookup()
     (finding,) = mapper.finish_step(look, MemoryError("no room"), 1.0)
-    assert (finding.event, finding.agent) == ("job failed", "ann-000b")
+    assert (finding.event, finding.agent) == ("step failed", "ann-000b")
     assert "no room" in finding.reason
-    assert mapper.report()["failed_jobs"] == 1
+    assert mapper.report()["failed_steps"] == 1
     assert mapper.next_lookup() is None
 
 

@@ -106,7 +106,9 @@ def test_a_run_whose_name_was_taken_from_its_key_is_refused() -> None:
     edge = Edge(Config(), 7)
     assert refusal(tell(edge, 1, hello_of("zoe", 1), 0, ["zoe"])) is None
     assert not of(tell(edge, 1, keyframe(0), 1, ["yan"]), ed.SendToPeer)  # so it is silent, and says hello
-    why = "its key speaks for 'yan', not for 'zoe'; at the edge: share keys authorize … --agent zoe"
+    why = (
+        "its key is authorized for 'yan', not for 'zoe'; on the edge run: share keys authorize … --agent zoe"
+    )
     assert refusal(tell(edge, 1, hello_of("zoe", 1), 2, ["yan"])) == why
     zoe = edge.report({})["agents"]["zoe"]
     assert (zoe["keyframes"], zoe["refused_messages"]) == (0, 0)  # whoever it was, it was not zoe
@@ -192,7 +194,7 @@ def test_who_said_bye_comes_back_only_to_a_free_place() -> None:
         tell(edge, k, m.Bye())
     said = [refusal(tell(edge, k, m.Ping(1, 1))) for k in range(8)]
     assert said[:4] == [None] * 4
-    assert all("4 agents already" in str(reason) for reason in said[4:])
+    assert all("already serves 4 agents" in str(reason) for reason in said[4:])
     assert present(edge) == 4
 
 
@@ -234,7 +236,7 @@ def test_bye_is_heard_once() -> None:
 def test_no_tracker_begins_for_who_cannot_come_back() -> None:
     edge = TrackingEdge(Config(), 7, capacity=TrackingCapacity(1, "it is small"))
     for k, name in enumerate(("ann", "bob")):
-        hello = replace(hello_of(name, k, AgentKind.AR), streams=True)
+        hello = replace(hello_of(name, k, AgentKind.AR), streams_frames=True)
         assert of(tell(edge, k, hello), ed.StartTracker)
         tell(edge, k, m.Bye())
     assert of(tell(edge, 0, m.Ping(1, 1)), ed.StartTracker)

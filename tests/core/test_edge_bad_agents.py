@@ -58,11 +58,11 @@ def test_the_others_map_stays_right(bad):
         f"others {1e3 * town.map_error(GOOD):.2f} mm, {ratio:.3f} of {1e3 * clean.map_error(GOOD):.2f}; "
         f"eve {100 * town.map_error(('eve',)):.2f} cm"
     )
-    assert town.edge.report()["failed_jobs"] == 0
+    assert town.edge.report()["failed_steps"] == 0
     assert town.map_error(GOOD) <= MOST_M
     states = {name: agent["consistency"]["state"] for name, agent in maps.items()}
     assert all(states[name] != "set apart" for name in GOOD)
     if bad in APART:
         assert states["eve"] == "set apart"
         assert maps["eve"]["map_id"] != maps["ann"]["map_id"]
-        assert any(r["event"] == "set apart" and "calibration" in r["reason"] for r in town.records)
+        assert any(r["event"] == "agent quarantined" and "calibration" in r["reason"] for r in town.records)

@@ -104,7 +104,7 @@ def test_huge_covariances_do_not_end_the_mapper():
     town.walk(24)
     town.run(500)
     report = town.edge.report()
-    assert report["failed_jobs"] == 0
+    assert report["failed_steps"] == 0
     assert report["maps"] == {f"ann-{m.public_tag(111)[:4]}/0": 48}  # theirs, and she in it
     assert report["solve_ms"]["n"] > 0
 
@@ -121,14 +121,14 @@ def test_a_result_that_cannot_be_used_costs_its_step(monkeypatch):
 
     monkeypatch.setattr(mapper, "_begin_search", bad)
     (finding,) = mapper.finish_step(step, step.run(), 1.0)
-    assert finding.event == "job failed"
+    assert finding.event == "step failed"
     assert finding.reason.startswith("place: ValueError: no such thing")
     monkeypatch.undo()
     mapper.add_keyframe("ann", keyframe(1))
     step = mapper.next_lookup()
     assert isinstance(step, QueryStep)
     assert not mapper.finish_step(step, step.run(), 1.0)
-    assert mapper.report()["failed_jobs"] == 1
+    assert mapper.report()["failed_steps"] == 1
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def test_a_key_speaks_for_its_names_only() -> None:
     edge = Edge(Config(), 7)
     (refused,) = sent(tell(edge, hello_of("ann", SECRET), EVE))
     assert isinstance(refused, m.Refused)
-    assert "speaks for 'eve', 'mallory', not for 'ann'" in refused.reason
+    assert "authorized for 'eve', 'mallory', not for 'ann'" in refused.reason
     assert "share keys authorize" in refused.reason
     (welcome,) = sent(tell(edge, hello_of("eve", SECRET), EVE))
     assert isinstance(welcome, m.Welcome)
@@ -97,7 +97,7 @@ def test_an_id_that_leaps_costs_its_own_message() -> None:
     edge = Edge(Config(), 7)
     tell(edge, hello_of("ann", SECRET), None)
     tell(edge, keyframe(0), None)
-    effects = tell(edge, replace(keyframe(1), id=10**9, reference=-1, follows=-1), None)
+    effects = tell(edge, replace(keyframe(1), id=10**9, reference=-1, predecessor=-1), None)
     assert not of(effects, ed.AddKeyframe)
     assert sent(effects) == [m.Ack(1)]
     assert of(tell(edge, keyframe(1), None), ed.AddKeyframe)

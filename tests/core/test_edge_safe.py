@@ -99,7 +99,7 @@ def test_a_leap_begins_a_stretch_in_the_same_odom() -> None:
     assert add.keyframe.reference == -1
     assert np.allclose(add.keyframe.T_ref_body[:3, 3], (100.0, 0, 0))
     (record,) = of(effects, ed.WriteEvent)
-    assert record.fields["event"] == "odometry doubted"
+    assert record.fields["event"] == "odometry suspect"
     assert "100 m" in record.fields["reason"]
     (add,) = of(tell(edge, keyframe(2, 1, at_m=100.2)), ed.AddKeyframe)
     assert add.keyframe.reference == 1
@@ -122,12 +122,12 @@ def test_a_step_that_is_not_between_its_two_poses_is_not_believed(bad: dict[str,
     assert add.keyframe.reference == -1
     assert np.array_equal(add.keyframe.T_ref_body, add.keyframe.T_odom_body)
     (record,) = of(effects, ed.WriteEvent)
-    assert record.fields["event"] == "odometry doubted"
+    assert record.fields["event"] == "odometry suspect"
     assert off in record.fields["reason"]
     assert "\n" not in record.fields["reason"]
     ann = edge.report({})["agents"]["ann"]
-    assert ann["doubted_keyframes"] == 1
-    assert off in ann["last_doubt"]
+    assert ann["suspect_keyframes"] == 1
+    assert off in ann["last_suspicion"]
     assert ann["refused_messages"] == 0  # it is taken in
 
 
@@ -140,9 +140,9 @@ def test_what_is_taken_in_with_a_bounded_variance_is_not_refused() -> None:
         assert add.keyframe.cov.max() == pytest.approx(100.0)
     report = edge.report({})
     ann = report["agents"]["ann"]
-    assert (ann["keyframes"], ann["doubted_keyframes"], ann["refused_messages"]) == (12, 12, 0)
+    assert (ann["keyframes"], ann["suspect_keyframes"], ann["refused_messages"]) == (12, 12, 0)
     (line,) = report["refused"]
-    assert line.startswith("agent 'ann': 12 keyframes doubted, the last: keyframe 11 has a variance of 1e+12")
+    assert line.startswith("agent 'ann': 12 suspect keyframes, the last: keyframe 11 has a variance of 1e+12")
 
 
 def test_what_a_filter_learns_of_its_past_is_no_contradiction() -> None:
@@ -214,6 +214,6 @@ def test_a_keyframe_that_is_refused_waits_for_no_disk() -> None:
     tell(edge, HELLO)
     keeps = [of(tell(edge, keyframe(k, k - 1)), ed.SaveChanges)[0] for k in range(2)]
     edge.handle(ed.ChangesSaved(keeps[-1].ticket), 0)
-    effects = tell(edge, replace(keyframe(2, 0), follows=0))  # refers to one that is not the last
+    effects = tell(edge, replace(keyframe(2, 0), predecessor=0))  # refers to one that is not the last
     assert not of(effects, ed.AddKeyframe)
     assert acks(effects) == [m.Ack(3)]

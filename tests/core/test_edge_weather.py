@@ -35,7 +35,7 @@ def check_nothing_lost(town: Town) -> None:
         report = agent.report()
         assert (report["open"], report["keyframes"], report["acknowledged"]) == (0, FRAMES, FRAMES)
         assert report["edge_sessions"] == 1
-    assert not [r for r in town.records if r["event"] in ("bad message", "job failed", "odometry doubted")]
+    assert not [r for r in town.records if r["event"] in ("bad message", "step failed", "odometry suspect")]
     added = {name: a["keyframes"] for name, a in town.edge.report()["agents"].items()}
     assert added == dict.fromkeys(NAMES, FRAMES)
 

@@ -26,7 +26,7 @@ def test_the_newest_rows_are_told_in_order(n: int) -> None:
 
 
 def test_a_row_of_another_width_is_refused() -> None:
-    with pytest.raises(ValueError, match="2 numbers instead of 3"):
+    with pytest.raises(ValueError, match="2 numbers, expected 3"):
         RingBuffer(3, 5).add((1.0, 2.0))
 
 

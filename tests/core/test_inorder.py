@@ -12,11 +12,12 @@ from share.wire.messages import MAX_BUFFERED, Ack
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32)))
 
 
-def keyframe(id_: int, follows: int | None = None, reference: int | None = None) -> Keyframe:
+def keyframe(id_: int, predecessor: int | None = None, reference: int | None = None) -> Keyframe:
     """By default relative to its predecessor, as an agent's keyframes are."""
-    follows = id_ - 1 if follows is None else follows
-    reference = follows if reference is None else reference
-    return Keyframe(id_, reference, id_, np.eye(4), np.eye(6), np.eye(4), np.zeros(3), 0.0, EMPTY, follows)
+    predecessor = id_ - 1 if predecessor is None else predecessor
+    reference = predecessor if reference is None else reference
+    eye = np.eye(4)
+    return Keyframe(id_, reference, id_, eye, np.eye(6), eye, np.zeros(3), 0.0, EMPTY, predecessor)
 
 
 def ids(keyframes: list[Keyframe]) -> list[int]:
@@ -51,14 +52,14 @@ def test_duplicates_are_ignored_and_acknowledged_again() -> None:
 def test_a_new_stretch_does_not_overtake() -> None:
     book = ReorderBuffer()
     book.push(keyframe(0))
-    assert book.push(keyframe(2, follows=1, reference=-1)) == []
+    assert book.push(keyframe(2, predecessor=1, reference=-1)) == []
     assert ids(book.push(keyframe(1))) == [1, 2]
 
 
 def test_dropped_ids_are_skipped() -> None:
     book = ReorderBuffer()
     book.push(keyframe(0))
-    assert ids(book.push(keyframe(5, follows=0))) == [5]
+    assert ids(book.push(keyframe(5, predecessor=0))) == [5]
     assert book.push(keyframe(3)) == []  # dropped by the agent, but late on its way
     assert book.ack() == Ack(6)
 
@@ -67,20 +68,20 @@ def test_the_later_version_of_a_waiting_keyframe_counts() -> None:
     book = ReorderBuffer()
     book.push(keyframe(0))
     book.push(keyframe(2))
-    assert ids(book.push(keyframe(2, follows=0))) == [2]
+    assert ids(book.push(keyframe(2, predecessor=0))) == [2]
     book.push(keyframe(5))
     assert book.push(keyframe(5)) == []
 
 
 def test_an_old_version_does_not_replace_a_later_one() -> None:
     book = ReorderBuffer()
-    book.push(keyframe(9, follows=3))
-    book.push(keyframe(9, follows=8))
-    assert ids(book.push(keyframe(3, follows=-1))) == [3, 9]
+    book.push(keyframe(9, predecessor=3))
+    book.push(keyframe(9, predecessor=8))
+    assert ids(book.push(keyframe(3, predecessor=-1))) == [3, 9]
 
 
 def test_an_edge_without_memory_begins_where_the_agent_does() -> None:
-    assert ids(ReorderBuffer().push(keyframe(40, follows=-1))) == [40]
+    assert ids(ReorderBuffer().push(keyframe(40, predecessor=-1))) == [40]
 
 
 def test_an_edge_with_memory_goes_on() -> None:
@@ -100,5 +101,5 @@ def test_the_holding_area_is_bounded() -> None:
 
 @pytest.mark.parametrize("hold", [0, MAX_BUFFERED + 1])
 def test_hold_must_fit_an_ack(hold: int) -> None:
-    with pytest.raises(ValueError, match="hold"):
+    with pytest.raises(ValueError, match="capacity"):
         ReorderBuffer(capacity=hold)

@@ -48,7 +48,7 @@ def due(book: KeyframeLedger, now_ns: int) -> list[int]:
 
 def links(book: KeyframeLedger) -> list[tuple[int, int, int]]:
     """(id, reference, follows) of all that is open."""
-    return [(e.keyframe.id, e.keyframe.reference, e.keyframe.follows) for e in book._pending.values()]
+    return [(e.keyframe.id, e.keyframe.reference, e.keyframe.predecessor) for e in book._pending.values()]
 
 
 def test_the_chain_composes_what_was_left_out() -> None:
@@ -58,7 +58,7 @@ def test_the_chain_composes_what_was_left_out() -> None:
     chain.extend(candidate(1))
     chain.extend(candidate(2))
     keyframe = chain.make_keyframe(candidate(2), 2)
-    assert (keyframe.id, keyframe.reference, keyframe.follows) == (1, 0, 0)
+    assert (keyframe.id, keyframe.reference, keyframe.predecessor) == (1, 0, 0)
     np.testing.assert_allclose(keyframe.T_ref_body, STEPS[0] @ STEPS[1], atol=1e-12)
     np.testing.assert_allclose(keyframe.cov, se3.compose_cov(STEPS[1], COV, COV), atol=1e-15)
 
@@ -70,7 +70,7 @@ def test_a_stretch_begins_even_if_its_first_candidate_was_left_out() -> None:
     chain.extend(candidate(1, new_stretch=True))
     chain.extend(candidate(2))
     keyframe = chain.make_keyframe(candidate(2), 2)
-    assert (keyframe.reference, keyframe.follows, chain.first_of_segment) == (-1, 0, 1)
+    assert (keyframe.reference, keyframe.predecessor, chain.first_of_segment) == (-1, 0, 1)
     np.testing.assert_array_equal(keyframe.T_ref_body, ODOMETRY[2])
 
 

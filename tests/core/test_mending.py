@@ -23,7 +23,7 @@ def test_a_gap_is_bridged_by_odometry():
     tied = whole.keyframes[2].keyframe
     assert (whole.reconnected_count, tied.reference, tied.id) == (1, 1, 4)
     assert np.allclose(pose(1) @ tied.T_ref_body, pose(4), atol=1e-12)
-    assert tied.follows == frames[2].keyframe.follows
+    assert tied.predecessor == frames[2].keyframe.predecessor
     assert whole.keyframes[3] is frames[3]
 
 

@@ -115,10 +115,10 @@ def test_however_slow_all_was_a_camera_that_is_gone_is_said_within_a_second() ->
 
 def test_states_have_their_reasons() -> None:
     for state, waits, reason in (
-        (TrackState.INITIALISING, WaitReason.IMU, "waits for the IMU's first samples"),
+        (TrackState.INITIALISING, WaitReason.IMU, "waiting for the IMU's first samples"),
         (TrackState.VISION_ONLY, None, "no IMU sample for 0.2 s"),
         (TrackState.LOST, None, "lost for 0.2 s"),
-        (TrackState.WEAK, None, "few points in view"),
+        (TrackState.WEAK, None, "few features in view"),
     ):
         agent, now = agent_with(3)
         T = tracked(0).T_odom_body if state.has_pose else None
@@ -139,7 +139,7 @@ def test_after_the_last_frame_it_is_not_called_lost() -> None:
     agent, now = agent_with(20)
     agent.handle(ev.InputFinished(), now)
     status = agent.status(now + 3 * S)
-    assert (status.state, status.reason) == (TrackState.OK, "no more frames follow")
+    assert (status.state, status.reason) == (TrackState.OK, "no more frames")
 
 
 def test_changes_are_said_at_once_but_not_oftener_than_ten_times_a_second() -> None:

@@ -55,7 +55,7 @@ def test_who_was_not_heard_in_this_life_has_no_age() -> None:
     edge.handle(EdgeTick(), 6600 * S)
     seen = shown(edge)
     assert (seen["state"], seen["heard_s"], seen["gone"]) == ("SILENT", None, True)
-    assert "not heard since" in str(seen["reason"])
+    assert "no message since" in str(seen["reason"])
     edge.handle(PeerMessageReceived(wire.peer_id(1), encode(hello_of("ann", 1))), 6601 * S)
     assert shown(edge)["heard_s"] == 0.0
 

@@ -25,7 +25,7 @@ from share.wire.codec import decode, encode
 
 MS = 1_000_000
 CONFIG = Config(edge=EdgeConfig(policy="streamed"), stream=StreamConfig(window=3))
-HELLO = replace(hello_of("ann", 7), streams=True)
+HELLO = replace(hello_of("ann", 7), streams_frames=True)
 PEER = m.peer_id(7)
 
 
@@ -190,11 +190,11 @@ def test_without_an_edge_it_goes_on_and_says_so() -> None:
     wire.cut = True
     wire.play(300, first=5)
     wire.run(4500)
-    assert wire.said[1:] == ["the edge is silent; nobody tracks this agent"]
+    assert wire.said[1:] == ["the edge is silent; no tracking without the edge"]
     wire.cut = False
     wire.run(12_000)
     report = wire.agent.report()
-    assert wire.said[2:] == ["the edge is back"]
+    assert wire.said[2:] == ["reconnected to the edge"]
     assert report["arrived"] == 305
     assert report["answered"] + report["drop_frame"] + report["drop_link"] + report["unanswered"] == 305
     assert report["answered"] > 100
@@ -209,7 +209,7 @@ def test_another_life_of_the_edge_begins_another_stretch() -> None:
     wire.run(1500)
     wire.play(3, first=5)
     wire.run(1800)
-    assert wire.said[1:] == ["the edge has restarted; it begins tracking anew"]
+    assert wire.said[1:] == ["the edge has restarted; tracking starts again"]
     assert [a.frame.new_segment for a in wire.of(ev.FrameTrackedRemotely)] == [False] * 5 + [
         True,
         False,
@@ -225,7 +225,7 @@ def test_a_tracker_that_dies_costs_what_it_had_and_another_begins() -> None:
     wire.to_edge(ed.TrackerLost(wire.trackers[0].key, 0, "was ended by SIGKILL"))
     assert wire.trackers[-1].generation == 1
     assert [t["reason"] for t in wire.told if t["event"] == "tracking lost"] == [
-        "its process was ended by SIGKILL; odometry begins anew"
+        "its process was ended by SIGKILL; odometry starts again"
     ]
     wire.run(2500)
     assert len(wire.of(ev.FrameDone)) == 1  # what the dead one would have answered counts for nothing
@@ -243,7 +243,7 @@ def test_a_tracker_that_cannot_begin_is_said_to_its_agent() -> None:
     wire.run(200)
     (fail,) = wire.of(ev.FailRun)
     assert isinstance(fail.error, UsageError)
-    assert "the process that is to track it ended with exit code 1" in str(fail.error)
+    assert "its tracking process ended with exit code 1" in str(fail.error)
     assert len(wire.trackers) == 1
 
 
@@ -261,7 +261,7 @@ def test_a_goodbye_waits_for_the_last_pose_and_ends_the_tracker() -> None:
 @pytest.mark.parametrize(
     ("edge", "streams", "said"),
     [
-        (Edge(Config(), 1), True, "this edge tracks nobody: start it with --policy streamed"),
+        (Edge(Config(), 1), True, "this edge does not track agents: start it with --policy streamed"),
         (
             TrackingEdge(CONFIG, 1),
             False,
@@ -270,7 +270,7 @@ def test_a_goodbye_waits_for_the_last_pose_and_ends_the_tracker() -> None:
     ],
 )
 def test_who_does_not_fit_is_refused(edge: Edge, streams: bool, said: str) -> None:
-    wire = Wire(edge=edge, agent=Agent(replace(HELLO, streams=streams), CONFIG))
+    wire = Wire(edge=edge, agent=Agent(replace(HELLO, streams_frames=streams), CONFIG))
     wire.run(200)
     (fail,) = wire.of(ev.FailRun)
     assert said in str(fail.error)
@@ -282,7 +282,7 @@ def test_a_frame_of_another_size_is_a_bad_message() -> None:
     wire.to_agent(ev.FrameArrived(frame(0, height=479), 0))
     wire.run(400)
     assert [t["reason"] for t in wire.told if t["event"] == "bad message"] == [
-        "frame 0: image0 is 640x479, its camera 640x480"
+        "frame 0: image0 is 640x479, the rig says 640x480"
     ]
     assert not wire.tracked
 
@@ -293,13 +293,13 @@ def test_a_stream_that_is_none_of_ours_changes_nothing() -> None:
     wire.to_edge(ed.PeerMessageReceived(PEER, encoded(m.Evaluation(0, 1.0, None))))
     wire.to_edge(ed.PeerMessageReceived(m.peer_id(9), encoded(frame(0))))
     report = wire.edge.report({})
-    assert report["agents"]["ann"]["unexpected"] == report["strangers"]["unexpected"] == 1
+    assert report["agents"]["ann"]["unexpected"] == report["unjoined"]["unexpected"] == 1
     alone = Agent(hello_of("bob", 8), Config())
     effects = alone.handle(
         ev.EdgeMessageReceived(encoded(m.RemoteTrackingResult(0, 0, TrackState.LOST, None))), 0
     )
     assert [e.text for e in effects if isinstance(e, ev.PrintLine)] == [
-        "the edge sent a RemoteTrackingResult, which is not for this agent"
+        "the edge sent a RemoteTrackingResult, which this agent does not expect"
     ]
 
 
@@ -312,7 +312,7 @@ def encoded(message: m.Message) -> list[bytes]:
 
 def greeted(edge: Edge, number: int, now_ms: int = 0) -> tuple[list[m.Message], list[ed.EdgeEffect]]:
     """What agent `number` is told when it says hello, and all else that follows."""
-    hello = replace(hello_of(f"agent{number}", 100 + number), streams=True)
+    hello = replace(hello_of(f"agent{number}", 100 + number), streams_frames=True)
     effects = edge.handle(ed.PeerMessageReceived(m.peer_id(100 + number), encode(hello)), now_ms * MS)
     down = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
     return down, effects
@@ -341,7 +341,7 @@ def test_a_rig_that_no_tracker_can_use_is_refused_at_hello():
         (replace(rig, T_body_cam0=se3.from_rt(np.eye(3), np.array([0, 0, 400.0]))), "400 m from the IMU"),
     ]
     for k, (rig, says) in enumerate(refused):
-        hello = replace(hello_of(f"agent{k}", 100 + k), streams=True, rig=rig)
+        hello = replace(hello_of(f"agent{k}", 100 + k), streams_frames=True, rig=rig)
         effects = edge.handle(ed.PeerMessageReceived(m.peer_id(100 + k), encode(hello)), 0)
         assert not [e for e in effects if isinstance(e, ed.StartTracker)]
         [told] = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
@@ -354,11 +354,11 @@ def test_large_images_need_more_room():
     large = Rig(Camera(3800, 2400, 3000.0, 3000.0, 1900.0, 1200.0), np.eye(4), imu=NOISE)
     begun, refused = 0, []
     for k in range(12):
-        hello = replace(hello_of(f"agent{k}", 100 + k), streams=True, rig=large)
+        hello = replace(hello_of(f"agent{k}", 100 + k), streams_frames=True, rig=large)
         effects = edge.handle(ed.PeerMessageReceived(m.peer_id(100 + k), encode(hello)), 0)
         begun += sum(isinstance(e, ed.StartTracker) for e in effects)
         refused += [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
-    why = "no memory to track images of 3800x2400 beside the others"
+    why = "not enough memory to track another 3800x2400 stream"
     why = f"{why}: 4 cores, 1.0 GB free; wait until one leaves"
     assert begun == 2 and refused == [m.Refused(why)] * 10
     assert [type(e) for e in greeted(edge, 50)[1]].count(ed.StartTracker) == 1  # a small one has room
@@ -370,7 +370,7 @@ def test_a_stretch_that_begins_with_a_frame_nobody_waits_for_any_more_begins_wit
     for k in range(2):
         streaming.add_frame(ev.FrameArrived(frame(k), 0), is_connected=True)
         streaming.next_frame(2000 * MS * k)  # by then nobody waits for the first
-    late = m.RemoteTrackingResult(0, 0, TrackState.OK, pose(0), new_stretch=True)
+    late = m.RemoteTrackingResult(0, 0, TrackState.OK, pose(0), new_segment=True)
     assert streaming.take_result(late, 2000 * MS) is None
     answer = streaming.take_result(m.RemoteTrackingResult(1, 33 * MS, TrackState.OK, pose(1)), 2001 * MS)
     assert answer is not None

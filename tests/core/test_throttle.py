@@ -38,7 +38,7 @@ def test_keys_that_are_new_each_time_are_few() -> None:
 
 def test_what_goes_on_and_on_is_written_once_a_minute() -> None:
     records = EventLog(0)
-    written = [records.throttled_event(s * S, "back", "eve", "is heard again") for s in range(3600)]
+    written = [records.throttled_event(s * S, "reconnected", "eve", "sends again") for s in range(3600)]
     first, later = written[:300], written[600:]
     assert sum(r is not None for r in first) > 150
     assert sum(r is not None for r in later) <= 51
@@ -47,7 +47,7 @@ def test_what_goes_on_and_on_is_written_once_a_minute() -> None:
 def test_nothing_that_is_held_back_is_forgotten() -> None:
     records, counted = EventLog(0), 0
     for k in range(36_000):
-        if (record := records.throttled_event(k * S // 10, "back", "eve", "is heard again")) is not None:
+        if (record := records.throttled_event(k * S // 10, "reconnected", "eve", "sends again")) is not None:
             more = re.search(r"and (\d+) more", record.fields["reason"])
             counted += 1 + (int(more[1]) if more else 0)
     assert 36_000 - counted < 700  # of the last minute

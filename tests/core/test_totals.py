@@ -52,7 +52,7 @@ def test_a_life_goes_on_where_the_one_before_it_ended() -> None:
     totals, before, now = SessionTotals(), life(1, 3, 5), life(2, 1, 2)
     totals.add_session(totals.with_totals(before))
     added = totals.with_totals(now)
-    for path in ("agents.ann.bytes_up", "strangers.unexpected", "solve_ms.n", "loops.tried"):
+    for path in ("agents.ann.bytes_up", "unjoined.unexpected", "solve_ms.n", "loops.tried"):
         assert numbers(added, path) == numbers(before, path) + numbers(now, path) > numbers(now, path), path
     assert added["session"] == 2
     assert added["agents"]["ann"]["state"] == now["agents"]["ann"]["state"]

@@ -64,7 +64,7 @@ def test_each_message_of_an_older_agent_is_refused_in_its_own_version(old: int) 
         report = edge.report({})
         assert report["internal_errors"] == 0
         assert report["agents"] == {}
-        assert report["strangers"]["other_version"] == len(ups(old))
+        assert report["unjoined"]["other_version"] == len(ups(old))
 
 
 def test_the_older_agents_conversation_is_refused_seldom(old: int) -> None:
@@ -139,7 +139,7 @@ def test_an_agent_finds_out_that_the_edge_is_older_and_goes_on(old: int) -> None
     effects = run(agent, OlderEdge(old), 20)
     (line,) = said(effects)
     assert line.startswith(f"the edge speaks wire {old}, this SHARE ")
-    assert line.endswith(f"wire {WIRE_VERSION}: upgrade the edge; tracking goes on alone")
+    assert line.endswith(f"wire {WIRE_VERSION}: upgrade the edge; tracking continues without the edge")
     assert len(poses(effects)) == 200
     assert not agent.report()["connected"]
     assert agent.report()["bad_messages"] == 0
@@ -159,7 +159,7 @@ def test_it_joins_the_edge_once_that_is_upgraded(old: int) -> None:
 
 def test_an_edge_of_this_version_is_not_taken_for_an_older_one(old: int) -> None:
     """It is slow to welcome, as one that starts trackers is: pings of older versions reach it meanwhile."""
-    agent, edge, answers = Agent(replace(HELLO, streams=True), Config()), edges()[1], []
+    agent, edge, answers = Agent(replace(HELLO, streams_frames=True), Config()), edges()[1], []
     agent.handle(ev.Connected(), 0)
     for k in range(100):
         now_ns = k * S // 10
@@ -167,7 +167,7 @@ def test_an_edge_of_this_version_is_not_taken_for_an_older_one(old: int) -> None
             if isinstance(effect, ev.SendToEdge):
                 received = ed.PeerMessageReceived(m.peer_id(HELLO.run_id), [bytes(f) for f in effect.frames])
                 answers += sends(edge.handle(received, now_ns))
-    assert edge.report({})["strangers"]["other_version"] >= 30
+    assert edge.report({})["unjoined"]["other_version"] >= 30
     assert answers == []
 
 

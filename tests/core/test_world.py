@@ -76,7 +76,7 @@ def test_everybody_is_tracked_joined_and_corrected() -> None:
     room = world()
     report = room.edge.report(room.mapper.report())
     assert {name: agent["keyframes"] for name, agent in report["agents"].items()} == {"ann": 24, "bob": 24}
-    assert report["failed_jobs"] == 0
+    assert report["failed_steps"] == 0
     assert len(set(room.mapper.current_poses().map_ids)) == 1
     for name, log in room.logs.items():
         assert len(track_ms(room, name)) == 120

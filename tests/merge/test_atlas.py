@@ -116,8 +116,8 @@ def test_correction_brings_odometry_into_the_map(ann: Walker, bob: Walker) -> No
     last = KeyframeKey("bob", 59)
     assert correction.T_map_odom @ bob.T_odom_body[-1] == pytest.approx(atlas.pose(last), abs=1e-9)
     assert correction.T_map_odom == pytest.approx(atlas.T_map_odom("bob"))
-    assert (correction.map_id, correction.revision, correction.answers) == ("ann/0", 0, 56)
-    assert applied.corrections["ann"].answers == -1
+    assert (correction.map_id, correction.revision, correction.answered_keyframe) == ("ann/0", 0, 56)
+    assert applied.corrections["ann"].answered_keyframe == -1
     # what is uncertain is where bob is, to a few centimetres, not the far-off origin of his odometry
     cov = se3.inverse_cov(se3.inverse(bob.T_odom_body[-1]), correction.cov)
     assert 0.001 < np.sqrt(np.trace(cov[3:, 3:])) < 0.2

@@ -107,7 +107,7 @@ def test_what_does_not_come_of_rows_is_told_too() -> None:
         log.add_result(waits is None, waits is not None, waits)
     told = log.report()
     assert (told["cpu_ms_per_frame"], told["decode_ms_per_frame"]) == (500.0, 250.0)
-    assert (told["stretches"], told["contradicted"], told["waited"]) == (1, 1, {"imu": 2})
+    assert (told["segments"], told["inconsistent_frames"], told["waiting_frames"]) == (1, 1, {"imu": 2})
 
 
 def test_an_hour_of_frames_takes_no_memory(tmp_path: Path) -> None:
@@ -131,5 +131,5 @@ def test_a_line_that_somebody_changed_is_said() -> None:
     log = RunLog(lines)
     log.add(5, 2.0, TrackState.OK, False)
     lines.write("5,what,,OK,0,0")
-    with pytest.raises(DataError, match="the run's own latencies were changed by somebody"):
+    with pytest.raises(DataError, match="the log of this run's frames was changed during the run"):
         log.report()

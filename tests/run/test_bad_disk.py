@@ -185,9 +185,9 @@ def test_an_agent_whose_disk_does_not_answer(tmp_path: Path, plain_session: Path
     out, who = disk.folder / "ann", ("--name", "ann", "--kind", "ar", "--edge", address)
     agent = Child(tmp_path / "ann.log", "agent", str(plain_session / "ar1"), *who, "--out", str(out))
     patch.undo()
-    edge.wait_for("joined the edge")
+    edge.wait_for("agent joined")
     disk.hangs()
-    edge.wait_for("left: ann: said bye")
+    edge.wait_for("left: ann: sent bye")
     with urllib.request.urlopen(f"{page}snapshot.json", timeout=5) as answer:
         told = json.load(answer)["agents"]["ann"]
     if not lasting:

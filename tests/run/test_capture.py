@@ -90,7 +90,7 @@ def test_a_silent_imu_is_reset_once_then_images_go_on_alone(tmp_path: Path) -> N
         bench.run.stop()  # at once: images that stop coming are another story
     assert Fake.resets == 1
     assert bench.report["health"] == "VISION_ONLY"
-    assert bench.report["stretches"] == 2
+    assert bench.report["segments"] == 2
     assert (np.diff(open_source(str(tmp_path / "a.mcap")).stamps()["cam0"]) > 0).all()
 
 
@@ -107,7 +107,7 @@ def test_a_camera_that_comes_back_with_a_new_clock_begins_a_new_stretch(tmp_path
     assert len(steps) == 19
     assert (steps[steps < 0.1] > 0).all()
     assert 0.3 < steps.max() < 5  # as long as it was away, by the host's clock
-    assert (bench.report["stretches"], bench.report["reconnections"]) == (2, 1)
+    assert (bench.report["segments"], bench.report["reconnections"]) == (2, 1)
 
 
 def test_a_slow_disk_costs_images_that_are_counted_and_never_the_imu(

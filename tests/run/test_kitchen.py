@@ -103,7 +103,7 @@ def test_an_edge_that_is_killed_and_started_again(kitchen, tracked, tmp_path):
     for agent in agents.values():
         agent.wait_for("the edge has restarted")
     assert [agent.wait(90) for agent in agents.values()] == [0, 0]
-    edge.wait_for(r"(?s)listening on.*listening on.*maps joined")  # on a busy machine, after they have left
+    edge.wait_for(r"(?s)listening on.*listening on.*maps merged")  # on a busy machine, after they have left
     assert edge.interrupt() == 0
     report = json.loads((tmp_path / "edge" / "edge.json").read_text())
     assert len(report["maps"]) == 1

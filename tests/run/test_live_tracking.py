@@ -183,7 +183,7 @@ def test_a_camera_that_was_unplugged_is_tracked_on_with_its_new_clock(plain_sess
     threading.Thread(target=plugged, daemon=True).start()
     run = tracked(source)
     camera, stamps_ns = run.report["camera"], run.trajectory.stamps_ns
-    assert (camera["reconnections"], camera["stretches"], camera["restarts"]) == (1, 2, 0)
+    assert (camera["reconnections"], camera["segments"], camera["restarts"]) == (1, 2, 0)
     assert run.report["frames"] > 80
     assert run.report["sequencer"]["gaps"] == 1
     steps_s = np.diff(stamps_ns) * 1e-9

@@ -64,5 +64,5 @@ def test_a_keyframe_that_fails_costs_itself_alone(monkeypatch: pytest.MonkeyPatc
         inbox.put(message)
     mapper_process._MapperProcess(inbox, answers.append, Config()).run()
     said = [one.event for found in answers if isinstance(found, MapperResult) for one in found.findings]
-    assert "job failed" in said
+    assert "step failed" in said
     assert len(said) == 2

@@ -84,7 +84,7 @@ def test_an_agent_whose_edge_is_upgraded_goes_on_alone(
     old.wait_for("connected to the edge")
     edge.kill()
     edge, _ = start_edge(tmp_path / "after", address)
-    refused = old.wait_for("upgrade the agent; tracking goes on alone")
+    refused = old.wait_for("upgrade the agent; tracking continues without the edge")
     assert refused and old.wait(60) == 0
     assert odometry(tmp_path, "ann") == 45
     assert edge.interrupt() == 0
@@ -99,7 +99,9 @@ def test_an_agent_says_that_the_edge_is_of_the_last_release(
     agent = start_agent(tmp_path, "ann", plain_session / "ar1", address)
     agent.wait(60)
     line = f"the edge speaks wire {LAST_VERSION}, this SHARE"
-    assert agent.said.count(line) == 1 and "upgrade the edge; tracking goes on alone" in agent.said
+    assert (
+        agent.said.count(line) == 1 and "upgrade the edge; tracking continues without the edge" in agent.said
+    )
     assert "Traceback" not in agent.said
     assert odometry(tmp_path, "ann") == 45
     doctor = Child(tmp_path / "doctor.log", "doctor", "--edge", address)

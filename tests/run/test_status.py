@@ -44,7 +44,7 @@ TIMES = {"n": 4, "mean": 20.0, "p50": 10.0, "p95": 30.0, "p99": 40.0, "max": 50.
 REPORT = {
     "agents": {"ann": AGENT, "bob": {**AGENT, "kind": "robot", "gone": True, "map_id": None}},
     "maps": {0: 12, 3: 1},
-    "failed_jobs": 2,
+    "failed_steps": 2,
     "solve_ms": TIMES,
 }
 

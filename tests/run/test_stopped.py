@@ -52,16 +52,16 @@ def test_a_process_of_the_edge_is_stopped(tmp_path, victim):
 def test_an_agent_is_stopped(tmp_path, plain_session):
     edge, address = start_edge(tmp_path)
     agent = start_agent(tmp_path, "ann", plain_session / "ar1", address)
-    edge.wait_for("joined the edge")
+    edge.wait_for("agent joined")
     time.sleep(0.5)
     agent.process.send_signal(signal.SIGSTOP)
-    edge.wait_for("silent: ann: nothing heard", 20)
+    edge.wait_for("silent: ann: no message", 20)
     agent.process.send_signal(signal.SIGCONT)
     assert agent.wait(60) == 0
     assert edge.interrupt() == 0
     events = [json.loads(line) for line in (tmp_path / "edge" / "events.jsonl").read_text().splitlines()]
     names = [event["event"] for event in events]
-    assert names.index("silent") < names.index("back") < names.index("left")
+    assert names.index("silent") < names.index("reconnected") < names.index("left")
     report = json.loads((tmp_path / "ann" / "report.json").read_text())
     told = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]["ann"]
     assert (report["protocol"]["open"], report["frames"]) == (0, 45)

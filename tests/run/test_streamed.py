@@ -104,10 +104,10 @@ def test_a_tracker_that_is_killed_costs_its_agent_only(
     hit, other = (lost[1], {"ann": "bob", "bob": "ann"}[lost[1]])
     assert (tmp_path / other / "odom.tum").read_text() == tracked_here(plain_session / "ar1")
     assert report_of(tmp_path, other)["untracked"] == 0
-    assert report_of(tmp_path, other)["stretches"] == 1
+    assert report_of(tmp_path, other)["segments"] == 1
     of_hit = report_of(tmp_path, hit)
     assert of_hit["frames"] + of_hit["untracked"] == FRAMES
-    assert of_hit["stretches"] == 2
+    assert of_hit["segments"] == 2
     assert of_hit["tracked"] > FRAMES / 3
     told = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]
     assert told[hit]["frames_dropped"] <= of_hit["untracked"]  # which counts answers that came late, too
@@ -130,7 +130,7 @@ def test_an_edge_that_is_killed_is_said_and_the_agent_goes_on(plain_session: Pat
     agent.wait_for("connected to the edge")
     edge.kill()
     assert agent.wait(60) == 0
-    assert "the edge is silent; nobody tracks this agent" in agent.said
+    assert "the edge is silent; no tracking without the edge" in agent.said
     report = report_of(tmp_path, "ann")
     assert report["frames"] + report["untracked"] == FRAMES
     assert report["untracked"] > FRAMES / 2
@@ -150,7 +150,7 @@ def test_who_does_not_fit_is_told_so(plain_session: Path, tmp_path: Path) -> Non
     streams = start_agent(tmp_path, "bob", plain_session / "ar1", address, "--streamed")
     assert streams.wait(60) == 2
     assert streams.said == (
-        "share: the edge refuses 'bob': this edge tracks nobody: start it with --policy streamed, "
+        "share: the edge refuses 'bob': this edge does not track agents: start it with --policy streamed, "
         "or the agent without --streamed\n"
     )
     maps.interrupt()

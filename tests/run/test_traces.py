@@ -29,11 +29,11 @@ def trial(tmp_path):
     series = {"ann": {"t_s": [1.0, 2.0], "qoe": [0.5, None], "rate_hz": [None, 2.5]}}
     (edge / "edge.json").write_text(json.dumps({"series": series}))
     events = [
-        {"t_s": 2.0, "event": "joined the edge"},
-        {"t_s": 2.5, "event": "joined the edge"},
+        {"t_s": 2.0, "event": "agent joined"},
+        {"t_s": 2.5, "event": "agent joined"},
         {"t_s": 4.0, "event": "loop accepted", "agent": "ann"},
         {"t_s": 5.0, "event": "loop refused", "agent": "ann"},
-        {"t_s": 6.0, "event": "maps joined", "agent": "bob"},
+        {"t_s": 6.0, "event": "maps merged", "agent": "bob"},
         {"t_s": 99.0, "event": "loop accepted", "agent": "ann"},
     ]
     (edge / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))

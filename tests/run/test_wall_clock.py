@@ -18,7 +18,7 @@ def test_odometry_is_the_same_and_nobody_is_lost(tmp_path: Path, plain_session: 
     edge, address = start_edge(tmp_path)
     ann = start_agent(tmp_path, "ann", plain_session / "ar1", address)
     patch.undo()
-    edge.wait_for("joined the edge")
+    edge.wait_for("agent joined")
     for off_s in (3600, -3600, 0):
         time.sleep(0.7)
         clock.set(off_s)

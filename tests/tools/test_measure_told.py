@@ -41,7 +41,7 @@ def trial(tool, tmp_path, monkeypatch):
     series = {"t_s": [12.0, 16.0, 17.5, 19.0, 30.0], "error_cm": [0.1, 3.0, 7.5, None, 1.0]}
     (tmp_path / "edge").mkdir()
     (tmp_path / "edge" / "edge.json").write_text(json.dumps({"series": {"ann": series}}))
-    (tmp_path / "edge" / "events.jsonl").write_text('{"t_s": 10.0, "event": "joined the edge"}\n')
+    (tmp_path / "edge" / "events.jsonl").write_text('{"t_s": 10.0, "event": "agent joined"}\n')
     session = SimpleNamespace(agents={"ann": SimpleNamespace(kind="ar")})
     return SimpleNamespace(folder=tmp_path, folders={}, session=session)
 

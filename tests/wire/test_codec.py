@@ -60,8 +60,8 @@ EXAMPLES: list[m.Message] = [
     m.Pong(1, 1, 2, 3, 2**62),
     frame(True),
     frame(False),
-    m.RemoteTrackingResult(4, 10**18, TrackState.OK, POSE, keyframe=True),
-    m.RemoteTrackingResult(5, 10**18, TrackState.INITIALISING, None, waits=WaitReason.TILT),
+    m.RemoteTrackingResult(4, 10**18, TrackState.OK, POSE, is_keyframe=True),
+    m.RemoteTrackingResult(5, 10**18, TrackState.INITIALISING, None, waiting_for=WaitReason.TILT),
 ]
 
 
@@ -160,11 +160,11 @@ BAD = {
     "is not a rigid transform": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), *T_FRAMES],
     "not finite": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
     "Invalid enum value 'LOSTER'": [header(V, 2, (1, "LOSTER", -1), [("<f8", (4, 4))]), *T_FRAMES],
-    "follows: 9": [header(V, 3, (7, -1, 0, 9, 0.0), codec_table := [
+    "predecessor: 9": [header(V, 3, (7, -1, 0, 9, 0.0), codec_table := [
         ("<f8", (4, 4)), ("<f8", (6, 6)), ("<f8", (4, 4)), ("<f8", (3,)),
         ("<f4", (0, 2)), ("<f4", (0, 3)), ("|u1", (0, 32))]),
         POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
-    "up_sigma: -0.1 is no standard deviation": [header(V, 3, (7, -1, 0, 6, -0.1), codec_table),
+    "up_sigma: -0.1 is outside 0 .. 1e+06": [header(V, 3, (7, -1, 0, 6, -0.1), codec_table),
         POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
     "view.uv: <f4 of shape (2001, 2)": [header(V, 3, (7, -1, 0, 6, 0.0), [
         *codec_table[:4], ("<f4", (2001, 2)), *codec_table[5:]]),
@@ -362,7 +362,7 @@ def test_a_rig_that_is_none_is_refused() -> None:
     version, code, scalars, table = msgspec.msgpack.decode(frames[0])
     for wrong, said in (
         ({**scalars[4], "fx": 0.5}, "focal lengths 0.5, 457 px are not within"),
-        ({**scalars[4], "width": 8193}, "image: 8193x480 px is more than 8192 a side"),
+        ({**scalars[4], "width": 8193}, "image: 8193x480 px exceeds 8192 px a side"),
         ({**scalars[4], "fx": float("nan")}, "focal lengths nan"),
         ({**scalars[4], "height": 0}, "resolution: 752x0 is not positive"),
         ({"width": 3}, "missing required field"),
@@ -394,8 +394,8 @@ def injured_frame(at: int, entry: tuple[str, tuple[int, ...]], data: bytes) -> l
         (0, ("|u1", (8192, 8192)), b"\0" * 9, "image0: 67108864 bytes, at most 9216000"),
         (0, ("|u1", (12, 16)), b"\0" * 191, "image0: 191 bytes, its shape needs 192"),
         (1, ("|u1", (0,)), b"\0", "image1: 1 bytes, its shape needs 0"),
-        (2, ("<f4", (1, 2)), np.array([[1, np.nan]], "<f4").tobytes(), "depth: has values"),
-        (2, ("<f4", (1, 2)), np.array([[1, -1]], "<f4").tobytes(), "depth: has values"),
+        (2, ("<f4", (1, 2)), np.array([[1, np.nan]], "<f4").tobytes(), "depth: negative or non-finite"),
+        (2, ("<f4", (1, 2)), np.array([[1, -1]], "<f4").tobytes(), "depth: negative or non-finite"),
         (3, ("<i8", (4,)), b"\0" * 32, "gyro: shape (5, 3), expected (4, 3)"),
         (3, ("<i8", (20_001,)), b"\0" * 160_008, "imu.stamps_ns: <i8 of shape (20001,)"),
         (4, ("<f8", (5, 3)), np.full(15, np.inf).tobytes(), "gyro: has values that are not finite"),
@@ -403,22 +403,22 @@ def injured_frame(at: int, entry: tuple[str, tuple[int, ...]], data: bytes) -> l
             4,
             ("<f8", (5, 3)),
             np.array([0.0, 1e300] + [0.0] * 13).tobytes(),
-            "gyro: has values beyond 1000, which no IMU measures",
+            "gyro: values beyond 1000, the limit of any IMU",
         ),
         (
             4,
             ("<f8", (5, 3)),
             np.full(15, -1001.0).tobytes(),
-            "gyro: has values beyond 1000, which no IMU measures",
+            "gyro: values beyond 1000, the limit of any IMU",
         ),
         (
             5,
             ("<f8", (5, 3)),
             np.full(15, 1.1e4).tobytes(),
-            "accel: has values beyond 10000, which no IMU measures",
+            "accel: values beyond 10000, the limit of any IMU",
         ),
-        (3, ("<i8", (5,)), np.array([1, 2, 2, 3, 4]).tobytes(), "stamps_ns: do not rise"),
-        (3, ("<i8", (5,)), np.array([1, 2, 1, 3, 4]).tobytes(), "stamps_ns: do not rise"),
+        (3, ("<i8", (5,)), np.array([1, 2, 2, 3, 4]).tobytes(), "stamps_ns: not strictly increasing"),
+        (3, ("<i8", (5,)), np.array([1, 2, 1, 3, 4]).tobytes(), "stamps_ns: not strictly increasing"),
     ],
 )
 def test_a_frame_that_is_none_is_refused(
@@ -439,7 +439,7 @@ def test_images_are_not_copied_on_either_side() -> None:
 
 def test_a_pose_goes_with_its_state() -> None:
     for state, T in ((TrackState.LOST, POSE), (TrackState.OK, None)):
-        with pytest.raises(ValueError, match="goes with a state that has a pose"):
+        with pytest.raises(ValueError, match="required with a pose"):
             m.RemoteTrackingResult(1, 2, state, T)
 
 

@@ -136,7 +136,7 @@ def _join_times(events: Path) -> dict[str, float]:
     membership = MapMembership()
     joined: dict[str, float] = {}
     for event in read_json_lines(events):
-        if event["event"] == "joined the edge" and first_s is None:
+        if event["event"] == "agent joined" and first_s is None:
             first_s = event["t_s"]
         if event["event"] == "correction":
             membership.add_correction(event["agent"], event["map_id"])
@@ -161,7 +161,7 @@ def _nan_if_none(value: float | None) -> float:
 
 # A run over time: QoE, rates and merges, from the files of its edge.
 
-_MERGE_EVENTS = ("loop accepted", "maps joined")
+_MERGE_EVENTS = ("loop accepted", "maps merged")
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +191,7 @@ def traces(trial: Trial) -> dict[str, AgentTrace]:
 def first_join_s(events: list[dict[str, Any]]) -> float:
     """Return when the first agent joined the edge, s of the edge's clock, which is where the truth starts;
     0 if none did."""
-    return next((e["t_s"] for e in events if e["event"] == "joined the edge"), 0.0)
+    return next((e["t_s"] for e in events if e["event"] == "agent joined"), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
