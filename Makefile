@@ -35,7 +35,7 @@ type: install
 bench: install
 	$(BIN)/python tools/bench.py
 vio-figures: install
-	$(BIN)/python tools/measure_vio.py
+	$(BIN)/python tools/experiments/measure_vio.py
 # The frozen program is built in an environment of its own, of exactly what the lock file says.
 LOCKS := tools/locks
 LOCK := $(LOCKS)/$(shell $(PYTHON) -c "import platform, sys; print('%s-py%d.%d' % (platform.machine(), *sys.version_info[:2]))").txt

@@ -14,11 +14,10 @@ import click
 from deploy_device import Device, Facts, check
 from deploy_release import Release, read_release, write_tar
 from deploy_settings import merged
-from tool_main import exit_code
 
 from share.cli.terminal import progress
 from share.devices import checks
-from share.errors import UsageError
+from share.errors import ShareError, UsageError
 from share.net.keys import public_key
 from share.net.transport import parse_address
 
@@ -226,4 +225,8 @@ def _roll_back(device: Device, service: Service, dry_run: bool) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code("deploy", cli))
+    try:
+        cli()
+    except ShareError as error:
+        print(f"deploy: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)

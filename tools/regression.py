@@ -31,6 +31,8 @@ from share import startup
 
 startup.prepare_process()
 
+sys.path.insert(0, str(Path(__file__).resolve().parent / "experiments"))
+
 import numpy as np  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 

@@ -1,4 +1,4 @@
-"""tools/measure_claims.py: what it makes of a lie, and what lies cost in a room of points."""
+"""tools/experiments/measure_claims.py: what it makes of a lie, and what lies cost in a room of points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge_sim import Person, walls
 from share.geometry import se3
 from share.types import AgentKind, Keyframe
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 STEPS = 48
 SEEDS = range(1, 11)
 COSTS = 1.10  # what a lie may cost the others, as a part of their error: of all rooms together

@@ -1,4 +1,4 @@
-"""The table of tools/measure_joins.py."""
+"""The table of tools/experiments/measure_joins.py."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from share.errors import ConfigError
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 
 
 @pytest.fixture(scope="module")

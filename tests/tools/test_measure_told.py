@@ -14,7 +14,7 @@ from share.lab.evaluate.real_time import AgentScore, SessionScore
 from share.metrics.ate import Ate, JointAte
 from share.recordings.trajectory import Trajectory
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 S = 1_000_000_000
 
 

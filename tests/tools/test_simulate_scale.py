@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-TOOL = Path(__file__).parents[2] / "tools" / "simulate_scale.py"
+TOOL = Path(__file__).parents[2] / "tools" / "experiments" / "simulate_scale.py"
 
 
 @pytest.mark.slow

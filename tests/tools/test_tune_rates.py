@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-TOOL = Path(__file__).parents[2] / "tools" / "tune_rates.py"
+TOOL = Path(__file__).parents[2] / "tools" / "experiments" / "tune_rates.py"
 
 
 def tuned(*arguments: str) -> subprocess.CompletedProcess[str]:
