@@ -201,7 +201,7 @@ def test_costs_by_reports_that_say_something_else(tmp_path, report):
 )
 def test_scores_of_other_types(tmp_path, row):
     (tmp_path / "a.json").write_text(f"[{row}]")
-    with pytest.raises(DataError, match="is not by `share train compare --json`, or damaged"):
+    with pytest.raises(DataError, match="not a file of `share train compare --json`, or damaged"):
         read_scores(tmp_path / "a.json")
 
 
