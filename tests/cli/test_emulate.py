@@ -60,7 +60,7 @@ TYPED = {
     "key": (["--motion", "walk:sped=1"], "'walk:sped=1': unknown key 'sped'; did you mean 'speed'?"),
     "value": (["--motion", "walk:speed=9"], "'walk:speed=9': speed=9: expected 0.2 to 2 m/s"),
     "experiment": (["--motion", "paper:6"], "'paper:6': the paper has five experiments; say paper:1 to"),
-    "no folder": (["--motion", "euroc:"], "'euroc:': says no folder or file"),
+    "no folder": (["--motion", "euroc:"], "'euroc:': names no folder or file"),
     "folder": (["--motion", "euroc:V1_02"], "V1_02: no recorded motion is here; expected mav0/imu0/data.csv"),
     "file": (["--motion", "tum:poses.txt"], "poses.txt: no such file"),
     "twice": (["--motion", "a=walk:", "--motion", "a=robot:"], "two agents are named 'a'; give each its own"),
@@ -190,7 +190,7 @@ EUROC = {
     "no overlap": (
         lambda r: shift(r / _TRUTH, 10**12),
         1,
-        "flight: IMU and truth do not overlap; are they of",
+        "flight: IMU and ground truth do not overlap in time; give",
     ),
     "no rotation": (
         lambda r: edit(r / _TRUTH, 9, lambda row: [*row[:4], "0", "0", "0", "0"]),
@@ -203,7 +203,7 @@ EUROC = {
     "no truth": (
         lambda r: shutil.rmtree(r / "mav0/state_groundtruth_estimate0"),
         1,
-        "has no truth; expected",
+        "has no ground truth; expected",
     ),
     "too short": (lambda r: edit(r / _TRUTH, 9, lambda row: row), 2, "at least 1 s are needed"),
 }
