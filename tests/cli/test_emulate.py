@@ -64,7 +64,7 @@ TYPED = {
     "folder": (["--motion", "euroc:V1_02"], "V1_02: no recorded motion is here; expected mav0/imu0/data.csv"),
     "file": (["--motion", "tum:poses.txt"], "poses.txt: no such file"),
     "twice": (["--motion", "a=walk:", "--motion", "a=robot:"], "two agents are named 'a'; give each its own"),
-    "taken": (["--motion", "truth=walk:"], "an agent cannot be named 'truth': the session's truth is in"),
+    "taken": (["--motion", "truth=walk:"], "an agent cannot be named 'truth': a folder of the"),
     "size": (["--size", "50x50x50"], "the plain room can be 5 x 4 x 2.2 to 12 x 9 x 4 m"),
     "word for a size": (["--size", "big"], "'big' is not a size in metres such as 9x6x4"),
     "halls": (
@@ -96,7 +96,7 @@ TYPED = {
         ["--profile", "euroc"],
         "walk1: scene 'plain' has no lens distortion; give --profile walk1=d435i",
     ),
-    "in a file": (["--out", "note/deep/session"], "note/deep/session: lies below a file, "),
+    "in a file": (["--out", "note/deep/session"], "note/deep/session: its parent "),
     "there already": (["--out", "note"], "note: exists already; give the name of a new folder"),
 }
 
@@ -245,7 +245,7 @@ def test_a_disk_that_fills_up(small, tmp_path):
         [*SHARE, "emulate", *words], cwd=tmp_path, preexec_fn=limit, capture_output=True, text=True
     )
     line = complaint(Done(done.returncode, done.stdout, done.stderr), 1)
-    assert "cannot be written: File too large; the same command goes on with what is drawn" in line
+    assert "cannot be written: File too large; run the same command again to resume" in line
     assert os.listdir(tmp_path) == [".session.partial"]
 
 
