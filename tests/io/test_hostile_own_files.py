@@ -283,7 +283,7 @@ def test_only_regular_files_of_bearable_size(tmp_path, name, kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_kept_of_a_room(tmp_path, kind):
     special(tmp_path / "room.json", kind)
-    with pytest.raises(DataError, match="not a whole room"):
+    with pytest.raises(DataError, match="not a complete room"):
         load_room(tmp_path)
     special(tmp_path / "plain.json", kind)
     with pytest.raises(ShareError):
