@@ -31,7 +31,7 @@ from share.errors import ShareError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Camera, rays  # noqa: E402
 from share.lab.emulate.motion.avatars import Avatar, avatar_shapes  # noqa: E402
-from share.lab.emulate.motion.crowd import path_length, settled_path  # noqa: E402
+from share.lab.emulate.motion.crowd import fixed_path, path_length  # noqa: E402
 from share.lab.emulate.motion.floor import Floor  # noqa: E402
 from share.lab.emulate.motion.motion_plan import PlannedAgent, plan_motions  # noqa: E402
 from share.lab.emulate.motion.paper import LENGTHS_M, NAMES, SECONDS  # noqa: E402
@@ -100,7 +100,7 @@ def of_plan(scene: str, number: int, seed: int) -> Row:
 
 def distances(room: Layout, agents: Sequence[PlannedAgent]) -> Row:
     """Least ones, m: of each from things at body height, of each head from anything, between agents."""
-    xyz1, xyz2, xyz3 = xyz = [settled_path(a.path, 0.0).xyz for a in agents]
+    xyz1, xyz2, xyz3 = xyz = [fixed_path(a.path, 0.0).xyz for a in agents]
     free = Occupancy.from_layout(room)
     floor = fine_floor(free)
     return {

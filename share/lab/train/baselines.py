@@ -37,9 +37,8 @@ class KeyframeRows(ArrayTable):
 
 Predictor = Callable[[KeyframeRows], F64]
 ShowProgress = Callable[[str], None]  # progress, as text for the user
-Baseline = Callable[
-    [KeyframeRows, KeyframeRows, int, ShowProgress], Predictor
-]  # learnt from, stopped by, seed
+# of training rows, validation rows and seed
+Baseline = Callable[[KeyframeRows, KeyframeRows, int, ShowProgress], Predictor]
 
 
 def linear(

@@ -48,7 +48,7 @@ class SimulatedAgent:
 
 
 @dataclass(frozen=True, eq=False)
-class SettledPath:
+class FixedPath:
     """A path that is fixed. xyz (M, 3) m every KNOT_S from its start; distance: m that others keep from
     it."""
 
@@ -59,7 +59,7 @@ class SettledPath:
 def plan_crowd(
     ground: FloorGraphs,
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     gaze_targets: F64,
     duration: float,
     seed: tuple[int, ...],
@@ -67,7 +67,7 @@ def plan_crowd(
     """Return paths of `duration` s, in the members' order. gaze_targets (K, 3) m: things to look at. Raises
     UsageError where no attempt finds room for all."""
     for attempt in range(_ATTEMPTS):
-        paths = _try_crowd(ground, members, settled, gaze_targets, duration, (*seed, attempt))
+        paths = _try_crowd(ground, members, fixed, gaze_targets, duration, (*seed, attempt))
         if paths is not None:
             return paths
     names = ", ".join(m.name for m in members)
@@ -80,32 +80,32 @@ def plan_crowd(
 def _try_crowd(
     ground: FloorGraphs,
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     gaze_targets: F64,
     duration: float,
     seed: tuple[int, ...],
 ) -> list[SplinePath] | None:
     lengths = [m.length for m in members]
-    courses_and_tracks = _plan_courses(ground, members, settled, duration, seed)
+    courses_and_tracks = _plan_courses(ground, members, fixed, duration, seed)
     before = np.full(len(members), np.inf)
     for _ in range(_LENGTH_ROUNDS):
         if courses_and_tracks is None:
             return None
         paths = _body_paths(
-            members, [track for _, track in courses_and_tracks], settled, gaze_targets, duration, seed
+            members, [track for _, track in courses_and_tracks], fixed, gaze_targets, duration, seed
         )
         missing = np.array(
             [m.length - path_length(p) if m.length else 0.0 for m, p in zip(members, paths, strict=True)]
         )
         length_errors = np.abs(missing) / [m.length or 1.0 for m in members]
         if (length_errors <= _LENGTH_TOLERANCE).all():
-            return paths if _keep_distance(members, paths, settled) else None
+            return paths if _keep_distance(members, paths, fixed) else None
         if (length_errors > np.maximum(_LENGTH_TOLERANCE, _MIN_IMPROVEMENT * before)).any():
             return None  # a length cannot be reached, or another agent forces a longer path
         before = length_errors
         lengths = [g and max(0.5, g + d) for g, d in zip(lengths, missing, strict=True)]
         courses_and_tracks = _replan_lengths(
-            ground, members, settled, duration, [course for course, _ in courses_and_tracks], lengths
+            ground, members, fixed, duration, [course for course, _ in courses_and_tracks], lengths
         )
     return None
 
@@ -117,24 +117,24 @@ def path_length(path: MotionPath) -> float:
     return float(np.linalg.norm(steps, axis=1).sum())
 
 
-def settled_path(path: MotionPath, distance: float) -> SettledPath:
+def fixed_path(path: MotionPath, distance: float) -> FixedPath:
     """Return a fixed path as an obstacle for others."""
     seconds = knot_times((path.end_ns - path.start_ns) / 1e9)
     stamps = np.minimum(path.start_ns + np.round(seconds * 1e9).astype(np.int64), path.end_ns)
-    return SettledPath(path.poses(stamps)[:, :3, 3], distance)
+    return FixedPath(path.poses(stamps)[:, :3, 3], distance)
 
 
 def _plan_courses(
     ground: FloorGraphs,
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     duration: float,
     seed: tuple[int, ...],
 ) -> list[tuple[PlannedRoute, PlanarTrack]] | None:
     """Return a route for each member, and the track on it; None if there is none."""
     planned: dict[int, tuple[PlannedRoute, PlanarTrack]] = {}
     for i in _priority_order(members):
-        obstacles = _obstacles(members, settled, {k: track for k, (_, track) in planned.items()}, i)
+        obstacles = _obstacles(members, fixed, {k: track for k, (_, track) in planned.items()}, i)
         preferences = replace(members[i].preferences, length=members[i].length)
         one = plan_motion(ground, preferences, obstacles, duration, (*seed, i))
         if one is None:
@@ -146,7 +146,7 @@ def _plan_courses(
 def _replan_lengths(
     ground: FloorGraphs,
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     duration: float,
     courses: Sequence[PlannedRoute],
     lengths: Sequence[float | None],
@@ -154,7 +154,7 @@ def _replan_lengths(
     """Return the same routes with tracks of other lengths; None if there are none."""
     tracks: dict[int, PlanarTrack] = {}
     for i in _priority_order(members):
-        track = courses[i].track(ground, _obstacles(members, settled, tracks, i), duration, lengths[i])
+        track = courses[i].track(ground, _obstacles(members, fixed, tracks, i), duration, lengths[i])
         if track is None:
             return None
         tracks[i] = track
@@ -168,32 +168,32 @@ def _priority_order(members: Sequence[SimulatedAgent]) -> list[int]:
 
 def _obstacles(
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     tracks: Mapping[int, PlanarTrack],
     i: int,
 ) -> list[MovingObstacle]:
     """Return what member i must keep off: all whose motion is planned."""
     own = members[i].preferences
-    settled_tracks = [(p.xyz[:, :2], p.distance) for p in settled]
-    settled_tracks += [(track.xy, members[k].preferences.distance) for k, track in tracks.items()]
-    return [moving_obstacle(xy, min(distance, own.distance)) for xy, distance in settled_tracks]
+    fixed_tracks = [(p.xyz[:, :2], p.distance) for p in fixed]
+    fixed_tracks += [(track.xy, members[k].preferences.distance) for k, track in tracks.items()]
+    return [moving_obstacle(xy, min(distance, own.distance)) for xy, distance in fixed_tracks]
 
 
 def _body_paths(
     members: Sequence[SimulatedAgent],
     tracks: Sequence[PlanarTrack],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     gaze_targets: F64,
     duration: float,
     seed: tuple[int, ...],
 ) -> list[SplinePath]:
     count = len(tracks[0].seconds)
     gaze_agents = [GazeAgent(t.xy, m.height) for t, m in zip(tracks, members, strict=True)]
-    settled_agents = [GazeAgent(_extended(p.xyz[:, :2], count), float(p.xyz[:, 2].mean())) for p in settled]
+    fixed_agents = [GazeAgent(_extended(p.xyz[:, :2], count), float(p.xyz[:, 2].mean())) for p in fixed]
     paths = []
     for i, (m, track) in enumerate(zip(members, tracks, strict=True)):
         rng = np.random.default_rng((*seed, i, 1))
-        others = [s for k, s in enumerate(gaze_agents) if k != i] + settled_agents
+        others = [s for k, s in enumerate(gaze_agents) if k != i] + fixed_agents
         if m.preferences.body_kind == "person":
             path = walk.headset_path(track, m.height, m.max_head_rate, gaze_targets, others, START_NS, rng)
         else:
@@ -203,11 +203,11 @@ def _body_paths(
 
 
 def _keep_distance(
-    members: Sequence[SimulatedAgent], paths: Sequence[SplinePath], settled: Sequence[SettledPath]
+    members: Sequence[SimulatedAgent], paths: Sequence[SplinePath], fixed: Sequence[FixedPath]
 ) -> bool:
     """Return whether all keep the lesser of their two distances at all times."""
-    bodies = [settled_path(p, m.preferences.distance) for p, m in zip(paths, members, strict=True)]
-    everyone = [*bodies, *settled]
+    bodies = [fixed_path(p, m.preferences.distance) for p, m in zip(paths, members, strict=True)]
+    everyone = [*bodies, *fixed]
     for i, a in enumerate(bodies):
         for b in everyone[i + 1 :]:
             count = max(len(a.xyz), len(b.xyz))

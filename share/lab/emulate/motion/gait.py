@@ -1,4 +1,4 @@
-"""How walking moves the trunk: bob, sway, the jolt of each step, and what a standing body does.
+"""Motion of the trunk in walking (bob, sway, heel strikes) and in standing.
 
 * Step frequency: step length / step frequency is constant in free walking, the walk ratio of about
   0.0065 m per step/min = 0.39 m s (Sekiya & Nagasaki, Gait & Posture 7, 1998), so f = sqrt(v / 0.39).

@@ -15,7 +15,7 @@ import numpy as np
 from share.errors import UsageError
 from share.geometry.camera import ImuNoise
 from share.lab.emulate.motion import board, paper
-from share.lab.emulate.motion.crowd import SettledPath, SimulatedAgent, plan_crowd, settled_path
+from share.lab.emulate.motion.crowd import FixedPath, SimulatedAgent, fixed_path, plan_crowd
 from share.lab.emulate.motion.floor import Floor, floor_from_occupancy
 from share.lab.emulate.motion.placement import MIN_DISTANCE_M, PathToPlace, place_paths
 from share.lab.emulate.motion.planned_motion import PEOPLE_M, FloorGraphs, MotionPreferences
@@ -105,7 +105,7 @@ def plan_motions(specs: Sequence[str], layout: Layout, seconds: float, seed: int
     agents += [
         _board_agent(a, a.spec, layout, seconds, seed) for a in requests if isinstance(a.spec, BoardSpec)
     ]
-    agents += _simulated_agents(requests, layout, [_settled(agent) for agent in agents], seconds, seed)
+    agents += _simulated_agents(requests, layout, [_fixed_path(agent) for agent in agents], seconds, seed)
     order = [name for a in requests for name in _agent_names(a)]
     if any(isinstance(a.spec, PaperSpec) for a in requests) and seconds != paper.SECONDS:
         notes = [*notes, f"an experiment of the paper lasts {paper.SECONDS:g} s"]
@@ -181,12 +181,12 @@ def _short_note(path: MotionPath, seconds: float) -> tuple[str, ...]:
     return (f"ends after {lasts:.1f} s",) if lasts < seconds - 0.5 else ()
 
 
-def _settled(agent: PlannedAgent) -> SettledPath:
-    return settled_path(agent.path, PEOPLE_M if agent.body_kind == "person" else MIN_DISTANCE_M)
+def _fixed_path(agent: PlannedAgent) -> FixedPath:
+    return fixed_path(agent.path, PEOPLE_M if agent.body_kind == "person" else MIN_DISTANCE_M)
 
 
 def _simulated_agents(
-    requests: Sequence[_NamedSpec], layout: Layout, settled: Sequence[SettledPath], seconds: float, seed: int
+    requests: Sequence[_NamedSpec], layout: Layout, fixed: Sequence[FixedPath], seconds: float, seed: int
 ) -> list[PlannedAgent]:
     """Return people and robots, also the paper's three."""
     members: list[SimulatedAgent] = []
@@ -201,7 +201,7 @@ def _simulated_agents(
     floor = floor_from_occupancy(Occupancy.from_layout(layout))
     if any(isinstance(a.spec, PaperSpec) for a in requests):
         floor, seconds = _floor_within(floor, _PAPER_SPACE_M), paper.SECONDS
-    paths = plan_crowd(FloorGraphs(floor), members, settled, _gaze_targets(layout, rng), seconds, (seed, 73))
+    paths = plan_crowd(FloorGraphs(floor), members, fixed, _gaze_targets(layout, rng), seconds, (seed, 73))
     kinds = {"person": AgentKind.AR, "robot": AgentKind.ROBOT}
     return [
         PlannedAgent(

@@ -169,14 +169,14 @@ def _grid_values(grid: F64 | F32, points: F64) -> F64:
     return out
 
 
-def _distance_from_paths(shell: Occupancy, settled: Sequence[F64]) -> F64:
+def _distance_from_paths(shell: Occupancy, fixed: Sequence[F64]) -> F64:
     """Return the horizontal distance (X, Y, 1) m of each place from placed paths, 0 everywhere without
     any."""
     from scipy.ndimage import distance_transform_edt
 
     shape = shell.solid.shape[:2]
     free = np.ones(shape, bool)
-    for xyz in settled:
+    for xyz in fixed:
         i, j = np.floor(xyz[:, :2] / _VOXEL_M).astype(int).T
         free[i.clip(0, shape[0] - 1), j.clip(0, shape[1] - 1)] = False
     if free.all():

@@ -138,7 +138,9 @@ def board(rng: Rng, n: int, text: str = "") -> U8:
     return sheet
 
 
-def _shelf_rows(rng: Rng, n: int, rows: int, tallest: float, widths: tuple[float, float], odd: float) -> U8:
+def _shelf_rows(
+    rng: Rng, n: int, rows: int, tallest: float, widths: tuple[float, float], filled: float
+) -> U8:
     """Upright objects side by side on boards, of all heights, some missing."""
     sheet = _background(rng, n, 42, 6, 2)
     pitch = n // rows
@@ -146,7 +148,7 @@ def _shelf_rows(rng: Rng, n: int, rows: int, tallest: float, widths: tuple[float
         x = 1
         while x < n - 3:
             wide = max(3, int(rng.uniform(*widths) * n))
-            if rng.random() < odd:
+            if rng.random() < filled:
                 tall = int(pitch * rng.uniform(0.55, tallest))
                 gray = float(rng.uniform(55, 205))
                 right = min(x + wide - 2, n - 2)

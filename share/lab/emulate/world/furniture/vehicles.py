@@ -8,8 +8,8 @@ from share.lab.emulate.world.furniture.parts import box_on, pick_material, pick_
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import Rng, Shape, box, concat_shapes, cylinder, decal, polygon, prism, quad
 
+# Takes an outline (y, z), extruded along +z, to one extruded along x.
 _UPRIGHT = np.array([(0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1.0)])
-# Rotation that turns an outline (y, z) extruded along +z so that it extends along x.
 
 
 def _body(outline: list[tuple[float, float]], half: float, skin: Material, rng: Rng) -> Shape:
