@@ -60,9 +60,9 @@ def test_a_row_says_how_well_agents_know_themselves(tool):
     assert row == {
         "runs": "2",
         "N": "4",
-        "told, cm": "2.74",
+        "estimated, cm": "2.74",
         "true, cm": "6.12",
-        "true / told": "2.12",
+        "true / estimated": "2.12",
         "within twice, %": "50",
         "rank": "0.80",
         "of runs": "1.00",

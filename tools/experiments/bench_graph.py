@@ -1,10 +1,11 @@
-"""How long the pose graph takes, by its size. Prints JSON: CPU time of one thread, in ms.
+"""Time of the pose graph by its size. Prints JSON: CPU time of one thread, in ms.
 
-    python tools/experiments/bench_graph.py [--poses 100 300 1000 2000 5000] [--density 1.0] [--steps 200] [--gtsam]
+    python tools/experiments/bench_graph.py [--poses 100 300 1000 2000 5000] [--density 1.0] [--steps 200] \\
+        [--gtsam]
 
-The graphs are simulated: agents walk about a room of 9 x 6 m, a keyframe every 0.25 m, every second
-with one to three loops (`--density` is the share of those that have any). `warm` is what comes all the
-time: three new keyframes and one new loop on a graph that is solved.
+The graphs are simulated: agents walk in a room of 9 x 6 m with a keyframe every 0.25 m, every second of which
+has one to three loops (`--density` is the share of those that have any). `warm` is the steady state: three
+new keyframes and one new loop on a solved graph.
 """
 
 from __future__ import annotations
@@ -39,18 +40,18 @@ from share.types import F64  # noqa: E402
 CONFIG = GraphConfig()
 EXACT = replace(CONFIG, step_tolerance=1e-8, relative_tolerance=1e-14, inner_tolerance=1e-6)
 NEW = 3  # keyframes a step
-FIRST_LOOP = 10**6  # ids of odometry edges are those of the keyframes that they lead to
+FIRST_LOOP = 10**6  # odometry edges have the ids of the keyframes that they lead to
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--poses", type=int, nargs="*", default=[100, 300, 1000, 2000, 5000])
     parser.add_argument("--density", type=float, default=1.0)
-    parser.add_argument("--steps", type=int, default=200, help="of the warm graph")
-    parser.add_argument("--gtsam", action="store_true", help="solve it once by gtsam too")
+    parser.add_argument("--steps", type=int, default=200, help="steps of the warm graph")
+    parser.add_argument("--gtsam", action="store_true", help="also solve it once by gtsam")
     options = parser.parse_args()
     rest = options.density, options.steps, options.gtsam
-    bench(100, 1.0, 3, False)  # imports
+    bench(100, 1.0, 3, False)  # warm-up, for imports
     print(json.dumps({f"{n}_poses": bench(n, *rest) for n in options.poses}, indent=2))
 
 
@@ -69,7 +70,7 @@ def cpu_ms(work: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def cold(room: Room, agents: int) -> dict[str, float]:
-    """From dead reckoning, all at once; and to hand it to another process."""
+    """Time a solution from dead reckoning, and sending the graph to another process."""
     n = len(room)
     news = change(room, range(n), dict(enumerate(room.guess)), room.closures)
     times, pickling = [], []
@@ -81,7 +82,7 @@ def cold(room: Room, agents: int) -> dict[str, float]:
 
 
 def warm(n: int, agents: int, density: float, wanted: int) -> dict[str, float]:
-    """The last tenth of each of several graphs is added step by step."""
+    """Time steps that add the last tenth of each of several graphs."""
     steps = min(wanted, max(1, n // (10 * NEW)))
     runs = [one_warm(n, agents, density, seed, steps) for seed in range(1, 1 + -(-wanted // steps))]
     times, off = (np.concatenate([run[k] for run in runs]) for k in (0, 1))
@@ -94,7 +95,7 @@ def warm(n: int, agents: int, density: float, wanted: int) -> dict[str, float]:
 
 
 def one_warm(n: int, agents: int, density: float, seed: int, steps: int) -> tuple[F64, F64]:
-    """Times [ms], and how far every pose is from the minimum [mm] at the end."""
+    """Return times [ms], and the distance of every pose from the minimum [mm] at the end."""
     room = simulate(n, agents, seed, density)
     first = n - steps * NEW
     solver = PoseGraphSolver(CONFIG)
@@ -116,7 +117,7 @@ def one_warm(n: int, agents: int, density: float, seed: int, steps: int) -> tupl
 
 
 def laid_on(room: Room, solution: GraphSolution, new: range) -> dict[int, F64]:
-    """New keyframes where their odometry says, as the mapper lays them."""
+    """Return poses of new keyframes by their odometry, as the mapper initialises them."""
     poses = dict(zip(solution.pose_ids.tolist(), solution.poses, strict=True))
     for i in new:
         edge = room.odometry[i]
@@ -135,7 +136,7 @@ def change(
 
 
 def roads(room: Room) -> dict[str, float]:
-    """To ask how well eight poses are known from one: after an edge came, and when none did."""
+    """Time the covariance paths to eight poses from one: after an edge was added, and without a change."""
     net, n, rng = CovariancePaths(), len(room), np.random.default_rng(0)
     edges = room.chain + room.closures
     adding = cpu_ms(lambda: [net.add(edge) for edge in edges])[0] / len(edges)

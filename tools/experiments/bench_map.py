@@ -1,9 +1,9 @@
-"""How long recognising a place takes: query, match, verify. Prints JSON, medians in ms.
+"""Time of place recognition: query, match, verify. Prints JSON, medians in ms.
 
     python tools/experiments/bench_map.py [--recording FOLDER] [--keyframes 300 5000]
 
 Without a recording the views are simulated. To fill the index, views are repeated with 6 % of their
-descriptor bits flipped: every place is then stored many times over, which is the dear case.
+descriptor bits flipped: every place is then stored many times, which is the expensive case.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PLACE = PlaceConfig()
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--recording", type=Path, help="EuRoC or TUM RGB-D folder with a ground truth")
+    parser.add_argument("--recording", type=Path, help="EuRoC or TUM RGB-D folder with ground truth")
     parser.add_argument("--keyframes", type=int, nargs="*", default=[300, 5000])
     options = parser.parse_args()
     views = load(options.recording).sights if options.recording else simulated()
@@ -63,7 +63,7 @@ def median_ms(runs: Iterable[Callable[[], Any]]) -> float:
 
 
 def bench_place(views: list[CameraView], n: int) -> dict[str, float]:
-    """`add` and `query` at n stored keyframes, and `chain`: query and verification of all candidates."""
+    """Time `add` and `query` at n stored keyframes, and `chain`: query and verification of all candidates."""
     rng = np.random.default_rng(0)
     index = PlaceIndex(PLACE.index_seed, PLACE.tables, PLACE.hash_bits)
     stored = [
@@ -82,7 +82,7 @@ def bench_place(views: list[CameraView], n: int) -> dict[str, float]:
 
 
 def bench_pair(views: list[CameraView]) -> dict[str, float]:
-    """Of neighbouring and of distant views: matching, and verification by its outcome."""
+    """Time matching and verification, the latter by outcome, of neighbouring and of distant views."""
     pairs = [*itertools.pairwise(views), *zip(views, views[7:], strict=False)]
     accepts = [isinstance(verify(a, b, PLACE), Verification) for a, b in pairs]
     matching = [

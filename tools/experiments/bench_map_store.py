@@ -1,6 +1,7 @@
-"""What it costs to keep the edge's map: commits, opening, and a file whose keyframes come and go.
+"""Cost of storing the edge's map: commits, opening, and a file with keyframes added and removed.
 
-    python tools/experiments/bench_map_store.py [--load 2000 20000] [--turnover 20000 --held 2000] [--folder DIR]
+    python tools/experiments/bench_map_store.py [--load 2000 20000] [--turnover 20000 --held 2000] \\
+        [--folder DIR]
 
 Prints one JSON object. Keyframes have 500 points. Times in ms (medians and 95 %) or s; *_cpu is process time.
 """
@@ -37,7 +38,7 @@ def main() -> None:
     parser.add_argument("--load", type=int, nargs="*", default=[2000, 20000])
     parser.add_argument("--turnover", type=int, default=20000)
     parser.add_argument("--held", type=int, default=2000)
-    parser.add_argument("--folder", type=Path, help="on the disk to be measured")
+    parser.add_argument("--folder", type=Path, help="folder on the disk to measure")
     options = parser.parse_args()
     report: dict[str, Any] = {}
     for batch, power_cut in ((1, False), (20, False), (1, True), (20, True)):
@@ -106,7 +107,8 @@ def bench_open(path: Path, count: int) -> dict[str, Any]:
 
 
 def bench_turnover(path: Path, count: int, held: int) -> dict[str, Any]:
-    """Twenty come, twenty chosen at random go, in each commit. MB of file and log together."""
+    """Time commits that each add twenty keyframes and remove twenty random ones. MB of file and log
+    together."""
     make, draw, there = keyframes(), np.random.default_rng(1), list[int]()
     sizes, batches_ms = [], []
     with opened(path) as store:

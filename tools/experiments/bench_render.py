@@ -1,10 +1,10 @@
-"""What drawing a room costs: CPU time an image, and images a second in one and in two processes. Prints JSON.
+"""Cost of drawing a room: CPU time per image, and images per second in one and in two processes. Prints JSON.
 
     python tools/experiments/bench_render.py [--scene NAME] [--images N] [--seed S] [--room FOLDER]
 
-In a room of `share.lab.emulate.world` (kept in FOLDER, if named, for baking takes a while), turning on the
-spot in its middle. `cpu_ms` is the median of one image, everything included that `radiance` and `depth` do;
-`per_second` is by the clock, and two processes need two idle cores.
+A room of `share.lab.emulate.world` (kept in FOLDER if given, as baking takes a while), seen while turning on
+the spot in its middle. `cpu_ms` is the median over images of `radiance` and `depth` together; `per_second` is
+by wall time, and two processes need two idle cores.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from share.spawning import SPAWN_CONTEXT  # noqa: E402
 
 D435I = Camera(640, 480, 383.2, 384.1, 318.7, 242.3)
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))
-MOMENTS = 8  # of a blurred image
+MOMENTS = 8  # of an image with motion blur
 
 
 def main() -> None:
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--scene", choices=sorted(SCENES), default="warehouse")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--images", type=int, default=60)
-    parser.add_argument("--room", type=Path, help="where the room is kept between runs")
+    parser.add_argument("--room", type=Path, help="folder that keeps the room between runs")
     options = parser.parse_args()
     room = the_room(options.scene, options.seed, options.room)
     renderer = GlRenderer(room)
@@ -63,7 +63,7 @@ def the_room(scene: str, seed: int, kept: Path | None) -> DrawableRoom:
 
 
 def moments(room: DrawableRoom, k: int, count: int) -> list[SceneInstant]:
-    """The k-th image's exposure: a slow turn in the middle of the room."""
+    """Return the instants of the k-th image's exposure: a slow turn in the middle of the room."""
     return [SceneInstant(looking(room.size, 0.15 * k + 0.005 * j)) for j in range(count)]
 
 
@@ -94,7 +94,7 @@ def cpu_ms(renderer: GlRenderer, room: DrawableRoom, job: str, images: int) -> f
 
 
 def per_second(room: DrawableRoom, processes: int, images: int) -> float:
-    """Images without depth, of all processes together, each on its own."""
+    """Return images per second, without depth, of all processes together."""
     barrier, done = SPAWN_CONTEXT.Barrier(processes + 1), SPAWN_CONTEXT.Queue()
     workers = [
         SPAWN_CONTEXT.Process(target=draw, args=(room, images, barrier, done)) for _ in range(processes)

@@ -1,16 +1,15 @@
-"""What tracking costs a headset: time to a pose, CPU a frame, and which stage takes it. Prints JSON, ms.
+"""Cost of tracking on a headset: time to a pose, CPU per frame, and per stage. Prints JSON, ms.
 
     python tools/experiments/bench_track.py [--frames N] [--recording SOURCE]
 
-With cameras and IMU: a walker with each of two stereo rigs in the warehouse; where there is no OpenGL, in the
-plain room, and without the rig whose lens that room does not have. By cameras alone: a robot (RGB-D) in the
-plain room, and the kitchen if it is beside the checkout; instead of that SOURCE, as `share track` would.
-Making and decoding images are not counted. Sessions with an IMU are kept for the next time.
+With cameras and IMU: a walker with each of two stereo rigs in the warehouse; without OpenGL in the plain
+room, less the rig with a lens that this room does not support. By cameras alone: a robot (RGB-D) in the plain
+room, and the kitchen recording if it is beside the checkout; SOURCE, as for `share track`, replaces it.
+Making and decoding images does not count. Sessions with an IMU are kept.
 
-`track_ms` is by the clock, all else CPU time. `cpu_ms`: of a frame until its pose is out (`pose`), of what a
-keyframe costs after that (`keyframe`), of both (`all`, `mean`). A stage's `median` and `p99` are of one call;
-`per_frame` spreads all its calls over all frames. ` cam1`: what is done with the second camera's image.
-`rest`: what is in no stage.
+`track_ms` is wall time, all else CPU time. `cpu_ms`: of a frame until its pose (`pose`), of a keyframe after
+that (`keyframe`), of both (`all`, `mean`). A stage's `median` and `p99` are of one call; `per_frame` spreads
+all its calls over all frames. ` cam1`: work on the second camera's image. `rest`: outside all stages.
 """
 
 from __future__ import annotations
@@ -50,9 +49,9 @@ from share.vision import corners, patches  # noqa: E402
 from share.vision.orb import ViewBuilder  # noqa: E402
 
 STEREO = {"euroc_752x480": ("euroc", 20), "d435i_848x480": ("d435i:848x480@30", 30)}  # profile, Hz
-NEEDS_LENS = "euroc_752x480"  # which the plain room does not have
+NEEDS_LENS = "euroc_752x480"  # the plain room has no lens distortion
 ROBOT, ROBOT_PROFILE, ROBOT_HZ = "robot=robot:speed=0.3", "d435i:640x480@15", 15
-SHORTEST_S = 3  # of a session
+SHORTEST_S = 3  # least length of a session
 KITCHEN = Path(__file__).resolve().parents[3] / "shared" / "data" / "real" / "redkitchen_0000_0499"
 STAGES: tuple[tuple[Any, str, str], ...] = (
     (filter, "propagate", "imu"),
@@ -84,12 +83,13 @@ Tracker = VisualTracker | InertialTracker
 
 
 class Stages:
-    """CPU ms of every call, by stage, of the trackers' stages from now on. A stage within a stage counts as
-    the outer one."""
+    """Records CPU ms of every call of the trackers' stages. A stage within a stage counts as the outer
+    one."""
 
     def __init__(self) -> None:
         self.spent: dict[str, list[float]] = defaultdict(list)
-        self.second: tuple[Any, ...] = ()  # the second camera and its image: whoever is given one works there
+        # the second camera and its image; calls with one of them count as ` cam1`
+        self.second: tuple[Any, ...] = ()
         self._open = 0
         for owner, name, stage in STAGES:
             setattr(owner, name, self._timed(getattr(owner, name), stage))
@@ -112,7 +112,7 @@ class Stages:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--frames", type=int, default=200, help="of each emulated session")
+    parser.add_argument("--frames", type=int, default=200, help="frames of each emulated session")
     parser.add_argument("--recording", type=Path, help="any SOURCE that `share track` takes")
     options = parser.parse_args()
     stages = Stages()
@@ -121,7 +121,7 @@ def main() -> None:
 
 
 def bench_stereo(frames: int, stages: Stages) -> dict[str, Any]:
-    """With an IMU."""
+    """Stereo with IMU."""
     reason = missing_reason()
     report: dict[str, Any] = {
         "scene": DEFAULT_SCENE if reason is None else f"{FALLBACK_SCENE}, because {reason}"
@@ -140,7 +140,7 @@ def bench_stereo(frames: int, stages: Stages) -> dict[str, Any]:
 
 
 def bench_robot(frames: int, stages: Stages) -> dict[str, Any]:
-    """RGB-D, by its camera alone."""
+    """RGB-D without IMU."""
     recipe = SessionRecipe(
         FALLBACK_SCENE, (ROBOT,), max(SHORTEST_S, frames / ROBOT_HZ), profiles={"": ROBOT_PROFILE}
     )
@@ -158,7 +158,7 @@ def bench_recording(given: Path | None, stages: Stages) -> dict[str, Any]:
 
 
 def bench(source: Source, estimator: Tracker, stages: Stages, most: int | None = None) -> dict[str, Any]:
-    """Over the first frames of `source`, one thread."""
+    """Track the first `most` frames of `source` in one thread."""
     stages.spent.clear()
     tracked, track_ms, pose_ms, keyframe_ms = 0, [], [], []
     for frame in islice(read_frames(source, Config(), SequencerCounters()), most):
@@ -179,7 +179,7 @@ def bench(source: Source, estimator: Tracker, stages: Stages, most: int | None =
 
 
 def report_of(track: F64, pose: F64, keyframe: F64, spent: dict[str, list[float]]) -> dict[str, Any]:
-    """Of times (N,) ms of frames; keyframe: NaN where it was none."""
+    """Summarise times (N,) ms of frames; keyframe: NaN where there was none."""
     whole = pose + np.nan_to_num(keyframe)
     in_stages = sum(sum(ms) for ms in spent.values())
     return {

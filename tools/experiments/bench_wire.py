@@ -1,4 +1,4 @@
-"""What the wire costs: encode and decode, sizes, round trips over loopback (plain and CURVE) and in memory.
+"""Cost of the wire: encode and decode, sizes, round trips over loopback (plain and CURVE) and in memory.
 
     python tools/experiments/bench_wire.py [--rounds N]
 
@@ -51,7 +51,7 @@ def timed_us(call: Callable[[], Any], rounds: int) -> float:
 
 
 def keys(folder: Path) -> tuple[EdgeKeys, AgentKeys]:
-    """Of an edge and of an agent that it lets in."""
+    """Return keys of an edge and of an agent that it authorises."""
     edge, agent = generate_pair(folder / "edge", "edge"), generate_pair(folder / "agent", "agent")
     authorize(folder / "edge", "agent", agent.public)
     return EdgeKeys(edge, allow_list(folder / "edge")), AgentKeys(agent, edge.public)

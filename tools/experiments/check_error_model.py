@@ -1,10 +1,10 @@
-"""The error model on recordings with truth, real ones for instance: does it rise where the tracker errs?
+"""Check the error model on recordings with ground truth: does its estimate rise with the tracker's error?
 
     python tools/experiments/check_error_model.py MODEL SOURCE [SOURCE ...] [--picture FILE]
 
 SOURCE as for `share track`. Prints a Markdown table: keyframes with a known error, its median and 95 %, RMSE,
- rank correlation (Spearman), how many errors lie in their intervals, how many keyframes were strange.
-The picture has error, estimate and interval over time, one panel a source.
+rank correlation (Spearman), share of errors within their intervals, number of strange keyframes. The picture
+has error, estimate and interval over time, one panel a source.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ HEAD = (
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """Of N keyframes: when, s; error_cm; told (N, 3), expected, low and high, cm; strange (N,)."""
+    """Of N keyframes: seconds; error_cm; estimate (N, 3): expected, low and high, cm; strange (N,)."""
 
     name: str
     seconds: F64
     error_cm: F64
-    told: F64
+    estimate: F64
     strange: F64
 
 
@@ -76,25 +76,25 @@ def checked(name: str, network: OnnxSession) -> Checked:
     rows = []
     for stamp_ns, error_cm, features in labelled_keyframes(open_source(name), Config()):
         if not np.isnan(error_cm):
-            told = estimate_error(network, features)
-            interval = told.error_cm, told.low_cm, told.high_cm
-            rows.append((stamp_ns * 1e-9, error_cm, *interval, told.out_of_distribution))
+            estimate = estimate_error(network, features)
+            interval = estimate.error_cm, estimate.low_cm, estimate.high_cm
+            rows.append((stamp_ns * 1e-9, error_cm, *interval, estimate.out_of_distribution))
     if len(rows) < 2:
-        raise UsageError(f"{name}: has {len(rows)} keyframes with a known error; that tells nothing")
+        raise UsageError(f"{name}: has {len(rows)} keyframes with a known error; too few")
     table = np.array(rows, float)
     return Checked(name, table[:, 0] - table[0, 0], table[:, 1], table[:, 2:5], table[:, 5])
 
 
 def cells_of(one: Checked) -> list[str]:
-    off = one.told[:, 0] - one.error_cm
-    covered = (one.told[:, 1] <= one.error_cm) & (one.error_cm <= one.told[:, 2])
+    off = one.estimate[:, 0] - one.error_cm
+    covered = (one.estimate[:, 1] <= one.error_cm) & (one.error_cm <= one.estimate[:, 2])
     p50, p95 = np.percentile(one.error_cm, [50, 95])
     return [
         Path(one.name).name,
         str(len(one.error_cm)),
         f"{p50:.2f}, {p95:.2f}",
         f"{np.sqrt((off**2).mean()):.2f}",
-        f"{spearmanr(one.told[:, 0], one.error_cm).statistic:.2f}",
+        f"{spearmanr(one.estimate[:, 0], one.error_cm).statistic:.2f}",
         f"{100 * covered.mean():.0f} %",
         f"{100 * one.strange.mean():.0f} %",
     ]
@@ -110,7 +110,7 @@ def draw(path: Path, found: list[Checked]) -> None:
         len(found), 1, figsize=(9, 2.6 * len(found)), layout="constrained", squeeze=False
     )
     for axis, one in zip(axes[:, 0], found, strict=True):
-        expected, low, high = one.told.T
+        expected, low, high = one.estimate.T
         axis.fill_between(one.seconds, low, high, color="#00798c", alpha=0.2, linewidth=0, label="interval")
         axis.plot(one.seconds, expected, color="#00798c", label="estimate")
         axis.plot(one.seconds, one.error_cm, color="#d1495b", label="error")

@@ -1,10 +1,11 @@
-"""The emulated network against the kernel's: the same messages over loopback through `tc`, and through ours.
+"""Compare the emulated network with the kernel's: the same messages over loopback through `tc`, and through
+the emulation.
 
     sudo python tools/experiments/check_link.py [--mbps 10] [--delay_ms 5] [--loss 0.01] [--seconds 20]
 
-In a network namespace of its own, which it removes. With netem: rate, delay and loss. Where the kernel has no
-netem only the rate is compared (tbf), and that is said. Prints a Markdown table: one-way delays of poses (200
-bytes, 30 a second) and keyframes (30 kB, 3 a second), ms.
+Runs in its own network namespace, which it removes. With netem: rate, delay and loss. If the kernel has no
+netem, only the rate is compared (tbf), and the output says so. Prints a Markdown table: one-way delays of
+poses (200 bytes, 30 a second) and keyframes (30 kB, 3 a second), ms.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def main() -> int:
 
 
 def compare(options: argparse.Namespace) -> None:
-    """The kernel's first: it says what there is to compare."""
+    """Measure both, the kernel first: it decides what can be compared."""
     if os.geteuid():
         raise UsageError("network namespaces need root: sudo python tools/experiments/check_link.py")
     kernel, has_netem = by_kernel(options)
@@ -66,7 +67,7 @@ def compare(options: argparse.Namespace) -> None:
 
 
 def by_kernel(options: argparse.Namespace) -> tuple[Delays, bool]:
-    """Delays through `tc`, and whether it had netem."""
+    """Return delays through `tc`, and whether it had netem."""
     name = f"share-link-{os.getpid()}"
     within = ["ip", "netns", "exec", name]
     subprocess.run(["ip", "netns", "add", name], check=True)
@@ -84,7 +85,7 @@ def by_kernel(options: argparse.Namespace) -> tuple[Delays, bool]:
 
 
 def shape(within: list[str], discipline: str) -> bool:
-    """Whether the kernel knows it."""
+    """Set a traffic discipline; return whether the kernel supports it."""
     command = [*within, "tc", "qdisc", "replace", "dev", "lo", "root", *discipline.split()]
     return subprocess.run(command, capture_output=True).returncode == 0
 
@@ -94,7 +95,7 @@ def inside(options: argparse.Namespace) -> None:
 
 
 def talk(seconds: float, network: NetworkModel | None) -> Delays:
-    """One-way delays, ms, of what an agent says to an edge in this process."""
+    """Return one-way delays, ms, of an agent's messages to an edge in this process."""
     edge = bind("tcp://127.0.0.1:0")
     plain = connect(edge.endpoint, 1)
     link: AgentLink = plain if network is None else EmulatedLink(plain, network, 1)
@@ -114,7 +115,7 @@ def talk(seconds: float, network: NetworkModel | None) -> Delays:
         left_ms = int(1e3 * (min(when for *_, when in due) - time.monotonic()))
         link.receive(max(1, left_ms))
     end = time.monotonic() + 1.0
-    while time.monotonic() < end:  # what is still under way
+    while time.monotonic() < end:  # messages in flight
         link.receive(20)
     over.set()
     listener.join()
@@ -124,7 +125,7 @@ def talk(seconds: float, network: NetworkModel | None) -> Delays:
 
 
 def listen(edge: EdgeLink, out: Delays, over: threading.Event) -> None:
-    """Delays, ms, by size."""
+    """Collect delays, ms, by size."""
     while not over.is_set():
         if (message := edge.receive(20)) is not None:
             (frame,) = message.frames

@@ -1,12 +1,11 @@
-"""Contact sheets of the scenes: `python tools/experiments/contact_sheets.py [--scene NAME ...] [--out DIR]`
+"""Contact sheets of the scenes, and of a session.
 
-For every scene and two seeds, 3 x 4 views as people (1.5-1.75 m) and robots (0.35 m) have them, from places
-where one can stand, looking along free ways, each exposed to the same mean.
-Figures: tools/experiments/corner_statistics.py.
-
+    python tools/experiments/contact_sheets.py [--scene NAME ...] [--out DIR]
     python tools/experiments/contact_sheets.py --session SESSION [--out DIR]
 
-makes DIR/session.jpg instead: the plan of an emulated session, beside it a row an agent of what it saw.
+For every scene and two seeds: 3 x 4 views of people (1.5-1.75 m) and robots (0.35 m) from free places along
+free directions, each exposed to the same mean. Figures: corner_statistics.py. With --session:
+DIR/session.jpg, the plan of an emulated session and a row of images for each agent.
 """
 
 from __future__ import annotations
@@ -32,16 +31,16 @@ from share.sensors.measurement import CAM0
 from share.types import F32, F64, U8
 
 ROWS, COLUMNS = 3, 4
-CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)  # as a D435i's infrared pair
+CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)  # like a D435i's infrared pair
 CLEARANCE = 0.45  # m
-EXPOSED, BRIGHTEST_GAIN = 110.0, 1.3  # mean gray level; how far dark views are raised to it
-SMALL = (288, 216)  # px, an image on a sheet
-BLUR, NOISE = 0.5, 1.5  # px, gray levels: of a good camera
+EXPOSED, BRIGHTEST_GAIN = 110.0, 1.3  # mean gray level; largest gain for dark views
+SMALL = (288, 216)  # px, of an image on a sheet
+BLUR, NOISE = 0.5, 1.5  # px, gray levels; of a good camera
 
 
 def views(room: Layout, count: int) -> list[F64]:
-    """Poses (4, 4) where people and every third time a robot can be. Each looks along the freest of
-    three directions: who walks looks where he goes, mostly."""
+    """Return poses (4, 4) of people and, for every third, of a robot. Each looks along the freest of three
+    directions, as people mostly look where they go."""
     rng = np.random.default_rng((room.seed, 77))
     distance, origin, step = Occupancy.from_layout(room, 0.1).floor_clearance(0.1, 1.9)
     cells = np.argwhere(distance >= CLEARANCE)
@@ -57,7 +56,7 @@ def views(room: Layout, count: int) -> list[F64]:
 
 
 def _free_ahead(distance: F32, x: float, y: float, yaw: float) -> int:
-    """Cells from (x, y) to the first blocked one."""
+    """Return the number of free cells from (x, y) to the first blocked one."""
     for k in range(1, max(distance.shape)):
         i, j = int(x + k * np.cos(yaw)), int(y + k * np.sin(yaw))
         if not (0 <= i < distance.shape[0] and 0 <= j < distance.shape[1]) or distance[i, j] <= 0:
@@ -66,7 +65,7 @@ def _free_ahead(distance: F32, x: float, y: float, yaw: float) -> int:
 
 
 def photograph(room: Layout, poses: list[F64]) -> list[U8]:
-    """Images (480, 640) of a room."""
+    """Return images (480, 640) of a room."""
     renderer, rng, out = GlRenderer(build_room(room)), np.random.default_rng((room.seed, 78)), []
     for T in poses:
         light = renderer.radiance(CAMERA, [SceneInstant(T)])
@@ -77,13 +76,13 @@ def photograph(room: Layout, poses: list[F64]) -> list[U8]:
 
 
 def sheet(images: list[U8]) -> U8:
-    """ROWS x COLUMNS images, made small."""
+    """Return ROWS x COLUMNS images, made small."""
     small = [cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA) for image in images]
     return np.block([[small[r * COLUMNS + c] for c in range(COLUMNS)] for r in range(ROWS)])
 
 
 def seen(folder: Path) -> U8:
-    """The plan of a session (colour), and COLUMNS images of each agent over its whole length."""
+    """Return the plan of a session (colour), and COLUMNS images of each agent over its whole length."""
     rows = [_along(folder / name) for name in read_session(folder).agents]
     images = cv2.cvtColor(np.concatenate(rows), cv2.COLOR_GRAY2BGR)
     plan = cv2.imread(str(folder / PLAN_FILE))
@@ -92,7 +91,7 @@ def seen(folder: Path) -> U8:
 
 
 def _along(agent: Path) -> U8:
-    """Images of cam0 of SESSION/NAME side by side."""
+    """Return images of cam0 of SESSION/NAME side by side."""
     source = open_source(str(agent))
     count = source.images_count
     chosen = {(2 * k + 1) * count // (2 * COLUMNS) for k in range(COLUMNS)}
@@ -123,7 +122,7 @@ def main() -> None:
 
 
 def write(path: Path, picture: U8) -> None:
-    """As JPEG, and say so."""
+    """Write a JPEG and print its name."""
     cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
     print(f"{path}  {path.stat().st_size / 1e3:.0f} kB", flush=True)
 

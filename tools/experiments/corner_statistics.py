@@ -3,10 +3,10 @@
     python tools/experiments/corner_statistics.py FOLDER ...             images (PNG, JPEG) in all sub-folders
     python tools/experiments/corner_statistics.py --room warehouse:1 --room firestation:2 [--sheet FILE]
 
-Images of folders are cut to the middle 4:3 and, where they are not 480 high, shrunk to 640 x 480 by areas.
-Rooms are drawn as the middle of a EuRoC camera sees them (640 x 480, f = 458 px, no distortion) from where
-people and robots can stand, exposed to a mean of 110, with 0.5 px of blur and 1.5 gray levels of noise. All
-figures are means over the images but the last three: quartiles of `fast`.
+Images of folders are cropped to the middle 4:3 and, where they are not 480 high, shrunk to 640 x 480 by
+areas. Rooms are drawn as the middle of a EuRoC camera's image (640 x 480, f = 458 px, no distortion) from
+free places of people and robots, exposed to a mean of 110, with 0.5 px of blur and 1.5 gray levels of noise.
+All figures are means over the images except for the last three: quartiles of `fast`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FOCAL, _MEAN, _BLUR, _NOISE = 458.0, 110.0, 0.5, 1.5
 
 
 def of_folder(folder: Path, most: int) -> list[U8]:
-    """At most `most` images, evenly over the sorted names; depth images are left out."""
+    """Return at most `most` images, evenly over the sorted names, without depth images."""
     found = sorted(
         p for p in folder.rglob("*") if p.suffix.lower() in (".png", ".jpg") and "depth" not in p.parts
     )
@@ -42,7 +42,7 @@ def of_folder(folder: Path, most: int) -> list[U8]:
 
 
 def of_room(name: str, seed: int, count: int) -> list[U8]:
-    """Views of one room."""
+    """Return views of one room."""
     from share.geometry.camera import Camera
     from share.lab.emulate.render.gl import GlRenderer
     from share.lab.emulate.types import SceneInstant
@@ -59,14 +59,14 @@ def of_room(name: str, seed: int, count: int) -> list[U8]:
 
 
 def taken(radiance: F32, rng: np.random.Generator) -> U8:
-    """A plain camera's picture of it."""
+    """Return a plain camera's image of the radiance."""
     soft = cv2.GaussianBlur(radiance * (_MEAN / max(float(radiance.mean()), 1.0)), (0, 0), _BLUR)
     out: U8 = (soft + rng.normal(0, _NOISE, soft.shape)).clip(0, 255).astype(np.uint8)
     return out
 
 
 def sheet(images: list[U8], columns: int = 4, rows: int = 3) -> U8:
-    """A contact sheet."""
+    """Return a contact sheet."""
     small = [cv2.resize(i, (400, 300), interpolation=cv2.INTER_AREA) for i in images[: columns * rows]]
     return np.asarray(np.block([small[k * columns : (k + 1) * columns] for k in range(rows)]), np.uint8)
 
@@ -83,8 +83,8 @@ def main() -> None:
     )
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--room", action="append", default=[], metavar="NAME:SEED")
-    parser.add_argument("--most", type=int, default=60, help="images of each")
-    parser.add_argument("--sheet", type=Path, help="where to put a contact sheet of the last room")
+    parser.add_argument("--most", type=int, default=60, help="images of each folder or room")
+    parser.add_argument("--sheet", type=Path, help="file for a contact sheet of the last room")
     args = parser.parse_args()
     names = [*(f.name for f in fields(ImageStatistics)), "q25", "q50", "q75"]
     print(f"{'':22}" + "".join(f"{name:>10}" for name in names))

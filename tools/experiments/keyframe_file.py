@@ -1,4 +1,4 @@
-"""A set of keyframes as one file: msgpack of the very bytes that agents send, and of poses."""
+"""A set of keyframes as one file: msgpack of messages as agents send them, and of poses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from share.wire.messages import Hello, Message
 
 
 class _Agent(msgspec.Struct, array_like=True):
-    """Frames of messages; poses are (N, 4, 4) little-endian doubles."""
+    """One agent: frames of messages; poses are (N, 4, 4) little-endian doubles."""
 
     hello: list[bytes]
     keyframes: list[list[bytes]]
@@ -32,18 +32,18 @@ class _Set(msgspec.Struct):
 
 
 def save(made: KeyframeSet, path: Path) -> None:
-    """Whole or not at all. Raises as `atomic_write`."""
+    """Write the set atomically. Raises as `atomic_write`."""
     agents = {name: _packed(agent) for name, agent in made.agents.items()}
     atomic_write(path, msgspec.msgpack.encode(_Set(made.size, agents)))
 
 
 def load(path: Path, recipe: SessionRecipe, every: Spacing) -> KeyframeSet:
-    """The set that was made of this recipe. Raises DataError where the file is damaged."""
+    """Return the set made of this recipe. Raises DataError where the file is damaged."""
     try:
         found = msgspec.msgpack.decode(path.read_bytes(), type=_Set)
         agents = {name: _unpacked(agent) for name, agent in found.agents.items()}
     except (msgspec.MsgspecError, WireError, ValueError) as error:
-        raise DataError(f"{path}: is damaged ({error}); delete it, and it is made again") from None
+        raise DataError(f"{path}: is damaged ({error}); delete it and run the command again") from None
     return KeyframeSet(recipe, every, found.size, agents)
 
 

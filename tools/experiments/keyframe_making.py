@@ -1,5 +1,4 @@
-"""From a recipe to a set of keyframes: the room and its motions as `share emulate` has them, few of the
-frames."""
+"""From a recipe to a set of keyframes: room and motions of `share emulate`, with few of the frames."""
 
 from __future__ import annotations
 
@@ -22,13 +21,13 @@ from share.recordings.trajectory import Trajectory
 from share.types import F64, I64, Keyframe, KeyframeCandidate, View
 from share.wire.messages import Hello
 
-_POINTS = 500  # of a view, as a tracker's
-_STREAM = 81  # of random numbers; the emulator has others
+_POINTS = 500  # of a view, as a tracker has
+_STREAM = 81  # of random numbers, not used by the emulator
 
 
 def make(recipe: SessionRecipe, every: Spacing, workers: int, progress: Progress) -> KeyframeSet:
-    """Nothing is kept. Raises UsageError, ConfigError or DataError for what cannot be made, RenderError
-    where nothing can be drawn."""
+    """Return the set without saving it. Raises UsageError, ConfigError or DataError for an invalid recipe,
+    RenderError where this machine cannot draw."""
     with TemporaryDirectory(prefix="keyframes-") as folder:
         prepared = prepare_session(recipe, Path(folder) / "room", progress)
         keep_room(prepared, progress)
@@ -38,8 +37,8 @@ def make(recipe: SessionRecipe, every: Spacing, workers: int, progress: Progress
 
 
 def make_unseen(recipe: SessionRecipe, every: Spacing) -> KeyframeSet:
-    """The same but for the views: as many bytes, of nothing; depths drawn from 1 to 8 m, one a view. Takes
-    seconds, and no OpenGL."""
+    """Return the same set with views of the same size but without content, with depths drawn from 1 to 8 m,
+    one a view. Takes seconds, and needs no OpenGL."""
     rng = np.random.default_rng((recipe.seed, _STREAM))
     with TemporaryDirectory(prefix="keyframes-") as folder:
         prepared = prepare_session(recipe, Path(folder) / "room", no_progress)
@@ -66,7 +65,8 @@ def _set(
 
 
 def spaced(truth: Trajectory, every: Spacing) -> I64:
-    """Which poses (N,) are keyframes: the first, and each that is far enough from the keyframe before."""
+    """Return the indices (N,) of keyframes: the first pose, and each that is far enough from the keyframe
+    before."""
     chosen = [0]
     for k in range(1, len(truth.stamps_ns)):
         last = chosen[-1]
@@ -78,7 +78,7 @@ def spaced(truth: Trajectory, every: Spacing) -> I64:
 
 
 def _chosen(actor: Actor, every: Spacing) -> tuple[I64, Trajectory]:
-    """Which of its pictures (N,), and their true poses."""
+    """Return the indices (N,) of the actor's keyframes among its pictures, and their true poses."""
     known, truth = true_trajectory(actor)
     at = spaced(truth, every)
     return known[at], Trajectory(truth.stamps_ns[at], truth.T[at])
@@ -92,7 +92,7 @@ def _agent(actor: Actor, truth: Trajectory, seen: list[View], rng: np.random.Gen
 
 
 def _chained(T_odom_body: F64, cov: F64, stamps_ns: I64, seen: list[View]) -> tuple[Keyframe, ...]:
-    """Candidates that are all sent. As a tracker has it, up is the z of odom."""
+    """Return all candidates as sent keyframes. As with a tracker, up is the z of odom."""
     before = np.concatenate([np.eye(4)[None], T_odom_body[:-1]])
     T_last_body = se3.orthonormal(se3.inverse(before) @ T_odom_body)
     chain, out = KeyframeChain(), []

@@ -1,4 +1,4 @@
-"""Odometry as an inertial tracker makes it, drawn from the truth: yaw and position drift, the vertical does
+"""Simulated odometry of an inertial tracker, from the true poses: yaw and position drift, the vertical does
 not."""
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from share.types import F64, I64
 
 @dataclass(frozen=True)
 class Drift:
-    """Standard deviations of what goes wrong from one keyframe to the next: m and m per m of the way, on each
-    axis; rad and rad per rad of the turn, about the vertical. tilt_rad: of roll and of pitch at any time;
-    they wander about the truth within tilt_s seconds, for gravity is seen."""
+    """Standard deviations of errors from one keyframe to the next: m and m per m of path, on each axis; rad
+    and rad per rad of rotation, about the vertical. tilt_rad: of roll and pitch at any time; they vary within
+    tilt_s seconds, as gravity is observed."""
 
     step_m: float = 0.002
     per_metre: float = 0.003
@@ -26,28 +26,29 @@ class Drift:
 
 
 def odometry(T_world_body: F64, stamps_ns: I64, rng: np.random.Generator, drift: Drift) -> tuple[F64, F64]:
-    """T_odom_body (N, 4, 4), and covariances (N, 6, 6) of each pose relative to the one before, of the first
-    one to odom. T_world_body (N, 4, 4): the truth at stamps (N,), rising.
+    """Return T_odom_body (N, 4, 4), and covariances (N, 6, 6) of each pose relative to the one before, of the
+    first one to odom. T_world_body (N, 4, 4): the true poses at stamps (N,), rising.
 
-    With the true step D_k between poses of distance d and angle a, the odometry's is D_k Exp(xi_k), xi =
+    With the true step D_k between poses of distance d and angle a, that of odometry is D_k Exp(xi_k), xi =
     (rotation, translation), right-perturbed as in `share.geometry.se3`:
 
-    - translation ~ N(0, step_m^2 + (per_metre d)^2) on each axis of the body;
-    - rotation turns the vertical by what yaw gains, N(0, (yaw_rad + per_radian a)^2), and by what roll and
-      pitch change: each is a first-order Gauss-Markov process of standard deviation tilt_rad with time
-      constant tilt_s, so its step has variance 2 tilt_rad^2 (1 - exp(-dt / tilt_s)).
+    * translation ~ N(0, step_m^2 + (per_metre d)^2) on each axis of the body;
+    * rotation about the vertical by the yaw error, N(0, (yaw_rad + per_radian a)^2), and by the changes of
+    roll and pitch: each is a first-order Gauss-Markov process of standard deviation tilt_rad with time
+    constant tilt_s, so its step has variance 2 tilt_rad^2 (1 - exp(-dt / tilt_s)).
 
-    odom begins at the first body, its yaw is any, and its z is up but for the tilt.
+    odom begins at the first body with a random yaw; its z is up except for the tilt.
     """
     T_step = se3.inverse(T_world_body[:-1]) @ T_world_body[1:]
-    way = np.append(0.0, np.linalg.norm(T_step[:, :3, 3], axis=1))
+    distances = np.append(0.0, np.linalg.norm(T_step[:, :3, 3], axis=1))
     turn = np.append(0.0, se3.rotation_angle(T_step))
-    keeps = np.append(0.0, np.exp(-np.diff(stamps_ns) * 1e-9 / drift.tilt_s))  # share of the tilt that stays
-    sigma_m = np.hypot(drift.step_m, drift.per_metre * way)
+    # correlation of the tilt over a step
+    keeps = np.append(0.0, np.exp(-np.diff(stamps_ns) * 1e-9 / drift.tilt_s))
+    sigma_m = np.hypot(drift.step_m, drift.per_metre * distances)
     sigma_yaw = drift.yaw_rad + drift.per_radian * turn
     sigma_tilt = drift.tilt_rad * np.sqrt(np.where(keeps > 0, 2 * (1 - keeps), 1.0))
     R_odom_body = _turned(T_world_body[:, :3, :3], sigma_yaw, keeps, drift.tilt_rad, rng)
-    shift = sigma_m[:, None] * rng.standard_normal((len(way), 3))
+    shift = sigma_m[:, None] * rng.standard_normal((len(distances), 3))
     poses = [se3.from_rt(R_odom_body[0], np.zeros(3))]
     for k, D in enumerate(T_step, start=1):
         reached = poses[-1] @ D
@@ -57,7 +58,8 @@ def odometry(T_world_body: F64, stamps_ns: I64, rng: np.random.Generator, drift:
 
 
 def _turned(R_world_body: F64, sigma_yaw: F64, keeps: F64, tilt_rad: float, rng: np.random.Generator) -> F64:
-    """R_odom_body (N, 3, 3): off by a yaw that adds up, from any beginning, and a tilt that does not."""
+    """Return R_odom_body (N, 3, 3) with a yaw error that accumulates, from a random start, and a tilt error
+    that does not."""
     steps = sigma_yaw * rng.standard_normal(len(keeps))
     steps[0] = rng.uniform(-np.pi, np.pi)
     tilt = np.zeros((len(keeps), 3))
@@ -70,7 +72,7 @@ def _turned(R_world_body: F64, sigma_yaw: F64, keeps: F64, tilt_rad: float, rng:
 
 
 def _covariances(R_odom_body: F64, sigma_tilt: F64, sigma_yaw: F64, sigma_m: F64) -> F64:
-    """(N, 6, 6), in the body."""
+    """Return covariances (N, 6, 6) in the body frame."""
     vertical = np.zeros((len(sigma_m), 3, 3))
     vertical[:, [0, 1], [0, 1]] = sigma_tilt[:, None] ** 2
     vertical[:, 2, 2] = sigma_yaw**2

@@ -1,4 +1,4 @@
-"""What agents would send to the edge from one emulated room, with the exact truth beside it."""
+"""Keyframes that agents would send to the edge from one emulated room, with exact ground truth."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from share.wire.messages import Hello
 
 @dataclass(frozen=True)
 class Spacing:
-    """A keyframe after so many metres or radians since the last one, and not before `seconds` after it.
-    Raises UsageError where one of them is not positive."""
+    """A keyframe follows after `metres` or `radians` since the last one, but not within `seconds`. Raises
+    UsageError where one of them is not positive."""
 
     metres: float = 0.15
     radians: float = 0.2
@@ -29,8 +29,8 @@ class Spacing:
 
 @dataclass(frozen=True, eq=False)
 class AgentKeyframes:
-    """keyframes: N of them, in the order in which they are sent. T_world_body (N, 4, 4): the truth.
-    T_odom_body (N, 4, 4): where its odometry believes it to be, which the keyframes chain up to."""
+    """keyframes: N of them, in the order of sending. T_world_body (N, 4, 4): true poses. T_odom_body (N, 4,
+    4): poses of odometry, which the keyframes' steps add up to."""
 
     hello: Hello
     keyframes: tuple[Keyframe, ...]
@@ -40,8 +40,8 @@ class AgentKeyframes:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeSet:
-    """agents: by name. size: of the room (x, y, z) m, as `share.lab.emulate.world.scenes.corridor.twins`
-    wants it."""
+    """agents: by name. size: of the room (x, y, z) m, which
+    `share.lab.emulate.world.scenes.corridor.twin_corridors` needs."""
 
     recipe: SessionRecipe
     every: Spacing

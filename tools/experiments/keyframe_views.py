@@ -1,4 +1,4 @@
-"""What agents see at their keyframes: only those frames of a stage are drawn, as its recordings have them."""
+"""Views of agents at their keyframes: draw only those frames of a stage, exactly as in its recordings."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.types import I64, Frame, View
 from share.vision.orb import make_view
 
-_STRIP = 12  # frames of a job
+_STRIP = 12  # frames a job
 
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """Pictures first .. last - 1 of actor number `who`, on a stage that has no others than keyframes. shots:
-    how they are exposed, one a picture. rig: by which they are understood."""
+    """Pictures first .. last - 1 of actor number `actor_index`, on a stage with keyframes only. shots:
+    exposure of each picture. rig: for making views."""
 
-    who: int
+    actor_index: int
     first: int
     last: int
     shots: ExposureSeries
@@ -38,32 +38,41 @@ class Strip:
 def views(
     stage: RoomStage, chosen: list[I64], images: str, workers: int, progress: Progress
 ) -> list[list[View]]:
-    """Of each actor at the chosen (N,) of its pictures. All of its light is metered, as for a recording, so
-    that the pictures are the recording's to the last bit. images: jpeg or png, by `Recipe.images`."""
+    """Return the views of each actor at the chosen (N,) of its pictures. The light is metered over all
+    pictures, as for a recording, so that images are equal to the recording's byte by byte. images: jpeg or
+    png, as in `SessionRecipe.images`."""
     thinned = replace(stage, actors=tuple(map(_thinned, stage.actors, chosen)))
     with Pool(workers, drawing.start_worker, (thinned, images)) as pool:
-        exposed = [_exposed(pool, who, actor, progress) for who, actor in enumerate(stage.actors)]
+        exposed = [
+            _exposed(pool, actor_index, actor, progress) for actor_index, actor in enumerate(stage.actors)
+        ]
         strips = [
-            Strip(who, k, min(k + _STRIP, len(at)), _of(exposed[who], at[k : k + _STRIP]), actor.rig)
-            for who, (actor, at) in enumerate(zip(stage.actors, chosen, strict=True))
+            Strip(
+                actor_index,
+                k,
+                min(k + _STRIP, len(at)),
+                _of(exposed[actor_index], at[k : k + _STRIP]),
+                actor.rig,
+            )
+            for actor_index, (actor, at) in enumerate(zip(stage.actors, chosen, strict=True))
             for k in range(0, len(at), _STRIP)
         ]
         seen: dict[tuple[int, int], list[View]] = {}
         for strip, found in pool.run(see, strips):
-            seen[strip.who, strip.first] = found
+            seen[strip.actor_index, strip.first] = found
             progress("drawing keyframes", len(seen), len(strips))
-    return [_of_one(seen, who) for who in range(len(chosen))]
+    return [_of_one(seen, actor_index) for actor_index in range(len(chosen))]
 
 
 def see(strip: Strip) -> list[View]:
-    """What a worker does: draw, encode, decode, and look at it as a tracker does that knows no depths yet."""
-    pictures = drawing.draw_pictures(strip.who, slice(strip.first, strip.last), strip.shots)
+    """Draw, encode, decode, and make views as a tracker without depth estimates does, in a worker process."""
+    pictures = drawing.draw_pictures(strip.actor_index, slice(strip.first, strip.last), strip.shots)
     frames = groupby(pictures, key=lambda picture: picture.stamp_ns)
     return [make_view(_frame(stamp_ns, of_one), strip.rig) for stamp_ns, of_one in frames]
 
 
-def _of_one(seen: dict[tuple[int, int], list[View]], who: int) -> list[View]:
-    return [view for key in sorted(seen) if key[0] == who for view in seen[key]]
+def _of_one(seen: dict[tuple[int, int], list[View]], actor_index: int) -> list[View]:
+    return [view for key in sorted(seen) if key[0] == actor_index for view in seen[key]]
 
 
 def _frame(stamp_ns: int, pictures: Iterator[EncodedPicture]) -> Frame:
@@ -71,9 +80,9 @@ def _frame(stamp_ns: int, pictures: Iterator[EncodedPicture]) -> Frame:
     return Frame(stamp_ns, 0, images[CAM0], images.get(CAM1), images.get(DEPTH))
 
 
-def _exposed(pool: Pool, who: int, actor: Actor, progress: Progress) -> ExposureSeries:
-    """Of all its pictures."""
-    jobs, found = drawing.meter_jobs(who, actor), {}
+def _exposed(pool: Pool, actor_index: int, actor: Actor, progress: Progress) -> ExposureSeries:
+    """Return the exposures of all pictures of an actor."""
+    jobs, found = drawing.meter_jobs(actor_index, actor), {}
     for job, brightness in pool.run(drawing.measure_brightness, jobs):
         found[int(job.true_ns[0])] = brightness
         progress(f"metering {actor.name}", len(found), len(jobs))

@@ -1,10 +1,9 @@
-"""N agents in one cheap process: what `share.protocol.agent` would say, when it would say it, in ready bytes.
+"""N agents in one cheap process that send prepared messages with the timing of `share.protocol.agent`.
 
     python tools/experiments/load_agents.py tcp://H:P N SECONDS COUNTED_FROM
 
-On stderr it says "counted" and "over" when that time has come, waits for a line, and prints JSON.
-
-Of each agent 30 poses, 3 keyframes with their evaluations, and 2 pings a second. It reads all that comes.
+Each agent sends 30 poses, 3 keyframes with their evaluations, and 2 pings a second, and reads all replies.
+Writes "counted" and "over" to stderr at those times, waits for a line on stdin, and prints JSON.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ from share.wire.codec import encode  # noqa: E402
 from share.wire.messages import Bye, Evaluation, Ping, PoseUpdate, peer_id  # noqa: E402
 
 _POSE_S, _PING_S, _KEYFRAME_S = 1 / 30, 0.5, 1 / RATE_HZ
-_COMING_S = 3.0  # within which they come in, at odd moments: nobody's keyframes keep step
+_COMING_S = 3.0  # agents join within this time, at random moments so that their keyframes are not in step
 _QUEUE = 128
 
 Frames = list[bytes]
 
 
 class _Agent:
-    """One of them: what it says, and when what it hears comes."""
+    """One agent: its messages, and arrival times of replies."""
 
     def __init__(
         self, context: zmq.Context[Any], address: str, made: KeyframeSet, index: int, count: int
@@ -60,8 +59,8 @@ class _Agent:
         self.pings = 0
         self.sent_s: list[float] = []  # of each keyframe
         self.acked_s: list[float] = []
-        self.corrected_s: list[tuple[float, int]] = []  # when, answers
-        self.pongs: list[tuple[float, float]] = []  # when sent, round trip
+        self.corrected_s: list[tuple[float, int]] = []  # time, answered keyframe
+        self.pongs: list[tuple[float, float]] = []  # time of sending, round trip
         self.dropped = 0
 
     def say(self, frames: Sequence[bytes]) -> None:
@@ -80,8 +79,8 @@ class _Agent:
         self.sent_s.append(now)
         self.say(_bytes(Evaluation(number, 50.0, None)))
 
-    def hear(self, now: float) -> None:
-        """All that has come."""
+    def receive(self, now: float) -> None:
+        """Read all replies."""
         while True:
             try:
                 frames = self.socket.recv_multipart(zmq.NOBLOCK)
@@ -106,21 +105,22 @@ def main() -> None:
     context: zmq.Context[Any] = zmq.Context()
     made = room()
     count = int(seconds * RATE_HZ) + 2
-    everybody = [_Agent(context, address, made, index, count) for index in range(int(agents))]
+    all_agents = [_Agent(context, address, made, index, count) for index in range(int(agents))]
     began = time.monotonic()
-    cpu = _talk(everybody, began, seconds, counted_from)
-    print(json.dumps(_figures(everybody, began + counted_from, began + seconds) | {"generator_cpu": cpu}))
+    cpu = _talk(all_agents, began, seconds, counted_from)
+    print(json.dumps(_figures(all_agents, began + counted_from, began + seconds) | {"generator_cpu": cpu}))
     context.destroy(linger=500)
 
 
-def _talk(everybody: list[_Agent], began: float, seconds: float, counted_from: float) -> float:
-    """Everything said in time. CPU seconds per second since `counted_from`."""
+def _talk(all_agents: list[_Agent], began: float, seconds: float, counted_from: float) -> float:
+    """Run all agents in real time. Return CPU seconds per second since `counted_from`."""
     poller = zmq.Poller()
-    by_socket = {agent.socket: agent for agent in everybody}
-    for agent in everybody:
+    by_socket = {agent.socket: agent for agent in all_agents}
+    for agent in all_agents:
         poller.register(agent.socket, zmq.POLLIN)
-    odd = np.random.default_rng(len(everybody)).uniform(size=len(everybody))
-    due = [(began + _COMING_S * (i + odd[i]) / len(everybody), i, "hello") for i in range(len(everybody))]
+    offsets = np.random.default_rng(len(all_agents)).uniform(size=len(all_agents))
+    join_s = _COMING_S * (np.arange(len(all_agents)) + offsets) / len(all_agents)
+    due = [(began + at, i, "hello") for i, at in enumerate(join_s.tolist())]
     heapq.heapify(due)
     cpu_at = 0.0
     while (now := time.monotonic()) < began + seconds:
@@ -129,20 +129,20 @@ def _talk(everybody: list[_Agent], began: float, seconds: float, counted_from: f
             print("counted", file=sys.stderr, flush=True)
         while due[0][0] <= now:
             at, i, what = heapq.heappop(due)
-            for later in _act(everybody[i], what, time.monotonic()):
+            for later in _act(all_agents[i], what, time.monotonic()):
                 heapq.heappush(due, (at + later[0], i, later[1]))
         for socket, _ in poller.poll(max(0, round(1e3 * (due[0][0] - time.monotonic())))):
-            by_socket[socket].hear(time.monotonic())
+            by_socket[socket].receive(time.monotonic())
     print("over", file=sys.stderr, flush=True)
     spent = time.process_time() - cpu_at
-    sys.stdin.readline()  # until the others' CPU is read
-    for agent in everybody:
+    sys.stdin.readline()  # until measure_load has read the edge's CPU
+    for agent in all_agents:
         agent.say(_bytes(Bye()))
     return spent / (seconds - counted_from)
 
 
 def _act(agent: _Agent, what: str, now: float) -> list[tuple[float, str]]:
-    """Say it; what is to be said again, and after how many seconds."""
+    """Do an action; return actions to repeat, and after how many seconds."""
     match what:
         case "hello" if agent.welcome:
             return [(0.0, "pose"), (0.0, "ping"), (0.1, "keyframe")]
@@ -160,14 +160,14 @@ def _act(agent: _Agent, what: str, now: float) -> list[tuple[float, str]]:
             return [(_KEYFRAME_S, what)]
 
 
-def _figures(everybody: list[_Agent], since: float, until: float) -> dict[str, Any]:
-    """Latencies in ms, of keyframes and pings sent in the time that counts; its last second does not."""
+def _figures(all_agents: list[_Agent], since: float, until: float) -> dict[str, Any]:
+    """Return latencies in ms of keyframes and pings sent in the counted time, less its last second."""
     acks: list[float] = []
     corrections: list[float] = []
     pongs: list[float] = []
     halves: tuple[list[float], list[float]] = ([], [])
     sent = answered = received = 0
-    for agent in everybody:
+    for agent in all_agents:
         acks += [1e3 * (b - a) for a, b in zip(agent.sent_s, agent.acked_s, strict=False) if a >= since]
         pongs += [1e3 * trip for at, trip in agent.pongs if at >= since]
         counted = {k for k, at in enumerate(agent.sent_s) if since <= at < until - 1}
@@ -182,19 +182,19 @@ def _figures(everybody: list[_Agent], since: float, until: float) -> dict[str, A
     return {
         "correction_ms": summary(corrections).report(),
         "correction_p95_ms_by_half": [summary(half).report()["p95"] for half in halves],
-        "any_correction_ms": summary(list(_until_any(everybody, since, until))).report(),
+        "any_correction_ms": summary(list(_until_any(all_agents, since, until))).report(),
         "ack_ms": summary(acks).report(),
         "pong_ms": summary(pongs).report(),
         "keyframes": sent,
         "answered": answered / max(1, sent),
-        "corrections_per_s": received / (until - since) / len(everybody),
-        "dropped_by_link": sum(agent.dropped for agent in everybody),
+        "corrections_per_s": received / (until - since) / len(all_agents),
+        "dropped_by_link": sum(agent.dropped for agent in all_agents),
     }
 
 
-def _until_any(everybody: list[_Agent], since: float, until: float) -> Iterator[float]:
-    """From a keyframe's sending to the first correction that answers it or a later one."""
-    for agent in everybody:
+def _until_any(all_agents: list[_Agent], since: float, until: float) -> Iterator[float]:
+    """Yield the time from sending a keyframe to the first correction that answers it or a later one."""
+    for agent in all_agents:
         answers = sorted((at, k) for at, k in agent.corrected_s if k >= 0)
         number = 0
         for k, sent in enumerate(agent.sent_s):

@@ -1,4 +1,4 @@
-"""The edge's map in one process, without sockets: keyframes in, every step timed in CPU time."""
+"""The edge's map in one process, without sockets: add keyframes and measure the CPU time of every step."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class TimedMap:
         self.findings += found
 
     def look(self) -> None:
-        """All that waits to be looked up."""
+        """Run all pending look-ups."""
         while (step := self.mapper.next_lookup()) is not None:
             result, ms = _timed(step.run)
             self.ms["query" if step.kind == "place" else step.kind].append(ms)
@@ -43,7 +43,7 @@ class TimedMap:
             self.findings += found
 
     def solve(self) -> None:
-        """All that is due."""
+        """Solve all maps that are due."""
         while True:
             step, tell_ms = _timed(self.mapper.next_solve)
             if step is None:
@@ -56,7 +56,7 @@ class TimedMap:
 
 
 def _timed(work: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
-    """What it says, and its CPU time in ms."""
+    """Return the result of `work`, and its CPU time in ms."""
     began = time.process_time()
     result = work(*arguments)
     return result, 1e3 * (time.process_time() - began)

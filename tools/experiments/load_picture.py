@@ -1,4 +1,7 @@
-"""load.png of load.json, grow.json and hour.json: python tools/experiments/load_picture.py FOLDER PICTURE"""
+"""Draw load.json, grow.json and hour.json of measure_load and measure_load_curve as one picture.
+
+python tools/experiments/load_picture.py FOLDER PICTURE
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from typing import Any
 
 
 def main() -> None:
-    """Three panels, left to right: many agents, a growing map, an hour in one room."""
+    """Draw three panels, left to right: many agents, a growing map, an hour in one room."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""What a process and its children have used, from /proc (Linux)."""
+"""CPU time and memory of a process and its children, from /proc (Linux)."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 def cpu_s(pid: int) -> float:
-    """Of all its threads, in user and kernel mode; children that ended are not counted (proc(5))."""
+    """Return CPU seconds of all its threads, in user and kernel mode, without ended children (proc(5))."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
 def rss_mb(pid: int) -> float:
-    """Memory that it holds, shared pages too."""
+    """Return its resident memory, shared pages included, MB."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE / 1e6
 
 
 def worker_of(pid: int) -> int:
-    """The process that it spawned to work for it. Raises LookupError unless there is exactly one."""
+    """Return its worker process. Raises LookupError unless there is exactly one."""
     tasks = Path(f"/proc/{pid}/task").iterdir()
     children = [int(child) for task in tasks for child in (task / "children").read_text().split()]
     workers = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]

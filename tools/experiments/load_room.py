@@ -1,4 +1,4 @@
-"""The room of the load measurements: a warehouse that two headsets and a robot walk for a minute."""
+"""The room of the load measurements: a warehouse with two headsets and a robot for a minute."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ RECIPE = SessionRecipe("warehouse", ("ar1=walk:", "ar2=walk:", "robot=robot:"), 
 
 
 def room() -> KeyframeSet:
-    """Made if it is not there yet, which takes a minute."""
+    """Return the set; making it takes a minute."""
     return keyframe_set(RECIPE)

@@ -1,8 +1,8 @@
-"""Many agents out of a few recorded ones: they walk the same tracks, each from another place on.
+"""Many agents from a few recorded ones: they walk the same tracks, each from another start.
 
-Every view is what was seen there, with descriptor bits flipped and image points and depths moved, so that no
-two are the same; odometry is drawn anew for each agent. At the end of a track it begins again, as a new
-stretch of odometry.
+Every view is that of the track with descriptor bits flipped and image points and depths moved, so that no two
+are equal; odometry is drawn for each agent. At the end of a track the agent starts it again as a new odometry
+segment.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from share.geometry import se3
 from share.types import F64, I64, U8, Keyframe, View
 from share.wire.messages import Hello
 
-RATE_HZ = 3.0  # keyframes
-_FLIPPED = 0.04  # of the descriptors' bits
+RATE_HZ = 3.0  # of keyframes
+_FLIPPED = 0.04  # share of the descriptors' bits
 _PIXELS = 0.3  # standard deviation of an image point
-_INVERSE_DEPTH = 0.003  # 1/m, the same of what is known of its depth
+_INVERSE_DEPTH = 0.003  # 1/m, standard deviation of inverse depths
 _FIRST_NS = 1_000_000_000
 
 
 class Walker:
-    """An agent without end. index: which one; it makes the run id and all that is drawn."""
+    """An agent without end. index: decides its run id and all random numbers."""
 
     def __init__(self, made: KeyframeSet, index: int) -> None:
         tracks = list(made.agents.values())
@@ -36,7 +36,7 @@ class Walker:
         self.hello = Hello(f"agent{index}", hello.kind, int(self._rng.integers(2**63)), hello.rig)
 
     def keyframes(self) -> Iterator[Keyframe]:
-        """One after the other, at `RATE_HZ`."""
+        """Yield its keyframes at `RATE_HZ`."""
         number, first = 0, int(self._rng.integers(len(self._track.keyframes)))
         while True:
             at = np.arange(first, len(self._track.keyframes))
@@ -44,7 +44,7 @@ class Walker:
             number, first = number + len(at), 0
 
     def _lap(self, number: int, at: I64) -> Iterator[Keyframe]:
-        """Keyframes `at` of the track, as one stretch, numbered from `number` on."""
+        """Yield keyframes `at` of the track as one segment, with ids from `number` on."""
         stamps_ns = _FIRST_NS + ((number + np.arange(len(at))) * (1e9 / RATE_HZ)).astype(np.int64)
         T, cov = odometry(self._track.T_world_body[at], stamps_ns, self._rng, Drift())
         for k, source in enumerate(at.tolist()):
@@ -73,5 +73,5 @@ class Walker:
 
 
 def _up(T_odom_body: F64) -> F64:
-    """Against gravity, in the body."""
+    """Return the up direction in the body frame."""
     return T_odom_body[2, :3]

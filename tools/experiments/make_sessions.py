@@ -1,11 +1,12 @@
-"""The sessions of the evaluation: the paper's five motions in two rooms, and agents who move as real ones.
+"""Make the sessions of the evaluation: the paper's five motions in two rooms, and agents with recorded
+motions.
 
     python tools/experiments/make_sessions.py --out DIR [--only NAME] [--list]
 
-Names: warehouse-1 to -5 and firestation-1 to -5 (three agents, 60 s, ways within 9 x 6 m), euroc-v1 and
-euroc-mh (two recorded flights in one room), tumvi-rooms (three recorded motions in one room). A session
-that is there is left; three to eight minutes each on two cores. The last three want recordings (--data), and
-are left out without.
+Names: warehouse-1 to -5 and firestation-1 to -5 (three agents, 60 s, within 9 x 6 m), euroc-v1 and euroc-mh
+(two recorded flights in one room), tumvi-rooms (three recorded motions in one room). Existing sessions are
+kept; three to eight minutes each on two cores. The last three need recordings (--data), and are left out
+without them.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from share.lab.emulate.session import make_session  # noqa: E402
 
 _DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "motion"
 _D435I = "d435i:640x480@15"
-_V1, _MH, _HALL = (11.0, 9.0, 4.5), (14.0, 11.0, 5.0), (10.0, 8.0, 4.0)  # m; the motions fit into them
+_V1, _MH, _HALL = (11.0, 9.0, 4.5), (14.0, 11.0, 5.0), (10.0, 8.0, 4.0)  # m, large enough for the motions
 Size = tuple[float, float, float]
 
 
 def recipes(data: Path) -> dict[str, SessionRecipe]:
-    """By name. data: the folder that has euroc/NAME and tumvi/NAME."""
+    """Return the recipes by name. data: folder with euroc/NAME and tumvi/NAME."""
 
     def real(scene: str, seed: int, profile: str, size: Size, **who: str) -> SessionRecipe:
         motions = [f"{name}={path.partition('/')[0]}:{data / path}" for name, path in who.items()]
@@ -53,11 +54,11 @@ def recipes(data: Path) -> dict[str, SessionRecipe]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--out", type=Path, help="where they come")
+    parser.add_argument("--out", type=Path, help="folder for the sessions")
     parser.add_argument("--only", action="append", metavar="NAME", help="may be repeated")
     parser.add_argument("--data", type=Path, default=_DATA, help="recordings: euroc/NAME, tumvi/NAME")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--list", action="store_true", help="their names, and what is in them")
+    parser.add_argument("--list", action="store_true", help="list names and content")
     options = parser.parse_args()
     known = recipes(options.data.resolve())
     if unknown := [name for name in options.only or () if name not in known]:
@@ -74,7 +75,7 @@ def make(chosen: dict[str, SessionRecipe], options: argparse.Namespace) -> None:
         if options.list:
             print(f"{name:15} {recipe.scene}, seed {recipe.seed}: {' '.join(recipe.motions)}")
         elif missing and not options.only:
-            print(f"{name}: left out, there is no {missing[0]} (--data names the folder of recordings)")
+            print(f"{name}: left out: no {missing[0]}; give the folder of recordings by --data")
         elif not (options.out / name).exists():
             print(name, file=sys.stderr)
             with Stages() as stages:
@@ -82,7 +83,7 @@ def make(chosen: dict[str, SessionRecipe], options: argparse.Namespace) -> None:
 
 
 def recorded(recipe: SessionRecipe) -> list[Path]:
-    """The recordings that its agents move by."""
+    """Return the recordings that its agents use."""
     specs = (motion.partition("=")[2].partition(":") for motion in recipe.motions)
     return [Path(folder) for kind, _, folder in specs if kind in ("euroc", "tumvi")]
 

@@ -1,14 +1,15 @@
-"""What an agent that is wrong about itself costs the others: sets of keyframes in virtual time, with lies.
+"""Cost to others of an agent with inconsistent claims about itself: sets of keyframes in virtual time.
 
-    python tools/experiments/measure_claims.py --scene firestation --motion walk: --motion walk: --motion walk: \\
+    python tools/experiments/measure_claims.py --scene firestation --motion walk: --motion walk: \\
+        --motion walk: \\
         --seeds 14:15 --spacing-m 0.3 --spacing-rad 0.35 [--lies "scale 0.99 sure 10,…"] [--honest]
 
-Takes what `make_keyframe_sets.py` takes; sets that it has not made are left out. The last agent lies, see
-`LIES`. ATE is that of the other agents: `final` of their keyframes as the edge has them at the end, `causal`
-of each keyframe as its agent was placed when it was made; one alignment (SE3) for all of a map. In brackets:
-against the same session where the last agent is honest, and against the session without it. A run is a room
-of `share.lab.evaluate.simulation` by policy covins-g, so everything is sent and every loop that is verified
-is judged. """
+Takes the options of `make_keyframe_sets.py`; sets that it has not made are left out. The last agent makes a
+false claim, see `LIES`. ATE is that of the other agents: `final` of their keyframes in the edge's final map,
+`causal` of each keyframe as its agent was localised at that time; one alignment (SE3) per map. In brackets:
+relative to the same session with an honest last agent, and without it. A run is a room of
+`share.lab.evaluate.simulation` with policy covins-g, so everything is sent and every verified loop is judged.
+"""
 
 from __future__ import annotations
 
@@ -45,10 +46,9 @@ from share.wire.messages import Hello, peer_id  # noqa: E402
 
 @dataclass(frozen=True)
 class Lie:
-    """path, depth: by what its way, and the depths that it sees, are too long. sure: its sigmas are so many
-    times too small. turn_deg: its camera is turned on its body against what it says. after_s: until then it
-    says what is right, but for the camera. every_s: it is started anew, as another run of its name, so often;
-    0: never."""
+    """A false claim. path, depth: factors on its path and depths. sure: its sigmas are divided by this.
+    turn_deg: error of its camera's rotation on the body. after_s: the claim is true until then, except for
+    the camera. every_s: it restarts as another run of its name at this interval; 0: never."""
 
     path: float = 1.0
     depth: float = 1.0
@@ -82,14 +82,13 @@ LIES = {
         for every in (4.0, 8.0)
     },
 }
-_GAP_S = 3.5  # between two runs of a name: as long as a name is held, and a little more
+_GAP_S = 3.5  # between two runs of a name: a little longer than the edge holds a name
 
 
 @dataclass
 class Outcome:
-    """Of the honest agents of one run, cm and s. together: since when they are in one map; doubt: the most
-    that was held against one of them, 1 sets apart; wronged: whether one of them ever was kept apart from
-    another."""
+    """Outcome for the honest agents of one run, cm and s. together: since when they are in one map; doubt:
+    largest contradiction of one of them, separated at 1; wronged: whether two of them were ever separated."""
 
     final: float
     causal: float
@@ -100,8 +99,8 @@ class Outcome:
     said: list[str] = field(default_factory=list)
 
 
-def told(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[TrackedFrame]]]:
-    """What each of its runs says of itself and sees; its frames are its keyframes."""
+def claimed_runs(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[TrackedFrame]]]:
+    """Return hello and frames of each of its runs, with the claim applied; its frames are its keyframes."""
     first_ns, runs = agent.keyframes[0].stamp_ns, list[list[TrackedFrame]]()
     began_ns, T_odom = first_ns, np.eye(4)
     for n, keyframe in enumerate(agent.keyframes):
@@ -127,10 +126,10 @@ def told(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[TrackedFrame
 
 
 class _Room(Simulation):
-    """Who comes later, or goes earlier, is not heard before and after; it says nothing when it goes."""
+    """A simulation in which members are connected for a part of the time; they leave without a message."""
 
     def __init__(self, spans_ns: Mapping[bytes, tuple[int, int]], *args: Any, **kwargs: Any) -> None:
-        """spans_ns: from when to when each is there; one that is not named always is."""
+        """spans_ns: connected from .. to, by peer; members without a span always are."""
         self._spans_ns = spans_ns
         super().__init__(*args, **kwargs)
 
@@ -151,10 +150,10 @@ def _turned(hello: Hello, degrees: float) -> Hello:
 
 
 def played(made: KeyframeSet, lie: Lie | None, config: Config, seed: int = 0) -> Outcome:
-    """The whole session; None: without the last agent."""
+    """Simulate the whole session; lie None: without the last agent."""
     *honest, liar = made.agents
-    agents = [run for name in honest for run in told(made.agents[name], Lie())]
-    lies = [] if lie is None else told(made.agents[liar], lie)
+    agents = [run for name in honest for run in claimed_runs(made.agents[name], Lie())]
+    lies = [] if lie is None else claimed_runs(made.agents[liar], lie)
     agents += lies
     began_ns = min(seen[0].arrival_ns for _, seen in agents)
     ends_ns = max(seen[-1].arrival_ns for _, seen in agents)
@@ -192,11 +191,11 @@ def played(made: KeyframeSet, lie: Lie | None, config: Config, seed: int = 0) ->
     )
 
 
-# ---------------------------------------------------------------- how wrong
+# ---------------------------------------------------------------- errors
 
 
 def _rmse_cm(groups: list[tuple[F64, F64]]) -> float:
-    """Positions (N, 3) found and true, of each map on its own."""
+    """Return the RMSE over maps of estimated and true positions (N, 3), each map aligned on its own."""
     gaps = [se3.transform(umeyama(a, b), a) - b for a, b in groups if len(a) >= 3]
     return 100 * float(np.sqrt((np.concatenate(gaps) ** 2).sum(1).mean())) if gaps else float("nan")
 
@@ -229,7 +228,7 @@ def _stacked(pairs: list[tuple[F64, F64]]) -> tuple[F64, F64]:
 
 
 def _together(room: Simulation, honest: Sequence[str]) -> float | None:
-    """Since when all of them are told of one map, s; None: they are not."""
+    """Return since when all of them are in one map, s; None: they are not."""
     frames = sorted((f.stamp_ns, name, f.map_id) for name in honest for f in room.localised[name])
     now: dict[str, str | None] = {}
     since: float | None = None
@@ -242,22 +241,22 @@ def _together(room: Simulation, honest: Sequence[str]) -> float | None:
     return since
 
 
-# ---------------------------------------------------------------- all of them
+# ---------------------------------------------------------------- the table
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     made = set_parser()
     made.description = __doc__
-    made.add_argument("--lies", default=",".join(LIES), help="of LIES, by comma")
-    made.add_argument("--honest", action="store_true", help="nobody lies, and all count")
+    made.add_argument("--lies", default=",".join(LIES), help="names in LIES, separated by commas")
+    made.add_argument("--honest", action="store_true", help="no false claims; all agents count")
     made.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="of Config")
-    made.add_argument("--json", type=Path, metavar="FILE", help="keep all figures there, a line a run")
+    made.add_argument("--json", type=Path, metavar="FILE", help="write all figures there, a line a run")
     options = made.parse_args(arguments)
     return exit_code("measure_claims", lambda: measure(options))
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Raises UsageError if no set is there, or a lie is not known."""
+    """Raises UsageError where there is no set, or a claim is not known."""
     lies = [] if options.honest else options.lies.split(",")
     if unknown := [lie for lie in lies if lie not in LIES]:
         raise UsageError(f"'{unknown[0]}' is not known; known: {', '.join(LIES)}")
@@ -273,7 +272,7 @@ def measure(options: argparse.Namespace) -> None:
                 with options.json.open("a") as out:
                     out.write(json.dumps({"row": row, **asdict(outcome)}) + "\n")
     if not some:
-        raise UsageError("no set is there; make them with make_keyframe_sets.py first")
+        raise UsageError("there are no sets; make them with make_keyframe_sets.py first")
 
 
 def _sets(options: argparse.Namespace) -> Iterator[tuple[str, KeyframeSet]]:

@@ -1,13 +1,14 @@
-"""Would what a picture looks like to the error model find places that words of descriptors do not?
+"""Test whether embeddings of the error model find places that the vocabulary of descriptors does not.
 
     python tools/experiments/measure_embedding.py SESSION [SESSION ...] [--model FILE]
 
-SESSION: a folder by `share emulate`. Keyframes are each 30 cm or 20 degrees of an agent's true path; each
-looks for the place among those of all other agents. True are those that
-`share.mapping.recognition.verification` finds with a pose that is right by 15 cm and 2 degrees. Prints, of
-keyframes that have a true one at all, how many have it among the first 1, 3, 8 and 20 found: by words, by
-likeness of the embeddings (cosine), of pictures of 16 x 12 pixels (for comparison), and by words and likeness
-together (reciprocal ranks, Cormack et al. 2009), at several weights."""
+SESSION: a folder by `share emulate`. Keyframes are each 30 cm or 20 degrees of an agent's true path; each is
+queried among those of all other agents. True matches are those that `share.mapping.recognition.verification`
+verifies with a pose error below 15 cm and 2 degrees. Prints, of keyframes with a true match, how many have it
+among the first 1, 3, 8 and 20 results: by words, by embedding similarity (cosine), by pictures of 16 x 12
+pixels (for comparison), and by words and similarity together (reciprocal ranks, Cormack et al. 2009), at
+several weights.
+"""
 
 from __future__ import annotations
 
@@ -45,16 +46,16 @@ from share.types import F64, U8  # noqa: E402
 from share.vision.orb import make_view  # noqa: E402
 
 EVERY = Spacing(0.3, 0.35)
-NEAR_M, NEAR_DEG = 2.5, 50.0  # further apart, two views are not even tried
+NEAR_M, NEAR_DEG = 2.5, 50.0  # views further apart are not verified
 RIGHT_M, RIGHT_DEG = 0.15, 2.0
 FIRST = (1, 3, 8, 20)
 WEIGHTS = (0.25, 0.5, 1.0)
-RANKS = 10  # of a reciprocal rank: how little the first few differ
+RANKS = 10  # of reciprocal ranks: flattens the differences of the first few
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A keyframe: whose, from where T_world_body (4, 4), its sight, and its picture (128, 128)."""
+    """A keyframe: its agent, pose T_world_body (4, 4), view, and picture (128, 128)."""
 
     agent: str
     T: F64
@@ -85,9 +86,9 @@ def report(name: str, seen: list[Seen], kinds: dict[str, F64]) -> None:
     agents = np.array([one.agent for one in seen])
     own, true = agents[:, None] == agents[None], truths(seen)
     if not true.any():
-        raise UsageError(f"{name}: no keyframe of one agent shows a place of another")
+        raise UsageError(f"{name}: no keyframe shows a place of another agent")
     words = by_words(seen, own)
-    print(f"\n{name}: {len(seen)} keyframes, {int(true.any(axis=1).sum())} have a true one\n")
+    print(f"\n{name}: {len(seen)} keyframes, {int(true.any(axis=1).sum())} with a true match\n")
     print("\n".join(line(cells) for cells in (["by", *(f"first {k}" for k in FIRST)], ["---"] * 5)))
     print(line(["words", *among_first(words, true)]))
     for kind, vectors in kinds.items():
@@ -103,7 +104,7 @@ def keyframes(folder: Path, agent: str) -> Iterator[Seen]:
     source = open_source(str(folder / agent))
     truth, rig = source.truth(), source.rig
     if truth is None:
-        raise UsageError(f"{folder}/{agent}: comes without a truth")
+        raise UsageError(f"{folder}/{agent}: has no ground truth")
     stamps = np.unique(source.stamps()["cam0"])
     known, T = interpolate(truth.stamps_ns, truth.T, stamps)
     at = spaced(Trajectory(stamps[known], T), EVERY)
@@ -115,7 +116,7 @@ def keyframes(folder: Path, agent: str) -> Iterator[Seen]:
 
 
 def truths(seen: list[Seen]) -> np.ndarray:
-    """(N, N): of keyframe q, which of other agents' show its place so that it can be verified."""
+    """Return (N, N): which keyframes of other agents are true matches of keyframe q."""
     config, out = PlaceConfig(), np.zeros((len(seen), len(seen)), bool)
     cameras = np.array([one.T @ one.sight.T_body_cam0 for one in seen])
     for q, one in enumerate(seen):
@@ -138,7 +139,7 @@ def right(T_c: F64, T_q: F64, T_c_q: F64) -> bool:
 
 
 def by_words(seen: list[Seen], own: np.ndarray) -> F64:
-    """Scores (N, N) by the index."""
+    """Return scores (N, N) by the index."""
     config, out = PlaceConfig(), np.where(own, -np.inf, 0.0)
     index = PlaceIndex(config.index_seed, config.tables, config.hash_bits)
     for k, one in enumerate(seen):
@@ -151,19 +152,19 @@ def by_words(seen: list[Seen], own: np.ndarray) -> F64:
 
 
 def cosine(vectors: F64) -> F64:
-    """(N, N): of vectors (N, D), without what all have in common."""
+    """Return (N, N) cosine similarities of vectors (N, D), less their mean."""
     apart = vectors - vectors.mean(axis=0)
     apart /= np.linalg.norm(apart, axis=1, keepdims=True)
     return np.asarray(apart @ apart.T)
 
 
 def ranks(score: F64) -> F64:
-    """0 for the best of a row."""
+    """Return ranks, 0 for the best of a row."""
     return np.asarray(np.argsort(np.argsort(-score, axis=1, kind="stable"), axis=1, kind="stable"))
 
 
 def among_first(score: F64, true: np.ndarray) -> list[str]:
-    """Of rows that have a true one, how many have it among the best."""
+    """Return, of rows with a true match, the share with one among the best."""
     order = np.argsort(-score, axis=1, kind="stable")
     first = np.take_along_axis(true, order, axis=1)[true.any(axis=1)].argmax(axis=1)
     return [f"{100 * (first < k).mean():.0f} %" for k in FIRST]

@@ -1,13 +1,12 @@
-"""How true an emulated session is. Prints JSON, one agent a line.
+"""Accuracy of an emulated session. Prints JSON, one agent a line.
 
     python tools/experiments/measure_emulation.py SESSION/NAME ...
 
-`track_*`: the tracker, which uses no IMU. Of recorded motions also:
-`fit_*`: the path against its motion capture, and the IMU against the path in units of its noise (rms of three
-axes; turn, change of velocity).
-`turn_*_mrad`: the angle between what two of three say of the turn from one picture to the next, rms: the IMU
-in the recording, less the fitted bias, integrated; the recorded pictures of cam0 (KLT, exact depth, PnP); the
-path; of the first two also the median, and `shift_ms` of best correlation.
+`track_*`: the tracker without IMU. Of recorded motions also: `fit_*`: the path against its motion capture,
+and the IMU against the path in units of its noise (rms of three axes; rotation, change of velocity).
+`turn_*_mrad`: rms angle between two of three rotations from one picture to the next: by the recording's IMU
+less the fitted bias, integrated; by the recorded pictures of cam0 (KLT, exact depth, PnP); by the path; of
+the first two also the median, and `shift_ms` of best correlation.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ def main() -> None:
 
 
 def of_session(name: str) -> Row:
-    """One agent of a session."""
+    """Return figures of one agent of a session."""
     source = open_source(name)
     row: Row = {"agent": name} | tracked(source)
     about = read_session(Path(name).parent).provenance
@@ -68,7 +67,7 @@ def of_session(name: str) -> Row:
 
 
 def replanned(about: Row) -> MotionPlan:
-    """The plan that a session was made by: seeds make it the same."""
+    """Plan a session's motions again from its recipe."""
     size = about["size"] and tuple(about["size"])
     return plan_motions(
         about["motions"],
@@ -79,7 +78,7 @@ def replanned(about: Row) -> MotionPlan:
 
 
 def tracked(source: Source) -> Row:
-    """By cameras alone, causal."""
+    """Track by cameras alone, causal."""
     run = track(source, Config(), lambda _: None)
     whole = run.report["stretches"] == 1
     found = trajectory_accuracy(run, source.truth()) if whole else None
@@ -107,12 +106,12 @@ def fitted(path: RecordedPath) -> Row:
 
 
 def turned(source: Source, path: RecordedPath, room: Layout) -> Row:
-    """Rotations between pictures, three ways."""
+    """Compare rotations between pictures, by three sources."""
     imu, stamps = inertial(source), I64_of(stamp for stamp, _ in pictures(source))
-    start, end, seen = seen_turns(source, path, room)
+    start, end, seen = rotations_by_pictures(source, path, room)
     inside = (start >= imu.stamps_ns[0] + _ns(SHIFTS_MS[-1])) & (end <= imu.stamps_ns[-1] + _ns(SHIFTS_MS[0]))
     start, end, seen = start[inside], end[inside], seen[inside]
-    felt, gone = felt_turns(imu, path, start, end), path_turns(path, start, end)
+    felt, gone = rotations_by_gyro(imu, path, start, end), path_turns(path, start, end)
     return {
         "intervals": len(start),
         "of": len(stamps) - 1,
@@ -131,16 +130,16 @@ def pictures(source: Source) -> Iterator[tuple[int, Any]]:
 
 
 def inertial(source: Source) -> ImuBatch:
-    """What is in the recording."""
+    """Return the recording's IMU samples."""
     found = [(m.stamp_ns, *m.payload) for m in source.measurements() if m.stream == IMU]
     values = np.array([row[1:] for row in found])
     return ImuBatch(I64_of(row[0] for row in found), values[:, :3], values[:, 3:])
 
 
-def seen_turns(source: Source, path: RecordedPath, room: Layout) -> tuple[I64, I64, F64]:
-    """Stamps (N,) of a picture and the next, and R_body_next (N, 3, 3) by the pictures alone: depth is the
-    room's where the path says the first camera was, and PnP finds the second. Left out: pairs with a hole
-    (lost frames, a gap in the truth) between them, and with too few matches."""
+def rotations_by_pictures(source: Source, path: RecordedPath, room: Layout) -> tuple[I64, I64, F64]:
+    """Return stamps (N,) of a picture and the next, and R_body_next (N, 3, 3) by the pictures alone: depths
+    are those of the room at the first camera's true pose, and PnP finds the second. Pairs with a gap (lost
+    frames, no ground truth) or too few matches are left out."""
     rig, scene = source.rig, scene_of([p.shape.mesh.triangles for p in room.all_pieces])
     R = rig.T_body_cam0[:3, :3]
     longest = 1.5 * float(np.median(np.diff(I64_of(stamp for stamp, _ in pictures(source)))))
@@ -157,11 +156,11 @@ def seen_turns(source: Source, path: RecordedPath, room: Layout) -> tuple[I64, I
 
 
 def relative(before: U8, after: U8, camera: Camera, scene: RayCaster, T_world_cam: F64) -> F64 | None:
-    """T_after_before (4, 4) of a camera, None where the pictures do not tell."""
+    """Return T_after_before (4, 4) of a camera, None where the pictures do not determine it."""
     px = detect(before, np.zeros((0, 2), np.float32), CORNERS, SPACING_PX)
     there, ok = track_points(before, after, px, px)
-    ways = rays(camera.normalise(px[ok].astype(float)))
-    points, hit = first_hits(scene, T_world_cam, ways)
+    directions = rays(camera.normalise(px[ok].astype(float)))
+    points, hit = first_hits(scene, T_world_cam, directions)
     points = se3.transform(se3.inverse(T_world_cam), points)[hit]
     if len(points) < LEAST:
         return None
@@ -170,8 +169,8 @@ def relative(before: U8, after: U8, camera: Camera, scene: RayCaster, T_world_ca
     return T if inliers.sum() >= LEAST else None
 
 
-def felt_turns(imu: ImuBatch, path: RecordedPath, start: I64, end: I64) -> F64:
-    """R_start_end (N, 3, 3) of the body by the gyro, less the bias of the fit."""
+def rotations_by_gyro(imu: ImuBatch, path: RecordedPath, start: I64, end: I64) -> F64:
+    """Return R_start_end (N, 3, 3) of the body by the gyro, less the fitted bias."""
     nodes = ImuBatch(path.fit.stamps_ns, path.fit.gyro_bias, path.fit.accel_bias)
     bias = interpolate_samples(nodes, start, nodes.gyro)
     return preintegrate(imu, start, end, bias, 0 * bias).dR
@@ -182,12 +181,12 @@ def path_turns(path: RecordedPath, start: I64, end: I64) -> F64:
 
 
 def best_shift_ms(imu: ImuBatch, path: RecordedPath, start: I64, end: I64, seen: F64) -> float:
-    """How late the gyro is: the peak of the normalised correlation of the turns, between steps by a
-    parabola."""
+    """Return the delay of the gyro: the peak of the normalised correlation of the rotations, interpolated by
+    a parabola."""
     turns = se3.so3_log(seen)
     scores = []
     for shift in SHIFTS_MS:
-        felt = se3.so3_log(felt_turns(imu, path, start + _ns(shift), end + _ns(shift)))
+        felt = se3.so3_log(rotations_by_gyro(imu, path, start + _ns(shift), end + _ns(shift)))
         scores.append(float((turns * felt).sum() / np.sqrt((turns**2).sum() * (felt**2).sum())))
     k = int(np.argmax(scores).clip(1, len(scores) - 2))
     a, b, c = scores[k - 1 : k + 2]
@@ -198,10 +197,10 @@ def scene_of(triangles: list[Any]) -> RayCaster:
     return RayCaster(np.concatenate(triangles).astype(np.float32))
 
 
-def first_hits(scene: RayCaster, T_world_cam: F64, ways: F64) -> tuple[F64, np.ndarray]:
-    """World points (N, 3) that rays through ways (N, 3) of a camera meet first, and which meet any (N,)."""
-    start = np.tile(T_world_cam[:3, 3], (len(ways), 1)).astype(np.float32)
-    which, weights = scene.first_hits(start, (ways @ T_world_cam[:3, :3].T).astype(np.float32))
+def first_hits(scene: RayCaster, T_world_cam: F64, rays: F64) -> tuple[F64, np.ndarray]:
+    """Return world points (N, 3) that a camera's rays (N, 3) meet first, and which meet any (N,)."""
+    start = np.tile(T_world_cam[:3, 3], (len(rays), 1)).astype(np.float32)
+    which, weights = scene.first_hits(start, (rays @ T_world_cam[:3, :3].T).astype(np.float32))
     points: F64 = np.einsum("nc,ncd->nd", weights.astype(float), scene.triangles[which].astype(float))
     return points, which >= 0
 
@@ -211,7 +210,7 @@ def I64_of(values: Any) -> I64:
 
 
 def _rms_between(a: F64, b: F64) -> float:
-    """Of the angle between rotations (N, 3, 3), rad."""
+    """Return the rms angle between rotations (N, 3, 3), rad."""
     return _rms(se3.rotation_angle(a.swapaxes(1, 2) @ b))
 
 

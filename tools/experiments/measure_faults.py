@@ -1,15 +1,14 @@
-"""How the inertial tracker bears what goes wrong. Prints JSON, one fault of one agent a line, and a table.
+"""Effect of faults on the inertial tracker. Prints JSON, one fault of one agent a line, and a table.
 
     python tools/experiments/measure_faults.py [--seconds S] [--faults A,B] [--out FILE] SESSION/NAME ...
 
-Faults are those of `share/lab/emulate/faults.py`, each on its own, on the first S seconds. Of each:
-`ate_cm`: causal poses, SE3 alignment, of the longest stretch (`scored`: its share of all frames that have a
-pose); `ratio`: to the clean run. `states`: % of the frames. `lost_s`, `segments`: as in report.json.
-`wrong_ok`: % of all frames that are told OK though the position is off by more than 5 cm and more than three
-sigmas of what is told; from the first pose of the stretch on, turned about the vertical so that it is right,
-or, where the tracker did not know what is up, turned in full. `changed`: % of cam0's pixels that differ from
-the recording's, in frames that differ. `cpu_ms`: median of a frame, keyframe included.
-The table is kept up to date in FILE.
+Each fault of `share/lab/emulate/faults.py` on its own, on the first S seconds. `ate_cm`: causal poses, SE3
+alignment, of the longest segment (`scored`: its share of all frames with a pose); `ratio`: to the clean run.
+`states`: % of the frames. `lost_s`, `stretches`: as in report.json. `wrong_ok`: % of all frames that are OK
+although the position errs by more than 5 cm and more than three of its sigmas; aligned at the first pose of
+the segment by yaw, or in full where the tracker has no gravity. `changed`: % of cam0's pixels that differ
+from the recording's, in frames that differ. `cpu_ms`: median of a frame, keyframe included. The table is
+written to FILE after each row.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ HEAD = (
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A part of a recording, its frames decoded, and where the body truly was."""
+    """A part of a recording with decoded frames and ground truth."""
 
     name: str
     source: Source
@@ -75,7 +74,7 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What the tracker said of each frame."""
+    """The tracker's results for each frame."""
 
     frames: list[Frame]
     results: list[TrackResult]
@@ -83,14 +82,14 @@ class Run:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Of the frames with a pose."""
+        """Return the frames with a pose."""
         told = [(f.stamp_ns, r.T_odom_body) for f, r in zip(self.frames, self.results, strict=True)]
         there = [(stamp, T) for stamp, T in told if T is not None]
         stamps = np.array([stamp for stamp, _ in there], np.int64)
         return Trajectory(stamps, np.array([T for _, T in there]).reshape(-1, 4, 4))
 
     def stretches(self) -> list[Run]:
-        """The frames with a pose, by unbroken stretch; without those that have less than three."""
+        """Return the frames with a pose by unbroken segment, without segments of less than three."""
         number = np.cumsum([r.new_segment for r in self.results])
         told = np.array([r.T_odom_body is not None for r in self.results])
         chosen = [np.flatnonzero(told & (number == n)) for n in np.unique(number)]
@@ -119,17 +118,17 @@ def main() -> None:
 
 
 def case(name: str, seconds: float) -> Case:
-    """The first seconds of a recording. Raises UsageError where it has no truth."""
+    """Return the first seconds of a recording. Raises UsageError where it has no ground truth."""
     whole = open_source(name)
     source = open_source(name, frames=slice(0, round(seconds * whole.rate_hz)))
     truth = whole.truth()
     if truth is None:
-        raise UsageError(f"{name}: has no truth to compare with")
+        raise UsageError(f"{name}: has no ground truth")
     return Case(name, source, list(read_frames(source, Config(), SequencerCounters())), truth)
 
 
 def rows_of(case: Case, faults: Sequence[str]) -> Iterator[Row]:
-    """One a fault; the clean run first, whether it was asked for or not."""
+    """Yield a row a fault; the clean run is always first."""
     clean: float | None = None
     for name in dict.fromkeys(("clean", *faults)):
         row: Row = {"session": case.name, "fault": name} | measured(case, FAULTS[name])
@@ -144,7 +143,7 @@ def measured(case: Case, fault: Fault) -> Row:
 
 
 def faulty(case: Case, fault: Fault) -> list[Frame]:
-    """What comes out of the sequencer, with the fault."""
+    """Return the sequencer's output with the fault."""
     frames = case.frames
     if fault.change_measurements is not None:
         door = Door(case.source, fault.change_measurements)
@@ -153,7 +152,7 @@ def faulty(case: Case, fault: Fault) -> list[Frame]:
 
 
 def tracked(rig: Rig, frames: list[Frame]) -> Run:
-    """One tracker over all frames."""
+    """Run one tracker over all frames."""
     config, log, results = Config(), RunLog(), []
     tracker = InertialTracker(rig, config.inertial, config.tracker)
     for frame in frames:
@@ -169,7 +168,7 @@ def tracked(rig: Rig, frames: list[Frame]) -> Run:
 
 
 def scored(run: Run, truth: Trajectory) -> Row:
-    """A run without a pose has None for its errors."""
+    """Return the figures; errors are None in a run without a pose."""
     report, states = run.log.report(), Counter(str(r.state) for r in run.results)
     parts = run.stretches()
     longest = max(parts, key=lambda part: len(part.results), default=None)
@@ -190,14 +189,14 @@ def scored(run: Run, truth: Trajectory) -> Row:
 
 
 def wrongly_ok(part: Run, truth: Trajectory) -> np.ndarray:
-    """Of the frames of a stretch whose truth is known (N,): which are told OK, and are not."""
+    """Return which frames (N,) of a segment with ground truth are OK although they are wrong."""
     told = part.trajectory
     known, true = interpolate(*truth, told.stamps_ns)
     results = [r for r, k in zip(part.results, known, strict=True) if k]
     if not results:
         return np.zeros(0, bool)
     T, cov = told.T[known], np.array([r.cov for r in results])
-    if results[0].state is TrackState.VISION_ONLY:  # it does not know what is up
+    if results[0].state is TrackState.VISION_ONLY:  # no gravity
         true = T[0] @ se3.inverse(true[0]) @ true
     found = deviations(T, cov, true, np.zeros(len(T), np.int64))
     error, C = found.errors[:, 3:], found.cov[:, 3:, 3:]
@@ -209,7 +208,8 @@ def wrongly_ok(part: Run, truth: Trajectory) -> np.ndarray:
 
 
 def changed(clean: list[Frame], frames: list[Frame]) -> float:
-    """% of cam0's pixels, of frames with the same stamp that differ at all; 0 where none does."""
+    """Return % of cam0's pixels that differ, over frames with the same stamp that differ; 0 where none
+    does."""
     before = {frame.stamp_ns: frame.image0 for frame in clean}
     shares = [
         float((before[f.stamp_ns] != f.image0).mean())
@@ -221,7 +221,7 @@ def changed(clean: list[Frame], frames: list[Frame]) -> float:
 
 
 class Door(Source):
-    """A recording to whose measurements something happens before they are put in order."""
+    """A source that changes measurements before the sequencer."""
 
     def __init__(self, source: Source, arriving: MeasurementFilter) -> None:
         self.name, self.rig, self.notes = source.name, source.rig, source.notes
@@ -238,7 +238,7 @@ class Door(Source):
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Markdown."""
+    """Return a Markdown table."""
     lines = [_cells(HEAD), "|" + "---|" * len(HEAD), *map(_line, rows)]
     return "\n".join(lines) + "\n"
 

@@ -1,15 +1,15 @@
-"""When the edge joins the maps of agents, and whether rightly: replays sets of keyframes through its mapper.
+"""Time and correctness of merges between agents: replay sets of keyframes through the edge's mapper.
 
-    python tools/experiments/measure_joins.py --scene corridor-twins --motion walk: --motion walk: --seeds 0:200 \\
-        --spacing-m 0.3 --spacing-rad 0.35 [--set merge.join_places=4] [--json FILE]
+    python tools/experiments/measure_joins.py --scene corridor-twins --motion walk: --motion walk: \\
+        --seeds 0:200 --spacing-m 0.3 --spacing-rad 0.35 [--set merge.join_places=4] [--json FILE]
 
-Takes what `make_keyframe_sets.py` takes; sets that it has not made are left out. Prints a Markdown table.
+Takes the options of `make_keyframe_sets.py`; sets that it has not made are left out. Prints a Markdown table.
 
-Protocol: keyframes of all agents in the order of their stamps; after each, everything there is to do is done
-at once, in one process, so a time here is that of a keyframe. Common view: keyframes of two agents nearer
-than 1 m and 30 degrees. Two agents are wrongly in one map while their newest keyframes lie there by more than
-0.5 m or 10 degrees otherwise than in truth. Joint ATE: of the keyframes of the largest map at the end, one
-alignment (SE3) for all agents.
+Protocol: keyframes of all agents in the order of their stamps; after each, all pending work is done at once,
+in one process, so a time here is that of a keyframe. Common view: keyframes of two agents nearer than 1 m and
+30 degrees. Two agents are wrongly in one map while the relative pose of their newest keyframes there errs by
+more than 0.5 m or 10 degrees. Joint ATE: of the keyframes of the largest map at the end, one alignment (SE3)
+for all agents.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ WRONG_M, WRONG_RAD = 0.5, float(np.radians(10))
 
 @dataclass
 class Pair:
-    """Two agents, in seconds since the first keyframe. joined: rightly, for the first time."""
+    """Two agents, in seconds since the first keyframe. joined: the first correct merge."""
 
     common: float | None = None
     joined: float | None = None
@@ -60,7 +60,7 @@ class Pair:
 
     @property
     def after(self) -> float | None:
-        """How long after the first common view they were joined."""
+        """Return the time from the first common view to the merge."""
         if self.common is None or self.joined is None:
             return None
         return max(0.0, self.joined - self.common)
@@ -68,7 +68,7 @@ class Pair:
 
 @dataclass
 class Run:
-    """pairs: by the names of both. joint_ate_cm: None if nobody was joined."""
+    """pairs: by the names of both. joint_ate_cm: None if no agents were merged."""
 
     seed: int
     pairs: dict[str, Pair] = field(default_factory=dict)
@@ -77,11 +77,11 @@ class Run:
 
 
 class Replay:
-    """One set, keyframe by keyframe."""
+    """Replays one set, keyframe by keyframe."""
 
     def __init__(self, made: KeyframeSet, config: Config) -> None:
         self._made, self._mapper, self._solver = made, Mapper(config), PoseGraphSolver(config.graph)
-        self._seen: dict[str, int] = {}  # how many keyframes of an agent have come
+        self._seen: dict[str, int] = {}  # keyframes of each agent so far
         self._before = 0.0
         self.run = Run(made.recipe.seed)
         for name, agent in made.agents.items():
@@ -106,7 +106,7 @@ class Replay:
             mapper.finish_step(step, result, 0.0)
 
     def _look(self, t: float, name: str) -> None:
-        """How all pairs are now; what was wrong stays so until the next keyframe."""
+        """Update the state of all pairs; a wrong one counts until the next keyframe."""
         found = self._mapper.current_poses()
         at = {
             key: (T, map_id)
@@ -130,7 +130,7 @@ class Replay:
         return KeyframeKey(name, self._made.agents[name].keyframes[self._seen[name] - 1].id)
 
     def _common(self, name: str, other: str) -> bool:
-        """Whether the newest keyframe shows what the other agent has seen."""
+        """Return whether the newest keyframe shows what the other agent has seen."""
         T = self._made.agents[name].T_world_body[self._seen[name] - 1]
         step = se3.inverse(T) @ self._made.agents[other].T_world_body[: self._seen[other]]
         near = np.linalg.norm(step[:, :3, 3], axis=1) < SEEN_M
@@ -166,39 +166,39 @@ class Replay:
 
 
 def order(made: KeyframeSet) -> list[tuple[float, str, int]]:
-    """Seconds since the first, agent, and which of its keyframes."""
+    """Return (seconds since the first, agent, index of the keyframe), in order."""
     stamps = [(kf.stamp_ns, name, k) for name, a in made.agents.items() for k, kf in enumerate(a.keyframes)]
     first = min(stamps)[0]
     return [((stamp - first) * 1e-9, name, k) for stamp, name, k in sorted(stamps)]
 
 
-# ---------------------------------------------------------------- all of them
+# ---------------------------------------------------------------- the table
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     made = set_parser()
     made.description = __doc__
     made.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="of Config")
-    made.add_argument("--json", type=Path, metavar="FILE", help="keep all figures there")
+    made.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
     options = made.parse_args(arguments)
     return exit_code("measure_joins", lambda: measure(options))
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Raises UsageError if no set is there."""
+    """Raises UsageError where there is no set."""
     runs = []
     for run in replayed(options, configured(options.set)):
         runs.append(run)
         print(line(run), file=sys.stderr, flush=True)
     if not runs:
-        raise UsageError("no set is there; make them with make_keyframe_sets.py first")
+        raise UsageError("there are no sets; make them with make_keyframe_sets.py first")
     print(table(options.scene, runs))
     if options.json:
         options.json.write_text(json.dumps([asdict(run) for run in runs], indent=1))
 
 
 def configured(settings: Sequence[str]) -> Config:
-    """The shipped settings but for these. Raises ConfigError for one that there is not."""
+    """Return the shipped settings with these changes. Raises ConfigError for an unknown setting."""
     mapping = to_mapping(Config())
     for setting in settings:
         name, _, value = setting.partition("=")
@@ -225,7 +225,7 @@ def line(run: Run) -> str:
 
 
 def table(scene: str, runs: Sequence[Run]) -> str:
-    """Markdown: one row."""
+    """Return a Markdown table with one row."""
     pairs = [pair for run in runs for pair in run.pairs.values()]
     seen = [pair for pair in pairs if pair.common is not None]
     after = [pair.after for pair in seen if pair.after is not None]

@@ -1,9 +1,9 @@
-"""How many agents one edge carries: a real `share edge --map`, and N agents that one process plays.
+"""Capacity of one edge: a real `share edge --map`, and N agents simulated by one process.
 
     python tools/experiments/measure_load.py [--agents 3 6 12 24 32 48] [--seconds 40] [--out out/load]
 
 Writes load.json to --out and prints a Markdown table. CPU is that of the edge's three processes, in seconds
-per second; agents share the machine. The first 10 s are not counted. docs/edge-load.md has the figures.
+per second; the agents share the machine. The first 10 s do not count. docs/edge-load.md has the figures.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def main() -> int:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """All loads, one after the other."""
+    """Measure all loads, one after the other."""
     rows: list[Row] = []
     writable_dir(options.out)
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))), flush=True)
@@ -79,7 +79,7 @@ def measure(options: argparse.Namespace) -> None:
 
 
 def carry(agents: int, seconds: float, config: Path | None) -> Row:
-    """One edge, from its start to its end."""
+    """Run one edge with N agents from start to end."""
     with tempfile.TemporaryDirectory(prefix="load-") as name, edge(Path(name), config) as (front, said):
         address, status = said
         command = [sys.executable, HERE / "load_agents.py", address, str(agents), str(seconds)]
@@ -104,7 +104,7 @@ def carry(agents: int, seconds: float, config: Path | None) -> Row:
 
 @contextmanager
 def edge(folder: Path, config: Path | None) -> Iterator[tuple[subprocess.Popen[str], tuple[str, str]]]:
-    """A `share edge`; its address, and where it tells how it is."""
+    """Run a `share edge`; yield the process, its address, and its status file."""
     command = [sys.executable, "-m", "share", "edge", "--bind", "tcp://127.0.0.1:0", "--http", "0"]
     command += ["--map", folder / "map.sqlite", "--out", folder / "out"]
     command += [] if config is None else ["--config", config]
@@ -131,7 +131,7 @@ def edge(folder: Path, config: Path | None) -> Iterator[tuple[subprocess.Popen[s
 
 
 def _watch(generator: subprocess.Popen[str], front: subprocess.Popen[str], status: str) -> Row:
-    """CPU, memory and queue of the edge's processes, in the time that counts."""
+    """Return CPU, memory and queue of the edge's processes in the counted time."""
     assert generator.stderr is not None
     _until(generator, "counted")
     mapper = worker_of(front.pid)
@@ -172,7 +172,7 @@ def _of_edge(report: Row, size: int) -> Row:
 
 
 def cells_of(row: Row) -> list[str]:
-    """A line of the table."""
+    """Return a row of the table."""
     cpu, ms = row["cpu"], row["correction_ms"]
     return [
         str(row["agents"]),

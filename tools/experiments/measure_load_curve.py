@@ -1,11 +1,12 @@
-"""What a keyframe costs the edge as its map grows, and an hour in one room, quicker than real time.
+"""Cost of a keyframe on the edge as its map grows, and an hour in one room, faster than real time.
 
     python tools/experiments/measure_load_curve.py grow [--keyframes 20000] [--every 12] [--out out/load]
-    python tools/experiments/measure_load_curve.py hour [--every 1] [--most 2000] [--limit_s 480] [--out out/load]
+    python tools/experiments/measure_load_curve.py hour [--every 1] [--most 2000] [--limit_s 480] \\
+        [--out out/load]
 
-One process, without sockets; CPU ms. `grow`: nothing is taken out, 24 agents. `hour`: three agents at 3
-keyframes/s, at most `--most` of them kept, and a map file; it ends after an hour of theirs, or `--limit_s` of
-ours. One of `--every` keyframes is looked up. Writes grow.json or hour.json.
+One process, without sockets; CPU ms. `grow`: 24 agents, no culling. `hour`: three agents at 3 keyframes/s, at
+most `--most` of them kept, and a map file; it ends after a simulated hour, or after `--limit_s` of real time.
+One of `--every` keyframes is looked up. Writes grow.json or hour.json.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from share.mapping.map_changes import SaveKeyframe, SaveRun  # noqa: E402
 from share.store.map_store import MapStore  # noqa: E402
 from share.types import Keyframe  # noqa: E402
 
-ROOM_FOR = 10**7  # keyframes: no bound
+ROOM_FOR = 10**7  # keyframes; no limit
 MARKS = (100, 200, 500, 1000, 2000, 3000, 5000, 7000, 10_000, 14_000, 20_000)
 _HOUR_S, _SAMPLE = 3600, 300  # keyframes between two samples
 
@@ -58,7 +59,7 @@ def main() -> int:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Rows as they are made; the file holds what is there so far."""
+    """Print rows as they are made; the file has all rows so far."""
     writable_dir(options.out)
     rows = []
     made = (
@@ -72,8 +73,8 @@ def measure(options: argparse.Namespace) -> None:
         atomic_write(options.out / f"{options.what}.json", json.dumps(rows, indent=2) + "\n")
 
 
-def everybody(agents: int) -> Iterator[tuple[str, Keyframe | None, Walker]]:
-    """All agents first, then their keyframes in turn, without end."""
+def all_agents(agents: int) -> Iterator[tuple[str, Keyframe | None, Walker]]:
+    """Yield all agents first, then their keyframes in turn, without end."""
     made = room()
     walkers = [Walker(made, index) for index in range(agents)]
     yield from ((walker.hello.name, None, walker) for walker in walkers)
@@ -84,12 +85,12 @@ def everybody(agents: int) -> Iterator[tuple[str, Keyframe | None, Walker]]:
 
 
 def grow(most: int, every: int) -> Iterator[Row]:
-    """A row at each mark: medians since halfway from the mark before."""
+    """Yield a row at each mark: medians since halfway from the mark before."""
     config = Config()
     timed = TimedMap(replace(config, edge=replace(config.edge, max_keyframes=ROOM_FOR, max_waiting=1)))
     marks = [mark for mark in MARKS if mark <= most]
     count = before = 0
-    for name, keyframe, walker in everybody(24):
+    for name, keyframe, walker in all_agents(24):
         if keyframe is None:
             timed.join(name, walker.hello)
             continue
@@ -121,14 +122,14 @@ def _maps(report: Row) -> int:
 
 
 def hour(limit_s: float, every: int, most: int) -> Iterator[Row]:
-    """A row every so many keyframes; one of `every` is looked up, `most` are kept."""
+    """Yield a row every _SAMPLE keyframes; one of `every` is looked up, `most` are kept."""
     config = Config()
     timed = TimedMap(replace(config, edge=replace(config.edge, max_keyframes=most, max_waiting=1)))
     began, count = time.monotonic(), 0
     with tempfile.TemporaryDirectory(prefix="load-") as folder:
         store = MapStore.open(Path(folder) / "map.sqlite")
         store.load()
-        for name, keyframe, walker in everybody(3):
+        for name, keyframe, walker in all_agents(3):
             if keyframe is None:
                 timed.join(name, walker.hello)
                 store.write([SaveRun(name, walker.hello)])
@@ -151,7 +152,7 @@ def hour(limit_s: float, every: int, most: int) -> Iterator[Row]:
 
 def _state(timed: TimedMap, count: int, folder: Path) -> Row:
     report = timed.mapper.report()
-    spent = {f"{kind}_ms": round(sum(ms) / _SAMPLE, 3) for kind, ms in timed.ms.items()}  # a keyframe
+    spent = {f"{kind}_ms": round(sum(ms) / _SAMPLE, 3) for kind, ms in timed.ms.items()}  # per keyframe
     thin = timed.ms.get("thin", [0.0])
     timed.ms.clear()
     timed.findings.clear()

@@ -1,13 +1,13 @@
-"""Whether the paper's experiments can always be planned, and who sees whom in them. Prints JSON, one run a
-line, a summary last.
+"""Whether the paper's experiments can always be planned, and which agents see each other. Prints JSON, one
+run a line, a summary last.
 
     python tools/experiments/measure_paper.py [--scene S] [--numbers 1-5] [--seeds 0-19] [--kept FILE]
     python tools/experiments/measure_paper.py --sights [--scene S] [--numbers 1-5] [--seeds 0-2] [--kept FILE]
 
-In rooms of 9 x 6 x 4 m; nothing is drawn. How far lengths are off (%), least distances (m) at any time: from
-things at body height, of the head or camera from anything, between agents; CPU time of planning. With
---sights: what share of user1's pictures has user2, or the robot, in it. With --kept, runs are added to FILE
-and those in it are not measured again, so it may be broken off.
+In rooms of 9 x 6 x 4 m; nothing is drawn. Length errors (%), least distances (m) at any time: from things at
+body height, of head or camera from anything, between agents; CPU time of planning. With --sights: share of
+user1's pictures that show user2, or the robot. With --kept, runs are added to FILE and those in it are not
+repeated, so it may be interrupted.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from share.types import F64, I64  # noqa: E402
 
 Row = dict[str, Any]
 SIZE = (9.0, 6.0, 4.0)
-BODY_M = (0.10, 1.95)  # above the floor: where furniture is in the way of a body
-LOOKS_S, GRID_PX, SEEN_PX = 0.5, 4, 100  # how often user1 looks, rays that far apart, least area of one seen
+BODY_M = (0.10, 1.95)  # heights above the floor where things are obstacles
+LOOKS_S, GRID_PX, SEEN_PX = 0.5, 4, 100  # s between pictures, px between rays, least visible area in px
 
 
 def main() -> None:
@@ -71,7 +71,7 @@ def _span(text: str) -> range:
 def measured(
     measure: Callable[[str, int, int], Row], jobs: list[tuple[str, int, int]], kept: Path | None
 ) -> Iterator[Row]:
-    """A row a job (scene, number, seed), from the file where it is there."""
+    """Yield a row a job (scene, number, seed), from the file if it is there."""
     lines = kept.read_text().splitlines() if kept and kept.exists() else []
     known = {tuple(row["job"]): row for row in map(json.loads, lines)}
     for job in jobs:
@@ -85,7 +85,7 @@ def measured(
 
 
 def of_plan(scene: str, number: int, seed: int) -> Row:
-    """One experiment planned in one room."""
+    """Plan one experiment in one room."""
     room = make_scene_layout(scene, seed, SIZE)
     began = time.process_time()
     try:
@@ -99,7 +99,8 @@ def of_plan(scene: str, number: int, seed: int) -> Row:
 
 
 def distances(room: Layout, agents: Sequence[PlannedAgent]) -> Row:
-    """Least ones, m: of each from things at body height, of each head from anything, between agents."""
+    """Return least distances, m: of each agent from things at body height, of each head from anything,
+    between agents."""
     xyz1, xyz2, xyz3 = xyz = [fixed_path(a.path, 0.0).xyz for a in agents]
     free = Occupancy.from_layout(room)
     floor = fine_floor(free)
@@ -112,13 +113,13 @@ def distances(room: Layout, agents: Sequence[PlannedAgent]) -> Row:
 
 
 def fine_floor(free: Occupancy) -> Floor:
-    """Distance from what is in the way of a body, as finely as the room is known."""
+    """Return distances from obstacles at the occupancy's resolution."""
     clearance, origin, step = free.floor_clearance(*BODY_M)
     return Floor(clearance.astype(np.float64), step, float(origin[0]))
 
 
 def summary_of_plans(rows: list[Row]) -> Row:
-    """The worst of each, by agent where there is one for each."""
+    """Return the worst of each figure, by agent where it has one."""
     done = [row for row in rows if "failed" not in row]
     cpu_s = [row["cpu_s"] for row in done]
 
@@ -139,19 +140,19 @@ def summary_of_plans(rows: list[Row]) -> Row:
 
 
 def of_sight(scene: str, number: int, seed: int) -> Row:
-    """What share of user1's pictures has user2, or the robot, in it; how large they are where they are."""
+    """Return the share of user1's pictures with user2, or the robot, in it, and their size there."""
     planned = plan_motions([f"paper:{number}"], make_scene_layout(scene, seed, SIZE), SECONDS, seed)
     me, *others = planned.agents
     stamps = np.arange(me.path.start_ns, me.path.end_ns + 1, round(LOOKS_S * 1e9))
-    poses = me.path.poses(stamps)  # a simulated body has its camera's axes, and is within centimetres of it
-    ways = grid(load_profile("d435i").rig().cam0)
+    poses = me.path.poses(stamps)  # a simulated body has camera axes, and is within centimetres of the camera
+    rays = grid(load_profile("d435i").rig().cam0)
     room = scene_of([piece.shape.mesh.triangles for piece in planned.layout.all_pieces])
-    walls = [depths(room, T, ways) for T in poses]
+    walls = [depths(room, T, rays) for T in poses]
     row: Row = {"looks": len(stamps)}
     anyone = np.zeros(len(stamps), bool)
     for other in others:
         seen = zip(poses, bodies(other, stamps), walls, strict=True)
-        areas = np.array([area(T, body, ways, wall) for T, body, wall in seen])
+        areas = np.array([area(T, body, rays, wall) for T, body, wall in seen])
         there = areas >= SEEN_PX
         anyone |= there
         row[f"{other.name}_percent"] = _percent(there)
@@ -160,13 +161,13 @@ def of_sight(scene: str, number: int, seed: int) -> Row:
 
 
 def grid(camera: Camera) -> F64:
-    """Rays (N, 3) through every GRID_PX-th pixel both ways."""
+    """Return rays (N, 3) through every GRID_PX-th pixel both rays."""
     x, y = np.meshgrid(*(np.arange(GRID_PX // 2, n, GRID_PX) for n in (camera.width, camera.height)))
     return rays(camera.normalise(np.column_stack([x.ravel(), y.ravel()]).astype(float)))
 
 
 def bodies(agent: PlannedAgent, stamps: I64) -> Iterator[RayCaster]:
-    """What there is of an agent at each time."""
+    """Yield the agent's body at each time."""
     parts = [
         shape.mesh.triangles.astype(float) for shape in avatar_shapes(agent.body_kind, agent.path, (0, 9))
     ]
@@ -174,19 +175,19 @@ def bodies(agent: PlannedAgent, stamps: I64) -> Iterator[RayCaster]:
         yield scene_of([se3.transform(T_part, part) for T_part, part in zip(T, parts, strict=True)])
 
 
-def area(T_world_cam: F64, body: RayCaster, ways: F64, wall: F64) -> int:
-    """Pixels of the body that nothing in the room hides."""
-    return int((depths(body, T_world_cam, ways) < wall).sum()) * GRID_PX**2
+def area(T_world_cam: F64, body: RayCaster, rays: F64, wall: F64) -> int:
+    """Return the visible area of the body, px."""
+    return int((depths(body, T_world_cam, rays) < wall).sum()) * GRID_PX**2
 
 
-def depths(scene: RayCaster, T_world_cam: F64, ways: F64) -> F64:
-    """Depth (N,) m of what rays through ways (N, 3) of a camera meet first, infinite where nothing is."""
-    points, hit = first_hits(scene, T_world_cam, ways)
+def depths(scene: RayCaster, T_world_cam: F64, rays: F64) -> F64:
+    """Return depths (N,) m at which a camera's rays (N, 3) meet something, infinite where nothing."""
+    points, hit = first_hits(scene, T_world_cam, rays)
     return np.where(hit, se3.transform(se3.inverse(T_world_cam), points)[:, 2], np.inf)
 
 
 def summary_of_sights(rows: list[Row]) -> Row:
-    """Mean, least and most over the runs."""
+    """Return mean, minimum and maximum over the runs."""
     keys = [key for key in rows[0] if key.endswith("_percent")]
     columns = {key: [row[key] for row in rows] for key in keys}
     return {key: {"mean": _round(np.mean(v)), "least": min(v), "most": max(v)} for key, v in columns.items()}

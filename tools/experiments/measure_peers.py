@@ -1,10 +1,10 @@
-"""Basalt and our inertial tracker on the same emulated sequences. Prints a Markdown table.
+"""Basalt and SHARE's inertial tracker on the same emulated sequences. Prints a Markdown table.
 
     python -m venv DIR && DIR/bin/pip install depthai==3.12.0
     python tools/experiments/measure_peers.py --peer basalt=DIR/bin/python [--only NAME] [--seeds 101,102,103]
 
-`share evaluate compare` on the sequences of measure_vio, which are made where they are not there. Runs are
-kept in --out; docs/peers.md has a table and says what is not fair in it.
+`share evaluate compare` on the sequences of measure_vio, which are made if missing. Runs are kept in --out;
+docs/peers.md has a table and the limits of the comparison.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def main() -> int:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """All runs, seed by seed; then the table."""
+    """Do all runs, seed by seed; then print the table."""
     (ours, *others), lacking = tracker_entries(
         Config(), peer_interpreters(options.peer), options.needs_vocabulary
     )

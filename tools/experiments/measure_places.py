@@ -3,9 +3,9 @@
     python tools/experiments/measure_places.py --data FOLDER [--emulated] [--far 2000] [--picture FILE.png]
 
 FOLDER holds the stereo keyframes and the RGB-D kitchen of docs/edge-map.md. True pairs are nearer than 1 m
-and 30 degrees; an accepted pose is wrong by more than 0.25 m or 5 degrees. Of the pairs that are not true,
---far are tried and stand for all. --emulated: warehouse, firestation and corridor-twins as well (made once,
-which takes minutes).
+and 30 degrees; an accepted pose is wrong by more than 0.25 m or 5 degrees. Of the false pairs, --far are
+tried and stand for all. --emulated: warehouse, firestation and corridor-twins as well (made once, which takes
+minutes).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def measure(options: argparse.Namespace) -> None:
 
 
 def over_both(pairs: Tried, config: PlaceConfig) -> tuple[list[Point], list[Point]]:
-    """Over the inliers with the sigma that is allowed; over sigma with the inliers."""
+    """Return curves over inliers at the allowed sigma, and over sigma at the allowed inliers."""
     inliers = [point(pairs, n, config.max_sigma_deg) for n in INLIERS]
     return inliers, [point(pairs, config.min_inliers, sigma) for sigma in SIGMAS]
 
@@ -84,7 +84,7 @@ def report(views: Views, recall: Any, served: float, pairs: Tried, here: Point) 
 
 
 def without_wrong(pairs: Tried) -> float:
-    """The best recall that limits of inliers and sigma give, if nothing wrong may pass."""
+    """Return the best recall by limits on inliers and sigma that accept nothing wrong."""
     points = [point(pairs, n, sigma) for n in INLIERS for sigma in SIGMAS]
     return float(np.max([p.recall for p in points if p.wrong == 0], initial=0.0))
 

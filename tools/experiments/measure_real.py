@@ -1,16 +1,20 @@
-"""The trackers on what is real: pictures, depth, IMU, motion capture. Prints Markdown tables.
+"""Accuracy of the trackers on real data: pictures, depth, IMU, motion capture. Prints Markdown tables.
 
-    python tools/experiments/measure_real.py [--part pairs|kitchen|rooms] [--apart S] [--start S] [--seconds S]
+    python tools/experiments/measure_real.py [--part pairs|kitchen|rooms] [--apart S] [--start S] \\
+        [--seconds S]
 
-Causal poses, as `share track` makes them. Needs the recordings in --data.
-`pairs`: 50 stereo pictures of EuRoC V1_01, 0.05 to 7 s apart, with the whole IMU. All go through the tracker
-in order; of every two neighbours the relative motion is compared with the truth's. Allowed are 2 % of the way
-and 1 cm. The truth is the Vicon body's, which is not quite the IMU's: `error` is against the truth moved onto
+Causal poses, as of `share track`. Needs the recordings in --data.
+
+`pairs`: 50 stereo pictures of EuRoC V1_01, 0.05 to 7 s apart, with the whole IMU. All are tracked in order;
+the relative motion of each pair of neighbours is compared with the true one. Allowed are 2 % of the path and
+1 cm. The ground truth is that of the Vicon body, not quite of the IMU: `error` is against the truth moved to
 the IMU, as fitted over the whole recording (docs/mocap-fit.md), `as given` against the truth as it is.
+
 `kitchen`: 500 RGB-D pictures, no IMU.
-`rooms`: TUM-VI's hand-held motion and real IMU; pictures are emulated over the path of the IMU, as fitted to
-the motion capture. `fitted`: against that path. `raw`: against the motion capture as recorded, its clock
-included, where it saw the body. `arm`: the same, the place of its body on the IMU solved for as well.
+
+`rooms`: TUM-VI's hand-held motion and real IMU; pictures are emulated along the IMU's path, as fitted to the
+motion capture. `fitted`: against that path. `raw`: against the motion capture as recorded, with its clock,
+where it saw the body. `arm`: the same, with the place of its body on the IMU solved for as well.
 """
 
 from __future__ import annotations
@@ -51,18 +55,18 @@ from share.types import F64, TrackState  # noqa: E402
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 ALLOWED_M, ALLOWED_PART = 0.01, 0.02
 SPANS_S = (0.5, 1.0, 2.0, np.inf)
-KITCHEN = {"0:500": 3.5, "0:250": 3.7, "250:500": 2.9}  # cm, before there was an inertial tracker
+KITCHEN = {"0:500": 3.5, "0:250": 3.7, "250:500": 2.9}  # cm, without the inertial tracker
 ROOMS, SCENE, SEED = ("room1", "room2", "room3"), "warehouse", 201
-_ROUNDS = 200  # of alternating, until arm and alignment agree
+_ROUNDS = 200  # of alternating between arm and alignment
 
 
 class Seen(NamedTuple):
-    """What was told of a picture, and its true pose by two truths."""
+    """The tracker's result for a picture, and its true pose by two ground truths."""
 
     number: int
     stamp_ns: int
     state: TrackState
-    stretch: int
+    segment: int
     T: F64 | None
     truth: F64
     given: F64
@@ -70,7 +74,7 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class Pair:
-    """Of neighbours: what is wrong with the relative motion, m, NaN where it was not told."""
+    """Two neighbours: error of the relative motion, m, NaN without a pose."""
 
     first: Seen
     second: Seen
@@ -93,7 +97,7 @@ def main() -> int:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """The parts asked for."""
+    """Measure the parts asked for."""
     parts = {"pairs": real_pairs, "kitchen": kitchen, "rooms": rooms}
     for name in options.part or parts:
         print(f"\n## {name}\n")
@@ -118,7 +122,7 @@ def arguments() -> argparse.Namespace:
 
 
 def real_pairs(options: argparse.Namespace) -> Iterator[str]:
-    """The pairs up to --apart, how many are right by time apart, and the states of all pictures."""
+    """Yield the pairs up to --apart, how many are right by time apart, and the states of all pictures."""
     seen = followed(there(options.data / "real" / "euroc_v1_01_keyframes"))
     pairs = [pair_of(a, b) for a, b in pairwise(seen)]
     yield "| pictures | s apart | states | moved, cm | error, cm | as given | allowed |"
@@ -146,33 +150,34 @@ def summed(longest: float, pairs: list[Pair]) -> str:
 
 
 def followed(folder: Path) -> list[Seen]:
-    """Every picture of the recording in turn. Raises DataError where its truth does not cover one."""
+    """Track every picture of the recording in turn. Raises DataError where its ground truth does not cover
+    one."""
     source, settings = open_source(str(folder)), Config()
     given = source.truth()
     if given is None:
-        raise DataError(f"{folder}: has no truth")
+        raise DataError(f"{folder}: has no ground truth")
     T_mocap_imu = se3.inverse(open_recorded_motion(folder, EUROC_OPTIONS).path.fit.T_body_mocap)
-    tracker, stretch, out = make_source_tracker(source, settings), 0, []
+    tracker, segment, out = make_source_tracker(source, settings), 0, []
     for frame in read_frames(source, settings, SequencerCounters()):
         result = tracker.track(frame)
         if result.keyframe_ready:
             tracker.make_keyframe(frame)
-        stretch += result.new_segment
+        segment += result.new_segment
         known, T = interpolate(*given, np.array([frame.stamp_ns]))
         if not known[0]:
-            raise DataError(f"{folder}: no truth at {frame.stamp_ns}")
+            raise DataError(f"{folder}: no ground truth at {frame.stamp_ns}")
         pose = result.T_odom_body
-        out.append(Seen(frame.index, frame.stamp_ns, result.state, stretch, pose, T[0] @ T_mocap_imu, T[0]))
+        out.append(Seen(frame.index, frame.stamp_ns, result.state, segment, pose, T[0] @ T_mocap_imu, T[0]))
     return out
 
 
 def pair_of(a: Seen, b: Seen) -> Pair:
     moved = float(np.linalg.norm((se3.inverse(a.truth) @ b.truth)[:3, 3]))
-    if a.T is None or b.T is None or a.stretch != b.stretch:
+    if a.T is None or b.T is None or a.segment != b.segment:
         return Pair(a, b, moved, np.nan, np.nan)
-    told = se3.inverse(a.T) @ b.T
+    estimate = se3.inverse(a.T) @ b.T
     error, given = (
-        float(np.linalg.norm((se3.inverse(se3.inverse(first) @ second) @ told)[:3, 3]))
+        float(np.linalg.norm((se3.inverse(se3.inverse(first) @ second) @ estimate)[:3, 3]))
         for first, second in ((a.truth, b.truth), (a.given, b.given))
     )
     return Pair(a, b, moved, error, given)
@@ -182,7 +187,7 @@ def pair_of(a: Seen, b: Seen) -> Pair:
 
 
 def kitchen(options: argparse.Namespace) -> Iterator[str]:
-    """ATE of the whole and of its halves, which is what docs/tracking.md tells."""
+    """Yield ATE of the whole and of its halves, as in docs/tracking.md."""
     folder = there(options.data / "real" / "redkitchen_0000_0499")
     yield "| frames | ATE, cm | without inertial tracker | tracked | lost, s |\n|---|---|---|---|---|"
     for frames, before in KITCHEN.items():
@@ -199,7 +204,7 @@ def kitchen(options: argparse.Namespace) -> Iterator[str]:
 
 
 def rooms(options: argparse.Namespace) -> Iterator[str]:
-    """ATE over each room, by three truths."""
+    """Yield ATE over each room, by three ground truths."""
     yield "| room | fitted, cm | raw | arm | worst | tracked | stretches | lost, s | blind mocap, s |"
     yield "|---|---|---|---|---|---|---|---|---|"
     for room in ROOMS:
@@ -217,7 +222,7 @@ def room_session(folder: Path, options: argparse.Namespace) -> Source:
 
 def room_row(run: TrackingOutput, source: Source, raw: Trajectory) -> str:
     report, truth = run.report, source.truth()
-    assert truth is not None  # an emulated session has one
+    assert truth is not None  # emulated sessions have one
     if report["stretches"] == 1:
         found, given = ate(run.trajectory, truth), ate(run.trajectory, raw)
         bare = ate(on_mocap(run.trajectory, raw), raw)
@@ -231,8 +236,8 @@ def room_row(run: TrackingOutput, source: Source, raw: Trajectory) -> str:
 
 
 def on_mocap(estimate: Trajectory, raw: Trajectory) -> Trajectory:
-    """The estimate of the point on the body that suits the raw positions best: arm in the body and alignment
-    by turns, each in closed form."""
+    """Return the estimate at the point of the body that fits the raw positions best: arm in the body and
+    alignment by turns, each in closed form."""
     _, T, truth = associate(estimate, raw)
     R, p, arm = T[:, :3, :3], T[:, :3, 3], np.zeros(3)
     for _ in range(_ROUNDS):
@@ -250,7 +255,7 @@ def mocap(folder: Path) -> Trajectory:
 
 def there(folder: Path) -> Path:
     if not folder.is_dir():
-        raise UsageError(f"{folder}: no such recording; say with --data where it is")
+        raise UsageError(f"{folder}: no such recording; give its folder by --data")
     return folder
 
 

@@ -1,10 +1,10 @@
-"""How well `share sync` and chrony agree, on one machine, where every clock is the same and the truth is 0.
+"""Compare `share sync` with chrony on one machine, where all clocks are equal and the true offset is 0.
 
     python tools/experiments/measure_sync.py [ROUNDS]
 
-Three ways: our server over loopback; a chronyd as the server; our server through a relay that delays each
-datagram as a radio might, by 0.5 ms and on average 2 ms more on the way there, 1 ms more on the way back. A
-round is 8 questions of `share sync check`, and a `chronyd -Q`, which measures and sets nothing. Needs chrony.
+Three set-ups: our server over loopback; a chronyd as the server; our server through a relay that delays each
+datagram like a radio link, by 0.5 ms and on average 2 ms more towards the server, 1 ms more on the way back.
+A round is 8 queries of `share sync check`, and a `chronyd -Q`, which measures without setting. Needs chrony.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from share.devices.time_client import query_servers  # noqa: E402
 from share.devices.time_server import TimeServer, TimeServerRun  # noqa: E402
 from share.net.udp import HostPort, StampedSocket, clock_precision  # noqa: E402
 
-LEAST_S, THERE_S, BACK_S = 0.0005, 0.002, 0.001  # of the relay: at least, and more on average
+LEAST_S, THERE_S, BACK_S = 0.0005, 0.002, 0.001  # of the relay: minimum, and mean of the rest
 US = 1e3
 HERE = "127.0.0.1"
 
 
 @dataclass
 class Round:
-    """Microseconds."""
+    """Offsets, microseconds."""
 
     ours: float
     bound: float

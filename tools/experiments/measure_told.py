@@ -1,13 +1,13 @@
-"""Whether agents know how far they are off: the errors that they tell the edge, against the truth.
+"""Errors that agents estimate of themselves, against the true ones.
 
     python tools/experiments/measure_told.py RUN… [--by policy|SECTION.NAME] [--picture FILE]
 
 A RUN is a folder by `share evaluate run`, or one by `sweep` or `ablation` with its runs. Prints a Markdown
 table, a row for each kind of agent (and each value of the setting): of N evaluations while an agent is in the
-largest map, the rms of the error told and of its true error then (position, one alignment for all in that
-map); the median of true / told, some 0.9 where agents are right about themselves; in how many the error is
-no more than twice what was told; rank correlation over all evaluations, and over agents' runs by their rms.
-Evaluations come by the edge's clock; the truth begins with the first agent that joined the edge.
+largest map, the rms of the estimated and of the true error then (position, one alignment for all in that
+map); the median of true / estimated, about 0.9 for calibrated estimates; the share with an error below twice
+the estimate; rank correlation over all evaluations, and over agents' runs by their rms. Evaluations have the
+edge's clock; the ground truth begins with the first agent that joined the edge.
 """
 
 from __future__ import annotations
@@ -36,12 +36,22 @@ from share.lab.evaluate.trial import RUN_FILE, SETTINGS_FILE, Trial, read_trial 
 from share.metrics.ate import error_statistics, position_errors  # noqa: E402
 from share.types import F64  # noqa: E402
 
-HEAD = ("agents", "runs", "N", "told, cm", "true, cm", "true / told", "within twice, %", "rank", "of runs")
+HEAD = (
+    "agents",
+    "runs",
+    "N",
+    "estimated, cm",
+    "true, cm",
+    "true / estimated",
+    "within twice, %",
+    "rank",
+    "of runs",
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Of one agent in one run, at N evaluations. told_cm, true_cm: (N,)."""
+    """Of one agent in one run, at N evaluations. told_cm, true_cm: estimated and true errors (N,)."""
 
     kind: str
     told_cm: F64
@@ -51,8 +61,8 @@ class Pairs:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--by", metavar="WHAT", help="rows of their own for each value")
-    parser.add_argument("--picture", type=Path, help="true errors over those told")
+    parser.add_argument("--by", metavar="WHAT", help="separate rows for each value")
+    parser.add_argument("--picture", type=Path, help="plot of true over estimated errors")
     options = parser.parse_args()
     return exit_code("measure_told", lambda: measure(options))
 
@@ -65,7 +75,7 @@ def measure(options: argparse.Namespace) -> None:
         for pairs in told_and_true(trial):
             rows[f"{pairs.kind} {value}".strip()].append(pairs)
     if not rows:
-        raise UsageError("nobody told an error while in a map; is there a run with an error model?")
+        raise UsageError("no run has error estimates in a map; run `share evaluate` with an error model")
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))))
     for name, of in sorted(rows.items()):
         print(line([name, *_figures(of)]))
@@ -74,7 +84,7 @@ def measure(options: argparse.Namespace) -> None:
 
 
 def told_and_true(trial: Trial) -> Iterator[Pairs]:
-    """Of each agent in the largest map. Raises DataError on damaged files."""
+    """Yield the pairs of each agent in the largest map. Raises DataError on damaged files."""
     found = score_session(trial.session, trial.folders)
     if found.joint is None:
         return
@@ -87,7 +97,7 @@ def told_and_true(trial: Trial) -> Iterator[Pairs]:
         stamps_ns, T_est, T_truth = associate(estimate, truth)
         error_cm = 100 * position_errors(found.joint.joint.T_truth_est, T_est, T_truth)
         frames_s, at_s = (stamps_ns - first_ns) * 1e-9, trace.seconds - began
-        then = (frames_s[0] <= at_s) & (at_s <= frames_s[-1]) & (trace.error_cm > 0)  # NaN: not told
+        then = (frames_s[0] <= at_s) & (at_s <= frames_s[-1]) & (trace.error_cm > 0)  # NaN: no estimate
         true_cm = np.interp(at_s[then], frames_s, error_cm)
         yield Pairs(str(trial.session.agents[name].kind), trace.error_cm[then], true_cm)
 
@@ -135,7 +145,7 @@ def _figures(of: list[Pairs]) -> list[str]:
 
 
 def _rank(a: F64, b: F64) -> float:
-    """Spearman's correlation."""
+    """Return Spearman's correlation."""
     from scipy.stats import spearmanr
 
     return float(spearmanr(a, b).statistic)
@@ -154,7 +164,7 @@ def _draw(path: Path, rows: dict[str, list[Pairs]]) -> None:
         for pairs in of:
             axis.loglog(pairs.told_cm, pairs.true_cm, ".", markersize=2.5, alpha=0.5)
         axis.plot([0.05, 20], [0.05, 20], color="black", linewidth=0.8)
-        axis.set(title=name, xlabel="error told, cm")
+        axis.set(title=name, xlabel="estimated error, cm")
     axes[0, 0].set_ylabel("true error in the map, cm")
     figure.tight_layout()
     figure.savefig(path, dpi=110)

@@ -1,20 +1,23 @@
-"""How far the inertial tracker's tracks are from the truth, px. Prints JSON, a session a line, then a table.
+"""Errors of the inertial tracker's feature tracks, px. Prints JSON, a session a line, then a table.
 
     python tools/experiments/measure_tracks.py [--seconds S] [SESSION/NAME ...]
 
-Of emulated sessions of one agent; without any, it makes its own and keeps them: two rooms, two seeds, with
-what a device does to pictures and without.
+On emulated sessions of one agent; without any, it makes its own and keeps them: two rooms, two seeds, with
+and without the sensor's effects on pictures.
 
-A feature is the point of the room that its first pixel shows: its depth there is the renderer's, exact. The
-error is the distance in cam0 between where the tracker found it and where that point is by the true
-pose. `age`: frames since that first one. Stamps, and so true poses, are of the middle of an exposure, about
-which blur is even but for the camera's acceleration.
-`edge`: depth spans over 10 % of itself in the first 11 x 11 px. There the first pixel may show what is behind
-the thing that is followed, and the error is then not the track's.
-`own_depth`: what is left of the error where each feature has the one depth that suits all of its track best.
-A filter that estimates depth suffers from no more than this; a wrong first pixel's depth is not in it, but
-neither is what creeps along the epipolar line and looks like depth.
-`align_ms`: CPU time of alignment a frame, both cameras; what a keyframe aligns is not counted.
+A feature is the point of the room at its first pixel, with the renderer's exact depth there. The error is the
+distance in cam0 between the tracked position and that point at the true pose. `age`: frames since the first
+one. Stamps, and so true poses, are of the middle of an exposure, about which blur is symmetric except for the
+camera's acceleration.
+
+`edge`: depth varies by over 10 % in the first 11 x 11 px. There the first pixel may show the background of
+what is tracked, and the error is not the track's.
+
+`own_depth`: the error that is left with the depth that fits all of the feature's track best. A filter that
+estimates depth suffers from this at most; it excludes a wrong depth of the first pixel, but also drift along
+the epipolar line that looks like depth.
+
+`align_ms`: CPU time of alignment per frame, both cameras; without the alignment of keyframes.
 """
 
 from __future__ import annotations
@@ -62,16 +65,16 @@ from share.vision import patches  # noqa: E402
 Row = dict[str, Any]
 ROOMS, SEEDS, PROFILE = ("warehouse", "firestation"), (11, 12), "d435i:640x480@30"
 AGES = (1, 5, 10, 20, 40, 80)
-EDGE = 0.1  # of the depth, that it spans within a patch
-FEWEST = 20  # errors that have percentiles
+EDGE = 0.1  # of the depth: range within a patch
+FEWEST = 20  # errors needed for percentiles
 SAME = 0.03  # of a depth: two pixels that differ by less show one surface
-ROUNDS, UNSURE = 6, 1.0  # of the fit of a depth; what keeps one that no motion shows, px^2 m^2
+ROUNDS, UNSURE = 6, 1.0  # of the depth fit; prior weight where there is no parallax, px^2 m^2
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("sessions", nargs="*", metavar="SESSION/NAME")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of the sessions that it makes")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of the sessions that it makes")
     options = parser.parse_args()
     found, spent = [], watch_alignment()
     try:
@@ -84,7 +87,7 @@ def main() -> None:
 
 
 def own_sessions(seconds: float) -> Iterator[str]:
-    """Pictures of the perfect device are kept as they are, others as JPEG."""
+    """Yield the sessions. Pictures of the perfect device are lossless, others JPEG."""
     for effects, images in ((NO_EFFECTS, "png"), (Effects(), "jpeg")):
         for scene in ROOMS:
             for seed in SEEDS:
@@ -96,8 +99,8 @@ def own_sessions(seconds: float) -> Iterator[str]:
 
 
 def of_session(name: str, spent: list[float]) -> Row:
-    """One agent of a session. spent: see `watch_alignment`. Raises UsageError for what was not emulated, or
-    with others in the room."""
+    """Measure one agent of a session. spent: see `watch_alignment`. Raises UsageError for a session that was
+    not emulated, or has other agents."""
     source, room = open_source(name), TrueRoom(Path(name))
     tracker, tracks = (
         InertialTracker(source.rig, Config().inertial, Config().tracker),
@@ -127,15 +130,15 @@ def of_session(name: str, spent: list[float]) -> Row:
 
 
 class TrueRoom:
-    """What a session's room and true path say of the pictures of its one agent."""
+    """A session's room and its one agent's true path: exact depth of its pictures."""
 
     def __init__(self, name: Path) -> None:
         source, session = open_source(str(name)), read_session(name.parent)
         truth = source.truth()
         if session.provenance.get("generator") != "share emulate" or truth is None:
-            raise UsageError(f"{name}: was not made by `share emulate`, so nobody knows its room")
+            raise UsageError(f"{name}: not a session of `share emulate`")
         if len(session.agents) > 1:
-            raise UsageError(f"{name}: others are in the room; a feature on them has no fixed place")
+            raise UsageError(f"{name}: has other agents; features on them move")
         self.recipe = recipe_of(session.provenance)
         self._camera = source.rig.cam0
         T_world_cam = truth.T @ source.rig.T_body_cam0
@@ -146,11 +149,12 @@ class TrueRoom:
             self._renderer = open_renderer(prepared.stage.room)
 
     def T_world_cam(self, stamp_ns: int) -> F64:
-        """(4, 4). Raises KeyError where there is no truth."""
+        """Return (4, 4). Raises KeyError where there is no ground truth."""
         return self._T[stamp_ns]
 
     def surface(self, stamp_ns: int, px: F32) -> tuple[F64, F64]:
-        """Inverse depth (N,) 1/m of what px (N, 2) show, and the share (N,) of depth that patches span."""
+        """Return inverse depth (N,) 1/m at px (N, 2), and the relative range (N,) of depth in their
+        patches."""
         depth = self._renderer.depth(self._camera, SceneInstant(self.T_world_cam(stamp_ns)))
         square = np.ones((2 * patches.HALF_SIZE + 1,) * 2, np.uint8)
         span = (cv2.dilate(depth, square) - cv2.erode(depth, square)) / depth
@@ -160,7 +164,7 @@ class TrueRoom:
 
 
 def recipe_of(about: Row) -> SessionRecipe:
-    """What a session says that it was made by."""
+    """Return the recipe of a session."""
     given = {f.name: about[f.name] for f in fields(SessionRecipe)}
     size = about["size"] and tuple(about["size"])
     effects = Effects(**about["effects"])
@@ -168,8 +172,8 @@ def recipe_of(about: Row) -> SessionRecipe:
 
 
 def one_surface(values: F32, px: F32) -> F64:
-    """Bilinear (N,) at px (N, 2), less those of the four pixels that are of another surface than the
-    nearest one."""
+    """Return values (N,) at px (N, 2), bilinear, without those of the four pixels that are on another surface
+    than the nearest one."""
     low = np.floor(px).astype(int)
     corners = low[:, None] + [[0, 0], [1, 0], [0, 1], [1, 1]]
     weight = (1 - np.abs(corners - px[:, None])).prod(axis=2)
@@ -182,8 +186,8 @@ def one_surface(values: F32, px: F32) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Births(ArrayTable):
-    """Of N features: number of the frame that saw them first, ray (N, 2) and inverse depth (N,) there, share
-    of the depth (N,) that the patch spans."""
+    """Of N features: index of the first frame, ray (N, 2) and inverse depth (N,) there, relative range of
+    depth (N,) in the patch."""
 
     frame: I64
     ray: F64
@@ -193,7 +197,7 @@ class Births(ArrayTable):
 
 @dataclass(frozen=True, eq=False)
 class Errors(ArrayTable):
-    """Of M sights: frames since the birth; edge as above; px off, and with depths of their own."""
+    """Of M observations: frames since the first; edge as above; px errors, and with the best depths."""
 
     age: I64
     edge: F64
@@ -202,11 +206,11 @@ class Errors(ArrayTable):
 
 
 class Tracks:
-    """Where features began, and where they were found since."""
+    """First and later observations of features."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._number: dict[int, int] = {}  # of a feature among all births, by the state's name for it
+        self._number: dict[int, int] = {}  # index of a feature among all births, by the state's id
         self._T_world_cam: list[F64] = []  # of frames
         self._births = [Births(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0))]
         self._sights: list[tuple[I64, I64, F32]] = []  # features, their frame, px
@@ -216,17 +220,17 @@ class Tracks:
         return sum(len(births.rho) for births in self._births)
 
     def see(self, stamp_ns: int, tracker: InertialTracker, room: TrueRoom) -> None:
-        """The frame just tracked."""
+        """Add the frame just tracked."""
         self._T_world_cam.append(room.T_world_cam(stamp_ns))
         if tracker.state is None or tracker.appearance is None:
-            self._number = {}  # who begins anew counts anew
+            self._number = {}  # ids start again with a new segment
             return
         known = self._known(tracker.state)
         which = np.array([self._number[k] for k in tracker.state.feature_ids[known].tolist()], np.int64)
         self._sights.append((which, np.full(len(which), self._now), tracker.appearance.last_px[known]))
 
     def begin(self, stamp_ns: int, tracker: InertialTracker, room: TrueRoom) -> None:
-        """Features that the frame just tracked has added."""
+        """Add features that the frame just tracked has begun."""
         if tracker.state is None or tracker.appearance is None:
             return
         new, first = ~self._known(tracker.state), self.features
@@ -236,7 +240,7 @@ class Tracks:
             self._births.append(Births(np.full(new.sum(), self._now), tracker.state.ray[new], *surface))
 
     def errors(self) -> Errors:
-        """Of all sights."""
+        """Return the errors of all observations."""
         which, frame, px = (np.concatenate(column) for column in zip(*self._sights, strict=True))
         births = self._births[0].concatenate(*self._births[1:])
         host = births.frame[which]
@@ -255,14 +259,15 @@ class Tracks:
 
 
 class Ways:
-    """Where M sights should be, by inverse depth. T_cam_host (M, 4, 4), ray (M, 2) in the host."""
+    """Predicted positions of M observations by inverse depth. T_cam_host (M, 4, 4), ray (M, 2) in the
+    host."""
 
     def __init__(self, camera: Camera, T_cam_host: F64, ray: F64) -> None:
         self._camera, self._t = camera, T_cam_host[:, :3, 3]
         self._far = (T_cam_host[:, :3, :3] @ rays(ray)[:, :, None])[:, :, 0]
 
     def at(self, rho: F64) -> tuple[F64, F64]:
-        """px (M, 2) at inverse depths (M,), and the derivative (M, 2)."""
+        """Return px (M, 2) at inverse depths (M,), and the derivative (M, 2)."""
         q = self._far + rho[:, None] * self._t
         uv = q[:, :2] / q[:, 2:]
         by_rho = (self._t[:, :2] - uv * self._t[:, 2:]) / q[:, 2:]
@@ -270,8 +275,8 @@ class Ways:
         return self._camera.distort(uv), slope
 
     def best_depth(self, px: F32, which: I64, rho: F64) -> F64:
-        """Inverse depths (N,) of features that suit their sights (M,), numbers `which` of them, best: Gauss
-        and Newton from rho (N,)."""
+        """Return the inverse depths (N,) that fit the observations (M,) of features `which` best:
+        Gauss-Newton from rho (N,)."""
         for _ in range(ROUNDS):
             there, slope = self.at(rho[which])
             pull = np.bincount(which, (slope * (px - there)).sum(axis=1), len(rho))
@@ -281,7 +286,7 @@ class Ways:
 
 
 def by_age(errors: Errors) -> Row:
-    """Percentiles by group and age."""
+    """Return percentiles by group and age."""
     edge = errors.edge > EDGE
     groups = {"all": errors, "smooth": errors.take(~edge), "edge": errors.take(edge)}
     return {
@@ -301,7 +306,7 @@ def percentiles(errors: Errors) -> Row:
 
 
 def watch_alignment() -> list[float]:
-    """The CPU ms of every alignment from now on."""
+    """Return a list that gets the CPU ms of every alignment from now on."""
     spent: list[float] = []
     align = patches.align
 
@@ -317,7 +322,7 @@ def watch_alignment() -> list[float]:
 
 
 def table(rows: list[Row]) -> str:
-    """Markdown: median / p90 / p99 px, (n)."""
+    """Return a Markdown table: median / p90 / p99 px, (n)."""
     lines = ["| room, motion, seed, effects | features | " + " | ".join(f"age {age}" for age in AGES) + " |"]
     lines.append("|---" * (2 + len(AGES)) + "|")
     for row in rows:

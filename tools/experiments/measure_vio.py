@@ -1,11 +1,10 @@
-"""What the inertial tracker is worth over 60 s: emulated sequences x seeds. Prints a Markdown table.
+"""Accuracy of the inertial tracker over 60 s: emulated sequences x seeds. Prints a Markdown table.
 
     python tools/experiments/measure_vio.py [--only NAME] [--seeds 101,102,103] [--data FOLDER] [--again]
 
-Causal poses of every frame. Sessions are made once (minutes each) and kept in the cache; a run that was
-made by the same code is not done again. In --out: a JSON and the series of each run, table.md; in
---pictures: a PNG a sequence.
-CPU is process time of one thread, decoding apart; all other figures are the same every time.
+Causal poses of every frame. Sessions are made once (minutes each) and kept in the cache; a run by the same
+code is not repeated. In --out: a JSON and the series of each run, table.md; in --pictures: a PNG a sequence.
+CPU is process time of one thread without decoding; all other figures are deterministic.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def arguments() -> argparse.Namespace:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """All runs, seed by seed; then the table and the pictures."""
+    """Do all runs, seed by seed; then the table and the pictures."""
     code, chosen = code_version(), vio_options.chosen(options)
     rows = [run(sequence, seed, options, code) for seed in options.seeds for sequence in chosen]
     rows.sort(key=lambda row: [s.name for s in chosen].index(row["sequence"]))
@@ -57,23 +56,24 @@ def measure(options: argparse.Namespace) -> None:
 
 
 def run(sequence: Sequence, seed: int, options: argparse.Namespace, code: str) -> Row:
-    """From its JSON, if that is of this code and session; else done, and kept there."""
+    """Return a run's figures from its JSON if that is of this code and session, else do the run and keep
+    it."""
     recipe = sequence.recipe(seed, options.data)
     made_by = {"sequence": sequence.name, "seed": seed, "code": code, "session": recipe.digest}
     file = _file(options.out, sequence.name, seed)
     if not options.again and (known := kept(file, made_by)) is not None:
         return known
     source = open_source(str(make_cached_session(recipe, options.cache, options.workers) / "agent"))
-    told = follow(source, Config())
-    found = series(source, told)
-    row: Row = made_by | figures(source, told, found)
+    tracked = follow(source, Config())
+    found = series(source, tracked)
+    row: Row = made_by | figures(source, tracked, found)
     options.out.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
         file.with_suffix(".npz"),
-        t_s=(found.stamps_ns - told.log.frames().stamp_ns[0]) * 1e-9,
+        t_s=(found.stamps_ns - tracked.log.frames().stamp_ns[0]) * 1e-9,
         errors=found.deviations.errors,
         sigmas=found.deviations.sigmas,
-        stretch=found.stretch,
+        segment=found.segment,
     )
     keep(file, row)
     print(f"{sequence.name} {seed}: {_cm(row)}", file=sys.stderr, flush=True)
@@ -81,7 +81,7 @@ def run(sequence: Sequence, seed: int, options: argparse.Namespace, code: str) -
 
 
 def picture(sequence: Sequence, rows: list[Row], options: argparse.Namespace) -> None:
-    """Of the runs of one sequence."""
+    """Draw the runs of one sequence."""
     runs = []
     for row in rows:
         with np.load(_file(options.out, sequence.name, row["seed"]).with_suffix(".npz")) as curves:

@@ -1,4 +1,4 @@
-"""What is found and what is wrong, over what is asked for."""
+"""Recall and precision of place recognition over its limits."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ LOOSE = {"min_inliers": 8, "min_direction_inliers": 4, "max_sigma_deg": 3.0}
 
 
 class Tried(NamedTuple):
-    """Of every pair, (M,): truly the same place; accepted by loose limits; the pose right, or the twin's;
-    inliers; sigma [deg]; and for how many pairs this one stands."""
+    """Of every pair, (M,): true match; accepted by loose limits; pose right, or right for the twin; inliers;
+    sigma [deg]; number of pairs that it stands for."""
 
     true: F64
     right: F64
@@ -30,7 +30,7 @@ class Tried(NamedTuple):
 
 
 def tried(views: Views, config: PlaceConfig, far: int, seed: int = 0) -> Tried:
-    """All true pairs and twins, and `far` of the others, each tried with loose limits."""
+    """Verify all true pairs and twins, and `far` of the others, with loose limits."""
     n = len(views.sights)
     kinds = {(q, c): _kind(views, q)[c] for q in range(n) for c in range(q)}
     others = [pair for pair, near in kinds.items() if not near]
@@ -67,8 +67,8 @@ def _right(error: tuple[float, float]) -> bool:
 
 
 class Point(NamedTuple):
-    """With limits of so many inliers and such a sigma: recall of the true pairs, precision, and how many of
-    the accepted are wrong, of these by a twin's transform."""
+    """At limits `inliers` and `sigma`: recall of the true pairs, precision, and how many of the accepted are
+    wrong, of these by a twin's transform."""
 
     inliers: float
     sigma: float
@@ -92,8 +92,8 @@ def point(pairs: Tried, inliers: float, sigma: float) -> Point:
 
 
 def recall_at(views: Views, others: list[Views], config: PlaceConfig, most: int = 50) -> tuple[F64, float]:
-    """Share of the true pairs among the first k = 1 … `most` answers, the other rooms' views being in the
-    index too; and the share of the views with a partner that have one among their first eight."""
+    """Return the share of the true pairs among the first k = 1 … `most` results, with the other rooms' views
+    in the index too; and the share of the views with a true match that have one among their first eight."""
     index = PlaceIndex(config.index_seed, config.tables, config.hash_bits)
     everything = [*views.sights, *(s for o in others for s in o.sights)]
     for number, sight in enumerate(everything):

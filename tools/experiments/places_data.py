@@ -1,4 +1,4 @@
-"""Views with known poses, for measuring place recognition: real recordings and emulated rooms."""
+"""Views with known poses for measuring place recognition: real recordings and emulated rooms."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ TWINS = SessionRecipe("corridor-twins", ("walk:", "walk:"), 40.0, seed=6)
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """sights: N of them. T_world_body, T_world_cam0 (N, 4, 4): the truth. T_twin (4, 4), where there is one:
-    takes the room's places to those that look alike, and back."""
+    """sights: N views. T_world_body, T_world_cam0 (N, 4, 4): true poses. T_twin (4, 4), if any: takes the
+    room's places to those that look alike, and back."""
 
     name: str
     sights: list[CameraView]
@@ -38,20 +38,21 @@ class Views:
     T_twin: F64 | None = None
 
     def apart(self, q: int, T: F64 | None = None) -> tuple[F64, F64]:
-        """Distance [m] and angle [deg] (N,) of camera q, moved by T in the world, from every other."""
+        """Return distance [m] and angle [deg] (N,) of camera q, moved by T in the world, from every other."""
         own = self.T_world_cam0[q] if T is None else T @ self.T_world_cam0[q]
         rel = se3.inverse(own) @ self.T_world_cam0
         return np.linalg.norm(rel[:, :3, 3], axis=1), np.degrees(se3.rotation_angle(rel))
 
     def true(self, q: int) -> np.ndarray:
-        """Which views (N,) show the place of view q: nearer than 1 m and 30 degrees."""
+        """Return which views (N,) are true matches of view q: nearer than 1 m and 30 degrees."""
         metres, degrees = self.apart(q)
         near = (metres < 1) & (degrees < 30)
         near[q] = False
         return near
 
     def error(self, q: int, c: int, T_c_q: F64, twin: bool = False) -> tuple[float, float]:
-        """How wrong T_c_q (4, 4) between the bodies is, m and degrees; twin: as seen from the wrong twin."""
+        """Return the error of T_c_q (4, 4) between the bodies, m and degrees; twin: relative to the wrong
+        twin."""
         own = self.T_world_body[q]
         if twin and self.T_twin is not None:
             own = self.T_twin @ own
@@ -60,13 +61,13 @@ class Views:
 
 
 def real(folder: Path) -> list[Views]:
-    """Stereo keyframes of a room, and every fifth frame of an RGB-D camera in a kitchen."""
+    """Return stereo keyframes of a room, and every fifth frame of an RGB-D camera in a kitchen."""
     stereo, kitchen = load(folder / STEREO), load(folder / KITCHEN, step=5, upright=False)
     return [Views("stereo", *stereo), Views("kitchen", *kitchen)]
 
 
 def emulated(recipe: SessionRecipe, every: Spacing, step: int) -> Views:
-    """Every `step`-th keyframe of all agents of an emulated room. Raises as `keyframe_set`."""
+    """Return every `step`-th keyframe of all agents of an emulated room. Raises as `keyframe_set`."""
     made = keyframe_set(recipe, every)
     agents = [(a, slice(None, None, step)) for a in made.agents.values()]
     sights = [

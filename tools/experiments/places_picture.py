@@ -20,8 +20,8 @@ def draw(
     curves: dict[str, tuple[list[Point], list[Point]]],
     here: dict[str, Point],
 ) -> None:
-    """PNG. recalls: by name, of the first k answers. curves: over inliers and over sigma. here: with the
-    limits that SHARE has."""
+    """Write a PNG. recalls: by name, of the first k results. curves: over inliers and over sigma. here: at
+    SHARE's limits."""
     import matplotlib
 
     matplotlib.use("Agg")

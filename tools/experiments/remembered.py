@@ -1,4 +1,5 @@
-"""A mapper that verifies each two views once, however many runs look at them, and notes who was doubted."""
+"""A mapper that verifies each pair of views once over many runs, and records contradictions between
+agents."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ _seen: dict[tuple[bytes, bytes, PlaceConfig], Verification | Refusal] = {}
 
 
 class _Remembered(VerifyStep):
-    """Its result hangs on both views alone."""
+    """A verification step; its result depends on the two views alone."""
 
     def run(self) -> Verification | Refusal:
         key = _digest(self.query_view), _digest(self.candidate_view), self.config
@@ -26,13 +27,13 @@ class _Remembered(VerifyStep):
 
 
 class RememberingMapper(Mapper):
-    """runs: by agents' names, what they are called here."""
+    """runs: run ids by agents' names."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
         self.runs: dict[str, str] = {}
-        self._doubts: dict[frozenset[str], float] = {}  # the most ever
-        self._were_apart: set[frozenset[str]] = set()  # ever
+        self._doubts: dict[frozenset[str], float] = {}  # largest so far
+        self._were_apart: set[frozenset[str]] = set()  # separated at any time
 
     def add_run(self, agent: str, hello: Hello) -> None:
         self.runs[hello.name] = agent
@@ -51,11 +52,11 @@ class RememberingMapper(Mapper):
         return findings
 
     def doubt(self, of: Collection[str]) -> float:
-        """The most that was ever held against two of these."""
+        """Return the largest contradiction ever between two of these."""
         return max((doubt for pair, doubt in self._doubts.items() if pair <= set(of)), default=0.0)
 
     def wronged(self, honest: Collection[str]) -> bool:
-        """Whether two of these were ever kept apart."""
+        """Return whether two of these were ever separated."""
         return any(pair <= set(honest) for pair in self._were_apart)
 
     def _note_standing(self) -> None:

@@ -1,12 +1,13 @@
-"""Policies in virtual time: real machines of agents, edge and mapper; how long things take is drawn.
+"""Policies in virtual time: real state machines of agents, edge and mapper, with durations drawn from
+samples.
 
     python tools/experiments/simulate.py [--policies covins-g share] [--link wifi5] [--seeds 0:3] \\
         [--set control.attribution=true]
 
-Two headsets and a robot, a minute in an emulated warehouse (keyframes as in tools/experiments/measure_load.py, odometry
-that drifts, frames at 30 Hz, evaluations with the true error). Prints a Markdown table: means over seeds of
-latency (as docs/evaluation.md has it) and its parts, keyframes sent, merges, and where agents took themselves
-to be in the map that they shared, cm rms, causal, one alignment of a map for all.
+Two headsets and a robot, a minute in an emulated warehouse (keyframes as in measure_load.py, odometry that
+drifts, frames at 30 Hz, evaluations with the true error). Prints a Markdown table: means over seeds of
+latency (as in docs/evaluation.md) and its parts, keyframes sent, merges, and the error of agents' poses in
+the map that they share, cm rms, causal, one alignment of a map for all.
 """
 
 from __future__ import annotations
@@ -43,9 +44,10 @@ from share.net.emulated_link import LinkAssignment  # noqa: E402
 from share.protocol.agent_events import LocalisedPose  # noqa: E402
 from share.types import F64, KeyframeCandidate  # noqa: E402
 
-SIMULATED = [policy for policy in POLICY_NAMES if policy != STREAMED]  # its agents send raw frames
+# others have agents that send raw frames
+SIMULATED = [policy for policy in POLICY_NAMES if policy != STREAMED]
 FRAME_NS = 33_333_333
-HEAD = ("policy", "agent", "latency ms", "frames ms", "corrected ms", "n", "sent", "Hz told", "QoE", "cm")
+HEAD = ("policy", "agent", "latency ms", "frames ms", "corrected ms", "n", "sent", "rate, Hz", "QoE", "cm")
 
 Row = dict[str, Any]
 
@@ -62,7 +64,7 @@ def main() -> int:
 
 
 def simulate(options: argparse.Namespace) -> None:
-    """Every policy, seed by seed."""
+    """Run every policy, seed by seed."""
     config, made = configured(options.set), room()
     first, end = map(int, options.seeds.split(":"))
     rows = []
@@ -79,14 +81,14 @@ def simulate(options: argparse.Namespace) -> None:
 
 
 def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool = False) -> Row:
-    """One run. modelled: by a mapper that knows the truth, which takes no views. busy, solving: of the edge's
-    mapper and solver, in seconds a second; passed_over: keyframes that were not looked up."""
+    """Simulate one run. modelled: with a mapper that knows the true poses and needs no views. busy, solving:
+    of the edge's mapper and solver, in seconds a second; passed_over: keyframes that were not looked up."""
     began = time.monotonic()
     who = list(made.agents.values())
     first_ns = min(agent.keyframes[0].stamp_ns for agent in who)
     last_ns = max(agent.keyframes[-1].stamp_ns for agent in who)
     rng = np.random.default_rng((seed, 9))
-    zeros_ns = [first_ns - int(rng.integers(FRAME_NS)) for _ in who]  # cameras do not keep step
+    zeros_ns = [first_ns - int(rng.integers(FRAME_NS)) for _ in who]  # cameras are not in step
     seen = [looks(agent, zero_ns, last_ns) for agent, zero_ns in zip(who, zeros_ns, strict=True)]
     truth = {
         a.hello.name: (np.array([k.stamp_ns - zero_ns for k in a.keyframes]), a.T_world_body)
@@ -143,13 +145,13 @@ def truth_of(made: KeyframeSet, near_m: float, far_m: float) -> GroundTruth:
 
 
 def which(truth: dict[str, Trajectory]) -> Callable[[str, int], int]:
-    """The number of an agent's keyframe, by its stamp."""
+    """Return a function that gives the index of an agent's keyframe by its stamp."""
     at = {name: {ns: k for k, ns in enumerate(stamps_ns.tolist())} for name, (stamps_ns, _) in truth.items()}
     return lambda name, stamp_ns: at[name][stamp_ns]
 
 
 def looks(agent: AgentKeyframes, first_ns: int, last_ns: int) -> Iterator[TrackedFrame]:
-    """Frames at 30 Hz since `first_ns`; a keyframe takes the place of the frame that is due by then."""
+    """Yield frames at 30 Hz since `first_ns`; a keyframe replaces the frame that is due by then."""
     at_ns, error_before_cm = first_ns, None
     for stamp_ns, candidate, error_cm in offered(agent):
         T = candidate.T_odom_body
@@ -165,7 +167,7 @@ def looks(agent: AgentKeyframes, first_ns: int, last_ns: int) -> Iterator[Tracke
 
 @lru_cache(64)
 def offered(agent: AgentKeyframes) -> list[tuple[int, KeyframeCandidate, float | None]]:
-    """Every keyframe as its tracker offers it, its stamp, and odometry's error (cm) by then."""
+    """Return every keyframe as its tracker publishes it, its stamp, and odometry's error (cm) by then."""
     stamps = np.array([k.stamp_ns for k in agent.keyframes])
     error = LocalError((stamps, agent.T_world_body))
     out = []
@@ -177,8 +179,8 @@ def offered(agent: AgentKeyframes) -> list[tuple[int, KeyframeCandidate, float |
 
 
 def shared_errors(placed: dict[str, list[LocalisedPose]], truth: dict[str, Trajectory]) -> dict[str, float]:
-    """cm rms, of each agent: where it took itself to be in the map that it shared with others when it was
-    there, at the stamps of `truth`. Every map is laid over the truth once, for all who share it."""
+    """Return, for each agent, the error (cm rms) of its localised poses in a map shared with others, at the
+    stamps of `truth`. Every map is aligned to the ground truth once, for all agents in it."""
     told: dict[str, list[tuple[str, F64, F64]]] = {}
     for name, poses in placed.items():
         stamps_ns, T_world_body = truth[name]

@@ -1,12 +1,13 @@
-"""How many agents one edge can serve, in virtual time with modelled mapping.
+"""Number of agents that one edge can serve, in virtual time with modelled mapping.
 
-    python tools/experiments/simulate_scale.py [--agents 3 6 12 24 50] [--rooms-of 10x5] [--policies covins-g share] \\
+    python tools/experiments/simulate_scale.py [--agents 3 6 12 24 50] [--rooms-of 10x5] \\
+        [--policies covins-g share] \\
         [--link wifi5] [--seeds 401:403] [--set SECTION.NAME=VALUE] [--workers 2] [--json FILE]
 
-Two headsets to one robot walk for a minute in a warehouse that grows with them, or as many in each of several
-rooms, far from each other, that one edge serves. Every agent has a link of its own. Prints a Markdown table,
-means over seeds: latency of headsets; corrections, median and 95 %; how much of its time the edge's mapper
-and its solver work; which share of keyframes is never looked up; merges a metre; errors in the map.
+Two headsets per robot walk for a minute in a warehouse that grows with their number, or equally many in each
+of several distant rooms of one edge. Every agent has its own link. Prints a Markdown table, means over seeds:
+latency of headsets; corrections, median and 95 %; load of the edge's mapper and solver; share of keyframes
+never looked up; merges a metre; errors in the map.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
 from share.spawning import SPAWN_CONTEXT  # noqa: E402
 
 KINDS = ("ar", "ar", "robot")
-APART_M = 1000.0  # of rooms
+APART_M = 1000.0  # between rooms
 HEAD = ("agents", "policy", "AR latency ms", "corrections: p50, p95 ms", "a second", "mapper", "solver")
 HEAD += ("passed over", "merges a metre", "error cm: headsets, robots", "maps")
 Size = tuple[int, int]  # rooms, agents in each
@@ -57,7 +58,7 @@ def main() -> int:
 
 
 def simulate(options: argparse.Namespace) -> None:
-    """Every size, by every policy, seed by seed."""
+    """Run every size by every policy, seed by seed."""
     first, end = map(int, options.seeds.split(":"))
     seeds, sizes = range(first, end), [(1, n) for n in options.agents] + list(map(_size, options.rooms_of))
     jobs: list[Job] = [
@@ -81,12 +82,12 @@ def simulate(options: argparse.Namespace) -> None:
 def _size(text: str) -> Size:
     rooms, _, each = text.partition("x")
     if not (rooms.isdecimal() and each.isdecimal()):
-        raise UsageError(f"'{text}': give ROOMSxAGENTS, as 10x5")
+        raise UsageError(f"'{text}': expected ROOMSxAGENTS, such as 10x5")
     return int(rooms), int(each)
 
 
 def _played(job: Job) -> list[Row]:
-    """A run by each policy."""
+    """Return a run by each policy."""
     (rooms, each), seed, policies, link, settings = job
     made, config = apart([_room(seed + 1000 * k, each) for k in range(rooms)]), configured(settings)
     return [
@@ -96,7 +97,7 @@ def _played(job: Job) -> list[Row]:
 
 
 def _room(seed: int, agents: int) -> KeyframeSet:
-    """About as many square metres for each, as far as a warehouse can have them."""
+    """Return a room with about the same area per agent, within a warehouse's limits."""
     kinds = [KINDS[k % len(KINDS)] for k in range(agents)]
     motions = tuple(f"{kind}{k}={'walk' if kind == 'ar' else 'robot'}:" for k, kind in enumerate(kinds))
     side = max(8.0, 3.0 * agents**0.5 + 3)
@@ -106,8 +107,8 @@ def _room(seed: int, agents: int) -> KeyframeSet:
 
 
 def apart(rooms: Sequence[KeyframeSet]) -> KeyframeSet:
-    """All in one world, out of each other's sight; agents are named by their rooms where there are several.
-    Recipe, spacing and size are those of the first."""
+    """Return all rooms in one world, out of sight of each other; agents get their room's name if there are
+    several rooms. Recipe, spacing and size are those of the first."""
     agents = {}
     for k, made in enumerate(rooms):
         for name, agent in made.agents.items():
@@ -123,9 +124,9 @@ def _moved(agent: AgentKeyframes, name: str, metres: float) -> AgentKeyframes:
 
 
 def cells_of(size: Size, runs: Sequence[Row]) -> list[str]:
-    """Of one size and policy; a run for each seed."""
+    """Return the cells of one size and policy; runs: one a seed."""
 
-    def told(figure: str, kind: str = "") -> float:
+    def average(figure: str, kind: str = "") -> float:
         values = [a[figure] for run in runs for name, a in run["agents"].items() if name.startswith(kind)]
         return float(np.nanmean(values)) if values else float("nan")
 
@@ -134,14 +135,14 @@ def cells_of(size: Size, runs: Sequence[Row]) -> list[str]:
     return [
         str(size[1]) if size[0] == 1 else f"{size[0]} × {size[1]}",
         runs[0]["policy"],
-        f"{told('latency_ms', 'ar'):.1f}",
+        f"{average('latency_ms', 'ar'):.1f}",
         f"{mean([ms['p50'] for ms in late]):.0f}, {mean([ms['p95'] for ms in late]):.0f}",
         f"{mean([ms['n'] for ms in late]) / 60:.1f}",
         f"{mean([run['busy'] for run in runs]):.2f}",
         f"{mean([run['solving'] for run in runs]):.2f}",
         f"{mean([run['passed_over'] / n for run, n in zip(runs, sent, strict=True)]):.2f}",
         f"{mean([run['done'] / run['metres'] for run in runs]):.1f}",
-        f"{told('error_cm', 'ar'):.2f}, {told('error_cm', 'robot'):.2f}",
+        f"{average('error_cm', 'ar'):.2f}, {average('error_cm', 'robot'):.2f}",
         f"{mean([run['maps'] for run in runs]):.1f}",
     ]
 

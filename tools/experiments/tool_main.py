@@ -1,4 +1,4 @@
-"""What tools share: an error of SHARE's is one line and an exit code; lines of Markdown tables."""
+"""Shared by the tools: one line and an exit code for SHARE's errors; lines of Markdown tables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from share.errors import ShareError
 
 
 def exit_code(name: str, work: Callable[[], None]) -> int:
-    """Of a tool that does `work`."""
+    """Run `work`; return its exit code."""
     try:
         work()
     except ShareError as error:
@@ -19,5 +19,5 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
 
 
 def line(cells: Iterable[str]) -> str:
-    """Of a Markdown table."""
+    """Return a line of a Markdown table."""
     return "| " + " | ".join(cells) + " |"

@@ -1,16 +1,17 @@
-"""What a setting of the scheduler costs and gains: a grid of settings, in virtual time with modelled mapping.
+"""Effect of scheduler settings: a grid, in virtual time with modelled mapping.
 
-    python tools/experiments/tune_rates.py control.kp=0.2,0.8,3.2 control.kd=0,0.2 [--policy share] [--link wifi5] \\
+    python tools/experiments/tune_rates.py control.kp=0.2,0.8,3.2 control.kd=0,0.2 [--policy share] \\
+        [--link wifi5] \\
         [--scenes warehouse firestation] [--rooms 401:404] [--agents ar ar robot] [--motions NAME=SPEC …] \\
         [--workers 2] [--json FILE] [--picture FILE]
 
-Settings joined by + have the same value: control.rate_min_hz+control.rate_max_hz=1.5,2 are fixed rates.
-Each room is one of a scene, by its seed, in which everybody moves for a minute as `--agents` usually do, or
-as `--motions` say in the words of `share emulate` (ar0=walk:speed=0.3,pauses=8); odometry as
-tools/experiments/keyframe_odometry.py draws it. The first row is `covins-g`. Prints a Markdown table, means over rooms
-with the standard error of the mean: latency of headsets and of robots as a part of `covins-g`'s in the same
-room, the same of their errors in the map and of merges, then the QoE of headsets and of who has least. Of
-two settings a picture is drawn: heat maps of latency and error.
+Settings joined by + have the same value: control.rate_min_hz+control.rate_max_hz=1.5,2 are fixed rates. Each
+room is a scene and a seed, in which all agents move for a minute as `--agents` usually do, or as `--motions`
+say in the specs of `share emulate` (ar0=walk:speed=0.3,pauses=8), with odometry of keyframe_odometry.py. The
+first row is `covins-g`. Prints a Markdown table, means over rooms with the standard error of the mean:
+latency of headsets and of robots relative to `covins-g` in the same room, likewise errors in the map and
+merges, then the QoE of headsets and the lowest of all agents. Two settings give a picture: heat maps of
+latency and error.
 """
 
 from __future__ import annotations
@@ -63,10 +64,10 @@ def main() -> int:
 
 
 def tune(options: argparse.Namespace) -> None:
-    """Every point of the grid in every room."""
+    """Run every point of the grid in every room."""
     names, values = _grid(options.grid)
     if options.picture and len(names) < 2:
-        raise UsageError("--picture: of two settings or more")
+        raise UsageError("--picture needs two settings or more")
     points = list(itertools.product(*values))
     first, end = map(int, options.room_log_sigma.split(":"))
     usual = (f"{kind}{k}={USUAL[kind]}" for k, kind in enumerate(options.agents))
@@ -75,7 +76,8 @@ def tune(options: argparse.Namespace) -> None:
     sets = [("edge.policy=" + json.dumps("covins-g"),)] + [
         ("edge.policy=" + json.dumps(options.policy), *_settings(names, point)) for point in points
     ]
-    jobs = [(room, settings, options.link) for room in rooms for settings in sets]  # a room stays in memory
+    # so that a room stays in memory
+    jobs = [(room, settings, options.link) for room in rooms for settings in sets]
     with ProcessPoolExecutor(options.workers, SPAWN_CONTEXT) as pool:
         rows = list(pool.map(_play, jobs, chunksize=len(sets)))
     runs = dict(zip(jobs, rows, strict=True))
@@ -89,8 +91,8 @@ def tune(options: argparse.Namespace) -> None:
         mean, sem = np.nanmean(ratios, axis=0), np.nanstd(ratios, axis=0) / np.sqrt(len(ratios))
         qoe = np.mean([_qoe(runs[room, settings, options.link]) for room in rooms], axis=0)
         table.append(mean.tolist())
-        told = [f"{m:.3f} ± {s:.3f}" for m, s in zip(mean, sem, strict=True)]
-        print(line([*point, *told, *(f"{q:.2f}" for q in qoe)]), flush=True)
+        ratios = [f"{m:.3f} ± {s:.3f}" for m, s in zip(mean, sem, strict=True)]
+        print(line([*point, *ratios, *(f"{q:.2f}" for q in qoe)]), flush=True)
     if options.json:
         kept = [
             {"settings": job[1], "scene": job[0][0], "room": job[0][1], **row} for job, row in runs.items()
@@ -102,7 +104,7 @@ def tune(options: argparse.Namespace) -> None:
 
 def _grid(words: list[str]) -> tuple[list[str], list[list[str]]]:
     if bad := [word for word in words if "=" not in word]:
-        raise UsageError(f"'{bad[0]}': give SECTION.NAME=VALUE,VALUE…")
+        raise UsageError(f"'{bad[0]}': expected SECTION.NAME=VALUE,VALUE…")
     return [w.split("=")[0] for w in words], [w.split("=", 1)[1].split(",") for w in words]
 
 
@@ -113,7 +115,7 @@ def _settings(names: list[str], point: tuple[str, ...]) -> Iterator[str]:
 
 @cache
 def _room(scene: str, seed: int, motions: tuple[str, ...]) -> KeyframeSet:
-    """The scene's own size for up to four, else larger with them."""
+    """Return a room of the scene's default size for up to four agents, else larger."""
     side = 3.0 * len(motions) ** 0.5 + 3
     longer = max(side, side**2 / LARGEST_M[1])
     size = (min(longer, LARGEST_M[0]), min(side, LARGEST_M[1]), LARGEST_M[2]) if len(motions) > 4 else None
@@ -135,18 +137,18 @@ def _of(row: Row, kind: str, figure: str) -> float:
 
 
 def _ratios(row: Row, base: Row) -> list[float]:
-    """As `FIGURES`."""
+    """Return the ratios of `FIGURES`."""
     pairs = [(kind, figure) for figure in ("latency_ms", "error_cm") for kind in ("ar", "robot")]
     return [*(_of(row, *pair) / _of(base, *pair) for pair in pairs), row["done"] / max(1, base["done"])]
 
 
 def _qoe(row: Row) -> tuple[float, float]:
-    """Of headsets, mean; of the agent that has least."""
+    """Return the mean QoE of headsets, and the lowest of all agents."""
     return _of(row, "ar", "qoe"), float(np.nanmin([agent["qoe"] for agent in row["agents"].values()]))
 
 
 def _draw(path: Path, names: list[str], values: list[list[str]], table: np.ndarray[Any, Any]) -> None:
-    """Heat maps over the first two settings; means over the others."""
+    """Draw heat maps over the first two settings; means over the others."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""Figures of a run, kept so that it need not be done again."""
+"""Cache of a run's figures."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 import share
 from share.files.writing import atomic_write
 
-_NOT_IN_A_RUN = ("cli", "emulate", "merge", "mocap", "wire")  # of share/
+_NOT_IN_A_RUN = ("cli", "emulate", "merge", "mocap", "wire")  # packages of share/ that a run does not use
 
 
 def code_version() -> str:
-    """Differs where anything does that a run goes through."""
+    """Return a digest of all code that a run uses."""
     digest = hashlib.sha256()
     package = Path(share.__file__).parent
     files = [p for p in package.rglob("*.py") if p.relative_to(package).parts[0] not in _NOT_IN_A_RUN]
@@ -24,7 +24,7 @@ def code_version() -> str:
 
 
 def kept(file: Path, made_by: dict[str, Any]) -> dict[str, Any] | None:
-    """What is in the file, if that was made by the same."""
+    """Return the file's figures if they were made by the same code and session, else None."""
     row: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
     return row if {key: row.get(key) for key in made_by} == made_by else None
 

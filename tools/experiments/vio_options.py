@@ -1,4 +1,4 @@
-"""What tools over sequences x seeds are asked for."""
+"""Options of the tools that run over sequences x seeds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DATA = ROOT.parent / "shared" / "data" / "motion"
 
 
 def parser(doc: str | None, out: str, seeds: tuple[int, ...]) -> argparse.ArgumentParser:
-    """out: name of the folder in build/; seeds: unless others are asked for."""
+    """Return a parser. out: name of the folder in build/; seeds: the default."""
     made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawTextHelpFormatter)
     names = [sequence.name for sequence in SEQUENCES]
     made.add_argument("--only", action="append", choices=names, help="may be repeated")
@@ -25,16 +25,15 @@ def parser(doc: str | None, out: str, seeds: tuple[int, ...]) -> argparse.Argume
     made.add_argument("--cache", type=Path, help="of sessions (default: the user's)")
     made.add_argument("--out", type=Path, default=ROOT / "build" / out)
     made.add_argument("--workers", type=int, default=2, help="processes that make sessions")
-    made.add_argument("--again", action="store_true", help="also what has been run already")
+    made.add_argument("--again", action="store_true", help="repeat runs that exist")
     return made
 
 
 def chosen(options: argparse.Namespace) -> list[Sequence]:
-    """The sequences asked for whose recordings are there; the others are named. Raises UsageError without
-    any."""
+    """Return the chosen sequences with recordings; report the others. Raises UsageError without any."""
     found = list(_there(options))
     if not found:
-        raise UsageError("none of the recordings asked for is there; say where they are with --data")
+        raise UsageError("none of the recordings exists; give their folder by --data")
     return found
 
 
@@ -46,7 +45,7 @@ def _there(options: argparse.Namespace) -> Iterator[Sequence]:
         if folder is None or folder.exists():
             yield sequence
         else:
-            print(f"left out: {sequence.name}, {folder} is not there", file=sys.stderr)
+            print(f"left out: {sequence.name}, {folder} does not exist", file=sys.stderr)
 
 
 def _folder(text: str) -> Path:

@@ -1,4 +1,4 @@
-"""One picture a sequence: errors over time between what the filter says is three sigma."""
+"""One picture a sequence: errors over time within the filter's three sigma."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from share.types import F64, I64
 
 _COLOURS = ("#00798c", "#d1495b", "#b8860b")
 _PALETTE = 64  # colours of the file
-_GAP_S = 0.2  # where nothing was told for longer, no line is drawn
-_BEGINNING_S, _ROOM = 10.0, 1.08  # the scale is that of what comes later, and a little more
+_GAP_S = 0.2  # longer gaps without a pose interrupt the line
+_BEGINNING_S, _ROOM = 10.0, 1.08  # the scale is that of later errors, with a margin
 
 
 class Curves(NamedTuple):
-    """Of one run: t_s (N,) since its first frame; errors and sigmas (N, 6) rad, then m; stretch (N,)."""
+    """Of one run: t_s (N,) since its first frame; errors and sigmas (N, 6) rad, then m; segment (N,)."""
 
     label: str
     t_s: F64
     errors: F64
     sigmas: F64
-    stretch: I64
+    segment: I64
 
 
 class Part(NamedTuple):
-    """columns: of the errors; scale: from their unit to the one shown."""
+    """columns: of the errors; scale: from their unit to the shown one."""
 
     name: str
     columns: slice
@@ -43,7 +43,7 @@ PARTS = (
 
 
 def draw(path: Path, title: str, runs: list[Curves]) -> None:
-    """PNG, all runs in every panel: position at the left, orientation at the right, an axis a row."""
+    """Write a PNG, all runs in every panel: position at the left, orientation at the right, an axis a row."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -64,11 +64,12 @@ def draw(path: Path, title: str, runs: list[Curves]) -> None:
 
 
 def _column(panels: Any, runs: list[Curves], part: Part) -> None:
-    """Three axes on one scale: that of what comes after the beginning; what is larger then is said."""
+    """Draw three axes on one scale: that of errors after the beginning; larger ones are noted in the
+    title."""
     limit, largest = (part.scale * largest_of(runs, part.columns, since) for since in (_BEGINNING_S, 0.0))
     outside = f"\n(in the first {_BEGINNING_S:g} s up to {largest:.2g} {part.unit})"
     beyond = outside if largest > _ROOM * limit else ""
-    panels[0].set_title(f"{part.name}, told less true; shaded: ± 3σ as told{beyond}", fontsize=11)
+    panels[0].set_title(f"{part.name}, estimate less truth; shaded: ± 3σ of the filter{beyond}", fontsize=11)
     for axis, panel in enumerate(panels):
         for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
             _curve(panel, run, part.columns.start + axis, part.scale, colour)
@@ -89,13 +90,13 @@ def _curve(panel: Any, run: Curves, column: int, scale: float, colour: str) -> N
 
 
 def largest_of(runs: list[Curves], columns: slice, since_s: float) -> float:
-    """Error or three sigma, whatever is more, from `since_s` on."""
+    """Return the largest error or three sigma from `since_s` on."""
     each = [np.maximum(np.abs(run.errors), 3 * run.sigmas)[run.t_s >= since_s, columns] for run in runs]
     return max((float(values.max()) for values in each if values.size), default=1.0)
 
 
 def broken(run: Curves, values: F64) -> F64:
-    """values (N, …) with NaN between where the run has a gap or begins a new stretch."""
-    gaps = np.flatnonzero((np.diff(run.t_s) > _GAP_S) | (np.diff(run.stretch) != 0)) + 1
+    """Return values (N, …) with NaN between where the run has a gap or a new segment."""
+    gaps = np.flatnonzero((np.diff(run.t_s) > _GAP_S) | (np.diff(run.segment) != 0)) + 1
     out: F64 = np.insert(values, gaps, np.nan, axis=0)
     return out

@@ -1,4 +1,4 @@
-"""One run of the inertial tracker over one recording: what it told of every frame, and figures of that."""
+"""One run of the inertial tracker over one recording: its poses and figures of them."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ ACCURACY = (
 
 
 @dataclass
-class Told:
-    """Of the frames that had a pose: stamps, poses, covariances, number of the unbroken stretch.
-    CPU ms of every frame and of every keyframe."""
+class TrackedRun:
+    """Of the frames with a pose: stamps, poses, covariances, index of the unbroken segment. CPU ms of every
+    frame and of every keyframe."""
 
     stamps: list[int] = field(default_factory=list)
     poses: list[F64] = field(default_factory=list)
     covs: list[F64] = field(default_factory=list)
-    stretches: list[int] = field(default_factory=list)
+    segments: list[int] = field(default_factory=list)
     track_ms: list[float] = field(default_factory=list)
     keyframe_ms: list[float] = field(default_factory=list)
     log: RunLog = field(default_factory=RunLog)
@@ -50,71 +50,71 @@ class Told:
         self.log.segments += result.new_segment
         self.log.add(stamp_ns, self.track_ms[-1], result.state, result.keyframe_ready)
         if result.T_odom_body is not None:
-            assert result.cov is not None  # the inertial tracker always tells it
+            assert result.cov is not None  # of the inertial tracker
             self.stamps.append(stamp_ns)
             self.poses.append(result.T_odom_body)
             self.covs.append(result.cov)
-            self.stretches.append(self.log.segments)
+            self.segments.append(self.log.segments)
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Over the frames with a pose and a truth: stamps (N,), their stretch (N,), deviations."""
+    """Of the frames with a pose and ground truth: stamps (N,), segment (N,), deviations."""
 
     stamps_ns: I64
-    stretch: I64
+    segment: I64
     deviations: Deviations
 
 
-def follow(source: Source, settings: Config) -> Told:
-    """Track every frame in turn, causal. Decoding is not counted."""
-    tracker, told = make_source_tracker(source, settings), Told()
+def follow(source: Source, settings: Config) -> TrackedRun:
+    """Track every frame in turn, causal. Decoding does not count."""
+    tracker, run = make_source_tracker(source, settings), TrackedRun()
     for frame in read_frames(source, settings, SequencerCounters()):
         began = time.process_time()
         result = tracker.track(frame)
-        told.track_ms.append(1e3 * (time.process_time() - began))
+        run.track_ms.append(1e3 * (time.process_time() - began))
         if result.keyframe_ready:
             began = time.process_time()
             tracker.make_keyframe(frame)
             tracker.finish_keyframe()
-            told.keyframe_ms.append(1e3 * (time.process_time() - began))
-        told.add(frame.stamp_ns, result)
-    return told
+            run.keyframe_ms.append(1e3 * (time.process_time() - began))
+        run.add(frame.stamp_ns, result)
+    return run
 
 
-def series(source: Source, told: Told) -> Series:
-    truth, (stamps, _) = source.truth(), told.trajectory
+def series(source: Source, run: TrackedRun) -> Series:
+    truth, (stamps, _) = source.truth(), run.trajectory
     assert truth is not None  # the emulator writes it
-    at, poses, true = associate(told.trajectory, truth)
+    at, poses, true = associate(run.trajectory, truth)
     chosen = np.isin(stamps, at)
-    stretch = np.array(told.stretches, np.int64)[chosen]
-    covs = np.array(told.covs).reshape(-1, 6, 6)[chosen]
-    return Series(at, stretch, deviations(poses, covs, true, stretch))
+    segment = np.array(run.segments, np.int64)[chosen]
+    covs = np.array(run.covs).reshape(-1, 6, 6)[chosen]
+    return Series(at, segment, deviations(poses, covs, true, segment))
 
 
-def figures(source: Source, told: Told, found: Series) -> dict[str, Any]:
-    """All of a run's; accuracies are None where there are too few poses to speak of any."""
-    report, frames = told.log.report(), told.log.frames()
+def figures(source: Source, run: TrackedRun, found: Series) -> dict[str, Any]:
+    """Return all figures of a run; accuracies are None where there are too few poses."""
+    report, frames = run.log.report(), run.log.frames()
     return {
         "frames": report["frames"],
         "told": report["tracked"] / report["frames"],
         "with_truth": len(found.stamps_ns),
-        **accuracy(source, told, found),
+        **accuracy(source, run, found),
         "states": {str(state): int(frames.in_state(state).sum()) / len(frames) for state in TrackState},
         "lost_s": report["lost_s"],
         "init_s": report["init_s"],
         "new_stretches": max(report["stretches"] - 1, 0),
-        "track_ms": _percentile(told.track_ms, 50),
-        "track_p99_ms": _percentile(told.track_ms, 99),
+        "track_ms": _percentile(run.track_ms, 50),
+        "track_p99_ms": _percentile(run.track_ms, 99),
         "keyframes": report["keyframes"],
-        "keyframe_ms": _percentile(told.keyframe_ms, 50),
-        "keyframe_p99_ms": _percentile(told.keyframe_ms, 99),
+        "keyframe_ms": _percentile(run.keyframe_ms, 50),
+        "keyframe_p99_ms": _percentile(run.keyframe_ms, 99),
     }
 
 
-def accuracy(source: Source, told: Told, found: Series) -> dict[str, float | None]:
-    """One alignment over all frames: a break of odometry shows in the ATE."""
-    estimate, truth = told.trajectory, source.truth()
+def accuracy(source: Source, run: TrackedRun, found: Series) -> dict[str, float | None]:
+    """Return accuracies with one alignment over all frames: a break of odometry shows in the ATE."""
+    estimate, truth = run.trajectory, source.truth()
     assert truth is not None
     try:
         absolute, relative = ate(estimate, truth), rpe_time(estimate, truth)
@@ -128,8 +128,8 @@ def accuracy(source: Source, told: Told, found: Series) -> dict[str, float | Non
 
 
 def consistency(found: Deviations) -> Iterator[float]:
-    """Of position, then orientation: mean NEES of three axes (3 is right) and share of frames within 3 sigma
-    on each axis. The first pose, which truth is laid over, says nothing and is left out."""
+    """Yield, of position, then orientation: mean NEES of three axes (3 is consistent) and share of frames
+    within 3 sigma on each axis. The first pose, at which the truth is aligned, is left out."""
     for part in (slice(3, 6), slice(0, 3)):
         errors, cov = found.errors[1:, part], found.cov[1:, part, part]
         yield float(nees(errors, cov).mean())

@@ -1,4 +1,4 @@
-"""The sequences that the inertial tracker is measured over: one agent, 60 s, all effects of the sensors."""
+"""The sequences for measuring the inertial tracker: one agent, 60 s, all sensor effects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _D435I = "d435i:640x480@30"
 @dataclass(frozen=True)
 class Sequence:
     """motion: `walk:`, `robot:`, or `euroc:NAME`, `tumvi:NAME` of a recording in the folder of recordings.
-    size: of the room, m; None: the scene's own. sensors: "" for the motion's usual ones."""
+    size: of the room, m; None: the scene's default. sensors: "" for the motion's usual ones."""
 
     name: str
     motion: str
@@ -24,7 +24,7 @@ class Sequence:
     size: tuple[float, float, float] | None = None
 
     def recording(self, data: Path) -> Path | None:
-        """Its folder in `data`, None where all is simulated."""
+        """Return its recording's folder in `data`, None for a simulated motion."""
         kind, _, name = self.motion.partition(":")
         return data / kind / name if name else None
 

@@ -1,4 +1,4 @@
-"""Runs as a Markdown table: a line a sequence, median over seeds and in brackets the worst of them."""
+"""Runs as a Markdown table: a line a sequence, median over seeds and in brackets the worst."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Row = dict[str, Any]
 
 
 class _Column(NamedTuple):
-    """key: of a run's figures; times: for the unit; worst: which of several is."""
+    """key: of a run's figures; times: unit conversion; worst: function that picks the worst of several."""
 
     title: str
     key: str
@@ -28,7 +28,7 @@ COLUMNS = (
     _Column("OK %", "OK", ".1f", 100, min),
     _Column("with a pose %", "told", ".1f", 100, min),
     _Column("LOST s", "lost_s", ".1f"),
-    _Column("new stretches", "new_stretches", ".0f"),
+    _Column("new segments", "new_stretches", ".0f"),
     _Column("ready s", "init_s", ".2f"),
     _Column("CPU ms", "track_ms", ".1f"),
     _Column("p99", "track_p99_ms", ".1f"),
@@ -41,7 +41,7 @@ COLUMNS = (
 
 
 def table(rows: Iterable[Row]) -> str:
-    """Of runs of any sequences and seeds, in their order."""
+    """Return the table of runs of any sequences and seeds, in their order."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row["sequence"], []).append(row)
@@ -54,7 +54,7 @@ def table(rows: Iterable[Row]) -> str:
 
 
 def _cell(column: _Column, runs: list[Row]) -> str:
-    """What a run does not have is the worst of all."""
+    """Return a cell; a missing figure counts as the worst."""
     found = [(run | run["states"])[column.key] for run in runs]
     values = [column.times * value for value in found if value is not None]
     if not values:
