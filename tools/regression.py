@@ -75,8 +75,8 @@ NOISE = {
     "AR RPE over 1 s": 0.25,
     "AR until in a shared map": 0.3,
     "agents in one map": 0.2,
-    "AR error command": 0.1,
-    "robot error command": 0.12,
+    "AR error told": 0.1,
+    "robot error told": 0.12,
 }
 _ALL = "all"
 MORE_IS_BETTER = ("agents in one map",)
