@@ -161,7 +161,7 @@ def of_sight(scene: str, number: int, seed: int) -> Row:
 
 
 def grid(camera: Camera) -> F64:
-    """Return rays (N, 3) through every GRID_PX-th pixel both rays."""
+    """Return rays (N, 3) through every GRID_PX-th pixel in both directions."""
     x, y = np.meshgrid(*(np.arange(GRID_PX // 2, n, GRID_PX) for n in (camera.width, camera.height)))
     return rays(camera.normalise(np.column_stack([x.ravel(), y.ravel()]).astype(float)))
 
