@@ -287,7 +287,7 @@ def test_what_is_wrong_is_said_in_one_line(device, tmp_path):
     cases = {
         "no frozen program there; make one with `make freeze`": device.agent(tmp_path / "nothing"),
         "cannot be reached: ssh: connect": device.deploy("edge", host="nowhere", dist=program),
-        "--edge is required the first time: tcp://HOST:5555": device.deploy("agent", "--name", "ann", dist=program),
+        "--edge is required the first time": device.deploy("agent", "--name", "ann", dist=program),
         "use 1 to 64 letters": device.deploy("agent", "--name", "a/b", dist=program),
         "neither a file nor a public key": device.agent(program, "--server-key", "x"),
         "--server-key: tcp://10.0.0.1:5555 is on": device.agent(program, "--edge", "tcp://10.0.0.1:5555"),

@@ -36,7 +36,8 @@ def test_fewer_keyframes_save_latency_and_a_picture_shows_it(tmp_path: Path) -> 
 
 def test_what_is_no_setting_is_said() -> None:
     done = tuned("control.kp")
-    assert (done.returncode, done.stderr) == (2, "tune_rates: 'control.kp': expected SECTION.NAME=VALUE,VALUE…\n")
+    said = "tune_rates: 'control.kp': expected SECTION.NAME=VALUE,VALUE…\n"
+    assert (done.returncode, done.stderr) == (2, said)
 
 
 @pytest.mark.slow

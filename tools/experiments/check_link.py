@@ -78,10 +78,10 @@ def by_kernel(options: argparse.Namespace) -> tuple[Delays, bool]:
         if not has_netem and not shape(within, f"tbf {rate} burst 3200 limit 1000000"):
             raise UsageError("this kernel has neither netem nor tbf: nothing to compare with")
         command = [*within, sys.executable, __file__, "--inside", "--seconds", str(options.seconds)]
-        told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     finally:
         subprocess.run(["ip", "netns", "del", name], check=False)
-    return {int(size): delays for size, delays in json.loads(told).items()}, has_netem
+    return {int(size): delays for size, delays in json.loads(output).items()}, has_netem
 
 
 def shape(within: list[str], discipline: str) -> bool:

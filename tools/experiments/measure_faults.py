@@ -83,16 +83,16 @@ class Run:
     @property
     def trajectory(self) -> Trajectory:
         """Return the frames with a pose."""
-        told = [(f.stamp_ns, r.T_odom_body) for f, r in zip(self.frames, self.results, strict=True)]
-        there = [(stamp, T) for stamp, T in told if T is not None]
+        tracked = [(f.stamp_ns, r.T_odom_body) for f, r in zip(self.frames, self.results, strict=True)]
+        there = [(stamp, T) for stamp, T in tracked if T is not None]
         stamps = np.array([stamp for stamp, _ in there], np.int64)
         return Trajectory(stamps, np.array([T for _, T in there]).reshape(-1, 4, 4))
 
     def stretches(self) -> list[Run]:
         """Return the frames with a pose by unbroken segment, without segments of less than three."""
         number = np.cumsum([r.new_segment for r in self.results])
-        told = np.array([r.T_odom_body is not None for r in self.results])
-        chosen = [np.flatnonzero(told & (number == n)) for n in np.unique(number)]
+        has_pose = np.array([r.T_odom_body is not None for r in self.results])
+        chosen = [np.flatnonzero(has_pose & (number == n)) for n in np.unique(number)]
         return [
             Run([self.frames[k] for k in some], [self.results[k] for k in some], self.log)
             for some in chosen
@@ -190,12 +190,12 @@ def scored(run: Run, truth: Trajectory) -> Row:
 
 def wrongly_ok(part: Run, truth: Trajectory) -> np.ndarray:
     """Return which frames (N,) of a segment with ground truth are OK although they are wrong."""
-    told = part.trajectory
-    known, true = interpolate(*truth, told.stamps_ns)
+    estimate = part.trajectory
+    known, true = interpolate(*truth, estimate.stamps_ns)
     results = [r for r, k in zip(part.results, known, strict=True) if k]
     if not results:
         return np.zeros(0, bool)
-    T, cov = told.T[known], np.array([r.cov for r in results])
+    T, cov = estimate.T[known], np.array([r.cov for r in results])
     if results[0].state is TrackState.VISION_ONLY:  # no gravity
         true = T[0] @ se3.inverse(true[0]) @ true
     found = deviations(T, cov, true, np.zeros(len(T), np.int64))

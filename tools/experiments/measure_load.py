@@ -92,14 +92,14 @@ def carry(agents: int, seconds: float, config: Path | None) -> Row:
             env=child_processes.child_environment(),
         ) as generator:
             used = _watch(generator, front, status)
-            told, _ = generator.communicate("\n")
+            output, _ = generator.communicate("\n")
         if generator.returncode:
             raise ShareError("the agents' process failed; see above")
         size = sum(file.stat().st_size for file in Path(name).glob("map.sqlite*"))
         front.send_signal(signal.SIGINT)
         front.wait(30)
         report = json.loads((Path(name) / "out" / "edge.json").read_text())
-    return {"agents": agents, "seconds": seconds} | used | json.loads(told) | _of_edge(report, size)
+    return {"agents": agents, "seconds": seconds} | used | json.loads(output) | _of_edge(report, size)
 
 
 @contextmanager

@@ -127,7 +127,9 @@ def _setting(trial: Trial, name: str) -> str:
 
 
 def _figures(of: list[Pairs]) -> list[str]:
-    told, true = (np.concatenate([getattr(pairs, what) for pairs in of]) for what in ("told_cm", "true_cm"))
+    estimated, true = (
+        np.concatenate([getattr(pairs, what) for pairs in of]) for what in ("told_cm", "true_cm")
+    )
     runs = np.array(
         [
             [error_statistics(pairs.told_cm).rmse, error_statistics(pairs.true_cm).rmse]
@@ -136,12 +138,16 @@ def _figures(of: list[Pairs]) -> list[str]:
         ]
     )
     cells = [
-        f"{error_statistics(told).rmse:.2f}",
+        f"{error_statistics(estimated).rmse:.2f}",
         f"{error_statistics(true).rmse:.2f}",
-        f"{np.median(true / told):.2f}",
+        f"{np.median(true / estimated):.2f}",
     ]
-    cells += f"{100 * np.mean(true <= 2 * told):.0f}", f"{_rank(told, true):.2f}", f"{_rank(*runs.T):.2f}"
-    return [str(len(runs)), str(len(told)), *cells]
+    cells += (
+        f"{100 * np.mean(true <= 2 * estimated):.0f}",
+        f"{_rank(estimated, true):.2f}",
+        f"{_rank(*runs.T):.2f}",
+    )
+    return [str(len(runs)), str(len(estimated)), *cells]
 
 
 def _rank(a: F64, b: F64) -> float:

@@ -181,16 +181,16 @@ def offered(agent: AgentKeyframes) -> list[tuple[int, KeyframeCandidate, float |
 def shared_errors(placed: dict[str, list[LocalisedPose]], truth: dict[str, Trajectory]) -> dict[str, float]:
     """Return, for each agent, the error (cm rms) of its localised poses in a map shared with others, at the
     stamps of `truth`. Every map is aligned to the ground truth once, for all agents in it."""
-    told: dict[str, list[tuple[str, F64, F64]]] = {}
+    by_map: dict[str, list[tuple[str, F64, F64]]] = {}
     for name, poses in placed.items():
         stamps_ns, T_world_body = truth[name]
         at = dict(zip(stamps_ns.tolist(), T_world_body[:, :3, 3], strict=True))
         for pose in poses:
             if pose.stamp_ns in at and pose.map_id is not None and pose.T_map_odom is not None:
                 p = (pose.T_map_odom @ pose.T_odom_body)[:3, 3]
-                told.setdefault(pose.map_id, []).append((name, p, at[pose.stamp_ns]))
+                by_map.setdefault(pose.map_id, []).append((name, p, at[pose.stamp_ns]))
     square: dict[str, list[float]] = {name: [] for name in placed}
-    for rows in told.values():
+    for rows in by_map.values():
         if len({name for name, _, _ in rows}) < 2:
             continue
         p, q = (np.array([row[i] for row in rows]) for i in (1, 2))
@@ -201,12 +201,12 @@ def shared_errors(placed: dict[str, list[LocalisedPose]], truth: dict[str, Traje
 
 def summary(policy: str, runs: list[Row]) -> str:
     names = ("requested", "skipped", "done", "metres", "joined", "took_s")
-    told = {name: mean([run[name] for run in runs]) for name in names}
+    means = {name: mean([run[name] for run in runs]) for name in names}
     agents = len(runs[0]["agents"])
     return (
-        f"{policy}: merges requested {told['requested']:.0f}, skipped {told['skipped']:.0f}, done "
-        f"{told['done']:.0f} ({told['done'] / told['metres']:.2f} a metre); {told['joined']:.1f} of {agents} "
-        f"in one map; {told['took_s']:.0f} s a run"
+        f"{policy}: merges requested {means['requested']:.0f}, skipped {means['skipped']:.0f}, done "
+        f"{means['done']:.0f} ({means['done'] / means['metres']:.2f} a metre); {means['joined']:.1f} of {agents} "
+        f"in one map; {means['took_s']:.0f} s a run"
     )
 
 
