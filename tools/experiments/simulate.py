@@ -205,8 +205,8 @@ def summary(policy: str, runs: list[Row]) -> str:
     agents = len(runs[0]["agents"])
     return (
         f"{policy}: merges requested {means['requested']:.0f}, skipped {means['skipped']:.0f}, done "
-        f"{means['done']:.0f} ({means['done'] / means['metres']:.2f} a metre); {means['joined']:.1f} of {agents} "
-        f"in one map; {means['took_s']:.0f} s a run"
+        f"{means['done']:.0f} ({means['done'] / means['metres']:.2f} a metre); "
+        f"{means['joined']:.1f} of {agents} in one map; {means['took_s']:.0f} s a run"
     )
 
 
