@@ -39,7 +39,7 @@ docs: install  # the site, into build/site; once installed it needs no network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	$(BIN)/pytest tests/test_docs.py
 vio-figures: install
-	$(BIN)/python tools/measure_vio.py
+	$(BIN)/python tools/experiments/measure_vio.py
 # The frozen program is built in an environment of its own, of exactly what the lock file says.
 LOCKS := tools/locks
 LOCK := $(LOCKS)/$(shell $(PYTHON) -c "import platform, sys; print('%s-py%d.%d' % (platform.machine(), *sys.version_info[:2]))").txt

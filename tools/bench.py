@@ -1,4 +1,4 @@
-"""Run every tools/bench_*.py and keep what it says as one JSON file: `make bench`."""
+"""Run every tools/experiments/bench_*.py and write their figures to build/bench.json: `make bench`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-OUT = HERE.parent / "build" / "bench.json"
+TOOLS = Path(__file__).resolve().parent
+OUT = TOOLS.parent / "build" / "bench.json"
 
 
 def main() -> None:
     results = {}
-    for script in sorted(HERE.glob("bench_*.py")):
+    for script in sorted((TOOLS / "experiments").glob("bench_*.py")):
         print(f"{script.stem} …", file=sys.stderr, flush=True)
         done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
         if done.returncode:

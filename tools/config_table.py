@@ -1,7 +1,7 @@
-"""The table of settings in docs/lookup/configuration.md, from share/config.py: names, defaults, comments.
+"""Make the table of settings in docs/lookup/configuration.md from share/config.py: names, defaults, comments.
 
 python tools/config_table.py            print it
-python tools/config_table.py --write    put it into docs/lookup/configuration.md, below its marker
+python tools/config_table.py --write    write it into docs/lookup/configuration.md, below its marker
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SOURCE = ROOT / "share" / "config.py"
 PAGE = ROOT / "docs" / "lookup" / "configuration.md"
 MARKER = "<!-- Below: made by tools/config_table.py from share/config.py. Change it there. -->\n"
 
-# By how a name ends; the first that fits.
+# unit by the end of a name; the first match counts.
 UNITS = {
     "_per_rad": "",
     "_per_m": "",
@@ -39,7 +39,7 @@ UNITS = {
 
 
 class Setting(NamedTuple):
-    """One row. meaning: the comment on the field's own line, empty if it has none."""
+    """One row. meaning: the comment on the field's line, empty if there is none."""
 
     name: str
     default: str
@@ -48,7 +48,7 @@ class Setting(NamedTuple):
 
 
 class Section(NamedTuple):
-    """One key of the file's top level. about: the docstring of its dataclass."""
+    """One top-level key of the file. about: the docstring of its dataclass."""
 
     name: str
     about: str
@@ -56,7 +56,7 @@ class Section(NamedTuple):
 
 
 def sections(text: str) -> list[Section]:
-    """In the order of `Config`, from the source text of share/config.py."""
+    """Return the sections in the order of `Config`, from the source text of share/config.py."""
     classes = {node.name: node for node in ast.parse(text).body if isinstance(node, ast.ClassDef)}
     comments = _comments(text)
     return [
@@ -67,7 +67,7 @@ def sections(text: str) -> list[Section]:
 
 
 def page(found: list[Section]) -> str:
-    """The sections as Markdown."""
+    """Return the sections as Markdown."""
     return "\n".join(_markdown(section) for section in found)
 
 

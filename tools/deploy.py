@@ -1,4 +1,4 @@
-"""Puts the frozen program onto a device, as services that start on boot. See docs/do/deploy.md."""
+"""Install the frozen program on a device, as services that start on boot. See docs/do/deploy.md."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ import click
 from deploy_device import Device, Facts, check
 from deploy_release import Release, read_release, write_tar
 from deploy_settings import merged
-from tool_main import exit_code
 
 from share.cli.terminal import progress
 from share.devices import checks
-from share.errors import UsageError
+from share.errors import ShareError, UsageError
 from share.net.keys import public_key
 from share.net.transport import parse_address
 
@@ -29,9 +28,9 @@ NO_SETTINGS = "# Settings of SHARE on this device: docs/lookup/configuration.md\
 
 @dataclass(frozen=True)
 class Service:
-    """unit: systemd's name; "" for the program alone. name: of its files in /etc/share. given: settings asked
-    for on the command line, None where nothing was said. defaults: empty for a service without settings.
-    more: further files."""
+    """unit: systemd's name; "" for the program alone. name: of its files in /etc/share. given: settings from
+    the command line, None if not given. defaults: empty for a service without settings. more: further files.
+    """
 
     unit: str
     name: str
@@ -44,11 +43,13 @@ _OPTIONS = (
     click.argument("host", metavar="[USER@]HOST"),
     click.option("--ssh", default="ssh", show_default=True, help='With options: "ssh -p 2222 -i key".'),
     click.option("--dist", type=click.Path(path_type=Path), default=DIST, help="The frozen program."),
-    click.option("--root", default="", metavar="DIR", help="A folder there in place of /, to try it."),
-    click.option("--settle", default=10.0, show_default=True, help="Seconds that it must stay up."),
+    click.option(
+        "--root", default="", metavar="DIR", help="A folder on the device in place of /, for a trial."
+    ),
+    click.option("--settle", default=10.0, show_default=True, help="Seconds that the service must stay up."),
     click.option("--keep", type=click.IntRange(2), default=3, show_default=True, help="Releases to keep."),
     click.option("--rollback", is_flag=True, help="Go back to the release before; copy nothing."),
-    click.option("--dry-run", is_flag=True, help="Say what would be done; change nothing."),
+    click.option("--dry-run", is_flag=True, help="Print what would be done; change nothing."),
 )
 
 
@@ -60,7 +61,7 @@ def common(command: Callable[..., None]) -> Callable[..., None]:
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 def cli() -> None:
-    """Put SHARE onto a device, as a service that starts on boot, or the program alone: docs/do/deploy.md.
+    """Install SHARE on a device, as a service that starts on boot, or the program alone: docs/do/deploy.md.
 
     \b
     Example:  tools/deploy program pi@headset1
@@ -70,14 +71,14 @@ def cli() -> None:
 
 
 @cli.command()
-@click.option("--name", required=True, help="What this agent is called.")
-@click.option("--edge", metavar="tcp://H:P", help="Where the edge listens; needed the first time.")
-@click.option("--kind", type=click.Choice(["ar", "robot"]), help="Who is served; at first ar.")
-@click.option("--source", help="As of `share agent`; at first realsense.")
+@click.option("--name", required=True, help="Name of the agent.")
+@click.option("--edge", metavar="tcp://H:P", help="Address of the edge; required the first time.")
+@click.option("--kind", type=click.Choice(["ar", "robot"]), help="ar (headset) or robot; initially ar.")
+@click.option("--source", help="As for `share agent`; initially realsense.")
 @click.option(
     "--server-key",
     metavar="FILE|KEY",
-    help="Public key of the edge; needed the first time, unless it is on the same machine.",
+    help="Public key of the edge; required the first time, unless it is on the same machine.",
 )
 @common
 def agent(name: str, edge: str | None, kind: str | None, source: str | None, **others: Any) -> None:
@@ -97,8 +98,8 @@ def agent(name: str, edge: str | None, kind: str | None, source: str | None, **o
 
 
 @cli.command()
-@click.option("--bind", metavar="tcp://H:P", help="At first tcp://0.0.0.0:5555.")
-@click.option("--http", metavar="[H:]P", help="At first 127.0.0.1:8080.")
+@click.option("--bind", metavar="tcp://H:P", help="Initially tcp://0.0.0.0:5555.")
+@click.option("--http", metavar="[H:]P", help="Initially 127.0.0.1:8080.")
 @common
 def edge(bind: str | None, http: str | None, **others: Any) -> None:
     """An edge: the service share-edge.
@@ -113,7 +114,7 @@ def edge(bind: str | None, http: str | None, **others: Any) -> None:
 @cli.command()
 @common
 def sync(**others: Any) -> None:
-    """The time of a room: the service share-sync, on the edge's machine (docs/do/sync.md).
+    """The time server of a room: the service share-sync, on the edge's machine (docs/do/sync.md).
 
     \b
     Example:  tools/deploy sync me@laptop
@@ -124,7 +125,7 @@ def sync(**others: Any) -> None:
 @cli.command()
 @common
 def program(**others: Any) -> None:
-    """The program alone, for people who type `share`; services that run there go on with it.
+    """The program alone, for use by hand; services on the device continue with it.
 
     \b
     Example:  tools/deploy program pi@headset1
@@ -143,7 +144,7 @@ def deploy(
     rollback: bool,
     dry_run: bool,
 ) -> None:
-    """Raises ShareError in one line; what did not come up has been put back by the device itself."""
+    """Install a release and a service. Raises ShareError in one line; the device has undone what failed."""
     device = Device(host, ssh, root, settle, keep)
     if rollback:
         _roll_back(device, service, dry_run)
@@ -165,7 +166,7 @@ def deploy(
 
 
 def settings_files(service: Service, there: Facts) -> dict[str, str]:
-    """Files for /etc/share: what was said now, and what people wrote there. Raises UsageError."""
+    """Return files for /etc/share: given settings merged into those on the device. Raises UsageError."""
     if not service.defaults:
         return {}
     text = merged(there.settings, service.given, service.defaults)
@@ -176,19 +177,19 @@ def settings_files(service: Service, there: Facts) -> dict[str, str]:
 
 
 def check_edge(settings: Mapping[str, str]) -> None:
-    """That an agent's settings name an edge, and say its key if it is another machine. Raises UsageError."""
+    """Check that an agent's settings name an edge, and its key if it is remote. Raises UsageError."""
     if not settings.get("EDGE"):
-        raise UsageError("--edge: where does the edge listen? tcp://HOST:5555; needed the first time")
+        raise UsageError("--edge is required the first time: tcp://HOST:5555, where the edge listens")
     keys = f"{settings.get('KEYS', '')} {settings.get('OPTIONS', '')}"
     if not parse_address(settings["EDGE"]).local and "--server-key" not in keys:
         raise UsageError(
-            f"--server-key: {settings['EDGE']} is on another machine, which wants keys; its own is the last "
-            "line of `tools/deploy edge`, and `share edge` shows it when it starts"
+            f"--server-key: {settings['EDGE']} is on another machine, so the edge's public key is required: "
+            "the last line of `tools/deploy edge`; `share edge` prints it at its start"
         )
 
 
 def profile(service: Service, files: Mapping[str, str]) -> str:
-    """Of the computer, for `share doctor`."""
+    """Return the computer's profile for `share doctor`."""
     found = re.search(r"^KIND=(ar|robot)$", files.get(f"{service.name}.env", ""), re.MULTILINE)
     return PROFILES[found[1] if found else ""]
 
@@ -226,4 +227,8 @@ def _roll_back(device: Device, service: Service, dry_run: bool) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code("deploy", cli))
+    try:
+        cli()
+    except ShareError as error:
+        print(f"deploy: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)

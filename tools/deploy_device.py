@@ -1,4 +1,5 @@
-"""A device over ssh: what it is, and the verbs of device/device.sh there. It needs nothing installed."""
+"""A device over ssh: its facts, and the verbs of device/device.sh on it. Nothing needs to be installed
+there."""
 
 from __future__ import annotations
 
@@ -15,15 +16,15 @@ from share.errors import ShareError, UsageError
 
 _SCRIPT = (HERE / "device.sh").read_text()
 _OPTIONS = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
-_MARGIN = 1.1  # of the program's size that must be free
+_MARGIN = 1.1  # of the program's size, required free space
 _UNREACHABLE = 255  # ssh's own exit code
 _AS_ROOT = 'test "$(id -u)" = 0 || set -- sudo -n "$@"; exec "$@"'
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What `probe` tells. glibc: minor version of 2.x. current: the release in force, "" for none.
-    settings: text of the service's .env, "" for none."""
+    """Facts by `probe`. glibc: minor version of 2.x. current: the active release, "" for none. settings: text
+    of the service's .env, "" for none."""
 
     machine: str
     glibc: int
@@ -37,7 +38,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Device:
-    """ssh: the command, with options of its own. root: a folder in place of / (then no sudo is asked for)."""
+    """ssh: the command, with options. root: a folder in place of / (then sudo is not used)."""
 
     host: str
     ssh: str = "ssh"
@@ -46,37 +47,39 @@ class Device:
     keep: int = 3
 
     def probe(self, service: str) -> Facts:
-        """Raises UsageError where it cannot be reached, or nobody can become root there."""
+        """Return the device's facts. Raises UsageError where it cannot be reached, or gives no root
+        access."""
         text = self._run(self._shell("probe", service), None)
         if not self.root:
             self._check_root()
         return facts(text)
 
     def do(self, *verb: str, data: bytes = b"") -> str:
-        """One verb of device.sh as root. Its stdout. Raises ShareError with its last line."""
+        """Run one verb of device.sh as root; return its stdout. Raises ShareError with its last line."""
         return self._run(self._sudo() + self._shell(*verb), data)
 
     def send(self, release: Release, write: Callable[[IO[bytes]], None]) -> None:
-        """Raises UsageError where the line broke, else ShareError; then the device is as it was."""
+        """Send a release. Raises UsageError where the connection breaks, else ShareError; then the device is
+        unchanged."""
         command = self._command(self._sudo() + self._shell("receive", release.name))
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as there:
             assert there.stdin is not None and there.stderr is not None
-            with contextlib.suppress(BrokenPipeError):  # then it says why, below
+            with contextlib.suppress(BrokenPipeError):  # the error follows below
                 write(there.stdin)
-            with contextlib.suppress(BrokenPipeError):  # what was still to be written
+            with contextlib.suppress(BrokenPipeError):  # the rest of the data
                 there.stdin.close()
             said = there.stderr.read().decode(errors="replace")
         if there.returncode == _UNREACHABLE:
             raise self._unreachable(said)
         if there.returncode:
-            raise ShareError(f"{self.host}: the program was not copied: {_told(said)}")
+            raise ShareError(f"{self.host}: the program was not copied: {_last_line(said)}")
 
     def _check_root(self) -> None:
         try:
             self._run('test "$(id -u)" = 0 || sudo -n true', None)
         except ShareError:
             raise UsageError(
-                f"{self.host}: nobody can become root there without a password; give root@HOST, or let this "
+                f"{self.host}: no root access without a password; give root@HOST, or allow it to this "
                 'user: echo "$USER ALL=(ALL) NOPASSWD: ALL" | sudo tee /etc/sudoers.d/share'
             ) from None
 
@@ -86,11 +89,13 @@ class Device:
         if done.returncode == _UNREACHABLE:
             raise self._unreachable(said)
         if done.returncode:
-            raise ShareError("\n".join([*done.stdout.decode(errors="replace").splitlines(), _told(said)]))
+            raise ShareError(
+                "\n".join([*done.stdout.decode(errors="replace").splitlines(), _last_line(said)])
+            )
         return done.stdout.decode(errors="replace")
 
     def _unreachable(self, said: str) -> UsageError:
-        return UsageError(f"{self.host}: cannot be reached: {_told(said)}; try `{self.ssh} {self.host}`")
+        return UsageError(f"{self.host}: cannot be reached: {_last_line(said)}; try `{self.ssh} {self.host}`")
 
     def _command(self, text: str) -> list[str]:
         return [*shlex.split(self.ssh), *_OPTIONS, self.host, text]
@@ -105,24 +110,24 @@ class Device:
 
 
 def facts(text: str) -> Facts:
-    """Of what `probe` printed."""
+    """Parse what `probe` printed."""
     lines = text.splitlines()
-    told = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("env:"))
+    values = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("env:"))
     settings = "".join(f"{line[4:]}\n" for line in lines if line.startswith("env:"))
     return Facts(
-        told["machine"],
-        int(told["glibc"].partition(".")[2] or 0),
-        int(told["free_kb"]) * 1024,
-        told["systemd"] == "yes",
-        told["current"],
-        told["previous"],
-        tuple(told["releases"].split()),
+        values["machine"],
+        int(values["glibc"].partition(".")[2] or 0),
+        int(values["free_kb"]) * 1024,
+        values["systemd"] == "yes",
+        values["current"],
+        values["previous"],
+        tuple(values["releases"].split()),
         settings,
     )
 
 
 def check(host: str, release: Release, there: Facts) -> None:
-    """Whether it can run there. Raises ShareError."""
+    """Raise ShareError if the release cannot run on the device."""
     if not there.systemd:
         raise ShareError(f"{host}: has no systemd; only the program itself (dist/share) can be copied there")
     if release.machine and release.machine != there.machine:
@@ -140,7 +145,7 @@ def check(host: str, release: Release, there: Facts) -> None:
         raise ShareError(f"{host}: {there.free / 1e6:.0f} MB free at /opt/share, {need:.0f} MB are needed")
 
 
-def _told(stderr: str) -> str:
-    """The last line of it."""
+def _last_line(stderr: str) -> str:
+    """Return the last line of stderr."""
     lines = [line for line in stderr.splitlines() if line.strip()]
-    return lines[-1].strip() if lines else "it said nothing"
+    return lines[-1].strip() if lines else "no message"

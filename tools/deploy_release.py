@@ -1,4 +1,4 @@
-"""What is put onto a device: the frozen program, units, rules and settings, as one release with a name."""
+"""A release: the frozen program, units, rules and settings, under one name."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _ELF, _MACHINE = b"\x7fELF", {62: "x86_64", 183: "aarch64"}  # e_machine, elf(5)
 
 @dataclass(frozen=True)
 class Release:
-    """folder: dist/share. name: VERSION-DIGEST, the same for the same bytes. size: bytes. machine, glibc:
-    of the oldest device that can run it; "" and 0 where no file tells (2.36 is 36)."""
+    """folder: dist/share. name: VERSION-DIGEST, the digest of all bytes. size: bytes. machine, glibc: of the
+    oldest device that can run it; "" and 0 if unknown (2.36 is 36)."""
 
     folder: Path
     name: str
@@ -35,7 +35,8 @@ class Release:
 
 
 def read_release(folder: Path) -> Release:
-    """Raises UsageError where there is no frozen program, ShareError where its version is not told."""
+    """Return the release in `folder`. Raises UsageError without a frozen program, ShareError without a
+    version."""
     if not (folder / "share").is_file():
         raise UsageError(f"{folder}: no frozen program there; make one with `make freeze`")
     digest, size, machine, glibc = hashlib.sha256(), 0, "", 0
@@ -50,7 +51,7 @@ def read_release(folder: Path) -> Release:
 
 
 def write_tar(release: Release, to: IO[bytes], wrote: Callable[[int], None]) -> None:
-    """A tar.gz of it. wrote: told the bytes of each file. Raises OSError of `to`."""
+    """Write a tar.gz of the release. wrote: called with the bytes of each file. Raises OSError of `to`."""
     with (
         gzip.GzipFile(fileobj=to, mode="wb", compresslevel=1) as packed,
         tarfile.open(fileobj=packed, mode="w|") as tar,
@@ -66,7 +67,7 @@ def write_tar(release: Release, to: IO[bytes], wrote: Callable[[int], None]) -> 
 
 
 def _members(folder: Path) -> list[tuple[str, Path | bytes]]:
-    """Name in the release and where it comes from; folders are made as they are needed."""
+    """Return each member's name in the release and its source; folders are made as needed."""
     program = [path for path in sorted(folder.rglob("*")) if path.is_symlink() or path.is_file()]
     units = sorted(path for path in HERE.iterdir() if path.suffix in (".service", ".sh"))
     return [
@@ -78,7 +79,7 @@ def _members(folder: Path) -> list[tuple[str, Path | bytes]]:
 
 
 def _at_boot(profile: str) -> bytes:
-    """What such a computer is set to."""
+    """Return the boot settings for computers of this profile."""
     host = load_host_profile(profile).host
     head = f"# Of SHARE, for {profile}: docs/do/deploy.md"
     return "".join(
@@ -93,19 +94,19 @@ def _content(source: Path | bytes) -> bytes:
 
 
 def _version(folder: Path) -> str:
-    """What `make freeze` wrote there; the program may be for another processor than this one's."""
+    """Return the version that `make freeze` wrote; the program may be for another processor than this one."""
     if (folder / "VERSION").is_file():
         text = (folder / "VERSION").read_text(errors="replace").strip()
         if not re.fullmatch(r"[\w.+-]+", text, re.ASCII):
             raise ShareError(
-                f"{folder}/VERSION: '{text}' is no version; make the program anew, `make freeze`"
+                f"{folder}/VERSION: '{text}' is not a version; make the program again by `make freeze`"
             )
         return text
     try:
         done = subprocess.run([folder / "share", "--version"], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
         raise ShareError(
-            f"{folder}: has no file VERSION, and its program does not start here ({error}); make it anew: "
+            f"{folder}: has no file VERSION, and its program does not start here ({error}); make it again: "
             "`make freeze` on a machine of the device's kind"
         ) from None
     return done.stdout.split()[-1]

@@ -1,4 +1,4 @@
-"""The settings of a service, /etc/share/SERVICE.env, as systemd reads them (systemd.exec(5))."""
+"""Settings of a service, /etc/share/SERVICE.env, as systemd reads them (systemd.exec(5))."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ _PLAIN = re.compile(r"[\w@%+=:,./ -]*", re.ASCII)  # nothing that systemd would 
 
 
 def merged(text: str, given: Mapping[str, str | None], defaults: Mapping[str, str]) -> str:
-    """`text` with the values of `given` that are not None put in, and `defaults` where nothing is said.
+    """Return `text` with all `given` values that are not None, and `defaults` for missing ones.
 
-    All other lines stay as people wrote them. Raises UsageError for a value that is not plain text.
+    Other lines stay as they are. Raises UsageError for a value that is not plain text.
     """
     wanted = {key: value for key, value in given.items() if value is not None}
     for key, value in wanted.items():
         if not _PLAIN.fullmatch(value):
-            raise UsageError(f"{key.lower()} '{value}': has characters that a settings file cannot hold")
+            raise UsageError(
+                f"{key.lower()} '{value}': has characters that are not allowed in a settings file"
+            )
     lines = [_put(line, wanted) for line in text.splitlines()]
     there = {match[1] for line in lines if (match := _LINE.fullmatch(line))}
     missing = {key: value for key, value in {**defaults, **wanted}.items() if key not in there}

@@ -1,9 +1,9 @@
-"""The licences of what the frozen program is built from: docs/lookup/licenses.md.
+"""Licences of the packages in the frozen program: docs/lookup/licenses.md.
 
     python tools/licenses.py PYTHON PAGE
 
-PYTHON is that of the environment which the program is built in. A package whose licence is unknown or not
-among ACCEPTED ends it, and the page stays as it is: read the licence, and add the package to KNOWN.
+PYTHON is that of the build environment. A package with a licence that is unknown or not among ACCEPTED is an
+error, and the page stays unchanged: read the licence, and add the package to KNOWN.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ACCEPTED = {
         "PSF-2.0",
     ),
 }
-KNOWN = {  # metadata says it in other words, or not at all; remarks follow a semicolon
+KNOWN = {  # metadata has other words or none; remarks follow a semicolon
     "altgraph": "MIT; builds only",
     "apsw": "Zlib; metadata says any-OSI; with SQLite (public domain)",
     "contourpy": "BSD-3-Clause",
@@ -65,7 +65,7 @@ def normalised(name: str) -> str:
 
 
 def licence(name: str, expression: str) -> tuple[str, str]:
-    """Licence and remark. Raises ValueError for one that nobody has read."""
+    """Return licence and remark. Raises ValueError for a licence that was not reviewed."""
     if (known := KNOWN.get(normalised(name))) is not None:
         stated, _, remark = known.partition("; ")
         return stated, remark
@@ -78,7 +78,8 @@ def licence(name: str, expression: str) -> tuple[str, str]:
 
 
 def table(installed: list[tuple[str, str, str]]) -> str:
-    """One row per package (name, version, licence by its metadata). Raises ValueError as `licence` does."""
+    """Return one row per package (name, version, licence by its metadata). Raises ValueError as `licence`
+    does."""
     rows = ["| package | version | licence | |", "|---|---|---|---|"]
     for name, version, expression in sorted(installed, key=lambda one: normalised(one[0])):
         if normalised(name) != "share-slam":

@@ -1,4 +1,4 @@
-"""In the frozen program, in place of SciPy's linear programming (HiGHS).
+"""Replaces SciPy's linear programming (HiGHS) in the frozen program.
 
 Every import of scipy.optimize loads its 7 MB and makes tables of its names. SHARE never calls it.
 """
@@ -9,7 +9,7 @@ from typing import NoReturn
 
 
 class _Name:
-    """Of whatever is asked for: it has more names in it, and cannot be called."""
+    """Any attribute: it has further attributes, and cannot be called."""
 
     def __getattr__(self, name: str) -> _Name:
         return _named(name)
@@ -20,7 +20,7 @@ class _Name:
 
 def _named(name: str) -> _Name:
     if name.startswith("__"):
-        raise AttributeError(name)  # Python's own questions
+        raise AttributeError(name)  # Python's own look-ups
     return _Name()
 
 

@@ -1,11 +1,11 @@
-"""Records what the agents and the edge of this release say to each other, for the tests of later ones.
+"""Record the messages between agents and the edge of this release, for tests of later ones.
 
     python tools/record_wire.py OUT
 
-Two agents run against an edge through a relay that keeps every message as it passes; then one agent streams
-to an edge that tracks. OUT/wire-N.msgpack.gz has the messages, OUT/map-N.sqlite.gz the edge's map file, where
-N is the wire version. tests/wire/recorded has those of the last releases, and how to read them is said in
-tests/recorded_traffic.py. Only the commands of SHARE are used, so that every release can be recorded.
+Two agents run against an edge through a relay that records every message; then one agent streams to an edge
+that tracks. OUT/wire-N.msgpack.gz has the messages, OUT/map-N.sqlite.gz the edge's map file, where N is the
+wire version. tests/wire/recorded has those of the last releases; tests/recorded_traffic.py reads them. Only
+the commands of SHARE are used, so that every release can be recorded.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SHARE = [sys.executable, "-m", "share"]
 
 
 class Relay(threading.Thread):
-    """Stands between agents and an edge as ZeroMQ sockets of the same kinds; keeps what passes."""
+    """Relays between agents and an edge by ZeroMQ sockets of the same kinds, and records the messages."""
 
     def __init__(self, edge: str, name: str) -> None:
         super().__init__(daemon=True)
@@ -107,7 +107,7 @@ def _session(work: Path) -> Path:
 
 
 def _maps(work: Path, session: Path) -> list[dict[str, Any]]:
-    """Two agents, and a third that asks for a name in use."""
+    """Record two agents, and a third that uses a name in use."""
     with _Edge(work / "edge.log", "--map", str(work / "map.sqlite")) as edge:
         relay = _relay(edge, "maps")
         runs = [_agent(work, session / name, name, relay) for name in ("ann", "rob")]
@@ -129,7 +129,7 @@ def _streams(work: Path, session: Path) -> list[dict[str, Any]]:
 
 
 class _Edge:
-    """A listening edge; `address` is where."""
+    """A listening edge at `address`."""
 
     def __init__(self, log: Path, *more: str) -> None:
         with log.open("wb") as sink:

@@ -1,16 +1,16 @@
-"""Has anything become worse? A small fixed set in virtual time, held against what it came to before.
+"""Regression gate: a small fixed set in virtual time, compared with earlier runs.
 
     python tools/regression.py                 compare with the history; code 1 if worse
     python tools/regression.py --keep WHY      compare, and add this run to the history, unless it is worse
-    ... --keep WHY --accept FIGURE             add it though FIGURE is worse; from now on this is its measure
-    python tools/regression.py --chance 6      how far figures move by chance alone: what NOISE is from
+    ... --keep WHY --accept FIGURE             add it although FIGURE is worse; the new reference from now on
+    python tools/regression.py --chance 6      variation of the figures by chance alone: source of NOISE
     python tools/regression.py --picture FILE  draw the history, run nothing
 
 The set: two rooms, in each two headsets and a robot for 30 s, over wifi5 by `share` and by `covins-g`, two
-seeds, as shipped. Sessions are made once and kept (--cache). In virtual time nothing depends on how busy this
-machine is; how quick it is, `make bench` says. History: docs/lab/results/regression.jsonl. A figure is held
-against its median over all lines since it was accepted (by name, or `all`), so that many small steps down are
-seen as one large one.
+seeds, default settings. Sessions are made once and kept (--cache). In virtual time nothing depends on the
+load of this machine; `make bench` measures its speed. The history: docs/lab/results/regression.jsonl. A figure is
+compared with its median over all lines since it was accepted (by name, or `all`), so that many small losses
+count as one large one.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ from typing import Any, NamedTuple
 from share import startup
 
 startup.prepare_process()
+
+sys.path.insert(0, str(Path(__file__).resolve().parent / "experiments"))
 
 import numpy as np  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
@@ -62,8 +64,8 @@ SET = tuple(
 )
 POLICIES, SEEDS = ("share", "covins-g"), (0, 1)
 _ODOMETRY = "odometry ATE"
-# By how much a figure has to move, as a part of itself, before it is called worse or better: three standard
-# deviations of what chance alone does to it (--chance 6; rounded up, and of means, which are less steady).
+# Relative change that counts as worse or better: three standard deviations of chance alone (--chance 6;
+# rounded up, and for means, which vary more).
 NOISE = {
     _ODOMETRY: 0.3,
     "AR latency": 0.05,
@@ -83,7 +85,7 @@ Figures = dict[str, float]
 
 
 class Verdict(NamedTuple):
-    """One figure, as a part of what it was; NaN where it was not known or is not any more."""
+    """One figure relative to its reference; NaN where it is missing now or before."""
 
     name: str
     before: float
@@ -96,7 +98,7 @@ class Verdict(NamedTuple):
 
     @property
     def says(self) -> str:
-        """`worse`, `better`, or nothing to speak of."""
+        """Return `worse`, `better`, or "" within the noise."""
         if math.isnan(self.now) and not math.isnan(self.before):
             return "worse"
         if math.isnan(self.part) or abs(self.part - 1) <= self.noise:
@@ -115,10 +117,12 @@ def main() -> int:
         default=[],
         help=f"may be worse (or `{_ALL}`); repeated",
     )
-    parser.add_argument("--chance", type=int, metavar="N", help="play the set N times, by chance alone")
+    parser.add_argument(
+        "--chance", type=int, metavar="N", help="run the set N times, to measure variation by chance"
+    )
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the history")
     parser.add_argument("--history", type=Path, default=HISTORY)
-    parser.add_argument("--cache", type=Path, help="of sessions (default: the user's)")
+    parser.add_argument("--cache", type=Path, help="cache of sessions (default: the user's)")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     return exit_code("regression", lambda: run(options))
@@ -134,12 +138,13 @@ def run(options: argparse.Namespace) -> None:
 
 
 def compare(options: argparse.Namespace) -> None:
-    """Raises ShareError where something is worse that is not accepted, and then keeps nothing."""
+    """Compare with the history. Raises ShareError where something is worse that is not accepted, and then
+    keeps nothing."""
     before = history(options.history)
     now = played(Config(), options)
     known = [*now, _ALL]
     if strange := [name for name in options.accept if name not in known]:
-        raise UsageError(f"--accept {strange[0]}: is none of {', '.join(known)}")
+        raise UsageError(f"--accept {strange[0]}: not known; known: {', '.join(known)}")
     accepted = list(now) if _ALL in options.accept else options.accept
     verdicts = judged(now, wanted(before))
     print(table(verdicts))
@@ -160,7 +165,7 @@ def compare(options: argparse.Namespace) -> None:
 
 
 def wanted(lines: Sequence[Mapping[str, Any]]) -> Figures:
-    """Of each figure the median over `lines`, from the last one on in which it was accepted."""
+    """Return the median of each figure over `lines`, since it was last accepted."""
     since: dict[str, list[float]] = {}
     for one in lines:
         for name, value in one["figures"].items():
@@ -170,7 +175,7 @@ def wanted(lines: Sequence[Mapping[str, Any]]) -> Figures:
 
 
 def played(config: Config, options: argparse.Namespace) -> Figures:
-    """Raises ShareError where a run fails."""
+    """Run the set. Raises ShareError where a run fails."""
     sessions = [read_session(make_cached_session(recipe, options.cache, options.workers)) for recipe in SET]
     with tempfile.TemporaryDirectory() as folder:
         terms = RunOptions("", link="wifi5", virtual=True)
@@ -184,8 +189,8 @@ def played(config: Config, options: argparse.Namespace) -> Figures:
 
 
 def figures_of(runs: Sequence[RunMetrics]) -> Figures:
-    """Medians by name, `POLICY: MEASURE`: one run that ends amid a join should not be all there is to see. Of
-    agents in one map the mean, in which one that does not come into it shows."""
+    """Return medians by name, `POLICY: MEASURE`, so that one run that ends amid a merge does not decide; for
+    agents in one map the mean, which shows a single agent that is missing."""
     out = {f"{POLICIES[0]}: {_ODOMETRY}": _median(a.odom_ate_cm for run in runs for a in run.agents)}
     for policy in policy_names(runs):
         mine = [run for run in runs if run.conditions.policy == policy]
@@ -212,7 +217,7 @@ def judged(now: Mapping[str, float], before: Mapping[str, float]) -> list[Verdic
 
 
 def history(path: Path) -> list[dict[str, Any]]:
-    """All runs that were kept, the oldest first. Raises DataError."""
+    """Return all kept runs, the oldest first. Raises DataError."""
     try:
         return [json.loads(text) for text in path.read_text().splitlines()] if path.exists() else []
     except ValueError as error:
@@ -220,7 +225,7 @@ def history(path: Path) -> list[dict[str, Any]]:
 
 
 def by_chance(options: argparse.Namespace) -> None:
-    """Prints the standard deviation of each figure, as a part of its mean, and three of them."""
+    """Print the relative standard deviation of each figure, and three of them."""
     base = Config()
     found = []
     for k in range(options.chance):
@@ -245,21 +250,21 @@ def table(verdicts: Sequence[Verdict]) -> str:
 
 
 def commit() -> str:
-    """Of this tree, with a + where it has changes; empty where there is no git."""
+    """Return this tree's commit, with a + for uncommitted changes; empty without git."""
     try:
-        told = ["git", "describe", "--always", "--dirty=+"]
+        command = ["git", "describe", "--always", "--dirty=+"]
         return subprocess.run(
-            told, cwd=HISTORY.parent, capture_output=True, text=True, check=True
+            command, cwd=HISTORY.parent, capture_output=True, text=True, check=True
         ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return ""
 
 
 def draw(path: Path, kept: Sequence[Mapping[str, Any]]) -> None:
-    """Each figure over the runs that were kept; the band is its noise about what it is held against. Raises
-    UsageError where there are none."""
+    """Draw each figure over the kept runs; the band is its noise about its reference. Raises UsageError
+    without any."""
     if not kept:
-        raise UsageError("--picture: nothing was kept yet; --keep WHY keeps a run")
+        raise UsageError("--picture: the history is empty; add a run by --keep WHY")
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,9 +1,9 @@
-"""The bill of materials of the frozen program, as CycloneDX 1.6 in JSON.
+"""Software bill of materials of the frozen program, as CycloneDX 1.6 in JSON.
 
     python tools/sbom.py PYTHON OUT
 
-PYTHON is that of the environment which the program is built in. What only builds it has the scope `excluded`.
-The file is checked against CycloneDX's schema before it is written, and is the same for the same environment.
+PYTHON is that of the build environment. Packages for building only have the scope `excluded`. The file is
+checked against CycloneDX's schema before it is written, and is deterministic for a given environment.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ BUILD_ONLY = {
     "setuptools",
     "altgraph",
     "pyinstaller-hooks-contrib",
-}  # PyInstaller's bootloader is in it
+}  # PyInstaller's bootloader is part of the program
 OWN = "share-slam"
 
 
 def bill(python: str) -> dict[str, Any]:
-    """Of what is installed for this interpreter, and the interpreter."""
+    """Return the components installed for this interpreter, and the interpreter."""
     command = [str(Path(sys.executable).with_name("cyclonedx-py")), "environment", python]
     more = ("--spec-version", "1.6", "--output-reproducible", "-o", "-")
     found = json.loads(subprocess.run([*command, *more], check=True, capture_output=True).stdout)
     (own,) = (part for part in found["components"] if part["name"] == OWN)
-    own.pop("externalReferences", None)  # where it was checked out
+    own.pop("externalReferences", None)  # path of the checkout
     found["components"] = [part for part in found["components"] if part is not own] + [_interpreter(python)]
     found.setdefault("metadata", {})["component"] = own | {"type": "application"}
     for part in found["components"]:
@@ -47,7 +47,7 @@ def _interpreter(python: str) -> dict[str, Any]:
 
 
 def faults(text: str) -> str | None:
-    """What CycloneDX's schema says against it."""
+    """Return what CycloneDX's schema finds wrong, None if nothing."""
     from cyclonedx.schema import SchemaVersion
     from cyclonedx.validation.json import JsonStrictValidator
 

@@ -1,4 +1,4 @@
-"""The frozen program without what its libraries bring and SHARE never uses. Figures: docs/do/freeze.md."""
+"""Remove from the frozen program what its libraries bring and SHARE never uses. Figures: docs/do/freeze.md."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pathlib import Path
 
 from stub_library import exported, needed, wanted, write_forward, write_hollow
 
-# Who asks for them, and what is hollowed out: video for cv2's VideoCapture, pictures that Pillow knows
-# beside PNG (matplotlib writes no other). They say so and abort.
-# But cv2 tries AVIF on whatever it is to decode: a libaom that answers finds no picture there.
+# Libraries to replace by hollow ones, by their user: video for cv2's VideoCapture, and Pillow's formats other
+# than PNG (the only one that matplotlib writes). Their functions report and abort. But cv2 tries AVIF on
+# every image that it decodes: that libaom answers that it finds none.
 HOLLOW = (
     (["cv2/cv2*.so"], ("libavcodec", "libavformat", "libavutil", "libswscale"), False),
     (["PIL/_imaging.*.so", "pillow.libs/libtiff-*"], ("libjpeg", "libzstd", "liblzma", "libxcb"), False),
@@ -25,7 +25,7 @@ _ELF = b"\x7fELF"
 
 
 def slim(inside: Path) -> None:
-    """inside: the `_internal` of a frozen program.
+    """Slim the frozen program. inside: its `_internal`.
 
     Raises subprocess.CalledProcessError where a tool fails, and what `one_blas` does.
     """
@@ -42,7 +42,7 @@ def slim(inside: Path) -> None:
 
 
 def one_blas(inside: Path) -> None:
-    """cv2's LAPACK, an OpenBLAS of 39 MB that it takes for large matrices only, led to SciPy's.
+    """Redirect cv2's LAPACK, an OpenBLAS of 39 MB that it uses for large matrices only, to SciPy's.
 
     Raises KeyError where SciPy's lacks a function, ValueError where there is not one of each.
     """
@@ -55,7 +55,7 @@ def one_blas(inside: Path) -> None:
 
 
 def remove_orphans(inside: Path) -> None:
-    """What only those asked for that are hollow now."""
+    """Remove libraries that only the hollowed ones needed."""
     while True:
         asked = {name for binary in binaries(inside) for name in needed(binary)}
         orphans = [path for path in _bundled(inside, ("lib",)) if path.name not in asked]
@@ -66,9 +66,9 @@ def remove_orphans(inside: Path) -> None:
 
 
 def strip(binary: Path) -> None:
-    """Without symbols for debugging, if the loader takes it then.
+    """Strip debugging symbols, if the result still loads.
 
-    Of some that auditwheel has patched, `strip` makes files that the loader refuses.
+    `strip` breaks some files that auditwheel has patched.
     """
     trial = binary.with_name(binary.name + ".stripped")
     subprocess.run(["strip", "--strip-unneeded", "-o", trial, binary], check=True, stderr=subprocess.DEVNULL)
@@ -80,7 +80,8 @@ def strip(binary: Path) -> None:
 
 
 def loadable(binary: Path) -> bool:
-    """Does every segment of a 64-bit ELF file lie in the file as it shall lie in memory, to a page? elf(5)"""
+    """Return whether every segment of a 64-bit ELF file has equal offsets in file and memory, modulo a page.
+    elf(5)"""
     data = binary.read_bytes()
     (table,), (entries,) = struct.unpack_from("<Q", data, 32), struct.unpack_from("<H", data, 56)
     for k in range(entries):
@@ -91,7 +92,8 @@ def loadable(binary: Path) -> bool:
 
 
 def link_twins(inside: Path) -> None:
-    """Of what several wheels bring (the same name but for the hash, the same symbols) one, and links."""
+    """Replace copies of a library by several wheels (same name but for the hash, same symbols) by links to
+    one."""
     first: dict[tuple[str, frozenset[tuple[str, str]]], Path] = {}
     for path in _bundled(inside, ("lib",)):
         key = _HASH.sub("", path.name), frozenset(exported(path).items())
@@ -107,7 +109,7 @@ def remove_dangling(inside: Path) -> None:
 
 
 def binaries(inside: Path) -> Iterator[Path]:
-    """Every ELF file."""
+    """Yield every ELF file."""
     for path in sorted(inside.rglob("*.so*")):
         if path.is_file() and not path.is_symlink():
             with path.open("rb") as file:
@@ -116,7 +118,7 @@ def binaries(inside: Path) -> Iterator[Path]:
 
 
 def _bundled(inside: Path, begin: tuple[str, ...]) -> list[Path]:
-    """Libraries that wheels bring along (NAME.libs) whose names begin so."""
+    """Return libraries bundled by wheels (NAME.libs) with names that begin with `begin`."""
     return sorted(
         path for path in inside.glob("*.libs/*.so*") if path.name.startswith(begin) and not path.is_symlink()
     )

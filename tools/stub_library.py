@@ -1,6 +1,6 @@
-"""Small shared libraries in place of large ones: same name and symbols, but hollow, or leading elsewhere.
+"""Small shared libraries in place of large ones: same name and symbols, but hollow, or forwarding.
 
-What is linked must be there for the loader, used or not. Needs a C compiler, `cc`, and binutils.
+A linked library must exist for the loader, used or not. Needs a C compiler, `cc`, and binutils.
 """
 
 from __future__ import annotations
@@ -20,35 +20,32 @@ _JUMP = {"x86_64": "jmp {}@PLT", "aarch64": "b {}"}
 
 
 def exported(library: Path) -> dict[str, str]:
-    """Symbols of `library` that others may use, each with its version, "" where it has none."""
+    """Return the exported symbols of `library` with their versions, "" without one."""
     return {name: "" if version == "Base" else version for name, version in _table(library, defined=True)}
 
 
 def wanted(users: Iterable[Path], library: Path) -> dict[str, str]:
-    """Of what `library` exports, what `users` ask for."""
+    """Return the exports of `library` that `users` import."""
     asked = {name for user in users for name, _ in _table(user, defined=False)}
     return {name: version for name, version in exported(library).items() if name in asked}
 
 
 def needed(binary: Path) -> list[str]:
-    """Names of the libraries that it is linked with."""
-    return re.findall(r"NEEDED\s+(\S+)", _told("objdump", "-p", binary))
+    """Return the names of the libraries that it is linked with."""
+    return re.findall(r"NEEDED\s+(\S+)", _output("objdump", "-p", binary))
 
 
 def write_hollow(path: Path, symbols: Mapping[str, str], answers: bool = False) -> None:
-    """In place of the library at `path`: every function says that it is left out and aborts, or, if it
-    `answers`, returns 0. symbols: with versions. Raises subprocess.CalledProcessError.
-    """
+    """Write a hollow library in place of `path`: every function reports that it is left out and aborts
+    or, if `answers`, returns 0. symbols: with versions. Raises subprocess.CalledProcessError."""
     head = (_ANSWERS_NOTHING if answers else _ABORTS).format(library=path.name.partition("-")[0])
     functions = "".join(f"long {name}(void) BODY\n" for name in sorted(symbols))
     _build(path, head + functions, symbols)
 
 
 def write_forward(path: Path, symbols: Iterable[str], prefix: str, to: Path) -> None:
-    """In place of the library at `path`: each function goes on in the library `to`, which has it by a name
-    that begins with `prefix`. Raises subprocess.CalledProcessError, KeyError on a processor of which it
-    knows no jump.
-    """
+    """Write a library in place of `path` whose functions jump to those of the library `to` with names
+    prefixed by `prefix`. Raises subprocess.CalledProcessError, KeyError on an unsupported processor."""
     jump = _JUMP[platform.machine()]
     lines = (
         rf'".globl {name}\n.type {name},%function\n{name}: {jump.format(prefix + name)}\n"'
@@ -77,10 +74,10 @@ def _build(path: Path, source: str, versions: Mapping[str, str], link: Sequence[
 
 
 def _table(binary: Path, defined: bool) -> list[tuple[str, str]]:
-    """(name, version) of its dynamic symbols. objdump's line: address, flags, section, tab, size, version
-    (in brackets if it is another's, or not the default), name."""
+    """Return (name, version) of dynamic symbols. objdump's line: address, flags, section, tab, size, version
+    (in brackets if it is not the default or another library's), name."""
     found = []
-    for line in _told("objdump", "-T", binary).splitlines():
+    for line in _output("objdump", "-T", binary).splitlines():
         left, tab, right = line.partition("\t")
         if tab and (left.split()[-1] != "*UND*") == defined:
             _, *version, name = right.split()
@@ -88,5 +85,5 @@ def _table(binary: Path, defined: bool) -> list[tuple[str, str]]:
     return found
 
 
-def _told(*command: str | Path) -> str:
+def _output(*command: str | Path) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -217,7 +217,9 @@ def _base_model_file(model_given: Path | None) -> Path:
     from share.odometry.error_model.network import SHIPPED_MODEL
 
     if model_given is None and not SHIPPED_MODEL.is_file():
-        raise UsageError("--base is required: this SHARE ships no model; see tools/make_backbone.py")
+        raise UsageError(
+            "--base: no model is shipped yet; make a backbone with tools/experiments/make_backbone.py"
+        )
     return model_given or SHIPPED_MODEL
 
 

@@ -60,11 +60,11 @@ TYPED = {
     "key": (["--motion", "walk:sped=1"], "'walk:sped=1': unknown key 'sped'; did you mean 'speed'?"),
     "value": (["--motion", "walk:speed=9"], "'walk:speed=9': speed=9: expected 0.2 to 2 m/s"),
     "experiment": (["--motion", "paper:6"], "'paper:6': the paper has five experiments; say paper:1 to"),
-    "no folder": (["--motion", "euroc:"], "'euroc:': says no folder or file"),
+    "no folder": (["--motion", "euroc:"], "'euroc:': names no folder or file"),
     "folder": (["--motion", "euroc:V1_02"], "V1_02: no recorded motion is here; expected mav0/imu0/data.csv"),
     "file": (["--motion", "tum:poses.txt"], "poses.txt: no such file"),
     "twice": (["--motion", "a=walk:", "--motion", "a=robot:"], "two agents are named 'a'; give each its own"),
-    "taken": (["--motion", "truth=walk:"], "an agent cannot be named 'truth': the session's truth is in"),
+    "taken": (["--motion", "truth=walk:"], "an agent cannot be named 'truth': a folder of the"),
     "size": (["--size", "50x50x50"], "the plain room can be 5 x 4 x 2.2 to 12 x 9 x 4 m"),
     "word for a size": (["--size", "big"], "'big' is not a size in metres such as 9x6x4"),
     "halls": (
@@ -96,7 +96,7 @@ TYPED = {
         ["--profile", "euroc"],
         "walk1: scene 'plain' has no lens distortion; give --profile walk1=d435i",
     ),
-    "in a file": (["--out", "note/deep/session"], "note/deep/session: lies below a file, "),
+    "in a file": (["--out", "note/deep/session"], "note/deep/session: its parent "),
     "there already": (["--out", "note"], "note: exists already; give the name of a new folder"),
 }
 
@@ -190,7 +190,7 @@ EUROC = {
     "no overlap": (
         lambda r: shift(r / _TRUTH, 10**12),
         1,
-        "flight: IMU and truth do not overlap; are they of",
+        "flight: IMU and ground truth do not overlap in time; give",
     ),
     "no rotation": (
         lambda r: edit(r / _TRUTH, 9, lambda row: [*row[:4], "0", "0", "0", "0"]),
@@ -203,7 +203,7 @@ EUROC = {
     "no truth": (
         lambda r: shutil.rmtree(r / "mav0/state_groundtruth_estimate0"),
         1,
-        "has no truth; expected",
+        "has no ground truth; expected",
     ),
     "too short": (lambda r: edit(r / _TRUTH, 9, lambda row: row), 2, "at least 1 s are needed"),
 }
@@ -245,7 +245,7 @@ def test_a_disk_that_fills_up(small, tmp_path):
         [*SHARE, "emulate", *words], cwd=tmp_path, preexec_fn=limit, capture_output=True, text=True
     )
     line = complaint(Done(done.returncode, done.stdout, done.stderr), 1)
-    assert "cannot be written: File too large; the same command goes on with what is drawn" in line
+    assert "cannot be written: File too large; run the same command again to resume" in line
     assert os.listdir(tmp_path) == [".session.partial"]
 
 

@@ -52,7 +52,7 @@ def test_without_a_truth_there_is_nothing_to_learn(share, plain_session, tmp_pat
         shutil.copy(path, bare)
     done = share("train", "labels", bare, "--out", tmp_path / "labels")
     assert done.code == 2
-    assert "has no truth/ar1.tum to tell how wrong it is" in done.err
+    assert "has no ground truth truth/ar1.tum, which labels need" in done.err
     assert not (tmp_path / "labels").exists()
 
 

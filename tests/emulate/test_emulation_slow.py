@@ -1,4 +1,4 @@
-"""What tools/measure_emulation.py and tools/measure_paper.py measure at length, in part."""
+"""A part of what measure_emulation.py and measure_paper.py in tools/experiments measure."""
 
 import importlib
 import json
@@ -14,7 +14,7 @@ from share.lab.emulate.render.context import missing_reason
 from share.lab.emulate.session import make_session
 
 pytestmark = pytest.mark.slow
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 
 
 @pytest.fixture(scope="module")

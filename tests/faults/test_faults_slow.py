@@ -1,4 +1,4 @@
-"""How the inertial tracker bears each fault on its own, on 20 s of a walk. See tools/measure_faults.py.
+"""How the inertial tracker bears each fault on its own, on 20 s of a walk. See measure_faults.py.
 
 What is not good enough yet is in `FAR` and `WRONG`, with the figure: once it is, it fails here
 until it is taken out.
@@ -19,7 +19,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}"),
 ]
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 SESSIONS = {
     "warehouse": SessionRecipe("warehouse", ("a=walk:",), 20.0, seed=7, profiles={"": "d435i:640x480@30"}),
     "firestation": SessionRecipe("firestation", ("a=walk:",), 20.0, seed=3),

@@ -33,7 +33,7 @@ def test_models_of_the_error(tmp_path):
 def test_scores_that_are_damaged_are_named(tmp_path, text):
     file = tmp_path / "scores.json"
     file.write_text(text)
-    with pytest.raises(DataError, match=r"scores\.json: is not by `share train compare --json`, or damaged"):
+    with pytest.raises(DataError, match=r"\.json: not a file of `share train compare --json`, or damaged"):
         read_section(file, 1)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 
 
 def test_every_stage_that_is_timed_exists(monkeypatch: pytest.MonkeyPatch) -> None:

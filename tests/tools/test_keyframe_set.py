@@ -19,7 +19,7 @@ from share.sensors.sequencer import SequencerCounters
 from share.types import AgentKind
 from share.vision.orb import make_view
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 NAMES = {"ann": AgentKind.AR, "rob": AgentKind.ROBOT}
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from share.lab.emulate.motion.spec import parse_motion
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""tools/measure_claims.py: what it makes of a lie, and what lies cost in a room of points."""
+"""tools/experiments/measure_claims.py: what it makes of a lie, and what lies cost in a room of points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge_sim import Person, walls
 from share.geometry import se3
 from share.types import AgentKind, Keyframe
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 STEPS = 48
 SEEDS = range(1, 11)
 COSTS = 1.10  # what a lie may cost the others, as a part of their error: of all rooms together
@@ -84,9 +84,9 @@ def geometric_mean(ratios: list[float]) -> float:
 
 def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
     agent = room(1).agents["eve"]
-    ((hello, honest),) = tool.told(agent, tool.Lie())
+    ((hello, honest),) = tool.claimed_runs(agent, tool.Lie())
     assert (hello.name, hello.run_id) == (agent.hello.name, agent.hello.run_id)
-    ((turned, seen),) = tool.told(agent, tool.Lie(path=1.1, depth=0.9, sure=10.0, turn_deg=5.0))
+    ((turned, seen),) = tool.claimed_runs(agent, tool.Lie(path=1.1, depth=0.9, sure=10.0, turn_deg=5.0))
     apart = se3.rotation_angle(se3.inverse(hello.rig.T_body_cam0) @ turned.rig.T_body_cam0)
     assert np.degrees(apart) == pytest.approx(5.0)
     for k, (one, other) in enumerate(zip(honest, seen, strict=True)):
@@ -100,13 +100,13 @@ def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
 
 def test_who_lies_later_or_is_started_again(tool):
     agent = room(1).agents["eve"]
-    ((_, later),) = tool.told(agent, tool.Lie(depth=1.1, after_s=6.0))
+    ((_, later),) = tool.claimed_runs(agent, tool.Lie(depth=1.1, after_s=6.0))
     ratios = [
         float(seen.candidate.view.points[0, 0] / keyframe.view.points[0, 0])
         for seen, keyframe in zip(later, agent.keyframes, strict=True)
     ]
     assert ratios == pytest.approx([1.0] * 24 + [1.1] * 24, rel=1e-5)
-    runs = tool.told(agent, tool.Lie(depth=1.1, every_s=2.0))
+    runs = tool.claimed_runs(agent, tool.Lie(depth=1.1, every_s=2.0))
     assert len({hello.run_id for hello, _ in runs}) == len(runs) > 1
     assert len({hello.name for hello, _ in runs}) == 1
     for (_, before), (_, after) in itertools.pairwise(runs):

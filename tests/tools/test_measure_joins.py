@@ -1,4 +1,4 @@
-"""The table of tools/measure_joins.py."""
+"""The table of tools/experiments/measure_joins.py."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from share.errors import ConfigError
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 
 
 @pytest.fixture(scope="module")
@@ -48,5 +48,5 @@ def test_settings_are_taken_and_unknown_ones_refused(tool):
 def test_without_sets_there_is_nothing_to_say(tool, tmp_path, capsys):
     words = ["--scene", "empty-hall", "--motion", "walk:", "--seeds", "7:9", "--cache", str(tmp_path)]
     assert tool.main([*words, "--json", str(tmp_path / "out.json")]) == 2
-    assert "no set is there; make them with make_keyframe_sets.py" in capsys.readouterr().err
+    assert "there are no sets; make them with make_keyframe_sets.py" in capsys.readouterr().err
     assert not (tmp_path / "out.json").exists()

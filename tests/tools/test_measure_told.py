@@ -14,7 +14,7 @@ from share.lab.evaluate.real_time import AgentScore, SessionScore
 from share.metrics.ate import Ate, JointAte
 from share.recordings.trajectory import Trajectory
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 S = 1_000_000_000
 
 
@@ -60,9 +60,9 @@ def test_a_row_says_how_well_agents_know_themselves(tool):
     assert row == {
         "runs": "2",
         "N": "4",
-        "told, cm": "2.74",
+        "estimated, cm": "2.74",
         "true, cm": "6.12",
-        "true / told": "2.12",
+        "true / estimated": "2.12",
         "within twice, %": "50",
         "rank": "0.80",
         "of runs": "1.00",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-TOOL = Path(__file__).parents[2] / "tools" / "simulate_scale.py"
+TOOL = Path(__file__).parents[2] / "tools" / "experiments" / "simulate_scale.py"
 
 
 @pytest.mark.slow
@@ -28,4 +28,4 @@ def test_rooms_that_are_apart_are_a_map_each(tmp_path: Path) -> None:
 def test_a_size_that_is_none_is_said() -> None:
     done = subprocess.run([sys.executable, str(TOOL), "--rooms-of", "10"], capture_output=True, text=True)
     assert done.returncode == 2
-    assert "'10': give ROOMSxAGENTS" in done.stderr
+    assert "'10': expected ROOMSxAGENTS" in done.stderr

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-TOOL = Path(__file__).parents[2] / "tools" / "tune_rates.py"
+TOOL = Path(__file__).parents[2] / "tools" / "experiments" / "tune_rates.py"
 
 
 def tuned(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -36,7 +36,8 @@ def test_fewer_keyframes_save_latency_and_a_picture_shows_it(tmp_path: Path) -> 
 
 def test_what_is_no_setting_is_said() -> None:
     done = tuned("control.kp")
-    assert (done.returncode, done.stderr) == (2, "tune_rates: 'control.kp': give SECTION.NAME=VALUE,VALUE…\n")
+    said = "tune_rates: 'control.kp': expected SECTION.NAME=VALUE,VALUE…\n"
+    assert (done.returncode, done.stderr) == (2, said)
 
 
 @pytest.mark.slow

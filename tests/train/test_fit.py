@@ -94,7 +94,7 @@ def test_a_test_on_what_was_learnt_is_refused(share, labels, base, tmp_path):
         (fewer / path.name).write_bytes(path.read_bytes())
     done = share("train", "compare", fewer, "--fit", fit, "--base", base)
     assert done.code == 2
-    assert "is not what it was taught on" in done.err
+    assert "these labels are not those of the training" in done.err
 
 
 def test_too_few_rooms_are_said(share, labels, base, tmp_path):

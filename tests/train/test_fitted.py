@@ -64,5 +64,5 @@ def test_what_is_kept_is_read(tmp_path, rng):
     assert (found.heads[0]["a.weight"] == weights["a.weight"]).all()
     assert (found.heads[1]["a.weight"] == 2 * weights["a.weight"]).all()
     (tmp_path / "fit.npz").write_bytes(b"no")
-    with pytest.raises(DataError, match=r"fit\.npz: is not by `share train fit`, or damaged"):
+    with pytest.raises(DataError, match=r"fit\.npz: not a file of `share train fit`, or damaged"):
         read_trained(tmp_path / "fit.npz")

@@ -41,7 +41,7 @@ def test_what_is_damaged_is_named(labels, tmp_path):
     whole = path.read_bytes()
     for data in (b"", b"text", whole[: len(whole) // 2]):
         path.write_bytes(data)
-        with pytest.raises(DataError, match=r"one\.npz: is no file of labels, or damaged"):
+        with pytest.raises(DataError, match=r"one\.npz: not a label file, or damaged"):
             read_labels(path)
 
 

@@ -1,4 +1,4 @@
-"""A finished session as EuRoC/ASL folders, for other people's programs."""
+"""Convert a finished session to EuRoC/ASL folders, for other programs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from share.runtime.source import open_source
 
 
 def check_asl(stage: RoomStage) -> None:
-    """Raises UsageError where an agent has what such a folder has no place for."""
+    """Raise UsageError where an agent has data that such a folder cannot hold."""
     for actor in stage.actors:
         if actor.device.clock.period_ns:
-            raise UsageError("stamps in an ASL folder do not wrap; leave --effect wrap=on out")
+            raise UsageError("ASL folders cannot hold stamps that wrap; leave out --effect wrap=on")
         if actor.rig.depth is not None:
             raise UsageError(
                 f"{actor.name}: an ASL folder has no place for depth; give --sensors {actor.name}=stereo"
@@ -24,7 +24,7 @@ def check_asl(stage: RoomStage) -> None:
 
 
 def to_asl(folder: Path, names: list[str], progress: Progress) -> None:
-    """Each NAME.mcap of the session in `folder` to NAME/mav0; the truth is in there too."""
+    """Convert each NAME.mcap of the session in `folder` to NAME/mav0, with the ground truth."""
     for name in names:
         source = open_source(str(folder / name))
         count = stage_progress(progress, f"writing {name}/mav0", source.images_count)

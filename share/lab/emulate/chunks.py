@@ -1,5 +1,5 @@
-"""A few frames of one agent, encoded, on disk until its recording is written: what a break leaves
-is not drawn again."""
+"""A few encoded frames of one agent on disk until its recording is written, so that an interrupted session
+can be resumed."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from share.files.writing import atomic_write
 from share.recordings.images import EncodedImage
 from share.sensors.measurement import DEPTH, Measurement
 
-DEPTH_SCALE = 1000.0  # millimetres
+DEPTH_SCALE = 1000.0  # per metre: millimetres
 
 
 class EncodedPicture(msgspec.Struct, frozen=True, array_like=True):
-    """One image as it will be recorded: JPEG or PNG."""
+    """One image as recorded: JPEG or PNG."""
 
     stream: str
     stamp_ns: int
@@ -28,12 +28,12 @@ class EncodedPicture(msgspec.Struct, frozen=True, array_like=True):
 
 
 def write_chunk(path: Path, pictures: list[EncodedPicture]) -> None:
-    """Whole or not at all. Raises as `atomic_write`."""
+    """Write the chunk atomically. Raises as `atomic_write`."""
     atomic_write(path, msgspec.msgpack.encode(pictures))
 
 
 def read_chunk(path: Path) -> Iterator[Measurement]:
-    """In the order in which they were written. Raises DataError if it is damaged."""
+    """Yield the images in the order in which they were written. Raises DataError if the chunk is damaged."""
     try:
         pictures = msgspec.msgpack.decode(read_bytes(path, MAX_ARRAYS_BYTES), type=list[EncodedPicture])
     except (OSError, msgspec.DecodeError, msgspec.ValidationError) as error:
@@ -43,5 +43,5 @@ def read_chunk(path: Path) -> Iterator[Measurement]:
 
 
 def encoded_image(p: EncodedPicture, where: str) -> EncodedImage:
-    """As a reader has it. where: what an error names."""
+    """Return the image as a reader does. where: named in errors."""
     return EncodedImage(p.data, where, p.width, p.height, DEPTH_SCALE if p.stream == DEPTH else 0.0)

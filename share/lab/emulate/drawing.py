@@ -1,7 +1,7 @@
-"""What a worker process does: it opens the room once, and then draws the frames that it is given.
+"""The work of a drawing process: open the room once, then draw frames as asked.
 
-First every actor's light is metered, at an eighth of the size; from that the device decides how each
-frame is exposed; then they are drawn, developed and encoded.
+First the light of each actor is metered at an eighth of the image size; from that the device decides the
+exposure of each frame; then frames are drawn, developed and encoded.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from share.lab.emulate.types import RoomRenderer
 from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.types import F64, I64, U8
 
-_METER_FACTOR = 8  # times smaller than the picture
-_METER_INTERVAL_NS, _METER_BATCH = 125_000_000, 50  # light is metered so often, by so many looks a job
+_METER_FACTOR = 8  # times smaller than the images
+_METER_INTERVAL_NS = 125_000_000
+_METER_BATCH = 50  # measurements a job
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95]
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _DEPTH_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
@@ -31,8 +32,8 @@ _DEPTH_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRIT
 
 @dataclass(frozen=True, eq=False)
 class ChunkJob:
-    """Frames first .. last - 1 (places in the actor's `pictures`) of actor number `actor_index`. file: the
-    chunk to write; shots: how they are exposed, one a frame."""
+    """Frames first .. last - 1 (indices into `pictures`) of actor number `actor_index`. file: the chunk to
+    write; shots: exposure of each frame."""
 
     actor_index: int
     first: int
@@ -43,7 +44,7 @@ class ChunkJob:
 
 @dataclass(frozen=True, eq=False)
 class MeterJob:
-    """Actor number `actor_index` looks about at true times (N,)."""
+    """Meter the light of actor number `actor_index` at true times (N,)."""
 
     actor_index: int
     true_ns: I64
@@ -60,27 +61,26 @@ _worker: _DrawingWorker | None = None
 
 
 def start_worker(stage: RoomStage, images: str) -> None:
-    """Called once in each worker process. images: jpeg or png."""
-    global _worker  # a process has one
+    """Open the room in this worker process. images: jpeg or png."""
+    global _worker
     _worker = _DrawingWorker(stage, images)
 
 
 def meter_jobs(actor_index: int, actor: Actor) -> list[MeterJob]:
-    """Where to meter, so that `exposure_series` can say how each of the actor's frames is taken."""
+    """Return jobs whose measurements `exposure_series` needs."""
     true_ns = actor.pictures.true_ns
     times = np.append(np.arange(true_ns[0], true_ns[-1], _METER_INTERVAL_NS), true_ns[-1])
     return [MeterJob(actor_index, times[k : k + _METER_BATCH]) for k in range(0, len(times), _METER_BATCH)]
 
 
 def exposure_series(actor: Actor, jobs: Sequence[MeterJob], brightness: F64) -> ExposureSeries:
-    """How each of the actor's frames is taken; brightness (N,): what `measure_brightness` found by all
-    the looks."""
+    """Return the exposure of each of the actor's frames; brightness (N,): of all measurements of `jobs`."""
     true_ns, times = actor.pictures.true_ns, np.concatenate([job.true_ns for job in jobs])
     return actor.device.exposures(true_ns, np.interp(true_ns - times[0], times - times[0], brightness))
 
 
 def measure_brightness(job: MeterJob) -> F64:
-    """Mean radiance of each (N,) image of cam0."""
+    """Return the mean radiance of each (N,) image of cam0."""
     w = _current_worker()
     rig = w.stage.actors[job.actor_index].rig
     camera, T_body_cam = downsized(rig.cam0, _METER_FACTOR), T_body_camera(rig, CAM0)
@@ -96,7 +96,7 @@ def draw_chunk(job: ChunkJob) -> None:
 
 
 def draw_pictures(actor_index: int, rows: slice, shots: ExposureSeries) -> Iterator[EncodedPicture]:
-    """The images of some of an actor's `pictures`, frame by frame; shots: how each frame is exposed."""
+    """Yield the images of some of an actor's `pictures`, frame by frame; shots: exposure of each frame."""
     w = _current_worker()
     for frame in _frame_jobs(w, actor_index, rows, shots):
         yield from _develop_frame(w, w.stage.actors[actor_index], frame)
@@ -104,7 +104,7 @@ def draw_pictures(actor_index: int, rows: slice, shots: ExposureSeries) -> Itera
 
 @dataclass(frozen=True, eq=False)
 class _FrameJob:
-    """One frame to be drawn: the sights over its exposure, and the one in the middle of it."""
+    """One frame to draw: views over its exposure, and the view in the middle of it."""
 
     index: int
     stamp_ns: int

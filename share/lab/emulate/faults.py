@@ -1,7 +1,7 @@
-"""What goes wrong with cameras and an IMU, done to a recording that was sound. One table: `FAULTS`.
+"""Faults of cameras and IMU, applied to a sound recording. One table: `FAULTS`.
 
-Pure and seeded: the same frames give the same faulty frames. What comes for a while comes after 40 % of the
-recording, what moves by itself after 25 %.
+Pure functions of the frames, with fixed seeds. Temporary faults start at 40 % of the recording, moving panels
+at 25 %.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ FrameFilter = Callable[[Frames, Rig, Trajectory], Frames]
 MeasurementFilter = Callable[[Sequence[Measurement]], list[Measurement]]
 
 _FAULT_START, _MOVER_START, _MOVER_S = 0.4, 0.25, 10.0
-_DROP_SHARE, _GAP_FACTOR = 0.2, 2.5  # gap: as the sequencer has it, times the usual step
+_DROP_SHARE, _GAP_FACTOR = 0.2, 2.5  # gap as in the sequencer: longer than this many usual steps
 _BLACK_S, _WALL_S, _FADE_S = 2.0, 3.0, 0.5
 _EXPOSURE_STEP_S = 1.5
-_BAD_STAMP_SHARE = 0.02  # of images, for each sort
+_BAD_STAMP_SHARE = 0.02  # of images, for each kind of bad stamp
 _STAMP_JUMP_NS, _STAMP_BACK_NS = 40_000_000, 500_000_000
 _CLIPPED_SHARE = 0.05  # of samples
-_MAX_BLUR_RAD = 3.0 * 0.008  # rad/s, s
+_MAX_BLUR_RAD = 3.0 * 0.008  # rad/s times s
 
 
 class Fault(NamedTuple):
-    """does: for a person. change: of frames; arriving: of measurements before the sequencer orders them."""
+    """description: for the user. change_frames: changes frames; change_measurements: changes measurements
+    before the sequencer."""
 
     description: str
     change_frames: FrameFilter | None = None
@@ -44,7 +45,7 @@ class Fault(NamedTuple):
 
 
 def apply_fault(fault: Fault, frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
-    """What the tracker gets. truth: where the body was in the world, for what moves in it."""
+    """Return the frames with the fault. truth: body poses in the world, which moving panels need."""
     return frames if fault.change_frames is None else fault.change_frames(frames, rig, truth)
 
 
@@ -52,7 +53,8 @@ def apply_fault(fault: Fault, frames: Frames, rig: Rig, truth: Trajectory) -> Fr
 
 
 def drop20(frames: Frames, *_: object) -> Frames:
-    """IMU samples of a lost frame come with the next, as from the sequencer."""
+    """Drop 20 % of the frames. IMU samples of a dropped frame come with the next one, as from the
+    sequencer."""
     is_dropped = np.random.default_rng(1).random(len(frames)) < _DROP_SHARE
     usual = np.median(np.diff([frame.stamp_ns for frame in frames]))
     out: Frames = []
@@ -69,7 +71,8 @@ def drop20(frames: Frames, *_: object) -> Frames:
 
 
 def bad_stamps(measurements: Sequence[Measurement]) -> list[Measurement]:
-    """The images of one frame share their fate: they are known by their number in their stream."""
+    """Give some images wrong stamps, the same for all images of a frame (matched by their index in their
+    stream)."""
     rng = np.random.default_rng(12)
     error_kinds = rng.choice(4, len(measurements), p=[1 - 3 * _BAD_STAMP_SHARE, *[_BAD_STAMP_SHARE] * 3])
     jumps = _STAMP_JUMP_NS * rng.choice([-1, 1], len(measurements))
@@ -130,13 +133,13 @@ def white_wall(frames: Frames, *_: object) -> Frames:
 
 
 def blur(frames: Frames, rig: Rig, *_: object) -> Frames:
-    """Box blur along the way that the middle of the image goes by the gyro while it is exposed."""
+    """Box blur along the image motion that the gyro predicts for the image's middle during the exposure."""
     imu = ImuBatch.empty().concatenate(*(frame.imu for frame in frames))
     fastest = np.quantile(np.linalg.norm(imu.gyro, axis=1), 0.99) if len(imu) else 0.0
     if fastest == 0:
         return frames
     turn = np.stack([np.interp(_stamps(frames), imu.stamps_ns, axis) for axis in imu.gyro.T], axis=1)
-    turn *= _MAX_BLUR_RAD / fastest  # rad, in the body
+    turn *= _MAX_BLUR_RAD / fastest  # rad, in the body frame
     in_cam = turn @ rig.T_body_cam0[:3, :3]
     R = np.eye(3) if rig.T_cam1_cam0 is None else rig.T_cam1_cam0[:3, :3]
     cams = (rig.cam0, in_cam), (rig.cam1 or rig.cam0, in_cam @ R.T)
@@ -162,7 +165,7 @@ def imu_never(frames: Frames, *_: object) -> Frames:
 
 
 def saturating(frames: Frames, *_: object) -> Frames:
-    """Where any axis goes beyond what 5 % of the samples do, it stops."""
+    """Clip gyro and accelerometer at the magnitude that 5 % of their samples exceed."""
     imu = ImuBatch.empty().concatenate(*(frame.imu for frame in frames))
     limits = [np.quantile(np.abs(x).max(axis=1), 1 - _CLIPPED_SHARE) for x in (imu.gyro, imu.accel)]
 
@@ -172,7 +175,7 @@ def saturating(frames: Frames, *_: object) -> Frames:
     return [replace(frame, imu=clip(frame.imu)) for frame in frames]
 
 
-# ------------------------------------------------------------------ things that move by themselves
+# ------------------------------------------------------------------ moving panels
 
 _SMALL_PANEL, _LARGE_PANEL = Panel(0.9, 1.4, seed=5), Panel(1.1, 1.4, seed=6)  # m
 
@@ -186,7 +189,7 @@ def panel_follows(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
 
 
 def panel_rests(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
-    """Shows that what moves does harm, and not how it is drawn."""
+    """A control experiment: a panel at rest shows that motion does harm, not how the panel is drawn."""
     return panel_starts(frames, rig, truth, speed=0.0)
 
 
@@ -204,7 +207,7 @@ def _with_panel(
     panel: Panel,
     path: Callable[[F64, F64, float, float], F64],
 ) -> Frames:
-    """Frames whose true pose is not known are left as they are."""
+    """Draw the panel; frames without a true pose stay unchanged."""
     known, T_world_body = interpolate(*truth, _stamps(frames))
     t = _seconds(frames)
     T_body_panel = np.full((len(frames), 4, 4), np.nan)
@@ -214,7 +217,7 @@ def _with_panel(
     return draw_panel(frames, rig, panel, T_body_panel)
 
 
-# ------------------------------------------------------------------ what they share
+# ------------------------------------------------------------------ helpers
 
 
 def _stamps(frames: Frames) -> np.ndarray:
@@ -228,13 +231,13 @@ def _seconds(frames: Frames) -> F64:
 
 
 def _change_during(frames: Frames, seconds: float, change: Callable[[Frame, float], Frame]) -> Frames:
-    """`change_frames` is told the seconds since it began."""
+    """Apply `change`, which gets the seconds since the fault began, for `seconds`."""
     since = _seconds(frames) - _FAULT_START * _seconds(frames)[-1]
     return [change(f, float(s)) if 0 <= s < seconds else f for f, s in zip(frames, since, strict=True)]
 
 
 def _change_images(frame: Frame, change: Callable[[U8], U8], keep_depth: bool = False) -> Frame:
-    """Other images; and no depth, where there is nothing to see."""
+    """Change the images; set the depth to 0 unless `keep_depth`."""
     image1 = None if frame.image1 is None else change(frame.image1)
     depth = frame.depth if keep_depth or frame.depth is None else np.zeros_like(frame.depth)
     return replace(frame, image0=change(frame.image0), image1=image1, depth=depth)
@@ -254,7 +257,8 @@ def _without_imu(frame: Frame) -> Frame:
 
 
 def _blur_kernel(camera: Camera, turn: F64) -> F32:
-    """The kernel of a camera's turn (3,) rad: a line as long as the way of what is ahead."""
+    """Return the blur kernel of a camera that turns by `turn` (3,) rad: a line as long as the motion in the
+    image's middle."""
     motion_px = np.array([-turn[1] * camera.fx, turn[0] * camera.fy])
     half = int(np.ceil(np.abs(motion_px).max() / 2)) + 1
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
@@ -275,23 +279,25 @@ def _blur_frame(frame: Frame, kernels: Sequence[F32]) -> Frame:
 
 
 FAULTS: dict[str, Fault] = {
-    "clean": Fault("as it was recorded"),
-    "drop20": Fault("20 % of the frames do not come", drop20),
+    "clean": Fault("as recorded"),
+    "drop20": Fault("20 % of the frames are dropped", drop20),
     "stamps": Fault(
         "2 % of the images have the stamp of the one before, 2 % one 0.5 s back, 2 % one 40 ms off",
         change_measurements=bad_stamps,
     ),
     "black": Fault("2 s of black, no depth", black),
     "covered": Fault("2 s of dark noise, no depth", covered),
-    "exposure": Fault("three times, and a third of, the light, in turns of 1.5 s", exposure),
+    "exposure": Fault("light times 3, 1, 1/3, 1 in turns of 1.5 s", exposure),
     "white_wall": Fault("3 s before a white wall: 3 % of the contrast, noise", white_wall),
-    "blur": Fault("blurred along the way, as by 8 ms at 3 rad/s where the gyro is at its 99 %", blur),
+    "blur": Fault("motion blur, as of 8 ms at 3 rad/s where the gyro is at its 99th percentile", blur),
     "imu_silent_1s": Fault("no IMU for 1 s", imu_silent_1s),
-    "imu_dead": Fault("no IMU any more", imu_dead),
+    "imu_dead": Fault("no IMU from then on", imu_dead),
     "imu_never": Fault("no IMU at all", imu_never),
-    "saturating": Fault("gyro and accelerometer end where 5 % of their samples are beyond", saturating),
-    "mover_rests": Fault("a panel that is part of the room, and stays: no fault at all", panel_rests),
-    "mover_comes": Fault("a panel comes in, stays 1 m before the camera for 10 s, to and fro", panel_comes),
-    "mover_starts": Fault("a panel that was part of the room goes off at 0.15 m/s for 10 s", panel_starts),
-    "mover_along": Fault("a panel goes along with the camera, fixed in its view, for 10 s", panel_follows),
+    "saturating": Fault(
+        "gyro and accelerometer clipped at the magnitude that 5 % of their samples exceed", saturating
+    ),
+    "mover_rests": Fault("a panel that is part of the room and stays: no fault", panel_rests),
+    "mover_comes": Fault("a panel comes in and sways 1 m before the camera for 10 s", panel_comes),
+    "mover_starts": Fault("a panel that was part of the room moves off at 0.15 m/s for 10 s", panel_starts),
+    "mover_along": Fault("a panel moves with the camera, fixed in its view, for 10 s", panel_follows),
 }

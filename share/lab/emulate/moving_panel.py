@@ -1,8 +1,8 @@
-"""A panel drawn into a recording where each camera would have seen it.
+"""Draw a panel into a recording as each camera would have seen it.
 
-Textured on both sides; seen by rays through every pixel, so disparity, perspective and distortion are the
-rig's own. It hides whatever is behind it, nothing hides it, and it is sharp however fast the camera turns.
-Panel coordinates: x to its right, y down, z away from who looks at it; m, its middle at 0.
+It is textured on both sides and drawn by rays through every pixel, so disparity, perspective and distortion
+are the rig's. It occludes everything, nothing occludes it, and it has no motion blur. Panel coordinates: x to
+its right, y down, z away from the viewer; m, its middle at 0.
 """
 
 from __future__ import annotations
@@ -17,20 +17,21 @@ from share.geometry import se3
 from share.geometry.camera import Camera, Rig, rays
 from share.types import F32, F64, U8, Frame
 
-_PIXELS_PER_M, _NOISE_SIGMA = 400, 1.5  # texture's pixels a metre; gray levels, as an imager's
+_PIXELS_PER_M = 400
+_NOISE_SIGMA = 1.5  # gray levels
 _MIN_DEPTH_M, _MAX_COORDINATE_M = 0.05, 1e4
 
 
 @dataclass(frozen=True)
 class Panel:
-    """width, height: m. seed: of what is on it."""
+    """width, height: m. seed: of its texture."""
 
     width: float
     height: float
     seed: int = 0
 
     def texture(self) -> U8:
-        """Blobs of 5 mm to 10 cm, (H, W), gray 60 to 195."""
+        """Return (H, W), gray 60 to 195: blobs of 5 mm to 10 cm."""
         rng, shape = (
             np.random.default_rng(self.seed),
             (round(self.height * _PIXELS_PER_M), round(self.width * _PIXELS_PER_M)),
@@ -44,7 +45,7 @@ class Panel:
 
 
 def draw_panel(frames: list[Frame], rig: Rig, panel: Panel, T_body_panel: F64) -> list[Frame]:
-    """Frames with the panel at T_body_panel (N, 4, 4) in front of all else; NaN: not there."""
+    """Return frames with the panel at T_body_panel (N, 4, 4) before everything else; NaN: absent."""
     texture, rng = panel.texture(), np.random.default_rng(panel.seed)
     return [
         frame if np.isnan(T).any() else _draw_in_frame(frame, rig, panel, texture, T, rng)
@@ -53,7 +54,7 @@ def draw_panel(frames: list[Frame], rig: Rig, panel: Panel, T_body_panel: F64) -
 
 
 def share_of_view(camera: Camera, panel: Panel, T_cam_panel: F64, step_px: int = 40) -> F64:
-    """Which part of the picture is the panel's, for poses (N, 4, 4): (N,)."""
+    """Return the panel's share (N,) of the image, for poses (N, 4, 4)."""
     rays_of = _pixel_rays(camera, step_px).reshape(-1, 3)
     xy, _, hit = _intersect_rays(rays_of, se3.inverse(T_cam_panel))
     out: F64 = (hit & _is_on_panel(panel, xy)).mean(axis=-1)
@@ -99,8 +100,8 @@ def _half_size(panel: Panel) -> F32:
 
 
 def _intersect_rays(directions: F32, T_panel_cam: F64) -> tuple[F64, F64, np.ndarray]:
-    """Where rays (..., 3) of a camera meet the panel's plane: (x, y) on it, depth, and whether they do.
-    Of poses (N, 4, 4), the answers have N in front."""
+    """Intersect rays (..., 3) of a camera with the panel's plane: (x, y) on it, depth, and whether they meet
+    it. With poses (N, 4, 4), results have a leading N."""
     T = T_panel_cam.astype(np.float32)
     rotated = directions @ np.swapaxes(T[..., :3, :3], -1, -2)
     start = T[..., None, :3, 3] if directions.ndim == 2 else T[:3, 3]
@@ -116,7 +117,7 @@ def _intersect_rays(directions: F32, T_panel_cam: F64) -> tuple[F64, F64, np.nda
 
 @lru_cache(maxsize=8)
 def _pixel_rays(camera: Camera, step_px: int = 1) -> F32:
-    """Rays (H, W, 3) at depth 1 through every pixel, or some."""
+    """Return rays (H, W, 3) at depth 1 through every `step_px`-th pixel."""
     x, y = np.arange(0, camera.width, step_px), np.arange(0, camera.height, step_px)
     px = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float64)
     return rays(camera.normalise(px)).reshape(len(y), len(x), 3).astype(np.float32)

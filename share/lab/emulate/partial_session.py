@@ -1,7 +1,7 @@
-"""Where a session grows until it is whole: nobody ever finds half of one under its name.
+"""The work folder of a session, so that a session of a given name is always complete.
 
-.NAME.partial/DIGEST/    room, brightness, chunks of frames: what a break leaves, the next attempt uses
-.NAME.partial/session/   begun anew in each attempt, and renamed at the end
+.NAME.partial/DIGEST/    room, brightness, chunks of frames: reused by the next attempt
+.NAME.partial/session/   made again in each attempt, and renamed at the end
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from share.files.writing import lock_folder, sync_folder
 
 
 class PartialSession:
-    """Of the session `out`. Context manager: inside, no other process writes there; work for another
-    digest is gone. An error leaves what has been drawn, if anything has, and says so."""
+    """Work folder of the session `out`, with an exclusive lock as a context manager. Work of other digests is
+    removed. After an error drawn frames are kept, and the error says so."""
 
     def __init__(self, out: Path, digest: str) -> None:
         self.out = out
@@ -26,27 +26,27 @@ class PartialSession:
 
     @property
     def room(self) -> Path:
-        """Folder of the finished room."""
+        """Return the folder of the finished room."""
         return self.work / "room"
 
     def frames(self, name: str) -> Path:
-        """Folder of the chunks of agent `name`."""
+        """Return the folder of the chunks of agent `name`."""
         return self.work / "frames" / name
 
     def drawn_chunks(self) -> list[Path]:
-        """All chunks that are there."""
+        """Return all chunks drawn so far."""
         return sorted(self.work.glob("frames/*/*.chunk"))
 
     def check_new(self) -> None:
-        """Raises UsageError where there is something of that name, or there can be nothing."""
+        """Raise UsageError where `out` exists or cannot be created."""
         if self.out.exists() or self.out.is_symlink():
             raise UsageError(f"{self.out}: exists already; give the name of a new folder")
         parent = next(folder for folder in self.out.absolute().parents if folder.exists())
         if not parent.is_dir():
-            raise UsageError(f"{self.out}: lies below a file, {parent}; give another --out")
+            raise UsageError(f"{self.out}: its parent {parent} is a file; give another --out")
 
     def finish(self) -> None:
-        """Give it its name."""
+        """Give the session its name and remove the work folder."""
         shutil.rmtree(self.work)
         self.session.rename(self.out)
         sync_folder(self.out.parent)
@@ -55,7 +55,7 @@ class PartialSession:
     def __enter__(self) -> PartialSession:
         self._created_folders = _missing_parents(self._folder)
         self._handle = lock_folder(self._folder)
-        self.check_new()  # another process may have finished it meanwhile
+        self.check_new()  # another process may have finished it since
         for leftover in self._folder.iterdir():
             if leftover != self.work:
                 shutil.rmtree(leftover)
@@ -74,12 +74,12 @@ class PartialSession:
 
     def _keep_or_remove(self, error: ShareError) -> None:
         if self.drawn_chunks():
-            raise type(error)(f"{error}; the same command goes on with what is drawn") from None
+            raise type(error)(f"{error}; run the same command again to resume") from None
         shutil.rmtree(self._folder)
         for folder in self._created_folders:
             folder.rmdir()
 
 
 def _missing_parents(folder: Path) -> list[Path]:
-    """The folders above it that are yet to be made, innermost first."""
+    """Return the parents that do not exist yet, innermost first."""
     return [parent for parent in folder.parents if not parent.exists()]

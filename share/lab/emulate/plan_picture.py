@@ -1,4 +1,4 @@
-"""The room and the paths in it, seen from above: what one looks at before anything else."""
+"""The plan of a session: the room and the paths in it, seen from above."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from share.types import F64
 
 _COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
 _STEP_NS = 50_000_000
-_ARROW_S = 5.0  # between two arrows that show where an agent looks
+_ARROW_S = 5.0  # between two arrows that show an agent's viewing direction
 
 
 def draw_plan(path: Path, layout: Layout, actors: tuple[Actor, ...]) -> None:
-    """PNG: furniture by its height (darker is higher), paths, an arrow every few seconds."""
+    """Write a PNG: furniture by its height (darker is higher), paths, and an arrow every few seconds."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -56,14 +56,14 @@ def draw_plan(path: Path, layout: Layout, actors: tuple[Actor, ...]) -> None:
 
 
 def _furniture_triangles(layout: Layout) -> F64:
-    """Triangles (F, 3, 3) of the solid pieces, lowest first."""
+    """Return triangles (F, 3, 3) of the solid pieces, lowest first."""
     meshes = [piece.shape.mesh.triangles for piece in layout.pieces if piece.solid]
     triangles = np.concatenate([np.zeros((0, 3, 3)), *meshes]).astype(float)
     return triangles[np.argsort(triangles[:, :, 2].max(axis=1), kind="stable")]
 
 
 def _camera_path(actor: Actor) -> tuple[F64, F64]:
-    """Positions (N, 3) and viewing directions (N, 3) of cam0 over the path."""
+    """Return positions (N, 3) and viewing directions (N, 3) of cam0 along the path."""
     stamps = np.arange(actor.path.start_ns, actor.path.end_ns + 1, _STEP_NS)
     T = actor.path.poses(stamps) @ actor.rig.T_body_cam0
     return T[:, :3, 3], T[:, :3, 2]

@@ -1,4 +1,4 @@
-"""From a recipe to a stage: the room is furnished, paths are found in it, devices are set up."""
+"""From a recipe to a stage: furnish the room, plan the paths, set up the devices."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from share.sensors.profile_types import Profile
 from share.types import I64, AgentKind
 
 _GLTF_SUFFIXES = (".glb", ".gltf")
-_RESERVED_NAMES = ("truth",)  # the name of a folder of the session
+_RESERVED_NAMES = ("truth",)  # a folder of the session has this name
 _PROFILE, _EUROC_PROFILE = "d435i", "euroc"
 _DEPTH, _MONO = "rgbd", "mono"
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedSession:
-    """layout: what stands in the room. notes: for a person."""
+    """layout: of the room. notes: text for the user."""
 
     stage: RoomStage
     layout: Layout
@@ -40,9 +40,10 @@ class PreparedSession:
 
 
 def prepare_session(recipe: SessionRecipe, room: Path, progress: Progress) -> PreparedSession:
-    """The stage, whose room is to be kept in the folder `room`. Nothing is written.
+    """Return the stage, with `room` as the folder for its room. Writes nothing.
 
-    Raises UsageError, ConfigError or DataError for what cannot be made."""
+    Raises UsageError, ConfigError or DataError for an invalid recipe.
+    """
     progress("planning", 0, 1)
     _check_first(recipe)
     motion_plan = plan_motions(recipe.motions, make_layout(recipe), recipe.seconds, recipe.seed)
@@ -55,7 +56,7 @@ def prepare_session(recipe: SessionRecipe, room: Path, progress: Progress) -> Pr
 
 
 def keep_room(prepared: PreparedSession, progress: Progress) -> None:
-    """Draw the room's pictures and bake its light where the stage expects them, if they are not there yet."""
+    """Draw the room's pictures and bake its light into the stage's folder, unless they are there."""
     progress("making the room", 0, 1)
     stage = prepared.stage
     room_file.save_room_once(
@@ -65,7 +66,7 @@ def keep_room(prepared: PreparedSession, progress: Progress) -> None:
 
 
 def make_layout(recipe: SessionRecipe) -> Layout:
-    """What stands where. Raises UsageError for an unknown scene or a size that it cannot have."""
+    """Return the room's layout. Raises UsageError for an unknown scene or an unsupported size."""
     if recipe.scene == room_file.PLAIN:
         from share.lab.emulate.plain.scene import plain_layout
 
@@ -86,7 +87,7 @@ def _gltf_layout(recipe: SessionRecipe) -> Layout:
     from share.lab.emulate.world.gltf import load_gltf
 
     if recipe.size is not None:
-        raise UsageError(f"{recipe.scene}: the room in a file has a size of its own; leave --size out")
+        raise UsageError(f"{recipe.scene}: a room file has a fixed size; leave out --size")
     return load_gltf(Path(recipe.scene))
 
 
@@ -108,7 +109,7 @@ def _make_actor(agent: PlannedAgent, number: int, recipe: SessionRecipe) -> Acto
 
 
 def _profile(agent: PlannedAgent, recipe: SessionRecipe) -> Profile:
-    """`NAME` or `NAME:MODE`, as asked for, or what the motion was recorded with."""
+    """Return the profile asked for (`NAME` or `NAME:MODE`), else the usual one of the motion."""
     _, spec = parse_motion(agent.spec)
     usual = _EUROC_PROFILE if isinstance(spec, EurocSpec) else _PROFILE
     return _read_profile(_option_for(recipe.profiles, agent.name) or usual)
@@ -120,27 +121,27 @@ def _read_profile(spec: str) -> Profile:
 
 
 def _default_sensors(agent: PlannedAgent) -> str:
-    """Depth helps a robot not to bump into things; a headset has the infrared pair."""
+    """Return depth for a simulated robot, else stereo."""
     simulated = agent.path.recorded is None
     return _DEPTH if agent.kind is AgentKind.ROBOT and simulated else "stereo"
 
 
 def _recorded_rig(rig: Rig, agent: PlannedAgent) -> Rig:
-    """The cameras where the recorded rig had them, and its IMU's noise."""
+    """Return the rig with the recording's camera mount and IMU noise, if any."""
     if agent.T_body_cam0 is not None:
         rig = replace(rig, T_body_cam0=agent.T_body_cam0)
     return rig if agent.imu is None else replace(rig, imu=agent.imu)
 
 
 def _imu_path(agent: PlannedAgent, rig: Rig) -> Motion:
-    """The path of the rig's IMU: where it sits otherwise than a simulated body, the camera still does not."""
+    """Return the path of the rig's IMU, with its axes; the cameras' path is the same."""
     if agent.has_camera_axes and isinstance(agent.path, SplinePath):
         return agent.path.with_axes(rig.T_body_cam0[:3, :3].T)
     return agent.path
 
 
 def _without_gaps(pictures: PictureTimes, gaps: I64) -> PictureTimes:
-    """Without those taken where nobody knows the truth."""
+    """Return the pictures with ground truth."""
     known = ~in_gaps(gaps, pictures.true_ns)
     return PictureTimes(pictures.index[known], pictures.true_ns[known], pictures.stamp_ns[known])
 
@@ -150,7 +151,7 @@ def _option_for(table: dict[str, str], name: str) -> str | None:
 
 
 def _check_first(recipe: SessionRecipe) -> None:
-    """What can be found wrong without a plan. Raises ConfigError; RenderError where nothing can be drawn."""
+    """Check what needs no plan. Raises ConfigError; RenderError where this machine cannot draw."""
     for words in recipe.profiles.values():
         _read_profile(words)
     if recipe.scene != room_file.PLAIN:
@@ -170,7 +171,7 @@ def _check_names(recipe: SessionRecipe, motion_plan: MotionPlan) -> None:
     known = {agent.name for agent in motion_plan.agents}
     if reserved := known.intersection(_RESERVED_NAMES):
         raise UsageError(
-            f"an agent cannot be named '{reserved.pop()}': the session's truth is in a folder of that name"
+            f"an agent cannot be named '{reserved.pop()}': a folder of the session has that name"
         )
     for table in (recipe.sensors, recipe.profiles):
         for name in table:

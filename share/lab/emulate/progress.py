@@ -1,11 +1,11 @@
-"""How far a session is."""
+"""Progress of a session."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-Progress = Callable[[str, int, int], None]  # what is done, how far, of how much
+Progress = Callable[[str, int, int], None]  # task, done, total
 
 
 def no_progress(what: str, done: int, total: int) -> None:
-    """Progress for nobody."""
+    """Ignore progress."""

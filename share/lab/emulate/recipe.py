@@ -1,4 +1,4 @@
-"""All that decides what a session holds: the same recipe gives the same bytes."""
+"""All inputs of a session: the same recipe gives the same bytes."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from share.files.reading import MAX_TABLE_BYTES, read_bytes
 from share.lab.emulate.motion.spec import RecordedSpec, parse_motion
 from share.lab.emulate.sensor.effects import Effects
 
-GENERATOR_VERSION = 2  # raise it when any picture, motion or file changes: cached sessions are made anew
+# increase it when any picture, motion or file changes, so that cached sessions are made again
+GENERATOR_VERSION = 2
 SENSORS = ("stereo", "rgbd", "mono")
 IMAGES = ("jpeg", "png")
-_FOLDER_DEPTHS, _TEXT_SUFFIXES = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")  # FOLDER/mav0/imu0/data.csv
+# depths at which a recording's folder has text files, as FOLDER/mav0/imu0/data.csv
+_FOLDER_DEPTHS, _TEXT_SUFFIXES = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")
 
 
 @dataclass(frozen=True)
 class SessionRecipe:
     """scene: a name, or a glTF file. motions: `[NAME=]SPEC` each. size: of the room, m; None: the scene's
-    own. sensors, profiles: one for all (key "") or by an agent's name; profiles may name a mode, as
-    `d435i:848x480@30`. images: jpeg is quality 95; png keeps every gray level. Raises UsageError for what
-    cannot be made."""
+    default. sensors, profiles: one for all (key "") or by an agent's name; profiles may name a mode, as
+    `d435i:848x480@30`. images: jpeg has quality 95; png is lossless. Raises UsageError for an invalid recipe.
+    """
 
     scene: str
     motions: tuple[str, ...]
@@ -49,15 +51,15 @@ class SessionRecipe:
             raise UsageError(f"images '{self.images}' are not known; known: {', '.join(IMAGES)}")
 
     def to_mapping(self) -> dict[str, Any]:
-        """As plain data, for a person and for session.yaml."""
+        """Return plain data for session.yaml."""
         out = asdict(self) | {"motions": list(self.motions), "generator_version": GENERATOR_VERSION}
         out["size"] = None if self.size is None else list(self.size)
         return out
 
     @property
     def digest(self) -> str:
-        """Twelve characters that differ where anything does, the user's own files included. Raises UsageError
-        for a motion that cannot be understood."""
+        """Return twelve characters that identify the recipe and the content of the user's files. Raises
+        UsageError for an invalid motion."""
         digest = hashlib.sha256(json.dumps(self.to_mapping(), sort_keys=True).encode())
         for path in self._user_files():
             try:
@@ -67,8 +69,7 @@ class SessionRecipe:
         return digest.hexdigest()[:12]
 
     def _user_files(self) -> Iterator[Path]:
-        """Scene and profiles where they are files, not ours by their names, and all of recorded motions
-        but images."""
+        """Yield the user's scene and profile files, and all files of recorded motions but images."""
         for name in (self.scene, *self.profiles.values()):
             path = Path(name.partition(":")[0])
             if path.suffix and path.is_file():
@@ -80,6 +81,6 @@ class SessionRecipe:
 
 
 def _text_files(path: Path) -> list[Path]:
-    """The file, or what a recording's folder holds as text."""
+    """Return the file, or the text files of a recording's folder."""
     candidates = [path] if path.is_file() else [p for depth in _FOLDER_DEPTHS for p in path.glob(depth)]
     return sorted(p for p in candidates if p.is_file() and (p == path or p.suffix in _TEXT_SUFFIXES))

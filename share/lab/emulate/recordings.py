@@ -1,4 +1,4 @@
-"""One actor's chunks and IMU to the recording and the truth that a session keeps."""
+"""Write an actor's recording and ground truth from its chunks and IMU."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from share.types import I64
 
 
 def write_recording(actor: Actor, chunks: list[Path], path: Path) -> None:
-    """`path`.mcap with everything, in order of time. Raises ShareError where the disk is full."""
+    """Write `path`.mcap with all streams in order of time. Raises ShareError where the disk is full."""
     clock = actor.device.clock
     first, period = int(clock.read(np.array([actor.path.start_ns]))[0]), clock.period_ns
     streams = (_unwrapped(s, first, period) for s in (_imu_measurements(actor), _image_measurements(chunks)))
@@ -30,7 +30,7 @@ def write_recording(actor: Actor, chunks: list[Path], path: Path) -> None:
 def _unwrapped(
     measurements: Iterator[Measurement], latest_ns: int, period_ns: int
 ) -> Iterator[tuple[int, Measurement]]:
-    """Each with its stamp without wraps of the device's counter."""
+    """Yield each measurement with its stamp, unwrapped."""
     for measurement in measurements:
         if period_ns:
             latest_ns = measurement.stamp_ns + period_ns * round(
@@ -40,13 +40,13 @@ def _unwrapped(
 
 
 def write_truth(actor: Actor, path: Path) -> None:
-    """Pose of the body in the world when the device's clock, which is the IMU's too, shows the stamp of
-    each picture. (With a time offset the picture itself was taken a little before or after.)"""
+    """Write the body's pose in the world at the time when the device's clock shows the stamp of each picture.
+    (With a time offset the picture itself was taken a little earlier or later.)"""
     atomic_write(path, format_tum(true_trajectory(actor)[1]))
 
 
 def true_trajectory(actor: Actor) -> tuple[I64, Trajectory]:
-    """Which of its pictures (N,) have a truth, and that, N poses; see `write_truth`."""
+    """Return the indices (N,) of pictures with ground truth, and their true poses, as in `write_truth`."""
     times, stamps = actor.device.truth_times(actor.pictures)
     known = (times >= actor.path.start_ns) & (times <= actor.path.end_ns) & ~actor.in_gap(times)
     return np.flatnonzero(known), Trajectory(stamps[known], actor.path.poses(times[known]))

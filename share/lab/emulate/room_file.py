@@ -1,4 +1,4 @@
-"""A room kept for other processes to open, and the renderer that can draw it."""
+"""Save a room for other processes, and open the renderer that draws it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from share.lab.emulate.world.mesh import Shape
 
 PLAIN = "plain"
 _PLAIN_FILE = "plain.json"
-_GL_FILE = "room.json"  # of `share.lab.emulate.world.room_files`
+_GL_FILE = "room.json"  # written by `share.lab.emulate.world.room_files`
 
 
 def save_room_once(layout: Layout, movers: dict[str, tuple[Shape, ...]], folder: Path) -> None:
-    """Draw pictures, bake light and write it all as the new folder `folder`, unless that was done before."""
+    """Draw pictures, bake light and write the room to the new folder `folder`, unless it exists."""
     if (folder / _PLAIN_FILE).exists() or (folder / _GL_FILE).exists():
         return
     if layout.name == PLAIN:
@@ -31,7 +31,8 @@ def save_room_once(layout: Layout, movers: dict[str, tuple[Shape, ...]], folder:
 
 
 def open_renderer(folder: Path) -> RoomRenderer:
-    """Raises RenderError where nothing can be drawn here, DataError where what was kept is damaged."""
+    """Return the renderer of a saved room. Raises RenderError where this machine cannot draw, DataError where
+    the room is damaged."""
     plain = folder / _PLAIN_FILE
     if plain.exists():
         from share.lab.emulate.plain.scene import PlainRenderer

@@ -1,6 +1,6 @@
-"""Makes a session folder: session.yaml, plan.png, NAME.mcap and truth/NAME.tum per agent.
+"""Make a session folder: session.yaml, plan.png, NAME.mcap and truth/NAME.tum per agent.
 
-recipe -> stage (nothing is written) -> how frames are exposed -> chunks of frames -> recordings, truth
+recipe -> stage (nothing is written) -> exposure of each frame -> chunks of frames -> recordings, truth
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from share.runtime.pool import Pool
 from share.types import F64
 
 PLAN_FILE = "plan.png"
-_CHUNK_FRAMES = 24  # of a chunk: what a break costs a process
+_CHUNK_FRAMES = 24  # in a chunk: the most that an interruption costs a process
 _IMAGE_BYTES = {
     "jpeg": 130_000,
     "png": 330_000,
-}  # of an image, about; to see beforehand whether the disk will do
+}  # estimated size of an image, to check the disk beforehand
 
 
 def make_session(
     recipe: SessionRecipe, out: Path, workers: int = 2, progress: Progress = no_progress, asl: bool = False
 ) -> Path:
     """Make a session in the new folder `out` with `workers` processes; with `asl`, an EuRoC/ASL folder
-    NAME/mav0 of each agent instead. What a break leaves is used by the next attempt at the same recipe.
+    NAME/mav0 per agent instead. Another attempt at the same recipe resumes an interrupted one.
 
-    Raises UsageError where `out` exists, or for what cannot be made; ShareError where the disk is full.
+    Raises UsageError where `out` exists or the recipe is invalid; ShareError where the disk is full.
     """
     partial = PartialSession(out, recipe.digest)
     partial.check_new()
@@ -69,17 +69,17 @@ def make_session(
 def make_cached_session(
     recipe: SessionRecipe, cache: Path | None = None, workers: int = 2, progress: Progress = no_progress
 ) -> Path:
-    """The session of this recipe in `cache` (default: the user's), made if it is not there yet."""
+    """Return the session of this recipe in `cache` (default: the user's); make it if it is not there."""
     out = (default_cache() if cache is None else cache) / f"session-{recipe.digest}"
     if not out.exists():
         with _cache_lock(out.parent):
-            if not out.exists():  # nobody else made it while we waited
+            if not out.exists():  # another process may have made it while this one waited
                 make_session(recipe, out, workers, progress)
     return out
 
 
 def default_cache() -> Path:
-    """$XDG_CACHE_HOME/share, or ~/.cache/share (XDG Base Directory Specification)."""
+    """Return $XDG_CACHE_HOME/share, or ~/.cache/share (XDG Base Directory Specification)."""
     return xdg_folder("XDG_CACHE_HOME", ".cache") / "share"
 
 
@@ -106,7 +106,7 @@ def _fill_session(
 def _exposure_series(
     pool: Pool, stage: RoomStage, actor_index: int, work: Path, progress: Progress
 ) -> ExposureSeries:
-    """How each of the actor's frames is exposed, from a quick look at some of them."""
+    """Return the exposure of each frame of the actor, from metering a part of them."""
     actor, brightness_file = (
         stage.actors[actor_index],
         work / f"{stage.actors[actor_index].name}.brightness.npy",
@@ -133,7 +133,7 @@ def _npy_bytes(values: F64) -> bytes:
 def _draw_chunks(
     pool: Pool, stage: RoomStage, exposures: list[ExposureSeries], growth: PartialSession, progress: Progress
 ) -> list[list[Path]]:
-    """The chunks of each actor, in order; those that are there already are not drawn again."""
+    """Draw the missing chunks; return all chunks of each actor, in order."""
     takes = [
         _make_takes(actor, actor_index, exposures[actor_index], growth.frames(actor.name))
         for actor_index, actor in enumerate(stage.actors)
@@ -156,7 +156,7 @@ def _make_takes(actor: Actor, actor_index: int, shots: ExposureSeries, folder: P
 
 
 def _check_space(growth: PartialSession, stage: RoomStage, recipe: SessionRecipe, copies: int) -> None:
-    """Before hours are spent: so many copies of the images are there side by side at the end."""
+    """Raise ShareError early if the disk cannot hold `copies` of the images at the same time."""
     images = sum(2 * len(actor.pictures) for actor in stage.actors)
     existing = sum(chunk.stat().st_size for chunk in growth.drawn_chunks())
     need, free = copies * images * _IMAGE_BYTES[recipe.images] - existing, shutil.disk_usage(growth.work).free
@@ -168,14 +168,14 @@ def _check_space(growth: PartialSession, stage: RoomStage, recipe: SessionRecipe
 
 
 def _first_stamp_ns(actor: Actor) -> int:
-    """What the device's clock shows at the session's first instant."""
+    """Return the device clock's reading at the session's first instant."""
     clock = actor.device.clock
     stamp = actor.path.start_ns + clock.offset_ns
     return stamp % clock.period_ns if clock.period_ns else stamp
 
 
 def _session_yaml(recipe: SessionRecipe, prepared: PreparedSession) -> str:
-    """session.yaml. A stamp in an agent's files is session time + clock_offset_ns."""
+    """Return session.yaml. A stamp in an agent's files is session time + clock_offset_ns."""
     import yaml
 
     agents = {
@@ -204,8 +204,8 @@ def _session_yaml(recipe: SessionRecipe, prepared: PreparedSession) -> str:
 
 @contextmanager
 def _cache_lock(cache: Path) -> Iterator[None]:
-    """Only one process at a time makes what is to be kept there; others wait. The lock is on the folder
-    itself, so nothing is left behind, and the system releases it if we are killed."""
+    """Let one process at a time write to `cache`. The lock is on the folder itself, so it leaves nothing
+    behind, and the system releases it if the process is killed."""
     import fcntl
 
     handle = os.open(writable_dir(cache), os.O_RDONLY)

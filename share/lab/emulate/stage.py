@@ -1,4 +1,4 @@
-"""A room with its agents in it, ready to be recorded: who is where at any moment, and what looks on."""
+"""A room with its agents, ready to be recorded: poses of all at any time, and views of cameras."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from share.lab.emulate.types import MotionPath, SceneInstant
 from share.lab.emulate.world.mesh import Shape
 from share.types import F64, I64, AgentKind
 
-_BLUR_DISTANCE_M = 1.5  # what motion blur is reckoned for; nearer things blur more than their samples show
+# distance for which motion blur is sampled; nearer things blur more than their samples show
+_BLUR_DISTANCE_M = 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """One agent of the session. avatar, shapes: what others see of it, where and what. pictures: all
-    frames that it records, in true time (its path's)."""
+    """One agent of the session. avatar, shapes: its body for others, poses and parts. pictures: all frames
+    that it records, in true time (that of its path)."""
 
     name: str
     kind: AgentKind
@@ -35,36 +36,36 @@ class Actor:
 
     @property
     def clock_offset_ns(self) -> int:
-        """Its first instant: sessions begin at 0."""
+        """Return the path's first instant, at which the session begins."""
         return self.path.start_ns
 
     def in_gap(self, true_ns: I64) -> NDArray[np.bool_]:
-        """At which of the times (N,) nobody knows where it is."""
+        """Return at which of the times (N,) there is no ground truth."""
         return in_gaps(self.path.gaps, true_ns)
 
 
 @dataclass(frozen=True, eq=False)
 class ActorView:
-    """One instant: where the body is (4, 4), and the parts of all others (P, 4, 4) by name."""
+    """One instant: T_world_body (4, 4), and parts of all other agents (P, 4, 4) by name."""
 
     T_world_body: F64
     part_poses: dict[str, F64]
 
     def camera_view(self, T_body_cam: F64) -> SceneInstant:
-        """What one of the body's cameras sees of it."""
+        """Return the view of one of the body's cameras."""
         return SceneInstant(self.T_world_body @ T_body_cam, self.part_poses)
 
 
 @dataclass(frozen=True, eq=False)
 class RoomStage:
-    """room: where it is kept, for `share.lab.emulate.drawing` to open."""
+    """room: folder that `share.lab.emulate.drawing` opens."""
 
     room: FilePath
     actors: tuple[Actor, ...]
 
     def views(self, actor_index: int, true_ns: I64) -> list[ActorView]:
-        """All that actor number `actor_index` may see at true times (N,), which are clipped to its path. Ask
-        for many at once: most of what it costs is paid once a call."""
+        """Return what actor number `actor_index` may see at true times (N,), clipped to its path. Most of the
+        cost is per call, so ask for many at once."""
         actor = self.actors[actor_index]
         times = np.clip(true_ns, actor.path.start_ns, actor.path.end_ns)
         others = self._other_parts(actor_index, times - actor.clock_offset_ns)
@@ -74,7 +75,8 @@ class RoomStage:
         ]
 
     def motion_px(self, actor_index: int, true_ns: I64, exposure_ms: F64) -> F64:
-        """How far things at _NEAR_M move in each picture (N,) during its exposure, px."""
+        """Return the image motion (N,) px of things at _BLUR_DISTANCE_M during the exposure of each
+        picture."""
         actor = self.actors[actor_index]
         half = (exposure_ms * 5e5).astype(np.int64)
         first, last = (
@@ -86,8 +88,7 @@ class RoomStage:
         return actor.rig.cam0.focal * (turned + moved / _BLUR_DISTANCE_M)
 
     def _other_parts(self, actor_index: int, session_ns: I64) -> dict[str, F64]:
-        """Parts (N, P, 4, 4) of all but `actor_index`; before its path begins and after it ends, one
-        stands still."""
+        """Return parts (N, P, 4, 4) of all other agents; they stand still before and after their paths."""
         out = {}
         for k, actor in enumerate(self.actors):
             if k != actor_index:
@@ -99,21 +100,21 @@ class RoomStage:
 
 
 def in_gaps(gaps: I64, true_ns: I64) -> NDArray[np.bool_]:
-    """Which of the times (N,) lie in one of the gaps (G, 2), whose ends are known."""
+    """Return which of the times (N,) lie inside one of the gaps (G, 2), ends excluded."""
     t = true_ns[:, None]
     out: NDArray[np.bool_] = np.any((t > gaps[:, 0]) & (t < gaps[:, 1]), axis=1)
     return out
 
 
 def T_body_camera(rig: Rig, camera: str) -> F64:
-    """T_body_camera (4, 4) of cam0, cam1 or depth."""
+    """Return T_body_camera (4, 4) of cam0, cam1 or depth."""
     T_camera_cam0 = {"cam0": np.eye(4), "cam1": rig.T_cam1_cam0, "depth": rig.T_depth_cam0}[camera]
     assert T_camera_cam0 is not None
     return rig.T_body_cam0 @ se3.inverse(T_camera_cam0)
 
 
 def downsized(camera: Camera, factor: int) -> Camera:
-    """The same view in `factor` times fewer pixels each way."""
+    """Return the same view with `factor` times fewer pixels both ways."""
     return replace(
         camera,
         width=camera.width // factor,

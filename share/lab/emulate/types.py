@@ -1,10 +1,10 @@
-"""What the parts of the emulator hand to each other: meshes, a finished room, a moment, a path.
+"""Types that the parts of the emulator share: meshes, rooms, instants, paths.
 
     layout (world) -> where paths fit (motion) -> room with pictures and light (world)
-                   -> images of moments (render) -> what a sensor makes of them (sensor) -> a session
+                   -> images of instants (render) -> sensor readings (sensor) -> a session
 
-World frame: z up, origin in a lower corner of the room, metres. Gray levels are linear in light:
-the non-linear parts (exposure, noise, saturation) are the sensor's.
+World frame: z up, origin in a lower corner of the room, metres. Gray levels are linear in light: the
+non-linear parts (exposure, noise, saturation) belong to the sensor.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ I32 = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles. vertices (V, 3) m and unit normals (V, 3); uv (V, 2): places in a picture, 1 being
-    its whole width, repeating beyond; layer (V,): which picture, the same for all corners of a
-    triangle; faces (F, 3): corners, counter-clockwise as seen from outside (both sides are drawn)."""
+    """Triangles. vertices (V, 3) m and unit normals (V, 3); uv (V, 2): position in a picture, whose width is
+    1 and which repeats; layer (V,): index of the picture, the same for all corners of a triangle; faces (F,
+    3): corners, counter-clockwise from outside (both sides are drawn)."""
 
     vertices: F32
     normals: F32
@@ -36,7 +36,7 @@ class Mesh:
 
     @property
     def triangles(self) -> F32:
-        """Corners (F, 3, 3) m."""
+        """Return corners (F, 3, 3) m."""
         return self.vertices[self.faces]
 
 
@@ -44,10 +44,10 @@ class Mesh:
 class DrawableRoom:
     """A room ready to be drawn.
 
-    size (3,) m. mesh: what does not move. pictures (L, P, P) uint8: albedo, one a layer. light_map
-    (H, W) uint8: baked light, 100 = as much as makes albedo the gray level; light_uv (V, 2): place of
-    each vertex of `mesh` in it, 0..1. movers: by name, the rigid parts of each agent that others may
-    see, each in the frame that `Moment.movers` places; their light is `mover_light` everywhere.
+    size (3,) m. mesh: the static part. pictures (L, P, P) uint8: albedo, one a layer. light_map (H, W) uint8:
+    baked light, 100 makes the gray level the albedo; light_uv (V, 2): position of each vertex of `mesh` in
+    it, 0..1. agent_parts: by name, the rigid parts of each agent, each in the frame that
+    `SceneInstant.part_poses` places; their light is `mover_light` everywhere.
     """
 
     name: str
@@ -63,32 +63,33 @@ class DrawableRoom:
 
 @dataclass(frozen=True, eq=False)
 class SceneInstant:
-    """What stands where at one instant. T_world_cam (4, 4); movers: by name, T_world_part (P, 4, 4).
-    An agent does not list itself: it does not see itself."""
+    """Poses at one instant. T_world_cam (4, 4); part_poses: by name, T_world_part (P, 4, 4) of all other
+    agents, as an agent does not see itself."""
 
     T_world_cam: F64
     part_poses: dict[str, F64] = field(default_factory=dict)
 
 
 class RoomRenderer(Protocol):
-    """Draws one room. Made once a process; not safe for threads."""
+    """Draws one room. Created once a process; not thread-safe."""
 
     def radiance(self, camera: Camera, instants: Sequence[SceneInstant]) -> F32:
-        """Image (H, W) in linear gray levels 0..255, the mean over `instants`: one for a sharp image,
-        several for one blurred by motion. Honours the camera's distortion; pixel centres at integers."""
+        """Return an image (H, W) in linear gray levels 0..255, the mean over `instants`: one for a sharp
+        image, several for motion blur. Includes the camera's distortion; pixel centres at integers."""
         ...
 
     def depth(self, camera: Camera, instant: SceneInstant) -> F32:
-        """Exact depth (H, W) m along the optical axis through pixel centres, 0 where nothing is."""
+        """Return the exact depth (H, W) m along the optical axis through pixel centres, 0 where there is
+        nothing."""
         ...
 
 
 class MotionPath(Protocol):
-    """The true motion of one agent's body (its IMU frame), known at every instant of its span.
+    """The true motion of one agent's body (its IMU frame), continuous over its span.
 
-    start_ns, end_ns: in the agent's clock, both included. gaps (G, 2) ns: where nobody knows the truth
-    (motion capture lost the body): no image is made there, and truth files have a gap.
-    recorded: a real IMU's samples, to be used untouched; None where the IMU is to be simulated.
+    start_ns, end_ns: in the agent's clock, both included. gaps (G, 2) ns: without ground truth (lost by
+    motion capture): no images there, and gaps in truth files. recorded: samples of a real IMU, used as they
+    are; None: the IMU is simulated.
     """
 
     @property
@@ -104,18 +105,18 @@ class MotionPath(Protocol):
     def recorded(self) -> ImuBatch | None: ...
 
     def poses(self, stamps_ns: I64) -> F64:
-        """T_world_body (N, 4, 4). Raises ValueError outside the span."""
+        """Return T_world_body (N, 4, 4). Raises ValueError outside the span."""
         ...
 
     def inertial(self, stamps_ns: I64) -> tuple[F64, F64]:
-        """What a perfect IMU would measure: angular rate (N, 3) rad/s and specific force (N, 3) m/s^2,
-        both in the body frame; gravity is `GRAVITY` along -z of the world."""
+        """Return what a perfect IMU would measure: angular rate (N, 3) rad/s and specific force (N, 3) m/s^2
+        in the body frame; gravity is `GRAVITY` along -z of the world."""
         ...
 
     def transformed(self, T_world_old: F64) -> MotionPath:
-        """The same motion elsewhere: turned about the vertical and shifted by T_world_old (4, 4)."""
+        """Return the same motion turned about the vertical and shifted by T_world_old (4, 4)."""
         ...
 
 
 GRAVITY = 9.81  # m/s^2
-START_NS = 1_750_000_000 * 10**9  # of simulated paths: session time 0, any moment that stays the same
+START_NS = 1_750_000_000 * 10**9  # of simulated paths, at session time 0; an arbitrary constant

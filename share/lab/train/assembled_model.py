@@ -1,4 +1,4 @@
-"""A head put onto the backbone that it was taught for, with the labels that it was taught on."""
+"""An error model assembled from a backbone and trained heads, with the labels of the training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from share.types import F32
 
 @dataclass(frozen=True, eq=False)
 class AssembledModel:
-    """model: the file; deep (N, 1280): of the collection's table."""
+    """model: the ONNX file. deep_features (N, 1280): of the collection's table."""
 
     fitted: TrainedHeads
     collection: LabelCollection
@@ -30,15 +30,15 @@ class AssembledModel:
 
     @property
     def test(self) -> KeyframeRows:
-        """Keyframes that nothing was learnt from."""
+        """Return the keyframes held out from training."""
         return KeyframeRows(self.collection.table, self.deep_features).take(
             self.collection.keyframes_of("test")
         )
 
 
 def assemble(fit: Path, labels: Path, base: Path) -> AssembledModel:
-    """fit: a folder by `share train fit`. Raises UsageError where labels or base are not what it was taught
-    on, DataError."""
+    """Load trained heads, labels and backbone, and assemble the model. fit: a folder of `share train fit`.
+    Raises UsageError where labels or base differ from those of the training, DataError."""
     fitted = read_trained(file := fit / "fit.npz")
     with own_format_errors(file):
         seed, backbone = int(fitted.about["options"]["seed"]), fitted.about["backbone"]
@@ -47,7 +47,9 @@ def assemble(fit: Path, labels: Path, base: Path) -> AssembledModel:
         _check_rooms(collection, fitted.about, labels)
     base_model = read_model(base)
     if backbone_id(base_model) != backbone:
-        raise UsageError(f"{base}: has another backbone than the one that {fit} was taught for")
+        raise UsageError(
+            f"{base}: its backbone is not the one that {fit} was trained with; give that one as --base"
+        )
     with own_format_errors(file):
         model = with_heads(base_model, fitted)
     network = open_network(model)
@@ -57,8 +59,10 @@ def assemble(fit: Path, labels: Path, base: Path) -> AssembledModel:
 
 
 def _check_rooms(collection: LabelCollection, about: Mapping[str, Any], labels: Path) -> None:
-    """Else a test would be on what was learnt."""
+    """Raise UsageError where the split differs from the training's: the test would include training data."""
     for part, runs in collection.parts.items():
         sessions = {str(collection.abouts[run]["session"]) for run in runs.tolist()}
         if sessions != set(about["rooms"][part]):
-            raise UsageError(f"{labels}: is not what it was taught on; sessions of '{part}' differ")
+            raise UsageError(
+                f"{labels}: these labels are not those of the training; the sessions of '{part}' differ"
+            )

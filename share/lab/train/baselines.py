@@ -1,7 +1,6 @@
-"""What else could estimate the error of a keyframe: the four that the paper compares its network with.
+"""The four baseline error models that the paper compares its network with.
 
-Each is a function: taught on some keyframes, stopped by others, it says what error it expects of new ones;
-meanwhile how far it is.
+Each is a function that trains on some keyframes, stops early by others, and returns a predictor of the error.
 """
 
 from __future__ import annotations
@@ -19,26 +18,27 @@ from share.lab.train.keyframe_table import KeyframeTable
 from share.types import F32, F64
 
 TREES = 70
-_BLOCKS = (2, 4)  # down and across, of each channel of a PSD: 24 numbers for the forest
+_BLOCKS = (2, 4)  # rows and columns of blocks of each PSD channel: 24 numbers for the forest
 _MIN_CM = 0.01
-_EPOCHS, _PATIENCE, _BATCH = 100, 12, 256
-_CNN_EPOCHS, _CNN_PATIENCE = 24, 5  # each takes long: it sees pictures, where the others see what is known
+_EPOCHS = 100
+_PATIENCE = 12  # rows and columns of blocks of each PSD channel: 24 numbers for the forest
+_BATCH = 256
+_CNN_EPOCHS, _CNN_PATIENCE = 24, 5  # trains on pictures, so an epoch takes long
 _CONTRAST_EPOCHS, _TEMPERATURE = 6, 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class KeyframeRows(ArrayTable):
-    """Keyframes, and deep (N, 1280) of each by the backbone."""
+    """Keyframes with the backbone's features, deep_features (N, 1280)."""
 
     table: KeyframeTable
     deep_features: F32
 
 
 Predictor = Callable[[KeyframeRows], F64]
-ShowProgress = Callable[[str], None]  # how far it is, for a person
-Baseline = Callable[
-    [KeyframeRows, KeyframeRows, int, ShowProgress], Predictor
-]  # learnt from, stopped by, seed
+ShowProgress = Callable[[str], None]  # progress, as text for the user
+# of training rows, validation rows and seed
+Baseline = Callable[[KeyframeRows, KeyframeRows, int, ShowProgress], Predictor]
 
 
 def linear(
@@ -54,19 +54,19 @@ def linear(
 def forest(
     training: KeyframeRows, validation: KeyframeRows, seed: int, on_progress: ShowProgress
 ) -> Predictor:
-    """70 trees on 1312 numbers: 1280 of the backbone, 24 of the PSD, 8 scalars."""
+    """Random forest on 1312 numbers: 1280 backbone features, 24 of the PSD, 8 scalars."""
     from sklearn.ensemble import RandomForestRegressor
 
     model = RandomForestRegressor(TREES, min_samples_leaf=3, max_features=0.3, random_state=seed, n_jobs=2)
     model.fit(_forest_inputs(training), training.table.error_cm)
-    model.n_jobs = 1  # one keyframe at a time is not worth a pool
+    model.n_jobs = 1  # a pool costs more than it gains for one keyframe
     return lambda rows: np.maximum(model.predict(_forest_inputs(rows)), _MIN_CM)
 
 
 def perceptron(
     training: KeyframeRows, validation: KeyframeRows, seed: int, on_progress: ShowProgress
 ) -> Predictor:
-    """A head of two layers on the backbone, which sees the picture and nothing else."""
+    """Two layers on the backbone's features, so it sees the picture alone."""
     torch.manual_seed(seed)
     mean, deviation = (
         training.deep_features.mean(axis=0),
@@ -86,8 +86,8 @@ def perceptron(
 def contrastive(
     training: KeyframeRows, validation: KeyframeRows, seed: int, on_progress: ShowProgress
 ) -> Predictor:
-    """A small CNN of its own on the picture: first taught to put pictures of like errors side by side
-    (supervised contrast, the nearer in error the more alike; Zha et al. 2023), then to tell the error."""
+    """A small CNN on the picture, trained to embed pictures of similar error close to each other (supervised
+    contrastive regression, Zha et al. 2023), then to predict the error."""
     torch.manual_seed(seed)
     encoder, output_layer = _encoder(), nn.Linear(96, 1)
     net = nn.Sequential(encoder, output_layer)
@@ -119,7 +119,7 @@ BASELINES: dict[str, Baseline] = {
 
 
 def _forest_inputs(rows: KeyframeRows) -> F32:
-    """(N, 1312)."""
+    """Return (N, 1312): backbone features, block means of the PSD, scalars."""
     psd = rows.table.psd
     n, channels, down, across = psd.shape
     blocks = psd.reshape(n, channels, _BLOCKS[0], down // _BLOCKS[0], _BLOCKS[1], across // _BLOCKS[1])
@@ -128,7 +128,7 @@ def _forest_inputs(rows: KeyframeRows) -> F32:
 
 
 def _half_size_pictures(rows: KeyframeRows) -> Tensor:
-    """Half as large: (N, 1, 64, 64)."""
+    """Return the pictures at half their size, (N, 1, 64, 64), in -1 .. 1."""
     x = torch.from_numpy(rows.table.picture).to(torch.float32)[:, None] / 127.5 - 1
     return functional.avg_pool2d(x, 2)
 
@@ -141,10 +141,11 @@ def _encoder() -> nn.Module:
 
 
 def _contrastive_loss(z: Tensor, y: Tensor) -> Tensor:
-    """z (B, D) of length 1, y (B,): of each pair, against all that are as far from the first in y or further.
+    """Return the loss of embeddings z (B, D) of unit length with errors y (B,): each pair is contrasted with
+    all samples at least as far from its anchor in y (Zha et al. 2023).
 
-    Of anchor i, all others in falling order of that: then those against which j stands are the ones up to j,
-    and to the last that is as far as j. So it takes B^2 log B, where the sum as it is written takes B^3.
+    Sorted by falling distance from the anchor, the contrast set of a pair is a prefix, so a cumulative sum
+    takes B^2 log B where the direct sum takes B^3.
     """
     others = ~torch.eye(len(z), dtype=torch.bool)
     similarity = (z @ z.T / _TEMPERATURE)[others].view(len(z), -1)
@@ -164,7 +165,8 @@ def _train(
     patience: int,
     on_progress: ShowProgress,
 ) -> None:
-    """By the Poisson deviance, as ours, until it gets no better where it stops."""
+    """Train `net` by the Poisson deviance, as the error model; keep the weights that do best on
+    `validation`."""
     optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=0.05)
     x, y = training[0], torch.from_numpy(training[1].table.error_cm)
     validation_inputs, validation_errors = validation[0], torch.from_numpy(validation[1].table.error_cm)
@@ -172,9 +174,9 @@ def _train(
     for epoch in range(epochs):
         on_progress(f"epoch {epoch + 1} of {epochs} at most")
         net.train()
-        for which in torch.randperm(len(x)).split(_BATCH):
+        for batch_rows in torch.randperm(len(x)).split(_BATCH):
             optimiser.zero_grad()
-            _poisson_deviance(net(x[which])[:, 0], y[which]).backward()
+            _poisson_deviance(net(x[batch_rows])[:, 0], y[batch_rows]).backward()
             optimiser.step()
         net.eval()
         with torch.no_grad():

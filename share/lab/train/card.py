@@ -1,4 +1,4 @@
-"""The model card: what an error model was taught on, how well it does, and what it is not for."""
+"""The model card: what an error model was trained on, its scores and its limits."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from share.lab.train.score import ErrorModelScore, score_table
 
 _LIMITS = (
     "It estimates the error of SHARE's own trackers over that window, not how far odometry has drifted.",
-    "It was taught on emulated rooms. `strange` says where a picture is unlike all of them.",
-    "What leaves no trace in a keyframe, as a wrong extrinsic, it cannot see.",
+    "It was trained on emulated rooms. `strange` marks keyframes unlike all of them.",
+    "It cannot detect errors that leave no trace in a keyframe, such as a wrong extrinsic.",
 )
 
 
 def model_card(about: Mapping[str, Any], scores: Sequence[ErrorModelScore], size: int, origin: str) -> str:
-    """Markdown. about: of the model; scores: on rooms that it has not learnt from; size: bytes;
-    origin: where its backbone comes from, empty if nobody says."""
+    """Return the card as Markdown. about: the model's metadata; scores: on the test rooms; size: bytes;
+    origin: source and licence of the backbone, empty if unknown."""
     rooms, counts = about["rooms"], about["keyframes"]
     parts = [f"| {part} | {len(rooms[part])} | {counts[part]} | {', '.join(rooms[part])} |" for part in rooms]
     return "\n".join(

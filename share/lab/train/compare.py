@@ -1,4 +1,4 @@
-"""The error model and what else could be in its place, on rooms that none of them has learnt from."""
+"""Compare the error model with its baselines on test rooms."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from share.odometry.error_model.inference import OnnxSession, estimate_error
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe
 from share.types import F32, F64, AgentKind
 
-_TIMED_KEYFRAMES = 200  # keyframes
+_TIMED_KEYFRAMES = 200
 
 
 def score_network(name: str, network: OnnxSession, rows: KeyframeRows) -> ErrorModelScore:
-    """One by one, as on an agent."""
+    """Score the network one keyframe at a time, as on an agent."""
     table, estimates, cpu_start_s = rows.table, [], time.thread_time()
     for features in table.features():
         estimates.append(estimate_error(network, features))
@@ -34,13 +34,13 @@ def score_network(name: str, network: OnnxSession, rows: KeyframeRows) -> ErrorM
 def score_baselines(
     collection: LabelCollection, deep_features: F32, seed: int, on_progress: ShowProgress
 ) -> Iterator[ErrorModelScore]:
-    """Each taught on the rooms that ours is taught on, and tried where it is tried; as they are done."""
+    """Train each baseline on the model's training rooms and yield its score on the test rooms."""
     rows = KeyframeRows(collection.table, deep_features)
     parts = {part: rows.take(collection.keyframes_of(part)) for part in collection.parts}
     training, validation, test = parts["learn"], parts["stop"], parts["test"]
     yield _score_constant_mean(training, test)
     for name, train_baseline in BASELINES.items():
-        on_progress(f"{name}: learns")
+        on_progress(f"{name}: training")
         predict = train_baseline(training, validation, seed, _with_name(name, on_progress))
         yield score_predictions(name, predict(test), test.table.error_cm, ms=_ms_per_keyframe(predict, test))
 
@@ -58,24 +58,24 @@ def score_predictions(
     )
 
 
-def _with_name(name: str, say: ShowProgress) -> ShowProgress:
-    return lambda how_far: say(f"{name}: {how_far}")
+def _with_name(name: str, report: ShowProgress) -> ShowProgress:
+    return lambda how_far: report(f"{name}: {how_far}")
 
 
 def _qoe(error_cm: F64 | F32) -> F64:
-    """Of a headset that waits for nothing: a delay would only make differences smaller."""
+    """Return the QoE of a headset without delay, which would only make differences smaller."""
     needs = QoeParameters.from_config(ControlConfig(), AgentKind.AR)
     return np.array([qoe(ACCEPTED_DELAY_MS, cm, needs) for cm in error_cm.tolist()])
 
 
 def _score_constant_mean(training: KeyframeRows, test: KeyframeRows) -> ErrorModelScore:
-    """Of who knows nothing of a keyframe."""
+    """Score the constant prediction of the training's mean error."""
     constant = np.full(len(test.deep_features), float(training.table.error_cm.mean()))
     return score_predictions("always the mean", constant, test.table.error_cm)
 
 
 def _ms_per_keyframe(predict: Predictor, rows: KeyframeRows) -> float:
-    """ms of CPU, one keyframe at a time."""
+    """Return CPU ms of a prediction, one keyframe at a time."""
     samples = [rows.take(np.array([k])) for k in range(min(_TIMED_KEYFRAMES, len(rows.deep_features)))]
     cpu_start_s = time.process_time()
     for one in samples:

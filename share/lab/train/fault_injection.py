@@ -1,7 +1,7 @@
-"""What goes wrong for a tracker, put into frames that went right: so that errors of all sizes are met.
+"""Faults injected into sound recordings, so that training sees tracking errors of all sizes.
 
-A run in a well-lit room errs by millimetres. Spoiled by and by, the same recording gives others in which
-it is dark, blurred, hazy, covered, or frames and IMU samples are missing.
+A run in a well-lit room errs by millimetres. With faults, the same recording is at times dark, blurred, hazy
+or covered, or frames or IMU samples are missing.
 """
 
 from __future__ import annotations
@@ -15,22 +15,19 @@ import numpy as np
 from share.geometry.camera import Rig
 from share.types import F32, U8, Frame, ImuBatch
 
-BETWEEN_FAULTS_S, FAULT_S = (
-    (2.0, 10.0),
-    (1.0, 8.0),
-)  # drawn evenly; how long a spell and what is between lasts
-_READ_NOISE = 2.0  # gray levels, of a sensor
-_FULL_WELL = 40.0  # photons a gray level
-_BLUR_PX = 6.0  # sigma, at the worst
-_OCCLUDER_DISTANCE_M = (0.1, 0.5)  # how far away what covers is
-_MIN_DEPTH_M = 0.28  # that a depth camera measures
+BETWEEN_FAULTS_S = (2.0, 10.0)  # uniform, between two faults of a kind
+FAULT_S = (1.0, 8.0)  # uniform, duration of a fault
+_READ_NOISE = 2.0  # gray levels
+_FULL_WELL = 40.0  # photons per gray level
+_BLUR_PX = 6.0  # sigma at severity 1
+_OCCLUDER_DISTANCE_M = (0.1, 0.5)  # distance of the occluder
+_MIN_DEPTH_M = 0.28  # least range of a depth camera
 
 
 @dataclass(frozen=True)
 class FaultInterval:
-    """Something is wrong from begin_ns until end_ns. how: one of `FAULT_KINDS`. much: from 0, hardly, to 1,
-    worst.
-    where: three numbers from 0 to 1, of what covers a part of the image: to the right, down, and away."""
+    """A fault in begin_ns <= t < end_ns. how: one of `FAULT_KINDS`. much: severity, 0 to 1. where: three
+    numbers in 0 .. 1 that place an occluder: right, down and distance."""
 
     how: str
     begin_ns: int
@@ -45,7 +42,7 @@ class FaultInterval:
 def draw_faults(
     rng: np.random.Generator, begin_ns: int, end_ns: int, kinds: Iterable[str]
 ) -> list[FaultInterval]:
-    """Spells of each of `kinds`, which come and go independently of each other."""
+    """Draw intervals of each of `kinds`, independent of each other."""
     faults = []
     for kind in kinds:
         begin = begin_ns + _ns(rng.uniform(*BETWEEN_FAULTS_S))
@@ -60,8 +57,7 @@ def draw_faults(
 def inject_faults(
     frames: Iterable[Frame], faults: Iterable[FaultInterval], seed: int, rig: Rig
 ) -> Iterator[Frame]:
-    """What a tracker is given of `frames`, which are rig's. IMU samples of a frame that is missing come with
-    the next one."""
+    """Yield `frames` of `rig` with `faults`. IMU samples of a dropped frame come with the next one."""
     faults = list(faults)
     pending_imu, missing_since_ns = ImuBatch.empty(), 0
     for frame in frames:
@@ -81,7 +77,7 @@ def inject_faults(
 
 
 def _degrade_images(frame: Frame, fault: FaultInterval, seed: int, rig: Rig) -> Frame:
-    """What is seen of it."""
+    """Return the frame with its images and depth degraded by `fault`."""
     image0, image1, depth = frame.image0, frame.image1, frame.depth
     noise0, noise1 = (np.random.default_rng((seed, frame.index, eye)) for eye in (0, 1))
     if fault.how in _IMAGE_FAULTS:
@@ -95,26 +91,26 @@ def _degrade_images(frame: Frame, fault: FaultInterval, seed: int, rig: Rig) -> 
 
 
 def _dark(image: U8, fault: FaultInterval, rng: np.random.Generator) -> U8:
-    """Fewer photons, down to a hundredth, and the noise of those that are left."""
+    """Fewer photons, down to 1 %, with their shot noise and read noise."""
     mean = image.astype(np.float32) * 10 ** (-2 * fault.much)
     noise = np.sqrt(mean / _FULL_WELL + _READ_NOISE**2) * rng.standard_normal(image.shape, np.float32)
     return _as_image(mean + noise)
 
 
 def _blur(image: U8, fault: FaultInterval, rng: np.random.Generator) -> U8:
-    """Out of focus."""
+    """Defocus: a Gaussian blur."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5 + (_BLUR_PX - 0.5) * fault.much), np.uint8)
 
 
 def _haze(image: U8, fault: FaultInterval, rng: np.random.Generator) -> U8:
-    """Less contrast, down to a fiftieth: walls without a texture, glare, fog."""
+    """Less contrast, down to 2 %: untextured walls, glare, fog."""
     contrast = 50 ** (-fault.much)
     return _as_image(contrast * image.astype(np.float32) + (1 - contrast) * float(image.mean()))
 
 
 def _occlude(image: U8, fault: FaultInterval, rng: np.random.Generator, disparity_px_m: float) -> U8:
-    """A hand or a wall right in front, which moves with the camera: a plain patch, from a third of the image
-    to nearly all of it. disparity_px_m: focal length times baseline, 0 for cam0."""
+    """Cover a third to nearly all of the image with a plain patch that moves with the camera, like a hand or
+    a near wall. disparity_px_m: focal length times baseline, 0 for cam0."""
     rows, columns = _occluded_region(image.shape, fault, disparity_px_m)
     out = image.copy()
     patch = float(image.mean()) + _READ_NOISE * rng.standard_normal(out[rows, columns].shape, np.float32)
@@ -131,7 +127,7 @@ def _occlude_depth(depth: F32, fault: FaultInterval) -> F32:
 def _occluded_region(
     shape: tuple[int, ...], fault: FaultInterval, disparity_px_m: float
 ) -> tuple[slice, slice]:
-    """Rows and columns."""
+    """Return the rows and columns that the occluder covers."""
     height, width = shape
     side = np.sqrt(0.33 + 0.65 * fault.much)
     w, h = round(side * width), round(side * height)

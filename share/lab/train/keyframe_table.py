@@ -1,4 +1,4 @@
-"""Keyframes of many runs in one table, for those who learn from them."""
+"""Keyframes of many runs in one table, for training."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _MIN_CM = 0.01
 
 @dataclass(frozen=True, eq=False)
 class KeyframeTable(ArrayTable):
-    """N keyframes whose error is known: run (N,), of which each is; error_cm (N,); picture (N, 128, 128),
-    psd (N, 3, 12, 16), scalars (N, 8), recent (N, 14) as in `ErrorModelInput`."""
+    """N keyframes with a known error: run (N,), index of its run; error_cm (N,); picture (N, 128, 128), psd
+    (N, 3, 12, 16), scalars (N, 8), recent (N, 14) as in `ErrorModelInput`."""
 
     run: I64
     error_cm: F32
@@ -41,31 +41,32 @@ class KeyframeTable(ArrayTable):
 
     @property
     def numbers(self) -> F32:
-        """(N, 22): scalars and recent."""
+        """Return (N, 22): scalars and recent."""
         return np.concatenate([self.scalars, self.recent], axis=1)
 
     def features(self) -> Iterator[ErrorModelInput]:
-        """Keyframe by keyframe."""
+        """Yield the inputs of each keyframe."""
         columns = [getattr(self, name) for name in INPUT_SHAPES]
         return (ErrorModelInput(*one) for one in zip(*columns, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class LabelCollection:
-    """abouts: of its R runs. parts: of `split.PARTS`, the runs in each."""
+    """abouts: metadata of the R runs. parts: the runs in each of `split.PARTS`."""
 
     abouts: list[dict[str, Any]]
     table: KeyframeTable
     parts: dict[str, I64]
 
     def keyframes_of(self, part: str) -> NDArray[np.bool_]:
-        """Which keyframes (N,) of the table are."""
+        """Return a mask (N,) of the table's keyframes that belong to `part`."""
         out: NDArray[np.bool_] = np.isin(self.table.run, self.parts[part])
         return out
 
 
 def collect_labels(folder: Path, seed: int) -> LabelCollection:
-    """All labels in `folder`, split by `seed`. Raises UsageError where there are too few, DataError."""
+    """Read all labels in `folder` and split them by `seed`. Raises UsageError where there are too few,
+    DataError."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         raise UsageError(f"{folder}: has no labels; make them with `share train labels`")
@@ -85,7 +86,7 @@ def collect_labels(folder: Path, seed: int) -> LabelCollection:
 
 
 def tabulate(all_labels: Sequence[Labels]) -> KeyframeTable:
-    """Their keyframes with a known error, errors within a hundredth of a centimetre and 20."""
+    """Return the keyframes with a known error, clipped to 0.01 .. 20 cm."""
     is_known = [np.isfinite(labels.error_cm) for labels in all_labels]
     run = [np.full(int(k.sum()), number) for number, k in enumerate(is_known)]
     columns = [

@@ -1,4 +1,5 @@
-"""`share train labels`: our own tracker over sessions with truth, and how wrong it was at each keyframe."""
+"""`share train labels`: run the tracker over sessions with ground truth and label each keyframe with its
+error."""
 
 from __future__ import annotations
 
@@ -33,14 +34,14 @@ from share.sensors.sequencer import SequencerCounters
 from share.startup import prepare_process
 from share.types import F32, I64, U8, Frame, ImuBatch
 
-_MAX_FAULT_KINDS = 3  # that come together in one run
+_MAX_FAULT_KINDS = 3  # fault kinds in one run, at most
 _IMU_SUFFIX = {True: "", False: "-without-imu"}
 
 
 @dataclass(frozen=True)
 class LabelRun:
-    """One run of one agent. number: 0 is as recorded, each other one spoiled in its own way. imu: False plays
-    it as if there were none."""
+    """One run of one agent. number: 0 is the recording as it is, others have faults of their own. imu: False
+    ignores the IMU."""
 
     session: Path
     agent: str
@@ -53,14 +54,17 @@ class LabelRun:
 def plan_label_runs(
     sessions: Sequence[Session], runs: int, seed: int, imu: bool, out: Path
 ) -> list[LabelRun]:
-    """Everything, done or not. Raises UsageError where there is no truth, or two sessions have one name."""
+    """Return all runs, whether or not their labels exist. Raises UsageError where a session has no ground
+    truth or two sessions have the same name."""
     check_unique_names(sessions)
     jobs = []
     for session in sessions:
         name = session.folder.resolve().name
         for agent in session.agents:
             if not (session.folder / "truth" / f"{agent}.tum").is_file():
-                raise UsageError(f"{session.folder}: has no truth/{agent}.tum to tell how wrong it is")
+                raise UsageError(
+                    f"{session.folder}: has no ground truth truth/{agent}.tum, which labels need"
+                )
             jobs += [
                 LabelRun(
                     session.folder,
@@ -76,14 +80,14 @@ def plan_label_runs(
 
 
 def make_labels(jobs: Sequence[LabelRun], config: Config, workers: int) -> Iterator[tuple[LabelRun, Labels]]:
-    """Those that are not there yet are made; each of `jobs` with its labels, as they come. Raises UsageError
-    where one is there that was spoiled otherwise."""
+    """Make missing labels; yield each of `jobs` with its labels as they become available. Raises UsageError
+    where existing labels have another seed."""
     pending = [job for job in jobs if not job.out.exists()]
     for job in jobs:
         if job.out.exists():
             run_labels = read_labels(job.out)
             if (seed := run_labels.about.get("seed")) != job.seed:
-                raise UsageError(f"{job.out}: is of seed {seed}; give another --out")
+                raise UsageError(f"{job.out}: has labels of seed {seed}; give another --out")
             yield job, run_labels
     if workers == 1:
         for job in pending:
@@ -127,13 +131,13 @@ def _make_run(work: tuple[LabelRun, Config]) -> None:
 def labelled_keyframes(
     source: Source, config: Config, faults: Sequence[FaultInterval] = (), seed: int = 0, imu: bool = True
 ) -> Iterator[tuple[int, float, ErrorModelInput]]:
-    """Of each keyframe of our own tracker: its stamp, how wrong the tracker was then (cm, NaN unknown),
-    and what the error model is told. imu: False plays it as if there were none. Raises UsageError without a
-    truth, or where no tracker fits."""
+    """Yield, for each keyframe of the tracker, its stamp, the tracker's error then (cm, NaN if unknown) and
+    the error model's input. imu: False ignores the IMU. Raises UsageError without ground truth, or where no
+    tracker supports the sensors."""
     truth = source.truth()
     if truth is None:
-        raise UsageError(f"{source.name}: comes without a truth, so nobody knows how wrong a tracker is")
-    # Not `without_imu`, which makes cam0 the body: the truth stays that of the body that was recorded.
+        raise UsageError(f"{source.name}: has no ground truth, which labels need")
+    # `without_imu` would make cam0 the body; the ground truth is that of the recorded body.
     rig = source.rig if imu else replace(source.rig, imu=None)
     check_trackable(source.name, rig)
     tracker, error, odometer = make_tracker(rig, config), LocalError(truth), MotionHistory()
@@ -152,18 +156,16 @@ def labelled_keyframes(
             yield own.stamp_ns, known_error_cm, error_model_input(own.image0, statistics, fares)
 
 
-# ---- What a tracker's keyframes looked like and how wrong it was: one file a run, for training.
-#
-# A NumPy archive (.npz) with a column each and `about`, JSON: of which session and agent, in which room, how
-# it moved, what was spoiled, and by which SHARE.
+# ---- Label files: one NumPy archive (.npz) a run, with an array for each column of `Labels` and `about` as
+# JSON: session, agent, room, motion, faults, version of SHARE.
 
 SCHEMA = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Keyframes of one run, in order: stamps_ns (N,); error_cm (N,), NaN unknown; picture (N, 128, 128), psd
-    (N, 3, 12, 16), scalars (N, 8), recent (N, 14) as in `ErrorModelInput`. about: plain data."""
+    """Keyframes of one run, in order: stamps_ns (N,); error_cm (N,), NaN if unknown; picture (N, 128, 128),
+    psd (N, 3, 12, 16), scalars (N, 8), recent (N, 14) as in `ErrorModelInput`. about: plain metadata."""
 
     about: dict[str, Any]
     stamps_ns: I64
@@ -178,7 +180,7 @@ class Labels:
 
     @classmethod
     def from_rows(cls, about: dict[str, Any], rows: Sequence[tuple[int, float, ErrorModelInput]]) -> Labels:
-        """rows: stamp_ns, error_cm and features of each keyframe."""
+        """Build the columns from `rows`: stamp_ns, error_cm and inputs of each keyframe."""
         return cls(
             about,
             np.array([row[0] for row in rows], np.int64),
@@ -199,7 +201,7 @@ _COLUMNS = tuple(_COLUMN_TYPES)
 
 
 def write_labels(path: Path, labels: Labels) -> None:
-    """Whole or not at all."""
+    """Write the labels atomically."""
     data = io.BytesIO()
     about = json.dumps({"schema": SCHEMA, **labels.about})
     np.savez_compressed(data, about=np.array(about), **{name: getattr(labels, name) for name in _COLUMNS})
@@ -207,18 +209,18 @@ def write_labels(path: Path, labels: Labels) -> None:
 
 
 def read_labels(path: Path) -> Labels:
-    """Raises DataError that names it."""
-    arrays = read_arrays(path, "is no file of labels")
+    """Read labels. Raises DataError that names the file."""
+    arrays = read_arrays(path, "not a label file")
     try:
         about = parse_json(str(arrays["about"]))
         columns = [arrays[name] for name in _COLUMNS]
         if about.pop("schema", None) != SCHEMA:
             raise DataError(
-                f"{path}: is of another schema than {SCHEMA}; make it anew with `share train labels`"
+                f"{path}: has a label schema other than {SCHEMA}; make it again with `share train labels`"
             )
         count = len(columns[0])
     except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise DataError(f"{path}: is no file of labels, or damaged: {error!r:.200}") from None
+        raise DataError(f"{path}: not a label file, or damaged: {error!r:.200}") from None
     for name, column in zip(_COLUMNS, columns, strict=True):
         shape, kind = _COLUMN_TYPES[name]
         if column.shape != (count, *shape) or column.dtype != kind:

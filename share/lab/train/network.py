@@ -1,7 +1,7 @@
-"""The network of the error model but for its backbone, in torch; and what it is taught by.
+"""The heads of the error model in torch, and their loss.
 
-Three branches are joined: what the picture looks like (by a backbone that stays as it is), where there are
-points, and numbers. Source: SHARE, IMWUT 10(3) 97, 2026; that these are also of the last seconds is ours
+Three branches are joined: backbone features of the picture, the distribution of feature points (PSD), and
+scalars. Source: SHARE, IMWUT 10(3) 97, 2026; scalars of the last seconds are added here
 (docs/understand/error-model.md).
 """
 
@@ -15,15 +15,15 @@ from share.odometry.error_model.inputs import RECENT_NAMES, SCALAR_NAMES
 
 DEEP_SIZE, EMBEDDING_SIZE, JOINED_SIZE = 1280, 64, 96
 NUMBERS_SIZE = len(SCALAR_NAMES) + len(RECENT_NAMES)
-LOW_QUANTILE, HIGH_QUANTILE = 0.05, 0.95  # quantiles
+LOW_QUANTILE, HIGH_QUANTILE = 0.05, 0.95
 
 
 class Head(nn.Module):  # type: ignore[misc]
-    """deep (N, 1280), psd (N, 3, 12, 16), numbers (N, 22: scalars, recent) to log of cm (N, 3):
-    expected, low, high.
+    """Map deep (N, 1280), psd (N, 3, 12, 16) and numbers (N, 22: scalars, recent) to the log error in cm (N,
+    3): expected, low, high.
 
-    What numbers say goes to what is expected also straight on, since many are logarithms of what the error is
-    a product of powers of: so it goes on beyond what has been learnt.
+    A linear skip connection leads from numbers to the expected log error: many are logarithms of factors of
+    the error, so it extrapolates beyond the training data.
     """
 
     def __init__(self, dropout: float = 0.0) -> None:
@@ -45,7 +45,7 @@ class Head(nn.Module):  # type: ignore[misc]
         self.straight = nn.Linear(NUMBERS_SIZE, 1)
 
     def join(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
-        """(N, 96)."""
+        """Return the joined branches (N, 96)."""
         branches = (self.visual(self.dropout(deep)), self.spread(psd), self.numbers(numbers))
         return torch.cat(branches, dim=1)
 
@@ -57,28 +57,29 @@ class Head(nn.Module):  # type: ignore[misc]
 
 
 class Heads(nn.Module):  # type: ignore[misc]
-    """Several heads that began differently. What rooms have taught all of them is what they agree on, so
-    their mean is less wrong than each (deep ensembles, Lakshminarayanan et al. 2017)."""
+    """An ensemble of heads with different initial weights, whose mean errs less than each (deep ensembles,
+    Lakshminarayanan et al. 2017)."""
 
     def __init__(self, count: int, dropout: float = 0.0) -> None:
         super().__init__()
         self.each = nn.ModuleList(Head(dropout) for _ in range(count))
 
     def join(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
-        """(N, 96), the first one's."""
+        """Return the joined branches (N, 96) of the first head."""
         joined: Tensor = self.each[0].join(deep, psd, numbers)
         return joined
 
     def forward(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
-        """(H, N, 3), each one's."""
+        """Return the outputs (H, N, 3) of all heads."""
         return torch.stack([head(deep, psd, numbers) for head in self.each])
 
 
 def loss(predicted: Tensor, log_error: Tensor) -> Tensor:
-    """told (..., N, 3) by `Head`, log_error (N,) of cm.
+    """Return the loss of predicted (..., N, 3), as of `Head`, for log_error (N,) in log cm.
 
-    What is expected is learnt by the Poisson deviance, whose least is the mean, and which minds large errors
-    more than a logarithm and less than a square would; the interval by the pinball loss of its quantiles.
+    The expected error is fitted by the Poisson deviance: its minimum is the mean, and it weighs large errors
+    more than a logarithm and less than a square would. The interval is fitted by the pinball loss of its
+    quantiles.
     """
     expected, low, high = predicted.unbind(dim=-1)
     deviance = torch.exp(expected) - torch.exp(log_error) * expected
@@ -90,5 +91,5 @@ def loss(predicted: Tensor, log_error: Tensor) -> Tensor:
 
 
 def _pinball_loss(excess: Tensor, quantile: float) -> Tensor:
-    """Koenker and Bassett 1978."""
+    """Quantile regression, Koenker and Bassett 1978."""
     return torch.maximum(quantile * excess, (quantile - 1) * excess).mean()

@@ -1,6 +1,6 @@
-"""The error model as ONNX: a backbone that is there already, and heads put onto it node by node.
+"""Append trained heads to a backbone's ONNX graph.
 
-Written out by hand, because it is thirty nodes a head, and so that the file depends on nobody's exporter.
+The nodes, thirty a head, are written by hand, so the file does not depend on an exporter.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from share.odometry.error_model.inference import OUTPUTS
 from share.odometry.error_model.inputs import INPUT_SHAPES
 from share.types import F32
 
-DEEP_OUTPUT = "deep"  # the backbone's last tensor (N, 1280)
-_HEAD_PREFIX = "head/"  # names of all that heads bring begin with it
+DEEP_OUTPUT = "deep"  # the backbone's output (N, 1280)
+_HEAD_PREFIX = "head/"  # prefix of the names of all nodes and constants of heads
 _INPUTS = {name: ("N", *shape) for name, shape in INPUT_SHAPES.items() if name != "picture"}
 _OUTPUT_SHAPES = {"log_error": ("N", 3), "embedding": ("N", 64), "distance": ("N",)}
 
 
 def with_heads(base: bytes, fitted: TrainedHeads) -> bytes:
-    """`base`, a model with a backbone and perhaps other heads, with these."""
+    """Return the model `base` (a backbone, perhaps with heads) with the heads of `fitted` in place of its
+    own."""
     model = onnx.load_model_from_string(base)
     graph = model.graph
     _strip_heads(graph)
@@ -43,7 +44,7 @@ def with_heads(base: bytes, fitted: TrainedHeads) -> bytes:
 
 
 def backbone_id(base: bytes) -> str:
-    """The same for models that differ in their heads alone."""
+    """Return an id of the backbone, independent of the heads."""
     graph = onnx.load_model_from_string(base).graph
     _strip_heads(graph)
     parts = (one.SerializeToString() for field in (graph.node, graph.initializer) for one in field)
@@ -51,12 +52,12 @@ def backbone_id(base: bytes) -> str:
 
 
 def origin(base: bytes) -> str:
-    """Where its backbone comes from, and by what licence; empty if nobody says."""
+    """Return source and licence of the backbone, empty if unknown."""
     return str(onnx.load_model_from_string(base).doc_string)
 
 
 def _strip_heads(graph: Any) -> None:
-    """Of earlier heads; deep stays as an output, by which others are taught."""
+    """Remove the heads; `deep` stays an output, which training needs."""
     for field in (graph.node, graph.initializer):
         remaining = [one for one in field if not one.name.startswith(_HEAD_PREFIX)]
         del field[:]
@@ -75,13 +76,13 @@ class _NodeList:
         self.constants: list[Any] = []
 
     def add(self, kind: str, inputs: list[str], output: str = "", **attributes: Any) -> str:
-        """Its output."""
+        """Append a node and return the name of its output."""
         name = f"{_HEAD_PREFIX}{len(self.all)}"
         self.all.append(helper.make_node(kind, inputs, [output or name], name, **attributes))
         return output or name
 
     def columns(self, x: str) -> list[str]:
-        """Three of them, (N, 1) each."""
+        """Split x (N, 3) into three columns (N, 1)."""
         name = f"{_HEAD_PREFIX}{len(self.all)}"
         each = [f"{name}/{k}" for k in range(3)]
         ones = self.constant(f"{name}/ones", np.ones(3, np.int64))
@@ -95,7 +96,8 @@ class _NodeList:
 
 
 class _HeadNodes:
-    """joined: (N, 96). told (N, 3): log of the error, and how far the interval's ends are from it."""
+    """The nodes of one head. joined: (N, 96). prediction (N, 3): log error, and widths of the interval below
+    and above it."""
 
     def __init__(self, nodes: _NodeList, number: int, weights: dict[str, F32], numbers: str) -> None:
         self._nodes, self._number, self._weights = nodes, number, weights
@@ -121,13 +123,13 @@ class _HeadNodes:
         return self._nodes.add("Relu", [self._nodes.add("Conv", [x, *self._layer(layer)], **shape)])
 
     def _layer(self, name: str) -> list[str]:
-        """Its weight and bias."""
+        """Add the layer's weight and bias as constants."""
         names = [f"{name}.{what}" for what in ("weight", "bias")]
         return [self._nodes.constant(f"{self._number}/{name}", self._weights[name]) for name in names]
 
 
 def _head_nodes(fitted: TrainedHeads) -> _NodeList:
-    """All heads, and what they say on average."""
+    """Return the nodes of all heads and of their mean."""
     nodes = _NodeList()
     numbers = nodes.add("Concat", ["scalars", "recent"], axis=1)
     heads = [_HeadNodes(nodes, k, weights, numbers) for k, weights in enumerate(fitted.heads)]

@@ -1,4 +1,4 @@
-"""Teaching the network: epochs until it gets no better on rooms that it does not learn from."""
+"""Train the heads, epoch by epoch, until they stop improving on the validation rooms."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from share.files.writing import atomic_write
 from share.lab.train.network import Heads, loss
 from share.types import F32
 
-_MAX_BYTES = 200 * MB  # of a checkpoint: four heads and their moments have 5
-ShowEpoch = Callable[[int, float, float], None]  # epoch, loss where it learns, loss where it stops
+_MAX_BYTES = 200 * MB  # of a checkpoint; four heads and their moments take 5 MB
+ShowEpoch = Callable[[int, float, float], None]  # epoch, training loss, validation loss
 
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """epochs at most; patience: without a gain, after which it ends. dropout: of what the backbone
-    says, since rooms are few, and many pictures are of the same one. heads: whose mean is told."""
+    """epochs: at most. patience: epochs without a gain before training stops. dropout: of backbone features,
+    since there are few rooms and many pictures of each. heads: number of heads whose mean is the prediction.
+    """
 
     epochs: int = 200
     patience: int = 25
@@ -40,7 +41,7 @@ class TrainingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Of N keyframes: deep (N, 1280), by the backbone; psd as in `Features`; numbers (N, 22), its scalars
+    """Inputs of N keyframes: deep_features (N, 1280); psd as in `ErrorModelInput`; numbers (N, 22), scalars
     and recent; log_error (N,)."""
 
     deep_features: F32
@@ -49,12 +50,12 @@ class Inputs:
     log_error: F32
 
     def tensors(self, device: torch.device) -> list[torch.Tensor]:
-        """In this order."""
+        """Return the arrays as tensors, in the order of the fields."""
         return [torch.from_numpy(column).to(device) for column in self._columns()]
 
     @property
     def crc(self) -> int:
-        """The same for the same keyframes."""
+        """Return a checksum of the arrays."""
         return zlib.crc32(b"".join(column.tobytes() for column in self._columns()))
 
     def _columns(self) -> list[F32]:
@@ -71,8 +72,8 @@ class _TrainingProgress:
 def train_heads(
     training: Inputs, validation: Inputs, options: TrainingOptions, checkpoint: Path | None, show: ShowEpoch
 ) -> Heads:
-    """The heads that do best on `validation`. checkpoint: a file to go on from, if it is of the same
-    keyframes and options, and to keep what has been learnt in, each epoch. On a GPU where there is one."""
+    """Return the heads that do best on `validation`. checkpoint: written after each epoch; resumed from if it
+    has the same inputs and options. Uses a GPU if there is one."""
     torch.manual_seed(options.seed)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     heads = Heads(options.heads, options.dropout)
@@ -89,8 +90,8 @@ def train_heads(
                 heads.load_state_dict(saved["heads"])
                 optimiser.load_state_dict(saved["optimiser"])
                 progress, best = _TrainingProgress(**saved["at"]), saved["best"]
-        except Exception as error:  # torch, pickle and zip each have their own
-            raise DataError(f"{checkpoint}: is damaged; remove it to begin anew ({error!r:.200})") from None
+        except Exception as error:  # torch, pickle and zip raise types of their own
+            raise DataError(f"{checkpoint}: is damaged; remove it to start again ({error!r:.200})") from None
     rows, validation_tensors = training.tensors(device), validation.tensors(device)
     while progress.epoch < options.epochs and progress.epoch - progress.best_epoch < options.patience:
         training_loss = _train_epoch(heads, optimiser, rows, options, progress.epoch)
@@ -113,7 +114,8 @@ def _train_epoch(
     options: TrainingOptions,
     epoch: int,
 ) -> float:
-    """In an order that the seed and the epoch decide, so that a run that goes on goes on as it would have."""
+    """Train one epoch and return its loss. Seed and epoch decide the order, so that a resumed run gives the
+    same result."""
     heads.train()
     torch.manual_seed(options.seed * 100_003 + epoch)
     order, total = torch.randperm(len(rows[0])), 0.0
@@ -121,7 +123,7 @@ def _train_epoch(
         *inputs, log_error = (column[batch_rows.to(column.device)] for column in rows)
         optimiser.zero_grad()
         value = loss(heads(*inputs), log_error)
-        (options.heads * value).backward()  # each learns as it would alone
+        (options.heads * value).backward()  # the gradients of training each head alone
         for head in heads.each:
             torch.nn.utils.clip_grad_norm_(head.parameters(), 1.0)
         optimiser.step()

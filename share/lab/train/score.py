@@ -1,4 +1,4 @@
-"""How well models of the error do on the same keyframes, and the table of it."""
+"""Scores of error models on the same keyframes, as a table and as JSON."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from share.files.reading import MAX_SETTINGS_BYTES, read_text
 
 @dataclass(frozen=True)
 class ErrorModelScore:
-    """Of one model on N keyframes. rmse_cm, mae_cm; rank: correlation with the true error (Spearman);
-    qoe_off: by how much a headset's QoE is off, on average, where nothing is late; covered: how many errors
-    lie in their intervals, NaN without any; ms: of CPU a keyframe, the features not included, NaN where it
-    was not measured."""
+    """Score of one model on N keyframes. rmse_cm, mae_cm: of the estimate; rank: Spearman correlation with
+    the true error; qoe_off: mean absolute error of a headset's QoE without delay; covered: share of errors
+    within their intervals, NaN without intervals; ms: CPU time a keyframe without the inputs, NaN if not
+    measured."""
 
     name: str
     rmse_cm: float
@@ -32,7 +32,7 @@ class ErrorModelScore:
 
 
 def score_table(scores: Sequence[ErrorModelScore]) -> str:
-    """Markdown, as the paper's: error, and time a keyframe."""
+    """Return a Markdown table with the paper's columns: errors, and time a keyframe."""
     head = (
         "| | RMSE cm | mean error cm | rank correlation | QoE off | in the interval | ms |",
         "|---|" + 6 * "---|",
@@ -50,20 +50,20 @@ def scores_json(scores: Sequence[ErrorModelScore]) -> str:
 
 
 def read_scores(path: Path) -> list[ErrorModelScore]:
-    """What `scores_json` wrote. Raises DataError."""
+    """Read what `scores_json` wrote. Raises DataError."""
     try:
         rows = parse_json(read_text(path, MAX_SETTINGS_BYTES))
         if not isinstance(rows, list):
-            raise ValueError("it is no list")
+            raise ValueError("not a list")
         return [_score_from_row(none_to_nan(row)) for row in rows]
     except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
-        raise DataError(f"{path}: is not by `share train compare --json`, or damaged: {error}") from None
+        raise DataError(f"{path}: not a file of `share train compare --json`, or damaged: {error}") from None
 
 
 def _score_from_row(row: dict[str, Any]) -> ErrorModelScore:
     numbers = (value for name, value in row.items() if name != "name")
     if not isinstance(row["name"], str) or not all(isinstance(value, int | float) for value in numbers):
-        raise ValueError("it has text where numbers should be")
+        raise ValueError("text in place of a number")
     return ErrorModelScore(**row)
 
 

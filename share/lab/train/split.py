@@ -1,4 +1,4 @@
-"""Which runs are learnt from and which are kept for the test: by room and motion, never by frame."""
+"""Split runs into training, validation, calibration and test by room and motion, never by frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SHARES = (0.6, 0.12, 0.13, 0.15)  # of the groups
 
 
 def room_groups(abouts: Sequence[Mapping[str, Any]]) -> I64:
-    """(R,) of R runs: those that share a room, or a motion that was recorded, are in one group."""
+    """Return the group (R,) of each of R runs: runs that share a room or a recorded motion are in one."""
     merged: list[set[str]] = []
     for about in abouts:
         keys = _room_keys(about)
@@ -27,8 +27,8 @@ def room_groups(abouts: Sequence[Mapping[str, Any]]) -> I64:
 
 
 def split_runs(group: I64, seed: int) -> dict[str, I64]:
-    """Runs (R,) of each of `PARTS`, by whole groups (R,) that are drawn by `seed`; no part is empty where
-    there are as many groups as parts."""
+    """Return the runs of each of `PARTS`: whole groups, drawn by `seed`. No part is empty if there are as
+    many groups as parts."""
     names = np.random.default_rng(seed).permutation(np.unique(group))
     min_groups = min(1, len(names) // len(PARTS))
     counts = [max(min_groups, round(share * len(names))) for share in _SHARES[1:]]
@@ -38,15 +38,16 @@ def split_runs(group: I64, seed: int) -> dict[str, I64]:
 
 
 def _room_keys(about: Mapping[str, Any]) -> set[str]:
-    """Its room, and the motions in it that are the same in any room."""
+    """Return the keys that a run shares with others of its group: its room, and its recorded motions."""
     provenance = about["provenance"]
-    if "scene" not in provenance:  # recorded, not emulated
+    if "scene" not in provenance:  # a recording, not emulated
         return {f"session {about['session']}"}
     room = f"room {provenance['scene']} {provenance['seed']} {provenance.get('size')}"
     return {room, *(f"motion {motion}" for motion in provenance["motions"] if _is_recorded(motion))}
 
 
 def _is_recorded(motion: str) -> bool:
-    """`paper:1`, a recording's path; not what is planned anew in each room, as `ar=walk:speed=0.6`."""
+    """Return whether a motion is the same in any room (`paper:1`, a recording), not planned in each, as
+    `ar=walk:speed=0.6`."""
     name, _, spec = motion.partition("=")
     return not (spec or name).startswith(("walk:", "robot:"))

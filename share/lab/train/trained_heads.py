@@ -1,4 +1,4 @@
-"""What has been taught, as arrays: weights of the heads, how wide their intervals are, what they know."""
+"""Trained heads as arrays: weights, width of the intervals, and the domain of the training data."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ from share.files.reading import MB
 from share.files.writing import atomic_write
 from share.types import F32, F64
 
-INTERVAL_COVERAGE = 0.9  # of all errors lie in their intervals
-KNOWN_QUANTILE = 0.99  # of what it was calibrated on is no further than what it knows
-_MAX_BYTES = 200 * MB  # four heads have 1.6
-_RIDGE = 1e-3  # of a variance, added
+INTERVAL_COVERAGE = 0.9  # share of errors that should lie in their intervals
+KNOWN_QUANTILE = 0.99  # quantile of the calibration data's distances that is distance 1
+_MAX_BYTES = 200 * MB  # four heads take 1.6 MB
+_RIDGE = 1e-3  # relative ridge added to the variances
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedHeads:
-    """heads: weights of each `share.lab.train.network.Head`, for inputs as they come
-    (`fold_standardisation`). margin: by
-    which low and high go further out, in logarithms. mean (96,), whitening (96, 96): a vector x that the
-    first head joined is as far from what was learnt as |(x - mean) whitening|, 1 where that ends. about:
-    plain data."""
+    """heads: weights of each `share.lab.train.network.Head`, for inputs that are not standardised
+    (`fold_standardisation`). margin: widens the interval on both sides, log. mean (96,), whitening (96, 96):
+    the distance of a joined vector x of the first head from the training data is |(x - mean) whitening|; 1 is
+    its limit. about: plain metadata."""
 
     heads: list[dict[str, F32]]
     margin: float
@@ -41,7 +40,7 @@ class TrainedHeads:
 
 
 def fold_standardisation(weights: dict[str, F32], layer: str, mean: F32, deviation: F32) -> dict[str, F32]:
-    """`weights` with a linear `layer` that takes x in place of (x - mean) / deviation."""
+    """Return `weights` with the linear `layer` changed to take x in place of (x - mean) / deviation."""
     W, b = weights[f"{layer}.weight"] / deviation, weights[f"{layer}.bias"]
     return weights | {
         f"{layer}.weight": W.astype(np.float32),
@@ -50,16 +49,17 @@ def fold_standardisation(weights: dict[str, F32], layer: str, mean: F32, deviati
 
 
 def conformal_margin(predicted: F32, log_error: F32, coverage: float = INTERVAL_COVERAGE) -> float:
-    """By which (N, 3) intervals have to go further out on both sides, so that a new one of their sort covers
-    its error with probability `coverage` (conformalised quantile regression, Romano et al. 2019)."""
+    """Return the margin by which intervals of predicted (N, 3) must widen on both sides to cover a new error
+    with probability `coverage` (conformalised quantile regression, Romano et al. 2019)."""
     excess = np.sort(np.maximum(predicted[:, 1] - log_error, log_error - predicted[:, 2]))
     rank = math.ceil((len(excess) + 1) * coverage)
     return float(excess[min(rank, len(excess)) - 1])
 
 
 def mahalanobis_scale(training: F32, calibration: F32) -> tuple[F32, F32]:
-    """Mean and whitening for `TrainedHeads`, of what was learnt (N, 96) and what it was calibrated on (M,
-    96): the Mahalanobis distance, in parts of the one that `KNOWN_QUANTILE` of the latter keep."""
+    """Return mean (96,) and whitening (96, 96) for `TrainedHeads` from joined vectors of training (N, 96) and
+    calibration (M, 96) data: a Mahalanobis distance, scaled so that the `KNOWN_QUANTILE` of the calibration
+    data is at 1."""
     mean = training.mean(axis=0, dtype=np.float64)
     cov = np.cov(training.T.astype(np.float64))
     cov += _RIDGE * np.trace(cov) / len(cov) * np.eye(len(cov))
@@ -69,7 +69,7 @@ def mahalanobis_scale(training: F32, calibration: F32) -> tuple[F32, F32]:
 
 
 def write_trained(path: Path, fitted: TrainedHeads) -> None:
-    """Whole or not at all."""
+    """Write the heads atomically."""
     data = io.BytesIO()
     numbered = enumerate(fitted.heads)
     arrays: dict[str, Any] = {f"{k}/{name}": value for k, head in numbered for name, value in head.items()}
@@ -79,8 +79,8 @@ def write_trained(path: Path, fitted: TrainedHeads) -> None:
 
 
 def read_trained(path: Path) -> TrainedHeads:
-    """Raises DataError that names it."""
-    arrays = read_arrays(path, "is not by `share train fit`", _MAX_BYTES)
+    """Read trained heads. Raises DataError that names the file."""
+    arrays = read_arrays(path, "not a file of `share train fit`", _MAX_BYTES)
     try:
         about = parse_json(str(arrays.pop("about")))
         if bad := [name for name, value in arrays.items() if not np.isfinite(value).all()]:
@@ -92,4 +92,4 @@ def read_trained(path: Path) -> TrainedHeads:
             list(heads.values()), float(arrays["margin"]), arrays["mean"], arrays["whitening"], about
         )
     except (KeyError, ValueError, TypeError) as error:
-        raise DataError(f"{path}: is not by `share train fit`, or damaged: {error!r:.200}") from None
+        raise DataError(f"{path}: not a file of `share train fit`, or damaged: {error!r:.200}") from None

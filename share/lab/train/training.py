@@ -1,5 +1,4 @@
-"""From labels to heads: inputs are standardised, heads are fitted and calibrated, and know how far their
-knowledge goes."""
+"""Fit heads to labels: standardise inputs, train, calibrate intervals and estimate the training domain."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from share.lab.train.trained_heads import (
 from share.metrics.local_error import WINDOW_S
 from share.types import F32
 
-_MIN_DEVIATION = 1e-3  # deviation of an input that hardly changes
+_MIN_DEVIATION = 1e-3  # least deviation of an input
 
 
 def train_model(
@@ -32,8 +31,8 @@ def train_model(
     checkpoint: Path | None,
     on_epoch: ShowEpoch,
 ) -> TrainedHeads:
-    """deep (N, 1280): of the table's pictures, by the backbone that the head will be put onto, which is
-    called `backbone` (`graph.backbone_id`)."""
+    """Return the heads trained on the collection. deep_features (N, 1280): of the table's pictures, by the
+    backbone whose id (`onnx_graph.backbone_id`) is `backbone`."""
     scale = _Standardiser(deep_features, collection)
     parts = {name: scale.inputs(name) for name in collection.parts}
     heads = train_heads(parts["learn"], parts["stop"], options, checkpoint, on_epoch)
@@ -57,7 +56,7 @@ def train_model(
 
 
 def _folded_weights(head: torch.nn.Module, scale: _Standardiser) -> dict[str, F32]:
-    """Its weights, for inputs as they come."""
+    """Return the head's weights for inputs that are not standardised."""
     weights = {name: value.numpy() for name, value in head.state_dict().items()}
     weights = fold_standardisation(weights, "visual.0", *scale.deep_moments)
     for layer in ("numbers.0", "straight"):
@@ -66,7 +65,7 @@ def _folded_weights(head: torch.nn.Module, scale: _Standardiser) -> dict[str, F3
 
 
 class _Standardiser:
-    """Inputs at a mean of 0 and a deviation of 1, by those that are learnt from."""
+    """Scales inputs to mean 0 and deviation 1 over the training part."""
 
     def __init__(self, deep: F32, collection: LabelCollection) -> None:
         self._deep_features, self._collection = deep, collection

@@ -117,7 +117,7 @@ def test_a_plan_has_it(room):
 
 
 def test_what_cannot_be_is_said_in_one_line(room):
-    with pytest.raises(UsageError, match="the whitewall has no calibration board; take --scene board"):
+    with pytest.raises(UsageError, match="the whitewall has no calibration board; use --scene board"):
         plan_motions(["board:"], make_scene_layout("whitewall", 1), 20, 1)
     with pytest.raises(UsageError, match="too small for distance=2"):
         plan_motions(["board:distance=2"], room, 20, 1)

@@ -45,7 +45,7 @@ def test_a_recording_two_people_and_a_robot_in_a_warehouse(warehouse, recorded):
 @pytest.mark.parametrize(
     ("specs", "says"),
     [
-        ([], "nobody moves"),
+        ([], "no agent is given"),
         (["paper:1", "walk:"], "give it alone"),
         (["x=paper:1"], "without a name"),
         (["a=walk:", "a=robot:"], "two agents are named 'a'"),

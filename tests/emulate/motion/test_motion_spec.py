@@ -28,7 +28,7 @@ def test_specs_are_read(text, name, spec):
         ("walk:speed=fast", "expected float"),
         ("walk:speed=9", "0.2 to 2 m/s"),
         ("walk:3", "'3' is not key=value"),
-        ("a b=walk:", "is no name"),
+        ("a b=walk:", "is not a valid name"),
         ("paper:6", "paper:1 to paper:5"),
         ("tum:", "no folder or file"),
         ("tum:x,look=cat", "known: person, robot, drone"),

@@ -7,7 +7,7 @@ from motion_sim import SECONDS, every, floor
 from share.errors import UsageError
 from share.lab.emulate.motion import crowd as crowds
 from share.lab.emulate.motion import paper, walk
-from share.lab.emulate.motion.crowd import SettledPath, SimulatedAgent, path_length, plan_crowd, settled_path
+from share.lab.emulate.motion.crowd import FixedPath, SimulatedAgent, fixed_path, path_length, plan_crowd
 from share.lab.emulate.motion.planned_motion import FloorGraphs, MotionPreferences
 from share.lab.emulate.motion.route import POINT_SPACING_M, FloorGraph, arc_length, smooth_route
 from share.lab.emulate.motion.schedule import (
@@ -91,7 +91,7 @@ def test_two_people_and_a_robot_keep_apart_and_off_one_who_is_there():
         SimulatedAgent(str(k), wish, 1.7 if wish.body_kind == "person" else 0.35)
         for k, wish in enumerate(wishes)
     ]
-    there = SettledPath(np.array([[2.5, 3.0, 1.5]]), 0.6)
+    there = FixedPath(np.array([[2.5, 3.0, 1.5]]), 0.6)
     things = np.array([[1.0, 1.0, 1.0]])
     paths = plan_crowd(ground, members, [there], things, SECONDS, (5,))
     bodies = [p.poses(every(p, 20))[:, :2, 3] for p in paths]
@@ -116,5 +116,5 @@ def test_an_experiment_of_the_paper_has_the_papers_lengths():
     paths = plan_crowd(FloorGraphs(floor()), members, [], np.array([[1.0, 1.0, 1.0]]), paper.SECONDS, (1,))
     lengths = [path_length(p) for p in paths]
     assert np.abs(np.array(lengths) / paper.LENGTHS_M[2] - 1).max() < 0.02
-    bodies = [settled_path(p, 0).xyz for p in paths]
+    bodies = [fixed_path(p, 0).xyz for p in paths]
     assert all(floor().at(b[:, :2]).min() > 0.1 for b in bodies)

@@ -29,7 +29,7 @@ def test_gray_level_is_albedo_times_light():
 
 
 def test_no_image_without_a_moment(boxes):
-    with pytest.raises(ValueError, match="moments"):
+    with pytest.raises(ValueError, match="instants"):
         boxes.radiance(D435I, [])
 
 

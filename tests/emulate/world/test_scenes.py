@@ -191,7 +191,7 @@ def test_a_size_that_no_such_room_can_have(name: str, size: tuple[float, float, 
 
 
 def test_an_unknown_scene() -> None:
-    with pytest.raises(UsageError, match="no scene is named 'attic'; there are: warehouse, firestation"):
+    with pytest.raises(UsageError, match="scene 'attic' is not known; known: warehouse, firestation"):
         make_scene_layout("attic", 0)
 
 

@@ -54,11 +54,11 @@ def test_a_second_writer_changes_nothing(peopled: DrawableRoom, tmp_path: Path) 
 
 
 def test_a_damaged_room_is_refused_in_one_line(peopled: DrawableRoom, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="not a whole room"):
+    with pytest.raises(DataError, match="not a complete room"):
         load_room(tmp_path / "none")
     save_room(peopled, tmp_path / "room")
     (tmp_path / "room" / "light_map.npy").write_bytes(b"\x93NUMPY")
-    with pytest.raises(DataError, match=r"not a whole room .*remove it"):
+    with pytest.raises(DataError, match=r"not a complete room .*delete it"):
         load_room(tmp_path / "room")
 
 

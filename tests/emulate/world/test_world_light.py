@@ -169,7 +169,7 @@ def test_panels_of_a_wall_are_one_patch() -> None:
 
 
 def test_a_room_without_lamps_is_refused(small_layout: Layout) -> None:
-    with pytest.raises(ValueError, match="needs a light"):
+    with pytest.raises(ValueError, match="needs a lamp"):
         build_room(replace(small_layout, lights=()))
 
 

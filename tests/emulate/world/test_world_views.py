@@ -28,5 +28,5 @@ def test_a_camera_looks_where_it_is_told() -> None:
 
 
 def test_a_full_room_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"nobody 1\.9 m tall can stand"):
+    with pytest.raises(ValueError, match=r"no free place for a body 1\.9 m tall"):
         standing_views(Occupancy(np.ones((20, 20, 40), bool), 0.1), 1, 1)

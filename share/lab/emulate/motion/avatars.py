@@ -1,9 +1,9 @@
-"""Where the parts of an agent's body are, told from its path alone.
+"""Poses of the parts of an agent's body, derived from its path alone.
 
-    path -> head (or base) -> where the trunk must be -> legs in step, feet on the floor
+    path -> head (or base) -> trunk -> legs in step, feet on the floor
 
-A person's step is read off the bob of the head: the phase of its analytic signal (Gabor 1946) between
-0.8 and 3 Hz, so that legs and head agree on recorded paths as well.
+A person's steps are found in the bob of the head: the phase of its analytic signal (Gabor 1946) between 0.8
+and 3 Hz, so that legs and head agree on recorded paths as well.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from share.lab.emulate.world.mesh import Shape
 from share.types import F64, I64
 
 _RATE_HZ = 50
-_TRUNK_SMOOTHING_S = 0.35  # sigma of the trunk's smoothing
-_GAZE_WEIGHT = 0.35  # m/s: walking faster than this, the trunk rather follows the way than the eyes
+_TRUNK_SMOOTHING_S = 0.35  # sigma
+_GAZE_WEIGHT = 0.35  # m/s; the trunk faces the direction of motion above this speed, the gaze below
 _STEP_HZ = (0.8, 3.0)
-_WALKING_SPEED = 0.45  # m/s, from which on one truly walks
+_WALKING_SPEED = 0.45  # m/s, full gait from here on
 _FOOT_LIFT_M = 0.11
 _ARM_SWING_RAD = 0.55  # rad of swing at 1.4 m/s
-_HEIGHT_RANGE_M = (1.3, 2.05)  # of a person, by how high the head is carried
+_HEIGHT_RANGE_M = (1.3, 2.05)  # of a person
 
 
 def avatar_shapes(body_kind: str, path: MotionPath, seed: tuple[int, ...]) -> tuple[Shape, ...]:
-    """The parts of an agent that looks as `person`, `robot` or `drone`, each in its own frame."""
+    """Return the parts of a `person`, `robot` or `drone`, each in its own frame."""
     return BODY_SHAPES[body_kind](np.random.default_rng(seed), body_height(body_kind, path))
 
 
 def body_height(body_kind: str, path: MotionPath) -> float:
-    """Height (m) of a person whose head is carried so high; of a robot's camera."""
+    """Return the height (m) of a person, from the height of the head, or of a robot's camera."""
     z = path.poses(_sample_stamps(path))[:, 2, 3]
     if body_kind != "person":
         return float(np.median(z))
@@ -47,26 +47,26 @@ def body_height(body_kind: str, path: MotionPath) -> float:
 
 
 def _sample_stamps(path: MotionPath) -> I64:
-    """Some stamps (200,) over a path; in integers, for a float does not hold them."""
+    """Return stamps (200,) spread over a path; integers, since float64 does not hold them."""
     return path.start_ns + np.linspace(0, path.end_ns - path.start_ns, 200).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class Avatar:
-    """The body of one agent along its path. T_body_cam0 (4, 4): how the camera sits on the path's body,
-    which tells where it looks; None where the body has a camera's axes itself, as simulated ones have."""
+    """The body of one agent along its path. T_body_cam0 (4, 4): the camera's pose on the body, which gives
+    its viewing direction; None where the body has camera axes, as simulated bodies have."""
 
     body_kind: str
     path: MotionPath
     T_body_cam0: F64 | None = None
 
     def part_poses(self, stamps_ns: I64) -> F64:
-        """T_world_part (N, P, 4, 4), in the order of `avatar_shapes`. Raises ValueError outside the
+        """Return T_world_part (N, P, 4, 4), in the order of `avatar_shapes`. Raises ValueError outside the
         path's span."""
         return _PART_FUNCTIONS[self.body_kind](self, np.asarray(stamps_ns, np.int64))
 
     def facing_poses(self, stamps_ns: I64) -> F64:
-        """T_world_camera-place (N, 4, 4): where the body is, its axes ahead, left, up of its camera."""
+        """Return (N, 4, 4): the body's position, with the axes ahead, left, up of its camera."""
         T = self.path.poses(stamps_ns)
         mount = np.eye(3) if self.T_body_cam0 is None else self.T_body_cam0[:3, :3]
         return se3.from_rt(T[:, :3, :3] @ mount @ CAMERA_AXES.T, T[:, :3, 3])
@@ -79,7 +79,7 @@ def _robot_parts(avatar: Avatar, stamps: I64) -> F64:
 
 
 def _drone_parts(avatar: Avatar, stamps: I64) -> F64:
-    """Upright on average, and tilted as the body tilts."""
+    """Return T_world_part (N, 1, 4, 4): upright on average, tilted as the body tilts."""
     up = avatar.facing_poses(_sample_stamps(avatar.path))[:, 2, :3].mean(0)
     up /= np.linalg.norm(up)
     ahead = np.cross((0.0, 1.0, 0.0), up)
@@ -113,7 +113,7 @@ _PART_FUNCTIONS = {"person": _person_parts, "robot": _robot_parts, "drone": _dro
 
 @dataclass(frozen=True, eq=False)
 class _TrunkMotion:
-    """How the trunk moves: xy (N, 2) m, heading (N,) rad, speed (N,) m/s, phase (N,) rad of a step."""
+    """Motion of the trunk: xy (N, 2) m, heading (N,) rad, speed (N,) m/s, phase (N,) rad of a step."""
 
     seconds: F64
     xy: F64
@@ -147,7 +147,7 @@ class _TrunkMotion:
 
 
 def _analytic_step_signal(z: F64) -> NDArray[np.complex128]:
-    """The analytic signal of what is quick as steps are in z (N,): no negative frequencies."""
+    """Return the analytic signal (no negative frequencies) of z (N,), band-passed to step frequencies."""
     spectrum = np.fft.rfft(z - z.mean())
     hz = np.fft.rfftfreq(len(z), 1 / _RATE_HZ)
     spectrum[(hz < _STEP_HZ[0]) | (hz > _STEP_HZ[1])] = 0
@@ -155,7 +155,7 @@ def _analytic_step_signal(z: F64) -> NDArray[np.complex128]:
 
 
 def _trunk_rotations(hip: F64, neck: F64, heading: F64) -> F64:
-    """Rotations (N, 3, 3) of a trunk that faces `heading` and reaches from hip to neck (N, 3) m."""
+    """Return rotations (N, 3, 3) of a trunk that faces `heading` and reaches from hip to neck (N, 3) m."""
     up = neck - hip
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     left = np.cross(up, np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1))
@@ -164,7 +164,7 @@ def _trunk_rotations(hip: F64, neck: F64, heading: F64) -> F64:
 
 
 def _arm_poses(torso: F64, walk: _TrunkMotion, height: float, side: int) -> tuple[F64, F64]:
-    """Upper arm and forearm; an arm swings with the opposite leg."""
+    """Return poses of upper arm and forearm; an arm swings with the opposite leg."""
     swing = _ARM_SWING_RAD * (walk.speed / 1.4).clip(0, 1.3) * _foot_position(walk, -side)
     shoulder = np.array([0.0, side * body_shapes.SHOULDERS * height, (body_shapes.SHOULDER - 0.02) * height])
     upper = _hang_limb(torso, shoulder, swing)
@@ -173,12 +173,13 @@ def _arm_poses(torso: F64, walk: _TrunkMotion, height: float, side: int) -> tupl
 
 
 def _foot_position(walk: _TrunkMotion, side: int) -> F64:
-    """-1 .. 1: how far ahead the foot of a side is."""
+    """Return how far ahead a side's foot is, -1 .. 1."""
     return side * np.cos(walk.phase / 2)
 
 
 def _leg_poses(hip: F64, walk: _TrunkMotion, height: float, side: int) -> tuple[F64, F64, F64]:
-    """Thigh, shin and foot: the foot stands while the body passes over it, then swings ahead."""
+    """Return poses of thigh, shin and foot: the foot stands while the body passes over it, then swings
+    ahead."""
     thigh, shin = body_shapes.THIGH * height, body_shapes.SHIN * height
     level = axis_rotation(2, walk.heading)
     joint = hip + level @ np.array([0.0, side * body_shapes.HIPS * height, 0.0])
@@ -196,7 +197,7 @@ def _leg_poses(hip: F64, walk: _TrunkMotion, height: float, side: int) -> tuple[
 
 
 def _ankle_motion(walk: _TrunkMotion, side: int) -> tuple[F64, F64]:
-    """How far ahead of the hip the ankle is, and how far above the floor (N,) m."""
+    """Return how far the ankle is ahead of the hip and above the floor, (N,) m each."""
     vigour = min_jerk(walk.speed / _WALKING_SPEED)
     length = np.sqrt(WALK_RATIO * walk.speed) * vigour
     share = (walk.phase / (4 * np.pi) + (0.0 if side > 0 else 0.5)) % 1.0
@@ -206,6 +207,7 @@ def _ankle_motion(walk: _TrunkMotion, side: int) -> tuple[F64, F64]:
 
 
 def _hang_limb(parent: F64, joint: F64, angle: F64) -> F64:
-    """A limb (N, 4, 4) hung at `joint` (3,) m of its parent, turned ahead by `angle` (N,) rad."""
+    """Return the pose (N, 4, 4) of a limb hung at `joint` (3,) m of its parent, pitched ahead by `angle` (N,)
+    rad."""
     R = parent[:, :3, :3] @ axis_rotation(1, -angle)
     return se3.from_rt(R, parent[:, :3, 3] + parent[:, :3, :3] @ joint)

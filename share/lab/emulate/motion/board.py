@@ -1,9 +1,9 @@
-"""A device moved before a calibration board, as people do it for Kalibr: `board:`.
+"""`board:` moves a device before a calibration board, as people do for Kalibr.
 
-Six signals that come and go on their own: where the device is around the board (azimuth, elevation,
-distance), where the board is in the image (aim, two ways), and roll. So all six axes are excited, and the
-board visits the whole image; how far it may go from the image's middle follows from how large it is there.
-The body frame has a camera's axes: x right, y down, z ahead.
+Six independent band-limited signals: position around the board (azimuth, elevation, distance), place of the
+board in the image (two), and roll. So all six axes are excited and the board visits the whole image; its
+apparent size limits how far it may go from the image's middle. The body frame has camera axes: x right, y
+down, z ahead.
 """
 
 from __future__ import annotations
@@ -21,40 +21,41 @@ from share.lab.emulate.types import START_NS
 from share.lab.emulate.world.layout import Layout, PlacedTarget
 from share.types import F64
 
-INITIAL_STILL_S = 1.5  # at the start, for the IMU
+INITIAL_STILL_S = 1.5  # at rest at the start, for IMU initialisation
 _START_EASE_S = 2.0  # from rest to full speed
-_PAUSE_VIGOUR = 0.5  # below this vigour, the device comes to rest every
-_PAUSE_S = 3.0  # s
+_PAUSE_VIGOUR = 0.5  # below this vigour, the device comes to rest every _PAUSE_S
+_PAUSE_S = 3.0
 _PERIODS = (1.2, 4.5)  # s, shortest and longest, at vigour 1
 _WAVES = 5
-_PERIOD_FACTORS = np.array([1.8, 1.8, 1.8, 1.0, 1.0, 1.0])  # times longer: an arm, against a wrist
-_DISTANCE_FACTOR = 1.8  # times nearer and farther than the usual distance, at most
-_MAX_AZIMUTH, _MAX_ELEVATION, _MAX_ROLL = np.radians((38.0, 30.0, 38.0))  # most, to either side
-_VIEW_TANGENTS = np.array([0.80, 0.53])  # tangents from the middle of the image to its edges: D435i and EuRoC
-_CAMERA_OFFSET_M = 0.06  # m; how far the cameras are from the body at most
-_MAX_OVERSHOOT = 1.1  # the board may leave the image by so much
-_WALL_CLEARANCE_M = 0.15  # m; what carries the device keeps so far from walls
+# periods of arm motions (first three) against wrist motions
+_PERIOD_FACTORS = np.array([1.8, 1.8, 1.8, 1.0, 1.0, 1.0])
+_DISTANCE_FACTOR = 1.8  # distance varies by this factor both ways
+_MAX_AZIMUTH, _MAX_ELEVATION, _MAX_ROLL = np.radians((38.0, 30.0, 38.0))  # to either side
+_VIEW_TANGENTS = np.array([0.80, 0.53])  # tangents from the middle of the image to its edges, D435i and EuRoC
+_CAMERA_OFFSET_M = 0.06  # largest distance of a camera from the body
+_MAX_OVERSHOOT = 1.1  # the board may leave the image by this factor
+_WALL_CLEARANCE_M = 0.15  # least distance of the device from walls
 
 
 def board_path(layout: Layout, spec: BoardSpec, seconds: float, rng: np.random.Generator) -> SplinePath:
-    """The body's path before the room's board, the same for the same `rng`. Raises UsageError where the
-    room has no board or no space for it."""
+    """Return the body's path before the room's board. Deterministic for a given `rng`. Raises UsageError
+    where the room has no board or no space for the motion."""
     if layout.target is None:
-        raise UsageError(f"the {layout.name} has no calibration board; take --scene board")
+        raise UsageError(f"the {layout.name} has no calibration board; use --scene board")
     t = knot_times(seconds)
     T = layout.target.T_world_target @ _target_poses(layout.target, spec, t, rng)
     if (T[:, :3, 3] < _WALL_CLEARANCE_M).any() or (
         T[:, :3, 3] > np.array(layout.size) - _WALL_CLEARANCE_M
     ).any():
         raise UsageError(
-            f"board: the room is too small for distance={spec.distance:g}; take less, or a larger --size"
+            f"board: the room is too small for distance={spec.distance:g}; use less, or a larger --size"
         )
     path = spline_through(START_NS, t, T[:, :3, 3], se3.quat_from_matrix(T[:, :3, :3]))
     return replace(path, end_ns=START_NS + round(seconds * 1e9))
 
 
 def _target_poses(target: PlacedTarget, spec: BoardSpec, t: F64, rng: np.random.Generator) -> F64:
-    """T_target_body (M, 4, 4) at t (M,) s."""
+    """Return T_target_body (M, 4, 4) at t (M,) s."""
     around, above, along, across, down, roll = _motion_signals(_exercise_progress(t, spec.vigour), rng)
     distance = spec.distance * _DISTANCE_FACTOR**along
     half = np.ptp(target.target.extent, axis=0) / 2
@@ -64,7 +65,7 @@ def _target_poses(target: PlacedTarget, spec: BoardSpec, t: F64, rng: np.random.
 
 
 def _exercise_progress(t: F64, vigour: float) -> F64:
-    """How far the exercise has come (M,) at t (M,), in seconds of one with vigour 1."""
+    """Return the progress (M,) of the exercise at t (M,), in seconds of one with vigour 1."""
     x = ((t - INITIAL_STILL_S) / _START_EASE_S).clip(0, 1)
     speed = vigour * x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3)  # smooth to the third derivative
     if vigour < _PAUSE_VIGOUR:
@@ -73,8 +74,8 @@ def _exercise_progress(t: F64, vigour: float) -> F64:
 
 
 def _motion_signals(progress: F64, rng: np.random.Generator) -> F64:
-    """Six signals (6, M) between -1 and 1, as often near the ends as in the middle. Their slow waves are
-    as quick as the fast ones, so they are larger."""
+    """Return six signals (6, M) in -1 .. 1, distributed about uniformly. All their waves have the same peak
+    rate, so slow ones are larger."""
     from scipy.special import erf
 
     periods = np.geomspace(*_PERIODS, _WAVES) * _PERIOD_FACTORS[:, None] * rng.uniform(0.9, 1.1, (6, _WAVES))
@@ -86,9 +87,9 @@ def _motion_signals(progress: F64, rng: np.random.Generator) -> F64:
 
 
 def _aim_limits(half: F64, distance: F64, roll: F64) -> F64:
-    """How far (2, M) the middle of a board of half-size (2,) m may be from the middle of the image,
-    tangents: what its size there leaves, and a little where it leaves nothing."""
-    c, s = np.cos(roll), np.sqrt(np.sin(roll) ** 2 + 1e-2)  # |sin|, but smooth
+    """Return how far (2, M) the middle of a board of half-size (2,) m may be from the middle of the image, as
+    tangents: what its size leaves, smoothly positive."""
+    c, s = np.cos(roll), np.sqrt(np.sin(roll) ** 2 + 1e-2)  # smooth |sin|
     size = (half[:, None] * c + half[::-1, None] * s) / distance
     margin = (
         _MAX_OVERSHOOT * _VIEW_TANGENTS[:, None] - size - np.array([[_CAMERA_OFFSET_M], [0.0]]) / distance
@@ -98,14 +99,14 @@ def _aim_limits(half: F64, distance: F64, roll: F64) -> F64:
 
 
 def _looking_pose(around: F64, above: F64, distance: F64, aim: F64, roll: F64) -> tuple[F64, F64]:
-    """Orientation (M, 3, 3) and place (M, 3) m of the body in a frame at the board's middle. aim (2, M):
-    where the middle is to be seen, tangents."""
-    facing = np.array([(1.0, 0, 0), (0, -1, 0), (0, 0, -1)])  # of one before the middle, looking at it
+    """Return orientation (M, 3, 3) and position (M, 3) m of the body in a frame at the board's middle. aim
+    (2, M): where the image shows the middle, tangents."""
+    facing = np.array([(1.0, 0, 0), (0, -1, 0), (0, 0, -1)])  # looks at the board from before its middle
     orbit = _axis_rotation(1, around) @ _axis_rotation(0, -above)
     aside = _axis_rotation(0, np.arctan(aim[1])) @ _axis_rotation(1, -np.arctan(aim[0]))
     return orbit @ facing @ _axis_rotation(2, roll) @ aside, orbit[:, :, 2] * distance[:, None]
 
 
 def _axis_rotation(axis: int, angle: F64) -> F64:
-    """Rotations (M, 3, 3) about one axis."""
+    """Return rotations (M, 3, 3) about one axis."""
     return se3.so3_exp(angle[:, None] * np.eye(3)[axis])

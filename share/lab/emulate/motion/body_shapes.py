@@ -1,9 +1,10 @@
-"""What agents look like to each other: rigid parts of a person, a robot, a drone, as shapes with materials.
+"""Bodies of agents as others see them: rigid parts of a person, a robot and a drone, as shapes with
+materials.
 
-Each part is in a frame of its own: x ahead, y left, z up, its origin where it hangs (a limb's upper
-joint, the middle of the hips, the middle of the head; the floor under a robot; the middle of a drone).
-A person is made for a height of 1 m and scaled: segment lengths by Drillis & Contini (1966), as in
-Winter, *Biomechanics and Motor Control of Human Movement*.
+Each part has a frame of its own: x ahead, y left, z up, its origin where it hangs (a limb's upper joint, the
+middle of the hips, the middle of the head; the floor under a robot; the middle of a drone). A person is made
+for a height of 1 m and scaled: segment lengths by Drillis & Contini (1966), as in Winter, *Biomechanics and
+Motor Control of Human Movement*.
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ from share.lab.emulate.world.mesh import Shape, box, concat_shapes, cylinder, pr
 
 Rng = np.random.Generator
 
-THIGH, SHIN, ANKLE, HIP = 0.245, 0.246, 0.039, 0.53  # of the height: lengths, and the hip over the floor
+THIGH, SHIN, ANKLE, HIP = 0.245, 0.246, 0.039, 0.53  # lengths, and height of the hip, over the body's height
 UPPER_ARM, FOREARM, SHOULDER = 0.186, 0.200, 0.285  # the shoulder over the hip
 SHOULDERS, HIPS = 0.110, 0.055  # half widths
-EYE = 0.936  # of the eyes over the floor
-HEADSET_M = 0.10  # m, from the middle of the head to the headset's IMU
+EYE = 0.936  # height of the eyes
+HEADSET_M = 0.10  # from the middle of the head to the headset's IMU
 
 
 def person(rng: Rng, height: float) -> tuple[Shape, ...]:
-    """Head, torso, upper arms, forearms, thighs, shins, feet; of pairs the left one first. height: m."""
+    """Return head, torso, upper arms, forearms, thighs, shins, feet; the left one of each pair first. height:
+    m."""
     h = height
     skin = Material("skin", gray=float(rng.uniform(90, 175)))
     shirt, trousers = (
@@ -46,7 +48,8 @@ def person(rng: Rng, height: float) -> tuple[Shape, ...]:
 
 
 def robot(rng: Rng, height: float) -> tuple[Shape, ...]:
-    """One like a TurtleBot 4: a round base of 34 cm, a plate above it, a mast with a camera at `height` m."""
+    """Return a body like a TurtleBot 4: a round base of 34 cm, a plate above it, a mast with a camera at
+    `height` m."""
     dark = Material("plastic", int(rng.integers(1000)), gray=60, contrast=1.2)
     light = Material("plastic", int(rng.integers(1000)), gray=170)
     metal = Material("galvanised", int(rng.integers(1000)))
@@ -80,7 +83,7 @@ def robot(rng: Rng, height: float) -> tuple[Shape, ...]:
 
 
 def drone(rng: Rng, height: float) -> tuple[Shape, ...]:
-    """A small multicopter; its rotors are discs. height: unused, it flies."""
+    """Return a small multicopter; its rotors are discs. height: unused."""
     dark = Material("plastic", int(rng.integers(1000)), gray=50)
     metal = Material("steel", int(rng.integers(1000)))
     parts = [
@@ -104,7 +107,7 @@ BODY_SHAPES: dict[str, Callable[[Rng, float], tuple[Shape, ...]]] = {
 
 
 def _limb(length: float, upper: float, lower: float, skin: Material, rng: Rng) -> Shape:
-    """Hangs down from its joint."""
+    """Return a limb that hangs down from its joint."""
     round_end = cylinder((0, 0, -0.01), upper, 0.03, skin, skin, sides=10, rng=rng, top=0.6 * upper)
     return concat_shapes(
         [cylinder((0, 0, -length), lower, length, skin, skin, sides=10, rng=rng, top=upper), round_end]
@@ -116,7 +119,8 @@ def _hand(forearm: float, skin: Material) -> Shape:
 
 
 def _torso(h: float, shirt: Material, trousers: Material, rng: Rng) -> Shape:
-    """From the hips up: slices of elliptic outline (half depth, half width, low, high in m)."""
+    """Return the torso from the hips up: slices of elliptic outline (half depth, half width, low, high in
+    m)."""
     up = SHOULDER * h
     slices = [
         (0.115, 0.165, -0.08, 0.06, trousers),
@@ -132,7 +136,7 @@ def _torso(h: float, shirt: Material, trousers: Material, rng: Rng) -> Shape:
 
 
 def _head(skin: Material, rng: Rng) -> Shape:
-    """Rounded, with hair and a headset before the eyes."""
+    """Return a rounded head with hair and a headset before the eyes."""
     hair = Material("carpet", int(rng.integers(1000)), gray=float(rng.uniform(35, 120)))
     shell = Material("plastic", int(rng.integers(1000)), gray=45)
     levels = [(-0.12, 0.050), (-0.09, 0.072), (-0.03, 0.086), (0.04, 0.090), (0.09, 0.070), (0.12, 0.030)]

@@ -1,4 +1,5 @@
-"""Several simulated agents at once: tracks that keep apart, then bodies that look about and at each other."""
+"""Plan several simulated agents at once: tracks that keep apart, then bodies that look at things and
+others."""
 
 from __future__ import annotations
 
@@ -27,16 +28,16 @@ from share.lab.emulate.types import START_NS, MotionPath
 from share.types import F64
 
 _ATTEMPTS = 60
-_LENGTH_ROUNDS = 6  # of bringing lengths to what they shall be
-_MIN_IMPROVEMENT = 0.7  # times what a length was off by; otherwise another attempt is worth more
-_LENGTH_TOLERANCE = 0.010  # relative; the paper's are asked to 2 %
+_LENGTH_ROUNDS = 6  # replanning rounds that adjust path lengths
+_MIN_IMPROVEMENT = 0.7  # a round must reduce length errors to this share, else a new attempt starts
+_LENGTH_TOLERANCE = 0.010  # path lengths are those of poses at 30 Hz
 _LENGTH_STEP_S = 1 / 30  # a length is that of the line through poses at 30 Hz
 
 
 @dataclass(frozen=True)
 class SimulatedAgent:
-    """One simulated agent. height: m, of eyes or camera. turns: rad/s, of a person's quickest turn of the
-    head. vibration: m/s^2, of a robot. length: m of the body's path at 30 Hz, None for any."""
+    """One simulated agent. height: m, of eyes or camera. max_head_rate: rad/s, of a person. vibration: m/s^2,
+    of a robot. length: m of the body's path at 30 Hz, None for any."""
 
     name: str
     preferences: MotionPreferences
@@ -47,9 +48,9 @@ class SimulatedAgent:
 
 
 @dataclass(frozen=True, eq=False)
-class SettledPath:
-    """One whose path is settled already. xyz (M, 3) m every KNOT_S of its own time from its start;
-    distance: m that others keep from it."""
+class FixedPath:
+    """A path that is fixed. xyz (M, 3) m every KNOT_S from its start; distance: m that others keep from
+    it."""
 
     xyz: F64
     distance: float
@@ -58,82 +59,82 @@ class SettledPath:
 def plan_crowd(
     ground: FloorGraphs,
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     gaze_targets: F64,
     duration: float,
     seed: tuple[int, ...],
 ) -> list[SplinePath]:
-    """Paths of `duration` s, in the members' order. things (K, 3) m: what there is to look at. Raises
+    """Return paths of `duration` s, in the members' order. gaze_targets (K, 3) m: things to look at. Raises
     UsageError where no attempt finds room for all."""
     for attempt in range(_ATTEMPTS):
-        paths = _try_crowd(ground, members, settled, gaze_targets, duration, (*seed, attempt))
+        paths = _try_crowd(ground, members, fixed, gaze_targets, duration, (*seed, attempt))
         if paths is not None:
             return paths
     names = ", ".join(m.name for m in members)
     raise UsageError(
         f"{names}: found no paths that keep people {PEOPLE_M} m and robots {ROBOT_M} m apart in this room; "
-        "take fewer agents, lower speeds, a larger --size or another --seed"
+        "use fewer agents, lower speeds, a larger --size or another --seed"
     )
 
 
 def _try_crowd(
     ground: FloorGraphs,
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     gaze_targets: F64,
     duration: float,
     seed: tuple[int, ...],
 ) -> list[SplinePath] | None:
     lengths = [m.length for m in members]
-    courses_and_tracks = _plan_courses(ground, members, settled, duration, seed)
+    courses_and_tracks = _plan_courses(ground, members, fixed, duration, seed)
     before = np.full(len(members), np.inf)
     for _ in range(_LENGTH_ROUNDS):
         if courses_and_tracks is None:
             return None
         paths = _body_paths(
-            members, [track for _, track in courses_and_tracks], settled, gaze_targets, duration, seed
+            members, [track for _, track in courses_and_tracks], fixed, gaze_targets, duration, seed
         )
         missing = np.array(
             [m.length - path_length(p) if m.length else 0.0 for m, p in zip(members, paths, strict=True)]
         )
         length_errors = np.abs(missing) / [m.length or 1.0 for m in members]
         if (length_errors <= _LENGTH_TOLERANCE).all():
-            return paths if _keep_distance(members, paths, settled) else None
+            return paths if _keep_distance(members, paths, fixed) else None
         if (length_errors > np.maximum(_LENGTH_TOLERANCE, _MIN_IMPROVEMENT * before)).any():
-            return None  # someone cannot go as far, or cannot help being pushed on
+            return None  # a length cannot be reached, or another agent forces a longer path
         before = length_errors
         lengths = [g and max(0.5, g + d) for g, d in zip(lengths, missing, strict=True)]
         courses_and_tracks = _replan_lengths(
-            ground, members, settled, duration, [course for course, _ in courses_and_tracks], lengths
+            ground, members, fixed, duration, [course for course, _ in courses_and_tracks], lengths
         )
     return None
 
 
 def path_length(path: MotionPath) -> float:
-    """Metres of the line through the body's positions at 30 Hz, as `share dataset info` counts them."""
+    """Return the length (m) of the body's path at 30 Hz, as `share dataset info` counts it."""
     stamps = np.arange(path.start_ns, path.end_ns + 1, round(_LENGTH_STEP_S * 1e9))
     steps = np.diff(path.poses(stamps)[:, :3, 3], axis=0)
     return float(np.linalg.norm(steps, axis=1).sum())
 
 
-def settled_path(path: MotionPath, distance: float) -> SettledPath:
-    """A settled path as others must respect it."""
+def fixed_path(path: MotionPath, distance: float) -> FixedPath:
+    """Return a fixed path as an obstacle for others."""
     seconds = knot_times((path.end_ns - path.start_ns) / 1e9)
     stamps = np.minimum(path.start_ns + np.round(seconds * 1e9).astype(np.int64), path.end_ns)
-    return SettledPath(path.poses(stamps)[:, :3, 3], distance)
+    return FixedPath(path.poses(stamps)[:, :3, 3], distance)
 
 
 def _plan_courses(
     ground: FloorGraphs,
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     duration: float,
     seed: tuple[int, ...],
 ) -> list[tuple[PlannedRoute, PlanarTrack]] | None:
-    """A course for each, and the track on it."""
+    """Return a route for each member, and the track on it; None if there is none."""
     planned: dict[int, tuple[PlannedRoute, PlanarTrack]] = {}
     for i in _priority_order(members):
-        obstacles = _obstacles(members, settled, {k: track for k, (_, track) in planned.items()}, i)
+        obstacles = _obstacles(members, fixed, {k: track for k, (_, track) in planned.items()}, i)
         preferences = replace(members[i].preferences, length=members[i].length)
         one = plan_motion(ground, preferences, obstacles, duration, (*seed, i))
         if one is None:
@@ -145,15 +146,15 @@ def _plan_courses(
 def _replan_lengths(
     ground: FloorGraphs,
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     duration: float,
     courses: Sequence[PlannedRoute],
     lengths: Sequence[float | None],
 ) -> list[tuple[PlannedRoute, PlanarTrack]] | None:
-    """The same courses, to go other lengths."""
+    """Return the same routes with tracks of other lengths; None if there are none."""
     tracks: dict[int, PlanarTrack] = {}
     for i in _priority_order(members):
-        track = courses[i].track(ground, _obstacles(members, settled, tracks, i), duration, lengths[i])
+        track = courses[i].track(ground, _obstacles(members, fixed, tracks, i), duration, lengths[i])
         if track is None:
             return None
         tracks[i] = track
@@ -161,38 +162,38 @@ def _replan_lengths(
 
 
 def _priority_order(members: Sequence[SimulatedAgent]) -> list[int]:
-    """The quick ones have the right of way: they have the least time to spare."""
+    """Return the planning order: the fastest first, since they have the least time to spare."""
     return sorted(range(len(members)), key=lambda i: -members[i].preferences.speed)
 
 
 def _obstacles(
     members: Sequence[SimulatedAgent],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     tracks: Mapping[int, PlanarTrack],
     i: int,
 ) -> list[MovingObstacle]:
-    """What member i must keep off: everyone whose motion is settled."""
+    """Return what member i must keep off: all whose motion is planned."""
     own = members[i].preferences
-    settled_tracks = [(p.xyz[:, :2], p.distance) for p in settled]
-    settled_tracks += [(track.xy, members[k].preferences.distance) for k, track in tracks.items()]
-    return [moving_obstacle(xy, min(distance, own.distance)) for xy, distance in settled_tracks]
+    fixed_tracks = [(p.xyz[:, :2], p.distance) for p in fixed]
+    fixed_tracks += [(track.xy, members[k].preferences.distance) for k, track in tracks.items()]
+    return [moving_obstacle(xy, min(distance, own.distance)) for xy, distance in fixed_tracks]
 
 
 def _body_paths(
     members: Sequence[SimulatedAgent],
     tracks: Sequence[PlanarTrack],
-    settled: Sequence[SettledPath],
+    fixed: Sequence[FixedPath],
     gaze_targets: F64,
     duration: float,
     seed: tuple[int, ...],
 ) -> list[SplinePath]:
     count = len(tracks[0].seconds)
     gaze_agents = [GazeAgent(t.xy, m.height) for t, m in zip(tracks, members, strict=True)]
-    settled_agents = [GazeAgent(_extended(p.xyz[:, :2], count), float(p.xyz[:, 2].mean())) for p in settled]
+    fixed_agents = [GazeAgent(_extended(p.xyz[:, :2], count), float(p.xyz[:, 2].mean())) for p in fixed]
     paths = []
     for i, (m, track) in enumerate(zip(members, tracks, strict=True)):
         rng = np.random.default_rng((*seed, i, 1))
-        others = [s for k, s in enumerate(gaze_agents) if k != i] + settled_agents
+        others = [s for k, s in enumerate(gaze_agents) if k != i] + fixed_agents
         if m.preferences.body_kind == "person":
             path = walk.headset_path(track, m.height, m.max_head_rate, gaze_targets, others, START_NS, rng)
         else:
@@ -202,11 +203,11 @@ def _body_paths(
 
 
 def _keep_distance(
-    members: Sequence[SimulatedAgent], paths: Sequence[SplinePath], settled: Sequence[SettledPath]
+    members: Sequence[SimulatedAgent], paths: Sequence[SplinePath], fixed: Sequence[FixedPath]
 ) -> bool:
-    """Whether nobody is ever nearer to another than both like."""
-    bodies = [settled_path(p, m.preferences.distance) for p, m in zip(paths, members, strict=True)]
-    everyone = [*bodies, *settled]
+    """Return whether all keep the lesser of their two distances at all times."""
+    bodies = [fixed_path(p, m.preferences.distance) for p, m in zip(paths, members, strict=True)]
+    everyone = [*bodies, *fixed]
     for i, a in enumerate(bodies):
         for b in everyone[i + 1 :]:
             count = max(len(a.xyz), len(b.xyz))
@@ -216,5 +217,5 @@ def _keep_distance(
 
 
 def _extended(values: F64, count: int) -> F64:
-    """(count, D): the first rows, the last one repeated where there are fewer."""
+    """Return the first `count` rows (count, D), the last one repeated where there are fewer."""
     return values[np.minimum(np.arange(count), len(values) - 1)]

@@ -1,4 +1,4 @@
-"""Free floor as a grid: how far from every place the nearest obstacle is."""
+"""Free floor as a grid: the distance of each place from the nearest obstacle."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from share.types import F64
 _MIN_OBSTACLE_M, _MAX_OBSTACLE_M = (
     0.10,
     1.95,
-)  # m: a step of less is walked over, a beam above is walked under
-_VOXELS_PER_CELL = 2  # voxels of the occupancy to one cell here
+)  # m; lower steps are walked over, higher beams are walked under
+_VOXELS_PER_CELL = 2  # voxels of the occupancy per grid cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Floor:
     origin: float = 0.0
 
     def clearance_at(self, xy: F64) -> F64:
-        """Clearance (N,) m at places (N, 2) m, bilinear; outside the grid as at its edge."""
+        """Return the clearance (N,) m at places (N, 2) m, bilinear; outside the grid that of its edge."""
         i, f = self._cells(xy)
         c = self.clearance
         low = c[i[:, 0], i[:, 1]] * (1 - f[:, 1]) + c[i[:, 0], i[:, 1] + 1] * f[:, 1]
@@ -35,7 +35,7 @@ class Floor:
         return out
 
     def clearance_gradient(self, xy: F64) -> F64:
-        """Gradient (N, 2) of the clearance: where to go to gain room."""
+        """Return the gradient (N, 2) of the clearance."""
         h = self.step * np.eye(2)
         return np.stack([self.clearance_at(xy + d) - self.clearance_at(xy - d) for d in h], axis=1) / (
             2 * self.step
@@ -49,7 +49,7 @@ class Floor:
 
 
 def floor_from_occupancy(occupancy: Occupancy) -> Floor:
-    """The floor of a room, for people and robots alike: under a table nobody goes."""
+    """Return the floor for people and robots alike: the space under a table is not free."""
     clearance, origin, step = occupancy.floor_clearance(_MIN_OBSTACLE_M, _MAX_OBSTACLE_M)
     grid = clearance[::_VOXELS_PER_CELL, ::_VOXELS_PER_CELL].astype(np.float64)
     return Floor(grid, step * _VOXELS_PER_CELL, float(origin[0]))

@@ -1,4 +1,4 @@
-"""How walking moves the trunk: bob, sway, the jolt of each step, and what a standing body does.
+"""Motion of the trunk in walking (bob, sway, heel strikes) and in standing.
 
 * Step frequency: step length / step frequency is constant in free walking, the walk ratio of about
   0.0065 m per step/min = 0.39 m s (Sekiya & Nagasaki, Gait & Posture 7, 1998), so f = sqrt(v / 0.39).
@@ -26,8 +26,8 @@ _STANDING_M, _BREATH_M = 0.0025, 0.0012  # rms
 
 @dataclass(frozen=True, eq=False)
 class Gait:
-    """phase (M,) rad, 2 pi a step, a foot striking at each multiple; vigour (M,) 0 standing .. 1 walking;
-    aside, up (M,) m: of the trunk off its smooth line."""
+    """phase (M,) rad, 2 pi a step, with a heel strike at each multiple; vigour (M,) 0 standing .. 1 walking;
+    sideways, up (M,) m: of the trunk from its smooth track."""
 
     phase: F64
     vigour: F64
@@ -36,7 +36,7 @@ class Gait:
 
 
 def make_gait(track: PlanarTrack, rng: np.random.Generator) -> Gait:
-    """How a body walks along `track`."""
+    """Return the gait of a body that moves along `track`."""
     v, t = track.speed, track.seconds
     phase, vigour = step_phase(v, rate=1 + 0.02 * random_wander(rng, t, (2.0, 6.0)))
     bob, sway = (np.interp(v, _SPEEDS, size) * vigour / 2 for size in (_BOB_M, _SWAY_M))
@@ -51,7 +51,7 @@ def make_gait(track: PlanarTrack, rng: np.random.Generator) -> Gait:
 
 
 def step_phase(speed: F64, rate: F64 | float = 1.0) -> tuple[F64, F64]:
-    """Phase (M,) rad and vigour (M,) of a body that goes at `speed` (M,) m/s, every KNOT_S."""
+    """Return phase (M,) rad and vigour (M,) of a body with `speed` (M,) m/s, every KNOT_S."""
     v = speed.clip(0)
     vigour = (v / 0.45).clip(0, 1)
     vigour = vigour**2 * (3 - 2 * vigour)
@@ -60,7 +60,7 @@ def step_phase(speed: F64, rate: F64 | float = 1.0) -> tuple[F64, F64]:
 
 
 def _heel_strikes(phase: F64, speed: F64, seconds: F64) -> F64:
-    """Displacement (M,) m by heel strikes: smooth pulses, a little after each."""
+    """Return displacement (M,) m by heel strikes: smooth pulses, slightly delayed."""
     out = np.zeros(len(seconds))
     reach = round(5 * _JOLT_S / KNOT_S)
     for i in np.flatnonzero(np.diff(np.floor(phase / (2 * np.pi))) > 0):

@@ -1,7 +1,7 @@
-"""Where a person looks: ahead, at things, at others; the head goes over in one smooth turn each time.
+"""Direction of a person's gaze: ahead, at things or at others, with one smooth turn between targets.
 
-A turn has the minimum-jerk profile, whose peak rate is 1.875 times the mean one. The head turns at most
-63 deg off the trunk: what one passes is followed less and less.
+A turn has the minimum-jerk profile, whose peak rate is 1.875 times the mean rate. The head turns at most 63
+deg off the trunk, so targets to the side are followed less and less.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import numpy as np
 from share.lab.emulate.motion.track import PlanarTrack, min_jerk
 from share.types import F64
 
-_LOOK_AHEAD_S = 0.35  # the head looks into a bend before the trunk gets there
-_PITCH_DOWN = 0.14  # rad, looking where one walks
-_MAX_SIDE, _MAX_UP = 1.1, 0.6  # rad, how far the head turns off the trunk, and up or down
+_LOOK_AHEAD_S = 0.35  # the head max_rate into a bend before the trunk
+_PITCH_DOWN = 0.14  # rad, when looking ahead
+_MAX_SIDE, _MAX_UP = 1.1, 0.6  # rad, of the head relative to the trunk
 _PEAK_RATE_RATIO = 1.875
 _MIN_TURN_S = 0.25
-_MAX_SLOWDOWNS = 8  # times that a turn is made a quarter longer
-_MIN_FOLLOWED_M = 0.7  # what is nearer than about this is not followed
-_MIN_TARGET_M, _MAX_TARGET_M = 1.0, 8.0  # m, between which things are looked at
+_MAX_SLOWDOWNS = 8  # a turn is lengthened by a quarter at most this often
+_MIN_FOLLOWED_M = 0.7  # nearer targets are not followed
+_MIN_TARGET_M, _MAX_TARGET_M = 1.0, 8.0  # range of targets
 
 
 @dataclass(frozen=True, eq=False)
 class GazeAgent:
-    """Another agent as something to look at: xy (M, 2) m at the same instants; z m."""
+    """Another agent as a target: xy (M, 2) m at the instants of the track; z m."""
 
     xy: F64
     z: float
@@ -41,8 +41,8 @@ def head_directions(
     max_rate: float,
     rng: np.random.Generator,
 ) -> tuple[F64, F64]:
-    """Yaw (M,) rad in the world and pitch (M,) rad, up positive, of the head. eye: m above the floor.
-    things (K, 3) m. For `still_s` one looks ahead. turns: rad/s, of the quickest turn."""
+    """Return yaw (M,) rad in the world and pitch (M,) rad, up positive, of the head. eye: m above the floor.
+    gaze_targets (K, 3) m. The person looks ahead for the first `still_s`. max_rate: rad/s."""
     t = track.seconds
     yaw, pitch = _direction_ahead(track)
     time_s, idle = still_s + rng.uniform(0.1, 0.5), True
@@ -60,14 +60,17 @@ def head_directions(
     return yaw, pitch
 
 
-def _turn_head(t: F64, start_s: float, turn_s: float, old: F64, new: F64, turns: float) -> tuple[float, F64]:
-    """Seconds it takes and yaw and pitch (2, M) of looking `old` until `at` s, then `new`: slower where
-    both move apart meanwhile, so that the head never turns quicker than `max_rate` rad/s for it."""
+def _turn_head(
+    t: F64, start_s: float, turn_s: float, old: F64, new: F64, max_rate: float
+) -> tuple[float, F64]:
+    """Return the duration (s) of a turn, and yaw and pitch (2, M) that follow `old` until `start_s`, then
+    `new`. The turn is slowed down where both move apart meanwhile, so that the head keeps below `max_rate`
+    rad/s."""
     for _ in range(_MAX_SLOWDOWNS):
         both = old + min_jerk((t - start_s) / turn_s) * (new - old)
         during = (t > start_s) & (t < start_s + turn_s)
         rates = np.gradient(both[:, during], t[1], axis=1) if during.sum() > 2 else np.zeros((2, 1))
-        if np.hypot(*rates).max() <= turns:
+        if np.hypot(*rates).max() <= max_rate:
             break
         turn_s *= 1.25
     return turn_s, both
@@ -81,7 +84,7 @@ def _choose_target(
     time_s: float,
     rng: np.random.Generator,
 ) -> tuple[F64, F64 | float] | None:
-    """What to look at next: places (M, 2) or (1, 2) m and heights; None for ahead."""
+    """Return the next target: places (M, 2) or (1, 2) m and heights; None for ahead."""
     i = min(int(np.searchsorted(track.seconds, time_s)), len(track.seconds) - 1)
     sort = rng.random()
     if sort < 0.3:
@@ -112,7 +115,7 @@ def _direction_to(track: PlanarTrack, eye: float, xy: F64, z: F64 | float) -> tu
     d = xy - track.xy
     near = np.linalg.norm(d, axis=1) / _MIN_FOLLOWED_M
     off = np.angle(np.exp(1j * (np.arctan2(d[:, 1], d[:, 0]) - track.heading)))
-    # 0 straight behind, where left and right meet, and at what one walks over: nothing jumps there
+    # 0 straight behind, where left and right meet, and at targets underfoot, so that the gaze never jumps
     side = _MAX_SIDE * np.sin(off) * (1 - np.exp(-(near**2)))
     up = _MAX_UP * np.tanh(np.arctan2(z - eye, _MIN_FOLLOWED_M * np.hypot(near, 1)) / _MAX_UP)
     return track.heading + side, up

@@ -1,6 +1,6 @@
-"""Who moves where in a room: from what a user asks for to paths that touch neither it nor each other.
+"""Plan the motion of all agents in a room: from specs to paths that touch neither the room nor each other.
 
-specs -> recorded motions are placed, what stands in their way leaves -> simulated ones go around them
+specs -> recorded motions are placed, obstacles to them are removed -> simulated ones keep clear of them
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from share.errors import UsageError
 from share.geometry.camera import ImuNoise
 from share.lab.emulate.motion import board, paper
-from share.lab.emulate.motion.crowd import SettledPath, SimulatedAgent, plan_crowd, settled_path
+from share.lab.emulate.motion.crowd import FixedPath, SimulatedAgent, fixed_path, plan_crowd
 from share.lab.emulate.motion.floor import Floor, floor_from_occupancy
 from share.lab.emulate.motion.placement import MIN_DISTANCE_M, PathToPlace, place_paths
 from share.lab.emulate.motion.planned_motion import PEOPLE_M, FloorGraphs, MotionPreferences
@@ -37,7 +37,7 @@ from share.lab.emulate.world.occupancy import Occupancy
 from share.types import F64, I64, AgentKind
 
 _MIN_SESSION_S, _MAX_SESSION_S = 3.0, 3600.0
-_GAZE_TARGETS = 150  # to look at
+_GAZE_TARGETS = 150
 _GAZE_TARGET_HEIGHTS_M = (0.3, 2.3)
 _EYE_HEIGHTS_M = (1.60, 1.75)
 _PAPER_SPACE_M = (9.0, 6.0)
@@ -45,12 +45,12 @@ _PAPER_SPACE_M = (9.0, 6.0)
 
 @dataclass(frozen=True, eq=False)
 class PlannedAgent:
-    """One who moves. look: what the others see of it, `person`, `robot` or `drone`.
+    """One agent. body_kind: its looks, `person`, `robot` or `drone`.
 
-    T_body_cam0 (4, 4): how the camera sits on the body, where a recorded motion brings its own rig, else
-    None: the sensor's profile says (a simulated body is the profile's IMU). images_ns (M,): stamps of
-    the recorded images, where there are any; imu: noise of the recorded IMU. spec: what the user asked
-    for. notes: for a person. like_camera: the body has a camera's axes, x right, y down, z ahead.
+    T_body_cam0 (4, 4): the camera's pose on the body, where a recorded motion has its own rig, else None:
+    that of the sensor's profile (a simulated body is the profile's IMU). images_ns (M,): stamps of the
+    recorded images, if any; imu: noise of the recorded IMU. spec: as given by the user. notes: text for the
+    user. has_camera_axes: the body has camera axes, x right, y down, z ahead.
     """
 
     name: str
@@ -67,8 +67,8 @@ class PlannedAgent:
 
 @dataclass(frozen=True, eq=False)
 class MotionPlan:
-    """layout: the room, less what stood in the way of recorded flights. Paths begin together: each
-    one's start_ns is the session's first instant, in a clock of its own. notes: for a person."""
+    """layout: the room without obstacles to recorded motions. All paths begin together: each start_ns is the
+    session's first instant, in the path's own clock. notes: text for the user."""
 
     layout: Layout
     agents: tuple[PlannedAgent, ...]
@@ -77,7 +77,7 @@ class MotionPlan:
 
 @dataclass(frozen=True, eq=False)
 class _NamedSpec:
-    """One spec with the name of its agent and how the user wrote it."""
+    """A spec with the agent's name and the user's text."""
 
     name: str
     spec: Spec
@@ -85,10 +85,11 @@ class _NamedSpec:
 
 
 def plan_motions(specs: Sequence[str], layout: Layout, seconds: float, seed: int) -> MotionPlan:
-    """The agents of `specs` (`[NAME=]SPEC`) in the room, for `seconds`; the same every time for a seed.
+    """Return paths of the agents of `specs` (`[NAME=]SPEC`) in the room for `seconds`. Deterministic for a
+    given seed.
 
-    Raises UsageError for a spec that cannot be understood, a name given twice, or paths for which the
-    room has no place, DataError for a recording that is damaged.
+    Raises UsageError for an invalid spec, a name given twice, or paths that do not fit into the room,
+    DataError for a damaged recording.
     """
     if not _MIN_SESSION_S <= seconds <= _MAX_SESSION_S:
         raise UsageError(
@@ -104,7 +105,7 @@ def plan_motions(specs: Sequence[str], layout: Layout, seconds: float, seed: int
     agents += [
         _board_agent(a, a.spec, layout, seconds, seed) for a in requests if isinstance(a.spec, BoardSpec)
     ]
-    agents += _simulated_agents(requests, layout, [_settled(agent) for agent in agents], seconds, seed)
+    agents += _simulated_agents(requests, layout, [_fixed_path(agent) for agent in agents], seconds, seed)
     order = [name for a in requests for name in _agent_names(a)]
     if any(isinstance(a.spec, PaperSpec) for a in requests) and seconds != paper.SECONDS:
         notes = [*notes, f"an experiment of the paper lasts {paper.SECONDS:g} s"]
@@ -112,9 +113,9 @@ def plan_motions(specs: Sequence[str], layout: Layout, seconds: float, seed: int
 
 
 def _named_specs(specs: Sequence[str]) -> list[_NamedSpec]:
-    """Specs with names: the user's, else the kind's with a number. Raises UsageError."""
+    """Return specs with names: the user's, else the kind's with a number. Raises UsageError."""
     if not specs:
-        raise UsageError("nobody moves; give at least one --motion, for example walk:")
+        raise UsageError("no agent is given; give at least one --motion, for example walk:")
     requests: list[_NamedSpec] = []
     for text in specs:
         name, spec = parse_motion(text)
@@ -140,7 +141,7 @@ def _free_name(kind: str, requests: Sequence[_NamedSpec]) -> str:
 
 
 def _recorded_agent(request: _NamedSpec, seconds: float) -> PlannedAgent:
-    """A recording's motion where it was recorded, no longer than the session."""
+    """Return a recording's motion where it was recorded, at most as long as the session."""
     spec = request.spec
     assert isinstance(spec, RecordedSpec)
     longest = min(seconds, spec.seconds or seconds)
@@ -166,7 +167,7 @@ def _recorded_agent(request: _NamedSpec, seconds: float) -> PlannedAgent:
 def _board_agent(
     request: _NamedSpec, spec: BoardSpec, layout: Layout, seconds: float, seed: int
 ) -> PlannedAgent:
-    """A device in a hand before the room's board; each name's motion is its own."""
+    """Return a hand-held device before the room's board; the motion depends on the agent's name."""
     rng = np.random.default_rng((seed, 74, zlib.crc32(request.name.encode())))
     path = board.board_path(layout, spec, min(seconds, spec.seconds or seconds), rng)
     notes = _short_note(path, seconds)
@@ -180,14 +181,14 @@ def _short_note(path: MotionPath, seconds: float) -> tuple[str, ...]:
     return (f"ends after {lasts:.1f} s",) if lasts < seconds - 0.5 else ()
 
 
-def _settled(agent: PlannedAgent) -> SettledPath:
-    return settled_path(agent.path, PEOPLE_M if agent.body_kind == "person" else MIN_DISTANCE_M)
+def _fixed_path(agent: PlannedAgent) -> FixedPath:
+    return fixed_path(agent.path, PEOPLE_M if agent.body_kind == "person" else MIN_DISTANCE_M)
 
 
 def _simulated_agents(
-    requests: Sequence[_NamedSpec], layout: Layout, settled: Sequence[SettledPath], seconds: float, seed: int
+    requests: Sequence[_NamedSpec], layout: Layout, fixed: Sequence[FixedPath], seconds: float, seed: int
 ) -> list[PlannedAgent]:
-    """People and robots, and the paper's three."""
+    """Return people and robots, also the paper's three."""
     members: list[SimulatedAgent] = []
     texts: list[str] = []
     rng = np.random.default_rng((seed, 72))
@@ -200,7 +201,7 @@ def _simulated_agents(
     floor = floor_from_occupancy(Occupancy.from_layout(layout))
     if any(isinstance(a.spec, PaperSpec) for a in requests):
         floor, seconds = _floor_within(floor, _PAPER_SPACE_M), paper.SECONDS
-    paths = plan_crowd(FloorGraphs(floor), members, settled, _gaze_targets(layout, rng), seconds, (seed, 73))
+    paths = plan_crowd(FloorGraphs(floor), members, fixed, _gaze_targets(layout, rng), seconds, (seed, 73))
     kinds = {"person": AgentKind.AR, "robot": AgentKind.ROBOT}
     return [
         PlannedAgent(
@@ -231,7 +232,7 @@ def _crowd_members(request: _NamedSpec, rng: np.random.Generator) -> list[Simula
 
 
 def _floor_within(floor: Floor, size: tuple[float, float]) -> Floor:
-    """The part of a floor within `size` m of its corner: what lies beyond is as a wall."""
+    """Return the floor with walls around the part within `size` m of its corner."""
     shape = np.array(floor.clearance.shape)
     positions = [floor.origin + np.arange(n) * floor.step for n in shape]
     beyond = np.minimum(size[0] - positions[0][:, None], size[1] - positions[1][None, :])
@@ -239,7 +240,7 @@ def _floor_within(floor: Floor, size: tuple[float, float]) -> Floor:
 
 
 def _gaze_targets(layout: Layout, rng: np.random.Generator) -> F64:
-    """Points (K, 3) m of the furniture that draw a look."""
+    """Return points (K, 3) m of the furniture as gaze targets."""
     pieces = [p for p in layout.pieces if p.bounding_box[1, 2] > _GAZE_TARGET_HEIGHTS_M[0]]
     if not pieces:
         return rng.uniform((0, 0, 1.0), (*layout.size[:2], 1.8), (_GAZE_TARGETS, 3))

@@ -1,7 +1,7 @@
 """`paper:1` .. `paper:5`: the three agents of the paper's five experiments, 60 s in 9 x 6 x 4 m.
 
-Path lengths: SHARE (IMWUT 10(3) 97, 2026). The recordings are not public; these are other paths of the
-same lengths.
+Path lengths: SHARE (IMWUT 10(3) 97, 2026). The recordings are not public; these are other paths of the same
+lengths.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ LENGTHS_M: dict[int, tuple[float, float, float]] = {
     5: (37.67, 34.17, 23.09),
 }
 _HEIGHTS_M = (1.70, 1.62, 0.35)
-_MIN_WALK_SPEED, _MIN_DRIVE_SPEED = 0.80, 0.32  # m/s; who has less far to go stands more, not slower
-_BEND_FACTORS = {"person": 1.1, "robot": 1.3}  # times the mean speed: what bends cost must be made good
+_MIN_WALK_SPEED, _MIN_DRIVE_SPEED = 0.80, 0.32  # m/s; agents with shorter paths pause more instead
+# times the mean speed, which makes up for slowing down in bends
+_BEND_FACTORS = {"person": 1.1, "robot": 1.3}
 _START_DELAY_S = 2.4
 
 
 def paper_agents(number: int) -> list[SimulatedAgent]:
-    """The three agents of one experiment. Raises KeyError for another number than 1 .. 5."""
+    """Return the three agents of one experiment. Raises KeyError for a number outside 1 .. 5."""
     return [
         _paper_agent(name, length, height)
         for name, length, height in zip(NAMES, LENGTHS_M[number], _HEIGHTS_M, strict=True)

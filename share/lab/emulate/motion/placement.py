@@ -1,8 +1,9 @@
-"""Where in a room a given motion fits: turned about the vertical and shifted, as far from things as can be.
+"""Place recorded motions in a room: turn them about the vertical and shift them, as far from things as
+possible.
 
-Every yaw of a grid with every shift of a grid is tried against the distances of the room's voxels. What
-touches walls, floor or ceiling is out; among the rest, few places near furniture come first (it will
-have to leave), then room around, then places that others visit as well.
+Every yaw of a grid with every shift of a grid is scored by the distances of the room's voxels. Shifts that
+touch walls, floor or ceiling are excluded; then the fewest places near furniture (which is removed) count
+first, then clearance, then places that others visit as well.
 """
 
 from __future__ import annotations
@@ -20,25 +21,25 @@ from share.lab.emulate.world.occupancy import Occupancy
 from share.types import F32, F64
 
 CLEARANCE_M = 0.25
-MIN_DISTANCE_M = 0.5  # between two at the same time
+MIN_DISTANCE_M = 0.5  # between two agents at the same time
 _VOXEL_M = 0.1
 _YAWS = 24
 _SHIFT_M = 0.25
 _TIME_S = 0.1
-_MAX_POINTS = 400  # of a path that are looked at
-_AMPLE_CLEARANCE_M = 0.8  # more room than this is worth nothing
-_USUAL_HEIGHTS = {"person": 1.65, "robot": 0.35, "drone": 1.5}  # m, where such a body likes to be on average
+_MAX_POINTS = 400  # of a path, for scoring
+_AMPLE_CLEARANCE_M = 0.8  # more clearance than this does not count
+_USUAL_HEIGHTS = {"person": 1.65, "robot": 0.35, "drone": 1.5}  # m, mean height of such a body's path
 _BODY_HEIGHTS = {
     "person": (0.35, 1.0),
     "robot": (),
     "drone": (),
-}  # m above the floor: what hangs below a head
-_MAX_CANDIDATES = 400  # places that are looked at closely
+}  # m above the floor: how far a body reaches below its head
+_MAX_CANDIDATES = 400  # candidates that are checked exactly
 
 
 @dataclass(frozen=True, eq=False)
 class PathToPlace:
-    """A motion that wants a place. look: what its body is; xyz (M, 3) m every _TIME_S from its start."""
+    """A motion to place. xyz (M, 3) m every _TIME_S from its start."""
 
     name: str
     body_kind: str
@@ -53,9 +54,9 @@ class PathToPlace:
 def place_paths(
     layout: Layout, requests: Sequence[PathToPlace], seed: tuple[int, ...]
 ) -> tuple[Layout, list[MotionPath], list[str]]:
-    """The room without the pieces that stood in the way, the guests' paths in it, and notes for a person.
+    """Return the room without the pieces in the way, the paths in it, and notes for the user.
 
-    Raises UsageError where a path is too large for the room, or keeps no distance to the others.
+    Raises UsageError where a path does not fit into the room, or cannot keep its distance from the others.
     """
     occupancy = Occupancy.from_layout(layout, _VOXEL_M)
     shell_occupancy = Occupancy.from_layout(replace(layout, pieces=()), _VOXEL_M)
@@ -112,13 +113,13 @@ def _find_place(
 
 
 def _yaw_transform(yaw: float, middle: F64) -> F64:
-    """Turns about the vertical through `middle`, and brings it to 0."""
+    """Return the rotation about the vertical through `middle`, with `middle` moved to 0."""
     R = se3.so3_exp(np.array([0.0, 0.0, yaw]))
     return se3.from_rt(R, -R @ middle)
 
 
 def _candidate_shifts(p: F64, size: F64, body_kind: str) -> F64:
-    """Where the middle of a path p (M, 3) around 0 may go (S, 3) m, by its extents alone."""
+    """Return shifts (S, 3) m of the middle of a path p (M, 3) around 0, limited by its extent alone."""
     low, high = CLEARANCE_M - p.min(0), size - CLEARANCE_M - p.max(0)
     if (low > high).any():
         return np.zeros((0, 3))
@@ -138,7 +139,7 @@ def _candidate_shifts(p: F64, size: F64, body_kind: str) -> F64:
 def _shift_scores(
     p: F64, shifts: F64, whole: Occupancy, shell: Occupancy, body_kind: str, visited: F64
 ) -> F64:
-    """How good each shift (S, 3) is; -inf where the path would touch the shell."""
+    """Return the score of each shift (S, 3); -inf where the path would touch the shell."""
     samples = p[:: max(1, len(p) // _MAX_POINTS)]
     out = np.empty(len(shifts))
     for i, shift in enumerate(shifts):
@@ -156,7 +157,7 @@ def _shift_scores(
 
 
 def _body_points(xyz: F64, body_kind: str) -> F64:
-    """All of a body that must be free, not the head alone."""
+    """Return points of the whole body, not of the head alone, that must be free."""
     lower = [np.column_stack([xyz[:, :2], np.full(len(xyz), z)]) for z in _BODY_HEIGHTS[body_kind]]
     return np.concatenate([xyz, *lower])
 
@@ -168,13 +169,14 @@ def _grid_values(grid: F64 | F32, points: F64) -> F64:
     return out
 
 
-def _distance_from_paths(shell: Occupancy, settled: Sequence[F64]) -> F64:
-    """Horizontal distance (X, Y, 1) m of every place from where others pass, 0 everywhere if nobody does."""
+def _distance_from_paths(shell: Occupancy, fixed: Sequence[F64]) -> F64:
+    """Return the horizontal distance (X, Y, 1) m of each place from placed paths, 0 everywhere without
+    any."""
     from scipy.ndimage import distance_transform_edt
 
     shape = shell.solid.shape[:2]
     free = np.ones(shape, bool)
-    for xyz in settled:
+    for xyz in fixed:
         i, j = np.floor(xyz[:, :2] / _VOXEL_M).astype(int).T
         free[i.clip(0, shape[0] - 1), j.clip(0, shape[1] - 1)] = False
     if free.all():
@@ -183,14 +185,14 @@ def _distance_from_paths(shell: Occupancy, settled: Sequence[F64]) -> F64:
 
 
 def _min_distance(a: F64, b: F64) -> float:
-    """Least distance (m) of two at the same times; who has ended stays."""
+    """Return the least distance (m) of two paths at the same times; one that has ended stands still."""
     count = np.arange(max(len(a), len(b)))
     d = a[np.minimum(count, len(a) - 1)] - b[np.minimum(count, len(b) - 1)]
     return float(np.linalg.norm(d, axis=1).min())
 
 
 def _too_large_text(layout: Layout, request: PathToPlace, xyz: F64) -> str:
-    """One line: what the path needs, what there is, and what to ask for."""
+    """Return one line: what the path needs, what the room has, and what to change."""
     extents = [
         np.ptp(se3.transform(_yaw_transform(yaw, 0 * xyz[0]), xyz), axis=0)
         for yaw in np.linspace(0, np.pi, 37)

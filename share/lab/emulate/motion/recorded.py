@@ -1,4 +1,4 @@
-"""A path that a real IMU took, from the batch fit of it and a motion capture: known at every instant
+"""A path that a real IMU took, known at every instant by a batch fit of IMU and motion capture
 (`share.lab.mocap.path`), and placed in a room."""
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ from share.types import F64, I64, ImuBatch
 
 @dataclass(frozen=True, eq=False)
 class RecordedPath:
-    """A `Path` (share.lab.emulate.types) from start_ns to end_ns, within the nodes of `fit`.
+    """A `MotionPath` from start_ns to end_ns, within the nodes of `fit`.
 
-    imu: the samples that were fitted, which reach beyond the span. T_world_fit (4, 4): where the fit's
-    world lies in the path's.
+    imu: the fitted samples, which reach beyond the span. T_world_fit (4, 4): pose of the fit's world.
     """
 
     fit: MocapFit
@@ -30,28 +29,28 @@ class RecordedPath:
 
     @property
     def gaps(self) -> I64:
-        """(G, 2) ns: where the motion capture was blind for longer than the IMU is trusted alone."""
+        """Return (G, 2) ns: gaps of the motion capture too long to bridge by the IMU."""
         gaps = self.fit.gaps
         keep = (gaps[:, 1] > self.start_ns) & (gaps[:, 0] < self.end_ns)
         return gaps[keep].clip(self.start_ns, self.end_ns)
 
     @cached_property
     def recorded(self) -> ImuBatch:
-        """The IMU's samples within the span, untouched."""
+        """Return the IMU's samples within the span, as recorded."""
         keep = (self.imu.stamps_ns >= self.start_ns) & (self.imu.stamps_ns <= self.end_ns)
         return self.imu.take(keep)
 
     def poses(self, stamps_ns: I64) -> F64:
-        """T_world_body (N, 4, 4). Raises ValueError outside the span."""
+        """Return T_world_body (N, 4, 4). Raises ValueError outside the span."""
         return self.T_world_fit @ self._pose_and_velocity(stamps_ns)[0]
 
     def velocity(self, stamps_ns: I64) -> F64:
-        """Of the body in the world (N, 3) m/s. Raises ValueError outside the span."""
+        """Return the body's velocity in the world (N, 3) m/s. Raises ValueError outside the span."""
         return np.asarray(self._pose_and_velocity(stamps_ns)[1] @ self.T_world_fit[:3, :3].T, np.float64)
 
     def inertial(self, stamps_ns: I64) -> tuple[F64, F64]:
-        """Angular rate (N, 3) rad/s and specific force (N, 3) m/s^2 as recorded, freed of their biases,
-        linear between samples: the real IMU's noise is in them. Raises ValueError outside the span."""
+        """Return angular rate (N, 3) rad/s and specific force (N, 3) m/s^2 as recorded less the biases,
+        linear between samples, so with the real IMU's noise. Raises ValueError outside the span."""
         stamps = self._checked_stamps(stamps_ns)
         gyro, accel = (
             interpolate_samples(self.imu, stamps, self.imu.gyro),
@@ -63,14 +62,14 @@ class RecordedPath:
         )
 
     def transformed(self, T_world_old: F64) -> RecordedPath:
-        """The same motion elsewhere: turned about the vertical and shifted by T_world_old (4, 4).
-        Raises ValueError if it would tilt gravity."""
+        """Return the same motion turned about the vertical and shifted by T_world_old (4, 4). Raises
+        ValueError if that would tilt gravity."""
         if not np.allclose(T_world_old[2, :3], (0, 0, 1), atol=1e-9):
             raise ValueError("T_world_old: turns about more than the vertical")
         return replace(self, T_world_fit=T_world_old @ self.T_world_fit)
 
     def cut(self, start_ns: int, end_ns: int) -> RecordedPath:
-        """The same motion between two stamps, which keep their meaning. Raises ValueError outside."""
+        """Return the motion between two stamps of the same clock. Raises ValueError outside the span."""
         if not self.start_ns <= start_ns < end_ns <= self.end_ns:
             raise ValueError(f"{start_ns} .. {end_ns} ns: is not within {self.start_ns} .. {self.end_ns} ns")
         return replace(self, start_ns=start_ns, end_ns=end_ns)
@@ -89,5 +88,5 @@ class RecordedPath:
         return FittedPath(self.fit, self.imu)
 
     def _pose_and_velocity(self, stamps_ns: I64) -> tuple[F64, F64]:
-        """T_fit_body (N, 4, 4) and velocity (N, 3) in the fit's world."""
+        """Return T_fit_body (N, 4, 4) and velocity (N, 3) in the fit's world."""
         return self._fitted_path.pose_and_velocity(self._checked_stamps(stamps_ns))

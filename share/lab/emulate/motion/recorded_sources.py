@@ -1,6 +1,6 @@
-"""Recorded motions: an EuRoC or TUM-VI folder to the path its IMU took, fitted to its motion capture.
+"""Recorded motions: from an EuRoC or TUM-VI folder to the path of its IMU, fitted to its motion capture.
 
-A folder has one of two forms. ASL, as published: mav0/{imu0,cam0}/data.csv, a truth, and sensor.yaml
+A folder has one of two forms. ASL, as published: mav0/{imu0,cam0}/data.csv, ground truth, and sensor.yaml
 files or dso/{camchain,imu_config}.yaml. Plain: imu0.csv, groundtruth.csv, cam_timestamps.txt, and Kalibr's
 two chains there or in ../calib. Images are not needed.
 """
@@ -28,11 +28,11 @@ from share.recordings.calibration import CAMCHAIN, IMU_CHAIN, imu_noise, kalibr_
 from share.recordings.euroc import TRUTH_FOLDERS
 from share.types import F64, I64, ImuBatch
 
-_MARGIN_S = 5.0  # fitted before and after what is asked for: the ends of a batch are known least
+_MARGIN_S = 5.0  # fitted before and after the wanted span: the ends of a batch are the least certain
 _MIN_SPAN_S = 1.0
 
-# Figures: docs/understand/mocap-fit.md. EuRoC's truth is an estimate from this very IMU and its clock;
-# TUM-VI's, and EuRoC's raw vicon0, are what cameras saw.
+# Figures: docs/understand/mocap-fit.md. EuRoC's ground truth is an estimate from this very IMU and its clock; that of
+# TUM-VI and EuRoC's raw vicon0 is motion capture.
 EUROC_OPTIONS = MocapFitOptions(
     sigma_position=0.0015,
     sigma_rotation=np.radians(0.3),
@@ -49,8 +49,8 @@ _RAW_MOCAP_FOLDERS = ("mocap0", "vicon0")
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion:
-    """A recorded motion. T_body_cam0 (4, 4): where its first camera was. noise: its IMU's data sheet.
-    images_ns (M,): stamps of its images within the span. notes: the fit in words."""
+    """A recorded motion. T_body_cam0 (4, 4): pose of its first camera. noise: of its IMU's data sheet.
+    images_ns (M,): stamps of its images within the span. notes: text about the fit."""
 
     path: RecordedPath
     T_body_cam0: F64
@@ -61,7 +61,7 @@ class RecordedMotion:
 
 @dataclass(frozen=True, eq=False)
 class _MotionFiles:
-    """What a folder holds, wherever it lies."""
+    """The files of a recording, in either form of folder."""
 
     imu: Path
     truth: Path
@@ -72,10 +72,12 @@ class _MotionFiles:
 def open_recorded_motion(
     folder: Path, options: MocapFitOptions, start: float = 0.0, seconds: float | None = None
 ) -> RecordedMotion:
-    """The motion in `folder` from `start` s after IMU and truth both began, for `seconds` or to the end.
+    """Return the motion in `folder` from `start` s after IMU and ground truth both began, for `seconds` or to
+    the end.
 
-    options: EUROC or TUMVI; the raw mocap of an ASL folder is fitted as TUM-VI's. Raises UsageError for
-    a folder or a start that is not there, DataError or ConfigError for what is damaged or does not fit.
+    options: EUROC_OPTIONS or TUMVI_OPTIONS; the raw motion capture of an ASL folder is fitted as TUM-VI's.
+    Raises UsageError for a missing folder or a start beyond the end, DataError or ConfigError for damaged or
+    inconsistent files.
     """
     files = _find_files(folder)
     if files.truth.parent.name in _RAW_MOCAP_FOLDERS:
@@ -124,11 +126,11 @@ def _asl_files(root: Path) -> _MotionFiles:
         (root / name / "data.csv" for name in TRUTH_FOLDERS if (root / name / "data.csv").is_file()), None
     )
     if truth is None:
-        raise DataError(f"{root}: has no truth; expected one of {', '.join(TRUTH_FOLDERS)}")
+        raise DataError(f"{root}: has no ground truth; expected one of {', '.join(TRUTH_FOLDERS)}")
     dso = root.parent / "dso"
 
     def mounting() -> tuple[F64, ImuNoise]:
-        if (dso / "camchain.yaml").is_file():  # TUM-VI's own
+        if (dso / "camchain.yaml").is_file():  # TUM-VI
             T = kalibr_T_imu_cam(read_yaml(dso / "camchain.yaml").section("cam0"))
             return T, imu_noise(read_yaml(dso / "imu_config.yaml"), "update_rate")
         imu, cam0 = read_yaml(root / "imu0" / "sensor.yaml"), read_yaml(root / "cam0" / "sensor.yaml")
@@ -143,18 +145,18 @@ def _read_imu(path: Path) -> ImuBatch:
 
 
 def _read_stamps(path: Path) -> I64:
-    """First column of a list of images."""
+    """Return the first column of a list of images."""
     return tables.parse_rows(path, ",", 1, lambda fields, where: (tables.parse_ns(fields[0], where),))[0]
 
 
 def _span(
     folder: Path, imu: ImuBatch, mocap: MocapTrajectory, start: float, seconds: float | None
 ) -> tuple[int, int]:
-    """First and last stamp of what is asked for."""
+    """Return the first and last stamp of the wanted span."""
     begin = max(int(imu.stamps_ns[0]), int(mocap.stamps_ns[0]))
     end = min(int(imu.stamps_ns[-1]), int(mocap.stamps_ns[-1]))
     if end <= begin:
-        raise DataError(f"{folder}: IMU and truth do not overlap; are they of one recording?")
+        raise DataError(f"{folder}: IMU and ground truth do not overlap in time; give files of one recording")
     first = begin + round(start * 1e9)
     last = end if seconds is None else min(end, first + round(seconds * 1e9))
     if start < 0 or last - first < _MIN_SPAN_S * 1e9:

@@ -1,8 +1,7 @@
-"""A robot on two driven wheels: `robot:`. Straight on, in bends, turning in place, stopping.
+"""`robot:` is a differential-drive robot: straight on, in bends, turning in place, stopping.
 
-It moves as a unicycle: speed along its heading, nothing aside, x' = v cos(h), y' = v sin(h), h' = w, so
-the way is followed without slip. The body frame is the IMU of its camera, over the middle of the axle,
-x right, y down, z ahead, tilted up a little.
+It moves as a unicycle without slip, x' = v cos(h), y' = v sin(h), h' = w. The body frame is the IMU of its
+camera, over the middle of the axle: x right, y down, z ahead, pitched up a little.
 """
 
 from __future__ import annotations
@@ -20,27 +19,28 @@ from share.lab.emulate.motion.track import KNOT_S, PlanarTrack, knot_times
 from share.lab.emulate.motion.walk import CAMERA_AXES, axis_rotation
 from share.types import F64
 
-RADIUS = 0.20  # m: a TurtleBot 4 is 34 cm wide
+RADIUS = 0.20  # m; a TurtleBot 4 is 34 cm wide
 INITIAL_STILL_S = 1.3
-CAMERA_PITCH = 0.10  # rad, of the camera: a little upwards
-_PIVOT_LEVER_M = 0.25  # m of way that a radian of turning in place counts as
-_MAX_DRIVEN_CORNER = 0.9  # rad, a corner that it takes in a bend
+CAMERA_PITCH = 0.10  # rad, upwards
+_PIVOT_LEVER_M = 0.25  # path length that counts for a radian of turning in place
+_MAX_DRIVEN_CORNER = 0.9  # rad, larger corners are turned in place
 _PIVOT_STEP_RAD = 0.02  # rad
-_WHEEL_SMOOTHING_S = 0.08  # sigma: how slowly the wheels follow
-_PITCH_PER_ACCEL = 0.010  # rad per m/s^2 of speeding up: the castors give
-_RUMBLE_BAND_HZ = (6.0, 17.0, 45.0)  # lowest, strongest, highest of what wheels and floor do
+_WHEEL_SMOOTHING_S = 0.08  # sigma of the wheels' response
+_PITCH_PER_ACCEL = 0.010  # rad per m/s^2 of acceleration, by the castors' compliance
+# lowest, strongest and highest frequency of vibration by wheels and floor
+_RUMBLE_BAND_HZ = (6.0, 17.0, 45.0)
 
 
 def motion_limits(speed: float) -> MotionLimits:
-    """Of a robot that cruises at `max_speed` m/s."""
+    """Return the limits of a robot that cruises at `speed` m/s."""
     return MotionLimits(
         max_speed=1.15 * speed, max_rotation_rate=1.3, lateral_acceleration=0.4, acceleration=0.5
     )
 
 
 def route_from_legs(floor: Floor, legs: Sequence[F64]) -> Route:
-    """Each leg of a tour as a smooth line; between them the robot turns in place, which goes on for
-    _ARM metres of way a radian."""
+    """Return each leg of a tour as a smooth line; between them the robot turns in place, which counts as
+    _PIVOT_LEVER_M of path a radian."""
     parts: list[Route] = []
     for leg in _merge_legs(legs):
         xy = smooth_route(floor, leg, RADIUS)
@@ -49,7 +49,7 @@ def route_from_legs(floor: Floor, legs: Sequence[F64]) -> Route:
         if parts:
             parts.append(_pivot_route(xy[0], parts[-1].heading[-1], heading[0]))
             heading = heading + parts[-1].heading[-1] - heading[0]
-        bend[[0, -1]] = 1e3  # it stands where it turns
+        bend[[0, -1]] = 1e3  # it stops where it turns
         parts.append(Route(xy, arc_length(xy), heading, bend))
     start, distances = 0.0, []
     for part in parts:
@@ -64,7 +64,7 @@ def route_from_legs(floor: Floor, legs: Sequence[F64]) -> Route:
 
 
 def track_on_route(route: Route, steps: F64, duration: float) -> PlanarTrack:
-    """The axle's motion: wheels that follow the schedule, and where that takes it."""
+    """Return the axle's motion: the wheels follow the schedule, and their motion is integrated."""
     from scipy.ndimage import gaussian_filter1d
 
     seconds = knot_times(duration)
@@ -81,11 +81,11 @@ def track_on_route(route: Route, steps: F64, duration: float) -> PlanarTrack:
 
 
 def imu_path(track: PlanarTrack, height: float, vibration: float, start_ns: int, rng: Rng) -> SplinePath:
-    """The camera's IMU. height: m. vibration: m/s^2, rms of the vertical at 0.3 m/s."""
-    strength = (np.abs(track.speed) / 0.3).clip(0, 3) ** 0.7 + 0.03  # fans never rest
+    """Return the path of the camera's IMU. height: m. vibration: m/s^2, rms of the vertical at 0.3 m/s."""
+    strength = (np.abs(track.speed) / 0.3).clip(0, 3) ** 0.7 + 0.03  # never 0: fans run
     shake = vibration * strength * np.stack([_rumble_displacement(len(track.seconds), rng) for _ in range(4)])
     up, aside = shake[0], 0.3 * shake[1]
-    pitch, roll = 3.0 * shake[2], 2.0 * shake[3]  # rad per m: of a wheel base of 0.3 m
+    pitch, roll = 3.0 * shake[2], 2.0 * shake[3]  # rad per m, for a wheel base of 0.3 m
     gain = np.gradient(track.speed, KNOT_S)
     left = np.stack([-np.sin(track.heading), np.cos(track.heading)], axis=1)
     p = np.column_stack([track.xy + aside[:, None] * left, height + up])
@@ -95,7 +95,7 @@ def imu_path(track: PlanarTrack, height: float, vibration: float, start_ns: int,
 
 
 def _merge_legs(legs: Sequence[F64]) -> list[F64]:
-    """Legs that go on in nearly the same direction as one: there it drives through."""
+    """Merge legs that continue in nearly the same direction; the robot drives through there."""
     out = [legs[0]]
     for leg in legs[1:]:
         before, after = out[-1][-1] - out[-1][-6:][0], leg[:6][-1] - leg[0]
@@ -107,7 +107,7 @@ def _merge_legs(legs: Sequence[F64]) -> list[F64]:
 
 
 def _pivot_route(xy: F64, before: float, after: float) -> Route:
-    """Turning in place, the short way."""
+    """Return a turn in place, the short way round."""
     angle = (after - before + np.pi) % (2 * np.pi) - np.pi
     count = max(3, round(abs(angle) / _PIVOT_STEP_RAD))
     heading = before + angle * np.linspace(0, 1, count)
@@ -122,7 +122,7 @@ def _pivot_route(xy: F64, before: float, after: float) -> Route:
 
 
 def _rumble_displacement(count: int, rng: Rng) -> F64:
-    """Displacement (M,) m whose acceleration has rms 1 m/s^2, in a band with one soft resonance."""
+    """Return displacement (M,) m whose acceleration has rms 1 m/s^2, in a band with one soft resonance."""
     hz = np.fft.rfftfreq(count, KNOT_S)
     low, peak, high = _RUMBLE_BAND_HZ
     shape = np.exp(-0.5 * (np.log(np.maximum(hz, 1e-3) / peak) / 0.5) ** 2) * (hz > low) * (hz < high)

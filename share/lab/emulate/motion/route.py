@@ -1,8 +1,8 @@
-"""Ways over free floor: from place to place by shortest paths that keep off obstacles, then smoothed.
+"""Routes over free floor: shortest paths that keep off obstacles, smoothed.
 
-Cheapest paths by Dijkstra on the grid with 16 neighbours, the price of a metre rising near obstacles.
-Smoothed as an elastic band (Quinlan & Khatib, ICRA 1993): diffusion along the way, repulsion where
-the clearance is short. A band of k steps of diffusion at spacing h is smooth over about sqrt(k / 2) h.
+Cheapest paths by Dijkstra on the grid with 16 neighbours; the cost of a metre rises near obstacles. Smoothed
+as an elastic band (Quinlan & Khatib, ICRA 1993): diffusion along the path, repulsion where the clearance is
+too small. k steps of diffusion at spacing h smooth over about sqrt(k / 2) h.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from share.lab.emulate.motion.floor import Floor
 from share.types import F64
 
 Rng = np.random.Generator
-POINT_SPACING_M = 0.05  # m between the points of a finished way
-_BAND_SPACING_M = 0.1  # m between those of a band
-_COMFORT_M = 0.35  # m beyond the radius: nearer to things than that, a metre costs more
+POINT_SPACING_M = 0.05  # between points of a finished route
+_BAND_SPACING_M = 0.1  # between points of a band
+_COMFORT_M = 0.35  # m beyond the radius; the cost of a metre rises below this clearance
 _NEIGHBOUR_STEPS = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)]
-_LEG_RANGE_M = (1.8, 6.0)  # m, how far the next place is
-_CANDIDATE_PLACES = 40  # that are looked at before one is chosen
+_LEG_RANGE_M = (1.8, 6.0)  # preferred length of a leg
+_CANDIDATE_PLACES = 40  # drawn for each leg
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A line to go along. xy (N, 2) m; gone (N,) m along it, rising; heading (N,) rad of the body, without
-    jumps; bend (N,) 1/m: what its speed must be limited for."""
+    """A line to follow. xy (N, 2) m; distance (N,) m along it, rising; heading (N,) rad of the body, without
+    jumps; curvature (N,) 1/m, which limits the speed."""
 
     xy: F64
     distance: F64
@@ -36,7 +36,7 @@ class Route:
 
 
 class FloorGraph:
-    """The free floor for a body of `radius` m as a graph: the largest part that hangs together."""
+    """The largest connected part of the free floor for a body of `radius` m, as a graph."""
 
     def __init__(self, floor: Floor, radius: float) -> None:
         from scipy.sparse.csgraph import connected_components
@@ -50,12 +50,12 @@ class FloorGraph:
 
     @property
     def places(self) -> F64:
-        """(N, 2) m, where a body may be."""
+        """Return places (N, 2) m where a body may be."""
         return np.asarray(self._cells * self.floor.step + self.floor.origin, np.float64)
 
     def random_tour(self, length: float, rng: Rng, start: F64 | None = None) -> list[F64]:
-        """Legs (n, 2) m, end to end, from the place nearest to `start` (2,) m, at least `length` m in all;
-        where they join they rather go on than back. Empty where there is nowhere to go."""
+        """Return legs (n, 2) m, end to end, from the place nearest to `start` (2,) m, at least `length` m in
+        all, preferring to continue ahead where they join. Empty where there is no free place."""
         if len(self._cells) < 2:
             return []
         at = int(rng.integers(len(self._cells))) if start is None else self.nearest(start)
@@ -71,7 +71,7 @@ class FloorGraph:
         return legs
 
     def nearest(self, xy: F64) -> int:
-        """Number of the free place nearest to (2,) m."""
+        """Return the index of the free place nearest to xy (2,) m."""
         return int(np.argmin(np.linalg.norm(self.places - xy, axis=1)))
 
     def _next_leg(self, start_cell: int, ahead: F64 | None, rng: Rng) -> tuple[F64, int]:
@@ -93,8 +93,8 @@ class FloorGraph:
 
 
 def smooth_route(floor: Floor, points: F64, radius: float, reach: float = 0.5) -> F64:
-    """`way` (N, 2) m at equal spacing, smooth over about `reach` m, its clearance at least `radius` where
-    it can be. Its ends stay."""
+    """Return `points` (N, 2) m resampled and smoothed over about `reach` m, with a clearance of at least
+    `radius` where possible. The ends stay."""
     p = resample(points, _BAND_SPACING_M)
     for _ in range(round(2 * (reach / _BAND_SPACING_M) ** 2)):
         p[1:-1] += 0.5 * ((p[:-2] + p[2:]) / 2 - p[1:-1])
@@ -107,12 +107,12 @@ def smooth_route(floor: Floor, points: F64, radius: float, reach: float = 0.5) -
 
 
 def arc_length(points: F64) -> F64:
-    """Metres (N,) gone at each point (N, 2)."""
+    """Return the distance (N,) m along the polyline at each point (N, 2)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
 def resample(points: F64, spacing: float) -> F64:
-    """The same polyline with points about `spacing` m apart, both ends kept."""
+    """Return the same polyline with points about `spacing` m apart, both ends kept."""
     distances = arc_length(points)
     count = max(2, round(distances[-1] / spacing) + 1)
     positions = np.linspace(0, distances[-1], count)
@@ -120,7 +120,7 @@ def resample(points: F64, spacing: float) -> F64:
 
 
 def headings(points: F64) -> F64:
-    """Direction (N,) rad of travel at each point (N, 2), without jumps of 2 pi."""
+    """Return the direction of travel (N,) rad at each point (N, 2), without jumps of 2 pi."""
     d = np.gradient(points, axis=0)
     return np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
 
@@ -135,7 +135,7 @@ def _push_from_obstacles(floor: Floor, p: F64, radius: float) -> F64:
 
 
 def _leg_cost(points: F64, ahead: F64 | None) -> float:
-    """How little one would like to go this way next: 0 straight on and neither near nor far."""
+    """Return the cost of a leg: 0 for one straight ahead of a preferred length."""
     length = arc_length(points)[-1]
     cost = max(0.0, _LEG_RANGE_M[0] - length) * 3 + max(0.0, length - _LEG_RANGE_M[1])
     if ahead is not None:

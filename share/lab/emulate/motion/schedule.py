@@ -1,8 +1,8 @@
-"""When to be where on a way: as fast as one likes, slow in bends, never where another is.
+"""Schedules along a route: near the target speed, slow in bends, never where another agent is.
 
-Path-velocity decomposition (Kant & Zucker, IJRR 5(3), 1986): the way is fixed, and the others are
-forbidden regions in the plane of time and place on it. Dynamic programming finds the cheapest monotone
-line through that plane; the cost is the square of the deviation from the speed one would like.
+Path-velocity decomposition (Kant & Zucker, IJRR 5(3), 1986): the route is fixed, and the others are forbidden
+regions in the plane of time and distance along it. Dynamic programming finds the cheapest monotone line
+through that plane; the cost is the squared deviation from the target speed.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from share.lab.emulate.motion.route import Route
 from share.types import F64
 
 STEP_S = 0.2
-_SPEED_LEVELS = 14  # that the search tells apart, besides standing
-_SUBSTEPS = 2  # times within a step at which the others are looked at
+_SPEED_LEVELS = 14  # speeds of the search, besides standing
+_SUBSTEPS = 2  # collision checks per step
 _FINE_S = 0.05
-_SMOOTHING_S = 0.4  # sigma of the smoothing in time: a step of 1 m/s becomes 1 m/s^2 at most
+_SMOOTHING_S = 0.4  # sigma of smoothing in time: a step of 1 m/s becomes 1 m/s^2 at most
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """What a body can do. speed: m/s at most. turn: rad/s at most. aside: m/s^2 in a bend. gain: m/s^2
-    of gaining and losing speed."""
+    """Limits of a body. max_speed: m/s. max_rotation_rate: rad/s. lateral_acceleration: m/s^2 in a bend.
+    acceleration: m/s^2 along the route, either sign."""
 
     max_speed: float
     max_rotation_rate: float
@@ -35,15 +35,15 @@ class MotionLimits:
 
 @dataclass(frozen=True, eq=False)
 class MovingObstacle:
-    """One to keep `distance` m away from: where it is, xy (K, 2) m every STEP_S / 2 from the start; its
-    last place counts for the time after."""
+    """Keep `distance` m away from xy (K, 2) m every STEP_S / 2 from the start; the last place holds
+    afterwards."""
 
     xy: F64
     distance: float
 
 
 def speed_limit(route: Route, limits: MotionLimits) -> F64:
-    """Most speed (N,) m/s at each place of the way, such that one can also brake for what comes."""
+    """Return the speed limit (N,) m/s at each point of the route that also leaves room to brake."""
     bend = np.abs(route.curvature) + 1e-9
     v: F64 = np.minimum(
         limits.max_speed,
@@ -65,11 +65,11 @@ def plan_schedule(
     others: Sequence[MovingObstacle] = (),
     end: float | None = None,
 ) -> F64 | None:
-    """Metres along the way (T,) at the instants k * STEP_S, T = len(wanted) + 1; None if the others leave
-    no way through.
+    """Return the distance (T,) m along the route at the instants k * STEP_S, T = len(target_speeds) + 1; None
+    if the others block it.
 
-    most (N,) m/s: speed limit at each place of the way; wanted (T - 1,) m/s: the speed one
-    would like in each step. end: metres to have gone at the end, as nearly as possible.
+    speed_limits (N,) m/s: at each point of the route; target_speeds (T - 1,) m/s: of each step. end: distance
+    to reach at the end, m, as nearly as possible.
     """
     cell = float(speed_limits.max()) * STEP_S / _SPEED_LEVELS
     place = np.arange(int(route.distance[-1] / cell) + 1) * cell
@@ -78,7 +78,7 @@ def plan_schedule(
     speeds = np.arange(_SPEED_LEVELS + 1) * (cell / STEP_S)
     is_forbidden = np.where(speeds[:, None] <= np.maximum(limit, speeds[1] + 1e-9), 0.0, np.inf)
     cost, back = np.full(len(place), np.inf), np.zeros((len(target_speeds), len(place)), np.int8)
-    cost[0], first, last = 0.0, 0, 1  # where one can be by now: in place[first:last]
+    cost[0], first, last = 0.0, 0, 1  # reachable by now: place[first:last]
     for k, target_speed in enumerate(target_speeds):
         reach = min(last + _SPEED_LEVELS, len(place))
         costs = np.full((len(speeds), reach - first), np.inf)
@@ -105,7 +105,8 @@ def plan_schedule(
 
 
 def smooth_schedule(steps: F64, seconds: F64) -> F64:
-    """Metres along the way (M,) at `seconds` (M,) of what `plan_schedule` found, smooth in time."""
+    """Return the distance (M,) m along the route at `seconds` (M,) of a schedule by `plan_schedule`, smooth
+    in time."""
     from scipy.interpolate import make_interp_spline
     from scipy.ndimage import gaussian_filter1d
 

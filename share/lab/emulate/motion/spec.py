@@ -1,4 +1,4 @@
-"""What a user asks for: `walk:`, `robot:speed=0.5`, `ann=euroc:V1_02,start=5`, `paper:3`.
+"""Parse motion specs: `walk:`, `robot:speed=0.5`, `ann=euroc:V1_02,start=5`, `paper:3`.
 
 [NAME=]KIND:[ARGUMENT][,key=value ...]
 """
@@ -19,8 +19,8 @@ BODY_KINDS = ("person", "robot", "drone")
 
 @dataclass(frozen=True)
 class RecordedSpec:
-    """A recording's motion, from `start` (s after its beginning), for `seconds` (None: to its end, or
-    the session's). kind: ar or robot. look: what the others see, person, robot or drone."""
+    """A recording's motion, from `start` (s after its beginning) for `seconds` (None: to its end, or the
+    session's). kind: ar or robot. look: the body that others see, person, robot or drone."""
 
     path: str = ""
     start: float = 0.0
@@ -30,7 +30,7 @@ class RecordedSpec:
 
     def __post_init__(self) -> None:
         if not self.path:
-            raise ValueError("says no folder or file")
+            raise ValueError("names no folder or file")
         _check_one_of("kind", self.kind, tuple(AgentKind))
         _check_one_of("look", self.look, BODY_KINDS)
         _check_positive(self, "seconds")
@@ -38,7 +38,7 @@ class RecordedSpec:
 
 @dataclass(frozen=True)
 class EurocSpec(RecordedSpec):
-    """`euroc:FOLDER`: truth, real IMU and image stamps in EuRoC's files."""
+    """`euroc:FOLDER`: ground truth, real IMU and image stamps in EuRoC's files."""
 
     kind: str = "robot"
     look: str = "drone"
@@ -46,7 +46,7 @@ class EurocSpec(RecordedSpec):
 
 @dataclass(frozen=True)
 class TumviSpec(RecordedSpec):
-    """`tumvi:FOLDER`: the same of a handheld device."""
+    """`tumvi:FOLDER`: the same for a hand-held device."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class TumSpec(RecordedSpec):
 
 @dataclass(frozen=True)
 class WalkSpec:
-    """`walk:` a person with a headset. speed: m/s, cruising. pauses: a minute. height: m, of the eyes
-    (None: 1.60 to 1.75 by the seed). turns: rad/s, the quickest turn of the head."""
+    """`walk:` is a person with a headset. speed: m/s, cruising. pauses: a minute. height: m, of the eyes
+    (None: 1.60 to 1.75 by the seed). turns: rad/s, of the head at most."""
 
     speed: float = 0.9
     seconds: float | None = None
@@ -76,8 +76,8 @@ class WalkSpec:
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """`robot:` a differential drive. speed: m/s, cruising. pauses: a minute. height: m, of the camera.
-    vibration: m/s^2, rms of the vertical while it drives at 0.3 m/s."""
+    """`robot:` is a differential drive. speed: m/s, cruising. pauses: a minute. height: m, of the camera.
+    vibration: m/s^2, rms of the vertical while driving at 0.3 m/s."""
 
     speed: float = 0.35
     seconds: float | None = None
@@ -95,9 +95,9 @@ class RobotSpec:
 
 @dataclass(frozen=True)
 class BoardSpec:
-    """`board:` a device in a hand before a calibration board. distance: m, the usual one; it comes to a
-    little more than half of it and to nearly twice. vigour: 1 for camera and IMU together; below 0.5 it
-    is slow and pauses, for a camera alone."""
+    """`board:` is a hand-held device before a calibration board. distance: m, on average; it varies from a
+    little more than half to nearly twice that. vigour: 1 for camera and IMU together; below 0.5 it is slow
+    and pauses, for a camera alone."""
 
     distance: float = 0.8
     vigour: float = 1.0
@@ -133,11 +133,13 @@ _OPTION = re.compile(r"\s*([a-z_]+)=(.*)", re.DOTALL)
 
 
 def parse_motion(text: str) -> tuple[str | None, Spec]:
-    """(name or None, spec) of `NAME=SPEC` or `SPEC`. Raises UsageError naming what is wrong."""
+    """Return (name or None, spec) of `NAME=SPEC` or `SPEC`. Raises UsageError that says what is wrong."""
     named = _NAME.fullmatch(text)
     name, spec = (named[1], named[2]) if named else (None, text)
     if name is not None and not _VALID_NAME.fullmatch(name):
-        raise UsageError(f"'{text}': '{name}' is no name; use letters, digits, '-' and '_', at most 32")
+        raise UsageError(
+            f"'{text}': '{name}' is not a valid name; use letters, digits, '-' and '_', at most 32"
+        )
     kind, colon, rest = spec.partition(":")
     if kind not in SPEC_KINDS or not colon:
         near = difflib.get_close_matches(kind, SPEC_KINDS, n=1)
@@ -148,7 +150,7 @@ def parse_motion(text: str) -> tuple[str | None, Spec]:
 
 
 def _split_options(rest: str) -> tuple[str, dict[str, str]]:
-    """`FOLDER,start=5,seconds=20` -> the folder, which may hold commas, and the options behind it."""
+    """Split `FOLDER,start=5,seconds=20` into the folder, which may hold commas, and the options."""
     parts, options = rest.split(","), {}
     while parts and (match := _OPTION.fullmatch(parts[-1])):
         options[match[1]] = match[2].strip()

@@ -26,8 +26,8 @@ _NO_GAPS = np.zeros((0, 2), np.int64)
 
 @dataclass(frozen=True, eq=False)
 class SplinePath:
-    """A `Path` (share.lab.emulate.types). position and quaternion (xyzw): scipy BSplines of seconds since
-    start_ns, with values (N, 3) m in the world and (N, 4), whose length need not be 1."""
+    """A `MotionPath`. position and quaternion (xyzw): scipy BSplines of seconds since start_ns, with values
+    (N, 3) m in the world and (N, 4) of any length."""
 
     start_ns: int
     end_ns: int
@@ -37,12 +37,12 @@ class SplinePath:
     recorded: ImuBatch | None = None
 
     def poses(self, stamps_ns: I64) -> F64:
-        """T_world_body (N, 4, 4). Raises ValueError outside the span."""
+        """Return T_world_body (N, 4, 4). Raises ValueError outside the span."""
         t = self._seconds(stamps_ns)
         return se3.from_quat(self.position(t), self.quaternion(t))
 
     def inertial(self, stamps_ns: I64) -> tuple[F64, F64]:
-        """Angular rate (N, 3) rad/s and specific force (N, 3) m/s^2 in the body frame."""
+        """Return angular rate (N, 3) rad/s and specific force (N, 3) m/s^2 in the body frame."""
         t = self._seconds(stamps_ns)
         s, ds = self.quaternion(t), self.quaternion(t, 1)
         force = self.position(t, 2) + np.array([0.0, 0.0, GRAVITY])
@@ -50,13 +50,13 @@ class SplinePath:
         return body_rates(s, ds), np.einsum("nji,nj->ni", R, force)
 
     def velocity(self, stamps_ns: I64) -> F64:
-        """Of the body in the world (N, 3) m/s."""
+        """Return the body's velocity in the world (N, 3) m/s."""
         v: F64 = self.position(self._seconds(stamps_ns), 1)
         return v
 
     def transformed(self, T_world_old: F64) -> SplinePath:
-        """The same motion elsewhere: turned about the vertical and shifted by T_world_old (4, 4). Exact:
-        both act on the coefficients alone. Raises ValueError if it would tilt gravity."""
+        """Return the same motion turned about the vertical and shifted by T_world_old (4, 4). Exact: both act
+        on the coefficients alone. Raises ValueError if it would tilt gravity."""
         R, shift = T_world_old[:3, :3], T_world_old[:3, 3]
         if not np.allclose(R[2], (0, 0, 1), atol=1e-9):
             raise ValueError("T_world_old: turns about more than the vertical")
@@ -68,14 +68,14 @@ class SplinePath:
         )
 
     def with_axes(self, R_body_new: F64) -> SplinePath:
-        """The motion of a body at the same place whose axes are turned by R_body_new (3, 3). Exact."""
+        """Return the motion of a body at the same place with axes turned by R_body_new (3, 3). Exact."""
         turn = se3.quat_from_matrix(R_body_new)
         return replace(
             self, quaternion=_with_coefficients(self.quaternion, quaternion_product(self.quaternion.c, turn))
         )
 
     def cut(self, start_ns: int, end_ns: int) -> SplinePath:
-        """The same motion between two stamps, which keep their meaning. Raises ValueError outside."""
+        """Return the motion between two stamps of the same clock. Raises ValueError outside the span."""
         if not self.start_ns <= start_ns < end_ns <= self.end_ns:
             raise ValueError(f"{start_ns} .. {end_ns} ns: is not within {self.start_ns} .. {self.end_ns} ns")
         shift = (start_ns - self.start_ns) / 1e9
@@ -104,8 +104,8 @@ class SplinePath:
 def spline_through(
     start_ns: int, seconds: F64, p: F64, q: F64, gaps: ArrayLike = (), recorded: ImuBatch | None = None
 ) -> SplinePath:
-    """The spline through positions p (N, 3) m and quaternions q (N, 4) xyzw, of any signs, at `seconds`
-    (N,), rising from 0. Raises ValueError for fewer than 6 knots."""
+    """Return the spline through positions p (N, 3) m and quaternions q (N, 4) xyzw, of any signs, at
+    `seconds` (N,), rising from 0. Raises ValueError for fewer than 6 knots."""
     from scipy.interpolate import make_interp_spline
 
     if len(seconds) <= SPLINE_DEGREE:
@@ -121,7 +121,7 @@ def spline_through(
 
 
 def continuous_quaternions(q: F64) -> F64:
-    """Quaternions (N, 4) of unit length with signs such that neighbours are near each other."""
+    """Return unit quaternions (N, 4) with signs such that neighbours are near each other."""
     q = q / np.linalg.norm(q, axis=1, keepdims=True)
     flips = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0, -1.0, 1.0)
     out: F64 = q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
@@ -129,15 +129,15 @@ def continuous_quaternions(q: F64) -> F64:
 
 
 def body_rates(s: F64, ds: F64) -> F64:
-    """Angular rate (N, 3) rad/s in the body frame, of quaternions s (N, 4) of any length and their
-    derivatives."""
+    """Return the angular rate (N, 3) rad/s in the body frame, for quaternions s (N, 4) of any length and
+    their derivatives."""
     conjugate = s * (-1.0, -1.0, -1.0, 1.0)
     out: F64 = 2 * quaternion_product(conjugate, ds)[..., :3] / np.sum(s * s, axis=-1, keepdims=True)
     return out
 
 
 def quaternion_product(a: F64, b: F64) -> F64:
-    """Hamilton product of quaternions (..., 4) xyzw."""
+    """Return the Hamilton product of quaternions (..., 4) xyzw."""
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
     vector = aw * bv + bw * av + np.cross(av, bv)
     return np.concatenate([vector, aw * bw - np.sum(av * bv, axis=-1, keepdims=True)], axis=-1)

@@ -1,9 +1,8 @@
-"""A path through the poses of a file: `tum:FILE`, its IMU to be simulated.
+"""`tum:FILE` is a path through the poses of a file; its IMU is simulated.
 
-A quintic spline is fitted by least squares; the spacing of its knots is that of least generalised
-cross-validation, n RSS / (n - p)^2 (Craven & Wahba, Numer. Math. 31, 1979): fine where the poses are
-good, coarse where they are noisy. Over a gap the body goes smoothly from one side to the other, so
-that the IMU stays plausible; nobody is told a pose there.
+A quintic spline is fitted by least squares; the knot spacing minimises the generalised cross-validation, n
+RSS / (n - p)^2 (Craven & Wahba, Numer. Math. 31, 1979): fine where the poses are good, coarse where they are
+noisy. Gaps are bridged smoothly, so that the IMU stays plausible; there is no ground truth in them.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ _GAP_FACTOR = 4.0  # times the usual step
 _MIN_GAP_S = 0.1
 _MAX_GAP_S = 5.0
 _MIN_DURATION_S, _MIN_POSES = 1.0, 20
-_MAX_STEP_S = 0.2  # a usual step beyond this says nothing of accelerations
-_POSES_PER_KNOT = (1.5, 2, 3, 4, 6, 8, 12, 16, 24)  # poses to one knot, tried
+_MAX_STEP_S = 0.2  # a longer usual step does not resolve accelerations
+_POSES_PER_KNOT = (1.5, 2, 3, 4, 6, 8, 12, 16, 24)  # candidates
 _STILL_M, _STILL_RAD = 1e-3, 1e-3
 
 
 def read_tum_path(path: Path, start: float = 0.0, seconds: float | None = None) -> SplinePath:
-    """The motion in `path` from `start` s after its beginning, for `seconds`. Raises UsageError where there
-    is no such file, DataError in one line for what is no motion of a body."""
+    """Return the motion in `path` from `start` s after its beginning, for `seconds`. Raises UsageError for a
+    missing file, DataError for poses that are not a body's motion."""
     if not path.is_file():
         raise UsageError(f"{path}: no such file")
     stamps, T = _cut(path, read_tum(path), start, seconds)
@@ -39,7 +38,8 @@ def read_tum_path(path: Path, start: float = 0.0, seconds: float | None = None) 
 
 
 def fit_spline(stamps_ns: I64, T: F64) -> SplinePath:
-    """The smoothing spline through poses T (N, 4, 4) at rising stamps (N,); gaps are found here."""
+    """Return the smoothing spline through poses T (N, 4, 4) at rising stamps (N,), with the gaps that are
+    found in them."""
     t = (stamps_ns - stamps_ns[0]) / 1e9
     usual_step = float(np.median(np.diff(t)))
     holes = np.flatnonzero(np.diff(t) > max(_GAP_FACTOR * usual_step, _MIN_GAP_S))
@@ -55,7 +55,7 @@ def fit_spline(stamps_ns: I64, T: F64) -> SplinePath:
 
 
 def _smoothing_spline(t: F64, values: F64) -> Any:
-    """The BSpline of least generalised cross-validation through values (N, D) at t (N,)."""
+    """Return the BSpline of least generalised cross-validation through values (N, D) at t (N,)."""
     from scipy.interpolate import make_lsq_spline
 
     best, best_score = None, np.inf
@@ -74,8 +74,8 @@ def _smoothing_spline(t: F64, values: F64) -> Any:
 
 
 def _fill_gaps(t: F64, values: F64, holes: Any, usual: float) -> tuple[F64, F64]:
-    """Times and values with each hole filled by a cubic that leaves and arrives at the body's speed
-    (quaternions component by component: they are normalised later)."""
+    """Fill each gap with a cubic that continues the body's speed at both ends (quaternions component by
+    component: they are normalised later). Return times and values."""
     from scipy.interpolate import CubicHermiteSpline
 
     times, rows = [t], [values]

@@ -1,9 +1,9 @@
-"""Gray image and exact depth of a room, by casting a ray through every pixel centre.
+"""Gray image and exact depth of a plain room, by casting a ray through every pixel centre.
 
-All in inverse depth q = 1/z: where a ray r (world frame, camera z = 1) from c meets the plane
-x_k = p, q = r_k / (p - c_k), a multiple of an image that is affine in the pixel. A box is the q-interval
-between its exit and entry planes (the slab method of Kay & Kajiya 1986). Textures are mip-mapped,
-trilinear (Williams 1983): the room's pyramid holds two levels in a pixel, so one remap fetches both.
+All in inverse depth q = 1/z: where a ray r (world frame, camera z = 1) from c meets the plane x_k = p, q =
+r_k / (p - c_k), a multiple of an image that is affine in the pixel. A box is the q-interval between its exit
+and entry planes (the slab method of Kay & Kajiya 1986). Textures are mip-mapped, trilinear (Williams 1983):
+the room's pyramid holds two levels in a pixel, so one remap fetches both.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from share.geometry.se3 import inverse, transform
 from share.lab.emulate.plain.room import LEVELS, TEXELS_PER_M, PlainRoom
 from share.types import F32, F64, U8
 
-_MIN_DEPTH_M = 0.05  # m; nothing is nearer
-_ANISOTROPY = 0.6  # blur on slanted faces: 0 by the short side of a pixel's footprint, 1 by the long
-_MAX_FACES = 256  # a face fits in a byte
+_MIN_DEPTH_M = 0.05  # least depth
+_ANISOTROPY = 0.6  # blur on slanted faces: 0 by the short side of a pixel's footprint, 1 by the long side
+_MAX_FACES = 256  # a face index is a byte
 
 
 class PlainRoomRenderer:
-    """Pictures of one room by one undistorted camera. Not safe for threads: it reuses its buffers."""
+    """Draws one room for one undistorted camera. Not thread-safe: it reuses its buffers."""
 
     def __init__(self, room: PlainRoom, camera: Camera) -> None:
         if camera.distortion:
@@ -36,8 +36,8 @@ class PlainRoomRenderer:
         self._q, self._face = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
 
     def render(self, T_world_cam: F64) -> tuple[U8, F32]:
-        """(image (H, W) uint8, depth (H, W) float32 m along the optical axis), the camera being
-        anywhere in the room and in no box."""
+        """Return image (H, W) uint8 and depth (H, W) float32 m along the optical axis; the camera must be
+        inside the room and outside all boxes."""
         centre = T_world_cam[:3, 3]
         rays = self._rays(T_world_cam[:3, :3])
         self._cast_room(rays, centre)
@@ -58,7 +58,7 @@ class PlainRoomRenderer:
         ]
 
     def _cast_room(self, rays: list[F32], centre: F64) -> None:
-        """From inside, the nearest of the six planes ahead is the one seen."""
+        """Draw the room: from inside, the nearest of the six planes ahead is visible."""
         slopes = 1 / (self._room.boxes[0] - centre)
         self._q.fill(0)
         for k, ray in enumerate(rays):
@@ -70,7 +70,7 @@ class PlainRoomRenderer:
         q, face = self._q[window], self._face[window]
         entry = np.full(q.shape, np.inf, np.float32)
         entered = np.zeros(q.shape, np.uint8)
-        behind = q  # a hit must lie before all that is drawn, and before the ray leaves the box
+        behind = q  # a hit must lie before everything drawn, and before the ray leaves the box
         for k, ray in enumerate(rays):
             slopes = (1 / (box[:, k] - centre[k])).astype(np.float32)
             near = 0 if centre[k] < box[0, k] else 1 if centre[k] > box[1, k] else None
@@ -87,7 +87,7 @@ class PlainRoomRenderer:
         np.copyto(face, entered, where=hit)
 
     def _window(self, box: F64, T_world_cam: F64) -> tuple[slice, slice] | None:
-        """The part of the image that may show the box, or None."""
+        """Return the part of the image that may show the box, or None."""
         c = self._camera
         corners = np.array(
             [[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
@@ -122,8 +122,7 @@ class PlainRoomRenderer:
         return out
 
     def _level(self, depth: F32, centre: F64) -> F32:
-        """log2 of a pixel's footprint in texels. On a plane at distance d the footprint is z / f
-        by z^2 / (f d)."""
+        """Return log2 of a pixel's footprint in texels: z / f by z^2 / (f d) on a plane at distance d."""
         room = self._room
         away = np.abs(room.boxes.swapaxes(1, 2) - centre[:, None]).reshape(-1).clip(_MIN_DEPTH_M)
         scale = np.log2(TEXELS_PER_M / self._camera.fx) - _ANISOTROPY * np.log2(away)
@@ -140,7 +139,7 @@ def _update_nearest(q: F32, face: U8, candidate: F32, name: int) -> None:
 
 
 def _lookup_table(values: F32) -> F32:
-    """Columns of (N, C) as lookup tables by a byte: (C, 256)."""
+    """Return the columns of (N, C) as lookup tables by a byte: (C, 256)."""
     out = np.zeros((values.shape[1], 256), np.float32)
     out[:, : len(values)] = values.T
     return out

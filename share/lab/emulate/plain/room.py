@@ -1,8 +1,8 @@
-"""A plain furnished room: axis-aligned boxes, each face with a texture of its own.
+"""A plain furnished room: axis-aligned boxes, each face with its own texture.
 
-World frame: z up, origin in a lower corner of the room, metres. Box 0 is the room itself, seen from
-inside; the others are furniture. Face 6 b + 2 k + s is the lower (s = 0) or upper (s = 1) face of
-box b across axis k; its picture is one patch of the atlas.
+World frame: z up, origin in a lower corner of the room, metres. Box 0 is the room itself, seen from inside;
+the others are furniture. Face 6 b + 2 k + s is the lower (s = 0) or upper (s = 1) face of box b across axis
+k; its picture is one patch of the atlas.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ TEXELS_PER_M = 250.0
 LEVELS = 6  # of the mip pyramid: level l has 2^-l of the resolution
 _PATCH_PADDING = 1 << (
     LEVELS - 1
-)  # texels repeated around a patch, so that no level bleeds into its neighbour
+)  # texels repeated around a patch, so that levels do not bleed into neighbours
 _ATLAS_WIDTH = 4096
-_AXIS_SHADE = (0.92, 1.0, 1.06)  # light falls a little differently on each axis
+_AXIS_SHADE = (0.92, 1.0, 1.06)  # brightness of faces by their axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,19 +46,19 @@ class PlainRoom:
 
     @property
     def size(self) -> F64:
-        """Extent of the room (3,) m."""
+        """Return the extent of the room (3,) m."""
         size: F64 = self.boxes[0, 1]
         return size
 
     @cached_property
     def pyramid(self) -> Pyramid:
-        """The atlas as renderers want it, made once for all of them."""
+        """Return the atlas with its mip levels."""
         return _make_pyramid(self.atlas)
 
 
 def make_room(seed: int, size: tuple[float, float, float] = (9.0, 6.0, 3.0)) -> PlainRoom:
-    """Another room for every seed. Furniture keeps to a strip of 0.75 m along the walls, but for a
-    column in the middle: between them one can walk."""
+    """Return the room of `seed`. Furniture keeps to a strip of 0.75 m along the walls, except for a column in
+    the middle."""
     rng = np.random.default_rng([seed, 1])
     boxes = _all_boxes(rng, size)
     pictures = [_face_picture(rng, boxes, face) for face in range(6 * len(boxes))]
@@ -67,7 +67,7 @@ def make_room(seed: int, size: tuple[float, float, float] = (9.0, 6.0, 3.0)) -> 
 
 
 def room_boxes(seed: int, size: tuple[float, float, float]) -> F64:
-    """`make_room(seed, size).boxes`, without drawing its pictures."""
+    """Return `make_room(seed, size).boxes` without drawing pictures."""
     return _all_boxes(np.random.default_rng([seed, 1]), size)
 
 
@@ -76,7 +76,7 @@ def _all_boxes(rng: np.random.Generator, size: tuple[float, float, float]) -> F6
 
 
 def face_axes(face: int) -> tuple[int, int, int]:
-    """(axis across the face, axis along its picture's columns, axis along its rows)."""
+    """Return (axis across the face, axis along its picture's columns, axis along its rows)."""
     return ((0, 1, 2), (1, 0, 2), (2, 0, 1))[face % 6 // 2]
 
 
@@ -87,7 +87,7 @@ def _column_box(rng: np.random.Generator, size: tuple[float, float, float]) -> F
 
 
 def _furniture_boxes(rng: np.random.Generator, size: tuple[float, float, float]) -> list[F64]:
-    """Shelves, cupboards and crates along the four walls, with gaps between them."""
+    """Return shelves, cupboards and crates along the four walls, with gaps between them."""
     out = []
     for across, along in ((0, 1), (1, 0)):
         for side in (0, 1):
@@ -121,19 +121,19 @@ def _face_picture(rng: np.random.Generator, boxes: F64, face: int) -> U8:
     if face < 6:
         picture *= _corner_shadow(size)
     if across < 2 and (across + face) % 2 == (face < 6):
-        picture = picture[:, ::-1]  # columns rise with the world axis: turn what is seen the other way
+        picture = picture[:, ::-1]  # columns rise with the world axis, so flip faces seen from the other side
     out: U8 = cv2.GaussianBlur(picture.clip(4, 250), (0, 0), 0.7).astype(np.uint8)
     return out
 
 
 def _corner_shadow(size: tuple[int, int]) -> F32:
-    """Less light reaches the corners of a room."""
+    """Return darkening (H, W) towards the corners of a room."""
     fall = [1 - 0.35 * np.exp(-np.minimum(np.arange(n), n - 1 - np.arange(n)) / 60) for n in size]
     return np.outer(*fall).astype(np.float32)
 
 
 def _pack_atlas(pictures: list[U8]) -> tuple[U8, list[tuple[int, int]]]:
-    """The atlas and the (column, row) of each picture in it: shelves, tallest first."""
+    """Return the atlas and the (column, row) of each picture in it: shelves, tallest first."""
     corners = [(0, 0)] * len(pictures)
     x = y = height = 0
     for i in sorted(range(len(pictures)), key=lambda i: -pictures[i].shape[0]):
@@ -154,7 +154,7 @@ def _pack_atlas(pictures: list[U8]) -> tuple[U8, list[tuple[int, int]]]:
 
 
 def _face_origins(boxes: F64, corners: list[tuple[int, int]]) -> F32:
-    """Where world (0, 0) of each face's axes would lie in the atlas. Rows of upright faces run down."""
+    """Return the texel of world (0, 0) of each face's axes. Rows of upright faces run down."""
     out = np.zeros((len(corners), 2), np.float32)
     for face, (cx, cy) in enumerate(corners):
         across, along, up = face_axes(face)
@@ -165,7 +165,7 @@ def _face_origins(boxes: F64, corners: list[tuple[int, int]]) -> F32:
 
 
 def _make_pyramid(atlas: U8) -> Pyramid:
-    """Pixel x of level 0 is pixel x / 2 of level 1 (pyrDown keeps even pixels)."""
+    """Return the mip levels. Pixel x of level 0 is pixel x / 2 of level 1 (pyrDown keeps even pixels)."""
     levels = [atlas]
     for _ in range(LEVELS):
         levels.append(cv2.pyrDown(levels[-1]))

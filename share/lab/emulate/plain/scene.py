@@ -1,4 +1,4 @@
-"""The plain room among the scenes: it needs neither OpenGL nor a ray caster, only numpy and OpenCV."""
+"""The plain room as a scene; it needs neither OpenGL nor a ray caster, only numpy and OpenCV."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from share.lab.emulate.world.mesh import box
 from share.types import F32, F64
 
 DEFAULT_SIZE = (9.0, 6.0, 3.0)
-_WALL_M = 0.1  # m; thickness, outside
-_MIN_SIZE, _MAX_SIZE = (5.0, 4.0, 2.2), (12.0, 9.0, 4.0)  # what its pictures have room for
+_WALL_M = 0.1  # thickness, outside
+_MIN_SIZE, _MAX_SIZE = (5.0, 4.0, 2.2), (12.0, 9.0, 4.0)  # that its atlas holds
 
 
 def plain_layout(seed: int, size: tuple[float, float, float] | None = None) -> Layout:
-    """What stands where in the plain room. Raises UsageError for a size that it cannot have."""
+    """Return the layout of the plain room. Raises UsageError for an unsupported size."""
     size = size or DEFAULT_SIZE
     if not all(a <= x <= b for a, x, b in zip(_MIN_SIZE, size, _MAX_SIZE, strict=True)):
         low, high = (" x ".join(f"{x:g}" for x in s) for s in (_MIN_SIZE, _MAX_SIZE))
         raise UsageError(f"the plain room can be {low} to {high} m")
     boxes = room_boxes(seed, size)
-    skin = Material("plaster")  # never drawn: it has pictures of its own
+    skin = Material("plaster")  # not drawn: the room has its own pictures
     walls = [
         Piece(f"wall {k}", box(corners[0], corners[1], skin))
         for k, corners in enumerate(_wall_boxes(boxes[0]))
@@ -38,7 +38,7 @@ def plain_layout(seed: int, size: tuple[float, float, float] | None = None) -> L
 
 
 def _wall_boxes(room: F64) -> list[F64]:
-    """Boxes (2, 3) around the room."""
+    """Return boxes (2, 3) around the room."""
     out = []
     for axis in range(3):
         for side in (0, 1):
@@ -49,7 +49,7 @@ def _wall_boxes(room: F64) -> list[F64]:
 
 
 class PlainRenderer:
-    """A `share.lab.emulate.types.Renderer`. It shows no other agents, and has no lens distortion."""
+    """A `share.lab.emulate.types.RoomRenderer`. It draws neither other agents nor lens distortion."""
 
     def __init__(self, seed: int, size: tuple[float, float, float]) -> None:
         self._room = make_room(seed, size)

@@ -1,7 +1,7 @@
-"""Procedural gray textures: every call draws another picture, so no two places look alike.
+"""Procedural gray textures, different at each call, so that no two places look alike.
 
-Sizes are (rows, columns) in texels; `per_m` is texels per metre. Results are float32 gray levels
-around 0..255, not clipped: shading and clipping come last.
+Sizes are (rows, columns) in texels; `per_m` is texels per metre. Results are float32 gray levels around
+0..255, not clipped: shading and clipping come last.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Rng = np.random.Generator
 
 
 def cloud_noise(rng: Rng, size: Size, amplitudes: dict[int, float]) -> F32:
-    """Smooth noise: {cell size in texels: standard deviation in gray levels}, summed."""
+    """Return the sum of smooth noises {cell size in texels: standard deviation in gray levels}."""
     out = np.zeros(size, np.float32)
     for cell, amplitude in amplitudes.items():
         coarse = rng.normal(0, amplitude, (size[0] // cell + 4, size[1] // cell + 4)).astype(np.float32)
@@ -26,8 +26,8 @@ def cloud_noise(rng: Rng, size: Size, amplitudes: dict[int, float]) -> F32:
 
 
 def brick_rows(rng: Rng, size: Size, height: int, width: int, contrast: float, joint: float) -> F32:
-    """Bricks, tiles or planks: rows of `height`, cut at lengths about `width`, each with a gray of
-    its own and dark joints."""
+    """Return bricks, tiles or planks: rows of `height`, cut at lengths about `width`, each with its own gray
+    and dark joints."""
     out = np.zeros(size, np.float32)
     for top in range(0, size[0], height):
         row = out[top : top + height]
@@ -42,7 +42,7 @@ def brick_rows(rng: Rng, size: Size, height: int, width: int, contrast: float, j
 
 
 def draw_marks(rng: Rng, surface: F32, per_m2: float, per_m: float) -> None:
-    """Stains and scratches of 1-6 cm, in place: what keeps a bare surface from being blank."""
+    """Draw stains and scratches of 1-6 cm in place, so that a bare surface is not blank."""
     h, w = surface.shape
     for _ in range(int(per_m2 * h * w / per_m**2)):
         at = int(rng.integers(w)), int(rng.integers(h))
@@ -52,10 +52,10 @@ def draw_marks(rng: Rng, surface: F32, per_m2: float, per_m: float) -> None:
 
 
 def poster_texture(rng: Rng, size: Size) -> F32:
-    """A printed sheet: shapes, lines and letters on a plain ground, in a frame."""
+    """Return a printed sheet: shapes, lines and letters on a plain ground, in a frame."""
     h, w = size
     ground = rng.uniform(60, 220) + cloud_noise(rng, size, {32: 18, 8: 6})
-    sheet = ground.clip(0, 255).astype(np.uint8)  # OpenCV 5 writes letters on bytes only
+    sheet = ground.clip(0, 255).astype(np.uint8)  # OpenCV 5 writes text on bytes only
     for _ in range(int(rng.integers(6, 13))):
         x, y = int(rng.integers(w)), int(rng.integers(h))
         dx, dy = int(rng.integers(5, w // 3 + 6)), int(rng.integers(5, h // 3 + 6))
@@ -80,7 +80,7 @@ def poster_texture(rng: Rng, size: Size) -> F32:
 
 
 def hang_posters(rng: Rng, wall: F32, count: int, smallest: float, largest: float, per_m: float) -> None:
-    """Put `count` posters of random sizes (m) on a wall, in place; later ones over earlier ones."""
+    """Put `count` posters of random sizes (m) on a wall in place, later ones over earlier ones."""
     h, w = wall.shape
     for _ in range(count):
         ph, pw = (min(int(rng.uniform(smallest, largest) * per_m), n - 4) for n in (h, w))

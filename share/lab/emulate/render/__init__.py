@@ -1,1 +1,1 @@
-"""Images and exact depth of a room by OpenGL, without a screen."""
+"""Images and exact depth of a room by OpenGL, without a display."""

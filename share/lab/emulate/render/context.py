@@ -1,4 +1,4 @@
-"""An OpenGL context without a screen (EGL), and one clear line where there can be none."""
+"""Create an OpenGL context without a display (EGL), or say in one line why there can be none."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from typing import Any
 from share.errors import install_hint
 from share.lab.emulate.render.errors import RenderError
 
-_VERSION = 430  # of OpenGL: storage buffers
+_VERSION = 430  # of OpenGL, for storage buffers
 _EGL, _GL = "libEGL.so.1", "libGL.so.1"  # by name: ctypes finds the unversioned ones by tools that may lack
 _ENVIRONMENT = {
-    # Mesa's software driver takes a thread a core unless it is told otherwise before the context is
-    # made. 0: everything is done in the calling thread; who wants two cores starts two processes.
+    # Mesa's software driver uses a thread per core unless told otherwise before the context is created. 0:
+    # everything runs in the calling thread; to use two cores, start two processes.
     "LP_NUM_THREADS": "0",
-    # Its look-ups in 8-bit pictures weigh by 8 bits of fraction, four channels at a time: floats are exact
-    # and, with one channel, faster.
+    # With 8-bit textures the software driver interpolates with 8 bits of fraction, four channels at a time;
+    # float textures are exact and, with one channel, faster.
     "GALLIVM_PERF": "no_aos_sampling",
-    "EGL_LOG_LEVEL": "fatal",  # what is missing is said once, by us
+    "EGL_LOG_LEVEL": "fatal",  # missing libraries are reported once, below
 }
-# Debian's packages by the library that a bare system lacks; the first two bring in the others.
+# Debian packages by the library that may be missing; the first two install the others.
 _PACKAGES = {_EGL: "libegl1", _GL: "libgl1", "libEGL_mesa.so.0": "libegl-mesa0"}
 _DRIVERS = "libgl1-mesa-dri"
 
 
 def create_context() -> Any:
-    """A moderngl context of this process. Raises RenderError."""
+    """Create a moderngl context in this process. Raises RenderError."""
     os.environ.update(_ENVIRONMENT)
     try:
         import moderngl
@@ -40,7 +40,7 @@ def create_context() -> Any:
 
 
 def missing_reason() -> str | None:
-    """Why no room can be drawn on this machine, in one line; None where one can."""
+    """Return why this machine cannot draw, in one line; None if it can."""
     try:
         create_context().release()
     except RenderError as e:

@@ -1,4 +1,4 @@
-"""What a person is told where nothing can be drawn."""
+"""The error of a machine that cannot draw."""
 
 from __future__ import annotations
 

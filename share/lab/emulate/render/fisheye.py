@@ -1,8 +1,8 @@
 """A fisheye lens: up to five undistorted views, ahead and to the sides, each resampled where it is nearest.
 
-One view of 150 degrees would be 15 times finer at its edge than in its middle, and end at 180; the faces of a
-cube stay within a factor of three, and show what lies behind the camera too (Greene, Environment mapping,
-1986).
+One view of 150 degrees would be 15 times finer at its edge than in its middle, and 180 degrees is its limit;
+the faces of a cube stay within a factor of three and also cover what is behind the camera (Greene,
+Environment mapping, 1986).
 """
 
 from __future__ import annotations
@@ -29,22 +29,23 @@ _FACE_ROTATIONS = [
 
 @dataclass(frozen=True, eq=False)
 class FisheyeFace:
-    """T_cam_face (4, 4), which pixels (H, W) of the camera it shows, and how it is resampled for them."""
+    """One face. T_cam_face (4, 4); pixel_mask (H, W): pixels of the camera that it covers; lens: its
+    resampling."""
 
     T_cam_face: F64
     pixel_mask: NDArray[np.bool_]
     lens: LensResampler
 
     def axis_depth_ratio(self) -> F32:
-        """(H, W): depth along the camera's axis over depth along the face's."""
+        """Return (H, W): depth along the camera's axis over depth along the face's."""
         uv = self.lens.uv.reshape(*self.pixel_mask.shape, 2)
         out: F32 = (uv @ self.T_cam_face[2, :2] + self.T_cam_face[2, 2]).astype(np.float32)
         return out
 
 
 def fisheye_faces(camera: Camera, zoom: float = 1.0) -> tuple[FisheyeFace, ...]:
-    """The faces that a fisheye camera sees; as finely drawn as `share.lab.emulate.render.lens.lens` has it.
-    Pixels beyond the range of the lens belong to none."""
+    """Return the faces that a fisheye camera sees, drawn as finely as
+    `share.lab.emulate.render.lens.make_lens` would. Pixels beyond the range of the lens belong to no face."""
     px = pixel_centres(camera).reshape(-1, 2)
     ray = camera.directions(px)
     along = np.nan_to_num(np.stack([ray @ R[:, 2] for R in _FACE_ROTATIONS]), nan=-1.0)
@@ -61,7 +62,7 @@ def _make_face(camera: Camera, R: F64, mask: NDArray[np.bool_], ray: F64, zoom: 
     low, high = np.floor(flat.min(axis=0)) - MARGIN_PX, np.ceil(flat.max(axis=0)) + MARGIN_PX
     width, height = (int(n) for n in high - low + 1)
     wide = Camera(width, height, f, f, float(-low[0]), float(-low[1]))
-    place = np.full((len(mask), 2), MARGIN_PX, np.float32)  # of the others: somewhere inside
+    place = np.full((len(mask), 2), MARGIN_PX, np.float32)  # for other pixels any place inside
     place[mask] = flat - low
     maps = place.reshape(camera.height, camera.width, 2)
     all_uv = np.zeros((len(mask), 2))
@@ -73,7 +74,7 @@ def _make_face(camera: Camera, R: F64, mask: NDArray[np.bool_], ray: F64, zoom: 
 
 
 def _max_magnification(camera: Camera, R: F64, mask: NDArray[np.bool_]) -> float:
-    """The most that the lens enlarges what the face shows, 1 being the middle of a face."""
+    """Return the largest magnification by the lens of the face's view, relative to the middle of a face."""
     px, step = pixel_centres(camera).reshape(-1, 2)[mask][::97], 1e-3
     sides = []
     for d in np.eye(2) * step:

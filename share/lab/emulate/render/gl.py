@@ -1,4 +1,5 @@
-"""The renderer on OpenGL: samples over the pixel and over time, and the lens, over the passes of `GlRoom`."""
+"""The OpenGL renderer: combines passes of `GlRoom` over samples in the pixel and in time, and applies the
+lens."""
 
 from __future__ import annotations
 
@@ -17,27 +18,29 @@ from share.lab.emulate.render.view import shifted_camera
 from share.lab.emulate.types import DrawableRoom, SceneInstant
 from share.types import F32, F64
 
-_MIN_SAMPLES = 3  # of a pixel, at least
-_DEPTH_ZOOM = 3.0  # of the view in which a lens finds its triangles: fewer slivers are missed
+_MIN_SAMPLES = 3  # of a pixel
+# magnification of the view in which a lens finds its triangles, so that fewer slivers are missed
+_DEPTH_ZOOM = 3.0
 _cached_lens = lru_cache(maxsize=16)(make_lens)
 _cached_faces = lru_cache(maxsize=16)(fisheye_faces)
 
 
 class GlRenderer:
-    """Draws one room. Made once a process; not safe for threads. Raises RenderError where it cannot."""
+    """Draws one room. Created once a process; not thread-safe. Raises RenderError where this machine cannot
+    draw."""
 
     def __init__(self, room: DrawableRoom) -> None:
         self._stage = GlRoom(room)
         self.device = self._stage.device
 
     def radiance(self, camera: Camera, instants: Sequence[SceneInstant]) -> F32:
-        """Image (H, W) in linear gray levels; see `Renderer`.
+        """Return an image (H, W) in linear gray levels; see `RoomRenderer`.
 
-        Samples over time and over the pixel are one sum (Cook, Porter & Carpenter 1984): every moment
-        has one sample of each pixel, at another place in it, or more where there are fewer than _SAMPLES.
+        Samples over time and over the pixel are one sum (Cook, Porter & Carpenter 1984): each instant has one
+        sample of each pixel, at another place in it, or more if there are fewer than _MIN_SAMPLES instants.
         """
         if not instants:
-            raise ValueError("moments: an image needs at least one")
+            raise ValueError("instants: an image needs at least one")
         if camera.is_fisheye:
             return self._fisheye_radiance(camera, instants)
         count = max(_MIN_SAMPLES, len(instants))
@@ -50,7 +53,7 @@ class GlRenderer:
         return optics.image(total) if optics else total
 
     def depth(self, camera: Camera, instant: SceneInstant) -> F32:
-        """Exact depth (H, W) m, 0 where nothing is; see `Renderer`."""
+        """Return the exact depth (H, W) m, 0 where there is nothing; see `RoomRenderer`."""
         if not camera.distortion:
             return self._stage.depth(camera, instant)
         if camera.is_fisheye:
@@ -59,7 +62,7 @@ class GlRenderer:
         return optics.depth(*self._stage.triangle_map(optics.wide_camera, instant))
 
     def _fisheye_radiance(self, camera: Camera, instants: Sequence[SceneInstant]) -> F32:
-        """`radiance` of a fisheye lens. Dark where the lens shows nothing."""
+        """Return `radiance` of a fisheye lens, 0 where the lens shows nothing."""
         out = np.zeros((camera.height, camera.width), np.float32)
         for face in _cached_faces(camera):
             face_instants = [_face_instant(moment, face) for moment in instants]
@@ -68,7 +71,7 @@ class GlRenderer:
         return out
 
     def _fisheye_depth(self, camera: Camera, instant: SceneInstant) -> F32:
-        """`depth` of a fisheye lens; 0 also of what is not ahead of it."""
+        """Return `depth` of a fisheye lens, 0 also behind the camera."""
         out = np.zeros((camera.height, camera.width), np.float32)
         for face in _cached_faces(camera, _DEPTH_ZOOM):
             z = face.lens.depth(
@@ -79,15 +82,15 @@ class GlRenderer:
 
 
 def _face_instant(instant: SceneInstant, face: FisheyeFace) -> SceneInstant:
-    """What the face's own camera sees."""
+    """Return the instant as the face's camera sees it."""
     return replace(instant, T_world_cam=instant.T_world_cam @ face.T_cam_face)
 
 
 @lru_cache
 def _sample_offsets(count: int) -> F64:
-    """Where in its pixel each of `count` samples lies (count, 2) px: a row and a column for each, which edges
-    along either need, as the Halton sequence (1960) orders them. It begins at the third point: so few points
-    lie on no line and go back and forth, and motion in between neither shrinks nor stretches them."""
+    """Return the place (count, 2) px in its pixel of each of `count` samples. Rows and columns follow the
+    Halton sequence (1960) from its third point on: so few points are on no line and go back and forth, so
+    that motion between them neither shrinks nor stretches them."""
     points = qmc.Halton(2, scramble=False).fast_forward(2).random(count)
     ranks = points.argsort(axis=0).argsort(axis=0)
     out: F64 = (ranks + 0.5) / count - 0.5

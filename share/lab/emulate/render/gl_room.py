@@ -1,6 +1,6 @@
-"""What OpenGL holds of a room, and the passes over it: one image, one depth, one map of triangles.
+"""A room's OpenGL objects, and the passes over it: image, depth, and map of triangles.
 
-Every pass is of an undistorted camera, one sample a pixel.
+Every pass has an undistorted camera and one sample a pixel.
 """
 
 from __future__ import annotations
@@ -19,18 +19,20 @@ from share.lab.emulate.types import I32, DrawableRoom, Mesh, SceneInstant
 from share.types import F32, F64, I64
 
 _UNIT_LIGHT = 100.0  # in the light map
-_MOVER_LAMP = np.array([0.12, 0.08, 0.22])  # direction and strength of the movers' fixed shading, world frame
-_VERTEX_COLUMNS = {"position": 3, "normal": 3, "uv": 2, "layer": 1, "light_uv": 2}  # of a vertex, float32
+# direction and strength of the fixed shading of movers, world frame
+_MOVER_LAMP = np.array([0.12, 0.08, 0.22])
+# floats of each vertex attribute
+_VERTEX_COLUMNS = {"position": 3, "normal": 3, "uv": 2, "layer": 1, "light_uv": 2}
 
 
 class GlRoom:
-    """Raises RenderError where this machine cannot draw."""
+    """The OpenGL objects of a room. Raises RenderError where this machine cannot draw."""
 
     def __init__(self, room: DrawableRoom) -> None:
         self._gl = gl = context.create_context()
         self._far_plane_m = (
             2.0 * float(np.linalg.norm(room.size)) + 10.0
-        )  # from anywhere near to anything in it
+        )  # far plane: from near the room to anything in it
         self._depth_program = gl.program(shaders.FACE_VERTEX, shaders.DEPTH_FRAGMENT)
         self._face_program = gl.program(shaders.FACE_VERTEX, shaders.FACE_FRAGMENT)
         self._room_program, self._mover_program = self._image_programs(room)
@@ -45,11 +47,11 @@ class GlRoom:
 
     @property
     def device(self) -> str:
-        """What draws: other drivers give other bytes."""
+        """Return the name of the OpenGL device; other drivers give other bytes."""
         return f"{self._gl.info['GL_RENDERER']}, {self._gl.info['GL_VERSION']}"
 
     def image(self, camera: Camera, instant: SceneInstant) -> F32:
-        """(H, W) gray levels, one sample a pixel: too sharp to stand alone, see `shaders`."""
+        """Return (H, W) gray levels, one sample a pixel: aliased on its own, see `shaders`."""
         lamp = _MOVER_LAMP @ instant.T_world_cam[:3, :3]
         with self._gl:
             target = self._cleared_target(camera)
@@ -61,7 +63,7 @@ class GlRoom:
             return _read_target(target, camera)
 
     def depth(self, camera: Camera, instant: SceneInstant) -> F32:
-        """(H, W) m along the optical axis, 0 where nothing is."""
+        """Return (H, W) m along the optical axis, 0 where there is nothing."""
         with self._gl:
             self._depth_program["focal"], self._depth_program["centre"] = (
                 (camera.fx, camera.fy),
@@ -76,7 +78,7 @@ class GlRoom:
             return _read_target(target, camera)
 
     def triangle_map(self, camera: Camera, instant: SceneInstant) -> tuple[I32, F64, F64]:
-        """Which triangle is seen (H, W), 0 for none; then of each triangle slopes (T, 3), see
+        """Return which triangle is seen (H, W), 0 for none; then of each triangle its slopes (T, 3), see
         `ChunkedSurface`, and corners (T, 3, 3) m in the camera frame."""
         slopes, corners, count = [np.zeros((1, 3))], [np.zeros((1, 3, 3))], 1
         with self._gl:
@@ -91,12 +93,12 @@ class GlRoom:
         return triangle_ids, np.concatenate(slopes), np.concatenate(corners)
 
     def _visible_pieces(self, camera: Camera, instant: SceneInstant) -> Iterator[tuple[_GlPiece, F64, I64]]:
-        """What may be in the image, with T_piece_cam and its chunks."""
+        """Yield what may be in the image, with T_piece_cam and its chunks."""
         planes = frustum_normals(camera)
         pieces = [(self._room, instant.T_world_cam)]
         for name, poses in instant.part_poses.items():
             pieces += self._movers[name].visible_parts(planes, instant.T_world_cam, poses)
-        for piece, T in reversed(pieces):  # movers hide the room
+        for piece, T in reversed(pieces):  # movers first: they hide the room
             chunks = piece.surface.visible_chunks(planes, T)
             if len(chunks):
                 yield piece, T, chunks
@@ -105,13 +107,13 @@ class GlRoom:
         faces = piece.surface.faces[chunks]
         piece.indices.orphan()
         piece.indices.write(faces)
-        program["turn"].write(T_piece_cam[:3, :3].astype("f4").tobytes())  # by columns: the transpose
+        program["turn"].write(T_piece_cam[:3, :3].astype("f4").tobytes())  # column-major, so the transpose
         program["origin"] = tuple(T_piece_cam[:3, 3])
         program["projection"].write(projection_matrix(camera, self._far_plane_m).T.astype("f4").tobytes())
         piece.arrays[program].render(vertices=faces.size)
 
     def _cleared_target(self, camera: Camera) -> Any:
-        """One float a pixel, all 0."""
+        """Return a target of one float a pixel, all 0."""
         size = camera.width, camera.height
         if size not in self._targets:
             color = self._gl.texture(size, 1, dtype="f4")
@@ -122,7 +124,7 @@ class GlRoom:
         return target
 
     def _image_programs(self, room: DrawableRoom) -> tuple[Any, Any]:
-        """One for the room, one for movers."""
+        """Return the programs for the room and for movers."""
         of_room = self._gl.program(shaders.ROOM_VERTEX, shaders.ROOM_FRAGMENT)
         of_room["pictures"], of_room["light_map"], of_room["gain"] = 0, 1, 255 * 255 / _UNIT_LIGHT
         of_mover = self._gl.program(shaders.MOVER_VERTEX, shaders.MOVER_FRAGMENT)
@@ -134,7 +136,7 @@ class GlRoom:
 
 
 class _GlPiece:
-    """A surface as OpenGL holds it."""
+    """The OpenGL buffers of a surface."""
 
     def __init__(self, gl: Any, programs: list[Any], mesh: Mesh, light_uv: F32 | None) -> None:
         self.surface: ChunkedSurface = chunked_surface(mesh)
@@ -156,8 +158,8 @@ class _MovingBody:
         self._radii = np.array([radius for _, radius in spheres])
 
     def visible_parts(self, planes: F64, T_world_cam: F64, T_world_part: F64) -> list[tuple[_GlPiece, F64]]:
-        """The parts that may be within `frustum_normals` (S, 3), with T_part_cam; T_world_part is (P, 4,
-        4)."""
+        """Return the parts that may be within `frustum_normals` (S, 3), with T_part_cam; T_world_part is (P,
+        4, 4)."""
         centres = (T_world_part @ self._centres[:, :, None])[:, :3, 0] - T_world_cam[:3, 3]
         inside = (centres @ T_world_cam[:3, :3] @ planes.T > -self._radii[:, None]).all(axis=1)
         return [(self._parts[k], inverse(T_world_part[k]) @ T_world_cam) for k in np.flatnonzero(inside)]
@@ -170,7 +172,8 @@ def _vertex_array(gl: Any, program: Any, vertices: Any, indices: Any) -> Any:
 
 
 def _textures(gl: Any, room: DrawableRoom) -> tuple[Any, Any]:
-    """Pictures at unit 0, repeated and mip-mapped, trilinear (Williams 1983); the light map at unit 1."""
+    """Return the pictures at unit 0, repeated and mip-mapped, trilinear (Williams 1983), and the light map at
+    unit 1."""
     layers, height, width = room.pictures.shape
     pictures = gl.texture_array((width, height, layers), 1, np.ascontiguousarray(room.pictures), alignment=1)
     pictures.build_mipmaps()

@@ -1,8 +1,7 @@
 """A lens: a wide undistorted view, resampled.
 
-Where a camera distorts, the view that is drawn has at its centre and everywhere else at least the
-camera's pixels a radian, and is as wide as the camera sees; then each sample is looked up where its ray
-meets it.
+For a camera with distortion, the wide view has at least the camera's pixels per radian everywhere and covers
+its field of view; each pixel is then looked up where its ray meets it.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ from share.lab.emulate.render.view import pixel_centres
 from share.lab.emulate.types import I32
 from share.types import F32, F64
 
-MARGIN_PX = 2  # px around what is seen, for interpolation
-_MAX_WIDENING = 3.0  # times the camera's own size: beyond it the model is used outside its range
-_EDGE_TOLERANCE = -1e-9  # how far outside its triangle a ray may pass, in sines
+MARGIN_PX = 2  # around the visible part, for interpolation
+_MAX_WIDENING = 3.0  # times the camera's size; beyond it the model is used outside its range
+_EDGE_TOLERANCE = -1e-9  # tolerance of rays outside their triangle, in sines
 
 
 @dataclass(frozen=True, eq=False)
 class LensResampler:
-    """wide: the undistorted camera to draw. uv (H W, 2): normalised coordinates of the camera's pixels.
-    place: where they are in the wide image, as OpenCV wants it."""
+    """wide_camera: the undistorted camera to draw. uv (H W, 2): normalised coordinates of the camera's
+    pixels. sample_maps: their places in the wide image, for OpenCV's remap."""
 
     camera: Camera
     wide_camera: Camera
@@ -34,16 +33,16 @@ class LensResampler:
     sample_maps: tuple[F32, F32]
 
     def image(self, wide: F32) -> F32:
-        """(H, W) as the lens shows it: by cubic interpolation, which hardly blurs what is drawn at least as
-        finely as it is seen."""
+        """Return (H, W) through the lens, by cubic interpolation, which hardly blurs a view that is at least
+        as fine as the result."""
         out: F32 = np.maximum(cv2.remap(wide, *self.sample_maps, cv2.INTER_CUBIC), 0)
         return out
 
     def depth(self, faces: I32, slopes: F64, corners: F64) -> F32:
-        """Exact depth (H, W) m on the camera's rays, from which triangle (0: none) the wide view sees.
+        """Return the exact depth (H, W) m on the camera's rays, from the wide view's triangles (0: none).
 
-        Of the triangles seen at the four pixels around a ray, the nearest that it really meets; where
-        it meets none (a gap narrower than a pixel), the one of the nearest pixel.
+        Of the triangles at the four pixels around a ray, take the nearest that the ray meets; if it meets
+        none (a gap narrower than a pixel), that of the nearest pixel.
         """
         x, y = (m.astype(np.float64).ravel() for m in self.sample_maps)
         r = rays(self.uv)
@@ -60,26 +59,26 @@ class LensResampler:
 
 
 def make_lens(camera: Camera, zoom: float = 1.0) -> LensResampler:
-    """The lens of `camera`; the wide view has `zoom` times its pixels a radian, or more. Raises ValueError
-    if the distortion has no inverse over the image."""
+    """Return the lens of `camera`; the wide view has at least `zoom` times its pixels per radian. Raises
+    ValueError if the distortion has no inverse over the image."""
     px = pixel_centres(camera).reshape(-1, 2)
     uv = camera.normalise(px)
     if not np.isfinite(uv).all() or np.abs(camera.distort(uv) - px).max() > 1e-3:
-        raise ValueError("camera: its distortion cannot be undone over the whole image")
+        raise ValueError("camera: its distortion has no inverse over the whole image")
     zoom *= max(1.0, _max_magnification(camera, uv))
     fx, fy = camera.fx * zoom, camera.fy * zoom
     flat = uv * (fx, fy)
     low, high = np.floor(flat.min(axis=0)) - MARGIN_PX, np.ceil(flat.max(axis=0)) + MARGIN_PX
     width, height = (int(n) for n in high - low + 1)
     if width * height > (_MAX_WIDENING * zoom) ** 2 * camera.width * camera.height:
-        raise ValueError(f"camera: its distortion asks for {width}x{height} pixels to be drawn")
+        raise ValueError(f"camera: its distortion needs a view of {width}x{height} pixels")
     wide = Camera(width, height, fx, fy, float(-low[0]), float(-low[1]))
     place = (flat - low).astype(np.float32).reshape(camera.height, camera.width, 2)
     return LensResampler(camera, wide, uv, (place[..., 0].copy(), place[..., 1].copy()))
 
 
 def _max_magnification(camera: Camera, uv: F64) -> float:
-    """The most that the lens enlarges anywhere, 1 being its centre."""
+    """Return the largest magnification by the lens, relative to its centre."""
     step = 1e-5
     columns = [(camera.distort(uv + d) - camera.distort(uv - d)) / (2 * step) for d in np.eye(2) * step]
     J = np.stack(columns, axis=-1) / np.array([camera.fx, camera.fy])[:, None]
@@ -87,7 +86,7 @@ def _max_magnification(camera: Camera, uv: F64) -> float:
 
 
 def _ray_hits_triangle(r: F64, corners: F64) -> NDArray[np.bool_]:
-    """Which rays (N, 3) pass through their triangle (N, 3, 3)."""
+    """Return which rays (N, 3) pass through their triangle (N, 3, 3)."""
     sides = np.stack([_edge_side(r, corners[:, i], corners[:, (i + 1) % 3]) for i in range(3)])
     within = (sides >= _EDGE_TOLERANCE).all(axis=0) | (sides <= -_EDGE_TOLERANCE).all(axis=0)
     hits: NDArray[np.bool_] = within & (sides != 0).any(axis=0)

@@ -1,13 +1,13 @@
-"""The shaders. All is drawn in the camera's frame: x right, y down, z ahead, metres.
+"""The shaders. Everything is drawn in the camera's frame: x right, y down, z ahead, metres.
 
-`origin` is the camera in the frame of what is drawn and `turn` the rotation into the camera's frame, so
-that large coordinates cancel before they are rounded. Pictures are low-passed to half a pixel
-(Williams 1983): an image is the mean of at least three samples, which does the rest.
+`origin` is the camera in the frame of what is drawn and `turn` the rotation into the camera's frame, so that
+large coordinates cancel before they are rounded. Pictures are low-passed to half a pixel (Williams 1983): an
+image is the mean of at least three samples, which does the rest.
 """
 
 from __future__ import annotations
 
-_MIP_BIAS = -1.0  # of detail, against a sample as large as a pixel
+_MIP_BIAS = -1.0  # level of detail, relative to a sample as large as a pixel
 
 _PLACE_GLSL = """
 #version 430
@@ -70,8 +70,8 @@ out float radiance;
 void main() {{ radiance = gain * texture(pictures, picture_at, {_MIP_BIAS}).r * shade; }}
 """
 
-# On a plane, inverse depth is affine in normalised coordinates: nothing interpolated is as exact. Doubles,
-# because on a surface seen almost edge-on the last bit of u and v is worth 1e-5 m.
+# On a plane, inverse depth is affine in normalised coordinates, which is more exact than interpolated depth.
+# Doubles, because on a surface seen almost edge-on the last bit of u and v is 1e-5 m.
 DEPTH_FRAGMENT = """
 #version 430
 layout(std430, binding = 0) readonly buffer Slopes { dvec4 slopes[]; };
@@ -84,7 +84,7 @@ void main() {
 }
 """
 
-# Numbers of triangles as floats: exact below 2^24.
+# Triangle numbers as floats: exact below 2^24.
 FACE_FRAGMENT = """
 #version 430
 uniform float first;

@@ -1,4 +1,4 @@
-"""Triangles in chunks of neighbours, so that only those are drawn that may be seen."""
+"""Triangles in chunks of neighbours, so that chunks outside the view are skipped."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from share.lab.emulate.types import I32, Mesh
 from share.types import F64, I64
 
-CHUNK_TRIANGLES = 16  # triangles that are drawn or left out together
-_GRID_CELLS = 1023  # a side of the grid that the Z-order curve runs through
+CHUNK_TRIANGLES = 16  # triangles per chunk
+_GRID_CELLS = 1023  # cells per side of the grid of the Z-order curve
 
 
 @dataclass(frozen=True, eq=False)
 class ChunkedSurface:
-    """faces (C, CHUNK, 3): corners, neighbours together, filled up with empty triangles. corners
-    (C, CHUNK, 3, 3) m; planes (C, CHUNK, 4): unit normal n and offset d, n . x = d; centre (C, 3) and
-    radius (C,) m of a sphere around each chunk."""
+    """faces (C, CHUNK, 3): corners, neighbours together, padded with empty triangles. corners (C, CHUNK, 3,
+    3) m; planes (C, CHUNK, 4): unit normal n and offset d, n . x = d; centre (C, 3) and radius (C,) m of a
+    sphere around each chunk."""
 
     faces: I32
     corners: F64
@@ -27,20 +27,21 @@ class ChunkedSurface:
 
     @property
     def bounding_sphere(self) -> tuple[F64, float]:
-        """Around all of it: centre (3,), radius m."""
+        """Return centre (3,) and radius of a sphere around all of it, m."""
         low, high = self.corners.min(axis=(0, 1, 2)), self.corners.max(axis=(0, 1, 2))
         return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
     def visible_chunks(self, planes: F64, T_surface_cam: F64) -> I64:
-        """Chunks that may be within `sides` (S, 3) of a view. Those whose far end is nearest come first:
-        what they hide costs less then."""
+        """Return chunks that may be within `planes` (S, 3) of a view, sorted by the distance of their far
+        end: near chunks hide others, which then cost less."""
         centre = (self.centre - T_surface_cam[:3, 3]) @ T_surface_cam[:3, :3]
         chunks = np.flatnonzero((centre @ planes.T > -self.radius[:, None]).all(axis=1))
         far = np.sqrt((centre[chunks] ** 2).sum(axis=1)) + self.radius[chunks]
         return chunks[np.argsort(far, kind="stable")]
 
     def inverse_depth_slopes(self, chunks: I64, T_surface_cam: F64) -> F64:
-        """Of these chunks' triangles, (T, 3): inverse depth at normalised (u, v) is slope . (u, v, 1)."""
+        """Return slopes (T, 3) of the chunks' triangles: inverse depth at normalised (u, v) is slope . (u, v,
+        1)."""
         planes = self.planes[chunks].reshape(-1, 4)
         distance = planes[:, 3] - planes[:, :3] @ T_surface_cam[:3, 3]
         distance = np.where(np.abs(distance) < 1e-12, np.inf, distance)  # seen edge-on: covers no pixel
@@ -49,7 +50,7 @@ class ChunkedSurface:
 
 
 def chunked_surface(mesh: Mesh) -> ChunkedSurface:
-    """`mesh` cut into chunks."""
+    """Return `mesh` cut into chunks."""
     faces = _faces_in_z_order(mesh)
     filler = np.broadcast_to(faces[-1, 0], (-len(faces) % CHUNK_TRIANGLES, 3))
     faces = np.ascontiguousarray(np.concatenate([faces, filler]).reshape(-1, CHUNK_TRIANGLES, 3), np.int32)
@@ -60,7 +61,7 @@ def chunked_surface(mesh: Mesh) -> ChunkedSurface:
 
 
 def _faces_in_z_order(mesh: Mesh) -> I32:
-    """Faces by the place of their centre along a Z-order curve (Morton 1966)."""
+    """Return faces sorted by their centres along a Z-order curve (Morton 1966)."""
     centres = mesh.triangles.mean(axis=1)
     span = max(float(np.ptp(centres, axis=0).max()), 1e-6)
     cells = ((centres - centres.min(axis=0)) / span * _GRID_CELLS).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Pinhole views: the matrix that OpenGL wants, the sides of what is seen, shifted pixel grids."""
+"""Pinhole views: projection matrix for OpenGL, frustum, shifted pixel grids."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 from share.geometry.camera import Camera
 from share.types import F64
 
-NEAR_M = 0.05  # m; what is nearer is not drawn
+NEAR_M = 0.05  # near plane
 
 
 def projection_matrix(camera: Camera, far: float) -> F64:
-    """(4, 4) from the camera frame (x right, y down, z ahead, m) to clip coordinates, `NEAR_M` to `far` m.
+    """Return (4, 4) from the camera frame (x right, y down, z ahead, m) to clip coordinates, `NEAR_M` to
+    `far` m.
 
     OpenGL's first row is the image's first row, and pixel centres are at integers: x = u + 1/2 there.
     """
@@ -26,7 +27,7 @@ def projection_matrix(camera: Camera, far: float) -> F64:
 
 
 def frustum_normals(camera: Camera) -> F64:
-    """Inward unit normals (5, 3) of the view frustum, camera frame, through the outer edges of the
+    """Return inward unit normals (5, 3) of the view frustum, camera frame, through the outer edges of the
     outermost pixels; the last one points ahead."""
     left, right = (-0.5 - camera.cx) / camera.fx, (camera.width - 0.5 - camera.cx) / camera.fx
     top, bottom = (-0.5 - camera.cy) / camera.fy, (camera.height - 0.5 - camera.cy) / camera.fy
@@ -36,11 +37,11 @@ def frustum_normals(camera: Camera) -> F64:
 
 
 def shifted_camera(camera: Camera, offset: F64) -> Camera:
-    """The same view, sampled `offset` (2,) px right of and below the pixel centres."""
+    """Return the same view, sampled `offset` (2,) px right of and below the pixel centres."""
     return replace(camera, cx=camera.cx - float(offset[0]), cy=camera.cy - float(offset[1]))
 
 
 def pixel_centres(camera: Camera) -> F64:
-    """The pixel centres (H, W, 2)."""
+    """Return the pixel centres (H, W, 2)."""
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     return np.stack([columns, rows], axis=-1).astype(np.float64)

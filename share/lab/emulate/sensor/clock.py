@@ -1,7 +1,7 @@
-"""When a device's streams are sampled, and what stamps its clock writes.
+"""Sampling times of a device's streams, and the stamps of its clock.
 
-True time is the path's, in ns: the time in which the motion happens. A picture's time is the middle of
-its exposure.
+True time is the path's, in ns: the time in which the motion happens. A picture's time is the middle of its
+exposure.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from share.lab.emulate.sensor.indexed_random import Seed, normal, uniform
 from share.types import I64
 
-_MAX_BURST_FRAMES = 64  # frames
-_MAX_JITTER_SHARE = 0.45  # of a period: how far a stamp may be off without overtaking the next
+_MAX_BURST_FRAMES = 64
+_MAX_JITTER_SHARE = 0.45  # of a period: largest stamp error that keeps the order
 
 
 @dataclass(frozen=True)
 class DeviceClock:
     """A clock that shows true time plus an offset and a drift since `origin_ns`, in ticks of tick_ns.
 
-    bits: width of its counter, which wraps; 0 = it does not.
+    bits: width of its counter, which wraps; 0: it does not wrap.
     """
 
     origin_ns: int = 0
@@ -34,11 +34,11 @@ class DeviceClock:
 
     @property
     def period_ns(self) -> int:
-        """After how long the counter wraps; 0 = it does not."""
+        """Return the period after which the counter wraps; 0: never."""
         return self.tick_ns << self.bits if self.bits else 0
 
     def read(self, true_ns: I64) -> I64:
-        """What the clock shows at true times (N,)."""
+        """Return the clock's reading at true times (N,)."""
         since = true_ns - self.origin_ns
         clock_ns = true_ns + self.offset_ns + np.rint(since * (self.drift_ppm * 1e-6)).astype(np.int64)
         ticks = clock_ns // self.tick_ns
@@ -50,13 +50,13 @@ class DeviceClock:
 
 @dataclass(frozen=True)
 class SampleStream:
-    """Samples at `rate_hz`, the first at `first_ns` true time; sample k is the same in every span."""
+    """Samples at `rate_hz`, the first at `first_ns` true time; indices do not depend on the span."""
 
     rate_hz: float
     first_ns: int
 
     def sample_times(self, start_ns: int, end_ns: int) -> tuple[I64, I64]:
-        """(index, true_ns), each (N,), of the samples in [start, end], both included."""
+        """Return (index, true_ns), each (N,), of the samples in [start, end], both included."""
         rate = self.rate_hz / 1e9
         low = max(0, int(np.ceil((start_ns - self.first_ns) * rate)) - 1)
         high = int(np.floor((end_ns - self.first_ns) * rate)) + 1
@@ -67,15 +67,16 @@ class SampleStream:
 
 
 def phase_ns(seed: Seed, rate_hz: float) -> int:
-    """Where in its first period a free-running stream starts, ns."""
+    """Return the start of a free-running stream within its first period, ns."""
     return int(np.random.default_rng(seed).random() * 1e9 / rate_hz)
 
 
 def dropped_mask(seed: Seed, index: I64, share: float, burst: float) -> np.ndarray:
-    """Which frames (N,) bool are lost: `share` of them on average, in bursts of `burst` frames on average.
+    """Return which frames (N,) bool are lost: `share` of them on average, in bursts of `burst` frames on
+    average.
 
-    A burst starts at any frame alike and lasts a geometrically distributed number of frames, up to 64;
-    bursts may overlap, so starts are thinned such that the share comes out.
+    A burst starts at each frame with equal probability and lasts a geometrically distributed number of
+    frames, up to 64; bursts may overlap, so the start probability is reduced to match `share`.
     """
     if share <= 0 or len(index) == 0:
         return np.zeros(len(index), bool)
@@ -92,17 +93,18 @@ def dropped_mask(seed: Seed, index: I64, share: float, burst: float) -> np.ndarr
     return out
 
 
-def _start_probability(share: float, survive: NDArray[Any]) -> float:
-    """p with 1 - prod(1 - p s_i) = share, by bisection: what leaves 1 - share of the frames whole."""
+def _start_probability(share: float, survival: NDArray[Any]) -> float:
+    """Return p with 1 - prod(1 - p s_i) = share, by bisection."""
     low, high = 0.0, 1.0
     for _ in range(60):
         p = (low + high) / 2
-        low, high = (p, high) if 1 - np.prod(1 - p * survive) < share else (low, p)
+        low, high = (p, high) if 1 - np.prod(1 - p * survival) < share else (low, p)
     return (low + high) / 2
 
 
 def stamp_jitter_ns(seed: Seed, index: I64, sigma_ns: float, rate_hz: float) -> I64:
-    """Error of each sample's stamp (N,) ns: normal, cut at 3 sigma and so that stamps stay in order."""
+    """Return the error of each sample's stamp (N,) ns: normal, clipped at 3 sigma and so that stamps stay in
+    order."""
     if sigma_ns <= 0:
         return np.zeros(len(index), np.int64)
     limit = min(3 * sigma_ns, _MAX_JITTER_SHARE * 1e9 / rate_hz)
@@ -110,7 +112,7 @@ def stamp_jitter_ns(seed: Seed, index: I64, sigma_ns: float, rate_hz: float) -> 
 
 
 def unwrapped_stamps(stamps_ns: I64, period_ns: int) -> I64:
-    """Stamps (N,) of one stream in order, without the wraps of its counter."""
+    """Return ordered stamps (N,) of one stream without the wraps of its counter."""
     if not period_ns:
         return stamps_ns
     wraps = np.cumsum(np.diff(stamps_ns, prepend=stamps_ns[:1]) < -period_ns // 2)

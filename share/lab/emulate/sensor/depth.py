@@ -1,12 +1,12 @@
-"""Depth as a D435i's stereo matching gives it: errors of disparity that depend on texture, and holes.
+"""Depth as of a D435i's stereo matching: texture-dependent disparity errors, and holes.
 
 The model follows block matching (docs/understand/sensors.md compares the two). A window of n pixels with mean
 squared horizontal gradient g^2 and gray noise s in both pictures gives disparity to
 
     sigma^2 = floor^2 + 2 s^2 / (n g^2)          (least squares; Gruen 1985)
 
-Nothing is found where g / s is small, where the right camera does not see the point (behind an edge, left of
-its picture), and outside the range. Edges of things are uncertain by what the window reaches over them.
+There is no reading where g / s is small, where the right camera does not see the point (behind an edge, left
+of its picture), and outside the range. Edges are uncertain by the reach of the window over them.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from share.lab.emulate.sensor.indexed_random import Seed
 from share.sensors.profile_types import CameraModel, Profile
 from share.types import F32, U8
 
-_BANK_MARGIN = 512  # the bank of noise is larger than a picture by this
-_EDGE_DISPARITY_PX = 1.5  # of disparity, within the reach of an edge; a slope has less
-_ROUNDING = 1 / 12  # variance of a gray level that was rounded
+_BANK_MARGIN = 512  # the noise bank exceeds a picture by this
+_EDGE_DISPARITY_PX = 1.5  # disparity step that counts as an edge; slopes have less
+_ROUNDING = 1 / 12  # variance of rounding gray levels
 
 
 class DepthSensor:
-    """Depth of one device. Seed and frame decide the noise, not the order of calls.
+    """Depth of one device. Noise depends on seed and frame, not on the order of calls.
 
     Raises ConfigError where the device measures no depth.
     """
@@ -41,9 +41,10 @@ class DepthSensor:
         self._bank = _noise_bank((camera.height, camera.width), model.smooth_px, seed)
 
     def depth_reading(self, depth: F32, left_image: U8, frame: int, gain: float = 1.0) -> np.ndarray:
-        """Exact depth (H, W) m, 0 = nothing there, and the left picture -> uint16 mm, 0 = no reading.
+        """Convert exact depth (H, W) m, 0 = nothing, and the left picture to uint16 mm, 0 = no reading.
 
-        gain: with which the picture was taken; its noise hides texture."""
+        gain: of the picture; its noise hides texture.
+        """
         near, far = self._spec.range_m
         if not self._noise:
             return np.where((depth < near) | (depth > far), 0, depth * 1000 + 0.5).astype(np.uint16)
@@ -64,18 +65,18 @@ class DepthSensor:
         return mm.astype(np.uint16)
 
     def _inverse_snr(self, left_image: U8, gain: float) -> F32:
-        """(s / g)^2 in the window about each pixel (H, W)."""
+        """Return (s / g)^2 in the window about each pixel (H, W)."""
         size = (self._model.window_px, self._model.window_px)
         slope = cv2.Sobel(left_image, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
         energy = cv2.boxFilter(cv2.multiply(slope, slope), -1, size)
         variance = noise_variance(cv2.blur(left_image, size), self._camera_model, gain)
-        clean = cv2.subtract(energy, 0.5 * variance)  # of a central difference of noise
+        clean = cv2.subtract(energy, 0.5 * variance)  # the central difference of noise
         out: F32 = variance / np.maximum(clean, 0.01 * variance)
         return out
 
     def _matched_disparity(self, disparity: F32, chance: F32) -> F32:
-        """Disparity of what fills the window: near an edge the thing before it or what is behind, by the
-        texture of both, here by chance; so edges wander by `edge_px` to either side."""
+        """Return the disparity that the window matches: near an edge the front or the back at random, so that
+        edges move by `edge_px` to either side."""
         kernel = np.ones((2 * self._model.edge_px + 1,) * 2, np.uint8)
         front, back = cv2.dilate(disparity, kernel), cv2.erode(disparity, kernel)
         edge = cv2.subtract(front, back) > _EDGE_DISPARITY_PX
@@ -84,8 +85,8 @@ class DepthSensor:
         return out
 
     def _occluded(self, disparity: F32) -> np.ndarray:
-        """Which pixels (H, W) the right camera does not see: some pixel further right lands on the same
-        place of its picture, or beyond; or they land outside it."""
+        """Return which pixels (H, W) the right camera does not see: a pixel further right lands at the same
+        place of its picture or beyond, or they land outside it."""
         at = np.arange(disparity.shape[1], dtype=np.float32) - disparity  # column in the right picture
         nearest = np.minimum.accumulate(at[:, ::-1], axis=1)[:, ::-1]
         hidden: np.ndarray = (nearest < at - 0.5) | (at < self._model.window_px // 2)
@@ -97,8 +98,8 @@ class DepthSensor:
 
 
 def noise_variance(gray: U8, model: CameraModel, gain: float) -> F32:
-    """Of a picture's gray levels (H, W) against another camera's: shot, read, fixed pattern and rounding
-    (see `share.lab.emulate.sensor.photometry`)."""
+    """Return the variance of gray levels (H, W) between two cameras: shot, read, fixed-pattern and rounding
+    noise (see `share.lab.emulate.sensor.photometry`)."""
     K, level = 255 * gain / model.full_well_e, np.arange(256)
     fixed = (model.pixel_gain * level) ** 2 + (K * model.pixel_offset_e) ** 2
     table = K * level + (K * model.read_e) ** 2 + fixed + _ROUNDING
@@ -107,7 +108,7 @@ def noise_variance(gray: U8, model: CameraModel, gain: float) -> F32:
 
 
 def _noise_bank(shape: tuple[int, int], smooth_px: float, seed: Seed) -> F32:
-    """Standard normal numbers that agree over `smooth_px` pixels, more than a picture needs."""
+    """Return standard normal numbers correlated over `smooth_px` pixels, more than a picture needs."""
     white = np.random.default_rng((*seed, 0)).standard_normal([n + _BANK_MARGIN for n in shape], np.float32)
     smooth = cv2.GaussianBlur(white, (0, 0), smooth_px) if smooth_px else white
     out: F32 = (smooth / smooth.std()).astype(np.float32)

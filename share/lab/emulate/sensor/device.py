@@ -1,6 +1,6 @@
-"""One emulated device: all that a session needs to turn perfect pictures and motion into a recording.
+"""One emulated device: turns perfect pictures and motion into a recording's data.
 
-Everything follows from (seed, stream, frame): call it in any order, in any process.
+All random numbers follow from (seed, stream, frame), in any order and any process.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from share.lab.emulate.types import MotionPath
 from share.sensors.profile_types import InertialFacts, Profile
 from share.types import F32, F64, I64, U8
 
-_MAX_EXPOSURE_SHARE = 0.9  # of a frame's time is what an exposure can take
-# streams of random numbers
+_MAX_EXPOSURE_SHARE = 0.9  # longest exposure, as a share of the frame period
+# indices of random streams
 (
     _PHASE_STREAM,
     _DROP_STREAM,
@@ -41,7 +41,7 @@ _MAX_EXPOSURE_SHARE = 0.9  # of a frame's time is what an exposure can take
 
 @dataclass(frozen=True, eq=False)
 class PictureTimes:
-    """Frames that arrive: index (N,), when they are exposed (true time) and their stamps, both (N,) ns."""
+    """Recorded frames: index (N,), middle of exposure (true time) and stamps, both (N,) ns."""
 
     index: I64
     true_ns: I64
@@ -54,8 +54,8 @@ class PictureTimes:
 class EmulatedDevice:
     """A device of `profile` with `effects`.
 
-    origin_ns: true time (the path's) at which it is switched on; frames count from there. seed: its own;
-    room_seed: what all devices in the room share, the lamps.
+    origin_ns: true time (that of the path) at which it is switched on, where frame 0 is. seed: its own;
+    room_seed: of the lamps, which all devices in the room share.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class EmulatedDevice:
     # -- pictures ----------------------------------------------------------------------------
 
     def picture_times(self, start_ns: int, end_ns: int) -> PictureTimes:
-        """The frames exposed in [start, end] true time that are not dropped."""
+        """Return the frames exposed in [start, end] true time that are not dropped."""
         effects = self.effects
         index, true = self._stream(self.profile.rate_hz, _CAMERA_STREAM).sample_times(start_ns, end_ns)
         is_dropped = clocks.dropped_mask(
@@ -96,8 +96,8 @@ class EmulatedDevice:
         return PictureTimes(index, true, self.clock.read(true - round(effects.time_offset_ms * 1e6) + error))
 
     def truth_times(self, pictures: PictureTimes) -> tuple[I64, I64]:
-        """(true_ns, stamp_ns), each (N,): when the clock shows the stamps of `picture_times`, and these
-        stamps as a reader repairs them, without wraps."""
+        """Return (true_ns, stamp_ns), each (N,): the true times at which the clock shows the stamps of
+        `picture_times`, and these stamps unwrapped."""
         stamp_error = pictures.stamp_ns - self.clock.read(pictures.true_ns)
         if period := self.clock.period_ns:
             stamp_error = (stamp_error + period // 2) % period - period // 2
@@ -106,7 +106,8 @@ class EmulatedDevice:
         )
 
     def lamp_light(self, true_ns: I64) -> F64:
-        """Of the room's lamps (N,) at true times (N,), against what the room was made with."""
+        """Return the light of the room's lamps (N,) at true times (N,), relative to the room's nominal
+        light."""
         effects = self.effects
         since = np.asarray(true_ns) - self._origin_ns
         return exposures.lamp_light(
@@ -114,7 +115,7 @@ class EmulatedDevice:
         )
 
     def exposures(self, true_ns: I64, brightness: F64) -> ExposureSeries:
-        """How the pictures at true_ns (N,) are taken; brightness (N,): mean radiance of what they see."""
+        """Return the exposures of pictures at true_ns (N,); brightness (N,): mean radiance of their views."""
         light, device = self.lamp_light(true_ns), self.profile.device
         model, reference = self.profile.emulation.exposure, self._reference_ms
         if not self.effects.exposure:
@@ -128,23 +129,25 @@ class EmulatedDevice:
         return ExposureSeries(time, gain, light)
 
     def blur_offsets(self, shot: Exposure, pixels_of_motion: float) -> F64:
-        """Times (S,) s about a picture's at which to draw it; pixels_of_motion: most, in the exposure."""
+        """Return times (S,) s, relative to a picture's, at which to draw it; pixels_of_motion: largest image
+        motion during the exposure."""
         return exposures.blur_offsets(shot.exposure_ms, pixels_of_motion if self.effects.blur else 0.0)
 
     def develop_image(self, radiance: F32, frame: int, camera: int, shot: Exposure | None = None) -> U8:
-        """Radiance (H, W) float32 of camera 0 or 1 -> gray (H, W) uint8. frame: its `Pictures.index`.
-        Without `shot`: the reference exposure."""
+        """Convert radiance (H, W) float32 of camera 0 or 1 to gray (H, W) uint8. frame: its
+        `PictureTimes.index`. Without `shot`: the reference exposure."""
         return self._imagers[camera].develop(radiance, frame, shot or Exposure(self._reference_ms))
 
     def depth_mm(self, depth: F32, left_image: U8, frame: int, shot: Exposure | None = None) -> np.ndarray:
-        """Exact depth (H, W) m and the developed left picture -> the device's, uint16 mm, 0 = none."""
+        """Convert exact depth (H, W) m and the developed left picture to the device's depth, uint16 mm, 0 =
+        none."""
         return self._depth.depth_reading(depth, left_image, frame, shot.gain if shot else 1.0)
 
     # -- IMU ---------------------------------------------------------------------------------
 
     def imu_streams(self, path: MotionPath) -> ImuStreams:
-        """All IMU samples of the span of `path`: recorded ones untouched, else simulated. Stamps are the
-        device clock's."""
+        """Return all IMU samples within the span of `path`: recorded ones as they are, else simulated. Stamps
+        are the device clock's."""
         if path.recorded is not None:
             stamps = self.clock.read(path.recorded.stamps_ns)
             return ImuStreams(stamps, path.recorded.gyro, stamps, path.recorded.accel, self.clock.period_ns)
@@ -168,7 +171,7 @@ class EmulatedDevice:
         return self.clock.read(true + error), values
 
     def _vibration(self, times_ns: I64, sensor_index: int) -> F64:
-        """What vibration and knocks add to gyro (0) or accelerometer (1), (N, 3)."""
+        """Return what vibration and knocks add to gyro (0) or accelerometer (1), (N, 3)."""
         effects, seed = self.effects, (*self._seed, _VIBRATION_STREAM)
         seconds = np.asarray((times_ns - self._origin_ns) * 1e-9, np.float64)
         out = np.zeros((len(seconds), 3))
@@ -181,7 +184,8 @@ class EmulatedDevice:
     # -- parts -------------------------------------------------------------------------------
 
     def _stream(self, rate_hz: float, stream: int) -> SampleStream:
-        """A free-running stream begins somewhere in its first period; a triggered one at the origin."""
+        """Return a stream; a free-running one begins within its first period, a triggered one at the
+        origin."""
         begin_ns = self._origin_ns
         if stream == _CAMERA_STREAM:
             begin_ns += round(self.effects.camera_phase_ms * 1e6)

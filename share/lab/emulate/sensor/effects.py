@@ -1,4 +1,4 @@
-"""Which imperfections an emulated device has, and how much of each."""
+"""Imperfections of an emulated device, and their magnitudes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from share.errors import UsageError
 
 @dataclass(frozen=True)
 class Effects:
-    """Each can be turned off or set. The defaults are a sound device; `NO_EFFECTS` is a perfect one.
+    """Each effect can be turned off or set. The defaults are those of a sound device; `NO_EFFECTS` is a
+    perfect one.
 
-    Signs: a picture taken at IMU time t is stamped t - time_offset_ms (Kalibr's timeshift_cam_imu:
-    t_imu = t_cam + shift). A device's clock shows session time + clock_offset_ms, and gains
-    clock_drift_ppm microseconds a second from the start of the session. Raises UsageError for a value that
-    makes no sense.
+    Signs: a picture taken at IMU time t is stamped t - time_offset_ms (Kalibr's timeshift_cam_imu: t_imu =
+    t_cam + shift). A device's clock shows session time + clock_offset_ms, and gains clock_drift_ppm
+    microseconds a second from the start of the session. Raises UsageError for a value out of range.
     """
 
     noise: bool = True  # of the imager: shot, read, fixed pattern
@@ -32,19 +32,19 @@ class Effects:
     imu_bias: bool = True
     imu_limits: bool = True  # saturation and digits
     vibration: float = 0.0  # m/s^2, rms of each axis: a machine's, at 70 to 220 Hz
-    knocks: float = 0.0  # m/s^2 of a knock, as of tiles or heels
+    knocks: float = 0.0  # m/s^2 of a knock, as by tiles or heels
     knock_every_s: float = 1.0  # mean time between knocks
     lamp_every_s: float = 0.0  # mean time between switchings of a lamp; 0: none
-    lamp_stops: float = 1.5  # how much a switching changes the light, as a power of two, at most
+    lamp_stops: float = 1.5  # largest change of light by a switching, as a power of two
     drops: float = 0.0  # share of frames that are lost
     drop_burst: float = 1.0  # mean number of frames lost together
     jitter_ms: float = 0.0  # sigma of a picture's stamp
     imu_jitter_ms: float = 0.0  # sigma of an IMU sample's stamp
     time_offset_ms: float = 0.0
-    camera_phase_ms: float = 0.0  # pictures are taken, and stamped, so much later
+    camera_phase_ms: float = 0.0  # pictures are taken, and stamped, this much later
     clock_offset_ms: float = 0.0
     clock_drift_ppm: float = 0.0
-    wrap: bool = False  # stamps wrap as the device's counter does, where it does
+    wrap: bool = False  # stamps wrap as the device's counter does, if it does
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -82,8 +82,8 @@ NO_EFFECTS = Effects(**{f.name: False for f in dataclasses.fields(Effects) if f.
 
 
 def parse_effects(words: Iterable[str], base: Effects | None = None) -> Effects:
-    """`base` with changes such as "noise=off", "drops=0.02", "time_offset_ms=-8" and "none" (a perfect
-    device, then what follows). Raises UsageError naming the word and what is known."""
+    """Return `base` with changes such as "noise=off", "drops=0.02", "time_offset_ms=-8" and "none" (a perfect
+    device, then the words that follow). Raises UsageError with the word and the known ones."""
     effects = base or Effects()
     for word in words:
         if word == "none":

@@ -1,4 +1,4 @@
-"""Auto exposure: exposure time and gain of every picture from how bright the scene is, and motion blur."""
+"""Auto exposure: exposure time and gain of each picture by the scene's brightness, and motion blur."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from share.sensors.profile_types import ExposureModel
 from share.types import F64, I64
 
 _MIN_BLUR_SAMPLES, _MAX_BLUR_SAMPLES = 3, 16  # of one blurred picture
-_SHARP_MOTION_PX = 0.3  # motion during the exposure that nobody sees
+_SHARP_MOTION_PX = 0.3  # less motion during the exposure is not visible
 _SAMPLE_STEP_PX = 1.0  # motion between two samples of a blurred picture, each a pixel wide itself
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """How one picture is taken. light: of the lamps, against the room's own."""
+    """Exposure of one picture. light: of the lamps, relative to the room's nominal light."""
 
     exposure_ms: float
     gain: float = 1.0
@@ -26,7 +26,7 @@ class Exposure:
 
 @dataclass(frozen=True, eq=False)
 class ExposureSeries:
-    """The same for a series: exposure_ms, gain, light, each (N,)."""
+    """Exposures of a series: exposure_ms, gain, light, each (N,)."""
 
     exposure_ms: F64
     gain: F64
@@ -36,7 +36,7 @@ class ExposureSeries:
         return len(self.exposure_ms)
 
     def part(self, first: int, last: int) -> ExposureSeries:
-        """Those of pictures first .. last - 1."""
+        """Return those of pictures first .. last - 1."""
         rows = slice(first, last)
         return ExposureSeries(self.exposure_ms[rows], self.gain[rows], self.light[rows])
 
@@ -51,16 +51,16 @@ def auto_exposure(
     exposure_ms: tuple[float, float],
     gain: tuple[float, float],
 ) -> tuple[F64, F64]:
-    """exposure_ms and gain, each (N,), for scenes of mean radiance `brightness` (N,), 0..255.
+    """Return exposure_ms and gain, each (N,), for scenes of mean radiance `brightness` (N,), 0..255.
 
-    exposure_ms, gain: least and most of the device. Frame k follows from the mean of frame k - 1 - delay,
-    which is 255 at most: it goes `damping` of the way to the target in stops, in steps of a fixed ratio, and
-    holds still within a step. The first picture is well exposed already: the device has been running.
+    exposure_ms, gain: range of the device. Frame k follows from the mean of frame k - 1 - delay, which is 255
+    at most: it goes `damping` of the way to the target in stops, in steps of a fixed ratio, and stays within
+    a step. The first picture is well exposed: the device has been running.
     """
     longest = min(model.longest_ms, exposure_ms[1])
     log_min, log_max = np.log([exposure_ms[0] * gain[0], longest * gain[1]])
     log_step = np.log1p(model.step)
-    scene = np.log(np.maximum(brightness, 1e-3) / reference_ms)  # of gray = scene * exposure * gain, in logs
+    scene = np.log(np.maximum(brightness, 1e-3) / reference_ms)  # log(gray) = log(scene * exposure * gain)
     product = np.empty(len(scene))
     now = np.log(model.target) - scene[0] if len(scene) else 0.0
     for k in range(len(scene)):
@@ -77,9 +77,10 @@ def auto_exposure(
 
 
 def lamp_light(seed: Seed, since_ns: I64, every_s: float, stops: float) -> F64:
-    """Light (N,) at times since the session's start: changes now and then by up to `stops` (a power of two).
+    """Return the light (N,) at times since the session's start: it changes now and then by up to `stops` (a
+    power of two).
 
-    The times between are exponentially distributed; the light returns to 1 at every second switching.
+    Times between changes are exponentially distributed; the light returns to 1 at every second one.
     """
     if every_s <= 0 or len(since_ns) == 0:
         return np.ones(len(since_ns))
@@ -92,10 +93,11 @@ def lamp_light(seed: Seed, since_ns: I64, every_s: float, stops: float) -> F64:
 
 
 def blur_offsets(exposure_ms: float, pixels_of_motion: float) -> F64:
-    """Times (S,) s about the middle of the exposure at which to draw a picture blurred by motion.
+    """Return times (S,) s, relative to the middle of the exposure, at which to draw a picture with motion
+    blur.
 
-    pixels_of_motion: the fastest in the picture during the exposure. They are the middles of S equal parts,
-    so that their mean is the integral by the midpoint rule. S is 1 below 0.3 px, else 3 to 16.
+    pixels_of_motion: largest image motion during the exposure. The times are the middles of S equal parts, so
+    that their mean is the integral by the midpoint rule. S is 1 below 0.3 px, else 3 to 16.
     """
     if pixels_of_motion < _SHARP_MOTION_PX:
         return np.zeros(1)

@@ -1,7 +1,7 @@
-"""What a real gyroscope and accelerometer make of a perfect measurement.
+"""Errors of a real gyroscope and accelerometer, added to perfect measurements.
 
-Model of IEEE Std 952 and Kalibr: white noise of density n gives each sample sigma n sqrt(rate); the bias
-walks with density w, sigma w sqrt(dt) a step; a first-order Gauss-Markov part is its instability.
+Model of IEEE Std 952 and Kalibr: white noise of density n gives each sample sigma n sqrt(rate); the bias is a
+random walk of density w, sigma w sqrt(dt) a step; a first-order Gauss-Markov part is its instability.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ InertialMotion = Callable[
 
 @dataclass(frozen=True, eq=False)
 class ImuStreams:
-    """Two streams with stamps of their own, in the device's clock: gyro (N, 3) rad/s, accel (M, 3) m/s^2.
-    period_ns: after which its stamps wrap, 0 = never."""
+    """Two streams, each with its own stamps of the device's clock: gyro (N, 3) rad/s, accel (M, 3) m/s^2.
+    period_ns: after which stamps wrap, 0 = never."""
 
     gyro_ns: I64
     gyro: F64
@@ -33,8 +33,8 @@ class ImuStreams:
     period_ns: int = 0
 
     def to_batch(self) -> ImuBatch:
-        """Six values at the gyroscope's stamps, the acceleration interpolated, as drivers do; without the
-        stamps that lie outside the accelerometer's."""
+        """Return six values at the gyroscope's stamps with the acceleration interpolated, as drivers do,
+        without stamps outside the accelerometer's span."""
         if not (len(self.gyro_ns) and len(self.accel_ns)):
             return ImuBatch.empty()
         gyro_ns, accel_ns = self._unwrapped()
@@ -44,11 +44,11 @@ class ImuStreams:
         return ImuBatch(self.gyro_ns[both], self.gyro[both], accel)
 
     def _unwrapped(self) -> tuple[I64, I64]:
-        """Stamps of both streams without wraps."""
+        """Return stamps of both streams without wraps."""
         gyro_ns, accel_ns = (
             unwrapped_stamps(stamps, self.period_ns) for stamps in (self.gyro_ns, self.accel_ns)
         )
-        if self.period_ns:  # the two start within a period of the slower: nearer than half a wrap
+        if self.period_ns:  # both start within a period of the slower one: nearer than half a wrap
             accel_ns = accel_ns + self.period_ns * round((gyro_ns[0] - accel_ns[0]) / self.period_ns)
         return gyro_ns, accel_ns
 
@@ -61,9 +61,10 @@ def measured_samples(
     bias: bool = True,
     limits: bool = True,
 ) -> F64:
-    """(N, 3) of one sensor at its own rate, from the sample at which it was switched on, with its errors.
+    """Return (N, 3) of one sensor at its own rate with its errors, from the sample at which it was switched
+    on.
 
-    The same seed gives the same errors: a shorter series is the head of a longer one.
+    Deterministic for a given seed: a shorter series is the head of a longer one.
     """
     out = perfect.copy()
     if noise:
@@ -75,7 +76,8 @@ def measured_samples(
 
 
 def bias_series(sensor: InertialFacts, n: int, seed: Seed) -> F64:
-    """Bias (n, 3): a start, uniform in +-sqrt(3) sigma; a random walk; and the Gauss-Markov part."""
+    """Return the bias (n, 3): a start, uniform in +-sqrt(3) sigma; a random walk; and the Gauss-Markov
+    part."""
     start = np.random.default_rng((*seed, 1)).uniform(-1, 1, 3) * np.sqrt(3) * sensor.start_bias
     steps = np.random.default_rng((*seed, 2)).standard_normal((n, 3)) * sensor.walk / np.sqrt(sensor.rate_hz)
     bias: F64 = start + np.cumsum(steps, axis=0)
@@ -83,7 +85,7 @@ def bias_series(sensor: InertialFacts, n: int, seed: Seed) -> F64:
 
 
 def _gauss_markov(sensor: InertialFacts, n: int, seed: Seed) -> F64:
-    """x_k = a x_{k-1} + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T): stationary from the start."""
+    """Return x_k = a x_{k-1} + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T), stationary from the start."""
     from scipy.signal import lfilter
 
     a = np.exp(-1 / (sensor.rate_hz * sensor.instability_s))
@@ -94,6 +96,6 @@ def _gauss_markov(sensor: InertialFacts, n: int, seed: Seed) -> F64:
 
 
 def saturate_and_quantise(values: F64, sensor: InertialFacts) -> F64:
-    """Saturated at +-range, in whole digits of `step` (0: no digits)."""
+    """Clip to +-range and round to multiples of `step` (0: no rounding)."""
     out: F64 = np.clip(values, -sensor.range, sensor.range)
     return np.rint(out / sensor.step) * sensor.step if sensor.step else out

@@ -1,4 +1,4 @@
-"""Random numbers that belong to an index: the same whoever asks, in whatever order, for whatever span."""
+"""Random numbers by index: independent of the order and span of requests."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _Draw = Callable[[np.random.Generator, int], Any]
 
 
 def uniform(seed: Seed, index: I64) -> F64:
-    """One number in [0, 1) for each index (N,), which must not be negative."""
+    """Return a number in [0, 1) for each index (N,), which must not be negative."""
     return _draw_by_index(seed, index, lambda rng, n: rng.random(n))
 
 
 def normal(seed: Seed, index: I64) -> F64:
-    """One standard normal number for each index (N,), which must not be negative."""
+    """Return a standard normal number for each index (N,), which must not be negative."""
     return _draw_by_index(seed, index, lambda rng, n: rng.standard_normal(n))
 
 

@@ -1,8 +1,8 @@
-"""From light to gray levels: what a lens and an imager make of a perfect picture.
+"""From light to gray levels: the effects of lens and imager on a perfect picture.
 
-Electrons e = radiance * light * (exposure / reference) * vignetting * full_well / 255, and gray = K e
-with K = 255 gain / full_well. The variance of gray is affine in it (EMVA 1288): shot noise K gray, and
-read noise (K read_e)^2. Rounding to 8 bits adds its own.
+Electrons e = radiance * light * (exposure / reference) * vignetting * full_well / 255, and gray = K e with K
+= 255 gain / full_well. The variance of gray is affine in it (EMVA 1288): shot noise K gray, and read noise (K
+read_e)^2. Rounding to 8 bits adds its own.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from share.lab.emulate.sensor.indexed_random import Seed
 from share.sensors.profile_types import CameraModel
 from share.types import F32, U8
 
-_BANK_MARGIN = 512  # the bank is larger than a picture by this, so there are 512^2 places to read it at
+_BANK_MARGIN = 512  # the noise bank exceeds a picture by this, so there are 512^2 offsets to read it at
 
 
 class Imager:
-    """One camera of one device. Pure: seed, frame and picture decide, not the order of calls."""
+    """One camera of one device. Pure: the result depends on seed, frame and picture, not on the order of
+    calls."""
 
     def __init__(
         self, camera: Camera, model: CameraModel, seed: Seed, noise: bool, vignetting: bool, blur: bool
@@ -39,16 +40,16 @@ class Imager:
 
     @property
     def mean_response(self) -> float:
-        """What the picture's mean loses to vignetting."""
+        """Return the share of the mean brightness left by vignetting."""
         return float(self._response.mean())
 
     def develop(self, radiance: F32, frame: int, shot: Exposure) -> U8:
-        """Radiance (H, W) float32, 0..255 and beyond -> gray levels (H, W) uint8."""
+        """Convert radiance (H, W) float32, 0..255 and beyond, to gray levels (H, W) uint8."""
         exposed = shot.light * shot.gain * shot.exposure_ms / self._model.reference_ms
         gray = cv2.multiply(self._blurred(radiance), self._response, scale=exposed)
         if self._noise:
             gray = cv2.add(gray, self._noise_image(gray, frame, shot.gain))
-        out: U8 = cv2.convertScaleAbs(np.maximum(gray, 0))  # rounds, saturates at 255
+        out: U8 = cv2.convertScaleAbs(np.maximum(gray, 0))  # rounds, and saturates at 255
         return out
 
     def _blurred(self, radiance: F32) -> F32:
@@ -67,11 +68,11 @@ class Imager:
 
 
 def vignetting_gain(camera: Camera, corner_light: float) -> F32:
-    """Light (H, W) float32 against the middle's: cos(field angle)^n, n such that the corner farthest from the
-    axis gets `corner_light`; of a fisheye lens by half that angle. n = 4 is the natural law; lenses are made
-    to have less of it."""
+    """Return the light (H, W) float32 relative to the middle: cos(field angle)^n, with n such that the corner
+    farthest from the axis gets `corner_light`; for a fisheye lens by half that angle. n = 4 is the natural
+    law; lenses are made to have less."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-    if camera.is_fisheye:  # sees beyond 90 degrees, where the law ends: half the angle in it
+    if camera.is_fisheye:  # it sees beyond 90 degrees, where the law ends
         cos = np.nan_to_num(camera.directions(grid.astype(np.float64))[..., 2], nan=-1.0)
         cos2 = np.maximum((1 + cos) / 2, 0.1)
     else:

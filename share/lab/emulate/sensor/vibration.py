@@ -1,8 +1,8 @@
-"""What an IMU feels of machines and of knocks: motion too small for a picture, with large accelerations.
+"""IMU readings by machines and knocks: motion too small for a picture, with large accelerations.
 
-A vibration is four rotors, each with a frequency of its own that wanders, and its double. A knock, as of a
-wheel on the edge of a tile or of a heel, is a damped oscillation. Both leave the body where and as fast as it
-was: their accelerations are second derivatives of a displacement.
+A vibration is four rotors, each with a frequency of its own that drifts, and its double. A knock, as of a
+wheel on the edge of a tile or of a heel, is a damped oscillation. Neither changes position or velocity in the
+end: their accelerations are second derivatives of a displacement.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from share.types import F64
 
 _ROTORS, _ROTOR_HZ, _WANDER_HZ, _WANDER_S = 4, (70.0, 110.0), 4.0, 2.0
 _HARMONIC_AMPLITUDE = 0.5  # amplitude of the double frequency
-_ROTATION_RATIO = 0.03  # rad/s of turning for each m/s^2
-_KNOCK_HZ, _KNOCK_S = (18.0, 40.0), 0.012  # of its oscillation; how fast it rises and dies
-_GRID_HZ = 4000.0  # on which a knock is derived
+_ROTATION_RATIO = 0.03  # rad/s of rotation for each m/s^2
+_KNOCK_HZ, _KNOCK_S = (18.0, 40.0), 0.012  # frequency of the oscillation; time constant of its rise and decay
+_GRID_HZ = 4000.0  # on which a knock is differentiated
 
 
 def vibration_acceleration(seconds: F64, rms: float, seed: Seed) -> F64:
-    """Acceleration (N, 3) m/s^2 at these times (N,) s from the start, rms of each axis. The same at the same
-    times, whatever others are asked for."""
+    """Return the acceleration (N, 3) m/s^2 at times (N,) s from the start, with `rms` on each axis. It does
+    not depend on which other times are asked for."""
     grid = np.arange(0.0, max(float(seconds.max(initial=0.0)), 0.0) + _WANDER_S, _WANDER_S / 20)
     out = np.zeros((len(seconds), 3))
     decay = np.exp(-(grid[1] - grid[0]) / _WANDER_S) if len(grid) > 1 else 0.0
@@ -41,7 +41,8 @@ def vibration_acceleration(seconds: F64, rms: float, seed: Seed) -> F64:
 
 
 def knock_acceleration(seconds: F64, peak: float, every_s: float, seed: Seed) -> F64:
-    """Acceleration (N, 3) m/s^2 at these times (N,) s: about `peak` each, at random times `every_s` apart."""
+    """Return the acceleration (N, 3) m/s^2 at times (N,) s: about `peak` each, at random times `every_s`
+    apart."""
     rng = np.random.default_rng((*seed, 1))
     out, at, end = np.zeros((len(seconds), 3)), 0.0, float(seconds.max(initial=0.0))
     while (at := at + float(rng.exponential(every_s))) < end:
@@ -55,7 +56,8 @@ def knock_acceleration(seconds: F64, peak: float, every_s: float, seed: Seed) ->
 
 
 def rotation_rates(acceleration: F64) -> F64:
-    """rad/s (N, 3) that go with it: what shakes a body off its centre of mass turns it, too."""
+    """Return angular rates (N, 3) rad/s of such a vibration: a force off the centre of mass also turns the
+    body."""
     return _ROTATION_RATIO * np.roll(acceleration, 1, axis=1)
 
 

@@ -1,1 +1,1 @@
-"""Rooms as seeded data: layout, pictures, light, where one can move, users' own glTF rooms."""
+"""Rooms from seeds: layout, pictures, light, free space; and users' own glTF rooms."""

@@ -18,8 +18,8 @@ Movers = Mapping[str, Sequence[Shape]]
 
 
 def build_room(layout: Layout, movers: Movers | None = None) -> DrawableRoom:
-    """The room of `layout`, and by name the parts of agents that others may see, each in its own frame.
-    The same layout and movers give the same bytes. Raises UsageError where a package for light is absent."""
+    """Return the room of `layout` with the parts of agents by name, each in its own frame. Deterministic: the
+    same layout and movers give the same bytes. Raises UsageError where the package for light is missing."""
     fixed = concat_shapes([piece.shape for piece in layout.all_pieces])
     parts = {name: tuple(shapes) for name, shapes in (movers or {}).items()}
     materials = tuple(
@@ -46,6 +46,6 @@ def build_room(layout: Layout, movers: Movers | None = None) -> DrawableRoom:
 
 
 def _with_layer_numbers(shape: Shape, materials: tuple[Material | GivenMaterial, ...]) -> Mesh:
-    """The mesh of a shape, its layers counting into `materials`."""
+    """Return the mesh of a shape, with layers that index `materials`."""
     number = np.array([materials.index(m) for m in shape.materials], np.int32)
     return replace(shape.mesh, layer=number[shape.mesh.layer])

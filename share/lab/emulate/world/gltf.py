@@ -1,8 +1,8 @@
 """A user's own room from a glTF 2.0 file (.gltf or .glb): y up and metres, as the format says.
 
-Every node is part of the shell: nothing of it is ever removed. Colours become albedo: base-colour textures
-and factors as linear luminance (Rec. 709); vertex colours in 16 steps, one a triangle. Lamps hang under its
-ceiling, on a grid, because few files carry any.
+All nodes belong to the shell, so nothing is removed for paths. Colours become albedo: base-colour textures
+and factors as linear luminance (Rec. 709); vertex colours in 16 steps, one a triangle. Lamps are added under
+the ceiling on a grid, because few files have any.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from share.types import F32, F64, U8
 
 MAX_PICTURES = 400
 MIN_EXTENT_M, MAX_EXTENT_M = 1.0, 200.0  # m, along any axis
-_ROW_BLOCK = 256  # of a texture
-_GRAY_STEPS = 16  # gray levels of vertex colours
+_ROW_BLOCK = 256  # rows of a texture
+_GRAY_STEPS = 16  # of vertex colours
 _LAMP_PITCH = 2.5  # m
 _Z_UP = np.array([(1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1.0)])
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 def load_gltf(path: Path) -> Layout:
-    """The room in a glTF file, its lower corner at the origin, z up. Raises UsageError where there is no
-    such file or a package is absent, DataError where it is not a glTF file or not a room."""
+    """Return the room in a glTF file, its lower corner at the origin, z up. Raises UsageError where the file
+    or a package is missing, DataError where it is not a glTF file or not a room."""
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"{path}: no such file")
@@ -45,7 +45,7 @@ def load_gltf(path: Path) -> Layout:
         pieces = _room_pieces(_read_scene(path), path)
     except (DataError, UsageError):
         raise
-    except Exception as error:  # trimesh and its decoders of pictures raise whatever they do
+    except Exception as error:  # trimesh and its image decoders raise any type
         lines = str(error).splitlines() or [type(error).__name__]
         raise DataError(f"{path}: not a readable glTF 2.0 file: {lines[0]:.200}") from None
     low, high = concat_shapes([p.shape for p in pieces]).bounding_box
@@ -87,8 +87,8 @@ def _room_pieces(scene: Any, path: Path) -> list[Piece]:
 
 
 def _node_shape(geometry: Any, T: F64, pictures: dict[int, GivenMaterial]) -> Shape | None:
-    """A node's triangles in the room, each with corners and a normal of its own; None where all of them
-    are too thin to see."""
+    """Return a node's triangles in the room, each with its own corners and normal; None where all are too
+    thin to see."""
     corners = np.asarray(geometry.triangles, float) @ T[:3, :3].T + T[:3, 3]
     if np.linalg.det(T[:3, :3]) < 0:  # mirrored
         corners = corners[:, ::-1]
@@ -114,7 +114,7 @@ def _node_shape(geometry: Any, T: F64, pictures: dict[int, GivenMaterial]) -> Sh
 def _node_colours(
     geometry: Any, pictures: dict[int, GivenMaterial]
 ) -> tuple[F64, np.ndarray, tuple[GivenMaterial, ...]]:
-    """uv (F, 3, 2), layer (F,) and the pictures it counts into."""
+    """Return uv (F, 3, 2), layer (F,) and the pictures that it indexes."""
     count, visual = len(geometry.faces), geometry.visual
     uv = np.zeros((count, 3, 2))
     if visual.kind == "texture":
@@ -129,7 +129,7 @@ def _node_colours(
 
 
 def _material_picture(material: Any, pictures: dict[int, GivenMaterial]) -> GivenMaterial:
-    """A material's base colour as a picture; the same material is drawn once."""
+    """Return a material's base colour as a picture, drawn once per material."""
     key = id(material)
     if key not in pictures:
         factor = getattr(material, "baseColorFactor", None)
@@ -152,12 +152,12 @@ def _gray_picture(level: float, pictures: dict[int, GivenMaterial], key: int) ->
 
 
 def _linear_luminance(texture: Any) -> F32:
-    """Luminance (P, P) 0..1 of an sRGB texture (IEC 61966-2-1)."""
+    """Return the luminance (P, P) 0..1 of an sRGB texture (IEC 61966-2-1)."""
     import cv2
 
     pixels = np.asarray(texture.convert("RGB"))
     light = np.empty(pixels.shape[:2])
-    for top in range(0, len(light), _ROW_BLOCK):  # some at a time: 50 bytes a pixel
+    for top in range(0, len(light), _ROW_BLOCK):  # in blocks: it takes 50 bytes a pixel
         rgb = pixels[top : top + _ROW_BLOCK].astype(np.float32) / 255
         some = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ _LUMINANCE
         light[top : top + _ROW_BLOCK] = some
@@ -189,7 +189,7 @@ def _check_size(path: Path, pieces: list[Piece], extent: F64) -> None:
 
 
 def _ceiling_lamps(shell: tuple[Piece, ...], extent: F64) -> tuple[Light, ...]:
-    """Panels 0.25 m under whatever is above the middle of the room's height, on a grid."""
+    """Return panels 0.25 m under whatever is above the middle of the room's height, on a grid."""
     scene = RayCaster(concat_shapes([p.shape for p in shell]).mesh.triangles)
     nx, ny = (max(1, round(float(e) / _LAMP_PITCH)) for e in extent[:2])
     x, y = np.meshgrid((np.arange(nx) + 0.5) / nx * extent[0], (np.arange(ny) + 0.5) / ny * extent[1])

@@ -1,7 +1,7 @@
-"""A glTF file and all that it names, read and measured before trimesh makes a scene of it.
+"""Read a glTF file and the files that it names, and check their sizes before trimesh loads them.
 
-trimesh makes whatever a file asks for: arrays of any count out of nothing, copies of one buffer without end,
-pictures of any size and format, files anywhere on the disk. What is let through is bounded here.
+trimesh builds whatever a file asks for: arrays of any size from nothing, unlimited copies of one buffer,
+pictures of any size and format, files anywhere on the disk. This module bounds all of these.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ _MAX_BYTES = 500 * MB  # of all files together, of all views of them, of all arr
 _MAX_JSON_BYTES = 50 * MB
 _MAX_PARTS = 50_000  # of one kind: nodes, meshes, primitives, accessors …
 _MAX_CORNERS = 12 * MAX_TRIANGLES  # trimesh copies them for each part of a mesh
-_MAX_DEPTH = 100  # nodes in each other
+_MAX_DEPTH = 100  # nesting of nodes
 _MAX_PIXELS, _MAX_TOTAL_PIXELS = (
     2**26,
     2 * 10**8,
-)  # of a picture, of all: four bytes each when they are decoded
+)  # of one picture, of all; four bytes each when decoded
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _KINDS = ("accessors", "buffers", "bufferViews", "images", "materials", "meshes", "nodes", "textures")
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}  # bytes of a componentType
 _TYPE_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _STRIP, _TRIANGLES = 5, 4
-_IGNORED_TYPE = "image/ktx2"  # which trimesh leaves out
+_IGNORED_TYPE = "image/ktx2"  # trimesh ignores it
 
 
 @dataclass(frozen=True, eq=False)
 class GltfFile:
-    """data: the file; files: those that it names, by the name that it has for them."""
+    """data: the file; files: the files that it names, by name."""
 
     data: bytes
     files: Mapping[str, bytes]
 
 
 def read_gltf(path: Path) -> GltfFile:
-    """Raises DataError that says what is wrong, or asks for too much."""
+    """Read a glTF file. Raises DataError that says what is wrong or too large."""
     try:
         data = read_bytes(path, _MAX_BYTES)
         text, binary = _chunks(data) if path.suffix.lower() == ".glb" else (data, b"")
@@ -55,7 +55,7 @@ def read_gltf(path: Path) -> GltfFile:
             raise ValueError(f"its description has {len(text) / MB:.0f} MB")
         tree = parse_json(text.decode("utf-8-sig"))
         if not isinstance(tree, dict):
-            raise ValueError("its description is no object")
+            raise ValueError("its description is not an object")
         document = _GltfDocument(path, tree, binary)
         document.check()
         return GltfFile(data, document.files)
@@ -67,21 +67,21 @@ def read_gltf(path: Path) -> GltfFile:
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes]:
-    """The description and what lies in the file itself."""
+    """Return the JSON description and the binary chunk of the file."""
     magic, version, _, length, kind = struct.unpack_from("<5I", data)
     if (magic, version, kind) != (_MAGIC, 2, _JSON) or length > len(data) - 20:
-        raise ValueError("its beginning is damaged, or it is cut short")
+        raise ValueError("its header is damaged, or it is truncated")
     text, rest = data[20 : 20 + length], data[20 + length :]
     if len(rest) < 8:
         return text, b""
     length, kind = struct.unpack_from("<2I", rest)
     if kind != _BIN or length > len(rest) - 8:
-        raise ValueError("it is cut short")
+        raise ValueError("it is truncated")
     return text, rest[8 : 8 + length]
 
 
 class _GltfDocument:
-    """What the description says, and the bytes that it is about."""
+    """The JSON description and the binary data that it refers to."""
 
     def __init__(self, path: Path, tree: dict[str, Any], binary: bytes) -> None:
         self._path, self._tree, self._binary = path, tree, binary
@@ -101,7 +101,7 @@ class _GltfDocument:
     def _list(self, kind: str) -> list[Any]:
         items = self._tree.get(kind, [])
         if not isinstance(items, list):
-            raise ValueError(f"its {kind} are no list")
+            raise ValueError(f"its {kind} are not a list")
         return items
 
     def _buffers(self) -> Iterator[bytes]:
@@ -113,7 +113,7 @@ class _GltfDocument:
             try:
                 return base64.b64decode(uri.partition("base64,")[2])
             except binascii.Error:
-                raise ValueError("what it holds is damaged") from None
+                raise ValueError("its binary data is damaged") from None
         if uri not in self.files:
             remaining = _MAX_BYTES - sum(map(len, self.files.values()))
             self.files[uri] = read_bytes(
@@ -122,7 +122,7 @@ class _GltfDocument:
         return self.files[uri]
 
     def _check_views(self, buffers: list[bytes]) -> None:
-        """trimesh copies each."""
+        """Check buffer views, since trimesh copies each."""
         total = 0
         for view in self._list("bufferViews"):
             start, length = _checked_count(view.get("byteOffset", 0)), _checked_count(view["byteLength"])
@@ -173,14 +173,14 @@ class _GltfDocument:
         return {_TRIANGLES: count // 3, _STRIP: max(0, count - 2)}.get(mode, 0)
 
     def _check_nodes(self, triangles: list[int]) -> None:
-        """Each is below one other at most, and shows a mesh anew."""
+        """Check nodes: each has one parent at most and draws a mesh again."""
         nodes = self._list("nodes")
         parent_of: dict[int, int] = {}
         total = 0
         for number, node in enumerate(nodes):
             for child in node.get("children", ()):
                 if _checked_count(child) in parent_of or child >= len(nodes):
-                    raise ValueError(f"node {child} is below two others, or not there")
+                    raise ValueError(f"node {child} has two parents, or does not exist")
                 parent_of[child] = number
             if "mesh" in node:
                 total += triangles[_checked_count(node["mesh"])]
@@ -195,7 +195,7 @@ class _GltfDocument:
 
 def _checked_count(value: Any) -> int:
     if type(value) is not int or value < 0:
-        raise ValueError(f"{value!r:.40} where a count should be")
+        raise ValueError(f"{value!r:.40} in place of a count")
     return value
 
 

@@ -1,4 +1,4 @@
-"""How much an image gives a tracker to hold on to: corners, where they are, contrast."""
+"""Statistics of an image that matter to a tracker: corners, their distribution, contrast."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from share.types import F64, U8
 
 GRID = 8  # cells along each side
-WIDTH, HEIGHT = 640, 480  # what all figures are for
+WIDTH, HEIGHT = 640, 480  # size for which all figures hold
 
 
 @dataclass(frozen=True)
 class ImageStatistics:
-    """fast: FAST corners at threshold 20. gftt: Shi-Tomasi corners at quality 0.01, 10 px apart. cells:
-    share of an 8 x 8 grid of cells with a FAST corner. slope: a of the amplitude spectrum 1 / f^a. mean,
-    p5, p95: gray levels. sharpness: median size of the gray-level gradient, levels a pixel."""
+    """fast: FAST corners at threshold 20. gftt: Shi-Tomasi corners at quality 0.01, 10 px apart. cells: share
+    of an 8 x 8 grid of cells with a FAST corner. slope: a of the amplitude spectrum 1 / f^a. mean, p5, p95:
+    gray levels. sharpness: median size of the gray-level gradient, levels per pixel."""
 
     fast: float
     gftt: float
@@ -30,7 +30,8 @@ class ImageStatistics:
 
 
 def image_statistics(image: U8) -> ImageStatistics:
-    """Of one image (480, 640) uint8. Raises ValueError for another shape: counts would not compare."""
+    """Return the statistics of an image (480, 640) uint8. Raises ValueError for another shape: counts would
+    not compare."""
     import cv2
 
     if image.shape != (HEIGHT, WIDTH):
@@ -53,12 +54,12 @@ def image_statistics(image: U8) -> ImageStatistics:
 
 
 def mean_statistics(images: Sequence[U8]) -> ImageStatistics:
-    """The mean over images."""
+    """Return the mean over the images."""
     return ImageStatistics(*np.mean([astuple(image_statistics(image)) for image in images], axis=0).tolist())
 
 
 def spectrum_slope(image: U8) -> float:
-    """a of the amplitude spectrum 1 / f^a between 1/64 and 1/4 cycle a pixel, from the middle square
+    """Return a of the amplitude spectrum 1 / f^a between 1/64 and 1/4 cycle per pixel, from the middle square
     under a Hann window, averaged over directions (van der Schaaf & van Hateren, Vision Res. 36, 1996)."""
     n = min(image.shape)
     top, left = ((s - n) // 2 for s in image.shape)
@@ -73,7 +74,8 @@ def spectrum_slope(image: U8) -> float:
 
 
 def resize_to_standard(image: U8) -> U8:
-    """The middle 4:3 of an image, shrunk to 640 x 480 by areas; one of that height is only cropped."""
+    """Return the middle 4:3 of an image, shrunk to 640 x 480 by areas; an image of that height is only
+    cropped."""
     import cv2
 
     h, w = image.shape

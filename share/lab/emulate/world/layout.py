@@ -1,4 +1,4 @@
-"""A room before it has pictures and light: what stands where, and what shines."""
+"""A room before it has pictures and light: its objects and lamps."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from share.types import F64
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One whole object: a shelf with everything on it. name: unique in the layout. solid: bodies cannot
-    pass through it (a decal, a cable or a lamp high up need not be)."""
+    """One object: a shelf with everything on it. name: unique in the layout. solid: an obstacle to bodies (a
+    decal, a cable or a high lamp is none)."""
 
     name: str
     shape: Shape
@@ -23,14 +23,14 @@ class Piece:
 
     @property
     def bounding_box(self) -> F64:
-        """Lower and upper corner (2, 3) m."""
+        """Return lower and upper corner (2, 3) m."""
         return self.shape.bounding_box
 
 
 @dataclass(frozen=True)
 class Light:
-    """A rectangular panel that shines to one side. position: its middle, m. power: relative to the
-    other lights (the room is scaled to a mean brightness). size: its extent, m. facing: where it shines."""
+    """A rectangular panel that emits to one side. position: its middle, m. power: relative to the other
+    lights (the room is scaled to a mean brightness). size: its extent, m. facing: its direction."""
 
     position: tuple[float, float, float]
     power: float = 1.0
@@ -40,7 +40,7 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class PlacedTarget:
-    """A calibration target in a room. T_world_target (4, 4): frame as `share.lab.calibrate.target` has it."""
+    """A calibration target in a room. T_world_target (4, 4): frame as in `share.lab.calibrate.target`."""
 
     target: Target
     T_world_target: F64
@@ -48,10 +48,9 @@ class PlacedTarget:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """size: extent (3,) m from the origin. shell: walls, floor, ceiling and what carries them, which
-    nothing removes, facing inwards. pieces: everything else. ambient: light that comes from nowhere, as a
-    share of the mean. brightness: mean light, 1 = albedo is the gray level. target: what cameras are
-    calibrated with, where there is one."""
+    """size: extent (3,) m from the origin. shell: walls, floor, ceiling and what carries them, facing
+    inwards, never removed. pieces: everything else. ambient: uniform light, as a share of the mean.
+    brightness: mean light, 1 = albedo is the gray level. target: calibration target, if any."""
 
     name: str
     seed: int
@@ -65,12 +64,12 @@ class Layout:
 
     @property
     def all_pieces(self) -> tuple[Piece, ...]:
-        """Shell and pieces."""
+        """Return shell and pieces."""
         return self.shell + self.pieces
 
     def without(self, positions: F64, clearance: float) -> tuple[Layout, tuple[str, ...]]:
-        """The room without the solid pieces that come nearer than `clearance` m to any of `positions`
-        (N, 3) m or hold one inside, and the names of what was removed. The shell always stays."""
+        """Return the room without the solid pieces that are nearer than `clearance` m to any of `positions`
+        (N, 3) m or contain one, and the names of the removed pieces. The shell always stays."""
         blocked = [
             piece.solid and is_near_mesh(piece.shape.mesh, positions, clearance) for piece in self.pieces
         ]

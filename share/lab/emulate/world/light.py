@@ -1,9 +1,9 @@
-"""Baked light: what reaches every texel of the light map from the lamps, directly and off other things.
+"""Baked light: the light on every texel of the light map from the lamps, directly and by reflection.
 
-Direct light by rays to points on the lamps, the rest by radiosity over rays that are cast once: a texel
-sees the same 16 places at every bounce. Texels of a 4 x 4 pattern take different samples of one
-low-discrepancy set, and a filter over five texels averages them within a patch, so that soft shadows are
-smooth without many rays. No randomness is needed: the same room has the same light.
+Direct light by rays to points on the lamps, the rest by radiosity over rays that are cast once: a texel sees
+the same 16 places at every bounce. Texels of a 4 x 4 pattern take different samples of one low-discrepancy
+set, and a filter over five texels averages them within a patch, so that soft shadows are smooth with few
+rays. Nothing is random: the same room has the same light.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from share.lab.emulate.world.light_atlas import LightAtlas, pad_patches, texel_m
 from share.lab.emulate.world.ray_casting import RayCaster
 from share.types import F32, U8
 
-UNIT_LIGHT = 100  # what makes albedo the gray level
-TEXELS_PER_M = 16.0  # texels a metre
-MAX_TEXELS = 600_000  # texels
+UNIT_LIGHT = 100  # light that makes albedo the gray level
+TEXELS_PER_M = 16.0
+MAX_TEXELS = 600_000
 _BOUNCES = 4
-_GATHER_RAYS = 16  # rays into the half space, a texel
-_STRONG_SHARE, _WEAK_SHARE = 0.05, 0.004  # of the mean light: above, a lamp gets four rays; below, none
-_RAY_OFFSET_M = 1e-3  # m; where rays start above their surface
-_MAX_BACK_SHARE = 0.3  # share of rays that meet backs of faces: the texel lies in a solid or under a decal
+_GATHER_RAYS = 16  # rays into the half space, per texel
+# of the mean light: lamps above the first get four rays, below the second none
+_STRONG_SHARE, _WEAK_SHARE = 0.05, 0.004
+_RAY_OFFSET_M = 1e-3  # offset of ray origins above their surface
+_MAX_BACK_SHARE = 0.3  # of rays that meet back faces; above it the texel lies in a solid or under a decal
 _RAY_CHUNK = 1 << 19  # rays at a time
 
 
@@ -38,10 +39,10 @@ def bake_light(
     ambient: float,
     brightness: float,
 ) -> tuple[F32, U8]:
-    """light_uv (V, 2) and light_map (H, W) of a room. albedo (L,): share of light that each picture
-    throws back; glows (L,): which pictures shine by themselves. Raises ValueError without a lamp."""
+    """Return light_uv (V, 2) and light_map (H, W) of a room. albedo (L,): share of light that each picture
+    reflects; glows (L,): which pictures emit light. Raises ValueError without a lamp."""
     if not lights:
-        raise ValueError("a room needs a light")
+        raise ValueError("a room needs a lamp")
     is_lamp_vertex = glows[mesh.layer]
     atlas = unfold_patches(mesh, is_lamp_vertex.astype(np.int32), TEXELS_PER_M, MAX_TEXELS)
     dark = ~is_lamp_vertex[mesh.faces[:, 0]]
@@ -63,20 +64,20 @@ def bake_light(
 
 
 def _pattern_index(atlas: LightAtlas) -> NDArray[np.int64]:
-    """Number of each texel (T,) in the 4 x 4 pattern."""
+    """Return the index of each texel (T,) in the 4 x 4 pattern."""
     return atlas.row % 4 * 4 + atlas.column % 4
 
 
 def _pattern_samples(count: int) -> F32:
-    """(16, count, 2) points in the unit square: the R2 sequence (Roberts, 2018), dealt out so that every
-    texel of the pattern has `count` well-spread points and all 16 together fill the square evenly."""
+    """Return (16, count, 2) points in the unit square: the R2 sequence (Roberts, 2018), dealt out so that
+    every texel of the pattern has `count` well-spread points and all 16 together fill the square evenly."""
     k = np.arange(16 * count)
     points = (0.5 + k[:, None] * np.array([0.7548776662466927, 0.5698402909980532])) % 1
     return np.asarray(points.reshape(count, 16, 2).swapaxes(0, 1), np.float32)
 
 
 def _direct_light(atlas: LightAtlas, scene: RayCaster, start: F32, lights: Sequence[Light]) -> F32:
-    """Light (T,) straight from the lamps: form factor of a one-sided diffuse panel, with shadows."""
+    """Return direct light (T,) of the lamps: form factor of a one-sided diffuse panel, with shadows."""
     centres = [_lamp_gain(atlas, start, light, np.asarray(light.position, np.float32)) for light in lights]
     mean = float(np.average(np.sum(centres, axis=0), weights=atlas.area))
     out = np.zeros(len(start), np.float32)
@@ -93,7 +94,7 @@ def _direct_light(atlas: LightAtlas, scene: RayCaster, start: F32, lights: Seque
 def _lamp_light(
     atlas: LightAtlas, scene: RayCaster, start: F32, light: Light, rays: int, texels: NDArray[np.intp]
 ) -> F32:
-    """Light of one lamp on the texels `texels`, by `rays` rays each."""
+    """Return the light of one lamp on the texels `texels`, by `rays` rays each."""
     x, y = _lamp_edges(light)
     spots = _pattern_samples(rays) - 0.5
     places = np.asarray(light.position, np.float32) + spots[..., :1] * x + spots[..., 1:] * y
@@ -108,7 +109,7 @@ def _lamp_light(
 
 
 def _lamp_edges(light: Light) -> tuple[F32, F32]:
-    """The two edges (3,) m of a lamp."""
+    """Return the two edges (3,) m of a lamp."""
     n = np.asarray(light.facing, float) / np.linalg.norm(light.facing)
     x = np.cross((0, 1, 0), n) if abs(n[1]) < 0.9 else np.cross((0, 0, 1), n)
     x /= np.linalg.norm(x)
@@ -119,7 +120,7 @@ def _lamp_edges(light: Light) -> tuple[F32, F32]:
 def _lamp_gain(
     atlas: LightAtlas, start: F32, light: Light, place: F32, part: NDArray[np.intp] | slice = slice(None)
 ) -> F32:
-    """power cos(a) cos(b) / (pi r^2), with r not below 0.2 m."""
+    """Return power cos(a) cos(b) / (pi r^2), with r not below 0.2 m."""
     direction = place - start[part]
     r2 = np.maximum((direction * direction).sum(1), 0.04)
     facing = np.asarray(light.facing, np.float32) / np.float32(np.linalg.norm(light.facing))
@@ -132,8 +133,8 @@ def _lamp_gain(
 def _radiosity_links(
     mesh: Mesh, faces: I32, albedo: F32, atlas: LightAtlas, scene: RayCaster, start: F32
 ) -> tuple[I32, NDArray[np.bool_], F32]:
-    """Where each texel's light comes from: numbers (T, G) of the texels that its rays meet and their
-    weights (T, G), and which texels (T,) lie in the open."""
+    """Return the sources of each texel's indirect light: indices (T, G) of the texels that its rays meet and
+    their weights (T, G), and which texels (T,) are in the open."""
     number = np.zeros(atlas.shape, np.int32)
     number[atlas.row, atlas.column] = np.arange(len(start))
     x, y = _tangents(atlas.normal)
@@ -161,7 +162,7 @@ def _radiosity_links(
 
 
 def _tangents(normal: F32) -> tuple[F32, F32]:
-    """Two axes (T, 3) across each unit vector; the same for equal ones."""
+    """Return two axes (T, 3) orthogonal to each unit vector; equal vectors have equal axes."""
     helper = np.eye(3, dtype=np.float32)[np.abs(normal).argmin(1)]
     x = np.cross(normal, helper)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -169,15 +170,15 @@ def _tangents(normal: F32) -> tuple[F32, F32]:
 
 
 def _cosine_directions(points: F32) -> F32:
-    """Unit square (..., 2) to directions (..., 3) about z, dense as the cosine (Malley's method)."""
+    """Map the unit square (..., 2) to directions (..., 3) about z with cosine density (Malley's method)."""
     r, turn = np.sqrt(points[..., 0]), 2 * np.pi * points[..., 1]
     up = np.sqrt(np.maximum(1 - points[..., 0], 0))
     return np.stack([r * np.cos(turn), r * np.sin(turn), up], axis=-1).astype(np.float32)
 
 
 def _smooth_within_patches(light: F32, valid: NDArray[np.bool_], atlas: LightAtlas) -> F32:
-    """Light (T,) averaged over the pattern within each patch, from valid texels only; the others take
-    the nearest valid ones' light, patch by patch."""
+    """Return light (T,) averaged over the pattern within each patch, from valid texels only; the others take
+    that of the nearest valid texels of their patch."""
     import cv2
 
     kernel = np.array([1, 2, 2, 2, 1], np.float32) / 8
@@ -193,7 +194,7 @@ def _smooth_within_patches(light: F32, valid: NDArray[np.bool_], atlas: LightAtl
         amount = amount[atlas.row, atlas.column]
         reached = is_missing & (amount > 1e-3)
         if not reached.any():
-            break  # a patch that lies in a solid altogether: nobody sees it
+            break  # a patch inside a solid, never visible
         out[reached] = value[atlas.row, atlas.column][reached] / amount[reached]
         is_missing &= ~reached
         image[atlas.row[reached], atlas.column[reached]] = out[reached]

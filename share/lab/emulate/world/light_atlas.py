@@ -1,8 +1,8 @@
 """Planar patches of a mesh and their places in the light map.
 
-A patch is what hangs together by corners of the same place and normal: the panels of a wall are one, so no
-seam is between them. Its outermost texel centres lie on its bounds, and one texel more on every side
-repeats them: bilinear sampling never reaches a neighbour.
+A patch is connected by corners of the same place and normal: the panels of a wall are one patch, so there is
+no seam between them. Its outermost texel centres lie on its bounds, and one more texel on every side repeats
+them, so that bilinear sampling never reaches a neighbour.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from share.lab.emulate.types import I32, Mesh
 from share.types import F32, F64, I64
 
 _PATCH_PADDING = 1
-_WELD_M = 5e-4  # m; corners nearer than this are one
-_RIM_INSET_M = 0.004  # m; texels on the rim are lit from so far inside: a rim often lies in another solid
+_WELD_M = 5e-4  # corners nearer than this are one
+_RIM_INSET_M = 0.004  # inset of lighting at rim texels: a rim often lies in another solid
 
 
 @dataclass(frozen=True, eq=False)
 class LightAtlas:
-    """uv (V, 2): each vertex's place in the map, 0..1. shape: rows and columns of the map. Then one entry
-    for each texel inside a patch: row, column (T,), position (T, 3) m, normal (T, 3), area (T,) m^2,
-    patch (T,): its number; vertex (patches,): one vertex of each patch."""
+    """uv (V, 2): each vertex's place in the map, 0..1. shape: rows and columns of the map. Then one entry for
+    each texel inside a patch: row, column (T,), position (T, 3) m, normal (T, 3), area (T,) m^2, patch (T,):
+    its index; vertex (patches,): one vertex of each patch."""
 
     uv: F32
     shape: tuple[int, int]
@@ -38,8 +38,9 @@ class LightAtlas:
 
 
 def unfold_patches(mesh: Mesh, group: I32, density: float, max_texels: int) -> LightAtlas:
-    """Patches of `mesh` at `density` texels a metre, fewer where the map would have more than `max_texels`
-    texels. Corners of a triangle must have its normal; corners of different `group` (V,) stay apart."""
+    """Return the patches of `mesh` at `density` texels per metre, fewer where the map would exceed
+    `max_texels` texels. Corners of a triangle must have its normal; corners of different `group` (V,) stay
+    apart."""
     patch = _patch_numbers(mesh, group)
     first = np.unique(patch, return_index=True)[1]
     normal, along, across = _patch_frames(mesh, patch, first)
@@ -69,7 +70,7 @@ def unfold_patches(mesh: Mesh, group: I32, density: float, max_texels: int) -> L
 
 
 def pad_patches(image: F32, atlas: LightAtlas) -> F32:
-    """`image` with the texels round every patch set to their nearest neighbours in it."""
+    """Return `image` with the texels around every patch set to their nearest neighbours in it."""
     import cv2
 
     inside = np.zeros(atlas.shape, bool)
@@ -79,7 +80,7 @@ def pad_patches(image: F32, atlas: LightAtlas) -> F32:
 
 
 def _patch_numbers(mesh: Mesh, group: I32) -> I64:
-    """Number of the patch of each vertex (V,)."""
+    """Return the index of the patch of each vertex (V,)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -92,7 +93,7 @@ def _patch_numbers(mesh: Mesh, group: I32) -> I64:
 
 
 def _patch_frames(mesh: Mesh, patch: I64, first: I64) -> tuple[F64, F64, F64]:
-    """Normal and two axes (patches, 3) of each patch; the first axis is one of its edges."""
+    """Return normal and two axes (patches, 3) of each patch; the first axis is one of its edges."""
     normal = mesh.normals[first].astype(float)
     edge = np.zeros((len(first), 3))
     owner, steps = patch[mesh.faces[:, 0]], mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]]
@@ -106,7 +107,7 @@ def _patch_frames(mesh: Mesh, patch: I64, first: I64) -> tuple[F64, F64, F64]:
 
 
 def _patch_bounds(patch: I64, flat: F64, count: int) -> tuple[F64, F64]:
-    """Lower corner and extent (patches, 2) m."""
+    """Return lower corner and extent (patches, 2) m."""
     low, high = (np.full((count, 2), v) for v in (np.inf, -np.inf))
     np.minimum.at(low, patch, flat)
     np.maximum.at(high, patch, flat)
@@ -114,7 +115,7 @@ def _patch_bounds(patch: I64, flat: F64, count: int) -> tuple[F64, F64]:
 
 
 def _patch_texels(extent: F64, density: float, max_texels: int) -> I64:
-    """Texels (patches, 2) along each axis, at least two."""
+    """Return texels (patches, 2) along each axis, at least two."""
     while True:
         texels = np.maximum(np.ceil(extent * density).astype(np.int64) + 1, 2)
         if texels.prod(1).sum() <= max_texels or density < 1:
@@ -123,7 +124,7 @@ def _patch_texels(extent: F64, density: float, max_texels: int) -> I64:
 
 
 def _pack_shelves(sizes: I64) -> tuple[I64, tuple[int, int]]:
-    """Corners (patches, 2), column and row, of blocks of `sizes` on shelves, and the map's shape."""
+    """Pack blocks of `sizes` on shelves; return corners (patches, 2), column and row, and the map's shape."""
     width = 1 << int(np.ceil(np.log2(max(np.sqrt(sizes.prod(1).sum() * 1.1), sizes[:, 0].max(), 16))))
     corners = np.zeros_like(sizes)
     x = y = height = 0
@@ -137,7 +138,7 @@ def _pack_shelves(sizes: I64) -> tuple[I64, tuple[int, int]]:
 
 
 def _enumerate_texels(texels: I64) -> tuple[I64, I64]:
-    """Patch (T,) and column, row (T, 2) in it of every texel."""
+    """Return patch (T,) and column, row (T, 2) in it of every texel."""
     counts = texels.prod(1)
     owner = np.repeat(np.arange(len(texels)), counts)
     rest = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -145,7 +146,7 @@ def _enumerate_texels(texels: I64) -> tuple[I64, I64]:
 
 
 def texel_mask(atlas: LightAtlas, texels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The map (H, W) with True where `texels` (T,) is."""
+    """Return the map (H, W) with True at `texels` (T,)."""
     out = np.zeros(atlas.shape, bool)
     out[atlas.row, atlas.column] = texels
     return out

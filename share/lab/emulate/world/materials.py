@@ -1,7 +1,7 @@
-"""What surfaces are made of, by name, before any picture is drawn.
+"""Materials of surfaces, by name, before any picture is drawn.
 
-A `surface` repeats: its picture covers a stated number of metres. A `print` is fitted to the quad it is
-put on; its picture holds cells x cells different ones.
+A `surface` repeats: its picture covers a given number of metres. A `print` is fitted to one quad; its picture
+holds cells x cells different prints.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from share.types import U8
 
 @dataclass(frozen=True)
 class MaterialKind:
-    """metres: extent of one picture (surfaces). cells: prints along each side of a picture (prints).
-    gray: mean albedo, 0..255. spread: how far the gray of one variant strays from it (sigma)."""
+    """metres: extent of one picture (surfaces). cells: prints along each side of a picture (prints). gray:
+    mean albedo, 0..255. gray_sigma: standard deviation of the gray over variants."""
 
     gray: float
     metres: float = 0.0
@@ -30,7 +30,7 @@ class MaterialKind:
 MATERIAL_KINDS: dict[str, MaterialKind] = {
     # walls and ceilings
     "plaster": MaterialKind(165, 3.0),
-    "paint": MaterialKind(175, 3.0, gray_sigma=6),  # a painted wall: almost nothing to see
+    "paint": MaterialKind(175, 3.0, gray_sigma=6),  # painted wall, almost without texture
     "brick": MaterialKind(115, 2.0),
     "block": MaterialKind(140, 2.4),  # concrete blocks, painted over
     "concrete": MaterialKind(130, 3.0),
@@ -43,7 +43,7 @@ MATERIAL_KINDS: dict[str, MaterialKind] = {
     "planks": MaterialKind(105, 2.0),
     "asphalt": MaterialKind(80, 2.0),
     "carpet": MaterialKind(90, 2.0),
-    # things
+    # objects
     "wood": MaterialKind(125, 1.0),
     "plywood": MaterialKind(145, 1.2),
     "cardboard": MaterialKind(135, 0.8, gray_sigma=14),
@@ -62,14 +62,14 @@ MATERIAL_KINDS: dict[str, MaterialKind] = {
     "marking": MaterialKind(200, 1.0),  # worn floor paint
     "foil": MaterialKind(150, 1.0),  # stretch film around goods on a pallet
     "skin": MaterialKind(150, 0.5),
-    "lamp": MaterialKind(250, 1.0, gray_sigma=0),  # shines by itself and casts no shadow
+    "lamp": MaterialKind(250, 1.0, gray_sigma=0),  # emits light and casts no shadow
     # prints: fitted to the quad
     "poster": MaterialKind(150, cells=2),  # pictures and letters
     "notice": MaterialKind(195, cells=2),  # a sheet of paper with lines of text
     "sign": MaterialKind(140, cells=2),  # a few large letters or a symbol
     "label": MaterialKind(200, cells=4),  # shipping labels: bars, text
     "board": MaterialKind(150, cells=1),  # a pin board with sheets
-    "goods": MaterialKind(115, cells=2),  # small things on a shelf, seen from the front
+    "goods": MaterialKind(115, cells=2),  # small objects on a shelf, from the front
     "books": MaterialKind(110, cells=2),  # spines of files and books
     "tools": MaterialKind(140, cells=1),  # a tool wall
     "gauge": MaterialKind(110, cells=2),  # an instrument or fuse panel
@@ -83,11 +83,11 @@ MATERIAL_KINDS: dict[str, MaterialKind] = {
 
 @dataclass(frozen=True)
 class Material:
-    """One picture: another one for every variant and every seed of the room.
+    """One picture, different for every variant and every seed of the room.
 
-    kind: a key of `MATERIAL_KINDS`. gray: mean albedo 0..255 instead of the kind's own. contrast: multiplies
-    the deviation from the mean. metres: extent of one picture instead of the kind's own (surfaces only).
-    text: what is written on a `sign`; random letters if empty. Raises ValueError for an unknown kind.
+    kind: a key of `MATERIAL_KINDS`. gray: mean albedo 0..255 instead of the kind's. contrast: multiplies the
+    deviation from the mean. metres: extent of one picture instead of the kind's (surfaces only). text: of a
+    `sign`; random letters if empty. Raises ValueError for an unknown kind.
     """
 
     kind: str
@@ -103,28 +103,28 @@ class Material:
 
     @property
     def is_fitted(self) -> bool:
-        """Whether it is a print."""
+        """Return whether it is a print."""
         return MATERIAL_KINDS[self.kind].is_fitted
 
     @property
     def cells(self) -> int:
-        """Prints along each side of its picture; 1 for a surface."""
+        """Return the prints along each side of its picture; 1 for a surface."""
         return MATERIAL_KINDS[self.kind].cells
 
     @property
     def extent(self) -> float:
-        """Metres that one picture covers; 0 for a print."""
+        """Return the metres that one picture covers; 0 for a print."""
         return self.metres or MATERIAL_KINDS[self.kind].metres
 
     @property
     def is_glowing(self) -> bool:
-        """Whether it shines by itself: it casts no shadow and is not lit."""
+        """Return whether it emits light: it casts no shadow and is not lit."""
         return self.kind == "lamp"
 
 
 @dataclass(frozen=True, eq=False)
 class GivenMaterial:
-    """A picture that somebody else has drawn: pixels (P, P) uint8. One extent of it is 1 in uv."""
+    """A given picture: pixels (P, P) uint8. One extent of it is 1 in uv."""
 
     pixels: U8
     is_fitted: ClassVar[bool] = False

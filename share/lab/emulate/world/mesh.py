@@ -1,8 +1,8 @@
-"""Solids and sheets of triangles, each face with a material: what furniture is made of.
+"""Solids and sheets of triangles with a material per face, to build furniture from.
 
-Faces look outwards (counter-clockwise from outside). Every planar face has corners of its own, so the
-corners that share vertices are one patch of the light map. uv: u runs along, v runs DOWN (row 0 of a
-picture is its top). `rng` shifts surfaces in their picture, so that equal boxes do not look equal.
+Faces look outwards (counter-clockwise from outside). Every planar face has its own corners, so corners that
+share vertices are one patch of the light map. uv: u runs along, v runs DOWN (row 0 of a picture is its top).
+`rng` shifts surfaces in their picture, so that equal boxes look different.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ SIDES = ("-x", "+x", "-y", "+y", "bottom", "top")
 Skins = Material | Mapping[str, Material | None]  # one for all, or by side; "side" names the upright
 # ones, "all" whatever is not named; None leaves a face out
 
-DECAL_OFFSET_M = 0.003  # m; how far a decal stands off what it is put on
+DECAL_OFFSET_M = 0.003  # distance of a decal from its surface
 _PRINT_INSET = 0.004  # of a picture; keeps prints clear of their neighbours
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh whose `layer` counts into `materials`: its pictures are not drawn yet."""
+    """A mesh whose `layer` indexes `materials`: its pictures are not drawn yet."""
 
     mesh: Mesh
     materials: tuple[Material | GivenMaterial, ...]
 
     def transformed(self, T: F64) -> Shape:
-        """The same elsewhere: rigid transform T (4, 4)."""
+        """Return the shape moved by the rigid transform T (4, 4)."""
         return replace(self, mesh=transform_mesh(self.mesh, T))
 
     def placed_at(self, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Shape:
-        """The same turned about the vertical by `yaw` rad, then shifted."""
+        """Return the shape turned about the vertical by `yaw` rad, then shifted."""
         c, s = np.cos(yaw), np.sin(yaw)
         return self.transformed(np.array([(c, -s, 0, x), (s, c, 0, y), (0, 0, 1, z), (0, 0, 0, 1.0)]))
 
     @property
     def bounding_box(self) -> F64:
-        """Lower and upper corner (2, 3) m."""
+        """Return lower and upper corner (2, 3) m."""
         v = self.mesh.vertices.astype(float)
         return np.stack([v.min(0), v.max(0)])
 
 
 def transform_mesh(mesh: Mesh, T: F64) -> Mesh:
-    """`mesh` moved by the rigid transform T (4, 4)."""
+    """Return `mesh` moved by the rigid transform T (4, 4)."""
     R, t = T[:3, :3], T[:3, 3]
     return replace(
         mesh,
@@ -61,7 +61,7 @@ def transform_mesh(mesh: Mesh, T: F64) -> Mesh:
 
 
 def concat_shapes(shapes: Sequence[Shape]) -> Shape:
-    """All in one; equal materials are shared. Raises ValueError for none."""
+    """Return one shape of all; equal materials are shared. Raises ValueError for none."""
     materials = tuple(dict.fromkeys(m for shape in shapes for m in shape.materials))
     number = {m: i for i, m in enumerate(materials)}
     layers = [np.array([number[m] for m in s.materials], np.int32)[s.mesh.layer] for s in shapes]
@@ -69,7 +69,7 @@ def concat_shapes(shapes: Sequence[Shape]) -> Shape:
 
 
 def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
-    """Meshes that count into the same pictures, in one. Raises ValueError for none."""
+    """Return one mesh of meshes that index the same pictures. Raises ValueError for none."""
     if not meshes:
         raise ValueError("no mesh to join")
     first = np.cumsum([0, *(len(m.vertices) for m in meshes)])
@@ -85,7 +85,7 @@ def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
 def quad(
     corner: ArrayLike, along: ArrayLike, up: ArrayLike, skin: Material, rng: Rng | None = None, cell: int = 0
 ) -> Shape:
-    """A parallelogram: lower left corner (3,) m and the two edges (3,) m from it, as seen from its
+    """Return a parallelogram: lower left corner (3,) m and the two edges (3,) m from it, as seen from its
     front, which is where `along` x `up` points. A print fills it with its picture number `cell`."""
     a, u = np.asarray(along, float), np.asarray(up, float)
     corners = np.asarray(corner, float) + np.array([0 * a, a, a + u, u])
@@ -109,13 +109,13 @@ def decal(
     cell: int = 0,
     offset: float = DECAL_OFFSET_M,
 ) -> Shape:
-    """A `quad` that stands `offset` m off the surface that its corner lies on."""
+    """Return a `quad` that is `offset` m off the surface that its corner lies on."""
     n = np.cross(np.asarray(along, float), np.asarray(up, float))
     return quad(np.asarray(corner, float) + offset * n / np.linalg.norm(n), along, up, skin, rng, cell)
 
 
 def polygon(corners: ArrayLike, skin: Material, rng: Rng | None = None) -> Shape:
-    """A convex planar polygon (N, 3) m, counter-clockwise from its front; u along its first edge."""
+    """Return a convex planar polygon (N, 3) m, counter-clockwise from its front; u along its first edge."""
     p = np.asarray(corners, float)
     a = (p[1] - p[0]) / np.linalg.norm(p[1] - p[0])
     n = np.cross(p[1] - p[0], p[2] - p[0])
@@ -131,7 +131,7 @@ def polygon(corners: ArrayLike, skin: Material, rng: Rng | None = None) -> Shape
 
 
 def box(low: ArrayLike, high: ArrayLike, skins: Skins, rng: Rng | None = None, cell: int = 0) -> Shape:
-    """An axis-aligned box from corner `low` to corner `high` (3,) m, seen from outside. Prints stand
+    """Return an axis-aligned box from corner `low` to corner `high` (3,) m, seen from outside. Prints stand
     upright on its sides; those of its top are read from -y."""
     lo, d = np.asarray(low, float), np.asarray(high, float) - np.asarray(low, float)
     if (d <= 0).any():
@@ -152,7 +152,7 @@ def box(low: ArrayLike, high: ArrayLike, skins: Skins, rng: Rng | None = None, c
 def prism(
     outline: ArrayLike, low: float, high: float, side: Material, caps: Material | None, rng: Rng | None = None
 ) -> Shape:
-    """An upright prism over a convex outline (N, 2) m, counter-clockwise from above."""
+    """Return an upright prism over a convex outline (N, 2) m, counter-clockwise from above."""
     p = np.asarray(outline, float)
     bottom, top = (np.column_stack([p, np.full(len(p), z)]) for z in (low, high))
     steps = np.roll(bottom, -1, axis=0) - bottom
@@ -177,7 +177,7 @@ def cylinder(
     rng: Rng | None = None,
     top: float | None = None,
 ) -> Shape:
-    """A cylinder from the middle of its base (3,) m along `axis`; a cone where the radius at its end
+    """Return a cylinder from the middle of its base (3,) m along `axis`; a cone where the radius at its end
     (`top`, m) differs. `caps=None` leaves it open."""
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -198,13 +198,13 @@ def cylinder(
 
 
 def tube(path: ArrayLike, radius: float, skin: Material, sides: int = 8, rng: Rng | None = None) -> Shape:
-    """A pipe or hose of `radius` m along a line of points (N, 3) m, closed at its ends."""
+    """Return a pipe or hose of `radius` m along a line of points (N, 3) m, closed at its ends."""
     p = np.asarray(path, float)
     tangent = np.gradient(p, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across, over = np.empty_like(p), np.empty_like(p)
     across[0] = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
-    for i, t in enumerate(tangent):  # carried along without twist
+    for i, t in enumerate(tangent):  # parallel transport, without twist
         a = across[max(i - 1, 0)]
         a = a - t * (a @ t)
         across[i] = a / np.linalg.norm(a)
@@ -229,8 +229,8 @@ def tube(path: ArrayLike, radius: float, skin: Material, sides: int = 8, rng: Rn
 def panels(
     corner: ArrayLike, along: ArrayLike, up: ArrayLike, skins: Sequence[Material], pitch: float, rng: Rng
 ) -> Shape:
-    """A rectangle in panels of about `pitch` m, each with one of `skins` at a place of its own: a
-    large wall or floor that repeats nowhere. Joints show; give `pitch` what the building would have."""
+    """Return a rectangle in panels of about `pitch` m, each with one of `skins` at its own offset: a large
+    wall or floor without repetition. Joints show; use the building's own spacing as `pitch`."""
     c, a, u = (np.asarray(v, float) for v in (corner, along, up))
     columns, rows = (max(1, round(float(np.linalg.norm(v)) / pitch)) for v in (a, u))
     return concat_shapes(
@@ -260,14 +260,14 @@ def _random_shift(rng: Rng | None) -> F64:
 
 
 def _shift_uv(shape: Shape, uv: F64) -> Shape:
-    """Elsewhere in its picture; prints stay where they are."""
+    """Shift surfaces in their picture; prints stay."""
     if shape.materials[0].is_fitted:
         return shape
     return replace(shape, mesh=replace(shape.mesh, uv=(shape.mesh.uv + uv).astype(np.float32)))
 
 
 def _print_cell(skin: Material, cell: int) -> F64:
-    """uv (4, 2) of print number `cell`: lower left, lower right, upper right, upper left."""
+    """Return uv (4, 2) of print number `cell`: lower left, lower right, upper right, upper left."""
     n = skin.cells
     row, column = divmod(cell % (n * n), n)
     low, high = _PRINT_INSET, 1 - _PRINT_INSET
@@ -276,7 +276,7 @@ def _print_cell(skin: Material, cell: int) -> F64:
 
 
 def _planar_shape(corners: F64, uv: F64, skin: Material) -> Shape:
-    """A convex planar face (N, 3) m as a fan of triangles."""
+    """Return a convex planar face (N, 3) m as a fan of triangles."""
     n = _cross_product(corners[1] - corners[0], corners[2] - corners[0])
     count = len(corners)
     normals = np.empty((count, 3), np.float32)
@@ -292,13 +292,14 @@ def _planar_shape(corners: F64, uv: F64, skin: Material) -> Shape:
 
 
 def _cross_product(a: F64, b: F64) -> F64:
-    """Of two vectors (3,): np.cross costs ten times as much on so few numbers, and a room has 10^4 faces."""
+    """Return the cross product of vectors (3,): np.cross costs ten times as much on so few numbers, and a
+    room has 10^4 faces."""
     (x, y, z), (u, v, w) = a.tolist(), b.tolist()
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def _axis_transform(axis: str, origin: ArrayLike) -> F64:
-    """Takes +z to the named axis and 0 to `origin`."""
+    """Return the transform that takes +z to the named axis and 0 to `origin`."""
     T = np.eye(4)
     T[:3, :3] = {
         "x": np.array([(0, 0, 1), (1, 0, 0), (0, 1, 0)]),

@@ -1,4 +1,4 @@
-"""Seamless noise and marks: fields (P, P) float32 that continue over their own borders."""
+"""Seamless noise and marks: fields (P, P) float32 that continue over their borders."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ import numpy as np
 
 from share.types import F32, U8
 
-PICTURE_TEXELS = 512  # texels along each side of a picture
+PICTURE_TEXELS = 512  # along each side of a picture
 Rng = np.random.Generator
 
 
 @lru_cache(maxsize=4)
 def _frequency(size: int) -> F32:
-    """Cycles per picture (size, size // 2 + 1) of each entry of `rfft2`; the mean counts as one."""
+    """Return cycles per picture (size, size // 2 + 1) of each entry of `rfft2`; 1 for the mean."""
     f = np.hypot(np.fft.fftfreq(size, 1 / size)[:, None], np.fft.rfftfreq(size, 1 / size)[None])
     f[0, 0] = 1
     return to_float32(f)
 
 
 def to_float32(array: object) -> F32:
-    """In single precision."""
+    """Return the array in single precision."""
     return np.asarray(array, np.float32)
 
 
 def cloud(rng: Rng, slope: float = 1.0, low: float = 1, high: float = 1e9, size: int = PICTURE_TEXELS) -> F32:
-    """Noise of amplitude 1 / f^slope between `low` and `high` cycles per picture; mean 0, sigma 1.
+    """Return noise of amplitude 1 / f^slope between `low` and `high` cycles per picture; mean 0, sigma 1.
     Photographs of rooms have a slope of about 1 (Field, JOSA A 4(12), 1987)."""
     f = _frequency(size)
     weight = f**-slope * (f >= low) * (f <= high)
@@ -39,7 +39,7 @@ def cloud(rng: Rng, slope: float = 1.0, low: float = 1, high: float = 1e9, size:
 
 
 def grain(rng: Rng, across: float, along: float) -> F32:
-    """Noise drawn out along the columns' axis: correlation of `across` and `along` texels; sigma 1."""
+    """Return noise stretched along the columns' axis: correlation of `across` and `along` texels; sigma 1."""
     fy, fx = np.fft.fftfreq(PICTURE_TEXELS)[:, None], np.fft.rfftfreq(PICTURE_TEXELS)[None]
     weight = np.exp(-2 * np.pi**2 * ((fy * across) ** 2 + (fx * along) ** 2))
     out = np.fft.irfft2(
@@ -50,8 +50,8 @@ def grain(rng: Rng, across: float, along: float) -> F32:
 
 
 def scattered_marks(draw: Callable[[U8], None], sigma: float = 0.7) -> F32:
-    """What `draw` paints in 128 + gray on a canvas 2 P wide, folded into one picture: a mark that
-    leaves on one side comes back on the other. Deviation from 128, a little softened."""
+    """Return what `draw` paints in 128 + gray on a canvas 2 P wide, folded into one picture: a mark that
+    leaves on one side comes back on the other. Deviation from 128, slightly softened."""
     canvas = np.full((2 * PICTURE_TEXELS, 2 * PICTURE_TEXELS), 128, np.uint8)
     draw(canvas)
     soft = cv2.GaussianBlur(canvas.astype(np.float32), (0, 0), sigma) - 128
@@ -66,7 +66,7 @@ def scattered_marks(draw: Callable[[U8], None], sigma: float = 0.7) -> F32:
 def spots(
     rng: Rng, count: int, radius: tuple[float, float], gray: tuple[float, float], flat: float = 0.5
 ) -> F32:
-    """`count` elliptic stains of `radius` texels (from, to) and deviation `gray` (sigma of both signs
+    """Return `count` elliptic stains of `radius` texels (from, to) and deviation `gray` (sigma of both signs
     in between); `flat` is the least ratio of their axes."""
 
     def draw(canvas: U8) -> None:
@@ -81,7 +81,7 @@ def spots(
 
 
 def scratches(rng: Rng, count: int, length: float, gray: tuple[float, float], turn: float = 180.0) -> F32:
-    """`count` thin lines of about `length` texels at up to +-`turn` degrees from the rows."""
+    """Return `count` thin lines of about `length` texels at up to +-`turn` degrees from the rows."""
 
     def draw(canvas: U8) -> None:
         for _ in range(count):
@@ -97,7 +97,7 @@ def scratches(rng: Rng, count: int, length: float, gray: tuple[float, float], tu
 def brick_courses(
     rng: Rng, rows: int, columns: int, spread: float, joint: float, width: int = 2, offset: float = 0.5
 ) -> F32:
-    """Bricks, tiles or planks: `rows` x `columns` stones, each with a gray of its own (sigma `spread`),
+    """Return bricks, tiles or planks: `rows` x `columns` stones, each with its own gray (sigma `spread`),
     joints `width` texels wide that deviate by `joint`; `offset` of a stone from row to row, random if
     negative."""
     out = np.zeros((PICTURE_TEXELS, PICTURE_TEXELS), np.float32)
@@ -114,7 +114,7 @@ def brick_courses(
 
 
 def soften(picture: F32, sigma: float = 0.6) -> F32:
-    """A Gaussian blur across the borders."""
+    """Return a Gaussian blur across the borders."""
     pad = 4
     wide = np.pad(picture, pad, mode="wrap")
     return to_float32(cv2.GaussianBlur(wide, (0, 0), sigma)[pad:-pad, pad:-pad])

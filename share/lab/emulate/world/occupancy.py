@@ -1,4 +1,4 @@
-"""Where bodies fit: how far every place in a room is from the nearest solid."""
+"""Distance of every place in a room from the nearest solid."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.proximity import winding_numbers
 from share.types import F32, F64
 
-STEP_M = 0.05  # m
-_COARSE_STEP_M = 0.1  # m; for rooms of more than
-_MAX_VOXELS = 12_000_000  # voxels
+STEP_M = 0.05
+_COARSE_STEP_M = 0.1  # for rooms of more than _MAX_VOXELS
+_MAX_VOXELS = 12_000_000
 _POINT_CHUNK = 200_000  # sample points at a time
-_SURFACE_OFFSET_M = 1e-4  # m
+_SURFACE_OFFSET_M = 1e-4
 
 BoolArray = NDArray[np.bool_]
 
 
 class Occupancy:
-    """Voxels of `step` m over a room. A voxel is solid where a triangle passes through it or a closed
-    piece surrounds it; so is everything outside. Distances are exact to about a voxel's diagonal."""
+    """Voxels of `step` m over a room. A voxel is solid where a triangle passes through it or a closed piece
+    surrounds it, and everywhere outside. Distances are exact to about a voxel's diagonal."""
 
     def __init__(self, solid: BoolArray, step: float) -> None:
         """solid: (X, Y, Z), voxel (0, 0, 0) at the origin."""
@@ -30,7 +30,8 @@ class Occupancy:
 
     @classmethod
     def from_layout(cls, layout: Layout, step: float | None = None) -> Occupancy:
-        """The solid pieces of a layout, its shell and its bounds; steps of 0.05 m, in large halls 0.1 m."""
+        """Return the occupancy of a layout's solid pieces, shell and bounds; steps of 0.05 m, in large halls
+        0.1 m."""
         step = step or (STEP_M if np.prod(layout.size) / STEP_M**3 < _MAX_VOXELS else _COARSE_STEP_M)
         shape = np.maximum(np.ceil(np.asarray(layout.size) / step - 1e-6).astype(int), 1)
         solid = np.zeros(shape, bool)
@@ -41,12 +42,13 @@ class Occupancy:
 
     @property
     def size(self) -> F64:
-        """Extent (3,) m."""
+        """Return the extent (3,) m."""
         return np.array(self.solid.shape) * self.step
 
     @cached_property
     def distance(self) -> F32:
-        """Distance (X, Y, Z) m of each voxel's centre from the nearest solid voxel's surface, 0 inside."""
+        """Return the distance (X, Y, Z) m of each voxel's centre from the nearest solid voxel's surface, 0
+        inside."""
         from scipy.ndimage import distance_transform_edt
 
         free = np.pad(~self.solid, 1)
@@ -54,7 +56,8 @@ class Occupancy:
         return np.asarray(np.maximum(cells - 0.5, 0) * self.step, np.float32)
 
     def clearance(self, points: F64) -> F64:
-        """Distance (N,) m of points (N, 3) from the nearest solid; 0 in it and outside the room."""
+        """Return the distance (N,) m of points (N, 3) from the nearest solid; 0 in it and outside the
+        room."""
         from scipy.ndimage import map_coordinates
 
         voxels = (np.asarray(points, float) / self.step - 0.5).T
@@ -63,9 +66,9 @@ class Occupancy:
         return np.where(inside, distances, 0.0)
 
     def floor_clearance(self, low: float, high: float) -> tuple[F32, F64, float]:
-        """For a body that stands between the heights `low` and `high` m: its distance (X, Y) m from the
-        nearest solid at those heights; the place (2,) m of entry (0, 0); the step between entries, m.
-        Take `low` a little above the floor, which is solid."""
+        """Return, for a body between the heights `low` and `high` m: its distance (X, Y) m from the nearest
+        solid at those heights; the place (2,) m of entry (0, 0); the step between entries, m. Choose `low` a
+        little above the floor, which is solid."""
         import cv2
 
         a, b = int(np.floor(low / self.step)), max(int(np.ceil(high / self.step)), 1)
@@ -90,8 +93,8 @@ def fill_voxels(solid: BoolArray, triangles: F64, step: float) -> None:
 
 
 def _mark_surface(local: BoolArray, triangles: F64, step: float) -> None:
-    """Mark voxels on the triangles, by points on them at most half a step apart, a little behind their
-    front: a face on the border of two voxels is in the one that the solid fills."""
+    """Mark voxels on the triangles, by points on them at most half a step apart, a little behind their front:
+    a face on the border of two voxels belongs to the one that the solid fills."""
     a, b, c = triangles.swapaxes(0, 1)
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)

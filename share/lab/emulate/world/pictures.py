@@ -1,4 +1,4 @@
-"""From materials to pictures: (P, P) uint8 albedo, another one for every seed and variant."""
+"""From materials to pictures: (P, P) uint8 albedo, different for every seed and variant."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from share.lab.emulate.world.prints import PRINTS
 from share.lab.emulate.world.surfaces import SURFACES
 from share.types import F32, U8
 
-MIN_ALBEDO, MAX_ALBEDO = 4, 250  # albedo; nothing is black or white
+MIN_ALBEDO, MAX_ALBEDO = 4, 250  # nothing is black or white
 
 
 def draw_material(material: Material | GivenMaterial, seed: int) -> U8:
-    """The picture of one material in the room `seed`."""
+    """Return the picture of one material in the room `seed`."""
     if isinstance(material, GivenMaterial):
         return material.pixels
     rng = np.random.default_rng(
@@ -37,17 +37,17 @@ def draw_material(material: Material | GivenMaterial, seed: int) -> U8:
 
 
 def draw_materials(materials: Sequence[Material | GivenMaterial], seed: int) -> U8:
-    """Pictures (L, P, P), one for each material."""
+    """Return pictures (L, P, P), one for each material."""
     return np.stack([draw_material(material, seed) for material in materials])
 
 
 def mean_albedo(pictures: U8) -> F32:
-    """Share of light that each picture (L, P, P) throws back, (L,) 0..1, where 255 is all of it."""
+    """Return the share of light that each picture (L, P, P) reflects, (L,) 0..1."""
     return np.asarray(pictures[:, ::4, ::4].mean((1, 2)) / 255, np.float32)
 
 
 def _print_sheet(material: Material, rng: np.random.Generator) -> U8:
-    """All prints of one picture."""
+    """Return all prints of one picture."""
     n = material.cells
     rows = [
         [PRINTS[material.kind](rng, PICTURE_TEXELS // n, material.text) for _ in range(n)] for _ in range(n)

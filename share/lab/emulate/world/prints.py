@@ -1,4 +1,4 @@
-"""Pictures that are fitted to one quad: posters, labels, fronts of shelves. Gray levels (n, n) uint8."""
+"""Prints, each fitted to one quad: posters, labels, fronts of shelves. Gray levels (n, n) uint8."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _random_text(rng: Rng, count: int) -> str:
 def _write_text(
     rng: Rng, sheet: U8, text: str, box: tuple[int, int, int, int], gray: float, stroke: float = 0.09
 ) -> None:
-    """`text` filling the box (x, y, width, height) in texels as well as it can."""
+    """Write `text` into the box (x, y, width, height) in texels, as large as it fits."""
     x, y, w, h = box
     font = int(_FONTS[int(rng.integers(len(_FONTS)))])
     (tw, th), _ = cv2.getTextSize(text, font, 1.0, 1)
@@ -41,7 +41,7 @@ def _write_text(
 
 
 def _text_lines(rng: Rng, sheet: U8, box: tuple[int, int, int, int], pitch: int, gray: float) -> None:
-    """Lines of print too small to read: words as dashes."""
+    """Draw lines of print too small to read: words as dashes."""
     x, y, w, h = box
     for top in range(y, y + h - pitch // 2, pitch):
         left, end = x, x + int(w * rng.uniform(0.6, 1))
@@ -138,15 +138,17 @@ def board(rng: Rng, n: int, text: str = "") -> U8:
     return sheet
 
 
-def _shelf_rows(rng: Rng, n: int, rows: int, tallest: float, widths: tuple[float, float], odd: float) -> U8:
-    """Upright things side by side on boards, of all heights, some missing."""
+def _shelf_rows(
+    rng: Rng, n: int, rows: int, tallest: float, widths: tuple[float, float], filled: float
+) -> U8:
+    """Upright objects side by side on boards, of all heights, some missing."""
     sheet = _background(rng, n, 42, 6, 2)
     pitch = n // rows
     for foot in range(pitch - 1, n, pitch):
         x = 1
         while x < n - 3:
             wide = max(3, int(rng.uniform(*widths) * n))
-            if rng.random() < odd:
+            if rng.random() < filled:
                 tall = int(pitch * rng.uniform(0.55, tallest))
                 gray = float(rng.uniform(55, 205))
                 right = min(x + wide - 2, n - 2)
@@ -161,7 +163,7 @@ def _shelf_rows(rng: Rng, n: int, rows: int, tallest: float, widths: tuple[float
 
 
 def goods(rng: Rng, n: int, text: str = "") -> U8:
-    """Small things on a shelf, from the front."""
+    """Small objects on a shelf, from the front."""
     return _shelf_rows(rng, n, int(rng.integers(2, 4)), 0.85, (0.08, 0.25), 0.85)
 
 

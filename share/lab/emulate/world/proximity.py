@@ -1,4 +1,4 @@
-"""How near points come to a mesh, exactly."""
+"""Exact distances of points from a mesh."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _PAIR_CHUNK = 400_000  # point-triangle pairs at a time
 
 
 def is_near_mesh(mesh: Mesh, points: F64, reach: float) -> bool:
-    """Whether any point (N, 3) m lies nearer than `reach` m to the mesh, or inside it."""
+    """Return whether any point (N, 3) m is nearer than `reach` m to the mesh, or inside it."""
     low, high = mesh.vertices.min(0) - reach, mesh.vertices.max(0) + reach
     near = points[((points >= low) & (points <= high)).all(axis=1)]
     if not len(near):
@@ -28,8 +28,8 @@ def is_near_mesh(mesh: Mesh, points: F64, reach: float) -> bool:
 
 
 def triangle_distances(corners: F64, points: F64) -> F64:
-    """Distance (N, F) m of points (N, 3) from triangles (F, 3, 3): to the plane where a point's foot
-    lies inside, else to the nearest edge."""
+    """Return distances (N, F) m of points (N, 3) from triangles (F, 3, 3): to the plane where the foot of the
+    perpendicular lies inside, else to the nearest edge."""
     p = points[:, None]
     edges = np.roll(corners, -1, axis=1) - corners
     out = np.full((len(points), len(corners)), np.inf)
@@ -48,8 +48,8 @@ def triangle_distances(corners: F64, points: F64) -> F64:
 
 
 def winding_numbers(corners: F64, points: F64) -> F64:
-    """How often the triangles (F, 3, 3) surround each point (N, 3): about 1 inside a closed solid, 0
-    outside. Solid angles by van Oosterom & Strackee, IEEE TBME 30(2), 1983."""
+    """Return the winding number (N,) of the triangles (F, 3, 3) around each point: about 1 inside a closed
+    solid, 0 outside. Solid angles by van Oosterom & Strackee, IEEE TBME 30(2), 1983."""
     a, b, c = (corners[:, k] - points[:, None] for k in range(3))
     na, nb, nc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
     top = (a * np.cross(b, c)).sum(-1)

@@ -1,4 +1,4 @@
-"""What a ray meets first, and whether it meets anything: Embree's single-precision ray casting."""
+"""First hits and occlusion of rays: Embree's single-precision ray casting."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class RayCaster:
         )
 
     def is_blocked(self, start: F32, segment: F32) -> NDArray[np.bool_]:
-        """Whether anything lies on each segment from `start` (N, 3) to `start + way`."""
+        """Return whether anything lies on each segment from `start` (N, 3) to `start + segment`."""
         hit = self._scene.run(start, segment, dists=np.ones(len(start), np.float32), query="OCCLUDED")
         return np.asarray(hit == 0)
 
     def first_hits(self, start: F32, direction: F32) -> tuple[I32, F32]:
-        """Triangle (N,) that each ray meets first, -1 for none, and where on it: weights (N, 3) of its
-        corners."""
+        """Return the triangle (N,) that each ray meets first, -1 for none, and weights (N, 3) of its corners
+        at the hit."""
         hit = self._scene.run(start, direction, output=1)
         u, v = hit["u"], hit["v"]
         return hit["primID"], np.stack([1 - u - v, u, v], axis=1)

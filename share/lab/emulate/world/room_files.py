@@ -1,4 +1,5 @@
-"""A finished room as a folder of plain arrays: other processes map it into memory instead of building it."""
+"""A finished room as a folder of plain arrays, which other processes map into memory instead of building
+it."""
 
 from __future__ import annotations
 
@@ -23,8 +24,8 @@ _ROOM_ARRAYS = ("size", "pictures", "light_uv", "light_map")
 
 
 def save_room(room: DrawableRoom, folder: Path) -> None:
-    """Write `room` under `folder`, which appears only when it is whole. A room already there is kept if
-    another process was quicker. Raises UsageError where it cannot be written."""
+    """Write `room` to `folder` atomically. An existing room is kept if another process was quicker. Raises
+    UsageError where it cannot be written."""
     folder = Path(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -39,7 +40,8 @@ def save_room(room: DrawableRoom, folder: Path) -> None:
 
 
 def load_room(folder: Path) -> DrawableRoom:
-    """The room saved in `folder`, its arrays mapped read-only. Raises DataError where it is not whole."""
+    """Return the room saved in `folder`, its arrays mapped read-only. Raises DataError where it is
+    incomplete."""
     folder = Path(folder)
     try:
         head = read_json(folder / "room.json")
@@ -58,7 +60,9 @@ def load_room(folder: Path) -> DrawableRoom:
             **{key: _load(folder, key) for key in _ROOM_ARRAYS},
         )
     except (DataError, OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{folder}: not a whole room ({error}): remove it, it will be built again") from None
+        raise DataError(
+            f"{folder}: not a complete room ({error}); delete it and it will be built again"
+        ) from None
 
 
 def _write(room: DrawableRoom, folder: Path) -> None:
@@ -90,7 +94,7 @@ def _publish_folder(part: Path, folder: Path) -> None:
 
 def _load(folder: Path, name: str) -> NDArray[Any]:
     path = folder / f"{name}.npy"
-    with open_regular(path):  # a pipe would wait; what is mapped is read only where it is looked at
+    with open_regular(path):  # a pipe would block; mapped files are read on access
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
 

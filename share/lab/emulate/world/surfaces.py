@@ -1,7 +1,7 @@
 """Pictures of surfaces that repeat: deviation from the mean gray, (P, P) float32 gray levels.
 
-Each recipe gets a generator and the metres that the picture covers. Strength is that of real rooms seen
-by a real camera: most of it soft and large, some of it fine; `Material.contrast` scales it.
+Each recipe gets a generator and the metres that the picture covers. Contrast is that of real rooms seen by a
+real camera: most of it soft and large, some of it fine; `Material.contrast` scales it.
 """
 
 from __future__ import annotations
@@ -27,17 +27,16 @@ from share.types import F32, U8
 Rng = np.random.Generator
 SurfacePainter = Callable[[Rng, float], F32]
 
-# Of all speckle: so that a warehouse has the corners of real halls (docs/understand/rooms.md).
-_SPECKLE_GAIN = 1.3
+_SPECKLE_GAIN = 1.3  # of all speckle, so that a warehouse has the corner counts of real halls (docs/understand/rooms.md)
 
 
 def _mark_count(rng: Rng, metres: float, density: float) -> int:
-    """How many marks lie on a picture at `density` a square metre."""
+    """Return the number of marks on a picture at `density` per square metre."""
     return int(rng.poisson(density * metres**2))
 
 
 def _phase_ramp(cycles: float, along: int) -> F32:
-    """Phase 0..1 that runs `cycles` times over the picture along axis `along`."""
+    """Return a phase 0..1 that runs `cycles` times over the picture along axis `along`."""
     line = (np.arange(PICTURE_TEXELS, dtype=np.float32) + 0.5) / PICTURE_TEXELS * cycles % 1
     return np.tile(
         line[:, None] if along == 0 else line[None],
@@ -46,13 +45,13 @@ def _phase_ramp(cycles: float, along: int) -> F32:
 
 
 def _wear_noise(rng: Rng, metres: float, large: float, fine: float) -> F32:
-    """What every surface has: soft 1/f variation and fine grain."""
+    """Soft 1/f variation and fine grain, part of every surface."""
     return large * cloud(rng, 1.4, high=80) + fine * cloud(rng, 0.4, low=40)
 
 
 def _speckle(rng: Rng, metres: float, strength: float) -> F32:
-    """Speckle of 1 to 4 cm with more strong specks than Gaussian noise has: what a corner detector finds on
-    a rough surface from across a room."""
+    """Speckle of 1 to 4 cm with more strong specks than Gaussian noise: what a corner detector finds on a
+    rough surface from across a room."""
     band = cloud(rng, 0.5, metres / 0.04, metres / 0.011)
     return to_float32(_SPECKLE_GAIN * strength * np.sign(band) * np.abs(band) ** 1.8)
 

@@ -1,4 +1,4 @@
-"""Drums and bins that stand about."""
+"""Drums and bins."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def drum(rng: Rng) -> Shape:
 
 
 def drum_row(rng: Rng, count: int) -> Shape:
-    """Drums side by side."""
+    """Drums in a row."""
     pitch = 2 * RADIUS + 0.03
     return concat_shapes([drum(rng).placed_at((k - (count - 1) / 2) * pitch, 0) for k in range(count)])
 

@@ -1,8 +1,8 @@
-"""A calibration board: its target printed exactly, in tiles whose seams nobody can see.
+"""A calibration board: its target printed exactly, in tiles without visible seams.
 
-The texels of all tiles lie on one lattice, and tiles begin at multiples of 32 of them: then the texels of
-the first five mip levels lie on one lattice too, and two tiles show the same at their seam. What a tile
-shows goes on beyond its edges, so that nothing is interpolated with the other end of its picture.
+The texels of all tiles lie on one lattice, and tiles begin at multiples of 32 of them: so the texels of the
+first five mip levels are on one lattice too, and two tiles are equal at their seam. A tile's picture
+continues beyond its edges, so that interpolation does not reach the opposite edge of the picture.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from share.lab.emulate.world.noise import PICTURE_TEXELS
 from share.types import F64, U8
 
 WHITE, BLACK = 205, 22  # albedo of paper and toner
-MARGIN = 0.025  # m of white around what is printed, at least
-_GUARD_TEXELS = 32  # texels of a tile's picture that lie beyond the tile, on each side
+MARGIN = 0.025  # of white around the print, at least
+_GUARD_TEXELS = 32  # texels of a tile's picture beyond each side of the tile
 _TILE_TEXELS = PICTURE_TEXELS - 2 * _GUARD_TEXELS
-_MAX_TEXEL_M = 0.0008  # m a texel
+_MAX_TEXEL_M = 0.0008
 _PLATE_M = 0.012
 
 
 def printed_sheet(target: Target) -> tuple[Shape, F64]:
-    """The printed sheet in the target's own frame, and its extent (2, 2) m."""
+    """Return the printed sheet in the target's frame, and its extent (2, 2) m."""
     low, high = target.extent
     tiles, texel = _tile_division(target)
     spare = (tiles * _TILE_TEXELS - (high - low) / texel) / 2
@@ -43,7 +43,7 @@ def printed_sheet(target: Target) -> tuple[Shape, F64]:
 
 
 def board_on_stand(target: Target, T_stand_target: F64, rng: Rng) -> Shape:
-    """The sheet on a plate on a post; the floor is z = 0 of the stand's frame."""
+    """Return the sheet on a plate on a post; z = 0 of the stand's frame is the floor."""
     paper, extent = printed_sheet(target)
     plate = box(
         (*(extent[0] - 0.006), -_PLATE_M), (*(extent[1] + 0.006), -0.001), pick_material(rng, "plywood"), rng
@@ -56,8 +56,9 @@ def board_on_stand(target: Target, T_stand_target: F64, rng: Rng) -> Shape:
 
 
 def _tile_division(target: Target) -> tuple[np.ndarray, float]:
-    """How many tiles (2,), and m a texel: as small as so many allow. An edge of a chessboard's square or
-    of a tag's cell is a whole number of texels, and of an AprilGrid's gap, if tag_spacing is a tenth."""
+    """Return the number of tiles (2,) and the texel size, m: the smallest that the limit on tiles allows.
+    Edges of squares and of tag cells are whole numbers of texels, and of an AprilGrid's gap if tag_spacing is
+    a multiple of a tenth."""
     cell = target.tag_size / 10 if isinstance(target, AprilGrid) else target.square / 16
     size = np.ptp(target.extent, axis=0) + 2 * MARGIN
     tiles = np.ceil(size * np.ceil(cell / _MAX_TEXEL_M) / cell / _TILE_TEXELS).astype(int)
@@ -65,7 +66,7 @@ def _tile_division(target: Target) -> tuple[np.ndarray, float]:
 
 
 def _tile_shape(rectangles: F64, low: F64, texel: float, paper: F64) -> Shape:
-    """What lies on the paper of the tile with its lower left corner at `low` (2,) m."""
+    """Return the print on the paper of the tile with its lower left corner at `low` (2,) m."""
     steps = (np.arange(PICTURE_TEXELS + 1) - _GUARD_TEXELS) * texel
     xs, ys = low[0] + steps, low[1] + _TILE_TEXELS * texel - steps
     pixels: U8 = (WHITE + (BLACK - WHITE) * darkness_image(rectangles, xs, ys)).round().astype(np.uint8)

@@ -10,7 +10,7 @@ _TAPE = Material("plastic", 9, gray=165, contrast=0.5)
 
 
 def carton(rng: Rng, width: float, depth: float, height: float) -> Shape:
-    """A closed carton, taped along its top, most with a label on the front or an end."""
+    """A closed carton, taped along its top; most have a label on the front or an end."""
     skin = pick_material(rng, "cardboard")
     out = [box((-width / 2, -depth, 0), (width / 2, 0, height), {"all": skin, "bottom": None}, rng)]
     tape = 0.05
@@ -56,7 +56,7 @@ def _carton_column(rng: Rng, x: float, width: float, depth: float, height: float
 
 
 def shelf_load(rng: Rng, width: float, depth: float, height: float) -> list[Shape]:
-    """What stands on one shelf: cartons of all sizes with gaps, at most `height` m high; may be empty."""
+    """Return the cartons on one shelf, of all sizes with gaps, at most `height` m high; may be empty."""
     out: list[Shape] = []
     x = -width / 2 + rng.uniform(0.0, 0.15)
     while True:
@@ -70,7 +70,7 @@ def shelf_load(rng: Rng, width: float, depth: float, height: float) -> list[Shap
 
 
 def _one_or_two(rng: Rng, x: float, w: float, d: float, h: float, y: float) -> list[Shape]:
-    """One carton, or two low ones on each other."""
+    """Return one carton, or two low ones on top of each other."""
     if h < 0.3 or rng.random() < 0.6:
         return [carton(rng, w, d, h).placed_at(x, y)]
     lower = h * rng.uniform(0.4, 0.6)

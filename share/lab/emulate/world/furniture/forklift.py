@@ -1,4 +1,4 @@
-"""Trucks that move pallets: a forklift, a hand pallet truck."""
+"""Trucks for pallets: a forklift and a hand pallet truck."""
 
 from __future__ import annotations
 

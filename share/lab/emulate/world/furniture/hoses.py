@@ -15,7 +15,7 @@ def rolled_hose(rng: Rng, radius: float, wide: float = 0.075) -> Shape:
     out = [cylinder((0, -wide, radius), radius, wide, skin, skin, axis="y", sides=20, rng=rng)]
     out.append(cylinder((0, -wide - 0.02, radius), 0.035, 0.02, metal, metal, axis="y", sides=10, rng=rng))
     rings = np.arange(0.06, radius - 0.01, 0.045)
-    for r in rings:  # the windings
+    for r in rings:  # windings
         out.append(
             cylinder((0, -wide - 0.006, radius), float(r), 0.006, skin, None, axis="y", sides=20, rng=rng)
         )

@@ -7,7 +7,7 @@ from share.lab.emulate.world.mesh import Rng, Shape, concat_shapes
 
 
 def leaning_ladder(rng: Rng, length: float) -> Shape:
-    """A ladder of `length` m that leans at a wall in the plane y = 0, its feet 0.3 of that away."""
+    """A ladder of `length` m that leans against a wall in the plane y = 0, its feet 0.3 of that away."""
     skin, foot = pick_material(rng, "galvanised"), -0.28 * length
     top = (length**2 - foot**2) ** 0.5
     out = [strut((x, foot, 0.02), (x, -0.04, top), 0.03, skin, rng, 0.06) for x in (-0.2, 0.2)]
@@ -19,7 +19,7 @@ def leaning_ladder(rng: Rng, length: float) -> Shape:
 
 
 def step_ladder(rng: Rng, height: float) -> Shape:
-    """A step ladder that stands open, climbed from -y."""
+    """An open step ladder, climbed from -y."""
     skin, d = pick_material(rng, "galvanised"), 0.55 * height
     out = []
     for x in (-0.22, 0.22):

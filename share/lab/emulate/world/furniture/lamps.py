@@ -1,4 +1,4 @@
-"""Lamps: the thing that one sees and the light that it gives."""
+"""Lamps: the object and its light."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import Rng, Shape, concat_shapes, cylinder
 
 _LAMP_MATERIAL = Material("lamp")
-_LIGHT_OFFSET_M = 0.02  # m; the light starts below the lamp that it comes from
+_LIGHT_OFFSET_M = 0.02  # the light starts below its lamp
 
 
 def tube_lamp(rng: Rng, length: float, drop: float) -> Shape:
@@ -27,7 +27,7 @@ def tube_lamp(rng: Rng, length: float, drop: float) -> Shape:
 def tube_light(
     x: float, y: float, ceiling: float, length: float, drop: float, power: float, along_y: bool
 ) -> Light:
-    """What `tube_lamp` at (x, y) under `ceiling` m shines; `along_y`: it runs along y."""
+    """Return the light of `tube_lamp` at (x, y) under `ceiling` m; `along_y`: it runs along y."""
     size = (0.1, length) if along_y else (length, 0.1)
     return Light((x, y, ceiling - drop - 0.1 - _LIGHT_OFFSET_M), power, size)
 
@@ -46,5 +46,5 @@ def high_bay_lamp(rng: Rng, drop: float) -> Shape:
 
 
 def high_bay_light(x: float, y: float, ceiling: float, drop: float, power: float) -> Light:
-    """What `high_bay_lamp` at (x, y) under `ceiling` m shines."""
+    """Return the light of `high_bay_lamp` at (x, y) under `ceiling` m."""
     return Light((x, y, ceiling - drop - 0.35 - _LIGHT_OFFSET_M), power, (0.4, 0.4))

@@ -25,7 +25,7 @@ def pallet(rng: Rng) -> Shape:
 
 
 def pallet_pile(rng: Rng, count: int) -> Shape:
-    """Bare pallets on each other, not quite in line."""
+    """A stack of bare pallets, slightly out of line."""
     shift = rng.uniform(-0.03, 0.03, count)
     return concat_shapes([pallet(rng).placed_at(float(s), 0, k * HEIGHT) for k, s in enumerate(shift)])
 
@@ -46,7 +46,7 @@ def _cartons(rng: Rng, height: float) -> list[Shape]:
         for i in range(nx):
             for j in range(ny):
                 if k and k >= int(height / h) - 1 and rng.random() < 0.3:
-                    continue  # the top layer is begun
+                    continue  # the top layer is incomplete
                 x = (i + 0.5) * w - WIDTH / 2
                 out.append(carton(rng, w - 0.012, d - 0.012, h - 0.002).placed_at(x, -j * d - 0.006, k * h))
     return out

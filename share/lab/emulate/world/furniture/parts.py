@@ -1,4 +1,4 @@
-"""Small things that furniture is put together from."""
+"""Small parts that furniture is built from."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from share.lab.emulate.world.mesh import Rng, Shape, box, concat_shapes, decal
 
 Point3 = Sequence[float]
 
-# Pictures of each kind that one room owns; two where nothing is said. Few, so that they fit in memory.
+# Pictures of each kind in a room, two by default; few, so that they fit in memory.
 VARIANTS = {
     "cardboard": 4,
     "steel": 4,
@@ -25,12 +25,12 @@ VARIANTS = {
 
 
 def pick_material(rng: Rng, kind: str) -> Material:
-    """One of the room's materials of this kind."""
+    """Return one of the room's materials of this kind."""
     return Material(kind, int(rng.integers(VARIANTS.get(kind, 2))))
 
 
 def pick_print(rng: Rng, kind: str) -> tuple[Material, int]:
-    """One of the room's prints of this kind, and which cell of its picture."""
+    """Return one of the room's prints of this kind, and a cell of its picture."""
     skin = pick_material(rng, kind)
     return skin, int(rng.integers(skin.cells**2))
 
@@ -71,7 +71,7 @@ def corner_posts(width: float, depth: float, height: float, thick: float, skin: 
 
 
 def side_by_side(shapes: Sequence[Shape], gap: float) -> Shape:
-    """Things side by side with gaps between, their backs in one plane, the middle at x = 0."""
+    """Shapes side by side with gaps between, their backs in one plane, the middle at x = 0."""
     widths = [float(s.bounding_box[1, 0] - s.bounding_box[0, 0]) for s in shapes]
     at, out = -(sum(widths) + gap * (len(shapes) - 1)) / 2, []
     for shape, width in zip(shapes, widths, strict=True):

@@ -47,7 +47,7 @@ def steel_pillar(rng: Rng, side: float, height: float) -> Shape:
 
 
 def girder(rng: Rng, length: float, height: float) -> Shape:
-    """An I-beam along x; its top flange, z = `height`, belongs at the ceiling."""
+    """An I-beam along x; its top flange, z = `height`, touches the ceiling."""
     skin, t, w = pick_material(rng, "steel"), 0.018, 0.6 * height
     out = [box_on((0, 0, z), (length, w, t), skin, rng) for z in (0.0, height - t)]
     out.append(box_on((0, 0, t), (length, 0.014, height - 2 * t), skin, rng))

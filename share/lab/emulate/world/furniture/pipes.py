@@ -1,4 +1,4 @@
-"""Pipes, ducts and trays: along walls and under the ceiling."""
+"""Pipes, ducts and trays along walls and under the ceiling."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from share.lab.emulate.world.mesh import Rng, Shape, concat_shapes, cylinder, tu
 
 
 def pipe_run(rng: Rng, length: float, count: int) -> Shape:
-    """Parallel pipes along x with flanges, and the brackets that hold them from above (their top,
-    z = 0.45, belongs at the ceiling)."""
+    """Parallel pipes along x with flanges, and brackets that hold them from above (their top, z = 0.45,
+    touches the ceiling)."""
     out, y = [], 0.0
     for _ in range(count):
         r = float(rng.uniform(0.03, 0.08))
@@ -32,7 +32,7 @@ def pipe_run(rng: Rng, length: float, count: int) -> Shape:
 
 
 def duct(rng: Rng, length: float) -> Shape:
-    """A ventilation duct along x with flanges and outlets; its top, z = 0.5, belongs at the ceiling."""
+    """A ventilation duct along x with flanges and outlets; its top, z = 0.5, touches the ceiling."""
     skin, w, h = pick_material(rng, "galvanised"), rng.uniform(0.35, 0.6), rng.uniform(0.25, 0.4)
     out = [box_on((0, -w / 2, 0.5 - h - 0.06), (length, w, h), skin, rng)]
     for k in range(int(length / 1.2) + 1):
@@ -45,7 +45,7 @@ def duct(rng: Rng, length: float) -> Shape:
 
 
 def wall_pipes(rng: Rng, height: float) -> Shape:
-    """Pipes that climb a wall from the floor to `height`, with clips and a valve."""
+    """Pipes that run up a wall from the floor to `height`, with clips and a valve."""
     out, x = [], 0.0
     for _ in range(int(rng.integers(1, 4))):
         r, skin = float(rng.uniform(0.012, 0.04)), pick_material(rng, "steel")

@@ -20,8 +20,8 @@ _BEAM_M = 0.07
 
 
 def goods_rack(rng: Rng, width: float, depth: float, height: float, pitch: float) -> Shape:
-    """Posts, beams, boards about every `pitch` m, braced ends, cartons and bins on every level. The
-    goods on top stay below `height` + 0.35 m."""
+    """Posts, beams, boards about every `pitch` m, braced ends, cartons and bins on every level. The goods on
+    top stay below `height` + 0.35 m."""
     paint, beam, board = (
         pick_material(rng, "steel"),
         pick_material(rng, "steel"),
@@ -68,7 +68,7 @@ def _goods(rng: Rng, width: float, depth: float, room: float) -> list[Shape]:
 
 
 def _bins(rng: Rng, width: float, depth: float, height: float) -> list[Shape]:
-    """A row of open plastic bins with small things in them."""
+    """A row of open plastic bins with small objects in them."""
     count = max(1, int(width / 0.28))
     skin, pitch = pick_material(rng, "plastic"), width / count
     return [

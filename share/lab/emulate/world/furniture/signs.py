@@ -1,4 +1,4 @@
-"""What hangs on walls: signs, posters, boards, panels."""
+"""Signs, posters, boards and panels on walls."""
 
 from __future__ import annotations
 

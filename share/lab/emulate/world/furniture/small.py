@@ -1,4 +1,4 @@
-"""Small things that stand on a floor: cones, buckets, tool boxes, hand trucks."""
+"""Small objects on the floor: cones, buckets, tool boxes, hand trucks."""
 
 from __future__ import annotations
 

@@ -8,7 +8,8 @@ from share.lab.emulate.world.mesh import Rng, Shape, box, concat_shapes, cylinde
 
 
 def workbench(rng: Rng, width: float) -> Shape:
-    """A bench 0.6 m deep and 0.86 m high with a drawer block, a shelf below, a vice and things on its top."""
+    """A bench 0.6 m deep and 0.86 m high with a drawer block, a shelf below, a vice and small objects on its
+    top."""
     depth, top, skin, wood = 0.6, 0.86, pick_material(rng, "steel"), pick_material(rng, "wood")
     out = [
         corner_posts(width, depth, top - 0.05, 0.06, skin, rng),
@@ -39,7 +40,7 @@ def _drawers(rng: Rng, width: float, depth: float, top: float) -> list[Shape]:
 
 
 def _table_clutter(rng: Rng, width: float, depth: float) -> list[Shape]:
-    """Cartons, cans, a flat sheet: what lies on a bench, in slots of its own."""
+    """Cartons, cans and a flat sheet on a bench, side by side."""
     out, x = [], -width / 2
     while x < width / 2 - 0.3:
         kind, d = rng.random(), rng.uniform(0.15, depth)
@@ -57,13 +58,13 @@ def _table_clutter(rng: Rng, width: float, depth: float) -> list[Shape]:
 
 
 def _paper_sheet(rng: Rng, x: float, y: float) -> Shape:
-    """Paper that lies flat."""
+    """A sheet of paper that lies flat."""
     skin, cell = pick_print(rng, "notice")
     return decal((x, y, 0), (0.21, 0, 0), (0, 0.297, 0), skin, rng, cell)
 
 
 def table(rng: Rng, width: float, depth: float = 0.8) -> Shape:
-    """A plain table of 0.74 m with something on it."""
+    """A plain table of 0.74 m with small objects on it."""
     top = 0.74
     out = [
         corner_posts(width, depth, top - 0.03, 0.05, pick_material(rng, "steel"), rng),

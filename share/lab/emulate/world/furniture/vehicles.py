@@ -1,4 +1,4 @@
-"""Vehicles: a fire engine, a van. Their noses point to -y; y = 0 is the rear."""
+"""Vehicles: a fire engine, a van. Their fronts point to -y; y = 0 is the rear."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from share.lab.emulate.world.furniture.parts import box_on, pick_material, pick_
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import Rng, Shape, box, concat_shapes, cylinder, decal, polygon, prism, quad
 
+# Takes an outline (y, z), extruded along +z, to one extruded along x.
 _UPRIGHT = np.array([(0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1.0)])
-# an outline drawn as (y, z) and raised along +z comes to lie along x
 
 
 def _body(outline: list[tuple[float, float]], half: float, skin: Material, rng: Rng) -> Shape:
@@ -66,7 +66,7 @@ def _window_pane(
 
 
 def _lights(half: float, y: float, z: float, rng: Rng) -> list[Shape]:
-    """Head lamps, grille, bumper and plate of a nose in the plane y."""
+    """Head lamps, grille, bumper and plate of a front in the plane y."""
     glass, skin = Material("plastic", 1, gray=215), Material("rubber")
     out = [box_on((x * (half - 0.22), y - 0.015, z), (0.3, 0.03, 0.18), glass, rng) for x in (-1, 1)]
     out.append(
@@ -155,7 +155,7 @@ def van(rng: Rng, length: float) -> Shape:
     """A panel van of 1.9 m width and height."""
     half, top, nose = 0.92, 1.95, -length + 0.1
     paint = Material("lacquer", 1, gray=float(rng.choice([70, 110, 190])))
-    # begins at the rear: from there every corner can be seen, which a bonnet makes necessary
+    # starts at the rear, from where all corners are visible, as the fan of triangles needs
     outline = [
         (-0.05, 0.32),
         (-0.05, top),

@@ -1,4 +1,4 @@
-"""The rooms that come with SHARE, by name: seeded layouts."""
+"""The rooms that come with SHARE: seeded layouts by name."""
 
 from __future__ import annotations
 

@@ -17,23 +17,23 @@ from share.lab.emulate.world.scenes.shell import build_enclosure
 from share.types import F64
 
 _FROM_WALL, _HEIGHT = 1.3, 1.35  # m, of the board's middle
-_MAX_YAW, _MAX_LEAN = 0.25, 0.12  # rad, at most
-_BRIGHTNESS = 1.7  # so that exposures are short
+_MAX_YAW, _MAX_LEAN = 0.25, 0.12  # rad
+_BRIGHTNESS = 1.7  # bright, for short exposures
 
 
 def april_grid_scene(seed: int, size: Size) -> Layout:
-    """With Kalibr's usual AprilGrid: 6 x 6 tags of 88 mm."""
+    """The room with Kalibr's usual AprilGrid: 6 x 6 tags of 88 mm."""
     return board_scene(AprilGrid(), seed, size)
 
 
 def charuco_scene(seed: int, size: Size) -> Layout:
-    """With a ChArUco board of 9 x 7 squares of 80 mm."""
+    """The room with a ChArUco board of 9 x 7 squares of 80 mm."""
     return board_scene(CharucoBoard(), seed, size)
 
 
 def board_scene(target: Target, seed: int, size: Size) -> Layout:
-    """The room with any target in it: it stands before the wall at x = 0 and looks along +x, turned and
-    leaning a little, as the seed says."""
+    """The room with a given target before the wall at x = 0, looking along +x, turned and tilted a little by
+    the seed."""
     rng = np.random.default_rng([seed, 17])
     plan = LayoutBuilder("board", seed, size, rng)
     dull = Material("plaster", 0, gray=120, contrast=0.5)
@@ -43,15 +43,15 @@ def board_scene(target: Target, seed: int, size: Size) -> Layout:
     T = _board_pose(target, size, rng)
     plan.add_to_shell(
         "board", board.board_on_stand(target, T, rng), is_reserved=True
-    )  # no path may remove it
+    )  # in the shell, so that no path removes it
     xs, ys = [size[0] * f for f in (0.3, 0.55, 0.8)], [size[1] * f for f in (0.2, 0.5, 0.8)]
     fill.light_tubes(plan, xs, ys, 1.2, 0.0)
     return replace(plan.to_layout(ambient=0.6), brightness=_BRIGHTNESS, target=PlacedTarget(target, T))
 
 
 def _board_pose(target: Target, size: Size, rng: np.random.Generator) -> F64:
-    """T_world_target (4, 4): its middle at a fixed place."""
-    upright = np.array([(0.0, 0, 1), (1, 0, 0), (0, 1, 0)])  # x right, y up, z out, of one who looks at -x
+    """Return T_world_target (4, 4), with the target's middle at a fixed place."""
+    upright = np.array([(0.0, 0, 1), (1, 0, 0), (0, 1, 0)])  # x right, y up, z out, as seen along -x
     yaw, lean, roll = rng.uniform(-1, 1, 3) * (_MAX_YAW, _MAX_LEAN, 0.03)
     R = se3.so3_exp(np.array([0, 0, yaw])) @ se3.so3_exp(np.array([roll, lean, 0])) @ upright
     middle = np.array([*target.extent.mean(axis=0), 0])

@@ -1,9 +1,8 @@
-"""Two long corridors that look alike, round one core: to provoke wrong merges.
+"""Two long corridors that look alike, around one core, to provoke wrong merges.
 
-The whole is a ring: the corridors run along x on both sides of the core, short passages join them at
-both ends. The south corridor is the north one turned by half a turn about the room's middle, so whoever
-walks round the ring sees the same twice; only what `_add_differences` adds tells them apart. The passages
-differ.
+The whole is a ring: the corridors run along x on both sides of the core, short passages join them at both
+ends. The south corridor is the north one turned by half a turn about the room's middle, so a walk around the
+ring passes the same views twice; only what `_add_differences` adds distinguishes them. The passages differ.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from share.types import F64
 
 
 def corridor_widths(size: Size) -> tuple[float, float]:
-    """Of the corridors and of the passages at their ends, m."""
+    """Return the widths of the corridors and of the passages at their ends, m."""
     return min(2.6, 0.37 * size[1]), min(2.8, 0.27 * size[0])
 
 
 def twin_corridors(size: Size) -> tuple[F64, F64, F64]:
-    """The two areas that look alike, and how they correspond: lower and upper corner (2, 2) m of the
-    north and of the south corridor, and T_south_north (4, 4), which takes the one to the other."""
+    """Return the two areas that look alike and their correspondence: lower and upper corner (2, 2) m of the
+    north and of the south corridor, and T_south_north (4, 4), which takes the north one to the south one."""
     x, y, _ = size
     width, end = corridor_widths(size)
     north = np.array([(end, y - width), (x - end, y)])
@@ -41,7 +40,7 @@ def twin_corridors(size: Size) -> tuple[F64, F64, F64]:
 
 
 def corridor_twins(seed: int, size: Size) -> Layout:
-    """One corridor is furnished, then copied; the passages get furniture of their own."""
+    """One corridor is furnished, then copied; the passages have their own furniture."""
     rng = np.random.default_rng([seed, 14])
     plan = LayoutBuilder("corridor-twins", seed, size, rng)
     _, _, T = twin_corridors(size)
@@ -62,7 +61,7 @@ def corridor_twins(seed: int, size: Size) -> Layout:
 
 
 def _core(size: Size) -> Walls:
-    """The walls of the core, seen from outside it: north, east, south, west."""
+    """Return the walls of the core, seen from outside it: north, east, south, west."""
     x, y, z = size
     wide, end = corridor_widths(size)
     (west, south), (east, north) = (end, wide), (x - end, y - wide)
@@ -75,7 +74,7 @@ def _core(size: Size) -> Walls:
 
 
 def _build_shell(plan: LayoutBuilder, outer: Walls, inner: Walls) -> None:
-    """One half of walls, floor and ceiling, and the same turned: nothing tells one half from the other."""
+    """One half of walls, floor and ceiling, and the same turned, so that the halves are identical."""
     rng, (x, y, z), T = plan.rng, plan.size, twin_corridors(plan.size)[2]
     paint = [(z, Material("plaster"))]
     floor = Material(str(rng.choice(["tiles", "planks", "carpet"])))
@@ -91,14 +90,14 @@ def _build_shell(plan: LayoutBuilder, outer: Walls, inner: Walls) -> None:
 
 
 def _core_caps(plan: LayoutBuilder) -> list[Shape]:
-    """Bottom and top of the core: nobody sees them, but with them it is closed, hence solid."""
+    """Return bottom and top of the core, never visible, which make it closed and so solid."""
     (x, y, z), (wide, end) = plan.size, corridor_widths(plan.size)
     skin, long, short = Material("plaster"), (x - 2 * end, 0, 0), (0, y - 2 * wide, 0)
     return [quad((end, wide, z), long, short, skin), quad((end, wide, 0), short, long, skin)]
 
 
 def _add_thresholds(plan: LayoutBuilder) -> None:
-    """A metal strip in the floor of each passage, where the halves meet."""
+    """A metal strip in the floor of each passage where the halves meet."""
     (x, y, _), (_, end) = plan.size, corridor_widths(plan.size)
     for left in (0.0, x - end):
         strip = decal(
@@ -145,7 +144,7 @@ _HANGINGS: dict[str, tuple[float, ShapeMaker]] = {
 
 
 def _furnish_passage(plan: LayoutBuilder, outer: Wall, core: Wall) -> None:
-    """An end of the ring: a window or a door, furniture of its own, a lamp."""
+    """An end of the ring: a window or a door, its own furniture, a lamp."""
     rng = plan.rng
     if rng.random() < 0.5:
         fill.add_window(
@@ -161,7 +160,7 @@ def _furnish_passage(plan: LayoutBuilder, outer: Wall, core: Wall) -> None:
 
 
 def _add_differences(plan: LayoutBuilder, inner: Walls) -> None:
-    """One small thing more on each side, so that the truth can be told by looking closely."""
+    """One more small object on each side, so that the corridors can be told apart by details."""
     for wall in (inner[0], inner[2]):
         fill.hang_on_wall(plan, wall, {"notice": (1, signs.notice)}, 1, 1.7)
 

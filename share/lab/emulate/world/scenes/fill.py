@@ -1,4 +1,4 @@
-"""Ways to fill a room: along walls, on walls, under the ceiling, on the floor."""
+"""Fill a room: along walls, on walls, under the ceiling, on the floor."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Wall
 
 ShapeMaker = Callable[[Rng], Shape]
 
-_SEARCH_STEP_M = 0.1  # m; how far something is moved on that finds no place
+_SEARCH_STEP_M = 0.1  # step of the search for a free place
 
 
 def choose_weighted(rng: Rng, weights: Mapping[str, float]) -> str:
-    """One of the names, by weight."""
+    """Return one of the names, drawn by weight."""
     share = np.array(list(weights.values()))
     return str(rng.choice(list(weights), p=share / share.sum()))
 
@@ -30,8 +30,8 @@ def furnish_wall(
     gaps: tuple[float, float],
     end_share: float = 1.0,
 ) -> None:
-    """Things with their backs to a wall, from left to right, with gaps (low, high) m between them, as
-    far as a share `end_share` of it. makers: by name, how often and how it is made."""
+    """Place furniture with its back to a wall, from left to right, with gaps (low, high) m between, up to a
+    share `end_share` of the wall. makers: by name, weight and function."""
     rng, weights = plan.rng, {name: weight for name, (weight, _) in makers.items()}
     position = rng.uniform(*gaps)
     while position < end_share * wall.length - 0.3:
@@ -43,8 +43,8 @@ def furnish_wall(
 def place_on_wall(
     plan: LayoutBuilder, wall: Wall, name: str, shape: Shape, left: float, search_m: float = 1.0
 ) -> float:
-    """Put something at the first free place at or after `left` m, within `search_m`; how far it reaches
-    from `left`, or 0 if there was none."""
+    """Place a shape at the first free place at or after `left` m, within `search_m`; return how far it
+    reaches from `left`, or 0 if there was none."""
     wide = float(shape.bounding_box[1, 0] - shape.bounding_box[0, 0])
     for shift in np.arange(0, search_m, _SEARCH_STEP_M):
         if left + shift + wide > wall.length:
@@ -58,7 +58,8 @@ def place_on_wall(
 def place_centred(
     plan: LayoutBuilder, wall: Wall, name: str, shape: Shape, position: float, clear: float = 0.0
 ) -> bool:
-    """Put something at a place along a wall, and keep `clear` m before it free of furniture."""
+    """Place a shape at a position along a wall, and keep `clear` m before it free of furniture; return
+    whether it was free."""
     moved = wall.place(shape, position)
     if not plan.add_if_free(name, moved):
         return False
@@ -69,15 +70,15 @@ def place_centred(
 
 
 def _reserved_box(half: float, clear: float) -> Shape:
-    """The place before something `half` m to each side of its middle."""
+    """Return the space before an object that extends `half` m to each side of its middle."""
     return box((-half, -clear - 0.4, 0), (half, -0.4, 2.0), Material("paint"))
 
 
 def hang_on_wall(
     plan: LayoutBuilder, wall: Wall, makers: Mapping[str, tuple[float, ShapeMaker]], count: int, top: float
 ) -> None:
-    """`count` things on the free parts of a wall, their middles between 1.2 and `top` m; what finds no
-    place in a few tries is left out."""
+    """Hang `count` objects on free parts of a wall, their middles between 1.2 and `top` m; leave out those
+    that find no place in eight tries."""
     rng, weights = plan.rng, {name: weight for name, (weight, _) in makers.items()}
     for _ in range(count):
         name = choose_weighted(rng, weights)
@@ -95,7 +96,7 @@ def hang_on_wall(
 def light_tubes(
     plan: LayoutBuilder, xs: Sequence[float], ys: Sequence[float], length: float, drop: float
 ) -> None:
-    """Fluorescent lamps along x at a grid of places; each a little brighter or darker, a few dead."""
+    """Fluorescent lamps along x on a grid; brightness varies, a few are off."""
     z, rng = plan.size[2], plan.rng
     for x in xs:
         for y in ys:
@@ -105,7 +106,7 @@ def light_tubes(
 
 
 def light_bells(plan: LayoutBuilder, xs: Sequence[float], ys: Sequence[float], drop: float) -> None:
-    """High-bay lamps at a grid of places."""
+    """High-bay lamps on a grid."""
     z, rng = plan.size[2], plan.rng
     for x in xs:
         for y in ys:
@@ -116,7 +117,8 @@ def light_bells(plan: LayoutBuilder, xs: Sequence[float], ys: Sequence[float], d
 def add_window(
     plan: LayoutBuilder, wall: Wall, position: float, sill: float, shape: Shape, power: float
 ) -> bool:
-    """A window on a wall, its sill `sill` m up, and the light that falls through it."""
+    """A window on a wall, its sill `sill` m up, with the light through it; return whether the place was
+    free."""
     if not plan.add_if_free("window", wall.place(shape, position, sill)):
         return False
     width, height = float(np.ptp(shape.bounding_box[:, 0])), float(np.ptp(shape.bounding_box[:, 2]))

@@ -1,4 +1,4 @@
-"""A fire station's hall: wide, plain walls and floor, a vehicle or two, little else. Few cues."""
+"""A fire station's hall: large, plain walls and floor, a vehicle or two, little else. Few features."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from share.lab.emulate.world.scenes.fill import ShapeMaker
 from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Size, Wall, outer_walls
 from share.lab.emulate.world.scenes.shell import add_floor_joints, add_skirting, build_enclosure
 
-_AISLE_M = 1.75  # m; round the vehicles
-_MIN_WALKABLE = 0.3  # of the floor, at least, is left to walk on
+_AISLE_M = 1.75  # around the vehicles
+_MIN_WALKABLE = 0.3  # least share of the floor that is left to walk on
 
 
 def firestation(seed: int, size: Size) -> Layout:
-    """Vehicles that look at the roller doors of the east wall; gear along the other walls."""
+    """Vehicles that face the roller doors of the east wall; gear along the other walls."""
     rng = np.random.default_rng([seed, 12])
     plan = LayoutBuilder("firestation", seed, size, rng)
     walls = outer_walls(size)
@@ -47,7 +47,7 @@ def firestation(seed: int, size: Size) -> Layout:
 
 
 def _build_shell(plan: LayoutBuilder, walls: tuple[Wall, ...]) -> None:
-    """Paint, darker up to the height of a shoulder; a smooth floor."""
+    """Paint, darker up to shoulder height; a smooth floor."""
     rng = plan.rng
     dado = Material("paint", 0, gray=float(rng.uniform(85, 125)))
     wall = Material("paint", 1, gray=float(rng.uniform(145, 170)))
@@ -60,7 +60,7 @@ def _build_shell(plan: LayoutBuilder, walls: tuple[Wall, ...]) -> None:
 
 
 def _lane_positions(size: Size) -> list[float]:
-    """The y of each vehicle's middle."""
+    """Return the y of each vehicle's middle."""
     count = max(1, min(4, int((size[1] - 1.5) / 3.7)))
     return [size[1] * (k + 0.5) / count for k in range(count)]
 
@@ -75,7 +75,7 @@ def _add_doors(plan: LayoutBuilder, wall: Wall, lanes: list[float]) -> None:
 
 
 def _add_vehicles(plan: LayoutBuilder, lanes: list[float]) -> None:
-    """One a lane; the first always, in large halls a lane may be empty."""
+    """One vehicle a lane; the first always, in large halls a lane may be empty."""
     x, rng = plan.size[0], plan.rng
     for k, y in enumerate(lanes):
         if k and rng.random() < 0.25:

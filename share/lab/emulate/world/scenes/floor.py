@@ -1,4 +1,4 @@
-"""The floor that furniture leaves to walk on."""
+"""Free floor between the furniture."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 
 from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder
 
-_STEP = 0.1  # m
-_WALKER_CLEARANCE_M = 0.45  # m; how far from all things the middle of a walker stays
-_MIN_OBSTACLE_M, _MAX_OBSTACLE_M = 0.1, 1.9  # m; what stands between these heights is in the way
+_STEP = 0.1
+_WALKER_CLEARANCE_M = 0.45  # least distance of a walker's middle from objects
+_MIN_OBSTACLE_M, _MAX_OBSTACLE_M = 0.1, 1.9  # obstacles are objects between these heights
 
 
 def clear_floor(plan: LayoutBuilder, min_share: float, names: Collection[str]) -> None:
-    """Take things of these `names` away again, the last first, until `min_share` of the floor can be walked
-    on in one piece, or there are none left."""
+    """Remove pieces of these `names`, the last first, until a connected share `min_share` of the floor is
+    walkable, or none are left."""
     while walkable_share(plan) < min_share:
         removed = next((p for p in reversed(plan.pieces) if p.name.rpartition(" ")[0] in names), None)
         if removed is None:
@@ -24,8 +24,8 @@ def clear_floor(plan: LayoutBuilder, min_share: float, names: Collection[str]) -
 
 
 def walkable_share(plan: LayoutBuilder) -> float:
-    """The largest connected place for a walker's middle, as a share of the floor; things count as the
-    boxes round them, so it is a little less than `Occupancy` finds."""
+    """Return the largest connected area for a walker's middle, as a share of the floor; objects count as
+    their boxes, so it is a little less than by `Occupancy`."""
     import cv2
 
     free = np.ones(np.ceil(np.array(plan.size[:2]) / _STEP - 1e-6).astype(int), np.uint8)

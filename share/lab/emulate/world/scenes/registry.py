@@ -1,4 +1,4 @@
-"""Every scene by its name, what it is for, and how large it may be."""
+"""Every scene by name, with its purpose and its range of sizes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from share.lab.emulate.world.scenes.whitewall import whitewall
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """furnish: (seed, size) -> layout. Sizes in m, (x, y, z): the usual one and the limits."""
+    """furnish: (seed, size) -> layout. Sizes in m, (x, y, z): the default and the limits."""
 
     description: str
     furnish: Callable[[int, Size], Layout]
@@ -58,11 +58,10 @@ SCENES = {
 
 
 def make_scene_layout(name: str, seed: int, size: Size | None = None) -> Layout:
-    """The room `name` of this seed; `size` (x, y, z) m instead of its usual one. The same arguments give
-    the same room, another seed another one. Raises UsageError for an unknown scene or a size it cannot
-    be built in, ValueError for a negative seed."""
+    """Return the room `name` of this seed; `size` (x, y, z) m instead of its default. Deterministic. Raises
+    UsageError for an unknown scene or an unsupported size, ValueError for a negative seed."""
     if name not in SCENES:
-        raise UsageError(f"no scene is named '{name}'; there are: {', '.join(SCENES)}")
+        raise UsageError(f"scene '{name}' is not known; known: {', '.join(SCENES)}")
     if seed < 0:
         raise ValueError(f"seed {seed} must not be negative")
     scene = SCENES[name]

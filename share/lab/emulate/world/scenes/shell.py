@@ -13,11 +13,11 @@ from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import Rng, Shape, concat_shapes, decal, panels, quad
 from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Wall, outer_walls
 
-BAY_M = 3.0  # m; about how far apart columns and girders stand
+BAY_M = 3.0  # about, between columns and girders
 
 
 def bay_joints(length: float, pitch: float = BAY_M) -> list[float]:
-    """Where the bays of a wall meet, m from its left end, without the ends."""
+    """Return where the bays of a wall meet, m from its left end, without the ends."""
     count = max(1, round(length / pitch))
     return [length * k / count for k in range(1, count)]
 
@@ -26,7 +26,7 @@ Bands = Sequence[tuple[float, Material]]  # of a wall, lowest first: (upper edge
 
 
 def wall_surface(wall: Wall, bands: Bands, rng: Rng, pitch: float = np.inf) -> Shape:
-    """The wall itself, in bays of about `pitch` m that repeat nowhere; the joints between them show."""
+    """Return the wall in bays of about `pitch` m without repetition; the joints between them show."""
     edges, out = [0.0, *bay_joints(wall.length, pitch), wall.length], []
     for left, right in pairwise(edges):
         low = 0.0

@@ -1,4 +1,4 @@
-"""A warehouse: racks with cartons, pallets, pillars, signs, pipes, lamps and windows. Much to see."""
+"""A warehouse: racks with cartons, pallets, pillars, signs, pipes, lamps and windows. Many features."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from share.lab.emulate.world.scenes.shell import (
     build_enclosure,
 )
 
-_ROW_DEPTH_M = 0.85  # m; depth of a row of islands
+_ROW_DEPTH_M = 0.85  # depth of a row of islands
 _GIRDER_M = 0.3
 
 
@@ -102,7 +102,7 @@ def _random_bay_middle(rng: Rng, wall: Wall) -> float:
 
 
 def _belt_depth(size: Size) -> float:
-    """How deep furniture along walls may be: little in a small room, where people must pass."""
+    """Return the largest depth of furniture along walls: small in a small room, where people must pass."""
     return 0.62 if min(size[:2]) < 8 else 1.1
 
 
@@ -117,7 +117,7 @@ def _rack_height(size: Size) -> float:
 
 
 def _wall_furniture(size: Size) -> dict[str, tuple[float, ShapeMaker]]:
-    """What stands along walls, not deeper than 0.62 m: how often, and how it is made."""
+    """Return furniture along walls, at most 0.62 m deep: weight and function by name."""
     top = _rack_height(size)
 
     def rack(rng: Rng) -> Shape:
@@ -143,7 +143,7 @@ def _wall_furniture(size: Size) -> dict[str, tuple[float, ShapeMaker]]:
     }
 
 
-_DEEP_FURNITURE: dict[str, tuple[float, ShapeMaker]] = {  # only where there is room for it
+_DEEP_FURNITURE: dict[str, tuple[float, ShapeMaker]] = {  # only where there is space for it
     "loaded pallet": (2, lambda r: pallets.loaded_pallet(r, r.uniform(0.7, 1.8))),
     "pallets": (0.8, lambda r: pallets.pallet_pile(r, int(r.integers(3, 9)))),
     "step ladder": (0.4, lambda r: ladders.step_ladder(r, r.uniform(0.9, 1.7))),
@@ -161,7 +161,7 @@ _HANGINGS: dict[str, tuple[float, ShapeMaker]] = {
 
 
 def _add_islands(plan: LayoutBuilder) -> None:
-    """Rows of islands along x; between them, round them and at gaps in them one can pass."""
+    """Rows of islands along x, with aisles between and around them and gaps in them."""
     x, y, _ = plan.size
     rng, margin = plan.rng, _belt_depth(plan.size) + (1.6 if y < 8 else 1.7)
     aisle = rng.uniform(1.8, 2.3)
@@ -195,7 +195,7 @@ def _pillar(rng: Rng, height: float) -> Shape:
 
 
 def _add_island(plan: LayoutBuilder, left: float, right: float, y: float) -> float:
-    """Racks end to end, or things on pallets, from `left` as far as `right` allows; where it ended."""
+    """Racks end to end, or loads on pallets, from `left` as far as `right` allows; return where they end."""
     rng = plan.rng
     racks = rng.random() < (0.35 if right - left < 2 else 0.7)
     while right - left > 0.6:
@@ -215,14 +215,14 @@ def _add_island(plan: LayoutBuilder, left: float, right: float, y: float) -> flo
 
 
 def _double_rack(plan: LayoutBuilder, width: float) -> Shape:
-    """A rack in the middle: low under a low roof, that one sees over it."""
+    """A rack in the middle of the room, low under a low roof so that one can look over it."""
     rng, highest = plan.rng, _rack_height(plan.size)
     height = rng.uniform(1.5, min(2.4, highest)) if plan.size[2] < 5 else rng.uniform(0.6, 1) * highest
     return shelving.goods_rack(rng, width, rng.uniform(0.6, _ROW_DEPTH_M), height, rng.uniform(0.5, 0.9))
 
 
 def _floor_goods(rng: Rng, room: float) -> tuple[str, Shape]:
-    """Something that stands in the middle of a warehouse and is narrower than `room` m."""
+    """Return name and shape of something in the middle of a warehouse, narrower than `room` m."""
     if room > 4 and rng.random() < 0.3:
         return "forklift", forklift.forklift(rng).placed_at(0, 0, 0, -np.pi / 2)
     kind = str(rng.choice(["loaded pallet", "pallets", "table", "crate", "drums", "cartons", "pallet truck"]))

@@ -1,4 +1,4 @@
-"""A bare room with white walls: next to nothing to see."""
+"""A bare room with white walls, almost without features."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from share.lab.emulate.world.scenes.shell import add_skirting, build_enclosure
 
 
 def whitewall(seed: int, size: Size) -> Layout:
-    """A door, a radiator, a table with chairs, one or two small things on the walls."""
+    """A door, a radiator, a table with chairs, one or two small objects on the walls."""
     rng = np.random.default_rng([seed, 13])
     plan = LayoutBuilder("whitewall", seed, size, rng)
     walls = outer_walls(size)

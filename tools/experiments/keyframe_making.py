@@ -1,0 +1,105 @@
+"""From a recipe to a set of keyframes: room and motions of `share emulate`, with few of the frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from keyframe_odometry import Drift, odometry
+from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
+from keyframe_views import views
+
+from share.geometry import se3
+from share.lab.emulate.preparation import PreparedSession, keep_room, prepare_session
+from share.lab.emulate.progress import Progress, no_progress
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.recordings import true_trajectory
+from share.lab.emulate.stage import Actor
+from share.protocol.agent_ledger import KeyframeChain
+from share.recordings.trajectory import Trajectory
+from share.types import F64, I64, Keyframe, KeyframeCandidate, View
+from share.wire.messages import Hello
+
+_POINTS = 500  # of a view, as a tracker has
+_STREAM = 81  # of random numbers, not used by the emulator
+
+
+def make(recipe: SessionRecipe, every: Spacing, workers: int, progress: Progress) -> KeyframeSet:
+    """Return the set without saving it. Raises UsageError, ConfigError or DataError for an invalid recipe,
+    RenderError where this machine cannot draw."""
+    with TemporaryDirectory(prefix="keyframes-") as folder:
+        prepared = prepare_session(recipe, Path(folder) / "room", progress)
+        keep_room(prepared, progress)
+        chosen = [_chosen(actor, every) for actor in prepared.stage.actors]
+        seen = views(prepared.stage, [at for at, _ in chosen], recipe.images, workers, progress)
+    return _set(recipe, every, prepared, [truth for _, truth in chosen], seen)
+
+
+def make_unseen(recipe: SessionRecipe, every: Spacing) -> KeyframeSet:
+    """Return the same set with views of the same size but without content, with depths drawn from 1 to 8 m,
+    one a view. Takes seconds, and needs no OpenGL."""
+    rng = np.random.default_rng((recipe.seed, _STREAM))
+    with TemporaryDirectory(prefix="keyframes-") as folder:
+        prepared = prepare_session(recipe, Path(folder) / "room", no_progress)
+    truths = [_chosen(actor, every)[1] for actor in prepared.stage.actors]
+    uv = rng.uniform(-0.5, 0.5, (_POINTS, 2)).astype(np.float32)
+    rays, nothing = np.c_[uv, np.ones(len(uv), np.float32)], np.zeros((len(uv), 32), np.uint8)
+    seen = [[View(uv, rays * rng.uniform(1.0, 8.0), nothing) for _ in truth.stamps_ns] for truth in truths]
+    return _set(recipe, every, prepared, truths, seen)
+
+
+def _set(
+    recipe: SessionRecipe,
+    every: Spacing,
+    prepared: PreparedSession,
+    truths: list[Trajectory],
+    seen: list[list[View]],
+) -> KeyframeSet:
+    agents = {
+        actor.name: _agent(actor, truth, shown, np.random.default_rng((recipe.seed, _STREAM, k)))
+        for k, (actor, truth, shown) in enumerate(zip(prepared.stage.actors, truths, seen, strict=True))
+    }
+    x, y, z = (float(v) for v in prepared.layout.size)
+    return KeyframeSet(recipe, every, (x, y, z), agents)
+
+
+def spaced(truth: Trajectory, every: Spacing) -> I64:
+    """Return the indices (N,) of keyframes: the first pose, and each that is far enough from the keyframe
+    before."""
+    chosen = [0]
+    for k in range(1, len(truth.stamps_ns)):
+        last = chosen[-1]
+        T = se3.inverse(truth.T[last]) @ truth.T[k]
+        far = np.linalg.norm(T[:3, 3]) >= every.metres or se3.rotation_angle(T) >= every.radians
+        if far and truth.stamps_ns[k] - truth.stamps_ns[last] >= every.seconds * 1e9:
+            chosen.append(k)
+    return np.array(chosen, np.int64)
+
+
+def _chosen(actor: Actor, every: Spacing) -> tuple[I64, Trajectory]:
+    """Return the indices (N,) of the actor's keyframes among its pictures, and their true poses."""
+    known, truth = true_trajectory(actor)
+    at = spaced(truth, every)
+    return known[at], Trajectory(truth.stamps_ns[at], truth.T[at])
+
+
+def _agent(actor: Actor, truth: Trajectory, seen: list[View], rng: np.random.Generator) -> AgentKeyframes:
+    run_id = int(rng.integers(2**63))
+    hello = Hello(actor.name, actor.kind, run_id, actor.rig)
+    T_odom_body, cov = odometry(truth.T, truth.stamps_ns, rng, Drift())
+    return AgentKeyframes(hello, _chained(T_odom_body, cov, truth.stamps_ns, seen), truth.T, T_odom_body)
+
+
+def _chained(T_odom_body: F64, cov: F64, stamps_ns: I64, seen: list[View]) -> tuple[Keyframe, ...]:
+    """Return all candidates as sent keyframes. As with a tracker, up is the z of odom."""
+    before = np.concatenate([np.eye(4)[None], T_odom_body[:-1]])
+    T_last_body = se3.orthonormal(se3.inverse(before) @ T_odom_body)
+    chain, out = KeyframeChain(), []
+    for T, T_last, step, stamp_ns, view in zip(
+        T_odom_body, T_last_body, cov, stamps_ns.tolist(), seen, strict=True
+    ):
+        candidate = KeyframeCandidate(T, T_last, step, T[2, :3], Drift().tilt_rad, view)
+        chain.extend(candidate)
+        out.append(chain.make_keyframe(candidate, stamp_ns))
+    return tuple(out)

@@ -1,0 +1,77 @@
+"""Many agents from a few recorded ones: they walk the same tracks, each from another start.
+
+Every view is that of the track with descriptor bits flipped and image points and depths moved, so that no two
+are equal; odometry is drawn for each agent. At the end of a track the agent starts it again as a new odometry
+segment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from keyframe_odometry import Drift, odometry
+from keyframe_set import AgentKeyframes, KeyframeSet
+
+from share.geometry import se3
+from share.types import F64, I64, U8, Keyframe, View
+from share.wire.messages import Hello
+
+RATE_HZ = 3.0  # of keyframes
+_FLIPPED = 0.04  # share of the descriptors' bits
+_PIXELS = 0.3  # standard deviation of an image point
+_INVERSE_DEPTH = 0.003  # 1/m, standard deviation of inverse depths
+_FIRST_NS = 1_000_000_000
+
+
+class Walker:
+    """An agent without end. index: decides its run id and all random numbers."""
+
+    def __init__(self, made: KeyframeSet, index: int) -> None:
+        tracks = list(made.agents.values())
+        self._track: AgentKeyframes = tracks[index % len(tracks)]
+        self._rng = np.random.default_rng((index, 6))
+        hello = self._track.hello
+        self.hello = Hello(f"agent{index}", hello.kind, int(self._rng.integers(2**63)), hello.rig)
+
+    def keyframes(self) -> Iterator[Keyframe]:
+        """Yield its keyframes at `RATE_HZ`."""
+        number, first = 0, int(self._rng.integers(len(self._track.keyframes)))
+        while True:
+            at = np.arange(first, len(self._track.keyframes))
+            yield from self._lap(number, at)
+            number, first = number + len(at), 0
+
+    def _lap(self, number: int, at: I64) -> Iterator[Keyframe]:
+        """Yield keyframes `at` of the track as one segment, with ids from `number` on."""
+        stamps_ns = _FIRST_NS + ((number + np.arange(len(at))) * (1e9 / RATE_HZ)).astype(np.int64)
+        T, cov = odometry(self._track.T_world_body[at], stamps_ns, self._rng, Drift())
+        for k, source in enumerate(at.tolist()):
+            yield Keyframe(
+                number + k,
+                number + k - 1 if k else -1,
+                int(stamps_ns[k]),
+                se3.inverse(T[k - 1]) @ T[k] if k else T[k],
+                cov[k],
+                T[k],
+                _up(T[k]),
+                Drift().tilt_rad,
+                self._seen_anew(self._track.keyframes[source].view),
+                number + k - 1,
+            )
+
+    def _seen_anew(self, view: View) -> View:
+        n, rng = len(view), self._rng
+        uv = view.uv + rng.normal(0, _PIXELS / self.hello.rig.cam0.focal, (n, 2)).astype(np.float32)
+        rho = np.maximum(1 / view.points[:, 2] + rng.normal(0, _INVERSE_DEPTH, n), 1e-3)
+        points = np.column_stack([uv, np.ones(n)]) / rho[:, None]
+        return replace(view, uv=uv, points=points, descriptors=view.descriptors ^ self._flips(n))
+
+    def _flips(self, n: int) -> U8:
+        return np.packbits(self._rng.random((n, 256), np.float32) < _FLIPPED, axis=1)
+
+
+def _up(T_odom_body: F64) -> F64:
+    """Return the up direction in the body frame."""
+    return T_odom_body[2, :3]

@@ -1,0 +1,93 @@
+"""Recall and precision of place recognition, on real recordings and in emulated rooms. Prints JSON.
+
+    python tools/experiments/measure_places.py --data FOLDER [--emulated] [--far 2000] [--picture FILE.png]
+
+FOLDER holds the stereo keyframes and the RGB-D kitchen of docs/understand/mapping.md. True pairs are nearer than 1 m
+and 30 degrees; an accepted pose is wrong by more than 0.25 m or 5 degrees. Of the false pairs, --far are
+tried and stand for all. --emulated: warehouse, firestation and corridor-twins as well (made once, which takes
+minutes).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from share import startup
+
+startup.prepare_process()
+
+import numpy as np  # noqa: E402
+from keyframe_set import Spacing  # noqa: E402
+from places_curves import Point, Tried, point, recall_at, tried  # noqa: E402
+from places_data import FIRESTATION, TWINS, WAREHOUSE, Views, emulated, real  # noqa: E402
+from places_picture import draw  # noqa: E402
+from tool_main import exit_code  # noqa: E402
+
+from share.config import PlaceConfig  # noqa: E402
+
+INLIERS = (8, 10, 12, 14, 16, 18, 20, 24, 28, 32, 40, 50, 65, 80, 100, 130, 160, 200)
+SIGMAS = (0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--emulated", action="store_true")
+    parser.add_argument("--far", type=int, default=2000)
+    parser.add_argument("--picture", type=Path)
+    options = parser.parse_args()
+    return exit_code("measure_places", lambda: measure(options))
+
+
+def measure(options: argparse.Namespace) -> None:
+    config = PlaceConfig()
+    rooms = real(options.data)
+    if options.emulated:
+        rooms += [emulated(WAREHOUSE, Spacing(), 6), emulated(FIRESTATION, Spacing(), 6)]
+        rooms += [emulated(TWINS, Spacing(0.3, 0.35), 2)]
+    recalls, curves, here = {}, {}, {}
+    for views in rooms:
+        recalls[views.name], served = recall_at(views, [v for v in rooms if v is not views], config)
+        pairs = tried(views, config, options.far)
+        curves[views.name] = over_both(pairs, config)
+        here[views.name] = point(pairs, config.min_inliers, config.max_sigma_deg)
+        row = report(views, recalls[views.name], served, pairs, here[views.name])
+        print(json.dumps(row), flush=True)
+    if options.picture:
+        draw(options.picture, recalls, curves, here)
+
+
+def over_both(pairs: Tried, config: PlaceConfig) -> tuple[list[Point], list[Point]]:
+    """Return curves over inliers at the allowed sigma, and over sigma at the allowed inliers."""
+    inliers = [point(pairs, n, config.max_sigma_deg) for n in INLIERS]
+    return inliers, [point(pairs, config.min_inliers, sigma) for sigma in SIGMAS]
+
+
+def report(views: Views, recall: Any, served: float, pairs: Tried, here: Point) -> dict[str, Any]:
+    return {
+        "room": views.name,
+        "views": len(views.sights),
+        "true_pairs": int(pairs.true.sum()),
+        "tried": len(pairs.true),
+        "recall_at": {k: round(float(recall[k - 1]), 3) for k in (1, 4, 8, 12, 20, 50)},
+        "views_served_by_8": round(served, 3),
+        "accepted": here.accepted,
+        "wrong": here.wrong,
+        "by_the_twins_transform": here.twins,
+        "recall": round(here.recall, 3),
+        "recall_without_wrong": round(without_wrong(pairs), 3),
+    }
+
+
+def without_wrong(pairs: Tried) -> float:
+    """Return the best recall by limits on inliers and sigma that accept nothing wrong."""
+    points = [point(pairs, n, sigma) for n in INLIERS for sigma in SIGMAS]
+    return float(np.max([p.recall for p in points if p.wrong == 0], initial=0.0))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

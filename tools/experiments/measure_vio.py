@@ -1,0 +1,102 @@
+"""Accuracy of the inertial tracker over 60 s: emulated sequences x seeds. Prints a Markdown table.
+
+    python tools/experiments/measure_vio.py [--only NAME] [--seeds 101,102,103] [--data FOLDER] [--again]
+
+Causal poses of every frame. Sessions are made once (minutes each) and kept in the cache; a run by the same
+code is not repeated. In --out: a JSON and the series of each run, table.md; in --pictures: a PNG a sequence.
+CPU is process time of one thread without decoding; all other figures are deterministic.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from share import startup
+
+startup.prepare_process()
+
+import numpy as np  # noqa: E402
+import vio_options  # noqa: E402
+from tool_main import exit_code  # noqa: E402
+from vio_kept import code_version, keep, kept  # noqa: E402
+from vio_picture import Curves, draw  # noqa: E402
+from vio_run import figures, follow, series  # noqa: E402
+from vio_sequences import SECONDS, Sequence  # noqa: E402
+from vio_table import Row, table  # noqa: E402
+
+from share.config import Config  # noqa: E402
+from share.files.writing import atomic_write  # noqa: E402
+from share.lab.emulate.session import make_cached_session  # noqa: E402
+from share.runtime.source import open_source  # noqa: E402
+
+
+def main() -> int:
+    options = arguments()
+    return exit_code("measure_vio", lambda: measure(options))
+
+
+def arguments() -> argparse.Namespace:
+    parser = vio_options.parser(__doc__, "vio", (101, 102, 103))
+    parser.add_argument("--pictures", type=Path, default=vio_options.ROOT / "docs" / "pictures" / "vio")
+    return parser.parse_args()
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Do all runs, seed by seed; then the table and the pictures."""
+    code, chosen = code_version(), vio_options.chosen(options)
+    rows = [run(sequence, seed, options, code) for seed in options.seeds for sequence in chosen]
+    rows.sort(key=lambda row: [s.name for s in chosen].index(row["sequence"]))
+    text = table(rows)
+    print(text)
+    atomic_write(options.out / "table.md", text + "\n")
+    for sequence in chosen:
+        picture(sequence, [row for row in rows if row["sequence"] == sequence.name], options)
+
+
+def run(sequence: Sequence, seed: int, options: argparse.Namespace, code: str) -> Row:
+    """Return a run's figures from its JSON if that is of this code and session, else do the run and keep
+    it."""
+    recipe = sequence.recipe(seed, options.data)
+    made_by = {"sequence": sequence.name, "seed": seed, "code": code, "session": recipe.digest}
+    file = _file(options.out, sequence.name, seed)
+    if not options.again and (known := kept(file, made_by)) is not None:
+        return known
+    source = open_source(str(make_cached_session(recipe, options.cache, options.workers) / "agent"))
+    tracked = follow(source, Config())
+    found = series(source, tracked)
+    row: Row = made_by | figures(source, tracked, found)
+    options.out.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        file.with_suffix(".npz"),
+        t_s=(found.stamps_ns - tracked.log.frames().stamp_ns[0]) * 1e-9,
+        errors=found.deviations.errors,
+        sigmas=found.deviations.sigmas,
+        segment=found.segment,
+    )
+    keep(file, row)
+    print(f"{sequence.name} {seed}: {_cm(row)}", file=sys.stderr, flush=True)
+    return row
+
+
+def picture(sequence: Sequence, rows: list[Row], options: argparse.Namespace) -> None:
+    """Draw the runs of one sequence."""
+    runs = []
+    for row in rows:
+        with np.load(_file(options.out, sequence.name, row["seed"]).with_suffix(".npz")) as curves:
+            runs.append(Curves(f"seed {row['seed']}: ATE {_cm(row)}", **curves))
+    what = f"{sequence.motion.rstrip(':')} in {sequence.scene}, {sequence.profile}, {SECONDS:g} s"
+    draw(options.pictures / f"{sequence.name}.png", f"{sequence.name}: {what}", runs)
+
+
+def _file(out: Path, name: str, seed: int) -> Path:
+    return out / f"{name}-{seed}.json"
+
+
+def _cm(row: Row) -> str:
+    return "none" if row["ate_cm"] is None else f"{row['ate_cm']:.2f} cm"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,233 @@
+"""Policies in virtual time: real state machines of agents, edge and mapper, with durations drawn from
+samples.
+
+    python tools/experiments/simulate.py [--policies covins-g share] [--link wifi5] [--seeds 0:3] \\
+        [--set control.attribution=true]
+
+Two headsets and a robot, a minute in an emulated warehouse (keyframes as in measure_load.py, odometry that
+drifts, frames at 30 Hz, evaluations with the true error). Prints a Markdown table: means over seeds of
+latency (as in docs/do/evaluate.md) and its parts, keyframes sent, merges, and the error of agents' poses in
+the map that they share, cm rms, causal, one alignment of a map for all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from share import startup
+
+startup.prepare_process()
+
+import numpy as np  # noqa: E402
+from keyframe_set import AgentKeyframes, KeyframeSet  # noqa: E402
+from load_room import room  # noqa: E402
+from measure_joins import configured  # noqa: E402
+from tool_main import exit_code, line  # noqa: E402
+
+from share.config import POLICY_NAMES, STREAMED, Config  # noqa: E402
+from share.geometry.interpolation import Trajectory  # noqa: E402
+from share.geometry.se3 import transform, umeyama  # noqa: E402
+from share.lab.evaluate.modelled_mapper import GroundTruth, ModelledMapper, RecognitionModel  # noqa: E402
+from share.lab.evaluate.simulation import ProcessingDelays, Simulation, TrackedFrame  # noqa: E402
+from share.metrics.frame_log import summary as summarised  # noqa: E402
+from share.metrics.local_error import LocalError  # noqa: E402
+from share.net.emulated_link import LinkAssignment  # noqa: E402
+from share.protocol.agent_events import LocalisedPose  # noqa: E402
+from share.types import F64, KeyframeCandidate  # noqa: E402
+
+# others have agents that send raw frames
+SIMULATED = [policy for policy in POLICY_NAMES if policy != STREAMED]
+FRAME_NS = 33_333_333
+HEAD = ("policy", "agent", "latency ms", "frames ms", "corrected ms", "n", "sent", "rate, Hz", "QoE", "cm")
+
+Row = dict[str, Any]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--policies", nargs="*", choices=SIMULATED, default=["covins-g", "share"])
+    parser.add_argument("--link", default="wifi5")
+    parser.add_argument("--seeds", default="0:3", metavar="FIRST:END")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    return exit_code("simulate", lambda: simulate(options))
+
+
+def simulate(options: argparse.Namespace) -> None:
+    """Run every policy, seed by seed."""
+    config, made = configured(options.set), room()
+    first, end = map(int, options.seeds.split(":"))
+    rows = []
+    print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))), flush=True)
+    for policy in options.policies:
+        chosen = replace(config, edge=replace(config.edge, policy=policy))
+        runs = [play(made, chosen, options.link, seed) for seed in range(first, end)]
+        rows += runs
+        for name in runs[0]["agents"]:
+            print(line(cells_of(policy, name, [run["agents"][name] for run in runs])))
+        print(summary(policy, runs), flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool = False) -> Row:
+    """Simulate one run. modelled: with a mapper that knows the true poses and needs no views. busy, solving:
+    of the edge's mapper and solver, in seconds a second; passed_over: keyframes that were not looked up."""
+    began = time.monotonic()
+    who = list(made.agents.values())
+    first_ns = min(agent.keyframes[0].stamp_ns for agent in who)
+    last_ns = max(agent.keyframes[-1].stamp_ns for agent in who)
+    rng = np.random.default_rng((seed, 9))
+    zeros_ns = [first_ns - int(rng.integers(FRAME_NS)) for _ in who]  # cameras are not in step
+    seen = [looks(agent, zero_ns, last_ns) for agent, zero_ns in zip(who, zeros_ns, strict=True)]
+    truth = {
+        a.hello.name: (np.array([k.stamp_ns - zero_ns for k in a.keyframes]), a.T_world_body)
+        for a, zero_ns in zip(who, zeros_ns, strict=True)
+    }
+    mapper = None
+    if modelled:
+        known = truth_of(made, config.control.near_m, config.control.far_m)
+        mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
+    links = LinkAssignment.parse(link)
+    links.check(made.agents)
+    networks = [links.network_for(agent.hello.name) for agent in who]
+    members = list(zip((a.hello for a in who), seen, networks, strict=True))
+    world = Simulation(config, members, ProcessingDelays(), seed, mapper)
+    world.run((last_ns - first_ns) / 1e9 + 2.0)
+    report = world.edge.report(world.mapper.report())
+    agents = {}
+    for agent in who:
+        log, own = world.logs[agent.hello.name].report(), report["agents"][agent.hello.name]
+        series = world.edge.series()[agent.hello.name]
+        agents[agent.hello.name] = {
+            **{
+                part: log[part]["mean"] or float("nan") for part in ("latency_ms", "track_ms", "corrected_ms")
+            },
+            "corrected": log["corrected_ms"]["n"],
+            "sent": own["keyframes"],
+            "rate_hz": own["rate_hz"],
+            "qoe": mean(series["qoe"]),
+        }
+    errors_cm = shared_errors(world.localised, truth)
+    for name, row in agents.items():
+        row["error_cm"] = errors_cm.get(name, float("nan"))
+    metres = sum(float(np.linalg.norm(np.diff(a.T_world_body[:, :3, 3], axis=0), axis=1).sum()) for a in who)
+    joined = max(Counter(own["map_id"] for own in report["agents"].values()).values())
+    corrected_ms = np.concatenate([log.frames().corrected_ms for log in world.logs.values()])
+    late_ms = corrected_ms[corrected_ms > 0]
+    whole = {
+        "metres": metres,
+        "joined": joined,
+        "maps": len({own["map_id"] for own in report["agents"].values()}),
+        "corrected_ms": summarised(late_ms).report(),
+        "busy": world.mapper_busy_ns / world.now_ns,
+        "solving": world.solver_busy_ns / world.now_ns,
+        "passed_over": sum(own["queries_skipped"] for own in report["agents"].values()),
+        "took_s": time.monotonic() - began,
+    }
+    return {"policy": config.edge.policy, "seed": seed, "agents": agents, **report["merges"], **whole}
+
+
+@lru_cache(1)  # runs in a room follow each other
+def truth_of(made: KeyframeSet, near_m: float, far_m: float) -> GroundTruth:
+    who = made.agents.items()
+    return GroundTruth(near_m, far_m, {n: a.hello.rig for n, a in who}, {n: a.T_world_body for n, a in who})
+
+
+def which(truth: dict[str, Trajectory]) -> Callable[[str, int], int]:
+    """Return a function that gives the index of an agent's keyframe by its stamp."""
+    at = {name: {ns: k for k, ns in enumerate(stamps_ns.tolist())} for name, (stamps_ns, _) in truth.items()}
+    return lambda name, stamp_ns: at[name][stamp_ns]
+
+
+def looks(agent: AgentKeyframes, first_ns: int, last_ns: int) -> Iterator[TrackedFrame]:
+    """Yield frames at 30 Hz since `first_ns`; a keyframe replaces the frame that is due by then."""
+    at_ns, error_before_cm = first_ns, None
+    for stamp_ns, candidate, error_cm in offered(agent):
+        T = candidate.T_odom_body
+        while at_ns < stamp_ns - FRAME_NS // 2:
+            yield TrackedFrame(at_ns - first_ns, T, error_before_cm)
+            at_ns += FRAME_NS
+        yield TrackedFrame(stamp_ns - first_ns, T, error_cm, candidate)
+        at_ns, error_before_cm = stamp_ns + FRAME_NS, error_cm
+    while at_ns < last_ns:
+        yield TrackedFrame(at_ns - first_ns, agent.T_odom_body[-1], error_before_cm)
+        at_ns += FRAME_NS
+
+
+@lru_cache(64)
+def offered(agent: AgentKeyframes) -> list[tuple[int, KeyframeCandidate, float | None]]:
+    """Return every keyframe as its tracker publishes it, its stamp, and odometry's error (cm) by then."""
+    stamps = np.array([k.stamp_ns for k in agent.keyframes])
+    error = LocalError((stamps, agent.T_world_body))
+    out = []
+    for keyframe, T in zip(agent.keyframes, agent.T_odom_body, strict=True):
+        up, fresh = (keyframe.up, keyframe.up_sigma), keyframe.reference < 0
+        candidate = KeyframeCandidate(T, keyframe.T_ref_body, keyframe.cov, *up, keyframe.view, fresh)
+        out.append((keyframe.stamp_ns, candidate, error.update(keyframe.stamp_ns, T)))
+    return out
+
+
+def shared_errors(placed: dict[str, list[LocalisedPose]], truth: dict[str, Trajectory]) -> dict[str, float]:
+    """Return, for each agent, the error (cm rms) of its localised poses in a map shared with others, at the
+    stamps of `truth`. Every map is aligned to the ground truth once, for all agents in it."""
+    by_map: dict[str, list[tuple[str, F64, F64]]] = {}
+    for name, poses in placed.items():
+        stamps_ns, T_world_body = truth[name]
+        at = dict(zip(stamps_ns.tolist(), T_world_body[:, :3, 3], strict=True))
+        for pose in poses:
+            if pose.stamp_ns in at and pose.map_id is not None and pose.T_map_odom is not None:
+                p = (pose.T_map_odom @ pose.T_odom_body)[:3, 3]
+                by_map.setdefault(pose.map_id, []).append((name, p, at[pose.stamp_ns]))
+    square: dict[str, list[float]] = {name: [] for name in placed}
+    for rows in by_map.values():
+        if len({name for name, _, _ in rows}) < 2:
+            continue
+        p, q = (np.array([row[i] for row in rows]) for i in (1, 2))
+        for (name, _, _), off in zip(rows, ((transform(umeyama(p, q), p) - q) ** 2).sum(1), strict=True):
+            square[name].append(float(off))
+    return {name: 100 * float(np.sqrt(np.mean(squares))) for name, squares in square.items() if squares}
+
+
+def summary(policy: str, runs: list[Row]) -> str:
+    names = ("requested", "skipped", "done", "metres", "joined", "took_s")
+    means = {name: mean([run[name] for run in runs]) for name in names}
+    agents = len(runs[0]["agents"])
+    return (
+        f"{policy}: merges requested {means['requested']:.0f}, skipped {means['skipped']:.0f}, done "
+        f"{means['done']:.0f} ({means['done'] / means['metres']:.2f} a metre); "
+        f"{means['joined']:.1f} of {agents} in one map; {means['took_s']:.0f} s a run"
+    )
+
+
+def cells_of(policy: str, name: str, runs: list[Row]) -> list[str]:
+    figures = {key: mean([run[key] for run in runs]) for key in runs[0] if key != "rate_hz"}
+    rates = [run["rate_hz"] for run in runs if run["rate_hz"] is not None]
+    return [
+        policy,
+        name,
+        *(f"{figures[key]:.1f}" for key in ("latency_ms", "track_ms", "corrected_ms")),
+        f"{figures['corrected']:.0f}",
+        f"{figures['sent']:.0f}",
+        f"{mean(rates):.1f}" if rates else "–",
+        f"{figures['qoe']:.2f}",
+        f"{figures['error_cm']:.2f}",
+    ]
+
+
+def mean(values: Any) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
