@@ -8,7 +8,8 @@
 
 The set: two rooms, in each two headsets and a robot for 30 s, over wifi5 by `share` and by `covins-g`, two
 seeds, default settings. Sessions are made once and kept (--cache). In virtual time nothing depends on the
-load of this machine; `make bench` measures its speed. The history: docs/lab/results/regression.jsonl. A figure is
+load of this machine; `make bench` measures its speed. The history: docs/lab/results/regression.jsonl. A
+figure is
 compared with its median over all lines since it was accepted (by name, or `all`), so that many small losses
 count as one large one.
 """

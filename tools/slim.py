@@ -1,4 +1,5 @@
-"""Remove from the frozen program what its libraries bring and SHARE never uses. Figures: docs/do/freeze.md."""
+"""Remove from the frozen program what its libraries bring and SHARE never uses. Figures:
+docs/do/freeze.md."""
 
 from __future__ import annotations
 

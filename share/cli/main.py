@@ -141,6 +141,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _exit_with(text: str, code: int) -> None:
+    flush_all()
     with contextlib.suppress(OSError):  # the terminal may be gone
         click.echo(f"share: {one_line(text)}", err=True)
     sys.exit(code)

@@ -11,11 +11,19 @@ import os
 import queue
 import sys
 import threading
+import weakref
 
 import click
 
 MAX_PENDING_LINES = 2000  # later ones are dropped (drop_newest)
 _FLUSH_S = 1.0  # for what is pending at the end
+_writers: weakref.WeakSet[Stderr] = weakref.WeakSet()
+
+
+def flush_all() -> None:
+    """Wait a moment until all pending text is written, so that what is printed next comes after it."""
+    for writer in list(_writers):
+        writer.flush()
 
 
 class Stderr:
@@ -27,6 +35,7 @@ class Stderr:
         self._thread: threading.Thread | None = None
         self._starting = threading.Lock()
         self._dropped_lines = 0
+        _writers.add(self)
 
     @property
     def is_terminal(self) -> bool:

@@ -2,7 +2,8 @@
 
     python tools/experiments/measure_places.py --data FOLDER [--emulated] [--far 2000] [--picture FILE.png]
 
-FOLDER holds the stereo keyframes and the RGB-D kitchen of docs/understand/mapping.md. True pairs are nearer than 1 m
+FOLDER holds the stereo keyframes and the RGB-D kitchen of docs/understand/mapping.md. True pairs are nearer
+than 1 m
 and 30 degrees; an accepted pose is wrong by more than 0.25 m or 5 degrees. Of the false pairs, --far are
 tried and stand for all. --emulated: warehouse, firestation and corridor-twins as well (made once, which takes
 minutes).

@@ -8,7 +8,8 @@ Causal poses, as of `share track`. Needs the recordings in --data.
 `pairs`: 50 stereo pictures of EuRoC V1_01, 0.05 to 7 s apart, with the whole IMU. All are tracked in order;
 the relative motion of each pair of neighbours is compared with the true one. Allowed are 2 % of the path and
 1 cm. The ground truth is that of the Vicon body, not quite of the IMU: `error` is against the truth moved to
-the IMU, as fitted over the whole recording (docs/understand/mocap-fit.md), `as given` against the truth as it is.
+the IMU, as fitted over the whole recording (docs/understand/mocap-fit.md), `as given` against the truth as
+it is.
 
 `kitchen`: 500 RGB-D pictures, no IMU.
 

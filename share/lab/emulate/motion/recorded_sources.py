@@ -31,7 +31,8 @@ from share.types import F64, I64, ImuBatch
 _MARGIN_S = 5.0  # fitted before and after the wanted span: the ends of a batch are the least certain
 _MIN_SPAN_S = 1.0
 
-# Figures: docs/understand/mocap-fit.md. EuRoC's ground truth is an estimate from this very IMU and its clock; that of
+# Figures: docs/understand/mocap-fit.md. EuRoC's ground truth is an estimate from this very IMU and its
+# clock; that of
 # TUM-VI and EuRoC's raw vicon0 is motion capture.
 EUROC_OPTIONS = MocapFitOptions(
     sigma_position=0.0015,

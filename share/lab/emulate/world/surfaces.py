@@ -27,7 +27,9 @@ from share.types import F32, U8
 Rng = np.random.Generator
 SurfacePainter = Callable[[Rng, float], F32]
 
-_SPECKLE_GAIN = 1.3  # of all speckle, so that a warehouse has the corner counts of real halls (docs/understand/rooms.md)
+_SPECKLE_GAIN = (
+    1.3  # of all speckle, so that a warehouse has the corner counts of real halls (docs/understand/rooms.md)
+)
 
 
 def _mark_count(rng: Rng, metres: float, density: float) -> int:
