@@ -149,7 +149,7 @@ def test_a_disk_that_fills_ends_the_recording_in_a_line_and_what_was_written_is_
     assert child.returncode == 1
     out = tmp_path / "a.mcap"
     assert child.stderr.splitlines() == [
-        f"share: {out}.part: is not closed; `share dataset recover {out}.part --out {out}` saves what it has",
+        f"share: {out}.part: is not closed; `share dataset recover {out}.part --out {out}` saves its contents",
         f"share: {out}: cannot be written: {reason}",
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.part"]

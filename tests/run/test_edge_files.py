@@ -96,7 +96,7 @@ def test_a_disk_that_is_full_for_a_while(tmp_path):
     assert ann.machine.report()["open"] > 2
     assert "keyframes are not acknowledged" in child.said
     resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, limits)
-    child.wait_for("the map is kept again")
+    child.wait_for("the map is saved again")
     ann.finish()
     ann.join(20)
     assert ann.error is None
@@ -148,7 +148,7 @@ def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
     child = Child(tmp_path / "again.log", "edge", "--bind", address, "--map", str(small_disk / "room.sqlite"))
     child.wait_for("keyframes are not acknowledged")
     (small_disk / "ballast").unlink()
-    child.wait_for("the map is kept again")
+    child.wait_for("the map is saved again")
     deadline = time.monotonic() + 20
     while ann.machine.report()["open"] > 1 and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -175,7 +175,7 @@ def test_a_file_that_is_taken_away_from_under_the_edge(tmp_path, how):
     time.sleep(0.5)
     assert ann.machine.report()["acknowledged"] == 0
     (tmp_path / "elsewhere").rename(path)
-    child.wait_for("the map is kept again")
+    child.wait_for("the map is saved again")
     ann.finish()
     ann.join(20)
     assert child.interrupt() == 0
