@@ -57,7 +57,7 @@ from share.wire import messages as m
 TICK_MS = 50
 # Events between tracker and main. Policy block: a live camera's own queue keeps the newest images.
 _INBOX_SIZE = 64
-_MAX_MESSAGES_PER_TICK = 64  # from the edge; the rest waits in the link, so that a flood cannot use up the CPU
+_MAX_MESSAGES_PER_TICK = 64  # from the edge; the rest waits in the link: a flood cannot use up the CPU
 _OVERDUE_MARGIN_S = 5.0  # after agent.finish_s: by then the state machine should have ended the run
 
 
@@ -82,7 +82,7 @@ class _Shared:
 
 
 class AgentRun:
-    """One run of an agent. `run` returns when the recording is over and everything is acknowledged and written.
+    """One run of an agent. `run` returns when the recording is over and all is acknowledged and written.
 
     A damaged image costs its frame. A recording that becomes unreadable ends the run cleanly; then `run`
     raises.
@@ -141,7 +141,8 @@ class AgentRun:
         self._arrivals.stop()
 
     def run(self) -> None:
-        """Run until the source ends or `stop`. Raises any error that ended it early, after closing everything."""
+        """Run until the source ends or `stop`. Raises any error that ended it early, after closing
+        everything."""
         tracker = threading.Thread(target=self._track, name="tracker", daemon=True)
         tracker.start()
         try:

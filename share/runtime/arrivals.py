@@ -1,4 +1,5 @@
-"""Frames at their arrival times: recorded ones when the sensor would have delivered them, live ones at once."""
+"""Frames at their arrival times: recorded ones when the sensor would have delivered them, live ones at
+once."""
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ class FrameArrivals(Protocol):
 
 
 class RecordedArrivals:
-    """A recording at its recorded pace, decoded ahead by a thread that waits when its queue is full (`block`).
+    """A recording at its recorded pace, decoded ahead by a thread that waits when its queue is full
+    (`block`).
 
     A read error is raised after the frames before it.
     """

@@ -1,7 +1,7 @@
 """`share capture`: record a camera's streams until stopped or the disk is almost full.
 
-    camera feed -> writer thread: the file
-    main thread: free disk space, live line
+camera feed -> writer thread: the file
+main thread: free disk space, live line
 """
 
 from __future__ import annotations

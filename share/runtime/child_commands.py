@@ -18,7 +18,13 @@ def share_command(*arguments: str) -> list[str]:
     """Return the command line that runs `share ARGUMENTS` with this program, frozen or not."""
     if getattr(sys, "frozen", False):
         return [sys.executable, *arguments]
-    return [sys.executable, "-P", "-m", "share", *arguments]  # -P: ignore a folder `share` in the working directory
+    return [
+        sys.executable,
+        "-P",
+        "-m",
+        "share",
+        *arguments,
+    ]  # -P: ignore a folder `share` in the working directory
 
 
 @contextlib.contextmanager

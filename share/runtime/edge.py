@@ -138,8 +138,8 @@ class EdgeRun:
         self._link.wake()
 
     def run(self) -> dict[str, Any]:
-        """Run until `stop` and return the report. Raises ShareError if the report, the events or the map could
-        not be written completely."""
+        """Run until `stop` and return the report. Raises ShareError if the report, the events or the map
+        could not be written completely."""
         try:
             while not self._stopping:
                 self._step()
@@ -218,7 +218,8 @@ class EdgeRun:
         return None
 
     def _load_stored_map(self) -> tuple[StoredMap | None, list[RestoredRun]]:
-        """Return the map and the agents' runs to start with. Raises StoreError if the map file is unreadable."""
+        """Return the map and the agents' runs to start with. Raises StoreError if the map file is
+        unreadable."""
         if POLICIES[self._settings.edge.policy].streams_frames:
             return None, []
         return self._restarts.load_map()

@@ -37,7 +37,8 @@ class ErrorEstimator(Protocol):
         """Add a tracked frame. Return the error, cm; None if unknown."""
 
     def make_keyframe(self, frame: Frame, tracker: KeyframeTracker) -> KeyframeCandidate:
-        """Have `tracker` make the frame just tracked a keyframe, and use it as input for the next estimate."""
+        """Have `tracker` make the frame just tracked a keyframe, and use it as input for the next
+        estimate."""
 
     def close(self) -> None: ...
 
@@ -119,7 +120,8 @@ class SynchronousErrorModel(NoErrorEstimate):
 
 
 class BackgroundErrorModel(SynchronousErrorModel):
-    """The error model in a thread. While it is busy, only the newest keyframe waits (policy drop_estimate)."""
+    """The error model in a thread. While it is busy, only the newest keyframe waits (policy
+    drop_estimate)."""
 
     def __init__(self, network: OnnxSession, notify: Callable[[str], None]) -> None:
         super().__init__(network)

@@ -19,7 +19,8 @@ from share.sensors.imu_memory import SavedBias, propagate_bias
 
 
 class ImuBiasStore:
-    """Loads and saves the bias. `bias` is the initial one, None if unknown. A file error costs one log line."""
+    """Loads and saves the bias. `bias` is the initial one, None if unknown. A file error costs one log
+    line."""
 
     def __init__(
         self,

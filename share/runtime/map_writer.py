@@ -26,8 +26,8 @@ class MapWriter:
     """Writes submitted changes in order. Calls `on_saved` once they are in the file and `notify` on errors,
     both from the thread.
 
-    While the file cannot be written, changes are held in memory and retried. Their number is bounded: an agent
-    sends at most its window without an acknowledgement, the edge accepts a bounded number
+    While the file cannot be written, changes are held in memory and retried. Their number is bounded: an
+    agent sends at most its window without an acknowledgement, the edge accepts a bounded number
     (`share.protocol.edge`), loops arise from keyframes only, and of solutions only the newest is held.
     """
 
@@ -62,8 +62,8 @@ class MapWriter:
         self._incoming.put(request)
 
     def drain(self, timeout_s: float) -> bool:
-        """Write the remaining changes, retry failed ones once, report unsaved ones, and end the thread. Return
-        False if that takes longer than `timeout_s`. May be repeated."""
+        """Write the remaining changes, retry failed ones once, report unsaved ones, and end the thread.
+        Return False if that takes longer than `timeout_s`. May be repeated."""
         self._incoming.put(None)
         self._thread.join(timeout_s)
         if self._thread.is_alive():

@@ -67,8 +67,8 @@ class _SolveResult:
 
 
 def run_mapper(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-    """Work of a `WorkerProcess`: takes RestoreMap, AddRun, SetCredential, SetPresence, AddKeyframe and DropRun
-    until END; answers MapperResult, MapperReport, MapRestored and SolverDied."""
+    """Work of a `WorkerProcess`: takes RestoreMap, AddRun, SetCredential, SetPresence, AddKeyframe and
+    DropRun until END; answers MapperResult, MapperReport, MapRestored and SolverDied."""
     _MapperProcess(inbox, answer, settings).run()
 
 

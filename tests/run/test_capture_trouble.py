@@ -148,8 +148,9 @@ def test_a_disk_that_fills_ends_the_recording_in_a_line_and_what_was_written_is_
     reason = os.strerror(errno.EFBIG)
     assert child.returncode == 1
     out = tmp_path / "a.mcap"
+    fix = f"`share dataset recover {out}.part --out {out}` saves its contents"
     assert child.stderr.splitlines() == [
-        f"share: {out}.part: is not closed; `share dataset recover {out}.part --out {out}` saves its contents",
+        f"share: {out}.part: is not closed; {fix}",
         f"share: {out}: cannot be written: {reason}",
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.part"]

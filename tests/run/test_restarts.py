@@ -104,8 +104,9 @@ def test_a_map_that_ends_mappers_is_set_aside(edge, path):
     assert pauses == [1, 2, 4]
     assert len(events(told, "mapper lost")) == 3
     assert "its process ended with exit code 3; restarted in" in events(told, "mapper lost")[0]
-    aside = "the map file is renamed to room.sqlite.damaged-1: 3 mappers in a row have died while restoring it"
-    assert events(told, "map") == [f"{aside}; a new one is started"]
+    reason = "3 mappers in a row have died while restoring it"
+    line = f"the map file is renamed to room.sqlite.damaged-1: {reason}; a new one is started"
+    assert events(told, "map") == [line]
     assert path.with_name("room.sqlite.damaged-1").read_bytes() == before
     step_until(run, lambda: run._restarts._tries == 0 and run._mapper_process.pid is not None)
     run._update_report()
