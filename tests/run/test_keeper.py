@@ -87,7 +87,7 @@ def test_what_is_not_on_the_disk_is_not_kept(kept, reason):
     until(lambda: disk.tries > tries + 5)
     assert tickets == [ChangesSaved(0)]
     assert disk.rows == [change(0)]
-    assert said == [f"{reason}; keyframes are not acknowledged until it can"]
+    assert said == [f"{reason}; keyframes are not acknowledged until a write succeeds"]
     assert keeper.trouble == f"{reason}; keyframes are not acknowledged"
     disk.error = None
     until(lambda: tickets[-1] == ChangesSaved(39))
