@@ -81,4 +81,4 @@ def test_what_only_a_camera_has_is_not_for_a_recording(share: Callable[..., Done
 def test_a_camera_is_no_recording_to_look_into(share: Callable[..., Done]) -> None:
     done = share("dataset", "info", "realsense")
     assert done.code == 2
-    assert "recorded with `share capture`" in done.err
+    assert "record a live camera with `share capture`" in done.err

@@ -45,7 +45,7 @@ def test_a_flipped_byte(path, tmp_path):
     assert child.interrupt() == 0
     said = lines(child, path)
     assert (
-        said[0] == "the file was damaged; it is kept as room.sqlite.damaged-1, what is whole was taken over"
+        said[0] == "the file was damaged; it is kept as room.sqlite.damaged-1, and its intact rows were taken over"
     )
     assert len(said) <= 4
     assert "39 keyframes of 2 runs" in said[-1]
@@ -60,8 +60,8 @@ def test_a_newer_schema(path, tmp_path):
     before = path.read_bytes()
     child = edge(tmp_path)
     assert child.wait(20) == 2
-    newer = f"was made by a newer SHARE (schema {SCHEMA + 1}, this one knows {SCHEMA})"
-    assert child.said == f"share: {path}: {newer}; use that, or give another file\n"
+    newer = f"was made by a newer SHARE (schema {SCHEMA + 1}, this one reads {SCHEMA})"
+    assert child.said == f"share: {path}: {newer}; use that SHARE, or give another file\n"
     assert path.read_bytes() == before
 
 
@@ -69,7 +69,7 @@ def test_what_is_no_map(path, tmp_path):
     path.write_text("notes")
     child = edge(tmp_path)
     assert child.wait(20) == 2
-    assert child.said == f"share: {path}: is not a map of SHARE, and was left as it is; give another file\n"
+    assert child.said == f"share: {path}: is not a SHARE map and was left unchanged; give another file\n"
     assert path.read_text() == "notes"
 
 
@@ -78,7 +78,7 @@ def test_a_map_in_use(path, tmp_path):
     first.wait_for("listening on")
     second = edge(tmp_path, "second")
     assert second.wait(20) == 1
-    assert second.said == f"share: {path}: another edge uses this map; end it, or give another file\n"
+    assert second.said == f"share: {path}: another edge uses this map; stop it, or give another file\n"
     assert first.interrupt() == 0
     assert lines(first, path) == ["40 keyframes of 2 runs, 5 loops"]
     assert "Traceback" not in first.said
@@ -171,7 +171,7 @@ def test_a_file_that_is_taken_away_from_under_the_edge(tmp_path, how):
     if how == "replaced":
         path.write_bytes(b"")
     ann.start()
-    child.wait_for(f"room.sqlite was {how} while the edge ran; put it back, or start the edge again")
+    child.wait_for(f"room.sqlite was {how} while the edge ran; put it back, or restart the edge")
     time.sleep(0.5)
     assert ann.machine.report()["acknowledged"] == 0
     (tmp_path / "elsewhere").rename(path)

@@ -111,7 +111,7 @@ def test_a_disk_that_does_not_answer_is_said(kept, monkeypatch):
     disk.go_on.clear()
     keeper.submit(SaveChanges(0, (change(0),)))
     until(lambda: keeper.trouble is not None)
-    assert "has been writing for" in keeper.trouble
+    assert "has taken" in keeper.trouble
     assert "not acknowledged" in keeper.trouble
     assert not tickets
     disk.go_on.set()

@@ -75,7 +75,7 @@ def test_a_map_that_ends_three_mappers_is_set_aside(tmp_path: Path, plain_sessio
                 os.kill(pid, signal.SIGKILL)
         return "the map file is renamed to" in child.said
 
-    until("set aside", aside, 60)
+    until("renamed to", aside, 60)
     why = "3 mappers in a row have died while restoring it; a new one is started"
     assert f"the map file is renamed to {path.name}.damaged-1: {why}" in child.said
     assert child.said.count("mapper lost: its process was ended by SIGKILL; restarted in") == 3
