@@ -566,9 +566,7 @@ def test_addresses_that_cannot_be_used(room, share, tmp_path, monkeypatch):
 
     with untouched(tmp_path):
         assert "is not an address" in complaint(agent_at("tcp://127.0.0.1:0"), 2)
-        assert "tcp://far:5555: links to other machines need keys" in complaint(
-            agent_at("tcp://far:5555"), 2
-        )
+        assert "tcp://far:5555: links to other machines need keys" in complaint(agent_at("tcp://far:5555"), 2)
         for host in ("0.0.0.0", "192.0.2.1", "[::]", "some.host"):
             done = share("edge", "--bind", f"tcp://{host}:5555", "--out", tmp_path / "out")
             said = "need keys; make them with `share keys generate`"

@@ -146,7 +146,10 @@ def test_a_kiss_of_death_ends_the_questions(share: Share) -> None:
     with udp(kiss) as port:
         done = share("sync", "check", f"127.0.0.1:{port}")
     assert (done.code, len(questions)) == (1, 1)
-    assert done.err == f"share: 127.0.0.1:{port}: it refuses to answer (DENY): it is set not to\n"
+    assert (
+        done.err
+        == f"share: 127.0.0.1:{port}: the server refuses to answer (DENY): its configuration denies it\n"
+    )
 
 
 def test_what_was_answered_before_a_kiss_counts(share: Share) -> None:

@@ -45,7 +45,7 @@ def test_a_processor_for_which_there_is_no_poselib_is_told() -> None:
     assert checks.check_libraries({"numpy": None, "poselib": None}).what == "numpy, poselib load"
     found = checks.check_libraries({"numpy": None})
     assert (found.state, found.fix) == (CheckState.OK, ())
-    assert found.what.startswith("numpy load; no poselib for this processor")
+    assert found.what.startswith("numpy load; without poselib")
 
 
 def test_into_a_frozen_program_nothing_can_be_installed() -> None:
@@ -128,7 +128,7 @@ def test_an_edge_without_keys_or_agents_serves_its_own_machine_only() -> None:
         ("share keys generate",),
     )
     assert checks.check_edge_keys("edge", []).state is CheckState.WARN
-    assert checks.check_edge_keys("edge", ["ann", "bob"]).what == "edge; lets in: ann, bob"
+    assert checks.check_edge_keys("edge", ["ann", "bob"]).what == "edge; authorized: ann, bob"
 
 
 def test_what_mends_the_host_outlives_a_start() -> None:
@@ -178,7 +178,7 @@ def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
     assert of(T, T_10, (848, 480))[1].endswith("; goes with --mode 640x480 only")
     assert of(inverse(T), T_10) == (CheckState.FAIL, "the extrinsics to the IMU are inverted")
     assert of(np.eye(4), T_10)[0] is CheckState.WARN
-    assert "cam1 lies left" in of(T, inverse(T_10))[1]
+    assert "cam1 is left" in of(T, inverse(T_10))[1]
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,9 @@ def test_authorize_and_revoke(tmp_path: Path) -> None:
 
 def test_one_name_one_key(tmp_path: Path) -> None:
     keys.authorize(tmp_path, "ann", key(1))
-    with pytest.raises(UsageError, match="'ann' has another key; remove it first with `share keys revoke ann`"):
+    with pytest.raises(
+        UsageError, match="'ann' has another key; remove it first with `share keys revoke ann`"
+    ):
         keys.authorize(tmp_path, "ann", key(2))
     with pytest.raises(UsageError, match="'bob': this key is authorized already, as 'ann'"):
         keys.authorize(tmp_path, "bob", key(1))
@@ -311,7 +313,8 @@ def test_who_is_not_listed_does_not_until_listed(house: House) -> None:
     assert said.endswith(f"is not authorized; to authorize it: share keys authorize NAME '{bob.public}'")
     assert "(127.0.0.1)" in said
     assert agent.trouble() == (
-        f"refused: the edge does not know this key; on the edge's machine: share keys authorize bob '{bob.public}'"
+        "refused: the edge does not know this key; "
+        f"on the edge's machine: share keys authorize bob '{bob.public}'"
     )
     keys.authorize(house.folder, "bob", bob.public)
     house.greets(agent, 2)

@@ -183,7 +183,7 @@ def test_dots_of_an_emitter_that_should_be_off_are_said_once(camera: SoftwareCam
                 time.sleep(0.002)
             assert (len(said) > 0) == (k >= 30)
         assert len(got) == 70
-    assert [text.partition(":")[0] for text in said] == ["the emitter is on though it was switched off"]
+    assert [text.partition(":")[0] for text in said] == ["the emitter is on although it was switched off"]
 
 
 def test_an_interleaved_emitter_that_does_not_alternate_is_said(camera: SoftwareCamera) -> None:

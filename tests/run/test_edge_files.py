@@ -45,7 +45,8 @@ def test_a_flipped_byte(path, tmp_path):
     assert child.interrupt() == 0
     said = lines(child, path)
     assert (
-        said[0] == "the file was damaged; it is kept as room.sqlite.damaged-1, and its intact rows were taken over"
+        said[0]
+        == "the file was damaged; it is kept as room.sqlite.damaged-1, and its intact rows were taken over"
     )
     assert len(said) <= 4
     assert "39 keyframes of 2 runs" in said[-1]
