@@ -23,7 +23,7 @@ from share.timing import PeriodicTimer
 
 _TICK_S = 0.1
 _RATE_WINDOW_S = 1.0
-_MAX_ARRIVALS = 1000  # newest images whose arrival is known
+_MAX_ARRIVALS = 1000  # newest images with a known arrival
 _MIN_HOST_STAMPS = 30  # stamps of the host's clock in one stream before a warning; fewer are exceptions
 _ACTION_NOTICES = {
     Action.RESET: "{silent}: no samples; resetting the camera once",

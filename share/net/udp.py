@@ -1,4 +1,4 @@
-"""UDP sockets whose datagrams carry the kernel's arrival stamps where available (Linux)."""
+"""UDP sockets that stamp datagrams on arrival, by the kernel where available (Linux)."""
 
 from __future__ import annotations
 

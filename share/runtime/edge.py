@@ -402,7 +402,7 @@ class EdgeRun:
         line = (
             line
             if line in self._refused_handshakes or len(self._refused_handshakes) < MAX_REFUSAL_KINDS
-            else "further kinds of refusals, which are only counted"
+            else "further kinds of refusal, which are only counted"
         )
         self._refused_handshakes[line] += 1
         if self._refused_handshakes[line] == 1:

@@ -1,4 +1,4 @@
-"""A tracker whose failures cost one frame, not the process."""
+"""A tracker in which a failure costs one frame, not the process."""
 
 from __future__ import annotations
 

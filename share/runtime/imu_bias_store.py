@@ -47,7 +47,7 @@ class ImuBiasStore:
             self._notify(f"the IMU bias is not saved: {error}")
 
     def report(self) -> dict[str, Any]:
-        """Return, for a live camera with an IMU, the end of the run whose bias was loaded, or None."""
+        """Return, for a live camera with an IMU, the end of the run that saved the loaded bias, or None."""
         return {} if self._serial is None else {"imu_bias": {"from": _utc(self._saved_ns)}}
 
     def _load(self, serial: str, source: Source, config: InertialConfig) -> None:

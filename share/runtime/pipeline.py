@@ -23,7 +23,7 @@ _MAX_MISFITS = (
     10  # images of a wrong size before any of the right one: the calibration is another recording's
 )
 _SILENT_NS = 1_000_000_000  # without IMU samples before a warning
-_MAX_SKIPPED_FRAMES = 600  # consecutive undecodable frames whose IMU samples are kept
+_MAX_SKIPPED_FRAMES = 600  # consecutive undecodable frames of which IMU samples are kept
 
 _IMU_WARNINGS = {
     "imu_out_of_range": "IMU samples beyond {0.gyro:.3g} rad/s or {0.accel:.3g} m/s^2, or not finite, are "

@@ -31,7 +31,7 @@ _DELETE_ORPHANS = (
     " OR (b_run, b_id) NOT IN (SELECT run, id FROM keyframe)",
 )
 
-# Segments whose row is lost.
+# Segments without a row, because it is lost.
 _SEGMENTS_WITHOUT_ROW = (
     "SELECT DISTINCT run, stretch FROM keyframe"
     " WHERE (run, stretch) NOT IN (SELECT run, nth FROM stretch) ORDER BY number"

@@ -80,7 +80,7 @@ def matches_schema(connection: sqlite3.Connection) -> bool:
 
 
 def own_tables(connection: sqlite3.Connection) -> set[str]:
-    """Return the tables whose definition is exactly ours. Nothing else of a file is read: a view or virtual
+    """Return the tables that are defined exactly like ours. Nothing else of a file is read: a view or virtual
     table may compute forever, a generated column may have any size. Raises sqlite3.Error."""
     return {name for kind, name, _, _ in _objects(connection) & _objects(_template()) if kind == "table"}
 

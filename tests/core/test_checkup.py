@@ -38,7 +38,7 @@ def test_nobody_is_told_to_go_back_to_an_older_firmware() -> None:
         SdkReport(firmware=("5.17.0.10",)), ["5.9.0.1", "5.16.0.1", "5.13"], None
     )
     assert (found.state, found.fix) == (CheckState.OK, ())
-    assert found.what.startswith("5.17.0.10, newer than those tried")
+    assert found.what.startswith("5.17.0.10, newer than those tested")
 
 
 def test_a_processor_for_which_there_is_no_poselib_is_told() -> None:
@@ -108,8 +108,8 @@ def test_the_host_is_held_against_the_profile() -> None:
     ("bits", "what", "mend"),
     [
         (0x0, "none since the start", ""),
-        (0x50005, "its supply gives too little voltage and it is slowed (get_throttled 0x50005)", "5.1 V"),
-        (0x50000, "its supply gave too little voltage and it was slowed since the start (", "5.1 V"),
+        (0x50005, "the supply voltage is too low and it is slowed (get_throttled 0x50005)", "5.1 V"),
+        (0x50000, "the supply voltage was too low and it was slowed since the start (", "5.1 V"),
         (0x80000, "it was slowed since the start (get_throttled 0x80000)", "cool it"),
         (0x8, "it is slowed (get_throttled 0x8)", "cool it"),
     ],
@@ -175,7 +175,7 @@ def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
         return found.state, found.what
 
     assert of(T, T_10) == (CheckState.OK, "cameras (640x480) and IMU, 1 days old")
-    assert of(T, T_10, (848, 480))[1].endswith("; goes with --mode 640x480 only")
+    assert of(T, T_10, (848, 480))[1].endswith("; valid only with --mode 640x480")
     assert of(inverse(T), T_10) == (CheckState.FAIL, "the extrinsics to the IMU are inverted")
     assert of(np.eye(4), T_10)[0] is CheckState.WARN
     assert "cam1 is left" in of(T, inverse(T_10))[1]

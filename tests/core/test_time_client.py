@@ -50,12 +50,12 @@ def test_an_answer_and_its_bound_by_hand() -> None:
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"mode": NtpMode.CLIENT}, "mode CLIENT in place of an answer"),
-        ({"mode": NtpMode.BROADCAST}, "mode BROADCAST in place of an answer"),
+        ({"mode": NtpMode.CLIENT}, "mode CLIENT, expected SERVER"),
+        ({"mode": NtpMode.BROADCAST}, "mode BROADCAST, expected SERVER"),
         ({"origin": NONCE + 1}, "answers another request"),
         ({"leap": 3}, "is not synchronised itself"),
         ({"stratum": 16}, "is not synchronised itself"),
-        ({"precision": 127}, r"reads its clock to no better than 2\^127 s"),
+        ({"precision": 127}, r"has a precision of only 2\^127 s"),
         ({"stratum": 0}, "is not synchronised itself"),  # chronyd's; a kiss has letters
         ({"receive": 0}, "unknown"),
         ({"transmit": 0}, "unknown"),

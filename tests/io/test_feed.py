@@ -144,7 +144,7 @@ def test_depth_beside_stereo_is_done_without_and_welcome_again() -> None:
     assert str(feed.status()).startswith("DEGRADED  ")
     camera.streams = (*camera.streams, "depth")
     wait(lambda: feed.health is Health.OK)
-    assert said[-1] == "depth: heard again"
+    assert said[-1] == "depth: samples come again"
     feed.stop()
     reader.join(5)
     assert (feed.report()["resets"], feed.has_failed) == (1, False)

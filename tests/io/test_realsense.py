@@ -143,7 +143,7 @@ def test_an_imu_with_other_rates_is_read_at_the_best_of_them(offered: tuple[int,
     ) as one:
         one.start(print)
         assert (one.rates_hz["accel"], one.rates_hz["gyro"], one.rates_hz["cam0"]) == (taken, 400, 30)
-    told = [f"the camera has no accel at 250 Hz: takes {taken} Hz"]
+    told = [f"the camera has no accel at 250 Hz; using {taken} Hz"]
     assert said == ([] if taken == 250 else told)
 
 
@@ -242,7 +242,7 @@ class Leaving:
 @pytest.mark.parametrize("last", ["query_devices", "get_info", "query_sensors"])
 def test_a_camera_that_leaves_while_it_is_asked_is_a_line(camera: SoftwareCamera, last: str) -> None:
     context = Leaving(Listed([Leaving(camera.device, last)]), last)
-    with pytest.raises(ShareError, match=r"^RealSense camera 0123: cannot be opened: get_xu.*device; plug"):
+    with pytest.raises(ShareError, match=r"^RealSense camera 0123: cannot be opened: get_xu.*device; replug"):
         RealSenseCamera(StreamRequest(D435I), "0123", context)
 
 

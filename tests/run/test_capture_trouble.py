@@ -129,7 +129,7 @@ def test_eyes_that_never_see_end_it_in_a_line_after_one_reset(tmp_path: Path) ->
             assert now < MOST_US
     assert bench.error == (
         "camera 0123: cam0, cam1: no sample, not even after a hardware reset; unplug it and plug it in "
-        "again, with another cable or port if need be; nothing was recorded"
+        "again, if need be with another cable or port; nothing was recorded"
     )
     assert (Fake.resets, bench.connected) == (1, 3)
     assert list(tmp_path.iterdir()) == []

@@ -59,7 +59,7 @@ def test_an_address_that_cannot_be_answered_costs_others_nothing_and_is_said_onc
     sent, said = serve(*forged, question("192.0.2.1", 4000), *forged, question("192.0.2.2", 4000))
     assert [to for _, to in sent] == [("192.0.2.1", 4000), ("192.0.2.2", 4000)]
     assert said == [
-        "an answer could not be sent to 192.0.2.9: Invalid argument",
+        "cannot send a reply to 192.0.2.9: Invalid argument",
         "new client: 192.0.2.9",
         "new client: 192.0.2.1",
         "new client: 192.0.2.2",
