@@ -75,8 +75,8 @@ class ConnectionGate:
     def release_waiting(
         self, connections: Iterable[Connection], is_full: bool, now_s: float
     ) -> list[Connection]:
-        """Release some connections that need not be held any longer, and return them. Close or open the gate for new
-        ones."""
+        """Release some connections that need not be held any longer, and return them. Close or open the gate
+        for new ones."""
         waiting = [c for c in connections if c.is_held and not (is_full or self.is_held(c.address, now_s))]
         released = waiting[:_RELEASES_PER_CHECK]  # oldest first
         for connection in released:

@@ -208,7 +208,7 @@ class ConnectionGuard:
                     self._failed_handshakes += 1
 
     def _accept(self, descriptor: int) -> None:
-        self._remove(descriptor)  # libzmq reports no end of a connection whose peer id was taken over
+        self._remove(descriptor)  # libzmq reports no end of a connection that another took over
         number, ends = tcp.socket_cookie(descriptor), tcp.addresses(descriptor)
         if number is None or ends is None:
             return

@@ -160,8 +160,8 @@ class LateFrameDropper:
 
 
 class LatenessMonitor:
-    """Counts frames whose pose came more than LATE_S after their image; warns when lateness first exceeds
-    1 s, and each time it doubles."""
+    """Counts frames with a pose more than LATE_S after the image; warns when lateness first exceeds 1 s, and
+    each time it doubles."""
 
     def __init__(self, notify: Callable[[str], None], bottleneck: str) -> None:
         """bottleneck: the cause to name, such as "this machine"."""

@@ -268,7 +268,7 @@ def test_a_camera_that_leaves_as_it_is_started_is_a_line_and_is_let_go(
     ("devices", "says"),
     [
         ([attached("1"), attached("2")], "several RealSense cameras"),
-        ([attached(usb="2.1")], "USB 2.1, too slow"),
+        ([attached(usb="2.1")], "USB 2.1, which is too slow"),
         ([attached(firmware="5.9.14.0")], "firmware 5.9.14.0 is older than 5.12.0.0; update"),
     ],
 )
