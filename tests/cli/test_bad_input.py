@@ -663,9 +663,9 @@ def test_an_agent_leaves_a_damaged_image_out(damaged, share, tmp_path):
         done = share(*as_agent(damaged, tmp_path / "out", address), "--frames", ":27")
         assert end(server).code == 0
     assert done.code == 0
-    left_out = [line for line in done.err.splitlines() if "left out" in line]
-    assert len(left_out) == 1
-    assert left_out[0].startswith(f"share agent: frame skipped: {damaged}/mav0/cam1/data/")
+    skipped = [line for line in done.err.splitlines() if "frame skipped" in line]
+    assert len(skipped) == 1
+    assert skipped[0].startswith(f"share agent: frame skipped: {damaged}/mav0/cam1/data/")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert (report["damaged_images"], report["frames"], report["tracked"]) == (1, 26, 26)
 

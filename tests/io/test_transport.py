@@ -276,7 +276,7 @@ def test_addresses() -> None:
 def test_only_loopback_without_keys() -> None:
     with pytest.raises(UsageError, match=r"0\.0\.0\.0.*need keys.*`share keys generate`"):
         bind("tcp://0.0.0.0:0")
-    with pytest.raises(UsageError, match=r"192\.0\.2\.1.*without keys"):
+    with pytest.raises(UsageError, match=r"192\.0\.2\.1.*need keys"):
         connect("tcp://192.0.2.1:5555", 1)
 
 
