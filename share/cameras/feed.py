@@ -1,6 +1,7 @@
-"""A live camera's measurements for as long as they are wanted, whatever happens to the camera.
+"""Measurements of a live camera, with a watchdog that resets and reconnects it.
 
-the device's threads -> bounded queue -> who reads: repair, join; watchdog, reconnection
+device threads -> bounded queue -> reader's thread: repair stamps, join the IMU's streams; watchdog,
+reconnection
 """
 
 from __future__ import annotations
@@ -21,21 +22,22 @@ from share.sensors.watchdog import Action, Health, Watchdog
 from share.timing import PeriodicTimer
 
 _TICK_S = 0.1
-_MAX_ARRIVALS = 1000  # images whose arrival can be asked for
-_MIN_HOST_STAMPS = 30  # stamps of the host's clock in one stream; fewer are exceptions
+_RATE_WINDOW_S = 1.0
+_MAX_ARRIVALS = 1000  # newest images with a known arrival
+_MIN_HOST_STAMPS = 30  # stamps of the host's clock in one stream before a warning; fewer are exceptions
 _ACTION_NOTICES = {
-    Action.RESET: "{silent}: silent; the camera is reset once",
-    Action.GO_WITHOUT: "{silent}: still silent; {health}: goes on without",
-    Action.RECOVERED: "{silent}: heard again",
+    Action.RESET: "{silent}: no samples; resetting the camera once",
+    Action.GO_WITHOUT: "{silent}: still no samples; {health}: continuing without",
+    Action.RECOVERED: "{silent}: samples come again",
 }
 _GIVE_UP_NOTICE = (
-    "camera {serial}: {silent}: no sample came, nor after a hardware reset; unplug it and plug it in again, "
-    "with another cable or port if need be"
+    "camera {serial}: {silent}: no sample, not even after a hardware reset; unplug it and plug it in again, "
+    "if need be with another cable or port"
 )
 
 
 class CameraDevice(Protocol):
-    """A camera that is connected, such as `share.cameras.realsense.camera.RealSense`."""
+    """A connected camera, such as `share.cameras.realsense.camera.RealSenseCamera`."""
 
     @property
     def rig(self) -> Rig: ...
@@ -53,16 +55,15 @@ class CameraDevice(Protocol):
     def reset(self) -> None: ...
 
 
-Connect = Callable[
-    [str | None, int], CameraDevice
-]  # serial number (None: any), how often it was tried before
+Connect = Callable[[str | None, int], CameraDevice]  # (serial number or None for any, earlier attempts)
 MakeWatchdog = Callable[[int, Collection[str]], Watchdog]
 
 
 class CameraFeed:
-    """`open` it, read `measurements` in one thread, `stop` it from any; the reader lets the camera go.
+    """A camera's measurements. Call `open`, read `measurements` in one thread, and `stop` from any; the
+    reader's thread then disconnects the camera.
 
-    `notify` is told what happens to the camera, a line each.
+    notify: called with a line for each event of the camera.
     """
 
     def __init__(
@@ -75,24 +76,25 @@ class CameraFeed:
         queue: SampleQueue,
         watchdog: MakeWatchdog = Watchdog,
     ) -> None:
-        """rates_hz: of every stream that is expected, until the device says its own."""
+        """rates_hz: expected rate of each stream, until the device reports its own."""
         self._connect, self._notify, self.queue = connect, notify, queue
         self.serial, self.processor = serial, SampleProcessor(rates_hz, max_jump_s)
         self._max_jump_s = max_jump_s
         self._watchdog = watchdog(time.monotonic_ns(), rates_hz)
-        self.has_failed = False  # what is needed has never come
+        self.has_failed = False  # a required stream never came
         self._tick = PeriodicTimer(_TICK_S)
         self._stop = threading.Event()
         self._device: CameraDevice | None = None
         self._last_sample_ns: dict[str, int] = {}
         self._attempts = self._notified_restarts = 0
-        self._notified_reasons: set[str] = set()  # said: why the camera could not be opened again
-        self._has_warned_clocks = False  # said: some streams are of the host's clock
-        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_MAX_ARRIVALS)
+        self._notified_reasons: set[str] = set()  # reported failures to reopen the camera
+        self._has_warned_clocks = False  # that some streams carry the host's clock
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_MAX_ARRIVALS)  # stamp, arrival of cam0
         self._rate_meter = RateMeter()
 
     def open(self) -> Rig:
-        """Connect; samples come from now on, and wait. Raises UsageError, ShareError, DataError."""
+        """Connect and start the camera; samples wait in the queue. Raises UsageError, ShareError,
+        DataError."""
         device = self._connect(self.serial, 0)
         rig, self.serial = device.rig, device.serial
         self.processor = SampleProcessor(device.rates_hz, self._max_jump_s)
@@ -102,8 +104,8 @@ class CameraFeed:
         return rig
 
     def measurements(self) -> Iterator[Measurement]:
-        """Until it is stopped; what has come by then is still given. Raises ShareError where a stream that is
-        needed never comes (`has_failed`)."""
+        """Yield measurements until stopped, those that wait in the queue included. Raises ShareError if a
+        required stream never comes (`has_failed`)."""
         try:
             while not self.queue.is_drained:
                 self._poll_watchdog()
@@ -115,18 +117,19 @@ class CameraFeed:
             self.close()
 
     def stop(self) -> None:
-        """Ask for the end, from any thread or signal handler."""
+        """Request the end. Safe from any thread and from a signal handler."""
         self._stop.set()
 
     def close(self) -> None:
-        """Let the camera go; what it sent can still be read. Only for who reads, or before anyone does."""
+        """Disconnect the camera; queued samples can still be read. Call in the reader's thread, or before any
+        reading."""
         if self._device is not None:
             self._device.stop()
         self._device = None
         self.queue.close()
 
     def arrived_ns(self, stamp_ns: int) -> int:
-        """When cam0's image of that stamp came, on the host's monotonic clock; now, if that is not known."""
+        """Return the arrival of cam0's image of that stamp on the host's monotonic clock; now, if unknown."""
         known = (arrived for stamp, arrived in reversed(self._arrivals) if stamp == stamp_ns)
         return next(known, time.monotonic_ns())
 
@@ -136,19 +139,20 @@ class CameraFeed:
 
     @property
     def image_ns(self) -> int | None:
-        """When cam0's newest image came, read or not, on the host's monotonic clock; None before any."""
+        """Arrival of cam0's newest image, read or not, on the host's monotonic clock; None before the
+        first."""
         return self._last_sample_ns.get(CAM0)
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the camera now, for a person; empty: nothing."""
+        """What is wrong with the camera now, "" if nothing."""
         health = self.health
         if health is Health.AWAY:
-            return "the camera is away"
-        return "" if health is Health.OK else f"the camera goes without {', '.join(self._watchdog.excluded)}"
+            return "the camera is disconnected"
+        return "" if health is Health.OK else f"the camera gives no {', '.join(self._watchdog.excluded)}"
 
     def status(self) -> FeedStatus:
-        """For a live line."""
+        """Return the status for a live line."""
         streams = self.processor.streams
         return FeedStatus(
             health=self.health,
@@ -161,11 +165,11 @@ class CameraFeed:
         )
 
     def report(self) -> dict[str, Any]:
-        """What came, was repaired and lost."""
+        """Return counts of samples, repairs and losses."""
         return feed_report(self.processor, self.queue.dropped, self._watchdog)
 
     def _receive(self, sample: DeviceSample) -> None:
-        """In the device's threads."""
+        """Called in the device's threads."""
         self._last_sample_ns[sample.stream] = time.monotonic_ns()
         self.queue.put(sample)
 
@@ -176,13 +180,13 @@ class CameraFeed:
             yield measurement
         if self.processor.restarts > self._notified_restarts:
             self._notified_restarts = self.processor.restarts
-            self._notify("the camera's clock began anew; so does a new stretch")
+            self._notify("the camera's clock restarted; a new segment begins")
         if not self._has_warned_clocks and max(self.processor.placed_by_arrival.values()) >= _MIN_HOST_STAMPS:
             self._has_warned_clocks = True
             self._notify(_describe_clocks(self.processor.placed_by_arrival))
 
     def _poll_watchdog(self) -> None:
-        """Feed the watchdog, and do what it asks for."""
+        """Feed the watchdog and execute its action."""
         if self._stop.is_set():
             self.close()
         if self.queue.is_closed or not self._tick.fire_if_due(time.monotonic_ns()):
@@ -214,7 +218,7 @@ class CameraFeed:
     def _reconnect(self) -> None:
         if self._device is not None:
             silent = ", ".join(self._watchdog.silent)
-            self._notify(f"{silent}: no more samples come; looks for camera {self.serial} until it is back")
+            self._notify(f"{silent}: no more samples; waiting for camera {self.serial} to come back")
             self._device.stop()
             self._device = None
         self._attempts += 1
@@ -228,36 +232,31 @@ class CameraFeed:
         self._device = device
         self._notified_reasons.clear()
         self._watchdog.record_connect(time.monotonic_ns())
-        self._notify(f"camera {self.serial} is connected again; a new stretch begins")
+        self._notify(f"camera {self.serial} is connected again; a new segment begins")
 
     def _notify_reason(self, error: ShareError) -> None:
-        """Why a camera that may well be plugged in is still away; each reason once."""
+        """Report once each reason but absence why the camera cannot be reopened."""
         if not isinstance(error, NotAttachedError) and str(error) not in self._notified_reasons:
             self._notified_reasons.add(str(error))
             self._notify(str(error))
 
 
 def _describe_clocks(placed_by_arrival: Mapping[str, int]) -> str:
-    """Which streams are of the host's clock, in words. placed: samples of it among those of the camera's."""
+    """Describe which streams carry the host's clock. placed_by_arrival: number of such samples by stream."""
     host_streams, device_streams = (
         ", ".join(n for n, count in placed_by_arrival.items() if bool(count) is host)
         for host in (True, False)
     )
     return (
-        f"{host_streams} carry the "
-        f"host's clock, {device_streams} "
-        f"the camera's: kernel patch missing, see docs/do/record.md"
+        f"{host_streams} carry the host's clock, {device_streams} the camera's: "
+        "kernel patch missing, see docs/do/record.md"
     )
-
-
-# ---- How a live camera does: for a live line, and for a report.
-
-_RATE_WINDOW_S = 1.0
 
 
 @dataclass(frozen=True)
 class FeedStatus:
-    """rates_hz: samples of every stream in the last second; missing, dropped: so far; queue: that wait."""
+    """Status for a live line. rates_hz: of each stream over the last second. missing, dropped: samples so
+    far. queue: samples that wait."""
 
     health: Health
     rates_hz: dict[str, float]
@@ -272,14 +271,14 @@ class FeedStatus:
 
 
 class RateMeter:
-    """Counts to rates over about a second."""
+    """Converts counts to rates over about a second."""
 
     def __init__(self) -> None:
         self._previous: tuple[float, Mapping[str, int]] | None = None
         self._rates: dict[str, float] = {}
 
     def update(self, counts: Mapping[str, int], now_s: float) -> dict[str, float]:
-        """Hz by name; before the first second is over, 0."""
+        """Return rates by name, Hz; 0 in the first second."""
         if self._previous is None:
             self._previous, self._rates = (now_s, counts), dict.fromkeys(counts, 0.0)
         since_s, before = now_s - self._previous[0], self._previous[1]
@@ -290,7 +289,7 @@ class RateMeter:
 
 
 def feed_report(processor: SampleProcessor, dropped: Mapping[str, int], watchdog: Watchdog) -> dict[str, Any]:
-    """What came, was repaired and lost, as plain data (docs/do/record.md)."""
+    """Return counts of samples, repairs and losses as plain data (docs/do/record.md)."""
     streams = {
         name: {
             "samples": gaps.samples,

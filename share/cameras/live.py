@@ -1,4 +1,4 @@
-"""A live camera as a SOURCE: frames as they come, until somebody stops it."""
+"""A live camera as a SOURCE: frames as they come, until stopped."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from share.sensors.imu_check import ImuRange
 from share.sensors.measurement import CAM0, Measurement
 from share.types import I64
 
-MAX_WAITING_FRAMES = 2  # frames that may wait for the tracker
+MAX_WAITING_FRAMES = 2  # for the tracker
 
 
 def choose_rig(
     calibration: Calibration | None, factory: Rig, serial: str | None
 ) -> tuple[Rig, tuple[str, ...]]:
-    """What is to be believed of a camera, and what a person should know of that. Raises UsageError where the
-    calibration that was given cannot be of it as it is read."""
+    """Return the rig to use, from `calibration` or else `factory`, and warnings for the user. Raises
+    UsageError if the calibration cannot fit this camera in its mode."""
     if calibration is None:
         return factory, ()
     try:
@@ -36,9 +36,9 @@ def choose_rig(
 
 
 class LiveSource(Source):
-    """The camera is opened here, and let go at the end of `measurements`.
+    """A live camera. The constructor opens it; the end of `measurements` disconnects it.
 
-    Raises UsageError, ShareError or DataError where it cannot be opened, or not with that calibration.
+    Raises UsageError, ShareError or DataError if it cannot be opened, or does not fit the calibration.
     """
 
     reports_silence = True
@@ -50,7 +50,7 @@ class LiveSource(Source):
         calibration: Calibration | None = None,
         imu_range: ImuRange | None = None,
     ) -> None:
-        """rate_hz: of cam0; calibration: in place of the factory's; imu_range: None: unknown."""
+        """rate_hz: of cam0. calibration: in place of the factory's. imu_range: None if unknown."""
         self.imu_range = imu_range or Source.imu_range
         factory = feed.open()
         self.feed, self._rate_hz = feed, rate_hz
@@ -62,10 +62,10 @@ class LiveSource(Source):
             raise
 
     def stamps(self) -> dict[str, I64]:
-        raise UsageError(f"{self.name}: nobody knows yet what a live camera will see; record it first")
+        raise UsageError(f"{self.name}: a live camera has no known stamps; record it first")
 
     def measurements(self) -> Iterator[Measurement]:
-        """Once only."""
+        """Yield measurements; may be called once."""
         return self.feed.measurements()
 
     def truth(self) -> Trajectory | None:
@@ -75,26 +75,26 @@ class LiveSource(Source):
         self.feed.stop()
 
     def close(self) -> None:
-        """Let the camera go, whether it was read or not."""
+        """Disconnect the camera, whether it was read or not."""
         self.feed.close()
 
     def arrived_ns(self, stamp_ns: int) -> int:
-        """When cam0's image of that stamp came, on the host's monotonic clock."""
+        """Return the arrival of cam0's image of that stamp on the host's monotonic clock."""
         return self.feed.arrived_ns(stamp_ns)
 
     @property
     def image_ns(self) -> int | None:
-        """When cam0's newest image came, tracked or not, on the same clock."""
+        """Arrival of cam0's newest image, tracked or not, on the same clock."""
         return self.feed.image_ns
 
     @property
     def images_dropped(self) -> int:
-        """Of cam0, for newer ones, as the tracker was slower."""
+        """Number of cam0 images dropped for newer ones because the tracker was too slow."""
         return self.feed.queue.dropped.get(CAM0, 0)
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the camera now, for a person; empty: nothing."""
+        """What is wrong with the camera now, "" if nothing."""
         return self.feed.trouble
 
     def report(self) -> dict[str, Any]:

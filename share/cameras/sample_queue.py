@@ -1,4 +1,4 @@
-"""Samples from a device's threads to the one that writes or tracks them: bounded, and nobody waits."""
+"""Bounded queues of samples, from a device's threads to the thread that writes or tracks them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 
 
 class SampleQueue:
-    """Policy `drop_new_image`: an image that finds the queue full is left out, with its partner of the same
-    stamp. Samples of the IMU are small, and left out only where `max_imu_samples` of them wait. `dropped`
-    counts by stream."""
+    """Policy `drop_new_image`: while the queue is full, new images are dropped, with all images of the same
+    stamp. IMU samples are dropped only while `max_imu_samples` of them wait. `dropped` counts by stream."""
 
     def __init__(self, max_images: int = 60, max_imu_samples: int = 20_000) -> None:
         self.dropped: dict[str, int] = {}
         self._max_images, self._max_imu_samples = max_images, max_imu_samples
         self._samples: deque[DeviceSample] = deque()
         self._image_count = 0
-        self._accepted_ns = self._refused_ns = -1  # stamp of the last image that was let in, and was not
+        self._accepted_ns = self._refused_ns = -1  # stamps of the last accepted and refused image
         self._changed = threading.Condition()
         self._is_closed = False
 
@@ -27,11 +26,11 @@ class SampleQueue:
 
     @property
     def image_count(self) -> int:
-        """How many images wait."""
+        """Number of images that wait."""
         return self._image_count
 
     def put(self, sample: DeviceSample) -> None:
-        """Never waits."""
+        """Add a sample or drop it; never waits."""
         with self._changed:
             if self._is_closed or not self._has_room(sample):
                 self._drop(sample)
@@ -41,7 +40,7 @@ class SampleQueue:
             self._changed.notify()
 
     def get(self, timeout_s: float) -> DeviceSample | None:
-        """The oldest sample; None after timeout_s, or when it is closed and empty."""
+        """Return the oldest sample; None after timeout_s, or if closed and empty."""
         with self._changed:
             if not self._samples and not self._is_closed:
                 self._changed.wait(timeout_s)
@@ -52,23 +51,23 @@ class SampleQueue:
             return sample
 
     def close(self) -> None:
-        """Let nothing more in; what waits can still be taken."""
+        """Accept no more samples; waiting ones can still be taken."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
 
     @property
     def is_closed(self) -> bool:
-        """Nothing more is let in."""
+        """Whether no more samples are accepted."""
         return self._is_closed
 
     @property
     def is_drained(self) -> bool:
-        """Closed, and all taken."""
+        """Whether the queue is closed and empty."""
         return self._is_closed and not self._samples
 
     def _has_room(self, sample: DeviceSample) -> bool:
-        """Whether it is let in."""
+        """Return whether `sample` is accepted; may drop others to make room."""
         if not _is_image(sample):
             return len(self._samples) - self._image_count < self._max_imu_samples
         return self._has_room_for_image(sample.stamp_ns)
@@ -87,13 +86,13 @@ class SampleQueue:
 
 
 class NewestImageQueue(SampleQueue):
-    """Policy `drop_old_image`: an image that finds the queue full takes the place of the oldest, which goes
-    with its partners of the same stamp. So a tracker that is slower than its camera tracks the newest."""
+    """Policy `drop_old_image`: while the queue is full, a new image replaces the oldest, with all images of
+    that stamp. So a tracker that is slower than its camera tracks the newest images."""
 
     def _has_room_for_image(self, stamp_ns: int) -> bool:
         while self._image_count >= self._max_images:
             oldest_ns = next(s.stamp_ns for s in self._samples if _is_image(s))
-            if oldest_ns == stamp_ns:  # its own partner
+            if oldest_ns == stamp_ns:  # of the same frame
                 break
             self._drop_images(oldest_ns)
         return True

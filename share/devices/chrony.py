@@ -1,4 +1,4 @@
-"""What the chronyd of this machine thinks of its clock, and how one is told to follow a server."""
+"""State of this machine's chronyd, and the configuration that makes one follow a server."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from share.errors import DataError
 from share.net.udp import HostPort
 
-_LOCAL_REFERENCE = "7F7F0101"  # reference id of a chronyd that follows its own clock
+_LOCAL_REFERENCE = "7F7F0101"  # reference id of a chronyd that follows its local clock
 _FIELDS = 14  # of `chronyc -c tracking`, chrony 2.2 and later
 _TIMEOUT_S = 10.0
 
 
 @dataclass(frozen=True)
 class ChronyTracking:
-    """offset_s: the clock that it follows minus this one. rms_s: of that over the last updates. delay_s
-    and dispersion_s: from here to where the time comes from. source: whom it follows, may be empty.
-    synchronised: it follows somebody. local: that is its own clock."""
+    """Output of `chronyc tracking`. offset_s: reference clock minus this one. rms_s: of that over recent
+    updates. delay_s, dispersion_s: root delay and dispersion. source: its reference, may be empty.
+    synchronised: it follows a reference. local: the reference is its own clock."""
 
     source: str
     synchronised: bool
@@ -30,13 +30,13 @@ class ChronyTracking:
 
     @property
     def uncertainty_s(self) -> float:
-        """Most that the offset can be wrong by: half the root delay and the root dispersion, as chrony's
-        own manual has it (chronyc(1), tracking)."""
+        """Largest error of the offset: half the root delay plus the root dispersion (chronyc(1),
+        tracking)."""
         return self.delay_s / 2 + self.dispersion_s
 
 
 def read_tracking() -> ChronyTracking | None:
-    """None where no chronyd runs. Raises DataError where it answers what is not understood."""
+    """Ask chronyd; None if none runs. Raises DataError for output that cannot be parsed."""
     try:
         result = subprocess.run(
             ["chronyc", "-c", "tracking"], capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
@@ -47,7 +47,7 @@ def read_tracking() -> ChronyTracking | None:
 
 
 def parse_tracking(text: str) -> ChronyTracking:
-    """Of the line that `chronyc -c tracking` prints. Raises DataError."""
+    """Parse the line that `chronyc -c tracking` prints. Raises DataError."""
     row = text.strip().split(",")
     try:
         if len(row) < _FIELDS:
@@ -56,15 +56,15 @@ def parse_tracking(text: str) -> ChronyTracking:
         delay_s, dispersion_s = float(row[10]), float(row[11])
         stratum = int(row[2])
     except ValueError as error:
-        raise DataError(f"chronyc -c tracking: not understood ({error}): {text.strip()!r}") from None
+        raise DataError(f"chronyc -c tracking: cannot be parsed ({error}): {text.strip()!r}") from None
     synchronised, local = row[13] != "Not synchronised", row[0].upper() == _LOCAL_REFERENCE
     return ChronyTracking(row[1], synchronised, local, stratum, offset_s, rms_s, delay_s, dispersion_s)
 
 
 def follow_lines(server: HostPort) -> list[str]:
-    """Lines of chrony.conf that make a machine follow `server`: asked every 1 to 16 s, stepped only at the
-    start where it is off by more than 10 ms. Servers of the internet, which packages of chrony bring, would
-    outvote the room's one: it is the one to trust, and to take before others."""
+    """Return the lines of chrony.conf that make a machine follow `server`: polled every 1 to 16 s, stepped
+    only at the start if more than 10 ms off. `prefer trust`, because the internet servers of chrony's
+    packages would outvote the room's server."""
     return [
         f"server {server.name} port {server.port} iburst minpoll 0 maxpoll 4 prefer trust",
         "makestep 0.01 3",

@@ -1,4 +1,4 @@
-"""How far clocks are from this machine's, by servers or by its own chronyd, and whether that will do."""
+"""Offsets between clocks, by time servers or by this machine's chronyd, checked against a limit."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from share.net.udp import HostPort
 
 @dataclass(frozen=True)
 class ClockCheck:
-    """One clock. Numbers are None where nothing is known. offset_ms: it minus this machine's, wrong by at
-    most uncertainty_ms. note: what else to know. wrong: why it will not do, and what to do; None: it
-    will. to_follow: this machine's clock would agree if it followed that one."""
+    """Check of one clock. Numbers are None if unknown. offset_ms: that clock minus this machine's, with an
+    error of at most uncertainty_ms. note: further information. wrong: why the check fails and what to do,
+    None if it passes. to_follow: following that clock would fix this machine's."""
 
     name: str
     offset_ms: float | None = None
@@ -38,12 +38,12 @@ class ClockCheck:
 def check_servers(
     hosts: Sequence[HostPort], count: int, limit_ms: float, step: Callable[[int], None] = lambda done: None
 ) -> list[ClockCheck]:
-    """As `query_servers`. Raises UsageError for a host that is unknown."""
+    """Check time servers, see `query_servers`. Raises UsageError for an unknown host."""
     return [_check_server(finding, limit_ms) for finding in query_servers(hosts, count, step)]
 
 
 def check_chrony(limit_ms: float) -> ClockCheck | None:
-    """None where no chronyd runs. Raises DataError where it is not understood."""
+    """Check by this machine's chronyd; None if none runs. Raises DataError if its output cannot be parsed."""
     tracking = chrony.read_tracking()
     if tracking is None:
         return None
@@ -52,7 +52,7 @@ def check_chrony(limit_ms: float) -> ClockCheck | None:
         return ClockCheck(name, wrong="follows no other clock yet; see `chronyc sources`")
     if tracking.local:
         return ClockCheck(
-            name, wrong="follows its own clock; right where others follow it: check from theirs"
+            name, wrong="follows its own clock; fine if others follow it: check on their machines"
         )
     offset_ms, uncertainty_ms = tracking.offset_s * 1e3, tracking.uncertainty_s * 1e3
     return ClockCheck(
@@ -95,13 +95,13 @@ def _limit_problem(offset_ms: float, uncertainty_ms: float, limit_ms: float, fix
         return None
     if not _is_clock_off(offset_ms, uncertainty_ms, limit_ms):
         return (
-            f"known to no better than ±{uncertainty_ms:.3f} ms, the limit is {limit_ms:g} ms; "
-            "a cable, a quieter network or a larger --count tell more; or give a larger --limit-ms"
+            f"uncertain by ±{uncertainty_ms:.3f} ms, the limit is {limit_ms:g} ms; "
+            "use a cable, a quieter network or a larger --count, or give a larger --limit-ms"
         )
     return f"off by {offset_ms:+.3f} ± {uncertainty_ms:.3f} ms, the limit is {limit_ms:g} ms; {fix}"
 
 
 def _is_clock_off(offset_ms: float, uncertainty_ms: float, limit_ms: float) -> bool:
-    """Whether it is the clock that will not do, rather than what is known of it."""
+    """Return whether the clock itself is off, not only its offset too uncertain."""
     max_ms, min_ms = abs(offset_ms) + uncertainty_ms, abs(offset_ms) - uncertainty_ms
     return min_ms > limit_ms or uncertainty_ms < limit_ms < max_ms

@@ -1,6 +1,6 @@
-"""What Linux tells of the computer: processor, USB, udev, disk. Every root can be a tree of a test.
+"""Facts of this computer from Linux: processor, USB, udev rules, disk, libraries.
 
-What is not there is None or empty: containers and virtual machines show little.
+Missing facts are None or empty: containers and virtual machines show little. root: a test can pass a tree.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ _VENDOR, _D435I = "8086", "0b3a"
 _RULE_FOLDERS = ("etc/udev/rules.d", "lib/udev/rules.d", "usr/lib/udev/rules.d")
 _CPUS = "sys/devices/system/cpu/cpu[0-9]*"
 _NATIVE_LIBRARIES = ("numpy", "cv2", "scipy.linalg", "zmq", "onnxruntime")
-_OPTIONAL_LIBRARIES = ("poselib",)  # for this processor; share.geometry.absolute_pose does without
+_OPTIONAL_LIBRARIES = ("poselib",)  # share.geometry.absolute_pose also works without it
 
 
 def governors(root: Path = Path("/")) -> list[str]:
-    """Of each core."""
+    """Return the CPU governor of each core."""
     return [text for path in root.glob(f"{_CPUS}/cpufreq/scaling_governor") if (text := _read_text(path))]
 
 
 def throttle_counts(root: Path = Path("/")) -> list[int]:
-    """How often each core was slowed by heat since the start (Intel's; core_throttle_count)."""
+    """Return how often heat slowed each core since the start (Intel only: core_throttle_count)."""
     files = root.glob(f"{_CPUS}/thermal_throttle/core_throttle_count")
     return [count for path in files if (count := _read_int(path)) is not None]
 
 
 def pi_throttled_bits(root: Path = Path("/")) -> int | None:
-    """What a Raspberry Pi's firmware says of supply and heat, as `vcgencmd get_throttled` has it; None of
-    another computer. A kernel that is not the Pi's own tells of the supply alone (rpi_volt)."""
+    """Return a Raspberry Pi's supply and heat bits as `vcgencmd get_throttled`; None on other computers. A
+    kernel that is not the Pi's own shows the supply alone (rpi_volt)."""
     for path in root.glob("sys/devices/platform/soc*/*firmware*/get_throttled"):
         if re.fullmatch(r"(0x)?[0-9a-fA-F]{1,8}", text := _read_text(path) or ""):
             return int(text, 16)
@@ -46,8 +46,8 @@ def pi_throttled_bits(root: Path = Path("/")) -> int | None:
 
 
 def is_governor_reset(root: Path = Path("/")) -> bool:
-    """Whether a power-profiles-daemon is installed and may run, which sets the governor of processors that
-    have an energy preference (Intel's, AMD's) to powersave whenever it starts."""
+    """Return whether a power-profiles-daemon may run: at each start it sets the governor of processors with
+    an energy preference (Intel, AMD) to powersave."""
     unit = "systemd/system/power-profiles-daemon.service"
     masked = os.path.realpath(root / "etc" / unit) == "/dev/null"
     is_installed = any((root / folder / unit).exists() for folder in ("lib", "usr/lib"))
@@ -60,7 +60,7 @@ def usb_memory_mb(root: Path = Path("/")) -> int | None:
 
 
 def cameras(root: Path = Path("/")) -> list[UsbCamera] | None:
-    """All D435i, by port; None where the system shows no USB."""
+    """Return all attached D435i by port; None if the system shows no USB devices."""
     folder = root / "sys/bus/usb/devices"
     if not folder.is_dir():
         return None
@@ -68,24 +68,23 @@ def cameras(root: Path = Path("/")) -> list[UsbCamera] | None:
 
 
 def camera_rules(root: Path = Path("/")) -> list[str]:
-    """Files of udev that name the camera and its IMU in lines that are no comments."""
+    """Return the udev rule files that match the camera and its IMU."""
     files = [path for folder in _RULE_FOLDERS for path in sorted((root / folder).glob("*.rules"))]
-    rule_files = {
-        path.resolve(): path for path in files if _names_camera(_read_text(path) or "")
-    }  # /lib is /usr/lib
+    # By resolved path: /lib may be a link to /usr/lib.
+    rule_files = {path.resolve(): path for path in files if _names_camera(_read_text(path) or "")}
     return [f"/{path.relative_to(root)}" for path in rule_files.values()]
 
 
 def free_disk_bytes(folder: Path) -> tuple[Path, int]:
-    """Of the disk of `folder`, by the nearest folder above that is there."""
+    """Return the nearest existing folder at or above `folder`, and the free bytes of its disk."""
     existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     return existing, shutil.disk_usage(existing).free
 
 
 def is_port_free(port: int) -> bool:
-    """Whether a TCP port can be listened at, on all addresses."""
+    """Return whether a TCP port is free on all addresses."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # what has ended does not count
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # ignore closed connections
         try:
             probe.bind(("", port))
             probe.listen()
@@ -97,7 +96,7 @@ def is_port_free(port: int) -> bool:
 def native_libraries(
     names: Sequence[str] = _NATIVE_LIBRARIES, optional: Sequence[str] = _OPTIONAL_LIBRARIES
 ) -> dict[str, str | None]:
-    """Why each does not load; None where it does. optional: those that may not be installed at all."""
+    """Return the load error of each library, None if it loads. optional: checked only if installed."""
     installed = [name for name in optional if importlib.util.find_spec(name) is not None]
     return {name: _load_error(name) for name in (*names, *installed)}
 
@@ -127,7 +126,7 @@ def _may_start_imu(path: Path) -> bool | None:
 
 
 def _names_camera(text: str) -> bool:
-    """librealsense's own file names each product; ours the D435i. Without a line for iio the IMU is shut."""
+    """Return whether udev rules match the D435i and also its IMU (iio), which needs a rule of its own."""
     lines = [line.lower() for line in text.splitlines() if not line.lstrip().startswith("#")]
     named = [line for line in lines if _VENDOR in line and _D435I in line]
     return any("iio" in line for line in named) and any("iio" not in line for line in named)
@@ -141,7 +140,8 @@ def _read_text(path: Path) -> str | None:
 
 
 def _read_float(path: Path) -> float | None:
-    """Also None of `unknown`, as the kernel calls the speed of a device that is coming or going."""
+    """Return the number in a file, None if absent or `unknown` (the speed of a device that is just coming or
+    going)."""
     text = _read_text(path) or ""
     return float(text) if re.fullmatch(r"\d+(\.\d+)?", text) else None
 

@@ -1,4 +1,7 @@
-"""Asks time servers how far their clocks are from this one's."""
+"""An NTP client: measures the offset of time servers' clocks, with a bound on its error.
+
+RFC 5905, sections 8 and 10, for a client that asks a few times and reports (SNTP, section 14).
+"""
 
 from __future__ import annotations
 
@@ -21,34 +24,33 @@ from share.net.ntp import (
 from share.net.udp import HostPort, StampedSocket, clock_precision
 from share.protocol.edge_clock import Exchange
 
-# ---- What answers of a time server say of the own clock: its offset, and how wrong that can be.
-#
-# RFC 5905, sections 8 and 10, for one who asks a few times and then says what it found (SNTP, section 14).
-
-MAX_DRIFT_PPM = 15  # PHI: how fast two clocks may part during an exchange
-
+MAX_DRIFT_PPM = 15  # PHI: largest drift between two clocks during an exchange
+QUESTION_PERIOD_S = 0.25  # between two requests to one server
+REPLY_TIMEOUT_S = 1.0
+MAX_UNANSWERED = 3  # requests without any reply before giving up
+_NTP_PORT = 123
 
 _KISS_REASONS = {
     "RATE": "asked too often; wait a minute",
-    "DENY": "it is set not to",
-    "RSTR": "it is set not to",
+    "DENY": "its configuration denies it",
+    "RSTR": "its configuration denies it",
 }
 
 
 class KissError(ValueError):
-    """The server refuses (section 7.4): it must not be asked again. code: four letters, RATE, DENY, …"""
+    """The server refuses (kiss-o'-death, section 7.4): it must not be asked again. code: RATE, DENY, …"""
 
     def __init__(self, code: str) -> None:
         super().__init__(
-            f"it refuses to answer ({code}): {_KISS_REASONS.get(code, 'for a reason of its own')}"
+            f"the server refuses to answer ({code}): {_KISS_REASONS.get(code, 'no known reason')}"
         )
         self.code = code
 
 
 @dataclass(frozen=True)
 class NtpReply:
-    """One exchange, and what the server says of itself. root_ns: how far what it has its time from
-    can be off by its own account, half its root delay and its root dispersion."""
+    """One exchange, and the server's own accuracy. root_distance_ns: half its root delay plus its root
+    dispersion."""
 
     exchange: Exchange
     stratum: int
@@ -56,7 +58,7 @@ class NtpReply:
     root_distance_ns: int
 
     def max_error_ns(self, own_precision_ns: int) -> int:
-        """Most that the offset can be wrong by: the root distance (section 11.2 and A.5.5.2) of one
+        """Return the largest error of the offset: the root distance (sections 11.2 and A.5.5.2) of one
         sample, without jitter, which is no bound."""
         took_ns = self.exchange.returned_ns - self.exchange.sent_ns
         reading_ns = self.precision_ns + own_precision_ns + -(-MAX_DRIFT_PPM * took_ns // 1_000_000)
@@ -65,7 +67,8 @@ class NtpReply:
 
 @dataclass(frozen=True)
 class NtpEstimate:
-    """Of several answers. offset_ns: server minus own clock, wrong by at most uncertainty_ns."""
+    """Estimate from several replies. offset_ns: server minus own clock, with an error of at most
+    uncertainty_ns."""
 
     offset_ns: int
     uncertainty_ns: int
@@ -76,46 +79,44 @@ class NtpEstimate:
 
     @property
     def max_difference_ns(self) -> int:
-        """How far apart the clocks can be."""
+        """Largest possible difference of the clocks."""
         return abs(self.offset_ns) + self.uncertainty_ns
 
 
 def make_request(nonce: int) -> bytes:
-    """A question. nonce: 64 random bits in place of the time, which is nobody's business: the answer has
-    to repeat them, so nobody can answer who has not heard the question."""
+    """Return a request. nonce: 64 random bits in place of the transmit time. The reply must repeat them, so
+    that only a host that received the request can answer."""
     return NtpPacket(NtpMode.CLIENT, transmit=nonce).encode()
 
 
 def parse_reply(data: bytes, nonce: int, sent_ns: int, back_ns: int) -> NtpReply:
-    """What came back at `returned_ns`. Raises KissError, and ValueError where it is no answer that can be
-    believed (section 9.2: "bogus", unsynchronised, impossible)."""
+    """Parse a datagram that came at `back_ns`. Raises KissError, or ValueError if it is no valid reply
+    (section 9.2: bogus, unsynchronised, impossible)."""
     packet = NtpPacket.decode(data)
     if packet.mode is not NtpMode.SERVER:
-        raise ValueError(f"mode {packet.mode.name} in place of an answer")
+        raise ValueError(f"mode {packet.mode.name}, expected SERVER")
     if packet.origin != nonce:
-        raise ValueError("it answers another question")
+        raise ValueError("it answers another request")
     if packet.stratum == KISS_STRATUM and (code := packet.refid.rstrip(b"\0 ")).isalnum():
         raise KissError(code.decode("ascii"))
-    if packet.leap == LEAP_UNKNOWN or packet.stratum in (
-        KISS_STRATUM,
-        UNSYNCHRONISED_STRATUM,
-    ):  # 0: chronyd says it so
-        raise ValueError("that server does not know the time itself (unsynchronised)")
+    unsynchronised = (KISS_STRATUM, UNSYNCHRONISED_STRATUM)  # chronyd uses 0
+    if packet.leap == LEAP_UNKNOWN or packet.stratum in unsynchronised:
+        raise ValueError("the server is not synchronised itself")
     if packet.precision > 0:
-        raise ValueError(f"that server reads its clock to no better than 2^{packet.precision} s")
+        raise ValueError(f"the server's clock has a precision of only 2^{packet.precision} s")
     received_ns, replied_ns = from_stamp(packet.receive, sent_ns), from_stamp(packet.transmit, sent_ns)
     exchange = Exchange(sent_ns, received_ns, replied_ns, back_ns)
     if not exchange.is_valid:
-        raise ValueError("its times are impossible; was a clock set meanwhile?")
+        raise ValueError("its times are impossible; a clock may have been set meanwhile")
     root_ns = -(-short_ns(packet.root_delay) // 2) + short_ns(packet.root_dispersion)
     return NtpReply(exchange, packet.stratum, log2_ns(packet.precision), root_ns)
 
 
 def estimate_offset(answers: Sequence[NtpReply], own_precision_ns: int) -> NtpEstimate:
-    """That of the answer with the least delay (section 10): what waited longest on its way says least.
+    """Return the estimate of the reply with the least delay (section 10), the one with the least queueing.
 
-    Jitter is the root mean square of the other offsets against that one; of a single answer the
-    precisions. Raises ValueError without answers.
+    Its jitter is the root mean square of the other offsets against that one; with a single reply, the sum of
+    the precisions. Raises ValueError without replies.
     """
     if not answers:
         raise ValueError("no answers")
@@ -133,15 +134,10 @@ def estimate_offset(answers: Sequence[NtpReply], own_precision_ns: int) -> NtpEs
     )
 
 
-QUESTION_PERIOD_S = 0.25  # between two questions to one server
-REPLY_TIMEOUT_S = 1.0  # for an answer
-MAX_UNANSWERED = 3  # questions without an answer, before the first one, that are enough
-_NTP_PORT = 123
-
-
 @dataclass(frozen=True)
 class TimeServerResult:
-    """estimate: None where nothing came. trouble: why nothing came, or not more, and what to do."""
+    """Result of one server. estimate: None without a reply. trouble: why there was no reply, or no further
+    ones, and what to do."""
 
     host: HostPort
     estimate: NtpEstimate | None
@@ -152,7 +148,7 @@ class TimeServerResult:
 
 @dataclass
 class _ServerQuery:
-    """What is known of one server so far."""
+    """State of the requests to one server."""
 
     host: HostPort
     socket: StampedSocket | None = None
@@ -170,88 +166,83 @@ class _ServerQuery:
 def query_servers(
     hosts: Sequence[HostPort], count: int, step: Callable[[int], None] = lambda done: None
 ) -> list[TimeServerResult]:
-    """Each is asked `count` times, one after the other so that none disturbs another. step: told 1 for
-    each question, also for those that one who is given up is spared. Raises UsageError for a host that is
-    unknown, before any is asked.
+    """Send `count` requests to each server, one at a time so that they do not disturb each other. step:
+    called with 1 for each request, also for those not sent to a server that was given up. Raises UsageError
+    for an unknown host before sending anything.
     """
-    inquiries: list[_ServerQuery] = []
+    queries: list[_ServerQuery] = []
     try:
         for host in hosts:
-            inquiries.append(_open_query(host))  # one by one: what is open is closed if the next is unknown
+            queries.append(_open_query(host))  # one by one: an unknown host closes the earlier sockets
         for round_ in range(count):
-            _pause(round_)
-            for inquiry in inquiries:
-                _ask_next(inquiry)
+            if round_:
+                time.sleep(QUESTION_PERIOD_S)
+            for query in queries:
+                _ask_next(query)
                 step(1)
     finally:
-        for inquiry in inquiries:
-            if inquiry.socket is not None:
-                inquiry.socket.close()
+        for query in queries:
+            if query.socket is not None:
+                query.socket.close()
     precision_ns = log2_ns(clock_precision())
-    return [_query_result(inquiry, precision_ns) for inquiry in inquiries]
-
-
-def _pause(round_: int) -> None:
-    if round_:
-        time.sleep(QUESTION_PERIOD_S)
+    return [_query_result(query, precision_ns) for query in queries]
 
 
 def _open_query(host: HostPort) -> _ServerQuery:
-    inquiry = _ServerQuery(host)
+    query = _ServerQuery(host)
     try:
-        inquiry.socket = StampedSocket.connect(host)
+        query.socket = StampedSocket.connect(host)
     except OSError as error:
-        inquiry.stop(f"no way there: {error.strerror or error}")
-    return inquiry
+        query.stop(f"unreachable: {error.strerror or error}")
+    return query
 
 
-def _ask_next(inquiry: _ServerQuery) -> None:
-    if inquiry.is_over or inquiry.socket is None:
+def _ask_next(query: _ServerQuery) -> None:
+    if query.is_over or query.socket is None:
         return
-    inquiry.questions += 1
-    if inquiry.start_s is None:
-        inquiry.start_s = time.monotonic()
+    query.questions += 1
+    if query.start_s is None:
+        query.start_s = time.monotonic()
     try:
-        _ask(inquiry, inquiry.socket)
+        _ask(query, query.socket)
     except KissError as error:
-        inquiry.stop(str(error))
+        query.stop(str(error))
     except ConnectionRefusedError:
-        inquiry.stop(_no_listener_message(inquiry.host))
+        query.stop(_no_listener_message(query.host))
     except OSError as error:
-        inquiry.stop(f"no way there: {error.strerror or error}")
-    inquiry.duration_s = time.monotonic() - inquiry.start_s
-    if not inquiry.answers and inquiry.questions >= MAX_UNANSWERED:
-        inquiry.stop(inquiry.trouble or _no_answer_message(inquiry.host))
+        query.stop(f"unreachable: {error.strerror or error}")
+    query.duration_s = time.monotonic() - query.start_s
+    if not query.answers and query.questions >= MAX_UNANSWERED:
+        query.stop(query.trouble or _no_answer_message(query.host))
 
 
-def _ask(inquiry: _ServerQuery, link: StampedSocket) -> None:
-    """One question. What is no answer to it is passed over, and remembered as the trouble."""
+def _ask(query: _ServerQuery, link: StampedSocket) -> None:
+    """Send one request and wait for its reply. Invalid replies are skipped and recorded as trouble."""
     nonce = secrets.randbits(64) or 1
-    question = make_request(nonce)
+    request = make_request(nonce)
     deadline = time.monotonic() + REPLY_TIMEOUT_S
     sent_ns = time.time_ns()
-    link.send(question)
+    link.send(request)
     while (left_s := deadline - time.monotonic()) > 0:
         datagram = link.receive(left_s)
         try:
             if datagram is not None:
-                inquiry.answers.append(parse_reply(datagram.data, nonce, sent_ns, datagram.stamp_ns))
+                query.answers.append(parse_reply(datagram.data, nonce, sent_ns, datagram.stamp_ns))
                 return
         except KissError:
             raise
         except ValueError as error:
-            inquiry.trouble = f"an answer that cannot be used: {error}"
+            query.trouble = f"invalid reply: {error}"
 
 
-def _query_result(inquiry: _ServerQuery, precision_ns: int) -> TimeServerResult:
-    if inquiry.answers:
-        ntp_estimate, trouble = (
-            estimate_offset(inquiry.answers, precision_ns),
-            inquiry.trouble if inquiry.is_over else None,
-        )
+def _query_result(query: _ServerQuery, precision_ns: int) -> TimeServerResult:
+    estimate: NtpEstimate | None = None
+    if query.answers:
+        estimate = estimate_offset(query.answers, precision_ns)
+        trouble = query.trouble if query.is_over else None
     else:
-        ntp_estimate, trouble = None, inquiry.trouble or _no_answer_message(inquiry.host)
-    return TimeServerResult(inquiry.host, ntp_estimate, inquiry.questions, inquiry.duration_s, trouble)
+        trouble = query.trouble or _no_answer_message(query.host)
+    return TimeServerResult(query.host, estimate, query.questions, query.duration_s, trouble)
 
 
 def _no_listener_message(host: HostPort) -> str:
@@ -259,9 +250,9 @@ def _no_listener_message(host: HostPort) -> str:
 
 
 def _no_answer_message(host: HostPort) -> str:
-    open_ = f"is UDP port {host.port} open to it?"
-    return f"no answer; does `share sync server` run there, and {open_}{_other_port_hint(host)}"
+    check = f"check that `share sync server` runs there and that UDP port {host.port} is open"
+    return f"no answer; {check}{_other_port_hint(host)}"
 
 
 def _other_port_hint(host: HostPort) -> str:
-    return "" if host.port == _NTP_PORT else f" (ntpd and chronyd have port {_NTP_PORT})"
+    return "" if host.port == _NTP_PORT else f" (ntpd and chronyd use port {_NTP_PORT})"

@@ -1,4 +1,4 @@
-"""A time server's side: which questions are answered, and with what (RFC 5905, sections 9.2 and 14)."""
+"""An NTP server: which requests are answered, and with what (RFC 5905, sections 9.2 and 14)."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from share.net.ntp import NtpMode, NtpPacket, to_stamp, with_transmit_time
 from share.net.udp import Datagram, StampedSocket
 from share.timing import PeriodicTimer, TokenBucket
 
-LOCAL_REFERENCE_ID = bytes(
-    (127, 127, 1, 1)
-)  # the reference id of a clock that follows nothing, as ntpd and chrony write it
-RATE_PER_S = 8.0  # questions that one address may ask, on average,
-BURST = 32  # and at once; chronyd's iburst is 4 to 8 in 2 s each
-MAX_CLIENTS = 1024  # addresses remembered; the one not heard for longest is forgotten
+LOCAL_REFERENCE_ID = bytes((127, 127, 1, 1))  # of an undisciplined local clock, as in ntpd and chrony
+RATE_PER_S = 8.0  # mean rate of requests per address
+BURST = 32  # requests at once per address; chronyd's iburst sends 4 to 8, every 2 s
+MAX_CLIENTS = 1024  # addresses remembered; the least recently used is forgotten
+_TICK_S = 0.2  # period of `show`; also how long `stop` may take
+_MAX_COMPLAINTS = 16  # kinds of errors that are reported
 
 
 class TimeServer:
-    """Answers clients, by address, out of the clock of this machine, which it calls true: stratum
-    `stratum`, no root delay, no root dispersion. Times are passed in. precision: log2 of s.
+    """Answers NTP clients from this machine's clock, which it declares true: stratum `stratum`, no root
+    delay, no root dispersion. Times are passed in. precision: log2 of s.
 
-    An answer is never longer than its question, and whoever asks too often is not answered at all, so that
-    questions with a forged address bring nobody more than was sent.
+    A reply is never longer than its request, and an address that asks too often gets none, so that requests
+    with a forged address amplify nothing.
     """
 
     def __init__(self, stratum: int = 10, precision: int = -20) -> None:
         self.stratum, self._precision = stratum, precision
         self._clients: OrderedDict[str, TokenBucket] = OrderedDict()
         self.counts: Counter[str] = Counter()  # answered, limited, ignored
-        self.last_client: str | None = None  # address that was answered last
+        self.last_client: str | None = None  # address answered last
 
     @property
     def clients(self) -> int:
-        """Addresses that asked, of those remembered."""
+        """Number of remembered addresses."""
         return len(self._clients)
 
     def answer(self, data: bytes, address: str, received_ns: int, now_ns: int) -> NtpPacket | None:
-        """All but its transmit stamp, which is for who sends it; None: nothing is to be sent.
+        """Return the reply without its transmit stamp, which the sender sets; None to send nothing.
 
-        received_ns: Unix time when `data` came; now_ns: of a clock that is never set.
+        received_ns: Unix time of arrival of `data`. now_ns: of a monotonic clock.
         """
         try:
             question = NtpPacket.decode(data)
@@ -66,7 +66,7 @@ class TimeServer:
             poll=question.poll,
             precision=self._precision,
             refid=LOCAL_REFERENCE_ID,
-            reference=received,  # a clock that follows nothing but itself was right just now
+            reference=received,  # the local clock is its own reference
             origin=question.transmit,
             receive=received,
         )
@@ -82,14 +82,9 @@ class TimeServer:
         return bucket
 
 
-# ---- A time server at its socket. Nothing that comes in ends it.
-
-_TICK_S = 0.2  # how long it may take to end
-_MAX_COMPLAINTS = 16  # complaints
-
-
 class TimeServerRun:
-    """`run` serves until `stop`. show: called a few times a second; say: what is new, a line."""
+    """Runs a `TimeServer` at a socket, from `run` until `stop`. No input can end it. show: called several
+    times a second. notify: called with a line for each new client and each new error."""
 
     def __init__(
         self,
@@ -110,8 +105,8 @@ class TimeServerRun:
         while not self._stop.is_set():
             try:
                 datagram = self._link.receive(_TICK_S)
-            except OSError as error:  # the system is short of something: not to be asked at once again
-                self._notify_once(f"nothing can be received: {error.strerror or error}")
+            except OSError as error:  # the system lacks a resource: pause before the next attempt
+                self._notify_once(f"cannot receive: {error.strerror or error}")
                 self._stop.wait(_TICK_S)
                 continue
             if datagram is not None:
@@ -125,16 +120,16 @@ class TimeServerRun:
         if reply is not None:
             self._send(reply.encode(), datagram.source)
         if self._server.clients > known:
-            self._notify(f"{address} asks")
+            self._notify(f"new client: {address}")
 
     def _send(self, reply: bytes, to: Any) -> None:
         try:
             self._link.send(with_transmit_time(reply, time.time_ns()), to)
-        except OSError as error:  # no way there, a firewall, a forged address: the next client is another
-            self._notify_once(f"an answer could not be sent to {to[0]}: {error.strerror or error}")
+        except OSError as error:  # no route, a firewall, a forged address: other clients are not affected
+            self._notify_once(f"cannot send a reply to {to[0]}: {error.strerror or error}")
 
     def _notify_once(self, trouble: str) -> None:
-        """Once each: `_MAX_COMPLAINTS` of them, as forged addresses are many."""
+        """Report each error once, at most `_MAX_COMPLAINTS`: forged addresses may be many."""
         if trouble not in self._notified and len(self._notified) < _MAX_COMPLAINTS:
             self._notified.add(trouble)
             self._notify(trouble)

@@ -1,6 +1,6 @@
-"""An agent's guard against its edge: what the edge sent and the agent has not taken yet is bounded.
+"""An agent's guard against its edge: bounds the data that libzmq has received and not yet delivered.
 
-The agent looks itself, whenever it receives (`share.net.connection_guard` does the same for an edge).
+The agent checks whenever it receives. `share.net.connection_guard` is the edge's counterpart.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from share.net.backlog import Backlog, BacklogLimits
 
 
 class AgentConnectionGuard:
-    """Of one connection at a time."""
+    """Guards one connection at a time."""
 
     def __init__(self, limits: BacklogLimits) -> None:
         self._limits = limits
@@ -18,17 +18,17 @@ class AgentConnectionGuard:
         self._backlog = Backlog(0.0)
 
     def set_connection(self, descriptor: int, now_s: float) -> None:
-        """To an edge, perhaps another than before."""
+        """Guard the new connection with this file descriptor."""
         cookie = tcp.socket_cookie(descriptor)
         self._connection = None if cookie is None else (descriptor, cookie)
         self._backlog = Backlog(now_s)
 
     def deliver(self, size: int, parts: int, now_s: float) -> None:
-        """A message of so many bytes on the wire, in so many parts, was received."""
+        """Record a received message of `size` bytes on the wire in `parts` frames."""
         self._backlog.deliver(size, parts, 1, now_s)
 
     def check(self) -> str | None:
-        """What is too much of what waits; then the connection is broken off."""
+        """Abort the connection if too much waits. Return the reason, None if all is well."""
         if self._connection is None:
             return None
         read = tcp.bytes_read(self._connection[0]) if self._is_open() else None
@@ -38,16 +38,16 @@ class AgentConnectionGuard:
         self._backlog.update_read(*read)
         if self._backlog.exceeds(self._limits):
             return self._abort(
-                "many small messages" if self._backlog.has_small_parts else "more than may wait"
+                "many small messages" if self._backlog.has_small_parts else "too much data waits"
             )
         return None
 
     def check_empty(self) -> str | None:
-        """There is no message now: what was read before the last time is at most a part of one. As
-        `check`."""
+        """Check a connection that has no complete message: what was read before the previous call is at most
+        part of one message. Returns as `check`."""
         backlog = self._backlog
         if self._connection is not None and backlog.marked_bytes > self._limits.message_bytes:
-            return self._abort("a message that does not end")
+            return self._abort("an endless message")
         backlog.classify_commands()
         backlog.mark()
         return None

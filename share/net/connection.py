@@ -1,4 +1,4 @@
-"""A connection to the edge's socket, as its guard knows it."""
+"""A TCP connection to the edge's socket, as `ConnectionGuard` tracks it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from share.net.backlog import Backlog
 
 @dataclass(eq=False)
 class Connection:
-    """cookie: by which its descriptor is known to be still the same. sure: no message of an earlier
-    connection with this descriptor can be waiting. is_held: the kernel lets none of its data in yet."""
+    """One connection. cookie: the kernel's, which tells whether the descriptor is still this connection.
+    is_unambiguous: no message of an earlier connection with this descriptor can be waiting. is_held: the
+    kernel holds back its data."""
 
     descriptor: int
     cookie: int
@@ -33,15 +34,15 @@ class Connection:
         return f"the key '{self.key}'" if self.key else self.address
 
     def block_target(self, agent_addresses: Container[str]) -> str | None:
-        """Whom to keep out: the key, if it is known; the address, unless agents live there
-        (`agent_addresses`)."""
+        """Return what to block: the key if known, else the address unless it is local or one of
+        `agent_addresses`, else None."""
         if self.key:
             return self.key
         local = ip_address(self.address.partition("%")[0]).is_loopback
         return None if local or self.address in agent_addresses else self.address
 
     def update_backlog(self) -> bool:
-        """Notes how much libzmq has read; False where the connection is no longer there."""
+        """Record how much libzmq has read. Return False if the connection is gone."""
         same = tcp.socket_cookie(self.descriptor) == self.cookie
         read = tcp.bytes_read(self.descriptor) if same else None
         if read is not None:
@@ -49,5 +50,5 @@ class Connection:
         return read is not None
 
     def abort(self) -> bool:
-        """Breaks it off. Whether it was there."""
+        """Reset the connection. Return whether it existed."""
         return tcp.abort(self.descriptor, self.cookie)

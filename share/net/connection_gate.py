@@ -1,7 +1,8 @@
-"""Who has to wait before the edge's socket: the kernel lets none of their data in until they are released.
+"""Holds new connections to the edge's socket: the kernel keeps back their data until they are released.
 
-After somebody was cut off, newcomers are held until what still waits of it is thrown away: one of them could
-have its descriptor next. And for a while those from an address whose offender is not known more closely.
+After a connection was aborted, new ones are held until its waiting data are discarded, since one of them may
+reuse its descriptor. New connections from an address are also held for a while if an offender there could
+not be identified.
 """
 
 from __future__ import annotations
@@ -11,27 +12,30 @@ from collections.abc import Iterable
 from share.net import tcp
 from share.net.connection import Connection
 
-_ADDRESS_PAUSE_S = 0.3  # without newcomers from an address
-_RELEASES_PER_CHECK = 4  # that were held are let in: an attacker may have sent many
-_DRAIN_S = 0.05  # until all that libzmq has read of a connection that was cut off is there to be received
+_ADDRESS_PAUSE_S = 0.3  # during which new connections from an address are held
+_RELEASES_PER_CHECK = 4  # held connections released at a time: an attacker may have opened many
+_DRAIN_S = 0.05  # until libzmq delivers all that it has read of an aborted connection
 _MAX_ADDRESSES = 4096
+FIRST_BLOCK_S = 10.0
+MAX_BLOCK_S = 600.0
+_MAX_ENTRIES = 256
 
 
 class ConnectionGate:
     def __init__(self) -> None:
         self._listener: tuple[int, int] | None = None  # descriptor and cookie
-        self._is_closed = False  # who is accepted is held from the start
+        self._is_closed = False  # new connections are held from accept(2) on
         self._discarded: frozenset[int] = frozenset()  # descriptors; read by other threads
-        self._last_abort_s = 0.0  # when the last was
-        self._paused_until_s: dict[str, float] = {}  # addresses, until when
+        self._last_abort_s = 0.0
+        self._paused_until_s: dict[str, float] = {}  # by address
 
     def set_listener(self, descriptor: int) -> None:
-        """The socket that accepts."""
+        """Set the listening socket."""
         number = tcp.socket_cookie(descriptor)
         self._listener = None if number is None else (descriptor, number)
 
     def is_discarding(self, descriptor: int) -> bool:
-        """Whether what still comes from that connection is to be thrown away."""
+        """Return whether messages from that connection are to be discarded."""
         return descriptor in self._discarded
 
     @property
@@ -39,41 +43,42 @@ class ConnectionGate:
         return bool(self._discarded)
 
     def discard(self, descriptor: int) -> None:
-        """Nothing of that connection has been read."""
+        """Discard all further messages from that connection."""
         self._discarded |= {descriptor}
 
     def record_abort(self, descriptor: int, now_s: float) -> None:
-        """That connection was, while some of what it sent may wait."""
+        """Record that the connection was aborted while its data may still wait."""
         self.discard(descriptor)
         self._last_abort_s = now_s
 
     def record_empty(self, empty_s: float) -> None:
-        """Nothing waited when asked at `empty_s`."""
+        """Record that no message waited at `empty_s`."""
         if empty_s > self._last_abort_s + _DRAIN_S:
             self._discarded = frozenset()
 
     def pause_address(self, address: str, now_s: float) -> None:
-        """Nobody new from there for a while."""
+        """Hold new connections from `address` for a while."""
         if address in self._paused_until_s or len(self._paused_until_s) < _MAX_ADDRESSES:
             self._paused_until_s[address] = now_s + _ADDRESS_PAUSE_S
 
     def is_held(self, address: str, now_s: float) -> bool:
-        """Whether newcomers from there have to wait."""
+        """Return whether new connections from `address` are held."""
         return bool(self._discarded) or now_s < self._paused_until_s.get(address, now_s)
 
     def admit(self, connection: Connection, is_full: bool, now_s: float) -> None:
-        """A newcomer: held, or let through."""
+        """Hold or let through a new connection. is_full: no more data may wait."""
         if is_full or self.is_held(connection.address, now_s):
             connection.is_held = tcp.hold_input(connection.descriptor, connection.cookie)
-        else:  # it may have come while the gate was closed
+        else:  # it may have been accepted while the gate was closed
             tcp.release_input(connection.descriptor, connection.cookie)
 
     def release_waiting(
         self, connections: Iterable[Connection], is_full: bool, now_s: float
     ) -> list[Connection]:
-        """Releases some of those who need not wait any longer; closes or opens the gate for those to come."""
+        """Release some connections that need not be held any longer, and return them. Close or open the gate
+        for new ones."""
         waiting = [c for c in connections if c.is_held and not (is_full or self.is_held(c.address, now_s))]
-        released = waiting[:_RELEASES_PER_CHECK]  # who came first
+        released = waiting[:_RELEASES_PER_CHECK]  # oldest first
         for connection in released:
             tcp.release_input(connection.descriptor, connection.cookie)
             connection.is_held = False
@@ -87,21 +92,15 @@ class ConnectionGate:
         return released
 
 
-# ---- Who is kept out, and for how long: longer with each time. Pure: time comes as an argument.
-
-FIRST_BLOCK_S = 10.0
-MAX_BLOCK_S = 600.0
-_MAX_ENTRIES = 256
-
-
 class Blocklist:
-    """By name: a key or an address. After MOST_S without an offence one begins anew."""
+    """Blocked keys and addresses. The duration doubles with each offence, up to MAX_BLOCK_S, and starts anew
+    after MAX_BLOCK_S without one. Pure: times are passed in."""
 
     def __init__(self) -> None:
-        self._blocks: dict[str, tuple[float, float]] = {}  # until when and for how long, oldest first
+        self._blocks: dict[str, tuple[float, float]] = {}  # end and duration, oldest first
 
     def block(self, peer: str, now_s: float) -> float:
-        """For how many seconds it is kept out from now."""
+        """Block `peer` from now. Return the duration, s."""
         until_s, previous_s = self._blocks.pop(peer, (now_s, 0.0))
         is_forgiven = now_s > until_s + MAX_BLOCK_S
         duration_s = (

@@ -1,16 +1,16 @@
-"""The edge's guard: no connection makes libzmq gather more than an honest agent could have waiting.
+"""The edge's guard: no connection can make libzmq hold more data than an honest agent could have waiting.
 
-It learns of connections from the socket's monitor, of what libzmq has read of each from the kernel, and of
-what was handed over from whoever receives (`deliver`, `empty`). It cuts off who has more waiting than may be,
-whose message has too many parts, who is no agent, and who says nothing.
+It learns of connections from the socket's monitor, of the bytes that libzmq has read of each from the kernel,
+and of delivered messages from the receiver (`deliver`, `record_empty`). It disconnects peers that have too
+much waiting, send too many parts, are no agents, or are silent.
 
-It looks in a thread of its own, and in that of whoever receives, which on a busy machine has its turn sooner.
-Newcomers wait at its gate after somebody was cut off, so that an attack that is repeated brings nothing, and
-honest ones are not turned away.
+It checks in a thread and also in the receiver's thread, which on a busy machine runs sooner. After a
+disconnection new connections are held at its gate, so that a repeated attack gains nothing and honest agents
+are not refused.
 
-No whole message of a connection waits when `receive` has found nothing at all, and neither when as many
-messages of others were handed over as there can be connections: libzmq takes one of each in turn. What still
-waits then of what had been read before is one message; if it is larger than any may be, it does not end.
+No complete message of a connection waits once `receive` has found nothing at all, or once as many messages of
+other connections were delivered as there can be connections: libzmq serves them in turn. What then still
+waits of the data read before is one message; if it is larger than the limit, it is endless.
 """
 
 from __future__ import annotations
@@ -32,17 +32,14 @@ from share.net.connection import Connection
 from share.net.connection_gate import Blocklist, ConnectionGate
 
 MAX_CONNECTIONS = 128  # at a time
-MAX_UNIDENTIFIED = 32  # of these, that have not said anything yet
+MAX_UNIDENTIFIED = 32  # of these, without a first message
 SILENCE_TIMEOUT_S = 60.0  # without a message; agents ping every half second
-_IDENTIFY_TIMEOUT_S = 10.0  # to the first message
-_CHECK_MS, _ALERT_CHECK_MS = 20, 5
-_BURST_MESSAGES = 64  # messages in less than _TICK_MS
-_ROUND_MESSAGES = (
-    2 * MAX_CONNECTIONS
-)  # messages; those of connections that are closed by now wait beside the others
-MAX_GROWTH_BYTES = (
-    12_000_000  # of memory, beyond the bytes that wait: small parts take much more than they have
-)
+_IDENTIFY_TIMEOUT_S = 10.0  # until the first message
+_CHECK_MS = 20  # between checks
+_ALERT_CHECK_MS = 5  # between checks while much waits
+_BURST_MESSAGES = 64  # since the last check; more cause an early one
+_ROUND_MESSAGES = 2 * MAX_CONNECTIONS  # after which each connection was served, closed ones included
+MAX_GROWTH_BYTES = 12_000_000  # of process memory beyond the waiting bytes: small parts take much more
 _MAX_AGENT_ADDRESSES = 4096
 _EVENTS = (
     zmq.EVENT_LISTENING
@@ -55,9 +52,9 @@ _EVENTS = (
 
 
 class ConnectionGuard:
-    """Of `socket`, before it is bound. A thread of its own, which ends when `close` is called.
+    """Guards `socket`, from before it is bound until `close`. Runs a thread.
 
-    poke: makes whoever receives look for a message, from any thread.
+    wake_receiver: makes the receiver look for a message; called from any thread.
     """
 
     def __init__(
@@ -67,51 +64,46 @@ class ConnectionGuard:
         blocklist: Blocklist,
         wake_receiver: Callable[[], None],
     ) -> None:
-        self._socket, self._limits, self._blocklist, self._wake_receiver = (
-            socket,
-            limits,
-            blocklist,
-            wake_receiver,
-        )
+        self._socket, self._limits = socket, limits
+        self._blocklist, self._wake_receiver = blocklist, wake_receiver
         self._event_socket: zmq.Socket[bytes] = socket.get_monitor_socket(_EVENTS)
-        self._event_poller = select.poll()  # which, unlike libzmq's, several threads may use
+        self._event_poller = select.poll()  # unlike libzmq's, several threads may use it
         self._event_poller.register(int(self._event_socket.getsockopt(zmq.FD)), select.POLLIN)
-        self._lock = Lock()  # of what several threads use, the next two
-        self._delivered: dict[
-            int, tuple[int, int, int, str]
-        ] = {}  # bytes, parts, messages, key by descriptor
+        self._lock = Lock()  # guards the next two
+        # By descriptor: bytes, parts, messages, key.
+        self._delivered: dict[int, tuple[int, int, int, str]] = {}
         self._failed_handshakes = 0
         self._offences: deque[tuple[Connection | int, str]] = deque(maxlen=MAX_CONNECTIONS)
         self._admissions: deque[tuple[str, str]] = deque(maxlen=MAX_CONNECTIONS)  # key and address
         self._reports: deque[str] = deque(maxlen=128)
         self._last_empty_s = 0.0
         self._gate = ConnectionGate()
-        self._unchecked_messages = 0  # messages since somebody looked
-        self._check_lock = Lock()  # of who looks, and of what follows
-        self._next_check_s, self._last_check_s = 0.0, 0.0  # when to look again, and when last
+        self._unchecked_messages = 0  # since the last check
+        self._check_lock = Lock()  # held by the thread that checks; guards all that follows
+        self._next_check_s, self._last_check_s = 0.0, 0.0
         self._is_stopped = False
         self._connections: dict[int, Connection] = {}  # by descriptor
-        self._closed_s: dict[int, float] = {}  # when a descriptor was last given back
-        self._expected_failures = 0  # handshakes that were cut off
-        self._orphaned_bytes = 0.0  # bytes of memory of connections that ended, since nothing waited
-        self._agent_addresses: set[str] = set()  # addresses from which a key has sent a message
-        self._resident_bytes = tcp.resident_bytes()  # memory of this process when last little waited
-        self._delivered_bytes = 0  # bytes handed over since then: whoever took them may have kept them
+        self._closed_s: dict[int, float] = {}  # by descriptor, when it was last closed
+        self._expected_failures = 0  # of handshakes that the guard itself aborted
+        self._orphaned_bytes = 0.0  # memory of closed connections since the socket was last empty
+        self._agent_addresses: set[str] = set()  # from which a key has sent a message
+        self._resident_bytes = tcp.resident_bytes()  # memory of this process when little waited last
+        self._delivered_bytes = 0  # since then: the receiver may still hold them
         self._marked_s = 0.0
-        self._messages_since_mark = 0  # messages handed over
+        self._messages_since_mark = 0
         self._thread = Thread(target=self._run, name="guard", daemon=True)
         self._thread.start()
 
     # ------------------------------------------------------------------ for other threads
 
     def deliver(self, descriptor: int, size: int, parts: int, key: str) -> None:
-        """A message of so many bytes on the wire, in so many parts, was received from that connection."""
+        """Record a received message of `size` bytes on the wire in `parts` frames from that connection."""
         with self._lock:
             all_bytes, all_parts, messages, _ = self._delivered.get(descriptor, (0, 0, 0, ""))
             self._delivered[descriptor] = all_bytes + size, all_parts + parts, messages + 1, key
 
     def check(self) -> None:
-        """Between two messages."""
+        """Check if due; call between two messages."""
         self._unchecked_messages += 1
         due_s = (
             self._last_check_s + _ALERT_CHECK_MS * 1e-3
@@ -126,46 +118,46 @@ class ConnectionGuard:
                 self._check_lock.release()
 
     def is_discarding(self, descriptor: int) -> bool:
-        """Whether what comes from that connection is to be thrown away."""
+        """Return whether messages from that connection are to be discarded."""
         return self._gate.is_discarding(descriptor)
 
     def record_empty(self, asked_s: float) -> None:
-        """There was no message when asked at `asked_s` (time.monotonic)."""
+        """Record that no message waited at `asked_s` (time.monotonic)."""
         self._last_empty_s = asked_s
 
     def report_offence(self, descriptor: int, reason: str) -> None:
-        """What that connection sent no agent sends."""
+        """Report that the connection sent what no agent sends."""
         connection = self._connections.get(descriptor)
-        if connection is not None and connection.is_unambiguous:  # at once; who it is will be looked at later
+        if connection is not None and connection.is_unambiguous:  # abort now; block at the next check
             connection.abort()
             self._offences.append((connection, reason))
         else:
             self._offences.append((descriptor, reason))
 
     def admit(self, key: str, address: str) -> bool:
-        """Whether that key, which is authorized, may come in now."""
+        """Return whether an authorized key may connect now, i.e. is not blocked."""
         if self._blocklist.is_blocked(key, time.monotonic()):
             return False
         self._admissions.append((key, address))
         return True
 
     def take_reports(self) -> list[str]:
-        """Who was cut off since the last call."""
+        """Return a line for each disconnection since the last call."""
         return [self._reports.popleft() for _ in range(len(self._reports))]
 
     def take_failed_handshakes(self) -> int:
-        """Handshakes that were broken off or made no sense, since the last call."""
+        """Return the number of failed handshakes since the last call."""
         with self._lock:
             failed, self._failed_handshakes = self._failed_handshakes, 0
         return failed
 
     def close(self) -> None:
-        """Before the socket itself is closed. May be repeated."""
+        """End the guard; call before the socket is closed. May be repeated."""
         if not self._socket.closed:
             self._socket.disable_monitor()
         self._thread.join()
 
-    # ------------------------------------------------------------------ whose turn it is
+    # ------------------------------------------------------------------ scheduling of checks
 
     def _run(self) -> None:
         wait_ms: float | None = None
@@ -178,7 +170,7 @@ class ConnectionGuard:
         self._event_socket.close(linger=0)
 
     def _try_to_check(self) -> None:
-        """A fault of our own costs this look, and neither the guard nor who receives."""
+        """Check if due. A failure costs this check, not the guard or the receiver."""
         try:
             self._check_if_due()
         except Exception as error:
@@ -194,7 +186,7 @@ class ConnectionGuard:
             self._next_check_s = self._last_check_s + wait_ms * 1e-3
 
     def _handle_events(self) -> bool:
-        """Events that have come. False once there will be no more."""
+        """Handle all waiting monitor events. Return False once the monitor has stopped."""
         while True:
             try:
                 message, _ = self._event_socket.recv_multipart(zmq.NOBLOCK)
@@ -212,11 +204,11 @@ class ConnectionGuard:
             elif self._expected_failures:
                 self._expected_failures -= 1
             elif not any(connection.is_held for connection in self._connections.values()):
-                with self._lock:  # who is held may fail for that
+                with self._lock:  # handshakes of held connections may time out
                     self._failed_handshakes += 1
 
     def _accept(self, descriptor: int) -> None:
-        self._remove(descriptor)  # libzmq does not tell of connections that another took over
+        self._remove(descriptor)  # libzmq reports no end of a connection that another took over
         number, ends = tcp.socket_cookie(descriptor), tcp.addresses(descriptor)
         if number is None or ends is None:
             return
@@ -235,7 +227,7 @@ class ConnectionGuard:
 
     @property
     def _is_full(self) -> bool:
-        """Whether more waits to be thrown away than may wait at all."""
+        """Whether more data wait to be discarded than may wait at all."""
         return self._orphaned_bytes > self._limits.total_bytes
 
     def _release_waiting(self, now_s: float) -> None:
@@ -244,8 +236,8 @@ class ConnectionGuard:
             connection.backlog.last_message_s = now_s
 
     def _enforce_connection_limit(self) -> None:
-        """Where there are too many, one that has said nothing goes, by chance among those of the address that
-        has the most: the first or the last could be foreseen. Where all have spoken, that is the newest."""
+        """If there are too many connections, abort a random unidentified one of the address that has most:
+        the oldest or newest would be predictable. If all others are identified, that is the newest."""
         live = self._live_connections()
         unidentified = [connection for connection in live if connection.is_unidentified]
         if unidentified and (len(unidentified) > MAX_UNIDENTIFIED or len(live) > MAX_CONNECTIONS):
@@ -253,7 +245,7 @@ class ConnectionGuard:
             self._abort(
                 random.choice([connection for connection in unidentified if connection.address == address])
             )
-            self._reports.append(f"{address}: more connections than may be open at a time")
+            self._reports.append(f"{address}: too many open connections")
 
     def _live_connections(self) -> list[Connection]:
         return [connection for connection in self._connections.values() if not connection.is_aborted]
@@ -265,8 +257,8 @@ class ConnectionGuard:
             self._orphaned_bytes += connection.backlog.memory_bytes
 
     def _check(self, now_s: float) -> int:
-        """Milliseconds until the next one is due."""
-        empty_s = self._last_empty_s  # first: what was received before is then among what was taken
+        """Check all connections. Return the milliseconds until the next check."""
+        empty_s = self._last_empty_s  # read first: messages received before are then among the deliveries
         while self._admissions:
             self._assign_key(*self._admissions.popleft())
         self._record_deliveries(now_s)
@@ -290,22 +282,22 @@ class ConnectionGuard:
         return _ALERT_CHECK_MS
 
     def _check_memory_growth(self, waiting_bytes: int, now_s: float) -> None:
-        """Whoever hides small parts behind large ones is known by how this process grows."""
+        """Disconnect a peer that hides small parts behind large ones, by the growth of this process."""
         explained = (
             self._resident_bytes + self._delivered_bytes + self._discarded_memory_bytes() + waiting_bytes
         )
         if (grown := tcp.resident_bytes() - explained) > MAX_GROWTH_BYTES:
             self._disconnect_and_block(self._heaviest(now_s), "many small parts", now_s)
-            self._orphaned_bytes += grown  # that is its own: nobody else is to be taken for it
+            self._orphaned_bytes += grown  # explained now: no further peer is blamed for it
 
     def _discarded_memory_bytes(self) -> float:
-        """Bytes of memory of what waits to be thrown away, were none thrown away yet."""
+        """Return the memory of all data to be discarded, as if none were discarded yet, bytes."""
         return self._orphaned_bytes + sum(
             c.backlog.memory_bytes for c in self._connections.values() if c.is_aborted
         )
 
     def _record_deliveries(self, now_s: float) -> None:
-        """What was handed over since the last time."""
+        """Add the deliveries since the last check to the backlogs."""
         with self._lock:
             delivered, self._delivered = self._delivered, {}
         for descriptor, (size, parts, messages, key) in delivered.items():
@@ -318,16 +310,16 @@ class ConnectionGuard:
                 connection.backlog.deliver(size, parts, messages, now_s)
 
     def _identify(self, connection: Connection, key: str) -> None:
-        """Its first message: now it is known whose it is."""
+        """Set the key of a connection by its first message."""
         connection.key = key
         if key and len(self._agent_addresses) < _MAX_AGENT_ADDRESSES:
             self._agent_addresses.add(connection.address)
         if key and sum(other.key == key for other in self._live_connections()) > MAX_CONNECTIONS // 2:
             self._abort(connection)
-            self._reports.append(f"the key '{key}': more connections than may be open at a time")
+            self._reports.append(f"the key '{key}': too many open connections")
 
     def _assign_key(self, key: str, address: str) -> None:
-        """A key was let in: at which connection is known if only one is waiting there."""
+        """Assign an admitted key to its connection, if only one of that address is unidentified."""
         unidentified = [c for c in self._live_connections() if c.address == address and c.is_unidentified]
         if len(unidentified) == 1:
             unidentified[0].key = key
@@ -338,7 +330,8 @@ class ConnectionGuard:
                 self._remove(connection.descriptor)
 
     def _check_quiet_connections(self, empty_s: float, now_s: float) -> None:
-        """No whole message waits of who was quiet since the mark; of nobody if it was empty since."""
+        """Check connections without a delivery since the mark, or all if the socket was empty since: no
+        complete message of them waits."""
         is_empty = empty_s > self._marked_s
         for connection in self._connections.values():
             backlog = connection.backlog
@@ -346,7 +339,7 @@ class ConnectionGuard:
                 connection.is_unambiguous |= self._closed_s.get(connection.descriptor, -1.0) < empty_s
             if is_empty or backlog.is_quiet():
                 if backlog.marked_bytes > self._limits.message_bytes:
-                    self._disconnect_and_block(connection, "a message that does not end", now_s)
+                    self._disconnect_and_block(connection, "an endless message", now_s)
                 elif not connection.is_held and now_s - backlog.last_message_s > (
                     _IDENTIFY_TIMEOUT_S if connection.is_unidentified else SILENCE_TIMEOUT_S
                 ):
@@ -357,14 +350,13 @@ class ConnectionGuard:
         self._marked_s, self._messages_since_mark = time.monotonic(), 0
 
     def _enforce_limits(self, now_s: float) -> None:
-        """Whatever it is that waits: who has too much of it goes, then who has the most for the longest."""
+        """Disconnect peers above their limit; then, while all together are above theirs, the heaviest
+        ones."""
         for connection in self._live_connections():
             if connection.backlog.exceeds(self._limits):
-                self._disconnect_overloaded(connection, "more than may wait", now_s)
-        discarded, share = (
-            self._discarded_memory_bytes(),
-            self._limits.peer_bytes / 8,
-        )  # which an agent may have in any case
+                self._disconnect_overloaded(connection, "too much data waits", now_s)
+        discarded = self._discarded_memory_bytes()
+        share = self._limits.peer_bytes / 8  # which a peer may have in any case
         while live := self._live_connections():
             live_bytes = sum(connection.backlog.memory_bytes for connection in live)
             worst = self._heaviest(now_s)
@@ -373,7 +365,7 @@ class ConnectionGuard:
                 <= self._limits.total_bytes
             ):
                 break
-            self._disconnect_overloaded(worst, "more than may wait of all together", now_s)
+            self._disconnect_overloaded(worst, "too much data of all connections waits", now_s)
 
     def _disconnect_overloaded(self, connection: Connection, reason: str, now_s: float) -> None:
         if connection.backlog.has_small_parts:
@@ -382,7 +374,8 @@ class ConnectionGuard:
             self._disconnect(connection, reason)
 
     def _heaviest(self, now_s: float) -> Connection:
-        """Who has the most waiting, for the longest."""
+        """Return the live connection with the largest product of waiting memory and time since its
+        message."""
         return max(
             self._live_connections(),
             key=lambda c: c.backlog.memory_bytes * (now_s - c.backlog.last_message_s + 0.1),
@@ -394,21 +387,22 @@ class ConnectionGuard:
             self._disconnect_and_block(connection, reason, time.monotonic())
 
     def _disconnect(self, connection: Connection, reason: str) -> None:
-        """Too much waits. An honest agent comes to that where the edge is very busy: it may come back."""
+        """Disconnect a peer with too much data waiting. This happens to honest agents if the edge is very
+        busy: it may reconnect at once."""
         self._abort_and_discard(connection)
-        self._reports.append(f"{connection.key or connection.address}: {reason}; cut off")
+        self._reports.append(f"{connection.key or connection.address}: {reason}; disconnected")
 
     def _abort_and_discard(self, connection: Connection) -> None:
         self._abort(connection)
         self._gate.record_abort(connection.descriptor, time.monotonic())
 
     def _disconnect_and_block(self, connection: Connection, reason: str, now_s: float) -> None:
-        """It sends what no agent does: it is kept out."""
+        """Disconnect a peer that sends what no agent does, and block it for a while."""
         if connection.is_aborted:
             return
         self._abort_and_discard(connection)
         target = connection.block_target(self._agent_addresses)
-        self._reports.append(f"{connection.name}: {reason}; cut off{' and kept out' if target else ''}")
+        self._reports.append(f"{connection.name}: {reason}; disconnected{' and blocked' if target else ''}")
         if target is not None:
             self._blocklist.block(target, now_s)
         else:

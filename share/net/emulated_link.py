@@ -1,4 +1,7 @@
-"""An agent's link through an emulated network (`share.net.channel`), for experiments on one machine."""
+"""An agent's link through an emulated network (`share.net.channel`), for experiments on one machine.
+
+`LinkAssignment` parses `--link`, which network each agent of a session goes through.
+"""
 
 from __future__ import annotations
 
@@ -21,28 +24,27 @@ _NS_PER_MS = 1_000_000
 
 
 def load_network(name: str) -> NetworkModel:
-    """By its name, or of a YAML file {up: {mbps, delay_ms, jitter_ms, loss, burst}, down: {…}}. Raises
-    UsageError, ConfigError."""
+    """Return a preset by its name, or read a YAML file {up: {mbps, delay_ms, jitter_ms, loss, burst}, down:
+    {…}}. Raises UsageError, ConfigError."""
     if name in NETWORK_PRESETS:
         return NETWORK_PRESETS[name]
     path = Path(name)
     if not path.is_file():
-        raise UsageError(f"--link: '{name}' is no file and none of {', '.join(NETWORK_PRESETS)}")
+        raise UsageError(f"--link: '{name}' is neither a file nor one of {', '.join(NETWORK_PRESETS)}")
     return from_mapping(NetworkModel, read_yaml(path).data, str(path))
 
 
 class EmulatedLink:
-    """`AgentLink` around another. What is sent is handed on once it would have arrived, and what arrives is
-    handed out once it would have: while `receive` waits, which may return early for that. Same seed, same
-    delays."""
+    """`AgentLink` around another one. It delays messages in both directions as the network would; outgoing
+    ones are forwarded while `receive` waits. Delays are deterministic for a given seed."""
 
     def __init__(self, link: AgentLink, network: NetworkModel, seed: int) -> None:
         self._link = link
         up, down = np.random.default_rng(seed).spawn(2)
         self._up = Channel(network.up, network.round_trip_ms, up)
         self._down = Channel(network.down, network.round_trip_ms, down)
-        self._outbound: deque[tuple[int, Sequence[Bytes]]] = deque()  # in order, with when they arrive
-        self._inbound: deque[tuple[int, list[bytes]]] = deque()
+        self._outbound: deque[tuple[int, Sequence[Bytes]]] = deque()  # arrival, ns, and message, in order
+        self._inbound: deque[tuple[int, list[bytes]]] = deque()  # the same
 
     def send(self, frames: Sequence[Bytes]) -> bool:
         self._forward_due()
@@ -64,7 +66,7 @@ class EmulatedLink:
                 continue
             message = self._link.receive(max(0, next_ns - now_ns) // _NS_PER_MS)
             if message is None:
-                return None  # time is up, something goes on, or it was woken
+                return None  # timeout, a message to forward, or woken
             at_ns = self._down.arrival_ns(message_bytes(message), time.monotonic_ns())
             self._inbound.append((at_ns, message))
 
@@ -85,26 +87,25 @@ class EmulatedLink:
         self._link.close()
 
     def _forward_due(self) -> None:
-        """What has arrived at the edge by now; if there is none, it is lost."""
+        """Forward messages that have arrived at the edge by now; they are lost if there is no edge."""
         while self._outbound and self._outbound[0][0] <= time.monotonic_ns():
             self._link.send(self._outbound.popleft()[1])
 
 
-# ---- Which emulated network each agent of a session goes through, as a person writes it.
-
-
 @dataclass(frozen=True)
 class LinkAssignment:
-    """Names or files. usual: for who has none of its own; None: this machine's own. own: by agent."""
+    """Networks of a session's agents, by preset name or file. default: for agents not in per_agent; None: no
+    emulation."""
 
     default: str | None
     per_agent: Mapping[str, str]
 
     @classmethod
     def parse(cls, text: str | None) -> LinkAssignment:
-        """`wifi5`, all; `wifi5,bob=wifi-busy`, all but Bob; `bob=far.yaml`, Bob alone.
+        """Parse `wifi5` (all agents), `wifi5,bob=wifi-busy` (another one for bob) or `bob=far.yaml` (bob
+        only).
 
-        Raises UsageError or ConfigError where one of them is no network.
+        Raises UsageError or ConfigError if a network is unknown or malformed.
         """
         if text is None:
             return cls(None, {})
@@ -116,25 +117,27 @@ class LinkAssignment:
             load_network(name)
         agents = [agent for agent, _ in pairs]
         if duplicates := [agent for agent in agents if agents.count(agent) > 1]:
-            raise UsageError(f"--link: two for {duplicates[0] or 'all'}; give one, and others as AGENT=LINK")
+            raise UsageError(
+                f"--link: two links for {duplicates[0] or 'all'}; give one, and others as AGENT=LINK"
+            )
         per_agent = dict(pairs)
         return cls(per_agent.pop("", None), per_agent)
 
     def check(self, agents: Collection[str]) -> None:
-        """Raises UsageError where a link is that of an agent who is not there."""
+        """Raises UsageError if a link is assigned to an unknown agent."""
         if unknown := [name for name in self.per_agent if name not in agents]:
-            raise UsageError(f"--link: no agent is called '{unknown[0]}'; there are {', '.join(agents)}")
+            raise UsageError(f"--link: there is no agent '{unknown[0]}'; the agents are {', '.join(agents)}")
 
     def name_for(self, agent: str) -> str | None:
         return self.per_agent.get(agent, self.default)
 
     def network_for(self, agent: str) -> NetworkModel:
-        """One without limits where it has no link."""
+        """Return the agent's network; an ideal one if it has no link."""
         name = self.name_for(agent)
         return NetworkModel() if name is None else load_network(name)
 
 
 def _parse_pair(part: str) -> tuple[str, str]:
-    """An agent, "" for all, and its network."""
+    """Return the agent ("" for all) and the network's name."""
     agent, separator, name = part.partition("=")
     return (agent, name) if separator else ("", part)

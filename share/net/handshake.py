@@ -1,4 +1,4 @@
-"""The door of an edge with keys: ZAP (RFC 27) within the context of the edge's socket."""
+"""Handshakes of encrypted links: their outcomes, and the edge's authentication of keys by ZAP (RFC 27)."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from zmq.utils.monitor import recv_monitor_message
 from share.net.connection_guard import ConnectionGuard
 from share.net.keys import EdgeKeys
 
-# ---- How handshakes end: what libzmq's monitor tells of a socket (zmq_socket_monitor).
-
 _MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+_ENDPOINT = "inproc://zeromq.zap.01"
+_DOMAIN = b"share"
 
 
 class HandshakeOutcome(Enum):
-    CONNECTED = "connected"  # the handshake begins
+    CONNECTED = "connected"  # the handshake starts
     DISCONNECTED = "disconnected"
     SUCCEEDED = "joined"
-    UNKNOWN_KEY = "unknown key"  # the edge does not let this key in
-    NO_KEYS = "no keys"  # one side uses keys, the other none, and libzmq could tell
-    BROKEN_OFF = "broken off"  # by the other side, which says no more
+    UNKNOWN_KEY = "unknown key"  # the edge refuses this key
+    NO_KEYS = "no keys"  # one side uses keys and the other none, as far as libzmq can tell
+    BROKEN_OFF = "broken off"  # by the other side, without a reason
 
 
 class HandshakeMonitor:
-    """The outcomes of one socket's handshakes, as they happen. descriptor: of its newest connection."""
+    """Outcomes of a socket's handshakes (zmq_socket_monitor). descriptor: of its newest connection."""
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
         self._socket = socket
@@ -43,7 +43,7 @@ class HandshakeMonitor:
         )
 
     def next_outcome(self) -> HandshakeOutcome | None:
-        """None: nothing has happened since."""
+        """Return the next outcome, None if there is no new one."""
         try:
             event = recv_monitor_message(self.events, zmq.NOBLOCK)
         except zmq.Again:
@@ -62,20 +62,16 @@ class HandshakeMonitor:
         )
 
     def close(self) -> None:
-        """Before the socket itself is closed."""
+        """End the monitor; call before the socket is closed."""
         self._socket.disable_monitor()
         self.events.close(linger=0)
 
 
-_ENDPOINT = "inproc://zeromq.zap.01"
-_DOMAIN = b"share"
-
-
 class ZapAuthenticator:
-    """Makes `socket` a CURVE server and answers for each handshake whether that key may come in.
+    """Makes `socket` a CURVE server and decides for each handshake whether its key is admitted.
 
-    A thread of its own, so that agents connect also while the edge is busy. It ends by itself when the
-    context is terminated; `join` then. Must be made before the socket is bound.
+    It runs a thread, so that agents can connect while the edge is busy. The thread ends when the context is
+    terminated; call `join` then. Must be created before the socket is bound.
     """
 
     def __init__(
@@ -88,27 +84,27 @@ class ZapAuthenticator:
         self._guard = guard
         self._refusals: deque[str] = deque(maxlen=128)
         self._allowed = keys.allowed
-        self._admitted_keys: set[str] = set()  # keys let in so far
+        self._admitted_keys: set[str] = set()  # so far
         socket.setsockopt(zmq.CURVE_SERVER, 1)
         socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
         socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN)
-        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without it nobody at the door lets everyone in
+        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without it, a missing ZAP handler admits everyone
         self._requests = context.socket(zmq.REP)
         self._requests.bind(_ENDPOINT)
-        self._thread = Thread(target=self._serve, name="doorkeeper", daemon=True)
+        self._thread = Thread(target=self._serve, name="authenticator", daemon=True)
         self._thread.start()
 
     def has_revoked(self) -> bool:
-        """Whether someone who was let in may not be here any more."""
+        """Return whether an admitted key is no longer authorized."""
         return not all(self._allowed.is_allowed(key) for key in tuple(self._admitted_keys))
 
     def trouble(self) -> str | None:
-        """Why nobody is let in, for a person; None where the list can be read."""
+        """Return why no key is admitted; None if the allow list is readable."""
         list_trouble = self._allowed.trouble()
-        return None if list_trouble is None else f"nobody is let in: {list_trouble}"
+        return None if list_trouble is None else f"all agents are refused: {list_trouble}"
 
     def refusals(self) -> list[str]:
-        """A line for each since the last call."""
+        """Return a line for each refusal since the last call."""
         return [self._refusals.popleft() for _ in range(len(self._refusals))]
 
     def join(self) -> None:
@@ -126,13 +122,13 @@ class ZapAuthenticator:
         version, number, _domain, address, _identity, _mechanism, credentials = request
         key = z85.encode(credentials).decode()
         if self._allowed.is_allowed(key):
-            if not self._guard.admit(key, address.decode()):  # 300: for now, so libzmq goes on trying
-                return [version, number, b"300", b"kept out", b"", b""]
-            self._admitted_keys.add(key)  # a revocation since then is seen by the next `has_revoked`
+            if not self._guard.admit(key, address.decode()):  # 300: temporary, so that libzmq retries
+                return [version, number, b"300", b"blocked", b"", b""]
+            self._admitted_keys.add(key)  # a revocation meanwhile is found by the next `has_revoked`
             return [version, number, b"200", b"", key.encode(), b""]
         self._refusals.append(
             self.trouble()
             or f"the key '{key}' ({address.decode()}) is not authorized; "
-            f"to let it in: share keys authorize NAME '{key}'"
+            f"to authorize it: share keys authorize NAME '{key}'"
         )
         return [version, number, b"400", b"not authorized", b"", b""]

@@ -1,4 +1,4 @@
-"""The links inside one process, for tests and demonstrations: as ZeroMQ's, without a network."""
+"""Links within one process, for tests and demonstrations; they behave like the ZeroMQ links."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class _Mailbox(Generic[T]):
-    """A bounded queue between threads whose reader can be woken."""
+    """A bounded queue between threads; its reader can be woken."""
 
     def __init__(self) -> None:
         self._items: deque[T] = deque()
@@ -45,7 +45,7 @@ class _Mailbox(Generic[T]):
 
 
 class MemoryNetwork:
-    """Where memory links find each other: edges by name, agents by edge name and peer id."""
+    """Registry of memory links: edges by name, agents by edge name and peer id."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -53,7 +53,7 @@ class MemoryNetwork:
         self._agents: dict[tuple[str, bytes], MemoryAgentLink] = {}
 
     def bind(self, name: str) -> MemoryEdgeLink:
-        """Raises TransportError if an edge of that name is there already."""
+        """Raises TransportError if an edge has that name already."""
         with self._lock:
             if name in self._edges:
                 raise TransportError(f"{name}: the name is in use; stop the other edge or choose another")

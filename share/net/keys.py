@@ -1,8 +1,8 @@
-"""Who may talk to whom: CurveZMQ key pairs and the list of agents that an edge lets in, as text files.
+"""CurveZMQ key pairs, and the edge's list of authorized keys, as text files.
 
-A folder holds one machine's pair, `NAME.public` and `NAME.secret`, and at an edge `authorized`. All are
-made of lines `share-public-key NAME KEY`, so the list is public keys one after the other. There, names of
-the agents that may run on that machine can follow; where none do, only the agent called NAME may. KEY is a
+A folder holds one machine's key pair, `NAME.public` and `NAME.secret`, and at an edge the list `authorized`.
+Each file consists of lines `share-public-key NAME KEY` (`share-secret-key` for the secret). In the list the
+names of the agents that may run on that machine can follow; without any, only the agent NAME may. KEY is a
 32-byte Curve25519 key in Z85 (RFC 26 CurveZMQ, RFC 32 Z85): 40 characters, none of them a quote.
 """
 
@@ -31,7 +31,7 @@ _LINE = re.compile(rf"share-(public|secret)-key ({_NAME}) ({_Z85})((?: {_NAME})*
 
 @dataclass(frozen=True)
 class KeyPair:
-    """Of one machine. Keys are Z85 text."""
+    """The key pair of one machine, in Z85."""
 
     name: str
     public: str
@@ -40,7 +40,7 @@ class KeyPair:
 
 @dataclass(frozen=True)
 class AgentKeys:
-    """What an agent needs: its own pair and the public key of its edge."""
+    """Keys of an agent: its own pair and the public key of its edge."""
 
     own: KeyPair
     edge: str
@@ -48,28 +48,25 @@ class AgentKeys:
 
 @dataclass(frozen=True)
 class EdgeKeys:
-    """What an edge needs: its own pair and who may connect."""
+    """Keys of an edge: its own pair and the list of authorized keys."""
 
     own: KeyPair
     allowed: AllowList
 
 
 class AllowList:
-    """Agents by public key. It follows its file: whoever looks sees what the file says now.
-
-    No file: nobody. May be looked at from several threads.
-    """
+    """The authorized keys, always as the file says now; none without a file. Safe from several threads."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._cached: tuple[tuple[int, ...], dict[str, Grant]] = (), {}
 
     def names_by_key(self) -> dict[str, str]:
-        """Name by public key. Raises UsageError if the file cannot be read or has another form."""
+        """Return machine names by public key. Raises UsageError if the file is unreadable or malformed."""
         return {key: grant.name for key, grant in self.grants().items()}
 
     def agents_for(self, public: str) -> frozenset[str]:
-        """Names of the agents that this key may speak for; none while the file cannot be read."""
+        """Return the names of the agents that this key may act for; none while the file is unreadable."""
         try:
             grant = self.grants().get(public)
         except UsageError:
@@ -77,7 +74,7 @@ class AllowList:
         return frozenset() if grant is None else frozenset(grant.agents)
 
     def grants(self) -> dict[str, Grant]:
-        """By public key. Raises UsageError if the file cannot be read or has another form."""
+        """Return all grants by public key. Raises UsageError if the file is unreadable or malformed."""
         try:
             status = self.path.stat()
         except FileNotFoundError:
@@ -91,14 +88,14 @@ class AllowList:
         return self._cached[1]
 
     def is_allowed(self, public: str) -> bool:
-        """Whether that key may connect. Nobody may while the file cannot be read."""
+        """Return whether that key may connect; False while the file is unreadable."""
         try:
             return public in self.grants()
         except UsageError:
             return False
 
     def trouble(self) -> str | None:
-        """Why nobody may connect; None where the file can be read."""
+        """Return why no key may connect; None if the file is readable."""
         try:
             self.grants()
         except UsageError as error:
@@ -110,14 +107,14 @@ class AllowList:
 
 
 class Grant(NamedTuple):
-    """What the list says of a key: the name of its machine, and which agents it may speak for."""
+    """An entry of the list: the machine's name, and the agents that its key may act for."""
 
     name: str
     agents: tuple[str, ...]
 
 
 class _ListLine(NamedTuple):
-    """Of the list, with its end. name and key are empty for a comment."""
+    """A line of the list, with its newline. name and key are empty for a comment."""
 
     text: str
     name: str = ""
@@ -126,13 +123,13 @@ class _ListLine(NamedTuple):
 
 
 def default_folder() -> Path:
-    """$XDG_CONFIG_HOME/share/keys, or ~/.config/share/keys."""
+    """Return $XDG_CONFIG_HOME/share/keys, or ~/.config/share/keys."""
     return xdg_folder("XDG_CONFIG_HOME", ".config") / "share" / "keys"
 
 
 def generate_pair(folder: Path, name: str | None = None) -> KeyPair:
-    """A new pair in `folder`, named after this machine unless `name` is given. Raises UsageError, also
-    if there is a pair already: it is never replaced."""
+    """Make a pair in `folder`, named after this machine unless `name` is given. Raises UsageError, also if a
+    pair exists: it is never replaced."""
     import zmq
 
     name = _checked_name(
@@ -143,7 +140,7 @@ def generate_pair(folder: Path, name: str | None = None) -> KeyPair:
         if old := _secret_files(folder):
             raise UsageError(f"{old[0]}: there is a key pair already; give another folder with --keys")
         public, secret = b"-", b""
-        while not public[:1].isalnum():  # or a shell command could take the key for an option
+        while not public[:1].isalnum():  # a command line could take the key for an option otherwise
             public, secret = zmq.curve_keypair()
         pair = KeyPair(name, public.decode(), secret.decode())
         _write_secret(folder / f"{name}.secret", f"share-secret-key {name} {pair.secret}\n")
@@ -152,12 +149,12 @@ def generate_pair(folder: Path, name: str | None = None) -> KeyPair:
 
 
 def has_pair(folder: Path) -> bool:
-    """Raises UsageError where it cannot be looked into."""
+    """Return whether `folder` holds a pair. Raises UsageError if it is unreadable."""
     return bool(_secret_files(folder))
 
 
 def load_pair(folder: Path) -> KeyPair:
-    """The pair in `folder`. Raises UsageError if there is none or not just one, or others can read it."""
+    """Read the pair in `folder`. Raises UsageError if there is not exactly one, or others can read it."""
     import zmq
 
     secrets = _secret_files(folder)
@@ -173,17 +170,18 @@ def load_pair(folder: Path) -> KeyPair:
     match = _LINE.fullmatch(_read_text(path).strip())
     if not match or match[1] != "secret" or not _is_key(match[3]) or match[4]:
         raise UsageError(
-            f"{path}: is not a secret key of SHARE; move it away, then `share keys generate` makes a new pair"
+            f"{path}: is not a SHARE secret key; move it away and make a new pair with `share keys generate`"
         )
     return KeyPair(match[2], zmq.curve_public(match[3].encode()).decode(), match[3])
 
 
 def public_key(key_or_path: str) -> str:
-    """The key in the file `key_or_path`, or `key_or_path` itself, if it is one. Raises UsageError."""
+    """Return the public key in the file `key_or_path`, or `key_or_path` itself if it is a key. Raises
+    UsageError."""
     if re.fullmatch(_Z85, key_or_path) and _is_key(key_or_path):
         return key_or_path
     if key_or_path.startswith("share-"):
-        return _parse_public_line(key_or_path, "what was given")[1]
+        return _parse_public_line(key_or_path, "the given key")[1]
     path = Path(key_or_path)
     if not _is_file(path):
         raise UsageError(
@@ -197,9 +195,8 @@ def allow_list(folder: Path) -> AllowList:
 
 
 def authorize(folder: Path, name: str, public: str, agents: Sequence[str] = ()) -> None:
-    """Let the machine `name` in, to speak for `agents_for` (default: the one agent called `name`), in place
-    of those it could speak for before. Raises UsageError if the name or the key is taken, or the list is
-    damaged."""
+    """Authorize the machine `name` to act for `agents` (default: the agent `name`), in place of those before.
+    Raises UsageError if the name or the key is taken, or the list is damaged."""
     name, agents = _checked_name(name), [_checked_name(agent) for agent in agents]
     line = _format_line(name, public, agents)
     _make_folder(folder)
@@ -208,7 +205,7 @@ def authorize(folder: Path, name: str, public: str, agents: Sequence[str] = ()) 
         if names.get(public, name) != name:
             raise UsageError(f"'{name}': this key is authorized already, as '{names[public]}'")
         if name in names.values() and public not in names:
-            raise UsageError(f"'{name}' has another key; `share keys revoke {name}` takes that away first")
+            raise UsageError(f"'{name}' has another key; remove it first with `share keys revoke {name}`")
         lines = _read_lines(folder / _LIST_FILE)
         if public not in names:
             _write_list(folder, [*lines, _ListLine(line)])
@@ -217,26 +214,27 @@ def authorize(folder: Path, name: str, public: str, agents: Sequence[str] = ()) 
 
 
 def revoke(folder: Path, name: str) -> None:
-    """Let it in no more, by any of its keys. Raises UsageError if there is none of that name, or the list is
-    damaged."""
+    """Remove all keys of the machine `name`. Raises UsageError if there is none, or the list is damaged."""
     if not (folder / _LIST_FILE).exists():
-        raise UsageError(f"'{name}' is not authorized; there is nobody")
+        raise UsageError(f"'{name}' is not authorized; the list is empty")
     with _locked(folder):
         lines = _read_lines(folder / _LIST_FILE)
         keys = {line.key for line in lines if line.key and line.name == name}
         if not keys:
             others = ", ".join(dict.fromkeys(line.name for line in lines if line.key))
-            raise UsageError(f"'{name}' is not authorized; there is {others or 'nobody'}")
-        _write_list(folder, [line for line in lines if line.key not in keys])  # also under another name
+            names = f"authorized are: {others}" if others else "the list is empty"
+            raise UsageError(f"'{name}' is not authorized; {names}")
+        _write_list(folder, [line for line in lines if line.key not in keys])  # also under other names
 
 
 def agent_keys(folder: Path | None, edge: str) -> AgentKeys:
-    """folder: of the agent's own pair, None for the default one; edge: see `public_key`."""
+    """Read an agent's keys. folder: with its pair, None for the default; edge: see `public_key`. Raises
+    UsageError."""
     return AgentKeys(load_pair(folder or default_folder()), public_key(edge))
 
 
 def edge_keys(folder: Path | None) -> EdgeKeys:
-    """The keys in `folder`, None for the default one. Raises UsageError, also for a damaged list."""
+    """Read an edge's keys in `folder`, None for the default. Raises UsageError, also for a damaged list."""
     folder = folder or default_folder()
     keys = EdgeKeys(load_pair(folder), allow_list(folder))
     keys.allowed.names_by_key()
@@ -247,17 +245,17 @@ def edge_keys(folder: Path | None) -> EdgeKeys:
 
 
 def _parse_public_line(line: str, where: str) -> tuple[str, str]:
-    """Name and key of a line. Raises UsageError."""
+    """Return the name and key of a line. Raises UsageError."""
     match = _LINE.fullmatch(line.strip())
     if match and match[1] == "secret":
-        raise UsageError(f"{where}: is a secret key, which stays on its machine; give the public one")
+        raise UsageError(f"{where}: is a secret key, which must stay on its machine; give the public key")
     if not match or not _is_key(match[3]):
         raise UsageError(f"{where}: is not `share-public-key NAME KEY`")
     return match[2], match[3]
 
 
 def _parse_grant_line(line: str, where: str) -> tuple[str, str, tuple[str, ...]]:
-    """Name, key and agents of a line of the list. Raises UsageError."""
+    """Return the name, key and agents of a line of the list. Raises UsageError."""
     name, key = _parse_public_line(line, where)
     match = _LINE.fullmatch(line.strip())
     assert match is not None
@@ -269,7 +267,7 @@ def _format_line(name: str, public: str, agents: Sequence[str] = ()) -> str:
 
 
 def _is_key(text: str) -> bool:
-    """Whether 40 characters of Z85 are 32 bytes: five can say more than four bytes hold."""
+    """Return whether 40 Z85 characters decode to 32 bytes; five characters can exceed four bytes."""
     from zmq.utils import z85
 
     try:
@@ -293,9 +291,10 @@ def _read_text(path: Path) -> str:
 
 
 def _secret_files(folder: Path) -> list[Path]:
-    """None where there is no folder. Raises UsageError where it cannot be looked into."""
+    """Return the secret files in `folder`, none if it does not exist. Raises UsageError if it is
+    unreadable."""
     try:
-        names = os.listdir(folder)  # glob would find nothing where it may not look
+        names = os.listdir(folder)  # unlike glob, it raises for an unreadable folder
     except FileNotFoundError:
         return []
     except OSError as error:
@@ -311,7 +310,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _read_lines(path: Path) -> list[_ListLine]:
-    """Of a list; none where there is no file. Raises UsageError."""
+    """Return the lines of a list, none without a file. Raises UsageError."""
     if not path.exists():
         return []
     lines = []
@@ -324,25 +323,25 @@ def _read_lines(path: Path) -> list[_ListLine]:
 
 
 def _write_list(folder: Path, lines: Iterable[_ListLine]) -> None:
-    """Comments stay where they are."""
+    """Write the list; comments stay in place."""
     atomic_write(folder / _LIST_FILE, "".join(line.text for line in lines))
 
 
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
-    except OSError:  # a name that is too long for any
+    except OSError:  # too long for a file name
         return False
 
 
 def _check_not_world_writable(path: Path, status: os.stat_result) -> None:
-    """Raises UsageError where anybody could let himself in."""
+    """Raises UsageError if any user could authorize keys."""
     if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
-        raise UsageError(f"{path}: anybody may write to it; `chmod o-w {path}`")
+        raise UsageError(f"{path}: all users can write to it; `chmod o-w {path}`")
 
 
 def _write_secret(path: Path, text: str) -> None:
-    """Nobody else can read it at any moment, and it replaces nothing."""
+    """Write a new file that no other user can read at any moment. Raises ShareError, also if it exists."""
     with write_errors(path):
         handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
         try:
@@ -357,7 +356,7 @@ def _write_secret(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """One writer at a time, or one's revocation could be undone by another's addition."""
+    """Lock `folder`: of two concurrent writers one could undo the other's revocation."""
     import fcntl
 
     handle = os.open(folder, os.O_RDONLY)

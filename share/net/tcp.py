@@ -1,10 +1,10 @@
-"""What the kernel knows of a TCP connection that libzmq owns, and of this process (Linux).
+"""Kernel state of TCP connections that libzmq owns, and of this process (Linux).
 
-The descriptor is libzmq's: it may close it, and the number may come to mean another connection, at any time.
-So each is known by its cookie (SO_COOKIE, which no other socket ever has) as well, and is never closed here.
+libzmq owns the descriptors: it may close one at any time, and the number may be reused for another
+connection. So each is also identified by its cookie (SO_COOKIE, unique to a socket), and never closed here.
 
-Calls that cannot wait keep the interpreter's lock: where another thread computes, to take it again may take
-5 ms each time.
+Calls that cannot block keep the interpreter's lock (PyDLL): while another thread computes, taking it again
+may take 5 ms each time.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ class _Program(ctypes.Structure):
     _fields_ = (("length", ctypes.c_ushort), ("filter", ctypes.POINTER(_Filter)))
 
 
-# `ret #1`: of each segment one byte may pass, and its header always does. So connections are made and ended,
-# but their data stay with the sender, who sends them again 0.2 s later, then 0.4, 0.8 ...
+# `ret #1`: one byte of each segment passes, and headers always do. So connections open and close, but data
+# stay with the sender, which resends them after 0.2, 0.4, 0.8 s ...
 _HEADERS_ONLY = _Program(1, ctypes.pointer(_Filter(0x06, 0, 0, 1)))
 
 
 def socket_cookie(descriptor: int) -> int | None:
-    """None where it is no socket, or closed."""
+    """Return the socket's cookie, None if the descriptor is closed or no socket."""
     value = ctypes.c_uint64()
     size = ctypes.c_uint(8)
     status = _libc.getsockopt(
@@ -59,17 +59,17 @@ def socket_cookie(descriptor: int) -> int | None:
 
 
 def addresses(descriptor: int) -> tuple[str, int] | None:
-    """The host at the other end and the port at ours; None where it is not connected."""
+    """Return the peer's host and our port; None if not connected."""
     try:
         with closing(socket.socket(fileno=os.dup(descriptor))) as copy:
             return str(copy.getpeername()[0]), int(copy.getsockname()[1])
-    except (OSError, IndexError, TypeError):  # a socket of another family has other names
+    except (OSError, IndexError, TypeError):  # a socket of another family
         return None
 
 
 def bytes_read(descriptor: int) -> tuple[int, bool] | None:
-    """By whoever reads it, since it was connected, and whether exactly so many or at least; None where it is
-    closed."""
+    """Return how many bytes the application has read since the connection was made, and whether that is exact
+    or a lower bound; None if closed."""
     before = _bytes_received(descriptor)
     for _ in range(_TRIES):
         queued = ctypes.c_int()
@@ -78,14 +78,14 @@ def bytes_read(descriptor: int) -> tuple[int, bool] | None:
         after = _bytes_received(descriptor)
         if before is None or after is None:
             return None
-        if before == after:  # else some of what is queued came since
+        if before == after:  # else some queued bytes arrived meanwhile
             return after - queued.value, True
         min_read, before = before - queued.value, after
     return min_read, False
 
 
 def _bytes_received(descriptor: int) -> int | None:
-    """Bytes that came so far."""
+    """Return the bytes received so far."""
     info = ctypes.create_string_buffer(_INFO_BYTES)
     size = ctypes.c_uint(_INFO_BYTES)
     if _libc.getsockopt(descriptor, socket.IPPROTO_TCP, socket.TCP_INFO, info, ctypes.byref(size)) != 0:
@@ -94,15 +94,14 @@ def _bytes_received(descriptor: int) -> int | None:
 
 
 def resident_bytes() -> int:
-    """Memory of this process that is really there."""
+    """Return the resident memory of this process."""
     with open("/proc/self/statm", "rb") as file:
         return int(file.read().split()[1]) * _PAGE_BYTES
 
 
 def abort(descriptor: int, expected_cookie: int) -> bool:
-    """Breaks the connection with the cookie `expected_cookie` off, which also throws away what it sent and
-    nobody has
-    read: after a shutdown that could still be read, up to 32 MB. Whether it was there."""
+    """Reset the connection with the cookie `expected_cookie`. Unlike a shutdown this also discards its unread
+    data, up to 32 MB. Return whether it existed."""
     return _with_copy(
         descriptor,
         expected_cookie,
@@ -111,15 +110,15 @@ def abort(descriptor: int, expected_cookie: int) -> bool:
 
 
 def hold_input(descriptor: int, expected_cookie: int) -> bool:
-    """Lets no data in any more by the socket with the cookie `expected_cookie`; where that listens, none by
-    what is accepted from now on. Whether that could be done."""
+    """Hold back all data of the socket with the cookie `expected_cookie`; of a listening socket, those of all
+    connections accepted from now on. Return whether that succeeded."""
     return _with_copy(
         descriptor, expected_cookie, lambda copy: _set_option(copy, _SO_ATTACH_FILTER, _HEADERS_ONLY)
     )
 
 
 def release_input(descriptor: int, expected_cookie: int) -> bool:
-    """Lets data in again. Whether they were held."""
+    """Let data in again. Return whether they were held back."""
     return _with_copy(
         descriptor, expected_cookie, lambda copy: _set_option(copy, _SO_DETACH_FILTER, ctypes.c_int())
     )
@@ -131,8 +130,8 @@ def _set_option(descriptor: int, option: int, value: ctypes.Structure | ctypes.c
 
 
 def _with_copy(descriptor: int, expected_cookie: int, action: Callable[[int], bool]) -> bool:
-    """What `action` says of a copy of the descriptor, which stays that socket's; False where it is
-    another's."""
+    """Return `action` of a duplicate of the descriptor, which keeps naming the same socket; False if the
+    cookie differs."""
     copy = _libc.dup(descriptor)
     if copy < 0:
         return False

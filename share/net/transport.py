@@ -1,9 +1,9 @@
-"""Links between agents and the edge: ZeroMQ for a network, memory for one process. Same behaviour.
+"""Interfaces of the links between agents and the edge: ZeroMQ for a network, memory for one process.
 
-Every link belongs to one thread; only `wake` may be called from any. Nothing ever blocks except
-`receive`, for at most its timeout. Queues are bounded. There is one drop policy, `drop_newest`: a
-message that finds its queue full, or nobody at the other end, is not sent, and `send` says so with
-False. What must arrive is sent again by the one who cares (`share.protocol.agent_ledger`).
+A link belongs to one thread; only `wake` may be called from any. Only `receive` blocks, for at most its
+timeout. Queues are bounded, with the drop policy `drop_newest`: if the queue is full or the peer absent,
+`send` drops the message and returns False. The sender resends what must arrive
+(`share.protocol.agent_ledger`).
 """
 
 from __future__ import annotations
@@ -19,41 +19,41 @@ from share.errors import TransportError, UsageError
 from share.net.keys import AgentKeys, EdgeKeys
 from share.wire.codec import MAX_FRAME_BYTES, Bytes
 
-QUEUE_MESSAGES = 128  # a queue in either direction; poses at 30 Hz fill it in 4 s
-LINGER_MS = 200  # how long `close` may wait for a last message to leave
+QUEUE_MESSAGES = 128  # per queue and direction; poses at 30 Hz fill it in 4 s
+LINGER_MS = 200  # how long `close` waits for the last messages to leave
 
 
 class AgentLink(Protocol):
-    """An agent's way to its edge. Connects and reconnects by itself."""
+    """An agent's link to its edge. It connects and reconnects by itself."""
 
     def send(self, frames: Sequence[Bytes]) -> bool:
-        """Whether the message was taken; False if there is no edge now or the queue is full."""
+        """Queue a message. Return False if there is no edge now or the queue is full."""
         ...
 
     def receive(self, timeout_ms: int) -> list[bytes] | None:
-        """The next message; None after `timeout_ms`, or at once if woken."""
+        """Return the next message; None after `timeout_ms`, or earlier if woken."""
         ...
 
     def trouble(self) -> str | None:
-        """Why the edge did not let us in, and what to do, or why we left it; None if neither."""
+        """Return why the edge refused this agent, or why the agent left it, and what to do; else None."""
         ...
 
     def poll_connected(self) -> bool:
-        """Whether it has reached an edge, once for each time."""
+        """Return whether a connection was made since the last call."""
         ...
 
     def wake(self) -> None:
-        """Makes the current or next `receive` return early. Safe from any thread, also after close."""
+        """Make the current or next `receive` return early. Safe from any thread, also after `close`."""
         ...
 
     def close(self) -> None:
-        """Gives what was sent LINGER_MS to leave, then drops the link. May be repeated."""
+        """Give sent messages LINGER_MS to leave, then drop the link. May be repeated."""
         ...
 
 
 @dataclass(frozen=True)
 class IncomingMessage:
-    """A message at the edge. peer: its sender's 8-byte id; key: that sender's CURVE public key in Z85, ""
+    """A message at the edge. peer: its sender's 8-byte id. key: the sender's CURVE public key in Z85, ""
     without keys."""
 
     peer: bytes
@@ -62,39 +62,39 @@ class IncomingMessage:
 
 
 class EdgeLink(Protocol):
-    """The edge's way to its agents, each known by its 8-byte peer id (`share.wire.messages.peer_id`)."""
+    """The edge's link to its agents, each with an 8-byte peer id (`share.wire.messages.peer_id`)."""
 
     @property
     def endpoint(self) -> str:
-        """The address really bound, with the port that was chosen."""
+        """The bound address, with the actual port."""
         ...
 
     def send(self, peer: bytes, frames: Sequence[Bytes]) -> bool:
-        """Whether the message was taken; False if the peer is not connected or its queue is full."""
+        """Queue a message. Return False if the peer is not connected or its queue is full."""
         ...
 
     def receive(self, timeout_ms: int) -> IncomingMessage | None:
-        """The next message and who sent it; None after `timeout_ms`, or at once if woken."""
+        """Return the next message; None after `timeout_ms`, or earlier if woken."""
         ...
 
     def agent_names(self, key: str) -> frozenset[str] | None:
-        """Of the agents that the owner of this key may speak for; None where no keys are used."""
+        """Return the names of the agents that this key may act for; None if no keys are used."""
         ...
 
     def refusals(self) -> list[str]:
-        """Who was not let in since the last call, and what to do: a line each, the same for the same."""
+        """Return a line for each refusal since the last call: who and what to do; equal for equal causes."""
         ...
 
     def trouble(self) -> str | None:
-        """Why nobody can be let in now; None where nothing is wrong."""
+        """Return why no agent can connect now; None if all is well."""
         ...
 
     def wake(self) -> None:
-        """As `AgentLink.wake`."""
+        """See `AgentLink.wake`."""
         ...
 
     def close(self) -> None:
-        """As `AgentLink.close`; frees the address."""
+        """See `AgentLink.close`; also frees the address."""
         ...
 
 
@@ -107,7 +107,7 @@ class Address:
 
     @property
     def local(self) -> bool:
-        """Whether nothing outside this machine can reach it."""
+        """Whether it can be reached from this machine only."""
         try:
             return ip_address(self.host).is_loopback
         except ValueError:  # a host name
@@ -132,8 +132,8 @@ def parse_address(text: str, bind: bool = False) -> Address:
 
 
 def bind_error(target: object, number: int | None, text: str, other: str = "edge") -> TransportError:
-    """Why nothing can listen at `target`: errno `number`, which the system calls `text`. other: who may
-    have the port."""
+    """Return the error for binding `target` with errno `number` and its message `text`. other: the program
+    that may use the port."""
     fixes = {
         errno.EADDRINUSE: f"the port is in use; stop the other {other} or choose another port",
         errno.EACCES: "this port needs root; choose one above 1023",
@@ -144,26 +144,28 @@ def bind_error(target: object, number: int | None, text: str, other: str = "edge
 
 
 def check_keys(target: Address, keys: AgentKeys | EdgeKeys | None) -> Address:
-    """`target`, if it may be used with these keys: without any, only this machine. Else UsageError."""
+    """Return `target`. Raises UsageError if it is on another machine and there are no keys."""
     if keys is None and not target.local:
         raise UsageError(
-            f"{target}: other machines are not spoken to without keys; make them with `share keys generate` "
+            f"{target}: links to other machines need keys; make them with `share keys generate` "
             "(docs/do/keys.md), or use tcp://127.0.0.1"
         )
     return target
 
 
 def connect(address: str, run_id: int, keys: AgentKeys | None = None) -> AgentLink:
-    """A link to the edge at `address`, whether or not it is there yet. Raises UsageError."""
+    """Return a link to the edge at `address`, which need not run yet. Raises UsageError."""
     from share.net.zeromq import ZmqAgentLink
 
     return ZmqAgentLink(address, run_id, keys)
 
 
 def bind(address: str, keys: EdgeKeys | None = None, max_frame_bytes: int = MAX_FRAME_BYTES) -> EdgeLink:
-    """A link that agents connect to; who sends it a frame above `max_frame_bytes` is cut off.
+    """Return a link that agents connect to. A peer that sends a frame above `max_frame_bytes` is
+    disconnected.
 
-    Raises UsageError, or TransportError if the port is in use."""
+    Raises UsageError, or TransportError if the port is in use.
+    """
     from share.net.zeromq import ZmqEdgeLink
 
     return ZmqEdgeLink(address, keys, max_frame_bytes)

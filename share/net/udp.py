@@ -1,4 +1,4 @@
-"""UDP whose datagrams are stamped by the kernel as they arrive, where it does that (Linux)."""
+"""UDP sockets that stamp datagrams on arrival, by the kernel where available (Linux)."""
 
 from __future__ import annotations
 
@@ -17,17 +17,15 @@ from typing import Any
 from share.errors import UsageError
 from share.net.transport import bind_error
 
-MAX_DATAGRAM_BYTES = 2048  # of a datagram; longer ones are cut off
-_TIMESTAMPNS = (
-    35  # SO_TIMESTAMPNS of asm-generic/socket.h, the same on x86 and ARM; Python has no name for it
-)
+MAX_DATAGRAM_BYTES = 2048  # longer ones are truncated
+_TIMESTAMPNS = 35  # SO_TIMESTAMPNS, asm-generic/socket.h (x86 and ARM); Python has no name for it
 _TIMESPEC = struct.Struct("@ll")
 _ADDRESS = re.compile(r"(?:\[([0-9A-Fa-f:.%\w]+)\]|([A-Za-z0-9_.-]+))(?::(\d{1,5}))?")
 
 
 @dataclass(frozen=True)
 class HostPort:
-    """Where a UDP socket is."""
+    """Address of a UDP socket."""
 
     name: str
     port: int
@@ -38,7 +36,8 @@ class HostPort:
 
 @dataclass(frozen=True)
 class Datagram:
-    """stamp_ns: Unix time of its arrival, by the kernel or else by us. source: as the socket gives it."""
+    """A received datagram. stamp_ns: Unix time of arrival, by the kernel or else by this process. source: the
+    socket address."""
 
     data: bytes
     source: Any
@@ -46,7 +45,7 @@ class Datagram:
 
 
 class StampedSocket:
-    """One socket; `has_kernel_stamps` says whose stamps its datagrams have."""
+    """A UDP socket. has_kernel_stamps: the kernel, not this process, stamps its datagrams."""
 
     def __init__(self, family: int) -> None:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
@@ -59,7 +58,7 @@ class StampedSocket:
 
     @classmethod
     def bind(cls, host: HostPort) -> StampedSocket:
-        """Raises UsageError for a host that is unknown, TransportError where nobody can listen."""
+        """Raises UsageError for an unknown host, TransportError if the address cannot be bound."""
         family, target = resolve(host)
         bound_socket = cls(family)
         try:
@@ -71,7 +70,8 @@ class StampedSocket:
 
     @classmethod
     def connect(cls, host: HostPort) -> StampedSocket:
-        """Hears that host only. Raises UsageError for one that is unknown, OSError for one without a way."""
+        """Return a socket that exchanges datagrams with `host` only. Raises UsageError for an unknown host,
+        OSError for an unreachable one."""
         family, target = resolve(host)
         connected_socket = cls(family)
         try:
@@ -83,7 +83,7 @@ class StampedSocket:
 
     @property
     def port(self) -> int:
-        """The one really bound."""
+        """The bound port."""
         return int(self._socket.getsockname()[1])
 
     def send(self, data: bytes, to: Any = None) -> None:
@@ -94,13 +94,13 @@ class StampedSocket:
             self._socket.sendto(data, to)
 
     def receive(self, timeout_s: float) -> Datagram | None:
-        """The next datagram; None after `timeout_s`. Raises OSError, on a connected socket also for what
-        became of a datagram sent before (nobody listens there)."""
+        """Return the next datagram, None after `timeout_s`. Raises OSError, on a connected socket also for a
+        datagram sent before (connection refused)."""
         if not select.select([self._socket], [], [], max(0.0, timeout_s))[0]:
             return None
         try:
             data, extra, _, source = self._socket.recvmsg(MAX_DATAGRAM_BYTES, 64)
-        except BlockingIOError:  # a damaged one, which the kernel threw away
+        except BlockingIOError:  # a damaged datagram that the kernel dropped
             return None
         return Datagram(data, source, _kernel_stamp_ns(extra) or time.time_ns())
 
@@ -118,19 +118,19 @@ def _kernel_stamp_ns(extra: list[tuple[int, int, bytes]]) -> int | None:
 
 
 def parse_host(text: str, default_port: int, bind: bool = False) -> HostPort:
-    """HOST, HOST:PORT, [IPV6] or [IPV6]:PORT. Raises UsageError."""
+    """Parse HOST, HOST:PORT, [IPV6] or [IPV6]:PORT. Raises UsageError."""
     match = _ADDRESS.fullmatch(text)
     port = int(match[3]) if match and match[3] else default_port
     if not match or text.isdigit() or not (0 if bind else 1) <= port <= 65535:
         raise UsageError(
-            f"'{text}' is no address; give HOST or HOST:PORT, such as 192.168.1.10:{default_port}"
+            f"'{text}' is not an address; give HOST or HOST:PORT, such as 192.168.1.10:{default_port}"
         )
     name = match[1] or match[2]
     return HostPort("127.0.0.1" if name == "localhost" else name, port)
 
 
 def resolve(host: HostPort) -> tuple[int, Any]:
-    """Family and socket address. Raises UsageError where nobody knows that host."""
+    """Return the address family and socket address. Raises UsageError for an unknown host."""
     try:
         candidates = socket.getaddrinfo(host.name, host.port, type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
@@ -140,7 +140,7 @@ def resolve(host: HostPort) -> tuple[int, Any]:
 
 
 def clock_precision() -> int:
-    """How long it takes to read this machine's clock, as log2 of s (RFC 5905, section 7.3)."""
+    """Return the time that reading this machine's clock takes, as log2 of s (RFC 5905, section 7.3)."""
     readings = [time.time_ns() for _ in range(200)]
     min_step_ns = min((b - a for a, b in pairwise(readings) if b > a), default=1_000_000)
     return math.ceil(math.log2(min_step_ns * 1e-9))

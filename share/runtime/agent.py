@@ -1,14 +1,14 @@
-"""An agent as a process: three threads and two bounded queues round the state machine of `core.agent`.
+"""The agent process: three threads and two bounded queues around the state machine `share.protocol.agent`.
 
-    reader: decode, wait until the sensor would have delivered -> tracker: pose, then keyframe
-        -> main: the machine, the link, the files
+    reader: decode, wait until the frame is due -> tracker: pose, then keyframe
+        -> main: state machine, link, files
 
-A live camera has no reader: the tracker takes what is newest (`run.arrivals`).
+A live camera has no reader thread: the tracker takes the newest frame (`share.runtime.arrivals`).
 
-A recording is played at its own pace and no frame of it is dropped: the reader waits when the tracker
-is behind (policy `block`), while a frame still counts as arrived when it was due. So the poses of a
-recording are the same to the last digit on any machine, with an edge or without, and lateness shows
-in the latency, where it belongs. With `agent.late_ms` the loop holds its rate instead (policy `drop_late`).
+A recording is played at its recorded pace and no frame is dropped: the reader waits when the tracker is
+behind (policy `block`), while a frame still counts as arrived when it was due. So the poses of a
+recording are the same to the last digit on any machine, with or without an edge, and lateness shows
+in the latency. With `agent.late_ms` late frames are dropped instead (policy `drop_late`).
 """
 
 from __future__ import annotations
@@ -55,18 +55,15 @@ from share.types import Frame
 from share.wire import messages as m
 
 TICK_MS = 50
-_INBOX_SIZE = (
-    64  # events between tracker and main: policy block, as the camera keeps the newest of what waits
-)
-_MAX_MESSAGES_PER_TICK = (
-    64  # messages of the edge in one tick: more wait in the link, so that no flood takes the processor
-)
-_OVERDUE_MARGIN_S = 5.0  # beyond agent.finish_s: the machine should have ended the run
+# Events between tracker and main. Policy block: a live camera's own queue keeps the newest images.
+_INBOX_SIZE = 64
+_MAX_MESSAGES_PER_TICK = 64  # from the edge; the rest waits in the link: a flood cannot use up the CPU
+_OVERDUE_MARGIN_S = 5.0  # after agent.finish_s: by then the state machine should have ended the run
 
 
 @dataclass(frozen=True, eq=False)
 class LiveStatus:
-    """For the live line. idle: no frame was tracked of late."""
+    """Contents of the live line. idle: no frame was tracked recently."""
 
     frames: int
     state: str
@@ -76,19 +73,19 @@ class LiveStatus:
 
 @dataclass
 class _Shared:
-    """What the threads tell each other."""
+    """State shared by the threads."""
 
     inbox: queue.Queue[ev.AgentEvent] = field(default_factory=lambda: queue.Queue(_INBOX_SIZE))
     stop: threading.Event = field(default_factory=threading.Event)
-    closed: threading.Event = field(default_factory=threading.Event)  # nobody takes from the inbox any more
-    error: BaseException | None = None  # what ended a thread
+    closed: threading.Event = field(default_factory=threading.Event)  # the inbox is no longer read
+    error: BaseException | None = None  # that ended a thread
 
 
 class AgentRun:
-    """One run: `run` returns when the recording is over and everything is acknowledged and written.
+    """One run of an agent. `run` returns when the recording is over and all is acknowledged and written.
 
-    A damaged image costs its frame; a recording that cannot be read on ends the run in good order,
-    and then raises.
+    A damaged image costs its frame. A recording that becomes unreadable ends the run cleanly; then `run`
+    raises.
     """
 
     def __init__(
@@ -104,38 +101,36 @@ class AgentRun:
         error_estimator: ErrorEstimator | None = None,
         pose_feed: PoseFeed | None = None,
     ) -> None:
-        """errors: tells how wrong the tracker is. poses: who else is told where this agent is."""
+        """error_estimator: estimates the tracking error of keyframes. pose_feed: publishes poses by UDP."""
         self._source, self._settings = source, settings
         self._notify, self._show, self._verbose = notify, show, verbose
         self._guard = FaultGuard(notify)
         self._state_machine = Agent(hello, settings)
-        self._imu_bias_store: ImuBiasStore | None = None  # of who tracks itself
+        self._imu_bias_store: ImuBiasStore | None = None  # None where the edge tracks
         self._prepare()
         self._files, self._output_writer = AgentFiles(out, notify), OutputWriter(out, notify)
         self._log = RunLog(BackgroundLines(self._files.frame_lines, self._output_writer))
-        self._error_estimator, self._pose_feed = (
-            NoErrorEstimate() if error_estimator is None else error_estimator,
-            pose_feed,
-        )
+        self._error_estimator = NoErrorEstimate() if error_estimator is None else error_estimator
+        self._pose_feed = pose_feed
         self._late_dropper = LateFrameDropper(settings.agent.late_ms)
         self._lateness_monitor = LatenessMonitor(
             notify, "the edge" if hello.streams_frames else "this machine"
         )
         self._counters = SequencerCounters()
-        self._link = connect()  # last: whatever is wrong with the above has been said by now
+        self._link = connect()  # last: any error above is raised before the edge sees this agent
         self._shared = _Shared()
         self._arrivals = self._make_arrivals()
         self._damaged_images = 0
         self._ended = False
-        self._tick_end_ns = 0  # when the present tick ends
-        self._messages_in_tick = 0  # messages in it
-        self._finished_ns: int | None = None  # when the last frame was done
+        self._tick_end_ns = 0
+        self._messages_in_tick = 0
+        self._finished_ns: int | None = None  # when the input ended
         self.report: dict[str, Any] = {}
         self._troubles = FaultDeduplicator()
-        self.trouble: str | None = None  # why the edge does not let this agent in
+        self.trouble: str | None = None  # why the edge refuses this agent
 
     def _prepare(self) -> None:
-        """Raises what is wrong with the source before there is a link."""
+        """Make the tracker. Raises UsageError where no tracker fits the source, before a link exists."""
         check_trackable(self._source.name, self._source.rig)
         self._imu_bias_store = ImuBiasStore(self._source, self._settings.inertial, self._notify)
         self._tracker = GuardedTracker(
@@ -143,12 +138,13 @@ class AgentRun:
         )
 
     def stop(self) -> None:
-        """End early, in good order: no more frames, but what was sent is still waited for."""
+        """End early and cleanly: read no more frames, but wait for outstanding acknowledgements."""
         self._shared.stop.set()
         self._arrivals.stop()
 
     def run(self) -> None:
-        """Raises what ended the run before its time, after everything was closed."""
+        """Run until the source ends or `stop`. Raises any error that ended it early, after closing
+        everything."""
         tracker = threading.Thread(target=self._track, name="tracker", daemon=True)
         tracker.start()
         try:
@@ -190,7 +186,7 @@ class AgentRun:
 
     def _skip_damaged(self, error: DataError) -> None:
         self._damaged_images += 1
-        self._notify(f"a frame is left out: {error}")
+        self._notify(f"frame skipped: {error}")
 
     # ------------------------------------------------------------------ tracker
 
@@ -218,11 +214,11 @@ class AgentRun:
             error_cm=self._estimate_error_cm(frame, result),
             waiting_for=result.waiting_for,
         )
-        self._post(tracked)  # the pose goes out before others are served
+        self._post(tracked)  # before keyframe work: the pose must not wait for it
         self._log.add_result(result.new_segment, result.is_consistent, result.waiting_for)
         if result.keyframe_ready:
             self._make_keyframe(frame, tracked)
-        self._tracker.attempt("settling a frame", frame, self._tracker.finish_keyframe)
+        self._tracker.attempt("finishing a keyframe", frame, self._tracker.finish_keyframe)
         self._log.imu_outliers = self._tracker.rejected_imu_samples
         self._log.cpu_s += time.thread_time() - cpu_start_s
 
@@ -238,7 +234,7 @@ class AgentRun:
         self._post(ev.KeyframeMade(tracked, candidate))
 
     def _post(self, event: ev.AgentEvent) -> None:
-        """Waits for room, as long as anybody takes what is posted."""
+        """Put `event` into the inbox; wait while it is full, unless it is no longer read."""
         while not self._shared.closed.is_set():
             try:
                 self._shared.inbox.put(event, timeout=0.1)
@@ -259,7 +255,7 @@ class AgentRun:
             self._handle(self._arrivals.tick())
 
     def _receive(self) -> None:
-        """One message of the edge, or what the tracker posts, or the end of the tick."""
+        """Handle one message from the edge; return early for a posted event or at the end of the tick."""
         now_ns = time.monotonic_ns()
         if now_ns >= self._tick_end_ns:
             self._tick_end_ns, self._messages_in_tick = now_ns + TICK_MS * 1_000_000, 0
@@ -281,7 +277,7 @@ class AgentRun:
         self._handle(event)
 
     def _is_overdue(self) -> bool:
-        """Whether the machine should have ended the run long ago."""
+        """Return whether the state machine has failed to end the run in time."""
         limit_s = self._settings.agent.finish_s + _OVERDUE_MARGIN_S
         return self._finished_ns is not None and time.monotonic_ns() - self._finished_ns > limit_s * 1e9
 
@@ -291,14 +287,14 @@ class AgentRun:
             self._notify(self.trouble)
 
     def _handle(self, event: ev.AgentEvent) -> None:
-        """One guarded step: what fails costs this event, and never the run."""
+        """Handle one event. A failure costs this event, not the run."""
         try:
             effects = self._state_machine.handle(event, time.monotonic_ns())
         except Exception as error:
             self._guard.record(f"handling {type(event).__name__}", error)
             effects = self._state_machine.pending_effects()
         for effect in effects:
-            with self._guard.step(f"carrying out {type(effect).__name__}"):
+            with self._guard.step(f"executing {type(effect).__name__}"):
                 self._execute(effect)
 
     def _execute(self, effect: ev.AgentEffect) -> None:
@@ -337,7 +333,7 @@ class AgentRun:
             if localised.T_map_odom is None or localised.map_id is None
             else localised.T_map_odom @ localised.T_odom_body
         )
-        if self._pose_feed is not None:  # first: somebody waits for it
+        if self._pose_feed is not None:  # first: its delay matters
             age_ms = (time.monotonic_ns() - localised.arrived_ns) / 1e6
             self._pose_feed.publish(
                 localised.stamp_ns,
@@ -357,7 +353,7 @@ class AgentRun:
             )
 
     def _show_idle(self, event: ev.StatusReport) -> None:
-        """No frame says it: the pose that was told last is not where the agent is now."""
+        """Publish and show that the last pose is stale; no frame reports this."""
         if self._pose_feed is not None and event.stamp_ns is not None:
             self._pose_feed.publish(event.stamp_ns, event.status.state, event.status.pose_age_ms)
         self._show_status(event.status, idle=True)

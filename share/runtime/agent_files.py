@@ -1,8 +1,8 @@
-"""What `share agent --out DIR` leaves behind.
+"""The files that `share agent --out DIR` writes.
 
-Poses are written as they come, under a `.partial` name that a crash leaves behind readable; a run
-that ends gives them their real name. One TUM file holds poses of one map only: when the agent is
-taken into another map, what it wrote before is kept as `map.before-N.tum`.
+Poses are written as they come, to `.partial` files that stay readable after a crash; a run that ends
+renames them. One TUM file holds poses in one map only: when the agent moves to another map, its earlier
+poses are kept as `map.before-N.tum`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from share.metrics.frame_log import RunLog
 from share.recordings.trajectory import format_pose
 from share.types import F64
 
-_MAX_MAPS = 100  # an edge that moves an agent from map to map must not fill a folder
+_MAX_MAPS = 100  # an edge that keeps moving an agent between maps must not fill the folder
 _FILE_NAMES = ("odom.tum", "map.tum", "latency.csv", "report.json")
 
 
@@ -30,9 +30,9 @@ def _lock_folder(out: Path) -> int:
 
 
 class AgentFiles:
-    """odom.tum, map.tum, latency.csv and report.json of one run in `out`; nothing where that is None.
+    """odom.tum, map.tum, latency.csv and report.json of one run in `out`; none if `out` is None.
 
-    `notify` is told of a disk that is full. Raises UsageError if another run is writing there.
+    `notify` is called when the disk is full. Raises UsageError if another run is writing to `out`.
     """
 
     def __init__(self, out: Path | None, notify: Callable[[str], None]) -> None:
@@ -42,10 +42,8 @@ class AgentFiles:
         self._previous_maps = 0
         self._has_warned = False
         self._lock_handle = None if out is None else _lock_folder(out)
-        self._remove_partials()  # of a run that was killed
-        self.frame_lines = Spool(
-            None if out is None else out / "latency.csv.partial", notify
-        )  # of the run's log
+        self._remove_partials()  # left by a killed run
+        self.frame_lines = Spool(None if out is None else out / "latency.csv.partial", notify)
 
     def write_odom_pose(self, stamp_ns: int, T_odom_body: F64) -> None:
         self._append_pose("odom.tum", stamp_ns, T_odom_body)
@@ -58,30 +56,32 @@ class AgentFiles:
         self._append_pose("map.tum", stamp_ns, T_map_body)
 
     def _archive_map(self, partial: Path) -> None:
-        """Poses of the map before, but not of more than _MOST_MAPS."""
+        """Keep the poses in the previous map, for at most _MAX_MAPS maps."""
         if self._previous_maps < _MAX_MAPS:
             self._previous_maps += 1
             partial.rename(partial.with_name(f"map.before-{self._previous_maps}.tum.partial"))
         elif not self._has_warned:
             self._has_warned = True
-            self._notify(f"taken into more than {_MAX_MAPS} maps: poses of those between are not kept")
+            self._notify(f"moved between more than {_MAX_MAPS} maps: poses in further ones are not kept")
 
     def finish(self, log: RunLog, report: dict[str, Any]) -> None:
-        """Close what is open and give everything its name; the report also says in which map map.tum is: a
-        correction after the last frame does not change that. Raises ShareError if the disk was full: then the
-        report, too, is of a part of the frames only."""
+        """Close all files, rename them and write the report, with the map id of map.tum as `map_tum`.
+
+        A correction after the last frame does not change that id. Raises ShareError if the disk was full
+        and poses or frame lines are missing.
+        """
         files = list(self._open_files.values())
         for file in files:
-            file.check()  # what there is stays, as .partial
+            file.check()  # on failure the .partial files stay
         self.frame_lines.check()
         self._close_files()
         if self._out is None:
             return
         for old in self._out.glob("map.before-*.tum"):
-            old.unlink()  # of an earlier run in the same folder
+            old.unlink()  # from an earlier run in this folder
         for name in ("odom.tum", "map.tum"):
             partial = self._out / f"{name}.partial"
-            partial.touch()  # no pose at all is an empty file, not an older run's
+            partial.touch()  # without poses: an empty file, not the one of an earlier run
             partial.replace(self._out / name)
         for number in range(1, self._previous_maps + 1):
             name = f"map.before-{number}.tum"
@@ -92,13 +92,13 @@ class AgentFiles:
         atomic_write(self._out / "report.json", json.dumps(report, indent=2) + "\n")
 
     def discard(self) -> None:
-        """The run came to nothing: leave no trace of it."""
+        """Remove all files of a failed run."""
         self._close_files()
         self.frame_lines.close()
         self._remove_partials()
 
     def release(self) -> None:
-        """Give the folder free for another run."""
+        """Unlock the folder."""
         self._close_files()
         self.frame_lines.close()
         if self._lock_handle is not None:

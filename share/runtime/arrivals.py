@@ -1,4 +1,5 @@
-"""Frames when they come: of a recording, when the sensor would have delivered them; of a camera, now."""
+"""Frames at their arrival times: recorded ones when the sensor would have delivered them, live ones at
+once."""
 
 from __future__ import annotations
 
@@ -16,29 +17,33 @@ from share.types import Frame, ImuBatch
 
 READ_AHEAD = 30  # frames decoded before they are due
 _WAIT_S = 0.1
-_DROP_WARNING_S = 2.0  # so long images that were left out are spoken of
-_TOO_SLOW = "too slow for the camera: images are left out"
+_DROP_WARNING_S = 2.0  # how long a warning about dropped images is shown
+_TOO_SLOW = "too slow for the camera: images are dropped"
+_FIRST_WARNING_S = 1.0  # lateness of poses at the first warning; the next comes at twice the last one
+_LATE_FRAMES_ADVICE = "set agent.late_ms to drop late frames, or use smaller images or a faster machine"
 
-FrameStream = Callable[[], Iterator[Frame]]  # begins to decode
+FrameStream = Callable[[], Iterator[Frame]]  # starts decoding
 
 
 class FrameArrivals(Protocol):
-    """`iter_frames` gives frames and when they arrived, on the monotonic clock (ns), until the end or
-    `stop`."""
+    """A source of frames with arrival times."""
 
-    def iter_frames(self) -> Iterator[tuple[Frame, int]]: ...
+    def iter_frames(self) -> Iterator[tuple[Frame, int]]:
+        """Yield each frame and its arrival on the monotonic clock, ns, until the end or `stop`."""
+        ...
 
     def stop(self) -> None: ...
 
     def tick(self) -> AgentTick:
-        """What is known now of images that are not tracked yet, and of the sensors."""
+        """Return the arrival of the oldest untracked image and the state of the sensors."""
         ...
 
 
 class RecordedArrivals:
-    """A recording at its own pace, decoded ahead in a thread of its own, which waits for room (`block`).
+    """A recording at its recorded pace, decoded ahead by a thread that waits when its queue is full
+    (`block`).
 
-    What cannot be read on is raised after the frames before it.
+    A read error is raised after the frames before it.
     """
 
     def __init__(self, frames: FrameStream, late_dropper: LateFrameDropper) -> None:
@@ -46,7 +51,7 @@ class RecordedArrivals:
         self._queue: queue.Queue[Frame | None] = queue.Queue(READ_AHEAD)
         self._stop = threading.Event()
         self._error: BaseException | None = None
-        self._is_tracking = False  # a frame that was given is worked on
+        self._is_tracking = False  # a yielded frame is being tracked
 
     def tick(self) -> AgentTick:
         return AgentTick(time.monotonic_ns() if self._is_tracking else None)
@@ -96,7 +101,7 @@ class RecordedArrivals:
             self._put(None)
 
     def _put(self, frame: Frame | None) -> bool:
-        """Wait for room, unless the run is over."""
+        """Put `frame` into the queue; wait while it is full. Return False if stopped before."""
         while not self._stop.is_set():
             try:
                 self._queue.put(frame, timeout=_WAIT_S)
@@ -107,13 +112,13 @@ class RecordedArrivals:
 
 
 class LiveArrivals:
-    """A live camera's frames, read by who tracks them: what waits meanwhile, waits in the camera's own queue,
-    whose policy `drop_old_image` keeps the newest."""
+    """A live camera's frames, read by the tracker's thread. Images that come meanwhile wait in the camera's
+    queue, which keeps the newest (policy `drop_old_image`)."""
 
     def __init__(self, frames: FrameStream, camera: LiveSource) -> None:
         self._frames, self._camera = frames, camera
-        self._dropped: int | None = None  # before the first frame nobody has read the camera yet
-        self._last_drop_s = -_DROP_WARNING_S  # when it last grew
+        self._dropped: int | None = None  # images; None before the first frame
+        self._last_drop_s = -_DROP_WARNING_S
 
     def tick(self) -> AgentTick:
         now, dropped = time.monotonic(), self._camera.images_dropped
@@ -132,21 +137,20 @@ class LiveArrivals:
             yield frame, self._camera.arrived_ns(frame.stamp_ns)
 
 
-# ---- A loop that cannot keep up leaves frames out and holds its rate: policy `drop_late`.
-
-
 class LateFrameDropper:
-    """Of frames in order, those that may be tracked. What the IMU said between them stays."""
+    """Drops frames that come too late to be tracked (policy `drop_late`), and keeps their IMU samples."""
 
     def __init__(self, late_ms: float) -> None:
-        """late_ms: 0: however late, no frame is left out."""
+        """late_ms: delay from which a frame is dropped; 0 drops none."""
         self._late_ns = late_ms * 1e6
         self._skipped_imu: list[ImuBatch] = []
         self.dropped = 0  # frames
 
     def admit(self, frame: Frame, late_ns: int, has_next: bool) -> Frame | None:
-        """The frame, with the IMU samples since the last one; None where it is left out: it begins to be
-        tracked `late_ns` after it arrived, and another waits."""
+        """Return `frame` with all IMU samples since the last admitted one, or None to drop it.
+
+        late_ns: time since it arrived. A frame is dropped only if a later one waits (`has_next`).
+        """
         if has_next and 0 < self._late_ns < late_ns:
             self.dropped += 1
             self._skipped_imu.append(frame.imu)
@@ -155,26 +159,18 @@ class LateFrameDropper:
         return replace(frame, imu=skipped[0].concatenate(*skipped[1:], frame.imu)) if skipped else frame
 
 
-# ---- That poses come late is said, since nothing else shows it where no frame is left out.
-
-_FIRST_WARNING_S = 1.0  # the first warning; the next at twice what was said
-_LATE_FRAMES_ADVICE = (
-    "consider agent.late_ms, by which frames that are late are left out, smaller images or a faster machine"
-)
-
-
 class LatenessMonitor:
-    """Counts frames whose pose came more than LATE_S after their image, and says how late poses are, once and
-    again where that doubles."""
+    """Counts frames with a pose more than LATE_S after the image; warns when lateness first exceeds 1 s, and
+    each time it doubles."""
 
     def __init__(self, notify: Callable[[str], None], bottleneck: str) -> None:
-        """slow: who is to blame, such as "this machine"."""
+        """bottleneck: the cause to name, such as "this machine"."""
         self._notify, self._bottleneck = notify, bottleneck
         self._next_warning_s = _FIRST_WARNING_S
         self._late_frames, self._max_late_s = 0, 0.0
 
     def record(self, track_ms: float) -> None:
-        """A frame is tracked, so long after its image came."""
+        """Record that a frame's pose came `track_ms` after its image."""
         late_s = track_ms / 1e3
         self._late_frames += late_s > LATE_S
         self._max_late_s = max(self._max_late_s, late_s)

@@ -1,7 +1,7 @@
-"""`share capture`: a camera's streams to a recording, for as long as the disk lasts.
+"""`share capture`: record a camera's streams until stopped or the disk is almost full.
 
-the camera's feed -> writer thread: the file
-    main thread: disk, live line
+camera feed -> writer thread: the file
+main thread: free disk space, live line
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SHOW_PERIOD_S = 1.0
 
 @dataclass(frozen=True)
 class CaptureStatus:
-    """For the live line. minutes: that the disk lasts, infinite where nothing is written."""
+    """Contents of the live line. minutes: time until the disk is full; infinite while nothing is written."""
 
     feed: FeedStatus
     mb_s: float
@@ -37,10 +37,10 @@ class CaptureStatus:
 
 
 class Capture:
-    """One recording. `run` returns when it was stopped, is long enough or the disk is almost full.
+    """One recording. `run` returns when it is stopped, long enough, or the disk is almost full.
 
-    Raises UsageError and ShareError before anything is written; later, only where the file itself cannot
-    be written any more (its `.part` stays, for `share dataset recover`).
+    Raises UsageError or ShareError before anything is written; later only if the file cannot be written any
+    more (its `.part` stays, for `share dataset recover`).
     """
 
     def __init__(
@@ -52,24 +52,24 @@ class Capture:
         show: Callable[[CaptureStatus], None] = lambda status: None,
         calibration: Calibration | None = None,
     ) -> None:
-        """calibration: what the recording says of the camera, in place of the factory's."""
+        """calibration: written to the recording in place of the factory's."""
         self._feed, self._out, self._min_free_bytes = feed, out, min_free_gb * 1e9
         self._calibration = calibration
         self._notify, self._show = notify, show
         self._stop = threading.Event()
         self._error: BaseException | None = None
-        self._written_measurements = 0  # measurements
-        self._last_shown = (time.monotonic(), 0)  # when, and bytes by then
+        self._written_measurements = 0
+        self._last_shown = (time.monotonic(), 0)  # time, bytes written by then
         self.end_reason = "stopped"
 
     def stop(self) -> None:
-        """End in good order."""
+        """End the recording and close its file."""
         self._stop.set()
 
     def run(self, seconds: float | None = None) -> dict[str, Any]:
-        """Record, and tell what came of it."""
+        """Record for `seconds`, or until stopped. Return the report."""
         _check_disk(self._out, self._min_free_bytes)
-        factory = self._feed.open()  # before there is a file: the queue holds what comes meanwhile
+        factory = self._feed.open()  # before the file exists: the queue holds samples meanwhile
         try:
             rig, warnings = choose_rig(self._calibration, factory, self._feed.serial)
             for warning in warnings:
@@ -84,7 +84,7 @@ class Capture:
         return {"out": str(self._out), "ended": self.end_reason, **self._feed.report()}
 
     def _record(self, recorder: Recorder, seconds: float | None) -> None:
-        """Until it ends; then the file is whole, or keeps its `.part` if something went wrong."""
+        """Record until the end. The file is then complete, or stays as `.part` after an error."""
         writer = threading.Thread(target=self._write_measurements, args=(recorder,), daemon=True)
         writer.start()
         try:
@@ -105,7 +105,7 @@ class Capture:
             recorder.close()
 
     def _wait_for_writer(self, writer: threading.Thread, recorder: Recorder) -> None:
-        """Until all that came is written, or a person does not want to wait for that."""
+        """Wait until everything is written, or a signal interrupts."""
         try:
             writer.join()
         except BaseException:
@@ -114,10 +114,10 @@ class Capture:
 
     def _notify_unclosed(self, recorder: Recorder) -> None:
         out, part = self._out, recorder.part
-        self._notify(f"{part}: is not closed; `share dataset recover {part} --out {out}` saves what it has")
+        self._notify(f"{part}: is not closed; `share dataset recover {part} --out {out}` saves its contents")
 
     def _describe_samples(self) -> str:
-        """What came where nothing could be written: not all of an IMU, or nothing."""
+        """Return which samples came although nothing could be written."""
         counts = {name: gaps.samples for name, gaps in self._feed.processor.streams.items()}
         if not any(counts.values()):
             return "no sample came"
@@ -137,7 +137,7 @@ class Capture:
     def _loop(self, seconds: float | None) -> None:
         start_s = time.monotonic()
         while not self._stop.wait(_TICK_S):
-            with write_errors(self._out):  # a disk that was pulled out
+            with write_errors(self._out):  # the disk may have been removed
                 free = shutil.disk_usage(self._out.parent).free
             if free < self._min_free_bytes:
                 self.end_reason = "disk almost full"
@@ -161,7 +161,7 @@ class Capture:
 
 
 def _check_disk(out: Path, min_free_bytes: float) -> None:
-    """Raises UsageError where a recording is not to begin."""
+    """Raises UsageError if the recording exists, is left over unclosed, or the disk is too full."""
     if out.exists():
         raise UsageError(f"{out}: exists; give a new name, a recording is never overwritten")
     if part_path(out).exists():
@@ -170,10 +170,8 @@ def _check_disk(out: Path, min_free_bytes: float) -> None:
     free = shutil.disk_usage(out.parent).free
     if free < min_free_bytes:
         raise UsageError(
-            f"{out.parent}: has {free / 1e9:.1f} GB left and "
-            f"{min_free_bytes / 1e9:g} must "
-            f"stay free (--min-free-gb); "
-            "delete something or record to another disk"
+            f"{out.parent}: has {free / 1e9:.1f} GB left and {min_free_bytes / 1e9:g} must stay free "
+            "(--min-free-gb); delete something or record to another disk"
         )
 
 

@@ -15,17 +15,24 @@ from share.files.writing import open_new
 
 
 def share_command(*arguments: str) -> list[str]:
-    """The command line that runs `share ARGUMENTS` with this very program."""
+    """Return the command line that runs `share ARGUMENTS` with this program, frozen or not."""
     if getattr(sys, "frozen", False):
         return [sys.executable, *arguments]
-    return [sys.executable, "-P", "-m", "share", *arguments]  # -P: not a folder `share` of whoever calls
+    return [
+        sys.executable,
+        "-P",
+        "-m",
+        "share",
+        *arguments,
+    ]  # -P: ignore a folder `share` in the working directory
 
 
 @contextlib.contextmanager
 def running_child(log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """`share ARGUMENTS` with its output in `log`; asked to end, then made to, when the block is left.
+    """Run `share ARGUMENTS` with its output in `log`; stop it when the block is left.
 
-    It ends with this process, however this one ends."""
+    The child ends with this process, however this one ends.
+    """
     with open_new(log) as sink:
         process = _start(sink, arguments)
         try:
@@ -35,7 +42,7 @@ def running_child(log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes
 
 
 def _start(sink: IO[bytes], arguments: tuple[str, ...]) -> subprocess.Popen[bytes]:
-    """In a group of its own: Ctrl-C in a terminal is for the parent, which ends its children in order."""
+    """Start it in a new process group: Ctrl-C in a terminal reaches only the parent, which stops it."""
     return subprocess.Popen(
         share_command(*arguments),
         stdin=subprocess.DEVNULL,
@@ -47,7 +54,7 @@ def _start(sink: IO[bytes], arguments: tuple[str, ...]) -> subprocess.Popen[byte
 
 
 def stop_child(process: subprocess.Popen[bytes], timeout_s: float = 10.0) -> int:
-    """Ask a child to stop, and kill it if it does not. Its exit code."""
+    """Send SIGINT, kill after `timeout_s`, and return the exit code."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
     try:

@@ -1,5 +1,5 @@
-"""Looks at this device as a profile wants it: facts read by `share.devices.host`,
-judged by `share.devices.checks`."""
+"""`share doctor`: read facts of this device (`share.devices.host`) and judge them by a profile
+(`share.devices.checks`)."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from share.wire.messages import Message, Ping, Pong
 
 _REALSENSE_MODEL = "RealSense"
 _PORT = 5555  # of `share edge`
+_EDGE_TIMEOUT_S = 4.0
 _DISABLE_PPD_COMMAND = (
     "sudo systemctl mask --now power-profiles-daemon  # or it sets powersave again at the next start"
 )
@@ -47,16 +48,16 @@ def inspect_host(profile: HostProfile, out: Path) -> list[CheckResult]:
 
 
 def query_sdk(profile: HostProfile) -> SdkReport | None:
-    """What librealsense sees; None where the profile's device is no RealSense."""
+    """Return librealsense's view of the cameras; None if the profile's device is no RealSense."""
     if profile.sensor is None or _REALSENSE_MODEL not in profile.sensor.device.model:
         return None
     return sdk_probe.probe_sdk()
 
 
 def inspect_camera(profile: HostProfile, sdk: SdkReport | None) -> list[CheckResult]:
-    """sdk: as `ask` found it."""
+    """sdk: from `query_sdk`."""
     if profile.sensor is None or sdk is None:
-        return [skipped("camera", f"profile '{profile.name}' has none that can be asked")]
+        return [skipped("camera", f"profile '{profile.name}' has no RealSense camera")]
     required, cameras = profile.host, facts.cameras()
     known_good, oldest = profile.sensor.device.firmware, profile.sensor.device.firmware_oldest
     return [
@@ -73,7 +74,7 @@ def inspect_camera(profile: HostProfile, sdk: SdkReport | None) -> list[CheckRes
 def inspect_calibration(
     profile: HostProfile, folder: Path | None, sdk: SdkReport | None
 ) -> list[CheckResult]:
-    """sdk: as `ask` found it."""
+    """sdk: from `query_sdk`."""
     if profile.sensor is None:
         return [skipped("calibration", f"profile '{profile.name}' has no device")]
     if folder is None:
@@ -90,21 +91,21 @@ def inspect_calibration(
 
 
 def inspect_port(profile: HostProfile) -> list[CheckResult]:
-    """Only of a computer that is to be an edge."""
+    """Check the edge's port, only for an edge profile."""
     return [checks.check_port(_PORT, facts.is_port_free(_PORT))] if profile.role == "edge" else []
 
 
 def inspect_edge(
     profile: HostProfile, address: str | None, keys: Path | None, server_key: str | None
 ) -> list[CheckResult]:
-    """This machine's keys, and the edge by them. Raises UsageError for an address that is none."""
+    """Check this machine's keys, and reach the edge with them. Raises UsageError for a malformed address."""
     if address is not None:
         parse_address(address)
     own_keys, usable_keys = _inspect_keys(keys or default_folder(), server_key, profile.role == "edge")
     if address is None:
         return [own_keys, skipped("edge", "none given: --edge tcp://HOST:PORT")]
     if server_key is not None and usable_keys is None:
-        return [own_keys, skipped("edge", "not without keys that can be used")]
+        return [own_keys, skipped("edge", "needs usable keys")]
     try:
         return [own_keys, probe_edge(address, usable_keys)]
     except ShareError as error:
@@ -119,7 +120,7 @@ def _inspect_keys(
             return _inspect_edge_keys(folder), None
         if server_key is not None:
             pair = agent_keys(folder, server_key)
-            return ok("keys", f"{pair.own.name}, and that of the edge"), pair
+            return ok("keys", f"{pair.own.name}, and the edge's public key"), pair
         if not has_pair(folder):
             return skipped("keys", f"{folder}: none; needed only for an edge on another machine"), None
         return ok("keys", f"{load_pair(folder).name}"), None
@@ -162,19 +163,18 @@ def _governor_fix(required: HostFacts) -> tuple[str, ...]:
 
 
 def _bytes_per_s(sensor: Profile | None) -> float:
-    """Two gray images, uncompressed; nothing where there is no camera."""
+    """Return the data rate of two uncompressed gray images; 0 without a camera."""
     if sensor is None:
         return 0.0
     return 2.0 * sensor.mode.width * sensor.mode.height * sensor.rate_hz
 
 
-# ---- Is an edge there, does it take our keys, does it speak our version, and how far is it?
+def probe_edge(address: str, keys: AgentKeys | None, timeout_s: float = _EDGE_TIMEOUT_S) -> CheckResult:
+    """Check that an edge answers at `address`, accepts `keys` and speaks our version; measure its round trip.
 
-_TIMEOUT_S = 4.0
-
-
-def probe_edge(address: str, keys: AgentKeys | None, timeout_s: float = _TIMEOUT_S) -> CheckResult:
-    """By pings, which an edge answers to strangers: no agent is made. Raises UsageError for an address."""
+    Uses pings, which an edge answers without a hello: no agent is created. Raises UsageError for a malformed
+    address.
+    """
     with closing(connect(address, secrets.randbits(63), keys)) as link:
         try:
             round_trip_s = _measure_round_trip(link, time.monotonic() + timeout_s)
@@ -185,12 +185,12 @@ def probe_edge(address: str, keys: AgentKeys | None, timeout_s: float = _TIMEOUT
         return ok("edge", f"{address}: answers in {round_trip_s * 1e3:.1f} ms")
     if trouble is not None:
         return fail("edge", f"{address}: {trouble}")
-    fix = f"start it there: share edge --bind {address}; is the port open?"
+    fix = f"start it there: share edge --bind {address}, and check that the port is open"
     return fail("edge", f"{address}: no answer within {timeout_s:g} s", fix)
 
 
 def _measure_round_trip(link: AgentLink, deadline_s: float) -> float | None:
-    """Of the quickest answer to several pings, s; None where none came."""
+    """Return the shortest of up to five round trips, s; None without an answer."""
     sent, edge = 0, EdgeVersionProbe()
     edge.mark_reached()
     round_trips_s: list[float] = []
@@ -207,7 +207,7 @@ def _measure_round_trip(link: AgentLink, deadline_s: float) -> float | None:
 
 
 def _decode_reply(frames: Sequence[Bytes], edge: EdgeVersionProbe) -> Message | None:
-    """Raises WireError, which says of an older edge that it is one."""
+    """Return the message. Raises WireError, with a clear line for an edge of another version."""
     try:
         return decode(frames)
     except VersionError as error:

@@ -1,10 +1,10 @@
-"""The edge as a process: one receive loop that never computes and never waits for a disk.
+"""The edge process: one receive loop that never computes and never waits for a disk.
 
-link -> Edge (core) -> mapper's process (share.runtime.mapper_process) -> findings -> Edge -> link
-                    -> keeper's thread (share.runtime.map_writer)   -> what is safe -> acknowledgements
-                    -> scribe's thread (share.runtime.output_writer)   -> events.jsonl, edge.json
-     or by policy `streamed`
-link -> TrackingEdge -> a process each (share.runtime.tracker_processes) -> poses -> TrackingEdge -> link
+link -> Edge (protocol) -> mapper process (share.runtime.mapper_process) -> findings -> Edge -> link
+                        -> map writer thread (share.runtime.map_writer) -> saved changes -> acknowledgements
+                        -> output writer thread (share.runtime.output_writer) -> events.jsonl, edge.json
+     or with policy `streamed`
+link -> TrackingEdge -> a process per agent (share.runtime.tracker_processes) -> poses -> TrackingEdge -> link
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from share.config import Config
 from share.errors import StoreError
 from share.files.line_file import LineFile
 from share.files.writing import atomic_write, check_replaceable, lock_folder
-from share.mapping.map_changes import StoredMap as KeptMap
+from share.mapping.map_changes import StoredMap
 from share.net.transport import EdgeLink
 from share.protocol.edge import Edge
 from share.protocol.edge_events import (
@@ -65,19 +65,19 @@ from share.startup import HeapTrimmer
 from share.store.map_store import MapStore
 
 TICK_MS = 50
-_REPORT_S = 0.1  # so that what is shown of agents is true within a second
-_TROUBLE_SHOWN_S = 10.0  # how long a death is trouble
-MAX_REFUSAL_KINDS = 64  # strangers at the door; more are only counted
-_MAX_MESSAGES_PER_STEP = 64  # messages, before anything else is looked after
-_MAPPER_SILENT_S = 5.0  # of the mapper, which says something every second
-_MAX_SOLVE_S = 15.0  # of one solution
-_STALE_REPORT_S = 1.0  # without a report: what is shown is no longer true
-_DRAIN_S = 0.5  # that the loop waits for the keeper of a life that is over
+_REPORT_S = 0.1  # period of reports
+_TROUBLE_SHOWN_S = 10.0  # how long the death of a process is shown as trouble
+MAX_REFUSAL_KINDS = 64  # kinds of refused handshakes that are logged; more are only counted
+_MAX_MESSAGES_PER_STEP = 64  # received before answers, ticks and reports get their turn
+_MAPPER_SILENT_S = 5.0  # without a report of the mapper, which comes every second, it is stuck
+_MAX_SOLVE_S = 15.0  # for one solution; longer means the solver is stuck
+_STALE_REPORT_S = 1.0  # age from which a report is declared stale
+_DRAIN_S = 0.5  # that the loop waits for the map writer of a session that is over
 
 
 @dataclass(frozen=True)
 class _Notice:
-    """By another thread, for a person."""
+    """A line for the event log, from another thread."""
 
     event: str
     text: str
@@ -91,7 +91,8 @@ class _MapperDied:
 
 
 class EdgeRun:
-    """`run` runs until `stop`. In `out`: events.jsonl as things happen, edge.json at the end."""
+    """One run of the edge, until `stop`. Writes events.jsonl as events happen and edge.json at the end to
+    `out`."""
 
     def __init__(
         self,
@@ -105,7 +106,7 @@ class EdgeRun:
         has_keys = link.agent_names("") is not None
         notify_map = partial(self._log_event, "map")
         self._restarts = MapperRestarts(store, settings.merge.enter_m, notify_map, has_keys)
-        self._restart_due_s: float | None = None  # a life that waits for the disk
+        self._restart_due_s: float | None = None  # when a session that waits for the disk starts
         self._restart_reason = ""
         self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._out = out
@@ -119,26 +120,26 @@ class EdgeRun:
             self._event_log = LineFile(out / "events.jsonl", self._post_write_failure)
             self._output_writer = OutputWriter(out, self._post_write_failure)
         self._stopping = self._closed = False
-        self._incomplete_reason: str | None = None  # the map's file, at the end
+        self._incomplete_reason: str | None = None  # why the map file is incomplete at the end
         self._start_ns = time.monotonic_ns()
-        self._refused_handshakes: Counter[str] = Counter()  # handshakes, by what was said of them
-        self._troubles_until: dict[str, float] = {}  # what to say until when
-        self._agent_troubles_until: dict[str, float] = {}  # the same, where it is one agent's alone
+        self._refused_handshakes: Counter[str] = Counter()  # by refusal line
+        self._troubles_until: dict[str, float] = {}  # text -> monotonic time until which it is shown, s
+        self._agent_troubles_until: dict[str, float] = {}  # the same, for trouble of one agent
         self._report: dict[str, Any] = {}
-        self._report_due_s = self._reported_s = 0.0  # when the next is due, and when there was one last
+        self._report_due_s = self._reported_s = 0.0  # next and last report, monotonic s
         self._heap = HeapTrimmer()
         self._totals = SessionTotals()
         self._guard = FaultGuard(lambda text: self._log_event("internal error", text))
         self._start_session(self._load_stored_map())
 
     def stop(self) -> None:
-        """From any thread or a signal handler."""
+        """End the run. Safe from any thread and from a signal handler."""
         self._stopping = True
         self._link.wake()
 
     def run(self) -> dict[str, Any]:
-        """The report, once stopped. Raises ShareError if it could not be written, or not all events, or not
-        all of the map."""
+        """Run until `stop` and return the report. Raises ShareError if the report, the events or the map
+        could not be written completely."""
         try:
             while not self._stopping:
                 self._step()
@@ -152,8 +153,7 @@ class EdgeRun:
         return self._report
 
     def close(self) -> None:
-        """Ends the processes and threads it has started, also where it never came to `run`. May be
-        repeated."""
+        """End all child processes and threads, also if `run` was never called. May be repeated."""
         self._stopping = True
         if self._closed:
             return
@@ -164,26 +164,27 @@ class EdgeRun:
         self._trackers.close()
         if self._map_writer is not None:
             self._incomplete_reason = self._map_writer.close()
-            self._handle_answers()  # what is safe by now is acknowledged
+            self._handle_answers()  # acknowledges what has been saved
             if self._incomplete_reason is not None:
                 self._log_event("map", self._incomplete_reason)
         self._link.close()
 
     def report(self) -> dict[str, Any]:
-        """As edge.json, 0.1 s old, and `trouble`: what is wrong now. From any thread."""
+        """Return the contents of edge.json, at most 0.1 s old, with current problems as `trouble`. Safe from
+        any thread."""
         report, late_s = self._report, time.monotonic() - self._reported_s - _REPORT_S
         if not report or late_s < _STALE_REPORT_S:
             return report
-        stuck = f"the edge has been stuck for {late_s:.0f} s; what is shown of agents is as old as that"
+        stuck = f"the edge has been stuck for {late_s:.0f} s; all values shown are that old"
         return {**report, "trouble": [stuck, *report["trouble"]]}
 
     def _try_to_report(self) -> None:
-        """A fault of ours costs this report, which is then shown to be old."""
+        """Update the report. A failure costs this report, and `report` shows it as stale."""
         with self._guard.step("a report"):
             self._update_report()
 
     def _update_report(self) -> None:
-        """A report, and when the next is due."""
+        """Make a report and set when the next is due."""
         now = time.monotonic()
         self._report_due_s = now + _REPORT_S
         self._heap.trim_if_due(now)
@@ -207,32 +208,33 @@ class EdgeRun:
         self._reported_s = now
 
     def _find_stall(self, now: float) -> str | None:
-        """Which process does not go on though it is alive, if one does not."""
+        """Return which live process makes no progress, None if all do."""
         if self._mapper_process is None or self._mapper_report_s is None:
             return None
         if (silent_s := now - self._mapper_report_s) > _MAPPER_SILENT_S:
             return f"the mapper has not answered for {silent_s:.0f} s: no corrections meanwhile"
         if (solving_s := self._solving_s + silent_s) > _MAX_SOLVE_S:
-            return f"the solver has been at one solution for {solving_s:.0f} s: no corrections meanwhile"
+            return f"the solver has worked on one solution for {solving_s:.0f} s: no corrections meanwhile"
         return None
 
-    def _load_stored_map(self) -> tuple[KeptMap | None, list[RestoredRun]]:
-        """What a new life begins with. Raises StoreError if the map's file cannot be read."""
-        return (
-            (None, []) if POLICIES[self._settings.edge.policy].streams_frames else self._restarts.load_map()
-        )
+    def _load_stored_map(self) -> tuple[StoredMap | None, list[RestoredRun]]:
+        """Return the map and the agents' runs to start with. Raises StoreError if the map file is
+        unreadable."""
+        if POLICIES[self._settings.edge.policy].streams_frames:
+            return None, []
+        return self._restarts.load_map()
 
     def _start_session(
-        self, loaded: tuple[KeptMap | None, list[RestoredRun]], start_delay_s: float = 0.0
+        self, loaded: tuple[StoredMap | None, list[RestoredRun]], start_delay_s: float = 0.0
     ) -> None:
-        """A new life: agents notice by its number, and send again what it lacks.
+        """Start a new session: agents see its new number and resend what the map lacks.
 
-        after_s: its mapper begins then.
+        start_delay_s: delay of the mapper's start.
         """
         self._mapper_report: dict[str, Any] = {}
         self._solved_s: float | None = None
-        self._mapper_report_s: float | None = None  # when the mapper last said something
-        self._solving_s = 0.0  # at that time
+        self._mapper_report_s: float | None = None  # time of the mapper's last report
+        self._solving_s = 0.0  # duration of the current solve at that time
         self._mapper_process: WorkerProcess | None = None
         self._map_writer: MapWriter | None = None
         self._trackers = TrackerProcesses(self._settings, self._post)
@@ -245,7 +247,7 @@ class EdgeRun:
             self._start_mapping(*loaded, start_delay_s)
 
     def _start_mapping(
-        self, stored_map: KeptMap | None, known: list[RestoredRun], start_delay_s: float
+        self, stored_map: StoredMap | None, known: list[RestoredRun], start_delay_s: float
     ) -> None:
         store, writable = self._restarts.store, self._restarts.writable
         self._state_machine = Edge(self._settings, secrets.randbits(63), writable, known, self._start_ns)
@@ -321,18 +323,16 @@ class EdgeRun:
                     self._restart_mapping(f"its process {mapper.reason}")
 
     def _restart_mapping(self, reason: str) -> None:
-        """The mapper has died: as if the whole edge had been restarted, to its agents too."""
+        """Start a new session after the mapper died; to the agents this looks like a restart of the edge."""
         pause_s = self._restarts.record_death()
-        text = (
-            f"{reason}; a new one begins in {pause_s:g} s; agents are asked for what is not in the map's file"
-        )
+        text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
         self._log_event("mapper lost", text)
         self._troubles_until[f"the mapper: {text}"] = time.monotonic() + pause_s + _TROUBLE_SHOWN_S
         if self._mapper_process is not None:
             self._mapper_process.close()
         try:
             if self._map_writer is not None and not self._map_writer.drain(_DRAIN_S):
-                raise StoreError("the map's disk does not answer")
+                raise StoreError("the disk of the map file does not answer")
             self._discard_answers()
             loaded = self._load_stored_map()
             self._totals.add_session(
@@ -340,12 +340,12 @@ class EdgeRun:
             )
             self._start_session(loaded, pause_s)
             self._restart_due_s = None
-        except StoreError as error:  # nothing is taken in or acknowledged until it can be read
-            self._log_event("map", f"{error}; tried again in {pause_s:g} s")
+        except StoreError as error:  # until it can be read, nothing is applied or acknowledged
+            self._log_event("map", f"{error}; retried in {pause_s:g} s")
             self._restart_due_s, self._restart_reason = time.monotonic() + pause_s, str(error)
 
     def _discard_answers(self) -> None:
-        """Those of the mapper and keeper of a life that is over are no answers to the next."""
+        """Drop answers to a session that is over; log only its notices."""
         while not self._inbox.empty():
             match self._inbox.get():
                 case _Notice() as notice:
@@ -382,7 +382,7 @@ class EdgeRun:
     def _post_mapper_died(self, reason: str) -> None:
         self._post(_MapperDied(reason))
 
-    # ------------------------------------------------------------------ what is said
+    # ------------------------------------------------------------------ log and report
 
     def _record(self, fields: dict[str, Any]) -> None:
         if self._event_log is not None and self._output_writer is not None:
@@ -394,15 +394,15 @@ class EdgeRun:
         self._record({"t_s": t_s, "event": event, "agent": None, "reason": reason})
 
     def _post_write_failure(self, text: str) -> None:
-        """From any thread."""
+        """Log that the disk does not take a file. Safe from any thread."""
         self._inbox.put(_Notice("not written", text))
 
     def _count_refusal(self, line: str) -> None:
-        """Counts a handshake that was refused; says each kind once, for a bounded number of kinds."""
+        """Count a refused handshake; log each kind once, up to MAX_REFUSAL_KINDS."""
         line = (
             line
             if line in self._refused_handshakes or len(self._refused_handshakes) < MAX_REFUSAL_KINDS
-            else "and others"
+            else "further kinds of refusal, which are only counted"
         )
         self._refused_handshakes[line] += 1
         if self._refused_handshakes[line] == 1:
@@ -410,5 +410,5 @@ class EdgeRun:
 
 
 def _solve_count(report: Mapping[str, Any]) -> int:
-    """How often poses were solved for, by the mapper's report."""
+    """Return the number of solves in a mapper's report."""
     return int(report.get("solve_ms", {}).get("n", 0))

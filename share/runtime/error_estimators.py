@@ -1,4 +1,4 @@
-"""How wrong its tracker is, as an agent tells the edge: by the truth, by the error model, or not at all."""
+"""Estimators of an agent's tracking error: from ground truth, by the error model, or none."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ from share.odometry.track_result import TrackResult
 from share.timing import RingBuffer
 from share.types import U8, FeatureStatistics, Frame, KeyframeCandidate
 
-_MAX_TIMINGS = 50_000  # estimates that a report is about, the newest: hours, at two keyframes a second
+_MAX_TIMINGS = 50_000  # newest estimates that a report covers: hours at two keyframes a second
 
 
 class KeyframeTracker(Protocol):
-    """What of either tracker is asked here."""
+    """The part of a tracker that an error estimator uses."""
 
     def feature_statistics(self) -> FeatureStatistics: ...
     def make_keyframe(self, frame: Frame) -> KeyframeCandidate: ...
 
 
 class ErrorEstimator(Protocol):
-    """Of one agent."""
+    """Estimates the tracking error of one agent."""
 
     def update(self, frame: Frame, result: TrackResult) -> float | None:
-        """cm, after another frame; None where it is not known."""
+        """Add a tracked frame. Return the error, cm; None if unknown."""
 
     def make_keyframe(self, frame: Frame, tracker: KeyframeTracker) -> KeyframeCandidate:
-        """Has `tracker` make the frame just tracked a keyframe, and looks at what it has to know of it."""
+        """Have `tracker` make the frame just tracked a keyframe, and use it as input for the next
+        estimate."""
 
     def close(self) -> None: ...
 
@@ -46,7 +47,7 @@ class ErrorEstimator(Protocol):
 
 
 def frame_outcome(frame: Frame, result: TrackResult) -> FrameOutcome:
-    """What of a frame and its result is remembered."""
+    """Return the part of a frame and its result that the error model's history keeps."""
     has_imu = len(frame.imu) > 0
     return FrameOutcome(
         frame.stamp_ns, has_imu, result.state, result.found_count, result.inlier_count, result.median_nis
@@ -54,7 +55,7 @@ def frame_outcome(frame: Frame, result: TrackResult) -> FrameOutcome:
 
 
 class NoErrorEstimate:
-    """Nobody tells."""
+    """Gives no estimate."""
 
     def update(self, frame: Frame, result: TrackResult) -> float | None:
         return None
@@ -70,7 +71,7 @@ class NoErrorEstimate:
 
 
 class GroundTruthError(NoErrorEstimate):
-    """An oracle, for experiments."""
+    """The true error, from a recording's ground truth; for experiments."""
 
     def __init__(self, error: LocalError) -> None:
         self._error = error
@@ -87,8 +88,10 @@ class _EstimateJob:
 
 
 class SynchronousErrorModel(NoErrorEstimate):
-    """The error model, where time is drawn (`share.lab.evaluate.virtual_time`): it has answered when
-    `keyframe` returns. What it said last holds until it says something else."""
+    """The error model, run within `make_keyframe`; used in virtual time (`share.lab.evaluate.virtual_time`).
+
+    An estimate holds until the next one.
+    """
 
     def __init__(self, network: OnnxSession) -> None:
         self._network, self._odometer = network, MotionHistory()
@@ -117,8 +120,8 @@ class SynchronousErrorModel(NoErrorEstimate):
 
 
 class BackgroundErrorModel(SynchronousErrorModel):
-    """The error model, in a thread of its own. A keyframe that comes while it is busy waits; one more, and
-    the older is left out (policy drop_estimate)."""
+    """The error model in a thread. While it is busy, only the newest keyframe waits (policy
+    drop_estimate)."""
 
     def __init__(self, network: OnnxSession, notify: Callable[[str], None]) -> None:
         super().__init__(network)
@@ -153,9 +156,9 @@ class BackgroundErrorModel(SynchronousErrorModel):
             start_s = time.thread_time()
             try:
                 latest = self._estimate(job)
-            except Exception as error:  # a network is a file from somewhere; odometry goes on without it
+            except Exception as error:  # the network is a user's file; odometry goes on without it
                 self._latest = None
-                self._notify(f"the error model has failed and is left alone: {error}")
+                self._notify(f"the error model failed and is switched off: {error}")
                 return
             self._latest = latest
             self._unfamiliar += latest.out_of_distribution

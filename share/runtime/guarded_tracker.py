@@ -1,4 +1,4 @@
-"""A tracker whose failures cost the frame that they come in, and not the process."""
+"""A tracker in which a failure costs one frame, not the process."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from share.odometry.track_result import TrackResult
 from share.runtime.pipeline import make_tracker
 from share.types import FeatureStatistics, Frame, KeyframeCandidate, TrackState
 
-# ---- A step that fails costs what it was about, and not the process.
+_MAX_FAILURE_KINDS = 16  # that are reported; more are only counted
 
-_MAX_FAILURE_KINDS = 16  # kinds of failure
+T = TypeVar("T")
 
 
 class FaultGuard:
-    """Counts steps that failed, and says each kind once, with the place in the program."""
+    """Counts failed steps and reports each kind once, with its place in the code."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self.failure_count = 0
@@ -30,7 +30,10 @@ class FaultGuard:
 
     @contextmanager
     def step(self, what: str) -> Iterator[None]:
-        """Within it any error but a ShareError, which ends a run by intent, costs only this step."""
+        """Suppress and record any error in the block but a ShareError, which ends a run on purpose.
+
+        what: the step, for the report.
+        """
         try:
             yield
         except ShareError:
@@ -48,24 +51,21 @@ class FaultGuard:
         if kind not in self._reported and len(self._reported) < _MAX_FAILURE_KINDS:
             self._reported.add(kind)
             text = "".join(c if c.isprintable() else "?" for c in str(error))[:200]
-            self._notify(f"{kind}: {text}; it is left out and the run goes on")
-
-
-T = TypeVar("T")
+            self._notify(f"{kind}: {text}; this step is skipped and the run goes on")
 
 
 class GuardedTracker:
-    """The estimator that fits a rig, see `InertialTracker`. What fails in it, a matrix that has no inverse or
-    a library that refuses its numbers, is counted and said by `guard`. The frame is LOST, and the next one
-    looks for itself among the places that the tracker knows; if that fails too, a new one begins."""
+    """The tracker that fits a rig, see `make_tracker`. `guard` records what fails in it, such as a singular
+    matrix. The frame is then LOST, and the next one relocalises by the tracker's keyframes; if that fails
+    too, a new tracker is made."""
 
     def __init__(self, rig: Rig, config: Config, guard: FaultGuard, bias: ImuBias | None = None) -> None:
-        """bias: of the rig's IMU, where that is known."""
+        """bias: initial bias of the IMU, None if unknown."""
         self._make_tracker = partial(make_tracker, rig, config, bias)
         self._tracker, self._guard = self._make_tracker(), guard
-        self.bias: ImuBias | None = None  # as was learnt by the last keyframe by which any was
-        self._had_pose = False  # since it failed last
-        self._rejected_before = 0  # by trackers before this one
+        self.bias: ImuBias | None = None  # newest estimate at a keyframe
+        self._had_pose = False  # since the last failure
+        self._rejected_before = 0  # IMU samples, by earlier trackers
 
     def track(self, frame: Frame) -> TrackResult:
         result = self.attempt("tracking a frame", frame, lambda: self._tracker.track(frame))
@@ -75,7 +75,7 @@ class GuardedTracker:
         return result
 
     def attempt(self, what: str, frame: Frame, step: Callable[[], T]) -> T | None:
-        """Of `frame`, the last; None where it fails. An error that is for a person goes on."""
+        """Return `step()`, a step of the newest `frame`; None if it fails. Raises ShareError only."""
         try:
             return step()
         except ShareError:
@@ -86,14 +86,14 @@ class GuardedTracker:
             return None
 
     def finish(self, frame: Frame, is_keyframe: bool) -> None:
-        """What is left to do for the frame just tracked, where nobody else is to have what it shows.
-        keyframe: whether it is one."""
+        """Finish the frame just tracked where its keyframe data are not sent. is_keyframe: make it a
+        keyframe."""
         if is_keyframe:
             self.attempt("making a keyframe", frame, partial(self.make_keyframe, frame))
-        self.attempt("settling a frame", frame, self._tracker.finish_keyframe)
+        self.attempt("finishing a keyframe", frame, self._tracker.finish_keyframe)
 
     def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
-        """Within `attempt`; so `finish_keyframe` and `feature_statistics`."""
+        """Call within `attempt`, like `finish_keyframe` and `feature_statistics`."""
         candidate = self._tracker.make_keyframe(frame)
         self.bias = self._tracker.bias or self.bias
         return candidate
@@ -106,7 +106,7 @@ class GuardedTracker:
 
     @property
     def rejected_imu_samples(self) -> int:
-        """How many IMU samples were not believed, since the beginning."""
+        """Number of IMU samples rejected as outliers, over all trackers."""
         return self._rejected_before + self._tracker.rejected_imu_samples
 
     def _recover(self, frame: Frame) -> None:
@@ -116,6 +116,6 @@ class GuardedTracker:
                 self._tracker.reset_after_failure(frame)
                 return
         except Exception as error:
-            self._guard.record("looking for itself again", error)
+            self._guard.record("resetting the tracker", error)
         self._rejected_before += self._tracker.rejected_imu_samples
         self._tracker = self._make_tracker()

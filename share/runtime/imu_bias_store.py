@@ -1,6 +1,6 @@
-"""What a live camera's IMU was like in the run before: read at the start, written at the end.
+"""The IMU bias of a live camera, kept from run to run: read at the start, written at the end.
 
-Only a camera is remembered: a recording gives the same poses whatever was run before it.
+Recordings have none: their poses must not depend on earlier runs.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from share.sensors.imu_memory import SavedBias, propagate_bias
 
 
 class ImuBiasStore:
-    """bias: to begin with; None: nothing is known. What cannot be read or written costs one line."""
+    """Loads and saves the bias. `bias` is the initial one, None if unknown. A file error costs one log
+    line."""
 
     def __init__(
         self,
@@ -37,16 +38,16 @@ class ImuBiasStore:
             self._load(self._serial, source, config)
 
     def save(self, bias: ImuBias | None) -> None:
-        """For the next run, at the end of this one; None: it has learnt nothing, and what was known stays."""
+        """Save the bias at the end of a run; None keeps the saved one."""
         if self._serial is None or bias is None:
             return
         try:
             imu_memory.save_bias(self._serial, SavedBias(self._now_ns(), bias))
         except ShareError as error:
-            self._notify(f"the IMU's bias is not remembered: {error}")
+            self._notify(f"the IMU bias is not saved: {error}")
 
     def report(self) -> dict[str, Any]:
-        """Of a live camera with an IMU: the end of the run that its bias is known from, or none."""
+        """Return, for a live camera with an IMU, the end of the run that saved the loaded bias, or None."""
         return {} if self._serial is None else {"imu_bias": {"from": _utc(self._saved_ns)}}
 
     def _load(self, serial: str, source: Source, config: InertialConfig) -> None:
@@ -54,14 +55,14 @@ class ImuBiasStore:
         try:
             saved = imu_memory.load_bias(serial)
         except ShareError as error:
-            self._notify(f"the IMU's bias is taken as unknown: {error}")
+            self._notify(f"the IMU bias is taken as unknown: {error}")
             return
         if saved is None:
             return
         age_s = (self._now_ns() - saved.run_end_ns) * 1e-9
         if age_s < 0:
             self._notify(
-                "the IMU's bias is taken as unknown: it is from later than this machine's clock says"
+                "the IMU bias is taken as unknown: its file is from the future by this machine's clock"
             )
             return
         self.bias = propagate_bias(saved.bias, source.rig.imu, age_s, config)

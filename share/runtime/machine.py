@@ -1,4 +1,4 @@
-"""On which machine, and with which libraries, something was measured."""
+"""Facts of this machine and this code, to record beside measurements: CPU, libraries, memory, code digest."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from typing import Any
 import share
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "pyzmq", "scipy")
+_DIGEST_DIGITS = 10
 
 
 def describe_machine() -> dict[str, Any]:
-    """Plain data. load: how many processes wanted a core over the last minute."""
+    """Return plain data. load: mean number of runnable processes over the last minute."""
     return {
         "cpu": _cpu_name() or platform.processor() or platform.machine(),
         "cores": core_count(),
@@ -29,20 +30,20 @@ def describe_machine() -> dict[str, Any]:
 
 
 def core_count() -> int:
-    """That this process may run on."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 def _cpu_name() -> str | None:
-    """Its name, as Linux gives it."""
+    """Return the CPU's model name from /proc/cpuinfo, None if absent."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), None)
 
 
 def free_memory_bytes(proc: Path = Path("/proc"), cgroups: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Memory that this process may still take: what the machine has available, or less where a control group
-    (a container, a systemd unit) has a limit. None where the system does not say."""
+    """Return the memory that this process may still take: the machine's available memory, or less where a
+    control group (container, systemd unit) has a limit. None if unknown."""
     candidates = [
         free
         for free in (_available_bytes(proc / "meminfo"), *_free_in_cgroups(proc, cgroups))
@@ -58,7 +59,7 @@ def _available_bytes(meminfo: Path) -> int | None:
 
 
 def _free_in_cgroups(proc: Path, cgroups: Path) -> list[int]:
-    """Of this process's control group and all that it lies in, of those with a limit."""
+    """Return the free bytes of this process's control group and its ancestors, of those with a limit."""
     cgroup_file = proc / "self" / "cgroup"
     lines = cgroup_file.read_text().splitlines() if cgroup_file.exists() else []
     out = []
@@ -82,7 +83,7 @@ def _free_in_cgroups(proc: Path, cgroups: Path) -> list[int]:
 
 
 def _read_int(file: Path) -> int | None:
-    """None for "max", or where there is no such file."""
+    """Return the number in `file`; None for "max" or a missing file."""
     try:
         text = file.read_text().strip()
     except OSError:
@@ -90,14 +91,10 @@ def _read_int(file: Path) -> int | None:
     return int(text) if text.isdecimal() else None
 
 
-# ---- Which state of SHARE's code made something: a version number stays while code changes.
-
-_DIGEST_DIGITS = 10
-
-
 @cache
 def code_digest() -> str:
-    """Hexadecimal digits that differ where any of SHARE's sources do; of a frozen program, where it does."""
+    """Return a hexadecimal digest of SHARE's sources, or of the frozen program: the version number does not
+    change with each change of the code."""
     frozen = getattr(sys, "frozen", False)
     folder = Path(share.__file__).parent
     files = [Path(sys.executable)] if frozen else sorted(folder.rglob("*.py"))

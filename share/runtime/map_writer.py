@@ -1,4 +1,4 @@
-"""The thread that writes the map to its file: the edge goes on while the disk works, or does not."""
+"""The thread that writes the map file, so that the edge never waits for the disk."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from share.mapping.map_changes import SavePoses
 from share.protocol.edge_events import ChangesSaved, SaveChanges
 from share.store.map_store import MapStore
 
-_RETRY_S = 1.0  # after a write that failed
-_SLOW_WRITE_S = 5.0  # for one write: from then on it is said
-_MAX_PER_COMMIT = 64  # in one commit
-_TIMEOUT_S = 5.0  # for what is left at the end
+_RETRY_S = 1.0  # after a failed write
+_SLOW_WRITE_S = 5.0  # duration of one write from which it is reported as trouble
+_MAX_PER_COMMIT = 64  # requests
+_TIMEOUT_S = 5.0  # for the remaining writes at the end
 _NOT_ACKNOWLEDGED = "keyframes are not acknowledged"
-_NOT_IN_FILE = "are not in the map's file"
+_NOT_IN_FILE = "are not in the map file"
 
 
 class MapWriter:
-    """`keep` what is to be safe; `on_saved` is told once it is, `notify` what goes wrong, from the thread.
+    """Writes submitted changes in order. Calls `on_saved` once they are in the file and `notify` on errors,
+    both from the thread.
 
-    Only what is in the file is `ChangesSaved`. While it cannot be written, that is said, changes are held in
-    memory
-    and tried again. They are few: an agent sends no more than its window without an acknowledgement, the edge
-    takes in a bounded number (`share.protocol.edge`), loops come of keyframes alone, and of solutions only
-    the newest is held."""
+    While the file cannot be written, changes are held in memory and retried. Their number is bounded: an
+    agent sends at most its window without an acknowledgement, the edge accepts a bounded number
+    (`share.protocol.edge`), loops arise from keyframes only, and of solutions only the newest is held.
+    """
 
     def __init__(
         self, store: MapStore, on_saved: Callable[[ChangesSaved], None], notify: Callable[[str], None]
@@ -39,31 +39,31 @@ class MapWriter:
         self._pending: deque[SaveChanges] = deque()
         self._failure: str | None = None
         self._writing_since: float | None = None
-        self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="map writer", daemon=True)
         self._thread.start()
 
     @property
     def trouble(self) -> str | None:
-        """Why nothing is kept at the moment, if so. From any thread."""
+        """Why changes cannot be saved now, None if they can. Safe from any thread."""
         if self._failure is not None:
             return f"{self._failure}; {_NOT_ACKNOWLEDGED}"
         since = self._writing_since
         took_s = 0.0 if since is None else time.monotonic() - since
         if took_s < _SLOW_WRITE_S:
             return None
-        return f"the map's disk has been writing for {took_s:.0f} s; {_NOT_ACKNOWLEDGED}"
+        return f"a write to the map file has taken {took_s:.0f} s so far; {_NOT_ACKNOWLEDGED}"
 
     @property
     def pending_changes(self) -> int:
-        """Changes that wait because the file cannot be written."""
+        """Number of changes that are not in the file yet."""
         return sum(len(keep.changes) for keep in tuple(self._pending))
 
     def submit(self, request: SaveChanges) -> None:
         self._incoming.put(request)
 
     def drain(self, timeout_s: float) -> bool:
-        """Writes what is left, tries once more what could not be written, says what is not kept, and ends.
-        False: the disk has not answered for so long. May be repeated."""
+        """Write the remaining changes, retry failed ones once, report unsaved ones, and end the thread.
+        Return False if that takes longer than `timeout_s`. May be repeated."""
         self._incoming.put(None)
         self._thread.join(timeout_s)
         if self._thread.is_alive():
@@ -73,16 +73,13 @@ class MapWriter:
         return True
 
     def close(self) -> str | None:
-        """The same, and closes the file. What is wrong if not all is in it, or nobody knows."""
+        """Drain and close the file. Return why the file is or may be incomplete, None if it is complete."""
         if not self.drain(_TIMEOUT_S):
             self._store.abandon()
-            return "the map's disk does not answer: what was not acknowledged may not be in its file"
+            return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
         self._store.close()
-        return (
-            f"{self._failure}: {self.pending_changes} changes {_NOT_IN_FILE}"
-            if self.pending_changes
-            else None
-        )
+        unsaved = self.pending_changes
+        return f"{self._failure}: {unsaved} changes {_NOT_IN_FILE}" if unsaved else None
 
     def _run(self) -> None:
         ended = False
@@ -92,7 +89,7 @@ class MapWriter:
                 pass
 
     def _collect(self) -> bool:
-        """What has come, into `_pending`; waits for it, or until it is time to try again. Whether all has."""
+        """Move new requests to `_pending`; wait for one, or until a retry is due. Return True at the end."""
         failing, until = self._failure is not None, time.monotonic() + _RETRY_S
         while True:
             wait = failing or not self._pending
@@ -105,7 +102,7 @@ class MapWriter:
             self._pending.append(request)
 
     def _write(self, max_requests: int = _MAX_PER_COMMIT) -> bool:
-        """A batch; whether it is done with now."""
+        """Write the next batch. Return False if the file cannot be written."""
         if self._failure is not None:
             self._pending = newest_poses_only(self._pending)
         batch = [self._pending[i] for i in range(min(max_requests, len(self._pending)))]
@@ -115,28 +112,28 @@ class MapWriter:
         except StoreError as error:
             self._notify_failure(str(error))
             return False
-        except Exception as error:  # not the disk's fault but a change's: it alone is left out
+        except Exception as error:  # a change is faulty, not the disk: skip only that change
             if len(batch) > 1:
                 return self._write(max_requests=1)
-            self._notify(f"a change cannot be kept and is left out: {type(error).__name__}: {error}")
+            self._notify(f"a change cannot be saved and is skipped: {type(error).__name__}: {error}")
         finally:
             self._writing_since = None
         for _ in batch:
             self._pending.popleft()
         if self._failure is not None:
             self._failure = None
-            self._notify("the map is kept again")
+            self._notify("the map is saved again")
         self._on_saved(ChangesSaved(batch[-1].ticket))
         return True
 
     def _notify_failure(self, reason: str) -> None:
         if self._failure != reason:
             self._failure = reason
-            self._notify(f"{reason}; {_NOT_ACKNOWLEDGED} until it can")
+            self._notify(f"{reason}; {_NOT_ACKNOWLEDGED} until a write succeeds")
 
 
 def newest_poses_only(pending: deque[SaveChanges]) -> deque[SaveChanges]:
-    """The same changes but for solutions that a later one takes the place of. Tickets stay."""
+    """Return the requests without solutions that a later one replaces. Tickets stay."""
     out: deque[SaveChanges] = deque()
     has_poses = False
     for request in reversed(pending):

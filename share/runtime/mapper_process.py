@@ -1,4 +1,4 @@
-"""The mapper's process: it looks keyframes up itself, and has a process of its own for the pose graph."""
+"""The mapper's process: adds keyframes and looks them up; a child process solves the pose graph."""
 
 from __future__ import annotations
 
@@ -22,21 +22,20 @@ from share.timing import Backoff
 
 T = TypeVar("T")
 
-_REPORT_S = 1.0
-_SAVE_POSES_S = 5.0  # between two keepings of where everything lies
+_REPORT_S = 1.0  # period of reports
+_SAVE_POSES_S = 5.0  # period of saving all poses
 
 
 @dataclass(frozen=True, eq=False)
 class RestoreMap:
-    """To the mapper, before anything else: what an earlier life of the edge knew."""
+    """First message to the mapper: the map of an earlier session."""
 
     stored_map: StoredMap
 
 
 @dataclass(frozen=True)
 class MapperReport:
-    """The mapper's report, every second, and at the end. solving_s: for how long the solver has been at what
-    it does now."""
+    """The mapper's report, every second and at the end. solving_s: duration of the current solve so far."""
 
     report: dict[str, Any]
     solving_s: float = 0.0
@@ -44,33 +43,32 @@ class MapperReport:
 
 @dataclass(frozen=True)
 class MapRestored:
-    """Everything of `RestoreMap` has been taken in: it was not what is in the file that a later death is
-    of."""
+    """All of `RestoreMap` is restored: a later death is not caused by the file's contents."""
 
 
 @dataclass(frozen=True)
 class SolverDied:
-    """For a person: how it ended, and when the next begins."""
+    """The solver's process has died. text: how, and when it restarts, for the event log."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class _SolverProcessDied:
-    """The solver's process has died."""
+    """To the mapper's own inbox: the solver's process has died."""
 
     reason: str
 
 
 @dataclass(frozen=True, eq=False)
 class _SolveResult:
-    result: object
+    result: object  # of the step, or the exception that it raised
     ms: float
 
 
 def run_mapper(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-    """For a `WorkerProcess`: takes Restore, Join, Speaks, Present, Add and Forget, until END; answers Found,
-    Mapped, Restored and SolverLost."""
+    """Work of a `WorkerProcess`: takes RestoreMap, AddRun, SetCredential, SetPresence, AddKeyframe and
+    DropRun until END; answers MapperResult, MapperReport, MapRestored and SolverDied."""
     _MapperProcess(inbox, answer, settings).run()
 
 
@@ -93,7 +91,7 @@ class _MapperProcess:
     def run(self) -> None:
         try:
             self._loop()
-        finally:  # whatever ended us: a process does not end while one of its own goes on
+        finally:  # a process does not end while a child of it runs
             self._solver.close()
         self._answer(
             MapperResult(tuple(self._findings), (*self._mapper.take_changes(), self._mapper.current_poses()))
@@ -109,14 +107,14 @@ class _MapperProcess:
             self._send_to_solver()
             self._publish()
             step = self._guarded("place", self._mapper.next_lookup, None)
-            if self._is_restoring:  # the views have been gone through by now
+            if self._is_restoring:  # the mapper has read all restored views by now
                 self._is_restoring = False
                 self._answer(MapRestored())
             if step is not None:
                 self._findings += self._mapper.finish_step(step, *_run_timed(step.run))
 
     def _receive(self, wait: bool) -> Iterator[Any]:
-        """What is in the inbox; if `wait`, at least one message, unless none comes for a while."""
+        """Yield all messages in the inbox; if `wait`, wait up to _REPORT_S for the first."""
         try:
             yield self._inbox.get(wait, _REPORT_S if wait else None)
             while True:
@@ -147,7 +145,7 @@ class _MapperProcess:
                 self._is_ended = True
 
     def _add_keyframes(self) -> None:
-        """Keyframes that wait; at the end all of them."""
+        """Add waiting keyframes as far as the queue's time budget allows; at the end all of them."""
         start_s = time.perf_counter()
         while True:
             spent_ms = 0.0 if self._is_ended else 1e3 * (time.perf_counter() - start_s)
@@ -157,7 +155,8 @@ class _MapperProcess:
             self._findings += self._guarded("keyframe", work, [], add.key)
 
     def _guarded(self, step: str, work: Callable[[], T], default: T, agent: str | None = None) -> T:
-        """A fault of ours costs this message or step, never the process: the map file would bring it back."""
+        """Return `work()`, or `default` if it fails. A failure must not end the process: the map file would
+        bring it back at each restart."""
         try:
             return work()
         except Exception as error:
@@ -183,14 +182,14 @@ class _MapperProcess:
         )
 
     def _post_solver_died(self, reason: str) -> None:
-        """From another thread."""
+        """Called from another thread."""
         self._inbox.put(_SolverProcessDied(reason))
 
     def _restart_solver(self, reason: str) -> None:
-        """It costs the solution that it was at, and telling it all again."""
+        """Start a new solver; the current solution is lost and the whole graph is sent again."""
         self._solver.close()
         pause_s = self._backoff.record_failure(time.monotonic_ns())
-        self._answer(SolverDied(f"its process {reason}; a new one begins in {pause_s:g} s"))
+        self._answer(SolverDied(f"its process {reason}; restarted in {pause_s:g} s"))
         self._solver = self._new_solver(pause_s)
         self._mapper.reset_solver()
         self._finish_solve(RuntimeError(f"the solver {reason}"), 0.0)
@@ -212,7 +211,7 @@ class _MapperProcess:
 
 
 def run_solver(inbox: Inbox, answer: Callable[[Any], None], settings: GraphConfig) -> None:
-    """For a `WorkerProcess`: takes Solve, answers with what came of it, until END."""
+    """Work of a `WorkerProcess`: takes a SolveStep, answers its _SolveResult, until END."""
     solver, heap = PoseGraphSolver(settings), HeapTrimmer()
     while (step := inbox.get()) is not END:
         answer(_SolveResult(*_run_timed(partial(step.run, solver))))
@@ -224,6 +223,6 @@ def _run_timed(work: Callable[[], object]) -> tuple[object, float]:
     result: object
     try:
         result = work()
-    except Exception as error:  # a step that fails costs its keyframe, never the edge
+    except Exception as error:  # a failed step costs its keyframe, not the edge
         result = error
     return result, 1e3 * (time.perf_counter() - start_s)

@@ -1,4 +1,4 @@
-"""What becomes of a mapper that has died: when the next one begins, and with which map."""
+"""Restarts of a mapper that has died: when the next one starts, and with which map."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from share.protocol.peer import RestoredRun, restored_runs
 from share.store.map_store import MapStore
 from share.timing import Backoff
 
-_MAX_TRIES = 3  # mappers that may die of one map, before it is set aside
+_MAX_TRIES = 3  # mappers that may die while restoring one map, before it is set aside
 
 
 class MapperRestarts:
-    """Of the mapper of one edge. `notify` is told what happens to the map file.
+    """Restarts of one edge's mapper. `notify` reports what happens to the map file.
 
-    A map that the edge cannot make anything of, or that has ended `_MAX_TRIES` mappers while they took it
-    in, is set aside under another name, never deleted; the edge goes on with a fresh one.
+    A map that cannot be interpreted, or that `_MAX_TRIES` mappers died of while restoring it, is renamed,
+    never deleted; the edge goes on with an empty one.
     """
 
     def __init__(
         self, store: MapStore | None, known_m: float, notify: Callable[[str], None], has_keys: bool = False
     ) -> None:
-        """known_m: as `share.protocol.peer.known_runs`. has_keys: whether agents of this edge have keys."""
-        self.store = store  # None also once a map that may not be written is no longer used
+        """known_m: see `share.protocol.peer.restored_runs`. has_keys: agents of this edge have keys."""
+        self.store = store  # None also once a read-only map is no longer used
         self._known_m, self._notify, self._has_keys = known_m, notify, has_keys
         self._backoff = Backoff(time.monotonic_ns())
         self._is_restoring = False
@@ -36,19 +36,20 @@ class MapperRestarts:
         return self.store is not None and self.store.writable
 
     def record_restored(self) -> None:
-        """The mapper has taken the map in."""
+        """Record that the mapper has restored the map."""
         self._is_restoring, self._tries = False, 0
 
     def record_death(self) -> float:
-        """Seconds until the next may begin."""
+        """Record that the mapper died. Return the seconds until the next may start."""
         self._tries += self._is_restoring
         return self._backoff.record_failure(time.monotonic_ns())
 
     def load_map(self) -> tuple[StoredMap | None, list[RestoredRun]]:
-        """What a new life begins with. Raises StoreError if the file cannot be read at the moment."""
+        """Return the map and the agents' runs for a new session. Raises StoreError if the file is unreadable
+        now."""
         self._is_restoring = False
         if self._tries >= _MAX_TRIES:
-            self._set_aside(f"{self._tries} mappers, one after the other, have died of it")
+            self._set_aside(f"{self._tries} mappers in a row have died while restoring it")
         if self.store is None:
             return None, []
         try:
@@ -56,7 +57,7 @@ class MapperRestarts:
             known = restored_runs(stored_map, self._known_m)
         except ShareError:
             raise
-        except Exception as error:  # whatever is in a file, the edge goes on
+        except Exception as error:  # no content of a file may end the edge
             self._set_aside(f"{type(error).__name__}: {error}")
             return None, []
         self._is_restoring = bool(stored_map.keyframes)
@@ -68,7 +69,7 @@ class MapperRestarts:
             return
         if not self.store.writable:
             self.store = None
-            self._notify(f"the map is not used any more: {reason}; nothing is kept")
+            self._notify(f"the map file is no longer used: {reason}; nothing is saved")
             return
         renamed = self.store.set_aside()
-        self._notify(f"the map is set aside as {renamed.name}: {reason}; a fresh one is begun")
+        self._notify(f"the map file is renamed to {renamed.name}: {reason}; a new one is started")

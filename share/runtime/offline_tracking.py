@@ -1,4 +1,4 @@
-"""One agent over one recording, no edge, as fast as it goes, and the same every time."""
+"""Track one recording without an edge, as fast as possible and repeatably (`share track`)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from share.sensors.sequencer import SequencerCounters
 
 @dataclass(frozen=True, eq=False)
 class TrackingOutput:
-    """Causal poses of the body in odom, one for every frame that had one, and the report."""
+    """Causal poses of the body in odom, one per frame that had a pose, and the report."""
 
     trajectory: Trajectory
     report: dict[str, Any]
@@ -38,8 +38,8 @@ def track(
     on_result: Callable[[TrackResult], None],
     notify: Callable[[str], None] = lambda text: None,
 ) -> TrackingOutput:
-    """Track every frame in turn, of a live camera the newest. `on_result` is what came of each; `notify` is
-    for a person. Raises UsageError where no tracker can use the rig."""
+    """Track all frames of a recording, or the newest ones of a live camera. Call `on_result` for each frame
+    and `notify` for messages to the user. Raises UsageError where no tracker fits the rig."""
     check_trackable(source.name, source.rig)
     guard, bias_store = FaultGuard(notify), ImuBiasStore(source, settings.inertial, notify)
     tracker = GuardedTracker(source.rig, settings, guard, bias_store.bias)
@@ -68,7 +68,7 @@ def track(
 
 
 def offline_report(log: RunLog, counters: SequencerCounters, settings: config.Config) -> dict[str, Any]:
-    """report.json of an agent that has not spoken to an edge."""
+    """Return the contents of report.json for a run without an edge."""
     return {
         **log.report(),
         "corrections": 0,
@@ -81,10 +81,10 @@ def offline_report(log: RunLog, counters: SequencerCounters, settings: config.Co
 
 
 def trajectory_accuracy(run: TrackingOutput, truth: Trajectory | None) -> Ate | None:
-    """ATE against the recording's own truth (SE3 alignment), None where there is none to speak of."""
+    """Return the ATE against the recording's ground truth (SE3 alignment); None without enough truth."""
     if truth is None:
         return None
     try:
         return ate(run.trajectory, truth)
-    except DataError:  # too few poses with a truth at their time
+    except DataError:  # too few poses have ground truth at their time
         return None

@@ -1,4 +1,4 @@
-"""The thread that writes what a live run leaves behind: the run goes on while the disk works, or does not."""
+"""The thread that writes the output files of a live run, so that the run never waits for the disk."""
 
 from __future__ import annotations
 
@@ -11,32 +11,31 @@ from functools import partial
 from share.errors import ShareError
 from share.metrics.frame_log import LineStore
 
-MAX_PENDING = 20_000  # pieces of work that may wait: minutes of all that an agent or an edge has to write
-_SLOW_WRITE_S = 5.0  # for one of them: from then on it is said
-_TIMEOUT_S = 5.0  # for what is left at the end
+MAX_PENDING = 20_000  # jobs that may wait: minutes of output of an agent or an edge
+_SLOW_WRITE_S = 5.0  # duration of one job from which it is reported as trouble
+_TIMEOUT_S = 5.0  # for the remaining jobs at the end
 
 
 class OutputWriter:
-    """`submit` never waits: pieces of work are done in their order, in a thread, and `notify` is told of a
-    disk
-    that does not answer. Where `MAX_PENDING` wait, what comes is left out (policy `drop_new`). What a piece
-    raises is kept for `check`, and the others go on.
+    """Runs submitted jobs in order, in a thread; `submit` never waits. `notify` reports a disk that does not
+    answer. While `MAX_PENDING` jobs wait, new ones are dropped (policy `drop_new`). The first error of a job
+    is kept for `check`; later jobs still run.
     """
 
     def __init__(self, where: object, notify: Callable[[str], None]) -> None:
-        """where: what is written, for a person. said: from any thread."""
+        """where: what is written, for messages. notify: called from any thread."""
         self._where, self._notify = where, notify
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._error: BaseException | None = None
         self._writing_since: float | None = None
         self._is_slow = False
         self._dropped = 0
-        self._thread = threading.Thread(target=self._run, name="scribe", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="output writer", daemon=True)
         self._thread.start()
 
     @property
     def trouble(self) -> str | None:
-        """What is wrong with the disk at the moment, if so. From any thread."""
+        """What is wrong with the disk now, None if nothing. Safe from any thread."""
         since = self._writing_since
         took_s = 0.0 if since is None else time.monotonic() - since
         return (
@@ -46,17 +45,17 @@ class OutputWriter:
     def submit(self, work: Callable[[], None]) -> None:
         if not self._is_slow and (trouble := self.trouble) is not None:
             self._is_slow = True
-            self._notify(f"{trouble}; what is to be written waits")
+            self._notify(f"{trouble}; writes wait")
         if self._jobs.qsize() < MAX_PENDING:
             self._jobs.put(work)
             return
         self._dropped += 1
         if self._dropped == 1:
-            self._notify(f"{self._where}: too much waits for its disk; what comes now is left out")
+            self._notify(f"{self._where}: too many writes wait for its disk; further ones are dropped")
 
     def wait(self, timeout_s: float = _TIMEOUT_S) -> None:
-        """Until what was to be done by now is done. Raises ShareError if that takes longer. A piece of work
-        need not: what came before it is done."""
+        """Wait until all jobs submitted so far are done; within a job they are. Raises ShareError on
+        timeout."""
         if threading.current_thread() is self._thread:
             return
         done = threading.Event()
@@ -65,12 +64,12 @@ class OutputWriter:
             raise ShareError(f"{self._where}: is not complete: its disk does not answer")
 
     def stop(self, timeout_s: float = _TIMEOUT_S) -> None:
-        """Waits until all is done, but not for longer. May be repeated."""
+        """Wait until all jobs are done, at most `timeout_s`. May be repeated."""
         self._jobs.put(None)
         self._thread.join(timeout_s)
 
     def check(self) -> None:
-        """After `stop`. Raises what a piece of work has raised, and ShareError if not all was done."""
+        """Call after `stop`. Raises the first error of a job, or ShareError if not all jobs were done."""
         if self._error is not None:
             raise self._error
         if self._thread.is_alive():
@@ -92,7 +91,7 @@ class OutputWriter:
 
 
 class BackgroundLines:
-    """Lines of a `RunLog` that a scribe writes; to read them is to wait for it."""
+    """Lines of a `RunLog`, written by an `OutputWriter`; `read` waits for it."""
 
     def __init__(self, lines: LineStore, writer: OutputWriter) -> None:
         self._lines, self._writer = lines, writer

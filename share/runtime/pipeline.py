@@ -1,4 +1,4 @@
-"""From a source to tracked frames: what `share track` and `share agent` have in common."""
+"""Reading and decoding frames of a source and making a tracker; shared by `share track` and `share agent`."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from share.types import Frame, ImuBatch
 _MAX_MISFITS = (
     10  # images of a wrong size before any of the right one: the calibration is another recording's
 )
-_SILENT_NS = 1_000_000_000  # as long as a camera may be silent before it is said
-_MAX_SKIPPED_FRAMES = 600  # frames that are left out one after the other, whose IMU samples are kept
+_SILENT_NS = 1_000_000_000  # without IMU samples before a warning
+_MAX_SKIPPED_FRAMES = 600  # consecutive undecodable frames of which IMU samples are kept
 
 _IMU_WARNINGS = {
-    "imu_out_of_range": "the IMU gave samples beyond {0.gyro:.3g} rad/s or {0.accel:.3g} m/s^2, or no "
-    "numbers; such are left out (sequencer.imu_out_of_range in the report)",
-    "imu_spikes": "the IMU gave one to three samples in a row far from those before and after; such are left "
-    "out (sequencer.imu_spikes in the report); look at its cable and supply",
+    "imu_out_of_range": "IMU samples beyond {0.gyro:.3g} rad/s or {0.accel:.3g} m/s^2, or not finite, are "
+    "dropped (sequencer.imu_out_of_range in the report)",
+    "imu_spikes": "one to three consecutive IMU samples far from their neighbours are dropped "
+    "(sequencer.imu_spikes in the report); check the IMU's cable and supply",
 }
 
 
@@ -41,13 +41,12 @@ def read_frames(
     on_decoded: Callable[[float], None] = lambda cpu_s: None,
     notify: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Frame]:
-    """Decoded frames in order. One with a damaged image is left out: the next one has its IMU samples too,
-    and `on_damaged` is told, or the source's losses are. Raises MisfitError where the first ten images, or
-    all of them, are of another size than the calibration's.
+    """Yield decoded frames in order. A frame with a damaged image is skipped; its IMU samples go to the next
+    one, and `on_damaged` is called, or else the source's losses count it.
 
-    `on_decoded` is told the CPU time of each frame's decoding on this thread; `notify`, once each, that the
-    IMU gave
-    what is no measurement, and that the IMU of a recording has stopped; a camera's feed says that itself.
+    on_decoded: called with each frame's decoding CPU time on this thread, s. notify: called once per kind of
+    IMU fault, and when a recording's IMU falls silent (a camera's feed reports that itself). Raises
+    CalibrationMismatchError if the first ten images, or all, have another size than the calibration.
     """
     rig = source.rig
     bundles = sequence_frames(
@@ -84,11 +83,11 @@ def _count_loss(source: Source, error: DataError) -> None:
 
 
 class _ImuSilenceMonitor:
-    """Says once that the IMU gives nothing any more."""
+    """Warns once when IMU samples stop."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self._notify = notify
-        self._first_ns = self._last_imu_ns = -1  # of frames: the first, the last with samples
+        self._first_ns = self._last_imu_ns = -1  # stamps of the first frame and the last one with samples
         self._has_warned = False
 
     def update(self, bundle: UndecodedFrame) -> None:
@@ -100,23 +99,23 @@ class _ImuSilenceMonitor:
             self._has_warned = True
             since_s = (self._last_imu_ns - self._first_ns) * 1e-9
             self._notify(
-                f"no IMU sample comes from {since_s:.1f} s on, for 1 s at least; poses are by images alone "
-                "meanwhile (sequencer.imu_silent in the report)"
+                f"no IMU samples from {since_s:.1f} s on, for at least 1 s; meanwhile poses come from images "
+                "alone (sequencer.imu_silent in the report)"
             )
 
 
 class _SkippedFrames:
-    """Frames since the last good one that cannot be decoded."""
+    """Undecodable frames since the last good one."""
 
     def __init__(self, on_damaged: Callable[[DataError], None]) -> None:
         self._on_damaged = on_damaged
         self._imu: deque[ImuBatch] = deque(maxlen=_MAX_SKIPPED_FRAMES)
         self._gap_ns = 0
-        self._misfits: list[CalibrationMismatchError] = []  # until there is a good one
+        self._misfits: list[CalibrationMismatchError] = []  # until the first good frame
         self._has_decoded = False
 
     def add(self, bundle: UndecodedFrame, error: DataError) -> None:
-        """Raises `error` if it is about the recording, not about this image."""
+        """Add an undecodable frame. Raises `error` if it concerns the recording, not this image."""
         self._imu.append(bundle.imu)
         self._gap_ns += bundle.gap_ns
         if isinstance(error, CalibrationMismatchError) and not self._has_decoded:
@@ -127,14 +126,14 @@ class _SkippedFrames:
             self._on_damaged(error)
 
     def merge_into(self, bundle: UndecodedFrame) -> UndecodedFrame:
-        """`bundle` with what those before it carried."""
+        """Return `bundle` with the IMU samples and gaps of the skipped frames before it."""
         if not self._imu:
             return bundle
         imu = ImuBatch.empty().concatenate(*self._imu, bundle.imu)
         return replace(bundle, imu=imu, gap_ns=self._gap_ns + bundle.gap_ns)
 
     def clear(self) -> None:
-        """There was a good one."""
+        """Forget the skipped frames after a good one."""
         if self._has_decoded and not self._imu:
             return
         for error in self._misfits:
@@ -145,25 +144,25 @@ class _SkippedFrames:
         self._gap_ns = 0
 
     def check_end(self) -> None:
+        """Raises CalibrationMismatchError if no frame could be decoded for that reason."""
         if self._misfits:
             raise self._misfits[0]
 
 
 def make_source_tracker(source: Source, config: Config) -> VisualTracker | InertialTracker:
-    """The estimator that fits the source's rig. Raises UsageError where there is none."""
+    """Return a tracker for the source's rig. Raises UsageError if none fits."""
     check_trackable(source.name, source.rig)
     return make_tracker(source.rig, config)
 
 
 def check_trackable(name: str, rig: Rig) -> None:
-    """Raises UsageError unless some estimator fits the rig of the source `name`."""
+    """Raises UsageError if no tracker fits the rig of the source `name`."""
     if (objection := rig_check.rig_problem(rig)) is not None:
         raise UsageError(f"{name}: {objection}")
 
 
 def make_tracker(rig: Rig, config: Config, bias: ImuBias | None = None) -> VisualTracker | InertialTracker:
-    """The estimator that fits a rig. bias: of its IMU, where that is known. Raises ValueError where there is
-    none."""
+    """Return a tracker for `rig`. bias: initial IMU bias, None if unknown. Raises ValueError if none fits."""
     if rig.imu is not None:
         return InertialTracker(rig, config.inertial, config.tracker, bias=bias)
     return VisualTracker(rig, config.tracker)

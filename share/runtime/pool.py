@@ -1,4 +1,4 @@
-"""Jobs on several processes, spawned: threads, locks and graphics contexts are not inherited."""
+"""Jobs on several spawned processes, which inherit no threads, locks or graphics contexts."""
 
 from __future__ import annotations
 
@@ -18,19 +18,18 @@ from share.spawning import SPAWN_CONTEXT, signals_deferred
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-_start_error: ShareError | None = None  # of this process, at its start
-_JOBS_AHEAD = 2  # jobs handed out per worker, so that none waits for work
+_start_error: ShareError | None = None  # raised by `start` in this worker
+_JOBS_AHEAD = 2  # jobs submitted per worker, so that none is idle
 
 
 class Pool:
-    """`workers` processes, each of which first calls `start(*arguments)`. They end with the block, or
-    with this process."""
+    """`workers` processes, each of which first calls `start(*arguments)`. They end with the block or with
+    this process."""
 
     def __init__(self, workers: int, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
         self._workers = workers
-        self._child_end, self._parent_end = SPAWN_CONTEXT.Pipe(
-            duplex=False
-        )  # nothing is sent: workers end when it closes
+        # Nothing is sent over this pipe: workers end when it closes.
+        self._child_end, self._parent_end = SPAWN_CONTEXT.Pipe(duplex=False)
         self._pool = ProcessPoolExecutor(
             workers, SPAWN_CONTEXT, _init_worker, (self._child_end, start, arguments)
         )
@@ -40,8 +39,8 @@ class Pool:
         return self._workers
 
     def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
-        """Every job with `work(job)`, in the order in which they are done. Raises what a job raised, or
-        the ShareError that `start` did."""
+        """Yield each job with `work(job)`, in order of completion. Raises the error of a job, or the
+        ShareError of `start`."""
         waiting = iter(jobs)
         running: dict[Future[Result], Job] = {}
         try:
@@ -54,7 +53,7 @@ class Pool:
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     yield running.pop(future), future.result()
         except BrokenProcessPool:
-            raise ShareError("one of its processes has died; is memory short?") from None
+            raise ShareError("a worker process has died; check whether memory is short") from None
 
     def __enter__(self) -> Pool:
         return self
@@ -63,16 +62,16 @@ class Pool:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is not None:
-            self._parent_end.close()  # a job may take many seconds; what it writes is whole or not there
+            self._parent_end.close()  # do not wait for running jobs; their outputs are written atomically
         self._pool.shutdown(cancel_futures=True)
         self._parent_end.close()
         self._child_end.close()
 
 
 def _init_worker(child_end: Connection, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
-    """The first thing that a process does."""
+    """Initialise a worker."""
     threading.Thread(target=_exit_with_parent, args=(child_end,), daemon=True).start()
-    global _start_error  # an exception here would be printed, and tell the parent nothing
+    global _start_error  # an exception here would be printed and not reach the parent
     try:
         start(*arguments)
     except ShareError as error:
@@ -87,5 +86,5 @@ def _run_job(work: Callable[[Job], Result], job: Job) -> Result:
 
 def _exit_with_parent(child_end: Connection) -> None:
     with suppress(OSError):
-        child_end.poll(None)  # nothing is sent: until the other end is closed
+        child_end.poll(None)  # returns when the other end is closed
     os._exit(1)

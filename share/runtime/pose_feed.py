@@ -1,7 +1,6 @@
-"""Poses for another program, as they come: a UDP datagram of JSON for each frame (docs/do/integrate.md).
+"""Live poses for another program: one UDP datagram of JSON per frame (docs/do/integrate.md).
 
-Nobody has to listen, and nobody who listens slowly can hold the agent up: what does not get through is gone,
-and the next pose is newer.
+No receiver is needed, and a slow one cannot delay the agent: lost datagrams are not resent.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _DIGITS = 9  # 1 nm
 
 
 class PoseFeed:
-    """To one address. Raises UsageError for one that is none, or a host that nobody knows."""
+    """Sends poses to one address. Raises UsageError for a malformed address or an unknown host."""
 
     def __init__(self, address: str, agent: str) -> None:
         if not address.startswith(_SCHEME):
@@ -46,8 +45,8 @@ class PoseFeed:
         T_map_body: F64 | None = None,
         map_id: str | None = None,
     ) -> None:
-        """One frame. age_ms: since it arrived in this process. stretch: of odometry. Poses (4, 4), None where
-        there is none."""
+        """Send one frame's pose. age_ms: time since it arrived in this process. segment: of odometry. Poses
+        (4, 4), None where unknown."""
         message = {
             "schema": SCHEMA,
             "agent": self._agent,

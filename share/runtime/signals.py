@@ -1,4 +1,4 @@
-"""Ending a live run in good order: on Ctrl-C, SIGTERM, or when its terminal is gone."""
+"""Clean end of a live run on Ctrl-C, SIGTERM or SIGHUP."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from types import FrameType
 
 @contextmanager
 def stop_on_signal(stop: Callable[[], None]) -> Iterator[None]:
-    """Within, the first SIGINT, SIGTERM or SIGHUP calls `stop`; then SIGINT and SIGTERM interrupt at once.
+    """Call `stop` on the first SIGINT, SIGTERM or SIGHUP in the block; further SIGINT and SIGTERM interrupt
+    at once.
 
-    SIGHUP is ignored from then on, also afterwards: kernel and shell may both send it for one terminal, and
-    there may be files to write. Where it was ignored before (nohup), it ends nothing.
+    From then on SIGHUP is ignored, also after the block: kernel and shell may both send it when a terminal
+    closes, while files are still being written. If it was ignored before (nohup), it stays ignored.
     """
 
     def handler(number: int, frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""A SOURCE on the command line to the reader that knows it."""
+"""Opening a recording by the SOURCE of the command line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["READERS", "Source", "open_source"]
 
 
 class Reader(NamedTuple):
-    """One kind of recording: how to know it, and how to open it."""
+    """One kind of recording: how to recognise and open it."""
 
     description: str
     matches: Callable[[Path], bool]
@@ -26,7 +26,7 @@ class Reader(NamedTuple):
 
 
 def _open_mcap(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
-    from share.recordings.mcap.reader import open_mcap  # rosbags and mcap only where they are needed
+    from share.recordings.mcap.reader import open_mcap  # imports rosbags and mcap only when needed
 
     return open_mcap(path, calibration, frames)
 
@@ -46,7 +46,7 @@ def _open_session_agent(path: Path, calibration: Calibration | None, frames: sli
 
 
 def _open_db3(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
-    from share.recordings.realsense import open_db3  # rosbags only where it is needed
+    from share.recordings.realsense import open_db3  # imports rosbags only when needed
 
     return open_db3(path, calibration, frames)
 
@@ -65,13 +65,13 @@ READERS = (
 
 
 def open_source(spec: str, calib: str | None = None, frames: slice | None = None) -> Source:
-    """The recording that `spec` names, with the calibration `calib` in place of its own.
+    """Open the recording `spec`, with the calibration `calib` in place of its own.
 
-    frames: only these images of cam0 (by number, no step), and the IMU samples since the one before.
+    frames: read only these cam0 images (by number, no step) and the IMU samples since the image before.
     Raises UsageError, ConfigError or DataError.
     """
     if is_camera(spec):
-        raise UsageError(f"{spec}: a live camera is recorded with `share capture`; then give the recording")
+        raise UsageError(f"{spec}: record a live camera with `share capture`, then give the recording")
     path = Path(spec)
     calibration = read_given_calibration(calib)
     for reader in READERS:
@@ -84,11 +84,11 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
         agents = ", ".join(str(path / name) for name in read_session(path).agents)
         raise UsageError(f"{spec}: is a session; name one of its agents: {agents}")
     known = "; ".join(reader.description for reader in READERS)
-    raise UsageError(f"{spec}: is none of the recordings that SHARE reads: {known}")
+    raise UsageError(f"{spec}: not a recording that SHARE reads: {known}")
 
 
 def read_given_calibration(calib: str | None) -> Calibration | None:
-    """What --calib names, None where it was not given. Raises UsageError, ConfigError."""
+    """Read the calibration that --calib names; None without one. Raises UsageError, ConfigError."""
     return None if calib is None else read_calibration(_check_exists(Path(calib), "--calib"))
 
 
@@ -102,5 +102,5 @@ def _check_exists(path: Path, what: str) -> Path:
 
 
 def _unclosed_error(part: Path) -> UsageError:
-    saves = f"`share dataset recover {part} --out {part.with_suffix('')}` saves it"
-    return UsageError(f"{part}: was not closed, or is being recorded; {saves}")
+    saves = f"`share dataset recover {part} --out {part.with_suffix('')}` saves its contents"
+    return UsageError(f"{part}: was not closed, or is still being recorded; {saves}")

@@ -1,4 +1,4 @@
-"""The edge's report as Prometheus reads it: a table of what is called what, and the text."""
+"""The edge's report in Prometheus' text format, by a table of metrics."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MetricSpec:
-    """One metric: `path`, keys with dots between, leads to its number in the report, or in each entry of
-    the report's mapping `over`. Labels: the entry's own key, then paths in the entry.
+    """One metric. path: dotted keys to its number in the report, or in each entry of the report's mapping
+    `over`. labels: first the entry's key, then dotted keys in the entry.
 
-    Names and units after Prometheus: *Metric and label naming*; ..._total only grows.
+    Names and units follow Prometheus, *Metric and label naming*; counters (..._total) only grow.
     """
 
     name: str
@@ -23,61 +23,64 @@ class MetricSpec:
     path: str
     over: str = ""
     labels: tuple[str, ...] = ()
-    scale: float = 1.0  # to the unit in its name
+    scale: float = 1.0  # from the report's unit to that in the name
 
 
 _PER_AGENT = ("agents", ("agent", "kind"))
 METRICS = (
-    MetricSpec("share_edge_uptime_seconds", "Time since the edge began.", "uptime_s"),
-    MetricSpec("share_edge_waiting_keyframes", "Keyframes that wait to be looked up.", "waiting"),
-    MetricSpec("share_edge_last_solve_age_seconds", "Time since poses were solved for.", "last_solve_s"),
-    MetricSpec("share_edge_troubles", "What is wrong now; /health says what.", "trouble"),
+    MetricSpec("share_edge_uptime_seconds", "Time since the edge started.", "uptime_s"),
+    MetricSpec("share_edge_waiting_keyframes", "Keyframes waiting for place recognition.", "waiting"),
+    MetricSpec("share_edge_last_solve_age_seconds", "Time since the last pose graph solve.", "last_solve_s"),
+    MetricSpec("share_edge_troubles", "Number of current problems; /health lists them.", "trouble"),
     MetricSpec("share_edge_failed_jobs_total", "Jobs that raised an error.", "failed_steps"),
-    MetricSpec(
-        "share_edge_refused_handshakes_total", "Attempts to connect without a key.", "refused_handshakes"
-    ),
-    MetricSpec("share_edge_maps", "Maps, each apart from the others.", "maps"),
+    MetricSpec("share_edge_refused_handshakes_total", "Refused attempts to connect.", "refused_handshakes"),
+    MetricSpec("share_edge_maps", "Separate maps.", "maps"),
     MetricSpec("share_edge_map_keyframes", "Keyframes in a map.", "", "maps", ("map",)),
     MetricSpec("share_edge_loops", "Loops in the maps.", "loops.in_map"),
-    MetricSpec("share_edge_loops_waiting", "Loops that wait for a witness.", "loops.waiting"),
-    MetricSpec("share_edge_agent_gone", "1 where the agent said bye or is silent.", "gone", *_PER_AGENT),
+    MetricSpec("share_edge_loops_waiting", "Loops waiting for a supporting loop.", "loops.waiting"),
+    MetricSpec("share_edge_agent_gone", "1 if the agent has left or is silent.", "gone", *_PER_AGENT),
     MetricSpec(
         "share_edge_pose_age_seconds", "Age of the newest pose.", "pose_age_ms", *_PER_AGENT, scale=1e-3
     ),
-    MetricSpec("share_edge_heard_age_seconds", "Time since the agent was heard.", "heard_s", *_PER_AGENT),
+    MetricSpec(
+        "share_edge_heard_age_seconds", "Time since the agent's last message.", "heard_s", *_PER_AGENT
+    ),
     MetricSpec("share_edge_keyframes_total", "Keyframes applied.", "keyframes", *_PER_AGENT),
     MetricSpec("share_edge_poses_total", "Poses received.", "poses", *_PER_AGENT),
     MetricSpec("share_edge_evaluations_total", "Evaluations received.", "evaluations", *_PER_AGENT),
     MetricSpec("share_edge_corrections_total", "Corrections sent.", "corrections", *_PER_AGENT),
     MetricSpec("share_edge_received_bytes_total", "Bytes received.", "bytes_up", *_PER_AGENT),
     MetricSpec("share_edge_sent_bytes_total", "Bytes sent.", "bytes_down", *_PER_AGENT),
-    MetricSpec("share_edge_bad_messages_total", "Messages that were malformed.", "bad_messages", *_PER_AGENT),
+    MetricSpec("share_edge_bad_messages_total", "Malformed messages.", "bad_messages", *_PER_AGENT),
     MetricSpec(
         "share_edge_unexpected_messages_total", "Messages that only an edge sends.", "unexpected", *_PER_AGENT
     ),
     MetricSpec("share_edge_loops_tried_total", "Pairs of views verified.", "loops.tried", *_PER_AGENT),
-    MetricSpec("share_edge_loops_accepted_total", "Pairs of views believed.", "loops.accepted", *_PER_AGENT),
-    MetricSpec("share_edge_merges_total", "Loops merged into a map.", "merges.done", *_PER_AGENT),
     MetricSpec(
-        "share_edge_merges_skipped_total", "Loops that were not merged.", "merges.skipped", *_PER_AGENT
+        "share_edge_loops_accepted_total", "Pairs of views accepted as loops.", "loops.accepted", *_PER_AGENT
     ),
+    MetricSpec("share_edge_merges_total", "Loops added to a map.", "merges.done", *_PER_AGENT),
+    MetricSpec("share_edge_merges_skipped_total", "Loops not added to a map.", "merges.skipped", *_PER_AGENT),
     MetricSpec(
-        "share_edge_queries_skipped_total", "Keyframes not looked up.", "queries_skipped", *_PER_AGENT
+        "share_edge_queries_skipped_total",
+        "Keyframes without place recognition.",
+        "queries_skipped",
+        *_PER_AGENT,
     ),
+    MetricSpec("share_edge_stranger_bytes_total", "Bytes from unidentified peers.", "unjoined.bytes_up"),
     MetricSpec(
-        "share_edge_stranger_bytes_total", "Bytes from peers that are no agents.", "unjoined.bytes_up"
-    ),
-    MetricSpec(
-        "share_edge_stranger_bad_messages_total", "Malformed, from such peers.", "unjoined.bad_messages"
+        "share_edge_stranger_bad_messages_total",
+        "Malformed messages from unidentified peers.",
+        "unjoined.bad_messages",
     ),
 )
-_INFO = ("share_edge_agent_info", "What an agent is now; always 1.", ("agent", "kind", "state", "map"))
-_JOBS = ("share_edge_job_seconds", "Time of a job of the worker.")
+_INFO = ("share_edge_agent_info", "State of an agent as labels; always 1.", ("agent", "kind", "state", "map"))
+_JOBS = ("share_edge_job_seconds", "Duration of a job of the mapper.")
 _QUANTILES = {"p50": "0.5", "p95": "0.95", "p99": "0.99"}
 
 
 def render_metrics(report: dict[str, Any]) -> tuple[bytes, str]:
-    """The metrics and their media type. What the report lacks is left out, what else it has passed over."""
+    """Return the metrics as text and their media type. Metrics that the report lacks are omitted."""
     from prometheus_client.exposition import choose_encoder
 
     encode, media_type = choose_encoder("")
@@ -86,7 +89,7 @@ def render_metrics(report: dict[str, Any]) -> tuple[bytes, str]:
 
 @dataclass(frozen=True)
 class _Collector:
-    """What prometheus_client calls a collector."""
+    """A collector for prometheus_client."""
 
     report: dict[str, Any]
 
@@ -121,7 +124,7 @@ def _info(report: dict[str, Any]) -> Metric:
 
 
 def _jobs(report: dict[str, Any]) -> Metric:
-    """Every NAME_ms of the report that has percentiles."""
+    """Return a summary of each NAME_ms in the report that has percentiles."""
     from prometheus_client.core import Metric
 
     metric = Metric(*_JOBS, typ="summary")
@@ -145,19 +148,19 @@ def _entries(report: dict[str, Any], over: str) -> Iterator[tuple[str, Any]]:
 
 
 def _labels(entry: Any, paths: tuple[str, ...]) -> list[str]:
-    """Empty, which to Prometheus is absent, where there is nothing."""
+    """Return the label values; empty, i.e. absent to Prometheus, where the entry has none."""
     return ["" if (value := _lookup(entry, path)) is None else str(value) for path in paths]
 
 
 def _lookup(tree: Any, path: str) -> Any:
-    """What `path` leads to; None if nothing."""
+    """Return the value at the dotted `path`, None if absent."""
     for key in path.split(".") if path else ():
         tree = tree.get(key) if isinstance(tree, dict) else None
     return tree
 
 
 def _as_number(value: Any) -> float | None:
-    """Of a mapping or list: how many are in it."""
+    """Return a number, the length of a mapping or list, or None."""
     if isinstance(value, dict | list | tuple):
         return float(len(value))
     return float(value) if isinstance(value, int | float) else None

@@ -1,8 +1,8 @@
-"""The page for people: asks for /snapshot.json thrice a second and shows it. Needs nothing from elsewhere."""
+"""The status page: it fetches /snapshot.json three times a second and shows it. Self-contained."""
 
 from __future__ import annotations
 
-# Whatever comes from outside, names above all, is set as text and never as HTML.
+# Values from outside, such as names, are set as text, never as HTML.
 PAGE = """<!doctype html>
 <html lang="en">
 <meta charset="utf-8">
@@ -26,9 +26,9 @@ td { border-bottom: 1px solid var(--line) }
 .words th:nth-child(-n+5), .words td:nth-child(-n+5), th:first-child, td:first-child { text-align: left }
 td:first-child { max-width: 14rem; overflow: hidden; text-overflow: ellipsis }
 #maps th:last-child, #maps td:last-child { text-align: left; white-space: normal }
-#claims td { text-align: left; vertical-align: top }
-#claims th { text-align: left }
-#claims td:nth-child(3) { white-space: normal; min-width: 12rem; overflow-wrap: anywhere }
+#consistency td { text-align: left; vertical-align: top }
+#consistency th { text-align: left }
+#consistency td:nth-child(3) { white-space: normal; min-width: 12rem; overflow-wrap: anywhere }
 tr.gone { color: var(--dim) }
 #agents td:nth-child(4) { white-space: normal; min-width: 9rem; max-width: 18rem; overflow-wrap: anywhere }
 .stale { opacity: .45 }
@@ -42,7 +42,7 @@ tr.gone { color: var(--dim) }
 <ul id="trouble"></ul>
 <main>
 <h2>Agents</h2><div class="wide"><table id="agents" class="words"></table></div>
-<h2>Whose claims agree</h2><div class="wide"><table id="claims"></table></div>
+<h2>Agent consistency</h2><div class="wide"><table id="consistency"></table></div>
 <h2>Maps</h2><div class="wide"><table id="maps"></table></div>
 <h2>Loops</h2><div class="wide"><table id="loops"></table></div>
 <h2>Times, ms</h2><div class="wide"><table id="times"></table></div>
@@ -51,20 +51,20 @@ tr.gone { color: var(--dim) }
 "use strict";
 const at = id => document.getElementById(id);
 const entries = x => Object.entries(x ?? {});
-const shown = x => x === null || x === undefined || x === "" ? "–" : String(x);
+const text = x => x === null || x === undefined || x === "" ? "–" : String(x);
 const fixed = (x, n) => Number.isFinite(x) ? x.toFixed(n) : "–";
 
-function node(tag, text, kind) {
-  const made = document.createElement(tag);
-  made.textContent = text;
-  if (kind) made.className = kind;
-  return made;
+function node(tag, content, kind) {
+  const element = document.createElement(tag);
+  element.textContent = content;
+  if (kind) element.className = kind;
+  return element;
 }
 
 function table(id, head, rows) {
   const body = rows.map(({cells, kind}) => {
     const row = node("tr", "", kind);
-    row.append(...cells.map(c => c instanceof Node ? c : node("td", shown(c))));
+    row.append(...cells.map(c => c instanceof Node ? c : node("td", text(c))));
     return row;
   });
   if (!body.length) body.push(node("td", "none yet", "none"));
@@ -73,79 +73,82 @@ function table(id, head, rows) {
   at(id).replaceChildren(...(rows.length ? [top] : []), ...body);
 }
 
-function lasted(s) {
+function duration(s) {
   if (typeof s !== "number") return "–";
   const [h, m] = [Math.floor(s / 3600), Math.floor(s / 60) % 60];
   return h ? `${h} h ${m} min` : m ? `${m} min ${Math.floor(s) % 60} s` : `${Math.floor(s)} s`;
 }
 
-const lost = a => !a.gone && ["LOST", "SILENT"].includes(a.state);
-const late = a => !a.gone && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
-const aged = ms => typeof ms === "number" ? `${fixed(ms / 1000, 1)} s` : "–";
+const isLost = a => !a.gone && ["LOST", "SILENT"].includes(a.state);
+const isStale = a => !a.gone && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
+const age = ms => typeof ms === "number" ? `${fixed(ms / 1000, 1)} s` : "–";
 
-const apart = a => ["set apart", "disputed"].includes(a.consistency?.state);
+const isQuarantined = a => ["set apart", "disputed"].includes(a.consistency?.state);
 const percent = log => Math.abs(100 * Math.expm1(log)).toFixed(1);
-function claim(c) {
+function describeConsistency(c) {
   if (c.reason) return c.reason;
   if (typeof c.log_scale !== "number") return "";
   const sigma = `± ${fixed(100 * c.sigma, 1)} %`;
-  if (!c.put_right && Math.abs(c.log_scale) < 2 * c.sigma) return `depths as the others', ${sigma}`;
-  const off = `depths ${percent(c.log_scale)} ${sigma} too ${c.log_scale > 0 ? "large" : "small"}`;
-  return c.put_right ? `${off}; put right by ${percent(c.put_right)} %` : off;
+  if (!c.put_right && Math.abs(c.log_scale) < 2 * c.sigma) return `depths agree within ${sigma}`;
+  const error = `depths ${percent(c.log_scale)} ${sigma} too ${c.log_scale > 0 ? "large" : "small"}`;
+  return c.put_right ? `${error}; corrected by ${percent(c.put_right)} %` : error;
 }
 
-let before = null, rates = {};
+let previous = null, rates = {};
 function rate(name, agent, now) {
-  const old = before?.agents[name];
-  if (!old || old.run !== agent.run || before.session !== now.session) return NaN;
+  const old = previous?.agents[name];
+  if (!old || old.run !== agent.run || previous.session !== now.session) return NaN;
   const bytes = agent.bytes_up + agent.bytes_down - old.bytes_up - old.bytes_down;
-  return bytes / (now.uptime_s - before.uptime_s) / 1000;
+  return bytes / (now.uptime_s - previous.uptime_s) / 1000;
 }
 
-function measure(now) {
-  if (before?.session === now.session && now.uptime_s - before.uptime_s < 1) return;
+function updateRates(now) {
+  if (previous?.session === now.session && now.uptime_s - previous.uptime_s < 1) return;
   rates = Object.fromEntries(entries(now.agents).map(([name, a]) => [name, rate(name, a, now)]));
-  before = now;
+  previous = now;
 }
 
-function mark(text, bad) {
-  at("mark").textContent = text;
+function mark(content, bad) {
+  at("mark").textContent = content;
   at("mark").className = bad ? "bad" : "";
 }
 
 function show(now) {
-  measure(now);
+  updateRates(now);
   const trouble = now.trouble ?? [];
-  const unwell = entries(now.agents).filter(([, a]) => lost(a) || late(a)).length;
-  const without = `${unwell} agent${unwell === 1 ? "" : "s"} without a current pose`;
-  const odd = entries(now.agents).filter(([, a]) => !a.gone && apart(a)).length;
-  const alone = `${odd} agent${odd === 1 ? "" : "s"} kept apart`;
-  const words = [...(unwell ? [without] : []), ...(odd ? [alone] : [])].join(", ");
-  mark(trouble.length ? "trouble" : words || "ok", trouble.length || words);
+  const count = matches => entries(now.agents).filter(([, a]) => matches(a)).length;
+  const agentCount = n => `${n} agent${n === 1 ? "" : "s"}`;
+  const stale = count(a => isLost(a) || isStale(a));
+  const quarantined = count(a => !a.gone && isQuarantined(a));
+  const warnings = [];
+  if (stale) warnings.push(`${agentCount(stale)} without a current pose`);
+  if (quarantined) warnings.push(`${agentCount(quarantined)} quarantined`);
+  mark(trouble.length ? "trouble" : warnings.join(", ") || "ok", trouble.length || warnings.length);
   at("trouble").replaceChildren(...trouble.concat(now.refused ?? []).map(t => node("li", t)));
-  const about = [`up ${lasted(now.uptime_s)}`];
-  if (now.waiting !== undefined) about.push(`waiting ${shown(now.waiting)}`);
-  if (typeof now.last_solve_s === "number") about.push(`solved ${lasted(now.last_solve_s)} ago`);
+  const about = [`up ${duration(now.uptime_s)}`];
+  if (now.waiting !== undefined) about.push(`waiting ${text(now.waiting)}`);
+  if (typeof now.last_solve_s === "number") about.push(`solved ${duration(now.last_solve_s)} ago`);
   if (now.failed_steps) about.push(`failed steps ${now.failed_steps}`);
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
   const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
   table("agents",
-    ["name", "state", "pose age", "why", "kind", "keyframes", "corrections", "map", "kB/s", "loops"],
+    ["name", "state", "pose age", "reason", "kind", "keyframes", "corrections", "map", "kB/s", "loops"],
     agents.map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
-      name, node("td", a.gone ? "gone" : shown(a.state), lost(a) ? "bad" : ""),
-      node("td", a.gone ? "–" : aged(a.pose_age_ms), late(a) ? "bad" : ""),
+      name, node("td", a.gone ? "gone" : text(a.state), isLost(a) ? "bad" : ""),
+      node("td", a.gone ? "–" : age(a.pose_age_ms), isStale(a) ? "bad" : ""),
       a.reason, a.kind, a.keyframes, a.corrections, a.map_id, a.gone ? "–" : fixed(rates[name], 1),
-      `${shown(a.loops?.accepted)} of ${shown(a.loops?.tried)}`]})));
-  table("claims", ["name", "it", "why"], agents.filter(([, a]) => a.consistency).map(([name, a]) => ({
-    kind: a.gone ? "gone" : "", cells: [
-      name, node("td", a.consistency.state, apart(a) && !a.gone ? "bad" : ""), claim(a.consistency)]})));
+      `${text(a.loops?.accepted)} of ${text(a.loops?.tried)}`]})));
+  table("consistency", ["name", "state", "reason"],
+    agents.filter(([, a]) => a.consistency).map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
+      name, node("td", a.consistency.state, isQuarantined(a) && !a.gone ? "bad" : ""),
+      describeConsistency(a.consistency)]})));
   table("maps", ["map", "keyframes", "agents"], entries(now.maps).map(([id, count]) => ({cells: [
     id, typeof count === "object" ? count?.keyframes : count,
     agents.filter(([, a]) => String(a.map_id) === id).map(([name]) => name).join(", ")]})));
   const loops = now.loops ?? {};
-  table("loops", ["tried", "accepted", "waiting for a witness", "in the maps", "merges"],
+  table("loops", ["tried", "accepted", "waiting for a supporting loop", "in the maps", "merges"],
     now.loops ? [{cells: [loops.tried, loops.accepted, loops.waiting, loops.in_map, now.merges?.done]}] : []);
-  table("times", ["step", "p50", "p95", "max", "times"],
+  table("times", ["step", "p50", "p95", "max", "count"],
     entries(now).filter(([k, t]) => k.endsWith("_ms") && t && "p50" in t).map(([k, t]) => ({cells: [
       k.slice(0, -3), fixed(t.p50, 1), fixed(t.p95, 1), fixed(t.max, 1), t.n]})));
 }

@@ -1,4 +1,4 @@
-"""What the edge is doing, over HTTP: health, metrics, the report, and a page (docs/lookup/status.md)."""
+"""The edge's status over HTTP: health, metrics, report and a status page (docs/lookup/status.md)."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from share.runtime import status_metrics
 from share.runtime.status_page import PAGE
 from share.runtime.web import Response, WebServer, text_response
 
-CACHE_S = 0.1  # an answer is given again so long: however many ask, the edge is asked ten times a second
+CACHE_S = 0.1  # lifetime of a response: any number of clients costs the edge ten reports a second
 
 
 class StatusServer:
     """Serves at `address`, HOST:PORT or a PORT of this machine alone, until closed.
 
-    report: the edge's report as in edge.json, and of now `trouble`, a list of what is wrong, `last_solve_s`
-    and `uptime_s`, so far as there are such. It is called from the server's own thread; if it fails, that
-    is answered, and told once. Raises UsageError or TransportError as `WebServer`.
+    report: returns the edge's report as in edge.json, with current problems as `trouble`, `last_solve_s` and
+    `uptime_s` where known. Called from the server's thread; if it fails, the response says so, and `notify`
+    is called once. Raises UsageError or TransportError like `WebServer`.
     """
 
     def __init__(
@@ -38,18 +38,18 @@ class StatusServer:
 
     @property
     def endpoint(self) -> str:
-        """HOST:PORT really bound."""
+        """The bound HOST:PORT."""
         return self._server.endpoint
 
     def close(self) -> None:
-        """Frees the address. May be repeated."""
+        """Free the address. May be repeated."""
         self._server.close()
 
     def _respond(self, path: str) -> Response:
         if path == "/":
             return _PAGE
         if path not in _REPORTS:
-            return text_response(HTTPStatus.NOT_FOUND, f"there are / {' '.join(_REPORTS)}")
+            return text_response(HTTPStatus.NOT_FOUND, f"not found; available: / {' '.join(_REPORTS)}")
         cached_s, response = self._cache.get(path, (-CACHE_S, None))
         if response is None or time.monotonic() - cached_s > CACHE_S:
             response = self._render(path)
@@ -61,7 +61,7 @@ class StatusServer:
             return _REPORTS[path](
                 {"uptime_s": round(time.monotonic() - self._start_s, 3), **self._get_report()}
             )
-        except Exception as error:  # whatever is wrong with a report, the edge goes on
+        except Exception as error:  # a faulty report must not end the edge
             text = " ".join(f"no report: {type(error).__name__}: {error}".split())
             if not self._failed:
                 self._notify(f"status: {text}")
@@ -70,7 +70,7 @@ class StatusServer:
 
 
 def _health(report: dict[str, Any]) -> Response:
-    """503 where something is wrong, for whoever restarts or balances and does not read on."""
+    """Return health as JSON; with status 503 if there is trouble, for monitors that read only the status."""
     trouble = list(report.get("trouble") or ())
     agents = report.get("agents", {}).items()
     health: dict[str, Any] = {
@@ -93,7 +93,7 @@ def _snapshot(report: dict[str, Any]) -> Response:
 
 
 def _json(status: HTTPStatus, value: Any) -> Response:
-    """Raises ValueError where a number is not finite: that is no JSON."""
+    """Raises ValueError for a number that is not finite, which JSON cannot express."""
     return Response(status, "application/json", json.dumps(value, allow_nan=False).encode() + b"\n")
 
 

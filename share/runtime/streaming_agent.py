@@ -1,8 +1,8 @@
-"""An agent that does not track itself (policy `streamed`), as a process.
+"""The process of an agent that the edge tracks (policy `streamed`).
 
-    reader: decode, wait until the sensor would have delivered -> main: the machine, the link, the files
+    reader: decode, wait until the frame is due -> main: state machine, link, files
 
-A recording is played once the edge can track it, so that its beginning is not lost; from then on nothing
+A recording starts once the edge can track it, so that its beginning is not lost; from then on nothing
 waits for the edge.
 """
 
@@ -21,7 +21,7 @@ from share.types import Frame
 
 
 class StreamingAgentRun(AgentRun):
-    """As `AgentRun`; what the tracker's thread did there is done by the edge."""
+    """`AgentRun` that sends frames to the edge instead of tracking them."""
 
     def _prepare(self) -> None:
         check_trackable(self._source.name, self._source.rig)
@@ -37,7 +37,7 @@ class StreamingAgentRun(AgentRun):
         deadline = time.monotonic() + self._settings.stream.begin_s
         while not (self._can_start.wait(TICK_MS / 1e3) or self._shared.stop.is_set()):
             if time.monotonic() >= deadline:
-                self._notify("the edge does not track this agent yet; the recording begins without")
+                self._notify("the edge does not track this agent yet; the recording starts anyway")
                 break
 
     def _track_frame(self, frame: Frame, arrived_ns: int) -> None:

@@ -1,5 +1,4 @@
-"""Trackers of agents that stream (policy `streamed`), each in a process of its own: the very one that
-`share track` runs."""
+"""Trackers of streaming agents (policy `streamed`), one process each, with the tracker of `share track`."""
 
 from __future__ import annotations
 
@@ -29,12 +28,12 @@ from share.timing import Backoff
 from share.types import Frame
 from share.wire.messages import RemoteTrackingResult
 
-_TIMEOUT_S = 6.0  # for one to end
+_TIMEOUT_S = 6.0  # for a process to end
 _TRACKERS_PER_CORE = 2  # at 15 frames a second each; a frame takes 15 to 30 ms
 
 
 def tracker_capacity() -> TrackingCapacity:
-    """For trackers, on this machine as it is now."""
+    """Return how many trackers this machine can run now."""
     free = free_memory_bytes()
     memory = "" if free is None else f", {free / 1e9:.1f} GB free"
     return TrackingCapacity(
@@ -45,14 +44,14 @@ def tracker_capacity() -> TrackingCapacity:
 
 
 class TrackerProcesses:
-    """Begins, feeds and ends them, and waits for none. `on_answer` is called from other threads."""
+    """Starts, feeds and stops tracker processes without waiting. `on_answer` is called from other threads."""
 
     def __init__(self, settings: Config, on_answer: Callable[[TrackerEvent], None]) -> None:
         self._settings, self._on_answer = settings, on_answer
         self._running: dict[str, WorkerProcess] = {}
         self._closing_threads: list[threading.Thread] = []
         self._backoffs: dict[str, Backoff] = {}
-        self._restart_pauses_s: dict[str, float] = {}  # of those that died, until the next begins
+        self._restart_pauses_s: dict[str, float] = {}  # by key of a dead tracker, until its next start
 
     def execute(self, effect: StartTracker | TrackFrame | StopTracker) -> None:
         match effect:
@@ -65,7 +64,7 @@ class TrackerProcesses:
                 self._stop(effect.key)
 
     def close(self) -> None:
-        """All end."""
+        """Stop all trackers and wait for them."""
         for key in list(self._running):
             self._stop(key)
         for thread in self._closing_threads:
@@ -77,7 +76,7 @@ class TrackerProcesses:
 
         def lost(how: str) -> None:
             self._restart_pauses_s[key] = pause_s = backoff.record_failure(time.monotonic_ns())
-            self._on_answer(TrackerLost(key, generation, f"{how}; the next one begins in {pause_s:g} s"))
+            self._on_answer(TrackerLost(key, generation, f"{how}; restarted in {pause_s:g} s"))
 
         arguments = (self._settings, effect.rig, key, generation)
         return WorkerProcess(
@@ -85,8 +84,8 @@ class TrackerProcesses:
         )
 
     def _pause_s(self, key: str) -> float:
-        """After a death; also while as many as there is room for are ending, or agents that come and go would
-        fill the machine with them."""
+        """Return the delay before a start: after a death, or while too many processes are still ending, so
+        that agents that come and go do not overload the machine."""
         pause_s = self._restart_pauses_s.pop(key, 0.0)
         ending = sum(thread.is_alive() for thread in self._closing_threads)
         return pause_s if ending < _TRACKERS_PER_CORE * core_count() else max(pause_s, _TIMEOUT_S)
@@ -106,19 +105,18 @@ def run_tracker(
     key: str,
     generation: int,
 ) -> None:
-    """For a `WorkerProcess`: takes frames, answers Ready and then each with Answered, until END."""
+    """Work of a `WorkerProcess`: answers TrackerReady, then takes frames and answers each with
+    TrackerAnswered, until END."""
     guard = FaultGuard(lambda text: print(f"share: tracking {key}: {text}", file=sys.stderr, flush=True))
     tracker, heap = GuardedTracker(rig, settings, guard), HeapTrimmer()
-    starts_new_odom = generation > 0  # there was another before, in another odom
+    starts_new_odom = generation > 0  # an earlier tracker had another odom frame
     answer(TrackerReady(key, generation))
     while (frame := inbox.get()) is not END:
         result = tracker.track(frame)
         new_segment = result.new_segment or (starts_new_odom and result.state.has_pose)
         starts_new_odom = starts_new_odom and not new_segment
         answer(TrackerAnswered(key, generation, _tracked_message(frame, result, new_segment)))
-        tracker.finish(
-            frame, result.keyframe_ready
-        )  # after its pose is out; what it shows to others is for nobody
+        tracker.finish(frame, result.keyframe_ready)  # after the pose is sent
         heap.trim_if_due(time.monotonic())
 
 

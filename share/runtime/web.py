@@ -1,7 +1,7 @@
-"""A small web server for a few readers, on one thread: no client can hold up the process that it serves.
+"""A small single-threaded HTTP server for few clients, which cannot hold up the process that it runs in.
 
-A connection is one request without a body, GET or HEAD, and its answer (RFC 9110, 9112). Whatever clients
-do, the thread computes for a fifth of the time at most: it sleeps four times as long as it has worked.
+A connection carries one GET or HEAD request without a body, and its response (RFC 9110, 9112). The thread
+uses at most a fifth of a core whatever clients do: it sleeps four times as long as it has worked.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from share.net.transport import Address, bind_error, parse_address
 
 MAX_CONNECTIONS = 16  # at a time; one more closes the oldest
 MAX_REQUEST_BYTES = 8192
-CLIENT_TIMEOUT_S = 5.0  # to ask, and again to take the answer
-_LINGER_S = 1.0  # what is still sent after the answer is read so long, else the answer would be lost with it
-_MAX_SLEEP_S = 0.1  # where the machine has no socket left, and the longest sleep after work
-_SLEEP_RATIO = 4.0  # times as long as it worked
+CLIENT_TIMEOUT_S = 5.0  # for the request, and again for the response
+_LINGER_S = 1.0  # input is read so long after the response; a reset would destroy the response
+_MAX_SLEEP_S = 0.1  # after work, and when no socket is left
+_SLEEP_RATIO = 4.0  # sleep per CPU time
 
 _REQUEST = re.compile(r"([A-Z]+) (\S+) HTTP/1\.[01]")
 _HEADERS = (
@@ -40,14 +40,14 @@ _HEADERS = (
 
 @dataclass(frozen=True)
 class Response:
-    """What is said, and of which media type."""
+    """An HTTP response."""
 
     status: HTTPStatus
     media_type: str
     body: bytes
 
     def encode(self, with_body: bool) -> bytes:
-        """As it goes over the wire."""
+        """Return the bytes on the wire."""
         allow = ["Allow: GET, HEAD"] if self.status is HTTPStatus.METHOD_NOT_ALLOWED else []
         head = [
             f"HTTP/1.1 {self.status.value} {self.status.phrase}",
@@ -61,15 +61,15 @@ class Response:
 
 
 def text_response(status: HTTPStatus, text: str) -> Response:
-    """One line of plain text."""
+    """Return a response of one line of plain text."""
     return Response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
 
 
 class WebServer:
-    """Listens on HOST:PORT, or PORT of this machine alone; port 0 takes a free one. `answer` is called with
-    a path, from the server's own thread, and must not raise.
+    """Listens on HOST:PORT, or on PORT of this machine alone; port 0 takes a free one. `handler` is called
+    with a path, from the server's thread, and must not raise.
 
-    Raises UsageError if that is no address, TransportError if nothing can listen there.
+    Raises UsageError for a malformed address, TransportError if it cannot be bound.
     """
 
     def __init__(self, address: str, handler: Callable[[str], Response]) -> None:
@@ -88,7 +88,7 @@ class WebServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Frees the address. May be repeated."""
+        """Free the address. May be repeated."""
         with contextlib.suppress(OSError):
             self._wake_sender.send(b"!")
         self._thread.join(timeout=CLIENT_TIMEOUT_S)
@@ -110,7 +110,7 @@ class WebServer:
         time.sleep(min(_SLEEP_RATIO * cpu_s, _MAX_SLEEP_S))
 
     def _step(self) -> bool:
-        """Waits for somebody and goes on with them. False once closed."""
+        """Wait for clients and serve those that are ready. Return False once closed."""
         next_deadline = min((client.deadline for client in self._clients), default=None)
         wait_s = None if next_deadline is None else max(next_deadline - time.monotonic(), 0.0)
         for key, _ in self._selector.select(wait_s):
@@ -142,7 +142,7 @@ class WebServer:
     def _advance(self, client: _Client) -> None:
         try:
             events = client.advance(self._respond)
-        except Exception:  # gone; or whatever it said that nobody thought of costs it its own connection
+        except Exception:  # the client has gone, or its request is malformed: only its connection ends
             events = 0
         if events:
             self._selector.modify(client.socket, events, client)
@@ -156,17 +156,19 @@ class WebServer:
 
     def _respond(self, request: bytes) -> bytes:
         if len(request) > MAX_REQUEST_BYTES:
-            text = f"a request has at most {MAX_REQUEST_BYTES} bytes"
+            text = f"the request is larger than {MAX_REQUEST_BYTES} bytes"
             return text_response(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, text).encode(True)
         first, _, rest = request.decode("latin-1").replace("\r\n", "\n").partition("\n")
         match = _REQUEST.fullmatch(first)
         if match is None:
-            return text_response(HTTPStatus.BAD_REQUEST, "this is not HTTP/1.1").encode(True)
+            return text_response(HTTPStatus.BAD_REQUEST, "not an HTTP/1.1 request").encode(True)
         method, path = match[1], match[2].partition("?")[0]
         if method not in ("GET", "HEAD"):
-            response = text_response(HTTPStatus.METHOD_NOT_ALLOWED, "only GET and HEAD")
+            response = text_response(HTTPStatus.METHOD_NOT_ALLOWED, "only GET and HEAD are allowed")
         elif self._target.local and not _has_local_host_header(rest):
-            response = text_response(HTTPStatus.FORBIDDEN, "this is for localhost, asked for by that name")
+            response = text_response(
+                HTTPStatus.FORBIDDEN, "only requests for the host name localhost are served"
+            )
         else:
             response = self._handler(path)
         return response.encode(method != "HEAD")
@@ -174,7 +176,7 @@ class WebServer:
 
 @dataclass(eq=False)
 class _Client:
-    """One connection: it asks, takes its answer, and goes."""
+    """One connection: reads a request, sends the response, closes."""
 
     socket: socket.socket
     deadline: float = field(default_factory=lambda: time.monotonic() + CLIENT_TIMEOUT_S)
@@ -182,7 +184,8 @@ class _Client:
     _response: memoryview | None = None
 
     def advance(self, respond: Callable[[bytes], bytes]) -> int:
-        """Selector events to wait for next; 0 where it is over. Raises OSError where the other has gone."""
+        """Return the selector events to wait for next, 0 at the end. Raises OSError if the client has
+        gone."""
         if self._response is None:
             return self._read_request(respond)
         if not self._response:
@@ -210,7 +213,7 @@ def _parse(address: str) -> Address:
     try:
         return parse_address(f"tcp://127.0.0.1:{address}" if address.isdigit() else f"tcp://{address}", True)
     except UsageError:
-        text = f"'{address}' is not an address to serve on; expected HOST:PORT, such as 127.0.0.1:8080"
+        text = f"'{address}' is not an address to serve at; expected HOST:PORT, such as 127.0.0.1:8080"
         raise UsageError(text) from None
 
 
@@ -225,8 +228,8 @@ def _listen(target: Address) -> socket.socket:
 
 
 def _has_local_host_header(headers: str) -> bool:
-    """Whether a request means a name that only this machine has. A web page whose own name was made to lead
-    here (DNS rebinding) would ask for that."""
+    """Return whether the Host header names this machine only. This refuses a web page that reaches this
+    server by DNS rebinding: it sends its own name."""
     for field_ in headers.split("\n"):
         name, _, value = field_.partition(":")
         if name.lower() == "host":
@@ -235,7 +238,7 @@ def _has_local_host_header(headers: str) -> bool:
 
 
 def _is_local_host(host: str) -> bool:
-    """host: a name or an address, perhaps with a port. In time that rises with its length, no faster."""
+    """host: a name or address, with or without a port. Takes linear time."""
     host_part, colon, port = host.rpartition(":")
     name = (host_part if colon and port.isdecimal() else host).strip("[]").lower()
     return name == "localhost" or Address(name, 0).local

@@ -1,4 +1,4 @@
-"""A process of our own that does heavy work while this one goes on."""
+"""A child process for heavy work, with queues in both directions."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from share import startup
 from share.spawning import SPAWN_CONTEXT
 
 Inbox = queue.SimpleQueue[Any]
-Work = Callable[..., None]  # (inbox, answer, *arguments); ends when it takes END from the inbox
+Work = Callable[..., None]  # (inbox, answer, *arguments); returns when it takes END from the inbox
 END = None
 _TIMEOUT_S = 5.0
 
 
 class WorkerProcess:
-    """Runs `work(inbox, answer, *arguments)` in a spawned process.
+    """Runs `work(inbox, answer, *arguments)` in a spawned process, which ends when this process ends.
 
-    `send` never waits. Answers go to `on_answer`, from a thread; `on_death` is called once, from that
-    thread, if
-    the process ends without being asked to. It ends with this one, however this one ends. after_s: it is
-    started so much later, and gets then what was sent meanwhile (`share.timing`).
+    `send` never waits. `on_answer` is called with each answer, from a thread; `on_death` once, from the same
+    thread, if the process ends without being asked to. start_delay_s: delay of the start; messages sent
+    meanwhile are kept.
     """
 
     def __init__(
@@ -41,7 +40,7 @@ class WorkerProcess:
         self._on_answer, self._on_death = on_answer, on_death
         self._closing = threading.Event()
         self._starting = threading.Lock()
-        self._start_error: str | None = None  # why it could not be started
+        self._start_error: str | None = None
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._parent_end, self._child_end = SPAWN_CONTEXT.Pipe()
         self._process = SPAWN_CONTEXT.Process(
@@ -56,11 +55,11 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int | None:
-        """None before it is started."""
+        """None before the start."""
         return self._process.pid
 
     def _start(self) -> None:
-        """Unless it was closed before it began."""
+        """Start the process, unless it was closed before."""
         with self._starting:
             if not self._closing.is_set():
                 try:
@@ -73,7 +72,7 @@ class WorkerProcess:
         self._outbox.put(message)
 
     def close(self) -> None:
-        """Everything sent is worked on first, but not for longer than a few seconds."""
+        """End the process after it has handled all messages; kill it after a few seconds."""
         with self._starting:
             self._closing.set()
         self._outbox.put(END)
@@ -94,7 +93,7 @@ class WorkerProcess:
             message = self._outbox.get()
             try:
                 self._parent_end.send(message)
-            except OSError:  # it has died: `_receive_loop` says so
+            except OSError:  # the process has died: `_receive_loop` reports it
                 return
             if message is END:
                 return
@@ -118,9 +117,9 @@ class WorkerProcess:
 
 
 def _run_child(connection: Connection, work: Work, arguments: tuple[Any, ...]) -> None:
-    """The first thing that the process does."""
+    """Entry point of the process."""
     startup.prepare_process()
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all: the parent ends us in order
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all; the parent ends this process
     inbox: Inbox = queue.SimpleQueue()
     threading.Thread(target=_fill_inbox, args=(connection, inbox), daemon=True).start()
     with contextlib.suppress(BrokenPipeError):  # the parent is gone

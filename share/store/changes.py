@@ -1,4 +1,4 @@
-"""Each change as SQL, inside a transaction of the caller. Repeating one changes nothing."""
+"""Apply map changes as SQL, within the caller's transaction. Idempotent."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _RUN_COLUMNS = (
 
 
 def apply_change(db: sqlite3.Connection, change: MapChange) -> None:
-    """Raises ValueError for a keyframe of a run that was never kept."""
+    """Apply one change. Raises ValueError for a keyframe of a run that is not in the file."""
     match change:
         case SaveRun():
             _insert_run(db, change)
-        case SaveCredential(run, voice):
-            _set_credential(db, run, voice)
+        case SaveCredential(run, credential):
+            _set_credential(db, run, credential)
         case SaveKeyframe():
             _insert_keyframe(db, change)
         case SaveLink():
@@ -79,7 +79,7 @@ def _insert_keyframe(db: sqlite3.Connection, change: SaveKeyframe) -> None:
 
 
 def _segment_and_ordinal(db: sqlite3.Connection, run: str, starts_segment: bool) -> tuple[int, int]:
-    """The run's newest stretch, since a keyframe refers to the one before it, or a new one; and its place."""
+    """Return the number of the run's newest segment, or of a new one, and the keyframe's position in it."""
     (segment,) = _first_row(db, "SELECT ifnull(max(nth), -1) FROM stretch WHERE run = ?", run)
     if starts_segment or segment < 0:
         insert(db, "stretch", (run, segment + 1))
@@ -90,10 +90,10 @@ def _segment_and_ordinal(db: sqlite3.Connection, run: str, starts_segment: bool)
 
 
 def _next_id(db: sqlite3.Connection, run: str) -> int:
-    """One above all numbers that the run ever had."""
+    """Return one more than the largest keyframe id that the run ever had."""
     row = _first_row(db, "SELECT next FROM run WHERE key = ?", run)
     if not row:
-        raise ValueError(f"run {run} is not kept; its KeepRun comes first")
+        raise ValueError(f"run {run} is not in the file; its SaveRun must come first")
     (next_id,) = _first_row(db, "SELECT ifnull(max(id) + 1, 0) FROM keyframe WHERE run = ?", run)
     return max(int(row[0]), int(next_id))
 
@@ -111,7 +111,7 @@ def _remove_keyframe(db: sqlite3.Connection, key: KeyframeKey) -> None:
         _delete_row(db, table, key)
     db.execute("DELETE FROM loop WHERE a_run = ? AND a_id = ?", key)
     db.execute("DELETE FROM loop WHERE b_run = ? AND b_id = ?", key)
-    if _next_id(db, key.agent) < next_id:  # it was the newest: the rest no longer says so
+    if _next_id(db, key.agent) < next_id:  # it was the newest: the remaining rows do not show its id
         _store_next_id(db, key.agent, next_id)
 
 
@@ -133,5 +133,5 @@ def _delete_row(db: sqlite3.Connection, table: str, key: KeyframeKey) -> None:
 
 
 def _first_row(db: sqlite3.Connection, query: str, *values: Any) -> tuple[Any, ...]:
-    """The first row, or ()."""
+    """Return the first row, or ()."""
     return db.execute(query, values).fetchone() or ()

@@ -1,4 +1,4 @@
-"""One way to open a map file with SQLite, and one to say what SQLite complains of."""
+"""Opening and locking a map file with SQLite, and translating SQLite's errors."""
 
 from __future__ import annotations
 
@@ -17,21 +17,20 @@ from share.files.sqlite_file import limit_untrusted, read_only_uri, shm_path, wa
 from share.store.schema import PAGE_BYTES, first_page
 
 BUSY_S = 5.0  # how long a commit waits for a reader of another process
-WAL_PAGES = 512  # after as many (4 MiB) the log is moved into the file
+WAL_PAGES = 512  # of the log (4 MiB) before a checkpoint
 MAGIC = b"SQLite format 3\0"
 _HEADER_BYTES = 100
-_FIXED_HEADER_BYTES = (
-    *range(18),
-    *range(20, 24),
-    *range(44, 48),
-    *range(52, 60),
-)  # sqlite.org/fileformat.html, 1.3
-_MAX_ROW_BYTES = 256 * 1024**2  # of a row: poses of a million keyframes are 128 MB
-_MIN_TIME_S, _MIN_BYTES_PER_S = 10.0, 1e6
-_STEPS_PER_CHECK = 10_000  # of SQLite's machine between two looks at the clock: some 0.1 ms
-_TABLE_MARKERS = b"CREATE TABLE keyframe(", b"CREATE TABLE run_copy("  # one survives a flipped byte
+# Offsets of header bytes that are the same in all maps (sqlite.org/fileformat.html, 1.3).
+_FIXED_HEADER_BYTES = (*range(18), *range(20, 24), *range(44, 48), *range(52, 60))
+_MAX_ROW_BYTES = 256 * 1024**2  # poses of a million keyframes take 128 MB
+_MIN_TIME_S = 10.0  # time limit for reading an empty file
+_MIN_BYTES_PER_S = 1e6  # slowest disk: adds to the time limit by file size
+_STEPS_PER_CHECK = 10_000  # of SQLite's virtual machine between two checks of the time: about 0.1 ms
+_TABLE_MARKERS = b"CREATE TABLE keyframe(", b"CREATE TABLE run_copy("  # two, to survive a flipped byte
+_INDEX_BYTES = 32_768  # by which SQLite grows the index of the log
+_FRAME_BYTES = 24  # before each page in the log
 
-# The world's troubles; whatever else SQLite says of a file, the file is damaged.
+# Errors that are not the file's fault; any other means that the file is damaged.
 _ENVIRONMENT_ERRORS = (
     sqlite3.SQLITE_BUSY,
     sqlite3.SQLITE_LOCKED,
@@ -43,20 +42,15 @@ _ENVIRONMENT_ERRORS = (
     sqlite3.SQLITE_PERM,
 )
 
-DAMAGE_ERRORS = (
-    sqlite3.Error,
-    MemoryError,
-    OverflowError,
-    UnicodeError,
-)  # all that reading damaged pages raises
+DAMAGE_ERRORS = (sqlite3.Error, MemoryError, OverflowError, UnicodeError)  # raised on damaged pages
 
 
 class DamageError(StoreError):
-    """The file is a map, and not whole."""
+    """The file is a map, but damaged."""
 
 
 def open_for_writing(path: Path, durable: bool) -> sqlite3.Connection:
-    """The one writer. power_cut: a commit waits for the disk, so that not even that costs one."""
+    """Open the single writer. durable: commits wait for the disk, so that a power failure loses none."""
     connection = sqlite3.connect(path, BUSY_S, isolation_level=None, check_same_thread=False)
     limit_untrusted(connection, _MAX_ROW_BYTES)
     connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
@@ -68,7 +62,7 @@ def open_for_writing(path: Path, durable: bool) -> sqlite3.Connection:
 
 
 def open_for_reading(path: Path) -> sqlite3.Connection:
-    """Beside a living writer too."""
+    """Open a reader; a writer may run at the same time."""
     connection = sqlite3.connect(
         read_only_uri(path), BUSY_S, uri=True, isolation_level=None, check_same_thread=False
     )
@@ -76,8 +70,8 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
 
 
 def limit_time(connection: sqlite3.Connection, path: Path) -> sqlite3.Connection:
-    """`connection` to a file from anywhere: after the time that reading so large a file takes on a slow disk,
-    whatever it does ends with an error."""
+    """Limit the time of all queries on an untrusted file, by the time that a slow disk takes to read it.
+    Return `connection`."""
     limit_untrusted(connection, _MAX_ROW_BYTES)
     deadline_s = time.monotonic() + _MIN_TIME_S + path.stat().st_size / _MIN_BYTES_PER_S
     connection.set_progress_handler(lambda: time.monotonic() > deadline_s, _STEPS_PER_CHECK)
@@ -86,7 +80,7 @@ def limit_time(connection: sqlite3.Connection, path: Path) -> sqlite3.Connection
 
 @contextlib.contextmanager
 def translate_errors(path: Path, action: str) -> Iterator[None]:
-    """SQLite's errors inside become a StoreError that names `path`, or DamageError: the file is to blame."""
+    """Turn SQLite's errors in the block into DamageError if the file is damaged, else StoreError."""
     try:
         yield
     except DAMAGE_ERRORS as error:
@@ -101,9 +95,10 @@ def is_damage(error: Exception) -> bool:
 
 
 def check_is_map(path: Path) -> bool:
-    """Whether there is something in it. Raises UsageError if that is not a map of ours.
+    """Return whether the file holds a map; False if it is missing or empty. Raises UsageError for another
+    file.
 
-    A writer killed before its first commit leaves nothing or a bare first page; what follows is in the log.
+    A writer killed before its first checkpoint leaves nothing or a bare first page; the rest is in the log.
     """
     for side_file in (wal_path(path), shm_path(path)):
         _check_side_file(side_file)
@@ -111,7 +106,7 @@ def check_is_map(path: Path) -> bool:
         with open_regular(path) as file:
             head = file.read(PAGE_BYTES)
         if is_sparse(path):
-            raise UsageError(f"{path}: is nearly all holes, which no map is; give another file")
+            raise UsageError(f"{path}: is a sparse file, not a map; give another file")
     except FileNotFoundError:
         return False
     except OSError as error:
@@ -119,15 +114,15 @@ def check_is_map(path: Path) -> bool:
     if any(text in head for text in _TABLE_MARKERS):
         return True
     if head and not is_blank(path):
-        raise UsageError(f"{path}: is not a map of SHARE, and was left as it is; give another file")
+        raise UsageError(f"{path}: is not a SHARE map and was left unchanged; give another file")
     return wal_path(path).exists() and bool(wal_path(path).stat().st_size)
 
 
 def _check_side_file(file: Path) -> None:
-    """Raises UsageError unless it is a file of SQLite's, or not there."""
+    """Raises UsageError if the file exists and cannot be one of SQLite's."""
     what = "the log of a map" if file.suffix.endswith("-wal") else "the index of a map's log"
     if file.is_symlink():
-        raise UsageError(f"{file}: is a link; {what} lies beside it")
+        raise UsageError(f"{file}: is a link, but should be {what}; remove it")
     try:
         open_regular(file).close()
     except FileNotFoundError:
@@ -137,16 +132,16 @@ def _check_side_file(file: Path) -> None:
 
 
 def is_blank(path: Path) -> bool:
-    """A first page without tables and nothing else."""
+    """Return whether the file is only a first page without tables."""
     head = read_bytes(path, PAGE_BYTES) if os.stat(path).st_size <= PAGE_BYTES else b"CREATE "
     return head.startswith(MAGIC) and b"CREATE " not in head
 
 
 def check_header(path: Path) -> None:
-    """Raises DamageError if a byte is wrong by which SQLite would take it for another kind of file."""
+    """Raises DamageError if a fixed header byte is wrong, which could make SQLite misread the file."""
     with open_regular(path) as file:
         head, expected = file.read(_HEADER_BYTES), first_page()
-    kinds = set(head[18:20])  # of file, for writing and reading: 1 without a log, 2 with one
+    kinds = set(head[18:20])  # write and read version: 1 without a log, 2 with one
     if not is_blank(path) and (
         any(head[offset] != expected[offset] for offset in _FIXED_HEADER_BYTES) or kinds - {1, 2}
     ):
@@ -154,21 +149,16 @@ def check_header(path: Path) -> None:
 
 
 def is_map(path: Path) -> bool:
-    """Whether a file looks like a map, whole or damaged."""
+    """Return whether a file looks like a map, intact or damaged."""
     try:
         return path.is_file() and check_is_map(path)
     except UsageError:
         return False
 
 
-# ---- Why SQLite cannot write a map, as a person knows it: SQLite itself says the same of many troubles.
-
-_INDEX_BYTES = 32_768  # by which SQLite lets the index of the log grow
-_FRAME_BYTES = 24  # before each page in the log
-
-
 def why_not_written(error: sqlite3.Error, path: Path) -> str:
-    """SQLite says the same of a quota and of a broken disk: the system is asked."""
+    """Return why a write failed. SQLite reports a quota and a broken disk alike, so a test file is
+    written."""
     if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
         return "No space left on device"
     try:
@@ -182,7 +172,7 @@ def why_not_written(error: sqlite3.Error, path: Path) -> str:
 
 
 def size_limit_message(error: Exception, path: Path) -> str | None:
-    """What is wrong, where the process may not let its files grow any more and SQLite met with that."""
+    """Return a message if the process's file size limit caused `error`, else None."""
     max_bytes, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     if code != sqlite3.SQLITE_IOERR or max_bytes == resource.RLIM_INFINITY:
@@ -191,34 +181,30 @@ def size_limit_message(error: Exception, path: Path) -> str | None:
     for file, more in growth_bytes.items():
         if file.exists() and file.stat().st_size + more > max_bytes:
             return (
-                f"{file.name} may not grow beyond the file size "
-                f"limit of this process, "
-                f"{max_bytes / 1e6:.3g} MB; "
-                "raise it (ulimit -f) and start again"
+                f"{file.name} may not grow beyond the file size limit of this process, "
+                f"{max_bytes / 1e6:.3g} MB; raise it (ulimit -f) and start again"
             )
     return None
 
 
-# ---- One edge a map: a lock beside the file, that ends with its holder however that ends.
-
-
 def write_obstacle(path: Path) -> str:
-    """Why the map at `path` cannot be written, for a person; "" if it can.
+    """Return why the map at `path` cannot be written, "" if it can.
 
-    The file itself is not opened: closing it would end all locks that this process has on it (POSIX, fcntl).
+    The file itself is not opened: closing it would release all locks that this process holds on it (fcntl).
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and not os.access(path, os.W_OK):
             return "the file is read-only"
-        with tempfile.TemporaryFile(dir=path.parent):  # SQLite puts files beside it
+        with tempfile.TemporaryFile(dir=path.parent):  # SQLite makes files beside it
             return ""
     except OSError as error:
         return f"its folder cannot be written: {error.strerror or error}"
 
 
 def lock_map(path: Path) -> int:
-    """A handle; closing it gives the map free. Raises StoreError while another edge has it."""
+    """Lock the map by a file beside it, which is released when this process ends. Return a handle; close it
+    to unlock. Raises StoreError while another edge has the lock."""
     import fcntl
 
     name = path.with_name(path.name + ".lock")
@@ -230,5 +216,5 @@ def lock_map(path: Path) -> int:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(handle)
-        raise StoreError(f"{path}: another edge uses this map; end it, or give another file") from None
+        raise StoreError(f"{path}: another edge uses this map; stop it, or give another file") from None
     return handle

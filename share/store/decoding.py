@@ -1,4 +1,4 @@
-"""The rows of a map file as values, and what is missing as lines for a person."""
+"""Decode the rows of a map file to a `StoredMap`, with a line for each kind of loss."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from share.store import rows
 from share.store.rows import Row
 from share.store.salvage import ReadRows
 
-_RECONNECTED = "keyframes lost the one before them and are tied to an earlier one"
-_ABOUT_LOST = "rows about the file, and who speaks for which run, could not be read"
-_SOLUTIONS_LOST = "solutions could not be read: odometry and loops say where keyframes are"
+_RECONNECTED = "keyframes lost their predecessor and are linked to an earlier one"
+_ABOUT_LOST = "rows about the file and the credentials of runs could not be read"
+_SOLUTIONS_LOST = "solutions could not be read: keyframes are placed by odometry and loops"
 
 
 def decode_map(read_rows: ReadRows) -> StoredMap:
-    """What the rows say; they are taken out of `read_rows`. Raises StoreError for another wire version."""
+    """Decode `read_rows` and empty it. Raises StoreError for another wire version."""
     next_ids = {key: next for _, (key, next, *_) in read_rows.tables["run"]}
     all_runs, lost_runs = _decode_rows(read_rows, "run", rows.read_run)
     credentials = rows.read_credentials(read_rows.tables["about"])
@@ -39,12 +39,12 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
         _loss_line(read_rows, "about", read_rows.lost_counts["about"], _ABOUT_LOST),
         _loss_line(read_rows, "run", lost_runs, "agent runs could not be read"),
         _loss_line(read_rows, "keyframe", lost_keyframes, "keyframes could not be read"),
-        _loss_line(read_rows, "", len(orphans), "keyframes are of a run that could not be read"),
+        _loss_line(read_rows, "", len(orphans), "keyframes belong to a run that could not be read"),
         _loss_line(read_rows, "", repaired.reconnected_count if read_rows.is_damaged else 0, _RECONNECTED),
         _loss_line(read_rows, "link", lost_links, "odometry edges could not be read"),
         _loss_line(read_rows, "loop", lost_loops, "loops could not be read"),
         _loss_line(read_rows, "", len(loops) - len(connected_loops), "loops led to lost keyframes"),
-        _loss_line(read_rows, "stretch", read_rows.lost_counts["stretch"], "stretches could not be read"),
+        _loss_line(read_rows, "stretch", read_rows.lost_counts["stretch"], "segments could not be read"),
         _loss_line(read_rows, "poses", lost_poses, _SOLUTIONS_LOST),
     ]
     return StoredMap(
@@ -60,14 +60,14 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
 
 
 def _loss_line(read_rows: ReadRows, table: str, lost_count: int, what: str) -> str:
-    """One line, "" if nothing is lost."""
+    """Return one line, "" if nothing is lost."""
     if table in read_rows.uncounted:
         return f"an unknown number of {what}"
     return f"{lost_count} {what}" if lost_count else ""
 
 
 def _decode_rows(read_rows: ReadRows, table: str, decode: Callable[[Row], Any]) -> tuple[list[Any], int]:
-    """Values of a table's rows, and how many are lost. Takes the rows out, to save memory."""
+    """Return the values of a table's rows and the number of lost ones. Removes the rows, to save memory."""
     out, lost_count, numbered = [], read_rows.lost_counts[table], read_rows.tables[table]
     version_error: StoreError | None = None
     numbered.reverse()
@@ -75,9 +75,9 @@ def _decode_rows(read_rows: ReadRows, table: str, decode: Callable[[Row], Any]) 
         _, row = numbered.pop()
         try:
             out.append(decode(row))
-        except (ValueError, WireError):  # written by something that was wrong already
+        except (ValueError, WireError):  # an invalid value with a correct CRC
             lost_count += 1
-        except StoreError as error:  # of another version, as all the others, or as nothing that we wrote
+        except StoreError as error:  # another wire version; fatal only if no row can be decoded
             version_error = error
             lost_count += 1
     if version_error is not None and not out:
@@ -97,7 +97,7 @@ def _next_ids(next_ids: dict[str, int], keyframes: Sequence[StoredKeyframe]) -> 
 
 
 def _present_poses(poses: SavePoses, known_keys: set[KeyframeKey]) -> SavePoses:
-    """Of keyframes that are there."""
+    """Return the poses of known keyframes."""
     indices = [i for i, key in enumerate(poses.keys) if key in known_keys]
     return SavePoses(
         tuple(poses.keys[i] for i in indices),

@@ -1,4 +1,5 @@
-"""A map for other programs: trajectories as TUM files, its points as PLY, its loops as CSV."""
+"""Export a map for other programs: trajectories as TUM, points as PLY, loops as CSV; and describe it as
+data."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from share.recordings.trajectory import Trajectory, format_tum
 from share.store.map_store import MapStore
 from share.types import F64
 
-COLOURS: tuple[Colour, ...] = (  # matplotlib's tab10: one an agent run, in the order in which they came
+COLOURS: tuple[Colour, ...] = (  # matplotlib's tab10: one per run, in order of arrival
     (31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189),
     (140, 86, 75), (227, 119, 194), (127, 127, 127), (188, 189, 34), (23, 190, 207),
 )  # fmt: skip
@@ -28,7 +29,7 @@ COLOURS: tuple[Colour, ...] = (  # matplotlib's tab10: one an agent run, in the 
 
 @dataclass(frozen=True)
 class ExportResult:
-    """Of one map: the folder it went to, its agents by file name, how many of each."""
+    """Result for one map: its folder, the file names of its agents, and counts."""
 
     folder: Path
     agents: tuple[str, ...]
@@ -38,10 +39,10 @@ class ExportResult:
 
 
 def export_map(stored_map: StoredMap, out: Path, progress: Callable[[int], None]) -> dict[str, ExportResult]:
-    """Write every map into `out`, a new folder; of several maps each into a folder there. On error: nothing.
+    """Write the maps to `out`, a new folder; several maps each to a subfolder. On error nothing is left.
 
-    In each: NAME.tum, poses of the body at the keyframes in the map; points.ply; loops.csv. progress: told of
-    each keyframe. Raises UsageError if there is nothing to write or something in `out`, ShareError.
+    Each gets NAME.tum (body poses of the keyframes in the map), points.ply and loops.csv. progress: called
+    with 1 for each keyframe. Raises UsageError if the map is empty or `out` is not; ShareError.
     """
     if not stored_map.keyframes:
         raise UsageError("the map is empty: there is nothing to export")
@@ -51,7 +52,7 @@ def export_map(stored_map: StoredMap, out: Path, progress: Callable[[int], None]
 
 
 def file_names(stored_map: StoredMap) -> dict[str, str]:
-    """By run: the agent's name, or the run's key where several runs have one name, or one is called as it."""
+    """Return file names by run: the agent's name, or the run's key if the name is not unique or is a key."""
     names = Counter(run.hello.name for run in stored_map.runs)
     keys = {run.run_key for run in stored_map.runs}
     return {
@@ -99,7 +100,7 @@ def _point_clouds(
     T: dict[KeyframeKey, F64],
     progress: Callable[[int], None],
 ) -> Iterator[tuple[F64, Colour]]:
-    """The points that each keyframe saw, in the map, in its agent's colour."""
+    """Yield each keyframe's points in the map frame, (N, 3), and its agent's colour."""
     runs = {
         run.run_key: (run.hello.rig.T_body_cam0, COLOURS[i % len(COLOURS)])
         for i, run in enumerate(stored_map.runs)
@@ -113,19 +114,18 @@ def _point_clouds(
 
 
 def _write_loops(path: Path, loops: list[Loop]) -> None:
-    """a and b by run and number; b's body in that of a: m, and a quaternion."""
+    """Write loops: keyframes a and b by run and id; pose of b's body in a's, m and quaternion; inliers."""
     lines = ["a_run,a,b_run,b,x,y,z,qx,qy,qz,qw,inliers"]
     for loop in loops:
         numbers = (*loop.T_a_b[:3, 3], *se3.quat_from_matrix(loop.T_a_b[:3, :3]))
         pose_text = ",".join(f"{value:.9f}" for value in numbers)
-        lines.append(
-            f"{_quoted(loop.a.agent)},{loop.a.id},{_quoted(loop.b.agent)},{loop.b.id},{pose_text},{loop.inliers}"
-        )
+        a, b = f"{_quoted(loop.a.agent)},{loop.a.id}", f"{_quoted(loop.b.agent)},{loop.b.id}"
+        lines.append(f"{a},{b},{pose_text},{loop.inliers}")
     atomic_write(path, "\n".join(lines) + "\n")
 
 
 def _quoted(name: str) -> str:
-    """As RFC 4180 has it: names may have commas."""
+    """Quote a field by RFC 4180: names may contain commas."""
     return '"' + name.replace('"', '""') + '"'
 
 
@@ -134,11 +134,11 @@ def _with_final_folder(exported: ExportResult, work: Path, out: Path) -> ExportR
     return ExportResult(folder, exported.agents, exported.keyframes, exported.points, exported.loops)
 
 
-# ---- What is in a map file, as plain data: `share dataset info`.
+# ---- Description of a map file: `share dataset info`
 
 
 def describe_map(store: MapStore) -> dict[str, Any]:
-    """Agents, maps, loops, size, schema, damage. Raises ShareError."""
+    """Return agents, maps, loops, size, schema and damage as plain data. Raises ShareError."""
     stored_map = store.load()
     log = wal_path(store.path)
     return {
@@ -155,7 +155,7 @@ def describe_map(store: MapStore) -> dict[str, Any]:
 
 
 def _describe_agents(stored_map: StoredMap) -> dict[str, Any]:
-    """By file name of each run, in the order in which they came."""
+    """Return a description of each run by its file name, in order of arrival."""
     keyframe_counts = Counter(k.run_key for k in stored_map.keyframes)
     segment_counts = Counter(name.rpartition("/")[0] for name in stored_map.segments)
     names = file_names(stored_map)
@@ -171,7 +171,7 @@ def _describe_agents(stored_map: StoredMap) -> dict[str, Any]:
     }
 
 
-# ---- Point clouds as PLY files (Turk, *The PLY Polygon File Format*, 1994): binary, little-endian.
+# ---- Point clouds as PLY files (Turk, *The PLY Polygon File Format*, 1994), binary little-endian
 
 Colour = tuple[int, int, int]
 
@@ -180,9 +180,9 @@ _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
 def write_ply(path: Path, clouds: Iterable[tuple[F64, Colour]]) -> int:
-    """All points (N, 3) of all clouds, each cloud in its colour; how many. Raises ShareError.
+    """Write all clouds, points (N, 3) with a colour, and return the number of points. Raises ShareError.
 
-    The clouds are written as they come, their number into the header in the end.
+    Clouds are written as they come; the header gets the number of points at the end.
     """
     with write_errors(path), open_new(path) as file:
         file.write(_ply_header(0))
@@ -200,7 +200,7 @@ def write_ply(path: Path, clouds: Iterable[tuple[F64, Colour]]) -> int:
 
 
 def _ply_header(count: int) -> bytes:
-    """Of the same length for every count."""
+    """Return the header, of the same length for every count."""
     assert _VERTEX.fields is not None
     properties = [f"property {_PLY_TYPES[kind.str]} {name}" for name, (kind, *_) in _VERTEX.fields.items()]
     lines = [

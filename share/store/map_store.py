@@ -1,4 +1,5 @@
-"""The edge's map on disk: one SQLite file with a log (WAL), and one writer. Read docs/lookup/map-file.md."""
+"""The edge's map on disk: an SQLite file with a write-ahead log and a single writer
+(docs/lookup/map-file.md)."""
 
 from __future__ import annotations
 
@@ -16,22 +17,20 @@ from share.store.database import is_map, why_not_written
 from share.store.opening import load_and_repair, load_read_only, open_writer
 from share.store.salvage import read_intact_rows, set_aside
 
-# ---- The edge's map on disk.
-
 __all__ = ["MapStore", "is_map"]
 
 
 class MapStore:
-    """Opened by `MapStore.open`. May be called from any one thread at a time.
+    """A map file, opened by `MapStore.open` or `MapStore.read`. Not thread-safe.
 
-    writable: whether `write` can be called. reason: why not. schema: of the file, as it was found.
+    writable: `write` can be called. read_only_reason: why not. schema: of the file when it was opened.
     """
 
     def __init__(self, path: Path, loaded_map: StoredMap, schema: int, reason: str) -> None:
         self.path, self.schema, self.read_only_reason = path, schema, reason
         self._loaded_map: StoredMap | None = loaded_map
         self._db: sqlite3.Connection | None = None
-        self._file_ids: dict[Path, tuple[int, int]] = {}  # those of the map, and which they are
+        self._file_ids: dict[Path, tuple[int, int]] = {}  # device and inode of the map's files
         self._lock: int | None = None
         self._durable = False
 
@@ -41,13 +40,13 @@ class MapStore:
 
     @staticmethod
     def open(path: Path, durable: bool = False) -> MapStore:
-        """The map in `path`, made if there is none; all of it is read and checked.
+        """Open the map at `path`, or create it; all of it is read and checked.
 
-        An older schema is brought up to date after a copy, FILE.schema-N, was made. From a damaged file
-        what is whole is taken over; it stays beside as FILE.damaged-N. A file that may not be written is
-        opened for reading. power_cut: even that costs no commit, for the price of waiting for the disk.
-        Raises UsageError if it is no map, or of a newer SHARE; StoreError if another edge has it; ShareError
-        if the disk is full or fails. The file is then as it was.
+        A file of an older schema is copied to FILE.schema-N and migrated. Of a damaged file all intact rows
+        are taken over, and it is kept as FILE.damaged-N. A file that may not be written is opened for
+        reading. durable: commits wait for the disk, so that a power failure loses none. Raises UsageError if
+        it is no map, or of a newer SHARE; StoreError if another edge uses it; ShareError if the disk is full
+        or fails. The file is then unchanged.
         """
         path = path.resolve() if path.is_symlink() else path
         if path.is_dir():
@@ -69,24 +68,24 @@ class MapStore:
 
     @staticmethod
     def read(path: Path, reason: str = "it was opened for reading") -> MapStore:
-        """A map to read only, beside an edge in another process too. Raises UsageError, ShareError."""
+        """Open a map for reading; an edge may use it at the same time. Raises UsageError, ShareError."""
         return MapStore(path, *load_read_only(path), reason)
 
     def write(self, new_changes: Sequence[MapChange]) -> None:
-        """All of them or none; on return they survive the end of this process, however it ends.
+        """Write all changes or none. After the return they survive any end of this process.
 
-        Raises StoreError if the disk is full or fails: then none was kept, and it may be tried again.
+        Raises StoreError if the disk is full or fails: then none is written, and the call may be repeated.
         """
         db = self._writable_db()
         self._check_in_place()
-        self._loaded_map = None  # of before
+        self._loaded_map = None  # outdated
         try:
             db.execute("BEGIN IMMEDIATE")
             for change in new_changes:
                 changes.apply_change(db, change)
             db.execute("COMMIT")
         except BaseException as error:
-            with contextlib.suppress(sqlite3.Error):  # a full disk has rolled back by itself
+            with contextlib.suppress(sqlite3.Error):  # on a full disk SQLite has rolled back by itself
                 db.execute("ROLLBACK")
             if isinstance(error, sqlite3.Error):
                 why = why_not_written(error, self.path)
@@ -95,11 +94,11 @@ class MapStore:
         self._check_in_place()
 
     def opened_map(self) -> StoredMap:
-        """What `open` has read, before anything is written or loaded."""
+        """Return the map as `open` read it; call before `write` and `load`."""
         return StoredMap() if self._loaded_map is None else self._loaded_map
 
     def load(self) -> StoredMap:
-        """All that is kept. The first time it is what `open` has read. Raises StoreError."""
+        """Return the whole map; the first call returns what `open` read. Raises StoreError."""
         loaded, self._loaded_map = self._loaded_map, None
         if loaded is not None:
             return loaded
@@ -108,9 +107,9 @@ class MapStore:
         return decoding.decode_map(read_intact_rows(self._db))
 
     def set_aside(self) -> Path:
-        """A fresh map in place of this one, which is kept beside; its new name.
+        """Rename the map and start an empty one in its place. Return the new name of the old one.
 
-        Raises ShareError where that cannot be: then the map is as it was.
+        Raises ShareError if that fails: then the map is unchanged.
         """
         self._writable_db().close()
         try:
@@ -121,7 +120,7 @@ class MapStore:
             self._file_ids = _read_file_ids(self.path)
 
     def close(self) -> None:
-        """Moves the log into the file and gives it free."""
+        """Checkpoint the log and unlock the file."""
         if self._db is not None:
             self._db.close()
             self._db = None
@@ -130,8 +129,8 @@ class MapStore:
             self._lock = None
 
     def abandon(self) -> None:
-        """In place of `close`, while another thread waits in `write` for a disk that does not answer: nothing
-        is asked of it any more. The lock ends with the process."""
+        """Give up the file without closing it, while another thread hangs in `write`. The lock ends with the
+        process."""
         self._db = self._lock = None
 
     def __enter__(self) -> MapStore:
@@ -141,14 +140,15 @@ class MapStore:
         self.close()
 
     def _check_in_place(self) -> None:
-        """SQLite would go on writing to a file that has lost its name, and nobody would find it there."""
+        """Raises StoreError if a file was removed or replaced: SQLite would go on writing to the unlinked
+        one."""
         now = _read_file_ids(self.path)
         for path, file_id in self._file_ids.items():
             if now.get(path) != file_id:
                 what = "removed" if path not in now else "replaced"
                 raise StoreError(
                     f"{self.path}: the map cannot be written: {path.name} was {what} while the edge ran; "
-                    "put it back, or start the edge again"
+                    "put it back, or restart the edge"
                 )
 
     def _writable_db(self) -> sqlite3.Connection:
@@ -160,7 +160,7 @@ class MapStore:
 
 
 def _read_file_ids(path: Path) -> dict[Path, tuple[int, int]]:
-    """Device and inode of the map and its log, of those that are there."""
+    """Return device and inode of the map and its log, as far as they exist."""
     out = {}
     for file in (path, wal_path(path)):
         with contextlib.suppress(FileNotFoundError):

@@ -1,4 +1,4 @@
-"""What opening a map file takes: is it one, of which schema, is it whole?"""
+"""Open a map file: check that it is one and intact, migrate an older schema, salvage a damaged file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from share.store.salvage import (
 
 
 def load_and_repair(path: Path) -> StoredMap:
-    """All of a map file, before it is opened for writing; brought up to date or salvaged first."""
+    """Read a whole map file before it is opened for writing; migrate or salvage it if needed."""
     finish_salvage(path)
     if not database.check_is_map(path):
         return StoredMap()
@@ -38,14 +38,14 @@ def load_and_repair(path: Path) -> StoredMap:
         salvaged, renamed = salvage(path)
         return _with_complaint(
             decoding.decode_map(salvaged),
-            f"the file was damaged; it is kept as {renamed.name}, what is whole was taken over",
+            f"the file was damaged; it is kept as {renamed.name}, and its intact rows were taken over",
         )
 
 
 def load_read_only(path: Path) -> tuple[StoredMap, int]:
-    """All of a map file and its schema, the file left as it is."""
+    """Read a whole map file and its schema without changing the file."""
     if not database.check_is_map(path):
-        raise UsageError(f"{path}: there is no map in it")
+        raise UsageError(f"{path}: contains no map")
     try:
         version = _read_schema(path)
         if version == schema.SCHEMA:
@@ -55,11 +55,11 @@ def load_read_only(path: Path) -> tuple[StoredMap, int]:
             return _load_intact(copy), version
     except DamageError:
         salvaged = decoding.decode_map(merge_run_copies(read_damaged(path)))
-        return _with_complaint(salvaged, "the file is damaged; only what is whole was read"), schema.SCHEMA
+        return _with_complaint(salvaged, "the file is damaged; only intact rows were read"), schema.SCHEMA
 
 
 def open_writer(path: Path, durable: bool) -> sqlite3.Connection:
-    """The writer's connection to a file that `load_and_repair` found good; its tables, if it has none."""
+    """Open the writer's connection to a file that `load_and_repair` has checked; create missing tables."""
     with translate_errors(path, "opened"):
         connection = database.open_for_writing(path, durable)
         if schema.is_empty(connection):
@@ -70,23 +70,23 @@ def open_writer(path: Path, durable: bool) -> sqlite3.Connection:
 
 
 def _read_schema(path: Path) -> int:
-    """Raises UsageError for a newer schema, DamageError if the file does not say."""
+    """Return the schema number. Raises UsageError for a newer schema, DamageError if it is unreadable."""
     with translate_errors(path, "opened"), contextlib.closing(database.open_for_reading(path)) as connection:
         if schema.is_empty(connection) and database.is_blank(path):
             return schema.SCHEMA
         version = schema.read_version(connection)
     if version is None:
-        raise DamageError(f"{path}: the map is damaged: it does not say its schema")
+        raise DamageError(f"{path}: the map is damaged: its schema number is unreadable")
     if version > schema.SCHEMA:
         raise UsageError(
-            f"{path}: was made by a newer SHARE (schema {version}, this one knows {schema.SCHEMA}); "
-            "use that, or give another file"
+            f"{path}: was made by a newer SHARE (schema {version}, this one reads {schema.SCHEMA}); "
+            "use that SHARE, or give another file"
         )
     return version
 
 
 def _load_intact(path: Path) -> StoredMap:
-    """Raises DamageError unless every part of the file is whole."""
+    """Read the map. Raises DamageError unless every part of the file is intact."""
     database.check_header(path)
     with translate_errors(path, "read"), contextlib.closing(database.open_for_reading(path)) as connection:
         if schema.is_empty(connection):
@@ -103,7 +103,7 @@ def _load_intact(path: Path) -> StoredMap:
 
 
 def _upgrade(path: Path, version: int) -> None:
-    """In place, after a copy was made."""
+    """Copy the file to FILE.schema-N, then migrate it in place."""
     with (
         translate_errors(path, "opened"),
         contextlib.closing(database.open_for_writing(path, True)) as connection,
@@ -117,18 +117,18 @@ def _upgrade(path: Path, version: int) -> None:
 
 def _migrate(path: Path, version: int) -> None:
     if missing := [n for n in range(version, schema.SCHEMA) if n not in schema.MIGRATIONS]:
-        raise UsageError(f"{path}: is of schema {missing[0]}, from which no way leads to {schema.SCHEMA}")
+        raise UsageError(f"{path}: has schema {missing[0]}, which cannot be migrated to {schema.SCHEMA}")
     try:
         with (
-            translate_errors(path, "brought up to date"),
+            translate_errors(path, "migrated"),
             contextlib.closing(sqlite3.connect(path)) as connection,
         ):
             connection.isolation_level = None
             schema.migrate(connection, version, schema.MIGRATIONS)
     except DamageError as error:
-        raise StoreError(f"{error}; it is of schema {version}: use the SHARE that made it") from None
+        raise StoreError(f"{error}; it has schema {version}: use the SHARE that made it") from None
 
 
 def _with_complaint(loaded: StoredMap, complaint: str) -> StoredMap:
-    nothing_lost = () if loaded.problems else ("nothing of it is lost",)
+    nothing_lost = () if loaded.problems else ("nothing is lost",)
     return replace(loaded, problems=(complaint, *loaded.problems, *nothing_lost))

@@ -1,4 +1,4 @@
-"""Values as rows of a map file, and back. A row is whole if its CRC-32 says so."""
+"""Conversion between values and rows of a map file. Each row carries a CRC-32."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from share.types import F64, Keyframe, checked_cov, checked_id, checked_pose
 from share.wire import codec, messages
 
 M = TypeVar("M")
-Row = tuple[Any, ...]  # the columns of COLUMNS, without number and crc
+Row = tuple[Any, ...]  # columns as in COLUMNS, without number and crc
 
 COLUMNS = {
     "about": ("name", "value"),
@@ -30,19 +30,15 @@ COLUMNS = {
     "poses": ("keys", "T_map_body"),
 }
 
-_CREDENTIAL_PREFIX = "voice "  # with a run's key after it, a name in `about`: SHARE 0.1 passes over it
-_READABLE_VERSIONS = (
-    3,
-    4,
-    codec.WIRE_VERSION,
-)  # wire versions in which a Hello and a Keyframe are what they are now
+_CREDENTIAL_PREFIX = "voice "  # before a run's key, a name in `about`; SHARE 0.1 ignores it
+_READABLE_VERSIONS = (3, 4, codec.WIRE_VERSION)  # wire versions with today's Hello and Keyframe
 _pack = msgspec.msgpack.encode
 _decode_frames = msgspec.msgpack.Decoder(list[bytes]).decode
 _decode_pose_keys = msgspec.msgpack.Decoder(list[tuple[str, int, str]]).decode
 
 
 def row_crc(table: str, number: int, row: Row) -> int:
-    """CRC-32 over the table's name, the row's number and its columns, as msgpack."""
+    """Return the CRC-32 of the table's name, the row's number and its columns, as msgpack."""
     return zlib.crc32(_pack((table, number, *row)))
 
 
@@ -50,12 +46,12 @@ def is_intact(table: str, number: int, row_and_crc: Row) -> bool:
     *row, crc = row_and_crc
     try:
         return bool(row_crc(table, number, tuple(row)) == crc)
-    except (TypeError, OverflowError, ValueError):  # what is not even packable
+    except (TypeError, OverflowError, ValueError):  # not encodable as msgpack
         return False
 
 
 def insert(connection: sqlite3.Connection, table: str, row: Row, number: int | None = None) -> None:
-    """One row with its CRC, behind all others unless its number is given."""
+    """Insert a row with its CRC, after all others unless its number is given."""
     if number is None:
         behind = f"SELECT ifnull(max(number), 0) + 1 FROM {table}"
         number = int(connection.execute(behind).fetchone()[0])
@@ -73,7 +69,7 @@ def run_row(run: SaveRun, next_keyframe: int) -> Row:
 
 
 def credential_row(run: str, credential: str) -> Row:
-    """Of `about`: the public key that speaks for a run. Where none does there is no row."""
+    """Return the row of `about` with the public key of a run. A run without a key has no row."""
     return _CREDENTIAL_PREFIX + run, credential
 
 
@@ -105,7 +101,7 @@ def read_run(row: Row) -> SaveRun:
 
 
 def read_credentials(about: list[tuple[int, Row]]) -> dict[str, str]:
-    """By run, from the rows of `about`."""
+    """Return credentials by run, from the rows of `about`."""
     texts = {name: value for _, (name, value) in about if isinstance(name, str) and isinstance(value, str)}
     return {
         name.removeprefix(_CREDENTIAL_PREFIX): value
@@ -120,12 +116,12 @@ def read_keyframe(row: Row) -> StoredKeyframe:
         checked_id(name, _checked_int(number))
     decoded = _decode_message(Keyframe, version, message)
     if decoded.id != id:
-        raise ValueError(f"keyframe {agent}:{id} says that it is {decoded.id}")
+        raise ValueError(f"the message of keyframe {agent}:{id} has id {decoded.id}")
     return StoredKeyframe(_checked_text(agent), decoded, segment_name(agent, segment), ordinal)
 
 
 def segment_name(run: str, nth: int) -> str:
-    """As the atlas calls it."""
+    """Return the segment's name in the mapper."""
     return f"{run}/{nth}"
 
 
@@ -155,14 +151,14 @@ def read_poses(row: Row) -> SavePoses:
 
 
 def _encode_message(message: messages.Message) -> bytes:
-    """Its frames on the wire, as one."""
+    """Return the message's wire frames, packed."""
     return _pack([bytes(frame) for frame in codec.encode(message)])
 
 
 def _decode_message(kind: type[M], version: int, data: bytes) -> M:
     if version not in _READABLE_VERSIONS:
         raise StoreError(
-            f"keyframes in it are of wire version {version}, this SHARE reads {codec.WIRE_VERSION}: "
+            f"its keyframes have wire version {version}, this SHARE reads {codec.WIRE_VERSION}: "
             "use the SHARE that wrote it"
         )
     if not isinstance(data, bytes):

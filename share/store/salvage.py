@@ -1,7 +1,7 @@
-"""A damaged map file: what is whole of it goes into a fresh one, and it is kept beside as FILE.damaged-1.
+"""Salvage of a damaged map file: its intact rows go to a new file, and it is kept as FILE.damaged-1.
 
-The fresh file is made first, under the name FILE.salvaged; then the damaged one with its log gives its
-name up. A break in between leaves FILE.salvaged, and the next opening goes on from there.
+The new file is made first, as FILE.salvaged; then the damaged one and its log are renamed. If that is
+interrupted, FILE.salvaged remains, and the next opening finishes the work.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from share.store.database import DAMAGE_ERRORS
 from share.store.rows import COLUMNS, Row, insert, is_intact
 from share.store.schema import PAGE_BYTES, own_tables
 
-# What hangs on rows that are lost. A keyframe that its agent still has may come again under its number.
+# Rows that depend on lost ones. An agent that still has a lost keyframe may send it again under its id.
 _DELETE_ORPHANS = (
     "DELETE FROM keyframe WHERE run NOT IN (SELECT key FROM run)",
     "DELETE FROM link WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
@@ -31,7 +31,7 @@ _DELETE_ORPHANS = (
     " OR (b_run, b_id) NOT IN (SELECT run, id FROM keyframe)",
 )
 
-# Stretches whose own row is lost.
+# Segments without a row, because it is lost.
 _SEGMENTS_WITHOUT_ROW = (
     "SELECT DISTINCT run, stretch FROM keyframe"
     " WHERE (run, stretch) NOT IN (SELECT run, nth FROM stretch) ORDER BY number"
@@ -40,7 +40,7 @@ _SEGMENTS_WITHOUT_ROW = (
 
 @contextlib.contextmanager
 def temporary_copy(path: Path, folder: Path | None = None) -> Iterator[Path]:
-    """A copy of `path` and its log for the time of the block, below `folder` or where temporary files are."""
+    """Copy `path` and its log to `folder`, or the default for temporary files, for the time of the block."""
     with tempfile.TemporaryDirectory(prefix=".map.", dir=folder) as name:
         copy = Path(name) / path.name
         with write_errors(Path(name)):
@@ -52,9 +52,10 @@ def temporary_copy(path: Path, folder: Path | None = None) -> Iterator[Path]:
 
 
 def read_damaged(path: Path, folder: Path | None = None) -> ReadRows:
-    """What is whole of a damaged file, read from a copy; with a first page of our own, if that finds more.
+    """Read the intact rows of a damaged file, from a copy, as it is or with a new first page, whichever
+    yields more.
 
-    The first page says where tables begin. It is the same in all maps, but for counters.
+    The first page locates the tables. It is the same in all maps, except for counters.
     """
     with temporary_copy(path, folder) as copy:
         unchanged = _read_copy(copy)
@@ -65,7 +66,8 @@ def read_damaged(path: Path, folder: Path | None = None) -> ReadRows:
 
 
 def salvage(path: Path) -> tuple[ReadRows, Path]:
-    """Replace `path` by what is whole of it. Also answers the damaged file's new name. Raises ShareError."""
+    """Replace `path` by a file of its intact rows. Return these and the damaged file's new name. Raises
+    ShareError."""
     read_rows = merge_run_copies(read_damaged(path, path.parent))
     part = path.with_name(path.name + ".salvaged.part")
     part.unlink(missing_ok=True)
@@ -76,7 +78,8 @@ def salvage(path: Path) -> tuple[ReadRows, Path]:
 
 
 def finish_salvage(path: Path) -> Path:
-    """The last steps, each of which may be done already; `path` itself if there is nothing to finish."""
+    """Do the last steps of a salvage, of which some may be done. Return the damaged file's new name, or
+    `path` if there was nothing to do."""
     if not _salvaged_path(path).exists():
         return path
     with write_errors(path):
@@ -87,7 +90,7 @@ def finish_salvage(path: Path) -> Path:
 
 
 def set_aside(path: Path) -> Path:
-    """A map that nobody has open, and its log, get another name, which is answered. Raises ShareError."""
+    """Rename a map that is not open, and its log. Return the new name. Raises ShareError."""
     renamed = _free_name(path)
     with write_errors(path):
         for old, new in ((wal_path(path), wal_path(renamed)), (path, renamed)):
@@ -111,7 +114,7 @@ def _free_name(path: Path) -> Path:
 def _read_copy(copy: Path) -> ReadRows:
     bare = sqlite3.connect(copy, isolation_level=None)
     with contextlib.closing(database.limit_time(bare, copy)) as connection:
-        with contextlib.suppress(*DAMAGE_ERRORS):  # moves the log into the file, as far as that is whole
+        with contextlib.suppress(*DAMAGE_ERRORS):  # applies the intact part of the log
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return read_intact_rows(connection)
 
@@ -136,15 +139,16 @@ def _write_rows(read_rows: ReadRows, part: Path) -> None:
         connection.execute("COMMIT")
 
 
-# ---- All rows of a map file that are whole; what is not is counted, never guessed.
+# ---- Reading intact rows
 
-MAX_PROBES = 100_000  # numbers looked up one by one between two parts of a damaged table, and no more than
-_MIN_ROW_BYTES = 32  # rows of so many bytes that the file has room for
+MAX_PROBES = 100_000  # row numbers looked up one by one in the gap of a damaged table
+_MIN_ROW_BYTES = 32  # smallest row, which bounds the number of rows by the file size
 
 
 @dataclass
 class ReadRows:
-    """Whole rows by table, with their numbers; how many others there are; and tables where nobody knows."""
+    """Intact rows by table, with their numbers; counts of lost rows; tables whose losses cannot be
+    counted."""
 
     tables: dict[str, list[tuple[int, Row]]] = field(default_factory=dict)
     lost_counts: Counter[str] = field(default_factory=Counter)
@@ -159,7 +163,7 @@ class ReadRows:
 
 
 def read_intact_rows(connection: sqlite3.Connection) -> ReadRows:
-    """Every row of every table of our making that can be read and whose CRC is right."""
+    """Read all rows of our own tables that are readable and have a correct CRC; count the others."""
     read_rows, own = ReadRows(), _own_tables(connection)
     for table in COLUMNS:
         table_rows, all_read = _read_table(connection, table) if table in own else ({}, False)
@@ -173,7 +177,7 @@ def read_intact_rows(connection: sqlite3.Connection) -> ReadRows:
 
 
 def merge_run_copies(read_rows: ReadRows) -> ReadRows:
-    """Runs that can be read in only one of their two tables, in both."""
+    """Return the rows with each run in both of its tables, if it is readable in one."""
     first, second = (dict(read_rows.tables[table]) for table in ("run", "run_copy"))
     both = sorted((second | first).items())
     run_count = max(
@@ -194,12 +198,12 @@ def _own_tables(connection: sqlite3.Connection) -> set[str]:
 
 
 def _read_table(connection: sqlite3.Connection, table: str) -> tuple[dict[int, Row], bool]:
-    """Rows by number, and whether that is all. From the front; where that breaks, from the back; and in
-    between number by number."""
+    """Return a table's rows by number, and whether these are all: read from the front, on an error from the
+    back, and the gap number by number."""
     select = f"SELECT number, {', '.join(COLUMNS[table])}, crc FROM {table} NOT INDEXED"
     rows: dict[int, Row] = {}
     if not _read_query(connection, f"{select} LIMIT 0", (), rows):
-        return rows, False  # not even the table is known
+        return rows, False  # the table itself is unreadable
     if _read_query(connection, f"{select} ORDER BY number", (), rows):
         return rows, True
     low = next(reversed(rows), 0)
@@ -212,7 +216,7 @@ def _read_table(connection: sqlite3.Connection, table: str) -> tuple[dict[int, R
 
 
 def _max_row_count(connection: sqlite3.Connection) -> int:
-    """For how many rows a file has room."""
+    """Return how many rows the file has room for."""
     try:
         (pages,) = connection.execute("PRAGMA page_count").fetchone()
     except DAMAGE_ERRORS:
@@ -223,7 +227,7 @@ def _max_row_count(connection: sqlite3.Connection) -> int:
 def _read_query(
     connection: sqlite3.Connection, query: str, values: tuple[int, ...], rows: dict[int, Row]
 ) -> bool:
-    """Into `rows`, up to where it breaks; whether it came to the end."""
+    """Read rows into `rows` up to the first error. Return whether there was none."""
     try:
         for number, *row in connection.execute(query, values):
             rows[number] = tuple(row)
@@ -233,7 +237,7 @@ def _read_query(
 
 
 def _count_rows(connection: sqlite3.Connection, table: str) -> int | None:
-    """As an index has it, which is another part of the file; None where that cannot be read either."""
+    """Return the number of rows by an index, another part of the file; None if that is unreadable too."""
     try:
         return int(connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0])
     except DAMAGE_ERRORS:

@@ -1,7 +1,7 @@
-"""The tables of a map file, its schema number, and the way from an older schema to this one.
+"""The tables of a map file, its schema number, and migrations from older schemas.
 
-Every row ends in a CRC-32 over its table's name and its other columns: it is known to be whole by
-itself. `about` keeps its form in all schemas: versions tell each other by it which is newer.
+Every row ends in a CRC-32 of its table's name and its other columns, so each can be checked alone. The table
+`about` is the same in all schemas: it holds the schema number.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ CREATE TABLE poses(number INTEGER PRIMARY KEY, keys BLOB, T_map_body BLOB, crc I
 """  # noqa: E501
 STATEMENTS = tuple(TABLES.strip().split(";\n"))
 
-# From each older schema to the next, in SQL. None leads on from schema 1: its keyframes do not say where
-# their agents took themselves to be; nor from 2: its agents do not say how large their images are.
+# SQL from each older schema to the next. Schema 1 has no migration: its keyframes lack the odometry pose; nor
+# has 2: its agents' image sizes are missing.
 MIGRATIONS: Mapping[int, tuple[str, ...]] = {}
 
 
 def create(connection: sqlite3.Connection) -> None:
-    """All tables, in an open transaction."""
+    """Create all tables, within an open transaction."""
     for statement in STATEMENTS:
         connection.execute(statement)
     for name, value in (("schema", str(SCHEMA)), ("made by", f"SHARE {__version__}")):
@@ -46,7 +46,7 @@ def create(connection: sqlite3.Connection) -> None:
 
 
 def read_version(connection: sqlite3.Connection) -> int | None:
-    """The file's schema; None if the row that says so is not whole. Raises sqlite3.Error."""
+    """Return the file's schema number; None if its row is not intact. Raises sqlite3.Error."""
     if "about" not in own_tables(connection):
         return None
     rows = connection.execute("SELECT number, name, value, crc FROM about NOT INDEXED").fetchall()
@@ -59,7 +59,8 @@ def read_version(connection: sqlite3.Connection) -> int | None:
 def migrate(
     connection: sqlite3.Connection, from_version: int, migrations: Mapping[int, tuple[str, ...]]
 ) -> None:
-    """From schema `found` to ours, all steps or none. Raises sqlite3.Error, KeyError for a missing step."""
+    """Migrate from schema `from_version` to SCHEMA, all steps or none. Raises sqlite3.Error, KeyError for a
+    missing step."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         for number in range(from_version, SCHEMA):
@@ -74,25 +75,25 @@ def migrate(
 
 
 def matches_schema(connection: sqlite3.Connection) -> bool:
-    """Whether tables and indexes are those of this schema, to the letter."""
+    """Return whether tables and indexes are exactly those of this schema."""
     return _objects(connection) == _objects(_template())
 
 
 def own_tables(connection: sqlite3.Connection) -> set[str]:
-    """Tables that were made as ours are, to the letter. Nothing else of a file is read: a view or a virtual
-    table may compute for ever, a generated column may be of any size. Raises sqlite3.Error."""
+    """Return the tables that are defined exactly like ours. Nothing else of a file is read: a view or virtual
+    table may compute forever, a generated column may have any size. Raises sqlite3.Error."""
     return {name for kind, name, _, _ in _objects(connection) & _objects(_template()) if kind == "table"}
 
 
 def is_empty(connection: sqlite3.Connection) -> bool:
-    """Whether nothing was ever made in it."""
+    """Return whether the file has no tables."""
     return not _objects(connection)
 
 
 def first_page() -> bytes:
-    """Page 1 of a file of this schema: the header, and where each table begins.
+    """Return page 1 of a file of this schema: the header and the root page of each table.
 
-    The number of pages (bytes 28 to 31) is left open: SQLite then goes by the file's length.
+    The number of pages (bytes 28 to 31) is 0: SQLite then uses the file's length.
     """
     page = bytearray(_template().serialize()[:PAGE_BYTES])
     page[28:32] = bytes(4)

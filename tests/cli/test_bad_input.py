@@ -136,7 +136,7 @@ def leave_only_cam0(folder: Path) -> None:
 CAM0, IMU0 = Path("mav0/cam0"), Path("mav0/imu0")
 EUROC_DAMAGE = {
     "gone": (2, "no such file or folder", shutil.rmtree),
-    "empty": (2, "none of the recordings", lambda r: shutil.rmtree(r / "mav0")),
+    "empty": (2, "not a recording that SHARE reads", lambda r: shutil.rmtree(r / "mav0")),
     "no cameras": (2, "cam0/sensor.yaml: no such file", lambda r: shutil.rmtree(r / CAM0)),
     "no list": (1, "data.csv: no such file", lambda r: (r / CAM0 / "data.csv").unlink()),
     "empty list": (1, "data.csv: has no data", lambda r: (r / CAM0 / "data.csv").write_text("#t,name\n")),
@@ -246,7 +246,7 @@ def test_names_that_are_no_recording(command, room, share, tmp_path):
     note = tmp_path / "note.txt"
     note.write_text("hello")
     for source, said in (
-        (note, "none of the recordings that SHARE reads"),
+        (note, "not a recording that SHARE reads"),
         (room, f"is a session; name one of its agents: {room}/ar1, {room}/ar2, {room}/robot"),
         (room / "bob", "no agent 'bob'; agents: ar1, ar2, robot"),
         ("realsense", "RealSense camera"),  # none is attached, or the SDK is not here
@@ -566,12 +566,10 @@ def test_addresses_that_cannot_be_used(room, share, tmp_path, monkeypatch):
 
     with untouched(tmp_path):
         assert "is not an address" in complaint(agent_at("tcp://127.0.0.1:0"), 2)
-        assert "tcp://far:5555: other machines are not spoken to without keys" in complaint(
-            agent_at("tcp://far:5555"), 2
-        )
+        assert "tcp://far:5555: links to other machines need keys" in complaint(agent_at("tcp://far:5555"), 2)
         for host in ("0.0.0.0", "192.0.2.1", "[::]", "some.host"):
             done = share("edge", "--bind", f"tcp://{host}:5555", "--out", tmp_path / "out")
-            said = "without keys; make them with `share keys generate`"
+            said = "need keys; make them with `share keys generate`"
             assert said in complaint(done, 2)
 
 
@@ -665,9 +663,9 @@ def test_an_agent_leaves_a_damaged_image_out(damaged, share, tmp_path):
         done = share(*as_agent(damaged, tmp_path / "out", address), "--frames", ":27")
         assert end(server).code == 0
     assert done.code == 0
-    left_out = [line for line in done.err.splitlines() if "left out" in line]
-    assert len(left_out) == 1
-    assert left_out[0].startswith(f"share agent: a frame is left out: {damaged}/mav0/cam1/data/")
+    skipped = [line for line in done.err.splitlines() if "frame skipped" in line]
+    assert len(skipped) == 1
+    assert skipped[0].startswith(f"share agent: frame skipped: {damaged}/mav0/cam1/data/")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert (report["damaged_images"], report["frames"], report["tracked"]) == (1, 26, 26)
 
@@ -768,7 +766,7 @@ def test_an_agent_of_no_kind(share, more):
 def test_a_network_that_nobody_knows(command: tuple[str, ...]) -> None:
     done = subprocess.run([*SHARE, *command, "--link", "nowhere"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == "share: --link: 'nowhere' is no file and none of wifi5, wifi-busy\n"
+    assert done.stderr == "share: --link: 'nowhere' is neither a file nor one of wifi5, wifi-busy\n"
 
 
 def test_a_frustum_that_is_none_ends_the_edge_before_it_begins(tmp_path: Path) -> None:

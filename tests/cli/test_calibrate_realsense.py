@@ -47,7 +47,7 @@ def test_the_doctor_knows_whose_it_is(share: Callable[..., Done], tmp_path: Path
     assert line("--calib", mine) == ("OK", "0123, as the calibration says")
     for chain in mine.iterdir():
         chain.write_text(chain.read_text().replace("'0123'", "'0456'"))
-    assert line("--calib", mine) == ("WARN", "the calibration is of 0456, plugged in is 0123")
+    assert line("--calib", mine) == ("WARN", "the calibration belongs to 0456; attached is 0123")
 
 
 def test_a_calibration_that_is_there_is_not_overwritten(share: Callable[..., Done], tmp_path: Path) -> None:
@@ -81,4 +81,4 @@ def test_what_only_a_camera_has_is_not_for_a_recording(share: Callable[..., Done
 def test_a_camera_is_no_recording_to_look_into(share: Callable[..., Done]) -> None:
     done = share("dataset", "info", "realsense")
     assert done.code == 2
-    assert "recorded with `share capture`" in done.err
+    assert "record a live camera with `share capture`" in done.err

@@ -80,7 +80,7 @@ def test_convert_to_euroc_and_jpeg(walk, tmp_path):
 
 def test_wrong_use(walk, tmp_path):
     assert "no such file" in bad(2, "info", tmp_path / "no")
-    assert "none of the recordings" in bad(2, "info", tmp_path)
+    assert "not a recording that SHARE reads" in bad(2, "info", tmp_path)
     assert "share capture" in bad(2, "info", "realsense")
     assert "ends in .mcap" in bad(2, "convert", walk, "--out", tmp_path / "x.bag")
     assert "below a file" in bad(2, "convert", walk, "--out", walk / "mav0/cam0/data.csv/x.mcap")

@@ -86,7 +86,7 @@ def test_a_network_too_slow_to_tell_is_said_and_chrony_not_advised(share: Share)
     assert done.code == 1
     assert done.err.count("\n") == 1
     assert re.search(
-        r": known to no better than ±(1[5-9]|[2-9]\d)\.\d+ ms, the limit is 10 ms; a cable, a quieter",
+        r": uncertain by ±(1[5-9]|[2-9]\d)\.\d+ ms, the limit is 10 ms; use a cable, a quieter",
         done.err,
     )
 
@@ -111,7 +111,7 @@ def test_nobody_at_that_port_is_said_at_once(share: Share) -> None:
     assert done.out.splitlines()[1].split() == [f"127.0.0.1:{port}", *"–––––", "0/1", "0.0"]
     assert done.err == (
         f"share: 127.0.0.1:{port}: nothing listens at UDP port {port}; start `share sync server` there "
-        "(ntpd and chronyd have port 123)\n"
+        "(ntpd and chronyd use port 123)\n"
     )
 
 
@@ -122,7 +122,8 @@ def test_who_does_not_answer_is_given_up_after_three(share: Share, monkeypatch: 
         done = share("sync", "check", f"127.0.0.1:{port}", "--count", 50)
     assert (done.code, len(questions)) == (1, 3)
     assert (
-        f"share: 127.0.0.1:{port}: no answer; does `share sync server` run there, and is UDP port" in done.err
+        f"share: 127.0.0.1:{port}: no answer; check that `share sync server` runs there and that UDP port"
+        in done.err
     )
 
 
@@ -146,7 +147,10 @@ def test_a_kiss_of_death_ends_the_questions(share: Share) -> None:
     with udp(kiss) as port:
         done = share("sync", "check", f"127.0.0.1:{port}")
     assert (done.code, len(questions)) == (1, 1)
-    assert done.err == f"share: 127.0.0.1:{port}: it refuses to answer (DENY): it is set not to\n"
+    assert (
+        done.err
+        == f"share: 127.0.0.1:{port}: the server refuses to answer (DENY): its configuration denies it\n"
+    )
 
 
 def test_what_was_answered_before_a_kiss_counts(share: Share) -> None:
@@ -162,7 +166,7 @@ def test_what_was_answered_before_a_kiss_counts(share: Share) -> None:
         done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 50)
     assert (done.code, len(questions)) == (0, 3)
     assert " 2/3 " in done.out
-    refused = f"127.0.0.1:{port}: it refuses to answer (RATE): asked too often; wait a minute"
+    refused = f"127.0.0.1:{port}: the server refuses to answer (RATE): asked too often; wait a minute"
     assert done.err == f"{refused}\nwithin 50 ms\n"
 
 
@@ -188,8 +192,8 @@ def test_forged_answers_are_passed_over_and_the_true_one_is_taken(share: Share) 
         ),
         ("a..b", "a..b: no such host ("),
         ("host.invalid", "host.invalid: no such host ("),
-        ("11123", "'11123' is no address; give HOST or HOST:PORT, such as 192.168.1.10:11123"),
-        ("127.0.0.1:0", "'127.0.0.1:0' is no address"),
+        ("11123", "'11123' is not an address; give HOST or HOST:PORT, such as 192.168.1.10:11123"),
+        ("127.0.0.1:0", "'127.0.0.1:0' is not an address"),
         ("127.0.0.1 --count 0", "0 is not in the range 1<=x<=1000"),
         ("127.0.0.1 --limit-ms 0", "0.0 is not in the range x>0"),
     ],
@@ -248,7 +252,7 @@ def test_a_server_answers_survives_whatever_comes_and_ends_in_good_order(number:
     told = re.fullmatch(rf"answered: (\d+), clients: 1 \(last 127\.0\.0\.1\), {counts}\n", out)
     assert told, out
     assert int(told[1]) + int(told[2]) == 108
-    assert err == "share sync: 127.0.0.1 asks\n"
+    assert err == "share sync: new client: 127.0.0.1\n"
 
 
 def test_a_port_in_use_is_said(share: Share) -> None:

@@ -81,5 +81,5 @@ def test_small_messages_are_lost_as_often_as_large_ones() -> None:
 def test_what_cannot_be_is_refused(wrong: dict[str, float]) -> None:
     from share.errors import ConfigError
 
-    with pytest.raises(ConfigError, match="loss: at most"):
+    with pytest.raises(ConfigError, match="loss must be at most"):
         from_mapping(ChannelModel, wrong, "a file")

@@ -38,14 +38,14 @@ def test_nobody_is_told_to_go_back_to_an_older_firmware() -> None:
         SdkReport(firmware=("5.17.0.10",)), ["5.9.0.1", "5.16.0.1", "5.13"], None
     )
     assert (found.state, found.fix) == (CheckState.OK, ())
-    assert found.what.startswith("5.17.0.10, newer than those tried")
+    assert found.what.startswith("5.17.0.10, newer than those tested")
 
 
 def test_a_processor_for_which_there_is_no_poselib_is_told() -> None:
     assert checks.check_libraries({"numpy": None, "poselib": None}).what == "numpy, poselib load"
     found = checks.check_libraries({"numpy": None})
     assert (found.state, found.fix) == (CheckState.OK, ())
-    assert found.what.startswith("numpy load; no poselib for this processor")
+    assert found.what.startswith("numpy load; without poselib")
 
 
 def test_into_a_frozen_program_nothing_can_be_installed() -> None:
@@ -108,8 +108,8 @@ def test_the_host_is_held_against_the_profile() -> None:
     ("bits", "what", "mend"),
     [
         (0x0, "none since the start", ""),
-        (0x50005, "its supply gives too little voltage and it is slowed (get_throttled 0x50005)", "5.1 V"),
-        (0x50000, "its supply gave too little voltage and it was slowed since the start (", "5.1 V"),
+        (0x50005, "the supply voltage is too low and it is slowed (get_throttled 0x50005)", "5.1 V"),
+        (0x50000, "the supply voltage was too low and it was slowed since the start (", "5.1 V"),
         (0x80000, "it was slowed since the start (get_throttled 0x80000)", "cool it"),
         (0x8, "it is slowed (get_throttled 0x8)", "cool it"),
     ],
@@ -128,7 +128,7 @@ def test_an_edge_without_keys_or_agents_serves_its_own_machine_only() -> None:
         ("share keys generate",),
     )
     assert checks.check_edge_keys("edge", []).state is CheckState.WARN
-    assert checks.check_edge_keys("edge", ["ann", "bob"]).what == "edge; lets in: ann, bob"
+    assert checks.check_edge_keys("edge", ["ann", "bob"]).what == "edge; authorized: ann, bob"
 
 
 def test_what_mends_the_host_outlives_a_start() -> None:
@@ -175,10 +175,10 @@ def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
         return found.state, found.what
 
     assert of(T, T_10) == (CheckState.OK, "cameras (640x480) and IMU, 1 days old")
-    assert of(T, T_10, (848, 480))[1].endswith("; goes with --mode 640x480 only")
+    assert of(T, T_10, (848, 480))[1].endswith("; valid only with --mode 640x480")
     assert of(inverse(T), T_10) == (CheckState.FAIL, "the extrinsics to the IMU are inverted")
     assert of(np.eye(4), T_10)[0] is CheckState.WARN
-    assert "cam1 lies left" in of(T, inverse(T_10))[1]
+    assert "cam1 is left" in of(T, inverse(T_10))[1]
 
 
 @pytest.mark.parametrize(

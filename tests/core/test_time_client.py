@@ -50,13 +50,13 @@ def test_an_answer_and_its_bound_by_hand() -> None:
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"mode": NtpMode.CLIENT}, "mode CLIENT in place of an answer"),
-        ({"mode": NtpMode.BROADCAST}, "mode BROADCAST in place of an answer"),
-        ({"origin": NONCE + 1}, "answers another question"),
-        ({"leap": 3}, "does not know the time itself"),
-        ({"stratum": 16}, "does not know the time itself"),
-        ({"precision": 127}, r"reads its clock to no better than 2\^127 s"),
-        ({"stratum": 0}, "does not know the time itself"),  # chronyd's; a kiss has letters
+        ({"mode": NtpMode.CLIENT}, "mode CLIENT, expected SERVER"),
+        ({"mode": NtpMode.BROADCAST}, "mode BROADCAST, expected SERVER"),
+        ({"origin": NONCE + 1}, "answers another request"),
+        ({"leap": 3}, "is not synchronised itself"),
+        ({"stratum": 16}, "is not synchronised itself"),
+        ({"precision": 127}, r"has a precision of only 2\^127 s"),
+        ({"stratum": 0}, "is not synchronised itself"),  # chronyd's; a kiss has letters
         ({"receive": 0}, "unknown"),
         ({"transmit": 0}, "unknown"),
         ({"transmit": to_stamp(NOW + 6 * MS)}, "impossible"),
@@ -78,7 +78,7 @@ def test_a_kiss_of_death_is_told_by_its_code() -> None:
 def test_a_kiss_from_who_did_not_hear_the_question_is_none() -> None:
     """Else anybody could keep us from our server."""
     kiss = replace(GOOD, stratum=0, refid=b"DENY", origin=1)
-    with pytest.raises(ValueError, match="another question") as told:
+    with pytest.raises(ValueError, match="another request") as told:
         parse_reply(kiss.encode(), NONCE, NOW, NOW + MS)
     assert not isinstance(told.value, KissError)
 

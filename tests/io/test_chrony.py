@@ -40,7 +40,7 @@ def test_who_follows_nobody_is_known() -> None:
 )
 def test_what_is_not_understood_is_said(text: str) -> None:
     with pytest.raises(
-        DataError, match=r"chronyc -c tracking: not understood \(.*(expected 14|could not convert)"
+        DataError, match=r"chronyc -c tracking: cannot be parsed \(.*(expected 14|could not convert)"
     ):
         chrony.parse_tracking(text)
 

@@ -79,10 +79,10 @@ def test_why_a_camera_is_still_away_is_said_once_unless_it_is_just_not_there() -
     feed.stop()
     reader.join(5)
     assert said[:4] == [
-        "cam0, accel, gyro: no more samples come; looks for camera 0123 until it is back",
+        "cam0, accel, gyro: no more samples; waiting for camera 0123 to come back",
         "cannot be opened: busy",
         "is on USB 2.1, too slow",
-        "camera 0123 is connected again; a new stretch begins",
+        "camera 0123 is connected again; a new segment begins",
     ]
 
 
@@ -119,14 +119,14 @@ def test_a_stream_that_is_needed_and_never_comes_ends_it_in_a_line_after_one_res
     )
     feed.open()
     with pytest.raises(
-        ShareError, match="camera 0123: cam0: no sample came, nor after a hardware reset; unplug"
+        ShareError, match="camera 0123: cam0: no sample, not even after a hardware reset; unplug"
     ):
         list(feed.measurements())
     assert said == [
-        "cam0: silent; the camera is reset once",
-        "camera 0123 is connected again; a new stretch begins",
-        "cam0: no more samples come; looks for camera 0123 until it is back",
-        "camera 0123 is connected again; a new stretch begins",
+        "cam0: no samples; resetting the camera once",
+        "camera 0123 is connected again; a new segment begins",
+        "cam0: no more samples; waiting for camera 0123 to come back",
+        "camera 0123 is connected again; a new segment begins",
     ]
     assert feed.has_failed
 
@@ -140,11 +140,11 @@ def test_depth_beside_stereo_is_done_without_and_welcome_again() -> None:
     reader = threading.Thread(target=lambda: list(feed.measurements()), daemon=True)
     reader.start()
     wait(lambda: feed.health is Health.DEGRADED)
-    assert said[-1] == "depth: still silent; DEGRADED: goes on without"
+    assert said[-1] == "depth: still no samples; DEGRADED: continuing without"
     assert str(feed.status()).startswith("DEGRADED  ")
     camera.streams = (*camera.streams, "depth")
     wait(lambda: feed.health is Health.OK)
-    assert said[-1] == "depth: heard again"
+    assert said[-1] == "depth: samples come again"
     feed.stop()
     reader.join(5)
     assert (feed.report()["resets"], feed.has_failed) == (1, False)

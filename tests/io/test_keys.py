@@ -91,8 +91,8 @@ def test_names(name: str, tmp_path: Path) -> None:
     ("damage", "said"),
     [
         (lambda d: (d / "edge.secret").unlink(), "has no key pair; make one with `share keys generate --"),
-        (lambda d: (d / "edge.secret").write_text("gone"), "edge.secret: is not a secret key of SHARE"),
-        (lambda d: (d / "edge.secret").write_text(text(d / "edge.public")), "is not a secret key of SHARE"),
+        (lambda d: (d / "edge.secret").write_text("gone"), "edge.secret: is not a SHARE secret key"),
+        (lambda d: (d / "edge.secret").write_text(text(d / "edge.public")), "is not a SHARE secret key"),
         (
             lambda d: (d / "edge.secret").write_bytes(b"\xff\0"),
             "edge.secret: cannot be read: not a text file",
@@ -143,7 +143,7 @@ def test_a_public_key_is_given_as_text_line_or_file(tmp_path: Path) -> None:
         ("#" * 40, "neither a file nor a public key"),  # five of them are more than 32 bits
         ("0" * 39, "neither a file nor a public key"),
         ("share-public-key ann short", "is not `share-public-key NAME KEY`"),
-        ("{}/ann.secret", "is a secret key, which stays on its machine; give the public one"),
+        ("{}/ann.secret", "is a secret key, which must stay on its machine; give the public key"),
     ],
 )
 def test_what_is_no_public_key(given: str, said: str, tmp_path: Path) -> None:
@@ -169,13 +169,15 @@ def test_authorize_and_revoke(tmp_path: Path) -> None:
     assert text(allowed.path) == f"share-public-key bob {key(2)}\nshare-public-key ann {key(1)}\n"
     keys.revoke(tmp_path, "ann")
     assert [allowed.is_allowed(key(n)) for n in (1, 2)] == [False, True]
-    with pytest.raises(UsageError, match="'ann' is not authorized; there is bob"):
+    with pytest.raises(UsageError, match="'ann' is not authorized; authorized are: bob"):
         keys.revoke(tmp_path, "ann")
 
 
 def test_one_name_one_key(tmp_path: Path) -> None:
     keys.authorize(tmp_path, "ann", key(1))
-    with pytest.raises(UsageError, match="'ann' has another key; `share keys revoke ann`"):
+    with pytest.raises(
+        UsageError, match="'ann' has another key; remove it first with `share keys revoke ann`"
+    ):
         keys.authorize(tmp_path, "ann", key(2))
     with pytest.raises(UsageError, match="'bob': this key is authorized already, as 'ann'"):
         keys.authorize(tmp_path, "bob", key(1))
@@ -212,11 +214,11 @@ def test_what_anybody_may_write_to_lets_nobody_in(tmp_path: Path) -> None:
     assert (allowed.is_allowed(key(1)), allowed.trouble()) == (True, None)
     allowed.path.chmod(0o666)
     assert not allowed.is_allowed(key(1))
-    assert allowed.trouble() == f"{allowed.path}: anybody may write to it; `chmod o-w {allowed.path}`"
+    assert allowed.trouble() == f"{allowed.path}: all users can write to it; `chmod o-w {allowed.path}`"
     allowed.path.chmod(0o664)
     assert allowed.is_allowed(key(1))
     tmp_path.chmod(0o777)
-    with pytest.raises(UsageError, match=f"^{tmp_path}: anybody may write to it; `chmod o-w"):
+    with pytest.raises(UsageError, match=f"^{tmp_path}: all users can write to it; `chmod o-w"):
         keys.load_pair(tmp_path)
     tmp_path.chmod(0o700)
 
@@ -293,7 +295,7 @@ def house(tmp_path: Path) -> Iterator[House]:
 
 
 def test_a_host_that_cannot_be(house: House) -> None:
-    with pytest.raises(UsageError, match="'-' cannot be the name of a machine"):
+    with pytest.raises(UsageError, match="'-' is not a valid host name"):
         connect("tcp://-:5555", 1, AgentKeys(house.ann, house.pair.public))
 
 
@@ -308,10 +310,11 @@ def test_who_is_not_listed_does_not_until_listed(house: House) -> None:
     bob = house.pair_of("bob")
     agent = house.agent(2, bob)
     said = house.refusals(agent)[0]
-    assert said.endswith(f"is not authorized; to let it in: share keys authorize NAME '{bob.public}'")
+    assert said.endswith(f"is not authorized; to authorize it: share keys authorize NAME '{bob.public}'")
     assert "(127.0.0.1)" in said
     assert agent.trouble() == (
-        f"not let in: the edge does not know this key; there: share keys authorize bob '{bob.public}'"
+        "refused: the edge does not know this key; "
+        f"on the edge's machine: share keys authorize bob '{bob.public}'"
     )
     keys.authorize(house.folder, "bob", bob.public)
     house.greets(agent, 2)
@@ -322,7 +325,7 @@ def test_a_list_that_was_damaged_meanwhile_is_said(house: House) -> None:
     path = house.folder / "authorized"
     path.write_text(text(path) + "bob\n")
     said = house.refusals(house.agent(1, house.ann))
-    why = f"nobody is let in: {path}, line 2: is not `share-public-key NAME KEY`"
+    why = f"all agents are refused: {path}, line 2: is not `share-public-key NAME KEY`"
     assert set(said) == {why}
     assert house.edge.trouble() == why
     keys_before = text(path).removesuffix("bob\n")
@@ -334,14 +337,14 @@ def test_a_list_that_was_damaged_meanwhile_is_said(house: House) -> None:
 
 def test_the_key_of_another_edge(house: House) -> None:
     agent = house.agent(3, house.ann, server=house.pair_of("other").public)
-    assert "with the key of another edge" in house.refusals(agent)[0]
-    assert "has another key than --server-key says" in str(agent.trouble())
+    assert "with another edge's key" in house.refusals(agent)[0]
+    assert "has another key than --server-key" in str(agent.trouble())
 
 
 def test_an_agent_without_keys(house: House) -> None:
     agent = house.agent(4, None)
-    assert "one without keys" in house.refusals(agent)[0]
-    assert "wants keys; give --server-key" in str(agent.trouble())
+    assert "an agent without keys" in house.refusals(agent)[0]
+    assert "the edge requires keys; give its public key with --server-key" in str(agent.trouble())
     house.greets(house.agent(1, house.ann), 1)  # the edge goes on
 
 
@@ -350,7 +353,7 @@ def test_an_edge_without_keys(house: House) -> None:
     with closing(bind(house.edge.endpoint)) as plain:
         house.edge = plain
         agent = house.agent(5, house.ann)
-        assert "uses none: start it with --keys" in house.refusals(agent)[0]
+        assert "this edge does not: start it with --keys" in house.refusals(agent)[0]
         assert "or none" in str(agent.trouble())
         plain.close()
     with closing(bind(plain.endpoint, EdgeKeys(house.pair, keys.allow_list(house.folder)))) as house.edge:

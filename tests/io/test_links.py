@@ -29,11 +29,11 @@ def test_whose_link_is_which(text: str | None, ann: str | None, bob: str | None)
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("wifi5,wifi-busy", "two for all; give one, and others as AGENT=LINK"),
-        ("bob=wifi5,bob=wifi-busy", "two for bob"),
-        ("wifi5,bob=wifi6", "'wifi6' is no file"),
-        ("wifi5,", "'' is no file"),
-        ("bob=", "'' is no file"),
+        ("wifi5,wifi-busy", "two links for all; give one, and others as AGENT=LINK"),
+        ("bob=wifi5,bob=wifi-busy", "two links for bob"),
+        ("wifi5,bob=wifi6", "'wifi6' is neither a file"),
+        ("wifi5,", "'' is neither a file"),
+        ("bob=", "'' is neither a file"),
     ],
 )
 def test_what_cannot_be_read_is_said(text: str, said: str) -> None:
@@ -44,7 +44,7 @@ def test_what_cannot_be_read_is_said(text: str, said: str) -> None:
 def test_a_link_of_nobody_is_said() -> None:
     links = LinkAssignment.parse("wifi5,bop=wifi-busy")
     links.check(["ann", "bop"])
-    with pytest.raises(UsageError, match="no agent is called 'bop'; there are ann, bob"):
+    with pytest.raises(UsageError, match="there is no agent 'bop'; the agents are ann, bob"):
         links.check(["ann", "bob"])
 
 

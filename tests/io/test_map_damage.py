@@ -61,7 +61,7 @@ def check_opens(path, as_it_was, good):
     return lost
 
 
-SPEAKS = "speaks for which run, could not be read"
+CREDENTIALS_LOST = "credentials of runs could not be read"
 
 
 def check_right(found, good) -> int:
@@ -78,14 +78,14 @@ def check_right(found, good) -> int:
     voices = {run[0]: run[-1] for run in good["runs"]}
     silent = [run for run in found["runs"] if run[-1] != voices[run[0]]]
     assert {run[-1] for run in silent} <= {""}
-    assert not silent or any(SPEAKS in line for line in found["complaints"])
+    assert not silent or any(CREDENTIALS_LOST in line for line in found["complaints"])
     assert found["poses"] in (None, good["poses"]) or set(found["poses"][0]) < set(good["poses"][0])
     lost = len(was) - len(order)
     complaints = "\n".join(found["complaints"])
     assert (lost > 0) == (
-        "keyframes could not be read" in complaints or "keyframes are of a run" in complaints
+        "keyframes could not be read" in complaints or "keyframes belong to a run" in complaints
     )
-    assert len(tied) == sum(int(c.split()[0]) for c in found["complaints"] if "are tied" in c)
+    assert len(tied) == sum(int(c.split()[0]) for c in found["complaints"] if "are linked" in c)
     assert (found["poses"] is None) == ("solutions could not be read" in complaints)
     return lost
 
@@ -153,8 +153,8 @@ def test_who_speaks_for_a_run_is_taken_over_from_a_damaged_file(whole, tmp_path)
         with MapStore.open(path) as store:
             kept = store.load()
         assert [run.credential for run in kept.runs] == (["", ""] if lost else [good["runs"][0][-1], ""])
-        said = [line for line in kept.problems if SPEAKS in line]
-        assert said == ([f"{lost} rows about the file, and who {SPEAKS}"] if lost else [])
+        said = [line for line in kept.problems if CREDENTIALS_LOST in line]
+        assert said == ([f"{lost} rows about the file and the {CREDENTIALS_LOST}"] if lost else [])
         with MapStore.open(path) as store:
             assert [run.credential for run in store.load().runs] == [run.credential for run in kept.runs]
 
@@ -200,7 +200,7 @@ def test_a_lost_keyframe_that_others_hang_on(tmp_path):
     T_odom = {k.keyframe_key.id: k.keyframe.T_odom_body for k in kept.keyframes}
     assert np.allclose(T_odom[2] @ tie.T_ref_body, T_odom[6], atol=1e-12)
     assert np.linalg.eigvalsh(tie.cov - link.cov)[0] > 0
-    assert "1 keyframes lost the one before them and are tied to an earlier one" in kept.problems
+    assert "1 keyframes lost their predecessor and are linked to an earlier one" in kept.problems
 
 
 def test_damaged_twice_keeps_both(whole, tmp_path):

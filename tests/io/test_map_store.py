@@ -184,7 +184,7 @@ def test_two_loops_may_tie_one_pair(path):
 def test_a_list_of_changes_is_kept_whole_or_not_at_all(path):
     with MapStore.open(path) as store:
         store.write([run(ANN), keyframe(ANN, 0)])
-        with pytest.raises(ValueError, match=r"bob-0002 is not kept; its KeepRun comes first"):
+        with pytest.raises(ValueError, match=r"bob-0002 is not in the file; its SaveRun must come first"):
             store.write([keyframe(ANN, 1), keyframe(BOB, 0)])
         assert [k.keyframe_key.id for k in store.load().keyframes] == [0]
 
@@ -230,7 +230,7 @@ def test_what_is_no_map_is_left_as_it_is(tmp_path):
     for path in (text, other):
         before = path.read_bytes()
         for how in (MapStore.open, MapStore.read):
-            with pytest.raises(UsageError, match="is not a map of SHARE, and was left as it is"):
+            with pytest.raises(UsageError, match="is not a SHARE map and was left unchanged"):
                 how(path)
         assert path.read_bytes() == before
         assert not is_map(path)
@@ -263,7 +263,7 @@ def test_a_newer_schema_is_left_alone(path):
     schema_said(path, schema.SCHEMA + 1)
     before = path.read_bytes()
     ours = schema.SCHEMA
-    with pytest.raises(UsageError, match=rf"newer SHARE \(schema {ours + 1}, this one knows {ours}\)"):
+    with pytest.raises(UsageError, match=rf"newer SHARE \(schema {ours + 1}, this one reads {ours}\)"):
         MapStore.open(path)
     assert path.read_bytes() == before
 
@@ -274,7 +274,7 @@ def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch
         whole = told(store.load())
     schema_said(path, OLD)
     before = path.read_bytes()
-    with pytest.raises(UsageError, match=f"is of schema {OLD}, from which no way leads to {schema.SCHEMA}"):
+    with pytest.raises(UsageError, match=f"has schema {OLD}, which cannot be migrated to {schema.SCHEMA}"):
         MapStore.open(path)
     monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
     with MapStore.read(path) as reader:
@@ -294,7 +294,7 @@ def test_a_step_that_fails_leaves_the_old_file(path, monkeypatch):
     before = path.read_bytes()
     monkeypatch.setattr(schema, "MIGRATIONS", {OLD: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
     with pytest.raises(
-        StoreError, match=f"no such table: nonsense; it is of schema {OLD}: use the SHARE that made it"
+        StoreError, match=f"no such table: nonsense; it has schema {OLD}: use the SHARE that made it"
     ):
         MapStore.open(path)
     monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
@@ -379,7 +379,7 @@ def test_keyframes_of_an_earlier_wire_version_that_have_not_changed_are_read(pat
     with MapStore.open(path) as store:
         store.write(small_map())
     monkeypatch.undo()
-    with pytest.raises(StoreError, match=r"are of wire version 99, this SHARE reads \d+: use the SHARE that"):
+    with pytest.raises(StoreError, match=r"have wire version 99, this SHARE reads \d+: use the SHARE that"):
         again(path)
 
 

@@ -81,7 +81,7 @@ def test_nobody_has_to_listen():
     ("address", "what"),
     [
         ("127.0.0.1:7000", r"--poses 127\.0\.0\.1:7000: expected udp://HOST:PORT"),
-        ("udp://a b:1", "'a b:1' is no address"),
+        ("udp://a b:1", "'a b:1' is not an address"),
         ("udp://nobody.invalid:7000", "no such host"),
     ],
 )

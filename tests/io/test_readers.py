@@ -254,7 +254,7 @@ def test_cut_image_in_a_folder(tum):
 def test_what_is_no_recording(tmp_path):
     for spec, complaint in (
         (str(tmp_path / "no"), "no such file or folder"),
-        (str(tmp_path), "none of the recordings that SHARE reads"),
+        (str(tmp_path), "not a recording that SHARE reads"),
         ("realsense:1234", "share capture"),
     ):
         with pytest.raises(UsageError, match=complaint):

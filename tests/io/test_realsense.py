@@ -143,7 +143,7 @@ def test_an_imu_with_other_rates_is_read_at_the_best_of_them(offered: tuple[int,
     ) as one:
         one.start(print)
         assert (one.rates_hz["accel"], one.rates_hz["gyro"], one.rates_hz["cam0"]) == (taken, 400, 30)
-    told = [f"the camera has no accel at 250 Hz: takes {taken} Hz"]
+    told = [f"the camera has no accel at 250 Hz; using {taken} Hz"]
     assert said == ([] if taken == 250 else told)
 
 
@@ -183,7 +183,7 @@ def test_dots_of_an_emitter_that_should_be_off_are_said_once(camera: SoftwareCam
                 time.sleep(0.002)
             assert (len(said) > 0) == (k >= 30)
         assert len(got) == 70
-    assert [text.partition(":")[0] for text in said] == ["the emitter is on though it was switched off"]
+    assert [text.partition(":")[0] for text in said] == ["the emitter is on although it was switched off"]
 
 
 def test_an_interleaved_emitter_that_does_not_alternate_is_said(camera: SoftwareCamera) -> None:
@@ -242,7 +242,7 @@ class Leaving:
 @pytest.mark.parametrize("last", ["query_devices", "get_info", "query_sensors"])
 def test_a_camera_that_leaves_while_it_is_asked_is_a_line(camera: SoftwareCamera, last: str) -> None:
     context = Leaving(Listed([Leaving(camera.device, last)]), last)
-    with pytest.raises(ShareError, match=r"^RealSense camera 0123: cannot be opened: get_xu.*device; plug"):
+    with pytest.raises(ShareError, match=r"^RealSense camera 0123: cannot be opened: get_xu.*device; replug"):
         RealSenseCamera(StreamRequest(D435I), "0123", context)
 
 
@@ -268,7 +268,7 @@ def test_a_camera_that_leaves_as_it_is_started_is_a_line_and_is_let_go(
     ("devices", "says"),
     [
         ([attached("1"), attached("2")], "several RealSense cameras"),
-        ([attached(usb="2.1")], "USB 2.1, too slow"),
+        ([attached(usb="2.1")], "USB 2.1, which is too slow"),
         ([attached(firmware="5.9.14.0")], "firmware 5.9.14.0 is older than 5.12.0.0; update"),
     ],
 )

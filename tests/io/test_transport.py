@@ -274,9 +274,9 @@ def test_addresses() -> None:
 
 
 def test_only_loopback_without_keys() -> None:
-    with pytest.raises(UsageError, match=r"0\.0\.0\.0.*without keys.*`share keys generate`"):
+    with pytest.raises(UsageError, match=r"0\.0\.0\.0.*need keys.*`share keys generate`"):
         bind("tcp://0.0.0.0:0")
-    with pytest.raises(UsageError, match=r"192\.0\.2\.1.*without keys"):
+    with pytest.raises(UsageError, match=r"192\.0\.2\.1.*need keys"):
         connect("tcp://192.0.2.1:5555", 1)
 
 
@@ -363,7 +363,7 @@ def test_a_network_of_a_file(tmp_path: Path) -> None:
     file.write_text("up: {mbps: 5, delay_ms: 40}\ndown: {delay_ms: 35, jitter_ms: 2}\n")
     assert load_network(str(file)) == NetworkModel(ChannelModel(5.0, 40.0), ChannelModel(0.0, 35.0, 2.0))
     assert load_network("wifi5").round_trip_ms == pytest.approx(3.4)
-    with pytest.raises(UsageError, match="no file and none of wifi5, wifi-busy"):
+    with pytest.raises(UsageError, match="neither a file nor one of wifi5, wifi-busy"):
         load_network("wifi6")
     file.write_text("up: {speed: 5}\n")
     with pytest.raises(ConfigError, match=r"far.yaml: up: unknown key 'speed'"):

@@ -143,7 +143,7 @@ def test_an_edge_that_sends_too_much_is_left(said: bytes) -> None:
         assert between_s > 0.9
         at_end = agent.end()
     said_once = {line.partition(" (")[0] for line in at_end["said"]}  # the reason depends on who is sooner
-    assert said_once == {"the edge there sends what no edge does"}
+    assert said_once == {"disconnected from the edge, which sends what no edge does"}
 
 
 def test_it_is_tried_ever_more_rarely() -> None:

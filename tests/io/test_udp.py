@@ -106,7 +106,7 @@ def test_hosts_may_have_a_port_or_not(text: str, host: HostPort) -> None:
 )
 def test_what_is_no_host_is_said(text: str) -> None:
     with pytest.raises(
-        UsageError, match=r"is no address; give HOST or HOST:PORT, such as 192.168.1.10:11123"
+        UsageError, match=r"is not an address; give HOST or HOST:PORT, such as 192.168.1.10:11123"
     ):
         parse_host(text, 11123)
 

@@ -31,7 +31,7 @@ def test_an_edge_that_moves_an_agent_from_map_to_map_does_not_fill_the_folder(tm
         files.write_map_pose(k, np.eye(4), f"map {k}")
     files.finish(RunLog(), {})
     assert len(list(tmp_path.glob("map.before-*"))) == 100
-    assert said == ["taken into more than 100 maps: poses of those between are not kept"]
+    assert said == ["moved between more than 100 maps: poses in further ones are not kept"]
     assert len(read_tum(tmp_path / "odom.tum").stamps_ns) == 300
     assert read_tum(tmp_path / "map.tum").stamps_ns.tolist() == [299]
 

@@ -89,4 +89,4 @@ def test_images_left_out_are_told_but_not_those_before_anybody_read_the_camera()
     next(frames)
     assert seen.tick().sensor_trouble == ""
     camera.images_dropped += 1
-    assert seen.tick().sensor_trouble == "too slow for the camera: images are left out"
+    assert seen.tick().sensor_trouble == "too slow for the camera: images are dropped"

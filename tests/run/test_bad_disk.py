@@ -97,7 +97,7 @@ def test_a_disk_that_fails_for_a_while(tmp_path: Path, number: int) -> None:
         assert made.acknowledged == before
         assert any(WORDS[number] in text for text in made.shown()["trouble"])
         made.disk.is_well()
-        made.edge.wait_for("the map is kept again")
+        made.edge.wait_for("the map is saved again")
         made.ann.finish()
         made.ann.join(20)
         assert made.ann.machine.report()["open"] == 0
@@ -115,7 +115,7 @@ def test_a_disk_that_fails_to_the_end(tmp_path: Path, number: int) -> None:
         time.sleep(1.0)
         assert made.ended() == 1
         assert f"{WORDS[number]}: " in made.edge.said.splitlines()[-1]
-        assert made.edge.said.endswith("changes are not in the map's file\n")
+        assert made.edge.said.endswith("changes are not in the map file\n")
         assert "Traceback" not in made.edge.said
         assert kept_ids(made.map, tmp_path / "copy") == list(range(made.acknowledged))
 
@@ -130,7 +130,7 @@ def test_a_disk_that_does_not_answer_for_ten_seconds(tmp_path: Path) -> None:
             made.is_served()
             assert made.acknowledged == before
         trouble = "\n".join(made.shown()["trouble"])
-        assert "the map's disk has been writing for" in trouble
+        assert "a write to the map file has taken" in trouble
         assert "out: its disk has not answered for" in trouble
         made.disk.is_well()
         made.ann.finish()
@@ -150,7 +150,7 @@ def test_ctrl_c_while_the_disk_does_not_answer(tmp_path: Path) -> None:
         time.sleep(2.0)
         acknowledged = made.acknowledged
         assert made.ended() == 1
-        assert "the map's disk does not answer" in made.edge.said
+        assert "the disk of the map file does not answer" in made.edge.said
         assert "Traceback" not in made.edge.said
         made.disk.is_well()
         assert kept_ids(made.map, tmp_path / "copy") == list(range(acknowledged))
@@ -162,7 +162,7 @@ def test_the_mapper_dies_while_the_disk_does_not_answer(tmp_path: Path) -> None:
         time.sleep(1.0)
         before = made.acknowledged
         os.kill(family(made.edge.process.pid)["mapper"], signal.SIGKILL)
-        made.edge.wait_for("map: the map's disk does not answer; tried again")
+        made.edge.wait_for("map: the disk of the map file does not answer; retried")
         made.is_served()
         assert made.acknowledged == before
         made.disk.is_well()

@@ -62,7 +62,7 @@ def test_a_clock_that_was_set_back_makes_no_age() -> None:
     memory(Camera())[0].save(LEARNT)
     young, said = memory(Camera(), NOON_NS - DAY_NS)
     assert young.bias is None
-    assert said == ["the IMU's bias is taken as unknown: it is from later than this machine's clock says"]
+    assert said == ["the IMU bias is taken as unknown: its file is from the future by this machine's clock"]
 
 
 def test_a_damaged_file_costs_one_line_and_is_replaced() -> None:
@@ -71,7 +71,7 @@ def test_a_damaged_file_costs_one_line_and_is_replaced() -> None:
     run, said = memory(Camera())
     assert run.bias is None
     assert len(said) == 1
-    assert said[0].startswith("the IMU's bias is taken as unknown: ")
+    assert said[0].startswith("the IMU bias is taken as unknown: ")
     assert "0123.json: is damaged" in said[0]
     run.save(LEARNT)
     assert memory(Camera())[0].bias is not None
@@ -93,7 +93,7 @@ def test_a_folder_that_cannot_be_made_does_not_end_the_run(
     run, said = memory(Camera())
     run.save(LEARNT)
     assert len(said) == 1
-    assert said[0].startswith("the IMU's bias is not remembered: ")
+    assert said[0].startswith("the IMU bias is not saved: ")
 
 
 def test_a_recording_is_not_remembered_though_it_has_a_serial_number() -> None:

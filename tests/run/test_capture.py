@@ -98,7 +98,7 @@ def test_a_camera_that_comes_back_with_a_new_clock_begins_a_new_stretch(tmp_path
     with Bench(tmp_path / "a.mcap", quick) as bench:
         bench.feed(500_000_000, 10)
         bench.there = False
-        bench.wait(lambda: any("looks for camera" in text for text in bench.said))
+        bench.wait(lambda: any("waiting for camera" in text for text in bench.said))
         bench.there = True
         bench.wait(lambda: bench.connected == 2)
         time.sleep(0.2)

@@ -91,7 +91,7 @@ def test_who_does_not_want_to_wait_for_the_disk_is_told_how_to_save_it(tmp_path:
     assert (child.returncode, told) == (130, "")
     assert complaints.splitlines() == [
         f"share: {part}: is not closed; `share dataset recover {part} --out {tmp_path / 'a.mcap'}` "
-        "saves what it has",
+        "saves its contents",
         "share: interrupted",
     ]
     recover_recording(part, tmp_path / "b.mcap")

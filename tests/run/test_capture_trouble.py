@@ -42,7 +42,7 @@ def test_a_clock_that_begins_anew_without_a_disconnection_begins_a_new_stretch(t
     assert 40 <= len(stamps) <= 43  # 0.25 s are the price of being sure
     assert steps.min() > 0
     assert steps.max() < 1.0  # as long as it was by the host's clock
-    assert bench.said == ["the camera's clock began anew; so does a new stretch"]
+    assert bench.said == ["the camera's clock restarted; a new segment begins"]
 
 
 def test_images_by_the_hosts_clock_do_not_cost_the_imu(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_what_tells_distance_too_and_never_comes_costs_one_reset_and_the_rest_go
         bench.feed(now, 20, eyes=eyes)
         bench.run.stop()
     assert Fake.resets == 1
-    assert bench.said[-1] == f"{missing}: still silent; DEGRADED: goes on without"
+    assert bench.said[-1] == f"{missing}: still no samples; DEGRADED: continuing without"
     assert bench.report["health"] == "DEGRADED"
     source, counters = open_source(str(tmp_path / "a.mcap")), SequencerCounters()
     assert source.notes == (f"has no images of {missing}: continuing without",)
@@ -128,8 +128,8 @@ def test_eyes_that_never_see_end_it_in_a_line_after_one_reset(tmp_path: Path) ->
             now = bench.feed(now, 5, eyes=())
             assert now < MOST_US
     assert bench.error == (
-        "camera 0123: cam0, cam1: no sample came, nor after a hardware reset; unplug it and plug it in "
-        "again, with another cable or port if need be; nothing was recorded"
+        "camera 0123: cam0, cam1: no sample, not even after a hardware reset; unplug it and plug it in "
+        "again, if need be with another cable or port; nothing was recorded"
     )
     assert (Fake.resets, bench.connected) == (1, 3)
     assert list(tmp_path.iterdir()) == []
@@ -148,8 +148,9 @@ def test_a_disk_that_fills_ends_the_recording_in_a_line_and_what_was_written_is_
     reason = os.strerror(errno.EFBIG)
     assert child.returncode == 1
     out = tmp_path / "a.mcap"
+    fix = f"`share dataset recover {out}.part --out {out}` saves its contents"
     assert child.stderr.splitlines() == [
-        f"share: {out}.part: is not closed; `share dataset recover {out}.part --out {out}` saves what it has",
+        f"share: {out}.part: is not closed; {fix}",
         f"share: {out}: cannot be written: {reason}",
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.part"]

@@ -72,7 +72,9 @@ def test_a_machine_without_a_camera_is_fine_where_none_is_wanted(share: Share, t
     states = {line.split()[0] for line in done.out.split("\n\n")[0].splitlines()}
     assert (done.code, done.err) == (0, "")
     assert states <= {"OK", "WARN", "SKIPPED"}
-    assert re.search(r"^OK +clock +`share sync server` makes it the room's", done.out, re.MULTILINE)
+    assert re.search(
+        r"^OK +clock +with `share sync server` all devices follow this clock", done.out, re.MULTILINE
+    )
     assert "libraries" in done.out
 
 
@@ -117,7 +119,7 @@ def test_the_key_of_another_edge_is_found_out(share: Share, guarded: Guarded) ->
 def test_librealsense_that_hangs_or_crashes_does_not_take_us_along(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sdk_probe, "_query_sdk", lambda: time.sleep(60))
     began = time.monotonic()
-    assert "said nothing for 0.2 s" in str(sdk_probe.probe_sdk(0.2).trouble)
+    assert "did not answer for 0.2 s" in str(sdk_probe.probe_sdk(0.2).trouble)
     assert time.monotonic() - began < 10
     monkeypatch.setattr(sdk_probe, "_query_sdk", lambda: os._exit(3))
     assert "crashed" in str(sdk_probe.probe_sdk().trouble)
@@ -181,10 +183,10 @@ def test_an_edge_is_told_of_its_keys(share: Share, tmp_path: Path) -> None:
     state, what, mend = keys_of(tmp_path / "none")
     assert (state, mend) == ("WARN", ["share keys generate"]) and "this machine alone" in what
     share("keys", "generate", "--name", "edge", "--keys", tmp_path / "its")
-    assert keys_of(tmp_path / "its")[:2] == ("WARN", "edge; lets in nobody from another machine")
+    assert keys_of(tmp_path / "its")[:2] == ("WARN", "edge; no other machine is authorized")
     public = share("keys", "generate", "--name", "ann", "--keys", tmp_path / "ann").out.strip()
     share("keys", "authorize", "ann", public, "--keys", tmp_path / "its")
-    assert keys_of(tmp_path / "its")[:2] == ("OK", "edge; lets in: ann")
+    assert keys_of(tmp_path / "its")[:2] == ("OK", "edge; authorized: ann")
     (tmp_path / "its" / "authorized").write_text("half a li")
     state, what, _ = keys_of(tmp_path / "its")
     assert state == "FAIL" and "authorized, line 1" in what

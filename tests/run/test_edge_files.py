@@ -45,7 +45,8 @@ def test_a_flipped_byte(path, tmp_path):
     assert child.interrupt() == 0
     said = lines(child, path)
     assert (
-        said[0] == "the file was damaged; it is kept as room.sqlite.damaged-1, what is whole was taken over"
+        said[0]
+        == "the file was damaged; it is kept as room.sqlite.damaged-1, and its intact rows were taken over"
     )
     assert len(said) <= 4
     assert "39 keyframes of 2 runs" in said[-1]
@@ -60,8 +61,8 @@ def test_a_newer_schema(path, tmp_path):
     before = path.read_bytes()
     child = edge(tmp_path)
     assert child.wait(20) == 2
-    newer = f"was made by a newer SHARE (schema {SCHEMA + 1}, this one knows {SCHEMA})"
-    assert child.said == f"share: {path}: {newer}; use that, or give another file\n"
+    newer = f"was made by a newer SHARE (schema {SCHEMA + 1}, this one reads {SCHEMA})"
+    assert child.said == f"share: {path}: {newer}; use that SHARE, or give another file\n"
     assert path.read_bytes() == before
 
 
@@ -69,7 +70,7 @@ def test_what_is_no_map(path, tmp_path):
     path.write_text("notes")
     child = edge(tmp_path)
     assert child.wait(20) == 2
-    assert child.said == f"share: {path}: is not a map of SHARE, and was left as it is; give another file\n"
+    assert child.said == f"share: {path}: is not a SHARE map and was left unchanged; give another file\n"
     assert path.read_text() == "notes"
 
 
@@ -78,7 +79,7 @@ def test_a_map_in_use(path, tmp_path):
     first.wait_for("listening on")
     second = edge(tmp_path, "second")
     assert second.wait(20) == 1
-    assert second.said == f"share: {path}: another edge uses this map; end it, or give another file\n"
+    assert second.said == f"share: {path}: another edge uses this map; stop it, or give another file\n"
     assert first.interrupt() == 0
     assert lines(first, path) == ["40 keyframes of 2 runs, 5 loops"]
     assert "Traceback" not in first.said
@@ -96,7 +97,7 @@ def test_a_disk_that_is_full_for_a_while(tmp_path):
     assert ann.machine.report()["open"] > 2
     assert "keyframes are not acknowledged" in child.said
     resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, limits)
-    child.wait_for("the map is kept again")
+    child.wait_for("the map is saved again")
     ann.finish()
     ann.join(20)
     assert ann.error is None
@@ -148,7 +149,7 @@ def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
     child = Child(tmp_path / "again.log", "edge", "--bind", address, "--map", str(small_disk / "room.sqlite"))
     child.wait_for("keyframes are not acknowledged")
     (small_disk / "ballast").unlink()
-    child.wait_for("the map is kept again")
+    child.wait_for("the map is saved again")
     deadline = time.monotonic() + 20
     while ann.machine.report()["open"] > 1 and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -171,11 +172,11 @@ def test_a_file_that_is_taken_away_from_under_the_edge(tmp_path, how):
     if how == "replaced":
         path.write_bytes(b"")
     ann.start()
-    child.wait_for(f"room.sqlite was {how} while the edge ran; put it back, or start the edge again")
+    child.wait_for(f"room.sqlite was {how} while the edge ran; put it back, or restart the edge")
     time.sleep(0.5)
     assert ann.machine.report()["acknowledged"] == 0
     (tmp_path / "elsewhere").rename(path)
-    child.wait_for("the map is kept again")
+    child.wait_for("the map is saved again")
     ann.finish()
     ann.join(20)
     assert child.interrupt() == 0

@@ -113,7 +113,7 @@ def test_a_network_that_fails_is_left_alone_and_said_so():
     until(lambda: errors.update(frame(1), TRACKED) is not None)
     keyframe(errors, 250)
     until(lambda: said)
-    assert said == ["the error model has failed and is left alone: too bright"]
+    assert said == ["the error model failed and is switched off: too bright"]
     keyframe(errors, 6)
     assert errors.update(frame(2), TRACKED) is None
     errors.close()

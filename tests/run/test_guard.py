@@ -17,7 +17,7 @@ def test_a_failure_is_counted_and_said_once_with_its_place() -> None:
     assert guard.failure_count == 3
     [line] = said
     assert line.startswith("handling Received: ZeroDivisionError at test_guard.py:")
-    assert line.endswith("by ? zero; it is left out and the run goes on")
+    assert line.endswith("by ? zero; this step is skipped and the run goes on")
 
 
 def test_what_ends_a_run_by_intent_passes() -> None:

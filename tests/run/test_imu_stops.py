@@ -43,7 +43,7 @@ def said_of(source: Source) -> list[str]:
 )
 def test_an_imu_that_stops_is_said_once(tmp_path: Path, from_s: float, to_s: float, told: str) -> None:
     (line,) = said_of(silenced(tmp_path, from_s, to_s))
-    assert line.startswith(f"no IMU sample comes from {told} on, for 1 s at least; ")
+    assert line.startswith(f"no IMU samples from {told} on, for at least 1 s; ")
 
 
 def test_a_short_silence_is_not(tmp_path: Path) -> None:
@@ -59,5 +59,5 @@ def test_nor_is_that_of_a_camera_whose_feed_says_it(tmp_path: Path) -> None:
 def test_track_says_it(tmp_path: Path) -> None:
     said: list[str] = []
     run = track(silenced(tmp_path, 1.0), Config(), lambda result: None, said.append)
-    assert ["no IMU sample comes" in line for line in said] == [True]
+    assert ["no IMU samples" in line for line in said] == [True]
     assert run.report["sequencer"]["imu_silent"] > 30

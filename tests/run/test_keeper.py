@@ -87,12 +87,12 @@ def test_what_is_not_on_the_disk_is_not_kept(kept, reason):
     until(lambda: disk.tries > tries + 5)
     assert tickets == [ChangesSaved(0)]
     assert disk.rows == [change(0)]
-    assert said == [f"{reason}; keyframes are not acknowledged until it can"]
+    assert said == [f"{reason}; keyframes are not acknowledged until a write succeeds"]
     assert keeper.trouble == f"{reason}; keyframes are not acknowledged"
     disk.error = None
     until(lambda: tickets[-1] == ChangesSaved(39))
     assert disk.rows == [change(n) for n in range(40)]  # in order, each once
-    assert said[1:] == ["the map is kept again"]
+    assert said[1:] == ["the map is saved again"]
     assert keeper.trouble is None
 
 
@@ -111,7 +111,7 @@ def test_a_disk_that_does_not_answer_is_said(kept, monkeypatch):
     disk.go_on.clear()
     keeper.submit(SaveChanges(0, (change(0),)))
     until(lambda: keeper.trouble is not None)
-    assert "has been writing for" in keeper.trouble
+    assert "has taken" in keeper.trouble
     assert "not acknowledged" in keeper.trouble
     assert not tickets
     disk.go_on.set()
@@ -127,7 +127,7 @@ def test_a_change_that_cannot_be_kept_costs_itself(kept):
     disk.go_on.set()
     until(lambda: tickets and tickets[-1] == ChangesSaved(4))
     assert disk.rows == [change(n) for n in (0, 1, 3, 4)]
-    assert said == ["a change cannot be kept and is left out: OverflowError: int too large"]
+    assert said == ["a change cannot be saved and is skipped: OverflowError: int too large"]
 
 
 def test_solutions_do_not_pile_up(kept):
@@ -158,10 +158,10 @@ def test_what_is_left_at_the_end_is_said(kept):
     keeper, disk, tickets, said = kept
     disk.error = StoreError(FULL)
     keeper.submit(SaveChanges(0, (change(0), change(1))))
-    assert keeper.close() == f"{FULL}: 2 changes are not in the map's file"
+    assert keeper.close() == f"{FULL}: 2 changes are not in the map file"
     assert disk.closed
     assert not tickets
-    assert said[-1] == "2 changes are not in the map's file; none of their keyframes was acknowledged"
+    assert said[-1] == "2 changes are not in the map file; none of their keyframes was acknowledged"
 
 
 def test_who_ends_does_not_wait_for_a_disk_that_does_not_answer(kept, monkeypatch):
@@ -171,7 +171,7 @@ def test_who_ends_does_not_wait_for_a_disk_that_does_not_answer(kept, monkeypatc
     keeper.submit(SaveChanges(0, (change(0),)))
     until(lambda: disk.tries)
     assert not keeper.drain(0.05)
-    assert "the map's disk does not answer" in keeper.close()
+    assert "the disk of the map file does not answer" in keeper.close()
     assert disk.abandoned
     assert not disk.closed  # which would wait for the write
     assert not tickets

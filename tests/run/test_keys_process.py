@@ -68,10 +68,10 @@ def test_an_agent_with_keys_gets_in_and_others_do_not(
     assert codes == {"ann": 0, "eve": 1, "bob": 1}
     assert "connected to the edge" in started["ann"].said
     assert (
-        "not let in: the edge does not know this key; there: share keys authorize eve '"
+        "refused: the edge does not know this key; on the edge's machine: share keys authorize eve '"
         in started["eve"].said
     )
-    assert "not let in: the edge there wants keys; give --server-key" in started["bob"].said
+    assert "refused: the edge requires keys; give its public key with --server-key" in started["bob"].said
     assert server.edge.interrupt() == 0
     report = json.loads((server.out / "edge.json").read_text())
     assert list(report["agents"]) == ["ann"]
@@ -94,14 +94,14 @@ def test_one_line_each(tmp_path: Path) -> None:
         ),
         (
             ("agent", "x", "--name", "a", "--kind", "ar", "--edge", "tcp://192.0.2.1:5555"),
-            "other machines are not spoken to without keys; make them with `share keys generate`",
+            "links to other machines need keys; make them with `share keys generate`",
         ),
         (
             ("agent", "x", "--name", "a", "--kind", "ar", "--edge", "tcp://127.0.0.1:1", "--keys", "k"),
             "--keys needs --server-key",
         ),
         (("keys", "authorize", "ann", "nothing", "--keys", str(tmp_path)), "neither a file nor a public key"),
-        (("keys", "revoke", "ann", "--keys", str(tmp_path)), "'ann' is not authorized; there is nobody"),
+        (("keys", "revoke", "ann", "--keys", str(tmp_path)), "'ann' is not authorized; the list is empty"),
     ):
         done = subprocess.run([*SHARE, *arguments], capture_output=True, text=True)
         assert (done.returncode, done.stderr.count("\n"), done.stdout) == (2, 1, "")

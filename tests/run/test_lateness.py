@@ -19,5 +19,5 @@ def test_late_ones_are_counted_and_said_once_and_where_it_doubles() -> None:
     for k in range(100):
         lateness.record(100.0 * k)  # to 9.9 s
     assert [line.split(":")[0] for line in said] == [f"poses are {s:.1f} s late" for s in (1, 2, 4, 8)]
-    assert "this machine is too slow for this source; consider agent.late_ms" in said[0]
+    assert "this machine is too slow for this source; set agent.late_ms" in said[0]
     assert lateness.report() == {"frames_late": 94, "latest_s": 9.9}

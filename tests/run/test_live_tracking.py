@@ -172,7 +172,7 @@ def test_a_camera_that_was_unplugged_is_tracked_on_with_its_new_clock(plain_sess
         time.sleep(0.2)
         room.play(room.taken(feed))
         room.there = False
-        wait_for(heard("looks for camera"))
+        wait_for(heard("waiting for camera"))
         time.sleep(0.3)
         room.there = True
         wait_for(heard("connected again"))

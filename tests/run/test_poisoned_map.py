@@ -73,12 +73,12 @@ def test_a_map_that_ends_three_mappers_is_set_aside(tmp_path: Path, plain_sessio
             if pid not in killed and len(killed) < 3:
                 killed.add(pid)
                 os.kill(pid, signal.SIGKILL)
-        return "the map is set aside as" in child.said
+        return "the map file is renamed to" in child.said
 
-    until("set aside", aside, 60)
-    why = "3 mappers, one after the other, have died of it; a fresh one is begun"
-    assert f"the map is set aside as {path.name}.damaged-1: {why}" in child.said
-    assert child.said.count("mapper lost: its process was ended by SIGKILL; a new one begins in") == 3
+    until("renamed to", aside, 60)
+    why = "3 mappers in a row have died while restoring it; a new one is started"
+    assert f"the map file is renamed to {path.name}.damaged-1: {why}" in child.said
+    assert child.said.count("mapper lost: its process was ended by SIGKILL; restarted in") == 3
     agent = start_agent(tmp_path, "eve", plain_session / "ar1", address)
     assert agent.wait(60) == 0
     time.sleep(0.2)

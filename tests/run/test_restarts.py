@@ -103,9 +103,10 @@ def test_a_map_that_ends_mappers_is_set_aside(edge, path):
     step_until(run, lambda: events(told, "map"))
     assert pauses == [1, 2, 4]
     assert len(events(told, "mapper lost")) == 3
-    assert "its process ended with exit code 3; a new one begins in" in events(told, "mapper lost")[0]
-    aside = "the map is set aside as room.sqlite.damaged-1: 3 mappers, one after the other, have died of it"
-    assert events(told, "map") == [f"{aside}; a fresh one is begun"]
+    assert "its process ended with exit code 3; restarted in" in events(told, "mapper lost")[0]
+    reason = "3 mappers in a row have died while restoring it"
+    line = f"the map file is renamed to room.sqlite.damaged-1: {reason}; a new one is started"
+    assert events(told, "map") == [line]
     assert path.with_name("room.sqlite.damaged-1").read_bytes() == before
     step_until(run, lambda: run._restarts._tries == 0 and run._mapper_process.pid is not None)
     run._update_report()
@@ -156,7 +157,7 @@ def test_a_map_that_the_front_cannot_read_is_set_aside(error):
     said, store = [], Store(raises(error))
     assert MapperRestarts(store, 0.05, said.append).load_map() == (None, [])
     assert store.asides == 1
-    aside = f"the map is set aside as m.damaged-1: {type(error).__name__}: {error}; a fresh one is begun"
+    aside = f"the map file is renamed to m.damaged-1: {type(error).__name__}: {error}; a new one is started"
     assert said == [aside]
 
 
@@ -165,7 +166,7 @@ def test_a_map_that_may_not_be_written_is_no_longer_used():
     restarts = MapperRestarts(Store(raises(ValueError("x")), writable=False), 0.05, said.append)
     assert restarts.load_map() == (None, [])
     assert restarts.store is None
-    assert said == ["the map is not used any more: ValueError: x; nothing is kept"]
+    assert said == ["the map file is no longer used: ValueError: x; nothing is saved"]
 
 
 def test_who_speaks_for_a_run_is_not_known_where_no_key_did_before_and_keys_are_used(path):
@@ -191,7 +192,7 @@ def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
         run._restarts, "load_map", raises(StoreError("room: the map cannot be read: disk I/O error"))
     )
     run._restart_mapping("its process was ended")
-    assert events(told, "map") == ["room: the map cannot be read: disk I/O error; tried again in 0.01 s"]
+    assert events(told, "map") == ["room: the map cannot be read: disk I/O error; retried in 0.01 s"]
     monkeypatch.setattr(run._restarts, "load_map", found)
     step_until(run, lambda: run._restart_due_s is None)
     assert run._mapper_process is not None

@@ -48,7 +48,7 @@ def test_a_disk_that_does_not_answer_is_said_and_that_it_does_again(monkeypatch:
     write(scribe, disk, range(2, 100))
     assert time.monotonic() - began < 0.05
     assert scribe.trouble == "out: its disk has not answered for 0 s"
-    assert said == ["out: its disk has not answered for 0 s; what is to be written waits"]
+    assert said == ["out: its disk has not answered for 0 s; writes wait"]
     disk.go_on.set()
     scribe.stop()
     scribe.check()
@@ -74,7 +74,7 @@ def test_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     scribe = OutputWriter("out", said.append)
     disk.go_on.clear()
     write(scribe, disk, range(50))
-    assert said == ["out: too much waits for its disk; what comes now is left out"]
+    assert said == ["out: too many writes wait for its disk; further ones are dropped"]
     disk.go_on.set()
     scribe.stop()
     assert disk.lines == list(range(len(disk.lines)))

@@ -230,13 +230,13 @@ def test_the_page_needs_nothing_from_elsewhere():
     assert 'fetch("snapshot.json"' in page
 
 
-def test_the_page_says_whose_claims_agree_and_the_snapshot_why():
+def test_the_page_shows_the_consistency_of_agents():
     """Each field that the page reads is one of the report's."""
     told = asdict(AgentStanding("set apart", "against ann its depths are larger", 0.03, 0.002))
     with serving(lambda: {"agents": {"eve": {**AGENT, "consistency": told}}}) as server:
         assert json.loads(get(server, "/snapshot.json")[2])["agents"]["eve"]["consistency"] == told
         page = get(server, "/")[2].decode()
-    assert 'id="claims"' in page and '["set apart", "disputed"].includes' in page
+    assert 'id="consistency"' in page and '["set apart", "disputed"].includes' in page
     assert set(re.findall(r"\bc\.(\w+)", page)) - {"consistency"} <= told.keys()
     assert {"reason", "log_scale", "sigma", "put_right"} <= set(re.findall(r"\bc\.(\w+)", page))
 

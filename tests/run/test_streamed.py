@@ -97,7 +97,7 @@ def test_a_tracker_that_is_killed_costs_its_agent_only(
     assert len(first) == 2
     os.kill(first[0], signal.SIGKILL)
     assert [agent.wait(60) for agent in agents] == [0, 0]
-    text = r"tracking lost: (\w+): its process was ended by SIGKILL; the next one begins in \d+ s; odometry"
+    text = r"tracking lost: (\w+): its process was ended by SIGKILL; restarted in \d+ s; odometry"
     lost = edge.wait_for(text)
     assert edge.interrupt() == 0
     assert not any(Path(f"/proc/{pid}").exists() for pid in first)

@@ -59,10 +59,10 @@ def test_an_address_that_cannot_be_answered_costs_others_nothing_and_is_said_onc
     sent, said = serve(*forged, question("192.0.2.1", 4000), *forged, question("192.0.2.2", 4000))
     assert [to for _, to in sent] == [("192.0.2.1", 4000), ("192.0.2.2", 4000)]
     assert said == [
-        "an answer could not be sent to 192.0.2.9: Invalid argument",
-        "192.0.2.9 asks",
-        "192.0.2.1 asks",
-        "192.0.2.2 asks",
+        "cannot send a reply to 192.0.2.9: Invalid argument",
+        "new client: 192.0.2.9",
+        "new client: 192.0.2.1",
+        "new client: 192.0.2.2",
     ]
 
 
@@ -70,7 +70,7 @@ def test_a_socket_that_fails_for_a_while_is_asked_again() -> None:
     failing = [OSError(105, "No buffer space available")] * 2
     sent, said = serve(*failing, question("192.0.2.1", 4000))
     assert len(sent) == 1
-    assert said == ["nothing can be received: No buffer space available", "192.0.2.1 asks"]
+    assert said == ["cannot receive: No buffer space available", "new client: 192.0.2.1"]
 
 
 def test_an_answer_says_when_it_was_sent() -> None:

@@ -88,12 +88,12 @@ def test_what_is_encoded_is_decoded(packet: NtpPacket) -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "0 bytes; expected 48"),
-        (BY_HAND[:47], "47 bytes; expected 48"),
-        (BY_HAND + b"!", "49 bytes; expected 48, or more by whole words"),
-        (b"\x0b" + BY_HAND[1:], "NTP version 1; 3 and 4 are understood"),
-        (b"\x2b" + BY_HAND[1:], "NTP version 5; 3 and 4 are understood"),
-        (b"\x64\x11" + BY_HAND[2:], "stratum 17; the most is 16"),
+        (b"", "0 bytes; expected at least 48"),
+        (BY_HAND[:47], "47 bytes; expected at least 48"),
+        (BY_HAND + b"!", "49 bytes; expected at least 48"),
+        (b"\x0b" + BY_HAND[1:], "NTP version 1; expected 3 or 4"),
+        (b"\x2b" + BY_HAND[1:], "NTP version 5; expected 3 or 4"),
+        (b"\x64\x11" + BY_HAND[2:], "stratum 17; expected at most 16"),
     ],
 )
 def test_what_is_no_packet_is_refused_with_the_reason(data: bytes, reason: str) -> None:
@@ -114,7 +114,7 @@ def test_any_bytes_are_a_packet_or_a_value_error(data: bytes) -> None:
     "wrong", [{"stratum": 256}, {"leap": 4}, {"refid": b"TOOLONG"}, {"transmit": 1 << 64}]
 )
 def test_a_field_that_does_not_fit_is_a_value_error(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="does not fit"):
+    with pytest.raises(ValueError, match="out of range"):
         NtpPacket(NtpMode.CLIENT, **wrong).encode()  # type: ignore[arg-type]
 
 

@@ -1,4 +1,4 @@
-"""One RealSense camera: connect, read, disconnect."""
+"""A RealSense camera: connect, read, disconnect."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ from share.geometry.camera import Rig
 from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 
-_QUEUE_FRAMES = {True: 2000, False: 32}  # frames between the SDK and us: of the IMU, of images
+_QUEUE_FRAMES = {True: 2000, False: 32}  # SDK frames that may wait, of the IMU and of images
 _WAIT_MS = 100
 _DEFAULT_DEPTH_UNIT_M = 0.001
 _UNKNOWN_DOTS_WARNING = (
-    "emitter interleaved: images do not tell which of them have dots, so all are kept: kernel patch missing, "
+    "emitter interleaved: images do not show which of them have dots, so all are kept: kernel patch missing, "
     "see docs/do/record.md"
 )
-_DOTS_WARNING = (
-    "the emitter is on though it was switched off: its dots spoil tracking; plug the camera in anew"
-)
-_MIN_DOTTED_IMAGES = 30  # images with dots and none without: it does not alternate
+_DOTS_WARNING = "the emitter is on although it was switched off: its dots harm tracking; replug the camera"
+_MIN_DOTTED_IMAGES = 30  # with dots and none without: the emitter does not alternate
 _ALWAYS_DOTS_WARNING = (
     "emitter interleaved: all images have dots, so none is kept; use a profile with emitter off"
 )
@@ -38,12 +36,12 @@ Sink = Callable[[DeviceSample], None]
 
 
 class RealSenseCamera:
-    """A camera that is connected. `start` reads it in threads of its own, one for each sensor.
+    """A connected camera. `start` reads it, with one thread per sensor.
 
-    Context manager; leaving it disconnects. Frames come through `frame_queue`s of the sensors and not
-    by the SDK's pipeline, which loses IMU samples. `dotted_images` counts images left out for their dots.
-    `notify` is told, in any thread, what a person has to know.
-    Raises UsageError where no such camera can be used, ShareError where it cannot be opened.
+    Context manager; leaving it disconnects. Frames come through the sensors' `frame_queue`s, since the SDK's
+    pipeline loses IMU samples. dotted_images: number of images dropped for their dots. notify: called from
+    any thread with warnings for the user. Raises UsageError if no such camera is usable, ShareError if it
+    cannot be opened.
     """
 
     def __init__(
@@ -63,18 +61,18 @@ class RealSenseCamera:
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.dotted_images = 0
-        self._has_dark_image = False  # whether an image without dots came
+        self._has_dark_image = False  # an image without dots came
         self._image_count = 0
         self._notified = set[str]()
 
     @property
     def serial(self) -> str:
-        """By which it is found again."""
+        """Serial number."""
         return self._device.serial
 
     @property
     def rates_hz(self) -> dict[str, float]:
-        """Of every stream that is read."""
+        """Rate of each stream that is read."""
         return stream_rates_hz(self._sensors, self._request)
 
     @property
@@ -83,9 +81,10 @@ class RealSenseCamera:
 
     @property
     def rig(self) -> Rig:
-        """The factory calibration, with the profile's IMU noise; of the profile where no images are read.
+        """The factory calibration with the profile's IMU noise; the profile's rig if no images are read.
 
-        Raises ShareError, DataError."""
+        Raises ShareError, DataError.
+        """
         profile_rig = self._request.profile.rig()
         if profile_rig.imu is not None:
             profile_rig = replace(profile_rig, imu=replace(profile_rig.imu, rate_hz=self.rates_hz[GYRO]))
@@ -96,11 +95,11 @@ class RealSenseCamera:
             return factory_rig(self._rs, profiles, profile_rig.imu)
 
     def start(self, sink: Sink) -> None:
-        """Deliver samples to `sink`, which is called from several threads. Raises ShareError."""
+        """Start reading; `sink` is called with samples from several threads. Raises ShareError."""
         for name, stated_hz in self._request.rates_hz().items():
             if abs(self.rates_hz[name] - stated_hz) > 1:
                 self._notify(
-                    f"the camera has no {name} at {stated_hz:g} Hz: takes {self.rates_hz[name]:g} Hz"
+                    f"the camera has no {name} at {stated_hz:g} Hz; using {self.rates_hz[name]:g} Hz"
                 )
         for one in self._sensors:
             is_imu = GYRO in one.profiles or ACCEL in one.profiles
@@ -119,10 +118,10 @@ class RealSenseCamera:
             self._threads.append(thread)
 
     def stop(self) -> None:
-        """Stop reading and disconnect; does nothing the second time."""
+        """Stop reading and disconnect. May be repeated."""
         self._stop.set()
         for one in self._sensors:
-            with contextlib.suppress(RuntimeError):  # it may be gone, or was never started
+            with contextlib.suppress(RuntimeError):  # disconnected, or never started
                 one.sensor.stop()
             with contextlib.suppress(RuntimeError):
                 one.sensor.close()
@@ -131,7 +130,7 @@ class RealSenseCamera:
         self._threads = []
 
     def reset(self) -> None:
-        """Reset the device by its hardware: it disconnects, and comes back after some seconds."""
+        """Reset the hardware: the device disconnects and comes back after some seconds."""
         self.stop()
         with contextlib.suppress(RuntimeError):
             self._device.handle.hardware_reset()
@@ -145,10 +144,10 @@ class RealSenseCamera:
         self.stop()
 
     def _configure(self, sensor: Any) -> None:
-        """Options of a sensor, each where it has it: emitter by the profile, stamps of the device."""
+        """Set a sensor's options as far as it has them: emitter by the profile, device clock for stamps."""
         option, emitter = self._rs.option, self._request.profile.device.emitter
         dots = {
-            "off": {option.emitter_on_off: 0, option.emitter_enabled: 0},  # others may have left it on
+            "off": {option.emitter_on_off: 0, option.emitter_enabled: 0},  # another program may have set it
             "on": {option.emitter_enabled: 1, option.emitter_on_off: 0},
             "interleaved": {option.emitter_enabled: 1, option.emitter_on_off: 1},
             "none": {},
@@ -159,7 +158,7 @@ class RealSenseCamera:
             try:
                 sensor.set_option(name, value)
             except RuntimeError:
-                if name != option.emitter_on_off or value:  # not to alternate is usual, and dots are said
+                if name != option.emitter_on_off or value:  # off is the default, and dots are reported
                     raise
 
     def _read_loop(self, queue: Any, sink: Sink, depth_unit_m: float) -> None:
@@ -170,34 +169,31 @@ class RealSenseCamera:
             try:
                 sample = to_sample(self._rs, frame, depth_unit_m, time.monotonic_ns(), self._epoch)
                 accepted = self._without_dots(sample, frame)
-            except RuntimeError as error:  # of this frame; where all are so, the stream is silent
+            except RuntimeError as error:  # affects this frame; if all fail, the watchdog acts
                 self._notify_once(f"a frame cannot be read: {str(error).partition(chr(10))[0]}")
                 continue
             if accepted is not None:
                 sink(accepted)
 
     def _without_dots(self, sample: DeviceSample, frame: Any) -> DeviceSample | None:
-        """The sample, None for an image that has dots where others come without."""
+        """Return the sample, or None for an image with dots while the emitter alternates."""
         emitter = self._request.profile.device.emitter
         if sample.stream not in (CAM0, CAM1) or emitter not in ("interleaved", "off"):
             return sample
         if emitter == "off":
             self._image_count += 1
-            if self._image_count % _MIN_DOTTED_IMAGES == 1 and has_dots(
-                self._rs, frame
-            ):  # now and then: asking takes time
+            is_due = self._image_count % _MIN_DOTTED_IMAGES == 1  # reading metadata takes time
+            if is_due and has_dots(self._rs, frame):
                 self._notify_once(_DOTS_WARNING)
             return sample
         dots = has_dots(self._rs, frame)
         if dots is None:
             self._notify_once(_UNKNOWN_DOTS_WARNING)
-        self.dotted_images, self._has_dark_image = (
-            self.dotted_images + bool(dots),
-            self._has_dark_image or not dots,
-        )
+        self.dotted_images += bool(dots)
+        self._has_dark_image = self._has_dark_image or not dots
         if self.dotted_images >= _MIN_DOTTED_IMAGES and not self._has_dark_image:
             self._notify_once(_ALWAYS_DOTS_WARNING)
-        # the number counts those with dots too, which are not missing
+        # The frame number also counts images with dots, which must not count as missing.
         return None if dots else replace(sample, number=None)
 
     def _notify_once(self, text: str) -> None:
@@ -207,6 +203,6 @@ class RealSenseCamera:
 
 
 def _depth_unit(one: OpenedSensor) -> float:
-    """Metres of one step of a depth map."""
+    """Return the size of one depth step, m."""
     depth = DEPTH in one.profiles and one.sensor.is_depth_sensor()
     return float(one.sensor.as_depth_sensor().get_depth_scale()) if depth else _DEFAULT_DEPTH_UNIT_M

@@ -1,4 +1,4 @@
-"""Which cameras are attached, and whether the one that is wanted can be used."""
+"""Attached RealSense cameras: list them, choose one, check that it is usable; and load the SDK."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ KIND = "realsense"
 
 
 def is_camera(spec: str) -> bool:
-    """Whether a SOURCE is a live camera."""
+    """Return whether a SOURCE is a live camera."""
     return spec == KIND or spec.startswith(f"{KIND}:")
 
 
 def parse_serial(spec: str) -> str | None:
-    """The serial number in realsense[:SERIAL], None if there is none. Raises UsageError."""
+    """Return the serial number in realsense[:SERIAL], None without one. Raises UsageError."""
     if not is_camera(spec):
         raise UsageError(f"{spec}: is not a camera; give {KIND} or {KIND}:SERIAL")
     return spec.partition(":")[2] or None
@@ -28,7 +28,7 @@ def parse_serial(spec: str) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class AttachedDevice:
-    """A device as the SDK lists it. usb: the kind of port, such as 3.2; empty if it is not told."""
+    """A device as the SDK lists it. usb: version of the link, such as 3.2; empty if unknown."""
 
     serial: str
     name: str
@@ -38,7 +38,7 @@ class AttachedDevice:
 
 
 def list_devices(rs: Any, context: Any) -> list[AttachedDevice]:
-    """All devices with a serial number, in the SDK's order."""
+    """Return all devices with a serial number, in the SDK's order."""
     kinds = rs.camera_info
     info_keys = (kinds.serial_number, kinds.name, kinds.firmware_version, kinds.usb_type_descriptor)
     devices = []
@@ -50,12 +50,13 @@ def list_devices(rs: Any, context: Any) -> list[AttachedDevice]:
 
 
 def choose_device(devices: list[AttachedDevice], serial: str | None, facts: DeviceFacts) -> AttachedDevice:
-    """The device `serial`, or the only one. Raises NotAttachedError, UsageError if it cannot be used."""
+    """Return the device `serial`, or the only one. Raises NotAttachedError, or UsageError if not usable."""
     listed = ", ".join(f"{device.serial} ({device.name})" for device in devices)
     if not devices:
         raise NotAttachedError(
             "no RealSense camera is attached, or none may be opened; if `lsusb` shows one: `id` must show "
-            "plugdev (log in again, replug), and nothing else may use it: sudo systemctl stop 'share-agent@*'"
+            "plugdev (log in again, replug), and no other program may use it: sudo systemctl stop "
+            "'share-agent@*'"
         )
     if serial is None:
         if len(devices) > 1:
@@ -71,7 +72,7 @@ def _check_usable(device: AttachedDevice, facts: DeviceFacts) -> AttachedDevice:
     label = f"{device.name} {device.serial}"
     if device.usb.startswith("2"):
         raise UsageError(
-            f"{label}: is on USB {device.usb}, too slow for it; use a USB 3 port and a USB 3 cable"
+            f"{label}: is on USB {device.usb}, which is too slow; use a USB 3 port and a USB 3 cable"
         )
     oldest = facts.firmware_oldest
     if oldest and device.firmware and parse_version(device.firmware) < parse_version(oldest):
@@ -82,11 +83,11 @@ def _check_usable(device: AttachedDevice, facts: DeviceFacts) -> AttachedDevice:
     return device
 
 
-# ---- The SDK, imported when a camera is asked for: it is an extra of SHARE.
+# ---- The SDK, an extra of SHARE, imported only for a camera
 
 
 def load_sdk() -> Any:
-    """The module pyrealsense2. Raises UsageError that says how to get it."""
+    """Import pyrealsense2. Raises UsageError with instructions to install it."""
     try:
         import pyrealsense2
     except ModuleNotFoundError:
@@ -99,10 +100,10 @@ def load_sdk() -> Any:
 
 @contextlib.contextmanager
 def sdk_errors(label: str) -> Iterator[None]:
-    """The SDK raises RuntimeError, at any question to a camera that comes or goes: here it becomes a
-    ShareError that names `label`, in one line."""
+    """Turn the SDK's RuntimeErrors in the block, which any call to a camera that comes or goes may raise,
+    into a one-line ShareError with `label`."""
     try:
         yield
     except RuntimeError as error:
-        reason, fix = str(error).partition("\n")[0], "plug it in anew, or ask `share doctor`"
+        reason, fix = str(error).partition("\n")[0], "replug it, or run `share doctor`"
         raise ShareError(f"{label}: cannot be opened: {reason}; {fix}") from None

@@ -1,4 +1,4 @@
-"""The factory calibration of a RealSense to our rig, body = IMU."""
+"""Conversion of a RealSense's factory calibration to a `Rig`, body = IMU."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from share.types import F64, checked_pose
 
 
 def factory_rig(rs: Any, profiles: dict[str, Any], noise: ImuNoise | None) -> Rig:
-    """profiles: of cam0 and what there is of cam1, depth and gyro, by stream.
+    """Return the rig. profiles: SDK stream profiles of cam0 and, if read, of cam1, depth and gyro, by stream.
 
-    noise: of the IMU; the factory measures none. Raises DataError for a lens that SHARE has no model of,
-    or values that are none.
+    noise: of the IMU; the factory gives none. Raises DataError for an unknown lens model or invalid values.
     """
     cam0 = profiles[CAM0]
     try:
@@ -42,26 +41,26 @@ def factory_rig(rs: Any, profiles: dict[str, Any], noise: ImuNoise | None) -> Ri
 
 
 def read_extrinsics(source: Any, target: Any) -> F64:
-    """T_target_source (4, 4) of two stream profiles. The SDK's rotation is column by column."""
+    """Return T_target_source (4, 4) of two stream profiles. The SDK's rotation is column-major."""
     extrinsics = source.get_extrinsics_to(target)
     T = np.eye(4)
     T[:3, :3] = np.reshape(extrinsics.rotation, (3, 3), order="F")
     T[:3, 3] = extrinsics.translation
-    return se3.orthonormal(checked_pose("extrinsics", T))  # single precision there: rigid to 1e-7 only
+    return se3.orthonormal(checked_pose("extrinsics", T))  # the SDK's single precision is rigid to 1e-7 only
 
 
 def read_camera(rs: Any, profile: Any) -> Camera:
-    """Intrinsics of a video stream's profile. Raises ValueError for an unknown model of distortion."""
+    """Return the intrinsics of a video stream profile. Raises ValueError for an unknown distortion model."""
     intrinsics_data = profile.as_video_stream_profile().get_intrinsics()
     coefficients = tuple(float(c) for c in intrinsics_data.coeffs)
-    if intrinsics_data.model == rs.distortion.kannala_brandt4:  # T265; its fifth number is 0
+    if intrinsics_data.model == rs.distortion.kannala_brandt4:  # T265; the fifth coefficient is 0
         intrinsics = (intrinsics_data.fx, intrinsics_data.fy, intrinsics_data.ppx, intrinsics_data.ppy)
         return Camera(
             intrinsics_data.width, intrinsics_data.height, *intrinsics, coefficients[:4], EQUIDISTANT
         )
     if any(coefficients) and intrinsics_data.model != rs.distortion.brown_conrady:
         raise ValueError(
-            f"distortion model {intrinsics_data.model} is not known; calibrate with `share calibrate camera`"
+            f"distortion model {intrinsics_data.model} is unknown; calibrate with `share calibrate camera`"
         )
     return Camera(
         intrinsics_data.width,

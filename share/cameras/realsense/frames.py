@@ -1,4 +1,4 @@
-"""Frames of the SDK to samples. Pixels are copied at once: the SDK has few buffers and wants them back."""
+"""Conversion of SDK frames to samples. Pixels are copied at once, since the SDK has few buffers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 from share.types import F32
 
-_INTEGER_TOLERANCE = 1e-3  # so far from a whole number a depth unit's inverse may be
+_INTEGER_TOLERANCE = 1e-3  # of the inverse of a depth unit
 
 
 def to_sample(rs: Any, frame: Any, depth_unit_m: float, arrived_ns: int, epoch: int) -> DeviceSample:
-    """An image, a depth map (in m) or three values, with the device's stamp to the microsecond."""
+    """Return a sample: an image, a depth map (m) or three IMU values, with the device's stamp in whole µs."""
     stream = _stream_name(rs, frame.profile)
     motion = stream in (ACCEL, GYRO)
     return DeviceSample(
@@ -31,12 +31,10 @@ def to_sample(rs: Any, frame: Any, depth_unit_m: float, arrived_ns: int, epoch: 
 
 
 def has_dots(rs: Any, frame: Any) -> bool | None:
-    """Whether the emitter was on; None where the frame does not say, for want of metadata."""
+    """Return whether the emitter was on; None if the frame lacks the metadata."""
     metadata = rs.frame_metadata_value
-    for kind in (
-        metadata.frame_emitter_mode,
-        metadata.frame_laser_power_mode,
-    ):  # the power itself is a setting
+    # Not the laser power, which is only a setting.
+    for kind in (metadata.frame_emitter_mode, metadata.frame_laser_power_mode):
         if frame.supports_frame_metadata(kind):
             return bool(frame.get_frame_metadata(kind))
     return None
@@ -60,8 +58,8 @@ def _pixels(frame: Any, stream: str, depth_unit_m: float) -> NDArray[Any]:
 
 
 def scale_depth(steps: NDArray[np.uint16], unit_m: float) -> F32:
-    """(H, W) depth in m. The unit is told in single precision: one of 1/n m is taken to be just that, and
-    divided by. So whole millimetres come out to the last bit, and are recorded as such."""
+    """Return depth (H, W) in m. The SDK gives the unit in single precision. A unit near 1/n m is taken as
+    exactly that, by division, so that whole millimetres are exact to the last bit."""
     n = round(1 / unit_m)
     if n and abs(1 / unit_m - n) < _INTEGER_TOLERANCE:
         return np.asarray(steps / np.float32(n))

@@ -1,4 +1,4 @@
-"""Which RealSense cameras librealsense sees, asked in a process of its own: it can hang or crash."""
+"""Query the cameras that librealsense sees, in a child process, since it can hang or crash."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _TIMEOUT_S = 10.0
 
 
 def probe_sdk(timeout_s: float = _TIMEOUT_S) -> SdkReport:
-    """Never raises: what went wrong is in `trouble`."""
-    context = multiprocessing.get_context("fork")  # a frozen program has no Python to start
+    """Return the SDK's view of the cameras. Errors are reported in `trouble`, never raised."""
+    context = multiprocessing.get_context("fork")  # a frozen program has no Python to spawn
     receiver, sender = context.Pipe(duplex=False)
     child = context.Process(
         target=_send_result, args=(sender, os.getpid(), child_processes.is_main_thread()), daemon=True
@@ -26,7 +26,7 @@ def probe_sdk(timeout_s: float = _TIMEOUT_S) -> SdkReport:
     try:
         if not receiver.poll(timeout_s):
             return SdkReport(
-                f"librealsense said nothing for {timeout_s:g} s; unplug the camera and plug it in again"
+                f"librealsense did not answer for {timeout_s:g} s; unplug the camera and plug it in again"
             )
         answer: SdkReport = receiver.recv()
         return answer

@@ -1,4 +1,4 @@
-"""realsense[:SERIAL] to a feed of its samples, and to a SOURCE."""
+"""Open the SOURCE realsense[:SERIAL], as a feed of samples or as a live source."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def make_feed(
     notify: Callable[[str], None],
     queue: SampleQueue,
 ) -> CameraFeed:
-    """What the camera delivers. It is not opened yet."""
+    """Return the camera's feed, not yet opened."""
     return CameraFeed(
         lambda serial, epoch: RealSenseCamera(request, serial, epoch=epoch, notify=notify),
         parse_serial(spec),
@@ -40,7 +40,7 @@ def open_live(
     notify: Callable[[str], None],
     calibration: Calibration | None = None,
 ) -> LiveSource:
-    """The camera as a source, with the factory's calibration or another.
+    """Open the camera as a source, with `calibration` or else the factory's.
 
     Raises UsageError, ShareError, DataError.
     """

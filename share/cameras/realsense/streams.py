@@ -1,4 +1,4 @@
-"""Which of a device's stream profiles are opened."""
+"""Choice of the stream profiles of a RealSense to open."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.sensors.profile_types import InertialFacts, Profile
 from share.sensors.sample_processor import ACCEL, GYRO
 
-_RANGE_MARGIN = 1.1
-_MIN_IMU_HZ = 100  # of an IMU; slower ones are taken only where there is nothing else
-ProfileMatcher = Callable[[Any], bool]  # whether a profile of the SDK is the one
+_RANGE_MARGIN = 1.1  # for the correction of scale and bias
+_MIN_IMU_HZ = 100  # slower rates are used only if there is no other
+ProfileMatcher = Callable[[Any], bool]  # whether an SDK stream profile is the requested one
 
 
 @dataclass(frozen=True)
 class StreamRequest:
-    """What to read: images, depth, IMU, as the firmware profile says. right: the other eye's images too."""
+    """Streams to read, with modes by the firmware profile. right: also the right images (cam1)."""
 
     profile: Profile
     images: bool = True
@@ -27,39 +27,40 @@ class StreamRequest:
     right: bool = True
 
     def rates_hz(self) -> dict[str, float]:
-        """Expected rate of every stream. Of images with an interleaved emitter, every other one is used."""
+        """Return the expected rate of each stream; of images half with an interleaved emitter."""
         imu = self.profile.device.imu
         rates = {ACCEL: imu.accel.rate_hz, GYRO: imu.gyro.rate_hz}
         image_hz = self.profile.rate_hz / (2 if self.is_interleaved else 1)
         return rates | {name: self.profile.rate_hz if name == DEPTH else image_hz for name in self.cameras}
 
     def imu_range(self) -> ImuRange:
-        """Beyond what the sensor shows where it saturates, by as much as its scale and bias are corrected."""
+        """Return the range of valid IMU samples: the sensor's, with a margin for scale and bias
+        corrections."""
         imu = self.profile.device.imu
         return ImuRange(_RANGE_MARGIN * imu.gyro.range, _RANGE_MARGIN * imu.accel.range)
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The streams of images."""
+        """Names of the image streams."""
         options = ((CAM0, self.images), (CAM1, self.images and self.right), (DEPTH, self.depth))
         return tuple(name for name, is_requested in options if is_requested)
 
     @property
     def is_interleaved(self) -> bool:
-        """Whether the dots are on in every other image."""
+        """Whether every other image has dots."""
         return self.profile.device.emitter == "interleaved"
 
 
 @dataclass(frozen=True, eq=False)
 class OpenedSensor:
-    """One sensor of a device and those of its profiles that are wanted, by our name of the stream."""
+    """A sensor of a device and its requested stream profiles, by our stream names."""
 
     sensor: Any
     profiles: dict[str, Any]
 
 
 def choose_streams(rs: Any, device: Any, request: StreamRequest) -> list[OpenedSensor]:
-    """Sensors and profiles for all that is wanted. Raises UsageError naming what the device lacks."""
+    """Return sensors and profiles for all requested streams. Raises UsageError that lists missing ones."""
     missing = {name: _matchers(rs, name, request) for name in request.rates_hz()}
     out = []
     for sensor in device.query_sensors():
@@ -81,7 +82,7 @@ def choose_streams(rs: Any, device: Any, request: StreamRequest) -> list[OpenedS
 
 
 def _infrared_modes(rs: Any, device: Any) -> list[str]:
-    """Of the left eye, as --mode takes them."""
+    """Return the modes of the left infrared camera, in the form of --mode."""
     modes = set()
     for p in (p for sensor in device.query_sensors() for p in sensor.get_stream_profiles()):
         if (p.stream_type(), p.stream_index(), p.format()) == (rs.stream.infrared, 1, rs.format.y8):
@@ -91,7 +92,7 @@ def _infrared_modes(rs: Any, device: Any) -> list[str]:
 
 
 def stream_rates_hz(sensors: list[OpenedSensor], request: StreamRequest) -> dict[str, float]:
-    """Of every stream as it comes: an IMU may have other rates than the profile states."""
+    """Return the actual rate of each stream: an IMU's may differ from the profile's."""
     inertial = {
         name: float(profile.fps())
         for one in sensors
@@ -102,14 +103,15 @@ def stream_rates_hz(sensors: list[OpenedSensor], request: StreamRequest) -> dict
 
 
 def preferred_hz(facts: InertialFacts) -> list[float]:
-    """An IMU's rates, best first: as stated, then the nearest of those that are enough, then the others."""
+    """Return an IMU's rates, best first: the stated one, then the nearest sufficient ones, then the
+    others."""
     return sorted(
         facts.rates_hz, key=lambda hz: (hz != facts.rate_hz, hz < _MIN_IMU_HZ, abs(hz - facts.rate_hz))
     )
 
 
 def _matchers(rs: Any, name: str, request: StreamRequest) -> tuple[list[ProfileMatcher], str]:
-    """What knows the stream's profile, the best first, and words for it."""
+    """Return matchers of the stream's profile, best first, and their description."""
     imu = request.profile.device.imu
     if name in (ACCEL, GYRO):
         kind, facts = (rs.stream.accel, imu.accel) if name == ACCEL else (rs.stream.gyro, imu.gyro)
