@@ -16,7 +16,7 @@ import click  # noqa: E402
 
 from share import __version__  # noqa: E402
 from share.cli.signals import unwind_on_signal  # noqa: E402
-from share.cli.stderr import flush_all
+from share.cli.stderr import flush_all  # noqa: E402
 from share.errors import ShareError, UsageError, one_line  # noqa: E402
 
 # name: (module, attribute, one line of help). A literal table, so that a freezer sees every module.
