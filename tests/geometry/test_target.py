@@ -36,8 +36,8 @@ def test_charuco_corners_are_opencvs_seen_with_y_up():
     [
         (lambda: AprilGrid(rows=0), "rows: 0 must be positive"),
         (lambda: AprilGrid(tag_size=float("nan")), "tag_size: nan must be positive"),
-        (lambda: AprilGrid(tag_spacing=1.5), "tag_spacing: 1.5 is a share"),
-        (lambda: AprilGrid(rows=30, cols=20), "30 x 20 tags: the family 36h11 has 587"),
+        (lambda: AprilGrid(tag_spacing=1.5), "tag_spacing: 1.5 must be below 1"),
+        (lambda: AprilGrid(rows=30, cols=20), "30 x 20 tags: the family 36h11 has only 587"),
         (lambda: CharucoBoard(squares_x=1), "1 x 7 squares have no inner corner"),
         (lambda: CharucoBoard(marker=0.08), "marker: 0.08 m does not fit"),
         (lambda: CharucoBoard(dictionary="DICT_9X9"), "dictionary: 'DICT_9X9' is not known"),

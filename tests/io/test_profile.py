@@ -132,7 +132,7 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
         (
             "rate_hz: 400\n",
             "rate_hz: 400\n      rate_hz: 200\n",
-            "line 47: not valid YAML: key 'rate_hz' for the second",
+            "line 47: not valid YAML: duplicate key 'rate_hz'",
         ),
         (
             "rates_hz: [30, 15, 60, 90]",
