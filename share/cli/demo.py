@@ -123,7 +123,7 @@ def _renderable_scene(scene: str | None) -> str:
         return scene
     missing_renderer = missing_reason()
     if missing_renderer is not None:
-        click.echo(f"share: using the plain room, because {missing_renderer}", err=True)
+        click.echo(f"share: using the plain room: {missing_renderer}", err=True)
     return DEFAULT_SCENE if missing_renderer is None else FALLBACK_SCENE
 
 

@@ -75,7 +75,8 @@ def doctor(
     failed = failures(findings)
     click.echo(_report_json(host.name, findings, not failed) if as_json else _findings_text(findings))
     if failed:
-        raise ShareError(f"doctor: {len(failed)} checks failed: {', '.join(one.name for one in failed)}")
+        names = ", ".join(one.name for one in failed)
+        raise ShareError(f"doctor: {len(failed)} check{'s'[: len(failed) != 1]} failed: {names}")
 
 
 def _report_json(profile: str, findings: Sequence[CheckResult], is_ok: bool) -> str:

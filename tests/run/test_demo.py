@@ -77,7 +77,7 @@ def test_without_opengl_it_plays_the_plain_room(plain_cache, tmp_path):
     done = demo(plain_cache, tmp_path / "out", "--seconds", "3", "--seed", "18", **hidden)
     assert done.returncode == 0, done.stderr
     assert re.fullmatch(
-        r"share: the plain room, because cannot draw without a screen \(.+\): apt install .+\n", done.stderr
+        r"share: using the plain room: cannot draw without a screen \(.+\): apt install .+\n", done.stderr
     )
     joined = re.search(r"(\d) of 3 agents in one map(, joint ATE \d\.\d\d cm)?", done.stdout)
     assert joined  # three seconds may be too short to meet: then there is no shared map to draw

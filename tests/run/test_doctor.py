@@ -90,7 +90,7 @@ def test_an_edge_that_is_not_there_fails_in_one_line(
     monkeypatch.setattr(doctor.probe_edge, "__defaults__", (0.3,))
     done = share("doctor", *LAPTOP, "--edge", "tcp://127.0.0.1:1", "--keys", tmp_path / "none")
     assert done.code == 1
-    assert done.err == "share: doctor: 1 FAIL: edge\n"
+    assert done.err == "share: doctor: 1 check failed: edge\n"
     assert "no answer within 0.3 s" in done.out
     assert "share edge --bind tcp://127.0.0.1:1" in done.out
 
