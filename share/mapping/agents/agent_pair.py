@@ -38,6 +38,7 @@ _ENDED_SEGMENTS: SegmentPair = (-1, -1)  # key of the newest loops of removed se
 _MIN_SIGMAS = 4.5  # significance of a disagreement: none by chance in thousands of comparisons
 _MAX_TILT_RAD = np.radians(1.0)  # harmless below
 _MIN_TILTS = 8  # loops with known up directions
+_MIN_TILT_VIEWS = 5  # keyframes of either agent in them: loops of one view share its error
 
 # Severity, a disagreement begins at 1; text about the second agent, and about the first.
 Contradiction = tuple[float, str, str]
@@ -231,9 +232,11 @@ def tilt_between(
 
 def gravity_contradictions(loops: list[InterAgentLoop]) -> list[Contradiction]:
     """Contradiction between the two agents' up directions, if enough loops know them."""
-    known = np.array([w.tilt for w in loops if w.tilt is not None]).reshape(-1, 2)
-    if len(known) < _MIN_TILTS:
+    with_tilt = [w for w in loops if w.tilt is not None]
+    views = min(len({w.a.index for w in with_tilt}), len({w.b.index for w in with_tilt}))
+    if len(with_tilt) < _MIN_TILTS or views < _MIN_TILT_VIEWS:
         return []
+    known = np.array([w.tilt for w in with_tilt])
     angle, sigmas = float(np.median(known[:, 0])), float(np.median(known[:, 0] / known[:, 1]))
     text = f"its up direction is {np.degrees(angle):.1f} degrees off"
     return [(min(angle / _MAX_TILT_RAD, sigmas / _MIN_SIGMAS), text, text)]
