@@ -38,7 +38,7 @@ _ENDED_SEGMENTS: SegmentPair = (-1, -1)  # key of the newest loops of removed se
 _MIN_SIGMAS = 4.5  # significance of a disagreement: none by chance in thousands of comparisons
 _MAX_TILT_RAD = np.radians(1.0)  # harmless below
 _MIN_TILTS = 8  # loops with known up directions
-_MIN_TILT_VIEWS = 5  # keyframes of either agent in them: loops of one view share its error
+_MIN_VIEWS = 5  # keyframes of either agent in loops that are compared: loops of one view share its error
 
 # Severity, a disagreement begins at 1; text about the second agent, and about the first.
 Contradiction = tuple[float, str, str]
@@ -71,7 +71,7 @@ class SegmentPairLoops:
         `solve_comparison`.
         """
         self.comparison = self.recent_comparison = None
-        if len(self.loops) < _MIN_LOOPS:
+        if len(self.loops) < _MIN_LOOPS or _count_views(self.loops) < _MIN_VIEWS:
             return None
         with suppress(np.linalg.LinAlgError):
             equations = comparison_equations(self.loops)
@@ -218,6 +218,11 @@ def _most_redundant_loop(loops: list[InterAgentLoop]) -> int:
 # Contradictions
 
 
+def _count_views(loops: Sequence[InterAgentLoop]) -> int:
+    """Count the keyframes in the loops, of the agent that has fewer."""
+    return min(len({loop.a.index for loop in loops}), len({loop.b.index for loop in loops}))
+
+
 def tilt_between(
     up_a: F64, sigma_a: float, up_b: F64, sigma_b: float, edge: PoseEdge
 ) -> tuple[float, float] | None:
@@ -233,8 +238,7 @@ def tilt_between(
 def gravity_contradictions(loops: list[InterAgentLoop]) -> list[Contradiction]:
     """Contradiction between the two agents' up directions, if enough loops know them."""
     with_tilt = [w for w in loops if w.tilt is not None]
-    views = min(len({w.a.index for w in with_tilt}), len({w.b.index for w in with_tilt}))
-    if len(with_tilt) < _MIN_TILTS or views < _MIN_TILT_VIEWS:
+    if len(with_tilt) < _MIN_TILTS or _count_views(with_tilt) < _MIN_VIEWS:
         return []
     known = np.array([w.tilt for w in with_tilt])
     angle, sigmas = float(np.median(known[:, 0])), float(np.median(known[:, 0] / known[:, 1]))
