@@ -38,7 +38,7 @@ _ENDED_SEGMENTS: SegmentPair = (-1, -1)  # key of the newest loops of removed se
 _MIN_SIGMAS = 4.5  # significance of a disagreement: none by chance in thousands of comparisons
 _MAX_TILT_RAD = np.radians(1.0)  # harmless below
 _MIN_TILTS = 8  # loops with known up directions
-_MIN_VIEWS = 5  # keyframes of either agent in loops that are compared: loops of one view share its error
+_MIN_VIEWS = 8  # keyframes of either agent in loops that are compared: loops of one view share its error
 
 # Severity, a disagreement begins at 1; text about the second agent, and about the first.
 Contradiction = tuple[float, str, str]
