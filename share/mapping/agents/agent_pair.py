@@ -38,7 +38,7 @@ _ENDED_SEGMENTS: SegmentPair = (-1, -1)  # key of the newest loops of removed se
 _MIN_SIGMAS = 4.5  # significance of a disagreement: none by chance in thousands of comparisons
 _MAX_TILT_RAD = np.radians(1.0)  # harmless below
 _MIN_TILTS = 8  # loops with known up directions
-_MIN_VIEWS = 8  # keyframes of either agent in loops that are compared: loops of one view share its error
+_MIN_VIEWS = 8  # keyframes of either agent in loops that contradict: loops of one view share its error
 
 # Severity, a disagreement begins at 1; text about the second agent, and about the first.
 Contradiction = tuple[float, str, str]
@@ -71,7 +71,7 @@ class SegmentPairLoops:
         `solve_comparison`.
         """
         self.comparison = self.recent_comparison = None
-        if len(self.loops) < _MIN_LOOPS or _count_views(self.loops) < _MIN_VIEWS:
+        if len(self.loops) < _MIN_LOOPS:
             return None
         with suppress(np.linalg.LinAlgError):
             equations = comparison_equations(self.loops)
@@ -140,7 +140,7 @@ class AgentPair:
         contradictions = [
             *self._depth_contradictions(),
             *gravity_contradictions(all_loops),
-            *gravity_contradictions(segment_loops.loops[-_MIN_LOOPS:]),
+            *gravity_contradictions(segment_loops.loops[-_RECENT_LOOPS:]),
         ]
         for others in self.by_segments.values():
             contradictions += self._path_contradictions(others)
@@ -183,7 +183,9 @@ class AgentPair:
         return [scale_contradiction(scale, self._tolerance, *words) for scale in estimates]
 
     def _path_contradictions(self, segment_loops: SegmentPairLoops) -> list[Contradiction]:
-        out = []
+        out: list[Contradiction] = []
+        if _count_views(segment_loops.loops) < _MIN_VIEWS:
+            return out
         for comparison in (segment_loops.comparison, segment_loops.recent_comparison):
             if comparison is None:
                 continue
