@@ -93,7 +93,7 @@ def configuration_keys() -> int:
     return sum(len(dataclasses.fields(getattr(Config(), field.name))) for field in dataclasses.fields(Config))
 
 
-class Recorder:
+class CallRecorder:
     """The functions of `share` that are entered while it is on."""
 
     def __init__(self) -> None:
@@ -141,7 +141,7 @@ def trace_frames(session: Path) -> list[set[tuple[str, str]]]:
     source, config = open_source(str(session / next(iter(read_session(session).agents)))), Config()
     tracker, out = make_source_tracker(source, config), []
     for frame in read_frames(source, config, SequencerCounters()):
-        recorder = Recorder()
+        recorder = CallRecorder()
         with recorder.on():
             result = tracker.track(frame)
         if result.state.has_pose:
@@ -165,7 +165,7 @@ def trace_keyframes(session: Path) -> list[set[tuple[str, str]]]:
         def call(*arguments: Any, **named: Any) -> Any:
             if name == "add_keyframe":
                 out.append(set())
-            recorder = Recorder()
+            recorder = CallRecorder()
             with recorder.on():
                 result = method(*arguments, **named)
             if out:

@@ -77,11 +77,6 @@ class NtpEstimate:
     stratum: int
     answers: int
 
-    @property
-    def max_difference_ns(self) -> int:
-        """Largest possible difference of the clocks."""
-        return abs(self.offset_ns) + self.uncertainty_ns
-
 
 def make_request(nonce: int) -> bytes:
     """Return a request. nonce: 64 random bits in place of the transmit time. The reply must repeat them, so

@@ -168,12 +168,6 @@ def reprojection_residuals(
     )
 
 
-def refit(state: CameraBundleState, views: Sequence[BoardView], target: Target) -> CameraBundleState:
-    """Estimate the target's poses in other views with fixed intrinsics and T_cam1_cam0."""
-    poses = np.stack([_initial_pose(state, view, target) for view in views])
-    return _solve(views, target, replace(state, T_cam0_target=poses), cameras_fixed=True).state
-
-
 def _board_points(view: BoardView, cam: int, target: Target) -> F64:
     """Return the corners (N, 2) m on the target that a camera sees."""
     return target.corners[view.detections[cam].ids, :2]
@@ -221,13 +215,6 @@ def _initial_stereo(
     ]
     poses = [first[k] if k in first else se3.inverse(median_mount) @ second[k] for k in range(count)]
     return CameraBundleState((singles[0].cameras[0], singles[1].cameras[0]), median_mount, np.stack(poses))
-
-
-def _initial_pose(state: CameraBundleState, view: BoardView, target: Target) -> F64:
-    cam = int(np.argmax([len(detection) for detection in view.detections]))
-    detection = view.detections[cam]
-    T = camera_initialisation.board_pose(state.cameras[cam], target.corners[detection.ids, :2], detection.px)
-    return T if cam == 0 else se3.inverse(state.T_cam1_cam0) @ T
 
 
 def _linearise(
@@ -279,24 +266,22 @@ def shared_size(cameras: Sequence[Camera]) -> int:
     return int(intrinsic_slices(cameras)[-1].stop) + 6 * (len(cameras) - 1)
 
 
-def _solve(
-    views: Sequence[BoardView], target: Target, state: CameraBundleState, cameras_fixed: bool = False
-) -> CameraBundleSolution:
+def _solve(views: Sequence[BoardView], target: Target, state: CameraBundleState) -> CameraBundleSolution:
     """Levenberg-Marquardt in three runs; each fixes the scale of Huber's weights."""
     for _ in range(3):
         blocks = [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
         limit = _HUBER_SIGMAS * robust_sigma(np.concatenate([r for r, _ in blocks]))
-        state = _levenberg_marquardt(views, target, state, limit, cameras_fixed)
+        state = _levenberg_marquardt(views, target, state, limit)
     return _solution(views, target, state, limit)
 
 
 def _levenberg_marquardt(
-    views: Sequence[BoardView], target: Target, state: CameraBundleState, limit: float, cameras_fixed: bool
+    views: Sequence[BoardView], target: Target, state: CameraBundleState, limit: float
 ) -> CameraBundleState:
     damping, blocks = 1e-4, [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
     cost = _cost(blocks, limit)
     for _ in range(_MAX_ITERATIONS):
-        trial = _updated_state(state, *_solve_step(blocks, limit, damping, cameras_fixed))
+        trial = _updated_state(state, *_solve_step(blocks, limit, damping))
         trial_blocks = (
             [_linearise_view(trial, v, k, target) for k, v in enumerate(views)] if trial else blocks
         )
@@ -327,15 +312,11 @@ def _normal_equations(block: tuple[F64, F64], limit: float) -> tuple[F64, F64]:
     return A.T @ A, A.T @ b
 
 
-def _solve_step(
-    blocks: list[tuple[F64, F64]], limit: float, damping: float, cameras_fixed: bool
-) -> tuple[F64, F64]:
+def _solve_step(blocks: list[tuple[F64, F64]], limit: float, damping: float) -> tuple[F64, F64]:
     """Return the step of the shared parameters (S,) and of the poses (V, 6)."""
     H, g = _view_normal_equations(blocks, limit)
     S = H.shape[1] - 6
     reduced, back_substitution = _schur_complement(H, g, damping)
-    if cameras_fixed:
-        return np.zeros(S), back_substitution[..., -1]
     total = reduced.sum(axis=0)
     damped = damping * np.diag(np.diag(H[:, :S, :S].sum(axis=0)))
     shared = np.linalg.solve(total[:, :S] + damped, total[:, S])

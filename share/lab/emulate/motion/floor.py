@@ -9,10 +9,8 @@ import numpy as np
 from share.lab.emulate.world.occupancy import Occupancy
 from share.types import F64
 
-_MIN_OBSTACLE_M, _MAX_OBSTACLE_M = (
-    0.10,
-    1.95,
-)  # m; lower steps are walked over, higher beams are walked under
+_MIN_OBSTACLE_M = 0.10  # lower steps are walked over
+_MAX_OBSTACLE_M = 1.95  # higher beams are walked under
 _VOXELS_PER_CELL = 2  # voxels of the occupancy per grid cell
 
 

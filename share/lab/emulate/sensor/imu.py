@@ -6,7 +6,6 @@ random walk of density w, sigma w sqrt(dt) a step; a first-order Gauss-Markov pa
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +14,6 @@ from share.lab.emulate.sensor.clock import unwrapped_stamps
 from share.lab.emulate.sensor.indexed_random import Seed
 from share.sensors.profile_types import InertialFacts
 from share.types import F64, I64, ImuBatch
-
-InertialMotion = Callable[
-    [I64], tuple[F64, F64]
-]  # stamps (N,) ns -> angular rate, specific force, each (N, 3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,10 +26,8 @@ _MAX_JSON_BYTES = 50 * MB
 _MAX_PARTS = 50_000  # of one kind: nodes, meshes, primitives, accessors …
 _MAX_CORNERS = 12 * MAX_TRIANGLES  # trimesh copies them for each part of a mesh
 _MAX_DEPTH = 100  # nesting of nodes
-_MAX_PIXELS, _MAX_TOTAL_PIXELS = (
-    2**26,
-    2 * 10**8,
-)  # of one picture, of all; four bytes each when decoded
+_MAX_PIXELS = 2**26  # of one picture; four bytes each when decoded
+_MAX_TOTAL_PIXELS = 2 * 10**8  # of all pictures
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _KINDS = ("accessors", "buffers", "bufferViews", "images", "materials", "meshes", "nodes", "textures")
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}  # bytes of a componentType

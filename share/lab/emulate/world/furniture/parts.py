@@ -68,13 +68,3 @@ def corner_posts(width: float, depth: float, height: float, thick: float, skin: 
     at = [(x, y) for x in (-1, 1) for y in (-depth + thick / 2, -thick / 2)]
     reach = (width - thick) / 2
     return concat_shapes([box_on((x * reach, y, 0), (thick, thick, height), skin, rng) for x, y in at])
-
-
-def side_by_side(shapes: Sequence[Shape], gap: float) -> Shape:
-    """Shapes side by side with gaps between, their backs in one plane, the middle at x = 0."""
-    widths = [float(s.bounding_box[1, 0] - s.bounding_box[0, 0]) for s in shapes]
-    at, out = -(sum(widths) + gap * (len(shapes) - 1)) / 2, []
-    for shape, width in zip(shapes, widths, strict=True):
-        out.append(shape.placed_at(at - float(shape.bounding_box[0, 0]), 0))
-        at += width + gap
-    return concat_shapes(out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from share.lab.emulate.world.furniture.parts import box_on, pick_material
 from share.lab.emulate.world.materials import Material
-from share.lab.emulate.world.mesh import Rng, Shape, concat_shapes, cylinder, tube
+from share.lab.emulate.world.mesh import Rng, Shape, concat_shapes, cylinder
 
 
 def pipe_run(rng: Rng, length: float, count: int) -> Shape:
@@ -55,13 +55,6 @@ def wall_pipes(rng: Rng, height: float) -> Shape:
                 out.append(box_on((x, -0.05, z), (2 * r + 0.02, 0.1, 0.03), skin, rng))
         x += 2 * r + 0.05
     return concat_shapes(out)
-
-
-def hanging_cable(rng: Rng, width: float, sag: float) -> Shape:
-    """A cable that hangs between two points of a wall; its ends are at z = 0."""
-    at = [(k / 8 - 0.5) * width for k in range(9)]
-    skin = Material("rubber")
-    return tube([(x, -0.02, sag * ((2 * x / width) ** 2 - 1)) for x in at], 0.012, skin, sides=6, rng=rng)
 
 
 def radiator(rng: Rng, width: float) -> Shape:

@@ -40,13 +40,3 @@ def tool_wall(rng: Rng) -> Shape:
 
 def fuse_box(rng: Rng) -> Shape:
     return printed_plate(rng, "gauge", rng.uniform(0.3, 0.6), rng.uniform(0.4, 0.8), 0.14)
-
-
-WALL_HANGINGS = {
-    "sign": sign,
-    "poster": poster,
-    "notice": notice,
-    "pin board": pin_board,
-    "tool wall": tool_wall,
-    "fuse box": fuse_box,
-}
