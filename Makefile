@@ -27,7 +27,7 @@ soak: install  # HOURS=2.5 make soak: shorter; 20 min of warm-up come before
 	$(BIN)/python tests/torture/soak.py --hours $(or $(HOURS),8) --out $(or $(OUT),share-soak)
 train-test: install  # brings torch
 	$(PIP) -e '.[train]'
-	$(BIN)/pytest tests/train -m "slow or not slow"
+	$(BIN)/pytest tests/lab/train -m "slow or not slow"
 lint: install
 	$(BIN)/ruff check && $(BIN)/ruff format --check && $(BIN)/lint-imports
 type: install

@@ -12,7 +12,7 @@ from pathlib import Path  # noqa: E402
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
-from shell import Done  # noqa: E402
+from helpers.shell import Done  # noqa: E402
 
 from share.cli.main import main  # noqa: E402
 

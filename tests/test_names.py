@@ -5,7 +5,7 @@ from __future__ import annotations
 from unicodedata import normalize
 
 import pytest
-from hellos import hello_of
+from helpers.hellos import hello_of
 
 from share.recordings.session import is_agent_name
 

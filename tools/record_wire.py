@@ -4,7 +4,7 @@
 
 Two agents run against an edge through a relay that records every message; then one agent streams to an edge
 that tracks. OUT/wire-N.msgpack.gz has the messages, OUT/map-N.sqlite.gz the edge's map file, where N is the
-wire version. tests/wire/recorded has those of the last releases; tests/recorded_traffic.py reads them. Only
+wire version. tests/wire/recorded has those of the last releases; `recorded_traffic.py` reads them. Only
 the commands of SHARE are used, so that every release can be recorded.
 """
 
@@ -26,7 +26,7 @@ import msgspec
 import zmq
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from small_session import small_profile
+from helpers.small_session import small_profile
 
 SECONDS = 6
 PER_KIND, PER_RAW = 12, 3  # messages kept of each kind, peer and direction; of raw frames

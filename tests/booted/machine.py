@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from shell import Done
+from helpers.shell import Done
 
 BASE = Path(__file__).resolve().parents[2] / "build" / "device-root"  # made once, read from then on
 SUITE = "bookworm"  # as old as the oldest device: glibc 2.36

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from frozen_program import frozen_program
+from helpers.frozen_program import frozen_program
+from helpers.shell import Done
+from helpers.small_session import small_profile
 from machine import THERE, Machine, machine
-from shell import Done
-from small_session import small_profile
 
 ROOT = Path(__file__).resolve().parents[2]
 EDGE = f"tcp://{THERE}:5555"  # not loopback: keys are asked for

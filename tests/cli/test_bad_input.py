@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from recordings import make_euroc, make_tum
-from shell import Done
+from helpers.recordings import make_euroc, make_tum
+from helpers.shell import Done
 
 from share.net.transport import bind
 from share.types import Keyframe

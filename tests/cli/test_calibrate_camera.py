@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import yaml
-from board_pictures import PAPER, printed
-from shell import Done
+from helpers.board_pictures import PAPER, printed
+from helpers.shell import Done
 
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from board_pictures import printed
-from camera_imu_sim import NOISE, SHIFT_S, T_IMU_CAM0, Dance, record
-from shell import Done
+from helpers.board_pictures import printed
+from helpers.camera_imu_sim import NOISE, SHIFT_S, T_IMU_CAM0, Dance, record
+from helpers.shell import Done
 
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig

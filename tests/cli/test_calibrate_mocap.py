@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from field_sim import RATE_HZ, export
-from mocap_sim import BODY, NOISE, START_NS, TILT, Motion, record_imu, record_mocap, stamps
+from helpers.field_sim import RATE_HZ, export
+from helpers.mocap_sim import BODY, NOISE, START_NS, TILT, Motion, record_imu, record_mocap, stamps
 
 from share.files.yaml_file import read_yaml
 from share.geometry import se3

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from shell import Done
-from software_camera import BASELINE, T_GYRO_IR, SoftwareCamera
+from helpers.shell import Done
+from helpers.software_camera import BASELINE, T_GYRO_IR, SoftwareCamera
 
 from share.recordings.calibration import read_calibration
 

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from live import RIG, live
-from recordings import make_euroc, make_tum
+from helpers.live import RIG, live
+from helpers.recordings import make_euroc, make_tum
 
 from share.recordings.calibration import kalibr_texts
 from share.recordings.mcap.recorder import Recorder

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from field_sim import FIRST, Watched, export, export_motive, offset_of, paths, reclocked, seen
-from field_sim import RATE_HZ as MOCAP_HZ
-from small_session import RATE_HZ, small_profile, small_recipe
+from helpers.field_sim import FIRST, Watched, export, export_motive, offset_of, paths, reclocked, seen
+from helpers.field_sim import RATE_HZ as MOCAP_HZ
+from helpers.small_session import RATE_HZ, small_profile, small_recipe
 
 from share.files.json_file import read_json
 from share.geometry import se3

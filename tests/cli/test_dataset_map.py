@@ -4,7 +4,7 @@ import json
 import os
 
 import pytest
-from map_changes import keyframe, small_map
+from helpers.map_changes import keyframe, small_map
 from test_dataset import bad, good, share
 
 from share.store.map_store import MapStore

@@ -14,9 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import make_euroc
-from shell import Done
-from small_session import small_profile
+from helpers.recordings import make_euroc
+from helpers.shell import Done
+from helpers.small_session import small_profile
 
 from share.lab.emulate.types import START_NS
 

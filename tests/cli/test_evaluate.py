@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from shell import Done
+from helpers.shell import Done
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from recordings import make_euroc
+from helpers.recordings import make_euroc
 
 ENDED = {
     signal.SIGINT: {130, -signal.SIGINT},  # shells call both 130

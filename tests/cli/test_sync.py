@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from shell import Done
-from time_servers import shifted, udp
+from helpers.shell import Done
+from helpers.time_servers import shifted, udp
 
 from share.cli.agent import _clock_text
 from share.devices import time_client

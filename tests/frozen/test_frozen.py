@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_device import make_device
-from frozen_program import ROOT, frozen_program
-from recordings import make_euroc, make_tum
-from ssh_server import HOST, ssh_server
+from helpers.fake_device import make_device
+from helpers.frozen_program import ROOT, frozen_program
+from helpers.recordings import make_euroc, make_tum
+from helpers.ssh_server import HOST, ssh_server
 
 from share import __version__
 from share.cli.main import COMMANDS

@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 import pyrealsense2 as rs
-from software_camera import SoftwareCamera
-from software_share import share
+from helpers.software_camera import SoftwareCamera
+from helpers.software_share import share
 
 from share.recordings.mcap.recorder import Recorder
 from share.sensors.measurement import Measurement

@@ -7,8 +7,8 @@ import sys
 import threading
 
 import pyrealsense2 as rs
-from room_camera import BEGIN_US, RoomCamera
-from software_share import share
+from helpers.room_camera import BEGIN_US, RoomCamera
+from helpers.software_share import share
 
 from share.runtime.source import open_source
 

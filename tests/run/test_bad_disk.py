@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from children import Child
-from crowd import Walker, crowd
-from preloaded import BadDisk, with_environment
+from helpers.children import Child
+from helpers.crowd import Walker, crowd
+from helpers.preloaded import BadDisk, with_environment
 from test_edge_files import kept_ids
 from test_edge_killed import family
 

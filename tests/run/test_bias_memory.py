@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plain_walk import RIG
+from helpers.plain_walk import RIG
 
 from share.cameras.live import LiveSource
 from share.config import Config

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from capture_bench import quick
-from children import Child
-from room_camera import HZ, STEREO, RoomCamera
+from helpers.capture_bench import quick
+from helpers.children import Child
+from helpers.room_camera import HZ, STEREO, RoomCamera
 
 from share.cameras.live import MAX_WAITING_FRAMES, LiveSource
 from share.cameras.sample_queue import NewestImageQueue

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_bench import PICTURE, WANTED, WRAP_US, Bench, Fake, quick
+from helpers.capture_bench import PICTURE, WANTED, WRAP_US, Bench, Fake, quick
 
 from share.cameras.feed import CameraFeed
 from share.cameras.sample_queue import SampleQueue

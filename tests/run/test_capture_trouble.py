@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_bench import PICTURE, WANTED, Bench, Fake, quick
+from helpers.capture_bench import PICTURE, WANTED, Bench, Fake, quick
 
 from share.cameras.realsense.streams import StreamRequest
 from share.config import Config

@@ -10,8 +10,17 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import pytest
-from shell import Done
-from time_servers import CHRONYC, chronyd, free_port, needs_chrony, running_chronyd, shifted, udp, wait_for
+from helpers.shell import Done
+from helpers.time_servers import (
+    CHRONYC,
+    chronyd,
+    free_port,
+    needs_chrony,
+    running_chronyd,
+    shifted,
+    udp,
+    wait_for,
+)
 
 from share.devices import time_client
 from share.devices.chrony import follow_lines, read_tracking

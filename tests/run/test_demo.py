@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from children import SHARE
+from helpers.children import SHARE
 
 from share.config import Config
 from share.geometry import se3

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from children import Child, start_edge
-from shell import Done
+from helpers.children import Child, start_edge
+from helpers.shell import Done
 
 from share.cameras.realsense import sdk_probe
 from share.devices.host import governors, is_governor_reset, pi_throttled_bits, throttle_counts, usb_memory_mb

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from children import Child
-from crowd import crowd
-from map_changes import small_map
+from helpers.children import Child
+from helpers.crowd import crowd
+from helpers.map_changes import small_map
 
 from share.store.map_store import MapStore
 from share.store.rows import insert

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from children import Child
-from crowd import EVERY, FRAME_S, Walker, crowd
+from helpers.children import Child
+from helpers.crowd import EVERY, FRAME_S, Walker, crowd
 
 from share.mapping.map_changes import map_poses
 from share.store.map_store import MapStore

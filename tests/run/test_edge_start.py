@@ -7,7 +7,7 @@ import socket
 from contextlib import closing
 
 import pytest
-from children import Child
+from helpers.children import Child
 
 from share.config import Config
 from share.net.transport import bind

@@ -7,8 +7,8 @@ import time
 
 import numpy as np
 import pytest
-import rig_fuzzer
-from plain_walk import RIG
+from helpers import rig_fuzzer
+from helpers.plain_walk import RIG
 
 from share.config import Config, InertialConfig, TrackerConfig
 from share.geometry import rig_check, se3

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from children import Child
-from liar import Liar
+from helpers.children import Child
+from helpers.liar import Liar
 
 from share.errors import WireError
 from share.wire import messages as m

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from recordings import make_euroc
+from helpers.recordings import make_euroc
 
 from share.config import Config
 from share.runtime.offline_tracking import track

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hellos import hello_of
+from helpers.hellos import hello_of
 
 from share.config import Config
 from share.odometry.track_result import TrackResult

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from children import SHARE, Child, start_agent
+from helpers.children import SHARE, Child, start_agent
 
 FRAMES = 20  # of `plain_session`; agents play in real time
 

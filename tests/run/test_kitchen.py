@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from children import Child, start_agent, start_edge
+from helpers.children import Child, start_agent, start_edge
 
 from share.metrics.ate import ate, joint_ate
 from share.recordings.trajectory import read_tum

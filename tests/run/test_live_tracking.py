@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_bench import quick
-from room_camera import BEGIN_US, HZ, RGBD, STEREO, RoomCamera
+from helpers.capture_bench import quick
+from helpers.room_camera import BEGIN_US, HZ, RGBD, STEREO, RoomCamera
 
 from share.cameras.live import MAX_WAITING_FRAMES, LiveSource
 from share.cameras.sample_queue import NewestImageQueue, SampleQueue

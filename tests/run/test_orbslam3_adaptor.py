@@ -9,7 +9,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from recordings import make_euroc
+from helpers.recordings import make_euroc
 
 from share.lab.evaluate.tracker_runs import peer_frames, rig_calibration
 from share.lab.peer_trackers import PEERS

@@ -10,7 +10,7 @@ import tarfile
 from pathlib import Path
 
 import pytest
-from children import Child, start_agent, start_edge
+from helpers.children import Child, start_agent, start_edge
 
 from share.wire.codec import WIRE_VERSION
 

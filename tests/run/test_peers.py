@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import make_euroc
+from helpers.recordings import make_euroc
 
 from share.config import Config
 from share.errors import DataError, UsageError

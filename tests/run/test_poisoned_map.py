@@ -12,8 +12,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from children import Child, start_agent
-from recorded_traffic import map_file
+from helpers.children import Child, start_agent
+from helpers.recorded_traffic import map_file
 from test_edge_killed import _workers, until
 
 from share.mapping.loops import KeyframeKey

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_changes import ANN, BOB, small_map
+from helpers.map_changes import ANN, BOB, small_map
 
 from share.config import Config, EdgeConfig
 from share.errors import StoreError

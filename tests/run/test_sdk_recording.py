@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from room_camera import RoomCamera
-from shell import Done
-from software_camera import BASELINE, SoftwareCamera
+from helpers.room_camera import RoomCamera
+from helpers.shell import Done
+from helpers.software_camera import BASELINE, SoftwareCamera
 
 from share.cameras.realsense.camera import RealSenseCamera
 from share.cameras.realsense.streams import StreamRequest

@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from hellos import hello_of
+from helpers.hellos import hello_of
 from prometheus_client.parser import text_string_to_metric_families
 
 from share.config import Config

@@ -12,8 +12,8 @@ import urllib.error
 import urllib.request
 
 import pytest
-from children import Child, start_agent, start_edge
-from crowd import crowd
+from helpers.children import Child, start_agent, start_edge
+from helpers.crowd import crowd
 from test_edge_killed import FOUND_S, check_map, family, start, until
 
 pytestmark = pytest.mark.slow

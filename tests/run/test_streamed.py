@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from children import SHARE, Child, start_agent
+from helpers.children import SHARE, Child, start_agent
 
 from share.config import Config
 from share.recordings.trajectory import format_tum

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 
 import pytest
-from children import SHARE
-from trees import Tree
+from helpers.children import SHARE
+from helpers.trees import Tree
 
 GONE_S = 2.0
 IN_ORDER_S = 20.0  # to write files, and for agents to say bye

@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 
 import pytest
-from children import start_agent, start_edge
-from preloaded import WallClock, with_environment
+from helpers.children import start_agent, start_edge
+from helpers.preloaded import WallClock, with_environment
 
 
 @pytest.mark.slow

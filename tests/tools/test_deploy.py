@@ -15,8 +15,8 @@ from pathlib import Path
 
 import click
 import pytest
-from fake_device import TOOLS, FakeDevice, make_device
-from ssh_server import HOST, ssh_server
+from helpers.fake_device import TOOLS, FakeDevice, make_device
+from helpers.ssh_server import HOST, ssh_server
 
 from share.cli.main import cli
 from share.devices import checks

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_session import small_profile, small_recipe
+from helpers.small_session import small_profile, small_recipe
 
 from share.config import Config
 from share.errors import DataError, UsageError

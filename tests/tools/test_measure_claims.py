@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from edge_sim import Person, walls
+from helpers.edge_sim import Person, walls
 
 from share.geometry import se3
 from share.types import AgentKind, Keyframe

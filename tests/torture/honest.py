@@ -18,15 +18,15 @@ from pathlib import Path
 from typing import Any, TextIO
 
 TESTS = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(TESTS), str(TESTS / "run"), str(Path(__file__).parent)]
+sys.path[:0] = [str(TESTS), str(Path(__file__).parent)]
 
 from share import startup  # noqa: E402
 
 startup.prepare_process()
 
-import crowd  # noqa: E402
 import numpy as np  # noqa: E402
-from edge_sim import Person, walls  # noqa: E402
+from helpers import crowd  # noqa: E402
+from helpers.edge_sim import Person, walls  # noqa: E402
 from raw_wire import unpack  # noqa: E402
 
 from share.net.transport import AgentLink, connect  # noqa: E402

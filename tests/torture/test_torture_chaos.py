@@ -19,7 +19,7 @@ from pathlib import Path
 import harness
 import pytest
 from harness import EdgeProgram, HonestAgents, Result, Setup, until
-from preloaded import WallClock
+from helpers.preloaded import WallClock
 from relay import Relay, Weather
 
 SEED = 20261126

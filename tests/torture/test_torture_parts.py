@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from corpus import KINDS, Corpus, Recorded, read, write
 from fuzzer import _small
-from hellos import hello_of
+from helpers.hellos import hello_of
 from mutations import mutate
 from raw_wire import multipart, pack, unpack
 from replay import shrink

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import field_trip
 import pyrealsense2 as rs
-from room_camera import BEGIN_US, RoomCamera
-from software_camera import SoftwareCamera
-from software_share import share
+from helpers.room_camera import BEGIN_US, RoomCamera
+from helpers.software_camera import SoftwareCamera
+from helpers.software_share import share
 
 from share.cli import main as command_line
 from share.recordings.images import ArrayImage

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from field_sim import Watched, export, paths, seen
+from helpers.field_sim import Watched, export, paths, seen
 
 from share.geometry import se3
 from share.lab.emulate.progress import Progress, no_progress

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from plain_walk import CAMERA, T_CAM1_CAM0
+from helpers.plain_walk import CAMERA, T_CAM1_CAM0
 
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig

@@ -10,9 +10,9 @@ from collections import Counter
 import msgspec
 import numpy as np
 import pytest
+from helpers.wire_strategies import messages
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from wire_strategies import messages
 
 from share.errors import WireError
 from share.geometry.camera import Camera, ImuNoise, Rig

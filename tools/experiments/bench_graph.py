@@ -26,10 +26,10 @@ startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "graph"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
-from gtsam_graph import solve  # noqa: E402
-from rooms import Room, simulate  # noqa: E402
+from helpers.gtsam_graph import solve  # noqa: E402
+from helpers.rooms import Room, simulate  # noqa: E402
 
 from share.config import GraphConfig  # noqa: E402
 from share.mapping.graph.covariance import CovariancePaths  # noqa: E402

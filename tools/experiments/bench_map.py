@@ -23,10 +23,10 @@ startup.prepare_process()
 
 import numpy as np  # noqa: E402
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "place"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
-from place_real import load  # noqa: E402
-from place_sim import sights  # noqa: E402
+from helpers.place_real import load  # noqa: E402
+from helpers.place_sim import sights  # noqa: E402
 
 from share.config import PlaceConfig  # noqa: E402
 from share.geometry import se3  # noqa: E402

@@ -15,9 +15,9 @@ from share.lab.emulate.world.scenes.corridor import twin_corridors
 from share.mapping.recognition.verification import CameraView
 from share.types import F64
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "place"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
-from place_real import load
+from helpers.place_real import load
 
 STEREO, KITCHEN = "euroc_v1_01_keyframes", "redkitchen_0000_0499"
 _THREE = ("ar1=walk:", "ar2=walk:", "robot=robot:")

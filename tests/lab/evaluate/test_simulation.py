@@ -1,0 +1,111 @@
+"""Real agents and a real edge in virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from helpers.edge_sim import Person, walls
+
+from share.config import Config, EdgeConfig
+from share.geometry import se3
+from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation, TrackedFrame
+from share.net.channel import NETWORK_PRESETS
+from share.types import KeyframeCandidate
+
+MS = 1_000_000
+ROOM = walls(1)
+
+
+def seen(person: Person, seconds: float) -> Iterator[TrackedFrame]:
+    """20 frames a second, every fifth a keyframe."""
+    T_before = None
+    for k in range(round(20 * seconds)):
+        if k % 5:
+            yield TrackedFrame(50 * k * MS, person.T_odom_body[-1], 0.5)
+            continue
+        T, view = person.step()
+        T_last_body = T if T_before is None else se3.inverse(T_before) @ T
+        candidate = KeyframeCandidate(T, T_last_body, person.cov, np.zeros(3), 0.0, view, T_before is None)
+        T_before = T
+        yield TrackedFrame(50 * k * MS, T, 0.5, candidate)
+
+
+def world(policy: str = "covins-g", seed: int = 0, seconds: float = 6.0, **costs: Delay) -> Simulation:
+    people = [Person("ann", ROOM, 0.0, 11), Person("bob", ROOM, 0.5, 22)]
+    agents = [(person.hello, seen(person, seconds), NETWORK_PRESETS["wifi5"]) for person in people]
+    made = Simulation(Config(edge=EdgeConfig(policy=policy)), agents, ProcessingDelays(**costs), seed)
+    made.run(seconds + 1.0)
+    return made
+
+
+def track_ms(room: Simulation, name: str) -> list[float]:
+    return room.logs[name].frames().track_ms.tolist()
+
+
+def corrected_ms(room: Simulation, name: str) -> list[float]:
+    """Of the frames that were corrected."""
+    late = room.logs[name].frames().corrected_ms.tolist()
+    return [ms for ms in late if not np.isnan(ms)]
+
+
+def test_a_cost_is_drawn_as_it_is_said() -> None:
+    rng = np.random.default_rng(0)
+    drawn = np.array([Delay(4.0, 9.0).draw_ns(x) for x in rng.standard_normal(20_000)]) / MS
+    assert np.percentile(drawn, [50, 95]) == pytest.approx([4.0, 9.0], rel=0.03)
+
+
+def test_samples_are_drawn_as_they_were_measured() -> None:
+    rng = np.random.default_rng(0)
+    measured = Sampled((0.0, 0.0, 0.0, 2.0, 5.0))
+    drawn = np.array([measured.draw_ns(x) for x in rng.standard_normal(20_000)]) / MS
+    assert np.percentile(drawn, [0, 25, 50, 75, 100]) == pytest.approx([0, 0, 0, 2, 5], abs=0.06)
+
+
+def test_a_slice_may_come_after_any_frame_and_delays_the_next_one() -> None:
+    none, always = (
+        world(seconds=3.0, frame=Delay(5.0, 5.0), finish_keyframe=Sampled((ms,) * 2)) for ms in (0.0, 80.0)
+    )
+    assert max(track_ms(none, "ann")) < 5.1
+    waits = np.diff(track_ms(always, "ann"))
+    assert np.median(waits) == pytest.approx(35.0, abs=1.0)  # 85 ms each, every 50 ms
+
+
+def test_everybody_is_tracked_joined_and_corrected() -> None:
+    room = world()
+    report = room.edge.report(room.mapper.report())
+    assert {name: agent["keyframes"] for name, agent in report["agents"].items()} == {"ann": 24, "bob": 24}
+    assert report["failed_steps"] == 0
+    assert len(set(room.mapper.current_poses().map_ids)) == 1
+    for name, log in room.logs.items():
+        assert len(track_ms(room, name)) == 120
+        assert np.median(track_ms(room, name)) == pytest.approx(ProcessingDelays().frame.p50, abs=1.0)
+        assert corrected_ms(room, name)
+        # tracked, sent, looked up, solved
+        assert min(corrected_ms(room, name)) > 4 + 3 + 2 * 1.0 + 3 + 4 + 14 - 15
+        both = [*track_ms(room, name), *corrected_ms(room, name)]
+        assert log.report()["latency_ms"]["mean"] == pytest.approx(np.mean(both))
+
+
+def test_the_same_seed_is_the_same_run_and_another_is_not() -> None:
+    first, again, other = (track_ms(world(seed=seed, seconds=3.0), "ann") for seed in (1, 1, 2))
+    assert first == again != other
+
+
+def test_a_slow_tracker_makes_frames_wait_and_a_slow_edge_corrections() -> None:
+    usual = world(seconds=3.0)
+    slow = world(seconds=3.0, frame=Delay(70.0, 70.0))
+    waits = np.diff(track_ms(slow, "ann"))
+    assert np.median(waits) == pytest.approx(20.0, abs=3.0)  # 70 ms each, every 50 ms
+    late = world(seconds=3.0, solve=Delay(300.0, 300.0))
+    assert min(corrected_ms(late, "bob")) > 300 > np.median(corrected_ms(usual, "bob"))
+    assert np.mean(track_ms(late, "bob")) == pytest.approx(np.mean(track_ms(usual, "bob")), rel=0.1)
+
+
+def test_an_agent_hears_its_rate() -> None:
+    room = world("share")
+    report = room.edge.report(room.mapper.report())["agents"]
+    heard = {name: told["rate_hz"] for name, told in room.reports().items()}
+    assert all(rate is not None for rate in heard.values())
+    assert {name: agent["rate_hz"] for name, agent in report.items()} == pytest.approx(heard, abs=1e-3)

@@ -1,0 +1,74 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.place_sim import bodies, sights
+from numpy.typing import NDArray
+
+from share.geometry import se3
+from share.mapping.recognition.missing_points import (
+    MissingPoints,
+    MissingRegions,
+    missing_points,
+    missing_regions,
+)
+from share.mapping.recognition.verification import CameraView
+from share.types import View
+
+T_C_Q = se3.exp(np.array([0.02, -0.03, 0.01, 0.1, 0.05, -0.1]))
+
+
+def test_nothing_is_missing_where_both_see_the_same() -> None:
+    seen = missing_points(*sights(0, T_C_Q), bodies(T_C_Q))
+    assert seen.visible > 300
+    assert seen.missing_share < 0.1
+
+
+def changed(sight: CameraView, where: NDArray[np.bool_]) -> CameraView:
+    """The same view, with something else at the keypoints where (N,)."""
+    view = sight.view
+    other = np.random.default_rng(0).integers(0, 256, view.descriptors.shape, np.uint8)
+    return replace(sight, view=View(view.uv, view.points, np.where(where[:, None], other, view.descriptors)))
+
+
+def test_what_was_taken_away_is_missing_and_a_thing_that_is_gone() -> None:
+    """A third of the candidate's image shows something else."""
+    query, candidate = sights(1, T_C_Q, n=1500)
+    u = candidate.view.uv[:, 0]
+    bare = changed(candidate, u < np.quantile(u, 1 / 3))
+    assert missing_points(query, bare, bodies(T_C_Q)).missing_share == pytest.approx(1 / 3, abs=0.1)
+    assert missing_regions(query, bare, bodies(T_C_Q)).missing_share == pytest.approx(
+        1 / 3 - 0.05, abs=0.05
+    )  # not at its edge
+
+
+def test_points_that_are_missing_here_and_there_are_no_thing() -> None:
+    """Half of all, as detectors miss them."""
+    query, candidate = sights(1, T_C_Q, n=1500)
+    some = changed(candidate, np.random.default_rng(1).random(len(candidate.view)) < 0.5)
+    assert missing_points(query, some, bodies(T_C_Q)).missing_share > 0.45
+    assert missing_regions(query, some, bodies(T_C_Q)).missing_share < 0.01
+    assert missing_regions(query, candidate, bodies(T_C_Q)).missing_share == 0
+
+
+def test_a_wrong_pose_misses_nearly_all() -> None:
+    aside = bodies(T_C_Q) @ se3.exp(np.array([0.1, 0.1, 0, 0.3, 0, 0]))
+    assert missing_points(*sights(2, T_C_Q), aside).missing_share > 0.9
+
+
+def test_what_is_hidden_is_not_missing() -> None:
+    """The candidate stands before a wall 1 m away; what is behind it cannot be expected."""
+    query, candidate = sights(3, T_C_Q, depth_share=1.0)
+    view = candidate.view
+    wall = View(view.uv, view.points / view.points[:, 2:], np.zeros_like(view.descriptors))
+    seen = missing_points(query, replace(candidate, view=wall), bodies(T_C_Q))
+    full = missing_points(query, candidate, bodies(T_C_Q))
+    assert seen.visible < 0.6 * full.visible
+
+
+def test_an_empty_view_says_nothing() -> None:
+    query, candidate = sights(4, T_C_Q)
+    empty = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+    assert missing_points(query, replace(candidate, view=empty), np.eye(4)) == MissingPoints(0, 0)
+    assert missing_regions(query, replace(candidate, view=empty), np.eye(4)) == MissingRegions(0, 0)
+    assert MissingPoints(0, 0).missing_share == MissingRegions(0, 0).missing_share == 0.0

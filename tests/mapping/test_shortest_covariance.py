@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+from helpers.rooms import LOOP, Room, simulate
+from helpers.walking import covariance_between, surest
+
+from share.mapping.graph.covariance import CovariancePaths
+from share.mapping.graph.edges import PoseEdge
+
+
+def roads_of(room: Room, seed: int) -> tuple[CovariancePaths, list[PoseEdge]]:
+    """With no two edges equally sure, so that there is one surest path."""
+    rng = np.random.default_rng(seed)
+    edges = [PoseEdge(e.a, e.b, e.T_a_b, e.cov * rng.uniform(0.5, 2)) for e in (*room.chain, *room.closures)]
+    roads = CovariancePaths()
+    for edge in edges:
+        roads.add(edge)
+    return roads, edges
+
+
+def agree(roads: CovariancePaths, edges: list[PoseEdge], room: Room, start: int, goals: list[int]) -> None:
+    """`covariances_from` against the path that is walked edge by edge."""
+    for goal, cov in zip(goals, roads.covariances_from(start, goals, room.guess), strict=True):
+        path = surest(edges, start, goal)
+        assert (path is None) == (cov is None)
+        if path is not None and cov is not None:
+            walked = covariance_between(path, start, room.guess)
+            assert np.abs(cov - walked).max() <= 1e-9 * np.abs(walked).max()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_one_search_tells_what_walking_each_path_tells(seed: int) -> None:
+    room = simulate(300, 3, seed)
+    roads, edges = roads_of(room, seed)
+    rng = np.random.default_rng(seed)
+    for start in (0, 7, 299):
+        agree(roads, edges, room, start, [*rng.choice(300, 8).tolist(), start])
+
+
+def test_edges_come_and_go() -> None:
+    room = simulate(200, 3, 2)
+    roads, edges = roads_of(room, 2)
+    rng = np.random.default_rng(2)
+    out: list[PoseEdge] = []
+    for k in range(60):
+        edge = edges.pop(int(rng.integers(len(edges))))
+        roads.remove(edge)
+        out.append(edge)
+        if k % 3 == 2:
+            back = out.pop(0)
+            roads.add(back)
+            edges.append(back)
+        if k % 5 == 0:
+            agree(roads, edges, room, 199 - k, rng.choice(200, 6).tolist())
+    with pytest.raises(KeyError):
+        roads.remove(out[0])
+    with pytest.raises(ValueError, match="was added before"):
+        roads.add(edges[0])
+
+
+def test_of_parallel_edges_the_surest_counts() -> None:
+    T = np.eye(4)
+    roads = CovariancePaths()
+    loose, sure = PoseEdge(4, 9, T, 4 * LOOP), PoseEdge(9, 4, T, LOOP)
+    poses = {4: T, 9: T}
+    roads.add(loose)
+    roads.add(sure)
+    assert roads.covariances_from(4, [9], poses)[0] == pytest.approx(LOOP)
+    roads.remove(sure)
+    assert roads.covariances_from(4, [9], poses)[0] == pytest.approx(4 * LOOP)
+    roads.remove(loose)
+    assert roads.covariances_from(4, [9, 4], poses)[0] is None
+
+
+def test_where_no_road_leads() -> None:
+    roads = CovariancePaths()
+    assert roads.covariances_from(3, [], {}) == []
+    cov = roads.covariances_from(3, [3, 5], {3: np.eye(4), 5: np.eye(4)})
+    assert np.array_equal(cov[0], np.zeros((6, 6))) and cov[1] is None

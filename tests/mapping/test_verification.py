@@ -1,0 +1,145 @@
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.place_sim import bodies, sights
+
+from share.config import PlaceConfig
+from share.geometry import se3
+from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
+from share.types import MAX_POSITION_M, MAX_UV, View
+
+CONFIG = PlaceConfig()
+T_C_Q = se3.exp(np.array([0.1, -0.15, 0.05, 0.3, 0.1, -0.2]))
+
+
+def test_finds_the_pose_between_bodies() -> None:
+    found = verify(*sights(0, T_C_Q), CONFIG)
+    assert isinstance(found, Verification), found
+    xi = se3.log(se3.inverse(bodies(T_C_Q)) @ found.T_c_q)
+    assert np.linalg.norm(xi[:3]) < np.radians(0.5)
+    assert np.linalg.norm(xi[3:]) < 0.02
+    assert found.inliers > 200
+    assert found.reason == f"{found.inliers} inliers of {found.matches} matches"
+
+
+def test_covariance_of_the_body_pose_is_consistent() -> None:
+    config = replace(CONFIG, floor_deg=1e-6, floor_m=1e-6, sigma_px=1.0)
+    nees = []
+    for seed in range(40):
+        found = verify(*sights(seed, T_C_Q), config)
+        assert isinstance(found, Verification)
+        xi = se3.log(se3.inverse(bodies(T_C_Q)) @ found.T_c_q)
+        nees.append(xi @ np.linalg.solve(found.cov, xi))
+    assert 4.0 < np.mean(nees) < 9.0
+
+
+def test_the_reverse_question_has_the_inverse_answer() -> None:
+    query, candidate = sights(1, T_C_Q)
+    there, back = verify(query, candidate, CONFIG), verify(candidate, query, CONFIG)
+    assert isinstance(there, Verification)
+    assert isinstance(back, Verification)
+    assert np.abs(se3.log(there.T_c_q @ back.T_c_q)).max() < 2e-3
+
+
+def test_same_input_same_output() -> None:
+    pair = sights(2, T_C_Q)
+    first, second = verify(*pair, CONFIG, seed=7), verify(*pair, CONFIG, seed=7)
+    assert isinstance(first, Verification)
+    assert isinstance(second, Verification)
+    assert first.T_c_q.tobytes() == second.T_c_q.tobytes()
+
+
+def reason(query: CameraView, candidate: CameraView, config: PlaceConfig = CONFIG) -> str:
+    found = verify(query, candidate, config)
+    assert isinstance(found, Refusal), found
+    return found.reason
+
+
+def test_another_place_has_too_few_matches() -> None:
+    assert reason(sights(3, T_C_Q)[0], sights(4, T_C_Q)[1]).endswith("matches of 20 needed")
+
+
+def test_descriptors_without_geometry_are_refused() -> None:
+    query, candidate = sights(5, T_C_Q)
+    order = np.random.default_rng(0).permutation(len(query.view))
+    shuffled = View(query.view.uv[order], query.view.points[order], query.view.descriptors)
+    why = reason(replace(query, view=shuffled), candidate)
+    assert re.fullmatch(r"\d inliers of the (query|candidate)'s points of 8 needed", why)
+
+
+def test_without_depth_on_one_side_it_is_refused() -> None:
+    query, candidate = sights(6, T_C_Q)
+    blind = View(query.view.uv, np.full_like(query.view.points, np.nan), query.view.descriptors)
+    assert reason(replace(query, view=blind), candidate) == "0 matches with the query's depth of 8 needed"
+
+
+def test_gravity_must_agree() -> None:
+    query, candidate = sights(7, T_C_Q)
+    tilted = replace(query, up=se3.so3_exp(np.array([0.2, 0, 0])) @ query.up)
+    assert reason(tilted, candidate).startswith("gravity differs by 11.")
+    assert isinstance(verify(replace(query, up=np.zeros(3)), candidate, CONFIG), Verification)
+
+
+def test_scale_that_differs_between_the_directions_is_refused() -> None:
+    """A view whose depths are all twice too long sees its own motion too long as well."""
+    query, candidate = sights(8, T_C_Q)
+    stretched = View(query.view.uv, query.view.points * 2, query.view.descriptors)
+    assert reason(replace(query, view=stretched), candidate).startswith("two poses fit")
+
+
+@pytest.mark.parametrize("half", [0.05])
+def test_inliers_in_one_corner_are_refused(half: float) -> None:
+    query, candidate = sights(9, T_C_Q)
+    near = np.abs(candidate.view.uv - candidate.view.uv.mean(0)).max(1) < half * 3
+    # only what lies in the corner keeps its descriptor
+    rng = np.random.default_rng(0)
+    others = np.where(
+        near[:, None], candidate.view.descriptors, rng.integers(0, 256, (len(near), 32), np.uint8)
+    )
+    corner = View(candidate.view.uv, candidate.view.points, others)
+    loose = replace(
+        CONFIG, min_matches=10, min_inliers=8, min_direction_inliers=6, min_consensus=6, min_spread=0.15
+    )
+    assert "inliers crowd in the" in reason(query, replace(candidate, view=corner), loose)
+
+
+def test_a_loose_pose_is_refused() -> None:
+    assert "pose uncertain by" in reason(*sights(10, T_C_Q), replace(CONFIG, max_sigma_deg=0.01))
+
+
+def test_empty_views_are_refused() -> None:
+    empty = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+    query, candidate = sights(11, T_C_Q)
+    assert reason(replace(query, view=empty), candidate) == "0 matches of 20 needed"
+    assert reason(query, replace(candidate, view=empty)) == "0 matches of 20 needed"
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_hostile_numbers_do_not_raise(seed: int) -> None:
+    """Values as large as the types admit, repeated, collinear or absurd, as a broken peer may send them."""
+    rng = np.random.default_rng(seed)
+    query, candidate = sights(12, T_C_Q)
+    uv, points = query.view.uv.copy(), query.view.points.copy()
+    some = rng.random(len(uv)) < 0.5 + 0.5 * (seed % 2)
+    kind = seed % 5
+    if kind == 0:
+        uv[some], points[some] = MAX_UV, MAX_POSITION_M
+    elif kind == 1:
+        points[some, 2] = rng.choice([0.0, -1.0, 1e-30, MAX_POSITION_M], some.sum())
+    elif kind == 2:
+        uv[some], points[some] = uv[0], points[0]
+    elif kind == 3:
+        uv[some, 1], points[some, 1] = 0, 0
+    else:
+        points[some] = points[some][:, ::-1]
+    broken = replace(
+        query, view=View(uv, points, query.view.descriptors), up=rng.normal(0, 10.0 ** (seed % 9), 3)
+    )
+    for result in (
+        verify(broken, candidate, CONFIG),
+        verify(candidate, broken, CONFIG),
+        verify(broken, broken, CONFIG),
+    ):
+        assert isinstance(result, Verification | Refusal)

@@ -1,0 +1,107 @@
+"""The filter in a simulated world: as sure as it should be, and able to calibrate itself."""
+
+import numpy as np
+import pytest
+from helpers.imu_simulation import SHIPPED, Setup, run
+
+MISSES = pytest.mark.xfail(
+    strict=True,
+    reason="what lasts in a pixel's error is white to the filter: see docs/understand/odometry.md",
+)
+BANDS = {6: (1.37, 5.04), 50: (2.36, 3.72)}  # of the mean of N chi-square values, 3 dof, 95 %
+
+
+def nees(seeds, setup):
+    """Mean over runs and the seconds from 1 on, of orientation and position."""
+    return np.mean([run(seed, setup).nees[20:].mean(axis=0) for seed in range(seeds)], axis=0)
+
+
+@pytest.mark.parametrize("mono", [False, True])
+def test_it_is_as_sure_as_it_should_be(mono):
+    low, high = BANDS[6]
+    orientation, position = nees(6, Setup(seconds=6.0, mono=mono))
+    assert low < orientation < high
+    assert low < position < high
+
+
+@pytest.mark.parametrize("mono", [pytest.param(False, marks=MISSES), True])  # 2.2 at 2 s, 3.8 at 20 s
+@pytest.mark.slow
+def test_it_is_as_sure_as_it_should_be_in_fifty_runs(mono):
+    """At 2, 5, 10 and 20 s, not over time, for errors of one run last. A single camera's first depths are so
+    unsure that slopes do not hold for them: 5 at 2 s."""
+    runs = [run(seed, Setup(mono=mono)) for seed in range(50)]
+    low, high = BANDS[50]
+    for k in (100, 200, 398) if mono else (40, 100, 200, 398):
+        orientation, position = np.mean([r.nees[k] for r in runs], axis=0)
+        print(k / 20, orientation, position)
+        assert low < orientation < high
+        assert low < position < high
+
+
+@MISSES  # too unsure: 1.6 to 2.4 of position where 2.36 is the least
+@pytest.mark.slow
+@pytest.mark.parametrize(("phase", "white"), [(0.37, 0.0), (0.37, 1.0), (0.8, 3.0)])
+def test_it_is_as_sure_as_it_should_be_between_samples_and_shaken(phase, white):
+    """Images between samples of the IMU; white shaking, m/s^2 and 0.03 rad/s for each of it."""
+    runs = [run(seed, Setup(phase=phase, white=white)) for seed in range(50)]
+    low, high = BANDS[50]
+    for k in (40, 100, 200, 398):
+        orientation, position = np.mean([r.nees[k] for r in runs], axis=0)
+        print(k / 20, orientation, position)
+        assert low < position < high
+        assert orientation < high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("machine", [1.0, 4.0])
+def test_beside_a_machine_it_is_no_surer_than_it_should_be(machine):
+    """Of a vibration that its samples follow, an integral loses more than `shaken` knows: it is less sure
+    than it could be, of its orientation."""
+    runs = [run(seed, Setup(phase=0.37, imu_hz=400.0, machine=machine)) for seed in range(50)]
+    for k in (40, 100, 200, 398):
+        orientation, position = np.mean([r.nees[k] for r in runs], axis=0)
+        print(k / 20, orientation, position)
+        assert max(orientation, position) < BANDS[50][1]
+
+
+def wrong(seed, sigma):
+    """3 degrees, 3 cm and 10 ms in some direction; the filter expects `sigma` times as much."""
+    rng = np.random.default_rng(seed)
+    turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    error = np.concatenate([turn * np.radians(3), shift * 0.03])
+    each = sigma / np.sqrt(3)
+    return Setup(
+        seconds=30.0,
+        turn=np.radians(3) * each + 1e-6,
+        shift=0.03 * each + 1e-6,
+        offset=0.01 * sigma + 1e-7,
+        extrinsic_error=error,
+        offset_error=float(rng.choice([-0.01, 0.01])),
+        sigma_px=SHIPPED.sigma_px,
+    )
+
+
+def slow(seed):
+    marks = [pytest.mark.slow]
+    return pytest.param(seed, marks=marks + [pytest.mark.xfail(reason="5.7 mm", strict=True)] * (seed == 5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, *map(slow, range(1, 6))])
+def test_it_finds_where_its_camera_sits_and_when_it_looks(seed):
+    left = run(seed, wrong(seed, 1.0)).extrinsics[-1]
+    print(np.degrees(np.linalg.norm(left[:3])), 1e3 * np.linalg.norm(left[3:6]), 1e3 * left[6])
+    assert np.degrees(np.linalg.norm(left[:3])) < 0.2
+    assert np.linalg.norm(left[3:6]) < 0.005
+    assert abs(left[6]) < 0.0005
+
+
+@pytest.mark.slow
+def test_a_wrong_extrinsic_taken_for_true_breaks_the_bands():
+    assert nees(3, wrong(0, 0.0)).min() > 20
+
+
+def test_the_same_seed_gives_the_same_bits():
+    a, b = (run(3, Setup(seconds=1.0)) for _ in range(2))
+    assert a.state.cov.tobytes() == b.state.cov.tobytes()
+    assert a.pose_errors.tobytes() == b.pose_errors.tobytes()

@@ -1,0 +1,193 @@
+"""The camera-only tracker on a rendered room: exact truth, and what goes wrong in a real one."""
+
+import numpy as np
+import pytest
+from helpers.plain_walk import CAMERA, STEREO, T_CAM1_CAM0, pairs, poses
+
+from share.config import TrackerConfig
+from share.geometry import se3
+from share.geometry.camera import ImuNoise, Rig
+from share.odometry import initialisation
+from share.odometry.visual_tracker import VisualTracker
+from share.types import Frame, ImuBatch, TrackState, WaitReason
+
+HZ = 20
+DEFAULT = TrackerConfig()
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """Three seconds of a person's stereo images, and the true poses of cam0."""
+    T = poses("walker", np.arange(1, 4, 1 / HZ), 5)
+    return pairs(T, 5), T
+
+
+def stamp(i):
+    return round(i * 1e9 / HZ)
+
+
+def run(images, config=DEFAULT, stamps=None, rig=STEREO):
+    tracker, results, candidates = VisualTracker(rig, config), [], []
+    for i, (left, right) in enumerate(images):
+        frame = Frame(stamps[i] if stamps else stamp(i), i, left, right)
+        results.append(tracker.track(frame))
+        if results[-1].keyframe_ready:
+            candidates.append(tracker.make_keyframe(frame))
+    return results, candidates
+
+
+def test_tracks_every_frame_to_the_centimetre(walk):
+    images, T = walk
+    results, candidates = run(images)
+    assert [r.state for r in results] == [TrackState.OK] * len(images)
+    estimate = np.array([r.T_odom_body for r in results])
+    truth = se3.inverse(T[0]) @ T
+    relative = se3.inverse(estimate[0]) @ estimate
+    assert np.linalg.norm(relative[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
+    assert np.degrees(se3.rotation_angle(se3.inverse(relative) @ truth)).max() < 0.6
+    assert 4 < len(candidates) < 40
+    assert candidates[0].new_segment
+    assert not any(c.new_segment for c in candidates[1:])
+
+
+def test_what_settles_a_keyframe_may_wait_for_the_next_frame(walk):
+    images, _ = walk
+    tracker, poses = VisualTracker(STEREO, DEFAULT), []
+    for i, (left, right) in enumerate(images[:30]):
+        frame = Frame(stamp(i), i, left, right)
+        result = tracker.track(frame)
+        poses.append(result.T_odom_body)
+        if result.keyframe_ready:
+            tracker.make_keyframe(frame)
+            tracker.finish_keyframe()
+    for mine, result in zip(poses, run(images[:30])[0], strict=True):
+        np.testing.assert_array_equal(mine, result.T_odom_body)
+
+
+def test_odom_starts_at_the_origin_with_z_up(walk):
+    results, _ = run(walk[0][:1])
+    T = results[0].T_odom_body
+    assert np.allclose(T[:3, 3], 0)
+    assert np.allclose(T[:3, 1], (0, 0, -1))  # the camera's y, down
+    assert np.allclose(T[:3, 2], (1, 0, 0))  # the camera's z, ahead
+
+
+def test_same_frames_same_poses(walk):
+    a, _ = run(walk[0][:30])
+    b, _ = run(walk[0][:30])
+    assert all((x.T_odom_body == y.T_odom_body).all() for x, y in zip(a, b, strict=True))
+
+
+def test_lost_in_the_dark_and_found_again_in_the_same_frame(walk):
+    images, T = walk
+    dark = (np.zeros((480, 640), np.uint8),) * 2
+    results, candidates = run([*images[:40], *[dark] * 10, *images[45:60]])
+    assert [r.state for r in results[40:50]] == [TrackState.LOST] * 10
+    assert all(r.T_odom_body is None for r in results[40:50])
+    back = results[50:]
+    assert all(r.state.has_pose for r in back)
+    truth = se3.inverse(T[0]) @ T[45:60]
+    found = np.array([se3.inverse(results[0].T_odom_body) @ r.T_odom_body for r in back])
+    assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.04
+    assert not any(c.new_segment for c in candidates[1:])
+
+
+def test_a_long_darkness_does_not_cost_the_map(walk):
+    """Longer than it takes to begin anew, but there was nothing to begin with."""
+    images, _ = walk
+    dark = (np.zeros((480, 640), np.uint8),) * 2
+    results, candidates = run([*images[:40], *[dark] * 20, *images[45:55]], TrackerConfig(new_stretch_s=0.3))
+    assert [r.state for r in results[40:60]] == [TrackState.LOST] * 20
+    assert all(r.state.has_pose for r in results[60:])
+    assert not any(c.new_segment for c in candidates[1:])
+
+
+def test_carried_away_while_blind_begins_a_new_stretch(walk):
+    images, _ = walk
+    other = pairs(poses("stroller", np.arange(1, 2, 1 / HZ), 77), 77)
+    config = TrackerConfig(new_stretch_s=0.3)
+    results, candidates = run([*images[:20], *other], config)
+    states = [r.state for r in results]
+    assert TrackState.LOST in states[20:30]
+    assert states[-1].has_pose
+    assert sum(c.new_segment for c in candidates) == 2
+
+
+def test_a_pose_that_implies_a_leap_is_not_believed(walk):
+    """The same images a hundred times as fast: the geometry fits, the speed does not."""
+    images, _ = walk
+    stamps = [round(i * 1e9 / HZ / 100) for i in range(40)]
+    results, _ = run(images[20:60], stamps=stamps)
+    assert TrackState.LOST in [r.state for r in results]
+
+
+def test_waits_for_something_to_see(walk):
+    dark = (np.zeros((480, 640), np.uint8),) * 2
+    results, _ = run([dark, dark, *walk[0][:3]])
+    assert [r.state for r in results] == [TrackState.INITIALISING] * 2 + [TrackState.OK] * 3
+    assert [r.waiting_for for r in results] == [WaitReason.VIEW] * 2 + [None] * 3
+
+
+def test_memory_is_bounded(walk):
+    config = TrackerConfig(max_keyframes=5, keyframe_m=0.02, keyframe_rad=0.02)
+    tracker = VisualTracker(STEREO, config)
+    for i, (left, right) in enumerate(walk[0]):
+        frame = Frame(stamp(i), i, left, right)
+        if tracker.track(frame).keyframe_ready:
+            tracker.make_keyframe(frame)
+        local_map = tracker._map
+        assert len(local_map.keyframes) <= 5
+        assert len(local_map.ids) <= 5 * config.corners
+        assert set(local_map.anchors) <= set(local_map.keyframes)
+
+
+def test_one_camera_alone_is_refused():
+    with pytest.raises(ValueError, match="scale"):
+        VisualTracker(Rig(CAMERA, np.eye(4)), TrackerConfig())
+
+
+def test_up_comes_from_the_accelerometer(walk):
+    """Body tilted against the camera: odom's z is what the accelerometer says, not the image."""
+    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
+    up = se3.so3_exp(np.array([0.1, 0, 0.2])) @ np.array([0.0, -1, 0])
+    imu = ImuBatch(np.arange(30), np.zeros((30, 3)), np.tile(9.81 * up, (30, 1)))
+    tracker = VisualTracker(rig, TrackerConfig())
+    frame = Frame(0, 0, *walk[0][0], imu=imu)
+    result = tracker.track(frame)
+    assert np.allclose(result.T_odom_body[2, :3], up, atol=1e-9)
+    assert np.allclose(tracker.make_keyframe(frame).up, up, atol=1e-9)
+
+
+def test_without_gravity_in_the_accelerometer_up_stays_unknown(walk):
+    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
+    results, candidates = run(walk[0][:15], rig=rig)  # the IMU says nothing at all
+    assert [r.state for r in results[:9]] == [TrackState.INITIALISING] * 9
+    assert {r.waiting_for for r in results[:9]} == {WaitReason.TILT}
+    assert results[9].state is TrackState.VISION_ONLY
+    assert (candidates[0].up == 0).all()
+
+
+def test_an_imu_that_falls_silent_is_seen_and_ends_nothing(walk):
+    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
+    imu = ImuBatch(np.arange(30), np.zeros((30, 3)), np.tile((0.0, -9.81, 0.0), (30, 1)))
+    tracker, states = VisualTracker(rig, TrackerConfig()), []
+    for i, images in enumerate(walk[0][:12]):
+        frame = Frame(stamp(i), i, *images, imu=ImuBatch.empty() if 4 <= i < 8 else imu)
+        result = tracker.track(frame)
+        states.append(result.state)
+        if result.keyframe_ready:
+            tracker.make_keyframe(frame)
+    ok, alone = [TrackState.OK] * 4, [TrackState.VISION_ONLY] * 4
+    assert states == [*ok, *alone, *ok]
+
+
+def test_level_looks_ahead_and_survives_looking_down():
+    T = initialisation.align_to_gravity(np.array([0, -1.0, 0]), np.array([0, 0, 1.0]))
+    assert np.allclose(T[:3, :3] @ [0, -1, 0], (0, 0, 1))
+    assert np.allclose(T[:3, :3] @ [0, 0, 1], (1, 0, 0))
+    down = initialisation.align_to_gravity(np.array([0, 0, -1.0]), np.array([0, 0, 1.0]))
+    assert np.allclose(down[:3, :3] @ [0, 0, -1], (0, 0, 1))
+    assert np.linalg.det(down[:3, :3]) == pytest.approx(1)

@@ -1,0 +1,167 @@
+"""How much one agent may make the mapper work, and whose turn it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.hellos import hello_of
+
+from share.config import Config
+from share.mapping.query_queue import QueryQueue
+from share.protocol.admission import KeyframeQuota
+from share.protocol.edge import Edge
+from share.protocol.edge_events import AddKeyframe, PeerMessageReceived, SendToPeer
+from share.protocol.edge_records import FairQueue
+from share.types import AgentKind, Keyframe, View
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+S = 1_000_000_000
+MS = S // 1000
+
+
+def keyframe(id: int, points: int) -> Keyframe:
+    view = View(np.zeros((points, 2)), np.zeros((points, 3)), np.zeros((points, 32), np.uint8))
+    T = np.eye(4)
+    return Keyframe(id, id - 1, id * S, T, 1e-6 * np.eye(6), T, np.zeros(3), 0.0, view, id - 1)
+
+
+def taken_in(allowance: KeyframeQuota, points: int, hz: float, seconds: float, name: str = "eve") -> int:
+    times = (round(k * S / hz) for k in range(int(seconds * hz)))
+    one = keyframe(1, points)
+    return sum(allowance.objection(name, one, at_ns) is None for at_ns in times)
+
+
+def test_an_honest_agent_is_never_held_back() -> None:
+    """Its whole ledger at once, and from then on as many as control.rate_max_hz allows."""
+    config = Config()
+    allowance, one = KeyframeQuota(5.0), keyframe(1, config.tracker.view_features)
+    burst = [allowance.objection("ann", one, 0) for _ in range(config.agent.keep_keyframes)]
+    assert not any(burst)
+    hz = config.control.rate_max_hz
+    assert taken_in(allowance, 500, hz, 60, name="ann") == 60 * hz
+
+
+def test_of_large_keyframes_fewer_are_taken_in() -> None:
+    allowance = KeyframeQuota(5.0)
+    assert taken_in(allowance, 2000, 50, 60) < 60 * 50 / 4
+    after = taken_in(allowance, 2000, 50, 60)
+    assert 60 * 3 <= after <= 60 * 4
+    assert taken_in(KeyframeQuota(5.0), 0, 50, 600) < 600 * 32 + 2000
+
+
+def test_a_new_run_gives_no_new_allowance_and_another_name_has_its_own() -> None:
+    allowance = KeyframeQuota(5.0)
+    taken_in(allowance, 2000, 50, 60)
+    assert taken_in(allowance, 2000, 50, 1) <= 4
+    assert taken_in(allowance, 500, 5, 20, name="ann") == 100
+
+
+def test_what_is_not_taken_in_is_not_acknowledged_and_is_said() -> None:
+    edge = Edge(Config(), 7)
+    hello, now_ns = hello_of("eve", 5), S
+
+    def tell(message: m.Message) -> list[Any]:
+        return edge.handle(PeerMessageReceived(m.peer_id(5), [bytes(f) for f in encode(message)]), now_ns)
+
+    tell(hello)
+    applied, acked = 0, m.Ack(0)
+    for k in range(300):
+        effects = tell(keyframe(k, 2000))
+        applied += sum(isinstance(effect, AddKeyframe) for effect in effects)
+        (acked,) = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, SendToPeer)]
+    assert 100 < applied < 250
+    assert acked == m.Ack(applied)
+    report = edge.report({})
+    eve = report["agents"]["eve"]
+    assert "5000 keypoints a second" in eve["reason"]
+    assert eve["refused_messages"] == 300 - applied
+    assert report["refused"] == [f"agent 'eve': {300 - applied} messages refused, the last: {eve['reason']}"]
+    now_ns += 10 * S  # sent again, it is taken in
+    assert any(isinstance(effect, AddKeyframe) for effect in tell(keyframe(applied, 2000)))
+    now_ns += 10 * S
+    tell(m.Ping(0, 0))
+    assert edge.report({})["agents"]["eve"]["reason"] == ""
+
+
+def test_each_name_in_turn() -> None:
+    turns = FairQueue[int]()
+    for k in range(100):
+        turns.add("eve", k)
+    turns.add("ann", 1000)
+    turns.add("ann", 1001)
+    turns.add("bob", 2000)
+    assert [turns.take_next() for _ in range(6)] == [0, 1000, 2000, 1, 1001, 2]
+    assert len(turns) == 97
+    assert [turns.take_next() for _ in range(97)] == list(range(3, 100))
+    assert turns.take_next() is None
+
+
+@pytest.mark.parametrize("spent_ms", [10.0, 1e6])
+def test_looking_up_has_its_turn_too(spent_ms: float) -> None:
+    turns = FairQueue[int]()
+    turns.add("eve", 1)
+    assert turns.take_next(spent_ms) is None
+    assert turns.take_next(9.9) == 1
+
+
+def test_what_an_agent_sends_beyond_the_rate_waits_until_nothing_else_does() -> None:
+    allowance = KeyframeQuota(5.0)
+    honest = [allowance.is_over_rate("ann", round(k * S / 5.5)) for k in range(600)]
+    assert not any(honest)
+    eager = [allowance.is_over_rate("eve", k * S // 40) for k in range(40 * 60)]
+    assert 0.8 < sum(eager) / len(eager) < 0.9
+    assert not any(KeyframeQuota(None).is_over_rate("eve", k * MS) for k in range(1000))
+
+
+def test_an_extra_keyframe_is_passed_over_at_once() -> None:
+    lookups = QueryQueue(Config().edge)
+    lookups.add("eve", AgentKind.AR, 1, is_extra=True)
+    lookups.add("ann", AgentKind.ROBOT, 0)
+    assert (lookups.next_query(), lookups.next_query(), lookups.next_skipped()) == (0, None, 1)
+    assert lookups.skipped == {"eve": 1}
+
+
+@pytest.mark.parametrize(("policy", "some"), [("share", True), ("covins-g", False)])
+def test_the_edge_says_which_keyframes_are_extra(policy: str, some: bool) -> None:
+    edge = Edge(replace(Config(), edge=replace(Config().edge, policy=policy)), 8)
+    edge.handle(PeerMessageReceived(m.peer_id(1), encode(hello_of("eve", 1))), 0)
+    effects = []
+    for k in range(100):
+        one = replace(keyframe(k, 0), stamp_ns=k * 20 * MS)
+        effects += edge.handle(PeerMessageReceived(m.peer_id(1), encode(one)), k * 20 * MS)
+    extra = [effect.is_over_rate for effect in effects if isinstance(effect, AddKeyframe)]
+    assert len(extra) == 100
+    assert (sum(extra) > 60) is some
+
+
+def test_a_copy_of_a_keyframe_that_waits_costs_nothing() -> None:
+    edge = Edge(Config(), 8)
+    edge.handle(PeerMessageReceived(m.peer_id(1), encode(hello_of("eve", 1))), 0)
+    for _ in range(1000):  # keyframe 0 has not come yet; each would cost 2,250
+        edge.handle(PeerMessageReceived(m.peer_id(1), encode(keyframe(1, 2000))), 0)
+    effects = edge.handle(PeerMessageReceived(m.peer_id(1), encode(keyframe(0, 2000))), 0)
+    assert [effect.keyframe.id for effect in effects if isinstance(effect, AddKeyframe)] == [0, 1]
+
+
+def test_what_begins_a_stretch_counts_as_twenty() -> None:
+    allowance, first = KeyframeQuota(5.0), keyframe(0, 0)
+    taken = sum(allowance.objection("eve", first, k * S // 50) is None for k in range(50 * 600))
+    assert 60 < taken < 1100
+    assert taken_in(KeyframeQuota(5.0), 0, 50, 600) > 10 * taken
+
+
+def test_what_waits_of_a_run_goes_when_it_leaves_and_is_asked_for_again() -> None:
+    edge = Edge(Config(), 8)
+
+    def tell(message: m.UplinkMessage) -> list[Any]:
+        effects = edge.handle(PeerMessageReceived(m.peer_id(1), encode(message)), S)
+        return [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, SendToPeer)]
+
+    tell(hello_of("eve", 1))
+    assert m.Ack(0, (1,)) in tell(keyframe(1, 2000))
+    tell(m.Bye())
+    assert m.Ack(0, (2,)) in [*tell(hello_of("eve", 1)), *tell(keyframe(2, 0))]

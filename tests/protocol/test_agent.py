@@ -1,0 +1,553 @@
+"""The agent's protocol machine, one duty at a time: scripted events, and what comes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+from helpers.model_edge import COV, HELLO, MS, UP, S, handle, tracked
+
+from share.config import AgentConfig, ClockConfig, Config
+from share.errors import UsageError
+from share.geometry import se3
+from share.protocol import agent_events as ev
+from share.protocol.agent import Agent
+from share.types import Correction, Keyframe, KeyframeCandidate, TrackState, View
+from share.wire import messages as m
+from share.wire.codec import WIRE_VERSION, decode, encode, message_bytes
+
+T = TypeVar("T")
+SESSION = 77
+
+
+def said(effects: Sequence[ev.AgentEffect]) -> list[str]:
+    return [effect.text for effect in effects if isinstance(effect, ev.PrintLine)]
+
+
+def sent(effects: Sequence[ev.AgentEffect]) -> list[Any]:
+    return [decode(effect.frames) for effect in effects if isinstance(effect, ev.SendToEdge)]
+
+
+def only(kind: type[T], effects: Sequence[ev.AgentEffect], messages: bool = False) -> list[T]:
+    return [x for x in (sent(effects) if messages else effects) if isinstance(x, kind)]
+
+
+def tell(agent: Agent, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
+    return handle(agent, ev.EdgeMessageReceived(encode(message)), now_ns)
+
+
+def welcomed(config: Config | None = None) -> Agent:
+    """An agent at time 0, connected."""
+    agent = Agent(HELLO, config or Config())
+    handle(agent, ev.AgentTick(), 0)
+    tell(agent, m.Welcome(SESSION, 0), 0)
+    return agent
+
+
+def pose(x: float = 0.0, yaw: float = 0.0) -> np.ndarray:
+    return se3.from_rt(se3.so3_exp(np.array([0, 0, yaw])), np.array([x, 0, 0.0]))
+
+
+def seen_at(depth: float) -> View:
+    """Three points at this depth, m."""
+    uv = np.array([[-0.1, 0.0], [0.0, 0.1], [0.1, 0.0]])
+    return View(uv, depth * np.c_[uv, np.ones(3)], np.zeros((3, 32), np.uint8))
+
+
+def correction(T: np.ndarray, revision: int, answers: int = -1, map_id: str = "a") -> Correction:
+    """About the stretch of the keyframe that it answers, or the first one."""
+    return Correction(T, COV, map_id, revision, max(answers, 0), answers)
+
+
+# ---------------------------------------------------------------- being connected
+
+
+def test_says_hello_until_welcomed() -> None:
+    agent = Agent(HELLO, Config())
+    hellos = [bool(sent(handle(agent, ev.AgentTick(), t * 100 * MS))) for t in range(11)]
+    assert [t for t, hello in enumerate(hellos) if hello] == [0, 5, 10]
+    effects = tell(agent, m.Welcome(SESSION, 0), 1100 * MS)
+    assert said(effects) == ["connected to the edge"]
+    later = [x for t in range(12, 30) for x in sent(handle(agent, ev.AgentTick(), t * 100 * MS))]
+    assert {type(x) for x in later} == {m.Ping, m.Status}
+
+
+def test_an_edge_that_never_answers_is_said_once() -> None:
+    agent = Agent(HELLO, Config())
+    lines = [line for t in range(100) for line in said(handle(agent, ev.AgentTick(), t * 100 * MS))]
+    assert lines == ["no edge answers yet; tracking continues without the edge"]
+
+
+def test_silence_and_return_are_said_once_each() -> None:
+    agent = welcomed()
+    effects = [x for t in range(1, 100) for x in handle(agent, ev.AgentTick(), t * 100 * MS)]
+    assert said(effects) == ["the edge is silent; tracking continues without the edge"]
+    assert len(only(m.Hello, effects, messages=True)) == pytest.approx(14, abs=1)
+    assert said(tell(agent, m.Welcome(SESSION, 0), 10 * S)) == ["reconnected to the edge"]
+    assert agent.report()["connected"]
+    assert agent.report()["edge_sessions"] == 1
+
+
+def test_a_taken_name_ends_the_run_with_the_edges_reason() -> None:
+    agent = Agent(HELLO, Config())
+    handle(agent, ev.AgentTick(), 0)
+    [fail] = tell(agent, m.Refused("the name is in use"), 1)
+    assert isinstance(fail, ev.FailRun)
+    assert isinstance(fail.error, UsageError)
+    assert str(fail.error) == "the edge refuses 'ann': the name is in use"
+    assert handle(agent, ev.AgentTick(), 2) == []
+
+
+def test_a_refusal_by_a_restarted_edge_does_not_end_the_run() -> None:
+    agent = welcomed()
+    assert said(tell(agent, m.Refused("full"), S)) == [
+        "the edge refuses 'ann': full; tracking continues without the edge"
+    ]
+    hellos = [
+        t for t in range(11, 80) if only(m.Hello, handle(agent, ev.AgentTick(), t * 100 * MS), messages=True)
+    ]
+    assert hellos[0] == 60
+    assert only(ev.LocalisedPose, handle(agent, tracked(200), 10 * S))
+
+
+def test_bad_messages_are_counted_and_said_once_a_kind() -> None:
+    agent = welcomed()
+    lines = []
+    for frames in ([b"junk"], [b"junk"], [], encode(m.Bye()), encode(m.Bye())):
+        lines += said(handle(agent, ev.EdgeMessageReceived(frames), S))
+    assert agent.report()["bad_messages"] == 5
+    assert len(lines) == 3
+    assert lines[-1] == "the edge sent a Bye, which this agent does not expect"
+
+
+def test_another_wire_version_is_said_in_words() -> None:
+    agent = Agent(HELLO, Config())
+    newer = b"\x94\x09\x01\x90\x90"
+    assert said(handle(agent, ev.EdgeMessageReceived([newer]), 0)) == [
+        "invalid message from the edge: "
+        f"header: peer speaks wire 9, this SHARE wire {WIRE_VERSION}: upgrade the older one"
+    ]
+
+
+def test_a_pong_of_another_session_brings_hello_and_then_everything_held() -> None:
+    agent = welcomed()
+    for k in range(3):
+        handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
+    tell(agent, m.Ack(3), 160 * MS)
+    [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
+    effects = tell(agent, m.Pong(ping.sequence, ping.sent_ns, 1, 2, SESSION + 1), 501 * MS)
+    assert only(m.Hello, effects, messages=True)
+    effects = tell(agent, m.Welcome(SESSION + 1, 0), 502 * MS)
+    assert said(effects) == ["the edge has restarted; 3 keyframes are resent"]
+    assert [k.id for k in only(Keyframe, effects, messages=True)] == [0, 1, 2]
+    assert tell(agent, m.Welcome(SESSION, 0), 503 * MS) == []  # overtaken on its way
+
+
+def test_ping_and_pong_give_round_trip_and_clock() -> None:
+    agent = welcomed()
+    for t in range(1, 40):
+        now = t * 500 * MS
+        for ping in only(m.Ping, handle(agent, ev.AgentTick(), now), messages=True):
+            edge = now + MS + 3 * S
+            tell(agent, m.Pong(ping.sequence, ping.sent_ns, edge, edge, SESSION), now + 2 * MS)
+            tell(agent, m.Pong(ping.sequence, ping.sent_ns, edge, edge, SESSION), now + 90 * MS)  # twice
+    report = agent.report()
+    assert report["rtt_ms"] == pytest.approx(2.0)
+    assert report["clock_offset_ns"] == pytest.approx(3 * S, abs=20_000)
+    assert abs(report["clock_drift_ppm"]) < 1
+
+
+def test_the_wait_for_a_view_is_no_delay() -> None:
+    """It is made while nobody waits, so the scheduler is told only what its last frame took."""
+    agent = welcomed()
+    [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
+    for k in (11, 12, 13):
+        handle(agent, tracked(k, pose(1)), (50 * k + 4) * MS)
+    frame = replace(tracked(14, pose(1)), is_keyframe=True)
+    candidate = KeyframeCandidate(pose(1), pose(1), COV, UP, 0.01, seen_at(2.0), True, frames_ago=3)
+    effects = agent.handle(frame, 704 * MS) + agent.handle(ev.KeyframeMade(frame, candidate), 710 * MS)
+    assert [told.delay_ms for told in only(m.Evaluation, effects, messages=True)] == [3.0 + 10.0]
+
+
+def latencies(edge_ns: Callable[[int], int], claim_ms: float = 1.0) -> tuple[list[float], Agent]:
+    """All that is called latency or delay in 30 s of keyframes, each corrected 27 ms after its frame came,
+    with an edge whose clock shows `edge_ns` of the agent's."""
+    agent, told = welcomed(Config(clock=ClockConfig(claim_ms=claim_ms))), []
+    for k in range(1, 600):
+        now = k * 50 * MS + 4 * MS
+        effects = handle(agent, tracked(k, pose(k / 100), candidate=k % 20 == 1), now)
+        for ping in only(m.Ping, effects, messages=True):
+            pong = m.Pong(ping.sequence, ping.sent_ns, edge_ns(now + MS), edge_ns(now + 2 * MS), SESSION)
+            effects += tell(agent, pong, now + 4 * MS)
+        for keyframe in only(Keyframe, effects, messages=True):
+            tell(agent, m.Ack(keyframe.id + 1), now + 5 * MS)
+            effects += tell(agent, correction(pose(), k, answers=keyframe.id), now + 23 * MS)
+        told += [frame.track_ms for frame in only(ev.FrameDone, effects)]
+        told += [evaluation.delay_ms for evaluation in only(m.Evaluation, effects, messages=True)]
+        told += [c.corrected_ms for c in only(ev.CorrectionApplied, effects) if c.corrected_ms is not None]
+    return told, agent
+
+
+@pytest.mark.parametrize(
+    "edge_ns",
+    [
+        lambda ns: ns - 86_400 * S,
+        lambda ns: ns + 3 * S + ns // 10_000,  # and 100 ppm fast
+        lambda ns: ns + (7 * S if ns < 15 * S else 9 * S),  # set in the middle
+    ],
+    ids=["a day behind", "fast", "set"],
+)
+def test_no_latency_depends_on_how_far_the_edges_clock_is_off(edge_ns: Callable[[int], int]) -> None:
+    """So none has to be taken back where that is not known."""
+    true, _ = latencies(lambda ns: ns)
+    told, _ = latencies(edge_ns)
+    assert told == pytest.approx(true, abs=1e-3)
+    assert {round(x) for x in true} == {4, 7, 27}  # to the pose; with a round trip of 3; to the correction
+
+
+def test_an_offset_is_claimed_as_the_setting_allows() -> None:
+    """1 ms there and 2 back, so it is off by 0.5 and nobody can see that; nor that the edge kept it for 1."""
+    _, agent = latencies(lambda ns: ns + 3 * S)
+    strict = agent.clock_estimate(30 * S)
+    assert (strict.claim_ms, strict.is_reliable, strict.offset_ms) == (1.0, False, None)
+    assert strict.asymmetry_ms == pytest.approx(2.5)
+    _, agent = latencies(lambda ns: ns + 3 * S, claim_ms=3.0)
+    assert agent.clock_estimate(30 * S).offset_ms == pytest.approx(2999.5, abs=0.1)
+    assert not agent.clock_estimate(7200 * S).is_reliable  # long after it was last heard
+
+
+# ---------------------------------------------------------------- frames
+
+
+def test_every_frame_is_localised_and_done_with_or_without_an_edge() -> None:
+    agent = Agent(HELLO, Config())
+    [localised] = only(ev.LocalisedPose, effects := handle(agent, tracked(3, pose(1)), 160 * MS))
+    assert (localised.index, localised.T_map_odom, localised.map_id) == (3, None, None)
+    np.testing.assert_array_equal(localised.T_odom_body, pose(1))
+    assert only(ev.FrameDone, effects) == [
+        ev.FrameDone(10**15 + 150 * MS, 4.0, TrackState.OK, is_keyframe=False, is_sent=False)
+    ]
+
+
+def test_a_lost_frame_has_no_pose_but_is_done() -> None:
+    agent = welcomed()
+    lost = ev.FrameTracked(0, 0, 0, MS, TrackState.LOST)
+    effects = handle(agent, lost, MS)
+    assert only(ev.LocalisedPose, effects) == only(m.PoseUpdate, effects, messages=True) == []
+    assert only(ev.FrameDone, effects)[0].state is TrackState.LOST
+
+
+def test_a_keyframe_that_could_not_be_made_leaves_a_frame_that_is_done() -> None:
+    agent = welcomed()
+    handle(agent, tracked(0, pose(0), candidate=True), 0)
+    frame = tracked(1, pose(1), candidate=True)
+    effects = agent.handle(frame, 60 * MS) + agent.handle(ev.KeyframeMade(frame, None), 70 * MS)
+    assert only(ev.FrameDone, effects) == [
+        ev.FrameDone(frame.stamp_ns, 4.0, TrackState.OK, is_keyframe=False, is_sent=False)
+    ]
+    assert not only(Keyframe, effects, messages=True)
+    [after] = only(Keyframe, handle(agent, tracked(2, pose(2), candidate=True), 100 * MS), messages=True)
+    assert (after.id, after.reference, agent.report()["candidates"]) == (1, 0, 2)
+    np.testing.assert_allclose(after.T_ref_body, pose(2))
+
+
+def test_a_candidate_whose_view_took_some_frames_is_a_keyframe_of_its_own_frame() -> None:
+    """Its stamp is that frame's, and a correction that answers it is as old as that; the frame that it came
+    with is the one that is done."""
+    agent = welcomed()
+    for k in range(3):
+        handle(agent, tracked(k, pose(k)), 50 * k * MS)
+    frame = replace(tracked(3, pose(3)), is_keyframe=True)
+    candidate = KeyframeCandidate(pose(1), pose(1), COV, UP, 0.01, seen_at(2.0), True, frames_ago=2)
+    effects = agent.handle(frame, 154 * MS) + agent.handle(ev.KeyframeMade(frame, candidate), 160 * MS)
+    [made] = only(Keyframe, effects, messages=True)
+    assert made.stamp_ns == tracked(1).stamp_ns
+    [done] = only(ev.FrameDone, effects)
+    assert (done.stamp_ns, done.is_keyframe, done.is_sent) == (frame.stamp_ns, True, True)
+    [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(0), 1, answers=0), 250 * MS))
+    assert (applied.stamp_ns, applied.corrected_ms) == (made.stamp_ns, pytest.approx(200.0))
+
+
+def test_poses_go_relative_to_the_last_keyframe_that_the_edge_has() -> None:
+    agent = welcomed()
+    handle(agent, tracked(0, pose(1), candidate=True), 0)
+    [before] = only(m.PoseUpdate, handle(agent, tracked(1, pose(2)), 50 * MS), messages=True)
+    assert before.keyframe == -1
+    np.testing.assert_array_equal(before.T_keyframe_body, pose(2))
+    tell(agent, m.Ack(1), 60 * MS)
+    [after] = only(m.PoseUpdate, handle(agent, tracked(2, pose(2.5)), 100 * MS), messages=True)
+    assert after.keyframe == 0
+    np.testing.assert_allclose(after.T_keyframe_body, pose(1.5))
+    broken = handle(agent, tracked(3, pose(9), candidate=True, new_stretch=True), 150 * MS)
+    for effects in (broken, handle(agent, tracked(4, pose(9)), 200 * MS)):
+        assert [p.keyframe for p in only(m.PoseUpdate, effects, messages=True)] == [-1]
+
+
+def test_keyframes_are_numbered_sent_and_evaluated() -> None:
+    agent = welcomed()
+    [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
+    effects = handle(agent, tracked(11, pose(1), candidate=True, ms=5), 560 * MS)
+    [keyframe] = only(Keyframe, effects, messages=True)
+    assert (keyframe.id, keyframe.reference, keyframe.stamp_ns) == (0, -1, 10**15 + 550 * MS)
+    assert only(m.Evaluation, effects, messages=True) == [m.Evaluation(0, 13.0, 0.0)]
+    assert only(ev.FrameDone, effects)[0].is_sent
+
+
+def test_keyframes_made_without_an_edge_are_sent_when_one_comes() -> None:
+    agent = Agent(HELLO, Config())
+    for k in range(40):
+        effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
+        assert not only(Keyframe, effects, messages=True)
+    effects = tell(agent, m.Welcome(SESSION, 0), 2 * S)
+    assert [k.id for k in only(Keyframe, effects, messages=True)] == list(range(Config().link.window))
+
+
+# ---------------------------------------------------------------- rate
+
+
+def test_a_rate_is_spent_as_a_token_bucket() -> None:
+    agent = welcomed()
+    tell(agent, m.Rate(2.0), 0)
+    done, keyframes = [], []
+    for k in range(100):  # 5 s, a candidate every frame
+        effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
+        done += only(ev.FrameDone, effects)
+        keyframes += only(Keyframe, effects, messages=True)
+        tell(agent, m.Ack(len(keyframes)), k * 50 * MS)
+    assert len(keyframes) == pytest.approx(2 + 2 * 5, abs=1)
+    report = agent.report()
+    assert report["candidates"] == 100 == report["keyframes"] + report["drop_rate"]
+    assert [d.stamp_ns for d in done] == [10**15 + k * 50 * MS for k in range(100)]
+    assert [d.stamp_ns for d in done if d.is_sent] == [k.stamp_ns for k in keyframes]
+    T = np.eye(4)
+    for keyframe in keyframes:  # the chain still leads to where the body was
+        T = T @ keyframe.T_ref_body
+        assert T[0, 3] == pytest.approx((keyframe.stamp_ns - 10**15) / (50 * MS))
+
+
+def test_views_that_see_far_are_preferred_and_the_rate_is_kept() -> None:
+    agent, depths = welcomed(), np.random.default_rng(3).uniform(1.0, 9.0, 200)
+    tell(agent, m.Rate(2.0), 0)
+    taken = []
+    for k, depth in enumerate(depths):  # 40 s, five candidates a second
+        at_ns = 200 * k * MS
+        effects = handle(agent, tracked(4 * k, pose(k), candidate=True), at_ns, seen_at(depth))
+        if only(ev.FrameDone, effects)[0].is_sent:
+            taken.append(depth)
+            tell(agent, m.Ack(len(taken)), at_ns)
+    assert len(taken) == pytest.approx(2 + 2 * 40, abs=4)
+    assert np.mean(taken) > np.mean(depths) + 0.8  # m
+
+
+def test_a_correction_sets_back_what_odometry_may_have_lost() -> None:
+    agent, errors_cm = welcomed(Config(agent=AgentConfig(tell_placement=False))), []
+    [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
+    for k in range(12):
+        now_ns = (550 + 50 * k) * MS
+        if k == 6:
+            tell(agent, correction(pose(), 1, answers=4), now_ns)
+        effects = handle(agent, tracked(11 + k, candidate=True), now_ns)
+        errors_cm += [e.error_cm for e in only(m.Evaluation, effects, messages=True)]
+        tell(agent, m.Ack(k + 1), now_ns)
+    sigma_cm = 100 * np.sqrt(np.trace(COV[3:, 3:]))
+    since = np.array([0, 1, 2, 3, 4, 5, 2, 3, 4, 5, 6, 7])
+    np.testing.assert_allclose(errors_cm, sigma_cm * np.sqrt(since))
+
+
+# ---------------------------------------------------------------- corrections
+
+
+def corrected_agent() -> Agent:
+    """Connected, keyframe 0 of frame 0 sent and acknowledged."""
+    agent = welcomed()
+    handle(agent, tracked(0, candidate=True), 4 * MS)
+    tell(agent, m.Ack(1), 10 * MS)
+    return agent
+
+
+def in_force(agent: Agent, now_ns: int) -> Any:
+    [localised] = only(ev.LocalisedPose, handle(agent, tracked(now_ns // (50 * MS)), now_ns))
+    return localised.T_map_odom
+
+
+def test_the_first_correction_applies_at_once_and_is_timed() -> None:
+    agent = corrected_agent()
+    effects = tell(agent, correction(pose(5), 1, answers=0), 31 * MS)
+    assert only(ev.CorrectionApplied, effects) == [
+        ev.CorrectionApplied(0, 0, 10**15, 31.0, "a", 1, new_map=True)
+    ]
+    np.testing.assert_array_equal(in_force(agent, 50 * MS), pose(5))
+    [second] = only(ev.CorrectionApplied, tell(agent, correction(pose(5), 2, answers=0), 60 * MS))
+    assert (second.keyframe_id, second.corrected_ms, second.new_map) == (0, None, False)
+    [anothers] = only(ev.CorrectionApplied, tell(agent, correction(pose(5), 3), 60 * MS))
+    assert (anothers.keyframe_id, anothers.stamp_ns, anothers.corrected_ms) == (None, None, None)
+
+
+def test_large_corrections_are_blended_and_small_ones_are_not() -> None:
+    agent = corrected_agent()
+    tell(agent, correction(pose(0), 1), 100 * MS)
+    tell(agent, correction(pose(0.04), 2), 200 * MS)
+    np.testing.assert_array_equal(in_force(agent, 200 * MS), pose(0.04))
+    tell(agent, correction(pose(1.04), 3), 1000 * MS)
+    xs = [in_force(agent, t * MS)[0, 3] for t in (1000, 1100, 1250, 1500, 2000)]
+    np.testing.assert_allclose(xs, [0.04, 0.24, 0.54, 1.04, 1.04], atol=1e-12)
+    tell(agent, correction(pose(3.04), 4), 3000 * MS)
+    in_force(agent, 3250 * MS)
+    tell(agent, correction(pose(2.04), 5), 3250 * MS)  # while blending: no step
+    np.testing.assert_allclose(in_force(agent, 3250 * MS), pose(2.04), atol=1e-12)
+
+
+def test_a_small_turn_far_from_the_origin_is_a_large_correction() -> None:
+    agent = corrected_agent()
+    handle(agent, tracked(1, pose(10)), 50 * MS)
+    tell(agent, correction(pose(0), 1), 100 * MS)
+    tell(agent, correction(pose(0, yaw=0.01), 2), 100 * MS)
+    np.testing.assert_allclose(in_force(agent, 100 * MS), pose(0), atol=1e-12)
+
+
+def test_another_map_applies_at_once() -> None:
+    agent = corrected_agent()
+    tell(agent, correction(pose(0), 1), 100 * MS)
+    [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(9), 2, map_id="b"), 200 * MS))
+    assert applied.new_map
+    np.testing.assert_array_equal(in_force(agent, 200 * MS), pose(9))
+
+
+def test_old_corrections_are_counted_and_ignored() -> None:
+    agent = corrected_agent()
+    tell(agent, correction(pose(1), 5), 100 * MS)
+    for revision in (5, 4, 1):
+        assert not only(ev.CorrectionApplied, tell(agent, correction(pose(2), revision), 200 * MS))
+    assert agent.report()["corrections_stale"] == 3
+    np.testing.assert_array_equal(in_force(agent, 300 * MS), pose(1))
+
+
+def test_after_odometry_broke_only_corrections_of_the_new_stretch_count() -> None:
+    agent = corrected_agent()
+    tell(agent, correction(pose(1), 1, answers=0), 100 * MS)
+    handle(agent, tracked(4, pose(0), candidate=True, new_stretch=True), 200 * MS)
+    assert in_force(agent, 250 * MS) is None
+    for late in (correction(pose(1), 2, answers=0), correction(pose(1), 2)):
+        assert not only(ev.CorrectionApplied, tell(agent, late, 260 * MS))
+    [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(7), 3, answers=1), 300 * MS))
+    assert applied.keyframe_id == 1
+    np.testing.assert_array_equal(in_force(agent, 300 * MS), pose(7))
+
+
+def test_a_founding_correction_counts_though_it_overtakes_the_acknowledgement() -> None:
+    """The edge acknowledges what its disk has; the map does not wait for that."""
+    agent = welcomed()
+    handle(agent, tracked(0, candidate=True), 4 * MS)
+    tell(agent, correction(pose(1), 1), 8 * MS)
+    np.testing.assert_array_equal(in_force(agent, 50 * MS), pose(1))
+
+
+def test_a_correction_of_the_old_stretch_that_comes_late_is_not_laid_on_the_new_one() -> None:
+    agent = corrected_agent()
+    handle(agent, tracked(4, pose(0), candidate=True, new_stretch=True), 200 * MS)
+    tell(agent, m.Ack(2), 210 * MS)  # the edge has a keyframe of the new one
+    tell(agent, correction(pose(1), 1), 220 * MS)
+    assert in_force(agent, 250 * MS) is None
+
+
+def test_the_delay_is_until_the_keyframe_is_made_and_does_not_jump() -> None:
+    agent = welcomed()
+    [ping] = [
+        p for t in (1, 500) for p in only(m.Ping, handle(agent, ev.AgentTick(), t * MS), messages=True)
+    ][-1:]
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), ping.sent_ns + 6 * MS)
+    delays = []
+    for k, took_ms in enumerate((11, 11, 91, 11), 20):
+        handle(agent, tracked(k, pose(k), candidate=False), k * 50 * MS + 5 * MS)
+        effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS + took_ms * MS)
+        delays += [told.delay_ms for told in only(m.Evaluation, effects, messages=True)]
+    assert delays == pytest.approx([17.0, 17.0, 27.0, 25.75])
+
+
+def test_a_correction_for_a_replayed_keyframe_is_not_a_latency() -> None:
+    agent = corrected_agent()
+    handle(agent, ev.Connected(), 60 * S)
+    tell(agent, m.Welcome(SESSION + 1, 0), 60 * S)
+    tell(agent, m.Ack(1), 60 * S)
+    [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(1), 1, answers=0), 60 * S))
+    assert (applied.keyframe_id, applied.corrected_ms) == (0, None)
+
+
+# ---------------------------------------------------------------- the end
+
+
+def test_the_end_waits_for_acknowledgements() -> None:
+    agent = welcomed()
+    handle(agent, tracked(0, candidate=True), 0)
+    assert not only(ev.CloseLink, handle(agent, ev.InputFinished(), 100 * MS))
+    assert only(Keyframe, handle(agent, ev.AgentTick(), 1000 * MS), messages=True)  # resent meanwhile
+    effects = tell(agent, m.Ack(1), 1100 * MS)
+    assert isinstance(sent(effects)[-1], m.Bye)
+    assert isinstance(effects[-1], ev.CloseLink)
+    assert handle(agent, ev.AgentTick(), 2 * S) == []
+
+
+def test_the_end_does_not_wait_for_ever() -> None:
+    agent = Agent(HELLO, Config())
+    handle(agent, tracked(0, candidate=True), 0)
+    handle(agent, ev.InputFinished(), S)
+    stops = [t for t in range(1, 100) if only(ev.CloseLink, handle(agent, ev.AgentTick(), S + t * 100 * MS))]
+    assert stops == [50]
+    assert agent.report()["open"] == 1
+
+
+def test_with_nothing_open_the_end_is_now() -> None:
+    effects = Agent(HELLO, Config()).handle(ev.InputFinished(), 0)
+    assert isinstance(effects[-1], ev.CloseLink)
+    assert not only(m.Bye, effects, messages=True)
+
+
+def test_the_report_is_plain_data() -> None:
+    report = corrected_agent().report()
+    assert all(value is None or type(value) in (int, float, str, bool) for value in report.values())
+    assert (report["sent"], report["acknowledged"], report["open"]) == (1, 1, 0)
+    assert report["bytes_up"] > report["bytes_down"] > 0
+
+
+@pytest.mark.parametrize("placement", [True, False])
+def test_an_agent_tells_how_unsurely_the_map_placed_it(placement: bool) -> None:
+    agent = welcomed(Config(agent=AgentConfig(tell_placement=placement)))
+    [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
+    handle(agent, tracked(10, pose(3), candidate=True), 510 * MS)
+    tell(agent, correction(pose(), 1, answers=0), 520 * MS)
+    effects = handle(agent, tracked(11, pose(3), candidate=True), 560 * MS)
+    [told] = only(m.Evaluation, effects, messages=True)
+    # of one motion, after that of odometry in the map
+    cov = se3.compose_cov(pose(3), COV, COV) if placement else COV
+    assert told.error_cm == pytest.approx(100 * np.sqrt(np.trace(cov[3:, 3:])))
+
+
+def test_what_no_link_takes_is_not_sent() -> None:
+    """Neither its bytes nor its keyframe count, however often it is tried in vain."""
+    agent, now, tried = welcomed(), 0, 0
+    bytes_up = agent.report()["bytes_up"]
+    effects = handle(agent, tracked(0, candidate=True), now)
+    while tried < 3:
+        for effect in only(ev.SendToEdge, effects):
+            tried += effect.keyframe_id == 0
+            assert not only(ev.SendToEdge, handle(agent, ev.SendFailed(effect), now))
+        now += 100 * MS
+        effects = tell(agent, m.Ack(0), now)  # it is there, but its queue is full
+    told = agent.report()
+    assert (told["sent"], told["resent"], told["bytes_up"]) == (0, 0, bytes_up)
+    assert (told["keyframes"], told["unacknowledged"]) == (1, 1)
+    while not (keyframes := [s for s in only(ev.SendToEdge, effects) if s.keyframe_id == 0]):
+        now += 100 * MS
+        effects = tell(agent, m.Ack(0), now)
+    told = agent.report()
+    assert (told["sent"], told["resent"]) == (1, 0)
+    assert told["bytes_up"] >= bytes_up + message_bytes(keyframes[0].frames)
+    tell(agent, m.Ack(1), now)
+    assert agent.report()["unacknowledged"] == 0

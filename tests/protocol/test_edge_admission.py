@@ -1,0 +1,246 @@
+"""How many runs of agents come in, and which that were gone come back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.hellos import hello_of
+
+from share.config import Config
+from share.mapping.map_changes import SaveKeyframe, SaveRun
+from share.protocol import edge_events as ed
+from share.protocol.admission import NewRunLimits
+from share.protocol.edge import Edge
+from share.protocol.edge_events import SaveChanges
+from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.remote_tracking import TrackingCapacity, TrackingEdge
+from share.types import AgentKind, Keyframe, View
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+S = 1_000_000_000
+EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+
+
+def keyframe(id: int) -> Keyframe:
+    cov = 1e-6 * np.eye(6)
+    return Keyframe(id, id - 1, 200 * id, np.eye(4), cov, np.eye(4), np.zeros(3), 0.0, EMPTY)
+
+
+def tell(
+    edge: Edge, run_id: int, message: m.Message, now_s: float = 0, names: Iterable[str] | None = None
+) -> list[ed.EdgeEffect]:
+    """names: of its key; None: no keys are used."""
+    frames, owned = [bytes(frame) for frame in encode(message)], None if names is None else frozenset(names)
+    key = "" if names is None else "its key"
+    return edge.handle(ed.PeerMessageReceived(m.peer_id(run_id), frames, owned, key), round(now_s * S))
+
+
+def come(edge: Edge, name: str, run_id: int, now_s: float = 0) -> list[ed.EdgeEffect]:
+    return tell(edge, run_id, hello_of(name, run_id), now_s)
+
+
+def refusal(effects: list[ed.EdgeEffect]) -> str | None:
+    messages = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
+    return next((message.reason for message in messages if isinstance(message, m.Refused)), None)
+
+
+def of(effects: list[ed.EdgeEffect], kind: type) -> list:
+    return [effect for effect in effects if isinstance(effect, kind)]
+
+
+def present(edge: Edge) -> int:
+    return sum(not agent["gone"] for agent in edge.report({})["agents"].values())
+
+
+# ---------------------------------------------------------------- how often
+
+
+def test_runs_of_one_keyframe_do_not_fill_the_edge() -> None:
+    """130 a second of one name for 20 s, which say bye: 8 and one each 10 s are taken in."""
+    edge = Edge(Config(), 7)
+    for k in range(2600):
+        come(edge, "eve", k, k / 130)
+        tell(edge, k, keyframe(0), k / 130)
+        tell(edge, k, m.Bye(), k / 130)
+    assert len(edge.report({})["agents"]) == 9
+    assert refusal(come(edge, "ann", -1, 20)) is None  # others come as before
+
+
+def test_who_comes_too_often_is_told_why_and_when_to_try_again() -> None:
+    edge = Edge(Config(), 7)
+    for k in range(8):
+        assert refusal(come(edge, "eve", k, 1)) is None
+        tell(edge, k, m.Bye(), 1)
+    assert refusal(come(edge, "eve", 8, 2.5)) == "too many new runs of 'eve': try again in 9 s"
+    assert refusal(come(edge, "eve", 8, 10.9)) is not None  # nor has it lost anything by asking too early
+    assert refusal(come(edge, "eve", 8, 11.1)) is None
+
+
+def test_new_runs_of_all_names_are_bounded_too() -> None:
+    edge = Edge(Config(), 7)
+    for k in range(128):
+        assert refusal(come(edge, f"eve{k}", k)) is None
+        tell(edge, k, m.Bye())
+    assert refusal(come(edge, "ann", -1)) == "too many new runs of all agents: try again in 1 s"
+    assert refusal(come(edge, "ann", -1, 0.6)) is None
+
+
+def test_new_runs_of_all_names_of_one_key_do_not_keep_others_out() -> None:
+    """100 names come 50 times a second and say bye, for a minute."""
+    edge, names, taken = Edge(Config(), 7), [f"eve{k}" for k in range(100)], 0
+    for k in range(3000):
+        came = tell(edge, k, hello_of(names[k % 100], k), k / 50, names)
+        reason = refusal(came)
+        taken += reason is None
+        tell(edge, k, m.Bye(), k / 50, names)
+    assert 46 <= taken <= 32 + 60 // 4
+    assert str(reason).startswith("too many new runs of the key of 'eve99': try again in ")
+    assert refusal(tell(edge, -1, hello_of("ann", -1), 60, ["ann"])) is None
+
+
+def test_a_run_whose_name_was_taken_from_its_key_is_refused() -> None:
+    edge = Edge(Config(), 7)
+    assert refusal(tell(edge, 1, hello_of("zoe", 1), 0, ["zoe"])) is None
+    assert not of(tell(edge, 1, keyframe(0), 1, ["yan"]), ed.SendToPeer)  # so it is silent, and says hello
+    why = (
+        "its key is authorized for 'yan', not for 'zoe'; on the edge run: share keys authorize … --agent zoe"
+    )
+    assert refusal(tell(edge, 1, hello_of("zoe", 1), 2, ["yan"])) == why
+    zoe = edge.report({})["agents"]["zoe"]
+    assert (zoe["keyframes"], zoe["refused_messages"]) == (0, 0)  # whoever it was, it was not zoe
+    assert refusal(tell(edge, 1, hello_of("zoe", 1), 3, ["yan", "zoe"])) is None
+
+
+def test_names_that_came_long_ago_take_no_memory() -> None:
+    newcomers = NewRunLimits()
+    for k in range(2000):
+        newcomers.record(f"eve{k}", f"eve{k}", k * S // 2)
+    assert len(newcomers._by_name) <= 2 * 10 + 1
+    assert len(newcomers._by_credential) <= 2 * 4 + 1
+
+
+def test_who_is_known_comes_again_as_often_as_it_likes() -> None:
+    known = [
+        RestoredRun(f"bob-{k:04x}", hello_of("bob", 100 + k), OdometryBase(4, 0, np.eye(4)), 5)
+        for k in range(12)
+    ]
+    edge = Edge(Config(), 7, has_store=True, restored=known)
+    for _ in range(200):  # a hello that is repeated, and a reconnect
+        assert refusal(come(edge, "ann", 1)) is None
+    for k in range(12):  # of the map's file
+        assert refusal(come(edge, "bob", 100 + k)) is None
+        tell(edge, 100 + k, m.Bye())
+    for k in range(8):
+        assert refusal(come(edge, "bob", 200 + k)) is None
+        tell(edge, 200 + k, m.Bye())
+    tell(edge, 1, m.Bye())
+    assert refusal(come(edge, "ann", 1)) is None
+
+
+def test_a_refusal_for_another_reason_costs_no_new_run() -> None:
+    edge = Edge(Config(), 7)
+    come(edge, "ann", 1)
+    for _ in range(20):
+        assert "in use" in str(refusal(come(edge, "ann", 2)))
+    tell(edge, 1, m.Bye())
+    assert refusal(come(edge, "ann", 2)) is None
+
+
+def test_a_run_without_a_keyframe_is_not_kept() -> None:
+    edge = Edge(Config(), 7, has_store=True)
+    assert not of(come(edge, "ann", 1), SaveChanges)
+    (keep,) = of(tell(edge, 1, keyframe(0)), SaveChanges)
+    assert [type(change) for change in keep.changes] == [SaveRun, SaveKeyframe]
+    (keep,) = of(tell(edge, 1, keyframe(1)), SaveChanges)
+    assert [type(change) for change in keep.changes] == [SaveKeyframe]
+
+
+# ---------------------------------------------------------------- who comes back
+
+
+@pytest.mark.parametrize(
+    "message",
+    [m.Evaluation(0, 1000.0, 0.0), keyframe(0), m.Ping(1, 1), hello_of("hope", 1)],
+    ids=lambda message: type(message).__name__,
+)
+def test_an_old_run_does_not_come_back_beside_the_present_one(message: m.Message) -> None:
+    edge = Edge(Config(), 7)
+    come(edge, "hope", 1)
+    tell(edge, 1, m.Bye())
+    come(edge, "hope", 2)
+    effects = tell(edge, 1, message, 1)
+    asks = isinstance(message, m.Ping | m.Hello)  # what it may send many of is not answered
+    assert ("in use" in str(refusal(effects))) == asks
+    assert not of(effects, ed.SetPresence) + of(effects, ed.AddKeyframe)
+    assert len(of(effects, ed.SendToPeer)) == asks
+    assert present(edge) == 1
+    assert sum(agent["refused_messages"] for agent in edge.report({})["agents"].values()) == 1
+    assert sum(agent["evaluations"] for agent in edge.report({})["agents"].values()) == 0
+    tell(edge, 2, m.Bye(), 2)
+    assert refusal(tell(edge, 1, m.Ping(1, 1), 2)) is None
+    assert present(edge) == 1
+
+
+def test_who_said_bye_comes_back_only_to_a_free_place() -> None:
+    """As many as may be, of names of their own, after others who said bye."""
+    config = Config()
+    edge = Edge(replace(config, edge=replace(config.edge, max_agents=4)), 7)
+    for k in range(8):
+        assert refusal(come(edge, f"eve{k}", k)) is None
+        tell(edge, k, m.Bye())
+    said = [refusal(tell(edge, k, m.Ping(1, 1))) for k in range(8)]
+    assert said[:4] == [None] * 4
+    assert all("already serves 4 agents" in str(reason) for reason in said[4:])
+    assert present(edge) == 4
+
+
+def test_who_was_silent_for_too_long_has_lost_its_name() -> None:
+    """Also where the edge has not had time to notice."""
+    edge = Edge(Config(), 7)
+    come(edge, "ann", 1)
+    effects = come(edge, "ann", 2, 3.5)
+    assert [(e.key, e.is_present) for e in of(effects, ed.SetPresence)] == [
+        (f"ann-{m.public_tag(1)[:4]}", False)
+    ]
+    assert "in use" in str(refusal(tell(edge, 1, m.Ping(1, 1), 3.6)))
+    assert present(edge) == 1
+
+
+def test_an_agent_that_was_killed_and_started_again_is_let_in_once_its_name_is_free() -> None:
+    edge = Edge(Config(), 7)
+    come(edge, "ann", 1)
+    tell(edge, 1, m.Ping(1, 1), 1)
+    assert "in use" in str(refusal(come(edge, "ann", 2, 1.5)))  # it has a ping's time to answer for itself
+    for now_s in (1.7, 2.2, 3.9):
+        assert not of(come(edge, "ann", 2, now_s), ed.SendToPeer)
+    welcome = come(edge, "ann", 2, 4.1)
+    assert refusal(welcome) is None
+    assert of(welcome, ed.AddRun)
+    tell(edge, 2, m.Ping(1, 1), 5)
+    assert not of(come(edge, "ann", 3, 5.8), ed.SendToPeer)
+    tell(edge, 2, m.Ping(2, 2), 5.9)  # it was there all the time
+    assert "in use" in str(refusal(come(edge, "ann", 3, 6.3)))
+
+
+def test_bye_is_heard_once() -> None:
+    edge = Edge(Config(), 7)
+    come(edge, "ann", 1)
+    tell(edge, 1, m.Bye())
+    assert tell(edge, 1, m.Bye()) == []
+
+
+def test_no_tracker_begins_for_who_cannot_come_back() -> None:
+    edge = TrackingEdge(Config(), 7, capacity=TrackingCapacity(1, "it is small"))
+    for k, name in enumerate(("ann", "bob")):
+        hello = replace(hello_of(name, k, AgentKind.AR), streams_frames=True)
+        assert of(tell(edge, k, hello), ed.StartTracker)
+        tell(edge, k, m.Bye())
+    assert of(tell(edge, 0, m.Ping(1, 1)), ed.StartTracker)
+    effects = tell(edge, 1, m.Ping(1, 1))
+    assert "can track 1 streamed agent" in str(refusal(effects))
+    assert not of(effects, ed.StartTracker)
+    assert present(edge) == 1

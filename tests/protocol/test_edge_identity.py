@@ -1,0 +1,168 @@
+"""Who may speak for a run: its number is its secret, and with keys only the owner of a name's key."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.hellos import hello_of
+
+from share.agent_names import checked_name
+from share.config import Config
+from share.mapping.map_changes import SaveCredential
+from share.protocol import edge_events as ed
+from share.protocol.edge import Edge
+from share.protocol.peer import OdometryBase, RestoredRun
+from share.types import Keyframe, View
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+SECRET = 0x0123_4567_89AB_CDEF
+EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+ANN = frozenset({"ann"})
+EVE = frozenset({"eve", "mallory"})
+
+
+def keyframe(id: int) -> Keyframe:
+    cov = 1e-6 * np.eye(6)
+    return Keyframe(id, id - 1, 200 * id, np.eye(4), cov, np.eye(4), np.zeros(3), 0.0, EMPTY)
+
+
+def tell(
+    edge: Edge,
+    message: m.Message,
+    names: frozenset[str] | None,
+    peer: int = SECRET,
+    now_ns: int = 0,
+    key: str = "",
+) -> list[ed.EdgeEffect]:
+    frames = [bytes(frame) for frame in encode(message)]
+    return edge.handle(ed.PeerMessageReceived(m.peer_id(peer), frames, names, key), now_ns)
+
+
+def sent(effects: list[ed.EdgeEffect]) -> list[m.Message]:
+    return [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
+
+
+def of(effects: list[ed.EdgeEffect], kind: type) -> list:
+    return [effect for effect in effects if isinstance(effect, kind)]
+
+
+def test_a_key_speaks_for_its_names_only() -> None:
+    edge = Edge(Config(), 7)
+    (refused,) = sent(tell(edge, hello_of("ann", SECRET), EVE))
+    assert isinstance(refused, m.Refused)
+    assert "authorized for 'eve', 'mallory', not for 'ann'" in refused.reason
+    assert "share keys authorize" in refused.reason
+    (welcome,) = sent(tell(edge, hello_of("eve", SECRET), EVE))
+    assert isinstance(welcome, m.Welcome)
+
+
+def test_a_run_is_not_taken_over_by_another_key() -> None:
+    """The attacker even knows the run's number and has taken over its routing id."""
+    edge = Edge(Config(), 7)
+    tell(edge, hello_of("ann", SECRET), ANN)
+    tell(edge, keyframe(0), ANN)
+    for message in (keyframe(1), m.Bye(), hello_of("ann", SECRET), m.Evaluation(0, 1.0, 1.0), m.Ping(1, 0)):
+        effects = tell(edge, message, EVE)
+        assert not of(effects, ed.AddKeyframe), message
+        assert not [answer for answer in sent(effects) if not isinstance(answer, m.Refused)], message
+    assert not edge.report({})["agents"]["ann"]["gone"]
+    assert of(tell(edge, keyframe(1), ANN), ed.AddKeyframe)
+
+
+def test_without_keys_who_holds_the_number_goes_on() -> None:
+    edge = Edge(Config(), 7)
+    tell(edge, hello_of("ann", SECRET), None)
+    assert of(tell(edge, keyframe(0), None), ed.AddKeyframe)
+    (welcome,) = sent(tell(edge, hello_of("ann", SECRET), None, now_ns=10**9))  # connected again
+    assert welcome == m.Welcome(7, 1)
+    (refused,) = sent(tell(edge, hello_of("ann", 5), None, peer=5, now_ns=10**9))
+    assert isinstance(refused, m.Refused)
+
+
+def test_nothing_that_is_shown_tells_the_number() -> None:
+    edge = Edge(Config(), 7, has_store=True)
+    effects = tell(edge, hello_of("ann", SECRET), None) + tell(edge, keyframe(0), None)
+    shown = [edge.report({}), edge.series(), *(e.fields for e in of(effects, ed.WriteEvent))]
+    keys = [e.key for e in of(effects, ed.AddRun)]
+    text = json.dumps([shown, keys])
+    for digits in (str(SECRET), f"{SECRET:x}", f"{SECRET:016x}"[-4:], f"{SECRET:016x}"[:4]):
+        assert digits not in text
+
+
+def test_an_id_that_leaps_costs_its_own_message() -> None:
+    edge = Edge(Config(), 7)
+    tell(edge, hello_of("ann", SECRET), None)
+    tell(edge, keyframe(0), None)
+    effects = tell(edge, replace(keyframe(1), id=10**9, reference=-1, predecessor=-1), None)
+    assert not of(effects, ed.AddKeyframe)
+    assert sent(effects) == [m.Ack(1)]
+    assert of(tell(edge, keyframe(1), None), ed.AddKeyframe)
+    assert edge.report({})["agents"]["ann"]["refused_messages"] == 1
+
+
+def test_the_voice_of_a_run_is_the_key_that_speaks_for_it_also_where_the_list_changes() -> None:
+    edge = Edge(Config(), 7, has_store=True)
+    (join,) = of(tell(edge, hello_of("eve", SECRET), EVE, key="E"), ed.AddRun)
+    (other,) = of(tell(edge, hello_of("mallory", 5), frozenset({"bob", "mallory"}), 5, key="E"), ed.AddRun)
+    assert join.credential == other.credential == "E"
+    (same,) = of(tell(edge, hello_of("mallory", 6), EVE, 6, 10**10, key="F"), ed.AddRun)
+    assert same.credential == "F"
+    (keep,) = of(tell(edge, keyframe(0), EVE, key="E"), ed.SaveChanges)
+    assert keep.changes[0].credential == "E"
+    assert "'E'" not in str(edge.report({}))
+
+
+@pytest.mark.parametrize("message", [hello_of("eve", SECRET), keyframe(3), m.Ping(1, 0)])
+@pytest.mark.parametrize("kept", [None, "", "E", "F"])
+def test_a_run_of_an_earlier_life_has_the_voice_of_whoever_speaks_for_it_now(
+    kept: str | None, message: m.Message
+) -> None:
+    known = RestoredRun(
+        "eve-1234", hello_of("eve", SECRET), OdometryBase.from_keyframe(keyframe(2)), 3, credential=kept
+    )
+    edge = Edge(Config(), 7, has_store=True, restored=[known])
+    effects = tell(edge, message, EVE, now_ns=1, key="E")
+    changes = [change for keep in of(effects, ed.SaveChanges) for change in keep.changes]
+    if kept == "E":
+        assert not of(effects, ed.SetCredential)
+    else:
+        assert of(effects, ed.SetCredential) == [ed.SetCredential("eve-1234", "E")]
+        assert SaveCredential("eve-1234", "E") in changes
+    again = tell(edge, m.Ping(2, 0), EVE, now_ns=2, key="E")
+    assert not of(again, ed.SetCredential)
+    assert not of(again, ed.SaveChanges)
+
+
+def test_no_name_is_taken_for_an_earlier_run_of_another() -> None:
+    """Eve's first run has the honest agent's name for a key, as she chose its number."""
+    edge, number = Edge(Config(), 7), next(n for n in range(10**6) if m.public_tag(n).startswith("0001"))
+    tell(edge, hello_of("eve-0001", SECRET), None)
+    for run, now_ns in ((number, 1), (5, 2)):
+        tell(edge, hello_of("eve", run), None, run, now_ns)
+        tell(edge, m.Bye(), None, run, now_ns)
+    assert of(tell(edge, keyframe(0), None, now_ns=3), ed.AddKeyframe)
+    own = edge.report({})["agents"]["eve-0001"]["run"]
+    agents = edge.report({"agents": {"eve-0001": {"map_id": "hers"}, own: {"map_id": "own"}}})["agents"]
+    assert agents.keys() == {"eve-0001", "eve", "eve/0001"}
+    assert (agents["eve-0001"]["gone"], agents["eve-0001"]["keyframes"]) == (False, 1)
+    assert (agents["eve-0001"]["map_id"], agents["eve/0001"]["map_id"]) == ("own", "hers")
+    assert agents["eve/0001"]["run"] == "eve-0001"
+    with pytest.raises(ValueError, match="name"):
+        checked_name("eve/0001")
+
+
+def test_earlier_runs_of_two_names_are_never_one_entry() -> None:
+    """Whatever comes after whatever."""
+    edge, run = Edge(Config(), 7), 0
+    for name in ("a", "a-b", "a-b.c", "a"):
+        for _ in range(3):
+            run += 1
+            tell(edge, hello_of(name, run), None, run, run * 10**10)
+            tell(edge, m.Bye(), None, run, run * 10**10)
+    agents = edge.report({})["agents"]
+    assert len(agents) == 12
+    assert len({agent["run"] for agent in agents.values()}) == 12

@@ -1,0 +1,91 @@
+"""What an edge shows of an agent is true of now, not of when the agent was last heard."""
+
+from __future__ import annotations
+
+import numpy as np
+from helpers.hellos import hello_of
+from helpers.model_edge import MS, S
+
+from share.config import Config
+from share.protocol.edge import Edge
+from share.protocol.edge_events import EdgeTick, PeerMessageReceived
+from share.protocol.peer import OdometryBase, PeerStatus, RestoredRun
+from share.types import TrackState
+from share.wire import messages as wire
+from share.wire.codec import encode
+
+OK = wire.Status(TrackState.OK, 20.0)
+GONE = wire.Status(TrackState.LOST, 2100.0, "no image for 2.1 s")
+
+
+def test_it_shows_state_age_and_reason_as_they_were_said() -> None:
+    status = PeerStatus()
+    status.update(GONE, 5 * S)
+    assert status.report(5 * S + 100 * MS, 5 * S) == {
+        "state": "LOST",
+        "reason": "no image for 2.1 s",
+        "pose_age_ms": 2200.0,
+        "heard_s": 0.1,
+    }
+
+
+def test_a_pose_makes_the_age_that_of_poses_when_they_were_last_spoken_of() -> None:
+    status = PeerStatus()
+    status.update(OK, 5 * S)
+    status.add_pose(TrackState.OK, 5 * S + 400 * MS)
+    assert status.report(5 * S + 450 * MS, 5 * S + 400 * MS)["pose_age_ms"] == 70
+
+
+def test_a_pose_ends_the_reason_for_having_none() -> None:
+    status = PeerStatus()
+    status.update(GONE, 5 * S)
+    status.add_pose(TrackState.OK, 6 * S)
+    assert status.report(6 * S, 6 * S)["reason"] == ""
+
+
+def test_before_it_has_said_anything_no_age_is_shown() -> None:
+    report = PeerStatus().report(9 * S, 9 * S)
+    assert (report["state"], report["pose_age_ms"]) == ("INITIALISING", None)
+
+
+def test_who_was_not_heard_in_this_life_has_no_age() -> None:
+    """The clock of the machine began long before the edge."""
+    known = RestoredRun("ann-000b", hello_of("ann", 1), OdometryBase(0, 0, np.eye(4)), 1)
+    edge = Edge(Config(), session=5, restored=[known])
+    edge.handle(EdgeTick(), 6600 * S)
+    seen = shown(edge)
+    assert (seen["state"], seen["heard_s"], seen["gone"]) == ("SILENT", None, True)
+    assert "no message since" in str(seen["reason"])
+    edge.handle(PeerMessageReceived(wire.peer_id(1), encode(hello_of("ann", 1))), 6601 * S)
+    assert shown(edge)["heard_s"] == 0.0
+
+
+def edge_with(status: wire.Status, at_ns: int) -> Edge:
+    edge = Edge(Config(), session=5)
+    for message in (hello_of("ann", 1), status):
+        edge.handle(PeerMessageReceived(wire.peer_id(1), encode(message)), at_ns)
+    return edge
+
+
+def shown(edge: Edge) -> dict[str, object]:
+    return edge.report({})["agents"]["ann"]
+
+
+def test_an_agent_that_falls_silent_is_not_shown_in_its_last_state() -> None:
+    edge = edge_with(OK, S)
+    edge.handle(EdgeTick(), S + 650 * MS)
+    assert (shown(edge)["state"], shown(edge)["reason"]) == ("OK", "")
+    for at_s in (1.75, 3.3, 60.0):  # and after it was taken as gone
+        edge.handle(EdgeTick(), round(at_s * S))
+        assert shown(edge)["state"] == "SILENT"
+        assert shown(edge)["reason"] == f"silent for {at_s - 1:.1f} s; its last state was OK"
+        assert shown(edge)["pose_age_ms"] == round(20 + (at_s - 1) * 1000, 1)
+    edge.handle(PeerMessageReceived(wire.peer_id(1), encode(OK)), 61 * S)
+    assert shown(edge)["state"] == "OK"
+
+
+def test_an_agent_that_said_bye_keeps_the_state_that_it_had() -> None:
+    edge = edge_with(OK, S)
+    edge.handle(PeerMessageReceived(wire.peer_id(1), encode(wire.Bye())), 2 * S)
+    edge.handle(EdgeTick(), 60 * S)
+    assert (shown(edge)["state"], shown(edge)["gone"]) == ("OK", True)

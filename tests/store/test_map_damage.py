@@ -1,0 +1,267 @@
+"""A damaged map file: never a crash, never a wrong value, and the file itself is kept."""
+
+import random
+import shutil
+import sqlite3
+
+import numpy as np
+import pytest
+from helpers.map_changes import ANN, BOB, keyframe, run, small_map, solution, told
+
+from share.errors import ShareError
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import RemoveKeyframes, SaveLink
+from share.store import salvage
+from share.store.map_store import MapStore, is_map
+from share.store.schema import PAGE_BYTES
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The bytes of a closed file, and what is in it."""
+    path = tmp_path_factory.mktemp("whole") / "room.sqlite"
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        told_whole = told(store.load())
+    return path.read_bytes(), told_whole
+
+
+def damaged(folder, data, at, by):
+    """A copy of `data`, its byte `keyframe_key` changed."""
+    path = folder / "room.sqlite"
+    for old in folder.iterdir():
+        old.unlink()
+    changed = bytearray(data)
+    changed[at] ^= by
+    path.write_bytes(changed)
+    return path, bytes(changed)
+
+
+def check_opens(path, as_it_was, good):
+    """Opens, is right as far as it goes, says what is lost, keeps the old file, and can be written. Answers
+    how many keyframes are lost."""
+    assert is_map(path)
+    with MapStore.read(path) as reader:
+        read_only = told(reader.load())
+    assert path.read_bytes() == as_it_was
+    with MapStore.open(path) as store:
+        found = told(store.load())
+        store.write([keyframe(ANN, 20)])
+    assert found["keyframes"] == read_only["keyframes"]
+    lost = check_right(found, good)
+    if found["complaints"]:
+        assert path.with_name("room.sqlite.damaged-1").read_bytes() == as_it_was
+        assert "kept as room.sqlite.damaged-1" in found["complaints"][0]
+    with MapStore.open(path) as store:
+        later = told(store.load())
+    assert later["complaints"] == ()
+    assert later["loops"] == found["loops"]
+    assert later["keyframes"][: len(found["keyframes"])] == found["keyframes"]
+    assert len(later["keyframes"]) == len(found["keyframes"]) + 1
+    return lost
+
+
+CREDENTIALS_LOST = "credentials of runs could not be read"
+
+
+def check_right(found, good) -> int:
+    """What is found is as it was, but for who is tied to whom where one between is lost."""
+    was = {k[0]: k for k in good["keyframes"]}
+    order = [k[0] for k in good["keyframes"] if k[0] in {f[0] for f in found["keyframes"]}]
+    assert [k[0] for k in found["keyframes"]] == order
+    tied = [k for k in found["keyframes"] if k != was[k[0]]]
+    for k in tied:  # all but its edge: reference, T_ref_body, cov
+        assert (k[:2], k[3:6], k[8:]) == (was[k[0]][:2], was[k[0]][3:6], was[k[0]][8:])
+        assert k[2] in {-1, *(key.id for key in order if key.agent == k[0].agent and key.id < k[0].id)}
+    assert set(found["loops"]) <= set(good["loops"])
+    assert {run[:-1] for run in found["runs"]} <= {run[:-1] for run in good["runs"]}
+    voices = {run[0]: run[-1] for run in good["runs"]}
+    silent = [run for run in found["runs"] if run[-1] != voices[run[0]]]
+    assert {run[-1] for run in silent} <= {""}
+    assert not silent or any(CREDENTIALS_LOST in line for line in found["complaints"])
+    assert found["poses"] in (None, good["poses"]) or set(found["poses"][0]) < set(good["poses"][0])
+    lost = len(was) - len(order)
+    complaints = "\n".join(found["complaints"])
+    assert (lost > 0) == (
+        "keyframes could not be read" in complaints or "keyframes belong to a run" in complaints
+    )
+    assert len(tied) == sum(int(c.split()[0]) for c in found["complaints"] if "are linked" in c)
+    assert (found["poses"] is None) == ("solutions could not be read" in complaints)
+    return lost
+
+
+@pytest.mark.parametrize("flips", [40, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_flipped_byte_anywhere_costs_a_page_at_most(whole, tmp_path, flips):
+    data, good = whole
+    draw = random.Random(flips)
+    lost = []
+    for _ in range(flips):
+        path, as_it_was = damaged(tmp_path, data, draw.randrange(len(data)), draw.randrange(1, 256))
+        lost.append(check_opens(path, as_it_was, good))
+    assert max(lost) <= 2
+    assert sum(lost) > flips / 10  # or nothing was put to the test
+
+
+def test_the_first_page_can_be_lost_whole(whole, tmp_path):
+    """All of it but what says that this is a map."""
+    data, good = whole
+    path, _ = damaged(tmp_path, data, 0, 1)
+    text = data.index(b"CREATE TABLE run_copy(")
+    path.write_bytes(bytes(text) + data[text : text + 22] + bytes(PAGE_BYTES - text - 22) + data[PAGE_BYTES:])
+    assert check_opens(path, path.read_bytes(), good) == 0
+
+
+def test_bytes_of_the_header(whole, tmp_path):
+    data, good = whole
+    for at in range(0, 100, 3):
+        path, as_it_was = damaged(tmp_path, data, at, 0x41)
+        assert check_opens(path, as_it_was, good) == 0
+
+
+def test_a_row_that_says_something_else_is_not_believed(whole, tmp_path):
+    """Written by SQLite in good order, so only the CRC can tell."""
+    path, _ = damaged(tmp_path, whole[0], 0, 0)
+    connection = sqlite3.connect(path, isolation_level=None)
+    connection.execute("UPDATE loop SET inliers = 999 WHERE number = 2")
+    connection.execute("UPDATE keyframe SET number = 1000 WHERE number = 7")
+    connection.execute("UPDATE run SET next = 3")
+    connection.execute("UPDATE stretch SET nth = 7 WHERE number = 1")
+    connection.close()
+    with MapStore.open(path) as store:
+        kept = store.load()
+        store.write([keyframe(ANN, 20)])
+        newest = store.load().keyframes[-1]
+    assert (newest.segment_name, newest.ordinal) == (f"{ANN}/0", 20)
+    assert kept.segments == (f"{BOB}/0", f"{ANN}/0")
+    assert len(kept.loops) == 4
+    assert len(kept.keyframes) == 39
+    assert kept.next_ids == {ANN: 20, BOB: 20}
+    assert [line for line in kept.problems if "loops could" in line] == ["1 loops could not be read"]
+    assert len(kept.runs) == 2  # from their copies
+
+
+def test_who_speaks_for_a_run_is_taken_over_from_a_damaged_file(whole, tmp_path):
+    """But not for one that is lost, and nothing is made up for one of which it cannot be read."""
+    data, good = whole
+    for broken, lost in (("loop SET inliers = 999 WHERE number = 2", 0), ("about SET value = 'E'", 3)):
+        for old in tmp_path.iterdir():
+            old.unlink()
+        path, _ = damaged(tmp_path, data, 0, 0)
+        connection = sqlite3.connect(path, isolation_level=None)
+        connection.execute(f"UPDATE {broken}")
+        connection.close()
+        with MapStore.open(path) as store:
+            kept = store.load()
+        assert [run.credential for run in kept.runs] == (["", ""] if lost else [good["runs"][0][-1], ""])
+        said = [line for line in kept.problems if CREDENTIALS_LOST in line]
+        assert said == ([f"{lost} rows about the file and the {CREDENTIALS_LOST}"] if lost else [])
+        with MapStore.open(path) as store:
+            assert [run.credential for run in store.load().runs] == [run.credential for run in kept.runs]
+
+
+def test_a_file_cut_short_or_grown(whole, tmp_path):
+    data, good = whole
+    path = tmp_path / "room.sqlite"
+    for length in (len(data) // 2, len(data) - 1, PAGE_BYTES, len(data) - 5 * PAGE_BYTES):
+        for old in tmp_path.iterdir():
+            old.unlink()
+        path.write_bytes(data[:length])
+        with MapStore.open(path) as store:
+            found = told(store.load())
+        check_right(found, good)
+        assert found["complaints"]
+        assert path.with_name("room.sqlite.damaged-1").read_bytes() == data[:length]
+
+
+def test_a_lost_keyframe_that_others_hang_on(tmp_path):
+    """Those after it are tied to the one before, by odometry; retired numbers stay retired."""
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        link = SaveLink(KeyframeKey(ANN, 6), 3, np.eye(4), np.eye(6))
+        frames = [keyframe(ANN, i, 300) for i in range(9)]
+        store.write(
+            [
+                run(ANN),
+                *frames,
+                link,
+                RemoveKeyframes((KeyframeKey(ANN, 4), KeyframeKey(ANN, 5), KeyframeKey(ANN, 8))),
+                solution([KeyframeKey(ANN, 6)]),
+            ]
+        )
+    data = bytearray(path.read_bytes())
+    data[data.index(frames[3].keyframe.view.descriptors.tobytes()[:64])] ^= 1
+    path.write_bytes(data)
+    with MapStore.open(path) as store:
+        kept = store.load()
+    assert [k.keyframe_key.id for k in kept.keyframes] == [0, 1, 2, 6, 7]
+    assert kept.next_ids == {ANN: 9}
+    tie = kept.links[KeyframeKey(ANN, 6)]
+    assert tie.reference == 2
+    T_odom = {k.keyframe_key.id: k.keyframe.T_odom_body for k in kept.keyframes}
+    assert np.allclose(T_odom[2] @ tie.T_ref_body, T_odom[6], atol=1e-12)
+    assert np.linalg.eigvalsh(tie.cov - link.cov)[0] > 0
+    assert "1 keyframes lost their predecessor and are linked to an earlier one" in kept.problems
+
+
+def test_damaged_twice_keeps_both(whole, tmp_path):
+    data, _ = whole
+    path, first = damaged(tmp_path, data, 30 * PAGE_BYTES // 2, 1)
+    MapStore.open(path).close()
+    second = bytearray(path.read_bytes())
+    second[21] ^= 4
+    path.write_bytes(second)
+    MapStore.open(path).close()
+    assert path.with_name("room.sqlite.damaged-1").read_bytes() == first
+    assert path.with_name("room.sqlite.damaged-2").read_bytes() == bytes(second)
+
+
+@pytest.mark.parametrize("step", range(4))
+def test_a_break_while_it_is_salvaged_loses_nothing(whole, tmp_path, monkeypatch, step):
+    """Broken off before each of the renames; the next opening finishes."""
+    data, good = whole
+    path, as_it_was = damaged(tmp_path, data, 21, 4)
+    shutil.copyfile(path, tmp_path / "room.sqlite-wal")  # some log
+    left = [step]
+    replace = type(path).replace
+
+    def breaking(self, target):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(5, "broken off")
+        return replace(self, target)
+
+    monkeypatch.setattr(type(path), "replace", breaking)
+    with pytest.raises(ShareError, match="broken off"):
+        salvage.salvage(path)
+    monkeypatch.undo()
+    with MapStore.open(path) as store:
+        assert told(store.load())["keyframes"] == good["keyframes"]
+    assert path.with_name("room.sqlite.damaged-1").read_bytes() == as_it_was
+    assert not path.with_name("room.sqlite.salvaged").exists()
+
+
+def test_a_damaged_log_costs_what_comes_after(tmp_path):
+    """As of a killed writer, whose log is not in the file yet. Of each commit all or nothing."""
+    path, copy = tmp_path / "room.sqlite", tmp_path / "killed" / "room.sqlite"
+    copy.parent.mkdir()
+    with MapStore.open(path) as store:
+        store.write([run(ANN)])
+        for i in range(0, 40, 2):
+            store.write([keyframe(ANN, i), keyframe(ANN, i + 1)])
+        file, log = path.read_bytes(), path.with_name("room.sqlite-wal").read_bytes()
+    draw, lost = random.Random(3), []
+    for _ in range(25):
+        for old in copy.parent.iterdir():
+            old.unlink()
+        changed = bytearray(log)
+        changed[draw.randrange(len(log))] ^= draw.randrange(1, 256)
+        copy.write_bytes(file)
+        copy.with_name("room.sqlite-wal").write_bytes(changed)
+        with MapStore.open(copy) as store:
+            kept = store.load()
+        numbers = [k.keyframe_key.id for k in kept.keyframes]
+        assert numbers == list(range(len(numbers)))
+        assert len(numbers) % 2 == 0
+        assert kept.next_ids.get(ANN, 0) == len(numbers)
+        lost.append(40 - len(numbers))
+    assert 0 < max(lost) <= 40

@@ -1,0 +1,44 @@
+"""Map files that edges of earlier releases wrote."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers.recorded_traffic import VERSIONS, map_file
+
+from share.errors import StoreError
+from share.protocol.peer import restored_runs
+from share.store import rows
+from share.store.map_store import MapStore
+from share.wire.codec import WIRE_VERSION
+
+pytestmark = pytest.mark.parametrize("old", [version for version in VERSIONS if version < WIRE_VERSION])
+
+
+def test_an_older_map_is_opened_and_gone_on_with(old: int, tmp_path: Path) -> None:
+    store = MapStore.open(map_file(old, tmp_path))
+    try:
+        kept = store.load()
+        assert store.writable
+        assert kept.problems == ()
+        assert {run.hello.name for run in kept.runs} == {"ann", "rob"}
+        ends = {found.run_key: found.keyframe.id + 1 for found in kept.keyframes}
+        assert len(kept.keyframes) == sum(ends.values()) == 16
+        assert {run.key: run.next_keyframe for run in restored_runs(kept, 0.03)} == ends
+    finally:
+        store.close()
+
+
+def test_one_that_cannot_be_read_is_refused_in_one_line(
+    old: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = map_file(old, tmp_path)
+    before = path.read_bytes()
+    monkeypatch.setattr(rows, "_READABLE_VERSIONS", (WIRE_VERSION,))
+    with pytest.raises(
+        StoreError, match=f"wire version {old}, this SHARE reads {WIRE_VERSION}: use the SHARE"
+    ) as told:
+        MapStore.open(path)
+    assert "\n" not in str(told.value)
+    assert path.read_bytes() == before

@@ -1,0 +1,436 @@
+"""The map file: what was written is found again, to the last bit, by whoever may."""
+
+import os
+import resource
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution, told
+from helpers.special_files import KINDS, special
+
+from share.errors import StoreError, UsageError
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import (
+    RemoveKeyframes,
+    RemoveLoops,
+    RemoveRun,
+    SaveCredential,
+    SaveLink,
+    SaveLoop,
+    SaveRun,
+    with_unknown_credentials,
+)
+from share.store import schema
+from share.store.map_store import MapStore, is_map
+from share.store.rows import insert
+from share.wire import codec
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "room.sqlite"
+
+
+def again(path):
+    with MapStore.open(path) as store:
+        return store.load()
+
+
+def files(path):
+    return sorted(os.listdir(path.parent))
+
+
+def test_a_new_file_is_empty(path):
+    with MapStore.open(path) as store:
+        assert told(store.load()) == told(type(store.load())())
+        assert (store.writable, store.read_only_reason, store.schema) == (True, "", schema.SCHEMA)
+    assert is_map(path)
+    assert files(path) == ["room.sqlite", "room.sqlite.lock"]
+
+
+def test_all_is_found_again(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        before = told(store.load())
+    kept = again(path)
+    assert told(kept) == before
+    frames = [keyframe(key, i) for i in range(20) for key in (ANN, BOB)]
+    assert [k.keyframe_key for k in kept.keyframes] == [k.keyframe_key for k in frames]
+    for found, sent in zip(kept.keyframes, frames, strict=True):
+        assert np.array_equal(found.keyframe.view.descriptors, sent.keyframe.view.descriptors)
+        assert np.array_equal(found.keyframe.view.points, sent.keyframe.view.points)
+        assert np.array_equal(found.keyframe.T_odom_body, sent.keyframe.T_odom_body)
+    assert [(x.a.id, x.inliers) for x in kept.loops] == [(i, 20 + i) for i in range(0, 20, 4)]
+    assert np.array_equal(kept.poses.T_map_body[5], pose(7) @ pose(2))
+    assert kept.segments == (f"{ANN}/0", f"{BOB}/0")
+    assert kept.next_ids == {ANN: 20, BOB: 20}
+    assert kept.problems == ()
+
+
+def test_the_same_again_changes_nothing(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        before = told(store.load())
+        store.write(small_map())
+        assert told(store.load()) == before
+
+
+def test_a_new_solution_takes_the_place_of_the_old(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        store.write([solution([KeyframeKey(ANN, 3)], "elsewhere")])
+        poses = store.load().poses
+    assert (poses.keys, poses.map_ids) == ((KeyframeKey(ANN, 3),), ("elsewhere",))
+
+
+def test_retired_keyframes_go_but_not_their_numbers(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        link = SaveLink(KeyframeKey(ANN, 5), 3, pose(2), np.eye(6) * 1e-3)
+        moved = SaveLoop(loop(3, 4))
+        store.write(
+            [
+                RemoveLoops(KeyframeKey(BOB, 4), KeyframeKey(ANN, 4)),
+                moved,
+                link,
+                RemoveKeyframes((KeyframeKey(ANN, 4), KeyframeKey(ANN, 19))),
+            ]
+        )
+        store.write([keyframe(ANN, 4), keyframe(ANN, 19)])  # late copies
+    kept = again(path)
+    numbers = [k.keyframe_key.id for k in kept.keyframes if k.run_key == ANN]
+    assert numbers == [i for i in range(19) if i != 4]
+    assert kept.next_ids[ANN] == 20
+    assert [x.a.id for x in kept.loops] == [0, 8, 12, 16, 3]
+    assert kept.links.keys() == {KeyframeKey(ANN, 5)}
+    assert (kept.links[KeyframeKey(ANN, 5)].reference, kept.links[KeyframeKey(ANN, 5)].cov[0, 0]) == (3, 1e-3)
+    assert KeyframeKey(ANN, 4) not in kept.poses.keys
+    assert len(kept.poses.keys) == 38
+    assert kept.problems == ()
+
+
+def test_the_order_of_stretches_outlives_their_keyframes(path):
+    with MapStore.open(path) as store:
+        store.write([run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0), keyframe(ANN, 1, first=True)])
+        store.write([RemoveKeyframes((KeyframeKey(ANN, 0),))])
+        store.write(
+            [keyframe(ANN, 2), keyframe(ANN, 3), RemoveKeyframes((KeyframeKey(ANN, 2),)), keyframe(ANN, 4)]
+        )
+        store.write([keyframe(ANN, 5, first=True)])
+    kept = again(path)
+    assert kept.segments == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1", f"{ANN}/2")
+    places = [(k.keyframe_key.id, k.segment_name, k.ordinal) for k in kept.keyframes if k.run_key == ANN]
+    assert places == [(1, f"{ANN}/1", 0), (3, f"{ANN}/1", 2), (4, f"{ANN}/1", 3), (5, f"{ANN}/2", 0)]
+
+
+def voices(path):
+    return {run.run_key: run.credential for run in again(path).runs}
+
+
+def test_who_speaks_for_a_run_is_kept_and_may_change(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    assert voices(path) == {ANN: f"key of {ANN[:3]}", BOB: ""}
+    for voice in ("E", "F", ""):
+        with MapStore.open(path) as store:
+            store.write(
+                [SaveCredential(BOB, voice), SaveCredential(ANN, voice), SaveCredential("eve-0003", "E")]
+            )
+        assert voices(path) == {ANN: voice, BOB: voice}
+    with MapStore.open(path) as store:
+        store.write([SaveCredential(BOB, "B"), SaveCredential(ANN, "A"), RemoveRun(BOB)])
+        store.write([run(BOB)])
+    assert voices(path) == {ANN: "A", BOB: ""}
+
+
+def test_a_map_of_share_0_1_says_of_no_run_who_speaks_for_it_and_is_not_changed_by_opening(path):
+    """It has only the rows that `about` begins with; whose number and schema are the same as now."""
+    with MapStore.open(path) as store:
+        store.write([replace(one, credential="") if isinstance(one, SaveRun) else one for one in small_map()])
+        assert schema.SCHEMA == 3
+    with closing(sqlite3.connect(path)) as connection:
+        assert {name for (name,) in connection.execute("SELECT name FROM about")} == {"schema", "made by"}
+    kept = again(path)
+    assert {run.credential for run in kept.runs} == {""}
+    assert {run.credential for run in with_unknown_credentials(kept).runs} == {None}  # may be anybody
+    assert kept.problems == ()
+    assert files(path) == ["room.sqlite", "room.sqlite.lock"]
+    with MapStore.open(path) as store:
+        store.write([SaveCredential(ANN, "A")])
+    assert {run.run_key: run.credential for run in with_unknown_credentials(again(path)).runs} == {
+        ANN: "A",
+        BOB: None,
+    }
+
+
+def test_two_loops_may_tie_one_pair(path):
+    with MapStore.open(path) as store:
+        store.write([*small_map(), SaveLoop(loop(4, 4)), SaveLoop(loop(4, 4).reverse())])
+        assert len(store.load().loops) == 6
+        store.write([RemoveLoops(KeyframeKey(ANN, 4), KeyframeKey(BOB, 4))])
+        assert len(store.load().loops) == 4
+
+
+def test_a_list_of_changes_is_kept_whole_or_not_at_all(path):
+    with MapStore.open(path) as store:
+        store.write([run(ANN), keyframe(ANN, 0)])
+        with pytest.raises(ValueError, match=r"bob-0002 is not in the file; its SaveRun must come first"):
+            store.write([keyframe(ANN, 1), keyframe(BOB, 0)])
+        assert [k.keyframe_key.id for k in store.load().keyframes] == [0]
+
+
+def test_another_thread_may_write(path):
+    with MapStore.open(path) as store:
+        thread = threading.Thread(target=store.write, args=(small_map(),))
+        thread.start()
+        thread.join()
+        assert len(store.load().keyframes) == 40
+
+
+def test_one_edge_a_map_but_any_number_of_readers(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        with pytest.raises(StoreError, match="another edge uses this map"):
+            MapStore.open(path)
+        assert keyframes_for_a_reader(path) == 40
+        store.write([keyframe(ANN, 20)])
+        assert keyframes_for_a_reader(path) == 41
+    with MapStore.read(path) as reader, pytest.raises(StoreError, match="opened for reading"):
+        reader.write([])
+    MapStore.open(path).close()
+
+
+def keyframes_for_a_reader(path) -> int:
+    """In a process of its own."""
+    code = (
+        "import sys; from pathlib import Path; from share.store.map_store import MapStore\n"
+        "print(len(MapStore.read(Path(sys.argv[1])).load().keyframes))"
+    )
+    return int(
+        subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, check=True).stdout
+    )
+
+
+def test_what_is_no_map_is_left_as_it_is(tmp_path):
+    text, other = tmp_path / "notes.txt", tmp_path / "browser.sqlite"
+    text.write_text("SQLite is nice" * 1000)
+    with sqlite3.connect(other) as connection:
+        connection.execute("CREATE TABLE bookmarks(url TEXT)")
+    connection.close()
+    for path in (text, other):
+        before = path.read_bytes()
+        for how in (MapStore.open, MapStore.read):
+            with pytest.raises(UsageError, match="is not a SHARE map and was left unchanged"):
+                how(path)
+        assert path.read_bytes() == before
+        assert not is_map(path)
+    with pytest.raises(UsageError, match="is a folder"):
+        MapStore.open(tmp_path)
+    with pytest.raises(UsageError, match="cannot be made there"):
+        MapStore.open(text / "room.sqlite")
+
+
+# ---------------------------------------------------------------- schemas
+
+
+def schema_said(path, number):
+    """As a SHARE of schema `number` would have left it."""
+    connection = sqlite3.connect(path, isolation_level=None)
+    connection.execute("DELETE FROM about WHERE name = 'schema'")
+    insert(connection, "about", ("schema", str(number)))
+    if number < schema.SCHEMA:  # made up: loops did not count their inliers
+        connection.execute("ALTER TABLE loop RENAME COLUMN inliers TO matches")
+    connection.close()
+
+
+OLD = schema.SCHEMA - 1
+STEP = ("ALTER TABLE loop RENAME COLUMN matches TO inliers",)
+
+
+def test_a_newer_schema_is_left_alone(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    schema_said(path, schema.SCHEMA + 1)
+    before = path.read_bytes()
+    ours = schema.SCHEMA
+    with pytest.raises(UsageError, match=rf"newer SHARE \(schema {ours + 1}, this one reads {ours}\)"):
+        MapStore.open(path)
+    assert path.read_bytes() == before
+
+
+def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        whole = told(store.load())
+    schema_said(path, OLD)
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match=f"has schema {OLD}, which cannot be migrated to {schema.SCHEMA}"):
+        MapStore.open(path)
+    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
+    with MapStore.read(path) as reader:
+        assert reader.schema == OLD
+        assert told(reader.load()) == whole
+    assert path.read_bytes() == before
+    assert told(again(path)) == whole
+    assert path.with_name(f"room.sqlite.schema-{OLD}").read_bytes() == before
+    assert told(again(path)) == whole
+    assert [name for name in files(path) if "damaged" in name] == []
+
+
+def test_a_step_that_fails_leaves_the_old_file(path, monkeypatch):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    schema_said(path, OLD)
+    before = path.read_bytes()
+    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
+    with pytest.raises(
+        StoreError, match=f"no such table: nonsense; it has schema {OLD}: use the SHARE that made it"
+    ):
+        MapStore.open(path)
+    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
+    assert len(again(path).keyframes) == 40
+    assert path.with_name(f"room.sqlite.schema-{OLD}").read_bytes() == before
+
+
+# ---------------------------------------------------------------- the disk
+
+
+def test_a_full_disk_keeps_nothing_half_and_works_again_afterwards(path):
+    """No file of this process may grow beyond a limit for a while."""
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with MapStore.open(path) as store:
+        store.write([run(ANN), *(keyframe(ANN, i, 500) for i in range(3))])
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))
+        try:
+            with pytest.raises(StoreError, match=r"room\.sqlite: the map cannot be written: "):
+                store.write([keyframe(ANN, i, 500) for i in range(3, 20)])
+            assert [k.keyframe_key.id for k in store.load().keyframes] == [0, 1, 2]
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            signal.signal(signal.SIGXFSZ, before)
+        store.write([keyframe(ANN, i, 500) for i in range(3, 20)])
+    assert [k.keyframe_key.id for k in again(path).keyframes] == list(range(20))
+
+
+@pytest.mark.parametrize("killed", [False, True], ids=["closed", "killed"])
+def test_a_map_that_may_only_be_read(killed):
+    """As somebody who is not root: root may write everything."""
+    folder = Path(tempfile.mkdtemp())
+    path = folder / "room.sqlite"
+    try:
+        store = MapStore.open(path)
+        store.write(small_map())
+        if killed:  # its log is still there
+            for name in os.listdir(folder):
+                shutil.copyfile(folder / name, folder / name.replace("room", "copy"))
+            path = folder / "copy.sqlite"
+        store.close()
+        for name in os.listdir(folder):
+            (folder / name).chmod(0o444)
+        folder.chmod(0o555)
+        code = (
+            "import os, sys; from pathlib import Path; from share.store.map_store import MapStore\n"
+            "if os.geteuid() == 0: os.setuid(65534)\n"
+            "store = MapStore.open(Path(sys.argv[1]))\n"
+            "print(len(store.load().keyframes), store.writable, store.read_only_reason)"
+        )
+        done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True)
+        assert (done.stdout, done.stderr) == ("40 False the file is read-only\n", "")
+    finally:
+        folder.chmod(0o755)
+        shutil.rmtree(folder)
+
+
+def test_the_file_stays_bounded_when_as_many_retire_as_come(path):
+    with MapStore.open(path) as store:
+        store.write([run(ANN)])
+        sizes = []
+        for start in range(0, 600, 20):
+            batch = [keyframe(ANN, i, 500) for i in range(start, start + 20)]
+            store.write(
+                [*batch, RemoveKeyframes(tuple(KeyframeKey(ANN, i) for i in range(start - 60, start - 40)))]
+            )
+            sizes.append(sum(f.stat().st_size for f in path.parent.iterdir()))
+        assert len(store.load().keyframes) == 60
+    assert max(sizes[10:]) < 1.1 * max(sizes[:10])
+    assert path.stat().st_size < 1.5 * 80 * 27_000
+
+
+def test_keyframes_of_an_earlier_wire_version_that_have_not_changed_are_read(path, monkeypatch):
+    with monkeypatch.context() as then:
+        then.setattr(codec, "WIRE_VERSION", 3)
+        with MapStore.open(path) as store:
+            store.write(small_map())
+            before = told(store.load())
+    assert told(again(path)) == before
+    path.unlink()
+    monkeypatch.setattr(codec, "WIRE_VERSION", 99)
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    monkeypatch.undo()
+    with pytest.raises(StoreError, match=r"have wire version 99, this SHARE reads \d+: use the SHARE that"):
+        again(path)
+
+
+@pytest.mark.parametrize("end", ["-wal", "-shm"])
+@pytest.mark.parametrize("kind", [*KINDS, "link"])
+@pytest.mark.parametrize("made", [True, False])
+def test_what_lies_beside_a_map_is_a_file(path, end, kind, made):
+    """SQLite would open a pipe, and wait or write there."""
+    if made:
+        with MapStore.open(path) as store:
+            store.write(small_map())
+    beside = path.with_name(path.name + end)
+    if kind == "link":
+        beside.symlink_to(path.parent / "elsewhere")
+    else:
+        special(beside, kind)
+    with pytest.raises(UsageError, match=f"sqlite{end}: (is a link|cannot be the (log|index) of)"):
+        MapStore.open(path)
+    assert not (path.parent / "elsewhere").exists()
+    beside.rmdir() if kind == "folder" else beside.unlink()
+    assert again(path) is not None
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from helpers.map_changes import small_map
+from share.errors import StoreError
+from share.store.map_store import MapStore
+path, limit = Path(sys.argv[1]), int(sys.argv[2])
+store = MapStore.open(path) if limit > 50_000 else None
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+try:
+    store = store or MapStore.open(path)
+    for _ in range(2000):
+        store.write(small_map())
+except StoreError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("limit", [1_000, 10_000, 40_000, 100_000, 300_000])
+def test_a_map_that_may_not_grow_says_by_which_limit(path, limit):
+    """SQLite says "disk I/O error". Wherever it meets the limit: file, log or index."""
+    here = Path(__file__).parents[1]
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, path, str(limit)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here), os.environ.get("PYTHONPATH", "")])},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stderr == ""
+    assert "may not grow beyond the file size limit of this process" in done.stdout, done.stdout
+    assert done.stdout.endswith("; raise it (ulimit -f) and start again\n")
