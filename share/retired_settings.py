@@ -29,7 +29,7 @@ def refuse_retired(data: Any, where: str) -> None:
         for key in settings if isinstance(settings, dict) else ():
             if constant := RETIRED_SETTINGS.get(f"{section}.{key}"):
                 module, _, name = constant.rpartition(".")
-                path = f"share/{module.replace('.', '/')}.py"
+                place = f"{name} in share/{module.replace('.', '/')}.py"
                 raise ConfigError(
-                    f"{where}: {section}.{key} is no longer a setting: it is {name} in {path}; remove the line"
+                    f"{where}: {section}.{key} is no longer a setting: it is {place}; remove the line"
                 )
