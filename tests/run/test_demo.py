@@ -55,7 +55,7 @@ def pictured(out: Path) -> bool:
 
 @pytest.mark.slow
 def test_a_short_demo_ends_in_one_map(tmp_path):
-    """In the plain room, which is quickly drawn; with this seed all three look at the same things after 6 s."""
+    """In the plain room, which is quickly drawn; with this seed all three meet after 6 s."""
     seed = ("--scene", "plain", "--seed", "22")
     done = demo(tmp_path / "cache", tmp_path / "out", "--seconds", "10", *seed)
     print(done.stdout)
