@@ -205,7 +205,7 @@ def _true_error(source: Source) -> ErrorEstimator:
 
 def _emulated_link(connect_edge: Callable[[], AgentLink], name: str, seed: int) -> Callable[[], AgentLink]:
     """Return `connect_edge` with an emulated network around its link. Raises UsageError, ConfigError."""
-    from share.net.emulated_link import EmulatedLink, load_network
+    from share.lab.evaluate.emulated_network import EmulatedLink, load_network
 
     link_network = load_network(name)
     return lambda: EmulatedLink(connect_edge(), link_network, seed)

@@ -1,4 +1,4 @@
-"""One suite for all links: what ZeroMQ does and what the in-process network does must not differ."""
+"""Links over ZeroMQ, with keys and without."""
 
 from __future__ import annotations
 
@@ -13,11 +13,8 @@ from typing import Any
 import pytest
 import zmq
 
-from share.errors import ConfigError, TransportError, UsageError
-from share.net.channel import ChannelModel, NetworkModel
+from share.errors import TransportError, UsageError
 from share.net.connection_guard import ConnectionGuard
-from share.net.emulated_link import EmulatedLink, load_network
-from share.net.in_memory import MemoryNetwork
 from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate_pair
 from share.net.transport import (
     LINGER_MS,
@@ -37,18 +34,14 @@ class Net:
     """Opens links of one kind and closes them all at the end."""
 
     def __init__(self, kind: str, stack: ExitStack, folder: Path) -> None:
-        self.kind, self._stack, self._memory = kind, stack, MemoryNetwork()
+        self._stack = stack
         self._edge_keys, self._agent_keys = keys_in(folder) if kind == "curve" else (None, None)
         self.agent_key = self._agent_keys.own.public if self._agent_keys else ""
 
     def edge(self, at: str | None = None) -> EdgeLink:
-        if self.kind == "memory":
-            return self._stack.enter_context(closing(self._memory.bind(at or "edge")))
         return self._stack.enter_context(closing(bind(at or "tcp://127.0.0.1:0", self._edge_keys)))
 
     def agent(self, at: str, run_id: int = 1) -> AgentLink:
-        if self.kind == "memory":
-            return self._stack.enter_context(closing(self._memory.connect(at, run_id)))
         return self._stack.enter_context(closing(connect(at, run_id, self._agent_keys)))
 
 
@@ -59,7 +52,7 @@ def keys_in(folder: Path) -> tuple[EdgeKeys, AgentKeys]:
     return EdgeKeys(edge, allow_list(folder / "edge")), AgentKeys(ann, edge.public)
 
 
-@pytest.fixture(params=["zmq", "curve", "memory"])
+@pytest.fixture(params=["zmq", "curve"])
 def net(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Net]:
     with ExitStack() as stack:
         yield Net(request.param, stack, tmp_path)
@@ -327,44 +320,3 @@ def test_bytes_that_are_not_zeromq_harm_nobody() -> None:
         eventually(lambda: agent.send([b"fine"]))
         assert eventually(lambda: heard(edge)) == (peer_id(2), [b"fine"])
         raw.close()
-
-
-def test_an_emulated_network_delays_both_ways_and_wakes_still_come_through() -> None:
-    memory = MemoryNetwork()
-    edge = memory.bind("edge")
-    link = EmulatedLink(
-        memory.connect("edge", 1), NetworkModel(ChannelModel(delay_ms=30.0), ChannelModel(delay_ms=20.0)), 0
-    )
-    took = []
-    for i in range(5):
-        sent = time.monotonic()
-        assert link.send(encode(Ping(i, 0)))
-        assert edge.receive(0) is None
-        assert link.receive(25) is None
-        while (got := edge.receive(0)) is None:
-            link.receive(5)
-        there = time.monotonic()
-        edge.send(got.peer, got.frames)
-        while link.receive(50) is None:
-            pass
-        took.append((1e3 * (there - sent), 1e3 * (time.monotonic() - there)))
-    up, down = zip(*took, strict=True)
-    assert min(up) >= 30 and sorted(up)[2] < 40
-    assert min(down) >= 20 and sorted(down)[2] < 30
-    threading.Timer(0.05, link.wake).start()
-    began = time.monotonic()
-    assert link.receive(2000) is None
-    assert time.monotonic() - began < 1.0
-    link.close()
-
-
-def test_a_network_of_a_file(tmp_path: Path) -> None:
-    file = tmp_path / "far.yaml"
-    file.write_text("up: {mbps: 5, delay_ms: 40}\ndown: {delay_ms: 35, jitter_ms: 2}\n")
-    assert load_network(str(file)) == NetworkModel(ChannelModel(5.0, 40.0), ChannelModel(0.0, 35.0, 2.0))
-    assert load_network("wifi5").round_trip_ms == pytest.approx(3.4)
-    with pytest.raises(UsageError, match="neither a file nor one of wifi5, wifi-busy"):
-        load_network("wifi6")
-    file.write_text("up: {speed: 5}\n")
-    with pytest.raises(ConfigError, match=r"far.yaml: up: unknown key 'speed'"):
-        load_network(str(file))

@@ -3,7 +3,7 @@
 import subprocess
 
 from share import __version__
-from share.runtime.child_commands import share_command
+from share.lab.evaluate.real_time import share_command
 
 
 def test_a_folder_called_share_where_one_stands_is_not_taken_for_the_program(tmp_path):

@@ -20,7 +20,7 @@ IN_ORDER_S = 20.0  # to write files, and for agents to say bye
 OF_A_PARENT = """
 import sys, time
 from pathlib import Path
-from share.runtime.child_commands import running_child
+from share.lab.evaluate.real_time import running_child
 log = Path(sys.argv[1]) / "edge.log"
 with running_child(log, "edge", "--bind", "tcp://127.0.0.1:0", "--out", sys.argv[1]):
     time.sleep(600)
@@ -28,7 +28,7 @@ with running_child(log, "edge", "--bind", "tcp://127.0.0.1:0", "--out", sys.argv
 OF_A_THREAD = """
 import sys, threading, time
 from pathlib import Path
-from share.runtime.child_commands import running_child
+from share.lab.evaluate.real_time import running_child
 def start():
     held.append(running_child(Path(sys.argv[1]) / "edge.log", "edge", "--bind", "tcp://127.0.0.1:0"))
     held[0].__enter__()

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from share.errors import ShareError, UsageError
-from share.runtime.pool import Pool
+from share.lab.pool import Pool
 
 _base = 0
 
