@@ -14,7 +14,7 @@ import pytest
 import zmq
 
 from share.errors import TransportError, UsageError
-from share.net.connection_guard import ConnectionGuard
+from share.net import tcp
 from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate_pair
 from share.net.transport import (
     LINGER_MS,
@@ -99,27 +99,23 @@ def test_who_sent_a_message_is_known_by_its_key(net: Net) -> None:
     assert arrival == IncomingMessage(peer_id(1), [b"hello"], net.agent_key)
 
 
-def test_a_fault_of_the_guard_costs_neither_the_edge_nor_the_guard(
+def test_a_failed_check_costs_neither_the_edge_nor_its_guard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    failing = [True]
-    check = ConnectionGuard._check
+    def fail() -> int:
+        raise ZeroDivisionError
 
-    def faulty(guard: ConnectionGuard, now_s: float) -> int:
-        if failing[0]:
-            raise ZeroDivisionError
-        return check(guard, now_s)
-
-    monkeypatch.setattr(ConnectionGuard, "_check", faulty)
     with ExitStack() as stack:
         net = Net("zmq", stack, tmp_path)
         edge = net.edge()
-        agent = joined(net, edge)
-        assert eventually(lambda: "guard of connections failed" in " ".join(edge.refusals()))
-        failing[0] = False
+        with monkeypatch.context() as patch:
+            patch.setattr(tcp, "resident_bytes", fail)
+            agent = joined(net, edge)
+            assert eventually(lambda: "guard of connections failed" in " ".join(edge.refusals()))
         assert agent.send([b"again"])
         assert eventually(lambda: heard(edge)) == (peer_id(1), [b"again"])
-        edge.refusals()
+        eventually(lambda: not edge.refusals())
+        time.sleep(0.05)  # two checks
         assert not edge.refusals()
 
 
