@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from share.files.line_file import LineFile, Spool
 from share.files.writing import atomic_write, check_replaceable, lock_folder
-from share.metrics.frame_log import RunLog
+from share.metrics.frame_log import LineStore, RunLog
 from share.recordings.trajectory import format_pose
+from share.runtime.output_writer import OutputWriter
 from share.types import F64
 
 _MAX_MAPS = 100  # an edge that keeps moving an agent between maps must not fill the folder
@@ -121,3 +123,18 @@ class AgentFiles:
         for file in self._open_files.values():
             file.close()
         self._open_files.clear()
+
+
+class BackgroundLines:
+    """Lines of a `RunLog`, written by an `OutputWriter`; `read` waits for it."""
+
+    def __init__(self, lines: LineStore, writer: OutputWriter) -> None:
+        self._lines, self._writer = lines, writer
+
+    def write(self, line: str) -> None:
+        self._writer.submit(partial(self._lines.write, line))
+
+    def read(self) -> Iterable[str]:
+        """Raises ShareError if the disk does not answer."""
+        self._writer.wait()
+        return self._lines.read()
