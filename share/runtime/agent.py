@@ -34,7 +34,6 @@ from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
 from share.protocol.reply_validation import FaultDeduplicator
-from share.runtime.agent_files import AgentFiles, BackgroundLines
 from share.runtime.arrivals import (
     FrameArrivals,
     LateFrameDropper,
@@ -48,6 +47,7 @@ from share.runtime.imu_bias_store import ImuBiasStore
 from share.runtime.output_writer import OutputWriter
 from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.pose_feed import PoseFeed
+from share.runtime.run_files import AgentFiles, BackgroundLines
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
 from share.startup import HeapTrimmer

@@ -10,7 +10,7 @@ from share.lab.evaluate.real_time import AgentScore, _joint_ate
 from share.metrics.ate import ate
 from share.metrics.frame_log import RunLog
 from share.recordings.trajectory import Trajectory, format_tum, read_tum
-from share.runtime.agent_files import AgentFiles
+from share.runtime.run_files import AgentFiles
 
 
 def test_a_map_that_comes_after_the_last_pose_is_not_that_of_the_file(tmp_path):

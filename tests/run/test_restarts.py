@@ -16,7 +16,7 @@ from share.protocol.edge_events import TrackerLost
 from share.runtime import edge as edge_module
 from share.runtime.edge import EdgeRun
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
-from share.runtime.mapper_restarts import MapperRestarts
+from share.runtime.mapper_supervision import MapperRestarts
 from share.runtime.worker_process import END
 from share.store.map_store import MapStore
 

@@ -10,7 +10,7 @@ import pytest
 from share.errors import ShareError
 from share.files.line_file import Spool
 from share.metrics.frame_log import RunLog
-from share.runtime.agent_files import AgentFiles
+from share.runtime.run_files import AgentFiles
 from share.types import TrackState
 
 LINES = [f"line {k}, {'é' * (k % 50)}" for k in range(30_000)]  # more than is read at once

@@ -33,7 +33,6 @@ from share.odometry.error_model.network import open_error_model
 from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
 from share.recordings.session import Session, read_session
-from share.runtime.agent_files import AgentFiles
 from share.runtime.error_estimators import (
     ErrorEstimator,
     GroundTruthError,
@@ -41,6 +40,7 @@ from share.runtime.error_estimators import (
     SynchronousErrorModel,
 )
 from share.runtime.pipeline import make_source_tracker, read_frames
+from share.runtime.run_files import AgentFiles
 from share.runtime.source import Source, open_source
 from share.sensors.sequencer import SequencerCounters
 from share.wire.messages import Hello

@@ -1,16 +1,20 @@
-"""Restarts of a mapper that has died: when the next one starts, and with which map."""
+"""Supervision of the mapper: its progress, and after its death, when and with which map it restarts."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from share.errors import ShareError
 from share.mapping.map_changes import StoredMap, with_unknown_credentials
 from share.protocol.peer import RestoredRun, restored_runs
+from share.runtime.mapper_process import MapperReport
 from share.store.map_store import MapStore
 from share.timing import Backoff
 
+_SILENT_S = 5.0  # without a report of the mapper, which comes every second, it is stuck
+_MAX_SOLVE_S = 15.0  # for one solution; longer means the solver is stuck
 _MAX_TRIES = 3  # mappers that may die while restoring one map, before it is set aside
 
 
@@ -73,3 +77,37 @@ class MapperRestarts:
             return
         renamed = self.store.set_aside()
         self._notify(f"the map file is renamed to {renamed.name}: {reason}; a new one is started")
+
+
+class MapperProgress:
+    """The newest report of one mapper, {} before the first, and what it tells of its progress."""
+
+    def __init__(self) -> None:
+        self.report: dict[str, Any] = {}
+        self._reported_s: float | None = None  # monotonic, as below
+        self._solving_s = 0.0  # duration of the current solve at that time
+        self._solved_s: float | None = None
+
+    def record(self, report: MapperReport) -> None:
+        self._reported_s, self._solving_s = time.monotonic(), report.solving_s
+        if _solve_count(report.report) > _solve_count(self.report):
+            self._solved_s = self._reported_s
+        self.report = report.report
+
+    def last_solve(self) -> dict[str, float]:
+        """Return {"last_solve_s": time since the last solution}, {} before the first."""
+        return {} if self._solved_s is None else {"last_solve_s": round(time.monotonic() - self._solved_s, 3)}
+
+    def stall(self) -> str | None:
+        """Return which process makes no progress, None if both do."""
+        if self._reported_s is None:
+            return None
+        if (silent_s := time.monotonic() - self._reported_s) > _SILENT_S:
+            return f"the mapper has not answered for {silent_s:.0f} s: no corrections meanwhile"
+        if (solving_s := self._solving_s + silent_s) > _MAX_SOLVE_S:
+            return f"the solver has worked on one solution for {solving_s:.0f} s: no corrections meanwhile"
+        return None
+
+
+def _solve_count(report: Mapping[str, Any]) -> int:
+    return int(report.get("solve_ms", {}).get("n", 0))

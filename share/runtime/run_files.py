@@ -1,7 +1,7 @@
-"""The files that `share agent --out DIR` writes.
+"""The files that `share agent --out DIR` and `share edge --out DIR` write.
 
-Poses are written as they come, to `.partial` files that stay readable after a crash; a run that ends
-renames them. One TUM file holds poses in one map only: when the agent moves to another map, its earlier
+Poses of an agent are written as they come, to `.partial` files that stay readable after a crash; a run that
+ends renames them. One TUM file holds poses in one map only: when the agent moves to another map, its earlier
 poses are kept as `map.before-N.tum`.
 """
 
@@ -22,11 +22,12 @@ from share.runtime.output_writer import OutputWriter
 from share.types import F64
 
 _MAX_MAPS = 100  # an edge that keeps moving an agent between maps must not fill the folder
-_FILE_NAMES = ("odom.tum", "map.tum", "latency.csv", "report.json")
 
 
-def _lock_folder(out: Path) -> int:
-    for name in _FILE_NAMES:
+def _lock_folder(out: Path, *file_names: str) -> int:
+    """Lock `out` for this process; return the handle. Raises UsageError if a file cannot be replaced or
+    another run writes there."""
+    for name in file_names:
         check_replaceable(out / name)
     return lock_folder(out)
 
@@ -43,7 +44,8 @@ class AgentFiles:
         self._map_id: str | None = None
         self._previous_maps = 0
         self._has_warned = False
-        self._lock_handle = None if out is None else _lock_folder(out)
+        names = ("odom.tum", "map.tum", "latency.csv", "report.json")
+        self._lock_handle = None if out is None else _lock_folder(out, *names)
         self._remove_partials()  # left by a killed run
         self.frame_lines = Spool(None if out is None else out / "latency.csv.partial", notify)
 
@@ -138,3 +140,42 @@ class BackgroundLines:
         """Raises ShareError if the disk does not answer."""
         self._writer.wait()
         return self._lines.read()
+
+
+class EdgeFiles:
+    """events.jsonl and edge.json of one run in `out`, written by a thread; none if `out` is None.
+
+    `notify` is called, from any thread, when the disk does not take them. Raises UsageError if another run is
+    writing to `out`.
+    """
+
+    def __init__(self, out: Path | None, notify: Callable[[str], None]) -> None:
+        self._out = out
+        if out is not None:
+            self._lock_handle = _lock_folder(out, "edge.json", "events.jsonl")
+            self._events = LineFile(out / "events.jsonl", notify)
+            self._writer = OutputWriter(out, notify)
+
+    @property
+    def trouble(self) -> str | None:
+        """What is wrong with the disk now, None if nothing."""
+        return None if self._out is None else self._writer.trouble
+
+    def write_event(self, fields: dict[str, Any]) -> None:
+        if self._out is not None:
+            self._writer.submit(partial(self._events.write, json.dumps(fields)))
+
+    def finish(self, report: dict[str, Any]) -> None:
+        """Write edge.json, at most for a few seconds. Call `check` after that."""
+        if self._out is not None:
+            self._writer.submit(self._events.close)
+            text = json.dumps(report, indent=2) + "\n"
+            self._writer.submit(partial(atomic_write, self._out / "edge.json", text))
+            self._writer.stop()
+
+    def check(self) -> None:
+        """Unlock the folder. Raises ShareError if the report or an event could not be written."""
+        if self._out is not None:
+            self._writer.check()
+            os.close(self._lock_handle)
+            self._events.check()
