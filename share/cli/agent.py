@@ -95,7 +95,6 @@ def agent(
     from share.runtime.agent import AgentRun
     from share.runtime.pose_feed import PoseFeed
     from share.runtime.signals import stop_on_signal
-    from share.runtime.streaming_agent import StreamingAgentRun
     from share.wire.messages import Hello
 
     if streamed and true_error:
@@ -112,7 +111,7 @@ def agent(
     errors = None if streamed else _error_estimator(opened, settings, true_error, live_line.print_line)
     feed = None if poses is None else PoseFeed(poses, hello.name)
     folder = None if out is None else Path(out)
-    run = (StreamingAgentRun if streamed else AgentRun)(
+    run = AgentRun(
         opened,
         hello,
         settings,
