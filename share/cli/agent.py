@@ -251,10 +251,10 @@ def _summary(run: AgentRun) -> str:
         lines += [f"{r['untracked']} more frames without an answer of the edge, {traffic}"]
     else:
         lines += [_keyframes_text(r, traffic)]
-    if r["drop_late"]:
-        lines.append(f"{r['drop_late']} more frames dropped to keep up")
-    if r["frames_late"]:
-        lines.append(f"{r['frames_late']} poses were late, by up to {r['latest_s']:.1f} s")
+    if r["dropped_late"]:
+        lines.append(f"{r['dropped_late']} more frames dropped to keep up")
+    if r["late_frames"]:
+        lines.append(f"{r['late_frames']} poses were late, by up to {r['max_late_s']:.1f} s")
     if p95 is not None:
         lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (p95 {p95:.1f} ms)")
     if r["clock"]["uncertainty_ms"] is not None:

@@ -279,7 +279,7 @@ class EdgeRun:
                 case MapRestored():
                     self._restarts.record_restored()
                 case SolverDied() as solver:
-                    self._log_event("solver lost", solver.text)
+                    self._log_event("solver died", solver.text)
                     self._troubles.add(f"the solver: {solver.text}")
                 case _MapperDied() as mapper if not self._stopping:
                     self._restart_mapping(f"its process {mapper.reason}")
@@ -288,7 +288,7 @@ class EdgeRun:
         """Start a new session after the mapper died; to the agents this looks like a restart of the edge."""
         pause_s = self._restarts.record_death()
         text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
-        self._log_event("mapper lost", text)
+        self._log_event("mapper died", text)
         self._troubles.add(f"the mapper: {text}", pause_s + _TROUBLE_SHOWN_S)
         if self._mapper_process is not None:
             self._mapper_process.close()
@@ -355,7 +355,7 @@ class EdgeRun:
 
     def _post_write_failure(self, text: str) -> None:
         """Log that the disk does not take a file. Safe from any thread."""
-        self._inbox.put(_Notice("not written", text))
+        self._inbox.put(_Notice("write failed", text))
 
     def _count_refusal(self, line: str) -> None:
         """Count a refused handshake; log each kind once, up to MAX_REFUSAL_KINDS."""
@@ -363,4 +363,4 @@ class EdgeRun:
             line = "further kinds of refusal, which are only counted"
         self._refused_handshakes[line] += 1
         if self._refused_handshakes[line] == 1:
-            self._log_event("not let in", line)
+            self._log_event("connection refused", line)

@@ -2,7 +2,7 @@
 
 Poses of an agent are written as they come, to `.partial` files that stay readable after a crash; a run that
 ends renames them. One TUM file holds poses in one map only: when the agent moves to another map, its earlier
-poses are kept as `map.before-N.tum`.
+poses are kept as `map.previous-N.tum`.
 """
 
 from __future__ import annotations
@@ -63,13 +63,13 @@ class AgentFiles:
         """Keep the poses in the previous map, for at most _MAX_MAPS maps."""
         if self._previous_maps < _MAX_MAPS:
             self._previous_maps += 1
-            partial.rename(partial.with_name(f"map.before-{self._previous_maps}.tum.partial"))
+            partial.rename(partial.with_name(f"map.previous-{self._previous_maps}.tum.partial"))
         elif not self._has_warned:
             self._has_warned = True
             self._notify(f"moved between more than {_MAX_MAPS} maps: poses in further ones are not kept")
 
     def finish(self, log: RunLog, report: dict[str, Any]) -> None:
-        """Close all files, rename them and write the report, with the map id of map.tum as `map_tum`.
+        """Close all files, rename them and write the report, with the map id of map.tum as `map_tum_id`.
 
         A correction after the last frame does not change that id. Raises ShareError if the disk was full
         and poses or frame lines are missing.
@@ -81,18 +81,18 @@ class AgentFiles:
         self._close_files()
         if self._out is None:
             return
-        for old in self._out.glob("map.before-*.tum"):
+        for old in self._out.glob("map.previous-*.tum"):
             old.unlink()  # from an earlier run in this folder
         for name in ("odom.tum", "map.tum"):
             partial = self._out / f"{name}.partial"
             partial.touch()  # without poses: an empty file, not the one of an earlier run
             partial.replace(self._out / name)
         for number in range(1, self._previous_maps + 1):
-            name = f"map.before-{number}.tum"
+            name = f"map.previous-{number}.tum"
             (self._out / f"{name}.partial").replace(self._out / name)
         atomic_write(self._out / "latency.csv", "".join(log.csv_chunks()))
         (self._out / "latency.csv.partial").unlink(missing_ok=True)
-        report = report | {"map_tum": self._map_id}
+        report = report | {"map_tum_id": self._map_id}
         atomic_write(self._out / "report.json", json.dumps(report, indent=2) + "\n")
 
     def discard(self) -> None:

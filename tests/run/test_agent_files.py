@@ -19,7 +19,7 @@ def test_a_map_that_comes_after_the_last_pose_is_not_that_of_the_file(tmp_path):
     files.write_map_pose(1, np.eye(4), "ann-1/0")
     files.write_map_pose(2, np.eye(4), "bob-1/0")
     files.finish(RunLog(), {"protocol": {"map_id": "eve-1/0"}})
-    assert json.loads((tmp_path / "report.json").read_text())["map_tum"] == "bob-1/0"
+    assert json.loads((tmp_path / "report.json").read_text())["map_tum_id"] == "bob-1/0"
     assert len(read_tum(tmp_path / "map.tum").stamps_ns) == 1
 
 
@@ -30,7 +30,7 @@ def test_an_edge_that_moves_an_agent_from_map_to_map_does_not_fill_the_folder(tm
         files.write_odom_pose(k, np.eye(4))
         files.write_map_pose(k, np.eye(4), f"map {k}")
     files.finish(RunLog(), {})
-    assert len(list(tmp_path.glob("map.before-*"))) == 100
+    assert len(list(tmp_path.glob("map.previous-*"))) == 100
     assert said == ["moved between more than 100 maps: poses in further ones are not kept"]
     assert len(read_tum(tmp_path / "odom.tum").stamps_ns) == 300
     assert read_tum(tmp_path / "map.tum").stamps_ns.tolist() == [299]
@@ -46,7 +46,7 @@ def test_who_was_told_of_the_join_too_late_is_not_scored_with_the_others(tmp_pat
     (tmp_path / "x.tum").write_text(format_tum(elsewhere))
 
     def agent(map_tum: str, told: Trajectory) -> AgentScore:
-        report = {"map_tum": map_tum, "protocol": {"map_id": "joined/0"}}
+        report = {"map_tum_id": map_tum, "protocol": {"map_id": "joined/0"}}
         return AgentScore(report, ate(told, truth), told, truth)
 
     found = _joint_ate(

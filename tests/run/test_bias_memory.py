@@ -35,13 +35,13 @@ def memory(source: Any, now_ns: int = NOON_NS) -> tuple[ImuBiasStore, list[str]]
 def test_the_next_run_begins_with_what_this_one_has_learnt() -> None:
     first, said = memory(Camera())
     assert first.bias is None
-    assert first.report() == {"imu_bias": {"from": None}}
+    assert first.report() == {"imu_bias": {"learnt_at": None}}
     first.save(LEARNT)
     second, more = memory(Camera(), NOON_NS + 10**9)
     assert second.bias is not None
     np.testing.assert_array_equal(second.bias.accel, LEARNT.accel)
     assert second.bias.accel_sigma == pytest.approx(POWER_ON_ACCEL, rel=0.01)
-    assert second.report() == {"imu_bias": {"from": "2026-09-21T14:13:20Z"}}
+    assert second.report() == {"imu_bias": {"learnt_at": "2026-09-21T14:13:20Z"}}
     assert memory(Camera("0456"))[0].bias is None
     assert said == more == []
 
@@ -49,13 +49,13 @@ def test_the_next_run_begins_with_what_this_one_has_learnt() -> None:
 def test_a_run_that_learnt_nothing_leaves_what_was_known() -> None:
     memory(Camera())[0].save(LEARNT)
     memory(Camera(), NOON_NS + DAY_NS)[0].save(None)
-    assert memory(Camera(), NOON_NS + DAY_NS)[0].report()["imu_bias"]["from"] == "2026-09-21T14:13:20Z"
+    assert memory(Camera(), NOON_NS + DAY_NS)[0].report()["imu_bias"]["learnt_at"] == "2026-09-21T14:13:20Z"
 
 
 def test_what_is_too_old_is_nothing() -> None:
     memory(Camera())[0].save(LEARNT)
     old, said = memory(Camera(), NOON_NS + 365 * DAY_NS)
-    assert (old.bias, old.report(), said) == (None, {"imu_bias": {"from": None}}, [])
+    assert (old.bias, old.report(), said) == (None, {"imu_bias": {"learnt_at": None}}, [])
 
 
 def test_a_clock_that_was_set_back_makes_no_age() -> None:

@@ -56,7 +56,7 @@ def test_a_person_ends_it_and_the_file_is_whole(tmp_path: Path, number: int) -> 
         told, complaints = child.communicate(timeout=20)
     assert (child.returncode, complaints) == (0, "")
     report = json.loads(told)
-    assert report["ended"] == "stopped"
+    assert report["end_reason"] == "stopped"
     assert len(open_source(str(out)).stamps()["cam0"]) == report["streams"]["cam0"]["samples"] > 10
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 

@@ -74,7 +74,7 @@ def test_what_was_said_last_holds():
     errors.close()
     told = errors.report()["error_model"]
     assert told["estimate_ms"]["n"] == 1
-    assert (told["drop_estimate"], told["strange"], said) == (0, 0, [])
+    assert (told["dropped_estimates"], told["unfamiliar"], said) == (0, 0, [])
 
 
 def test_times_are_remembered_of_the_newest_estimates_only(monkeypatch):
@@ -102,7 +102,7 @@ def test_who_is_busy_leaves_the_older_out():
     until(lambda: errors.update(frame(1), TRACKED) == pytest.approx(4))
     errors.close()
     assert network.seen == [1.0, 4.0]
-    assert errors.report()["error_model"]["drop_estimate"] == 2
+    assert errors.report()["error_model"]["dropped_estimates"] == 2
 
 
 def test_a_network_that_fails_is_left_alone_and_said_so():

@@ -77,7 +77,7 @@ def test_an_agent_with_keys_gets_in_and_others_do_not(
     assert list(report["agents"]) == ["ann"]
     assert report["agents"]["ann"]["keyframes"] > 0
     assert report["refused_handshakes"] >= 2
-    reasons = [str(event["reason"]) for event in server.events() if event["event"] == "not let in"]
+    reasons = [str(event["reason"]) for event in server.events() if event["event"] == "connection refused"]
     assert len(reasons) == 2  # each kind once
     assert any("share keys authorize NAME" in reason for reason in reasons)
     for name in ("eve", "bob"):

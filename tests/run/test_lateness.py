@@ -10,7 +10,7 @@ def test_poses_in_time_are_not_spoken_of() -> None:
     lateness = LatenessMonitor(said.append, "this machine")
     for _ in range(100):
         lateness.record(45.0)
-    assert (said, lateness.report()) == ([], {"frames_late": 0, "latest_s": 0.045})
+    assert (said, lateness.report()) == ([], {"late_frames": 0, "max_late_s": 0.045})
 
 
 def test_late_ones_are_counted_and_said_once_and_where_it_doubles() -> None:
@@ -20,4 +20,4 @@ def test_late_ones_are_counted_and_said_once_and_where_it_doubles() -> None:
         lateness.record(100.0 * k)  # to 9.9 s
     assert [line.split(":")[0] for line in said] == [f"poses are {s:.1f} s late" for s in (1, 2, 4, 8)]
     assert "this machine is too slow for this source; set agent.late_ms" in said[0]
-    assert lateness.report() == {"frames_late": 94, "latest_s": 9.9}
+    assert lateness.report() == {"late_frames": 94, "max_late_s": 9.9}

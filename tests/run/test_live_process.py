@@ -96,6 +96,6 @@ def test_a_person_ends_an_agent_and_its_files_are_whole(tmp_path: Path, plain_se
     assert "camera: missing " in told
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["camera"]["streams"]["accel"]["dropped"] == 0
-    assert f"imu bias: from the run of {report['imu_bias']['from']}\n" in told
+    assert f"imu bias: from the run of {report['imu_bias']['learnt_at']}\n" in told
     assert report["track_ms"]["p50"] > 0  # from the image's arrival
     assert len(read_tum(tmp_path / "odom.tum").stamps_ns) == report["tracked"] > 10

@@ -67,7 +67,7 @@ def test_a_recorded_camera_is_tracked_as_the_original(
     feed_stopped = feed.stop
     feed.stop = lambda: (feed_stopped(), run.stop())  # type: ignore[method-assign,assignment]
     report = run.run(30)
-    assert (report["ended"], said) == ("stopped", [])
+    assert (report["end_reason"], said) == ("stopped", [])
     assert_same(room, tracked(open_source(str(tmp_path / "a.mcap"))), original)
 
 
@@ -103,7 +103,7 @@ def test_a_live_camera_begins_with_the_bias_of_the_run_before_and_keeps_its_own(
     run = tracked(source)
     assert (begun[0].gyro[1], begun[0].accel[2]) == (0.001, 0.001)
     assert 0.1 < begun[0].accel_sigma < 0.11
-    assert run.report["imu_bias"]["from"] is not None
+    assert run.report["imu_bias"]["learnt_at"] is not None
     assert f"imu bias: from the run of {run.report['imu_bias']['from']}" in camera_options.camera_summary(
         run.report
     )

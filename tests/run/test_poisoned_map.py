@@ -55,7 +55,7 @@ def test_a_pose_beyond_measure_costs_its_keyframe(tmp_path: Path, plain_session:
     agent = start_agent(tmp_path, "eve", plain_session / "ar1", address)
     assert agent.wait(60) == 0
     assert child.interrupt() == 0
-    assert "mapper lost" not in child.said
+    assert "mapper died" not in child.said
     with MapStore.read(path) as store:
         keys = [found.keyframe_key for found in store.load().keyframes]
     assert len([key for key in keys if not key.agent.startswith("eve")]) == 15
@@ -78,7 +78,7 @@ def test_a_map_that_ends_three_mappers_is_set_aside(tmp_path: Path, plain_sessio
     until("renamed to", aside, 60)
     why = "3 mappers in a row have died while restoring it; a new one is started"
     assert f"the map file is renamed to {path.name}.damaged-1: {why}" in child.said
-    assert child.said.count("mapper lost: its process was ended by SIGKILL; restarted in") == 3
+    assert child.said.count("mapper died: its process was ended by SIGKILL; restarted in") == 3
     agent = start_agent(tmp_path, "eve", plain_session / "ar1", address)
     assert agent.wait(60) == 0
     time.sleep(0.2)

@@ -102,8 +102,8 @@ def test_a_map_that_ends_mappers_is_set_aside(edge, path):
     run, pauses, told = edge(dies_of_a_map)
     step_until(run, lambda: events(told, "map"))
     assert pauses == [1, 2, 4]
-    assert len(events(told, "mapper lost")) == 3
-    assert "its process ended with exit code 3; restarted in" in events(told, "mapper lost")[0]
+    assert len(events(told, "mapper died")) == 3
+    assert "its process ended with exit code 3; restarted in" in events(told, "mapper died")[0]
     reason = "3 mappers in a row have died while restoring it"
     line = f"the map file is renamed to room.sqlite.damaged-1: {reason}; a new one is started"
     assert events(told, "map") == [line]
@@ -128,7 +128,7 @@ def test_a_mapper_that_dies_of_something_else_keeps_its_map(edge, path):
 
 
 def test_answers_of_a_life_that_is_over_are_none_of_the_next(edge):
-    """A ticket of the keeper before would acknowledge what the new one has not written."""
+    """A ticket of the earlier map writer would acknowledge what the new one has not written."""
     run, _, _ = edge(dies_later)
     run._post(edge_module.ChangesSaved(10**6))
     run._restart_mapping("its process was ended")
@@ -208,7 +208,7 @@ def counts(inbox, answer, settings):
 def test_what_was_counted_before_a_mapper_died_still_counts(edge):
     run, _, told = edge(counts)
     for dead in range(1, 4):
-        step_until(run, lambda dead=dead: len(events(told, "mapper lost")) >= dead)
+        step_until(run, lambda dead=dead: len(events(told, "mapper died")) >= dead)
         run._update_report()
         assert run.report()["loops"] == {"tried": 7 * dead, "accepted": 2 * dead}
         assert run.report()["place_ms"]["n"] == 7 * dead

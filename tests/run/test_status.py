@@ -192,7 +192,7 @@ def test_all_that_an_edge_reports_is_in_a_metric():
     not_yet = {
         "share_edge_map_keyframes",
         "share_edge_pose_age_seconds",
-        "share_edge_stranger_bad_messages_total",
+        "share_edge_unidentified_bad_messages_total",
     }
     assert absent <= by_others | not_yet
 

@@ -44,7 +44,7 @@ def test_a_process_of_the_edge_is_stopped(tmp_path, victim):
         walker.join(FOUND_S)
         assert walker.error is None
         assert walker.machine.report()["open"] == 0
-    assert "mapper lost" not in edge.said
+    assert "mapper died" not in edge.said
     assert edge.interrupt() == 0
     check_map(tmp_path / "room.sqlite", walkers)
 

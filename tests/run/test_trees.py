@@ -147,7 +147,7 @@ def test_a_signal_ends_all_in_good_order(tmp_path, number, whom):
     assert tree.left(IN_ORDER_S) == {}
     assert tree.parent.returncode == 0
     assert (tmp_path / "out" / "edge.json").exists()
-    assert "mapper lost" not in (tmp_path / "out" / "events.jsonl").read_text()
+    assert "mapper died" not in (tmp_path / "out" / "events.jsonl").read_text()
     assert "Traceback" not in tree.log.read_text()
 
 

@@ -47,19 +47,19 @@ def test_a_pose_comes_as_it_was_told(app):
     feed.publish(456, "OK", 7.1234, 1, T_odom, T_map, "bob-1/0")
     first, second = (json.loads(app.recv(2000)) for _ in range(2))
     assert first == {
-        "schema": 1,
+        "schema": 2,
         "agent": "ann",
         "sequence": 0,
         "stamp_ns": 123,
         "age_ms": None,
         "state": "INITIALISING",
-        "stretch": None,
+        "segment": None,
         "odom": None,
         "map": None,
         "map_id": None,
     }
     assert (second["sequence"], second["stamp_ns"], second["age_ms"]) == (1, 456, 7.123)
-    assert (second["stretch"], second["map_id"]) == (1, "bob-1/0")
+    assert (second["segment"], second["map_id"]) == (1, "bob-1/0")
     for told, T in ((second["odom"], T_odom), (second["map"], T_map)):
         assert np.allclose(told["position"], T[:3, 3], atol=1e-9)
         assert np.allclose(matrix_from_quat(np.array(told["quaternion"])), T[:3, :3], atol=1e-8)
