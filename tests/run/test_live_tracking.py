@@ -104,9 +104,8 @@ def test_a_live_camera_begins_with_the_bias_of_the_run_before_and_keeps_its_own(
     assert (begun[0].gyro[1], begun[0].accel[2]) == (0.001, 0.001)
     assert 0.1 < begun[0].accel_sigma < 0.11
     assert run.report["imu_bias"]["learnt_at"] is not None
-    assert f"imu bias: from the run of {run.report['imu_bias']['learnt_at']}" in camera_options.camera_summary(
-        run.report
-    )
+    learnt_at = run.report["imu_bias"]["learnt_at"]
+    assert f"imu bias: from the run of {learnt_at}" in camera_options.camera_summary(run.report)
     assert run.report["tracked"] > 40
     kept = load_bias("0123")
     assert kept is not None

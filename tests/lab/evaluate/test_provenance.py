@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import share
-from share.runtime.machine import code_digest
+from share.lab.evaluate.provenance import code_digest
 
 
 def test_it_is_another_once_a_source_is(tmp_path, monkeypatch):
