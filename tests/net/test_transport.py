@@ -91,7 +91,7 @@ def test_a_message_goes_there_and_back_in_its_frames(net: Net) -> None:
     assert eventually(lambda: agent.receive(100)) == frames
 
 
-def test_who_sent_a_message_is_known_by_its_key(net: Net) -> None:
+def test_a_message_carries_the_key_of_its_sender(net: Net) -> None:
     edge = net.edge()
     agent = net.agent(edge.endpoint)
     eventually(lambda: agent.send([b"hello"]))
@@ -130,7 +130,7 @@ def test_without_an_edge_nothing_is_sent_and_nothing_blocks(net: Net) -> None:
     assert time.monotonic() - start < 0.5
 
 
-def test_what_was_sent_to_an_absent_edge_does_not_arrive_later(net: Net) -> None:
+def test_messages_to_an_absent_edge_are_dropped(net: Net) -> None:
     first = net.edge()
     agent = joined(net, first)
     first.close()
@@ -151,7 +151,7 @@ def test_a_restarted_edge_is_found_again_and_can_send(net: Net) -> None:
         assert eventually(lambda: agent.receive(100)) == [b"%d" % life]
 
 
-def test_sending_to_a_peer_that_is_not_there_says_so(net: Net) -> None:
+def test_sending_to_an_absent_peer_returns_false(net: Net) -> None:
     edge = net.edge()
     assert not edge.send(peer_id(77), [b"x"])
     agent = joined(net, edge, 77)
@@ -160,7 +160,7 @@ def test_sending_to_a_peer_that_is_not_there_says_so(net: Net) -> None:
     eventually(lambda: not edge.send(peer_id(77), [b"x"]))
 
 
-def test_a_slow_reader_costs_bounded_memory_and_blocks_nobody(net: Net) -> None:
+def test_a_slow_reader_costs_bounded_memory(net: Net) -> None:
     edge = net.edge()
     agent = joined(net, edge)
     payload = [bytes(26_000)]
@@ -175,7 +175,7 @@ def test_a_slow_reader_costs_bounded_memory_and_blocks_nobody(net: Net) -> None:
     assert eventually(lambda: (edge.receive(5), agent.send([b"again"]))[1])  # it may have been cut off
 
 
-def test_many_agents_are_told_apart(net: Net) -> None:
+def test_many_agents_are_distinguished(net: Net) -> None:
     edge = net.edge()
     agents = {peer_id(k): net.agent(edge.endpoint, k) for k in (-5, 0, 1, 255, 2**62, *range(10, 25))}
     for peer, agent in agents.items():
@@ -188,7 +188,7 @@ def test_many_agents_are_told_apart(net: Net) -> None:
         assert eventually(lambda agent=agent: agent.receive(100)) == [b"to " + peer]
 
 
-def test_an_agent_that_comes_back_twice_is_still_one_peer(net: Net) -> None:
+def test_a_reconnected_agent_takes_over_its_id(net: Net) -> None:
     edge = net.edge()
     stale = joined(net, edge)
     fresh = net.agent(edge.endpoint, 1)  # the same run over another path: the old one is half open
@@ -233,7 +233,7 @@ def test_the_last_message_leaves_before_close(net: Net) -> None:
     assert eventually(lambda: heard(edge)) == (peer_id(1), encode(Bye()))
 
 
-def test_an_address_in_use_is_said_in_one_line(net: Net) -> None:
+def test_an_address_in_use_is_reported(net: Net) -> None:
     edge = net.edge()
     with pytest.raises(TransportError, match="in use; stop the other edge or choose another") as caught:
         net.edge(edge.endpoint)
@@ -275,7 +275,7 @@ def test_loopback_names(host: str) -> None:
         assert parse_address(edge.endpoint).port > 0
 
 
-def test_an_oversized_frame_is_not_let_in_and_harms_nobody() -> None:
+def test_an_oversized_frame_is_refused() -> None:
     with closing(bind("tcp://127.0.0.1:0")) as edge, closing(connect(edge.endpoint, 2)) as good:
         context = zmq.Context()
         rogue = context.socket(zmq.DEALER)
@@ -292,7 +292,7 @@ def test_an_oversized_frame_is_not_let_in_and_harms_nobody() -> None:
 
 
 @pytest.mark.parametrize("with_keys", [False, True], ids=["zmq", "curve"])
-def test_an_edge_that_takes_images_takes_them_up_to_its_bound(with_keys: bool, tmp_path: Path) -> None:
+def test_images_are_accepted_up_to_the_limit(with_keys: bool, tmp_path: Path) -> None:
     edge_keys, agent_keys = keys_in(tmp_path) if with_keys else (None, None)
     most = 1_000_000
     with (
@@ -309,7 +309,7 @@ def test_an_edge_that_takes_images_takes_them_up_to_its_bound(with_keys: bool, t
         eventually(lambda: agent.send([b"back"]) and edge.receive(100))
 
 
-def test_bytes_that_are_not_zeromq_harm_nobody() -> None:
+def test_bytes_that_are_not_zeromq_do_no_harm() -> None:
     with closing(bind("tcp://127.0.0.1:0")) as edge, closing(connect(edge.endpoint, 2)) as agent:
         raw = socket.create_connection(("127.0.0.1", parse_address(edge.endpoint).port))
         raw.sendall(b"GET / HTTP/1.1\r\n\r\n" + bytes(range(256)) * 40)

@@ -1,4 +1,4 @@
-"""`share demo` as a user starts it: a room made, an edge and three agents as processes, a table."""
+"""`share demo` as a user starts it: a scene, an edge and three agents as processes, a table."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def pictured(out: Path) -> bool:
 
 
 @pytest.mark.slow
-def test_six_seconds_of_everything(tmp_path):
+def test_a_demo_of_six_seconds(tmp_path):
     """In the plain room, which is quickly drawn; with this seed all three soon look at the same things."""
     seed = ("--scene", "plain", "--seed", "8")
     done = demo(tmp_path / "cache", tmp_path / "out", "--seconds", "6", *seed)
@@ -71,6 +71,7 @@ def test_six_seconds_of_everything(tmp_path):
     assert pictured(tmp_path / "out")
 
 
+@pytest.mark.long
 def test_without_opengl_it_plays_the_plain_room(plain_cache, tmp_path):
     """No driver of EGL is to be found: one line says so, and what can be done; the rest is as ever."""
     hidden = {"__EGL_VENDOR_LIBRARY_FILENAMES": str(tmp_path / "nothing")}

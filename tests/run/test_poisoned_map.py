@@ -46,7 +46,7 @@ def edge(folder: Path, path: Path) -> tuple[Child, str]:
     return child, child.wait_for(r"listening on (tcp://\S+?),")[1]
 
 
-def test_a_pose_beyond_measure_costs_its_keyframe(tmp_path: Path, plain_session: Path) -> None:
+def test_an_absurd_pose_costs_its_keyframe(tmp_path: Path, plain_session: Path) -> None:
     path = map_file(4, tmp_path)
     poison(path)
     child, address = edge(tmp_path, path)
@@ -62,7 +62,7 @@ def test_a_pose_beyond_measure_costs_its_keyframe(tmp_path: Path, plain_session:
     assert len(keys) > 15
 
 
-def test_a_map_that_ends_three_mappers_is_set_aside(tmp_path: Path, plain_session: Path) -> None:
+def test_a_map_that_three_mappers_die_of_is_set_aside(tmp_path: Path, plain_session: Path) -> None:
     """Whatever it is of that they die while they take it in."""
     path = map_file(4, tmp_path)
     child, address = edge(tmp_path, path)

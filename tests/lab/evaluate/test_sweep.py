@@ -1,4 +1,4 @@
-"""Which points a sweep tries, with which settings, and what it makes of the runs."""
+"""Points of a sweep, their settings, and its heat map."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KP, KI = Axis.parse("control.kp=0.2,0.8"), Axis.parse("control.ki=0,0.1,1e-3")
     "text",
     ["control.kp", "kp=1", "control.kp=", "a.b.c=1", "control.kp=1:x", "control.kp=3:1", "control.kp=1:2:3"],
 )
-def test_what_cannot_be_read_is_said(text):
+def test_malformed_axes_are_refused(text):
     with pytest.raises(UsageError, match=f"--set {text}: "):
         Axis.parse(text)
 
@@ -34,7 +34,7 @@ def test_a_grid_is_every_combination():
         grid([Axis.parse("control.kp=1:2")])
 
 
-def test_points_are_drawn_evenly_by_the_logarithm_and_the_same_again():
+def test_random_points_are_log_uniform_and_repeatable():
     axes = [Axis.parse("control.kp=0.1:10"), Axis.parse("control.ki=0:2"), KI]
     points = random_points(axes, 2000, seed=0)
     kp, ki = (np.array([float(point[k]) for point in points]) for k in (0, 1))

@@ -1,4 +1,4 @@
-"""From run to run: what a live camera's IMU was like, and of a recording nothing."""
+"""The IMU bias of a live camera is kept from run to run, that of a recording is not."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def memory(source: Any, now_ns: int = NOON_NS) -> tuple[ImuBiasStore, list[str]]
     return ImuBiasStore(source, Config().inertial, said.append, lambda: now_ns), said
 
 
-def test_the_next_run_begins_with_what_this_one_has_learnt() -> None:
+def test_the_next_run_starts_with_the_saved_bias() -> None:
     first, said = memory(Camera())
     assert first.bias is None
     assert first.report() == {"imu_bias": {"learnt_at": None}}
@@ -46,19 +46,19 @@ def test_the_next_run_begins_with_what_this_one_has_learnt() -> None:
     assert said == more == []
 
 
-def test_a_run_that_learnt_nothing_leaves_what_was_known() -> None:
+def test_a_run_without_an_estimate_keeps_the_saved_bias() -> None:
     memory(Camera())[0].save(LEARNT)
     memory(Camera(), NOON_NS + DAY_NS)[0].save(None)
     assert memory(Camera(), NOON_NS + DAY_NS)[0].report()["imu_bias"]["learnt_at"] == "2026-09-21T14:13:20Z"
 
 
-def test_what_is_too_old_is_nothing() -> None:
+def test_an_old_bias_is_not_used() -> None:
     memory(Camera())[0].save(LEARNT)
     old, said = memory(Camera(), NOON_NS + 365 * DAY_NS)
     assert (old.bias, old.report(), said) == (None, {"imu_bias": {"learnt_at": None}}, [])
 
 
-def test_a_clock_that_was_set_back_makes_no_age() -> None:
+def test_a_bias_from_the_future_is_not_used() -> None:
     memory(Camera())[0].save(LEARNT)
     young, said = memory(Camera(), NOON_NS - DAY_NS)
     assert young.bias is None
@@ -77,7 +77,7 @@ def test_a_damaged_file_costs_one_line_and_is_replaced() -> None:
     assert memory(Camera())[0].bias is not None
 
 
-def test_a_device_that_says_what_is_no_serial_number_costs_a_line_each_time() -> None:
+def test_a_malformed_serial_number_costs_a_line_each_time() -> None:
     run, said = memory(Camera("../../0123"))
     run.save(LEARNT)
     assert run.bias is None
@@ -96,7 +96,7 @@ def test_a_folder_that_cannot_be_made_does_not_end_the_run(
     assert said[0].startswith("the IMU bias is not saved: ")
 
 
-def test_a_recording_is_not_remembered_though_it_has_a_serial_number() -> None:
+def test_no_bias_is_saved_of_a_recording() -> None:
     memory(Camera())[0].save(LEARNT)
     recording = SimpleNamespace(serial="0123", rig=RIG)
     run, said = memory(recording, NOON_NS + DAY_NS)

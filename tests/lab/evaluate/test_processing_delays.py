@@ -1,4 +1,4 @@
-"""How long things took in a run, for runs in virtual time."""
+"""Delays measured in a run, for runs in virtual time."""
 
 import json
 from pathlib import Path
@@ -32,7 +32,7 @@ def run(folder: Path, solved: int = 10) -> Path:
     return folder
 
 
-def test_what_was_measured_and_the_rest_in_proportion(tmp_path):
+def test_unmeasured_delays_are_in_proportion_to_measured_ones(tmp_path):
     costs, usual = read_delays(run(tmp_path)), ProcessingDelays()
     assert costs.frame == Delay(20.0, 40.0)
     assert costs.query == Delay(6.0, 9.0)
@@ -45,7 +45,7 @@ def test_what_was_measured_and_the_rest_in_proportion(tmp_path):
         assert getattr(costs, name).p50 == pytest.approx(0.5 * getattr(usual, name).p50)
 
 
-def test_what_is_not_there_is_said(tmp_path):
+def test_missing_delays_are_reported(tmp_path):
     with pytest.raises(UsageError, match="not a folder of"):
         read_delays(tmp_path)
     folder = run(tmp_path, solved=0)

@@ -1,4 +1,4 @@
-"""A process of our own: it answers, it dies, it ends with us."""
+"""A worker process: it answers, it dies, it ends with its parent."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from share.runtime.worker_process import END, Inbox, WorkerProcess
 
 LINES = """
 import sys, time
-from test_companion import doubles
+from test_worker_process import doubles
 from share.runtime.worker_process import WorkerProcess
 if __name__ == "__main__":
     c = WorkerProcess("doubles", doubles, (), lambda m: None, lambda how: None)
@@ -25,7 +25,7 @@ if __name__ == "__main__":
 
 
 INTERRUPTED = """
-from test_companion import doubles
+from test_worker_process import doubles
 from share.runtime import worker_process as companion
 start = companion.SPAWN_CONTEXT.Process.start
 def interrupted(process):
@@ -59,7 +59,7 @@ def test_it_answers_and_ends() -> None:
     assert not lost
 
 
-def test_its_death_is_told_once() -> None:
+def test_its_death_is_reported_once() -> None:
     lost: queue.SimpleQueue[str] = queue.SimpleQueue()
     companion = WorkerProcess("doubles", doubles, (), lambda message: None, lost.put)
     companion.send("die")
@@ -69,7 +69,7 @@ def test_its_death_is_told_once() -> None:
     assert lost.empty()
 
 
-def test_it_ends_with_us_however_we_end() -> None:
+def test_it_ends_with_its_parent() -> None:
     here = os.path.dirname(__file__)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([here, *sys.path])}
     parent = subprocess.Popen([sys.executable, "-c", LINES], stdout=subprocess.PIPE, env=environment)
@@ -84,7 +84,7 @@ def test_it_ends_with_us_however_we_end() -> None:
     assert not _alive(pid)
 
 
-def test_interrupted_before_anybody_can_close_it() -> None:
+def test_it_ends_if_the_parent_is_interrupted_before_close() -> None:
     here = os.path.dirname(__file__)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([here, *sys.path])}
     done = subprocess.run(

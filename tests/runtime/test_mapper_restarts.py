@@ -1,4 +1,4 @@
-"""A mapper that dies again and again: the edge stays up, pauses grow, a map that it dies of is set aside."""
+"""A mapper that keeps dying: the edge goes on, pauses grow, a map that it dies of is set aside."""
 
 from __future__ import annotations
 
@@ -97,7 +97,8 @@ def events(told, name):
     return [event["reason"] for event in told if event["event"] == name]
 
 
-def test_a_map_that_ends_mappers_is_set_aside(edge, path):
+@pytest.mark.long
+def test_a_map_that_mappers_die_of_is_set_aside(edge, path):
     before = path.read_bytes()
     run, pauses, told = edge(dies_of_a_map)
     step_until(run, lambda: events(told, "map"))
@@ -119,6 +120,7 @@ def test_a_map_that_ends_mappers_is_set_aside(edge, path):
         assert len(old.load().keyframes) == 40
 
 
+@pytest.mark.long
 def test_a_mapper_that_dies_of_something_else_keeps_its_map(edge, path):
     run, pauses, told = edge(dies_later)
     step_until(run, lambda: len(pauses) == 5)
@@ -127,7 +129,7 @@ def test_a_mapper_that_dies_of_something_else_keeps_its_map(edge, path):
     assert not path.with_name("room.sqlite.damaged-1").exists()
 
 
-def test_answers_of_a_life_that_is_over_are_none_of_the_next(edge):
+def test_answers_to_an_earlier_session_are_discarded(edge):
     """A ticket of the earlier map writer would acknowledge what the new one has not written."""
     run, _, _ = edge(dies_later)
     run._post(edge_module.ChangesSaved(10**6))
@@ -153,7 +155,7 @@ def raises(error):
 
 
 @pytest.mark.parametrize("error", [np.linalg.LinAlgError("no pose"), ValueError("x"), RecursionError("deep")])
-def test_a_map_that_the_front_cannot_read_is_set_aside(error):
+def test_a_map_that_cannot_be_interpreted_is_set_aside(error):
     said, store = [], Store(raises(error))
     assert MapperRestarts(store, 0.05, said.append).load_map() == (None, [])
     assert store.asides == 1
@@ -161,7 +163,7 @@ def test_a_map_that_the_front_cannot_read_is_set_aside(error):
     assert said == [aside]
 
 
-def test_a_map_that_may_not_be_written_is_no_longer_used():
+def test_a_damaged_read_only_map_is_no_longer_used():
     said = []
     restarts = MapperRestarts(Store(raises(ValueError("x")), writable=False), 0.05, said.append)
     assert restarts.load_map() == (None, [])
@@ -169,7 +171,7 @@ def test_a_map_that_may_not_be_written_is_no_longer_used():
     assert said == ["the map file is no longer used: ValueError: x; nothing is saved"]
 
 
-def test_who_speaks_for_a_run_is_not_known_where_no_key_did_before_and_keys_are_used(path):
+def test_runs_without_a_credential_are_unknown_to_an_edge_with_keys(path):
     """Of the map of `small_map`, a key speaks for Ann."""
     for has_keys, bob in ((True, None), (False, "")):
         store = MapStore.read(path)
@@ -178,7 +180,7 @@ def test_who_speaks_for_a_run_is_not_known_where_no_key_did_before_and_keys_are_
         assert voices == {run.key: run.credential for run in known} == {ANN: "key of ann", BOB: bob}
 
 
-def test_a_disk_that_fails_is_not_the_maps_fault():
+def test_a_failing_disk_does_not_set_the_map_aside():
     store = Store(raises(StoreError("the map cannot be read: disk I/O error")))
     with pytest.raises(StoreError):
         MapperRestarts(store, 0.05, print).load_map()
@@ -205,7 +207,8 @@ def counts(inbox, answer, settings):
     os._exit(3)
 
 
-def test_what_was_counted_before_a_mapper_died_still_counts(edge):
+@pytest.mark.long
+def test_counters_continue_after_a_mapper_died(edge):
     run, _, told = edge(counts)
     for dead in range(1, 4):
         step_until(run, lambda dead=dead: len(events(told, "mapper died")) >= dead)
@@ -214,7 +217,7 @@ def test_what_was_counted_before_a_mapper_died_still_counts(edge):
         assert run.report()["place_ms"]["n"] == 7 * dead
 
 
-def test_a_tracker_that_dies_is_its_agents_trouble(monkeypatch):
+def test_a_dead_tracker_is_trouble_of_its_agent(monkeypatch):
     """Not the edge's: whoever could end one by its frames would have /health say 503."""
     settings = Config(edge=EdgeConfig(policy="streamed"))
     run = EdgeRun(settings, Link(), None, lambda fields: None)
@@ -229,7 +232,7 @@ def test_a_tracker_that_dies_is_its_agents_trouble(monkeypatch):
         run.run()
 
 
-def test_a_report_that_fails_costs_itself_and_is_shown_to_be_old(edge, monkeypatch):
+def test_a_failed_report_is_shown_as_stale(edge, monkeypatch):
     run, _, told = edge(dies_later)
     step_until(run, run.report)
     report = run._state_machine.report

@@ -1,4 +1,4 @@
-"""What else a report may hold."""
+"""Optional sections of a report."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_models_of_the_error(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"name": "x"}]', '[{"name": "x", "more": 1}]'])
-def test_scores_that_are_damaged_are_named(tmp_path, text):
+def test_damaged_scores_are_reported(tmp_path, text):
     file = tmp_path / "scores.json"
     file.write_text(text)
     with pytest.raises(DataError, match=r"\.json: not a file of `share train compare --json`, or damaged"):

@@ -1,4 +1,4 @@
-"""In which order sessions are played, and what is not played again."""
+"""The order in which sessions are played, and which earlier runs are used."""
 
 import json
 from pathlib import Path
@@ -35,19 +35,19 @@ def test_policies_take_turns_at_being_first():
     }
 
 
-def test_two_sessions_of_one_name_would_share_their_runs():
+def test_two_sessions_of_one_name_are_refused():
     with pytest.raises(UsageError, match="two sessions have the name room"):
         plan_policies([session("x/room"), session("y/room")], ("share",), [0], TERMS, Path("out"))
 
 
-def test_a_policy_that_is_named_twice_is_played_once():
+def test_a_policy_named_twice_is_played_once():
     assert len(plan_policies([session("a")], ("share", "share"), [0], TERMS, Path("out"))) == 1
 
 
 @pytest.mark.parametrize(
     ("workers", "sizes"), [(1, [4, 4]), (2, [4, 4]), (3, [2, 2, 2, 2]), (7, [1] * 8), (50, [1] * 8)]
 )
-def test_nobody_stands_idle_while_a_session_has_runs(workers, sizes):
+def test_no_worker_is_idle_while_a_session_has_runs(workers, sizes):
     runs = plan_policies([session("b"), session("a")], ("share", "covins-g"), [0, 1], TERMS, Path("out"))
     jobs = split_jobs(runs, workers)
     assert [len(job) for job in jobs] == sizes
@@ -79,19 +79,19 @@ def done(tmp_path) -> PlannedRun:
     return one
 
 
-def test_what_a_dead_worker_had_done_of_its_job_is_taken(done):
+def test_finished_runs_of_a_dead_worker_are_used(done):
     (came,) = play_job([done])
     assert came.folder == done.out
 
 
-def test_a_run_of_a_session_that_was_made_anew_is_not_taken(done):
+def test_runs_of_an_older_session_are_not_used(done):
     path = done.session.folder / "session.yaml"
     path.write_text(path.read_text().replace("seed: 3", "seed: 4"))
     with pytest.raises(UsageError, match="room was generated again since, with another truth; play it"):
         list(run_all([done], lambda number, now: None))
 
 
-def test_a_run_of_before_a_setting_was_there_is_taken(done):
+def test_runs_without_a_new_setting_are_used(done):
     one = done
     settings = yaml.safe_load(settings_yaml(Config(), 0))
     del settings["agent"]["error_model"]
@@ -107,7 +107,7 @@ def test_a_run_of_before_a_setting_was_there_is_taken(done):
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", "{", json.dumps({"policy": "share"})])
-def test_a_damaged_record_is_said(tmp_path, text):
+def test_a_damaged_record_is_reported(tmp_path, text):
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(Exception, match=r"run\.json: is damaged"):
         read_trial(tmp_path)

@@ -1,4 +1,4 @@
-"""An IMU that gives nothing any more is said once, by `share track` as by agents."""
+"""An IMU that falls silent is reported once, by `share track` and by agents."""
 
 from __future__ import annotations
 
@@ -41,22 +41,22 @@ def said_of(source: Source) -> list[str]:
 @pytest.mark.parametrize(
     ("from_s", "to_s", "told"), [(1.0, 9.0, "1.0 s"), (-9.0, 9.0, "0.0 s"), (0.5, 2.0, "0.5 s")]
 )
-def test_an_imu_that_stops_is_said_once(tmp_path: Path, from_s: float, to_s: float, told: str) -> None:
+def test_an_imu_that_stops_is_reported_once(tmp_path: Path, from_s: float, to_s: float, told: str) -> None:
     (line,) = said_of(silenced(tmp_path, from_s, to_s))
     assert line.startswith(f"no IMU samples from {told} on, for at least 1 s; ")
 
 
-def test_a_short_silence_is_not(tmp_path: Path) -> None:
+def test_a_short_silence_is_not_reported(tmp_path: Path) -> None:
     assert said_of(silenced(tmp_path, 1.0, 1.8)) == []
 
 
-def test_nor_is_that_of_a_camera_whose_feed_says_it(tmp_path: Path) -> None:
+def test_silence_of_a_live_camera_is_left_to_its_feed(tmp_path: Path) -> None:
     source = silenced(tmp_path, 1.0)
     object.__setattr__(source, "reports_silence", True)
     assert said_of(source) == []
 
 
-def test_track_says_it(tmp_path: Path) -> None:
+def test_share_track_reports_it(tmp_path: Path) -> None:
     said: list[str] = []
     run = track(silenced(tmp_path, 1.0), Config(), lambda result: None, said.append)
     assert ["no IMU samples" in line for line in said] == [True]

@@ -29,7 +29,7 @@ def add(run: str, id: int) -> AddKeyframe:
 
 
 @pytest.mark.parametrize("ends", [False, True])
-def test_whoever_sends_many_waits_for_itself(monkeypatch: pytest.MonkeyPatch, ends: bool) -> None:
+def test_an_agent_with_many_keyframes_delays_only_itself(monkeypatch: pytest.MonkeyPatch, ends: bool) -> None:
     """eve by two runs, ann after all of them."""
     monkeypatch.setattr(mapper_process._MapperProcess, "_new_solver", lambda self, after_s: NoSolver())
     order: list[str] = []
@@ -56,7 +56,7 @@ def test_whoever_sends_many_waits_for_itself(monkeypatch: pytest.MonkeyPatch, en
     assert max(k for k, run in enumerate(order) if run == "ann-1") <= 5
 
 
-def test_a_keyframe_that_fails_costs_itself_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_keyframe_costs_itself_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mapper_process._MapperProcess, "_new_solver", lambda self, after_s: NoSolver())
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
     answers: list[Any] = []

@@ -1,4 +1,4 @@
-"""Lines that a run puts down and reads again at its end."""
+"""Lines that a run writes and reads again at its end."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_all_lines_come_back_in_order_while_it_is_open(in_a_folder: bool, tmp_pa
     spool.close()
 
 
-def test_what_has_no_name_leaves_nothing_and_no_handle() -> None:
+def test_a_spool_without_a_name_leaves_no_file_and_no_handle() -> None:
     before = os.listdir("/proc/self/fd")
     there = set(os.listdir("/var/tmp"))
     spool = Spool(None, print)
@@ -38,7 +38,7 @@ def test_what_has_no_name_leaves_nothing_and_no_handle() -> None:
     assert len(os.listdir("/proc/self/fd")) == len(before)
 
 
-def test_a_file_that_was_removed_meanwhile_is_read_all_the_same(tmp_path: Path) -> None:
+def test_a_removed_file_is_still_read(tmp_path: Path) -> None:
     spool = Spool(tmp_path / "x.partial", print)
     spool.write("one")
     (tmp_path / "x.partial").unlink()
@@ -47,7 +47,7 @@ def test_a_file_that_was_removed_meanwhile_is_read_all_the_same(tmp_path: Path) 
     spool.close()
 
 
-def test_a_file_that_was_cut_off_meanwhile_is_said(tmp_path: Path) -> None:
+def test_a_truncated_file_is_reported(tmp_path: Path) -> None:
     spool = Spool(tmp_path / "x.partial", print)
     spool.write("one")
     os.truncate(tmp_path / "x.partial", 2)
@@ -57,7 +57,7 @@ def test_a_file_that_was_cut_off_meanwhile_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_full_disk_is_said_once_and_the_run_goes_on() -> None:
+def test_a_full_disk_is_reported_once() -> None:
     said: list[str] = []
     spool = Spool(Path("/dev/full"), said.append)
     log = RunLog(spool)
@@ -70,7 +70,7 @@ def test_a_full_disk_is_said_once_and_the_run_goes_on() -> None:
     spool.close()
 
 
-def test_a_run_gives_its_latencies_their_name_and_a_killed_one_leaves_them_readable(tmp_path: Path) -> None:
+def test_latencies_stay_readable_after_a_kill(tmp_path: Path) -> None:
     killed = AgentFiles(tmp_path, print)
     RunLog(killed.frame_lines).add(7, 1.5, TrackState.OK, True, True)
     lines = (tmp_path / "latency.csv.partial").read_text().splitlines()

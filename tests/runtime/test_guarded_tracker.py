@@ -1,4 +1,4 @@
-"""No rig and no failure within a tracker ends the process that tracks."""
+"""No rig and no failure within a tracker ends its process; a failed step costs that step."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from helpers import rig_fuzzer
 from helpers.plain_walk import RIG
 
 from share.config import Config, InertialConfig, TrackerConfig
+from share.errors import UsageError
 from share.geometry import rig_check, se3
 from share.geometry.camera import ImuBias, Rig
 from share.odometry import filter
@@ -37,7 +38,7 @@ def played(walk: rig_fuzzer.Walk, tracker: GuardedTracker, fails: dict[int, pyte
             continue
         results.append(tracker.track(frame))
         if results[-1].keyframe_ready:
-            tracker.attempt("a keyframe", frame, lambda frame=frame: rig_fuzzer._keep(tracker, frame))
+            tracker.attempt("a keyframe", frame, lambda frame=frame: rig_fuzzer.make_keyframe(tracker, frame))
     return results
 
 
@@ -45,7 +46,8 @@ def _no_gain(*anything: object, **more: object) -> None:
     raise np.linalg.LinAlgError("innovation covariance is not positive definite")
 
 
-def test_an_update_that_fails_costs_its_frame_and_odometry_finds_itself_again(
+@pytest.mark.long
+def test_a_failed_update_costs_its_frame_and_odometry_relocalises(
     walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
@@ -61,7 +63,7 @@ def test_an_update_that_fails_costs_its_frame_and_odometry_finds_itself_again(
     assert len(said) == 1 and "LinAlgError" in said[0]
 
 
-def test_one_that_fails_twice_begins_anew(walk: rig_fuzzer.Walk) -> None:
+def test_a_tracker_that_fails_twice_is_replaced(walk: rig_fuzzer.Walk) -> None:
     guard = FaultGuard(lambda text: None)
     tracker = GuardedTracker(RIG, Config(), guard)
 
@@ -82,9 +84,7 @@ def test_one_that_fails_twice_begins_anew(walk: rig_fuzzer.Walk) -> None:
     assert tracker.rejected_imu_samples == 7  # by the first
 
 
-def test_what_a_lost_tracker_had_learnt_of_the_bias_is_not_lost(
-    walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bias_outlives_a_replaced_tracker(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
     learnt = ImuBias([0.01, 0.0, 0.0], [0.1, 0.2, 0.3], 1e-3, 1e-2)
     told = iter([None, learnt, None])
     monkeypatch.setattr(InertialTracker, "bias", property(lambda self: next(told)))
@@ -99,14 +99,14 @@ def test_what_a_lost_tracker_had_learnt_of_the_bias_is_not_lost(
     assert biases == [None, learnt, learnt]
 
 
-def test_one_of_cameras_alone_knows_no_bias(walk: rig_fuzzer.Walk) -> None:
+def test_a_visual_tracker_has_no_bias(walk: rig_fuzzer.Walk) -> None:
     tracker = GuardedTracker(RIG.without_imu(), Config(), FaultGuard(lambda text: None))
     assert tracker.track(walk.frames[0]).keyframe_ready
     tracker.finish(walk.frames[0], True)
     assert tracker.bias is None
 
 
-def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_keyframe_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
     guard = FaultGuard(lambda text: None)
     tracker = GuardedTracker(RIG, Config(), guard)
     assert tracker.track(walk.frames[0]).keyframe_ready
@@ -117,7 +117,7 @@ def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("rig", [RIG, RIG.without_imu()], ids=["imu", "cameras"])
-def test_after_a_keyframe_that_failed_the_next_step_is_from_the_last_that_others_have(rig: Rig) -> None:
+def test_after_a_failed_keyframe_the_next_motion_starts_at_the_last_published_one(rig: Rig) -> None:
     often = {"keyframe_m": 1e-4, "keyframe_gap_s": 0.1}
     config = Config(inertial=InertialConfig(**often), tracker=TrackerConfig(**often))
     tracker = GuardedTracker(rig, config, FaultGuard(lambda text: None))
@@ -141,7 +141,7 @@ def test_after_a_keyframe_that_failed_the_next_step_is_from_the_last_that_others
     np.testing.assert_allclose(again.T_previous_body, step, atol=1e-4)
 
 
-def test_giving_up_leaves_nothing_of_a_keyframe_for_the_next_beginning(walk: rig_fuzzer.Walk) -> None:
+def test_a_reset_discards_the_unfinished_keyframe(walk: rig_fuzzer.Walk) -> None:
     tracker, frame = InertialTracker(RIG, Config().inertial, Config().tracker), walk.frames[0]
     tracker.track(frame)
     tracker.make_keyframe(frame)
@@ -158,11 +158,11 @@ def test_no_rig_ends_a_tracker(walk: rig_fuzzer.Walk) -> None:
         assert states["refused"] or sum(n for k, n in states.items() if k.isupper()) == len(walk.frames), what
 
 
-def test_the_rig_of_the_walk_is_tracked_without_a_failure(walk: rig_fuzzer.Walk) -> None:
+def test_the_unchanged_rig_is_tracked_without_a_failure(walk: rig_fuzzer.Walk) -> None:
     assert rig_fuzzer.play(RIG, walk) == {"OK": len(walk.frames)}
 
 
-def test_the_fuzzer_makes_rigs_that_are_refused_for_many_reasons_and_such_that_are_not() -> None:
+def test_the_fuzzer_makes_accepted_and_refused_rigs() -> None:
     told = [rig_check.rig_problem(rig) for _, rig in rig_fuzzer.rigs(200, seed=1)]
     count = sum(why is not None for why in told)
     assert 60 < count < 190
@@ -179,3 +179,31 @@ def test_many_rigs_over_two_seconds() -> None:
         if n == 50:
             held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - held < 200_000  # kB
+
+
+def test_a_failure_is_counted_and_reported_once_with_its_place() -> None:
+    said: list[str] = []
+    guard = FaultGuard(said.append)
+    for _ in range(3):
+        with guard.step("handling Received"):
+            raise ZeroDivisionError("by \x1b zero")
+    assert guard.failure_count == 3
+    [line] = said
+    assert line.startswith("handling Received: ZeroDivisionError at test_guarded_tracker.py:")
+    assert line.endswith("by ? zero; this step is skipped and the run goes on")
+
+
+def test_a_share_error_passes() -> None:
+    guard = FaultGuard(lambda text: None)
+    with pytest.raises(UsageError), guard.step("handling Received"):
+        raise UsageError("the name is taken")
+    assert guard.failure_count == 0
+
+
+def test_reported_failures_are_bounded() -> None:
+    said: list[str] = []
+    guard = FaultGuard(said.append)
+    for k in range(100):
+        with guard.step(f"step {k}"):
+            raise ValueError
+    assert (guard.failure_count, len(said)) == (100, 16)

@@ -1,4 +1,4 @@
-"""What ends a live run in good order, and what does not."""
+"""Which signals end a live run cleanly."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def counted() -> tuple[list[int], Callable[[], None]]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_the_first_signal_asks_for_the_end(number: signal.Signals) -> None:
+def test_the_first_signal_calls_stop(number: signal.Signals) -> None:
     calls, stop = counted()
     with stop_on_signal(stop):
         signal.raise_signal(number)
@@ -34,7 +34,7 @@ def test_the_first_signal_asks_for_the_end(number: signal.Signals) -> None:
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == [signal.SIG_DFL] * 2
 
 
-def test_a_terminal_that_goes_away_twice_ends_in_good_order_too() -> None:
+def test_a_second_hangup_is_ignored() -> None:
     calls, stop = counted()
     with stop_on_signal(stop):
         for _ in range(3):
@@ -43,13 +43,13 @@ def test_a_terminal_that_goes_away_twice_ends_in_good_order_too() -> None:
     assert calls == [1]
 
 
-def test_where_nobody_asks_for_the_end_all_is_as_before() -> None:
+def test_handlers_are_restored_after_the_block() -> None:
     with stop_on_signal(counted()[1]):
         pass
     assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
 
 
-def test_under_nohup_it_goes_on() -> None:
+def test_an_ignored_hangup_stays_ignored() -> None:
     calls, stop = counted()
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with stop_on_signal(stop):

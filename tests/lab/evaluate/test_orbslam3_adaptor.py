@@ -1,4 +1,4 @@
-"""What ORB-SLAM3's adaptor tells it, without ORB-SLAM3: settings as OpenCV reads them, and IMU samples."""
+"""The input of ORB-SLAM3's adaptor, without ORB-SLAM3: settings as OpenCV reads them, IMU samples."""
 
 from __future__ import annotations
 

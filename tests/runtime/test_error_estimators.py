@@ -1,4 +1,4 @@
-"""How an agent knows how wrong its tracker is: the error model beside it never holds it up, nor ends it."""
+"""The error model of an agent never delays or ends it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def until(reached, limit_s: float = 5.0) -> None:
         time.sleep(0.002)
 
 
-def test_what_was_said_last_holds():
+def test_an_estimate_holds_until_the_next():
     network, said = Network(), []
     network.may.set()
     errors = BackgroundErrorModel(network, said.append)
@@ -77,7 +77,7 @@ def test_what_was_said_last_holds():
     assert (told["dropped_estimates"], told["unfamiliar"], said) == (0, 0, [])
 
 
-def test_times_are_remembered_of_the_newest_estimates_only(monkeypatch):
+def test_timings_cover_the_newest_estimates(monkeypatch):
     monkeypatch.setattr("share.runtime.error_estimators._MAX_TIMINGS", 3)
     network = Network()
     network.may.set()
@@ -89,7 +89,7 @@ def test_times_are_remembered_of_the_newest_estimates_only(monkeypatch):
     assert errors.report()["error_model"]["estimate_ms"]["n"] == 3
 
 
-def test_who_is_busy_leaves_the_older_out():
+def test_a_busy_model_drops_the_older_keyframe():
     network = Network()
     errors = BackgroundErrorModel(network, lambda text: None)
     began = time.monotonic()
@@ -105,7 +105,7 @@ def test_who_is_busy_leaves_the_older_out():
     assert errors.report()["error_model"]["dropped_estimates"] == 2
 
 
-def test_a_network_that_fails_is_left_alone_and_said_so():
+def test_a_failing_network_is_switched_off_and_reported():
     network, said = Network(), []
     network.may.set()
     errors = BackgroundErrorModel(network, said.append)
@@ -119,7 +119,7 @@ def test_a_network_that_fails_is_left_alone_and_said_so():
     errors.close()
 
 
-def test_in_virtual_time_it_has_answered_at_once():
+def test_in_virtual_time_an_estimate_is_immediate():
     network = Network()
     network.may.set()
     errors = SynchronousErrorModel(network)
@@ -129,7 +129,7 @@ def test_in_virtual_time_it_has_answered_at_once():
     assert errors.update(frame(1), LOST) is None
 
 
-def test_a_keyframe_that_is_told_late_is_judged_by_its_own_picture():
+def test_a_keyframe_made_late_is_estimated_by_its_own_image():
     class Late(Tracker):
         def make_keyframe(self, frame):
             return replace(CANDIDATE, frames_ago=2)

@@ -1,4 +1,4 @@
-"""What goes to a peer in another interpreter and comes back, and what is said of one that is not there."""
+"""What a peer tracker in another interpreter receives and returns, and errors of one that is missing."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def command(tmp_path, most=1000):
     return [sys.executable, str(script), str(tmp_path / "seen.npy"), str(most)]
 
 
-def test_peer_sees_what_was_recorded(source, tmp_path):
+def test_a_peer_receives_the_recorded_data(source, tmp_path):
     run_peer(source, command(tmp_path))
     seen = np.load(tmp_path / "seen.npy", allow_pickle=True).item()
     frames = list(read_frames(source, Config(), SequencerCounters()))
@@ -71,14 +71,14 @@ def test_samples_go_just_past_their_frame(source):
         assert moment.imu_ns[-2] <= moment.stamp_ns < moment.imu_ns[-1]
 
 
-def test_frames_that_no_sample_comes_after_are_not_shown(source):
+def test_frames_without_a_later_sample_are_not_sent(source):
     stamps, values = source.imu
     last = source.stamps()["cam0"][-1]
     object.__setattr__(source, "imu", (stamps[stamps <= last], values[stamps <= last]))
     assert [m.stamp_ns for m in peer_frames(source)] == source.stamps()["cam0"][:-1].tolist()
 
 
-def test_peer_is_told_the_calibration(source, tmp_path):
+def test_a_peer_receives_the_calibration(source, tmp_path):
     run_peer(source, command(tmp_path))
     told = np.load(tmp_path / "seen.npy", allow_pickle=True).item()["calibration"]
     left, right = told["cameras"]
@@ -98,7 +98,7 @@ def test_a_fisheye_lens_is_refused_in_one_line(source):
         rig_calibration(source)
 
 
-def test_answers_come_back(source, tmp_path):
+def test_poses_of_a_peer_are_returned(source, tmp_path):
     run = run_peer(source, command(tmp_path))
     first = next(peer_frames(source))
     assert run.stamps == source.stamps()["cam0"].tolist()
@@ -106,12 +106,12 @@ def test_answers_come_back(source, tmp_path):
     assert run.cpu_ms == pytest.approx(range(2, 26))  # the first frame sets up
 
 
-def test_peer_that_stops_is_an_error(source, tmp_path):
+def test_a_peer_that_ends_early_is_an_error(source, tmp_path):
     with pytest.raises(DataError, match="frame 3"):
         run_peer(source, command(tmp_path, most=3))
 
 
-def test_peer_that_loses_itself_has_no_pose_then_and_may_mend_its_past(source, tmp_path):
+def test_a_lost_peer_has_no_pose_and_may_correct_earlier_ones(source, tmp_path):
     lost = PEER.replace(
         "T_world_body=T.tolist()", "T_world_body=None if len(seen['moments']) < 5 else T.tolist()"
     )
@@ -125,13 +125,13 @@ def test_peer_that_loses_itself_has_no_pose_then_and_may_mend_its_past(source, t
     assert run.final.T.shape == (2, 4, 4)
 
 
-def test_what_else_a_peer_says_is_kept(source, tmp_path):
+def test_other_output_of_a_peer_is_kept(source, tmp_path):
     with pytest.raises(DataError, match=r"frame 3; see .*peer\.log"):
         run_peer(source, command(tmp_path, most=3), tmp_path / "peer.log")
     assert "chatter that is no answer" in (tmp_path / "peer.log").read_text()
 
 
-def test_ours_is_what_track_tells(source):
+def test_our_result_is_that_of_share_track(source):
     from share.runtime.offline_tracking import track
 
     run, told = run_share(source, Config()), track(source, Config(), lambda done: None)
@@ -140,7 +140,7 @@ def test_ours_is_what_track_tells(source):
     assert len(run.cpu_ms) == 24
 
 
-def test_cameras_that_look_alike_need_not_be_turned(source):
+def test_similar_cameras_need_not_be_turned(source):
     assert np.allclose(rig_calibration(source)["R_rectified_cam0"], np.eye(3), atol=1e-6)
 
 

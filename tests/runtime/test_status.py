@@ -1,4 +1,4 @@
-"""What `share edge --http` serves, asked over real sockets."""
+"""Responses of `share edge --http`, over real sockets."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def real_report():
 # ---------------------------------------------------------------- what is served
 
 
-def test_health_says_who_is_there():
+def test_health_lists_present_agents():
     with serving(lambda: {**REPORT, "waiting": 3, "last_solve_s": 0.5}) as server:
         status, headers, body = get(server, "/health")
     assert (status, headers["Content-Type"]) == (200, "application/json")
@@ -116,7 +116,7 @@ def test_health_says_who_is_there():
     assert health == expected
 
 
-def test_what_a_peer_says_wrong_is_in_health_and_does_not_make_it_503():
+def test_a_peers_bad_messages_do_not_make_the_edge_unhealthy():
     """Whoever restarts an edge because of that would do the attacker's work."""
     edge = Edge(Config(), session=5)
     for k in range(100):
@@ -135,7 +135,7 @@ def test_what_a_peer_says_wrong_is_in_health_and_does_not_make_it_503():
     assert not any(value for (name, _), value in samples.items() if name == "share_edge_troubles")
 
 
-def test_health_is_503_where_something_is_wrong():
+def test_trouble_makes_health_503():
     trouble = ["the map file cannot be written"]
     with serving(lambda: {**REPORT, "trouble": trouble}) as server:
         status, _, body = get(server, "/health")
@@ -177,14 +177,14 @@ def test_metrics_are_read_back():
         assert read[name, frozenset(labels)] == pytest.approx(value), name
 
 
-def test_what_the_report_lacks_is_left_out():
+def test_metrics_that_the_report_lacks_are_omitted():
     odd = {"agents": {"ann": {"keyframes": "many"}, "bob": None}, "maps": 3, "loops": None, "x_ms": {"n": 0}}
     for report in ({}, odd):
         body, _ = status_metrics.render_metrics(report)
         assert all(value == value for value in metrics(body).values())
 
 
-def test_all_that_an_edge_reports_is_in_a_metric():
+def test_every_metric_has_a_value_in_a_real_report():
     body, _ = status_metrics.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": []})
     names = {name for name, _ in metrics(body)}
     absent = {row.name for row in status_metrics.METRICS} - names
@@ -244,7 +244,7 @@ def test_the_page_shows_the_consistency_of_agents():
 # ---------------------------------------------------------------- what goes wrong
 
 
-def test_a_report_that_raises_is_500_and_said_once():
+def test_a_failed_report_is_500_and_reported_once():
     told = []
 
     def report():
@@ -279,7 +279,7 @@ def test_it_recovers():
         assert get(server, "/health")[0] == 200
 
 
-def test_the_edge_is_not_asked_for_each_of_many():
+def test_responses_are_cached():
     asked = []
     with serving(lambda: asked.append(1) or REPORT) as server:
         began = time.monotonic()
@@ -303,7 +303,7 @@ def test_head_has_no_body():
 
 
 @pytest.mark.parametrize("path", ["/nothing", "/../etc/passwd", "/health/", "//", "*", "/%2e%2e/"])
-def test_there_is_nothing_else(path):
+def test_other_paths_are_404(path):
     with serving() as server:
         assert get(server, path)[0] == 404
 
@@ -320,7 +320,7 @@ def test_a_large_request_is_refused():
     "request_",
     [b"hello\r\n\r\n", b"GET /\r\n\r\n", b"\r\n\r\n", b"GET / HTTP/3\n\n", b"\x16\x03\x01\n\n\xff"],
 )
-def test_what_is_no_http_is_refused(request_):
+def test_malformed_requests_are_refused(request_):
     with serving() as server:
         assert said(server, request_).startswith(b"HTTP/1.1 400 ")
 
@@ -335,7 +335,8 @@ def test_a_request_may_come_in_pieces():
             assert client.recv(15) == b"HTTP/1.1 200 OK"
 
 
-def test_slow_clients_hold_nobody_up(monkeypatch):
+@pytest.mark.long
+def test_slow_clients_delay_no_other(monkeypatch):
     monkeypatch.setattr(web, "CLIENT_TIMEOUT_S", 0.5)
     with serving() as server:
         host, _, port = server.endpoint.rpartition(":")
@@ -358,7 +359,8 @@ def test_slow_clients_hold_nobody_up(monkeypatch):
             client.close()
 
 
-def test_who_does_not_take_the_answer_is_dropped(monkeypatch):
+@pytest.mark.long
+def test_a_client_that_does_not_read_is_dropped(monkeypatch):
     monkeypatch.setattr(web, "CLIENT_TIMEOUT_S", 0.5)
     with serving(lambda: {"x": "y" * 20_000_000, "agents": {}}) as server:
         host, _, port = server.endpoint.rpartition(":")
@@ -378,7 +380,7 @@ def test_who_does_not_take_the_answer_is_dropped(monkeypatch):
 # ---------------------------------------------------------------- where it listens
 
 
-def test_a_port_alone_is_of_this_machine_alone():
+def test_a_port_alone_is_served_on_loopback():
     with serving(address="0") as server:
         assert server.endpoint.startswith("127.0.0.1:") and get(server, "/health")[0] == 200
 
@@ -390,22 +392,22 @@ def test_ipv6_and_localhost():
 
 
 @pytest.mark.parametrize("address", ["", "host", ":8080", "127.0.0.1:70000", "http://127.0.0.1:80", "a b:1"])
-def test_what_is_no_address(address):
+def test_malformed_addresses_are_refused(address):
     with pytest.raises(UsageError, match="expected HOST:PORT"):
         StatusServer(address, lambda: REPORT)
 
 
-def test_a_port_in_use_is_said():
+def test_a_port_in_use_is_reported():
     with serving() as server, pytest.raises(TransportError, match="port is in use"):
         StatusServer(server.endpoint, lambda: REPORT)
 
 
-def test_an_address_of_nobody_is_said():
+def test_an_address_of_another_machine_is_reported():
     with pytest.raises(TransportError, match="this machine has no such address"):
         StatusServer("192.0.2.1:0", lambda: REPORT)
 
 
-def test_a_page_from_elsewhere_cannot_ask_this_machine():
+def test_dns_rebinding_is_refused():
     with serving() as server:
         assert get(server, "/health", headers={"Host": "evil.example:80"})[0] == 403
         for host in ("localhost", "LocalHost:80", "127.0.0.1:1", "[::1]:80"):
@@ -486,10 +488,11 @@ def noise(address):
         client.recv(65536)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "attack", [connect_and_go, connect_and_stay, byte_by_byte, endless_body, pipelined, noise]
 )
-def test_whatever_clients_do_the_server_takes_little_and_goes_on(attack):
+def test_attacks_take_little_and_end_nothing(attack):
     with serving() as server:
         (web_thread,) = [thread for thread in threading.enumerate() if thread.name == "web"]
         clock = time.pthread_getcpuclockid(web_thread.ident)
@@ -510,7 +513,7 @@ def resident_bytes():
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
-def test_an_answer_that_fails_costs_one_connection():
+def test_a_failed_handler_costs_one_connection():
     def fails(path):
         raise RuntimeError(path)
 
@@ -522,7 +525,7 @@ def test_an_answer_that_fails_costs_one_connection():
         server.close()
 
 
-def test_closed_it_is_gone_and_its_port_free():
+def test_close_ends_the_thread_and_frees_the_port():
     with serving() as server:
         endpoint = server.endpoint
         get(server, "/health")

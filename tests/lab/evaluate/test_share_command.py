@@ -6,7 +6,7 @@ from share import __version__
 from share.lab.evaluate.real_time import share_command
 
 
-def test_a_folder_called_share_where_one_stands_is_not_taken_for_the_program(tmp_path):
+def test_a_folder_named_share_in_the_working_directory_is_ignored(tmp_path):
     (tmp_path / "share").mkdir()
     told = subprocess.run(
         share_command("--version"), cwd=tmp_path, capture_output=True, text=True, timeout=30

@@ -54,7 +54,7 @@ def question(address: str, port: int) -> Datagram:
     return Datagram(QUESTION, (address, port), NOW)
 
 
-def test_an_address_that_cannot_be_answered_costs_others_nothing_and_is_said_once() -> None:
+def test_an_unreachable_client_is_reported_once_and_delays_no_other() -> None:
     forged = [question("192.0.2.9", 0)] * 5
     sent, said = serve(*forged, question("192.0.2.1", 4000), *forged, question("192.0.2.2", 4000))
     assert [to for _, to in sent] == [("192.0.2.1", 4000), ("192.0.2.2", 4000)]
@@ -66,14 +66,14 @@ def test_an_address_that_cannot_be_answered_costs_others_nothing_and_is_said_onc
     ]
 
 
-def test_a_socket_that_fails_for_a_while_is_asked_again() -> None:
+def test_a_socket_that_fails_for_a_while_is_retried() -> None:
     failing = [OSError(105, "No buffer space available")] * 2
     sent, said = serve(*failing, question("192.0.2.1", 4000))
     assert len(sent) == 1
     assert said == ["cannot receive: No buffer space available", "new client: 192.0.2.1"]
 
 
-def test_an_answer_says_when_it_was_sent() -> None:
+def test_a_reply_carries_its_transmit_time() -> None:
     before = time.time_ns()
     sent, _ = serve(question("192.0.2.1", 4000))
     answer = NtpPacket.decode(sent[0][0])

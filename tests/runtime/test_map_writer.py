@@ -1,4 +1,4 @@
-"""What is not in the map's file is not acknowledged, however the disk fails; what waits is bounded."""
+"""Only changes in the map file are acknowledged, however the disk fails; pending ones are bounded."""
 
 import threading
 import time
@@ -11,7 +11,7 @@ from share.errors import StoreError
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import RemoveLoops, SavePoses
 from share.protocol.edge_events import ChangesSaved, SaveChanges
-from share.runtime import map_writer as keeper_module
+from share.runtime import map_writer
 from share.runtime.map_writer import MapWriter, newest_poses_only
 
 FULL = "/room.sqlite: the map cannot be written: No space left on device"
@@ -50,13 +50,13 @@ class Disk:
 
 
 @pytest.fixture
-def kept(monkeypatch):
-    monkeypatch.setattr(keeper_module, "_RETRY_S", 0.02)
-    disk, tickets, said = Disk(), [], []
-    keeper = MapWriter(disk, lambda done: tickets.append(done), said.append)
-    yield keeper, disk, tickets, said
+def opened(monkeypatch):
+    monkeypatch.setattr(map_writer, "_RETRY_S", 0.02)
+    disk, tickets, messages = Disk(), [], []
+    writer = MapWriter(disk, lambda done: tickets.append(done), messages.append)
+    yield writer, disk, tickets, messages
     disk.go_on.set()
-    keeper.close()
+    writer.close()
 
 
 def until(condition):
@@ -66,76 +66,76 @@ def until(condition):
         time.sleep(0.005)
 
 
-def test_what_is_written_is_kept(kept):
-    keeper, disk, tickets, said = kept
+def test_written_changes_are_acknowledged(opened):
+    writer, disk, tickets, messages = opened
     for n in range(200):
-        keeper.submit(SaveChanges(n, (change(n),)))
+        writer.submit(SaveChanges(n, (change(n),)))
     until(lambda: tickets and tickets[-1] == ChangesSaved(199))
     assert disk.rows == [change(n) for n in range(200)]
-    assert (said, keeper.trouble) == ([], None)
+    assert (messages, writer.trouble) == ([], None)
 
 
 @pytest.mark.parametrize("reason", [FULL, FULL.replace("No space left on device", "disk I/O error")])
-def test_what_is_not_on_the_disk_is_not_kept(kept, reason):
-    keeper, disk, tickets, said = kept
-    keeper.submit(SaveChanges(0, (change(0),)))
+def test_unwritten_changes_are_not_acknowledged(opened, reason):
+    writer, disk, tickets, messages = opened
+    writer.submit(SaveChanges(0, (change(0),)))
     until(lambda: tickets == [ChangesSaved(0)])
     disk.error = StoreError(reason)
     for n in range(1, 40):
-        keeper.submit(SaveChanges(n, (change(n),)))
+        writer.submit(SaveChanges(n, (change(n),)))
     tries = disk.tries
     until(lambda: disk.tries > tries + 5)
     assert tickets == [ChangesSaved(0)]
     assert disk.rows == [change(0)]
-    assert said == [f"{reason}; keyframes are not acknowledged until a write succeeds"]
-    assert keeper.trouble == f"{reason}; keyframes are not acknowledged"
+    assert messages == [f"{reason}; keyframes are not acknowledged until a write succeeds"]
+    assert writer.trouble == f"{reason}; keyframes are not acknowledged"
     disk.error = None
     until(lambda: tickets[-1] == ChangesSaved(39))
     assert disk.rows == [change(n) for n in range(40)]  # in order, each once
-    assert said[1:] == ["the map is saved again"]
-    assert keeper.trouble is None
+    assert messages[1:] == ["the map is saved again"]
+    assert writer.trouble is None
 
 
-def test_another_reason_is_said(kept):
-    keeper, disk, _, said = kept
+def test_another_reason_is_reported(opened):
+    writer, disk, _, messages = opened
     for reason in ("full", "broken"):
         disk.error = StoreError(reason)
-        keeper.submit(SaveChanges(0, (change(0),)))
-        until(lambda reason=reason: said and said[-1].startswith(reason))
-    assert len(said) == 2
+        writer.submit(SaveChanges(0, (change(0),)))
+        until(lambda reason=reason: messages and messages[-1].startswith(reason))
+    assert len(messages) == 2
 
 
-def test_a_disk_that_does_not_answer_is_said(kept, monkeypatch):
-    keeper, disk, tickets, _ = kept
-    monkeypatch.setattr(keeper_module, "_SLOW_WRITE_S", 0.05)
+def test_a_disk_that_does_not_answer_is_reported(opened, monkeypatch):
+    writer, disk, tickets, _ = opened
+    monkeypatch.setattr(map_writer, "_SLOW_WRITE_S", 0.05)
     disk.go_on.clear()
-    keeper.submit(SaveChanges(0, (change(0),)))
-    until(lambda: keeper.trouble is not None)
-    assert "has taken" in keeper.trouble
-    assert "not acknowledged" in keeper.trouble
+    writer.submit(SaveChanges(0, (change(0),)))
+    until(lambda: writer.trouble is not None)
+    assert "has taken" in writer.trouble
+    assert "not acknowledged" in writer.trouble
     assert not tickets
     disk.go_on.set()
     until(lambda: tickets == [ChangesSaved(0)])
-    assert keeper.trouble is None
+    assert writer.trouble is None
 
 
-def test_a_change_that_cannot_be_kept_costs_itself(kept):
-    keeper, disk, tickets, said = kept
+def test_a_faulty_change_is_skipped(opened):
+    writer, disk, tickets, messages = opened
     disk.go_on.clear()
     for n in range(5):
-        keeper.submit(SaveChanges(n, (change(n) if n != 2 else "poison",)))
+        writer.submit(SaveChanges(n, (change(n) if n != 2 else "poison",)))
     disk.go_on.set()
     until(lambda: tickets and tickets[-1] == ChangesSaved(4))
     assert disk.rows == [change(n) for n in (0, 1, 3, 4)]
-    assert said == ["a change cannot be saved and is skipped: OverflowError: int too large"]
+    assert messages == ["a change cannot be saved and is skipped: OverflowError: int too large"]
 
 
-def test_solutions_do_not_pile_up(kept):
-    keeper, disk, tickets, _ = kept
+def test_of_pending_solutions_only_the_newest_is_kept(opened):
+    writer, disk, tickets, _ = opened
     disk.error = StoreError(FULL)
     for n in range(500):
-        keeper.submit(SaveChanges(n, (poses(n),)))
-    until(lambda: disk.tries > 3 and keeper.pending_changes == 1)
+        writer.submit(SaveChanges(n, (poses(n),)))
+    until(lambda: disk.tries > 3 and writer.pending_changes == 1)
     disk.error = None
     until(lambda: tickets and tickets[-1] == ChangesSaved(499))
     assert [p.keys[0].id for p in disk.rows] == [499]
@@ -154,27 +154,27 @@ def test_the_newest_solution_stays_in_its_place():
     assert [keep.changes for keep in out] == [(change(0),), held[1].changes, (change(2),)]
 
 
-def test_what_is_left_at_the_end_is_said(kept):
-    keeper, disk, tickets, said = kept
+def test_unsaved_changes_are_reported_at_the_end(opened):
+    writer, disk, tickets, messages = opened
     disk.error = StoreError(FULL)
-    keeper.submit(SaveChanges(0, (change(0), change(1))))
-    assert keeper.close() == f"{FULL}: 2 changes are not in the map file"
+    writer.submit(SaveChanges(0, (change(0), change(1))))
+    assert writer.close() == f"{FULL}: 2 changes are not in the map file"
     assert disk.closed
     assert not tickets
-    assert said[-1] == "2 changes are not in the map file; none of their keyframes was acknowledged"
+    assert messages[-1] == "2 changes are not in the map file; none of their keyframes was acknowledged"
 
 
-def test_who_ends_does_not_wait_for_a_disk_that_does_not_answer(kept, monkeypatch):
-    keeper, disk, tickets, _ = kept
-    monkeypatch.setattr(keeper_module, "_TIMEOUT_S", 0.05)
+def test_close_does_not_wait_for_a_disk_that_does_not_answer(opened, monkeypatch):
+    writer, disk, tickets, _ = opened
+    monkeypatch.setattr(map_writer, "_TIMEOUT_S", 0.05)
     disk.go_on.clear()
-    keeper.submit(SaveChanges(0, (change(0),)))
+    writer.submit(SaveChanges(0, (change(0),)))
     until(lambda: disk.tries)
-    assert not keeper.drain(0.05)
-    assert "the disk of the map file does not answer" in keeper.close()
+    assert not writer.drain(0.05)
+    assert "the disk of the map file does not answer" in writer.close()
     assert disk.abandoned
     assert not disk.closed  # which would wait for the write
     assert not tickets
     disk.go_on.set()
     until(lambda: tickets == [ChangesSaved(0)])  # it was written after all
-    assert keeper.drain(1.0)
+    assert writer.drain(1.0)

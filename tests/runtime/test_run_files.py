@@ -1,4 +1,4 @@
-"""In which map an agent's poses are, and who is scored together."""
+"""The files of an agent's run, and which agents are scored together."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from share.recordings.trajectory import Trajectory, format_tum, read_tum
 from share.runtime.run_files import AgentFiles
 
 
-def test_a_map_that_comes_after_the_last_pose_is_not_that_of_the_file(tmp_path):
+def test_a_map_after_the_last_pose_is_not_that_of_the_file(tmp_path):
     files = AgentFiles(tmp_path, print)
     files.write_odom_pose(1, np.eye(4))
     files.write_map_pose(1, np.eye(4), "ann-1/0")
@@ -36,7 +36,7 @@ def test_an_edge_that_moves_an_agent_from_map_to_map_does_not_fill_the_folder(tm
     assert read_tum(tmp_path / "map.tum").stamps_ns.tolist() == [299]
 
 
-def test_who_was_told_of_the_join_too_late_is_not_scored_with_the_others(tmp_path):
+def test_agents_are_scored_by_the_map_of_their_file(tmp_path):
     stamps = np.arange(50) * 10**8
     T = np.tile(np.eye(4), (50, 1, 1))
     T[:, 0, 3], T[:, 1, 3] = np.linspace(0, 5, 50), np.sin(np.linspace(0, 5, 50))

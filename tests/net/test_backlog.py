@@ -1,4 +1,4 @@
-"""How much may wait of a connection, and who is kept out for how long: without sockets."""
+"""Limits for waiting data of a connection, and how long peers are blocked; without sockets."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_small_parts_weigh_more_than_their_bytes() -> None:
     assert empty.memory_bytes > 50_000 * PART_OVERHEAD_BYTES * 0.9
 
 
-def test_large_parts_of_before_hide_small_ones_not_for_long() -> None:
+def test_earlier_large_parts_hide_small_ones_only_briefly() -> None:
     account = Backlog(0.0)
     account.deliver(100_000_000, 1000, 100, 0.0)
     assert account.memory_per_byte < 2.0
@@ -60,7 +60,7 @@ def test_heartbeats_do_not_add_up() -> None:
         assert account.waiting_bytes <= 200
 
 
-def test_a_message_that_does_not_end_adds_up_however_slowly_it_comes() -> None:
+def test_an_endless_message_adds_up_at_any_speed() -> None:
     account, read = Backlog(0.0), 0
     for second in range(1000):
         read += 100
@@ -70,7 +70,7 @@ def test_a_message_that_does_not_end_adds_up_however_slowly_it_comes() -> None:
         assert account.waiting_bytes == 100 * (second + 1)
 
 
-def test_half_a_message_behind_each_is_no_way_to_hide_one() -> None:
+def test_partial_messages_do_not_hide_an_endless_one() -> None:
     account, read = Backlog(0.0), 64
     account.update_read(read, True)
     for second in range(100):
@@ -87,7 +87,7 @@ def test_half_a_message_behind_each_is_no_way_to_hide_one() -> None:
     assert account.waiting_bytes >= 10_000
 
 
-def test_what_is_not_known_exactly_changes_no_more_than_it_says() -> None:
+def test_an_inexact_count_is_a_lower_bound() -> None:
     account = Backlog(0.0)
     account.update_read(1000, True)
     account.deliver(100, 1, 1, 1.0)
@@ -95,7 +95,7 @@ def test_what_is_not_known_exactly_changes_no_more_than_it_says() -> None:
     assert account.waiting_bytes == 900
 
 
-def test_kept_out_twice_as_long_each_time() -> None:
+def test_the_blocking_time_doubles() -> None:
     keep, now = Blocklist(), 0.0
     for lasts in (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 600.0, 600.0):
         assert keep.block("bob", now) == lasts
@@ -110,7 +110,7 @@ def test_offences_at_the_same_time_count_once() -> None:
     assert [keep.block("bob", 0.1 * at) for at in range(5)] == [FIRST_BLOCK_S] * 5
 
 
-def test_only_so_many_are_remembered() -> None:
+def test_the_number_of_blocked_peers_is_bounded() -> None:
     keep = Blocklist()
     for number in range(10_000):
         keep.block(str(number), float(number))

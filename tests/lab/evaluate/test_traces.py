@@ -1,4 +1,4 @@
-"""How a run went over time, from files whose content is known."""
+"""A run over time, from files of known content."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def trial(tmp_path):
     )
 
 
-def test_what_an_agent_was_told_over_time(trial):
+def test_corrections_over_time(trial):
     found = traces(trial)
     assert found["ann"].seconds.tolist() == [1.0, 2.0]
     assert np.array_equal(found["ann"].qoe, [0.5, np.nan], equal_nan=True)
@@ -53,13 +53,13 @@ def test_what_an_agent_was_told_over_time(trial):
     assert len(found["bob"].seconds) == 0  # nobody evaluated Bob
 
 
-def test_merges_lie_where_all_had_gone_by_then(trial):
+def test_merges_are_located_by_the_path_of_all_agents(trial):
     assert merge_locations(trial).metres.tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
     assert merge_locations(trial).xy["ann"].tolist() == [[2.0, 0.0], [10.0, 0.0]]
     assert merge_locations(trial).xy["bob"].tolist() == [[2.0, 0.0]]
 
 
-def test_who_began_later_has_gone_less_in_virtual_time_alone(trial):
+def test_start_times_count_in_virtual_time_only(trial):
     bob = trial.session.folder / "truth" / "bob.tum"
     later = read_tum(bob)
     bob.write_text(format_tum(Trajectory(later.stamps_ns + 103 * S, later.T)))
