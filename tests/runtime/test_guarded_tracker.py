@@ -17,6 +17,7 @@ from share.geometry.camera import ImuBias, Rig
 from share.odometry import filter
 from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.track_result import TrackResult
+from share.runtime import guarded_tracker
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
 from share.types import TrackState
 from share.vision import corners
@@ -63,23 +64,29 @@ def test_a_failed_update_costs_its_frame_and_odometry_relocalises(
     assert len(said) == 1 and "LinAlgError" in said[0]
 
 
-def test_a_tracker_that_fails_twice_is_replaced(walk: rig_fuzzer.Walk) -> None:
-    guard = FaultGuard(lambda text: None)
-    tracker = GuardedTracker(RIG, Config(), guard)
-
+def test_a_tracker_that_fails_twice_is_replaced(
+    walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Broken:
+        """Has one pose, then fails, and cannot be reset."""
+
         rejected_imu_samples = 7
 
+        def __init__(self) -> None:
+            self.poses = [np.eye(4)]
+
         def track(self, frame: object) -> TrackResult:
-            raise FloatingPointError
+            return TrackResult(TrackState.OK, self.poses.pop())
 
         def reset_after_failure(self, frame: object) -> None:
             raise ValueError
 
-    tracker._tracker = Broken()  # type: ignore[assignment]
-    tracker._had_pose = True
-    results = [tracker.track(frame) for frame in walk.frames[:4]]
-    assert [result.state for result in results[:1]] == [TrackState.LOST]
+    made = [lambda *arguments: Broken(), guarded_tracker.make_tracker]
+    monkeypatch.setattr(guarded_tracker, "make_tracker", lambda *arguments: made.pop(0)(*arguments))
+    guard = FaultGuard(lambda text: None)
+    tracker = GuardedTracker(RIG, Config(), guard)
+    results = [tracker.track(frame) for frame in walk.frames[:5]]
+    assert [result.state for result in results[:2]] == [TrackState.OK, TrackState.LOST]
     assert results[-1].state is TrackState.OK and guard.failure_count == 2
     assert tracker.rejected_imu_samples == 7  # by the first
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from pathlib import Path
 
@@ -12,9 +13,11 @@ from helpers.map_changes import ANN, BOB, small_map
 
 from share.config import Config, EdgeConfig
 from share.errors import StoreError
-from share.protocol.edge_events import TrackerLost
+from share.protocol.edge import Edge
+from share.protocol.edge_events import ChangesSaved, TrackerLost
 from share.runtime import edge as edge_module
 from share.runtime.edge import EdgeRun
+from share.runtime.map_writer import MapWriter
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
 from share.runtime.mapper_supervision import MapperRestarts
 from share.runtime.worker_process import END
@@ -22,7 +25,7 @@ from share.store.map_store import MapStore
 
 
 class Link:
-    """Nobody is there."""
+    """A link without agents."""
 
     endpoint = "nowhere"
 
@@ -75,67 +78,84 @@ def edge(path, monkeypatch):
         monkeypatch.setattr(
             MapperRestarts, "record_death", lambda self: pauses.append(died(self)) or pauses[-1] / 100
         )
-        pauses, told = [], []
-        run = EdgeRun(Config(), Link(), None, told.append, MapStore.open(path))
-        runs.append(run)
-        return run, pauses, told
+        pauses, events = [], []
+        run = EdgeRun(Config(), Link(), None, events.append, MapStore.open(path))
+        thread = threading.Thread(target=run.run)
+        runs.append((run, thread))
+        thread.start()
+        return run, pauses, events
 
     yield make
-    for run in runs:
+    for run, thread in runs:
         run.stop()
-        run.run()
+        thread.join(30)
+        assert not thread.is_alive()
 
 
-def step_until(run, condition, seconds=30):
+def until(condition, seconds=30):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
-        run._step()
+        time.sleep(0.005)
 
 
-def events(told, name):
-    return [event["reason"] for event in told if event["event"] == name]
+def reasons(events, name):
+    return [event["reason"] for event in events if event["event"] == name]
 
 
 @pytest.mark.long
 def test_a_map_that_mappers_die_of_is_set_aside(edge, path):
     before = path.read_bytes()
-    run, pauses, told = edge(dies_of_a_map)
-    step_until(run, lambda: events(told, "map"))
+    run, pauses, events = edge(dies_of_a_map)
+    until(lambda: reasons(events, "map"))
     assert pauses == [1, 2, 4]
-    assert len(events(told, "mapper died")) == 3
-    assert "its process ended with exit code 3; restarted in" in events(told, "mapper died")[0]
+    assert len(reasons(events, "mapper died")) == 3
+    assert "its process ended with exit code 3; restarted in" in reasons(events, "mapper died")[0]
     reason = "3 mappers in a row have died while restoring it"
     line = f"the map file is renamed to room.sqlite.damaged-1: {reason}; a new one is started"
-    assert events(told, "map") == [line]
+    assert reasons(events, "map") == [line]
     assert path.with_name("room.sqlite.damaged-1").read_bytes() == before
-    step_until(run, lambda: run._restarts._tries == 0 and run._mapper_process.pid is not None)
-    run._update_report()
-    assert any(text.startswith("the mapper: its process ended") for text in run.report()["trouble"])
-    deadline = time.monotonic() + 0.5
-    step_until(run, lambda: time.monotonic() > deadline)
+    until(lambda: any(text.startswith("the mapper: its process ended") for text in run.report()["trouble"]))
+    time.sleep(0.5)
     assert len(pauses) == 3  # the next lives
-    assert run._restarts.writable
+    assert path.exists()  # and has a new map file
     with MapStore.read(path.with_name("room.sqlite.damaged-1")) as old:
         assert len(old.load().keyframes) == 40
 
 
 @pytest.mark.long
 def test_a_mapper_that_dies_of_something_else_keeps_its_map(edge, path):
-    run, pauses, told = edge(dies_later)
-    step_until(run, lambda: len(pauses) == 5)
-    assert pauses == [1, 2, 4, 8, 16]
-    assert not events(told, "map")
+    _, pauses, events = edge(dies_later)
+    until(lambda: len(pauses) >= 5)
+    assert pauses[:5] == [1, 2, 4, 8, 16]
+    assert not reasons(events, "map")
     assert not path.with_name("room.sqlite.damaged-1").exists()
 
 
-def test_answers_to_an_earlier_session_are_discarded(edge):
+def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
     """A ticket of the earlier map writer would acknowledge what the new one has not written."""
-    run, _, _ = edge(dies_later)
-    run._post(edge_module.ChangesSaved(10**6))
-    run._restart_mapping("its process was ended")
-    run._handle_answers()
-    assert run._state_machine._durability._saved_ticket == 0
+    writers, handled = [], []
+    handle = Edge.handle
+
+    class Writer(MapWriter):
+        """Answers each change once more when its session is over."""
+
+        def __init__(self, store, on_saved, notify):
+            super().__init__(store, on_saved, notify)
+            writers.append(self)
+            self._answer = on_saved
+
+        def drain(self, timeout_s):
+            self._answer(ChangesSaved(10**6))
+            return super().drain(timeout_s)
+
+    monkeypatch.setattr(edge_module, "MapWriter", Writer)
+    monkeypatch.setattr(
+        Edge, "handle", lambda self, event, now: handled.append(event) or handle(self, event, now)
+    )
+    edge(dies_later)
+    until(lambda: len(writers) > 2)
+    assert ChangesSaved(10**6) not in handled
 
 
 class Store:
@@ -188,16 +208,14 @@ def test_a_failing_disk_does_not_set_the_map_aside():
 
 
 def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
-    run, _, told = edge(dies_later)
-    found = run._restarts.load_map
-    monkeypatch.setattr(
-        run._restarts, "load_map", raises(StoreError("room: the map cannot be read: disk I/O error"))
-    )
-    run._restart_mapping("its process was ended")
-    assert events(told, "map") == ["room: the map cannot be read: disk I/O error; retried in 0.01 s"]
-    monkeypatch.setattr(run._restarts, "load_map", found)
-    step_until(run, lambda: run._restart_due_s is None)
-    assert run._mapper_process is not None
+    run, _, events = edge(dies_later)
+    unreadable = StoreError("room: the map cannot be read: disk I/O error")
+    with monkeypatch.context() as patch:
+        patch.setattr(MapperRestarts, "load_map", lambda self: raises(unreadable)())
+        until(lambda: len(reasons(events, "map")) > 1)
+    assert reasons(events, "map")[0] == "room: the map cannot be read: disk I/O error; retried in 0.01 s"
+    session = run.report()["session"]
+    until(lambda: run.report()["session"] != session)
 
 
 def counts(inbox, answer, settings):
@@ -209,36 +227,43 @@ def counts(inbox, answer, settings):
 
 @pytest.mark.long
 def test_counters_continue_after_a_mapper_died(edge):
-    run, _, told = edge(counts)
-    for dead in range(1, 4):
-        step_until(run, lambda dead=dead: len(events(told, "mapper died")) >= dead)
-        run._update_report()
-        assert run.report()["loops"] == {"tried": 7 * dead, "accepted": 2 * dead}
-        assert run.report()["place_ms"]["n"] == 7 * dead
+    run, _, events = edge(counts)
+    until(lambda: len(reasons(events, "mapper died")) >= 3)
+    until(lambda: run.report().get("place_ms", {}).get("n", 0) >= 21)
+    tried = run.report()["loops"]["tried"]
+    assert tried % 7 == 0
+    until(lambda: run.report()["loops"]["tried"] > tried)
+    loops = run.report()["loops"]
+    assert 2 * loops["tried"] == 7 * loops["accepted"]
 
 
 def test_a_dead_tracker_is_trouble_of_its_agent(monkeypatch):
-    """Not the edge's: whoever could end one by its frames would have /health say 503."""
-    settings = Config(edge=EdgeConfig(policy="streamed"))
-    run = EdgeRun(settings, Link(), None, lambda fields: None)
+    """Not the edge's: else an agent could make /health 503 by its frames."""
+    made = edge_module.TrackerProcesses
+
+    def with_a_dead_one(settings, on_answer):
+        on_answer(TrackerLost("ann-0001", 0, "was ended by SIGKILL"))
+        return made(settings, on_answer)
+
+    monkeypatch.setattr(edge_module, "TrackerProcesses", with_a_dead_one)
+    run = EdgeRun(Config(edge=EdgeConfig(policy="streamed")), Link(), None, lambda fields: None)
+    thread = threading.Thread(target=run.run)
+    thread.start()
     try:
-        run._inbox.put(TrackerLost("ann-0001", 0, "was ended by SIGKILL"))
-        run._step()
-        run._update_report()
+        until(lambda: run.report().get("refused"))
         assert run.report()["trouble"] == []
         assert run.report()["refused"] == ["agent's run ann-0001: its tracker was ended by SIGKILL"]
     finally:
         run.stop()
-        run.run()
+        thread.join(30)
 
 
 def test_a_failed_report_is_shown_as_stale(edge, monkeypatch):
-    run, _, told = edge(dies_later)
-    step_until(run, run.report)
-    report = run._state_machine.report
-    monkeypatch.setattr(run._state_machine, "report", lambda mapped: report({})["nobody"])
+    run, _, events = edge(dies_later)
+    until(run.report)
     monkeypatch.setattr(edge_module, "_STALE_REPORT_S", 0.2)
-    step_until(run, lambda: any("stuck" in line for line in run.report()["trouble"]))
-    assert [line["event"] for line in told].count("internal error") == 1
-    monkeypatch.setattr(run._state_machine, "report", report)
-    step_until(run, lambda: not any("stuck" in line for line in run.report()["trouble"]))
+    with monkeypatch.context() as patch:
+        patch.setattr(Edge, "report", lambda self, mapper: {}["none"])
+        until(lambda: any("stuck" in line for line in run.report()["trouble"]))
+        assert [line["event"] for line in events].count("internal error") == 1
+    until(lambda: not any("stuck" in line for line in run.report()["trouble"]))
