@@ -95,7 +95,6 @@ def agent(
     from share.runtime.agent import AgentRun
     from share.runtime.pose_feed import PoseFeed
     from share.runtime.signals import stop_on_signal
-    from share.runtime.streaming_agent import StreamingAgentRun
     from share.wire.messages import Hello
 
     if streamed and true_error:
@@ -112,7 +111,7 @@ def agent(
     errors = None if streamed else _error_estimator(opened, settings, true_error, live_line.print_line)
     feed = None if poses is None else PoseFeed(poses, hello.name)
     folder = None if out is None else Path(out)
-    run = (StreamingAgentRun if streamed else AgentRun)(
+    run = AgentRun(
         opened,
         hello,
         settings,
@@ -205,7 +204,7 @@ def _true_error(source: Source) -> ErrorEstimator:
 
 def _emulated_link(connect_edge: Callable[[], AgentLink], name: str, seed: int) -> Callable[[], AgentLink]:
     """Return `connect_edge` with an emulated network around its link. Raises UsageError, ConfigError."""
-    from share.net.emulated_link import EmulatedLink, load_network
+    from share.lab.evaluate.emulated_network import EmulatedLink, load_network
 
     link_network = load_network(name)
     return lambda: EmulatedLink(connect_edge(), link_network, seed)
@@ -252,10 +251,10 @@ def _summary(run: AgentRun) -> str:
         lines += [f"{r['untracked']} more frames without an answer of the edge, {traffic}"]
     else:
         lines += [_keyframes_text(r, traffic)]
-    if r["drop_late"]:
-        lines.append(f"{r['drop_late']} more frames dropped to keep up")
-    if r["frames_late"]:
-        lines.append(f"{r['frames_late']} poses were late, by up to {r['latest_s']:.1f} s")
+    if r["dropped_late"]:
+        lines.append(f"{r['dropped_late']} more frames dropped to keep up")
+    if r["late_frames"]:
+        lines.append(f"{r['late_frames']} poses were late, by up to {r['max_late_s']:.1f} s")
     if p95 is not None:
         lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (p95 {p95:.1f} ms)")
     if r["clock"]["uncertainty_ms"] is not None:

@@ -158,6 +158,6 @@ def camera_summary(report: dict[str, Any]) -> list[str]:
     lines = [
         f"camera: {', '.join([*counts, *filter(None, [camera_events(camera_report)])])} (docs/do/record.md)"
     ]
-    if (known := report.get("imu_bias", {}).get("from")) is not None:
+    if (known := report.get("imu_bias", {}).get("learnt_at")) is not None:
         lines.append(f"imu bias: from the run of {known}")
     return lines

@@ -112,4 +112,4 @@ def _summary(report: dict[str, Any]) -> str:
             f"{report['foreign']} samples have stamps of the host's clock, not the camera's: "
             "see docs/do/record.md"
         )
-    return "\n".join([*lines, f"{report['out']} ({report['ended']})"])
+    return "\n".join([*lines, f"{report['out']} ({report['end_reason']})"])

@@ -80,8 +80,8 @@ def demo(
     from share.files.writing import writable_dir
     from share.lab.emulate.demo import AGENTS, meeting_seed, recipe
     from share.lab.emulate.session import make_cached_session
+    from share.lab.evaluate.emulated_network import LinkAssignment
     from share.lab.evaluate.real_time import RunOptions, play_in_real_time, score_session
-    from share.net.emulated_link import LinkAssignment
     from share.recordings.session import read_session
     from share.runtime.machine import core_count
 

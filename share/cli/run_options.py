@@ -52,7 +52,7 @@ def load_run_config(
 
     Raises ConfigError, UsageError.
     """
-    from share.net.emulated_link import LinkAssignment
+    from share.lab.evaluate.emulated_network import LinkAssignment
 
     config, links = options.load_config(config_file), LinkAssignment.parse(options_given["link"])
     for session in sessions:

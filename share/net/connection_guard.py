@@ -28,8 +28,7 @@ import zmq
 
 from share.net import tcp
 from share.net.backlog import Backlog, BacklogLimits
-from share.net.connection import Connection
-from share.net.connection_gate import Blocklist, ConnectionGate
+from share.net.connection_gate import Blocklist, Connection, ConnectionGate
 
 MAX_CONNECTIONS = 128  # at a time
 MAX_UNIDENTIFIED = 32  # of these, without a first message
@@ -113,7 +112,7 @@ class ConnectionGuard:
         if time.monotonic() >= due_s and self._check_lock.acquire(blocking=False):
             try:
                 self._next_check_s = min(self._next_check_s, time.monotonic())
-                self._try_to_check()
+                self._check_if_due()
             finally:
                 self._check_lock.release()
 
@@ -164,26 +163,23 @@ class ConnectionGuard:
         while not self._is_stopped:
             self._event_poller.poll(wait_ms)
             with self._check_lock:
-                self._try_to_check()
+                self._check_if_due()
                 left_s = max(0.0, self._next_check_s - time.monotonic())
                 wait_ms = math.ceil(1e3 * left_s) if self._connections else None
         self._event_socket.close(linger=0)
 
-    def _try_to_check(self) -> None:
-        """Check if due. A failure costs this check, not the guard or the receiver."""
+    def _check_if_due(self) -> None:
+        """Handle events, and check if due. A failure costs this check, not the guard or the receiver."""
         try:
-            self._check_if_due()
+            self._is_stopped = self._is_stopped or not self._handle_events()
+            if not self._is_stopped and time.monotonic() >= self._next_check_s:
+                self._next_check_s = time.monotonic() + _CHECK_MS * 1e-3
+                wait_ms = self._check(time.monotonic())
+                self._unchecked_messages, self._last_check_s = 0, time.monotonic()
+                self._next_check_s = self._last_check_s + wait_ms * 1e-3
         except Exception as error:
             self._next_check_s = time.monotonic() + _CHECK_MS * 1e-3
             self._reports.append(f"the guard of connections failed and goes on: {error!r}")
-
-    def _check_if_due(self) -> None:
-        self._is_stopped = self._is_stopped or not self._handle_events()
-        if not self._is_stopped and time.monotonic() >= self._next_check_s:
-            self._next_check_s = time.monotonic() + _CHECK_MS * 1e-3
-            wait_ms = self._check(time.monotonic())
-            self._unchecked_messages, self._last_check_s = 0, time.monotonic()
-            self._next_check_s = self._last_check_s + wait_ms * 1e-3
 
     def _handle_events(self) -> bool:
         """Handle all waiting monitor events. Return False once the monitor has stopped."""
@@ -242,9 +238,7 @@ class ConnectionGuard:
         unidentified = [connection for connection in live if connection.is_unidentified]
         if unidentified and (len(unidentified) > MAX_UNIDENTIFIED or len(live) > MAX_CONNECTIONS):
             address = Counter(connection.address for connection in unidentified).most_common(1)[0][0]
-            self._abort(
-                random.choice([connection for connection in unidentified if connection.address == address])
-            )
+            self._abort(random.choice([c for c in unidentified if c.address == address]))
             self._reports.append(f"{address}: too many open connections")
 
     def _live_connections(self) -> list[Connection]:
@@ -262,16 +256,19 @@ class ConnectionGuard:
         while self._admissions:
             self._assign_key(*self._admissions.popleft())
         self._record_deliveries(now_s)
-        self._update_backlogs()
+        for connection in list(self._connections.values()):
+            if not connection.update_backlog():
+                self._remove(connection.descriptor)
         while self._offences:
-            self._apply_offence(*self._offences.popleft())
+            offender, reason = self._offences.popleft()
+            found = self._connections.get(offender) if isinstance(offender, int) else offender
+            if found is not None and found.is_unambiguous:
+                self._disconnect(found, reason, now_s, block=True)
         if empty_s > self._marked_s or self._messages_since_mark >= _ROUND_MESSAGES:
             self._check_quiet_connections(empty_s, now_s)
         self._enforce_limits(now_s)
         self._gate.record_empty(empty_s)
-        waiting_bytes = sum(
-            max(0, connection.backlog.waiting_bytes) for connection in self._live_connections()
-        )
+        waiting_bytes = sum(max(0, c.backlog.waiting_bytes) for c in self._live_connections())
         if waiting_bytes > self._limits.message_bytes:
             self._check_memory_growth(waiting_bytes, now_s)
         self._release_waiting(now_s)
@@ -283,11 +280,10 @@ class ConnectionGuard:
 
     def _check_memory_growth(self, waiting_bytes: int, now_s: float) -> None:
         """Disconnect a peer that hides small parts behind large ones, by the growth of this process."""
-        explained = (
-            self._resident_bytes + self._delivered_bytes + self._discarded_memory_bytes() + waiting_bytes
-        )
-        if (grown := tcp.resident_bytes() - explained) > MAX_GROWTH_BYTES:
-            self._disconnect_and_block(self._heaviest(now_s), "many small parts", now_s)
+        explained = self._resident_bytes + self._delivered_bytes + waiting_bytes
+        grown = tcp.resident_bytes() - explained - self._discarded_memory_bytes()
+        if grown > MAX_GROWTH_BYTES:
+            self._disconnect(self._heaviest(now_s), "many small parts", now_s, block=True)
             self._orphaned_bytes += grown  # explained now: no further peer is blamed for it
 
     def _discarded_memory_bytes(self) -> float:
@@ -324,11 +320,6 @@ class ConnectionGuard:
         if len(unidentified) == 1:
             unidentified[0].key = key
 
-    def _update_backlogs(self) -> None:
-        for connection in list(self._connections.values()):
-            if not connection.update_backlog():
-                self._remove(connection.descriptor)
-
     def _check_quiet_connections(self, empty_s: float, now_s: float) -> None:
         """Check connections without a delivery since the mark, or all if the socket was empty since: no
         complete message of them waits."""
@@ -339,7 +330,7 @@ class ConnectionGuard:
                 connection.is_unambiguous |= self._closed_s.get(connection.descriptor, -1.0) < empty_s
             if is_empty or backlog.is_quiet():
                 if backlog.marked_bytes > self._limits.message_bytes:
-                    self._disconnect_and_block(connection, "an endless message", now_s)
+                    self._disconnect(connection, "an endless message", now_s, block=True)
                 elif not connection.is_held and now_s - backlog.last_message_s > (
                     _IDENTIFY_TIMEOUT_S if connection.is_unidentified else SILENCE_TIMEOUT_S
                 ):
@@ -369,9 +360,9 @@ class ConnectionGuard:
 
     def _disconnect_overloaded(self, connection: Connection, reason: str, now_s: float) -> None:
         if connection.backlog.has_small_parts:
-            self._disconnect_and_block(connection, "many small parts", now_s)
+            self._disconnect(connection, "many small parts", now_s, block=True)
         else:
-            self._disconnect(connection, reason)
+            self._disconnect(connection, reason, now_s)
 
     def _heaviest(self, now_s: float) -> Connection:
         """Return the live connection with the largest product of waiting memory and time since its
@@ -381,26 +372,16 @@ class ConnectionGuard:
             key=lambda c: c.backlog.memory_bytes * (now_s - c.backlog.last_message_s + 0.1),
         )
 
-    def _apply_offence(self, offender: Connection | int, reason: str) -> None:
-        connection = self._connections.get(offender) if isinstance(offender, int) else offender
-        if connection is not None and connection.is_unambiguous:
-            self._disconnect_and_block(connection, reason, time.monotonic())
-
-    def _disconnect(self, connection: Connection, reason: str) -> None:
-        """Disconnect a peer with too much data waiting. This happens to honest agents if the edge is very
-        busy: it may reconnect at once."""
-        self._abort_and_discard(connection)
-        self._reports.append(f"{connection.key or connection.address}: {reason}; disconnected")
-
-    def _abort_and_discard(self, connection: Connection) -> None:
-        self._abort(connection)
-        self._gate.record_abort(connection.descriptor, time.monotonic())
-
-    def _disconnect_and_block(self, connection: Connection, reason: str, now_s: float) -> None:
-        """Disconnect a peer that sends what no agent does, and block it for a while."""
+    def _disconnect(self, connection: Connection, reason: str, now_s: float, block: bool = False) -> None:
+        """Abort a connection and discard its data. block: its peer sends what no agent does, and stays out
+        for a while; else it may be an honest agent of a very busy edge, and may reconnect at once."""
         if connection.is_aborted:
             return
-        self._abort_and_discard(connection)
+        self._abort(connection)
+        self._gate.record_abort(connection.descriptor, time.monotonic())
+        if not block:
+            self._reports.append(f"{connection.key or connection.address}: {reason}; disconnected")
+            return
         target = connection.block_target(self._agent_addresses)
         self._reports.append(f"{connection.name}: {reason}; disconnected{' and blocked' if target else ''}")
         if target is not None:

@@ -84,15 +84,13 @@ class AllowList:
         _check_not_world_writable(self.path, status)
         state = (status.st_mtime_ns, status.st_ino, status.st_size)
         if state != self._cached[0]:
-            self._cached = state, self._parse()
+            lines = _read_lines(self.path)
+            self._cached = state, {line.key: line.grant for line in lines if line.grant is not None}
         return self._cached[1]
 
     def is_allowed(self, public: str) -> bool:
         """Return whether that key may connect; False while the file is unreadable."""
-        try:
-            return public in self.grants()
-        except UsageError:
-            return False
+        return bool(self.agents_for(public))
 
     def trouble(self) -> str | None:
         """Return why no key may connect; None if the file is readable."""
@@ -101,9 +99,6 @@ class AllowList:
         except UsageError as error:
             return str(error)
         return None
-
-    def _parse(self) -> dict[str, Grant]:
-        return {line.key: Grant(line.name, line.agents) for line in _read_lines(self.path) if line.key}
 
 
 class Grant(NamedTuple):
@@ -114,12 +109,11 @@ class Grant(NamedTuple):
 
 
 class _ListLine(NamedTuple):
-    """A line of the list, with its newline. name and key are empty for a comment."""
+    """A line of the list, with its newline. grant: None for a comment."""
 
     text: str
-    name: str = ""
     key: str = ""
-    agents: tuple[str, ...] = ()
+    grant: Grant | None = None
 
 
 def default_folder() -> Path:
@@ -181,13 +175,12 @@ def public_key(key_or_path: str) -> str:
     if re.fullmatch(_Z85, key_or_path) and _is_key(key_or_path):
         return key_or_path
     if key_or_path.startswith("share-"):
-        return _parse_public_line(key_or_path, "the given key")[1]
-    path = Path(key_or_path)
-    if not _is_file(path):
+        return _parse_line(key_or_path, "the given key")[0]
+    if not os.path.isfile(key_or_path):
         raise UsageError(
             f"'{key_or_path:.60}': neither a file nor a public key (40 characters, in single quotes)"
         )
-    return _parse_public_line(_read_text(path).strip(), key_or_path)[1]
+    return _parse_line(_read_text(Path(key_or_path)), key_or_path)[0]
 
 
 def allow_list(folder: Path) -> AllowList:
@@ -219,9 +212,9 @@ def revoke(folder: Path, name: str) -> None:
         raise UsageError(f"'{name}' is not authorized; the list is empty")
     with _locked(folder):
         lines = _read_lines(folder / _LIST_FILE)
-        keys = {line.key for line in lines if line.key and line.name == name}
+        keys = {line.key for line in lines if line.grant is not None and line.grant.name == name}
         if not keys:
-            others = ", ".join(dict.fromkeys(line.name for line in lines if line.key))
+            others = ", ".join(dict.fromkeys(line.grant.name for line in lines if line.grant is not None))
             names = f"authorized are: {others}" if others else "the list is empty"
             raise UsageError(f"'{name}' is not authorized; {names}")
         _write_list(folder, [line for line in lines if line.key not in keys])  # also under other names
@@ -244,22 +237,14 @@ def edge_keys(folder: Path | None) -> EdgeKeys:
 # ---------------------------------------------------------------- files
 
 
-def _parse_public_line(line: str, where: str) -> tuple[str, str]:
-    """Return the name and key of a line. Raises UsageError."""
+def _parse_line(line: str, where: str) -> tuple[str, Grant]:
+    """Return the key of a line and what it grants. Raises UsageError."""
     match = _LINE.fullmatch(line.strip())
     if match and match[1] == "secret":
         raise UsageError(f"{where}: is a secret key, which must stay on its machine; give the public key")
     if not match or not _is_key(match[3]):
         raise UsageError(f"{where}: is not `share-public-key NAME KEY`")
-    return match[2], match[3]
-
-
-def _parse_grant_line(line: str, where: str) -> tuple[str, str, tuple[str, ...]]:
-    """Return the name, key and agents of a line of the list. Raises UsageError."""
-    name, key = _parse_public_line(line, where)
-    match = _LINE.fullmatch(line.strip())
-    assert match is not None
-    return name, key, tuple(match[4].split()) or (name,)
+    return match[3], Grant(match[2], tuple(match[4].split()) or (match[2],))
 
 
 def _format_line(name: str, public: str, agents: Sequence[str] = ()) -> str:
@@ -315,23 +300,15 @@ def _read_lines(path: Path) -> list[_ListLine]:
         return []
     lines = []
     for number, text in enumerate(_read_text(path).splitlines(), 1):
-        comment = not text.strip() or text.startswith("#")
-        lines.append(
-            _ListLine(text + "\n", *(() if comment else _parse_grant_line(text, f"{path}, line {number}")))
-        )
+        is_comment = not text.strip() or text.startswith("#")
+        parsed = () if is_comment else _parse_line(text, f"{path}, line {number}")
+        lines.append(_ListLine(text + "\n", *parsed))
     return lines
 
 
 def _write_list(folder: Path, lines: Iterable[_ListLine]) -> None:
     """Write the list; comments stay in place."""
     atomic_write(folder / _LIST_FILE, "".join(line.text for line in lines))
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # too long for a file name
-        return False
 
 
 def _check_not_world_writable(path: Path, status: os.stat_result) -> None:

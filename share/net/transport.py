@@ -155,7 +155,7 @@ def check_keys(target: Address, keys: AgentKeys | EdgeKeys | None) -> Address:
 
 def connect(address: str, run_id: int, keys: AgentKeys | None = None) -> AgentLink:
     """Return a link to the edge at `address`, which need not run yet. Raises UsageError."""
-    from share.net.zeromq import ZmqAgentLink
+    from share.net.zeromq_agent import ZmqAgentLink
 
     return ZmqAgentLink(address, run_id, keys)
 
@@ -166,6 +166,6 @@ def bind(address: str, keys: EdgeKeys | None = None, max_frame_bytes: int = MAX_
 
     Raises UsageError, or TransportError if the port is in use.
     """
-    from share.net.zeromq import ZmqEdgeLink
+    from share.net.zeromq_edge import ZmqEdgeLink
 
     return ZmqEdgeLink(address, keys, max_frame_bytes)

@@ -1,6 +1,6 @@
 """The agent process: three threads and two bounded queues around the state machine `share.protocol.agent`.
 
-    reader: decode, wait until the frame is due -> tracker: pose, then keyframe
+    reader: decode, wait until the frame is due -> tracker: pose, then keyframe (`frame_consumers`)
         -> main: state machine, link, files
 
 A live camera has no reader thread: the tracker takes the newest frame (`share.runtime.arrivals`).
@@ -29,12 +29,10 @@ from share.cameras.live import LiveSource
 from share.errors import DataError
 from share.metrics.frame_log import RunLog
 from share.net.transport import AgentLink
-from share.odometry.track_result import TrackResult
 from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
 from share.protocol.reply_validation import FaultDeduplicator
-from share.runtime.agent_files import AgentFiles
 from share.runtime.arrivals import (
     FrameArrivals,
     LateFrameDropper,
@@ -43,11 +41,12 @@ from share.runtime.arrivals import (
     RecordedArrivals,
 )
 from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
-from share.runtime.imu_bias_store import ImuBiasStore
-from share.runtime.output_writer import BackgroundLines, OutputWriter
+from share.runtime.frame_consumers import FrameConsumer, LocalTracking, RemoteTracking
+from share.runtime.guarded_tracker import FaultGuard
+from share.runtime.output_writer import OutputWriter
 from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.pose_feed import PoseFeed
+from share.runtime.run_files import AgentFiles, BackgroundLines
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
 from share.startup import HeapTrimmer
@@ -106,19 +105,21 @@ class AgentRun:
         self._notify, self._show, self._verbose = notify, show, verbose
         self._guard = FaultGuard(notify)
         self._state_machine = Agent(hello, settings)
-        self._imu_bias_store: ImuBiasStore | None = None  # None where the edge tracks
-        self._prepare()
+        check_trackable(source.name, source.rig)  # before files are made and the edge sees this agent
+        self._shared = _Shared()
         self._files, self._output_writer = AgentFiles(out, notify), OutputWriter(out, notify)
         self._log = RunLog(BackgroundLines(self._files.frame_lines, self._output_writer))
-        self._error_estimator = NoErrorEstimate() if error_estimator is None else error_estimator
+        estimator = NoErrorEstimate() if error_estimator is None else error_estimator
+        self._consumer: FrameConsumer = (
+            RemoteTracking(source, settings, self._log, self._shared.stop, notify)
+            if hello.streams_frames
+            else LocalTracking(source, settings, self._guard, estimator, self._log, notify)
+        )
         self._pose_feed = pose_feed
         self._late_dropper = LateFrameDropper(settings.agent.late_ms)
-        self._lateness_monitor = LatenessMonitor(
-            notify, "the edge" if hello.streams_frames else "this machine"
-        )
+        self._lateness_monitor = LatenessMonitor(notify, self._consumer.bottleneck)
         self._counters = SequencerCounters()
         self._link = connect()  # last: any error above is raised before the edge sees this agent
-        self._shared = _Shared()
         self._arrivals = self._make_arrivals()
         self._damaged_images = 0
         self._ended = False
@@ -128,14 +129,6 @@ class AgentRun:
         self.report: dict[str, Any] = {}
         self._troubles = FaultDeduplicator()
         self.trouble: str | None = None  # why the edge refuses this agent
-
-    def _prepare(self) -> None:
-        """Make the tracker. Raises UsageError where no tracker fits the source, before a link exists."""
-        check_trackable(self._source.name, self._source.rig)
-        self._imu_bias_store = ImuBiasStore(self._source, self._settings.inertial, self._notify)
-        self._tracker = GuardedTracker(
-            self._source.rig, self._settings, self._guard, self._imu_bias_store.bias
-        )
 
     def stop(self) -> None:
         """End early and cleanly: read no more frames, but wait for outstanding acknowledgements."""
@@ -159,9 +152,7 @@ class AgentRun:
             if self._pose_feed is not None:
                 self._pose_feed.close()
             tracker.join(timeout=4)
-            if self._imu_bias_store is not None:
-                self._output_writer.submit(partial(self._imu_bias_store.save, self._tracker.bias))
-            self._error_estimator.close()
+            self._consumer.close(self._output_writer.submit)
             self._output_writer.stop()
         self._output_writer.check()
         if self._shared.error is not None:
@@ -192,46 +183,13 @@ class AgentRun:
 
     def _track(self) -> None:
         try:
+            self._consumer.start()
             for frame, arrived_ns in self._arrivals.iter_frames():
-                self._track_frame(frame, arrived_ns)
+                self._consumer.consume(frame, arrived_ns, self._post)
         except BaseException as error:
             self._shared.error = error
         finally:
             self._post(ev.InputFinished())
-
-    def _track_frame(self, frame: Frame, arrived_ns: int) -> None:
-        cpu_start_s = time.thread_time()
-        result = self._tracker.track(frame)
-        tracked = ev.FrameTracked(
-            index=frame.index,
-            stamp_ns=frame.stamp_ns,
-            arrived_ns=arrived_ns,
-            done_ns=time.monotonic_ns(),
-            state=result.state,
-            T_odom_body=result.T_odom_body,
-            is_keyframe=result.keyframe_ready,
-            new_segment=result.new_segment,
-            error_cm=self._estimate_error_cm(frame, result),
-            waiting_for=result.waiting_for,
-        )
-        self._post(tracked)  # before keyframe work: the pose must not wait for it
-        self._log.add_result(result.new_segment, result.is_consistent, result.waiting_for)
-        if result.keyframe_ready:
-            self._make_keyframe(frame, tracked)
-        self._tracker.attempt("finishing a keyframe", frame, self._tracker.finish_keyframe)
-        self._log.imu_outliers = self._tracker.rejected_imu_samples
-        self._log.cpu_s += time.thread_time() - cpu_start_s
-
-    def _estimate_error_cm(self, frame: Frame, result: TrackResult) -> float | None:
-        error_cm: float | None = None
-        with self._guard.step("estimating the error"):
-            error_cm = self._error_estimator.update(frame, result)
-        return error_cm
-
-    def _make_keyframe(self, frame: Frame, tracked: ev.FrameTracked) -> None:
-        make_candidate = partial(self._error_estimator.make_keyframe, frame, self._tracker)
-        candidate = self._tracker.attempt("making a keyframe", frame, make_candidate)
-        self._post(ev.KeyframeMade(tracked, candidate))
 
     def _post(self, event: ev.AgentEvent) -> None:
         """Put `event` into the inbox; wait while it is full, unless it is no longer read."""
@@ -246,13 +204,14 @@ class AgentRun:
     # ------------------------------------------------------------------ main
 
     def _loop(self) -> None:
-        heap = HeapTrimmer()
+        heap, cpu_start_s = HeapTrimmer(), time.thread_time()
         while not self._ended and not self._is_overdue():
             heap.trim_if_due(time.monotonic())
             self._receive()
             while not self._shared.inbox.empty():
                 self._handle_posted(self._shared.inbox.get())
             self._handle(self._arrivals.tick())
+        self._consumer.loop_ended(time.thread_time() - cpu_start_s)
 
     def _receive(self) -> None:
         """Handle one message from the edge; return early for a posted event or at the end of the tick."""
@@ -293,15 +252,18 @@ class AgentRun:
         except Exception as error:
             self._guard.record(f"handling {type(event).__name__}", error)
             effects = self._state_machine.pending_effects()
+        self._consumer.event_handled(event, self._state_machine.is_connected)
         for effect in effects:
             with self._guard.step(f"executing {type(effect).__name__}"):
                 self._execute(effect)
 
     def _execute(self, effect: ev.AgentEffect) -> None:
         match effect:
-            case ev.SendToEdge():
+            case ev.SendToEdge() | ev.SendFrameToEdge():
                 if not self._link.send(effect.frames):
                     self._handle(ev.SendFailed(effect))
+            case ev.FrameTrackedRemotely():
+                self._log.add_result(effect.frame.new_segment, effect.is_consistent, effect.waiting_for)
             case ev.LocalisedPose():
                 self._publish_pose(effect)
             case ev.FrameDone():
@@ -372,12 +334,11 @@ class AgentRun:
             "bytes_down": protocol["bytes_down"],
             "damaged_images": self._damaged_images,
             "failed_steps": self._guard.failure_count,
-            "left_out": self._source.losses.counts,
-            "drop_late": self._late_dropper.dropped,
+            "skipped": self._source.losses.counts,
+            "dropped_late": self._late_dropper.dropped,
             **self._lateness_monitor.report(),
             **self._source.report(),
-            **({} if self._imu_bias_store is None else self._imu_bias_store.report()),
-            **self._error_estimator.report(),
+            **self._consumer.report(protocol),
             "sequencer": dataclasses.asdict(self._counters),
             "clock": self._state_machine.clock_estimate(time.monotonic_ns()).report(),
             "protocol": protocol,

@@ -182,4 +182,4 @@ class LatenessMonitor:
             )
 
     def report(self) -> dict[str, Any]:
-        return {"frames_late": self._late_frames, "latest_s": round(self._max_late_s, 3)}
+        return {"late_frames": self._late_frames, "max_late_s": round(self._max_late_s, 3)}

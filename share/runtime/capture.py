@@ -81,7 +81,7 @@ class Capture:
         self._record(recorder, seconds)
         if self._error is not None:
             raise self._error
-        return {"out": str(self._out), "ended": self.end_reason, **self._feed.report()}
+        return {"out": str(self._out), "end_reason": self.end_reason, **self._feed.report()}
 
     def _record(self, recorder: Recorder, seconds: float | None) -> None:
         """Record until the end. The file is then complete, or stays as `.part` after an error."""

@@ -9,13 +9,11 @@ link -> TrackingEdge -> a process per agent (share.runtime.tracker_processes) ->
 
 from __future__ import annotations
 
-import json
-import os
 import queue
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,8 +21,6 @@ from typing import Any
 
 from share.config import Config
 from share.errors import StoreError
-from share.files.line_file import LineFile
-from share.files.writing import atomic_write, check_replaceable, lock_folder
 from share.mapping.map_changes import StoredMap
 from share.net.transport import EdgeLink
 from share.protocol.edge import Edge
@@ -56,8 +52,8 @@ from share.protocol.remote_tracking import TrackingEdge
 from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.map_writer import MapWriter
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap, SolverDied, run_mapper
-from share.runtime.mapper_restarts import MapperRestarts
-from share.runtime.output_writer import OutputWriter
+from share.runtime.mapper_supervision import MapperProgress, MapperRestarts
+from share.runtime.run_files import EdgeFiles
 from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
 from share.runtime.worker_process import WorkerProcess
 from share.scheduling.policies import POLICIES
@@ -69,8 +65,6 @@ _REPORT_S = 0.1  # period of reports
 _TROUBLE_SHOWN_S = 10.0  # how long the death of a process is shown as trouble
 MAX_REFUSAL_KINDS = 64  # kinds of refused handshakes that are logged; more are only counted
 _MAX_MESSAGES_PER_STEP = 64  # received before answers, ticks and reports get their turn
-_MAPPER_SILENT_S = 5.0  # without a report of the mapper, which comes every second, it is stuck
-_MAX_SOLVE_S = 15.0  # for one solution; longer means the solver is stuck
 _STALE_REPORT_S = 1.0  # age from which a report is declared stale
 _DRAIN_S = 0.5  # that the loop waits for the map writer of a session that is over
 
@@ -88,6 +82,21 @@ class _MapperDied:
     """The mapper's process has died."""
 
     reason: str
+
+
+class _RecentTroubles:
+    """Lines that are shown as trouble for a while."""
+
+    def __init__(self) -> None:
+        self._until_s: dict[str, float] = {}  # monotonic
+
+    def add(self, text: str, duration_s: float = _TROUBLE_SHOWN_S) -> None:
+        self._until_s[text] = time.monotonic() + duration_s
+
+    def current(self) -> list[str]:
+        now_s = time.monotonic()
+        self._until_s = {text: until_s for text, until_s in self._until_s.items() if now_s < until_s}
+        return list(self._until_s)
 
 
 class EdgeRun:
@@ -109,22 +118,13 @@ class EdgeRun:
         self._restart_due_s: float | None = None  # when a session that waits for the disk starts
         self._restart_reason = ""
         self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
-        self._out = out
-        self._lock_handle: int | None = None
-        self._event_log: LineFile | None = None
-        self._output_writer: OutputWriter | None = None
-        if out is not None:
-            check_replaceable(out / "edge.json")
-            check_replaceable(out / "events.jsonl")
-            self._lock_handle = lock_folder(out)
-            self._event_log = LineFile(out / "events.jsonl", self._post_write_failure)
-            self._output_writer = OutputWriter(out, self._post_write_failure)
+        self._files = EdgeFiles(out, self._post_write_failure)
         self._stopping = self._closed = False
         self._incomplete_reason: str | None = None  # why the map file is incomplete at the end
         self._start_ns = time.monotonic_ns()
         self._refused_handshakes: Counter[str] = Counter()  # by refusal line
-        self._troubles_until: dict[str, float] = {}  # text -> monotonic time until which it is shown, s
-        self._agent_troubles_until: dict[str, float] = {}  # the same, for trouble of one agent
+        self._troubles = _RecentTroubles()
+        self._agent_troubles = _RecentTroubles()  # of one agent, not of the edge
         self._report: dict[str, Any] = {}
         self._report_due_s = self._reported_s = 0.0  # next and last report, monotonic s
         self._heap = HeapTrimmer()
@@ -147,7 +147,9 @@ class EdgeRun:
             self.close()
             self._try_to_report()
             self._report["series"] = self._state_machine.series()
-            self._write_report(self._report)
+            self._files.finish(self._report)
+            self._discard_answers()
+            self._files.check()
         if self._incomplete_reason is not None:
             raise StoreError(self._incomplete_reason)
         return self._report
@@ -188,34 +190,18 @@ class EdgeRun:
         now = time.monotonic()
         self._report_due_s = now + _REPORT_S
         self._heap.trim_if_due(now)
-        disk_troubles = [
-            writer.trouble for writer in (self._map_writer, self._output_writer) if writer is not None
-        ]
-        current_troubles = [*disk_troubles, self._find_stall(now), self._link.trouble()]
-        self._troubles_until = {text: until for text, until in self._troubles_until.items() if now < until}
-        self._agent_troubles_until = {
-            text: until for text, until in self._agent_troubles_until.items() if now < until
-        }
-        report = self._totals.with_totals(self._state_machine.report(self._mapper_report))
+        map_trouble = None if self._map_writer is None else self._map_writer.trouble
+        current = (map_trouble, self._files.trouble, self._progress.stall(), self._link.trouble())
+        report = self._totals.with_totals(self._state_machine.report(self._progress.report))
         self._report = {
             **report,
-            "refused": [*self._agent_troubles_until, *report["refused"]],
+            "refused": [*self._agent_troubles.current(), *report["refused"]],
             "refused_handshakes": self._refused_handshakes.total(),
-            "trouble": [*self._troubles_until, *(text for text in current_troubles if text is not None)],
+            "trouble": [*self._troubles.current(), *filter(None, current)],
             "uptime_s": round((time.monotonic_ns() - self._start_ns) * 1e-9, 3),
-            **({} if self._solved_s is None else {"last_solve_s": round(now - self._solved_s, 3)}),
+            **self._progress.last_solve(),
         }
         self._reported_s = now
-
-    def _find_stall(self, now: float) -> str | None:
-        """Return which live process makes no progress, None if all do."""
-        if self._mapper_process is None or self._mapper_report_s is None:
-            return None
-        if (silent_s := now - self._mapper_report_s) > _MAPPER_SILENT_S:
-            return f"the mapper has not answered for {silent_s:.0f} s: no corrections meanwhile"
-        if (solving_s := self._solving_s + silent_s) > _MAX_SOLVE_S:
-            return f"the solver has worked on one solution for {solving_s:.0f} s: no corrections meanwhile"
-        return None
 
     def _load_stored_map(self) -> tuple[StoredMap | None, list[RestoredRun]]:
         """Return the map and the agents' runs to start with. Raises StoreError if the map file is
@@ -231,10 +217,7 @@ class EdgeRun:
 
         start_delay_s: delay of the mapper's start.
         """
-        self._mapper_report: dict[str, Any] = {}
-        self._solved_s: float | None = None
-        self._mapper_report_s: float | None = None  # time of the mapper's last report
-        self._solving_s = 0.0  # duration of the current solve at that time
+        self._progress = MapperProgress()
         self._mapper_process: WorkerProcess | None = None
         self._map_writer: MapWriter | None = None
         self._trackers = TrackerProcesses(self._settings, self._post)
@@ -259,24 +242,6 @@ class EdgeRun:
             self._mapper_process.send(RestoreMap(stored_map))
         if store is not None and writable:
             self._map_writer = MapWriter(store, self._post, self._post_map_notice)
-
-    def _write_report(self, report: dict[str, Any]) -> None:
-        if (
-            self._out is None
-            or self._event_log is None
-            or self._lock_handle is None
-            or self._output_writer is None
-        ):
-            return
-        self._output_writer.submit(self._event_log.close)
-        self._output_writer.submit(
-            partial(atomic_write, self._out / "edge.json", json.dumps(report, indent=2) + "\n")
-        )
-        self._output_writer.stop()
-        self._discard_answers()
-        self._output_writer.check()
-        os.close(self._lock_handle)
-        self._event_log.check()
 
     # ------------------------------------------------------------------ the loop
 
@@ -305,20 +270,17 @@ class EdgeRun:
                     self._handle(answer)
                 case TrackerLost() as tracker if not self._stopping:
                     text = f"agent's run {tracker.key}: its tracker {tracker.reason}"
-                    self._agent_troubles_until[text] = time.monotonic() + _TROUBLE_SHOWN_S
+                    self._agent_troubles.add(text)
                     self._handle(tracker)
                 case MapperReport() as report:
-                    if _solve_count(report.report) > _solve_count(self._mapper_report):
-                        self._solved_s = time.monotonic()
-                    self._mapper_report = report.report
-                    self._mapper_report_s, self._solving_s = time.monotonic(), report.solving_s
+                    self._progress.record(report)
                 case _Notice() as notice:
                     self._log_event(notice.event, notice.text)
                 case MapRestored():
                     self._restarts.record_restored()
                 case SolverDied() as solver:
-                    self._log_event("solver lost", solver.text)
-                    self._troubles_until[f"the solver: {solver.text}"] = time.monotonic() + _TROUBLE_SHOWN_S
+                    self._log_event("solver died", solver.text)
+                    self._troubles.add(f"the solver: {solver.text}")
                 case _MapperDied() as mapper if not self._stopping:
                     self._restart_mapping(f"its process {mapper.reason}")
 
@@ -326,8 +288,8 @@ class EdgeRun:
         """Start a new session after the mapper died; to the agents this looks like a restart of the edge."""
         pause_s = self._restarts.record_death()
         text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
-        self._log_event("mapper lost", text)
-        self._troubles_until[f"the mapper: {text}"] = time.monotonic() + pause_s + _TROUBLE_SHOWN_S
+        self._log_event("mapper died", text)
+        self._troubles.add(f"the mapper: {text}", pause_s + _TROUBLE_SHOWN_S)
         if self._mapper_process is not None:
             self._mapper_process.close()
         try:
@@ -335,9 +297,8 @@ class EdgeRun:
                 raise StoreError("the disk of the map file does not answer")
             self._discard_answers()
             loaded = self._load_stored_map()
-            self._totals.add_session(
-                self._totals.with_totals(self._state_machine.report(self._mapper_report))
-            )
+            report = self._state_machine.report(self._progress.report)
+            self._totals.add_session(self._totals.with_totals(report))
             self._start_session(loaded, pause_s)
             self._restart_due_s = None
         except StoreError as error:  # until it can be read, nothing is applied or acknowledged
@@ -385,8 +346,7 @@ class EdgeRun:
     # ------------------------------------------------------------------ log and report
 
     def _record(self, fields: dict[str, Any]) -> None:
-        if self._event_log is not None and self._output_writer is not None:
-            self._output_writer.submit(partial(self._event_log.write, json.dumps(fields)))
+        self._files.write_event(fields)
         self._on_record(fields)
 
     def _log_event(self, event: str, reason: str) -> None:
@@ -395,20 +355,12 @@ class EdgeRun:
 
     def _post_write_failure(self, text: str) -> None:
         """Log that the disk does not take a file. Safe from any thread."""
-        self._inbox.put(_Notice("not written", text))
+        self._inbox.put(_Notice("write failed", text))
 
     def _count_refusal(self, line: str) -> None:
         """Count a refused handshake; log each kind once, up to MAX_REFUSAL_KINDS."""
-        line = (
-            line
-            if line in self._refused_handshakes or len(self._refused_handshakes) < MAX_REFUSAL_KINDS
-            else "further kinds of refusal, which are only counted"
-        )
+        if line not in self._refused_handshakes and len(self._refused_handshakes) >= MAX_REFUSAL_KINDS:
+            line = "further kinds of refusal, which are only counted"
         self._refused_handshakes[line] += 1
         if self._refused_handshakes[line] == 1:
-            self._log_event("not let in", line)
-
-
-def _solve_count(report: Mapping[str, Any]) -> int:
-    """Return the number of solves in a mapper's report."""
-    return int(report.get("solve_ms", {}).get("n", 0))
+            self._log_event("connection refused", line)

@@ -148,8 +148,8 @@ class BackgroundErrorModel(SynchronousErrorModel):
 
     def report(self) -> dict[str, Any]:
         timings = summary(np.array(self._timings_ms.column(0), float))
-        counts = {"estimate_ms": timings.report(), "drop_estimate": self._dropped}
-        return {"error_model": {**counts, "strange": self._unfamiliar}}
+        counts = {"estimate_ms": timings.report(), "dropped_estimates": self._dropped}
+        return {"error_model": {**counts, "unfamiliar": self._unfamiliar}}
 
     def _run(self) -> None:
         while (job := self._next_job()) is not None:

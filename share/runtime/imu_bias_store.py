@@ -48,7 +48,7 @@ class ImuBiasStore:
 
     def report(self) -> dict[str, Any]:
         """Return, for a live camera with an IMU, the end of the run that saved the loaded bias, or None."""
-        return {} if self._serial is None else {"imu_bias": {"from": _utc(self._saved_ns)}}
+        return {} if self._serial is None else {"imu_bias": {"learnt_at": _utc(self._saved_ns)}}
 
     def _load(self, serial: str, source: Source, config: InertialConfig) -> None:
         assert source.rig.imu is not None

@@ -1,44 +1,14 @@
-"""Facts of this machine and this code, to record beside measurements: CPU, libraries, memory, code digest."""
+"""What this process may use of the machine: cores and memory."""
 
 from __future__ import annotations
 
-import hashlib
 import os
-import platform
-import sys
-from functools import cache
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-
-import share
-
-_LIBRARIES = ("numpy", "opencv-python-headless", "pyzmq", "scipy")
-_DIGEST_DIGITS = 10
-
-
-def describe_machine() -> dict[str, Any]:
-    """Return plain data. load: mean number of runnable processes over the last minute."""
-    return {
-        "cpu": _cpu_name() or platform.processor() or platform.machine(),
-        "cores": core_count(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        **{name: version(name) for name in _LIBRARIES},
-        "load": round(os.getloadavg()[0], 2),
-    }
 
 
 def core_count() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
-
-
-def _cpu_name() -> str | None:
-    """Return the CPU's model name from /proc/cpuinfo, None if absent."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.exists() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), None)
 
 
 def free_memory_bytes(proc: Path = Path("/proc"), cgroups: Path = Path("/sys/fs/cgroup")) -> int | None:
@@ -89,17 +59,3 @@ def _read_int(file: Path) -> int | None:
     except OSError:
         return None
     return int(text) if text.isdecimal() else None
-
-
-@cache
-def code_digest() -> str:
-    """Return a hexadecimal digest of SHARE's sources, or of the frozen program: the version number does not
-    change with each change of the code."""
-    frozen = getattr(sys, "frozen", False)
-    folder = Path(share.__file__).parent
-    files = [Path(sys.executable)] if frozen else sorted(folder.rglob("*.py"))
-    digest = hashlib.sha256()
-    for path in files:
-        digest.update(path.name.encode() if frozen else path.relative_to(folder).as_posix().encode())
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()[:_DIGEST_DIGITS]

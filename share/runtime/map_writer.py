@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import queue
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -12,6 +10,7 @@ from dataclasses import replace
 from share.errors import StoreError
 from share.mapping.map_changes import SavePoses
 from share.protocol.edge_events import ChangesSaved, SaveChanges
+from share.runtime.output_writer import JobThread
 from share.store.map_store import MapStore
 
 _RETRY_S = 1.0  # after a failed write
@@ -35,21 +34,17 @@ class MapWriter:
         self, store: MapStore, on_saved: Callable[[ChangesSaved], None], notify: Callable[[str], None]
     ) -> None:
         self._store, self._on_saved, self._notify = store, on_saved, notify
-        self._incoming: queue.SimpleQueue[SaveChanges | None] = queue.SimpleQueue()
-        self._pending: deque[SaveChanges] = deque()
+        self._pending: deque[SaveChanges] = deque()  # of the thread
         self._failure: str | None = None
-        self._writing_since: float | None = None
-        self._thread = threading.Thread(target=self._run, name="map writer", daemon=True)
-        self._thread.start()
+        self._retry_due_s = 0.0  # monotonic
+        self._thread = JobThread("map writer", on_idle=self._write_pending)
 
     @property
     def trouble(self) -> str | None:
         """Why changes cannot be saved now, None if they can. Safe from any thread."""
         if self._failure is not None:
             return f"{self._failure}; {_NOT_ACKNOWLEDGED}"
-        since = self._writing_since
-        took_s = 0.0 if since is None else time.monotonic() - since
-        if took_s < _SLOW_WRITE_S:
+        if (took_s := self._thread.busy_s) < _SLOW_WRITE_S:
             return None
         return f"a write to the map file has taken {took_s:.0f} s so far; {_NOT_ACKNOWLEDGED}"
 
@@ -59,14 +54,13 @@ class MapWriter:
         return sum(len(keep.changes) for keep in tuple(self._pending))
 
     def submit(self, request: SaveChanges) -> None:
-        self._incoming.put(request)
+        self._thread.submit(lambda: self._pending.append(request))
 
     def drain(self, timeout_s: float) -> bool:
         """Write the remaining changes, retry failed ones once, report unsaved ones, and end the thread.
         Return False if that takes longer than `timeout_s`. May be repeated."""
-        self._incoming.put(None)
-        self._thread.join(timeout_s)
-        if self._thread.is_alive():
+        self._thread.submit(self._write_all)
+        if not self._thread.stop(timeout_s):
             return False
         if unsaved := self.pending_changes:
             self._notify(f"{unsaved} changes {_NOT_IN_FILE}; none of their keyframes was acknowledged")
@@ -81,32 +75,23 @@ class MapWriter:
         unsaved = self.pending_changes
         return f"{self._failure}: {unsaved} changes {_NOT_IN_FILE}" if unsaved else None
 
-    def _run(self) -> None:
-        ended = False
-        while not ended:
-            ended = self._collect()
-            while self._pending and self._write():
-                pass
+    def _write_pending(self) -> float | None:
+        """Write a batch if there is one and no failed write waits for its retry. Return the seconds until
+        there is more to do, None if all is written."""
+        wait_s = 0.0 if self._failure is None else self._retry_due_s - time.monotonic()
+        if self._pending and wait_s <= 0.0:
+            wait_s = 0.0 if self._write() else _RETRY_S
+        return max(wait_s, 0.0) if self._pending else None
 
-    def _collect(self) -> bool:
-        """Move new requests to `_pending`; wait for one, or until a retry is due. Return True at the end."""
-        failing, until = self._failure is not None, time.monotonic() + _RETRY_S
-        while True:
-            wait = failing or not self._pending
-            try:
-                request = self._incoming.get(wait, max(0.0, until - time.monotonic()) if failing else None)
-            except queue.Empty:
-                return False
-            if request is None:
-                return True
-            self._pending.append(request)
+    def _write_all(self) -> None:
+        while self._pending and self._write():
+            pass
 
     def _write(self, max_requests: int = _MAX_PER_COMMIT) -> bool:
         """Write the next batch. Return False if the file cannot be written."""
         if self._failure is not None:
             self._pending = newest_poses_only(self._pending)
         batch = [self._pending[i] for i in range(min(max_requests, len(self._pending)))]
-        self._writing_since = time.monotonic()
         try:
             self._store.write([change for keep in batch for change in keep.changes])
         except StoreError as error:
@@ -116,8 +101,6 @@ class MapWriter:
             if len(batch) > 1:
                 return self._write(max_requests=1)
             self._notify(f"a change cannot be saved and is skipped: {type(error).__name__}: {error}")
-        finally:
-            self._writing_since = None
         for _ in batch:
             self._pending.popleft()
         if self._failure is not None:
@@ -127,6 +110,7 @@ class MapWriter:
         return True
 
     def _notify_failure(self, reason: str) -> None:
+        self._retry_due_s = time.monotonic() + _RETRY_S
         if self._failure != reason:
             self._failure = reason
             self._notify(f"{reason}; {_NOT_ACKNOWLEDGED} until a write succeeds")

@@ -62,7 +62,7 @@ def track(
     bias_store.save(tracker.bias)
     log.imu_outliers = tracker.rejected_imu_samples
     trajectory = Trajectory(np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4))
-    report = offline_report(log, counters, settings) | {"left_out": source.losses.counts}
+    report = offline_report(log, counters, settings) | {"skipped": source.losses.counts}
     report["failed_steps"] = guard.failure_count
     return TrackingOutput(trajectory, report | source.report() | bias_store.report())
 

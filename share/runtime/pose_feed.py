@@ -15,7 +15,7 @@ from share.geometry.se3 import quat_from_matrix
 from share.net.udp import HostPort, parse_host, resolve
 from share.types import F64
 
-SCHEMA = 1
+SCHEMA = 2
 _SCHEME = "udp://"
 _DEFAULT_PORT = 5570
 _DIGITS = 9  # 1 nm
@@ -54,7 +54,7 @@ class PoseFeed:
             "stamp_ns": stamp_ns,
             "age_ms": None if age_ms is None else round(age_ms, 3),
             "state": state,
-            "stretch": segment,
+            "segment": segment,
             "odom": _pose_fields(T_odom_body),
             "map": _pose_fields(T_map_body),
             "map_id": None if T_map_body is None else map_id,

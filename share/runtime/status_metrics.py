@@ -43,7 +43,7 @@ METRICS = (
         "share_edge_pose_age_seconds", "Age of the newest pose.", "pose_age_ms", *_PER_AGENT, scale=1e-3
     ),
     MetricSpec(
-        "share_edge_heard_age_seconds", "Time since the agent's last message.", "heard_s", *_PER_AGENT
+        "share_edge_last_message_age_seconds", "Time since the agent's last message.", "heard_s", *_PER_AGENT
     ),
     MetricSpec("share_edge_keyframes_total", "Keyframes applied.", "keyframes", *_PER_AGENT),
     MetricSpec("share_edge_poses_total", "Poses received.", "poses", *_PER_AGENT),
@@ -67,9 +67,9 @@ METRICS = (
         "queries_skipped",
         *_PER_AGENT,
     ),
-    MetricSpec("share_edge_stranger_bytes_total", "Bytes from unidentified peers.", "unjoined.bytes_up"),
+    MetricSpec("share_edge_unidentified_bytes_total", "Bytes from unidentified peers.", "unjoined.bytes_up"),
     MetricSpec(
-        "share_edge_stranger_bad_messages_total",
+        "share_edge_unidentified_bad_messages_total",
         "Malformed messages from unidentified peers.",
         "unjoined.bad_messages",
     ),

@@ -11,7 +11,7 @@ TOLD = {
     "held": 0,
 }  # fmt: skip
 
-KEYS = "not let in: the edge there wants keys"
+KEYS = "refused: the edge requires keys"
 UNSAFE = "could not store them in its map file; see the edge's log"
 
 

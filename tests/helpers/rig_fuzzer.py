@@ -219,13 +219,13 @@ def play(rig: Rig, walk: Walk, guarded: bool = True) -> Counter[str]:
             assert np.isfinite(result.T_odom_body).all()
         if result.keyframe_ready:
             if isinstance(tracker, GuardedTracker):
-                tracker.attempt("keyframe", frame, lambda frame=frame: _keep(tracker, frame))
+                tracker.attempt("keyframe", frame, lambda frame=frame: make_keyframe(tracker, frame))
             else:
-                _keep(tracker, frame)
+                make_keyframe(tracker, frame)
     return states
 
 
-def _keep(tracker: object, frame: Frame) -> None:
+def make_keyframe(tracker: object, frame: Frame) -> None:
     tracker.make_keyframe(frame)
     tracker.finish_keyframe()
 

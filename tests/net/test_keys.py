@@ -1,4 +1,4 @@
-"""Keys as files, and who gets in over CURVE."""
+"""Keys as files, and which are admitted over CURVE."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_only_the_owner_can_read_the_secret(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])
-def test_a_secret_that_others_can_read_is_refused(mode: int, tmp_path: Path) -> None:
+def test_a_readable_secret_is_refused(mode: int, tmp_path: Path) -> None:
     keys.generate_pair(tmp_path, "edge")
     (tmp_path / "edge.secret").chmod(mode)
     with pytest.raises(UsageError, match=r"edge\.secret: others can read this secret; `chmod 600 "):
@@ -107,9 +107,7 @@ def test_a_folder_that_cannot_be_used(damage, said: str, tmp_path: Path) -> None
         keys.load_pair(tmp_path)
 
 
-def test_a_folder_that_may_not_be_read_is_not_said_to_be_empty(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unreadable_folder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def denied(where: object) -> list[str]:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(where))
 
@@ -146,7 +144,7 @@ def test_a_public_key_is_given_as_text_line_or_file(tmp_path: Path) -> None:
         ("{}/ann.secret", "is a secret key, which must stay on its machine; give the public key"),
     ],
 )
-def test_what_is_no_public_key(given: str, said: str, tmp_path: Path) -> None:
+def test_malformed_public_keys_are_refused(given: str, said: str, tmp_path: Path) -> None:
     keys.generate_pair(tmp_path, "ann")
     with pytest.raises(UsageError, match=said):
         keys.public_key(given.format(tmp_path))
@@ -191,7 +189,7 @@ def test_a_list_made_of_public_key_files(tmp_path: Path) -> None:
     assert AllowList(path).names_by_key() == {pair.public: pair.name for pair in pairs}
 
 
-def test_what_was_written_by_hand_stays(tmp_path: Path) -> None:
+def test_comments_in_the_list_stay(tmp_path: Path) -> None:
     path = tmp_path / "authorized"
     path.write_text(f"# room 1\n\nshare-public-key ann {key(1)}\n# spare")  # without an end
     keys.authorize(tmp_path, "bob", key(2))
@@ -199,7 +197,7 @@ def test_what_was_written_by_hand_stays(tmp_path: Path) -> None:
     assert text(path) == f"# room 1\n\n# spare\nshare-public-key bob {key(2)}\n"
 
 
-def test_a_key_that_stands_there_twice_is_revoked_by_either_name(tmp_path: Path) -> None:
+def test_a_key_listed_twice_is_revoked_by_either_name(tmp_path: Path) -> None:
     path = tmp_path / "authorized"
     for name in ("ann", "old-ann"):
         path.write_text("".join(f"share-public-key {n} {key(1)}\n" for n in ("ann", "old-ann")))
@@ -207,7 +205,7 @@ def test_a_key_that_stands_there_twice_is_revoked_by_either_name(tmp_path: Path)
         assert not AllowList(path).is_allowed(key(1))
 
 
-def test_what_anybody_may_write_to_lets_nobody_in(tmp_path: Path) -> None:
+def test_a_world_writable_list_admits_no_key(tmp_path: Path) -> None:
     keys.generate_pair(tmp_path, "edge")
     keys.authorize(tmp_path, "ann", key(1))
     allowed = keys.allow_list(tmp_path)
@@ -223,7 +221,7 @@ def test_what_anybody_may_write_to_lets_nobody_in(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
 
 
-def test_a_damaged_list_lets_nobody_in_and_says_where(tmp_path: Path) -> None:
+def test_a_damaged_list_admits_no_key_and_is_reported(tmp_path: Path) -> None:
     keys.generate_pair(tmp_path, "edge")
     keys.authorize(tmp_path, "ann", key(1))
     allowed = keys.allow_list(tmp_path)
@@ -294,19 +292,20 @@ def house(tmp_path: Path) -> Iterator[House]:
         yield House(tmp_path, stack)
 
 
-def test_a_host_that_cannot_be(house: House) -> None:
+def test_a_malformed_host_is_refused(house: House) -> None:
     with pytest.raises(UsageError, match="'-' is not a valid host name"):
         connect("tcp://-:5555", 1, AgentKeys(house.ann, house.pair.public))
 
 
-def test_who_is_listed_gets_in(house: House) -> None:
+def test_a_listed_key_is_admitted(house: House) -> None:
     agent = house.agent(1, house.ann)
     house.greets(agent, 1)
     assert agent.trouble() is None
     assert house.edge.refusals() == []
 
 
-def test_who_is_not_listed_does_not_until_listed(house: House) -> None:
+@pytest.mark.long
+def test_an_unlisted_key_is_refused_until_it_is_listed(house: House) -> None:
     bob = house.pair_of("bob")
     agent = house.agent(2, bob)
     said = house.refusals(agent)[0]
@@ -321,7 +320,7 @@ def test_who_is_not_listed_does_not_until_listed(house: House) -> None:
     assert agent.trouble() is None
 
 
-def test_a_list_that_was_damaged_meanwhile_is_said(house: House) -> None:
+def test_a_list_damaged_meanwhile_is_reported(house: House) -> None:
     path = house.folder / "authorized"
     path.write_text(text(path) + "bob\n")
     said = house.refusals(house.agent(1, house.ann))
@@ -360,7 +359,7 @@ def test_an_edge_without_keys(house: House) -> None:
         house.greets(agent, 5)  # as soon as the right edge is there
 
 
-def test_a_revoked_key_is_thrown_out_and_the_others_are_back(house: House) -> None:
+def test_a_revoked_key_is_disconnected_and_others_reconnect(house: House) -> None:
     bob = house.pair_of("bob")
     keys.authorize(house.folder, "bob", bob.public)
     ann, bad = house.agent(1, house.ann), house.agent(2, bob)
@@ -376,7 +375,7 @@ def test_a_revoked_key_is_thrown_out_and_the_others_are_back(house: House) -> No
     house.greets(ann, 1)
 
 
-def test_a_change_that_revokes_nobody_here_breaks_no_connection(house: House) -> None:
+def test_a_change_that_revokes_no_admitted_key_breaks_no_connection(house: House) -> None:
     agent = house.agent(1, house.ann)
     house.greets(agent, 1)
     keys.authorize(house.folder, "bob", key(9))
@@ -387,7 +386,7 @@ def test_a_change_that_revokes_nobody_here_breaks_no_connection(house: House) ->
     assert agent.receive(2000) == [b"still here"]
 
 
-def test_a_stranger_with_a_free_hand_stays_outside(house: House) -> None:
+def test_a_peer_without_a_key_cannot_connect(house: House) -> None:
     """Anonymous CURVE, as anyone could who knows only the edge's public key; many at a time."""
     context = zmq.Context()
     sockets = []

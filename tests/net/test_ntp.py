@@ -96,7 +96,7 @@ def test_what_is_encoded_is_decoded(packet: NtpPacket) -> None:
         (b"\x64\x11" + BY_HAND[2:], "stratum 17; expected at most 16"),
     ],
 )
-def test_what_is_no_packet_is_refused_with_the_reason(data: bytes, reason: str) -> None:
+def test_malformed_packets_are_refused_with_the_reason(data: bytes, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         NtpPacket.decode(data)
 

@@ -1,4 +1,4 @@
-"""What a raw peer that says what libzmq never would does to a front in a process of its own: nothing.
+"""Attacks by a raw peer on an edge's link in a process of its own: an honest agent goes on.
 
 Beside each attack an honest agent exchanges messages with the front. Memory is the most that its process ever
 had.
@@ -232,9 +232,10 @@ DURATIONS = [pytest.param(2.0, id="2s"), pytest.param(10.0, id="10s", marks=pyte
 WHAT = [large_parts, empty_parts, many_parts]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lasts_s", DURATIONS)
 @pytest.mark.parametrize("say", WHAT, ids=lambda say: say.__name__)
-def test_messages_without_end(front: Front, say: Callable[[RawPeer], bytes], lasts_s: float) -> None:
+def test_endless_messages(front: Front, say: Callable[[RawPeer], bytes], lasts_s: float) -> None:
     """One peer after the other, at full speed: memory stays, the agent is served, and SIGINT ends it."""
     with Agent(front) as agent, under(front, say) as attack:
         began = time.monotonic()
@@ -253,6 +254,7 @@ def test_messages_without_end(front: Front, say: Callable[[RawPeer], bytes], las
 SMALL = {"empty": [b""], "a ping": [bytes(24)], "a pose": [bytes(300)], "empty parts": [b""] * 9}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lasts_s", DURATIONS)
 @pytest.mark.parametrize("front", ["zmq"], indirect=True)
 @pytest.mark.parametrize("bodies", SMALL.values(), ids=SMALL)
@@ -272,7 +274,7 @@ def test_floods_of_small_whole_messages(front: Front, bodies: list[bytes], lasts
 
 @pytest.mark.parametrize("front", ["zmq"], indirect=True)
 @pytest.mark.parametrize("number", [3, pytest.param(30, marks=pytest.mark.slow)])
-def test_newcomers_get_in_beside_an_attack_that_is_repeated(front: Front, number: int) -> None:
+def test_new_agents_connect_during_repeated_attacks(front: Front, number: int) -> None:
     """From the same address, so that it cannot be kept out."""
     took = []
     with Agent(front), under(front, whole_messages(b"")) as attack:
@@ -294,8 +296,9 @@ def joining_s(front: Front, run_id: int) -> float:
     return time.monotonic() - began
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("front", ["curve"], indirect=True)
-def test_a_key_that_was_cut_off_is_kept_out_and_others_are_not(front: Front) -> None:
+def test_a_blocked_key_stays_out_and_others_connect(front: Front) -> None:
     with Agent(front), under(front, large_parts) as attack:
         wait_for(lambda: attack.sent)
         attack.over.set()
@@ -308,7 +311,8 @@ def test_a_key_that_was_cut_off_is_kept_out_and_others_are_not(front: Front) -> 
         front.rogue = other
 
 
-def test_many_peers_at_once_that_each_hold_a_little(front: Front) -> None:
+@pytest.mark.long
+def test_many_peers_that_each_hold_a_little(front: Front) -> None:
     """60 of them begin a message and stay below what one may have waiting."""
     with Agent(front) as agent, ExitStack() as stack:
         began = time.monotonic()
@@ -327,7 +331,7 @@ def test_many_peers_at_once_that_each_hold_a_little(front: Front) -> None:
 
 
 @pytest.mark.parametrize("number", [300, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_a_flood_of_connections_that_say_nothing(front: Front, number: int) -> None:
+def test_a_flood_of_silent_connections(front: Front, number: int) -> None:
     host, port = front.endpoint.removeprefix("tcp://").split(":")
     usual = front.descriptors
     with Agent(front) as agent, ExitStack() as stack:
@@ -352,14 +356,15 @@ def test_a_flood_of_connections_that_say_nothing(front: Front, number: int) -> N
     [b"", b"\xff", greeting()[:40], greeting(), greeting() + ready(b"12345678")[:9]],
     ids=["nothing", "a byte", "half a greeting", "a greeting", "half of READY"],
 )
-def test_a_handshake_that_does_not_go_on_is_ended(front: Front, beginning: bytes) -> None:
+def test_an_unfinished_handshake_is_ended(front: Front, beginning: bytes) -> None:
     with RawPeer(front.endpoint) as peer:
         peer.send(beginning)
         assert peer.closed(within_s=15.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("front", ["zmq"], indirect=True)
-def test_strangers_are_counted_and_hold_up_nobody(front: Front) -> None:
+def test_unidentified_peers_are_counted_and_delay_no_agent(front: Front) -> None:
     """Whoever has an id that is not 8 bytes is no agent, however much it says."""
     with Agent(front) as agent:
         began = time.monotonic()
@@ -375,7 +380,7 @@ def test_strangers_are_counted_and_hold_up_nobody(front: Front) -> None:
     assert said["strangers"] > 0 and len(said["said"]) < 10
 
 
-def test_a_flood_of_handshakes_that_fail_says_little(front: Front) -> None:
+def test_a_flood_of_failed_handshakes_gives_few_reports(front: Front) -> None:
     wrong = frame(b"\x05READY\xff\xff", command=True)
     with Agent(front) as agent:
         began, used_s = time.monotonic(), front.cpu_s
@@ -389,8 +394,9 @@ def test_a_flood_of_handshakes_that_fail_says_little(front: Front) -> None:
     assert len(said["said"]) < 10
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("last", [b"", PING], ids=["messages", "a ping"])
-def test_a_peer_that_fills_its_queue_and_is_gone(front: Front, last: bytes) -> None:
+def test_a_peer_that_fills_its_queue_and_disconnects(front: Front, last: bytes) -> None:
     """libzmq 4.3.5 ends the whole process where a connection breaks whose input it had stopped, and then
     a heartbeat is to be sent or answered: so its input is never stopped."""
     for _ in range(20):
@@ -406,6 +412,7 @@ def test_a_peer_that_fills_its_queue_and_is_gone(front: Front, last: bytes) -> N
     assert said_at_end["messages"] > 0
 
 
+@pytest.mark.long
 def test_a_connection_that_was_taken_over_and_is_reset(front: Front) -> None:
     """The same, where a second connection with its id has stopped its input; its heartbeat would be due."""
     for pause_s in (0.0, 0.1, 0.2, 0.3, 0.4):

@@ -1,4 +1,4 @@
-"""What a raw edge that says what libzmq never would does to an agent's link in a process of its own: nothing.
+"""Attacks by a raw edge on an agent's link in a process of its own.
 
 Memory is the most that its process ever had.
 """
@@ -131,8 +131,9 @@ FLOODS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("said", FLOODS.values(), ids=FLOODS)
-def test_an_edge_that_sends_too_much_is_left(said: bytes) -> None:
+def test_an_agent_leaves_an_edge_that_sends_too_much(said: bytes) -> None:
     """One line, and it is tried again after 1 s, then 2, 4 ..."""
     edge = RawEdge(said)
     with agent_of(edge) as agent:
@@ -146,7 +147,8 @@ def test_an_edge_that_sends_too_much_is_left(said: bytes) -> None:
     assert said_once == {"disconnected from the edge, which sends what no edge does"}
 
 
-def test_it_is_tried_ever_more_rarely() -> None:
+@pytest.mark.long
+def test_reconnection_intervals_grow() -> None:
     edge = RawEdge(parts(30_000))
     with agent_of(edge) as agent:
         wait_for(lambda: len(edge.came_s) > 2)
@@ -155,6 +157,7 @@ def test_it_is_tried_ever_more_rarely() -> None:
         assert len(agent.end()["said"]) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("last", [b"", PING], ids=["messages", "a ping"])
 def test_an_edge_that_fills_the_queue_and_resets(last: bytes) -> None:
     """Input that libzmq had stopped and a heartbeat would end the process: its input is never stopped."""
@@ -165,7 +168,8 @@ def test_an_edge_that_fills_the_queue_and_resets(last: bytes) -> None:
         assert agent.end()["joined"] > 2
 
 
-def test_frames_beyond_measure_and_garbage() -> None:
+@pytest.mark.long
+def test_oversized_frames_and_garbage() -> None:
     for said in (frame(bytes(70_000)), b"\xff" * 1000, b"\x01\x00" * 1000):
         edge = RawEdge(once=said)
         with agent_of(edge) as agent:

@@ -1,4 +1,4 @@
-"""UDP sockets that say when a datagram came."""
+"""UDP sockets that stamp datagrams on arrival."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def pair() -> Iterator[tuple[StampedSocket, StampedSocket]]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux is asked for stamps")
-def test_the_kernel_says_when_a_datagram_came_not_when_it_was_read() -> None:
+def test_kernel_stamps_are_arrival_times() -> None:
     with pair() as (server, client):
         client.send(
             b"first"
@@ -42,7 +42,7 @@ def test_the_kernel_says_when_a_datagram_came_not_when_it_was_read() -> None:
         assert before <= datagram.stamp_ns <= after + 10_000_000 < time.time_ns()
 
 
-def test_without_stamps_of_the_kernel_it_stamps_itself_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_kernel_stamps_the_process_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp, "_TIMESTAMPNS", 9999)  # an option that no kernel has
     with pair() as (server, client):
         client.send(b"hello")
@@ -54,7 +54,7 @@ def test_without_stamps_of_the_kernel_it_stamps_itself_and_says_so(monkeypatch: 
         assert before <= datagram.stamp_ns <= time.time_ns()
 
 
-def test_an_answer_goes_back_to_who_asked() -> None:
+def test_a_reply_goes_to_the_sender() -> None:
     with pair() as (server, client):
         client.send(b"hello")
         datagram = server.receive(1.0)
@@ -66,7 +66,7 @@ def test_an_answer_goes_back_to_who_asked() -> None:
         assert client.receive(0.01) is None
 
 
-def test_nobody_at_the_other_end_is_told_to_who_waits_for_an_answer() -> None:
+def test_a_refused_datagram_raises_at_receive() -> None:
     with pair() as (server, client):
         server.close()
         client.send(b"hello")
@@ -74,14 +74,14 @@ def test_nobody_at_the_other_end_is_told_to_who_waits_for_an_answer() -> None:
             client.receive(1.0)
 
 
-def test_a_port_in_use_is_said() -> None:
+def test_a_port_in_use_is_reported() -> None:
     with pair() as (server, _):
         at = HostPort("127.0.0.1", server.port)
         with pytest.raises(TransportError, match=f"^{at}: the port is in use; stop the other server"):
             StampedSocket.bind(at)
 
 
-def test_an_address_of_nobody_is_said() -> None:
+def test_an_address_of_another_machine_is_reported() -> None:
     with pytest.raises(TransportError, match="this machine has no such address"):
         StampedSocket.bind(HostPort("192.0.2.1", 0))
 
@@ -104,7 +104,7 @@ def test_hosts_may_have_a_port_or_not(text: str, host: HostPort) -> None:
 @pytest.mark.parametrize(
     "text", ["", "11123", ":123", "a b", "udp://a:1", "a:99999", "a:0", "::1", "a:b", "ä"]
 )
-def test_what_is_no_host_is_said(text: str) -> None:
+def test_malformed_hosts_are_refused(text: str) -> None:
     with pytest.raises(
         UsageError, match=r"is not an address; give HOST or HOST:PORT, such as 192.168.1.10:11123"
     ):

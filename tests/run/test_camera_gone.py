@@ -36,7 +36,7 @@ def free_port(kind: int) -> int:
 
 
 @pytest.mark.slow
-def test_a_camera_that_is_gone_is_said_everywhere_within_a_second(
+def test_a_disconnected_camera_is_reported_everywhere_within_a_second(
     plain_session: Path, tmp_path: Path
 ) -> None:
     http, udp = free_port(socket.SOCK_STREAM), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -1,4 +1,4 @@
-"""A camera of software, through the real SDK, to a file that can be read: whatever the camera does."""
+"""A simulated camera, through the real SDK, to a readable file, whatever the camera does."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from share.sensors.sample_processor import DeviceSample
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
 
-def test_what_the_camera_sees_is_in_the_recording(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_the_recording_contains_the_cameras_images(tmp_path: Path) -> None:
     with Bench(tmp_path / "a.mcap") as bench:
         bench.feed(1_000_000, 20)
     source = open_source(str(tmp_path / "a.mcap"))
@@ -43,7 +44,7 @@ def test_what_the_camera_sees_is_in_the_recording(tmp_path: Path) -> None:
     assert bench.said == []
 
 
-def test_a_calibration_of_another_camera_is_recorded_and_said(tmp_path: Path) -> None:
+def test_a_calibration_of_another_camera_is_recorded_and_reported(tmp_path: Path) -> None:
     own = load_profile("d435i").rig()
     given = Calibration(replace(own, timeshift_s=0.004), "mine", serials=("0456",))
     with Bench(tmp_path / "a.mcap", calibration=given) as bench:
@@ -62,7 +63,7 @@ def test_a_calibration_of_other_images_ends_it_before_there_is_a_file(tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_wrap_of_the_cameras_clock_is_not_seen(tmp_path: Path) -> None:
+def test_the_wrap_of_the_cameras_clock_is_removed(tmp_path: Path) -> None:
     with Bench(tmp_path / "a.mcap") as bench:
         bench.feed(WRAP_US - 5 * 33_333, 10, wrap=True)
     stamps = open_source(str(tmp_path / "a.mcap")).stamps()
@@ -71,7 +72,7 @@ def test_the_wrap_of_the_cameras_clock_is_not_seen(tmp_path: Path) -> None:
     assert bench.report["streams"]["gyro"]["backward"] == 0
 
 
-def test_backward_and_missing_frames_are_counted_and_left_out(tmp_path: Path) -> None:
+def test_backward_and_missing_frames_are_counted_and_skipped(tmp_path: Path) -> None:
     with Bench(tmp_path / "a.mcap") as bench:
         after = bench.feed(1_000_000, 4)
         bench.camera.image(0, after - 100_000, PICTURE)
@@ -81,6 +82,7 @@ def test_backward_and_missing_frames_are_counted_and_left_out(tmp_path: Path) ->
     assert len(open_source(str(tmp_path / "a.mcap")).stamps()["cam0"]) == 5
 
 
+@pytest.mark.long
 def test_a_silent_imu_is_reset_once_then_images_go_on_alone(tmp_path: Path) -> None:
     with Bench(tmp_path / "a.mcap", quick) as bench:
         now, until = bench.feed(1_000_000, 10), time.monotonic() + 20
@@ -94,7 +96,8 @@ def test_a_silent_imu_is_reset_once_then_images_go_on_alone(tmp_path: Path) -> N
     assert (np.diff(open_source(str(tmp_path / "a.mcap")).stamps()["cam0"]) > 0).all()
 
 
-def test_a_camera_that_comes_back_with_a_new_clock_begins_a_new_stretch(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_a_reconnected_camera_with_a_new_clock_starts_a_new_segment(tmp_path: Path) -> None:
     with Bench(tmp_path / "a.mcap", quick) as bench:
         bench.feed(500_000_000, 10)
         bench.there = False
@@ -110,6 +113,7 @@ def test_a_camera_that_comes_back_with_a_new_clock_begins_a_new_stretch(tmp_path
     assert (bench.report["segments"], bench.report["reconnections"]) == (2, 1)
 
 
+@pytest.mark.long
 def test_a_slow_disk_costs_images_that_are_counted_and_never_the_imu(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -142,7 +146,7 @@ def test_a_recording_is_not_overwritten_and_not_begun_on_a_full_disk(tmp_path: P
     assert list(tmp_path.iterdir()) == [there]
 
 
-def test_what_a_power_cut_left_is_not_overwritten(tmp_path: Path) -> None:
+def test_a_partial_recording_is_not_overwritten(tmp_path: Path) -> None:
     part, out = tmp_path / "a.mcap.part", tmp_path / "a.mcap"
     part.write_bytes(b"dear")
     run = Capture(CameraFeed(_never, None, WANTED.rates_hz(), 10.0, print, SampleQueue()), out, 0.0, print)

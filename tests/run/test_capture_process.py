@@ -1,4 +1,4 @@
-"""`share capture` as a process on a camera of software: ended by a person, by time, by a power cut."""
+"""`share capture` as a process on a simulated camera: ended by Ctrl-C, by time, by a power failure."""
 
 from __future__ import annotations
 
@@ -47,8 +47,9 @@ def grown(part: Path, size: int) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_person_ends_it_and_the_file_is_whole(tmp_path: Path, number: int) -> None:
+def test_ctrl_c_completes_the_file(tmp_path: Path, number: int) -> None:
     out = tmp_path / "a.mcap"
     with capturing(out, "--json") as child:
         grown(tmp_path / "a.mcap.part", 10_000_000)
@@ -56,11 +57,12 @@ def test_a_person_ends_it_and_the_file_is_whole(tmp_path: Path, number: int) -> 
         told, complaints = child.communicate(timeout=20)
     assert (child.returncode, complaints) == (0, "")
     report = json.loads(told)
-    assert report["ended"] == "stopped"
+    assert report["end_reason"] == "stopped"
     assert len(open_source(str(out)).stamps()["cam0"]) == report["streams"]["cam0"]["samples"] > 10
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
+@pytest.mark.long
 def test_a_terminal_that_is_closed_costs_nothing_of_the_recording(tmp_path: Path) -> None:
     ours, terminal = pty.openpty()
     child = subprocess.Popen(
@@ -80,7 +82,8 @@ def test_a_terminal_that_is_closed_costs_nothing_of_the_recording(tmp_path: Path
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
-def test_who_does_not_want_to_wait_for_the_disk_is_told_how_to_save_it(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_a_second_ctrl_c_names_the_command_that_saves_the_file(tmp_path: Path) -> None:
     part = tmp_path / "a.mcap.part"
     with capturing(tmp_path / "a.mcap", slow=True) as child:
         grown(part, 3_000_000)
@@ -98,7 +101,8 @@ def test_who_does_not_want_to_wait_for_the_disk_is_told_how_to_save_it(tmp_path:
     assert len(open_source(str(tmp_path / "b.mcap")).stamps()["cam0"]) > 2
 
 
-def test_what_a_power_cut_leaves_is_mended(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_a_recording_cut_off_by_a_power_failure_is_recovered(tmp_path: Path) -> None:
     with capturing(tmp_path / "a.mcap"):
         grown(tmp_path / "a.mcap.part", 20_000_000)
     recover_recording(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
@@ -107,6 +111,7 @@ def test_what_a_power_cut_leaves_is_mended(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.diff(stamps["cam0"]), np.full(len(stamps["cam0"]) - 1, 33_333_000))
 
 
+@pytest.mark.long
 def test_it_ends_when_the_time_is_over_and_prints_a_table(tmp_path: Path) -> None:
     with capturing(tmp_path / "a.mcap", "--seconds", "1") as child:
         told, complaints = child.communicate(timeout=30)

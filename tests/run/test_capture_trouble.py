@@ -1,4 +1,4 @@
-"""What goes wrong in the field while a camera of software is recorded through the real SDK."""
+"""Faults in the field while a simulated camera is recorded through the real SDK."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ MOST_US = 60_000_000  # of the camera's time, for what is waited for
 ENV = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, CHILD.parents[1:3]))}  # tests, and the checkout
 
 
-def test_a_clock_that_begins_anew_without_a_disconnection_begins_a_new_stretch(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_a_clock_that_restarts_starts_a_new_segment(tmp_path: Path) -> None:
     with Bench(tmp_path / "a.mcap") as bench:
         bench.feed(500_000_000, 20)
         bench.feed(0, 30)
@@ -45,6 +46,7 @@ def test_a_clock_that_begins_anew_without_a_disconnection_begins_a_new_stretch(t
     assert bench.said == ["the camera's clock restarted; a new segment begins"]
 
 
+@pytest.mark.long
 def test_images_by_the_hosts_clock_do_not_cost_the_imu(tmp_path: Path) -> None:
     with Bench(tmp_path / "a.mcap") as bench:
         bench.feed(1_000_000, 60, host_us=1_760_000_000_000_000)
@@ -62,7 +64,7 @@ def test_images_by_the_hosts_clock_do_not_cost_the_imu(tmp_path: Path) -> None:
     ]
 
 
-def test_an_interleaved_emitter_without_metadata_is_said_and_all_is_kept(tmp_path: Path) -> None:
+def test_an_interleaved_emitter_without_metadata_is_reported(tmp_path: Path) -> None:
     device = replace(WANTED.profile.device, emitter="interleaved")
     with Bench(tmp_path / "a.mcap", wanted=StreamRequest(replace(WANTED.profile, device=device))) as bench:
         bench.feed(1_000_000, 10)
@@ -82,6 +84,7 @@ def test_without_images_the_imu_alone_is_recorded(tmp_path: Path) -> None:
     np.testing.assert_array_equal(imu.gyro[:, 0], np.arange(400.0))
 
 
+@pytest.mark.long
 def test_of_an_interleaved_emitter_the_images_without_dots_are_recorded(tmp_path: Path) -> None:
     device = replace(WANTED.profile.device, emitter="interleaved")
     wanted = StreamRequest(replace(WANTED.profile, device=device))
@@ -100,10 +103,9 @@ def test_of_an_interleaved_emitter_the_images_without_dots_are_recorded(tmp_path
     assert (told["gaps"], told["missing"]) == (0, 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("missing", "eyes"), [("depth", (0, 1)), ("cam1", (0,))])
-def test_what_tells_distance_too_and_never_comes_costs_one_reset_and_the_rest_goes_on(
-    tmp_path: Path, missing: str, eyes: tuple[int, ...]
-) -> None:
+def test_missing_depth_costs_one_reset(tmp_path: Path, missing: str, eyes: tuple[int, ...]) -> None:
     now, wanted = 1_000_000, replace(WANTED, depth=missing == "depth")
     with Bench(tmp_path / "a.mcap", quick, wanted) as bench:
         while bench.source.health is not Health.DEGRADED:
@@ -121,7 +123,8 @@ def test_what_tells_distance_too_and_never_comes_costs_one_reset_and_the_rest_go
     assert len(frames) >= bench.report["streams"]["cam0"]["samples"] - 2  # a pair cut by the reset
 
 
-def test_eyes_that_never_see_end_it_in_a_line_after_one_reset(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_missing_images_end_the_recording_after_one_reset(tmp_path: Path) -> None:
     now = 1_000_000
     with Bench(tmp_path / "a.mcap", quick) as bench:
         while bench.thread.is_alive():
@@ -135,7 +138,8 @@ def test_eyes_that_never_see_end_it_in_a_line_after_one_reset(tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_disk_that_fills_ends_the_recording_in_a_line_and_what_was_written_is_saved(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_a_full_disk_ends_the_recording_and_keeps_what_was_written(tmp_path: Path) -> None:
     most = 15_000_000  # bytes; the kernel refuses more, as a full disk does
     child = subprocess.run(
         [sys.executable, str(CHILD), str(tmp_path / "a.mcap")],

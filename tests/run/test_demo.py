@@ -1,4 +1,4 @@
-"""`share demo` as a user starts it: a room made, an edge and three agents as processes, a table."""
+"""`share demo` as a user starts it: a scene, an edge and three agents as processes, a table."""
 
 from __future__ import annotations
 
@@ -71,6 +71,7 @@ def test_a_short_demo_ends_in_one_map(tmp_path):
     assert pictured(tmp_path / "out")
 
 
+@pytest.mark.long
 def test_without_opengl_it_plays_the_plain_room(plain_cache, tmp_path):
     """No driver of EGL is to be found: one line says so, and what can be done; the rest is as ever."""
     hidden = {"__EGL_VENDOR_LIBRARY_FILENAMES": str(tmp_path / "nothing")}

@@ -1,4 +1,4 @@
-"""`share doctor` as people use it: with edges that are there, are not, or do not know us."""
+"""`share doctor` with edges that are present, absent, or refuse its keys."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def of_edge(done: Done) -> dict[str, object]:
     return dict(found)
 
 
-def test_a_port_that_is_taken_is_said(share: Share, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_used_port_is_reported(share: Share, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -67,7 +67,7 @@ def test_a_port_that_is_taken_is_said(share: Share, monkeypatch: pytest.MonkeyPa
     assert [found.get("port") for found in state] == ["WARN", "OK", None]
 
 
-def test_a_machine_without_a_camera_is_fine_where_none_is_wanted(share: Share, tmp_path: Path) -> None:
+def test_a_profile_without_a_camera_needs_none(share: Share, tmp_path: Path) -> None:
     done = share("doctor", *LAPTOP, "--keys", tmp_path / "none")
     states = {line.split()[0] for line in done.out.split("\n\n")[0].splitlines()}
     assert (done.code, done.err) == (0, "")
@@ -78,13 +78,13 @@ def test_a_machine_without_a_camera_is_fine_where_none_is_wanted(share: Share, t
     assert "libraries" in done.out
 
 
-def test_an_edge_that_is_there_answers_soon(share: Share, edge: str, tmp_path: Path) -> None:
+def test_a_running_edge_answers(share: Share, edge: str, tmp_path: Path) -> None:
     found = of_edge(share("doctor", *LAPTOP, "--edge", edge, "--keys", tmp_path / "none", "--json"))
     assert found["state"] == "OK"
     assert "answers in" in str(found["what"])
 
 
-def test_an_edge_that_is_not_there_fails_in_one_line(
+def test_an_absent_edge_fails_in_one_line(
     share: Share, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(doctor.probe_edge, "__defaults__", (0.3,))
@@ -95,13 +95,14 @@ def test_an_edge_that_is_not_there_fails_in_one_line(
     assert "share edge --bind tcp://127.0.0.1:1" in done.out
 
 
-def test_what_is_no_address_is_wrong_use(share: Share) -> None:
+def test_a_malformed_address_is_wrong_use(share: Share) -> None:
     done = share("doctor", *LAPTOP, "--edge", "kitchen")
     assert (done.code, done.out) == (2, "")
     assert "kitchen" in done.err
 
 
-def test_an_edge_with_keys_takes_those_that_are_authorized(share: Share, guarded: Guarded) -> None:
+@pytest.mark.long
+def test_an_edge_with_keys_accepts_authorized_ones(share: Share, guarded: Guarded) -> None:
     ask = ("doctor", *LAPTOP, "--edge", guarded.address, "--keys", guarded.ours, "--json")
     unknown = of_edge(share(*ask, "--server-key", guarded.public))
     assert unknown["state"] == "FAIL"
@@ -110,13 +111,14 @@ def test_an_edge_with_keys_takes_those_that_are_authorized(share: Share, guarded
     assert of_edge(share(*ask, "--server-key", guarded.public))["state"] == "OK"
 
 
-def test_the_key_of_another_edge_is_found_out(share: Share, guarded: Guarded) -> None:
+@pytest.mark.long
+def test_the_key_of_another_edge_is_reported(share: Share, guarded: Guarded) -> None:
     ask = ("doctor", *LAPTOP, "--edge", guarded.address, "--keys", guarded.ours, "--json")
     found = of_edge(share(*ask, "--server-key", guarded.our_public))
     assert found["state"] == "FAIL"
 
 
-def test_librealsense_that_hangs_or_crashes_does_not_take_us_along(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_librealsense_may_hang_or_crash(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sdk_probe, "_query_sdk", lambda: time.sleep(60))
     began = time.monotonic()
     assert "did not answer for 0.2 s" in str(sdk_probe.probe_sdk(0.2).trouble)
@@ -125,7 +127,7 @@ def test_librealsense_that_hangs_or_crashes_does_not_take_us_along(monkeypatch: 
     assert "crashed" in str(sdk_probe.probe_sdk().trouble)
 
 
-def test_what_the_computer_says_of_itself_is_read(tmp_path: Path) -> None:
+def test_facts_of_the_computer_are_read(tmp_path: Path) -> None:
     cpu = tmp_path / "sys/devices/system/cpu"
     for k, governor in enumerate(("performance", "powersave")):
         (cpu / f"cpu{k}/cpufreq").mkdir(parents=True)
@@ -160,7 +162,7 @@ def test_a_raspberry_pi_is_read(path: str, text: str, bits: int | None, tmp_path
     assert pi_throttled_bits(tmp_path) == bits
 
 
-def test_what_sets_the_governor_back_is_found_unless_it_is_masked(tmp_path: Path) -> None:
+def test_a_service_that_resets_the_governor_is_found(tmp_path: Path) -> None:
     unit = tmp_path / "usr/lib/systemd/system/power-profiles-daemon.service"
     unit.parent.mkdir(parents=True)
     unit.touch()
@@ -175,7 +177,7 @@ def test_what_sets_the_governor_back_is_found_unless_it_is_masked(tmp_path: Path
     assert not is_governor_reset(tmp_path)
 
 
-def test_an_edge_is_told_of_its_keys(share: Share, tmp_path: Path) -> None:
+def test_keys_of_an_edge_are_checked(share: Share, tmp_path: Path) -> None:
     def keys_of(folder: Path) -> tuple[str, str, list[str]]:
         told = json.loads(share("doctor", *LAPTOP, "--keys", folder, "--json").out)
         return next((f["state"], f["what"], f["mend"]) for f in told["findings"] if f["name"] == "keys")

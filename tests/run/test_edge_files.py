@@ -1,4 +1,4 @@
-"""`share edge --map` as a user sees it where the file or the disk is not as it should be: one clear line."""
+"""`share edge --map` with a damaged file or a failing disk: one clear line."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ def lines(child: Child, path: Path) -> list[str]:
     return [line.partition(f"{path}: ")[2] for line in child.said.splitlines() if str(path) in line]
 
 
+@pytest.mark.long
 def test_a_flipped_byte(path, tmp_path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0x40
@@ -66,7 +67,7 @@ def test_a_newer_schema(path, tmp_path):
     assert path.read_bytes() == before
 
 
-def test_what_is_no_map(path, tmp_path):
+def test_a_file_that_is_no_map(path, tmp_path):
     path.write_text("notes")
     child = edge(tmp_path)
     assert child.wait(20) == 2
@@ -74,6 +75,7 @@ def test_what_is_no_map(path, tmp_path):
     assert path.read_text() == "notes"
 
 
+@pytest.mark.long
 def test_a_map_in_use(path, tmp_path):
     first = edge(tmp_path)
     first.wait_for("listening on")
@@ -85,6 +87,7 @@ def test_a_map_in_use(path, tmp_path):
     assert "Traceback" not in first.said
 
 
+@pytest.mark.long
 def test_a_disk_that_is_full_for_a_while(tmp_path):
     """What is not in the file is not acknowledged; all of it is there once there is space again."""
     child = edge(tmp_path)
@@ -131,6 +134,7 @@ def kept_ids(path: Path, to: Path) -> list[int]:
         return [k.keyframe_key.id for k in store.load().keyframes]
 
 
+@pytest.mark.long
 def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
     """Killed while the disk is full, the edge has in its file exactly what it has acknowledged."""
     child = Child(
@@ -162,8 +166,9 @@ def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
     assert ann.machine.report()["open"] == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["removed", "replaced"])
-def test_a_file_that_is_taken_away_from_under_the_edge(tmp_path, how):
+def test_a_map_file_that_is_moved_away_meanwhile(tmp_path, how):
     child = edge(tmp_path)
     address = child.wait_for(r"listening on (tcp://\S+?),")[1]
     (ann,) = crowd(("ann",), address, frames=120)

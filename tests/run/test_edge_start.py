@@ -1,4 +1,4 @@
-"""`share edge` where something it needs cannot be had: one line, and nothing stays behind."""
+"""`share edge` without something that it needs: one line, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def test_a_busy_status_port_ends_it_with_one_line(tmp_path):
     assert said[-1].startswith(f"share: tcp://127.0.0.1:{port}: the port is in use") and len(said) <= 2
 
 
-def test_and_frees_the_map(tmp_path):
+@pytest.mark.long
+def test_a_busy_port_releases_the_map(tmp_path):
     """Another edge can have it at once."""
     at_map = ("--map", str(tmp_path / "room.sqlite"), "--bind", "tcp://127.0.0.1:0")
     with closing(socket.create_server(("127.0.0.1", 0))) as other:
@@ -43,7 +44,8 @@ def test_an_address_that_cannot_be_served_on(http, tmp_path):
     assert child.said.splitlines()[-1].startswith("share: ") and "Traceback" not in child.said
 
 
-def test_an_edge_that_never_ran_leaves_no_process():
+@pytest.mark.long
+def test_close_without_run_ends_all_processes():
     before = set(multiprocessing.active_children())
     run = EdgeRun(Config(), bind("tcp://127.0.0.1:0"), None, lambda event: None)
     assert len(set(multiprocessing.active_children()) - before) == 1

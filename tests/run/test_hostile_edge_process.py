@@ -1,4 +1,4 @@
-"""`share agent` against an edge that lies as fast as it can: the same odometry, no exit, few lines."""
+"""`share agent` with an edge that sends absurd values: the same odometry, no exit, few lines."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class HostileEdge:
 
 
 @pytest.mark.slow
-def test_an_agent_lives_through_a_hostile_edge(plain_session: Path, tmp_path: Path) -> None:
+def test_an_agent_survives_a_hostile_edge(plain_session: Path, tmp_path: Path) -> None:
     edge = HostileEdge()
     said = {}
     try:

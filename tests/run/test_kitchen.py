@@ -36,6 +36,7 @@ def tracked(kitchen, tmp_path_factory) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in ranges}
 
 
+@pytest.mark.long
 def test_every_frame_is_tracked_to_five_centimetres(kitchen, tracked, tmp_path):
     (tmp_path / "T.tum").write_bytes(tracked["whole"])
     estimate, truth = read_tum(tmp_path / "T.tum"), read_tum(kitchen / "groundtruth.txt")
@@ -53,6 +54,7 @@ def _events(folder: Path) -> list[dict]:
     return [json.loads(line) for line in (folder / "edge" / "events.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.long
 def test_two_agents_end_in_one_map(kitchen, tracked, tmp_path):
     edge, address = start_edge(tmp_path)
     agents = {
@@ -87,6 +89,7 @@ def test_two_agents_end_in_one_map(kitchen, tracked, tmp_path):
         assert "clock of the edge: " in agents[name].said
 
 
+@pytest.mark.long
 def test_an_edge_that_is_killed_and_started_again(kitchen, tracked, tmp_path):
     """Odometry does not notice; the new edge is rejoined, given the map again, and joins it again."""
     edge, address = start_edge(tmp_path)

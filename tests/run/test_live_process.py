@@ -1,4 +1,4 @@
-"""`share track realsense` and `share agent realsense` as processes, ended by a person."""
+"""`share track realsense` and `share agent realsense` as processes, ended by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -66,9 +66,8 @@ def ended(child: subprocess.Popen[str], terminal: int) -> tuple[str, str]:
     return told, text
 
 
-def test_a_person_ends_tracking_and_finds_the_poses_and_what_the_camera_did(
-    tmp_path: Path, plain_session: Path
-) -> None:
+@pytest.mark.long
+def test_ctrl_c_ends_tracking_with_poses_and_a_report(tmp_path: Path, plain_session: Path) -> None:
     out, report = tmp_path / "a.tum", tmp_path / "a.json"
     line = ("track", "realsense:0123", *MODE, "--out", out, "--report", report)
     with running(plain_session / "ar1", *line) as (child, terminal):
@@ -84,7 +83,8 @@ def test_a_person_ends_tracking_and_finds_the_poses_and_what_the_camera_did(
     assert (np.diff(read_tum(out).stamps_ns) > 0).all()
 
 
-def test_a_person_ends_an_agent_and_its_files_are_whole(tmp_path: Path, plain_session: Path) -> None:
+@pytest.mark.long
+def test_ctrl_c_completes_the_files_of_an_agent(tmp_path: Path, plain_session: Path) -> None:
     who = ("agent", "realsense", *MODE, "--name", "ann", "--profile", "d435i-n100-headset")
     save_bias("0123", SavedBias(10**9 * int(time.time() - 60), ImuBias([0.0] * 3, [0.0] * 3, 1e-3, 1e-2)))
     with running(plain_session / "ar1", *who, "--edge", "tcp://127.0.0.1:9", "--out", tmp_path) as (child, t):
@@ -96,6 +96,6 @@ def test_a_person_ends_an_agent_and_its_files_are_whole(tmp_path: Path, plain_se
     assert "camera: missing " in told
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["camera"]["streams"]["accel"]["dropped"] == 0
-    assert f"imu bias: from the run of {report['imu_bias']['from']}\n" in told
+    assert f"imu bias: from the run of {report['imu_bias']['learnt_at']}\n" in told
     assert report["track_ms"]["p50"] > 0  # from the image's arrival
     assert len(read_tum(tmp_path / "odom.tum").stamps_ns) == report["tracked"] > 10

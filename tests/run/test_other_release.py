@@ -1,4 +1,4 @@
-"""The last release as real processes against this one, both ways round."""
+"""The last release as real processes with this one, in both directions."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def odometry(folder: Path, name: str) -> int:
     return len((folder / name / "odom.tum").read_text().splitlines())
 
 
-def test_an_agent_of_the_last_release_is_told_to_upgrade(
+def test_an_agent_of_the_last_release_is_asked_to_upgrade(
     of_last_release, plain_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

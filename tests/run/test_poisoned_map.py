@@ -46,7 +46,7 @@ def edge(folder: Path, path: Path) -> tuple[Child, str]:
     return child, child.wait_for(r"listening on (tcp://\S+?),")[1]
 
 
-def test_a_pose_beyond_measure_costs_its_keyframe(tmp_path: Path, plain_session: Path) -> None:
+def test_an_absurd_pose_costs_its_keyframe(tmp_path: Path, plain_session: Path) -> None:
     path = map_file(4, tmp_path)
     poison(path)
     child, address = edge(tmp_path, path)
@@ -55,14 +55,14 @@ def test_a_pose_beyond_measure_costs_its_keyframe(tmp_path: Path, plain_session:
     agent = start_agent(tmp_path, "eve", plain_session / "ar1", address)
     assert agent.wait(60) == 0
     assert child.interrupt() == 0
-    assert "mapper lost" not in child.said
+    assert "mapper died" not in child.said
     with MapStore.read(path) as store:
         keys = [found.keyframe_key for found in store.load().keyframes]
     assert len([key for key in keys if not key.agent.startswith("eve")]) == 15
     assert len(keys) > 15
 
 
-def test_a_map_that_ends_three_mappers_is_set_aside(tmp_path: Path, plain_session: Path) -> None:
+def test_a_map_that_three_mappers_die_of_is_set_aside(tmp_path: Path, plain_session: Path) -> None:
     """Whatever it is of that they die while they take it in."""
     path = map_file(4, tmp_path)
     child, address = edge(tmp_path, path)
@@ -78,7 +78,7 @@ def test_a_map_that_ends_three_mappers_is_set_aside(tmp_path: Path, plain_sessio
     until("renamed to", aside, 60)
     why = "3 mappers in a row have died while restoring it; a new one is started"
     assert f"the map file is renamed to {path.name}.damaged-1: {why}" in child.said
-    assert child.said.count("mapper lost: its process was ended by SIGKILL; restarted in") == 3
+    assert child.said.count("mapper died: its process was ended by SIGKILL; restarted in") == 3
     agent = start_agent(tmp_path, "eve", plain_session / "ar1", address)
     assert agent.wait(60) == 0
     time.sleep(0.2)

@@ -1,4 +1,4 @@
-"""Recordings that the maker's SDK writes of a camera of software: read without the SDK, and tracked."""
+"""Recordings of a simulated camera by the maker's SDK: read without the SDK, and tracked."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def stereo(plain_session: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     return recorded(plain_session, "ar1", out), out
 
 
-def test_it_is_tracked_as_what_the_camera_saw(stereo: tuple[RoomCamera, Path]) -> None:
+@pytest.mark.long
+def test_it_is_tracked_like_the_cameras_images(stereo: tuple[RoomCamera, Path]) -> None:
     room, path = stereo
     source = open_source(str(path))
     assert (source.rig.kind, source.rig.baseline) == ("stereo+imu", pytest.approx(BASELINE))
@@ -75,6 +76,7 @@ def test_it_is_tracked_as_what_the_camera_saw(stereo: tuple[RoomCamera, Path]) -
     assert np.linalg.norm(apart, axis=1).max() < 0.002
 
 
+@pytest.mark.long
 def test_images_are_the_same_to_the_last_bit_and_depth_is_in_metres(
     plain_session: Path, tmp_path: Path
 ) -> None:
@@ -89,7 +91,7 @@ def test_images_are_the_same_to_the_last_bit_and_depth_is_in_metres(
         np.testing.assert_allclose(np.nan_to_num(a), np.nan_to_num(b), atol=0.00026)
 
 
-def test_its_extrinsics_are_those_that_the_sdk_itself_tells(tmp_path: Path) -> None:
+def test_its_extrinsics_are_those_of_the_sdk(tmp_path: Path) -> None:
     camera = Turned(rs)
     with RealSenseCamera(StreamRequest(load_profile("d435i")), context=camera.context) as device:
         theirs = device.rig
@@ -106,7 +108,7 @@ def test_its_extrinsics_are_those_that_the_sdk_itself_tells(tmp_path: Path) -> N
     assert (ours.cam0, ours.imu) == (theirs.cam0, None)
 
 
-def test_it_is_converted_and_told_of(
+def test_it_is_converted_and_described(
     stereo: tuple[RoomCamera, Path], share: Callable[..., Done], tmp_path: Path
 ) -> None:
     _, path = stereo
@@ -142,7 +144,7 @@ def test_without_an_accelerometer_there_is_no_imu_to_calibrate(
     assert "a.db3: has no" in done.err
 
 
-def test_a_file_that_is_none_is_said_in_a_line(share: Callable[..., Done], tmp_path: Path) -> None:
+def test_a_file_that_is_no_recording_is_refused(share: Callable[..., Done], tmp_path: Path) -> None:
     (tmp_path / "a.db3").write_bytes(b"no database")
     sqlite3.connect(tmp_path / "b.db3").close()
     for name in ("a.db3", "b.db3"):

@@ -44,7 +44,7 @@ def test_a_process_of_the_edge_is_stopped(tmp_path, victim):
         walker.join(FOUND_S)
         assert walker.error is None
         assert walker.machine.report()["open"] == 0
-    assert "mapper lost" not in edge.said
+    assert "mapper died" not in edge.said
     assert edge.interrupt() == 0
     check_map(tmp_path / "room.sqlite", walkers)
 
@@ -85,7 +85,7 @@ def test_agents_are_killed_again_and_again(tmp_path, plain_session):
     assert edge.interrupt() == 0
 
 
-def test_a_mapper_that_stands_still_is_said(tmp_path):
+def test_a_stuck_mapper_is_reported(tmp_path):
     """It is alive, and nothing else would tell: no keyframe waits in the front."""
     edge = Child(tmp_path / "edge.log", "edge", "--bind", "tcp://127.0.0.1:0", "--http", "0")
     address = edge.wait_for(r"status at (\S+)/")[1]

@@ -83,6 +83,7 @@ def trackers_of(edge: Child) -> list[int]:
     return [pid for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
+@pytest.mark.long
 def test_a_tracker_that_is_killed_costs_its_agent_only(
     plain_session: Path, tmp_path: Path, config: Path
 ) -> None:
@@ -121,7 +122,8 @@ def await_poses(*files: Path) -> None:
         time.sleep(0.02)
 
 
-def test_an_edge_that_is_killed_is_said_and_the_agent_goes_on(plain_session: Path, tmp_path: Path) -> None:
+@pytest.mark.long
+def test_an_agent_continues_when_its_edge_is_killed(plain_session: Path, tmp_path: Path) -> None:
     config = tmp_path / "quick.yaml"
     config.write_text("link: {silent_s: 1}\n")
     edge, address = edge_that_tracks(tmp_path)
@@ -136,7 +138,8 @@ def test_an_edge_that_is_killed_is_said_and_the_agent_goes_on(plain_session: Pat
     assert report["untracked"] > FRAMES / 2
 
 
-def test_who_does_not_fit_is_told_so(plain_session: Path, tmp_path: Path) -> None:
+@pytest.mark.long
+def test_an_agent_beyond_the_capacity_is_refused(plain_session: Path, tmp_path: Path) -> None:
     edge, address = edge_that_tracks(tmp_path)
     tracks = start_agent(tmp_path, "ann", plain_session / "ar1", address)
     assert tracks.wait(60) == 2
@@ -173,7 +176,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_what_does_not_go_together(what: str, tmp_path: Path) -> None:
+def test_conflicting_options_are_refused(what: str, tmp_path: Path) -> None:
     command, said = BAD[what]
     done = subprocess.run([*SHARE, *command], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (2, f"share: {said}\n")

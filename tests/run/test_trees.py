@@ -1,4 +1,4 @@
-"""Whoever starts processes may be killed at any moment: nothing of the tree is left two seconds later."""
+"""A process that starts others may be killed at any moment: two seconds later none of them is left."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ IN_ORDER_S = 20.0  # to write files, and for agents to say bye
 OF_A_PARENT = """
 import sys, time
 from pathlib import Path
-from share.runtime.child_commands import running_child
+from share.lab.evaluate.real_time import running_child
 log = Path(sys.argv[1]) / "edge.log"
 with running_child(log, "edge", "--bind", "tcp://127.0.0.1:0", "--out", sys.argv[1]):
     time.sleep(600)
@@ -28,7 +28,7 @@ with running_child(log, "edge", "--bind", "tcp://127.0.0.1:0", "--out", sys.argv
 OF_A_THREAD = """
 import sys, threading, time
 from pathlib import Path
-from share.runtime.child_commands import running_child
+from share.lab.evaluate.real_time import running_child
 def start():
     held.append(running_child(Path(sys.argv[1]) / "edge.log", "edge", "--bind", "tcp://127.0.0.1:0"))
     held[0].__enter__()
@@ -74,6 +74,7 @@ KINDS = {"edge": edge, "parent": parent, "thread": thread, "emulate": emulate, "
 QUICK = [("edge", 0.3), ("edge", 0.8), ("parent", 0.5), ("parent", 1.5), ("thread", 1.5), ("emulate", 2.0)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "after_s"), QUICK)
 def test_killed(tmp_path, kind, after_s):
     tree = Tree(KINDS[kind](tmp_path), tmp_path / "log")
@@ -90,6 +91,7 @@ def test_killed_when_all_are_there(tmp_path, kind):
     assert tree.left(GONE_S) == {}
 
 
+@pytest.mark.long
 def test_a_thread_that_has_ended_is_no_parent_that_has_died(tmp_path):
     tree = Tree(thread(tmp_path), tmp_path / "log")
     tree.until(4)
@@ -99,6 +101,7 @@ def test_a_thread_that_has_ended_is_no_parent_that_has_died(tmp_path):
     assert tree.left(GONE_S) == {}
 
 
+@pytest.mark.long
 def test_grandchildren_follow(tmp_path):
     """The mapper's death is not the edge's, but the solver's."""
     tree = Tree(edge(tmp_path), tmp_path / "log")
@@ -123,6 +126,7 @@ def _workers(pid: int) -> list[int]:
     return [int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("number", "whom"),
     [
@@ -147,7 +151,7 @@ def test_a_signal_ends_all_in_good_order(tmp_path, number, whom):
     assert tree.left(IN_ORDER_S) == {}
     assert tree.parent.returncode == 0
     assert (tmp_path / "out" / "edge.json").exists()
-    assert "mapper lost" not in (tmp_path / "out" / "events.jsonl").read_text()
+    assert "mapper died" not in (tmp_path / "out" / "events.jsonl").read_text()
     assert "Traceback" not in tree.log.read_text()
 
 

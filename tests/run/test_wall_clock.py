@@ -1,4 +1,4 @@
-"""A real agent and its edge while somebody sets the wall clock by an hour: nothing changes, to the digit."""
+"""A real agent and its edge while the wall clock is set by an hour: poses stay the same to the digit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from helpers.preloaded import WallClock, with_environment
 
 
 @pytest.mark.slow
-def test_odometry_is_the_same_and_nobody_is_lost(tmp_path: Path, plain_session: Path) -> None:
+def test_setting_the_wall_clock_changes_no_pose(tmp_path: Path, plain_session: Path) -> None:
     clock = WallClock(tmp_path)
     patch = with_environment(clock.env)
     edge, address = start_edge(tmp_path)

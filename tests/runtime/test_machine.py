@@ -1,4 +1,4 @@
-"""What this process may still take of the machine's memory."""
+"""Memory that this process may still take."""
 
 from pathlib import Path
 
@@ -38,13 +38,13 @@ def machine(
         ),
     ],
 )
-def test_the_least_counts(tmp_path, group, files, free):
+def test_the_smallest_limit_counts(tmp_path, group, files, free):
     assert machine(tmp_path, 3 * GB, group, files) == (free if free != 3 * GB else free // 1024 * 1024)
 
 
-def test_a_system_that_does_not_say(tmp_path):
+def test_free_memory_may_be_unknown(tmp_path):
     assert machine(tmp_path, None) is None
 
 
-def test_this_one_says():
+def test_free_memory_of_this_machine():
     assert free_memory_bytes() > 10_000_000

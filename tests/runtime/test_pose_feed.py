@@ -39,7 +39,7 @@ def waiting(app: socket.socket) -> Iterator[dict[str, Any]]:
             yield json.loads(app.recv(2000))
 
 
-def test_a_pose_comes_as_it_was_told(app):
+def test_a_pose_arrives_as_published(app):
     feed = PoseFeed(where(app), "ann")
     T_odom = from_rt(so3_exp(np.array([0.1, -0.2, 0.3])), np.array([1.0, 2.0, -0.5]))
     T_map = from_rt(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.25, 0.0, 3.0]))
@@ -47,26 +47,26 @@ def test_a_pose_comes_as_it_was_told(app):
     feed.publish(456, "OK", 7.1234, 1, T_odom, T_map, "bob-1/0")
     first, second = (json.loads(app.recv(2000)) for _ in range(2))
     assert first == {
-        "schema": 1,
+        "schema": 2,
         "agent": "ann",
         "sequence": 0,
         "stamp_ns": 123,
         "age_ms": None,
         "state": "INITIALISING",
-        "stretch": None,
+        "segment": None,
         "odom": None,
         "map": None,
         "map_id": None,
     }
     assert (second["sequence"], second["stamp_ns"], second["age_ms"]) == (1, 456, 7.123)
-    assert (second["stretch"], second["map_id"]) == (1, "bob-1/0")
+    assert (second["segment"], second["map_id"]) == (1, "bob-1/0")
     for told, T in ((second["odom"], T_odom), (second["map"], T_map)):
         assert np.allclose(told["position"], T[:3, 3], atol=1e-9)
         assert np.allclose(matrix_from_quat(np.array(told["quaternion"])), T[:3, :3], atol=1e-8)
     feed.close()
 
 
-def test_nobody_has_to_listen():
+def test_no_receiver_is_needed():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
         gone.bind(("127.0.0.1", 0))
         address = where(gone)
@@ -85,12 +85,13 @@ def test_nobody_has_to_listen():
         ("udp://nobody.invalid:7000", "no such host"),
     ],
 )
-def test_an_address_that_is_none_is_said(address, what):
+def test_malformed_feed_addresses_are_refused(address, what):
     with pytest.raises(UsageError, match=what):
         PoseFeed(address, "ann")
 
 
-def test_an_agent_tells_every_pose_that_it_writes(share, app, plain_session, tmp_path):
+@pytest.mark.long
+def test_an_agent_publishes_every_pose_that_it_writes(share, app, plain_session, tmp_path):
     """Without an edge: what it has is its odometry."""
     config = tmp_path / "config.yaml"
     config.write_text("agent: {finish_s: 0.1}\n")

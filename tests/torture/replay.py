@@ -59,7 +59,7 @@ def ends_an_edge(messages: list[Recorded]) -> bool:
             end = time.monotonic() + PATIENCE_S
             while time.monotonic() < end and edge.running:
                 time.sleep(0.05)
-            bad = not edge.running or "Traceback" in edge.said or "mapper lost" in edge.said
+            bad = not edge.running or "Traceback" in edge.said or "mapper died" in edge.said
             return bad or edge.interrupt() != 0
 
 

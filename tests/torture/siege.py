@@ -14,7 +14,7 @@ from harness import EdgeProgram, HonestAgents, Keys, Program, Result, Setup, Wat
 
 SETTLED_S = 3.0  # of the honest agents alone, before anything begins
 RSS_MB = 300.0  # by which all processes of the edge together may grow from the attack's beginning on
-BAD_WORDS = ("Traceback", "Warning:", "Assertion failed", "mapper lost", "step failed", "not written")
+BAD_WORDS = ("Traceback", "Warning:", "Assertion failed", "mapper died", "step failed", "write failed")
 SAID_BYTES = 2_000_000  # log and events together; honest agents of some minutes write a tenth of it
 
 

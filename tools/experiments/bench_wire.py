@@ -1,4 +1,4 @@
-"""Cost of the wire: encode and decode, sizes, round trips over loopback (plain and CURVE) and in memory.
+"""Cost of the wire: encode and decode, sizes, round trips over loopback, plain and with CURVE.
 
     python tools/experiments/bench_wire.py [--rounds N]
 
@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from share.net.in_memory import MemoryNetwork
 from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate_pair
 from share.net.transport import AgentLink, EdgeLink, bind, connect
 from share.types import Keyframe, TrackState, View
@@ -106,9 +105,6 @@ def main() -> None:
             closing(connect(edge.endpoint, 1, agent_keys)) as agent,
         ):
             result["round_trip_curve"] = round_trips(edge, agent, rounds)
-    network = MemoryNetwork()
-    with closing(network.bind("edge")) as edge, closing(network.connect("edge", 1)) as agent:
-        result["round_trip_memory"] = round_trips(edge, agent, rounds)
     print(json.dumps(result, indent=2))
 
 

@@ -22,8 +22,7 @@ import numpy as np
 from tool_main import exit_code, line
 
 from share.errors import UsageError
-from share.net.channel import ChannelModel, NetworkModel
-from share.net.emulated_link import EmulatedLink
+from share.lab.evaluate.emulated_network import ChannelModel, EmulatedLink, NetworkModel
 from share.net.transport import AgentLink, EdgeLink, bind, connect
 
 POSE, KEYFRAME = 200, 30_000  # bytes

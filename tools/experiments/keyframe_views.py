@@ -15,7 +15,7 @@ from share.lab.emulate.progress import Progress
 from share.lab.emulate.sensor.device import PictureTimes
 from share.lab.emulate.sensor.exposure import ExposureSeries
 from share.lab.emulate.stage import Actor, RoomStage
-from share.runtime.pool import Pool
+from share.lab.pool import Pool
 from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.types import I64, Frame, View
 from share.vision.orb import make_view

@@ -16,9 +16,9 @@ from share.lab.calibrate.camera_bundle import BoardView
 from share.lab.calibrate.camera_report import UNKNOWN_UNCERTAINTY, RigUncertainty, read_rig_uncertainty
 from share.lab.calibrate.corners import Detection, detector
 from share.lab.calibrate.target import Target
+from share.lab.pool import Pool
 from share.recordings.calibration import CAMCHAIN, Calibration
 from share.recordings.images import decode_gray, read_picture
-from share.runtime.pool import Pool
 from share.runtime.source import READERS, open_source, read_given_calibration
 from share.sensors.measurement import CAM0, CAM1
 from share.types import F64, I64, U8

@@ -31,9 +31,9 @@ from share.lab.emulate.recordings import write_recording, write_truth
 from share.lab.emulate.sensor.exposure import ExposureSeries
 from share.lab.emulate.stage import Actor, RoomStage
 from share.lab.emulate.types import START_NS
+from share.lab.pool import Pool
 from share.recordings.calibration import to_kalibr
 from share.recordings.session import SCHEMA, SESSION_FILE
-from share.runtime.pool import Pool
 from share.types import F64
 
 PLAN_FILE = "plan.png"

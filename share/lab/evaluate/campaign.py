@@ -18,8 +18,8 @@ from share.errors import DataError, ShareError, UsageError
 from share.files.yaml_file import read_settings
 from share.lab.evaluate.real_time import Progress, RunOptions
 from share.lab.evaluate.trial import RUN_FILE, SETTINGS_FILE, Trial, read_trial, run_trial, settings_yaml
+from share.lab.pool import Pool
 from share.recordings.session import Session
-from share.runtime.pool import Pool
 
 TrialResult = Trial | ShareError
 ShowRun = Callable[[int, Progress | None], None]  # number of the run, and its progress
@@ -43,7 +43,7 @@ SessionJob = list[PlannedRun]  # runs of one session, which is tracked once for 
 
 
 class WorkerPool(Protocol):
-    """The interface of `share.runtime.pool.Pool`."""
+    """The interface of `share.lab.pool.Pool`."""
 
     @property
     def worker_count(self) -> int: ...

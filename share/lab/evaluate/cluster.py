@@ -15,7 +15,7 @@ _CONNECT_S = 10
 
 
 class Cluster:
-    """A pool with the interface of `share.runtime.pool.Pool`, on the dask scheduler at `address`.
+    """A pool with the interface of `share.lab.pool.Pool`, on the dask scheduler at `address`.
 
     Workers need SHARE, and the same files at the same paths.
     """

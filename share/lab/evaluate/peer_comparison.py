@@ -20,13 +20,13 @@ from share.config import Config
 from share.errors import DataError, UsageError
 from share.files.json_file import nan_to_none, none_to_nan, read_json, to_plain
 from share.files.writing import atomic_write
+from share.lab.evaluate.provenance import describe_machine
 from share.lab.evaluate.tracker_runs import TrackerRun, can_run_peers, peer_version, run_peer, run_share
 from share.lab.peer_trackers import PEERS
 from share.metrics.ate import ate
 from share.metrics.rpe import rpe_time
 from share.plain_data import to_mapping
 from share.recordings.trajectory import Trajectory, format_tum
-from share.runtime.machine import describe_machine
 from share.runtime.source import Source
 
 _FINAL_SUFFIX = ", final trajectory"

@@ -13,8 +13,8 @@ import numpy as np
 from share import __version__
 from share.lab.evaluate.charts import draw_bars
 from share.lab.evaluate.peer_comparison import TrackerRow
+from share.lab.evaluate.provenance import describe_machine
 from share.lab.evaluate.report import bullets, csv_text, format_number, image_link, markdown_table
-from share.runtime.machine import describe_machine
 
 PROTOCOL = (
     "causal poses of all frames, as each tracker gave them at the time; truth interpolated at their stamps",

@@ -9,26 +9,28 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
+import sys
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from share import child_processes
 from share.config import STREAMED
 from share.errors import DataError, ShareError
 from share.files.json_file import read_json
 from share.files.line_file import GrowingFile
 from share.files.reading import MAX_LOG_BYTES, read_bytes
-from share.files.writing import writable_dir
+from share.files.writing import open_new, writable_dir
+from share.lab.evaluate.emulated_network import LinkAssignment
 from share.lab.evaluate.map_membership import MapMembership
 from share.metrics.ate import Ate, JointAte, ate, joint_ate
-from share.net.emulated_link import LinkAssignment
 from share.recordings.session import Session
 from share.recordings.trajectory import Trajectory, read_tum
-from share.runtime.child_commands import running_child, stop_child
 
 EDGE_START_TIMEOUT_S = 20.0  # until the edge listens
 AGENT_GRACE_S = 60.0  # how much longer than its recording an agent may run
@@ -236,8 +238,8 @@ def _joint_ate(agents: dict[str, AgentScore]) -> JointAte | None:
     members: dict[str, list[str]] = {}
     for name, agent in agents.items():
         if agent.map is not None:
-            fallback_map = agent.report["protocol"]["map_id"]  # of runs before map_tum was written
-            members.setdefault(agent.report.get("map_tum", fallback_map), []).append(name)
+            fallback_map = agent.report["protocol"]["map_id"]  # of runs before map_tum_id was written
+            members.setdefault(agent.report.get("map_tum_id", fallback_map), []).append(name)
     if not members:
         return None
     largest = max(members.values(), key=len)
@@ -248,3 +250,44 @@ def _joint_ate(agents: dict[str, AgentScore]) -> JointAte | None:
         return joint_ate({name: (m, t) for name, (m, t) in pairs.items() if m is not None})
     except DataError:
         return None
+
+
+def share_command(*arguments: str) -> list[str]:
+    """Return the command line that runs `share ARGUMENTS` with this program, frozen or not."""
+    if getattr(sys, "frozen", False):
+        return [sys.executable, *arguments]
+    # -P: ignore a folder `share` in the working directory
+    return [sys.executable, "-P", "-m", "share", *arguments]
+
+
+@contextmanager
+def running_child(log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run `share ARGUMENTS` with its output in `log`; stop it when the block is left.
+
+    The child ends with this process, however this one ends. It is in a process group of its own: Ctrl-C in a
+    terminal reaches only this process.
+    """
+    with open_new(log) as sink:
+        process = subprocess.Popen(
+            share_command(*arguments),
+            stdin=subprocess.DEVNULL,
+            stdout=sink,
+            stderr=subprocess.STDOUT,
+            env=child_processes.child_environment(),
+            process_group=0,
+        )
+        try:
+            yield process
+        finally:
+            stop_child(process)
+
+
+def stop_child(process: subprocess.Popen[bytes], timeout_s: float = 10.0) -> int:
+    """Send SIGINT, kill after `timeout_s`, and return the exit code."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()

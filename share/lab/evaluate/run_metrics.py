@@ -11,7 +11,7 @@ class Conditions:
     """Under which conditions a session was played. Runs that differ in the policy alone are compared.
 
     `clock`: real or virtual time. `told`: source of the agents' estimated errors. `code`: digest of SHARE's
-    code (`share.runtime.machine`), empty where unknown.
+    code (`share.lab.evaluate.provenance`), empty where unknown.
     """
 
     session: str

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from share.config import Config
+from share.lab.evaluate.emulated_network import Channel, NetworkModel
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange
@@ -26,7 +27,6 @@ from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Verification
 from share.mapping.steps import MapEvent
 from share.metrics.frame_log import RunLog
-from share.net.channel import Channel, NetworkModel
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent

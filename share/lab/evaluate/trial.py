@@ -19,11 +19,11 @@ from share.config import Config
 from share.errors import ConfigError, DataError, UsageError
 from share.files.json_file import read_json, to_plain
 from share.files.writing import atomic_write, new_folder
+from share.lab.evaluate.provenance import code_digest, describe_machine
 from share.lab.evaluate.real_time import Progress, RunOptions, play_in_real_time
 from share.lab.evaluate.virtual_time import play_in_virtual_time
 from share.plain_data import from_mapping, to_mapping
 from share.recordings.session import Session, read_session
-from share.runtime.machine import code_digest, describe_machine
 from share.runtime.source import open_source
 from share.sensors.measurement import CAM0
 

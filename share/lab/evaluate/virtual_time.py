@@ -24,16 +24,15 @@ from share.files.line_file import LineFile
 from share.files.writing import atomic_write, writable_dir
 from share.files.yaml_file import read_settings
 from share.geometry.camera import Rig
+from share.lab.evaluate.emulated_network import LinkAssignment
 from share.lab.evaluate.map_membership import MapMembership
 from share.lab.evaluate.real_time import Progress, RunOptions
 from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation, TrackedFrame
 from share.metrics.local_error import LocalError
-from share.net.emulated_link import LinkAssignment
 from share.odometry.error_model.network import open_error_model
 from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
 from share.recordings.session import Session, read_session
-from share.runtime.agent_files import AgentFiles
 from share.runtime.error_estimators import (
     ErrorEstimator,
     GroundTruthError,
@@ -41,6 +40,7 @@ from share.runtime.error_estimators import (
     SynchronousErrorModel,
 )
 from share.runtime.pipeline import make_source_tracker, read_frames
+from share.runtime.run_files import AgentFiles
 from share.runtime.source import Source, open_source
 from share.sensors.sequencer import SequencerCounters
 from share.wire.messages import Hello

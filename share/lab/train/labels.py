@@ -21,6 +21,7 @@ from share.files.arrays import read_arrays
 from share.files.json_file import parse_json
 from share.files.writing import atomic_write
 from share.lab.evaluate.campaign import check_unique_names
+from share.lab.pool import Pool
 from share.lab.train.fault_injection import FAULT_KINDS, FaultInterval, draw_faults, inject_faults
 from share.metrics.local_error import WINDOW_S, LocalError
 from share.odometry.error_model.history import MOST_AGO, MotionHistory
@@ -28,7 +29,6 @@ from share.odometry.error_model.inputs import INPUT_SHAPES, ErrorModelInput, err
 from share.recordings.session import Session, read_session
 from share.runtime.error_estimators import frame_outcome
 from share.runtime.pipeline import check_trackable, make_tracker, read_frames
-from share.runtime.pool import Pool
 from share.runtime.source import Source, open_source
 from share.sensors.sequencer import SequencerCounters
 from share.startup import prepare_process

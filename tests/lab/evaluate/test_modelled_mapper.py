@@ -11,9 +11,9 @@ from test_simulation import MS, seen
 
 from share.config import Config, EdgeConfig
 from share.geometry import se3
+from share.lab.evaluate.emulated_network import NETWORK_PRESETS
 from share.lab.evaluate.modelled_mapper import GroundTruth, ModelledMapper, RecognitionModel
 from share.lab.evaluate.simulation import ProcessingDelays, Simulation
-from share.net.channel import NETWORK_PRESETS
 
 ROOM = walls(1)
 SECONDS = 6.0

@@ -10,8 +10,8 @@ from helpers.edge_sim import Person, walls
 
 from share.config import Config, EdgeConfig
 from share.geometry import se3
+from share.lab.evaluate.emulated_network import NETWORK_PRESETS
 from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation, TrackedFrame
-from share.net.channel import NETWORK_PRESETS
 from share.types import KeyframeCandidate
 
 MS = 1_000_000

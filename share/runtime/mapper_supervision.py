@@ -1,0 +1,113 @@
+"""Supervision of the mapper: its progress, and after its death, when and with which map it restarts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from share.errors import ShareError
+from share.mapping.map_changes import StoredMap, with_unknown_credentials
+from share.protocol.peer import RestoredRun, restored_runs
+from share.runtime.mapper_process import MapperReport
+from share.store.map_store import MapStore
+from share.timing import Backoff
+
+_SILENT_S = 5.0  # without a report of the mapper, which comes every second, it is stuck
+_MAX_SOLVE_S = 15.0  # for one solution; longer means the solver is stuck
+_MAX_TRIES = 3  # mappers that may die while restoring one map, before it is set aside
+
+
+class MapperRestarts:
+    """Restarts of one edge's mapper. `notify` reports what happens to the map file.
+
+    A map that cannot be interpreted, or that `_MAX_TRIES` mappers died of while restoring it, is renamed,
+    never deleted; the edge goes on with an empty one.
+    """
+
+    def __init__(
+        self, store: MapStore | None, known_m: float, notify: Callable[[str], None], has_keys: bool = False
+    ) -> None:
+        """known_m: see `share.protocol.peer.restored_runs`. has_keys: agents of this edge have keys."""
+        self.store = store  # None also once a read-only map is no longer used
+        self._known_m, self._notify, self._has_keys = known_m, notify, has_keys
+        self._backoff = Backoff(time.monotonic_ns())
+        self._is_restoring = False
+        self._tries = 0
+
+    @property
+    def writable(self) -> bool:
+        return self.store is not None and self.store.writable
+
+    def record_restored(self) -> None:
+        """Record that the mapper has restored the map."""
+        self._is_restoring, self._tries = False, 0
+
+    def record_death(self) -> float:
+        """Record that the mapper died. Return the seconds until the next may start."""
+        self._tries += self._is_restoring
+        return self._backoff.record_failure(time.monotonic_ns())
+
+    def load_map(self) -> tuple[StoredMap | None, list[RestoredRun]]:
+        """Return the map and the agents' runs for a new session. Raises StoreError if the file is unreadable
+        now."""
+        self._is_restoring = False
+        if self._tries >= _MAX_TRIES:
+            self._set_aside(f"{self._tries} mappers in a row have died while restoring it")
+        if self.store is None:
+            return None, []
+        try:
+            stored_map = with_unknown_credentials(self.store.load()) if self._has_keys else self.store.load()
+            known = restored_runs(stored_map, self._known_m)
+        except ShareError:
+            raise
+        except Exception as error:  # no content of a file may end the edge
+            self._set_aside(f"{type(error).__name__}: {error}")
+            return None, []
+        self._is_restoring = bool(stored_map.keyframes)
+        return stored_map, known
+
+    def _set_aside(self, reason: str) -> None:
+        self._tries = 0
+        if self.store is None:
+            return
+        if not self.store.writable:
+            self.store = None
+            self._notify(f"the map file is no longer used: {reason}; nothing is saved")
+            return
+        renamed = self.store.set_aside()
+        self._notify(f"the map file is renamed to {renamed.name}: {reason}; a new one is started")
+
+
+class MapperProgress:
+    """The newest report of one mapper, {} before the first, and what it tells of its progress."""
+
+    def __init__(self) -> None:
+        self.report: dict[str, Any] = {}
+        self._reported_s: float | None = None  # monotonic, as below
+        self._solving_s = 0.0  # duration of the current solve at that time
+        self._solved_s: float | None = None
+
+    def record(self, report: MapperReport) -> None:
+        self._reported_s, self._solving_s = time.monotonic(), report.solving_s
+        if _solve_count(report.report) > _solve_count(self.report):
+            self._solved_s = self._reported_s
+        self.report = report.report
+
+    def last_solve(self) -> dict[str, float]:
+        """Return {"last_solve_s": time since the last solution}, {} before the first."""
+        return {} if self._solved_s is None else {"last_solve_s": round(time.monotonic() - self._solved_s, 3)}
+
+    def stall(self) -> str | None:
+        """Return which process makes no progress, None if both do."""
+        if self._reported_s is None:
+            return None
+        if (silent_s := time.monotonic() - self._reported_s) > _SILENT_S:
+            return f"the mapper has not answered for {silent_s:.0f} s: no corrections meanwhile"
+        if (solving_s := self._solving_s + silent_s) > _MAX_SOLVE_S:
+            return f"the solver has worked on one solution for {solving_s:.0f} s: no corrections meanwhile"
+        return None
+
+
+def _solve_count(report: Mapping[str, Any]) -> int:
+    return int(report.get("solve_ms", {}).get("n", 0))

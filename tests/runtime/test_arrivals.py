@@ -1,0 +1,159 @@
+"""Frames at their arrival times, and those that come late."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from share.protocol.agent_events import AgentTick
+from share.runtime.arrivals import (
+    READ_AHEAD,
+    LateFrameDropper,
+    LatenessMonitor,
+    LiveArrivals,
+    RecordedArrivals,
+)
+from share.types import Frame, ImuBatch
+
+_PATIENCE_S = 5.0
+_WHILE_S = 0.3  # in which a thread that is free to decode would
+
+
+class _Recording:
+    """Frames that are all due at once; counts those that were decoded, and fails at number `broken`."""
+
+    def __init__(self, count: int, broken: int = -1) -> None:
+        self._count, self._broken = count, broken
+        self.decoded = 0
+        self.changed = threading.Condition()
+
+    def frames(self) -> Iterator[Frame]:
+        for index in range(self._count):
+            if index == self._broken:
+                raise ValueError("cannot be read on")
+            with self.changed:
+                self.decoded += 1
+                self.changed.notify_all()
+            yield Frame(0, index, np.zeros((2, 2), np.uint8), None, None, ImuBatch.empty())
+
+    def reaches(self, decoded: int, within_s: float = _PATIENCE_S) -> bool:
+        with self.changed:
+            return self.changed.wait_for(lambda: self.decoded >= decoded, within_s)
+
+
+def test_decoding_ahead_is_bounded() -> None:
+    recording = _Recording(2 * READ_AHEAD)
+    played = RecordedArrivals(recording.frames, LateFrameDropper(0.0)).iter_frames()
+    next(played)
+    most = READ_AHEAD + 2  # one with the tracker, one that waits for room
+    assert recording.reaches(most)
+    assert not recording.reaches(most + 1, _WHILE_S)
+
+
+def test_every_frame_comes_in_order_and_the_end_ends_it() -> None:
+    count = 3 * READ_AHEAD
+    played = RecordedArrivals(_Recording(count).frames, LateFrameDropper(0.0)).iter_frames()
+    assert [frame.index for frame, _ in played] == list(range(count))
+
+
+def test_a_read_error_is_raised_after_the_frames_before_it() -> None:
+    played = RecordedArrivals(_Recording(50, broken=40).frames, LateFrameDropper(0.0)).iter_frames()
+    assert [next(played)[0].index for _ in range(40)] == list(range(40))
+    with pytest.raises(ValueError, match="cannot be read on"):
+        next(played)
+
+
+def test_stop_ends_a_reader_that_waits_for_room() -> None:
+    recording = _Recording(2 * READ_AHEAD)
+    arrivals = RecordedArrivals(recording.frames, LateFrameDropper(0.0))
+    played = arrivals.iter_frames()
+    next(played)
+    assert recording.reaches(READ_AHEAD)
+    arrivals.stop()
+    assert list(played) == []
+    assert not [t for t in threading.enumerate() if t.name == "reader"]
+
+
+class _Camera:
+    """A live camera by what its arrivals ask of it."""
+
+    image_ns, trouble, images_dropped = 7, "", 61
+
+    def arrived_ns(self, stamp_ns: int) -> int:
+        return stamp_ns
+
+
+def test_dropped_images_are_reported_from_the_first_frame_on() -> None:
+    camera: Any = _Camera()
+    seen = LiveArrivals(_Recording(3).frames, camera)
+    assert seen.tick() == AgentTick(7, "")
+    frames = seen.iter_frames()
+    next(frames)
+    assert seen.tick().sensor_trouble == ""
+    camera.images_dropped += 1
+    assert seen.tick().sensor_trouble == "too slow for the camera: images are dropped"
+
+
+# ---------------------------------------------------------------- frames that come late
+
+
+MS = 1_000_000
+IMAGE = np.zeros((4, 4), np.uint8)
+
+
+def frame_with_imu(k: int) -> Frame:
+    stamps = np.array([10 * k, 10 * k + 5], np.int64) * MS
+    return Frame(10 * k * MS, k, IMAGE, imu=ImuBatch(stamps, np.full((2, 3), k), np.full((2, 3), -k)))
+
+
+def test_a_late_frame_is_dropped_if_a_later_one_waits() -> None:
+    late = LateFrameDropper(20.0)
+    assert late.admit(frame_with_imu(0), 19 * MS, has_next=True) is not None
+    assert late.admit(frame_with_imu(1), 21 * MS, has_next=True) is None
+    assert late.admit(frame_with_imu(2), 21 * MS, has_next=True) is None
+    assert late.dropped == 2
+
+
+def test_the_next_frame_has_all_imu_samples() -> None:
+    late = LateFrameDropper(20.0)
+    late.admit(frame_with_imu(1), 30 * MS, has_next=True)
+    late.admit(frame_with_imu(2), 30 * MS, has_next=True)
+    taken = late.admit(frame_with_imu(3), 5 * MS, has_next=True)
+    assert taken is not None and taken.index == 3
+    assert taken.imu.stamps_ns.tolist() == [10 * MS, 15 * MS, 20 * MS, 25 * MS, 30 * MS, 35 * MS]
+    assert taken.imu.gyro[:, 0].tolist() == [1, 1, 2, 2, 3, 3]
+    assert taken.imu.accel[:, 0].tolist() == [-1, -1, -2, -2, -3, -3]
+    following = late.admit(frame_with_imu(4), 0, has_next=True)
+    assert following is not None and following.imu.stamps_ns.tolist() == [40 * MS, 45 * MS]
+
+
+@pytest.mark.parametrize(("late_ms", "another"), [(0.0, True), (20.0, False)])
+def test_no_frame_is_dropped_without_a_limit_or_a_later_frame(late_ms: float, another: bool) -> None:
+    late = LateFrameDropper(late_ms)
+    assert late.admit(frame_with_imu(1), 10**12, another) is not None
+    assert late.dropped == 0
+
+
+# ---------------------------------------------------------------- poses that come late
+
+
+def test_poses_in_time_are_not_reported() -> None:
+    said: list[str] = []
+    lateness = LatenessMonitor(said.append, "this machine")
+    for _ in range(100):
+        lateness.record(45.0)
+    assert (said, lateness.report()) == ([], {"late_frames": 0, "max_late_s": 0.045})
+
+
+def test_late_poses_are_counted_and_reported_whenever_lateness_doubles() -> None:
+    said: list[str] = []
+    lateness = LatenessMonitor(said.append, "this machine")
+    for k in range(100):
+        lateness.record(100.0 * k)  # to 9.9 s
+    assert [line.split(":")[0] for line in said] == [f"poses are {s:.1f} s late" for s in (1, 2, 4, 8)]
+    assert "this machine is too slow for this source; set agent.late_ms" in said[0]
+    assert lateness.report() == {"late_frames": 94, "max_late_s": 9.9}

@@ -1,0 +1,216 @@
+"""No rig and no failure within a tracker ends its process; a failed step costs that step."""
+
+from __future__ import annotations
+
+import resource
+import time
+
+import numpy as np
+import pytest
+from helpers import rig_fuzzer
+from helpers.plain_walk import RIG
+
+from share.config import Config, InertialConfig, TrackerConfig
+from share.errors import UsageError
+from share.geometry import rig_check, se3
+from share.geometry.camera import ImuBias, Rig
+from share.odometry import filter
+from share.odometry.inertial_tracker import InertialTracker
+from share.odometry.track_result import TrackResult
+from share.runtime import guarded_tracker
+from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.types import TrackState
+from share.vision import corners
+
+
+@pytest.fixture(scope="module")
+def walk() -> rig_fuzzer.Walk:
+    return rig_fuzzer.walk(8)
+
+
+def played(walk: rig_fuzzer.Walk, tracker: GuardedTracker, fails: dict[int, pytest.MonkeyPatch]) -> list:
+    results = []
+    for frame in walk.frames:
+        if (broken := fails.get(frame.index)) is not None:
+            with broken.context() as patch:
+                patch.setattr(filter, "_whitened_update", _no_gain)
+                patch.setattr(corners, "count_fast", _no_gain)
+                results.append(tracker.track(frame))
+            continue
+        results.append(tracker.track(frame))
+        if results[-1].keyframe_ready:
+            tracker.attempt("a keyframe", frame, lambda frame=frame: rig_fuzzer.make_keyframe(tracker, frame))
+    return results
+
+
+def _no_gain(*anything: object, **more: object) -> None:
+    raise np.linalg.LinAlgError("innovation covariance is not positive definite")
+
+
+@pytest.mark.long
+def test_a_failed_update_costs_its_frame_and_odometry_relocalises(
+    walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    guard = FaultGuard(said.append)
+    results = played(walk, GuardedTracker(RIG, Config(), guard), {4: monkeypatch})
+    assert [result.state for result in results[:4]] == [TrackState.OK] * 4
+    assert (results[4].state, results[4].T_odom_body) == (TrackState.LOST, None)
+    assert results[-1].state is TrackState.OK
+    assert not any(result.new_segment for result in results[1:])  # its places were kept: the same odom
+    far = np.linalg.norm(results[-1].T_odom_body[:3, 3] - results[3].T_odom_body[:3, 3])
+    assert far < 0.2
+    assert guard.failure_count == 1
+    assert len(said) == 1 and "LinAlgError" in said[0]
+
+
+def test_a_tracker_that_fails_twice_is_replaced(
+    walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken:
+        """Has one pose, then fails, and cannot be reset."""
+
+        rejected_imu_samples = 7
+
+        def __init__(self) -> None:
+            self.poses = [np.eye(4)]
+
+        def track(self, frame: object) -> TrackResult:
+            return TrackResult(TrackState.OK, self.poses.pop())
+
+        def reset_after_failure(self, frame: object) -> None:
+            raise ValueError
+
+    made = [lambda *arguments: Broken(), guarded_tracker.make_tracker]
+    monkeypatch.setattr(guarded_tracker, "make_tracker", lambda *arguments: made.pop(0)(*arguments))
+    guard = FaultGuard(lambda text: None)
+    tracker = GuardedTracker(RIG, Config(), guard)
+    results = [tracker.track(frame) for frame in walk.frames[:5]]
+    assert [result.state for result in results[:2]] == [TrackState.OK, TrackState.LOST]
+    assert results[-1].state is TrackState.OK and guard.failure_count == 2
+    assert tracker.rejected_imu_samples == 7  # by the first
+
+
+def test_the_bias_outlives_a_replaced_tracker(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    learnt = ImuBias([0.01, 0.0, 0.0], [0.1, 0.2, 0.3], 1e-3, 1e-2)
+    told = iter([None, learnt, None])
+    monkeypatch.setattr(InertialTracker, "bias", property(lambda self: next(told)))
+    tracker = GuardedTracker(RIG, Config(), FaultGuard(lambda text: None), learnt)
+    assert tracker.bias is None  # what it was told is not what it has learnt
+    tracker.track(walk.frames[0])
+    monkeypatch.setattr(InertialTracker, "make_keyframe", lambda self, frame: None)
+    biases = []
+    for frame in walk.frames[:3]:
+        tracker.finish(frame, True)
+        biases.append(tracker.bias)
+    assert biases == [None, learnt, learnt]
+
+
+def test_a_visual_tracker_has_no_bias(walk: rig_fuzzer.Walk) -> None:
+    tracker = GuardedTracker(RIG.without_imu(), Config(), FaultGuard(lambda text: None))
+    assert tracker.track(walk.frames[0]).keyframe_ready
+    tracker.finish(walk.frames[0], True)
+    assert tracker.bias is None
+
+
+def test_a_failed_keyframe_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    guard = FaultGuard(lambda text: None)
+    tracker = GuardedTracker(RIG, Config(), guard)
+    assert tracker.track(walk.frames[0]).keyframe_ready
+    monkeypatch.setattr("share.odometry.keyframes.ViewBuilder.finish", _no_gain)
+    kept = tracker.attempt("a keyframe", walk.frames[0], lambda: tracker.make_keyframe(walk.frames[0]))
+    assert kept is None and guard.failure_count == 1
+    assert tracker.track(walk.frames[1]).state is TrackState.LOST
+
+
+@pytest.mark.parametrize("rig", [RIG, RIG.without_imu()], ids=["imu", "cameras"])
+def test_after_a_failed_keyframe_the_next_motion_starts_at_the_last_published_one(rig: Rig) -> None:
+    often = {"keyframe_m": 1e-4, "keyframe_gap_s": 0.1}
+    config = Config(inertial=InertialConfig(**often), tracker=TrackerConfig(**often))
+    tracker = GuardedTracker(rig, config, FaultGuard(lambda text: None))
+    frames = iter(rig_fuzzer.walk(16).frames)
+    frame = next(frames)
+    assert tracker.track(frame).keyframe_ready
+    first = tracker.make_keyframe(frame)
+    while not tracker.track(frame := next(frames)).keyframe_ready:
+        pass
+
+    def fails_once_made() -> None:
+        tracker.make_keyframe(frame)
+        _no_gain()
+
+    assert tracker.attempt("a keyframe", frame, fails_once_made) is None
+    while not tracker.track(frame := next(frames)).keyframe_ready:
+        pass
+    again = tracker.make_keyframe(frame)
+    step = se3.inverse(first.T_odom_body) @ again.T_odom_body
+    assert not again.new_segment and np.linalg.norm(step[:3, 3]) > 1e-3
+    np.testing.assert_allclose(again.T_previous_body, step, atol=1e-4)
+
+
+def test_a_reset_discards_the_unfinished_keyframe(walk: rig_fuzzer.Walk) -> None:
+    tracker, frame = InertialTracker(RIG, Config().inertial, Config().tracker), walk.frames[0]
+    tracker.track(frame)
+    tracker.make_keyframe(frame)
+    tracker.reset_after_failure(frame)
+    assert tracker._keyframes._offered is None
+
+
+# ---------------------------------------------------------------- rigs that nobody has
+
+
+def test_no_rig_ends_a_tracker(walk: rig_fuzzer.Walk) -> None:
+    for what, rig in rig_fuzzer.rigs(25, seed=35):
+        states = rig_fuzzer.play(rig, walk)
+        assert states["refused"] or sum(n for k, n in states.items() if k.isupper()) == len(walk.frames), what
+
+
+def test_the_unchanged_rig_is_tracked_without_a_failure(walk: rig_fuzzer.Walk) -> None:
+    assert rig_fuzzer.play(RIG, walk) == {"OK": len(walk.frames)}
+
+
+def test_the_fuzzer_makes_accepted_and_refused_rigs() -> None:
+    told = [rig_check.rig_problem(rig) for _, rig in rig_fuzzer.rigs(200, seed=1)]
+    count = sum(why is not None for why in told)
+    assert 60 < count < 190
+    assert len({str(why)[:25] for why in told}) > 10
+
+
+@pytest.mark.slow
+def test_many_rigs_over_two_seconds() -> None:
+    walk = rig_fuzzer.walk(30)
+    for n, (what, rig) in enumerate(rig_fuzzer.rigs(400, seed=3535)):
+        began = time.process_time()
+        rig_fuzzer.play(rig, walk)
+        assert time.process_time() - began < 60, what
+        if n == 50:
+            held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - held < 200_000  # kB
+
+
+def test_a_failure_is_counted_and_reported_once_with_its_place() -> None:
+    said: list[str] = []
+    guard = FaultGuard(said.append)
+    for _ in range(3):
+        with guard.step("handling Received"):
+            raise ZeroDivisionError("by \x1b zero")
+    assert guard.failure_count == 3
+    [line] = said
+    assert line.startswith("handling Received: ZeroDivisionError at test_guarded_tracker.py:")
+    assert line.endswith("by ? zero; this step is skipped and the run goes on")
+
+
+def test_a_share_error_passes() -> None:
+    guard = FaultGuard(lambda text: None)
+    with pytest.raises(UsageError), guard.step("handling Received"):
+        raise UsageError("the name is taken")
+    assert guard.failure_count == 0
+
+
+def test_reported_failures_are_bounded() -> None:
+    said: list[str] = []
+    guard = FaultGuard(said.append)
+    for k in range(100):
+        with guard.step(f"step {k}"):
+            raise ValueError
+    assert (guard.failure_count, len(said)) == (100, 16)

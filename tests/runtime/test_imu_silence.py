@@ -1,0 +1,63 @@
+"""An IMU that falls silent is reported once, by `share track` and by agents."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from helpers.recordings import make_euroc
+
+from share.config import Config
+from share.runtime.offline_tracking import track
+from share.runtime.pipeline import read_frames
+from share.runtime.source import Source, open_source
+from share.sensors.measurement import IMU, Measurement
+from share.sensors.sequencer import SequencerCounters
+
+FRAMES = 60  # at 20 Hz
+
+
+def silenced(tmp_path: Path, from_s: float, to_s: float = 1e9) -> Source:
+    """A recording whose IMU gives nothing from one time to another."""
+    source = open_source(str(make_euroc(tmp_path / "recording", frames=FRAMES)))
+    all_of, first_ns = source.measurements, int(source.stamps()["cam0"][0])
+
+    def measurements() -> Iterator[Measurement]:
+        for one in all_of():
+            if one.stream != IMU or not from_s <= (one.stamp_ns - first_ns) * 1e-9 < to_s:
+                yield one
+
+    object.__setattr__(source, "measurements", measurements)  # it is frozen
+    return source
+
+
+def said_of(source: Source) -> list[str]:
+    said: list[str] = []
+    assert len(list(read_frames(source, Config(), SequencerCounters(), notify=said.append))) == FRAMES
+    return said
+
+
+@pytest.mark.parametrize(
+    ("from_s", "to_s", "told"), [(1.0, 9.0, "1.0 s"), (-9.0, 9.0, "0.0 s"), (0.5, 2.0, "0.5 s")]
+)
+def test_an_imu_that_stops_is_reported_once(tmp_path: Path, from_s: float, to_s: float, told: str) -> None:
+    (line,) = said_of(silenced(tmp_path, from_s, to_s))
+    assert line.startswith(f"no IMU samples from {told} on, for at least 1 s; ")
+
+
+def test_a_short_silence_is_not_reported(tmp_path: Path) -> None:
+    assert said_of(silenced(tmp_path, 1.0, 1.8)) == []
+
+
+def test_silence_of_a_live_camera_is_left_to_its_feed(tmp_path: Path) -> None:
+    source = silenced(tmp_path, 1.0)
+    object.__setattr__(source, "reports_silence", True)
+    assert said_of(source) == []
+
+
+def test_share_track_reports_it(tmp_path: Path) -> None:
+    said: list[str] = []
+    run = track(silenced(tmp_path, 1.0), Config(), lambda result: None, said.append)
+    assert ["no IMU samples" in line for line in said] == [True]
+    assert run.report["sequencer"]["imu_silent"] > 30

@@ -1,0 +1,269 @@
+"""A mapper that keeps dying: the edge goes on, pauses grow, a map that it dies of is set aside."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.map_changes import ANN, BOB, small_map
+
+from share.config import Config, EdgeConfig
+from share.errors import StoreError
+from share.protocol.edge import Edge
+from share.protocol.edge_events import ChangesSaved, TrackerLost
+from share.runtime import edge as edge_module
+from share.runtime.edge import EdgeRun
+from share.runtime.map_writer import MapWriter
+from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
+from share.runtime.mapper_supervision import MapperRestarts
+from share.runtime.worker_process import END
+from share.store.map_store import MapStore
+
+
+class Link:
+    """A link without agents."""
+
+    endpoint = "nowhere"
+
+    def receive(self, timeout_ms):
+        time.sleep(min(timeout_ms, 5) / 1e3)
+
+    def send(self, peer, frames): ...
+    def refusals(self):
+        return []
+
+    def agent_names(self, key): ...
+    def trouble(self): ...
+    def wake(self): ...
+    def close(self): ...
+
+
+def dies_of_a_map(inbox, answer, settings):
+    """A mapper that cannot take in any keyframe."""
+    while (message := inbox.get()) is not END:
+        if isinstance(message, RestoreMap):
+            if message.stored_map.keyframes:
+                os._exit(3)
+            answer(MapRestored())
+
+
+def dies_later(inbox, answer, settings):
+    """A mapper that dies of what comes after its map."""
+    while (message := inbox.get()) is not END:
+        if isinstance(message, RestoreMap):
+            answer(MapRestored())
+            time.sleep(0.1)
+            os._exit(3)
+
+
+@pytest.fixture
+def path(tmp_path):
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        store.write(small_map())
+    return tmp_path / "room.sqlite"
+
+
+@pytest.fixture
+def edge(path, monkeypatch):
+    """Makes an edge of a mapper, whose pauses are a hundredth as long."""
+    runs = []
+
+    def make(mapper):
+        monkeypatch.setattr(edge_module, "run_mapper", mapper)
+        died = MapperRestarts.record_death
+        monkeypatch.setattr(
+            MapperRestarts, "record_death", lambda self: pauses.append(died(self)) or pauses[-1] / 100
+        )
+        pauses, events = [], []
+        run = EdgeRun(Config(), Link(), None, events.append, MapStore.open(path))
+        thread = threading.Thread(target=run.run)
+        runs.append((run, thread))
+        thread.start()
+        return run, pauses, events
+
+    yield make
+    for run, thread in runs:
+        run.stop()
+        thread.join(30)
+        assert not thread.is_alive()
+
+
+def until(condition, seconds=30):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def reasons(events, name):
+    return [event["reason"] for event in events if event["event"] == name]
+
+
+@pytest.mark.long
+def test_a_map_that_mappers_die_of_is_set_aside(edge, path):
+    before = path.read_bytes()
+    run, pauses, events = edge(dies_of_a_map)
+    until(lambda: reasons(events, "map"))
+    assert pauses == [1, 2, 4]
+    assert len(reasons(events, "mapper died")) == 3
+    assert "its process ended with exit code 3; restarted in" in reasons(events, "mapper died")[0]
+    reason = "3 mappers in a row have died while restoring it"
+    line = f"the map file is renamed to room.sqlite.damaged-1: {reason}; a new one is started"
+    assert reasons(events, "map") == [line]
+    assert path.with_name("room.sqlite.damaged-1").read_bytes() == before
+    until(lambda: any(text.startswith("the mapper: its process ended") for text in run.report()["trouble"]))
+    time.sleep(0.5)
+    assert len(pauses) == 3  # the next lives
+    assert path.exists()  # and has a new map file
+    with MapStore.read(path.with_name("room.sqlite.damaged-1")) as old:
+        assert len(old.load().keyframes) == 40
+
+
+@pytest.mark.long
+def test_a_mapper_that_dies_of_something_else_keeps_its_map(edge, path):
+    _, pauses, events = edge(dies_later)
+    until(lambda: len(pauses) >= 5)
+    assert pauses[:5] == [1, 2, 4, 8, 16]
+    assert not reasons(events, "map")
+    assert not path.with_name("room.sqlite.damaged-1").exists()
+
+
+def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
+    """A ticket of the earlier map writer would acknowledge what the new one has not written."""
+    writers, handled = [], []
+    handle = Edge.handle
+
+    class Writer(MapWriter):
+        """Answers each change once more when its session is over."""
+
+        def __init__(self, store, on_saved, notify):
+            super().__init__(store, on_saved, notify)
+            writers.append(self)
+            self._answer = on_saved
+
+        def drain(self, timeout_s):
+            self._answer(ChangesSaved(10**6))
+            return super().drain(timeout_s)
+
+    monkeypatch.setattr(edge_module, "MapWriter", Writer)
+    monkeypatch.setattr(
+        Edge, "handle", lambda self, event, now: handled.append(event) or handle(self, event, now)
+    )
+    edge(dies_later)
+    until(lambda: len(writers) > 2)
+    assert ChangesSaved(10**6) not in handled
+
+
+class Store:
+    def __init__(self, load, writable=True):
+        self.load, self.writable, self.asides = load, writable, 0
+
+    def set_aside(self):
+        self.asides += 1
+        return Path("m.damaged-1")
+
+
+def raises(error):
+    def load():
+        raise error
+
+    return load
+
+
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError("no pose"), ValueError("x"), RecursionError("deep")])
+def test_a_map_that_cannot_be_interpreted_is_set_aside(error):
+    said, store = [], Store(raises(error))
+    assert MapperRestarts(store, 0.05, said.append).load_map() == (None, [])
+    assert store.asides == 1
+    aside = f"the map file is renamed to m.damaged-1: {type(error).__name__}: {error}; a new one is started"
+    assert said == [aside]
+
+
+def test_a_damaged_read_only_map_is_no_longer_used():
+    said = []
+    restarts = MapperRestarts(Store(raises(ValueError("x")), writable=False), 0.05, said.append)
+    assert restarts.load_map() == (None, [])
+    assert restarts.store is None
+    assert said == ["the map file is no longer used: ValueError: x; nothing is saved"]
+
+
+def test_runs_without_a_credential_are_unknown_to_an_edge_with_keys(path):
+    """Of the map of `small_map`, a key speaks for Ann."""
+    for has_keys, bob in ((True, None), (False, "")):
+        store = MapStore.read(path)
+        kept, known = MapperRestarts(store, 0.05, print, has_keys).load_map()
+        voices = {run.run_key: run.credential for run in kept.runs}
+        assert voices == {run.key: run.credential for run in known} == {ANN: "key of ann", BOB: bob}
+
+
+def test_a_failing_disk_does_not_set_the_map_aside():
+    store = Store(raises(StoreError("the map cannot be read: disk I/O error")))
+    with pytest.raises(StoreError):
+        MapperRestarts(store, 0.05, print).load_map()
+    assert store.asides == 0
+
+
+def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
+    run, _, events = edge(dies_later)
+    unreadable = StoreError("room: the map cannot be read: disk I/O error")
+    with monkeypatch.context() as patch:
+        patch.setattr(MapperRestarts, "load_map", lambda self: raises(unreadable)())
+        until(lambda: len(reasons(events, "map")) > 1)
+    assert reasons(events, "map")[0] == "room: the map cannot be read: disk I/O error; retried in 0.01 s"
+    session = run.report()["session"]
+    until(lambda: run.report()["session"] != session)
+
+
+def counts(inbox, answer, settings):
+    """A mapper that has looked up seven keyframes and dies."""
+    answer(MapperReport({"loops": {"tried": 7, "accepted": 2}, "place_ms": {"n": 7}, "maps": {}}))
+    time.sleep(0.1)
+    os._exit(3)
+
+
+@pytest.mark.long
+def test_counters_continue_after_a_mapper_died(edge):
+    run, _, events = edge(counts)
+    until(lambda: len(reasons(events, "mapper died")) >= 3)
+    until(lambda: run.report().get("place_ms", {}).get("n", 0) >= 21)
+    tried = run.report()["loops"]["tried"]
+    assert tried % 7 == 0
+    until(lambda: run.report()["loops"]["tried"] > tried)
+    loops = run.report()["loops"]
+    assert 2 * loops["tried"] == 7 * loops["accepted"]
+
+
+def test_a_dead_tracker_is_trouble_of_its_agent(monkeypatch):
+    """Not the edge's: else an agent could make /health 503 by its frames."""
+    made = edge_module.TrackerProcesses
+
+    def with_a_dead_one(settings, on_answer):
+        on_answer(TrackerLost("ann-0001", 0, "was ended by SIGKILL"))
+        return made(settings, on_answer)
+
+    monkeypatch.setattr(edge_module, "TrackerProcesses", with_a_dead_one)
+    run = EdgeRun(Config(edge=EdgeConfig(policy="streamed")), Link(), None, lambda fields: None)
+    thread = threading.Thread(target=run.run)
+    thread.start()
+    try:
+        until(lambda: run.report().get("refused"))
+        assert run.report()["trouble"] == []
+        assert run.report()["refused"] == ["agent's run ann-0001: its tracker was ended by SIGKILL"]
+    finally:
+        run.stop()
+        thread.join(30)
+
+
+def test_a_failed_report_is_shown_as_stale(edge, monkeypatch):
+    run, _, events = edge(dies_later)
+    until(run.report)
+    monkeypatch.setattr(edge_module, "_STALE_REPORT_S", 0.2)
+    with monkeypatch.context() as patch:
+        patch.setattr(Edge, "report", lambda self, mapper: {}["none"])
+        until(lambda: any("stuck" in line for line in run.report()["trouble"]))
+        assert [line["event"] for line in events].count("internal error") == 1
+    until(lambda: not any("stuck" in line for line in run.report()["trouble"]))

@@ -1,0 +1,101 @@
+"""A worker process: it answers, it dies, it ends with its parent."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from share.runtime.worker_process import END, Inbox, WorkerProcess
+
+LINES = """
+import sys, time
+from test_worker_process import doubles
+from share.runtime.worker_process import WorkerProcess
+if __name__ == "__main__":
+    c = WorkerProcess("doubles", doubles, (), lambda m: None, lambda how: None)
+    print(c.pid, flush=True)
+    time.sleep(60)
+"""
+
+
+INTERRUPTED = """
+from test_worker_process import doubles
+from share.runtime import worker_process as companion
+start = companion.SPAWN_CONTEXT.Process.start
+def interrupted(process):
+    start(process)
+    raise KeyboardInterrupt
+if __name__ == "__main__":
+    companion.SPAWN_CONTEXT.Process.start = interrupted
+    try:
+        companion.WorkerProcess("doubles", doubles, (), lambda m: None, lambda how: None)
+    except KeyboardInterrupt as error:
+        kept = error  # as a traceback that is printed keeps it
+    print("interrupted", flush=True)
+"""
+
+
+def doubles(inbox: Inbox, answer: Callable[[Any], None]) -> None:
+    while (number := inbox.get()) is not END:
+        if number == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        answer(2 * number)
+
+
+def test_it_answers_and_ends() -> None:
+    heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    lost: list[str] = []
+    companion = WorkerProcess("doubles", doubles, (), heard.put, lost.append)
+    for number in range(100):
+        companion.send(number)
+    companion.close()
+    assert [heard.get_nowait() for _ in range(100)] == [2 * n for n in range(100)]
+    assert not lost
+
+
+def test_its_death_is_reported_once() -> None:
+    lost: queue.SimpleQueue[str] = queue.SimpleQueue()
+    companion = WorkerProcess("doubles", doubles, (), lambda message: None, lost.put)
+    companion.send("die")
+    assert "SIGKILL" in lost.get(timeout=20)
+    companion.send(1)  # goes nowhere, and waits for nobody
+    companion.close()
+    assert lost.empty()
+
+
+def test_it_ends_with_its_parent() -> None:
+    here = os.path.dirname(__file__)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([here, *sys.path])}
+    parent = subprocess.Popen([sys.executable, "-c", LINES], stdout=subprocess.PIPE, env=environment)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    deadline = time.monotonic() + 20
+    while _alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not _alive(pid)
+
+
+def test_it_ends_if_the_parent_is_interrupted_before_close() -> None:
+    here = os.path.dirname(__file__)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([here, *sys.path])}
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, env=environment, timeout=20
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
+
+
+def _alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
