@@ -18,11 +18,9 @@ class SequencerConfig:
     sync_tolerance_ms: float = 5.0  # largest difference of the stamps of one frame's cameras
     imu_silent_ms: float = 100.0  # longest wait of a frame for partner images and IMU samples, in stream time
     reorder_ms: float = 0.0  # disorder within a stream that is corrected; delays frames by as much
-    gap_factor: float = 2.5  # a step longer than this many frame intervals is a gap
-    max_jump_s: float = 10.0  # a longer step is accepted after three consistent samples; a backward one never
 
     def __post_init__(self) -> None:
-        _require_positive(self, "imu_silent_ms", "gap_factor", "max_jump_s")
+        _require_positive(self, "imu_silent_ms")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from share.config import SequencerConfig
 from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
@@ -110,7 +109,7 @@ def repair_samples(
     rates = {
         name: file.read_number(f"{file.streams[name]}/info", "fps", 30.0, *_RATE_RANGE_HZ) for name in streams
     }
-    intake = SampleProcessor(rates, SequencerConfig().max_jump_s)
+    intake = SampleProcessor(rates)
     for sample in file.samples(losses, images):
         yield from intake.feed(sample)
     yield from intake.flush()

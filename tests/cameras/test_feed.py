@@ -70,7 +70,7 @@ def test_why_a_camera_is_still_away_is_said_once_unless_it_is_just_not_there() -
 
     first = answers[0]
     assert isinstance(first, Fake)
-    feed = CameraFeed(connect, None, RATES, 10.0, said.append, SampleQueue(), quick)
+    feed = CameraFeed(connect, None, RATES, said.append, SampleQueue(), quick)
     feed.open()
     first.sink(DeviceSample("cam0", 10**9, None, time.monotonic_ns()))
     reader = threading.Thread(target=lambda: list(feed.measurements()), daemon=True)
@@ -112,7 +112,6 @@ def test_a_stream_that_is_needed_and_never_comes_ends_it_in_a_line_after_one_res
         lambda serial, epoch: Playing(streams=("accel", "gyro")),
         None,
         RATES,
-        10.0,
         said.append,
         SampleQueue(),
         quick,
@@ -135,7 +134,7 @@ def test_depth_beside_stereo_is_done_without_and_welcome_again() -> None:
     said: list[str] = []
     rates = RATES | {"cam1": 30.0, "depth": 30.0}
     camera = Playing(streams=("cam0", "cam1", "accel", "gyro"))
-    feed = CameraFeed(lambda serial, epoch: camera, None, rates, 10.0, said.append, SampleQueue(), quick)
+    feed = CameraFeed(lambda serial, epoch: camera, None, rates, said.append, SampleQueue(), quick)
     feed.open()
     reader = threading.Thread(target=lambda: list(feed.measurements()), daemon=True)
     reader.start()
@@ -152,7 +151,7 @@ def test_depth_beside_stereo_is_done_without_and_welcome_again() -> None:
 
 def test_gaps_are_told_by_the_rates_that_the_camera_has() -> None:
     slow = Fake(rates_hz=RATES | {"accel": 100.0})
-    feed = CameraFeed(lambda serial, epoch: slow, None, RATES, 10.0, print, SampleQueue())
+    feed = CameraFeed(lambda serial, epoch: slow, None, RATES, print, SampleQueue())
     feed.open()
     for at_ms in range(0, 1000, 10):
         for stream in ("accel", "gyro"):

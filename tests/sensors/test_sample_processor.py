@@ -23,13 +23,13 @@ def image(stamp_ns: int, arrived_ns: int = 0, **more: int) -> DeviceSample:
 
 
 def test_time_goes_on_over_a_wrap() -> None:
-    intake = SampleProcessor(RATES, 10.0)
+    intake = SampleProcessor(RATES)
     assert stamps(intake, image(WRAP_NS - 10 * MS), image(20 * MS)) == [WRAP_NS - 10 * MS, WRAP_NS + 20 * MS]
     assert intake.counts()["wraps"] == 1
 
 
 def test_a_clock_that_began_anew_goes_on_as_far_as_the_hosts_did() -> None:
-    intake = SampleProcessor(RATES, 10.0)
+    intake = SampleProcessor(RATES)
     told = stamps(
         intake,
         image(900 * MS, arrived_ns=5000 * MS),
@@ -41,7 +41,7 @@ def test_a_clock_that_began_anew_goes_on_as_far_as_the_hosts_did() -> None:
 
 
 def test_what_was_left_over_from_before_a_reconnection_is_left_out() -> None:
-    intake = SampleProcessor(RATES, 10.0)
+    intake = SampleProcessor(RATES)
     told = stamps(
         intake,
         image(900 * MS, arrived_ns=5000 * MS),
@@ -66,7 +66,7 @@ def of_imu(at_ms: int, stream: str = "gyro", epoch: int = 0, off_ms: int = 0) ->
 
 
 def test_where_the_device_has_no_clock_the_hosts_is_time() -> None:
-    intake = SampleProcessor(RATES, 10.0)
+    intake = SampleProcessor(RATES)
     assert stamps(intake, *(foreign(at) for at in range(0, 1001, 100))) == []
     assert stamps(intake, foreign(1100)) == [HOST_NS + at * MS for at in range(0, 1101, 100)]
     assert stamps(intake, foreign(1200)) == [HOST_NS + 1200 * MS]
@@ -75,14 +75,14 @@ def test_where_the_device_has_no_clock_the_hosts_is_time() -> None:
 
 
 def test_a_short_recording_by_the_hosts_clock_is_used_at_its_end() -> None:
-    intake = SampleProcessor(RATES, 10.0)
+    intake = SampleProcessor(RATES)
     assert stamps(intake, foreign(0), foreign(33)) == []
     assert [m.stamp_ns - HOST_NS for m in intake.flush()] == [0, 33 * MS]
     assert list(intake.flush()) == []
 
 
 def test_images_of_the_hosts_clock_leave_the_imu_alone_and_keep_to_it() -> None:
-    intake, images, imu = SampleProcessor(RATES | {"cam1": 30.0}, 10.0), [], []
+    intake, images, imu = SampleProcessor(RATES | {"cam1": 30.0}), [], []
     for at in range(4000):
         more = [foreign(at), foreign(at, "cam1")] if at % 33 == 0 else []
         for sample in (*more, of_imu(at, "accel", off_ms=5000), of_imu(at, off_ms=5000)):
@@ -100,7 +100,7 @@ def test_images_of_the_hosts_clock_leave_the_imu_alone_and_keep_to_it() -> None:
 
 
 def test_a_few_images_of_the_hosts_clock_do_not_move_the_cameras() -> None:
-    intake, told = SampleProcessor({"cam0": 30.0}, 10.0), []
+    intake, told = SampleProcessor({"cam0": 30.0}), []
     for k in range(3000):
         at = 33 * k
         told += stamps(intake, foreign(at) if k % 500 > 497 else of_imu(at, "cam0", off_ms=70_000))
@@ -109,14 +109,14 @@ def test_a_few_images_of_the_hosts_clock_do_not_move_the_cameras() -> None:
 
 
 def test_a_clock_of_the_device_that_comes_late_takes_over() -> None:
-    intake = SampleProcessor(RATES, 10.0)
+    intake = SampleProcessor(RATES)
     stamps(intake, *(foreign(at) for at in range(0, 2001, 100)))
     assert stamps(intake, of_imu(2050, "cam0"), foreign(2100)) == [HOST_NS + 2050 * MS, HOST_NS + 2100 * MS]
     assert intake.placed_by_arrival["cam0"] == 1
 
 
 def test_after_a_reconnection_images_of_the_hosts_clock_wait_for_nobody() -> None:
-    intake = SampleProcessor(RATES, 10.0)
+    intake = SampleProcessor(RATES)
     told = stamps(
         intake,
         of_imu(100, "cam0", off_ms=900),
@@ -128,7 +128,7 @@ def test_after_a_reconnection_images_of_the_hosts_clock_wait_for_nobody() -> Non
 
 
 def test_a_stream_that_was_not_asked_for_is_left_out() -> None:
-    intake = SampleProcessor({"cam0": 30.0}, 10.0)
+    intake = SampleProcessor({"cam0": 30.0})
     assert stamps(intake, DeviceSample("gyro", MS, (0, 0, 0), 0), image(2 * MS)) == [2 * MS]
 
 
@@ -164,7 +164,7 @@ def fed(intake: SampleProcessor, stream: str, begin_ms: int, count: int, arrived
 
 @pytest.mark.parametrize("before_ms", [900_000, 3_000])
 def test_a_clock_that_begins_anew_without_a_word_is_noticed(before_ms: int) -> None:
-    intake = SampleProcessor(RATES, 10.0)
+    intake = SampleProcessor(RATES)
     assert fed(intake, "cam0", before_ms, 100, 7_000)[-1] == before_ms + 495
     told = fed(intake, "cam0", 0, 100, 7_500)
     assert told[0] == pytest.approx(before_ms + 500 + 250, abs=10)  # 0.25 s are the price of being sure
@@ -174,7 +174,7 @@ def test_a_clock_that_begins_anew_without_a_word_is_noticed(before_ms: int) -> N
 
 
 def test_late_and_doubled_samples_are_no_new_clock() -> None:
-    intake = SampleProcessor(RATES, 10.0)
+    intake = SampleProcessor(RATES)
     fed(intake, "cam0", 10_000, 100, 0)
     for again in range(20):  # the same 40 ms twenty times: doubled, not a clock
         assert fed(intake, "cam0", 10_200, 8, 500 + 40 * again) == []

@@ -10,7 +10,6 @@ from share.cameras.realsense.camera import RealSenseCamera
 from share.cameras.realsense.devices import parse_serial
 from share.cameras.realsense.streams import StreamRequest
 from share.cameras.sample_queue import NewestImageQueue, SampleQueue
-from share.config import SequencerConfig
 from share.recordings.calibration import Calibration
 from share.sensors.measurement import CAM0
 
@@ -18,7 +17,6 @@ from share.sensors.measurement import CAM0
 def make_feed(
     spec: str,
     request: StreamRequest,
-    config: SequencerConfig,
     notify: Callable[[str], None],
     queue: SampleQueue,
 ) -> CameraFeed:
@@ -27,7 +25,6 @@ def make_feed(
         lambda serial, epoch: RealSenseCamera(request, serial, epoch=epoch, notify=notify),
         parse_serial(spec),
         request.rates_hz(),
-        config.max_jump_s,
         notify,
         queue,
     )
@@ -36,7 +33,6 @@ def make_feed(
 def open_live(
     spec: str,
     request: StreamRequest,
-    config: SequencerConfig,
     notify: Callable[[str], None],
     calibration: Calibration | None = None,
 ) -> LiveSource:
@@ -46,5 +42,5 @@ def open_live(
     """
     rates = request.rates_hz()
     queue = NewestImageQueue(MAX_WAITING_FRAMES * len(request.cameras))
-    feed = make_feed(spec, request, config, notify, queue)
+    feed = make_feed(spec, request, notify, queue)
     return LiveSource(feed, rates[CAM0], calibration, request.imu_range())
