@@ -6,8 +6,8 @@ import numpy as np
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig, rays
 from share.vision import corners
+from share.vision.corners import field_mask
 from share.vision.depth import disparity_per_rho
-from share.vision.mask import field_mask
 from share.vision.orb import detect_orb
 
 FISHEYE = Camera(256, 256, 95.0, 95.0, 127.0, 128.0, (0.0035, 0.0007, -0.002, 0.0002), "equidistant")

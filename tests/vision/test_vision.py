@@ -11,7 +11,7 @@ from share.lab.emulate.motion import walk
 from share.lab.emulate.plain.render import PlainRoomRenderer
 from share.lab.emulate.plain.room import make_room
 from share.types import Frame
-from share.vision import corners, depth, epipolar, optical_flow
+from share.vision import corners, depth, optical_flow
 from share.vision.orb import detect_orb, make_view
 
 
@@ -101,7 +101,7 @@ def test_what_is_infinitely_far_has_no_depth(scene):
 
 
 def test_the_whole_line_is_searched(scene):
-    known, disparity_error = stereo_by(epipolar.search_depth, scene)
+    known, disparity_error = stereo_by(depth.search_depth, scene)
     assert known.mean() > 0.7
     assert (disparity_error < 1.5).mean() > 0.95
 
@@ -111,8 +111,8 @@ def test_what_repeats_along_the_line_has_no_depth():
     image = stripes + np.linspace(0, 20, 480).astype(np.uint8)[:, None]
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
     px = np.array([[300.0, 200.0], [400.0, 300.0]], np.float32)
-    assert np.isnan(epipolar.search_depth(image, image, rig, px, CAMERA.normalise(px.astype(float)))).all()
-    assert len(epipolar.search_depth(image, image, rig, px[:0], np.zeros((0, 2)))) == 0
+    assert np.isnan(depth.search_depth(image, image, rig, px, CAMERA.normalise(px.astype(float)))).all()
+    assert len(depth.search_depth(image, image, rig, px[:0], np.zeros((0, 2)))) == 0
 
 
 def test_depth_of_an_unregistered_camera():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from share.geometry.peak import subsample_peak
+from share.geometry.interpolation import subsample_peak
 
 
 @pytest.mark.parametrize("top", [-0.4, 0.0, 0.3])
