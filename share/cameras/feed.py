@@ -142,6 +142,11 @@ class CameraFeed:
         return self._last_sample_ns.get(CAM0)
 
     @property
+    def images_dropped(self) -> int:
+        """Number of cam0 images dropped for newer ones because the reader was too slow."""
+        return self.queue.dropped.get(CAM0, 0)
+
+    @property
     def trouble(self) -> str:
         """What is wrong with the camera now, "" if nothing."""
         health = self.health

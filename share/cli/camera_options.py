@@ -95,7 +95,7 @@ def open_source(
         return open_source(source, calib, frames)
     if frames is not None:
         raise UsageError("--frames works only with a recording, not with a live camera; leave it out")
-    from share.cameras.realsense.source import open_live
+    from share.cameras.realsense.camera import open_live
     from share.runtime.source import read_given_calibration
 
     calibration = read_given_calibration(calib)

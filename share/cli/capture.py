@@ -59,7 +59,7 @@ def capture(
     \b
     Example:  share capture --out walk.mcap --seconds 60
     """
-    from share.cameras.realsense.source import make_feed
+    from share.cameras.realsense.camera import make_feed
     from share.cameras.realsense.streams import StreamRequest
     from share.cameras.sample_queue import SampleQueue
     from share.runtime.capture import Capture

@@ -15,8 +15,8 @@ from helpers.software_camera import BASELINE, T_GYRO_IR, Listed, SoftwareCamera
 from share.cameras.realsense import camera as adapter
 from share.cameras.realsense.camera import RealSenseCamera
 from share.cameras.realsense.devices import AttachedDevice, choose_device
-from share.cameras.realsense.factory import read_camera as factory_camera
-from share.cameras.realsense.frames import scale_depth
+from share.cameras.realsense.sdk_data import read_camera as factory_camera
+from share.cameras.realsense.sdk_data import read_extrinsics, scale_depth
 from share.cameras.realsense.streams import StreamRequest
 from share.errors import ShareError, UsageError
 from share.recordings.mcap import ros_messages as ros
@@ -112,8 +112,6 @@ def test_the_factory_calibration_becomes_a_rig_with_the_body_in_the_imu(camera: 
 
 
 def test_a_rotation_of_the_sdk_is_read_column_by_column() -> None:
-    from share.cameras.realsense.factory import read_extrinsics
-
     class Told:
         rotation, translation = (0, 1, 0, -1, 0, 0, 0, 0, 1), (1, 2, 3)  # rs2_extrinsics: column-major
 

@@ -134,7 +134,7 @@ def test_a_tracker_slower_than_its_camera_takes_the_newest_and_all_of_the_imu(ro
 
     def slowly(result: TrackResult) -> None:
         stamp_ns = source.feed.processor.streams["cam0"].last_ns
-        waited.append(time.monotonic_ns() - source.arrived_ns(stamp_ns or 0))
+        waited.append(time.monotonic_ns() - source.feed.arrived_ns(stamp_ns or 0))
         time.sleep(0.15)
 
     room.begin(source.feed, pause_s=0.03)
