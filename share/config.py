@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from share.plain_data import from_mapping, load_yaml
+from share.plain_data import from_mapping
 from share.retired_settings import refuse_retired
 
 
@@ -363,6 +363,8 @@ def _require_positive(config: Any, *names: str) -> None:
 
 def load_config(text: str, where: str = "configuration") -> Config:
     """Return a `Config` from YAML text. Raises ConfigError naming the key and the remedy."""
+    from share.strict_yaml import load_yaml
+
     data = load_yaml(text, where)
     refuse_retired(data, where)
     return from_mapping(Config, {} if data is None else data, where)

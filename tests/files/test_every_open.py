@@ -34,7 +34,7 @@ DOORS = {
     "files/writing.py",
     "files/arrays.py",
     "files/json_file.py",
-    "plain_data.py",
+    "strict_yaml.py",
     "files/sqlite_file.py",
 }
 

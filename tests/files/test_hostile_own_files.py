@@ -218,8 +218,8 @@ def test_scores_of_other_types(tmp_path, row):
         ("edge: {max_agents: .inf}", "max_agents: expected"),
         ("edge: {max_agents: 1" + "0" * 50 + "}", "max_agents: expected a number from 0 to 1e"),
         ("edge: {max_agents: 1e400}", "max_agents: expected"),
-        ("edge: [1]", "edge: expected a mapping"),
-        ("5", "expected a mapping"),
+        ("edge: [1]", "edge: expected keys and values"),
+        ("5", "expected keys and values"),
     ],
 )
 def test_settings_that_nobody_knows(tmp_path, text, says):

@@ -21,7 +21,6 @@ from share.files.line_file import LineFile
 from share.files.reading import path_inside, read_bytes
 from share.files.writing import atomic_write, open_new
 from share.files.yaml_file import read_yaml
-from share.plain_data import load_yaml
 from share.recordings.calibration import read_calibration
 from share.recordings.images import EncodedImage, decode_gray, image_header
 from share.recordings.mcap.recorder import Recorder
@@ -30,6 +29,7 @@ from share.recordings.tables import longest_nondecreasing, read_table
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
+from share.strict_yaml import load_yaml
 
 pytestmark = pytest.mark.usefixtures("soon")
 
