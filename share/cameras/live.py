@@ -9,11 +9,12 @@ from share.cameras.feed import CameraFeed
 from share.errors import UsageError
 from share.geometry.camera import Rig
 from share.recordings.calibration import Calibration
-from share.recordings.device_match import device_mismatch, fit_to_device, uncalibrated_sensors
+from share.recordings.calibration_match import device_mismatch, fit_to_device, unused_streams
 from share.recordings.recording import Source
 from share.recordings.trajectory import Trajectory
 from share.sensors.imu_check import ImuRange
 from share.sensors.measurement import CAM0, Measurement
+from share.sensors.sequencer import rig_streams
 from share.types import I64
 
 MAX_WAITING_FRAMES = 2  # for the tracker
@@ -30,8 +31,8 @@ def choose_rig(
         rig = fit_to_device(calibration.rig, factory)
     except ValueError as error:
         raise UsageError(f"{calibration.where}: {error}") from None
-    warning = device_mismatch(calibration.serials, serial)
-    return rig, (*uncalibrated_sensors(rig, factory), *([] if warning is None else [warning]))
+    delivered = {name: name for name in rig_streams(factory)}
+    return rig, unused_streams(delivered, rig) + device_mismatch(calibration.serials, serial)
 
 
 class LiveSource(Source):

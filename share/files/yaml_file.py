@@ -7,7 +7,7 @@ from typing import Any
 
 from share.config import Config, load_config
 from share.errors import ConfigError, UsageError
-from share.files.reading import MAX_SETTINGS_BYTES, read_text
+from share.files.reading import MAX_SETTINGS_BYTES, read_errors, read_text
 from share.plain_data import checked_mapping, describe_value, parse_numbers, parse_pose
 from share.types import F64
 
@@ -59,14 +59,8 @@ class Section:
 
 def read_yaml_text(path: Path) -> str:
     """Read the text of a YAML file. Raises ConfigError."""
-    try:
+    with read_errors(path, ConfigError, missing="no such file; give the calibration with --calib"):
         return read_text(path, MAX_SETTINGS_BYTES, "utf-8-sig")  # some editors begin with a byte-order mark
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; give the calibration with --calib") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not a text file") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def read_yaml(path: Path) -> Section:
@@ -83,9 +77,6 @@ def read_yaml(path: Path) -> Section:
 
 def read_settings(path: Path) -> Config:
     """Read a file of settings. Raises ConfigError that names the key and the valid values, UsageError."""
-    try:
+    with read_errors(path, UsageError):
         text = read_text(path, MAX_SETTINGS_BYTES)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not a text file"
-        raise UsageError(f"{path}: cannot read the configuration: {reason}") from None
     return load_config(text, str(path))

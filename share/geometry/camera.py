@@ -274,6 +274,11 @@ class Rig:
         if not abs(self.timeshift_s) <= MAX_TIMESHIFT_S:
             raise ValueError(f"timeshift_s: {self.timeshift_s} is not within {MAX_TIMESHIFT_S:g} s")
 
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """The cameras by name: cam0, cam1, depth."""
+        return {k: c for k, c in (("cam0", self.cam0), ("cam1", self.cam1), ("depth", self.depth)) if c}
+
     def without_imu(self) -> Rig:
         """Return the same cameras without an IMU: the body is cam0."""
         return replace(self, imu=None, T_body_cam0=np.eye(4), timeshift_s=0.0)

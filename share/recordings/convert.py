@@ -13,7 +13,6 @@ from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise
 from share.geometry.lens import EQUIDISTANT
 from share.recordings.images import EncodedImage, encode_png, image_format
-from share.recordings.mcap import rig as ros_rig
 from share.recordings.mcap.recorder import Recorder
 from share.recordings.recording import Source
 from share.recordings.trajectory import Trajectory, format_tum
@@ -99,7 +98,7 @@ def _write_asl(source: Source, root: Path, progress: Progress) -> None:
     T_imu = {CAM0: rig.T_body_cam0}
     if rig.T_cam1_cam0 is not None:
         T_imu[CAM1] = rig.T_body_cam0 @ se3.inverse(rig.T_cam1_cam0)
-    for stream, camera in ros_rig.rig_cameras(rig).items():
+    for stream, camera in rig.cameras.items():
         (root / stream / "data").mkdir(parents=True)
         (root / stream / "sensor.yaml").write_text(_camera_yaml(camera, T_imu[stream], source.rate_hz))
         listings[stream] = ["#timestamp [ns],filename"]

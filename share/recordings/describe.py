@@ -48,8 +48,7 @@ def describe_stream(stamps: I64) -> dict[str, Any]:
 
 def describe_rig(rig: Rig) -> dict[str, Any]:
     """Return the cameras (resolution, intrinsics, field of view, baseline) and the IMU of a rig."""
-    cameras = {"cam0": rig.cam0, "cam1": rig.cam1, "depth": rig.depth}
-    out: dict[str, Any] = {name: _camera(camera) for name, camera in cameras.items() if camera}
+    out: dict[str, Any] = {name: _camera(camera) for name, camera in rig.cameras.items()}
     if rig.cam1:
         out["baseline_m"] = round(rig.baseline, 6)
     if rig.imu:

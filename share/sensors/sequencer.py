@@ -60,8 +60,7 @@ class SequencerCounters:
 
 def rig_streams(rig: Rig) -> tuple[str, ...]:
     """Return the streams of a rig's frames."""
-    options = ((CAM0, True), (CAM1, rig.cam1), (DEPTH, rig.depth), (IMU, rig.imu))
-    return tuple(name for name, is_present in options if is_present)
+    return (*rig.cameras, *((IMU,) if rig.imu else ()))
 
 
 def sequence_frames(

@@ -493,7 +493,7 @@ def test_streams_that_are_not_used_are_named(stereo, share, tmp_path):
     (tmp_path / "camchain.yaml").write_text(CAMCHAIN)
     done = share("track", recording, "--calib", tmp_path / "camchain.yaml")
     assert done.code == 0
-    assert done.err == "share: stereo: imu0 is not used: the calibration has no imu0\n"
+    assert done.err == "share: stereo: imu0 is not used: the calibration has no imu\n"
 
 
 def test_ctrl_c_on_track(stereo, tmp_path):

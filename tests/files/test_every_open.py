@@ -77,7 +77,6 @@ ALLOWED = {
     ("odometry/error_model/network.py", "InferenceSession"): "after onnx_header has looked through it",
     ("cameras/realsense/camera.py", "open"): "a camera",
     ("runtime/source.py", "open"): "a reader's own",
-    ("recordings/tables.py", "loadtxt"): "from lines that are there",
     ("recordings/tables.py", "read_text"): "its own, through the door",
     ("net/tcp.py", "open"): KERNEL,
     ("lab/peer_trackers/basalt.py", "read_text"): KERNEL,

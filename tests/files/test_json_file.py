@@ -24,7 +24,7 @@ def test_what_is_not_there_or_not_text_is_named(tmp_path):
     with pytest.raises(DataError, match=r"report\.json: cannot be read: No such file"):
         read_json(tmp_path / "report.json")
     (tmp_path / "report.json").write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(DataError, match=r"report\.json: is damaged"):
+    with pytest.raises(DataError, match=r"report\.json: is not a text file"):
         read_json(tmp_path / "report.json")
 
 

@@ -15,7 +15,7 @@ from helpers.special_files import KINDS, special
 from share.config import Config
 from share.errors import DataError, ShareError
 from share.lab.calibrate.imu_table import read_imu
-from share.recordings import realsense_db3
+from share.recordings import realsense
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
@@ -164,11 +164,7 @@ def test_samples_that_are_not_finite_and_images_that_are_none(path):
 
 
 def test_a_message_larger_than_any_is_not_read(path, monkeypatch):
-    monkeypatch.setattr(
-        realsense_db3,
-        "_DATA_OR_NULL",
-        realsense_db3._DATA_OR_NULL.replace(str(realsense_db3._MAX_MESSAGE_BYTES), "100000"),
-    )
+    monkeypatch.setattr(realsense, "MAX_MESSAGE_BYTES", 100_000)
     change(path, "UPDATE messages SET data = zeroblob(200000) WHERE id = (SELECT id FROM messages "
            f"WHERE topic_id = {topic(path, EYE_DATA)} LIMIT 1)")  # fmt: skip
     assert read(path) == (23, {"samples of cam0": 1})

@@ -19,9 +19,8 @@ from share.geometry import se3
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SaveLink, StoredMap
 from share.recordings.images import ArrayImage
-from share.recordings.mcap.chunks import MAX_CHUNK_BYTES
-from share.recordings.mcap.recorder import Recorder
-from share.recordings.mcap.recover import recover_recording
+from share.recordings.mcap.file import MAX_CHUNK_BYTES
+from share.recordings.mcap.recorder import Recorder, recover_recording
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.measurement import Measurement
@@ -57,8 +56,7 @@ def test_a_chunk_is_unpacked_no_further_than_it_says(tmp_path, compression, said
     import zstandard
     from mcap.records import Chunk
 
-    from share.recordings.mcap.chunks import chunk_records
-    from share.recordings.mcap.file import damage_errors
+    from share.recordings.mcap.file import chunk_records, damage_errors
 
     pack = zstandard.ZstdCompressor().compress if compression == "zstd" else lz4.frame.compress
     data = pack(bytes(50 * 10**6))

@@ -124,7 +124,7 @@ def test_calib_overrides(euroc, tmp_path):
     assert source.rig.cam0.fx == 77
     assert source.rig.baseline == pytest.approx(0.2)
     assert source.rig.kind == "stereo"
-    assert source.notes == ("imu0 is not used: the calibration has no imu0",)
+    assert source.notes == ("imu0 is not used: the calibration has no imu",)
     with pytest.raises(UsageError, match="--calib"):
         open_source(str(euroc), calib=str(tmp_path / "no.yaml"))
     shutil.rmtree(euroc / "mav0" / "cam1")

@@ -20,7 +20,7 @@ from share.cameras.realsense.sdk_data import read_extrinsics, scale_depth
 from share.cameras.realsense.streams import StreamRequest
 from share.errors import ShareError, UsageError
 from share.recordings.mcap import ros_messages as ros
-from share.recordings.mcap.images import encode_raw
+from share.recordings.mcap.ros_messages import encode_raw
 from share.sensors.profile import load_profile
 from share.sensors.sample_processor import DeviceSample
 

@@ -14,8 +14,7 @@ from helpers.recordings import STEP_NS, make_tum
 
 from share.errors import DataError, ShareError, UsageError
 from share.recordings.convert import to_mcap
-from share.recordings.mcap.recorder import Recorder
-from share.recordings.mcap.recover import recover_recording
+from share.recordings.mcap.recorder import Recorder, recover_recording
 from share.runtime.source import open_source
 
 
@@ -99,7 +98,7 @@ def test_a_disk_that_cannot_be_read_to_its_end_costs_what_is_behind(tmp_path, mo
             return super().readinto(buffer)
 
     monkeypatch.setattr(
-        "share.recordings.mcap.recover.open_regular", lambda name: io.BufferedReader(Worn(name, "rb"))
+        "share.recordings.mcap.recorder.open_regular", lambda name: io.BufferedReader(Worn(name, "rb"))
     )
     result = recover_recording(path, tmp_path / "good.mcap")
     monkeypatch.undo()
@@ -152,7 +151,7 @@ def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
     out = tmp_path / "walk.mcap"
     code = (
         "import sys, time; sys.path[:0] = sys.argv[2:]\n"
-        "from pathlib import Path; from live import RIG, live\n"
+        "from pathlib import Path; from helpers.live import RIG, live\n"
         "from share.recordings.mcap.recorder import Recorder\n"
         "with Recorder(Path(sys.argv[1]), RIG) as recorder:\n"
         "    for m in live(10**6):\n"
