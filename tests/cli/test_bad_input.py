@@ -316,7 +316,7 @@ def test_images_of_another_size(stereo, share, tmp_path):
 
 
 CONFIGS = {
-    "missing": (None, "config.yaml: cannot read the configuration: No such file"),
+    "missing": (None, "config.yaml: cannot be read: No such file"),
     "no YAML": ("tracker: {", "config.yaml, line 1: not valid YAML"),
     "twice": ("agent: {}\nagent: {}", "config.yaml, line 2: not valid YAML: duplicate key 'agent'"),
     "a list": ("- tracker", "config.yaml: expected keys and values, found list"),
