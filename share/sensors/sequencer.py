@@ -84,7 +84,7 @@ def sequence_frames(
     without any effect on the frames. Memory is bounded by these times.
     """
     repair = StampRepair()
-    merger = _Merger(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
+    merger = FrameMerger(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
     for measurement in measurements:
         if measurement.stream in merger.buffers:
             for stamp, usable in repair.feed(measurement):
@@ -99,7 +99,7 @@ def sequence_frames(
     _update_counters(repair, counters, merger)
 
 
-def _update_counters(repair: StampRepair, counters: SequencerCounters, merger: _Merger) -> None:
+def _update_counters(repair: StampRepair, counters: SequencerCounters, merger: FrameMerger) -> None:
     counters.wraps, counters.jumps, counters.strays = repair.wraps, repair.jumps, repair.strays
     counters.backward = merger.backward + repair.past
 
@@ -147,7 +147,7 @@ class _Buffer:
         return out
 
 
-class _Merger:
+class FrameMerger:
     """The state of `sequence_frames`: buffers of all streams, and which frames are complete."""
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A calibration and the device at hand: which may be another, and which cannot be."""
+"""A calibration is matched to the device and the streams at hand."""
 
 from dataclasses import replace
 
@@ -32,12 +32,12 @@ RGBD = replace(ALL, cam1=None, T_cam1_cam0=None)
         (("1", "2"), "3", "1, 2"),
     ],
 )
-def test_another_device_is_named_with_the_one_at_hand(said, serial, named):
+def test_a_calibration_of_another_device_gives_a_warning(said, serial, named):
     start = f"the calibration is of device {named}, this is {serial}: "
     assert [text[: len(start)] for text in device_mismatch(said, serial)] == ([start] if named else [])
 
 
-def test_cameras_that_are_not_read_are_left_out():
+def test_unused_cameras_are_removed_from_the_rig():
     assert fit_to_device(ALL, STEREO).kind == "stereo" and fit_to_device(ALL, STEREO).depth is None
     assert (fit_to_device(ALL, RGBD).cam1, fit_to_device(ALL, RGBD).depth) == (None, LENS)
     assert fit_to_device(STEREO, ALL).depth is None
@@ -49,7 +49,7 @@ def test_cameras_that_are_not_read_are_left_out():
     assert unused_streams(imu, moved) == ()
 
 
-def test_images_of_another_size_cannot_be_meant():
+def test_a_calibration_for_another_image_size_is_refused():
     larger = replace(STEREO, cam0=replace(LENS, width=848), cam1=replace(LENS, width=848))
     with pytest.raises(ValueError, match="its cam0 is 848x480, the camera sends 640x480; add --mode 848x480"):
         fit_to_device(larger, STEREO)
