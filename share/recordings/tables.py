@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from decimal import Decimal, InvalidOperation
+from decimal import ROUND_DOWN, Context, Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,6 +20,7 @@ from share.types import F64, I64
 
 Row = TypeVar("Row", bound=tuple[Any, ...])
 MAX_STAMP_NS = 2**62  # of either sign: 146 years; differences still fit 64 bits
+_TRUNCATING = Context(prec=60, rounding=ROUND_DOWN)
 _PROBE_BYTES = 4096  # searched for a NUL, the sign of a binary file
 
 
@@ -162,25 +163,15 @@ def parse_ns(text: str, where: str) -> int:
 
 def parse_seconds(text: str, where: str) -> int:
     """Parse decimal seconds, with or without exponent, to integer nanoseconds without floats; truncates."""
-    if "e" in text.lower():
-        return _parse_exponent_seconds(text, where)
-    seconds, _, fraction = text.partition(".")
-    digits = seconds.lstrip("+-")
-    if not (digits + fraction).isdecimal() or len(digits) > 10:
-        raise DataError(f"{where}: stamp '{text:.40}' is not a time in seconds")
-    stamp = int(digits or "0") * 10**9 + int((fraction + "000000000")[:9])
-    return _checked_stamp(-stamp if seconds.startswith("-") else stamp, text, where)
-
-
-def _parse_exponent_seconds(text: str, where: str) -> int:
-    """Parse seconds with an exponent, such as 1.4e+09."""
     try:
+        if "_" in text:  # which Decimal ignores
+            raise InvalidOperation
         seconds = Decimal(text)
+        in_range = -(10**10) < seconds < 10**10  # check before int(): 1e999999 has a million digits
     except InvalidOperation:
         raise DataError(f"{where}: stamp '{text:.40}' is not a time in seconds") from None
-    if not -(10**10) < seconds < 10**10:  # check before int(): 1e999999 has a million digits
-        raise DataError(f"{where}: stamp {text:.40} is out of range")
-    return _checked_stamp(int(seconds * 10**9), text, where)
+    stamp_ns = int(_TRUNCATING.multiply(seconds, 10**9)) if in_range else MAX_STAMP_NS
+    return _checked_stamp(stamp_ns, text, where)
 
 
 def _checked_stamp(stamp_ns: int, text: str, where: str) -> int:
