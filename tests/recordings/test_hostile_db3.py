@@ -16,6 +16,7 @@ from share.config import Config
 from share.errors import DataError, ShareError
 from share.lab.calibrate.imu_table import read_imu
 from share.recordings import realsense
+from share.recordings.calibration import kalibr_texts
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
@@ -143,16 +144,19 @@ def test_a_damaged_message_is_skipped(path, name, data):
     assert sum(lost.values()) == 1
 
 
-@pytest.mark.parametrize("stamp", ["nan", "inf", "1e300", "-1e300", "", "x"])
-def test_a_sample_with_an_invalid_stamp_is_skipped(path, stamp):
-    spoil(path, ACCEL_TOLD, text(TOLD.format(stamp, 3)))
-    assert read(path) == (24, {"samples of accel": 1})
+BAD_STAMPS, BAD_NUMBERS = ("nan", "inf", "1e300", "-1e300", "", "x"), ("9" * 30, "-" + "9" * 5000, "x", "1.5")
 
 
-@pytest.mark.parametrize("number", ["9" * 30, "-" + "9" * 5000, "x", "1.5"])
-def test_a_sample_with_an_invalid_frame_number_is_skipped(path, number):
-    spoil(path, EYE_TOLD, text(TOLD.format(1100, number)))
-    assert read(path) == (23, {"samples of cam0": 1})
+@pytest.mark.parametrize(
+    ("topic", "metadata", "result"),
+    [
+        *((ACCEL_TOLD, TOLD.format(stamp, 3), (24, {"samples of accel": 1})) for stamp in BAD_STAMPS),
+        *((EYE_TOLD, TOLD.format(1100, number), (23, {"samples of cam0": 1})) for number in BAD_NUMBERS),
+    ],
+)
+def test_a_sample_with_an_invalid_stamp_or_frame_number_is_skipped(path, topic, metadata, result):
+    spoil(path, topic, text(metadata))
+    assert read(path) == result
 
 
 def test_invalid_samples_and_images_are_skipped(path):
@@ -176,26 +180,40 @@ def test_more_than_5_percent_of_damaged_samples_are_refused(path):
         read(path)
 
 
-@pytest.mark.parametrize("unit", ["0", "nan", "inf", "-1", "x", "1e-300", "9" * 400])
-def test_an_invalid_depth_unit_is_refused(tmp_path, unit):
-    topic = f"{DEPTH.rpartition('/')[0]}/option/Depth_Units/value"
-    with pytest.raises(DataError, match="is not a number from 1e-06 to 1"):
-        open_source(str(make_db3(tmp_path / "a.db3", 2, {topic: unit})))
-
-
-@pytest.mark.parametrize("rate", ["0", "nan", "inf", "-1", "x"])
-def test_an_invalid_rate_is_refused(tmp_path, rate):
-    with pytest.raises(DataError, match=r"is not a number from 0\.1 to 100000"):
-        open_source(str(make_db3(tmp_path / "a.db3", 2, {f"{ACCEL}/info": f"fps={rate}"})))
+UNIT, BAD_UNITS = (
+    f"{DEPTH.rpartition('/')[0]}/option/Depth_Units/value",
+    ("0", "nan", "inf", "-1", "x", "1e-300"),
+)
+BAD_LENSES = (
+    "",
+    "width=x",
+    "width=1000000000;height=1000000000",
+    "width=64;height=48;fx=nan;fy=1;ppx=1;ppy=1",
+)
 
 
 @pytest.mark.parametrize(
-    "said",
-    ["", "width=x", "width=1000000000;height=1000000000", "width=64;height=48;fx=nan;fy=1;ppx=1;ppy=1"],
+    ("topic", "value", "complaint"),
+    [
+        *((UNIT, unit, "is not a number from 1e-06 to 1") for unit in (*BAD_UNITS, "9" * 400)),
+        *((f"{ACCEL}/info", f"fps={rate}", r"is not a number from 0\.1 to 100000") for rate in BAD_UNITS[:5]),
+        *((f"{EYE}/camera_info", lens, "calibration of cam0") for lens in BAD_LENSES),
+    ],
 )
-def test_an_invalid_lens_is_refused(tmp_path, said):
-    with pytest.raises(DataError, match="calibration of cam0"):
-        open_source(str(make_db3(tmp_path / "a.db3", 2, {f"{EYE}/camera_info": said})))
+def test_an_invalid_depth_unit_rate_or_lens_is_refused(tmp_path, topic, value, complaint):
+    with pytest.raises(DataError, match=complaint):
+        open_source(str(make_db3(tmp_path / "a.db3", 2, {topic: value})))
+
+
+def test_a_calibrated_imu_that_was_not_recorded_is_left_out(path, tmp_path):
+    source = open_source(str(path))
+    assert source.rig.kind == "stereo+imu"
+    for name, chain in kalibr_texts(source.rig, "made").items():
+        (tmp_path / name).write_text(chain)
+    change(path, f"UPDATE topics SET name = 'x' || id WHERE name LIKE '{ACCEL}%'")
+    tracked = open_source(str(path), calib=str(tmp_path))
+    assert tracked.rig.kind == "stereo"
+    assert len(frames(tracked)) == 24
 
 
 def test_a_serial_number_with_control_characters_is_ignored(tmp_path):

@@ -11,7 +11,7 @@ import heapq
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -65,7 +65,10 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         check_magic(path)
-        self._check_index()
+        summary = self._summary
+        is_empty = summary and summary.statistics and not summary.statistics.message_count
+        if summary is None or not (summary.chunk_indexes or is_empty):
+            raise self._damaged_error("it has no index")
 
     @cached_property
     def topics(self) -> dict[str, Topic]:
@@ -125,14 +128,13 @@ class McapFile:
         """
         channels = {id: name for name in topics if name in self.topics for id in self.topics[name].channels}
         lo, hi = start_ns or 0, 2**64 if end_ns is None else end_ns
-        waiting: list[
-            tuple[int, int, int, Any]
-        ] = [  # chunks and messages, by time, then by place in the file
+        # chunks and messages by time, then by place in the file; a chunk without an index may have any
+        waiting: list[tuple[int, int, int, Any]] = [
             (chunk.message_start_time, chunk.chunk_start_offset, -1, chunk)
             for chunk in self._summary.chunk_indexes
             if chunk.message_end_time >= lo
             and chunk.message_start_time < hi
-            and _may_have_messages(chunk, channels)
+            and (not chunk.message_index_offsets or channels.keys() & chunk.message_index_offsets)
         ]
         heapq.heapify(waiting)
         total, held_bytes = len(waiting), 0
@@ -177,11 +179,6 @@ class McapFile:
             except damage_errors():  # OSError: the file is shorter than a footer
                 raise self._damaged_error("its end is missing") from None
 
-    def _check_index(self) -> None:
-        summary = self._summary
-        if summary is None or (not summary.chunk_indexes and _message_count(summary) != 0):
-            raise self._damaged_error("it has no index")
-
     def _damaged_error(self, reason: str) -> DataError:
         return DataError(
             f"{self.path}: is damaged or was not closed properly ({reason}); "
@@ -204,15 +201,6 @@ class McapFile:
 
 
 _NO_TIMES = np.zeros(0, np.int64)
-
-
-def _may_have_messages(chunk: Any, channels: Mapping[int, str]) -> bool:
-    """Return whether a chunk may have messages of `channels`; one without an index may have any."""
-    return not chunk.message_index_offsets or any(id in channels for id in chunk.message_index_offsets)
-
-
-def _message_count(summary: Any) -> int | None:
-    return None if summary.statistics is None else int(summary.statistics.message_count)
 
 
 # ---- Chunks and summary
