@@ -29,12 +29,11 @@ from share.recordings.images import EncodedImage
 from share.recordings.losses import DataLosses
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.recording import Recording, select_span
-from share.recordings.tables import MAX_STAMP_NS
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, Measurement
 from share.sensors.profile import load_profile
 from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample, SampleProcessor
 from share.sensors.sequencer import rig_streams
-from share.types import F64, I64, checked_pose
+from share.types import F64, I64, MAX_STAMP_NS, checked_pose
 
 STREAMS = {"Infrared_1": CAM0, "Infrared_2": CAM1, "Depth_0": DEPTH, "Accel_0": ACCEL, "Gyro_0": GYRO}
 _DATA_SUFFIXES = ("/imu/data", "/image/data/compressed", "/image/data/compressedDepth")

@@ -16,10 +16,9 @@ from share.errors import DataError
 from share.files import reading
 from share.files.reading import MAX_TABLE_BYTES, read_errors
 from share.recordings.losses import DataLosses
-from share.types import F64, I64
+from share.types import F64, I64, MAX_STAMP_NS
 
 Row = TypeVar("Row", bound=tuple[Any, ...])
-MAX_STAMP_NS = 2**62  # of either sign: 146 years; differences still fit 64 bits
 _TRUNCATING = Context(prec=60, rounding=ROUND_DOWN)
 _PROBE_BYTES = 4096  # searched for a NUL, the sign of a binary file
 
