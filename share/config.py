@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from share.plain_data import from_mapping, load_yaml
+from share.plain_data import from_mapping
 from share.retired_settings import refuse_retired
 
 
@@ -18,11 +18,9 @@ class SequencerConfig:
     sync_tolerance_ms: float = 5.0  # largest difference of the stamps of one frame's cameras
     imu_silent_ms: float = 100.0  # longest wait of a frame for partner images and IMU samples, in stream time
     reorder_ms: float = 0.0  # disorder within a stream that is corrected; delays frames by as much
-    gap_factor: float = 2.5  # a step longer than this many frame intervals is a gap
-    max_jump_s: float = 10.0  # a longer step is accepted after three consistent samples; a backward one never
 
     def __post_init__(self) -> None:
-        _require_positive(self, "imu_silent_ms", "gap_factor", "max_jump_s")
+        _require_positive(self, "imu_silent_ms")
 
 
 @dataclass(frozen=True)
@@ -365,6 +363,8 @@ def _require_positive(config: Any, *names: str) -> None:
 
 def load_config(text: str, where: str = "configuration") -> Config:
     """Return a `Config` from YAML text. Raises ConfigError naming the key and the remedy."""
+    from share.strict_yaml import load_yaml
+
     data = load_yaml(text, where)
     refuse_retired(data, where)
     return from_mapping(Config, {} if data is None else data, where)

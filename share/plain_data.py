@@ -1,4 +1,4 @@
-"""Strict conversion of plain data to frozen dataclasses and back, and strict YAML."""
+"""Strict conversion of plain data (of YAML or JSON) to frozen dataclasses, numbers and poses, and back."""
 
 from __future__ import annotations
 
@@ -7,21 +7,27 @@ import dataclasses
 import difflib
 import types
 import typing
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
+import numpy as np
+
 from share.errors import ConfigError
+from share.types import F64, checked_pose
 
 T = TypeVar("T")
-_MAX_NUMBER = 1e9  # larger than any meaningful setting; the check also rejects NaN and infinity
+MAX_NUMBER = 1e9  # larger than any meaningful setting; the check also rejects NaN and infinity
+_KIND_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
 
 
-def from_mapping(cls: type[T], data: Any, where: str) -> T:
-    """Return the dataclass `cls` from a mapping, recursively; absent keys take their defaults.
+def from_mapping(cls: type[T], data: Any, where: str, lowest: float = 0.0) -> T:
+    """Return the dataclass `cls` from a mapping, recursively: its fields are the keys, with their types.
 
-    where: names the source in errors. Raises ConfigError; for an unknown key it names the closest known
-    one."""
-    if not isinstance(data, dict):
-        raise ConfigError(f"{where}: expected a mapping of settings, found {type(data).__name__}")
+    A list is a tuple, a 4x4 matrix an array (`parse_pose`); absent keys take their defaults. where: names the
+    source in errors. lowest: least number allowed. Raises ConfigError that names the key; for an unknown one
+    the closest known one.
+    """
+    data = checked_mapping(data, where)
     hints = typing.get_type_hints(cls)
     values = {}
     for key, value in data.items():
@@ -29,7 +35,7 @@ def from_mapping(cls: type[T], data: Any, where: str) -> T:
             similar = difflib.get_close_matches(str(key), hints, n=1)
             hint = f"; did you mean '{similar[0]}'?" if similar else f"; known: {', '.join(hints)}"
             raise ConfigError(f"{where}: unknown key '{key}'{hint}")
-        values[key] = _convert(hints[key], value, f"{where}: {key}")
+        values[key] = _convert(hints[key], value, f"{where}: {key}", lowest)
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         defaults = field.default, field.default_factory
         if field.name not in values and defaults == (dataclasses.MISSING, dataclasses.MISSING):
@@ -45,37 +51,76 @@ def to_mapping(config: Any) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
+def _convert(hint: Any, value: Any, where: str, lowest: float) -> Any:
+    if isinstance(hint, types.UnionType):  # X | None
+        if value is None:
+            return None
+        hint = next(kind for kind in typing.get_args(hint) if kind is not types.NoneType)
+    container, items = typing.get_origin(hint), typing.get_args(hint)
+    if container is np.ndarray:
+        return parse_pose(value, where)
+    if container is dict:
+        data = checked_mapping(value, where)
+        return {str(key): _convert(items[1], one, f"{where}: {key}", lowest) for key, one in data.items()}
+    if container is tuple:
+        length = None if items[-1] is Ellipsis else len(items)
+        if not isinstance(value, list) or length not in (None, len(value)):
+            raise ConfigError(f"{where}: expected a list{f' of {length}' if length else ''}")
+        return tuple(_convert(items[0], one, f"{where}[{i}]", lowest) for i, one in enumerate(value))
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return from_mapping(hint, value, where)
-    if typing.get_origin(hint) is dict and isinstance(value, dict):
-        return {str(k): _convert(typing.get_args(hint)[1], v, f"{where}: {k}") for k, v in value.items()}
-    accepted = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    if float in accepted and isinstance(value, str):  # PyYAML reads 1e-3 as text
+        return from_mapping(hint, value, where, lowest)
+    return _convert_scalar(hint, value, where, lowest)
+
+
+def _convert_scalar(kind: type, value: Any, where: str, lowest: float) -> Any:
+    if kind is float and isinstance(value, str):  # PyYAML reads 1e-3 as text
         with contextlib.suppress(ValueError):
             value = float(value)
-    if type(value) in (int, float) and not 0 <= value <= _MAX_NUMBER:
-        raise ConfigError(f"{where}: expected a number from 0 to {_MAX_NUMBER:g}, found {value}")
-    if float in accepted and type(value) is int:
+    if type(value) in (int, float) and not lowest <= value <= MAX_NUMBER:
+        raise ConfigError(f"{where}: expected a number from {lowest:g} to {MAX_NUMBER:g}, found {value}")
+    if kind is float and type(value) is int:
         return float(value)
-    for kind in accepted:
-        if isinstance(kind, type) and type(value) is kind:
-            return value
-    names = " or ".join(getattr(kind, "__name__", str(kind)) for kind in accepted)
-    raise ConfigError(f"{where}: expected {names}, found {value!r}")
+    if type(value) is not kind:
+        quote = "; put it in quotes" if kind is str and type(value) in (int, float, bool) else ""
+        raise ConfigError(f"{where}: expected {_KIND_NAMES[kind]}, found {value!r:.80}{quote}")
+    return value
 
 
-def load_yaml(text: str, where: str) -> Any:
-    """Return the data of YAML text, as yaml.safe_load, but with duplicate keys refused and size limits
-    (`share.strict_yaml`). Raises ConfigError."""
-    import yaml
+def checked_mapping(data: Any, where: str) -> dict[Any, Any]:
+    """Return `data` if it is a mapping. Raises ConfigError."""
+    if not isinstance(data, dict):
+        raise ConfigError(f"{where}: expected keys and values, found {describe_value(data)}")
+    return data
 
-    from share.strict_yaml import StrictLoader
 
+def parse_numbers(values: Sequence[Any], where: str) -> list[float]:
+    """Return finite numbers, which may be given as text. Raises ConfigError."""
     try:
-        return yaml.load(text, StrictLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}" if mark else ""
-        reason = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise ConfigError(f"{where}{line}: not valid YAML: {reason}") from None
+        numbers = [float(value) for value in values]  # PyYAML reads 1e-3 as text
+    except (TypeError, ValueError, OverflowError):
+        raise ConfigError(f"{where}: expected numbers, found {values}") from None
+    if not np.isfinite(numbers).all():
+        raise ConfigError(f"{where}: has values that are not finite: {values}")
+    return numbers
+
+
+def parse_pose(value: Any, where: str) -> F64:
+    """Return a rigid transform (4, 4), of rows, 16 numbers, or OpenCV's {rows, cols, data}. Raises
+    ConfigError."""
+    if isinstance(value, dict):
+        value = value.get("data")
+    rows = value if isinstance(value, list) else []
+    flat = [x for row in rows for x in (row if isinstance(row, list) else [row])]
+    if len(flat) != 16:
+        raise ConfigError(f"{where}: expected a 4x4 matrix, found {len(flat)} numbers")
+    try:
+        return checked_pose(where, np.reshape(parse_numbers(flat, where), (4, 4)))
+    except ValueError:
+        raise ConfigError(
+            f"{where}: is not a rigid transform (a rotation and a translation over 0 0 0 1)"
+        ) from None
+
+
+def describe_value(value: Any) -> str:
+    """Return kind and value for an error."""
+    return "nothing" if value is None else f"{type(value).__name__} {value!r:.40}"

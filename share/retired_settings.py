@@ -11,6 +11,8 @@ RETIRED_SETTINGS: dict[str, str] = {
     # tracker
     # inertial
     # sequencer
+    "sequencer.gap_factor": "sensors.stamps.GAP_FACTOR",
+    "sequencer.max_jump_s": "sensors.stamps.MAX_JUMP_S",
     # place
     # graph
     # merge

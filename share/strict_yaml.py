@@ -1,4 +1,4 @@
-"""YAML loader for untrusted settings files: unique keys and limits on depth, size and numbers.
+"""Load untrusted YAML: unique keys and limits on depth, size and numbers.
 
 An alias counts as all values that it stands for, since a walk over the result visits them each time: ten
 nested levels of ten aliases are 10^10 values. The length of numbers is limited: Python takes minutes to read
@@ -12,11 +12,24 @@ from typing import Any
 
 import yaml
 
+from share.errors import ConfigError
+
 _MAX_DEPTH = 40  # nested lists and mappings; a session with its recipe has 8
 _MAX_VALUES = 200_000  # values, aliases counted in full; a session of ten agents has 5,000
 _MAX_NUMBER_LENGTH = 60  # characters of a number or a date
 _MERGE_TAG = "tag:yaml.org,2002:merge"  # of `<<`
 _BOUNDED_TAGS = ("int", "float", "timestamp", "bool")
+
+
+def load_yaml(text: str, where: str) -> Any:
+    """Return the data of YAML text, as yaml.safe_load, within the limits. Raises ConfigError."""
+    try:
+        return yaml.load(text, StrictLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        reason = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise ConfigError(f"{where}{line}: not valid YAML: {reason}") from None
 
 
 class StrictLoader(yaml.SafeLoader):

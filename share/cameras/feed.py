@@ -71,15 +71,13 @@ class CameraFeed:
         connect: Connect,
         serial: str | None,
         rates_hz: Mapping[str, float],
-        max_jump_s: float,
         notify: Callable[[str], None],
         queue: SampleQueue,
         watchdog: MakeWatchdog = Watchdog,
     ) -> None:
         """rates_hz: expected rate of each stream, until the device reports its own."""
         self._connect, self._notify, self.queue = connect, notify, queue
-        self.serial, self.processor = serial, SampleProcessor(rates_hz, max_jump_s)
-        self._max_jump_s = max_jump_s
+        self.serial, self.processor = serial, SampleProcessor(rates_hz)
         self._watchdog = watchdog(time.monotonic_ns(), rates_hz)
         self.has_failed = False  # a required stream never came
         self._tick = PeriodicTimer(_TICK_S)
@@ -97,7 +95,7 @@ class CameraFeed:
         DataError."""
         device = self._connect(self.serial, 0)
         rig, self.serial = device.rig, device.serial
-        self.processor = SampleProcessor(device.rates_hz, self._max_jump_s)
+        self.processor = SampleProcessor(device.rates_hz)
         device.start(self._receive)
         self._device = device
         self._watchdog.record_connect(time.monotonic_ns())
@@ -142,6 +140,11 @@ class CameraFeed:
         """Arrival of cam0's newest image, read or not, on the host's monotonic clock; None before the
         first."""
         return self._last_sample_ns.get(CAM0)
+
+    @property
+    def images_dropped(self) -> int:
+        """Number of cam0 images dropped for newer ones because the reader was too slow."""
+        return self.queue.dropped.get(CAM0, 0)
 
     @property
     def trouble(self) -> str:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cached_property
 from typing import Any
 
 from share.cameras.feed import CameraFeed
 from share.errors import UsageError
 from share.geometry.camera import Rig
 from share.recordings.calibration import Calibration
-from share.recordings.device_match import device_mismatch, fit_to_device, uncalibrated_sensors
+from share.recordings.calibration_match import device_mismatch, fit_to_device, unused_streams
 from share.recordings.recording import Source
 from share.recordings.trajectory import Trajectory
 from share.sensors.imu_check import ImuRange
 from share.sensors.measurement import CAM0, Measurement
+from share.sensors.sequencer import rig_streams
 from share.types import I64
 
 MAX_WAITING_FRAMES = 2  # for the tracker
@@ -31,8 +31,8 @@ def choose_rig(
         rig = fit_to_device(calibration.rig, factory)
     except ValueError as error:
         raise UsageError(f"{calibration.where}: {error}") from None
-    warning = device_mismatch(calibration.serials, serial)
-    return rig, (*uncalibrated_sensors(rig, factory), *([] if warning is None else [warning]))
+    delivered = {name: name for name in rig_streams(factory)}
+    return rig, unused_streams(delivered, rig) + device_mismatch(calibration.serials, serial)
 
 
 class LiveSource(Source):
@@ -53,7 +53,7 @@ class LiveSource(Source):
         """rate_hz: of cam0. calibration: in place of the factory's. imu_range: None if unknown."""
         self.imu_range = imu_range or Source.imu_range
         factory = feed.open()
-        self.feed, self._rate_hz = feed, rate_hz
+        self.feed, self.rate_hz = feed, rate_hz
         self.name, self.serial = f"realsense:{feed.serial}", feed.serial
         try:
             self.rig, self.notes = choose_rig(calibration, factory, feed.serial)
@@ -78,32 +78,9 @@ class LiveSource(Source):
         """Disconnect the camera, whether it was read or not."""
         self.feed.close()
 
-    def arrived_ns(self, stamp_ns: int) -> int:
-        """Return the arrival of cam0's image of that stamp on the host's monotonic clock."""
-        return self.feed.arrived_ns(stamp_ns)
-
-    @property
-    def image_ns(self) -> int | None:
-        """Arrival of cam0's newest image, tracked or not, on the same clock."""
-        return self.feed.image_ns
-
-    @property
-    def images_dropped(self) -> int:
-        """Number of cam0 images dropped for newer ones because the tracker was too slow."""
-        return self.feed.queue.dropped.get(CAM0, 0)
-
-    @property
-    def trouble(self) -> str:
-        """What is wrong with the camera now, "" if nothing."""
-        return self.feed.trouble
-
     def report(self) -> dict[str, Any]:
         return {"camera": self.feed.report()}
 
     @property
     def images_count(self) -> int:
         return self.feed.processor.streams[CAM0].samples
-
-    @cached_property
-    def rate_hz(self) -> float:
-        return self._rate_hz

@@ -10,72 +10,64 @@ from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 
 class SampleQueue:
     """Policy `drop_new_image`: while the queue is full, new images are dropped, with all images of the same
-    stamp. IMU samples are dropped only while `max_imu_samples` of them wait. `dropped` counts by stream."""
+    stamp. IMU samples are dropped only while `max_imu_samples` of them wait.
+
+    dropped: count by stream. image_count: images that wait. is_closed: no more samples are accepted.
+    """
 
     def __init__(self, max_images: int = 60, max_imu_samples: int = 20_000) -> None:
         self.dropped: dict[str, int] = {}
         self._max_images, self._max_imu_samples = max_images, max_imu_samples
         self._samples: deque[DeviceSample] = deque()
-        self._image_count = 0
+        self.image_count = 0
         self._accepted_ns = self._refused_ns = -1  # stamps of the last accepted and refused image
         self._changed = threading.Condition()
-        self._is_closed = False
+        self.is_closed = False
 
     def __len__(self) -> int:
         return len(self._samples)
 
-    @property
-    def image_count(self) -> int:
-        """Number of images that wait."""
-        return self._image_count
-
     def put(self, sample: DeviceSample) -> None:
         """Add a sample or drop it; never waits."""
         with self._changed:
-            if self._is_closed or not self._has_room(sample):
+            if self.is_closed or not self._has_room(sample):
                 self._drop(sample)
                 return
             self._samples.append(sample)
-            self._image_count += _is_image(sample)
+            self.image_count += _is_image(sample)
             self._changed.notify()
 
     def get(self, timeout_s: float) -> DeviceSample | None:
         """Return the oldest sample; None after timeout_s, or if closed and empty."""
         with self._changed:
-            if not self._samples and not self._is_closed:
+            if not self._samples and not self.is_closed:
                 self._changed.wait(timeout_s)
             if not self._samples:
                 return None
             sample = self._samples.popleft()
-            self._image_count -= _is_image(sample)
+            self.image_count -= _is_image(sample)
             return sample
 
     def close(self) -> None:
         """Accept no more samples; waiting ones can still be taken."""
         with self._changed:
-            self._is_closed = True
+            self.is_closed = True
             self._changed.notify_all()
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether no more samples are accepted."""
-        return self._is_closed
 
     @property
     def is_drained(self) -> bool:
         """Whether the queue is closed and empty."""
-        return self._is_closed and not self._samples
+        return self.is_closed and not self._samples
 
     def _has_room(self, sample: DeviceSample) -> bool:
-        """Return whether `sample` is accepted; may drop others to make room."""
         if not _is_image(sample):
-            return len(self._samples) - self._image_count < self._max_imu_samples
+            return len(self._samples) - self.image_count < self._max_imu_samples
         return self._has_room_for_image(sample.stamp_ns)
 
     def _has_room_for_image(self, stamp_ns: int) -> bool:
-        if stamp_ns == self._refused_ns or (
-            self._image_count >= self._max_images and stamp_ns != self._accepted_ns
-        ):
+        """Return whether an image is accepted; may drop others to make room."""
+        is_full = self.image_count >= self._max_images and stamp_ns != self._accepted_ns
+        if stamp_ns == self._refused_ns or is_full:
             self._refused_ns = stamp_ns
             return False
         self._accepted_ns = stamp_ns
@@ -90,7 +82,7 @@ class NewestImageQueue(SampleQueue):
     that stamp. So a tracker that is slower than its camera tracks the newest images."""
 
     def _has_room_for_image(self, stamp_ns: int) -> bool:
-        while self._image_count >= self._max_images:
+        while self.image_count >= self._max_images:
             oldest_ns = next(s.stamp_ns for s in self._samples if _is_image(s))
             if oldest_ns == stamp_ns:  # of the same frame
                 break
@@ -98,14 +90,13 @@ class NewestImageQueue(SampleQueue):
         return True
 
     def _drop_images(self, stamp_ns: int) -> None:
-        remaining: deque[DeviceSample] = deque()
-        for sample in self._samples:
+        samples, self._samples = self._samples, deque()
+        for sample in samples:
             if _is_image(sample) and sample.stamp_ns == stamp_ns:
                 self._drop(sample)
-                self._image_count -= 1
+                self.image_count -= 1
             else:
-                remaining.append(sample)
-        self._samples = remaining
+                self._samples.append(sample)
 
 
 def _is_image(sample: DeviceSample) -> bool:

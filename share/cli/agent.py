@@ -104,7 +104,7 @@ def agent(
     connect_edge = _connector(address, run_id, _agent_keys(keys, server_key))
     connect_link = connect_edge if link is None else _emulated_link(connect_edge, link, link_seed)
     live_line = _AgentLine(streamed)
-    opened = camera_options.open_source(source, calib, frames, camera, settings, live_line.print_line)
+    opened = camera_options.open_source(source, calib, frames, camera, live_line.print_line)
     live_line.watch_source(opened)
     options.print_notes(opened)
     hello = Hello(options.agent_name(name), agent_kind, run_id, opened.rig, streamed)

@@ -18,7 +18,6 @@ from share.timing import PeriodicTimer
 if TYPE_CHECKING:
     from share.cameras.feed import CameraFeed
     from share.cameras.realsense.streams import StreamRequest
-    from share.config import Config
     from share.odometry.track_result import TrackResult
     from share.runtime.source import Source
 
@@ -81,7 +80,6 @@ def open_source(
     calib: str | None,
     frames: slice | None,
     camera: CameraOptions,
-    settings: Config,
     print_line: Callable[[str], None],
 ) -> Source:
     """Open a recording or a live camera; a camera is closed when the command ends.
@@ -97,11 +95,11 @@ def open_source(
         return open_source(source, calib, frames)
     if frames is not None:
         raise UsageError("--frames works only with a recording, not with a live camera; leave it out")
-    from share.cameras.realsense.source import open_live
+    from share.cameras.realsense.camera import open_live
     from share.runtime.source import read_given_calibration
 
     calibration = read_given_calibration(calib)
-    live = open_live(source, camera.camera_request(), settings.sequencer, print_line, calibration)
+    live = open_live(source, camera.camera_request(), print_line, calibration)
     click.get_current_context().with_resource(closing(live))
     return live
 

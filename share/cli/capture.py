@@ -59,10 +59,9 @@ def capture(
     \b
     Example:  share capture --out walk.mcap --seconds 60
     """
-    from share.cameras.realsense.source import make_feed
+    from share.cameras.realsense.camera import make_feed
     from share.cameras.realsense.streams import StreamRequest
     from share.cameras.sample_queue import SampleQueue
-    from share.config import SequencerConfig
     from share.runtime.capture import Capture
     from share.runtime.signals import stop_on_signal
     from share.runtime.source import read_given_calibration
@@ -82,7 +81,7 @@ def capture(
     def print_line(text: str) -> None:
         line.print_line(f"share: {text}")
 
-    feed = make_feed(source, request, SequencerConfig(), print_line, SampleQueue())
+    feed = make_feed(source, request, print_line, SampleQueue())
     run = Capture(
         feed, out, min_free_gb, print_line, lambda status: line.write(_status_text(status)), given_calibration
     )

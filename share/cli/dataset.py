@@ -117,7 +117,7 @@ def recover(broken: str, out: str, as_json: bool) -> None:
     \b
     Example:  share dataset recover walk.mcap.part --out walk.mcap
     """
-    from share.recordings.mcap.recover import recover_recording as run
+    from share.recordings.mcap.recorder import recover_recording as run
 
     path, out_file = Path(broken), Path(out)
     if not path.is_file():

@@ -130,10 +130,10 @@ def print_losses(source: Source) -> None:
 
 def warn_other_device(name: str, given_calibration: Calibration | None, serial: str | None) -> None:
     """Warn on stderr if the calibration given belongs to another device."""
-    from share.recordings.device_match import device_mismatch
+    from share.recordings.calibration_match import device_mismatch
 
-    if given_calibration is not None and (wrong := device_mismatch(given_calibration.serials, serial)):
-        click.echo(f"share: {name}: {wrong}", err=True)
+    for warning in () if given_calibration is None else device_mismatch(given_calibration.serials, serial):
+        click.echo(f"share: {name}: {warning}", err=True)
 
 
 def print_counters(counters: dict[str, int]) -> None:

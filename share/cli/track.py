@@ -59,7 +59,7 @@ def track(
 
     line = LiveLine()
     opened = camera_options.open_source(
-        source, calib, frames, camera, settings, lambda text: line.print_line(f"share: {text}")
+        source, calib, frames, camera, lambda text: line.print_line(f"share: {text}")
     )
     options.print_notes(opened)
     output_files = _output_files(paths_given, source)

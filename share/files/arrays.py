@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.errors import DataError
-from share.files.reading import MAX_ARRAYS_BYTES, read_bytes
+from share.files.reading import MAX_ARRAYS_BYTES, read_bytes, read_errors
 
 _MAX_ARRAYS = 2000  # per archive; the weights of a fit have 100
 _PLAIN_KINDS = "biufU"  # kinds of dtype; objects are excluded: unpickling them runs code
@@ -25,26 +25,25 @@ def read_arrays(path: Path, objection: str, max_bytes: int = MAX_ARRAYS_BYTES) -
     objection: what the error says of any other file (`is not a file of labels`). max_bytes: limit of the
     packed and of the unpacked size. Raises DataError that names the file.
     """
+    with read_errors(path):
+        data = read_bytes(path, max_bytes)
     try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(path, max_bytes))) as archive:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = archive.infolist()
             total = sum(one.file_size for one in entries)
             if len(entries) > _MAX_ARRAYS or total > max_bytes:
                 raise ValueError(f"too large: {len(entries)} arrays that unpack to {total / 1e6:,.1f} MB")
             return {one.filename.removesuffix(".npy"): _read_entry(archive, one) for one in entries}
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:  # zip, zlib and numpy raise different kinds
         raise DataError(f"{path}: {objection}, or damaged: {error!r:.200}") from None
 
 
 def read_array(path: Path, max_bytes: int = MAX_ARRAYS_BYTES) -> NDArray[Any]:
     """Return the array of a .npy file. Raises DataError that names the file."""
-    try:
+    with read_errors(path):
         data = read_bytes(path, max_bytes)
+    try:
         return _read_checked(io.BytesIO(data), len(data))
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:
         raise DataError(f"{path}: is not an array file, or damaged: {error!r:.200}") from None
 

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from share.errors import DataError
-from share.files.reading import MAX_EVENTS_BYTES, MAX_REPORT_BYTES, read_text
+from share.files.reading import MAX_EVENTS_BYTES, MAX_REPORT_BYTES, read_errors, read_text
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a file with one JSON object. Raises DataError that names the file."""
-    return _parse_object(_read_text(path, MAX_REPORT_BYTES), str(path))
+    with read_errors(path):
+        text = read_text(path, MAX_REPORT_BYTES)
+    return _parse_object(text, str(path))
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
@@ -23,7 +25,8 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
     Raises DataError that names file and line.
     """
-    text = _read_text(path, MAX_EVENTS_BYTES)
+    with read_errors(path):
+        text = read_text(path, MAX_EVENTS_BYTES)
     complete = text[: text.rfind("\n") + 1].splitlines()
     return [_parse_object(line, f"{path}, line {number}") for number, line in enumerate(complete, 1)]
 
@@ -68,15 +71,6 @@ def to_plain(value: Any) -> Any:
 def none_to_nan(row: dict[str, Any]) -> dict[str, Any]:
     """Undo `nan_to_none` on a row of numbers."""
     return {name: math.nan if value is None else value for name, value in row.items()}
-
-
-def _read_text(path: Path, max_bytes: int) -> str:
-    try:
-        return read_text(path, max_bytes)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is damaged: {error}") from None
 
 
 def _parse_object(text: str, where: str) -> dict[str, Any]:

@@ -23,18 +23,21 @@ class LineFile:
     written; the file keeps its complete lines.
     """
 
-    def __init__(
-        self, path: Path, notify: Callable[[str], None], open_file: Callable[[Path], IO[bytes]] = open_new
-    ) -> None:
-        """open_file: creates the file; may raise OSError."""
+    def __init__(self, path: Path, notify: Callable[[str], None]) -> None:
         self.path, self._notify = path, notify
         self.written_bytes = 0  # in complete lines
         self._file: IO[str] | None = None
         self._failure = ""
+        self._open()
+
+    def _open(self) -> None:
         try:
-            self._file = io.TextIOWrapper(open_file(path), "utf-8", line_buffering=True)
+            self._file = io.TextIOWrapper(self._create(), "utf-8", line_buffering=True)
         except OSError as error:
             self._fail(error)
+
+    def _create(self) -> IO[bytes]:
+        return open_new(self.path)
 
     def write(self, line: str) -> None:
         """Append a line, given without its end."""
@@ -71,66 +74,60 @@ _VAR_TMP = Path("/var/tmp")  # /tmp may be in memory
 _READ_BYTES = 1 << 20  # per read
 
 
-class Spool:
+class Spool(LineFile):
     """A `LineFile` created with its first line, and readable while it is open, even after its removal.
 
     path None: an unnamed temporary file, of which nothing is left however the run ends.
     """
 
     def __init__(self, path: Path | None, notify: Callable[[str], None]) -> None:
-        self._path, self._notify = path, notify
-        self._file: LineFile | None = None
+        self._is_named, self._has_begun = path is not None, False
         self._read_handle: int | None = None  # a handle of the same file
+        super().__init__(path or _temp_folder() / "share (unnamed)", notify)
 
     def write(self, line: str) -> None:
-        """Append a line, given without its end."""
-        if self._file is None:
-            shown_path = _temp_folder() / "share (unnamed)" if self._path is None else self._path
-            self._file = LineFile(shown_path, self._notify, self._open_file)
-        self._file.write(line)
+        if not self._has_begun:
+            self._has_begun = True
+            super()._open()
+        super().write(line)
 
     def read(self) -> Iterator[str]:
         """Yield all lines that were written, in order. Raises ShareError if the disk fails."""
-        if self._file is None or self._read_handle is None:
-            return
         offset, partial_line = 0, b""
-        while offset < self._file.written_bytes:
-            lines = (
-                partial_line + self._read_at(offset, min(_READ_BYTES, self._file.written_bytes - offset))
-            ).split(b"\n")
-            offset += sum(map(len, lines)) + len(lines) - 1 - len(partial_line)
-            partial_line = lines.pop()
+        while offset < self.written_bytes:
+            part = self._read_at(offset, min(_READ_BYTES, self.written_bytes - offset))
+            *lines, partial_line = (partial_line + part).split(b"\n")
+            offset += len(part)
             yield from (line.decode() for line in lines)
 
-    def check(self) -> None:
-        """Raise ShareError if a line is missing."""
-        if self._file is not None:
-            self._file.check()
-
     def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
+        super().close()
         if self._read_handle is not None:
             os.close(self._read_handle)
             self._read_handle = None
 
-    def _open_file(self, path: Path) -> IO[bytes]:
-        file = self._open_nameless() if self._path is None else open_new(path)
+    def _open(self) -> None:
+        """Wait for the first line."""
+
+    def _create(self) -> IO[bytes]:
+        file = super()._create() if self._is_named else _unnamed_file()
         self._read_handle = os.dup(file.fileno())
         return file
 
-    def _open_nameless(self) -> IO[bytes]:
-        return tempfile.TemporaryFile(dir=_temp_folder())
-
     def _read_at(self, offset: int, size: int) -> bytes:
-        assert self._file is not None and self._read_handle is not None
+        if self._read_handle is None:
+            return b""
         try:
             part = os.pread(self._read_handle, size, offset)
         except OSError as error:
-            raise ShareError(f"{self._file.path}: cannot be read: {error.strerror}") from None
+            raise ShareError(f"{self.path}: cannot be read: {error.strerror}") from None
         if not part:
-            raise ShareError(f"{self._file.path}: was truncated by another process while it was written")
+            raise ShareError(f"{self.path}: was truncated by another process while it was written")
         return part
+
+
+def _unnamed_file() -> IO[bytes]:
+    return tempfile.TemporaryFile(dir=_temp_folder())
 
 
 def _temp_folder() -> Path:

@@ -6,13 +6,15 @@ as if from the operating system.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from share.errors import DataError
+from share.errors import DataError, ShareError
 
 MB = 10**6
 MAX_SETTINGS_BYTES = 2 * MB  # YAML of settings or a calibration; ours with full provenance has 0.1
@@ -52,6 +54,22 @@ def open_regular(path: Path, max_bytes: int | None = None) -> BinaryIO:
     except BaseException:
         os.close(handle)
         raise
+
+
+@contextlib.contextmanager
+def read_errors(path: Path, kind: type[ShareError] = DataError, missing: str = "") -> Iterator[None]:
+    """Within the block, an error of reading `path` becomes a `kind` that names it.
+
+    missing: what to say if there is no such file.
+    """
+    try:
+        yield
+    except UnicodeDecodeError:
+        raise kind(f"{path}: is not a text file, or damaged") from None
+    except OSError as error:
+        is_missing = missing and isinstance(error, FileNotFoundError)
+        reason = missing if is_missing else f"cannot be read: {error.strerror or error}"
+        raise kind(f"{path}: {reason}") from None
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:

@@ -25,27 +25,45 @@ def atomic_write(path: Path, data: bytes | str) -> None:
     if is_special(path):
         _write_special(path, content)
         return
-    path = path.resolve() if _is_system_path(path) else path
+    with _replacing(path.resolve() if _is_system_path(path) else path) as file:
+        file.write(content)
+
+
+@contextlib.contextmanager
+def new_file(out: Path) -> Iterator[IO[bytes]]:
+    """Yield a temporary file that becomes `out`, synced to disk, at the end of the block. On error, no file.
+
+    Raises UsageError if `out` exists or cannot be created, ShareError if the disk is full or fails.
+    """
+    if check_replaceable(out).exists():
+        raise UsageError(f"{out}: exists and is not overwritten; give a new name")
+    with _replacing(out) as file:
+        yield file
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[IO[bytes]]:
+    """Yield a temporary file beside `path` that replaces it at the end of the block, synced to disk."""
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     except OSError as error:
         raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
     try:
-        with write_errors(path):
-            _write_durably(handle, name, content)
+        with write_errors(path), os.fdopen(handle, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            os.chmod(name, 0o666 & ~_umask())  # mkstemp makes it private
             os.replace(name, path)
     finally:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(name)
+        Path(name).unlink(missing_ok=True)
     sync_folder(path.parent)
 
 
-def _write_durably(handle: int, name: str, content: bytes) -> None:
-    with os.fdopen(handle, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.chmod(name, 0o666 & ~_umask())  # mkstemp makes it private
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
 
 
 @contextlib.contextmanager
@@ -205,33 +223,6 @@ def writable_dir(path: Path, *names: str) -> Path:
         if is_special(path / name):
             raise _blocked_path_error(path / name)
     return path
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-@contextlib.contextmanager
-def new_file(out: Path) -> Iterator[IO[bytes]]:
-    """Yield a temporary file that becomes `out`, synced to disk, at the end of the block. On error, no file.
-
-    Raises UsageError if `out` exists or cannot be created, ShareError if the disk is full or fails.
-    """
-    if check_replaceable(out).exists():
-        raise UsageError(f"{out}: exists and is not overwritten; give a new name")
-    handle, name = tempfile.mkstemp(prefix=f".{out.name}.", dir=out.parent)
-    try:
-        with write_errors(out), os.fdopen(handle, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-            os.chmod(name, 0o666 & ~_umask())  # mkstemp makes it private
-            os.replace(name, out)
-    finally:
-        Path(name).unlink(missing_ok=True)
-    sync_folder(out.parent)
 
 
 @contextlib.contextmanager

@@ -22,7 +22,7 @@ _FOCAL_RANGE_PX = (1.0, 1e5)  # beyond, rounding errors dominate
 _MAX_PRINCIPAL_POINT_PX = 1e6  # from the corner; the principal point may lie outside the image
 _MAX_NOISE, _MAX_RATE_HZ = 1e3, 1e5  # of an IMU
 _MAX_GYRO_BIAS, _MAX_ACCEL_BIAS = 0.5, 3.0  # rad/s, m/s^2
-MOST_APART_M = 1e3  # of sensors on one body, also if given in millimetres, which `rig_check` reports
+MAX_SENSOR_DISTANCE_M = 1e3  # of sensors on one body, also if given in millimetres, which `rig_check` reports
 _RIGID = 1e-6  # a transform nearer to rigid than this is not changed
 _MAX_DISTORTION = 1e4  # of a coefficient; k3 of a narrow lens is some hundreds
 
@@ -232,11 +232,11 @@ class ImuBias:
 def _extrinsics(name: str, value: F64) -> F64:
     """Return the nearest rigid transform, because a calibration may be rounded to three digits. Raises
     ValueError as `checked_pose`."""
-    T = checked_pose(name, value, MOST_APART_M)
+    T = checked_pose(name, value, MAX_SENSOR_DISTANCE_M)
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() <= _RIGID:
         return T
-    return checked_pose(name, se3.orthonormal(T), MOST_APART_M)
+    return checked_pose(name, se3.orthonormal(T), MAX_SENSOR_DISTANCE_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,6 +273,11 @@ class Rig:
             )
         if not abs(self.timeshift_s) <= MAX_TIMESHIFT_S:
             raise ValueError(f"timeshift_s: {self.timeshift_s} is not within {MAX_TIMESHIFT_S:g} s")
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """The cameras by name: cam0, cam1, depth."""
+        return {k: c for k, c in (("cam0", self.cam0), ("cam1", self.cam1), ("depth", self.depth)) if c}
 
     def without_imu(self) -> Rig:
         """Return the same cameras without an IMU: the body is cam0."""

@@ -1,4 +1,7 @@
-"""Ground truth at the stamps of an estimate. A trajectory is (stamps_ns (N,) int64 rising, T (N, 4, 4))."""
+"""Interpolate poses (ground truth at the stamps of an estimate) and the peak of a sampled curve.
+
+A trajectory is (stamps_ns (N,) int64 rising, T (N, 4, 4)).
+"""
 
 from __future__ import annotations
 
@@ -52,6 +55,16 @@ def require_poses(n: int, minimum: int, metric: str) -> None:
             f"{metric}: {n} poses of the estimate have a ground truth, at least {minimum} are needed; "
             "check that both use the same clock"
         )
+
+
+def subsample_peak(score: F64, i: int) -> float:
+    """Return the peak of the parabola through score[i - 1 : i + 2], in steps from i, at most half a step;
+    0 at an end of the curve and where it is not concave."""
+    if not 0 < i < len(score) - 1:
+        return 0.0
+    left, middle, right = score[i - 1 : i + 2]
+    bend = left - 2 * middle + right
+    return float(np.clip((left - right) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
 
 
 def _checked(name: str, trajectory: Trajectory) -> Trajectory:

@@ -43,9 +43,8 @@ def lens_problem(camera: Camera) -> str | None:
 def _rig_problems(rig: Rig) -> Iterator[str]:
     if rig.imu is None and rig.cam1 is None and rig.depth is None:
         yield "one camera alone gives no scale; stereo, depth or an IMU is needed"
-    for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1), ("depth", rig.depth)):
-        if camera is not None:
-            yield from (f"{name}: {problem}" for problem in _lens_problems(camera))
+    for name, camera in rig.cameras.items():
+        yield from (f"{name}: {problem}" for problem in _lens_problems(camera))
     if rig.cam1 is not None and rig.T_cam1_cam0 is not None:
         yield from _stereo_problems(rig.cam0, rig.cam1, rig.T_cam1_cam0)
     if rig.depth is not None and rig.T_depth_cam0 is not None:

@@ -18,9 +18,9 @@ from share.odometry.feature_appearance import Appearance
 from share.odometry.feature_matching import FeatureMatches, Prediction
 from share.odometry.state import FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
-from share.vision import corners, epipolar
-from share.vision.depth import disparity_per_rho, from_depth_camera, from_stereo
-from share.vision.mask import field_mask
+from share.vision import corners
+from share.vision.corners import field_mask
+from share.vision.depth import disparity_per_rho, from_depth_camera, from_stereo, search_depth
 from share.vision.orb import measures_depth
 
 _DEPTH_SIGMA_PX, _DEPTH_BASELINE_M = 0.3, 0.05  # px, m: of the stereo pair inside a depth camera
@@ -301,7 +301,7 @@ class LandmarkMap:
     def _stereo_depth(self, image0: U8, image1: U8, px: F32, ray: F64) -> F64:
         """Return the depth (N,) m by epipolar search and subpixel refinement; NaN where it is ambiguous or
         they disagree."""
-        coarse = epipolar.search_depth(image0, image1, self._rig, px, ray)
+        coarse = search_depth(image0, image1, self._rig, px, ray)
         out, found = np.full(len(px), np.nan), np.flatnonzero(~np.isnan(coarse))
         z = from_stereo(image0, image1, self._rig, px[found], ray[found], coarse[found])
         error_px = np.abs(1 / z - 1 / coarse[found]) * self._rig.cam0.focal * self._rig.baseline

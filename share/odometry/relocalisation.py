@@ -13,7 +13,7 @@ from share.geometry import se3
 from share.geometry.absolute_pose import RansacOptions, absolute_pose
 from share.geometry.camera import Camera, Rig
 from share.types import F32, F64, I64, U8, Frame, View
-from share.vision.mask import UNIFORM_FIELD_DEG, field_mask
+from share.vision.corners import UNIFORM_FIELD_DEG, field_mask
 from share.vision.matching import match_descriptors
 from share.vision.orb import detect_orb
 

@@ -32,7 +32,7 @@ from share.types import (
     WaitReason,
 )
 from share.vision import corners, optical_flow
-from share.vision.mask import UNIFORM_FIELD_DEG, field_mask
+from share.vision.corners import UNIFORM_FIELD_DEG, field_mask
 from share.vision.orb import make_view, measure_depth
 
 MIN_NCC = 0.8  # of a patch matched in an earlier keyframe

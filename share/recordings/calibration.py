@@ -27,6 +27,12 @@ CAMCHAIN = "kalibr_imucam_chain.yaml"
 IMU_CHAIN = "kalibr_imu_chain.yaml"
 _MODELS = dict.fromkeys(("radtan", "radial-tangential", "plumb_bob"), RADTAN)  # by name in files
 _MODELS |= dict.fromkeys(("equidistant", "kannala_brandt", "fisheye"), EQUIDISTANT)
+_NOISE_KEYS = {
+    "gyro_density": "gyroscope_noise_density",
+    "gyro_walk": "gyroscope_random_walk",
+    "accel_density": "accelerometer_noise_density",
+    "accel_walk": "accelerometer_random_walk",
+}
 TIMESHIFT = "timeshift_cam_imu"
 SERIAL = "serial"
 _MAX_TIMESHIFT_SPREAD_S = 1e-3  # between the timeshifts of synchronised cameras
@@ -214,20 +220,9 @@ def lens_model(name: str) -> str | None:
 
 def imu_noise(section: Section, rate: str) -> ImuNoise:
     """Read an IMU's noise under Kalibr's keys. rate: the key of its rate, Hz. Raises ConfigError."""
-
-    def positive(key: str) -> float:
-        return section.number(key, positive=True)
-
-    try:
-        return ImuNoise(
-            gyro_density=positive("gyroscope_noise_density"),
-            accel_density=positive("accelerometer_noise_density"),
-            gyro_walk=positive("gyroscope_random_walk"),
-            accel_walk=positive("accelerometer_random_walk"),
-            rate_hz=positive(rate),
-        )
-    except ValueError as error:
-        raise ConfigError(f"{section.where}: {error}") from None
+    keys = _NOISE_KEYS | {"rate_hz": rate}
+    with config_errors(section.where):
+        return ImuNoise(**{name: section.number(key, positive=True) for name, key in keys.items()})
 
 
 def kalibr_T_imu_cam(cam: Section) -> F64:
@@ -306,16 +301,37 @@ def kalibr_texts(rig: Rig, remark: str, serial: str | None = None) -> dict[str, 
 
     remark: a comment line for the top. serial: of the device.
     """
-    import yaml
-
     data = to_kalibr(rig, serial=serial)
     parts = {CAMCHAIN: {k: v for k, v in data.items() if k != "imu0"}}
     if "imu0" in data:
         parts[IMU_CHAIN] = {"imu0": data["imu0"]}
-    return {
-        name: f"# {remark}\n" + yaml.safe_dump(part, sort_keys=False, default_flow_style=None)
-        for name, part in parts.items()
-    }
+    return {name: f"# {remark}\n" + _yaml_text(part) for name, part in parts.items()}
+
+
+def asl_camera_text(camera: Camera, T_bs: F64, rate_hz: float) -> str:
+    """Return the text of a camera's sensor.yaml in an ASL folder. T_bs (4, 4): its pose in the IMU."""
+    values = _kalibr_camera(camera)
+    if camera.distortion:
+        values["distortion_model"] = EQUIDISTANT if camera.is_fisheye else "radial-tangential"
+        values["distortion_coefficients"] = values.pop("distortion_coeffs")
+    return _asl_text("camera", T_bs, {"rate_hz": rate_hz} | values)
+
+
+def asl_imu_text(imu: ImuNoise) -> str:
+    """Return the text of the IMU's sensor.yaml in an ASL folder."""
+    noise = _kalibr_imu(imu)
+    return _asl_text("imu", np.eye(4), {"rate_hz": noise.pop("update_rate")} | noise)
+
+
+def _asl_text(kind: str, T_bs: F64, values: dict[str, Any]) -> str:
+    pose = {"rows": 4, "cols": 4, "data": T_bs.reshape(-1).tolist()}
+    return "%YAML:1.0\n" + _yaml_text({"sensor_type": kind, "T_BS": pose, **values})
+
+
+def _yaml_text(values: dict[str, Any]) -> str:
+    import yaml
+
+    return str(yaml.safe_dump(values, sort_keys=False, default_flow_style=None))
 
 
 def _kalibr_camera(camera: Camera) -> dict[str, Any]:
@@ -333,10 +349,4 @@ def _kalibr_camera(camera: Camera) -> dict[str, Any]:
 
 
 def _kalibr_imu(imu: ImuNoise) -> dict[str, Any]:
-    return {
-        "gyroscope_noise_density": imu.gyro_density,
-        "gyroscope_random_walk": imu.gyro_walk,
-        "accelerometer_noise_density": imu.accel_density,
-        "accelerometer_random_walk": imu.accel_walk,
-        "update_rate": imu.rate_hz,
-    }
+    return {key: getattr(imu, name) for name, key in _NOISE_KEYS.items()} | {"update_rate": imu.rate_hz}

@@ -10,15 +10,12 @@ import numpy as np
 from share.errors import CalibrationMismatchError, DataError, UsageError
 from share.files.writing import atomic_write, check_replaceable, new_folder
 from share.geometry import se3
-from share.geometry.camera import Camera, ImuNoise
-from share.geometry.lens import EQUIDISTANT
+from share.recordings.calibration import asl_camera_text, asl_imu_text
 from share.recordings.images import EncodedImage, encode_png, image_format
-from share.recordings.mcap import rig as ros_rig
 from share.recordings.mcap.recorder import Recorder
 from share.recordings.recording import Source
 from share.recordings.trajectory import Trajectory, format_tum
 from share.sensors.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
-from share.types import F64
 
 Progress = Callable[[int], None]
 StageProgress = Callable[[str, int, int], None]  # stage, done, total
@@ -99,13 +96,13 @@ def _write_asl(source: Source, root: Path, progress: Progress) -> None:
     T_imu = {CAM0: rig.T_body_cam0}
     if rig.T_cam1_cam0 is not None:
         T_imu[CAM1] = rig.T_body_cam0 @ se3.inverse(rig.T_cam1_cam0)
-    for stream, camera in ros_rig.rig_cameras(rig).items():
+    for stream, camera in rig.cameras.items():
         (root / stream / "data").mkdir(parents=True)
-        (root / stream / "sensor.yaml").write_text(_camera_yaml(camera, T_imu[stream], source.rate_hz))
+        (root / stream / "sensor.yaml").write_text(asl_camera_text(camera, T_imu[stream], source.rate_hz))
         listings[stream] = ["#timestamp [ns],filename"]
     if rig.imu:
         (root / "imu0").mkdir()
-        (root / "imu0" / "sensor.yaml").write_text(_imu_yaml(rig.imu))
+        (root / "imu0" / "sensor.yaml").write_text(asl_imu_text(rig.imu))
         listings["imu0"] = ["#timestamp [ns],w_x,w_y,w_z [rad s^-1],a_x,a_y,a_z [m s^-2]"]
     for m in _intact_measurements(source, progress):
         if m.stream == IMU:
@@ -138,43 +135,3 @@ def _write_truth(folder: Path, truth: Trajectory) -> None:
     values = np.concatenate([truth.T[:, :3, 3], q], axis=1)
     lines = [f"{t},{_numbers(row)}\n" for t, row in zip(truth.stamps_ns.tolist(), values, strict=True)]
     (folder / "data.csv").write_text("#timestamp [ns],p_x,p_y,p_z [m],q_w,q_x,q_y,q_z\n" + "".join(lines))
-
-
-def _yaml(values: dict[str, object]) -> str:
-    import yaml
-
-    return "%YAML:1.0\n" + yaml.safe_dump(values, sort_keys=False, default_flow_style=None)
-
-
-def _pose(T: F64) -> dict[str, object]:
-    return {"rows": 4, "cols": 4, "data": T.reshape(-1).tolist()}
-
-
-def _camera_yaml(camera: Camera, T_bs: F64, rate_hz: float) -> str:
-    named = EQUIDISTANT if camera.is_fisheye else "radial-tangential"
-    distortion = {"distortion_model": named, "distortion_coefficients": list(camera.distortion)}
-    return _yaml(
-        {
-            "sensor_type": "camera",
-            "T_BS": _pose(T_bs),
-            "rate_hz": rate_hz,
-            "resolution": [camera.width, camera.height],
-            "camera_model": "pinhole",
-            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-            **(distortion if camera.distortion else {"distortion_model": "none"}),
-        }
-    )
-
-
-def _imu_yaml(imu: ImuNoise) -> str:
-    return _yaml(
-        {
-            "sensor_type": "imu",
-            "T_BS": _pose(np.eye(4)),
-            "rate_hz": imu.rate_hz,
-            "gyroscope_noise_density": imu.gyro_density,
-            "gyroscope_random_walk": imu.gyro_walk,
-            "accelerometer_noise_density": imu.accel_density,
-            "accelerometer_random_walk": imu.accel_walk,
-        }
-    )

@@ -8,9 +8,8 @@ import numpy as np
 
 from share.geometry.camera import Camera, Rig
 from share.recordings.recording import Source
+from share.sensors.stamps import GAP_FACTOR
 from share.types import I64
-
-_GAP_FACTOR = 2.5  # of the median step; as the sequencer's
 
 
 def describe_recording(source: Source) -> dict[str, Any]:
@@ -36,7 +35,7 @@ def describe_stream(stamps: I64) -> dict[str, Any]:
     steps = np.diff(stamps)
     forward = steps[steps > 0]
     median = float(np.median(forward)) if len(forward) else 0.0
-    gaps = forward[forward > _GAP_FACTOR * median]
+    gaps = forward[forward > GAP_FACTOR * median]
     return {
         "count": len(stamps),
         "rate_hz": round(1e9 / median, 3) if median else 0.0,
@@ -49,8 +48,7 @@ def describe_stream(stamps: I64) -> dict[str, Any]:
 
 def describe_rig(rig: Rig) -> dict[str, Any]:
     """Return the cameras (resolution, intrinsics, field of view, baseline) and the IMU of a rig."""
-    cameras = {"cam0": rig.cam0, "cam1": rig.cam1, "depth": rig.depth}
-    out: dict[str, Any] = {name: _camera(camera) for name, camera in cameras.items() if camera}
+    out: dict[str, Any] = {name: _camera(camera) for name, camera in rig.cameras.items()}
     if rig.cam1:
         out["baseline_m"] = round(rig.baseline, 6)
     if rig.imu:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.errors import CalibrationMismatchError, DataError
-from share.files.reading import MB, read_bytes
+from share.files.reading import MB, read_bytes, read_errors
 from share.geometry.camera import MAX_PIXELS, Camera
 from share.sensors.sequencer import UndecodedFrame
 from share.types import F32, U8, Frame
@@ -51,21 +51,19 @@ class EncodedImage:
         check_complete(data, self.where)
         return data
 
-    def check(self) -> None:
-        """Raise DataError unless the image is complete and of the calibration's size, without decoding it."""
-        header = _checked_header(self.read(), self.where)
-        check_header_size(header.width, header.height, self.width, self.height, self.where)
-
-    def load(self) -> NDArray[Any]:
+    def check(self) -> bytes:
+        """Return the encoded bytes of a complete image of the calibration's size, without decoding it. Raises
+        DataError."""
         data = self.read()
         header = _checked_header(data, self.where)
-        check_header_size(header.width, header.height, self.width, self.height, self.where)
-        image = (
-            decode_depth(data, self.depth_scale, self.where)
-            if self.depth_scale
-            else decode_gray(data, self.where)
-        )
-        return check_size(image, self.width, self.height, self.where)
+        check_size((header.width, header.height), (self.width, self.height), self.where)
+        return data
+
+    def load(self) -> NDArray[Any]:
+        data, scale = self.check(), self.depth_scale
+        image = decode_depth(data, scale, self.where) if scale else decode_gray(data, self.where)
+        check_size(image.shape[::-1], (self.width, self.height), self.where)  # EXIF may turn it
+        return image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,17 +151,11 @@ def encode_png(image: U8) -> bytes:
     return bytes(cv2.imencode(".png", image)[1])
 
 
-def check_size(image: NDArray[Any], width: int, height: int, where: str) -> NDArray[Any]:
-    """Return `image` if it has the calibration's size, else raise CalibrationMismatchError."""
-    check_header_size(image.shape[1], image.shape[0], width, height, where)
-    return image
-
-
-def check_header_size(found_width: int, found_height: int, width: int, height: int, where: str) -> None:
-    """Raise CalibrationMismatchError for a size other than the calibration's."""
-    if (found_width, found_height) != (width, height):
+def check_size(found: tuple[int, ...], expected: tuple[int, int], where: str) -> None:
+    """Raise CalibrationMismatchError if an image's (width, height) is not the calibration's."""
+    if found != expected:
         raise CalibrationMismatchError(
-            f"{where}: is {found_width}x{found_height}, but the calibration is for {width}x{height}; "
+            f"{where}: is {found[0]}x{found[1]}, but the calibration is for {expected[0]}x{expected[1]}; "
             "give the calibration of this recording with --calib"
         )
 
@@ -201,12 +193,8 @@ def read_picture(path: Path) -> bytes:
 
 
 def _read_file(path: Path, max_bytes: int) -> bytes:
-    try:
+    with read_errors(path, missing=f"the image is listed but missing; {_ADVICE}"):
         return read_bytes(path, max_bytes)
-    except FileNotFoundError:
-        raise DataError(f"{path}: the image is listed but missing; {_ADVICE}") from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 # ---- Headers of JPEG and PNG, parsed before a decoder sees the image

@@ -1,12 +1,17 @@
-"""The interface of all recordings and cameras: a rig, streams of measurements, perhaps ground truth."""
+"""The interface of all recordings and cameras: a rig, streams of measurements, perhaps ground truth.
+
+`Source` is what a tracker reads; `Recording` one on disk, of which a span of frames is read; `FolderSource`
+one of image files.
+"""
 
 from __future__ import annotations
 
 import heapq
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +33,7 @@ class Source(ABC):
 
     name: str
     rig: Rig
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     serial: str | None = None
     imu_range = ImuRange()  # by default that of the widest common sensor
     reports_silence = False  # whether the source itself reports a stream that has stopped
@@ -41,9 +46,9 @@ class Source(ABC):
     def measurements(self) -> Iterator[Measurement]:
         """Yield all samples, roughly in order of time; `share.sensors.sequencer` merges them."""
 
-    @abstractmethod
     def truth(self) -> Trajectory | None:
         """Return the true poses of the body in the world, None if unknown."""
+        return None
 
     def stop(self) -> None:  # noqa: B027 -- a recording ends by itself
         """Ask a live camera to end, from any thread or signal handler."""
@@ -82,15 +87,19 @@ class Span(NamedTuple):
 
 
 UNBOUNDED_NS = 2**62  # limit of a span without an end
+WHOLE = Span(-UNBOUNDED_NS, UNBOUNDED_NS, -UNBOUNDED_NS, UNBOUNDED_NS)
 
 
 def select_span(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> Span:
     """Return the span of cam0's images number `frames`, with the IMU samples since the image before them.
 
-    imu_shift_ns: IMU time minus camera time. Raises UsageError if nothing is left or the slice has a step.
+    cam0 (N,): stamps of its images, ns. imu_shift_ns: IMU time minus camera time. Raises DataError without
+    images, UsageError if nothing is left or the slice has a step.
     """
+    if len(cam0) == 0:
+        raise DataError(f"{where}: has no images")
     if frames is None:
-        return Span(-UNBOUNDED_NS, UNBOUNDED_NS, -UNBOUNDED_NS, UNBOUNDED_NS)
+        return WHOLE
     first, last, step = frames.indices(len(cam0))
     if step != 1 or first >= last:
         requested = ":".join("" if end is None else str(end) for end in (frames.start, frames.stop))
@@ -105,56 +114,78 @@ def select_span(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int =
     )
 
 
-@dataclass(frozen=True, eq=False)
-class FolderSource(Source):
-    """A recording in files: lists of images, and an IMU table (stamps (N,) ns, values (N, 6))."""
+class Recording(Source):
+    """A recording on disk, of which `span` is read."""
 
-    name: str
-    rig: Rig
-    images: dict[str, list[tuple[int, LazyImage]]]
-    imu: tuple[I64, F64] | None = None
-    read_truth: Callable[[], Trajectory | None] = lambda: None
-    notes: tuple[str, ...] = field(default=())
-    losses: DataLosses = field(default_factory=DataLosses)
+    span: Span = WHOLE
+
+    @abstractmethod
+    def all_stamps(self) -> dict[str, I64]:
+        """Return the stamps (N,) ns of every stream, of the whole recording."""
 
     def stamps(self) -> dict[str, I64]:
-        out = {
-            name: np.array([stamp for stamp, _ in images], np.int64) for name, images in self.images.items()
+        out = {}
+        for stream, stamps in self.all_stamps().items():
+            lo, hi = self.span.limits(stream)
+            out[stream] = stamps[(stamps > lo) & (stamps <= hi)]
+        return out
+
+    def is_in_span(self, stream: str, stamp_ns: int) -> bool:
+        lo, hi = self.span.limits(stream)
+        return lo < stamp_ns <= hi
+
+
+class FolderSource(Recording):
+    """A recording in files.
+
+    images: (stamp ns, image) of each stream. imu: stamps (N,) ns, values (N, 6). frames: the images of cam0
+    to read. Raises DataError, UsageError as `select_span`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        rig: Rig,
+        images: dict[str, list[tuple[int, LazyImage]]],
+        losses: DataLosses,
+        imu: tuple[I64, F64] | None = None,
+        read_truth: Callable[[], Trajectory | None] = lambda: None,
+        notes: tuple[str, ...] = (),
+        frames: slice | None = None,
+    ) -> None:
+        self.name, self.rig, self.notes, self.losses = path.resolve().name, rig, notes, losses
+        self.images, self.imu, self._read_truth = images, imu, read_truth
+        self.span = select_span(self.all_stamps()[CAM0], frames, self.name, rig.timeshift_ns)
+
+    def all_stamps(self) -> dict[str, I64]:
+        stamps = {
+            name: np.array([stamp for stamp, _ in items], np.int64) for name, items in self.images.items()
         }
-        return out if self.imu is None else {**out, IMU: self.imu[0]}
+        return stamps | ({} if self.imu is None else {IMU: self.imu[0]})
 
     def measurements(self) -> Iterator[Measurement]:
-        return heapq.merge(*self._streams(), key=lambda m: m.stamp_ns)
+        streams = [self._stream(name, items) for name, items in self.images.items()]
+        if self.imu is not None:  # first, so that samples precede an image of the same stamp
+            stamps, values = self.imu
+            streams.insert(0, self._stream(IMU, zip(stamps.tolist(), values.tolist(), strict=True)))
+        return heapq.merge(*streams, key=lambda m: m.stamp_ns)
+
+    def _stream(self, name: str, items: Any) -> Iterator[Measurement]:
+        return (Measurement(name, stamp, one) for stamp, one in items if self.is_in_span(name, stamp))
 
     def truth(self) -> Trajectory | None:
-        return self.read_truth()
-
-    def slice_frames(self, frames: slice | None) -> FolderSource:
-        """Return this recording with only the frames number `frames` of cam0."""
-        if not self.images[CAM0]:
-            raise DataError(f"{self.name}: has no images")
-        span = select_span(self.stamps()[CAM0], frames, self.name, self.rig.timeshift_ns)
-        lo, hi = span.limits(CAM0)
-        images = {
-            name: [(stamp, image) for stamp, image in items if lo < stamp <= hi]
-            for name, items in self.images.items()
-        }
-        imu = self.imu
-        if imu is not None:
-            keep = (imu[0] > span.imu_from) & (imu[0] <= span.imu_to)
-            imu = (imu[0][keep], imu[1][keep])
-        return FolderSource(self.name, self.rig, images, imu, self.read_truth, self.notes, self.losses)
-
-    def _streams(self) -> Iterator[Iterator[Measurement]]:
-        if self.imu is not None:  # first, so that samples precede an image of the same stamp
-            yield map(_imu_measurement, self.imu[0].tolist(), self.imu[1].tolist())
-        for name, items in self.images.items():
-            yield _image_measurements(name, items)
+        return self._read_truth()
 
 
-def _imu_measurement(stamp_ns: int, values: list[float]) -> Measurement:
-    return Measurement(IMU, stamp_ns, values)
+def existing_images(folder: Path, names: list[str], listing: Path, losses: DataLosses) -> set[str]:
+    """Return which of the files `names`, listed in `listing`, exist below `folder`; others go to losses.
 
-
-def _image_measurements(stream: str, items: list[tuple[int, LazyImage]]) -> Iterator[Measurement]:
-    return (Measurement(stream, stamp, image) for stamp, image in items)
+    Raises DataError if more than 5 % are missing.
+    """
+    folders = {(folder / name).parent for name in names}
+    found = {one / name for one in folders if one.is_dir() for name in os.listdir(one)}
+    existing, kind = {name for name in names if folder / name in found}, f"images of {listing}"
+    for name in (name for name in names if name not in existing):
+        losses.add(kind, name, f"{listing}: {name} is missing from {folder}; copy the recording again")
+    losses.check(kind, len(names))
+    return existing

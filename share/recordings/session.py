@@ -17,12 +17,11 @@ from share.errors import ConfigError, UsageError
 from share.files.reading import path_inside
 from share.files.yaml_file import Section, read_yaml
 from share.recordings.calibration import Calibration, calibration_from_kalibr, read_calibration
-from share.types import AgentKind
+from share.types import MAX_STAMP_NS, AgentKind
 
 SESSION_FILE = "session.yaml"
 SCHEMA = 1
 AGENT_NAME_RULE = "1 to 64 letters, digits, '_', '-' or '.'"
-_MAX_OFFSET_NS = 2**62
 _AGENT_KEYS = ("kind", "sensors", "rate_hz", "clock_offset_ns", "calibration")
 
 
@@ -104,7 +103,7 @@ def _read_agent(section: Section, folder: Path) -> SessionAgent:
     if kind not in list(AgentKind):
         raise ConfigError(f"{section.where}: kind '{kind}' is not known; known: {', '.join(AgentKind)}")
     offset = section.data.get("clock_offset_ns", 0)
-    if type(offset) is not int or abs(offset) >= _MAX_OFFSET_NS:
+    if type(offset) is not int or abs(offset) >= MAX_STAMP_NS:
         raise ConfigError(f"{section.where}: clock_offset_ns: expected whole nanoseconds, found {offset!r}")
     return SessionAgent(
         AgentKind(kind),

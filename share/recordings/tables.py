@@ -1,11 +1,11 @@
-"""Read CSV and TXT tables of datasets: with numpy, or, if that fails, line by line to find bad lines."""
+"""Read CSV and TXT tables of datasets line by line; a bad line costs itself."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from decimal import Decimal, InvalidOperation
+from decimal import ROUND_DOWN, Context, Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,28 +14,22 @@ from numpy.typing import NDArray
 
 from share.errors import DataError
 from share.files import reading
-from share.files.reading import MAX_TABLE_BYTES
+from share.files.reading import MAX_TABLE_BYTES, read_errors
 from share.recordings.losses import DataLosses
-from share.types import F64, I64
+from share.types import F64, I64, MAX_STAMP_NS
 
 Row = TypeVar("Row", bound=tuple[Any, ...])
-MAX_STAMP_NS = 2**62  # of either sign: 146 years; differences still fit 64 bits
+_TRUNCATING = Context(prec=60, rounding=ROUND_DOWN)
 _PROBE_BYTES = 4096  # searched for a NUL, the sign of a binary file
 
 
 def read_text(path: Path) -> str:
     """Read the text of a file. Raises DataError if it is missing, unreadable or binary."""
-    try:
+    with read_errors(path, missing="no such file; the recording is incomplete"):
         with reading.open_regular(path, MAX_TABLE_BYTES) as file:  # probe before reading all of it
             binary = b"\0" in file.read(_PROBE_BYTES)
         # utf-8-sig: spreadsheets write a byte-order mark
         text = "" if binary else reading.read_text(path, MAX_TABLE_BYTES, "utf-8-sig")
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file; the recording is incomplete") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: is not a text file; the recording is damaged") from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
     if binary:
         raise DataError(f"{path}: is not a text file; the recording is damaged")
     return text
@@ -97,12 +91,14 @@ def parse_rows(
         except DataError as error:
             _count_loss(losses, path, number, str(error).removeprefix(f"{path}, line {number}: "))
     stamps = np.array([row[0] for row in parsed_rows], np.int64)
-    valid = ordered_mask(path, stamps, lines, losses)
-    _check_losses(path, losses, int(valid.sum()))
+    valid = _ordered_mask(path, stamps, lines, losses)
+    if losses is not None:
+        kind = f"lines of {path}"
+        losses.check(kind, int(valid.sum()) + losses.counts.get(kind, 0))
     return stamps[valid], [parsed_rows[i] for i in np.flatnonzero(valid)]
 
 
-def ordered_mask(
+def _ordered_mask(
     path: Path, stamps: I64, lines: Sequence[int], losses: DataLosses | None
 ) -> NDArray[np.bool_]:
     """Return the largest set of rows (N,) whose stamps never decrease; the others go to `losses`.
@@ -138,12 +134,6 @@ def longest_nondecreasing(stamps: I64) -> NDArray[np.bool_]:
     return out
 
 
-def _check_losses(path: Path, losses: DataLosses | None, valid_count: int) -> None:
-    if losses is not None:
-        kind = f"lines of {path}"
-        losses.check(kind, valid_count + losses.counts.get(kind, 0))
-
-
 def read_table(
     path: Path, columns: int, nan: bool = False, losses: DataLosses | None = None
 ) -> tuple[I64, F64]:
@@ -153,31 +143,9 @@ def read_table(
     a finite number go to `losses`. Raises DataError that names file and line if losses is None, or more than
     5 % are lost.
     """
-    dtype = [("stamp", np.int64), *((f"c{i}", np.float64) for i in range(1, columns))]
-    lines = read_text(path).splitlines()
-    try:
-        if all(not line.strip() or line.startswith("#") for line in lines):
-            raise ValueError("empty")
-        table = np.loadtxt(lines, dtype, delimiter=",", usecols=range(columns), ndmin=1)
-        stamps, values = table["stamp"], np.stack([table[name] for name, _ in dtype[1:]], axis=1)
-    except (ValueError, IndexError, OverflowError):
-        return _read_slowly(path, columns, nan, losses)
-    finite = (np.isfinite(values) | (nan & np.isnan(values))).all()
-    if len(table) == 0 or not finite or (stamps[1:] < stamps[:-1]).any() or not _is_in_stamp_range(stamps):
-        return _read_slowly(path, columns, nan, losses)
-    return stamps, values
-
-
-def _is_in_stamp_range(stamps: I64) -> bool:
-    return int(stamps.min()) > -MAX_STAMP_NS and int(stamps.max()) < MAX_STAMP_NS
-
-
-def _read_slowly(path: Path, columns: int, nan: bool, losses: DataLosses | None) -> tuple[I64, F64]:
-    """Read as `read_table`, line by line, to find the bad ones."""
 
     def parse(fields: list[str], where: str) -> tuple[int, list[float]]:
-        stamp = parse_ns(fields[0], where)
-        return stamp, [parse_number(field, where, nan) for field in fields[1:columns]]
+        return parse_ns(fields[0], where), parse_numbers(fields[1:columns], where, nan)
 
     stamps, parsed_rows = parse_rows(path, ",", columns, parse, losses)
     return stamps, np.array([values for _, values in parsed_rows], np.float64).reshape(-1, columns - 1)
@@ -194,25 +162,15 @@ def parse_ns(text: str, where: str) -> int:
 
 def parse_seconds(text: str, where: str) -> int:
     """Parse decimal seconds, with or without exponent, to integer nanoseconds without floats; truncates."""
-    if "e" in text.lower():
-        return _parse_exponent_seconds(text, where)
-    seconds, _, fraction = text.partition(".")
-    digits = seconds.lstrip("+-")
-    if not (digits + fraction).isdecimal() or len(digits) > 10:
-        raise DataError(f"{where}: stamp '{text:.40}' is not a time in seconds")
-    stamp = int(digits or "0") * 10**9 + int((fraction + "000000000")[:9])
-    return _checked_stamp(-stamp if seconds.startswith("-") else stamp, text, where)
-
-
-def _parse_exponent_seconds(text: str, where: str) -> int:
-    """Parse seconds with an exponent, such as 1.4e+09."""
     try:
+        if "_" in text:  # which Decimal ignores
+            raise InvalidOperation
         seconds = Decimal(text)
+        in_range = -(10**10) < seconds < 10**10  # check before int(): 1e999999 has a million digits
     except InvalidOperation:
         raise DataError(f"{where}: stamp '{text:.40}' is not a time in seconds") from None
-    if not -(10**10) < seconds < 10**10:  # check before int(): 1e999999 has a million digits
-        raise DataError(f"{where}: stamp {text:.40} is out of range")
-    return _checked_stamp(int(seconds * 10**9), text, where)
+    stamp_ns = int(_TRUNCATING.multiply(seconds, 10**9)) if in_range else MAX_STAMP_NS
+    return _checked_stamp(stamp_ns, text, where)
 
 
 def _checked_stamp(stamp_ns: int, text: str, where: str) -> int:
@@ -221,7 +179,17 @@ def _checked_stamp(stamp_ns: int, text: str, where: str) -> int:
     return stamp_ns
 
 
-def parse_number(text: str, where: str, nan: bool = False) -> float:
+def parse_numbers(texts: list[str], where: str, nan: bool = False) -> list[float]:
+    """Parse finite numbers. nan: NaN and empty texts are allowed, as NaN."""
+    try:
+        if math.isfinite(sum(values := [float(text) for text in texts])):
+            return values
+    except ValueError:
+        pass
+    return [_parse_number(text, where, nan) for text in texts]
+
+
+def _parse_number(text: str, where: str, nan: bool = False) -> float:
     """Parse a finite number. nan: NaN and an empty text are allowed, as NaN."""
     if nan and not text:
         return math.nan

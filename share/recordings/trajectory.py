@@ -65,8 +65,7 @@ def read_tum_table(path: Path, nan: bool = False, losses: DataLosses | None = No
     """Read stamps (N,) ns and x y z qx qy qz qw (N, 7). nan: these may be NaN. Raises as `read_tum`."""
 
     def parse(fields: list[str], where: str) -> tuple[int, list[float]]:
-        stamp = tables.parse_seconds(fields[0], where)
-        return stamp, [tables.parse_number(field, where, nan) for field in fields[1:8]]
+        return tables.parse_seconds(fields[0], where), tables.parse_numbers(fields[1:8], where, nan)
 
     stamps_ns, parsed_rows = tables.parse_rows(path, None, 8, parse, losses)
     return stamps_ns, np.array([values for _, values in parsed_rows]).reshape(-1, 7)

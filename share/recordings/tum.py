@@ -17,10 +17,10 @@ from share.files.yaml_file import read_yaml
 from share.geometry.camera import Rig
 from share.recordings import tables
 from share.recordings.calibration import Calibration, read_camera_yaml
-from share.recordings.euroc import existing_images
+from share.recordings.calibration_match import fit_to_recording
 from share.recordings.images import file_image
 from share.recordings.losses import DataLosses
-from share.recordings.recording import FolderSource
+from share.recordings.recording import FolderSource, existing_images
 from share.recordings.trajectory import Trajectory, read_tum
 from share.sensors.measurement import CAM0, DEPTH, LazyImage
 from share.types import F64
@@ -28,7 +28,7 @@ from share.types import F64
 CAMERA_FILE = "camera.yaml"
 _MAX_PAIR_GAP_NS = 20_000_000
 
-ImagePair = tuple[int, str, str]  # stamp of the colour image, its file, its depth file
+ImagePair = tuple[int, dict[str, str]]  # stamp of the colour image; its file and the depth's, by stream
 
 
 def is_tum(path: Path) -> bool:
@@ -37,48 +37,43 @@ def is_tum(path: Path) -> bool:
 
 def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) -> FolderSource:
     """Open the recording in `path`. Raises DataError, ConfigError, UsageError."""
-    own = path / CAMERA_FILE
     if calibration is None:
-        calibration = read_camera_yaml(own)
-    rig, scale = calibration.rig, calibration.depth_scale
-    if rig.depth is None:
+        calibration = read_camera_yaml(path / CAMERA_FILE)
+    if calibration.rig.depth is None:
         raise ConfigError(f"{calibration.where}: has no depth camera, but {path} is an RGB-D recording")
-    if rig.cam1:
-        raise ConfigError(f"{path}: the calibration has cam1, the recording does not; give another --calib")
-    depth = rig.depth
-    rig = Rig(cam0=rig.cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=rig.T_depth_cam0)
+    rig = fit_to_recording(calibration.rig, (CAM0, DEPTH), path).without_imu()
     losses = DataLosses()
-    pairs, note = _read_pairs(path, losses)
+    pairs, notes = _read_pairs(path, losses)
     images: dict[str, list[tuple[int, LazyImage]]] = {
-        CAM0: [(stamp, file_image(path / colour, rig.cam0)) for stamp, colour, _ in pairs],
-        DEPTH: [(stamp, file_image(path / file, depth, scale)) for stamp, _, file in pairs],
+        name: [
+            (stamp, file_image(path / files[name], camera, calibration.depth_scale if name == DEPTH else 0.0))
+            for stamp, files in pairs
+        ]
+        for name, camera in rig.cameras.items()
     }
-    source = FolderSource(
-        path.resolve().name, rig, images, None, lambda: _truth(path, rig, losses), note, losses
+    return FolderSource(
+        path, rig, images, losses, read_truth=lambda: _truth(path, rig, losses), notes=notes, frames=frames
     )
-    return source.slice_frames(frames)
 
 
 def _read_pairs(path: Path, losses: DataLosses) -> tuple[list[ImagePair], tuple[str, ...]]:
-    listing = path / "associations.txt"
-    note: tuple[str, ...] = ()
+    listing, notes = path / "associations.txt", tuple[str, ...]()
     if listing.is_file():
         pairs = _read_associations(listing, losses)
     else:
         listing = path / "rgb.txt"
         colour, depth = _read_list(listing, losses), _read_list(path / "depth.txt", losses)
         pairs = _pair_nearest(colour, depth)
-        unpaired = len(colour) - len(pairs)
-        if unpaired:
-            note = (f"{unpaired} of {len(colour)} colour images have no depth image within 20 ms",)
+        if unpaired := len(colour) - len(pairs):
+            notes = (f"{unpaired} of {len(colour)} colour images have no depth image within 20 ms",)
     if not pairs:
         raise DataError(
             f"{listing}: no colour image has a depth image within 20 ms; check that both use one clock"
         )
-    for column in (1, 2):
-        existing = _existing_files(path, [str(pair[column]) for pair in pairs], listing, losses)
-        pairs = [pair for pair in pairs if pair[column] in existing]
-    return pairs, note
+    for stream in (CAM0, DEPTH):
+        existing = existing_images(path, [files[stream] for _, files in pairs], listing, losses)
+        pairs = [(stamp, files) for stamp, files in pairs if files[stream] in existing]
+    return pairs, notes
 
 
 def _read_associations(listing: Path, losses: DataLosses) -> list[ImagePair]:
@@ -90,7 +85,7 @@ def _read_associations(listing: Path, losses: DataLosses) -> list[ImagePair]:
             stamp, colour, depth = other, depth, colour
         for name in (colour, depth):
             path_inside(listing.parent, name, where)
-        return tables.parse_seconds(stamp, where), colour, depth
+        return tables.parse_seconds(stamp, where), {CAM0: colour, DEPTH: depth}
 
     return tables.parse_rows(listing, None, 4, parse, losses)[1]
 
@@ -113,20 +108,9 @@ def _pair_nearest(colour: list[tuple[int, str]], depth: list[tuple[int, str]]) -
             (i for i in (right - 1, right) if 0 <= i < len(stamps)), key=lambda i: abs(stamps[i] - stamp)
         )
         if near > used and abs(int(stamps[near]) - stamp) <= _MAX_PAIR_GAP_NS:
-            pairs.append((stamp, file, depth[near][1]))
+            pairs.append((stamp, {CAM0: file, DEPTH: depth[near][1]}))
             used = near
     return pairs
-
-
-def _existing_files(path: Path, files: list[str], listing: Path, losses: DataLosses) -> set[str]:
-    """Return which of `files` exist. Raises DataError if more than 5 % are missing."""
-    by_folder: dict[Path, list[str]] = {}
-    for file in files:
-        by_folder.setdefault((path / file).parent, []).append(Path(file).name)
-    existing = {
-        folder: existing_images(folder, names, listing, losses) for folder, names in by_folder.items()
-    }
-    return {file for file in files if Path(file).name in existing[(path / file).parent]}
 
 
 def _truth(path: Path, rig: Rig, losses: DataLosses) -> Trajectory | None:

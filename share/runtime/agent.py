@@ -162,7 +162,7 @@ class AgentRun:
 
     def _make_arrivals(self) -> FrameArrivals:
         if isinstance(self._source, LiveSource):
-            return LiveArrivals(self._decode_frames, self._source)
+            return LiveArrivals(self._decode_frames, self._source.feed)
         return RecordedArrivals(self._decode_frames, self._late_dropper)
 
     def _decode_frames(self) -> Iterator[Frame]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, Protocol
 
-from share.cameras.live import LiveSource
+from share.cameras.feed import CameraFeed
 from share.protocol.agent_events import AgentTick
 from share.protocol.agent_status import LATE_S
 from share.types import Frame, ImuBatch
@@ -115,7 +115,7 @@ class LiveArrivals:
     """A live camera's frames, read by the tracker's thread. Images that come meanwhile wait in the camera's
     queue, which keeps the newest (policy `drop_old_image`)."""
 
-    def __init__(self, frames: FrameStream, camera: LiveSource) -> None:
+    def __init__(self, frames: FrameStream, camera: CameraFeed) -> None:
         self._frames, self._camera = frames, camera
         self._dropped: int | None = None  # images; None before the first frame
         self._last_drop_s = -_DROP_WARNING_S

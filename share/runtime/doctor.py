@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from share.cameras.realsense import sdk_probe
+from share.cameras.realsense import devices
 from share.devices import camera_check, checks
 from share.devices import host as facts
 from share.devices.camera_check import SdkReport
@@ -51,7 +51,7 @@ def query_sdk(profile: HostProfile) -> SdkReport | None:
     """Return librealsense's view of the cameras; None if the profile's device is no RealSense."""
     if profile.sensor is None or _REALSENSE_MODEL not in profile.sensor.device.model:
         return None
-    return sdk_probe.probe_sdk()
+    return devices.probe_sdk()
 
 
 def inspect_camera(profile: HostProfile, sdk: SdkReport | None) -> list[CheckResult]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from share.errors import ConfigError
-from share.files.yaml_file import Section, read_dataclass, read_yaml
+from share.files.yaml_file import Section, read_yaml
+from share.plain_data import MAX_NUMBER, from_mapping
 from share.sensors.profile_types import CameraMode, DeviceFacts, Emulation, HostFacts, InertialFacts, Profile
 
 
@@ -88,7 +89,7 @@ def _read_file(path: Path) -> _ProfileFile:
                 f"{path}: device: '{name}' is not a shipped profile with a device, such as d435i"
             )
         top = Section(top.data | {key: base.section(key).data for key in ("device", "emulation")}, top.where)
-    return read_dataclass(_ProfileFile, top)
+    return from_mapping(_ProfileFile, top.data, top.where, lowest=-MAX_NUMBER)
 
 
 def shipped_profiles() -> dict[str, Path]:

@@ -53,14 +53,13 @@ class SampleProcessor:
     arrival (`placed_by_arrival`, by stream); if the device has no clock, the host's is used for all.
     """
 
-    def __init__(self, rates_hz: Mapping[str, float], max_jump_s: float) -> None:
-        """rates_hz: expected rate of each stream. max_jump_s: as for `StampRepair`."""
+    def __init__(self, rates_hz: Mapping[str, float]) -> None:
+        """rates_hz: expected rate of each stream."""
         self.host_stamped = self.segments = self.restarts = 0
         self.placed_by_arrival = dict.fromkeys(rates_hz, 0)
         self.streams = {stream: GapCounter(rate) for stream, rate in rates_hz.items()}
         gap_s = _MAX_ACCEL_GAP_STEPS / rates_hz.get(ACCEL, 1.0)
         self.imu_interpolator = ImuInterpolator(int(gap_s * 1e9))
-        self._max_jump_s = max_jump_s
         self._time_source: tuple[int, bool] | None = None  # epoch, is_device_clock
         self._clocks: list[_Clock] = []
         self._waiting: list[DeviceSample] = []  # host-stamped, until a device-stamped one comes
@@ -128,7 +127,7 @@ class SampleProcessor:
         }
 
     def _start_segment(self, sample: DeviceSample) -> None:
-        clock = _Clock(StampRepair(self._max_jump_s))
+        clock = _Clock(StampRepair())
         if self._newest is not None:
             stamp, arrived = self._newest
             clock.offset_ns = stamp + (sample.arrived_ns - arrived) - sample.stamp_ns

@@ -19,7 +19,7 @@ from share.config import SequencerConfig
 from share.geometry.camera import Rig
 from share.sensors.imu_check import ImuCheck, ImuRange
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, LazyImage, Measurement
-from share.sensors.stamps import StampRepair
+from share.sensors.stamps import GAP_FACTOR, MAX_JUMP_NS, StampRepair
 from share.types import ImuBatch
 
 _DEFAULT_IMU_RANGE = ImuRange()
@@ -50,7 +50,7 @@ class SequencerCounters:
     backward: int = 0  # dropped: older than its stream
     unpaired: int = 0  # dropped: images without a partner within sync_tolerance_ms
     imu_silent: int = 0  # frames without IMU samples although the rig has an IMU
-    imu_dropped: int = 0  # samples more than max_jump_s before their frame
+    imu_dropped: int = 0  # samples more than MAX_JUMP_S before their frame
     imu_out_of_range: int = 0  # dropped: beyond the sensor's range, or not finite
     imu_spikes: int = 0  # dropped: runs of up to three samples far from their neighbours
     wraps: int = 0
@@ -60,8 +60,7 @@ class SequencerCounters:
 
 def rig_streams(rig: Rig) -> tuple[str, ...]:
     """Return the streams of a rig's frames."""
-    options = ((CAM0, True), (CAM1, rig.cam1), (DEPTH, rig.depth), (IMU, rig.imu))
-    return tuple(name for name, is_present in options if is_present)
+    return (*rig.cameras, *((IMU,) if rig.imu else ()))
 
 
 def sequence_frames(
@@ -84,8 +83,8 @@ def sequence_frames(
     Streams may be out of step by up to imu_silent_ms, and out of order within themselves by reorder_ms,
     without any effect on the frames. Memory is bounded by these times.
     """
-    repair = StampRepair(config.max_jump_s)
-    merger = _Merger(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
+    repair = StampRepair()
+    merger = FrameMerger(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
     for measurement in measurements:
         if measurement.stream in merger.buffers:
             for stamp, usable in repair.feed(measurement):
@@ -100,7 +99,7 @@ def sequence_frames(
     _update_counters(repair, counters, merger)
 
 
-def _update_counters(repair: StampRepair, counters: SequencerCounters, merger: _Merger) -> None:
+def _update_counters(repair: StampRepair, counters: SequencerCounters, merger: FrameMerger) -> None:
     counters.wraps, counters.jumps, counters.strays = repair.wraps, repair.jumps, repair.strays
     counters.backward = merger.backward + repair.past
 
@@ -148,7 +147,7 @@ class _Buffer:
         return out
 
 
-class _Merger:
+class FrameMerger:
     """The state of `sequence_frames`: buffers of all streams, and which frames are complete."""
 
     def __init__(
@@ -172,8 +171,7 @@ class _Merger:
         self._tolerance_ns = _ns(config.sync_tolerance_ms)
         self._wait_ns = _ns(config.imu_silent_ms) + _ns(config.reorder_ms)
         self._imu_shift_ns, self._imu_ahead_ns = imu_shift_ns, max(imu_shift_ns, 0)
-        self._max_jump_ns = int(config.max_jump_s * 1e9)
-        self._min_gap_ns = config.gap_factor / rate_hz * 1e9 if rate_hz > 0 else float("inf")
+        self._min_gap_ns = GAP_FACTOR / rate_hz * 1e9 if rate_hz > 0 else float("inf")
 
     def add(self, stream: str, stamp: int, payload: Any) -> None:
         buffer = self.buffers[stream]
@@ -279,7 +277,7 @@ class _Merger:
         imu = self._imu
         if imu is None:
             return ImuBatch.empty()
-        self._counters.imu_dropped += len(imu.pop_until(stamp - self._max_jump_ns))
+        self._counters.imu_dropped += len(imu.pop_until(stamp - MAX_JUMP_NS))
         if imu.consumed_until >= stamp:  # the previous frame has the first sample after both
             return ImuBatch.empty()
         first = imu.first_from(stamp)
@@ -308,8 +306,8 @@ class _Merger:
         for buffer in self._partners:
             if buffer.items and buffer.items[0][0] < oldest:
                 self._counters.unpaired += len(buffer.pop_until(oldest))
-        if self._imu and self._imu.items and self._imu.items[0][0] < oldest - self._max_jump_ns:
-            self._counters.imu_dropped += len(self._imu.pop_until(oldest - self._max_jump_ns))
+        if self._imu and self._imu.items and self._imu.items[0][0] < oldest - MAX_JUMP_NS:
+            self._counters.imu_dropped += len(self._imu.pop_until(oldest - MAX_JUMP_NS))
 
 
 def _ns(ms: float) -> int:

@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from share.sensors.measurement import Measurement
 
 WRAP_NS = 2**32 * 1000  # 4294.967296 s
+MAX_JUMP_S = 10.0  # a longer step is accepted after three consistent samples; a backward one never
+GAP_FACTOR = 2.5  # a step longer than this many frame intervals is a gap of the frames
+MAX_JUMP_NS = int(MAX_JUMP_S * 1e9)
 _MIN_AGREEING = 3  # measurements that must agree before a jump is accepted
 _MAX_CONTRADICTING = 100  # measurements from before a jump, after which the jump is taken for stray stamps
 
@@ -16,12 +19,11 @@ class StampRepair:
 
     Repairs the wrap of the D4xx's 32-bit microsecond counter, accepts a jump forward once several
     measurements agree on it, and drops single stamps that are far off. Counts `wraps`, `jumps`, `strays`
-    (single stamps far off) and `past` (stamps more than max_jump_s back that no wrap explains).
+    (single stamps far off) and `past` (stamps more than `MAX_JUMP_S` back that no wrap explains).
     """
 
-    def __init__(self, max_jump_s: float) -> None:
+    def __init__(self) -> None:
         self.wraps = self.jumps = self.strays = self.past = 0
-        self._max_jump_ns = int(max_jump_s * 1e9)
         self._latest_ns: int | None = None
         self._jump_candidates: list[tuple[int, Measurement]] = []
         self._contradictions_left = 0
@@ -35,9 +37,9 @@ class StampRepair:
             self._latest_ns = measurement.stamp_ns
         stamp = self._unwrap(measurement.stamp_ns, self._latest_ns)
         step = stamp - self._latest_ns
-        if step < -self._max_jump_ns:
+        if step < -MAX_JUMP_NS:
             self.past += 1
-        elif step > self._max_jump_ns:
+        elif step > MAX_JUMP_NS:
             yield from self._add_jump_candidate(stamp, measurement)
         else:
             self._latest_ns = max(self._latest_ns, stamp)
@@ -53,17 +55,17 @@ class StampRepair:
     def _unwrap(self, raw: int, latest: int) -> int:
         """Return `raw` plus the number of wraps that brings it near `latest`; unchanged if none does."""
         stamp = raw + self.wraps * WRAP_NS
-        if abs(stamp - latest) <= self._max_jump_ns:
+        if abs(stamp - latest) <= MAX_JUMP_NS:
             return stamp
-        if abs(stamp + WRAP_NS - latest) <= self._max_jump_ns:
+        if abs(stamp + WRAP_NS - latest) <= MAX_JUMP_NS:
             self.wraps += 1
             return stamp + WRAP_NS
-        if self.wraps and abs(stamp - WRAP_NS - latest) <= self._max_jump_ns:
+        if self.wraps and abs(stamp - WRAP_NS - latest) <= MAX_JUMP_NS:
             return stamp - WRAP_NS  # a straggler from before the wrap
         return stamp
 
     def _add_jump_candidate(self, stamp: int, measurement: Measurement) -> Iterator[tuple[int, Measurement]]:
-        if self._jump_candidates and abs(stamp - self._jump_candidates[0][0]) > self._max_jump_ns:
+        if self._jump_candidates and abs(stamp - self._jump_candidates[0][0]) > MAX_JUMP_NS:
             self.strays += len(self._jump_candidates)
             self._jump_candidates = []
         self._jump_candidates.append((stamp, measurement))
@@ -86,7 +88,7 @@ class StampRepair:
 
 # ---- Gaps of a stream
 
-_GAP_FACTOR = 1.5  # a longer step, in expected steps, is a gap
+_STREAM_GAP_FACTOR = 1.5  # a longer step, in expected steps, is a gap of one stream
 
 
 class GapCounter:
@@ -127,7 +129,7 @@ class GapCounter:
         return True
 
     def _count_missing(self, step: int, number: int | None) -> None:
-        is_gap = step > _GAP_FACTOR * self._step_ns
+        is_gap = step > _STREAM_GAP_FACTOR * self._step_ns
         missing = round(step / self._step_ns) - 1 if is_gap else 0
         if number is not None and self._number is not None and number > self._number:
             missing = number - self._number - 1

@@ -1,11 +1,15 @@
-"""Detect corners to track: strong, and spread evenly over the image; order points by the cells of a grid."""
+"""Detect corners to track: strong, spread evenly, and within the used part of a wide lens's image."""
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from share.geometry.camera import Camera
+from share.geometry.lens import MAX_FIELD_DEG
 from share.types import F32, F64, I64, U8
 
 _BLOCK_PX = 5
@@ -127,3 +131,22 @@ def spread_order(
         rank = rank + np.bincount(cell_indices(occupied_px, size, grid), minlength=len(first))[cell[order]]
     out: I64 = order[np.lexsort((-strength[order], rank))]
     return out
+
+
+# ---- The used part of an image
+
+# Limit for views and for a tracker without an IMU, which weigh all points alike: here a pixel is four times
+# as large in (x/z, y/z) as on the axis.
+UNIFORM_FIELD_DEG = 60.0
+
+
+@lru_cache(maxsize=8)
+def field_mask(camera: Camera, max_deg: float = MAX_FIELD_DEG) -> U8 | None:
+    """Return a mask (H, W), 255 within `max_deg` of the axis and the range of the lens; None, for all, of
+    an unbounded lens."""
+    if not camera.is_bounded:
+        return None
+    px = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    uv = camera.normalise(px.astype(np.float64))
+    radius = np.hypot(uv[..., 0], uv[..., 1])
+    return np.where(radius < np.tan(np.radians(max_deg)), 255, 0).astype(np.uint8)

@@ -1,4 +1,8 @@
-"""Depth of image points, from a depth camera that need not be registered, or from a stereo pair."""
+"""Depth of image points, from a depth camera that need not be registered, or from a stereo pair.
+
+In a pair a point is tracked into the other image from a guess (`from_stereo`), or searched for along its
+whole epipolar line (`search_depth`).
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ from share.geometry import se3
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8
 from share.vision import optical_flow
+from share.vision.patches import sample_square
 
 EDGE_RATIO = 0.05  # relative depth step within 3 x 3 px at an object's edge
 MIN_DEPTH, MAX_DEPTH = 0.2, 12.0  # m
@@ -131,4 +136,61 @@ def disparity_per_rho(rig: Rig, uv: F64, rho: F64) -> F64:
     J_rho = (t[:2] - q[:, :2] / q[:, 2:] * t[2]) / q[:, 2:]
     J = rig.cam1.jacobian(q[:, :2] / q[:, 2:]) @ J_rho[:, :, None]
     out: F64 = np.linalg.norm(J[:, :, 0], axis=1)
+    return out
+
+
+# ---- Search along epipolar lines
+
+_MIN_SEARCH_DEPTH_M = 0.3
+_STEP_PX = 1.5  # between positions on the line
+_HALF_SIZE = 4  # px; patches are 9 x 9
+_MIN_CORRELATION = 0.75  # of the best position
+_MIN_PEAK_MARGIN = 0.03  # of its correlation over that of any other peak
+_PEAK_WIDTH = 3  # positions nearer than this belong to the same peak
+
+
+def search_depth(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64) -> F64:
+    """Return the depth (N,) m in cam0, to a pixel of disparity, of points px (N, 2) at normalised uv (N, 2).
+
+    NaN where no position on the line matches, or more than one does: repeated texture, edges along the line.
+    """
+    assert rig.cam1 is not None
+    if len(px) == 0:
+        return np.zeros(0)
+    scale = rig.cam0.focal * rig.baseline
+    rho = np.arange(0.0, scale / _MIN_SEARCH_DEPTH_M, _STEP_PX) / scale
+    if rig.cam1.is_fisheye:  # a step of 1.5 px is more inverse depth off the axis
+        rho = rho * (scale / np.maximum(disparity_per_rho(rig, uv, np.zeros(len(uv))), 0.02 * scale))[:, None]
+    score = _correlations(image0, image1, rig, px, uv, rho)
+    best = score.argmax(axis=1)
+    top = score[np.arange(len(px)), best]
+    is_same_peak = np.abs(np.arange(rho.shape[-1]) - best[:, None]) < _PEAK_WIDTH
+    is_clear = (top > _MIN_CORRELATION) & (
+        np.where(is_same_peak, -1, score).max(axis=1) < top - _MIN_PEAK_MARGIN
+    )
+    best_rho = rho[best] if rho.ndim == 1 else rho[np.arange(len(px)), best]
+    out: F64 = np.where(is_clear, 1 / np.maximum(best_rho, 0.25 / scale), np.nan)
+    return out
+
+
+def _correlations(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, rho: F64) -> F32:
+    """Return the correlation (N, K) of each patch at each inverse depth, (K,) or (N, K); -1 outside the
+    image."""
+    assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
+    R, t = rig.T_cam1_cam0[:3, :3], rig.T_cam1_cam0[:3, 3]
+    q = (rays(uv) @ R.T)[:, None] + rho[..., None] * t
+    projected = rig.cam1.project(q.reshape(-1, 3))
+    px1 = np.nan_to_num(projected, nan=-1e3).astype(np.float32)
+    patches1 = _unit_patches(image1, px1).reshape(len(px), rho.shape[-1], -1)
+    score = np.einsum("nks,ns->nk", patches1, _unit_patches(image0, px))
+    inside = rig.cam1.is_inside(px1.astype(np.float64), 1.0).reshape(score.shape)
+    out: F32 = np.where(inside, score, np.float32(-1))
+    return out
+
+
+def _unit_patches(image: U8, px: F32) -> F32:
+    """Return patches (N, S) of zero mean and unit norm."""
+    gray = sample_square(image, px, _HALF_SIZE)
+    gray = gray - gray.mean(axis=1, keepdims=True)
+    out: F32 = gray / np.maximum(np.linalg.norm(gray, axis=1, keepdims=True), np.float32(1e-3))
     return out

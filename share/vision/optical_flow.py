@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.types import F32, U8
-from share.vision.patches import sample
+from share.vision.patches import sample_square
 
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
@@ -61,18 +61,9 @@ def ncc(source: U8, target: U8, px: F32, found_px: F32, half: int = 5) -> F32:
     and bias."""
     if len(px) == 0:
         return np.zeros(0, np.float32)
-    a, b = _patches(source, px, half), _patches(target, found_px, half)
+    a, b = sample_square(source, px, half), sample_square(target, found_px, half)
     a = a - a.mean(axis=1, keepdims=True)
     b = b - b.mean(axis=1, keepdims=True)
     scale = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
     out: F32 = (a * b).sum(axis=1) / np.maximum(scale, 1e-6)
     return out
-
-
-def _patches(image: U8, px: F32, half: int) -> F32:
-    """Return bilinear patches (N, (2 half + 1)^2) round px (N, 2), in one remap."""
-    offset = np.arange(-half, half + 1, dtype=np.float32)
-    dx, dy = np.meshgrid(offset, offset)
-    x = px[:, :1].astype(np.float32) + dx.ravel()
-    y = px[:, 1:].astype(np.float32) + dy.ravel()
-    return sample(image, x, y)

@@ -8,8 +8,7 @@ import numpy as np
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8, Frame, View
 from share.vision import depth as depths
-from share.vision.corners import spread_order
-from share.vision.mask import UNIFORM_FIELD_DEG, field_mask
+from share.vision.corners import UNIFORM_FIELD_DEG, field_mask, spread_order
 
 _GRID = 8, 6  # cells across and down, over which features are spread
 _NEIGHBOUR_PX = 4.0  # where no depth is measured, a feature this near to a known point has its depth

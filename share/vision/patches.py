@@ -69,10 +69,7 @@ def extract(image: U8, px: F32) -> Patches:
     """Return the patches round px (N, 2)."""
     if len(px) == 0:
         return empty_patches()
-    axis = np.arange(-HALF_SIZE - 1, HALF_SIZE + 2, dtype=np.float32)
-    x, y = np.meshgrid(axis, axis)
-    padded = sample(image, px[:, :1] + x.ravel(), px[:, 1:] + y.ravel())
-    padded = padded.reshape(-1, _SIDE + 2, _SIDE + 2)
+    padded = sample_square(image, px, HALF_SIZE + 1).reshape(-1, _SIDE + 2, _SIDE + 2)
     dx = (padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]) / 2
     dy = (padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]) / 2
     gradient = np.stack([dx, dy], axis=1).reshape(len(px), 2, -1)
@@ -180,6 +177,13 @@ def sample(image: U8, x: F32, y: F32) -> F32:
         borderMode=cv2.BORDER_REPLICATE,
     ).astype(np.float32)
     return out
+
+
+def sample_square(image: U8, px: F32, half: int) -> F32:
+    """Return bilinear gray levels (N, (2 half + 1)^2) round px (N, 2), row by row."""
+    axis = np.arange(-half, half + 1, dtype=np.float32)
+    dx, dy = np.meshgrid(axis, axis)
+    return sample(image, px[:, :1] + dx.ravel(), px[:, 1:] + dy.ravel())
 
 
 def _normalised(gray: F32) -> tuple[F32, F32]:

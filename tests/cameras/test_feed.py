@@ -1,4 +1,4 @@
-"""A camera's feed on a camera that is none: what it says, and what it goes on through."""
+"""A camera's feed on a simulated camera: its notices and reconnections."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RATES = {"cam0": 30.0, "accel": 250.0, "gyro": 400.0}
 
 @dataclass
 class Fake:
-    """A camera that delivers what it is told to."""
+    """A simulated camera."""
 
     rig: Rig = field(default_factory=load_profile("d435i").rig)
     serial: str = "0123"
@@ -50,7 +50,7 @@ def wait(until: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def test_why_a_camera_is_still_away_is_said_once_unless_it_is_just_not_there() -> None:
+def test_each_reason_why_a_camera_cannot_be_reopened_is_reported_once() -> None:
     answers: list[Fake | ShareError] = [
         Fake(),
         NotAttachedError("no RealSense camera is attached"),
@@ -70,7 +70,7 @@ def test_why_a_camera_is_still_away_is_said_once_unless_it_is_just_not_there() -
 
     first = answers[0]
     assert isinstance(first, Fake)
-    feed = CameraFeed(connect, None, RATES, 10.0, said.append, SampleQueue(), quick)
+    feed = CameraFeed(connect, None, RATES, said.append, SampleQueue(), quick)
     feed.open()
     first.sink(DeviceSample("cam0", 10**9, None, time.monotonic_ns()))
     reader = threading.Thread(target=lambda: list(feed.measurements()), daemon=True)
@@ -88,7 +88,7 @@ def test_why_a_camera_is_still_away_is_said_once_unless_it_is_just_not_there() -
 
 @dataclass
 class Playing(Fake):
-    """It delivers some streams, from a thread of its own, until it is stopped."""
+    """A camera that delivers `streams` from a thread of its own until it is stopped."""
 
     streams: tuple[str, ...] = ()
 
@@ -106,13 +106,12 @@ class Playing(Fake):
         self._ended.set()
 
 
-def test_a_stream_that_is_needed_and_never_comes_ends_it_in_a_line_after_one_reset() -> None:
+def test_a_needed_stream_that_never_comes_ends_the_feed_after_one_reset() -> None:
     said: list[str] = []
     feed = CameraFeed(
         lambda serial, epoch: Playing(streams=("accel", "gyro")),
         None,
         RATES,
-        10.0,
         said.append,
         SampleQueue(),
         quick,
@@ -131,11 +130,11 @@ def test_a_stream_that_is_needed_and_never_comes_ends_it_in_a_line_after_one_res
     assert feed.has_failed
 
 
-def test_depth_beside_stereo_is_done_without_and_welcome_again() -> None:
+def test_depth_beside_stereo_is_optional() -> None:
     said: list[str] = []
     rates = RATES | {"cam1": 30.0, "depth": 30.0}
     camera = Playing(streams=("cam0", "cam1", "accel", "gyro"))
-    feed = CameraFeed(lambda serial, epoch: camera, None, rates, 10.0, said.append, SampleQueue(), quick)
+    feed = CameraFeed(lambda serial, epoch: camera, None, rates, said.append, SampleQueue(), quick)
     feed.open()
     reader = threading.Thread(target=lambda: list(feed.measurements()), daemon=True)
     reader.start()
@@ -150,9 +149,9 @@ def test_depth_beside_stereo_is_done_without_and_welcome_again() -> None:
     assert (feed.report()["resets"], feed.has_failed) == (1, False)
 
 
-def test_gaps_are_told_by_the_rates_that_the_camera_has() -> None:
+def test_gaps_are_counted_by_the_cameras_own_rates() -> None:
     slow = Fake(rates_hz=RATES | {"accel": 100.0})
-    feed = CameraFeed(lambda serial, epoch: slow, None, RATES, 10.0, print, SampleQueue())
+    feed = CameraFeed(lambda serial, epoch: slow, None, RATES, print, SampleQueue())
     feed.open()
     for at_ms in range(0, 1000, 10):
         for stream in ("accel", "gyro"):

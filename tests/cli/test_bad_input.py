@@ -316,15 +316,15 @@ def test_images_of_another_size(stereo, share, tmp_path):
 
 
 CONFIGS = {
-    "missing": (None, "config.yaml: cannot read the configuration: No such file"),
+    "missing": (None, "config.yaml: cannot be read: No such file"),
     "no YAML": ("tracker: {", "config.yaml, line 1: not valid YAML"),
     "twice": ("agent: {}\nagent: {}", "config.yaml, line 2: not valid YAML: duplicate key 'agent'"),
-    "a list": ("- tracker", "config.yaml: expected a mapping of settings, found list"),
+    "a list": ("- tracker", "config.yaml: expected keys and values, found list"),
     "unknown section": ("traker: {}", "config.yaml: unknown key 'traker'; did you mean 'tracker'?"),
     "unknown key": ("tracker: {cornrs: 9}", "tracker: unknown key 'cornrs'; did you mean 'corners'?"),
     "far from any": ("tracker: {zzz: 9}", "tracker: unknown key 'zzz'; known: corners, "),
-    "wrong type": ("tracker: {corners: many}", "tracker: corners: expected int, found 'many'"),
-    "a number": ("tracker: 5", "tracker: expected a mapping of settings, found int"),
+    "wrong type": ("tracker: {corners: many}", "tracker: corners: expected a whole number, found 'many'"),
+    "a number": ("tracker: 5", "tracker: expected keys and values, found int"),
     "out of range": ("link: {window: 0}", "link: window: 0 must be positive"),
     "zero": ("tracker: {corners: 0}", "tracker: corners: 0 must be positive"),
     "negative": (
@@ -493,7 +493,7 @@ def test_streams_that_are_not_used_are_named(stereo, share, tmp_path):
     (tmp_path / "camchain.yaml").write_text(CAMCHAIN)
     done = share("track", recording, "--calib", tmp_path / "camchain.yaml")
     assert done.code == 0
-    assert done.err == "share: stereo: imu0 is not used: the calibration has no imu0\n"
+    assert done.err == "share: stereo: imu0 is not used: the calibration has no imu\n"
 
 
 def test_ctrl_c_on_track(stereo, tmp_path):

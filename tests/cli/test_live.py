@@ -11,7 +11,7 @@ RATES = {"cam0": 30.0, "cam1": 30.0, "accel": 250.0, "gyro": 400.0}
 
 
 def test_a_camera_to_which_nothing_happened_is_not_spoken_of() -> None:
-    report = feed_report(SampleProcessor(RATES, 10.0), {}, Watchdog(0, RATES))
+    report = feed_report(SampleProcessor(RATES), {}, Watchdog(0, RATES))
     assert camera_events(report) == ""
     assert camera_summary({"camera": report}) == [
         "camera: missing 0, dropped 0, backward 0 (docs/do/record.md)"
@@ -26,6 +26,4 @@ def test_what_was_done_without_at_the_end_is_told() -> None:
         dog.tick(now_ms * 10**6)
         if now_ms == 10_000:
             dog.record_connect(now_ms * 10**6)
-    assert (
-        camera_events(feed_report(SampleProcessor(RATES, 10.0), {}, dog)) == "resets 1, DEGRADED at the end"
-    )
+    assert camera_events(feed_report(SampleProcessor(RATES), {}, dog)) == "resets 1, DEGRADED at the end"

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all; what cannot be written is found out first."""
+"""Files appear complete or not at all; unwritable paths are found beforehand."""
 
 import contextlib
 import os
@@ -30,8 +30,9 @@ def current_umask() -> int:
     return mask
 
 
-def test_a_reader_never_sees_half(tmp_path):
-    """Another process writes as fast as it can; every read is one of its two texts, whole."""
+@pytest.mark.long
+def test_a_reader_never_sees_a_half_written_file(tmp_path):
+    """Another process writes as fast as it can; every read is one of its two texts."""
     path = tmp_path / "x"
     code = (
         "import sys; from pathlib import Path; from share.files.writing import atomic_write\n"
@@ -49,7 +50,7 @@ def test_a_reader_never_sees_half(tmp_path):
     assert seen
 
 
-def test_paths_that_cannot_be_written(tmp_path):
+def test_unwritable_paths_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="is a folder"):
         check_writable(tmp_path)
@@ -63,8 +64,8 @@ def test_paths_that_cannot_be_written(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["pipe", "socket"])
-def test_what_is_no_file_is_not_written_where_a_file_belongs(tmp_path, kind):
-    """Opening a pipe waits for a reader, for ever; with one, who reads it decides how long we wait."""
+def test_special_files_are_not_written_as_output(tmp_path, kind):
+    """Opening a pipe waits for a reader forever; a slow reader delays the writer."""
     path, said = tmp_path / "events.jsonl", []
     special(path, kind)
     with reading(path) if kind == "pipe" else contextlib.nullcontext():
@@ -92,7 +93,7 @@ def reading(path: Path) -> Iterator[int]:
     os.close(handle)
 
 
-def test_a_pipe_that_a_person_names_needs_a_reader(tmp_path):
+def test_a_named_pipe_needs_a_reader(tmp_path):
     os.mkfifo(path := tmp_path / "poses")
     with pytest.raises(UsageError, match="poses: is a pipe without a reader; give the name of a file"):
         check_writable(path)
@@ -101,7 +102,7 @@ def test_a_pipe_that_a_person_names_needs_a_reader(tmp_path):
         check_writable(socket)
 
 
-def test_a_pipe_that_somebody_reads_is_written_and_has_no_end_before(tmp_path):
+def test_a_pipe_stays_open_until_it_is_written(tmp_path):
     os.mkfifo(path := tmp_path / "poses")
     with reading(path) as handle:
         assert check_writable(path) == path

@@ -77,7 +77,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_arrays_that_are_not_as_they_say(tmp_path, name):
+def test_arrays_that_contradict_their_header_are_refused(tmp_path, name):
     (tmp_path / "a.npy").write_bytes(BAD[name])
     with pytest.raises(DataError, match=r"a\.npy: is not an array file, or damaged"):
         read_array(tmp_path / "a.npy")
@@ -86,7 +86,7 @@ def test_arrays_that_are_not_as_they_say(tmp_path, name):
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_arrays_are_read_as_numpy_does(tmp_path, order, rng):
+def test_arrays_are_read_as_by_numpy(tmp_path, order, rng):
     arrays = {
         "a": np.asarray(rng.standard_normal((3, 4, 5)), order=order),
         "b": np.array("text: ö"),
@@ -104,7 +104,7 @@ def test_arrays_are_read_as_numpy_does(tmp_path, order, rng):
         np.testing.assert_array_equal(read_array(tmp_path / "a.npy"), value)
 
 
-def test_an_archive_that_unpacks_without_end_is_not_unpacked(tmp_path, monkeypatch):
+def test_an_archive_bomb_is_not_unpacked(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as out, out.open("x.npy", "w") as file:
         for _ in range(30):
@@ -119,7 +119,7 @@ def labels(count: int = 3) -> Labels:
     return Labels({"session": "s"}, np.arange(count), np.zeros(count, np.float32), *columns)
 
 
-def test_labels_of_other_shapes_and_kinds(tmp_path):
+def test_labels_of_other_shapes_and_types_are_refused(tmp_path):
     path = tmp_path / "a.npz"
     write_labels(path, labels())
     assert len(read_labels(path)) == 3
@@ -139,7 +139,7 @@ def test_labels_of_other_shapes_and_kinds(tmp_path):
             read_labels(path)
 
 
-def test_weights_that_are_not_finite(tmp_path):
+def test_non_finite_weights_are_refused(tmp_path):
     head = {"a.weight": np.full(3, np.nan, np.float32)}
     write_trained(tmp_path / "fit.npz", TrainedHeads([head], 0.1, np.zeros(96), np.eye(96), {}))
     with pytest.raises(DataError, match=r"0/a\.weight is not finite"):
@@ -152,7 +152,7 @@ def test_weights_that_are_not_finite(tmp_path):
 @pytest.mark.parametrize(
     "text", ["NaN", "[Infinity]", '{"a": -Infinity}', "1e999", "1" + "0" * 400, "-" + "9" * 5000, "[" * 10**5]
 )
-def test_json_says_numbers_or_nothing(tmp_path, text):
+def test_json_with_non_finite_or_huge_numbers_is_refused(tmp_path, text):
     with pytest.raises(ValueError, match=r"is not a valid number|nested too deeply"):
         parse_json(text)
     (tmp_path / "a.json").write_text(f'{{"x": {text}}}\n')
@@ -172,7 +172,7 @@ def run(folder: Path, **changes: object) -> Path:
     "change",
     [{"policy": 5}, {"seed": []}, {"virtual": "yes"}, {"session": 5}, {"code": {}}, {"error_model": 1}],
 )
-def test_records_of_runs_of_other_types(tmp_path, change):
+def test_run_records_of_other_types_are_refused(tmp_path, change):
     with pytest.raises(DataError, match=r"run\.json: is damaged"):
         read_trial(run(tmp_path / "a", **change))
 
@@ -180,7 +180,7 @@ def test_records_of_runs_of_other_types(tmp_path, change):
 @pytest.mark.parametrize(
     "report", [{}, {"track_ms": 5}, {"track_ms": {"p50": "x"}}, {"track_ms": {"p50": None}}]
 )
-def test_costs_by_reports_that_say_something_else(tmp_path, report):
+def test_delays_from_invalid_reports_are_refused(tmp_path, report):
     for name in ("edge", "ann"):
         (tmp_path / name).mkdir()
     (tmp_path / "edge/edge.json").write_text("{}")
@@ -199,7 +199,7 @@ def test_costs_by_reports_that_say_something_else(tmp_path, report):
         '{"name": "a", "rmse_cm": "x", "mae_cm": 1, "rank": 1, "qoe_off": 1}',
     ],
 )
-def test_scores_of_other_types(tmp_path, row):
+def test_scores_of_other_types_are_refused(tmp_path, row):
     (tmp_path / "a.json").write_text(f"[{row}]")
     with pytest.raises(DataError, match="not a file of `share train compare --json`, or damaged"):
         read_scores(tmp_path / "a.json")
@@ -218,18 +218,18 @@ def test_scores_of_other_types(tmp_path, row):
         ("edge: {max_agents: .inf}", "max_agents: expected"),
         ("edge: {max_agents: 1" + "0" * 50 + "}", "max_agents: expected a number from 0 to 1e"),
         ("edge: {max_agents: 1e400}", "max_agents: expected"),
-        ("edge: [1]", "edge: expected a mapping"),
-        ("5", "expected a mapping"),
+        ("edge: [1]", "edge: expected keys and values"),
+        ("5", "expected keys and values"),
     ],
 )
-def test_settings_that_nobody_knows(tmp_path, text, says):
+def test_invalid_settings_are_refused(tmp_path, text, says):
     (tmp_path / "c.yaml").write_text(text)
     with pytest.raises(ConfigError, match=says) as error:
         read_settings(tmp_path / "c.yaml")
     assert "\n" not in str(error.value) and "c.yaml" in str(error.value)
 
 
-def test_a_key_that_nobody_knows_is_one_line_of_the_program(tmp_path, share):
+def test_an_unknown_key_gives_one_line(tmp_path, share):
     (tmp_path / "c.yaml").write_text("edge:\n  max_agent: 3\n")
     done = share("track", tmp_path, "--config", tmp_path / "c.yaml")
     assert (done.code, done.err.count("\n")) == (2, 1)
@@ -237,7 +237,7 @@ def test_a_key_that_nobody_knows_is_one_line_of_the_program(tmp_path, share):
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
-def test_byte_order_marks(tmp_path, encoding):
+def test_byte_order_marks_are_accepted_or_refused(tmp_path, encoding):
     (tmp_path / "a.yaml").write_bytes("a: 1\n".encode(encoding))
     (tmp_path / "a.csv").write_bytes("1,2.5\n2,3.5\n".encode(encoding))
     if encoding == "utf-8-sig":
@@ -268,7 +268,7 @@ READERS = {
 
 @pytest.mark.parametrize("kind", [*KINDS, "hollow"])
 @pytest.mark.parametrize("name", READERS)
-def test_only_regular_files_of_bearable_size(tmp_path, name, kind):
+def test_only_regular_files_of_limited_size_are_read(tmp_path, name, kind):
     path = tmp_path / name
     if kind == "hollow":
         with path.open("wb") as file:
@@ -281,7 +281,7 @@ def test_only_regular_files_of_bearable_size(tmp_path, name, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_kept_of_a_room(tmp_path, kind):
+def test_a_special_file_in_a_room_cache_is_refused(tmp_path, kind):
     special(tmp_path / "room.json", kind)
     with pytest.raises(DataError, match="not a complete room"):
         load_room(tmp_path)
@@ -291,7 +291,7 @@ def test_what_is_kept_of_a_room(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "socket"])
-def test_what_another_process_writes_is_no_file(tmp_path, kind):
+def test_a_special_file_instead_of_a_growing_file_is_ignored(tmp_path, kind):
     special(tmp_path / "odom.tum", kind)
     assert GrowingFile(tmp_path / "odom.tum").new_lines() == []
 
@@ -300,7 +300,7 @@ def test_what_another_process_writes_is_no_file(tmp_path, kind):
 
 
 @pytest.mark.parametrize("name", ["../secret.png", "/etc/passwd", "a/../../secret.png"])
-def test_a_report_shows_no_pictures_from_elsewhere(tmp_path, name):
+def test_a_report_embeds_only_its_own_pictures(tmp_path, name):
     (tmp_path / "secret.png").write_bytes(b"secret")
     (tmp_path / "out").mkdir()
     with pytest.raises(DataError, match="is not a file name below"):
@@ -308,7 +308,7 @@ def test_a_report_shows_no_pictures_from_elsewhere(tmp_path, name):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_annex_that_is_no_file(tmp_path, kind):
+def test_a_report_section_that_is_a_special_file_is_refused(tmp_path, kind):
     special(tmp_path / "sweep.md", kind)
     with pytest.raises(UsageError):
         read_section(tmp_path, 1)

@@ -1,4 +1,4 @@
-"""A camera's pose is found among wrong matches, by either search."""
+"""Both solvers find a camera's pose among wrong matches."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def matches(rng, n, wrong, noise_px=1.0):
 
 
 def apart(T, truth):
-    """m, of the camera's place."""
+    """Return the position error, m."""
     return float(np.linalg.norm((se3.inverse(T) - se3.inverse(truth))[:3, 3]))
 
 
@@ -48,8 +48,8 @@ def test_the_same_seed_gives_the_same_pose(search, rng):
 
 
 @BOTH
-def test_the_best_first_need_few_samples(search, rng):
-    """80 % are wrong, and nobody draws so often as to find the others by chance."""
+def test_sorted_matches_need_few_iterations(search, rng):
+    """80 % are wrong: random samples would need far more iterations."""
     points, uv, truth, bad = matches(rng, 200, 0.8)
     order = np.argsort(bad, kind="stable")
     few = RansacOptions(3.0, 0, min_iterations=10, max_iterations=50, best_first=True)
@@ -59,7 +59,7 @@ def test_the_best_first_need_few_samples(search, rng):
 
 @BOTH
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 30])
-def test_where_there_is_none_nothing_is_raised(search, n, rng):
+def test_without_a_solution_nothing_is_raised(search, n, rng):
     points, uv = rng.normal([0, 0, 4], 1.0, (n, 3)), rng.uniform(-0.5, 0.5, (n, 2))
     T, inlier = search(points, uv, FOCAL, RansacOptions(1.0, 0, max_iterations=100))
     assert inlier.shape == (n,)
@@ -67,7 +67,7 @@ def test_where_there_is_none_nothing_is_raised(search, n, rng):
     assert inlier.sum() < 8
 
 
-def test_without_poselib_it_is_opencv_s(monkeypatch, rng):
+def test_opencv_replaces_a_missing_poselib(monkeypatch, rng):
     points, uv, *_ = matches(rng, 60, 0.3)
     monkeypatch.setattr(searches, "poselib", None)
     found, _ = absolute_pose(points, uv, FOCAL, RansacOptions(3.0, 5))

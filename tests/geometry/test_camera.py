@@ -25,7 +25,7 @@ def test_projection_is_opencvs(rng):
     assert np.abs(EUROC.project(points) - want.reshape(-1, 2)).max() < 1e-9
 
 
-def test_behind_the_camera_is_nowhere():
+def test_points_behind_the_camera_project_to_nan():
     assert np.isnan(PLAIN.project(np.array([[0.0, 0, -1], [0, 0, 0]]))).all()
 
 
@@ -46,7 +46,7 @@ def test_inside_counts_pixel_centres():
         ({"cx": float("nan")}, "finite"),
     ],
 )
-def test_nonsense_is_refused_by_name(change, says):
+def test_impossible_values_are_refused_by_name(change, says):
     values = {"width": 640, "height": 480, "fx": 400.0, "fy": 400.0, "cx": 320.0, "cy": 240.0} | change
     with pytest.raises(ValueError, match=says):
         Camera(**values)
@@ -65,7 +65,7 @@ def test_rig_wants_a_timeshift_of_at_most_a_second(seconds):
         Rig(PLAIN, np.eye(4), timeshift_s=seconds)
 
 
-def test_rig_says_what_it_is():
+def test_a_rigs_kind_names_its_sensors():
     T = np.eye(4)
     T[0, 3] = -0.05
     stereo = Rig(PLAIN, np.eye(4), cam1=PLAIN, T_cam1_cam0=T)
@@ -82,8 +82,8 @@ def test_a_baseline_that_is_not_in_metres_is_refused(metres: float) -> None:
         Rig(camera, np.eye(4), camera, T)
 
 
-def test_a_calibration_that_was_rounded_is_the_nearest_rigid_one():
-    """Else products of it are none, and no loop of that agent could be believed."""
+def test_rounded_extrinsics_become_the_nearest_rigid_transform():
+    """Products of a rounded one are not rigid, and no loop of that agent could be verified."""
     exact = se3.exp(np.array([0.4, -1.1, 0.7, 0.02, 0.01, -0.03]))
     held = Rig(PLAIN, np.round(exact, 3)).T_body_cam0
     assert np.abs(held[:3, :3] @ held[:3, :3].T - np.eye(3)).max() < 1e-12
@@ -92,6 +92,6 @@ def test_a_calibration_that_was_rounded_is_the_nearest_rigid_one():
     assert Rig(PLAIN, as_printed).T_body_cam0.tobytes() == as_printed.tobytes()
 
 
-def test_what_sits_on_one_body_is_near_it():
+def test_sensors_far_apart_are_refused():
     with pytest.raises(ValueError, match="T_body_cam0: is more than 1000 m away"):
         Rig(PLAIN, se3.exp(np.array([0, 0, 0, 1500.0, 0, 0])))

@@ -1,4 +1,4 @@
-"""Both lens models against OpenCV's, and against differences; nothing folds back into the image."""
+"""Both lens models against OpenCV's and against finite differences; nothing folds back."""
 
 import warnings
 
@@ -17,7 +17,7 @@ NONE = np.zeros((3, 1))
 
 
 def _everywhere(rng, most_deg, n=400):
-    """Points (n, 3) up to so many degrees off the axis."""
+    """Return points (n, 3) up to `deg` degrees off the axis."""
     angle, turn = np.radians(rng.uniform(0, most_deg, n)), rng.uniform(0, 2 * np.pi, n)
     ray = [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)]
     return np.column_stack(ray) * rng.uniform(0.3, 20, (n, 1))
@@ -38,7 +38,7 @@ def test_equidistant_is_opencvs(rng):
 
 
 @pytest.mark.parametrize(("camera", "deg"), [(EUROC, 45), (FIVE, 45), (TUMVI, 74)])
-def test_there_and_back(camera, deg, rng):
+def test_undistortion_inverts_distortion(camera, deg, rng):
     points = _everywhere(rng, deg)
     px = camera.project(points)
     assert np.abs(camera.normalise(px) - points[:, :2] / points[:, 2:]).max() < 1e-8
@@ -78,7 +78,7 @@ def test_derivatives_by_points_and_by_coefficients_against_differences(camera, d
 
 
 @pytest.mark.parametrize("camera", [EUROC, FIVE, TUMVI])
-def test_the_axis_is_no_exception(camera):
+def test_derivatives_on_the_axis_are_finite(camera):
     middle = np.array([[0.0, 0, 2]])
     centre = np.array([[camera.cx, camera.cy]])
     np.testing.assert_allclose(camera.project(middle), centre)
@@ -90,8 +90,8 @@ def test_the_axis_is_no_exception(camera):
     assert np.isfinite(camera.lens.coefficient_jacobian(middle)).all()
 
 
-def test_beyond_its_range_a_lens_shows_nothing():
-    """1 - 3 * 0.5 r^2 is 0 at 0.816: what is further out would come back into the image."""
+def test_points_beyond_a_lenss_range_are_nan():
+    """1 - 3 * 0.5 r^2 is 0 at 0.816: points further out would fold back into the image."""
     strong = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, (-0.5, 0.0, 0.0, 0.0))
     within, beyond = np.array([[0.8, 0.0]]), np.array([[0.9, 0.0]])
     assert np.isfinite(strong.distort(within)).all() and np.isnan(strong.distort(beyond)).all()
@@ -130,8 +130,8 @@ def test_field_of_view():
         ("radtan", (1e4, 1e4, 30.0, 1e4)),
     ],
 )
-def test_a_lens_that_no_glass_has_gives_no_wrong_ray(model, coefficients):
-    """What it gives is right, and where it finds none there is NaN, without a warning."""
+def test_absurd_coefficients_give_no_wrong_ray(model, coefficients):
+    """A result is right or NaN, without a warning."""
     camera = Camera(64, 48, 30.0, 30.0, 31.5, 23.5, coefficients, model)
     px = np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), axis=-1)
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""What no tracker can use is said in one line, and what people have is let through."""
+"""Unusable rigs are refused in one line; usual ones pass."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def both(**values: object) -> Rig:
     ],
     ids=lambda rig: rig.kind,
 )
-def test_what_people_have_is_let_through(rig: Rig) -> None:
+def test_usual_rigs_pass(rig: Rig) -> None:
     assert rig_problem(rig) is None
 
 
@@ -83,13 +83,13 @@ def test_what_people_have_is_let_through(rig: Rig) -> None:
         (replace(RIG, imu=replace(NOISE, accel_walk=900.0)), "random walk"),
     ],
 )
-def test_what_no_tracker_can_use_is_refused_in_a_line_that_says_why(rig: Rig, says: str) -> None:
+def test_unusable_rigs_are_refused_with_the_reason(rig: Rig, says: str) -> None:
     told = rig_problem(rig)
     assert told is not None
     assert any(part in told for part in says.split("|")), told
     assert "\n" not in told and len(told) < 250
 
 
-def test_a_lens_alone() -> None:
+def test_a_lens_is_checked_alone() -> None:
     assert lens_problem(EUROC) is None
     assert "folds" in str(lens_problem(replace(EUROC, distortion=(-30.0, 0.0, 0.0, 0.0))))

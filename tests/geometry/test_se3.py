@@ -51,7 +51,7 @@ def test_adjoint_moves_a_perturbation_to_the_other_side(rng):
     assert np.allclose(T @ se3.exp(xi), se3.exp(se3.adjoint(T) @ xi) @ T, atol=1e-12)
 
 
-def test_vectorised_like_one_by_one(rng):
+def test_batches_equal_single_calls(rng):
     xi = rng.normal(size=(5, 7, 6))
     T = se3.exp(xi)
     assert np.allclose(T[2, 3], se3.exp(xi[2, 3]))
@@ -59,6 +59,7 @@ def test_vectorised_like_one_by_one(rng):
     assert np.allclose(se3.log(T)[1, 1], se3.log(T[1, 1]))
 
 
+@pytest.mark.long
 def test_covariances_of_products_and_inverses_against_sampling(rng):
     A, B = se3.exp(rng.normal(size=6)), se3.exp(rng.normal(size=6))
     cov_a = np.diag([1, 2, 3, 4, 5, 6]) * 1e-6
@@ -71,7 +72,7 @@ def test_covariances_of_products_and_inverses_against_sampling(rng):
     assert np.allclose(np.cov(inverse.T), se3.inverse_cov(A, cov_a), atol=3e-7)
 
 
-def test_orthonormal_mends_a_drifted_rotation(rng):
+def test_orthonormal_removes_the_drift_of_a_rotation(rng):
     T = se3.exp(rng.normal(size=6))
     bent = T.copy()
     bent[:3, :3] += 1e-4 * rng.normal(size=(3, 3))
@@ -80,13 +81,13 @@ def test_orthonormal_mends_a_drifted_rotation(rng):
     assert np.allclose(mended, T, atol=1e-3)
 
 
-def test_angle_is_that_of_the_logarithm_from_nothing_to_half_a_turn() -> None:
+def test_rotation_angle_equals_the_norm_of_the_logarithm() -> None:
     axis = np.array([0.6, -0.48, 0.64])
     for radians in (0.0, 1e-9, 1e-4, 0.5, 2.0, 3.0, np.pi - 1e-7, np.pi):
         assert abs(se3.rotation_angle(se3.so3_exp(radians * axis)) - radians) < 1e-8
 
 
-def test_poses_are_as_far_apart_as_one_by_one(rng):
+def test_pairwise_distances_equal_single_calls(rng):
     poses, others = (se3.exp(rng.normal(0, 1, (n, 6))) for n in (5, 7))
     metres, radians = se3.pairwise_distances(poses, others)
     for i, T in enumerate(poses):
@@ -98,7 +99,7 @@ def test_poses_are_as_far_apart_as_one_by_one(rng):
         assert np.diagonal(gap) == pytest.approx(0.0, abs=1e-7)
 
 
-def test_the_spread_of_a_position_is_of_its_translation_alone():
+def test_position_sigma_uses_the_translation_block_only():
     cov = np.diag([100.0, 100.0, 100.0, 0.04, 0.05, 0.07])
     assert se3.position_sigma(cov) == pytest.approx(0.4)
     assert se3.position_sigma(-1e-20 * cov) == 0

@@ -16,7 +16,6 @@ from share.cameras.realsense.camera import RealSenseCamera
 from share.cameras.realsense.devices import load_sdk
 from share.cameras.realsense.streams import StreamRequest
 from share.cameras.sample_queue import SampleQueue
-from share.config import SequencerConfig
 from share.errors import ShareError, UsageError
 from share.recordings.calibration import Calibration
 from share.runtime.capture import Capture
@@ -59,9 +58,8 @@ class Bench:
         self.camera = SoftwareCamera(load_sdk(), depth=wanted.depth)
         self.said, self.there, self.error = list[str](), True, ""
         self.wanted, self.connected = wanted, 0
-        rates_hz, max_jump_s = wanted.rates_hz(), SequencerConfig().max_jump_s
         queue = SampleQueue(most_images)
-        self.source = CameraFeed(self.connect, None, rates_hz, max_jump_s, self.said.append, queue, watchdog)
+        self.source = CameraFeed(self.connect, None, wanted.rates_hz(), self.said.append, queue, watchdog)
         self.run = Capture(self.source, out, 0.0, self.said.append, calibration=calibration)
         self.report: dict[str, Any] = {}
         self.thread = threading.Thread(target=self._go, daemon=True)

@@ -40,8 +40,7 @@ from share.odometry.error_model.inputs import INPUT_SHAPES, input_dtype
 from share.odometry.error_model.network import open_error_model
 from share.recordings.calibration import kalibr_texts, read_calibration
 from share.recordings.describe import describe_recording
-from share.recordings.mcap.recorder import Recorder
-from share.recordings.mcap.recover import recover_recording
+from share.recordings.mcap.recorder import Recorder, recover_recording
 from share.recordings.session import read_session
 from share.runtime.pipeline import make_source_tracker, read_frames
 from share.runtime.source import open_source

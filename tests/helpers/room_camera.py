@@ -15,7 +15,6 @@ from share.cameras.feed import CameraFeed, MakeWatchdog
 from share.cameras.realsense.camera import RealSenseCamera
 from share.cameras.realsense.streams import StreamRequest
 from share.cameras.sample_queue import SampleQueue
-from share.config import SequencerConfig
 from share.errors import UsageError
 from share.runtime.source import Source
 from share.sensors.profile import load_profile
@@ -42,14 +41,13 @@ class RoomCamera:
         self, wanted: StreamRequest, queue: SampleQueue, said: list[str], watchdog: MakeWatchdog = Watchdog
     ) -> CameraFeed:
         """What the camera delivers, not opened yet."""
-        rates, jump_s = wanted.rates_hz(), SequencerConfig().max_jump_s
 
         def connect(serial: str | None, epoch: int) -> RealSenseCamera:
             if not self.there:
                 raise UsageError("no camera")
             return self.device(wanted, epoch)
 
-        return CameraFeed(connect, None, rates, jump_s, said.append, queue, watchdog)
+        return CameraFeed(connect, None, wanted.rates_hz(), said.append, queue, watchdog)
 
     def play(self, before_image: Callable[[], None] = lambda: None, begin_us: int = BEGIN_US) -> int:
         """All of it; the stamp of the camera's clock after it. before_image: called before each frame."""

@@ -11,7 +11,14 @@ from hypothesis.extra import numpy as hnp
 
 from share.agent_names import checked_name
 from share.geometry import se3
-from share.geometry.camera import BASELINE_RANGE_M, MAX_TIMESHIFT_S, MOST_APART_M, Camera, ImuNoise, Rig
+from share.geometry.camera import (
+    BASELINE_RANGE_M,
+    MAX_SENSOR_DISTANCE_M,
+    MAX_TIMESHIFT_S,
+    Camera,
+    ImuNoise,
+    Rig,
+)
 from share.types import (
     MAX_ID,
     MAX_ODOM_M,
@@ -119,9 +126,11 @@ def tracked(draw: st.DrawFn) -> m.RemoteTrackingResult:
 def rigs(draw: st.DrawFn) -> Rig:
     beside = poses(BASELINE_RANGE_M[1] / 2).filter(lambda T: np.linalg.norm(T[:3, 3]) > BASELINE_RANGE_M[0])
     cam1 = draw(st.none() | st.tuples(cameras, beside)) or (None, None)
-    depth = draw(st.none() | st.tuples(cameras, poses(MOST_APART_M))) or (None, None)
+    depth = draw(st.none() | st.tuples(cameras, poses(MAX_SENSOR_DISTANCE_M))) or (None, None)
     shift_s = draw(st.floats(-MAX_TIMESHIFT_S, MAX_TIMESHIFT_S))
-    return Rig(draw(cameras), draw(poses(MOST_APART_M)), *cam1, *depth, draw(st.none() | imus), shift_s)
+    return Rig(
+        draw(cameras), draw(poses(MAX_SENSOR_DISTANCE_M)), *cam1, *depth, draw(st.none() | imus), shift_s
+    )
 
 
 messages = st.one_of(

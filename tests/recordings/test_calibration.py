@@ -1,4 +1,4 @@
-"""Calibration files: all three forms give the rig they mean; what is wrong is named by file and key."""
+"""Calibration files: three forms give the same rig; errors name file and key."""
 
 from pathlib import Path
 
@@ -65,7 +65,7 @@ EXTRINSICS = [
 
 @pytest.mark.parametrize(("key0", "T0", "key1", "T1"), EXTRINSICS)
 @pytest.mark.parametrize("head", ["", "%YAML:1.0\n", "%YAML:1.0 # of OpenCV\n---\n"])
-def test_kalibr_extrinsics_mean_what_they_are_named(tmp_path, key0, T0, key1, T1, head):
+def test_extrinsics_are_read_in_the_direction_of_their_key(tmp_path, key0, T0, key1, T1, head):
     text = chain(f"  {key0}: {matrix(T0)}\n  rostopic: /left/image\n", f"  {key1}: {matrix(T1)}\n", head)
     calibration = read_calibration(write(tmp_path, text))
     rig = calibration.rig
@@ -77,7 +77,7 @@ def test_kalibr_extrinsics_mean_what_they_are_named(tmp_path, key0, T0, key1, T1
     assert calibration.topics == {"cam0": "/left/image", "imu": "/imu0"}
 
 
-def test_a_fisheye_lens_is_written_as_it_is_read(tmp_path):
+def test_a_fisheye_lens_survives_writing_and_reading(tmp_path):
     text = chain(f"  T_cam_imu: {matrix(T_CAM0_IMU)}\n").replace("radtan", "equidistant")
     rig = read_calibration(write(tmp_path, text)).rig
     assert (rig.cam0.model, rig.cam0.distortion) == ("equidistant", (-0.28, 0.07, 0.0002, 1e-05))
@@ -120,7 +120,7 @@ GOOD0 = f"  T_cam_imu: {matrix(T_CAM0_IMU)}\n"
         ("cam2: {}\n", "key 'cam0' is missing"),
     ],
 )
-def test_what_is_wrong_is_said_with_file_and_key(tmp_path, text, complaint):
+def test_an_invalid_calibration_is_refused_by_file_and_key(tmp_path, text, complaint):
     with pytest.raises(ConfigError, match=rf"(?s){CAMCHAIN}.*{complaint}"):
         read_calibration(write(tmp_path, text))
 
@@ -158,14 +158,14 @@ def test_timeshift_is_the_cameras_mean(tmp_path, camchain, seconds):
         ),
     ],
 )
-def test_a_timeshift_that_cannot_be(tmp_path, camchain, complaint):
+def test_an_invalid_timeshift_is_refused(tmp_path, camchain, complaint):
     with pytest.raises(ConfigError, match=rf"{CAMCHAIN}: {complaint}") as error:
         read_calibration(write(tmp_path, camchain))
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("seconds", [0.0, -0.02])
-def test_a_rig_written_under_kalibrs_names_is_read_as_it_was(tmp_path, seconds):
+def test_a_rig_survives_writing_and_reading_as_kalibr_files(tmp_path, seconds):
     text = chain(SHIFT0.format(seconds), SHIFT1.format(seconds))
     rig = read_calibration(write(tmp_path, text)).rig
     written = Section(to_kalibr(rig), "written")
@@ -176,8 +176,8 @@ def test_a_rig_written_under_kalibrs_names_is_read_as_it_was(tmp_path, seconds):
     np.testing.assert_allclose(back.T_body_cam0, rig.T_body_cam0, atol=1e-12)
 
 
-def test_the_device_is_told_in_every_section_and_never_at_the_top(tmp_path):
-    """Where Kalibr would take it for a camera. Quoted: YAML reads 0123 as 83."""
+def test_the_serial_number_is_written_in_every_section(tmp_path):
+    """Not at the top, where Kalibr takes a key for a camera. Quoted: YAML reads 0123 as 83."""
     rig = read_calibration(write(tmp_path, chain(SHIFT0.format(0), SHIFT1.format(0)))).rig
     assert read_calibration(tmp_path).serials == ()
     for name, text in kalibr_texts(rig, "ours", "0123").items():
@@ -206,8 +206,8 @@ DEPTH = """depth:
 """
 
 
-def test_what_no_rig_holds_is_kept_of_the_calibration_that_it_was(tmp_path):
-    """Also without the IMU chain, without which the rig has no IMU."""
+def test_what_a_rig_lacks_is_kept_from_its_original_calibration(tmp_path):
+    """Also without the IMU chain: the rig then has no IMU."""
     T = matrix(se3.inverse(T_CAM0_IMU))
     told = f"  T_imu_cam: {T}\n  timeshift_cam_imu: 0.004\n  rostopic: /left/image\n"
     path = write(tmp_path, chain(told) + DEPTH, None) / CAMCHAIN
@@ -248,7 +248,7 @@ def test_camera_yaml_registered_and_not(tmp_path):
         read_calibration(path)
 
 
-def test_the_example_in_calib():
+def test_the_example_calibration_loads():
     """calib/ holds a whole example, and it stays loadable."""
     rig = read_calibration(Path(__file__).parents[2] / "calib" / "d435i").rig
     assert rig.kind == "stereo+imu"

@@ -1,4 +1,4 @@
-"""MCAP recordings and map files made to hurt, likewise."""
+"""Malicious MCAP recordings and map files are refused in one line, or lose the damaged parts only."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from share.geometry import se3
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SaveLink, StoredMap
 from share.recordings.images import ArrayImage
-from share.recordings.mcap.chunks import MAX_CHUNK_BYTES
-from share.recordings.mcap.recorder import Recorder
-from share.recordings.mcap.recover import recover_recording
+from share.recordings.mcap.file import MAX_CHUNK_BYTES
+from share.recordings.mcap.recorder import Recorder, recover_recording
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.measurement import Measurement
@@ -35,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("soon")
 
 
 def _chunk(compression: str, data: bytes, said: int) -> bytes:
-    """An MCAP file of one chunk."""
+    """Return an MCAP file of one chunk."""
     body = struct.pack("<QQQI", 0, 10, said, 0) + struct.pack("<I", len(compression)) + compression.encode()
     body += struct.pack("<Q", len(data)) + data
     head = struct.pack("<BQ", 1, 8) + bytes(8)
@@ -52,13 +51,12 @@ def _chunk(compression: str, data: bytes, said: int) -> bytes:
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 @pytest.mark.parametrize("said", [1000, 2 * 10**9, 2**63])
-def test_a_chunk_is_unpacked_no_further_than_it_says(tmp_path, compression, said):
+def test_a_chunk_is_unpacked_only_to_its_declared_size(tmp_path, compression, said):
     import lz4.frame
     import zstandard
     from mcap.records import Chunk
 
-    from share.recordings.mcap.chunks import chunk_records
-    from share.recordings.mcap.file import damage_errors
+    from share.recordings.mcap.file import chunk_records, damage_errors
 
     pack = zstandard.ZstdCompressor().compress if compression == "zstd" else lz4.frame.compress
     data = pack(bytes(50 * 10**6))
@@ -79,7 +77,7 @@ def _recorded(path: Path, images: int = 40) -> Path:
     return path
 
 
-def test_a_message_that_cannot_be_read_costs_itself(tmp_path):
+def test_unreadable_messages_are_skipped(tmp_path):
     path = tmp_path / "a.mcap"
     with Recorder(path, RIG) as recorder:
         for k, m in enumerate(live(100)):
@@ -96,7 +94,7 @@ def test_a_message_that_cannot_be_read_costs_itself(tmp_path):
     assert source.losses.counts == {f"messages of {topic}": 4 for topic in topics}
 
 
-def test_an_image_message_of_an_absurd_size_and_a_sample_that_is_not_finite(tmp_path):
+def test_absurd_image_sizes_and_non_finite_samples_are_skipped(tmp_path):
     path = tmp_path / "a.mcap"
     with Recorder(path, RIG) as recorder:
         for m in live(40):
@@ -121,7 +119,7 @@ def test_an_image_message_of_an_absurd_size_and_a_sample_that_is_not_finite(tmp_
 @pytest.mark.parametrize(
     "attack", ["twice", "outside", "elsewhere", "summary at the front", "no such channel"]
 )
-def test_an_index_that_leads_astray(tmp_path, attack):
+def test_an_invalid_index_is_refused(tmp_path, attack):
     from mcap.reader import SeekingReader
 
     data = _recorded(tmp_path / "a.mcap").read_bytes()
@@ -184,7 +182,7 @@ EVIL = {
 
 
 @pytest.mark.parametrize("name", EVIL)
-def test_a_map_whose_tables_are_not_ours_is_read_without_them(tmp_path, name):
+def test_foreign_tables_of_a_map_are_ignored(tmp_path, name):
     path = tmp_path / "map.sqlite"
     kept = filled(path)
     with sqlite3.connect(path) as db:
@@ -203,7 +201,7 @@ def test_a_map_whose_tables_are_not_ours_is_read_without_them(tmp_path, name):
     assert {kind for (kind,) in kinds} <= {"table", "index"}
 
 
-def test_rows_that_say_what_cannot_be_cost_themselves(tmp_path):
+def test_invalid_rows_of_a_map_are_skipped(tmp_path):
     from share.store.rows import COLUMNS, row_crc
 
     path = tmp_path / "map.sqlite"
@@ -243,7 +241,7 @@ def test_rows_that_say_what_cannot_be_cost_themselves(tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_map_that_is_no_file(tmp_path, kind):
+def test_a_map_that_is_a_special_file_is_refused(tmp_path, kind):
     special(tmp_path / "map.sqlite", kind)
     with pytest.raises(UsageError):
         MapStore.read(tmp_path / "map.sqlite")

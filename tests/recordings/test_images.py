@@ -1,4 +1,4 @@
-"""Images: what is whole decodes, what is not is refused by name."""
+"""Intact images decode exactly; others are refused by name."""
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ def test_gray_png_is_exact_and_colour_becomes_gray():
     assert np.abs(colour - cv2.cvtColor(picture(1, 3), cv2.COLOR_BGR2GRAY).astype(int)).max() <= 1
 
 
-def test_depth_is_metres_and_zero_stays_none():
+def test_depth_is_in_metres_and_zero_stays_zero():
     mm = depth_mm(0)
     mm[0, 0] = 0
     depth = encoded(".png", mm, 1000.0).load()
@@ -46,7 +46,7 @@ def test_a_flipped_bit_in_a_png_is_refused():
         EncodedImage(bytes(data), "x", WIDTH, HEIGHT, 1000.0).load()
 
 
-def test_wrong_size_missing_file_8_bit_depth_and_no_image(tmp_path):
+def test_wrong_size_missing_file_8_bit_depth_and_other_formats_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"is 64x48, but the calibration is for 99x48.*--calib"):
         encoded(".png", picture(1), width=99).load()
     with pytest.raises(DataError, match="missing"):

@@ -1,4 +1,4 @@
-"""IMU samples of all kinds of recordings, with cameras or without."""
+"""IMU samples are read from all kinds of recordings, with cameras or without."""
 
 from pathlib import Path
 
@@ -9,8 +9,6 @@ from helpers.recordings import make_euroc, make_tum
 from share.errors import DataError, UsageError
 from share.lab.calibrate.imu_table import read_imu
 from share.recordings.convert import to_mcap
-from share.recordings.losses import DataLosses
-from share.recordings.mcap import imu as fast
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.recorder import Recorder
 from share.runtime.source import open_source
@@ -20,7 +18,7 @@ from share.sensors.stamps import WRAP_NS
 
 
 def recorded(path: Path, stamps: list[int], values: np.ndarray, log: list[int] | None = None) -> Path:
-    """An MCAP with the IMU alone."""
+    """Write an MCAP with the IMU alone."""
     with Recorder(path, load_profile("d435i").rig()) as recorder:
         for stamp, sample, at in zip(stamps, values, log or stamps, strict=True):
             recorder.write(Measurement(IMU, stamp, sample), at)
@@ -39,8 +37,8 @@ def test_a_recording_without_cameras_comes_back_bit_for_bit(tmp_path):
     assert np.array_equal(np.concatenate([table.imu.gyro, table.imu.accel], axis=1), values)
 
 
-def test_all_forms_of_one_recording_say_the_same(tmp_path, monkeypatch):
-    """Of the folder, its table, and the MCAP made of it; no image is decoded on the way."""
+def test_all_forms_of_a_recording_give_the_same_imu_samples(tmp_path, monkeypatch):
+    """The folder, its table, and an MCAP made of it; no image is decoded."""
     folder = make_euroc(tmp_path / "walk")
     to_mcap(open_source(str(folder)), tmp_path / "walk.mcap", None, lambda done: None)
     monkeypatch.setattr("cv2.imdecode", None)
@@ -54,8 +52,8 @@ def test_all_forms_of_one_recording_say_the_same(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("frame", ["", "imu", "camera_imu_optical_frame"])
-def test_messages_are_read_as_rosbags_writes_them(frame):
-    """Doubles begin at a multiple of eight, whatever the length of the frame's name."""
+def test_imu_messages_are_parsed_as_rosbags_writes_them(frame):
+    """Doubles are aligned to eight bytes, whatever the length of the frame's name."""
     numbers = iter(np.random.default_rng(1).normal(size=10))
     vector, other = (
         ros.make_message("geometry_msgs/msg/Vector3", **{k: next(numbers) for k in "xyz"}) for _ in "ab"
@@ -72,18 +70,14 @@ def test_messages_are_read_as_rosbags_writes_them(frame):
         linear_acceleration=other,
         linear_acceleration_covariance=covariances[2],
     )
-    stamps, values = fast._parse_batch([ros.encode(message)] * 2)
-    assert stamps.tolist() == [12_000_000_345] * 2
-    assert values[1].tolist() == [getattr(v, k) for v in (vector, other) for k in "xyz"]
-    losses = DataLosses()
-    assert len(fast._intact_messages([ros.encode(message)[:-8], ros.encode(message)], "here", losses)) == 1
-    losses.check("IMU messages", 2)
-    assert not fast._intact_messages([ros.encode(message)[:-8]], "here", losses)
-    with pytest.raises(DataError, match="here: a message is not sensor_msgs/Imu"):
-        losses.check("IMU messages", 3)
+    data = ros.encode(message)
+    assert ros.header_stamps([data] * 2).tolist() == [12_000_000_345] * 2
+    values = [getattr(v, k) for v in (vector, other) for k in "xyz"]
+    assert ros.parse_imu_batch([data] * 2).tolist() == [values, values]
+    assert (ros.is_imu_message(data), ros.is_imu_message(data[:-8])) == (True, False)
 
 
-def test_a_counter_that_wraps_goes_on(tmp_path):
+def test_a_wrapping_counter_is_unwrapped(tmp_path):
     steps = np.arange(400, dtype=np.int64) * 5_000_000
     raw = ((WRAP_NS - 10**9 + steps) % WRAP_NS).tolist()
     path = recorded(tmp_path / "wrap.mcap", raw, np.ones((400, 6)), (10**18 + steps).tolist())
@@ -99,7 +93,7 @@ def test_samples_out_of_order_are_dropped_and_counted(tmp_path):
     assert table.imu.gyro[-1].tolist() == [30.0, 31.0, 32.0]
 
 
-def test_what_has_no_imu_is_refused(tmp_path):
+def test_a_source_without_imu_is_refused(tmp_path):
     make_tum(tmp_path / "tum")
     with pytest.raises(UsageError, match="not an IMU recording that SHARE reads"):
         read_imu(str(tmp_path / "tum"))
@@ -110,7 +104,7 @@ def test_what_has_no_imu_is_refused(tmp_path):
         read_imu(str(tmp_path / "tum.mcap"))
 
 
-def test_a_sample_that_is_no_number_is_left_out_and_counted_but_not_many(tmp_path):
+def test_few_non_finite_samples_are_dropped_and_many_refused(tmp_path):
     values = np.ones((5, 6))
     values[3, 2] = np.nan
     table = read_imu(str(recorded(tmp_path / "a.mcap", list(range(5)), values)))

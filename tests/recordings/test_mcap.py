@@ -1,5 +1,4 @@
-"""MCAP: what is recorded comes back bit for bit, others can read it, others' files can be read, and a
-killed recorder's file can be recovered."""
+"""MCAP recordings come back bit for bit, rosbags reads them, and recordings of others are read."""
 
 import dataclasses
 import os
@@ -23,12 +22,13 @@ from share.recordings.images import ArrayImage
 from share.recordings.mcap import rig as ros_rig
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.recorder import Recorder
+from share.recordings.recording import FolderSource
 from share.runtime.source import open_source
 from share.sensors.measurement import Measurement
 
 
 def assert_same(a, b):
-    """Two lists of frames are equal to the last bit."""
+    """Assert that two lists of frames are equal to the last bit."""
     assert [f.stamp_ns for f in a] == [f.stamp_ns for f in b]
     for f, g in zip(a, b, strict=True):
         assert f.gap_ns == g.gap_ns
@@ -45,6 +45,12 @@ def assert_same_rig(a: Rig, b: Rig):
     for name in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0"):
         x, y = getattr(a, name), getattr(b, name)
         assert (x is None and y is None) or np.array_equal(x, y)
+
+
+def with_timeshift(source: FolderSource, part: slice | None = None) -> FolderSource:
+    """Return the recording with a timeshift of 20 ms."""
+    rig = dataclasses.replace(source.rig, timeshift_s=0.02)
+    return FolderSource(Path("walk"), rig, source.images, source.losses, source.imu, frames=part)
 
 
 def nothing(done: int) -> None:
@@ -70,6 +76,7 @@ def test_a_recording_comes_back_bit_for_bit(folder, tmp_path):
     assert_same(frames(open_source(str(folder), frames=part)), frames(open_source(str(out), frames=part)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["euroc_v1_01_keyframes", "redkitchen_0000_0499"])
 def test_real_recordings_come_back_bit_for_bit(shared_data, tmp_path, name):
     part = slice(0, 40)
@@ -88,21 +95,21 @@ def test_asl_folder_comes_back(tmp_path):
     with pytest.raises(UsageError, match="cannot hold depth"):
         to_euroc(open_source(str(make_tum(tmp_path / "rgbd"))), tmp_path / "x", nothing)
     assert not (tmp_path / "x").exists()
-    shifted = dataclasses.replace(source, rig=dataclasses.replace(source.rig, timeshift_s=0.02))
+    shifted = with_timeshift(source)
     with pytest.raises(UsageError, match="cannot hold the cameras' timeshift"):
         to_euroc(shifted, tmp_path / "x", nothing)
     assert not (tmp_path / "x").exists()
 
 
 def test_a_part_of_a_recording_with_a_timeshift(tmp_path):
-    """Its IMU samples are those between its images by the IMU's clock, in a folder as in MCAP."""
+    """IMU samples are selected by the IMU's clock, in a folder as in MCAP."""
     source = open_source(str(make_euroc(tmp_path / "walk")))
-    shifted = dataclasses.replace(source, rig=dataclasses.replace(source.rig, timeshift_s=0.02))
+    shifted = with_timeshift(source)
     to_mcap(shifted, tmp_path / "walk.mcap", None, nothing)
     whole = frames(shifted)
     part = frames(open_source(str(tmp_path / "walk.mcap"), frames=slice(2, 4)))
     assert_same(part, whole[2:4])
-    assert_same(frames(shifted.slice_frames(slice(2, 4))), part)
+    assert_same(frames(with_timeshift(source, slice(2, 4))), part)
     assert part[-1].imu.stamps_ns[-1] == part[-1].stamp_ns + 20_000_000
 
 
@@ -144,8 +151,8 @@ def test_raw_arrays_are_exact_in_either_depth_encoding(tmp_path, scale, encoding
         np.testing.assert_array_equal(f.image0, picture(i))
         np.testing.assert_array_equal(f.depth, depth_mm(i) / np.float32(scale))
     assert len(out) == 4
-    messages = source._file.messages(["/depth/image_raw"])
-    assert ros.decode(next(messages)[2], ros.IMAGE).encoding == encoding
+    messages = source.file.messages(["/depth/image_raw"])
+    assert ros.decode(next(messages)[2], ros.IMAGE, "depth").encoding == encoding
 
 
 def test_jpeg_is_close_and_small(tmp_path):
@@ -157,15 +164,15 @@ def test_jpeg_is_close_and_small(tmp_path):
     assert 0 < np.abs(image.astype(int) - picture(0)).mean() < 4
 
 
-def test_the_rigs_timeshift_is_recorded_with_it():
+def test_the_timeshift_is_recorded():
     shifted = dataclasses.replace(RIG, timeshift_s=-0.0123456789)
     assert_same_rig(ros_rig.rig_from_json(ros_rig.rig_to_json(shifted), "x"), shifted)
     with pytest.raises(DataError, match="timeshift_s: 2 is not within 1 s"):
         ros_rig.rig_from_json(ros_rig.rig_to_json(RIG)[:-1] + ', "timeshift_s": 2}', "x")
 
 
-def test_the_record_tells_a_lens_only_where_it_is_not_radtan():
-    """So what reads no lens models still reads the recordings of cameras that it knows."""
+def test_the_rig_record_names_only_lens_models_other_than_radtan():
+    """Earlier releases, which know no lens models, still read recordings with radtan lenses."""
     assert "model" not in ros_rig.rig_to_json(RIG)
     fisheye = dataclasses.replace(
         RIG, cam0=dataclasses.replace(CAMERA, distortion=(0.01,) * 4, model="equidistant")
@@ -174,7 +181,7 @@ def test_the_record_tells_a_lens_only_where_it_is_not_radtan():
 
 
 def test_the_rig_survives_as_ros_messages():
-    """CameraInfo and /tf_static tell the same rig as our own record, but for rounding."""
+    """CameraInfo and /tf_static give the same rig as our own record, but for rounding."""
     tree = ros_rig.FrameTree([ros_rig.to_tf(RIG, 0)], "here")
     np.testing.assert_allclose(tree.find("body", "cam0"), RIG.T_body_cam0, atol=1e-12)
     np.testing.assert_allclose(tree.find("depth", "cam0"), RIG.T_depth_cam0, atol=1e-12)
@@ -209,7 +216,7 @@ def raw_image(encoding: str, pixels: np.ndarray, padding: int = 0):
 
 
 def write_foreign(path: Path, topics: dict, tf=None, info=CAMERA) -> Path:
-    """A file as a ROS 2 recorder writes it: `topics` is name -> list of (type, fields)."""
+    """Write a file as a ROS 2 recorder does. topics: name -> list of (type, fields)."""
     from mcap.writer import Writer
 
     with open(path, "wb") as file:
@@ -295,7 +302,7 @@ def test_foreign_depth_and_calib_by_topic(tmp_path):
         open_source(str(path), calib=str(chain))
 
 
-def test_foreign_recordings_that_do_not_say_enough(tmp_path):
+def test_foreign_recordings_without_calibration_are_refused(tmp_path):
     eyes = {
         f"/camera/{eye}/image": image_messages(2, eye, lambda i: raw_image("mono8", picture(i)))
         for eye in ("infra1", "infra2")
@@ -317,7 +324,7 @@ def test_foreign_recordings_that_do_not_say_enough(tmp_path):
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path):
-    """Reading 40 MB of raw images keeps little of it: messages are let go as they are used."""
+    """Reading 40 MB of raw images holds few of them at a time."""
     import tracemalloc
 
     big = Camera(752, 480, 400.0, 400.0, 376.0, 240.0)
@@ -336,7 +343,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
     assert time.process_time() - began < 5
 
 
-def test_the_device_goes_with_its_recording_and_a_calibration_of_another_is_said(tmp_path):
+def test_the_serial_number_is_recorded_and_compared_with_the_calibration(tmp_path):
     path, again = tmp_path / "a.mcap", tmp_path / "again.mcap"
     with Recorder(path, RIG, serial="0123") as recorder:
         for measurement in live(3):

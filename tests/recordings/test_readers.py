@@ -1,4 +1,4 @@
-"""EuRoC and TUM folders: what they hold comes out, what is wrong with them is said."""
+"""EuRoC and TUM folders are read exactly; errors name file and line."""
 
 import re
 import shutil
@@ -41,7 +41,7 @@ def test_euroc(euroc):
 
 
 def test_body_is_the_imu_and_the_truth_follows(euroc):
-    """A turned IMU mount turns T_body_cam0 and the truth, so that the camera stays where it was."""
+    """Another mounting of the IMU changes T_body_cam0 and the truth, not the pose of the camera."""
     before = open_source(str(euroc))
     truth = before.truth()
     T = se3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.2, 0.3]))
@@ -93,7 +93,7 @@ def test_tum(tmp_path, associations):
         np.testing.assert_array_equal(f.depth, depth_mm(i) / np.float32(1000))
 
 
-def test_tum_truth_is_that_of_the_camera_it_names(tum):
+def test_tum_truth_belongs_to_the_named_camera(tum):
     depth_camera = open_source(str(tum)).truth()
     yaml = tum / "camera.yaml"
     yaml.write_text(yaml.read_text() + "truth_frame: cam0\n")
@@ -104,7 +104,7 @@ def test_tum_truth_is_that_of_the_camera_it_names(tum):
         open_source(str(tum)).truth()
 
 
-def test_tum_images_without_a_partner_are_told(tum):
+def test_unpaired_tum_images_are_counted_in_the_notes(tum):
     lines = (tum / "depth.txt").read_text().splitlines(keepends=True)
     (tum / "depth.txt").write_text("".join(lines[:2] + lines[3:]))
     source = open_source(str(tum))
@@ -115,7 +115,7 @@ def test_tum_images_without_a_partner_are_told(tum):
         open_source(str(tum))
 
 
-def test_calib_overrides(euroc, tmp_path):
+def test_a_given_calibration_overrides_the_recordings(euroc, tmp_path):
     chain = tmp_path / "chain.yaml"
     cam = f"{{resolution: [{WIDTH}, {HEIGHT}], intrinsics: [77, 78, 31, 23], T_cn_cnm1: T}}"
     one = "[[1, 0, 0, -0.2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
@@ -124,7 +124,7 @@ def test_calib_overrides(euroc, tmp_path):
     assert source.rig.cam0.fx == 77
     assert source.rig.baseline == pytest.approx(0.2)
     assert source.rig.kind == "stereo"
-    assert source.notes == ("imu0 is not used: the calibration has no imu0",)
+    assert source.notes == ("imu0 is not used: the calibration has no imu",)
     with pytest.raises(UsageError, match="--calib"):
         open_source(str(euroc), calib=str(tmp_path / "no.yaml"))
     shutil.rmtree(euroc / "mav0" / "cam1")
@@ -203,7 +203,7 @@ ONE = {
 
 
 @pytest.mark.parametrize("case", ONE)
-def test_one_damaged_line_or_image_costs_itself_and_is_said(euroc, case):
+def test_a_damaged_line_or_image_is_skipped_and_counted(euroc, case):
     damage, images, samples, said = ONE[case]
     damage(euroc)
     source = open_source(str(euroc))
@@ -214,7 +214,7 @@ def test_one_damaged_line_or_image_costs_itself_and_is_said(euroc, case):
 
 
 @pytest.mark.parametrize("file", ["state_groundtruth_estimate0/data.csv", "groundtruth.txt"])
-def test_one_damaged_line_of_a_truth_costs_itself(request, file):
+def test_a_damaged_line_of_a_ground_truth_is_skipped(request, file):
     root = request.getfixturevalue("tum" if file.endswith("txt") else "euroc")
     path = root / file if file.endswith("txt") else root / "mav0" / file
     whole = open_source(str(root)).truth()
@@ -227,7 +227,7 @@ def test_one_damaged_line_of_a_truth_costs_itself(request, file):
     assert said.startswith(f"skipped as damaged: 1 of the lines of {path}")
 
 
-def test_files_that_a_list_names_stay_in_its_folder(tum):
+def test_listed_images_cannot_leave_the_folder(tum):
     (tum / "rgb.txt").write_text("10.0 ../../../etc/passwd\n10.033333 /etc/passwd\n10.066667 rgb/2.jpg\n")
     with pytest.raises(
         DataError, match=r"rgb\.txt, line 1: '\.\./\.\./\.\./etc/passwd' is not a file name below"
@@ -236,7 +236,7 @@ def test_files_that_a_list_names_stay_in_its_folder(tum):
 
 
 @pytest.mark.parametrize("case", DAMAGE)
-def test_damage_is_one_clear_line(euroc, case):
+def test_a_damaged_folder_gives_one_clear_line(euroc, case):
     damage, kind, complaint = DAMAGE[case]
     damage(euroc)
     with pytest.raises(kind, match=complaint) as error:
@@ -251,7 +251,7 @@ def test_cut_image_in_a_folder(tum):
         frames(open_source(str(tum)))
 
 
-def test_what_is_no_recording(tmp_path):
+def test_other_folders_and_files_are_refused(tmp_path):
     for spec, complaint in (
         (str(tmp_path / "no"), "no such file or folder"),
         (str(tmp_path), "not a recording that SHARE reads"),
@@ -264,6 +264,7 @@ def test_what_is_no_recording(tmp_path):
         open_source(str(tmp_path))
 
 
+@pytest.mark.long
 def test_real_recordings(shared_data):
     euroc = open_source(str(shared_data / "real" / "euroc_v1_01_keyframes"))
     assert euroc.rig.kind == "stereo+imu"

@@ -1,4 +1,4 @@
-"""Recordings that were cut off or damaged: refused with a hint, and recovered as far as they are whole."""
+"""Recordings that were cut off or damaged are refused with a hint, and recovered as far as intact."""
 
 import errno
 import io
@@ -14,8 +14,7 @@ from helpers.recordings import STEP_NS, make_tum
 
 from share.errors import DataError, ShareError, UsageError
 from share.recordings.convert import to_mcap
-from share.recordings.mcap.recorder import Recorder
-from share.recordings.mcap.recover import recover_recording
+from share.recordings.mcap.recorder import Recorder, recover_recording
 from share.runtime.source import open_source
 
 
@@ -23,7 +22,7 @@ def nothing(done: int) -> None:
     pass
 
 
-def test_no_mcap_and_empty(tmp_path):
+def test_other_files_and_empty_ones_are_refused(tmp_path):
     for content in (b"", b"hello, this is no recording"):
         (tmp_path / "x.mcap").write_bytes(content)
         with pytest.raises(DataError, match="is not an MCAP file, or is empty"):
@@ -41,7 +40,7 @@ def record(path: Path, count: int) -> Path:
 
 
 def test_any_cut_is_refused_and_recovered(tmp_path):
-    """Cut anywhere: open says `recover_recording`; recover saves a beginning of what was there, unaltered."""
+    """Cut anywhere: opening names the remedy; recovery saves an unaltered beginning."""
     data = record(tmp_path / "whole.mcap", 200).read_bytes()
     whole = [(m.stream, m.stamp_ns) for m in open_source(str(tmp_path / "whole.mcap")).measurements()]
     saved_before = 0
@@ -88,7 +87,7 @@ def test_a_flipped_bit_costs_one_chunk(tmp_path):
         (MemoryError(), "damaged: MemoryError"),
     ],
 )
-def test_a_disk_that_cannot_be_read_to_its_end_costs_what_is_behind(tmp_path, monkeypatch, error, says):
+def test_recovery_keeps_what_precedes_a_read_error(tmp_path, monkeypatch, error, says):
     path = record(tmp_path / "whole.mcap", 100)
     half = path.stat().st_size // 2
 
@@ -99,7 +98,7 @@ def test_a_disk_that_cannot_be_read_to_its_end_costs_what_is_behind(tmp_path, mo
             return super().readinto(buffer)
 
     monkeypatch.setattr(
-        "share.recordings.mcap.recover.open_regular", lambda name: io.BufferedReader(Worn(name, "rb"))
+        "share.recordings.mcap.recorder.open_regular", lambda name: io.BufferedReader(Worn(name, "rb"))
     )
     result = recover_recording(path, tmp_path / "good.mcap")
     monkeypatch.undo()
@@ -108,7 +107,7 @@ def test_a_disk_that_cannot_be_read_to_its_end_costs_what_is_behind(tmp_path, mo
     assert open_source(str(tmp_path / "good.mcap")).images_count > 20
 
 
-def test_a_chunk_that_takes_more_memory_than_there_is_is_left_out(tmp_path, monkeypatch):
+def test_recovery_skips_a_chunk_that_exceeds_memory(tmp_path, monkeypatch):
     from mcap import stream_reader
 
     path, opened, chunks = record(tmp_path / "whole.mcap", 100), stream_reader.breakup_chunk, iter(range(99))
@@ -123,7 +122,7 @@ def test_a_chunk_that_takes_more_memory_than_there_is_is_left_out(tmp_path, monk
     assert 60 < open_source(str(tmp_path / "good.mcap")).images_count < 100
 
 
-def test_other_recordings_are_left_alone(tmp_path):
+def test_recovery_overwrites_no_file(tmp_path):
     whole = record(tmp_path / "whole.mcap", 20)
     other, part = tmp_path / "a.mcap", tmp_path / "b.mcap.part"
     other.write_bytes(b"dear")
@@ -136,7 +135,7 @@ def test_other_recordings_are_left_alone(tmp_path):
     assert (tmp_path / "b.mcap").stat().st_mode & 0o777 == whole.stat().st_mode & 0o777
 
 
-def test_a_full_disk_is_not_taken_for_a_broken_recording(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_as_such(tmp_path, monkeypatch):
     def full(*arguments):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -147,12 +146,13 @@ def test_a_full_disk_is_not_taken_for_a_broken_recording(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["whole.mcap"]
 
 
-def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
-    """A real recorder in a real process, killed in mid-run: at most the last second is missing."""
+@pytest.mark.long
+def test_a_killed_recorder_leaves_a_recoverable_file(tmp_path):
+    """A recorder in a process of its own is killed: at most the last second is missing."""
     out = tmp_path / "walk.mcap"
     code = (
         "import sys, time; sys.path[:0] = sys.argv[2:]\n"
-        "from pathlib import Path; from live import RIG, live\n"
+        "from pathlib import Path; from helpers.live import RIG, live\n"
         "from share.recordings.mcap.recorder import Recorder\n"
         "with Recorder(Path(sys.argv[1]), RIG) as recorder:\n"
         "    for m in live(10**6):\n"

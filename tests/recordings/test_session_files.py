@@ -46,7 +46,7 @@ def test_agents_open_by_name(session):
     assert read.provenance == {"generator": "a test"}
 
 
-def test_calibration_of_the_session_goes_before_the_recordings(session):
+def test_the_sessions_calibration_overrides_the_recordings(session):
     assert open_source(f"{session}/rob").rig.cam0.fx == 50
     text = YAML.replace("  rob: {kind: robot, sensors: rgbd}\n", "  rob:\n    kind: robot\n" + CHAIN)
     (session / "session.yaml").write_text(text)
@@ -66,14 +66,14 @@ def test_calibration_of_the_session_goes_before_the_recordings(session):
         ("123456789", "0.5", "clock_offset_ns: expected whole nanoseconds, found 0.5"),
     ],
 )
-def test_what_is_wrong_with_session_yaml(session, old, new, complaint):
+def test_an_invalid_session_yaml_is_refused_by_its_key(session, old, new, complaint):
     file = session / "session.yaml"
     file.write_text(file.read_text().replace(old, new))
     with pytest.raises(ConfigError, match=rf"session\.yaml.*{complaint}"):
         open_source(f"{session}/ann")
 
 
-def test_unknown_and_missing_agents(session):
+def test_unknown_and_missing_agents_are_refused(session):
     with pytest.raises(UsageError, match="no agent 'eve'; agents: ann, rob"):
         open_source(f"{session}/eve")
     (session / "rob.mcap").unlink()

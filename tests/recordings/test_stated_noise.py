@@ -1,4 +1,4 @@
-"""How noisy an IMU is: by a file, by what a recording carries, or not known."""
+"""The noise of an IMU is stated by a file, by a recording, or unknown."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ rate_hz: 200
 
 
 def recorded(path: Path, rig: Rig) -> Path:
-    """As `share capture --imu-only` does."""
+    """Record as `share capture --imu-only` does."""
     with Recorder(path, rig) as recorder:
         recorder.write(Measurement(IMU, 10**9, (0.0,) * 6))
     return path
 
 
-def test_a_recording_of_an_imu_alone_says_it(tmp_path: Path) -> None:
+def test_a_recording_of_the_imu_alone_states_its_noise(tmp_path: Path) -> None:
     assert stated_noise(str(recorded(tmp_path / "a.mcap", RIG)), None, "--calib") == NOISE
     silent = recorded(tmp_path / "b.mcap", replace(RIG, imu=None))
     with pytest.raises(UsageError, match=r"b\.mcap: does not state the IMU's noise; give --calib DIR"):
@@ -41,7 +41,7 @@ def test_a_recording_of_an_imu_alone_says_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", ["imu0", "mav0/imu0", "."])
-def test_a_folder_says_it_or_that_it_does_not(tmp_path: Path, where: str) -> None:
+def test_a_folder_states_the_noise_or_is_refused(tmp_path: Path, where: str) -> None:
     (tmp_path / where).mkdir(parents=True, exist_ok=True)
     (tmp_path / where / "data.csv").write_text("1000,0,0,0,0,0,9.8\n")
     with pytest.raises(UsageError, match="does not state the IMU's noise; give --imu DIR"):
@@ -50,7 +50,7 @@ def test_a_folder_says_it_or_that_it_does_not(tmp_path: Path, where: str) -> Non
     assert stated_noise(str(tmp_path), None, "--imu") == NOISE
 
 
-def test_what_is_given_goes_first_and_must_be_an_imus(tmp_path: Path) -> None:
+def test_a_given_imu_chain_overrides_the_source(tmp_path: Path) -> None:
     chain = to_kalibr(replace(RIG, imu=replace(NOISE, rate_hz=100.0)))
     (tmp_path / "imu.yaml").write_text(yaml.safe_dump({"imu0": chain.pop("imu0")}))
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(chain))
@@ -60,7 +60,7 @@ def test_what_is_given_goes_first_and_must_be_an_imus(tmp_path: Path) -> None:
         stated_noise(source, str(tmp_path / "camera.yaml"), "--calib")
 
 
-def test_a_source_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_an_absent_source_is_named(tmp_path: Path) -> None:
     for name in ("no.csv", "no.mcap", "no"):
         with pytest.raises(UsageError, match=f"{name}: no such file or folder"):
             stated_noise(str(tmp_path / name), None, "--calib")

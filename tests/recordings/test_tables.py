@@ -1,4 +1,4 @@
-"""Tables and trajectories: exact stamps, and complaints that name file and line."""
+"""Tables and trajectories have exact stamps; errors name file and line."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from share.recordings.trajectory import Trajectory, format_seconds, format_tum, 
 GOOD = "#t,a,b\n1403715273262142976,0.5,-1e-3\n1403715273267142912,1.5,2\n"
 
 
-def test_table_keeps_nanoseconds(tmp_path):
+def test_a_table_keeps_nanoseconds(tmp_path):
     path = tmp_path / "data.csv"
     path.write_text(GOOD.replace("\n", "\r\n"))
     stamps, values = read_table(path, 3)
@@ -37,14 +37,14 @@ def test_table_keeps_nanoseconds(tmp_path):
         ("#t,a,b\n\n", "has no data"),
     ],
 )
-def test_what_is_wrong_is_said_with_its_line(tmp_path, text, complaint):
+def test_a_wrong_line_is_refused_by_its_number(tmp_path, text, complaint):
     path = tmp_path / "data.csv"
     path.write_text(text)
     with pytest.raises(DataError, match=f"data.csv.*{complaint}"):
         read_table(path, 3)
 
 
-def test_missing_and_binary(tmp_path):
+def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(DataError, match="no such file"):
         read_table(tmp_path / "no.csv", 3)
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x81")
@@ -81,7 +81,7 @@ def test_other_seconds_are_refused(text):
         parse_seconds(text, "t.txt, line 1")
 
 
-def test_tum_is_the_same_every_time_and_close(tmp_path, rng):
+def test_tum_files_are_deterministic_and_accurate(tmp_path, rng):
     T = se3.exp(rng.normal(size=(50, 6)))
     stamps = np.cumsum(rng.integers(1, 10**9, 50)) + 1_700_000_000_000_000_001
     path = tmp_path / "t.tum"
@@ -98,7 +98,7 @@ def numbers(text: str) -> np.ndarray:
     return np.array([line.split()[1:] for line in text.splitlines()], float)
 
 
-def test_tum_refuses_what_is_no_rotation_and_what_is_cut(tmp_path):
+def test_tum_files_with_invalid_rotations_or_cut_lines_are_refused(tmp_path):
     path = tmp_path / "t.tum"
     path.write_text("1.0 0 0 0 0 0 0 0\n")
     with pytest.raises(DataError, match="quaternion norm is 0"):
@@ -108,7 +108,7 @@ def test_tum_refuses_what_is_no_rotation_and_what_is_cut(tmp_path):
         read_tum(path)
 
 
-def test_a_quaternion_beyond_all_numbers_is_one_damaged_line(tmp_path):
+def test_an_overflowing_quaternion_is_one_damaged_line(tmp_path):
     lines = [f"{k}.0 0 0 0 0 0 0 1" for k in range(40)]
     lines[7] = "7.0 0 0 0 0 0 1e308 1e308"
     path, losses = tmp_path / "truth.tum", DataLosses()

@@ -137,9 +137,7 @@ def test_a_recording_is_not_overwritten_and_not_begun_on_a_full_disk(tmp_path: P
     there = tmp_path / "a.mcap"
     there.write_bytes(b"dear")
     for out, least, says in ((there, 0.0, "never overwritten"), (tmp_path / "b.mcap", 1e9, "must stay free")):
-        run = Capture(
-            CameraFeed(_never, None, WANTED.rates_hz(), 10.0, print, SampleQueue()), out, least, print
-        )
+        run = Capture(CameraFeed(_never, None, WANTED.rates_hz(), print, SampleQueue()), out, least, print)
         with pytest.raises(UsageError, match=says):
             run.run()
     assert there.read_bytes() == b"dear"
@@ -149,7 +147,7 @@ def test_a_recording_is_not_overwritten_and_not_begun_on_a_full_disk(tmp_path: P
 def test_a_partial_recording_is_not_overwritten(tmp_path: Path) -> None:
     part, out = tmp_path / "a.mcap.part", tmp_path / "a.mcap"
     part.write_bytes(b"dear")
-    run = Capture(CameraFeed(_never, None, WANTED.rates_hz(), 10.0, print, SampleQueue()), out, 0.0, print)
+    run = Capture(CameraFeed(_never, None, WANTED.rates_hz(), print, SampleQueue()), out, 0.0, print)
     with pytest.raises(
         UsageError, match=rf"a\.mcap\.part: belongs to .* recover {part} --out {out}`, or give"
     ):
@@ -182,7 +180,7 @@ class Gyroscope:
 
 
 def test_an_imu_alone_without_an_accelerometer_is_no_recording(tmp_path: Path) -> None:
-    feed = CameraFeed(lambda *_: Gyroscope(), None, Gyroscope.rates_hz, 10.0, print, SampleQueue())
+    feed = CameraFeed(lambda *_: Gyroscope(), None, Gyroscope.rates_hz, print, SampleQueue())
     with pytest.raises(
         ShareError, match=r"0123: samples came \(0 of accel, 100 of gyro\), but the IMU needs"
     ):

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.recordings.mcap.recover import recover_recording
+from share.recordings.mcap.recorder import recover_recording
 from share.runtime.source import open_source
 
 pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)

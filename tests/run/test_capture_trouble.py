@@ -19,7 +19,7 @@ from helpers.capture_bench import PICTURE, WANTED, Bench, Fake, quick
 from share.cameras.realsense.streams import StreamRequest
 from share.config import Config
 from share.lab.calibrate.imu_table import read_imu
-from share.recordings.mcap.recover import recover_recording
+from share.recordings.mcap.recorder import recover_recording
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters

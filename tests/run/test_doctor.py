@@ -14,7 +14,7 @@ import pytest
 from helpers.children import Child, start_edge
 from helpers.shell import Done
 
-from share.cameras.realsense import sdk_probe
+from share.cameras.realsense import devices
 from share.devices.host import governors, is_governor_reset, pi_throttled_bits, throttle_counts, usb_memory_mb
 from share.runtime import doctor
 
@@ -119,12 +119,12 @@ def test_the_key_of_another_edge_is_reported(share: Share, guarded: Guarded) -> 
 
 
 def test_librealsense_may_hang_or_crash(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sdk_probe, "_query_sdk", lambda: time.sleep(60))
+    monkeypatch.setattr(devices, "_query_sdk", lambda: time.sleep(60))
     began = time.monotonic()
-    assert "did not answer for 0.2 s" in str(sdk_probe.probe_sdk(0.2).trouble)
+    assert "did not answer for 0.2 s" in str(devices.probe_sdk(0.2).trouble)
     assert time.monotonic() - began < 10
-    monkeypatch.setattr(sdk_probe, "_query_sdk", lambda: os._exit(3))
-    assert "crashed" in str(sdk_probe.probe_sdk().trouble)
+    monkeypatch.setattr(devices, "_query_sdk", lambda: os._exit(3))
+    assert "crashed" in str(devices.probe_sdk().trouble)
 
 
 def test_facts_of_the_computer_are_read(tmp_path: Path) -> None:

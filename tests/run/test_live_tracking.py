@@ -137,7 +137,7 @@ def test_a_slow_tracker_takes_the_newest_images_and_all_imu_samples(room: RoomCa
 
     def slowly(result: TrackResult) -> None:
         stamp_ns = source.feed.processor.streams["cam0"].last_ns
-        waited.append(time.monotonic_ns() - source.arrived_ns(stamp_ns or 0))
+        waited.append(time.monotonic_ns() - source.feed.arrived_ns(stamp_ns or 0))
         time.sleep(0.15)
 
     room.begin(source.feed, pause_s=0.03)

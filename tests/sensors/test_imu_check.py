@@ -1,4 +1,4 @@
-"""What is left out of an IMU's samples is no measurement, and what is a measurement stays."""
+"""The IMU check rejects glitches and accepts measurements."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ MOTION = Path(__file__).parents[3] / "shared" / "data" / "motion"
 
 
 def walking(count: int = 400, seed: int = 0) -> np.ndarray:
-    """Gyro and accel (count, 6) at 200 Hz of somebody who walks, with noise."""
+    """Return gyro and accel (count, 6) at 200 Hz of a walk, with noise."""
     t, rng = np.arange(count)[:, None] * 0.005, np.random.default_rng(seed)
     gyro, accel = 0.8 * np.sin(9 * t + np.arange(3)), 3 * np.sin(12 * t + np.arange(3)) + [0, 0, 9.81]
     return np.hstack([gyro, accel]) + rng.normal(size=(count, 6)) * np.repeat([0.01, 0.1], 3)
 
 
 def judged(values: np.ndarray, each: int = 10, step: int = STEP) -> tuple[np.ndarray, ImuCheck]:
-    """Which are believed, in frames of so many samples."""
+    """Return which samples are accepted, in frames of so many."""
     check, stamps = ImuCheck(ImuRange()), np.arange(len(values)) * step
     parts = [
         check.valid_mask(stamps[k : k + each], values[k : k + each]) for k in range(0, len(values), each)
@@ -37,7 +37,7 @@ def judged(values: np.ndarray, each: int = 10, step: int = STEP) -> tuple[np.nda
     ("axis", "value"),
     [(0, 500.0), (1, -30.0), (2, 20.0), (0, 5.0), (3, 1e6), (4, -150.0), (5, 90.0), (0, np.nan), (3, np.inf)],
 )
-def test_one_sample_that_is_none_is_left_out_and_no_other(axis: int, value: float, each: int) -> None:
+def test_a_single_spike_is_rejected_and_nothing_else(axis: int, value: float, each: int) -> None:
     for at in (100, 103, 109):  # at the beginning, in the middle and at the end of a frame
         values = walking()
         values[at, axis] = value
@@ -58,7 +58,7 @@ def test_one_sample_that_is_none_is_left_out_and_no_other(axis: int, value: floa
         [(2, 20.0), (3, -150.0), (4, 80.0)],
     ],
 )
-def test_two_or_three_in_a_row_are_left_out_and_no_other(
+def test_two_or_three_spikes_in_a_row_are_rejected_and_nothing_else(
     run: list[tuple[int, float]], step: int, each: int
 ) -> None:
     for at in range(100, 110):  # everywhere in a frame, and over its end
@@ -70,14 +70,14 @@ def test_two_or_three_in_a_row_are_left_out_and_no_other(
         assert check.spikes == len(run)
 
 
-def test_two_runs_near_each_other_are_left_out() -> None:
+def test_two_spikes_near_each_other_are_rejected() -> None:
     for at in range(100, 110):
         values = walking()
         values[[at, at + 1, at + 6, at + 7, at + 8], 4] = 150.0
         assert np.flatnonzero(~judged(values)[0]).tolist() == [at, at + 1, at + 6, at + 7, at + 8]
 
 
-def test_of_a_pair_over_the_end_of_a_frame_the_second_is_left_out_though_the_first_was_believed() -> None:
+def test_a_spike_across_two_frames_is_rejected_from_its_second_sample_on() -> None:
     for at in range(100, 110):
         values = walking()
         values[[at, at + 1], 3] += 40.0  # at the end of a frame that may be a knock
@@ -86,7 +86,7 @@ def test_of_a_pair_over_the_end_of_a_frame_the_second_is_left_out_though_the_fir
         )
 
 
-def test_what_lasts_longer_than_a_glitch_stays() -> None:
+def test_longer_excursions_are_accepted() -> None:
     values = walking()
     values[100:104, 3:] += 150.0
     assert judged(values, each=400)[0].all()
@@ -96,8 +96,8 @@ def test_what_lasts_longer_than_a_glitch_stays() -> None:
     assert judged(values, 400, 2 * STEP)[0].all()  # 20 ms
 
 
-def test_a_step_stays() -> None:
-    """Somebody bumps into a wall: from one sample to the next all is different, and stays so."""
+def test_a_step_is_accepted() -> None:
+    """A bump: all axes change from one sample to the next, and stay so."""
     values = walking()
     values[204:, :3] += 6.0
     values[204:, 3:] += 80.0
@@ -115,7 +115,7 @@ def test_a_step_near_the_end_of_a_frame_costs_at_most_three_samples(each: int) -
         assert each != 10 or not lost or lost[-1] == 209
 
 
-def test_shocks_and_vibration_stay() -> None:
+def test_shocks_and_vibration_are_accepted() -> None:
     rng, values = np.random.default_rng(1), walking()
     values[100:300, 3:] += 60 * rng.normal(size=(200, 3))  # a motor
     values[100:300, :3] += 2 * rng.normal(size=(200, 3))
@@ -126,7 +126,7 @@ def test_shocks_and_vibration_stay() -> None:
     assert judged(values, each=400)[0].mean() > 0.995
 
 
-def test_of_a_knock_at_most_what_begins_at_the_end_of_a_frame_is_left_out() -> None:
+def test_a_knock_loses_at_most_its_start_at_the_end_of_a_frame() -> None:
     ring = np.exp(-np.arange(12) / 3) * np.cos(np.arange(12) * 2)
     for at in range(100, 110):
         values = walking()
@@ -136,7 +136,7 @@ def test_of_a_knock_at_most_what_begins_at_the_end_of_a_frame_is_left_out() -> N
         assert lost == ([109] if at == 109 else [])
 
 
-def test_across_a_gap_nothing_is_judged() -> None:
+def test_samples_across_a_gap_are_not_compared() -> None:
     values = walking()
     values[200:, 0] += 9.0
     check = ImuCheck(ImuRange())
@@ -148,7 +148,7 @@ def test_across_a_gap_nothing_is_judged() -> None:
     )
 
 
-def test_samples_beyond_a_known_range_are_left_out() -> None:
+def test_samples_out_of_range_are_rejected() -> None:
     values = walking()
     values[200:240, 0] = 18.0  # many: no spike
     check = ImuCheck(ImuRange(17.5, 39.3))
@@ -161,7 +161,7 @@ RECORDED = sorted(MOTION.glob("*/*/imu0.csv"))
 
 @pytest.mark.skipif(not RECORDED, reason="the recorded motions are not here")
 @pytest.mark.parametrize("path", RECORDED, ids=lambda path: path.parent.name)
-def test_of_what_was_recorded_everything_stays(path: Path) -> None:
+def test_recorded_samples_are_all_accepted(path: Path) -> None:
     table = np.loadtxt(path, delimiter=",")
     stamps, values = table[:, 0].astype(np.int64), table[:, 1:7]
     check, parts = ImuCheck(ImuRange(17.5, 180.0)), range(0, len(values), 10)
@@ -179,7 +179,7 @@ def bundles(values: np.ndarray) -> tuple[list, SequencerCounters]:
     return list(sequence_frames(both, ("cam0", "imu"), 20.0, SequencerConfig(), counters)), counters
 
 
-def test_frames_come_without_what_is_no_sample_and_it_is_counted() -> None:
+def test_frames_lack_rejected_samples_and_count_them() -> None:
     values = walking()
     clean, counters = bundles(values)
     assert (counters.imu_out_of_range, counters.imu_spikes) == (0, 0)
@@ -193,7 +193,7 @@ def test_frames_come_without_what_is_no_sample_and_it_is_counted() -> None:
     assert set(range(391)) - set(told.tolist()) == {105, 155, 207}
 
 
-def test_an_imu_that_gives_nothing_else_is_silent() -> None:
+def test_an_imu_with_rejected_samples_only_is_silent() -> None:
     values = walking()
     values[100:200] = np.nan
     _, counters = bundles(values)

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def changed(tmp_path: Path):
-    """A copy of d435i.yaml with one text replaced."""
+    """Return a copy of d435i.yaml with one text replaced."""
 
     def write(old: str, new: str) -> str:
         text = (ROOT / "firmware_profiles" / "d435i.yaml").read_text()
@@ -25,6 +25,7 @@ def changed(tmp_path: Path):
     return write
 
 
+@pytest.mark.long
 def test_every_shipped_profile_reads_in_every_mode():
     hosts = {"d435i-n100-headset", "d435i-turtlebot4", "laptop-edge"}
     assert set(shipped_profiles()) == {"d435i", "euroc", "tumvi"} | hosts
@@ -74,7 +75,7 @@ def test_the_euroc_rig_is_that_of_its_calibration(shared_data: Path):
     assert rig.imu.accel_density == pytest.approx(2 * real.imu.accel_density, rel=1e-3)
 
 
-def test_with_depth_the_rig_is_the_left_camera_with_depth_registered_to_it():
+def test_the_rgbd_rig_has_depth_registered_to_the_left_camera():
     rig = load_profile("d435i").rig(depth=True)
     assert rig.kind == "rgbd+imu" and rig.cam1 is None
     assert rig.depth == rig.cam0 and np.array_equal(rig.T_depth_cam0, np.eye(4))
@@ -95,7 +96,7 @@ def test_with_depth_the_rig_is_the_left_camera_with_depth_registered_to_it():
         (("d435i", None, 300.0), "gyro: rate_hz: 300 is not one of 200, 400"),
     ],
 )
-def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
+def test_unknown_profiles_modes_and_rates_are_refused_with_the_known_ones(arguments: tuple, says: str):
     with pytest.raises(ConfigError) as refused:
         load_profile(*arguments)
     assert says in str(refused.value) and "\n" not in str(refused.value)
@@ -152,19 +153,19 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
         ("[[1, 0, 0, -0.00552]", "[[2, 0, 0, -0.00552]", "device: T_imu_cam0: is not a rigid transform"),
     ],
 )
-def test_a_file_with_a_mistake_is_refused_by_its_key(changed, old: str, new: str, says: str):
+def test_an_invalid_profile_is_refused_by_its_key(changed, old: str, new: str, says: str):
     with pytest.raises(ConfigError) as refused:
         load_profile(changed(old, new))
     assert says in str(refused.value) and "\n" not in str(refused.value)
 
 
-def test_a_file_of_ones_own_is_read(changed):
+def test_a_users_profile_is_read(changed):
     assert (
         load_profile(changed("model: Bosch BMI055", "model: Bosch BMI085")).device.imu.model == "Bosch BMI085"
     )
 
 
-def test_the_folder_is_found_in_a_frozen_bundle_and_its_absence_is_said(monkeypatch, tmp_path: Path):
+def test_the_profile_folder_is_found_in_a_frozen_bundle(monkeypatch, tmp_path: Path):
     monkeypatch.setattr(profiles, "__file__", str(tmp_path / "lib" / "share" / "io" / "profile.py"))
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "nowhere"))
     with pytest.raises(ConfigError, match="firmware_profiles is missing from this installation"):
@@ -175,7 +176,7 @@ def test_the_folder_is_found_in_a_frozen_bundle_and_its_absence_is_said(monkeypa
     assert set(shipped_profiles()) == {"x"}
 
 
-def test_a_device_by_its_name_is_that_of_the_shipped_profile():
+def test_a_device_given_by_name_is_the_shipped_one():
     headset, bare = load_host_profile("d435i-n100-headset"), load_profile("d435i")
     assert headset.role == "ar" and load_host_profile("d435i-turtlebot4").role == "robot"
     assert headset.sensor is not None and headset.sensor.device.firmware == bare.device.firmware
@@ -183,7 +184,7 @@ def test_a_device_by_its_name_is_that_of_the_shipped_profile():
 
 
 @pytest.mark.parametrize("name", ["laptop-edge", "d435i-n100-headset", "../d435i"])
-def test_a_device_by_a_name_that_describes_none(name: str, tmp_path: Path):
+def test_an_unknown_device_name_is_refused(name: str, tmp_path: Path):
     mine = tmp_path / "mine.yaml"
     host = "{cpu_governor: performance, usb_autosuspend: false, usbfs_mb: 0}"
     mine.write_text(f"name: mine\ndevice: {name}\nhost: {host}\n")

@@ -31,7 +31,7 @@ def test_finds_the_permutation_of_noisy_descriptors() -> None:
     assert np.array_equal(order[pairs[:, 1]], pairs[:, 0])
 
 
-def test_is_symmetric_and_refuses_the_unlike() -> None:
+def test_matching_is_symmetric_and_rejects_unlike_descriptors() -> None:
     rng = np.random.default_rng(2)
     a, b = (rng.integers(0, 256, (100, 32), np.uint8) for _ in range(2))
     assert len(match_descriptors(a, b, 64, 1.0)) == 0
@@ -40,7 +40,7 @@ def test_is_symmetric_and_refuses_the_unlike() -> None:
 
 
 def test_mutual_pairs_are_the_best_of_row_and_column() -> None:
-    """Of equals the first, and the most alike come first."""
+    """Of equals the first; the most similar come first."""
     distance = np.array([[9, 3, 9], [2, 1, 9], [9, 9, 5], [9, 9, 5]], np.uint16)
     found = mutual_best(pairs_within(distance, 8))
     assert [tuple(map(int, pair)) for pair in zip(*found, strict=True)] == [(1, 1, 1), (2, 2, 5)]

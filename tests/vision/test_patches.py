@@ -1,4 +1,4 @@
-"""Gray levels at many places."""
+"""Gray levels are sampled at many positions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from share.vision.patches import sample
 
 
-def test_more_places_than_opencv_takes_at_a_time(rng: np.random.Generator) -> None:
+def test_sampling_exceeds_the_row_limit_of_opencv(rng: np.random.Generator) -> None:
     image = rng.integers(0, 255, (40, 50), dtype=np.uint8)
     x, y = (rng.uniform(0, side - 1, (70_000, 3)).astype(np.float32) for side in (50, 40))
     seen = sample(image, x, y)

@@ -11,13 +11,13 @@ from share.lab.emulate.motion import walk
 from share.lab.emulate.plain.render import PlainRoomRenderer
 from share.lab.emulate.plain.room import make_room
 from share.types import Frame
-from share.vision import corners, depth, epipolar, optical_flow
+from share.vision import corners, depth, optical_flow
 from share.vision.orb import detect_orb, make_view
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """Left image, its exact depth, right image, and an image from 8 cm and 3 degrees away."""
+    """Return left image, its exact depth, right image, an image 8 cm and 3 degrees away, and that motion."""
     room = make_room(3)
     renderer = PlainRoomRenderer(room, CAMERA)
     T = se3.from_rt(walk.axis_rotation(1, np.array([0.1]))[0] @ walk.CAMERA_AXES, np.array([5.35, 1.5, 1.66]))
@@ -28,8 +28,9 @@ def scene():
     return left, exact, right, other, se3.inverse(near) @ T
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("detect", [corners.detect, corners.strongest])
-def test_corners_fill_what_is_empty(scene, detect):
+def test_corners_fill_empty_regions(scene, detect):
     image = scene[0]
     first = detect(image, np.zeros((0, 2), np.float32), 100, 15)
     more = detect(image, first, 100, 15)
@@ -58,7 +59,8 @@ def test_no_corners_on_a_blank_wall():
     assert detect_orb(blank, 100)[0].shape == (0, 2)
 
 
-def test_following_is_subpixel_exact(scene):
+@pytest.mark.long
+def test_tracked_points_are_subpixel_exact(scene):
     left, exact, _, other, T_other_left = scene
     px = corners.detect(left, np.zeros((0, 2), np.float32), 200, 15)
     uv = CAMERA.normalise(px.astype(float))
@@ -75,7 +77,7 @@ def test_following_is_subpixel_exact(scene):
 
 
 def stereo_by(method, scene):
-    """Which corners (N,) it finds a depth for, and the errors of disparity of these, px."""
+    """Return which corners (N,) get a depth, and their errors of disparity, px."""
     left, exact, right, _, _ = scene
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
     px = corners.detect(left, np.zeros((0, 2), np.float32), 200, 15)
@@ -85,6 +87,7 @@ def stereo_by(method, scene):
     return known, np.abs(385 * 0.05 * (1 / z - 1 / truth))[known]
 
 
+@pytest.mark.long
 def test_stereo_depth(scene):
     known, disparity_error = stereo_by(depth.from_stereo, scene)
     assert known.mean() > 0.8
@@ -92,27 +95,29 @@ def test_stereo_depth(scene):
     assert (disparity_error < 1).mean() > 0.95
 
 
-def test_what_is_infinitely_far_has_no_depth(scene):
-    """Nor does it warn: a lens that is covered shows both cameras the same."""
+@pytest.mark.long
+def test_points_at_infinity_have_no_depth(scene):
+    """And no warning: a covered lens shows both cameras the same."""
     left, *_ = scene
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
     px = corners.detect(left, np.zeros((0, 2), np.float32), 50, 15)
     assert np.isnan(depth.from_stereo(left, left, rig, px, CAMERA.normalise(px.astype(float)))).all()
 
 
-def test_the_whole_line_is_searched(scene):
-    known, disparity_error = stereo_by(epipolar.search_depth, scene)
+@pytest.mark.long
+def test_the_whole_epipolar_line_is_searched(scene):
+    known, disparity_error = stereo_by(depth.search_depth, scene)
     assert known.mean() > 0.7
     assert (disparity_error < 1.5).mean() > 0.95
 
 
-def test_what_repeats_along_the_line_has_no_depth():
+def test_repeated_texture_has_no_depth():
     stripes = np.tile(np.repeat(np.array([60, 190], np.uint8), 6), (480, 640))[:, :640]
     image = stripes + np.linspace(0, 20, 480).astype(np.uint8)[:, None]
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
     px = np.array([[300.0, 200.0], [400.0, 300.0]], np.float32)
-    assert np.isnan(epipolar.search_depth(image, image, rig, px, CAMERA.normalise(px.astype(float)))).all()
-    assert len(epipolar.search_depth(image, image, rig, px[:0], np.zeros((0, 2)))) == 0
+    assert np.isnan(depth.search_depth(image, image, rig, px, CAMERA.normalise(px.astype(float)))).all()
+    assert len(depth.search_depth(image, image, rig, px[:0], np.zeros((0, 2)))) == 0
 
 
 def test_depth_of_an_unregistered_camera():
@@ -146,8 +151,8 @@ def test_no_depth_in_mid_air():
     assert z[[1, 3]] == pytest.approx([1.0, 3.0])
 
 
-def test_nothing_to_see_is_no_error():
-    """No point at all: a blank wall, or every corner taken."""
+def test_no_points_are_no_error():
+    """A blank wall, or every corner taken."""
     none, px = np.zeros((0, 2)), np.zeros((0, 2), np.float32)
     image, far = np.full((480, 640), 128, np.uint8), np.full((480, 640), 3.0, np.float32)
     rgbd = Rig(CAMERA, np.eye(4), depth=CAMERA, T_depth_cam0=np.eye(4))
@@ -159,6 +164,7 @@ def test_nothing_to_see_is_no_error():
         assert len(make_view(frame, rig)) == 0
 
 
+@pytest.mark.long
 def test_a_view_is_spread_and_has_depth(scene):
     left, _, right, _, _ = scene
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)

@@ -1,4 +1,4 @@
-"""A RealSense camera: connect, read, disconnect."""
+"""A RealSense camera: connect, read, disconnect; as a feed of samples and as a live source."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Any
 
-from share.cameras.realsense.devices import choose_device, list_devices, load_sdk, sdk_errors
-from share.cameras.realsense.factory import factory_rig
-from share.cameras.realsense.frames import has_dots, to_sample
+from share.cameras.feed import CameraFeed
+from share.cameras.live import MAX_WAITING_FRAMES, LiveSource
+from share.cameras.realsense.devices import choose_device, list_devices, load_sdk, parse_serial, sdk_errors
+from share.cameras.realsense.sdk_data import factory_rig, has_dots, to_sample
 from share.cameras.realsense.streams import OpenedSensor, StreamRequest, choose_streams, stream_rates_hz
+from share.cameras.sample_queue import NewestImageQueue, SampleQueue
 from share.errors import ShareError
 from share.geometry.camera import Rig
+from share.recordings.calibration import Calibration
 from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 
@@ -206,3 +209,35 @@ def _depth_unit(one: OpenedSensor) -> float:
     """Return the size of one depth step, m."""
     depth = DEPTH in one.profiles and one.sensor.is_depth_sensor()
     return float(one.sensor.as_depth_sensor().get_depth_scale()) if depth else _DEFAULT_DEPTH_UNIT_M
+
+
+def make_feed(
+    spec: str,
+    request: StreamRequest,
+    notify: Callable[[str], None],
+    queue: SampleQueue,
+) -> CameraFeed:
+    """Return the camera's feed, not yet opened."""
+    return CameraFeed(
+        lambda serial, epoch: RealSenseCamera(request, serial, epoch=epoch, notify=notify),
+        parse_serial(spec),
+        request.rates_hz(),
+        notify,
+        queue,
+    )
+
+
+def open_live(
+    spec: str,
+    request: StreamRequest,
+    notify: Callable[[str], None],
+    calibration: Calibration | None = None,
+) -> LiveSource:
+    """Open the camera as a source, with `calibration` or else the factory's.
+
+    Raises UsageError, ShareError, DataError.
+    """
+    rates = request.rates_hz()
+    queue = NewestImageQueue(MAX_WAITING_FRAMES * len(request.cameras))
+    feed = make_feed(spec, request, notify, queue)
+    return LiveSource(feed, rates[CAM0], calibration, request.imu_range())

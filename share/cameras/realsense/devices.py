@@ -1,17 +1,23 @@
-"""Attached RealSense cameras: list them, choose one, check that it is usable; and load the SDK."""
+"""Attached RealSense cameras: list them, choose one, check that it is usable; load and probe the SDK."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from share.devices.camera_check import parse_version
+from share import child_processes
+from share.devices.camera_check import SdkReport, parse_version
 from share.errors import NotAttachedError, ShareError, UsageError, install_hint
 from share.sensors.profile_types import DeviceFacts
 
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
 KIND = "realsense"
+_PROBE_TIMEOUT_S = 10.0
 
 
 def is_camera(spec: str) -> bool:
@@ -107,3 +113,48 @@ def sdk_errors(label: str) -> Iterator[None]:
     except RuntimeError as error:
         reason, fix = str(error).partition("\n")[0], "replug it, or run `share doctor`"
         raise ShareError(f"{label}: cannot be opened: {reason}; {fix}") from None
+
+
+def probe_sdk(timeout_s: float = _PROBE_TIMEOUT_S) -> SdkReport:
+    """Return the SDK's view of the cameras, from a child process, since the SDK can hang or crash.
+
+    Errors are reported in `trouble`, never raised.
+    """
+    import multiprocessing
+
+    context = multiprocessing.get_context("fork")  # a frozen program has no Python to spawn
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(
+        target=_send_result, args=(sender, os.getpid(), child_processes.is_main_thread()), daemon=True
+    )
+    child.start()
+    sender.close()
+    try:
+        if not receiver.poll(timeout_s):
+            return SdkReport(
+                f"librealsense did not answer for {timeout_s:g} s; unplug the camera and plug it in again"
+            )
+        answer: SdkReport = receiver.recv()
+        return answer
+    except EOFError:
+        return SdkReport("librealsense crashed; unplug the camera and plug it in again")
+    finally:
+        child.kill()
+        child.join()
+        receiver.close()
+
+
+def _send_result(connection: Connection, parent: int, from_main: bool) -> None:
+    child_processes.exit_with_parent(parent, from_main)
+    connection.send(_query_sdk())
+
+
+def _query_sdk() -> SdkReport:
+    try:
+        rs = load_sdk()
+        devices = list_devices(rs, rs.context())
+        return SdkReport(
+            firmware=tuple(d.firmware for d in devices), serials=tuple(d.serial for d in devices)
+        )
+    except (ShareError, RuntimeError) as error:
+        return SdkReport(str(error).splitlines()[0])

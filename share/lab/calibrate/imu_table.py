@@ -66,8 +66,8 @@ def imu_csv_files(path: Path) -> list[Path]:
 
 def _read_mcap(name: str, path: Path, on_progress: Callable[[int, int], None]) -> ImuTable:
     from share.recordings.mcap.file import McapFile
-    from share.recordings.mcap.imu import read_imu as read
-    from share.recordings.mcap.reader import own_serial
+    from share.recordings.mcap.reader import read_imu as read
+    from share.recordings.mcap.rig import own_serial
 
     file, losses = McapFile(path), DataLosses()
     stamps, values = read(file, on_progress, losses)
@@ -75,8 +75,7 @@ def _read_mcap(name: str, path: Path, on_progress: Callable[[int, int], None]) -
 
 
 def _read_db3(path: Path, on_progress: Callable[[int, int], None]) -> ImuTable:
-    from share.recordings.realsense import read_recorded_imu  # rosbags is imported only where needed
-    from share.recordings.realsense_db3 import Db3
+    from share.recordings.realsense import Db3, read_recorded_imu  # rosbags is imported only where needed
 
     on_progress(0, 1)
     file, losses = Db3(path), DataLosses()
@@ -123,7 +122,7 @@ def _source_noise(source: Path) -> ImuNoise | None:
     """Return the noise that the source states, None where it states none, as a recording of the IMU alone."""
     if source.suffix == ".mcap" and source.is_file():
         from share.recordings.mcap.file import McapFile  # imported only where needed
-        from share.recordings.mcap.reader import own_rig
+        from share.recordings.mcap.rig import own_rig
 
         rig = own_rig(McapFile(source), {}, needed=False)
         return None if rig is None else rig.imu

@@ -19,8 +19,9 @@ from share.lab.evaluate.campaign import PlannedRun, check_unique_names
 from share.lab.evaluate.real_time import RunOptions
 from share.lab.evaluate.run_metrics import RunMetrics
 from share.lab.evaluate.statistics import MEASURES
-from share.plain_data import from_mapping, load_yaml, to_mapping
+from share.plain_data import from_mapping, to_mapping
 from share.recordings.session import Session
+from share.strict_yaml import load_yaml
 
 _SEED = 20261123
 Point = tuple[str, ...]  # a value of each axis, in YAML

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from share.errors import DataError
-from share.recordings.tables import MAX_STAMP_NS
-from share.types import F64, I64
+from share.types import F64, I64, MAX_STAMP_NS
 
 _MAX_VALUE = 1e15  # in any unit
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from share.errors import CalibrationMismatchError
 from share.geometry import se3
-from share.geometry.peak import subsample_peak
+from share.geometry.interpolation import subsample_peak
 from share.lab.mocap.factors import preintegrate
 from share.lab.mocap.trajectory import MocapTrajectory
 from share.types import F64, I64, ImuBatch

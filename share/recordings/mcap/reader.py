@@ -1,4 +1,4 @@
-"""Read MCAP recordings with ROS 2 messages, ours and others', as a Source.
+"""Read MCAP recordings with ROS 2 messages, ours and others', as a Source; and all samples of the IMU alone.
 
 The calibration's `rostopic` assigns topics to streams, else the topics' names do. The rig comes from --calib,
 else from our own record in the file, else from CameraInfo and /tf_static.
@@ -6,10 +6,10 @@ else from our own record in the file, else from CameraInfo and /tf_static.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,18 @@ import numpy as np
 
 from share.errors import ConfigError, DataError
 from share.geometry import se3
-from share.geometry.camera import Camera, Rig
-from share.recordings.calibration import Calibration, config_errors
-from share.recordings.device_match import device_mismatch
+from share.geometry.camera import Rig
+from share.recordings.calibration import Calibration
+from share.recordings.calibration_match import device_mismatch, fit_to_recording, unused_streams
 from share.recordings.losses import DataLosses
-from share.recordings.mcap import images as ros_images
-from share.recordings.mcap import rig as ros_rig
 from share.recordings.mcap import ros_messages as ros
-from share.recordings.mcap.file import McapFile, damage_errors
-from share.recordings.recording import UNBOUNDED_NS, Source, Span, select_span
+from share.recordings.mcap.file import McapFile
+from share.recordings.mcap.rig import own_rig, own_serial
+from share.recordings.recording import UNBOUNDED_NS, Recording, select_span
 from share.recordings.trajectory import Trajectory, read_tum
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, STREAMS, Measurement
+from share.sensors.sequencer import rig_streams
+from share.sensors.stamps import WRAP_NS
 from share.types import F64, I64
 
 _IMAGE_TYPES = (ros.IMAGE, ros.COMPRESSED)
@@ -39,7 +40,7 @@ _TOPIC_HINTS = {  # parts of a topic's name, best first
 _MAX_SKEW_NS = 2 * 10**9  # between log times and header stamps, when only a part is read
 
 
-def open_mcap(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
+def open_mcap(path: Path, calibration: Calibration | None, frames: slice | None) -> McapSource:
     """Open the recording in `path`. Raises UsageError, DataError, ConfigError."""
     file = McapFile(path)
     topics = find_topics(file, calibration.topics if calibration else {})
@@ -47,8 +48,11 @@ def open_mcap(path: Path, calibration: Calibration | None, frames: slice | None)
     return McapSource(file, topics, calibration, own, frames)
 
 
-class McapSource(Source):
-    """An MCAP recording with those streams of `topics` (stream -> topic) that the rig has."""
+class McapSource(Recording):
+    """An MCAP recording with those streams of `topics` (stream -> topic) that the rig has.
+
+    Its stamps are log times, which equal the stamps in our recordings and are close to them in others'.
+    """
 
     def __init__(
         self,
@@ -62,62 +66,54 @@ class McapSource(Source):
         if rig is None:
             raise ConfigError(f"{file.path}: contains no calibration; give one with --calib")
         recorded_rig = rig if calibration else _recorded_rig(rig, topics)
-        self.name, self.rig = file.path.stem, _fit_rig(recorded_rig, topics, file.path)
-        self._file, self._own, self.serial = file, own, own_serial(file)
-        self.losses = DataLosses()
-        cameras = ros_rig.rig_cameras(self.rig)
-        used = {s for s in topics if s in cameras or (s == IMU and self.rig.imu)}
-        self._topics = {s: topics[s] for s in used}
-        self.notes = tuple(
-            f"{topics[s]} is not used: the calibration has no {s}" for s in topics if s not in used
-        ) + tuple(
-            f"has no images of {s}: continuing without" for s in ros_rig.rig_cameras(rig) if s not in cameras
+        self.name, self.rig = file.path.stem, fit_to_recording(recorded_rig, topics, file.path)
+        self.file, self._own, self.serial = file, own, own_serial(file)
+        self._topics = {stream: topics[stream] for stream in rig_streams(self.rig)}
+        self.notes = unused_streams(topics, self.rig) + tuple(
+            f"has no images of {s}: continuing without" for s in rig.cameras if s not in self.rig.cameras
         )
-        if calibration and (warning := device_mismatch(calibration.serials, self.serial)):
-            self.notes += (warning,)
-        self._span = self._find_span(frames)
+        if calibration:
+            self.notes += device_mismatch(calibration.serials, self.serial)
+        stamps = self.all_stamps()[CAM0] if frames is None else self._header_stamps()
+        self.span = select_span(stamps, frames, str(file.path), self.rig.timeshift_ns)
 
-    def stamps(self) -> dict[str, I64]:
-        """Return log times, which equal the stamps in our recordings and are close to them in others'."""
-        out = {}
-        for stream in (s for s in STREAMS if s in self._topics):
-            times, (lo, hi) = self._file.log_times[self._topics[stream]], self._span.limits(stream)
-            out[stream] = times[(times > lo) & (times <= hi)]
-        return out
+    def all_stamps(self) -> dict[str, I64]:
+        return {stream: self.file.log_times[topic] for stream, topic in self._topics.items()}
 
     def measurements(self) -> Iterator[Measurement]:
         streams = {topic: stream for stream, topic in self._topics.items()}
-        kinds = {topic: self._file.topics[topic].kind for topic in streams}
-        cameras = ros_rig.rig_cameras(self.rig)
-        for topic, log_ns, data in self._file.messages(streams, *self._log_range, losses=self.losses):
-            stream = streams[topic]
+        for topic, log_ns, data in self.file.messages(streams, *self._log_range, losses=self.losses):
             try:
-                message = _decode(self._file, data, kinds[topic], topic)
+                message = ros.decode(data, self.file.topics[topic].kind, f"{self.file.path}: {topic}")
                 stamp = ros.stamp_of(message)
-                lo, hi = self._span.limits(stream)
-                if not lo < stamp <= hi:
+                if not self.is_in_span(streams[topic], stamp):
                     continue
-                payload = (
-                    _imu_values(message, f"{self._file.path}: {topic} at {stamp}")
-                    if stream == IMU
-                    else self._image(message, topic, stamp, cameras[stream], stream)
-                )
+                payload = self._payload(message, topic, stamp, streams[topic])
             except DataError as error:  # skip this message only
                 self.losses.add(f"messages of {topic}", str(log_ns), str(error))
                 continue
-            yield Measurement(stream, stamp, payload)
-        self._check_losses()
+            yield Measurement(streams[topic], stamp, payload)
+        for topic in streams:
+            self.losses.check(f"messages of {topic}", len(self.file.log_times[topic]))
 
-    def _check_losses(self) -> None:
-        for topic in self._topics.values():
-            self.losses.check(f"messages of {topic}", len(self._file.log_times[topic]))
+    def _payload(self, message: Any, topic: str, stamp: int, stream: str) -> Any:
+        where = f"{self.file.path}: {topic} at {stamp}"
+        if stream == IMU:
+            return ros.imu_values(message, where)
+        camera, is_depth = self.rig.cameras[stream], stream == DEPTH
+        if self.file.topics[topic].kind == ros.COMPRESSED:
+            return ros.decode_compressed(message, where, camera, is_depth)
+        return ros.RawImage(message, where, camera, is_depth)
 
     def truth(self) -> Trajectory | None:
-        path = truth_path(self._file.path)
-        if path is None:
-            return None
-        truth = read_tum(path, self.losses)
-        return Trajectory(truth.stamps_ns, truth.T @ self._T_recorded_body)
+        """Read truth/NAME.tum of a session, or NAME.truth.tum beside the recording."""
+        path = self.file.path
+        beside = path.with_name(path.stem + ".truth.tum")
+        for file in (path.parent / "truth" / f"{path.stem}.tum", beside):
+            if file.is_file():
+                truth = read_tum(file, self.losses)
+                return Trajectory(truth.stamps_ns, truth.T @ self._T_recorded_body)
+        return None
 
     @cached_property
     def _T_recorded_body(self) -> F64:
@@ -129,32 +125,17 @@ class McapSource(Source):
 
     @property
     def _log_range(self) -> tuple[int | None, int | None]:
-        first = min(self._span.imu_from, self._span.image_from)
-        last = max(self._span.imu_to, self._span.image_to)
+        first = min(self.span.imu_from, self.span.image_from)
+        last = max(self.span.imu_to, self.span.image_to)
         return (
             None if first <= -UNBOUNDED_NS else max(0, first - _MAX_SKEW_NS),
             None if last >= UNBOUNDED_NS else last + _MAX_SKEW_NS,
         )
 
-    def _find_span(self, frames: slice | None) -> Span:
-        times = self._file.log_times[self._topics[CAM0]]
-        if len(times) == 0:
-            raise DataError(f"{self._file.path}: {self._topics[CAM0]} has no images")
-        stamps = times if frames is None else self._header_stamps()
-        return select_span(stamps, frames, str(self._file.path), self.rig.timeshift_ns)
-
     def _header_stamps(self) -> I64:
         """Return cam0's sorted header stamps (N,) ns, by one pass that decodes nothing else."""
-        messages = self._file.messages([self._topics[CAM0]], losses=self.losses)
-        heads = (data[4:12] for _, _, data in messages if len(data) >= 12)
-        pairs = np.frombuffer(b"".join(heads), "<u4").reshape(-1, 2).astype(np.int64)
-        return np.sort(pairs[:, 0] * 10**9 + pairs[:, 1])
-
-    def _image(self, message: Any, topic: str, stamp: int, camera: Camera, stream: str) -> Any:
-        where, is_depth = f"{self._file.path}: {topic} at {stamp}", stream == DEPTH
-        if self._file.topics[topic].kind == ros.COMPRESSED:
-            return ros_images.decode_compressed(message, where, camera, is_depth)
-        return ros_images.RawImage(message, where, camera, is_depth)
+        messages = self.file.messages([self._topics[CAM0]], losses=self.losses)
+        return np.sort(ros.header_stamps([data for _, _, data in messages if len(data) >= 12]))
 
 
 def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
@@ -206,65 +187,6 @@ def guess_topic(stream: str, candidates: list[str]) -> str | None:
     return None
 
 
-def own_rig(file: McapFile, topics: dict[str, str], needed: bool) -> Rig | None:
-    """Return the rig in our record of the file, else (if `needed`) that of CameraInfo; None if unknown."""
-    record = _rig_record(file)
-    if "rig" in record:
-        return ros_rig.rig_from_json(record["rig"], str(file.path))
-    return _rig_from_messages(file, topics) if needed else None
-
-
-def own_serial(file: McapFile) -> str | None:
-    """Return the device's serial number; None if unknown."""
-    return _rig_record(file).get("serial")
-
-
-def _rig_record(file: McapFile) -> dict[str, str]:
-    """Return our metadata record of the device; empty for other recordings, or if damaged."""
-    try:
-        return file.metadata(ros.RIG_RECORD)
-    except damage_errors():
-        return {}
-
-
-def _rig_from_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
-    """Return the rig of CameraInfo and /tf_static, None without cam0's CameraInfo.
-
-    Raises ConfigError for a recording with an IMU, whose noise no message states.
-    """
-    infos: dict[str, Any] = {s: _camera_info(file, topics[s]) for s in (CAM0, CAM1, DEPTH) if s in topics}
-    if infos[CAM0] is None:
-        return None
-    if IMU in topics:
-        raise ConfigError(
-            f"{file.path}: noise and extrinsics of IMU {topics[IMU]} are missing; give a folder with both "
-            "Kalibr chains with --calib, or only a camchain to track without the IMU"
-        )
-    missing = [topics[s] for s, info in infos.items() if info is None]
-    if missing:
-        raise ConfigError(f"{file.path}: {missing[0]} has no CameraInfo; give the calibration with --calib")
-    where = str(file.path)
-    transforms = (_decode(file, d, ros.TF, ros.TF_STATIC) for _, _, d in file.messages([ros.TF_STATIC]))
-    tree = ros_rig.FrameTree(transforms, where)
-    cams = {s: ros_rig.from_camera_info(info, f"{where}: {topics[s]}") for s, info in infos.items()}
-    T = {s: tree.find(info.header.frame_id, infos[CAM0].header.frame_id) for s, info in infos.items()}
-    if any(pose is None for pose in T.values()):
-        raise ConfigError(f"{where}: /tf_static lacks the extrinsics of the cameras; give --calib")
-    with config_errors(where):
-        return Rig(cams[CAM0], np.eye(4), cams.get(CAM1), T.get(CAM1), cams.get(DEPTH), T.get(DEPTH))
-
-
-def _camera_info(file: McapFile, topic: str) -> Any | None:
-    """Return the first CameraInfo of an image topic; None if there is none."""
-    for suffix in ros.SUFFIXES:
-        topic = topic.removesuffix(suffix)
-    name = topic.rpartition("/")[0] + "/camera_info"
-    if name not in file.topics:
-        return None
-    first = next(file.messages([name]), None)
-    return None if first is None else _decode(file, first[2], ros.CAMERA_INFO, name)
-
-
 def _recorded_rig(rig: Rig, topics: dict[str, str]) -> Rig:
     """Return the rig without a partner of cam0 that was never recorded (broken camera), if another stream
     that gives scale was."""
@@ -276,36 +198,39 @@ def _recorded_rig(rig: Rig, topics: dict[str, str]) -> Rig:
     return rig
 
 
-def _fit_rig(rig: Rig, topics: dict[str, str], path: Path) -> Rig:
-    """Return the rig, without the IMU if none was recorded. Raises ConfigError if a camera is missing."""
-    for stream in ros_rig.rig_cameras(rig):
-        if stream not in topics:
-            raise ConfigError(
-                f"{path}: the calibration has {stream}, the recording does not; give another --calib"
-            )
-    if rig.imu and IMU not in topics:
-        return rig.without_imu()
-    return rig
+# ---- All IMU samples, hours of them in less than a minute
+
+_BATCH_MESSAGES = 20_000
+_LOSS_KIND = "IMU messages"
 
 
-def _decode(file: McapFile, data: bytes, kind: str, topic: str) -> Any:
-    """Decode a message. Raises DataError."""
-    try:
-        return ros.decode(data, kind)
-    except Exception as error:  # rosbags raises many kinds on invalid bytes
-        raise DataError(f"{file.path}: {topic}: a message cannot be read ({error})") from None
+def read_imu(file: McapFile, progress: Callable[[int, int], None], losses: DataLosses) -> tuple[I64, F64]:
+    """Return stamps (N,) ns, unwrapped, in the order of the log, and values (N, 6), rad/s and m/s^2.
+
+    Images are skipped, and messages parsed in batches. progress: called with the samples read and their
+    total. losses: gets damaged samples. Raises DataError without samples, or if more than 5 % are damaged.
+    """
+    imu_topics = [n for n, t in file.topics.items() if t.kind == ros.IMU_MSG and len(file.log_times[n])]
+    topic = guess_topic(IMU, imu_topics)
+    if topic is None:
+        raise DataError(f"{file.path}: has no IMU samples; its topics: {', '.join(file.topics) or 'none'}")
+    total, stamps, values = len(file.log_times[topic]), [], []
+    messages = (data for _, _, data in file.messages([topic], losses=losses))
+    while batch := list(islice(messages, _BATCH_MESSAGES)):
+        intact = [data for data in batch if ros.is_imu_message(data)]
+        for _ in range(len(batch) - len(intact)):
+            where, what = f"{file.path}: {topic}", "a message is not sensor_msgs/Imu in little-endian CDR"
+            losses.add(_LOSS_KIND, f"{losses.counts.get(_LOSS_KIND)}", f"{where}: {what}; record again")
+        stamps.append(ros.header_stamps(intact))
+        values.append(ros.parse_imu_batch(intact))
+        progress(sum(map(len, stamps)), total)
+    losses.check(_LOSS_KIND, total)
+    if not stamps:
+        raise DataError(f"{file.path}: {topic}: has no readable sample")
+    return unwrap_stamps(np.concatenate(stamps)), np.concatenate(values)
 
 
-def _imu_values(message: Any, where: str) -> tuple[float, ...]:
-    w, a = message.angular_velocity, message.linear_acceleration
-    values = (w.x, w.y, w.z, a.x, a.y, a.z)
-    if not math.isfinite(sum(values)):
-        raise DataError(f"{where}: the sample has values that are not finite")
-    return values
-
-
-def truth_path(recording: Path) -> Path | None:
-    """Return truth/NAME.tum of a session, or NAME.truth.tum beside the recording; None if neither exists."""
-    beside = recording.with_name(recording.stem + ".truth.tum")
-    paths = (recording.parent / "truth" / f"{recording.stem}.tum", beside)
-    return next((path for path in paths if path.is_file()), None)
+def unwrap_stamps(stamps_ns: I64) -> I64:
+    """Unwrap the stamps (N,) ns of a D4xx, whose counter restarts every 71 minutes."""
+    back = np.diff(stamps_ns, prepend=stamps_ns[:1]) < -WRAP_NS // 2
+    return np.asarray(stamps_ns + WRAP_NS * np.cumsum(back), np.int64)

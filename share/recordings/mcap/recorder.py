@@ -1,31 +1,31 @@
-"""Write MCAP recordings with ROS 2 messages, which Foxglove, rosbags and ROS 2 open as they are.
+"""Write MCAP recordings, which Foxglove, rosbags and ROS 2 open as they are; recover those that were cut off.
 
 Topics are those of `share.recordings.mcap.ros_messages.TOPICS`. The file grows as NAME.part, in chunks of at
-most 256 kB (or one image), and gets its name when it is closed. After a crash,
-`share.recordings.mcap.recover` recovers the `.part`.
+most 256 kB (or one image), and gets its name when it is closed. After a crash `recover_recording` copies
+every intact message of the `.part`, which has no index, and whose last chunk may be incomplete: it is read
+from the start, record by record, as far as possible.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
-
-import numpy as np
+from typing import IO, Any, BinaryIO, NamedTuple
 
 from share.errors import DataError, UsageError
-from share.files.writing import check_replaceable, open_new, sync_folder, write_errors
+from share.files.reading import open_regular
+from share.files.writing import check_replaceable, new_file, open_new, sync_folder, write_errors
 from share.geometry.camera import Rig
 from share.recordings.images import EncodedImage, encode_jpeg
-from share.recordings.mcap import images as ros_images
 from share.recordings.mcap import rig as ros_rig
 from share.recordings.mcap import ros_messages as ros
+from share.recordings.mcap.file import BoundedFile, check_magic, chunk_records, damage_errors
 from share.sensors.measurement import DEPTH, IMU, Measurement
-from share.types import F64
 
-CHUNK_BYTES = 256 * 1024
+_CHUNK_BYTES = 256 * 1024
 _FLUSH_PERIOD_NS = 10**9  # a crash loses at most this much
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"
 _LATCHED = {  # transient local: a player sends it to late subscribers too
@@ -75,7 +75,7 @@ class Recorder:
             raise leftover_error(self.part) from None
         except OSError as error:
             raise UsageError(f"{self.part}: cannot be written: {error.strerror}") from None
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
+        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
         self._writer.start(profile="ros2", library="share")
         metadata = {"rig": ros_rig.rig_to_json(rig), "schema": "1"} | ({"serial": serial} if serial else {})
         self._writer.add_metadata(ros.RIG_RECORD, metadata)
@@ -96,7 +96,7 @@ class Recorder:
             if self._flushed_ns is None:
                 self._write_rig(stamp)
             if measurement.stream == IMU:
-                self._write_message(ros.TOPICS[IMU], _imu_message(stamp, measurement.payload))
+                self._write_message(ros.TOPICS[IMU], ros.imu_message(stamp, measurement.payload))
             else:
                 self._write_image(measurement.stream, stamp, measurement.payload)
             if self._flushed_ns is None or self._log_ns - self._flushed_ns >= _FLUSH_PERIOD_NS:
@@ -134,22 +134,22 @@ class Recorder:
         header, is_depth, topic = ros.make_header(stamp, stream), stream == DEPTH, ros.TOPICS[stream]
         data = self._encode(image, is_depth)
         if data is None:
-            self._write_message(topic, ros_images.encode_raw(header, image.load()))
+            self._write_message(topic, ros.encode_raw(header, image.load()))
         else:
             suffix = ros.SUFFIXES[is_depth]
-            self._write_message(topic + suffix, ros_images.encode_compressed(header, data, is_depth))
+            self._write_message(topic + suffix, ros.encode_compressed(header, data, is_depth))
 
     def _encode(self, image: Any, is_depth: bool) -> bytes | None:
         """Return the encoded image; None to write raw pixels."""
         if is_depth:
-            mm = isinstance(image, EncodedImage) and image.depth_scale == ros_images.MILLIMETRES
+            mm = isinstance(image, EncodedImage) and image.depth_scale == ros.MILLIMETRES
             return image.read() if mm else None
         if self._jpeg is not None:
             return encode_jpeg(image.load(), self._jpeg)
         return image.read() if isinstance(image, EncodedImage) else None
 
     def _write_rig(self, stamp: int) -> None:
-        for stream, camera in ros_rig.rig_cameras(self._rig).items():
+        for stream, camera in self._rig.cameras.items():
             info = ros_rig.to_camera_info(camera, ros.make_header(stamp, stream))
             self._write_message(ros.INFO_TOPICS[stream], info)
         self._write_message(ros.TF_STATIC, ros_rig.to_tf(self._rig, stamp), _LATCHED)
@@ -175,19 +175,104 @@ class Recorder:
             os.fdatasync(self._file.fileno())
 
 
-_UNKNOWN_COVARIANCE = np.zeros(9)
-_NO_ORIENTATION = np.array([-1.0, *[0.0] * 8])  # sensor_msgs/Imu: -1 marks a missing orientation
+# ---- Recovery of recordings that were cut off
 
 
-def _imu_message(stamp: int, sample: F64) -> Any:
-    wx, wy, wz, ax, ay, az = (float(value) for value in sample)
-    return ros.make_message(
-        ros.IMU_MSG,
-        header=ros.make_header(stamp, ros_rig.BODY),
-        orientation=ros.make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=_NO_ORIENTATION,
-        angular_velocity=ros.make_message("geometry_msgs/msg/Vector3", x=wx, y=wy, z=wz),
-        angular_velocity_covariance=_UNKNOWN_COVARIANCE,
-        linear_acceleration=ros.make_message("geometry_msgs/msg/Vector3", x=ax, y=ay, z=az),
-        linear_acceleration_covariance=_UNKNOWN_COVARIANCE,
-    )
+class Recovered(NamedTuple):
+    """messages: count by topic. lost_bytes: not readable. reason: why, empty if nothing was lost."""
+
+    messages: dict[str, int]
+    lost_bytes: int
+    reason: str
+
+
+def recover_recording(path: Path, out: Path, progress: Callable[[int], None] = lambda _: None) -> Recovered:
+    """Copy all intact messages from `path` to `out`. progress: called with each number of bytes read.
+
+    Raises UsageError for unusable paths, DataError if nothing can be recovered, ShareError if the disk of
+    `out` is full or fails.
+    """
+    check_magic(path)
+    if out.exists() and out.samefile(path):
+        raise UsageError(f"--out {out} is the broken file itself; give another name")
+    with open_regular(path) as file, new_file(out) as target:
+        result = _copy(file, target, progress)
+        if not result.messages:
+            raise DataError(f"{path}: has no complete message ({result.reason or 'it is empty'})")
+    return result
+
+
+def _copy(file: BinaryIO, target: IO[bytes], progress: Callable[[int], None]) -> Recovered:
+    from mcap.writer import Writer
+
+    writer = Writer(target, chunk_size=_CHUNK_BYTES)
+    writer.start(profile="ros2", library="share")
+    copier = _Copier(writer)
+    lost_bytes, reason = _copy_records(file, copier, progress)
+    writer.finish()
+    return Recovered(copier.counts, lost_bytes, reason)
+
+
+def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], None]) -> tuple[int, str]:
+    """Copy up to the first damaged record; return the bytes lost and why. A chunk damaged inside is skipped.
+
+    Raises OSError if the copy cannot be written.
+    """
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    records = StreamReader(BoundedFile(file), emit_chunks=True, record_size_limit=2**30).records
+    lost_bytes, reason, intact_end = 0, "", 0
+    while True:
+        try:
+            record = next(records, None)
+        except damage_errors() as error:
+            return lost_bytes + os.fstat(file.fileno()).st_size - intact_end, reason or _describe_error(error)
+        if record is None:
+            return lost_bytes, reason
+        try:
+            for part in chunk_records(record) if isinstance(record, Chunk) else [record]:
+                copier.copy(part)
+        except OSError:  # from writing: nothing is read here
+            raise
+        except damage_errors() as error:
+            lost_bytes, reason = lost_bytes + file.tell() - intact_end, reason or _describe_error(error)
+        progress(file.tell() - intact_end)
+        intact_end = file.tell()
+
+
+def _describe_error(error: Exception) -> str:
+    if isinstance(error, OSError):
+        return f"reading failed: {error.strerror}"
+    name = type(error).__name__
+    return "the file is cut short" if name == "EndOfFile" else f"damaged: {str(error) or name}"
+
+
+class _Copier:
+    """Writes schemas, channels, metadata and messages with the ids of the new file."""
+
+    def __init__(self, writer: Any) -> None:
+        self._writer = writer
+        self._schemas: dict[int, int] = {0: 0}
+        self._channels: dict[int, int] = {}
+        self._names: dict[int, str] = {}
+        self.counts: dict[str, int] = {}
+
+    def copy(self, record: Any) -> None:
+        kind = type(record).__name__
+        if kind == "Schema" and record.id not in self._schemas:
+            self._schemas[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)
+        elif kind == "Channel" and record.id not in self._channels:
+            self._channels[record.id] = self._writer.register_channel(
+                record.topic, record.message_encoding, self._schemas[record.schema_id], record.metadata
+            )
+            self._names[record.id] = record.topic
+        elif kind == "Metadata":
+            self._writer.add_metadata(record.name, record.metadata)
+        elif kind == "Message":
+            name = self._names[record.channel_id]
+            self._writer.add_message(
+                self._channels[record.channel_id], record.log_time, record.data, record.publish_time,
+                record.sequence,
+            )  # fmt: skip
+            self.counts[name] = self.counts.get(name, 0) + 1

@@ -1,4 +1,4 @@
-"""Convert a rig to ROS 2 messages and back: CameraInfo for each camera, /tf_static for the extrinsics.
+"""The rig of an MCAP recording as ROS 2 messages: CameraInfo for each camera, /tf_static for the extrinsics.
 
 Our recordings also contain the rig as JSON in an MCAP metadata record: exact to the last digit, and with the
 IMU's noise, for which ROS has no message.
@@ -18,25 +18,21 @@ from share.files.json_file import parse_json
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.lens import EQUIDISTANT, RADTAN
+from share.recordings.calibration import config_errors
 from share.recordings.mcap import ros_messages as ros
+from share.recordings.mcap.file import McapFile, damage_errors
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU
 from share.types import F64
 
-BODY = "body"
 _ROS_MODELS = {RADTAN: "plumb_bob", EQUIDISTANT: "equidistant"}
 _RADTAN_NAMES, _FISHEYE_NAMES = ("plumb_bob", "none", ""), ("equidistant", "fisheye", "kannala_brandt")
-
-
-def rig_cameras(rig: Rig) -> dict[str, Camera]:
-    """Return the cameras of a rig, by stream."""
-    return {k: c for k, c in ((CAM0, rig.cam0), (CAM1, rig.cam1), (DEPTH, rig.depth)) if c}
 
 
 def rig_to_json(rig: Rig) -> str:
     """Return a rig as JSON, with all numbers exact."""
     poses = {k: getattr(rig, k) for k in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0")}
     return json.dumps(
-        {name: _camera_fields(camera) for name, camera in rig_cameras(rig).items()}
+        {name: _camera_fields(camera) for name, camera in rig.cameras.items()}
         | {name: T.tolist() for name, T in poses.items() if T is not None}
         | ({"imu": asdict(rig.imu)} if rig.imu else {})
         | ({"timeshift_s": rig.timeshift_s} if rig.timeshift_s else {})
@@ -107,7 +103,7 @@ def from_camera_info(info: Any, where: str) -> Camera:
 
 def to_tf(rig: Rig, stamp_ns: int) -> Any:
     """Return the extrinsics of a rig as transforms body -> cam0 -> cam1, depth."""
-    edges = {(BODY, CAM0): rig.T_body_cam0}
+    edges = {(ros.BODY, CAM0): rig.T_body_cam0}
     if rig.T_cam1_cam0 is not None:
         edges[CAM0, CAM1] = se3.inverse(rig.T_cam1_cam0)
     if rig.T_depth_cam0 is not None:
@@ -157,3 +153,67 @@ class FrameTree:
                     reached[other] = reached[frame] @ T
                     todo.append(other)
         return reached.get(b.lstrip("/"))
+
+
+# ---- The rig of a file
+
+
+def own_rig(file: McapFile, topics: dict[str, str], needed: bool) -> Rig | None:
+    """Return the rig in our record of the file, else (if `needed`) that of CameraInfo; None if unknown."""
+    record = _rig_record(file)
+    if "rig" in record:
+        return rig_from_json(record["rig"], str(file.path))
+    return _rig_from_messages(file, topics) if needed else None
+
+
+def own_serial(file: McapFile) -> str | None:
+    """Return the device's serial number; None if unknown."""
+    return _rig_record(file).get("serial")
+
+
+def _rig_record(file: McapFile) -> dict[str, str]:
+    """Return our metadata record of the device; empty for other recordings, or if damaged."""
+    try:
+        return file.metadata(ros.RIG_RECORD)
+    except damage_errors():
+        return {}
+
+
+def _rig_from_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
+    """Return the rig of CameraInfo and /tf_static, None without cam0's CameraInfo.
+
+    Raises ConfigError for a recording with an IMU, whose noise no message states.
+    """
+    infos: dict[str, Any] = {s: _camera_info(file, topics[s]) for s in (CAM0, CAM1, DEPTH) if s in topics}
+    if infos[CAM0] is None:
+        return None
+    if IMU in topics:
+        raise ConfigError(
+            f"{file.path}: noise and extrinsics of IMU {topics[IMU]} are missing; give a folder with both "
+            "Kalibr chains with --calib, or only a camchain to track without the IMU"
+        )
+    missing = [topics[s] for s, info in infos.items() if info is None]
+    if missing:
+        raise ConfigError(f"{file.path}: {missing[0]} has no CameraInfo; give the calibration with --calib")
+    where = str(file.path)
+    transforms = (
+        ros.decode(data, ros.TF, f"{where}: {ros.TF_STATIC}") for _, _, data in file.messages([ros.TF_STATIC])
+    )
+    tree = FrameTree(transforms, where)
+    cams = {s: from_camera_info(info, f"{where}: {topics[s]}") for s, info in infos.items()}
+    T = {s: tree.find(info.header.frame_id, infos[CAM0].header.frame_id) for s, info in infos.items()}
+    if any(pose is None for pose in T.values()):
+        raise ConfigError(f"{where}: /tf_static lacks the extrinsics of the cameras; give --calib")
+    with config_errors(where):
+        return Rig(cams[CAM0], np.eye(4), cams.get(CAM1), T.get(CAM1), cams.get(DEPTH), T.get(DEPTH))
+
+
+def _camera_info(file: McapFile, topic: str) -> Any | None:
+    """Return the first CameraInfo of an image topic; None if there is none."""
+    for suffix in ros.SUFFIXES:
+        topic = topic.removesuffix(suffix)
+    name = topic.rpartition("/")[0] + "/camera_info"
+    if name not in file.topics:
+        return None
+    first = next(file.messages([name]), None)
+    return None if first is None else ros.decode(first[2], ros.CAMERA_INFO, f"{file.path}: {name}")

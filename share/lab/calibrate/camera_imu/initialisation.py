@@ -15,7 +15,7 @@ import numpy as np
 from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.geometry.peak import subsample_peak
+from share.geometry.interpolation import subsample_peak
 from share.geometry.se3 import best_rotation
 from share.lab.calibrate import camera_initialisation
 from share.lab.calibrate.camera_bundle import BoardView

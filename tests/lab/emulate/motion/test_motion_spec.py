@@ -25,7 +25,7 @@ def test_specs_are_read(text, name, spec):
         ("wlk:", "did you mean 'walk:'"),
         ("euroc", "did you mean 'euroc:'"),
         ("walk:sped=2", "did you mean 'speed'"),
-        ("walk:speed=fast", "expected float"),
+        ("walk:speed=fast", "expected a number"),
         ("walk:speed=9", "0.2 to 2 m/s"),
         ("walk:3", "'3' is not key=value"),
         ("a b=walk:", "is not a valid name"),

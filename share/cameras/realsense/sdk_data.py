@@ -1,4 +1,7 @@
-"""Conversion of SDK frames to samples. Pixels are copied at once, since the SDK has few buffers."""
+"""Convert the SDK's data: frames to samples, the factory calibration to a rig with the body in the IMU.
+
+Pixels are copied at once, since the SDK has few buffers.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from share.errors import DataError
+from share.geometry import se3
+from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.lens import EQUIDISTANT, RADTAN
 from share.recordings.images import ArrayImage
 from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
-from share.types import F32
+from share.types import F32, F64, checked_pose
 
 _INTEGER_TOLERANCE = 1e-3  # of the inverse of a depth unit
 
@@ -64,3 +71,47 @@ def scale_depth(steps: NDArray[np.uint16], unit_m: float) -> F32:
     if n and abs(1 / unit_m - n) < _INTEGER_TOLERANCE:
         return np.asarray(steps / np.float32(n))
     return np.asarray(steps * np.float32(unit_m))
+
+
+# ---- The factory calibration
+
+
+def factory_rig(rs: Any, profiles: dict[str, Any], noise: ImuNoise | None) -> Rig:
+    """Return the rig. profiles: SDK stream profiles of cam0 and, if read, of cam1, depth and gyro, by stream.
+
+    noise: of the IMU; the factory gives none. Raises DataError for an unknown lens model or invalid values.
+    """
+    cam0 = profiles[CAM0]
+    try:
+        rig: dict[str, Any] = {"cam0": read_camera(rs, cam0), "T_body_cam0": np.eye(4)}
+        for name in (CAM1, DEPTH):
+            if name in profiles:
+                rig |= {name: read_camera(rs, profiles[name])}
+                rig |= {f"T_{name}_cam0": read_extrinsics(cam0, profiles[name])}
+        if GYRO in profiles and noise is not None:
+            rig |= {"imu": noise, "T_body_cam0": read_extrinsics(cam0, profiles[GYRO])}
+        return Rig(**rig)
+    except ValueError as error:
+        raise DataError(f"the camera's factory calibration: {error}") from None
+
+
+def read_extrinsics(source: Any, target: Any) -> F64:
+    """Return T_target_source (4, 4) of two stream profiles. The SDK's rotation is column-major."""
+    extrinsics = source.get_extrinsics_to(target)
+    T = np.eye(4)
+    T[:3, :3] = np.reshape(extrinsics.rotation, (3, 3), order="F")
+    T[:3, 3] = extrinsics.translation
+    return se3.orthonormal(checked_pose("extrinsics", T))  # the SDK's single precision is rigid to 1e-7 only
+
+
+def read_camera(rs: Any, profile: Any) -> Camera:
+    """Return the intrinsics of a video stream profile. Raises ValueError for an unknown distortion model."""
+    found = profile.as_video_stream_profile().get_intrinsics()
+    distortion, model = tuple(float(c) for c in found.coeffs), RADTAN
+    if found.model == rs.distortion.kannala_brandt4:  # T265; the fifth coefficient is 0
+        distortion, model = distortion[:4], EQUIDISTANT
+    elif not any(distortion):
+        distortion = ()
+    elif found.model != rs.distortion.brown_conrady:
+        raise ValueError(f"distortion model {found.model} is unknown; calibrate it: `share calibrate camera`")
+    return Camera(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy, distortion, model)

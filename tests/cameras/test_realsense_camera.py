@@ -1,4 +1,4 @@
-"""The camera's adapter on the real SDK, with a device that is made of software."""
+"""The RealSense camera on the real SDK with its software device."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from helpers.software_camera import BASELINE, T_GYRO_IR, Listed, SoftwareCamera
 from share.cameras.realsense import camera as adapter
 from share.cameras.realsense.camera import RealSenseCamera
 from share.cameras.realsense.devices import AttachedDevice, choose_device
-from share.cameras.realsense.factory import read_camera as factory_camera
-from share.cameras.realsense.frames import scale_depth
+from share.cameras.realsense.sdk_data import read_camera as factory_camera
+from share.cameras.realsense.sdk_data import read_extrinsics, scale_depth
 from share.cameras.realsense.streams import StreamRequest
 from share.errors import ShareError, UsageError
 from share.recordings.mcap import ros_messages as ros
-from share.recordings.mcap.images import encode_raw
+from share.recordings.mcap.ros_messages import encode_raw
 from share.sensors.profile import load_profile
 from share.sensors.sample_processor import DeviceSample
 
@@ -42,7 +42,7 @@ def camera() -> SoftwareCamera:
 def read(
     camera: SoftwareCamera, count: int, feed: Callable[[], None], wanted: StreamRequest | None = None
 ) -> list[DeviceSample]:
-    """The samples that come out when `feed` puts them in; waits for `count`, at most 5 s."""
+    """Return the samples that `feed` puts in; wait for `count`, at most 5 s."""
     got: list[DeviceSample] = []
     with RealSenseCamera(wanted or StreamRequest(D435I), context=camera.context) as device:
         device.start(got.append)
@@ -54,7 +54,7 @@ def read(
     return got
 
 
-def test_pictures_and_motion_come_out_as_they_went_in(camera: SoftwareCamera) -> None:
+def test_images_and_motion_samples_are_unchanged(camera: SoftwareCamera) -> None:
     left, right = (np.random.default_rng(k).integers(0, 255, (480, 640), np.uint8) for k in (0, 1))
 
     def feed() -> None:
@@ -87,7 +87,7 @@ def test_depth_in_millimetres_is_recorded_as_such(unit_m: float, encoding: str) 
         np.testing.assert_array_equal(message.data.view(np.uint16).reshape(256, 256), steps)
 
 
-def test_a_thousand_samples_of_the_imu_are_all_there(camera: SoftwareCamera) -> None:
+def test_no_imu_sample_of_a_thousand_is_lost(camera: SoftwareCamera) -> None:
     def feed() -> None:
         for k in range(1000):
             camera.turn(2500 * k, k, 0, 0)
@@ -95,7 +95,7 @@ def test_a_thousand_samples_of_the_imu_are_all_there(camera: SoftwareCamera) -> 
     assert [s.payload[0] for s in read(camera, 1000, feed)] == [float(k) for k in range(1000)]
 
 
-def test_a_stamp_of_the_hosts_clock_is_told_apart(camera: SoftwareCamera) -> None:
+def test_a_stamp_of_the_hosts_clock_is_recognised(camera: SoftwareCamera) -> None:
     picture = np.zeros((480, 640), np.uint8)
     got = read(camera, 1, lambda: camera.image(0, 1000, picture, rs.timestamp_domain.system_time))
     assert [sample.is_device_clock for sample in got] == [False]
@@ -112,8 +112,6 @@ def test_the_factory_calibration_becomes_a_rig_with_the_body_in_the_imu(camera: 
 
 
 def test_a_rotation_of_the_sdk_is_read_column_by_column() -> None:
-    from share.cameras.realsense.factory import read_extrinsics
-
     class Told:
         rotation, translation = (0, 1, 0, -1, 0, 0, 0, 0, 1), (1, 2, 3)  # rs2_extrinsics: column-major
 
@@ -170,8 +168,8 @@ def test_an_emitter_that_another_program_left_on_is_switched_off_and_no_longer_a
     assert camera.stereo.get_option(rs.option.emitter_on_off) == 0
 
 
-def test_dots_of_an_emitter_that_should_be_off_are_said_once(camera: SoftwareCamera) -> None:
-    """They come with the third image; one of thirty is looked at."""
+def test_dots_of_an_emitter_that_should_be_off_give_one_warning(camera: SoftwareCamera) -> None:
+    """They begin with the third image; one image of thirty is checked."""
     said, got = list[str](), list[DeviceSample]()
     with RealSenseCamera(StreamRequest(D435I), context=camera.context, notify=said.append) as device:
         device.start(got.append)
@@ -186,7 +184,7 @@ def test_dots_of_an_emitter_that_should_be_off_are_said_once(camera: SoftwareCam
     assert [text.partition(":")[0] for text in said] == ["the emitter is on although it was switched off"]
 
 
-def test_an_interleaved_emitter_that_does_not_alternate_is_said(camera: SoftwareCamera) -> None:
+def test_an_interleaved_emitter_that_does_not_alternate_gives_a_warning(camera: SoftwareCamera) -> None:
     said, got = list[str](), list[DeviceSample]()
     interleaved = replace(D435I, device=replace(FACTS, emitter="interleaved"))
     with RealSenseCamera(StreamRequest(interleaved), context=camera.context, notify=said.append) as device:
@@ -202,7 +200,7 @@ def test_an_interleaved_emitter_that_does_not_alternate_is_said(camera: Software
     ]
 
 
-def test_a_frame_that_cannot_be_read_is_said_once_and_those_after_it_are_read(
+def test_an_unreadable_frame_gives_one_warning_and_later_ones_are_read(
     camera: SoftwareCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said, got, as_sample = list[str](), list[DeviceSample](), adapter.to_sample
@@ -222,13 +220,13 @@ def test_a_frame_that_cannot_be_read_is_said_once_and_those_after_it_are_read(
     assert said == ["a frame cannot be read: null pointer passed for argument"]
 
 
-def test_without_a_camera_one_line_says_so() -> None:
+def test_without_a_camera_the_error_is_one_line() -> None:
     with pytest.raises(UsageError, match=r"no RealSense camera is attached, or none may.*plugdev.*stop"):
         RealSenseCamera(StreamRequest(D435I), context=rs.context())
 
 
 class Leaving:
-    """A context or device that answers the SDK's questions up to one of them."""
+    """A context or device whose call `last` fails."""
 
     def __init__(self, of: Any, last: str) -> None:
         self._of, self._last = of, last
@@ -240,18 +238,18 @@ class Leaving:
 
 
 @pytest.mark.parametrize("last", ["query_devices", "get_info", "query_sensors"])
-def test_a_camera_that_leaves_while_it_is_asked_is_a_line(camera: SoftwareCamera, last: str) -> None:
+def test_a_camera_unplugged_while_opening_gives_one_line(camera: SoftwareCamera, last: str) -> None:
     context = Leaving(Listed([Leaving(camera.device, last)]), last)
     with pytest.raises(ShareError, match=r"^RealSense camera 0123: cannot be opened: get_xu.*device; replug"):
         RealSenseCamera(StreamRequest(D435I), "0123", context)
 
 
-def test_a_serial_number_that_is_not_there_lists_those_that_are(camera: SoftwareCamera) -> None:
+def test_an_absent_serial_number_lists_the_attached_ones(camera: SoftwareCamera) -> None:
     with pytest.raises(UsageError, match=r"serial number 99 is attached; there is 0123 \(Intel"):
         RealSenseCamera(StreamRequest(D435I), "99", camera.context)
 
 
-def test_a_camera_that_leaves_as_it_is_started_is_a_line_and_is_let_go(
+def test_a_camera_unplugged_while_starting_gives_one_line_and_is_released(
     camera: SoftwareCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def gone(opened: object) -> float:
@@ -272,17 +270,17 @@ def test_a_camera_that_leaves_as_it_is_started_is_a_line_and_is_let_go(
         ([attached(firmware="5.9.14.0")], "firmware 5.9.14.0 is older than 5.12.0.0; update"),
     ],
 )
-def test_a_camera_that_cannot_be_used_is_refused(devices: list[AttachedDevice], says: str) -> None:
+def test_an_unusable_camera_is_refused(devices: list[AttachedDevice], says: str) -> None:
     with pytest.raises(UsageError, match=says):
         choose_device(devices, None, FACTS)
 
 
-def test_firmware_is_compared_by_number_and_not_by_letter() -> None:
+def test_firmware_versions_are_compared_as_numbers() -> None:
     assert choose_device([attached(firmware="5.12.10.0")], None, replace(FACTS, firmware_oldest="5.12.9.0"))
 
 
-def test_a_fisheye_lens_of_the_factory() -> None:
-    """As a T265 has it: four coefficients, and a fifth number that is 0."""
+def test_a_factory_fisheye_lens_is_read() -> None:
+    """Of a T265: four coefficients, and a fifth number of 0."""
     models = SimpleNamespace(brown_conrady=1, kannala_brandt4=2)
     told = SimpleNamespace(
         width=848, height=800, fx=286.0, fy=286.1, ppx=420.0, ppy=400.0, model=2,

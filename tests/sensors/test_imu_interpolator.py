@@ -1,8 +1,9 @@
-"""Two streams to one: only between neighbours, nothing invented, nothing lost."""
+"""The accelerometer is interpolated at the stamps of the gyroscope, never extrapolated."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,7 +15,7 @@ GAP = 20
 def run(
     gyro: list[int], accel: list[int], lag: int = 0
 ) -> tuple[ImuInterpolator, list[tuple[int, list[float]]]]:
-    """Both in order of arrival, the accelerometer later by `lag`; its value is 2 * time."""
+    """Yield both in order of arrival, the accelerometer later by `lag`; its value is 2 * time."""
     join = ImuInterpolator(GAP)
     events = [(t, 1, t) for t in gyro] + [(t + lag, 0, t) for t in accel]
     out: list[tuple[int, list[float]]] = []
@@ -27,9 +28,10 @@ def run(
 stamps = st.lists(st.integers(0, 400), max_size=60, unique=True).map(sorted)
 
 
+@pytest.mark.long
 @settings(max_examples=200, deadline=None)
 @given(stamps, stamps, st.integers(0, 50))
-def test_what_is_joined_is_as_numpy_interpolates_and_lies_between_near_neighbours(
+def test_joined_samples_equal_numpys_interpolation_between_near_neighbours(
     gyro: list[int], accel: list[int], lag: int
 ) -> None:
     join, out = run(gyro, accel, lag)

@@ -23,7 +23,7 @@ def test_is_the_least_squares_answer_and_never_a_reflection(rng):
         assert cost(T) <= cost(T @ se3.exp(xi))
 
 
-def test_refuses_nothing_and_mismatch():
+def test_empty_and_mismatched_points_are_refused():
     with pytest.raises(ValueError, match="umeyama"):
         umeyama(np.zeros((0, 3)), np.zeros((0, 3)))
     with pytest.raises(ValueError, match="umeyama"):

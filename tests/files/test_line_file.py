@@ -1,9 +1,9 @@
-"""A file that is read while it is written."""
+"""A file is read while another process writes it."""
 
 from share.files.line_file import GrowingFile
 
 
-def test_each_whole_line_comes_once(tmp_path):
+def test_each_complete_line_is_yielded_once(tmp_path):
     path = tmp_path / "events.jsonl"
     file = GrowingFile(path)
     assert file.new_lines() == []
@@ -17,7 +17,7 @@ def test_each_whole_line_comes_once(tmp_path):
     assert file.new_lines() == []
 
 
-def test_it_is_the_same_file_once_it_has_its_name_and_an_earlier_one_is_not(tmp_path):
+def test_a_renamed_file_is_continued_and_an_older_one_ignored(tmp_path):
     path, partial = tmp_path / "odom.tum", tmp_path / "odom.tum.partial"
     path.write_text("of an earlier run\n" * 9)
     file = GrowingFile(path, partial)

@@ -1,4 +1,4 @@
-"""Queues that are full: what they keep, and what they count."""
+"""Full queues keep complete pairs of images, and count what they drop."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from share.sensors.sample_processor import DeviceSample
 
 
 def filled(queue: SampleQueue, pairs: int) -> list[tuple[str, int]]:
-    """What can be taken after so many pairs of images, each with a sample of the gyroscope before it."""
+    """Return what is left of so many pairs of images, each after a sample of the gyroscope."""
     for stamp in range(pairs):
         for stream in ("gyro", "cam0", "cam1"):
             queue.put(DeviceSample(stream, stamp, None, 0))
@@ -22,19 +22,19 @@ def images(taken: list[tuple[str, int]]) -> list[tuple[str, int]]:
     return [one for one in taken if one[0] != "gyro"]
 
 
-def test_the_oldest_pairs_stay_and_a_pair_is_never_parted() -> None:
+def test_a_full_queue_keeps_the_oldest_pairs_complete() -> None:
     queue = SampleQueue(max_images=3)
     assert images(filled(queue, 5)) == [("cam0", 0), ("cam1", 0), ("cam0", 1), ("cam1", 1)]
     assert queue.dropped == {"cam0": 3, "cam1": 3}
 
 
-def test_the_newest_pairs_stay_and_a_pair_is_never_parted() -> None:
+def test_a_full_newest_image_queue_keeps_the_newest_pairs_complete() -> None:
     queue = NewestImageQueue(max_images=4)
     assert images(filled(queue, 5)) == [("cam0", 3), ("cam1", 3), ("cam0", 4), ("cam1", 4)]
     assert queue.dropped == {"cam0": 3, "cam1": 3}
 
 
-def test_the_imu_stays_in_order_whatever_is_dropped() -> None:
+def test_imu_samples_stay_in_order_while_images_are_dropped() -> None:
     for queue in (SampleQueue(max_images=2), NewestImageQueue(max_images=2)):
         taken = filled(queue, 50)
         assert [stamp for stream, stamp in taken if stream == "gyro"] == list(range(50))
@@ -42,7 +42,7 @@ def test_the_imu_stays_in_order_whatever_is_dropped() -> None:
         assert (queue.image_count, len(queue)) == (0, 0)
 
 
-def test_a_bound_holds_for_the_imu_too() -> None:
+def test_imu_samples_are_bounded_too() -> None:
     queue = SampleQueue(max_imu_samples=3)
     for stamp in range(5):
         queue.put(DeviceSample("accel", stamp, None, 0))
