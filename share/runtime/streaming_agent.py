@@ -34,7 +34,7 @@ class StreamingAgentRun(AgentRun):
         super()._track()
 
     def _await_edge(self) -> None:
-        deadline = time.monotonic() + self._settings.stream.begin_s
+        deadline = time.monotonic() + TRACKER_START_S
         while not (self._can_start.wait(TICK_MS / 1e3) or self._shared.stop.is_set()):
             if time.monotonic() >= deadline:
                 self._notify("the edge does not track this agent yet; the recording starts anyway")

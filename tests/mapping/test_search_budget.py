@@ -37,4 +37,4 @@ def test_who_comes_meanwhile_ends_it():
 
 def test_the_settings_say_how_many():
     config = Config()
-    assert SearchBudget.from_config(config) == (config.place.enough, config.edge.hurry_candidates)
+    assert SearchBudget.from_config(config) == (config.place.enough, HURRY_CANDIDATES)

@@ -291,10 +291,11 @@ def test_maps_that_came_all_at_once_are_joined_at_leisure():
         ("share", {"bob": AgentQoe(form="ar")}, "ababab"),
     ],
 )
-def test_headsets_and_who_needs_the_same_go_first_unless_all_are_alike(policy, needs, turns):
+def test_headsets_and_who_needs_the_same_go_first_unless_all_are_alike(policy, needs, turns, monkeypatch):
+    monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 10)
     both = town()
     both.walk(10)
-    config = Config(edge=EdgeConfig(policy=policy, each_waiting=10), control=ControlConfig(agents=needs))
+    config = Config(edge=EdgeConfig(policy=policy), control=ControlConfig(agents=needs))
     mapper, kinds = Mapper(config), {"ann": AgentKind.AR, "bob": AgentKind.ROBOT}
     for run_id, (name, kind) in enumerate(kinds.items()):
         mapper.add_run(name, replace(hello(name, run_id), kind=kind))
@@ -309,12 +310,13 @@ def test_headsets_and_who_needs_the_same_go_first_unless_all_are_alike(policy, n
     assert looked == turns
 
 
-def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
+def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough(monkeypatch):
+    monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 12)
     both = town()
     both.walk(40)
-    config = Config(edge=EdgeConfig(each_waiting=12))
+    config = Config()
     tried, same = {}, Verification(np.eye(4), 1e-4 * np.eye(6), 40, 30)
-    for waiting, refuse in itertools.product((0, config.edge.hurry_waiting), (True, False)):
+    for waiting, refuse in itertools.product((0, query_queue.HURRY_WAITING), (True, False)):
         mapper = Mapper(config)
         mapper.add_run("ann-000b", hello(run_id=11))
         keyframes = both.keyframes("ann")
@@ -331,8 +333,8 @@ def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
             tried[waiting, refuse] += 1
             mapper.finish_step(verify, Refusal("not it") if refuse else same, 1.0)
     assert [tried[0, True], tried[0, False]] == [config.place.candidates, config.place.enough]
-    assert [tried[config.edge.hurry_waiting, True], tried[config.edge.hurry_waiting, False]] == [
-        config.edge.hurry_candidates,
+    assert [tried[query_queue.HURRY_WAITING, True], tried[query_queue.HURRY_WAITING, False]] == [
+        query_queue.HURRY_CANDIDATES,
         1,
     ]
 
