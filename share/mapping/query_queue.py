@@ -16,7 +16,6 @@ from share.scheduling.qoe import QoeParameters
 from share.types import F64, AgentKind
 from share.wire.messages import Hello
 
-
 HURRY_WAITING = 1  # with this many queued, a query verifies fewer candidates
 HURRY_CANDIDATES = 3  # at most these, and the first verified one ends the search
 MAX_WAITING_EACH = 3  # queued queries of one agent

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from share import __version__, config
 from share.cameras.live import LiveSource
@@ -88,6 +88,8 @@ class AgentRun:
     raises.
     """
 
+    state_machine: ClassVar[type[Agent]] = Agent
+
     def __init__(
         self,
         source: Source,
@@ -105,7 +107,7 @@ class AgentRun:
         self._source, self._settings = source, settings
         self._notify, self._show, self._verbose = notify, show, verbose
         self._guard = FaultGuard(notify)
-        self._state_machine = Agent(hello, settings)
+        self._state_machine = self.state_machine(hello, settings)
         self._imu_bias_store: ImuBiasStore | None = None  # None where the edge tracks
         self._prepare()
         self._files, self._output_writer = AgentFiles(out, notify), OutputWriter(out, notify)

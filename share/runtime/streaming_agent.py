@@ -14,14 +14,19 @@ from typing import Any
 
 from share.cameras.live import LiveSource
 from share.protocol import agent_events as ev
+from share.protocol.streaming import StreamingAgent
 from share.runtime.agent import TICK_MS, AgentRun
 from share.runtime.arrivals import READ_AHEAD
 from share.runtime.pipeline import check_trackable
 from share.types import Frame
 
+TRACKER_START_S = 20.0  # longest wait of a recording for the edge's tracker before it plays
+
 
 class StreamingAgentRun(AgentRun):
     """`AgentRun` that sends frames to the edge instead of tracking them."""
+
+    state_machine = StreamingAgent
 
     def _prepare(self) -> None:
         check_trackable(self._source.name, self._source.rig)

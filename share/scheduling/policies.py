@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -233,8 +233,6 @@ class RatedEvaluation(NamedTuple):
 class RateScheduler:
     """A policy and the history of its decisions, for one edge. Agents go by name; a new run starts anew."""
 
-    REPORT_FIELDS: ClassVar = ("rate_hz", "qoe")
-
     def __init__(self, config: ControlConfig, policy: str) -> None:
         self._config, self._policy = config, POLICIES[policy](config)
         self.max_rate_hz = config.rate_max_hz if self._policy.limits_rate else None  # None: no limit
@@ -265,10 +263,10 @@ class RateScheduler:
         self._latest[agent] = rated
         return rate_hz
 
-    def report(self, agent: str) -> dict[str, Any]:
-        """Return `rate_hz` and `qoe` for edge.json, the newest of the present run."""
-        rated = self._latest.get(agent)
-        return {name: None if rated is None else getattr(rated, name) for name in self.REPORT_FIELDS}
+    def report(self, agent: str | None) -> dict[str, float | None]:
+        """Return `rate_hz` and `qoe` for edge.json, the newest of the present run; None: no run."""
+        rated = None if agent is None else self._latest.get(agent)
+        return {name: None if rated is None else getattr(rated, name) for name in ("rate_hz", "qoe")}
 
     def series(self, agent: str) -> dict[str, list[float | None]]:
         """Return `series` for edge.json: a list for each field of `RatedEvaluation`."""

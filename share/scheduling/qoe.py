@@ -41,8 +41,8 @@ class QoeParameters:
         else:
             defaults = (config.robot_beta, config.robot_gamma, config.robot_theta_ms, config.robot_target)
         own = (override.beta, override.gamma, override.theta_ms, override.target)
-        chosen = (default if one is None else one for one, default in zip(own, defaults, strict=True))
-        return cls(form, *chosen, config.signed_penalty)
+        beta, gamma, theta_ms, target = (b if a is None else a for a, b in zip(own, defaults, strict=True))
+        return cls(form, beta, gamma, theta_ms, target, config.signed_penalty)
 
 
 def accuracy(error_cm: float | None) -> float:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 
+import pytest
+
 from share.config import EdgeConfig
+from share.mapping import query_queue
 from share.mapping.query_queue import QueryQueue
 from share.types import AgentKind
 

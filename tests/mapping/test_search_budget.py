@@ -1,7 +1,7 @@
 """How many candidates are tried, while nobody waits and while somebody does."""
 
 from share.config import Config
-from share.mapping.query_queue import CandidateSearch, SearchBudget
+from share.mapping.query_queue import HURRY_CANDIDATES, CandidateSearch, SearchBudget
 
 EFFORT = SearchBudget(max_verified=3, max_tried_hurried=2)
 

@@ -11,10 +11,9 @@ from helpers.hellos import hello_of
 
 from share.config import Config
 from share.mapping.query_queue import QueryQueue
-from share.protocol.admission import KeyframeQuota
 from share.protocol.edge import Edge
 from share.protocol.edge_events import AddKeyframe, PeerMessageReceived, SendToPeer
-from share.protocol.edge_records import FairQueue
+from share.protocol.keyframe_intake import FairQueue, KeyframeQuota
 from share.types import AgentKind, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.model_edge import COV, HELLO, MS, UP, S, handle, tracked
 
-from share.config import AgentConfig, ClockConfig, Config
+from share.config import ClockConfig, Config
 from share.errors import UsageError
 from share.geometry import se3
 from share.protocol import agent_events as ev
@@ -345,13 +345,13 @@ def test_views_that_see_far_are_preferred_and_the_rate_is_kept() -> None:
 
 
 def test_a_correction_sets_back_what_odometry_may_have_lost() -> None:
-    agent, errors_cm = welcomed(Config(agent=AgentConfig(tell_placement=False))), []
+    agent, errors_cm = welcomed(), []
     [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
     tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
     for k in range(12):
         now_ns = (550 + 50 * k) * MS
         if k == 6:
-            tell(agent, correction(pose(), 1, answers=4), now_ns)
+            tell(agent, replace(correction(pose(), 1, answers=4), cov=np.zeros((6, 6))), now_ns)
         effects = handle(agent, tracked(11 + k, candidate=True), now_ns)
         errors_cm += [e.error_cm for e in only(m.Evaluation, effects, messages=True)]
         tell(agent, m.Ack(k + 1), now_ns)
@@ -499,7 +499,7 @@ def test_the_end_does_not_wait_for_ever() -> None:
     handle(agent, ev.InputFinished(), S)
     stops = [t for t in range(1, 100) if only(ev.CloseLink, handle(agent, ev.AgentTick(), S + t * 100 * MS))]
     assert stops == [50]
-    assert agent.report()["open"] == 1
+    assert agent.report()["pending"] == 1
 
 
 def test_with_nothing_open_the_end_is_now() -> None:
@@ -511,13 +511,12 @@ def test_with_nothing_open_the_end_is_now() -> None:
 def test_the_report_is_plain_data() -> None:
     report = corrected_agent().report()
     assert all(value is None or type(value) in (int, float, str, bool) for value in report.values())
-    assert (report["sent"], report["acknowledged"], report["open"]) == (1, 1, 0)
+    assert (report["sent"], report["acknowledged"], report["pending"]) == (1, 1, 0)
     assert report["bytes_up"] > report["bytes_down"] > 0
 
 
-@pytest.mark.parametrize("placement", [True, False])
-def test_an_agent_tells_how_unsurely_the_map_placed_it(placement: bool) -> None:
-    agent = welcomed(Config(agent=AgentConfig(tell_placement=placement)))
+def test_an_evaluation_includes_the_sigma_of_the_correction() -> None:
+    agent = welcomed()
     [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
     tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
     handle(agent, tracked(10, pose(3), candidate=True), 510 * MS)
@@ -525,7 +524,7 @@ def test_an_agent_tells_how_unsurely_the_map_placed_it(placement: bool) -> None:
     effects = handle(agent, tracked(11, pose(3), candidate=True), 560 * MS)
     [told] = only(m.Evaluation, effects, messages=True)
     # of one motion, after that of odometry in the map
-    cov = se3.compose_cov(pose(3), COV, COV) if placement else COV
+    cov = se3.compose_cov(pose(3), COV, COV)
     assert told.error_cm == pytest.approx(100 * np.sqrt(np.trace(cov[3:, 3:])))
 
 

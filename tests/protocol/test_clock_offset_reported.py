@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 from test_edge_clock import US, S, World, run
 
-from share.config import ClockConfig
 from share.protocol.edge_clock import ClockEstimate, ClockFilter
 
 MS = 1000 * US
@@ -13,14 +12,14 @@ END = 120 * S
 
 
 def test_nothing_is_claimed_before_an_exchange() -> None:
-    claim = ClockEstimate.from_filter(ClockFilter(ClockConfig()), 0, 1.0)
+    claim = ClockEstimate.from_filter(ClockFilter(), 0, 1.0)
     assert claim.report() == {
         "offset_ms": None,
         "sigma_ms": None,
         "asymmetry_ms": None,
         "claim_ms": 1.0,
         "uncertainty_ms": None,
-        "claim": False,
+        "is_reliable": False,
     }
 
 
@@ -56,7 +55,7 @@ def test_what_was_not_heard_for_long_is_claimed_no_more() -> None:
 @pytest.mark.parametrize("up_us", [100.0, 400.0, 700.0])
 def test_the_truth_is_within_what_is_stated_however_uneven_the_ways(up_us: float) -> None:
     """800 us on the way in all. Three sigmas, as sigma is a standard deviation, and all of the asymmetry."""
-    clock = ClockFilter(ClockConfig())
+    clock = ClockFilter()
     for k in range(200):
         sent = k * S // 2
         arrived = sent + round(up_us * US)
@@ -72,7 +71,7 @@ def test_the_truth_is_within_what_is_stated_however_uneven_the_ways(up_us: float
 def test_an_edge_that_says_that_it_kept_the_question_long_makes_no_claim_surer(read_at: float) -> None:
     """Of the 30 ms that it took it says to have had the question for all but 0.2. Wherever within these its
     one true reading was made, here 7 s off, the offset is within what is stated."""
-    clock, took, kept = ClockFilter(ClockConfig()), 30 * MS, 30 * MS - 200 * US
+    clock, took, kept = ClockFilter(), 30 * MS, 30 * MS - 200 * US
     for k in range(200):
         sent = k * S // 2
         replied = sent + round(read_at * took) + 7 * S

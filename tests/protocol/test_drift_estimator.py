@@ -7,7 +7,7 @@ import pytest
 from helpers.model_edge import EMPTY, MS, UP, S
 
 from share.geometry import se3
-from share.protocol.agent_status import DriftEstimator
+from share.protocol.localisation import DriftEstimator
 from share.types import Keyframe
 
 COV = np.diag([1e-6, 1e-6, 1e-6, 4e-6, 4e-6, 4e-6])

@@ -13,6 +13,7 @@ from helpers.hellos import hello_of
 
 from share.config import AgentQoe, Config, ControlConfig, EdgeConfig, GraphConfig
 from share.geometry import se3
+from share.mapping import query_queue
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Refusal, Verification

@@ -12,11 +12,12 @@ from helpers.hellos import hello_of
 from share.config import Config
 from share.mapping.map_changes import SaveKeyframe, SaveRun
 from share.protocol import edge_events as ed
-from share.protocol.admission import NewRunLimits
 from share.protocol.edge import Edge
 from share.protocol.edge_events import SaveChanges
-from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingCapacity, TrackingEdge
+from share.timing import TokenBuckets
 from share.types import AgentKind, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -116,16 +117,15 @@ def test_a_run_whose_name_was_taken_from_its_key_is_refused() -> None:
 
 
 def test_names_that_came_long_ago_take_no_memory() -> None:
-    newcomers = NewRunLimits()
+    limits = TokenBuckets(8.0, 0.1)
     for k in range(2000):
-        newcomers.record(f"eve{k}", f"eve{k}", k * S // 2)
-    assert len(newcomers._by_name) <= 2 * 10 + 1
-    assert len(newcomers._by_credential) <= 2 * 4 + 1
+        limits.bucket(f"eve{k}", k * S // 2).take(k * S // 2)
+    assert len(limits) <= 2 * 10 + 1
 
 
 def test_who_is_known_comes_again_as_often_as_it_likes() -> None:
     known = [
-        RestoredRun(f"bob-{k:04x}", hello_of("bob", 100 + k), OdometryBase(4, 0, np.eye(4)), 5)
+        RestoredRun(f"bob-{k:04x}", hello_of("bob", 100 + k), OdometryBase(4, 0, np.eye(4)))
         for k in range(12)
     ]
     edge = Edge(Config(), 7, has_store=True, restored=known)

@@ -18,7 +18,8 @@ from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
-from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import RestoredRun
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -80,9 +81,7 @@ def test_a_number_that_is_used_again_changes_nothing():
 
 def test_two_runs_of_one_name_whose_tags_begin_alike():
     tag = m.public_tag(0xB000B)
-    edge = Edge(
-        Config(), 8, restored=[RestoredRun(f"ann-{tag[:4]}", HELLO, OdometryBase(0, 0, np.eye(4)), 1)]
-    )
+    edge = Edge(Config(), 8, restored=[RestoredRun(f"ann-{tag[:4]}", HELLO, OdometryBase(0, 0, np.eye(4)))])
     (join,) = of(tell(edge, replace(HELLO, run_id=0xB000B), 0xB000B), ed.AddRun)
     assert join.key == f"ann-{tag[:5]}"
     assert of(tell(edge, keyframe(0), 0xB000B), ed.AddKeyframe)[0].key == f"ann-{tag[:5]}"
@@ -169,7 +168,7 @@ def test_hello_at_once_when_the_link_is_back():
 
 def test_who_is_not_greeted_yet_is_told_the_newest_correction_with_the_welcome():
     """Until then it counts revisions of our predecessor, and would not take it."""
-    known = RestoredRun("ann-000b", HELLO, OdometryBase(0, 0, np.eye(4)), 1)
+    known = RestoredRun("ann-000b", HELLO, OdometryBase(0, 0, np.eye(4)))
     edge, mapper = Edge(Config(), 8, restored=[known]), Mapper(Config())
     mapper.add_run("ann-000b", HELLO)
     tell(edge, m.Ping(1, 0))

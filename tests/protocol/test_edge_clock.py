@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from share.config import ClockConfig
 from share.protocol.edge_clock import ClockFilter
 
 S = 1_000_000_000
@@ -48,7 +47,7 @@ def error_us(clock: ClockFilter, world: World, now_ns: int) -> float:
 
 def run(world: World, n: int = 240) -> tuple[ClockFilter, list[tuple[float, float]]]:
     """The filter after n exchanges, and (error us, sigma us) after each of the second half."""
-    clock, track = ClockFilter(ClockConfig()), []
+    clock, track = ClockFilter(), []
     for k, stamps in enumerate(world.exchanges(n)):
         clock.update(*stamps)
         sigma = clock.sigma_ns(stamps[3])
@@ -59,13 +58,13 @@ def run(world: World, n: int = 240) -> tuple[ClockFilter, list[tuple[float, floa
 
 
 def test_nothing_is_known_before_the_first_exchange() -> None:
-    clock = ClockFilter(ClockConfig())
+    clock = ClockFilter()
     assert clock.offset_ns(0) is clock.sigma_ns(0) is clock.rtt_ms is clock.drift_ppm is None
     assert clock.report()["clock_steps"] == 0
 
 
 def test_four_stamps_as_in_rfc_5905() -> None:
-    clock = ClockFilter(ClockConfig())
+    clock = ClockFilter()
     assert clock.update(1000 * US, 5400 * US, 5500 * US, 1900 * US)
     assert clock.offset_ns(1450 * US) == 4000 * US
     assert clock.rtt_ms == pytest.approx(0.8)
@@ -142,14 +141,14 @@ def test_exchanges_out_of_order_do_no_harm() -> None:
     world = World(3)
     stamps = list(world.exchanges(240))
     rng = np.random.default_rng(0)
-    clock = ClockFilter(ClockConfig())
+    clock = ClockFilter()
     for k in np.argsort(np.arange(240) + rng.uniform(0, 3, 240)):
         clock.update(*stamps[k])
     assert abs(error_us(clock, world, 120 * S)) < 150
 
 
 def test_what_an_edge_says_it_held_a_question_for_adds_to_what_may_be_wrong() -> None:
-    clock = ClockFilter(ClockConfig())
+    clock = ClockFilter()
     assert clock.asymmetry_ns is None
     clock.update(0, S + 400 * US, S + 500 * US, 900 * US)
     assert clock.asymmetry_ns == 500 * US  # half of 900 and 100

@@ -14,7 +14,8 @@ from share.config import Config
 from share.mapping.map_changes import SaveCredential
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
-from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import RestoredRun
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -122,7 +123,7 @@ def test_a_run_of_an_earlier_life_has_the_voice_of_whoever_speaks_for_it_now(
     kept: str | None, message: m.Message
 ) -> None:
     known = RestoredRun(
-        "eve-1234", hello_of("eve", SECRET), OdometryBase.from_keyframe(keyframe(2)), 3, credential=kept
+        "eve-1234", hello_of("eve", SECRET), OdometryBase.from_keyframe(keyframe(2)), credential=kept
     )
     edge = Edge(Config(), 7, has_store=True, restored=[known])
     effects = tell(edge, message, EVE, now_ns=1, key="E")

@@ -22,7 +22,7 @@ def walked(seed: int, loss: float, **network) -> Town:
     town.walk(FRAMES)
     for _ in range(60):
         town.run(1000)
-        if not any(agent.report()["open"] for agent in town.agents.values()):
+        if not any(agent.report()["pending"] for agent in town.agents.values()):
             break
     town.run(1000)
     return town
@@ -33,7 +33,7 @@ def check_nothing_lost(town: Town) -> None:
     assert len(keys) == len(set(keys)) == FRAMES * len(NAMES)
     for agent in town.agents.values():
         report = agent.report()
-        assert (report["open"], report["keyframes"], report["acknowledged"]) == (0, FRAMES, FRAMES)
+        assert (report["pending"], report["keyframes"], report["acknowledged"]) == (0, FRAMES, FRAMES)
         assert report["edge_sessions"] == 1
     assert not [r for r in town.records if r["event"] in ("bad message", "step failed", "odometry suspect")]
     added = {name: a["keyframes"] for name, a in town.edge.report()["agents"].items()}
@@ -76,6 +76,6 @@ def test_two_agents_of_whom_a_fifth_is_lost():
     )
     town.walk(16)
     town.run(30_000)
-    assert [agent.report()["open"] for agent in town.agents.values()] == [0, 0]
+    assert [agent.report()["pending"] for agent in town.agents.values()] == [0, 0]
     keys = town.edge.mapper.current_poses().keys
     assert len(keys) == len(set(keys)) == 32

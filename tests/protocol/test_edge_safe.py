@@ -13,7 +13,8 @@ from share.geometry import se3
 from share.mapping.map_changes import SaveKeyframe, SaveRun
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
-from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import RestoredRun
 from share.types import F64, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -79,7 +80,7 @@ def test_several_kept_at_once_are_acknowledged_once() -> None:
 
 def test_a_known_run_goes_on_where_it_was() -> None:
     foot = OdometryBase(4, 800 * MS, at(0.8))
-    edge = Edge(Config(), 8, has_store=True, restored=[RestoredRun("ann-000b", HELLO, foot, 5)])
+    edge = Edge(Config(), 8, has_store=True, restored=[RestoredRun("ann-000b", HELLO, foot)])
     effects = tell(edge, HELLO)
     (welcome,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.SendToPeer)]
     assert welcome == m.Welcome(8, 5)

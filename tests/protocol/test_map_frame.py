@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.config import AgentConfig
 from share.geometry import se3
 from share.protocol.localisation import BlendedMapFrame
 from share.types import Correction
 
 
 def placed(cov: np.ndarray, T_map_odom: np.ndarray) -> BlendedMapFrame:
-    frame = BlendedMapFrame(AgentConfig())
+    frame = BlendedMapFrame(0.5)
     frame.apply(Correction(T_map_odom, cov, "a", 1, 0), np.eye(4), 0)
     return frame
 
@@ -34,7 +33,7 @@ def test_the_spread_is_that_of_bodies_drawn(rng) -> None:
 
 
 def test_nothing_is_unsure_before_there_is_a_map() -> None:
-    frame = BlendedMapFrame(AgentConfig())
+    frame = BlendedMapFrame(0.5)
     assert frame.sigma_cm(np.eye(4)) == 0.0
     frame = placed(np.eye(6), np.eye(4))
     frame.reset()

@@ -9,7 +9,8 @@ from helpers.model_edge import MS, S
 from share.config import Config
 from share.protocol.edge import Edge
 from share.protocol.edge_events import EdgeTick, PeerMessageReceived
-from share.protocol.peer import OdometryBase, PeerStatus, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import PeerStatus, RestoredRun
 from share.types import TrackState
 from share.wire import messages as wire
 from share.wire.codec import encode
@@ -25,7 +26,7 @@ def test_it_shows_state_age_and_reason_as_they_were_said() -> None:
         "state": "LOST",
         "reason": "no image for 2.1 s",
         "pose_age_ms": 2200.0,
-        "heard_s": 0.1,
+        "last_received_s": 0.1,
     }
 
 
@@ -50,14 +51,14 @@ def test_before_it_has_said_anything_no_age_is_shown() -> None:
 
 def test_who_was_not_heard_in_this_life_has_no_age() -> None:
     """The clock of the machine began long before the edge."""
-    known = RestoredRun("ann-000b", hello_of("ann", 1), OdometryBase(0, 0, np.eye(4)), 1)
+    known = RestoredRun("ann-000b", hello_of("ann", 1), OdometryBase(0, 0, np.eye(4)))
     edge = Edge(Config(), session=5, restored=[known])
     edge.handle(EdgeTick(), 6600 * S)
     seen = shown(edge)
-    assert (seen["state"], seen["heard_s"], seen["gone"]) == ("SILENT", None, True)
+    assert (seen["state"], seen["last_received_s"], seen["gone"]) == ("SILENT", None, True)
     assert "no message since" in str(seen["reason"])
     edge.handle(PeerMessageReceived(wire.peer_id(1), encode(hello_of("ann", 1))), 6601 * S)
-    assert shown(edge)["heard_s"] == 0.0
+    assert shown(edge)["last_received_s"] == 0.0
 
 
 def edge_with(status: wire.Status, at_ns: int) -> Edge:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from share.protocol.peer import ReorderBuffer
+from share.protocol.keyframe_intake import ReorderBuffer
 from share.types import Keyframe, View
-from share.wire.messages import MAX_BUFFERED, Ack
+from share.wire.messages import Ack
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32)))
 
@@ -97,9 +96,3 @@ def test_the_holding_area_is_bounded() -> None:
     assert book.ack() == Ack(0, (1, 2, 3, 4))
     assert book.evicted == 5
     assert ids(book.push(keyframe(0))) == [0, 1, 2, 3, 4]
-
-
-@pytest.mark.parametrize("hold", [0, MAX_BUFFERED + 1])
-def test_hold_must_fit_an_ack(hold: int) -> None:
-    with pytest.raises(ValueError, match="capacity"):
-        ReorderBuffer(capacity=hold)

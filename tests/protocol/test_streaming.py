@@ -18,7 +18,7 @@ from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
 from share.protocol.remote_tracking import TrackingCapacity, TrackingEdge
-from share.protocol.streaming import FrameStreamer
+from share.protocol.streaming import FrameStreamer, StreamingAgent
 from share.types import F64, Frame, ImuBatch, TrackState
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -47,7 +47,7 @@ class Wire:
     now_ms: float = 0.0
     takes: bool = True  # the link
     cut: bool = False
-    agent: Agent = field(default_factory=lambda: Agent(HELLO, CONFIG))
+    agent: Agent = field(default_factory=lambda: StreamingAgent(HELLO, CONFIG))
     edge: Edge = field(default_factory=lambda: TrackingEdge(CONFIG, 1))
     effects: list[ev.AgentEffect] = field(default_factory=list)
     told: list[dict] = field(default_factory=list)
@@ -270,7 +270,10 @@ def test_a_goodbye_waits_for_the_last_pose_and_ends_the_tracker() -> None:
     ],
 )
 def test_who_does_not_fit_is_refused(edge: Edge, streams: bool, said: str) -> None:
-    wire = Wire(edge=edge, agent=Agent(replace(HELLO, streams_frames=streams), CONFIG))
+    wire = Wire(
+        edge=edge,
+        agent=(StreamingAgent if streams else Agent)(replace(HELLO, streams_frames=streams), CONFIG),
+    )
     wire.run(200)
     (fail,) = wire.of(ev.FailRun)
     assert said in str(fail.error)

@@ -18,6 +18,7 @@ from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
 from share.protocol.remote_tracking import TrackingEdge
+from share.protocol.streaming import StreamingAgent
 from share.types import TrackState
 from share.wire import messages as m
 from share.wire.codec import WIRE_VERSION, decode, encode
@@ -159,7 +160,7 @@ def test_it_joins_the_edge_once_that_is_upgraded(old: int) -> None:
 
 def test_an_edge_of_this_version_is_not_taken_for_an_older_one(old: int) -> None:
     """It is slow to welcome, as one that starts trackers is: pings of older versions reach it meanwhile."""
-    agent, edge, answers = Agent(replace(HELLO, streams_frames=True), Config()), edges()[1], []
+    agent, edge, answers = StreamingAgent(replace(HELLO, streams_frames=True), Config()), edges()[1], []
     agent.handle(ev.Connected(), 0)
     for k in range(100):
         now_ns = k * S // 10

@@ -30,7 +30,7 @@ def test_odometry_is_the_same_and_nobody_is_lost(tmp_path: Path, plain_session: 
     odometry = [(tmp_path / name / "odom.tum").read_bytes() for name in ("ann", "bob")]
     assert odometry[0] == odometry[1]
     report = json.loads((tmp_path / "ann" / "report.json").read_text())
-    assert (report["frames"], report["protocol"]["open"], report["lost_s"]) == (45, 0, 0)
+    assert (report["frames"], report["protocol"]["pending"], report["lost_s"]) == (45, 0, 0)
     assert abs(report["clock"]["offset_ms"]) < 1000
     t_s = [json.loads(line)["t_s"] for line in (tmp_path / "edge" / "events.jsonl").read_text().splitlines()]
     assert t_s == sorted(t_s)

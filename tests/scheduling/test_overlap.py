@@ -172,14 +172,12 @@ def test_a_narrow_view_inside_a_wide_one() -> None:
 
 @pytest.mark.parametrize("interval_m", [1e-3, 50.0])
 @pytest.mark.parametrize("frustum", [Frustum(3.0, 3.0, 0, 1), Frustum(0.01, 3.0, 0.3, 5)])
-def test_the_number_of_sample_points_is_bounded_for_any_interval(
-    frustum: Frustum, interval_m: float
-) -> None:
+def test_the_number_of_sample_points_is_bounded_for_any_interval(frustum: Frustum, interval_m: float) -> None:
     assert 9 <= SampledFrustum(frustum, interval_m).points.shape[1] <= 2_048_000
 
 
 def test_a_near_plane_beyond_the_far_plane_is_refused() -> None:
-    with pytest.raises(ConfigError, match="near_m: 6.0 m is not nearer than far_m, 5.0 m"):
+    with pytest.raises(ConfigError, match=r"near_m: 6.0 m is not nearer than far_m, 5.0 m"):
         from_mapping(ControlConfig, {"near_m": 6.0}, "control")
 
 
