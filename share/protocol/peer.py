@@ -182,16 +182,20 @@ class RestoredRun:
     last_finding: MapEvent | None = None
     credential: str | None = ""
 
+    @property
+    def next_keyframe(self) -> int:
+        """Id of the keyframe that the edge asks for."""
+        return 0 if self.odometry_base is None else self.odometry_base.id + 1
+
     def peer(self) -> Peer:
         """Return the absent run, which may resume where it was."""
-        next_keyframe = 0 if self.odometry_base is None else self.odometry_base.id + 1
         return Peer(
             id=peer_id(self.hello.run_id),
             hello=self.hello,
             key=self.key,
             last_received_ns=0,
-            reorder_buffer=ReorderBuffer(next_keyframe),
-            durable_below=next_keyframe,
+            reorder_buffer=ReorderBuffer(self.next_keyframe),
+            durable_below=self.next_keyframe,
             odometry_base=self.odometry_base,
             is_gone=True,
             last_finding=self.last_finding,

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from share import __version__
 from share.errors import VersionError
 from share.timing import Throttle
-from share.wire.codec import OLDEST_VERSION, WIRE_VERSION, Bytes, decode, encode, message_code
+from share.wire.codec import MESSAGE_CODES, OLDEST_VERSION, WIRE_VERSION, Bytes, decode, encode
 from share.wire.messages import Ping, Pong
 
 _REFUSE_HZ = 0.5  # refusals a second per peer, at most
@@ -36,7 +36,7 @@ class VersionRefusals:
 
         A ping of an older version is a newer agent's probe: an answer would mean an edge of that version.
         """
-        if error.code == message_code(Ping) or self._throttle.admit(peer_id, now_ns) is None:
+        if error.code == MESSAGE_CODES[Ping] or self._throttle.admit(peer_id, now_ns) is None:
             return None
         own_text = f"this edge is SHARE {__version__} (wire {WIRE_VERSION})"
         return (
