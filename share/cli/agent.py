@@ -285,7 +285,7 @@ def _unacknowledged_text(run: AgentRun, name: str, finish_s: float) -> str | Non
         why = run.trouble or "the edge is silent"
     elif protocol["buffered_at_edge"]:
         why = (
-            f"it received {protocol['held']} of them but could not store them in its map file; "
+            f"it received {protocol['buffered_at_edge']} of them but could not store them in its map file; "
             "see the edge's log"
         )
     else:
