@@ -1,4 +1,4 @@
-"""The merge gate's probability, exact and in draws."""
+"""Probability of the merge gate, by hand and in draws."""
 
 import numpy as np
 import pytest
