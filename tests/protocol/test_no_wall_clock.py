@@ -3,6 +3,8 @@
 import ast
 from pathlib import Path
 
+import pytest
+
 SHARE = Path(__file__).resolve().parents[2] / "share"
 LIVE = (
     *("cameras", "devices", "files", "mapping", "net", "odometry", "protocol", "recordings"),
