@@ -12,14 +12,9 @@ from share.protocol.peer import Peer, RestoredRun
 from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
 from share.wire.messages import Hello, public_tag
 
-# Limits on new runs: each stays in the report, and in the map once it has a keyframe. One name: as many as a
-# person starts while trying things out; one key: a full room at once; the edge: two rooms.
-_NAME_BURST = 8.0
-_NAME_HZ = 0.1
-_CREDENTIAL_BURST = 32.0
-_CREDENTIAL_HZ = 0.25
-_EDGE_BURST = 128.0
-_EDGE_HZ = 2.0
+# Limits on new runs, each at once and a second: each run stays in the report, and in the map once it has a
+# keyframe. One name: as many as a person starts while trying things out; one key: a full room; the edge: two.
+_NAME_LIMIT, _CREDENTIAL_LIMIT, _EDGE_LIMIT = (8.0, 0.1), (32.0, 0.25), (128.0, 2.0)
 _SILENT_S = 0.6  # an agent pings every 0.5 s
 NAME_HOLD_S = 3.0  # a name stays in use for this long after its agent's last message
 
@@ -30,26 +25,26 @@ class NewRunLimits:
     credential: as in `PeerMessageReceived`; "" without keys."""
 
     def __init__(self) -> None:
-        self._total = TokenBucket(_EDGE_BURST, _EDGE_HZ)
-        self._by_name = TokenBuckets(_NAME_BURST, _NAME_HZ)
-        self._by_credential = TokenBuckets(_CREDENTIAL_BURST, _CREDENTIAL_HZ)
+        self._total = TokenBucket(*_EDGE_LIMIT)
+        self._by_name, self._by_credential = TokenBuckets(*_NAME_LIMIT), TokenBuckets(*_CREDENTIAL_LIMIT)
 
     def objection(self, name: str, credential: str, now_ns: int) -> str | None:
         """Return why this name may not start a new run now, and when it may; None if it may."""
-        if wait_s := self._by_name.bucket(name, now_ns).wait_s(now_ns):
-            return f"too many new runs of '{name}': try again in {ceil(wait_s)} s"
-        if credential and (wait_s := self._by_credential.bucket(credential, now_ns).wait_s(now_ns)):
-            return f"too many new runs of the key of '{name}': try again in {ceil(wait_s)} s"
-        if wait_s := self._total.wait_s(now_ns):
-            return f"too many new runs of all agents: try again in {ceil(wait_s)} s"
+        for owner, bucket in self._buckets(name, credential, now_ns):
+            if wait_s := bucket.wait_s(now_ns):
+                return f"too many new runs of {owner}: try again in {ceil(wait_s)} s"
         return None
 
     def record(self, name: str, credential: str, now_ns: int) -> None:
         """Count a new run of this name that `objection` allowed."""
-        self._total.take(now_ns)
-        self._by_name.bucket(name, now_ns).take(now_ns)
+        for _, bucket in self._buckets(name, credential, now_ns):
+            bucket.take(now_ns)
+
+    def _buckets(self, name: str, credential: str, now_ns: int) -> Iterator[tuple[str, TokenBucket]]:
+        yield f"'{name}'", self._by_name.bucket(name, now_ns)
         if credential:
-            self._by_credential.bucket(credential, now_ns).take(now_ns)
+            yield f"the key of '{name}'", self._by_credential.bucket(credential, now_ns)
+        yield "all agents", self._total
 
 
 class Admission:
@@ -62,9 +57,11 @@ class Admission:
         self._new_run_limits = NewRunLimits()
 
     def objection(
-        self, event: PeerMessageReceived, hello: Hello, peers: Mapping[bytes, Peer], now_ns: int
+        self, event: PeerMessageReceived, hello: Hello, runs: RunRegistry, now_ns: int
     ) -> str | None:
         """Return why this run may not join, for a person; None if it may. event: carried `hello`."""
+        if runs.was_forgotten(event.peer_id):
+            return f"this run of '{hello.name}' was forgotten during its absence: start the agent again"
         if not event.is_authorised_for(hello.name):
             return name_objection(hello.name, event.allowed_names or ())
         if hello.streams_frames and not self._tracks_agents:
@@ -72,10 +69,10 @@ class Admission:
             return f"this edge does not track agents: {remedy}"
         if self._tracks_agents and not hello.streams_frames:
             return "this edge tracks its agents (policy streamed): start the agent with --streamed"
-        if (existing := peers.get(event.peer_id)) is not None:
+        if (existing := runs.get(event.peer_id)) is not None:
             in_use = f"this run id is in use by '{existing.name}'; start the agent again"
             return None if existing.name == hello.name else in_use
-        return self.capacity_objection(hello, peers, now_ns) or self._new_run_limits.objection(
+        return self.capacity_objection(hello, runs, now_ns) or self._new_run_limits.objection(
             hello.name, event.credential, now_ns
         )
 

@@ -22,12 +22,14 @@ from share.protocol.admission import Admission, RunRegistry, name_objection, new
 from share.protocol.edge_records import DurabilityTracker, EventLog
 from share.protocol.keyframe_intake import KeyframeQuota, OdometryBase, sanitise
 from share.protocol.peer import Peer, RestoredRun, Sender, fault_warnings
-from share.protocol.versions import VersionRefusals
+from share.protocol.versions import refusal_of_version
 from share.scheduling.policies import RateScheduler
-from share.timing import seconds_to_ns
+from share.timing import Throttle, seconds_to_ns
 from share.types import Keyframe
 from share.wire import messages as wire
 from share.wire.codec import WIRE_VERSION, decode, encode, message_bytes
+
+_VERSION_REFUSAL_HZ = 0.5  # refusals a second of a peer of another wire version, at most
 
 
 class Edge:
@@ -54,7 +56,7 @@ class Edge:
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
         self._admission = Admission(config.edge, self.tracks_agents)
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
-        self._event_log, self._version_refusals = EventLog(began_ns), VersionRefusals()
+        self._event_log, self._version_throttle = EventLog(began_ns), Throttle(_VERSION_REFUSAL_HZ, 1.0)
         self._durability = DurabilityTracker(has_store)
         self._internal_errors = 0
         self._effects: list[ed.EdgeEffect] = []
@@ -125,7 +127,8 @@ class Edge:
             case _ if peer:
                 self._on_agent_message(peer, message)
             case _:
-                self._count_unexpected(self._unjoined, message, "before its hello")
+                reason = f"a {type(message).__name__} before its hello"
+                self._unjoined.count("unexpected", reason, self._now_ns)
 
     def _may_send(self, event: ed.PeerMessageReceived, peer: Peer, message: wire.Message) -> bool:
         """Return whether a known run may send: its credential allows it, and it is present or comes back."""
@@ -159,30 +162,25 @@ class Edge:
             case wire.Evaluation():
                 self._on_evaluation(peer, message)
             case _:  # a downlink message
-                self._count_unexpected(peer, message, "which agents must not send")
+                reason = f"a {type(message).__name__} which agents must not send"
+                peer.count("unexpected", reason, self._now_ns)
 
     def _on_evaluation(self, peer: Peer, evaluation: wire.Evaluation) -> None:
         peer.counts["evaluations"] += 1
-        t_s = self._event_log.elapsed_s(self._now_ns)
-        rate_hz = self._rate_scheduler.evaluate(peer.name, peer.hello.kind, evaluation, self._now_ns, t_s)
+        now_ns, t_s = self._now_ns, self._event_log.elapsed_s(self._now_ns)
+        rate_hz = self._rate_scheduler.evaluate(peer.name, peer.hello.kind, evaluation, now_ns, t_s)
         if rate_hz is not None:
             self._send(peer.id, wire.Rate(rate_hz))
 
     def _on_other_version(self, peer_id: bytes, error: VersionError) -> None:
         self._unjoined.counts["other_version"] += 1
-        if (reason := self._version_refusals.refusal(peer_id, error, self._now_ns)) is not None:
+        reason = refusal_of_version(error)
+        if reason is not None and self._version_throttle.admit(peer_id, self._now_ns) is not None:
             self._refuse(peer_id, reason, error.version)
-
-    def _count_unexpected(self, sender: Sender, message: wire.Message, detail: str) -> None:
-        sender.counts["unexpected"] += 1
-        sender.refusals.add(f"a {type(message).__name__} {detail}", self._now_ns)
 
     def _count_bad_message(self, peer: Peer | None, reason: str) -> None:
         """Count a bad message; record the first of each peer."""
-        sender = peer or self._unjoined
-        sender.counts["bad_messages"] += 1
-        sender.refusals.add(reason, self._now_ns)
-        if sender.counts["bad_messages"] == 1:
+        if (peer or self._unjoined).count("bad_messages", reason, self._now_ns) == 1:
             self._record("bad message", peer, reason, throttled=False)
 
     # ------------------------------------------------------------------ joining and leaving
@@ -198,8 +196,6 @@ class Edge:
         self._welcome(peer)
 
     def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
-        if self._registry.was_forgotten(event.peer_id):
-            return f"this run of '{hello.name}' was forgotten during its absence: start the agent again"
         return self._admission.objection(event, hello, self._registry, self._now_ns)
 
     def _join(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> Peer:

@@ -79,7 +79,6 @@ class ClockFilter:
 
     def reset(self) -> None:
         """Drop all state, for another clock."""
-        self.accepted = 0
         self.rejected = 0
         self.steps = 0
         self.rtt_ms: float | None = None
@@ -163,7 +162,6 @@ class ClockFilter:
         self._base_ns, self._updated_ns = offset_ns, at_ns
         self._consecutive_rejects = 0
         self._agreeing_exchanges = 1
-        self.accepted += 1
 
     def _gated_update(self, x: F64, offset_ns: int, at_ns: int, variance: float) -> bool:
         self._x, self._P = x, P = self._predict(x, at_ns)
@@ -182,7 +180,6 @@ class ClockFilter:
         self._P = I_KH @ P @ I_KH.T + K * variance @ K.T  # Joseph's form
         self._consecutive_rejects = 0
         self._agreeing_exchanges += 1
-        self.accepted += 1
         return True
 
     def _predict(self, x: F64, now_ns: int) -> tuple[F64, F64]:

@@ -89,16 +89,9 @@ class MapLocalisation:
     def localise(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> ev.LocalisedPose:
         """Return the localised pose of a frame that has one. T_odom_body (4, 4)."""
         self.T_odom_body = T_odom_body
-        return ev.LocalisedPose(
-            frame.index,
-            frame.stamp_ns,
-            frame.arrived_ns,
-            self._segment,
-            T_odom_body,
-            self.map_frame.transform(now_ns),
-            self.map_frame.map_id,
-            frame.state,
-        )
+        times = frame.index, frame.stamp_ns, frame.arrived_ns
+        T_map_odom, map_id = self.map_frame.transform(now_ns), self.map_frame.map_id
+        return ev.LocalisedPose(*times, self._segment, T_odom_body, T_map_odom, map_id, frame.state)
 
     def apply_correction(
         self, correction: Correction, entry: LedgerEntry | None, corrected_ms: float | None, now_ns: int
@@ -106,15 +99,11 @@ class MapLocalisation:
         """Apply a valid correction. entry, corrected_ms: from `KeyframeLedger.record_correction`."""
         T_odom_body = correction.T_map_odom if self.T_odom_body is None else self.T_odom_body
         new_map = self.map_frame.apply(correction, T_odom_body, now_ns)
-        return ev.CorrectionApplied(
-            entry.keyframe.id if entry else None,
-            entry.frame_index if entry else None,
-            entry.keyframe.stamp_ns if entry else None,
-            corrected_ms,
-            correction.map_id,
-            correction.revision,
-            new_map,
-        )
+        answered: tuple[int | None, int | None, int | None] = (None, None, None)
+        if entry is not None:
+            answered = (entry.keyframe.id, entry.frame_index, entry.keyframe.stamp_ns)
+        where = (correction.map_id, correction.revision, new_map)
+        return ev.CorrectionApplied(*answered, corrected_ms, *where)
 
 
 def pose_update(

@@ -98,6 +98,12 @@ class Sender:
     counts: Counter[str] = field(default_factory=Counter)
     refusals: Faults = field(default_factory=Faults)  # refused messages
 
+    def count(self, kind: str, reason: str, now_ns: int) -> int:
+        """Count a refused message of this kind; return their number."""
+        self.counts[kind] += 1
+        self.refusals.add(reason, now_ns)
+        return self.counts[kind]
+
 
 @dataclass(eq=False)
 class Peer(Sender):

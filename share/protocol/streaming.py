@@ -181,7 +181,7 @@ class StreamingAgent(Agent):
         if not isinstance(message, RemoteTrackingResult):
             super()._on_other_message(message)
         elif (frame := self._streamer.take_result(message, self._now_ns)) is not None:
-            self._effects.append(ev.FrameTrackedRemotely(frame, message.is_consistent, message.waiting_for))
+            self._effects.append(ev.FrameTrackedRemotely(frame, message.is_consistent))
             self._on_frame_tracked(frame)
 
     def _restart(self, pending: int) -> str:

@@ -69,7 +69,7 @@ class StreamingAgentRun(AgentRun):
                 if not self._link.send(effect.frames):
                     self._handle(ev.SendFailed(effect))
             case ev.FrameTrackedRemotely():
-                self._log.add_result(effect.frame.new_segment, effect.is_consistent, effect.waiting_for)
+                self._log.add_result(effect.frame.new_segment, effect.is_consistent, effect.frame.waiting_for)
             case _:
                 super()._execute(effect)
 
