@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from share.config import Config
-from share.errors import UsageError, VersionError, WireError
+from share.errors import UsageError, VersionError, WireError, printable
 from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, KeyframeScore, LedgerEntry
 from share.protocol.agent_status import StatusReporter
@@ -296,7 +296,7 @@ class Agent:
         return f"{pending} keyframes are resent"
 
     def _on_refused(self, refused: m.Refused) -> None:
-        self._refusal = "".join(c if c.isprintable() else "?" for c in refused.reason)
+        self._refusal = printable(refused.reason)
         text = f"the edge refuses '{self._name}': {self._refusal}"
         is_new_run = self._status_reporter.has_just_begun(self._now_ns, self._silence_limit_ns)
         if self._sessions.session is None and is_new_run:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from share.errors import printable
 from share.protocol.agent_events import AgentTick, FrameTracked, StatusReport
 from share.protocol.edge_clock import PING_S, exponential_average
 from share.timing import SECOND_NS, PeriodicTimer, seconds_to_ns
@@ -91,7 +92,7 @@ class StatusReporter:
         stale = self.is_stale(now_ns)
         state = TrackState.LOST if stale and self._state.has_pose else self._state
         reasons = (self._stale_reason(now_ns) if stale else self._state_text(now_ns), self._sensor_trouble)
-        reason = "".join(c if c.isprintable() else "?" for c in "; ".join(filter(None, reasons)))
+        reason = printable("; ".join(filter(None, reasons)))
         return Status(state, self._age_ms(now_ns), reason[:MAX_REASON_LENGTH])
 
     def due_report(self, now_ns: int) -> StatusReport | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
+from share.errors import printable
 from share.timing import TokenBucket
 
 _MAX_SESSIONS = 16  # remembered sessions: their messages may still be in flight
@@ -89,7 +90,7 @@ class LineLimiter:
             self._suppressed += 1
             return None
         suppressed, self._suppressed = self._suppressed, 0
-        line = "".join(c if c.isprintable() else "?" for c in text[:_MAX_LINE_LENGTH])
+        line = printable(text[:_MAX_LINE_LENGTH])
         return f"{line} ({suppressed} lines before this were suppressed)" if suppressed else line
 
     def admit_once(self, text: str, now_ns: int) -> str | None:

@@ -20,7 +20,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from share.errors import VersionError, WireError
+from share.errors import VersionError, WireError, printable
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import (
     DESCRIPTOR_BYTES,
@@ -355,5 +355,4 @@ def _shorten_quote(match: re.Match[str]) -> str:
 def _wire_error(where: str, error: Exception) -> WireError:
     """Return a WireError of one short printable line; quotes of the peer's text are cut but stay closed."""
     text = _QUOTED.sub(_shorten_quote, str(error))
-    line = "".join(c if c.isprintable() else "?" for c in f"{where}: {text}")
-    return WireError(line[:200])
+    return WireError(printable(f"{where}: {text}")[:200])
