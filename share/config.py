@@ -142,37 +142,25 @@ class AgentConfig:
 
     keep_keyframes: int = 600  # keyframes kept, sent ones included, to resend to a restarted edge
     late_ms: float = 0.0  # frames later than this are skipped; 0: none
-    rate_burst: float = 2.0  # keyframes that may be saved up under a rate limit
-    blend_jump_m: float = 0.05  # a correction that moves the body further is blended in
-    blend_jump_rad: float = 0.02  # a correction that rotates it further is blended in
     blend_s: float = 0.5  # duration of the blend
     finish_s: float = 5.0  # longest wait for acknowledgements at the end of a run
     error_model: str = "shipped"  # error model: shipped, a file, or "" for odometry's covariance
-    tell_placement: bool = True  # add the agent's map position sigma to the error sent to the edge
 
     def __post_init__(self) -> None:
         _require_positive(self, "keep_keyframes", "blend_s")
         if not self.late_ms >= 0:
             raise ValueError(f"late_ms: {self.late_ms} must not be negative")
-        if self.rate_burst < 1:
-            raise ValueError(f"rate_burst: {self.rate_burst} must be at least 1")
 
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """Timing of the link between agent and edge."""
+    """The link between agent and edge."""
 
-    hello_s: float = 0.5  # interval of hellos, until welcomed
-    refused_s: float = 5.0  # a running agent that was refused asks again after this
-    ping_s: float = 0.5  # interval of pings
     silent_s: float = 3.0  # no message for this long: the edge counts as gone
     window: int = 16  # keyframes in flight
-    resend_s: float = 1.0  # first wait for an acknowledgement; doubles with each resend
-    resend_max_s: float = 8.0  # longest wait
-    gap_s: float = 0.1  # first wait for a keyframe that later ones have overtaken
 
     def __post_init__(self) -> None:
-        _require_positive(self, "hello_s", "ping_s", "silent_s", "window", "resend_s", "resend_max_s")
+        _require_positive(self, "silent_s", "window")
 
 
 @dataclass(frozen=True)
@@ -181,7 +169,6 @@ class StreamConfig:
 
     window: int = 3  # frames in flight per agent, and as many at its tracker; beyond, the newest waits
     patience_s: float = 1.0  # a frame without an answer for this long counts as unanswered
-    begin_s: float = 20.0  # longest wait of a recording for the edge's tracker before it plays
 
     def __post_init__(self) -> None:
         _require_positive(self, "window", "patience_s")
@@ -189,20 +176,12 @@ class StreamConfig:
 
 @dataclass(frozen=True)
 class ClockConfig:
-    """The filter of the edge's clock relative to the agent's."""
+    """The edge's clock as the agent reports it."""
 
-    noise_us: float = 20.0  # standard deviation of an exchange that was not queued
-    asymmetry: float = 0.5  # error of an offset as a share of the delay above the minimum; 0.5 is the bound
-    offset_walk_us: float = 4.0  # random walk of the offset, per sqrt(s)
-    drift_walk_ppm: float = 0.05  # random walk of the drift, per sqrt(s)
-    drift_ppm: float = 100.0  # initial standard deviation of the drift
-    least_of: int = 64  # recent exchanges among which the minimum delay is taken
-    gate_sigma: float = 4.0  # an exchange further off is rejected
-    step_after: int = 5  # rejected exchanges in a row after which the filter restarts: the clock was set
     claim_ms: float = 1.0  # an offset with a larger uncertainty is not reported (docs/do/sync.md)
 
     def __post_init__(self) -> None:
-        _require_positive(self, "noise_us", "drift_ppm", "least_of", "gate_sigma", "step_after", "claim_ms")
+        _require_positive(self, "claim_ms")
 
 
 @dataclass(frozen=True)
@@ -267,19 +246,14 @@ class EdgeConfig:
 
     policy: str = "share"  # overridden by `share edge --policy`
     silent_s: float = 3.0  # no message of an agent for this long: it counts as gone
-    name_hold_s: float = 3.0  # a name stays in use for this long after its agent's last message
     max_agents: int = 64  # present at once; more are refused
     max_keyframes: int = 2000  # kept; beyond, the agent with most gives up redundant ones first
     max_waiting: int = 12  # queued queries; beyond, the oldest keyframe is only stored
-    each_waiting: int = 3  # the same, of one agent
-    hurry_waiting: int = 1  # with this many queued, a query verifies fewer candidates
-    hurry_candidates: int = 3  # at most these, and the first verified one ends the search
 
     def __post_init__(self) -> None:
         if self.policy not in POLICY_NAMES:
             raise ValueError(f"policy: '{self.policy}' is not known; known: {', '.join(POLICY_NAMES)}")
-        _require_positive(self, "max_agents", "max_keyframes", "max_waiting", "each_waiting")
-        _require_positive(self, "hurry_waiting", "hurry_candidates")
+        _require_positive(self, "max_agents", "max_keyframes", "max_waiting")
 
 
 @dataclass(frozen=True)
@@ -316,21 +290,16 @@ class ControlConfig:
     ki: float = 0.15  # the same, of an error of 1 for a second
     kd: float = 0.2  # the same, of an error that grows by 1 in a second
     alpha: float = 0.3  # weight of the newest derivative of the error, of 1
-    integral_max_hz: float = 0.1  # bound of the integral term
     rate_min_hz: float = 1.5  # lowest rate of an agent
     rate_max_hz: float = 5.0  # highest rate of an agent, and its initial one
-    gap_s: float = 5.0  # without an evaluation for longer, the derivative is reset and the integral held
-    random_seed: int = 1  # of policy random
-    gate_seed: int = 1  # of the merge gate
+    random_seed: int = 1  # of the merge gate and of policy random
     near_m: float = 0.3  # near plane of the view frusta
     far_m: float = 5.0  # far plane of the view frusta
-    interval_m: float = 0.5  # spacing of the points at which overlap is sampled
     merges: int = 20  # completed merges in the mean overlap that a new one is compared with (N)
     eagerness: float = 1.5  # a merge has this probability times its overlap over their mean (alpha_m)
 
     def __post_init__(self) -> None:
         _require_positive(self, "ar_gamma", "robot_gamma", "robot_theta_ms", "rate_min_hz", "merges")
-        _require_positive(self, "interval_m")
         if not self.near_m < self.far_m:
             raise ValueError(f"near_m: {self.near_m} m is not nearer than far_m, {self.far_m} m")
         if not (self.rate_min_hz <= self.rate_max_hz <= 1000 and self.alpha <= 1):

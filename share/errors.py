@@ -57,11 +57,16 @@ class StoreError(ShareError):
     """A map file cannot be opened, read or written."""
 
 
+def printable(text: str) -> str:
+    """Return `text` with "?" for each character that is not printable."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
 def describe_exception(error: BaseException) -> str:
     """Return one line on an unexpected exception: its type, its text, and where it was raised."""
     frames = traceback.extract_tb(error.__traceback__)
     where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    text = "".join(c if c.isprintable() else "?" for c in str(error))[:200]
+    text = printable(str(error))[:200]
     return f"{type(error).__name__}: {text}{where}"
 
 

@@ -17,11 +17,36 @@ RETIRED_SETTINGS: dict[str, str] = {
     # graph
     # merge
     # edge
+    "edge.name_hold_s": "protocol.admission.NAME_HOLD_S",
+    "edge.each_waiting": "mapping.query_queue.MAX_WAITING_EACH",
+    "edge.hurry_waiting": "mapping.query_queue.HURRY_WAITING",
+    "edge.hurry_candidates": "mapping.query_queue.HURRY_CANDIDATES",
     # control
+    "control.integral_max_hz": "scheduling.policies.INTEGRAL_MAX_HZ",
+    "control.gap_s": "scheduling.policies.GAP_S",
+    "control.interval_m": "scheduling.merge_gate.INTERVAL_M",
     # agent
+    "agent.rate_burst": "protocol.agent.RATE_BURST",
+    "agent.blend_jump_m": "protocol.localisation.BLEND_JUMP_M",
+    "agent.blend_jump_rad": "protocol.localisation.BLEND_JUMP_RAD",
     # link
+    "link.hello_s": "protocol.agent.HELLO_S",
+    "link.refused_s": "protocol.agent.REFUSED_S",
+    "link.ping_s": "protocol.edge_clock.PING_S",
+    "link.resend_s": "protocol.agent_ledger.RESEND_S",
+    "link.resend_max_s": "protocol.agent_ledger.RESEND_MAX_S",
+    "link.gap_s": "protocol.agent_ledger.GAP_RESEND_S",
     # stream
+    "stream.begin_s": "runtime.frame_consumers.TRACKER_START_S",
     # clock
+    "clock.noise_us": "protocol.edge_clock.NOISE_US",
+    "clock.asymmetry": "protocol.edge_clock.ASYMMETRY",
+    "clock.offset_walk_us": "protocol.edge_clock.OFFSET_WALK_US",
+    "clock.drift_walk_ppm": "protocol.edge_clock.DRIFT_WALK_PPM",
+    "clock.drift_ppm": "protocol.edge_clock.DRIFT_PPM",
+    "clock.least_of": "protocol.edge_clock.LEAST_OF",
+    "clock.gate_sigma": "protocol.edge_clock.GATE_SIGMA",
+    "clock.step_after": "protocol.edge_clock.STEP_AFTER",
 }
 
 

@@ -282,9 +282,9 @@ def _unacknowledged_text(run: AgentRun, name: str, finish_s: float) -> str | Non
         why = f"the edge refuses '{name}': {protocol['refusal']}"
     elif not protocol["connected"]:
         why = run.trouble or "the edge is silent"
-    elif protocol["held"]:
+    elif protocol["buffered_at_edge"]:
         why = (
-            f"it received {protocol['held']} of them but could not store them in its map file; "
+            f"it received {protocol['buffered_at_edge']} of them but could not store them in its map file; "
             "see the edge's log"
         )
     else:
@@ -298,7 +298,7 @@ def _count_text(keyframes: int) -> str:
 
 def _clock_text(c: dict[str, Any]) -> str:
     uncertainty = f"±{c['uncertainty_ms']:.3g} ms"
-    if c["claim"]:
+    if c["is_reliable"]:
         return f"{c['offset_ms']:+.3f} ms from this machine's, {uncertainty}"
     bound = f"more than clock.claim_ms ({c['claim_ms']:g})"
     return f"offset too uncertain ({uncertainty}, {bound}); latencies use this machine's clock alone"

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 @click.option(
     "--policy",
     type=click.Choice(POLICY_NAMES),
-    help="How keyframe rates are set; covins-g: every keyframe is sent.  [default: edge.policy of --config, "
-    "else share]",
+    help="How keyframe rates are set, see below.  [default: edge.policy of --config, else share]",
 )
 @options.keys
 @click.option(
@@ -58,6 +57,15 @@ def edge(
 
     Prints when agents connect and leave and when maps merge; with -v, every decision and its reason.
     Agents on other machines need keys: see `share keys --help`.
+
+    \b
+    Policies:
+      share     rate of each agent by its quality of experience; merges with a small gain are skipped
+      covins-g  every keyframe is sent, every verified loop is merged
+      linear    rate falls with the delay; merges as share
+      equal     as share, robots rated like headsets
+      random    as share, with control gains drawn from control.random_seed
+      streamed  agents send raw frames; the edge tracks each alone, without a shared map
 
     With --map, every keyframe that the edge acknowledged survives a crash; the next start continues there.
 

@@ -16,6 +16,10 @@ from share.scheduling.qoe import QoeParameters
 from share.types import F64, AgentKind
 from share.wire.messages import Hello
 
+HURRY_WAITING = 1  # with this many queued, a query verifies fewer candidates
+HURRY_CANDIDATES = 3  # at most these, and the first verified one ends the search
+MAX_WAITING_EACH = 3  # queued queries of one agent
+
 
 class SearchBudget(NamedTuple):
     """Limits of the verification of one keyframe's candidates.
@@ -29,7 +33,7 @@ class SearchBudget(NamedTuple):
 
     @classmethod
     def from_config(cls, config: Config) -> SearchBudget:
-        return cls(config.place.enough, config.edge.hurry_candidates)
+        return cls(config.place.enough, HURRY_CANDIDATES)
 
 
 class CandidateSearch:
@@ -72,7 +76,7 @@ def service_kind(config: Config, hello: Hello) -> AgentKind:
 
 
 class QueryQueue:
-    """Keyframes that wait to be looked up: at most `edge.max_waiting`, and `edge.each_waiting` of an agent.
+    """Keyframes that wait to be looked up: at most `edge.max_waiting`, and MAX_WAITING_EACH of an agent.
 
     Beyond that the oldest one, of this agent or of the one with most, is skipped (policy skip_oldest_query):
     an answer that late is of no use.
@@ -93,7 +97,7 @@ class QueryQueue:
     @property
     def is_hurried(self) -> bool:
         """Return whether so many wait that the current search should end soon."""
-        return len(self) >= self._config.hurry_waiting
+        return len(self) >= HURRY_WAITING
 
     def remove_agent(self, agent: str) -> None:
         """Forget an agent and its waiting keyframes."""
@@ -108,7 +112,7 @@ class QueryQueue:
         self._weights[agent] = _TURN_WEIGHT[kind]
         self._last_turn.setdefault(agent, self._turn)
         self._waiting.setdefault(agent, deque()).append(node_id)
-        if len(self._waiting[agent]) > self._config.each_waiting:
+        if len(self._waiting[agent]) > MAX_WAITING_EACH:
             self._skip_oldest(agent)
         elif len(self) > self._config.max_waiting:
             self._skip_oldest(max(self._waiting, key=lambda name: len(self._waiting[name])))

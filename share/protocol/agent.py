@@ -9,71 +9,78 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 from share.config import Config
-from share.errors import UsageError, VersionError, WireError
+from share.errors import UsageError, VersionError, WireError, printable
 from share.protocol import agent_events as ev
-from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry
-from share.protocol.agent_status import SelfEvaluation, StatusReporter
+from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, KeyframeScore, LedgerEntry
+from share.protocol.agent_status import StatusReporter
 from share.protocol.edge_clock import ClockEstimate, PingTracker
-from share.protocol.localisation import MapLocalisation, pose_update
-from share.protocol.reply_validation import EdgeSessions, LineLimiter, ReplyValidator
-from share.protocol.streaming import FrameStreamer
+from share.protocol.localisation import MapLocalisation, SelfEvaluation, pose_update
+from share.protocol.reply_validation import EdgeSessions, LineLimiter
 from share.protocol.versions import EdgeVersionProbe
-from share.scheduling.keyframe_score import KeyframeScore
 from share.timing import PeriodicTimer, TokenBucket, seconds_to_ns
 from share.types import F64, Correction, Keyframe, KeyframeCandidate
 from share.wire import messages as m
 from share.wire.codec import Bytes, decode, encode, message_bytes
 
+HELLO_S = 0.5  # interval of hellos, until welcomed
+REFUSED_S = 5.0  # a running agent that was refused asks again after this
+RATE_BURST = 2.0  # keyframes that may be saved up under a rate limit
+_MIN_RATE_HZ = 0.1  # that an edge cannot undercut: without keyframes it could not evaluate again
+_RECENT_FRAMES = 8  # frames among which a candidate's own is found
 _COUNTERS = (
     *("bytes_up", "bytes_down", "bad_messages", "poses", "candidates", "drop_rate"),
     *("corrections", "corrections_stale"),
 )
-_LEDGER_COUNTERS = ("sent", "resent", "acknowledged", "drop_oldest_acknowledged", "drop_oldest", "bad_acks")
-_RECENT_FRAMES = 8  # frames among which a candidate's own is found
-_MIN_RATE_HZ = (
-    0.1  # keyframe rate that an edge cannot undercut: without keyframes it could not evaluate again
+_LEDGER_COUNTERS = (
+    "sent",
+    "resent",
+    "acknowledged",
+    "drop_oldest_acknowledged",
+    "drop_oldest",
+    "invalid_acks",
 )
 
 
 class Agent:
     """One run of one agent. `hello` is repeated until an edge welcomes it.
 
-    It takes `FrameTracked` and `KeyframeMade`, or `FrameArrived` where `hello.streams_frames`.
+    It takes `FrameTracked` and `KeyframeMade`: it tracks its frames (else: `share.protocol.streaming`).
     """
 
+    offline_text: ClassVar[str] = "tracking continues without the edge"
+    slow_text: ClassVar[str] = "this machine is too slow"  # why poses are late
+    makes_keyframes: ClassVar[bool] = True  # of its frames, and sends poses relative to them
+
     def __init__(self, hello: m.Hello, config: Config) -> None:
-        link = config.link
         self._config = config
-        self._name = hello.name
-        self._hello = encode(hello)
-        self._keyframe_chain = KeyframeChain()
-        self._ledger = KeyframeLedger(config.agent, link)
-        self._bucket = TokenBucket(config.agent.rate_burst)
-        self._keyframe_score = KeyframeScore()
-        self._localisation = MapLocalisation(config.agent)
+        self._name, self._hello = hello.name, encode(hello)
+        self._keyframe_chain, self._keyframe_score = KeyframeChain(), KeyframeScore()
+        self._bucket = TokenBucket(RATE_BURST)
+        self._ledger = KeyframeLedger(config.agent.keep_keyframes, config.link.window)
+        self._localisation = MapLocalisation(config.agent.blend_s)
+        self._self_evaluation = SelfEvaluation()
         self._recent_frames: deque[ev.FrameTracked] = deque(maxlen=_RECENT_FRAMES)
-        self._self_evaluation = SelfEvaluation(config.agent.tell_placement)
-        self._streamer = FrameStreamer(config.stream) if hello.streams_frames else None
-        self._pings = PingTracker(link, config.clock)
-        self._hello_timer = PeriodicTimer(link.hello_s)
-        self._status_reporter = StatusReporter(link.ping_s, hello.streams_frames)
+        self._status_reporter = StatusReporter(self.slow_text)
+        # the edge
         self._is_connected = False
         self._sessions = EdgeSessions()
+        self._hello_timer = PeriodicTimer(HELLO_S)
+        self._pings = PingTracker()
+        self._version_probe = EdgeVersionProbe()
         self._refusal: str | None = None  # last reason that the edge gave
-        self._silence_limit_ns = seconds_to_ns(link.silent_s)
+        self._silence_limit_ns = seconds_to_ns(config.link.silent_s)
         self._last_received_ns: int | None = None  # or the first event
         self._silence_reported = False
-        self._version_probe = EdgeVersionProbe()
+        # the run
         self._line_limiter = LineLimiter()
-        self._validator = ReplyValidator(self._ledger, self._sessions, self._line_limiter, self._print_line)
-        self._now_ns = 0  # of the newest event
         self._finish_deadline_ns: int | None = None
         self._ended = False
         self._counts: Counter[str] = Counter()
         self._effects: list[ev.AgentEffect] = []
+        self._now_ns = 0  # of the event that is being handled
 
     def handle(self, event: ev.AgentEvent, now_ns: int) -> list[ev.AgentEffect]:
         """Return the effects of `event` at `now_ns` (host monotonic clock, never falling)."""
@@ -87,24 +94,23 @@ class Agent:
         self._status_reporter.begin(now_ns)
         match event:
             case ev.FrameTracked():
-                self._on_frame_tracked(event, now_ns)
+                self._on_frame_tracked(event)
             case ev.KeyframeMade():
-                self._on_keyframe_made(event.frame, event.candidate, now_ns)
-            case ev.FrameArrived() if self._streamer:
-                self._status_reporter.add_image(event.arrived_ns)
-                self._streamer.add_frame(event, self._is_connected)
+                self._on_keyframe_made(event.frame, event.candidate)
+            case ev.FrameArrived():
+                self._on_frame_arrived(event)
             case ev.EdgeMessageReceived():
-                self._on_received(event, now_ns)
+                self._on_received(event.frames)
             case ev.InputFinished():
                 self._status_reporter.finish()
                 self._finish_deadline_ns = now_ns + seconds_to_ns(self._config.agent.finish_s)
             case ev.Connected():  # a welcome tells sooner than a pong whether this edge knows us
                 self._version_probe.mark_reached()
-                self._send_hello(now_ns)
+                self._send_hello()
             case ev.AgentTick():
                 self._status_reporter.add_tick(event)
         if not self._ended:
-            self._send_due(now_ns)
+            self._send_due()
         return self._effects
 
     def pending_effects(self) -> list[ev.AgentEffect]:
@@ -120,15 +126,15 @@ class Agent:
         """Return counters and the present state as plain data."""
         return {
             **{name: self._counts[name] for name in _COUNTERS},
-            "bad_messages": self._validator.bad_messages,
             **{name: self._ledger.counts[name] for name in _LEDGER_COUNTERS},
-            **(self._streamer.report() if self._streamer else {}),
             "keyframes": self._keyframe_chain.next_id,
-            "open": self._ledger.pending,
+            "pending": len(self._ledger.pending),
+            "kept": len(self._ledger),
             "unacknowledged": self._ledger.unacknowledged,
-            "held": self._ledger.buffered_at_edge,
+            "buffered_at_edge": self._ledger.buffered_at_edge,
             "rate_hz": self._bucket.hz,
             "connected": self._is_connected,
+            "edge_session": self._sessions.session,
             "edge_sessions": len(self._sessions),
             "map_id": self._localisation.map_frame.map_id,
             "revision": self._sessions.revision,
@@ -146,65 +152,54 @@ class Agent:
 
     # ------------------------------------------------------------ frames
 
-    def _on_frame_tracked(self, frame: ev.FrameTracked, now_ns: int) -> None:
-        self._status_reporter.add_frame(frame, now_ns)
+    def _on_frame_arrived(self, event: ev.FrameArrived) -> None:
+        """Take a frame that is not tracked yet; this agent tracks its own frames, so none comes."""
+
+    def _on_frame_tracked(self, frame: ev.FrameTracked) -> None:
+        self._status_reporter.add_frame(frame, self._now_ns)
         self._recent_frames.append(frame)
         if frame.new_segment:
             self._keyframe_chain.begin_segment()
             self._localisation.begin_segment()
         if frame.T_odom_body is not None and frame.state.has_pose:
-            self._publish_localisation(frame, frame.T_odom_body, now_ns)
-        if self._streamer or not frame.is_keyframe:
+            self._publish_pose(frame, frame.T_odom_body)
+        if not (frame.is_keyframe and self.makes_keyframes):  # else when it is made
             self._finish_frame(frame, sent=False)
 
-    def _on_keyframe_made(
-        self, frame: ev.FrameTracked, candidate: KeyframeCandidate | None, now_ns: int
-    ) -> None:
+    def _publish_pose(self, frame: ev.FrameTracked, T_odom_body: F64) -> None:
+        self._effects.append(self._localisation.localise(frame, T_odom_body, self._now_ns))
+        if self._is_connected and self.makes_keyframes:
+            self._counts["poses"] += 1
+            last, first = self._ledger.last_acknowledged, self._keyframe_chain.first_of_segment
+            self._send(pose_update(frame, T_odom_body, last, first))
+
+    def _on_keyframe_made(self, frame: ev.FrameTracked, candidate: KeyframeCandidate | None) -> None:
+        """Make a keyframe of the candidate that came with `frame`, if the rate allows (else drop_rate)."""
         if candidate is None:
             self._finish_frame(replace(frame, is_keyframe=False), sent=False)
-        else:
-            self._offer_candidate(frame, candidate, now_ns)
-
-    def _offer_candidate(self, frame: ev.FrameTracked, candidate: KeyframeCandidate, now_ns: int) -> None:
-        """Make a keyframe of the candidate that came with `frame`, if the rate allows (else drop_rate)."""
+            return
         source_frame = self._recent_frames[-1 - candidate.frames_ago]
         self._counts["candidates"] += 1
         # since the newest frame: extracting the view of an earlier frame delays no pose
-        self._self_evaluation.add_processing_time((now_ns - frame.arrived_ns) / 1e6)
+        self._self_evaluation.add_processing_time((self._now_ns - frame.arrived_ns) / 1e6)
         self._keyframe_chain.extend(candidate)
-        sent = self._bucket.take(now_ns, self._keyframe_score.is_above_median(candidate.view))
+        sent = self._bucket.take(self._now_ns, self._keyframe_score.is_above_median(candidate.view))
         if sent:
             keyframe = self._keyframe_chain.make_keyframe(candidate, source_frame.stamp_ns)
-            self._add_keyframe(keyframe, source_frame, frame.error_cm, now_ns)
+            self._ledger.add(LedgerEntry(keyframe, source_frame.index, source_frame.arrived_ns))
+            self._self_evaluation.drift.add_keyframe(keyframe, source_frame.arrived_ns)
+            self._send_evaluation(keyframe, frame.error_cm)
         else:
             self._counts["drop_rate"] += 1
         self._finish_frame(frame, sent)
 
-    def _add_keyframe(
-        self, keyframe: Keyframe, frame: ev.FrameTracked, error_cm: float | None, now_ns: int
-    ) -> None:
-        """Queue a keyframe of `frame` and send its evaluation. error_cm: expected error now; None:
-        unknown."""
-        self._ledger.add(LedgerEntry(keyframe, frame.index, frame.arrived_ns))
-        self._self_evaluation.drift.add_keyframe(keyframe, frame.arrived_ns)
-        if self._is_connected and (clock := self._pings.clock).rtt_ms is not None:
-            self._send(
-                self._self_evaluation.evaluation(
-                    keyframe.id,
-                    clock.rtt_ms,
-                    error_cm,
-                    self._localisation.T_odom_body,
-                    self._localisation.map_frame,
-                    now_ns,
-                )
-            )
-
-    def _publish_localisation(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> None:
-        self._effects.append(self._localisation.localise(frame, T_odom_body, now_ns))
-        if self._is_connected and not self._streamer:
-            self._counts["poses"] += 1
-            last, first = self._ledger.last_acknowledged, self._keyframe_chain.first_of_segment
-            self._send(pose_update(frame, T_odom_body, last, first))
+    def _send_evaluation(self, keyframe: Keyframe, error_cm: float | None) -> None:
+        """Send delay and error with a keyframe. error_cm: expected error of odometry; None: unknown."""
+        rtt_ms, T_odom_body = self._pings.clock.rtt_ms, self._localisation.T_odom_body
+        if not self._is_connected or rtt_ms is None:
+            return
+        sigma_cm = 0.0 if T_odom_body is None else self._localisation.map_frame.sigma_cm(T_odom_body)
+        self._send(self._self_evaluation.evaluation(keyframe.id, rtt_ms, error_cm, sigma_cm, self._now_ns))
 
     def _finish_frame(self, frame: ev.FrameTracked, sent: bool) -> None:
         self._effects.append(
@@ -213,34 +208,36 @@ class Agent:
 
     # ------------------------------------------------------------ messages from the edge
 
-    def _on_received(self, event: ev.EdgeMessageReceived, now_ns: int) -> None:
-        self._counts["bytes_down"] += message_bytes(event.frames)
+    def _on_received(self, frames: Sequence[Bytes]) -> None:
+        self._counts["bytes_down"] += message_bytes(frames)
         try:
-            message = self._decode(event.frames)
+            message = self._decode(frames)
         except WireError as error:
-            self._validator.report_invalid(f"invalid message from the edge: {error}", now_ns)
+            self._report_invalid(f"invalid message from the edge: {error}")
             return
         if message is None:
             return
-        self._last_received_ns = now_ns
+        self._last_received_ns = self._now_ns
         match message:
             case m.Welcome():
-                self._on_welcome(message, now_ns)
+                self._on_welcome(message)
             case m.Refused():
-                self._on_refused(message, now_ns)
-            case m.Ack():
-                self._validator.take_ack(message, now_ns)
+                self._on_refused(message)
+            case m.Ack():  # one of an earlier session is rejected, but is no fault
+                if not self._ledger.acknowledge(message):
+                    self._is_of_sent("an acknowledgement", message.next_keyframe - 1, *message.buffered)
             case Correction():
-                self._on_correction(message, now_ns)
+                self._on_correction(message)
             case m.Rate():
-                self._bucket.set_rate(max(message.hz, _MIN_RATE_HZ), now_ns)
+                self._bucket.set_rate(max(message.hz, _MIN_RATE_HZ), self._now_ns)
             case m.Pong():
-                self._on_pong(message, now_ns)
-            case m.RemoteTrackingResult() if self._streamer:
-                self._on_remote_result(message, self._streamer, now_ns)
+                self._on_pong(message)
             case _:
-                description = f"a {type(message).__name__}, which this agent does not expect"
-                self._validator.report_invalid(f"the edge sent {description}", now_ns)
+                self._on_other_message(message)
+
+    def _on_other_message(self, message: m.Message) -> None:
+        name = type(message).__name__
+        self._report_invalid(f"the edge sent a {name}, which this agent does not expect")
 
     def _decode(self, frames: Sequence[Bytes]) -> m.Message | None:
         """Decode a message. Print a line and return None for an edge of an older version. Raises
@@ -250,126 +247,134 @@ class Agent:
         except VersionError as error:
             if (line := self._version_probe.check_message(frames, error)) is not None:
                 self._silence_reported = True
-                self._print(f"{line}; {self._offline_text}")
+                self._print(f"{line}; {self.offline_text}")
             return None
 
-    def _on_welcome(self, welcome: m.Welcome, now_ns: int) -> None:
-        if not self._validator.accepts_welcome(welcome, now_ns):
+    def _report_invalid(self, text: str) -> None:
+        """Count a message that no edge should send, and print it if new."""
+        self._counts["bad_messages"] += 1
+        if (line := self._line_limiter.admit_once(text, self._now_ns)) is not None:
+            self._effects.append(ev.PrintLine(line))
+
+    def _is_of_sent(self, message_name: str, *keyframes: int) -> bool:
+        """Return whether an edge can have these keyframes; report a message about others."""
+        is_sent = max(keyframes, default=-1) < self._ledger.next_unsent_id
+        if not is_sent:
+            self._report_invalid(f"the edge sent {message_name} of keyframes that were never sent; ignored")
+        return is_sent
+
+    def _on_welcome(self, welcome: m.Welcome) -> None:
+        if self._sessions.is_past(welcome.session):
+            return
+        if not self._is_of_sent("a welcome", welcome.next_keyframe - 1):
+            return
+        if self._sessions.is_unsolicited(welcome.session):
+            self._report_invalid("the edge sent a welcome without a hello; ignored")
             return
         was_disconnected, self._is_connected, self._silence_reported = not self._is_connected, True, False
         self._version_probe.mark_answered()
         if welcome.session != self._sessions.session:
-            self._begin_session(welcome, now_ns)
+            self._begin_session(welcome)
         elif was_disconnected:
             self._ledger.resume(welcome)
             self._print("reconnected to the edge")
 
-    def _begin_session(self, welcome: m.Welcome, now_ns: int) -> None:
+    def _begin_session(self, welcome: m.Welcome) -> None:
         is_restart = self._sessions.session is not None
         self._sessions.begin(welcome.session)
         self._refusal = None
-        self._bucket.set_rate(None, now_ns)
+        self._bucket.set_rate(None, self._now_ns)
         self._pings.begin_session()
         pending = self._ledger.begin_session(welcome)
-        if is_restart and self._streamer:
-            self._streamer.reset()
-            self._print("the edge has restarted; tracking starts again")
-        elif is_restart:
-            self._print(f"the edge has restarted; {pending} keyframes are resent")
+        if is_restart:
+            self._print(f"the edge has restarted; {self._restart(pending)}")
         else:
             self._print("connected to the edge")
 
-    def _on_refused(self, refused: m.Refused, now_ns: int) -> None:
-        self._refusal = "".join(c if c.isprintable() else "?" for c in refused.reason)
+    def _restart(self, pending: int) -> str:
+        """Return what a restart of the edge means, for a person. pending: number of keyframes."""
+        return f"{pending} keyframes are resent"
+
+    def _on_refused(self, refused: m.Refused) -> None:
+        self._refusal = printable(refused.reason)
         text = f"the edge refuses '{self._name}': {self._refusal}"
-        if self._sessions.session is None and self._status_reporter.has_just_begun(
-            now_ns, self._silence_limit_ns
-        ):
+        is_new_run = self._status_reporter.has_just_begun(self._now_ns, self._silence_limit_ns)
+        if self._sessions.session is None and is_new_run:
             self._ended = True
             self._effects.append(ev.FailRun(UsageError(text)))
             return
         self._is_connected = False
-        self._hello_timer.postpone(now_ns + seconds_to_ns(self._config.link.refused_s))
-        self._print(f"{text}; {self._offline_text}")
+        self._hello_timer.postpone(self._now_ns + seconds_to_ns(REFUSED_S))
+        self._print(f"{text}; {self.offline_text}")
 
-    def _on_correction(self, correction: Correction, now_ns: int) -> None:
-        if not self._validator.accepts_correction(correction, now_ns):
+    def _on_correction(self, correction: Correction) -> None:
+        answered = correction.answered_keyframe
+        if not self._is_of_sent("a correction", correction.segment_keyframe, answered):
             return
-        is_current = (
-            self._is_connected and correction.segment_keyframe >= self._keyframe_chain.first_of_segment
-        )
+        is_of_segment = correction.segment_keyframe >= self._keyframe_chain.first_of_segment
+        is_current = self._is_connected and is_of_segment
         if not (is_current and self._sessions.accept_revision(correction.revision)):
             self._counts["corrections_stale"] += 1
             return
         self._counts["corrections"] += 1
-        self._self_evaluation.drift.correct(correction.answered_keyframe)
-        entry, corrected_ms = self._ledger.record_correction(correction.answered_keyframe, now_ns)
-        self._effects.append(self._localisation.apply_correction(correction, entry, corrected_ms, now_ns))
+        self._self_evaluation.drift.correct(answered)
+        entry, corrected_ms = self._ledger.record_correction(answered, self._now_ns)
+        applied = self._localisation.apply_correction(correction, entry, corrected_ms, self._now_ns)
+        self._effects.append(applied)
 
-    def _on_remote_result(self, result: m.RemoteTrackingResult, streamer: FrameStreamer, now_ns: int) -> None:
-        frame = streamer.take_result(result, now_ns)
-        if frame is not None:
-            self._effects.append(ev.FrameTrackedRemotely(frame, result.is_consistent, result.waiting_for))
-            self._on_frame_tracked(frame, now_ns)
-
-    def _on_pong(self, pong: m.Pong, now_ns: int) -> None:
+    def _on_pong(self, pong: m.Pong) -> None:
         if not self._pings.take_answer(pong):
             return
         if pong.session != self._sessions.session:
             self._is_connected = False  # the edge has restarted and does not know us: hello
             return
-        self._pings.measure(pong, now_ns)
+        self._pings.measure(pong, self._now_ns)
 
     # ------------------------------------------------------------ messages to the edge
 
-    def _send_due(self, now_ns: int) -> None:
-        self._check_silence(now_ns)
-        self._send_status(now_ns)
+    def _send_due(self) -> None:
+        self._check_silence()
+        self._send_status()
         if self._is_connected:
-            if (ping := self._pings.due_ping(now_ns)) is not None:
+            if (ping := self._pings.due_ping(self._now_ns)) is not None:
                 self._send(ping)
-            for entry in self._ledger.take_due(now_ns):
-                self._send_frames(encode(entry.keyframe), entry.keyframe.id)
-            self._send_frame(now_ns)
-        elif self._hello_timer.fire_if_due(now_ns):
-            self._send_hello(now_ns)
-        if self._finish_deadline_ns is not None and (self._is_done or now_ns >= self._finish_deadline_ns):
+            self._send_data()
+        elif self._hello_timer.fire_if_due(self._now_ns):
+            self._send_hello()
+        deadline_ns = self._finish_deadline_ns
+        if deadline_ns is not None and (self._is_idle or self._now_ns >= deadline_ns):
             self._finish()
 
+    def _send_data(self) -> None:
+        for entry in self._ledger.take_due(self._now_ns):
+            self._send_frames(encode(entry.keyframe), entry.keyframe.id)
+
     @property
-    def _is_done(self) -> bool:
+    def _is_idle(self) -> bool:
         """Whether nothing is pending."""
-        return not self._ledger.pending and (self._streamer is None or self._streamer.is_idle)
+        return not self._ledger.pending
 
-    def _send_hello(self, now_ns: int) -> None:
-        self._hello_timer.postpone(now_ns + seconds_to_ns(self._config.link.hello_s))
+    def _send_hello(self) -> None:
+        self._hello_timer.postpone(self._now_ns + seconds_to_ns(HELLO_S))
         self._sessions.expect_welcome()
-        self._send_frames(self._hello)
-        for ping in self._version_probe.pings(now_ns):
-            self._send_frames(ping)
+        for frames in (self._hello, *self._version_probe.pings(self._now_ns)):
+            self._send_frames(frames)
 
-    def _check_silence(self, now_ns: int) -> None:
+    def _check_silence(self) -> None:
         assert self._last_received_ns is not None
-        if now_ns - self._last_received_ns <= self._silence_limit_ns:
+        if self._now_ns - self._last_received_ns <= self._silence_limit_ns:
             return
         self._is_connected = False
         if not self._silence_reported:
             self._silence_reported = True
             problem = "the edge is silent" if self._sessions.session is not None else "no edge answers yet"
-            self._print(f"{problem}; {self._offline_text}")
+            self._print(f"{problem}; {self.offline_text}")
 
-    def _send_status(self, now_ns: int) -> None:
-        if (report := self._status_reporter.due_report(now_ns)) is not None:
+    def _send_status(self) -> None:
+        if (report := self._status_reporter.due_report(self._now_ns)) is not None:
             self._effects.append(report)
             if self._is_connected:
                 self._send(report.status)
-
-    def _send_frame(self, now_ns: int) -> None:
-        frame = None if self._streamer is None else self._streamer.next_frame(now_ns)
-        if frame is not None:
-            frames = encode(frame)
-            self._counts["bytes_up"] += message_bytes(frames)
-            self._effects.append(ev.SendFrameToEdge(frame.index, frames))
 
     def _finish(self) -> None:
         if self._is_connected:
@@ -380,25 +385,15 @@ class Agent:
     def _send(self, message: m.UplinkMessage) -> None:
         self._send_frames(encode(message))
 
-    def _send_frames(self, frames: Any, keyframe: int | None = None) -> None:
+    def _send_frames(self, frames: Sequence[Bytes], keyframe: int | None = None) -> None:
         self._counts["bytes_up"] += message_bytes(frames)
         self._effects.append(ev.SendToEdge(frames, keyframe))
 
     def _on_send_failed(self, effect: ev.SendToEdge | ev.SendFrameToEdge) -> None:
         self._counts["bytes_up"] -= message_bytes(effect.frames)
-        if isinstance(effect, ev.SendFrameToEdge):
-            if self._streamer is not None:
-                self._streamer.cancel(effect.index)
-        elif effect.keyframe_id is not None:
+        if isinstance(effect, ev.SendToEdge) and effect.keyframe_id is not None:
             self._ledger.record_send_failure(effect.keyframe_id)
-
-    @property
-    def _offline_text(self) -> str:
-        return "no tracking without the edge" if self._streamer else "tracking continues without the edge"
 
     def _print(self, text: str) -> None:
         if (line := self._line_limiter.admit(text, self._now_ns)) is not None:
-            self._print_line(line)
-
-    def _print_line(self, line: str) -> None:
-        self._effects.append(ev.PrintLine(line))
+            self._effects.append(ev.PrintLine(line))

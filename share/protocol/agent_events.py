@@ -1,5 +1,5 @@
-"""Events and effects of the agent's state machine. Times are host monotonic ns, except `stamp_ns`: the
-frame's stamp in the sensor's clock."""
+"""Events and effects of the agent's state machine. Times are host monotonic ns; `stamp_ns` is the frame's
+stamp in the sensor's clock."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class KeyframeMade:
 
 @dataclass(frozen=True, eq=False)
 class FrameArrived:
-    """A frame for the edge to track, with the IMU samples since the one before. arrived_ns: its arrival."""
+    """A frame for the edge to track, with the IMU samples since the one before."""
 
     frame: Frame
     arrived_ns: int
@@ -106,8 +106,7 @@ AgentEvent = (
 
 @dataclass(frozen=True, eq=False)
 class SendToEdge:
-    """Hand these frames to the link; answer `SendFailed` if it refuses them. keyframe_id: None for messages
-    that are no keyframe."""
+    """Hand a message to the link; answer `SendFailed` if it refuses. keyframe_id: None if it is none."""
 
     frames: Sequence[Bytes]
     keyframe_id: int | None = None
@@ -115,7 +114,7 @@ class SendToEdge:
 
 @dataclass(frozen=True, eq=False)
 class SendFrameToEdge:
-    """Hand the frame `index`, which the edge is to track, to the link; answer `SendFailed` if it refuses."""
+    """Hand frame `index`, for the edge to track, to the link; answer `SendFailed` if it refuses."""
 
     index: int
     frames: Sequence[Bytes]
@@ -123,11 +122,10 @@ class SendFrameToEdge:
 
 @dataclass(frozen=True, eq=False)
 class FrameTrackedRemotely:
-    """The edge has tracked a frame; `FrameDone` follows. frame: as for a frame tracked on the agent."""
+    """The edge has tracked a frame; `FrameDone` follows. is_consistent: as in `TrackResult`."""
 
     frame: FrameTracked
     is_consistent: bool
-    waiting_for: WaitReason | None
 
 
 @dataclass(frozen=True, eq=False)

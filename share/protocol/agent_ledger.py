@@ -1,17 +1,22 @@
-"""The agent's ledger of keyframes: sent, acknowledged, due for a resend; and the chain that numbers them."""
+"""The agent's keyframes: the choice under a rate limit, the chain that numbers them, and the ledger of those
+sent, acknowledged and due for a resend."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 
-from share.config import AgentConfig, LinkConfig
 from share.geometry.se3 import compose_cov, orthonormal
 from share.timing import seconds_to_ns
-from share.types import F64, Keyframe, KeyframeCandidate
+from share.types import F64, Keyframe, KeyframeCandidate, View
 from share.wire.messages import Ack, Welcome
+
+RESEND_S = 1.0  # first wait for an acknowledgement; doubles with each resend
+RESEND_MAX_S = 8.0  # longest wait
+GAP_RESEND_S = 0.1  # first wait for a keyframe that later ones have overtaken
 
 
 @dataclass(eq=False, slots=True)
@@ -37,15 +42,13 @@ class KeyframeLedger:
     keyframe onto the dropped one's reference. `counts` has both, by name.
     """
 
-    def __init__(self, agent: AgentConfig, link: LinkConfig) -> None:
+    def __init__(self, capacity: int, window: int) -> None:
         self.counts: Counter[str] = Counter()
-        self._capacity = agent.keep_keyframes
-        self._link = link
+        self._capacity, self._window = capacity, window
         self._acknowledged: dict[int, LedgerEntry] = {}
         self._pending: dict[int, LedgerEntry] = {}
-        self._buffered_at_edge = frozenset[
-            int
-        ]()  # ids that wait at the edge for a gap to close, or for its disk
+        # ids that wait at the edge for a gap to close, or for its disk
+        self._buffered_at_edge = frozenset[int]()
         self._max_sent_id = -1  # highest id sent in this session of the edge
         self._max_ever_sent_id = -1  # in any session
 
@@ -53,9 +56,9 @@ class KeyframeLedger:
         return len(self._acknowledged) + len(self._pending)
 
     @property
-    def pending(self) -> int:
-        """Number of keyframes that are not acknowledged."""
-        return len(self._pending)
+    def pending(self) -> list[LedgerEntry]:
+        """Keyframes that are not acknowledged, in order."""
+        return list(self._pending.values())
 
     @property
     def unacknowledged(self) -> int:
@@ -97,12 +100,11 @@ class KeyframeLedger:
 
     def take_due(self, now_ns: int) -> list[LedgerEntry]:
         """Return what to send now, in order. It counts as sent unless `record_send_failure` follows."""
-        window = list(self._pending.values())[: self._link.window]
-        due = [entry for entry in window if self._is_due(entry, now_ns)]
+        due = [entry for entry in self.pending[: self._window] if self._is_due(entry, now_ns)]
         for entry in due:
             self._count_sends(entry, 1)
-            backoff = self._link.resend_s * 2.0 ** min(entry.attempts, 30)
-            entry.due_ns = now_ns + seconds_to_ns(min(backoff, self._link.resend_max_s))
+            backoff = RESEND_S * 2.0 ** min(entry.attempts, 30)
+            entry.due_ns = now_ns + seconds_to_ns(min(backoff, RESEND_MAX_S))
             entry.attempts += 1
             entry.sent_ns = now_ns
             self._max_sent_id = max(self._max_sent_id, entry.keyframe.id)
@@ -121,27 +123,24 @@ class KeyframeLedger:
         entry.send_count += change
 
     def acknowledge(self, ack: Ack) -> bool:
-        """Apply an acknowledgement. Gaps below buffered keyframes are due again after `gap_s`.
+        """Apply an acknowledgement. Gaps below buffered keyframes are due again after GAP_RESEND_S.
 
         Return False, and ignore it, if it covers keyframes not sent in this session of the edge: it is of an
         earlier session, or false.
         """
-        if (
-            ack.next_keyframe > self._max_sent_id + 1
-            or max(ack.buffered, default=-1) > self._max_ever_sent_id
-        ):
-            self.counts["bad_acks"] += 1
+        max_buffered = max(ack.buffered, default=-1)
+        if ack.next_keyframe > self._max_sent_id + 1 or max_buffered > self._max_ever_sent_id:
+            self.counts["invalid_acks"] += 1
             return False
         while self._pending and (first := next(iter(self._pending))) < ack.next_keyframe:
             self._acknowledged[first] = self._pending.pop(first)
             self.counts["acknowledged"] += 1
         self._buffered_at_edge = frozenset(ack.buffered)
-        max_buffered = max(self._buffered_at_edge, default=-1)
         if max_buffered in self._pending:  # it was in flight when this session began
             self._max_sent_id = max(self._max_sent_id, max_buffered)
-        for entry in list(self._pending.values())[: self._link.window]:
+        for entry in self.pending[: self._window]:
             if entry.attempts and entry.keyframe.id < max_buffered:
-                entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds_to_ns(self._link.gap_s))
+                entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds_to_ns(GAP_RESEND_S))
         return True
 
     def resume(self, welcome: Welcome) -> None:
@@ -166,7 +165,7 @@ class KeyframeLedger:
         for entry in self._pending.values():
             entry.attempts = 0
         self._make_all_due()
-        return self.pending
+        return len(self._pending)
 
     def _is_due(self, entry: LedgerEntry, now_ns: int) -> bool:
         if entry.keyframe.id in self._buffered_at_edge and entry.keyframe.id != next(iter(self._pending)):
@@ -258,3 +257,27 @@ class KeyframeChain:
     def _reset_motion(self) -> None:
         """Restart the accumulated motion at the last keyframe, or at the start of the segment."""
         self._T_keyframe_candidate, self._cov = np.eye(4), np.zeros((6, 6))
+
+
+_SCORE_WINDOW = 20  # recent candidates with which one is compared
+_MAX_DEPTH_M = 20.0  # depth beyond which the score does not grow
+
+
+class KeyframeScore:
+    """Scores the keyframe candidates of an agent by their median depth: under a rate limit it prefers views
+    that are recognised more often.
+
+    A view of distant structure overlaps with views from elsewhere; a close-up is recognised from the same
+    spot only.
+    """
+
+    def __init__(self) -> None:
+        self._recent_scores: deque[float] = deque(maxlen=_SCORE_WINDOW)
+
+    def is_above_median(self, view: View) -> bool:
+        """Return whether the view scores at least the median of the recent ones, itself included."""
+        depth = view.points[:, 2]
+        valid = depth[np.isfinite(depth)]
+        score = float(np.median(valid.clip(0.0, _MAX_DEPTH_M))) if valid.size else 0.0
+        self._recent_scores.append(score)
+        return score >= median(self._recent_scores)

@@ -1,27 +1,13 @@
-"""The agent's reports on itself: status (also without frames), delay and expected error."""
+"""The agent's status: its state and the age of its pose, also without frames."""
 
 from __future__ import annotations
 
-import math
-from collections import deque
-
-import numpy as np
-
-from share.geometry.se3 import compose_cov, position_sigma
-from share.metrics.local_error import WINDOW_S
+from share.errors import printable
 from share.protocol.agent_events import AgentTick, FrameTracked, StatusReport
-from share.protocol.edge_clock import exponential_average
-from share.protocol.localisation import BlendedMapFrame
+from share.protocol.edge_clock import PING_S, exponential_average
 from share.timing import SECOND_NS, PeriodicTimer, seconds_to_ns
-from share.types import F64, Keyframe, TrackState, WaitReason
-from share.wire.messages import (
-    MAX_DELAY_MS,
-    MAX_ERROR_CM,
-    MAX_POSE_AGE_MS,
-    MAX_REASON_LENGTH,
-    Evaluation,
-    Status,
-)
+from share.types import TrackState, WaitReason
+from share.wire.messages import MAX_POSE_AGE_MS, MAX_REASON_LENGTH, Status
 
 STALE_S = 0.4  # s without a tracked frame (or three frame intervals, if longer): the last pose is stale
 _MAX_INTERVAL_S = 0.2  # cap of the averaged frame interval, so that staleness is reported within a second
@@ -41,10 +27,10 @@ class StatusReporter:
     A state with a pose becomes LOST when it is stale. All times are the agent's clock, ns.
     """
 
-    def __init__(self, period_s: float, streams: bool) -> None:
-        """streams: the edge does the tracking."""
-        self._timer = PeriodicTimer(period_s)
-        self._slow_text = "the edge does not answer" if streams else "this machine is too slow"
+    def __init__(self, slow_text: str) -> None:
+        """slow_text: why poses are late, for a person."""
+        self._timer = PeriodicTimer(PING_S)
+        self._slow_text = slow_text
         self._began_ns: int | None = None
         self._state, self._since_ns = TrackState.INITIALISING, 0
         self._waiting_for: WaitReason | None = None
@@ -106,7 +92,7 @@ class StatusReporter:
         stale = self.is_stale(now_ns)
         state = TrackState.LOST if stale and self._state.has_pose else self._state
         reasons = (self._stale_reason(now_ns) if stale else self._state_text(now_ns), self._sensor_trouble)
-        reason = "".join(c if c.isprintable() else "?" for c in "; ".join(filter(None, reasons)))
+        reason = printable("; ".join(filter(None, reasons)))
         return Status(state, self._age_ms(now_ns), reason[:MAX_REASON_LENGTH])
 
     def due_report(self, now_ns: int) -> StatusReport | None:
@@ -139,84 +125,3 @@ class StatusReporter:
         if self._state is TrackState.INITIALISING:
             return "" if self._waiting_for is None else f"waiting for {self._waiting_for.text}"
         return _STATE_TEXTS.get(self._state, "").format((now_ns - self._since_ns) / SECOND_NS)
-
-
-class SelfEvaluation:
-    """Estimates the delay and error that the agent reports with each keyframe. `drift` grows with odometry
-    and is reset by corrections."""
-
-    def __init__(self, include_map_sigma: bool) -> None:
-        """include_map_sigma: add the standard deviation of the agent's position in the map to the error."""
-        self.drift = DriftEstimator()
-        self._include_map_sigma = include_map_sigma
-        self._processing_ms: float | None = None  # average, from a frame's arrival to its candidate
-
-    def add_processing_time(self, ms: float) -> None:
-        """Add the time from a frame's arrival to its candidate, ms."""
-        self._processing_ms = exponential_average(self._processing_ms, ms)
-
-    def evaluation(
-        self,
-        keyframe: int,
-        rtt_ms: float,
-        local_cm: float | None,
-        T_odom_body: F64 | None,
-        map_frame: BlendedMapFrame,
-        now_ns: int,
-    ) -> Evaluation:
-        """Return the evaluation to send with `keyframe`, within the bounds of the wire.
-
-        local_cm: as in `DriftEstimator.expected_cm`."""
-        error_cm = self.drift.expected_cm(local_cm, now_ns)
-        if error_cm is not None and T_odom_body is not None and self._include_map_sigma:
-            error_cm = math.hypot(error_cm, map_frame.sigma_cm(T_odom_body))
-        if error_cm is not None:
-            error_cm = min(error_cm, MAX_ERROR_CM)
-        delay_ms = min(rtt_ms + (self._processing_ms or 0.0), MAX_DELAY_MS)
-        return Evaluation(keyframe, delay_ms, error_cm)
-
-
-_MAX_MOTIONS = 100  # keyframes since the last answered one; the motion of older ones is merged
-
-
-class DriftEstimator:
-    """Expected drift of odometry since the newest keyframe that a correction answered. Times: agent's clock,
-    ns."""
-
-    def __init__(self) -> None:
-        self._since_ns: int | None = None
-        self._motions: deque[tuple[int, int, F64, F64]] = deque()  # keyframe id, time, T_last_this, cov
-
-    def add_keyframe(self, keyframe: Keyframe, sent_ns: int) -> None:
-        """Add a sent keyframe. One without a reference starts a segment with zero drift."""
-        if keyframe.reference < 0 or self._since_ns is None:
-            self._motions.clear()
-            self._since_ns = sent_ns
-            return
-        self._motions.append((keyframe.id, sent_ns, keyframe.T_ref_body, keyframe.cov))
-        if len(self._motions) > _MAX_MOTIONS:
-            (_, _, _, cov), (second, second_ns, T, added_cov) = (
-                self._motions.popleft(),
-                self._motions.popleft(),
-            )
-            self._motions.appendleft((second, second_ns, T, compose_cov(T, cov, added_cov)))
-
-    def correct(self, keyframe: int) -> None:
-        """Drop the drift up to this keyframe, which a correction answers."""
-        while self._motions and self._motions[0][0] <= keyframe:
-            self._since_ns = self._motions.popleft()[1]
-
-    def expected_cm(self, local_cm: float | None, now_ns: int) -> float | None:
-        """Return the expected position error of the newest sent keyframe, cm; None before the first.
-
-        local_cm: error of odometry within `WINDOW_S` (`share.metrics.local_error`), scaled as a random walk.
-        None: use the covariances of odometry.
-        """
-        if self._since_ns is None:
-            return None
-        if local_cm is not None:
-            return local_cm * math.sqrt(min(1.0, max(0, now_ns - self._since_ns) / seconds_to_ns(WINDOW_S)))
-        cov = np.zeros((6, 6))
-        for _, _, T, added_cov in self._motions:
-            cov = compose_cov(T, cov, added_cov)
-        return 100 * position_sigma(cov)

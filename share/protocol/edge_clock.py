@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from share.config import ClockConfig, LinkConfig
 from share.timing import SECOND_NS, PeriodicTimer
 from share.types import F64
 from share.wire.messages import Ping, Pong
@@ -47,6 +46,15 @@ class Exchange:
         return self.returned_ns >= self.sent_ns and self.replied_ns >= self.received_ns and self.delay_ns >= 0
 
 
+PING_S = 0.5  # interval of pings
+NOISE_US = 20.0  # standard deviation of an exchange that was not queued
+ASYMMETRY = 0.5  # error of an offset as a share of the delay above the minimum; 0.5 is the bound
+OFFSET_WALK_US = 4.0  # random walk of the offset, per sqrt(s)
+DRIFT_WALK_PPM = 0.05  # random walk of the drift, per sqrt(s)
+DRIFT_PPM = 100.0  # initial standard deviation of the drift
+LEAST_OF = 64  # recent exchanges among which the minimum delay is taken
+GATE_SIGMA = 4.0  # an exchange further off is rejected
+STEP_AFTER = 5  # rejected exchanges in a row after which the filter restarts: the clock was set
 _SMOOTHING = 1 / 8  # RFC 6298, section 2
 MAX_OFFSET_NS = 10 * 365 * 86_400 * SECOND_NS  # clocks start at boot: no machine has run for longer
 _MIN_AGREEING = 3  # agreeing exchanges before a clock is accepted: its stamps must advance as ours do
@@ -66,24 +74,20 @@ class ClockFilter:
     asymmetry of the path: it is not in `sigma_ns`, but bounded by `asymmetry_ns`.
     """
 
-    def __init__(self, config: ClockConfig) -> None:
-        from filterpy.kalman import KalmanFilter  # takes a second to import: now, not at the first pong
-
-        self._make_filter = KalmanFilter
-        self._config = config
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
         """Drop all state, for another clock."""
-        self.accepted = 0
         self.rejected = 0
         self.steps = 0
         self.rtt_ms: float | None = None
-        self._filter: Any = None
+        self._x: F64 | None = None  # offset and drift (2,); None before the first exchange
+        self._P: F64 = np.zeros((2, 2))
         self._base_ns = 0  # the filtered offset is relative to this, so that it stays small
         self._updated_ns = 0
-        self._recent_rtt_ns: deque[int] = deque(maxlen=self._config.least_of)
-        self._recent_unverified_ns: deque[int] = deque(maxlen=self._config.least_of)
+        self._recent_rtt_ns: deque[int] = deque(maxlen=LEAST_OF)
+        self._recent_unverified_ns: deque[int] = deque(maxlen=LEAST_OF)
         self._consecutive_rejects = 0
         self._agreeing_exchanges = 0  # since the clock was last set
 
@@ -104,23 +108,23 @@ class ClockFilter:
         self._recent_unverified_ns.append(exchange.unverified_ns)
         self.rtt_ms = exponential_average(self.rtt_ms, rtt_ns / 1e6)
         variance = self._variance(rtt_ns)
-        if self._filter is None:
+        if self._x is None:
             self._initialise(offset_ns, middle_ns, variance)
             return True
-        return self._gated_update(offset_ns, middle_ns, variance)
+        return self._gated_update(self._x, offset_ns, middle_ns, variance)
 
     def offset_ns(self, now_ns: int) -> int | None:
         """Return edge time minus agent time at the agent's `now_ns`; None before the first exchange."""
-        if self._filter is None:
+        if self._x is None:
             return None
-        offset_us, drift_ppm = self._filter.x
+        offset_us, drift_ppm = self._x
         return self._base_ns + round(float(offset_us + drift_ppm * self._elapsed_s(now_ns)) * 1e3)
 
     def sigma_ns(self, now_ns: int) -> float | None:
         """Return the standard deviation of `offset_ns`; None before the first exchange."""
-        if self._filter is None:
+        if self._x is None:
             return None
-        P = self._predict(now_ns)[1]
+        P = self._predict(self._x, now_ns)[1]
         return float(np.sqrt(P[0, 0])) * 1e3
 
     @property
@@ -133,7 +137,7 @@ class ClockFilter:
 
     @property
     def drift_ppm(self) -> float | None:
-        return None if self._filter is None else float(self._filter.x[1])
+        return None if self._x is None else float(self._x[1])
 
     def report(self) -> dict[str, Any]:
         """Return plain data, with the offset at the last exchange."""
@@ -151,46 +155,40 @@ class ClockFilter:
         section 8)."""
         has_enough = len(self._recent_rtt_ns) >= _MIN_EXCHANGES
         excess_us = (rtt_ns - (min(self._recent_rtt_ns) if has_enough else 0)) / 1e3
-        return self._config.noise_us**2 + (self._config.asymmetry * excess_us) ** 2
+        return NOISE_US**2 + (ASYMMETRY * excess_us) ** 2
 
     def _initialise(self, offset_ns: int, at_ns: int, variance: float) -> None:
-        self._filter = self._make_filter(dim_x=2, dim_z=1)
-        self._filter.x = np.zeros(2)
-        self._filter.P = np.diag([variance, self._config.drift_ppm**2])
-        self._filter.H = np.array([[1.0, 0.0]])
+        self._x, self._P = np.zeros(2), np.diag([variance, DRIFT_PPM**2])
         self._base_ns, self._updated_ns = offset_ns, at_ns
         self._consecutive_rejects = 0
         self._agreeing_exchanges = 1
-        self.accepted += 1
 
-    def _gated_update(self, offset_ns: int, at_ns: int, variance: float) -> bool:
-        kf = self._filter
-        kf.x, kf.P = self._predict(at_ns)
+    def _gated_update(self, x: F64, offset_ns: int, at_ns: int, variance: float) -> bool:
+        self._x, self._P = x, P = self._predict(x, at_ns)
         self._updated_ns = max(at_ns, self._updated_ns)
-        innovation = (offset_ns - self._base_ns) / 1e3 - kf.x[0]
-        if innovation**2 > self._config.gate_sigma**2 * (kf.P[0, 0] + variance):
-            return self._reject(offset_ns, at_ns, variance)
-        kf.update(np.array([(offset_ns - self._base_ns) / 1e3]), R=variance)
+        innovation, S = (offset_ns - self._base_ns) / 1e3 - x[0], P[0, 0] + variance
+        if innovation**2 > GATE_SIGMA**2 * S:
+            self._consecutive_rejects += 1
+            self.rejected += 1
+            if self._consecutive_rejects >= STEP_AFTER:
+                self.steps += 1
+                self._initialise(offset_ns, at_ns, variance)
+            return False
+        K = P[:, :1] * (1 / S)
+        I_KH = np.eye(2) - K @ [[1.0, 0.0]]
+        self._x = x + K[:, 0] * innovation
+        self._P = I_KH @ P @ I_KH.T + K * variance @ K.T  # Joseph's form
         self._consecutive_rejects = 0
         self._agreeing_exchanges += 1
-        self.accepted += 1
         return True
 
-    def _reject(self, offset_ns: int, at_ns: int, variance: float) -> bool:
-        self._consecutive_rejects += 1
-        self.rejected += 1
-        if self._consecutive_rejects >= self._config.step_after:
-            self.steps += 1
-            self._initialise(offset_ns, at_ns, variance)
-        return False
-
-    def _predict(self, now_ns: int) -> tuple[F64, F64]:
+    def _predict(self, x: F64, now_ns: int) -> tuple[F64, F64]:
         """Return state (2,) and covariance (2, 2) at `now_ns`, with random walks of offset and drift."""
         dt = max(0.0, self._elapsed_s(now_ns))
         F = np.array([[1.0, dt], [0.0, 1.0]])
-        q, r = self._config.offset_walk_us**2, self._config.drift_walk_ppm**2
+        q, r = OFFSET_WALK_US**2, DRIFT_WALK_PPM**2
         Q = np.array([[q * dt + r * dt**3 / 3, r * dt**2 / 2], [r * dt**2 / 2, r * dt]])
-        return F @ self._filter.x, F @ self._filter.P @ F.T + Q
+        return F @ x, F @ self._P @ F.T + Q
 
     def _elapsed_s(self, now_ns: int) -> float:
         return (now_ns - self._updated_ns) / SECOND_NS
@@ -235,7 +233,7 @@ class ClockEstimate:
 
     def report(self) -> dict[str, Any]:
         """Return plain data."""
-        return {**asdict(self), "uncertainty_ms": self.uncertainty_ms, "claim": self.is_reliable}
+        return {**asdict(self), "uncertainty_ms": self.uncertainty_ms, "is_reliable": self.is_reliable}
 
 
 _MAX_IN_FLIGHT = 16
@@ -244,9 +242,9 @@ _MAX_IN_FLIGHT = 16
 class PingTracker:
     """Sends pings and feeds the pongs to `clock`, the filter of the present edge session."""
 
-    def __init__(self, link: LinkConfig, clock: ClockConfig) -> None:
-        self.clock = ClockFilter(clock)
-        self._timer = PeriodicTimer(link.ping_s)
+    def __init__(self) -> None:
+        self.clock = ClockFilter()
+        self._timer = PeriodicTimer(PING_S)
         self._sequence = 0
         self._in_flight: deque[Ping] = deque(maxlen=_MAX_IN_FLIGHT)
 

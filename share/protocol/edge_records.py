@@ -1,10 +1,10 @@
-"""The edge's bookkeeping: event log, durability of keyframes, totals over mapper restarts, fair queue."""
+"""The edge's bookkeeping: event log, durability of keyframes, totals over mapper restarts."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from share.mapping.map_changes import MapChange
 from share.protocol.edge_events import SaveChanges, WriteEvent
@@ -42,9 +42,8 @@ class EventLog:
         """Return the event, or None beyond the limits of its kind and agent; the next one counts those left
         out."""
         suppressed = self._throttle.admit((kind, agent), now_ns)
-        if suppressed is None:
-            return None
-        suppressed = self._sustained.admit((kind, agent), now_ns, suppressed)
+        if suppressed is not None:
+            suppressed = self._sustained.admit((kind, agent), now_ns, suppressed)
         if suppressed is None:
             return None
         more = f" (and {suppressed} more since the last line)" if suppressed else ""
@@ -145,55 +144,13 @@ class SessionTotals:
 def _add_counts(
     now: Mapping[str, Any], previous: Mapping[str, Any], paths: tuple[tuple[str, ...], ...]
 ) -> dict[str, Any]:
+    """Return a copy of `now` with the counts of `previous` at these paths (one or two keys) added."""
     out = dict(now)
-    for path in paths:
-        count = _count_at(previous, path)
-        if not count:
-            continue
-        if len(path) == 1:
-            out[path[0]] = out.get(path[0], 0) + count
-        else:
-            inner = dict(out.get(path[0], {}))
-            inner[path[1]] = inner.get(path[1], 0) + count
-            out[path[0]] = inner
+    for *outer, name in paths:
+        before = previous.get(outer[0], {}) if outer else previous
+        if before.get(name):
+            counts = out
+            if outer:
+                counts = out[outer[0]] = dict(out.get(outer[0], {}))
+            counts[name] = counts.get(name, 0) + before[name]
     return out
-
-
-def _count_at(report: Mapping[str, Any], path: tuple[str, ...]) -> int:
-    value: Any = report
-    for key in path:
-        if key not in value:
-            return 0
-        value = value[key]
-    return int(value)
-
-
-T = TypeVar("T")
-
-_MAX_ADD_MS = 10.0  # spent on adding keyframes before one is queried
-
-
-class FairQueue(Generic[T]):
-    """Keyframes that wait to be added to the map: names take turns, each in order of arrival, so that an
-    agent that sends many delays only itself."""
-
-    def __init__(self) -> None:
-        self._queues: dict[str, deque[T]] = {}  # by name, next in turn first
-
-    def __len__(self) -> int:
-        return sum(map(len, self._queues.values()))
-
-    def add(self, name: str, item: T) -> None:
-        self._queues.setdefault(name, deque()).append(item)
-
-    def take_next(self, spent_ms: float = 0.0) -> T | None:
-        """Return the next item; None if there is none, or if `spent_ms` (on items since the last query)
-        calls for a query."""
-        if not self._queues or spent_ms >= _MAX_ADD_MS:
-            return None
-        name = next(iter(self._queues))
-        queue = self._queues.pop(name)
-        item = queue.popleft()
-        if queue:
-            self._queues[name] = queue
-        return item

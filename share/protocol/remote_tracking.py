@@ -10,19 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from share.geometry import rig_check
-from share.geometry.camera import Camera, Rig
+from share.geometry.camera import Rig
+from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
-from share.protocol.edge_events import (
-    EdgeEvent,
-    PeerMessageReceived,
-    StartTracker,
-    StopTracker,
-    TrackerAnswered,
-    TrackerEffect,
-    TrackerLost,
-    TrackerReady,
-    TrackFrame,
-)
 from share.protocol.peer import Peer
 from share.protocol.streaming import FrameWindow
 from share.types import Frame
@@ -46,26 +36,26 @@ class RemoteTracker:
     frames_tracked: int = 0
     _has_answered: bool = field(default=False)  # in this generation
 
-    def start(self) -> Sequence[TrackerEffect]:
+    def start(self) -> Sequence[ed.TrackerEffect]:
         """Start a tracker, if none is running."""
         if self.is_running:
             return ()
         self.is_running, self._has_answered = True, False
-        return (StartTracker(self.key, self.generation, self.rig),)
+        return (ed.StartTracker(self.key, self.generation, self.rig),)
 
-    def stop(self) -> Sequence[TrackerEffect]:
+    def stop(self) -> Sequence[ed.TrackerEffect]:
         """Stop the tracker, if one is running."""
         was_running = self._reset()
-        return (StopTracker(self.key),) if was_running else ()
+        return (ed.StopTracker(self.key),) if was_running else ()
 
-    def offer_frame(self, frame: Frame, now_ns: int) -> Sequence[TrackerEffect]:
+    def offer_frame(self, frame: Frame, now_ns: int) -> Sequence[ed.TrackerEffect]:
         """Queue a frame. Raises ValueError if its images do not fit the rig."""
         self._check_frame(frame)
         self.frames_streamed += 1
         self.frame_window.offer(frame, now_ns)
         return self._next_frame(now_ns)
 
-    def take_answer(self, result: RemoteTrackingResult, now_ns: int) -> Sequence[TrackerEffect]:
+    def take_answer(self, result: RemoteTrackingResult, now_ns: int) -> Sequence[ed.TrackerEffect]:
         self.frame_window.take_answered(result.index)
         self.frames_tracked += 1
         self._has_answered = True
@@ -79,15 +69,12 @@ class RemoteTracker:
     def report(self) -> dict[str, int]:
         """Return counts for edge.json. frames_dropped: for newer ones, or lost with a tracker that died."""
         dropped = self.frame_window.dropped + self.frame_window.unanswered
-        return {
-            "frames_streamed": self.frames_streamed,
-            "frames_tracked": self.frames_tracked,
-            "frames_dropped": dropped,
-        }
+        counts = {"streamed": self.frames_streamed, "tracked": self.frames_tracked, "dropped": dropped}
+        return {f"frames_{name}": count for name, count in counts.items()}
 
-    def _next_frame(self, now_ns: int) -> Sequence[TrackerEffect]:
+    def _next_frame(self, now_ns: int) -> Sequence[ed.TrackerEffect]:
         frame = self.frame_window.take_next(now_ns) if self.is_running else None
-        return () if frame is None else (TrackFrame(self.key, frame),)
+        return () if frame is None else (ed.TrackFrame(self.key, frame),)
 
     def _reset(self) -> bool:
         """Forget the running tracker. Return whether there was one."""
@@ -97,24 +84,13 @@ class RemoteTracker:
         return was_running
 
     def _check_frame(self, frame: Frame) -> None:
-        for name, image, camera in (
-            ("image0", frame.image0, self.rig.cam0),
-            ("image1", frame.image1, self.rig.cam1),
-            ("depth", frame.depth, self.rig.depth),
-        ):
-            have, want = None if image is None else image.shape, _image_shape(camera)
+        images = {"image0": frame.image0, "image1": frame.image1, "depth": frame.depth}
+        cameras = (self.rig.cam0, self.rig.cam1, self.rig.depth)
+        for (name, image), camera in zip(images.items(), cameras, strict=True):
+            have = "none" if image is None else f"{image.shape[1]}x{image.shape[0]}"
+            want = "none" if camera is None else f"{camera.width}x{camera.height}"
             if have != want:
-                raise ValueError(
-                    f"frame {frame.index}: {name} is {_shape_text(have)}, the rig says {_shape_text(want)}"
-                )
-
-
-def _image_shape(camera: Camera | None) -> tuple[int, ...] | None:
-    return None if camera is None else (camera.height, camera.width)
-
-
-def _shape_text(shape: tuple[int, ...] | None) -> str:
-    return "none" if shape is None else f"{shape[1]}x{shape[0]}"
+                raise ValueError(f"frame {frame.index}: {name} is {have}, the rig says {want}")
 
 
 @dataclass(frozen=True)
@@ -155,102 +131,88 @@ class TrackingEdge(Edge):
         self._capacity = capacity
         self._trackers: dict[str, RemoteTracker] = {}  # by the key of the run
 
-    def _dispatch(self, event: EdgeEvent, now_ns: int) -> None:
+    def _dispatch(self, event: ed.EdgeEvent) -> None:
         match event:
-            case TrackerReady() | TrackerAnswered() | TrackerLost():
+            case ed.TrackerReady() | ed.TrackerAnswered() | ed.TrackerLost():
                 tracker = self._trackers[event.key]
                 if event.generation == tracker.generation and tracker.is_running:
-                    self._on_tracker_event(self._registry.peer_id_by_key[event.key], tracker, event, now_ns)
+                    self._on_tracker_event(self._registry.by_key[event.key], tracker, event)
             case _:
-                super()._dispatch(event, now_ns)
+                super()._dispatch(event)
 
     def _on_tracker_event(
-        self,
-        peer_id: bytes,
-        tracker: RemoteTracker,
-        event: TrackerReady | TrackerAnswered | TrackerLost,
-        now_ns: int,
+        self, peer: Peer, tracker: RemoteTracker, event: ed.TrackerReady | ed.TrackerAnswered | ed.TrackerLost
     ) -> None:
         """Handle an event of the run's present tracker."""
-        peer = self._registry[peer_id]
         match event:
-            case TrackerReady():
+            case ed.TrackerReady():
                 tracker.is_ready = True
-                self._welcome(peer_id, peer, now_ns)
-            case TrackerAnswered():
-                peer.status.add_pose(event.result.state, now_ns)
-                self._send(peer_id, event.result)
-                self._emit(tracker.take_answer(event.result, now_ns))
-            case TrackerLost():
+                self._welcome(peer)
+            case ed.TrackerAnswered():
+                peer.status.add_pose(event.result.state, self._now_ns)
+                self._send(peer.id, event.result)
+                self._effects.extend(tracker.take_answer(event.result, self._now_ns))
+            case ed.TrackerLost():
                 should_restart = tracker.record_loss()
-                self._record(
-                    now_ns, "tracking lost", peer, f"its process {event.reason}; odometry starts again"
-                )
+                reason = f"its process {event.reason}; odometry starts again"
+                self._record("tracking lost", peer, reason, throttled=False)
                 if should_restart:
-                    self._emit(tracker.start())
+                    self._effects.extend(tracker.start())
                 else:  # it sends a hello again after a while
-                    self._send(peer_id, wire.Refused(f"its tracking process {event.reason}"))
+                    self._send(peer.id, wire.Refused(f"its tracking process {event.reason}"))
 
-    def _on_agent_message(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
-        if isinstance(message, wire.Status):
-            peer.status.update(message, now_ns)
-            return
-        if not isinstance(message, Frame):
-            peer.counts["unexpected"] += 1
-            return
-        try:
-            self._emit(self._trackers[peer.key].offer_frame(message, now_ns))
-        except ValueError as error:
-            self._count_bad_message(peer, str(error), now_ns)
+    def _on_agent_message(self, peer: Peer, message: wire.Message) -> None:
+        match message:
+            case wire.Status():
+                peer.status.update(message, self._now_ns)
+            case Frame():
+                try:
+                    self._effects.extend(self._trackers[peer.key].offer_frame(message, self._now_ns))
+                except ValueError as error:
+                    self._count_bad_message(peer, str(error))
+            case _:
+                peer.counts["unexpected"] += 1
 
-    def _objection(self, event: PeerMessageReceived, hello: wire.Hello, now_ns: int) -> str | None:
+    def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
         existing = self._registry.get(event.peer_id)
-        if existing is not None:
-            return super()._objection(event, hello, now_ns) or self._tracking_objection(
-                existing.key, hello.rig
-            )
         return (
-            super()._objection(event, hello, now_ns)
-            or rig_check.rig_problem(hello.rig)
-            or self._tracking_objection(None, hello.rig)
+            super()._objection(event, hello)
+            or (rig_check.rig_problem(hello.rig) if existing is None else None)
+            or self._tracking_objection(None if existing is None else existing.key, hello.rig)
         )
 
     def _tracking_objection(self, key: str | None, rig: Rig) -> str | None:
         """Return why no tracker can start for this run (key None: a new run); None if one can."""
-        running = [
-            tracker.rig for other, tracker in self._trackers.items() if tracker.is_running and other != key
-        ]
-        return None if self._capacity is None else self._capacity.objection(running, rig)
+        others = [one.rig for one in self._trackers.values() if one.is_running and one.key != key]
+        return None if self._capacity is None else self._capacity.objection(others, rig)
 
-    def _add_run(self, peer_id: bytes, peer: Peer) -> None:
-        self._registry.add(peer_id, peer)
+    def _join(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> Peer:
+        peer = super()._join(event, hello)
         window = FrameWindow(self._config.stream.window)
-        self._trackers[peer.key] = RemoteTracker(peer.key, peer.hello.rig, window)
+        self._trackers[peer.key] = RemoteTracker(peer.key, hello.rig, window)
+        return peer
 
-    def _forget(self, peer: Peer, was_latest: bool) -> None:
-        super()._forget(peer, was_latest)
+    def _forget(self, peer: Peer) -> None:
+        super()._forget(peer)
         del self._trackers[peer.key]
 
-    def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
+    def _welcome(self, peer: Peer) -> None:
         """Send the welcome now, or as soon as the tracker is ready."""
         tracker = self._trackers[peer.key]
-        self._emit(tracker.start())
+        self._effects.extend(tracker.start())
         if tracker.is_ready:
-            super()._welcome(peer_id, peer, now_ns)
+            super()._welcome(peer)
 
-    def _capacity_objection(self, peer: Peer, now_ns: int) -> str | None:
-        return super()._capacity_objection(peer, now_ns) or self._tracking_objection(peer.key, peer.hello.rig)
+    def _capacity_objection(self, peer: Peer) -> str | None:
+        return super()._capacity_objection(peer) or self._tracking_objection(peer.key, peer.hello.rig)
 
-    def _readmit(self, peer: Peer, now_ns: int) -> None:
-        super()._readmit(peer, now_ns)
-        self._emit(self._trackers[peer.key].start())
+    def _readmit(self, peer: Peer) -> None:
+        super()._readmit(peer)
+        self._effects.extend(self._trackers[peer.key].start())
 
-    def _mark_gone(self, peer: Peer, event: str, reason: str, now_ns: int) -> None:
-        super()._mark_gone(peer, event, reason, now_ns)
-        self._emit(self._trackers[peer.key].stop())
-
-    def _emit(self, effects: Sequence[TrackerEffect]) -> None:
-        self._effects.extend(effects)
+    def _mark_gone(self, peer: Peer, event: str, reason: str) -> None:
+        super()._mark_gone(peer, event, reason)
+        self._effects.extend(self._trackers[peer.key].stop())
 
     def _peer_report(self, peer: Peer) -> dict[str, Any]:
         return super()._peer_report(peer) | self._trackers[peer.key].report()

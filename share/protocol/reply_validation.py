@@ -1,75 +1,14 @@
-"""Plausibility checks on an edge's messages, and limits on the lines that its faults may print."""
+"""Sessions and revisions of an edge as its agent sees them; limits on the lines that faults may print."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 
-from share.protocol.agent_ledger import KeyframeLedger
+from share.errors import printable
 from share.timing import TokenBucket
-from share.types import Correction
-from share.wire import messages as m
-
-
-class ReplyValidator:
-    """Checks the messages of an edge against the agent's ledger and the edge sessions that it knows.
-
-    Rejected messages are counted; each kind is printed once.
-    """
-
-    def __init__(
-        self,
-        ledger: KeyframeLedger,
-        sessions: EdgeSessions,
-        line_limiter: LineLimiter,
-        print_line: Callable[[str], None],
-    ) -> None:
-        """line_limiter: limits the lines given to `print_line`."""
-        self.bad_messages = 0
-        self._ledger, self._sessions = ledger, sessions
-        self._line_limiter, self._print_line = line_limiter, print_line
-
-    def report_invalid(self, text: str, now_ns: int) -> None:
-        """Count a message that no edge should send, and print it if new."""
-        self.bad_messages += 1
-        if (line := self._line_limiter.admit_once(text, now_ns)) is not None:
-            self._print_line(line)
-
-    def accepts_welcome(self, welcome: m.Welcome, now_ns: int) -> bool:
-        """Return whether this welcome is of the present session, or of a new one that was asked for."""
-        if self._sessions.is_past(welcome.session):
-            return False
-        if self._reports_unsent("a welcome", now_ns, welcome.next_keyframe - 1):
-            return False
-        if self._sessions.is_unsolicited(welcome.session):
-            self.report_invalid("the edge sent a welcome without a hello; ignored", now_ns)
-            return False
-        return True
-
-    def accepts_correction(self, correction: Correction, now_ns: int) -> bool:
-        """Return whether it refers to keyframes that the edge can have."""
-        return not self._reports_unsent(
-            "a correction", now_ns, correction.segment_keyframe, correction.answered_keyframe
-        )
-
-    def take_ack(self, ack: m.Ack, now_ns: int) -> None:
-        """Apply an acknowledgement to the ledger. One of an earlier session is rejected, but is no fault."""
-        if not self._ledger.acknowledge(ack):
-            self._reports_unsent("an acknowledgement", now_ns, ack.next_keyframe - 1, *ack.buffered)
-
-    def _reports_unsent(self, message_name: str, now_ns: int, *keyframes: int) -> bool:
-        unsent = max(keyframes, default=-1) >= self._ledger.next_unsent_id
-        if unsent:
-            self.report_invalid(
-                f"the edge sent {message_name} of keyframes that were never sent; ignored", now_ns
-            )
-        return unsent
-
 
 _MAX_SESSIONS = 16  # remembered sessions: their messages may still be in flight
-_MAX_REORDERING = (
-    1000  # corrections that a network may reorder; a larger step back is a restart of the counter
-)
+_MAX_REORDERING = 1000  # corrections; a larger step back is a restart of the counter
 
 
 class EdgeSessions:
@@ -97,6 +36,7 @@ class EdgeSessions:
         return session != self.session and session in self._recent
 
     def is_unsolicited(self, session: int) -> bool:
+        """Return whether this is a new session that no hello asked for."""
         return session != self.session and not self._welcome_expected
 
     def begin(self, session: int) -> None:
@@ -150,7 +90,7 @@ class LineLimiter:
             self._suppressed += 1
             return None
         suppressed, self._suppressed = self._suppressed, 0
-        line = "".join(c if c.isprintable() else "?" for c in text[:_MAX_LINE_LENGTH])
+        line = printable(text[:_MAX_LINE_LENGTH])
         return f"{line} ({suppressed} lines before this were suppressed)" if suppressed else line
 
     def admit_once(self, text: str, now_ns: int) -> str | None:

@@ -1,16 +1,20 @@
-"""Frames streamed to a peer that answers them in order: a bounded window, in which the newest frame waits."""
+"""The agent whose frames the edge tracks (policy streamed): it sends them through a bounded window, in which
+the newest frame waits."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
-from share.config import StreamConfig
+from share.config import Config, StreamConfig
 from share.protocol import agent_events as ev
+from share.protocol.agent import Agent
 from share.timing import seconds_to_ns
 from share.types import Frame, ImuBatch
-from share.wire.messages import MAX_IMU_SAMPLES, RemoteTrackingResult
+from share.wire.codec import encode, message_bytes
+from share.wire.messages import MAX_IMU_SAMPLES, Hello, Message, RemoteTrackingResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +91,7 @@ class FrameWindow:
 
 
 class FrameStreamer:
-    """The agent's side of remote tracking: frames up, poses down. A frame without an answer was not
-    tracked."""
+    """Frames up, poses down. A frame without an answer was not tracked."""
 
     def __init__(self, config: StreamConfig) -> None:
         self._timeout_ns = seconds_to_ns(config.patience_s)
@@ -153,3 +156,49 @@ class FrameStreamer:
         unanswered: sent, but not answered in time."""
         named = {name: self._counts[name] for name in ("arrived", "streamed", "answered", "drop_link")}
         return named | {"drop_frame": self._window.dropped, "unanswered": self._window.unanswered}
+
+
+class StreamingAgent(Agent):
+    """An `Agent` whose frames the edge tracks. It takes `FrameArrived` and sends neither poses nor
+    keyframes."""
+
+    offline_text = "no tracking without the edge"
+    slow_text = "the edge does not answer"
+    makes_keyframes = False
+
+    def __init__(self, hello: Hello, config: Config) -> None:
+        super().__init__(hello, config)
+        self._streamer = FrameStreamer(config.stream)
+
+    def report(self) -> dict[str, Any]:
+        return super().report() | self._streamer.report()
+
+    def _on_frame_arrived(self, event: ev.FrameArrived) -> None:
+        self._status_reporter.add_image(event.arrived_ns)
+        self._streamer.add_frame(event, self._is_connected)
+
+    def _on_other_message(self, message: Message) -> None:
+        if not isinstance(message, RemoteTrackingResult):
+            super()._on_other_message(message)
+        elif (frame := self._streamer.take_result(message, self._now_ns)) is not None:
+            self._effects.append(ev.FrameTrackedRemotely(frame, message.is_consistent))
+            self._on_frame_tracked(frame)
+
+    def _restart(self, pending: int) -> str:
+        self._streamer.reset()
+        return "tracking starts again"
+
+    @property
+    def _is_idle(self) -> bool:
+        return self._streamer.is_idle
+
+    def _send_data(self) -> None:
+        if (frame := self._streamer.next_frame(self._now_ns)) is not None:
+            frames = encode(frame)
+            self._counts["bytes_up"] += message_bytes(frames)
+            self._effects.append(ev.SendFrameToEdge(frame.index, frames))
+
+    def _on_send_failed(self, effect: ev.SendToEdge | ev.SendFrameToEdge) -> None:
+        super()._on_send_failed(effect)
+        if isinstance(effect, ev.SendFrameToEdge):
+            self._streamer.cancel(effect.index)

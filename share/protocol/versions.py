@@ -11,11 +11,9 @@ from collections.abc import Sequence
 
 from share import __version__
 from share.errors import VersionError
-from share.timing import Throttle
-from share.wire.codec import OLDEST_VERSION, WIRE_VERSION, Bytes, decode, encode, message_code
+from share.wire.codec import MESSAGE_CODES, OLDEST_VERSION, WIRE_VERSION, Bytes, decode, encode
 from share.wire.messages import Ping, Pong
 
-_REFUSE_HZ = 0.5  # refusals a second per peer, at most
 _MAX_UNANSWERED = 2  # unanswered hellos before older versions are tried
 _OLDER_VERSIONS = range(OLDEST_VERSION, WIRE_VERSION)
 
@@ -25,24 +23,16 @@ def upgrade_advice(edge_version: int, agent_version: int) -> str:
     return "upgrade the agent" if agent_version < edge_version else "upgrade the edge"
 
 
-class VersionRefusals:
-    """The edge's refusals of peers with other wire versions."""
+def refusal_of_version(error: VersionError) -> str | None:
+    """Return why an edge refuses a message of another version; None for a ping, which stays unanswered.
 
-    def __init__(self) -> None:
-        self._throttle = Throttle(_REFUSE_HZ, 1.0)
-
-    def refusal(self, peer_id: bytes, error: VersionError, now_ns: int) -> str | None:
-        """Return the reason for a refusal; None if it was just sent, or for a ping.
-
-        A ping of an older version is a newer agent's probe: an answer would mean an edge of that version.
-        """
-        if error.code == message_code(Ping) or self._throttle.admit(peer_id, now_ns) is None:
-            return None
-        own_text = f"this edge is SHARE {__version__} (wire {WIRE_VERSION})"
-        return (
-            f"{own_text}, this agent speaks wire {error.version}: "
-            f"{upgrade_advice(WIRE_VERSION, error.version)}"
-        )
+    A ping of an older version is a newer agent's probe: an answer would mean an edge of that version.
+    """
+    if error.code == MESSAGE_CODES[Ping]:
+        return None
+    advice = upgrade_advice(WIRE_VERSION, error.version)
+    own_text = f"this edge is SHARE {__version__} (wire {WIRE_VERSION})"
+    return f"{own_text}, this agent speaks wire {error.version}: {advice}"
 
 
 class EdgeVersionProbe:

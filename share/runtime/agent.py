@@ -33,6 +33,7 @@ from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
 from share.protocol.reply_validation import FaultDeduplicator
+from share.protocol.streaming import StreamingAgent
 from share.runtime.arrivals import (
     FrameArrivals,
     LateFrameDropper,
@@ -104,7 +105,7 @@ class AgentRun:
         self._source, self._settings = source, settings
         self._notify, self._show, self._verbose = notify, show, verbose
         self._guard = FaultGuard(notify)
-        self._state_machine = Agent(hello, settings)
+        self._state_machine = (StreamingAgent if hello.streams_frames else Agent)(hello, settings)
         check_trackable(source.name, source.rig)  # before files are made and the edge sees this agent
         self._shared = _Shared()
         self._files, self._output_writer = AgentFiles(out, notify), OutputWriter(out, notify)
@@ -263,7 +264,7 @@ class AgentRun:
                 if not self._link.send(effect.frames):
                     self._handle(ev.SendFailed(effect))
             case ev.FrameTrackedRemotely():
-                self._log.add_result(effect.frame.new_segment, effect.is_consistent, effect.waiting_for)
+                self._log.add_result(effect.frame.new_segment, effect.is_consistent, effect.frame.waiting_for)
             case ev.LocalisedPose():
                 self._publish_pose(effect)
             case ev.FrameDone():

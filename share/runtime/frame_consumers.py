@@ -21,6 +21,7 @@ from share.runtime.source import Source
 from share.types import Frame
 
 _POLL_S = 0.05
+TRACKER_START_S = 20.0  # longest wait of a recording for the edge's tracker before it plays
 
 Post = Callable[[ev.AgentEvent], None]
 
@@ -122,7 +123,7 @@ class RemoteTracking(FrameConsumer):
         stop: threading.Event,
         notify: Callable[[str], None],
     ) -> None:
-        self._max_wait_s = 0.0 if isinstance(source, LiveSource) else settings.stream.begin_s
+        self._max_wait_s = 0.0 if isinstance(source, LiveSource) else TRACKER_START_S
         self._log, self._stop, self._notify = log, stop, notify
         self._free_slots = threading.Semaphore(READ_AHEAD)  # frames between the threads: policy block
         self._can_start = threading.Event()

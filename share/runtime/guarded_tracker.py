@@ -9,7 +9,7 @@ from functools import partial
 from typing import TypeVar
 
 from share.config import Config
-from share.errors import ShareError
+from share.errors import ShareError, printable
 from share.geometry.camera import ImuBias, Rig
 from share.odometry.track_result import TrackResult
 from share.runtime.pipeline import make_tracker
@@ -50,7 +50,7 @@ class FaultGuard:
         )
         if kind not in self._reported and len(self._reported) < _MAX_FAILURE_KINDS:
             self._reported.add(kind)
-            text = "".join(c if c.isprintable() else "?" for c in str(error))[:200]
+            text = printable(str(error))[:200]
             self._notify(f"{kind}: {text}; this step is skipped and the run goes on")
 
 

@@ -15,7 +15,7 @@ from share.mapping.map_changes import StoredMap
 from share.mapping.mapper import Mapper
 from share.mapping.steps import MapEvent, SolveStep
 from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, MapperResult, SetCredential, SetPresence
-from share.protocol.edge_records import FairQueue
+from share.protocol.keyframe_intake import FairQueue
 from share.runtime.worker_process import END, Inbox, WorkerProcess
 from share.startup import HeapTrimmer
 from share.timing import Backoff

@@ -43,7 +43,10 @@ METRICS = (
         "share_edge_pose_age_seconds", "Age of the newest pose.", "pose_age_ms", *_PER_AGENT, scale=1e-3
     ),
     MetricSpec(
-        "share_edge_last_message_age_seconds", "Time since the agent's last message.", "heard_s", *_PER_AGENT
+        "share_edge_last_message_age_seconds",
+        "Time since the agent's last message.",
+        "last_received_s",
+        *_PER_AGENT,
     ),
     MetricSpec("share_edge_keyframes_total", "Keyframes applied.", "keyframes", *_PER_AGENT),
     MetricSpec("share_edge_poses_total", "Poses received.", "poses", *_PER_AGENT),

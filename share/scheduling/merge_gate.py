@@ -6,7 +6,7 @@ IMWUT 10(3) 97, 2026.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
 from functools import lru_cache
 
 import numpy as np
@@ -17,38 +17,7 @@ from share.scheduling.overlap import Frustum, SampledFrustum, overlap_volumes
 from share.scheduling.policies import POLICIES
 from share.types import F64
 
-
-@dataclass(frozen=True)
-class MergeGateState:
-    """eagerness: alpha_m. window: N. overlap_volumes: of the last completed merges, m^3, oldest first."""
-
-    eagerness: float
-    window: int
-    overlap_volumes: tuple[float, ...] = ()
-
-    @classmethod
-    def from_config(cls, config: ControlConfig) -> MergeGateState:
-        return cls(config.eagerness, config.merges)
-
-    def after_merge(self, volume: float) -> MergeGateState:
-        """Return the state after a merge with this overlap, m^3."""
-        return MergeGateState(self.eagerness, self.window, (*self.overlap_volumes, volume)[-self.window :])
-
-    def skip_probability(self, volume: float, same_map: bool) -> float:
-        """Return P_skip of a merge with this overlap, m^3. same_map: both sides are in one map already.
-
-        0 between two maps, and without completed merges.
-        """
-        total = sum(self.overlap_volumes)
-        if not same_map or total <= 0:
-            return 0.0
-        return max(0.0, 1 - self.eagerness * volume * len(self.overlap_volumes) / total)
-
-    def should_skip(self, volume: float, same_map: bool, draw: float) -> bool:
-        """Return whether to skip the merge. draw: uniform in [0, 1)."""
-        return draw < self.skip_probability(volume, same_map)
-
-
+INTERVAL_M = 0.5  # spacing of the points at which overlap is sampled
 _CACHED_CAMERAS = 64  # sampled frusta kept; agents have few kinds of camera
 
 
@@ -57,12 +26,13 @@ class MergeGate:
 
     def __init__(self, config: ControlConfig, policy: str) -> None:
         self._is_enabled = POLICIES[policy].has_merge_gate
-        self._state = MergeGateState.from_config(config)
-        self._rng = np.random.default_rng(config.gate_seed)
+        self._eagerness = config.eagerness  # alpha_m
+        self._volumes: deque[float] = deque(maxlen=config.merges)  # of the last N completed merges, m^3
+        self._rng = np.random.default_rng(config.random_seed)
 
         @lru_cache(_CACHED_CAMERAS)
         def sampled_frustum(camera: Camera) -> SampledFrustum:
-            return SampledFrustum(Frustum.from_camera(camera, config.near_m, config.far_m), config.interval_m)
+            return SampledFrustum(Frustum.from_camera(camera, config.near_m, config.far_m), INTERVAL_M)
 
         self._sampled_frustum = sampled_frustum
 
@@ -78,14 +48,24 @@ class MergeGate:
             )[0]
         )
 
+    def skip_probability(self, volume: float, same_map: bool) -> float:
+        """Return P_skip of a merge with this overlap, m^3. same_map: both sides are in one map already.
+
+        0 between two maps, without completed merges, and without a gate.
+        """
+        total = sum(self._volumes)
+        if not self._is_enabled or not same_map or total <= 0:
+            return 0.0
+        return max(0.0, 1 - self._eagerness * volume * len(self._volumes) / total)
+
     def skip_reason(self, volume: float, same_map: bool) -> str:
-        """Return why a merge with this overlap is skipped, for a person; empty if it is not. same_map: both
-        sides are in one map already."""
-        if not self._is_enabled or not self._state.should_skip(volume, same_map, float(self._rng.random())):
-            return ""
-        probability = self._state.skip_probability(volume, same_map)
-        return f"small gain: views overlap by {volume:.1f} m³, skipped with probability {probability:.0%}"
+        """Return why a merge with this overlap is skipped, for a person; empty if it is not. Parameters as in
+        `skip_probability`."""
+        probability = self.skip_probability(volume, same_map)
+        if self._is_enabled and self._rng.random() < probability:
+            return f"small gain: views overlap by {volume:.1f} m³, skipped with probability {probability:.0%}"
+        return ""
 
     def record_merge(self, volume: float) -> None:
         """Record a completed merge with this overlap, m^3."""
-        self._state = self._state.after_merge(volume)
+        self._volumes.append(volume)

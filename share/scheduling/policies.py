@@ -1,24 +1,64 @@
 """Scheduling policies: the keyframe rate of each agent, and whether merges are gated. One class a policy.
 
-Source: SHARE, IMWUT 10(3) 97, 2026, and its baselines; see docs/understand/scheduling.md.
+The PID controller of policy share makes one step per evaluation:
+
+    e = Q* - Q;  P = Kp e;  I = clip(I + Ki e dt, +-I_max)
+    d = alpha (e - e_prev)/dt + (1 - alpha) d_prev;  D = Kd d
+    R = clip(R_prev + P + I + D, R_min, R_max)
+
+Source: SHARE, IMWUT 10(3) 97, 2026, and its baselines; see docs/understand/scheduling.md. Filtered
+derivative and bounded integral: Astrom and Hagglund, *Advanced PID Control* (2006). Each step adds to R, so
+a persistent error drives the rate to a bound.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from share.config import ControlConfig
-from share.scheduling import pid
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe, qoe_factors
 from share.timing import RingBuffer
 from share.types import AgentKind
 from share.wire.messages import Evaluation
+
+INTEGRAL_MAX_HZ = 0.1  # I_max: the past never outweighs the present
+GAP_S = 5.0  # without an evaluation for longer, the derivative is reset and the integral held
+
+
+@dataclass(frozen=True)
+class PidState:
+    """State of one agent's controller after an evaluation. integral_hz: I. derivative: d, 1/s. updated_ns:
+    time of the evaluation; None before the first."""
+
+    rate_hz: float
+    error: float = 0.0
+    integral_hz: float = 0.0
+    derivative: float = 0.0
+    updated_ns: int | None = None
+
+
+def pid_step(state: PidState, error: float, now_ns: int, gains: ControlConfig) -> PidState:
+    """Return the state after an evaluation at `now_ns`. error: target minus QoE, finite.
+
+    The first evaluation, one with dt <= 0 and one after a gap have no derivative: d = 0, I is held.
+    """
+    dt = 0.0 if state.updated_ns is None else (now_ns - state.updated_ns) / 1e9
+    integral, derivative = state.integral_hz, 0.0
+    if 0 < dt <= GAP_S:
+        integral = _clip(integral + gains.ki * error * dt, -INTEGRAL_MAX_HZ, INTEGRAL_MAX_HZ)
+        derivative = gains.alpha * (error - state.error) / dt + (1 - gains.alpha) * state.derivative
+    rate = state.rate_hz + gains.kp * error + integral + gains.kd * derivative
+    return PidState(_clip(rate, gains.rate_min_hz, gains.rate_max_hz), error, integral, derivative, now_ns)
+
+
+def _clip(value: float, low: float, high: float) -> float:
+    return min(high, max(low, value))
+
 
 _MINUTE_NS = 60_000_000_000
 _BASE_DELAY_MINUTES = 10  # after a change to a slower network the old minimum expires
@@ -41,11 +81,7 @@ class BaseDelay:
     def with_delay(self, delay_ms: float, now_ns: int) -> BaseDelay:
         """Return the base delay with one more measurement, at `now_ns`."""
         minute = now_ns // _MINUTE_NS
-        minima = {
-            old_minute: minimum
-            for old_minute, minimum in self.minima.items()
-            if minute - old_minute < _BASE_DELAY_MINUTES
-        }
+        minima = {old: ms for old, ms in self.minima.items() if minute - old < _BASE_DELAY_MINUTES}
         minima[minute] = min(delay_ms, minima.get(minute, math.inf))
         return BaseDelay(minima)
 
@@ -106,7 +142,7 @@ class LinearPolicy(Policy):
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
     ) -> float | None:
-        dropped = min(1.0, max(0.0, (delay_ms - ACCEPTED_DELAY_MS) / (_FULL_DROP_MS - ACCEPTED_DELAY_MS)))
+        dropped = _clip((delay_ms - ACCEPTED_DELAY_MS) / (_FULL_DROP_MS - ACCEPTED_DELAY_MS), 0.0, 1.0)
         return max(self._config.rate_min_hz, self._config.rate_max_hz * (1 - dropped))
 
 
@@ -122,8 +158,7 @@ class SharePolicy(Policy):
 
     def __init__(self, config: ControlConfig) -> None:
         super().__init__(config)
-        self._gains = pid.PidGains.from_config(config)
-        self._states: dict[str, pid.PidState] = {}
+        self._states: dict[str, PidState] = {}
         self._base_delays: dict[str, BaseDelay] = {}
 
     def rate(
@@ -136,8 +171,8 @@ class SharePolicy(Policy):
         error = parameters.target - math.prod(parts)
         if self._config.attribution and error > 0:
             error *= parts.error_attribution
-        state = self._states.get(agent, pid.PidState(self._gains.rate_max_hz))
-        self._states[agent] = pid.step(state, error, now_ns, self._gains)
+        state = self._states.get(agent, PidState(self._config.rate_max_hz))
+        self._states[agent] = pid_step(state, error, now_ns, self._config)
         return self._states[agent].rate_hz
 
     def forget(self, agent: str) -> None:
@@ -146,9 +181,8 @@ class SharePolicy(Policy):
 
     def _avoidable_delay_ms(self, agent: str, delay_ms: float, now_ns: int) -> float:
         """Return the delay without the part of the base delay above 20 ms."""
-        base = self._base_delays[agent] = self._base_delays.get(agent, BaseDelay()).with_delay(
-            delay_ms, now_ns
-        )
+        base = self._base_delays.get(agent, BaseDelay()).with_delay(delay_ms, now_ns)
+        self._base_delays[agent] = base
         return delay_ms - max(0.0, base.ms - ACCEPTED_DELAY_MS)
 
     def _qoe_parameters(self, agent: str, kind: AgentKind) -> QoeParameters:
@@ -169,11 +203,8 @@ class RandomPolicy(SharePolicy):
     same for all agents."""
 
     def __init__(self, config: ControlConfig) -> None:
-        super().__init__(config)
         kp, ki, kd = np.random.default_rng(config.random_seed).uniform(0.0, 2.0, 3).tolist()
-        self._gains = dataclasses.replace(
-            self._gains, kp=kp * config.kp, ki=ki * config.ki, kd=kd * config.kd
-        )
+        super().__init__(replace(config, kp=kp * config.kp, ki=ki * config.ki, kd=kd * config.kd))
 
 
 POLICIES: dict[str, type[Policy]] = {
@@ -202,8 +233,6 @@ class RatedEvaluation(NamedTuple):
 class RateScheduler:
     """A policy and the history of its decisions, for one edge. Agents go by name; a new run starts anew."""
 
-    REPORT_FIELDS: ClassVar = ("rate_hz", "qoe")
-
     def __init__(self, config: ControlConfig, policy: str) -> None:
         self._config, self._policy = config, POLICIES[policy](config)
         self.max_rate_hz = config.rate_max_hz if self._policy.limits_rate else None  # None: no limit
@@ -225,26 +254,21 @@ class RateScheduler:
     ) -> float | None:
         """Return the rate to send to the agent, Hz; None: no limit. t_s: time for the report."""
         rate_hz = self._policy.rate(agent, kind, evaluation.delay_ms, evaluation.error_cm, now_ns)
-        value = qoe(
-            evaluation.delay_ms, evaluation.error_cm, QoeParameters.from_config(self._config, kind, agent)
-        )
+        delay_ms, error_cm = evaluation.delay_ms, evaluation.error_cm
+        value = qoe(delay_ms, error_cm, QoeParameters.from_config(self._config, kind, agent))
         rated = RatedEvaluation(
-            *(_rounded(x) for x in (t_s, evaluation.delay_ms, evaluation.error_cm, value, rate_hz))
+            *(None if x is None else round(x, 4) for x in (t_s, delay_ms, error_cm, value, rate_hz))
         )
         self._history.setdefault(agent, RingBuffer(len(rated), _MAX_SERIES)).add(rated)
         self._latest[agent] = rated
         return rate_hz
 
-    def report(self, agent: str) -> dict[str, Any]:
-        """Return `rate_hz` and `qoe` for edge.json, the newest of the present run."""
-        rated = self._latest.get(agent)
-        return {name: None if rated is None else getattr(rated, name) for name in self.REPORT_FIELDS}
+    def report(self, agent: str | None) -> dict[str, float | None]:
+        """Return `rate_hz` and `qoe` for edge.json, the newest of the present run; None: no run."""
+        rated = None if agent is None else self._latest.get(agent)
+        return {name: None if rated is None else getattr(rated, name) for name in ("rate_hz", "qoe")}
 
     def series(self, agent: str) -> dict[str, list[float | None]]:
         """Return `series` for edge.json: a list for each field of `RatedEvaluation`."""
         rated = self._history.get(agent, RingBuffer(len(RatedEvaluation._fields), 0))
         return {name: rated.column(k) for k, name in enumerate(RatedEvaluation._fields)}
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)

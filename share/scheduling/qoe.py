@@ -36,15 +36,13 @@ class QoeParameters:
         """Return the parameters of an agent: its entry in `control.agents`, else the defaults of its form."""
         override = config.agents.get(agent, AgentQoe())
         form = AgentKind(override.form or kind)
-        ar = form is AgentKind.AR
-        return cls(
-            form,
-            _or_default(override.beta, config.ar_beta if ar else config.robot_beta),
-            _or_default(override.gamma, config.ar_gamma if ar else config.robot_gamma),
-            _or_default(override.theta_ms, config.robot_theta_ms),
-            _or_default(override.target, config.ar_target if ar else config.robot_target),
-            config.signed_penalty,
-        )
+        if form is AgentKind.AR:
+            defaults = (config.ar_beta, config.ar_gamma, config.robot_theta_ms, config.ar_target)
+        else:
+            defaults = (config.robot_beta, config.robot_gamma, config.robot_theta_ms, config.robot_target)
+        own = (override.beta, override.gamma, override.theta_ms, override.target)
+        beta, gamma, theta_ms, target = (b if a is None else a for a, b in zip(own, defaults, strict=True))
+        return cls(form, beta, gamma, theta_ms, target, config.signed_penalty)
 
 
 def accuracy(error_cm: float | None) -> float:
@@ -89,7 +87,3 @@ def qoe_factors(delay_ms: float, error_cm: float | None, parameters: QoeParamete
         if parameters.form is AgentKind.AR
         else QoeFactors(quality_factor, penalty_factor)
     )
-
-
-def _or_default(override: float | None, default: float) -> float:
-    return default if override is None else override

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite, prod
 from operator import attrgetter
@@ -20,7 +20,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from share.errors import VersionError, WireError
+from share.errors import VersionError, WireError, printable
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import (
     DESCRIPTOR_BYTES,
@@ -83,36 +83,14 @@ _decode_version = msgspec.msgpack.Decoder(_VersionHeader).decode
 _decode_header = msgspec.msgpack.Decoder(_Header).decode
 
 
-@dataclass(frozen=True)
-class _ScalarFields:
-    """Scalar fields by attribute path, checked both when encoding and when decoding."""
-
-    names: tuple[str, ...]
-    getters: tuple[Callable[[object], Any], ...]
-    decoder: msgspec.msgpack.Decoder[Any]
-
-    @staticmethod
-    def from_fields(**fields: Any) -> _ScalarFields:
-        decoder = msgspec.msgpack.Decoder(tuple[tuple(fields.values())])  # type: ignore[misc]
-        return _ScalarFields(tuple(map(_field_name, fields)), tuple(map(attrgetter, fields)), decoder)
-
-    def encode(self, message: object) -> bytes:
-        raw = _encoder.encode([get(message) for get in self.getters])
-        self.decode(raw)
-        return raw
-
-    def decode(self, raw: msgspec.Raw | bytes) -> dict[str, Any]:
-        values = self.decoder.decode(raw)
-        for value in values:
-            if isinstance(value, float) and not isfinite(value):
-                raise ValueError("a number is not finite")
-        return dict(zip(self.names, values, strict=True))
+def _field_name(path: str) -> str:
+    return path.rpartition(".")[2]
 
 
 @dataclass(frozen=True)
-class _ArrayField:
-    """One array field. None in the shape: any length up to `max_length`. An absent optional array has the
-    shape (0,)."""
+class _Array:
+    """One array of a message, by its attribute path. None in the shape: any length up to `max_length`. An
+    absent optional array has the shape (0,)."""
 
     path: str
     dtype: str
@@ -134,10 +112,10 @@ class _ArrayField:
         return np.ascontiguousarray(() if absent else value, _DTYPES[self.dtype])
 
     def decode(self, dtype: str, shape: tuple[int, ...], frame: Bytes) -> NDArray[Any] | None:
-        if dtype not in _DTYPES:
-            raise ValueError(f"{self.path}: unknown dtype {dtype[:8]!r}")
-        if dtype != self.dtype or not self._is_valid_shape(shape):
-            raise ValueError(f"{self.path}: {dtype} of shape {shape[:4]}, expected {self.dtype} {self.shape}")
+        absent = self.optional and shape == (0,)
+        if dtype != self.dtype or not (absent or self._matches(shape)):
+            expected = f"expected {self.dtype} {self.shape}"
+            raise ValueError(f"{self.path}: {dtype[:8]} of shape {shape[:4]}, {expected}")
         size = prod(shape) * _DTYPES[dtype].itemsize
         if size > MAX_IMAGE_BYTES:
             raise ValueError(f"{self.path}: {size} bytes, at most {MAX_IMAGE_BYTES}")
@@ -145,30 +123,67 @@ class _ArrayField:
         if data.nbytes != size:
             raise ValueError(f"{self.path}: {data.nbytes} bytes, its shape needs {size}")
         if not size:
-            return None if self._is_absent(shape) else np.empty(shape, _DTYPES[dtype])
+            return None if absent else np.empty(shape, _DTYPES[dtype])
         # copied only if unaligned, as short frames are in their message
         array = np.frombuffer(data, _DTYPES[dtype]).reshape(shape)
         return array if array.flags.aligned else array.copy()
 
-    def _is_valid_shape(self, shape: tuple[int, ...]) -> bool:
-        return shape == self.shape or self._is_absent(shape) or self._shape_matches(shape)
-
-    def _shape_matches(self, shape: tuple[int, ...]) -> bool:
+    def _matches(self, shape: tuple[int, ...]) -> bool:
         return len(shape) == len(self.shape) and all(
             0 <= have <= self.max_length if want is None else have == want
             for want, have in zip(self.shape, shape, strict=True)
         )
 
-    def _is_absent(self, shape: tuple[int, ...]) -> bool:
-        return self.optional and shape == (0,)
+
+class _Layout:
+    """Layout of one message type. scalars: types by attribute path, checked both when encoding and when
+    decoding. build: makes the message of all its fields by name."""
+
+    def __init__(self, code: int, build: Callable[..., m.Message], *arrays: _Array, **scalars: Any) -> None:
+        self.code, self.build, self.arrays = code, build, arrays
+        self._names, self._getters = tuple(map(_field_name, scalars)), tuple(map(attrgetter, scalars))
+        self._decoder = msgspec.msgpack.Decoder(tuple[tuple(scalars.values())])  # type: ignore[misc]
+
+    def encode_scalars(self, message: object) -> msgspec.Raw:
+        raw = _encoder.encode([get(message) for get in self._getters])
+        self.decode_scalars(raw)
+        return msgspec.Raw(raw)
+
+    def decode_scalars(self, raw: msgspec.Raw | bytes) -> dict[str, Any]:
+        values = self._decoder.decode(raw)
+        for value in values:
+            if isinstance(value, float) and not isfinite(value):
+                raise ValueError("a number is not finite")
+        return dict(zip(self._names, values, strict=True))
+
+    def decode_arrays(self, header: _Header, frames: Sequence[Bytes]) -> dict[str, NDArray[Any] | None]:
+        received, declared, expected = len(frames) - 1, len(header.arrays), len(self.arrays)
+        if not received == declared == expected:
+            raise ValueError(f"{received} array frames, {declared} declared, {expected} expected")
+        return {
+            array.name: array.decode(dtype, shape, frame)
+            for array, (dtype, shape), frame in zip(self.arrays, header.arrays, frames[1:], strict=True)
+        }
 
 
-def _image_field(path: str, dtype: str = "|u1", optional: bool = False) -> _ArrayField:
-    return _ArrayField(path, dtype, (None, None), optional, m.MAX_IMAGE_SIDE)
+def _pose(path: str, optional: bool = False) -> _Array:
+    return _Array(path, "<f8", (4, 4), optional)
 
 
-def _imu_field(path: str, dtype: str, *shape: int) -> _ArrayField:
-    return _ArrayField(path, dtype, (None, *shape), max_length=m.MAX_IMU_SAMPLES)
+def _image(path: str, dtype: str = "|u1", optional: bool = False) -> _Array:
+    return _Array(path, dtype, (None, None), optional, m.MAX_IMAGE_SIDE)
+
+
+def _imu(path: str, dtype: str, *shape: int) -> _Array:
+    return _Array(path, dtype, (None, *shape), max_length=m.MAX_IMU_SAMPLES)
+
+
+def _build_hello(*, name: str, kind: AgentKind, run_id: int, streams_frames: bool, **rig: Any) -> m.Hello:
+    return m.Hello(name, kind, run_id, Rig(**rig), streams_frames)
+
+
+def _build_keyframe(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
+    return Keyframe(**fields, view=View(uv, points, descriptors))
 
 
 def _build_frame(*, stamps_ns: I64, gyro: F64, accel: F64, **fields: Any) -> Frame:
@@ -189,33 +204,7 @@ def _build_frame(*, stamps_ns: I64, gyro: F64, accel: F64, **fields: Any) -> Fra
     return Frame(**fields, imu=imu)
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Layout of one message type on the wire."""
-
-    code: int
-    build: Callable[..., m.Message]
-    scalars: _ScalarFields = field(default_factory=lambda: _ScalarFields.from_fields())
-    arrays: tuple[_ArrayField, ...] = ()
-
-
-def _field_name(path: str) -> str:
-    return path.rpartition(".")[2]
-
-
-def _pose_field(path: str, optional: bool = False) -> _ArrayField:
-    return _ArrayField(path, "<f8", (4, 4), optional)
-
-
-def _build_hello(*, name: str, kind: AgentKind, run_id: int, streams_frames: bool, **rig: Any) -> m.Hello:
-    return m.Hello(name, kind, run_id, Rig(**rig), streams_frames)
-
-
-def _build_keyframe(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
-    return Keyframe(**fields, view=View(uv, points, descriptors))
-
-
-_RIG_FIELDS: dict[str, Any] = {  # sent as maps by field name, checked by their types
+_RIG: dict[str, Any] = {  # sent as maps by field name, checked by their types
     "rig.cam0": Camera,
     "rig.cam1": Camera | None,
     "rig.depth": Camera | None,
@@ -226,93 +215,79 @@ _LAYOUTS: dict[type, _Layout] = {
     m.Hello: _Layout(
         1,
         _build_hello,
-        _ScalarFields.from_fields(
-            name=Name, kind=AgentKind, run_id=Int64, streams_frames=bool, **_RIG_FIELDS
-        ),
-        (
-            _pose_field("rig.T_body_cam0"),
-            _pose_field("rig.T_cam1_cam0", optional=True),
-            _pose_field("rig.T_depth_cam0", optional=True),
-        ),
+        _pose("rig.T_body_cam0"),
+        _pose("rig.T_cam1_cam0", optional=True),
+        _pose("rig.T_depth_cam0", optional=True),
+        **{"name": Name, "kind": AgentKind, "run_id": Int64, "streams_frames": bool} | _RIG,
     ),
     m.PoseUpdate: _Layout(
-        2,
-        m.PoseUpdate,
-        _ScalarFields.from_fields(stamp_ns=Int64, state=TrackState, keyframe=Int64),
-        (_pose_field("T_keyframe_body"),),
+        2, m.PoseUpdate, _pose("T_keyframe_body"), stamp_ns=Int64, state=TrackState, keyframe=Int64
     ),
     Keyframe: _Layout(
         3,
         _build_keyframe,
-        _ScalarFields.from_fields(
-            id=Int64, reference=Int64, stamp_ns=Int64, predecessor=Int64, up_sigma=float
-        ),
-        (
-            _pose_field("T_ref_body"),
-            _ArrayField("cov", "<f8", (6, 6)),
-            _pose_field("T_odom_body"),
-            _ArrayField("up", "<f8", (3,)),
-            _ArrayField("view.uv", "<f4", (None, 2)),
-            _ArrayField("view.points", "<f4", (None, 3)),
-            _ArrayField("view.descriptors", "|u1", (None, DESCRIPTOR_BYTES)),
-        ),
+        _pose("T_ref_body"),
+        _Array("cov", "<f8", (6, 6)),
+        _pose("T_odom_body"),
+        _Array("up", "<f8", (3,)),
+        _Array("view.uv", "<f4", (None, 2)),
+        _Array("view.points", "<f4", (None, 3)),
+        _Array("view.descriptors", "|u1", (None, DESCRIPTOR_BYTES)),
+        id=Int64,
+        reference=Int64,
+        stamp_ns=Int64,
+        predecessor=Int64,
+        up_sigma=float,
     ),
-    m.Evaluation: _Layout(
-        4, m.Evaluation, _ScalarFields.from_fields(keyframe=Int64, delay_ms=float, error_cm=float | None)
-    ),
-    m.Ping: _Layout(5, m.Ping, _ScalarFields.from_fields(sequence=Int64, sent_ns=Int64)),
+    m.Evaluation: _Layout(4, m.Evaluation, keyframe=Int64, delay_ms=float, error_cm=float | None),
+    m.Ping: _Layout(5, m.Ping, sequence=Int64, sent_ns=Int64),
     m.Bye: _Layout(6, m.Bye),
     Frame: _Layout(
         7,
         _build_frame,
-        _ScalarFields.from_fields(stamp_ns=Int64, index=Int64, gap_ns=Int64),
-        (
-            _image_field("image0"),
-            _image_field("image1", optional=True),
-            _image_field("depth", "<f4", optional=True),
-            _imu_field("imu.stamps_ns", "<i8"),
-            _imu_field("imu.gyro", "<f8", 3),
-            _imu_field("imu.accel", "<f8", 3),
-        ),
+        _image("image0"),
+        _image("image1", optional=True),
+        _image("depth", "<f4", optional=True),
+        _imu("imu.stamps_ns", "<i8"),
+        _imu("imu.gyro", "<f8", 3),
+        _imu("imu.accel", "<f8", 3),
+        stamp_ns=Int64,
+        index=Int64,
+        gap_ns=Int64,
     ),
-    m.Status: _Layout(
-        8, m.Status, _ScalarFields.from_fields(state=TrackState, pose_age_ms=float, reason=Reason)
-    ),
-    m.Welcome: _Layout(16, m.Welcome, _ScalarFields.from_fields(session=Int64, next_keyframe=Int64)),
-    m.Refused: _Layout(17, m.Refused, _ScalarFields.from_fields(reason=Text)),
-    m.Ack: _Layout(18, m.Ack, _ScalarFields.from_fields(next_keyframe=Int64, buffered=Ids)),
+    m.Status: _Layout(8, m.Status, state=TrackState, pose_age_ms=float, reason=Reason),
+    m.Welcome: _Layout(16, m.Welcome, session=Int64, next_keyframe=Int64),
+    m.Refused: _Layout(17, m.Refused, reason=Text),
+    m.Ack: _Layout(18, m.Ack, next_keyframe=Int64, buffered=Ids),
     Correction: _Layout(
         19,
         Correction,
-        _ScalarFields.from_fields(
-            map_id=MapId, revision=Int64, segment_keyframe=Int64, answered_keyframe=Int64
-        ),
-        (_pose_field("T_map_odom"), _ArrayField("cov", "<f8", (6, 6))),
+        _pose("T_map_odom"),
+        _Array("cov", "<f8", (6, 6)),
+        map_id=MapId,
+        revision=Int64,
+        segment_keyframe=Int64,
+        answered_keyframe=Int64,
     ),
-    m.Rate: _Layout(20, m.Rate, _ScalarFields.from_fields(hz=float)),
+    m.Rate: _Layout(20, m.Rate, hz=float),
     m.Pong: _Layout(
-        21,
-        m.Pong,
-        _ScalarFields.from_fields(
-            sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64, session=Int64
-        ),
+        21, m.Pong, sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64, session=Int64
     ),
     m.RemoteTrackingResult: _Layout(
         22,
         m.RemoteTrackingResult,
-        _ScalarFields.from_fields(
-            index=Int64,
-            stamp_ns=Int64,
-            state=TrackState,
-            is_keyframe=bool,
-            new_segment=bool,
-            is_consistent=bool,
-            waiting_for=WaitReason | None,
-        ),
-        (_pose_field("T_odom_body", optional=True),),
+        _pose("T_odom_body", optional=True),
+        index=Int64,
+        stamp_ns=Int64,
+        state=TrackState,
+        is_keyframe=bool,
+        new_segment=bool,
+        is_consistent=bool,
+        waiting_for=WaitReason | None,
     ),
 }
-_LAYOUT_BY_CODE = {layout.code: (cls, layout) for cls, layout in _LAYOUTS.items()}
+MESSAGE_CODES = {message_type: layout.code for message_type, layout in _LAYOUTS.items()}
+_LAYOUT_BY_CODE = {layout.code: (cls.__name__, layout) for cls, layout in _LAYOUTS.items()}
 STABLE_MESSAGES = (m.Ping, m.Pong, m.Refused)  # the same since OLDEST_VERSION: peers find a mismatch by them
 
 # All that msgspec, numpy and our own validation raise on bad bytes.
@@ -328,10 +303,10 @@ def encode(message: m.Message, version: int | None = None) -> list[Bytes]:
     version = WIRE_VERSION if version is None else version
     assert version == WIRE_VERSION or isinstance(message, STABLE_MESSAGES)
     layout = _LAYOUTS[type(message)]
-    arrays = [spec.get(message) for spec in layout.arrays]
-    table = [(spec.dtype, array.shape) for spec, array in zip(layout.arrays, arrays, strict=True)]
+    arrays = [array.get(message) for array in layout.arrays]
+    table = [(field.dtype, array.shape) for field, array in zip(layout.arrays, arrays, strict=True)]
     try:
-        scalars = msgspec.Raw(layout.scalars.encode(message))
+        scalars = layout.encode_scalars(message)
     except _DECODE_ERRORS as error:
         raise _wire_error(type(message).__name__, error) from None
     header = _encoder.encode((version, layout.code, scalars, table))
@@ -345,20 +320,21 @@ def decode(frames: Sequence[Bytes], versions: Sequence[int] = (WIRE_VERSION,)) -
     """
     if not frames:
         raise WireError("empty message")
-    if memoryview(frames[0]).nbytes > MAX_HEADER_BYTES:
-        raise WireError(f"header of {memoryview(frames[0]).nbytes} bytes, at most {MAX_HEADER_BYTES}")
+    if (header_bytes := memoryview(frames[0]).nbytes) > MAX_HEADER_BYTES:
+        raise WireError(f"header of {header_bytes} bytes, at most {MAX_HEADER_BYTES}")
+    where = "header"
     try:
-        _check_version(_decode_version(frames[0]), versions)
+        start = _decode_version(frames[0])
+        if start.version not in versions:
+            code = start.code if isinstance(start.code, int) else None
+            raise VersionError(start.version, code, WIRE_VERSION)
         header = _decode_header(frames[0])
+        if (known := _LAYOUT_BY_CODE.get(header.code)) is None:
+            raise WireError(f"unknown message type {header.code}")
+        where, layout = known
+        return layout.build(**layout.decode_scalars(header.scalars), **layout.decode_arrays(header, frames))
     except _DECODE_ERRORS as error:
-        raise _wire_error("header", error) from None
-    cls, layout = _LAYOUT_BY_CODE.get(header.code, (None, None))
-    if cls is None or layout is None:
-        raise WireError(f"unknown message type {header.code}")
-    try:
-        return layout.build(**layout.scalars.decode(header.scalars), **_decode_arrays(layout, header, frames))
-    except _DECODE_ERRORS as error:
-        raise _wire_error(cls.__name__, error) from None
+        raise _wire_error(where, error) from None
 
 
 def message_bytes(frames: Sequence[Bytes]) -> int:
@@ -379,30 +355,4 @@ def _shorten_quote(match: re.Match[str]) -> str:
 def _wire_error(where: str, error: Exception) -> WireError:
     """Return a WireError of one short printable line; quotes of the peer's text are cut but stay closed."""
     text = _QUOTED.sub(_shorten_quote, str(error))
-    line = "".join(c if c.isprintable() else "?" for c in f"{where}: {text}")
-    return WireError(line[:200])
-
-
-def _check_version(header: _VersionHeader, versions: Sequence[int]) -> None:
-    if header.version not in versions:
-        raise VersionError(
-            header.version, header.code if isinstance(header.code, int) else None, WIRE_VERSION
-        )
-
-
-def message_code(message_type: type[m.Message]) -> int:
-    """Return the code of a message type in headers."""
-    return _LAYOUTS[message_type].code
-
-
-def _decode_arrays(
-    layout: _Layout, header: _Header, frames: Sequence[Bytes]
-) -> dict[str, NDArray[Any] | None]:
-    if not len(header.arrays) == len(layout.arrays) == len(frames) - 1:
-        raise ValueError(
-            f"{len(frames) - 1} array frames, {len(header.arrays)} declared, {len(layout.arrays)} expected"
-        )
-    return {
-        spec.name: spec.decode(dtype, shape, frame)
-        for spec, (dtype, shape), frame in zip(layout.arrays, header.arrays, frames[1:], strict=True)
-    }
+    return WireError(printable(f"{where}: {text}")[:200])

@@ -8,7 +8,7 @@ from share.cli.agent import _keyframes_text, _unacknowledged_text
 
 TOLD = {
     "edge_sessions": 1, "keyframes": 53, "sent": 50, "unacknowledged": 5, "refusal": None, "connected": True,
-    "held": 0,
+    "buffered_at_edge": 0,
 }  # fmt: skip
 
 KEYS = "refused: the edge requires keys"
@@ -24,7 +24,7 @@ def report(**told):
     [
         ({}, None, "no answer within agent.finish_s (5 s)"),
         (
-            {"held": 4},
+            {"buffered_at_edge": 4},
             None,
             f"it received 4 of them but {UNSAFE}",
         ),

@@ -26,7 +26,6 @@ HEAVY = [
     "numpy",
     "yaml",
     "msgspec",
-    "filterpy",
 ]
 HELPS = [
     [],

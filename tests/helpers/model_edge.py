@@ -13,7 +13,7 @@ from helpers.hellos import hello_of
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
-from share.protocol.peer import ReorderBuffer
+from share.protocol.keyframe_intake import ReorderBuffer
 from share.types import Correction, Keyframe, KeyframeCandidate, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from collections import Counter
 
+import pytest
+
 from share.config import EdgeConfig
+from share.mapping import query_queue
 from share.mapping.query_queue import QueryQueue
 from share.types import AgentKind
 
 AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
 
 
-def test_one_agent_newest_first() -> None:
-    queue = QueryQueue(EdgeConfig(max_waiting=10, each_waiting=10))
+def test_one_agent_newest_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 10)
+    queue = QueryQueue(EdgeConfig(max_waiting=10))
     for number in range(3):
         queue.add("ann", AR, number)
     assert [queue.next_query() for _ in range(4)] == [2, 1, 0, None]
 
 
-def test_who_sends_more_is_not_served_more() -> None:
-    queue = QueryQueue(EdgeConfig(max_waiting=1000, each_waiting=1000))
+def test_who_sends_more_is_not_served_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 1000)
+    queue = QueryQueue(EdgeConfig(max_waiting=1000))
     for number in range(90):
         queue.add("ann", AR, number)
     for number in range(100, 110):
@@ -28,8 +33,9 @@ def test_who_sends_more_is_not_served_more() -> None:
     assert sum(number >= 100 for number in first if number is not None) == 10
 
 
-def test_headsets_before_robots_but_robots_too() -> None:
-    queue = QueryQueue(EdgeConfig(max_waiting=1000, each_waiting=1000))
+def test_headsets_before_robots_but_robots_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 1000)
+    queue = QueryQueue(EdgeConfig(max_waiting=1000))
     who = Counter[str]()
     for number in range(200):
         queue.add("ann", AR, number)
@@ -41,8 +47,9 @@ def test_headsets_before_robots_but_robots_too() -> None:
     assert 15 <= who["rob"] <= 25  # of two that always wait, one turn in five
 
 
-def test_one_too_many_costs_the_longest_queue_its_oldest() -> None:
-    queue = QueryQueue(EdgeConfig(max_waiting=4, each_waiting=4))
+def test_one_too_many_costs_the_longest_queue_its_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 4)
+    queue = QueryQueue(EdgeConfig(max_waiting=4))
     for number in range(4):
         queue.add("ann", AR, number)
     queue.add("bob", AR, 10)
@@ -52,7 +59,7 @@ def test_one_too_many_costs_the_longest_queue_its_oldest() -> None:
 
 
 def test_one_that_sends_much_is_answered_soon_or_not_at_all() -> None:
-    queue = QueryQueue(EdgeConfig(max_waiting=12, each_waiting=3))
+    queue = QueryQueue(EdgeConfig(max_waiting=12))
     for number in range(8):
         queue.add("ann", AR, number)
     queue.add("bob", AR, 10)
@@ -63,7 +70,7 @@ def test_one_that_sends_much_is_answered_soon_or_not_at_all() -> None:
 def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
     """Twenty agents in turn, half as many look-ups as keyframes: none is looked up that is older than a few
     others, and everybody has its turn."""
-    queue, served, age = QueryQueue(EdgeConfig(max_waiting=12, each_waiting=3)), Counter[int](), []
+    queue, served, age = QueryQueue(EdgeConfig(max_waiting=12)), Counter[int](), []
     for number in range(2000):
         queue.add(f"agent{number % 20}", AR, number)
         if number % 2:
@@ -76,7 +83,7 @@ def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
 
 
 def test_those_passed_over_are_there_for_later_newest_first() -> None:
-    queue = QueryQueue(EdgeConfig(max_waiting=12, each_waiting=3))
+    queue = QueryQueue(EdgeConfig(max_waiting=12))
     for number in range(300):
         queue.add("ann", AR, number)
     assert [queue.next_query() for _ in range(4)] == [299, 298, 297, None]

@@ -1,7 +1,7 @@
 """How many candidates are tried, while nobody waits and while somebody does."""
 
 from share.config import Config
-from share.mapping.query_queue import CandidateSearch, SearchBudget
+from share.mapping.query_queue import HURRY_CANDIDATES, CandidateSearch, SearchBudget
 
 EFFORT = SearchBudget(max_verified=3, max_tried_hurried=2)
 
@@ -37,4 +37,4 @@ def test_who_comes_meanwhile_ends_it():
 
 def test_the_settings_say_how_many():
     config = Config()
-    assert SearchBudget.from_config(config) == (config.place.enough, config.edge.hurry_candidates)
+    assert SearchBudget.from_config(config) == (config.place.enough, HURRY_CANDIDATES)

@@ -1,4 +1,4 @@
-"""How much one agent may make the mapper work, and whose turn it is."""
+"""Keyframe quota of an agent, and the order in which keyframes are added."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from helpers.hellos import hello_of
 
 from share.config import Config
 from share.mapping.query_queue import QueryQueue
-from share.protocol.admission import KeyframeQuota
 from share.protocol.edge import Edge
 from share.protocol.edge_events import AddKeyframe, PeerMessageReceived, SendToPeer
-from share.protocol.edge_records import FairQueue
+from share.protocol.keyframe_intake import FairQueue, KeyframeQuota
 from share.types import AgentKind, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -35,8 +34,8 @@ def taken_in(allowance: KeyframeQuota, points: int, hz: float, seconds: float, n
     return sum(allowance.objection(name, one, at_ns) is None for at_ns in times)
 
 
-def test_an_honest_agent_is_never_held_back() -> None:
-    """Its whole ledger at once, and from then on as many as control.rate_max_hz allows."""
+def test_an_agent_within_its_rate_is_never_refused() -> None:
+    """The whole ledger at once, and from then on control.rate_max_hz."""
     config = Config()
     allowance, one = KeyframeQuota(5.0), keyframe(1, config.tracker.view_features)
     burst = [allowance.objection("ann", one, 0) for _ in range(config.agent.keep_keyframes)]
@@ -45,7 +44,7 @@ def test_an_honest_agent_is_never_held_back() -> None:
     assert taken_in(allowance, 500, hz, 60, name="ann") == 60 * hz
 
 
-def test_of_large_keyframes_fewer_are_taken_in() -> None:
+def test_the_quota_counts_keypoints() -> None:
     allowance = KeyframeQuota(5.0)
     assert taken_in(allowance, 2000, 50, 60) < 60 * 50 / 4
     after = taken_in(allowance, 2000, 50, 60)
@@ -53,14 +52,14 @@ def test_of_large_keyframes_fewer_are_taken_in() -> None:
     assert taken_in(KeyframeQuota(5.0), 0, 50, 600) < 600 * 32 + 2000
 
 
-def test_a_new_run_gives_no_new_allowance_and_another_name_has_its_own() -> None:
+def test_the_quota_is_per_name_and_not_per_run() -> None:
     allowance = KeyframeQuota(5.0)
     taken_in(allowance, 2000, 50, 60)
     assert taken_in(allowance, 2000, 50, 1) <= 4
     assert taken_in(allowance, 500, 5, 20, name="ann") == 100
 
 
-def test_what_is_not_taken_in_is_not_acknowledged_and_is_said() -> None:
+def test_a_keyframe_beyond_the_quota_is_not_acknowledged_and_is_reported() -> None:
     edge = Edge(Config(), 7)
     hello, now_ns = hello_of("eve", 5), S
 
@@ -87,7 +86,7 @@ def test_what_is_not_taken_in_is_not_acknowledged_and_is_said() -> None:
     assert edge.report({})["agents"]["eve"]["reason"] == ""
 
 
-def test_each_name_in_turn() -> None:
+def test_the_fair_queue_serves_names_in_turn() -> None:
     turns = FairQueue[int]()
     for k in range(100):
         turns.add("eve", k)
@@ -101,14 +100,14 @@ def test_each_name_in_turn() -> None:
 
 
 @pytest.mark.parametrize("spent_ms", [10.0, 1e6])
-def test_looking_up_has_its_turn_too(spent_ms: float) -> None:
+def test_the_fair_queue_leaves_time_for_queries(spent_ms: float) -> None:
     turns = FairQueue[int]()
     turns.add("eve", 1)
     assert turns.take_next(spent_ms) is None
     assert turns.take_next(9.9) == 1
 
 
-def test_what_an_agent_sends_beyond_the_rate_waits_until_nothing_else_does() -> None:
+def test_keyframes_beyond_the_rate_are_queried_last() -> None:
     allowance = KeyframeQuota(5.0)
     honest = [allowance.is_over_rate("ann", round(k * S / 5.5)) for k in range(600)]
     assert not any(honest)
@@ -117,7 +116,7 @@ def test_what_an_agent_sends_beyond_the_rate_waits_until_nothing_else_does() -> 
     assert not any(KeyframeQuota(None).is_over_rate("eve", k * MS) for k in range(1000))
 
 
-def test_an_extra_keyframe_is_passed_over_at_once() -> None:
+def test_an_extra_keyframe_is_skipped_at_once() -> None:
     lookups = QueryQueue(Config().edge)
     lookups.add("eve", AgentKind.AR, 1, is_extra=True)
     lookups.add("ann", AgentKind.ROBOT, 0)
@@ -126,7 +125,7 @@ def test_an_extra_keyframe_is_passed_over_at_once() -> None:
 
 
 @pytest.mark.parametrize(("policy", "some"), [("share", True), ("covins-g", False)])
-def test_the_edge_says_which_keyframes_are_extra(policy: str, some: bool) -> None:
+def test_the_edge_marks_keyframes_beyond_the_rate(policy: str, some: bool) -> None:
     edge = Edge(replace(Config(), edge=replace(Config().edge, policy=policy)), 8)
     edge.handle(PeerMessageReceived(m.peer_id(1), encode(hello_of("eve", 1))), 0)
     effects = []
@@ -138,7 +137,7 @@ def test_the_edge_says_which_keyframes_are_extra(policy: str, some: bool) -> Non
     assert (sum(extra) > 60) is some
 
 
-def test_a_copy_of_a_keyframe_that_waits_costs_nothing() -> None:
+def test_a_duplicate_of_a_buffered_keyframe_costs_nothing() -> None:
     edge = Edge(Config(), 8)
     edge.handle(PeerMessageReceived(m.peer_id(1), encode(hello_of("eve", 1))), 0)
     for _ in range(1000):  # keyframe 0 has not come yet; each would cost 2,250
@@ -147,14 +146,14 @@ def test_a_copy_of_a_keyframe_that_waits_costs_nothing() -> None:
     assert [effect.keyframe.id for effect in effects if isinstance(effect, AddKeyframe)] == [0, 1]
 
 
-def test_what_begins_a_stretch_counts_as_twenty() -> None:
+def test_a_keyframe_that_starts_a_segment_costs_twenty() -> None:
     allowance, first = KeyframeQuota(5.0), keyframe(0, 0)
     taken = sum(allowance.objection("eve", first, k * S // 50) is None for k in range(50 * 600))
     assert 60 < taken < 1100
     assert taken_in(KeyframeQuota(5.0), 0, 50, 600) > 10 * taken
 
 
-def test_what_waits_of_a_run_goes_when_it_leaves_and_is_asked_for_again() -> None:
+def test_buffered_keyframes_are_dropped_when_a_run_leaves_and_requested_again() -> None:
     edge = Edge(Config(), 8)
 
     def tell(message: m.UplinkMessage) -> list[Any]:

@@ -1,4 +1,4 @@
-"""The agent's protocol machine, one duty at a time: scripted events, and what comes of them."""
+"""The agent's state machine: scripted events and their effects."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.model_edge import COV, HELLO, MS, UP, S, handle, tracked
 
-from share.config import AgentConfig, ClockConfig, Config
+from share.config import ClockConfig, Config
 from share.errors import UsageError
 from share.geometry import se3
 from share.protocol import agent_events as ev
@@ -40,7 +40,7 @@ def tell(agent: Agent, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
 
 
 def welcomed(config: Config | None = None) -> Agent:
-    """An agent at time 0, connected."""
+    """A connected agent at time 0."""
     agent = Agent(HELLO, config or Config())
     handle(agent, ev.AgentTick(), 0)
     tell(agent, m.Welcome(SESSION, 0), 0)
@@ -52,20 +52,20 @@ def pose(x: float = 0.0, yaw: float = 0.0) -> np.ndarray:
 
 
 def seen_at(depth: float) -> View:
-    """Three points at this depth, m."""
+    """A view of three points at this depth, m."""
     uv = np.array([[-0.1, 0.0], [0.0, 0.1], [0.1, 0.0]])
     return View(uv, depth * np.c_[uv, np.ones(3)], np.zeros((3, 32), np.uint8))
 
 
 def correction(T: np.ndarray, revision: int, answers: int = -1, map_id: str = "a") -> Correction:
-    """About the stretch of the keyframe that it answers, or the first one."""
+    """A correction of the segment of the keyframe that it answers, by default the first."""
     return Correction(T, COV, map_id, revision, max(answers, 0), answers)
 
 
 # ---------------------------------------------------------------- being connected
 
 
-def test_says_hello_until_welcomed() -> None:
+def test_hello_is_repeated_until_a_welcome() -> None:
     agent = Agent(HELLO, Config())
     hellos = [bool(sent(handle(agent, ev.AgentTick(), t * 100 * MS))) for t in range(11)]
     assert [t for t, hello in enumerate(hellos) if hello] == [0, 5, 10]
@@ -75,13 +75,13 @@ def test_says_hello_until_welcomed() -> None:
     assert {type(x) for x in later} == {m.Ping, m.Status}
 
 
-def test_an_edge_that_never_answers_is_said_once() -> None:
+def test_an_unanswered_hello_prints_one_line() -> None:
     agent = Agent(HELLO, Config())
     lines = [line for t in range(100) for line in said(handle(agent, ev.AgentTick(), t * 100 * MS))]
     assert lines == ["no edge answers yet; tracking continues without the edge"]
 
 
-def test_silence_and_return_are_said_once_each() -> None:
+def test_silence_and_reconnection_print_one_line_each() -> None:
     agent = welcomed()
     effects = [x for t in range(1, 100) for x in handle(agent, ev.AgentTick(), t * 100 * MS)]
     assert said(effects) == ["the edge is silent; tracking continues without the edge"]
@@ -91,7 +91,7 @@ def test_silence_and_return_are_said_once_each() -> None:
     assert agent.report()["edge_sessions"] == 1
 
 
-def test_a_taken_name_ends_the_run_with_the_edges_reason() -> None:
+def test_a_refusal_at_the_start_ends_the_run_with_its_reason() -> None:
     agent = Agent(HELLO, Config())
     handle(agent, ev.AgentTick(), 0)
     [fail] = tell(agent, m.Refused("the name is in use"), 1)
@@ -113,7 +113,7 @@ def test_a_refusal_by_a_restarted_edge_does_not_end_the_run() -> None:
     assert only(ev.LocalisedPose, handle(agent, tracked(200), 10 * S))
 
 
-def test_bad_messages_are_counted_and_said_once_a_kind() -> None:
+def test_bad_messages_are_counted_and_each_kind_is_printed_once() -> None:
     agent = welcomed()
     lines = []
     for frames in ([b"junk"], [b"junk"], [], encode(m.Bye()), encode(m.Bye())):
@@ -123,7 +123,7 @@ def test_bad_messages_are_counted_and_said_once_a_kind() -> None:
     assert lines[-1] == "the edge sent a Bye, which this agent does not expect"
 
 
-def test_another_wire_version_is_said_in_words() -> None:
+def test_another_wire_version_prints_which_side_to_upgrade() -> None:
     agent = Agent(HELLO, Config())
     newer = b"\x94\x09\x01\x90\x90"
     assert said(handle(agent, ev.EdgeMessageReceived([newer]), 0)) == [
@@ -132,7 +132,7 @@ def test_another_wire_version_is_said_in_words() -> None:
     ]
 
 
-def test_a_pong_of_another_session_brings_hello_and_then_everything_held() -> None:
+def test_a_pong_of_another_session_causes_a_hello_and_a_resend() -> None:
     agent = welcomed()
     for k in range(3):
         handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
@@ -146,7 +146,7 @@ def test_a_pong_of_another_session_brings_hello_and_then_everything_held() -> No
     assert tell(agent, m.Welcome(SESSION, 0), 503 * MS) == []  # overtaken on its way
 
 
-def test_ping_and_pong_give_round_trip_and_clock() -> None:
+def test_pings_measure_round_trip_and_clock() -> None:
     agent = welcomed()
     for t in range(1, 40):
         now = t * 500 * MS
@@ -160,8 +160,8 @@ def test_ping_and_pong_give_round_trip_and_clock() -> None:
     assert abs(report["clock_drift_ppm"]) < 1
 
 
-def test_the_wait_for_a_view_is_no_delay() -> None:
-    """It is made while nobody waits, so the scheduler is told only what its last frame took."""
+def test_extracting_a_view_of_an_earlier_frame_is_no_delay() -> None:
+    """No pose waits for the view, so the evaluation includes only the processing of the last frame."""
     agent = welcomed()
     [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
     tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
@@ -201,16 +201,16 @@ def latencies(edge_ns: Callable[[int], int], claim_ms: float = 1.0) -> tuple[lis
     ],
     ids=["a day behind", "fast", "set"],
 )
-def test_no_latency_depends_on_how_far_the_edges_clock_is_off(edge_ns: Callable[[int], int]) -> None:
-    """So none has to be taken back where that is not known."""
+def test_no_latency_depends_on_the_clock_offset(edge_ns: Callable[[int], int]) -> None:
+    """So latencies are valid without the offset."""
     true, _ = latencies(lambda ns: ns)
     told, _ = latencies(edge_ns)
     assert told == pytest.approx(true, abs=1e-3)
     assert {round(x) for x in true} == {4, 7, 27}  # to the pose; with a round trip of 3; to the correction
 
 
-def test_an_offset_is_claimed_as_the_setting_allows() -> None:
-    """1 ms there and 2 back, so it is off by 0.5 and nobody can see that; nor that the edge kept it for 1."""
+def test_the_clock_offset_is_reported_if_the_setting_allows_its_uncertainty() -> None:
+    """1 ms there and 2 back: the offset is wrong by 0.5, which no exchange shows."""
     _, agent = latencies(lambda ns: ns + 3 * S)
     strict = agent.clock_estimate(30 * S)
     assert (strict.claim_ms, strict.is_reliable, strict.offset_ms) == (1.0, False, None)
@@ -233,7 +233,7 @@ def test_every_frame_is_localised_and_done_with_or_without_an_edge() -> None:
     ]
 
 
-def test_a_lost_frame_has_no_pose_but_is_done() -> None:
+def test_a_lost_frame_is_done_without_a_pose() -> None:
     agent = welcomed()
     lost = ev.FrameTracked(0, 0, 0, MS, TrackState.LOST)
     effects = handle(agent, lost, MS)
@@ -241,7 +241,7 @@ def test_a_lost_frame_has_no_pose_but_is_done() -> None:
     assert only(ev.FrameDone, effects)[0].state is TrackState.LOST
 
 
-def test_a_keyframe_that_could_not_be_made_leaves_a_frame_that_is_done() -> None:
+def test_a_frame_is_done_if_its_keyframe_could_not_be_made() -> None:
     agent = welcomed()
     handle(agent, tracked(0, pose(0), candidate=True), 0)
     frame = tracked(1, pose(1), candidate=True)
@@ -255,7 +255,7 @@ def test_a_keyframe_that_could_not_be_made_leaves_a_frame_that_is_done() -> None
     np.testing.assert_allclose(after.T_ref_body, pose(2))
 
 
-def test_a_candidate_whose_view_took_some_frames_is_a_keyframe_of_its_own_frame() -> None:
+def test_a_delayed_candidate_is_a_keyframe_of_its_own_frame() -> None:
     """Its stamp is that frame's, and a correction that answers it is as old as that; the frame that it came
     with is the one that is done."""
     agent = welcomed()
@@ -272,7 +272,7 @@ def test_a_candidate_whose_view_took_some_frames_is_a_keyframe_of_its_own_frame(
     assert (applied.stamp_ns, applied.corrected_ms) == (made.stamp_ns, pytest.approx(200.0))
 
 
-def test_poses_go_relative_to_the_last_keyframe_that_the_edge_has() -> None:
+def test_poses_are_relative_to_the_last_acknowledged_keyframe() -> None:
     agent = welcomed()
     handle(agent, tracked(0, pose(1), candidate=True), 0)
     [before] = only(m.PoseUpdate, handle(agent, tracked(1, pose(2)), 50 * MS), messages=True)
@@ -298,7 +298,7 @@ def test_keyframes_are_numbered_sent_and_evaluated() -> None:
     assert only(ev.FrameDone, effects)[0].is_sent
 
 
-def test_keyframes_made_without_an_edge_are_sent_when_one_comes() -> None:
+def test_keyframes_made_offline_are_sent_after_the_welcome() -> None:
     agent = Agent(HELLO, Config())
     for k in range(40):
         effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
@@ -310,7 +310,7 @@ def test_keyframes_made_without_an_edge_are_sent_when_one_comes() -> None:
 # ---------------------------------------------------------------- rate
 
 
-def test_a_rate_is_spent_as_a_token_bucket() -> None:
+def test_the_rate_limit_is_a_token_bucket() -> None:
     agent = welcomed()
     tell(agent, m.Rate(2.0), 0)
     done, keyframes = [], []
@@ -330,7 +330,7 @@ def test_a_rate_is_spent_as_a_token_bucket() -> None:
         assert T[0, 3] == pytest.approx((keyframe.stamp_ns - 10**15) / (50 * MS))
 
 
-def test_views_that_see_far_are_preferred_and_the_rate_is_kept() -> None:
+def test_distant_views_are_preferred_at_the_same_rate() -> None:
     agent, depths = welcomed(), np.random.default_rng(3).uniform(1.0, 9.0, 200)
     tell(agent, m.Rate(2.0), 0)
     taken = []
@@ -344,14 +344,14 @@ def test_views_that_see_far_are_preferred_and_the_rate_is_kept() -> None:
     assert np.mean(taken) > np.mean(depths) + 0.8  # m
 
 
-def test_a_correction_sets_back_what_odometry_may_have_lost() -> None:
-    agent, errors_cm = welcomed(Config(agent=AgentConfig(tell_placement=False))), []
+def test_a_correction_resets_the_expected_drift() -> None:
+    agent, errors_cm = welcomed(), []
     [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
     tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
     for k in range(12):
         now_ns = (550 + 50 * k) * MS
         if k == 6:
-            tell(agent, correction(pose(), 1, answers=4), now_ns)
+            tell(agent, replace(correction(pose(), 1, answers=4), cov=np.zeros((6, 6))), now_ns)
         effects = handle(agent, tracked(11 + k, candidate=True), now_ns)
         errors_cm += [e.error_cm for e in only(m.Evaluation, effects, messages=True)]
         tell(agent, m.Ack(k + 1), now_ns)
@@ -376,7 +376,7 @@ def in_force(agent: Agent, now_ns: int) -> Any:
     return localised.T_map_odom
 
 
-def test_the_first_correction_applies_at_once_and_is_timed() -> None:
+def test_the_first_correction_applies_at_once_and_its_latency_is_measured() -> None:
     agent = corrected_agent()
     effects = tell(agent, correction(pose(5), 1, answers=0), 31 * MS)
     assert only(ev.CorrectionApplied, effects) == [
@@ -411,7 +411,7 @@ def test_a_small_turn_far_from_the_origin_is_a_large_correction() -> None:
     np.testing.assert_allclose(in_force(agent, 100 * MS), pose(0), atol=1e-12)
 
 
-def test_another_map_applies_at_once() -> None:
+def test_a_correction_to_another_map_applies_at_once() -> None:
     agent = corrected_agent()
     tell(agent, correction(pose(0), 1), 100 * MS)
     [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(9), 2, map_id="b"), 200 * MS))
@@ -419,7 +419,7 @@ def test_another_map_applies_at_once() -> None:
     np.testing.assert_array_equal(in_force(agent, 200 * MS), pose(9))
 
 
-def test_old_corrections_are_counted_and_ignored() -> None:
+def test_stale_corrections_are_counted_and_ignored() -> None:
     agent = corrected_agent()
     tell(agent, correction(pose(1), 5), 100 * MS)
     for revision in (5, 4, 1):
@@ -428,7 +428,7 @@ def test_old_corrections_are_counted_and_ignored() -> None:
     np.testing.assert_array_equal(in_force(agent, 300 * MS), pose(1))
 
 
-def test_after_odometry_broke_only_corrections_of_the_new_stretch_count() -> None:
+def test_a_new_segment_ignores_corrections_of_earlier_ones() -> None:
     agent = corrected_agent()
     tell(agent, correction(pose(1), 1, answers=0), 100 * MS)
     handle(agent, tracked(4, pose(0), candidate=True, new_stretch=True), 200 * MS)
@@ -440,15 +440,15 @@ def test_after_odometry_broke_only_corrections_of_the_new_stretch_count() -> Non
     np.testing.assert_array_equal(in_force(agent, 300 * MS), pose(7))
 
 
-def test_a_founding_correction_counts_though_it_overtakes_the_acknowledgement() -> None:
-    """The edge acknowledges what its disk has; the map does not wait for that."""
+def test_the_first_correction_of_a_map_may_overtake_the_acknowledgement() -> None:
+    """Acknowledgements wait for the disk of the edge; corrections do not."""
     agent = welcomed()
     handle(agent, tracked(0, candidate=True), 4 * MS)
     tell(agent, correction(pose(1), 1), 8 * MS)
     np.testing.assert_array_equal(in_force(agent, 50 * MS), pose(1))
 
 
-def test_a_correction_of_the_old_stretch_that_comes_late_is_not_laid_on_the_new_one() -> None:
+def test_a_late_correction_of_an_earlier_segment_is_ignored() -> None:
     agent = corrected_agent()
     handle(agent, tracked(4, pose(0), candidate=True, new_stretch=True), 200 * MS)
     tell(agent, m.Ack(2), 210 * MS)  # the edge has a keyframe of the new one
@@ -456,7 +456,7 @@ def test_a_correction_of_the_old_stretch_that_comes_late_is_not_laid_on_the_new_
     assert in_force(agent, 250 * MS) is None
 
 
-def test_the_delay_is_until_the_keyframe_is_made_and_does_not_jump() -> None:
+def test_the_reported_delay_is_smoothed_and_includes_the_keyframe() -> None:
     agent = welcomed()
     [ping] = [
         p for t in (1, 500) for p in only(m.Ping, handle(agent, ev.AgentTick(), t * MS), messages=True)
@@ -470,7 +470,7 @@ def test_the_delay_is_until_the_keyframe_is_made_and_does_not_jump() -> None:
     assert delays == pytest.approx([17.0, 17.0, 27.0, 25.75])
 
 
-def test_a_correction_for_a_replayed_keyframe_is_not_a_latency() -> None:
+def test_a_correction_of_a_keyframe_resent_to_a_restarted_edge_is_no_latency() -> None:
     agent = corrected_agent()
     handle(agent, ev.Connected(), 60 * S)
     tell(agent, m.Welcome(SESSION + 1, 0), 60 * S)
@@ -482,7 +482,7 @@ def test_a_correction_for_a_replayed_keyframe_is_not_a_latency() -> None:
 # ---------------------------------------------------------------- the end
 
 
-def test_the_end_waits_for_acknowledgements() -> None:
+def test_the_run_ends_after_all_acknowledgements() -> None:
     agent = welcomed()
     handle(agent, tracked(0, candidate=True), 0)
     assert not only(ev.CloseLink, handle(agent, ev.InputFinished(), 100 * MS))
@@ -493,16 +493,16 @@ def test_the_end_waits_for_acknowledgements() -> None:
     assert handle(agent, ev.AgentTick(), 2 * S) == []
 
 
-def test_the_end_does_not_wait_for_ever() -> None:
+def test_the_run_ends_after_finish_s_without_acknowledgements() -> None:
     agent = Agent(HELLO, Config())
     handle(agent, tracked(0, candidate=True), 0)
     handle(agent, ev.InputFinished(), S)
     stops = [t for t in range(1, 100) if only(ev.CloseLink, handle(agent, ev.AgentTick(), S + t * 100 * MS))]
     assert stops == [50]
-    assert agent.report()["open"] == 1
+    assert agent.report()["pending"] == 1
 
 
-def test_with_nothing_open_the_end_is_now() -> None:
+def test_the_run_ends_at_once_with_nothing_pending() -> None:
     effects = Agent(HELLO, Config()).handle(ev.InputFinished(), 0)
     assert isinstance(effects[-1], ev.CloseLink)
     assert not only(m.Bye, effects, messages=True)
@@ -511,13 +511,12 @@ def test_with_nothing_open_the_end_is_now() -> None:
 def test_the_report_is_plain_data() -> None:
     report = corrected_agent().report()
     assert all(value is None or type(value) in (int, float, str, bool) for value in report.values())
-    assert (report["sent"], report["acknowledged"], report["open"]) == (1, 1, 0)
+    assert (report["sent"], report["acknowledged"], report["pending"]) == (1, 1, 0)
     assert report["bytes_up"] > report["bytes_down"] > 0
 
 
-@pytest.mark.parametrize("placement", [True, False])
-def test_an_agent_tells_how_unsurely_the_map_placed_it(placement: bool) -> None:
-    agent = welcomed(Config(agent=AgentConfig(tell_placement=placement)))
+def test_an_evaluation_includes_the_sigma_of_the_correction() -> None:
+    agent = welcomed()
     [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
     tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
     handle(agent, tracked(10, pose(3), candidate=True), 510 * MS)
@@ -525,12 +524,12 @@ def test_an_agent_tells_how_unsurely_the_map_placed_it(placement: bool) -> None:
     effects = handle(agent, tracked(11, pose(3), candidate=True), 560 * MS)
     [told] = only(m.Evaluation, effects, messages=True)
     # of one motion, after that of odometry in the map
-    cov = se3.compose_cov(pose(3), COV, COV) if placement else COV
+    cov = se3.compose_cov(pose(3), COV, COV)
     assert told.error_cm == pytest.approx(100 * np.sqrt(np.trace(cov[3:, 3:])))
 
 
-def test_what_no_link_takes_is_not_sent() -> None:
-    """Neither its bytes nor its keyframe count, however often it is tried in vain."""
+def test_a_keyframe_that_the_link_refuses_does_not_count_as_sent() -> None:
+    """Neither bytes nor keyframes count, however often the link refuses them."""
     agent, now, tried = welcomed(), 0, 0
     bytes_up = agent.report()["bytes_up"]
     effects = handle(agent, tracked(0, candidate=True), now)

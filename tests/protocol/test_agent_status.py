@@ -1,4 +1,4 @@
-"""What an agent says of its own state: true while frames come, come late, or do not come."""
+"""The agent's status while frames come, come late, or do not come."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def agent_with(frames: int, ms: float = 4.0) -> tuple[Agent, int]:
 
 
 def heard_again(agent: Agent, now_ns: int) -> None:
-    """The edge is there."""
+    """Connect the agent."""
     agent.handle(ev.EdgeMessageReceived(encode(m.Welcome(1, 0))), now_ns)
 
 
@@ -37,7 +37,7 @@ def said(effects: list[ev.AgentEffect]) -> list[m.Status]:
     return [message for message in messages if isinstance(message, m.Status)]
 
 
-def test_while_all_is_well_it_is_said_twice_a_second_without_a_reason() -> None:
+def test_a_status_without_reason_is_sent_twice_a_second() -> None:
     agent, _ = agent_with(1)
     statuses = []
     for k in range(1, 101):
@@ -49,7 +49,7 @@ def test_while_all_is_well_it_is_said_twice_a_second_without_a_reason() -> None:
     assert all(s.pose_age_ms <= 60 for s in statuses)
 
 
-def test_a_camera_that_is_gone_is_said_within_half_a_second_and_how_long() -> None:
+def test_a_missing_camera_is_reported_within_half_a_second() -> None:
     agent, last = agent_with(100)
     heard = []
     for t in range(1, 61):
@@ -74,14 +74,14 @@ def test_a_camera_that_is_gone_is_said_within_half_a_second_and_how_long() -> No
     assert (status.state, status.reason) == (TrackState.OK, "")
 
 
-def test_a_slow_machine_says_how_late_its_poses_are() -> None:
+def test_late_poses_are_reported_with_their_latency() -> None:
     agent, now = agent_with(100, ms=3400)
     status = agent.status(now)
     assert (status.state, status.pose_age_ms) == (TrackState.OK, 3400)
     assert status.reason == "poses are 3.4 s late: this machine is too slow"
 
 
-def test_a_tracker_that_hangs_while_images_come_is_not_called_a_camera_that_is_gone() -> None:
+def test_a_hanging_tracker_is_not_reported_as_a_missing_camera() -> None:
     agent, last = agent_with(20)
     now = last + 2 * S
     agent.handle(ev.AgentTick(waiting_image_ns=now - 30 * MS), now)
@@ -92,7 +92,7 @@ def test_a_tracker_that_hangs_while_images_come_is_not_called_a_camera_that_is_g
     )
 
 
-def test_a_slow_camera_is_not_lost_between_its_frames() -> None:
+def test_a_slow_camera_is_not_lost_between_frames() -> None:
     agent, now = Agent(HELLO, Config()), 0
     agent.handle(ev.AgentTick(), 0)
     for k in range(30):  # 2 Hz
@@ -102,8 +102,8 @@ def test_a_slow_camera_is_not_lost_between_its_frames() -> None:
     assert agent.status(now + 1600 * MS).state is TrackState.LOST
 
 
-def test_however_slow_all_was_a_camera_that_is_gone_is_said_within_a_second() -> None:
-    """As on a machine that others keep busy, where a frame took 0.9 s: it was said after 2.7 s."""
+def test_a_missing_camera_is_reported_within_a_second_on_a_slow_machine() -> None:
+    """On a busy machine a frame took 0.9 s, and the missing camera was reported after 2.7 s."""
     agent, now = Agent(HELLO, Config()), 0
     agent.handle(ev.AgentTick(), 0)
     for k in range(30):
@@ -113,7 +113,7 @@ def test_however_slow_all_was_a_camera_that_is_gone_is_said_within_a_second() ->
     assert (status.state, status.reason) == (TrackState.LOST, "no image for 0.7 s")
 
 
-def test_states_have_their_reasons() -> None:
+def test_each_state_has_its_reason() -> None:
     for state, waits, reason in (
         (TrackState.INITIALISING, WaitReason.IMU, "waiting for the IMU's first samples"),
         (TrackState.VISION_ONLY, None, "no IMU sample for 0.2 s"),
@@ -128,21 +128,21 @@ def test_states_have_their_reasons() -> None:
         assert (agent.status(now).state, agent.status(now).reason) == (state, reason)
 
 
-def test_no_image_at_all_is_said_too() -> None:
+def test_a_run_without_any_image_is_reported() -> None:
     agent = Agent(HELLO, Config())
     agent.handle(ev.AgentTick(), 7 * S)
     agent.handle(ev.AgentTick(), 9 * S)
     assert agent.status(9 * S) == m.Status(TrackState.INITIALISING, 2000.0, "no image for 2.0 s")
 
 
-def test_after_the_last_frame_it_is_not_called_lost() -> None:
+def test_the_state_after_the_last_frame_is_not_lost() -> None:
     agent, now = agent_with(20)
     agent.handle(ev.InputFinished(), now)
     status = agent.status(now + 3 * S)
     assert (status.state, status.reason) == (TrackState.OK, "no more frames")
 
 
-def test_changes_are_said_at_once_but_not_oftener_than_ten_times_a_second() -> None:
+def test_changes_are_reported_at_once_but_at_most_ten_times_a_second() -> None:
     agent, now = agent_with(20)
     statuses = []
     for k in range(21, 221):  # 1 ms apart, and each in another state

@@ -13,6 +13,7 @@ from helpers.hellos import hello_of
 
 from share.config import AgentQoe, Config, ControlConfig, EdgeConfig, GraphConfig
 from share.geometry import se3
+from share.mapping import query_queue
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Refusal, Verification
@@ -45,7 +46,8 @@ def joined() -> Town:
     return both
 
 
-def test_two_agents_come_to_share_a_map(joined):
+@pytest.mark.long
+def test_two_agents_share_a_map(joined):
     maps = {name: joined.event(ev.LocalisedPose, name)[-1].map_id for name in ("ann", "bob")}
     assert len(set(maps.values())) == 1
     ann, bob = joined.people[joined.peer("ann")], joined.people[joined.peer("bob")]
@@ -56,7 +58,8 @@ def test_two_agents_come_to_share_a_map(joined):
     assert joined.map_error_m("bob", T_world_map) < 0.06
 
 
-def test_corrections_answer_keyframes_and_every_one_has_a_reason(joined):
+@pytest.mark.long
+def test_corrections_answer_keyframes_and_have_reasons(joined):
     corrections = [r for r in joined.records if r["event"] == "correction"]
     assert len(corrections) > 4
     assert all(r["reason"] and r["map_id"] and r["agent"] for r in corrections)
@@ -68,6 +71,7 @@ def test_corrections_answer_keyframes_and_every_one_has_a_reason(joined):
     assert revisions == sorted(set(revisions))
 
 
+@pytest.mark.long
 def test_every_refusal_has_a_reason(joined):
     for record in joined.records:
         assert record["reason"], record
@@ -76,7 +80,8 @@ def test_every_refusal_has_a_reason(joined):
     assert kinds["loop not accepted"] >= 1  # the first witness waits
 
 
-def test_the_report_counts_what_happened(joined):
+@pytest.mark.long
+def test_the_report_counts_keyframes_loops_and_merges(joined):
     report = joined.edge.report()
     ann = report["agents"]["ann"]
     assert ann["keyframes"] == 24
@@ -87,13 +92,14 @@ def test_the_report_counts_what_happened(joined):
     assert sum(report["maps"].values()) == 48
 
 
-def test_other_rooms_are_never_joined():
+def test_maps_of_different_rooms_are_never_merged():
     apart = Town([Person("ann", ROOM, 0.0, 11), Person("bob", walls(2), 0.0, 22)])
     apart.walk(20)
     assert len(apart.edge.report()["maps"]) == 2
     assert not [r for r in apart.records if r["event"] == "maps merged"]
 
 
+@pytest.mark.long
 def test_same_events_same_effects():
     a, b = town(), town()
     a.walk(8)
@@ -102,7 +108,8 @@ def test_same_events_same_effects():
     assert a.edge.report() == b.edge.report()
 
 
-def test_an_edge_without_memory_is_given_the_map_again_and_joins_it_again(joined):
+@pytest.mark.long
+def test_an_edge_without_map_gets_the_keyframes_again_and_merges_again(joined):
     again = town()
     again.walk(16)
     again.edge = None
@@ -120,7 +127,8 @@ def test_an_edge_without_memory_is_given_the_map_again_and_joins_it_again(joined
     assert sum("restarted" in text for text in said) == 1
 
 
-def test_a_restarted_agent_is_a_new_run_and_finds_its_old_map():
+@pytest.mark.long
+def test_a_restarted_agent_is_a_new_run_in_its_old_map():
     first = town()
     first.walk(16)
     first.vanish("bob")
@@ -139,7 +147,8 @@ def test_a_restarted_agent_is_a_new_run_and_finds_its_old_map():
 
 
 @pytest.mark.parametrize("silent_ms", [500, 3500])  # not noticed by the edge; noticed, before they meet
-def test_who_was_away_is_told_what_was_missed(silent_ms):
+@pytest.mark.long
+def test_a_reconnected_agent_gets_the_newest_correction(silent_ms):
     both = town()
     both.walk(12)
     peer, before = both.peer("bob"), len(both.event(ev.CorrectionApplied, "bob"))
@@ -166,7 +175,7 @@ def tell(edge: Edge, run_id: int, message: m.Message, now_ms: float = 0) -> list
     return edge.handle(ed.PeerMessageReceived(m.peer_id(run_id), frames), round(now_ms * MS))
 
 
-def test_a_name_in_use_is_refused_until_its_holder_is_silent():
+def test_a_name_in_use_is_refused_until_its_run_is_silent():
     edge = Edge(Config(), 7)
     assert sent(tell(edge, 1, hello()), m.Welcome) == [m.Welcome(7, 0)]
     refused = tell(edge, 2, hello(run_id=2), 100)
@@ -175,7 +184,7 @@ def test_a_name_in_use_is_refused_until_its_holder_is_silent():
     assert sent(tell(edge, 2, hello(run_id=2), 200 + 3100), m.Welcome)
 
 
-def test_the_mapper_hears_who_is_there():
+def test_the_mapper_gets_the_presence_of_runs():
     edge = Edge(Config(), 7)
     tell(edge, 1, hello())
     told = [
@@ -191,14 +200,14 @@ def test_the_mapper_hears_who_is_there():
     assert told == [[], [False], [], [True], [False]]
 
 
-def test_a_name_is_free_at_once_after_goodbye():
+def test_a_name_is_free_at_once_after_a_bye():
     edge = Edge(Config(), 7)
     tell(edge, 1, hello())
     tell(edge, 1, m.Bye(), 10)
     assert sent(tell(edge, 2, hello(run_id=2), 20), m.Welcome)
 
 
-def test_no_more_agents_than_agreed():
+def test_max_agents_is_kept():
     config = Config()
     edge = Edge(replace(config, edge=replace(config.edge, max_agents=2)), 7)
     tell(edge, 1, hello("a", 1))
@@ -208,7 +217,7 @@ def test_no_more_agents_than_agreed():
     assert sent(tell(edge, 3, hello("c", 3)), m.Welcome)
 
 
-def test_strangers_get_a_pong_and_nothing_else():
+def test_unjoined_peers_get_a_pong_and_nothing_else():
     edge = Edge(Config(), 7)
     pong = sent(tell(edge, 5, m.Ping(3, 42), 9), m.Pong)
     assert pong == [m.Pong(3, 42, 9 * MS, 9 * MS, 7)]
@@ -216,7 +225,7 @@ def test_strangers_get_a_pong_and_nothing_else():
     assert edge.report({})["unjoined"]["unexpected"] == 1
 
 
-def test_malformed_messages_are_counted_and_said_once():
+def test_malformed_messages_are_counted_and_recorded_once():
     edge = Edge(Config(), 7)
     tell(edge, 1, hello())
     records = []
@@ -253,7 +262,7 @@ def test_a_step_that_fails_costs_its_keyframe_only():
     assert mapper.next_lookup() is None
 
 
-def test_under_load_keyframes_are_kept_but_not_looked_up():
+def test_under_load_keyframes_are_stored_but_not_queried():
     slow = town(job_ms=4000)
     slow.walk(40)
     report = slow.edge.report()
@@ -265,8 +274,8 @@ def test_under_load_keyframes_are_kept_but_not_looked_up():
 
 
 @pytest.mark.slow
-def test_maps_that_came_all_at_once_are_joined_at_leisure():
-    """As after an outage: most is passed over when it comes, and looked up later."""
+def test_skipped_keyframes_are_queried_later_and_merge_maps():
+    """As after an outage: most keyframes are skipped at first, and queried later."""
     both, mapper = town(), Mapper(Config())
     both.walk(16)
     for run_id, name in enumerate(("ann", "bob"), start=11):
@@ -291,10 +300,11 @@ def test_maps_that_came_all_at_once_are_joined_at_leisure():
         ("share", {"bob": AgentQoe(form="ar")}, "ababab"),
     ],
 )
-def test_headsets_and_who_needs_the_same_go_first_unless_all_are_alike(policy, needs, turns):
+def test_headsets_are_queried_first_unless_the_policy_treats_agents_alike(policy, needs, turns, monkeypatch):
+    monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 10)
     both = town()
     both.walk(10)
-    config = Config(edge=EdgeConfig(policy=policy, each_waiting=10), control=ControlConfig(agents=needs))
+    config = Config(edge=EdgeConfig(policy=policy), control=ControlConfig(agents=needs))
     mapper, kinds = Mapper(config), {"ann": AgentKind.AR, "bob": AgentKind.ROBOT}
     for run_id, (name, kind) in enumerate(kinds.items()):
         mapper.add_run(name, replace(hello(name, run_id), kind=kind))
@@ -309,12 +319,14 @@ def test_headsets_and_who_needs_the_same_go_first_unless_all_are_alike(policy, n
     assert looked == turns
 
 
-def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
+@pytest.mark.long
+def test_while_queries_wait_fewer_candidates_are_tried(monkeypatch):
+    monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 12)
     both = town()
     both.walk(40)
-    config = Config(edge=EdgeConfig(each_waiting=12))
+    config = Config()
     tried, same = {}, Verification(np.eye(4), 1e-4 * np.eye(6), 40, 30)
-    for waiting, refuse in itertools.product((0, config.edge.hurry_waiting), (True, False)):
+    for waiting, refuse in itertools.product((0, query_queue.HURRY_WAITING), (True, False)):
         mapper = Mapper(config)
         mapper.add_run("ann-000b", hello(run_id=11))
         keyframes = both.keyframes("ann")
@@ -331,13 +343,14 @@ def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
             tried[waiting, refuse] += 1
             mapper.finish_step(verify, Refusal("not it") if refuse else same, 1.0)
     assert [tried[0, True], tried[0, False]] == [config.place.candidates, config.place.enough]
-    assert [tried[config.edge.hurry_waiting, True], tried[config.edge.hurry_waiting, False]] == [
-        config.edge.hurry_candidates,
+    assert [tried[query_queue.HURRY_WAITING, True], tried[query_queue.HURRY_WAITING, False]] == [
+        query_queue.HURRY_CANDIDATES,
         1,
     ]
 
 
-def test_by_policy_share_agents_hear_their_rate_and_merges_are_skipped():
+@pytest.mark.long
+def test_policy_share_sends_rates_and_skips_merges():
     both = town(config=Config(edge=EdgeConfig(policy="share")))
     both.walk(40)
     both.run(500)

@@ -1,4 +1,4 @@
-"""How many runs of agents come in, and which that were gone come back."""
+"""Admission: limits on new runs, and runs that return."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from helpers.hellos import hello_of
 from share.config import Config
 from share.mapping.map_changes import SaveKeyframe, SaveRun
 from share.protocol import edge_events as ed
-from share.protocol.admission import NewRunLimits
 from share.protocol.edge import Edge
 from share.protocol.edge_events import SaveChanges
-from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingCapacity, TrackingEdge
+from share.timing import TokenBuckets
 from share.types import AgentKind, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -33,7 +34,7 @@ def keyframe(id: int) -> Keyframe:
 def tell(
     edge: Edge, run_id: int, message: m.Message, now_s: float = 0, names: Iterable[str] | None = None
 ) -> list[ed.EdgeEffect]:
-    """names: of its key; None: no keys are used."""
+    """names: that its key is authorised for; None: no keys are used."""
     frames, owned = [bytes(frame) for frame in encode(message)], None if names is None else frozenset(names)
     key = "" if names is None else "its key"
     return edge.handle(ed.PeerMessageReceived(m.peer_id(run_id), frames, owned, key), round(now_s * S))
@@ -59,8 +60,9 @@ def present(edge: Edge) -> int:
 # ---------------------------------------------------------------- how often
 
 
-def test_runs_of_one_keyframe_do_not_fill_the_edge() -> None:
-    """130 a second of one name for 20 s, which say bye: 8 and one each 10 s are taken in."""
+@pytest.mark.long
+def test_new_runs_of_one_name_are_limited() -> None:
+    """130 runs a second of one name for 20 s, each with a bye: 8 and one each 10 s are admitted."""
     edge = Edge(Config(), 7)
     for k in range(2600):
         come(edge, "eve", k, k / 130)
@@ -70,7 +72,7 @@ def test_runs_of_one_keyframe_do_not_fill_the_edge() -> None:
     assert refusal(come(edge, "ann", -1, 20)) is None  # others come as before
 
 
-def test_who_comes_too_often_is_told_why_and_when_to_try_again() -> None:
+def test_too_many_new_runs_are_refused_with_the_time_to_wait() -> None:
     edge = Edge(Config(), 7)
     for k in range(8):
         assert refusal(come(edge, "eve", k, 1)) is None
@@ -80,7 +82,7 @@ def test_who_comes_too_often_is_told_why_and_when_to_try_again() -> None:
     assert refusal(come(edge, "eve", 8, 11.1)) is None
 
 
-def test_new_runs_of_all_names_are_bounded_too() -> None:
+def test_new_runs_of_all_names_are_limited() -> None:
     edge = Edge(Config(), 7)
     for k in range(128):
         assert refusal(come(edge, f"eve{k}", k)) is None
@@ -89,8 +91,9 @@ def test_new_runs_of_all_names_are_bounded_too() -> None:
     assert refusal(come(edge, "ann", -1, 0.6)) is None
 
 
-def test_new_runs_of_all_names_of_one_key_do_not_keep_others_out() -> None:
-    """100 names come 50 times a second and say bye, for a minute."""
+@pytest.mark.long
+def test_new_runs_of_one_key_do_not_keep_others_out() -> None:
+    """100 names join and leave 50 times a second, for a minute."""
     edge, names, taken = Edge(Config(), 7), [f"eve{k}" for k in range(100)], 0
     for k in range(3000):
         came = tell(edge, k, hello_of(names[k % 100], k), k / 50, names)
@@ -115,17 +118,16 @@ def test_a_run_whose_name_was_taken_from_its_key_is_refused() -> None:
     assert refusal(tell(edge, 1, hello_of("zoe", 1), 3, ["yan", "zoe"])) is None
 
 
-def test_names_that_came_long_ago_take_no_memory() -> None:
-    newcomers = NewRunLimits()
+def test_limits_of_old_names_take_no_memory() -> None:
+    limits = TokenBuckets(8.0, 0.1)
     for k in range(2000):
-        newcomers.record(f"eve{k}", f"eve{k}", k * S // 2)
-    assert len(newcomers._by_name) <= 2 * 10 + 1
-    assert len(newcomers._by_credential) <= 2 * 4 + 1
+        limits.bucket(f"eve{k}", k * S // 2).take(k * S // 2)
+    assert len(limits) <= 2 * 10 + 1
 
 
-def test_who_is_known_comes_again_as_often_as_it_likes() -> None:
+def test_a_known_run_may_return_at_any_rate() -> None:
     known = [
-        RestoredRun(f"bob-{k:04x}", hello_of("bob", 100 + k), OdometryBase(4, 0, np.eye(4)), 5)
+        RestoredRun(f"bob-{k:04x}", hello_of("bob", 100 + k), OdometryBase(4, 0, np.eye(4)))
         for k in range(12)
     ]
     edge = Edge(Config(), 7, has_store=True, restored=known)
@@ -141,7 +143,7 @@ def test_who_is_known_comes_again_as_often_as_it_likes() -> None:
     assert refusal(come(edge, "ann", 1)) is None
 
 
-def test_a_refusal_for_another_reason_costs_no_new_run() -> None:
+def test_a_refused_hello_does_not_count_as_a_new_run() -> None:
     edge = Edge(Config(), 7)
     come(edge, "ann", 1)
     for _ in range(20):
@@ -150,7 +152,7 @@ def test_a_refusal_for_another_reason_costs_no_new_run() -> None:
     assert refusal(come(edge, "ann", 2)) is None
 
 
-def test_a_run_without_a_keyframe_is_not_kept() -> None:
+def test_runs_without_a_keyframe_are_forgotten() -> None:
     edge = Edge(Config(), 7, has_store=True)
     assert not of(come(edge, "ann", 1), SaveChanges)
     (keep,) = of(tell(edge, 1, keyframe(0)), SaveChanges)
@@ -167,7 +169,7 @@ def test_a_run_without_a_keyframe_is_not_kept() -> None:
     [m.Evaluation(0, 1000.0, 0.0), keyframe(0), m.Ping(1, 1), hello_of("hope", 1)],
     ids=lambda message: type(message).__name__,
 )
-def test_an_old_run_does_not_come_back_beside_the_present_one(message: m.Message) -> None:
+def test_an_earlier_run_does_not_return_beside_the_present_one(message: m.Message) -> None:
     edge = Edge(Config(), 7)
     come(edge, "hope", 1)
     tell(edge, 1, m.Bye())
@@ -185,8 +187,8 @@ def test_an_old_run_does_not_come_back_beside_the_present_one(message: m.Message
     assert present(edge) == 1
 
 
-def test_who_said_bye_comes_back_only_to_a_free_place() -> None:
-    """As many as may be, of names of their own, after others who said bye."""
+def test_a_run_that_left_returns_only_to_a_free_place() -> None:
+    """The edge is full of runs of other names after a run has left."""
     config = Config()
     edge = Edge(replace(config, edge=replace(config.edge, max_agents=4)), 7)
     for k in range(8):
@@ -198,8 +200,8 @@ def test_who_said_bye_comes_back_only_to_a_free_place() -> None:
     assert present(edge) == 4
 
 
-def test_who_was_silent_for_too_long_has_lost_its_name() -> None:
-    """Also where the edge has not had time to notice."""
+def test_a_silent_run_loses_its_name() -> None:
+    """Also before the next tick of the edge."""
     edge = Edge(Config(), 7)
     come(edge, "ann", 1)
     effects = come(edge, "ann", 2, 3.5)
@@ -210,7 +212,7 @@ def test_who_was_silent_for_too_long_has_lost_its_name() -> None:
     assert present(edge) == 1
 
 
-def test_an_agent_that_was_killed_and_started_again_is_let_in_once_its_name_is_free() -> None:
+def test_a_killed_and_restarted_agent_joins_once_its_name_is_free() -> None:
     edge = Edge(Config(), 7)
     come(edge, "ann", 1)
     tell(edge, 1, m.Ping(1, 1), 1)
@@ -226,14 +228,14 @@ def test_an_agent_that_was_killed_and_started_again_is_let_in_once_its_name_is_f
     assert "in use" in str(refusal(come(edge, "ann", 3, 6.3)))
 
 
-def test_bye_is_heard_once() -> None:
+def test_a_repeated_bye_has_no_effect() -> None:
     edge = Edge(Config(), 7)
     come(edge, "ann", 1)
     tell(edge, 1, m.Bye())
     assert tell(edge, 1, m.Bye()) == []
 
 
-def test_no_tracker_begins_for_who_cannot_come_back() -> None:
+def test_no_tracker_starts_for_a_run_that_may_not_return() -> None:
     edge = TrackingEdge(Config(), 7, capacity=TrackingCapacity(1, "it is small"))
     for k, name in enumerate(("ann", "bob")):
         hello = replace(hello_of(name, k, AgentKind.AR), streams_frames=True)

@@ -1,4 +1,4 @@
-"""One agent is wrong about itself: the map of the others stays right to millimetres."""
+"""One agent has wrong odometry: the map of the others stays right to millimetres."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BAD = {
 
 @cache
 def walked(bad: str | None) -> Town:
-    """None: eve is right, and in another room."""
+    """None: the odometry of eve is right, in another room."""
     place = walls(1)
     people = [Person(name, place, 1.5 * i, 100 + 11 * (i + 1)) for i, name in enumerate(GOOD)]
     kind, more = (Person, {}) if bad is None else BAD[bad]
@@ -47,7 +47,7 @@ def walked(bad: str | None) -> Town:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bad", BAD)
-def test_the_others_map_stays_right(bad):
+def test_a_wrong_agent_does_not_distort_the_map_of_others(bad):
     clean, town = walked(None), walked(bad)
     ratio = town.map_error(GOOD) / clean.map_error(GOOD)
     maps = town.edge.report()["agents"]

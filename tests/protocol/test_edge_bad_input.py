@@ -1,4 +1,4 @@
-"""What cannot be, or should not: said once, and the map is as before."""
+"""Invalid input is recorded once and does not change the map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
-from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import RestoredRun
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -53,7 +54,7 @@ def sent(effects: list, kind: type) -> list:
     [(1, np.nan), (2, -1.0), (2, np.inf), (3, np.nan), (4, np.nan), (5, np.inf)],
     ids=["pose", "covariance not positive", "covariance not finite", "place", "up", "uv"],
 )
-def test_numbers_that_are_none_stop_at_the_door(frame, value):
+def test_non_finite_numbers_are_refused_when_decoded(frame, value):
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     view = View(np.zeros((2, 2)), np.ones((2, 3)), np.zeros((2, 32), np.uint8))
@@ -69,7 +70,7 @@ def test_numbers_that_are_none_stop_at_the_door(frame, value):
     assert edge.report({})["agents"]["ann"]["bad_messages"] == 3
 
 
-def test_a_number_that_is_used_again_changes_nothing():
+def test_a_reused_keyframe_id_changes_nothing():
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     assert of(tell(edge, keyframe(0)), ed.AddKeyframe)
@@ -78,17 +79,15 @@ def test_a_number_that_is_used_again_changes_nothing():
     assert sent(effects, m.Ack) == [m.Ack(1)]
 
 
-def test_two_runs_of_one_name_whose_tags_begin_alike():
+def test_two_runs_whose_tags_start_alike_have_different_keys():
     tag = m.public_tag(0xB000B)
-    edge = Edge(
-        Config(), 8, restored=[RestoredRun(f"ann-{tag[:4]}", HELLO, OdometryBase(0, 0, np.eye(4)), 1)]
-    )
+    edge = Edge(Config(), 8, restored=[RestoredRun(f"ann-{tag[:4]}", HELLO, OdometryBase(0, 0, np.eye(4)))])
     (join,) = of(tell(edge, replace(HELLO, run_id=0xB000B), 0xB000B), ed.AddRun)
     assert join.key == f"ann-{tag[:5]}"
     assert of(tell(edge, keyframe(0), 0xB000B), ed.AddKeyframe)[0].key == f"ann-{tag[:5]}"
 
 
-def test_a_covariance_beyond_measure_is_bounded_and_said():
+def test_an_excessive_covariance_is_bounded_and_recorded():
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     effects = tell(edge, keyframe(0, 1e11 * np.eye(6)))
@@ -97,6 +96,7 @@ def test_a_covariance_beyond_measure_is_bounded_and_said():
     assert "1e+11" in record.fields["reason"]
 
 
+@pytest.mark.long
 def test_huge_covariances_do_not_end_the_mapper():
     place = walls(1)
     eve = Person("eve", place, 0.3, 133, cov=1e11 * np.eye(6))
@@ -109,7 +109,7 @@ def test_huge_covariances_do_not_end_the_mapper():
     assert report["solve_ms"]["n"] > 0
 
 
-def test_a_result_that_cannot_be_used_costs_its_step(monkeypatch):
+def test_an_unusable_result_costs_its_step_only(monkeypatch):
     mapper = Mapper(Config())
     mapper.add_run("ann", HELLO)
     mapper.add_keyframe("ann", keyframe(0))
@@ -132,7 +132,7 @@ def test_a_result_that_cannot_be_used_costs_its_step(monkeypatch):
 
 
 @pytest.mark.slow
-def test_ten_thousand_keyframes_at_once_stay_bounded():
+def test_ten_thousand_keyframes_at_once_are_bounded():
     rng = np.random.default_rng(1)
     config = Config(edge=EdgeConfig(max_keyframes=500, max_waiting=12))
     mapper = Mapper(config)
@@ -154,8 +154,8 @@ def test_ten_thousand_keyframes_at_once_stay_bounded():
     assert report["maps"]["ann/0"] == 20  # it cost the others nothing
 
 
-def test_hello_at_once_when_the_link_is_back():
-    """A new life of the edge is known by its welcome, not only by the answer to the next ping."""
+def test_a_hello_is_sent_at_once_when_the_link_is_back():
+    """A new session of the edge is known by its welcome, not only by the answer to the next ping."""
     agent, edge = Agent(HELLO, Config()), Edge(Config(), 7)
     hello = agent.handle(ev.Connected(), 0)
     assert sent(hello, m.Hello)
@@ -167,9 +167,9 @@ def test_hello_at_once_when_the_link_is_back():
     assert any("restarted" in e.text for e in effects if isinstance(e, ev.PrintLine))
 
 
-def test_who_is_not_greeted_yet_is_told_the_newest_correction_with_the_welcome():
-    """Until then it counts revisions of our predecessor, and would not take it."""
-    known = RestoredRun("ann-000b", HELLO, OdometryBase(0, 0, np.eye(4)), 1)
+def test_the_newest_correction_comes_with_the_welcome():
+    """Until then it has revisions of the earlier session, and would reject it."""
+    known = RestoredRun("ann-000b", HELLO, OdometryBase(0, 0, np.eye(4)))
     edge, mapper = Edge(Config(), 8, restored=[known]), Mapper(Config())
     mapper.add_run("ann-000b", HELLO)
     tell(edge, m.Ping(1, 0))

@@ -1,4 +1,4 @@
-"""Who may speak for a run: its number is its secret, and with keys only the owner of a name's key."""
+"""Identity of a run: its run id is secret, and with keys a credential is authorised for names."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from share.config import Config
 from share.mapping.map_changes import SaveCredential
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
-from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import RestoredRun
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -50,7 +51,7 @@ def of(effects: list[ed.EdgeEffect], kind: type) -> list:
     return [effect for effect in effects if isinstance(effect, kind)]
 
 
-def test_a_key_speaks_for_its_names_only() -> None:
+def test_a_key_is_authorised_for_its_names_only() -> None:
     edge = Edge(Config(), 7)
     (refused,) = sent(tell(edge, hello_of("ann", SECRET), EVE))
     assert isinstance(refused, m.Refused)
@@ -61,7 +62,7 @@ def test_a_key_speaks_for_its_names_only() -> None:
 
 
 def test_a_run_is_not_taken_over_by_another_key() -> None:
-    """The attacker even knows the run's number and has taken over its routing id."""
+    """The attacker knows the run id and has taken over the transport id."""
     edge = Edge(Config(), 7)
     tell(edge, hello_of("ann", SECRET), ANN)
     tell(edge, keyframe(0), ANN)
@@ -73,7 +74,7 @@ def test_a_run_is_not_taken_over_by_another_key() -> None:
     assert of(tell(edge, keyframe(1), ANN), ed.AddKeyframe)
 
 
-def test_without_keys_who_holds_the_number_goes_on() -> None:
+def test_without_keys_the_run_id_identifies_a_run() -> None:
     edge = Edge(Config(), 7)
     tell(edge, hello_of("ann", SECRET), None)
     assert of(tell(edge, keyframe(0), None), ed.AddKeyframe)
@@ -83,7 +84,7 @@ def test_without_keys_who_holds_the_number_goes_on() -> None:
     assert isinstance(refused, m.Refused)
 
 
-def test_nothing_that_is_shown_tells_the_number() -> None:
+def test_no_output_reveals_the_run_id() -> None:
     edge = Edge(Config(), 7, has_store=True)
     effects = tell(edge, hello_of("ann", SECRET), None) + tell(edge, keyframe(0), None)
     shown = [edge.report({}), edge.series(), *(e.fields for e in of(effects, ed.WriteEvent))]
@@ -93,7 +94,7 @@ def test_nothing_that_is_shown_tells_the_number() -> None:
         assert digits not in text
 
 
-def test_an_id_that_leaps_costs_its_own_message() -> None:
+def test_a_jump_of_ids_costs_one_message() -> None:
     edge = Edge(Config(), 7)
     tell(edge, hello_of("ann", SECRET), None)
     tell(edge, keyframe(0), None)
@@ -104,7 +105,7 @@ def test_an_id_that_leaps_costs_its_own_message() -> None:
     assert edge.report({})["agents"]["ann"]["refused_messages"] == 1
 
 
-def test_the_voice_of_a_run_is_the_key_that_speaks_for_it_also_where_the_list_changes() -> None:
+def test_the_credential_of_a_run_follows_the_authorised_key() -> None:
     edge = Edge(Config(), 7, has_store=True)
     (join,) = of(tell(edge, hello_of("eve", SECRET), EVE, key="E"), ed.AddRun)
     (other,) = of(tell(edge, hello_of("mallory", 5), frozenset({"bob", "mallory"}), 5, key="E"), ed.AddRun)
@@ -118,11 +119,9 @@ def test_the_voice_of_a_run_is_the_key_that_speaks_for_it_also_where_the_list_ch
 
 @pytest.mark.parametrize("message", [hello_of("eve", SECRET), keyframe(3), m.Ping(1, 0)])
 @pytest.mark.parametrize("kept", [None, "", "E", "F"])
-def test_a_run_of_an_earlier_life_has_the_voice_of_whoever_speaks_for_it_now(
-    kept: str | None, message: m.Message
-) -> None:
+def test_a_restored_run_takes_the_credential_of_its_sender(kept: str | None, message: m.Message) -> None:
     known = RestoredRun(
-        "eve-1234", hello_of("eve", SECRET), OdometryBase.from_keyframe(keyframe(2)), 3, credential=kept
+        "eve-1234", hello_of("eve", SECRET), OdometryBase.from_keyframe(keyframe(2)), credential=kept
     )
     edge = Edge(Config(), 7, has_store=True, restored=[known])
     effects = tell(edge, message, EVE, now_ns=1, key="E")
@@ -137,8 +136,8 @@ def test_a_run_of_an_earlier_life_has_the_voice_of_whoever_speaks_for_it_now(
     assert not of(again, ed.SaveChanges)
 
 
-def test_no_name_is_taken_for_an_earlier_run_of_another() -> None:
-    """Eve's first run has the honest agent's name for a key, as she chose its number."""
+def test_no_name_equals_the_label_of_an_earlier_run() -> None:
+    """The key of eve's first run is the honest agent's name, by choice of the run id."""
     edge, number = Edge(Config(), 7), next(n for n in range(10**6) if m.public_tag(n).startswith("0001"))
     tell(edge, hello_of("eve-0001", SECRET), None)
     for run, now_ns in ((number, 1), (5, 2)):
@@ -155,8 +154,8 @@ def test_no_name_is_taken_for_an_earlier_run_of_another() -> None:
         checked_name("eve/0001")
 
 
-def test_earlier_runs_of_two_names_are_never_one_entry() -> None:
-    """Whatever comes after whatever."""
+def test_labels_of_earlier_runs_are_unique() -> None:
+    """For any order of joining."""
     edge, run = Edge(Config(), 7), 0
     for name in ("a", "a-b", "a-b.c", "a"):
         for _ in range(3):

@@ -1,4 +1,4 @@
-"""What the edge acknowledges, and what it makes of odometry that cannot be."""
+"""Acknowledgements and durability; checks of implausible odometry."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from share.geometry import se3
 from share.mapping.map_changes import SaveKeyframe, SaveRun
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
-from share.protocol.peer import OdometryBase, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import RestoredRun
 from share.types import F64, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -31,7 +32,7 @@ def keyframe(
     at_m: float | None = None,
     yaw: float = 0.0,
 ) -> Keyframe:
-    """A step forwards, to where that leads from 0.2 m a keyframe; at_m, yaw: or there in its odom."""
+    """Keyframe of a step of 0.2 m forwards; at_m, yaw: its pose in odom instead."""
     at_m = 0.2 * (id - 1) + forward_m if at_m is None else at_m
     T, T_odom_body = (se3.from_rt(np.eye(3), np.array([x, 0.0, 0.0])) for x in (forward_m, at_m))
     T_odom_body = T_odom_body @ se3.exp(np.array([0, 0, yaw, 0, 0, 0]))
@@ -55,7 +56,7 @@ def of(effects: list[ed.EdgeEffect], kind: type) -> list:
     return [effect for effect in effects if isinstance(effect, kind)]
 
 
-def test_nothing_is_acknowledged_before_it_is_kept() -> None:
+def test_nothing_is_acknowledged_before_it_is_stored() -> None:
     edge = Edge(Config(), 7, has_store=True)
     tell(edge, HELLO)
     effects = tell(edge, keyframe(0, -1))
@@ -69,7 +70,7 @@ def test_nothing_is_acknowledged_before_it_is_kept() -> None:
     assert acks(edge.handle(ed.ChangesSaved(keep.ticket), 0)) == []
 
 
-def test_several_kept_at_once_are_acknowledged_once() -> None:
+def test_several_stored_at_once_are_acknowledged_once() -> None:
     edge = Edge(Config(), 7, has_store=True)
     tell(edge, HELLO)
     keeps = [of(tell(edge, keyframe(k, k - 1)), ed.SaveChanges)[0] for k in range(3)]
@@ -77,9 +78,9 @@ def test_several_kept_at_once_are_acknowledged_once() -> None:
     assert acks(edge.handle(ed.ChangesSaved(keeps[2].ticket), 0)) == [m.Ack(3)]
 
 
-def test_a_known_run_goes_on_where_it_was() -> None:
+def test_a_restored_run_continues() -> None:
     foot = OdometryBase(4, 800 * MS, at(0.8))
-    edge = Edge(Config(), 8, has_store=True, restored=[RestoredRun("ann-000b", HELLO, foot, 5)])
+    edge = Edge(Config(), 8, has_store=True, restored=[RestoredRun("ann-000b", HELLO, foot)])
     effects = tell(edge, HELLO)
     (welcome,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.SendToPeer)]
     assert welcome == m.Welcome(8, 5)
@@ -90,7 +91,7 @@ def test_a_known_run_goes_on_where_it_was() -> None:
     assert keep.changes[0].keyframe.reference == 4
 
 
-def test_a_leap_begins_a_stretch_in_the_same_odom() -> None:
+def test_an_implausible_jump_starts_a_segment_in_the_same_odom() -> None:
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
@@ -113,7 +114,7 @@ def test_a_leap_begins_a_stretch_in_the_same_odom() -> None:
         ({"yaw": 0.4}, "23 degrees"),
     ],
 )
-def test_a_step_that_is_not_between_its_two_poses_is_not_believed(bad: dict[str, float], off: str) -> None:
+def test_a_motion_that_contradicts_its_two_poses_starts_a_segment(bad: dict[str, float], off: str) -> None:
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
@@ -131,7 +132,7 @@ def test_a_step_that_is_not_between_its_two_poses_is_not_believed(bad: dict[str,
     assert ann["refused_messages"] == 0  # it is taken in
 
 
-def test_what_is_taken_in_with_a_bounded_variance_is_not_refused() -> None:
+def test_a_keyframe_with_a_bounded_variance_is_not_refused() -> None:
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     for id in range(12):
@@ -145,8 +146,8 @@ def test_what_is_taken_in_with_a_bounded_variance_is_not_refused() -> None:
     assert line.startswith("agent 'ann': 12 suspect keyframes, the last: keyframe 11 has a variance of 1e+12")
 
 
-def test_what_a_filter_learns_of_its_past_is_no_contradiction() -> None:
-    """As much and more than was measured of honest agents."""
+def test_a_later_estimate_of_the_past_is_no_contradiction() -> None:
+    """Differences larger than those measured of correct agents."""
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
@@ -163,7 +164,7 @@ def at(x: float) -> F64:
     return se3.from_rt(np.eye(3), np.array([x, 0.0, 0.0]))
 
 
-def test_far_is_no_leap_if_time_enough_has_passed() -> None:
+def test_a_long_motion_in_a_long_time_is_no_jump() -> None:
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
@@ -171,7 +172,7 @@ def test_far_is_no_leap_if_time_enough_has_passed() -> None:
     assert add.keyframe.reference == 0
 
 
-def test_a_reference_that_is_not_the_last_is_said_and_left_out() -> None:
+def test_a_reference_that_is_not_the_last_keyframe_is_refused() -> None:
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
@@ -184,7 +185,7 @@ def test_a_reference_that_is_not_the_last_is_said_and_left_out() -> None:
     assert of(tell(edge, keyframe(3, -1)), ed.AddKeyframe)  # a new stretch goes on
 
 
-def test_a_runs_number_is_not_shared_by_two_names() -> None:
+def test_a_run_id_is_not_shared_by_two_names() -> None:
     edge = Edge(Config(), 7)
     tell(edge, HELLO)
     effects = tell(edge, hello_of("eve", 11))
@@ -193,8 +194,8 @@ def test_a_runs_number_is_not_shared_by_two_names() -> None:
     assert "'ann'" in refused.reason
 
 
-def test_what_waits_for_the_disk_is_bounded(monkeypatch) -> None:
-    """An agent that does not wait for acknowledgements is not taken in beyond a bound, and loses nothing."""
+def test_keyframes_waiting_for_the_disk_are_bounded(monkeypatch) -> None:
+    """Keyframes of an agent that ignores the window are deferred beyond a bound, and none is lost."""
     monkeypatch.setattr("share.protocol.peer._MAX_PENDING_SAVES", 5)
     edge = Edge(Config(), 7, has_store=True)
     tell(edge, HELLO)

@@ -1,4 +1,4 @@
-"""Counts go on where the life before ended."""
+"""Totals over restarts of the mapper."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from share.wire.codec import encode
 
 
 def life(session: int, poses: int, solves: int) -> dict[str, Any]:
-    """The report of an edge that has heard ann so often, a stranger too, and solved so often."""
+    """The report of an edge with so many messages of ann and of an unjoined peer, and so many solutions."""
     edge, mapper = Edge(Config(), session), Mapper(Config())
 
     def tell(run_id: int, message: m.Message) -> None:
@@ -32,9 +32,10 @@ def life(session: int, poses: int, solves: int) -> dict[str, Any]:
         tell(1, m.Bye())
         tell(1, hello_of("ann", 1))
     tell(9, m.Evaluation(0, 1.0, None))
-    mapper._counters.steps["solve"] = solves
-    mapper._counters._removed_runs.loops_tried = solves
-    return edge.report(mapper.report())
+    report = edge.report(mapper.report())
+    report["solve_ms"] |= {"n": solves}
+    report["loops"] |= {"tried": solves}
+    return report
 
 
 def numbers(report: dict[str, Any], path: str) -> float:
@@ -43,12 +44,12 @@ def numbers(report: dict[str, Any], path: str) -> float:
     return report  # type: ignore[return-value]
 
 
-def test_the_first_life_counts_for_itself() -> None:
+def test_the_first_session_has_no_earlier_counts() -> None:
     report = life(1, 3, 5)
     assert SessionTotals().with_totals(report) == report
 
 
-def test_a_life_goes_on_where_the_one_before_it_ended() -> None:
+def test_counts_continue_after_a_restart_of_the_mapper() -> None:
     totals, before, now = SessionTotals(), life(1, 3, 5), life(2, 1, 2)
     totals.add_session(totals.with_totals(before))
     added = totals.with_totals(now)
@@ -60,7 +61,7 @@ def test_a_life_goes_on_where_the_one_before_it_ended() -> None:
     assert numbers(totals.with_totals(now), "loops.tried") == 5 + 2 + 2
 
 
-def test_before_the_next_mapper_has_said_anything_they_are_there_too() -> None:
+def test_earlier_counts_are_reported_before_the_next_mapper_reports() -> None:
     totals, before = SessionTotals(), life(1, 3, 5)
     totals.add_session(totals.with_totals(before))
     silent = Edge(Config(), 2).report({})
@@ -70,14 +71,14 @@ def test_before_the_next_mapper_has_said_anything_they_are_there_too() -> None:
     assert added["agents"] == {}
 
 
-def test_another_run_of_a_name_counts_for_itself() -> None:
+def test_another_run_of_a_name_counts_separately() -> None:
     totals, before, now = SessionTotals(), life(1, 3, 5), life(2, 1, 2)
     before["agents"]["ann"]["run"] = "ann-ffff"
     totals.add_session(totals.with_totals(before))
     assert totals.with_totals(now)["agents"] == now["agents"]
 
 
-def test_an_agent_that_one_life_did_not_hear_goes_on_in_the_next() -> None:
+def test_the_counts_of_an_agent_survive_a_session_without_it() -> None:
     totals, heard = SessionTotals(), life(1, 3, 5)
     totals.add_session(totals.with_totals(heard))
     totals.add_session(totals.with_totals(Edge(Config(), 2).report({})))

@@ -1,4 +1,4 @@
-"""Frames under way: bounded, the newest wins, and no IMU sample is lost with a frame that is dropped."""
+"""Frames in flight are bounded, the newest waits, and IMU samples of dropped frames are kept."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def offered(window: FrameWindow, index: int, now_ns: int = 0) -> int | None:
     return None if went is None else went.index
 
 
-def test_the_newest_waits_and_brings_along_what_the_imu_said() -> None:
+def test_the_newest_frame_waits_and_carries_the_imu_samples_of_dropped_ones() -> None:
     window = FrameWindow(2)
     assert [offered(window, i) for i in range(6)] == [0, 1, None, None, None, None]
     assert (window.dropped, window.unanswered) == (3, 0)
@@ -38,7 +38,7 @@ def test_the_newest_waits_and_brings_along_what_the_imu_said() -> None:
     assert not window.is_idle
 
 
-def test_an_answer_ends_the_wait_for_those_before_it() -> None:
+def test_an_answer_expires_earlier_frames() -> None:
     window = FrameWindow(3)
     assert [offered(window, i) for i in range(3)] == [0, 1, 2]
     assert window.take_answered(1) is not None
@@ -49,7 +49,7 @@ def test_an_answer_ends_the_wait_for_those_before_it() -> None:
     assert window.is_idle
 
 
-def test_what_was_not_taken_goes_with_the_next() -> None:
+def test_the_imu_samples_of_a_cancelled_frame_go_with_the_next() -> None:
     window = FrameWindow(1)
     assert offered(window, 0) == 0
     window.cancel(0)
@@ -60,7 +60,7 @@ def test_what_was_not_taken_goes_with_the_next() -> None:
     assert went.imu.stamps_ns.tolist() == [0, 1000]
 
 
-def test_nobody_waits_for_ever() -> None:
+def test_unanswered_frames_expire() -> None:
     window = FrameWindow(2)
     for i in range(3):
         offered(window, i, now_ns=10 * i)
@@ -73,7 +73,7 @@ def test_nobody_waits_for_ever() -> None:
     assert (window.unanswered, window.is_idle) == (3, True)
 
 
-def test_a_long_silence_does_not_fill_memory() -> None:
+def test_kept_imu_samples_are_bounded() -> None:
     window = FrameWindow(1)
     for i in range(5):
         window.skip(frame(i, MAX_IMU_SAMPLES // 2))
@@ -85,7 +85,7 @@ def test_a_long_silence_does_not_fill_memory() -> None:
 
 
 @given(st.lists(st.sampled_from(["offer", "answer the oldest", "answer the newest"]), max_size=60))
-def test_every_frame_has_one_fate_and_every_sample_goes_once(acts: list[str]) -> None:
+def test_every_frame_is_counted_once_and_every_sample_is_sent_once(acts: list[str]) -> None:
     window, came, answered = FrameWindow(2), 0, 0
     under_way, heard = list[int](), list[int]()
     for act in acts:

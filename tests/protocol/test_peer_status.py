@@ -1,4 +1,4 @@
-"""What an edge shows of an agent is true of now, not of when the agent was last heard."""
+"""The state that an edge shows of an agent, and its age."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from helpers.model_edge import MS, S
 from share.config import Config
 from share.protocol.edge import Edge
 from share.protocol.edge_events import EdgeTick, PeerMessageReceived
-from share.protocol.peer import OdometryBase, PeerStatus, RestoredRun
+from share.protocol.keyframe_intake import OdometryBase
+from share.protocol.peer import PeerStatus, RestoredRun
 from share.types import TrackState
 from share.wire import messages as wire
 from share.wire.codec import encode
@@ -18,18 +19,18 @@ OK = wire.Status(TrackState.OK, 20.0)
 GONE = wire.Status(TrackState.LOST, 2100.0, "no image for 2.1 s")
 
 
-def test_it_shows_state_age_and_reason_as_they_were_said() -> None:
+def test_state_age_and_reason_are_those_of_the_last_status() -> None:
     status = PeerStatus()
     status.update(GONE, 5 * S)
     assert status.report(5 * S + 100 * MS, 5 * S) == {
         "state": "LOST",
         "reason": "no image for 2.1 s",
         "pose_age_ms": 2200.0,
-        "heard_s": 0.1,
+        "last_received_s": 0.1,
     }
 
 
-def test_a_pose_makes_the_age_that_of_poses_when_they_were_last_spoken_of() -> None:
+def test_a_pose_resets_the_age_to_that_of_the_last_status() -> None:
     status = PeerStatus()
     status.update(OK, 5 * S)
     status.add_pose(TrackState.OK, 5 * S + 400 * MS)
@@ -43,21 +44,21 @@ def test_a_pose_ends_the_reason_for_having_none() -> None:
     assert status.report(6 * S, 6 * S)["reason"] == ""
 
 
-def test_before_it_has_said_anything_no_age_is_shown() -> None:
+def test_no_age_is_shown_before_the_first_status() -> None:
     report = PeerStatus().report(9 * S, 9 * S)
     assert (report["state"], report["pose_age_ms"]) == ("INITIALISING", None)
 
 
-def test_who_was_not_heard_in_this_life_has_no_age() -> None:
-    """The clock of the machine began long before the edge."""
-    known = RestoredRun("ann-000b", hello_of("ann", 1), OdometryBase(0, 0, np.eye(4)), 1)
+def test_a_restored_run_has_no_age() -> None:
+    """The machine has run for long before the edge starts."""
+    known = RestoredRun("ann-000b", hello_of("ann", 1), OdometryBase(0, 0, np.eye(4)))
     edge = Edge(Config(), session=5, restored=[known])
     edge.handle(EdgeTick(), 6600 * S)
     seen = shown(edge)
-    assert (seen["state"], seen["heard_s"], seen["gone"]) == ("SILENT", None, True)
+    assert (seen["state"], seen["last_received_s"], seen["gone"]) == ("SILENT", None, True)
     assert "no message since" in str(seen["reason"])
     edge.handle(PeerMessageReceived(wire.peer_id(1), encode(hello_of("ann", 1))), 6601 * S)
-    assert shown(edge)["heard_s"] == 0.0
+    assert shown(edge)["last_received_s"] == 0.0
 
 
 def edge_with(status: wire.Status, at_ns: int) -> Edge:
@@ -71,7 +72,7 @@ def shown(edge: Edge) -> dict[str, object]:
     return edge.report({})["agents"]["ann"]
 
 
-def test_an_agent_that_falls_silent_is_not_shown_in_its_last_state() -> None:
+def test_a_silent_agent_is_shown_as_silent() -> None:
     edge = edge_with(OK, S)
     edge.handle(EdgeTick(), S + 650 * MS)
     assert (shown(edge)["state"], shown(edge)["reason"]) == ("OK", "")
@@ -84,7 +85,7 @@ def test_an_agent_that_falls_silent_is_not_shown_in_its_last_state() -> None:
     assert shown(edge)["state"] == "OK"
 
 
-def test_an_agent_that_said_bye_keeps_the_state_that_it_had() -> None:
+def test_an_agent_that_left_keeps_its_last_state() -> None:
     edge = edge_with(OK, S)
     edge.handle(PeerMessageReceived(wire.peer_id(1), encode(wire.Bye())), 2 * S)
     edge.handle(EdgeTick(), 60 * S)

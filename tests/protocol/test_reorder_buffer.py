@@ -1,19 +1,18 @@
-"""In-order application at the edge."""
+"""Reordering of keyframes at the edge."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from share.protocol.peer import ReorderBuffer
+from share.protocol.keyframe_intake import ReorderBuffer
 from share.types import Keyframe, View
-from share.wire.messages import MAX_BUFFERED, Ack
+from share.wire.messages import Ack
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32)))
 
 
 def keyframe(id_: int, predecessor: int | None = None, reference: int | None = None) -> Keyframe:
-    """By default relative to its predecessor, as an agent's keyframes are."""
+    """A keyframe, by default relative to its predecessor."""
     predecessor = id_ - 1 if predecessor is None else predecessor
     reference = predecessor if reference is None else reference
     eye = np.eye(4)
@@ -24,13 +23,13 @@ def ids(keyframes: list[Keyframe]) -> list[int]:
     return [k.id for k in keyframes]
 
 
-def test_in_order_passes_through() -> None:
+def test_keyframes_in_order_are_applied_at_once() -> None:
     book = ReorderBuffer()
     assert [ids(book.push(keyframe(k))) for k in range(3)] == [[0], [1], [2]]
     assert book.ack() == Ack(3)
 
 
-def test_a_gap_holds_what_comes_after_it() -> None:
+def test_keyframes_after_a_gap_are_buffered() -> None:
     book = ReorderBuffer()
     book.push(keyframe(0))
     assert book.push(keyframe(3)) == book.push(keyframe(2)) == []
@@ -49,7 +48,7 @@ def test_duplicates_are_ignored_and_acknowledged_again() -> None:
     assert book.ack() == Ack(1, (2,))
 
 
-def test_a_new_stretch_does_not_overtake() -> None:
+def test_a_new_segment_does_not_overtake() -> None:
     book = ReorderBuffer()
     book.push(keyframe(0))
     assert book.push(keyframe(2, predecessor=1, reference=-1)) == []
@@ -64,7 +63,7 @@ def test_dropped_ids_are_skipped() -> None:
     assert book.ack() == Ack(6)
 
 
-def test_the_later_version_of_a_waiting_keyframe_counts() -> None:
+def test_the_later_version_of_a_buffered_keyframe_is_used() -> None:
     book = ReorderBuffer()
     book.push(keyframe(0))
     book.push(keyframe(2))
@@ -80,26 +79,20 @@ def test_an_old_version_does_not_replace_a_later_one() -> None:
     assert ids(book.push(keyframe(3, predecessor=-1))) == [3, 9]
 
 
-def test_an_edge_without_memory_begins_where_the_agent_does() -> None:
+def test_an_edge_without_map_starts_at_any_id() -> None:
     assert ids(ReorderBuffer().push(keyframe(40, predecessor=-1))) == [40]
 
 
-def test_an_edge_with_memory_goes_on() -> None:
+def test_an_edge_with_map_continues() -> None:
     book = ReorderBuffer(next_keyframe=40)
     assert book.push(keyframe(39)) == []
     assert ids(book.push(keyframe(40))) == [40]
 
 
-def test_the_holding_area_is_bounded() -> None:
+def test_the_buffer_is_bounded() -> None:
     book = ReorderBuffer(capacity=4)
     for k in (9, 8, 7, 6, 5, 4, 3, 2, 1):
         assert book.push(keyframe(k)) == []
     assert book.ack() == Ack(0, (1, 2, 3, 4))
     assert book.evicted == 5
     assert ids(book.push(keyframe(0))) == [0, 1, 2, 3, 4]
-
-
-@pytest.mark.parametrize("hold", [0, MAX_BUFFERED + 1])
-def test_hold_must_fit_an_ack(hold: int) -> None:
-    with pytest.raises(ValueError, match="capacity"):
-        ReorderBuffer(capacity=hold)

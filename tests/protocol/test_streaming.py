@@ -1,4 +1,4 @@
-"""Frames up, poses down, in virtual time: a real agent and a real edge; the trackers are made up."""
+"""Frames up, poses down, in virtual time: a real agent and a real edge with simulated trackers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
 from share.protocol.remote_tracking import TrackingCapacity, TrackingEdge
-from share.protocol.streaming import FrameStreamer
+from share.protocol.streaming import FrameStreamer, StreamingAgent
 from share.types import F64, Frame, ImuBatch, TrackState
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -47,7 +47,7 @@ class Wire:
     now_ms: float = 0.0
     takes: bool = True  # the link
     cut: bool = False
-    agent: Agent = field(default_factory=lambda: Agent(HELLO, CONFIG))
+    agent: Agent = field(default_factory=lambda: StreamingAgent(HELLO, CONFIG))
     edge: Edge = field(default_factory=lambda: TrackingEdge(CONFIG, 1))
     effects: list[ev.AgentEffect] = field(default_factory=list)
     told: list[dict] = field(default_factory=list)
@@ -130,7 +130,7 @@ def joined(**more: float) -> Wire:
     return wire
 
 
-def test_it_is_welcomed_once_its_tracker_is_ready() -> None:
+def test_the_welcome_waits_for_the_tracker() -> None:
     wire = Wire(start_ms=1200)
     wire.run(1150)
     assert not wire.agent.is_connected
@@ -155,7 +155,7 @@ def test_every_frame_comes_back_with_its_pose() -> None:
     assert told["state"] == "OK"
 
 
-def test_an_edge_that_cannot_keep_up_is_given_the_newest() -> None:
+def test_a_slow_edge_gets_the_newest_frame() -> None:
     wire = joined(track_ms=100)
     wire.play(90)
     wire.run(3800)
@@ -169,7 +169,7 @@ def test_an_edge_that_cannot_keep_up_is_given_the_newest() -> None:
     assert heard.tolist() == list(range(90))
 
 
-def test_what_the_link_does_not_take_is_counted_and_its_imu_kept() -> None:
+def test_a_frame_that_the_link_refuses_is_counted_and_its_imu_samples_are_kept() -> None:
     wire = joined()
     wire.takes = False
     wire.play(3)
@@ -183,7 +183,7 @@ def test_what_the_link_does_not_take_is_counted_and_its_imu_kept() -> None:
     assert wire.tracked[0].imu.stamps_ns.tolist() == [0, 1, 2, 3]
 
 
-def test_without_an_edge_it_goes_on_and_says_so() -> None:
+def test_without_an_edge_the_run_continues_and_prints_a_line() -> None:
     wire = joined()
     wire.play(5)
     wire.run(500)
@@ -201,7 +201,7 @@ def test_without_an_edge_it_goes_on_and_says_so() -> None:
     assert [type(t).__name__ for t in wire.trackers] == ["StartTracker", "StopTracker", "StartTracker"]
 
 
-def test_another_life_of_the_edge_begins_another_stretch() -> None:
+def test_a_restarted_edge_starts_a_new_segment() -> None:
     wire = joined()
     wire.play(5)
     wire.run(500)
@@ -217,7 +217,7 @@ def test_another_life_of_the_edge_begins_another_stretch() -> None:
     ]
 
 
-def test_a_tracker_that_dies_costs_what_it_had_and_another_begins() -> None:
+def test_a_dead_tracker_loses_its_frames_and_is_restarted() -> None:
     wire = joined(track_ms=500)
     wire.play(3, every_ms=10)
     wire.run(900)
@@ -236,7 +236,7 @@ def test_a_tracker_that_dies_costs_what_it_had_and_another_begins() -> None:
     assert wire.edge.report({})["agents"]["ann"]["frames_dropped"] == 2
 
 
-def test_a_tracker_that_cannot_begin_is_said_to_its_agent() -> None:
+def test_an_agent_whose_tracker_cannot_start_is_refused() -> None:
     wire = Wire(start_ms=1e6)
     wire.run(100)
     wire.to_edge(ed.TrackerLost(wire.trackers[0].key, 0, "ended with exit code 1"))
@@ -247,7 +247,7 @@ def test_a_tracker_that_cannot_begin_is_said_to_its_agent() -> None:
     assert len(wire.trackers) == 1
 
 
-def test_a_goodbye_waits_for_the_last_pose_and_ends_the_tracker() -> None:
+def test_the_bye_waits_for_the_last_pose_and_stops_the_tracker() -> None:
     wire = joined(track_ms=100)
     wire.play(4, every_ms=5)
     wire.later(30, lambda: wire.to_agent(ev.InputFinished()))
@@ -269,8 +269,11 @@ def test_a_goodbye_waits_for_the_last_pose_and_ends_the_tracker() -> None:
         ),
     ],
 )
-def test_who_does_not_fit_is_refused(edge: Edge, streams: bool, said: str) -> None:
-    wire = Wire(edge=edge, agent=Agent(replace(HELLO, streams_frames=streams), CONFIG))
+def test_an_agent_of_the_other_mode_is_refused(edge: Edge, streams: bool, said: str) -> None:
+    wire = Wire(
+        edge=edge,
+        agent=(StreamingAgent if streams else Agent)(replace(HELLO, streams_frames=streams), CONFIG),
+    )
     wire.run(200)
     (fail,) = wire.of(ev.FailRun)
     assert said in str(fail.error)
@@ -287,8 +290,8 @@ def test_a_frame_of_another_size_is_a_bad_message() -> None:
     assert not wire.tracked
 
 
-def test_a_stream_that_is_none_of_ours_changes_nothing() -> None:
-    """An evaluation by one who streams, a frame of a stranger, a pose for one who tracks itself."""
+def test_unexpected_messages_change_nothing() -> None:
+    """An evaluation of a streaming agent, a frame of an unjoined peer, a remote pose for a tracking agent."""
     wire = joined()
     wire.to_edge(ed.PeerMessageReceived(PEER, encoded(m.Evaluation(0, 1.0, None))))
     wire.to_edge(ed.PeerMessageReceived(m.peer_id(9), encoded(frame(0))))
@@ -311,14 +314,14 @@ def encoded(message: m.Message) -> list[bytes]:
 
 
 def greeted(edge: Edge, number: int, now_ms: int = 0) -> tuple[list[m.Message], list[ed.EdgeEffect]]:
-    """What agent `number` is told when it says hello, and all else that follows."""
+    """The answer to the hello of agent `number`, and all effects."""
     hello = replace(hello_of(f"agent{number}", 100 + number), streams_frames=True)
     effects = edge.handle(ed.PeerMessageReceived(m.peer_id(100 + number), encode(hello)), now_ms * MS)
     down = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
     return down, effects
 
 
-def test_no_more_are_tracked_than_there_is_room_for():
+def test_tracked_agents_are_limited_by_cores_and_memory():
     edge = TrackingEdge(CONFIG, 1, capacity=TrackingCapacity(4, "2 cores, 3.1 GB free"))
     begun = [e for k in range(12) for e in greeted(edge, k)[1] if isinstance(e, ed.StartTracker)]
     assert len(begun) == 4
@@ -348,8 +351,8 @@ def test_a_rig_that_no_tracker_can_use_is_refused_at_hello():
         assert isinstance(told, m.Refused) and says in told.reason
 
 
-def test_large_images_need_more_room():
-    """Each tracker of 3800x2400 takes 392 MB of it, of 640x480 110."""
+def test_large_images_need_more_memory():
+    """A tracker of 3800x2400 takes 392 MB, one of 640x480 110 MB."""
     edge = TrackingEdge(CONFIG, 1, capacity=TrackingCapacity(8, "4 cores, 1.0 GB free", 1_000_000_000))
     large = Rig(Camera(3800, 2400, 3000.0, 3000.0, 1900.0, 1200.0), np.eye(4), imu=NOISE)
     begun, refused = 0, []
@@ -364,8 +367,8 @@ def test_large_images_need_more_room():
     assert [type(e) for e in greeted(edge, 50)[1]].count(ed.StartTracker) == 1  # a small one has room
 
 
-def test_a_stretch_that_begins_with_a_frame_nobody_waits_for_any_more_begins_with_the_next() -> None:
-    """A tracker that died and came back answers first what it was given meanwhile: too late."""
+def test_a_new_segment_in_a_late_answer_starts_with_the_next_pose() -> None:
+    """A restarted tracker first answers frames that have expired."""
     streaming = FrameStreamer(CONFIG.stream)
     for k in range(2):
         streaming.add_frame(ev.FrameArrived(frame(k), 0), is_connected=True)

@@ -1,22 +1,24 @@
-"""What peers can cause at any rate is few, and nobody's is hidden by another's."""
+"""Limits on events and lines that a peer can cause at any rate."""
 
 from __future__ import annotations
 
 import re
 
+import pytest
 from helpers.model_edge import S
 
 from share.protocol.edge_records import EventLog
+from share.protocol.reply_validation import FaultDeduplicator
 from share.timing import Throttle
 
 
-def test_a_burst_then_so_many_a_second_and_the_rest_is_counted() -> None:
+def test_a_burst_passes_then_the_rate_and_the_rest_is_counted() -> None:
     throttle = Throttle(1.0, 3.0)
     assert [throttle.admit("a", 0) for _ in range(5)] == [0, 0, 0, None, None]
     assert throttle.admit("a", S) == 2
 
 
-def test_a_new_key_is_admitted_however_many_there_are() -> None:
+def test_a_new_key_is_admitted_whatever_their_number() -> None:
     throttle = Throttle(1.0, 3.0)
     for k in range(600):
         throttle.admit(k, 0)
@@ -27,8 +29,9 @@ def test_a_new_key_is_admitted_however_many_there_are() -> None:
     assert throttle.admit("ann", 101 * S) == 0
 
 
-def test_keys_that_are_new_each_time_are_few() -> None:
-    """For ten minutes, a thousand new ones a second: two a second, and those that share one limit."""
+@pytest.mark.long
+def test_ever_new_keys_are_limited() -> None:
+    """A thousand new keys a second for ten minutes: two a second pass, and those that share one limit."""
     throttle = Throttle(1.0, 3.0)
     let_through = sum(
         throttle.admit((second, k), second * S) is not None for second in range(600) for k in range(1000)
@@ -36,7 +39,7 @@ def test_keys_that_are_new_each_time_are_few() -> None:
     assert let_through < 512 + 64 + 3 * 600 + 10
 
 
-def test_what_goes_on_and_on_is_written_once_a_minute() -> None:
+def test_a_lasting_event_is_written_once_a_minute() -> None:
     records = EventLog(0)
     written = [records.throttled_event(s * S, "reconnected", "eve", "sends again") for s in range(3600)]
     first, later = written[:300], written[600:]
@@ -44,10 +47,26 @@ def test_what_goes_on_and_on_is_written_once_a_minute() -> None:
     assert sum(r is not None for r in later) <= 51
 
 
-def test_nothing_that_is_held_back_is_forgotten() -> None:
+def test_suppressed_events_are_counted() -> None:
     records, counted = EventLog(0), 0
     for k in range(36_000):
         if (record := records.throttled_event(k * S // 10, "reconnected", "eve", "sends again")) is not None:
             more = re.search(r"and (\d+) more", record.fields["reason"])
             counted += 1 + (int(more[1]) if more else 0)
     assert 36_000 - counted < 700  # of the last minute
+
+
+def test_a_fault_is_new_again_after_a_minute_of_absence() -> None:
+    lasting = FaultDeduplicator()
+    said = [t for t in range(0, 600, 2) if lasting.is_new("wants keys", t * S)]
+    assert said == [0]
+    assert not lasting.is_new("wants keys", 655 * S)
+    assert lasting.is_new("another key", 656 * S)
+    assert lasting.is_new("wants keys", 716 * S)
+
+
+def test_the_number_of_remembered_faults_is_bounded() -> None:
+    lasting = FaultDeduplicator()
+    assert all(lasting.is_new(str(k), k) for k in range(1000))
+    assert not lasting.is_new("999", 1000)
+    assert lasting.is_new("980", 1001)  # forgotten, although it was seen less than a minute ago

@@ -18,6 +18,7 @@ from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
 from share.protocol.remote_tracking import TrackingEdge
+from share.protocol.streaming import StreamingAgent
 from share.types import TrackState
 from share.wire import messages as m
 from share.wire.codec import WIRE_VERSION, decode, encode
@@ -67,15 +68,15 @@ def test_each_message_of_an_older_agent_is_refused_in_its_own_version(old: int) 
         assert report["unjoined"]["other_version"] == len(ups(old))
 
 
-def test_the_older_agents_conversation_is_refused_seldom(old: int) -> None:
-    """As it passed, several messages in a frame's time."""
+def test_an_older_agent_is_refused_at_a_low_rate(old: int) -> None:
+    """The recorded messages, several in the time of a frame."""
     for edge in edges():
         said = [sends(edge.handle(ed.PeerMessageReceived(up.peer, up.frames), up.t_ns)) for up in ups(old)]
         agents, last_s = len({up.peer for up in ups(old)}), ups(old)[-1].t_ns / S
         assert agents <= sum(map(len, said)) <= agents * (1 + last_s / 2)
 
 
-def test_the_refusal_is_written_down_and_seen_on_the_page(old: int) -> None:
+def test_the_refusal_is_recorded_and_reported(old: int) -> None:
     edge, frames = edges()[0], ups(old)[0].frames
     assert ups(old)[0].code != PING
     records = [
@@ -114,7 +115,7 @@ class OlderEdge:
 
 
 def run(agent: Agent, edge: OlderEdge | None, seconds: int) -> list[ev.AgentEffect]:
-    """Ten frames a second; whatever is answered is heard at the next one."""
+    """Run at ten frames a second; answers arrive at the next frame."""
     effects = agent.handle(ev.Connected(), 0)
     inbox: list[list[bytes]] = []
     for k in range(10 * seconds):
@@ -134,7 +135,7 @@ def poses(effects: list[ev.AgentEffect]) -> list[ev.LocalisedPose]:
     return [effect for effect in effects if isinstance(effect, ev.LocalisedPose)]
 
 
-def test_an_agent_finds_out_that_the_edge_is_older_and_goes_on(old: int) -> None:
+def test_an_agent_finds_that_the_edge_is_older_and_continues(old: int) -> None:
     agent = Agent(HELLO, Config())
     effects = run(agent, OlderEdge(old), 20)
     (line,) = said(effects)
@@ -145,11 +146,11 @@ def test_an_agent_finds_out_that_the_edge_is_older_and_goes_on(old: int) -> None
     assert agent.report()["bad_messages"] == 0
 
 
-def test_it_finds_out_within_two_seconds(old: int) -> None:
+def test_an_older_edge_is_found_within_two_seconds(old: int) -> None:
     assert len(said(run(Agent(HELLO, Config()), OlderEdge(old), 2))) == 1
 
 
-def test_it_joins_the_edge_once_that_is_upgraded(old: int) -> None:
+def test_an_agent_joins_once_the_edge_is_upgraded(old: int) -> None:
     agent = Agent(HELLO, Config())
     run(agent, OlderEdge(old), 5)
     welcome = [bytes(f) for f in encode(m.Welcome(8, 0))]
@@ -158,8 +159,8 @@ def test_it_joins_the_edge_once_that_is_upgraded(old: int) -> None:
 
 
 def test_an_edge_of_this_version_is_not_taken_for_an_older_one(old: int) -> None:
-    """It is slow to welcome, as one that starts trackers is: pings of older versions reach it meanwhile."""
-    agent, edge, answers = Agent(replace(HELLO, streams_frames=True), Config()), edges()[1], []
+    """An edge that starts trackers is slow to welcome: pings of older versions reach it before."""
+    agent, edge, answers = StreamingAgent(replace(HELLO, streams_frames=True), Config()), edges()[1], []
     agent.handle(ev.Connected(), 0)
     for k in range(100):
         now_ns = k * S // 10
@@ -171,7 +172,7 @@ def test_an_edge_of_this_version_is_not_taken_for_an_older_one(old: int) -> None
     assert answers == []
 
 
-def test_whatever_an_older_edge_says_changes_nothing(old: int) -> None:
+def test_messages_of_an_older_edge_change_nothing(old: int) -> None:
     agent = Agent(HELLO, Config())
     effects = run(agent, None, 5)
     downs = [message for message in traffic(old) if message.way == "down"]
@@ -187,8 +188,8 @@ def test_whatever_an_older_edge_says_changes_nothing(old: int) -> None:
     assert len(said(effects)) == 2  # that no edge answers yet, and that it does not understand
 
 
-def test_frozen_messages_are_the_same_in_every_version(old: int) -> None:
-    """Byte for byte behind the version: their layout is never to change."""
+def test_stable_messages_are_the_same_in_every_version(old: int) -> None:
+    """Byte for byte after the version: their layout must not change."""
     by_code = {message.code: message for message in traffic(old)}
     for code, kind in ((PING, m.Ping), (21, m.Pong), (REFUSED, m.Refused)):
         frames = by_code[code].frames

@@ -97,7 +97,7 @@ def test_a_disk_that_is_full_for_a_while(tmp_path):
     ann.start()
     child.wait_for("the map cannot be written")
     time.sleep(1.5)
-    assert ann.machine.report()["open"] > 2
+    assert ann.machine.report()["pending"] > 2
     assert "keyframes are not acknowledged" in child.said
     resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, limits)
     child.wait_for("the map is saved again")
@@ -145,7 +145,7 @@ def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
     ann.start()
     child.wait_for("the map cannot be written: No space left on device; keyframes are not acknowledged")
     time.sleep(2.0)
-    acknowledged, waiting = (ann.machine.report()[name] for name in ("acknowledged", "open"))
+    acknowledged, waiting = (ann.machine.report()[name] for name in ("acknowledged", "pending"))
     assert waiting > 3
     assert ann.machine.report()["acknowledged"] == acknowledged
     child.kill()
@@ -155,7 +155,7 @@ def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
     (small_disk / "ballast").unlink()
     child.wait_for("the map is saved again")
     deadline = time.monotonic() + 20
-    while ann.machine.report()["open"] > 1 and time.monotonic() < deadline:
+    while ann.machine.report()["pending"] > 1 and time.monotonic() < deadline:
         time.sleep(0.05)
     ann.finish()
     ann.join(20)
@@ -163,7 +163,7 @@ def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
     assert child.interrupt() == 0
     ids = kept_ids(small_disk / "room.sqlite", tmp_path / "well")
     assert ids == list(range(ann.machine.report()["keyframes"]))
-    assert ann.machine.report()["open"] == 0
+    assert ann.machine.report()["pending"] == 0
 
 
 @pytest.mark.long

@@ -153,7 +153,7 @@ def check_agents(walkers: list[Walker], took_s: float) -> None:
             assert T is walker.script.T_odom_body[k] or np.array_equal(T, walker.script.T_odom_body[k])
         assert len(walker.odometry) >= min(len(walker.script.T_odom_body), (took_s - FOUND_S) / FRAME_S)
         report = walker.machine.report()
-        assert report["open"] == 0
+        assert report["pending"] == 0
         assert report["keyframes"] == -(-len(walker.odometry) // EVERY)
         assert report["drop_oldest"] == report["drop_rate"] == 0
 

@@ -85,7 +85,7 @@ def test_two_agents_end_in_one_map(kitchen, tracked, tmp_path):
         estimate_ms = own["protocol"]["clock_offset_ns"] / 1e6
         busy_ms = 0.5  # by which either side may wait for a core; the bound itself is tested in virtual time
         assert abs(estimate_ms) <= clock["asymmetry_ms"] + 4 * clock["sigma_ms"] + busy_ms
-        assert clock["claim"] == (clock["uncertainty_ms"] <= 1.0) == (clock["offset_ms"] is not None)
+        assert clock["is_reliable"] == (clock["uncertainty_ms"] <= 1.0) == (clock["offset_ms"] is not None)
         assert "clock of the edge: " in agents[name].said
 
 

@@ -43,7 +43,7 @@ def test_a_process_of_the_edge_is_stopped(tmp_path, victim):
     for walker in walkers:
         walker.join(FOUND_S)
         assert walker.error is None
-        assert walker.machine.report()["open"] == 0
+        assert walker.machine.report()["pending"] == 0
     assert "mapper died" not in edge.said
     assert edge.interrupt() == 0
     check_map(tmp_path / "room.sqlite", walkers)
@@ -64,7 +64,7 @@ def test_an_agent_is_stopped(tmp_path, plain_session):
     assert names.index("silent") < names.index("reconnected") < names.index("left")
     report = json.loads((tmp_path / "ann" / "report.json").read_text())
     told = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]["ann"]
-    assert (report["protocol"]["open"], report["frames"]) == (0, 45)
+    assert (report["protocol"]["pending"], report["frames"]) == (0, 45)
     assert told["keyframes"] == report["protocol"]["acknowledged"]
 
 
@@ -79,7 +79,7 @@ def test_agents_are_killed_again_and_again(tmp_path, plain_session):
     last = start_agent(tmp_path, "last", plain_session / "ar1", address)
     assert last.wait(60) == 0
     report = json.loads((tmp_path / "last" / "report.json").read_text())
-    assert report["protocol"]["open"] == 0
+    assert report["protocol"]["pending"] == 0
     assert "Traceback" not in edge.said
     assert edge.process.poll() is None
     assert edge.interrupt() == 0

@@ -30,7 +30,7 @@ def test_setting_the_wall_clock_changes_no_pose(tmp_path: Path, plain_session: P
     odometry = [(tmp_path / name / "odom.tum").read_bytes() for name in ("ann", "bob")]
     assert odometry[0] == odometry[1]
     report = json.loads((tmp_path / "ann" / "report.json").read_text())
-    assert (report["frames"], report["protocol"]["open"], report["lost_s"]) == (45, 0, 0)
+    assert (report["frames"], report["protocol"]["pending"], report["lost_s"]) == (45, 0, 0)
     assert abs(report["clock"]["offset_ms"]) < 1000
     t_s = [json.loads(line)["t_s"] for line in (tmp_path / "edge" / "events.jsonl").read_text().splitlines()]
     assert t_s == sorted(t_s)

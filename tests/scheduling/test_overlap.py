@@ -1,4 +1,4 @@
-"""Overlap of frusta against what can be worked out, and against chance."""
+"""Overlap of view frusta: exact cases, Monte Carlo, symmetry."""
 
 import math
 
@@ -23,7 +23,7 @@ seeds = st.integers(0, 10_000)
 
 
 def poses(seed: int, count: int, metres: float = 3.0) -> F64:
-    """Anyhow in a cube of this side (count, 4, 4)."""
+    """Random poses in a cube of this side (count, 4, 4)."""
     rng = np.random.default_rng(seed)
     return exp(np.hstack([rng.normal(0, 1, (count, 3)), rng.uniform(0, metres, (count, 3))]))
 
@@ -32,7 +32,7 @@ def shifted(x: float = 0, y: float = 0, z: float = 0) -> F64:
     return exp(np.array([0, 0, 0, x, y, z], dtype=float))
 
 
-def test_a_frustum_follows_from_a_calibration() -> None:
+def test_frustum_from_a_calibration() -> None:
     frustum = Frustum.from_camera(Camera(640, 480, 320.0, 240.0, 319.5, 239.5), 0.3, 5.0)
     assert frustum.slopes == (pytest.approx(1.0), pytest.approx(1.0))
     assert Frustum.from_camera(Camera(8192, 480, 1.0, 240.0, 0, 0), 0.3, 5.0).horizontal_rad < math.pi
@@ -43,15 +43,15 @@ def test_volume_by_hand() -> None:
     assert Frustum(half, half, 1, 4).volume == pytest.approx(84, abs=1e-12)
 
 
-def test_a_view_overlaps_itself_wholly() -> None:
+def test_a_view_overlaps_itself_completely() -> None:
     for T in poses(0, 20):
         assert ious(USUAL, T, USUAL, T[None])[0] == 1
         assert overlap_volumes(USUAL, T, USUAL, T[None])[0] == WIDE.volume
 
 
 @pytest.mark.parametrize("step", [0.25, 1.0, 2.2, 4.0, 4.7, 5.5])
-def test_a_step_forward_is_as_worked_out(step: float) -> None:
-    """Of the rear frustum there remains what is within the front one, from its near end on."""
+def test_overlap_after_a_step_forward(step: float) -> None:
+    """The overlap is the part of the rear frustum that is in the front one, from its near plane on."""
     sx, sy = WIDE.slopes
     expected = 4 / 3 * sx * sy * max(0.0, (WIDE.far_m - step) ** 3 - WIDE.near_m**3)
     got = overlap_volumes(FINE, np.eye(4), FINE, shifted(z=step)[None])[0]
@@ -62,8 +62,8 @@ def test_a_step_forward_is_as_worked_out(step: float) -> None:
     )
 
 
-def test_a_step_aside_is_as_worked_out() -> None:
-    """At depth z both see a width of 2 z tan - step, as far as that is positive."""
+def test_overlap_after_a_step_aside() -> None:
+    """At depth z both see a width of 2 z tan - step where that is positive."""
     sx, sy = WIDE.slopes
     depth = np.linspace(WIDE.near_m, WIDE.far_m, 20_001)
     expected = np.trapezoid(np.maximum(0, 2 * sx * depth - 1.5) * 2 * sy * depth, depth)
@@ -72,7 +72,7 @@ def test_a_step_aside_is_as_worked_out() -> None:
     )
 
 
-def test_who_look_away_from_each_other_share_nothing() -> None:
+def test_opposite_and_distant_views_do_not_overlap() -> None:
     back = exp(np.array([0, math.pi, 0, 0, 0, 0]))
     others = np.array([back, shifted(z=50), shifted(x=20)])
     assert overlap_volumes(USUAL, np.eye(4), USUAL, others).tolist() == [0, 0, 0]
@@ -81,7 +81,7 @@ def test_who_look_away_from_each_other_share_nothing() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_small_frusta_against_chance(seed: int) -> None:
+def test_overlap_agrees_with_monte_carlo(seed: int) -> None:
     rng = np.random.default_rng(seed)
     frustum = Frustum(0.9, 0.6, 0.1, 0.5)
     T_a_b = exp(np.hstack([rng.normal(0, 0.2, 3), rng.normal(0, 0.05, 3)]))
@@ -102,7 +102,7 @@ def test_small_frusta_against_chance(seed: int) -> None:
 
 
 @given(seeds)
-def test_symmetric_and_between_nothing_and_all(seed: int) -> None:
+def test_overlap_is_symmetric_and_between_zero_and_the_volume(seed: int) -> None:
     a, b = poses(seed, 2)
     assert overlap_volumes(USUAL, a, USUAL, b[None])[0] == overlap_volumes(USUAL, b, USUAL, a[None])[0]
     assert 0 <= ious(USUAL, a, USUAL, b[None])[0] <= 1
@@ -110,7 +110,7 @@ def test_symmetric_and_between_nothing_and_all(seed: int) -> None:
 
 
 @given(seeds)
-def test_where_the_world_begins_does_not_matter(seed: int) -> None:
+def test_overlap_does_not_depend_on_the_origin_of_the_world(seed: int) -> None:
     a, b, moved = poses(seed, 3, 10.0)
     assert ious(USUAL, moved @ a, USUAL, (moved @ b)[None])[0] == pytest.approx(
         ious(USUAL, a, USUAL, b[None])[0], abs=1e-3
@@ -119,13 +119,13 @@ def test_where_the_world_begins_does_not_matter(seed: int) -> None:
 
 @given(seeds)
 @settings(max_examples=30)
-def test_many_at_once_are_each_as_alone(seed: int) -> None:
+def test_a_batch_gives_the_same_as_single_views(seed: int) -> None:
     a, *others = poses(seed, 8, 12.0)
     together = overlap_volumes(USUAL, a, USUAL, np.array(others))
     assert together.tolist() == [overlap_volumes(USUAL, a, USUAL, other[None])[0] for other in others]
 
 
-def test_the_usual_grid_is_as_exact_as_documented() -> None:
+def test_the_default_grid_has_the_documented_accuracy() -> None:
     views = poses(5, 80)
     wrong = [
         ious(USUAL, a, USUAL, b[None])[0] - ious(FINE, a, FINE, b[None])[0]
@@ -137,7 +137,7 @@ def test_the_usual_grid_is_as_exact_as_documented() -> None:
 @pytest.mark.parametrize(
     "frustum", [Frustum(1.5, 1.0, 0.3, 5), Frustum(0.2, 0.1, 1, 2), Frustum(3.0, 3.0, 0, 1)]
 )
-def test_sphere_holds_all_corners(frustum: Frustum) -> None:
+def test_bounding_sphere_contains_all_corners(frustum: Frustum) -> None:
     sx, sy = frustum.slopes
     z, radius = frustum.bounding_sphere
     far = [math.hypot(d * sx, d * sy, d - z) for d in (frustum.near_m, frustum.far_m)]
@@ -145,8 +145,8 @@ def test_sphere_holds_all_corners(frustum: Frustum) -> None:
 
 
 @given(seeds)
-def test_two_sorts_of_cameras(seed: int) -> None:
-    """Symmetric, within the smaller, and of many at once each as alone."""
+def test_two_different_cameras(seed: int) -> None:
+    """The overlap is symmetric, within the smaller frustum, and the same in a batch."""
     a, *others = poses(seed, 6, 6.0)
     together = overlap_volumes(USUAL, a, OTHER, np.array(others))
     assert together.tolist() == [overlap_volumes(OTHER, b, USUAL, a[None])[0] for b in others]
@@ -155,7 +155,7 @@ def test_two_sorts_of_cameras(seed: int) -> None:
     assert ious(USUAL, a, OTHER, np.array(others)).tolist() == (together / union).tolist()
 
 
-def test_two_sorts_of_cameras_against_finer_points() -> None:
+def test_two_different_cameras_agree_with_a_finer_grid() -> None:
     views = poses(7, 160, 2.0)
     pairs = list(zip(views[::2], views[1::2], strict=True))
     rough = np.array([overlap_volumes(USUAL, a, OTHER, b[None])[0] for a, b in pairs])
@@ -164,33 +164,24 @@ def test_two_sorts_of_cameras_against_finer_points() -> None:
     assert np.abs(rough - fine).max() < 0.1 * NARROW.volume
 
 
-def test_one_view_within_the_other() -> None:
-    """Looking the same way from the same place, the narrow one sees nothing that the wide one does not."""
+def test_a_narrow_view_inside_a_wide_one() -> None:
+    """From the same pose the narrow camera sees nothing that the wide one does not."""
     got = overlap_volumes(FINE, np.eye(4), OTHER_FINE, np.eye(4)[None])[0]
     assert got == pytest.approx(NARROW.volume, rel=0.02)
 
 
 @pytest.mark.parametrize("interval_m", [1e-3, 50.0])
 @pytest.mark.parametrize("frustum", [Frustum(3.0, 3.0, 0, 1), Frustum(0.01, 3.0, 0.3, 5)])
-def test_whatever_the_interval_there_are_some_points_and_not_too_many(
-    frustum: Frustum, interval_m: float
-) -> None:
+def test_the_number_of_sample_points_is_bounded_for_any_interval(frustum: Frustum, interval_m: float) -> None:
     assert 9 <= SampledFrustum(frustum, interval_m).points.shape[1] <= 2_048_000
 
 
-@pytest.mark.parametrize(
-    ("setting", "said"),
-    [
-        ({"interval_m": 0.0}, "interval_m: 0.0 must be positive"),
-        ({"near_m": 6.0}, "near_m: 6.0 m is not nearer than far_m, 5.0 m"),
-    ],
-)
-def test_settings_that_are_no_frustum_are_refused(setting: dict[str, float], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        from_mapping(ControlConfig, setting, "control")
+def test_a_near_plane_beyond_the_far_plane_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"near_m: 6.0 m is not nearer than far_m, 5.0 m"):
+        from_mapping(ControlConfig, {"near_m": 6.0}, "control")
 
 
 @pytest.mark.parametrize("frustum", [(0.0, 1.0, 0.3, 5.0), (1.0, math.pi, 0.3, 5.0), (1.0, 1.0, 5.0, 5.0)])
-def test_what_is_no_frustum_is_refused(frustum: tuple[float, float, float, float]) -> None:
+def test_an_invalid_frustum_is_refused(frustum: tuple[float, float, float, float]) -> None:
     with pytest.raises(ValueError, match="frustum: "):
         Frustum(*frustum)

@@ -1,4 +1,4 @@
-"""What each policy lets an agent send."""
+"""Rates that each policy sets."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -41,7 +41,7 @@ def settled(plant: Plant, seconds: float = 90) -> dict[str, float]:
     return {agent: float(np.mean(values)) for agent, values in late.items()}
 
 
-def test_every_policy_that_may_be_set_is_here() -> None:
+def test_every_configurable_policy_exists() -> None:
     assert set(settings.POLICY_NAMES) <= set(POLICIES)
     assert list(POLICIES) == ["share", "covins-g", "linear", "equal", "random", "streamed"]
 
@@ -57,33 +57,33 @@ def test_every_policy_that_may_be_set_is_here() -> None:
         ("streamed", False, True, True),
     ],
 )
-def test_what_policies_say_of_themselves(name: str, gated: bool, alike: bool, raw: bool) -> None:
+def test_properties_of_policies(name: str, gated: bool, alike: bool, raw: bool) -> None:
     policy = made(name)
     assert (policy.has_merge_gate, policy.treats_alike, policy.streams_frames) == (gated, alike, raw)
 
 
 @pytest.mark.parametrize("name", ["covins-g", "streamed"])
-def test_some_set_no_limit(name: str) -> None:
+def test_policies_without_a_rate_limit(name: str) -> None:
     assert made(name).rate("ann", AgentKind.AR, 500, 3, 0) is None
 
 
 @pytest.mark.parametrize(
     ("delay_ms", "hz"), [(0, 10), (20, 10), (265, 7.5), (510, 5), (755, 2.5), (990, 0.5), (1e9, 0.5)]
 )
-def test_linear_drops_by_delay_alone(delay_ms: float, hz: float) -> None:
+def test_linear_depends_on_the_delay_alone(delay_ms: float, hz: float) -> None:
     policy = made("linear")
     for kind in AgentKind:
         assert policy.rate("ann", kind, delay_ms, None, 0) == pytest.approx(hz, abs=1e-12)
 
 
-def test_equal_takes_a_robot_for_a_headset() -> None:
+def test_equal_rates_a_robot_as_a_headset() -> None:
     equal, share = made("equal"), made("share")
     for t in range(5):
         at = (60.0, 0.3, t * S)
         assert equal.rate("robot", AgentKind.ROBOT, *at) == share.rate("ann", AgentKind.AR, *at)
 
 
-def test_a_robot_gets_the_form_of_a_headset_by_settings_alone() -> None:
+def test_a_setting_gives_a_robot_the_ar_form() -> None:
     policy = made("share", settings.load_config("control: {agents: {bob: {form: ar}}}").control)
     for t in range(3):
         at = (60.0, 0.3, t * S)
@@ -91,7 +91,7 @@ def test_a_robot_gets_the_form_of_a_headset_by_settings_alone() -> None:
     assert policy.rate("carl", AgentKind.ROBOT, 60, 0.3, 0) != policy.rate("bob", AgentKind.ROBOT, 60, 0.3, 0)
 
 
-def test_random_is_its_seed() -> None:
+def test_random_is_determined_by_its_seed() -> None:
     def rates(seed: int) -> list[float | None]:
         policy = made("random", replace(CONFIG, random_seed=seed))
         return [policy.rate("ann", AgentKind.AR, 20, 0.1 * t, t * S // 2) for t in range(1, 9)]
@@ -99,7 +99,7 @@ def test_random_is_its_seed() -> None:
     assert rates(1) == rates(1) != rates(2)
 
 
-def test_agents_do_not_touch_each_other_and_are_forgotten() -> None:
+def test_agents_are_independent_and_can_be_forgotten() -> None:
     policy, alone = made("share"), made("share")
     for t in range(6):
         policy.rate("bob", AgentKind.ROBOT, 900, 5, t * S)
@@ -143,13 +143,13 @@ def test_rates_settle_where_more_keyframes_mean_less_error() -> None:
     assert 2 < rates["ar"] < 4.5 and 0.7 < rates["robot"] < 1.5
 
 
-def test_a_robot_makes_room_for_a_headset_at_an_edge_that_is_busy() -> None:
+def test_a_robot_gives_way_to_a_headset_at_a_busy_edge() -> None:
     rates = settled(lambda rates, agent: (20 + 300 / (40 - sum(rates.values())), 0.4 + 0.4 / rates[agent]))
     assert rates["ar"] > 9 and rates["robot"] < 1
 
 
 def test_where_keyframes_alone_make_the_delay_all_rates_rise() -> None:
-    """As the paper has it, who is worse off sends more: see docs/understand/scheduling.md."""
+    """As in the paper, the agent with the lower QoE sends more: see docs/understand/scheduling.md."""
     rates = settled(lambda rates, agent: (20 + 2000 / (26 - sum(rates.values())), 0.4))
     assert min(rates.values()) > 9
 
@@ -169,8 +169,8 @@ def test_by_attribution_delay_lowers_the_rate_and_error_raises_it() -> None:
         assert last(15.0, 0.1, kind, attribution=True) == last(15.0, 0.1, kind, attribution=False) < 6
 
 
-def test_by_attribution_a_delay_that_is_there_at_any_rate_is_nobodys_fault() -> None:
-    """A keyframe may take 30 ms however few there are: the rate then is what the error asks for."""
+def test_by_attribution_the_base_delay_does_not_lower_the_rate() -> None:
+    """A delay of 30 ms at any rate: the rate is then that of the error alone."""
 
     def last(told: list[tuple[float, float]]) -> float | None:
         policy = made("share", replace(CONFIG, attribution=True))

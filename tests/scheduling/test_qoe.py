@@ -57,12 +57,12 @@ def test_less_delay_and_less_error_are_never_worse(
     assert signed or better <= 1
 
 
-def test_what_no_double_holds_is_still_finite() -> None:
+def test_extreme_values_give_finite_qoe() -> None:
     needs = replace(ROBOT, beta=1e9, signed=True)
     assert math.isfinite(qoe(0, 0, needs)) and qoe(1e300, 1e300, needs) == 0
 
 
-def test_default_needs_are_about_met_where_they_should_be() -> None:
+def test_default_targets_are_met_at_the_documented_delays_and_errors() -> None:
     ar, robot = (QoeParameters.from_config(ControlConfig(), kind) for kind in (AgentKind.AR, AgentKind.ROBOT))
     assert abs(qoe(20, 1.35, ar) - ar.target) < 0.02
     assert qoe(200, 0.5, robot) < robot.target < qoe(100, 0.5, robot)
@@ -74,7 +74,7 @@ def test_default_needs_are_about_met_where_they_should_be() -> None:
         )
 
 
-def test_the_table_of_the_documentation_is_so() -> None:
+def test_the_table_of_the_documentation_is_correct() -> None:
     text = (Path(__file__).parents[2] / "docs" / "understand" / "scheduling.md").read_text()
     table = text.split("<!-- QoE by default")[1].split("\n\n")[1].splitlines()
     ar, robot = (QoeParameters.from_config(ControlConfig(), kind) for kind in (AgentKind.AR, AgentKind.ROBOT))
@@ -85,7 +85,7 @@ def test_the_table_of_the_documentation_is_so() -> None:
     assert len(table) == 8
 
 
-def test_one_agent_has_needs_of_its_own() -> None:
+def test_one_agent_may_have_its_own_parameters() -> None:
     text = "control: {agents: {bob: {form: ar, target: 0.8}, ann: {beta: 0}}}"
     control = settings.load_config(text).control
     bob = QoeParameters.from_config(control, AgentKind.ROBOT, "bob")
@@ -107,14 +107,14 @@ def test_one_agent_has_needs_of_its_own() -> None:
         ("rate_min_hz: 20", "control: rate_min_hz, rate_max_hz, 1000 must rise"),
     ],
 )
-def test_wrong_settings_are_named(text: str, said: str) -> None:
+def test_invalid_settings_are_named(text: str, said: str) -> None:
     with pytest.raises(ConfigError) as error:
         settings.load_config(f"control: {{{text}}}")
     assert said in str(error.value)
 
 
 @given(delays, errors, st.sampled_from(AgentKind))
-def test_blame_is_of_what_costs_more(delay_ms: float, error_cm: float, kind: AgentKind) -> None:
+def test_attribution_is_to_the_larger_loss(delay_ms: float, error_cm: float, kind: AgentKind) -> None:
     needs = QoeParameters.from_config(ControlConfig(), kind)
     found = qoe_factors(delay_ms, error_cm, needs)
     assert math.prod(found) == qoe(delay_ms, error_cm, needs)
@@ -122,7 +122,7 @@ def test_blame_is_of_what_costs_more(delay_ms: float, error_cm: float, kind: Age
     assert (found.error_attribution > 0) == (found.error < found.delay)
 
 
-def test_blame_by_hand() -> None:
+def test_attribution_by_hand() -> None:
     """e^-1 is lost by delay, 1 - e^-1 is left by error: ln is -1 and -0.45868."""
     found = qoe_factors(120, 0.5, AR)
     assert found.delay == pytest.approx(math.exp(-1), abs=1e-15)

@@ -1,6 +1,8 @@
-"""Evaluations in, rates out: what an edge tells its agents to send, by policy."""
+"""By policy: rates that an edge sends for evaluations, history of evaluations, gated merges."""
 
 from __future__ import annotations
+
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -11,11 +13,13 @@ from share.geometry import se3
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
 from share.scheduling.merge_gate import MergeGate
-from share.scheduling.policies import POLICIES
+from share.scheduling.policies import POLICIES, RateScheduler
 from share.scheduling.qoe import QoeParameters, qoe
+from share.timing import RingBuffer
 from share.types import AgentKind
 from share.wire import messages as m
 from share.wire.codec import decode, encode
+from share.wire.messages import Evaluation
 
 MS = 1_000_000
 CONTROL = ControlConfig(ar_target=0.8)
@@ -34,7 +38,7 @@ def rates(edge: Edge, delay_ms: float, error_cm: float | None, now_ms: int) -> l
     return [message.hz for message in said if isinstance(message, m.Rate)]
 
 
-def test_without_a_limit_nothing_is_told_but_quality_is_written_down() -> None:
+def test_without_a_limit_no_rate_is_sent_but_qoe_is_reported() -> None:
     edge = welcomed("covins-g")
     assert rates(edge, 50.0, 0.5, 10) == []
     told = edge.report({})["agents"]["ann"]
@@ -44,7 +48,7 @@ def test_without_a_limit_nothing_is_told_but_quality_is_written_down() -> None:
     )
 
 
-def test_each_evaluation_is_answered_and_none_is_forgotten() -> None:
+def test_each_evaluation_is_answered_and_recorded() -> None:
     edge = welcomed("share")
     told = [rates(edge, 15.0, error, 200 * i) for i, error in enumerate((0.3, 0.3, 0.3, 2.0, 2.0))]
     assert [len(each) for each in told] == [1] * 5
@@ -57,7 +61,7 @@ def test_each_evaluation_is_answered_and_none_is_forgotten() -> None:
     assert series["rate_hz"] == pytest.approx([hz for (hz,) in told], abs=1e-4)
 
 
-def test_a_new_run_begins_anew() -> None:
+def test_a_new_run_starts_without_history() -> None:
     edge = welcomed("share")
     for i in range(20):
         (last,) = rates(edge, 15.0, 0.1, 200 * i)
@@ -70,7 +74,7 @@ def test_a_new_run_begins_anew() -> None:
     assert first > last
 
 
-def test_what_adds_little_is_skipped_once_there_is_something_to_compare_with() -> None:
+def test_merges_with_little_overlap_are_skipped_after_completed_ones() -> None:
     gating, rig = MergeGate(CONTROL, "share"), rig_of()
     same = gating.overlap_volume(rig, rig, np.eye(4))
     away = gating.overlap_volume(rig, rig, se3.exp(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])))
@@ -84,8 +88,8 @@ def test_what_adds_little_is_skipped_once_there_is_something_to_compare_with() -
     assert not any(gating.skip_reason(away, same_map=False) for _ in range(50))
 
 
-def test_each_is_judged_by_its_own_field_of_view_from_where_its_camera_is() -> None:
-    """One who sees half as far to the side sees a quarter, all of which the other sees too."""
+def test_the_overlap_uses_each_agents_own_camera() -> None:
+    """Half the slope each way is a quarter of the volume, all of which the wider camera sees too."""
     gating, wide, narrow = MergeGate(CONTROL, "share"), rig_of(focal=400.0), rig_of(focal=800.0)
     whole, part = (
         gating.overlap_volume(wide, wide, np.eye(4)),
@@ -99,14 +103,46 @@ def test_each_is_judged_by_its_own_field_of_view_from_where_its_camera_is() -> N
 
 
 @pytest.mark.parametrize("focal", [1.0, 1e5])
-def test_a_calibration_that_cannot_be_does_not_stop_the_edge(focal: float) -> None:
+def test_the_gate_accepts_absurd_calibrations(focal: float) -> None:
     gating, rig = MergeGate(CONTROL, "share"), rig_of(focal)
     assert 0 < gating.overlap_volume(rig, rig, np.eye(4)) < 1e5
 
 
 @pytest.mark.parametrize("policy", [name for name, kind in POLICIES.items() if not kind.has_merge_gate])
-def test_who_gates_nothing_skips_nothing(policy: str) -> None:
+def test_policies_without_a_gate_skip_nothing(policy: str) -> None:
     gating = MergeGate(CONTROL, policy)
     gating.record_merge(100.0)
     assert gating.overlap_volume(rig_of(), rig_of(), np.eye(4)) == 0
     assert not any(gating.skip_reason(0.0, same_map=True) for _ in range(50))
+
+
+@pytest.mark.parametrize("n", [0, 1, 4, 5, 6, 11, 23])
+def test_the_ring_buffer_returns_the_newest_rows_in_order(n: int) -> None:
+    history = RingBuffer(3, 5)
+    rows = [(float(k), None if k % 3 else k / 7, -k) for k in range(n)]
+    for row in rows:
+        history.add(row)
+    assert len(history) == min(n, 5)
+    for k in range(3):
+        assert history.column(k) == [row[k] for row in rows[-5:]]
+
+
+def test_a_row_of_another_width_is_refused() -> None:
+    with pytest.raises(ValueError, match="2 numbers, expected 3"):
+        RingBuffer(3, 5).add((1.0, 2.0))
+
+
+def test_the_history_of_an_agent_takes_little_memory() -> None:
+    """5000 evaluations were 1.1 MB of objects an agent: the edge grew for an hour."""
+    schedule, draw = RateScheduler(ControlConfig(), "share"), np.random.default_rng(1)
+    told = [Evaluation(k, float(d), float(e)) for k, (d, e) in enumerate(draw.random((6000, 2)))]
+    schedule.evaluate("ann", AgentKind.AR, told[0], 0, 0.0)
+    tracemalloc.start()
+    for k, one in enumerate(told):
+        schedule.evaluate("ann", AgentKind.AR, one, k * 10**9, k + 0.5)
+    grown, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert grown < 450_000  # a free list of the interpreter among it
+    series = schedule.series("ann")
+    assert series["t_s"] == [k + 0.5 for k in range(1000, 6000)]
+    assert series["delay_ms"] == [round(one.delay_ms, 4) for one in told[1000:]]

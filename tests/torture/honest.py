@@ -112,7 +112,7 @@ class Honest(crowd.Walker):
         return {
             "name": self.name,
             "keyframes": report["keyframes"],
-            "open": report["open"],
+            "open": report["pending"],
             "drop_oldest": report["drop_oldest"],
             "sent": sorted(link.sent.items()),
             "acked": sorted(link.acked.items()),

@@ -237,7 +237,7 @@ def test_clock_is_set(who: str, tmp_path: Path, results: Path) -> None:
             clock.set(off_s)
             time.sleep(1.0)
             agents = room.edge.snapshot()["agents"]
-            of_now = [agents[name]["heard_s"] < 1.0 for name in ("hope", "faith")]
+            of_now = [agents[name]["last_received_s"] < 1.0 for name in ("hope", "faith")]
             result.expect(all(of_now), f"set by {off_s} s, an agent is not heard")
         time.sleep(4.0)
         result.expect(room.edge.said.count(" silent: ") == silent, "an agent was taken for silent")

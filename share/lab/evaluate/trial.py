@@ -128,13 +128,11 @@ def read_trial(folder: Path) -> Trial:
 
 
 def settings_yaml(config: Config, seed: int) -> str:
-    """Return the text of config.yaml: `config`, with the scheduler's seeds shifted by `seed`."""
+    """Return the text of config.yaml: `config`, with the scheduler's seed shifted by `seed`."""
     import yaml
 
     control = config.control
-    seeded = dataclasses.replace(
-        control, gate_seed=control.gate_seed + seed, random_seed=control.random_seed + seed
-    )
+    seeded = dataclasses.replace(control, random_seed=control.random_seed + seed)
     text: str = yaml.safe_dump(to_mapping(dataclasses.replace(config, control=seeded)), sort_keys=False)
     return text
 

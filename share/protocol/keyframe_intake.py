@@ -1,0 +1,211 @@
+"""Keyframes on their way from an agent into the map: order, quota, plausibility, turns."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from share.geometry import se3
+from share.timing import SECOND_NS, TokenBuckets
+from share.types import F64, Keyframe
+from share.wire.messages import MAX_BUFFERED, Ack
+
+MAX_ID_GAP = 1_000_000  # ids that an agent may have dropped since the last one: two days at 5 Hz
+_CAPACITY = 64  # keyframes of one run that wait for a predecessor
+
+
+class ReorderBuffer:
+    """Releases each keyframe of a run once, after its predecessor; buffers a bounded number.
+
+    Ids that the agent dropped are skipped: the predecessor of the next keyframe shows them. Of two versions
+    of a buffered keyframe the one with the lower predecessor is the newer.
+    """
+
+    def __init__(self, next_keyframe: int = 0, capacity: int = _CAPACITY) -> None:
+        """next_keyframe: one more than the last applied id. capacity: at most MAX_BUFFERED."""
+        self.next_keyframe = next_keyframe
+        self.duplicates = 0
+        self.evicted = 0
+        self._capacity = capacity
+        self._waiting: dict[int, Keyframe] = {}
+
+    def clear(self) -> None:
+        """Drop buffered keyframes, which are not acknowledged: the agent resends them."""
+        self._waiting.clear()
+
+    def is_new(self, keyframe_id: int) -> bool:
+        """Return whether no keyframe of that id has been applied or is buffered."""
+        return keyframe_id >= self.next_keyframe and keyframe_id not in self._waiting
+
+    def push(self, keyframe: Keyframe) -> list[Keyframe]:
+        """Add a keyframe; return those that can be applied now, rising by id.
+
+        Raises ValueError if its id jumps by more than MAX_ID_GAP."""
+        if keyframe.id > self.next_keyframe + MAX_ID_GAP:
+            raise ValueError(f"keyframe {keyframe.id}: id jumps; expected about {self.next_keyframe}")
+        if keyframe.id < self.next_keyframe:
+            self.duplicates += 1
+            return []
+        waiting = self._waiting.get(keyframe.id)
+        self.duplicates += waiting is not None
+        if waiting is None or keyframe.predecessor < waiting.predecessor:
+            self._waiting[keyframe.id] = keyframe
+        ready = []
+        while (applicable := self._next_applicable()) is not None:
+            ready.append(applicable)
+            self.next_keyframe = applicable.id + 1
+            self._waiting = {k: v for k, v in self._waiting.items() if k > applicable.id}
+        if len(self._waiting) > self._capacity:
+            del self._waiting[max(self._waiting)]  # drop_newest: the agent resends it
+            self.evicted += 1
+        return ready
+
+    def ack(self, durable_below: int | None = None) -> Ack:
+        """Return the answer to any keyframe, duplicates too: their acknowledgement may have been lost.
+
+        durable_below: applied keyframes from this id on count as buffered (default: none).
+        """
+        durable_below = self.next_keyframe if durable_below is None else durable_below
+        applied = range(durable_below, min(self.next_keyframe, durable_below + MAX_BUFFERED))
+        return Ack(durable_below, (*applied, *sorted(self._waiting))[:MAX_BUFFERED])
+
+    def _next_applicable(self) -> Keyframe | None:
+        ready = (one for _, one in sorted(self._waiting.items()) if one.predecessor < self.next_keyframe)
+        return next(ready, None)
+
+
+# Keyframe quota: the mapper work that one agent may cause, over all its runs.
+#
+# The work grows with the keypoints; a keyframe without any costs as much as _BASE_COST of them
+# (docs/understand/robustness.md). With the default settings an agent sends keyframes of 500 keypoints, at
+# most 5 a second (control.rate_max_hz), and resends up to 600 at once to a new edge. Twice that rate and 700
+# at once are accepted.
+_BASE_COST = 250
+_KEYFRAME_COST = 500 + _BASE_COST
+_COST_HZ = 10.0 * _KEYFRAME_COST
+_COST_BURST = 700.0 * _KEYFRAME_COST
+_SEGMENT_FACTOR = 20  # a keyframe that starts a segment costs this much more: the mapper never forgets one
+_OVERLOAD_TEXT = (
+    f"more than {_COST_HZ / _KEYFRAME_COST * 500:.0f} keypoints a second: further keyframes are deferred"
+)
+_RATE_SLACK = 1.2  # keyframes arrive unevenly
+_RATE_BURST = 10.0  # keyframes
+
+
+class KeyframeQuota:
+    """Limits the keyframes of each agent name.
+
+    max_rate_hz: keyframes a second that the policy grants at most; None: unlimited."""
+
+    def __init__(self, max_rate_hz: float | None) -> None:
+        self._cost_buckets = TokenBuckets(_COST_BURST, _COST_HZ)
+        self._rate_buckets = TokenBuckets(
+            _RATE_BURST, None if max_rate_hz is None else _RATE_SLACK * max_rate_hz
+        )
+
+    def objection(self, name: str, keyframe: Keyframe, now_ns: int) -> str | None:
+        """Return why this keyframe is not accepted now; None if it is, and charge its cost."""
+        cost = (len(keyframe.view.uv) + _BASE_COST) * (1 if keyframe.reference >= 0 else _SEGMENT_FACTOR)
+        return None if self._cost_buckets.bucket(name, now_ns).take(now_ns, cost=cost) else _OVERLOAD_TEXT
+
+    def is_over_rate(self, name: str, now_ns: int) -> bool:
+        """Return whether this accepted keyframe exceeds the highest rate that an agent may have."""
+        return not self._rate_buckets.bucket(name, now_ns).take(now_ns)
+
+
+# Largest plausible motion between two keyframes, m, and what is added for each second in between.
+_MAX_JUMP_M, _MAX_JUMP_M_S = 2.0, 10.0
+# T_ref_body is the filter's present estimate, T_odom_body its estimate then (docs/understand/mapping.md):
+# measured on correct agents they differ by up to 3 cm after 8 s and 6 m, and by 2.7 degrees while a
+# headset's tilt converges.
+_MAX_MISMATCH_M, _MISMATCH_PER_M = 0.3, 0.05  # and what is added for each m of motion
+_MAX_MISMATCH_RAD = float(np.radians(12.0))
+_MAX_VARIANCE = 100.0  # rad^2, m^2: as good as unknown; more would make the solver ill-conditioned
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryBase:
+    """The newest applied keyframe: its id, its stamp, and T_odom_body (4, 4)."""
+
+    id: int
+    stamp_ns: int
+    T_odom_body: F64
+
+    @classmethod
+    def from_keyframe(cls, keyframe: Keyframe) -> OdometryBase:
+        return cls(keyframe.id, keyframe.stamp_ns, keyframe.T_odom_body)
+
+    def jump_m(self, keyframe: Keyframe) -> float:
+        """Return the distance to the keyframe, m, if no agent can move so far in that time, else 0."""
+        distance_m = float(np.linalg.norm(keyframe.T_ref_body[:3, 3]))
+        elapsed_s = max(0, keyframe.stamp_ns - self.stamp_ns) / SECOND_NS
+        return distance_m if distance_m > _MAX_JUMP_M + _MAX_JUMP_M_S * elapsed_s else 0.0
+
+    def contradiction(self, keyframe: Keyframe) -> str | None:
+        """Return a text on how far the keyframe's T_ref_body differs from the relative pose of the two
+        T_odom_body; None if a filter's later estimate of the past can explain it."""
+        T_ref_body = se3.inverse(self.T_odom_body) @ keyframe.T_odom_body
+        T = se3.inverse(keyframe.T_ref_body) @ T_ref_body
+        mismatch_m, mismatch_rad = float(np.linalg.norm(T[:3, 3])), float(se3.rotation_angle(T))
+        step_m = float(np.linalg.norm(keyframe.T_ref_body[:3, 3]))
+        if mismatch_m <= _MAX_MISMATCH_M + _MISMATCH_PER_M * step_m and mismatch_rad <= _MAX_MISMATCH_RAD:
+            return None
+        mismatch_deg = np.degrees(mismatch_rad)
+        return f"its motion and its two poses differ by {mismatch_m:.2g} m and {mismatch_deg:.2g} degrees"
+
+
+def sanitise(keyframe: Keyframe, base: OdometryBase | None) -> tuple[Keyframe, str | None]:
+    """Return the next keyframe of a run as the map accepts it, and what was wrong with it, None if nothing.
+
+    base: the run's keyframe before. A keyframe with an implausible jump, or with a motion that contradicts
+    its two poses, starts a segment in the same odom. An excessive covariance is bounded. Raises ValueError
+    if its reference is not `base`.
+    """
+    problem = None
+    if keyframe.reference >= 0:
+        if base is None or keyframe.reference != base.id:
+            raise ValueError(f"keyframe {keyframe.id} refers to {keyframe.reference}, not to the last one")
+        if jump_m := base.jump_m(keyframe):
+            problem = f"keyframe {keyframe.id} is {jump_m:.0f} m from the previous one: new segment"
+        elif contradiction := base.contradiction(keyframe):
+            problem = f"keyframe {keyframe.id}: {contradiction}: new segment"
+        if problem:
+            keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body)
+    if (variance := float(keyframe.cov.diagonal().max())) > _MAX_VARIANCE:
+        problem = problem or f"keyframe {keyframe.id} has a variance of {variance:.0e}; treated as unknown"
+        keyframe = replace(keyframe, cov=keyframe.cov * (_MAX_VARIANCE / variance))
+    return keyframe, problem
+
+
+T = TypeVar("T")
+
+_MAX_ADD_MS = 10.0  # spent on adding keyframes before one is queried
+
+
+class FairQueue(Generic[T]):
+    """Keyframes that wait to be added to the map: names take turns, each in order of arrival, so that an
+    agent that sends many delays only itself."""
+
+    def __init__(self) -> None:
+        self._queues: dict[str, deque[T]] = {}  # by name, next in turn first
+
+    def __len__(self) -> int:
+        return sum(map(len, self._queues.values()))
+
+    def add(self, name: str, item: T) -> None:
+        self._queues.setdefault(name, deque()).append(item)
+
+    def take_next(self, spent_ms: float = 0.0) -> T | None:
+        """Return the next item; None if there is none, or if `spent_ms` (on items since the last query)
+        calls for a query."""
+        if not self._queues or spent_ms >= _MAX_ADD_MS:
+            return None
+        name = next(iter(self._queues))
+        queue = self._queues.pop(name)
+        item = queue.popleft()
+        if queue:
+            self._queues[name] = queue
+        return item
