@@ -17,7 +17,7 @@ import numpy as np
 from share.geometry import se3
 from share.mapping.graph.covariance import CovariancePaths
 from share.mapping.graph.edges import PoseEdge
-from share.mapping.graph.updates import GraphUpdate
+from share.mapping.graph.solver import GraphUpdate
 from share.mapping.loops import KeyframeKey, Loop, RelativePose
 from share.mapping.segments import OdometrySegments
 from share.types import F64, Keyframe

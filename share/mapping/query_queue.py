@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,34 +15,24 @@ from share.scheduling.qoe import QoeParameters
 from share.types import F64, AgentKind
 from share.wire.messages import Hello
 
-
-class SearchBudget(NamedTuple):
-    """Limits of the verification of one keyframe's candidates.
-
-    max_verified: accepted candidates after which the rest is skipped. While other queries wait it is one, and
-    at most `max_tried_hurried` are tried.
-    """
-
-    max_verified: int
-    max_tried_hurried: int
-
-    @classmethod
-    def from_config(cls, config: Config) -> SearchBudget:
-        return cls(config.place.enough, config.edge.hurry_candidates)
+ENOUGH_VERIFIED = 3  # verified candidates after which a search ends
 
 
 class CandidateSearch:
-    """Candidates of keyframe `node_id`, best first, tried within a budget."""
+    """Candidates of one keyframe, best first.
 
-    def __init__(self, node_id: int, candidates: Iterable[int], budget: SearchBudget) -> None:
-        self.node_id = node_id
-        self._remaining, self._budget = deque(candidates), budget
+    The search ends after `ENOUGH_VERIFIED` verified candidates; while other queries wait after one, and after
+    at most `max_tried_hurried` tried ones.
+    """
+
+    def __init__(self, candidates: Iterable[int], max_tried_hurried: int) -> None:
+        self._remaining, self._max_tried_hurried = deque(candidates), max_tried_hurried
         self._tried_count = self._verified_count = 0
 
     def next_candidate(self, is_hurried: bool) -> int | None:
         """Return the next candidate to verify; None when there are none left or the budget is spent."""
-        max_tried = self._budget.max_tried_hurried if is_hurried else self._tried_count + 1
-        max_verified = 1 if is_hurried else self._budget.max_verified
+        max_tried = self._max_tried_hurried if is_hurried else self._tried_count + 1
+        max_verified = 1 if is_hurried else ENOUGH_VERIFIED
         if not self._remaining or self._tried_count >= max_tried or self._verified_count >= max_verified:
             return None
         self._tried_count += 1
@@ -69,6 +58,16 @@ def service_kind(config: Config, hello: Hello) -> AgentKind:
     if POLICIES[config.edge.policy].treats_alike:
         return AgentKind.AR
     return qoe_form(config, hello)
+
+
+def map_rank(config: Config, hello: Hello | None, is_reference: bool = False) -> int:
+    """Rank of a new segment: lower ranks keep their map in a merge.
+
+    Headsets' maps stay, as their wearers would notice a jump; restored maps come first. hello: None if
+    missing in a damaged file.
+    """
+    is_headset = hello is not None and qoe_form(config, hello) is AgentKind.AR
+    return (0 if is_headset else 1) + (0 if is_reference else 2)
 
 
 class QueryQueue:

@@ -27,6 +27,7 @@ from share.types import F64
 _APPLY_SIGMAS = 2.5  # significance at which a scale is corrected
 _KEEP_SIGMAS = 1.25  # significance down to which it stays corrected
 _MIN_SCALE_CHANGE = 0.001  # log scale
+_EVENTS = {"set apart": "agent quarantined", "disputed": "agents disputed"}  # by state
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,13 @@ class AgentStanding:
     nis: float | None = None
     doubt: float = 0.0
     widened: float = 1.0
+
+    @property
+    def event(self) -> tuple[str, str]:
+        """Event and reason to report when this standing is new."""
+        if self.state in _EVENTS:
+            return _EVENTS[self.state], self.reason
+        return "quarantine lifted", "consistent with the others again"
 
 
 AgentNames = tuple[str, str]
@@ -150,6 +158,10 @@ class AgentAgreement:
                 if a != b and ({a, b} & self.quarantined or frozenset((a, b)) in self.disputed):
                     return f"{a} and {b} are kept in separate maps"
         return ""
+
+    def are_separated(self, first: str, second: str) -> bool:
+        """Return whether these runs must be in separate maps."""
+        return bool(self.separation_reason([first], [second]))
 
     def unverified_reason(self, first_runs: Collection[str], second_runs: Collection[str]) -> str:
         """Why an agent must be compared before these share a map with those; empty if none must."""

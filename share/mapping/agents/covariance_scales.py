@@ -29,15 +29,21 @@ from share.geometry import se3
 from share.mapping.agents.pairwise import ComparisonEquations
 from share.types import F64, I64
 
+# Added to an odometry step's standard deviation: fixed, and per rad and m of the step.
+_FLOOR_DEG = 0.002
+_FLOOR_M = 0.0002
+_FLOOR_PER_RAD = 0.0005
+_FLOOR_PER_M = 0.003
+
 
 def inflate_covariance(config: MergeConfig, T_ref_body: F64, cov: F64) -> F64:
     """Covariance (6, 6) of an odometry step as the graph uses it.
 
-    Agents understate it, so it is scaled; a floor that grows with the step is added.
+    Agents understate it, so it is scaled; a floor that grows with the step is added in quadrature.
     """
     angle_rad, length_m = float(se3.rotation_angle(T_ref_body)), float(np.linalg.norm(T_ref_body[:3, 3]))
-    rad2 = np.radians(config.odometry_floor_deg) ** 2 + (config.odometry_floor_per_rad * angle_rad) ** 2
-    m2 = config.odometry_floor_m**2 + (config.odometry_floor_per_m * length_m) ** 2
+    rad2 = np.radians(_FLOOR_DEG) ** 2 + (_FLOOR_PER_RAD * angle_rad) ** 2
+    m2 = _FLOOR_M**2 + (_FLOOR_PER_M * length_m) ** 2
     return config.odometry_scale**2 * cov + np.diag([rad2] * 3 + [m2] * 3)
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from share.geometry import se3
 from share.mapping.agents.agent_pair import tilt_between
 from share.mapping.agents.agreement import AgentAgreement, AgentStanding
-from share.mapping.culling import RemovedKeyframe
 from share.mapping.graph.edges import PoseEdge
+from share.mapping.keyframe_removal import RemovedKeyframe
 from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision
 from share.mapping.loops import Loop
 from share.mapping.map_graph import MapGraph, rescale_translation
@@ -49,10 +49,6 @@ class Quarantine:
         self.agreement = AgentAgreement(tolerance)
         self._graph, self._loop_acceptance, self._camera_views = graph, loop_acceptance, camera_views
         self._withdrawn: list[Loop] = []
-
-    def add_run(self, run: str, name: str, credential: str | None = "") -> None:
-        """Register a run of the agent of this name."""
-        self.agreement.add_run(run, name, credential)
 
     def remove_run(self, run: str) -> None:
         """Forget a run without keyframes that will not return."""
@@ -100,7 +96,7 @@ class Quarantine:
         """Nodes of agents that must not share a map with this one."""
         odometry = self._graph.odometry
         segments = [odometry.segments[segment] for segment in sorted(odometry.live_segments)]
-        separated = {s.agent for s in segments if self.agreement.separation_reason([agent], [s.agent])}
+        separated = {s.agent for s in segments if self.agreement.are_separated(agent, s.agent)}
         return tuple(n for s in segments if s.agent in separated for n in s.nodes) if separated else ()
 
     def separation_reason(self, loop: Loop) -> str:
@@ -131,7 +127,7 @@ class Quarantine:
     def to_agent_scale(self, removed: RemovedKeyframe) -> RemovedKeyframe:
         """Convert a removal to the agent's own metres and covariances, in which odometry is stored."""
         link = removed.link
-        if link is None or link.reference is None:
+        if link is None or link.reference < 0:
             return removed
         T = rescale_translation(link.T_ref_body, -self._log_scale(removed.key.agent))
         cov = link.cov / self._graph.covariance_scales.get(removed.key.agent, 1.0)
@@ -169,12 +165,11 @@ class Quarantine:
         """
         graph, segments = self._graph, self._graph.odometry.segments
         before = list(graph.reference_segments)
-        loops_between = [
-            n for n, loop in graph.edges.loops.items() if self._are_separated(loop.a.agent, loop.b.agent)
-        ]
+        are_separated, loops = self.agreement.are_separated, graph.edges.loops
+        loops_between = [n for n, loop in loops.items() if are_separated(loop.a.agent, loop.b.agent)]
         dropped = graph.drop_loops(loops_between) if loops_between else ()
         for a, b in itertools.combinations(sorted(graph.odometry.live_segments), 2):
-            if graph.reference_segments[a] == graph.reference_segments[b] and self._are_separated(
+            if graph.reference_segments[a] == graph.reference_segments[b] and self.agreement.are_separated(
                 segments[a].agent, segments[b].agent
             ):
                 dropped += self._loop_acceptance.split_segments(a, b)
@@ -205,16 +200,13 @@ class Quarantine:
         for loop in self._withdrawn:
             if not (odometry.has_keyframe(loop.a) and odometry.has_keyframe(loop.b)):
                 continue
-            if self._are_separated(loop.a.agent, loop.b.agent) or self.separation_reason(loop):
+            if self.agreement.are_separated(loop.a.agent, loop.b.agent) or self.separation_reason(loop):
                 still_withdrawn.append(loop)
             else:
                 decisions.append(self._loop_acceptance.decide(loop))
         self._withdrawn = still_withdrawn
         undone = tuple(x for d in decisions for x in d.dropped)
         return tuple(x for d in decisions for x in d.added if x not in undone), undone
-
-    def _are_separated(self, first: str, second: str) -> bool:
-        return bool(self.agreement.separation_reason([first], [second]))
 
     def _agents_in_map(self, reference_segment: int) -> set[str]:
         return {self._graph.odometry.segments[s].agent for s in self._graph.map_segments(reference_segment)}
