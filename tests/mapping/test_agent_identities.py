@@ -173,8 +173,8 @@ def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
             atlas.add_keyframe(walker.name, keyframe)
     for a, b, log in ((ann, bob, 0.0), (ann, first, 0.05), (bob, first, 0.05)):
         for loop in near_loops(a, b, rng):
-            atlas.compare_agents(loop, DepthScale(log, 0.005))
-    assert atlas.standing("eve-1").state == "set apart"
+            atlas.quarantine.add_loop(loop, DepthScale(log, 0.005))
+    assert atlas.quarantine.agreement.standing("eve-1").state == "set apart"
     atlas.add_run("eve-2", "eve")
     for keyframe in second.keyframes:
         atlas.add_keyframe("eve-2", keyframe)
@@ -232,15 +232,15 @@ def test_runs_of_a_suspect_without_end_leave_nothing_but_the_suspicion():
     atlas.add_run("ann", "ann")
     for keyframe in ann.keyframes:
         atlas.add_keyframe("ann", keyframe)
-    agreement = atlas._quarantine.agreement
+    agreement = atlas.quarantine.agreement
     for n in range(1, 6):
         eve = Walker(f"eve-{n}", n, n=20, phase=0.1)
         atlas.add_run(eve.name, "eve")
         assert agreement.identities.unverified == ({eve.name} if n > 1 else set())
         numbers = [atlas.add_keyframe(eve.name, keyframe) for keyframe in eve.keyframes]
         for loop in near_loops(ann, eve, rng):
-            atlas.compare_agents(loop, DepthScale(0.05, 0.005))
-        assert atlas.standing("ann").state == "disputed"
+            atlas.quarantine.add_loop(loop, DepthScale(0.05, 0.005))
+        assert atlas.quarantine.agreement.standing("ann").state == "disputed"
         atlas.set_present(eve.name, False)
         atlas.add_run("eve-next", "eve")
         atlas.remove_keyframes(numbers)
@@ -251,7 +251,7 @@ def test_runs_of_a_suspect_without_end_leave_nothing_but_the_suspicion():
         assert not agreement._pairs
         assert not agreement.disputed
         assert agreement._covariance_scales._claims.known_agents == {"ann"}
-        assert atlas.standing("ann").state == "unknown"
+        assert atlas.quarantine.agreement.standing("ann").state == "unknown"
 
 
 def test_a_disagreement_outlives_the_keyframes_that_showed_it():
@@ -278,8 +278,8 @@ def test_what_loops_said_of_a_stretch_goes_with_it():
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     for loop in near_loops(ann, bob, rng, every=2):
-        atlas.compare_agents(loop, DepthScale(0.0, 0.005))
-    agreement = atlas._quarantine.agreement
+        atlas.quarantine.add_loop(loop, DepthScale(0.0, 0.005))
+    agreement = atlas.quarantine.agreement
     (pair,) = agreement._pairs.values()
     assert agreement._covariance_scales._evidence.keys() == pair.by_segments.keys() == {(0, 1)}
     atlas.set_present("bob-1", False)
@@ -288,7 +288,7 @@ def test_what_loops_said_of_a_stretch_goes_with_it():
     assert len(atlas.remove_keyframes(gone)) == len(gone)
     assert not agreement._covariance_scales._evidence
     assert (0, 1) not in pair.by_segments
-    assert atlas.standing("ann").state == "agrees"
+    assert atlas.quarantine.agreement.standing("ann").state == "agrees"
 
 
 def test_who_is_doubted_since_the_edge_was_started_again_is_proven_by_another_who_is():
@@ -381,16 +381,16 @@ def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     loops = near_loops(ann, bob, np.random.default_rng(0))
-    atlas._quarantine._withdrawn = list(loops)
+    atlas.quarantine._withdrawn = list(loops)
     if decide is not None:
-        atlas._loop_acceptance.decide = decide
+        atlas.loop_acceptance.decide = decide
     return atlas, loops
 
 
 def test_loops_that_were_taken_back_wait_while_anything_forbids_them():
     """Bob is not kept apart any more, but has to be compared first."""
     atlas, loops = pair_that_met()
-    parting, unproven = atlas._quarantine, atlas._quarantine.agreement.identities.unverified
+    parting, unproven = atlas.quarantine, atlas.quarantine.agreement.identities.unverified
     unproven.add("bob")
     assert parting._reconsider_withdrawn() == ((), ())
     unproven.clear()
@@ -404,9 +404,9 @@ def test_loops_that_were_taken_back_wait_while_anything_forbids_them():
 
 def test_loops_that_were_taken_back_are_judged_once_who_was_to_be_compared_is():
     atlas, loops = pair_that_met()
-    atlas._quarantine.agreement.identities.unverified.add("bob")
-    said = [atlas.compare_agents(loop, DepthScale(0.0, 0.005)) for loop in loops]
-    assert "bob" not in atlas._quarantine.agreement.identities.unverified
+    atlas.quarantine.agreement.identities.unverified.add("bob")
+    said = [atlas.quarantine.add_loop(loop, DepthScale(0.0, 0.005)) for loop in loops]
+    assert "bob" not in atlas.quarantine.agreement.identities.unverified
     assert sum(len(parted.added) for parted in said) > len(loops) / 2
     assert not any(parted.standings for parted in said)
 
@@ -416,7 +416,7 @@ def test_a_loop_that_is_believed_again_and_undone_at_once_is_not_said_to_be_tied
         return LoopDecision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
 
     atlas, loops = pair_that_met(decide)
-    tied, undone = atlas._quarantine._reconsider_withdrawn()
+    tied, undone = atlas.quarantine._reconsider_withdrawn()
     assert tied == tuple(loops[1:])
     assert undone == (loops[0],)
 
@@ -427,7 +427,7 @@ def test_what_is_put_right_is_so_in_one_order():
     names = [f"agent{k}" for k in range(10)]
     for name in names:
         atlas.add_keyframe(name, Walker(name, 1, n=1).keyframes[0])
-    atlas._quarantine.agreement.log_scales = dict.fromkeys(names, 0.01)
-    atlas._graph.rescale_odometry = lambda agent, log, width: done.append(agent)
-    atlas._quarantine._apply_scales()
+    atlas.quarantine.agreement.log_scales = dict.fromkeys(names, 0.01)
+    atlas.graph.rescale_odometry = lambda agent, log, width: done.append(agent)
+    atlas.quarantine._apply_scales()
     assert done == names

@@ -6,12 +6,12 @@ from helpers.atlas_sim import Walker, answer, error, loop, near_loops, settle
 
 from share.config import MergeConfig
 from share.geometry import se3
+from share.mapping import loop_acceptance, loop_consistency
 from share.mapping.atlas import Atlas
 from share.mapping.loops import KeyframeKey, Loop
 from share.types import F64
 
-# as careful as where copies of whole corridors are to be expected
-CONFIG = MergeConfig(join_places=5, near_m=1.0, near_rad=0.52, join_found=0.45, place_m=0.7, place_rad=0.5)
+CONFIG = MergeConfig(join_places=5)
 WRONG = se3.exp(np.array([0.0, 0.0, 0.5, 1.0, -0.7, 0.1]))
 
 
@@ -33,6 +33,14 @@ def truth(*walkers: Walker) -> F64:
     return np.concatenate([w.truth for w in walkers])
 
 
+@pytest.fixture(autouse=True)
+def strict_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As careful as where copies of whole corridors are to be expected."""
+    for name, value in (("NEAR_M", 1.0), ("NEAR_RAD", 0.52), ("PLACE_M", 0.7), ("PLACE_RAD", 0.5)):
+        monkeypatch.setattr(loop_consistency, name, value)
+    monkeypatch.setattr(loop_acceptance, "JOIN_FOUND", 0.45)
+
+
 @pytest.fixture
 def ann() -> Walker:
     return Walker("ann", 1)
@@ -47,7 +55,7 @@ def test_every_stretch_is_a_map_until_joined(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     assert atlas.map_sizes() == {"ann/0": 60, "bob/0": 60}
     assert len(atlas) == 120
-    assert atlas.due_maps() == []
+    assert atlas.solving.due_maps() == []
     assert atlas.T_map_odom("bob") == pytest.approx(np.eye(4), abs=1e-9)
     assert atlas.T_map_odom("nobody") is None
 
@@ -151,8 +159,8 @@ def test_a_wrong_loop_never_joins(ann: Walker, bob: Walker) -> None:
     good = [atlas.propose(x) for x in near_loops(ann, bob, rng)[:5]]
     assert [d.accepted for d in good] == [False] * 4 + [True]
     settle(atlas)
-    assert len(atlas.loops) == 5
-    assert len(atlas.pending) == 6
+    assert len(tuple(atlas.graph.edges.loops.values())) == 5
+    assert len(tuple(atlas.loop_acceptance.pending)) == 6
 
 
 def test_of_small_maps_fewer_places_are_enough_but_never_one_keyframe() -> None:
@@ -166,13 +174,14 @@ def test_of_small_maps_fewer_places_are_enough_but_never_one_keyframe() -> None:
     assert atlas.propose(loop(ann, 1, bob, 2, rng)).joined_maps == ("ann/0", "bob/0")
 
 
-def test_views_from_afar_are_no_witnesses(ann: Walker, bob: Walker) -> None:
+def test_views_from_afar_are_no_witnesses(ann: Walker, bob: Walker, monkeypatch: pytest.MonkeyPatch) -> None:
     """They would join, were they believed to have been taken from near."""
     rng = np.random.default_rng(0)
     far = [far_loop(ann, i, bob, i, rng) for i in range(0, 40, 4)]
     assert not any(atlas_of(ann, bob).propose(x).accepted for x in far)
-    atlas, easy = atlas_of(ann, bob), atlas_of(ann, bob, config=replace(CONFIG, near_m=9.0, near_rad=4.0))
-    assert not any(atlas.propose(x).accepted for x in far)
+    monkeypatch.setattr(loop_consistency, "NEAR_M", 9.0)
+    monkeypatch.setattr(loop_consistency, "NEAR_RAD", 4.0)
+    easy = atlas_of(ann, bob)
     assert any(easy.propose(x).accepted for x in far)
 
 
@@ -225,7 +234,7 @@ def test_order_of_arrival_does_not_matter(ann: Walker, bob: Walker) -> None:
         settle(atlas)
         settle(atlas)
         assert atlas.map_sizes().keys() == {"ann/0"}
-        assert len(atlas.loops) == len(loops)
+        assert len(tuple(atlas.graph.edges.loops.values())) == len(loops)
         results.append(poses(atlas, ann, bob))
     for other in results[1:]:
         assert np.abs(other - results[0]).max() < 2e-3
@@ -275,7 +284,7 @@ def test_keyframes_that_came_while_solving_follow(ann: Walker, bob: Walker) -> N
     result = answer(atlas, "ann/0")
     for k in bob.keyframes[late:]:
         atlas.add_keyframe("bob", k)
-    applied = atlas.apply_solution(*result)
+    applied = atlas.solving.apply(*result)
     rigid = se3.inverse(bob.T_odom_body[late - 1]) @ bob.T_odom_body[-1]
     assert se3.inverse(atlas.pose(KeyframeKey("bob", late - 1))) @ atlas.pose(
         KeyframeKey("bob", 59)
@@ -292,18 +301,18 @@ def test_a_solution_of_a_map_that_was_joined_meanwhile_is_left_aside(ann: Walker
     for x in near_loops(ann, bob, rng):
         atlas.propose(x)
     before = poses(atlas, ann, bob)
-    applied = atlas.apply_solution(*result)
+    applied = atlas.solving.apply(*result)
     assert applied.corrections == {}
     assert "merged or split" in applied.reason
     assert np.array_equal(poses(atlas, ann, bob), before)
-    assert atlas.due_maps() == ["ann/0"]
+    assert atlas.solving.due_maps() == ["ann/0"]
     assert settle(atlas)[0].corrections.keys() == {"ann", "bob"}
 
 
 def far_loop(ann: Walker, i: int, bob: Walker, j: int, rng: np.random.Generator) -> Loop:
     """A true one, but seen from further than a witness may."""
     x = loop(ann, i, bob, j, rng)
-    assert np.linalg.norm(x.T_a_b[:3, 3]) > CONFIG.near_m
+    assert np.linalg.norm(x.T_a_b[:3, 3]) > loop_consistency.NEAR_M
     return x
 
 
@@ -315,7 +324,7 @@ def twin_loops(ann: Walker, bob: Walker, count: int, found: float = 0.46) -> lis
     for i in range(0, 4 * count, 4):
         j = i + 13
         T = se3.inverse(ann.truth[i]) @ half @ bob.truth[j]
-        assert np.linalg.norm(T[:3, 3]) < CONFIG.near_m
+        assert np.linalg.norm(T[:3, 3]) < loop_consistency.NEAR_M
         out.append(Loop(KeyframeKey("ann", i), KeyframeKey("bob", j), T, cov, 80, found))
     return out
 
@@ -382,7 +391,10 @@ def test_two_stories_of_like_weight_join_nothing(ann: Walker, bob: Walker) -> No
 
 def test_views_that_lack_what_both_should_show_join_nothing(ann: Walker, bob: Walker) -> None:
     true = near_loops(ann, bob, np.random.default_rng(0))
-    for found, joined in ((CONFIG.join_found - 0.01, False), (CONFIG.join_found + 0.01, True)):
+    for found, joined in (
+        (loop_acceptance.JOIN_FOUND - 0.01, False),
+        (loop_acceptance.JOIN_FOUND + 0.01, True),
+    ):
         atlas = atlas_of(ann, bob)
         decisions = [atlas.propose(replace(x, found_share=found)) for x in true]
         assert any(d.joined_maps for d in decisions) == joined
@@ -411,11 +423,14 @@ def test_what_cannot_be_is_refused_by_name(ann: Walker) -> None:
     with pytest.raises(ValueError, match="keyframe ann:99 is not known"):
         atlas.propose(Loop(KeyframeKey("ann", 1), KeyframeKey("ann", 99), np.eye(4), np.eye(6), 50))
     with pytest.raises(ValueError, match="there is no map"):
-        atlas.make_job("zoe/0")
+        atlas.solving.make_job("zoe/0")
 
 
-def test_a_loop_that_the_solved_map_speaks_against_is_dropped(ann: Walker, bob: Walker) -> None:
-    atlas = atlas_of(ann, bob, config=replace(CONFIG, agree_chi2=1e9, surprise_chi2=1e9))
+def test_a_loop_that_the_solved_map_speaks_against_is_dropped(
+    ann: Walker, bob: Walker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop_acceptance, "AGREE_CHI2", 1e9)
+    atlas = atlas_of(ann, bob)
     rng = np.random.default_rng(0)
     for x in near_loops(ann, bob, rng):
         atlas.propose(x)
@@ -423,7 +438,7 @@ def test_a_loop_that_the_solved_map_speaks_against_is_dropped(ann: Walker, bob: 
     assert atlas.propose(wrong).accepted
     reasons = [applied.reason for applied in settle(atlas)]
     assert "outlier loops removed: ann:30 - bob:8" in reasons[0]
-    assert wrong not in atlas.loops
+    assert wrong not in tuple(atlas.graph.edges.loops.values())
     assert error(poses(atlas, ann, bob), truth(ann, bob)) < 0.06
 
 
@@ -434,11 +449,11 @@ def test_without_its_loops_a_join_is_undone(ann: Walker, bob: Walker) -> None:
     for x in near_loops(ann, bob, rng):
         atlas.propose(x)
     job, solution = answer(atlas, "ann/0")
-    applied = atlas.apply_solution(job, replace(solution, loop_chi2=np.full_like(solution.loop_chi2, 1e6)))
+    applied = atlas.solving.apply(job, replace(solution, loop_chi2=np.full_like(solution.loop_chi2, 1e6)))
     assert atlas.map_sizes().keys() == {"ann/0", "bob/0"}
     assert applied.corrections["bob"].map_id == "bob/0"
     assert np.abs(atlas.pose(KeyframeKey("bob", 0)) - bob.T_odom_body[0]).max() < 1e-9
-    assert atlas.due_maps() == ["ann/0", "bob/0"]
+    assert atlas.solving.due_maps() == ["ann/0", "bob/0"]
     settle(atlas)
     assert not atlas.propose(near_loops(ann, bob, rng)[0]).accepted
 
@@ -452,7 +467,7 @@ def test_how_surely_somebody_is_known_is_reckoned_for_who_is_answered(ann: Walke
     first = settle(atlas)[-1]
     atlas.propose(loops[-1])
     job, solution = answer(atlas, "ann/0")
-    assert job.covariance_segments == (atlas._graph.odometry.current_segment("bob"),)
-    second = atlas.apply_solution(job, solution)
+    assert job.covariance_segments == (atlas.graph.odometry.current_segment("bob"),)
+    second = atlas.solving.apply(job, solution)
     assert (second.corrections["ann"].cov == first.corrections["ann"].cov).all()
     assert (second.corrections["bob"].cov != first.corrections["bob"].cov).any()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.corrections import CorrectionFilter
+from share.mapping.corrections import CorrectionPublisher
+from share.mapping.map_solving import AppliedSolution
 from share.types import Correction
 
 
@@ -16,23 +17,40 @@ def correction(
     return Correction(T, np.eye(6), map_id, 0, 0, answers)
 
 
+def is_sent(publisher: CorrectionPublisher, agent: str, correction: Correction) -> bool:
+    events = publisher.publish("a/0", AppliedSolution({agent: correction}, "solved"))
+    return [event.correction for event in events] == [correction]
+
+
 def test_what_moves_nobody_is_not_sent() -> None:
-    concern = CorrectionFilter()
-    assert concern.should_send("ann", correction())
-    assert not concern.should_send("ann", correction(shift_m=0.0009))
-    assert not concern.should_send("ann", correction(turn_deg=0.019))
-    assert concern.should_send("bob", correction())
+    concern = CorrectionPublisher()
+    assert is_sent(concern, "ann", correction())
+    assert not is_sent(concern, "ann", correction(shift_m=0.0009))
+    assert not is_sent(concern, "ann", correction(turn_deg=0.019))
+    assert is_sent(concern, "bob", correction())
 
 
 def test_small_steps_add_up() -> None:
-    concern = CorrectionFilter()
-    sent = [concern.should_send("ann", correction(shift_m=0.0004 * k)) for k in range(7)]
+    concern = CorrectionPublisher()
+    sent = [is_sent(concern, "ann", correction(shift_m=0.0004 * k)) for k in range(7)]
     assert sent == [True, False, False, True, False, False, True]
 
 
 def test_an_answer_and_another_map_are_always_sent() -> None:
-    concern = CorrectionFilter()
-    concern.should_send("ann", correction())
-    assert concern.should_send("ann", correction(answers=3))
-    assert concern.should_send("ann", correction(map_id="b/0"))
-    assert concern.should_send("ann", correction(turn_deg=0.021, map_id="b/0"))
+    concern = CorrectionPublisher()
+    is_sent(concern, "ann", correction())
+    assert is_sent(concern, "ann", correction(answers=3))
+    assert is_sent(concern, "ann", correction(map_id="b/0"))
+    assert is_sent(concern, "ann", correction(turn_deg=0.021, map_id="b/0"))
+
+
+def test_a_correction_that_is_held_back_is_reported_once_for_each_map() -> None:
+    publisher = CorrectionPublisher()
+    held_back = AppliedSolution({}, "solved", waiting_sigma_m={"ann": 0.12})
+    (event,) = publisher.publish("b/0", held_back)
+    assert (event.agent, event.event, event.correction) == ("ann", "correction held back", None)
+    assert event.reason == "its position in map b/0 is known to 12 cm"
+    assert publisher.publish("b/0", held_back) == []
+    assert len(publisher.publish("c/0", held_back)) == 1
+    publisher.remove_agent("ann")
+    assert len(publisher.publish("b/0", held_back)) == 1

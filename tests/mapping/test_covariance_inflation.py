@@ -13,9 +13,10 @@ from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.agents.agreement import AgentAgreement
 from share.mapping.agents.covariance_scales import inflate_covariance
-from share.mapping.atlas import Atlas, RestoredKeyframe
+from share.mapping.atlas import Atlas
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import StoredKeyframe, StoredMap
 from share.mapping.recognition.depth_scale import DepthScale, relative_depth_scale
 from share.mapping.recognition.refinement import KeypointNoise, refine_pose
 from share.types import Keyframe, View
@@ -92,10 +93,10 @@ def test_a_chart_is_shortened_and_what_is_kept_of_it_is_not():
     for a, e in zip(ann.keyframes[:30], eve.keyframes[:30], strict=True):
         atlas.add_keyframe("ann", a)
         atlas.add_keyframe("eve", e)
-    chart, agreement = atlas._graph, atlas._quarantine.agreement
+    chart, agreement = atlas.graph, atlas.quarantine.agreement
     agreement.log_scales["eve"], agreement.covariance_scale = 0.01, lambda run: 4.0 if run == "eve" else 1.0
-    atlas._quarantine._apply_scales()
-    assert atlas.due_maps() == ["eve/0"]
+    atlas.quarantine._apply_scales()
+    assert atlas.solving.due_maps() == ["eve/0"]
     atlas.add_keyframe("eve", eve.keyframes[30])
     for walker, by in ((ann, 1.0), (eve, np.exp(-0.01))):
         for k in range(1, 30):
@@ -113,7 +114,7 @@ def test_a_chart_is_shortened_and_what_is_kept_of_it_is_not():
     plain = inflate_covariance(MergeConfig(), told, eve.keyframes[6].cov)
     assert np.trace(taken.link.cov) < 3 * np.trace(plain)  # of two steps
     agreement.log_scales["eve"] = 0.0
-    atlas._quarantine._apply_scales()
+    atlas.quarantine._apply_scales()
     last = [chart.odometry.node_id(KeyframeKey("eve", k)) for k in (29, 30)]
     assert chart.odometry_edge(*last).T_a_b[:3, 3] == pytest.approx(eve.keyframes[30].T_ref_body[:3, 3])
 
@@ -125,17 +126,19 @@ def test_loops_are_put_right_too():
         atlas.add_keyframe(walker.name, walker.keyframes[0])
     (loop,) = near_loops(ann, eve, np.random.default_rng(0))[:1]
     lean = np.array([0.0, 0.0, 0.0, 2.0, 0.0, 0.0])
-    assert atlas.rescale_loop(loop, DepthScale(0.01, 0.004, lean)) is loop  # nobody's scale is known
-    atlas._graph.log_scales["eve"] = 0.01
-    right = atlas.rescale_loop(loop, DepthScale(0.01, 0.004, lean))
+    assert (
+        atlas.quarantine.rescale_loop(loop, DepthScale(0.01, 0.004, lean)) is loop
+    )  # nobody's scale is known
+    atlas.graph.log_scales["eve"] = 0.01
+    right = atlas.quarantine.rescale_loop(loop, DepthScale(0.01, 0.004, lean))
     gap = se3.log(right.T_a_b @ se3.inverse(loop.T_a_b))
     assert gap == pytest.approx(0.01 * lean, abs=1e-6)
-    back = atlas.rescale_loop(loop.reverse(), DepthScale(-0.01, 0.004, lean))
+    back = atlas.quarantine.rescale_loop(loop.reverse(), DepthScale(-0.01, 0.004, lean))
     leant = (se3.exp(-0.01 * lean) @ loop.reverse().T_a_b)[:3, 3]
     assert back.T_a_b[:3, 3] == pytest.approx(
         np.exp(-0.01) * leant
     )  # in the metres of eve, which are too long
-    assert atlas.rescale_loop(loop, None) is loop
+    assert atlas.quarantine.rescale_loop(loop, None) is loop
 
 
 @pytest.mark.parametrize(("metres", "radians"), [(0.1, 0.0), (1.0, 0.0), (0.3, 0.5)])
@@ -143,7 +146,7 @@ def test_nobody_is_surer_than_a_part_of_his_way(metres, radians):
     atlas, step = Atlas(MergeConfig()), se3.exp(np.array([0, 0, radians, metres, 0, 0]))
     atlas.add_keyframe("eve", Keyframe(0, -1, 0, np.eye(4), OWN, np.eye(4), UP, UP_SIGMA, NO_VIEW))
     atlas.add_keyframe("eve", Keyframe(1, 0, 10**8, step, OWN, step, UP, UP_SIGMA, NO_VIEW))
-    sigma = np.sqrt(np.diag(atlas._graph.odometry_edge(0, 1).cov))
+    sigma = np.sqrt(np.diag(atlas.graph.odometry_edge(0, 1).cov))
     assert sigma[3:].min() >= 0.003 * np.linalg.norm(step[:3, 3])
     assert sigma[3:].max() < 0.004 * metres + 0.0003
     assert sigma[:3].min() >= 0.0005 * radians
@@ -155,14 +158,11 @@ def test_nobody_is_surer_than_a_part_of_his_way(metres, radians):
 def again(tied: bool) -> tuple[Atlas, list]:
     """Ann, bob and eve in a second life; ann and bob were in one map. Returns loops between ann and eve."""
     walkers = Walker("ann", 1), Walker("bob", 2, phase=0.3), Walker("eve", 3, phase=0.7)
-    placed = [
-        RestoredKeyframe(KeyframeKey(w.name, k.id), f"{w.name}/0", k.id, k, k.T_ref_body, k.cov, True)
-        for w in walkers
-        for k in w.keyframes
-    ]
+    placed = [StoredKeyframe(w.name, k, f"{w.name}/0", k.id) for w in walkers for k in w.keyframes]
     rng, atlas = np.random.default_rng(0), Atlas(MergeConfig())
     kept = near_loops(*walkers[:2], rng)[:6] if tied else []
-    atlas.restore([(w.name, 0) for w in walkers], placed, kept, {})
+    segments = tuple(f"{w.name}/0" for w in walkers)
+    atlas.restore(StoredMap((), segments, tuple(placed), loops=tuple(kept)), [0, 0, 0])
     return atlas, near_loops(walkers[0], walkers[2], rng)
 
 
@@ -170,18 +170,18 @@ def again(tied: bool) -> tuple[Atlas, list]:
 @pytest.mark.parametrize("log", [0.0, 0.05])
 def test_after_a_restart_who_was_not_in_the_common_map_is_compared_before_he_comes_into_it(tied, log):
     atlas, loops = again(tied)
-    assert "the edge has restarted" in atlas.standing("eve").reason
+    assert "the edge has restarted" in atlas.quarantine.agreement.standing("eve").reason
     said = [atlas.propose(loop) for loop in loops[:4]]
     assert not any(decision.accepted for decision in said)
     assert all("compared first" in decision.reason for decision in said)
     met_again = []
     for loop in loops:
-        atlas.compare_agents(loop, DepthScale(log, 0.005))
+        atlas.quarantine.add_loop(loop, DepthScale(log, 0.005))
         decision = atlas.propose(replace(loop, found_share=1.0))
         met_again.append(atlas.map_id(KeyframeKey("ann", 0)) == atlas.map_id(KeyframeKey("eve", 0)))
         if log:
             assert not decision.accepted
     assert met_again[-1] == (log == 0.0)
-    assert atlas.standing("eve").state == ("agrees" if log == 0.0 else "disputed")
-    assert atlas.standing("bob").state == "unknown"
-    assert ("edge has restarted" in atlas.standing("bob").reason) != tied
+    assert atlas.quarantine.agreement.standing("eve").state == ("agrees" if log == 0.0 else "disputed")
+    assert atlas.quarantine.agreement.standing("bob").state == "unknown"
+    assert ("edge has restarted" in atlas.quarantine.agreement.standing("bob").reason) != tied

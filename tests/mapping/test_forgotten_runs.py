@@ -154,13 +154,10 @@ def test_a_run_that_comes_back_to_less_is_tied_to_what_is_left_in_the_file_too(t
         life = Life(store)
         for name, run_id, count in (("ann", 1, 2), ("eve", 100, 20), ("eve", 101, 1)):
             life.run(name, run_id, count, stays=name == "ann")
-        atlas = life.mapper._atlas
-        key = next(key.agent for key in atlas.all_poses()[0] if key.id == 19)
-        life.mapper._to_remove = [
-            n for n in atlas._graph.poses if atlas.key(n) in {(key, k) for k in range(8, 20)}
-        ]
-        while life.mapper._to_remove:
-            life.mapper._cull_keyframes()
+        atlas = life.mapper.atlas
+        key = next(key.agent for key in atlas.all_poses().keys if key.id == 19)
+        newer = {(key, k) for k in range(8, 20)}
+        life.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n) in newer])
         life.handle(ed.EdgeTick())
         life.tell(100, hello_of("eve", 100))
         life.tell(
@@ -172,7 +169,7 @@ def test_a_run_that_comes_back_to_less_is_tied_to_what_is_left_in_the_file_too(t
         second = Life(store, session=8)
         assert np.allclose(second.mapper.current_poses().T_map_body, life.mapper.current_poses().T_map_body)
         covs = [
-            one._atlas._graph.odometry_edge(*one._atlas._graph.odometry.segments[1].nodes[-2:]).cov
+            one.atlas.graph.odometry_edge(*one.atlas.graph.odometry.segments[1].nodes[-2:]).cov
             for one in (life.mapper, second.mapper)
         ]
         assert np.allclose(covs[0], covs[1])
@@ -235,10 +232,8 @@ def test_a_restored_run_that_is_emptied_is_forgotten_in_this_life(tmp_path: Path
 
 def emptied(life: Life, run_id: int) -> None:
     """All keyframes of a run of eve are taken out."""
-    atlas, run = life.mapper._atlas, f"eve-{m.public_tag(run_id)[:4]}"
-    life.mapper._to_remove = [n for n in atlas._graph.poses if atlas.key(n).agent == run]
-    while life.mapper._to_remove:
-        life.mapper._cull_keyframes()
+    atlas, run = life.mapper.atlas, f"eve-{m.public_tag(run_id)[:4]}"
+    life.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n).agent == run])
     for _ in range(2):
         life.handle(ed.EdgeTick())
 
@@ -288,10 +283,8 @@ def test_a_run_is_forgotten_only_with_the_last_of_its_stretches(tmp_path: Path) 
         gone = next(key.agent for key in life.mapper.current_poses().keys if key.id == 11)
 
         def leave(ids: range) -> None:
-            keys, atlas = {(gone, k) for k in ids}, life.mapper._atlas
-            life.mapper._to_remove = [n for n in life.mapper._camera_views if atlas.key(n) in keys]
-            while life.mapper._to_remove:
-                life.mapper._cull_keyframes()
+            keys, atlas = {(gone, k) for k in ids}, life.mapper.atlas
+            life.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n) in keys])
             life.handle(ed.EdgeTick())
             life.handle(ed.EdgeTick())
 
@@ -308,9 +301,9 @@ def test_a_run_that_comes_back_to_nothing_hears_that_it_is_in_a_map_of_its_own(t
         life = Life(store)
         life.run("ann", 1, 20, stays=True)
         life.run("eve", 100, 5)
-        atlas, mapper = life.mapper._atlas, life.mapper
+        atlas, mapper = life.mapper.atlas, life.mapper
         ann, eve = sorted({key.agent for key in mapper.current_poses().keys})
-        atlas._graph.add_loop(Loop(KeyframeKey(ann, 3), KeyframeKey(eve, 3), np.eye(4), 1e-4 * np.eye(6), 50))
+        atlas.graph.add_loop(Loop(KeyframeKey(ann, 3), KeyframeKey(eve, 3), np.eye(4), 1e-4 * np.eye(6), 50))
         assert atlas.current_map_id(eve) == f"{ann}/0"
         atlas.remove_keyframes([n for n in range(len(atlas)) if atlas.key(n).agent == eve])
         mapper.set_present(eve, True)

@@ -142,12 +142,6 @@ def test_empty_index_and_empty_view() -> None:
     assert index.query(np.zeros((5, 32), np.uint8), 5) == []
 
 
-@pytest.mark.parametrize(("tables", "bits"), [(0, 16), (4, 0), (4, 21)])
-def test_impossible_tables_are_refused(tables: int, bits: int) -> None:
-    with pytest.raises(ValueError, match="bits"):
-        PlaceIndex(0, tables, bits)
-
-
 def test_words_of_those_that_are_gone_are_held_no_longer() -> None:
     """Otherwise they would count as common, and be read no more."""
     rng = np.random.default_rng(8)

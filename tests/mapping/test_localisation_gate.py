@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.atlas_sim import Walker, loop, settle
 
 from share.config import MergeConfig
+from share.mapping import localisation_gate
 from share.mapping.atlas import Atlas
-from share.mapping.corrections import LocalisationGate, PlacementUncertainty
+from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty
 from share.mapping.loops import Loop
 
 ANN, BOB, EVE, ROBOT = ALL = range(4)  # stretches, the oldest first
@@ -21,8 +20,9 @@ def known(cm: float, value: float = 1.0, answers: int | None = None) -> Placemen
 
 
 @pytest.fixture
-def surety() -> LocalisationGate:
-    return LocalisationGate(enter_m=0.05, patience=3)
+def surety(monkeypatch: pytest.MonkeyPatch) -> LocalisationGate:
+    monkeypatch.setattr(localisation_gate, "PATIENCE", 3)
+    return LocalisationGate(enter_m=0.05)
 
 
 def test_in_his_own_map_everybody_hears_at_once(surety: LocalisationGate) -> None:
@@ -102,11 +102,10 @@ def faint(ann: Walker, bob: Walker, at: int) -> Loop:
     return Loop(seen.a, seen.b, seen.T_a_b, sigma, 20)
 
 
-def apart(**settings: int) -> tuple[Atlas, Walker, Walker]:
+def apart() -> tuple[Atlas, Walker, Walker]:
     """Ann and Bob, who see the same, each in a map of his own."""
     ann, bob = Walker("ann", 0), Walker("bob", 1, n=12, turn=3.5 * np.pi / 59 * 11)
-    config = MergeConfig(join_places=1, near_m=1.0, near_rad=0.52, place_m=0.7, place_rad=0.5)
-    atlas = Atlas(replace(config, **settings))
+    atlas = Atlas(MergeConfig(join_places=1))
     for walker in (ann, bob):
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
@@ -139,29 +138,32 @@ def test_nobody_waits_for_who_is_away_and_he_is_told_once_he_is_back() -> None:
     atlas.propose(loop(ann, 11, bob, 11, np.random.default_rng(0)))
     (applied,) = settle(atlas)
     assert list(applied.corrections) == ["ann"]
-    assert not atlas.due_maps()
+    assert not atlas.solving.due_maps()
     atlas.set_present("bob", True)
     (applied,) = settle(atlas)
     assert applied.corrections["bob"].map_id == "ann/0"
     atlas.set_present("bob", True)
-    assert not atlas.due_maps()
+    assert not atlas.solving.due_maps()
 
 
 @pytest.mark.parametrize("solved_between", [True, False])
-def test_a_join_that_was_undone_and_made_again_is_waited_for_anew(solved_between: bool) -> None:
+def test_a_join_that_was_undone_and_made_again_is_waited_for_anew(
+    solved_between: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At once too, as where better evidence overthrows it."""
-    atlas, ann, bob = apart(enter_patience=1)
+    monkeypatch.setattr(localisation_gate, "PATIENCE", 1)
+    atlas, ann, bob = apart()
     for first in (0, 2):
         joined = [atlas.propose(faint(ann, bob, at)).joined_maps for at in (first, first + 1)]
         assert joined == [None, ("ann/0", "bob/0")]
         assert settle(atlas)[-1].waiting_sigma_m.keys() == {"bob"}  # one keyframe of his has found loops
-        atlas._graph.drop_loops(list(atlas._graph.edges.loops))
+        atlas.graph.drop_loops(list(atlas.graph.edges.loops))
         if solved_between:
             settle(atlas)
 
 
 def test_of_a_stretch_without_keyframes_nothing_is_remembered() -> None:
-    surety = LocalisationGate(0.05, 3)
+    surety = LocalisationGate(0.05)
     surety.restore(2, 0)
     surety.forget([2])
     assert not surety.is_published(2, 0)

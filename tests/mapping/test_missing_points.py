@@ -6,7 +6,7 @@ from helpers.place_sim import bodies, sights
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.mapping.recognition.missing_points import (
+from share.mapping.overlap_check import (
     MissingPoints,
     MissingRegions,
     missing_points,

@@ -60,13 +60,13 @@ class Room:
             for walker, ring in zip(self.walkers, self.rings, strict=True):
                 number = self.atlas.add_keyframe(walker.name, walker.keyframes[i])
                 self.sights[number] = ring.sight(walker.truth[i], self.rng)
-                decisions.append(self.atlas.review_joins(number))
+                decisions.append(self.atlas.loop_acceptance.review_joins(number))
         return [d for d in decisions if d is not None]
 
     def solve(self) -> None:
-        job = self.atlas.make_job("a/0")
+        job = self.atlas.solving.make_job("a/0")
         self.solver.update(job.change)
-        self.atlas.apply_solution(job, self.solver.solve(job.anchor, job.covariance_nodes))
+        self.atlas.solving.apply(job, self.solver.solve(job.anchor, job.covariance_nodes))
 
     def loops(self, at: range) -> list[Loop]:
         a, b = self.walkers

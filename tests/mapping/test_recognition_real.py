@@ -73,7 +73,7 @@ def report(name: str, found: dict[tuple[int, int], tuple[float, float]], true: s
 
 def test_stereo_keyframes_query_and_verification(euroc: Seen, kitchen: Seen) -> None:
     """The other recording's views lie in the index too, as views to be mistaken for."""
-    index = PlaceIndex(CONFIG.index_seed, CONFIG.tables, CONFIG.hash_bits)
+    index = PlaceIndex()
     for i, sight in enumerate(euroc.sights):
         index.add(i, sight.view.descriptors)
     for i, sight in enumerate(kitchen.sights):

@@ -8,7 +8,7 @@ from helpers.map_changes import ANN, BOB, kept_keyframe, pose
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SaveLink
-from share.mapping.repair import repair_references
+from share.store.loading import repair_references
 
 
 def test_nothing_to_mend():

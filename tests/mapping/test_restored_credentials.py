@@ -82,7 +82,7 @@ def test_a_restored_run_has_the_voice_that_was_kept_until_another_is_heard(kept:
     mapper.restore(
         StoredMap(tuple(SaveRun(p.name, p.hello, "A" if p.name == "ann" else kept) for p in people))
     )
-    voice = mapper._atlas._quarantine.agreement.identities.credential
+    voice = mapper.atlas.quarantine.agreement.identities.credential
     assert [voice(name) for name in KEYS] == ["A", kept, kept]
     mapper.set_credential("e2", "F")
     assert [voice(name) for name in KEYS] == ["A", kept, "F"]

@@ -74,8 +74,8 @@ def again(life: Life, path: Path, config: Config) -> Life:
     for run, name in zip(restored_runs(kept, 0.05), ("ann", "bob"), strict=True):
         told = run.last_finding  # before the mapper has said anything, and the same as it would
         assert told is not None and told.correction is not None
-        assert (told.agent, told.correction.map_id) == (name, second.mapper._atlas.current_map_id(name))
-        T_map_odom = second.mapper._atlas.T_map_odom(name)
+        assert (told.agent, told.correction.map_id) == (name, second.mapper.atlas.current_map_id(name))
+        T_map_odom = second.mapper.atlas.T_map_odom(name)
         assert np.allclose(told.correction.T_map_odom, T_map_odom, atol=1e-9)
         T_odom_body = [found.keyframe.T_odom_body for found in kept.keyframes if found.run_key == name][-1]
         at_body = se3.compose_cov(T_odom_body, told.correction.cov, np.zeros((6, 6)))
@@ -131,7 +131,7 @@ def test_a_headset_keeps_its_place_and_a_map_its_founder(
 def test_maps_that_meet_only_in_a_second_life_are_joined_as_in_the_first(tmp_path: Path) -> None:
     """The robot's to the headset's, though it is older."""
     config = Config()
-    life, people = walked(replace(config, place=replace(config.place, min_matches=10**6)), AgentKind.ROBOT)
+    life, people = walked(replace(config, place=replace(config.place, min_inliers=10**6)), AgentKind.ROBOT)
     assert list(life.mapper.report()["maps"]) == ["ann/0", "bob/0"]
     second = again(life, tmp_path / "room.sqlite", config)
     for _ in range(STEPS):
@@ -159,7 +159,7 @@ def test_a_stretch_whose_run_was_lost_is_no_obstacle() -> None:
 def test_a_join_that_poses_were_not_kept_of_is_not_told_as_it_was_before(tmp_path: Path) -> None:
     """The edge is killed within seconds of a join: loops are kept at once, poses now and then."""
     config = Config()
-    apart, _ = walked(replace(config, place=replace(config.place, min_matches=10**6)))
+    apart, _ = walked(replace(config, place=replace(config.place, min_inliers=10**6)))
     before = apart.mapper.current_poses()
     assert set(before.map_ids) == {"ann/0", "bob/0"}
     with MapStore.open(tmp_path / "room.sqlite") as store:

@@ -1,9 +1,6 @@
 """How many candidates are tried, while nobody waits and while somebody does."""
 
-from share.config import Config
-from share.mapping.query_queue import CandidateSearch, SearchBudget
-
-EFFORT = SearchBudget(max_verified=3, max_tried_hurried=2)
+from share.mapping.query_queue import CandidateSearch
 
 
 def tried(search: CandidateSearch, hurries: list[bool], hits: set[int]) -> list[int]:
@@ -19,22 +16,33 @@ def tried(search: CandidateSearch, hurries: list[bool], hits: set[int]) -> list[
     return out
 
 
+def search() -> CandidateSearch:
+    return CandidateSearch(range(8), max_tried_hurried=2)
+
+
 def test_at_leisure_all_are_tried_until_three_are_it():
-    assert tried(CandidateSearch(9, range(8), EFFORT), [False] * 20, set()) == list(range(8))
-    assert tried(CandidateSearch(9, range(8), EFFORT), [False] * 20, {1, 2, 5, 6}) == [0, 1, 2, 3, 4, 5]
+    assert tried(search(), [False] * 20, set()) == list(range(8))
+    assert tried(search(), [False] * 20, {1, 2, 5, 6}) == [
+        0,
+        1,
+        2,
+        3,
+        4,
+        5,
+    ]
 
 
 def test_in_a_hurry_one_is_enough_and_two_are_tried():
-    assert tried(CandidateSearch(9, range(8), EFFORT), [True] * 20, set()) == [0, 1]
-    assert tried(CandidateSearch(9, range(8), EFFORT), [True] * 20, {0}) == [0]
+    assert tried(search(), [True] * 20, set()) == [0, 1]
+    assert tried(search(), [True] * 20, {0}) == [0]
 
 
 def test_who_comes_meanwhile_ends_it():
-    assert tried(CandidateSearch(9, range(8), EFFORT), [False] * 4 + [True] * 9, set()) == [0, 1, 2, 3]
-    assert tried(CandidateSearch(9, range(8), EFFORT), [False, True, True], {0}) == [0]
-    assert tried(CandidateSearch(9, range(8), EFFORT), [False, True, True], set()) == [0, 1]
-
-
-def test_the_settings_say_how_many():
-    config = Config()
-    assert SearchBudget.from_config(config) == (config.place.enough, config.edge.hurry_candidates)
+    assert tried(search(), [False] * 4 + [True] * 9, set()) == [
+        0,
+        1,
+        2,
+        3,
+    ]
+    assert tried(search(), [False, True, True], {0}) == [0]
+    assert tried(search(), [False, True, True], set()) == [0, 1]

@@ -1,22 +1,20 @@
 import pickle
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.drifting import loops_of_a_room, rms
+from helpers.exact_solver import make_exact
 from helpers.gtsam_graph import solve
 from helpers.rooms import LOOP, Room, false_loops, simulate
 
 from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.graph.edges import EdgeArrays, PoseEdge, jacobians, residuals
-from share.mapping.graph.solver import PoseGraphSolver
-from share.mapping.graph.updates import GraphUpdate
+from share.mapping.graph.solver import GraphUpdate, PoseGraphSolver
 from share.types import F64
 
 CONFIG = GraphConfig()
-EXACT = replace(CONFIG, step_tolerance=1e-8, relative_tolerance=1e-14, inner_tolerance=1e-6)
 
 
 def change(
@@ -65,7 +63,7 @@ def test_residuals_are_the_logarithm(size: float) -> None:
 def test_agrees_with_gtsam(n: int, agents: int, density: float) -> None:
     room = simulate(n, agents, 4, density)
     solution = loaded(room).solve(0)
-    theirs = solve(room.guess, room.chain, room.closures, [0], replace(CONFIG, relative_tolerance=1e-10))
+    theirs = solve(room.guess, room.chain, room.closures, [0], relative_tolerance=1e-10)
     off = np.linalg.norm((solution.poses - theirs.poses)[:, :3, 3], axis=1)
     assert rms(room.guess, room.truth) > 1.5 * rms(solution.poses, room.truth)
     assert np.median(off) < 0.001 and off.max() < 0.003
@@ -85,7 +83,7 @@ def test_tolerates_three_false_loops_in_ten() -> None:
     assert rms(solution.poses, room.truth) < 1.2 * rms(clean.poses, room.truth) + 0.002
     wrong = solution.loop_ids >= 10**7
     assert np.median(solution.loop_chi2[wrong]) > 1000 * np.median(solution.loop_chi2[~wrong])
-    gaussian = loaded(room, replace(CONFIG, cauchy=1e6))
+    gaussian = loaded(room, GraphConfig(cauchy=1e6))
     gaussian.update(change({}, [], false, first=10**7))
     assert rms(gaussian.solve(0).poses, room.truth) > 10 * rms(solution.poses, room.truth)
 
@@ -97,11 +95,11 @@ def test_a_room_met_before_is_no_worse_than_by_gtsam() -> None:
     loops += [PoseEdge(int(a), int(b), se3.exp(rng.normal(0, [0.5] * 3 + [1.5] * 3)), LOOP) for a, b in pairs]
     solver = PoseGraphSolver(CONFIG)
     solver.update(change(dict(enumerate(guess)), odometry, loops))
-    theirs = solve(guess, odometry, loops, [0], CONFIG)
+    theirs = solve(guess, odometry, loops, [0])
     assert rms(solver.solve(0).poses, truth) < 1.05 * rms(theirs.poses, truth)
 
 
-def test_grows_step_by_step_to_what_it_would_be_at_once() -> None:
+def test_grows_step_by_step_to_what_it_would_be_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also a pose and a loop that come and go leave nothing behind."""
     room = simulate(300, 3, 2)
     solver = PoseGraphSolver(CONFIG)
@@ -116,15 +114,17 @@ def test_grows_step_by_step_to_what_it_would_be_at_once() -> None:
     solver.solve(0)
     solver.update(GraphUpdate.from_edges({}, removed_poses=[999]))
     solution = solver.solve(0)
-    at_once = loaded(room, EXACT).solve(0)
+    make_exact(monkeypatch)
+    at_once = loaded(room).solve(0)
     off = np.linalg.norm((solution.poses - at_once.poses)[:, :3, 3], axis=1)
     assert np.median(off) < 0.001 and off.max() < 0.003
     assert len(solver) == 300
 
 
-def test_a_loop_taken_back_is_forgotten() -> None:
+def test_a_loop_taken_back_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_exact(monkeypatch)
     room = simulate(150, 3, 3)
-    solver = loaded(room, EXACT)
+    solver = loaded(room)
     before = solver.solve(0)
     solver.update(change({}, [], [PoseEdge(3, 140, np.eye(4), LOOP)], first=10**7))
     assert 10**7 + 10**6 in solver.solve(0).loop_ids
@@ -161,7 +161,7 @@ def test_covariances_are_never_too_small_and_hardly_too_large() -> None:
     wanted = [297, 298, 299, 150, 0]
     solver = loaded(room)
     claimed = solver.solve(0, wanted).covariances
-    exact = solve(room.guess, room.chain, room.closures, [0], CONFIG, wanted).covariances
+    exact = solve(room.guess, room.chain, room.closures, [0], wanted).covariances
     assert np.array_equal(claimed[-1], np.zeros((6, 6)))
     for ours, theirs in zip(claimed[:-1], exact, strict=False):
         root = np.linalg.inv(np.linalg.cholesky(theirs))
@@ -175,7 +175,7 @@ def test_covariance_is_consistent() -> None:
     nees = []
     for seed in range(40):
         room = simulate(60, 2, 100 + seed)
-        solution = loaded(room, replace(CONFIG, cauchy=1e6)).solve(0, [58])
+        solution = loaded(room, GraphConfig(cauchy=1e6)).solve(0, [58])
         xi = se3.log(se3.inverse(solution.poses[58]) @ room.truth[58])
         nees.append(xi @ np.linalg.solve(solution.covariances[0], xi))
     assert 3.5 < np.mean(nees) < 7.2
@@ -278,15 +278,16 @@ def test_a_change_pickles_quickly() -> None:
     assert np.median(times) < 0.003
 
 
-def test_a_straight_chain_with_one_loop_in_closed_form() -> None:
+def test_a_straight_chain_with_one_loop_in_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
     """Along x only: n equal odometry steps and one loop over all of them. The gap is shared out in
     proportion to variance: every step gets gap * s2 / (n s2 + l2)."""
+    make_exact(monkeypatch)
     n, s2, l2, gap = 10, 0.01**2, 0.02**2, 0.05
     step = se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
     edges = [(i, PoseEdge(i, i + 1, step, s2 * np.eye(6)), False) for i in range(n)]
     loop = PoseEdge(0, n, se3.exp(np.array([0, 0, 0, n + gap, 0, 0])), l2 * np.eye(6))
     start = {i: se3.exp(np.array([0, 0, 0, float(i), 0, 0])) for i in range(n + 1)}
-    solver = PoseGraphSolver(replace(EXACT, cauchy=1e6))
+    solver = PoseGraphSolver(GraphConfig(cauchy=1e6))
     solver.update(GraphUpdate.from_edges(start, [*edges, (n, loop, True)]))
     solved = solver.solve(0, [n])
     assert solved.poses[:, 0, 3] == pytest.approx(np.arange(n + 1) * (1 + gap * s2 / (n * s2 + l2)), abs=1e-7)

@@ -305,7 +305,7 @@ def test_headsets_and_who_needs_the_same_go_first_unless_all_are_alike(policy, n
     for _ in range(6):
         query = mapper.next_lookup()
         mapper.finish_step(query, [], 1.0)
-        looked += mapper._atlas.key(query.node_id).agent[0]
+        looked += mapper.atlas.key(query.node_id).agent[0]
     assert looked == turns
 
 

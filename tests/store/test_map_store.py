@@ -53,7 +53,7 @@ def files(path):
 def test_a_new_file_is_empty(path):
     with MapStore.open(path) as store:
         assert told(store.load()) == told(type(store.load())())
-        assert (store.writable, store.read_only_reason, store.schema) == (True, "", schema.SCHEMA)
+        assert (store.writable, store.read_only_reason) == (True, "")
     assert is_map(path)
     assert files(path) == ["room.sqlite", "room.sqlite.lock"]
 
@@ -243,63 +243,21 @@ def test_what_is_no_map_is_left_as_it_is(tmp_path):
 # ---------------------------------------------------------------- schemas
 
 
-def schema_said(path, number):
-    """As a SHARE of schema `number` would have left it."""
+@pytest.mark.parametrize(("number", "age"), [(schema.SCHEMA + 1, "a newer"), (schema.SCHEMA - 1, "an older")])
+def test_a_map_of_another_schema_is_refused_and_left_unchanged(path, number, age):
+    with MapStore.open(path) as store:
+        store.write(small_map())
     connection = sqlite3.connect(path, isolation_level=None)
     connection.execute("DELETE FROM about WHERE name = 'schema'")
     insert(connection, "about", ("schema", str(number)))
-    if number < schema.SCHEMA:  # made up: loops did not count their inliers
-        connection.execute("ALTER TABLE loop RENAME COLUMN inliers TO matches")
     connection.close()
-
-
-OLD = schema.SCHEMA - 1
-STEP = ("ALTER TABLE loop RENAME COLUMN matches TO inliers",)
-
-
-def test_a_newer_schema_is_left_alone(path):
-    with MapStore.open(path) as store:
-        store.write(small_map())
-    schema_said(path, schema.SCHEMA + 1)
     before = path.read_bytes()
-    ours = schema.SCHEMA
-    with pytest.raises(UsageError, match=rf"newer SHARE \(schema {ours + 1}, this one reads {ours}\)"):
-        MapStore.open(path)
+    line = rf"made by {age} SHARE \(schema {number}, this one reads {schema.SCHEMA}\); use that SHARE"
+    for opening in (MapStore.open, MapStore.read):
+        with pytest.raises(UsageError, match=line):
+            opening(path)
     assert path.read_bytes() == before
-
-
-def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch):
-    with MapStore.open(path) as store:
-        store.write(small_map())
-        whole = told(store.load())
-    schema_said(path, OLD)
-    before = path.read_bytes()
-    with pytest.raises(UsageError, match=f"has schema {OLD}, which cannot be migrated to {schema.SCHEMA}"):
-        MapStore.open(path)
-    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
-    with MapStore.read(path) as reader:
-        assert reader.schema == OLD
-        assert told(reader.load()) == whole
-    assert path.read_bytes() == before
-    assert told(again(path)) == whole
-    assert path.with_name(f"room.sqlite.schema-{OLD}").read_bytes() == before
-    assert told(again(path)) == whole
-    assert [name for name in files(path) if "damaged" in name] == []
-
-
-def test_a_step_that_fails_leaves_the_old_file(path, monkeypatch):
-    with MapStore.open(path) as store:
-        store.write(small_map())
-    schema_said(path, OLD)
-    before = path.read_bytes()
-    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
-    with pytest.raises(
-        StoreError, match=f"no such table: nonsense; it has schema {OLD}: use the SHARE that made it"
-    ):
-        MapStore.open(path)
-    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
-    assert len(again(path).keyframes) == 40
-    assert path.with_name(f"room.sqlite.schema-{OLD}").read_bytes() == before
+    assert files(path) == ["room.sqlite", "room.sqlite.lock"]
 
 
 # ---------------------------------------------------------------- the disk

@@ -34,7 +34,7 @@ from helpers.rooms import Room, simulate  # noqa: E402
 from share.config import GraphConfig  # noqa: E402
 from share.mapping.graph.covariance import CovariancePaths  # noqa: E402
 from share.mapping.graph.solver import PoseGraphSolver  # noqa: E402
-from share.mapping.graph.updates import GraphSolution, GraphUpdate  # noqa: E402
+from share.mapping.graph.solver import GraphSolution, GraphUpdate  # noqa: E402
 from share.types import F64  # noqa: E402
 
 CONFIG = GraphConfig()
