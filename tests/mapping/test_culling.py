@@ -14,7 +14,7 @@ from share.mapping.atlas import Atlas
 from share.mapping.culling import fair_quotas
 from share.mapping.loop_consistency import articulation_segments
 from share.mapping.loops import KeyframeKey
-from share.mapping.segments import AgentRuns
+from share.mapping.segments import MIN_LOOP_GAP, AgentRuns
 from share.types import F64, Keyframe
 
 CONFIG = MergeConfig()
@@ -179,7 +179,7 @@ def test_who_is_away_and_comes_back_finds_its_newest_keyframes() -> None:
     atlas.set_present("ann-1", False)
     thin(atlas, 20)
     left = {key.id for key in atlas.all_poses().keys}
-    assert left >= {0, *range(60 - CONFIG.min_loop_gap, 60)}
+    assert left >= {0, *range(60 - MIN_LOOP_GAP, 60)}
 
 
 def test_with_more_names_than_room_those_heard_of_longest_ago_go_altogether() -> None:

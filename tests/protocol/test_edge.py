@@ -15,6 +15,7 @@ from share.config import AgentQoe, Config, ControlConfig, EdgeConfig, GraphConfi
 from share.geometry import se3
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
+from share.mapping.query_queue import ENOUGH_VERIFIED
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.steps import QueryStep, SolveStep, VerifyStep
 from share.protocol import agent_events as ev
@@ -330,7 +331,7 @@ def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
         while isinstance(verify := mapper.next_lookup(), VerifyStep):
             tried[waiting, refuse] += 1
             mapper.finish_step(verify, Refusal("not it") if refuse else same, 1.0)
-    assert [tried[0, True], tried[0, False]] == [config.place.candidates, config.place.enough]
+    assert [tried[0, True], tried[0, False]] == [config.place.candidates, ENOUGH_VERIFIED]
     assert [tried[config.edge.hurry_waiting, True], tried[config.edge.hurry_waiting, False]] == [
         config.edge.hurry_candidates,
         1,
