@@ -321,6 +321,10 @@ class MapGraph:
         T_odom_body = self.odometry.nodes[node_id].T_odom_body
         return se3.orthonormal(self.poses[node_id] @ se3.inverse(T_odom_body))
 
+    def place(self, node_id: int) -> tuple[F64, str]:
+        """T_map_odom (4, 4) at this node, and the name of its map."""
+        return self.T_map_odom(node_id), self.map_id(self.odometry.nodes[node_id].segment)
+
     def relative_pose(self, a: int, b: int) -> F64:
         """T_a_b (4, 4) of two nodes of one map."""
         return se3.inverse(self.poses[a]) @ self.poses[b]

@@ -72,11 +72,9 @@ class Mapper:
         self.atlas.add_run(agent, self.agent_name(agent), credential)
 
     def agent_name(self, agent: str) -> str:
-        """Name of the agent whose run it is."""
         return self._hellos[agent].name if agent in self._hellos else agent
 
     def set_present(self, agent: str, is_present: bool) -> None:
-        """Set whether the run's agent is connected."""
         self.atlas.set_present(agent, is_present)
 
     def remove_run(self, agent: str) -> None:
@@ -98,8 +96,10 @@ class Mapper:
         node_id = self.atlas.add_keyframe(agent, keyframe, map_rank(self._config, hello))
         self._views.add(node_id, keyframe, hello.rig)
         self._queries.add(agent, service_kind(self._config, hello), node_id, is_extra)
-        begins_map = keyframe.reference < 0 or (link is not None and link.reference < 0)
-        events = [self._new_map_event(agent, keyframe)] if begins_map else []
+        events = []
+        if keyframe.reference < 0 or (link is not None and link.reference < 0):
+            T_map_odom, map_id = self.atlas.graph.place(node_id)
+            events = [map_assignment(agent, map_id, T_map_odom, keyframe.id)]
         if redundant := self.atlas.culling.next_nodes(self._config.edge.max_keyframes):
             self.remove_keyframes(redundant)
         return events
@@ -127,20 +127,13 @@ class Mapper:
             self.set_present(run.run_key, False)
         references = set[str]() if kept.poses is None else set(kept.poses.map_ids)
         hellos = self._hellos  # a damaged file may lack the run of a segment, never that of a keyframe
-        agents = [name.rpartition("/")[0] for name in kept.segments]
         ranks = [
-            map_rank(self._config, hellos.get(agent), is_reference=name in references)
-            for agent, name in zip(agents, kept.segments, strict=True)
+            map_rank(self._config, hellos.get(name.rpartition("/")[0]), is_reference=name in references)
+            for name in kept.segments
         ]
         for node_id, stored in zip(self.atlas.restore(kept, ranks), kept.keyframes, strict=True):
             self._views.add_restored(node_id, stored.keyframe, hellos[stored.run_key].rig)
-            counters = self._counters.runs[stored.run_key]
-            counters.newest_id = max(counters.newest_id, stored.keyframe.id)
-
-    def _new_map_event(self, agent: str, keyframe: Keyframe) -> MapEvent:
-        T, map_id = self.atlas.T_map_odom(agent), self.atlas.current_map_id(agent)
-        assert T is not None and map_id is not None
-        return map_assignment(agent, map_id, T, keyframe.id)
+            self._counters.runs[stored.run_key].newest_id = stored.keyframe.id
 
     # Steps: what to do next, and what follows from the result
 
@@ -181,10 +174,8 @@ class Mapper:
     def report_failure(self, what: str, error: Exception, agent: str | None = None) -> list[MapEvent]:
         """Count and report an error; the map goes on without the step. agent: the run concerned."""
         self._counters.failed_steps += 1
-        agent = next(iter(self._hellos), None) if agent is None else agent
-        return (
-            [] if agent is None else [MapEvent(agent, "step failed", f"{what}: {describe_exception(error)}")]
-        )
+        agents = list(self._hellos)[:1] if agent is None else [agent]
+        return [MapEvent(run, "step failed", f"{what}: {describe_exception(error)}") for run in agents]
 
     # A keyframe's way through the map
 
@@ -206,7 +197,8 @@ class Mapper:
                 continue  # removed meanwhile
             try:
                 outcome = yield VerifyStep(node_id, views[node_id], candidate, views[candidate], place)
-                events = self._judge_candidate(search, node_id, candidate, outcome)
+                is_kept = {node_id, candidate} <= views.keys()
+                events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
             except Exception as error:  # costs this candidate only
                 events = self.report_failure(VerifyStep.kind, error, agent)
             yield events
@@ -215,8 +207,6 @@ class Mapper:
         self, search: CandidateSearch, node_id: int, candidate: int, outcome: Verification | Refusal
     ) -> list[MapEvent]:
         """Decide on a verified candidate: count, gate, compare the agents, check the loop and add it."""
-        if not {node_id, candidate} <= self._views.by_node.keys():
-            return []  # removed meanwhile
         atlas, a, b = self.atlas, self.atlas.key(candidate), self.atlas.key(node_id)
         counters = self._counters.runs[b.agent]
         counters.loops_tried += 1
@@ -232,7 +222,9 @@ class Mapper:
         if objection := self._merge_gate.skip_reason(volume, atlas.map_id(a) == atlas.map_id(b)):
             counters.merges["skipped"] += 1
             return [MapEvent(b.agent, "merge skipped", f"loop {loop}: {objection}")]
-        events = self._quarantine_events(atlas.quarantine.add_loop(loop, outcome.depth_scale))
+        change = atlas.quarantine.add_loop(loop, outcome.depth_scale)
+        self._record_loops(change)
+        events = [MapEvent(agent, *standing.event) for agent, standing in change.standings.items()]
         decision = atlas.propose(atlas.quarantine.rescale_loop(loop, outcome.depth_scale))
         self._record_loops(decision)
         reason = f"{decision.reason} ({outcome.reason})"
@@ -243,10 +235,6 @@ class Mapper:
         undone = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
         accepted = MapEvent(b.agent, "maps merged" if decision.joined_maps else "loop accepted", reason)
         return [*events, *undone, accepted]
-
-    def _quarantine_events(self, change: QuarantineChange) -> list[MapEvent]:
-        self._record_loops(change)
-        return [MapEvent(agent, *standing.event) for agent, standing in change.standings.items()]
 
     def _review_joins(self, node_id: int) -> list[MapEvent]:
         """Undo a recent merge that the view of a new keyframe contradicts."""
@@ -276,7 +264,6 @@ class Mapper:
     # Results
 
     def _record_loops(self, outcome: LoopDecision | AppliedSolution | QuarantineChange) -> None:
-        """Record accepted and removed loops as changes to store."""
         self._changes += [RemoveLoops(loop.a, loop.b) for loop in outcome.dropped]
         self._changes += [SaveLoop(loop) for loop in outcome.added]
 
@@ -291,7 +278,6 @@ class Mapper:
         return empty_runs
 
     def current_poses(self) -> SavePoses:
-        """Return the current poses of all keyframes."""
         return self.atlas.all_poses()
 
     def report(self) -> dict[str, Any]:
