@@ -60,7 +60,7 @@ def with_a_wrong_one():
     return town
 
 
-def test_who_is_restarted_before_it_is_found_out_is_found_out_by_all_its_runs():
+def test_loops_of_all_runs_of_a_name_count_as_those_of_one_agent():
     """Two loops with each of two others in each run: never enough of one run."""
     town = Town()
     for run in ("ann-1", "bob-1"):
@@ -80,7 +80,7 @@ def test_who_is_restarted_before_it_is_found_out_is_found_out_by_all_its_runs():
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
-def test_a_run_of_a_name_that_was_set_apart_is_compared_before_it_comes_in(scale):
+def test_a_new_run_of_a_quarantined_name_is_compared_before_it_joins(scale):
     town = with_a_wrong_one()
     assert town.agreement.standing("eve-1").state == "set apart"
     town.enter("eve-2")
@@ -102,7 +102,7 @@ def test_a_run_of_a_name_that_was_set_apart_is_compared_before_it_comes_in(scale
         assert town.agreement.separation_reason(["ann-1"], ["eve-2"])
 
 
-def test_who_was_set_apart_before_is_wrong_again_where_only_one_can_say_so():
+def test_of_two_that_disagree_the_one_with_a_quarantined_run_is_quarantined():
     town = with_a_wrong_one()
     town.enter("eve-2")
     town.meet("bob-1", "eve-2", 1.05, 5)
@@ -110,7 +110,7 @@ def test_who_was_set_apart_before_is_wrong_again_where_only_one_can_say_so():
     assert town.agreement.standing("bob-1").state == "agrees"
 
 
-def test_many_runs_of_one_name_are_one_voice():
+def test_runs_of_one_name_have_one_vote():
     town = Town()
     town.enter("ann-1")
     for n in range(1, 5):
@@ -120,7 +120,7 @@ def test_many_runs_of_one_name_are_one_voice():
     assert not town.agreement.quarantined
 
 
-def test_what_is_known_of_a_names_scale_holds_for_its_next_run():
+def test_a_new_run_of_a_name_inherits_its_scale():
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
         town.enter(run)
@@ -132,7 +132,7 @@ def test_what_is_known_of_a_names_scale_holds_for_its_next_run():
     assert town.agreement.log_scale("eve-2") == pytest.approx(np.log(0.99), abs=0.004)
 
 
-def test_who_turns_bad_is_found_out_by_its_newest_loops():
+def test_an_agent_that_becomes_wrong_is_detected_by_its_newest_loops():
     """After thirty with each other that were good; it took as many bad ones."""
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
@@ -150,7 +150,7 @@ def test_who_turns_bad_is_found_out_by_its_newest_loops():
     assert not town.agreement.separation_reason(["ann-1"], ["bob-1"])
 
 
-def test_runs_of_an_earlier_life_that_were_outside_are_a_subject_of_their_own():
+def test_restored_runs_outside_the_largest_map_are_an_unverified_identity():
     subjects = AgentIdentities()
     for run, name in (("eve-1", "eve"), ("eve-2", "eve"), ("ann-1", "ann"), ("eve-3", "eve")):
         subjects.add_run(run, name, ())
@@ -162,7 +162,7 @@ def test_runs_of_an_earlier_life_that_were_outside_are_a_subject_of_their_own():
     assert subjects.identity("eve-4") in subjects.unverified
 
 
-def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
+def test_loops_of_an_unverified_run_are_not_accepted_before_it_is_compared():
     """Through the atlas: what the newest run of a name that was set apart says moves nobody."""
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.3)
     first, second = Walker("eve-1", 3, phase=0.7), Walker("eve-2", 4, phase=0.7)
@@ -183,7 +183,7 @@ def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
     assert all("an earlier run of its name" in decision.reason for decision in said)
 
 
-def test_who_is_set_apart_is_no_measure_of_the_others_scale():
+def test_a_quarantined_agent_does_not_affect_the_scales_of_others():
     """Ann and bob have met only eve, whose depths became wrong: nothing says how theirs compare."""
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
@@ -195,7 +195,7 @@ def test_who_is_set_apart_is_no_measure_of_the_others_scale():
     assert town.agreement.log_scale("ann-1") == town.agreement.log_scale("bob-1") == 0.0
 
 
-def test_a_run_that_is_forgotten_takes_nothing_of_its_name_with_it():
+def test_removing_one_run_keeps_what_is_known_of_its_name():
     subjects = AgentIdentities()
     for number in range(1, 4):
         subjects.add_run(f"eve-{number}", "eve", ())
@@ -208,7 +208,7 @@ def test_a_run_that_is_forgotten_takes_nothing_of_its_name_with_it():
     assert (subjects.identity("eve-5"), subjects.unverified) == ("eve-5", set())
 
 
-def test_what_is_held_against_a_name_outlives_its_runs():
+def test_suspicion_of_a_name_outlives_its_runs():
     subjects = AgentIdentities()
     subjects.add_run("eve-1", "eve", ())
     assert subjects.remove_run("eve-1", {"eve-1"}, ()) == "eve-1"
@@ -226,7 +226,7 @@ def test_what_is_held_against_a_name_outlives_its_runs():
     assert not subjects.unverified
 
 
-def test_runs_of_a_suspect_without_end_leave_nothing_but_the_suspicion():
+def test_any_number_of_removed_runs_leaves_only_the_suspicion():
     """Eve met ann in each of her runs, and disagreed; each is forgotten with its keyframes."""
     ann, atlas, rng = Walker("ann", 1, n=20), Atlas(MergeConfig()), np.random.default_rng(0)
     atlas.add_run("ann", "ann")
@@ -270,7 +270,7 @@ def test_a_disagreement_outlives_the_keyframes_that_showed_it():
     assert sum(len(met.loops) for met in pair.by_segments.values()) <= 32
 
 
-def test_what_loops_said_of_a_stretch_goes_with_it():
+def test_the_covariance_evidence_of_a_segment_is_removed_with_it():
     ann, bob = Walker("ann", 1), Walker("bob-1", 2, phase=0.3)
     atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
     for walker in (ann, bob):
@@ -291,7 +291,7 @@ def test_what_loops_said_of_a_stretch_goes_with_it():
     assert atlas.quarantine.agreement.standing("ann").state == "agrees"
 
 
-def test_who_is_doubted_since_the_edge_was_started_again_is_proven_by_another_who_is():
+def test_two_unverified_agents_of_a_restored_map_verify_each_other():
     """Both were alone in their maps, and now meet: there is nobody else to compare them with."""
     town = Town()
     for run in ("ann-1", "bob-1"):
@@ -304,7 +304,7 @@ def test_who_is_doubted_since_the_edge_was_started_again_is_proven_by_another_wh
     assert not town.agreement.unverified_reason(["ann-2"], ["bob-2"])
 
 
-def test_names_of_one_key_have_one_voice():
+def test_names_of_one_key_have_one_vote():
     """Eve speaks for three, whose metres are too long; ann and bob agree."""
     for voice, apart in (("eve", {"e1-1", "e2-1", "e3-1"}), ("", None)):
         town = Town()
@@ -339,21 +339,21 @@ def quarrel(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
 @pytest.mark.parametrize(
     "known", [{}, {"ann": "A"}, {"ann": "A", "e1": "E"}, {"e1": "E"}, {"ann": "A", "e1": "E", "e2": "E"}]
 )
-def test_voices_that_are_not_known_may_be_one_and_the_same(known):
+def test_unknown_credentials_may_all_be_the_same(known):
     """Ann stands against one key, also while it is not known yet that it is one."""
     town = quarrel(known)
     assert not town.agreement.quarantined
     assert town.agreement.standing("ann-1").state == "disputed"
 
 
-def test_who_is_outvoted_whoever_the_unknown_are_is_set_apart_at_once():
+def test_an_agent_outvoted_under_every_hypothesis_is_quarantined_at_once():
     known = {"ann": "A", "bob": "B", "e1": "E", "e2": "E"}
     assert quarrel(known, ("ann", "bob", "cat")).agreement.quarantined == {"e1-1", "e2-1"}
     town = quarrel({"e1": "E"}, ("ann", "bob"))  # who may both be Eve
     assert not town.agreement.quarantined
 
 
-def test_a_voice_that_becomes_known_counts_from_then_on():
+def test_a_credential_counts_from_when_it_is_known():
     town = quarrel({"ann": "A"})
     town.agreement.add_run("e1-1", "e1", "E")
     town.agreement.add_run("e2-1", "e2", "F")
@@ -387,7 +387,7 @@ def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
     return atlas, loops
 
 
-def test_loops_that_were_taken_back_wait_while_anything_forbids_them():
+def test_withdrawn_loops_wait_while_their_agents_are_kept_apart():
     """Bob is not kept apart any more, but has to be compared first."""
     atlas, loops = pair_that_met()
     parting, unproven = atlas.quarantine, atlas.quarantine.agreement.identities.unverified
@@ -402,7 +402,7 @@ def test_loops_that_were_taken_back_wait_while_anything_forbids_them():
     assert not parting._withdrawn
 
 
-def test_loops_that_were_taken_back_are_judged_once_who_was_to_be_compared_is():
+def test_withdrawn_loops_are_decided_once_their_agents_are_compared():
     atlas, loops = pair_that_met()
     atlas.quarantine.agreement.identities.unverified.add("bob")
     said = [atlas.quarantine.add_loop(loop, DepthScale(0.0, 0.005)) for loop in loops]
@@ -411,7 +411,7 @@ def test_loops_that_were_taken_back_are_judged_once_who_was_to_be_compared_is():
     assert not any(parted.standings for parted in said)
 
 
-def test_a_loop_that_is_believed_again_and_undone_at_once_is_not_said_to_be_tied():
+def test_a_loop_added_again_and_undone_at_once_is_not_reported_as_added():
     def decide(loop: Loop) -> LoopDecision:
         return LoopDecision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
 
@@ -421,7 +421,7 @@ def test_a_loop_that_is_believed_again_and_undone_at_once_is_not_said_to_be_tied
     assert undone == (loops[0],)
 
 
-def test_what_is_put_right_is_so_in_one_order():
+def test_scales_are_applied_in_the_order_of_names():
     """Whatever the hashes of their names are."""
     atlas, done = Atlas(MergeConfig()), list[str]()
     names = [f"agent{k}" for k in range(10)]

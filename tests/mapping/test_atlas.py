@@ -51,7 +51,7 @@ def bob() -> Walker:
     return Walker("bob", 2, phase=0.7)
 
 
-def test_every_stretch_is_a_map_until_joined(ann: Walker, bob: Walker) -> None:
+def test_every_segment_is_a_map_until_merged(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     assert atlas.map_sizes() == {"ann/0": 60, "bob/0": 60}
     assert len(atlas) == 120
@@ -60,7 +60,7 @@ def test_every_stretch_is_a_map_until_joined(ann: Walker, bob: Walker) -> None:
     assert atlas.T_map_odom("nobody") is None
 
 
-def test_two_agents_are_joined_to_truth(ann: Walker, bob: Walker) -> None:
+def test_maps_of_two_agents_merge_at_their_true_poses(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     rng = np.random.default_rng(0)
     decisions, applied = [], []
@@ -81,7 +81,7 @@ def test_two_agents_are_joined_to_truth(ann: Walker, bob: Walker) -> None:
     assert after < max(before)
 
 
-def test_the_founders_gauge_never_moves(ann: Walker, bob: Walker) -> None:
+def test_the_gauge_of_the_reference_segment_never_moves(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     rng = np.random.default_rng(0)
     for x in near_loops(bob, ann, rng) + near_loops(ann, ann, rng):
@@ -94,7 +94,7 @@ def test_the_founders_gauge_never_moves(ann: Walker, bob: Walker) -> None:
         assert atlas.map_id(KeyframeKey("ann", 5)) == "ann/0"
 
 
-def test_a_map_that_leads_stays_where_it_is_however_old_the_other_is() -> None:
+def test_the_map_of_lower_rank_stays_however_old_the_other_is() -> None:
     """A robot came first, then two headsets; they join each other, then him."""
     robot, ann, bob = Walker("robot", 1), Walker("ann", 0), Walker("bob", 2)
     atlas, rng = Atlas(CONFIG), np.random.default_rng(0)
@@ -149,7 +149,7 @@ def test_correction_covariance_is_not_too_small() -> None:
     assert 0.8 < np.mean(nees) < 7.2
 
 
-def test_a_wrong_loop_never_joins(ann: Walker, bob: Walker) -> None:
+def test_a_wrong_loop_never_merges_maps(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     rng = np.random.default_rng(0)
     for i in range(6):
@@ -163,7 +163,7 @@ def test_a_wrong_loop_never_joins(ann: Walker, bob: Walker) -> None:
     assert len(tuple(atlas.loop_acceptance.pending)) == 6
 
 
-def test_of_small_maps_fewer_places_are_enough_but_never_one_keyframe() -> None:
+def test_small_maps_need_fewer_places_but_more_than_one_keyframe() -> None:
     """Both have been to two or three places."""
     ann, bob = Walker("ann", 1, 5, turn=0.5), Walker("bob", 2, 5, turn=0.5)
     rng = np.random.default_rng(0)
@@ -174,7 +174,9 @@ def test_of_small_maps_fewer_places_are_enough_but_never_one_keyframe() -> None:
     assert atlas.propose(loop(ann, 1, bob, 2, rng)).joined_maps == ("ann/0", "bob/0")
 
 
-def test_views_from_afar_are_no_witnesses(ann: Walker, bob: Walker, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loops_of_distant_views_do_not_support_a_merge(
+    ann: Walker, bob: Walker, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """They would join, were they believed to have been taken from near."""
     rng = np.random.default_rng(0)
     far = [far_loop(ann, i, bob, i, rng) for i in range(0, 40, 4)]
@@ -185,7 +187,7 @@ def test_views_from_afar_are_no_witnesses(ann: Walker, bob: Walker, monkeypatch:
     assert any(easy.propose(x).accepted for x in far)
 
 
-def test_in_a_map_a_wrong_loop_contradicts_it(ann: Walker) -> None:
+def test_a_wrong_loop_within_a_map_contradicts_it(ann: Walker) -> None:
     atlas = atlas_of(ann)
     rng = np.random.default_rng(0)
     right = near_loops(ann, ann, rng)[0]
@@ -197,14 +199,14 @@ def test_in_a_map_a_wrong_loop_contradicts_it(ann: Walker) -> None:
     assert "have a loop already" in atlas.propose(right.reverse()).reason
 
 
-def test_neighbours_are_odometrys_business(ann: Walker) -> None:
+def test_odometry_neighbours_make_no_loop(ann: Walker) -> None:
     atlas = atlas_of(ann)
     rng = np.random.default_rng(0)
     assert "neighbours by odometry" in atlas.propose(loop(ann, 20, ann, 29, rng)).reason
     assert atlas.propose(loop(ann, 20, ann, 30, rng)).accepted
 
 
-def test_drift_beyond_what_odometry_admits_needs_two_witnesses() -> None:
+def test_drift_beyond_the_covariance_needs_two_consistent_loops() -> None:
     ann = Walker("ann", 3, breaks=())
     bent = [
         replace(k, T_ref_body=k.T_ref_body @ se3.exp(np.array([0, 0, 0.08, 0, 0, 0]))) if k.id == 25 else k
@@ -240,7 +242,7 @@ def test_order_of_arrival_does_not_matter(ann: Walker, bob: Walker) -> None:
         assert np.abs(other - results[0]).max() < 2e-3
 
 
-def test_three_agents_find_together(ann: Walker, bob: Walker) -> None:
+def test_three_maps_merge_into_one(ann: Walker, bob: Walker) -> None:
     cyd = Walker("cyd", 5, phase=1.4)
     atlas = atlas_of(ann, bob, cyd)
     rng = np.random.default_rng(0)
@@ -256,7 +258,7 @@ def test_three_agents_find_together(ann: Walker, bob: Walker) -> None:
     assert error(poses(atlas, ann, bob, cyd), truth(ann, bob, cyd)) < 0.08
 
 
-def test_a_new_stretch_is_a_map_of_its_own_and_rejoins() -> None:
+def test_a_new_segment_is_a_map_of_its_own_and_merges_again() -> None:
     ann = Walker("ann", 1, breaks=(40,))
     atlas = atlas_of(ann)
     assert atlas.map_sizes() == {"ann/0": 40, "ann/1": 20}
@@ -271,7 +273,7 @@ def test_a_new_stretch_is_a_map_of_its_own_and_rejoins() -> None:
     assert error(poses(atlas, ann), ann.truth) < 0.06
 
 
-def test_keyframes_that_came_while_solving_follow(ann: Walker, bob: Walker) -> None:
+def test_keyframes_that_arrive_while_solving_follow_the_solution(ann: Walker, bob: Walker) -> None:
     rng = np.random.default_rng(0)
     late = 45
     atlas = Atlas(CONFIG)
@@ -292,7 +294,7 @@ def test_keyframes_that_came_while_solving_follow(ann: Walker, bob: Walker) -> N
     assert applied.corrections["bob"].T_map_odom == pytest.approx(atlas.T_map_odom("bob"), abs=1e-9)
 
 
-def test_a_solution_of_a_map_that_was_joined_meanwhile_is_left_aside(ann: Walker, bob: Walker) -> None:
+def test_a_solution_of_a_map_that_was_merged_meanwhile_is_discarded(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     rng = np.random.default_rng(0)
     for x in near_loops(bob, bob, rng):
@@ -329,7 +331,7 @@ def twin_loops(ann: Walker, bob: Walker, count: int, found: float = 0.46) -> lis
     return out
 
 
-def test_a_false_join_is_taken_out_once_better_evidence_is_there(ann: Walker, bob: Walker) -> None:
+def test_a_false_merge_is_undone_by_better_evidence(ann: Walker, bob: Walker) -> None:
     """False loops at many places that tell one story do join: no geometry can tell. What comes later can."""
     atlas = atlas_of(ann, bob)
     false = twin_loops(ann, bob, 5)
@@ -354,7 +356,7 @@ def test_a_false_join_is_taken_out_once_better_evidence_is_there(ann: Walker, bo
     assert error(poses(atlas, ann, bob), truth(ann, bob)) < 0.06
 
 
-def test_what_stands_is_not_taken_out_by_hardly_more(ann: Walker, bob: Walker) -> None:
+def test_slightly_more_contradicting_weight_does_not_undo_a_merge(ann: Walker, bob: Walker) -> None:
     """Four places against five that weigh nearly as much."""
     atlas = atlas_of(ann, bob)
     for x in twin_loops(ann, bob, 5):
@@ -366,7 +368,7 @@ def test_what_stands_is_not_taken_out_by_hardly_more(ann: Walker, bob: Walker) -
     assert not fourth.accepted
 
 
-def test_copies_match_worse_and_do_not_outvote_the_truth(ann: Walker, bob: Walker) -> None:
+def test_loops_of_copies_do_not_outweigh_true_loops(ann: Walker, bob: Walker) -> None:
     rng = np.random.default_rng(0)
     for found, overthrown in ((0.4, False), (0.7, True)):  # the second as a check that they could
         atlas = atlas_of(ann, bob)
@@ -378,7 +380,7 @@ def test_copies_match_worse_and_do_not_outvote_the_truth(ann: Walker, bob: Walke
         assert (error(poses(atlas, ann, bob), truth(ann, bob)) < 0.08) != overthrown
 
 
-def test_two_stories_of_like_weight_join_nothing(ann: Walker, bob: Walker) -> None:
+def test_two_hypotheses_of_similar_weight_block_the_merge(ann: Walker, bob: Walker) -> None:
     true = near_loops(ann, bob, np.random.default_rng(0))[:5]
     for found, joined in ((0.45, False), (0.3, True)):
         atlas = atlas_of(ann, bob)
@@ -389,7 +391,7 @@ def test_two_stories_of_like_weight_join_nothing(ann: Walker, bob: Walker) -> No
         assert joined or "a competing hypothesis has 4 places" in decisions[-1].reason
 
 
-def test_views_that_lack_what_both_should_show_join_nothing(ann: Walker, bob: Walker) -> None:
+def test_loops_with_a_low_found_share_merge_nothing(ann: Walker, bob: Walker) -> None:
     true = near_loops(ann, bob, np.random.default_rng(0))
     for found, joined in (
         (loop_acceptance.JOIN_FOUND - 0.01, False),
@@ -414,7 +416,7 @@ def test_many_views_of_one_spot_are_one_place(ann: Walker, bob: Walker) -> None:
     assert all("2 of 5" in d.reason or "1 of 5" in d.reason for d in decisions)
 
 
-def test_what_cannot_be_is_refused_by_name(ann: Walker) -> None:
+def test_invalid_keyframes_loops_and_maps_are_refused_by_name(ann: Walker) -> None:
     atlas = atlas_of(ann)
     with pytest.raises(ValueError, match="ann:3 was added before"):
         atlas.add_keyframe("ann", ann.keyframes[3])
@@ -426,7 +428,7 @@ def test_what_cannot_be_is_refused_by_name(ann: Walker) -> None:
         atlas.solving.make_job("zoe/0")
 
 
-def test_a_loop_that_the_solved_map_speaks_against_is_dropped(
+def test_an_outlier_loop_is_dropped_after_the_solution(
     ann: Walker, bob: Walker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop_acceptance, "AGREE_CHI2", 1e9)
@@ -442,7 +444,7 @@ def test_a_loop_that_the_solved_map_speaks_against_is_dropped(
     assert error(poses(atlas, ann, bob), truth(ann, bob)) < 0.06
 
 
-def test_without_its_loops_a_join_is_undone(ann: Walker, bob: Walker) -> None:
+def test_without_its_loops_a_merge_is_undone(ann: Walker, bob: Walker) -> None:
     """As if the solver had found every loop between the two at odds with the map."""
     atlas = atlas_of(ann, bob)
     rng = np.random.default_rng(0)
@@ -458,7 +460,7 @@ def test_without_its_loops_a_join_is_undone(ann: Walker, bob: Walker) -> None:
     assert not atlas.propose(near_loops(ann, bob, rng)[0]).accepted
 
 
-def test_how_surely_somebody_is_known_is_reckoned_for_who_is_answered(ann: Walker, bob: Walker) -> None:
+def test_covariances_are_requested_for_agents_that_are_answered(ann: Walker, bob: Walker) -> None:
     """For others what they were told stays, until they are in another map."""
     atlas = atlas_of(ann, bob)
     loops = near_loops(ann, bob, np.random.default_rng(0))

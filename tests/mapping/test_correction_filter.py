@@ -22,7 +22,7 @@ def is_sent(publisher: CorrectionPublisher, agent: str, correction: Correction) 
     return [event.correction for event in events] == [correction]
 
 
-def test_what_moves_nobody_is_not_sent() -> None:
+def test_corrections_that_move_odom_unnoticeably_are_not_sent() -> None:
     concern = CorrectionPublisher()
     assert is_sent(concern, "ann", correction())
     assert not is_sent(concern, "ann", correction(shift_m=0.0009))
@@ -30,7 +30,7 @@ def test_what_moves_nobody_is_not_sent() -> None:
     assert is_sent(concern, "bob", correction())
 
 
-def test_small_steps_add_up() -> None:
+def test_small_changes_add_up() -> None:
     concern = CorrectionPublisher()
     sent = [is_sent(concern, "ann", correction(shift_m=0.0004 * k)) for k in range(7)]
     assert sent == [True, False, False, True, False, False, True]

@@ -39,7 +39,7 @@ def views(log: float, rng) -> tuple:
 
 
 @pytest.mark.parametrize("log", [-0.03, -0.01, 0.01, 0.03])
-def test_a_pose_leans_as_depths_disagree(log):
+def test_the_pose_sensitivity_is_that_of_a_depth_scale(log):
     y_q, y_c = views(log, np.random.default_rng(1))
     fine = refine_pose(T_C_Q, y_q, y_c, NOISE, NOISE, 11.3)
     found = relative_depth_scale(fine.T, y_q, y_c, NOISE, NOISE, 11.3)
@@ -71,7 +71,7 @@ def met(scales: dict[str, float], rounds: int = 40) -> AgentAgreement:
 
 
 @pytest.mark.parametrize("scale", [0.99, 0.994, 1.007, 1.012])
-def test_what_does_no_harm_is_measured_against_the_others(scale):
+def test_harmless_scales_are_estimated_relative_to_the_others(scale):
     agreement = met({"ann": 1.0, "bob": 1.0, "eve": scale})
     assert not agreement.quarantined
     assert agreement.log_scales["eve"] == pytest.approx(np.log(scale), abs=0.0025)
@@ -79,7 +79,7 @@ def test_what_does_no_harm_is_measured_against_the_others(scale):
     assert abs(agreement.log_scales.get("ann", 0.0)) < 0.0025 > abs(agreement.log_scales.get("bob", 0.0))
 
 
-def test_of_who_is_set_apart_nothing_is_put_right_and_of_honest_ones_next_to_nothing():
+def test_scales_of_quarantined_agents_are_not_corrected_and_those_of_correct_ones_hardly():
     agreement = met({"ann": 1.0, "bob": 1.0, "eve": 1.04})
     assert agreement.quarantined == {"eve"}
     assert agreement.log_scales.get("eve", 0.0) == 0.0
@@ -87,7 +87,7 @@ def test_of_who_is_set_apart_nothing_is_put_right_and_of_honest_ones_next_to_not
     assert all(abs(log) < 0.002 for log in honest.log_scales.values())
 
 
-def test_a_chart_is_shortened_and_what_is_kept_of_it_is_not():
+def test_the_graph_is_rescaled_and_stored_links_are_not():
     ann, eve = Walker("ann", 1), Walker("eve", 2, phase=0.7)
     atlas = Atlas(MergeConfig())
     for a, e in zip(ann.keyframes[:30], eve.keyframes[:30], strict=True):
@@ -119,7 +119,7 @@ def test_a_chart_is_shortened_and_what_is_kept_of_it_is_not():
     assert chart.odometry_edge(*last).T_a_b[:3, 3] == pytest.approx(eve.keyframes[30].T_ref_body[:3, 3])
 
 
-def test_loops_are_put_right_too():
+def test_loops_are_rescaled_too():
     ann, eve = Walker("ann", 1), Walker("eve", 2, phase=0.7)
     atlas = Atlas(MergeConfig())
     for walker in (ann, eve):
@@ -142,7 +142,7 @@ def test_loops_are_put_right_too():
 
 
 @pytest.mark.parametrize(("metres", "radians"), [(0.1, 0.0), (1.0, 0.0), (0.3, 0.5)])
-def test_nobody_is_surer_than_a_part_of_his_way(metres, radians):
+def test_sigmas_are_at_least_a_share_of_the_step(metres, radians):
     atlas, step = Atlas(MergeConfig()), se3.exp(np.array([0, 0, radians, metres, 0, 0]))
     atlas.add_keyframe("eve", Keyframe(0, -1, 0, np.eye(4), OWN, np.eye(4), UP, UP_SIGMA, NO_VIEW))
     atlas.add_keyframe("eve", Keyframe(1, 0, 10**8, step, OWN, step, UP, UP_SIGMA, NO_VIEW))
@@ -168,7 +168,7 @@ def again(tied: bool) -> tuple[Atlas, list]:
 
 @pytest.mark.parametrize("tied", [True, False])
 @pytest.mark.parametrize("log", [0.0, 0.05])
-def test_after_a_restart_who_was_not_in_the_common_map_is_compared_before_he_comes_into_it(tied, log):
+def test_after_a_restart_agents_outside_the_common_map_are_compared_before_they_join(tied, log):
     atlas, loops = again(tied)
     assert "the edge has restarted" in atlas.quarantine.agreement.standing("eve").reason
     said = [atlas.propose(loop) for loop in loops[:4]]

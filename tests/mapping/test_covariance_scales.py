@@ -55,18 +55,18 @@ def factors(seed: int, sure: float, rounds: int = 8) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("sure", [3.0, 10.0])
-def test_who_is_too_sure_is_widened_and_nobody_else(sure):
+def test_only_the_overconfident_agent_is_scaled(sure):
     found = np.array([list(factors(seed, sure).values()) for seed in range(2)])
     assert found[:, 2] == pytest.approx(sure**2, rel=0.6)
     assert found[:, :2].max() < 2.5
 
 
-def test_honest_agents_are_not_widened():
+def test_correct_agents_are_not_scaled():
     found = [factors(seed, 1.0, rounds=3) for seed in range(3)]
     assert max(max(one.values()) for one in found) < 1.6
 
 
-def test_few_loops_say_nothing():
+def test_few_loops_change_no_scale():
     sureness = CovarianceScales(CovarianceClaims())
     rng = np.random.default_rng(0)
     x, y = ring(0.0), ring(0.7)
@@ -87,7 +87,7 @@ def claimed(sigmas: dict[str, float]) -> CovarianceClaims:
     return claims
 
 
-def test_who_was_never_met_measures_nobody():
+def test_agents_without_a_common_loop_are_not_compared():
     """Its variances may be anything."""
     claims = claimed({"ann": 1.0})
     for _ in range(10):
@@ -97,7 +97,7 @@ def test_who_was_never_met_measures_nobody():
     assert claims.min_scale("ann") == 100.0
 
 
-def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
+def test_without_evidence_no_agent_counts_as_much_more_certain_than_the_others():
     claims = claimed({"ann": 1.0, "bob": 3.0, "eve": 0.1})
     assert claims.min_scale("ann") == claims.min_scale("bob") == 1.0
     assert claims.min_scale("eve") == pytest.approx(100 / 2.25)
@@ -111,16 +111,16 @@ def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
     assert claims.known_agents == {"bob", "eve"}
 
 
-def test_honest_agents_may_differ():
+def test_small_differences_of_stated_covariances_change_no_scale():
     claims = claimed({"ann": 1.0, "bob": 1.4, "eve": 0.7})
     assert all(claims.min_scale(name) == 1.0 for name in ("ann", "bob", "eve"))
 
 
-def test_who_is_alone_is_measured_by_nobody():
+def test_an_agent_alone_is_not_scaled():
     assert claimed({"eve": 0.01}).min_scale("eve") == 1.0
 
 
-def test_depths_that_are_spread_say_so():
+def test_scattered_depth_scales_have_a_larger_sigma():
     """Each loop says 0.5 %, and they differ by 10: the mean is not known to 0.5."""
     rng = np.random.default_rng(4)
     logs = 0.4 + 0.1 * rng.standard_normal((200, 12))
@@ -129,7 +129,7 @@ def test_depths_that_are_spread_say_so():
     assert 0.6 < np.sqrt((off**2).mean()) < 1.7
 
 
-def test_what_loops_said_is_no_longer_told_once_they_are_left():
+def test_dropped_evidence_no_longer_scales():
     """At once, not with the next step; what eve claims still holds."""
     claimed_only = 100 / 2.25
     for let_go in (lambda s: s.drop_evidence([(0, 1), (1, 2), (2, 3)]), lambda s: s.exclude(["eve"])):
@@ -139,7 +139,7 @@ def test_what_loops_said_is_no_longer_told_once_they_are_left():
         assert sureness.scales["eve"] == pytest.approx(claimed_only, rel=0.01)
 
 
-def test_loops_between_agents_that_disagree_widen_nobody():
+def test_loops_between_agents_that_disagree_scale_no_covariance():
     """Bob's way is a tenth too long, which is no reason to take either for less sure than it says."""
     rng, agreement, widths = np.random.default_rng(1), AgentAgreement(0.015), []
     x, y = ring(0.0), ring(0.7)
@@ -155,7 +155,7 @@ def test_loops_between_agents_that_disagree_widen_nobody():
     assert set(widths) == {(1.0, 1.0)}
 
 
-def test_who_is_just_sure_enough_to_be_widened_is_not_told_so_again_and_again():
+def test_a_scale_near_its_threshold_does_not_toggle():
     """Its variances are 4.5 times below another's, twice the leeway; steps differ in size."""
     rng, sureness, told = np.random.default_rng(0), CovarianceScales(CovarianceClaims()), list[float]()
     sureness.link("ann", "bob")

@@ -46,7 +46,7 @@ def thin(atlas: Atlas, most: int) -> None:
     atlas.remove_keyframes(atlas.culling.choose(len(atlas) - most))
 
 
-def test_who_holds_most_gives() -> None:
+def test_the_name_with_most_keyframes_gives() -> None:
     held = Counter(ann=10, bob=50, eve=100)
     assert fair_quotas(held, held, 30, {}) == Counter(eve=30)
     assert fair_quotas(held, held, 60, {}) == Counter(eve=55, bob=5)
@@ -55,12 +55,12 @@ def test_who_holds_most_gives() -> None:
     assert fair_quotas(held, held, 1000, {}) == held
 
 
-def test_of_those_who_hold_as_much_the_one_heard_of_longest_ago_gives() -> None:
+def test_among_equals_the_name_that_connected_longest_ago_gives() -> None:
     held = Counter(ann=1, bob=1, eve=1)
     assert fair_quotas(held, held, 1, {"eve": 0, "ann": 1, "bob": 2}) == Counter(eve=1)
 
 
-def test_a_run_is_over_when_another_of_its_name_has_come_and_it_is_away() -> None:
+def test_an_absent_run_is_superseded_by_a_newer_one_of_its_name() -> None:
     owners = AgentRuns()
     owners.add("ann-1", "ann")
     owners.set_present("ann-1", False)
@@ -89,11 +89,11 @@ def test_a_run_is_over_when_another_of_its_name_has_come_and_it_is_away() -> Non
         ([(0, 0), (0, 1), (5, 6)], set()),
     ],
 )
-def test_without_what_a_map_falls_apart(bonds: list[tuple[int, int]], expected: set[int]) -> None:
+def test_articulation_segments_disconnect_the_map(bonds: list[tuple[int, int]], expected: set[int]) -> None:
     assert articulation_segments(bonds) == expected
 
 
-def test_any_number_of_small_runs_of_one_name_takes_nothing_of_anothers() -> None:
+def test_many_small_runs_of_one_name_take_no_keyframe_of_others() -> None:
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 50)
     for k in range(40):
@@ -105,7 +105,7 @@ def test_any_number_of_small_runs_of_one_name_takes_nothing_of_anothers() -> Non
             assert len(atlas) == 100
 
 
-def test_they_take_nothing_either_once_they_are_in_its_map() -> None:
+def test_many_small_runs_in_one_map_take_no_keyframe_of_others() -> None:
     ann, atlas, rng = Walker("ann", 1), Atlas(CONFIG), np.random.default_rng(0)
     atlas.add_run("ann", "ann")
     for keyframe in ann.keyframes:
@@ -124,7 +124,7 @@ def test_they_take_nothing_either_once_they_are_in_its_map() -> None:
     assert list(atlas.map_sizes()) == ["ann/0"]
 
 
-def test_nobody_has_more_by_starting_again() -> None:
+def test_a_name_keeps_no_more_by_restarting() -> None:
     """A name with many runs gives as one with a single run does, once it holds as much."""
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 80)
@@ -137,7 +137,7 @@ def test_nobody_has_more_by_starting_again() -> None:
     assert by_name == Counter(ann=50, bob=50, eve=50)
 
 
-def test_what_is_over_goes_first_and_whole() -> None:
+def test_finished_maps_are_removed_first_and_whole() -> None:
     """The smallest first; a run that walks on keeps its own."""
     atlas = Atlas(CONFIG)
     for k, count in enumerate((30, 12, 16)):
@@ -151,7 +151,7 @@ def test_what_is_over_goes_first_and_whole() -> None:
     assert sorted(atlas.map_sizes()) == ["eve-0/0", "eve-9/0"]
 
 
-def test_what_is_alike_goes_before_a_map_that_is_over() -> None:
+def test_redundant_keyframes_are_removed_before_finished_maps() -> None:
     atlas = Atlas(CONFIG)
     walk(atlas, "eve-0", "eve", 20)
     atlas.set_present("eve-0", False)
@@ -160,7 +160,7 @@ def test_what_is_alike_goes_before_a_map_that_is_over() -> None:
     assert held(atlas) == Counter({"eve-0": 20, "eve-1": 20})
 
 
-def test_new_stretches_of_a_present_run_are_no_way_out() -> None:
+def test_new_segments_of_a_present_run_do_not_evade_its_quota() -> None:
     """Each is a map of its own, whose first keyframe held its gauge."""
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 30)
@@ -173,7 +173,7 @@ def test_new_stretches_of_a_present_run_are_no_way_out() -> None:
     assert atlas.T_map_odom("eve-1") is not None
 
 
-def test_who_is_away_and_comes_back_finds_its_newest_keyframes() -> None:
+def test_an_absent_run_keeps_its_newest_keyframes() -> None:
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 60)
     atlas.set_present("ann-1", False)
@@ -182,7 +182,7 @@ def test_who_is_away_and_comes_back_finds_its_newest_keyframes() -> None:
     assert left >= {0, *range(60 - MIN_LOOP_GAP, 60)}
 
 
-def test_with_more_names_than_room_those_heard_of_longest_ago_go_altogether() -> None:
+def test_with_more_names_than_capacity_the_longest_absent_are_removed_whole() -> None:
     atlas = Atlas(CONFIG)
     for k in range(30):
         walk(atlas, f"n{k}-1", f"n{k}", 3)
@@ -192,7 +192,7 @@ def test_with_more_names_than_room_those_heard_of_longest_ago_go_altogether() ->
     assert all(count == 1 for count in held(atlas).values())
 
 
-def test_where_there_is_no_other_way_the_newest_of_those_who_are_away_go_too() -> None:
+def test_newest_keyframes_of_absent_runs_are_removed_where_nothing_else_can_be() -> None:
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 12)
     for k in range(9):
@@ -202,7 +202,7 @@ def test_where_there_is_no_other_way_the_newest_of_those_who_are_away_go_too() -
     assert held(atlas) == Counter({"ann-1": 12, "n0-1": 3} | {f"n{k}-1": 4 for k in range(1, 9)})
 
 
-def test_any_number_of_names_that_come_and_go_leaves_its_share_to_one_that_is_heard() -> None:
+def test_many_absent_names_leave_a_present_one_its_share() -> None:
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 100)
     for k in range(100):
@@ -213,7 +213,7 @@ def test_any_number_of_names_that_come_and_go_leaves_its_share_to_one_that_is_he
     assert held(atlas)["ann-1"] == 60
 
 
-def test_a_stretch_that_holds_two_others_together_is_not_forgotten() -> None:
+def test_a_segment_that_connects_two_others_keeps_a_keyframe() -> None:
     ann, bob = Walker("ann", 1, n=20), Walker("bob", 2, n=20)
     eve, atlas, rng = Walker("eve-0", 3, n=20), Atlas(CONFIG), np.random.default_rng(0)
     for walker, name in ((ann, "ann"), (bob, "bob"), (eve, "eve")):
@@ -234,7 +234,7 @@ def test_a_stretch_that_holds_two_others_together_is_not_forgotten() -> None:
 
 
 @pytest.mark.parametrize("all_gone", [False, True])
-def test_a_run_goes_on_whose_newest_keyframes_were_taken_out(all_gone: bool) -> None:
+def test_a_run_continues_after_its_newest_keyframes_were_removed(all_gone: bool) -> None:
     atlas = Atlas(CONFIG)
     walk(atlas, "eve-0", "eve", 20)
     atlas.set_present("eve-0", False)

@@ -94,7 +94,7 @@ def crowded(store: MapStore, runs: int = 30) -> Life:
     return life
 
 
-def test_runs_without_end_take_nothing_of_anothers_and_leave_nothing(tmp_path: Path) -> None:
+def test_any_number_of_runs_take_no_keyframe_of_others_and_leave_nothing(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = crowded(store)
         report = life.edge.report(life.mapper.report())
@@ -110,7 +110,7 @@ def test_runs_without_end_take_nothing_of_anothers_and_leave_nothing(tmp_path: P
     assert kept.problems == ()
 
 
-def test_the_map_that_is_left_is_found_again(tmp_path: Path) -> None:
+def test_the_remaining_map_is_restored(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = crowded(store)
     with MapStore.open(tmp_path / "room.sqlite") as store:
@@ -122,7 +122,7 @@ def test_the_map_that_is_left_is_found_again(tmp_path: Path) -> None:
         assert len(second.mapper.current_poses().keys) <= 1.05 * MOST
 
 
-def test_a_run_that_was_forgotten_and_comes_back_is_told_to_start_again(tmp_path: Path) -> None:
+def test_a_removed_run_that_returns_is_refused_with_the_remedy(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = crowded(store)
         life.tell(100, hello_of("eve", 100))
@@ -134,7 +134,7 @@ def test_a_run_that_was_forgotten_and_comes_back_is_told_to_start_again(tmp_path
         assert isinstance(life.sent[-1], m.Welcome)
 
 
-def test_a_run_that_comes_back_before_it_is_forgotten_goes_on(tmp_path: Path) -> None:
+def test_a_run_that_returns_before_it_is_removed_continues(tmp_path: Path) -> None:
     """What the mapper said of it is of before."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = crowded(store, runs=6)
@@ -149,7 +149,7 @@ def test_a_run_that_comes_back_before_it_is_forgotten_goes_on(tmp_path: Path) ->
         assert gone in life.mapper.report()["agents"]
 
 
-def test_a_run_that_comes_back_to_less_is_tied_to_what_is_left_in_the_file_too(tmp_path: Path) -> None:
+def test_a_run_that_returns_is_reconnected_in_the_file_too(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = Life(store)
         for name, run_id, count in (("ann", 1, 2), ("eve", 100, 20), ("eve", 101, 1)):
@@ -175,7 +175,7 @@ def test_a_run_that_comes_back_to_less_is_tied_to_what_is_left_in_the_file_too(t
         assert np.allclose(covs[0], covs[1])
 
 
-def test_a_crash_before_a_run_is_forgotten_is_made_up_for(tmp_path: Path) -> None:
+def test_a_run_is_removed_after_a_crash_before_its_removal(tmp_path: Path) -> None:
     """Its keyframes went from the file, and the run itself did not."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = crowded(store, runs=2)
@@ -191,7 +191,7 @@ def test_a_crash_before_a_run_is_forgotten_is_made_up_for(tmp_path: Path) -> Non
         assert len(store.load().runs) == 2
 
 
-def test_a_run_that_such_a_crash_left_begins_anew(tmp_path: Path) -> None:
+def test_a_run_left_by_such_a_crash_begins_a_new_segment(tmp_path: Path) -> None:
     """Its agent is the first to be heard. What it sends is in the file, though its numbers were there."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = crowded(store, runs=1)
@@ -205,7 +205,7 @@ def test_a_run_that_such_a_crash_left_begins_anew(tmp_path: Path) -> None:
         assert [k.keyframe_key.id for k in store.load().keyframes if k.run_key == gone] == [0, 1, 2]
 
 
-def test_runs_that_never_sent_a_keyframe_leave_the_mapper_too(tmp_path: Path) -> None:
+def test_runs_without_a_keyframe_are_removed_from_the_mapper(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = Life(store)
         life.run("ann", 1, 2, stays=True)
@@ -214,7 +214,7 @@ def test_runs_that_never_sent_a_keyframe_leave_the_mapper_too(tmp_path: Path) ->
         assert len(life.mapper.report()["agents"]) <= 258
 
 
-def test_a_restored_run_that_is_emptied_is_forgotten_in_this_life(tmp_path: Path) -> None:
+def test_a_restored_run_without_keyframes_is_removed(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = Life(store)
         life.run("ann", 1, 30, stays=True)
@@ -238,7 +238,7 @@ def emptied(life: Life, run_id: int) -> None:
         life.handle(ed.EdgeTick())
 
 
-def test_a_run_that_came_back_is_its_names_present_one_and_stays_so(tmp_path: Path) -> None:
+def test_a_run_that_returned_stays_the_current_one_of_its_name(tmp_path: Path) -> None:
     """When the later run of the name is forgotten: the edge ended (KeyError)."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = Life(store)
@@ -252,7 +252,7 @@ def test_a_run_that_came_back_is_its_names_present_one_and_stays_so(tmp_path: Pa
     assert report["forgotten_runs"] == 1
 
 
-def test_of_a_name_whose_newest_run_is_forgotten_the_one_before_it_is_shown(tmp_path: Path) -> None:
+def test_the_report_shows_the_run_before_a_removed_one(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = Life(store)
         life.run("ann", 1, 30, stays=True)
@@ -268,7 +268,7 @@ def test_of_a_name_whose_newest_run_is_forgotten_the_one_before_it_is_shown(tmp_
     assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
 
 
-def test_a_run_is_forgotten_only_with_the_last_of_its_stretches(tmp_path: Path) -> None:
+def test_a_run_is_removed_only_with_its_last_segment(tmp_path: Path) -> None:
     """Two stretches, of 9 and 3 keyframes, of which the newer goes first."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = Life(store)
@@ -295,7 +295,7 @@ def test_a_run_is_forgotten_only_with_the_last_of_its_stretches(tmp_path: Path) 
         assert gone not in {run.run_key for run in store.load().runs} | life.mapper.report()["agents"].keys()
 
 
-def test_a_run_that_comes_back_to_nothing_hears_that_it_is_in_a_map_of_its_own(tmp_path: Path) -> None:
+def test_a_run_that_returns_without_keyframes_is_sent_a_map_of_its_own(tmp_path: Path) -> None:
     """It was in ann's; all its keyframes were taken out while it was away."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = Life(store)

@@ -39,7 +39,7 @@ def tilted(room: Room, degrees: float) -> Room:
     return replace(room, guess=about @ tilt @ se3.inverse(about) @ room.guess)
 
 
-def test_slope_and_curvature_are_the_cost_s() -> None:
+def test_gradient_and_hessian_are_those_of_the_cost() -> None:
     rng = np.random.default_rng(3)
     poses = se3.exp(rng.normal(0, 0.4, (5, 6)))
     lines = np.concatenate([rng.normal(0, 1, (4, 3)), np.zeros((1, 3))])
@@ -76,7 +76,7 @@ def spread(poses: F64, truth: F64) -> float:
     return float(np.sqrt(((poses[:, 2, 3] - truth[:, 2, 3]) ** 2).mean()))
 
 
-def test_covariances_say_how_much_surer_it_is() -> None:
+def test_gravity_factors_reduce_the_covariances_consistently() -> None:
     """NEES of a late pose over 40 rooms, by an upper bound: not over 6."""
     nees, surer = [], []
     exact = GraphConfig(cauchy=1e6)
@@ -91,7 +91,7 @@ def test_covariances_say_how_much_surer_it_is() -> None:
     assert np.mean(surer) < 0.6
 
 
-def test_a_pose_that_knows_nothing_of_up_keeps_the_first_to_the_bit() -> None:
+def test_without_gravity_factors_the_anchor_stays_to_the_bit() -> None:
     room = simulate(60, 2, 5)
     found = solved(room, dict.fromkeys(range(60), np.zeros(3)), [58], CONFIG)
     assert np.array_equal(found.poses[0], room.guess[0])

@@ -19,7 +19,7 @@ def filled(n: int, rng: np.random.Generator) -> tuple[PlaceIndex, list[U8]]:
     return index, places
 
 
-def test_finds_the_place_that_half_of_a_view_shows() -> None:
+def test_a_half_overlapping_view_is_found() -> None:
     rng = np.random.default_rng(0)
     index, places = filled(60, rng)
     assert len(index) == 60
@@ -30,7 +30,7 @@ def test_finds_the_place_that_half_of_a_view_shows() -> None:
         assert found[0].score > 5 * found[1].score
 
 
-def test_excluded_ones_stay_out_and_the_limit_holds() -> None:
+def test_exclusions_and_limit_hold() -> None:
     rng = np.random.default_rng(1)
     index, places = filled(20, rng)
     ids = [c.id for c in index.query(places[4], limit=5, exclude=[1004, 1000])]
@@ -38,7 +38,7 @@ def test_excluded_ones_stay_out_and_the_limit_holds() -> None:
     assert not {1004, 1000} & set(ids)
 
 
-def test_what_is_everywhere_says_nothing() -> None:
+def test_descriptors_common_to_all_views_do_not_count() -> None:
     rng = np.random.default_rng(2)
     common = rng.integers(0, 256, (150, 32), np.uint8)
     index = PlaceIndex(seed=0)
@@ -51,7 +51,7 @@ def test_what_is_everywhere_says_nothing() -> None:
 
 
 @pytest.mark.parametrize("n", [37, 64, 300])
-def test_answer_does_not_depend_on_where_a_keyframe_is_written(n: int) -> None:
+def test_the_result_does_not_depend_on_the_page_of_a_keyframe(n: int) -> None:
     """Against words counted by hand; descriptors are random, so that no word is too common to be read."""
     rng = np.random.default_rng(3)
     index, places = filled(n, rng)
@@ -68,7 +68,7 @@ def test_answer_does_not_depend_on_where_a_keyframe_is_written(n: int) -> None:
     assert set(found) == set(np.flatnonzero(np.array(score) > 0))
 
 
-def test_what_was_removed_is_not_found_and_takes_no_memory() -> None:
+def test_removed_keyframes_are_not_found_and_take_no_memory() -> None:
     rng = np.random.default_rng(5)
     index, places = filled(600, rng)
     full = index.nbytes
@@ -87,7 +87,7 @@ def test_what_was_removed_is_not_found_and_takes_no_memory() -> None:
     assert {c.id: c.score for c in index.query(query, 60)} == pytest.approx(again, rel=0.3)
 
 
-def test_removed_ones_can_come_again() -> None:
+def test_removed_keyframes_can_be_added_again() -> None:
     rng = np.random.default_rng(6)
     index, places = filled(130, rng)
     for i in (3, 129):  # on a page, and among the newest
@@ -99,7 +99,7 @@ def test_removed_ones_can_come_again() -> None:
     assert len(index) == 130
 
 
-def test_joined_pages_are_the_page_written_at_once_from_what_lives() -> None:
+def test_merged_pages_equal_one_page_of_the_remaining_keyframes() -> None:
     rng = np.random.default_rng(8)
     vocabulary = 150_000  # joined in several blocks
     common = rng.integers(0, vocabulary, 500, np.uint32)
@@ -114,7 +114,7 @@ def test_joined_pages_are_the_page_written_at_once_from_what_lives() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(whole, name), name, strict=True)
 
 
-def test_words_that_are_everywhere_are_not_read() -> None:
+def test_frequent_words_are_not_read() -> None:
     """Of a view whose every word is in every keyframe, nothing is left to find it by."""
     index = PlaceIndex(seed=0)
     same = np.random.default_rng(7).integers(0, 256, (200, 32), np.uint8)
@@ -142,7 +142,7 @@ def test_empty_index_and_empty_view() -> None:
     assert index.query(np.zeros((5, 32), np.uint8), 5) == []
 
 
-def test_words_of_those_that_are_gone_are_held_no_longer() -> None:
+def test_words_of_removed_keyframes_are_not_counted() -> None:
     """Otherwise they would count as common, and be read no more."""
     rng = np.random.default_rng(8)
     index, _ = filled(320, rng)

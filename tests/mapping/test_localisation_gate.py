@@ -25,20 +25,20 @@ def surety(monkeypatch: pytest.MonkeyPatch) -> LocalisationGate:
     return LocalisationGate(enter_m=0.05)
 
 
-def test_in_his_own_map_everybody_hears_at_once(surety: LocalisationGate) -> None:
+def test_corrections_in_the_own_map_pass_at_once(surety: LocalisationGate) -> None:
     assert surety.update(BOB, ALL, {BOB: known(80.0)}) == {}
     assert surety.published_cov(BOB, BOB) is not None
     assert surety.published_cov(BOB, ANN) is None
 
 
-def test_who_is_surely_known_hears_at_once_and_then_always(surety: LocalisationGate) -> None:
+def test_a_small_sigma_passes_and_then_always(surety: LocalisationGate) -> None:
     assert surety.update(ANN, ALL, {BOB: known(4.9)}) == {}
     assert surety.update(ANN, ALL, {BOB: known(90.0, 2.0)}) == {}
     told = surety.published_cov(BOB, ANN)
     assert told is not None and (told == 2 * np.eye(6)).all()
 
 
-def test_who_is_not_waits_and_his_own_map_goes_on(surety: LocalisationGate) -> None:
+def test_a_large_sigma_waits_in_the_own_map(surety: LocalisationGate) -> None:
     surety.update(BOB, ALL, {BOB: known(0.0)})
     assert surety.update(ANN, ALL, {BOB: known(7.0)}) == {BOB: pytest.approx(0.07)}
     assert surety.published_cov(BOB, ANN) is None
@@ -47,14 +47,14 @@ def test_who_is_not_waits_and_his_own_map_goes_on(surety: LocalisationGate) -> N
     assert surety.published_cov(BOB, ANN) is not None
 
 
-def test_who_were_in_one_map_hear_together(surety: LocalisationGate) -> None:
+def test_segments_of_one_map_enter_together(surety: LocalisationGate) -> None:
     surety.update(BOB, ALL, {BOB: known(0.0), EVE: known(1.0)})
     found = {BOB: known(2.0), EVE: known(7.0), ROBOT: known(1.0)}
     assert surety.update(ANN, ALL, found).keys() == {BOB, EVE}  # the robot comes from a map of its own
     assert surety.update(ANN, ALL, {BOB: known(2.0), EVE: known(3.0)}) == {}
 
 
-def test_nobody_waits_for_more_than_so_many_keyframes_of_his_own(surety: LocalisationGate) -> None:
+def test_the_wait_is_bounded_by_keyframes_with_loops(surety: LocalisationGate) -> None:
     for keyframe in (2, 5, 9):
         for answers in (keyframe, keyframe, None):
             assert surety.update(ANN, ALL, {BOB: known(20.0, answers=answers)})
@@ -62,13 +62,13 @@ def test_nobody_waits_for_more_than_so_many_keyframes_of_his_own(surety: Localis
     assert surety.published_cov(BOB, ANN) is not None
 
 
-def test_another_map_is_waited_for_anew(surety: LocalisationGate) -> None:
+def test_the_wait_restarts_for_another_map(surety: LocalisationGate) -> None:
     for founder in (EVE, ANN):
         for keyframe in range(3):
             assert surety.update(founder, ALL, {ROBOT: known(20.0, answers=keyframe)})
 
 
-def test_a_join_that_was_undone_is_waited_for_anew(surety: LocalisationGate) -> None:
+def test_the_wait_restarts_after_an_undone_merge(surety: LocalisationGate) -> None:
     for keyframe in range(4):
         surety.update(ANN, ALL, {BOB: known(20.0, answers=keyframe)})
     assert surety.published_cov(BOB, ANN) is not None  # his patience was at an end
@@ -77,14 +77,14 @@ def test_a_join_that_was_undone_is_waited_for_anew(surety: LocalisationGate) -> 
     assert surety.update(ANN, ALL, {BOB: known(60.0, answers=9)})
 
 
-def test_who_was_told_of_a_map_that_has_proved_false_hears_of_his_own_again(surety: LocalisationGate) -> None:
+def test_after_a_false_merge_the_own_map_is_published_again(surety: LocalisationGate) -> None:
     surety.update(BOB, [BOB, EVE], {BOB: known(0.0), EVE: known(0.0)})
     surety.update(ANN, ALL, {BOB: known(1.0), EVE: known(1.0)})
     assert not surety.update(BOB, [BOB, EVE], {BOB: known(0.0), EVE: known(30.0)})
     assert surety.published_cov(EVE, BOB) is not None
 
 
-def test_who_was_told_by_an_earlier_life_goes_on_hearing(surety: LocalisationGate) -> None:
+def test_a_restored_segment_stays_published(surety: LocalisationGate) -> None:
     surety.restore(BOB, ANN)
     assert surety.published_cov(BOB, ANN) is None  # how surely is asked
     assert not surety.update(ANN, ALL, {BOB: known(30.0)})
@@ -113,7 +113,7 @@ def apart() -> tuple[Atlas, Walker, Walker]:
     return atlas, ann, bob
 
 
-def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
+def test_a_correction_waits_until_the_pose_in_the_map_is_known() -> None:
     atlas, ann, bob = apart()
     assert atlas.propose(faint(ann, bob, 0)).joined_maps is None
     assert atlas.propose(faint(ann, bob, 1)).joined_maps == ("ann/0", "bob/0")
@@ -127,7 +127,7 @@ def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
     assert not applied.waiting_sigma_m
 
 
-def test_nobody_waits_for_who_is_away_and_he_is_told_once_he_is_back() -> None:
+def test_absent_agents_delay_no_correction_and_get_theirs_when_they_return() -> None:
     """As above; Bob is away while the map comes to know him well."""
     atlas, ann, bob = apart()
     atlas.set_present("bob", False)
@@ -147,7 +147,7 @@ def test_nobody_waits_for_who_is_away_and_he_is_told_once_he_is_back() -> None:
 
 
 @pytest.mark.parametrize("solved_between", [True, False])
-def test_a_join_that_was_undone_and_made_again_is_waited_for_anew(
+def test_the_wait_restarts_when_a_merge_is_undone_and_made_again(
     solved_between: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At once too, as where better evidence overthrows it."""
@@ -162,7 +162,7 @@ def test_a_join_that_was_undone_and_made_again_is_waited_for_anew(
             settle(atlas)
 
 
-def test_of_a_stretch_without_keyframes_nothing_is_remembered() -> None:
+def test_segments_without_keyframes_are_forgotten() -> None:
     surety = LocalisationGate(0.05)
     surety.restore(2, 0)
     surety.forget([2])

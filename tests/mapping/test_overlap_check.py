@@ -80,7 +80,7 @@ def some(*posters: int) -> NDArray[np.bool_]:
     return np.isin(np.arange(40), posters)
 
 
-def test_maps_that_look_alike_where_they_overlap_are_joined_and_stay_so() -> None:
+def test_maps_that_look_alike_where_they_overlap_stay_merged() -> None:
     room = Room((Ring(), Ring()))
     room.walk(0, 20)
     assert room.propose(room.loops(range(0, 20, 5)))[-1].accepted
@@ -91,7 +91,7 @@ def test_maps_that_look_alike_where_they_overlap_are_joined_and_stay_so() -> Non
         room.solve()
 
 
-def test_what_is_recognised_does_not_hide_what_is_gone() -> None:
+def test_recognised_places_do_not_hide_missing_regions() -> None:
     """Loops at the first places only, where both rings are the same; further on they differ."""
     ring = Ring()
     room = Room((ring, ring.copy(some(*range(4, 30)))))
@@ -101,7 +101,7 @@ def test_what_is_recognised_does_not_hide_what_is_gone() -> None:
     assert "of the 20 overlapping views is missing: pending" in decision.reason
 
 
-def test_a_join_is_undone_where_the_copy_ends() -> None:
+def test_a_merge_is_undone_where_the_copy_ends() -> None:
     """They begin where all is the same, and are joined rightly by all that anybody knows."""
     ring = Ring()
     room = Room((ring, ring.copy(some(*range(16, 36)))))
@@ -117,7 +117,7 @@ def test_a_join_is_undone_where_the_copy_ends() -> None:
     assert "views" in again.reason
 
 
-def test_little_overlap_is_too_little_where_more_is_asked_for() -> None:
+def test_overlap_pairs_requires_more_overlap() -> None:
     for asked, accepted in ((3, True), (8, False)):
         room = Room((Ring(), Ring()), MergeConfig(overlap_pairs=asked))
         room.walk(0, 5)

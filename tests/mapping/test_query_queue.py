@@ -11,14 +11,14 @@ from share.types import AgentKind
 AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
 
 
-def test_one_agent_newest_first() -> None:
+def test_the_newest_keyframe_of_an_agent_is_first() -> None:
     queue = QueryQueue(EdgeConfig(max_waiting=10, each_waiting=10))
     for number in range(3):
         queue.add("ann", AR, number)
     assert [queue.next_query() for _ in range(4)] == [2, 1, 0, None]
 
 
-def test_who_sends_more_is_not_served_more() -> None:
+def test_an_agent_that_sends_more_is_not_served_more() -> None:
     queue = QueryQueue(EdgeConfig(max_waiting=1000, each_waiting=1000))
     for number in range(90):
         queue.add("ann", AR, number)
@@ -28,7 +28,7 @@ def test_who_sends_more_is_not_served_more() -> None:
     assert sum(number >= 100 for number in first if number is not None) == 10
 
 
-def test_headsets_before_robots_but_robots_too() -> None:
+def test_headsets_are_served_before_robots_but_not_only() -> None:
     queue = QueryQueue(EdgeConfig(max_waiting=1000, each_waiting=1000))
     who = Counter[str]()
     for number in range(200):
@@ -41,7 +41,7 @@ def test_headsets_before_robots_but_robots_too() -> None:
     assert 15 <= who["rob"] <= 25  # of two that always wait, one turn in five
 
 
-def test_one_too_many_costs_the_longest_queue_its_oldest() -> None:
+def test_a_full_queue_skips_the_oldest_of_the_longest() -> None:
     queue = QueryQueue(EdgeConfig(max_waiting=4, each_waiting=4))
     for number in range(4):
         queue.add("ann", AR, number)
@@ -51,7 +51,7 @@ def test_one_too_many_costs_the_longest_queue_its_oldest() -> None:
     assert {queue.next_query() for _ in range(4)} == {1, 2, 3, 10}
 
 
-def test_one_that_sends_much_is_answered_soon_or_not_at_all() -> None:
+def test_an_agent_that_sends_much_has_its_older_keyframes_skipped() -> None:
     queue = QueryQueue(EdgeConfig(max_waiting=12, each_waiting=3))
     for number in range(8):
         queue.add("ann", AR, number)
@@ -60,7 +60,7 @@ def test_one_that_sends_much_is_answered_soon_or_not_at_all() -> None:
     assert {queue.next_query() for _ in range(4)} == {5, 6, 7, 10}
 
 
-def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
+def test_of_many_agents_the_newest_are_served_and_none_starves() -> None:
     """Twenty agents in turn, half as many look-ups as keyframes: none is looked up that is older than a few
     others, and everybody has its turn."""
     queue, served, age = QueryQueue(EdgeConfig(max_waiting=12, each_waiting=3)), Counter[int](), []
@@ -75,7 +75,7 @@ def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
     assert min(served.values()) >= 30 and len(served) == 20
 
 
-def test_those_passed_over_are_there_for_later_newest_first() -> None:
+def test_skipped_keyframes_are_returned_newest_first() -> None:
     queue = QueryQueue(EdgeConfig(max_waiting=12, each_waiting=3))
     for number in range(300):
         queue.add("ann", AR, number)

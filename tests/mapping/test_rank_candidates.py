@@ -22,14 +22,14 @@ def chart_of(**lengths: int) -> tuple[MapGraph, dict[str, list[int]]]:
     return chart, numbers
 
 
-def test_larger_maps_come_first_and_likeness_decides_within_one() -> None:
+def test_larger_maps_come_first_and_the_score_decides_within_one() -> None:
     chart, at = chart_of(ann=2, bob=9, eve=5)
     others = [at["eve"][1], at["bob"][4], at["eve"][0], at["bob"][2]]
     expected = [at["bob"][4], at["bob"][2], at["eve"][1], at["eve"][0]]
     assert rank_candidates(chart, at["ann"][1], others) == expected
 
 
-def test_what_cannot_be_seen_from_here_comes_last() -> None:
+def test_candidates_out_of_view_come_last() -> None:
     chart, at = chart_of(ann=20, bob=3)
     near, far, other = at["ann"][16], at["ann"][2], at["bob"][0]
     assert rank_candidates(chart, at["ann"][19], [far, other, near]) == [near, other, far]

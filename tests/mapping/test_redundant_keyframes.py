@@ -40,23 +40,23 @@ def chosen(poses: F64, may_go: Collection[int], count: int, below: float = np.in
     return redundant(poses, whose, Counter(ann=count), below)
 
 
-def test_of_what_is_alike_one_stays() -> None:
+def test_of_similar_poses_one_stays() -> None:
     poses = np.array([at(0), at(0.05), at(1), at(2), at(2.01), at(3)])
     assert sorted(chosen(poses, range(6), 2)) in ([0, 4], [1, 4], [0, 3], [1, 3])
     assert 4 in chosen(poses, range(6), 1) or 3 in chosen(poses, range(6), 1)
 
 
-def test_turned_elsewhere_is_not_alike() -> None:
+def test_a_rotated_pose_is_not_similar() -> None:
     poses = np.array([at(0), at(0.01, yaw=2.0), at(0.3), at(0.6)])
     assert chosen(poses, range(4), 1)[0] != 1
 
 
-def test_only_what_may_go_goes() -> None:
+def test_only_removable_poses_are_chosen() -> None:
     poses = np.array([at(0.001 * k) for k in range(6)])
     assert sorted(chosen(poses, [1, 4], 5)) == [1, 4]
 
 
-def test_what_is_not_alike_enough_stays() -> None:
+def test_poses_beyond_the_distance_stay() -> None:
     poses = np.array([at(0), at(0.05), at(1), at(2), at(2.01), at(3)])
     assert len(chosen(poses, range(6), 6, below=0.5)) == 2
     assert len(chosen(poses, range(6), 6)) == 6
@@ -64,7 +64,7 @@ def test_what_is_not_alike_enough_stays() -> None:
     assert chosen(poses[:1], [0], 1, below=0.5) == []
 
 
-def test_each_gives_what_is_due_of_it() -> None:
+def test_each_name_gives_its_quota() -> None:
     poses = np.array([at(0.01 * k) for k in range(12)])
     due = Counter(ann=2, bob=1)
     gone = redundant(poses, ["ann", "bob", "eve"] * 4, due, np.inf)
@@ -72,7 +72,7 @@ def test_each_gives_what_is_due_of_it() -> None:
     assert due.total() == 0
 
 
-def test_a_keyframe_in_the_middle_leaves_its_neighbours_tied() -> None:
+def test_removing_a_keyframe_connects_its_neighbours() -> None:
     ann = Walker("ann", 1)
     chart = chart_of(ann)
     out = remove_keyframe(chart, 30)
@@ -86,7 +86,7 @@ def test_a_keyframe_in_the_middle_leaves_its_neighbours_tied() -> None:
     assert known.cov == pytest.approx(twice)
 
 
-def test_that_others_look_alike_is_forgotten_with_the_keyframe() -> None:
+def test_ambiguous_places_are_forgotten_with_their_keyframes() -> None:
     ann, atlas = Walker("ann", 1), Atlas(CONFIG)
     for keyframe in ann.keyframes:
         atlas.add_keyframe("ann", keyframe)
@@ -95,7 +95,7 @@ def test_that_others_look_alike_is_forgotten_with_the_keyframe() -> None:
     assert atlas.loop_acceptance._ambiguous_nodes == {30}
 
 
-def test_without_its_first_a_stretch_begins_with_the_next() -> None:
+def test_without_its_first_keyframe_a_segment_begins_with_the_next() -> None:
     ann = Walker("ann", 1)
     chart = chart_of(ann)
     out = remove_keyframe(chart, 0)
@@ -139,7 +139,7 @@ def settle(atlas: Atlas, solver: PoseGraphSolver) -> None:
         atlas.solving.apply(job, solver.solve(job.anchor, job.covariance_nodes))
 
 
-def test_a_thinned_map_is_solved_as_well_and_goes_on() -> None:
+def test_a_culled_map_is_solved_as_well_and_continues() -> None:
     walkers = Walker("ann", 1, n=200), Walker("bob", 2, n=200, phase=0.4)
     rng, atlas, solver = np.random.default_rng(0), Atlas(CONFIG), PoseGraphSolver(GraphConfig())
     for k in range(150):
@@ -173,7 +173,7 @@ def test_a_thinned_map_is_solved_as_well_and_goes_on() -> None:
             atlas.pose(key)
 
 
-def test_taken_out_and_joined_while_the_map_is_solved() -> None:
+def test_keyframes_removed_while_the_map_is_solved() -> None:
     walkers = Walker("ann", 1), Walker("bob", 2, phase=0.4)
     rng, atlas, solver = np.random.default_rng(0), Atlas(CONFIG), PoseGraphSolver(GraphConfig())
     for k in range(60):

@@ -76,7 +76,7 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Person]
 
 
 @pytest.mark.parametrize("kept", ["E", None])
-def test_a_restored_run_has_the_voice_that_was_kept_until_another_is_heard(kept: str | None) -> None:
+def test_a_restored_run_has_its_stored_credential_until_it_is_replaced(kept: str | None) -> None:
     people = [Person(name, ROOM, 0.0, 11 + i) for i, name in enumerate(KEYS)]
     mapper = Mapper(Config())
     mapper.restore(
@@ -92,7 +92,7 @@ def test_a_restored_run_has_the_voice_that_was_kept_until_another_is_heard(kept:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["says who speaks", "of SHARE 0.1"])
-def test_after_a_restart_one_key_has_one_voice(walked: tuple[Path, list[Person]], file: str) -> None:
+def test_after_a_restart_one_key_has_one_vote(walked: tuple[Path, list[Person]], file: str) -> None:
     """As in the first life, nobody is set apart; also where one of the key's two runs does not say hello."""
     path, people = walked
     people = [replace(p, T_world_body=[*p.T_world_body], T_odom_body=[*p.T_odom_body]) for p in people]

@@ -85,7 +85,7 @@ def again(life: Life, path: Path, config: Config) -> Life:
 
 
 @pytest.mark.parametrize("most", [2000, 60])
-def test_it_has_the_same_maps_and_goes_on(tmp_path: Path, most: int) -> None:
+def test_a_restored_mapper_has_the_same_maps_and_continues(tmp_path: Path, most: int) -> None:
     config = Config()
     config = replace(config, edge=replace(config.edge, max_keyframes=most))
     first, people = walked(config)
@@ -112,7 +112,7 @@ def test_it_has_the_same_maps_and_goes_on(tmp_path: Path, most: int) -> None:
 
 
 @pytest.mark.parametrize(("first", "founder"), [(AgentKind.AR, "ann/0"), (AgentKind.ROBOT, "bob/0")])
-def test_a_headset_keeps_its_place_and_a_map_its_founder(
+def test_the_reference_segment_is_a_headsets_and_stays_after_a_restart(
     tmp_path: Path, first: AgentKind, founder: str
 ) -> None:
     """In a second life too, and whoever comes then."""
@@ -128,7 +128,7 @@ def test_a_headset_keeps_its_place_and_a_map_its_founder(
 
 
 @pytest.mark.slow
-def test_maps_that_meet_only_in_a_second_life_are_joined_as_in_the_first(tmp_path: Path) -> None:
+def test_maps_of_an_earlier_session_merge_as_those_of_one(tmp_path: Path) -> None:
     """The robot's to the headset's, though it is older."""
     config = Config()
     life, people = walked(replace(config, place=replace(config.place, min_inliers=10**6)), AgentKind.ROBOT)
@@ -140,7 +140,7 @@ def test_maps_that_meet_only_in_a_second_life_are_joined_as_in_the_first(tmp_pat
     assert list(second.mapper.report()["maps"]) == ["bob/0"]
 
 
-def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:
+def test_a_run_without_keyframes_is_restored(tmp_path: Path) -> None:
     config = Config()
     life = Life(config)
     life.join(Person("ann", ROOM, 0.0, 11))
@@ -151,12 +151,12 @@ def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:
     assert [run.last_finding for run in restored_runs(kept, 0.05)] == [None]
 
 
-def test_a_stretch_whose_run_was_lost_is_no_obstacle() -> None:
+def test_a_segment_whose_run_was_lost_is_restored() -> None:
     """As a damaged file leaves it."""
     Mapper(Config()).restore(StoredMap(segments=("ann/0",)))
 
 
-def test_a_join_that_poses_were_not_kept_of_is_not_told_as_it_was_before(tmp_path: Path) -> None:
+def test_a_merge_whose_poses_were_not_stored_is_not_published_as_before(tmp_path: Path) -> None:
     """The edge is killed within seconds of a join: loops are kept at once, poses now and then."""
     config = Config()
     apart, _ = walked(replace(config, place=replace(config.place, min_inliers=10**6)))

@@ -20,7 +20,7 @@ def search() -> CandidateSearch:
     return CandidateSearch(range(8), max_tried_hurried=2)
 
 
-def test_at_leisure_all_are_tried_until_three_are_it():
+def test_all_candidates_are_tried_until_three_are_verified():
     assert tried(search(), [False] * 20, set()) == list(range(8))
     assert tried(search(), [False] * 20, {1, 2, 5, 6}) == [
         0,
@@ -32,12 +32,12 @@ def test_at_leisure_all_are_tried_until_three_are_it():
     ]
 
 
-def test_in_a_hurry_one_is_enough_and_two_are_tried():
+def test_a_hurried_search_tries_two_and_ends_at_one():
     assert tried(search(), [True] * 20, set()) == [0, 1]
     assert tried(search(), [True] * 20, {0}) == [0]
 
 
-def test_who_comes_meanwhile_ends_it():
+def test_a_query_that_arrives_meanwhile_ends_the_search():
     assert tried(search(), [False] * 4 + [True] * 9, set()) == [
         0,
         1,

@@ -28,7 +28,7 @@ def agree(roads: CovariancePaths, edges: list[PoseEdge], room: Room, start: int,
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_one_search_tells_what_walking_each_path_tells(seed: int) -> None:
+def test_one_search_gives_the_covariances_along_all_paths(seed: int) -> None:
     room = simulate(300, 3, seed)
     roads, edges = roads_of(room, seed)
     rng = np.random.default_rng(seed)
@@ -57,7 +57,7 @@ def test_edges_come_and_go() -> None:
         roads.add(edges[0])
 
 
-def test_of_parallel_edges_the_surest_counts() -> None:
+def test_of_parallel_edges_the_most_certain_counts() -> None:
     T = np.eye(4)
     roads = CovariancePaths()
     loose, sure = PoseEdge(4, 9, T, 4 * LOOP), PoseEdge(9, 4, T, LOOP)
@@ -71,7 +71,7 @@ def test_of_parallel_edges_the_surest_counts() -> None:
     assert roads.covariances_from(4, [9, 4], poses)[0] is None
 
 
-def test_where_no_road_leads() -> None:
+def test_without_a_path_there_is_no_covariance() -> None:
     roads = CovariancePaths()
     assert roads.covariances_from(3, [], {}) == []
     cov = roads.covariances_from(3, [3, 5], {3: np.eye(4), 5: np.eye(4)})

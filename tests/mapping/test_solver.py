@@ -33,7 +33,7 @@ def loaded(room: Room, config: GraphConfig = CONFIG) -> PoseGraphSolver:
     return solver
 
 
-def test_jacobians_are_those_of_small_steps() -> None:
+def test_jacobians_equal_finite_differences() -> None:
     rng = np.random.default_rng(0)
     poses = se3.exp(rng.normal(0, 0.7, (2, 4, 4))[:, 0, :1] * np.ones((2, 6)))
     near = se3.inverse(poses[0]) @ poses[1] @ se3.exp(rng.normal(0, 0.05, 6))
@@ -88,7 +88,7 @@ def test_tolerates_three_false_loops_in_ten() -> None:
     assert rms(gaussian.solve(0).poses, room.truth) > 10 * rms(solution.poses, room.truth)
 
 
-def test_a_room_met_before_is_no_worse_than_by_gtsam() -> None:
+def test_a_revisited_room_is_no_worse_than_by_gtsam() -> None:
     truth, guess, odometry, loops = loops_of_a_room(300, 1, 70)
     rng = np.random.default_rng(0)
     pairs = [rng.choice(300, 2, replace=False) for _ in range(30)]
@@ -99,7 +99,7 @@ def test_a_room_met_before_is_no_worse_than_by_gtsam() -> None:
     assert rms(solver.solve(0).poses, truth) < 1.05 * rms(theirs.poses, truth)
 
 
-def test_grows_step_by_step_to_what_it_would_be_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_incremental_solutions_converge_to_the_batch_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also a pose and a loop that come and go leave nothing behind."""
     room = simulate(300, 3, 2)
     solver = PoseGraphSolver(CONFIG)
@@ -121,7 +121,7 @@ def test_grows_step_by_step_to_what_it_would_be_at_once(monkeypatch: pytest.Monk
     assert len(solver) == 300
 
 
-def test_a_loop_taken_back_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_removed_loop_has_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     make_exact(monkeypatch)
     room = simulate(150, 3, 3)
     solver = loaded(room)
@@ -134,7 +134,7 @@ def test_a_loop_taken_back_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None
     assert np.array_equal(after.loop_ids, before.loop_ids)
 
 
-def test_a_map_that_joins_is_laid_elsewhere_and_solved() -> None:
+def test_a_merged_map_is_moved_and_solved() -> None:
     """The second agent's map lies 3 m off until its first loop comes."""
     room = simulate(200, 2, 5)
     second = range(1, 200, 2)
@@ -156,7 +156,7 @@ def test_a_map_that_joins_is_laid_elsewhere_and_solved() -> None:
     assert solution.covariances.shape == (1, 6, 6)
 
 
-def test_covariances_are_never_too_small_and_hardly_too_large() -> None:
+def test_covariances_are_tight_upper_bounds() -> None:
     room = simulate(300, 3, 6)
     wanted = [297, 298, 299, 150, 0]
     solver = loaded(room)
@@ -187,7 +187,7 @@ def test_same_input_same_bytes() -> None:
     assert first.covariances.tobytes() == second.covariances.tobytes()
 
 
-def test_a_pose_alone_is_where_it_is() -> None:
+def test_a_single_pose_stays() -> None:
     solver = PoseGraphSolver(CONFIG)
     solver.update(GraphUpdate.from_edges({5: np.eye(4)}))
     solution = solver.solve(5, [5])
@@ -196,7 +196,7 @@ def test_a_pose_alone_is_where_it_is() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-12, 1e12])
-def test_any_covariance_that_is_valid_is_borne(scale: float) -> None:
+def test_any_valid_covariance_is_solved(scale: float) -> None:
     room = simulate(60, 2, 8)
     odd = [PoseEdge(e.a, e.b, e.T_a_b, scale * e.cov) for e in room.chain[::3]]
     rest = [e for k, e in enumerate(room.chain) if k % 3]
@@ -226,7 +226,7 @@ def test_nothing_that_is_valid_raises(seed: int) -> None:
     assert all(np.linalg.eigvalsh(cov)[0] > 0 for cov in solution.covariances)
 
 
-def test_what_has_no_finite_error_comes_back_as_it_was() -> None:
+def test_poses_without_a_finite_cost_are_returned_unchanged() -> None:
     far = np.eye(4)
     far[0, 3] = 1e200
     solver = PoseGraphSolver(CONFIG)
@@ -237,7 +237,7 @@ def test_what_has_no_finite_error_comes_back_as_it_was() -> None:
     assert solution.covariances.shape == (0, 6, 6)
 
 
-def test_news_that_do_not_fit_are_refused_and_change_nothing() -> None:
+def test_invalid_updates_are_refused_and_change_nothing() -> None:
     solver = PoseGraphSolver(CONFIG)
     edge = PoseEdge(0, 1, np.eye(4), LOOP)
     solver.update(GraphUpdate.from_edges({0: np.eye(4), 1: np.eye(4)}, [(3, edge, False)]))
@@ -295,6 +295,6 @@ def test_a_straight_chain_with_one_loop_in_closed_form(monkeypatch: pytest.Monke
     assert solved.loop_chi2[0] == pytest.approx((gap * l2 / (n * s2 + l2)) ** 2 / l2, rel=1e-4)
 
 
-def test_an_edge_joins_two_poses() -> None:
+def test_an_edge_needs_two_poses() -> None:
     with pytest.raises(ValueError, match="needs two different poses"):
         PoseEdge(1, 1, np.eye(4), LOOP)

@@ -30,7 +30,7 @@ def random_edge(a: int, b: int, seed: int) -> PoseEdge:
     return PoseEdge(a, b, se3.exp(rng.normal(0, 0.5, 6)), root @ root.T + 1e-6 * np.eye(6))
 
 
-def test_a_link_of_a_chain_is_composed() -> None:
+def test_contracting_a_chain_composes_its_edges() -> None:
     first, second = random_edge(1, 2, 0), random_edge(2, 3, 1)
     (edge,), loops = contract_pose(2, [first, second], [])
     T = first.T_a_b @ second.T_a_b
@@ -44,7 +44,7 @@ def test_a_link_of_a_chain_is_composed() -> None:
     assert backward.cov == pytest.approx(cov, rel=1e-9, abs=1e-15)
 
 
-def test_loops_go_to_the_nearest_neighbour_and_keep_their_direction() -> None:
+def test_loops_move_along_the_more_certain_edge_and_keep_their_direction() -> None:
     loose, tight = random_edge(1, 2, 0), random_edge(2, 3, 1)
     loose = PoseEdge(1, 2, loose.T_a_b, 100 * loose.cov)
     out, into, own = random_edge(2, 9, 2), random_edge(8, 2, 3), random_edge(3, 2, 4)
@@ -71,7 +71,7 @@ def test_an_end_of_a_chain_is_dropped() -> None:
     assert contract_pose(5, [last], []) == ([], [])
 
 
-def test_what_cannot_be_contracted_is_refused() -> None:
+def test_unrelated_edges_and_isolated_poses_are_refused() -> None:
     with pytest.raises(ValueError, match="no odometry edge"):
         contract_pose(5, [], [random_edge(1, 5, 0)])
     with pytest.raises(ValueError, match="does not end at it"):

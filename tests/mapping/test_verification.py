@@ -37,7 +37,7 @@ def test_covariance_of_the_body_pose_is_consistent(monkeypatch: pytest.MonkeyPat
     assert 4.0 < np.mean(nees) < 9.0
 
 
-def test_the_reverse_question_has_the_inverse_answer() -> None:
+def test_the_reverse_query_has_the_inverse_pose() -> None:
     query, candidate = sights(1, T_C_Q)
     there, back = verify(query, candidate, CONFIG), verify(candidate, query, CONFIG)
     assert isinstance(there, Verification)
@@ -108,7 +108,7 @@ def test_inliers_in_one_corner_are_refused(half: float, monkeypatch: pytest.Monk
     assert "inliers crowd in the" in reason(query, replace(candidate, view=corner), loose)
 
 
-def test_a_loose_pose_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_uncertain_pose_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verification, "MAX_SIGMA_DEG", 0.01)
     assert "pose uncertain by" in reason(*sights(10, T_C_Q))
 

@@ -111,14 +111,14 @@ def test_the_first_page_can_be_lost_whole(whole, tmp_path):
     assert check_opens(path, path.read_bytes(), good) == 0
 
 
-def test_bytes_of_the_header(whole, tmp_path):
+def test_any_header_byte_may_be_wrong(whole, tmp_path):
     data, good = whole
     for at in range(0, 100, 3):
         path, as_it_was = damaged(tmp_path, data, at, 0x41)
         assert check_opens(path, as_it_was, good) == 0
 
 
-def test_a_row_that_says_something_else_is_not_believed(whole, tmp_path):
+def test_a_row_with_a_wrong_crc_is_not_read(whole, tmp_path):
     """Written by SQLite in good order, so only the CRC can tell."""
     path, _ = damaged(tmp_path, whole[0], 0, 0)
     connection = sqlite3.connect(path, isolation_level=None)
@@ -140,7 +140,7 @@ def test_a_row_that_says_something_else_is_not_believed(whole, tmp_path):
     assert len(kept.runs) == 2  # from their copies
 
 
-def test_who_speaks_for_a_run_is_taken_over_from_a_damaged_file(whole, tmp_path):
+def test_credentials_are_salvaged_from_a_damaged_file(whole, tmp_path):
     """But not for one that is lost, and nothing is made up for one of which it cannot be read."""
     data, good = whole
     for broken, lost in (("loop SET inliers = 999 WHERE number = 2", 0), ("about SET value = 'E'", 3)):
@@ -159,7 +159,7 @@ def test_who_speaks_for_a_run_is_taken_over_from_a_damaged_file(whole, tmp_path)
             assert [run.credential for run in store.load().runs] == [run.credential for run in kept.runs]
 
 
-def test_a_file_cut_short_or_grown(whole, tmp_path):
+def test_a_file_may_be_truncated_or_grown(whole, tmp_path):
     data, good = whole
     path = tmp_path / "room.sqlite"
     for length in (len(data) // 2, len(data) - 1, PAGE_BYTES, len(data) - 5 * PAGE_BYTES):
@@ -173,7 +173,7 @@ def test_a_file_cut_short_or_grown(whole, tmp_path):
         assert path.with_name("room.sqlite.damaged-1").read_bytes() == data[:length]
 
 
-def test_a_lost_keyframe_that_others_hang_on(tmp_path):
+def test_a_lost_keyframe_is_bridged_for_those_that_follow(tmp_path):
     """Those after it are tied to the one before, by odometry; retired numbers stay retired."""
     path = tmp_path / "room.sqlite"
     with MapStore.open(path) as store:
@@ -203,7 +203,7 @@ def test_a_lost_keyframe_that_others_hang_on(tmp_path):
     assert "1 keyframes lost their predecessor and are linked to an earlier one" in kept.problems
 
 
-def test_damaged_twice_keeps_both(whole, tmp_path):
+def test_two_damaged_files_are_both_kept(whole, tmp_path):
     data, _ = whole
     path, first = damaged(tmp_path, data, 30 * PAGE_BYTES // 2, 1)
     MapStore.open(path).close()
@@ -216,7 +216,7 @@ def test_damaged_twice_keeps_both(whole, tmp_path):
 
 
 @pytest.mark.parametrize("step", range(4))
-def test_a_break_while_it_is_salvaged_loses_nothing(whole, tmp_path, monkeypatch, step):
+def test_an_interrupted_salvage_loses_nothing(whole, tmp_path, monkeypatch, step):
     """Broken off before each of the renames; the next opening finishes."""
     data, good = whole
     path, as_it_was = damaged(tmp_path, data, 21, 4)

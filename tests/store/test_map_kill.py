@@ -33,7 +33,7 @@ with MapStore.open(Path(sys.argv[1])) as store:
 
 
 @pytest.mark.parametrize("kills", [5, pytest.param(50, marks=pytest.mark.slow)])
-def test_killed_at_random_instants(tmp_path, kills):
+def test_a_writer_killed_at_random_instants_loses_nothing_written(tmp_path, kills):
     path = tmp_path / "room.sqlite"
     draw = random.Random(kills)
     written, logs = 0, 0

@@ -58,7 +58,7 @@ def test_a_new_file_is_empty(path):
     assert files(path) == ["room.sqlite", "room.sqlite.lock"]
 
 
-def test_all_is_found_again(path):
+def test_all_changes_are_read_back(path):
     with MapStore.open(path) as store:
         store.write(small_map())
         before = told(store.load())
@@ -77,7 +77,7 @@ def test_all_is_found_again(path):
     assert kept.problems == ()
 
 
-def test_the_same_again_changes_nothing(path):
+def test_repeated_changes_change_nothing(path):
     with MapStore.open(path) as store:
         store.write(small_map())
         before = told(store.load())
@@ -85,7 +85,7 @@ def test_the_same_again_changes_nothing(path):
         assert told(store.load()) == before
 
 
-def test_a_new_solution_takes_the_place_of_the_old(path):
+def test_a_new_solution_replaces_the_old(path):
     with MapStore.open(path) as store:
         store.write(small_map())
         store.write([solution([KeyframeKey(ANN, 3)], "elsewhere")])
@@ -93,7 +93,7 @@ def test_a_new_solution_takes_the_place_of_the_old(path):
     assert (poses.keys, poses.map_ids) == ((KeyframeKey(ANN, 3),), ("elsewhere",))
 
 
-def test_retired_keyframes_go_but_not_their_numbers(path):
+def test_ids_of_removed_keyframes_are_not_used_again(path):
     with MapStore.open(path) as store:
         store.write(small_map())
         link = SaveLink(KeyframeKey(ANN, 5), 3, pose(2), np.eye(6) * 1e-3)
@@ -119,7 +119,7 @@ def test_retired_keyframes_go_but_not_their_numbers(path):
     assert kept.problems == ()
 
 
-def test_the_order_of_stretches_outlives_their_keyframes(path):
+def test_segments_stay_in_order_without_their_keyframes(path):
     with MapStore.open(path) as store:
         store.write([run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0), keyframe(ANN, 1, first=True)])
         store.write([RemoveKeyframes((KeyframeKey(ANN, 0),))])
@@ -137,7 +137,7 @@ def voices(path):
     return {run.run_key: run.credential for run in again(path).runs}
 
 
-def test_who_speaks_for_a_run_is_kept_and_may_change(path):
+def test_credentials_are_stored_and_may_change(path):
     with MapStore.open(path) as store:
         store.write(small_map())
     assert voices(path) == {ANN: f"key of {ANN[:3]}", BOB: ""}
@@ -153,7 +153,7 @@ def test_who_speaks_for_a_run_is_kept_and_may_change(path):
     assert voices(path) == {ANN: "A", BOB: ""}
 
 
-def test_a_map_of_share_0_1_says_of_no_run_who_speaks_for_it_and_is_not_changed_by_opening(path):
+def test_a_map_of_share_0_1_has_no_credentials_and_is_not_changed_by_opening(path):
     """It has only the rows that `about` begins with; whose number and schema are the same as now."""
     with MapStore.open(path) as store:
         store.write([replace(one, credential="") if isinstance(one, SaveRun) else one for one in small_map()])
@@ -173,7 +173,7 @@ def test_a_map_of_share_0_1_says_of_no_run_who_speaks_for_it_and_is_not_changed_
     }
 
 
-def test_two_loops_may_tie_one_pair(path):
+def test_one_pair_of_keyframes_may_have_two_loops(path):
     with MapStore.open(path) as store:
         store.write([*small_map(), SaveLoop(loop(4, 4)), SaveLoop(loop(4, 4).reverse())])
         assert len(store.load().loops) == 6
@@ -181,7 +181,7 @@ def test_two_loops_may_tie_one_pair(path):
         assert len(store.load().loops) == 4
 
 
-def test_a_list_of_changes_is_kept_whole_or_not_at_all(path):
+def test_a_list_of_changes_is_written_whole_or_not_at_all(path):
     with MapStore.open(path) as store:
         store.write([run(ANN), keyframe(ANN, 0)])
         with pytest.raises(ValueError, match=r"bob-0002 is not in the file; its SaveRun must come first"):
@@ -197,7 +197,7 @@ def test_another_thread_may_write(path):
         assert len(store.load().keyframes) == 40
 
 
-def test_one_edge_a_map_but_any_number_of_readers(path):
+def test_a_map_has_one_writer_and_any_number_of_readers(path):
     with MapStore.open(path) as store:
         store.write(small_map())
         with pytest.raises(StoreError, match="another edge uses this map"):
@@ -221,7 +221,7 @@ def keyframes_for_a_reader(path) -> int:
     )
 
 
-def test_what_is_no_map_is_left_as_it_is(tmp_path):
+def test_other_files_are_refused_and_left_unchanged(tmp_path):
     text, other = tmp_path / "notes.txt", tmp_path / "browser.sqlite"
     text.write_text("SQLite is nice" * 1000)
     with sqlite3.connect(other) as connection:
@@ -263,7 +263,7 @@ def test_a_map_of_another_schema_is_refused_and_left_unchanged(path, number, age
 # ---------------------------------------------------------------- the disk
 
 
-def test_a_full_disk_keeps_nothing_half_and_works_again_afterwards(path):
+def test_a_full_disk_keeps_nothing_half_and_recovers(path):
     """No file of this process may grow beyond a limit for a while."""
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -282,7 +282,7 @@ def test_a_full_disk_keeps_nothing_half_and_works_again_afterwards(path):
 
 
 @pytest.mark.parametrize("killed", [False, True], ids=["closed", "killed"])
-def test_a_map_that_may_only_be_read(killed):
+def test_a_read_only_map_is_opened_for_reading(killed):
     """As somebody who is not root: root may write everything."""
     folder = Path(tempfile.mkdtemp())
     path = folder / "room.sqlite"
@@ -310,7 +310,7 @@ def test_a_map_that_may_only_be_read(killed):
         shutil.rmtree(folder)
 
 
-def test_the_file_stays_bounded_when_as_many_retire_as_come(path):
+def test_the_file_stays_bounded_when_keyframes_are_removed(path):
     with MapStore.open(path) as store:
         store.write([run(ANN)])
         sizes = []
@@ -344,7 +344,7 @@ def test_keyframes_of_an_earlier_wire_version_that_have_not_changed_are_read(pat
 @pytest.mark.parametrize("end", ["-wal", "-shm"])
 @pytest.mark.parametrize("kind", [*KINDS, "link"])
 @pytest.mark.parametrize("made", [True, False])
-def test_what_lies_beside_a_map_is_a_file(path, end, kind, made):
+def test_side_files_of_a_map_must_be_regular_files(path, end, kind, made):
     """SQLite would open a pipe, and wait or write there."""
     if made:
         with MapStore.open(path) as store:
@@ -380,7 +380,7 @@ except StoreError as error:
 
 
 @pytest.mark.parametrize("limit", [1_000, 10_000, 40_000, 100_000, 300_000])
-def test_a_map_that_may_not_grow_says_by_which_limit(path, limit):
+def test_a_file_size_limit_is_named(path, limit):
     """SQLite says "disk I/O error". Wherever it meets the limit: file, log or index."""
     here = Path(__file__).parents[1]
     done = subprocess.run(
