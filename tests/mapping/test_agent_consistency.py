@@ -1,4 +1,4 @@
-"""Two odometries against each other: what is wrong with one shows, and honest ones show nothing."""
+"""Comparison of two odometries: errors of one are detected, and correct ones show none."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FRAMES = 60
 
 
 def ring(phase: float) -> list:
-    """Poses round a room, nodding."""
+    """Poses around a room, with pitch."""
     out = []
     for k in range(FRAMES):
         angle = phase + 0.1 * k
@@ -50,7 +50,7 @@ def chain(steps: list, sure: float = 1.0) -> list[AccumulatedOdometry]:
 
 
 def loops(rng, turn: float = 0.0, sure: float = 1.0, **bad) -> list[InterAgentLoop]:
-    """24 of them, of which two are false, between an honest odometry and one that is `bad`."""
+    """24 loops, two of them false, between a correct odometry and one with the errors in `bad`."""
     x, y = ring(0.0), ring(0.7)
     a, b = chain(steps_of(x, rng)), chain(steps_of(y, rng, **bad), sure)
     X = se3.exp(np.array([turn, 0, 0, 0, 0, 0]))
@@ -88,8 +88,9 @@ def test_a_camera_rotation_is_estimated():
     assert found.camera_rotation.significance > 4.5
 
 
+@pytest.mark.long
 def test_noise_of_an_overconfident_agent_is_no_camera_rotation_once_its_covariance_is_scaled():
-    """By ten loops, of ways that are ten times as noisy as claimed."""
+    """Ten loops; odometry is ten times as noisy as stated."""
     found, as_claimed = [], []
     for seed in range(20):
         few = loops(np.random.default_rng(seed), drift=10.0)[:10]
@@ -108,7 +109,7 @@ def test_scaled_covariances_hide_neither_a_camera_rotation_nor_a_path_scale():
 
 
 def test_drift_beyond_the_stated_covariances_raises_the_nis():
-    """Beyond the loops' own noise: 6 cm a step. What is less than that noise, no loop can tell."""
+    """6 cm a step, above the noise of the loops; below it, loops cannot show drift."""
     assert compare_odometry(loops(np.random.default_rng(5), drift=30.0, sure=0.01)).nis > 3
 
 
@@ -123,7 +124,7 @@ def test_depth_scales_are_pooled_robustly():
 
 
 def town(scales: dict[str, float], pairs: list[tuple[str, str]]) -> tuple[AgentAgreement, list[bool]]:
-    """Agents whose depths are so much too large, who meet so."""
+    """Agents with these scales of their depths, with loops between these pairs."""
     agreement, rng, said = AgentAgreement(0.015), np.random.default_rng(2), []
     nodes = {name: range(10 * i, 10 * i + 10) for i, name in enumerate(scales)}
     for name, numbers in nodes.items():
@@ -176,6 +177,7 @@ def test_two_agents_that_disagree_are_disputed():
     assert "larger" in agreement.standing("eve").reason
 
 
+@pytest.mark.long
 def test_quarantine_ends_when_later_loops_agree():
     agreement, _ = town({"ann": 1.0, "eve": 1.04}, [("ann", "eve")])
     assert agreement.disputed

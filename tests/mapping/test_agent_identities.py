@@ -1,4 +1,4 @@
-"""What is known of a name holds for all its runs, and a name counts once."""
+"""All runs of a name are one agent with one vote, except after suspicion."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIGMA = 0.004
 
 
 class Town:
-    """Runs that meet at one spot, one after the other."""
+    """Runs with loops at one spot, one after the other."""
 
     def __init__(self) -> None:
         self.agreement, self.rng = AgentAgreement(0.015), np.random.default_rng(3)
@@ -40,7 +40,7 @@ class Town:
             self.agreement.add_step(run, first + k, first + k - 1 if k else None, step, STEP)
 
     def meet(self, a: str, b: str, scale: float, times: int = 1) -> None:
-        """b's depths over a's."""
+        """scale: of b's depths relative to a's."""
         for _ in range(times):
             k = int(self.rng.integers(12))
             ends = self.numbers[a], self.numbers[b]
@@ -49,8 +49,8 @@ class Town:
             self.agreement.add_loop((a, b), ends, edge, DepthScale(log, SIGMA), None)
 
 
-def with_a_wrong_one():
-    """Ann and bob agree; eve's metres are 5 % too long for both."""
+def with_a_wrong_agent():
+    """Ann and bob agree; eve's scale is 5 % too large."""
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
         town.enter(run)
@@ -61,7 +61,7 @@ def with_a_wrong_one():
 
 
 def test_loops_of_all_runs_of_a_name_count_as_those_of_one_agent():
-    """Two loops with each of two others in each run: never enough of one run."""
+    """Two loops with each of two others in each run: too few of any one run."""
     town = Town()
     for run in ("ann-1", "bob-1"):
         town.enter(run)
@@ -81,12 +81,12 @@ def test_loops_of_all_runs_of_a_name_count_as_those_of_one_agent():
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
 def test_a_new_run_of_a_quarantined_name_is_compared_before_it_joins(scale):
-    town = with_a_wrong_one()
+    town = with_a_wrong_agent()
     assert town.agreement.standing("eve-1").state == "set apart"
     town.enter("eve-2")
     assert "earlier run" in town.agreement.standing("eve-2").reason
     assert "earlier run" in town.agreement.unverified_reason(["ann-1"], ["eve-2"])
-    assert not town.agreement.unverified_reason(["eve-2"], ["eve-2"])  # its own stretches
+    assert not town.agreement.unverified_reason(["eve-2"], ["eve-2"])  # its own segments
     for _ in range(10):
         for other in ("ann-1", "bob-1"):
             town.meet(other, "eve-2", scale)
@@ -103,7 +103,7 @@ def test_a_new_run_of_a_quarantined_name_is_compared_before_it_joins(scale):
 
 
 def test_of_two_that_disagree_the_one_with_a_quarantined_run_is_quarantined():
-    town = with_a_wrong_one()
+    town = with_a_wrong_agent()
     town.enter("eve-2")
     town.meet("bob-1", "eve-2", 1.05, 5)
     assert town.agreement.standing("eve-2").state == "set apart"
@@ -133,7 +133,7 @@ def test_a_new_run_of_a_name_inherits_its_scale():
 
 
 def test_an_agent_that_becomes_wrong_is_detected_by_its_newest_loops():
-    """After thirty with each other that were good; it took as many bad ones."""
+    """After thirty correct loops, by fewer wrong ones."""
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
         town.enter(run)
@@ -151,19 +151,19 @@ def test_an_agent_that_becomes_wrong_is_detected_by_its_newest_loops():
 
 
 def test_restored_runs_outside_the_largest_map_are_an_unverified_identity():
-    subjects = AgentIdentities()
+    identities = AgentIdentities()
     for run, name in (("eve-1", "eve"), ("eve-2", "eve"), ("ann-1", "ann"), ("eve-3", "eve")):
-        subjects.add_run(run, name, ())
-    subjects.mark_unverified({"eve-1", "eve-3"})
-    assert subjects.identity("eve-3") == subjects.identity("eve-1") != subjects.identity("eve-2")
-    assert subjects.unverified == {subjects.identity("eve-1")}
-    assert subjects.name("eve-2") == subjects.name("eve-3") == "eve"
-    subjects.add_run("eve-4", "eve", ())
-    assert subjects.identity("eve-4") in subjects.unverified
+        identities.add_run(run, name, ())
+    identities.mark_unverified({"eve-1", "eve-3"})
+    assert identities.identity("eve-3") == identities.identity("eve-1") != identities.identity("eve-2")
+    assert identities.unverified == {identities.identity("eve-1")}
+    assert identities.name("eve-2") == identities.name("eve-3") == "eve"
+    identities.add_run("eve-4", "eve", ())
+    assert identities.identity("eve-4") in identities.unverified
 
 
 def test_loops_of_an_unverified_run_are_not_accepted_before_it_is_compared():
-    """Through the atlas: what the newest run of a name that was set apart says moves nobody."""
+    """In the atlas: loops of the newest run of a quarantined name move no map."""
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.3)
     first, second = Walker("eve-1", 3, phase=0.7), Walker("eve-2", 4, phase=0.7)
     atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
@@ -184,7 +184,7 @@ def test_loops_of_an_unverified_run_are_not_accepted_before_it_is_compared():
 
 
 def test_a_quarantined_agent_does_not_affect_the_scales_of_others():
-    """Ann and bob have met only eve, whose depths became wrong: nothing says how theirs compare."""
+    """Ann and bob have loops with eve only, whose depths became wrong: theirs cannot be compared."""
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
         town.enter(run)
@@ -196,38 +196,38 @@ def test_a_quarantined_agent_does_not_affect_the_scales_of_others():
 
 
 def test_removing_one_run_keeps_what_is_known_of_its_name():
-    subjects = AgentIdentities()
+    identities = AgentIdentities()
     for number in range(1, 4):
-        subjects.add_run(f"eve-{number}", "eve", ())
-    assert [subjects.remove_run(f"eve-{number}", (), ()) for number in (1, 2)] == [None, None]
-    subjects.add_run("eve-4", "eve", ())
-    assert subjects.identity("eve-4") == "eve-1"
-    assert (subjects.name("eve-1"), subjects.newest_run("eve-1")) == ("eve", "eve-4")
-    assert [subjects.remove_run(f"eve-{number}", (), ()) for number in (3, 4)] == [None, "eve-1"]
-    subjects.add_run("eve-5", "eve", ())
-    assert (subjects.identity("eve-5"), subjects.unverified) == ("eve-5", set())
+        identities.add_run(f"eve-{number}", "eve", ())
+    assert [identities.remove_run(f"eve-{number}", (), ()) for number in (1, 2)] == [None, None]
+    identities.add_run("eve-4", "eve", ())
+    assert identities.identity("eve-4") == "eve-1"
+    assert (identities.name("eve-1"), identities.newest_run("eve-1")) == ("eve", "eve-4")
+    assert [identities.remove_run(f"eve-{number}", (), ()) for number in (3, 4)] == [None, "eve-1"]
+    identities.add_run("eve-5", "eve", ())
+    assert (identities.identity("eve-5"), identities.unverified) == ("eve-5", set())
 
 
 def test_suspicion_of_a_name_outlives_its_runs():
-    subjects = AgentIdentities()
-    subjects.add_run("eve-1", "eve", ())
-    assert subjects.remove_run("eve-1", {"eve-1"}, ()) == "eve-1"
+    identities = AgentIdentities()
+    identities.add_run("eve-1", "eve", ())
+    assert identities.remove_run("eve-1", {"eve-1"}, ()) == "eve-1"
     for number in range(2, 5):
-        subjects.add_run(f"eve-{number}", "eve", ())
-        assert subjects.unverified == {f"eve-{number}"}
-        assert f"eve-{number}" in subjects.suspected
-        assert subjects.had_quarantined_run(f"eve-{number}", ())
-        subjects.remove_run(f"eve-{number}", (), ())
-    assert not subjects.unverified
-    subjects.add_run("eve-9", "eve", ())
-    subjects.mark_verified("eve-9")  # it was compared, and agrees
-    subjects.remove_run("eve-9", (), ())
-    subjects.add_run("eve-10", "eve", ())
-    assert not subjects.unverified
+        identities.add_run(f"eve-{number}", "eve", ())
+        assert identities.unverified == {f"eve-{number}"}
+        assert f"eve-{number}" in identities.suspected
+        assert identities.had_quarantined_run(f"eve-{number}", ())
+        identities.remove_run(f"eve-{number}", (), ())
+    assert not identities.unverified
+    identities.add_run("eve-9", "eve", ())
+    identities.mark_verified("eve-9")  # it was compared, and agrees
+    identities.remove_run("eve-9", (), ())
+    identities.add_run("eve-10", "eve", ())
+    assert not identities.unverified
 
 
 def test_any_number_of_removed_runs_leaves_only_the_suspicion():
-    """Eve met ann in each of her runs, and disagreed; each is forgotten with its keyframes."""
+    """Each run of eve disagreed with ann and is removed with its keyframes."""
     ann, atlas, rng = Walker("ann", 1, n=20), Atlas(MergeConfig()), np.random.default_rng(0)
     atlas.add_run("ann", "ann")
     for keyframe in ann.keyframes:
@@ -255,7 +255,7 @@ def test_any_number_of_removed_runs_leaves_only_the_suspicion():
 
 
 def test_a_disagreement_outlives_the_keyframes_that_showed_it():
-    """Two loops with each of many runs of bob, whose stretches go one after the other."""
+    """Two loops with each of many runs of bob, whose segments are removed one after the other."""
     town = Town()
     town.enter("ann-1")
     for n in range(1, 30):
@@ -292,7 +292,7 @@ def test_the_covariance_evidence_of_a_segment_is_removed_with_it():
 
 
 def test_two_unverified_agents_of_a_restored_map_verify_each_other():
-    """Both were alone in their maps, and now meet: there is nobody else to compare them with."""
+    """Both were alone in their maps; there is no third agent."""
     town = Town()
     for run in ("ann-1", "bob-1"):
         town.enter(run)
@@ -305,7 +305,7 @@ def test_two_unverified_agents_of_a_restored_map_verify_each_other():
 
 
 def test_names_of_one_key_have_one_vote():
-    """Eve speaks for three, whose metres are too long; ann and bob agree."""
+    """Three names have the key of eve and a wrong scale; ann and bob agree."""
     for voice, apart in (("eve", {"e1-1", "e2-1", "e3-1"}), ("", None)):
         town = Town()
         for run in ("ann-1", "bob-1"):
@@ -321,9 +321,9 @@ def test_names_of_one_key_have_one_vote():
         assert not apart or not town.agreement.separation_reason(["ann-1"], ["bob-1"])
 
 
-def quarrel(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
-    """Eve speaks for e1 and e2, whose metres are too long, and that agree. known: voices, of the others
-    nobody knows which they have."""
+def disagreeing_agents(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
+    """The names e1 and e2 have the key of eve and the same wrong scale. known: credentials; those of
+    the others are unknown."""
     town = Town()
     names = (*honest, "e1", "e2")
     for name in names:
@@ -340,21 +340,21 @@ def quarrel(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
     "known", [{}, {"ann": "A"}, {"ann": "A", "e1": "E"}, {"e1": "E"}, {"ann": "A", "e1": "E", "e2": "E"}]
 )
 def test_unknown_credentials_may_all_be_the_same(known):
-    """Ann stands against one key, also while it is not known yet that it is one."""
-    town = quarrel(known)
+    """Ann disagrees with two names of one key, also before the key is known."""
+    town = disagreeing_agents(known)
     assert not town.agreement.quarantined
     assert town.agreement.standing("ann-1").state == "disputed"
 
 
 def test_an_agent_outvoted_under_every_hypothesis_is_quarantined_at_once():
     known = {"ann": "A", "bob": "B", "e1": "E", "e2": "E"}
-    assert quarrel(known, ("ann", "bob", "cat")).agreement.quarantined == {"e1-1", "e2-1"}
-    town = quarrel({"e1": "E"}, ("ann", "bob"))  # who may both be Eve
+    assert disagreeing_agents(known, ("ann", "bob", "cat")).agreement.quarantined == {"e1-1", "e2-1"}
+    town = disagreeing_agents({"e1": "E"}, ("ann", "bob"))  # which may have the key too
     assert not town.agreement.quarantined
 
 
 def test_a_credential_counts_from_when_it_is_known():
-    town = quarrel({"ann": "A"})
+    town = disagreeing_agents({"ann": "A"})
     town.agreement.add_run("e1-1", "e1", "E")
     town.agreement.add_run("e2-1", "e2", "F")
     town.meet("ann-1", "e1-1", 1.05, 12)
@@ -365,15 +365,15 @@ def test_a_credential_counts_from_when_it_is_known():
 
 
 def test_names_of_one_key_that_disagree_are_disputed():
-    """Nobody else has a vote: this is decided, and ends."""
+    """No other agent has a vote: the search ends."""
     assert outvoted_agents([frozenset("ab")], [], dict.fromkeys("ab", "E"), ()) == frozenset()
     assert outvoted_agents([frozenset("ab"), frozenset("ac")], [], {"a": "E", "b": "E", "c": "C"}, "a") == {
         "a"
     }
 
 
-def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
-    """An atlas of ann and bob, and loops between them that were taken back; decide: in the judge's place."""
+def pair_with_withdrawn_loops(decide=None) -> tuple[Atlas, list[Loop]]:
+    """An atlas of ann and bob with withdrawn loops; decide: replaces the decision on loops."""
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.3)
     atlas = Atlas(MergeConfig())
     for walker in (ann, bob):
@@ -388,22 +388,22 @@ def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
 
 
 def test_withdrawn_loops_wait_while_their_agents_are_kept_apart():
-    """Bob is not kept apart any more, but has to be compared first."""
-    atlas, loops = pair_that_met()
-    parting, unproven = atlas.quarantine, atlas.quarantine.agreement.identities.unverified
-    unproven.add("bob")
-    assert parting._reconsider_withdrawn() == ((), ())
-    unproven.clear()
+    """Bob is not separated any more, but unverified."""
+    atlas, loops = pair_with_withdrawn_loops()
+    quarantine, unverified = atlas.quarantine, atlas.quarantine.agreement.identities.unverified
+    unverified.add("bob")
+    assert quarantine._reconsider_withdrawn() == ((), ())
+    unverified.clear()
     gone = Loop(KeyframeKey("ann", 99), loops[0].b, loops[0].T_a_b, loops[0].cov, 9)
-    parting._withdrawn.append(gone)
-    tied, undone = parting._reconsider_withdrawn()
+    quarantine._withdrawn.append(gone)
+    tied, undone = quarantine._reconsider_withdrawn()
     assert len(tied) > len(loops) / 2
     assert not undone
-    assert not parting._withdrawn
+    assert not quarantine._withdrawn
 
 
 def test_withdrawn_loops_are_decided_once_their_agents_are_compared():
-    atlas, loops = pair_that_met()
+    atlas, loops = pair_with_withdrawn_loops()
     atlas.quarantine.agreement.identities.unverified.add("bob")
     said = [atlas.quarantine.add_loop(loop, DepthScale(0.0, 0.005)) for loop in loops]
     assert "bob" not in atlas.quarantine.agreement.identities.unverified
@@ -415,14 +415,14 @@ def test_a_loop_added_again_and_undone_at_once_is_not_reported_as_added():
     def decide(loop: Loop) -> LoopDecision:
         return LoopDecision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
 
-    atlas, loops = pair_that_met(decide)
+    atlas, loops = pair_with_withdrawn_loops(decide)
     tied, undone = atlas.quarantine._reconsider_withdrawn()
     assert tied == tuple(loops[1:])
     assert undone == (loops[0],)
 
 
 def test_scales_are_applied_in_the_order_of_names():
-    """Whatever the hashes of their names are."""
+    """Independent of the hashes of their names."""
     atlas, done = Atlas(MergeConfig()), list[str]()
     names = [f"agent{k}" for k in range(10)]
     for name in names:

@@ -16,7 +16,7 @@ WRONG = se3.exp(np.array([0.0, 0.0, 0.5, 1.0, -0.7, 0.1]))
 
 
 def atlas_of(*walkers: Walker, config: MergeConfig = CONFIG) -> Atlas:
-    """All keyframes of all, taken in turn."""
+    """An atlas with the keyframes of all walkers, in turn."""
     atlas = Atlas(config)
     for i in range(max(len(w.keyframes) for w in walkers)):
         for w in walkers:
@@ -35,7 +35,7 @@ def truth(*walkers: Walker) -> F64:
 
 @pytest.fixture(autouse=True)
 def strict_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As careful as where copies of whole corridors are to be expected."""
+    """As strict as copies of whole corridors require."""
     for name, value in (("NEAR_M", 1.0), ("NEAR_RAD", 0.52), ("PLACE_M", 0.7), ("PLACE_RAD", 0.5)):
         monkeypatch.setattr(loop_consistency, name, value)
     monkeypatch.setattr(loop_acceptance, "JOIN_FOUND", 0.45)
@@ -95,7 +95,7 @@ def test_the_gauge_of_the_reference_segment_never_moves(ann: Walker, bob: Walker
 
 
 def test_the_map_of_lower_rank_stays_however_old_the_other_is() -> None:
-    """A robot came first, then two headsets; they join each other, then him."""
+    """A robot comes first, then two headsets; their maps merge, then with that of the robot."""
     robot, ann, bob = Walker("robot", 1), Walker("ann", 0), Walker("bob", 2)
     atlas, rng = Atlas(CONFIG), np.random.default_rng(0)
     for walker in (robot, ann, bob):
@@ -126,18 +126,19 @@ def test_correction_brings_odometry_into_the_map(ann: Walker, bob: Walker) -> No
     assert correction.T_map_odom == pytest.approx(atlas.T_map_odom("bob"))
     assert (correction.map_id, correction.revision, correction.answered_keyframe) == ("ann/0", 0, 56)
     assert applied.corrections["ann"].answered_keyframe == -1
-    # what is uncertain is where bob is, to a few centimetres, not the far-off origin of his odometry
+    # uncertain is where bob is, to a few centimetres, not the distant origin of its odometry
     cov = se3.inverse_cov(se3.inverse(bob.T_odom_body[-1]), correction.cov)
     assert 0.001 < np.sqrt(np.trace(cov[3:, 3:])) < 0.2
 
 
+@pytest.mark.long
 def test_correction_covariance_is_not_too_small() -> None:
-    """NEES of the joined agent's newest pose in the founder's frame. The atlas believes odometry twice
-    as uncertain as it is here, so that the mean lies below 6; it must not lie above."""
+    """NEES of the newest pose of the second agent in the frame of the first. Odometry is half as uncertain
+    as the atlas assumes, so that the mean is below 6; it must not be above."""
     nees = []
     for seed in range(25):
         a, b = Walker("a", 2 * seed, 30), Walker("b", 2 * seed + 1, 30, phase=0.3)
-        atlas = atlas_of(a, b, config=replace(CONFIG, enter_m=1.0))  # told however unsure it is
+        atlas = atlas_of(a, b, config=replace(CONFIG, enter_m=1.0))  # published however uncertain
         for x in near_loops(a, b, np.random.default_rng(seed), every=2):
             atlas.propose(x)
         applied = settle(atlas)[-1]
@@ -164,7 +165,7 @@ def test_a_wrong_loop_never_merges_maps(ann: Walker, bob: Walker) -> None:
 
 
 def test_small_maps_need_fewer_places_but_more_than_one_keyframe() -> None:
-    """Both have been to two or three places."""
+    """Both maps have two or three places."""
     ann, bob = Walker("ann", 1, 5, turn=0.5), Walker("bob", 2, 5, turn=0.5)
     rng = np.random.default_rng(0)
     atlas = atlas_of(ann, bob)
@@ -177,7 +178,7 @@ def test_small_maps_need_fewer_places_but_more_than_one_keyframe() -> None:
 def test_loops_of_distant_views_do_not_support_a_merge(
     ann: Walker, bob: Walker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They would join, were they believed to have been taken from near."""
+    """They would merge the maps if such views counted as near."""
     rng = np.random.default_rng(0)
     far = [far_loop(ann, i, bob, i, rng) for i in range(0, 40, 4)]
     assert not any(atlas_of(ann, bob).propose(x).accepted for x in far)
@@ -312,14 +313,14 @@ def test_a_solution_of_a_map_that_was_merged_meanwhile_is_discarded(ann: Walker,
 
 
 def far_loop(ann: Walker, i: int, bob: Walker, j: int, rng: np.random.Generator) -> Loop:
-    """A true one, but seen from further than a witness may."""
+    """A true loop of views that are too far apart to support a merge."""
     x = loop(ann, i, bob, j, rng)
     assert np.linalg.norm(x.T_a_b[:3, 3]) > loop_consistency.NEAR_M
     return x
 
 
 def twin_loops(ann: Walker, bob: Walker, count: int, found: float = 0.46) -> list[Loop]:
-    """The room looks the same from the other side: turned by half a turn, bob's way lies on ann's."""
+    """The room looks the same from the other side: turned by 180°, bob's path lies on ann's."""
     half = se3.exp(np.array([0, 0, np.pi, 0, 0, 0]))
     cov = loop(ann, 0, bob, 0, np.random.default_rng(0)).cov
     out = []
@@ -332,7 +333,7 @@ def twin_loops(ann: Walker, bob: Walker, count: int, found: float = 0.46) -> lis
 
 
 def test_a_false_merge_is_undone_by_better_evidence(ann: Walker, bob: Walker) -> None:
-    """False loops at many places that tell one story do join: no geometry can tell. What comes later can."""
+    """Consistent false loops at many places do merge maps; later evidence undoes it."""
     atlas = atlas_of(ann, bob)
     false = twin_loops(ann, bob, 5)
     assert [atlas.propose(x).accepted for x in false] == [False] * 4 + [True]
@@ -357,7 +358,7 @@ def test_a_false_merge_is_undone_by_better_evidence(ann: Walker, bob: Walker) ->
 
 
 def test_slightly_more_contradicting_weight_does_not_undo_a_merge(ann: Walker, bob: Walker) -> None:
-    """Four places against five that weigh nearly as much."""
+    """Four places against five of nearly the same weight."""
     atlas = atlas_of(ann, bob)
     for x in twin_loops(ann, bob, 5):
         atlas.propose(x)
@@ -445,7 +446,7 @@ def test_an_outlier_loop_is_dropped_after_the_solution(
 
 
 def test_without_its_loops_a_merge_is_undone(ann: Walker, bob: Walker) -> None:
-    """As if the solver had found every loop between the two at odds with the map."""
+    """As if every loop between the two were an outlier of the solution."""
     atlas = atlas_of(ann, bob)
     rng = np.random.default_rng(0)
     for x in near_loops(ann, bob, rng):
@@ -461,7 +462,7 @@ def test_without_its_loops_a_merge_is_undone(ann: Walker, bob: Walker) -> None:
 
 
 def test_covariances_are_requested_for_agents_that_are_answered(ann: Walker, bob: Walker) -> None:
-    """For others what they were told stays, until they are in another map."""
+    """For others the published one stays, until they are in another map."""
     atlas = atlas_of(ann, bob)
     loops = near_loops(ann, bob, np.random.default_rng(0))
     for x in loops[:-1]:

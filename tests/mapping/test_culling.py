@@ -1,4 +1,4 @@
-"""Which keyframes go where there are too many: fair between names, and what is over first."""
+"""Which keyframes are removed: fair between names, finished maps first."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STANDING = np.eye(4)
 
 
 def walk(atlas: Atlas, run: str, name: str, count: int, step_m: float = 1.0, first: int = 0) -> None:
-    """So many keyframes of a run, a step forwards each."""
+    """Add `count` keyframes of a run, `step_m` apart."""
     if first == 0:
         atlas.add_run(run, name)
     for k in range(first, first + count):
@@ -38,11 +38,11 @@ def at(x: float) -> F64:
 
 
 def held(atlas: Atlas) -> Counter[str]:
-    """Keyframes of each run."""
+    """Number of keyframes of each run."""
     return Counter(key.agent for key in atlas.all_poses().keys)
 
 
-def thin(atlas: Atlas, most: int) -> None:
+def cull(atlas: Atlas, most: int) -> None:
     atlas.remove_keyframes(atlas.culling.choose(len(atlas) - most))
 
 
@@ -61,22 +61,22 @@ def test_among_equals_the_name_that_connected_longest_ago_gives() -> None:
 
 
 def test_an_absent_run_is_superseded_by_a_newer_one_of_its_name() -> None:
-    owners = AgentRuns()
-    owners.add("ann-1", "ann")
-    owners.set_present("ann-1", False)
-    assert not owners.is_superseded("ann-1")
-    owners.add("ann-2", "ann")
-    assert owners.is_superseded("ann-1")
-    owners.set_present("ann-2", False)
-    assert owners.set_present("ann-1", True)
-    assert (owners.is_superseded("ann-1"), owners.is_superseded("ann-2")) == (False, True)
-    owners.remove("ann-2")
-    assert owners.name("ann-2") == "ann-2"
-    owners.set_present("ann-1", False)
-    assert not owners.is_superseded("ann-1")  # no run of its name has come after it any more
-    owners.add("ann-3", "ann")
-    owners.remove("ann-3")
-    assert not owners.is_superseded("ann-1")
+    runs = AgentRuns()
+    runs.add("ann-1", "ann")
+    runs.set_present("ann-1", False)
+    assert not runs.is_superseded("ann-1")
+    runs.add("ann-2", "ann")
+    assert runs.is_superseded("ann-1")
+    runs.set_present("ann-2", False)
+    assert runs.set_present("ann-1", True)
+    assert (runs.is_superseded("ann-1"), runs.is_superseded("ann-2")) == (False, True)
+    runs.remove("ann-2")
+    assert runs.name("ann-2") == "ann-2"
+    runs.set_present("ann-1", False)
+    assert not runs.is_superseded("ann-1")  # no run of its name has come after it any more
+    runs.add("ann-3", "ann")
+    runs.remove("ann-3")
+    assert not runs.is_superseded("ann-1")
 
 
 @pytest.mark.parametrize(
@@ -93,6 +93,7 @@ def test_articulation_segments_disconnect_the_map(bonds: list[tuple[int, int]], 
     assert articulation_segments(bonds) == expected
 
 
+@pytest.mark.long
 def test_many_small_runs_of_one_name_take_no_keyframe_of_others() -> None:
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 50)
@@ -100,7 +101,7 @@ def test_many_small_runs_of_one_name_take_no_keyframe_of_others() -> None:
         walk(atlas, f"eve-{k}", "eve", 12)
         atlas.set_present(f"eve-{k}", False)
         if len(atlas) > 100:
-            thin(atlas, 100)
+            cull(atlas, 100)
             assert held(atlas)["ann-1"] == 50
             assert len(atlas) == 100
 
@@ -118,33 +119,33 @@ def test_many_small_runs_in_one_map_take_no_keyframe_of_others() -> None:
         atlas.graph.add_loop(loop(ann, 5 * k, eve, 3, rng))
         atlas.set_present(eve.name, False)
         if len(atlas) > 120:
-            thin(atlas, 120)
+            cull(atlas, 120)
             assert len(atlas) == 120
             assert held(atlas)["ann"] == 60
     assert list(atlas.map_sizes()) == ["ann/0"]
 
 
 def test_a_name_keeps_no_more_by_restarting() -> None:
-    """A name with many runs gives as one with a single run does, once it holds as much."""
+    """A name with many runs gives as many keyframes as one with a single run."""
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 80)
     for k in range(4):
         walk(atlas, f"eve-{k}", "eve", 20)
         atlas.set_present(f"eve-{k}", False)
     walk(atlas, "bob-1", "bob", 80)
-    thin(atlas, 150)
+    cull(atlas, 150)
     by_name = Counter(key.agent.partition("-")[0] for key in atlas.all_poses().keys)
     assert by_name == Counter(ann=50, bob=50, eve=50)
 
 
 def test_finished_maps_are_removed_first_and_whole() -> None:
-    """The smallest first; a run that walks on keeps its own."""
+    """The smallest first; a growing run keeps its keyframes."""
     atlas = Atlas(CONFIG)
     for k, count in enumerate((30, 12, 16)):
         walk(atlas, f"eve-{k}", "eve", count)
         atlas.set_present(f"eve-{k}", False)
     walk(atlas, "eve-9", "eve", 40)
-    thin(atlas, 98 - 12 - 16 - 5)
+    cull(atlas, 98 - 12 - 16 - 5)
     assert held(atlas) == Counter({"eve-0": 25, "eve-9": 40})
     assert atlas.is_run_gone("eve-1")
     assert not atlas.is_run_gone("eve-0")
@@ -156,19 +157,19 @@ def test_redundant_keyframes_are_removed_before_finished_maps() -> None:
     walk(atlas, "eve-0", "eve", 20)
     atlas.set_present("eve-0", False)
     walk(atlas, "eve-1", "eve", 60, step_m=0.01)
-    thin(atlas, 40)
+    cull(atlas, 40)
     assert held(atlas) == Counter({"eve-0": 20, "eve-1": 20})
 
 
 def test_new_segments_of_a_present_run_do_not_evade_its_quota() -> None:
-    """Each is a map of its own, whose first keyframe held its gauge."""
+    """Each is a map of its own with an anchor."""
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 30)
     atlas.add_run("eve-1", "eve")
     for k in range(100):
         keyframe = Keyframe(k, -1, k * 10**8, STANDING, STEP, STANDING, UP, UP_SIGMA, EMPTY)
         atlas.add_keyframe("eve-1", keyframe)
-    thin(atlas, 60)
+    cull(atlas, 60)
     assert held(atlas) == Counter({"ann-1": 30, "eve-1": 30})
     assert atlas.T_map_odom("eve-1") is not None
 
@@ -177,7 +178,7 @@ def test_an_absent_run_keeps_its_newest_keyframes() -> None:
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 60)
     atlas.set_present("ann-1", False)
-    thin(atlas, 20)
+    cull(atlas, 20)
     left = {key.id for key in atlas.all_poses().keys}
     assert left >= {0, *range(60 - MIN_LOOP_GAP, 60)}
 
@@ -187,7 +188,7 @@ def test_with_more_names_than_capacity_the_longest_absent_are_removed_whole() ->
     for k in range(30):
         walk(atlas, f"n{k}-1", f"n{k}", 3)
         atlas.set_present(f"n{k}-1", False)
-    thin(atlas, 20)
+    cull(atlas, 20)
     assert len(atlas) <= 30  # the gauge of each map; what holds it may not go while its agent may come back
     assert all(count == 1 for count in held(atlas).values())
 
@@ -198,17 +199,18 @@ def test_newest_keyframes_of_absent_runs_are_removed_where_nothing_else_can_be()
     for k in range(9):
         walk(atlas, f"n{k}-1", f"n{k}", 12)
         atlas.set_present(f"n{k}-1", False)
-    thin(atlas, 47)
+    cull(atlas, 47)
     assert held(atlas) == Counter({"ann-1": 12, "n0-1": 3} | {f"n{k}-1": 4 for k in range(1, 9)})
 
 
+@pytest.mark.long
 def test_many_absent_names_leave_a_present_one_its_share() -> None:
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 100)
     for k in range(100):
         walk(atlas, f"n{k}-1", f"n{k}", 12)
         atlas.set_present(f"n{k}-1", False)
-        thin(atlas, 120)
+        cull(atlas, 120)
         assert len(atlas) <= 120
     assert held(atlas)["ann-1"] == 60
 
@@ -225,8 +227,8 @@ def test_a_segment_that_connects_two_others_keeps_a_keyframe() -> None:
     atlas.set_present("eve-0", False)
     walk(atlas, "eve-1", "eve", 20)
     everything = [n for n in atlas.graph.poses if atlas.key(n).agent == "eve-0"]
-    assert len(atlas.remove_keyframes(everything)) == 19  # whoever chose them
-    thin(atlas, 45)
+    assert len(atlas.remove_keyframes(everything)) == 19  # however they were chosen
+    cull(atlas, 45)
     assert held(atlas)["eve-0"] == 1
     assert len(atlas) == 45
     assert len(set(atlas.all_poses().map_ids)) == 2  # eve's new run is alone; ann and bob are together

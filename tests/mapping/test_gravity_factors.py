@@ -1,4 +1,4 @@
-"""Which way is up, as the agents' IMUs know it, in the pose graph."""
+"""Gravity factors in the pose graph."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ SIGMA = float(np.radians(0.1))
 
 
 def plumb_lines(room: Room, seed: int) -> dict[int, F64]:
-    """As IMUs would tell, of every pose, off by `SIGMA` about both level axes."""
+    """A factor of each pose, with errors of `SIGMA` about both horizontal axes."""
     rng = np.random.default_rng(seed)
     noise = np.column_stack([rng.normal(0, SIGMA, (len(room), 2)), np.zeros(len(room))])
     up = (se3.so3_exp(noise) @ room.truth[:, :3, :3])[:, 2, :3]
@@ -33,7 +33,7 @@ def solved(room: Room, lines: dict[int, F64] | None, wanted: list[int], config: 
 
 
 def tilted(room: Room, degrees: float) -> Room:
-    """All that odometry laid, by an agent that began with a wrong idea of up."""
+    """The room by an agent whose initial up direction was wrong."""
     tilt = se3.exp(np.radians([0.6 * degrees, -0.8 * degrees, 0, 0, 0, 0]))
     about = room.guess[0]
     return replace(room, guess=about @ tilt @ se3.inverse(about) @ room.guess)
@@ -72,10 +72,11 @@ def test_the_map_is_upright_though_its_first_pose_was_not() -> None:
 
 
 def spread(poses: F64, truth: F64) -> float:
-    """RMS of what is off in height, m, where the first pose is right; tilts do most of it."""
+    """RMS error of the height, m, with the first pose aligned; mostly caused by tilt."""
     return float(np.sqrt(((poses[:, 2, 3] - truth[:, 2, 3]) ** 2).mean()))
 
 
+@pytest.mark.long
 def test_gravity_factors_reduce_the_covariances_consistently() -> None:
     """NEES of a late pose over 40 rooms, by an upper bound: not over 6."""
     nees, surer = [], []

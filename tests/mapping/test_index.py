@@ -52,7 +52,7 @@ def test_descriptors_common_to_all_views_do_not_count() -> None:
 
 @pytest.mark.parametrize("n", [37, 64, 300])
 def test_the_result_does_not_depend_on_the_page_of_a_keyframe(n: int) -> None:
-    """Against words counted by hand; descriptors are random, so that no word is too common to be read."""
+    """Compared with counted words; descriptors are random, so that no word is too frequent."""
     rng = np.random.default_rng(3)
     index, places = filled(n, rng)
     query = noisy(places[11], rng, 0.1)
@@ -115,7 +115,7 @@ def test_merged_pages_equal_one_page_of_the_remaining_keyframes() -> None:
 
 
 def test_frequent_words_are_not_read() -> None:
-    """Of a view whose every word is in every keyframe, nothing is left to find it by."""
+    """A view whose every word is in every keyframe is not found."""
     index = PlaceIndex(seed=0)
     same = np.random.default_rng(7).integers(0, 256, (200, 32), np.uint8)
     for i in range(100):
@@ -143,7 +143,7 @@ def test_empty_index_and_empty_view() -> None:
 
 
 def test_words_of_removed_keyframes_are_not_counted() -> None:
-    """Otherwise they would count as common, and be read no more."""
+    """Otherwise they would count as frequent, and not be read."""
     rng = np.random.default_rng(8)
     index, _ = filled(320, rng)
     for i in rng.permutation(320)[:200]:

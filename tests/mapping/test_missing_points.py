@@ -24,11 +24,13 @@ def test_no_point_is_missing_in_views_of_the_same() -> None:
     assert seen.missing_share < 0.1
 
 
-def changed(sight: CameraView, where: NDArray[np.bool_]) -> CameraView:
+def changed(camera_view: CameraView, where: NDArray[np.bool_]) -> CameraView:
     """The same view, with something else at the keypoints where (N,)."""
-    view = sight.view
+    view = camera_view.view
     other = np.random.default_rng(0).integers(0, 256, view.descriptors.shape, np.uint8)
-    return replace(sight, view=View(view.uv, view.points, np.where(where[:, None], other, view.descriptors)))
+    return replace(
+        camera_view, view=View(view.uv, view.points, np.where(where[:, None], other, view.descriptors))
+    )
 
 
 def test_removed_points_are_missing_and_form_a_missing_region() -> None:
@@ -43,7 +45,7 @@ def test_removed_points_are_missing_and_form_a_missing_region() -> None:
 
 
 def test_scattered_missing_points_form_no_region() -> None:
-    """Half of all, as detectors miss them."""
+    """Half of the points, as detectors miss them."""
     query, candidate = sights(1, T_C_Q, n=1500)
     some = changed(candidate, np.random.default_rng(1).random(len(candidate.view)) < 0.5)
     assert missing_points(query, some, bodies(T_C_Q)).missing_share > 0.45
@@ -57,7 +59,7 @@ def test_at_a_wrong_pose_nearly_all_points_are_missing() -> None:
 
 
 def test_occluded_points_are_not_missing() -> None:
-    """The candidate stands before a wall 1 m away; what is behind it cannot be expected."""
+    """The candidate is in front of a wall at 1 m; points behind it are not expected."""
     query, candidate = sights(3, T_C_Q, depth_share=1.0)
     view = candidate.view
     wall = View(view.uv, view.points / view.points[:, 2:], np.zeros_like(view.descriptors))

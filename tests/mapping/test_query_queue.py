@@ -1,4 +1,4 @@
-"""Whose keyframe is looked up next."""
+"""Which keyframe is looked up next."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def test_an_agent_that_sends_much_has_its_older_keyframes_skipped() -> None:
 
 
 def test_of_many_agents_the_newest_are_served_and_none_starves() -> None:
-    """Twenty agents in turn, half as many look-ups as keyframes: none is looked up that is older than a few
-    others, and everybody has its turn."""
+    """Twenty agents in turn, half as many look-ups as keyframes: only recent keyframes are looked up, and
+    each agent has its turn."""
     queue, served, age = QueryQueue(EdgeConfig(max_waiting=12, each_waiting=3)), Counter[int](), []
     for number in range(2000):
         queue.add(f"agent{number % 20}", AR, number)

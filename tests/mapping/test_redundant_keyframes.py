@@ -1,4 +1,4 @@
-"""Fewer keyframes, the same room."""
+"""Removal of redundant keyframes from the graph."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from share.types import F64
 CONFIG = MergeConfig()
 
 
-def chart_of(*walkers: Walker) -> MapGraph:
-    chart = MapGraph()
+def graph_of(*walkers: Walker) -> MapGraph:
+    graph = MapGraph()
     for walker in walkers:
         for keyframe in walker.keyframes:
-            chart.add_keyframe(walker.name, keyframe, keyframe.cov, keyframe.up)
-    return chart
+            graph.add_keyframe(walker.name, keyframe, keyframe.cov, keyframe.up)
+    return graph
 
 
 def at(x: float, yaw: float = 0.0) -> F64:
@@ -74,14 +74,14 @@ def test_each_name_gives_its_quota() -> None:
 
 def test_removing_a_keyframe_connects_its_neighbours() -> None:
     ann = Walker("ann", 1)
-    chart = chart_of(ann)
-    out = remove_keyframe(chart, 30)
+    graph = graph_of(ann)
+    out = remove_keyframe(graph, 30)
     assert out.key == KeyframeKey("ann", 30)
     assert out.link is not None
     assert (out.link.key, out.link.reference) == (KeyframeKey("ann", 31), 29)
     assert out.link.T_ref_body == pytest.approx(se3.inverse(ann.T_odom_body[29]) @ ann.T_odom_body[31])
-    assert len(chart.edges.by_id) == 58
-    (known,) = chart.relative_estimates(29, [31])
+    assert len(graph.edges.by_id) == 58
+    (known,) = graph.relative_estimates(29, [31])
     twice = se3.compose_cov(ann.keyframes[31].T_ref_body, ann.keyframes[30].cov, ann.keyframes[31].cov)
     assert known.cov == pytest.approx(twice)
 
@@ -97,8 +97,8 @@ def test_ambiguous_places_are_forgotten_with_their_keyframes() -> None:
 
 def test_without_its_first_keyframe_a_segment_begins_with_the_next() -> None:
     ann = Walker("ann", 1)
-    chart = chart_of(ann)
-    out = remove_keyframe(chart, 0)
+    graph = graph_of(ann)
+    out = remove_keyframe(graph, 0)
     assert out.link is not None
     assert out.link.reference == -1
     assert out.link.T_ref_body == pytest.approx(ann.T_odom_body[1], abs=1e-9)
@@ -106,15 +106,15 @@ def test_without_its_first_keyframe_a_segment_begins_with_the_next() -> None:
 
 def test_loops_move_to_the_neighbour() -> None:
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.7)
-    chart = chart_of(ann, bob)
-    chart.add_loop(loop(ann, 20, bob, 10, np.random.default_rng(0)))
-    out = remove_keyframe(chart, 20)
+    graph = graph_of(ann, bob)
+    graph.add_loop(loop(ann, 20, bob, 10, np.random.default_rng(0)))
+    out = remove_keyframe(graph, 20)
     (moved,) = out.moved_loops
     assert moved.a in (KeyframeKey("ann", 19), KeyframeKey("ann", 21))
     assert moved.b == KeyframeKey("bob", 10)
     wanted = se3.inverse(ann.truth[moved.a.id]) @ bob.truth[10]
     assert np.abs(moved.T_a_b - wanted).max() < 0.1
-    assert list(chart.edges.loops.values()) == [moved]
+    assert list(graph.edges.loops.values()) == [moved]
 
 
 def test_the_last_loop_between_two_segments_stays_whatever_the_limit(
@@ -122,12 +122,12 @@ def test_the_last_loop_between_two_segments_stays_whatever_the_limit(
 ) -> None:
     monkeypatch.setattr(keyframe_removal, "MAX_LOOPS", 0)
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.7)
-    chart = chart_of(ann, bob)
-    chart.add_loop(loop(ann, 20, bob, 10, np.random.default_rng(0)))
-    out = remove_keyframe(chart, 20)
+    graph = graph_of(ann, bob)
+    graph.add_loop(loop(ann, 20, bob, 10, np.random.default_rng(0)))
+    out = remove_keyframe(graph, 20)
     assert len(out.moved_loops) == 1
-    chart.update_maps()
-    assert chart.reference_segments == [0, 0]
+    graph.update_maps()
+    assert graph.reference_segments == [0, 0]
 
 
 def settle(atlas: Atlas, solver: PoseGraphSolver) -> None:

@@ -99,8 +99,9 @@ def test_a_revisited_room_is_no_worse_than_by_gtsam() -> None:
     assert rms(solver.solve(0).poses, truth) < 1.05 * rms(theirs.poses, truth)
 
 
+@pytest.mark.long
 def test_incremental_solutions_converge_to_the_batch_solution(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also a pose and a loop that come and go leave nothing behind."""
+    """Also a pose and a loop that were added and removed have no effect."""
     room = simulate(300, 3, 2)
     solver = PoseGraphSolver(CONFIG)
     for k in range(0, 300, 20):
@@ -135,7 +136,7 @@ def test_a_removed_loop_has_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_merged_map_is_moved_and_solved() -> None:
-    """The second agent's map lies 3 m off until its first loop comes."""
+    """The second agent's map is 3 m off until its first loop."""
     room = simulate(200, 2, 5)
     second = range(1, 200, 2)
     away = se3.exp(np.array([0, 0, 1.0, 3.0, 0, 0]))
@@ -170,8 +171,9 @@ def test_covariances_are_tight_upper_bounds() -> None:
         assert np.trace(ours[3:, 3:]) < 1.3**2 * np.trace(theirs[3:, 3:])
 
 
+@pytest.mark.long
 def test_covariance_is_consistent() -> None:
-    """NEES of a late pose over 40 rooms: 6 on average if exact, less where an upper bound is told."""
+    """NEES of a late pose over 40 rooms: 6 on average if exact, less for an upper bound."""
     nees = []
     for seed in range(40):
         room = simulate(60, 2, 100 + seed)
@@ -210,7 +212,7 @@ def test_any_valid_covariance_is_solved(scale: float) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_nothing_that_is_valid_raises(seed: int) -> None:
-    """Certainties over 40 orders of magnitude, false loops, poses laid anywhere."""
+    """Covariances over 40 orders of magnitude, false loops, arbitrary poses."""
     rng = np.random.default_rng(seed)
     room = simulate(40, 3, seed)
     edges = [*room.chain, *room.closures, *false_loops(room, 10, seed)]

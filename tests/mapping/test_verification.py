@@ -85,7 +85,7 @@ def test_gravity_must_agree() -> None:
 
 
 def test_scale_that_differs_between_the_directions_is_refused() -> None:
-    """A view whose depths are all twice too long sees its own motion too long as well."""
+    """A view with doubled depths gives a doubled motion."""
     query, candidate = sights(8, T_C_Q)
     stretched = View(query.view.uv, query.view.points * 2, query.view.descriptors)
     assert reason(replace(query, view=stretched), candidate).startswith("two poses fit")

@@ -1,4 +1,4 @@
-"""A map for other programs: what they read is what the map says."""
+"""Exported files hold the values of the map."""
 
 import csv
 import os
@@ -29,7 +29,7 @@ def kept_of(tmp_path, changes):
 
 
 def read_ply(path):
-    """As the format says: a header of lines, then records. Points (N, 3) and colours (N, 3)."""
+    """Read a PLY file: points (N, 3) and colours (N, 3)."""
     head, _, data = path.read_bytes().partition(b"end_header\n")
     lines = head.decode().splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]

@@ -38,7 +38,7 @@ def test_an_unreadable_map_is_refused_in_one_line(
     monkeypatch.setattr(rows, "_READABLE_VERSIONS", (WIRE_VERSION,))
     with pytest.raises(
         StoreError, match=f"wire version {old}, this SHARE reads {WIRE_VERSION}: use the SHARE"
-    ) as told:
+    ) as raised:
         MapStore.open(path)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
     assert path.read_bytes() == before

@@ -1,4 +1,4 @@
-"""The map file: what was written is found again, to the last bit, by whoever may."""
+"""The map file: all that was written is read back to the last bit."""
 
 import os
 import resource
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution, told
+from helpers.map_changes import ANN, BOB, as_values, keyframe, loop, pose, run, small_map, solution
 from helpers.special_files import KINDS, special
 
 from share.errors import StoreError, UsageError
@@ -41,7 +41,7 @@ def path(tmp_path):
     return tmp_path / "room.sqlite"
 
 
-def again(path):
+def reopened(path):
     with MapStore.open(path) as store:
         return store.load()
 
@@ -52,7 +52,7 @@ def files(path):
 
 def test_a_new_file_is_empty(path):
     with MapStore.open(path) as store:
-        assert told(store.load()) == told(type(store.load())())
+        assert as_values(store.load()) == as_values(type(store.load())())
         assert (store.writable, store.read_only_reason) == (True, "")
     assert is_map(path)
     assert files(path) == ["room.sqlite", "room.sqlite.lock"]
@@ -61,9 +61,9 @@ def test_a_new_file_is_empty(path):
 def test_all_changes_are_read_back(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-        before = told(store.load())
-    kept = again(path)
-    assert told(kept) == before
+        before = as_values(store.load())
+    kept = reopened(path)
+    assert as_values(kept) == before
     frames = [keyframe(key, i) for i in range(20) for key in (ANN, BOB)]
     assert [k.keyframe_key for k in kept.keyframes] == [k.keyframe_key for k in frames]
     for found, sent in zip(kept.keyframes, frames, strict=True):
@@ -80,9 +80,9 @@ def test_all_changes_are_read_back(path):
 def test_repeated_changes_change_nothing(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-        before = told(store.load())
+        before = as_values(store.load())
         store.write(small_map())
-        assert told(store.load()) == before
+        assert as_values(store.load()) == before
 
 
 def test_a_new_solution_replaces_the_old(path):
@@ -107,7 +107,7 @@ def test_ids_of_removed_keyframes_are_not_used_again(path):
             ]
         )
         store.write([keyframe(ANN, 4), keyframe(ANN, 19)])  # late copies
-    kept = again(path)
+    kept = reopened(path)
     numbers = [k.keyframe_key.id for k in kept.keyframes if k.run_key == ANN]
     assert numbers == [i for i in range(19) if i != 4]
     assert kept.next_ids[ANN] == 20
@@ -127,47 +127,47 @@ def test_segments_stay_in_order_without_their_keyframes(path):
             [keyframe(ANN, 2), keyframe(ANN, 3), RemoveKeyframes((KeyframeKey(ANN, 2),)), keyframe(ANN, 4)]
         )
         store.write([keyframe(ANN, 5, first=True)])
-    kept = again(path)
+    kept = reopened(path)
     assert kept.segments == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1", f"{ANN}/2")
     places = [(k.keyframe_key.id, k.segment_name, k.ordinal) for k in kept.keyframes if k.run_key == ANN]
     assert places == [(1, f"{ANN}/1", 0), (3, f"{ANN}/1", 2), (4, f"{ANN}/1", 3), (5, f"{ANN}/2", 0)]
 
 
-def voices(path):
-    return {run.run_key: run.credential for run in again(path).runs}
+def credentials(path):
+    return {run.run_key: run.credential for run in reopened(path).runs}
 
 
 def test_credentials_are_stored_and_may_change(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-    assert voices(path) == {ANN: f"key of {ANN[:3]}", BOB: ""}
+    assert credentials(path) == {ANN: f"key of {ANN[:3]}", BOB: ""}
     for voice in ("E", "F", ""):
         with MapStore.open(path) as store:
             store.write(
                 [SaveCredential(BOB, voice), SaveCredential(ANN, voice), SaveCredential("eve-0003", "E")]
             )
-        assert voices(path) == {ANN: voice, BOB: voice}
+        assert credentials(path) == {ANN: voice, BOB: voice}
     with MapStore.open(path) as store:
         store.write([SaveCredential(BOB, "B"), SaveCredential(ANN, "A"), RemoveRun(BOB)])
         store.write([run(BOB)])
-    assert voices(path) == {ANN: "A", BOB: ""}
+    assert credentials(path) == {ANN: "A", BOB: ""}
 
 
 def test_a_map_of_share_0_1_has_no_credentials_and_is_not_changed_by_opening(path):
-    """It has only the rows that `about` begins with; whose number and schema are the same as now."""
+    """It has only the first rows of `about`, with the numbers and the schema of today."""
     with MapStore.open(path) as store:
         store.write([replace(one, credential="") if isinstance(one, SaveRun) else one for one in small_map()])
         assert schema.SCHEMA == 3
     with closing(sqlite3.connect(path)) as connection:
         assert {name for (name,) in connection.execute("SELECT name FROM about")} == {"schema", "made by"}
-    kept = again(path)
+    kept = reopened(path)
     assert {run.credential for run in kept.runs} == {""}
     assert {run.credential for run in with_unknown_credentials(kept).runs} == {None}  # may be anybody
     assert kept.problems == ()
     assert files(path) == ["room.sqlite", "room.sqlite.lock"]
     with MapStore.open(path) as store:
         store.write([SaveCredential(ANN, "A")])
-    assert {run.run_key: run.credential for run in with_unknown_credentials(again(path)).runs} == {
+    assert {run.run_key: run.credential for run in with_unknown_credentials(reopened(path)).runs} == {
         ANN: "A",
         BOB: None,
     }
@@ -197,6 +197,7 @@ def test_another_thread_may_write(path):
         assert len(store.load().keyframes) == 40
 
 
+@pytest.mark.long
 def test_a_map_has_one_writer_and_any_number_of_readers(path):
     with MapStore.open(path) as store:
         store.write(small_map())
@@ -278,12 +279,13 @@ def test_a_full_disk_keeps_nothing_half_and_recovers(path):
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
             signal.signal(signal.SIGXFSZ, before)
         store.write([keyframe(ANN, i, 500) for i in range(3, 20)])
-    assert [k.keyframe_key.id for k in again(path).keyframes] == list(range(20))
+    assert [k.keyframe_key.id for k in reopened(path).keyframes] == list(range(20))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("killed", [False, True], ids=["closed", "killed"])
 def test_a_read_only_map_is_opened_for_reading(killed):
-    """As somebody who is not root: root may write everything."""
+    """As a user other than root, who may write everything."""
     folder = Path(tempfile.mkdtemp())
     path = folder / "room.sqlite"
     try:
@@ -310,6 +312,7 @@ def test_a_read_only_map_is_opened_for_reading(killed):
         shutil.rmtree(folder)
 
 
+@pytest.mark.long
 def test_the_file_stays_bounded_when_keyframes_are_removed(path):
     with MapStore.open(path) as store:
         store.write([run(ANN)])
@@ -330,15 +333,15 @@ def test_keyframes_of_an_earlier_wire_version_that_have_not_changed_are_read(pat
         then.setattr(codec, "WIRE_VERSION", 3)
         with MapStore.open(path) as store:
             store.write(small_map())
-            before = told(store.load())
-    assert told(again(path)) == before
+            before = as_values(store.load())
+    assert as_values(reopened(path)) == before
     path.unlink()
     monkeypatch.setattr(codec, "WIRE_VERSION", 99)
     with MapStore.open(path) as store:
         store.write(small_map())
     monkeypatch.undo()
     with pytest.raises(StoreError, match=r"have wire version 99, this SHARE reads \d+: use the SHARE that"):
-        again(path)
+        reopened(path)
 
 
 @pytest.mark.parametrize("end", ["-wal", "-shm"])
@@ -358,7 +361,7 @@ def test_side_files_of_a_map_must_be_regular_files(path, end, kind, made):
         MapStore.open(path)
     assert not (path.parent / "elsewhere").exists()
     beside.rmdir() if kind == "folder" else beside.unlink()
-    assert again(path) is not None
+    assert reopened(path) is not None
 
 
 LIMITED = """
@@ -379,9 +382,10 @@ except StoreError as error:
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("limit", [1_000, 10_000, 40_000, 100_000, 300_000])
 def test_a_file_size_limit_is_named(path, limit):
-    """SQLite says "disk I/O error". Wherever it meets the limit: file, log or index."""
+    """SQLite reports "disk I/O error", for the file, the log or the index."""
     here = Path(__file__).parents[1]
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, path, str(limit)],

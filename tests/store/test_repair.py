@@ -1,4 +1,4 @@
-"""Keyframes whose reference is lost are tied to what is left, and no surer than before."""
+"""Keyframes whose reference is lost are reconnected, and no more certain than before."""
 
 from dataclasses import replace
 

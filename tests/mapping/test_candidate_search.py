@@ -1,10 +1,10 @@
-"""How many candidates are tried, while nobody waits and while somebody does."""
+"""How many candidates are tried while other queries wait, and while none does."""
 
 from share.mapping.query_queue import CandidateSearch
 
 
 def tried(search: CandidateSearch, hurries: list[bool], hits: set[int]) -> list[int]:
-    """Until it has enough; hurries: whether others wait, at each step. hits: those that are verified."""
+    """Candidates tried. hurries: whether others wait, at each step. hits: those that are verified."""
     out = []
     for in_a_hurry in hurries:
         candidate = search.next_candidate(in_a_hurry)

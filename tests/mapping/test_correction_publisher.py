@@ -1,4 +1,4 @@
-"""Which corrections are sent."""
+"""The filter of corrections that are sent."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ def is_sent(publisher: CorrectionPublisher, agent: str, correction: Correction) 
 
 
 def test_corrections_that_move_odom_unnoticeably_are_not_sent() -> None:
-    concern = CorrectionPublisher()
-    assert is_sent(concern, "ann", correction())
-    assert not is_sent(concern, "ann", correction(shift_m=0.0009))
-    assert not is_sent(concern, "ann", correction(turn_deg=0.019))
-    assert is_sent(concern, "bob", correction())
+    publisher = CorrectionPublisher()
+    assert is_sent(publisher, "ann", correction())
+    assert not is_sent(publisher, "ann", correction(shift_m=0.0009))
+    assert not is_sent(publisher, "ann", correction(turn_deg=0.019))
+    assert is_sent(publisher, "bob", correction())
 
 
 def test_small_changes_add_up() -> None:
-    concern = CorrectionPublisher()
-    sent = [is_sent(concern, "ann", correction(shift_m=0.0004 * k)) for k in range(7)]
+    publisher = CorrectionPublisher()
+    sent = [is_sent(publisher, "ann", correction(shift_m=0.0004 * k)) for k in range(7)]
     assert sent == [True, False, False, True, False, False, True]
 
 
 def test_an_answer_and_another_map_are_always_sent() -> None:
-    concern = CorrectionPublisher()
-    is_sent(concern, "ann", correction())
-    assert is_sent(concern, "ann", correction(answers=3))
-    assert is_sent(concern, "ann", correction(map_id="b/0"))
-    assert is_sent(concern, "ann", correction(turn_deg=0.021, map_id="b/0"))
+    publisher = CorrectionPublisher()
+    is_sent(publisher, "ann", correction())
+    assert is_sent(publisher, "ann", correction(answers=3))
+    assert is_sent(publisher, "ann", correction(map_id="b/0"))
+    assert is_sent(publisher, "ann", correction(turn_deg=0.021, map_id="b/0"))
 
 
 def test_a_correction_that_is_held_back_is_reported_once_for_each_map() -> None:
