@@ -70,12 +70,13 @@ class LoopAcceptance:
     """Decides on the loops of one graph and adds them to it.
 
     pending: loops that need support, oldest first. contradicting: loops that contradict their map.
+    ambiguous_nodes: those at places with a known look-alike.
     """
 
     def __init__(self, config: MergeConfig, graph: MapGraph, overlap_check: OverlapCheck) -> None:
         self.pending: list[Loop] = []
         self.contradicting: list[Loop] = []
-        self._ambiguous_nodes: set[int] = set()  # at places with a known look-alike
+        self.ambiguous_nodes: set[int] = set()
         self._rejected_at: dict[Loop, F64] = {}  # pending loops that did not fit, and T_a_b of the map then
         self._config, self._graph, self._overlap_check = config, graph, overlap_check
 
@@ -128,7 +129,7 @@ class LoopAcceptance:
 
     def remove_keyframes(self, removed: Collection[KeyframeKey]) -> None:
         """Forget loops of keyframes that were removed from the graph."""
-        self._ambiguous_nodes.intersection_update(self._graph.poses)
+        self.ambiguous_nodes.intersection_update(self._graph.poses)
         self.pending = [loop for loop in self.pending if loop.keyframes.isdisjoint(removed)]
         self.contradicting = [loop for loop in self.contradicting if loop.keyframes.isdisjoint(removed)]
 
@@ -174,7 +175,7 @@ class LoopAcceptance:
         """
         a, b = (self._graph.segment(key) for key in (loop.a, loop.b))
         if a == b:
-            self._ambiguous_nodes.update(self._graph.loop_nodes(loop))
+            self.ambiguous_nodes.update(self._graph.loop_nodes(loop))
             return LoopDecision(False, f"{reason}: two places look alike")
         loop = self._overlap_check.with_found_share(loop)
         consistent = [*self._consistent_loops(loop, self.contradicting), loop]
@@ -328,7 +329,7 @@ class LoopAcceptance:
             segment = graph.odometry.nodes[node_id].segment
             ambiguous = [
                 n
-                for n in self._ambiguous_nodes
+                for n in self.ambiguous_nodes
                 if n in graph.poses and graph.odometry.nodes[n].segment == segment
             ]
             if is_at_any(graph.poses[node_id], [graph.poses[n] for n in ambiguous]):

@@ -248,9 +248,9 @@ def test_any_number_of_removed_runs_leaves_only_the_suspicion():
         atlas.remove_run(eve.name)
         atlas.set_present("eve-next", False)
         atlas.remove_run("eve-next")
-        assert not agreement._pairs
+        assert not agreement.pairs
         assert not agreement.disputed
-        assert agreement._covariance_scales._claims.known_agents == {"ann"}
+        assert agreement.covariance_scales.claims.known_agents == {"ann"}
         assert atlas.quarantine.agreement.standing("ann").state == "unknown"
 
 
@@ -265,7 +265,7 @@ def test_a_disagreement_outlives_the_keyframes_that_showed_it():
         first = town.numbers[f"bob-{n}"]
         town.agreement.remove_nodes(range(first, first + 12), {town.numbers["ann-1"]})
         assert bool(town.agreement.disputed) == (n > 1)
-    (pair,) = town.agreement._pairs.values()
+    (pair,) = town.agreement.pairs.values()
     assert len(pair.by_segments) == 1
     assert sum(len(met.loops) for met in pair.by_segments.values()) <= 32
 
@@ -280,13 +280,13 @@ def test_the_covariance_evidence_of_a_segment_is_removed_with_it():
     for loop in near_loops(ann, bob, rng, every=2):
         atlas.quarantine.add_loop(loop, DepthScale(0.0, 0.005))
     agreement = atlas.quarantine.agreement
-    (pair,) = agreement._pairs.values()
-    assert agreement._covariance_scales._evidence.keys() == pair.by_segments.keys() == {(0, 1)}
+    (pair,) = agreement.pairs.values()
+    assert agreement.covariance_scales.evidence.keys() == pair.by_segments.keys() == {(0, 1)}
     atlas.set_present("bob-1", False)
     atlas.add_run("bob-2", "bob")
     gone = [n for n in range(len(atlas)) if atlas.key(n).agent == "bob-1"]
     assert len(atlas.remove_keyframes(gone)) == len(gone)
-    assert not agreement._covariance_scales._evidence
+    assert not agreement.covariance_scales.evidence
     assert (0, 1) not in pair.by_segments
     assert atlas.quarantine.agreement.standing("ann").state == "agrees"
 
@@ -381,7 +381,7 @@ def pair_with_withdrawn_loops(decide=None) -> tuple[Atlas, list[Loop]]:
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     loops = near_loops(ann, bob, np.random.default_rng(0))
-    atlas.quarantine._withdrawn = list(loops)
+    atlas.quarantine.withdrawn = list(loops)
     if decide is not None:
         atlas.loop_acceptance.decide = decide
     return atlas, loops
@@ -392,14 +392,14 @@ def test_withdrawn_loops_wait_while_their_agents_are_kept_apart():
     atlas, loops = pair_with_withdrawn_loops()
     quarantine, unverified = atlas.quarantine, atlas.quarantine.agreement.identities.unverified
     unverified.add("bob")
-    assert quarantine._reconsider_withdrawn() == ((), ())
+    assert quarantine.reconsider_withdrawn() == ((), ())
     unverified.clear()
     gone = Loop(KeyframeKey("ann", 99), loops[0].b, loops[0].T_a_b, loops[0].cov, 9)
-    quarantine._withdrawn.append(gone)
-    tied, undone = quarantine._reconsider_withdrawn()
+    quarantine.withdrawn.append(gone)
+    tied, undone = quarantine.reconsider_withdrawn()
     assert len(tied) > len(loops) / 2
     assert not undone
-    assert not quarantine._withdrawn
+    assert not quarantine.withdrawn
 
 
 def test_withdrawn_loops_are_decided_once_their_agents_are_compared():
@@ -416,7 +416,7 @@ def test_a_loop_added_again_and_undone_at_once_is_not_reported_as_added():
         return LoopDecision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
 
     atlas, loops = pair_with_withdrawn_loops(decide)
-    tied, undone = atlas.quarantine._reconsider_withdrawn()
+    tied, undone = atlas.quarantine.reconsider_withdrawn()
     assert tied == tuple(loops[1:])
     assert undone == (loops[0],)
 
@@ -429,5 +429,5 @@ def test_scales_are_applied_in_the_order_of_names():
         atlas.add_keyframe(name, Walker(name, 1, n=1).keyframes[0])
     atlas.quarantine.agreement.log_scales = dict.fromkeys(names, 0.01)
     atlas.graph.rescale_odometry = lambda agent, log, width: done.append(agent)
-    atlas.quarantine._apply_scales()
+    atlas.quarantine.apply_scales()
     assert done == names

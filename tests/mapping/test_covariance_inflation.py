@@ -96,7 +96,7 @@ def test_the_graph_is_rescaled_and_stored_links_are_not():
         atlas.add_keyframe("eve", e)
     graph, agreement = atlas.graph, atlas.quarantine.agreement
     agreement.log_scales["eve"], agreement.covariance_scale = 0.01, lambda run: 4.0 if run == "eve" else 1.0
-    atlas.quarantine._apply_scales()
+    atlas.quarantine.apply_scales()
     assert atlas.solving.due_maps() == ["eve/0"]
     atlas.add_keyframe("eve", eve.keyframes[30])
     for walker, by in ((ann, 1.0), (eve, np.exp(-0.01))):
@@ -115,7 +115,7 @@ def test_the_graph_is_rescaled_and_stored_links_are_not():
     plain = inflate_covariance(MergeConfig(), stated, eve.keyframes[6].cov)
     assert np.trace(taken.link.cov) < 3 * np.trace(plain)  # of two steps
     agreement.log_scales["eve"] = 0.0
-    atlas.quarantine._apply_scales()
+    atlas.quarantine.apply_scales()
     last = [graph.odometry.node_id(KeyframeKey("eve", k)) for k in (29, 30)]
     assert graph.odometry_edge(*last).T_a_b[:3, 3] == pytest.approx(eve.keyframes[30].T_ref_body[:3, 3])
 

@@ -68,7 +68,7 @@ def test_correct_agents_are_not_scaled():
 
 
 def test_few_loops_change_no_scale():
-    covariance_scales = CovarianceScales(CovarianceClaims())
+    covariance_scales = CovarianceScales()
     rng = np.random.default_rng(0)
     x, y = ring(0.0), ring(0.7)
     a, b = chain(steps_of(x, rng, drift=10.0)), chain(steps_of(y, rng, drift=10.0))
@@ -160,8 +160,8 @@ def test_loops_between_agents_that_disagree_scale_no_covariance():
 def test_a_scale_near_its_threshold_does_not_toggle():
     """Its variances are 4.5 times below another's, twice the tolerance; steps differ in size."""
     rng, applied = np.random.default_rng(0), list[float]()
-    covariance_scales = CovarianceScales(CovarianceClaims())
-    covariance_scales.link("ann", "bob")
+    covariance_scales = CovarianceScales()
+    covariance_scales.claims.link("ann", "bob")
     for _ in range(300):
         for name, part in (("ann", 1.0), ("bob", 1 / 4.5)):
             step = se3.exp(np.r_[rng.normal(0, 0.05, 3), rng.normal(0, 0.15, 3)])

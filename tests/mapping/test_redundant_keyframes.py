@@ -90,9 +90,9 @@ def test_ambiguous_places_are_forgotten_with_their_keyframes() -> None:
     ann, atlas = Walker("ann", 1), Atlas(CONFIG)
     for keyframe in ann.keyframes:
         atlas.add_keyframe("ann", keyframe)
-    atlas.loop_acceptance._ambiguous_nodes.update({20, 30})
+    atlas.loop_acceptance.ambiguous_nodes.update({20, 30})
     assert [out.node_id for out in atlas.remove_keyframes([20, 21])] == [20, 21]
-    assert atlas.loop_acceptance._ambiguous_nodes == {30}
+    assert atlas.loop_acceptance.ambiguous_nodes == {30}
 
 
 def test_without_its_first_keyframe_a_segment_begins_with_the_next() -> None:

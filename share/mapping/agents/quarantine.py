@@ -37,7 +37,7 @@ class QuarantineChange:
 
 
 class Quarantine:
-    """Quarantine in one graph. camera_views: by node id."""
+    """Quarantine in one graph. camera_views: by node id. withdrawn: loops that are kept for later."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class Quarantine:
     ) -> None:
         self.agreement = AgentAgreement(tolerance)
         self._graph, self._loop_acceptance, self._camera_views = graph, loop_acceptance, camera_views
-        self._withdrawn: list[Loop] = []
+        self.withdrawn: list[Loop] = []
 
     def remove_run(self, run: str) -> None:
         """Forget a run without keyframes that will not return."""
@@ -61,7 +61,7 @@ class Quarantine:
         odometry = self._graph.odometry
         agent = odometry.nodes[node_id].key.agent
         self.agreement.add_step(agent, node_id, odometry.previous_node(node_id), T_ref_body, cov)
-        self._apply_scales()
+        self.apply_scales()
 
     def add_loop(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
         """Compare the agents of a verified loop, and split maps of agents that no longer agree.
@@ -77,7 +77,7 @@ class Quarantine:
         before, unverified = self._separated(), self.agreement.identities.unverified
         unverified_before = len(unverified)
         changed = self.agreement.add_loop(agents, segments, edge, depth_scale, self._tilt(edge))
-        self._apply_scales()
+        self.apply_scales()
         if not changed and len(unverified) == unverified_before:
             return QuarantineChange()
         after = self._separated()
@@ -86,7 +86,7 @@ class Quarantine:
         )
         standings = {name: self.agreement.standing(name) for name in sorted(affected)}
         dropped = self._split_maps()
-        added, undone = self._reconsider_withdrawn()
+        added, undone = self.reconsider_withdrawn()
         return QuarantineChange(standings, (*dropped, *undone), added)
 
     def _separated(self) -> tuple[frozenset[str], frozenset[frozenset[str]]]:
@@ -136,7 +136,7 @@ class Quarantine:
     def _log_scale(self, agent: str) -> float:
         return self._graph.log_scales.get(agent, 0.0)
 
-    def _apply_scales(self) -> None:
+    def apply_scales(self) -> None:
         agreement, graph = self.agreement, self._graph
         for agent in sorted(
             {graph.odometry.segments[segment].agent for segment in graph.odometry.live_segments}
@@ -174,7 +174,7 @@ class Quarantine:
             ):
                 dropped += self._loop_acceptance.split_segments(a, b)
         dropped += graph.drop_loops(self._weak_loops(before, {before[graph.segment(x.a)] for x in dropped}))
-        self._withdrawn = [*self._withdrawn, *dropped][-_MAX_WITHDRAWN:]
+        self.withdrawn = [*self.withdrawn, *dropped][-_MAX_WITHDRAWN:]
         return dropped
 
     def _weak_loops(self, reference_segments: Sequence[int], maps: Collection[int]) -> list[int]:
@@ -191,20 +191,20 @@ class Quarantine:
                 out.append(edge_id)
         return out
 
-    def _reconsider_withdrawn(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
+    def reconsider_withdrawn(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
         """Decide again on withdrawn loops that are no longer forbidden; return those added and those dropped.
 
         Others stay withdrawn while their keyframes exist.
         """
         odometry, decisions, still_withdrawn = self._graph.odometry, list[LoopDecision](), list[Loop]()
-        for loop in self._withdrawn:
+        for loop in self.withdrawn:
             if not (odometry.has_keyframe(loop.a) and odometry.has_keyframe(loop.b)):
                 continue
             if self.agreement.are_separated(loop.a.agent, loop.b.agent) or self.separation_reason(loop):
                 still_withdrawn.append(loop)
             else:
                 decisions.append(self._loop_acceptance.decide(loop))
-        self._withdrawn = still_withdrawn
+        self.withdrawn = still_withdrawn
         undone = tuple(x for d in decisions for x in d.dropped)
         return tuple(x for d in decisions for x in d.added if x not in undone), undone
 

@@ -67,7 +67,7 @@ class PlaceIndex:
 
     def add(self, id: int, descriptors: U8) -> None:
         """Add keyframe `id` with its descriptors (N, 32)."""
-        words = self._words(descriptors)
+        words = self.words(descriptors)
         np.add.at(self._word_counts, words, np.int32(1))  # another dtype is 30 times slower
         self._unpaged[id] = words
         if len(self._unpaged) == _MAX_UNPAGED:
@@ -109,7 +109,7 @@ class PlaceIndex:
 
     def _weight_words(self, descriptors: U8) -> tuple[I64, F64]:
         """Distinct words of the view within the budget of entries, and their weights."""
-        words, term_counts = np.unique(self._words(descriptors).astype(np.int64), return_counts=True)
+        words, term_counts = np.unique(self.words(descriptors).astype(np.int64), return_counts=True)
         word_counts = self._word_counts[words]
         rare_first = np.argsort(word_counts, kind="stable")
         n = len(self)
@@ -149,7 +149,7 @@ class PlaceIndex:
             )
         self._pages[first : first + len(old)] = [new] if len(new) else []
 
-    def _words(self, descriptors: U8) -> U32:
+    def words(self, descriptors: U8) -> U32:
         """Words (N * tables,) of descriptors (N, 32): table number and sampled bits in one integer."""
         tables, bits = self._sampled_bits.shape
         sampled = np.unpackbits(descriptors, axis=1)[:, self._sampled_bits].astype(np.float32)
