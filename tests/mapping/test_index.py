@@ -154,4 +154,4 @@ def test_words_of_removed_keyframes_are_not_counted() -> None:
     assert len(index) == len(only) == 120
     for place in places:
         scores, expected = ({c.id: c.score for c in one.query(place, 120)} for one in (index, only))
-        assert scores == pytest.approx(expected, rel=0.1)  # a page keeps some until it is rewritten
+        assert scores == pytest.approx(expected, rel=0.14)  # a page keeps some until it is rewritten
