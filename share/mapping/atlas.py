@@ -54,7 +54,6 @@ class Atlas:
     # Queries
 
     def key(self, node_id: int) -> KeyframeKey:
-        """Key of the keyframe with this node id."""
         return self.graph.odometry.nodes[node_id].key
 
     def pose(self, key: KeyframeKey) -> F64:
@@ -71,7 +70,6 @@ class Atlas:
         return None if segment is None else self.graph.map_id(segment)
 
     def map_sizes(self) -> dict[str, int]:
-        """Number of keyframes of each map."""
         out = Counter[str]()
         for segment in sorted(self.graph.odometry.live_segments):
             out[self.graph.map_id(segment)] += len(self.graph.odometry.segments[segment].nodes)

@@ -22,7 +22,6 @@ class CorrectionPublisher:
         self._reported_waits: set[tuple[str, str]] = set()  # (run, map)
 
     def remove_agent(self, agent: str) -> None:
-        """Forget a run."""
         self._last_sent.pop(agent, None)
         self._reported_waits = {(run, map_id) for run, map_id in self._reported_waits if run != agent}
 

@@ -144,7 +144,6 @@ class LoopAcceptance:
         return self._decide_drift(loop, f"loop {loop}: fits the map badly ({difference})")
 
     def _disagreements(self, loops: Sequence[Loop]) -> list[Disagreement]:
-        """Compare each loop with the relative pose in its map."""
         ends = [self._graph.loop_nodes(loop) for loop in loops]
         nodes_by_goal: dict[int, list[int]] = {}
         for a, b in ends:

@@ -79,7 +79,6 @@ class MapSolving:
         self._answered_ids[key.agent] = max(key.id, self._answered_ids.get(key.agent, -1))
 
     def remove_run(self, agent: str) -> None:
-        """Forget a run."""
         self._answered_ids.pop(agent, None)
 
     def schedule_unpublished(self, agent: str) -> None:

@@ -38,7 +38,6 @@ class MapperCounters:
         self._step_ms = {kind: deque[float](maxlen=_MAX_STEP_TIMES) for kind in ("place", "verify", "solve")}
 
     def add_run(self, agent: str) -> None:
-        """Begin to count for a run."""
         self.runs[agent] = RunCounters()
 
     def remove_run(self, agent: str) -> None:
@@ -48,7 +47,6 @@ class MapperCounters:
         self._removed_runs.merges += counters.merges
 
     def add_step(self, kind: str, ms: float) -> None:
-        """Count a finished step that took `ms`."""
         self._step_ms[kind].append(ms)
         self.steps[kind] += 1
 

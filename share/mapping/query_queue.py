@@ -39,7 +39,6 @@ class CandidateSearch:
         return self._remaining.popleft()
 
     def count_verified(self) -> None:
-        """Count the last candidate as verified."""
         self._verified_count += 1
 
 
@@ -95,7 +94,6 @@ class QueryQueue:
         return len(self) >= self._config.hurry_waiting
 
     def remove_agent(self, agent: str) -> None:
-        """Forget an agent and its waiting keyframes."""
         for per_agent in (self.skipped, self._waiting, self._weights, self._last_turn):
             per_agent.pop(agent, None)
 
@@ -127,7 +125,6 @@ class QueryQueue:
         return self._pop(agent, is_oldest=False)
 
     def next_skipped(self) -> int | None:
-        """Take the newest skipped keyframe, or None."""
         return self._skipped_ids.pop() if self._skipped_ids else None
 
     def _skip_oldest(self, agent: str) -> None:

@@ -114,7 +114,6 @@ class OdometrySegments:
         return nodes[-1] if nodes else None
 
     def has_nodes(self, agent: str) -> bool:
-        """Return whether the agent has nodes on any segment."""
         return any(self.segments[segment].agent == agent for segment in self.live_segments)
 
     def has_keyframe(self, key: KeyframeKey) -> bool:
@@ -188,7 +187,6 @@ class AgentRuns:
         return was_absent
 
     def remove(self, run: str) -> None:
-        """Forget a run."""
         name = self._name_by_run.pop(run, run)
         self._absent.discard(run)
         if self._present_run.get(name) == run:

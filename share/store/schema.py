@@ -63,7 +63,6 @@ def own_tables(connection: sqlite3.Connection) -> set[str]:
 
 
 def is_empty(connection: sqlite3.Connection) -> bool:
-    """Return whether the file has no tables."""
     return not _objects(connection)
 
 

@@ -71,7 +71,6 @@ class CovarianceClaims:
 
     @property
     def known_agents(self) -> set[str]:
-        """Agents with enough steps."""
         return set(self._medians)
 
     def add_step(self, agent: str, T_ref_body: F64, cov: F64) -> bool:
@@ -93,7 +92,6 @@ class CovarianceClaims:
         self._linked.setdefault(second, set()).add(first)
 
     def remove_agent(self, agent: str) -> None:
-        """Forget an agent."""
         self._steps.pop(agent, None)
         self._medians.pop(agent, None)
         self._excluded.discard(agent)
@@ -199,7 +197,6 @@ class CovarianceScales:
         )
 
     def remove_agent(self, agent: str) -> None:
-        """Forget an agent."""
         self.evidence = {
             segment_pair: evidence
             for segment_pair, evidence in self.evidence.items()

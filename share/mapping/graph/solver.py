@@ -109,7 +109,6 @@ class PoseGraphSolver:
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
         empty = GraphUpdate.from_edges({})
         self._pose_ids = empty.pose_ids  # ascending
         self._poses, self._gravity_factors = empty.poses, empty.gravity_factors

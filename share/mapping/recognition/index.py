@@ -61,7 +61,6 @@ class PlaceIndex:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the index, bytes."""
         arrays = [array for page in self._pages for array in (page.starts, page.slots)]
         return sum(array.nbytes for array in (*arrays, *self._unpaged.values(), self._word_counts))
 
@@ -169,7 +168,6 @@ class KeyframeViews:
         self._restored: list[tuple[int, Keyframe, Rig]] = []
 
     def add(self, node_id: int, keyframe: Keyframe, rig: Rig) -> None:
-        """Add a keyframe's view."""
         self.by_node[node_id] = CameraView(keyframe.view, rig.cam0.focal, rig.T_body_cam0, keyframe.up)
         self.index.add(node_id, keyframe.view.descriptors)
 
@@ -184,7 +182,6 @@ class KeyframeViews:
         self._restored = []
 
     def remove(self, node_id: int) -> None:
-        """Remove a keyframe's view."""
         self.index.remove(node_id)
         del self.by_node[node_id]
 
@@ -227,7 +224,6 @@ class IndexPage:
         return starts[1:] - starts[:-1]
 
     def compact(self) -> IndexPage:
-        """Return the page without removed keyframes."""
         if self.is_alive.all():
             return self
         kept = self.is_alive[self.slots]

@@ -242,7 +242,6 @@ def _two_way_poses(y_q: F64, y_c: F64, focal_q: float, focal_c: float, seed: int
 
 
 def _median_depth(y_q: F64, y_c: F64) -> float:
-    """Median depth, m."""
     rho = np.concatenate([y_q[:, 2], y_c[:, 2]])
     rho = rho[np.isfinite(rho)]
     return float(1 / np.partition(rho, len(rho) // 2)[len(rho) // 2])  # a quarter of np.nanmedian's time
