@@ -4,7 +4,7 @@ results of every run.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 from share.plain_data import from_mapping
@@ -101,39 +101,11 @@ class InertialConfig:
 class PlaceConfig:
     """Verification that two views show the same place."""
 
-    candidates: int = 8  # keyframes verified per query, best first
-    enough: int = 3  # verified candidates after which the search ends
-    tables: int = 8  # hash tables of the index
-    hash_bits: int = 16  # descriptor bits that form a word in each table
-    index_seed: int = 1  # seed for the choice of these bits
-    max_distance_bits: int = 64  # largest Hamming distance of a match, of 256
-    min_matches: int = 20  # mutual nearest neighbours required before geometry is tried
-    ransac_px: float = 6.0  # reprojection error of a RANSAC inlier
-    ransac_iterations: int = 300  # at most, best matches first
-    reverse_iterations: int = 900  # the same, of the reverse direction, in random order
-    min_consensus: int = 8  # RANSAC inliers: 3-D points of one view in the other's image
-    guided_bits: int = 80  # largest Hamming distance of a match found near its predicted position
-    guided_px: float = 15.0  # largest distance from the predicted position of such a match
-    agree_depth_ratio: float = 0.05  # poses are equal if positions differ by less than this times the depth
-    agree_deg: float = 2.5  # and their rotations by less than this
-    rival_share: float = 0.5  # another pose with more than this share of the inliers: refused
-    sigma_px: float = 1.5  # standard deviation of a keypoint
-    sigma_inverse_depth: float = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
-    inlier_chi2: float = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 degrees of freedom)
-    min_inliers: int = 20  # after refinement; fewer: refused
-    min_direction_inliers: int = 10  # the same, per direction: with the query's depths, with the candidate's
-    max_sigma_deg: float = 0.5  # a pose with a larger standard deviation is refused
-    min_spread: float = 0.05  # narrow side (1 sigma) of the inliers, normalised coordinates
-    gravity_deg: float = 6.0  # largest difference of the two gravity directions, where both are known
-    floor_deg: float = 0.1  # added to the covariance: errors that inliers do not average out
-    floor_m: float = 0.005  # the same, for the position
+    candidates: int = 8  # keyframes verified per query, best first; more find more loops and take longer
+    min_inliers: int = 20  # matches that agree with the relative pose; fewer: refused
 
     def __post_init__(self) -> None:
-        _require_positive(self, "candidates", "enough", "tables", "hash_bits", "ransac_px")
-        _require_positive(self, "ransac_iterations", "reverse_iterations", "guided_px")
-        _require_positive(self, "sigma_px", "sigma_inverse_depth", "inlier_chi2")
-        if self.tables << self.hash_bits > 1 << 22:
-            raise ValueError(f"hash_bits: {self.tables} tables of {self.hash_bits} bits are too many words")
+        _require_positive(self, "candidates", "min_inliers")
 
 
 @dataclass(frozen=True)
@@ -189,51 +161,23 @@ class GraphConfig:
     """Solution of the pose graph."""
 
     cauchy: float = 3.0  # whitened residual (6 dof: 2.4 is usual) at which a loop begins to lose weight
-    max_iterations: int = 30  # of Levenberg-Marquardt; the next solution continues from the result
-    relative_tolerance: float = 1e-6  # of the cost, between two iterations
-    step_tolerance: float = 3e-3  # rad and m; converged once no pose moves by more
-    inner_tolerance: float = 3e-2  # relative residual of the linear system of a step
-    covariance_edges: int = 250  # surest edges used for covariances; more: tighter and slower
-    covariance_rounds: int = 16  # rounds of the search for shortest covariance paths, at most
 
     def __post_init__(self) -> None:
-        _require_positive(self, *(setting.name for setting in fields(self)))
+        _require_positive(self, "cauchy")
 
 
 @dataclass(frozen=True)
 class MergeConfig:
     """Acceptance of loops and merging of maps."""
 
-    min_loop_gap: int = 10  # keyframes of one segment closer than this make no loop
-    agree_chi2: float = 22.5  # two loops agree, or a loop fits the map (99.9 %, 6 dof)
-    surprise_chi2: float = 200.0  # above this a loop contradicts the map whatever supporting loops there are
-    odometry_scale: float = 1.0  # agents' standard deviations are too small by this factor
-    odometry_floor_deg: float = 0.002  # per edge, added in quadrature
-    odometry_floor_m: float = 0.0002  # the same, for the position
-    odometry_floor_per_rad: float = 0.0005  # the same, per rad that the edge rotates
-    odometry_floor_per_m: float = 0.003  # the same, per m that the edge moves
-    gravity_floor_deg: float = 0.1  # the same, of a gravity factor: error of the IMU calibration
-    most_loops: int = 10  # loops of a keyframe that loops of removed keyframes may be moved to
-    max_pending: int = 200  # pending loops; the oldest is dropped
-    place_m: float = 0.5  # views further apart than this are different places
-    place_rad: float = 0.35  # views rotated further than this are different places
-    near_m: float = 2.5  # views further apart than this do not support a merge
-    near_rad: float = 0.8  # views rotated further than this do not support a merge
     join_places: int = 2  # places that must agree before maps merge; of a smaller map, all but one
-    join_found: float = 0.3  # share of the common points that must be found, on average
-    overlap_pairs: int = 0  # least number of overlapping view pairs for the overlap check
-    overlap_gone: float = 0.06  # largest share of the common points that may be missing
-    undo_doubt: float = 0.6  # CUSUM of the missing share above that; more forbids or undoes a merge
-    rival_weight: float = 0.5  # a competing hypothesis with more than this share of the weight blocks a merge
+    overlap_pairs: int = 0  # least number of overlapping view pairs before maps merge, where rooms are copies
+    odometry_scale: float = 1.0  # agents' standard deviations are too small by this factor
     enter_m: float = 0.05  # an agent with a larger map position sigma waits for its correction
-    enter_patience: int = 20  # but at most for this many of its keyframes with loops
-    rebel_places: int = 4  # contradicting loops split a map from this many places on
-    rebel_weight: float = 1.4  # and from this multiple of the existing loops' weight on
     scale_tolerance: float = 0.015  # agents whose depths or path lengths differ by more are quarantined
-    drop_chi2: float = 1000.0  # loops with a larger chi-squared after a solution are dropped
 
     def __post_init__(self) -> None:
-        _require_positive(self, "min_loop_gap", "most_loops", "max_pending")
+        _require_positive(self, "join_places", "odometry_scale", "scale_tolerance")
 
 
 STREAMED = "streamed"

@@ -1,41 +1,48 @@
-"""Which corrections an agent is sent: the localisation gate and the filter of small changes.
-
-Localisation gate: an agent whose map merged into another is not sent its pose there while that is uncertain.
-A merge by a few loops at one spot can be wrong by degrees, which further loops correct within seconds; until
-then the agent keeps its own map. Agents that shared a map enter the new one together. The wait is bounded by
-a number of keyframes with loops: in a large hall, far from the reference, no pose is known to centimetres.
-"""
+"""Publishing of corrections: an agent is sent those that matter, and told once of one that is held back."""
 
 from __future__ import annotations
-
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from share.geometry import se3
-from share.types import F64, Correction
+from share.mapping.map_solving import AppliedSolution
+from share.mapping.steps import MapEvent
+from share.types import Correction
 
 # Changes below both are not noticeable.
 _MIN_SHIFT_M = 1e-3
 _MIN_ROTATION_RAD = float(np.radians(0.02))
 
 
-class CorrectionFilter:
-    """Remembers the last correction sent to each run, and passes those that matter."""
+class CorrectionPublisher:
+    """Remembers the last correction sent to each run, and which ones were reported as held back."""
 
     def __init__(self) -> None:
         self._last_sent: dict[str, Correction] = {}
+        self._reported_waits: set[tuple[str, str]] = set()  # (run, map)
 
     def remove_agent(self, agent: str) -> None:
-        """Forget a run."""
         self._last_sent.pop(agent, None)
+        self._reported_waits = {(run, map_id) for run, map_id in self._reported_waits if run != agent}
 
-    def should_send(self, agent: str, correction: Correction) -> bool:
-        """Return whether to send `correction`; if so, it counts as sent.
+    def publish(self, map_id: str, applied: AppliedSolution) -> list[MapEvent]:
+        """Events for the corrections of a solved map, which count as sent."""
+        sent = [
+            MapEvent(agent, "correction", applied.reason, correction)
+            for agent, correction in applied.corrections.items()
+            if self._should_send(agent, correction)
+        ]
+        known = f"its position in map {map_id} is known to"
+        waiting = [
+            MapEvent(agent, "correction held back", f"{known} {100 * sigma_m:.0f} cm")
+            for agent, sigma_m in applied.waiting_sigma_m.items()
+            if (agent, map_id) not in self._reported_waits
+        ]
+        self._reported_waits |= {(agent, map_id) for agent in applied.waiting_sigma_m}
+        return sent + waiting
 
-        It must answer a keyframe, name another map, or move odom by more than 1 mm or 0.02 degrees.
-        """
+    def _should_send(self, agent: str, correction: Correction) -> bool:
+        """Return whether it answers a keyframe, names another map, or moves odom noticeably."""
         last_sent = self._last_sent.get(agent)
         if last_sent is not None and not _has_changed(last_sent, correction):
             return False
@@ -48,93 +55,3 @@ def _has_changed(last_sent: Correction, new: Correction) -> bool:
         return True
     moved = se3.inverse(last_sent.T_map_odom) @ new.T_map_odom
     return bool(np.linalg.norm(moved[:3, 3]) > _MIN_SHIFT_M or se3.rotation_angle(moved) > _MIN_ROTATION_RAD)
-
-
-@dataclass(frozen=True, eq=False)
-class PlacementUncertainty:
-    """Uncertainty of an agent's pose in a map.
-
-    cov (6, 6): of T_map_odom. sigma_m: root of the trace of the position covariance, m. answered_id: the
-    agent's keyframe with a loop that is new in this solution, or None.
-    """
-
-    cov: F64
-    sigma_m: float
-    answered_id: int | None = None
-
-
-class LocalisationGate:
-    """State of the gate for each segment. Segments and reference segments are given by their indices."""
-
-    def __init__(self, enter_m: float, patience: int) -> None:
-        """Agents enter another map once sigma is below `enter_m`, or after `patience` keyframes with
-        loops.
-        """
-        self._enter_m, self._patience = enter_m, patience
-        # By segment: reference segment of the published map, and the covariance there.
-        self._published: dict[int, tuple[int, F64 | None]] = {}
-        # By map left and map entered: (segment, keyframe) with loops since the merge.
-        self._waited: dict[tuple[int, int], set[tuple[int, int]]] = {}
-
-    def restore(self, segment: int, reference_segment: int) -> None:
-        """An earlier session published this map to the segment; its covariance there is not known yet."""
-        self._published[segment] = (reference_segment, None)
-
-    def forget(self, segments: Collection[int]) -> None:
-        """Forget segments without keyframes."""
-        for segment in segments:
-            self._published.pop(segment, None)
-
-    def is_published(self, segment: int, reference_segment: int) -> bool:
-        """Return whether the segment's agent was sent a correction in this map."""
-        return segment in self._published and self._published[segment][0] == reference_segment
-
-    def published_cov(self, segment: int, reference_segment: int) -> F64 | None:
-        """Last covariance (6, 6) of T_map_odom; None if unknown or if the map is not published."""
-        published, cov = self._published.get(segment, (None, None))
-        return cov if published == reference_segment else None
-
-    def forget_waits(self, segments: Collection[int]) -> None:
-        """Restart the wait of these segments, whose merge was undone."""
-        self._waited = {pair: waited for pair, waited in self._waited.items() if pair[0] not in segments}
-
-    def update(
-        self,
-        reference_segment: int,
-        map_segments: Collection[int],
-        uncertainties: Mapping[int, PlacementUncertainty],
-    ) -> dict[int, float]:
-        """Apply a solution of a map: publish it to the segments that may enter.
-
-        Returns the sigma (m) of each segment that has to wait.
-        """
-        entering: dict[int, list[int]] = {}
-        for s in uncertainties:
-            previous_map = self._published[s][0] if s in self._published else s
-            enters = reference_segment not in (s, previous_map)
-            if enters and previous_map in map_segments:  # else the published map no longer exists
-                entering.setdefault(previous_map, []).append(s)
-        waiting_groups = (
-            group
-            for previous_map, group in entering.items()
-            if self._must_wait(previous_map, reference_segment, uncertainties, group)
-        )
-        waiting = [s for group in waiting_groups for s in group]
-        self._published |= {
-            s: (reference_segment, known.cov) for s, known in uncertainties.items() if s not in waiting
-        }
-        return {s: uncertainties[s].sigma_m for s in waiting}
-
-    def _must_wait(
-        self,
-        previous_map: int,
-        reference_segment: int,
-        uncertainties: Mapping[int, PlacementUncertainty],
-        entering: list[int],
-    ) -> bool:
-        """Decide for the segments that enter from one map, and count their keyframes with loops."""
-        if max(uncertainties[s].sigma_m for s in entering) <= self._enter_m:
-            return False
-        waited = self._waited.setdefault((previous_map, reference_segment), set())
-        waited.update((s, key) for s in entering if (key := uncertainties[s].answered_id) is not None)
-        return len(waited) <= self._patience

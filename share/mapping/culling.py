@@ -1,7 +1,7 @@
-"""Culling: which redundant keyframes to remove, and how to remove them.
+"""Culling: which redundant keyframes to remove.
 
-The keyframes that stay cover the same views. Odometry and loops of a removed keyframe move to its neighbour
-(`share.mapping.graph.updates`), so their information stays, slightly less certain.
+The keyframes that stay cover the same views, and keep most of the information of those removed
+(`share.mapping.keyframe_removal`).
 
 Quotas are per agent name, not per run: restarts gain nothing. All absent names together count as one name
 beside those present. A name gives in this order: keyframes that resemble others in finished maps, the same in
@@ -12,65 +12,33 @@ none of its agents is present and it has keyframes of one name only.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum, auto
 
 import numpy as np
 
-from share.config import MergeConfig
 from share.geometry import se3
-from share.mapping.graph.edges import PoseEdge
-from share.mapping.graph.updates import contract_pose
-from share.mapping.loop_consistency import articulation_segments
-from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.loop_consistency import PLACE_M, PLACE_RAD, articulation_segments
 from share.mapping.map_graph import MapGraph
-from share.mapping.segments import AgentRuns, Node, fair_quotas
-from share.types import F64, Keyframe
+from share.mapping.segments import MIN_LOOP_GAP, AgentRuns
+from share.types import F64
 
+_MARGIN = 1.05  # share of the most keyframes at which those to remove are chosen
+_REMOVED_PER_KEYFRAME = 2
 _BLOCK_ROWS = 256
 _NO_NEIGHBOUR_DISTANCE = 1e9  # of a pose without others
 
 
-@dataclass(frozen=True, eq=False)
-class OdometryLink:
-    """The odometry edge that now leads to keyframe `key` from keyframe `reference` of the same agent.
-
-    reference None: the keyframe is now the first of its segment, and T_ref_body (4, 4) is its T_odom_body.
-    cov (6, 6): of T_ref_body.
-    """
-
-    key: KeyframeKey
-    reference: KeyframeKey | None
-    T_ref_body: F64
-    cov: F64
-
-
-@dataclass(frozen=True, eq=False)
-class RemovedKeyframe:
-    """A removed keyframe, the edge that now leads to the next one, and its loops at their new ends."""
-
-    node_id: int
-    key: KeyframeKey
-    link: OdometryLink | None
-    moved_loops: tuple[Loop, ...]
-
-
 def redundant(
-    poses: F64,
-    owners: Sequence[str | None],
-    quotas: Counter[str],
-    scale_m: float,
-    scale_rad: float,
-    max_distance: float,
+    poses: F64, owners: Sequence[str | None], quotas: Counter[str], max_distance: float
 ) -> list[int]:
     """Select poses (N, 4, 4) to remove, by index, in order of removal.
 
     Repeatedly takes one of the closest pair, the one whose second neighbour is nearer, while the pair is
-    closer than `max_distance`. Distance of two poses: |shift| / scale_m + angle / scale_rad. owners: name of
+    closer than `max_distance`. Distance of two poses: |shift| / PLACE_M + angle / PLACE_RAD. owners: name of
     each pose; None: must stay. quotas: removals of each name; counted down.
     """
-    distance = _pairwise_distance(poses, scale_m, scale_rad)
+    distance = _pairwise_distance(poses)
     np.fill_diagonal(distance, np.inf)
     names = np.array([name or "" for name in owners])
     is_removable = np.array([name is not None and quotas[name] > 0 for name in owners], bool)
@@ -92,66 +60,11 @@ def redundant(
     return out
 
 
-def bridge_odometry(T_odom_previous: F64, lost_steps: int, keyframe: Keyframe) -> tuple[F64, F64]:
-    """T_previous_body (4, 4), with covariance (6, 6), of a keyframe whose reference was removed.
-
-    T_odom_previous: an earlier keyframe of the segment, `lost_steps` before the reference. Both are in one
-    odometry frame, so their relative pose is T_odom_previous^-1 T_odom_body. The covariances of the steps
-    between are gone; each is given that of the known step.
-    """
-    cov: F64 = se3.compose_cov(keyframe.T_ref_body, max(1, lost_steps) * keyframe.cov, keyframe.cov)
-    return se3.orthonormal(se3.inverse(T_odom_previous) @ keyframe.T_odom_body), (cov + cov.T) / 2
-
-
-def reconnect(agent: str, keyframe: Keyframe, previous: Node | None) -> OdometryLink:
-    """Odometry edge to such a keyframe from the newest one left on its segment, if any."""
-    key = KeyframeKey(agent, keyframe.id)
-    if previous is None:
-        return OdometryLink(key, None, keyframe.T_odom_body, keyframe.cov)
-    return OdometryLink(
-        key,
-        previous.key,
-        *bridge_odometry(previous.T_odom_body, keyframe.reference - previous.key.id, keyframe),
-    )
-
-
-def remove_keyframe(graph: MapGraph, node_id: int, max_loops: int) -> RemovedKeyframe:
-    """Remove a keyframe and move its odometry and loops to a neighbour on its segment.
-
-    Without such a neighbour its loops are removed. No keyframe receives more than `max_loops` loops, except
-    the last loop between two segments. Call `graph.update_maps` afterwards.
-    """
-    segments, edges = graph.odometry, graph.edges
-    key, previous, following = (
-        segments.nodes[node_id].key,
-        segments.previous_node(node_id),
-        segments.next_node(node_id),
-    )
-    incident = edges.incident(node_id)
-    loops = [(edges.loops[n], edges.by_id[n]) for n in incident if n in edges.loops]
-    odometry_edges = [edges.by_id[n] for n in incident if n not in edges.loops]
-    for n in incident:
-        if n in edges.loops:
-            graph.remove_loop_edge(n)
-        else:
-            edges.remove(n)
-    graph.remove_node(node_id)
-    if not odometry_edges:
-        return RemovedKeyframe(node_id, key, None, ())
-    contracted = contract_pose(node_id, odometry_edges, [edge for _, edge in loops])
-    for edge in contracted.odometry:
-        edges.add(edge)
-    link = None if following is None else _odometry_link(graph, previous, following)
-    moving = [(old, edge) for (old, _), edge in zip(loops, contracted.loops, strict=True) if edge is not None]
-    moved_loops = [_move_loop(graph, old, edge, max_loops) for old, edge in moving]
-    return RemovedKeyframe(node_id, key, link, tuple(loop for loop in moved_loops if loop is not None))
-
-
-def _pairwise_distance(poses: F64, scale_m: float, scale_rad: float) -> F64:
+def _pairwise_distance(poses: F64) -> F64:
     distance: F64 = np.empty((len(poses), len(poses)))
     for rows in _row_blocks(len(poses)):
         shift, angle = se3.pairwise_distances(poses[rows], poses)
-        distance[rows] = shift / scale_m + angle / scale_rad
+        distance[rows] = shift / PLACE_M + angle / PLACE_RAD
     return distance
 
 
@@ -165,29 +78,6 @@ def _two_nearest(distance: F64) -> F64:
     if distance.shape[1] < 2:
         return np.full((len(distance), 2), np.inf)
     return np.partition(distance, 1, axis=1)[:, :2].copy()
-
-
-def _odometry_link(graph: MapGraph, previous: int | None, node_id: int) -> OdometryLink:
-    node = graph.odometry.nodes[node_id]
-    if previous is None:
-        return OdometryLink(node.key, None, node.T_odom_body, np.zeros((6, 6)))
-    edge = graph.odometry_edge(previous, node_id)
-    return OdometryLink(node.key, graph.odometry.nodes[previous].key, edge.T_a_b, edge.cov)
-
-
-def _move_loop(graph: MapGraph, old: Loop, edge: PoseEdge, max_loops: int) -> Loop | None:
-    """Add the loop at its new ends; return None where they have one already, or enough."""
-    edges, nodes = graph.edges, graph.odometry.nodes
-    loops_at_a, loops_at_b = (
-        {n for n in edges.incident(end) if n in edges.loops} for end in (edge.a, edge.b)
-    )
-    if loops_at_a & loops_at_b or (
-        max(len(loops_at_a), len(loops_at_b)) >= max_loops and graph.loop_counts[graph.segment_pair(edge)]
-    ):
-        return None
-    loop = Loop(nodes[edge.a].key, nodes[edge.b].key, edge.T_a_b, edge.cov, old.inliers, old.found_share)
-    graph.add_loop_edge(edge, loop)
-    return loop
 
 
 _ABSENT_AGENTS = ""  # not a valid name
@@ -208,8 +98,20 @@ class ReturnReserve(Enum):
 class KeyframeCulling:
     """Chooses the keyframes of one graph to remove."""
 
-    def __init__(self, config: MergeConfig, graph: MapGraph, runs: AgentRuns) -> None:
-        self._config, self._graph, self._runs = config, graph, runs
+    def __init__(self, graph: MapGraph, runs: AgentRuns) -> None:
+        self._graph, self._runs = graph, runs
+        self._due: list[int] = []
+        self._threshold = 0.0  # number of keyframes at which removable ones are searched for again
+
+    def next_nodes(self, max_keyframes: int) -> list[int]:
+        """Nodes to remove when a keyframe arrives: two at most, since all at once would delay the others."""
+        count = len(self._graph.poses)
+        if not self._due and count > max(max_keyframes * _MARGIN, self._threshold):
+            self._due = self.choose(count - max_keyframes)
+            # Where no keyframe is removable, do not search for one each time.
+            self._threshold = 0.0 if self._due else count * _MARGIN
+        batch, self._due = self._due[:_REMOVED_PER_KEYFRAME], self._due[_REMOVED_PER_KEYFRAME:]
+        return batch
 
     def choose(self, count: int) -> list[int]:
         """Return up to `count` node ids to remove.
@@ -226,10 +128,7 @@ class KeyframeCulling:
         graph = self._graph
         segment = graph.odometry.nodes[node_id].segment
         nodes, reference_segment = graph.odometry.segments[segment].nodes, graph.reference_segments[segment]
-        if (
-            self._is_growing(segment, ReturnReserve.NOTHING)
-            and node_id in nodes[-self._config.min_loop_gap :]
-        ):
+        if self._is_growing(segment, ReturnReserve.NOTHING) and node_id in nodes[-MIN_LOOP_GAP:]:
             return False
         if self._is_finished(graph.map_segments(reference_segment), ReturnReserve.NOTHING):
             return True
@@ -247,12 +146,8 @@ class KeyframeCulling:
         ongoing = [reference_segment for reference_segment in maps if reference_segment not in set(finished)]
         protected = self._protected(ongoing, reserve)
         quotas, out = self._quotas(count, protected), dict[int, None]()
-        for reference_segments, max_distance in (
-            (finished, _SAME_PLACE_DISTANCE),
-            (ongoing, _SAME_PLACE_DISTANCE),
-        ):
-            for reference_segment in reference_segments:
-                self._add_redundant(maps[reference_segment], protected, quotas, out, max_distance)
+        for reference_segment in (*finished, *ongoing):
+            self._add_redundant(maps[reference_segment], protected, quotas, out, _SAME_PLACE_DISTANCE)
         for reference_segment in (*reversed(finished), *ongoing):
             self._add_redundant(maps[reference_segment], protected, quotas, out)
         return list(out)
@@ -266,12 +161,12 @@ class KeyframeCulling:
         max_distance: float = np.inf,
     ) -> None:
         """Add redundant nodes of one map to `removed`, within the quotas, closer than `max_distance`."""
-        graph, c = self._graph, self._config
+        graph = self._graph
         node_ids = [n for s in segments for n in graph.odometry.segments[s].nodes if n not in removed]
         owners = [None if n in protected else self._agent_name(n) for n in node_ids]
         if any(name is not None and quotas[name] for name in owners):
             poses = np.array([graph.poses[n] for n in node_ids])
-            chosen = redundant(poses, owners, quotas, c.place_m, c.place_rad, max_distance)
+            chosen = redundant(poses, owners, quotas, max_distance)
             removed |= dict.fromkeys(node_ids[i] for i in chosen)
 
     def _quotas(self, count: int, protected: set[int]) -> Counter[str]:
@@ -307,7 +202,7 @@ class KeyframeCulling:
         out = {graph.anchor(reference_segment) for reference_segment in reference_segments}
         for segment in odometry.live_segments:
             if self._is_growing(segment, reserve):
-                out.update(odometry.segments[segment].nodes[-self._config.min_loop_gap :])
+                out.update(odometry.segments[segment].nodes[-MIN_LOOP_GAP:])
         for segment in articulation_segments(graph.loop_counts):
             nodes = odometry.segments[segment].nodes
             out.add(max(nodes, key=lambda n: len(graph.edges.incident(n))))
@@ -339,3 +234,19 @@ class KeyframeCulling:
 
     def _agent_name(self, node_id: int) -> str:
         return self._runs.name(self._graph.odometry.nodes[node_id].key.agent)
+
+
+def fair_quotas(
+    counts: Counter[str], limits: Counter[str], count: int, presence_order: Mapping[str, int]
+) -> Counter[str]:
+    """Split `count` removals among names: one at a time from the name that holds most.
+
+    Ties go to the name that connected longest ago. A name that holds no more than a fair share gives nothing.
+    counts: keyframes of each name; limits: how many each can give; presence_order: from
+    `AgentRuns.presence_order`.
+    """
+    out = Counter[str]()
+    for _ in range(min(count, limits.total())):
+        candidates = (name for name in counts if out[name] < limits[name])
+        out[max(candidates, key=lambda name: (counts[name] - out[name], -presence_order.get(name, -1)))] += 1
+    return out

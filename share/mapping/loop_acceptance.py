@@ -15,7 +15,14 @@ import numpy as np
 
 from share.config import MergeConfig
 from share.geometry import se3
-from share.mapping.loop_consistency import LoopEvidence, count_places, is_near, minimum_cut, weigh_loops
+from share.mapping.loop_consistency import (
+    LoopEvidence,
+    count_places,
+    is_at_any,
+    is_near,
+    minimum_cut,
+    weigh_loops,
+)
 from share.mapping.loops import (
     Disagreement,
     KeyframeKey,
@@ -23,13 +30,22 @@ from share.mapping.loops import (
     RelativePose,
     disagreement,
     inverse_pose,
-    is_near_any,
     pairwise_chi2,
 )
 from share.mapping.map_graph import MapGraph
 from share.mapping.overlap_check import OverlapCheck, cusum
+from share.mapping.segments import MIN_LOOP_GAP
 from share.types import F64
 
+AGREE_CHI2 = 22.5  # two loops agree, or a loop fits the map (99.9 %, 6 dof)
+_CONTRADICT_CHI2 = 200.0  # above this a loop contradicts the map whatever supporting loops there are
+_MAX_PENDING = 200  # pending loops; the oldest is dropped
+JOIN_FOUND = 0.3  # share of the common points that must be found, on average, before maps merge
+_OVERLAP_MISSING = 0.06  # largest share of the common points that may be missing
+_UNDO_CUSUM = 0.6  # CUSUM of the missing share above that; more forbids or undoes a merge
+_COMPETING_WEIGHT = 0.5  # a competing hypothesis with more than this share of the weight blocks a merge
+_CONTRADICTING_PLACES = 4  # contradicting loops split a map from this many places on
+_CONTRADICTING_WEIGHT = 1.4  # and from this multiple of the existing loops' weight on
 _MAX_NAMED = 3  # loops listed in a reason
 _MIN_MOVE = 2e-3  # rad and m; a pending loop is tested again once its ends moved by more
 _MAX_CHECKED = 8  # accepted loops whose found share is computed when others contradict them
@@ -54,25 +70,26 @@ class LoopAcceptance:
     """Decides on the loops of one graph and adds them to it.
 
     pending: loops that need support, oldest first. contradicting: loops that contradict their map.
+    ambiguous_nodes: those at places with a known look-alike.
     """
 
     def __init__(self, config: MergeConfig, graph: MapGraph, overlap_check: OverlapCheck) -> None:
         self.pending: list[Loop] = []
         self.contradicting: list[Loop] = []
-        self._ambiguous_nodes: set[int] = set()  # at places with a known look-alike
+        self.ambiguous_nodes: set[int] = set()
         self._rejected_at: dict[Loop, F64] = {}  # pending loops that did not fit, and T_a_b of the map then
         self._config, self._graph, self._overlap_check = config, graph, overlap_check
 
     def decide(self, loop: Loop) -> LoopDecision:
         """Accept a loop, keep it pending, or reject it. Raises ValueError if a keyframe is unknown."""
         a, b = self._graph.loop_nodes(loop)
-        edges, min_gap = self._graph.edges, self._config.min_loop_gap
+        edges = self._graph.edges
         if any(
             n in edges.loops and {a, b} == {edges.by_id[n].a, edges.by_id[n].b} for n in edges.incident(b)
         ):
             return LoopDecision(False, f"loop {loop}: these keyframes have a loop already")
-        if self._graph.odometry.are_neighbours(a, b, min_gap):
-            gap = f"less than {min_gap} keyframes apart"
+        if self._graph.odometry.are_neighbours(a, b):
+            gap = f"less than {MIN_LOOP_GAP} keyframes apart"
             return LoopDecision(False, f"loop {loop}: neighbours by odometry, {gap}")
         if self._graph.is_same_map(a, b):
             return self._decide_within_map(loop)
@@ -80,9 +97,8 @@ class LoopAcceptance:
 
     def review_joins(self, node_id: int) -> LoopDecision | None:
         """Undo a recent merge that the view of a new node contradicts; None if there is none."""
-        c = self._config
-        for (a, b), cusum_value in self._overlap_check.review_joins(node_id, c.overlap_gone):
-            if cusum_value > c.undo_doubt:
+        for (a, b), cusum_value in self._overlap_check.review_joins(node_id, _OVERLAP_MISSING):
+            if cusum_value > _UNDO_CUSUM:
                 self._overlap_check.end_probation((a, b))
                 dropped = self._graph.drop_loops(self._separating_loops(a, b))
                 first, second = (self._graph.odometry.segments[s].name for s in (a, b))
@@ -104,7 +120,7 @@ class LoopAcceptance:
             if loop not in self._rejected_at or _has_moved(self._rejected_at[loop], map_poses[loop])
         ]
         differences = zip(moved, self._disagreements(moved), strict=True)
-        fitting = [loop for loop, difference in differences if difference.chi2 <= self._config.agree_chi2]
+        fitting = [loop for loop, difference in differences if difference.chi2 <= AGREE_CHI2]
         self._rejected_at = {
             x: map_poses[x] if x in moved else self._rejected_at[x] for x in in_one_map if x not in fitting
         }
@@ -113,7 +129,7 @@ class LoopAcceptance:
 
     def remove_keyframes(self, removed: Collection[KeyframeKey]) -> None:
         """Forget loops of keyframes that were removed from the graph."""
-        self._ambiguous_nodes.intersection_update(self._graph.poses)
+        self.ambiguous_nodes.intersection_update(self._graph.poses)
         self.pending = [loop for loop in self.pending if loop.keyframes.isdisjoint(removed)]
         self.contradicting = [loop for loop in self.contradicting if loop.keyframes.isdisjoint(removed)]
 
@@ -121,14 +137,13 @@ class LoopAcceptance:
 
     def _decide_within_map(self, loop: Loop) -> LoopDecision:
         (difference,) = self._disagreements([loop])
-        if difference.chi2 <= self._config.agree_chi2:
+        if difference.chi2 <= AGREE_CHI2:
             return self._accept([loop], f"loop {loop}: fits the map, {difference}")
-        if difference.chi2 > self._config.surprise_chi2:
+        if difference.chi2 > _CONTRADICT_CHI2:
             return self._decide_contradiction(loop, f"loop {loop}: contradicts the map, {difference}")
         return self._decide_drift(loop, f"loop {loop}: fits the map badly ({difference})")
 
     def _disagreements(self, loops: Sequence[Loop]) -> list[Disagreement]:
-        """Compare each loop with the relative pose in its map."""
         ends = [self._graph.loop_nodes(loop) for loop in loops]
         nodes_by_goal: dict[int, list[int]] = {}
         for a, b in ends:
@@ -159,19 +174,19 @@ class LoopAcceptance:
         """
         a, b = (self._graph.segment(key) for key in (loop.a, loop.b))
         if a == b:
-            self._ambiguous_nodes.update(self._graph.loop_nodes(loop))
+            self.ambiguous_nodes.update(self._graph.loop_nodes(loop))
             return LoopDecision(False, f"{reason}: two places look alike")
         loop = self._overlap_check.with_found_share(loop)
         consistent = [*self._consistent_loops(loop, self.contradicting), loop]
-        self.contradicting = [*self.contradicting, loop][-self._config.max_pending :]
-        c, evidence = self._config, self._weigh(consistent)
+        self.contradicting = [*self.contradicting, loop][-_MAX_PENDING:]
+        evidence = self._weigh(consistent)
         reason = f"{reason}; {evidence} support it"
-        if evidence.places < c.rebel_places:
-            return LoopDecision(False, f"{reason}, {c.rebel_places} places needed")
+        if evidence.places < _CONTRADICTING_PLACES:
+            return LoopDecision(False, f"{reason}, {_CONTRADICTING_PLACES} places needed")
         existing_ids = self._separating_loops(a, b)
         existing = self._weigh_existing(existing_ids)
         reason = f"{reason}, {existing} oppose it"
-        if evidence.weight <= c.rebel_weight * existing.weight:
+        if evidence.weight <= _CONTRADICTING_WEIGHT * existing.weight:
             return LoopDecision(False, f"{reason}, more weight needed")
         if objection := self._overlap_objection(loop):
             return LoopDecision(False, reason + objection)
@@ -190,7 +205,7 @@ class LoopAcceptance:
     def _weigh_existing(self, edge_ids: Sequence[int]) -> LoopEvidence:
         """Weigh accepted loops by edge id, after computing the found share of a few that lack it."""
         loops = self._graph.edges.loops
-        unchecked = [n for n in edge_ids if loops[n].found_share is None and is_near(loops[n], self._config)]
+        unchecked = [n for n in edge_ids if loops[n].found_share is None and is_near(loops[n])]
         for n in unchecked[:: 1 + len(unchecked) // _MAX_CHECKED]:
             loops[n] = self._overlap_check.with_found_share(loops[n])
         return self._weigh([loops[n] for n in edge_ids])
@@ -217,36 +232,36 @@ class LoopAcceptance:
 
     def _join_objection(self, loop: Loop, evidence: LoopEvidence) -> str:
         """Reason why loops at enough places may still be of a copy, or empty."""
-        c = self._config
-        if evidence.found_share < c.join_found:
+        if evidence.found_share < JOIN_FOUND:
             return f", but only {evidence.found_share:.0%} of the points in both views are found: pending"
-        max_weight = c.rival_weight * evidence.weight
+        max_weight = _COMPETING_WEIGHT * evidence.weight
         competing = self._competing_hypothesis(loop, max_weight)
         return f"; a competing hypothesis has {competing}: pending" if competing.weight > max_weight else ""
 
     def _overlap_objection(self, loop: Loop) -> str:
         """Reason of the overlap check against a merge as this loop says, or empty."""
-        comparisons, c = self._overlap_check.compare_overlap(loop), self._config
-        if len(comparisons) < c.overlap_pairs:
+        comparisons = self._overlap_check.compare_overlap(loop)
+        if len(comparisons) < self._config.overlap_pairs:
             return f", but only {len(comparisons)} views overlap: pending"
         missing_share = sum(comparison.missing_share for comparison in comparisons) / max(1, len(comparisons))
-        if missing_share > c.overlap_gone:
+        if missing_share > _OVERLAP_MISSING:
             return (
                 f", but {missing_share:.0%} of the {len(comparisons)} overlapping views is missing: pending"
             )
         cusums = itertools.accumulate(
-            comparisons, lambda value, comparison: cusum(value, comparison, c.overlap_gone), initial=0.0
+            comparisons, lambda value, comparison: cusum(value, comparison, _OVERLAP_MISSING), initial=0.0
         )
-        if (worst := max(cusums)) > c.undo_doubt:
+        if (worst := max(cusums)) > _UNDO_CUSUM:
             return f", but things are missing in consecutive views (CUSUM {worst:.1f}): pending"
         return ""
 
     def _min_places(self, loop: Loop) -> int:
         """Places required for a merge; in a map with few known places, all but one."""
-        graph, c = self._graph, self._config
+        graph = self._graph
         maps = [graph.map_nodes(graph.reference_segment(key)) for key in (loop.a, loop.b)]
         known_places = min(
-            count_places([graph.poses[n] for n in nodes], c, c.join_places + 1) for nodes in maps
+            count_places(np.array([graph.poses[n] for n in nodes]), self._config.join_places + 1)
+            for nodes in maps
         )
         return max(1, known_places - 1)
 
@@ -256,7 +271,7 @@ class LoopAcceptance:
         The first one that outweighs `max_weight`, or else the best.
         """
         compared = self._compare_loops(loop, self.pending)
-        remaining = [other for other, chi2 in compared if chi2 > self._config.surprise_chi2]
+        remaining = [other for other, chi2 in compared if chi2 > _CONTRADICT_CHI2]
         best = LoopEvidence()
         while remaining and best.weight <= max_weight:
             hypothesis = [*self._consistent_loops(remaining[-1], remaining[:-1]), remaining[-1]]
@@ -271,7 +286,7 @@ class LoopAcceptance:
 
     def _consistent_loops(self, loop: Loop, others: Sequence[Loop]) -> list[Loop]:
         """Loops between the same two maps (within a map: the same segments) that agree with this one."""
-        return [x for x, chi2 in self._compare_loops(loop, others) if chi2 <= self._config.agree_chi2]
+        return [x for x, chi2 in self._compare_loops(loop, others) if chi2 <= AGREE_CHI2]
 
     def _compare_loops(self, loop: Loop, others: Sequence[Loop]) -> list[tuple[Loop, float]]:
         """Loops between the same two maps, directed as this one, each with its chi-square against it."""
@@ -300,23 +315,23 @@ class LoopAcceptance:
         return None
 
     def _weigh(self, loops: Sequence[Loop]) -> LoopEvidence:
-        return weigh_loops(loops, self._graph, self._config)
+        return weigh_loops(loops, self._graph)
 
     def _weigh_unambiguous(self, loops: Sequence[Loop]) -> LoopEvidence:
         """Weigh the near loops away from places that are known to look alike."""
-        near_loops = [loop for loop in loops if is_near(loop, self._config)]
+        near_loops = [loop for loop in loops if is_near(loop)]
         return self._weigh([loop for loop in near_loops if not self._is_ambiguous(loop)])
 
     def _is_ambiguous(self, loop: Loop) -> bool:
-        graph, c = self._graph, self._config
+        graph = self._graph
         for node_id in graph.loop_nodes(loop):
             segment = graph.odometry.nodes[node_id].segment
             ambiguous = [
                 n
-                for n in self._ambiguous_nodes
+                for n in self.ambiguous_nodes
                 if n in graph.poses and graph.odometry.nodes[n].segment == segment
             ]
-            if is_near_any(graph.poses[node_id], [graph.poses[n] for n in ambiguous], c.place_m, c.place_rad):
+            if is_at_any(graph.poses[node_id], [graph.poses[n] for n in ambiguous]):
                 return True
         return False
 
@@ -345,7 +360,7 @@ class LoopAcceptance:
             self._graph.add_loop(loop)
 
     def _add_pending(self, loop: Loop) -> None:
-        self.pending = [*self.pending, loop][-self._config.max_pending :]
+        self.pending = [*self.pending, loop][-_MAX_PENDING:]
 
 
 def _has_moved(before: F64, now: F64) -> bool:

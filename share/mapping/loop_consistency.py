@@ -11,12 +11,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from share.config import MergeConfig
-from share.mapping.loops import Loop, count_distinct
+from share.mapping.loops import Loop
 from share.mapping.map_graph import MapGraph
 from share.types import F64, I64
 
+PLACE_M = 0.5  # views further apart than this are different places
+PLACE_RAD = 0.35  # views rotated further than this are different places
+NEAR_M = 2.5  # views further apart than this do not support a merge
+NEAR_RAD = 0.8  # views rotated further than this do not support a merge
 _DEFAULT_FOUND_SHARE = 0.5  # where not computed: that of most true loops
 
 
@@ -40,15 +44,15 @@ class LoopEvidence:
         return f"{self.places} places (weight {self.weight:.2f})"
 
 
-def is_near(loop: Loop, config: MergeConfig) -> bool:
+def is_near(loop: Loop) -> bool:
     """Return whether both views are from about the same spot: only those distinguish look-alike places."""
     distance_m, angle_rad = loop.view_offset
-    return distance_m <= config.near_m and angle_rad <= config.near_rad
+    return distance_m <= NEAR_M and angle_rad <= NEAR_RAD
 
 
-def weigh_loops(loops: Sequence[Loop], graph: MapGraph, config: MergeConfig) -> LoopEvidence:
+def weigh_loops(loops: Sequence[Loop], graph: MapGraph) -> LoopEvidence:
     """Weigh `loops`. Places are counted per segment, the least counts; loops of distant views are ignored."""
-    near_loops = [loop for loop in loops if is_near(loop, config)]
+    near_loops = [loop for loop in loops if is_near(loop)]
     if not near_loops:
         return LoopEvidence()
     poses_by_segment: dict[int, list[F64]] = {}
@@ -57,16 +61,36 @@ def weigh_loops(loops: Sequence[Loop], graph: MapGraph, config: MergeConfig) -> 
             poses_by_segment.setdefault(graph.odometry.nodes[node_id].segment, []).append(
                 graph.poses[node_id]
             )
-    count = min(count_places(poses, config) for poses in poses_by_segment.values())
+    count = min(count_places(np.array(poses)) for poses in poses_by_segment.values())
     found_shares = [loop.found_share for loop in near_loops if loop.found_share is not None]
     found_share = float(np.mean(found_shares)) if found_shares else _DEFAULT_FOUND_SHARE
     keyframes = min(len({loop.a for loop in near_loops}), len({loop.b for loop in near_loops}))
     return LoopEvidence(count, found_share, keyframes)
 
 
-def count_places(poses: Sequence[F64], config: MergeConfig, max_count: int | None = None) -> int:
-    """Count the places of poses (4, 4), up to `max_count`."""
-    return count_distinct(np.array(poses), config.place_m, config.place_rad, max_count)
+def count_places(poses: F64, max_count: int | None = None) -> int:
+    """Count the places of poses (N, 4, 4), greedily: a pose far from all places before is a new one.
+
+    Counting stops at `max_count`.
+    """
+    count = 0
+    while len(poses) and count != max_count:
+        count += 1
+        poses = poses[~_is_one_place(poses[0], poses)]
+    return count
+
+
+def is_at_any(T: F64, poses: Sequence[F64]) -> bool:
+    """Return whether pose T (4, 4) is at the place of any of `poses`."""
+    return len(poses) > 0 and bool(_is_one_place(T, np.array(poses)).any())
+
+
+def _is_one_place(T: F64, poses: F64) -> NDArray[np.bool_]:
+    """Mask of poses (N, 4, 4) at the place of T (4, 4). T itself always is, despite rounding."""
+    shift = poses[:, :3, 3] - T[:3, 3]
+    cosine = (poses[:, :3, :3].reshape(-1, 9) @ T[:3, :3].ravel() - 1) / 2
+    near = ((shift**2).sum(1) <= PLACE_M**2) & (cosine >= min(np.cos(PLACE_RAD), 1 - 1e-9))
+    return np.asarray(near)
 
 
 # Connectivity of a map: which loops, and which segments, it cannot do without.

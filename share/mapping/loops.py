@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from share.geometry import se3
 from share.types import F64, checked_array, checked_pose
@@ -34,7 +33,7 @@ class Loop:
     """A verified relative pose of two keyframes: T_a_b (4, 4) of their bodies, cov (6, 6), inlier count.
 
     found_share: share of the points visible in both views that both views show
-    (`share.mapping.recognition.missing_points`); None if not computed.
+    (`share.mapping.overlap_check`); None if not computed.
     """
 
     a: KeyframeKey
@@ -126,32 +125,3 @@ def _difference(first: RelativePose, second: RelativePose) -> tuple[F64, F64]:
     xi = se3.log(se3.inverse(first.T) @ second.T)
     weighted = np.linalg.solve(first.cov + second.cov, xi[..., None])[..., 0]
     return xi, np.asarray((xi * weighted).sum(-1))
-
-
-# Places: neighbouring views of one spot count once.
-
-
-def count_distinct(poses: F64, distance_m: float, angle_rad: float, max_count: int | None = None) -> int:
-    """Count distinct places among poses (N, 4, 4), greedily.
-
-    A pose is a new place if it is farther than `distance_m`, or rotated by more than `angle_rad`, from every
-    place counted before. Counting stops at `max_count`.
-    """
-    count = 0
-    while len(poses) and count != max_count:
-        count += 1
-        poses = poses[~_is_near(poses[0], poses, distance_m, angle_rad)]
-    return count
-
-
-def is_near_any(T: F64, poses: Sequence[F64], within_m: float, within_rad: float) -> bool:
-    """Return whether pose T (4, 4) is within both limits of any of `poses`."""
-    return len(poses) > 0 and bool(_is_near(T, np.array(poses), within_m, within_rad).any())
-
-
-def _is_near(T: F64, poses: F64, within_m: float, within_rad: float) -> NDArray[np.bool_]:
-    """Mask of poses (N, 4, 4) within both limits of T (4, 4). T itself always is, despite rounding."""
-    shift = poses[:, :3, 3] - T[:3, 3]
-    cosine = (poses[:, :3, :3].reshape(-1, 9) @ T[:3, :3].ravel() - 1) / 2
-    near = ((shift**2).sum(1) <= within_m**2) & (cosine >= min(np.cos(within_rad), 1 - 1e-9))
-    return np.asarray(near)

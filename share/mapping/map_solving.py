@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from share.config import MergeConfig
 from share.geometry import se3
-from share.mapping.corrections import LocalisationGate, PlacementUncertainty
-from share.mapping.graph.updates import GraphSolution, GraphUpdate
+from share.mapping.graph.solver import GraphSolution, GraphUpdate
+from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty
 from share.mapping.loop_acceptance import LoopAcceptance, pending_text
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_graph import MapGraph
 from share.mapping.segments import AgentRuns
 from share.types import Correction
+
+_OUTLIER_CHI2 = 1000.0  # loops with a larger chi-squared after a solution are dropped
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +65,12 @@ class MapSolving:
 
     def __init__(
         self,
-        config: MergeConfig,
         graph: MapGraph,
         loop_acceptance: LoopAcceptance,
         localisation_gate: LocalisationGate,
         runs: AgentRuns,
     ) -> None:
-        self._config, self._graph, self._loop_acceptance = config, graph, loop_acceptance
+        self._graph, self._loop_acceptance = graph, loop_acceptance
         self._localisation_gate, self._runs = localisation_gate, runs
         self._answered_ids: dict[str, int] = {}  # newest keyframe of each agent with a loop not solved yet
 
@@ -79,7 +79,6 @@ class MapSolving:
         self._answered_ids[key.agent] = max(key.id, self._answered_ids.get(key.agent, -1))
 
     def remove_run(self, agent: str) -> None:
-        """Forget a run."""
         self._answered_ids.pop(agent, None)
 
     def schedule_unpublished(self, agent: str) -> None:
@@ -143,10 +142,6 @@ class MapSolving:
             )
         )
 
-    def reset(self) -> None:
-        """The solver lost its state: the next job contains the whole graph."""
-        self._graph.edges.reset()
-
     def apply(self, job: SolveJob, solution: GraphSolution) -> AppliedSolution:
         """Apply a solution; keyframes and loops that arrived meanwhile are kept.
 
@@ -163,7 +158,7 @@ class MapSolving:
         if solution.reason:
             return AppliedSolution({}, f"map {job.map_id}: not solved, {solution.reason}")
         self._apply_poses(job, solution)
-        outlier_ids = solution.loop_ids[solution.loop_chi2 > self._config.drop_chi2].tolist()
+        outlier_ids = solution.loop_ids[solution.loop_chi2 > _OUTLIER_CHI2].tolist()
         dropped = graph.drop_loops([n for n in outlier_ids if n in graph.edges.loops]) if outlier_ids else ()
         added = self._loop_acceptance.accept_fitting()
         waiting = self._update_gate(job, solution)

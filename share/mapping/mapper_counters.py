@@ -38,7 +38,6 @@ class MapperCounters:
         self._step_ms = {kind: deque[float](maxlen=_MAX_STEP_TIMES) for kind in ("place", "verify", "solve")}
 
     def add_run(self, agent: str) -> None:
-        """Begin to count for a run."""
         self.runs[agent] = RunCounters()
 
     def remove_run(self, agent: str) -> None:
@@ -48,29 +47,29 @@ class MapperCounters:
         self._removed_runs.merges += counters.merges
 
     def add_step(self, kind: str, ms: float) -> None:
-        """Count a finished step that took `ms`."""
         self._step_ms[kind].append(ms)
         self.steps[kind] += 1
 
-    @property
-    def loops_tried(self) -> int:
-        """Verified candidates of all runs, accepted or refused."""
-        return sum(counters.loops_tried for counters in self._all_runs())
-
-    @property
-    def merges(self) -> dict[str, int]:
-        """Merges of all runs by outcome."""
-        return merge_counts(sum((counters.merges for counters in self._all_runs()), Counter()))
-
-    def step_report(self) -> dict[str, Any]:
-        """Durations and number of steps: `place_ms`, `verify_ms`, `solve_ms`."""
+    def report(self, pending_count: int, loop_count: int) -> dict[str, Any]:
+        """Totals of all runs and durations of steps, for edge.json. Counts: of loops now in the map."""
+        runs = [*self.runs.values(), self._removed_runs]
+        merges = merge_counts(sum((run.merges for run in runs), Counter()))
+        tried = sum(run.loops_tried for run in runs)
         return {
-            f"{kind}_ms": {**summary(list(ms)).report(), "n": self.steps[kind]}
-            for kind, ms in self._step_ms.items()
+            "loops": {
+                "tried": tried,
+                "accepted": merges["done"],
+                "waiting": pending_count,
+                "in_map": loop_count,
+            },
+            "merges": merges,
+            "removed_keyframes": self.removed_keyframes,
+            "failed_steps": self.failed_steps,
+            **{
+                f"{kind}_ms": {**summary(list(ms)).report(), "n": self.steps[kind]}
+                for kind, ms in self._step_ms.items()
+            },
         }
-
-    def _all_runs(self) -> list[RunCounters]:
-        return [*self.runs.values(), self._removed_runs]
 
 
 def merge_counts(merges: Counter[str]) -> dict[str, int]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,42 +18,30 @@ from share.wire.messages import Hello
 HURRY_WAITING = 1  # with this many queued, a query verifies fewer candidates
 HURRY_CANDIDATES = 3  # at most these, and the first verified one ends the search
 MAX_WAITING_EACH = 3  # queued queries of one agent
-
-
-class SearchBudget(NamedTuple):
-    """Limits of the verification of one keyframe's candidates.
-
-    max_verified: accepted candidates after which the rest is skipped. While other queries wait it is one, and
-    at most `max_tried_hurried` are tried.
-    """
-
-    max_verified: int
-    max_tried_hurried: int
-
-    @classmethod
-    def from_config(cls, config: Config) -> SearchBudget:
-        return cls(config.place.enough, HURRY_CANDIDATES)
+ENOUGH_VERIFIED = 3  # verified candidates after which a search ends
 
 
 class CandidateSearch:
-    """Candidates of keyframe `node_id`, best first, tried within a budget."""
+    """Candidates of one keyframe, best first.
 
-    def __init__(self, node_id: int, candidates: Iterable[int], budget: SearchBudget) -> None:
-        self.node_id = node_id
-        self._remaining, self._budget = deque(candidates), budget
+    The search ends after `ENOUGH_VERIFIED` verified candidates; while other queries wait after one, and after
+    at most `HURRY_CANDIDATES` tried ones.
+    """
+
+    def __init__(self, candidates: Iterable[int]) -> None:
+        self._remaining = deque(candidates)
         self._tried_count = self._verified_count = 0
 
     def next_candidate(self, is_hurried: bool) -> int | None:
         """Return the next candidate to verify; None when there are none left or the budget is spent."""
-        max_tried = self._budget.max_tried_hurried if is_hurried else self._tried_count + 1
-        max_verified = 1 if is_hurried else self._budget.max_verified
+        max_tried = HURRY_CANDIDATES if is_hurried else self._tried_count + 1
+        max_verified = 1 if is_hurried else ENOUGH_VERIFIED
         if not self._remaining or self._tried_count >= max_tried or self._verified_count >= max_verified:
             return None
         self._tried_count += 1
         return self._remaining.popleft()
 
     def count_verified(self) -> None:
-        """Count the last candidate as verified."""
         self._verified_count += 1
 
 
@@ -73,6 +60,16 @@ def service_kind(config: Config, hello: Hello) -> AgentKind:
     if POLICIES[config.edge.policy].treats_alike:
         return AgentKind.AR
     return qoe_form(config, hello)
+
+
+def map_rank(config: Config, hello: Hello | None, is_reference: bool = False) -> int:
+    """Rank of a new segment: lower ranks keep their map in a merge.
+
+    Headsets' maps stay, as their wearers would notice a jump; restored maps come first. hello: None if
+    missing in a damaged file.
+    """
+    is_headset = hello is not None and qoe_form(config, hello) is AgentKind.AR
+    return (0 if is_headset else 1) + (0 if is_reference else 2)
 
 
 class QueryQueue:
@@ -100,7 +97,6 @@ class QueryQueue:
         return len(self) >= HURRY_WAITING
 
     def remove_agent(self, agent: str) -> None:
-        """Forget an agent and its waiting keyframes."""
         for per_agent in (self.skipped, self._waiting, self._weights, self._last_turn):
             per_agent.pop(agent, None)
 
@@ -132,7 +128,6 @@ class QueryQueue:
         return self._pop(agent, is_oldest=False)
 
     def next_skipped(self) -> int | None:
-        """Take the newest skipped keyframe, or None."""
         return self._skipped_ids.pop() if self._skipped_ids else None
 
     def _skip_oldest(self, agent: str) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from share.mapping.loops import KeyframeKey
 from share.types import F64, Keyframe
+
+MIN_LOOP_GAP = 10  # keyframes of one segment closer than this make no loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,6 @@ class OdometrySegments:
         return nodes[-1] if nodes else None
 
     def has_nodes(self, agent: str) -> bool:
-        """Return whether the agent has nodes on any segment."""
         return any(self.segments[segment].agent == agent for segment in self.live_segments)
 
     def has_keyframe(self, key: KeyframeKey) -> bool:
@@ -138,12 +137,17 @@ class OdometrySegments:
         """Node after this one on its segment; None for the newest."""
         return self._neighbour(node_id, +1)
 
-    def are_neighbours(self, a: int, b: int, min_gap: int) -> bool:
-        """Return whether a and b are too close on one segment for a loop: fewer than `min_gap` keyframes
-        apart.
-        """
+    def are_neighbours(self, a: int, b: int) -> bool:
+        """Return whether a and b are too close on one segment for a loop."""
         first, second = self.nodes[a], self.nodes[b]
-        return first.segment == second.segment and abs(first.ordinal - second.ordinal) < min_gap
+        return first.segment == second.segment and abs(first.ordinal - second.ordinal) < MIN_LOOP_GAP
+
+    def neighbours(self, node_id: int) -> tuple[int, ...]:
+        """The node, and those too close to it on its segment for a loop."""
+        nodes = self.segments[self.nodes[node_id].segment].nodes
+        position = bisect_left(nodes, node_id)
+        nearby = nodes[max(0, position - MIN_LOOP_GAP) : position + MIN_LOOP_GAP]
+        return tuple(n for n in nearby if self.are_neighbours(n, node_id))
 
     def _neighbour(self, node_id: int, step: int) -> int | None:
         nodes = self.segments[self.nodes[node_id].segment].nodes
@@ -183,7 +187,6 @@ class AgentRuns:
         return was_absent
 
     def remove(self, run: str) -> None:
-        """Forget a run."""
         name = self._name_by_run.pop(run, run)
         self._absent.discard(run)
         if self._present_run.get(name) == run:
@@ -208,19 +211,3 @@ class AgentRuns:
     def presence_order(self) -> dict[str, int]:
         """Rank of each name by when its current run last connected, oldest first."""
         return {name: i for i, name in enumerate(self._present_run)}
-
-
-def fair_quotas(
-    counts: Counter[str], limits: Counter[str], count: int, presence_order: Mapping[str, int]
-) -> Counter[str]:
-    """Split `count` removals among names: one at a time from the name that holds most.
-
-    Ties go to the name that connected longest ago. A name that holds no more than a fair share gives nothing.
-    counts: keyframes of each name; limits: how many each can give; presence_order: from
-    `AgentRuns.presence_order`.
-    """
-    out = Counter[str]()
-    for _ in range(min(count, limits.total())):
-        candidates = (name for name in counts if out[name] < limits[name])
-        out[max(candidates, key=lambda name: (counts[name] - out[name], -presence_order.get(name, -1)))] += 1
-    return out

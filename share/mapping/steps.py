@@ -1,14 +1,15 @@
-"""The slow steps of mapping as frozen values, which the caller runs; results go back to the mapper."""
+"""The slow steps of mapping, frozen values that the caller runs, and the jobs that yield them."""
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from share.config import PlaceConfig
-from share.mapping.graph.solver import PoseGraphSolver
-from share.mapping.graph.updates import GraphSolution
+from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.map_solving import SolveJob
 from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
@@ -61,6 +62,36 @@ class SolveStep:
 
 LookupStep = QueryStep | VerifyStep
 Step = QueryStep | VerifyStep | SolveStep
+
+# Yields in turn a step, whose result or exception it is sent, and the events that follow from it.
+Job = Generator[Any, Any, None]
+
+
+class StepRunner:
+    """Runs one job at a time, step by step. is_running: a step is with the caller."""
+
+    def __init__(self) -> None:
+        self._job: Job | None = None
+        self.is_running = False
+
+    def start(self, job: Job) -> None:
+        """Begin a job, in place of one without further steps."""
+        self._job = job
+
+    def next_step(self) -> Any:
+        """Next step of the job; None if it has no more."""
+        step = None if self._job is None else next(self._job, None)
+        self.is_running = step is not None
+        return step
+
+    def finish(self, result: Any) -> list[MapEvent]:
+        """Return the events that follow from a step's result. Raises what the job does not catch."""
+        self.is_running = False
+        assert self._job is not None
+        events: list[MapEvent] = (
+            self._job.throw(result) if isinstance(result, Exception) else self._job.send(result)
+        )
+        return events
 
 
 @dataclass(frozen=True, eq=False)

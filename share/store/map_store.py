@@ -8,13 +8,28 @@ import os
 import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from share.errors import StoreError, UsageError
 from share.files.sqlite_file import wal_path
-from share.mapping.map_changes import MapChange, StoredMap
-from share.store import changes, database, decoding, schema
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import (
+    MapChange,
+    RemoveKeyframes,
+    RemoveLoops,
+    RemoveRun,
+    SaveCredential,
+    SaveKeyframe,
+    SaveLink,
+    SaveLoop,
+    SavePoses,
+    SaveRun,
+    StoredMap,
+)
+from share.store import database, rows
 from share.store.database import is_map, why_not_written
-from share.store.opening import load_and_repair, load_read_only, open_writer
+from share.store.loading import decode_map, load_and_repair, load_read_only, open_writer
+from share.store.rows import COLUMNS, insert
 from share.store.salvage import read_intact_rows, set_aside
 
 __all__ = ["MapStore", "is_map"]
@@ -23,11 +38,11 @@ __all__ = ["MapStore", "is_map"]
 class MapStore:
     """A map file, opened by `MapStore.open` or `MapStore.read`. Not thread-safe.
 
-    writable: `write` can be called. read_only_reason: why not. schema: of the file when it was opened.
+    writable: `write` can be called. read_only_reason: why not.
     """
 
-    def __init__(self, path: Path, loaded_map: StoredMap, schema: int, reason: str) -> None:
-        self.path, self.schema, self.read_only_reason = path, schema, reason
+    def __init__(self, path: Path, loaded_map: StoredMap, reason: str) -> None:
+        self.path, self.read_only_reason = path, reason
         self._loaded_map: StoredMap | None = loaded_map
         self._db: sqlite3.Connection | None = None
         self._file_ids: dict[Path, tuple[int, int]] = {}  # device and inode of the map's files
@@ -42,11 +57,10 @@ class MapStore:
     def open(path: Path, durable: bool = False) -> MapStore:
         """Open the map at `path`, or create it; all of it is read and checked.
 
-        A file of an older schema is copied to FILE.schema-N and migrated. Of a damaged file all intact rows
-        are taken over, and it is kept as FILE.damaged-N. A file that may not be written is opened for
-        reading. durable: commits wait for the disk, so that a power failure loses none. Raises UsageError if
-        it is no map, or of a newer SHARE; StoreError if another edge uses it; ShareError if the disk is full
-        or fails. The file is then unchanged.
+        Of a damaged file all intact rows are taken over, and it is kept as FILE.damaged-N. A file that may
+        not be written is opened for reading. durable: commits wait for the disk, so that a power failure
+        loses none. Raises UsageError if it is no map, or of another schema; StoreError if another edge uses
+        it; ShareError if the disk is full or fails. The file is then unchanged.
         """
         path = path.resolve() if path.is_symlink() else path
         if path.is_dir():
@@ -58,7 +72,7 @@ class MapStore:
             return MapStore.read(path, reason)
         lock = database.lock_map(path)
         try:
-            store = MapStore(path, load_and_repair(path), schema.SCHEMA, "")
+            store = MapStore(path, load_and_repair(path), "")
             store._db, store._lock = open_writer(path, durable), lock
             store._file_ids, store._durable = _read_file_ids(path), durable
             return store
@@ -69,7 +83,7 @@ class MapStore:
     @staticmethod
     def read(path: Path, reason: str = "it was opened for reading") -> MapStore:
         """Open a map for reading; an edge may use it at the same time. Raises UsageError, ShareError."""
-        return MapStore(path, *load_read_only(path), reason)
+        return MapStore(path, load_read_only(path), reason)
 
     def write(self, new_changes: Sequence[MapChange]) -> None:
         """Write all changes or none. After the return they survive any end of this process.
@@ -82,7 +96,7 @@ class MapStore:
         try:
             db.execute("BEGIN IMMEDIATE")
             for change in new_changes:
-                changes.apply_change(db, change)
+                apply_change(db, change)
             db.execute("COMMIT")
         except BaseException as error:
             with contextlib.suppress(sqlite3.Error):  # on a full disk SQLite has rolled back by itself
@@ -103,8 +117,8 @@ class MapStore:
         if loaded is not None:
             return loaded
         if self._db is None:
-            return load_read_only(self.path)[0]
-        return decoding.decode_map(read_intact_rows(self._db))
+            return load_read_only(self.path)
+        return decode_map(read_intact_rows(self._db))
 
     def set_aside(self) -> Path:
         """Rename the map and start an empty one in its place. Return the new name of the old one.
@@ -167,3 +181,121 @@ def _read_file_ids(path: Path) -> dict[Path, tuple[int, int]]:
             status = file.stat()
             out[file] = status.st_dev, status.st_ino
     return out
+
+
+# ---- Changes as SQL, within the caller's transaction
+
+_RUN_COLUMNS = (
+    *(("run", "key"), ("run_copy", "key"), ("stretch", "run"), ("keyframe", "run"), ("link", "run")),
+    *(("loop", "a_run"), ("loop", "b_run")),
+)
+
+
+def apply_change(db: sqlite3.Connection, change: MapChange) -> None:
+    """Apply one change; again it changes nothing. Raises ValueError for a keyframe of an unknown run."""
+    match change:
+        case SaveRun():
+            _insert_run(db, change)
+        case SaveCredential(run, credential):
+            _set_credential(db, run, credential)
+        case SaveKeyframe():
+            _insert_keyframe(db, change)
+        case SaveLink():
+            _delete_row(db, "link", change.key)
+            insert(db, "link", rows.link_row(change))
+        case SaveLoop():
+            _insert_loop(db, change)
+        case RemoveLoops(a, b):
+            for first, second in ((a, b), (b, a)):
+                db.execute(
+                    "DELETE FROM loop WHERE a_run = ? AND a_id = ? AND b_run = ? AND b_id = ?",
+                    (*first, *second),
+                )
+        case RemoveKeyframes():
+            for key in change.keys:
+                _remove_keyframe(db, key)
+        case RemoveRun():
+            _delete_run(db, change.run_key)
+        case SavePoses():
+            db.execute("DELETE FROM poses")
+            insert(db, "poses", rows.poses_row(change))
+
+
+def _insert_run(db: sqlite3.Connection, change: SaveRun) -> None:
+    if not _first_row(db, "SELECT 1 FROM run WHERE key = ?", change.run_key):
+        for table in ("run", "run_copy"):
+            insert(db, table, rows.run_row(change, 0))
+        _set_credential(db, change.run_key, change.credential)
+
+
+def _set_credential(db: sqlite3.Connection, run: str, credential: str | None) -> None:
+    row = rows.credential_row(run, credential or "")
+    db.execute("DELETE FROM about WHERE name = ?", row[:1])
+    if credential and _first_row(db, "SELECT 1 FROM run WHERE key = ?", run):
+        insert(db, "about", row)
+
+
+def _insert_keyframe(db: sqlite3.Connection, change: SaveKeyframe) -> None:
+    if change.keyframe_key.id < _next_id(db, change.run_key):
+        return
+    segment, ordinal = _segment_and_ordinal(db, change.run_key, starts_segment=change.keyframe.reference < 0)
+    insert(db, "keyframe", rows.keyframe_row(change, segment, ordinal))
+
+
+def _segment_and_ordinal(db: sqlite3.Connection, run: str, starts_segment: bool) -> tuple[int, int]:
+    """Return the number of the run's newest segment, or of a new one, and the keyframe's position in it."""
+    (segment,) = _first_row(db, "SELECT ifnull(max(nth), -1) FROM stretch WHERE run = ?", run)
+    if starts_segment or segment < 0:
+        insert(db, "stretch", (run, segment + 1))
+        return segment + 1, 0
+    newest = "SELECT stretch, ordinal FROM keyframe WHERE run = ? ORDER BY id DESC LIMIT 1"
+    previous_segment, ordinal = _first_row(db, newest, run) or (-1, -1)
+    return segment, ordinal + 1 if previous_segment == segment else 0
+
+
+def _next_id(db: sqlite3.Connection, run: str) -> int:
+    """Return one more than the largest keyframe id that the run ever had."""
+    row = _first_row(db, "SELECT next FROM run WHERE key = ?", run)
+    if not row:
+        raise ValueError(f"run {run} is not in the file; its SaveRun must come first")
+    (next_id,) = _first_row(db, "SELECT ifnull(max(id) + 1, 0) FROM keyframe WHERE run = ?", run)
+    return max(int(row[0]), int(next_id))
+
+
+def _insert_loop(db: sqlite3.Connection, change: SaveLoop) -> None:
+    row = rows.loop_row(change.loop)
+    same = " AND ".join(f"{name} IS ?" for name in COLUMNS["loop"])
+    if not _first_row(db, f"SELECT 1 FROM loop WHERE {same}", *row):
+        insert(db, "loop", row)
+
+
+def _remove_keyframe(db: sqlite3.Connection, key: KeyframeKey) -> None:
+    next_id = _next_id(db, key.agent)
+    for table in ("keyframe", "link"):
+        _delete_row(db, table, key)
+    db.execute("DELETE FROM loop WHERE a_run = ? AND a_id = ?", key)
+    db.execute("DELETE FROM loop WHERE b_run = ? AND b_id = ?", key)
+    if _next_id(db, key.agent) < next_id:  # it was the newest: the remaining rows do not show its id
+        _store_next_id(db, key.agent, next_id)
+
+
+def _delete_run(db: sqlite3.Connection, run: str) -> None:
+    for table, column in _RUN_COLUMNS:
+        db.execute(f"DELETE FROM {table} WHERE {column} = ?", (run,))
+    _set_credential(db, run, None)
+
+
+def _store_next_id(db: sqlite3.Connection, run: str, next_id: int) -> None:
+    for table in ("run", "run_copy"):
+        number, codec, hello = _first_row(db, f"SELECT number, codec, hello FROM {table} WHERE key = ?", run)
+        db.execute(f"DELETE FROM {table} WHERE number = ?", (number,))
+        insert(db, table, (run, next_id, codec, hello), number)
+
+
+def _delete_row(db: sqlite3.Connection, table: str, key: KeyframeKey) -> None:
+    db.execute(f"DELETE FROM {table} WHERE run = ? AND id = ?", key)
+
+
+def _first_row(db: sqlite3.Connection, query: str, *values: Any) -> tuple[Any, ...]:
+    """Return the first row, or ()."""
+    return db.execute(query, values).fetchone() or ()

@@ -1,4 +1,4 @@
-"""The tables of a map file, its schema number, and migrations from older schemas.
+"""The tables of a map file, and its schema number.
 
 Every row ends in a CRC-32 of its table's name and its other columns, so each can be checked alone. The table
 `about` is the same in all schemas: it holds the schema number.
@@ -7,7 +7,6 @@ Every row ends in a CRC-32 of its table's name and its other columns, so each ca
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Mapping
 
 from share import __version__
 from share.store.rows import insert, is_intact
@@ -32,10 +31,6 @@ CREATE TABLE poses(number INTEGER PRIMARY KEY, keys BLOB, T_map_body BLOB, crc I
 """  # noqa: E501
 STATEMENTS = tuple(TABLES.strip().split(";\n"))
 
-# SQL from each older schema to the next. Schema 1 has no migration: its keyframes lack the odometry pose; nor
-# has 2: its agents' image sizes are missing.
-MIGRATIONS: Mapping[int, tuple[str, ...]] = {}
-
 
 def create(connection: sqlite3.Connection) -> None:
     """Create all tables, within an open transaction."""
@@ -56,24 +51,6 @@ def read_version(connection: sqlite3.Connection) -> int | None:
     )
 
 
-def migrate(
-    connection: sqlite3.Connection, from_version: int, migrations: Mapping[int, tuple[str, ...]]
-) -> None:
-    """Migrate from schema `from_version` to SCHEMA, all steps or none. Raises sqlite3.Error, KeyError for a
-    missing step."""
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        for number in range(from_version, SCHEMA):
-            for statement in migrations[number]:
-                connection.execute(statement)
-        connection.execute("DELETE FROM about WHERE name = 'schema'")
-        insert(connection, "about", ("schema", str(SCHEMA)))
-        connection.execute("COMMIT")
-    except BaseException:
-        connection.execute("ROLLBACK")
-        raise
-
-
 def matches_schema(connection: sqlite3.Connection) -> bool:
     """Return whether tables and indexes are exactly those of this schema."""
     return _objects(connection) == _objects(_template())
@@ -86,7 +63,6 @@ def own_tables(connection: sqlite3.Connection) -> set[str]:
 
 
 def is_empty(connection: sqlite3.Connection) -> bool:
-    """Return whether the file has no tables."""
     return not _objects(connection)
 
 

@@ -7,8 +7,7 @@ import numpy as np
 from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.atlas import Atlas
-from share.mapping.graph.solver import PoseGraphSolver
-from share.mapping.graph.updates import GraphSolution
+from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_solving import AppliedSolution, SolveJob
 from share.types import F64, Keyframe, View
@@ -74,16 +73,16 @@ def near_loops(a: Walker, b: Walker, rng: np.random.Generator, every: int = 4) -
 
 def answer(atlas: Atlas, map_id: str) -> tuple[SolveJob, GraphSolution]:
     """By a solver that knows nothing before."""
-    atlas.reset_solver()
-    job, solver = atlas.make_job(map_id), PoseGraphSolver(GraphConfig())
+    atlas.graph.edges.reset()
+    job, solver = atlas.solving.make_job(map_id), PoseGraphSolver(GraphConfig())
     solver.update(job.change)
     return job, solver.solve(job.anchor, job.covariance_nodes)
 
 
 def settle(atlas: Atlas) -> list[AppliedSolution]:
     done = []
-    while atlas.due_maps():
-        done.append(atlas.apply_solution(*answer(atlas, atlas.due_maps()[0])))
+    while atlas.solving.due_maps():
+        done.append(atlas.solving.apply(*answer(atlas, atlas.solving.due_maps()[0])))
     return done
 
 

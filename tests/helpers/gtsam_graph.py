@@ -11,6 +11,7 @@ import numpy as np
 from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.graph.edges import PoseEdge
+from share.mapping.graph.optimiser import MAX_ITERATIONS, RELATIVE_TOLERANCE
 from share.types import F64
 
 ANCHOR_SIGMA = 1e-4  # rad and m; holds the gauge, removed again after solving
@@ -32,8 +33,9 @@ def solve(
     odometry: Sequence[PoseEdge],
     loops: Sequence[PoseEdge],
     anchors: Sequence[int],
-    config: GraphConfig,
     covariances_of: Sequence[int] = (),
+    cauchy_width: float = GraphConfig.cauchy,
+    relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> SolvedGraph:
     """The most likely poses, starting from `poses` (N, 4, 4); anchored ones stay exactly as given.
 
@@ -48,7 +50,7 @@ def solve(
         graph.add(gtsam.PriorFactorPose3(index, gtsam.Pose3(poses[index]), _gaussian(ANCHOR_SIGMA**2)))
     for edge in odometry:
         graph.add(_between(edge, gtsam.noiseModel.Gaussian.Covariance(edge.cov)))
-    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(config.cauchy)
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy_width)
     for edge in loops:
         gaussian = gtsam.noiseModel.Gaussian.Covariance(edge.cov)
         graph.add(_between(edge, gtsam.noiseModel.Robust.Create(cauchy, gaussian)))
@@ -56,8 +58,8 @@ def solve(
     for index, T in enumerate(poses):
         initial.insert(index, gtsam.Pose3(se3.orthonormal(T)))
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(config.max_iterations)
-    parameters.setRelativeErrorTol(config.relative_tolerance)
+    parameters.setMaxIterations(MAX_ITERATIONS)
+    parameters.setRelativeErrorTol(relative_tolerance)
     values = gtsam.LevenbergMarquardtOptimizer(graph, initial, parameters).optimize()
     solved = np.array([values.atPose3(i).matrix() for i in range(len(poses))])
     solved[list(anchors)] = poses[list(anchors)]

@@ -67,7 +67,7 @@ def small_map(count: int = 20, points: int = 40) -> list[MapChange]:
     return [run(ANN), run(BOB), *frames, *loops, solution([k.keyframe_key for k in frames])]
 
 
-def told(kept: StoredMap) -> dict[str, object]:
+def as_values(kept: StoredMap) -> dict[str, object]:
     """All of it in a form that can be compared to the last bit."""
     return {
         "runs": [

@@ -1,4 +1,4 @@
-"""Two odometries against each other: what is wrong with one shows, and honest ones show nothing."""
+"""Comparison of two odometries: errors of one are detected, and correct ones show none."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FRAMES = 60
 
 
 def ring(phase: float) -> list:
-    """Poses round a room, nodding."""
+    """Poses around a room, with pitch."""
     out = []
     for k in range(FRAMES):
         angle = phase + 0.1 * k
@@ -50,7 +50,7 @@ def chain(steps: list, sure: float = 1.0) -> list[AccumulatedOdometry]:
 
 
 def loops(rng, turn: float = 0.0, sure: float = 1.0, **bad) -> list[InterAgentLoop]:
-    """24 of them, of which two are false, between an honest odometry and one that is `bad`."""
+    """24 loops, two of them false, between a correct odometry and one with the errors in `bad`."""
     x, y = ring(0.0), ring(0.7)
     a, b = chain(steps_of(x, rng)), chain(steps_of(y, rng, **bad), sure)
     X = se3.exp(np.array([turn, 0, 0, 0, 0, 0]))
@@ -66,7 +66,7 @@ def loops(rng, turn: float = 0.0, sure: float = 1.0, **bad) -> list[InterAgentLo
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_honest_agents_show_nothing(seed):
+def test_correct_agents_show_no_difference(seed):
     found = compare_odometry(loops(np.random.default_rng(seed)))
     assert found.path_scale.significance < 3.5
     assert found.camera_rotation.significance < 4
@@ -76,20 +76,21 @@ def test_honest_agents_show_nothing(seed):
 
 @pytest.mark.parametrize("scale", [0.95, 0.97, 1.03, 1.05])
 @pytest.mark.parametrize("sure", [1.0, 0.01])
-def test_a_longer_way_is_measured(scale, sure):
+def test_a_path_scale_is_estimated(scale, sure):
     found = compare_odometry(loops(np.random.default_rng(3), scale=scale, sure=sure))
     assert found.path_scale.value == pytest.approx(np.log(scale), abs=3.5 * found.path_scale.sigma)
     assert found.path_scale.significance > 4.5
 
 
-def test_a_turned_camera_is_measured():
+def test_a_camera_rotation_is_estimated():
     found = compare_odometry(loops(np.random.default_rng(4), turn=np.radians(4.0)))
     assert np.degrees(found.camera_rotation.value) == pytest.approx(4.0, abs=1.0)
     assert found.camera_rotation.significance > 4.5
 
 
-def test_noise_of_who_is_too_sure_is_no_turn_once_its_claims_are_widened():
-    """By ten loops, of ways that are ten times as noisy as claimed."""
+@pytest.mark.long
+def test_noise_of_an_overconfident_agent_is_no_camera_rotation_once_its_covariance_is_scaled():
+    """Ten loops; odometry is ten times as noisy as stated."""
     found, as_claimed = [], []
     for seed in range(20):
         few = loops(np.random.default_rng(seed), drift=10.0)[:10]
@@ -99,7 +100,7 @@ def test_noise_of_who_is_too_sure_is_no_turn_once_its_claims_are_widened():
     assert max(turn.significance for turn in found) < 3
 
 
-def test_claims_that_are_widened_hide_neither_a_turned_camera_nor_a_longer_way():
+def test_scaled_covariances_hide_neither_a_camera_rotation_nor_a_path_scale():
     wide = compare_odometry(loops(np.random.default_rng(4), turn=np.radians(4.0)), (1.0, 4.0))
     assert np.degrees(wide.camera_rotation.value) == pytest.approx(4.0, abs=1.0)
     assert wide.camera_rotation.significance > 4.5
@@ -107,12 +108,12 @@ def test_claims_that_are_widened_hide_neither_a_turned_camera_nor_a_longer_way()
     assert compare_odometry(long, (1.0, 100.0)).path_scale == compare_odometry(long).path_scale
 
 
-def test_drift_beyond_its_covariances_is_seen():
-    """Beyond the loops' own noise: 6 cm a step. What is less than that noise, no loop can tell."""
+def test_drift_beyond_the_stated_covariances_raises_the_nis():
+    """6 cm a step, above the noise of the loops; below it, loops cannot show drift."""
     assert compare_odometry(loops(np.random.default_rng(5), drift=30.0, sure=0.01)).nis > 3
 
 
-def test_points_are_pooled_robustly():
+def test_depth_scales_are_pooled_robustly():
     rng = np.random.default_rng(1)
     scales = [DepthScale(0.05 + 0.005 * rng.standard_normal(), 0.005) for _ in range(12)] + [
         DepthScale(-0.3, 0.005)
@@ -123,7 +124,7 @@ def test_points_are_pooled_robustly():
 
 
 def town(scales: dict[str, float], pairs: list[tuple[str, str]]) -> tuple[AgentAgreement, list[bool]]:
-    """Agents whose depths are so much too large, who meet so."""
+    """Agents with these scales of their depths, with loops between these pairs."""
     agreement, rng, said = AgentAgreement(0.015), np.random.default_rng(2), []
     nodes = {name: range(10 * i, 10 * i + 10) for i, name in enumerate(scales)}
     for name, numbers in nodes.items():
@@ -146,7 +147,7 @@ THREE = [("ann", "bob"), ("eve", "ann"), ("bob", "eve")]
 
 @pytest.mark.parametrize("liar", ["ann", "bob", "eve"])
 @pytest.mark.parametrize("scale", [0.9, 0.95, 0.97, 1.03, 1.05])
-def test_of_three_the_one_that_is_wrong_is_set_apart(liar, scale):
+def test_of_three_agents_the_wrong_one_is_quarantined(liar, scale):
     agreement, said = town({n: scale if n == liar else 1.0 for n in ("ann", "bob", "eve")}, THREE)
     assert agreement.quarantined == {liar}
     assert any(said)
@@ -160,14 +161,14 @@ def test_of_three_the_one_that_is_wrong_is_set_apart(liar, scale):
     assert not agreement.separation_reason(honest, honest)
 
 
-def test_honest_agents_stay_together():
+def test_correct_agents_are_not_quarantined():
     agreement, said = town({"ann": 1.003, "bob": 1.0, "eve": 0.997}, THREE)
     assert not agreement.quarantined
     assert not agreement.disputed
     assert not any(said)
 
 
-def test_of_two_nobody_can_say_who_is_wrong():
+def test_two_agents_that_disagree_are_disputed():
     agreement, _ = town({"ann": 1.0, "eve": 1.05}, [("ann", "eve")])
     assert not agreement.quarantined
     assert agreement.disputed == {frozenset(("ann", "eve"))}
@@ -176,7 +177,8 @@ def test_of_two_nobody_can_say_who_is_wrong():
     assert "larger" in agreement.standing("eve").reason
 
 
-def test_who_agrees_by_later_loops_is_let_in_again():
+@pytest.mark.long
+def test_quarantine_ends_when_later_loops_agree():
     agreement, _ = town({"ann": 1.0, "eve": 1.04}, [("ann", "eve")])
     assert agreement.disputed
     for k in range(200):

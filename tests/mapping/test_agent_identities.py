@@ -1,4 +1,4 @@
-"""What is known of a name holds for all its runs, and a name counts once."""
+"""All runs of a name are one agent with one vote, except after suspicion."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIGMA = 0.004
 
 
 class Town:
-    """Runs that meet at one spot, one after the other."""
+    """Runs with loops at one spot, one after the other."""
 
     def __init__(self) -> None:
         self.agreement, self.rng = AgentAgreement(0.015), np.random.default_rng(3)
@@ -40,7 +40,7 @@ class Town:
             self.agreement.add_step(run, first + k, first + k - 1 if k else None, step, STEP)
 
     def meet(self, a: str, b: str, scale: float, times: int = 1) -> None:
-        """b's depths over a's."""
+        """scale: of b's depths relative to a's."""
         for _ in range(times):
             k = int(self.rng.integers(12))
             ends = self.numbers[a], self.numbers[b]
@@ -49,8 +49,8 @@ class Town:
             self.agreement.add_loop((a, b), ends, edge, DepthScale(log, SIGMA), None)
 
 
-def with_a_wrong_one():
-    """Ann and bob agree; eve's metres are 5 % too long for both."""
+def with_a_wrong_agent():
+    """Ann and bob agree; eve's scale is 5 % too large."""
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
         town.enter(run)
@@ -60,8 +60,8 @@ def with_a_wrong_one():
     return town
 
 
-def test_who_is_restarted_before_it_is_found_out_is_found_out_by_all_its_runs():
-    """Two loops with each of two others in each run: never enough of one run."""
+def test_loops_of_all_runs_of_a_name_count_as_those_of_one_agent():
+    """Two loops with each of two others in each run: too few of any one run."""
     town = Town()
     for run in ("ann-1", "bob-1"):
         town.enter(run)
@@ -80,13 +80,13 @@ def test_who_is_restarted_before_it_is_found_out_is_found_out_by_all_its_runs():
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
-def test_a_run_of_a_name_that_was_set_apart_is_compared_before_it_comes_in(scale):
-    town = with_a_wrong_one()
+def test_a_new_run_of_a_quarantined_name_is_compared_before_it_joins(scale):
+    town = with_a_wrong_agent()
     assert town.agreement.standing("eve-1").state == "set apart"
     town.enter("eve-2")
     assert "earlier run" in town.agreement.standing("eve-2").reason
     assert "earlier run" in town.agreement.unverified_reason(["ann-1"], ["eve-2"])
-    assert not town.agreement.unverified_reason(["eve-2"], ["eve-2"])  # its own stretches
+    assert not town.agreement.unverified_reason(["eve-2"], ["eve-2"])  # its own segments
     for _ in range(10):
         for other in ("ann-1", "bob-1"):
             town.meet(other, "eve-2", scale)
@@ -102,15 +102,15 @@ def test_a_run_of_a_name_that_was_set_apart_is_compared_before_it_comes_in(scale
         assert town.agreement.separation_reason(["ann-1"], ["eve-2"])
 
 
-def test_who_was_set_apart_before_is_wrong_again_where_only_one_can_say_so():
-    town = with_a_wrong_one()
+def test_of_two_that_disagree_the_one_with_a_quarantined_run_is_quarantined():
+    town = with_a_wrong_agent()
     town.enter("eve-2")
     town.meet("bob-1", "eve-2", 1.05, 5)
     assert town.agreement.standing("eve-2").state == "set apart"
     assert town.agreement.standing("bob-1").state == "agrees"
 
 
-def test_many_runs_of_one_name_are_one_voice():
+def test_runs_of_one_name_have_one_vote():
     town = Town()
     town.enter("ann-1")
     for n in range(1, 5):
@@ -120,7 +120,7 @@ def test_many_runs_of_one_name_are_one_voice():
     assert not town.agreement.quarantined
 
 
-def test_what_is_known_of_a_names_scale_holds_for_its_next_run():
+def test_a_new_run_of_a_name_inherits_its_scale():
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
         town.enter(run)
@@ -132,8 +132,8 @@ def test_what_is_known_of_a_names_scale_holds_for_its_next_run():
     assert town.agreement.log_scale("eve-2") == pytest.approx(np.log(0.99), abs=0.004)
 
 
-def test_who_turns_bad_is_found_out_by_its_newest_loops():
-    """After thirty with each other that were good; it took as many bad ones."""
+def test_an_agent_that_becomes_wrong_is_detected_by_its_newest_loops():
+    """After thirty correct loops, by fewer wrong ones."""
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
         town.enter(run)
@@ -150,20 +150,20 @@ def test_who_turns_bad_is_found_out_by_its_newest_loops():
     assert not town.agreement.separation_reason(["ann-1"], ["bob-1"])
 
 
-def test_runs_of_an_earlier_life_that_were_outside_are_a_subject_of_their_own():
-    subjects = AgentIdentities()
+def test_restored_runs_outside_the_largest_map_are_an_unverified_identity():
+    identities = AgentIdentities()
     for run, name in (("eve-1", "eve"), ("eve-2", "eve"), ("ann-1", "ann"), ("eve-3", "eve")):
-        subjects.add_run(run, name, ())
-    subjects.mark_unverified({"eve-1", "eve-3"})
-    assert subjects.identity("eve-3") == subjects.identity("eve-1") != subjects.identity("eve-2")
-    assert subjects.unverified == {subjects.identity("eve-1")}
-    assert subjects.name("eve-2") == subjects.name("eve-3") == "eve"
-    subjects.add_run("eve-4", "eve", ())
-    assert subjects.identity("eve-4") in subjects.unverified
+        identities.add_run(run, name, ())
+    identities.mark_unverified({"eve-1", "eve-3"})
+    assert identities.identity("eve-3") == identities.identity("eve-1") != identities.identity("eve-2")
+    assert identities.unverified == {identities.identity("eve-1")}
+    assert identities.name("eve-2") == identities.name("eve-3") == "eve"
+    identities.add_run("eve-4", "eve", ())
+    assert identities.identity("eve-4") in identities.unverified
 
 
-def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
-    """Through the atlas: what the newest run of a name that was set apart says moves nobody."""
+def test_loops_of_an_unverified_run_are_not_accepted_before_it_is_compared():
+    """In the atlas: loops of the newest run of a quarantined name move no map."""
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.3)
     first, second = Walker("eve-1", 3, phase=0.7), Walker("eve-2", 4, phase=0.7)
     atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
@@ -173,8 +173,8 @@ def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
             atlas.add_keyframe(walker.name, keyframe)
     for a, b, log in ((ann, bob, 0.0), (ann, first, 0.05), (bob, first, 0.05)):
         for loop in near_loops(a, b, rng):
-            atlas.compare_agents(loop, DepthScale(log, 0.005))
-    assert atlas.standing("eve-1").state == "set apart"
+            atlas.quarantine.add_loop(loop, DepthScale(log, 0.005))
+    assert atlas.quarantine.agreement.standing("eve-1").state == "set apart"
     atlas.add_run("eve-2", "eve")
     for keyframe in second.keyframes:
         atlas.add_keyframe("eve-2", keyframe)
@@ -183,8 +183,8 @@ def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
     assert all("an earlier run of its name" in decision.reason for decision in said)
 
 
-def test_who_is_set_apart_is_no_measure_of_the_others_scale():
-    """Ann and bob have met only eve, whose depths became wrong: nothing says how theirs compare."""
+def test_a_quarantined_agent_does_not_affect_the_scales_of_others():
+    """Ann and bob have loops with eve only, whose depths became wrong: theirs cannot be compared."""
     town = Town()
     for run in ("ann-1", "bob-1", "eve-1"):
         town.enter(run)
@@ -195,52 +195,52 @@ def test_who_is_set_apart_is_no_measure_of_the_others_scale():
     assert town.agreement.log_scale("ann-1") == town.agreement.log_scale("bob-1") == 0.0
 
 
-def test_a_run_that_is_forgotten_takes_nothing_of_its_name_with_it():
-    subjects = AgentIdentities()
+def test_removing_one_run_keeps_what_is_known_of_its_name():
+    identities = AgentIdentities()
     for number in range(1, 4):
-        subjects.add_run(f"eve-{number}", "eve", ())
-    assert [subjects.remove_run(f"eve-{number}", (), ()) for number in (1, 2)] == [None, None]
-    subjects.add_run("eve-4", "eve", ())
-    assert subjects.identity("eve-4") == "eve-1"
-    assert (subjects.name("eve-1"), subjects.newest_run("eve-1")) == ("eve", "eve-4")
-    assert [subjects.remove_run(f"eve-{number}", (), ()) for number in (3, 4)] == [None, "eve-1"]
-    subjects.add_run("eve-5", "eve", ())
-    assert (subjects.identity("eve-5"), subjects.unverified) == ("eve-5", set())
+        identities.add_run(f"eve-{number}", "eve", ())
+    assert [identities.remove_run(f"eve-{number}", (), ()) for number in (1, 2)] == [None, None]
+    identities.add_run("eve-4", "eve", ())
+    assert identities.identity("eve-4") == "eve-1"
+    assert (identities.name("eve-1"), identities.newest_run("eve-1")) == ("eve", "eve-4")
+    assert [identities.remove_run(f"eve-{number}", (), ()) for number in (3, 4)] == [None, "eve-1"]
+    identities.add_run("eve-5", "eve", ())
+    assert (identities.identity("eve-5"), identities.unverified) == ("eve-5", set())
 
 
-def test_what_is_held_against_a_name_outlives_its_runs():
-    subjects = AgentIdentities()
-    subjects.add_run("eve-1", "eve", ())
-    assert subjects.remove_run("eve-1", {"eve-1"}, ()) == "eve-1"
+def test_suspicion_of_a_name_outlives_its_runs():
+    identities = AgentIdentities()
+    identities.add_run("eve-1", "eve", ())
+    assert identities.remove_run("eve-1", {"eve-1"}, ()) == "eve-1"
     for number in range(2, 5):
-        subjects.add_run(f"eve-{number}", "eve", ())
-        assert subjects.unverified == {f"eve-{number}"}
-        assert f"eve-{number}" in subjects.suspected
-        assert subjects.had_quarantined_run(f"eve-{number}", ())
-        subjects.remove_run(f"eve-{number}", (), ())
-    assert not subjects.unverified
-    subjects.add_run("eve-9", "eve", ())
-    subjects.mark_verified("eve-9")  # it was compared, and agrees
-    subjects.remove_run("eve-9", (), ())
-    subjects.add_run("eve-10", "eve", ())
-    assert not subjects.unverified
+        identities.add_run(f"eve-{number}", "eve", ())
+        assert identities.unverified == {f"eve-{number}"}
+        assert f"eve-{number}" in identities.suspected
+        assert identities.had_quarantined_run(f"eve-{number}", ())
+        identities.remove_run(f"eve-{number}", (), ())
+    assert not identities.unverified
+    identities.add_run("eve-9", "eve", ())
+    identities.mark_verified("eve-9")  # it was compared, and agrees
+    identities.remove_run("eve-9", (), ())
+    identities.add_run("eve-10", "eve", ())
+    assert not identities.unverified
 
 
-def test_runs_of_a_suspect_without_end_leave_nothing_but_the_suspicion():
-    """Eve met ann in each of her runs, and disagreed; each is forgotten with its keyframes."""
+def test_any_number_of_removed_runs_leaves_only_the_suspicion():
+    """Each run of eve disagreed with ann and is removed with its keyframes."""
     ann, atlas, rng = Walker("ann", 1, n=20), Atlas(MergeConfig()), np.random.default_rng(0)
     atlas.add_run("ann", "ann")
     for keyframe in ann.keyframes:
         atlas.add_keyframe("ann", keyframe)
-    agreement = atlas._quarantine.agreement
+    agreement = atlas.quarantine.agreement
     for n in range(1, 6):
         eve = Walker(f"eve-{n}", n, n=20, phase=0.1)
         atlas.add_run(eve.name, "eve")
         assert agreement.identities.unverified == ({eve.name} if n > 1 else set())
         numbers = [atlas.add_keyframe(eve.name, keyframe) for keyframe in eve.keyframes]
         for loop in near_loops(ann, eve, rng):
-            atlas.compare_agents(loop, DepthScale(0.05, 0.005))
-        assert atlas.standing("ann").state == "disputed"
+            atlas.quarantine.add_loop(loop, DepthScale(0.05, 0.005))
+        assert atlas.quarantine.agreement.standing("ann").state == "disputed"
         atlas.set_present(eve.name, False)
         atlas.add_run("eve-next", "eve")
         atlas.remove_keyframes(numbers)
@@ -248,14 +248,14 @@ def test_runs_of_a_suspect_without_end_leave_nothing_but_the_suspicion():
         atlas.remove_run(eve.name)
         atlas.set_present("eve-next", False)
         atlas.remove_run("eve-next")
-        assert not agreement._pairs
+        assert not agreement.pairs
         assert not agreement.disputed
-        assert agreement._covariance_scales._claims.known_agents == {"ann"}
-        assert atlas.standing("ann").state == "unknown"
+        assert agreement.covariance_scales.claims.known_agents == {"ann"}
+        assert atlas.quarantine.agreement.standing("ann").state == "unknown"
 
 
 def test_a_disagreement_outlives_the_keyframes_that_showed_it():
-    """Two loops with each of many runs of bob, whose stretches go one after the other."""
+    """Two loops with each of many runs of bob, whose segments are removed one after the other."""
     town = Town()
     town.enter("ann-1")
     for n in range(1, 30):
@@ -265,12 +265,12 @@ def test_a_disagreement_outlives_the_keyframes_that_showed_it():
         first = town.numbers[f"bob-{n}"]
         town.agreement.remove_nodes(range(first, first + 12), {town.numbers["ann-1"]})
         assert bool(town.agreement.disputed) == (n > 1)
-    (pair,) = town.agreement._pairs.values()
+    (pair,) = town.agreement.pairs.values()
     assert len(pair.by_segments) == 1
     assert sum(len(met.loops) for met in pair.by_segments.values()) <= 32
 
 
-def test_what_loops_said_of_a_stretch_goes_with_it():
+def test_the_covariance_evidence_of_a_segment_is_removed_with_it():
     ann, bob = Walker("ann", 1), Walker("bob-1", 2, phase=0.3)
     atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
     for walker in (ann, bob):
@@ -278,21 +278,21 @@ def test_what_loops_said_of_a_stretch_goes_with_it():
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     for loop in near_loops(ann, bob, rng, every=2):
-        atlas.compare_agents(loop, DepthScale(0.0, 0.005))
-    agreement = atlas._quarantine.agreement
-    (pair,) = agreement._pairs.values()
-    assert agreement._covariance_scales._evidence.keys() == pair.by_segments.keys() == {(0, 1)}
+        atlas.quarantine.add_loop(loop, DepthScale(0.0, 0.005))
+    agreement = atlas.quarantine.agreement
+    (pair,) = agreement.pairs.values()
+    assert agreement.covariance_scales.evidence.keys() == pair.by_segments.keys() == {(0, 1)}
     atlas.set_present("bob-1", False)
     atlas.add_run("bob-2", "bob")
     gone = [n for n in range(len(atlas)) if atlas.key(n).agent == "bob-1"]
     assert len(atlas.remove_keyframes(gone)) == len(gone)
-    assert not agreement._covariance_scales._evidence
+    assert not agreement.covariance_scales.evidence
     assert (0, 1) not in pair.by_segments
-    assert atlas.standing("ann").state == "agrees"
+    assert atlas.quarantine.agreement.standing("ann").state == "agrees"
 
 
-def test_who_is_doubted_since_the_edge_was_started_again_is_proven_by_another_who_is():
-    """Both were alone in their maps, and now meet: there is nobody else to compare them with."""
+def test_two_unverified_agents_of_a_restored_map_verify_each_other():
+    """Both were alone in their maps; there is no third agent."""
     town = Town()
     for run in ("ann-1", "bob-1"):
         town.enter(run)
@@ -304,8 +304,8 @@ def test_who_is_doubted_since_the_edge_was_started_again_is_proven_by_another_wh
     assert not town.agreement.unverified_reason(["ann-2"], ["bob-2"])
 
 
-def test_names_of_one_key_have_one_voice():
-    """Eve speaks for three, whose metres are too long; ann and bob agree."""
+def test_names_of_one_key_have_one_vote():
+    """Three names have the key of eve and a wrong scale; ann and bob agree."""
     for voice, apart in (("eve", {"e1-1", "e2-1", "e3-1"}), ("", None)):
         town = Town()
         for run in ("ann-1", "bob-1"):
@@ -321,9 +321,9 @@ def test_names_of_one_key_have_one_voice():
         assert not apart or not town.agreement.separation_reason(["ann-1"], ["bob-1"])
 
 
-def quarrel(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
-    """Eve speaks for e1 and e2, whose metres are too long, and that agree. known: voices, of the others
-    nobody knows which they have."""
+def disagreeing_agents(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
+    """The names e1 and e2 have the key of eve and the same wrong scale. known: credentials; those of
+    the others are unknown."""
     town = Town()
     names = (*honest, "e1", "e2")
     for name in names:
@@ -339,22 +339,22 @@ def quarrel(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
 @pytest.mark.parametrize(
     "known", [{}, {"ann": "A"}, {"ann": "A", "e1": "E"}, {"e1": "E"}, {"ann": "A", "e1": "E", "e2": "E"}]
 )
-def test_voices_that_are_not_known_may_be_one_and_the_same(known):
-    """Ann stands against one key, also while it is not known yet that it is one."""
-    town = quarrel(known)
+def test_unknown_credentials_may_all_be_the_same(known):
+    """Ann disagrees with two names of one key, also before the key is known."""
+    town = disagreeing_agents(known)
     assert not town.agreement.quarantined
     assert town.agreement.standing("ann-1").state == "disputed"
 
 
-def test_who_is_outvoted_whoever_the_unknown_are_is_set_apart_at_once():
+def test_an_agent_outvoted_under_every_hypothesis_is_quarantined_at_once():
     known = {"ann": "A", "bob": "B", "e1": "E", "e2": "E"}
-    assert quarrel(known, ("ann", "bob", "cat")).agreement.quarantined == {"e1-1", "e2-1"}
-    town = quarrel({"e1": "E"}, ("ann", "bob"))  # who may both be Eve
+    assert disagreeing_agents(known, ("ann", "bob", "cat")).agreement.quarantined == {"e1-1", "e2-1"}
+    town = disagreeing_agents({"e1": "E"}, ("ann", "bob"))  # which may have the key too
     assert not town.agreement.quarantined
 
 
-def test_a_voice_that_becomes_known_counts_from_then_on():
-    town = quarrel({"ann": "A"})
+def test_a_credential_counts_from_when_it_is_known():
+    town = disagreeing_agents({"ann": "A"})
     town.agreement.add_run("e1-1", "e1", "E")
     town.agreement.add_run("e2-1", "e2", "F")
     town.meet("ann-1", "e1-1", 1.05, 12)
@@ -365,15 +365,15 @@ def test_a_voice_that_becomes_known_counts_from_then_on():
 
 
 def test_names_of_one_key_that_disagree_are_disputed():
-    """Nobody else has a vote: this is decided, and ends."""
+    """No other agent has a vote: the search ends."""
     assert outvoted_agents([frozenset("ab")], [], dict.fromkeys("ab", "E"), ()) == frozenset()
     assert outvoted_agents([frozenset("ab"), frozenset("ac")], [], {"a": "E", "b": "E", "c": "C"}, "a") == {
         "a"
     }
 
 
-def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
-    """An atlas of ann and bob, and loops between them that were taken back; decide: in the judge's place."""
+def pair_with_withdrawn_loops(decide=None) -> tuple[Atlas, list[Loop]]:
+    """An atlas of ann and bob with withdrawn loops; decide: replaces the decision on loops."""
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.3)
     atlas = Atlas(MergeConfig())
     for walker in (ann, bob):
@@ -381,53 +381,53 @@ def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     loops = near_loops(ann, bob, np.random.default_rng(0))
-    atlas._quarantine._withdrawn = list(loops)
+    atlas.quarantine.withdrawn = list(loops)
     if decide is not None:
-        atlas._loop_acceptance.decide = decide
+        atlas.loop_acceptance.decide = decide
     return atlas, loops
 
 
-def test_loops_that_were_taken_back_wait_while_anything_forbids_them():
-    """Bob is not kept apart any more, but has to be compared first."""
-    atlas, loops = pair_that_met()
-    parting, unproven = atlas._quarantine, atlas._quarantine.agreement.identities.unverified
-    unproven.add("bob")
-    assert parting._reconsider_withdrawn() == ((), ())
-    unproven.clear()
+def test_withdrawn_loops_wait_while_their_agents_are_kept_apart():
+    """Bob is not separated any more, but unverified."""
+    atlas, loops = pair_with_withdrawn_loops()
+    quarantine, unverified = atlas.quarantine, atlas.quarantine.agreement.identities.unverified
+    unverified.add("bob")
+    assert quarantine.reconsider_withdrawn() == ((), ())
+    unverified.clear()
     gone = Loop(KeyframeKey("ann", 99), loops[0].b, loops[0].T_a_b, loops[0].cov, 9)
-    parting._withdrawn.append(gone)
-    tied, undone = parting._reconsider_withdrawn()
+    quarantine.withdrawn.append(gone)
+    tied, undone = quarantine.reconsider_withdrawn()
     assert len(tied) > len(loops) / 2
     assert not undone
-    assert not parting._withdrawn
+    assert not quarantine.withdrawn
 
 
-def test_loops_that_were_taken_back_are_judged_once_who_was_to_be_compared_is():
-    atlas, loops = pair_that_met()
-    atlas._quarantine.agreement.identities.unverified.add("bob")
-    said = [atlas.compare_agents(loop, DepthScale(0.0, 0.005)) for loop in loops]
-    assert "bob" not in atlas._quarantine.agreement.identities.unverified
+def test_withdrawn_loops_are_decided_once_their_agents_are_compared():
+    atlas, loops = pair_with_withdrawn_loops()
+    atlas.quarantine.agreement.identities.unverified.add("bob")
+    said = [atlas.quarantine.add_loop(loop, DepthScale(0.0, 0.005)) for loop in loops]
+    assert "bob" not in atlas.quarantine.agreement.identities.unverified
     assert sum(len(parted.added) for parted in said) > len(loops) / 2
     assert not any(parted.standings for parted in said)
 
 
-def test_a_loop_that_is_believed_again_and_undone_at_once_is_not_said_to_be_tied():
+def test_a_loop_added_again_and_undone_at_once_is_not_reported_as_added():
     def decide(loop: Loop) -> LoopDecision:
         return LoopDecision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
 
-    atlas, loops = pair_that_met(decide)
-    tied, undone = atlas._quarantine._reconsider_withdrawn()
+    atlas, loops = pair_with_withdrawn_loops(decide)
+    tied, undone = atlas.quarantine.reconsider_withdrawn()
     assert tied == tuple(loops[1:])
     assert undone == (loops[0],)
 
 
-def test_what_is_put_right_is_so_in_one_order():
-    """Whatever the hashes of their names are."""
+def test_scales_are_applied_in_the_order_of_names():
+    """Independent of the hashes of their names."""
     atlas, done = Atlas(MergeConfig()), list[str]()
     names = [f"agent{k}" for k in range(10)]
     for name in names:
         atlas.add_keyframe(name, Walker(name, 1, n=1).keyframes[0])
-    atlas._quarantine.agreement.log_scales = dict.fromkeys(names, 0.01)
-    atlas._graph.rescale_odometry = lambda agent, log, width: done.append(agent)
-    atlas._quarantine._apply_scales()
+    atlas.quarantine.agreement.log_scales = dict.fromkeys(names, 0.01)
+    atlas.graph.rescale_odometry = lambda agent, log, width: done.append(agent)
+    atlas.quarantine.apply_scales()
     assert done == names

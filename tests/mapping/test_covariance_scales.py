@@ -1,4 +1,4 @@
-"""How much too sure an agent is shows in the loops; honest agents stay as they are."""
+"""Loops show by how much an agent understates its covariances; others are not scaled."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ DRIFT = 4.0  # by what all odometry is worse than STEP_COV, so that it shows bes
 
 
 def walkers(seed: int, sure: float, rounds: int = 8) -> CovarianceScales:
-    """What is known of three agents that have gone round a room, of whom eve's sigmas are so many times too
-    small."""
+    """Covariance scales of three agents around a room; eve's sigmas are too small by the factor `sure`."""
     rng, paths, walked = np.random.default_rng(seed), {}, {}
     for name, phase in WALKERS.items():
         paths[name] = ring(phase)
-        told = DRIFT**2 / (sure**2 if name == "eve" else 1.0)
-        walked[name] = chain(steps_of(paths[name], rng, drift=DRIFT), told)
-    claims = claimed({name: 1 / sure if name == "eve" else 1.0 for name in WALKERS})
-    sureness, met = CovarianceScales(claims), {}
+        scale = DRIFT**2 / (sure**2 if name == "eve" else 1.0)
+        walked[name] = chain(steps_of(paths[name], rng, drift=DRIFT), scale)
+    claims = claims_of({name: 1 / sure if name == "eve" else 1.0 for name in WALKERS})
+    covariance_scales, evidence = CovarianceScales(claims), {}
     for n, (a, b) in enumerate((("ann", "bob"), ("ann", "eve"), ("bob", "eve"))):
         loops = []
         for j in range(4, FRAMES, 2):
@@ -42,42 +41,45 @@ def walkers(seed: int, sure: float, rounds: int = 8) -> CovarianceScales:
             noise = se3.exp(np.sqrt(np.diag(LOOP_COV)) * rng.standard_normal(6))
             T = se3.orthonormal(se3.inverse(paths[a][i]) @ paths[b][j] @ noise)
             loops.append(InterAgentLoop(walked[a][i], walked[b][j], T, LOOP_COV))
-        met[(n, n + 1)] = (a, b), comparison_equations(loops)
+        evidence[(n, n + 1)] = (a, b), comparison_equations(loops)
     for _ in range(rounds):
-        for meeting, (agents, told) in met.items():
-            sureness.set_evidence(meeting, agents, told, solve_comparison(told).weights)
-    return sureness
+        for pair, (agents, equations) in evidence.items():
+            weights = solve_comparison(equations).weights
+            covariance_scales.set_evidence(pair, agents, equations, weights)
+    return covariance_scales
 
 
 def factors(seed: int, sure: float, rounds: int = 8) -> dict[str, float]:
-    sureness = walkers(seed, sure, rounds)
-    return {name: sureness.scales.get(name, 1.0) for name in WALKERS}
+    covariance_scales = walkers(seed, sure, rounds)
+    return {name: covariance_scales.scales.get(name, 1.0) for name in WALKERS}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sure", [3.0, 10.0])
-def test_who_is_too_sure_is_widened_and_nobody_else(sure):
+def test_only_the_overconfident_agent_is_scaled(sure):
     found = np.array([list(factors(seed, sure).values()) for seed in range(2)])
     assert found[:, 2] == pytest.approx(sure**2, rel=0.6)
     assert found[:, :2].max() < 2.5
 
 
-def test_honest_agents_are_not_widened():
+def test_correct_agents_are_not_scaled():
     found = [factors(seed, 1.0, rounds=3) for seed in range(3)]
     assert max(max(one.values()) for one in found) < 1.6
 
 
-def test_few_loops_say_nothing():
-    sureness = CovarianceScales(CovarianceClaims())
+def test_few_loops_change_no_scale():
+    covariance_scales = CovarianceScales()
     rng = np.random.default_rng(0)
     x, y = ring(0.0), ring(0.7)
     a, b = chain(steps_of(x, rng, drift=10.0)), chain(steps_of(y, rng, drift=10.0))
     loops = [InterAgentLoop(a[j + 7], b[j], se3.inverse(x[j + 7]) @ y[j], LOOP_COV) for j in range(7)]
-    told = comparison_equations(loops)
-    sureness.set_evidence((0, 1), ("ann", "bob"), told, solve_comparison(told).weights)
-    assert sureness.scales == {}
+    equations = comparison_equations(loops)
+    weights = solve_comparison(equations).weights
+    covariance_scales.set_evidence((0, 1), ("ann", "bob"), equations, weights)
+    assert covariance_scales.scales == {}
 
 
-def claimed(sigmas: dict[str, float]) -> CovarianceClaims:
+def claims_of(sigmas: dict[str, float]) -> CovarianceClaims:
     claims = CovarianceClaims()
     for name, sigma in sigmas.items():
         for _ in range(10):
@@ -87,9 +89,9 @@ def claimed(sigmas: dict[str, float]) -> CovarianceClaims:
     return claims
 
 
-def test_who_was_never_met_measures_nobody():
-    """Its variances may be anything."""
-    claims = claimed({"ann": 1.0})
+def test_agents_without_a_common_loop_are_not_compared():
+    """With any variances."""
+    claims = claims_of({"ann": 1.0})
     for _ in range(10):
         claims.add_step("eve", MOVED, 1e6 * STEP_COV)
     assert claims.min_scale("ann") == 1.0
@@ -97,8 +99,8 @@ def test_who_was_never_met_measures_nobody():
     assert claims.min_scale("ann") == 100.0
 
 
-def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
-    claims = claimed({"ann": 1.0, "bob": 3.0, "eve": 0.1})
+def test_without_evidence_no_agent_counts_as_much_more_certain_than_the_others():
+    claims = claims_of({"ann": 1.0, "bob": 3.0, "eve": 0.1})
     assert claims.min_scale("ann") == claims.min_scale("bob") == 1.0
     assert claims.min_scale("eve") == pytest.approx(100 / 2.25)
     claims.exclude(["ann"])
@@ -111,17 +113,17 @@ def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
     assert claims.known_agents == {"bob", "eve"}
 
 
-def test_honest_agents_may_differ():
-    claims = claimed({"ann": 1.0, "bob": 1.4, "eve": 0.7})
+def test_small_differences_of_stated_covariances_change_no_scale():
+    claims = claims_of({"ann": 1.0, "bob": 1.4, "eve": 0.7})
     assert all(claims.min_scale(name) == 1.0 for name in ("ann", "bob", "eve"))
 
 
-def test_who_is_alone_is_measured_by_nobody():
-    assert claimed({"eve": 0.01}).min_scale("eve") == 1.0
+def test_an_agent_alone_is_not_scaled():
+    assert claims_of({"eve": 0.01}).min_scale("eve") == 1.0
 
 
-def test_depths_that_are_spread_say_so():
-    """Each loop says 0.5 %, and they differ by 10: the mean is not known to 0.5."""
+def test_scattered_depth_scales_have_a_larger_sigma():
+    """Each loop states 0.5 %, and they differ by 10 %: the mean is less certain than 0.5 %."""
     rng = np.random.default_rng(4)
     logs = 0.4 + 0.1 * rng.standard_normal((200, 12))
     found = [robust_depth_scale([DepthScale(log, 0.005) for log in one]) for one in logs]
@@ -129,18 +131,18 @@ def test_depths_that_are_spread_say_so():
     assert 0.6 < np.sqrt((off**2).mean()) < 1.7
 
 
-def test_what_loops_said_is_no_longer_told_once_they_are_left():
-    """At once, not with the next step; what eve claims still holds."""
+def test_dropped_evidence_no_longer_scales():
+    """At once, not with the next step; the stated covariances of eve still count."""
     claimed_only = 100 / 2.25
     for let_go in (lambda s: s.drop_evidence([(0, 1), (1, 2), (2, 3)]), lambda s: s.exclude(["eve"])):
-        sureness = walkers(0, 10.0, rounds=2)
-        assert sureness.scales["eve"] != pytest.approx(claimed_only, rel=0.01)
-        let_go(sureness)
-        assert sureness.scales["eve"] == pytest.approx(claimed_only, rel=0.01)
+        covariance_scales = walkers(0, 10.0, rounds=2)
+        assert covariance_scales.scales["eve"] != pytest.approx(claimed_only, rel=0.01)
+        let_go(covariance_scales)
+        assert covariance_scales.scales["eve"] == pytest.approx(claimed_only, rel=0.01)
 
 
-def test_loops_between_agents_that_disagree_widen_nobody():
-    """Bob's way is a tenth too long, which is no reason to take either for less sure than it says."""
+def test_loops_between_agents_that_disagree_scale_no_covariance():
+    """The path of bob is 10 % too long, which does not scale the covariance of either."""
     rng, agreement, widths = np.random.default_rng(1), AgentAgreement(0.015), []
     x, y = ring(0.0), ring(0.7)
     for name, first, steps in (("ann", 0, steps_of(x, rng)), ("bob", 1000, steps_of(y, rng, scale=1.1))):
@@ -155,14 +157,15 @@ def test_loops_between_agents_that_disagree_widen_nobody():
     assert set(widths) == {(1.0, 1.0)}
 
 
-def test_who_is_just_sure_enough_to_be_widened_is_not_told_so_again_and_again():
-    """Its variances are 4.5 times below another's, twice the leeway; steps differ in size."""
-    rng, sureness, told = np.random.default_rng(0), CovarianceScales(CovarianceClaims()), list[float]()
-    sureness.link("ann", "bob")
+def test_a_scale_near_its_threshold_does_not_toggle():
+    """Its variances are 4.5 times below another's, twice the tolerance; steps differ in size."""
+    rng, applied = np.random.default_rng(0), list[float]()
+    covariance_scales = CovarianceScales()
+    covariance_scales.claims.link("ann", "bob")
     for _ in range(300):
         for name, part in (("ann", 1.0), ("bob", 1 / 4.5)):
             step = se3.exp(np.r_[rng.normal(0, 0.05, 3), rng.normal(0, 0.15, 3)])
-            sureness.add_step(name, step, part * STEP_COV)
-            if (now := sureness.scales.get("bob", 1.0)) != (told or [1.0])[-1]:
-                told.append(now)
-    assert 1 <= len(told) <= 4
+            covariance_scales.add_step(name, step, part * STEP_COV)
+            if (now := covariance_scales.scales.get("bob", 1.0)) != (applied or [1.0])[-1]:
+                applied.append(now)
+    assert 1 <= len(applied) <= 4

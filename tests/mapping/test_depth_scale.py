@@ -25,7 +25,7 @@ def views(log: float, rng, n: int = 80):
 
 
 @pytest.mark.parametrize("log", [-0.1, -0.05, 0.0, 0.03, 0.1])
-def test_it_is_found_with_its_sigma(log):
+def test_the_depth_scale_is_estimated_with_its_sigma(log):
     found = []
     for seed in range(30):
         got = relative_depth_scale(T_C_Q, *views(log, np.random.default_rng(seed)), NOISE, NOISE, 11.3)
@@ -35,7 +35,7 @@ def test_it_is_found_with_its_sigma(log):
     assert 0.6 < np.std(found) < 1.5
 
 
-def test_wrong_matches_do_not_matter():
+def test_wrong_matches_do_not_change_the_depth_scale():
     y_q, y_c = views(0.05, np.random.default_rng(3))
     y_c[:16, :2] = np.random.default_rng(4).uniform(-0.5, 0.5, (16, 2))
     found = relative_depth_scale(T_C_Q, y_q, y_c, NOISE, NOISE, 11.3)
@@ -43,11 +43,11 @@ def test_wrong_matches_do_not_matter():
     assert found.log == pytest.approx(0.05, abs=4 * found.sigma)
 
 
-def test_too_few_depths_say_nothing():
+def test_too_few_depths_give_no_depth_scale():
     y_q, y_c = views(0.05, np.random.default_rng(3))
     y_q[5:, 2] = np.nan
     assert relative_depth_scale(T_C_Q, y_q, y_c, NOISE, NOISE, 11.3) is None
 
 
-def test_from_the_other_end():
+def test_the_reverse_has_the_opposite_depth_scale():
     assert DepthScale(0.1, 0.02).reverse() == DepthScale(-0.1, 0.02)

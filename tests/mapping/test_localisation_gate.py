@@ -1,19 +1,18 @@
-"""Who hears of the map that he has come into, and who waits."""
+"""The localisation gate: which corrections pass, and which wait."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.atlas_sim import Walker, loop, settle
 
 from share.config import MergeConfig
+from share.mapping import localisation_gate
 from share.mapping.atlas import Atlas
-from share.mapping.corrections import LocalisationGate, PlacementUncertainty
+from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty
 from share.mapping.loops import Loop
 
-ANN, BOB, EVE, ROBOT = ALL = range(4)  # stretches, the oldest first
+ANN, BOB, EVE, ROBOT = ALL = range(4)  # segments, the oldest first
 
 
 def known(cm: float, value: float = 1.0, answers: int | None = None) -> PlacementUncertainty:
@@ -21,92 +20,92 @@ def known(cm: float, value: float = 1.0, answers: int | None = None) -> Placemen
 
 
 @pytest.fixture
-def surety() -> LocalisationGate:
-    return LocalisationGate(enter_m=0.05, patience=3)
+def gate(monkeypatch: pytest.MonkeyPatch) -> LocalisationGate:
+    monkeypatch.setattr(localisation_gate, "PATIENCE", 3)
+    return LocalisationGate(enter_m=0.05)
 
 
-def test_in_his_own_map_everybody_hears_at_once(surety: LocalisationGate) -> None:
-    assert surety.update(BOB, ALL, {BOB: known(80.0)}) == {}
-    assert surety.published_cov(BOB, BOB) is not None
-    assert surety.published_cov(BOB, ANN) is None
+def test_corrections_in_the_own_map_pass_at_once(gate: LocalisationGate) -> None:
+    assert gate.update(BOB, ALL, {BOB: known(80.0)}) == {}
+    assert gate.published_cov(BOB, BOB) is not None
+    assert gate.published_cov(BOB, ANN) is None
 
 
-def test_who_is_surely_known_hears_at_once_and_then_always(surety: LocalisationGate) -> None:
-    assert surety.update(ANN, ALL, {BOB: known(4.9)}) == {}
-    assert surety.update(ANN, ALL, {BOB: known(90.0, 2.0)}) == {}
-    told = surety.published_cov(BOB, ANN)
-    assert told is not None and (told == 2 * np.eye(6)).all()
+def test_a_small_sigma_passes_and_then_always(gate: LocalisationGate) -> None:
+    assert gate.update(ANN, ALL, {BOB: known(4.9)}) == {}
+    assert gate.update(ANN, ALL, {BOB: known(90.0, 2.0)}) == {}
+    published = gate.published_cov(BOB, ANN)
+    assert published is not None and (published == 2 * np.eye(6)).all()
 
 
-def test_who_is_not_waits_and_his_own_map_goes_on(surety: LocalisationGate) -> None:
-    surety.update(BOB, ALL, {BOB: known(0.0)})
-    assert surety.update(ANN, ALL, {BOB: known(7.0)}) == {BOB: pytest.approx(0.07)}
-    assert surety.published_cov(BOB, ANN) is None
-    assert surety.published_cov(BOB, BOB) is not None
-    assert surety.update(ANN, ALL, {BOB: known(4.0)}) == {}
-    assert surety.published_cov(BOB, ANN) is not None
+def test_a_large_sigma_waits_in_the_own_map(gate: LocalisationGate) -> None:
+    gate.update(BOB, ALL, {BOB: known(0.0)})
+    assert gate.update(ANN, ALL, {BOB: known(7.0)}) == {BOB: pytest.approx(0.07)}
+    assert gate.published_cov(BOB, ANN) is None
+    assert gate.published_cov(BOB, BOB) is not None
+    assert gate.update(ANN, ALL, {BOB: known(4.0)}) == {}
+    assert gate.published_cov(BOB, ANN) is not None
 
 
-def test_who_were_in_one_map_hear_together(surety: LocalisationGate) -> None:
-    surety.update(BOB, ALL, {BOB: known(0.0), EVE: known(1.0)})
+def test_segments_of_one_map_enter_together(gate: LocalisationGate) -> None:
+    gate.update(BOB, ALL, {BOB: known(0.0), EVE: known(1.0)})
     found = {BOB: known(2.0), EVE: known(7.0), ROBOT: known(1.0)}
-    assert surety.update(ANN, ALL, found).keys() == {BOB, EVE}  # the robot comes from a map of its own
-    assert surety.update(ANN, ALL, {BOB: known(2.0), EVE: known(3.0)}) == {}
+    assert gate.update(ANN, ALL, found).keys() == {BOB, EVE}  # the robot comes from a map of its own
+    assert gate.update(ANN, ALL, {BOB: known(2.0), EVE: known(3.0)}) == {}
 
 
-def test_nobody_waits_for_more_than_so_many_keyframes_of_his_own(surety: LocalisationGate) -> None:
+def test_the_wait_is_bounded_by_keyframes_with_loops(gate: LocalisationGate) -> None:
     for keyframe in (2, 5, 9):
         for answers in (keyframe, keyframe, None):
-            assert surety.update(ANN, ALL, {BOB: known(20.0, answers=answers)})
-    assert not surety.update(ANN, ALL, {BOB: known(20.0, answers=11)})
-    assert surety.published_cov(BOB, ANN) is not None
+            assert gate.update(ANN, ALL, {BOB: known(20.0, answers=answers)})
+    assert not gate.update(ANN, ALL, {BOB: known(20.0, answers=11)})
+    assert gate.published_cov(BOB, ANN) is not None
 
 
-def test_another_map_is_waited_for_anew(surety: LocalisationGate) -> None:
-    for founder in (EVE, ANN):
+def test_the_wait_restarts_for_another_map(gate: LocalisationGate) -> None:
+    for reference in (EVE, ANN):
         for keyframe in range(3):
-            assert surety.update(founder, ALL, {ROBOT: known(20.0, answers=keyframe)})
+            assert gate.update(reference, ALL, {ROBOT: known(20.0, answers=keyframe)})
 
 
-def test_a_join_that_was_undone_is_waited_for_anew(surety: LocalisationGate) -> None:
+def test_the_wait_restarts_after_an_undone_merge(gate: LocalisationGate) -> None:
     for keyframe in range(4):
-        surety.update(ANN, ALL, {BOB: known(20.0, answers=keyframe)})
-    assert surety.published_cov(BOB, ANN) is not None  # his patience was at an end
-    surety.forget_waits({BOB})
-    surety.update(BOB, [BOB], {BOB: known(0.0)})
-    assert surety.update(ANN, ALL, {BOB: known(60.0, answers=9)})
+        gate.update(ANN, ALL, {BOB: known(20.0, answers=keyframe)})
+    assert gate.published_cov(BOB, ANN) is not None  # its wait was over
+    gate.forget_waits({BOB})
+    gate.update(BOB, [BOB], {BOB: known(0.0)})
+    assert gate.update(ANN, ALL, {BOB: known(60.0, answers=9)})
 
 
-def test_who_was_told_of_a_map_that_has_proved_false_hears_of_his_own_again(surety: LocalisationGate) -> None:
-    surety.update(BOB, [BOB, EVE], {BOB: known(0.0), EVE: known(0.0)})
-    surety.update(ANN, ALL, {BOB: known(1.0), EVE: known(1.0)})
-    assert not surety.update(BOB, [BOB, EVE], {BOB: known(0.0), EVE: known(30.0)})
-    assert surety.published_cov(EVE, BOB) is not None
+def test_after_a_false_merge_the_own_map_is_published_again(gate: LocalisationGate) -> None:
+    gate.update(BOB, [BOB, EVE], {BOB: known(0.0), EVE: known(0.0)})
+    gate.update(ANN, ALL, {BOB: known(1.0), EVE: known(1.0)})
+    assert not gate.update(BOB, [BOB, EVE], {BOB: known(0.0), EVE: known(30.0)})
+    assert gate.published_cov(EVE, BOB) is not None
 
 
-def test_who_was_told_by_an_earlier_life_goes_on_hearing(surety: LocalisationGate) -> None:
-    surety.restore(BOB, ANN)
-    assert surety.published_cov(BOB, ANN) is None  # how surely is asked
-    assert not surety.update(ANN, ALL, {BOB: known(30.0)})
-    assert surety.published_cov(BOB, ANN) is not None
+def test_a_restored_segment_stays_published(gate: LocalisationGate) -> None:
+    gate.restore(BOB, ANN)
+    assert gate.published_cov(BOB, ANN) is None  # how surely is asked
+    assert not gate.update(ANN, ALL, {BOB: known(30.0)})
+    assert gate.published_cov(BOB, ANN) is not None
 
 
 # ---------------------------------------------------------------- in the atlas
 
 
-def faint(ann: Walker, bob: Walker, at: int) -> Loop:
-    """What a few inliers give: turned by who knows how much."""
+def uncertain_loop(ann: Walker, bob: Walker, at: int) -> Loop:
+    """A loop of a few inliers, with a large covariance."""
     rng = np.random.default_rng(at)
     sigma = np.diag([0.03**2] * 3 + [0.02**2] * 3)
     seen = loop(ann, at, bob, at, rng)
     return Loop(seen.a, seen.b, seen.T_a_b, sigma, 20)
 
 
-def apart(**settings: int) -> tuple[Atlas, Walker, Walker]:
-    """Ann and Bob, who see the same, each in a map of his own."""
+def separate_maps() -> tuple[Atlas, Walker, Walker]:
+    """Ann and bob in maps of their own, which see the same."""
     ann, bob = Walker("ann", 0), Walker("bob", 1, n=12, turn=3.5 * np.pi / 59 * 11)
-    config = MergeConfig(join_places=1, near_m=1.0, near_rad=0.52, place_m=0.7, place_rad=0.5)
-    atlas = Atlas(replace(config, **settings))
+    atlas = Atlas(MergeConfig(join_places=1))
     for walker in (ann, bob):
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
@@ -114,10 +113,10 @@ def apart(**settings: int) -> tuple[Atlas, Walker, Walker]:
     return atlas, ann, bob
 
 
-def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
-    atlas, ann, bob = apart()
-    assert atlas.propose(faint(ann, bob, 0)).joined_maps is None
-    assert atlas.propose(faint(ann, bob, 1)).joined_maps == ("ann/0", "bob/0")
+def test_a_correction_waits_until_the_pose_in_the_map_is_known() -> None:
+    atlas, ann, bob = separate_maps()
+    assert atlas.propose(uncertain_loop(ann, bob, 0)).joined_maps is None
+    assert atlas.propose(uncertain_loop(ann, bob, 1)).joined_maps == ("ann/0", "bob/0")
     (applied,) = settle(atlas)
     assert list(applied.corrections) == ["ann"]
     assert applied.waiting_sigma_m.keys() == {"bob"}
@@ -128,40 +127,43 @@ def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
     assert not applied.waiting_sigma_m
 
 
-def test_nobody_waits_for_who_is_away_and_he_is_told_once_he_is_back() -> None:
-    """As above; Bob is away while the map comes to know him well."""
-    atlas, ann, bob = apart()
+def test_absent_agents_delay_no_correction_and_get_theirs_when_they_return() -> None:
+    """As above; bob is absent while its pose becomes certain."""
+    atlas, ann, bob = separate_maps()
     atlas.set_present("bob", False)
-    atlas.propose(faint(ann, bob, 0))
-    assert atlas.propose(faint(ann, bob, 1)).joined_maps == ("ann/0", "bob/0")
+    atlas.propose(uncertain_loop(ann, bob, 0))
+    assert atlas.propose(uncertain_loop(ann, bob, 1)).joined_maps == ("ann/0", "bob/0")
     (applied,) = settle(atlas)
     assert not applied.waiting_sigma_m
     atlas.propose(loop(ann, 11, bob, 11, np.random.default_rng(0)))
     (applied,) = settle(atlas)
     assert list(applied.corrections) == ["ann"]
-    assert not atlas.due_maps()
+    assert not atlas.solving.due_maps()
     atlas.set_present("bob", True)
     (applied,) = settle(atlas)
     assert applied.corrections["bob"].map_id == "ann/0"
     atlas.set_present("bob", True)
-    assert not atlas.due_maps()
+    assert not atlas.solving.due_maps()
 
 
 @pytest.mark.parametrize("solved_between", [True, False])
-def test_a_join_that_was_undone_and_made_again_is_waited_for_anew(solved_between: bool) -> None:
-    """At once too, as where better evidence overthrows it."""
-    atlas, ann, bob = apart(enter_patience=1)
+def test_the_wait_restarts_when_a_merge_is_undone_and_made_again(
+    solved_between: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also at once, where better evidence undoes it."""
+    monkeypatch.setattr(localisation_gate, "PATIENCE", 1)
+    atlas, ann, bob = separate_maps()
     for first in (0, 2):
-        joined = [atlas.propose(faint(ann, bob, at)).joined_maps for at in (first, first + 1)]
+        joined = [atlas.propose(uncertain_loop(ann, bob, at)).joined_maps for at in (first, first + 1)]
         assert joined == [None, ("ann/0", "bob/0")]
-        assert settle(atlas)[-1].waiting_sigma_m.keys() == {"bob"}  # one keyframe of his has found loops
-        atlas._graph.drop_loops(list(atlas._graph.edges.loops))
+        assert settle(atlas)[-1].waiting_sigma_m.keys() == {"bob"}  # one keyframe of bob has loops
+        atlas.graph.drop_loops(list(atlas.graph.edges.loops))
         if solved_between:
             settle(atlas)
 
 
-def test_of_a_stretch_without_keyframes_nothing_is_remembered() -> None:
-    surety = LocalisationGate(0.05, 3)
-    surety.restore(2, 0)
-    surety.forget([2])
-    assert not surety.is_published(2, 0)
+def test_segments_without_keyframes_are_forgotten() -> None:
+    gate = LocalisationGate(0.05)
+    gate.restore(2, 0)
+    gate.forget([2])
+    assert not gate.is_published(2, 0)

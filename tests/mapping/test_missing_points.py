@@ -6,7 +6,7 @@ from helpers.place_sim import bodies, sights
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.mapping.recognition.missing_points import (
+from share.mapping.overlap_check import (
     MissingPoints,
     MissingRegions,
     missing_points,
@@ -18,20 +18,22 @@ from share.types import View
 T_C_Q = se3.exp(np.array([0.02, -0.03, 0.01, 0.1, 0.05, -0.1]))
 
 
-def test_nothing_is_missing_where_both_see_the_same() -> None:
+def test_no_point_is_missing_in_views_of_the_same() -> None:
     seen = missing_points(*sights(0, T_C_Q), bodies(T_C_Q))
     assert seen.visible > 300
     assert seen.missing_share < 0.1
 
 
-def changed(sight: CameraView, where: NDArray[np.bool_]) -> CameraView:
+def changed(camera_view: CameraView, where: NDArray[np.bool_]) -> CameraView:
     """The same view, with something else at the keypoints where (N,)."""
-    view = sight.view
+    view = camera_view.view
     other = np.random.default_rng(0).integers(0, 256, view.descriptors.shape, np.uint8)
-    return replace(sight, view=View(view.uv, view.points, np.where(where[:, None], other, view.descriptors)))
+    return replace(
+        camera_view, view=View(view.uv, view.points, np.where(where[:, None], other, view.descriptors))
+    )
 
 
-def test_what_was_taken_away_is_missing_and_a_thing_that_is_gone() -> None:
+def test_removed_points_are_missing_and_form_a_missing_region() -> None:
     """A third of the candidate's image shows something else."""
     query, candidate = sights(1, T_C_Q, n=1500)
     u = candidate.view.uv[:, 0]
@@ -42,8 +44,8 @@ def test_what_was_taken_away_is_missing_and_a_thing_that_is_gone() -> None:
     )  # not at its edge
 
 
-def test_points_that_are_missing_here_and_there_are_no_thing() -> None:
-    """Half of all, as detectors miss them."""
+def test_scattered_missing_points_form_no_region() -> None:
+    """Half of the points, as detectors miss them."""
     query, candidate = sights(1, T_C_Q, n=1500)
     some = changed(candidate, np.random.default_rng(1).random(len(candidate.view)) < 0.5)
     assert missing_points(query, some, bodies(T_C_Q)).missing_share > 0.45
@@ -51,13 +53,13 @@ def test_points_that_are_missing_here_and_there_are_no_thing() -> None:
     assert missing_regions(query, candidate, bodies(T_C_Q)).missing_share == 0
 
 
-def test_a_wrong_pose_misses_nearly_all() -> None:
+def test_at_a_wrong_pose_nearly_all_points_are_missing() -> None:
     aside = bodies(T_C_Q) @ se3.exp(np.array([0.1, 0.1, 0, 0.3, 0, 0]))
     assert missing_points(*sights(2, T_C_Q), aside).missing_share > 0.9
 
 
-def test_what_is_hidden_is_not_missing() -> None:
-    """The candidate stands before a wall 1 m away; what is behind it cannot be expected."""
+def test_occluded_points_are_not_missing() -> None:
+    """The candidate is in front of a wall at 1 m; points behind it are not expected."""
     query, candidate = sights(3, T_C_Q, depth_share=1.0)
     view = candidate.view
     wall = View(view.uv, view.points / view.points[:, 2:], np.zeros_like(view.descriptors))
@@ -66,7 +68,7 @@ def test_what_is_hidden_is_not_missing() -> None:
     assert seen.visible < 0.6 * full.visible
 
 
-def test_an_empty_view_says_nothing() -> None:
+def test_an_empty_view_has_no_missing_points() -> None:
     query, candidate = sights(4, T_C_Q)
     empty = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
     assert missing_points(query, replace(candidate, view=empty), np.eye(4)) == MissingPoints(0, 0)

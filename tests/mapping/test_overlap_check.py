@@ -1,4 +1,4 @@
-"""Two agents who walk a ring of posters; in the copy of it, some posters are others."""
+"""Two agents walk a ring of posters; in a copy of the ring some posters differ."""
 
 import numpy as np
 from helpers.atlas_sim import Walker, loop
@@ -30,13 +30,13 @@ class Ring:
         self.descriptors: U8 = rng.integers(0, 256, (len(bearing), 32), np.uint8)
 
     def copy(self, others: NDArray[np.bool_]) -> "Ring":
-        """With other posters at these of the 40."""
+        """A copy with other posters at these of the 40."""
         ring, rng = Ring(), np.random.default_rng(1)
         new = rng.integers(0, 256, self.descriptors.shape, np.uint8)
         ring.descriptors = np.where(others[self.poster][:, None], new, self.descriptors)
         return ring
 
-    def sight(self, T_world_body: F64, rng: np.random.Generator) -> CameraView:
+    def camera_view(self, T_world_body: F64, rng: np.random.Generator) -> CameraView:
         p = se3.transform(se3.inverse(T_world_body @ X_CAM), self.points)
         uv = p[:, :2] / np.abs(p[:, 2:])
         seen = (p[:, 2] > 0.3) & (np.abs(uv) < [0.8, 0.6]).all(1) & (rng.random(len(p)) < 0.9)
@@ -45,7 +45,7 @@ class Ring:
 
 
 class Room:
-    """An atlas that is told what two walkers see, each in a ring of its own."""
+    """An atlas with the views of two walkers, each in a ring of its own."""
 
     def __init__(self, rings: tuple[Ring, Ring], config: MergeConfig | None = None) -> None:
         self.walkers = Walker("a", 1, n=60, turn=1.9 * np.pi), Walker("b", 2, n=60, turn=1.9 * np.pi)
@@ -54,19 +54,19 @@ class Room:
         self.rings, self.rng, self.solver = rings, np.random.default_rng(3), PoseGraphSolver(GraphConfig())
 
     def walk(self, first: int, last: int) -> list[LoopDecision]:
-        """Keyframes first .. last - 1 of both; what their reviews led to."""
+        """Add keyframes first .. last - 1 of both; return the decisions of the reviews."""
         decisions = []
         for i in range(first, last):
             for walker, ring in zip(self.walkers, self.rings, strict=True):
                 number = self.atlas.add_keyframe(walker.name, walker.keyframes[i])
-                self.sights[number] = ring.sight(walker.truth[i], self.rng)
-                decisions.append(self.atlas.review_joins(number))
+                self.sights[number] = ring.camera_view(walker.truth[i], self.rng)
+                decisions.append(self.atlas.loop_acceptance.review_joins(number))
         return [d for d in decisions if d is not None]
 
     def solve(self) -> None:
-        job = self.atlas.make_job("a/0")
+        job = self.atlas.solving.make_job("a/0")
         self.solver.update(job.change)
-        self.atlas.apply_solution(job, self.solver.solve(job.anchor, job.covariance_nodes))
+        self.atlas.solving.apply(job, self.solver.solve(job.anchor, job.covariance_nodes))
 
     def loops(self, at: range) -> list[Loop]:
         a, b = self.walkers
@@ -80,7 +80,7 @@ def some(*posters: int) -> NDArray[np.bool_]:
     return np.isin(np.arange(40), posters)
 
 
-def test_maps_that_look_alike_where_they_overlap_are_joined_and_stay_so() -> None:
+def test_maps_that_look_alike_where_they_overlap_stay_merged() -> None:
     room = Room((Ring(), Ring()))
     room.walk(0, 20)
     assert room.propose(room.loops(range(0, 20, 5)))[-1].accepted
@@ -91,7 +91,7 @@ def test_maps_that_look_alike_where_they_overlap_are_joined_and_stay_so() -> Non
         room.solve()
 
 
-def test_what_is_recognised_does_not_hide_what_is_gone() -> None:
+def test_recognised_places_do_not_hide_missing_regions() -> None:
     """Loops at the first places only, where both rings are the same; further on they differ."""
     ring = Ring()
     room = Room((ring, ring.copy(some(*range(4, 30)))))
@@ -101,8 +101,8 @@ def test_what_is_recognised_does_not_hide_what_is_gone() -> None:
     assert "of the 20 overlapping views is missing: pending" in decision.reason
 
 
-def test_a_join_is_undone_where_the_copy_ends() -> None:
-    """They begin where all is the same, and are joined rightly by all that anybody knows."""
+def test_a_merge_is_undone_where_the_copy_ends() -> None:
+    """They begin where both rings are equal, so the merge is right by all evidence there."""
     ring = Ring()
     room = Room((ring, ring.copy(some(*range(16, 36)))))
     room.walk(0, 12)
@@ -112,12 +112,12 @@ def test_a_join_is_undone_where_the_copy_ends() -> None:
     assert "what a/0 and b/0 should share is missing" in undone.reason
     assert "a:0 - b:0, a:3 - b:3, a:6 - b:6 and 1 more" in undone.reason
     assert sorted(room.atlas.map_sizes().values()) == [40, 40]
-    again = room.propose(room.loops(range(1, 13, 3)))[-1]  # the same story, by others who were there
+    again = room.propose(room.loops(range(1, 13, 3)))[-1]  # the same hypothesis, by other keyframes
     assert not again.accepted
     assert "views" in again.reason
 
 
-def test_little_overlap_is_too_little_where_more_is_asked_for() -> None:
+def test_overlap_pairs_requires_more_overlap() -> None:
     for asked, accepted in ((3, True), (8, False)):
         room = Room((Ring(), Ring()), MergeConfig(overlap_pairs=asked))
         room.walk(0, 5)

@@ -1,4 +1,4 @@
-"""Whose keyframe is looked up next."""
+"""Which keyframe is looked up next."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from share.types import AgentKind
 AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
 
 
-def test_one_agent_newest_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_newest_keyframe_of_an_agent_is_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 10)
     queue = QueryQueue(EdgeConfig(max_waiting=10))
     for number in range(3):
@@ -22,7 +22,7 @@ def test_one_agent_newest_first(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [queue.next_query() for _ in range(4)] == [2, 1, 0, None]
 
 
-def test_who_sends_more_is_not_served_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_agent_that_sends_more_is_not_served_more(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 1000)
     queue = QueryQueue(EdgeConfig(max_waiting=1000))
     for number in range(90):
@@ -33,7 +33,7 @@ def test_who_sends_more_is_not_served_more(monkeypatch: pytest.MonkeyPatch) -> N
     assert sum(number >= 100 for number in first if number is not None) == 10
 
 
-def test_headsets_before_robots_but_robots_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_headsets_are_served_before_robots_but_not_only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 1000)
     queue = QueryQueue(EdgeConfig(max_waiting=1000))
     who = Counter[str]()
@@ -47,7 +47,7 @@ def test_headsets_before_robots_but_robots_too(monkeypatch: pytest.MonkeyPatch) 
     assert 15 <= who["rob"] <= 25  # of two that always wait, one turn in five
 
 
-def test_one_too_many_costs_the_longest_queue_its_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_queue_skips_the_oldest_of_the_longest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(query_queue, "MAX_WAITING_EACH", 4)
     queue = QueryQueue(EdgeConfig(max_waiting=4))
     for number in range(4):
@@ -58,7 +58,7 @@ def test_one_too_many_costs_the_longest_queue_its_oldest(monkeypatch: pytest.Mon
     assert {queue.next_query() for _ in range(4)} == {1, 2, 3, 10}
 
 
-def test_one_that_sends_much_is_answered_soon_or_not_at_all() -> None:
+def test_an_agent_that_sends_much_has_its_older_keyframes_skipped() -> None:
     queue = QueryQueue(EdgeConfig(max_waiting=12))
     for number in range(8):
         queue.add("ann", AR, number)
@@ -67,9 +67,9 @@ def test_one_that_sends_much_is_answered_soon_or_not_at_all() -> None:
     assert {queue.next_query() for _ in range(4)} == {5, 6, 7, 10}
 
 
-def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
-    """Twenty agents in turn, half as many look-ups as keyframes: none is looked up that is older than a few
-    others, and everybody has its turn."""
+def test_of_many_agents_the_newest_are_served_and_none_starves() -> None:
+    """Twenty agents in turn, half as many look-ups as keyframes: only recent keyframes are looked up, and
+    each agent has its turn."""
     queue, served, age = QueryQueue(EdgeConfig(max_waiting=12)), Counter[int](), []
     for number in range(2000):
         queue.add(f"agent{number % 20}", AR, number)
@@ -82,7 +82,7 @@ def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
     assert min(served.values()) >= 30 and len(served) == 20
 
 
-def test_those_passed_over_are_there_for_later_newest_first() -> None:
+def test_skipped_keyframes_are_returned_newest_first() -> None:
     queue = QueryQueue(EdgeConfig(max_waiting=12))
     for number in range(300):
         queue.add("ann", AR, number)

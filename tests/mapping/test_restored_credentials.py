@@ -1,4 +1,4 @@
-"""Who speaks for a run is known to a mapper that begins anew: one key does not become many."""
+"""Credentials of restored runs: one key keeps one vote."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from share.types import Keyframe, View
 ROOM = walls(1)
 STEPS = 16
 KEYS = {"ann": "A", "e1": "E", "e2": "E"}
-LONG = {"e1": 1.05, "e2": 1.05}  # metres of whose odometry and depths are too long
+LONG = {"e1": 1.05, "e2": 1.05}  # scale of odometry and depths
 
 
-class Life:
+class Session:
     """A mapper, and its solver."""
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class Life:
         self.mapper, self.solver = Mapper(self.config), PoseGraphSolver(self.config.graph)
 
     def step(self, person: Person) -> SaveKeyframe:
-        """One keyframe on, and all that follows from it."""
+        """Add a keyframe of each, and run all steps."""
         scale = LONG.get(person.name, 1.0)
         before = scaled(person.T_odom_body[-1], scale) if person.T_odom_body else None
         T, view = person.step()
@@ -61,28 +61,28 @@ def scaled(T: np.ndarray, scale: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def walked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Person]]:
-    """The map of ann, and of two of one key who agree with each other and not with her."""
+    """The map of ann and of two names of one key, which agree with each other and not with ann."""
     people = [Person(name, ROOM, 0.2 * i, 11 + i) for i, name in enumerate(KEYS)]
-    life, path = Life(), tmp_path_factory.mktemp("voices") / "room.sqlite"
+    session, path = Session(), tmp_path_factory.mktemp("voices") / "room.sqlite"
     changes: list[MapChange] = []
     for person in people:
-        life.mapper.add_run(person.name, person.hello, KEYS[person.name])
+        session.mapper.add_run(person.name, person.hello, KEYS[person.name])
         changes.append(SaveRun(person.name, person.hello, KEYS[person.name]))
-    changes += life.walk(people)
-    assert life.standing() == dict.fromkeys(KEYS, "disputed")
+    changes += session.walk(people)
+    assert session.standing() == dict.fromkeys(KEYS, "disputed")
     with MapStore.open(path) as store:
-        store.write([*changes, *life.mapper.take_changes(), life.mapper.current_poses()])
+        store.write([*changes, *session.mapper.take_changes(), session.mapper.current_poses()])
     return path, people
 
 
 @pytest.mark.parametrize("kept", ["E", None])
-def test_a_restored_run_has_the_voice_that_was_kept_until_another_is_heard(kept: str | None) -> None:
+def test_a_restored_run_has_its_stored_credential_until_it_is_replaced(kept: str | None) -> None:
     people = [Person(name, ROOM, 0.0, 11 + i) for i, name in enumerate(KEYS)]
     mapper = Mapper(Config())
     mapper.restore(
         StoredMap(tuple(SaveRun(p.name, p.hello, "A" if p.name == "ann" else kept) for p in people))
     )
-    voice = mapper._atlas._quarantine.agreement.identities.credential
+    voice = mapper.atlas.quarantine.agreement.identities.credential
     assert [voice(name) for name in KEYS] == ["A", kept, kept]
     mapper.set_credential("e2", "F")
     assert [voice(name) for name in KEYS] == ["A", kept, "F"]
@@ -92,14 +92,14 @@ def test_a_restored_run_has_the_voice_that_was_kept_until_another_is_heard(kept:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["says who speaks", "of SHARE 0.1"])
-def test_after_a_restart_one_key_has_one_voice(walked: tuple[Path, list[Person]], file: str) -> None:
-    """As in the first life, nobody is set apart; also where one of the key's two runs does not say hello."""
+def test_after_a_restart_one_key_has_one_vote(walked: tuple[Path, list[Person]], file: str) -> None:
+    """As before, no agent is quarantined; also where one of the two runs of a key does not connect."""
     path, people = walked
     people = [replace(p, T_world_body=[*p.T_world_body], T_odom_body=[*p.T_odom_body]) for p in people]
     kept = MapStore.read(path).load()
     if file == "of SHARE 0.1":
         kept = replace(kept, runs=tuple(replace(run, credential="") for run in kept.runs))
-    second = Life()
+    second = Session()
     second.mapper.restore(with_unknown_credentials(kept))
     present = people[:2] if file == "of SHARE 0.1" else people
     for person in present:

@@ -1,4 +1,4 @@
-"""A mapper that is given what an earlier life kept has the same maps, and goes on in them."""
+"""A mapper with a restored map has the same maps, and continues."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from share.geometry import se3
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.map_changes import MapChange, SaveKeyframe, SaveRun, StoredMap
 from share.mapping.mapper import Mapper
+from share.mapping.recognition import verification
 from share.protocol.peer import restored_runs
 from share.store.map_store import MapStore
 from share.types import AgentKind, Keyframe
@@ -23,8 +24,8 @@ ROOM = walls(1)
 STEPS = 36
 
 
-class Life:
-    """A mapper, its solver, and what it wanted kept."""
+class Session:
+    """A mapper, its solver, and the changes to store."""
 
     def __init__(self, config: Config) -> None:
         self.mapper, self.solver = Mapper(config), PoseGraphSolver(config.graph)
@@ -35,7 +36,7 @@ class Life:
         self.changes.append(SaveRun(person.name, person.hello))
 
     def step(self, person: Person) -> None:
-        """One keyframe on, and all that follows from it."""
+        """Add a keyframe of each, and run all steps."""
         before = person.T_odom_body[-1] if person.T_odom_body else None
         T, view = person.step()
         id = len(person.T_odom_body) - 1
@@ -53,43 +54,45 @@ class Life:
         self.changes += self.mapper.take_changes()
 
 
-def walked(config: Config, first: AgentKind = AgentKind.AR) -> tuple[Life, list[Person]]:
+def after_a_walk(config: Config, first: AgentKind = AgentKind.AR) -> tuple[Session, list[Person]]:
     people = [Person("ann", ROOM, 0.0, 11, first), Person("bob", ROOM, 0.3, 22)]
-    life = Life(config)
+    session = Session(config)
     for person in people:
-        life.join(person)
+        session.join(person)
     for _ in range(STEPS):
         for person in people:
-            life.step(person)
-    return life, people
+            session.step(person)
+    return session, people
 
 
-def again(life: Life, path: Path, config: Config) -> Life:
+def restarted(session: Session, path: Path, config: Config) -> Session:
     with MapStore.open(path) as store:
-        store.write([*life.changes, life.mapper.current_poses()])
+        store.write([*session.changes, session.mapper.current_poses()])
     with MapStore.open(path) as store:
         kept = store.load()
-    second = Life(config)
+    second = Session(config)
     second.mapper.restore(kept)
     for run, name in zip(restored_runs(kept, 0.05), ("ann", "bob"), strict=True):
-        told = run.last_finding  # before the mapper has said anything, and the same as it would
-        assert told is not None and told.correction is not None
-        assert (told.agent, told.correction.map_id) == (name, second.mapper._atlas.current_map_id(name))
-        T_map_odom = second.mapper._atlas.T_map_odom(name)
-        assert np.allclose(told.correction.T_map_odom, T_map_odom, atol=1e-9)
+        published = run.last_finding  # before the mapper has said anything, and the same as it would
+        assert published is not None and published.correction is not None
+        correction = published.correction
+        assert (published.agent, correction.map_id) == (name, second.mapper.atlas.current_map_id(name))
+        T_map_odom = second.mapper.atlas.T_map_odom(name)
+        assert np.allclose(correction.T_map_odom, T_map_odom, atol=1e-9)
         T_odom_body = [found.keyframe.T_odom_body for found in kept.keyframes if found.run_key == name][-1]
-        at_body = se3.compose_cov(T_odom_body, told.correction.cov, np.zeros((6, 6)))
-        known_m = 0.0 if told.correction.map_id.startswith(name) else 0.05  # the gauge is his, or another's
+        at_body = se3.compose_cov(T_odom_body, correction.cov, np.zeros((6, 6)))
+        known_m = 0.0 if correction.map_id.startswith(name) else 0.05  # in its own map the pose is exact
         assert se3.position_sigma(at_body) == pytest.approx(known_m, abs=1e-9)
     return second
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("most", [2000, 60])
-def test_it_has_the_same_maps_and_goes_on(tmp_path: Path, most: int) -> None:
+def test_a_restored_mapper_has_the_same_maps_and_continues(tmp_path: Path, most: int) -> None:
     config = Config()
     config = replace(config, edge=replace(config.edge, max_keyframes=most))
-    first, people = walked(config)
-    second = again(first, tmp_path / "room.sqlite", config)
+    first, people = after_a_walk(config)
+    second = restarted(first, tmp_path / "room.sqlite", config)
     report, before = second.mapper.report(), first.mapper.report()
     assert report["maps"] == before["maps"]
     assert report["loops"]["in_map"] == before["loops"]["in_map"] > 0
@@ -100,8 +103,8 @@ def test_it_has_the_same_maps_and_goes_on(tmp_path: Path, most: int) -> None:
     solve = second.mapper.next_solve()  # everything is solved anew, from where it was
     assert solve is not None
     found = second.mapper.finish_step(solve, solve.run(second.solver), 1.0)
-    told = {one.agent: one.correction.map_id for one in found if one.correction is not None}
-    assert told == dict.fromkeys(("ann", "bob"), "ann/0")  # they are not back yet
+    published = {one.agent: one.correction.map_id for one in found if one.correction is not None}
+    assert published == dict.fromkeys(("ann", "bob"), "ann/0")  # they are not back yet
     second.work()
     assert np.abs(second.mapper.current_poses().T_map_body - then.T_map_body).max() < 0.02
     for _ in range(6):
@@ -111,59 +114,65 @@ def test_it_has_the_same_maps_and_goes_on(tmp_path: Path, most: int) -> None:
     assert second.mapper.report()["loops"]["accepted"] > 0
 
 
-@pytest.mark.parametrize(("first", "founder"), [(AgentKind.AR, "ann/0"), (AgentKind.ROBOT, "bob/0")])
-def test_a_headset_keeps_its_place_and_a_map_its_founder(
-    tmp_path: Path, first: AgentKind, founder: str
+@pytest.mark.long
+@pytest.mark.parametrize(("first", "reference"), [(AgentKind.AR, "ann/0"), (AgentKind.ROBOT, "bob/0")])
+def test_the_reference_segment_is_a_headsets_and_stays_after_a_restart(
+    tmp_path: Path, first: AgentKind, reference: str
 ) -> None:
-    """In a second life too, and whoever comes then."""
-    life, _ = walked(Config(), first)
-    assert list(life.mapper.report()["maps"]) == [founder]
-    second = again(life, tmp_path / "room.sqlite", Config())
-    assert list(second.mapper.report()["maps"]) == [founder]
+    """Also after a restart, whichever agent comes then."""
+    session, _ = after_a_walk(Config(), first)
+    assert list(session.mapper.report()["maps"]) == [reference]
+    second = restarted(session, tmp_path / "room.sqlite", Config())
+    assert list(second.mapper.report()["maps"]) == [reference]
     eve = Person("eve", ROOM, 0.6, 33)
     second.join(eve)
     for _ in range(STEPS):
         second.step(eve)
-    assert list(second.mapper.report()["maps"]) == [founder]
+    assert list(second.mapper.report()["maps"]) == [reference]
 
 
 @pytest.mark.slow
-def test_maps_that_meet_only_in_a_second_life_are_joined_as_in_the_first(tmp_path: Path) -> None:
-    """The robot's to the headset's, though it is older."""
+def test_maps_of_an_earlier_session_merge_as_those_of_one(tmp_path: Path) -> None:
+    """The robot's map into the headset's, though it is older."""
     config = Config()
-    life, people = walked(replace(config, place=replace(config.place, min_matches=10**6)), AgentKind.ROBOT)
-    assert list(life.mapper.report()["maps"]) == ["ann/0", "bob/0"]
-    second = again(life, tmp_path / "room.sqlite", config)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verification, "MIN_MATCHES", 10**6)  # no loop is verified
+        session, people = after_a_walk(config, AgentKind.ROBOT)
+    assert list(session.mapper.report()["maps"]) == ["ann/0", "bob/0"]
+    second = restarted(session, tmp_path / "room.sqlite", config)
     for _ in range(STEPS):
         for person in people:
             second.step(person)
     assert list(second.mapper.report()["maps"]) == ["bob/0"]
 
 
-def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:
+def test_a_run_without_keyframes_is_restored(tmp_path: Path) -> None:
     config = Config()
-    life = Life(config)
-    life.join(Person("ann", ROOM, 0.0, 11))
+    session = Session(config)
+    session.join(Person("ann", ROOM, 0.0, 11))
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        store.write(life.changes)
+        store.write(session.changes)
         kept = store.load()
     Mapper(config).restore(kept)
     assert [run.last_finding for run in restored_runs(kept, 0.05)] == [None]
 
 
-def test_a_stretch_whose_run_was_lost_is_no_obstacle() -> None:
+def test_a_segment_whose_run_was_lost_is_restored() -> None:
     """As a damaged file leaves it."""
     Mapper(Config()).restore(StoredMap(segments=("ann/0",)))
 
 
-def test_a_join_that_poses_were_not_kept_of_is_not_told_as_it_was_before(tmp_path: Path) -> None:
-    """The edge is killed within seconds of a join: loops are kept at once, poses now and then."""
+@pytest.mark.long
+def test_a_merge_whose_poses_were_not_stored_is_not_published_as_before(tmp_path: Path) -> None:
+    """The edge is killed within seconds of a merge: loops are stored at once, poses periodically."""
     config = Config()
-    apart, _ = walked(replace(config, place=replace(config.place, min_matches=10**6)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verification, "MIN_MATCHES", 10**6)  # no loop is verified
+        apart, _ = after_a_walk(config)
     before = apart.mapper.current_poses()
     assert set(before.map_ids) == {"ann/0", "bob/0"}
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        store.write([*walked(config)[0].changes, before])
+        store.write([*after_a_walk(config)[0].changes, before])
     with MapStore.open(tmp_path / "room.sqlite") as store:
         kept = store.load()
     assert len(kept.loops) > 0

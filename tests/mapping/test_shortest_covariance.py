@@ -7,19 +7,19 @@ from share.mapping.graph.covariance import CovariancePaths
 from share.mapping.graph.edges import PoseEdge
 
 
-def roads_of(room: Room, seed: int) -> tuple[CovariancePaths, list[PoseEdge]]:
-    """With no two edges equally sure, so that there is one surest path."""
+def paths_of(room: Room, seed: int) -> tuple[CovariancePaths, list[PoseEdge]]:
+    """No two edges are equally certain, so that one path is the shortest."""
     rng = np.random.default_rng(seed)
     edges = [PoseEdge(e.a, e.b, e.T_a_b, e.cov * rng.uniform(0.5, 2)) for e in (*room.chain, *room.closures)]
-    roads = CovariancePaths()
+    paths = CovariancePaths()
     for edge in edges:
-        roads.add(edge)
-    return roads, edges
+        paths.add(edge)
+    return paths, edges
 
 
-def agree(roads: CovariancePaths, edges: list[PoseEdge], room: Room, start: int, goals: list[int]) -> None:
-    """`covariances_from` against the path that is walked edge by edge."""
-    for goal, cov in zip(goals, roads.covariances_from(start, goals, room.guess), strict=True):
+def agree(paths: CovariancePaths, edges: list[PoseEdge], room: Room, start: int, goals: list[int]) -> None:
+    """`covariances_from` equals the composition edge by edge."""
+    for goal, cov in zip(goals, paths.covariances_from(start, goals, room.guess), strict=True):
         path = surest(edges, start, goal)
         assert (path is None) == (cov is None)
         if path is not None and cov is not None:
@@ -28,51 +28,51 @@ def agree(roads: CovariancePaths, edges: list[PoseEdge], room: Room, start: int,
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_one_search_tells_what_walking_each_path_tells(seed: int) -> None:
+def test_one_search_gives_the_covariances_along_all_paths(seed: int) -> None:
     room = simulate(300, 3, seed)
-    roads, edges = roads_of(room, seed)
+    paths, edges = paths_of(room, seed)
     rng = np.random.default_rng(seed)
     for start in (0, 7, 299):
-        agree(roads, edges, room, start, [*rng.choice(300, 8).tolist(), start])
+        agree(paths, edges, room, start, [*rng.choice(300, 8).tolist(), start])
 
 
 def test_edges_come_and_go() -> None:
     room = simulate(200, 3, 2)
-    roads, edges = roads_of(room, 2)
+    paths, edges = paths_of(room, 2)
     rng = np.random.default_rng(2)
     out: list[PoseEdge] = []
     for k in range(60):
         edge = edges.pop(int(rng.integers(len(edges))))
-        roads.remove(edge)
+        paths.remove(edge)
         out.append(edge)
         if k % 3 == 2:
             back = out.pop(0)
-            roads.add(back)
+            paths.add(back)
             edges.append(back)
         if k % 5 == 0:
-            agree(roads, edges, room, 199 - k, rng.choice(200, 6).tolist())
+            agree(paths, edges, room, 199 - k, rng.choice(200, 6).tolist())
     with pytest.raises(KeyError):
-        roads.remove(out[0])
+        paths.remove(out[0])
     with pytest.raises(ValueError, match="was added before"):
-        roads.add(edges[0])
+        paths.add(edges[0])
 
 
-def test_of_parallel_edges_the_surest_counts() -> None:
+def test_of_parallel_edges_the_most_certain_counts() -> None:
     T = np.eye(4)
-    roads = CovariancePaths()
+    paths = CovariancePaths()
     loose, sure = PoseEdge(4, 9, T, 4 * LOOP), PoseEdge(9, 4, T, LOOP)
     poses = {4: T, 9: T}
-    roads.add(loose)
-    roads.add(sure)
-    assert roads.covariances_from(4, [9], poses)[0] == pytest.approx(LOOP)
-    roads.remove(sure)
-    assert roads.covariances_from(4, [9], poses)[0] == pytest.approx(4 * LOOP)
-    roads.remove(loose)
-    assert roads.covariances_from(4, [9, 4], poses)[0] is None
+    paths.add(loose)
+    paths.add(sure)
+    assert paths.covariances_from(4, [9], poses)[0] == pytest.approx(LOOP)
+    paths.remove(sure)
+    assert paths.covariances_from(4, [9], poses)[0] == pytest.approx(4 * LOOP)
+    paths.remove(loose)
+    assert paths.covariances_from(4, [9, 4], poses)[0] is None
 
 
-def test_where_no_road_leads() -> None:
-    roads = CovariancePaths()
-    assert roads.covariances_from(3, [], {}) == []
-    cov = roads.covariances_from(3, [3, 5], {3: np.eye(4), 5: np.eye(4)})
+def test_without_a_path_there_is_no_covariance() -> None:
+    paths = CovariancePaths()
+    assert paths.covariances_from(3, [], {}) == []
+    cov = paths.covariances_from(3, [3, 5], {3: np.eye(4), 5: np.eye(4)})
     assert np.array_equal(cov[0], np.zeros((6, 6))) and cov[1] is None

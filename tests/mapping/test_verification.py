@@ -7,6 +7,7 @@ from helpers.place_sim import bodies, sights
 
 from share.config import PlaceConfig
 from share.geometry import se3
+from share.mapping.recognition import verification
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
 from share.types import MAX_POSITION_M, MAX_UV, View
 
@@ -24,18 +25,19 @@ def test_finds_the_pose_between_bodies() -> None:
     assert found.reason == f"{found.inliers} inliers of {found.matches} matches"
 
 
-def test_covariance_of_the_body_pose_is_consistent() -> None:
-    config = replace(CONFIG, floor_deg=1e-6, floor_m=1e-6, sigma_px=1.0)
+def test_covariance_of_the_body_pose_is_consistent(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("_FLOOR_DEG", 1e-6), ("_FLOOR_M", 1e-6), ("SIGMA_PX", 1.0)):
+        monkeypatch.setattr(verification, name, value)
     nees = []
     for seed in range(40):
-        found = verify(*sights(seed, T_C_Q), config)
+        found = verify(*sights(seed, T_C_Q), CONFIG)
         assert isinstance(found, Verification)
         xi = se3.log(se3.inverse(bodies(T_C_Q)) @ found.T_c_q)
         nees.append(xi @ np.linalg.solve(found.cov, xi))
     assert 4.0 < np.mean(nees) < 9.0
 
 
-def test_the_reverse_question_has_the_inverse_answer() -> None:
+def test_the_reverse_query_has_the_inverse_pose() -> None:
     query, candidate = sights(1, T_C_Q)
     there, back = verify(query, candidate, CONFIG), verify(candidate, query, CONFIG)
     assert isinstance(there, Verification)
@@ -83,14 +85,14 @@ def test_gravity_must_agree() -> None:
 
 
 def test_scale_that_differs_between_the_directions_is_refused() -> None:
-    """A view whose depths are all twice too long sees its own motion too long as well."""
+    """A view with doubled depths gives a doubled motion."""
     query, candidate = sights(8, T_C_Q)
     stretched = View(query.view.uv, query.view.points * 2, query.view.descriptors)
     assert reason(replace(query, view=stretched), candidate).startswith("two poses fit")
 
 
 @pytest.mark.parametrize("half", [0.05])
-def test_inliers_in_one_corner_are_refused(half: float) -> None:
+def test_inliers_in_one_corner_are_refused(half: float, monkeypatch: pytest.MonkeyPatch) -> None:
     query, candidate = sights(9, T_C_Q)
     near = np.abs(candidate.view.uv - candidate.view.uv.mean(0)).max(1) < half * 3
     # only what lies in the corner keeps its descriptor
@@ -99,14 +101,16 @@ def test_inliers_in_one_corner_are_refused(half: float) -> None:
         near[:, None], candidate.view.descriptors, rng.integers(0, 256, (len(near), 32), np.uint8)
     )
     corner = View(candidate.view.uv, candidate.view.points, others)
-    loose = replace(
-        CONFIG, min_matches=10, min_inliers=8, min_direction_inliers=6, min_consensus=6, min_spread=0.15
-    )
+    limits = {"MIN_MATCHES": 10, "MIN_DIRECTION_INLIERS": 6, "_MIN_CONSENSUS": 6, "MIN_SPREAD": 0.15}
+    for name, value in limits.items():
+        monkeypatch.setattr(verification, name, value)
+    loose = PlaceConfig(min_inliers=8)
     assert "inliers crowd in the" in reason(query, replace(candidate, view=corner), loose)
 
 
-def test_a_loose_pose_is_refused() -> None:
-    assert "pose uncertain by" in reason(*sights(10, T_C_Q), replace(CONFIG, max_sigma_deg=0.01))
+def test_an_uncertain_pose_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verification, "MAX_SIGMA_DEG", 0.01)
+    assert "pose uncertain by" in reason(*sights(10, T_C_Q))
 
 
 def test_empty_views_are_refused() -> None:

@@ -16,6 +16,7 @@ from share.geometry import se3
 from share.mapping import query_queue
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
+from share.mapping.query_queue import ENOUGH_VERIFIED
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.steps import QueryStep, SolveStep, VerifyStep
 from share.protocol import agent_events as ev
@@ -315,7 +316,7 @@ def test_headsets_are_queried_first_unless_the_policy_treats_agents_alike(policy
     for _ in range(6):
         query = mapper.next_lookup()
         mapper.finish_step(query, [], 1.0)
-        looked += mapper._atlas.key(query.node_id).agent[0]
+        looked += mapper.atlas.key(query.node_id).agent[0]
     assert looked == turns
 
 
@@ -342,7 +343,7 @@ def test_while_queries_wait_fewer_candidates_are_tried(monkeypatch):
         while isinstance(verify := mapper.next_lookup(), VerifyStep):
             tried[waiting, refuse] += 1
             mapper.finish_step(verify, Refusal("not it") if refuse else same, 1.0)
-    assert [tried[0, True], tried[0, False]] == [config.place.candidates, config.place.enough]
+    assert [tried[0, True], tried[0, False]] == [config.place.candidates, ENOUGH_VERIFIED]
     assert [tried[query_queue.HURRY_WAITING, True], tried[query_queue.HURRY_WAITING, False]] == [
         query_queue.HURRY_CANDIDATES,
         1,

@@ -119,7 +119,7 @@ def test_an_unusable_result_costs_its_step_only(monkeypatch):
     def bad(*_):
         raise ValueError("no such thing")
 
-    monkeypatch.setattr(mapper, "_begin_search", bad)
+    monkeypatch.setattr(mapper.atlas.loop_acceptance, "review_joins", bad)
     (finding,) = mapper.finish_step(step, step.run(), 1.0)
     assert finding.event == "step failed"
     assert finding.reason.startswith("place: ValueError: no such thing")

@@ -6,7 +6,7 @@ import sqlite3
 
 import numpy as np
 import pytest
-from helpers.map_changes import ANN, BOB, keyframe, run, small_map, solution, told
+from helpers.map_changes import ANN, BOB, as_values, keyframe, run, small_map, solution
 
 from share.errors import ShareError
 from share.mapping.loops import KeyframeKey
@@ -18,11 +18,11 @@ from share.store.schema import PAGE_BYTES
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The bytes of a closed file, and what is in it."""
+    """The bytes of a closed file, and its map."""
     path = tmp_path_factory.mktemp("whole") / "room.sqlite"
     with MapStore.open(path) as store:
         store.write(small_map())
-        told_whole = told(store.load())
+        told_whole = as_values(store.load())
     return path.read_bytes(), told_whole
 
 
@@ -38,14 +38,14 @@ def damaged(folder, data, at, by):
 
 
 def check_opens(path, as_it_was, good):
-    """Opens, is right as far as it goes, says what is lost, keeps the old file, and can be written. Answers
-    how many keyframes are lost."""
+    """Check that the file opens with right values, names its losses, is kept, and can be written. Return
+    the number of lost keyframes."""
     assert is_map(path)
     with MapStore.read(path) as reader:
-        read_only = told(reader.load())
+        read_only = as_values(reader.load())
     assert path.read_bytes() == as_it_was
     with MapStore.open(path) as store:
-        found = told(store.load())
+        found = as_values(store.load())
         store.write([keyframe(ANN, 20)])
     assert found["keyframes"] == read_only["keyframes"]
     lost = check_right(found, good)
@@ -53,7 +53,7 @@ def check_opens(path, as_it_was, good):
         assert path.with_name("room.sqlite.damaged-1").read_bytes() == as_it_was
         assert "kept as room.sqlite.damaged-1" in found["complaints"][0]
     with MapStore.open(path) as store:
-        later = told(store.load())
+        later = as_values(store.load())
     assert later["complaints"] == ()
     assert later["loops"] == found["loops"]
     assert later["keyframes"][: len(found["keyframes"])] == found["keyframes"]
@@ -65,7 +65,7 @@ CREDENTIALS_LOST = "credentials of runs could not be read"
 
 
 def check_right(found, good) -> int:
-    """What is found is as it was, but for who is tied to whom where one between is lost."""
+    """Check that all values are as before, except edges to keyframes whose reference is lost."""
     was = {k[0]: k for k in good["keyframes"]}
     order = [k[0] for k in good["keyframes"] if k[0] in {f[0] for f in found["keyframes"]}]
     assert [k[0] for k in found["keyframes"]] == order
@@ -90,6 +90,7 @@ def check_right(found, good) -> int:
     return lost
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("flips", [40, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_flipped_byte_anywhere_costs_a_page_at_most(whole, tmp_path, flips):
     data, good = whole
@@ -103,7 +104,7 @@ def test_a_flipped_byte_anywhere_costs_a_page_at_most(whole, tmp_path, flips):
 
 
 def test_the_first_page_can_be_lost_whole(whole, tmp_path):
-    """All of it but what says that this is a map."""
+    """The whole page except the markers of a map."""
     data, good = whole
     path, _ = damaged(tmp_path, data, 0, 1)
     text = data.index(b"CREATE TABLE run_copy(")
@@ -111,15 +112,16 @@ def test_the_first_page_can_be_lost_whole(whole, tmp_path):
     assert check_opens(path, path.read_bytes(), good) == 0
 
 
-def test_bytes_of_the_header(whole, tmp_path):
+@pytest.mark.long
+def test_any_header_byte_may_be_wrong(whole, tmp_path):
     data, good = whole
     for at in range(0, 100, 3):
         path, as_it_was = damaged(tmp_path, data, at, 0x41)
         assert check_opens(path, as_it_was, good) == 0
 
 
-def test_a_row_that_says_something_else_is_not_believed(whole, tmp_path):
-    """Written by SQLite in good order, so only the CRC can tell."""
+def test_a_row_with_a_wrong_crc_is_not_read(whole, tmp_path):
+    """Written by SQLite, so only the CRC differs."""
     path, _ = damaged(tmp_path, whole[0], 0, 0)
     connection = sqlite3.connect(path, isolation_level=None)
     connection.execute("UPDATE loop SET inliers = 999 WHERE number = 2")
@@ -140,8 +142,8 @@ def test_a_row_that_says_something_else_is_not_believed(whole, tmp_path):
     assert len(kept.runs) == 2  # from their copies
 
 
-def test_who_speaks_for_a_run_is_taken_over_from_a_damaged_file(whole, tmp_path):
-    """But not for one that is lost, and nothing is made up for one of which it cannot be read."""
+def test_credentials_are_salvaged_from_a_damaged_file(whole, tmp_path):
+    """Except of a lost run; an unreadable credential is left out."""
     data, good = whole
     for broken, lost in (("loop SET inliers = 999 WHERE number = 2", 0), ("about SET value = 'E'", 3)):
         for old in tmp_path.iterdir():
@@ -159,7 +161,7 @@ def test_who_speaks_for_a_run_is_taken_over_from_a_damaged_file(whole, tmp_path)
             assert [run.credential for run in store.load().runs] == [run.credential for run in kept.runs]
 
 
-def test_a_file_cut_short_or_grown(whole, tmp_path):
+def test_a_file_may_be_truncated_or_grown(whole, tmp_path):
     data, good = whole
     path = tmp_path / "room.sqlite"
     for length in (len(data) // 2, len(data) - 1, PAGE_BYTES, len(data) - 5 * PAGE_BYTES):
@@ -167,14 +169,14 @@ def test_a_file_cut_short_or_grown(whole, tmp_path):
             old.unlink()
         path.write_bytes(data[:length])
         with MapStore.open(path) as store:
-            found = told(store.load())
+            found = as_values(store.load())
         check_right(found, good)
         assert found["complaints"]
         assert path.with_name("room.sqlite.damaged-1").read_bytes() == data[:length]
 
 
-def test_a_lost_keyframe_that_others_hang_on(tmp_path):
-    """Those after it are tied to the one before, by odometry; retired numbers stay retired."""
+def test_a_lost_keyframe_is_bridged_for_those_that_follow(tmp_path):
+    """Later ones are connected to the one before by odometry; used ids are not used again."""
     path = tmp_path / "room.sqlite"
     with MapStore.open(path) as store:
         link = SaveLink(KeyframeKey(ANN, 6), 3, np.eye(4), np.eye(6))
@@ -203,7 +205,7 @@ def test_a_lost_keyframe_that_others_hang_on(tmp_path):
     assert "1 keyframes lost their predecessor and are linked to an earlier one" in kept.problems
 
 
-def test_damaged_twice_keeps_both(whole, tmp_path):
+def test_two_damaged_files_are_both_kept(whole, tmp_path):
     data, _ = whole
     path, first = damaged(tmp_path, data, 30 * PAGE_BYTES // 2, 1)
     MapStore.open(path).close()
@@ -216,8 +218,8 @@ def test_damaged_twice_keeps_both(whole, tmp_path):
 
 
 @pytest.mark.parametrize("step", range(4))
-def test_a_break_while_it_is_salvaged_loses_nothing(whole, tmp_path, monkeypatch, step):
-    """Broken off before each of the renames; the next opening finishes."""
+def test_an_interrupted_salvage_loses_nothing(whole, tmp_path, monkeypatch, step):
+    """Interrupted before each of the renames; the next opening finishes."""
     data, good = whole
     path, as_it_was = damaged(tmp_path, data, 21, 4)
     shutil.copyfile(path, tmp_path / "room.sqlite-wal")  # some log
@@ -235,13 +237,14 @@ def test_a_break_while_it_is_salvaged_loses_nothing(whole, tmp_path, monkeypatch
         salvage.salvage(path)
     monkeypatch.undo()
     with MapStore.open(path) as store:
-        assert told(store.load())["keyframes"] == good["keyframes"]
+        assert as_values(store.load())["keyframes"] == good["keyframes"]
     assert path.with_name("room.sqlite.damaged-1").read_bytes() == as_it_was
     assert not path.with_name("room.sqlite.salvaged").exists()
 
 
+@pytest.mark.long
 def test_a_damaged_log_costs_what_comes_after(tmp_path):
-    """As of a killed writer, whose log is not in the file yet. Of each commit all or nothing."""
+    """As after a killed writer, with a log. Of each commit all or nothing."""
     path, copy = tmp_path / "room.sqlite", tmp_path / "killed" / "room.sqlite"
     copy.parent.mkdir()
     with MapStore.open(path) as store:

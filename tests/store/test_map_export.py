@@ -1,4 +1,4 @@
-"""A map for other programs: what they read is what the map says."""
+"""Exported files hold the values of the map."""
 
 import csv
 import os
@@ -29,7 +29,7 @@ def kept_of(tmp_path, changes):
 
 
 def read_ply(path):
-    """As the format says: a header of lines, then records. Points (N, 3) and colours (N, 3)."""
+    """Read a PLY file: points (N, 3) and colours (N, 3)."""
     head, _, data = path.read_bytes().partition(b"end_header\n")
     lines = head.decode().splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
@@ -44,7 +44,7 @@ def read_ply(path):
     )
 
 
-def test_one_map(tmp_path):
+def test_one_map_is_exported(tmp_path):
     kept = kept_of(tmp_path, small_map())
     counted = []
     done = export_map(kept, tmp_path / "out", counted.append)
@@ -81,7 +81,7 @@ def test_points_of_unknown_depth_are_left_out(tmp_path):
     assert np.isfinite(found).all()
 
 
-def test_several_maps_and_several_runs_of_one_name(tmp_path):
+def test_several_maps_have_folders_and_runs_of_one_name_files(tmp_path):
     again = SaveRun("ann-0003", hello_of("ann", 3, AgentKind.ROBOT))
     changes = [run(ANN), run(BOB), again]
     changes += [keyframe(key, i) for i in range(3) for key in (ANN, BOB, "ann-0003")]
@@ -99,7 +99,7 @@ def test_several_maps_and_several_runs_of_one_name(tmp_path):
     assert np.allclose(alone.T, [pose(i) for i in range(3)], atol=1e-8)
 
 
-def test_a_name_that_is_another_run_s_key(tmp_path):
+def test_a_name_that_is_another_runs_key_gives_the_key(tmp_path):
     sly = SaveRun("ann-0001-0009", hello_of(ANN, 9))
     kept = kept_of(tmp_path, [run(ANN), sly])
     assert file_names(kept) == {ANN: "ann", "ann-0001-0009": "ann-0001-0009"}
@@ -112,7 +112,7 @@ def test_keyframes_after_the_solution_follow_their_references(tmp_path):
     assert np.allclose(T, pose(7) @ pose(21), atol=1e-9)
 
 
-def test_refusals(tmp_path):
+def test_empty_maps_and_folders_in_use_are_refused(tmp_path):
     kept = kept_of(tmp_path, [run(ANN), SaveLoop(loop(1, 1))])
     with pytest.raises(UsageError, match="the map is empty"):
         export_map(kept, tmp_path / "out", nothing)

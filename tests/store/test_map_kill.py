@@ -1,4 +1,4 @@
-"""A writer that is killed: what `write` returned for is there, once; and at most the list in flight."""
+"""After a writer is killed all that `write` returned for is stored once, and at most the list in flight."""
 
 import os
 import random
@@ -32,8 +32,9 @@ with MapStore.open(Path(sys.argv[1])) as store:
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kills", [5, pytest.param(50, marks=pytest.mark.slow)])
-def test_killed_at_random_instants(tmp_path, kills):
+def test_a_writer_killed_at_random_instants_loses_nothing_written(tmp_path, kills):
     path = tmp_path / "room.sqlite"
     draw = random.Random(kills)
     written, logs = 0, 0
@@ -55,7 +56,7 @@ def test_killed_at_random_instants(tmp_path, kills):
 
 
 def life_and_death(path: Path, seed: int, seconds: float) -> tuple[int, int]:
-    """The last numbers that were offered and written."""
+    """The last ids that were passed to `write`, and written."""
     command = [sys.executable, "-c", WRITER, str(path), str(seed), str(Path(__file__).parents[1])]
     writer = subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}

@@ -16,7 +16,7 @@ from share.wire.codec import WIRE_VERSION
 pytestmark = pytest.mark.parametrize("old", [version for version in VERSIONS if version < WIRE_VERSION])
 
 
-def test_an_older_map_is_opened_and_gone_on_with(old: int, tmp_path: Path) -> None:
+def test_a_map_of_an_older_release_is_opened_and_continued(old: int, tmp_path: Path) -> None:
     store = MapStore.open(map_file(old, tmp_path))
     try:
         kept = store.load()
@@ -30,7 +30,7 @@ def test_an_older_map_is_opened_and_gone_on_with(old: int, tmp_path: Path) -> No
         store.close()
 
 
-def test_one_that_cannot_be_read_is_refused_in_one_line(
+def test_an_unreadable_map_is_refused_in_one_line(
     old: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = map_file(old, tmp_path)
@@ -38,7 +38,7 @@ def test_one_that_cannot_be_read_is_refused_in_one_line(
     monkeypatch.setattr(rows, "_READABLE_VERSIONS", (WIRE_VERSION,))
     with pytest.raises(
         StoreError, match=f"wire version {old}, this SHARE reads {WIRE_VERSION}: use the SHARE"
-    ) as told:
+    ) as raised:
         MapStore.open(path)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
     assert path.read_bytes() == before

@@ -1,4 +1,4 @@
-"""The map file: what was written is found again, to the last bit, by whoever may."""
+"""The map file: all that was written is read back to the last bit."""
 
 import os
 import resource
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution, told
+from helpers.map_changes import ANN, BOB, as_values, keyframe, loop, pose, run, small_map, solution
 from helpers.special_files import KINDS, special
 
 from share.errors import StoreError, UsageError
@@ -41,7 +41,7 @@ def path(tmp_path):
     return tmp_path / "room.sqlite"
 
 
-def again(path):
+def reopened(path):
     with MapStore.open(path) as store:
         return store.load()
 
@@ -52,18 +52,18 @@ def files(path):
 
 def test_a_new_file_is_empty(path):
     with MapStore.open(path) as store:
-        assert told(store.load()) == told(type(store.load())())
-        assert (store.writable, store.read_only_reason, store.schema) == (True, "", schema.SCHEMA)
+        assert as_values(store.load()) == as_values(type(store.load())())
+        assert (store.writable, store.read_only_reason) == (True, "")
     assert is_map(path)
     assert files(path) == ["room.sqlite", "room.sqlite.lock"]
 
 
-def test_all_is_found_again(path):
+def test_all_changes_are_read_back(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-        before = told(store.load())
-    kept = again(path)
-    assert told(kept) == before
+        before = as_values(store.load())
+    kept = reopened(path)
+    assert as_values(kept) == before
     frames = [keyframe(key, i) for i in range(20) for key in (ANN, BOB)]
     assert [k.keyframe_key for k in kept.keyframes] == [k.keyframe_key for k in frames]
     for found, sent in zip(kept.keyframes, frames, strict=True):
@@ -77,15 +77,15 @@ def test_all_is_found_again(path):
     assert kept.problems == ()
 
 
-def test_the_same_again_changes_nothing(path):
+def test_repeated_changes_change_nothing(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-        before = told(store.load())
+        before = as_values(store.load())
         store.write(small_map())
-        assert told(store.load()) == before
+        assert as_values(store.load()) == before
 
 
-def test_a_new_solution_takes_the_place_of_the_old(path):
+def test_a_new_solution_replaces_the_old(path):
     with MapStore.open(path) as store:
         store.write(small_map())
         store.write([solution([KeyframeKey(ANN, 3)], "elsewhere")])
@@ -93,7 +93,7 @@ def test_a_new_solution_takes_the_place_of_the_old(path):
     assert (poses.keys, poses.map_ids) == ((KeyframeKey(ANN, 3),), ("elsewhere",))
 
 
-def test_retired_keyframes_go_but_not_their_numbers(path):
+def test_ids_of_removed_keyframes_are_not_used_again(path):
     with MapStore.open(path) as store:
         store.write(small_map())
         link = SaveLink(KeyframeKey(ANN, 5), 3, pose(2), np.eye(6) * 1e-3)
@@ -107,7 +107,7 @@ def test_retired_keyframes_go_but_not_their_numbers(path):
             ]
         )
         store.write([keyframe(ANN, 4), keyframe(ANN, 19)])  # late copies
-    kept = again(path)
+    kept = reopened(path)
     numbers = [k.keyframe_key.id for k in kept.keyframes if k.run_key == ANN]
     assert numbers == [i for i in range(19) if i != 4]
     assert kept.next_ids[ANN] == 20
@@ -119,7 +119,7 @@ def test_retired_keyframes_go_but_not_their_numbers(path):
     assert kept.problems == ()
 
 
-def test_the_order_of_stretches_outlives_their_keyframes(path):
+def test_segments_stay_in_order_without_their_keyframes(path):
     with MapStore.open(path) as store:
         store.write([run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0), keyframe(ANN, 1, first=True)])
         store.write([RemoveKeyframes((KeyframeKey(ANN, 0),))])
@@ -127,53 +127,53 @@ def test_the_order_of_stretches_outlives_their_keyframes(path):
             [keyframe(ANN, 2), keyframe(ANN, 3), RemoveKeyframes((KeyframeKey(ANN, 2),)), keyframe(ANN, 4)]
         )
         store.write([keyframe(ANN, 5, first=True)])
-    kept = again(path)
+    kept = reopened(path)
     assert kept.segments == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1", f"{ANN}/2")
     places = [(k.keyframe_key.id, k.segment_name, k.ordinal) for k in kept.keyframes if k.run_key == ANN]
     assert places == [(1, f"{ANN}/1", 0), (3, f"{ANN}/1", 2), (4, f"{ANN}/1", 3), (5, f"{ANN}/2", 0)]
 
 
-def voices(path):
-    return {run.run_key: run.credential for run in again(path).runs}
+def credentials(path):
+    return {run.run_key: run.credential for run in reopened(path).runs}
 
 
-def test_who_speaks_for_a_run_is_kept_and_may_change(path):
+def test_credentials_are_stored_and_may_change(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-    assert voices(path) == {ANN: f"key of {ANN[:3]}", BOB: ""}
+    assert credentials(path) == {ANN: f"key of {ANN[:3]}", BOB: ""}
     for voice in ("E", "F", ""):
         with MapStore.open(path) as store:
             store.write(
                 [SaveCredential(BOB, voice), SaveCredential(ANN, voice), SaveCredential("eve-0003", "E")]
             )
-        assert voices(path) == {ANN: voice, BOB: voice}
+        assert credentials(path) == {ANN: voice, BOB: voice}
     with MapStore.open(path) as store:
         store.write([SaveCredential(BOB, "B"), SaveCredential(ANN, "A"), RemoveRun(BOB)])
         store.write([run(BOB)])
-    assert voices(path) == {ANN: "A", BOB: ""}
+    assert credentials(path) == {ANN: "A", BOB: ""}
 
 
-def test_a_map_of_share_0_1_says_of_no_run_who_speaks_for_it_and_is_not_changed_by_opening(path):
-    """It has only the rows that `about` begins with; whose number and schema are the same as now."""
+def test_a_map_of_share_0_1_has_no_credentials_and_is_not_changed_by_opening(path):
+    """It has only the first rows of `about`, with the numbers and the schema of today."""
     with MapStore.open(path) as store:
         store.write([replace(one, credential="") if isinstance(one, SaveRun) else one for one in small_map()])
         assert schema.SCHEMA == 3
     with closing(sqlite3.connect(path)) as connection:
         assert {name for (name,) in connection.execute("SELECT name FROM about")} == {"schema", "made by"}
-    kept = again(path)
+    kept = reopened(path)
     assert {run.credential for run in kept.runs} == {""}
     assert {run.credential for run in with_unknown_credentials(kept).runs} == {None}  # may be anybody
     assert kept.problems == ()
     assert files(path) == ["room.sqlite", "room.sqlite.lock"]
     with MapStore.open(path) as store:
         store.write([SaveCredential(ANN, "A")])
-    assert {run.run_key: run.credential for run in with_unknown_credentials(again(path)).runs} == {
+    assert {run.run_key: run.credential for run in with_unknown_credentials(reopened(path)).runs} == {
         ANN: "A",
         BOB: None,
     }
 
 
-def test_two_loops_may_tie_one_pair(path):
+def test_one_pair_of_keyframes_may_have_two_loops(path):
     with MapStore.open(path) as store:
         store.write([*small_map(), SaveLoop(loop(4, 4)), SaveLoop(loop(4, 4).reverse())])
         assert len(store.load().loops) == 6
@@ -181,7 +181,7 @@ def test_two_loops_may_tie_one_pair(path):
         assert len(store.load().loops) == 4
 
 
-def test_a_list_of_changes_is_kept_whole_or_not_at_all(path):
+def test_a_list_of_changes_is_written_whole_or_not_at_all(path):
     with MapStore.open(path) as store:
         store.write([run(ANN), keyframe(ANN, 0)])
         with pytest.raises(ValueError, match=r"bob-0002 is not in the file; its SaveRun must come first"):
@@ -197,7 +197,8 @@ def test_another_thread_may_write(path):
         assert len(store.load().keyframes) == 40
 
 
-def test_one_edge_a_map_but_any_number_of_readers(path):
+@pytest.mark.long
+def test_a_map_has_one_writer_and_any_number_of_readers(path):
     with MapStore.open(path) as store:
         store.write(small_map())
         with pytest.raises(StoreError, match="another edge uses this map"):
@@ -221,7 +222,7 @@ def keyframes_for_a_reader(path) -> int:
     )
 
 
-def test_what_is_no_map_is_left_as_it_is(tmp_path):
+def test_other_files_are_refused_and_left_unchanged(tmp_path):
     text, other = tmp_path / "notes.txt", tmp_path / "browser.sqlite"
     text.write_text("SQLite is nice" * 1000)
     with sqlite3.connect(other) as connection:
@@ -243,69 +244,27 @@ def test_what_is_no_map_is_left_as_it_is(tmp_path):
 # ---------------------------------------------------------------- schemas
 
 
-def schema_said(path, number):
-    """As a SHARE of schema `number` would have left it."""
+@pytest.mark.parametrize(("number", "age"), [(schema.SCHEMA + 1, "a newer"), (schema.SCHEMA - 1, "an older")])
+def test_a_map_of_another_schema_is_refused_and_left_unchanged(path, number, age):
+    with MapStore.open(path) as store:
+        store.write(small_map())
     connection = sqlite3.connect(path, isolation_level=None)
     connection.execute("DELETE FROM about WHERE name = 'schema'")
     insert(connection, "about", ("schema", str(number)))
-    if number < schema.SCHEMA:  # made up: loops did not count their inliers
-        connection.execute("ALTER TABLE loop RENAME COLUMN inliers TO matches")
     connection.close()
-
-
-OLD = schema.SCHEMA - 1
-STEP = ("ALTER TABLE loop RENAME COLUMN matches TO inliers",)
-
-
-def test_a_newer_schema_is_left_alone(path):
-    with MapStore.open(path) as store:
-        store.write(small_map())
-    schema_said(path, schema.SCHEMA + 1)
     before = path.read_bytes()
-    ours = schema.SCHEMA
-    with pytest.raises(UsageError, match=rf"newer SHARE \(schema {ours + 1}, this one reads {ours}\)"):
-        MapStore.open(path)
+    line = rf"made by {age} SHARE \(schema {number}, this one reads {schema.SCHEMA}\); use that SHARE"
+    for opening in (MapStore.open, MapStore.read):
+        with pytest.raises(UsageError, match=line):
+            opening(path)
     assert path.read_bytes() == before
-
-
-def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch):
-    with MapStore.open(path) as store:
-        store.write(small_map())
-        whole = told(store.load())
-    schema_said(path, OLD)
-    before = path.read_bytes()
-    with pytest.raises(UsageError, match=f"has schema {OLD}, which cannot be migrated to {schema.SCHEMA}"):
-        MapStore.open(path)
-    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
-    with MapStore.read(path) as reader:
-        assert reader.schema == OLD
-        assert told(reader.load()) == whole
-    assert path.read_bytes() == before
-    assert told(again(path)) == whole
-    assert path.with_name(f"room.sqlite.schema-{OLD}").read_bytes() == before
-    assert told(again(path)) == whole
-    assert [name for name in files(path) if "damaged" in name] == []
-
-
-def test_a_step_that_fails_leaves_the_old_file(path, monkeypatch):
-    with MapStore.open(path) as store:
-        store.write(small_map())
-    schema_said(path, OLD)
-    before = path.read_bytes()
-    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
-    with pytest.raises(
-        StoreError, match=f"no such table: nonsense; it has schema {OLD}: use the SHARE that made it"
-    ):
-        MapStore.open(path)
-    monkeypatch.setattr(schema, "MIGRATIONS", {OLD: STEP})
-    assert len(again(path).keyframes) == 40
-    assert path.with_name(f"room.sqlite.schema-{OLD}").read_bytes() == before
+    assert files(path) == ["room.sqlite", "room.sqlite.lock"]
 
 
 # ---------------------------------------------------------------- the disk
 
 
-def test_a_full_disk_keeps_nothing_half_and_works_again_afterwards(path):
+def test_a_full_disk_keeps_nothing_half_and_recovers(path):
     """No file of this process may grow beyond a limit for a while."""
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -320,12 +279,13 @@ def test_a_full_disk_keeps_nothing_half_and_works_again_afterwards(path):
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
             signal.signal(signal.SIGXFSZ, before)
         store.write([keyframe(ANN, i, 500) for i in range(3, 20)])
-    assert [k.keyframe_key.id for k in again(path).keyframes] == list(range(20))
+    assert [k.keyframe_key.id for k in reopened(path).keyframes] == list(range(20))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("killed", [False, True], ids=["closed", "killed"])
-def test_a_map_that_may_only_be_read(killed):
-    """As somebody who is not root: root may write everything."""
+def test_a_read_only_map_is_opened_for_reading(killed):
+    """As a user other than root, who may write everything."""
     folder = Path(tempfile.mkdtemp())
     path = folder / "room.sqlite"
     try:
@@ -352,7 +312,8 @@ def test_a_map_that_may_only_be_read(killed):
         shutil.rmtree(folder)
 
 
-def test_the_file_stays_bounded_when_as_many_retire_as_come(path):
+@pytest.mark.long
+def test_the_file_stays_bounded_when_keyframes_are_removed(path):
     with MapStore.open(path) as store:
         store.write([run(ANN)])
         sizes = []
@@ -372,21 +333,21 @@ def test_keyframes_of_an_earlier_wire_version_that_have_not_changed_are_read(pat
         then.setattr(codec, "WIRE_VERSION", 3)
         with MapStore.open(path) as store:
             store.write(small_map())
-            before = told(store.load())
-    assert told(again(path)) == before
+            before = as_values(store.load())
+    assert as_values(reopened(path)) == before
     path.unlink()
     monkeypatch.setattr(codec, "WIRE_VERSION", 99)
     with MapStore.open(path) as store:
         store.write(small_map())
     monkeypatch.undo()
     with pytest.raises(StoreError, match=r"have wire version 99, this SHARE reads \d+: use the SHARE that"):
-        again(path)
+        reopened(path)
 
 
 @pytest.mark.parametrize("end", ["-wal", "-shm"])
 @pytest.mark.parametrize("kind", [*KINDS, "link"])
 @pytest.mark.parametrize("made", [True, False])
-def test_what_lies_beside_a_map_is_a_file(path, end, kind, made):
+def test_side_files_of_a_map_must_be_regular_files(path, end, kind, made):
     """SQLite would open a pipe, and wait or write there."""
     if made:
         with MapStore.open(path) as store:
@@ -400,7 +361,7 @@ def test_what_lies_beside_a_map_is_a_file(path, end, kind, made):
         MapStore.open(path)
     assert not (path.parent / "elsewhere").exists()
     beside.rmdir() if kind == "folder" else beside.unlink()
-    assert again(path) is not None
+    assert reopened(path) is not None
 
 
 LIMITED = """
@@ -421,9 +382,10 @@ except StoreError as error:
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("limit", [1_000, 10_000, 40_000, 100_000, 300_000])
-def test_a_map_that_may_not_grow_says_by_which_limit(path, limit):
-    """SQLite says "disk I/O error". Wherever it meets the limit: file, log or index."""
+def test_a_file_size_limit_is_named(path, limit):
+    """SQLite reports "disk I/O error", for the file, the log or the index."""
     here = Path(__file__).parents[1]
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, path, str(limit)],

@@ -16,7 +16,6 @@ import pickle
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,20 +24,24 @@ from share import startup
 startup.prepare_process()
 
 import numpy as np  # noqa: E402
+import pytest  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
+from helpers.exact_solver import make_exact  # noqa: E402
 from helpers.gtsam_graph import solve  # noqa: E402
 from helpers.rooms import Room, simulate  # noqa: E402
 
 from share.config import GraphConfig  # noqa: E402
 from share.mapping.graph.covariance import CovariancePaths  # noqa: E402
-from share.mapping.graph.solver import PoseGraphSolver  # noqa: E402
-from share.mapping.graph.updates import GraphSolution, GraphUpdate  # noqa: E402
+from share.mapping.graph.solver import (  # noqa: E402
+    GraphSolution,
+    GraphUpdate,
+    PoseGraphSolver,
+)
 from share.types import F64  # noqa: E402
 
 CONFIG = GraphConfig()
-EXACT = replace(CONFIG, step_tolerance=1e-8, relative_tolerance=1e-14, inner_tolerance=1e-6)
 NEW = 3  # keyframes a step
 FIRST_LOOP = 10**6  # odometry edges have the ids of the keyframes that they lead to
 
@@ -110,9 +113,11 @@ def one_warm(n: int, agents: int, density: float, seed: int, steps: int) -> tupl
         wanted = range(k + NEW - agents, k + NEW)
         spent, solution = cpu_ms(lambda c=news, w=wanted: (solver.update(c), solver.solve(0, w))[1])
         times.append(spent)
-    exact = PoseGraphSolver(EXACT)
+    exact = PoseGraphSolver(CONFIG)
     exact.update(change(room, range(n), dict(enumerate(solution.poses)), known))
-    off = np.linalg.norm((exact.solve(0).poses - solution.poses)[:, :3, 3], axis=1)
+    with pytest.MonkeyPatch.context() as patch:
+        make_exact(patch)
+        off = np.linalg.norm((exact.solve(0).poses - solution.poses)[:, :3, 3], axis=1)
     return np.array(times), 1e3 * off
 
 
@@ -157,7 +162,7 @@ def roads(room: Room) -> dict[str, float]:
 def gtsam(room: Room, agents: int) -> dict[str, float]:
     n = len(room)
     last = list(range(n - agents, n))
-    args = (room.guess, room.chain, room.closures, [0], CONFIG)
+    args = (room.guess, room.chain, room.closures, [0])
     return {
         "gtsam_cold": round(cpu_ms(lambda: solve(*args))[0], 1),
         "gtsam_cold_with_covariances": round(cpu_ms(lambda: solve(*args, covariances_of=last))[0], 1),

@@ -31,7 +31,7 @@ from helpers.place_sim import sights  # noqa: E402
 from share.config import PlaceConfig  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.mapping.recognition.index import PlaceIndex  # noqa: E402
-from share.mapping.recognition.verification import CameraView, Verification, verify  # noqa: E402
+from share.mapping.recognition.verification import MAX_BITS, CameraView, Verification, verify  # noqa: E402
 from share.vision.matching import match_descriptors  # noqa: E402
 
 PLACE = PlaceConfig()
@@ -65,7 +65,7 @@ def median_ms(runs: Iterable[Callable[[], Any]]) -> float:
 def bench_place(views: list[CameraView], n: int) -> dict[str, float]:
     """Time `add` and `query` at n stored keyframes, and `chain`: query and verification of all candidates."""
     rng = np.random.default_rng(0)
-    index = PlaceIndex(PLACE.index_seed, PLACE.tables, PLACE.hash_bits)
+    index = PlaceIndex()
     stored = [
         v.view.descriptors ^ np.packbits(rng.random((len(v.view), 256)) < 0.06, axis=1)
         for v in (views[i % len(views)] for i in range(n))
@@ -86,9 +86,7 @@ def bench_pair(views: list[CameraView]) -> dict[str, float]:
     pairs = [*itertools.pairwise(views), *zip(views, views[7:], strict=False)]
     accepts = [isinstance(verify(a, b, PLACE), Verification) for a, b in pairs]
     matching = [
-        lambda a=a, b=b: match_descriptors(
-            a.view.descriptors, b.view.descriptors, PLACE.max_distance_bits, 1.0
-        )
+        lambda a=a, b=b: match_descriptors(a.view.descriptors, b.view.descriptors, MAX_BITS, 1.0)
         for a, b in pairs
     ]
 

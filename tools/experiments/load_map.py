@@ -27,9 +27,9 @@ class TimedMap:
         self.mapper.add_run(agent, hello)
 
     def add(self, agent: str, keyframe: Keyframe) -> None:
-        before = self.mapper.removed_count
+        before = self.mapper.report()["removed_keyframes"]
         found, ms = _timed(self.mapper.add_keyframe, agent, keyframe)
-        self.ms["add" if self.mapper.removed_count == before else "thin"].append(ms)
+        self.ms["add" if self.mapper.report()["removed_keyframes"] == before else "thin"].append(ms)
         self.findings += found
 
     def look(self) -> None:

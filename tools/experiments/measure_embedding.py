@@ -140,8 +140,7 @@ def right(T_c: F64, T_q: F64, T_c_q: F64) -> bool:
 
 def by_words(seen: list[Seen], own: np.ndarray) -> F64:
     """Return scores (N, N) by the index."""
-    config, out = PlaceConfig(), np.where(own, -np.inf, 0.0)
-    index = PlaceIndex(config.index_seed, config.tables, config.hash_bits)
+    index, out = PlaceIndex(), np.where(own, -np.inf, 0.0)
     for k, one in enumerate(seen):
         index.add(k, one.sight.view.descriptors)
     for q, one in enumerate(seen):

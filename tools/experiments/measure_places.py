@@ -29,6 +29,7 @@ from places_picture import draw  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.config import PlaceConfig  # noqa: E402
+from share.mapping.recognition.verification import MAX_SIGMA_DEG  # noqa: E402
 
 INLIERS = (8, 10, 12, 14, 16, 18, 20, 24, 28, 32, 40, 50, 65, 80, 100, 130, 160, 200)
 SIGMAS = (0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0)
@@ -45,27 +46,26 @@ def main() -> int:
 
 
 def measure(options: argparse.Namespace) -> None:
-    config = PlaceConfig()
     rooms = real(options.data)
     if options.emulated:
         rooms += [emulated(WAREHOUSE, Spacing(), 6), emulated(FIRESTATION, Spacing(), 6)]
         rooms += [emulated(TWINS, Spacing(0.3, 0.35), 2)]
     recalls, curves, here = {}, {}, {}
     for views in rooms:
-        recalls[views.name], served = recall_at(views, [v for v in rooms if v is not views], config)
-        pairs = tried(views, config, options.far)
-        curves[views.name] = over_both(pairs, config)
-        here[views.name] = point(pairs, config.min_inliers, config.max_sigma_deg)
+        recalls[views.name], served = recall_at(views, [v for v in rooms if v is not views])
+        pairs = tried(views, options.far)
+        curves[views.name] = over_both(pairs)
+        here[views.name] = point(pairs, PlaceConfig.min_inliers, MAX_SIGMA_DEG)
         row = report(views, recalls[views.name], served, pairs, here[views.name])
         print(json.dumps(row), flush=True)
     if options.picture:
         draw(options.picture, recalls, curves, here)
 
 
-def over_both(pairs: Tried, config: PlaceConfig) -> tuple[list[Point], list[Point]]:
+def over_both(pairs: Tried) -> tuple[list[Point], list[Point]]:
     """Return curves over inliers at the allowed sigma, and over sigma at the allowed inliers."""
-    inliers = [point(pairs, n, config.max_sigma_deg) for n in INLIERS]
-    return inliers, [point(pairs, config.min_inliers, sigma) for sigma in SIGMAS]
+    inliers = [point(pairs, n, MAX_SIGMA_DEG) for n in INLIERS]
+    return inliers, [point(pairs, PlaceConfig.min_inliers, sigma) for sigma in SIGMAS]
 
 
 def report(views: Views, recall: Any, served: float, pairs: Tried, here: Point) -> dict[str, Any]:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from places_data import Views
 
 from share.config import PlaceConfig
+from share.mapping.recognition import verification
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.verification import Verification, verify
 from share.types import F64
 
 FALSE_M, FALSE_DEG = 0.25, 5.0
-LOOSE = {"min_inliers": 8, "min_direction_inliers": 4, "max_sigma_deg": 3.0}
+LOOSE = PlaceConfig(min_inliers=8)
+LOOSE_LIMITS = {"MIN_DIRECTION_INLIERS": 4, "MAX_SIGMA_DEG": 3.0}  # of the verification
 
 
 class Tried(NamedTuple):
@@ -29,16 +30,22 @@ class Tried(NamedTuple):
     stands_for: F64
 
 
-def tried(views: Views, config: PlaceConfig, far: int, seed: int = 0) -> Tried:
+def tried(views: Views, far: int, seed: int = 0) -> Tried:
     """Verify all true pairs and twins, and `far` of the others, with loose limits."""
     n = len(views.sights)
     kinds = {(q, c): _kind(views, q)[c] for q in range(n) for c in range(q)}
     others = [pair for pair, near in kinds.items() if not near]
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(len(others))[:far]
-    loose = replace(config, **LOOSE)
-    rows = [_try(views, loose, *pair, 1.0) for pair, near in kinds.items() if near]
-    rows += [_try(views, loose, *others[i], len(others) / max(1, len(chosen))) for i in chosen]
+    limits = {name: getattr(verification, name) for name in LOOSE_LIMITS}
+    try:
+        for name, value in LOOSE_LIMITS.items():
+            setattr(verification, name, value)
+        rows = [_try(views, *pair, 1.0) for pair, near in kinds.items() if near]
+        rows += [_try(views, *others[i], len(others) / max(1, len(chosen))) for i in chosen]
+    finally:
+        for name, value in limits.items():
+            setattr(verification, name, value)
     return Tried(*np.array(rows).T)
 
 
@@ -50,14 +57,14 @@ def _kind(views: Views, q: int) -> np.ndarray:
     return np.asarray(near | ((metres < 1) & (degrees < 30)))
 
 
-def _try(views: Views, config: PlaceConfig, q: int, c: int, stands_for: float) -> tuple[float, ...]:
+def _try(views: Views, q: int, c: int, stands_for: float) -> tuple[float, ...]:
     true = bool(views.true(q)[c])
-    found = verify(views.sights[q], views.sights[c], config)
+    found = verify(views.sights[q], views.sights[c], LOOSE)
     if not isinstance(found, Verification):
         return true, False, False, 0, 0.0, stands_for
     right = _right(views.error(q, c, found.T_c_q))
     twin = not right and views.T_twin is not None and _right(views.error(q, c, found.T_c_q, twin=True))
-    floor = np.radians(config.floor_deg) ** 2 * 3
+    floor = np.radians(verification._FLOOR_DEG) ** 2 * 3
     sigma = float(np.degrees(np.sqrt(max(0.0, np.trace(found.cov[:3, :3]) - floor))))
     return true, right, twin, found.inliers, sigma, stands_for
 
@@ -91,10 +98,10 @@ def point(pairs: Tried, inliers: float, sigma: float) -> Point:
     return Point(inliers, sigma, float(recall), precision, int(taken.sum()), int(wrong.sum()), twins)
 
 
-def recall_at(views: Views, others: list[Views], config: PlaceConfig, most: int = 50) -> tuple[F64, float]:
+def recall_at(views: Views, others: list[Views], most: int = 50) -> tuple[F64, float]:
     """Return the share of the true pairs among the first k = 1 … `most` results, with the other rooms' views
     in the index too; and the share of the views with a true match that have one among their first eight."""
-    index = PlaceIndex(config.index_seed, config.tables, config.hash_bits)
+    index = PlaceIndex()
     everything = [*views.sights, *(s for o in others for s in o.sights)]
     for number, sight in enumerate(everything):
         index.add(number, sight.view.descriptors)

@@ -60,10 +60,10 @@ class RememberingMapper(Mapper):
         return any(pair <= set(honest) for pair in self._were_apart)
 
     def _note_standing(self) -> None:
-        for names, doubt in self._atlas.contradictions().items():
+        for names, doubt in self.atlas.quarantine.agreement.contradictions().items():
             pair = frozenset(names)
             self._doubts[pair] = max(doubt, self._doubts.get(pair, 0.0))
-            if self._atlas.are_separated(*names):
+            if self.atlas.quarantine.agreement.are_separated(*names):
                 self._were_apart.add(pair)
 
 

@@ -24,8 +24,9 @@ from share.config import Config
 from share.geometry import se3
 from share.geometry.camera import Rig
 from share.mapping.map_changes import MapChange
-from share.mapping.query_queue import CandidateSearch, QueryQueue, SearchBudget, service_kind
+from share.mapping.query_queue import CandidateSearch, QueryQueue, service_kind
 from share.mapping.recognition.verification import Refusal, Verification
+from share.mapping.segments import MIN_LOOP_GAP
 from share.mapping.steps import MapEvent, map_assignment
 from share.scheduling.merge_gate import MergeGate
 from share.scheduling.overlap import Frustum, SampledFrustum, overlap_volumes
@@ -140,8 +141,7 @@ class ModelledMapper:
         self._T_map_world: dict[str, F64] = {}
         self._lookups = QueryQueue(config.edge)
         self._gating = MergeGate(config.control, config.edge.policy)
-        self._budget = SearchBudget.from_config(config)
-        self._search: CandidateSearch | None = None
+        self._search: tuple[int, CandidateSearch] | None = None  # of a keyframe, by number
         self._is_searching = self._is_solving = False
         self._maps_to_solve: dict[str, None] = {}
         self._verified_pairs: dict[frozenset[str], int] = {}  # verified loops between two maps
@@ -198,7 +198,7 @@ class ModelledMapper:
             return self._corrections(*result)
         self._is_searching = False
         if step.kind == "place":
-            self._search = CandidateSearch(step.number, result, self._budget)
+            self._search = step.number, CandidateSearch(result)
             return []
         return self._accept_verified(step, result.T_c_q) if isinstance(result, Verification) else []
 
@@ -226,7 +226,7 @@ class ModelledMapper:
 
     def _candidates(self, number: int) -> list[int]:
         """Return candidates for a keyframe, best first."""
-        agent, gap = self._stored[number].agent, self._config.merge.min_loop_gap
+        agent = self._stored[number].agent
         ranked: list[tuple[float, int]] = []
         for other, run in self._agents.items():
             if not (numbers := run.keyframe_numbers):
@@ -236,19 +236,19 @@ class ModelledMapper:
             overlaps[self._rng.random(len(overlaps)) < self._model.false_match_rate] += 0.5
             end = len(numbers)
             if other == agent:  # keyframes this close are joined by odometry
-                end = max(0, self._stored[number].keyframe.id - gap)
+                end = max(0, self._stored[number].keyframe.id - MIN_LOOP_GAP)
             best = np.argsort(-overlaps[:end])[: self._config.place.candidates]
             ranked += [(float(overlaps[i]), numbers[i]) for i in best if numbers[i] != number]
         ranked.sort(reverse=True)
         return [n for _, n in ranked[: self._config.place.candidates]]
 
     def _next_verify(self) -> ModelledStep | None:
-        search = self._search
-        candidate = None if search is None else search.next_candidate(self._lookups.is_hurried)
-        if search is None or candidate is None:
+        if self._search is None:
+            return None
+        number, search = self._search
+        if (candidate := search.next_candidate(self._lookups.is_hurried)) is None:
             self._search = None
             return None
-        number = search.node_id
         return ModelledStep("verify", number, lambda: self._verify(number, candidate), candidate)
 
     def _verify(self, number: int, candidate: int) -> Verification | Refusal:
@@ -263,7 +263,7 @@ class ModelledMapper:
         a, b = self._stored[step.candidate], self._stored[step.number]
         one, other = self._agents[a.agent], self._agents[b.agent]
         if self._search is not None:
-            self._search.count_verified()
+            self._search[1].count_verified()
         other.merges["requested"] += 1
         volume = self._gating.overlap_volume(one.hello.rig, other.hello.rig, T_a_b)
         if self._gating.skip_reason(volume, one.map_id == other.map_id):

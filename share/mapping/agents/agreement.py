@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.mapping.agents.agent_pair import AgentPair
-from share.mapping.agents.covariance_scales import CovarianceClaims, CovarianceScales, SegmentPair
+from share.mapping.agents.covariance_scales import CovarianceScales, SegmentPair
 from share.mapping.agents.identities import AgentIdentities, outvoted_agents
 from share.mapping.agents.pairwise import AccumulatedOdometry, InterAgentLoop
 from share.mapping.graph.edges import PoseEdge
@@ -27,6 +27,7 @@ from share.types import F64
 _APPLY_SIGMAS = 2.5  # significance at which a scale is corrected
 _KEEP_SIGMAS = 1.25  # significance down to which it stays corrected
 _MIN_SCALE_CHANGE = 0.001  # log scale
+_EVENTS = {"set apart": "agent quarantined", "disputed": "agents disputed"}  # by state
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,13 @@ class AgentStanding:
     doubt: float = 0.0
     widened: float = 1.0
 
+    @property
+    def event(self) -> tuple[str, str]:
+        """Event and reason to report when this standing is new."""
+        if self.state in _EVENTS:
+            return _EVENTS[self.state], self.reason
+        return "quarantine lifted", "consistent with the others again"
+
 
 AgentNames = tuple[str, str]
 
@@ -58,7 +66,7 @@ class AgentAgreement:
 
     tolerance: log scale that does no harm. quarantined: agents that must not affect others. disputed: pairs
     in which it is undetermined who is wrong. log_scales: log of how much too long each agent's metres are,
-    where significant; else missing.
+    where significant; else missing. pairs: comparisons of every two agents with loops, by their names.
     """
 
     def __init__(self, tolerance: float) -> None:
@@ -66,10 +74,10 @@ class AgentAgreement:
         self.disputed: frozenset[frozenset[str]] = frozenset()
         self.log_scales: dict[str, float] = {}
         self.identities = AgentIdentities()
-        self._covariance_scales = CovarianceScales(CovarianceClaims())
+        self.covariance_scales = CovarianceScales()
         self._tolerance = tolerance
         self._accumulated: dict[int, AccumulatedOdometry] = {}
-        self._pairs: dict[AgentNames, AgentPair] = {}
+        self.pairs: dict[AgentNames, AgentPair] = {}
 
     def add_run(self, run: str, name: str, credential: str | None = "") -> None:
         """Register a run of the agent of this name; what is known of the name applies to it. credential: see
@@ -84,7 +92,7 @@ class AgentAgreement:
             AccumulatedOdometry.origin() if previous is None else previous.with_step(T_ref_body, cov)
         )
         if previous_id is not None:
-            self._covariance_scales.add_step(self.identities.identity(run), T_ref_body, cov)
+            self.covariance_scales.add_step(self.identities.identity(run), T_ref_body, cov)
 
     def log_scale(self, run: str) -> float:
         """Log of how much too long the run's metres are, where significant; else 0."""
@@ -92,7 +100,7 @@ class AgentAgreement:
 
     def covariance_scale(self, run: str) -> float:
         """Factor on the variances of the run's odometry."""
-        return self._covariance_scales.scales.get(self.identities.identity(run), 1.0)
+        return self.covariance_scales.scales.get(self.identities.identity(run), 1.0)
 
     def remove_nodes(self, node_ids: Collection[int], live: Container[int]) -> None:
         """Remove nodes. live: segments that still have nodes; see `AgentPair.end_segments` for the loops of
@@ -100,19 +108,19 @@ class AgentAgreement:
         """
         for node_id in node_ids:
             self._accumulated.pop(node_id, None)
-        ended = set[SegmentPair]().union(*[pair.end_segments(live) for pair in self._pairs.values()])
-        self._covariance_scales.drop_evidence(sorted(ended))
+        ended = set[SegmentPair]().union(*[pair.end_segments(live) for pair in self.pairs.values()])
+        self.covariance_scales.drop_evidence(sorted(ended))
 
     def remove_run(self, run: str) -> None:
         """Forget a run that will not return; after an agent's last run only suspicion of its name stays."""
         removed = self.identities.remove_run(run, self.quarantined, frozenset[str]().union(*self.disputed))
         if removed is None:
             return
-        self._pairs = {names: pair for names, pair in self._pairs.items() if removed not in names}
+        self.pairs = {names: pair for names, pair in self.pairs.items() if removed not in names}
         self.quarantined -= {removed}
         self.disputed = frozenset(names for names in self.disputed if removed not in names)
         self.log_scales.pop(removed, None)
-        self._covariance_scales.remove_agent(removed)
+        self.covariance_scales.remove_agent(removed)
 
     def add_loop(
         self,
@@ -132,8 +140,8 @@ class AgentAgreement:
         if first > second:
             first, second, segments, edge = second, first, segments[::-1], edge.reverse()
             scale = None if scale is None else scale.reverse()
-        pair = self._pairs.setdefault((first, second), AgentPair(self._tolerance))
-        self._covariance_scales.link(first, second)
+        pair = self.pairs.setdefault((first, second), AgentPair(self._tolerance))
+        self.covariance_scales.claims.link(first, second)
         a, b = self._accumulated[edge.a], self._accumulated[edge.b]
         if not pair.add_loop(segments, InterAgentLoop(a, b, edge.T_a_b, edge.cov, scale, tilt)):
             return False
@@ -151,6 +159,10 @@ class AgentAgreement:
                     return f"{a} and {b} are kept in separate maps"
         return ""
 
+    def are_separated(self, first: str, second: str) -> bool:
+        """Return whether these runs must be in separate maps."""
+        return bool(self.separation_reason([first], [second]))
+
     def unverified_reason(self, first_runs: Collection[str], second_runs: Collection[str]) -> str:
         """Why an agent must be compared before these share a map with those; empty if none must."""
         identities = {self.identities.identity(run) for run in (*first_runs, *second_runs)}
@@ -164,7 +176,7 @@ class AgentAgreement:
     def standing(self, run: str) -> AgentStanding:
         """Return how the run's agent agrees with the others."""
         agent = self.identities.identity(run)
-        pairs = {names: pair for names, pair in self._pairs.items() if agent in names}
+        pairs = {names: pair for names, pair in self.pairs.items() if agent in names}
         disagreeing = [(names, pair) for names, pair in pairs.items() if pair.disagrees]
         nis = max((pair.nis for pair in pairs.values() if pair.nis is not None), default=None)
         log, sigma = self._estimate_scales().get(agent, (None, None))
@@ -198,19 +210,20 @@ class AgentAgreement:
 
     def contradictions(self) -> dict[AgentNames, float]:
         """Severity of the contradictions of each pair (names in order); 1 begins a disagreement."""
-        return {names: pair.severity for names, pair in self._pairs.items()}
+        return {names: pair.severity for names, pair in self.pairs.items()}
 
     def _compare(self, pair: AgentPair, names: AgentNames, segment_pair: SegmentPair) -> None:
-        claims = self._covariance_scales.claims(names[0]), self._covariance_scales.claims(names[1])
+        min_scale = self.covariance_scales.claims.min_scale
+        claims = min_scale(names[0]), min_scale(names[1])
         equations = pair.compare(segment_pair, claims)
         if pair.disagrees:
-            self._covariance_scales.drop_evidence(pair.by_segments)
+            self.covariance_scales.drop_evidence(pair.by_segments)
             return
         self._mark_verified(pair, names)
         comparison = pair.by_segments[segment_pair].comparison
         if equations is not None and comparison is not None and not self.quarantined & {*names}:
             with suppress(np.linalg.LinAlgError):  # absurd numbers are no evidence
-                self._covariance_scales.set_evidence(segment_pair, names, equations, comparison.weights)
+                self.covariance_scales.set_evidence(segment_pair, names, equations, comparison.weights)
 
     def _mark_verified(self, pair: AgentPair, names: AgentNames) -> None:
         """Mark agents of the pair as compared, unless the other is itself suspect.
@@ -229,9 +242,9 @@ class AgentAgreement:
         Quarantined are those outvoted under every assumption on unknown credentials. Agents with a
         quarantined earlier run are suspects.
         """
-        disagreeing = {frozenset(names) for names, pair in self._pairs.items() if pair.disagrees}
-        agreeing = [names for names, pair in self._pairs.items() if pair.agrees]
-        agents = {name for names in self._pairs for name in names}
+        disagreeing = {frozenset(names) for names, pair in self.pairs.items() if pair.disagrees}
+        agreeing = [names for names, pair in self.pairs.items() if pair.agrees]
+        agents = {name for names in self.pairs for name in names}
         suspects = {name for name in agents if self.identities.had_quarantined_run(name, self.quarantined)}
         quarantined = frozenset(agents)
         for credentials in self.identities.credential_hypotheses(agents):
@@ -240,7 +253,7 @@ class AgentAgreement:
         previous = self.quarantined, self.disputed
         self.quarantined = quarantined
         self.disputed = frozenset(names for names in disagreeing if not names & quarantined)
-        self._covariance_scales.exclude(quarantined)
+        self.covariance_scales.exclude(quarantined)
         return previous != (self.quarantined, self.disputed)
 
     def _update_scales(self) -> None:
@@ -261,7 +274,7 @@ class AgentAgreement:
         """
         estimates = (
             (names, pair.pooled_depth_scale)
-            for names, pair in self._pairs.items()
+            for names, pair in self.pairs.items()
             if not {*names} & {*excluded}
         )
         known = [(names, scale) for names, scale in estimates if scale is not None]

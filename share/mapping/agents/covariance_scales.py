@@ -29,15 +29,21 @@ from share.geometry import se3
 from share.mapping.agents.pairwise import ComparisonEquations
 from share.types import F64, I64
 
+# Added to an odometry step's standard deviation: fixed, and per rad and m of the step.
+_FLOOR_DEG = 0.002
+_FLOOR_M = 0.0002
+_FLOOR_PER_RAD = 0.0005
+_FLOOR_PER_M = 0.003
+
 
 def inflate_covariance(config: MergeConfig, T_ref_body: F64, cov: F64) -> F64:
     """Covariance (6, 6) of an odometry step as the graph uses it.
 
-    Agents understate it, so it is scaled; a floor that grows with the step is added.
+    Agents understate it, so it is scaled; a floor that grows with the step is added in quadrature.
     """
     angle_rad, length_m = float(se3.rotation_angle(T_ref_body)), float(np.linalg.norm(T_ref_body[:3, 3]))
-    rad2 = np.radians(config.odometry_floor_deg) ** 2 + (config.odometry_floor_per_rad * angle_rad) ** 2
-    m2 = config.odometry_floor_m**2 + (config.odometry_floor_per_m * length_m) ** 2
+    rad2 = np.radians(_FLOOR_DEG) ** 2 + (_FLOOR_PER_RAD * angle_rad) ** 2
+    m2 = _FLOOR_M**2 + (_FLOOR_PER_M * length_m) ** 2
     return config.odometry_scale**2 * cov + np.diag([rad2] * 3 + [m2] * 3)
 
 
@@ -65,7 +71,6 @@ class CovarianceClaims:
 
     @property
     def known_agents(self) -> set[str]:
-        """Agents with enough steps."""
         return set(self._medians)
 
     def add_step(self, agent: str, T_ref_body: F64, cov: F64) -> bool:
@@ -87,7 +92,6 @@ class CovarianceClaims:
         self._linked.setdefault(second, set()).add(first)
 
     def remove_agent(self, agent: str) -> None:
-        """Forget an agent."""
         self._steps.pop(agent, None)
         self._medians.pop(agent, None)
         self._excluded.discard(agent)
@@ -137,27 +141,19 @@ class _VarianceEvidence:
 
 
 class CovarianceScales:
-    """scales: factor on the variances of each agent's odometry; 1 where missing."""
+    """scales: factor on the variances of each agent's odometry; 1 where missing. evidence: by segments."""
 
-    def __init__(self, claims: CovarianceClaims) -> None:
+    def __init__(self, claims: CovarianceClaims | None = None) -> None:
         self.scales: dict[str, float] = {}
-        self._claims = claims
+        self.claims = CovarianceClaims() if claims is None else claims
         self._estimates: dict[str, float] = {}  # before thresholds
         self._loop_scales: dict[SegmentPair, float] = {}
-        self._evidence: dict[SegmentPair, _VarianceEvidence] = {}
+        self.evidence: dict[SegmentPair, _VarianceEvidence] = {}
 
     def add_step(self, agent: str, T_ref_body: F64, cov: F64) -> None:
         """Add a step (4, 4) of an agent's odometry with its covariance (6, 6)."""
-        if self._claims.add_step(agent, T_ref_body, cov):
+        if self.claims.add_step(agent, T_ref_body, cov):
             self._estimate()
-
-    def claims(self, agent: str) -> float:
-        """Least factor of the agent: see `CovarianceClaims.min_scale`."""
-        return self._claims.min_scale(agent)
-
-    def link(self, first: str, second: str) -> None:
-        """There is a loop between these agents."""
-        self._claims.link(first, second)
 
     def set_evidence(
         self, segment_pair: SegmentPair, agents: tuple[str, str], equations: ComparisonEquations, weights: F64
@@ -166,14 +162,14 @@ class CovarianceScales:
 
         Raises LinAlgError where absurd numbers leave no solution.
         """
-        self.link(*agents)
+        self.claims.link(*agents)
         inliers = np.flatnonzero(weights > _MIN_LOOP_WEIGHT)
         if len(inliers) < _MIN_LOOPS:
             self.drop_evidence([segment_pair])
             return
-        estimates = [self._estimates.get(agent, self._claims.min_scale(agent)) for agent in agents]
+        estimates = [self._estimates.get(agent, self.claims.min_scale(agent)) for agent in agents]
         factors = np.array([*estimates, self._loop_scales.get(segment_pair, _LOOP_PRIOR_SCALE)])
-        self._evidence[segment_pair] = _VarianceEvidence(
+        self.evidence[segment_pair] = _VarianceEvidence(
             agents, *_variance_components(equations, inliers, factors), factors
         )
         self._estimate()
@@ -183,55 +179,54 @@ class CovarianceScales:
         dropped = [
             segment_pair
             for segment_pair in segment_pairs
-            if self._evidence.pop(segment_pair, None) is not None
+            if self.evidence.pop(segment_pair, None) is not None
         ]
         if dropped:
             self._estimate()
 
     def exclude(self, agents: Collection[str]) -> None:
         """Drop the evidence of these agents, and compare no claims with theirs."""
-        if self._claims.exclude(agents):
+        if self.claims.exclude(agents):
             self._estimate()
         self.drop_evidence(
             [
                 segment_pair
-                for segment_pair, evidence in self._evidence.items()
+                for segment_pair, evidence in self.evidence.items()
                 if set(evidence.agents) & set(agents)
             ]
         )
 
     def remove_agent(self, agent: str) -> None:
-        """Forget an agent."""
-        self._evidence = {
+        self.evidence = {
             segment_pair: evidence
-            for segment_pair, evidence in self._evidence.items()
+            for segment_pair, evidence in self.evidence.items()
             if agent not in evidence.agents
         }
-        self._claims.remove_agent(agent)
+        self.claims.remove_agent(agent)
         self._estimate()
         self.scales.pop(agent, None)
 
     def _estimate(self) -> None:
-        agents = sorted({name for evidence in self._evidence.values() for name in evidence.agents})
+        agents = sorted({name for evidence in self.evidence.values() for name in evidence.agents})
         column, n = {name: i for i, name in enumerate(agents)}, len(agents)
-        size = n + len(self._evidence)
+        size = n + len(self.evidence)
         q, F, linearised_at = np.zeros(size), np.zeros((size, size)), np.full(size, _MAX_SCALE)
-        for row, evidence in enumerate(self._evidence.values(), start=n):
+        for row, evidence in enumerate(self.evidence.values(), start=n):
             rows = [column[name] for name in evidence.agents] + [row]
             q[rows] += evidence.q
             F[np.ix_(rows, rows)] += evidence.F
             linearised_at[rows] = np.minimum(linearised_at[rows], evidence.linearised_at)
-        claimed = np.array([self._claims.min_scale(name) for name in agents])
-        prior = np.append(claimed, np.full(len(self._evidence), _LOOP_PRIOR_SCALE))
-        dof = np.append(np.full(n, _PRIOR_DOF), np.full(len(self._evidence), _LOOP_PRIOR_DOF))
+        claimed = np.array([self.claims.min_scale(name) for name in agents])
+        prior = np.append(claimed, np.full(len(self.evidence), _LOOP_PRIOR_SCALE))
+        dof = np.append(np.full(n, _PRIOR_DOF), np.full(len(self.evidence), _LOOP_PRIOR_DOF))
         prior_information = dof / np.where(linearised_at < _MAX_SCALE, linearised_at, prior) ** 2
         estimates = np.linalg.solve(F + np.diag(prior_information), q + prior_information * prior).clip(
             _MIN_SCALE, _MAX_SCALE
         )
-        self._loop_scales = dict(zip(self._evidence, estimates[n:].tolist(), strict=True))
+        self._loop_scales = dict(zip(self.evidence, estimates[n:].tolist(), strict=True))
         self._estimates = dict(zip(agents, estimates[:n].tolist(), strict=True))
-        for name in sorted({*agents, *self.scales, *self._claims.known_agents}):
-            self._update_scale(name, self._estimates.get(name, self._claims.min_scale(name)))
+        for name in sorted({*agents, *self.scales, *self.claims.known_agents}):
+            self._update_scale(name, self._estimates.get(name, self.claims.min_scale(name)))
 
     def _update_scale(self, name: str, estimate: float) -> None:
         previous = self.scales.get(name, 1.0)

@@ -145,7 +145,6 @@ class AgentIdentities:
         return self._identity_by_run.get(run, run)
 
     def name(self, run: str) -> str:
-        """Name of a run or of an identity."""
         identity = self.identity(run)
         return self._names.get(identity, identity)
 
@@ -168,14 +167,10 @@ class AgentIdentities:
         return [credentials | {identity: f"of {identity}" for identity in unknown}, *together]
 
     def newest_run(self, identity: str) -> str:
-        """Newest run of an identity."""
         return self._runs.get(identity, [identity])[-1]
 
     def had_quarantined_run(self, run: str, quarantined: Iterable[str]) -> bool:
         """Return whether another identity of the run's name was quarantined, or is in `quarantined`."""
-        return self.shares_name_with_any(run, quarantined) or self._suspect_names.get(self.name(run), False)
-
-    def shares_name_with_any(self, run: str, others: Iterable[str]) -> bool:
-        """Return whether one of `others` is another identity of the run's name."""
         identity, name = self.identity(run), self.name(run)
-        return any(other != identity and self._names.get(other) == name for other in others)
+        others = (other for other in quarantined if other != identity)
+        return any(self._names.get(other) == name for other in others) or self._suspect_names.get(name, False)

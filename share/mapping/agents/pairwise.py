@@ -84,7 +84,6 @@ class ScalarEstimate:
 
     @property
     def significance(self) -> float:
-        """Absolute value in sigmas."""
         return abs(self.value) / self.sigma
 
 
@@ -103,7 +102,6 @@ class OdometryComparison:
 
     @property
     def inlier_share(self) -> float:
-        """Share of the loops that fit."""
         return float((self.weights > _MIN_INLIER_WEIGHT).mean())
 
 

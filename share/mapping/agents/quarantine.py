@@ -14,8 +14,8 @@ import numpy as np
 from share.geometry import se3
 from share.mapping.agents.agent_pair import tilt_between
 from share.mapping.agents.agreement import AgentAgreement, AgentStanding
-from share.mapping.culling import RemovedKeyframe
 from share.mapping.graph.edges import PoseEdge
+from share.mapping.keyframe_removal import RemovedKeyframe
 from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision
 from share.mapping.loops import Loop
 from share.mapping.map_graph import MapGraph, rescale_translation
@@ -37,7 +37,7 @@ class QuarantineChange:
 
 
 class Quarantine:
-    """Quarantine in one graph. camera_views: by node id."""
+    """Quarantine in one graph. camera_views: by node id. withdrawn: loops that are kept for later."""
 
     def __init__(
         self,
@@ -48,11 +48,7 @@ class Quarantine:
     ) -> None:
         self.agreement = AgentAgreement(tolerance)
         self._graph, self._loop_acceptance, self._camera_views = graph, loop_acceptance, camera_views
-        self._withdrawn: list[Loop] = []
-
-    def add_run(self, run: str, name: str, credential: str | None = "") -> None:
-        """Register a run of the agent of this name."""
-        self.agreement.add_run(run, name, credential)
+        self.withdrawn: list[Loop] = []
 
     def remove_run(self, run: str) -> None:
         """Forget a run without keyframes that will not return."""
@@ -65,7 +61,7 @@ class Quarantine:
         odometry = self._graph.odometry
         agent = odometry.nodes[node_id].key.agent
         self.agreement.add_step(agent, node_id, odometry.previous_node(node_id), T_ref_body, cov)
-        self._apply_scales()
+        self.apply_scales()
 
     def add_loop(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
         """Compare the agents of a verified loop, and split maps of agents that no longer agree.
@@ -81,7 +77,7 @@ class Quarantine:
         before, unverified = self._separated(), self.agreement.identities.unverified
         unverified_before = len(unverified)
         changed = self.agreement.add_loop(agents, segments, edge, depth_scale, self._tilt(edge))
-        self._apply_scales()
+        self.apply_scales()
         if not changed and len(unverified) == unverified_before:
             return QuarantineChange()
         after = self._separated()
@@ -90,7 +86,7 @@ class Quarantine:
         )
         standings = {name: self.agreement.standing(name) for name in sorted(affected)}
         dropped = self._split_maps()
-        added, undone = self._reconsider_withdrawn()
+        added, undone = self.reconsider_withdrawn()
         return QuarantineChange(standings, (*dropped, *undone), added)
 
     def _separated(self) -> tuple[frozenset[str], frozenset[frozenset[str]]]:
@@ -100,7 +96,7 @@ class Quarantine:
         """Nodes of agents that must not share a map with this one."""
         odometry = self._graph.odometry
         segments = [odometry.segments[segment] for segment in sorted(odometry.live_segments)]
-        separated = {s.agent for s in segments if self.agreement.separation_reason([agent], [s.agent])}
+        separated = {s.agent for s in segments if self.agreement.are_separated(agent, s.agent)}
         return tuple(n for s in segments if s.agent in separated for n in s.nodes) if separated else ()
 
     def separation_reason(self, loop: Loop) -> str:
@@ -131,7 +127,7 @@ class Quarantine:
     def to_agent_scale(self, removed: RemovedKeyframe) -> RemovedKeyframe:
         """Convert a removal to the agent's own metres and covariances, in which odometry is stored."""
         link = removed.link
-        if link is None or link.reference is None:
+        if link is None or link.reference < 0:
             return removed
         T = rescale_translation(link.T_ref_body, -self._log_scale(removed.key.agent))
         cov = link.cov / self._graph.covariance_scales.get(removed.key.agent, 1.0)
@@ -140,7 +136,7 @@ class Quarantine:
     def _log_scale(self, agent: str) -> float:
         return self._graph.log_scales.get(agent, 0.0)
 
-    def _apply_scales(self) -> None:
+    def apply_scales(self) -> None:
         agreement, graph = self.agreement, self._graph
         for agent in sorted(
             {graph.odometry.segments[segment].agent for segment in graph.odometry.live_segments}
@@ -169,17 +165,16 @@ class Quarantine:
         """
         graph, segments = self._graph, self._graph.odometry.segments
         before = list(graph.reference_segments)
-        loops_between = [
-            n for n, loop in graph.edges.loops.items() if self._are_separated(loop.a.agent, loop.b.agent)
-        ]
+        are_separated, loops = self.agreement.are_separated, graph.edges.loops
+        loops_between = [n for n, loop in loops.items() if are_separated(loop.a.agent, loop.b.agent)]
         dropped = graph.drop_loops(loops_between) if loops_between else ()
         for a, b in itertools.combinations(sorted(graph.odometry.live_segments), 2):
-            if graph.reference_segments[a] == graph.reference_segments[b] and self._are_separated(
+            if graph.reference_segments[a] == graph.reference_segments[b] and self.agreement.are_separated(
                 segments[a].agent, segments[b].agent
             ):
                 dropped += self._loop_acceptance.split_segments(a, b)
         dropped += graph.drop_loops(self._weak_loops(before, {before[graph.segment(x.a)] for x in dropped}))
-        self._withdrawn = [*self._withdrawn, *dropped][-_MAX_WITHDRAWN:]
+        self.withdrawn = [*self.withdrawn, *dropped][-_MAX_WITHDRAWN:]
         return dropped
 
     def _weak_loops(self, reference_segments: Sequence[int], maps: Collection[int]) -> list[int]:
@@ -196,25 +191,22 @@ class Quarantine:
                 out.append(edge_id)
         return out
 
-    def _reconsider_withdrawn(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
+    def reconsider_withdrawn(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
         """Decide again on withdrawn loops that are no longer forbidden; return those added and those dropped.
 
         Others stay withdrawn while their keyframes exist.
         """
         odometry, decisions, still_withdrawn = self._graph.odometry, list[LoopDecision](), list[Loop]()
-        for loop in self._withdrawn:
+        for loop in self.withdrawn:
             if not (odometry.has_keyframe(loop.a) and odometry.has_keyframe(loop.b)):
                 continue
-            if self._are_separated(loop.a.agent, loop.b.agent) or self.separation_reason(loop):
+            if self.agreement.are_separated(loop.a.agent, loop.b.agent) or self.separation_reason(loop):
                 still_withdrawn.append(loop)
             else:
                 decisions.append(self._loop_acceptance.decide(loop))
-        self._withdrawn = still_withdrawn
+        self.withdrawn = still_withdrawn
         undone = tuple(x for d in decisions for x in d.dropped)
         return tuple(x for d in decisions for x in d.added if x not in undone), undone
-
-    def _are_separated(self, first: str, second: str) -> bool:
-        return bool(self.agreement.separation_reason([first], [second]))
 
     def _agents_in_map(self, reference_segment: int) -> set[str]:
         return {self._graph.odometry.segments[s].agent for s in self._graph.map_segments(reference_segment)}

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.graph.edges import EdgeArrays, PoseEdge
 from share.mapping.graph.gravity import gravity_equations
@@ -168,6 +167,8 @@ class CovariancePaths:
 # covariance: once found, the cost of their edges is raised and the next paths are added, until there are
 # enough edges.
 
+MAX_EDGES = 250  # surest edges used; more: tighter and slower
+_MAX_ROUNDS = 16  # of the search for shortest paths
 _MIN_WEIGHT = 1e-9  # of a loop, to divide by
 _UNKNOWN_COV = 1e6 * np.eye(6)
 
@@ -178,7 +179,6 @@ def relative_covariances(
     result: OptimisedPoses,
     anchor: int,
     wanted: I64,
-    config: GraphConfig,
 ) -> F64:
     """Covariances (K, 6, 6) of `wanted` (K,) of n poses relative to `anchor`, right perturbation.
 
@@ -191,7 +191,7 @@ def relative_covariances(
     if not len(not_anchor):
         return out
     weights = np.maximum(result.weights, _MIN_WEIGHT)
-    selected = _tightest_edges(n, edges, edges.cov_trace / weights, anchor, wanted[not_anchor], config)
+    selected = _tightest_edges(n, edges, edges.cov_trace / weights, anchor, wanted[not_anchor])
     poses = np.unique(np.concatenate([edges.a[selected], edges.b[selected]]))
     local_edges = edges[selected].with_ends(
         *(np.searchsorted(poses, end[selected]) for end in (edges.a, edges.b))
@@ -207,19 +207,17 @@ def relative_covariances(
     return out
 
 
-def _tightest_edges(
-    n: int, edges: EdgeArrays, cost: F64, anchor: int, wanted: I64, config: GraphConfig
-) -> I64:
+def _tightest_edges(n: int, edges: EdgeArrays, cost: F64, anchor: int, wanted: I64) -> I64:
     """Indices of the edges on the paths of least covariance from the anchor to the wanted poses."""
     used, path_cost = np.zeros(len(edges), bool), cost.copy()
-    for _ in range(config.covariance_rounds):
+    for _ in range(_MAX_ROUNDS):
         paths = ShortestPaths(n, edges.a, edges.b, path_cost)
         predecessors = paths.predecessors(anchor)
         visited = poses_on_paths(predecessors, wanted)
         path_edges = paths.cheapest_edges(predecessors[visited], visited)
         used[path_edges] = True
         path_cost[path_edges] += 2 * cost[path_edges]
-        if used.sum() >= config.covariance_edges:
+        if used.sum() >= MAX_EDGES:
             break
     return np.flatnonzero(used)
 

@@ -33,7 +33,6 @@ class PoseEdge:
         object.__setattr__(self, "cov", checked_array("cov", self.cov, (6, 6), np.float64))
 
     def reverse(self) -> PoseEdge:
-        """Return the edge from b to a."""
         return PoseEdge(self.b, self.a, se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov))
 
     @property

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.config import MergeConfig
 from share.geometry import se3
 from share.types import F64, Keyframe
 
+_FLOOR_DEG = 0.1  # added to sigma in quadrature: error of the IMU calibration
 
-def make_gravity_factor(config: MergeConfig, keyframe: Keyframe) -> F64:
+
+def make_gravity_factor(keyframe: Keyframe) -> F64:
     """Return a keyframe's factor (3,). Sigma has a floor: that of the calibration of camera and IMU."""
     norm = float(np.linalg.norm(keyframe.up))
-    sigma = np.hypot(keyframe.up_sigma, np.radians(config.gravity_floor_deg))
+    sigma = np.hypot(keyframe.up_sigma, np.radians(_FLOOR_DEG))
     return keyframe.up / (norm * sigma) if norm else np.zeros(3)
 
 

@@ -17,12 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.graph.edges import EdgeArrays, EdgeResiduals, jacobians, residuals
 from share.mapping.graph.gravity import gravity_cost, gravity_equations, tilt_projector
 from share.types import F64, I64
 
+MAX_ITERATIONS = 30  # the next solution continues from the result
+RELATIVE_TOLERANCE = 1e-6  # of the cost, between two iterations
+STEP_TOLERANCE = 3e-3  # rad and m; converged once no pose moves by more
+INNER_TOLERANCE = 3e-2  # relative residual of the linear system of a step
 _INITIAL_DAMPING = 1e-4
 _MAX_DAMPING = 1e8
 _MIN_CURVATURE = 0.5  # along a loop's residual, relative to that across; 0.3 overshot at times
@@ -46,40 +49,37 @@ class OptimisedPoses:
 
 
 def optimise(
-    poses: F64, gravity_factors: F64, edges: EdgeArrays, anchor_index: int, config: GraphConfig
+    poses: F64, gravity_factors: F64, edges: EdgeArrays, anchor_index: int, cauchy: float
 ) -> OptimisedPoses:
     """Optimise poses (N, 4, 4), in `chain_order`, with gravity factors (N, 3). Deterministic.
 
+    cauchy: whitened residual of a loop at which it begins to lose weight.
     The anchor stays, to the bit without gravity factors; with any, it tilts in place.
     """
     with np.errstate(all="ignore"):
-        return _levenberg_marquardt(poses, gravity_factors, edges, anchor_index, config)
+        return _levenberg_marquardt(poses, gravity_factors, edges, anchor_index, cauchy)
 
 
 def _levenberg_marquardt(
-    poses: F64, gravity_factors: F64, edges: EdgeArrays, anchor_index: int, config: GraphConfig
+    poses: F64, gravity_factors: F64, edges: EdgeArrays, anchor_index: int, cauchy: float
 ) -> OptimisedPoses:
     current, damping, iterations = residuals(poses, edges), 0.0, 0
     gauge_projector = tilt_projector(poses[anchor_index]) if gravity_factors.any() else np.zeros((6, 6))
 
     def cost_of(at: EdgeResiduals, poses: F64) -> float:
-        return _robust_cost(at, edges, config) + gravity_cost(poses, gravity_factors)
+        return _robust_cost(at, edges, cauchy) + gravity_cost(poses, gravity_factors)
 
     cost = cost_of(current, poses)
     if not np.isfinite(cost):
         reason = "the cost of the initial poses is not finite"
         return OptimisedPoses(
-            poses, gauge_projector, current, _cauchy_weights(current, edges, config), 0, reason
+            poses, gauge_projector, current, _cauchy_weights(current, edges, cauchy), 0, reason
         )
     equations = NormalEquations(len(poses), edges, anchor_index, gauge_projector)
-    while (
-        (len(edges) or gauge_projector.any())
-        and iterations < config.max_iterations
-        and damping <= _MAX_DAMPING
-    ):
+    while (len(edges) or gauge_projector.any()) and iterations < MAX_ITERATIONS and damping <= _MAX_DAMPING:
         iterations += 1
         step = _gauss_newton_step(
-            equations, current, edges, gravity_equations(poses, gravity_factors), damping, config
+            equations, current, edges, gravity_equations(poses, gravity_factors), damping, cauchy
         )
         trial_poses = poses @ se3.exp(step)
         trial = residuals(trial_poses, edges)
@@ -89,10 +89,10 @@ def _levenberg_marquardt(
             continue
         gain, cost, poses, current = cost - trial_cost, trial_cost, trial_poses, trial
         damping = damping / 10 if damping > _INITIAL_DAMPING else 0.0
-        if np.abs(step).max() < config.step_tolerance or gain <= config.relative_tolerance * cost:
+        if np.abs(step).max() < STEP_TOLERANCE or gain <= RELATIVE_TOLERANCE * cost:
             break
     return OptimisedPoses(
-        poses, gauge_projector, current, _cauchy_weights(current, edges, config), iterations
+        poses, gauge_projector, current, _cauchy_weights(current, edges, cauchy), iterations
     )
 
 
@@ -109,15 +109,15 @@ def _gauss_newton_step(
     edges: EdgeArrays,
     unary: tuple[F64, F64],
     damping: float,
-    config: GraphConfig,
+    cauchy: float,
 ) -> F64:
-    weights = _cauchy_weights(residuals_at, edges, config)
+    weights = _cauchy_weights(residuals_at, edges, cauchy)
     J, softness = weighted_jacobians(residuals_at, weights, edges), np.ones(len(edges))
     if not damping:
         J, softness = _triggs_correction(J, residuals_at, weights, edges)
     whitened = residuals_at.whitened * (np.sqrt(weights) / softness)[:, None]
     try:
-        return equations.solve_step(J, whitened, unary, damping, config.inner_tolerance)
+        return equations.solve_step(J, whitened, unary, damping, INNER_TOLERANCE)
     except np.linalg.LinAlgError:
         return np.full((len(equations), 6), np.nan)
 
@@ -139,13 +139,13 @@ def _triggs_correction(
     return (by_a, by_b), softness
 
 
-def _cauchy_weights(residuals_at: EdgeResiduals, edges: EdgeArrays, config: GraphConfig) -> F64:
+def _cauchy_weights(residuals_at: EdgeResiduals, edges: EdgeArrays, cauchy: float) -> F64:
     """Weights of the Cauchy kernel: 1 / (1 + chi2 / width^2) for loops, else 1."""
-    return np.where(edges.is_loop, 1 / (1 + residuals_at.chi2 / config.cauchy**2), 1.0)
+    return np.where(edges.is_loop, 1 / (1 + residuals_at.chi2 / cauchy**2), 1.0)
 
 
-def _robust_cost(residuals_at: EdgeResiduals, edges: EdgeArrays, config: GraphConfig) -> float:
-    width = config.cauchy**2
+def _robust_cost(residuals_at: EdgeResiduals, edges: EdgeArrays, cauchy: float) -> float:
+    width = cauchy**2
     return float(
         np.where(edges.is_loop, width * np.log1p(residuals_at.chi2 / width), residuals_at.chi2).sum()
     )

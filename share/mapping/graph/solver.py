@@ -5,17 +5,100 @@ Runs in one thread, without a clock. Cost: docs/understand/mapping.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from share.config import GraphConfig
 from share.mapping.graph.covariance import relative_covariances
-from share.mapping.graph.edges import EdgeArrays
+from share.mapping.graph.edges import EdgeArrays, PoseEdge
 from share.mapping.graph.optimiser import chain_order, optimise
-from share.mapping.graph.updates import GraphSolution, GraphUpdate
-from share.types import F64, I64
+from share.types import F64, I64, checked_array
+
+
+@dataclass(frozen=True, eq=False)
+class GraphUpdate:
+    """Changes of the graph, as arrays that can cross to another process. Removals apply first; a removed pose
+    takes its edges along.
+
+    pose_ids (N,), poses (N, 4, 4), gravity_factors (N, 3): new or moved poses. edge_ids (E,), ends (E, 2) as
+    (a, b), T_a_b (E, 4, 4), covs (E, 6, 6), right perturbation: new edges. is_loop (E,): under the robust
+    kernel. removed_edges, removed_poses: ids.
+    """
+
+    pose_ids: I64
+    poses: F64
+    gravity_factors: F64
+    edge_ids: I64
+    ends: I64
+    T_a_b: F64
+    covs: F64
+    is_loop: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    removed_edges: I64
+    removed_poses: I64
+
+    def __post_init__(self) -> None:
+        n, e = len(self.pose_ids), len(self.edge_ids)
+        shapes = {
+            "pose_ids": ((n,), np.int64),
+            "poses": ((n, 4, 4), np.float64),
+            "gravity_factors": ((n, 3), np.float64),
+            "edge_ids": ((e,), np.int64),
+            "ends": ((e, 2), np.int64),
+            "T_a_b": ((e, 4, 4), np.float64),
+            "covs": ((e, 6, 6), np.float64),
+            "is_loop": ((e,), np.bool_),
+            "removed_edges": ((None,), np.int64),
+            "removed_poses": ((None,), np.int64),
+        }
+        for name, (shape, dtype) in shapes.items():
+            object.__setattr__(self, name, checked_array(name, getattr(self, name), shape, dtype))
+
+    @staticmethod
+    def from_edges(
+        poses: Mapping[int, F64],
+        edges: Iterable[tuple[int, PoseEdge, bool]] = (),
+        removed_edges: Iterable[int] = (),
+        removed_poses: Iterable[int] = (),
+        gravity_factors: Mapping[int, F64] | None = None,
+    ) -> GraphUpdate:
+        """From poses by id and edges as (id, edge, is_loop). gravity_factors: by id, of some of the poses."""
+        edges, gravity_factors = list(edges), gravity_factors or {}
+        return GraphUpdate(
+            np.array(list(poses), np.int64),
+            np.array(list(poses.values()) or np.zeros((0, 4, 4)), np.float64),
+            np.array([gravity_factors.get(node_id, np.zeros(3)) for node_id in poses], np.float64).reshape(
+                -1, 3
+            ),
+            np.array([i for i, _, _ in edges], np.int64),
+            np.array([(edge.a, edge.b) for _, edge, _ in edges], np.int64).reshape(-1, 2),
+            np.array([edge.T_a_b for _, edge, _ in edges], np.float64).reshape(-1, 4, 4),
+            np.array([edge.cov for _, edge, _ in edges], np.float64).reshape(-1, 6, 6),
+            np.array([loop for _, _, loop in edges], np.bool_),
+            np.array(list(removed_edges), np.int64),
+            np.array(list(removed_poses), np.int64),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GraphSolution:
+    """Solution of one connected component.
+
+    pose_ids (N,), ascending, poses (N, 4, 4). covariances (K, 6, 6): of the wanted poses relative to the
+    anchor, right perturbation, upper bounds (`share.mapping.graph.covariance`). loop_ids (L,), loop_chi2
+    (L,): squared Mahalanobis residual. reason: why it is not solved; then poses are unchanged and there are
+    no covariances; empty if solved.
+    """
+
+    pose_ids: I64
+    poses: F64
+    covariances: F64
+    loop_ids: I64
+    loop_chi2: F64
+    iterations: int
+    reason: str = ""
 
 
 class PoseGraphSolver:
@@ -26,7 +109,6 @@ class PoseGraphSolver:
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
         empty = GraphUpdate.from_edges({})
         self._pose_ids = empty.pose_ids  # ascending
         self._poses, self._gravity_factors = empty.poses, empty.gravity_factors
@@ -63,7 +145,7 @@ class PoseGraphSolver:
         anchor_index = int(rank[np.searchsorted(pose_ids, anchor)])
         gravity_factors = self._gravity_factors[component][order]
         minimum = optimise(
-            self._poses[component][order], gravity_factors, ordered_edges, anchor_index, self._config
+            self._poses[component][order], gravity_factors, ordered_edges, anchor_index, self._config.cauchy
         )
         poses = minimum.poses[rank]
         if minimum.reason:
@@ -73,9 +155,7 @@ class PoseGraphSolver:
         return GraphSolution(
             pose_ids,
             poses,
-            relative_covariances(
-                ordered_edges, gravity_factors, minimum, anchor_index, rank[goals], self._config
-            ),
+            relative_covariances(ordered_edges, gravity_factors, minimum, anchor_index, rank[goals]),
             self._edge_ids[component_edges][edges.is_loop],
             minimum.residuals.chi2[edges.is_loop],
             minimum.iterations,

@@ -1,7 +1,7 @@
 """Place recognition: an inverted index over hashed ORB descriptors.
 
-Each of `tables` hash functions reads `bits` of a descriptor's 256: a word. Two descriptors that differ in d
-bits share a word with probability (1 - d/256)^bits, so the tables form a vocabulary that needs no training.
+Each of 8 hash functions reads 16 of a descriptor's 256 bits: a word. Two descriptors that differ in d bits
+share a word with probability (1 - d/256)^16, so the tables form a vocabulary that needs no training.
 Sources: bit-sampling locality-sensitive hashing, Indyk and Motwani, STOC 1998; tf-idf scoring, Sivic and
 Zisserman, ICCV 2003.
 
@@ -22,8 +22,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from share.types import F32, F64, I64, U8
+from share.geometry.camera import Rig
+from share.mapping.recognition.verification import CameraView
+from share.types import F32, F64, I64, U8, Keyframe
 
+TABLES = 8  # hash functions
+HASH_BITS = 16  # descriptor bits that form a word in each table
+SEED = 1  # of the choice of these bits
 _MAX_UNPAGED = 64  # keyframes compared one by one
 _MAX_DEAD_SHARE = 0.25  # removed keyframes of a page; beyond, it is rewritten
 _ENTRIES_PER_KEYFRAME = 64  # entries that a query reads, per stored keyframe
@@ -39,13 +44,12 @@ class PlaceCandidate(NamedTuple):
 
 
 class PlaceIndex:
-    """Index of keyframes by their descriptors. Ids are any distinct integers."""
+    """Index of keyframes by their descriptors. Ids are any distinct integers.
 
-    def __init__(self, seed: int, tables: int = 8, bits: int = 16) -> None:
-        if not (bits >= 1 and tables >= 1 and tables << bits <= MAX_WORDS):
-            raise ValueError(
-                f"tables {tables}, bits {bits}: need at least 1 each, and tables * 2^bits <= {MAX_WORDS}"
-            )
+    tables * 2^bits <= MAX_WORDS; seed: of the choice of each table's bits.
+    """
+
+    def __init__(self, seed: int = SEED, tables: int = TABLES, bits: int = HASH_BITS) -> None:
         rng = np.random.default_rng(seed)
         self._sampled_bits = np.stack([rng.choice(256, bits, replace=False) for _ in range(tables)])
         self._word_counts = np.zeros(tables << bits, np.int32)
@@ -57,13 +61,12 @@ class PlaceIndex:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the index, bytes."""
         arrays = [array for page in self._pages for array in (page.starts, page.slots)]
         return sum(array.nbytes for array in (*arrays, *self._unpaged.values(), self._word_counts))
 
     def add(self, id: int, descriptors: U8) -> None:
         """Add keyframe `id` with its descriptors (N, 32)."""
-        words = self._words(descriptors)
+        words = self.words(descriptors)
         np.add.at(self._word_counts, words, np.int32(1))  # another dtype is 30 times slower
         self._unpaged[id] = words
         if len(self._unpaged) == _MAX_UNPAGED:
@@ -105,7 +108,7 @@ class PlaceIndex:
 
     def _weight_words(self, descriptors: U8) -> tuple[I64, F64]:
         """Distinct words of the view within the budget of entries, and their weights."""
-        words, term_counts = np.unique(self._words(descriptors).astype(np.int64), return_counts=True)
+        words, term_counts = np.unique(self.words(descriptors).astype(np.int64), return_counts=True)
         word_counts = self._word_counts[words]
         rare_first = np.argsort(word_counts, kind="stable")
         n = len(self)
@@ -145,7 +148,7 @@ class PlaceIndex:
             )
         self._pages[first : first + len(old)] = [new] if len(new) else []
 
-    def _words(self, descriptors: U8) -> U32:
+    def words(self, descriptors: U8) -> U32:
         """Words (N * tables,) of descriptors (N, 32): table number and sampled bits in one integer."""
         tables, bits = self._sampled_bits.shape
         sampled = np.unpackbits(descriptors, axis=1)[:, self._sampled_bits].astype(np.float32)
@@ -154,6 +157,33 @@ class PlaceIndex:
             values.astype(np.uint32) + (np.arange(tables, dtype=np.uint32) << np.uint32(bits))
         ).ravel()
         return words
+
+
+class KeyframeViews:
+    """Views of keyframes by node id, and the index that finds similar ones."""
+
+    def __init__(self) -> None:
+        self.by_node: dict[int, CameraView] = {}
+        self.index = PlaceIndex()
+        self._restored: list[tuple[int, Keyframe, Rig]] = []
+
+    def add(self, node_id: int, keyframe: Keyframe, rig: Rig) -> None:
+        self.by_node[node_id] = CameraView(keyframe.view, rig.cam0.focal, rig.T_body_cam0, keyframe.up)
+        self.index.add(node_id, keyframe.view.descriptors)
+
+    def add_restored(self, node_id: int, keyframe: Keyframe, rig: Rig) -> None:
+        """Note a restored keyframe; it takes effect at `index_restored`, so that a restart is quick."""
+        self._restored.append((node_id, keyframe, rig))
+
+    def index_restored(self) -> None:
+        """Add the views of restored keyframes."""
+        for restored in self._restored:
+            self.add(*restored)
+        self._restored = []
+
+    def remove(self, node_id: int) -> None:
+        self.index.remove(node_id)
+        del self.by_node[node_id]
 
 
 U32 = NDArray[np.uint32]
@@ -194,7 +224,6 @@ class IndexPage:
         return starts[1:] - starts[:-1]
 
     def compact(self) -> IndexPage:
-        """Return the page without removed keyframes."""
         if self.is_alive.all():
             return self
         kept = self.is_alive[self.slots]

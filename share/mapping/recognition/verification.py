@@ -7,23 +7,44 @@ have to agree, and the result must not contradict gravity. A refusal says which 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.config import PlaceConfig
 from share.geometry import se3
 from share.geometry.absolute_pose import RansacOptions, absolute_pose
 from share.geometry.camera import rays
 from share.mapping.recognition.depth_scale import DepthScale, relative_depth_scale
-from share.mapping.recognition.guided import guided_pairs
-from share.mapping.recognition.refinement import KeypointNoise, refine_pose
+from share.mapping.recognition.refinement import KeypointNoise, refine_pose, transfer_keypoints
 from share.types import F64, View
 from share.vision.matching import DescriptorPairs, hamming_matrix, mutual_best, pairs_within
 
 _MIN_DEPTH_M, _MAX_DEPTH_M = 0.05, 1000.0  # other depths count as unknown
 
 
+MAX_BITS = 64  # largest Hamming distance of a match, of 256
+MIN_MATCHES = 20  # mutual nearest neighbours required before geometry is tried
+RANSAC_PX = 6.0  # reprojection error of a RANSAC inlier
+_RANSAC_ITERATIONS = 300  # at most, best matches first
+_REVERSE_ITERATIONS = 900  # the same, of the reverse direction, in random order
+_MIN_CONSENSUS = 8  # RANSAC inliers: 3-D points of one view in the other's image
+GUIDED_BITS = 80  # largest Hamming distance of a match found near its predicted position
+GUIDED_PX = 15.0  # largest distance from the predicted position of such a match
+_AGREE_DEPTH_RATIO = 0.05  # poses are equal if positions differ by less than this times the depth
+_AGREE_DEG = 2.5  # and their rotations by less than this
+_COMPETING_SHARE = 0.5  # another pose with more than this share of the inliers: refused
+SIGMA_PX = 1.5  # standard deviation of a keypoint
+SIGMA_INVERSE_DEPTH = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
+INLIER_CHI2 = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 degrees of freedom)
+MIN_DIRECTION_INLIERS = 10  # of `place.min_inliers`, with the query's depths and with the candidate's
+MAX_SIGMA_DEG = 0.5  # a pose with a larger standard deviation is refused
+MIN_SPREAD = 0.05  # narrow side (1 sigma) of the inliers, normalised coordinates
+GRAVITY_DEG = 6.0  # largest difference of the two gravity directions, where both are known
+# Added to the covariance: errors that many inliers do not average out (calibration, depth bias, rolling
+# shutter).
+_FLOOR_DEG = 0.1
+_FLOOR_M = 0.005
 MIN_RANSAC_ITERATIONS = 50  # per direction: a wrong place costs more than a millisecond
 RANSAC_CONFIDENCE = 0.99  # per direction; the two seldom fail alike
 
@@ -86,7 +107,7 @@ def verify(
     Deterministic for a given seed. Does not raise for any two valid views.
     """
     try:
-        return _verify_or_raise(query, candidate, config, seed)
+        return _verify_or_raise(query, candidate, config.min_inliers, seed)
     except _RefusedError as failed:
         return Refusal(str(failed))
     except np.linalg.LinAlgError:
@@ -115,42 +136,39 @@ class _PoseFit:
         return len(self.inliers_q)
 
 
-def _verify_or_raise(
-    query: CameraView, candidate: CameraView, config: PlaceConfig, seed: int
-) -> Verification:
+def _verify_or_raise(query: CameraView, candidate: CameraView, min_inliers: int, seed: int) -> Verification:
     y_q, y_c = query.keypoints, candidate.keypoints
     candidate_pairs = pairs_within(
-        hamming_matrix(query.view.descriptors, candidate.view.descriptors), config.guided_bits
+        hamming_matrix(query.view.descriptors, candidate.view.descriptors), GUIDED_BITS
     )
-    pairs = mutual_best(candidate_pairs.keep(candidate_pairs.bits <= config.max_distance_bits))
-    _require_count(len(pairs.rows), config.min_matches, "matches")
-    initial_poses = _two_way_poses(
-        y_q[pairs.rows], y_c[pairs.cols], query.focal, candidate.focal, config, seed
-    )
-    noises = _keypoint_noise(query, config), _keypoint_noise(candidate, config)
+    pairs = mutual_best(candidate_pairs.keep(candidate_pairs.bits <= MAX_BITS))
+    _require_count(len(pairs.rows), MIN_MATCHES, "matches")
+    initial_poses = _two_way_poses(y_q[pairs.rows], y_c[pairs.cols], query.focal, candidate.focal, seed)
+    noises = _keypoint_noise(query), _keypoint_noise(candidate)
     has_gravity = bool(query.up.any() and candidate.up.any())
     if not has_gravity and len(initial_poses) > 1:
         raise _RefusedError("the two directions give different poses, and gravity is unknown")
-    fit = _best_fit(_refine_poses(initial_poses, candidate_pairs, y_q, y_c, noises, config), config)
-    _require_count(fit.inliers, config.min_inliers, "inliers")
+    fit = _best_fit(_refine_poses(initial_poses, candidate_pairs, y_q, y_c, noises, min_inliers))
+    _require_count(fit.inliers, min_inliers, "inliers")
     for y, side in ((fit.inliers_q, "query"), (fit.inliers_c, "candidate")):
         known = int(np.isfinite(y[:, 2]).sum())
-        _require_count(known, config.min_direction_inliers, f"inliers with the {side}'s depth")
-        _check_spread(y, side, config)
-    _check_uncertainty(fit.cov, config.max_sigma_deg)
+        _require_count(known, MIN_DIRECTION_INLIERS, f"inliers with the {side}'s depth")
+        _check_spread(y, side)
+    _check_uncertainty(fit.cov)
     if has_gravity:
-        _check_gravity(fit.T, query, candidate, config)
+        _check_gravity(fit.T, query, candidate)
     T, cov = _between_bodies(fit.T, fit.cov, query.T_body_cam0, candidate.T_body_cam0)
-    depth_scale = _depth_scale(fit, noises, config, candidate.T_body_cam0)
-    return Verification(T, cov + _covariance_floor(config), fit.matches, fit.inliers, depth_scale)
+    cov = cov + np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_M**2] * 3)
+    depth_scale = _depth_scale(fit, noises, candidate.T_body_cam0)
+    return Verification(T, cov, fit.matches, fit.inliers, depth_scale)
 
 
 def _depth_scale(
-    fit: _PoseFit, noises: tuple[KeypointNoise, KeypointNoise], config: PlaceConfig, T_body_cam_c: F64
+    fit: _PoseFit, noises: tuple[KeypointNoise, KeypointNoise], T_body_cam_c: F64
 ) -> DepthScale | None:
     """Depth scale, or None where the matches do not determine it."""
     try:
-        depth_scale = relative_depth_scale(fit.T, *fit.guided_matches, *noises, config.inlier_chi2)
+        depth_scale = relative_depth_scale(fit.T, *fit.guided_matches, *noises, INLIER_CHI2)
     except np.linalg.LinAlgError:
         return None
     if depth_scale is None or depth_scale.pose_sensitivity is None:
@@ -158,8 +176,8 @@ def _depth_scale(
     return depth_scale._replace(pose_sensitivity=se3.adjoint(T_body_cam_c) @ depth_scale.pose_sensitivity)
 
 
-def _keypoint_noise(camera_view: CameraView, config: PlaceConfig) -> KeypointNoise:
-    return KeypointNoise(config.sigma_px / camera_view.focal, config.sigma_inverse_depth)
+def _keypoint_noise(camera_view: CameraView) -> KeypointNoise:
+    return KeypointNoise(SIGMA_PX / camera_view.focal, SIGMA_INVERSE_DEPTH)
 
 
 def _refine_poses(
@@ -168,38 +186,38 @@ def _refine_poses(
     y_q: F64,
     y_c: F64,
     noises: tuple[KeypointNoise, KeypointNoise],
-    config: PlaceConfig,
+    min_inliers: int,
 ) -> list[_PoseFit]:
     """Refine the initial poses, except those with too few matches to compete."""
-    radius = noises[0].uv / config.sigma_px * config.guided_px
+    radius = noises[0].uv / SIGMA_PX * GUIDED_PX
     matched = [
         (mutual_best(guided_pairs(candidate_pairs, initial_pose, y_q, y_c, radius)), initial_pose)
         for initial_pose in initial_poses
     ]
     matched.sort(key=lambda found: -len(found[0].rows))
-    _require_count(len(matched[0][0].rows), config.min_inliers, "matches near the projected points")
+    _require_count(len(matched[0][0].rows), min_inliers, "matches near the projected points")
     fits: list[_PoseFit] = []
     for pairs, initial_pose in matched:
-        if not fits or len(pairs.rows) > config.rival_share * max(fit.inliers for fit in fits):
-            fits.append(_refine_matches(initial_pose, y_q[pairs.rows], y_c[pairs.cols], noises, config))
+        if not fits or len(pairs.rows) > _COMPETING_SHARE * max(fit.inliers for fit in fits):
+            fits.append(_refine_matches(initial_pose, y_q[pairs.rows], y_c[pairs.cols], noises))
     return fits
 
 
 def _refine_matches(
-    initial_pose: F64, y_q: F64, y_c: F64, noises: tuple[KeypointNoise, KeypointNoise], config: PlaceConfig
+    initial_pose: F64, y_q: F64, y_c: F64, noises: tuple[KeypointNoise, KeypointNoise]
 ) -> _PoseFit:
     """Refine the pose by matched keypoints, and select the inliers."""
-    refined = refine_pose(initial_pose, y_q, y_c, *noises, config.inlier_chi2)
-    is_inlier = refined.d2 < config.inlier_chi2
+    refined = refine_pose(initial_pose, y_q, y_c, *noises, INLIER_CHI2)
+    is_inlier = refined.d2 < INLIER_CHI2
     return _PoseFit(refined.T, refined.cov, (y_q, y_c), y_q[is_inlier], y_c[is_inlier])
 
 
-def _best_fit(fits: list[_PoseFit], config: PlaceConfig) -> _PoseFit:
+def _best_fit(fits: list[_PoseFit]) -> _PoseFit:
     """Return the fit with most inliers. Raises if a different pose has nearly as many."""
     best, *others = sorted(fits, key=lambda fit: -fit.inliers)
     for other in others:
-        if other.inliers > config.rival_share * best.inliers and _poses_differ(
-            best.T, other.T, _median_depth(best.inliers_q, best.inliers_c), config
+        if other.inliers > _COMPETING_SHARE * best.inliers and _poses_differ(
+            best.T, other.T, _median_depth(best.inliers_q, best.inliers_c)
         ):
             raise _RefusedError(f"two poses fit: {best.inliers} and {other.inliers} inliers")
     return best
@@ -210,34 +228,30 @@ def _require_count(count: int, needed: int, what: str) -> None:
         raise _RefusedError(f"{count} {what} of {needed} needed")
 
 
-def _two_way_poses(
-    y_q: F64, y_c: F64, focal_q: float, focal_c: float, config: PlaceConfig, seed: int
-) -> list[F64]:
+def _two_way_poses(y_q: F64, y_c: F64, focal_q: float, focal_c: float, seed: int) -> list[F64]:
     """T_c_q by the query's points in the candidate's image and by the reverse; one pose if both agree.
 
     For a flat scene two poses look nearly alike (Schweighofer and Pinz, PAMI 2006). The two directions seldom
     choose the same wrong one if only one of them uses the order of the matches.
     """
-    forward = _absolute_pose(y_q, y_c, focal_c, "query's", config, seed, config.ransac_iterations, True)
-    iterations = config.reverse_iterations
-    backward = _absolute_pose(y_c, y_q, focal_q, "candidate's", config, seed, iterations, False)
+    forward = _absolute_pose(y_q, y_c, focal_c, "query's", seed, _RANSAC_ITERATIONS, True)
+    backward = _absolute_pose(y_c, y_q, focal_q, "candidate's", seed, _REVERSE_ITERATIONS, False)
     backward = se3.inverse(backward)
     depth = _median_depth(y_q, y_c)
-    return [forward, backward] if _poses_differ(forward, backward, depth, config) else [forward]
+    return [forward, backward] if _poses_differ(forward, backward, depth) else [forward]
 
 
 def _median_depth(y_q: F64, y_c: F64) -> float:
-    """Median depth, m."""
     rho = np.concatenate([y_q[:, 2], y_c[:, 2]])
     rho = rho[np.isfinite(rho)]
     return float(1 / np.partition(rho, len(rho) // 2)[len(rho) // 2])  # a quarter of np.nanmedian's time
 
 
-def _poses_differ(a: F64, b: F64, depth: float, config: PlaceConfig) -> bool:
+def _poses_differ(a: F64, b: F64, depth: float) -> bool:
     difference = se3.inverse(a) @ b
     metres = float(np.linalg.norm(difference[:3, 3]))
     degrees = float(np.degrees(se3.rotation_angle(difference)))
-    return metres > config.agree_depth_ratio * depth or degrees > config.agree_deg
+    return metres > _AGREE_DEPTH_RATIO * depth or degrees > _AGREE_DEG
 
 
 def _absolute_pose(
@@ -245,49 +259,46 @@ def _absolute_pose(
     target: F64,
     focal: float,
     side: str,
-    config: PlaceConfig,
     seed: int,
     iterations: int,
     best_first: bool,
 ) -> F64:
     """T_target_source from 3D points of the source and their projections in the target."""
     known = np.isfinite(source[:, 2])
-    _require_count(int(known.sum()), config.min_consensus, f"matches with the {side} depth")
+    _require_count(int(known.sum()), _MIN_CONSENSUS, f"matches with the {side} depth")
     y = source[known]
     points, observed = rays(y[:, :2]) / y[:, 2:], target[known, :2]
-    options = RansacOptions(
-        config.ransac_px, seed, MIN_RANSAC_ITERATIONS, iterations, best_first, RANSAC_CONFIDENCE
-    )
+    options = RansacOptions(RANSAC_PX, seed, MIN_RANSAC_ITERATIONS, iterations, best_first, RANSAC_CONFIDENCE)
     T, inliers = absolute_pose(points, observed, focal, options)
-    _require_count(int(inliers.sum()), config.min_consensus, f"inliers of the {side} points")
+    _require_count(int(inliers.sum()), _MIN_CONSENSUS, f"inliers of the {side} points")
     if not np.isfinite(T).all():
         raise _RefusedError(f"no pose from the {side} points")
     return T
 
 
-def _check_spread(y: F64, side: str, config: PlaceConfig) -> None:
+def _check_spread(y: F64, side: str) -> None:
     """Refuse inliers in one corner or on one line: they do not determine a pose."""
     centred = y[:, :2] - y[:, :2].mean(0)
     narrow_sigma = float(np.linalg.svd(centred, compute_uv=False)[-1] / np.sqrt(len(y) - 1))
-    if narrow_sigma < config.min_spread:
+    if narrow_sigma < MIN_SPREAD:
         raise _RefusedError(
-            f"inliers crowd in the {side} image: spread {narrow_sigma:.3f} of {config.min_spread} needed"
+            f"inliers crowd in the {side} image: spread {narrow_sigma:.3f} of {MIN_SPREAD} needed"
         )
 
 
-def _check_uncertainty(cov: F64, max_deg: float) -> None:
+def _check_uncertainty(cov: F64) -> None:
     """Refuse an uncertain pose; most wrong poses that pass the other checks fail here."""
     degrees = float(np.degrees(np.sqrt(np.trace(cov[:3, :3]))))
-    if degrees > max_deg:
-        raise _RefusedError(f"pose uncertain by {degrees:.2f}°, {max_deg:.2f}° allowed")
+    if degrees > MAX_SIGMA_DEG:
+        raise _RefusedError(f"pose uncertain by {degrees:.2f}°, {MAX_SIGMA_DEG:.2f}° allowed")
 
 
-def _check_gravity(T_c_q: F64, query: CameraView, candidate: CameraView, config: PlaceConfig) -> None:
+def _check_gravity(T_c_q: F64, query: CameraView, candidate: CameraView) -> None:
     up_q, up_c = (view.T_body_cam0[:3, :3].T @ view.up for view in (query, candidate))
     cosine = float((T_c_q[:3, :3] @ up_q) @ up_c / (np.linalg.norm(up_q) * np.linalg.norm(up_c)))
     degrees = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    if degrees > config.gravity_deg:
-        raise _RefusedError(f"gravity differs by {degrees:.1f}°, {config.gravity_deg:.1f}° allowed")
+    if degrees > GRAVITY_DEG:
+        raise _RefusedError(f"gravity differs by {degrees:.1f}°, {GRAVITY_DEG:.1f}° allowed")
 
 
 def _between_bodies(T_c_q: F64, cov: F64, T_body_cam_q: F64, T_body_cam_c: F64) -> tuple[F64, F64]:
@@ -296,6 +307,31 @@ def _between_bodies(T_c_q: F64, cov: F64, T_body_cam_q: F64, T_body_cam_c: F64) 
     return T_body_cam_c @ T_c_q @ se3.inverse(T_body_cam_q), Ad @ cov @ Ad.T
 
 
-def _covariance_floor(config: PlaceConfig) -> Any:
-    """Errors that many inliers do not average out: calibration, depth bias, rolling shutter."""
-    return np.diag([np.radians(config.floor_deg) ** 2] * 3 + [config.floor_m**2] * 3)
+# Guided matching: without a prediction a descriptor must be very similar to count as a match; near the
+# position that an initial pose predicts much less similarity is enough. Source: Hartley and Zisserman (2004),
+# section 4.7.1 and algorithm 11.4.
+
+
+def guided_pairs(pairs: DescriptorPairs, T_c_q: F64, y_q: F64, y_c: F64, radius: float) -> DescriptorPairs:
+    """Keep the pairs within `radius` (normalised coordinates) of where T_c_q (4, 4) projects them.
+
+    y_q (N, 3), y_c (K, 3): keypoints with inverse depth, NaN if unknown. Each keypoint with a depth is
+    projected; pairs without any depth are dropped.
+    """
+    query_in_candidate, candidate_in_query = _transfer(T_c_q, y_q), _transfer(se3.inverse(T_c_q), y_c)
+    for axis in (0, 1):  # one coordinate after the other: each leaves few pairs for the next
+        pairs = pairs.keep(_is_near(query_in_candidate[axis][pairs.rows], y_c[:, axis][pairs.cols], radius))
+        pairs = pairs.keep(_is_near(candidate_in_query[axis][pairs.cols], y_q[:, axis][pairs.rows], radius))
+    return pairs.keep(np.isfinite(y_q[pairs.rows, 2]) | np.isfinite(y_c[pairs.cols, 2]))
+
+
+def _transfer(T: F64, y: F64) -> F64:
+    """Projected keypoints (3, N): NaN where the depth is unknown, infinite behind the camera."""
+    out = transfer_keypoints(T, y.T)
+    out[:, np.isnan(out[2]) & np.isfinite(y[:, 2])] = np.inf
+    return out
+
+
+def _is_near(a: F64, b: F64, radius: float) -> NDArray[np.bool_]:
+    """Mask of values within `radius`; unknown ones (NaN) pass."""
+    return np.asarray(~(np.abs(a - b) > radius))

@@ -1,4 +1,4 @@
-"""Keyframes whose reference is lost are tied to what is left, and no surer than before."""
+"""Keyframes whose reference is lost are reconnected, and no more certain than before."""
 
 from dataclasses import replace
 
@@ -8,10 +8,10 @@ from helpers.map_changes import ANN, BOB, kept_keyframe, pose
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SaveLink
-from share.mapping.repair import repair_references
+from share.store.loading import repair_references
 
 
-def test_nothing_to_mend():
+def test_intact_keyframes_stay_unchanged():
     frames = [kept_keyframe(key, i) for i in range(4) for key in (ANN, BOB)]
     whole = repair_references(frames, {})
     assert (whole.keyframes, whole.links, whole.reconnected_count) == (tuple(frames), {}, 0)
@@ -27,7 +27,7 @@ def test_a_gap_is_bridged_by_odometry():
     assert whole.keyframes[3] is frames[3]
 
 
-def test_it_is_as_uncertain_as_the_lost_steps_and_its_own_together():
+def test_a_bridged_step_has_the_covariance_of_the_lost_steps():
     sent = kept_keyframe(ANN, 4)
     whole = repair_references([kept_keyframe(ANN, 1), sent], {}).keyframes[1].keyframe
     own = sent.keyframe
@@ -36,7 +36,7 @@ def test_it_is_as_uncertain_as_the_lost_steps_and_its_own_together():
     assert np.linalg.eigvalsh(whole.cov - own.cov)[0] > 0
 
 
-def test_with_nothing_before_it_a_keyframe_begins_its_stretch():
+def test_without_an_earlier_keyframe_one_begins_its_segment():
     frames = [kept_keyframe(ANN, 0), kept_keyframe(ANN, 7, stretch=1), kept_keyframe(BOB, 3)]
     whole = repair_references(frames, {})
     for found in whole.keyframes[1:]:
@@ -44,7 +44,7 @@ def test_with_nothing_before_it_a_keyframe_begins_its_stretch():
         assert np.array_equal(found.keyframe.T_ref_body, found.keyframe.T_odom_body)
 
 
-def test_a_link_is_mended_as_a_link():
+def test_a_link_is_repaired_as_a_link():
     """Its covariance is the graph's, not the agent's; the keyframe stays as it was sent."""
     link = SaveLink(KeyframeKey(ANN, 4), 2, pose(2), np.eye(6))
     gone = replace(link, key=KeyframeKey(ANN, 9))

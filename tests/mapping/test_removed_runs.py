@@ -1,4 +1,4 @@
-"""Runs of one name without end: the map, its file and the edge stay bounded, and others keep theirs."""
+"""With any number of runs of a name the map, its file and the edge stay bounded."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from helpers.hellos import hello_of
 
 from share.config import Config
@@ -32,8 +33,8 @@ def at(x: float) -> F64:
     return se3.from_rt(np.eye(3), np.array([x, 0.0, 0.0]))
 
 
-class Life:
-    """An edge, its mapper, and the map's file; lossless: whether changes are kept."""
+class Session:
+    """An edge, its mapper, and the map's file."""
 
     def __init__(self, store: MapStore, session: int = 7) -> None:
         kept = store.load()
@@ -69,7 +70,7 @@ class Life:
         self.handle(ed.PeerMessageReceived(m.peer_id(run_id), [bytes(f) for f in encode(message)]))
 
     def run(self, name: str, run_id: int, count: int, stays: bool = False) -> None:
-        """A run with so many keyframes, 1 m apart; then it leaves."""
+        """A run with `count` keyframes, 1 m apart, which leaves unless it `stays`."""
         self.tell(run_id, hello_of(name, run_id))
         for k in range(count):
             step = at(k) if k == 0 else at(1.0)
@@ -85,107 +86,108 @@ class Life:
         return Counter(key.agent.partition("-")[0] for key in self.mapper.current_poses().keys)
 
 
-def crowded(store: MapStore, runs: int = 30) -> Life:
-    """ann with 30 keyframes, and one small run of eve after the other."""
-    life = Life(store)
-    life.run("ann", 1, 30, stays=True)
+def crowded(store: MapStore, runs: int = 30) -> Session:
+    """30 keyframes of ann, and small runs of eve, one after the other."""
+    session = Session(store)
+    session.run("ann", 1, 30, stays=True)
     for k in range(runs):
-        life.run("eve", 100 + k, 8)
-    return life
+        session.run("eve", 100 + k, 8)
+    return session
 
 
-def test_runs_without_end_take_nothing_of_anothers_and_leave_nothing(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_any_number_of_runs_take_no_keyframe_of_others_and_leave_nothing(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = crowded(store)
-        report = life.edge.report(life.mapper.report())
-        assert life.held()["ann"] == 30
-        assert len(life.mapper.current_poses().keys) <= 1.05 * MOST
-        assert len(report["agents"]) == len(life.mapper.report()["agents"]) <= 6
+        session = crowded(store)
+        report = session.edge.report(session.mapper.report())
+        assert session.held()["ann"] == 30
+        assert len(session.mapper.current_poses().keys) <= 1.05 * MOST
+        assert len(report["agents"]) == len(session.mapper.report()["agents"]) <= 6
         assert report["forgotten_runs"] + len(report["agents"]) == 31
-        assert report["maps"].keys() == {f"{run}/0" for run in life.mapper.report()["agents"]}
+        assert report["maps"].keys() == {f"{run}/0" for run in session.mapper.report()["agents"]}
         kept = store.load()
-    assert {run.run_key for run in kept.runs} == life.mapper.report()["agents"].keys()
-    assert {k.keyframe_key for k in kept.keyframes} == set(life.mapper.current_poses().keys)
+    assert {run.run_key for run in kept.runs} == session.mapper.report()["agents"].keys()
+    assert {k.keyframe_key for k in kept.keyframes} == set(session.mapper.current_poses().keys)
     assert {name.rpartition("/")[0] for name in kept.segments} == {run.run_key for run in kept.runs}
     assert kept.problems == ()
 
 
-def test_the_map_that_is_left_is_found_again(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_the_remaining_map_is_restored(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = crowded(store)
+        session = crowded(store)
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        second = Life(store, session=8)
-        assert second.mapper.report()["maps"] == life.mapper.report()["maps"]
+        second = Session(store, session=8)
+        assert second.mapper.report()["maps"] == session.mapper.report()["maps"]
         for k in range(10):
             second.run("eve", 300 + k, 8)
         assert second.held()["ann"] == 30
         assert len(second.mapper.current_poses().keys) <= 1.05 * MOST
 
 
-def test_a_run_that_was_forgotten_and_comes_back_is_told_to_start_again(tmp_path: Path) -> None:
+def test_a_removed_run_that_returns_is_refused_with_the_remedy(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = crowded(store)
-        life.tell(100, hello_of("eve", 100))
-        refused = life.sent[-1]
+        session = crowded(store)
+        session.tell(100, hello_of("eve", 100))
+        refused = session.sent[-1]
         assert isinstance(refused, m.Refused)
         assert "start the agent again" in refused.reason
-        life.now_ns += 100 * S
-        life.tell(999, hello_of("eve", 999))
-        assert isinstance(life.sent[-1], m.Welcome)
+        session.now_ns += 100 * S
+        session.tell(999, hello_of("eve", 999))
+        assert isinstance(session.sent[-1], m.Welcome)
 
 
-def test_a_run_that_comes_back_before_it_is_forgotten_goes_on(tmp_path: Path) -> None:
-    """What the mapper said of it is of before."""
+def test_a_run_that_returns_before_it_is_removed_continues(tmp_path: Path) -> None:
+    """A report of the mapper from before its return has no effect."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = crowded(store, runs=6)
-        gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
+        session = crowded(store, runs=6)
+        gone = next(run for run in session.mapper.report()["agents"] if run.startswith("eve"))
         step = Keyframe(8, 7, 8 * S, at(1.0), 1e-6 * np.eye(6), at(8), np.zeros(3), 0.0, EMPTY, 7)
         number = next(k for k in range(6) if f"-{m.public_tag(100 + k)[:4]}" in gone)
-        life.tell(100 + number, hello_of("eve", 100 + number))
-        life.tell(100 + number, step)
-        life.handle(ed.MapperResult((), (), (ed.KeyframeKey(gone, 7),)))
-        life.tell(100 + number, m.Bye())
-        life.handle(ed.EdgeTick())
-        assert gone in life.mapper.report()["agents"]
+        session.tell(100 + number, hello_of("eve", 100 + number))
+        session.tell(100 + number, step)
+        session.handle(ed.MapperResult((), (), (ed.KeyframeKey(gone, 7),)))
+        session.tell(100 + number, m.Bye())
+        session.handle(ed.EdgeTick())
+        assert gone in session.mapper.report()["agents"]
 
 
-def test_a_run_that_comes_back_to_less_is_tied_to_what_is_left_in_the_file_too(tmp_path: Path) -> None:
+def test_a_run_that_returns_is_reconnected_in_the_file_too(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = Life(store)
+        session = Session(store)
         for name, run_id, count in (("ann", 1, 2), ("eve", 100, 20), ("eve", 101, 1)):
-            life.run(name, run_id, count, stays=name == "ann")
-        atlas = life.mapper._atlas
-        key = next(key.agent for key in atlas.all_poses()[0] if key.id == 19)
-        life.mapper._to_remove = [
-            n for n in atlas._graph.poses if atlas.key(n) in {(key, k) for k in range(8, 20)}
-        ]
-        while life.mapper._to_remove:
-            life.mapper._cull_keyframes()
-        life.handle(ed.EdgeTick())
-        life.tell(100, hello_of("eve", 100))
-        life.tell(
+            session.run(name, run_id, count, stays=name == "ann")
+        atlas = session.mapper.atlas
+        key = next(key.agent for key in atlas.all_poses().keys if key.id == 19)
+        newer = {(key, k) for k in range(8, 20)}
+        session.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n) in newer])
+        session.handle(ed.EdgeTick())
+        session.tell(100, hello_of("eve", 100))
+        session.tell(
             100, Keyframe(20, 19, 20 * S, at(1.0), 1e-6 * np.eye(6), at(20), np.zeros(3), 0.0, EMPTY, 19)
         )
         kept = store.load()
         link = kept.links[ed.KeyframeKey(key, 20)]
         assert (link.reference, link.T_ref_body[0, 3]) == (7, 13.0)
-        second = Life(store, session=8)
-        assert np.allclose(second.mapper.current_poses().T_map_body, life.mapper.current_poses().T_map_body)
+        second = Session(store, session=8)
+        assert np.allclose(
+            second.mapper.current_poses().T_map_body, session.mapper.current_poses().T_map_body
+        )
         covs = [
-            one._atlas._graph.odometry_edge(*one._atlas._graph.odometry.segments[1].nodes[-2:]).cov
-            for one in (life.mapper, second.mapper)
+            one.atlas.graph.odometry_edge(*one.atlas.graph.odometry.segments[1].nodes[-2:]).cov
+            for one in (session.mapper, second.mapper)
         ]
         assert np.allclose(covs[0], covs[1])
 
 
-def test_a_crash_before_a_run_is_forgotten_is_made_up_for(tmp_path: Path) -> None:
-    """Its keyframes went from the file, and the run itself did not."""
+def test_a_run_is_removed_after_a_crash_before_its_removal(tmp_path: Path) -> None:
+    """Its keyframes were removed from the file, the run itself was not."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = crowded(store, runs=2)
-        gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
+        session = crowded(store, runs=2)
+        gone = next(run for run in session.mapper.report()["agents"] if run.startswith("eve"))
         keys = tuple(k.keyframe_key for k in store.load().keyframes if k.run_key == gone)
         store.write([RemoveKeyframes(keys)])
-        second = Life(store, session=8)
+        second = Session(store, session=8)
         assert gone in second.mapper.report()["agents"]
         second.handle(ed.EdgeTick())
         assert gone not in second.mapper.report()["agents"]
@@ -194,123 +196,121 @@ def test_a_crash_before_a_run_is_forgotten_is_made_up_for(tmp_path: Path) -> Non
         assert len(store.load().runs) == 2
 
 
-def test_a_run_that_such_a_crash_left_begins_anew(tmp_path: Path) -> None:
-    """Its agent is the first to be heard. What it sends is in the file, though its numbers were there."""
+def test_a_run_left_by_such_a_crash_begins_a_new_segment(tmp_path: Path) -> None:
+    """Its agent connects first. Its keyframes are stored, though their ids were used."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = crowded(store, runs=1)
-        gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
+        session = crowded(store, runs=1)
+        gone = next(run for run in session.mapper.report()["agents"] if run.startswith("eve"))
         store.write(
             [RemoveKeyframes(tuple(k.keyframe_key for k in store.load().keyframes if k.run_key == gone))]
         )
-        second = Life(store, session=8)
+        second = Session(store, session=8)
         second.run("eve", 100, 3)
         assert second.sent[0] == m.Welcome(8, 0)
         assert [k.keyframe_key.id for k in store.load().keyframes if k.run_key == gone] == [0, 1, 2]
 
 
-def test_runs_that_never_sent_a_keyframe_leave_the_mapper_too(tmp_path: Path) -> None:
+def test_runs_without_a_keyframe_are_removed_from_the_mapper(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = Life(store)
-        life.run("ann", 1, 2, stays=True)
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
         for k in range(300):
-            life.run(f"n{k}", 1000 + k, 0)
-        assert len(life.mapper.report()["agents"]) <= 258
+            session.run(f"n{k}", 1000 + k, 0)
+        assert len(session.mapper.report()["agents"]) <= 258
 
 
-def test_a_restored_run_that_is_emptied_is_forgotten_in_this_life(tmp_path: Path) -> None:
+def test_a_restored_run_without_keyframes_is_removed(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = Life(store)
-        life.run("ann", 1, 30, stays=True)
-        life.run("eve", 100, 5)
-        life.run("eve", 101, 3)
-        life = Life(store, session=8)
+        session = Session(store)
+        session.run("ann", 1, 30, stays=True)
+        session.run("eve", 100, 5)
+        session.run("eve", 101, 3)
+        session = Session(store, session=8)
         for k in range(12):
-            life.run("eve", 300 + k, 8)
-        report = life.edge.report(life.mapper.report())
-        held = {key.agent for key in life.mapper.current_poses().keys}
+            session.run("eve", 300 + k, 8)
+        report = session.edge.report(session.mapper.report())
+        held = {key.agent for key in session.mapper.current_poses().keys}
         kept = store.load()
     assert {run.run_key for run in kept.runs} == {agent["run"] for agent in report["agents"].values()}
     assert {run.run_key for run in kept.runs} - held <= {f"ann-{m.public_tag(1)[:4]}"}
 
 
-def emptied(life: Life, run_id: int) -> None:
-    """All keyframes of a run of eve are taken out."""
-    atlas, run = life.mapper._atlas, f"eve-{m.public_tag(run_id)[:4]}"
-    life.mapper._to_remove = [n for n in atlas._graph.poses if atlas.key(n).agent == run]
-    while life.mapper._to_remove:
-        life.mapper._cull_keyframes()
+def emptied(session: Session, run_id: int) -> None:
+    """Remove all keyframes of a run of eve."""
+    atlas, run = session.mapper.atlas, f"eve-{m.public_tag(run_id)[:4]}"
+    session.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n).agent == run])
     for _ in range(2):
-        life.handle(ed.EdgeTick())
+        session.handle(ed.EdgeTick())
 
 
-def test_a_run_that_came_back_is_its_names_present_one_and_stays_so(tmp_path: Path) -> None:
-    """When the later run of the name is forgotten: the edge ended (KeyError)."""
+def test_a_run_that_returned_stays_the_current_one_of_its_name(tmp_path: Path) -> None:
+    """Also when the later run of the name is removed: the edge ended with a KeyError."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = Life(store)
-        life.run("ann", 1, 30, stays=True)
-        life.run("eve", 100, 5)
-        life.run("eve", 101, 3)
-        life.tell(100, hello_of("eve", 100))
-        emptied(life, 101)
-        report = life.edge.report(life.mapper.report())
+        session = Session(store)
+        session.run("ann", 1, 30, stays=True)
+        session.run("eve", 100, 5)
+        session.run("eve", 101, 3)
+        session.tell(100, hello_of("eve", 100))
+        emptied(session, 101)
+        report = session.edge.report(session.mapper.report())
     assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
     assert report["forgotten_runs"] == 1
 
 
-def test_of_a_name_whose_newest_run_is_forgotten_the_one_before_it_is_shown(tmp_path: Path) -> None:
+def test_the_report_shows_the_run_before_a_removed_one(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = Life(store)
-        life.run("ann", 1, 30, stays=True)
-        life.run("eve", 100, 5)
-        life.tell(101, hello_of("eve", 101))
+        session = Session(store)
+        session.run("ann", 1, 30, stays=True)
+        session.run("eve", 100, 5)
+        session.tell(101, hello_of("eve", 101))
         for k in range(256):  # which have no keyframe either, so the oldest of all is forgotten
-            life.tell(1000 + k, hello_of(f"n{k}", 1000 + k))
-            life.tell(1000 + k, m.Bye())
-            life.now_ns += 10 * S
-            life.tell(1, m.Ping(0, 0))
-            life.handle(ed.EdgeTick())
-        report = life.edge.report(life.mapper.report())
+            session.tell(1000 + k, hello_of(f"n{k}", 1000 + k))
+            session.tell(1000 + k, m.Bye())
+            session.now_ns += 10 * S
+            session.tell(1, m.Ping(0, 0))
+            session.handle(ed.EdgeTick())
+        report = session.edge.report(session.mapper.report())
     assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
 
 
-def test_a_run_is_forgotten_only_with_the_last_of_its_stretches(tmp_path: Path) -> None:
-    """Two stretches, of 9 and 3 keyframes, of which the newer goes first."""
+def test_a_run_is_removed_only_with_its_last_segment(tmp_path: Path) -> None:
+    """Two segments, of 9 and 3 keyframes; the newer is removed first."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = Life(store)
-        life.run("ann", 1, 2, stays=True)
-        life.tell(100, hello_of("eve", 100))
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.tell(100, hello_of("eve", 100))
         for k in range(12):
             before, T = (-1, at(k)) if k in (0, 9) else (k - 1, at(1.0))
             own = Keyframe(k, before, k * S, T, 1e-6 * np.eye(6), at(k), np.zeros(3), 0.0, EMPTY, k - 1)
-            life.tell(100, own)
-        life.tell(100, m.Bye())
-        life.run("eve", 101, 2)
-        gone = next(key.agent for key in life.mapper.current_poses().keys if key.id == 11)
+            session.tell(100, own)
+        session.tell(100, m.Bye())
+        session.run("eve", 101, 2)
+        gone = next(key.agent for key in session.mapper.current_poses().keys if key.id == 11)
 
         def leave(ids: range) -> None:
-            keys, atlas = {(gone, k) for k in ids}, life.mapper._atlas
-            life.mapper._to_remove = [n for n in life.mapper._camera_views if atlas.key(n) in keys]
-            while life.mapper._to_remove:
-                life.mapper._cull_keyframes()
-            life.handle(ed.EdgeTick())
-            life.handle(ed.EdgeTick())
+            keys, atlas = {(gone, k) for k in ids}, session.mapper.atlas
+            session.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n) in keys])
+            session.handle(ed.EdgeTick())
+            session.handle(ed.EdgeTick())
 
         leave(range(9, 12))
         assert {k.keyframe_key.id for k in store.load().keyframes if k.run_key == gone} == set(range(9))
-        assert gone in life.mapper.report()["agents"]
+        assert gone in session.mapper.report()["agents"]
         leave(range(9))
-        assert gone not in {run.run_key for run in store.load().runs} | life.mapper.report()["agents"].keys()
+        assert (
+            gone not in {run.run_key for run in store.load().runs} | session.mapper.report()["agents"].keys()
+        )
 
 
-def test_a_run_that_comes_back_to_nothing_hears_that_it_is_in_a_map_of_its_own(tmp_path: Path) -> None:
-    """It was in ann's; all its keyframes were taken out while it was away."""
+def test_a_run_that_returns_without_keyframes_is_sent_a_map_of_its_own(tmp_path: Path) -> None:
+    """It was in ann's map; all its keyframes were removed while it was absent."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        life = Life(store)
-        life.run("ann", 1, 20, stays=True)
-        life.run("eve", 100, 5)
-        atlas, mapper = life.mapper._atlas, life.mapper
+        session = Session(store)
+        session.run("ann", 1, 20, stays=True)
+        session.run("eve", 100, 5)
+        atlas, mapper = session.mapper.atlas, session.mapper
         ann, eve = sorted({key.agent for key in mapper.current_poses().keys})
-        atlas._graph.add_loop(Loop(KeyframeKey(ann, 3), KeyframeKey(eve, 3), np.eye(4), 1e-4 * np.eye(6), 50))
+        atlas.graph.add_loop(Loop(KeyframeKey(ann, 3), KeyframeKey(eve, 3), np.eye(4), 1e-4 * np.eye(6), 50))
         assert atlas.current_map_id(eve) == f"{ann}/0"
         atlas.remove_keyframes([n for n in range(len(atlas)) if atlas.key(n).agent == eve])
         mapper.set_present(eve, True)

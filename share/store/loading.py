@@ -1,0 +1,246 @@
+"""Loading of a map file: check that it is one and intact, salvage a damaged one, and decode its rows.
+
+Each kind of loss costs a line in `StoredMap.problems`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from share.errors import StoreError, UsageError, WireError
+from share.mapping.keyframe_removal import reconnect
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import SaveLink, SavePoses, StoredKeyframe, StoredMap, odometry_link
+from share.store import database, rows, schema
+from share.store.database import DamageError, translate_errors
+from share.store.rows import Row
+from share.store.salvage import (
+    ReadRows,
+    finish_salvage,
+    merge_run_copies,
+    read_damaged,
+    read_intact_rows,
+    salvage,
+)
+from share.types import Keyframe
+
+_RECONNECTED = "keyframes lost their predecessor and are linked to an earlier one"
+_ABOUT_LOST = "rows about the file and the credentials of runs could not be read"
+_SOLUTIONS_LOST = "solutions could not be read: keyframes are placed by odometry and loops"
+
+
+def load_and_repair(path: Path) -> StoredMap:
+    """Read a whole map file before it is opened for writing; salvage it if needed."""
+    finish_salvage(path)
+    if not database.check_is_map(path):
+        return StoredMap()
+    try:
+        return _load_intact(path)
+    except DamageError:
+        salvaged, renamed = salvage(path)
+        return _with_complaint(
+            decode_map(salvaged),
+            f"the file was damaged; it is kept as {renamed.name}, and its intact rows were taken over",
+        )
+
+
+def load_read_only(path: Path) -> StoredMap:
+    """Read a whole map file without changing it."""
+    if not database.check_is_map(path):
+        raise UsageError(f"{path}: contains no map")
+    try:
+        return _load_intact(path)
+    except DamageError:
+        salvaged = decode_map(merge_run_copies(read_damaged(path)))
+        return _with_complaint(salvaged, "the file is damaged; only intact rows were read")
+
+
+def open_writer(path: Path, durable: bool) -> sqlite3.Connection:
+    """Open the writer's connection to a file that `load_and_repair` has checked; create missing tables."""
+    with translate_errors(path, "opened"):
+        connection = database.open_for_writing(path, durable)
+        if schema.is_empty(connection):
+            connection.execute("BEGIN IMMEDIATE")
+            schema.create(connection)
+            connection.execute("COMMIT")
+    return connection
+
+
+def _check_schema(path: Path) -> None:
+    """Raises UsageError for another schema, DamageError if its number is unreadable."""
+    with translate_errors(path, "opened"), contextlib.closing(database.open_for_reading(path)) as connection:
+        if schema.is_empty(connection) and database.is_blank(path):
+            return
+        version = schema.read_version(connection)
+    if version is None:
+        raise DamageError(f"{path}: the map is damaged: its schema number is unreadable")
+    if version != schema.SCHEMA:
+        age = "a newer" if version > schema.SCHEMA else "an older"
+        raise UsageError(
+            f"{path}: was made by {age} SHARE (schema {version}, this one reads {schema.SCHEMA}); "
+            "use that SHARE, or give another file"
+        )
+
+
+def _load_intact(path: Path) -> StoredMap:
+    """Read the map. Raises DamageError if any part is damaged, UsageError for another schema."""
+    _check_schema(path)
+    database.check_header(path)
+    with translate_errors(path, "read"), contextlib.closing(database.open_for_reading(path)) as connection:
+        if schema.is_empty(connection):
+            return StoredMap()
+        if not schema.matches_schema(connection):
+            raise DamageError(f"{path}: the map is damaged: its tables")
+        (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+        if verdict != "ok":
+            raise DamageError(f"{path}: the map is damaged: {verdict}")
+        read_rows = read_intact_rows(connection)
+    if read_rows.is_damaged:
+        raise DamageError(f"{path}: the map is damaged: its rows")
+    return decode_map(read_rows)
+
+
+def _with_complaint(loaded: StoredMap, complaint: str) -> StoredMap:
+    nothing_lost = () if loaded.problems else ("nothing is lost",)
+    return replace(loaded, problems=(complaint, *loaded.problems, *nothing_lost))
+
+
+# ---- Rows to values
+
+
+def decode_map(read_rows: ReadRows) -> StoredMap:
+    """Decode `read_rows` and empty it. Raises StoreError for another wire version."""
+    next_ids = {key: next for _, (key, next, *_) in read_rows.tables["run"]}
+    all_runs, lost_runs = _decode_rows(read_rows, "run", rows.read_run)
+    credentials = rows.read_credentials(read_rows.tables["about"])
+    runs = {run.run_key: replace(run, credential=credentials.get(run.run_key, "")) for run in all_runs}
+    keyframes, lost_keyframes = _decode_rows(read_rows, "keyframe", rows.read_keyframe)
+    orphans = [k for k in keyframes if k.run_key not in runs]
+    links, lost_links = _decode_rows(read_rows, "link", rows.read_link)
+    loops, lost_loops = _decode_rows(read_rows, "loop", rows.read_loop)
+    poses, lost_poses = _decode_rows(read_rows, "poses", rows.read_poses)
+    repaired = repair_references(
+        [k for k in keyframes if k.run_key in runs], {link.key: link for link in links}
+    )
+    known_keys = {k.keyframe_key for k in repaired.keyframes}
+    connected_loops = tuple(loop for loop in loops if loop.a in known_keys and loop.b in known_keys)
+    complaints = [
+        _loss_line(read_rows, "about", read_rows.lost_counts["about"], _ABOUT_LOST),
+        _loss_line(read_rows, "run", lost_runs, "agent runs could not be read"),
+        _loss_line(read_rows, "keyframe", lost_keyframes, "keyframes could not be read"),
+        _loss_line(read_rows, "", len(orphans), "keyframes belong to a run that could not be read"),
+        _loss_line(read_rows, "", repaired.reconnected_count if read_rows.is_damaged else 0, _RECONNECTED),
+        _loss_line(read_rows, "link", lost_links, "odometry edges could not be read"),
+        _loss_line(read_rows, "loop", lost_loops, "loops could not be read"),
+        _loss_line(read_rows, "", len(loops) - len(connected_loops), "loops led to lost keyframes"),
+        _loss_line(read_rows, "stretch", read_rows.lost_counts["stretch"], "segments could not be read"),
+        _loss_line(read_rows, "poses", lost_poses, _SOLUTIONS_LOST),
+    ]
+    return StoredMap(
+        tuple(runs.values()),
+        _segment_names(read_rows, repaired.keyframes),
+        repaired.keyframes,
+        repaired.links,
+        connected_loops,
+        _present_poses(poses[0], known_keys) if poses else None,
+        _next_ids(next_ids, repaired.keyframes),
+        tuple(line for line in complaints if line),
+    )
+
+
+def _loss_line(read_rows: ReadRows, table: str, lost_count: int, what: str) -> str:
+    """Return one line, "" if nothing is lost."""
+    if table in read_rows.uncounted:
+        return f"an unknown number of {what}"
+    return f"{lost_count} {what}" if lost_count else ""
+
+
+def _decode_rows(read_rows: ReadRows, table: str, decode: Callable[[Row], Any]) -> tuple[list[Any], int]:
+    """Return the values of a table's rows and the number of lost ones. Removes the rows, to save memory."""
+    out, lost_count, numbered = [], read_rows.lost_counts[table], read_rows.tables[table]
+    version_error: StoreError | None = None
+    numbered.reverse()
+    while numbered:
+        _, row = numbered.pop()
+        try:
+            out.append(decode(row))
+        except (ValueError, WireError):  # an invalid value with a correct CRC
+            lost_count += 1
+        except StoreError as error:  # another wire version; fatal only if no row can be decoded
+            version_error = error
+            lost_count += 1
+    if version_error is not None and not out:
+        raise version_error
+    return out, lost_count
+
+
+def _segment_names(read_rows: ReadRows, keyframes: Sequence[StoredKeyframe]) -> tuple[str, ...]:
+    named = [rows.segment_name(*row) for _, row in read_rows.tables["stretch"]]
+    return tuple(dict.fromkeys((*named, *(k.segment_name for k in keyframes))))
+
+
+def _next_ids(next_ids: dict[str, int], keyframes: Sequence[StoredKeyframe]) -> dict[str, int]:
+    for keyframe in keyframes:
+        next_ids[keyframe.run_key] = max(next_ids[keyframe.run_key], keyframe.keyframe_key.id + 1)
+    return next_ids
+
+
+def _present_poses(poses: SavePoses, known_keys: set[KeyframeKey]) -> SavePoses:
+    """Return the poses of known keyframes."""
+    indices = [i for i, key in enumerate(poses.keys) if key in known_keys]
+    return SavePoses(
+        tuple(poses.keys[i] for i in indices),
+        poses.T_map_body[indices],
+        tuple(poses.map_ids[i] for i in indices),
+    )
+
+
+# ---- Repair of keyframes whose reference is missing
+
+
+@dataclass(frozen=True, eq=False)
+class Repaired:
+    """keyframes, links: with every reference present. reconnected_count: keyframes whose edge was rebuilt."""
+
+    keyframes: tuple[StoredKeyframe, ...]
+    links: dict[KeyframeKey, SaveLink]
+    reconnected_count: int
+
+
+def repair_references(keyframes: Sequence[StoredKeyframe], links: Mapping[KeyframeKey, SaveLink]) -> Repaired:
+    """Connect each keyframe without its reference to the nearest earlier one on its segment.
+
+    keyframes: in order of arrival. A keyframe without an earlier one begins its segment.
+    """
+    out: list[StoredKeyframe] = []
+    current_links = dict(links)
+    newest_in_segment: dict[str, Keyframe] = {}
+    present_keys: set[KeyframeKey] = set()
+    reconnected_count = 0
+    for stored in keyframes:
+        key = stored.keyframe_key
+        reference = (current_links.get(key) or stored.keyframe).reference
+        if reference >= 0 and KeyframeKey(stored.run_key, reference) not in present_keys:
+            edge = odometry_link(stored, current_links)
+            newest = newest_in_segment.get(stored.segment_name)
+            previous = None if newest is None else (newest.id, newest.T_odom_body)
+            edge = reconnect(stored.run_key, _with_edge(stored.keyframe, edge), previous)
+            if key in current_links:
+                current_links[key] = edge
+            else:  # as if its agent had sent this edge: the covariance is not yet inflated
+                stored = replace(stored, keyframe=_with_edge(stored.keyframe, edge))
+            reconnected_count += 1
+        out.append(stored)
+        newest_in_segment[stored.segment_name] = stored.keyframe
+        present_keys.add(key)
+    present_links = {key: link for key, link in current_links.items() if key in present_keys}
+    return Repaired(tuple(out), present_links, reconnected_count)
+
+
+def _with_edge(keyframe: Keyframe, edge: SaveLink) -> Keyframe:
+    return replace(keyframe, reference=edge.reference, T_ref_body=edge.T_ref_body, cov=edge.cov)
