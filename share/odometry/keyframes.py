@@ -38,7 +38,7 @@ class KeyframeSpacing:
     def __init__(self, gap_s: float, distance_m: float, angle_rad: float, min_share: float) -> None:
         self._gap_ns, self._distance_m, self._min_share = gap_s * 1e9, distance_m, min_share
         self._min_cosine = np.cos(min(angle_rad, np.pi))
-        self.stamp_ns = self.feature_count = 0  # of the newest keyframe
+        self.stamp_ns, self.feature_count = -(2**62), 0  # of the newest keyframe
         self.T = np.eye(4)
 
     def wants_keyframe(self, stamp_ns: int, T: F64, inlier_count: int) -> bool:

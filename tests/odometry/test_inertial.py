@@ -310,3 +310,20 @@ def test_what_it_cannot_track_is_refused():
     stereo = Rig(camera, np.eye(4), cam1=camera, T_cam1_cam0=se3.from_rt(np.eye(3), np.array([-0.05, 0, 0])))
     with pytest.raises(ValueError, match="IMU"):
         InertialTracker(stereo, InertialConfig(), TrackerConfig())
+
+
+def test_a_recording_whose_clock_begins_at_zero(walk):
+    frames, rig, _ = walk
+    first_ns = frames[0].stamp_ns
+    first, second = (
+        dataclasses.replace(
+            frame,
+            stamp_ns=frame.stamp_ns - first_ns,
+            imu=dataclasses.replace(frame.imu, stamps_ns=frame.imu.stamps_ns - first_ns),
+        )
+        for frame in frames[:2]
+    )
+    tracker = InertialTracker(rig, InertialConfig(), TrackerConfig())
+    tracker.track(first)
+    assert tracker.track(second).state is not TrackState.LOST
+    assert tracker.state is not None
