@@ -328,8 +328,8 @@ CONFIGS = {
     "out of range": ("link: {window: 0}", "link: window: 0 must be positive"),
     "zero": ("tracker: {corners: 0}", "tracker: corners: 0 must be positive"),
     "negative": (
-        "tracker: {spacing_px: -1}",
-        "spacing_px: expected a number from 0 to 1e+09, found -1",
+        "tracker: {new_stretch_s: -1}",
+        "new_stretch_s: expected a number from 0 to 1e+09, found -1",
     ),
     "huge": ("tracker: {corners: 1" + 40 * "0" + "}", "tracker: corners: expected a number from 0 to 1e+09"),
     "absurd": ("tracker: {corners: 1" + 400 * "0" + "}", "not valid YAML: number of 401 characters"),

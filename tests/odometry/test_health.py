@@ -13,7 +13,7 @@ MANY = 60  # features
 
 @pytest.fixture
 def straying() -> DivergenceMonitor:
-    return DivergenceMonitor(weak=25, blind=6)
+    return DivergenceMonitor()
 
 
 def test_nothing_of_what_should_be_there_three_times_in_a_row(straying: DivergenceMonitor) -> None:

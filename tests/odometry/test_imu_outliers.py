@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.odometry.imu_buffer import ImuBuffer
 from share.odometry.imu_outliers import ImuOutlierDetector
+from share.odometry.imu_predictor import ImuBuffer
 from share.types import ImuBatch
 
 STEP = 5_000_000

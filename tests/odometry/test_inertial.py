@@ -10,6 +10,7 @@ from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
 from share.metrics.ate import ate
+from share.odometry import initialisation
 from share.odometry.inertial_tracker import InertialTracker
 from share.recordings.trajectory import Trajectory
 from share.runtime.pipeline import read_frames
@@ -292,13 +293,15 @@ def test_a_renderer_knows_the_pose_between_frames(walk):
     assert InertialTracker(walk[1], InertialConfig(), TrackerConfig()).predict(to) is None
 
 
-def test_a_camera_that_sits_elsewhere_is_told_and_found(walk, tracked):
+def test_a_camera_that_sits_elsewhere_is_reported_and_estimated(walk, tracked, monkeypatch):
     """Turned by 5 degrees and shifted by 5 cm against its calibration."""
     frames, rig, truth = walk
     off = se3.exp(np.concatenate([np.radians(5) * np.array([0.6, 0.0, 0.8]), [0.03, -0.04, 0.0]]))
     wrong = dataclasses.replace(rig, T_body_cam0=rig.T_body_cam0 @ off)
     fixed, _, _ = run((frames, wrong, truth), frames)
-    _, _, tracker = run((frames, wrong, truth), frames, InertialConfig(extrinsic_rad=0.05, extrinsic_m=0.03))
+    monkeypatch.setattr(initialisation, "EXTRINSIC_SIGMA_RAD", 0.05)
+    monkeypatch.setattr(initialisation, "EXTRINSIC_SIGMA_M", 0.03)
+    _, _, tracker = run((frames, wrong, truth), frames)
     assert all(r.is_consistent for r in tracked[0])
     assert not any(r.is_consistent for r in fixed[-5:])
     left = se3.log(se3.inverse(rig.T_body_cam0) @ tracker.state.T_body_cam)

@@ -8,7 +8,8 @@ import pytest
 from helpers.imu_world import GRAVITY, NOISE, Path, imu_of, rig
 
 from share.geometry import se3
-from share.odometry import feature_matching, filter, state_augmentation
+from share.odometry import feature_matching, filter
+from share.odometry import state as filter_state
 from share.odometry.imu_propagation import integrate
 from share.odometry.state import CORE_SIZE, TIMESHIFT, initial_state
 
@@ -32,8 +33,8 @@ def state():
     )
     for k in range(2):
         s.T = T[k]
-        state_augmentation.add_keyframe(s, 10 + k, np.array([0.1, 0.2, -0.3]))
-        state_augmentation.add_features(
+        filter_state.add_keyframe(s, 10 + k, np.array([0.1, 0.2, -0.3]))
+        filter_state.add_features(
             s,
             np.arange(5) + 5 * k,
             np.full(5, k),
@@ -82,7 +83,7 @@ def test_what_is_seen(state, right):
         up, down = (looked(moved(state, s * basis(state, k)), T) for s in (1, -1))
         assert np.allclose(H[:, k], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
     later, sooner = copy.deepcopy(state), copy.deepcopy(state)
-    V = filter.twist(state, rate)
+    V = filter_state.twist(state, rate)
     later.T, sooner.T = se3.exp(V * STEP) @ state.T, se3.exp(-V * STEP) @ state.T
     up, down = (looked(s, T) for s in (later, sooner))
     assert np.allclose(H[:, TIMESHIFT], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
@@ -133,7 +134,7 @@ def test_the_twist_is_how_the_pose_moves():
     )
     rate = path.inertial(t)[0][0]
     moved = path.poses(t + 1e-4)[0] @ se3.inverse(path.poses(t - 1e-4)[0])
-    assert np.allclose(filter.twist(s, rate), se3.log(moved) / 2e-4, atol=1e-5)
+    assert np.allclose(filter_state.twist(s, rate), se3.log(moved) / 2e-4, atol=1e-5)
 
 
 def test_integration_follows_the_path():

@@ -14,7 +14,7 @@ SECOND = 1_000_000_000
 
 @pytest.fixture
 def newest() -> KeyframeSpacing:
-    spacing = KeyframeSpacing(gap_s=0.1, distance_m=0.15, angle_rad=0.2, min_share=0.7)
+    spacing = KeyframeSpacing(distance_m=0.15, angle_rad=0.2, min_share=0.7)
     spacing.stamp_ns, spacing.T, spacing.feature_count = (
         SECOND,
         se3.exp(np.array([0, 0, 1.0, 4.0, 5.0, 6.0])),

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from helpers.imu_world import CAMERA, rig
 
-from share.odometry import feature_matching, filter, outliers, state_augmentation
+from share.odometry import feature_matching, filter, visual_update
+from share.odometry import state as filter_state
 from share.odometry.state import CORE_SIZE, VELOCITY, initial_state
 
 RIG, SIZE = rig(), (CAMERA.width, CAMERA.height)
@@ -18,10 +19,10 @@ def state():
     rng, sigma = np.random.default_rng(1), np.full(CORE_SIZE, 1e-4)
     sigma[VELOCITY] = 0.01
     s = initial_state(0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), RIG.T_body_cam0, sigma)
-    host = state_augmentation.add_keyframe(s, 0, np.zeros(3))
+    host = filter_state.add_keyframe(s, 0, np.zeros(3))
     px = np.stack(np.meshgrid(np.linspace(40, SIZE[0] - 40, 10), np.linspace(40, SIZE[1] - 40, 10)), -1)
     ray = RIG.cam0.normalise(px.reshape(-1, 2))
-    state_augmentation.add_features(
+    filter_state.add_features(
         s, np.arange(N), np.full(N, host), ray, rng.uniform(0.2, 1.0, N), np.full(N, 1e-3)
     )
     s.cov[:6, :6] += np.diag(np.repeat([1e-3, 2e-3], 3) ** 2)
@@ -37,7 +38,9 @@ def judged(state, shift_px, proven=None, noise=0.3):
         state, np.arange(N), seen, uv, np.full(N, SIGMA), np.zeros(N), np.zeros(3)
     )
     px = RIG.cam0.distort(uv).astype(np.float32)
-    return outliers.static_inliers(state, rows, px, np.ones(N, bool) if proven is None else proven, RIG.cam0)
+    return visual_update.static_inliers(
+        state, rows, px, np.ones(N, bool) if proven is None else proven, RIG.cam0
+    )
 
 
 def mistaken(room, mover):
@@ -93,7 +96,7 @@ def test_too_few_are_believed(state):
     rows = filter.feature_measurements(
         state, few, seen, seen.uv + 1.0, np.full(5, SIGMA), np.zeros(5), np.zeros(3)
     )
-    assert outliers.static_inliers(
+    assert visual_update.static_inliers(
         state, rows, np.zeros((5, 2), np.float32), np.ones(5, bool), RIG.cam0
     ).all()
 
@@ -103,4 +106,4 @@ def test_the_imu_alone_explains_an_image_where_nothing_moves(share, as_expected)
     """Else somebody is asked; so too if all of the image moves."""
     off_px = np.random.default_rng(4).normal(0, 0.3, (N, 2))
     off_px[: round(share * N)] += 3.0
-    assert outliers.matches_imu(off_px, 0.15, 0.3) == as_expected
+    assert visual_update.matches_imu(off_px, 0.15) == as_expected

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from helpers.plain_walk import CAMERA, STEREO, T_CAM1_CAM0, pairs, poses
+from helpers.plain_walk import CAMERA, STEREO, pairs, poses
 
 from share.config import TrackerConfig
 from share.geometry import se3
-from share.geometry.camera import ImuNoise, Rig
-from share.odometry import initialisation
+from share.geometry.camera import Rig
+from share.odometry import initialisation, relocalisation, visual_tracker
 from share.odometry.visual_tracker import VisualTracker
-from share.types import Frame, ImuBatch, TrackState, WaitReason
+from share.types import Frame, TrackState, WaitReason
 
 HZ = 20
 DEFAULT = TrackerConfig()
@@ -128,60 +128,24 @@ def test_waits_for_something_to_see(walk):
     assert [r.waiting_for for r in results] == [WaitReason.VIEW] * 2 + [None] * 3
 
 
-def test_memory_is_bounded(walk):
-    config = TrackerConfig(max_keyframes=5, keyframe_m=0.02, keyframe_rad=0.02)
-    tracker = VisualTracker(STEREO, config)
+def test_memory_is_bounded(walk, monkeypatch):
+    monkeypatch.setattr(relocalisation, "MAX_KEYFRAMES", 5)
+    monkeypatch.setattr(visual_tracker, "KEYFRAME_M", 0.02)
+    monkeypatch.setattr(visual_tracker, "KEYFRAME_RAD", 0.02)
+    tracker = VisualTracker(STEREO, DEFAULT)
     for i, (left, right) in enumerate(walk[0]):
         frame = Frame(stamp(i), i, left, right)
         if tracker.track(frame).keyframe_ready:
             tracker.make_keyframe(frame)
         local_map = tracker._map
         assert len(local_map.keyframes) <= 5
-        assert len(local_map.ids) <= 5 * config.corners
+        assert len(local_map.ids) <= 5 * DEFAULT.corners
         assert set(local_map.anchors) <= set(local_map.keyframes)
 
 
 def test_one_camera_alone_is_refused():
     with pytest.raises(ValueError, match="scale"):
         VisualTracker(Rig(CAMERA, np.eye(4)), TrackerConfig())
-
-
-def test_up_comes_from_the_accelerometer(walk):
-    """Body tilted against the camera: odom's z is what the accelerometer says, not the image."""
-    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
-    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
-    up = se3.so3_exp(np.array([0.1, 0, 0.2])) @ np.array([0.0, -1, 0])
-    imu = ImuBatch(np.arange(30), np.zeros((30, 3)), np.tile(9.81 * up, (30, 1)))
-    tracker = VisualTracker(rig, TrackerConfig())
-    frame = Frame(0, 0, *walk[0][0], imu=imu)
-    result = tracker.track(frame)
-    assert np.allclose(result.T_odom_body[2, :3], up, atol=1e-9)
-    assert np.allclose(tracker.make_keyframe(frame).up, up, atol=1e-9)
-
-
-def test_without_gravity_in_the_accelerometer_up_stays_unknown(walk):
-    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
-    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
-    results, candidates = run(walk[0][:15], rig=rig)  # the IMU says nothing at all
-    assert [r.state for r in results[:9]] == [TrackState.INITIALISING] * 9
-    assert {r.waiting_for for r in results[:9]} == {WaitReason.TILT}
-    assert results[9].state is TrackState.VISION_ONLY
-    assert (candidates[0].up == 0).all()
-
-
-def test_an_imu_that_falls_silent_is_seen_and_ends_nothing(walk):
-    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
-    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
-    imu = ImuBatch(np.arange(30), np.zeros((30, 3)), np.tile((0.0, -9.81, 0.0), (30, 1)))
-    tracker, states = VisualTracker(rig, TrackerConfig()), []
-    for i, images in enumerate(walk[0][:12]):
-        frame = Frame(stamp(i), i, *images, imu=ImuBatch.empty() if 4 <= i < 8 else imu)
-        result = tracker.track(frame)
-        states.append(result.state)
-        if result.keyframe_ready:
-            tracker.make_keyframe(frame)
-    ok, alone = [TrackState.OK] * 4, [TrackState.VISION_ONLY] * 4
-    assert states == [*ok, *alone, *ok]
 
 
 def test_level_looks_ahead_and_survives_looking_down():

@@ -10,7 +10,7 @@ import pytest
 from helpers import rig_fuzzer
 from helpers.plain_walk import RIG
 
-from share.config import Config, InertialConfig, TrackerConfig
+from share.config import Config, InertialConfig
 from share.geometry import rig_check, se3
 from share.geometry.camera import ImuBias, Rig
 from share.odometry import filter
@@ -117,9 +117,11 @@ def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("rig", [RIG, RIG.without_imu()], ids=["imu", "cameras"])
-def test_after_a_keyframe_that_failed_the_next_step_is_from_the_last_that_others_have(rig: Rig) -> None:
-    often = {"keyframe_m": 1e-4, "keyframe_gap_s": 0.1}
-    config = Config(inertial=InertialConfig(**often), tracker=TrackerConfig(**often))
+def test_after_a_keyframe_that_failed_the_next_step_is_from_the_last_that_others_have(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("share.odometry.visual_tracker.KEYFRAME_M", 1e-4)
+    config = Config(inertial=InertialConfig(keyframe_m=1e-4))
     tracker = GuardedTracker(rig, config, FaultGuard(lambda text: None))
     frames = iter(rig_fuzzer.walk(16).frames)
     frame = next(frames)
