@@ -122,7 +122,7 @@ def innovation_covariance(
     """
     M, n = len(rows.feature), state.size
     dtype: type[np.floating[Any]] = (
-        np.float64 if double_precision or _needs_double_precision(state) else np.float32
+        np.float64 if double_precision or needs_double_precision(state) else np.float32
     )
     P = _relative_to_body(state).astype(dtype, copy=False)
     H_calibration = rows.H_core[:, :, CALIBRATION].reshape(2 * M, -1).astype(dtype, copy=False)
@@ -158,7 +158,7 @@ def innovation_covariance(
     return HP, S
 
 
-def _needs_double_precision(state: FilterState) -> bool:
+def needs_double_precision(state: FilterState) -> bool:
     """Return whether an update may reduce the uncertainty by more than single precision can represent."""
     return bool((state.cov.diagonal()[_TILT_AND_VELOCITY] > _SINGLE_PRECISION_VARIANCE).any())
 

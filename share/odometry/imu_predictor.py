@@ -33,7 +33,7 @@ class ImuBuffer:
 
     def __init__(self) -> None:
         self.samples = ImuBatch.empty()
-        self._max_abs = np.zeros(6)  # of each axis, over all time
+        self.max_abs = np.zeros(6)  # of each axis, over all time
         self._outliers = ImuOutlierDetector()
 
     def add(self, imu: ImuBatch) -> None:
@@ -46,19 +46,19 @@ class ImuBuffer:
             imu, values = imu.take(accepted), values[accepted]
         if self._outliers.retracted_ns:
             self._remove(self._outliers.retracted_ns)
-        self._max_abs = np.abs(values).max(axis=0, initial=0.0).clip(self._max_abs)
+        self.max_abs = np.abs(values).max(axis=0, initial=0.0).clip(self.max_abs)
         self.samples = self.samples.take(slice(-_MAX_SAMPLES, None)).concatenate(imu)
 
     def extended(self, imu: ImuBatch) -> ImuBuffer:
         """Return a buffer with later samples added; this one does not change."""
         out = ImuBuffer()
-        out.samples, out._max_abs, out._outliers = self.samples, self._max_abs, self._outliers.copy()
+        out.samples, out.max_abs, out._outliers = self.samples, self.max_abs, self._outliers.copy()
         out.add(imu)
         return out
 
     def _remove(self, stamps_ns: list[int]) -> None:
         self.samples = self.samples.take(~np.isin(self.samples.stamps_ns, stamps_ns))
-        self._max_abs = np.abs(np.hstack([self.samples.gyro, self.samples.accel])).max(axis=0, initial=0.0)
+        self.max_abs = np.abs(np.hstack([self.samples.gyro, self.samples.accel])).max(axis=0, initial=0.0)
 
     @property
     def rejected_count(self) -> int:
@@ -114,7 +114,7 @@ class ImuBuffer:
         """Return which axes (6,), gyro then accelerometer, are at the end of their scale: several samples
         equal the largest value ever, and it is large. Noise does not repeat exactly."""
         magnitude = np.abs(np.hstack([imu.gyro, imu.accel]))
-        out: NDArray[np.bool_] = ((magnitude == self._max_abs) & (magnitude > _MIN_FULL_SCALE)).sum(
+        out: NDArray[np.bool_] = ((magnitude == self.max_abs) & (magnitude > _MIN_FULL_SCALE)).sum(
             axis=0
         ) >= _MIN_CLIPPED
         return out

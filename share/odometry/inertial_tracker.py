@@ -10,12 +10,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.config import InertialConfig, TrackerConfig
 from share.geometry import se3
 from share.geometry.camera import ImuBias, Rig
 from share.odometry import filter, initialisation, relocalisation, visual_update
 from share.odometry.feature_appearance import Appearance
+from share.odometry.feature_matching import FeatureMatches
 from share.odometry.health import (
     BLIND,
     WEAK,
@@ -172,26 +174,18 @@ class InertialTracker:
         return self._realignment.published_pose(T_odom_body)
 
     def _track_frame(self, frame: Frame, last_frame: Frame, landmarks: LandmarkMap) -> TrackResult:
-        s, camera = landmarks.state, self._rig.cam0
-        T_before, interval_ns = s.T, frame.stamp_ns - last_frame.stamp_ns
+        s, T_before, interval_ns = landmarks.state, landmarks.state.T, frame.stamp_ns - last_frame.stamp_ns
         imu = self._predict(frame, s)
         matches = landmarks.match_features(frame, last_frame.image0, interval_ns * 1e-9)
-        visual_update.mark_dynamic(landmarks, matches, camera, self._imu.rate)
-        is_suspect = self._imu.buffer.is_suspect(s.stamp_ns)
-        inliers, nis = visual_update.update(
-            landmarks, matches, camera, self._imu.rate, interval_ns > _LONG_GAP_NS, is_suspect
-        )
-        landmarks.record_frame(matches, inliers)
+        visual_update.mark_dynamic(landmarks, matches, self._rig.cam0, self._imu.rate)
+        inliers, nis = self._update(landmarks, matches, interval_ns)
+        count = int(inliers.sum())
         if not imu.has_gyro:
             self._imu.rate = mean_angular_rate(T_before, s.T, interval_ns)
         elif self._mono_window is None:
             self._consistency.add(nis, interval_ns * 1e-9)
-        count, found_count = int(inliers.sum()), int(matches.is_found.sum())
         is_textured = count >= BLIND or corners.count_fast(frame.image0) >= WEAK
-        self._divergence.add(
-            is_textured, matches.in_view_count(camera), found_count, count, interval_ns * 1e-9
-        )
-        if self._divergence.has_diverged or not is_plausible(s, self._config.max_speed_m_s):
+        if not self._is_healthy(s, matches, count, is_textured, interval_ns):
             return self._declare_lost(frame)
         state = self._track_state(s, count, imu)
         if state is TrackState.LOST:
@@ -209,6 +203,27 @@ class InertialTracker:
         """Propagate the state to the time of the frame's image."""
         image_ns = frame.stamp_ns + round(s.timeshift_s * 1e9)  # IMU time
         return self._imu.predict(s, image_ns, gyro_only=self._mono_window is not None)
+
+    def _update(
+        self, landmarks: LandmarkMap, matches: FeatureMatches, interval_ns: int
+    ) -> tuple[NDArray[np.bool_], F64]:
+        """Update state and features with the matches. Return the inliers (N,) and the NIS of the
+        measurements."""
+        is_after_gap = interval_ns > _LONG_GAP_NS
+        is_suspect = self._imu.buffer.is_suspect(landmarks.state.stamp_ns)
+        inliers, nis = visual_update.update(
+            landmarks, matches, self._rig.cam0, self._imu.rate, is_after_gap, is_suspect
+        )
+        landmarks.record_frame(matches, inliers)
+        return inliers, nis
+
+    def _is_healthy(
+        self, s: FilterState, matches: FeatureMatches, count: int, is_textured: bool, interval_ns: int
+    ) -> bool:
+        """Return whether the state is plausible, and the images do not contradict it for long."""
+        in_view, found_count = matches.in_view_count(self._rig.cam0), int(matches.is_found.sum())
+        self._divergence.add(is_textured, in_view, found_count, count, interval_ns * 1e-9)
+        return not self._divergence.has_diverged and is_plausible(s, self._config.max_speed_m_s)
 
     def _is_scale_solved(self, frame: Frame, landmarks: LandmarkMap, is_keyframe: bool) -> bool:
         """Return whether a single camera's window gives the scale, and the state has converged. is_keyframe:

@@ -78,7 +78,7 @@ class VisualTracker:
             raise ValueError("one camera alone gives no scale; stereo or depth is needed")
         self._rig, self._config, self._seed = rig, config, seed
         self._T_cam_body = se3.inverse(rig.T_body_cam0)
-        self._map = LocalMap()
+        self.local_map = LocalMap()
         self._tracks = _NO_TRACKS
         self._found_tracks = _NO_TRACKS  # in the last frame, outliers included
         self._tracked_count = 0  # tracked into the last frame
@@ -131,7 +131,7 @@ class VisualTracker:
         self._T_last_published = self._T_odom_body()  # not before: making its candidate might have failed
         if self._keyframe_pending:
             self._add_keyframe(frame)
-        self._map.set_view(view)
+        self.local_map.set_view(view)
 
     def reset_after_failure(self, frame: Frame) -> None:
         """Declare LOST: something failed in or after `frame`, the last."""
@@ -153,11 +153,11 @@ class VisualTracker:
         """Return the statistics of the frame just tracked, which must have a pose."""
         assert self._T_odom_cam is not None
         tracks = self._all_found_tracks()
-        rows = self._map.row_indices(tracks.ids)
-        points = np.where(rows[:, None] >= 0, self._map.points[rows], np.nan)
+        rows = self.local_map.row_indices(tracks.ids)
+        points = np.where(rows[:, None] >= 0, self.local_map.points[rows], np.nan)
         z = se3.transform(se3.inverse(self._T_odom_cam), points)[:, 2]
         is_inlier = np.arange(len(rows)) < len(self._tracks.ids)
-        tracked_count, known_count = max(self._tracked_count, len(rows)), len(self._map.ids)
+        tracked_count, known_count = max(self._tracked_count, len(rows)), len(self.local_map.ids)
         return FeatureStatistics(tracks.px, is_inlier, z, tracked_count, known_count)
 
     def _all_found_tracks(self) -> _Tracks:
@@ -169,7 +169,7 @@ class VisualTracker:
     def _median_nis(self, tracks: _Tracks) -> float:
         """Return `TrackResult.median_nis`."""
         assert self._T_odom_cam is not None
-        expected = self._project(se3.inverse(self._T_odom_cam), self._map.row_indices(tracks.ids))
+        expected = self._project(se3.inverse(self._T_odom_cam), self.local_map.row_indices(tracks.ids))
         return finite_median((((tracks.px - expected) / NOISE_PX) ** 2).sum(axis=1))
 
     def _track_frame(self, frame: Frame, T_last: F64) -> TrackResult:
@@ -197,7 +197,7 @@ class VisualTracker:
 
     def _follow_tracks(self, image: U8, T_predicted: F64) -> _Tracks:
         assert self._image is not None
-        rows = self._map.row_indices(self._tracks.ids)
+        rows = self.local_map.row_indices(self._tracks.ids)
         tracks = self._tracks.take(rows >= 0)
         expected = self._project(se3.inverse(T_predicted), rows[rows >= 0])
         guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
@@ -208,12 +208,12 @@ class VisualTracker:
 
     def _project(self, T_cam_odom: F64, rows: I64) -> F64:
         """Return predicted px (N, 2) of points of the map, NaN behind the camera."""
-        return self._rig.cam0.project(se3.transform(T_cam_odom, self._map.points[rows]))
+        return self._rig.cam0.project(se3.transform(T_cam_odom, self.local_map.points[rows]))
 
     def _estimate_pose(self, tracks: _Tracks) -> tuple[PoseEstimate | None, _Tracks]:
         """Return the pose T_cam_odom, None without enough inliers, and the inlier tracks."""
         focal = self._rig.cam0.focal
-        points = self._map.points[self._map.row_indices(tracks.ids)]
+        points = self.local_map.points[self.local_map.row_indices(tracks.ids)]
         uv = self._rig.cam0.normalise(tracks.px.astype(np.float64))
         initial = ransac_pose(points, uv, focal, RANSAC_PX, self._seed)
         if initial is None or initial.inliers.sum() < MIN_INLIERS:
@@ -235,7 +235,7 @@ class VisualTracker:
     def _add_keyframe(self, frame: Frame, new_segment: bool = False) -> None:
         """Add this frame to the local map as a keyframe, with points at free corners."""
         assert self._T_odom_cam is not None
-        anchor = self._map.add_keyframe(frame.image0, self._T_odom_cam)
+        anchor = self.local_map.add_keyframe(frame.image0, self._T_odom_cam)
         self._add_corners(frame, anchor)
         spacing = self._spacing
         spacing.stamp_ns = frame.stamp_ns
@@ -251,30 +251,30 @@ class VisualTracker:
         """
         assert self._T_odom_cam is not None
         T_cam_odom = se3.inverse(self._T_odom_cam)
-        anchors = self._map.keyframes_near(self._T_odom_cam, _REOBSERVE_M, _REOBSERVE_RAD)
+        anchors = self.local_map.keyframes_near(self._T_odom_cam, _REOBSERVE_M, _REOBSERVE_RAD)
         found = _NO_TRACKS
         for anchor in anchors[:_REOBSERVED_KEYFRAMES]:
-            rows, guess = self._map.visible_points(T_cam_odom, self._rig.cam0, [anchor])
-            fresh = ~np.isin(self._map.ids[rows], self._tracks.ids)
+            rows, guess = self.local_map.visible_points(T_cam_odom, self._rig.cam0, [anchor])
+            fresh = ~np.isin(self.local_map.ids[rows], self._tracks.ids)
             if fresh.sum() >= MIN_POINTS_TO_MATCH:
                 found = found.concatenate(
                     self._match_patches(frame.image0, anchor, rows[fresh], guess[fresh])
                 )
-        expected = self._project(T_cam_odom, self._map.row_indices(found.ids))
+        expected = self._project(T_cam_odom, self.local_map.row_indices(found.ids))
         found = found.take(np.linalg.norm(found.px - expected, axis=1) < _REOBSERVE_PX)
         estimate, tracks = self._estimate_pose(self._tracks.concatenate(found))
         if estimate is not None:
             self._T_odom_cam, self._tracks = se3.inverse(estimate.T), tracks
 
     def _match_patches(self, image: U8, anchor: int, rows: I64, guess: F32) -> _Tracks:
-        source = self._map.keyframes[anchor].image
-        anchor_px = self._map.anchor_px[rows]
+        source = self.local_map.keyframes[anchor].image
+        anchor_px = self.local_map.anchor_px[rows]
         px, found = optical_flow.track_points(
             source, image, anchor_px, guess, window=15, levels=1, back_check_px=None
         )
         found &= optical_flow.ncc(source, image, anchor_px, px) > MIN_NCC
         found &= self._rig.cam0.has_normalised(px.astype(np.float64))
-        return _Tracks(self._map.ids[rows], px).take(found)
+        return _Tracks(self.local_map.ids[rows], px).take(found)
 
     def _add_corners(self, frame: Frame, anchor: int) -> None:
         assert self._T_odom_cam is not None
@@ -285,7 +285,7 @@ class VisualTracker:
         z = measure_depth(frame, self._rig, px, uv)
         known = ~np.isnan(z)
         points = se3.transform(self._T_odom_cam, rays(uv[known]) * z[known, None])
-        ids = self._map.add_points(anchor, points, px[known])
+        ids = self.local_map.add_points(anchor, points, px[known])
         self._tracks = self._tracks.concatenate(_Tracks(ids, px[known]))
 
     def _initialise(self, frame: Frame) -> TrackResult:
@@ -296,7 +296,7 @@ class VisualTracker:
         self._add_keyframe(frame, new_segment=True)
         if len(self._tracks.ids) < MIN_INLIERS:
             self._T_odom_cam, self._tracks = None, _NO_TRACKS
-            self._map = LocalMap()
+            self.local_map = LocalMap()
             return TrackResult(TrackState.INITIALISING, None, waiting_for=WaitReason.VIEW)
         return TrackResult(TrackState.OK, self._T_odom_body(), True, len(self._tracks.ids), True)
 
@@ -315,12 +315,12 @@ class VisualTracker:
             self._reobserve(frame)
         elif waited_s < config.new_stretch_s:
             return TrackResult(TrackState.LOST, None)
-        old_map = self._map
+        old_map = self.local_map
         if T_found is None:
-            self._map, self._tracks = LocalMap(), _NO_TRACKS
+            self.local_map, self._tracks = LocalMap(), _NO_TRACKS
         self._add_keyframe(frame, new_segment=T_found is None)
         if len(self._tracks.ids) < MIN_INLIERS:
-            self._map = old_map  # no features here either: keep the map for relocalisation
+            self.local_map = old_map  # no features here either: keep the map for relocalisation
             return TrackResult(TrackState.LOST, None)
         self._lost_since_ns = None
         return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids), T_found is None)
@@ -328,8 +328,8 @@ class VisualTracker:
     def _next_keyframes(self) -> list[LocalKeyframe]:
         """Return the next batch of the local map's keyframes, nearest to the last pose first."""
         assert self._T_odom_cam is not None
-        nearest = self._map.keyframes_near(self._T_odom_cam, np.inf, np.inf)
-        return [self._map.keyframes[n] for n in self._round_robin.next_batch(nearest)]
+        nearest = self.local_map.keyframes_near(self._T_odom_cam, np.inf, np.inf)
+        return [self.local_map.keyframes[n] for n in self._round_robin.next_batch(nearest)]
 
     def _T_odom_body(self) -> F64:
         assert self._T_odom_cam is not None

@@ -13,6 +13,8 @@ from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 
+pytestmark = pytest.mark.long
+
 CONFIG, STILL = InertialConfig(), np.zeros(3)
 ENOUGH = WEAK // 2
 
@@ -44,13 +46,13 @@ def look(scene, last_frame, frame, movers=0):
     scene.record_frame(matches, matches.is_found & ~matches.is_dynamic)
 
 
-def test_a_view_in_which_nothing_moves_is_static_at_once(frames, scene):
+def test_a_static_view_is_static_at_once(frames, scene):
     assert scene.is_static(ENOUGH)
     look(scene, *frames[:2])
     assert scene.is_static(ENOUGH)
 
 
-def test_with_movers_it_is_once_enough_features_have_proven_static(frames, scene):
+def test_with_dynamic_features_enough_must_be_proven_static(frames, scene):
     look(scene, *frames[:2], movers=6)
     assert not scene.is_static(ENOUGH)
     for last_frame, frame in pairwise(frames[1:5]):
