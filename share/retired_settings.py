@@ -30,7 +30,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     # inertial
     "inertial.spacing_px": "odometry.landmarks._SPACING_PX",
     "inertial.lasting_px": "odometry.landmarks.LASTING_PX",
-    "inertial.stereo_px": "odometry.landmarks._STEREO_PX",
+    "inertial.stereo_px": "odometry.initial_depth._STEREO_PX",
     "inertial.common_rad": "odometry.visual_update.COMMON_COV",
     "inertial.common_m": "odometry.visual_update.COMMON_COV",
     "inertial.gate": "odometry.filter.GATE",

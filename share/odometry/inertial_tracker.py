@@ -51,7 +51,6 @@ class InertialTracker:
         rig: Rig,
         config: InertialConfig,
         tracker_config: TrackerConfig,
-        seed: int = 0,
         bias: ImuBias | None = None,
     ) -> None:
         """bias: of the IMU, as estimated by an earlier run. Raises ValueError without an IMU."""
@@ -74,7 +73,7 @@ class InertialTracker:
         self._keyframes = KeyframeScheduler(rig, config, tracker_config.view_features)
         self._realignment = TiltRealignment()
         self._local_map = LocalMap()  # for relocalisation
-        self._tracker_config, self._seed = tracker_config, seed
+        self._tracker_config = tracker_config
         self._round_robin = relocalisation.RoundRobin()
         self._lost_ns: int | None = None
 
@@ -339,4 +338,4 @@ class InertialTracker:
         batch = self._round_robin.next_batch(sorted(self._local_map.keyframes, reverse=True))
         keyframes = [self._local_map.keyframes[n] for n in batch]
         view_features = self._tracker_config.view_features
-        return relocalisation.relocalise(keyframes, frame, self._rig, view_features, self._seed)
+        return relocalisation.relocalise(keyframes, frame, self._rig, view_features)

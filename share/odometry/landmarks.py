@@ -11,25 +11,20 @@ from numpy.typing import NDArray
 from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.odometry import feature_appearance, feature_matching, filter, state
-from share.odometry.depth_prior import DepthPrior, prior_from_neighbours
+from share.odometry import feature_appearance, feature_matching, filter, initial_depth, state
 from share.odometry.dormant_features import DormantFeatures
 from share.odometry.feature_appearance import Appearance
 from share.odometry.feature_matching import FeatureMatches, Prediction
 from share.odometry.state import FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
-from share.vision import corners, epipolar
-from share.vision.depth import disparity_per_rho, from_depth_camera, from_stereo
+from share.vision import corners
 from share.vision.mask import field_mask
 from share.vision.orb import measures_depth
 
 LASTING_PX = 0.3  # persistent error of a feature: edges, patches seen from elsewhere
-_STEREO_PX = 0.25  # noise of a new feature's disparity
 _SPACING_PX = 18.0  # least distance between new features
-_DEPTH_SIGMA_PX, _DEPTH_BASELINE_M = 0.3, 0.05  # px, m: of the stereo pair inside a depth camera
 _GRAY_NOISE = 3.0  # gray levels of an image
 _MAX_PATCH_SIGMA_PX = 0.5  # error of a patch's position by image noise; with more it is no feature
-_MAX_DISPARITY_ERROR_PX = 2.0  # between the epipolar search and its refinement
 _AVOID_FRAMES = 30  # for which no feature is searched where a dynamic feature was
 _MIN_DYNAMIC = 5  # dynamic features in a frame that begin a time of caution,
 _CAUTION_FRAMES = 60  # frames of it after the last such frame
@@ -245,7 +240,7 @@ class LandmarkMap:
     def _add_features(self, frame: Frame, anchor: int, px: F32) -> None:
         camera, s = self._rig.cam0, self.state
         ray = camera.normalise(px.astype(np.float64))
-        prior = self._initial_depths(frame, px, ray)
+        prior = initial_depth.initial_depths(frame, self._rig, s, px, ray, self.appearance.last_px)
         appearance = feature_appearance.extract_appearance(
             frame.image0, camera, px, ray, np.nan_to_num(prior.rho)
         )
@@ -267,37 +262,6 @@ class LandmarkMap:
         self.appearance = self.appearance.concatenate(appearance.take(is_usable))
         px_now = camera.distort(feature_matching.predict(s, np.arange(old_count, old_count + len(ids))).uv)
         self.appearance.last_px[old_count:] = np.where(np.isnan(px_now), px[is_usable], px_now)
-
-    def _initial_depths(self, frame: Frame, px: F32, ray: F64) -> DepthPrior:
-        """Return the inverse depths of new features, measured or else by the prior; NaN where a
-        measurement fails."""
-        if not measures_depth(frame, self._rig):
-            return prior_from_neighbours(self.state, px, self.appearance.last_px)
-        focal, n = self._rig.cam0.focal, len(px)
-        if frame.image1 is not None and self._rig.cam1 is not None:
-            z = self._stereo_depth(frame.image0, frame.image1, px, ray)
-            sigma = np.full(n, _STEREO_PX / focal / self._rig.baseline)
-            if self._rig.cam1.is_fisheye:
-                sigma = _STEREO_PX / disparity_per_rho(self._rig, ray, 1 / z)
-        else:
-            assert frame.depth is not None
-            z = from_depth_camera(frame.depth, self._rig, ray)
-            sigma = np.full(n, _DEPTH_SIGMA_PX / focal / _DEPTH_BASELINE_M)
-        return DepthPrior(1 / z, sigma, np.zeros((n, 0)), np.zeros(n))
-
-    def _stereo_depth(self, image0: U8, image1: U8, px: F32, ray: F64) -> F64:
-        """Return the depth (N,) m by epipolar search and subpixel refinement; NaN where it is ambiguous or
-        they disagree."""
-        coarse = epipolar.search_depth(image0, image1, self._rig, px, ray)
-        out, found = np.full(len(px), np.nan), np.flatnonzero(~np.isnan(coarse))
-        z = from_stereo(image0, image1, self._rig, px[found], ray[found], coarse[found])
-        error_px = np.abs(1 / z - 1 / coarse[found]) * self._rig.cam0.focal * self._rig.baseline
-        if self._rig.cam0.is_fisheye:
-            error_px = np.abs(1 / z - 1 / coarse[found]) * disparity_per_rho(
-                self._rig, ray[found], 1 / coarse[found]
-            )
-        out[found] = np.where(error_px < _MAX_DISPARITY_ERROR_PX, z, np.nan)
-        return out
 
     def reactivate(self, frame: Frame, rate: F64) -> F32:
         """Reactivate dormant features where the frame just tracked shows them within the gate. Return

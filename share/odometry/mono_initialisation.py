@@ -10,8 +10,8 @@ import numpy as np
 from share.config import InertialConfig
 from share.geometry.camera import Camera, ImuNoise, rays
 from share.odometry import filter, mono_bundle
-from share.odometry.depth_prior import FEATURE_SPREAD, MEAN_RHO, ROOM_LOG_SIGMA
 from share.odometry.feature_matching import anchors_in_camera
+from share.odometry.initial_depth import FEATURE_SPREAD, MEAN_RHO, ROOM_LOG_SIGMA
 from share.odometry.landmarks import LASTING_PX, LandmarkMap
 from share.odometry.mono_bundle import FRAME_SIZE, BundleModel, BundleSolution, WindowFrame
 from share.odometry.state import CORE_SIZE, EXTRINSIC, FilterState

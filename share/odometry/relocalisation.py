@@ -33,7 +33,9 @@ class PoseEstimate:
     inliers: NDArray[np.bool_]
 
 
-def ransac_pose(points: F64, uv: F64, focal: float, threshold_px: float, seed: int) -> PoseEstimate | None:
+def ransac_pose(
+    points: F64, uv: F64, focal: float, threshold_px: float, seed: int = 0
+) -> PoseEstimate | None:
     """Return the pose of `absolute_pose` by points (N, 3) m, world, seen at uv (N, 2), with a unit
     covariance; None without a model."""
     if len(points) < 4:
@@ -220,9 +222,7 @@ class RoundRobin:
         return numbers[first : first + self._batch_size]
 
 
-def relocalise(
-    keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, view_features: int, seed: int
-) -> F64 | None:
+def relocalise(keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, view_features: int) -> F64 | None:
     """Return T_odom_cam (4, 4) of the frame by its ORB features and the keyframe with the most inliers; None
     without enough.
 
@@ -230,7 +230,7 @@ def relocalise(
     """
     px, descriptors = detect_orb(frame.image0, view_features, mask=field_mask(rig.cam0, UNIFORM_FIELD_DEG))
     uv = rig.cam0.normalise(px.astype(np.float64))
-    estimates = (_match_keyframe(keyframe, uv, descriptors, rig.cam0.focal, seed) for keyframe in keyframes)
+    estimates = (_match_keyframe(keyframe, uv, descriptors, rig.cam0.focal) for keyframe in keyframes)
     best = max(
         (estimate for estimate in estimates if estimate is not None),
         key=lambda f: f.inliers.sum(),
@@ -241,9 +241,7 @@ def relocalise(
     return se3.inverse(best.T)
 
 
-def _match_keyframe(
-    keyframe: LocalKeyframe, uv: F64, descriptors: U8, focal: float, seed: int
-) -> PoseEstimate | None:
+def _match_keyframe(keyframe: LocalKeyframe, uv: F64, descriptors: U8, focal: float) -> PoseEstimate | None:
     if keyframe.view is None:
         return None
     with_depth = np.flatnonzero(~np.isnan(keyframe.view.points[:, 0]))
@@ -252,7 +250,7 @@ def _match_keyframe(
     )
     points = keyframe.view.points[with_depth[pairs[:, 1]]].astype(np.float64)
     points, matched_uv = se3.transform(keyframe.T_odom_cam, points), uv[pairs[:, 0]]
-    initial = ransac_pose(points, matched_uv, focal, RANSAC_PX, seed)
+    initial = ransac_pose(points, matched_uv, focal, RANSAC_PX)
     if initial is None:
         return None
     return refine_pose(initial.T, points, matched_uv, focal, np.full(len(points), NOISE_PX), GATE_SIGMA)

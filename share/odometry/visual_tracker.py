@@ -72,11 +72,11 @@ _NO_TRACKS = _Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
 class VisualTracker:
     """Feed frames in order to `track`. Deterministic: the same frames give the same poses."""
 
-    def __init__(self, rig: Rig, config: TrackerConfig, seed: int = 0) -> None:
+    def __init__(self, rig: Rig, config: TrackerConfig) -> None:
         """Raises ValueError for a rig without stereo and depth."""
         if rig.cam1 is None and rig.depth is None:
             raise ValueError("one camera alone gives no scale; stereo or depth is needed")
-        self._rig, self._config, self._seed = rig, config, seed
+        self._rig, self._config = rig, config
         self._T_cam_body = se3.inverse(rig.T_body_cam0)
         self.local_map = LocalMap()
         self._tracks = _NO_TRACKS
@@ -215,7 +215,7 @@ class VisualTracker:
         focal = self._rig.cam0.focal
         points = self.local_map.points[self.local_map.row_indices(tracks.ids)]
         uv = self._rig.cam0.normalise(tracks.px.astype(np.float64))
-        initial = ransac_pose(points, uv, focal, RANSAC_PX, self._seed)
+        initial = ransac_pose(points, uv, focal, RANSAC_PX)
         if initial is None or initial.inliers.sum() < MIN_INLIERS:
             return None, _NO_TRACKS
         sigma = np.full(len(points), NOISE_PX)
@@ -308,7 +308,7 @@ class VisualTracker:
         """Relocalise in the local map; after `new_stretch_s`, begin a new segment at the last pose."""
         assert self._lost_since_ns is not None
         config, keyframes = self._config, self._next_keyframes()
-        T_found = relocalisation.relocalise(keyframes, frame, self._rig, config.view_features, self._seed)
+        T_found = relocalisation.relocalise(keyframes, frame, self._rig, config.view_features)
         waited_s = (frame.stamp_ns - self._lost_since_ns) * 1e-9
         if T_found is not None:
             self._T_odom_cam, self._tracks = T_found, _NO_TRACKS

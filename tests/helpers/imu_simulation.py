@@ -12,9 +12,9 @@ from share.geometry import se3
 from share.lab.emulate.sensor.vibration import rotation_rates, vibration_acceleration
 from share.odometry import feature_matching, filter
 from share.odometry import state as filter_state
-from share.odometry.depth_prior import prior_from_neighbours
 from share.odometry.imu_predictor import ImuBuffer
 from share.odometry.imu_propagation import noise_with_vibration
+from share.odometry.initial_depth import prior_from_neighbours
 from share.odometry.landmarks import LASTING_PX
 from share.odometry.state import CORE_SIZE, FilterState, initial_state
 from share.types import ImuBatch
