@@ -25,33 +25,14 @@ class SequencerConfig:
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """Tracking by camera alone (`share.odometry.visual_tracker`)."""
+    """Tracking by cameras alone (`share.odometry.visual_tracker`); the views and loss of any tracker."""
 
     corners: int = 250  # features tracked at once
-    spacing_px: float = 14.0  # least distance between corners
     view_features: int = 500  # ORB features of a keyframe, for other agents and for relocalisation
-    noise_px: float = 1.0  # standard deviation of a tracked corner
-    ransac_px: float = 3.0  # reprojection error of a RANSAC inlier
-    gate_sigma: float = 3.0  # a measurement further off is an outlier
-    min_inliers: int = 15  # features that agree with a pose; fewer: LOST
-    weak_inliers: int = 40  # fewer: WEAK
-    keyframe_m: float = 0.15  # motion since the last keyframe that triggers a new one
-    keyframe_rad: float = 0.15  # rotation since the last keyframe that triggers a new one
-    keyframe_tracked: float = 0.6  # a smaller share of its features still tracked triggers one too
-    keyframe_gap_s: float = 0.1  # least time between keyframes
-    max_keyframes: int = 60  # of the local map; a full one drops the keyframe closest to another
-    reobserve_hosts: int = 6  # earlier keyframes whose points are searched for again
-    reobserve_m: float = 1.0  # largest distance to such a keyframe
-    reobserve_rad: float = 0.5  # largest rotation to such a keyframe
-    reobserve_px: float = 3.0  # largest distance between the predicted and the found position of such a point
-    relocalise_hosts: int = 8  # keyframes of the local map that a LOST frame is matched with
     new_stretch_s: float = 3.0  # LOST for this long: odometry starts a new segment
-    max_speed_m_s: float = 5.0  # a pose that implies a higher speed is rejected
-    max_turn_rad_s: float = 12.0  # a pose that implies a higher angular rate is rejected
 
     def __post_init__(self) -> None:
-        _require_positive(self, "corners", "spacing_px", "view_features", "noise_px", "ransac_px")
-        _require_positive(self, "gate_sigma", "min_inliers", "max_keyframes")
+        _require_positive(self, "corners", "view_features")
 
 
 @dataclass(frozen=True)
@@ -59,41 +40,18 @@ class InertialConfig:
     """Tracking by cameras and IMU (`share.odometry`)."""
 
     features: int = 80  # features tracked at once
-    spacing_px: float = 18.0  # least distance between new features
     sigma_px: float = 0.15  # noise of a feature's position, independent in each image
-    lasting_px: float = 0.3  # persistent error of a feature: edges, patches seen from elsewhere
-    stereo_px: float = 0.25  # noise of a new feature's disparity
-    common_rad: float = 1e-3  # error of an image that all its features share (blur, time offset)
-    common_m: float = 1e-4  # the same, as a shift of the camera
-    gate: float = 12.0  # squared Mahalanobis distance (2 dof) above which a measurement is rejected
-    alike: float = 0.85  # correlation with the first patch below which a feature is not found
-    settled_px: float = 0.3  # alignment has converged if its last step is smaller than this
-    reach_px: float = 4.0  # largest distance of an alignment from the predicted position
     imu_noise: float = 2.0  # multiple of the IMU's data-sheet noise
     gyro_bias: float = 0.02  # rad/s, initial standard deviation
     accel_bias: float = 0.3  # m/s^2, initial standard deviation
-    extrinsic_rad: float = 1e-5  # standard deviation of the camera-to-body rotation; small: as calibrated
-    extrinsic_m: float = 1e-5  # the same, of its position
-    offset_s: float = 1e-6  # the same, of its time offset to the IMU
     gravity: float = 9.81  # m/s^2
     keyframe_m: float = 0.25  # motion since the last keyframe that triggers a new one
     keyframe_rad: float = 0.35  # rotation since the last keyframe that triggers a new one
-    keyframe_seen: float = 0.8  # a smaller share of its features in use triggers one too
-    keyframe_gap_s: float = 0.1  # least time between keyframes
     max_keyframes: int = 20  # in the state
-    recall: int = 80  # features of earlier keyframes that a keyframe searches for again
-    recall_m: float = 1.5  # largest distance to such a keyframe
-    recall_rad: float = 0.7  # largest rotation to such a keyframe
-    weak: int = 25  # features in use; fewer: WEAK
-    blind: int = 6  # features in use; fewer: INERTIAL_ONLY
     max_speed_m_s: float = 8.0  # a faster state is LOST
-    lost_m: float = 0.5  # position sigma since the last measurement at which the state is LOST
-    silent_s: float = 0.1  # the IMU counts as silent after this long without a sample
-    turning_noise: float = 0.5  # rad/s/sqrt(Hz), process noise of the angular rate while the IMU is silent
-    moving_noise: float = 1.0  # m/s^2/sqrt(Hz), process noise of the velocity while the IMU is silent
 
     def __post_init__(self) -> None:
-        _require_positive(self, "features", "spacing_px", "sigma_px", "gate", "imu_noise", "gravity")
+        _require_positive(self, "features", "sigma_px", "imu_noise", "gravity")
         _require_positive(self, "max_keyframes")
 
 

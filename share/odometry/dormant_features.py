@@ -18,6 +18,8 @@ from share.types import F64, I64
 _MAX_RELATIVE_SIGMA = 0.1  # relative sigma of an inverse depth that is kept
 _SIGMA_INFLATION = 1.5  # times its sigma, because its correlation with the poses is lost
 _MAX_PER_KEYFRAME = 40  # features
+_MAX_SEARCHED = 80  # that a keyframe searches for again,
+_MAX_DISTANCE_M, _MAX_ANGLE_RAD = 1.5, 0.7  # of keyframes at most so far away
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,20 +95,16 @@ class DormantFeatures:
         for keyframe_id in keyframe_ids.tolist():
             self._by_keyframe.pop(keyframe_id, None)
 
-    def nearby(
-        self, state: FilterState, camera: Camera, max_m: float, max_rad: float, max_count: int
-    ) -> DormantTable | None:
-        """Return features that the camera should see, from keyframes within `max_m` and `max_rad` of the
-        body's pose.
+    def nearby(self, state: FilterState, camera: Camera) -> DormantTable | None:
+        """Return features that the camera should see, of the nearest keyframes first; None without any.
 
-        The nearest keyframes come first, until there are `max_count` features. `anchor` is the index in the
-        state. None without any.
+        `anchor` is the index in the state.
         """
         self._group_by_keyframe()
         (distance,), (angle,) = se3.pairwise_distances(state.T[None], state.keyframe_poses)
         out: list[DormantTable] = []
         for k in np.argsort(distance + angle, kind="stable").tolist():
-            if distance[k] >= max_m or angle[k] >= max_rad:
+            if distance[k] >= _MAX_DISTANCE_M or angle[k] >= _MAX_ANGLE_RAD:
                 continue
             candidates = self._most_certain(int(state.keyframe_ids[k]))
             if candidates is None:
@@ -117,7 +115,7 @@ class DormantFeatures:
             if len(candidates.ids) == 0:
                 continue
             out.append(replace(candidates, anchor=np.full(len(candidates.ids), k)))
-            if sum(len(table.ids) for table in out) >= max_count:
+            if sum(len(table.ids) for table in out) >= _MAX_SEARCHED:
                 break
         return out[0].concatenate(*out[1:]) if out else None
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.array_table import ArrayTable
-from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig, rays
 from share.odometry.feature_appearance import Appearance, is_stereo_due
@@ -17,6 +16,9 @@ from share.types import F32, F64, I64, U8, Frame
 from share.vision import optical_flow, patches
 
 _BORDER_PX = 6.0
+_MIN_CORRELATION = 0.85  # with the first patch, of a match
+_MAX_LAST_STEP_PX = 0.3  # of an alignment that has converged
+_MAX_REACH_PX = 4.0  # of an alignment, from the predicted position
 _MAX_FLOW_ERROR_PX = 1.5  # between the position by optical flow and by alignment of the patch
 _MAX_MISSING_SHARE = 0.15  # of the features in view; if more are missing, they are tracked by optical flow
 
@@ -57,7 +59,7 @@ class FeatureMatches:
 
 
 def match_features(
-    frame: Frame, rig: Rig, state: FilterState, appearance: Appearance, config: InertialConfig, start: int = 0
+    frame: Frame, rig: Rig, state: FilterState, appearance: Appearance, start: int = 0
 ) -> FeatureMatches:
     """Match the features from index `start` on in the images of a frame, both in one pass; in cam1 only those
     that are due."""
@@ -90,7 +92,7 @@ def match_features(
     aligned = patches.align(
         images, cam0_to_align, appearance.patch.kernels[indices[to_align]], px, warp[to_align]
     )
-    accepted = _is_match(aligned, px, config, config.reach_px)
+    accepted = _is_match(aligned, px, _MAX_REACH_PX)
     predicted_px = patch.uv[to_align] + _solved(jacobian[to_align], aligned.px - px)
     for camera, part in zip(cameras, (slice(0, cam0_to_align), slice(cam0_to_align, None)), strict=False):
         if camera.is_fisheye:  # the Jacobian changes within a few px
@@ -126,7 +128,6 @@ def match_by_flow(
     camera: Camera,
     appearance: Appearance,
     matches: FeatureMatches,
-    config: InertialConfig,
 ) -> None:
     """Track the missing features from the previous image by optical flow, if many are missing in cam0.
 
@@ -147,7 +148,7 @@ def match_by_flow(
         (image,), len(missing), appearance.patch.kernels[missing], flow_px, matches.warp[missing]
     )
     start_px = camera.normalise(aligned.px.astype(np.float64))
-    accepted = _is_match(aligned, flow_px, config, _MAX_FLOW_ERROR_PX) & np.isfinite(start_px).all(axis=1)
+    accepted = _is_match(aligned, flow_px, _MAX_FLOW_ERROR_PX) & np.isfinite(start_px).all(axis=1)
     _store(matches, missing, aligned, start_px, accepted, slice(None))
 
 
@@ -187,13 +188,11 @@ def _px_per_rho(patch: PatchPrediction) -> F64:
     return np.where(np.isfinite(out), out, 0.0)
 
 
-def _is_match(
-    aligned: patches.AlignedPatches, px: F64, config: InertialConfig, reach_px: float
-) -> NDArray[np.bool_]:
+def _is_match(aligned: patches.AlignedPatches, px: F64, reach_px: float) -> NDArray[np.bool_]:
     """Return which alignments (N,) converged within `reach_px` of px (N, 2) with enough correlation."""
     distance = np.hypot(*(aligned.px - px).T)
-    converged = (aligned.last_step < config.settled_px) & (distance < reach_px)
-    out: NDArray[np.bool_] = converged & (aligned.correlation > config.alike)
+    converged = (aligned.last_step < _MAX_LAST_STEP_PX) & (distance < reach_px)
+    out: NDArray[np.bool_] = converged & (aligned.correlation > _MIN_CORRELATION)
     return out
 
 

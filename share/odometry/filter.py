@@ -1,7 +1,7 @@
 """The steps of the filter: propagate, gate, update, covariances of poses. Each changes the state in place.
 
 Source: EKF with right-invariant errors, see `state`; time offset in the state: Li & Mourikis (2014).
-`state_augmentation` adds and removes keyframes and features.
+`state` adds and removes keyframes and features.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from share.odometry.state import (
     TIMESHIFT,
     VELOCITY,
     FilterState,
+    twist,
 )
 from share.types import F64, I64, ImuBatch
 
@@ -37,6 +38,7 @@ _TILT_AND_VELOCITY = np.array([0, 1, 6, 7, 8])  # columns
 # rad^2, (m/s)^2 of these: with a larger variance, single precision does not suffice.
 _SINGLE_PRECISION_VARIANCE = np.array([3e-4, 3e-4, 1e-2, 1e-2, 1e-2])
 _MIN_VARIANCE = 1e-10  # rounding error of differences of covariances
+GATE = 12.0  # NIS (2 degrees of freedom) above which a measurement is rejected
 CORRELATION_INFLATION = 16.0  # frames for which a correlated error lasts; chosen by NEES
 FloatArray = NDArray[np.floating[Any]]  # in double or in single precision
 _STEP_TOLERANCE = 1e-4  # rad, m, 1/m: a smaller step does not change the derivatives
@@ -75,14 +77,6 @@ def propagate(state: FilterState, imu: ImuBatch, to_ns: int, noise: ImuNoise, gr
     P[IMU_STATE_SIZE:, :IMU_STATE_SIZE] = P[:IMU_STATE_SIZE, IMU_STATE_SIZE:].T
     state.T, state.v, state.stamp_ns = motion.T, motion.v, to_ns
     return motion.rate
-
-
-def twist(state: FilterState, rate: F64) -> F64:
-    """Return the derivative (6,) of the body's pose by time: T(t + dt) = Exp(twist dt) T(t). rate (3,):
-    rad/s, body."""
-    turning = state.T[:3, :3] @ rate
-    (a, b, c), (x, y, z) = turning.tolist(), state.T[:3, 3].tolist()
-    return np.concatenate([turning, state.v - (b * z - c * y, c * x - a * z, a * y - b * x)])
 
 
 def feature_measurements(
@@ -128,7 +122,7 @@ def innovation_covariance(
     """
     M, n = len(rows.feature), state.size
     dtype: type[np.floating[Any]] = (
-        np.float64 if double_precision or _needs_double_precision(state) else np.float32
+        np.float64 if double_precision or needs_double_precision(state) else np.float32
     )
     P = _relative_to_body(state).astype(dtype, copy=False)
     H_calibration = rows.H_core[:, :, CALIBRATION].reshape(2 * M, -1).astype(dtype, copy=False)
@@ -164,7 +158,7 @@ def innovation_covariance(
     return HP, S
 
 
-def _needs_double_precision(state: FilterState) -> bool:
+def needs_double_precision(state: FilterState) -> bool:
     """Return whether an update may reduce the uncertainty by more than single precision can represent."""
     return bool((state.cov.diagonal()[_TILT_AND_VELOCITY] > _SINGLE_PRECISION_VARIANCE).any())
 
@@ -274,11 +268,11 @@ def scalar_update(state: FilterState, residual: F64, H: F64, sigma: float, gate:
     return True
 
 
-def zero_velocity_update(state: FilterState, sigma: float, gate: float) -> bool:
-    """Update with a velocity of 0, sigma m/s. Return False if the gate rejects it, see `scalar_update`."""
+def zero_velocity_update(state: FilterState, sigma: float) -> bool:
+    """Update with a velocity of 0, sigma m/s. Return False if `GATE` rejects it, see `scalar_update`."""
     H = np.zeros((3, state.size))
     H[:, POSE][:, :3], H[:, VELOCITY] = -se3.hat(state.v), np.eye(3)
-    return scalar_update(state, -state.v, H, sigma, gate)
+    return scalar_update(state, -state.v, H, sigma, GATE)
 
 
 def inflate(state: FilterState, sigma_rad: float, sigma_m: float, sigma_m_s: float) -> None:

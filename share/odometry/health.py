@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.config import InertialConfig
 from share.odometry import filter
 from share.odometry.state import FilterState
 from share.odometry.track_result import median
-from share.types import F64
+from share.types import F64, TrackState
 
+WEAK = 25  # features in use; fewer: WEAK
+BLIND = 6  # features in use; fewer: INERTIAL_ONLY
+_MAX_DRIFT_M = 0.5  # position sigma since the newest keyframe at which the state is LOST
 _SETTLING_S = 1.0  # after its start, in which a filter converges
 _MIN_DURATION_S = 1.0  # of frames after that, before an inconsistency is reported
 _AVERAGING_S = 5.0  # of the exponential mean
@@ -53,13 +55,11 @@ class DivergenceMonitor:
     """Detects a wrong filter: textured images that show almost none of the features that should be in view,
     or for long none that the filter accepts.
 
-    Features that have left the view do not count.
+    Features that have left the view do not count. With fewer than `WEAK` features in view a frame says
+    little; fewer than `BLIND` found or accepted count as none.
     """
 
-    def __init__(self, weak: int, blind: int) -> None:
-        """With fewer than `weak` features in view a frame says little; fewer than `blind` found or
-        accepted count as none."""
-        self._weak, self._blind = weak, blind
+    def __init__(self) -> None:
         self._empty_frames, self._rejected_s = 0, 0.0
 
     def add(
@@ -70,10 +70,10 @@ class DivergenceMonitor:
         textured: the image shows something. `in_view` features should be in view, `found_count` were found,
         `inlier_count` were accepted as well.
         """
-        if textured and in_view >= self._weak:
-            self._empty_frames = self._empty_frames + 1 if found_count < self._blind else 0
-        if in_view >= self._blind:  # else all were rejected in the frame before, and are gone
-            rejected = textured and inlier_count < self._blind
+        if textured and in_view >= WEAK:
+            self._empty_frames = self._empty_frames + 1 if found_count < BLIND else 0
+        if in_view >= BLIND:  # else all were rejected in the frame before, and are gone
+            rejected = textured and inlier_count < BLIND
             self._rejected_s = self._rejected_s + min(interval_s, _MAX_INTERVAL_S) if rejected else 0.0
 
     @property
@@ -87,8 +87,16 @@ class DivergenceMonitor:
         return self._empty_frames >= _MAX_EMPTY_FRAMES or self._rejected_s > _MAX_REJECTED_S
 
 
-def is_plausible(s: FilterState, config: InertialConfig) -> bool:
-    """Return whether the state is finite, no faster than a person or robot, and its drift since the newest
-    keyframe below `lost_m`."""
+def is_plausible(s: FilterState, max_speed_m_s: float) -> bool:
+    """Return whether the state is finite, not too fast, and its drift since the newest keyframe small."""
     finite = np.isfinite(s.T).all() and np.isfinite(s.v).all() and np.isfinite(s.cov).all()
-    return bool(finite and np.linalg.norm(s.v) < config.max_speed_m_s and filter.drift_m(s) < config.lost_m)
+    return bool(finite and np.linalg.norm(s.v) < max_speed_m_s and filter.drift_m(s) < _MAX_DRIFT_M)
+
+
+def pose_state(count: int, has_imu: bool) -> TrackState:
+    """Return the state of a frame whose pose is based on `count` features and, with `has_imu`, on the IMU."""
+    if count < BLIND:
+        return TrackState.INERTIAL_ONLY if has_imu else TrackState.LOST
+    if not has_imu:
+        return TrackState.VISION_ONLY
+    return TrackState.OK if count >= WEAK else TrackState.WEAK

@@ -1,22 +1,160 @@
-"""Predict the state at the time of an image: by IMU samples, at constant velocity where some are missing."""
+"""The last seconds of IMU samples, and the prediction of the state at the time of an image: by the samples,
+at constant velocity where some are missing."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.config import InertialConfig
+from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.odometry import filter
-from share.odometry.imu_buffer import ImuBuffer, constant_velocity_samples, fill_clipped, gyro_only_samples
+from share.odometry.imu_outliers import ImuInflation, ImuOutlierDetector
 from share.odometry.imu_propagation import integrate, noise_with_vibration, noise_without_axes, scaled_noise
 from share.odometry.state import FilterState
 from share.types import F64, ImuBatch
 
+_MAX_SAMPLES = 600
+_REST_S = 0.5  # window in which rest is detected
+_MIN_REST_SAMPLES = 20
+_MAX_REST_ACCEL_STD = 0.12  # m/s^2, about twice a D435i's noise
+_MAX_REST_GYRO_STD = 0.02  # rad/s
+_VIBRATION_WINDOW_S = 0.2  # window in which vibration is measured
+_MIN_CLIPPED = 4  # samples at the end of the scale
+_MIN_FULL_SCALE = np.repeat([0.5, 11.0], 3)  # rad/s and m/s^2; every scale ends above
+
+
+class ImuBuffer:
+    """IMU samples of the last few seconds in order of time, without outliers (`ImuOutlierDetector`)."""
+
+    def __init__(self) -> None:
+        self.samples = ImuBatch.empty()
+        self.max_abs = np.zeros(6)  # of each axis, over all time
+        self._outliers = ImuOutlierDetector()
+
+    def add(self, imu: ImuBatch) -> None:
+        """Add samples; those not later than the newest are dropped."""
+        start = int(np.searchsorted(imu.stamps_ns, self._outliers.newest_ns, side="right"))
+        imu = imu.take(slice(start, None)) if start else imu
+        values = np.hstack([imu.gyro, imu.accel])
+        accepted = self._outliers.accepted_mask(imu.stamps_ns, values)
+        if accepted is not None:
+            imu, values = imu.take(accepted), values[accepted]
+        if self._outliers.retracted_ns:
+            self._remove(self._outliers.retracted_ns)
+        self.max_abs = np.abs(values).max(axis=0, initial=0.0).clip(self.max_abs)
+        self.samples = self.samples.take(slice(-_MAX_SAMPLES, None)).concatenate(imu)
+
+    def extended(self, imu: ImuBatch) -> ImuBuffer:
+        """Return a buffer with later samples added; this one does not change."""
+        out = ImuBuffer()
+        out.samples, out.max_abs, out._outliers = self.samples, self.max_abs, self._outliers.copy()
+        out.add(imu)
+        return out
+
+    def _remove(self, stamps_ns: list[int]) -> None:
+        self.samples = self.samples.take(~np.isin(self.samples.stamps_ns, stamps_ns))
+        self.max_abs = np.abs(np.hstack([self.samples.gyro, self.samples.accel])).max(axis=0, initial=0.0)
+
+    @property
+    def rejected_count(self) -> int:
+        """The number of samples rejected."""
+        return self._outliers.rejected_count
+
+    def is_suspect(self, now_ns: int) -> bool:
+        """Return whether recent samples may be wrong although they were accepted."""
+        return self._outliers.is_suspect(now_ns)
+
+    def inflation(self, from_ns: int, to_ns: int) -> ImuInflation | None:
+        """Return the inflation for rejected or suspect samples in [from_ns, to_ns); None where there are
+        none."""
+        return self._outliers.inflation(from_ns, to_ns)
+
+    @property
+    def last_ns(self) -> int:
+        """The stamp of the newest sample; 0 without samples."""
+        return int(self.samples.stamps_ns[-1]) if len(self.samples) else 0
+
+    def between(self, from_ns: int, to_ns: int, silent_ns: int) -> ImuBatch | None:
+        """Return the samples in an interval and one beyond each end, if there is one; None with a gap
+        longer than `silent_ns`."""
+        stamps = self.samples.stamps_ns
+        first = max(int(np.searchsorted(stamps, from_ns, side="right")) - 1, 0)
+        last = int(np.searchsorted(stamps, to_ns)) + 1
+        part = self.samples.take(slice(first, last))
+        stamps_inside = part.stamps_ns
+        if (
+            len(stamps_inside) == 0
+            or np.diff(np.r_[stamps_inside, max(to_ns, int(stamps_inside[-1]))]).max() > silent_ns
+        ):
+            return None
+        return part
+
+    def latest(self, to_ns: int) -> ImuBatch:
+        """Return the samples of the last `_VIBRATION_WINDOW_S` before `to_ns`."""
+        stamps = self.samples.stamps_ns
+        first, last = np.searchsorted(stamps, [to_ns - round(_VIBRATION_WINDOW_S * 1e9), to_ns], side="right")
+        return self.samples.take(slice(int(first), int(last) + 1))
+
+    def is_still(self, now_ns: int) -> bool:
+        """Return whether the IMU was at rest for `_REST_S` before `now_ns`, with no motor running."""
+        last = self.samples.stamps_ns > now_ns - round(_REST_S * 1e9)
+        if last.sum() < _MIN_REST_SAMPLES:
+            return False
+        accel_std, gyro_std = self.samples.accel[last].std(axis=0), self.samples.gyro[last].std(axis=0)
+        return bool(
+            np.linalg.norm(accel_std) < _MAX_REST_ACCEL_STD and np.linalg.norm(gyro_std) < _MAX_REST_GYRO_STD
+        )
+
+    def is_clipped(self, imu: ImuBatch) -> NDArray[np.bool_]:
+        """Return which axes (6,), gyro then accelerometer, are at the end of their scale: several samples
+        equal the largest value ever, and it is large. Noise does not repeat exactly."""
+        magnitude = np.abs(np.hstack([imu.gyro, imu.accel]))
+        out: NDArray[np.bool_] = ((magnitude == self.max_abs) & (magnitude > _MIN_FULL_SCALE)).sum(
+            axis=0
+        ) >= _MIN_CLIPPED
+        return out
+
+
+def fill_clipped(imu: ImuBatch, axes: NDArray[np.bool_], rate: F64) -> ImuBatch:
+    """Return the samples with clipped gyro axes (3,) replaced by `rate` (3,) rad/s, biased as a gyro's,
+    where that is faster."""
+    if not axes.any():
+        return imu
+    is_faster = axes & (np.abs(rate) > np.abs(imu.gyro)) & (rate * imu.gyro > 0)
+    return replace(imu, gyro=np.where(is_faster, rate, imu.gyro))
+
+
+def constant_velocity_samples(state: FilterState, rate: F64, to_ns: int, gravity: float) -> ImuBatch:
+    """Return the samples that an IMU would measure of a body that keeps its velocity and turns by rate
+    (3,) rad/s."""
+    half_turn = se3.so3_exp(rate * (to_ns - state.stamp_ns) * 0.5e-9)
+    force = (state.T[:3, :3] @ half_turn).T @ np.array([0.0, 0.0, gravity])
+    stamps = np.array([state.stamp_ns, to_ns])
+    return ImuBatch(stamps, np.tile(rate + state.bg, (2, 1)), np.tile(force + state.ba, (2, 1)))
+
+
+def gyro_only_samples(state: FilterState, imu: ImuBatch, to_ns: int, gravity: float) -> ImuBatch:
+    """Return samples of a body that turns as measured, at constant velocity."""
+    return constant_velocity_samples(state, imu.gyro.mean(axis=0) - state.bg, to_ns, gravity)
+
+
+def mean_angular_rate(before: F64, after: F64, dt_ns: int) -> F64:
+    """Return the mean rate (3,) rad/s, in the body, between two poses (4, 4)."""
+    out: F64 = se3.so3_log(before[:3, :3].T @ after[:3, :3]) / max(dt_ns * 1e-9, 1e-3)
+    return out
+
+
 _MAX_REST_RATE = 0.03  # rad/s
 _MAX_REST_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to the filter's velocity
 _ZERO_VELOCITY_SIGMA = 0.02  # m/s
+_SILENT_NS = 100_000_000  # the IMU counts as silent after this long without a sample; then
+_TURNING_NOISE = 0.5  # rad/s/sqrt(Hz) is the process noise of the angular rate,
+_MOVING_NOISE = 1.0  # m/s^2/sqrt(Hz) that of the velocity
 
 
 class ImuUse(NamedTuple):
@@ -35,13 +173,12 @@ class ImuPredictor:
         self.buffer = ImuBuffer()
         self.noise = scaled_noise(imu, config.imu_noise)
         self.rate = np.zeros(3)
-        self._constant_velocity = ImuNoise(config.turning_noise, config.moving_noise, 0.0, 0.0, imu.rate_hz)
-        self._config = config
-        self._silent_ns = round(config.silent_s * 1e9)
+        self._constant_velocity = ImuNoise(_TURNING_NOISE, _MOVING_NOISE, 0.0, 0.0, imu.rate_hz)
+        self._gravity = config.gravity
 
     def samples(self, from_ns: int, to_ns: int) -> ImuBatch | None:
         """Return the samples of an interval; None if some are missing."""
-        return self.buffer.between(from_ns, to_ns, self._silent_ns)
+        return self.buffer.between(from_ns, to_ns, _SILENT_NS)
 
     def restart(self, state: FilterState) -> None:
         """Begin with a new state: its rate is that of the newest sample."""
@@ -57,7 +194,7 @@ class ImuPredictor:
         has_rejected = inflation is not None and bool(inflation.rejected_axes.any())
         if to_ns <= s.stamp_ns:
             return ImuUse(True, True, has_rejected)
-        samples, gravity = self.samples(s.stamp_ns, to_ns), self._config.gravity
+        samples, gravity = self.samples(s.stamp_ns, to_ns), self._gravity
         if samples is None:
             substitute = constant_velocity_samples(s, self.rate, to_ns, gravity)
             filter.propagate(s, substitute, to_ns, self._constant_velocity, gravity)
@@ -77,7 +214,7 @@ class ImuPredictor:
         if inflation is not None:
             filter.inflate(s, inflation.turn_rad, 0.0, inflation.speed_m_s)
         elif self._is_at_rest(s, to_ns):
-            filter.zero_velocity_update(s, _ZERO_VELOCITY_SIGMA, self._config.gate)
+            filter.zero_velocity_update(s, _ZERO_VELOCITY_SIGMA)
         return ImuUse(not silent_axes[:3].any(), True, has_rejected)
 
     def _is_at_rest(self, s: FilterState, now_ns: int) -> bool:
@@ -89,8 +226,8 @@ class ImuPredictor:
 
         After the last sample the body is taken to turn and accelerate as it did then. Nothing changes here.
         """
-        buffer, gravity = self.buffer.extended(imu), self._config.gravity
-        samples = buffer.between(s.stamp_ns, min(t_ns, buffer.last_ns), self._silent_ns)
+        buffer, gravity = self.buffer.extended(imu), self._gravity
+        samples = buffer.between(s.stamp_ns, min(t_ns, buffer.last_ns), _SILENT_NS)
         if samples is None:
             samples = constant_velocity_samples(s, self.rate, t_ns, gravity)
         return integrate(s.T, s.v, s.bg, s.ba, samples, s.stamp_ns, t_ns, self.noise, gravity).T

@@ -37,6 +37,8 @@ _MAX_STILL_RATE = 0.05  # rad/s, mean plus standard deviation at rest
 _STILL_FORCE_SIGMA = 0.03  # m/s^2, of the mean force less gravity and bias, at rest
 _MOVING_FORCE_SIGMA = 1.5  # m/s^2, the same in motion
 _STILL_RATE_SIGMA = 0.005  # rad/s, of the mean rate less bias, at rest
+EXTRINSIC_SIGMA_RAD, EXTRINSIC_SIGMA_M = 1e-5, 1e-5  # of T_body_cam; small: as calibrated
+_TIMESHIFT_SIGMA_S = 1e-6  # the same, of the camera's time offset to the IMU
 _RATE_GATE, _FORCE_GATE = 16.3, 10.8  # chi-square, 3 and 1 degrees of freedom, 0.1 %
 
 
@@ -56,18 +58,18 @@ def state_from_imu(
     if is_still and _contradicts_rest(bias, force, rate, config.gravity):
         bias = unknown_bias(config)
     T = align_to_gravity(force - bias.accel, rig.T_body_cam0[:3, 2])
-    state = _state_at_image(stamp_ns, T, rig, bias, _initial_sigmas(is_still, bias, config))
+    state = _state_at_image(stamp_ns, T, rig, bias, _initial_sigmas(is_still, bias))
     _update_with_force(state, force, _STILL_FORCE_SIGMA if is_still else _MOVING_FORCE_SIGMA, config.gravity)
     if is_still:
         _update_with_rate(state, rate)
     return state
 
 
-def state_from_camera(stamp_ns: int, rig: Rig, config: InertialConfig, bias: ImuBias) -> FilterState:
+def state_from_camera(stamp_ns: int, rig: Rig, bias: ImuBias) -> FilterState:
     """Return a state for a body without IMU samples: up is the top of the image."""
     up = rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
     T = align_to_gravity(up, rig.T_body_cam0[:3, 2])
-    sigma = _initial_sigmas(False, bias, config)
+    sigma = _initial_sigmas(False, bias)
     sigma[0:2] = _GAUGE_SIGMA  # constant velocity says nothing of gravity
     return _state_at_image(stamp_ns, T, rig, bias, sigma)
 
@@ -98,13 +100,13 @@ def _contradicts_rest(bias: ImuBias, force: F64, rate: F64, g: float) -> bool:
     return bool(rate_nis > _RATE_GATE or force_nis > _FORCE_GATE)
 
 
-def _initial_sigmas(is_still: bool, bias: ImuBias, config: InertialConfig) -> F64:
+def _initial_sigmas(is_still: bool, bias: ImuBias) -> F64:
     out = np.zeros(CORE_SIZE)
     out[0:2], out[2:6] = _UNKNOWN_TILT_RAD, _GAUGE_SIGMA
     out[VELOCITY] = _STILL_SPEED_SIGMA if is_still else _MOVING_SPEED_SIGMA
     out[GYRO_BIAS], out[ACCEL_BIAS] = bias.gyro_sigma, bias.accel_sigma
-    out[EXTRINSIC][:3], out[EXTRINSIC][3:] = config.extrinsic_rad, config.extrinsic_m
-    out[TIMESHIFT] = config.offset_s
+    out[EXTRINSIC][:3], out[EXTRINSIC][3:] = EXTRINSIC_SIGMA_RAD, EXTRINSIC_SIGMA_M
+    out[TIMESHIFT] = _TIMESHIFT_SIGMA_S
     return out
 
 
@@ -177,62 +179,6 @@ def estimated_bias(s: FilterState, config: InertialConfig) -> ImuBias | None:
         return ImuBias(s.bg.copy(), s.ba.copy(), gyro, accel)
     except ValueError:
         return None
-
-
-# The up direction by an accelerometer nearly at rest, for the tracker without IMU.
-
-STANDARD_GRAVITY = 9.80665  # m/s^2
-MIN_SAMPLES = 20  # with fewer there is no estimate
-REST_SAMPLES = 60  # the newest ones, by which rest is detected
-MAX_SAMPLES = 200  # averaged for an estimate in motion
-GRAVITY_TOLERANCE = 0.08  # of gravity; the zero of an uncalibrated BMI055, a D435i's, is up to 0.07 off
-MAX_ACCEL_STD = 0.6  # m/s^2, standard deviation: a headset on a standing person, motors idling
-MAX_MEAN_RATE = 0.15  # rad/s
-UP_SIGMA_RAD = float(np.radians(3.0))  # of up, as nothing corrects it
-
-
-class GravityEstimator:
-    """Up is the mean specific force, if the body hardly turns or shakes and the force has the size of
-    gravity.
-
-    A body that starts in motion measures its acceleration too: 1 m/s^2 tilts "up" by 6 degrees.
-    """
-
-    def __init__(self, max_frames: int = 10) -> None:
-        self._max_frames = max_frames
-        self._imu = np.zeros((0, 6))  # gyro, accel of the newest samples
-        self._frames = 0
-
-    @property
-    def has_timed_out(self) -> bool:
-        """Whether the IMU was silent, or the body not at rest, for too long: begin without knowing up."""
-        return self._frames >= self._max_frames
-
-    def add(self, imu: ImuBatch) -> F64 | None:
-        """Add samples of a frame. Return the unit vector up (3,) in the body frame, None while unknown."""
-        self._imu = np.concatenate([self._imu, np.hstack([imu.gyro, imu.accel])])[-MAX_SAMPLES:]
-        self._frames += 1
-        newest = self._imu[-REST_SAMPLES:]
-        return _mean_direction(newest) if len(newest) >= MIN_SAMPLES and _is_at_rest(newest) else None
-
-    def mean_direction(self) -> F64 | None:
-        """Return the direction of the mean specific force, at rest or not; None with too few samples."""
-        return _mean_direction(self._imu) if len(self._imu) >= MIN_SAMPLES else None
-
-
-def _is_at_rest(imu: F64) -> bool:
-    force = np.linalg.norm(imu[:, 3:].mean(axis=0))
-    accel_std = np.linalg.norm(imu[:, 3:].std(axis=0))
-    mean_rate = np.linalg.norm(imu[:, :3].mean(axis=0))
-    right_size = abs(force - STANDARD_GRAVITY) < GRAVITY_TOLERANCE * STANDARD_GRAVITY
-    return bool(right_size and accel_std < MAX_ACCEL_STD and mean_rate < MAX_MEAN_RATE)
-
-
-def _mean_direction(imu: F64) -> F64 | None:
-    """Return the unit mean of the accelerations in (N, 6); None in free fall."""
-    mean = imu[:, 3:].mean(axis=0)
-    magnitude = float(np.linalg.norm(mean))
-    return mean / magnitude if magnitude > 0.5 * STANDARD_GRAVITY else None
 
 
 def align_to_gravity(up: F64, forward: F64) -> F64:

@@ -26,24 +26,26 @@ from share.odometry.state import FilterState
 from share.types import F32, F64, FeatureStatistics, Frame, View
 from share.vision.orb import ViewBuilder
 
+KEYFRAME_GAP_NS = 100_000_000  # least time between keyframes
+
 
 class KeyframeSpacing:
     """Decides when a frame is far enough from the newest keyframe, by poses (4, 4) of the body or of the
     camera.
 
-    gap_s: minimum time between keyframes. distance_m, angle_rad: after more motion than this. min_share: or
-    with less than this part of the newest keyframe's features left.
+    distance_m, angle_rad: after more motion than this. min_share: or with less than this part of the newest
+    keyframe's features left.
     """
 
-    def __init__(self, gap_s: float, distance_m: float, angle_rad: float, min_share: float) -> None:
-        self._gap_ns, self._distance_m, self._min_share = gap_s * 1e9, distance_m, min_share
+    def __init__(self, distance_m: float, angle_rad: float, min_share: float) -> None:
+        self._distance_m, self._min_share = distance_m, min_share
         self._min_cosine = np.cos(min(angle_rad, np.pi))
-        self.stamp_ns = self.feature_count = 0  # of the newest keyframe
+        self.stamp_ns, self.feature_count = -(2**62), 0  # of the newest keyframe
         self.T = np.eye(4)
 
     def wants_keyframe(self, stamp_ns: int, T: F64, inlier_count: int) -> bool:
         """Return whether a frame with `inlier_count` features is to be a keyframe."""
-        if stamp_ns - self.stamp_ns < self._gap_ns:
+        if stamp_ns - self.stamp_ns < KEYFRAME_GAP_NS:
             return False
         cosine = ((self.T[:3, :3] * T[:3, :3]).sum() - 1) / 2  # of the angle between the two
         return bool(
@@ -92,6 +94,7 @@ class LastPublishedKeyframe:
         ) + _RELOCALISED_COV
 
 
+_MIN_SEEN_SHARE = 0.8  # a smaller share of the newest keyframe's features in use triggers another
 _PUBLISH_GAP_NS = 400_000_000  # minimum between published keyframes
 _SLICE_PERIOD_NS = 30_000_000  # of the time between frames: two slices a frame at 15 Hz, one at 20 and at 30
 
@@ -148,8 +151,7 @@ class KeyframeScheduler:
 
     def __init__(self, rig: Rig, config: InertialConfig, view_features: int) -> None:
         self._rig, self._view_features = rig, view_features
-        c = config
-        self._spacing = KeyframeSpacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_seen)
+        self._spacing = KeyframeSpacing(config.keyframe_m, config.keyframe_rad, _MIN_SEEN_SHARE)
         self._last_published = LastPublishedKeyframe()
         self._published_ns = self._processed_ns = 0
         self._offered: OfferedKeyframe | None = None

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.odometry import feature_appearance, feature_matching, filter, outliers, state_augmentation
-from share.odometry.depth_prior import DepthPrior, prior_from_neighbours
+from share.odometry import feature_appearance, feature_matching, filter, initial_depth, state
 from share.odometry.dormant_features import DormantFeatures
 from share.odometry.feature_appearance import Appearance
 from share.odometry.feature_matching import FeatureMatches, Prediction
@@ -20,13 +19,12 @@ from share.odometry.state import FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
 from share.vision import corners
 from share.vision.corners import field_mask
-from share.vision.depth import disparity_per_rho, from_depth_camera, from_stereo, search_depth
 from share.vision.orb import measures_depth
 
-_DEPTH_SIGMA_PX, _DEPTH_BASELINE_M = 0.3, 0.05  # px, m: of the stereo pair inside a depth camera
+LASTING_PX = 0.3  # persistent error of a feature: edges, patches seen from elsewhere
+_SPACING_PX = 18.0  # least distance between new features
 _GRAY_NOISE = 3.0  # gray levels of an image
 _MAX_PATCH_SIGMA_PX = 0.5  # error of a patch's position by image noise; with more it is no feature
-_MAX_DISPARITY_ERROR_PX = 2.0  # between the epipolar search and its refinement
 _AVOID_FRAMES = 30  # for which no feature is searched where a dynamic feature was
 _MIN_DYNAMIC = 5  # dynamic features in a frame that begin a time of caution,
 _CAUTION_FRAMES = 60  # frames of it after the last such frame
@@ -42,8 +40,9 @@ _ACTIVE_FEATURES_COST = 100.0  # added to the distance of a keyframe that anchor
 class LandmarkMap:
     """Keyframes, features and their appearance, in step with `state`."""
 
-    def __init__(self, state: FilterState, rig: Rig, config: InertialConfig) -> None:
-        self.state, self._rig, self._config = state, rig, config
+    def __init__(self, s: FilterState, rig: Rig, config: InertialConfig) -> None:
+        self.state, self._rig, self._config = s, rig, config
+        self.sigma_px = config.sigma_px  # noise of a feature's position, independent in each image
         self.appearance: Appearance = feature_appearance.empty_appearance()
         self._dormant = DormantFeatures()
         self._avoided_px: list[F32] = []
@@ -55,13 +54,16 @@ class LandmarkMap:
 
     def add_keyframe(self, rate: F64) -> int:
         """Add the pose of the frame just tracked as a keyframe. Return its id."""
-        state_augmentation.add_keyframe(self.state, self._next_keyframe, rate)
+        state.add_keyframe(self.state, self._next_keyframe, rate)
         self._next_keyframe += 1
         return self._next_keyframe - 1
 
-    def begin_frame(self, interval_s: float) -> None:
-        """Begin a frame, `interval_s` after the one before."""
+    def match_features(self, frame: Frame, last_image: U8, interval_s: float) -> FeatureMatches:
+        """Return the matches of the features in a frame, `interval_s` after the one with `last_image`."""
         self._probation_frames = int(_PROBATION_S / max(interval_s, 1e-3))
+        matches = feature_matching.match_features(frame, self._rig, self.state, self.appearance)
+        feature_matching.match_by_flow(last_image, frame.image0, self._rig.cam0, self.appearance, matches)
+        return matches
 
     def record_frame(self, matches: FeatureMatches, inliers: NDArray[np.bool_]) -> None:
         """Keep the inliers (N,) of a frame; features that were not found become dormant, the others are
@@ -137,24 +139,6 @@ class LandmarkMap:
         """Search no new features near px (N, 2) for a while."""
         self._avoided_px = [*self._avoided_px[-_AVOID_FRAMES:], px]
 
-    def mark_dynamic(self, matches: FeatureMatches, rate: F64) -> None:
-        """Mark dynamic features among the matches, in place, where the IMU alone does not explain the
-        image."""
-        indices = np.flatnonzero(matches.is_found)
-        camera, config = self._rig.cam0, self._config
-        residual = camera.to_image_plane(matches.at[indices]) - camera.to_image_plane(
-            matches.predicted_uv[indices]
-        )
-        if len(indices) == 0 or outliers.matches_imu(
-            residual * camera.focal, config.sigma_px, config.lasting_px
-        ):
-            return
-        rows = self.cam0_measurements(matches.at, indices, rate)
-        static = outliers.static_inliers(
-            self.state, rows, matches.px[indices], self.is_proven(indices), camera
-        )
-        matches.is_dynamic[indices[~static]] = True
-
     def cam0_measurements(self, uv: F64, indices: I64, rate: F64) -> filter.FeatureMeasurements:
         """Return measurements of features `indices` (M,) at uv (N, 2) of all in cam0."""
         return self._measurements(indices, uv[indices], None, rate)
@@ -190,7 +174,7 @@ class LandmarkMap:
             predicted, uv = self._in_image_plane(
                 predicted, uv, np.zeros(len(indices), bool) if in_cam1 is None else in_cam1
             )
-        sigma, correlated_sigma = self._config.sigma_px / focal, self._config.lasting_px / focal
+        sigma, correlated_sigma = self.sigma_px / focal, LASTING_PX / focal
         return filter.feature_measurements(self.state, indices, predicted, uv, sigma, correlated_sigma, rate)
 
     def _in_image_plane(
@@ -241,9 +225,7 @@ class LandmarkMap:
         """Return px (N, 2) of corners for new features of a keyframe, away from occupied_px (M, 2), best
         first."""
         max_count = self._config.features if self._free_slots() else 0
-        return corners.detect(
-            frame.image0, occupied_px, max_count, self._config.spacing_px, field_mask(self._rig.cam0)
-        )
+        return corners.detect(frame.image0, occupied_px, max_count, _SPACING_PX, field_mask(self._rig.cam0))
 
     def admit_features(self, frame: Frame, keyframe_id: int, px: F32) -> None:
         """Add features at px (N, 2) of `frame`, the keyframe with this id; the last frame may be a later
@@ -258,7 +240,7 @@ class LandmarkMap:
     def _add_features(self, frame: Frame, anchor: int, px: F32) -> None:
         camera, s = self._rig.cam0, self.state
         ray = camera.normalise(px.astype(np.float64))
-        prior = self._initial_depths(frame, px, ray)
+        prior = initial_depth.initial_depths(frame, self._rig, s, px, ray, self.appearance.last_px)
         appearance = feature_appearance.extract_appearance(
             frame.image0, camera, px, ray, np.nan_to_num(prior.rho)
         )
@@ -267,7 +249,7 @@ class LandmarkMap:
         self._next_feature += len(ids)
         prior = prior.take(is_usable)
         old_count = len(s.feature_ids)
-        state_augmentation.add_features(
+        state.add_features(
             s,
             ids,
             np.full(len(ids), anchor),
@@ -281,47 +263,14 @@ class LandmarkMap:
         px_now = camera.distort(feature_matching.predict(s, np.arange(old_count, old_count + len(ids))).uv)
         self.appearance.last_px[old_count:] = np.where(np.isnan(px_now), px[is_usable], px_now)
 
-    def _initial_depths(self, frame: Frame, px: F32, ray: F64) -> DepthPrior:
-        """Return the inverse depths of new features, measured or else by the prior; NaN where a
-        measurement fails."""
-        if not measures_depth(frame, self._rig):
-            return prior_from_neighbours(self.state, px, self.appearance.last_px)
-        focal, n = self._rig.cam0.focal, len(px)
-        if frame.image1 is not None and self._rig.cam1 is not None:
-            z = self._stereo_depth(frame.image0, frame.image1, px, ray)
-            sigma = np.full(n, self._config.stereo_px / focal / self._rig.baseline)
-            if self._rig.cam1.is_fisheye:
-                sigma = self._config.stereo_px / disparity_per_rho(self._rig, ray, 1 / z)
-        else:
-            assert frame.depth is not None
-            z = from_depth_camera(frame.depth, self._rig, ray)
-            sigma = np.full(n, _DEPTH_SIGMA_PX / focal / _DEPTH_BASELINE_M)
-        return DepthPrior(1 / z, sigma, np.zeros((n, 0)), np.zeros(n))
-
-    def _stereo_depth(self, image0: U8, image1: U8, px: F32, ray: F64) -> F64:
-        """Return the depth (N,) m by epipolar search and subpixel refinement; NaN where it is ambiguous or
-        they disagree."""
-        coarse = search_depth(image0, image1, self._rig, px, ray)
-        out, found = np.full(len(px), np.nan), np.flatnonzero(~np.isnan(coarse))
-        z = from_stereo(image0, image1, self._rig, px[found], ray[found], coarse[found])
-        error_px = np.abs(1 / z - 1 / coarse[found]) * self._rig.cam0.focal * self._rig.baseline
-        if self._rig.cam0.is_fisheye:
-            error_px = np.abs(1 / z - 1 / coarse[found]) * disparity_per_rho(
-                self._rig, ray[found], 1 / coarse[found]
-            )
-        out[found] = np.where(error_px < _MAX_DISPARITY_ERROR_PX, z, np.nan)
-        return out
-
     def reactivate(self, frame: Frame, rate: F64) -> F32:
         """Reactivate dormant features where the frame just tracked shows them within the gate. Return
         their px (M, 2)."""
-        s, config, old_count = self.state, self._config, len(self.state.feature_ids)
-        dormant = self._dormant.nearby(s, self._rig.cam0, config.recall_m, config.recall_rad, config.recall)
+        s, old_count = self.state, len(self.state.feature_ids)
+        dormant = self._dormant.nearby(s, self._rig.cam0)
         if dormant is None:
             return np.zeros((0, 2), np.float32)
-        state_augmentation.add_features(
-            s, dormant.ids, dormant.anchor, dormant.ray, dormant.rho, dormant.sigma
-        )
+        state.add_features(s, dormant.ids, dormant.anchor, dormant.ray, dormant.rho, dormant.sigma)
         self.appearance = self.appearance.concatenate(dormant.appearance)
         recognised = self._is_recognised(frame, rate, old_count)
         self._dormant.reactivate(s.feature_ids[recognised][old_count:])
@@ -331,21 +280,19 @@ class LandmarkMap:
     def _is_recognised(self, frame: Frame, rate: F64, start: int) -> NDArray[np.bool_]:
         """Return True for features before index `start`, and for the others that are found within the
         gate."""
-        matches = feature_matching.match_features(
-            frame, self._rig, self.state, self.appearance, self._config, start
-        )
+        matches = feature_matching.match_features(frame, self._rig, self.state, self.appearance, start)
         self.appearance.last_px[matches.is_found] = matches.px[matches.is_found]
         rows = self.cam0_measurements(matches.at, np.flatnonzero(matches.is_found), rate)
         recognised = np.arange(len(self.state.feature_ids)) < start
         if len(rows.feature):
             _, S = filter.innovation_covariance(self.state, rows)
-            recognised[rows.feature[filter.nis(rows, S) < self._config.gate]] = True
+            recognised[rows.feature[filter.nis(rows, S) < filter.GATE]] = True
         return recognised
 
     def keep_features(self, keep: NDArray[np.bool_]) -> None:
         """Drop the features where keep (N,) is False."""
         if not keep.all():
-            state_augmentation.keep_features(self.state, keep)
+            state.keep_features(self.state, keep)
             self.appearance = self.appearance.take(keep)
 
     def drop_dormant(self) -> None:
@@ -377,4 +324,4 @@ class LandmarkMap:
             return
         self._dormant.drop_keyframes(s.keyframe_ids[dropped])
         self.appearance = self.appearance.take(~dropped[s.anchor])
-        state_augmentation.drop_keyframes(s, s.keyframe_ids[dropped])
+        state.drop_keyframes(s, s.keyframe_ids[dropped])

@@ -10,12 +10,12 @@ import numpy as np
 from share.config import InertialConfig
 from share.geometry.camera import Camera, ImuNoise, rays
 from share.odometry import filter, mono_bundle
-from share.odometry.depth_prior import FEATURE_SPREAD, MEAN_RHO, ROOM_LOG_SIGMA
 from share.odometry.feature_matching import anchors_in_camera
-from share.odometry.landmarks import LandmarkMap
-from share.odometry.mono_bundle import BundleModel, BundleSolution, WindowFrame
-from share.odometry.normal_equations import FRAME_SIZE
+from share.odometry.initial_depth import FEATURE_SPREAD, MEAN_RHO, ROOM_LOG_SIGMA
+from share.odometry.landmarks import LASTING_PX, LandmarkMap
+from share.odometry.mono_bundle import FRAME_SIZE, BundleModel, BundleSolution, WindowFrame
 from share.odometry.state import CORE_SIZE, EXTRINSIC, FilterState
+from share.odometry.visual_update import COMMON_COV
 from share.types import F64, ImuBatch
 
 _FRAME_GAP_NS = 90_000_000  # minimum between frames of the window that are no keyframes
@@ -34,13 +34,11 @@ _GAUGE_SIGMA = 1e-3  # rad, 1/m
 class MonoWindow:
     """Frames since the first keyframe."""
 
-    def __init__(
-        self, first: FilterState, camera: Camera, noise: ImuNoise, config: InertialConfig, common_cov: F64
-    ) -> None:
-        sigma = _NOISE_SCALE * float(np.hypot(config.sigma_px, config.lasting_px)) / camera.focal
+    def __init__(self, first: FilterState, camera: Camera, noise: ImuNoise, config: InertialConfig) -> None:
+        sigma = _NOISE_SCALE * float(np.hypot(config.sigma_px, LASTING_PX)) / camera.focal
         self._first, self._camera = copy.deepcopy(first), camera
         self._model = BundleModel(
-            noise, config.gravity, sigma, common_cov, MEAN_RHO, ROOM_LOG_SIGMA, FEATURE_SPREAD
+            noise, config.gravity, sigma, COMMON_COV, MEAN_RHO, ROOM_LOG_SIGMA, FEATURE_SPREAD
         )
         self._frames: list[WindowFrame] = []
         self._add(first, ImuBatch.empty(), np.zeros((0, 2)), is_keyframe=True)
@@ -116,7 +114,7 @@ class MonoWindow:
 
 
 def start_mono_window(
-    first: FilterState, camera: Camera, noise: ImuNoise, config: InertialConfig, common_cov: F64
+    first: FilterState, camera: Camera, noise: ImuNoise, config: InertialConfig
 ) -> MonoWindow | None:
     """Return a window where depth is unknown, None where it was measured.
 
@@ -125,7 +123,7 @@ def start_mono_window(
     """
     if filter.scale_sigma(first) < _UNKNOWN_SCALE_SIGMA:
         return None
-    window = MonoWindow(first, camera, noise, config, common_cov)
+    window = MonoWindow(first, camera, noise, config)
     _fix_gauge(first)
     return window
 

@@ -17,7 +17,6 @@ from share.geometry import se3
 from share.geometry.camera import rays
 from share.odometry.feature_matching import pose_jacobian
 from share.odometry.imu_propagation import ImuPropagation
-from share.odometry.normal_equations import inverse
 from share.odometry.state import IMU_STATE_SIZE, FilterState
 from share.types import F64, I64
 
@@ -124,6 +123,10 @@ class ShootingSolver:
         delta, s = se3.exp(x[:6]), self.state
         v = delta[:3, :3] @ s.v + x[6:9]
         self.state = replace(s, T=delta @ s.T, v=v, bg=s.bg + x[9:12], ba=s.ba + x[12:])
+
+
+def inverse(A: F64) -> F64:
+    return np.asarray(np.linalg.inv(A), np.float64)
 
 
 def state_error(target: FilterState, source: FilterState) -> F64:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from share.config import TrackerConfig
 from share.geometry import se3
 from share.geometry.absolute_pose import RansacOptions, absolute_pose
 from share.geometry.camera import Camera, Rig
@@ -18,6 +17,11 @@ from share.vision.matching import match_descriptors
 from share.vision.orb import detect_orb
 
 # Pose of a camera from known points: RANSAC, then weighted least squares.
+
+RANSAC_PX = 3.0  # reprojection error of a RANSAC inlier
+NOISE_PX = 1.0  # standard deviation of a point's position in an image
+GATE_SIGMA = 3.0  # a measurement further off is an outlier
+MIN_INLIERS = 15  # points that agree with a pose; with fewer there is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +33,9 @@ class PoseEstimate:
     inliers: NDArray[np.bool_]
 
 
-def ransac_pose(points: F64, uv: F64, focal: float, threshold_px: float, seed: int) -> PoseEstimate | None:
+def ransac_pose(
+    points: F64, uv: F64, focal: float, threshold_px: float, seed: int = 0
+) -> PoseEstimate | None:
     """Return the pose of `absolute_pose` by points (N, 3) m, world, seen at uv (N, 2), with a unit
     covariance; None without a model."""
     if len(points) < 4:
@@ -90,6 +96,9 @@ def reprojection_residuals(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F6
     return (projected - uv) * scale[:, None], J
 
 
+MAX_KEYFRAMES = 60  # of the local map; a full one drops the keyframe closest to another
+
+
 @dataclass(frozen=True, eq=False)
 class LocalKeyframe:
     """A keyframe of the local map: its image, in which patches of points are found, its pose T_odom_cam (4,
@@ -109,8 +118,7 @@ class LocalMap:
     Points have stable ids; a point is dropped with its anchor. The tracker with IMU uses only the keyframes.
     """
 
-    def __init__(self, max_keyframes: int) -> None:
-        self._max_keyframes = max_keyframes
+    def __init__(self) -> None:
         self.keyframes: dict[int, LocalKeyframe] = {}
         self._next_keyframe = 0
         self._next_id = 0
@@ -122,7 +130,7 @@ class LocalMap:
     def add_keyframe(self, image: U8, T_odom_cam: F64) -> int:
         """Add a keyframe and return its number. If the map is full, the most redundant keyframe is
         dropped."""
-        if len(self.keyframes) >= self._max_keyframes:
+        if len(self.keyframes) >= MAX_KEYFRAMES:
             self._drop_keyframe(self._most_redundant())
         keyframe_id = self._next_keyframe
         self._next_keyframe += 1
@@ -192,6 +200,7 @@ class LocalMap:
 # Relocalisation in the keyframes of the local map.
 
 MAX_HAMMING_BITS = 64  # of 256
+_BATCH_SIZE = 8  # keyframes that a LOST frame is matched with
 MATCH_RATIO = 0.8  # of the best distance to the second best (Lowe 2004)
 
 
@@ -199,7 +208,7 @@ class RoundRobin:
     """Takes turns among keyframes, `batch_size` a frame: matching all of them would delay a live camera's
     frames."""
 
-    def __init__(self, batch_size: int) -> None:
+    def __init__(self, batch_size: int = _BATCH_SIZE) -> None:
         self._batch_size, self._offset = batch_size, 0
 
     def reset(self) -> None:
@@ -213,34 +222,26 @@ class RoundRobin:
         return numbers[first : first + self._batch_size]
 
 
-def relocalise(
-    keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, config: TrackerConfig, seed: int
-) -> F64 | None:
+def relocalise(keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, view_features: int) -> F64 | None:
     """Return T_odom_cam (4, 4) of the frame by its ORB features and the keyframe with the most inliers; None
     without enough.
 
     It takes twice as many inliers as tracking, because nothing else confirms the pose.
     """
-    px, descriptors = detect_orb(
-        frame.image0, config.view_features, mask=field_mask(rig.cam0, UNIFORM_FIELD_DEG)
-    )
+    px, descriptors = detect_orb(frame.image0, view_features, mask=field_mask(rig.cam0, UNIFORM_FIELD_DEG))
     uv = rig.cam0.normalise(px.astype(np.float64))
-    estimates = (
-        _match_keyframe(keyframe, uv, descriptors, rig.cam0.focal, config, seed) for keyframe in keyframes
-    )
+    estimates = (_match_keyframe(keyframe, uv, descriptors, rig.cam0.focal) for keyframe in keyframes)
     best = max(
         (estimate for estimate in estimates if estimate is not None),
         key=lambda f: f.inliers.sum(),
         default=None,
     )
-    if best is None or best.inliers.sum() < 2 * config.min_inliers:
+    if best is None or best.inliers.sum() < 2 * MIN_INLIERS:
         return None
     return se3.inverse(best.T)
 
 
-def _match_keyframe(
-    keyframe: LocalKeyframe, uv: F64, descriptors: U8, focal: float, config: TrackerConfig, seed: int
-) -> PoseEstimate | None:
+def _match_keyframe(keyframe: LocalKeyframe, uv: F64, descriptors: U8, focal: float) -> PoseEstimate | None:
     if keyframe.view is None:
         return None
     with_depth = np.flatnonzero(~np.isnan(keyframe.view.points[:, 0]))
@@ -249,9 +250,7 @@ def _match_keyframe(
     )
     points = keyframe.view.points[with_depth[pairs[:, 1]]].astype(np.float64)
     points, matched_uv = se3.transform(keyframe.T_odom_cam, points), uv[pairs[:, 0]]
-    initial = ransac_pose(points, matched_uv, focal, config.ransac_px, seed)
+    initial = ransac_pose(points, matched_uv, focal, RANSAC_PX)
     if initial is None:
         return None
-    return refine_pose(
-        initial.T, points, matched_uv, focal, np.full(len(points), config.noise_px), config.gate_sigma
-    )
+    return refine_pose(initial.T, points, matched_uv, focal, np.full(len(points), NOISE_PX), GATE_SIGMA)

@@ -17,7 +17,17 @@ from share.geometry import se3
 from share.geometry.camera import ImuBias, Rig, rays
 from share.odometry import initialisation, relocalisation
 from share.odometry.keyframes import KeyframeSpacing
-from share.odometry.relocalisation import LocalKeyframe, LocalMap, PoseEstimate, ransac_pose, refine_pose
+from share.odometry.relocalisation import (
+    GATE_SIGMA,
+    MIN_INLIERS,
+    NOISE_PX,
+    RANSAC_PX,
+    LocalKeyframe,
+    LocalMap,
+    PoseEstimate,
+    ransac_pose,
+    refine_pose,
+)
 from share.odometry.track_result import TrackResult, finite_median
 from share.types import (
     F32,
@@ -35,6 +45,15 @@ from share.vision import corners, optical_flow
 from share.vision.corners import UNIFORM_FIELD_DEG, field_mask
 from share.vision.orb import make_view, measure_depth
 
+KEYFRAME_M, KEYFRAME_RAD = 0.15, 0.15  # motion since the last keyframe that triggers a new one
+_UP_SIGMA_RAD = float(np.radians(3.0))  # of a candidate's up, which is 0: not known
+_MIN_TRACKED_SHARE = 0.6  # a smaller share of its features still tracked triggers one too
+_SPACING_PX = 14.0  # least distance between corners
+_WEAK_INLIERS = 40  # features that agree with a pose; fewer: WEAK
+_MAX_SPEED_M_S, _MAX_TURN_RAD_S = 5.0, 12.0  # a pose that implies a faster motion is rejected
+_REOBSERVED_KEYFRAMES = 6  # earlier keyframes whose points are searched for again,
+_REOBSERVE_M, _REOBSERVE_RAD = 1.0, 0.5  # at most so far away
+_REOBSERVE_PX = 3.0  # largest distance between the predicted and the found position of such a point
 MIN_NCC = 0.8  # of a patch matched in an earlier keyframe
 MIN_POINTS_TO_MATCH = 8  # of an earlier keyframe; fewer are not worth an image pyramid
 
@@ -53,14 +72,13 @@ _NO_TRACKS = _Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
 class VisualTracker:
     """Feed frames in order to `track`. Deterministic: the same frames give the same poses."""
 
-    def __init__(self, rig: Rig, config: TrackerConfig, seed: int = 0) -> None:
+    def __init__(self, rig: Rig, config: TrackerConfig) -> None:
         """Raises ValueError for a rig without stereo and depth."""
         if rig.cam1 is None and rig.depth is None:
             raise ValueError("one camera alone gives no scale; stereo or depth is needed")
-        self._rig, self._config, self._seed = rig, config, seed
+        self._rig, self._config = rig, config
         self._T_cam_body = se3.inverse(rig.T_body_cam0)
-        self._gravity_estimator = initialisation.GravityEstimator() if rig.imu else None
-        self._map = LocalMap(config.max_keyframes)
+        self.local_map = LocalMap()
         self._tracks = _NO_TRACKS
         self._found_tracks = _NO_TRACKS  # in the last frame, outliers included
         self._tracked_count = 0  # tracked into the last frame
@@ -69,14 +87,13 @@ class VisualTracker:
         self._T_odom_cam: F64 | None = None  # of the last accepted pose
         self._velocity = np.zeros(6)  # body twist of the camera, rad/s and m/s
         self._cov = np.zeros((6, 6))  # of the last pose against the local map, camera frame
-        c = config
-        self._spacing = KeyframeSpacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_tracked)
+        self._spacing = KeyframeSpacing(KEYFRAME_M, KEYFRAME_RAD, _MIN_TRACKED_SHARE)
         self._new_segment = True  # of the last keyframe
         self._T_last_published = np.eye(4)  # T_odom_body of the last published keyframe
         self._keyframe_pending = False  # the last frame is to become a keyframe of the local map
         self._offered: tuple[Frame, View] | None = None
         self._lost_since_ns: int | None = None
-        self._round_robin = relocalisation.RoundRobin(config.relocalise_hosts)
+        self._round_robin = relocalisation.RoundRobin()
 
     def track(self, frame: Frame) -> TrackResult:
         """Return the causal pose of this frame. Frames must come with rising stamps."""
@@ -87,8 +104,6 @@ class VisualTracker:
             result = self._relocalise(frame)
         else:
             result = self._track_frame(frame, self._T_odom_cam)
-        if self._rig.imu and not len(frame.imu) and result.state is TrackState.OK:
-            result = replace(result, state=TrackState.VISION_ONLY)  # the IMU is silent
         self._image, self._stamp_ns = frame.image0, frame.stamp_ns
         return result
 
@@ -101,12 +116,11 @@ class VisualTracker:
         view = make_view(frame, self._rig, self._config.view_features)
         new_segment = self._new_segment and not self._keyframe_pending
         T_odom_body = self._T_odom_body()
-        up = T_odom_body[2, :3] if self._gravity_estimator else np.zeros(3)
         T_previous_body = T_odom_body if new_segment else se3.inverse(self._T_last_published) @ T_odom_body
         cov = se3.compose_cov(self._T_cam_body, self._cov, np.zeros((6, 6)))
         self._offered = frame, view
         return KeyframeCandidate(
-            T_odom_body, T_previous_body, cov, up, initialisation.UP_SIGMA_RAD, view, new_segment
+            T_odom_body, T_previous_body, cov, np.zeros(3), _UP_SIGMA_RAD, view, new_segment
         )
 
     def finish_keyframe(self) -> None:
@@ -117,7 +131,7 @@ class VisualTracker:
         self._T_last_published = self._T_odom_body()  # not before: making its candidate might have failed
         if self._keyframe_pending:
             self._add_keyframe(frame)
-        self._map.set_view(view)
+        self.local_map.set_view(view)
 
     def reset_after_failure(self, frame: Frame) -> None:
         """Declare LOST: something failed in or after `frame`, the last."""
@@ -139,11 +153,11 @@ class VisualTracker:
         """Return the statistics of the frame just tracked, which must have a pose."""
         assert self._T_odom_cam is not None
         tracks = self._all_found_tracks()
-        rows = self._map.row_indices(tracks.ids)
-        points = np.where(rows[:, None] >= 0, self._map.points[rows], np.nan)
+        rows = self.local_map.row_indices(tracks.ids)
+        points = np.where(rows[:, None] >= 0, self.local_map.points[rows], np.nan)
         z = se3.transform(se3.inverse(self._T_odom_cam), points)[:, 2]
         is_inlier = np.arange(len(rows)) < len(self._tracks.ids)
-        tracked_count, known_count = max(self._tracked_count, len(rows)), len(self._map.ids)
+        tracked_count, known_count = max(self._tracked_count, len(rows)), len(self.local_map.ids)
         return FeatureStatistics(tracks.px, is_inlier, z, tracked_count, known_count)
 
     def _all_found_tracks(self) -> _Tracks:
@@ -155,8 +169,8 @@ class VisualTracker:
     def _median_nis(self, tracks: _Tracks) -> float:
         """Return `TrackResult.median_nis`."""
         assert self._T_odom_cam is not None
-        expected = self._project(se3.inverse(self._T_odom_cam), self._map.row_indices(tracks.ids))
-        return finite_median((((tracks.px - expected) / self._config.noise_px) ** 2).sum(axis=1))
+        expected = self._project(se3.inverse(self._T_odom_cam), self.local_map.row_indices(tracks.ids))
+        return finite_median((((tracks.px - expected) / NOISE_PX) ** 2).sum(axis=1))
 
     def _track_frame(self, frame: Frame, T_last: F64) -> TrackResult:
         dt = (frame.stamp_ns - self._stamp_ns) * 1e-9
@@ -176,14 +190,14 @@ class VisualTracker:
             self._reobserve(frame)
             self._keyframe_pending = True
         count = len(self._tracks.ids)
-        state = TrackState.OK if count >= self._config.weak_inliers else TrackState.WEAK
+        state = TrackState.OK if count >= _WEAK_INLIERS else TrackState.WEAK
         found = self._all_found_tracks()
         result = TrackResult(state, self._T_odom_body(), wants_keyframe, count)
         return replace(result, found_count=len(found.ids), median_nis=self._median_nis(found))
 
     def _follow_tracks(self, image: U8, T_predicted: F64) -> _Tracks:
         assert self._image is not None
-        rows = self._map.row_indices(self._tracks.ids)
+        rows = self.local_map.row_indices(self._tracks.ids)
         tracks = self._tracks.take(rows >= 0)
         expected = self._project(se3.inverse(T_predicted), rows[rows >= 0])
         guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
@@ -194,19 +208,19 @@ class VisualTracker:
 
     def _project(self, T_cam_odom: F64, rows: I64) -> F64:
         """Return predicted px (N, 2) of points of the map, NaN behind the camera."""
-        return self._rig.cam0.project(se3.transform(T_cam_odom, self._map.points[rows]))
+        return self._rig.cam0.project(se3.transform(T_cam_odom, self.local_map.points[rows]))
 
     def _estimate_pose(self, tracks: _Tracks) -> tuple[PoseEstimate | None, _Tracks]:
         """Return the pose T_cam_odom, None without enough inliers, and the inlier tracks."""
-        config, focal = self._config, self._rig.cam0.focal
-        points = self._map.points[self._map.row_indices(tracks.ids)]
+        focal = self._rig.cam0.focal
+        points = self.local_map.points[self.local_map.row_indices(tracks.ids)]
         uv = self._rig.cam0.normalise(tracks.px.astype(np.float64))
-        initial = ransac_pose(points, uv, focal, config.ransac_px, self._seed)
-        if initial is None or initial.inliers.sum() < config.min_inliers:
+        initial = ransac_pose(points, uv, focal, RANSAC_PX)
+        if initial is None or initial.inliers.sum() < MIN_INLIERS:
             return None, _NO_TRACKS
-        sigma = np.full(len(points), config.noise_px)
-        best = refine_pose(initial.T, points, uv, focal, sigma, config.gate_sigma)
-        if best.inliers.sum() < config.min_inliers:
+        sigma = np.full(len(points), NOISE_PX)
+        best = refine_pose(initial.T, points, uv, focal, sigma, GATE_SIGMA)
+        if best.inliers.sum() < MIN_INLIERS:
             return None, _NO_TRACKS
         return best, tracks.take(best.inliers)
 
@@ -215,13 +229,13 @@ class VisualTracker:
         if dt <= 0 or not np.isfinite(estimate.T).all():
             return False
         motion = se3.log(se3.inverse(T_last) @ se3.inverse(estimate.T)) / dt
-        slow = np.linalg.norm(motion[3:]) < self._config.max_speed_m_s
-        return bool(slow and np.linalg.norm(motion[:3]) < self._config.max_turn_rad_s)
+        slow = np.linalg.norm(motion[3:]) < _MAX_SPEED_M_S
+        return bool(slow and np.linalg.norm(motion[:3]) < _MAX_TURN_RAD_S)
 
     def _add_keyframe(self, frame: Frame, new_segment: bool = False) -> None:
         """Add this frame to the local map as a keyframe, with points at free corners."""
         assert self._T_odom_cam is not None
-        anchor = self._map.add_keyframe(frame.image0, self._T_odom_cam)
+        anchor = self.local_map.add_keyframe(frame.image0, self._T_odom_cam)
         self._add_corners(frame, anchor)
         spacing = self._spacing
         spacing.stamp_ns = frame.stamp_ns
@@ -235,62 +249,54 @@ class VisualTracker:
         Matches further away would correct all drift since then in one frame: a jump that a headset shows and
         that the edge's map takes for motion. The edge closes loops.
         """
-        config = self._config
         assert self._T_odom_cam is not None
         T_cam_odom = se3.inverse(self._T_odom_cam)
-        anchors = self._map.keyframes_near(self._T_odom_cam, config.reobserve_m, config.reobserve_rad)
+        anchors = self.local_map.keyframes_near(self._T_odom_cam, _REOBSERVE_M, _REOBSERVE_RAD)
         found = _NO_TRACKS
-        for anchor in anchors[: config.reobserve_hosts]:
-            rows, guess = self._map.visible_points(T_cam_odom, self._rig.cam0, [anchor])
-            fresh = ~np.isin(self._map.ids[rows], self._tracks.ids)
+        for anchor in anchors[:_REOBSERVED_KEYFRAMES]:
+            rows, guess = self.local_map.visible_points(T_cam_odom, self._rig.cam0, [anchor])
+            fresh = ~np.isin(self.local_map.ids[rows], self._tracks.ids)
             if fresh.sum() >= MIN_POINTS_TO_MATCH:
                 found = found.concatenate(
                     self._match_patches(frame.image0, anchor, rows[fresh], guess[fresh])
                 )
-        expected = self._project(T_cam_odom, self._map.row_indices(found.ids))
-        found = found.take(np.linalg.norm(found.px - expected, axis=1) < config.reobserve_px)
+        expected = self._project(T_cam_odom, self.local_map.row_indices(found.ids))
+        found = found.take(np.linalg.norm(found.px - expected, axis=1) < _REOBSERVE_PX)
         estimate, tracks = self._estimate_pose(self._tracks.concatenate(found))
         if estimate is not None:
             self._T_odom_cam, self._tracks = se3.inverse(estimate.T), tracks
 
     def _match_patches(self, image: U8, anchor: int, rows: I64, guess: F32) -> _Tracks:
-        source = self._map.keyframes[anchor].image
-        anchor_px = self._map.anchor_px[rows]
+        source = self.local_map.keyframes[anchor].image
+        anchor_px = self.local_map.anchor_px[rows]
         px, found = optical_flow.track_points(
             source, image, anchor_px, guess, window=15, levels=1, back_check_px=None
         )
         found &= optical_flow.ncc(source, image, anchor_px, px) > MIN_NCC
         found &= self._rig.cam0.has_normalised(px.astype(np.float64))
-        return _Tracks(self._map.ids[rows], px).take(found)
+        return _Tracks(self.local_map.ids[rows], px).take(found)
 
     def _add_corners(self, frame: Frame, anchor: int) -> None:
         assert self._T_odom_cam is not None
         max_count = self._config.corners - len(self._tracks.ids)
         mask = field_mask(self._rig.cam0, UNIFORM_FIELD_DEG)
-        px = corners.strongest(frame.image0, self._tracks.px, max_count, self._config.spacing_px, mask=mask)
+        px = corners.strongest(frame.image0, self._tracks.px, max_count, _SPACING_PX, mask=mask)
         uv = self._rig.cam0.normalise(px.astype(np.float64))
         z = measure_depth(frame, self._rig, px, uv)
         known = ~np.isnan(z)
         points = se3.transform(self._T_odom_cam, rays(uv[known]) * z[known, None])
-        ids = self._map.add_points(anchor, points, px[known])
+        ids = self.local_map.add_points(anchor, points, px[known])
         self._tracks = self._tracks.concatenate(_Tracks(ids, px[known]))
 
     def _initialise(self, frame: Frame) -> TrackResult:
-        """Make the first keyframe, which defines odom: body at the origin, z up as far as known."""
-        up = self._gravity_estimator.add(frame.imu) if self._gravity_estimator else None
-        if self._gravity_estimator and up is None and not self._gravity_estimator.has_timed_out:
-            return TrackResult(TrackState.INITIALISING, None, waiting_for=WaitReason.TILT)
-        if up is None:
-            up = self._gravity_estimator.mean_direction() if self._gravity_estimator else None
-            self._gravity_estimator = None
-        if up is None:
-            up = self._rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
+        """Make the first keyframe, which defines odom: body at the origin, the top of the image up."""
+        up = self._rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
         forward = self._rig.T_body_cam0[:3, 2]
         self._T_odom_cam = initialisation.align_to_gravity(up, forward) @ self._rig.T_body_cam0
         self._add_keyframe(frame, new_segment=True)
-        if len(self._tracks.ids) < self._config.min_inliers:
+        if len(self._tracks.ids) < MIN_INLIERS:
             self._T_odom_cam, self._tracks = None, _NO_TRACKS
-            self._map = LocalMap(self._config.max_keyframes)
+            self.local_map = LocalMap()
             return TrackResult(TrackState.INITIALISING, None, waiting_for=WaitReason.VIEW)
         return TrackResult(TrackState.OK, self._T_odom_body(), True, len(self._tracks.ids), True)
 
@@ -301,20 +307,20 @@ class VisualTracker:
     def _relocalise(self, frame: Frame) -> TrackResult:
         """Relocalise in the local map; after `new_stretch_s`, begin a new segment at the last pose."""
         assert self._lost_since_ns is not None
-        config = self._config
-        T_found = relocalisation.relocalise(self._next_keyframes(), frame, self._rig, config, self._seed)
+        config, keyframes = self._config, self._next_keyframes()
+        T_found = relocalisation.relocalise(keyframes, frame, self._rig, config.view_features)
         waited_s = (frame.stamp_ns - self._lost_since_ns) * 1e-9
         if T_found is not None:
             self._T_odom_cam, self._tracks = T_found, _NO_TRACKS
             self._reobserve(frame)
         elif waited_s < config.new_stretch_s:
             return TrackResult(TrackState.LOST, None)
-        old_map = self._map
+        old_map = self.local_map
         if T_found is None:
-            self._map, self._tracks = LocalMap(config.max_keyframes), _NO_TRACKS
+            self.local_map, self._tracks = LocalMap(), _NO_TRACKS
         self._add_keyframe(frame, new_segment=T_found is None)
-        if len(self._tracks.ids) < config.min_inliers:
-            self._map = old_map  # no features here either: keep the map for relocalisation
+        if len(self._tracks.ids) < MIN_INLIERS:
+            self.local_map = old_map  # no features here either: keep the map for relocalisation
             return TrackResult(TrackState.LOST, None)
         self._lost_since_ns = None
         return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids), T_found is None)
@@ -322,8 +328,8 @@ class VisualTracker:
     def _next_keyframes(self) -> list[LocalKeyframe]:
         """Return the next batch of the local map's keyframes, nearest to the last pose first."""
         assert self._T_odom_cam is not None
-        nearest = self._map.keyframes_near(self._T_odom_cam, np.inf, np.inf)
-        return [self._map.keyframes[n] for n in self._round_robin.next_batch(nearest)]
+        nearest = self.local_map.keyframes_near(self._T_odom_cam, np.inf, np.inf)
+        return [self.local_map.keyframes[n] for n in self._round_robin.next_batch(nearest)]
 
     def _T_odom_body(self) -> F64:
         assert self._T_odom_cam is not None

@@ -10,16 +10,18 @@ from helpers.imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 from share.config import InertialConfig
 from share.geometry import se3
 from share.lab.emulate.sensor.vibration import rotation_rates, vibration_acceleration
-from share.odometry import feature_matching, filter, state_augmentation
-from share.odometry.depth_prior import prior_from_neighbours
-from share.odometry.imu_buffer import ImuBuffer
+from share.odometry import feature_matching, filter
+from share.odometry import state as filter_state
+from share.odometry.imu_predictor import ImuBuffer
 from share.odometry.imu_propagation import noise_with_vibration
+from share.odometry.initial_depth import prior_from_neighbours
+from share.odometry.landmarks import LASTING_PX
 from share.odometry.state import CORE_SIZE, FilterState, initial_state
 from share.types import ImuBatch
 
 FRAME_HZ = 20
 SHIPPED = InertialConfig()
-LASTING_PX, LASTING_S = SHIPPED.lasting_px, 1.0  # a Gauss-Markov process of the world's
+LASTING_S = 1.0  # of a Gauss-Markov process with `LASTING_PX` of the world's
 
 
 @dataclass
@@ -93,7 +95,7 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
         level = world.see(state, taken, rate)
         if len(state.feature_ids) < 0.7 * setup.features or stamp - keyframe_at > 1.0:
             keyframe_at = stamp
-            host = state_augmentation.add_keyframe(state, k, rate)
+            host = filter_state.add_keyframe(state, k, rate)
             next_id = world.new(state, host, k, taken, setup.features - len(state.feature_ids), next_id)
             _forget_idle(state)
         true = path.poses(np.array([state.stamp_ns * 1e-9]))[0]
@@ -127,7 +129,7 @@ def _sigmas(setup: Setup) -> np.ndarray:
 def _forget_idle(state: FilterState) -> None:
     busy = np.unique(state.anchor)
     idle = np.setdiff1d(np.arange(len(state.keyframe_ids)), busy)
-    state_augmentation.drop_keyframes(state, state.keyframe_ids[idle])
+    filter_state.drop_keyframes(state, state.keyframe_ids[idle])
 
 
 class _World:
@@ -179,7 +181,7 @@ class _World:
             level = filter.update(state, rows, *filter.innovation_covariance(state, rows)) / (
                 2 * len(rows.feature)
             )
-        state_augmentation.keep_features(state, inside)
+        filter_state.keep_features(state, inside)
         self._px = seen[0][inside].astype(np.float32)
         return level
 
@@ -202,14 +204,14 @@ class _World:
         ids = np.arange(next_id, next_id + count)
         if self._mono:
             g = prior_from_neighbours(state, px.astype(np.float32), self._px)
-            state_augmentation.add_features(
+            filter_state.add_features(
                 state, ids, np.full(count, host), uv, g.rho, g.sigma, g.J_existing, g.common_sigma
             )
             return next_id + count
         sigma = self._sigma_px / CAMERA.fx / self._rig.baseline
         rho = np.maximum(1 / z + self._rng.normal(0, sigma, count), 0.02)
         hosts = np.full(count, host)
-        state_augmentation.add_features(
+        filter_state.add_features(
             state, np.arange(next_id, next_id + count), hosts, uv, rho, np.full(count, sigma)
         )
         return next_id + count

@@ -1,5 +1,8 @@
 """How many candidates are tried while other queries wait, and while none does."""
 
+import pytest
+
+from share.mapping import query_queue
 from share.mapping.query_queue import CandidateSearch
 
 
@@ -16,8 +19,13 @@ def tried(search: CandidateSearch, hurries: list[bool], hits: set[int]) -> list[
     return out
 
 
+@pytest.fixture(autouse=True)
+def two_in_a_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(query_queue, "HURRY_CANDIDATES", 2)
+
+
 def search() -> CandidateSearch:
-    return CandidateSearch(range(8), max_tried_hurried=2)
+    return CandidateSearch(range(8))
 
 
 def test_all_candidates_are_tried_until_three_are_verified():

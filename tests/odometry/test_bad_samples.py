@@ -14,6 +14,8 @@ from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.track_result import TrackResult
 from share.types import Frame, ImuBatch, TrackState
 
+pytestmark = pytest.mark.long
+
 AT = 5  # the frame that they come in
 
 
@@ -68,7 +70,7 @@ def apart_m(a: list[TrackResult], b: list[TrackResult]) -> list[float]:
         (11, 2, 1, 2.5),
     ],
 )
-def test_a_run_of_wrong_samples_moves_no_pose_and_is_said(
+def test_a_run_of_wrong_samples_is_rejected_and_reported(
     walk: tuple[Frame, ...], clean: list[TrackResult], first: int, count: int, axis: int, by: float
 ) -> None:
     results, tracker = tracked(spoiled(walk, first, count, axis, by))
@@ -79,15 +81,15 @@ def test_a_run_of_wrong_samples_moves_no_pose_and_is_said(
     assert np.trace(results[AT].cov) > np.trace(clean[AT].cov)
 
 
-def test_a_wrong_sample_after_the_image_is_held_against_the_next_frame_only(
+def test_a_wrong_sample_after_the_image_affects_the_next_frame_only(
     walk: tuple[Frame, ...], clean: list[TrackResult]
 ) -> None:
     last = len(walk[AT].imu) - 1
     assert walk[AT].imu.stamps_ns[last] > walk[AT].stamp_ns
     results, tracker = tracked(spoiled(walk, last, 1, 3, 80.0))
     assert tracker.rejected_imu_samples == 1
-    doubted = [result.state is TrackState.VISION_ONLY for result in results]
-    assert doubted == [k == AT + 1 for k in range(len(walk))]
+    is_rejected = [result.state is TrackState.VISION_ONLY for result in results]
+    assert is_rejected == [k == AT + 1 for k in range(len(walk))]
     assert max(apart_m(results, clean)) < 0.02
 
 
@@ -101,7 +103,7 @@ def with_gap(walk: tuple[Frame, ...]) -> tuple[Frame, ...]:
 
 @pytest.mark.parametrize(("axis", "by"), [(0, 34.0), (1, 5.0), (2, -20.0), (3, 150.0), (5, -60.0)])
 @pytest.mark.parametrize("after", [0, 1, 3])  # right ones in the frame
-def test_a_wrong_sample_after_a_gap_moves_no_pose(
+def test_a_wrong_sample_after_a_gap_is_rejected(
     walk: tuple[Frame, ...], clean: list[TrackResult], after: int, axis: int, by: float
 ) -> None:
     frames = with_gap(walk)
@@ -116,7 +118,7 @@ def test_a_wrong_sample_after_a_gap_moves_no_pose(
 
 
 @pytest.mark.parametrize(("axis", "by"), [(1, 30.0), (3, 150.0), (4, 20.0)])
-def test_nor_does_the_first_of_all(walk: tuple[Frame, ...], axis: int, by: float) -> None:
+def test_a_wrong_first_sample_is_rejected(walk: tuple[Frame, ...], axis: int, by: float) -> None:
     values = np.hstack([walk[0].imu.gyro, walk[0].imu.accel])
     values[0, axis] += by
     first = replace(walk[0], imu=ImuBatch(walk[0].imu.stamps_ns, values[:, :3], values[:, 3:]))
@@ -127,7 +129,7 @@ def test_nor_does_the_first_of_all(walk: tuple[Frame, ...], axis: int, by: float
 
 
 @pytest.mark.parametrize(("axis", "by"), [(1, 0.5), (4, 8.0)])
-def test_what_is_too_small_for_that_is_outvoted_by_the_images(
+def test_images_correct_wrong_samples_too_small_to_reject(
     walk: tuple[Frame, ...], clean: list[TrackResult], axis: int, by: float
 ) -> None:
     results, tracker = tracked(spoiled(walk, 3, 10, axis, by))
@@ -135,7 +137,7 @@ def test_what_is_too_small_for_that_is_outvoted_by_the_images(
     assert max(apart_m(results, clean)) < 0.02
 
 
-def test_in_the_dark_nobody_is_told_a_pose_that_rests_on_them(walk: tuple[Frame, ...]) -> None:
+def test_no_pose_is_published_in_the_dark_with_wrong_samples(walk: tuple[Frame, ...]) -> None:
     dark = tuple(
         replace(frame, image0=np.zeros_like(frame.image0), image1=np.zeros_like(frame.image1))
         if frame.index >= AT
@@ -147,6 +149,6 @@ def test_in_the_dark_nobody_is_told_a_pose_that_rests_on_them(walk: tuple[Frame,
     assert results[AT].T_odom_body is None
 
 
-def test_of_the_walk_itself_nothing_is_doubted(walk: tuple[Frame, ...], clean: list[TrackResult]) -> None:
+def test_no_sample_of_a_normal_walk_is_rejected(walk: tuple[Frame, ...], clean: list[TrackResult]) -> None:
     assert {result.state for result in clean} == {TrackState.OK}
     assert tracked(walk)[1].rejected_imu_samples == 0

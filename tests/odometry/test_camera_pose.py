@@ -36,7 +36,7 @@ def test_finds_the_pose_among_sixty_percent_outliers(rng):
     assert best.inliers[:120].mean() < 0.1
 
 
-def test_same_seed_same_answer(rng):
+def test_the_same_seed_gives_the_same_pose(rng):
     _, points, uv = scene(rng, 200, 0.5, outliers=80)
     a, b = (ransac_pose(points, uv, FOCAL, 3.0, seed=7) for _ in range(2))
     assert (a.T == b.T).all()

@@ -1,4 +1,4 @@
-"""The error model that comes with SHARE: small, whole, and it expects more of a tracker that fares badly."""
+"""The shipped error model is small and valid, and expects larger errors where tracking is poor."""
 
 from __future__ import annotations
 
@@ -31,43 +31,43 @@ def network():
     return open_error_model("shipped")
 
 
-def told(
-    network, found: int, believed: int, sigma_cm: float, state=TrackState.OK, surprise=0.3
+def estimate(
+    network, found: int, inlier_count: int, sigma_cm: float, state=TrackState.OK, nis=0.3
 ) -> ErrorEstimate:
     rng = np.random.default_rng(7)
     image = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), np.uint8), (0, 0), 2)
     px = rng.uniform(0, 470, (found, 2)).astype(np.float32)
-    footing = FeatureStatistics(
-        px, np.arange(found) < believed, np.full(found, 2.5), max(found, 30), 3 * found
+    statistics = FeatureStatistics(
+        px, np.arange(found) < inlier_count, np.full(found, 2.5), max(found, 30), 3 * found
     )
-    frames = tuple(FrameOutcome(k * 66_666_667, True, state, found, believed, surprise) for k in range(75))
+    frames = tuple(FrameOutcome(k * 66_666_667, True, state, found, inlier_count, nis) for k in range(75))
     return estimate_error(
-        network, error_model_input(image, footing, RecentMotion(frames, 2.0, 1.5, (sigma_cm,) * 12))
+        network, error_model_input(image, statistics, RecentMotion(frames, 2.0, 1.5, (sigma_cm,) * 12))
     )
 
 
-def test_it_is_there_and_small(network):
+def test_the_shipped_model_is_small(network):
     assert SHIPPED_MODEL.stat().st_size <= 6e6
     assert "MIT" in SHIPPED_MODEL.with_suffix(".md").read_text()
     assert {given.name for given in network.get_inputs()} == set(INPUT_SHAPES)
 
 
-def test_it_expects_more_where_the_tracker_fares_badly(network):
-    well = told(network, 80, 78, 0.4)
-    unsure = told(network, 80, 78, 4.0)
-    blind = told(network, 6, 2, 15.0, TrackState.INERTIAL_ONLY, surprise=8.0)
+def test_a_larger_error_is_expected_where_tracking_is_poor(network):
+    well = estimate(network, 80, 78, 0.4)
+    unsure = estimate(network, 80, 78, 4.0)
+    blind = estimate(network, 6, 2, 15.0, TrackState.INERTIAL_ONLY, nis=8.0)
     assert well.error_cm < 0.5 * unsure.error_cm < blind.error_cm
     assert 0.02 < well.error_cm < 1
     assert blind.error_cm > 3
-    assert blind.high_cm <= MAX_ERROR_CM  # more is not told
+    assert blind.high_cm <= MAX_ERROR_CM  # more is not estimate
 
 
-def test_what_it_expects_lies_in_its_interval(network):
-    for one in (told(network, 80, 78, 0.4), told(network, 6, 2, 15.0, TrackState.INERTIAL_ONLY)):
+def test_the_expected_error_lies_in_its_interval(network):
+    for one in (estimate(network, 80, 78, 0.4), estimate(network, 6, 2, 15.0, TrackState.INERTIAL_ONLY)):
         assert one.low_cm < one.error_cm <= one.high_cm
 
 
-def test_a_file_that_is_no_network_is_named(tmp_path):
+def test_the_message_names_a_file_that_is_no_network(tmp_path):
     path = tmp_path / "mine.onnx"
     path.write_bytes(b"not a network")
     with pytest.raises(DataError, match=r"mine\.onnx: not a usable ONNX network"):
@@ -82,18 +82,20 @@ def small(path: Path, **given: Any) -> Path:
     return path
 
 
-def test_one_written_by_hand_is_an_error_model(tmp_path):
-    assert told(open_error_model(str(small(tmp_path / "a.onnx"))), 80, 78, 0.4).error_cm == pytest.approx(1.0)
+def test_a_minimal_network_is_accepted(tmp_path):
+    assert estimate(open_error_model(str(small(tmp_path / "a.onnx"))), 80, 78, 0.4).error_cm == pytest.approx(
+        1.0
+    )
 
 
 @pytest.mark.parametrize("says", [(np.inf, 0, 0), (np.nan, 0, 0), (0, -np.inf, 0), (1e38, -1e38, 1e38)])
-def test_one_that_says_no_number(tmp_path, says):
+def test_an_output_that_is_not_finite_is_refused(tmp_path, says):
     network = open_error_model(str(small(tmp_path / "a.onnx", says=says)))
     if np.isfinite(says).all():
-        assert told(network, 80, 78, 0.4).error_cm == MAX_ERROR_CM
+        assert estimate(network, 80, 78, 0.4).error_cm == MAX_ERROR_CM
         return
     with pytest.raises(DataError, match="output for a keyframe is not finite"):
-        told(network, 80, 78, 0.4)
+        estimate(network, 80, 78, 0.4)
 
 
 BRANCH = field(1, "body") + field(6, field(1, node("Identity", ["x"], "y"))) + field(20, 5)
@@ -117,14 +119,14 @@ LAYERS = {
 
 
 @pytest.mark.parametrize("name", LAYERS)
-def test_what_no_error_model_needs_is_not_run(tmp_path, name):
+def test_operators_that_no_error_model_needs_are_refused(tmp_path, name):
     more, weights, says = LAYERS[name]
     with pytest.raises(DataError, match=says) as error:
         open_error_model(str(small(tmp_path / "a.onnx", more=more, weights=weights)))
     assert "\n" not in str(error.value)
 
 
-def test_memory_is_bounded_whatever_layers_make_of_it(tmp_path):
+def test_memory_of_a_network_is_bounded(tmp_path):
     """Two of 60,000 numbers, added row to column, are 14 GB."""
     more = [
         node("ReduceMean", ["scalars"], "mean"),
@@ -143,7 +145,7 @@ def test_memory_is_bounded_whatever_layers_make_of_it(tmp_path):
         open_error_model(made(60_000))
 
 
-def test_cut_short_or_not_of_this_kind(tmp_path):
+def test_a_truncated_or_other_file_is_refused(tmp_path):
     whole = small(tmp_path / "a.onnx").read_bytes()
     for k in (0, 1, 5, 100, len(whole) // 2, len(whole) - 1):
         (tmp_path / "b.onnx").write_bytes(whole[:k])
@@ -159,7 +161,7 @@ def test_cut_short_or_not_of_this_kind(tmp_path):
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "huge"])
-def test_a_model_that_is_no_file(tmp_path, kind):
+def test_a_model_that_is_no_regular_file_is_refused(tmp_path, kind):
     path = tmp_path / "a.onnx"
     if kind == "huge":
         with path.open("wb") as file:

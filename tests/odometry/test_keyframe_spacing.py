@@ -1,4 +1,4 @@
-"""When a frame is to be the next keyframe, and whose turn it is to be compared with."""
+"""When a frame is to be a keyframe, and the round robin of relocalisation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SECOND = 1_000_000_000
 
 @pytest.fixture
 def newest() -> KeyframeSpacing:
-    spacing = KeyframeSpacing(gap_s=0.1, distance_m=0.15, angle_rad=0.2, min_share=0.7)
+    spacing = KeyframeSpacing(distance_m=0.15, angle_rad=0.2, min_share=0.7)
     spacing.stamp_ns, spacing.T, spacing.feature_count = (
         SECOND,
         se3.exp(np.array([0, 0, 1.0, 4.0, 5.0, 6.0])),
@@ -37,31 +37,31 @@ def moved(newest: KeyframeSpacing, turn: float = 0.0, way: float = 0.0) -> np.nd
         (0.0, 0.0, 69, True),
     ],
 )
-def test_moved_turned_or_little_left_in_view(
+def test_motion_rotation_or_few_features_trigger_a_keyframe(
     newest: KeyframeSpacing, turn: float, way: float, seen: int, wanted: bool
 ) -> None:
     assert newest.wants_keyframe(2 * SECOND, moved(newest, turn, way), seen) is wanted
 
 
-def test_never_sooner_than_the_gap(newest: KeyframeSpacing) -> None:
+def test_keyframes_keep_the_least_gap(newest: KeyframeSpacing) -> None:
     far = moved(newest, way=3.0)
     assert not newest.wants_keyframe(SECOND + 99_000_000, far, 0)
     assert newest.wants_keyframe(SECOND + 100_000_000, far, 0)
 
 
-def test_all_have_their_turn_likeliest_first_and_then_again() -> None:
+def test_round_robin_goes_through_all_and_starts_again() -> None:
     turns = RoundRobin(2)
     seen = [list(turns.next_batch([9, 7, 5])) for _ in range(4)]
     assert seen[:2] == [[9, 7], [5]]
     assert {n for turn in seen for n in turn} == {9, 7, 5}
 
 
-def test_who_is_lost_anew_begins_with_the_likeliest() -> None:
+def test_round_robin_restarts_after_a_reset() -> None:
     turns = RoundRobin(2)
     turns.next_batch([9, 7, 5])
     turns.reset()
     assert list(turns.next_batch([4, 3])) == [4, 3]
 
 
-def test_nobody_to_compare_with() -> None:
+def test_round_robin_of_none() -> None:
     assert list(RoundRobin(2).next_batch([])) == []

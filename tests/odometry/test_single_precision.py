@@ -1,4 +1,4 @@
-"""Gains in single precision leave poses where double precision has them."""
+"""Updates in single precision give the poses of double precision."""
 
 import numpy as np
 import pytest
@@ -18,9 +18,9 @@ def apart(one: Run, other: Run) -> float:
 
 @pytest.mark.parametrize(("seconds", "features"), [(1.0, 20), pytest.param(60.0, 60, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mono", [False, True])
-def test_poses_do_not_drift_apart(seconds, features, mono, monkeypatch):
+def test_poses_agree_with_double_precision(seconds, features, mono, monkeypatch):
     setup = Setup(seconds=seconds, features=features, mono=mono)
     short = run(0, setup)
-    assert not filter._needs_double_precision(short.state)
-    monkeypatch.setattr(filter, "_needs_double_precision", lambda state: True)
+    assert not filter.needs_double_precision(short.state)
+    monkeypatch.setattr(filter, "needs_double_precision", lambda state: True)
     assert 0 < apart(short, run(0, setup)) < MOST

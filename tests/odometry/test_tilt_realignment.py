@@ -1,4 +1,4 @@
-"""Where the body is told to be when the filter learns what is up."""
+"""Published positions when the filter's tilt improves."""
 
 from __future__ import annotations
 
@@ -54,16 +54,16 @@ def pivot() -> TiltRealignment:
     return out
 
 
-def test_a_body_stays_where_it_was_when_up_is_learnt(pivot):
+def test_the_position_stays_when_the_tilt_improves(pivot):
     learnt = State().moved(turned((0.0, 0.05, 0.0)))
     assert learnt.T[2, 3] < -0.15  # the filter has it elsewhere
     pivot.update(learnt)
-    told = pivot.published_pose(learnt.T)
-    assert told[:3, 3] == pytest.approx([5, 0, 0], abs=1e-9)
-    assert (told[:3, :3] == learnt.T[:3, :3]).all()  # up is right at once
+    published = pivot.published_pose(learnt.T)
+    assert published[:3, 3] == pytest.approx([5, 0, 0], abs=1e-9)
+    assert (published[:3, :3] == learnt.T[:3, :3]).all()  # up is right at once
 
 
-def test_the_filter_turns_about_where_it_began_not_where_it_was_first_told():
+def test_the_filter_rotates_about_its_start_not_its_first_published_pose():
     pivot = TiltRealignment()
     pivot.start(State(), BEGAN, new_segment=True)  # 4 m from there
     learnt = State().moved(turned((0.0, 0.05, 0.0)))
@@ -71,17 +71,17 @@ def test_the_filter_turns_about_where_it_began_not_where_it_was_first_told():
     assert pivot.published_pose(learnt.T)[:3, 3] == pytest.approx([5, 0, 0], abs=1e-9)
 
 
-def test_what_follows_goes_on_from_there(pivot):
+def test_later_motion_continues_from_there(pivot):
     learnt = State().moved(turned((0.0, 0.05, 0.0)))
     pivot.update(learnt)
     step = se3.exp(np.array([0.0, 0.0, 0.1, 0.2, 0.1, 0.0]))
     on = State(learnt.T @ step, learnt.keyframe_ids, learnt.keyframe_poses)
     pivot.update(on)
-    told = se3.inverse(pivot.published_pose(learnt.T)) @ pivot.published_pose(on.T)
-    assert told == pytest.approx(step, abs=1e-9)
+    published = se3.inverse(pivot.published_pose(learnt.T)) @ pivot.published_pose(on.T)
+    assert published == pytest.approx(step, abs=1e-9)
 
 
-def test_other_corrections_are_told_as_they_are(pivot):
+def test_other_corrections_are_published_as_they_are(pivot):
     for correction in (turned((0.0, 0.0, 0.02)), at(0.1)):
         mended = State().moved(correction)
         pivot.update(mended)
@@ -89,14 +89,14 @@ def test_other_corrections_are_told_as_they_are(pivot):
         pivot.update(State())
 
 
-def test_keyframes_that_are_gone_tell_nothing(pivot):
+def test_dropped_keyframes_do_not_count(pivot):
     learnt = State().moved(turned((0.0, 0.05, 0.0)))
     learnt.keyframe_ids = learnt.keyframe_ids + 100
     pivot.update(learnt)
     assert (pivot.offset == 0).all()
 
 
-def test_after_a_loss_odom_is_the_same_and_anew_it_is_not(pivot):
+def test_the_offset_survives_a_loss_but_not_a_new_segment(pivot):
     learnt = State().moved(turned((0.0, 0.05, 0.0)))
     pivot.update(learnt)
     shift = pivot.offset

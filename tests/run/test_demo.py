@@ -17,7 +17,6 @@ from share.geometry import se3
 from share.geometry.interpolation import associate
 from share.lab.emulate.demo import DEFAULT_SCENE, recipe
 from share.lab.emulate.session import make_cached_session
-from share.odometry.initialisation import MIN_SAMPLES
 from share.runtime.offline_tracking import track
 from share.runtime.source import open_source
 from share.sensors.measurement import CAM0, IMU
@@ -41,7 +40,7 @@ def without_up(recording: Path) -> int:
     frames = samples = 0
     for measurement in open_source(str(recording)).measurements():
         samples += measurement.stream == IMU
-        if samples >= MIN_SAMPLES:
+        if samples >= 20:
             break
         frames += measurement.stream == CAM0
     return frames

@@ -10,7 +10,7 @@ import pytest
 from helpers import rig_fuzzer
 from helpers.plain_walk import RIG
 
-from share.config import Config, InertialConfig, TrackerConfig
+from share.config import Config, InertialConfig
 from share.errors import UsageError
 from share.geometry import rig_check, se3
 from share.geometry.camera import ImuBias, Rig
@@ -124,9 +124,11 @@ def test_a_failed_keyframe_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("rig", [RIG, RIG.without_imu()], ids=["imu", "cameras"])
-def test_after_a_failed_keyframe_the_next_motion_starts_at_the_last_published_one(rig: Rig) -> None:
-    often = {"keyframe_m": 1e-4, "keyframe_gap_s": 0.1}
-    config = Config(inertial=InertialConfig(**often), tracker=TrackerConfig(**often))
+def test_after_a_failed_keyframe_the_next_motion_starts_at_the_last_published_one(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("share.odometry.visual_tracker.KEYFRAME_M", 1e-4)
+    config = Config(inertial=InertialConfig(keyframe_m=1e-4))
     tracker = GuardedTracker(rig, config, FaultGuard(lambda text: None))
     frames = iter(rig_fuzzer.walk(16).frames)
     frame = next(frames)

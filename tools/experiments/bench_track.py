@@ -37,7 +37,7 @@ from share.lab.emulate.demo import DEFAULT_SCENE, FALLBACK_SCENE  # noqa: E402
 from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
 from share.lab.emulate.render.context import missing_reason  # noqa: E402
 from share.lab.emulate.session import make_cached_session, make_session  # noqa: E402
-from share.odometry import feature_appearance, feature_matching, filter  # noqa: E402
+from share.odometry import feature_appearance, feature_matching, filter, initial_depth, visual_update  # noqa: E402
 from share.odometry.inertial_tracker import InertialTracker  # noqa: E402
 from share.odometry.landmarks import LandmarkMap  # noqa: E402
 from share.odometry.visual_tracker import VisualTracker  # noqa: E402
@@ -58,7 +58,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (feature_matching, "predict_patches", "expect"),
     (patches, "align", "align"),
     (feature_matching, "match_by_flow", "rescue"),
-    (LandmarkMap, "mark_dynamic", "movers"),
+    (visual_update, "mark_dynamic", "movers"),
     (LandmarkMap, "frame_measurements", "rows"),
     (filter, "relinearised_rows", "relinearised rows"),
     (filter, "innovation_covariance", "gains"),
@@ -66,7 +66,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (LandmarkMap, "record_frame", "slant and runaways"),
     (LandmarkMap, "reactivate", "keyframe: reactivate"),
     (LandmarkMap, "drop_dormant", "keyframe: forget"),
-    (LandmarkMap, "_initial_depths", "keyframe: depth"),
+    (initial_depth, "initial_depths", "keyframe: depth"),
     (feature_appearance, "extract_appearance", "keyframe: patches"),
     (ViewBuilder, "detect", "view: features"),
     (ViewBuilder, "describe", "view: descriptors"),

@@ -1,4 +1,4 @@
-"""Every derivative of the inertial filter against differences of what it is the derivative of."""
+"""Every derivative of the filter against numerical differences."""
 
 import copy
 from dataclasses import replace
@@ -8,7 +8,8 @@ import pytest
 from helpers.imu_world import GRAVITY, NOISE, Path, imu_of, rig
 
 from share.geometry import se3
-from share.odometry import feature_matching, filter, state_augmentation
+from share.odometry import feature_matching, filter
+from share.odometry import state as filter_state
 from share.odometry.imu_propagation import integrate
 from share.odometry.state import CORE_SIZE, TIMESHIFT, initial_state
 
@@ -32,8 +33,8 @@ def state():
     )
     for k in range(2):
         s.T = T[k]
-        state_augmentation.add_keyframe(s, 10 + k, np.array([0.1, 0.2, -0.3]))
-        state_augmentation.add_features(
+        filter_state.add_keyframe(s, 10 + k, np.array([0.1, 0.2, -0.3]))
+        filter_state.add_features(
             s,
             np.arange(5) + 5 * k,
             np.full(5, k),
@@ -65,7 +66,7 @@ def looked(state, T):
 
 
 @pytest.mark.parametrize("right", [False, True])
-def test_what_is_seen(state, right):
+def test_measurement_jacobians(state, right):
     T = RIG.T_cam1_cam0 if right else None
     which = np.arange(10)
     rate = np.array([0.3, -0.2, 0.5])
@@ -82,7 +83,7 @@ def test_what_is_seen(state, right):
         up, down = (looked(moved(state, s * basis(state, k)), T) for s in (1, -1))
         assert np.allclose(H[:, k], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
     later, sooner = copy.deepcopy(state), copy.deepcopy(state)
-    V = filter.twist(state, rate)
+    V = filter_state.twist(state, rate)
     later.T, sooner.T = se3.exp(V * STEP) @ state.T, se3.exp(-V * STEP) @ state.T
     up, down = (looked(s, T) for s in (later, sooner))
     assert np.allclose(H[:, TIMESHIFT], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
@@ -91,7 +92,7 @@ def test_what_is_seen(state, right):
     assert np.allclose(S, H @ state.cov @ H.T + np.eye(20), atol=1e-14)
 
 
-def test_what_lasts_is_the_same_in_both_cameras(state):
+def test_correlated_noise_is_shared_by_both_cameras(state):
     which, rate = np.arange(10), np.zeros(3)
     sigma, lasting = np.full(10, 0.5), np.full(10, 0.3)
     left, right = (
@@ -112,7 +113,7 @@ def test_what_lasts_is_the_same_in_both_cameras(state):
     assert np.allclose(together - alone, shared, atol=1e-14)
 
 
-def test_covariance_of_a_motion(state):
+def test_covariance_of_a_relative_pose(state):
     """Of T_a_b = T_a^-1 T_b, by differences."""
 
     def motion(s):
@@ -126,14 +127,14 @@ def test_covariance_of_a_motion(state):
     assert np.allclose(filter.relative_pose_cov(state, 0, 1), J @ state.cov @ J.T, atol=1e-9, rtol=1e-5)
 
 
-def test_the_twist_is_how_the_pose_moves():
+def test_twist_is_the_derivative_of_the_pose():
     path, t = Path(4), np.array([1.0])
     s = initial_state(
         0, path.poses(t)[0], path.velocity(t)[0], np.zeros(3), np.zeros(3), np.eye(4), np.ones(CORE_SIZE)
     )
     rate = path.inertial(t)[0][0]
     moved = path.poses(t + 1e-4)[0] @ se3.inverse(path.poses(t - 1e-4)[0])
-    assert np.allclose(filter.twist(s, rate), se3.log(moved) / 2e-4, atol=1e-5)
+    assert np.allclose(filter_state.twist(s, rate), se3.log(moved) / 2e-4, atol=1e-5)
 
 
 def test_integration_follows_the_path():
@@ -188,7 +189,8 @@ def test_transition(dt, close):
         assert np.allclose(motion.transition[:, k], numeric, atol=close), k
 
 
-def test_noise_is_that_of_many_runs():
+@pytest.mark.long
+def test_noise_covariance_against_many_runs():
     path, rng = Path(7), np.random.default_rng(8)
     t = np.arange(0, 0.505, 0.005)
     clean, _, _ = imu_of(path, t)

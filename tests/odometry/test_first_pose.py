@@ -1,4 +1,4 @@
-"""When a first pose is told: tilt and velocity known, and no tilt that would carry a runner off."""
+"""When the first pose is published: tilt and velocity are known, and the tilt makes no drift."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def state(tilt_deg: float, speed: float = 0.0, speed_sigma: float = 0.05) -> Fil
     return out
 
 
-def test_the_tilt_is_that_of_both_axes():
+def test_the_tilt_sigma_is_that_of_both_axes():
     assert tilt_sigma(state(2.5)) == pytest.approx(np.radians(2.5))
 
 
@@ -31,22 +31,22 @@ def test_the_tilt_is_that_of_both_axes():
         (state(2.5, 2.0), WaitReason.TILT),
     ],
 )
-def test_it_says_what_it_waits_for(s, waits):
+def test_the_wait_reason(s, waits):
     assert not is_publishable(s, 0.2, new_segment=True)
     assert waiting_for(s) is waits
 
 
-def test_who_rests_or_drives_slowly_is_told_at_once():
+def test_a_resting_or_slow_body_gets_a_pose_at_once():
     for speed in (0.0, 0.6):
         assert is_publishable(state(2.5, speed), 0.0, new_segment=True)
 
 
-def test_a_runner_waits_until_what_is_up_is_known_but_not_for_ever():
+def test_a_fast_body_waits_for_its_tilt_but_not_for_ever():
     assert has_converged(state(2.5, 1.5))
     assert not is_publishable(state(2.5, 1.5), 0.8, new_segment=True)
     assert is_publishable(state(1.1, 1.5), 0.5, new_segment=True)
     assert is_publishable(state(2.5, 1.5), 0.9, new_segment=True)
 
 
-def test_who_was_found_again_in_his_map_does_not_wait():
+def test_a_relocalised_body_does_not_wait():
     assert is_publishable(state(2.5, 1.5), 0.0, new_segment=False)

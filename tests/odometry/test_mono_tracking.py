@@ -1,12 +1,14 @@
-"""One camera and an IMU; and a stereo rig whose second camera is away for a while."""
+"""One camera and an IMU; and a stereo rig whose second camera fails for a while."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from test_inertial import error_m, run, some, states, walk  # noqa: F401
+from test_inertial_tracker import error_m, run, some, states, walk  # noqa: F401
 
 from share.types import ImuBatch, TrackState, WaitReason
+
+pytestmark = pytest.mark.long
 
 OK, STARTING = TrackState.OK, TrackState.INITIALISING
 
@@ -34,18 +36,18 @@ def waiting(frame, count):
 
 
 def scale_of(frames, results, truth):
-    """Length of the way that was told over that of the truth."""
-    told = [
+    """Length of the published path over that of the true one."""
+    published = [
         (f.stamp_ns, r.T_odom_body) for f, r in zip(frames, results, strict=True) if r.T_odom_body is not None
     ]
     at = {int(t): T[:3, 3] for t, T in zip(truth.stamps_ns, truth.T, strict=True)}
-    mine = np.array([T[:3, 3] for _, T in told])
-    true = np.array([at[t] for t, _ in told])
-    return np.linalg.norm(mine - mine.mean(axis=0)) / np.linalg.norm(true - true.mean(axis=0))
+    estimated = np.array([T[:3, 3] for _, T in published])
+    true = np.array([at[t] for t, _ in published])
+    return np.linalg.norm(estimated - estimated.mean(axis=0)) / np.linalg.norm(true - true.mean(axis=0))
 
 
 def test_scale_from_the_imu(walk):  # noqa: F811
-    """Nothing is told before the scale is known."""
+    """No pose is published before the scale is known."""
     mono = alone(walk)
     results, candidates, _ = run(mono, mono[0])
     ready = states(results).index(OK)
@@ -61,21 +63,21 @@ def test_scale_from_the_imu(walk):  # noqa: F811
     assert np.isfinite(candidates[-1].view.points[:, 2]).sum() > 20
 
 
-def test_at_rest_there_is_no_scale_and_none_is_told(walk):  # noqa: F811
+def test_no_pose_at_rest_because_there_is_no_scale(walk):  # noqa: F811
     mono = alone(walk)
     results, candidates, _ = run(mono, waiting(walk[0][0], 90))
     assert set(states(results)) == {STARTING}
     assert candidates == []
 
 
-def test_without_its_imu_a_single_camera_tells_nothing(walk):  # noqa: F811
+def test_no_pose_of_a_single_camera_without_imu_samples(walk):  # noqa: F811
     mono = alone(walk)
-    deaf = [dataclasses.replace(f, imu=ImuBatch.empty()) for f in mono[0][:30]]
-    results, _, _ = run(mono, deaf)
+    without_imu = [dataclasses.replace(f, imu=ImuBatch.empty()) for f in mono[0][:30]]
+    results, _, _ = run(mono, without_imu)
     assert set(states(results)) == {STARTING}
 
 
-def test_a_second_camera_that_goes_and_comes_back(walk):  # noqa: F811
+def test_a_second_camera_that_fails_for_a_while(walk):  # noqa: F811
     frames = some(walk[0], one_eyed, 12, 32)
     results, _, _ = run(walk, frames)
     assert states(results)[3:] == [OK] * (len(frames) - 3)
@@ -83,7 +85,7 @@ def test_a_second_camera_that_goes_and_comes_back(walk):  # noqa: F811
     assert error_m(walk, frames, results) < 0.015
 
 
-def test_a_second_camera_that_comes_late(walk):  # noqa: F811
+def test_a_second_camera_that_starts_late(walk):  # noqa: F811
     frames = some(walk[0], one_eyed, 0, 8)
     results, _, _ = run(walk, frames)
     assert set(states(results)[:8]) == {STARTING}

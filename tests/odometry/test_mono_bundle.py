@@ -1,4 +1,4 @@
-"""The first seconds of a single camera, from nothing, in a world of points."""
+"""Bundle adjustment of the first seconds of a single camera, in a simulated world of points."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,8 @@ def error_of(seed):
     return motion_error(T[-1], v[-1], out.T[-1], out.v[-1]), out.cov[last, last]
 
 
-def test_it_finds_velocity_and_scale_and_knows_how_well():
+@pytest.mark.long
+def test_velocity_and_scale_with_their_covariance():
     """9 degrees of freedom, 8 runs: 95 % of means are from 6.3 to 12.2."""
     nees = []
     for seed in range(8):
@@ -74,7 +75,7 @@ def test_it_finds_velocity_and_scale_and_knows_how_well():
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_few_wrong_sights(seed):
+def test_a_few_outliers(seed):
     """Two in a hundred, by up to 20 px."""
     shots, first, T, v = scene(seed, outliers=0.02)
     out = solve_bundle(shots, first, MODEL)
@@ -82,6 +83,6 @@ def test_a_few_wrong_sights(seed):
     assert np.linalg.norm(motion_error(T[-1], v[-1], out.T[-1], out.v[-1])[6:]) < 0.1
 
 
-def test_the_same_shots_give_the_same_bits():
+def test_the_same_frames_give_the_same_bits():
     a, b = (solve_bundle(*scene(3)[:2], MODEL) for _ in range(2))
     assert a.cov.tobytes() == b.cov.tobytes()

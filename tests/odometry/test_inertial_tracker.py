@@ -1,4 +1,4 @@
-"""The inertial tracker on three seconds of an emulated D435i: exact truth, and what goes wrong."""
+"""The tracker with IMU on three seconds of an emulated D435i with exact truth, and under faults."""
 
 import dataclasses
 
@@ -10,6 +10,7 @@ from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
 from share.metrics.ate import ate
+from share.odometry import initialisation
 from share.odometry.inertial_tracker import InertialTracker
 from share.recordings.trajectory import Trajectory
 from share.runtime.pipeline import read_frames
@@ -18,7 +19,14 @@ from share.sensors.measurement import IMU
 from share.sensors.sequencer import SequencerCounters
 from share.types import ImuBatch, TrackState, WaitReason
 
-OK, BLIND, DEAF, LOST = TrackState.OK, TrackState.INERTIAL_ONLY, TrackState.VISION_ONLY, TrackState.LOST
+pytestmark = pytest.mark.long
+
+OK, BLIND, WITHOUT_IMU, LOST = (
+    TrackState.OK,
+    TrackState.INERTIAL_ONLY,
+    TrackState.VISION_ONLY,
+    TrackState.LOST,
+)
 STARTING = TrackState.INITIALISING
 
 
@@ -49,10 +57,10 @@ def run(walk, frames, config=None):
 
 
 def error_m(walk, frames, results):
-    told = [
+    published = [
         (f.stamp_ns, r.T_odom_body) for f, r in zip(frames, results, strict=True) if r.T_odom_body is not None
     ]
-    stamps, poses = zip(*told, strict=True)
+    stamps, poses = zip(*published, strict=True)
     return ate(Trajectory(np.array(stamps), np.array(poses)), walk[2]).rmse
 
 
@@ -73,7 +81,7 @@ def states(results):
     return [r.state for r in results]
 
 
-def test_to_the_centimetre_and_every_frame(walk, tracked):
+def test_every_frame_is_tracked_to_the_centimetre(walk, tracked):
     frames = walk[0]
     results, candidates, _ = tracked
     assert set(states(results)[:3]) <= {STARTING, OK}
@@ -85,8 +93,8 @@ def test_to_the_centimetre_and_every_frame(walk, tracked):
         assert np.linalg.eigvalsh(r.cov)[0] > 0
 
 
-def test_up_is_up(walk, tracked):
-    """Of the body, as keyframes tell others; the accelerometer of a D435i is off by up to 0.2 m/s^2."""
+def test_the_up_direction(walk, tracked):
+    """Of the body, as keyframes publish it; the accelerometer of a D435i is off by up to 0.2 m/s^2."""
     _, _, truth = walk
     _, candidates, tracker = tracked
     last = tracker.state.stamp_ns
@@ -95,8 +103,8 @@ def test_up_is_up(walk, tracked):
     assert np.linalg.norm(candidates[-1].up) == pytest.approx(1)
 
 
-def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
-    """The first ones were told with a tilt that is off by a degree; what was learnt of it is no turn."""
+def test_keyframes_carry_the_motion_by_the_present_state(walk):
+    """The first keyframes are published with a tilt a degree off; its correction is no rotation."""
     frames, rig, truth = walk
     tracker, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), []
     for k, frame in enumerate(frames):
@@ -106,18 +114,18 @@ def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
     stamps = np.array([stamp for stamp, _ in shown])
     _, true = interpolate(truth.stamps_ns, truth.T, stamps)
     true = se3.inverse(true[:-1]) @ true[1:]
-    told = np.array([c.T_odom_body for _, c in shown])
-    told = se3.inverse(told[:-1]) @ told[1:]
+    published = np.array([c.T_odom_body for _, c in shown])
+    published = se3.inverse(published[:-1]) @ published[1:]
     steps = np.array([c.T_previous_body for _, c in shown[1:]])
     sigma = np.sqrt([np.trace(c.cov[:3, :3]) for _, c in shown[1:]])
-    off, before = (se3.rotation_angle(se3.inverse(T) @ true) for T in (steps, told))
+    off, before = (se3.rotation_angle(se3.inverse(T) @ true) for T in (steps, published))
     assert before.max() > 10 * sigma.max()
     assert (off < 4 * sigma).all()
     assert np.sqrt((off**2).mean()) < 0.2 * np.sqrt((before**2).mean())
 
 
-def test_a_keyframe_brings_two_slices_of_work_a_frame_and_nothing_depends_on_when(walk, tracked):
-    """Others are told of it one frame after its own; its features come with the second slice, or with the
+def test_keyframe_work_is_sliced_and_poses_do_not_depend_on_when_it_runs(walk, tracked):
+    """It is published one frame after its own; its features come with the second slice, or with the
     third where it is shown. Whether anybody calls `finish_keyframe`, or the next frame does it."""
     frames, rig, _ = walk
     tracker, poses, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], {}
@@ -147,7 +155,7 @@ def test_a_keyframe_brings_two_slices_of_work_a_frame_and_nothing_depends_on_whe
 
 
 @pytest.mark.parametrize("every", [2, 3])  # of 15 Hz
-def test_where_frames_are_rare_others_are_told_with_the_next(walk, every):
+def test_at_low_frame_rates_a_keyframe_is_published_with_the_next_frame(walk, every):
     """Of a keyframe, as its view is made in between."""
     frames, rig, _ = walk
     rare, samples = [], ImuBatch.empty()
@@ -161,7 +169,7 @@ def test_where_frames_are_rare_others_are_told_with_the_next(walk, every):
 
 
 class Late:
-    """A source whose IMU has a clock of its own, as its calibration says."""
+    """A source whose IMU has a clock of its own, as calibrated."""
 
     def __init__(self, source, shift_s):
         self.imu_range, self.reports_silence = source.imu_range, source.reports_silence
@@ -178,7 +186,7 @@ class Late:
 
 
 @pytest.mark.parametrize("shift_s", [0.02, -0.02])
-def test_a_timeshift_that_the_calibration_tells_costs_nothing(walk, tracked, plain_session, shift_s):
+def test_a_calibrated_timeshift_does_not_change_the_error(walk, tracked, plain_session, shift_s):
     """Poses are of when the IMU's clock shows the stamp, so the truth is shifted too."""
     source = Late(open_source(f"{plain_session}/ar1"), shift_s)
     frames = list(read_frames(source, Config(), SequencerCounters()))
@@ -192,7 +200,7 @@ def test_a_timeshift_that_the_calibration_tells_costs_nothing(walk, tracked, pla
     assert error_m((None, None, truth), frames, deceived) > 2 * clean
 
 
-def test_same_frames_same_bits(walk):
+def test_the_same_frames_give_the_same_bits(walk):
     a, b = (run(walk, walk[0][:25])[0] for _ in range(2))
     assert [x.cov is None for x in a] == [y.cov is None for y in b]
     for x, y in zip(a, b, strict=True):
@@ -201,7 +209,7 @@ def test_same_frames_same_bits(walk):
             assert (x.cov == y.cov).all()
 
 
-def test_the_imu_carries_it_through_the_dark(walk):
+def test_the_imu_carries_the_pose_through_the_dark(walk):
     frames = some(walk[0], dark, 20, 35)
     results, _, _ = run(walk, frames)
     assert states(results)[20:35] == [BLIND] * 15
@@ -209,34 +217,34 @@ def test_the_imu_carries_it_through_the_dark(walk):
     assert error_m(walk, frames, results) < 0.03
 
 
-def test_an_imu_that_falls_silent_is_seen_and_ends_nothing(walk):
+def test_tracking_continues_when_the_imu_falls_silent(walk):
     frames = some(walk[0], mute, 8, 18)
     results, _, _ = run(walk, frames)
-    assert states(results)[10:18] == [DEAF] * 8  # it is missed after a tenth of a second
+    assert states(results)[10:18] == [WITHOUT_IMU] * 8  # silent after a tenth of a second
     assert states(results)[20:] == [OK] * 25
     assert error_m(walk, frames, results) < 0.02
 
 
-def test_it_says_when_it_has_gone_astray_and_finds_back(walk):
-    """The IMU is silent while the head turns by 2 rad/s, too much at 15 Hz. What is not known is not told for
+def test_divergence_is_reported_and_the_tracker_relocalises(walk):
+    """The IMU is silent while the head turns by 2 rad/s, too much at 15 Hz. No pose is published for
     longer than a second."""
     frames = some(walk[0], mute, 18, 27)
     results, _, _ = run(walk, frames)
-    assert set(states(results)[20:26]) == {DEAF}
+    assert set(states(results)[20:26]) == {WITHOUT_IMU}
     assert set(states(results)[-2:]) <= {OK, STARTING, LOST}
 
 
-def test_an_imu_that_was_never_there(walk):
+def test_tracking_starts_without_any_imu_sample(walk):
     frames = some(walk[0], mute, 0, 99)
     results, candidates, _ = run(walk, frames)
     assert states(results)[:9] == [STARTING] * 9
     assert {r.waiting_for for r in results[:9]} == {WaitReason.IMU}
-    assert states(results)[10:] == [DEAF] * 35
+    assert states(results)[10:] == [WITHOUT_IMU] * 35
     assert error_m(walk, frames, results) < 0.04
     assert all((c.up == 0).all() for c in candidates)
 
 
-def test_lost_without_imu_and_sight_and_found_again(walk):
+def test_lost_without_imu_and_features_and_relocalised(walk):
     frames = some(some(walk[0], mute, 3, 99), dark, 8, 18)
     results, candidates, _ = run(walk, frames)
     assert set(states(results)[9:18]) == {LOST}
@@ -256,7 +264,7 @@ def test_dropped_frames(walk):
     assert error_m(walk, kept, results) < 0.01
 
 
-def test_waits_for_something_to_see(walk):
+def test_the_first_pose_waits_for_features(walk):
     frames = some(walk[0][:15], dark, 0, 6)
     results, _, _ = run(walk, frames)
     assert states(results)[:6] == [STARTING] * 6
@@ -274,7 +282,7 @@ def test_memory_is_bounded(walk):
     assert results[-1].state is OK
 
 
-def test_a_renderer_knows_the_pose_between_frames(walk):
+def test_predicted_poses_between_frames(walk):
     """Two frames ahead, 133 ms: by the IMU to a few mm, without it as far as a head keeps its ways."""
     frames, _, truth = walk
     _, _, tracker = run(walk, frames[:40])
@@ -292,21 +300,40 @@ def test_a_renderer_knows_the_pose_between_frames(walk):
     assert InertialTracker(walk[1], InertialConfig(), TrackerConfig()).predict(to) is None
 
 
-def test_a_camera_that_sits_elsewhere_is_told_and_found(walk, tracked):
+def test_a_wrong_extrinsic_is_reported_and_can_be_estimated(walk, tracked, monkeypatch):
     """Turned by 5 degrees and shifted by 5 cm against its calibration."""
     frames, rig, truth = walk
     off = se3.exp(np.concatenate([np.radians(5) * np.array([0.6, 0.0, 0.8]), [0.03, -0.04, 0.0]]))
     wrong = dataclasses.replace(rig, T_body_cam0=rig.T_body_cam0 @ off)
     fixed, _, _ = run((frames, wrong, truth), frames)
-    _, _, tracker = run((frames, wrong, truth), frames, InertialConfig(extrinsic_rad=0.05, extrinsic_m=0.03))
+    monkeypatch.setattr(initialisation, "EXTRINSIC_SIGMA_RAD", 0.05)
+    monkeypatch.setattr(initialisation, "EXTRINSIC_SIGMA_M", 0.03)
+    _, _, tracker = run((frames, wrong, truth), frames)
     assert all(r.is_consistent for r in tracked[0])
     assert not any(r.is_consistent for r in fixed[-5:])
     left = se3.log(se3.inverse(rig.T_body_cam0) @ tracker.state.T_body_cam)
     assert np.degrees(np.linalg.norm(left[:3])) < 1.5
 
 
-def test_what_it_cannot_track_is_refused():
+def test_a_rig_without_imu_is_refused():
     camera = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
     stereo = Rig(camera, np.eye(4), cam1=camera, T_cam1_cam0=se3.from_rt(np.eye(3), np.array([-0.05, 0, 0])))
     with pytest.raises(ValueError, match="IMU"):
         InertialTracker(stereo, InertialConfig(), TrackerConfig())
+
+
+def test_a_recording_whose_clock_begins_at_zero(walk):
+    frames, rig, _ = walk
+    first_ns = frames[0].stamp_ns
+    first, second = (
+        dataclasses.replace(
+            frame,
+            stamp_ns=frame.stamp_ns - first_ns,
+            imu=dataclasses.replace(frame.imu, stamps_ns=frame.imu.stamps_ns - first_ns),
+        )
+        for frame in frames[:2]
+    )
+    tracker = InertialTracker(rig, InertialConfig(), TrackerConfig())
+    tracker.track(first)
+    assert tracker.track(second).state is not TrackState.LOST
+    assert tracker.state is not None

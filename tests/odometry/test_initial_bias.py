@@ -1,4 +1,4 @@
-"""A bias that a run before has learnt: how the filter begins with it, and what it tells of its own."""
+"""A bias known from an earlier run: the filter begins with it, and returns its own estimate."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def begun(imu, bias):
     return state, up
 
 
-def test_who_knows_its_bias_knows_what_is_up():
+def test_a_known_bias_gives_the_up_direction():
     state, off_deg = begun(at_rest(), unknown_bias(CONFIG))
     assert 2.3 < np.degrees(tilt_sigma(state)) < 2.7
     assert off_deg > 1.0
@@ -43,7 +43,7 @@ def test_who_knows_its_bias_knows_what_is_up():
     np.testing.assert_allclose(state.bg, GYRO, atol=0.002)
 
 
-def test_it_is_as_unsure_of_what_is_up_as_of_the_bias():
+def test_the_tilt_sigma_follows_from_the_bias_sigma():
     off = ImuBias(GYRO, ACCEL + np.array([0.1, -0.1, 0.1]), 0.003, 0.1)
     state, off_deg = begun(at_rest(), off)
     assert 0.4 < off_deg < 2 * np.degrees(tilt_sigma(state))
@@ -52,7 +52,7 @@ def test_it_is_as_unsure_of_what_is_up_as_of_the_bias():
 @pytest.mark.parametrize(
     ("gyro", "accel"), [(GYRO + 0.03 * X, ACCEL), (GYRO, ACCEL + 0.5 * Z)], ids=["turn", "force"]
 )
-def test_samples_at_rest_that_contradict_it_are_believed(gyro, accel):
+def test_samples_at_rest_override_a_contradicting_bias(gyro, accel):
     contradicted, _ = begun(at_rest(gyro, accel), KNOWN)
     unknown, _ = begun(at_rest(gyro, accel), unknown_bias(CONFIG))
     assert contradicted.cov.tobytes() == unknown.cov.tobytes()
@@ -61,7 +61,7 @@ def test_samples_at_rest_that_contradict_it_are_believed(gyro, accel):
     assert tilt_sigma(agreeing) < 0.5 * tilt_sigma(unknown)
 
 
-def test_in_motion_a_mean_force_contradicts_nothing():
+def test_a_mean_force_in_motion_does_not_contradict_the_bias():
     moving, _ = begun(at_rest(accel=ACCEL + 0.5 * Z, shake=1.0), KNOWN)
     assert np.sqrt(np.diag(moving.cov)[ACCEL_BIAS]).max() <= 0.1
 
@@ -72,7 +72,7 @@ def state(gyro_sigma, accel_sigma, ba=ACCEL):
     return initial_state(0, np.eye(4), np.zeros(3), GYRO, ba, np.eye(4), sigma)
 
 
-def test_what_is_told_of_it_is_what_the_filter_knows():
+def test_the_estimated_bias_is_that_of_the_filter():
     learnt = estimated_bias(state(0.0002, 0.01), CONFIG)
     assert learnt is not None
     np.testing.assert_array_equal(learnt.gyro, GYRO)
@@ -90,9 +90,9 @@ def test_what_is_told_of_it_is_what_the_filter_knows():
         state(0.0002, 0.01, np.array([0.0, np.nan, 0.0])),
     ],
 )
-def test_nothing_is_told_before_it_is_learnt_or_where_it_is_none(s):
+def test_an_uncertain_or_implausible_bias_is_not_returned(s):
     assert estimated_bias(s, CONFIG) is None
 
 
-def test_noise_of_the_rig_is_as_the_test_thinks():
+def test_imu_noise_of_the_test_rig():
     assert NOISE.accel_density / np.sqrt(0.005) == pytest.approx(0.03, rel=0.1)

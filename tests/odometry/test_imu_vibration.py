@@ -1,4 +1,4 @@
-"""How loud an IMU's samples show it to be: white noise in full, vibration in part, motion not at all."""
+"""Noise that IMU samples show: white noise in full, vibration in part, motion not at all."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from helpers.imu_world import NOISE, Path, imu_of
 
 from share.geometry.camera import ImuNoise
 from share.lab.emulate.sensor.vibration import vibration_acceleration
-from share.odometry.imu_buffer import ImuBuffer
+from share.odometry.imu_predictor import ImuBuffer
 from share.odometry.imu_propagation import noise_with_vibration
 from share.types import ImuBatch
 
@@ -39,7 +39,7 @@ def test_white_noise_shows_its_density(hz, most, rng):
     assert ratios.max() < most
 
 
-def test_a_slower_accelerometer_that_is_joined_to_the_gyroscope_shows_most_of_its_own(rng):
+def test_an_accelerometer_slower_than_the_gyroscope_shows_most_of_its_noise(rng):
     """250 Hz at the stamps of 400 Hz, as of a D435i: what lies between two samples is no news."""
     t, own = np.arange(0, 12, 1 / 400), np.arange(-0.1, 12.1, 1 / 250)
     noise = rng.normal(0, 0.2 * np.sqrt(250), (len(own), 3))
@@ -59,14 +59,15 @@ def test_a_body_that_moves_shows_no_noise(hz):
         assert noise_with_vibration(NOISE, imu.take(slice(0, 60))) == NOISE
 
 
-def test_the_bob_of_a_walk_is_motion():
+def test_the_bobbing_of_a_walk_is_motion():
     t = np.arange(0, 6, 1 / 400)
     bob = (5.0 * np.sin(2 * np.pi * 2 * t) + 1.0 * np.sin(2 * np.pi * 6 * t))[:, None] * np.ones(3)
     _, accel = shown(batch(t, np.zeros((len(t), 3)), bob))
     assert accel < 1e-3
 
 
-def test_machines_show_more_than_what_they_add_to_velocities():
+@pytest.mark.long
+def test_vibration_shows_more_than_it_adds_to_velocities():
     """Over 0.3 s, rms: an integral loses nearly all of a vibration that the samples follow. (Of one that is
     faster than half their rate, and looks slow, it does not; such samples look like a bias.)"""
     t, ratios = np.arange(0, 10, 1 / 400), []
@@ -95,13 +96,13 @@ def test_the_latest_samples_reach_one_beyond_the_image():
     assert len(samples.latest(0)) <= 2
 
 
-def test_a_shaken_body_goes_less_astray_and_knows_how_far(monkeypatch):
+def test_vibration_noise_reduces_error_and_keeps_the_covariance_right(monkeypatch):
     """White shaking of 1 m/s^2 a sample, as of many small blows."""
     setup = Setup(seconds=3.0, white=1.0, phase=0.4)
-    heard = run(1, setup)
+    measured = run(1, setup)
     monkeypatch.setattr(imu_simulation, "noise_with_vibration", lambda noise, samples: noise)
-    deaf = run(1, setup)
-    off = [np.sqrt((r.pose_errors[20:, 3:6] ** 2).sum(axis=1).mean()) for r in (heard, deaf)]
+    ignored = run(1, setup)
+    off = [np.sqrt((r.pose_errors[20:, 3:6] ** 2).sum(axis=1).mean()) for r in (measured, ignored)]
     assert off[0] < 0.5 * off[1]
-    assert heard.nees[20:, 1].mean() < 10
-    assert deaf.nees[20:, 1].mean() > 50
+    assert measured.nees[20:, 1].mean() < 10
+    assert ignored.nees[20:, 1].mean() > 50

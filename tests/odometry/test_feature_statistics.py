@@ -1,4 +1,4 @@
-"""What both trackers say that the pose of a keyframe rests on."""
+"""Feature statistics of a keyframe, of both trackers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from share.sensors.sequencer import SequencerCounters
 from share.types import FeatureStatistics, Frame
 from share.vision.depth import from_stereo
 
+pytestmark = pytest.mark.long
+
 Walk = tuple[list[Frame], list[tuple[Frame, FeatureStatistics, TrackResult]]]
 
 
 @pytest.fixture(scope="module", params=["inertial", "visual"])
 def walk(request, plain_session):
-    """Rig, and of each keyframe: its own frame, its footing and what the tracker said of it."""
+    """Rig, and of each keyframe: its own frame, its feature statistics and its result."""
     source = open_source(f"{plain_session}/ar1")
     rig = source.rig
     tracker = (
@@ -28,41 +30,41 @@ def walk(request, plain_session):
         if request.param == "inertial"
         else VisualTracker(rig, TrackerConfig())
     )
-    told, tracked = [], []
+    published, tracked = [], []
     for frame in read_frames(source, Config(), SequencerCounters()):
         result = tracker.track(frame)
         tracked.append((frame, result))
         if result.keyframe_ready:
             before = tracker.feature_statistics()
             own, its_result = tracked[-1 - tracker.make_keyframe(frame).frames_ago]
-            told.append((own, before, its_result))
-            again = tracker.feature_statistics()  # what joined since is not what the pose rests on
+            published.append((own, before, its_result))
+            again = tracker.feature_statistics()  # features added since do not count
             if request.param == "inertial":
                 assert again.px.tobytes() == before.px.tobytes()
-    return rig, told
+    return rig, published
 
 
-def test_what_a_pose_rests_on_is_counted_and_in_the_image(walk):
-    rig, told = walk
-    assert len(told) >= 2
-    for _, footing, result in told[1:]:
-        assert footing.inlier.sum() == result.inlier_count > 20
-        assert len(footing.px) == result.found_count
-        assert result.inlier_count / footing.expected > 0.5
-        assert rig.cam0.is_inside(footing.px).all()
-        assert footing.mapped > 20
+def test_inliers_are_counted_and_in_the_image(walk):
+    rig, published = walk
+    assert len(published) >= 2
+    for _, statistics, result in published[1:]:
+        assert statistics.inlier.sum() == result.inlier_count > 20
+        assert len(statistics.px) == result.found_count
+        assert result.inlier_count / statistics.expected > 0.5
+        assert rig.cam0.is_inside(statistics.px).all()
+        assert statistics.mapped > 20
         assert 0 < result.median_nis < 3
 
 
-def test_depths_are_those_that_stereo_measures(walk):
-    rig, told = walk
+def test_depths_agree_with_stereo(walk):
+    rig, published = walk
     off = []
-    for frame, footing, _ in told[1:]:
-        known = footing.inlier & np.isfinite(footing.depth)
-        assert known.sum() > 0.5 * footing.inlier.sum()
-        px = footing.px[known]
+    for frame, statistics, _ in published[1:]:
+        known = statistics.inlier & np.isfinite(statistics.depth)
+        assert known.sum() > 0.5 * statistics.inlier.sum()
+        px = statistics.px[known]
         uv = rig.cam0.normalise(px.astype(np.float64))
-        z = from_stereo(frame.image0, frame.image1, rig, px, uv, footing.depth[known])
-        off += np.abs(z / footing.depth[known] - 1).tolist()
+        z = from_stereo(frame.image0, frame.image1, rig, px, uv, statistics.depth[known])
+        off += np.abs(z / statistics.depth[known] - 1).tolist()
     assert np.nanmedian(off) < 0.02
     assert np.nanpercentile(off, 90) < 0.2

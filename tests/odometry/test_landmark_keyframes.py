@@ -1,4 +1,4 @@
-"""Which keyframes of a scene go where there are too many."""
+"""Which keyframes are dropped where there are too many."""
 
 import dataclasses
 
@@ -12,11 +12,13 @@ from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 
+pytestmark = pytest.mark.long
+
 STILL = np.zeros(3)
 
 
 @pytest.mark.parametrize("held", [(), (0,), (0, 1)])
-def test_those_that_others_are_told_of_stay(plain_session, held):
+def test_published_keyframes_stay(plain_session, held):
     source = open_source(f"{plain_session}/ar1")
     frame = next(iter(read_frames(source, Config(), SequencerCounters())))
     state = initial_state(0, np.eye(4), STILL, STILL, STILL, source.rig.T_body_cam0, np.full(CORE_SIZE, 1e-3))

@@ -1,4 +1,4 @@
-"""Rows of the filter for a fisheye lens are in its image plane, where all pixels are worth the same."""
+"""Measurements of a fisheye lens are in its image plane, where all pixels have the same size."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ LENS = (0.00348, 0.000715, -0.00205, 0.000203)
 FISHEYE = Camera(512, 512, 190.0, 190.0, 254.93, 256.90, LENS, "equidistant")
 
 
-def test_a_pixel_is_as_much_everywhere():
+def test_a_pixel_has_the_same_size_everywhere():
     px = np.array([[255.0, 257], [255 + 240, 257], [100, 400]])
     one = FISHEYE.to_image_plane(FISHEYE.normalise(px + np.array([1.0, 0]))) - FISHEYE.to_image_plane(
         FISHEYE.normalise(px)
@@ -20,7 +20,7 @@ def test_a_pixel_is_as_much_everywhere():
     assert plain.to_image_plane(px) is px
 
 
-def test_what_is_predicted_keeps_its_derivatives(rng):
+def test_derivatives_of_predictions_in_the_image_plane(rng):
     uv, eps = rng.uniform(-2, 2, (6, 2)), 1e-6
     by_rho, mine = rng.normal(size=(6, 2)), np.array([True, True, True, True, False, False])
     by_pose = rng.normal(size=(6, 2, 6))
