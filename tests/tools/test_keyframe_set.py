@@ -38,7 +38,7 @@ def recipe(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def every(tool):
-    return tool("keyframe_types").Spacing(0.1, 0.15, 0.25)
+    return tool("keyframe_set").Spacing(0.1, 0.15, 0.25)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_a_damaged_file_is_named(tool, made, recipe, every, cache, tmp_path):
         path = tmp_path / "bad.msgpack"
         path.write_bytes(bad)
         with pytest.raises(DataError, match=r"bad\.msgpack: is damaged"):
-            tool("keyframe_file").load(path, recipe, every)
+            tool("keyframe_set").load(path, recipe, every)
 
 
 def test_odometry_errs_as_its_covariance_says(tool, rng):
@@ -164,6 +164,6 @@ def test_bad_words_are_refused(tool, capsys):
     assert main(["--scene", "corridor-twinz", "--motion", "walk:"]) == 2
     assert "did you mean 'corridor-twins'" in capsys.readouterr().err
     with pytest.raises(UsageError, match="must be positive"):
-        tool("keyframe_types").Spacing(0.0)
+        tool("keyframe_set").Spacing(0.0)
     with pytest.raises(SystemExit):
         main(["--scene", "plain", "--motion", "walk:", "--seeds", "5:5"])

@@ -18,9 +18,9 @@ from share import startup
 
 startup.prepare_process()
 
-import vio_options  # noqa: E402
 from tool_main import exit_code  # noqa: E402
-from vio_kept import code_version  # noqa: E402
+from vio_sequences import chosen_sequences, code_version  # noqa: E402
+from vio_sequences import parser as sequences_parser  # noqa: E402
 
 from share.cli.compare_trackers import peer_interpreters  # noqa: E402
 from share.config import Config  # noqa: E402
@@ -32,7 +32,7 @@ from share.runtime.source import open_source  # noqa: E402
 
 
 def main() -> int:
-    parser = vio_options.parser(__doc__, "peers", (101,))
+    parser = sequences_parser(__doc__, "peers", (101,))
     parser.add_argument("--peer", action="append", default=[], metavar="NAME=PYTHON", help="may be repeated")
     parser.add_argument("--vocabulary", type=Path, metavar="FILE", help="for ORB-SLAM3")
     options = parser.parse_args()
@@ -41,13 +41,11 @@ def main() -> int:
 
 def measure(options: argparse.Namespace) -> None:
     """Do all runs, seed by seed; then print the table."""
-    (ours, *others), lacking = tracker_entries(
-        Config(), peer_interpreters(options.peer), options.needs_vocabulary
-    )
+    (ours, *others), lacking = tracker_entries(Config(), peer_interpreters(options.peer), options.vocabulary)
     trackers = [replace(ours, identity={**ours.identity, "code": code_version()}), *others]
     for text in lacking:
         print(f"left out: {text}", file=sys.stderr)
-    chosen, found = vio_options.chosen(options), []
+    chosen, found = chosen_sequences(options), []
     writable_dir(options.out)
     for seed in options.seeds:
         for sequence in chosen:
