@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 @click.option(
     "--link", metavar="NAME|FILE", help="Emulate a network to the edge: wifi5, wifi-busy or a YAML file."
 )
-@click.option("--link-seed", type=int, default=0, show_default=True, help="Seed of its delays and losses.")
+@click.option("--link-seed", type=int, default=0, help="Seed of its delays and losses.")
 @click.option("--streamed", is_flag=True, help="Send raw frames and let the edge track (policy streamed).")
 @click.option(
     "--true-error", is_flag=True, help="Report the error against ground truth to the edge, for experiments."

@@ -8,8 +8,9 @@ from typing import Any
 
 import click
 
-from share.cli import dataset_align, dataset_map, options
-from share.cli.terminal import progress
+from share.cli import options
+from share.cli.dataset_align import align
+from share.cli.terminal import print_note, progress
 from share.errors import UsageError
 
 
@@ -22,8 +23,7 @@ def dataset() -> None:
     """
 
 
-dataset.add_command(dataset_align.align)
-dataset.add_command(dataset_map.export)
+dataset.add_command(align)
 
 
 @dataset.command(short_help="Describe a recording or a map.")
@@ -41,13 +41,14 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     """
     from share.recordings.describe import describe_recording
     from share.runtime.source import open_source
-    from share.store.map_store import is_map
+    from share.store.export import describe_map
+    from share.store.map_store import MapStore, is_map
 
     if is_map(Path(source)):
         if calib or frames:
             raise UsageError(f"{source} is a map; --calib and --frames work only with recordings")
-        map_info = dataset_map.map_info(Path(source))
-        click.echo(json.dumps(map_info) if as_json else dataset_map.map_info_text(map_info))
+        found = describe_map(MapStore.read(Path(source)))
+        click.echo(json.dumps(found) if as_json else _map_text(found))
         return
     description = describe_recording(open_source(source, calib, frames))
     click.echo(json.dumps(description) if as_json else _description_text(description))
@@ -67,12 +68,7 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     help="Compress gray images as JPEG of this quality.  [default: keep images as they are, byte for byte]",
 )
 @click.option(
-    "--format",
-    "kind",
-    type=click.Choice(["mcap", "euroc"]),
-    default="mcap",
-    show_default=True,
-    help="Format to write.",
+    "--format", "kind", type=click.Choice(["mcap", "euroc"]), default="mcap", help="Format to write."
 )
 def convert(
     source: str, out: str, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
@@ -128,6 +124,39 @@ def recover(broken: str, out: str, as_json: bool) -> None:
     click.echo(json.dumps(result._asdict()) if as_json else _recovery_text(path, out_file, result))
 
 
+@dataset.command(short_help="Write an edge's map as TUM and PLY files.")
+@click.argument("map_file", metavar="MAP")
+@click.option("--out", required=True, metavar="DIR", help="A new folder.")
+@options.as_json
+def export(map_file: str, out: str, as_json: bool) -> None:
+    """Export the trajectories, points and loops of an edge's map for other programs.
+
+    DIR gets NAME.tum for each agent, points.ply and loops.csv; if MAP holds several maps, each gets its own
+    folder. The edge may be running.
+
+    \b
+    Example:  share dataset export room.sqlite --out room
+    """
+    from share.store.export import export_map as run
+    from share.store.map_store import MapStore
+
+    if not Path(map_file).is_file():
+        raise UsageError(f"{map_file}: no such file")
+    map_state = MapStore.read(Path(map_file)).load()
+    for complaint in map_state.problems:
+        print_note(map_file, complaint)
+    with progress(len(map_state.keyframes), "exporting") as bar:
+        exported = run(map_state, Path(out), bar)
+    if as_json:
+        click.echo(json.dumps({name: {**vars(e), "folder": str(e.folder)} for name, e in exported.items()}))
+        return
+    for name, e in exported.items():
+        click.echo(
+            f"{e.folder}: map {name}, {e.keyframes} keyframes of {', '.join(e.agents)}; "
+            f"{e.points} points, {e.loops} loops"
+        )
+
+
 def _check_mcap(out: Path, source: str) -> None:
     if out.suffix != ".mcap":
         raise UsageError(f"--out {out}: give a name that ends in .mcap")
@@ -174,3 +203,17 @@ def _camera_text(camera: dict[str, Any]) -> str:
     lens_name = "fisheye" if camera["lens"] == "equidistant" else "radial-tangential"
     distortion = lens_name if camera["distortion"] else "no distortion"
     return f"{width}x{height}, f {fx:.1f} {fy:.1f} px, {camera['fov_deg']:.0f} deg wide, {distortion}"
+
+
+def _map_text(d: dict[str, Any]) -> str:
+    lines = [f"{d['name']}: map, schema {d['schema']}, {d['bytes'] / 1e6:.1f} MB"]
+    for name, agent in d["agents"].items():
+        removed = agent["next_keyframe"] - agent["keyframes"]
+        segments_text = f", {agent['stretches']} segments" if agent["stretches"] > 1 else ""
+        lines.append(
+            f"  {name:<10} {agent['kind']:<6} {agent['keyframes']:>6} keyframes, {removed} removed"
+            f"{segments_text}"
+        )
+    lines += [f"  map {name}: {count} keyframes" for name, count in d["maps"].items()]
+    lines.append(f"  {d['loops']} loops, {d['solved']} keyframes in the latest solution")
+    return "\n".join(lines + [f"  damage: {line}" for line in d["damage"]])

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.table import aligned_table
-from share.cli.terminal import LiveLine, Stages
-from share.config import POLICY_NAMES, STREAMED
+from share.cli.terminal import Column, LiveLine, Stages, column_table
+from share.config import STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -30,24 +29,12 @@ class _Seconds(click.FloatRange):
 
 
 @click.command()
-@click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True, help="Length of the run, s.")
-@click.option(
-    "--policy",
-    type=click.Choice(POLICY_NAMES),
-    default=POLICY_NAMES[0],
-    show_default=True,
-    help="How keyframe rates are set.",
-)
-@click.option(
-    "--link",
-    metavar="LINK[,AGENT=LINK…]",
-    help="Emulated network, as share agent --link: one for all agents, or one per agent.",
-)
-@click.option(
-    "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
-)
+@click.option("--seconds", type=_Seconds(3, 600), default=20, help="Length of the run, s.")
+@options.policy
+@options.link
+@options.true_error
 @options.config
-@click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Output folder.")
+@click.option("--out", metavar="DIR", default="share-demo", help="Output folder.")
 @click.option("--scene", help="Kind of room (see share emulate --help).  [default: warehouse]")
 @click.option(
     "--seed", type=click.IntRange(0), help="Seed of the room.  [default: one where agents meet soon]"
@@ -129,49 +116,36 @@ def _renderable_scene(scene: str | None) -> str:
 
 def _score_table(result: SessionScore, streamed: bool) -> str:
     joint = {} if result.joint is None else result.joint.agents
-    head = (
-        "agent",
-        "odom ATE",
-        "map ATE",
-        "pose p50",
-        "p95",
-        "> 20 ms",
-        "corrected p50",
-        "p95",
-        "keyframes",
-        "sent",
-        "corrections",
+
+    def duration(title: str, name: str, percentile: str) -> Column:
+        return title, lambda agent: _ms(result.agents[agent].report[name][percentile])
+
+    def count(name: str) -> Column:
+        return name, lambda agent: str(result.agents[agent].report[name])
+
+    columns: tuple[Column, ...] = (
+        ("agent", str),
+        ("odom ATE", lambda agent: _cm(result.agents[agent].odometry)),
+        ("map ATE", lambda agent: _cm(joint.get(agent))),
+        duration("pose p50", "track_ms", "p50"),
+        duration("p95", "track_ms", "p95"),
+        ("> 20 ms", lambda agent: f"{100 * result.agents[agent].report['over_20ms']:.1f} %"),
+        duration("corrected p50", "corrected_ms", "p50"),
+        duration("p95", "corrected_ms", "p95"),
+        *(count(name) for name in ("keyframes", "sent", "corrections")),
     )
-    rows = [head]
-    for name, agent in result.agents.items():
-        r = agent.report
-        rows.append(
-            (
-                name,
-                _cm(agent.odometry),
-                _cm(joint.get(name)),
-                _ms(r["track_ms"]["p50"]),
-                _ms(r["track_ms"]["p95"]),
-                f"{100 * r['over_20ms']:.1f} %",
-                _ms(r["corrected_ms"]["p50"]),
-                _ms(r["corrected_ms"]["p95"]),
-                str(r["keyframes"]),
-                str(r["sent"]),
-                str(r["corrections"]),
-            )
-        )
-    lines = aligned_table(rows).splitlines()
+    table = column_table(columns, result.agents)
     if streamed:
         untracked = ", ".join(f"{name} {agent.report['untracked']}" for name, agent in result.agents.items())
         note = f"the edge tracked each agent alone; frames without an answer: {untracked}"
-        return "\n".join([*lines, "", note])
+        return f"{table}\n\n{note}"
     members = len(joint)
     verdict = (
         f"{members} of {len(result.agents)} agents in one map"
         + (f", joint ATE {_cm(result.joint.joint)}" if result.joint else "")
         + "  (causal poses, one SE3 alignment for all)"
     )
-    return "\n".join([*lines, "", verdict])
+    return f"{table}\n\n{verdict}"
 
 
 def _cm(ate: Ate | None) -> str:

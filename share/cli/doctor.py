@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 @click.option(
     "--profile",
     default="d435i",
-    show_default=True,
     metavar="NAME|FILE",
     help="What this device should be: d435i, d435i-n100-headset, d435i-turtlebot4, laptop-edge, or a file.",
 )
@@ -28,13 +27,7 @@ if TYPE_CHECKING:
 @click.option("--edge", "address", metavar="tcp://H:P", help="Edge to connect to.")
 @options.keys
 @click.option("--server-key", metavar="FILE|KEY", help="Public key of that edge.")
-@click.option(
-    "--out",
-    default=".",
-    show_default=True,
-    metavar="DIR",
-    help="Folder for recordings, whose disk is checked.",
-)
+@click.option("--out", default=".", metavar="DIR", help="Folder for recordings, whose disk is checked.")
 @options.as_json
 def doctor(
     profile: str,

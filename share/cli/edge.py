@@ -19,13 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option(
-    "--bind",
-    default="tcp://127.0.0.1:5555",
-    show_default=True,
-    metavar="tcp://H:P",
-    help="Address to listen on.",
-)
+@click.option("--bind", default="tcp://127.0.0.1:5555", metavar="tcp://H:P", help="Address to listen on.")
 @click.option(
     "--policy",
     type=click.Choice(POLICY_NAMES),

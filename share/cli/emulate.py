@@ -44,10 +44,8 @@ class _Size(click.ParamType[tuple[float, ...]]):
     help="An agent and its motion; see below. May be repeated.",
 )
 @click.option("--out", required=True, metavar="SESSION", help="A new folder.")
-@click.option("--seconds", type=float, default=30, show_default=True, help="Length of the session, s.")
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the room and the noise."
-)
+@click.option("--seconds", type=float, default=30, help="Length of the session, s.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the room and the noise.")
 @click.option("--size", type=_Size(), metavar="LxWxH", help="Size of the room, m.  [default: the scene's]")
 @click.option(
     "--profile",
@@ -79,13 +77,10 @@ class _Size(click.ParamType[tuple[float, ...]]):
     "form",
     type=click.Choice(["session", "euroc"]),
     default="session",
-    show_default=True,
     help="A session of SHARE, or EuRoC/ASL folders.",
 )
 @options.as_json
-@click.option(
-    "--workers", type=click.IntRange(1, 64), default=_WORKERS, show_default=True, help="Processes to use."
-)
+@click.option("--workers", type=click.IntRange(1, 64), default=_WORKERS, help="Processes to use.")
 def emulate(
     scene: str,
     motions: tuple[str, ...],

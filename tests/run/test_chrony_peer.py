@@ -23,7 +23,7 @@ from helpers.time_servers import (
 )
 
 from share.devices import time_client
-from share.devices.chrony import follow_lines, read_tracking
+from share.devices.clocks import follow_lines, read_tracking
 from share.devices.time_client import query_servers
 from share.devices.time_server import TimeServer, TimeServerRun
 from share.net.udp import HostPort, StampedSocket

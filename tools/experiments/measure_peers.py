@@ -22,7 +22,7 @@ from tool_main import exit_code  # noqa: E402
 from vio_sequences import chosen_sequences, code_version  # noqa: E402
 from vio_sequences import parser as sequences_parser  # noqa: E402
 
-from share.cli.compare_trackers import peer_interpreters  # noqa: E402
+from share.cli.evaluate_compare import peer_interpreters  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.files.writing import atomic_write, writable_dir  # noqa: E402
 from share.lab.emulate.session import make_cached_session  # noqa: E402

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @click.option(
     "--vocabulary",
     metavar="FILE",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=options.EXISTING_FILE,
     help="ORBvoc.txt, which ORB-SLAM3 needs and its package lacks.",
 )
 @options.config
