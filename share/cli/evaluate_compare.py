@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
+from share.cli.evaluate_many import check_none_failed
 from share.cli.terminal import LiveLine
-from share.errors import DataError, ShareError, UsageError
+from share.errors import DataError, UsageError
 from share.lab.peer_trackers import PEERS
 
 if TYPE_CHECKING:
@@ -74,10 +75,7 @@ def compare(
     rows_found, failed = _run_jobs(jobs, recordings, out)
     if rows_found:
         _write_report(out, rows_found, missing)
-    if failed:
-        raise ShareError(
-            f"{failed} of {len(jobs)} runs failed; run the same command again to repeat only those"
-        )
+    check_none_failed(len(jobs) - failed, len(jobs))
 
 
 def _open_recordings(sources: tuple[str, ...]) -> dict[str, Source]:

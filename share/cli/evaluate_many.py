@@ -55,6 +55,12 @@ def play_runs(
     return {one.out: done[one.out] for one in runs if one.out in done}
 
 
+def _check_parallel(option: str | None, virtual: bool) -> None:
+    """Raise UsageError if an option asks for parallel runs (None: none does) in real time."""
+    if option is not None and not virtual:
+        raise UsageError(f"{option} needs --virtual: parallel runs in real time would slow each other down")
+
+
 def check_none_failed(succeeded: int, total: int) -> None:
     """Raise ShareError if any run failed."""
     if succeeded < total:
@@ -103,8 +109,7 @@ def ablation(
     \b
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
     """
-    if workers > 1 and not options_given["virtual"]:
-        raise UsageError("--workers needs --virtual: parallel runs in real time would slow each other down")
+    _check_parallel("--workers" if workers > 1 else None, options_given["virtual"])
     from share.files.writing import writable_dir
     from share.lab.evaluate.campaign import plan_policies, worker_pool
     from share.lab.evaluate.real_time import RunOptions
@@ -198,9 +203,8 @@ def sweep(
     \b
     Example:  share evaluate sweep room1 --virtual --set control.kp=0.2,0.8 --set control.ki=0,0.1 --out s
     """
-    if (workers > 1 or scheduler) and not options_given["virtual"]:
-        which = "--scheduler" if scheduler else "--workers"
-        raise UsageError(f"{which} needs --virtual: parallel runs in real time would slow each other down")
+    parallel_option = "--scheduler" if scheduler else "--workers" if workers > 1 else None
+    _check_parallel(parallel_option, options_given["virtual"])
     from share.files.writing import writable_dir
     from share.lab.evaluate.campaign import worker_pool
     from share.lab.evaluate.cluster import Cluster
