@@ -57,7 +57,11 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
 @dataset.command(short_help="Write a recording as MCAP or as an EuRoC/ASL folder.")
 @click.argument("source")
 @click.option(
-    "--out", required=True, metavar="PATH", help="X.mcap to write, or a new folder with --format euroc."
+    "--out",
+    required=True,
+    metavar="PATH",
+    type=options.PATH,
+    help="X.mcap to write, or a new folder with --format euroc.",
 )
 @options.calib
 @options.frames
@@ -71,7 +75,7 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     "--format", "kind", type=click.Choice(["mcap", "euroc"]), default="mcap", help="Format to write."
 )
 def convert(
-    source: str, out: str, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
+    source: str, out: Path, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
 ) -> None:
     """Write a recording as MCAP (ROS 2 messages) or as an EuRoC/ASL folder.
 
@@ -85,27 +89,26 @@ def convert(
     from share.recordings.convert import to_euroc, to_mcap
     from share.runtime.source import open_source
 
-    out_file = Path(out)
     if kind == "euroc" and jpeg is not None:
         raise UsageError("--jpeg works only with --format mcap; leave it out")
     if kind == "mcap":
-        _check_mcap(check_replaceable(out_file), source)
+        _check_mcap(check_replaceable(out), source)
     opened = open_source(source, calib, frames)
     options.print_notes(opened)
     with progress(opened.images_count, "converting") as bar:
         if kind == "mcap":
-            to_mcap(opened, out_file, jpeg, bar)
+            to_mcap(opened, out, jpeg, bar)
         else:
-            to_euroc(opened, out_file, bar)
+            to_euroc(opened, out, bar)
     options.print_losses(opened)
-    click.echo(f"{out_file}: {opened.images_count} frames")
+    click.echo(f"{out}: {opened.images_count} frames")
 
 
 @dataset.command(short_help="Recover a recording that was cut off.")
-@click.argument("broken")
-@click.option("--out", required=True, metavar="GOOD.mcap", help="Recording to write.")
+@click.argument("broken", type=options.PATH)
+@click.option("--out", required=True, metavar="GOOD.mcap", type=options.PATH, help="Recording to write.")
 @options.as_json
-def recover(broken: str, out: str, as_json: bool) -> None:
+def recover(broken: Path, out: Path, as_json: bool) -> None:
     """Recover all intact messages of an MCAP recording that was cut off (a crash, a power cut, a full disk).
 
     A recording in progress is named X.mcap.part; after a crash, that is the file to recover.
@@ -115,20 +118,19 @@ def recover(broken: str, out: str, as_json: bool) -> None:
     """
     from share.recordings.mcap.recover import recover_recording as run
 
-    path, out_file = Path(broken), Path(out)
-    if not path.is_file():
+    if not broken.is_file():
         raise UsageError(f"{broken}: no such file")
-    _check_mcap(out_file, broken)
-    with progress(path.stat().st_size, "recovering") as bar:
-        result = run(path, out_file, bar)
-    click.echo(json.dumps(result._asdict()) if as_json else _recovery_text(path, out_file, result))
+    _check_mcap(out, broken)
+    with progress(broken.stat().st_size, "recovering") as bar:
+        result = run(broken, out, bar)
+    click.echo(json.dumps(result._asdict()) if as_json else _recovery_text(broken, out, result))
 
 
 @dataset.command(short_help="Write an edge's map as TUM and PLY files.")
-@click.argument("map_file", metavar="MAP")
-@click.option("--out", required=True, metavar="DIR", help="A new folder.")
+@click.argument("map_file", metavar="MAP", type=options.PATH)
+@click.option("--out", required=True, metavar="DIR", type=options.PATH, help="A new folder.")
 @options.as_json
-def export(map_file: str, out: str, as_json: bool) -> None:
+def export(map_file: Path, out: Path, as_json: bool) -> None:
     """Export the trajectories, points and loops of an edge's map for other programs.
 
     DIR gets NAME.tum for each agent, points.ply and loops.csv; if MAP holds several maps, each gets its own
@@ -140,13 +142,13 @@ def export(map_file: str, out: str, as_json: bool) -> None:
     from share.store.export import export_map as run
     from share.store.map_store import MapStore
 
-    if not Path(map_file).is_file():
+    if not map_file.is_file():
         raise UsageError(f"{map_file}: no such file")
-    map_state = MapStore.read(Path(map_file)).load()
+    map_state = MapStore.read(map_file).load()
     for complaint in map_state.problems:
-        print_note(map_file, complaint)
+        print_note(str(map_file), complaint)
     with progress(len(map_state.keyframes), "exporting") as bar:
-        exported = run(map_state, Path(out), bar)
+        exported = run(map_state, out, bar)
     if as_json:
         click.echo(json.dumps({name: {**vars(e), "folder": str(e.folder)} for name, e in exported.items()}))
         return
@@ -157,7 +159,7 @@ def export(map_file: str, out: str, as_json: bool) -> None:
         )
 
 
-def _check_mcap(out: Path, source: str) -> None:
+def _check_mcap(out: Path, source: str | Path) -> None:
     if out.suffix != ".mcap":
         raise UsageError(f"--out {out}: give a name that ends in .mcap")
     if out.exists() and Path(source).exists() and out.samefile(source):

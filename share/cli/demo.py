@@ -34,7 +34,7 @@ class _Seconds(click.FloatRange):
 @options.link
 @options.true_error
 @options.config
-@click.option("--out", metavar="DIR", default="share-demo", help="Output folder.")
+@click.option("--out", metavar="DIR", type=options.PATH, default="share-demo", help="Output folder.")
 @click.option("--scene", help="Kind of room (see share emulate --help).  [default: warehouse]")
 @click.option(
     "--seed", type=click.IntRange(0), help="Seed of the room.  [default: one where agents meet soon]"
@@ -44,8 +44,8 @@ def demo(
     policy: str,
     link: str | None,
     true_error: bool,
-    config_file: str | None,
-    out: str,
+    config_file: Path | None,
+    out: Path,
     scene: str | None,
     seed: int | None,
 ) -> None:
@@ -58,7 +58,6 @@ def demo(
     \b
     Example:  share demo --seconds 30 --out /tmp/demo
     """
-    folder = Path(out)
     options.load_config(config_file)  # check it and the link before the room is made
     if policy == STREAMED and true_error:
         raise UsageError(
@@ -73,14 +72,21 @@ def demo(
     from share.runtime.machine import core_count
 
     LinkAssignment.parse(link).check(AGENTS)
-    writable_dir(folder)
+    writable_dir(out)
     room = _renderable_scene(scene)
     seed = meeting_seed(room) if seed is None else seed
     with Stages() as stages:
         session = read_session(make_cached_session(recipe(room, seconds, seed), progress=stages))
     live = LiveLine()
-    run_terms = RunOptions(policy, link, seed, true_error, config=config_file, agents_first=True)
-    folders = play_in_real_time(session, seconds, run_terms, folder, lambda now: live.write(str(now)))
+    run_terms = RunOptions(
+        policy,
+        link,
+        seed,
+        true_error,
+        config=None if config_file is None else str(config_file),
+        agents_first=True,
+    )
+    folders = play_in_real_time(session, seconds, run_terms, out, lambda now: live.write(str(now)))
     live.end()
     result = score_session(session, folders)
     click.echo(_score_table(result, policy == STREAMED))
@@ -90,7 +96,7 @@ def demo(
             "machines they would not"
         )
         click.echo(warning)
-    picture = folder / "trajectories.png"
+    picture = out / "trajectories.png"
     picture.unlink(missing_ok=True)  # left by an earlier demo
     if result.joint is not None:
         from share.lab.evaluate.charts import draw_trajectories
@@ -98,7 +104,7 @@ def demo(
         title = f"joint ATE {100 * result.joint.joint.rmse:.2f} cm, causal, one alignment for all"
         paths = {name: (agent.map, agent.truth) for name, agent in result.agents.items()}
         draw_trajectories(picture, paths, result.joint.joint.T_truth_est, title)
-        click.echo(f"\npicture: {picture}   decisions of the edge: {folder / 'edge' / 'events.jsonl'}")
+        click.echo(f"\npicture: {picture}   decisions of the edge: {out / 'edge' / 'events.jsonl'}")
 
 
 def _renderable_scene(scene: str | None) -> str:

@@ -43,7 +43,7 @@ for command in (ablation, sweep, compare):
 @options.config
 @click.option("--out", required=True, metavar="RUN", type=options.PATH, help="A new folder.")
 def run(
-    session: Path, policy: str, seed: int, config_file: str | None, out: Path, **options_given: Any
+    session: Path, policy: str, seed: int, config_file: Path | None, out: Path, **options_given: Any
 ) -> None:
     """Play SESSION in real time with an edge and its agents, each its own process; or, with --virtual, with
     the same trackers and state machines in virtual time, independent of this machine's load.

@@ -41,7 +41,7 @@ def compare(
     sources: tuple[str, ...],
     peers: tuple[str, ...],
     vocabulary: Path | None,
-    config_file: str | None,
+    config_file: Path | None,
     out: Path,
 ) -> None:
     """Run SHARE's tracker and others over the same recordings; compare their errors against ground truth and

@@ -96,7 +96,7 @@ def ablation(
     section_paths: tuple[Path, ...],
     seeds: int,
     workers: int,
-    config_file: str | None,
+    config_file: Path | None,
     out: Path,
     **options_given: Any,
 ) -> None:
@@ -191,7 +191,7 @@ def sweep(
     seeds: int,
     workers: int,
     scheduler: str | None,
-    config_file: str | None,
+    config_file: Path | None,
     out: Path,
     **options_given: Any,
 ) -> None:

@@ -32,11 +32,15 @@ calib = click.option(
     "overrides the calibration in the source.",
 )
 config = click.option(
-    "--config", "config_file", metavar="FILE", help="YAML file with settings (docs/lookup/configuration.md)."
+    "--config",
+    "config_file",
+    metavar="FILE",
+    type=PATH,
+    help="YAML file with settings (docs/lookup/configuration.md).",
 )
 verbose = click.option("-v", "--verbose", is_flag=True, help="Print more.")
 keys = click.option(
-    "--keys", metavar="DIR", help="Folder of this machine's keys.  [default: ~/.config/share/keys]"
+    "--keys", metavar="DIR", type=PATH, help="Folder of this machine's keys.  [default: ~/.config/share/keys]"
 )
 out_folder = click.option("--out", required=True, metavar="DIR", type=PATH, help="Output folder.")
 target = click.option(
@@ -135,12 +139,12 @@ run_options = option_group(
 )
 
 
-def load_config(path: str | None) -> Config:
+def load_config(path: Path | None) -> Config:
     """Read settings from a YAML file; the defaults without one. Raises ConfigError, UsageError."""
     from share.config import Config
     from share.files.yaml_file import read_settings
 
-    return Config() if path is None else read_settings(Path(path))
+    return Config() if path is None else read_settings(path)
 
 
 def agent_name(value: str) -> str:
@@ -194,7 +198,7 @@ def print_counters(counters: dict[str, int]) -> None:
 
 
 def load_run_config(
-    config_file: str | None, options_given: dict[str, Any], sessions: Sequence[Session]
+    config_file: Path | None, options_given: dict[str, Any], sessions: Sequence[Session]
 ) -> Config:
     """Read the settings and check them and the run options before anything is played.
 

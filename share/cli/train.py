@@ -55,7 +55,7 @@ def labels(
     seed: int,
     without_imu: bool,
     workers: int,
-    config_file: str | None,
+    config_file: Path | None,
     out: Path,
 ) -> None:
     """Run the tracker over each agent of SESSIONS, as recorded and degraded; write the inputs of the error

@@ -1,4 +1,4 @@
-"""A grid of the scheduler's settings in virtual time, as a person calls it."""
+"""A grid of scheduler settings in virtual time."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ def test_fewer_keyframes_save_latency_and_a_picture_shows_it(tmp_path: Path) -> 
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_is_no_setting_is_said() -> None:
+@pytest.mark.long
+def test_unknown_setting_is_refused() -> None:
     done = tuned("control.kp")
     said = "tune_rates: 'control.kp': expected SECTION.NAME=VALUE,VALUE…\n"
     assert (done.returncode, done.stderr) == (2, said)
 
 
 @pytest.mark.slow
-def test_agents_may_move_as_told_at_fixed_rates(tmp_path: Path) -> None:
+def test_given_motions_and_fixed_rates_are_used(tmp_path: Path) -> None:
     one = ("--scenes", "warehouse", "--rooms", "501:502", "--workers", "1")
     where = ("--json", str(tmp_path / "a.json"))
     motions = ("--motions", "ann=walk:speed=0.3,pauses=8", "bob=robot:speed=0.7")
