@@ -229,8 +229,9 @@ def _roll_back(device: Device, service: Service, dry_run: bool) -> None:
 
 def merge_settings(text: str, given: Mapping[str, str | None], defaults: Mapping[str, str]) -> str:
     """Return the settings `text` of a service, as systemd reads them (systemd.exec(5)), with all `given`
-    values that are not None, and `defaults` for missing ones. Other lines stay as they are. Raises UsageError for a
-    value that is not plain text.
+    values that are not None, and `defaults` for missing ones.
+
+    Other lines stay as they are. Raises UsageError for a value that is not plain text.
     """
     wanted = {key: value for key, value in given.items() if value is not None}
     for key, value in wanted.items():
