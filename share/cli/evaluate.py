@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from share.cli.evaluate_many import ablation, sweep
 from share.cli.terminal import Column, LiveLine, column_table
 
 if TYPE_CHECKING:
-    from share.lab.evaluate.run_metrics import RunMetrics
+    from share.lab.evaluate.run_metrics import AgentMetrics, RunMetrics
 
 
 @click.group()
@@ -120,46 +121,48 @@ def _value_text(value: float, unit: str, digits: int = 1) -> str:
     return "–" if math.isnan(value) else f"{value:.{digits}f} {unit}".rstrip()
 
 
-def _value(title: str, field: str, unit: str, digits: int = 1, factor: float = 1.0) -> Column:
-    """Return a column with a number field of `AgentMetrics`."""
-    return title, lambda agent: _value_text(factor * getattr(agent, field), unit, digits)
+def _value(
+    title: str, of: Callable[[AgentMetrics], float], unit: str, digits: int = 1, factor: float = 1.0
+) -> Column:
+    """Return a column with a figure of each agent, in a unit; "–" for NaN."""
+    return title, lambda agent: _value_text(factor * of(agent), unit, digits)
 
 
-def _plain(title: str, field: str) -> Column:
-    return title, lambda agent: str(getattr(agent, field))
+def _plain(title: str, of: Callable[[AgentMetrics], object]) -> Column:
+    return title, lambda agent: str(of(agent))
 
 
 _LATENCY_COLUMNS = (
-    _plain("", "agent"),
-    _value("latency", "latency_ms", "ms"),
-    _value("frames", "track_ms", "ms"),
-    _value("50 %", "track_p50_ms", "ms"),
-    _value("95 %", "track_p95_ms", "ms"),
-    _value("99 %", "track_p99_ms", "ms"),
-    _value("> 20 ms", "over_20ms", "%", factor=100),
-    _value("corrected", "corrected_ms", "ms"),
-    _value("50 %", "corrected_p50_ms", "ms"),
-    _value("95 %", "corrected_p95_ms", "ms"),
-    _value("99 %", "corrected_p99_ms", "ms"),
-    _plain("of", "corrected"),
+    _plain("", lambda a: a.agent),
+    _value("latency", lambda a: a.latency_ms, "ms"),
+    _value("frames", lambda a: a.track_ms, "ms"),
+    _value("50 %", lambda a: a.track_p50_ms, "ms"),
+    _value("95 %", lambda a: a.track_p95_ms, "ms"),
+    _value("99 %", lambda a: a.track_p99_ms, "ms"),
+    _value("> 20 ms", lambda a: a.over_20ms, "%", factor=100),
+    _value("corrected", lambda a: a.corrected_ms, "ms"),
+    _value("50 %", lambda a: a.corrected_p50_ms, "ms"),
+    _value("95 %", lambda a: a.corrected_p95_ms, "ms"),
+    _value("99 %", lambda a: a.corrected_p99_ms, "ms"),
+    _plain("of", lambda a: a.corrected),
 )
 _ERROR_COLUMNS = (
-    _plain("", "agent"),
-    _value("odom ATE", "odom_ate_cm", "cm", 2),
-    _plain("of", "odom_n"),
-    _value("map ATE", "ate_cm", "cm", 2),
-    _plain("of", "in_map"),
-    _value("RPE frame", "rpe_frame_cm", "mm", factor=10),
-    _value("", "rpe_frame_deg", "°", 3),
-    _value("RPE 1 s", "rpe_1s_cm", "cm", 2),
-    _value("", "rpe_1s_deg", "°", 2),
-    _plain("of", "rpe_1s_n"),
-    _value("in a map", "joined_s", "s"),
-    _value("sent", "rate_hz", "Hz"),
-    _value("up", "kb_up_s", "kB/s", 0),
-    _value("down", "kb_down_s", "kB/s", 0),
-    _value("QoE", "qoe", "", 2),
-    _value("reported error", "told_cm", "cm", 2),
+    _plain("", lambda a: a.agent),
+    _value("odom ATE", lambda a: a.odom_ate_cm, "cm", 2),
+    _plain("of", lambda a: a.odom_n),
+    _value("map ATE", lambda a: a.ate_cm, "cm", 2),
+    _plain("of", lambda a: a.in_map),
+    _value("RPE frame", lambda a: a.rpe_frame_cm, "mm", factor=10),
+    _value("", lambda a: a.rpe_frame_deg, "°", 3),
+    _value("RPE 1 s", lambda a: a.rpe_1s_cm, "cm", 2),
+    _value("", lambda a: a.rpe_1s_deg, "°", 2),
+    _plain("of", lambda a: a.rpe_1s_n),
+    _value("in a map", lambda a: a.joined_s, "s"),
+    _value("sent", lambda a: a.rate_hz, "Hz"),
+    _value("up", lambda a: a.kb_up_s, "kB/s", 0),
+    _value("down", lambda a: a.kb_down_s, "kB/s", 0),
+    _value("QoE", lambda a: a.qoe, "", 2),
+    _value("reported error", lambda a: a.told_cm, "cm", 2),
 )
 
 
