@@ -3,7 +3,7 @@ PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: install demo test lint type bench slow torture soak train-test freeze lock sbom licenses audit vio-figures docs
+.PHONY: install demo test unit lint type bench slow torture soak train-test freeze lock sbom licenses audit vio-figures docs
 
 install: .venv/installed
 .venv/installed: setup.cfg pyproject.toml
@@ -14,6 +14,8 @@ install: .venv/installed
 
 demo: install
 	$(BIN)/share demo
+unit: install  # the inner loop: what decides, without what takes a second or more
+	$(BIN)/pytest -n auto --maxprocesses 4 -m "not slow and not torture and not long" tests/geometry tests/vision tests/scheduling tests/metrics tests/wire tests/sensors tests/protocol tests/mapping tests/odometry
 test: install
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --ignore tests/run
 	$(BIN)/pytest tests/run  # real processes in real time: with the cores to themselves

@@ -21,8 +21,7 @@ I64 = NDArray[np.int64]
 
 DESCRIPTOR_BYTES = 32  # ORB: 256 bits
 
-# Limits, checked on construction so that no computation overflows. No real room, sensor or run comes near
-# them.
+# Limits, checked on construction so that no computation overflows; no real room or sensor comes near them.
 MAX_KEYPOINTS = 2000  # per keyframe
 MAX_NAME_LENGTH = 64  # characters, of an agent's name
 MAX_MAP_ID_LENGTH = MAX_NAME_LENGTH + 32  # a run key has up to 17 characters more, a segment number up to 11
@@ -69,11 +68,10 @@ class WaitReason(StrEnum):
 
     @property
     def text(self) -> str:
-        """For a person, after "waiting for"."""
         return _WAIT_TEXTS[self]
 
 
-_WAIT_TEXTS = {
+_WAIT_TEXTS = {  # for a person, after "waiting for"
     WaitReason.IMU: "the IMU's first samples",
     WaitReason.VIEW: "features in view",
     WaitReason.TILT: "the direction of gravity",
@@ -91,19 +89,17 @@ def checked_array(
     not finite.
     """
     array = np.asarray(value, dtype)
-    if array.shape != shape and not _shape_matches(array.shape, shape):
+    fits = array.shape == shape or (
+        array.ndim == len(shape)
+        and all(want in (None, have) for have, want in zip(array.shape, shape, strict=True))
+    )
+    if not fits:
         raise ValueError(f"{name}: shape {array.shape}, expected {shape}")
     if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{name}: has values that are not finite")
     array = array.view()
     array.flags.writeable = False
     return array
-
-
-def _shape_matches(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(expected) and all(
-        want is None or have == want for have, want in zip(shape, expected, strict=True)
-    )
 
 
 def checked_pose(name: str, value: ArrayLike, max_m: float = MAX_POSITION_M) -> F64:
@@ -143,8 +139,8 @@ def checked_up(name: str, value: ArrayLike) -> F64:
 
 
 def _is_rigid(x: list[float], y: list[float], z: list[float], bottom: list[float]) -> bool:
-    """Return whether the rows of T (4, 4), finite, are a rigid transform. Plain floats: every pose of every
-    message is checked, and numpy takes several times as long for so few numbers."""
+    """Return whether the rows of T (4, 4), finite, are a rigid transform. Plain floats, which take a fraction
+    of numpy's time: every pose of every message is checked."""
     (a, b, c, _), (d, e, f, _), (g, h, i, _), (p, q, r, s) = x, y, z, bottom
     return (
         # R R' = 1; squares first: once they are bounded nothing below overflows
@@ -211,12 +207,8 @@ class ImuBatch:
 
     def concatenate(self, *others: ImuBatch) -> ImuBatch:
         """Return the samples of all batches in order."""
-        parts = (self, *others)
-        return ImuBatch._from_checked(
-            np.concatenate([part.stamps_ns for part in parts]),
-            np.concatenate([part.gyro for part in parts]),
-            np.concatenate([part.accel for part in parts]),
-        )
+        columns = zip(*((part.stamps_ns, part.gyro, part.accel) for part in (self, *others)), strict=True)
+        return ImuBatch._from_checked(*map(np.concatenate, columns))
 
     @staticmethod
     def _from_checked(stamps_ns: I64, gyro: F64, accel: F64) -> ImuBatch:
@@ -365,11 +357,12 @@ class Keyframe:
         checked_stamp("stamp_ns", self.stamp_ns)
         if not -1 <= self.reference < self.id:
             raise ValueError(f"reference: {self.reference} must lie in -1 .. {self.id - 1}")
-        _set_fields(self, predecessor=max(self.reference, self.predecessor))
-        if not self.predecessor < self.id:
-            raise ValueError(f"predecessor: {self.predecessor} must lie in -1 .. {self.id - 1}")
+        predecessor = max(self.reference, self.predecessor)
+        if not predecessor < self.id:
+            raise ValueError(f"predecessor: {predecessor} must lie in -1 .. {self.id - 1}")
         _set_fields(
             self,
+            predecessor=predecessor,
             T_ref_body=checked_pose("T_ref_body", self.T_ref_body, MAX_ODOM_M),
             cov=checked_cov("cov", self.cov),
             T_odom_body=checked_pose("T_odom_body", self.T_odom_body, MAX_ODOM_M),

@@ -5,7 +5,7 @@ from share.timing import Backoff
 S = 1_000_000_000
 
 
-def test_who_dies_at_once_is_started_ever_more_seldom():
+def test_restarts_of_a_failing_process_slow_down():
     backoff, now, pauses = Backoff(0), 0, []
     for _ in range(40):
         now += S // 10
@@ -15,14 +15,14 @@ def test_who_dies_at_once_is_started_ever_more_seldom():
     assert backoff.failures == 40
 
 
-def test_who_was_well_begins_anew():
+def test_pause_is_reset_after_a_long_life():
     backoff = Backoff(0)
     assert [backoff.record_failure(t * S) for t in (1, 3, 6)] == [1, 2, 4]
     assert backoff.record_failure(10 * S + 10 * S) == 1  # begun at 10 s, and ten seconds old
     assert backoff.failures == 1
 
 
-def test_the_pause_is_no_part_of_its_life():
+def test_pause_does_not_count_as_lifetime():
     backoff, now = Backoff(0), 0
     for _ in range(6):
         now += round(backoff.record_failure(now) * S)

@@ -1,4 +1,4 @@
-"""What the documentation says of commands, settings and files is so."""
+"""The pages agree with commands, settings and files."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_configuration_page_is_up_to_date() -> None:
     assert table.strip() == made.strip(), "run `python tools/config_table.py --write`"
 
 
-def test_every_setting_says_what_it_is() -> None:
+def test_every_setting_has_a_description() -> None:
     found = TOOL["sections"](TOOL["SOURCE"].read_text())
     assert [f"{s.name}.{row.name}" for s in found for row in s.settings if not row.meaning] == []
     assert [s.name for s in found if not s.about] == []
@@ -91,7 +91,7 @@ def test_table_has_every_key_and_its_default() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_have_targets(page: Path) -> None:
     for target in links(page.read_text()):
         if re.match(r"https?://", target):
             continue

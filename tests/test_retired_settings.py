@@ -1,4 +1,4 @@
-"""Settings that have become constants: each is refused by a line that names its constant, which exists."""
+"""Each former setting is refused by a line that names its constant, which exists."""
 
 from __future__ import annotations
 

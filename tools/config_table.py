@@ -47,7 +47,7 @@ class Setting(NamedTuple):
     meaning: str
 
 
-class Section(NamedTuple):
+class SettingsSection(NamedTuple):
     """One top-level key of the file. about: the docstring of its dataclass."""
 
     name: str
@@ -55,18 +55,18 @@ class Section(NamedTuple):
     settings: list[Setting]
 
 
-def sections(text: str) -> list[Section]:
+def sections(text: str) -> list[SettingsSection]:
     """Return the sections in the order of `Config`, from the source text of share/config.py."""
     classes = {node.name: node for node in ast.parse(text).body if isinstance(node, ast.ClassDef)}
     comments = _comments(text)
     return [
-        Section(name, " ".join((ast.get_docstring(classes[kind]) or "").split()), rows)
+        SettingsSection(name, " ".join((ast.get_docstring(classes[kind]) or "").split()), rows)
         for name, kind in _fields_of_config(classes["Config"])
         for rows in [list(_settings(classes[kind], comments))]
     ]
 
 
-def page(found: list[Section]) -> str:
+def page(found: list[SettingsSection]) -> str:
     """Return the sections as Markdown."""
     return "\n".join(_markdown(section) for section in found)
 
@@ -91,7 +91,7 @@ def _comments(text: str) -> dict[int, str]:
     return {t.start[0]: t.string.lstrip("# ") for t in tokens if t.type == tokenize.COMMENT}
 
 
-def _markdown(section: Section) -> str:
+def _markdown(section: SettingsSection) -> str:
     lines = [f"## {section.name}", "", section.about, ""]
     lines += ["| key | default | unit | meaning |", "|---|---|---|---|"]
     for name, default, unit, meaning in section.settings:

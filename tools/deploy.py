@@ -13,7 +13,6 @@ from typing import Any
 import click
 from deploy_device import Device, Facts, check
 from deploy_release import Release, read_release, write_tar
-from deploy_settings import merged
 
 from share.cli.terminal import progress
 from share.devices import checks
@@ -23,6 +22,8 @@ from share.net.transport import parse_address
 
 DIST = Path(__file__).resolve().parents[1] / "dist" / "share"
 PROFILES = {"ar": "d435i-n100-headset", "robot": "d435i-turtlebot4", "": "laptop-edge"}  # by KIND
+_SETTING = re.compile(r"([A-Z_]+)=(.*)")
+_PLAIN_VALUE = re.compile(r"[\w@%+=:,./ -]*", re.ASCII)  # systemd quotes and expands nothing of it
 NO_SETTINGS = "# Settings of SHARE on this device: docs/lookup/configuration.md\n{}\n"
 
 
@@ -169,7 +170,7 @@ def settings_files(service: Service, there: Facts) -> dict[str, str]:
     """Return files for /etc/share: given settings merged into those on the device. Raises UsageError."""
     if not service.defaults:
         return {}
-    text = merged(there.settings, service.given, service.defaults)
+    text = merge_settings(there.settings, service.given, service.defaults)
     if "EDGE" in service.given:
         check_edge(dict(line.partition("=")[::2] for line in text.splitlines()))
     first = {} if there.settings else {f"{service.name}.yaml": NO_SETTINGS}
@@ -224,6 +225,29 @@ def _roll_back(device: Device, service: Service, dry_run: bool) -> None:
         click.echo(f"{device.host}: {there.current or 'none'} -> {there.previous or 'none'}")
         return
     click.echo(device.do("rollback"), nl=False)
+
+
+def merge_settings(text: str, given: Mapping[str, str | None], defaults: Mapping[str, str]) -> str:
+    """Return the settings `text` of a service, as systemd reads them (systemd.exec(5)), with all `given`
+    values that are not None, and `defaults` for missing ones.
+
+    Other lines stay as they are. Raises UsageError for a value that is not plain text.
+    """
+    wanted = {key: value for key, value in given.items() if value is not None}
+    for key, value in wanted.items():
+        if not _PLAIN_VALUE.fullmatch(value):
+            raise UsageError(
+                f"{key.lower()} '{value}': has characters that are not allowed in a settings file"
+            )
+    lines = [_put(line, wanted) for line in text.splitlines()]
+    there = {match[1] for line in lines if (match := _SETTING.fullmatch(line))}
+    missing = {key: value for key, value in {**defaults, **wanted}.items() if key not in there}
+    return "".join(f"{line}\n" for line in [*lines, *(f"{k}={v}" for k, v in missing.items())])
+
+
+def _put(line: str, wanted: Mapping[str, str]) -> str:
+    match = _SETTING.fullmatch(line)
+    return f"{match[1]}={wanted[match[1]]}" if match and match[1] in wanted else line
 
 
 if __name__ == "__main__":

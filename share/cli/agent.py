@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 @click.option(
     "--link", metavar="NAME|FILE", help="Emulate a network to the edge: wifi5, wifi-busy or a YAML file."
 )
-@click.option("--link-seed", type=int, default=0, show_default=True, help="Seed of its delays and losses.")
+@click.option("--link-seed", type=int, default=0, help="Seed of its delays and losses.")
 @click.option("--streamed", is_flag=True, help="Send raw frames and let the edge track (policy streamed).")
 @click.option(
     "--true-error", is_flag=True, help="Report the error against ground truth to the edge, for experiments."
@@ -52,7 +52,12 @@ if TYPE_CHECKING:
 @options.calib
 @options.frames
 @camera_options.camera_options
-@click.option("--out", metavar="DIR", help="Folder for odom.tum, map.tum, latency.csv and report.json.")
+@click.option(
+    "--out",
+    metavar="DIR",
+    type=options.PATH,
+    help="Folder for odom.tum, map.tum, latency.csv and report.json.",
+)
 @click.option(
     "--poses",
     metavar="udp://H:P",
@@ -66,7 +71,7 @@ def agent(
     name: str,
     kind: str | None,
     address: str,
-    keys: str | None,
+    keys: Path | None,
     server_key: str | None,
     link: str | None,
     link_seed: int,
@@ -75,9 +80,9 @@ def agent(
     calib: str | None,
     frames: slice | None,
     camera: camera_options.CameraOptions,
-    out: str | None,
+    out: Path | None,
     poses: str | None,
-    config_file: str | None,
+    config_file: Path | None,
     verbose: bool,
     as_json: bool,
 ) -> None:
@@ -110,13 +115,12 @@ def agent(
     hello = Hello(options.agent_name(name), agent_kind, run_id, opened.rig, streamed)
     errors = None if streamed else _error_estimator(opened, settings, true_error, live_line.print_line)
     feed = None if poses is None else PoseFeed(poses, hello.name)
-    folder = None if out is None else Path(out)
     run = AgentRun(
         opened,
         hello,
         settings,
         connect_link,
-        folder,
+        out,
         live_line.print_line,
         live_line.show,
         verbose,
@@ -128,7 +132,7 @@ def agent(
     live_line.end()
     options.print_losses(opened)
     click.echo(json.dumps(run.report) if as_json else _summary(run))
-    if (warning := _unacknowledged_text(run, hello.name, settings.agent.finish_s)) is not None:
+    if (warning := unacknowledged_text(run, hello.name, settings.agent.finish_s)) is not None:
         live_line.print_line(warning)
         live_line.end()
     if not run.report["protocol"]["edge_sessions"]:
@@ -140,7 +144,7 @@ def agent(
 _NO_EDGE_HINT = "is `share edge` running there?"
 
 
-def _agent_keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
+def _agent_keys(folder: Path | None, server_key: str | None) -> AgentKeys | None:
     """Return the keys of this machine and the edge, None without --server-key. Raises UsageError."""
     from share.net.keys import agent_keys
 
@@ -148,7 +152,7 @@ def _agent_keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
         if folder is not None:
             raise UsageError("--keys needs --server-key, the public key of the edge")
         return None
-    return agent_keys(None if folder is None else Path(folder), server_key)
+    return agent_keys(folder, server_key)
 
 
 def _agent_kind(kind_given: str | None, profile_name: str | None) -> AgentKind:
@@ -250,7 +254,7 @@ def _summary(run: AgentRun) -> str:
     if "untracked" in r:
         lines += [f"{r['untracked']} more frames without an answer of the edge, {traffic}"]
     else:
-        lines += [_keyframes_text(r, traffic)]
+        lines += [keyframes_text(r, traffic)]
     if r["dropped_late"]:
         lines.append(f"{r['dropped_late']} more frames dropped to keep up")
     if r["late_frames"]:
@@ -258,11 +262,11 @@ def _summary(run: AgentRun) -> str:
     if p95 is not None:
         lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (p95 {p95:.1f} ms)")
     if r["clock"]["uncertainty_ms"] is not None:
-        lines.append(f"clock of the edge: {_clock_text(r['clock'])}")
+        lines.append(f"clock of the edge: {clock_text(r['clock'])}")
     return "\n".join([*lines, *camera_options.camera_summary(r)])
 
 
-def _keyframes_text(r: dict[str, Any], traffic: str) -> str:
+def keyframes_text(r: dict[str, Any], traffic: str) -> str:
     """Return how many keyframes were made, sent and acknowledged."""
     protocol, count = r["protocol"], r["keyframes"]
     if not protocol["edge_sessions"]:
@@ -272,7 +276,7 @@ def _keyframes_text(r: dict[str, Any], traffic: str) -> str:
     return f"{_count_text(count)}: {sent}, {r['corrections']} corrections, {traffic}"
 
 
-def _unacknowledged_text(run: AgentRun, name: str, finish_s: float) -> str | None:
+def unacknowledged_text(run: AgentRun, name: str, finish_s: float) -> str | None:
     """Return how many keyframes the edge did not acknowledge and why, as far as known; None if none."""
     protocol = run.report["protocol"]
     count = protocol["unacknowledged"]
@@ -296,7 +300,7 @@ def _count_text(keyframes: int) -> str:
     return "1 keyframe" if keyframes == 1 else f"{keyframes} keyframes"
 
 
-def _clock_text(c: dict[str, Any]) -> str:
+def clock_text(c: dict[str, Any]) -> str:
     uncertainty = f"±{c['uncertainty_ms']:.3g} ms"
     if c["is_reliable"]:
         return f"{c['offset_ms']:+.3f} ms from this machine's, {uncertainty}"

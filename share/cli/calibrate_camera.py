@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
-from share.cli.table import aligned_table
-from share.cli.terminal import Stages
+from share.cli.terminal import Stages, aligned_table
 from share.errors import DataError, ShareError
 
 if TYPE_CHECKING:
@@ -24,21 +23,27 @@ if TYPE_CHECKING:
 @click.argument("source")
 @options.target
 @click.option(
-    "--camera", type=click.Choice(["cam0", "both"]), default="both", show_default=True,
+    "--camera",
+    type=click.Choice(["cam0", "both"]),
+    default="both",
     help="Calibrate cam0 only, or cam0 and cam1.",
-)  # fmt: skip
+)
+@click.option("--every", type=click.IntRange(1), default=1, metavar="N", help="Use every N-th image.")
 @click.option(
-    "--every", type=click.IntRange(1), default=1, show_default=True, metavar="N",
-    help="Use every N-th image.",
-)  # fmt: skip
-@click.option(
-    "--views", "max_views", type=click.IntRange(4), default=60, show_default=True, metavar="N",
+    "--views",
+    "max_views",
+    type=click.IntRange(4),
+    default=60,
+    metavar="N",
     help="Use the N most informative views.",
-)  # fmt: skip
+)
 @click.option(
-    "--lens", "model", type=click.Choice(["radtan", "equidistant"]), default="radtan", show_default=True,
+    "--lens",
+    "model",
+    type=click.Choice(["radtan", "equidistant"]),
+    default="radtan",
     help="Lens model: radial-tangential, or Kannala and Brandt's fisheye model (equidistant).",
-)  # fmt: skip
+)
 @options.calib
 @options.workers
 @options.out_folder
@@ -138,9 +143,16 @@ def _calibrate(
         for cam, T in enumerate((state.T_cam0_target, state.T_cam1_cam0 @ state.T_cam0_target)[: len(sizes)])
     )
     return CameraCalibration(
-        used, solution, covers, judge_cameras(solution, covers, with_target), rig, len(with_target),
-        previous_px, pictures.given_calibration, pictures.serial,
-    )  # fmt: skip
+        used,
+        solution,
+        covers,
+        judge_cameras(solution, covers, with_target),
+        rig,
+        len(with_target),
+        previous_px,
+        pictures.given_calibration,
+        pictures.serial,
+    )
 
 
 def _summary(outcome: CameraCalibration, files: tuple[Path, ...]) -> str:

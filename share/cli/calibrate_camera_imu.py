@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
-from share.cli.table import aligned_table
-from share.cli.terminal import Stages
+from share.cli.terminal import Stages, aligned_table, print_note
 from share.errors import DataError, ShareError
 
 if TYPE_CHECKING:
@@ -28,21 +27,24 @@ _WARN_NOISE_RATIO = 2.0  # residuals above this many times the stated noise give
 @click.argument("source")
 @options.target
 @click.option(
-    "--camera", metavar="CALIB.yaml",
+    "--camera",
+    metavar="CALIB.yaml",
     help="The cameras: a camchain file by share calibrate camera, or its folder.  [default: SOURCE's]",
-)  # fmt: skip
+)
 @click.option(
-    "--imu", metavar="IMU.yaml",
+    "--imu",
+    metavar="IMU.yaml",
     help="The IMU's noise: a file by share calibrate imu, or its folder.  [default: SOURCE's]",
-)  # fmt: skip
+)
+@click.option("--every", type=click.IntRange(1), default=1, metavar="N", help="Use every N-th image.")
 @click.option(
-    "--every", type=click.IntRange(1), default=1, show_default=True, metavar="N",
-    help="Use every N-th image.",
-)  # fmt: skip
-@click.option(
-    "--within", "max_offset_s", type=click.FloatRange(0.01, 1.0), default=0.5, show_default=True, metavar="S",
+    "--within",
+    "max_offset_s",
+    type=click.FloatRange(0.01, 1.0),
+    default=0.5,
+    metavar="S",
     help="Largest time offset to search, s.",
-)  # fmt: skip
+)
 @options.workers
 @options.out_folder
 @options.as_json
@@ -103,7 +105,7 @@ def camera_imu(
     atomic_write(picture, residual_chart(outcome.fit, f"{source}: {verdict}"))
     click.echo(text if as_json else _summary(outcome, (chain, imu_chain, report_file, picture)))
     for warning in warnings:
-        click.echo(f"share: {source}: {warning}", err=True)
+        print_note(source, warning)
     if not outcome.verdict.passed:
         reasons = "; ".join(outcome.verdict.reasons)
         raise ShareError(f"{source}: unreliable result ({written_message(chain)}): {reasons}")
@@ -132,9 +134,16 @@ def _calibrate(
             raise DataError(f"{source}: no IMU samples in the recording")
         views = find_stamped_views(pictures, target, every, partial(stages, "looking for the board"), workers)
         result = fit_camera_imu(
-            views.stamps, views.views, target, pictures.rig, table.imu, noise, max_offset_s,
-            partial(stages, "fitting"), pictures.uncertainty.covariance,
-        )  # fmt: skip
+            views.stamps,
+            views.views,
+            target,
+            pictures.rig,
+            table.imu,
+            noise,
+            max_offset_s,
+            partial(stages, "fitting"),
+            pictures.uncertainty.covariance,
+        )
     comparison = (
         None
         if pictures.given_T_imu_cam0 is None

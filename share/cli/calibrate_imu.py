@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
-from share.cli.table import aligned_table
-from share.cli.terminal import Stages
+from share.cli.terminal import Stages, aligned_table, print_note
 
 if TYPE_CHECKING:
     from share.lab.calibrate.imu import ImuCharacteristics
@@ -32,7 +31,6 @@ _SYMBOLS = {"density": "N", "instability": "B", "walk": "K"}
     "--inflate",
     type=click.FloatRange(min=1),
     default=1.0,
-    show_default=True,
     help="Multiply the measured noise by this in the file for the filter.",
 )
 @options.out_folder
@@ -77,7 +75,7 @@ def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_jso
     rows = imu_report.noise_rows(characteristics, device_profile)
     click.echo(text if as_json else _summary(characteristics, rows, table.dropped))
     for warning in _warnings(characteristics, rows):
-        click.echo(f"share: {source}: {warning}", err=True)
+        print_note(source, warning)
 
 
 def _summary(characteristics: ImuCharacteristics, rows: list[NoiseRow], dropped: int) -> str:

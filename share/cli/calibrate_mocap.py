@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
-from share.cli.terminal import Stages
+from share.cli.terminal import Stages, print_note
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     "--truth",
     required=True,
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=options.PATH,
     help="Motion capture file: Vicon's or Motive's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
 )
 @click.option(
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 @click.option(
     "--track",
     metavar="T.tum",
-    type=click.Path(path_type=Path),
+    type=options.PATH,
     help="Poses of the device by share track, to check the result.",
 )
 @click.option("--one-clock", is_flag=True, help="Device and motion capture share one clock.")
@@ -52,7 +52,6 @@ if TYPE_CHECKING:
     "max_offset_s",
     type=click.FloatRange(min=0.01),
     default=0.5,
-    show_default=True,
     metavar="S",
     help="Largest clock offset to search, s.",
 )
@@ -107,7 +106,7 @@ def mocap(
     atomic_write(out / "mocap-report.json", report + "\n")
     click.echo(report if as_json else _summary(result, hand_eye_check))
     for warning in fit_warnings(result):
-        click.echo(f"share: {source}: {warning}", err=True)
+        print_note(source, warning)
     if hand_eye_check and not hand_eye_check.agrees:
         click.echo(f"share: {track} contradicts the fit; check that it is of this recording", err=True)
 

@@ -19,15 +19,11 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("source", default="realsense")
 @camera_options.profile
-@click.option(
-    "--out", required=True, metavar="REC.mcap", type=click.Path(path_type=Path), help="Recording to write."
-)
+@click.option("--out", required=True, metavar="REC.mcap", type=options.PATH, help="Recording to write.")
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this time, s.")
 @camera_options.mode
 @click.option(
-    "--calib",
-    metavar="DIR",
-    help="Record this calibration of the camera instead of the factory's.",
+    "--calib", metavar="DIR", help="Record this calibration of the camera instead of the factory's."
 )
 @click.option("--depth", is_flag=True, help="Record depth as well.")
 @click.option("--imu-only", is_flag=True, help="Record no images, as `share calibrate imu` needs.")
@@ -35,7 +31,6 @@ if TYPE_CHECKING:
     "--min-free-gb",
     type=click.FloatRange(min=0),
     default=2.0,
-    show_default=True,
     help="Stop when less than this is free on the disk, GB.",
 )
 @options.as_json
@@ -97,15 +92,12 @@ def _status_text(status: CaptureStatus) -> str:
 
 
 def _summary(report: dict[str, Any]) -> str:
-    from share.cli.table import aligned_table
+    from share.cli.terminal import aligned_table
 
     head = ["stream", "samples", "seconds", "gaps", "missing", "backward", "dropped"]
     rows = [[name, *(f"{stream[key]:g}" for key in head[1:])] for name, stream in report["streams"].items()]
     notes = camera_options.camera_events(report)
-    lines = [
-        aligned_table([head, *rows]),
-        f"{report['imu']} IMU samples" + (f"; {notes}" if notes else ""),
-    ]
+    lines = [aligned_table([head, *rows]), f"{report['imu']} IMU samples" + (f"; {notes}" if notes else "")]
     if report["foreign"]:
         lines.append(
             f"{report['foreign']} samples have stamps of the host's clock, not the camera's: "

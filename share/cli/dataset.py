@@ -8,8 +8,9 @@ from typing import Any
 
 import click
 
-from share.cli import dataset_align, dataset_map, options
-from share.cli.terminal import progress
+from share.cli import options
+from share.cli.dataset_align import align
+from share.cli.terminal import print_note, progress
 from share.errors import UsageError
 
 
@@ -22,8 +23,7 @@ def dataset() -> None:
     """
 
 
-dataset.add_command(dataset_align.align)
-dataset.add_command(dataset_map.export)
+dataset.add_command(align)
 
 
 @dataset.command(short_help="Describe a recording or a map.")
@@ -41,13 +41,14 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     """
     from share.recordings.describe import describe_recording
     from share.runtime.source import open_source
-    from share.store.map_store import is_map
+    from share.store.export import describe_map
+    from share.store.map_store import MapStore, is_map
 
     if is_map(Path(source)):
         if calib or frames:
             raise UsageError(f"{source} is a map; --calib and --frames work only with recordings")
-        map_info = dataset_map.map_info(Path(source))
-        click.echo(json.dumps(map_info) if as_json else dataset_map.map_info_text(map_info))
+        found = describe_map(MapStore.read(Path(source)))
+        click.echo(json.dumps(found) if as_json else _map_text(found))
         return
     description = describe_recording(open_source(source, calib, frames))
     click.echo(json.dumps(description) if as_json else _description_text(description))
@@ -56,7 +57,11 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
 @dataset.command(short_help="Write a recording as MCAP or as an EuRoC/ASL folder.")
 @click.argument("source")
 @click.option(
-    "--out", required=True, metavar="PATH", help="X.mcap to write, or a new folder with --format euroc."
+    "--out",
+    required=True,
+    metavar="PATH",
+    type=options.PATH,
+    help="X.mcap to write, or a new folder with --format euroc.",
 )
 @options.calib
 @options.frames
@@ -67,15 +72,10 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     help="Compress gray images as JPEG of this quality.  [default: keep images as they are, byte for byte]",
 )
 @click.option(
-    "--format",
-    "kind",
-    type=click.Choice(["mcap", "euroc"]),
-    default="mcap",
-    show_default=True,
-    help="Format to write.",
+    "--format", "kind", type=click.Choice(["mcap", "euroc"]), default="mcap", help="Format to write."
 )
 def convert(
-    source: str, out: str, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
+    source: str, out: Path, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
 ) -> None:
     """Write a recording as MCAP (ROS 2 messages) or as an EuRoC/ASL folder.
 
@@ -89,27 +89,26 @@ def convert(
     from share.recordings.convert import to_euroc, to_mcap
     from share.runtime.source import open_source
 
-    out_file = Path(out)
     if kind == "euroc" and jpeg is not None:
         raise UsageError("--jpeg works only with --format mcap; leave it out")
     if kind == "mcap":
-        _check_mcap(check_replaceable(out_file), source)
+        _check_mcap(check_replaceable(out), source)
     opened = open_source(source, calib, frames)
     options.print_notes(opened)
     with progress(opened.images_count, "converting") as bar:
         if kind == "mcap":
-            to_mcap(opened, out_file, jpeg, bar)
+            to_mcap(opened, out, jpeg, bar)
         else:
-            to_euroc(opened, out_file, bar)
+            to_euroc(opened, out, bar)
     options.print_losses(opened)
-    click.echo(f"{out_file}: {opened.images_count} frames")
+    click.echo(f"{out}: {opened.images_count} frames")
 
 
 @dataset.command(short_help="Recover a recording that was cut off.")
-@click.argument("broken")
-@click.option("--out", required=True, metavar="GOOD.mcap", help="Recording to write.")
+@click.argument("broken", type=options.PATH)
+@click.option("--out", required=True, metavar="GOOD.mcap", type=options.PATH, help="Recording to write.")
 @options.as_json
-def recover(broken: str, out: str, as_json: bool) -> None:
+def recover(broken: Path, out: Path, as_json: bool) -> None:
     """Recover all intact messages of an MCAP recording that was cut off (a crash, a power cut, a full disk).
 
     A recording in progress is named X.mcap.part; after a crash, that is the file to recover.
@@ -119,16 +118,48 @@ def recover(broken: str, out: str, as_json: bool) -> None:
     """
     from share.recordings.mcap.recorder import recover_recording as run
 
-    path, out_file = Path(broken), Path(out)
-    if not path.is_file():
+    if not broken.is_file():
         raise UsageError(f"{broken}: no such file")
-    _check_mcap(out_file, broken)
-    with progress(path.stat().st_size, "recovering") as bar:
-        result = run(path, out_file, bar)
-    click.echo(json.dumps(result._asdict()) if as_json else _recovery_text(path, out_file, result))
+    _check_mcap(out, broken)
+    with progress(broken.stat().st_size, "recovering") as bar:
+        result = run(broken, out, bar)
+    click.echo(json.dumps(result._asdict()) if as_json else _recovery_text(broken, out, result))
 
 
-def _check_mcap(out: Path, source: str) -> None:
+@dataset.command(short_help="Write an edge's map as TUM and PLY files.")
+@click.argument("map_file", metavar="MAP", type=options.PATH)
+@click.option("--out", required=True, metavar="DIR", type=options.PATH, help="A new folder.")
+@options.as_json
+def export(map_file: Path, out: Path, as_json: bool) -> None:
+    """Export the trajectories, points and loops of an edge's map for other programs.
+
+    DIR gets NAME.tum for each agent, points.ply and loops.csv; if MAP holds several maps, each gets its own
+    folder. The edge may be running.
+
+    \b
+    Example:  share dataset export room.sqlite --out room
+    """
+    from share.store.export import export_map as run
+    from share.store.map_store import MapStore
+
+    if not map_file.is_file():
+        raise UsageError(f"{map_file}: no such file")
+    map_state = MapStore.read(map_file).load()
+    for complaint in map_state.problems:
+        print_note(str(map_file), complaint)
+    with progress(len(map_state.keyframes), "exporting") as bar:
+        exported = run(map_state, out, bar)
+    if as_json:
+        click.echo(json.dumps({name: {**vars(e), "folder": str(e.folder)} for name, e in exported.items()}))
+        return
+    for name, e in exported.items():
+        click.echo(
+            f"{e.folder}: map {name}, {e.keyframes} keyframes of {', '.join(e.agents)}; "
+            f"{e.points} points, {e.loops} loops"
+        )
+
+
+def _check_mcap(out: Path, source: str | Path) -> None:
     if out.suffix != ".mcap":
         raise UsageError(f"--out {out}: give a name that ends in .mcap")
     if out.exists() and Path(source).exists() and out.samefile(source):
@@ -174,3 +205,17 @@ def _camera_text(camera: dict[str, Any]) -> str:
     lens_name = "fisheye" if camera["lens"] == "equidistant" else "radial-tangential"
     distortion = lens_name if camera["distortion"] else "no distortion"
     return f"{width}x{height}, f {fx:.1f} {fy:.1f} px, {camera['fov_deg']:.0f} deg wide, {distortion}"
+
+
+def _map_text(d: dict[str, Any]) -> str:
+    lines = [f"{d['name']}: map, schema {d['schema']}, {d['bytes'] / 1e6:.1f} MB"]
+    for name, agent in d["agents"].items():
+        removed = agent["next_keyframe"] - agent["keyframes"]
+        segments_text = f", {agent['stretches']} segments" if agent["stretches"] > 1 else ""
+        lines.append(
+            f"  {name:<10} {agent['kind']:<6} {agent['keyframes']:>6} keyframes, {removed} removed"
+            f"{segments_text}"
+        )
+    lines += [f"  map {name}: {count} keyframes" for name, count in d["maps"].items()]
+    lines.append(f"  {d['loops']} loops, {d['solved']} keyframes in the latest solution")
+    return "\n".join(lines + [f"  damage: {line}" for line in d["damage"]])

@@ -10,18 +10,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.table import aligned_table
-from share.cli.terminal import Stages
+from share.cli.terminal import Column, Stages, column_table, print_note
 from share.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from share.lab.mocap.session import AlignedRecording
     from share.lab.mocap.state import MocapFitOptions
     from share.lab.mocap.trajectory import MocapTrajectory
-
-_CLOCK_COLUMNS = ("device", "offset s", "± ms", "drift ppm", "corr.", "next corr.")
-_MOUNTING_COLUMNS = ("body deg", "±", "body mm", "±", "up", "tilt deg")
-_RESIDUAL_COLUMNS = ("rms mm", "rms deg", "outliers %", "gaps", "truth s")
 
 
 @click.command(short_help="Make a session of field recordings and a motion capture.")
@@ -70,13 +65,10 @@ _RESIDUAL_COLUMNS = ("rms mm", "rms deg", "outliers %", "gaps", "truth s")
     "--bridge",
     type=click.FloatRange(0.1, 2),
     default=0.5,
-    show_default=True,
     metavar="S",
     help="Fill gaps of the motion capture up to this long by the IMU, s; longer gaps get no truth.",
 )
-@click.option(
-    "--out", required=True, metavar="SESSION", type=click.Path(path_type=Path), help="A new folder."
-)
+@click.option("--out", required=True, metavar="SESSION", type=options.PATH, help="A new folder.")
 @options.as_json
 def align(
     recordings: tuple[str, ...],
@@ -130,7 +122,7 @@ def align(
     click.echo(json.dumps(results) if as_json else _result_table(results))
     for name, one in results.items():
         for line in (*_axis_warnings(one), *one["doubts"]):
-            click.echo(f"share: {name}: {line}", err=True)
+            print_note(name, line)
     if not as_json:
         click.echo(f"{out}: ready; play it: share evaluate run {out} --virtual --out RUN")
 
@@ -248,28 +240,32 @@ def _axis_warnings(one: dict[str, Any]) -> list[str]:
     return [] if one["up"] == "z" else [f"the motion capture's up axis is {one['up']}; the session's is z"]
 
 
+def _form(title: str, key: str, form: str, factor: float = 1.0) -> Column:
+    """Return a column with a number of a device's result."""
+    return title, lambda one: format(factor * one[key], form)
+
+
+_COLUMNS: tuple[Column, ...] = (
+    ("device", lambda one: one["name"]),
+    _form("offset s", "offset_ns", "+.6f", 1e-9),
+    _form("± ms", "offset_sigma_ms", ".2f"),
+    _form("drift ppm", "drift_ppm", "+.1f"),
+    _form("corr.", "correlation", ".3f"),
+    _form("next corr.", "next_correlation", ".3f"),
+    _form("body deg", "body_turned_deg", ".2f"),
+    _form("±", "body_turned_sigma_deg", ".2f"),
+    _form("body mm", "body_shifted_mm", ".1f"),
+    _form("±", "body_shifted_sigma_mm", ".1f"),
+    ("up", lambda one: one["up"]),
+    _form("tilt deg", "tilt_deg", ".3f"),
+    _form("rms mm", "left_mm", ".1f"),
+    _form("rms deg", "left_deg", ".2f"),
+    _form("outliers %", "doubted", ".1f", 100),
+    ("gaps", lambda one: str(len(one["gaps_s"]))),
+    _form("truth s", "truth_s", ".1f"),
+)
+
+
 def _result_table(results: dict[str, Any]) -> str:
     """Return a table with a line per device."""
-    rows = [
-        [
-            name,
-            f"{one['offset_ns'] * 1e-9:+.6f}",
-            f"{one['offset_sigma_ms']:.2f}",
-            f"{one['drift_ppm']:+.1f}",
-            f"{one['correlation']:.3f}",
-            f"{one['next_correlation']:.3f}",
-            f"{one['body_turned_deg']:.2f}",
-            f"{one['body_turned_sigma_deg']:.2f}",
-            f"{one['body_shifted_mm']:.1f}",
-            f"{one['body_shifted_sigma_mm']:.1f}",
-            one["up"],
-            f"{one['tilt_deg']:.3f}",
-            f"{one['left_mm']:.1f}",
-            f"{one['left_deg']:.2f}",
-            f"{100 * one['doubted']:.1f}",
-            f"{len(one['gaps_s'])}",
-            f"{one['truth_s']:.1f}",
-        ]
-        for name, one in results.items()
-    ]
-    return aligned_table([(*_CLOCK_COLUMNS, *_MOUNTING_COLUMNS, *_RESIDUAL_COLUMNS), *rows])
+    return column_table(_COLUMNS, [{"name": name, **one} for name, one in results.items()])

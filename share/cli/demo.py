@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.table import aligned_table
-from share.cli.terminal import LiveLine, Stages
-from share.config import POLICY_NAMES, STREAMED
+from share.cli.terminal import Column, LiveLine, Stages, column_table
+from share.config import STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -30,24 +29,12 @@ class _Seconds(click.FloatRange):
 
 
 @click.command()
-@click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True, help="Length of the run, s.")
-@click.option(
-    "--policy",
-    type=click.Choice(POLICY_NAMES),
-    default=POLICY_NAMES[0],
-    show_default=True,
-    help="How keyframe rates are set.",
-)
-@click.option(
-    "--link",
-    metavar="LINK[,AGENT=LINK…]",
-    help="Emulated network, as share agent --link: one for all agents, or one per agent.",
-)
-@click.option(
-    "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
-)
+@click.option("--seconds", type=_Seconds(3, 600), default=20, help="Length of the run, s.")
+@options.policy
+@options.link
+@options.true_error
 @options.config
-@click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Output folder.")
+@click.option("--out", metavar="DIR", type=options.PATH, default="share-demo", help="Output folder.")
 @click.option("--scene", help="Kind of room (see share emulate --help).  [default: warehouse]")
 @click.option(
     "--seed", type=click.IntRange(0), help="Seed of the room.  [default: one where agents meet soon]"
@@ -57,8 +44,8 @@ def demo(
     policy: str,
     link: str | None,
     true_error: bool,
-    config_file: str | None,
-    out: str,
+    config_file: Path | None,
+    out: Path,
     scene: str | None,
     seed: int | None,
 ) -> None:
@@ -71,7 +58,6 @@ def demo(
     \b
     Example:  share demo --seconds 30 --out /tmp/demo
     """
-    folder = Path(out)
     options.load_config(config_file)  # check it and the link before the room is made
     if policy == STREAMED and true_error:
         raise UsageError(
@@ -86,14 +72,21 @@ def demo(
     from share.runtime.machine import core_count
 
     LinkAssignment.parse(link).check(AGENTS)
-    writable_dir(folder)
+    writable_dir(out)
     room = _renderable_scene(scene)
     seed = meeting_seed(room) if seed is None else seed
     with Stages() as stages:
         session = read_session(make_cached_session(recipe(room, seconds, seed), progress=stages))
     live = LiveLine()
-    run_terms = RunOptions(policy, link, seed, true_error, config=config_file, agents_first=True)
-    folders = play_in_real_time(session, seconds, run_terms, folder, lambda now: live.write(str(now)))
+    run_terms = RunOptions(
+        policy,
+        link,
+        seed,
+        true_error,
+        config=None if config_file is None else str(config_file),
+        agents_first=True,
+    )
+    folders = play_in_real_time(session, seconds, run_terms, out, lambda now: live.write(str(now)))
     live.end()
     result = score_session(session, folders)
     click.echo(_score_table(result, policy == STREAMED))
@@ -103,7 +96,7 @@ def demo(
             "machines they would not"
         )
         click.echo(warning)
-    picture = folder / "trajectories.png"
+    picture = out / "trajectories.png"
     picture.unlink(missing_ok=True)  # left by an earlier demo
     if result.joint is not None:
         from share.lab.evaluate.charts import draw_trajectories
@@ -111,7 +104,7 @@ def demo(
         title = f"joint ATE {100 * result.joint.joint.rmse:.2f} cm, causal, one alignment for all"
         paths = {name: (agent.map, agent.truth) for name, agent in result.agents.items()}
         draw_trajectories(picture, paths, result.joint.joint.T_truth_est, title)
-        click.echo(f"\npicture: {picture}   decisions of the edge: {folder / 'edge' / 'events.jsonl'}")
+        click.echo(f"\npicture: {picture}   decisions of the edge: {out / 'edge' / 'events.jsonl'}")
 
 
 def _renderable_scene(scene: str | None) -> str:
@@ -129,49 +122,36 @@ def _renderable_scene(scene: str | None) -> str:
 
 def _score_table(result: SessionScore, streamed: bool) -> str:
     joint = {} if result.joint is None else result.joint.agents
-    head = (
-        "agent",
-        "odom ATE",
-        "map ATE",
-        "pose p50",
-        "p95",
-        "> 20 ms",
-        "corrected p50",
-        "p95",
-        "keyframes",
-        "sent",
-        "corrections",
+
+    def duration(title: str, name: str, percentile: str) -> Column:
+        return title, lambda agent: _ms(result.agents[agent].report[name][percentile])
+
+    def count(name: str) -> Column:
+        return name, lambda agent: str(result.agents[agent].report[name])
+
+    columns: tuple[Column, ...] = (
+        ("agent", str),
+        ("odom ATE", lambda agent: _cm(result.agents[agent].odometry)),
+        ("map ATE", lambda agent: _cm(joint.get(agent))),
+        duration("pose p50", "track_ms", "p50"),
+        duration("p95", "track_ms", "p95"),
+        ("> 20 ms", lambda agent: f"{100 * result.agents[agent].report['over_20ms']:.1f} %"),
+        duration("corrected p50", "corrected_ms", "p50"),
+        duration("p95", "corrected_ms", "p95"),
+        *(count(name) for name in ("keyframes", "sent", "corrections")),
     )
-    rows = [head]
-    for name, agent in result.agents.items():
-        r = agent.report
-        rows.append(
-            (
-                name,
-                _cm(agent.odometry),
-                _cm(joint.get(name)),
-                _ms(r["track_ms"]["p50"]),
-                _ms(r["track_ms"]["p95"]),
-                f"{100 * r['over_20ms']:.1f} %",
-                _ms(r["corrected_ms"]["p50"]),
-                _ms(r["corrected_ms"]["p95"]),
-                str(r["keyframes"]),
-                str(r["sent"]),
-                str(r["corrections"]),
-            )
-        )
-    lines = aligned_table(rows).splitlines()
+    table = column_table(columns, result.agents)
     if streamed:
         untracked = ", ".join(f"{name} {agent.report['untracked']}" for name, agent in result.agents.items())
         note = f"the edge tracked each agent alone; frames without an answer: {untracked}"
-        return "\n".join([*lines, "", note])
+        return f"{table}\n\n{note}"
     members = len(joint)
     verdict = (
         f"{members} of {len(result.agents)} agents in one map"
         + (f", joint ATE {_cm(result.joint.joint)}" if result.joint else "")
         + "  (causal poses, one SE3 alignment for all)"
     )
-    return "\n".join([*lines, "", verdict])
+    return f"{table}\n\n{verdict}"
 
 
 def _cm(ate: Ate | None) -> str:

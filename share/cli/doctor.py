@@ -20,29 +20,28 @@ if TYPE_CHECKING:
 @click.option(
     "--profile",
     default="d435i",
-    show_default=True,
     metavar="NAME|FILE",
     help="What this device should be: d435i, d435i-n100-headset, d435i-turtlebot4, laptop-edge, or a file.",
 )
-@click.option("--calib", metavar="DIR", help="Calibration of this device to check.")
+@click.option("--calib", metavar="DIR", type=options.PATH, help="Calibration of this device to check.")
 @click.option("--edge", "address", metavar="tcp://H:P", help="Edge to connect to.")
 @options.keys
 @click.option("--server-key", metavar="FILE|KEY", help="Public key of that edge.")
 @click.option(
     "--out",
     default=".",
-    show_default=True,
     metavar="DIR",
+    type=options.PATH,
     help="Folder for recordings, whose disk is checked.",
 )
 @options.as_json
 def doctor(
     profile: str,
-    calib: str | None,
+    calib: Path | None,
     address: str | None,
-    keys: str | None,
+    keys: Path | None,
     server_key: str | None,
-    out: str,
+    out: Path,
     as_json: bool,
 ) -> None:
     """Check camera, calibration, computer, clock, keys and edge, and say what to fix. Changes nothing.
@@ -67,10 +66,10 @@ def doctor(
     sdk = query_sdk(host)
     findings = [
         *inspect_camera(host, sdk),
-        *inspect_calibration(host, None if calib is None else Path(calib), sdk),
-        *inspect_host(host, Path(out)),
+        *inspect_calibration(host, calib, sdk),
+        *inspect_host(host, out),
         *inspect_port(host),
-        *inspect_edge(host, address, None if keys is None else Path(keys), server_key),
+        *inspect_edge(host, address, keys, server_key),
     ]
     failed = failures(findings)
     click.echo(_report_json(host.name, findings, not failed) if as_json else _findings_text(findings))

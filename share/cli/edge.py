@@ -19,13 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option(
-    "--bind",
-    default="tcp://127.0.0.1:5555",
-    show_default=True,
-    metavar="tcp://H:P",
-    help="Address to listen on.",
-)
+@click.option("--bind", default="tcp://127.0.0.1:5555", metavar="tcp://H:P", help="Address to listen on.")
 @click.option(
     "--policy",
     type=click.Choice(POLICY_NAMES),
@@ -33,23 +27,27 @@ if TYPE_CHECKING:
 )
 @options.keys
 @click.option(
-    "--map", "map_file", metavar="FILE", help="Keep the map in this file; continue with what it holds."
+    "--map",
+    "map_file",
+    metavar="FILE",
+    type=options.PATH,
+    help="Keep the map in this file; continue with what it holds.",
 )
 @click.option(
     "--http", metavar="[H:]P", help="Serve a status page, /health, /metrics and /snapshot.json here."
 )
-@click.option("--out", metavar="DIR", help="Folder for events.jsonl and edge.json.")
+@click.option("--out", metavar="DIR", type=options.PATH, help="Folder for events.jsonl and edge.json.")
 @options.config
 @options.verbose
 @options.as_json
 def edge(
     bind: str,
     policy: str | None,
-    keys: str | None,
-    map_file: str | None,
+    keys: Path | None,
+    map_file: Path | None,
     http: str | None,
-    out: str | None,
-    config_file: str | None,
+    out: Path | None,
+    config_file: Path | None,
     verbose: bool,
     as_json: bool,
 ) -> None:
@@ -91,7 +89,6 @@ def edge(
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
     max_message_bytes = MAX_IMAGE_BYTES if is_streamed else MAX_FRAME_BYTES
-    folder = None if out is None else Path(out)
     runs: list[EdgeRun] = []
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
@@ -101,9 +98,9 @@ def edge(
             status = stack.enter_context(
                 closing(StatusServer(http, lambda: runs[0].report() if runs else {}, stderr.print_line))
             )
-        store = None if map_file is None else stack.enter_context(_open_map(stderr, Path(map_file)))
+        store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
         run = stack.enter_context(
-            closing(EdgeRun(settings, link, folder, lambda e: _print_event(stderr, e, verbose), store))
+            closing(EdgeRun(settings, link, out, lambda e: _print_event(stderr, e, verbose), store))
         )
         runs.append(run)
         with stop_on_signal(run.stop):
@@ -115,7 +112,7 @@ def edge(
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
-def _edge_keys(folder: str | None, local: bool) -> EdgeKeys | None:
+def _edge_keys(folder: Path | None, local: bool) -> EdgeKeys | None:
     """Return the keys in --keys, or those in the default folder if the edge is on a network.
 
     None if there are none. Raises UsageError.
@@ -124,7 +121,7 @@ def _edge_keys(folder: str | None, local: bool) -> EdgeKeys | None:
 
     if folder is None and (local or not has_pair(default_folder())):
         return None
-    return edge_keys(None if folder is None else Path(folder))
+    return edge_keys(folder)
 
 
 def _open_map(stderr: Stderr, path: Path) -> MapStore:

@@ -43,11 +43,9 @@ class _Size(click.ParamType[tuple[float, ...]]):
     metavar="[NAME=]SPEC",
     help="An agent and its motion; see below. May be repeated.",
 )
-@click.option("--out", required=True, metavar="SESSION", help="A new folder.")
-@click.option("--seconds", type=float, default=30, show_default=True, help="Length of the session, s.")
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the room and the noise."
-)
+@click.option("--out", required=True, metavar="SESSION", type=options.PATH, help="A new folder.")
+@click.option("--seconds", type=float, default=30, help="Length of the session, s.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the room and the noise.")
 @click.option("--size", type=_Size(), metavar="LxWxH", help="Size of the room, m.  [default: the scene's]")
 @click.option(
     "--profile",
@@ -79,17 +77,14 @@ class _Size(click.ParamType[tuple[float, ...]]):
     "form",
     type=click.Choice(["session", "euroc"]),
     default="session",
-    show_default=True,
     help="A session of SHARE, or EuRoC/ASL folders.",
 )
 @options.as_json
-@click.option(
-    "--workers", type=click.IntRange(1, 64), default=_WORKERS, show_default=True, help="Processes to use."
-)
+@click.option("--workers", type=click.IntRange(1, 64), default=_WORKERS, help="Processes to use.")
 def emulate(
     scene: str,
     motions: tuple[str, ...],
-    out: str,
+    out: Path,
     seconds: float,
     seed: int,
     size: tuple[float, float, float] | None,
@@ -136,7 +131,7 @@ def emulate(
         images=images or ("png" if euroc else "jpeg"),
     )
     with Stages() as stages:
-        folder = make_session(recipe, Path(out), workers, stages, asl=euroc)
+        folder = make_session(recipe, out, workers, stages, asl=euroc)
     description = _describe_session(folder, euroc)
     click.echo(json.dumps(description) if as_json else _description_text(description))
 

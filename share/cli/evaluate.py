@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from share.cli import options
-from share.cli.compare_trackers import compare
-from share.cli.evaluate_sweep import sweep
-from share.cli.many_runs import check_none_failed, many_run_options, play_runs
-from share.cli.run_options import load_run_config, run_options
-from share.cli.run_table import run_table
-from share.cli.terminal import LiveLine
-from share.config import POLICY_NAMES
-from share.errors import UsageError
+from share.cli.evaluate_compare import compare
+from share.cli.evaluate_many import ablation, sweep
+from share.cli.terminal import Column, LiveLine, column_table
 
 if TYPE_CHECKING:
-    from share.lab.evaluate.report import ReportSection
-    from share.lab.evaluate.trial import Trial
-
-BASE_POLICY = "covins-g"  # the policy to which the others are compared
+    from share.lab.evaluate.run_metrics import AgentMetrics, RunMetrics
 
 
 @click.group()
@@ -38,32 +32,19 @@ def evaluate() -> None:
     """
 
 
-evaluate.add_command(sweep)
-evaluate.add_command(compare)
+for command in (ablation, sweep, compare):
+    evaluate.add_command(command)
 
 
 @evaluate.command(short_help="Play a session and keep all outputs.")
-@click.argument("session", type=click.Path(path_type=Path))
-@click.option(
-    "--policy",
-    type=click.Choice(POLICY_NAMES),
-    default=POLICY_NAMES[0],
-    show_default=True,
-    help="How keyframe rates are set.",
-)
-@run_options
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of link and scheduler."
-)
+@click.argument("session", type=options.PATH)
+@options.policy
+@options.run_options
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of link and scheduler.")
 @options.config
-@click.option("--out", required=True, metavar="RUN", type=click.Path(path_type=Path), help="A new folder.")
+@click.option("--out", required=True, metavar="RUN", type=options.PATH, help="A new folder.")
 def run(
-    session: Path,
-    policy: str,
-    seed: int,
-    config_file: str | None,
-    out: Path,
-    **options_given: Any,
+    session: Path, policy: str, seed: int, config_file: Path | None, out: Path, **options_given: Any
 ) -> None:
     """Play SESSION in real time with an edge and its agents, each its own process; or, with --virtual, with
     the same trackers and state machines in virtual time, independent of this machine's load.
@@ -80,7 +61,7 @@ def run(
     from share.recordings.session import read_session
 
     opened, live = read_session(session), LiveLine()
-    config = load_run_config(config_file, options_given, [opened])
+    config = options.load_run_config(config_file, options_given, [opened])
     run_terms = RunOptions(policy, seed=seed, **options_given)
     trial = run_trial(opened, run_terms, config, out, lambda now: live.write(str(now)))
     live.end()
@@ -88,18 +69,12 @@ def run(
 
 
 @evaluate.command(short_help="Score runs: errors, latency, merges, QoE.")
-@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option(
-    "--csv",
-    "csv_file",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="CSV file with a line per agent.",
-)
+@click.argument("runs", nargs=-1, required=True, type=options.PATH)
+@click.option("--csv", "csv_file", metavar="FILE", type=options.PATH, help="CSV file with a line per agent.")
 @click.option(
     "--plots",
     metavar="DIR",
-    type=click.Path(path_type=Path),
+    type=options.PATH,
     help="Folder for charts: QoE and rates over time, merges over distance.",
 )
 @options.as_json
@@ -142,91 +117,66 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_
         click.echo(f"\npictures: {', '.join(map(str, pictures))}")
 
 
-@evaluate.command(short_help="Compare policies on sessions.")
-@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option(
-    "--policy",
-    "policies_given",
-    type=click.Choice(POLICY_NAMES),
-    multiple=True,
-    help="A policy to compare; may be repeated.  [default: all that share a map]",
+def _value_text(value: float, unit: str, digits: int = 1) -> str:
+    return "–" if math.isnan(value) else f"{value:.{digits}f} {unit}".rstrip()
+
+
+def _value(
+    title: str, of: Callable[[AgentMetrics], float], unit: str, digits: int = 1, factor: float = 1.0
+) -> Column:
+    """Return a column with a figure of each agent, in a unit; "–" for NaN."""
+    return title, lambda agent: _value_text(factor * of(agent), unit, digits)
+
+
+def _plain(title: str, of: Callable[[AgentMetrics], object]) -> Column:
+    return title, lambda agent: str(of(agent))
+
+
+_LATENCY_COLUMNS = (
+    _plain("", lambda a: a.agent),
+    _value("latency", lambda a: a.latency_ms, "ms"),
+    _value("frames", lambda a: a.track_ms, "ms"),
+    _value("50 %", lambda a: a.track_p50_ms, "ms"),
+    _value("95 %", lambda a: a.track_p95_ms, "ms"),
+    _value("99 %", lambda a: a.track_p99_ms, "ms"),
+    _value("> 20 ms", lambda a: a.over_20ms, "%", factor=100),
+    _value("corrected", lambda a: a.corrected_ms, "ms"),
+    _value("50 %", lambda a: a.corrected_p50_ms, "ms"),
+    _value("95 %", lambda a: a.corrected_p95_ms, "ms"),
+    _value("99 %", lambda a: a.corrected_p99_ms, "ms"),
+    _plain("of", lambda a: a.corrected),
 )
-@run_options
-@many_run_options
-@click.option(
-    "--with",
-    "section_paths",
-    multiple=True,
-    metavar="PATH",
-    type=click.Path(path_type=Path, exists=True),
-    help="Add to the report: a folder by `evaluate sweep`, or a file by `train compare --json`.",
+_ERROR_COLUMNS = (
+    _plain("", lambda a: a.agent),
+    _value("odom ATE", lambda a: a.odom_ate_cm, "cm", 2),
+    _plain("of", lambda a: a.odom_n),
+    _value("map ATE", lambda a: a.ate_cm, "cm", 2),
+    _plain("of", lambda a: a.in_map),
+    _value("RPE frame", lambda a: a.rpe_frame_cm, "mm", factor=10),
+    _value("", lambda a: a.rpe_frame_deg, "°", 3),
+    _value("RPE 1 s", lambda a: a.rpe_1s_cm, "cm", 2),
+    _value("", lambda a: a.rpe_1s_deg, "°", 2),
+    _plain("of", lambda a: a.rpe_1s_n),
+    _value("in a map", lambda a: a.joined_s, "s"),
+    _value("sent", lambda a: a.rate_hz, "Hz"),
+    _value("up", lambda a: a.kb_up_s, "kB/s", 0),
+    _value("down", lambda a: a.kb_down_s, "kB/s", 0),
+    _value("QoE", lambda a: a.qoe, "", 2),
+    _value("reported error", lambda a: a.told_cm, "cm", 2),
 )
-@options.config
-@options.out_folder
-def ablation(
-    sessions: tuple[Path, ...],
-    policies_given: tuple[str, ...],
-    section_paths: tuple[Path, ...],
-    seeds: int,
-    workers: int,
-    config_file: str | None,
-    out: Path,
-    **options_given: Any,
-) -> None:
-    """Play SESSIONS with each policy and each seed, and compare the policies.
 
-    The policies take turns on each session, so that a slower machine affects all alike. DIR gets a folder
-    per run, report.html (opens offline), report.md, agents.csv, runs.csv and pictures. An interrupted command
-    continues when it is run again.
 
-    \b
-    Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
-    """
-    if workers > 1 and not options_given["virtual"]:
-        raise UsageError("--workers needs --virtual: parallel runs in real time would slow each other down")
-    from share.files.writing import writable_dir
-    from share.lab.evaluate.campaign import plan_policies, worker_pool
-    from share.lab.evaluate.real_time import RunOptions
-    from share.lab.evaluate.report import read_section
-    from share.recordings.session import read_session
-
-    policies = policies_given or tuple(policy for policy in POLICY_NAMES if policy != "streamed")
-    sections = [read_section(path, number) for number, path in enumerate(section_paths, 1)]
-    opened = [read_session(folder) for folder in sessions]
-    config = load_run_config(config_file, options_given, opened)
-    planned_runs = plan_policies(
-        opened, policies, range(seeds), RunOptions("", **options_given), out / "runs", config
+def run_table(run: RunMetrics) -> str:
+    """Return two tables with a line per agent, latency and then errors and sharing, and the merges."""
+    merges = (
+        f"merges: {run.merges_requested} requested, {run.merges_skipped} skipped, {run.merges_done} done, "
+        f"{_value_text(run.merges_per_metre, 'a metre', 2)} over {run.metres:.0f} m"
     )
-    writable_dir(out, "agents.csv", "runs.csv", "report.md", "report.html")
-    trials_by_folder = play_runs(planned_runs, worker_pool(workers), lambda one: one.out.name)
-    trials = list(trials_by_folder.values())
-    failed = [one.out.name for one in planned_runs if one.out not in trials_by_folder]
-    if trials:
-        _write_report(out, trials, failed, sections)
-    check_none_failed(len(trials), len(planned_runs))
-
-
-def _write_report(out: Path, trials: list[Trial], failed: list[str], sections: list[ReportSection]) -> None:
-    from share.files.writing import atomic_write
-    from share.lab.evaluate.html_page import html_page
-    from share.lab.evaluate.report import agents_csv, markdown, runs_csv
-    from share.lab.evaluate.report_charts import draw_report
-    from share.lab.evaluate.scoring import run_metrics
-    from share.lab.evaluate.statistics import policy_names
-    from share.recordings.images import read_picture
-
-    all_metrics = [run_metrics(trial) for trial in trials]
-    names = policy_names(all_metrics)
-    base = BASE_POLICY if BASE_POLICY in names else names[0]
-    report_pictures = draw_report(out, all_metrics, trials, base)
-    report = "\n".join(
-        [markdown(all_metrics, trials, base, failed, report_pictures), *(one.text for one in sections)]
+    c = run.conditions
+    where = f"{c.session}: policy {c.policy}, {c.link or 'loopback'}, seed {c.seed}"
+    joint_text = f"joint ATE {_value_text(run.joint_ate_cm, 'cm', 2)}"
+    return (
+        f"{where}; in {c.clock}, evaluations report {c.told}\n"
+        f"{column_table(_LATENCY_COLUMNS, run.agents)}\n\n{column_table(_ERROR_COLUMNS, run.agents)}\n"
+        f"{run.in_one_map} of {len(run.agents)} agents in one map, {joint_text}; {merges}"
     )
-    for name, path in (named for one in sections for named in one.pictures.items()):
-        atomic_write(out / name, read_picture(path))
-    atomic_write(out / "agents.csv", agents_csv(all_metrics))
-    atomic_write(out / "runs.csv", runs_csv(all_metrics))
-    atomic_write(out / "report.md", report)
-    atomic_write(out / "report.html", html_page("Policies compared", report, out))
-    click.echo(markdown(all_metrics, trials, base, failed))
-    click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv")

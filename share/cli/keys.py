@@ -29,7 +29,7 @@ def keys() -> None:
 @keys.command(short_help="Generate this machine's key pair.")
 @click.option("--name", help="Name of the key pair.  [default: this machine's name]")
 @options.keys
-def generate(name: str | None, keys: str | None) -> None:
+def generate(name: str | None, keys: Path | None) -> None:
     """Generate this machine's key pair and print the public key.
 
     NAME.public may be copied anywhere; NAME.secret must stay on this machine. An existing pair is kept.
@@ -56,7 +56,7 @@ def generate(name: str | None, keys: str | None) -> None:
     help="Name of an agent on that machine, if not NAME; may be repeated.",
 )
 @options.keys
-def authorize(name: str, public_key: str, agents: tuple[str, ...], keys: str | None) -> None:
+def authorize(name: str, public_key: str, agents: tuple[str, ...], keys: Path | None) -> None:
     """Allow an agent to connect, by the public key of its machine: the text in single quotes, or NAME.public.
 
     NAME is the machine's name. Its key is valid for the agent of that name, or for those given with --agent,
@@ -74,7 +74,7 @@ def authorize(name: str, public_key: str, agents: tuple[str, ...], keys: str | N
 @keys.command(short_help="Withdraw a machine's authorization.")
 @click.argument("name")
 @options.keys
-def revoke(name: str, keys: str | None) -> None:
+def revoke(name: str, keys: Path | None) -> None:
     """Withdraw the authorization of machine NAME. A running edge disconnects its agents at once.
 
     \b
@@ -88,7 +88,7 @@ def revoke(name: str, keys: str | None) -> None:
 @keys.command("list", short_help="List this machine's public key and the authorized ones.")
 @options.keys
 @options.as_json
-def list_keys(keys: str | None, as_json: bool) -> None:
+def list_keys(keys: Path | None, as_json: bool) -> None:
     """List this machine's public key and the authorized ones.
 
     \b
@@ -110,7 +110,7 @@ def list_keys(keys: str | None, as_json: bool) -> None:
         click.echo(f"{key}  {name}{others}")
 
 
-def _key_folder(folder_given: str | None) -> Path:
+def _key_folder(folder_given: Path | None) -> Path:
     from share.net.keys import default_folder
 
-    return default_folder() if folder_given is None else Path(folder_given)
+    return folder_given or default_folder()

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
 import click
 
+from share.cli.terminal import print_note
+from share.config import POLICY_NAMES
 from share.errors import UsageError, one_line
 
 if TYPE_CHECKING:
     from share.config import Config
     from share.recordings.calibration import Calibration
+    from share.recordings.session import Session
     from share.runtime.source import Source
+
+Command = Callable[..., Any]
+
+PATH = click.Path(path_type=Path)
+EXISTING_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 calib = click.option(
     "--calib",
@@ -23,19 +32,24 @@ calib = click.option(
     "overrides the calibration in the source.",
 )
 config = click.option(
-    "--config", "config_file", metavar="FILE", help="YAML file with settings (docs/lookup/configuration.md)."
+    "--config",
+    "config_file",
+    metavar="FILE",
+    type=PATH,
+    help="YAML file with settings (docs/lookup/configuration.md).",
 )
 verbose = click.option("-v", "--verbose", is_flag=True, help="Print more.")
 keys = click.option(
-    "--keys", metavar="DIR", help="Folder of this machine's keys.  [default: ~/.config/share/keys]"
+    "--keys", metavar="DIR", type=PATH, help="Folder of this machine's keys.  [default: ~/.config/share/keys]"
 )
-out_folder = click.option(
-    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Output folder."
-)
+out_folder = click.option("--out", required=True, metavar="DIR", type=PATH, help="Output folder.")
 target = click.option(
-    "--target", "target_name", required=True, metavar="T",
+    "--target",
+    "target_name",
+    required=True,
+    metavar="T",
     help="The board: aprilgrid or charuco in the usual size, or its YAML file.",
-)  # fmt: skip
+)
 
 
 def _cores() -> int:
@@ -55,15 +69,27 @@ sigma_mm = click.option(
     "--sigma-mm",
     type=click.FloatRange(min=0.01),
     default=2.0,
-    show_default=True,
     help="Position noise of the motion capture, 1 sigma, mm.",
 )
 rotations = click.option(
     "--rotations",
     type=click.Choice(["helical", "xyz"]),
     default="helical",
-    show_default=True,
     help="Meaning of RX, RY, RZ in a Vicon CSV without RW: rotation vector (helical) or Euler angles (xyz).",
+)
+policy = click.option(
+    "--policy",
+    type=click.Choice(POLICY_NAMES),
+    default=POLICY_NAMES[0],
+    help="How keyframe rates are set.",
+)
+link = click.option(
+    "--link",
+    metavar="LINK[,AGENT=LINK…]",
+    help="Emulated network, as share agent --link: one for all agents, or one per agent.",
+)
+true_error = click.option(
+    "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
 )
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
@@ -84,12 +110,41 @@ class _Frames(click.ParamType[slice]):
 frames = click.option("--frames", type=_Frames(), help="Use only camera frames A to B-1, such as 0:250.")
 
 
-def load_config(path: str | None) -> Config:
+def option_group(*group: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Return a decorator that adds options to a command, in this order."""
+
+    def add(command: Command) -> Command:
+        for option in reversed(group):
+            command = option(command)
+        return command
+
+    return add
+
+
+# How `share evaluate` plays a session; their names are fields of `share.lab.evaluate.real_time.RunOptions`.
+run_options = option_group(
+    link,
+    true_error,
+    click.option(
+        "--virtual", is_flag=True, help="Play in virtual time: track once, draw the durations from a seed."
+    ),
+    click.option(
+        "--costs", metavar="RUN", help="With --virtual: take the durations from this real-time run."
+    ),
+    click.option(
+        "--agents-first",
+        is_flag=True,
+        help="Run the edge at lower CPU priority, as if agents had machines of their own.",
+    ),
+)
+
+
+def load_config(path: Path | None) -> Config:
     """Read settings from a YAML file; the defaults without one. Raises ConfigError, UsageError."""
     from share.config import Config
     from share.files.yaml_file import read_settings
 
-    return Config() if path is None else read_settings(Path(path))
+    return Config() if path is None else read_settings(path)
 
 
 def agent_name(value: str) -> str:
@@ -119,13 +174,13 @@ def values_by_name(option: str, values: tuple[str, ...]) -> dict[str, str]:
 def print_notes(source: Source) -> None:
     """Print the notes on a recording, such as unused streams, on stderr, one per line."""
     for note in source.notes:
-        click.echo(f"share: {source.name}: {note}", err=True)
+        print_note(source.name, note)
 
 
 def print_losses(source: Source) -> None:
     """Print what could not be read of a recording on stderr, one line per kind of loss."""
     for line in source.losses.lines():
-        click.echo(f"share: {source.name}: {one_line(line)}", err=True)
+        print_note(source.name, one_line(line))
 
 
 def warn_other_device(name: str, given_calibration: Calibration | None, serial: str | None) -> None:
@@ -133,10 +188,31 @@ def warn_other_device(name: str, given_calibration: Calibration | None, serial: 
     from share.recordings.calibration_match import device_mismatch
 
     for warning in () if given_calibration is None else device_mismatch(given_calibration.serials, serial):
-        click.echo(f"share: {name}: {warning}", err=True)
+        print_note(name, warning)
 
 
 def print_counters(counters: dict[str, int]) -> None:
     """Print the sequencer's non-zero counters on one line on stderr."""
     counts_text = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counters.items() if count)
     click.echo(f"sequencer: {counts_text or 'nothing to report'}", err=True)
+
+
+def load_run_config(
+    config_file: Path | None, options_given: dict[str, Any], sessions: Sequence[Session]
+) -> Config:
+    """Read the settings and check them and the run options before anything is played.
+
+    Raises ConfigError, UsageError.
+    """
+    from share.lab.evaluate.emulated_network import LinkAssignment
+
+    config, links = load_config(config_file), LinkAssignment.parse(options_given["link"])
+    for session in sessions:
+        links.check(session.agents)
+    if options_given["costs"] is not None:
+        from share.lab.evaluate.virtual_time import read_delays
+
+        if not options_given["virtual"]:
+            raise UsageError("--costs needs --virtual: in real time, durations are as they are")
+        read_delays(Path(options_given["costs"]))
+    return config

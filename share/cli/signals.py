@@ -35,7 +35,7 @@ def _unwind(number: int, frame: FrameType | None) -> None:
     There, some libraries turn the exception into another (poselib: "cannot import the C++ backend"), and
     some swallow it.
     """
-    if _is_importing(frame):
+    if is_importing(frame):
         signal.signal(signal.SIGALRM, lambda _, later: _unwind(number, later))
         signal.setitimer(signal.ITIMER_REAL, _RETRY_S)
     elif number == signal.SIGINT:
@@ -44,7 +44,7 @@ def _unwind(number: int, frame: FrameType | None) -> None:
         sys.exit(128 + number)
 
 
-def _is_importing(frame: FrameType | None) -> bool:
+def is_importing(frame: FrameType | None) -> bool:
     while frame is not None:
         if frame.f_code.co_filename == _IMPORT_FILE:
             return True

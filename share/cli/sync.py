@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.table import aligned_table
-from share.cli.terminal import LiveLine, progress
+from share.cli.terminal import Column, LiveLine, column_table, progress
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
@@ -36,18 +35,11 @@ def sync() -> None:
 
 
 @sync.command(short_help="Serve this machine's time to others.")
-@click.option(
-    "--bind",
-    default=f"0.0.0.0:{PORT}",
-    show_default=True,
-    metavar="HOST:PORT",
-    help="Address to listen on.",
-)
+@click.option("--bind", default=f"0.0.0.0:{PORT}", metavar="HOST:PORT", help="Address to listen on.")
 @click.option(
     "--stratum",
     type=click.IntRange(1, 15),
     default=10,
-    show_default=True,
     help="NTP stratum to announce: distance from a reference clock.",
 )
 def server(bind: str, stratum: int) -> None:
@@ -82,7 +74,7 @@ def server(bind: str, stratum: int) -> None:
 
 
 def _print_server(address: HostPort, stratum: int, by_kernel: bool) -> None:
-    from share.devices.chrony import follow_lines
+    from share.devices.clocks import follow_lines
     from share.net.udp import HostPort
 
     stamps = "by the kernel" if by_kernel else "by this program, which is less precise"
@@ -101,14 +93,11 @@ def _counts_text(times: TimeServer) -> str:
 
 @sync.command(short_help="Measure the clock offsets of other machines.")
 @click.argument("hosts", nargs=-1, metavar="[HOSTS]")
-@click.option(
-    "--count", type=click.IntRange(1, 1000), default=8, show_default=True, help="Requests per host."
-)
+@click.option("--count", type=click.IntRange(1, 1000), default=8, help="Requests per host.")
 @click.option(
     "--limit-ms",
     type=click.FloatRange(0, min_open=True),
     default=1.0,
-    show_default=True,
     help="Largest allowed |offset| + uncertainty.",
 )
 @options.as_json
@@ -162,7 +151,7 @@ def _check_rows(rows: Sequence[ClockCheck], limit_ms: float) -> None:
 
 
 def _print_chrony_advice(host: HostPort) -> None:
-    from share.devices.chrony import follow_lines
+    from share.devices.clocks import follow_lines
 
     click.echo(
         "to follow it: install chrony, append this to /etc/chrony/chrony.conf, restart chrony:", err=True
@@ -179,17 +168,19 @@ def _report_values(rows: Sequence[ClockCheck], limit_ms: float) -> dict[str, Any
     }
 
 
-def _table(rows: Sequence[ClockCheck]) -> str:
-    head = ("clock", "offset ms", "± ms", "delay ms", "jitter ms", "stratum", "answers", "took s")
-    return aligned_table([head, *(_cells(row) for row in rows)])
-
-
-def _cells(row: ClockCheck) -> tuple[str, ...]:
-    ms = (row.uncertainty_ms, row.delay_ms, row.jitter_ms)
-    numbers = (_number(row.offset_ms, "+.3f"), *(_number(value, ".3f") for value in ms))
-    answers = "–" if row.asked is None else f"{row.answers}/{row.asked}"
-    return (row.name, *numbers, _number(row.stratum, "d"), answers, _number(row.took_s, ".1f"))
-
-
 def _number(value: float | None, form: str) -> str:
     return "–" if value is None else format(value, form)
+
+
+def _table(rows: Sequence[ClockCheck]) -> str:
+    columns: tuple[Column, ...] = (
+        ("clock", lambda row: row.name),
+        ("offset ms", lambda row: _number(row.offset_ms, "+.3f")),
+        ("± ms", lambda row: _number(row.uncertainty_ms, ".3f")),
+        ("delay ms", lambda row: _number(row.delay_ms, ".3f")),
+        ("jitter ms", lambda row: _number(row.jitter_ms, ".3f")),
+        ("stratum", lambda row: _number(row.stratum, "d")),
+        ("answers", lambda row: "–" if row.asked is None else f"{row.answers}/{row.asked}"),
+        ("took s", lambda row: _number(row.took_s, ".1f")),
+    )
+    return column_table(columns, rows)

@@ -1,15 +1,18 @@
-"""Progress bars and a live line on stderr, silent when it is not a terminal."""
+"""What a command shows: progress bars and a live line on stderr, silent where that is no terminal; tables."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import click
 
 from share.cli.stderr import Stderr
+
+Column = tuple[str, Callable[[Any], str]]  # title, and the text of its cell in a row
 
 
 @contextmanager
@@ -86,3 +89,22 @@ class Stages:
     def _end(self) -> None:
         self._stack.close()
         self._stage, self._done = "", 0
+
+
+def print_note(about: str, text: str) -> None:
+    """Print a note or warning about a file, a recording or a device on stderr."""
+    click.echo(f"share: {about}: {text}", err=True)
+
+
+def column_table(columns: Sequence[Column], rows: Iterable[Any]) -> str:
+    """Return an aligned table: a line of titles, and a line per row."""
+    titles = [title for title, _ in columns]
+    return aligned_table([titles, *([text(row) for _, text in columns] for row in rows)])
+
+
+def aligned_table(rows: Sequence[Sequence[str]]) -> str:
+    """Return rows of cells as lines with right-aligned columns."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
+    )

@@ -24,8 +24,15 @@ _LONG_INIT_S = 1.0  # a first pose later than this is reported
 @click.argument("source")
 @options.calib
 @options.frames
-@click.option("--out", metavar="T.tum", help="File for the causal poses of the body in odom (TUM format).")
-@click.option("--report", "report_file", metavar="R.json", help="File for the report (JSON).")
+@click.option(
+    "--out",
+    metavar="T.tum",
+    type=options.PATH,
+    help="File for the causal poses of the body in odom (TUM format).",
+)
+@click.option(
+    "--report", "report_file", metavar="R.json", type=options.PATH, help="File for the report (JSON)."
+)
 @camera_options.camera_options
 @options.config
 @options.verbose
@@ -34,10 +41,10 @@ def track(
     source: str,
     calib: str | None,
     frames: slice | None,
-    out: str | None,
-    report_file: str | None,
+    out: Path | None,
+    report_file: Path | None,
     camera: camera_options.CameraOptions,
-    config_file: str | None,
+    config_file: Path | None,
     verbose: bool,
     as_json: bool,
 ) -> None:
@@ -85,14 +92,14 @@ def track(
         options.print_counters(report["sequencer"])
 
 
-def _output_files(paths_given: dict[str, str | None], source: str) -> dict[str, Path]:
+def _output_files(paths_given: dict[str, Path | None], source: str) -> dict[str, Path]:
     """Return the files to write, by option.
 
     Raises UsageError if one cannot be written, or would overwrite the source or the other.
     """
     from share.files.writing import check_writable, is_special
 
-    files = {option: check_writable(Path(name)) for option, name in paths_given.items() if name is not None}
+    files = {option: check_writable(path) for option, path in paths_given.items() if path is not None}
     for option, path in files.items():
         if path.exists() and Path(source).exists() and path.samefile(source):
             raise UsageError(f"{option} {path} is the source itself; give another name")

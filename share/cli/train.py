@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _BASE_OPTION = click.option(
     "--base",
     metavar="FILE",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=options.EXISTING_FILE,
     help="Model whose backbone is used.  [default: the one shipped with SHARE]",
 )
 
@@ -35,24 +35,19 @@ def train() -> None:
 
 
 @train.command(short_help="Run the tracker over sessions and record its errors.")
-@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("sessions", nargs=-1, required=True, type=options.PATH)
 @click.option(
     "--runs",
     type=click.IntRange(1, 1000),
     default=4,
-    show_default=True,
     help="Runs per agent: one as recorded, the others degraded (dark, blurred, frames missing, …).",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the degradation.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the degradation.")
 @click.option("--without-imu", is_flag=True, help="Ignore the IMU: stereo or depth only.")
-@click.option("--workers", type=click.IntRange(1, 64), default=2, show_default=True, help="Runs in parallel.")
+@click.option("--workers", type=click.IntRange(1, 64), default=2, help="Runs in parallel.")
 @options.config
 @click.option(
-    "--out",
-    required=True,
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Output folder; gets a file per run.",
+    "--out", required=True, metavar="DIR", type=options.PATH, help="Output folder; gets a file per run."
 )
 def labels(
     sessions: tuple[Path, ...],
@@ -60,7 +55,7 @@ def labels(
     seed: int,
     without_imu: bool,
     workers: int,
-    config_file: str | None,
+    config_file: Path | None,
     out: Path,
 ) -> None:
     """Run the tracker over each agent of SESSIONS, as recorded and degraded; write the inputs of the error
@@ -89,13 +84,9 @@ def labels(
 
 
 @train.command(short_help="Train the error model on labels.")
-@click.argument("labels", metavar="LABELS", type=click.Path(path_type=Path))
-@click.option(
-    "--epochs", type=click.IntRange(1), default=200, show_default=True, help="Largest number of epochs."
-)
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the split and the training."
-)
+@click.argument("labels", metavar="LABELS", type=options.PATH)
+@click.option("--epochs", type=click.IntRange(1), default=200, help="Largest number of epochs.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the split and the training.")
 @_BASE_OPTION
 @options.out_folder
 def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> None:
@@ -137,18 +128,12 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
 
 
 @train.command(short_help="Write the trained model and its model card.")
-@click.argument("fitted", metavar="FIT", type=click.Path(path_type=Path))
+@click.argument("fitted", metavar="FIT", type=options.PATH)
 @click.option(
-    "--labels",
-    required=True,
-    metavar="LABELS",
-    type=click.Path(path_type=Path),
-    help="The labels it was trained on.",
+    "--labels", required=True, metavar="LABELS", type=options.PATH, help="The labels it was trained on."
 )
 @_BASE_OPTION
-@click.option(
-    "--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="ONNX file to write."
-)
+@click.option("--out", required=True, metavar="FILE", type=options.PATH, help="ONNX file to write.")
 def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
     """Join the head in FIT, a folder by `share train fit`, to the backbone; write the model, and beside it a
     model card with its results on the test rooms.
@@ -174,14 +159,9 @@ def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
 
 
 @train.command(short_help="Compare the trained model with four others on the test rooms.")
-@click.argument("labels", metavar="LABELS", type=click.Path(path_type=Path))
+@click.argument("labels", metavar="LABELS", type=options.PATH)
 @click.option(
-    "--fit",
-    "fitted",
-    required=True,
-    metavar="FIT",
-    type=click.Path(path_type=Path),
-    help="Folder by share train fit.",
+    "--fit", "fitted", required=True, metavar="FIT", type=options.PATH, help="Folder by share train fit."
 )
 @_BASE_OPTION
 @options.as_json

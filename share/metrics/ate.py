@@ -22,15 +22,21 @@ Alignment = Literal["se3", "origin", "none"]
 _MIN_POSES = {"se3": 3, "origin": 1, "none": 1}  # associated poses that an alignment needs
 
 
-@dataclass(frozen=True, eq=False)
-class Ate:
-    """Position errors in m under the alignment T_truth_est (4, 4): p_truth ~ T_truth_est p_est."""
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Statistics of n errors, in their unit."""
 
     rmse: float
     mean: float
     median: float
     max: float
     n: int
+
+
+@dataclass(frozen=True, eq=False)
+class Ate(ErrorStatistics):
+    """Position errors in m under the alignment T_truth_est (4, 4): p_truth ~ T_truth_est p_est."""
+
     T_truth_est: F64
 
 
@@ -52,8 +58,7 @@ def ate(
     poses made equal; `none`: as given. Raises DataError if too few poses have a truth at their time."""
     _, T_est, T_truth = associate(estimate, truth, max_gap_ns)
     require_poses(len(T_est), _MIN_POSES[alignment], "ATE")
-    T = _fit_alignment(T_est, T_truth, alignment)
-    return _make_ate(error_statistics(position_errors(T, T_est, T_truth)), T)
+    return _ate_under(_fit_alignment(T_est, T_truth, alignment), T_est, T_truth)
 
 
 def joint_ate(
@@ -72,10 +77,8 @@ def joint_ate(
     require_poses(sum(len(T) for T, _ in associated.values()), _MIN_POSES[alignment], "joint ATE")
     all_est, all_truth = (np.concatenate(side) for side in zip(*associated.values(), strict=True))
     T = _fit_alignment(all_est, all_truth, alignment)
-    agents = {
-        name: _make_ate(error_statistics(position_errors(T, *pair)), T) for name, pair in associated.items()
-    }
-    return JointAte(_make_ate(error_statistics(position_errors(T, all_est, all_truth)), T), agents)
+    agents = {name: _ate_under(T, *pair) for name, pair in associated.items()}
+    return JointAte(_ate_under(T, all_est, all_truth), agents)
 
 
 def position_errors(T_truth_est: F64, T_est: F64, T_truth: F64) -> F64:
@@ -93,19 +96,9 @@ def _fit_alignment(T_est: F64, T_truth: F64, alignment: Alignment) -> F64:
     return np.eye(4)
 
 
-def _make_ate(statistics: ErrorStatistics, T: F64) -> Ate:
-    return Ate(statistics.rmse, statistics.mean, statistics.median, statistics.max, statistics.n, T)
-
-
-@dataclass(frozen=True)
-class ErrorStatistics:
-    """Statistics of n errors, in their unit."""
-
-    rmse: float
-    mean: float
-    median: float
-    max: float
-    n: int
+def _ate_under(T: F64, T_est: F64, T_truth: F64) -> Ate:
+    """Return the ATE of associated poses (N, 4, 4) under the alignment T (4, 4)."""
+    return Ate(**vars(error_statistics(position_errors(T, T_est, T_truth))), T_truth_est=T)
 
 
 def error_statistics(errors: F64) -> ErrorStatistics:

@@ -1,10 +1,10 @@
-"""The last lines of an agent say what was sent, what the edge acknowledged, and why not all was."""
+"""The summary of an agent: keyframes sent and acknowledged, and why some were not."""
 
 from types import SimpleNamespace
 
 import pytest
 
-from share.cli.agent import _keyframes_text, _unacknowledged_text
+from share.cli.agent import keyframes_text, unacknowledged_text
 
 TOLD = {
     "edge_sessions": 1, "keyframes": 53, "sent": 50, "unacknowledged": 5, "refusal": None, "connected": True,
@@ -33,16 +33,16 @@ def report(**told):
         ({"connected": False, "refusal": "too many"}, None, "the edge refuses 'ann': too many"),
     ],
 )
-def test_why_keyframes_were_never_acknowledged(told, trouble, why):
+def test_missing_acknowledgements_are_explained(told, trouble, why):
     run = SimpleNamespace(report=report(**told), trouble=trouble)
-    assert _unacknowledged_text(run, "ann", 5.0) == f"the edge did not acknowledge 5 keyframes: {why}"
+    assert unacknowledged_text(run, "ann", 5.0) == f"the edge did not acknowledge 5 keyframes: {why}"
 
 
 @pytest.mark.parametrize("told", [{"unacknowledged": 0}, {"edge_sessions": 0}])
-def test_nothing_is_said_where_all_is_well_or_there_never_was_an_edge(told):
-    assert _unacknowledged_text(SimpleNamespace(report=report(**told), trouble=None), "ann", 5.0) is None
+def test_no_explanation_if_all_is_acknowledged_or_no_edge_answered(told):
+    assert unacknowledged_text(SimpleNamespace(report=report(**told), trouble=None), "ann", 5.0) is None
 
 
-def test_the_last_line_says_what_was_sent():
-    assert _keyframes_text(report(), "T") == "60 keyframes: 50 sent, 48 acknowledged, 3 corrections, T"
-    assert _keyframes_text(report(edge_sessions=0), "T") == "no edge answered: 60 keyframes not sent"
+def test_keyframe_counts_are_printed():
+    assert keyframes_text(report(), "T") == "60 keyframes: 50 sent, 48 acknowledged, 3 corrections, T"
+    assert keyframes_text(report(edge_sessions=0), "T") == "no edge answered: 60 keyframes not sent"

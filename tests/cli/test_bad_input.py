@@ -1,4 +1,4 @@
-"""What a person meets when something is wrong: one clear line, the right exit code, nothing half-written.
+"""Invalid input gives one clear line, the right exit code, and no partial output.
 
 Commands run for real: within this process where that is the same, as processes where signals, sockets
 or two of them at a time matter. Exit code 2: what was typed or pointed at; 1: damaged data or a failure.
@@ -26,6 +26,8 @@ from share.types import Keyframe
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
+pytestmark = pytest.mark.long
+
 SHARE = [sys.executable, "-m", "share"]
 NOBODY = "tcp://127.0.0.1:1"  # a port that nothing listens on
 FRAMES = 45  # of `plain_session`
@@ -38,7 +40,7 @@ cam1: {camera_model: pinhole, intrinsics: [385, 385, 320.4, 239.6], resolution: 
 
 
 def complaint(done: Done, code: int) -> str:
-    """The one line that a command that failed with `code` has said."""
+    """Return the one error line of a command that failed with `code`."""
     assert done.code == code, done.err
     assert done.out == ""
     assert done.err.startswith("share: ")
@@ -52,7 +54,7 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 @contextmanager
 def untouched(folder: Path) -> Iterator[None]:
-    """Every file below `folder` is the same afterwards, and there is no new one."""
+    """Assert that no file below `folder` changes or appears."""
     before = tree(folder)
     yield
     assert tree(folder) == before
@@ -73,7 +75,7 @@ both = pytest.mark.parametrize("command", [as_track, as_agent])
 
 @pytest.fixture(scope="module")
 def room(plain_session) -> Path:
-    """A session of pictures that can be tracked, three seconds long."""
+    """A trackable session of three seconds."""
     return plain_session
 
 
@@ -97,7 +99,7 @@ def damaged(stereo, tmp_path) -> Path:
 
 
 def longer(stereo: Path, to: Path, frames: int, step_s: float) -> Path:
-    """The same images, there and back again, `frames` of them at `step_s`."""
+    """The same images forwards and backwards, `frames` of them at `step_s`."""
     folder = shutil.copytree(stereo, to)
     for listing in folder.glob("mav0/cam*/data.csv"):
         lines = [line for line in listing.read_text().splitlines() if not line.startswith("#")]
@@ -221,7 +223,7 @@ def test_tum_folder(damage, command, share, tmp_path):
         assert said in complaint(share(*command(recording, tmp_path / "out")), code)
 
 
-def test_a_truth_that_is_cut_short(share, tmp_path):
+def test_truncated_ground_truth_is_refused(share, tmp_path):
     recording = make_tum(tmp_path / "kitchen")
     cut(recording / "groundtruth.txt")
     with untouched(tmp_path):
@@ -233,7 +235,7 @@ def test_a_truth_that_is_cut_short(share, tmp_path):
 
 
 @both
-def test_an_mcap_that_is_cut_short(command, room, share, tmp_path):
+def test_truncated_mcap_is_refused(command, room, share, tmp_path):
     recording = tmp_path / "cut.mcap"
     recording.write_bytes((room / "ar1.mcap").read_bytes()[:-3000])
     with untouched(tmp_path):
@@ -242,7 +244,7 @@ def test_an_mcap_that_is_cut_short(command, room, share, tmp_path):
 
 
 @both
-def test_names_that_are_no_recording(command, room, share, tmp_path):
+def test_paths_without_a_recording_are_refused(command, room, share, tmp_path):
     note = tmp_path / "note.txt"
     note.write_text("hello")
     for source, said in (
@@ -256,7 +258,7 @@ def test_names_that_are_no_recording(command, room, share, tmp_path):
 
 
 @both
-def test_frames_beyond_the_end(command, room, share, tmp_path):
+def test_frame_range_beyond_the_end_is_refused(command, room, share, tmp_path):
     said = complaint(share(*command(room / "ar1", tmp_path / "out"), "--frames", f"{FRAMES}:"), 2)
     assert f"--frames {FRAMES}: selects nothing; it has {FRAMES} frames" in said
 
@@ -305,7 +307,7 @@ def test_calibration_folder_without_a_camchain(stereo, share, tmp_path):
     assert "has no kalibr_imucam_chain.yaml" in said
 
 
-def test_images_of_another_size(stereo, share, tmp_path):
+def test_images_of_wrong_size_are_refused(stereo, share, tmp_path):
     calib = tmp_path / "camchain.yaml"
     calib.write_text(CAMCHAIN.replace("640, 480", "752, 480"))
     with untouched(tmp_path):
@@ -350,12 +352,12 @@ def test_configuration(case, command, share, tmp_path):
         assert said in complaint(share(*command("nowhere", tmp_path / "out"), "--config", path), 2)
 
 
-def test_numbers_are_read_as_people_write_them(room, share, tmp_path):
-    (tmp_path / "config.yaml").write_text("graph: {relative_tolerance: 1e-5}\ninertial: {max_speed_m_s: 9}\n")
+def test_numbers_of_a_configuration_have_all_yaml_forms(room, share, tmp_path):
+    (tmp_path / "config.yaml").write_text("merge: {odometry_scale: 15e-1}\ninertial: {max_speed_m_s: 9}\n")
     done = share("track", room / "ar1", "--config", tmp_path / "config.yaml", "--frames", ":3", "--json")
     used = json.loads(done.out)["config"]
     assert done.code == 0
-    assert (used["graph"]["relative_tolerance"], used["inertial"]["max_speed_m_s"]) == (1e-5, 9.0)
+    assert (used["merge"]["odometry_scale"], used["inertial"]["max_speed_m_s"]) == (1.5, 9.0)
 
 
 # ------------------------------------------------------------------ where results go
@@ -363,7 +365,7 @@ def test_numbers_are_read_as_people_write_them(room, share, tmp_path):
 EDGE = ["edge", "--bind", "tcp://127.0.0.1:0", "--out"]
 
 
-def test_out_that_cannot_be_written(room, share, tmp_path, monkeypatch):
+def test_unwritable_output_is_refused(room, share, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "file").write_text("old")
     (tmp_path / "taken" / "odom.tum").mkdir(parents=True)
@@ -390,7 +392,7 @@ def test_out_that_cannot_be_written(room, share, tmp_path, monkeypatch):
             assert said in complaint(share(*arguments), 2)
 
 
-def test_out_names_are_paths_like_any_other(room, share, tmp_path, monkeypatch):
+def test_output_may_have_any_valid_file_name(room, share, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert share("track", room / "ar1", "--out", "./new//T.tum", "--report", "new/../R.json").code == 0
     assert len((tmp_path / "new" / "T.tum").read_text().splitlines()) == FRAMES
@@ -407,7 +409,7 @@ def test_out_names_are_paths_like_any_other(room, share, tmp_path, monkeypatch):
     not all(Path(device).is_char_device() for device in ("/dev/null", "/dev/full")),
     reason="/dev/null or /dev/full is no device here",
 )
-def test_out_may_be_a_device_and_stays_one(room, share):
+def test_output_to_a_device_does_not_replace_it(room, share):
     assert share("track", room / "ar1", "--out", "/dev/null", "--frames", ":5").code == 0
     assert Path("/dev/null").is_char_device()
     done = share("track", room / "ar1", "--out", "/dev/full", "--frames", ":5")
@@ -416,7 +418,7 @@ def test_out_may_be_a_device_and_stays_one(room, share):
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """What takes longer ends with an error, for it would take for ever."""
+    """Fail after a time limit instead of waiting forever."""
 
     def late(number: int, frame: object) -> None:
         raise AssertionError(f"not done within {seconds} s")
@@ -430,8 +432,8 @@ def within(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def test_out_where_a_pipe_lies(room, share, tmp_path):
-    """It would be opened, and that waits for somebody who reads it."""
+def test_output_to_a_pipe_without_a_reader_is_refused(room, share, tmp_path):
+    """To open it would wait for a reader."""
     names = ("T.tum", "events.jsonl", "edge.json", "odom.tum", "report.json")
     for name in names:
         (tmp_path / name).mkdir()
@@ -448,7 +450,7 @@ def test_out_where_a_pipe_lies(room, share, tmp_path):
             assert said in complaint(share(*arguments), 2)
 
 
-def test_poses_into_a_command_that_reads_them(room):
+def test_poses_can_be_piped_into_a_command(room):
     command = 'exec "$@" --out >(wc -l)'
     arguments = [*SHARE, "track", room / "ar1", "--frames", ":5"]
     done = subprocess.run(
@@ -461,7 +463,7 @@ def test_poses_into_a_command_that_reads_them(room):
 # ------------------------------------------------------------------ tracking
 
 
-def test_the_same_bytes_twice(room, share, tmp_path):
+def test_two_runs_write_the_same_bytes(room, share, tmp_path):
     for agent in ("ar1", "robot"):
         first, second = tmp_path / f"{agent}.1", tmp_path / f"{agent}.2"
         assert share("track", room / agent, "--out", first).code == 0
@@ -471,7 +473,7 @@ def test_the_same_bytes_twice(room, share, tmp_path):
         assert len(first.read_text().splitlines()) == FRAMES
 
 
-def test_track_of_a_damaged_image(damaged, share, tmp_path):
+def test_damaged_image_is_reported_by_track(damaged, share, tmp_path):
     done = share(*as_track(damaged, tmp_path / "out"))
     assert done.code == 0
     (said,) = done.err.splitlines()
@@ -480,7 +482,7 @@ def test_track_of_a_damaged_image(damaged, share, tmp_path):
     assert "the image is cut short or damaged" in said
 
 
-def test_track_of_what_cannot_be_tracked(share, tmp_path):
+def test_untrackable_recording_is_refused_by_track(share, tmp_path):
     """Images of noise, too small to hold features."""
     recording = make_tum(tmp_path / "kitchen")
     with untouched(tmp_path):
@@ -488,7 +490,7 @@ def test_track_of_what_cannot_be_tracked(share, tmp_path):
     assert "kitchen: none of its 5 frames could be tracked" in said
 
 
-def test_streams_that_are_not_used_are_named(stereo, share, tmp_path):
+def test_unused_streams_are_named(stereo, share, tmp_path):
     recording = shutil.copytree(stereo, tmp_path / "stereo")
     (recording / "mav0" / "imu0").mkdir()
     (tmp_path / "camchain.yaml").write_text(CAMCHAIN)
@@ -522,7 +524,7 @@ def start(*arguments: object, limit: str = "true") -> Iterator[subprocess.Popen]
 
 
 def end(process: subprocess.Popen, ask: bool = True, said: str = "") -> Done:
-    """Wait for its end, after Ctrl-C if `ask`. said: what has been read of its stderr."""
+    """Wait for the end of a process, after Ctrl-C if `ask`. said: its stderr so far."""
     if ask:
         process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=20)
@@ -552,14 +554,14 @@ def wait_for(what: Callable[[], bool]) -> None:
         *("tcp://h:65536", "udp://127.0.0.1:5555", "tcp://a b:1", "tcp://::1:5555", "tcp://h:1:2"),
     ],
 )
-def test_addresses_that_are_none(address, room, share, tmp_path):
+def test_invalid_addresses_are_refused(address, room, share, tmp_path):
     expected = f"'{address}' is not an address; expected tcp://HOST:PORT, such as tcp://127.0.0.1:5555"
     with untouched(tmp_path):
         assert expected in complaint(share(*as_agent(room / "ar1", tmp_path / "out", address)), 2)
         assert expected in complaint(share("edge", "--bind", address, "--out", tmp_path / "out"), 2)
 
 
-def test_addresses_that_cannot_be_used(room, share, tmp_path, monkeypatch):
+def test_unusable_addresses_are_refused(room, share, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))  # where nobody has keys
 
     def agent_at(address: str) -> Done:
@@ -575,18 +577,18 @@ def test_addresses_that_cannot_be_used(room, share, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../x", ".hidden", "a b", "x" * 65, "hope\u3164"])
-def test_names_that_no_file_could_have(name, room, share, tmp_path):
+def test_names_invalid_as_file_names_are_refused(name, room, share, tmp_path):
     done = share(*as_agent(room / "ar1", tmp_path / "out", name=name))
     assert f"--name '{name}': use 1 to 64 letters" in complaint(done, 2)
     assert os.listdir(tmp_path) == []
 
 
 def _not_late(said: str) -> list[str]:
-    """But for what a busy machine adds."""
+    """Apart from figures that depend on the load of the machine."""
     return [line for line in said.splitlines() if " late: this machine is too slow" not in line]
 
 
-def test_an_edge_that_never_answers(room, share, tmp_path):
+def test_agent_fails_if_no_edge_answers(room, share, tmp_path):
     """Tracking is what `share track` makes of it, to the last digit; everything is written."""
     config = tmp_path / "quick.yaml"
     config.write_text("link: {silent_s: 0.4}\nagent: {finish_s: 0.2}")
@@ -610,7 +612,7 @@ def test_an_edge_that_never_answers(room, share, tmp_path):
 
 
 class Careless(threading.Thread):
-    """An edge that makes only the first keyframe safe, and holds the others."""
+    """An edge that acknowledges only the first keyframe and buffers the others."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -635,7 +637,7 @@ class Careless(threading.Thread):
                 yield m.Ack(1, tuple(sorted(self._held)))
 
 
-def test_what_an_edge_never_acknowledged_is_said(room, share, tmp_path):
+def test_unacknowledged_keyframes_are_reported(room, share, tmp_path):
     (config := tmp_path / "quick.yaml").write_text(
         "agent: {finish_s: 0.4}\ninertial: {keyframe_m: 0.01, keyframe_rad: 0.01}\n"
     )
@@ -659,7 +661,7 @@ def test_what_an_edge_never_acknowledged_is_said(room, share, tmp_path):
     ]
 
 
-def test_an_agent_leaves_a_damaged_image_out(damaged, share, tmp_path):
+def test_agent_skips_a_damaged_image(damaged, share, tmp_path):
     with edge(tmp_path / "edge") as (server, address):
         done = share(*as_agent(damaged, tmp_path / "out", address), "--frames", ":27")
         assert end(server).code == 0
@@ -671,8 +673,8 @@ def test_an_agent_leaves_a_damaged_image_out(damaged, share, tmp_path):
     assert (report["damaged_images"], report["frames"], report["tracked"]) == (1, 26, 26)
 
 
-def test_two_of_one_name_and_two_in_one_folder(stereo, room, share, tmp_path):
-    """Both newcomers are refused; the first agent goes on, and Ctrl-C ends it and the edge in good order."""
+def test_second_agent_of_a_name_or_folder_is_refused(stereo, room, share, tmp_path):
+    """Both later agents are refused; the first continues, and Ctrl-C ends it and the edge cleanly."""
     slow = longer(stereo, tmp_path / "slow", 600, 0.05)
     first, report = tmp_path / "first", tmp_path / "first" / "report.json"
     with (
@@ -704,7 +706,7 @@ def refused_reason() -> str:
     return "the name 'ann' is in use by another agent; choose another with --name"
 
 
-def test_a_port_in_use(share, tmp_path):
+def test_port_in_use_is_reported(share, tmp_path):
     old = tmp_path / "old"
     old.mkdir()
     (old / "events.jsonl").write_text("an older run\n")
@@ -715,7 +717,7 @@ def test_a_port_in_use(share, tmp_path):
     )
 
 
-def test_an_edge_whose_disk_is_full_serves_on(room, share, tmp_path):
+def test_edge_with_a_full_disk_continues(room, share, tmp_path):
     """A limit on file size stands for the disk."""
     out = tmp_path / "edge"
     with edge(out, "ulimit -f 0") as (server, address):
@@ -728,7 +730,7 @@ def test_an_edge_whose_disk_is_full_serves_on(room, share, tmp_path):
     )
 
 
-def test_an_agent_whose_disk_is_full_tracks_on(room, tmp_path):
+def test_agent_with_a_full_disk_continues(room, tmp_path):
     """A limit on file size stands for the disk: 1 kB is full after a few poses."""
     with edge(tmp_path / "edge") as (server, address):
         with start(*as_agent(room / "ar1", tmp_path / "out", address), *FEW, limit="ulimit -f 1") as agent:
@@ -754,7 +756,7 @@ def test_an_agent_whose_disk_is_full_tracks_on(room, tmp_path):
 
 
 @pytest.mark.parametrize("more", [(), ("--profile", "d435i"), ("--profile", "laptop-edge")])
-def test_an_agent_of_no_kind(share, more):
+def test_agent_without_a_kind_is_refused(share, more):
     done = share("agent", "realsense", "--name", "a", "--edge", NOBODY, *more)
     assert (done.code, done.out) == (2, "")
     assert done.err.startswith("share: --kind is required: ar (headset) or robot")
@@ -764,13 +766,13 @@ def test_an_agent_of_no_kind(share, more):
 @pytest.mark.parametrize(
     "command", [("demo",), ("agent", "x", "--name", "a", "--kind", "ar", "--edge", "tcp://127.0.0.1:1")]
 )
-def test_a_network_that_nobody_knows(command: tuple[str, ...]) -> None:
+def test_unknown_network_is_refused(command: tuple[str, ...]) -> None:
     done = subprocess.run([*SHARE, *command, "--link", "nowhere"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert done.stderr == "share: --link: 'nowhere' is neither a file nor one of wifi5, wifi-busy\n"
 
 
-def test_a_frustum_that_is_none_ends_the_edge_before_it_begins(tmp_path: Path) -> None:
+def test_invalid_frustum_is_refused_before_the_edge_starts(tmp_path: Path) -> None:
     config = tmp_path / "flat.yaml"
     config.write_text("control: {near_m: 5, far_m: 1}\n")
     command = [*SHARE, "edge", "--bind", "tcp://127.0.0.1:0", "--policy", "share", "--config", str(config)]

@@ -1,4 +1,4 @@
-"""`share calibrate camera` on pictures of a known camera, and where there is nothing to calibrate."""
+"""`share calibrate camera` on images of a known camera, and without a board."""
 
 import json
 from collections.abc import Callable
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import yaml
 from helpers.board_pictures import PAPER, printed
 from helpers.shell import Done
@@ -18,7 +19,7 @@ from share.recordings.calibration import read_calibration, to_kalibr
 K = np.array([[420, 0, 319.5], [0, 424, 241], [0, 0, 1]])
 
 
-def test_pictures_without_a_board_are_one_line_and_leave_nothing(
+def test_images_without_a_board_are_refused_and_nothing_is_written(
     share: Callable[..., Done], tmp_path: Path
 ) -> None:
     (tmp_path / "pictures" / "cam0").mkdir(parents=True)
@@ -32,7 +33,7 @@ def test_pictures_without_a_board_are_one_line_and_leave_nothing(
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_a_calibration_of_which_nothing_can_be_kept_is_refused_first(
+def test_unusable_given_calibration_is_refused_before_the_work(
     share: Callable[..., Done], tmp_path: Path
 ) -> None:
     (tmp_path / "pictures" / "cam0").mkdir(parents=True)
@@ -64,7 +65,8 @@ def _pictures(folder: Path, rng: np.random.Generator, count: int = 14) -> None:
     cv2.imwrite(str(folder / "row.png"), row)
 
 
-def test_a_known_camera_is_found_from_a_folder_of_pictures(
+@pytest.mark.long
+def test_known_camera_is_estimated_from_a_folder_of_images(
     share: Callable[..., Done], tmp_path: Path, rng: np.random.Generator
 ) -> None:
     """Of the camchain that is given, all that is not found anew is kept."""
@@ -99,7 +101,8 @@ def test_a_known_camera_is_found_from_a_folder_of_pictures(
     assert (out / "camera-report.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_is_not_to_be_believed_does_not_replace_what_was(
+@pytest.mark.long
+def test_unreliable_result_keeps_the_earlier_one(
     share: Callable[..., Done], tmp_path: Path, rng: np.random.Generator
 ) -> None:
     _pictures(tmp_path / "pictures" / "cam0", rng, 5)

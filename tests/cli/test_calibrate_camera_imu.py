@@ -1,4 +1,4 @@
-"""`share calibrate camera-imu` on pictures of a board and the samples of an IMU, whose rig is known."""
+"""`share calibrate camera-imu` on images of a board and samples of an IMU, from a known rig."""
 
 import json
 from collections.abc import Callable
@@ -52,7 +52,8 @@ def asked(folder: Path, out: Path, *more: object, camera: str = "bare.yaml") -> 
     return ("calibrate", "camera-imu", folder, "--target", "charuco", *known, "--out", out, *more)
 
 
-def test_mounting_and_offset_are_found_and_an_inverted_one_is_said(
+@pytest.mark.long
+def test_mounting_and_offset_are_estimated_and_inverted_extrinsics_reported(
     share: Callable[..., Done], dance: Path, tmp_path: Path
 ) -> None:
     done = share(*asked(dance, tmp_path, "--json", camera="camera.yaml"))
@@ -84,11 +85,12 @@ def badly_known(dance: Path, folder: Path) -> Path:
     return folder
 
 
-def test_what_is_not_to_be_believed_fails_and_leaves_what_was_there(
+@pytest.mark.long
+def test_unreliable_result_fails_and_keeps_the_earlier_one(
     share: Callable[..., Done], dance: Path, tmp_path: Path
 ) -> None:
-    """Beside a measured IMU chain and a camchain that somebody believes in. The cameras are known badly, by
-    the report beside their own camchain, which did not believe in them."""
+    """DIR holds a measured IMU chain and an accepted camchain. The cameras come from a camchain whose report
+    calls them unreliable."""
     proud = yaml.safe_load((dance / "imu.yaml").read_text())
     proud["imu0"]["gyroscope_noise_density"] /= 30
     (tmp_path / "proud.yaml").write_text(yaml.safe_dump(proud))
@@ -116,7 +118,7 @@ def test_what_is_not_to_be_believed_fails_and_leaves_what_was_there(
     assert {name: (tmp_path / name).read_text() for name in before} == before
 
 
-def test_wrong_use_is_one_line_and_leaves_nothing(
+def test_wrong_use_is_one_line_and_leaves_no_output(
     share: Callable[..., Done], dance: Path, tmp_path: Path
 ) -> None:
     def refused(code: int, *arguments: object) -> str:

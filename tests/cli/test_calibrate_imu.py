@@ -1,4 +1,4 @@
-"""`share calibrate imu`, over a table as an EuRoC folder has it."""
+"""`share calibrate imu` on the IMU table of an EuRoC folder."""
 
 import json
 import re
@@ -32,6 +32,7 @@ def written(path: Path, seconds: int, louder: float = 1.0) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_files_and_table(share, table, tmp_path):
     done = share("calibrate", "imu", table, "--profile", "euroc", "--out", tmp_path / "mine")
     assert done.code == 0
@@ -45,7 +46,8 @@ def test_files_and_table(share, table, tmp_path):
     assert (tmp_path / "mine" / "imu-report.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_the_picture_wants_no_fonts_for_formulas(share, table, tmp_path, monkeypatch):
+@pytest.mark.long
+def test_chart_needs_no_formula_fonts(share, table, tmp_path, monkeypatch):
     """The frozen program has one font."""
     from matplotlib.mathtext import MathTextParser
 
@@ -54,7 +56,8 @@ def test_the_picture_wants_no_fonts_for_formulas(share, table, tmp_path, monkeyp
     assert (tmp_path / "imu-report.png").exists()
 
 
-def test_what_five_minutes_do_not_tell_is_said(share, table, tmp_path):
+@pytest.mark.long
+def test_quantities_not_measurable_in_five_minutes_are_named(share, table, tmp_path):
     done = share("calibrate", "imu", table, "--out", tmp_path, "--json")
     report = json.loads(done.out)
     assert not report["gyroscope"]["walk"]["told"]
@@ -66,7 +69,7 @@ def test_what_five_minutes_do_not_tell_is_said(share, table, tmp_path):
 
 
 @pytest.mark.slow
-def test_inflated_noise_is_written_and_said(share, table, tmp_path):
+def test_inflated_noise_is_written_and_stated(share, table, tmp_path):
     share("calibrate", "imu", table, "--out", tmp_path / "one")
     share("calibrate", "imu", table, "--out", tmp_path / "two", "--inflate", "2")
     one, two = (
@@ -78,7 +81,8 @@ def test_inflated_noise_is_written_and_said(share, table, tmp_path):
     assert "2 times what was measured" in (tmp_path / "two" / "kalibr_imu_chain.yaml").read_text()
 
 
-def test_the_device_is_named_where_the_recording_knows_it(share, tmp_path):
+@pytest.mark.long
+def test_serial_number_of_the_recording_is_written(share, tmp_path):
     with Recorder(tmp_path / "rest.mcap", load_profile("euroc").rig(), serial="0123") as recorder:
         for stamp, *values in np.loadtxt(written(tmp_path / "a.csv", 70), delimiter=",", skiprows=1):
             recorder.write(Measurement("imu", int(stamp), tuple(values)))
@@ -86,7 +90,8 @@ def test_the_device_is_named_where_the_recording_knows_it(share, tmp_path):
     assert read_yaml(tmp_path / "mine" / "kalibr_imu_chain.yaml").section("imu0").get("serial") == "0123"
 
 
-def test_noise_far_from_the_profile_is_told(share, tmp_path):
+@pytest.mark.long
+def test_noise_far_from_the_profile_gives_a_warning(share, tmp_path):
     loud = written(tmp_path / "loud.csv", 120, louder=3.0)
     done = share("calibrate", "imu", loud, "--profile", "euroc", "--out", tmp_path)
     assert done.code == 0

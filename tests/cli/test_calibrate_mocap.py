@@ -62,7 +62,7 @@ def error_of(T: np.ndarray) -> tuple[float, float]:
     return float(np.degrees(np.linalg.norm(error[:3]))), float(np.linalg.norm(error[3:]))
 
 
-def test_body_tilt_and_clock_are_found_and_the_track_agrees(share, room, tmp_path):
+def test_body_tilt_and_clock_are_estimated_and_the_track_agrees(share, room, tmp_path):
     done = share(*found(room, "mocap.tum", "--track", room / "track.tum", "--out", tmp_path))
     assert (done.code, done.err) == (0, "")
     made = read_yaml(tmp_path / "mocap.yaml")
@@ -77,7 +77,7 @@ def test_body_tilt_and_clock_are_found_and_the_track_agrees(share, room, tmp_pat
     assert "body position" in done.out and "hand-eye" in done.out
 
 
-def test_csv_and_tum_are_read_alike(room):
+def test_csv_and_tum_give_the_same_result(room):
     tum, csv = read_mocap(room / "mocap.tum"), read_mocap(room / "mocap.csv")
     assert np.array_equal(tum.stamps_ns, csv.stamps_ns) and np.allclose(tum.T, csv.T, atol=1e-8)
 
@@ -86,7 +86,7 @@ def test_csv_and_tum_are_read_alike(room):
 @pytest.mark.parametrize(
     ("name", "order"), [("mocap.tum", [0, 1, 2, 3, 7, 4, 5, 6]), ("mocap.csv", [0, 1, 2, 3, 5, 6, 7, 4])]
 )
-def test_a_quaternion_in_the_order_of_the_other_form_is_refused(share, room, tmp_path, name, order):
+def test_quaternion_in_wrong_order_is_refused(share, room, tmp_path, name, order):
     """It turns by the same angles, so the clocks are found; but about other axes."""
     between = "," if name.endswith(".csv") else " "
     rows = [line.split(between) for line in (room / name).read_text().splitlines()]
@@ -97,7 +97,7 @@ def test_a_quaternion_in_the_order_of_the_other_form_is_refused(share, room, tmp
     assert not list((tmp_path / "out").iterdir())
 
 
-def test_a_body_of_vicons_export_is_found_by_another_clock(share, room, tmp_path):
+def test_body_of_a_vicon_export_with_another_clock_is_estimated(share, room, tmp_path):
     """Its clock counts frames from nought; another body is in the file."""
     mine, other = (record_mocap(Motion(seed), 14, LATE_NS, hz=RATE_HZ).T for seed in (1, 4))
     export(tmp_path / "vicon.csv", {"Hat": other, "Mine": mine}, quaternions=True)
@@ -109,7 +109,7 @@ def test_a_body_of_vicons_export_is_found_by_another_clock(share, room, tmp_path
     assert turned < 0.05 and shifted < 0.0015
 
 
-def test_a_recording_of_the_imu_alone_will_do(share, room, tmp_path):
+def test_recording_without_images_suffices(share, room, tmp_path):
     """As `share capture --imu-only` makes it: it carries the noise."""
     rig = Rig(Camera(64, 48, 40.0, 40.0, 31.5, 23.5), np.eye(4), imu=NOISE)
     imu = record_imu(Motion(), 14)
@@ -124,7 +124,7 @@ def test_a_recording_of_the_imu_alone_will_do(share, room, tmp_path):
     assert turned < 0.05 and shifted < 0.0015
 
 
-def test_a_track_of_another_motion_does_not_agree(share, room, tmp_path):
+def test_track_of_another_motion_gives_a_warning(share, room, tmp_path):
     """Of the same time, with the device turned a quarter about its z."""
     other = tmp_path / "other.tum"
     T = Motion().pose((stamps(14, 20) - START_NS) * 1e-9) @ se3.exp(np.array([0, 0, 1.57, 0, 0, 0]))
@@ -133,7 +133,7 @@ def test_a_track_of_another_motion_does_not_agree(share, room, tmp_path):
     assert done.code == 0 and "contradicts the fit" in done.err
 
 
-def test_a_body_that_turns_about_one_axis_is_refused(share, tmp_path):
+def test_rotation_about_one_axis_is_refused(share, tmp_path):
     recorded(tmp_path, Motion(5, planar=True), 12)
     done = share(*found(tmp_path, "mocap.tum", "--out", tmp_path / "out"))
     assert done.code == 1 and "turn it about two axes" in done.err and done.err.count("\n") == 1

@@ -1,4 +1,4 @@
-"""`share calibrate realsense` on the maker's SDK, with a camera of software."""
+"""`share calibrate realsense` on librealsense, with a software camera."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def attached(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rs, "context", lambda: camera.context)
 
 
-def test_the_file_has_what_the_factory_measured(share: Callable[..., Done], tmp_path: Path) -> None:
+def test_files_hold_the_factory_calibration(share: Callable[..., Done], tmp_path: Path) -> None:
     done = share("calibrate", "realsense", "0123", "--depth", "--out", tmp_path / "mine")
     assert done.code == 0, done.err
     assert "0123" in done.out
@@ -37,7 +37,7 @@ def test_the_file_has_what_the_factory_measured(share: Callable[..., Done], tmp_
     np.testing.assert_allclose(rig.T_body_cam0[:3, 3], T_GYRO_IR, atol=1e-8)
 
 
-def test_the_doctor_knows_whose_it_is(share: Callable[..., Done], tmp_path: Path) -> None:
+def test_doctor_matches_the_serial_number(share: Callable[..., Done], tmp_path: Path) -> None:
     def line(*words: object) -> tuple[str, str]:
         told = json.loads(share("doctor", "--json", *words).out)["findings"]
         return next((one["state"], one["what"]) for one in told if one["name"] == "serial number")
@@ -50,7 +50,7 @@ def test_the_doctor_knows_whose_it_is(share: Callable[..., Done], tmp_path: Path
     assert line("--calib", mine) == ("WARN", "the calibration belongs to 0456; attached is 0123")
 
 
-def test_a_calibration_that_is_there_is_not_overwritten(share: Callable[..., Done], tmp_path: Path) -> None:
+def test_existing_calibration_is_not_overwritten(share: Callable[..., Done], tmp_path: Path) -> None:
     dear = tmp_path / "kalibr_imu_chain.yaml"
     dear.write_text("dear")
     done = share("calibrate", "realsense", "--out", tmp_path)
@@ -60,7 +60,7 @@ def test_a_calibration_that_is_there_is_not_overwritten(share: Callable[..., Don
     assert dear.read_text() == "dear"
 
 
-def test_a_camera_that_is_not_there_is_said_and_nothing_is_written(
+def test_missing_camera_is_reported_and_nothing_is_written(
     share: Callable[..., Done], tmp_path: Path
 ) -> None:
     done = share("calibrate", "realsense", "999", "--out", tmp_path / "mine")
@@ -69,7 +69,7 @@ def test_a_camera_that_is_not_there_is_said_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_only_a_camera_has_is_not_for_a_recording(share: Callable[..., Done], tmp_path: Path) -> None:
+def test_camera_options_are_refused_for_a_recording(share: Callable[..., Done], tmp_path: Path) -> None:
     done = share("track", tmp_path, "--sensors", "rgbd")
     assert done.code == 2
     assert "--sensors works only with a live camera" in done.err
@@ -78,7 +78,7 @@ def test_what_only_a_camera_has_is_not_for_a_recording(share: Callable[..., Done
     assert "--frames" in done.err
 
 
-def test_a_camera_is_no_recording_to_look_into(share: Callable[..., Done]) -> None:
+def test_camera_is_refused_where_a_recording_is_needed(share: Callable[..., Done]) -> None:
     done = share("dataset", "info", "realsense")
     assert done.code == 2
     assert "record a live camera with `share capture`" in done.err

@@ -1,11 +1,11 @@
-"""`share calibrate target`: a sheet, and the file by which other commands know it."""
+"""`share calibrate target`: the sheet, and the file that describes it."""
 
 from pathlib import Path
 
 from share.lab.calibrate.target import AprilGrid, read_target
 
 
-def test_the_yaml_file_is_of_what_is_printed(share, tmp_path):
+def test_yaml_file_describes_the_printed_board(share, tmp_path):
     done = share("calibrate", "target", "--paper", "A3", "--size", 30, "--out", tmp_path / "b.pdf")
     assert done.code == 0, done.err
     assert read_target(tmp_path / "b.yaml") == AprilGrid(6, 6, 0.03, 0.3)
@@ -13,21 +13,21 @@ def test_the_yaml_file_is_of_what_is_printed(share, tmp_path):
     assert "aprilgrid, 6 x 6 tags of 30 mm, 9 mm apart, on A3" in done.out
 
 
-def test_what_does_not_fit_is_said_and_nothing_written(share, tmp_path):
+def test_board_that_does_not_fit_is_refused(share, tmp_path):
     done = share("calibrate", "target", "--size", 40, "--out", tmp_path / "b.pdf")
     assert done.code == 2
     assert "at most 23.4 mm fit" in done.err
     assert not list(tmp_path.iterdir())
 
 
-def test_another_ending_is_refused(share, tmp_path):
+def test_other_file_endings_are_refused(share, tmp_path):
     done = share("calibrate", "target", "--out", tmp_path / "b.png")
     assert done.code == 2
     assert "ends in .pdf" in done.err
     assert not Path(tmp_path / "b.png").exists()
 
 
-def test_a_size_that_was_mended_is_kept(share, tmp_path):
+def test_corrected_size_is_kept(share, tmp_path):
     asked = ("calibrate", "target", "--size", 20, "--out", tmp_path / "b.pdf")
     assert share(*asked).code == 0
     assert share(*asked).code == 0  # the same board once more

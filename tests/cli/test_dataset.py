@@ -1,4 +1,4 @@
-"""`share dataset` as people use it: real processes, exit codes, one clear line."""
+"""`share dataset` as real processes: output, exit codes, one clear line."""
 
 import json
 import os
@@ -27,7 +27,7 @@ def good(*arguments: object) -> str:
 
 
 def bad(code: int, *arguments: object) -> str:
-    """The one line of complaint."""
+    """Return the one error line."""
     done = share(*arguments)
     assert done.returncode == code, done.stderr
     assert done.stderr.count("\n") == 1
@@ -53,6 +53,7 @@ def test_info(walk):
     assert data["calibration"]["cam0"]["resolution"] == [64, 48]
 
 
+@pytest.mark.long
 def test_convert_and_recover(walk, tmp_path):
     first, second, saved = (tmp_path / "out" / f"{n}.mcap" for n in ("first", "second", "saved"))
     assert good("convert", walk, "--out", first) == f"{first}: 6 frames\n"
@@ -70,6 +71,7 @@ def test_convert_and_recover(walk, tmp_path):
     assert whole.splitlines()[-1] == f"nothing was lost: {second} can be deleted"
 
 
+@pytest.mark.long
 def test_convert_to_euroc_and_jpeg(walk, tmp_path):
     good("convert", walk, "--out", tmp_path / "asl", "--format", "euroc")
     assert (tmp_path / "asl" / "mav0" / "cam1" / "sensor.yaml").read_text().startswith("%YAML:1.0\n")
@@ -78,6 +80,7 @@ def test_convert_to_euroc_and_jpeg(walk, tmp_path):
     assert "not an empty folder" in bad(2, "convert", walk, "--out", tmp_path / "asl", "--format", "euroc")
 
 
+@pytest.mark.long
 def test_wrong_use(walk, tmp_path):
     assert "no such file" in bad(2, "info", tmp_path / "no")
     assert "not a recording that SHARE reads" in bad(2, "info", tmp_path)
@@ -91,7 +94,7 @@ def test_wrong_use(walk, tmp_path):
     assert "is the source itself" in bad(2, "convert", tmp_path / "x.mcap", "--out", tmp_path / "x.mcap")
 
 
-def test_damage_leaves_nothing_half_written(tmp_path):
+def test_damaged_source_leaves_no_partial_output(tmp_path):
     folder = make_tum(tmp_path / "kitchen")
     for image in (folder / "depth" / "3.png", folder / "depth" / "4.png"):
         image.write_bytes(image.read_bytes()[:-20])
@@ -100,7 +103,8 @@ def test_damage_leaves_nothing_half_written(tmp_path):
     assert os.listdir(out) == []
 
 
-def test_a_full_disk_is_one_line_and_leaves_nothing(walk, tmp_path):
+@pytest.mark.long
+def test_full_disk_is_one_line_and_leaves_no_output(walk, tmp_path):
     out = tmp_path / "out"
     program = "from share.cli.main import main; main()"
     limited = 'ulimit -f 16; exec "$@"'  # blocks of 1 kB
@@ -129,7 +133,8 @@ def test_real_recording(shared_data: Path):
     assert data["truth"]["poses"] == 500
 
 
-def test_a_calibration_of_another_device_is_said(tmp_path):
+@pytest.mark.long
+def test_calibration_of_another_device_gives_a_warning(tmp_path):
     with Recorder(tmp_path / "a.mcap", RIG, serial="0123") as recorder:
         for measurement in live(3):
             recorder.write(measurement)

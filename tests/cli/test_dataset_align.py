@@ -24,6 +24,8 @@ from share.recordings.session import read_session
 from share.recordings.trajectory import Trajectory, read_tum
 from share.runtime.source import open_source
 
+pytestmark = pytest.mark.long
+
 SECONDS = 12.0
 WATCHED = {
     "ann": Watched(se3.exp(np.array([0.3, -2.1, 0.7, 0.04, -0.09, 0.06])), 0, ((5.0, 5.3), (8.0, 9.5))),
@@ -78,7 +80,7 @@ def made(share, room) -> Path:
     return out
 
 
-def test_offset_and_mounting_are_found(room, made):
+def test_offset_and_mounting_are_estimated(room, made):
     found = read_json(made / "align.json")
     for name, watched in WATCHED.items():
         assert abs(found[name]["offset_ns"] - offset_of(room.paths[name], watched)) < 300_000
@@ -92,7 +94,7 @@ def test_offset_and_mounting_are_found(room, made):
     assert found["ann"]["truth_s"] == pytest.approx(SECONDS - 1.5, abs=0.3)
 
 
-def test_the_truth_is_the_emulators_in_one_world(room, made):
+def test_truth_agrees_with_the_emulator_in_one_world(room, made):
     """Millimetres, with one turn and shift for both devices, and no pose in the gap."""
     pairs = {}
     for name, watched in WATCHED.items():
@@ -105,7 +107,7 @@ def test_the_truth_is_the_emulators_in_one_world(room, made):
     assert joint_ate(pairs).joint.rmse < 0.003
 
 
-def test_the_session_is_as_others_are(room, made):
+def test_session_has_the_usual_format(room, made):
     agents = read_session(made).agents
     assert {name: str(agent.kind) for name, agent in agents.items()} == {"ann": "ar", "bob": "robot"}
     assert sorted(os.listdir(made)) == [
@@ -124,9 +126,9 @@ def test_the_session_is_as_others_are(room, made):
 
 
 @pytest.mark.slow
-def test_it_is_played_and_scored_as_with_the_real_truth(share, room, made, tmp_path):
-    """The errors that are told differ from those of the same poses against the real truth by what the truths
-    differ. bob comes 3 s later: it lasts until he is through."""
+def test_scores_agree_with_those_of_the_exact_truth(share, room, made, tmp_path):
+    """Scores differ from those against the exact truth by at most the difference of the truths. bob
+    starts 3 s later, so the run lasts until bob ends."""
     run, session = tmp_path / "run", tmp_path / "session"
     shutil.copytree(made, session)
     plain = yaml.safe_load((session / "session.yaml").read_text())
@@ -145,7 +147,7 @@ def test_it_is_played_and_scored_as_with_the_real_truth(share, room, made, tmp_p
         assert one["odom_ate_cm"] == pytest.approx(real_cm, abs=0.2)
 
 
-def test_provenance_says_whence_everything_is(room, made):
+def test_provenance_names_all_inputs(room, made):
     whence = read_session(made).provenance
     assert whence["settings"] == {"rotations": "helical", "within_s": None, "sigma_mm": 2.0, "bridge_s": 0.5}
     ann = whence["devices"]["ann"]
@@ -155,7 +157,7 @@ def test_provenance_says_whence_everything_is(room, made):
 
 
 @pytest.mark.slow
-def test_motives_export_with_y_up_gives_the_same(share, room, made, tmp_path):
+def test_motive_export_with_y_up_gives_the_same(share, room, made, tmp_path):
     """Another clock, which begins with its first frame; the same session."""
     told = ("--mocap", room.folder / "take.csv", "--json", "--out", tmp_path / "made")
     done = share("dataset", "align", room.recordings[1], *told)
@@ -170,7 +172,7 @@ def test_motives_export_with_y_up_gives_the_same(share, room, made, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_euroc_folder_is_written_anew(share, room, tmp_path):
+def test_euroc_folder_is_converted(share, room, tmp_path):
     """As one recording, and the truth is the one that was found, not the folder's."""
     asl = tmp_path / "asl"
     assert share("dataset", "convert", room.session / "bob", "--format", "euroc", "--out", asl).code == 0
@@ -188,7 +190,7 @@ def test_an_euroc_folder_is_written_anew(share, room, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_calibration_of_ones_own_and_a_known_mounting_are_used(share, room, tmp_path):
+def test_given_calibration_and_mounting_are_used(share, room, tmp_path):
     """The recording is written anew with the one, and the body stays where the other says."""
     chains = yaml.safe_load((room.session / "session.yaml").read_text())["agents"]["bob"]["calibration"]
     imu = {"imu0": chains.pop("imu0")}
@@ -212,7 +214,7 @@ def test_a_calibration_of_ones_own_and_a_known_mounting_are_used(share, room, tm
     )
 
 
-def test_wrong_use_is_one_line_and_leaves_nothing(share, room, tmp_path):
+def test_wrong_use_is_one_line_and_leaves_no_output(share, room, tmp_path):
     def refused(code: int, *arguments: object) -> str:
         out = tmp_path / "out"
         done = share("dataset", "align", *arguments, "--out", out)
@@ -238,14 +240,14 @@ def test_wrong_use_is_one_line_and_leaves_nothing(share, room, tmp_path):
     assert "bob: the time offset of motion capture" in refused(1, bob, *csv, "--body", "bob=Headset1")
 
 
-def test_nothing_is_written_over(share, room, made):
+def test_existing_output_is_not_overwritten(share, room, made):
     before = (made / "session.yaml").read_bytes()
     done = share("dataset", "align", room.recordings[1], "--mocap", room.folder / "vicon.csv", "--out", made)
     assert done.code == 2 and "is not an empty folder" in done.err
     assert (made / "session.yaml").read_bytes() == before
 
 
-def test_a_mounting_is_read_back(tmp_path):
+def test_written_mounting_is_read(tmp_path):
     (tmp_path / "mocap.yaml").write_text(
         "T_body_mocap: [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]\n"
         "sigma: {rotation_deg: [0.01, 0.05, 0.02], position_m: [0.001, 0.0005, 0.002]}\n"
@@ -256,7 +258,7 @@ def test_a_mounting_is_read_back(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_real_recording_against_what_is_no_raw_motion_capture(share, shared_data, tmp_path):
+def test_real_recording_with_processed_motion_capture(share, shared_data, tmp_path):
     """EuRoC's truth is an estimate by the same IMU: its body is found as the Vicon's is known to sit
     (docs/understand/mocap-fit.md), its clock to some ms, and that is said."""
     folder = shared_data / "real" / "euroc_v1_01_keyframes"

@@ -1,4 +1,4 @@
-"""`share dataset info` and `export` of a map, as people use them."""
+"""`share dataset info` and `export` of a map."""
 
 import json
 import os
@@ -18,6 +18,7 @@ def room(tmp_path):
     return path
 
 
+@pytest.mark.long
 def test_info(room):
     text = good("info", room)
     assert text.startswith("room.sqlite: map, schema 3, 0.3 MB\n")
@@ -30,7 +31,8 @@ def test_info(room):
     assert "is a map; --calib and --frames" in bad(2, "info", room, "--frames", "0:3")
 
 
-def test_info_and_export_of_a_damaged_map_say_so_and_change_nothing(room, tmp_path):
+@pytest.mark.long
+def test_damage_of_a_map_is_reported_and_the_file_unchanged(room, tmp_path):
     frames = bytearray(room.read_bytes())
     at = frames.index(keyframe("ann-0001", 9).keyframe.view.descriptors.tobytes()[:40])
     frames[at] ^= 8
@@ -44,7 +46,8 @@ def test_info_and_export_of_a_damaged_map_say_so_and_change_nothing(room, tmp_pa
     assert sorted(os.listdir(tmp_path)) == ["out", "room.sqlite", "room.sqlite.lock"]
 
 
-def test_export_while_an_edge_writes(room, tmp_path):
+@pytest.mark.long
+def test_export_works_while_an_edge_writes(room, tmp_path):
     with MapStore.open(room) as store:
         store.write([keyframe("ann-0001", 20)])
         said = good("export", room, "--out", tmp_path / "out")
@@ -55,6 +58,7 @@ def test_export_while_an_edge_writes(room, tmp_path):
     assert data["ann-0001/0"]["keyframes"] == 42
 
 
+@pytest.mark.long
 def test_wrong_use(room, tmp_path):
     assert "no such file" in bad(2, "export", tmp_path / "no", "--out", tmp_path / "out")
     assert "is not an empty folder" in bad(2, "export", room, "--out", tmp_path)

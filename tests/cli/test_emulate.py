@@ -1,4 +1,4 @@
-"""`share emulate` as a user types it: what it says, what it leaves, and what it says when it cannot."""
+"""`share emulate`: its output, its files and its errors."""
 
 import json
 import os
@@ -37,7 +37,7 @@ def small(tmp_path_factory) -> Path:
 
 
 def complaint(done: Done, code: int) -> str:
-    """The one line that it has said; nothing is left behind that was not there."""
+    """Return the one error line; assert that no file was added."""
     assert done.code == code, done
     assert done.out == ""
     assert done.err.startswith("share: ")
@@ -102,7 +102,7 @@ TYPED = {
 
 
 @pytest.mark.parametrize("case", TYPED)
-def test_what_was_typed(case, emulate, tmp_path):
+def test_invalid_arguments_are_refused(case, emulate, tmp_path):
     words, said = TYPED[case]
     (tmp_path / "note").write_text("hello")
     usual = {"--scene": "plain", "--motion": "walk:", "--out": "deep/er/session", "--workers": "1"}
@@ -112,7 +112,7 @@ def test_what_was_typed(case, emulate, tmp_path):
     assert os.listdir(tmp_path) == ["note"]
 
 
-def test_what_must_be_given(emulate, tmp_path):
+def test_missing_options_are_named(emulate, tmp_path):
     assert "Missing option '--motion'" in complaint(emulate("--scene", "plain", "--out", "x"), 2)
     assert os.listdir(tmp_path) == []
 
@@ -121,7 +121,7 @@ def test_what_must_be_given(emulate, tmp_path):
 
 
 def poses(seconds: float = 5.0, reach: float = 0.5) -> list[str]:
-    """Lines of a TUM file: somebody swings about."""
+    """Lines of a TUM file of a swinging motion."""
     t = np.arange(0, seconds, 0.02)
     x = reach * np.sin(t)
     return [
@@ -156,7 +156,7 @@ TUM = {
 
 
 @pytest.mark.parametrize("damage", TUM)
-def test_poses_that_are_damaged(damage, emulate, tmp_path):
+def test_damaged_poses_are_refused(damage, emulate, tmp_path):
     damaged, said = TUM[damage]
     (tmp_path / "poses.tum").write_text("".join(damaged(poses())))
     line = complaint(emulate(*QUICK, "--seconds", 20, "--motion", "ann=tum:poses.tum", "--out", "x"), 1)
@@ -165,7 +165,7 @@ def test_poses_that_are_damaged(damage, emulate, tmp_path):
     assert os.listdir(tmp_path) == ["poses.tum"]
 
 
-def test_a_motion_that_fits_in_no_room(emulate, tmp_path):
+def test_motion_that_fits_no_room_is_refused(emulate, tmp_path):
     (tmp_path / "poses.tum").write_text("".join(poses(5.0, reach=20.0)))
     line = complaint(emulate(*QUICK, "--motion", "ann=tum:poses.tum", "--out", "x"), 2)
     assert "ann" in line
@@ -210,7 +210,7 @@ EUROC = {
 
 
 @pytest.mark.parametrize("damage", EUROC)
-def test_recorded_motion_that_is_damaged(damage, emulate, tmp_path):
+def test_damaged_recorded_motion_is_refused(damage, emulate, tmp_path):
     do, code, said = EUROC[damage]
     frames = 12 if damage == "too short" else 40
     do(make_euroc(tmp_path / "flight", frames=frames))
@@ -223,7 +223,7 @@ def test_recorded_motion_that_is_damaged(damage, emulate, tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"glTF\x02\0\0\0\x10\0\0\0", b"\xff" * 4000], ids=["empty", "cut", "noise"]
 )
-def test_a_room_that_is_damaged(content, emulate, tmp_path):
+def test_damaged_room_file_is_refused(content, emulate, tmp_path):
     (tmp_path / "room.glb").write_bytes(content)
     line = complaint(emulate("--scene", "room.glb", "--motion", "walk:", "--out", "x"), 1)
     assert line.startswith("room.glb: not a readable glTF 2.0 file: ")
@@ -234,7 +234,7 @@ def test_a_room_that_is_damaged(content, emulate, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_disk_that_fills_up(small, tmp_path):
+def test_full_disk_is_one_line(small, tmp_path):
     """No file may grow beyond 500 kB: chunks keep within, the recording does not."""
 
     def limit() -> None:
@@ -249,7 +249,7 @@ def test_a_disk_that_fills_up(small, tmp_path):
     assert os.listdir(tmp_path) == [".session.partial"]
 
 
-def test_no_opengl(tmp_path):
+def test_missing_opengl_is_reported(tmp_path):
     environment = os.environ | {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent"}
     words = ["--scene", "whitewall", "--seconds", "3", "--motion", "walk:", "--workers", "2", "--out", "x"]
     done = subprocess.run(
@@ -264,6 +264,7 @@ def test_no_opengl(tmp_path):
 # ------------------------------------------------------------------ what it says
 
 
+@pytest.mark.long
 def test_text(emulate, small, tmp_path):
     (tmp_path / "poses.tum").write_text("".join(poses(2.0)))
     words = ["--motion", "ann=walk:", "--motion", "bob=tum:poses.tum", "--profile", small]
@@ -278,6 +279,7 @@ def test_text(emulate, small, tmp_path):
     assert ready == "room: ready"
 
 
+@pytest.mark.long
 def test_json(emulate, small, tmp_path):
     words = [*QUICK, "--motion", "walk:", "--profile", small, "--seed", "3", "--json", "--out", "flights"]
     done = emulate(*words, "--format", "euroc")
@@ -291,8 +293,9 @@ def test_json(emulate, small, tmp_path):
     assert cv2.imread(str(images[0]), cv2.IMREAD_UNCHANGED).shape == (120, 160)
 
 
-def test_progress_is_for_terminals(small, tmp_path):
-    """What stages there are, and that each is seen to its end."""
+@pytest.mark.long
+def test_progress_is_shown_on_terminals_only(small, tmp_path):
+    """Each stage is shown to its end."""
     words = [*QUICK, "--motion", "walk:", "--profile", str(small), "--out", "session"]
     ours, theirs = pty.openpty()
     maker = subprocess.Popen(

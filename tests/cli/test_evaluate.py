@@ -1,4 +1,4 @@
-"""`share evaluate` as a user types it: a session played, scored, and policies compared."""
+"""`share evaluate`: a session is played and scored, policies are compared."""
 
 import csv
 import json
@@ -25,7 +25,8 @@ def runs_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session, tmp_path):
+@pytest.mark.long
+def test_run_is_scored_compared_and_never_overwritten(evaluate, plain_session, tmp_path):
     out = tmp_path / "ablation"
     arguments = ("ablation", plain_session, "--policy", "covins-g", "--true-error", "--out", out)
     done = evaluate(*arguments)
@@ -85,7 +86,7 @@ def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session,
 
 
 @pytest.mark.slow
-def test_what_is_missing_is_played_the_next_time(evaluate, plain_session, tmp_path):
+def test_missing_runs_are_played_by_the_next_call(evaluate, plain_session, tmp_path):
     out = tmp_path / "two"
     arguments = ("ablation", plain_session, "--policy", "share", "--policy", "covins-g", "--out", out)
     assert evaluate(*arguments).code == 0
@@ -97,7 +98,7 @@ def test_what_is_missing_is_played_the_next_time(evaluate, plain_session, tmp_pa
     assert (kept / "run.json").stat().st_mtime_ns == before
 
 
-def test_what_is_wrong_is_said_before_anything_is_played(evaluate, plain_session, tmp_path):
+def test_wrong_use_is_refused_before_anything_is_played(evaluate, plain_session, tmp_path):
     for arguments, what in (
         (("run", plain_session, "--link", "wifi6", "--out", tmp_path / "r"), "wifi6"),
         (("run", plain_session, "--link", "bob=wifi5", "--out", tmp_path / "r"), "are ar1, ar2, robot"),
@@ -122,7 +123,7 @@ def test_what_is_wrong_is_said_before_anything_is_played(evaluate, plain_session
 
 @pytest.mark.slow
 @pytest.mark.parametrize("clock", ["--virtual", "--agents-first"])  # the latter is in real time
-def test_an_agent_has_its_own_link(evaluate, plain_session, tmp_path, clock):
+def test_each_agent_can_have_its_own_link(evaluate, plain_session, tmp_path, clock):
     far, out = tmp_path / "far.yaml", tmp_path / "run"
     far.write_text("up: {delay_ms: 150}\ndown: {delay_ms: 150}\n")
     assert evaluate("run", plain_session, clock, "--link", f"wifi5,robot={far}", "--out", out).code == 0
@@ -135,7 +136,7 @@ def test_an_agent_has_its_own_link(evaluate, plain_session, tmp_path, clock):
 
 
 @pytest.mark.slow
-def test_in_virtual_time_the_same_seed_gives_the_same_run(evaluate, plain_session, tmp_path):
+def test_same_seed_gives_the_same_virtual_run(evaluate, plain_session, tmp_path):
     """And odometry is that of real time, to the last digit."""
     virtual = ("--virtual", "--true-error", "--link", "wifi5")
     for name in ("one", "two"):
@@ -165,7 +166,7 @@ def test_in_virtual_time_the_same_seed_gives_the_same_run(evaluate, plain_sessio
 
 
 @pytest.mark.slow
-def test_virtual_runs_go_side_by_side(evaluate, plain_session, tmp_path):
+def test_virtual_runs_can_be_parallel(evaluate, plain_session, tmp_path):
     """Two sessions by two policies; the table has them in the order that was asked for."""
     twin = tmp_path / "twin"
     shutil.copytree(plain_session, twin)
@@ -187,7 +188,7 @@ def test_virtual_runs_go_side_by_side(evaluate, plain_session, tmp_path):
 
 
 @pytest.mark.slow
-def test_settings_are_swept_and_what_is_there_is_not_played_again(evaluate, plain_session, tmp_path):
+def test_sweep_keeps_existing_runs(evaluate, plain_session, tmp_path):
     out = tmp_path / "out"
     axes = ("--set", "control.kp=0.2,0.8", "--set", "control.rate_max_hz=2,5")
     arguments = ("sweep", plain_session, "--virtual", *axes, "--out", out)

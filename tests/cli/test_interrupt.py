@@ -46,7 +46,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
 
 
 def ended(arguments: list[str], after_s: float, number: int) -> tuple[int, str]:
-    """Exit code and stderr of a command that gets a signal so long after its beginning."""
+    """Return exit code and stderr of a command that gets a signal after a delay."""
     process = subprocess.Popen(
         [sys.executable, "-c", LOOKED_AFTER, *arguments],
         stdin=subprocess.DEVNULL,
@@ -66,7 +66,7 @@ def ended(arguments: list[str], after_s: float, number: int) -> tuple[int, str]:
 
 
 def printed(program: str) -> str:
-    """What a Python program prints that ends well and complains of nothing."""
+    """Return the output of a Python program that ends with code 0 and an empty stderr."""
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
@@ -85,6 +85,7 @@ def check(folder: Path, command: str, number: int, steps: Sequence[float]) -> No
             assert word not in said, (after_s, said)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["edge", "track"])
 def test_ctrl_c(tmp_path, command):
     check(tmp_path, command, signal.SIGINT, (0.005, 0.1, 0.4))
@@ -93,16 +94,16 @@ def test_ctrl_c(tmp_path, command):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", list(ENDED))
 @pytest.mark.parametrize("command", ["edge", "agent", "track", "demo", "capture", "evaluate"])
-def test_at_every_moment(tmp_path, monkeypatch, plain_cache, command, number):
+def test_interrupt_at_any_moment_ends_with_one_line(tmp_path, monkeypatch, plain_cache, command, number):
     monkeypatch.setenv("XDG_CACHE_HOME", str(plain_cache))  # the demo's session
     check(tmp_path, command, number, STEPS_S)
 
 
-def test_one_line_before_the_command_has_begun(tmp_path):
+def test_interrupt_before_the_command_starts_is_one_line(tmp_path):
     assert ended(["edge"], 0.005, signal.SIGINT) == (130, "share: interrupted\n")
 
 
-def test_where_it_is_ignored_it_stays_so(tmp_path):
+def test_ignored_signal_stays_ignored(tmp_path):
     """As of `share … &` in a script."""
     program = f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); {PROGRAM}"
     process = subprocess.Popen(
@@ -115,7 +116,7 @@ def test_where_it_is_ignored_it_stays_so(tmp_path):
     assert out.startswith(b"share")
 
 
-def test_an_import_is_not_interrupted(tmp_path):
+def test_import_is_not_interrupted(tmp_path):
     """poselib makes a RuntimeError of it: then Ctrl-C ended `share track` with a traceback."""
     (tmp_path / "swallows.py").write_text(
         "import os, signal, time\n"
@@ -131,7 +132,7 @@ def test_an_import_is_not_interrupted(tmp_path):
     assert printed(program) == "interrupted\n"
 
 
-def test_a_worker_is_not_left_half_started():
+def test_signal_during_a_worker_start_leaves_no_process():
     """It would say that it got no work (EOFError), with a traceback. The signal goes to another thread, which
     does not hold it back, while the worker is started."""
     program = (
@@ -154,9 +155,10 @@ def test_a_worker_is_not_left_half_started():
     assert printed(program) == "worked\ninterrupted\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", list(ENDED))
-def test_a_worker_that_nobody_has_taken_charge_of_is_not_waited_for(number):
-    """The signal comes when the edge's mapper runs, and before the edge has it: it went on for ever."""
+def test_worker_without_an_owner_does_not_delay_the_end(number):
+    """The signal comes when the mapper process runs but the edge does not own it yet."""
     program = (
         "import os\n"
         "from share.__main__ import run\n"
@@ -174,7 +176,7 @@ def test_a_worker_that_nobody_has_taken_charge_of_is_not_waited_for(number):
     assert done.stderr == ("share: interrupted\n" if number == signal.SIGINT else "")
 
 
-def test_what_waited_for_an_import_waits_for_a_worker_too():
+def test_signal_deferred_by_an_import_is_deferred_by_a_worker_start():
     """A signal that came while a module was imported is handled 20 ms later: while a worker is started."""
     program = (
         "import os, signal, time\n"
@@ -189,7 +191,7 @@ def test_what_waited_for_an_import_waits_for_a_worker_too():
         "worker = SPAWN_CONTEXT.Process(target=print, args=('worked',))\n"
         "spawning.util.spawnv_passfds = slow\n"
         "importing = iter([True])\n"
-        "module._is_importing = lambda frame: next(importing, False)\n"
+        "module.is_importing = lambda frame: next(importing, False)\n"
         "try:\n    with module.unwind_on_signal():\n"
         "        os.kill(os.getpid(), signal.SIGTERM)\n        worker.start()\n"
         "except SystemExit:\n    worker.join()\n    print('ended')\n"

@@ -1,4 +1,4 @@
-"""The command line as such: help, names, speed, what is imported, one line for whatever is wrong."""
+"""The command line itself: help, names, speed, imports, one line for each error."""
 
 import resource
 import signal
@@ -76,13 +76,13 @@ def test_help_is_quick():
     assert min(spent) < 0.5
 
 
-def test_dataset_names_its_commands(capsys):
+def test_dataset_help_lists_its_commands(capsys):
     code, out, _ = run(capsys, "dataset", "--help")
     assert code == 0
     assert all(f"  {name} " in out for name in ("info", "convert", "recover"))
 
 
-def test_module_and_script_are_one_program():
+def test_module_and_script_are_the_same_program():
     done = subprocess.run([*SHARE, "track"], capture_output=True, text=True, timeout=30)
     assert done.returncode == 2
     assert done.stderr == "share: Missing argument 'SOURCE'. (see `share track --help`)\n"
@@ -96,7 +96,7 @@ def test_version(capsys):
     assert run(capsys, "--version") == (0, f"share, version {__version__}\n", "")
 
 
-def test_no_arguments_is_the_help_and_wrong_use(capsys):
+def test_no_arguments_prints_help_with_exit_code_2(capsys):
     code, out, err = run(capsys)
     assert (code, out) == (2, "")
     assert err.startswith("Usage: share ")
@@ -140,7 +140,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(arguments, said, capsys, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_reader_that_goes_away_is_no_traceback():
+def test_closed_pipe_gives_no_traceback():
     """`share --help | head -1`, with a reader that is gone before we write."""
     with subprocess.Popen([*SHARE, "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
@@ -176,7 +176,7 @@ def interrupted(home: Path, number: int) -> tuple[int, str, str]:
 
 
 def chunks(home: Path) -> dict[Path, int]:
-    """What is drawn of a session that is not whole: files, and when they were written."""
+    """Return the files of an incomplete session and their times."""
     return {path: path.stat().st_mtime_ns for path in home.glob("share/.session-*/**/*.chunk")}
 
 
@@ -186,14 +186,15 @@ def only_unfinished(home: Path) -> bool:
     return left.name.startswith(".session-") and not [*left.rglob("session.yaml"), *left.rglob("*.mcap*")]
 
 
-def test_a_command_that_is_ended_leaves_nothing_that_looks_whole(tmp_path):
+@pytest.mark.long
+def test_ended_command_leaves_no_complete_looking_output(tmp_path):
     assert interrupted(tmp_path, signal.SIGTERM) == (143, "", "")
     assert chunks(tmp_path)
     assert only_unfinished(tmp_path)
 
 
 @pytest.mark.slow
-def test_after_ctrl_c_the_same_command_goes_on_where_it_was(tmp_path):
+def test_interrupted_command_continues_when_run_again(tmp_path):
     from share.lab.emulate.demo import recipe
     from share.lab.emulate.session import make_cached_session
 

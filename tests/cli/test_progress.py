@@ -1,4 +1,4 @@
-"""A live line, also on a terminal that is gone."""
+"""A live line, also on a closed terminal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Gone(io.StringIO):
         raise OSError(errno.EIO, "Input/output error")
 
 
-def test_a_terminal_that_is_gone_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closed_terminal_does_not_end_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stderr", Gone())
     line = LiveLine()
     assert line.is_terminal

@@ -25,7 +25,7 @@ from share.wire.codec import decode, encode
 
 @contextmanager
 def pipe(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
-    """Both ends of one of 4 kB, whose end for writing is stderr."""
+    """Return both ends of a pipe of 4 kB; stderr writes to it."""
     reader, writer = os.pipe()
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
     with os.fdopen(writer, "w", closefd=False) as stream, monkeypatch.context() as patch:
@@ -42,7 +42,7 @@ def read(handle: int, until: bytes) -> bytes:
     return data
 
 
-def test_a_reader_that_stops_delays_nothing_and_is_shown_how_many_lines_it_missed(
+def test_blocked_reader_delays_nothing_and_dropped_lines_are_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(stderr_module, "MAX_PENDING_LINES", 50)
@@ -58,7 +58,7 @@ def test_a_reader_that_stops_delays_nothing_and_is_shown_how_many_lines_it_misse
         assert b"lines were dropped" in read(reader, b"again\n")
 
 
-def test_lines_come_in_their_order_and_are_there_after_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_keep_their_order_and_are_written_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     with pipe(monkeypatch) as (reader, writer):
         line = LiveLine()
         for i in range(20):
@@ -68,7 +68,7 @@ def test_lines_come_in_their_order_and_are_there_after_the_end(monkeypatch: pyte
         assert read(reader, b"after").decode().split() == [*map(str, range(20)), "after"]
 
 
-def test_a_disk_that_is_full_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_does_not_end_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stderr", full)
         line = LiveLine()
@@ -78,7 +78,8 @@ def test_a_disk_that_is_full_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> No
         line.end()
 
 
-def test_an_edge_whose_output_nobody_reads_answers_and_ends(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_edge_with_a_blocked_output_answers_and_ends(tmp_path: Path) -> None:
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     with suppress(BlockingIOError):

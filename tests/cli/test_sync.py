@@ -1,4 +1,4 @@
-"""`share sync` as people use it, over real sockets."""
+"""`share sync` over real sockets."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 from helpers.shell import Done
 from helpers.time_servers import shifted, udp
 
-from share.cli.agent import _clock_text
+from share.cli.agent import clock_text
 from share.devices import time_client
 from share.net.ntp import NtpMode, NtpPacket
 from share.protocol.edge_clock import ClockEstimate
@@ -43,7 +43,7 @@ def asked(done: Done) -> dict[str, object]:
 # ------------------------------------------------------------------ check
 
 
-def test_a_clock_that_agrees_is_a_row_and_exit_code_0(share: Share) -> None:
+def test_clock_within_the_limit_is_a_row_and_exit_code_0(share: Share) -> None:
     with udp(shifted(0.0)) as port:
         done = share("sync", "check", f"127.0.0.1:{port}", "--count", 4, "--limit-ms", 90)
     head, row = done.out.splitlines()
@@ -58,14 +58,14 @@ def test_a_clock_that_agrees_is_a_row_and_exit_code_0(share: Share) -> None:
 
 
 @pytest.mark.parametrize("offset_ms", [-70.0, 5.0, 3600e3])
-def test_a_clock_that_is_off_is_told_within_its_uncertainty(offset_ms: float, share: Share) -> None:
+def test_offset_of_a_clock_is_measured_within_its_uncertainty(offset_ms: float, share: Share) -> None:
     with udp(shifted(offset_ms)) as port:
         clock = asked(share("sync", "check", f"127.0.0.1:{port}", "--json"))
     assert abs(clock["offset_ms"] - offset_ms) <= clock["uncertainty_ms"]  # type: ignore[operator]
     assert f"off by {clock['offset_ms']:+.3f} ±" in str(clock["wrong"])
 
 
-def test_who_is_off_is_told_what_to_write_into_chrony_conf(share: Share) -> None:
+def test_wrong_clock_gets_lines_for_chrony_conf(share: Share) -> None:
     with udp(shifted(50.0)) as port:
         done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 20)
     *advice, last = done.err.splitlines()
@@ -80,7 +80,7 @@ def test_who_is_off_is_told_what_to_write_into_chrony_conf(share: Share) -> None
     assert done.code == 1
 
 
-def test_a_network_too_slow_to_tell_is_said_and_chrony_not_advised(share: Share) -> None:
+def test_too_slow_network_is_reported_without_chrony_advice(share: Share) -> None:
     with udp(shifted(0.0, slow_ms=30.0)) as port:
         done = share("sync", "check", f"127.0.0.1:{port}", "--count", 2, "--limit-ms", 10)
     assert done.code == 1
@@ -91,19 +91,19 @@ def test_a_network_too_slow_to_tell_is_said_and_chrony_not_advised(share: Share)
     )
 
 
-def test_a_clock_that_is_surely_off_is_said_to_be_however_slow_the_network(share: Share) -> None:
+def test_certainly_wrong_clock_is_reported_on_a_slow_network(share: Share) -> None:
     with udp(shifted(900.0, slow_ms=30.0)) as port:
         done = share("sync", "check", f"127.0.0.1:{port}", "--count", 2, "--limit-ms", 10)
     assert re.search(r"\nshare: 127\.0\.0\.1:\d+: off by \+9\d\d\.\d+ ± ", done.err)
 
 
-def test_a_server_that_says_how_unsure_it_is_is_believed(share: Share) -> None:
+def test_uncertainty_stated_by_a_server_is_added(share: Share) -> None:
     with udp(shifted(0.0, root_dispersion=3 << 16, root_delay=2 << 16)) as port:  # 3 s, and half of 2
         clock = asked(share("sync", "check", f"127.0.0.1:{port}", "--json"))
     assert clock["uncertainty_ms"] == pytest.approx(4000, abs=50)
 
 
-def test_nobody_at_that_port_is_said_at_once(share: Share) -> None:
+def test_closed_port_is_reported_at_once(share: Share) -> None:
     with udp(shifted(0.0)) as port:
         pass
     done = share("sync", "check", f"localhost:{port}")
@@ -115,7 +115,10 @@ def test_nobody_at_that_port_is_said_at_once(share: Share) -> None:
     )
 
 
-def test_who_does_not_answer_is_given_up_after_three(share: Share, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.long
+def test_silent_server_is_given_up_after_three_requests(
+    share: Share, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(time_client, "REPLY_TIMEOUT_S", 0.05)
     questions = []
     with udp(lambda data: questions.append(data) or []) as port:  # type: ignore[func-returns-value]
@@ -127,7 +130,7 @@ def test_who_does_not_answer_is_given_up_after_three(share: Share, monkeypatch: 
     )
 
 
-def test_one_of_several_that_will_not_do_is_named_and_the_others_shown(share: Share) -> None:
+def test_one_wrong_server_of_several_is_named_and_all_are_shown(share: Share) -> None:
     with udp(shifted(0.0)) as good, udp(shifted(900.0)) as bad:
         done = share("sync", "check", f"127.0.0.1:{good}", f"127.0.0.1:{bad}", "--limit-ms", 90)
     assert done.code == 1
@@ -137,7 +140,7 @@ def test_one_of_several_that_will_not_do_is_named_and_the_others_shown(share: Sh
     assert done.err.endswith("share: 1 of 2 clocks are not proven to be within 90 ms; see above\n")
 
 
-def test_a_kiss_of_death_ends_the_questions(share: Share) -> None:
+def test_kiss_of_death_ends_the_requests(share: Share) -> None:
     questions = []
 
     def kiss(data: bytes) -> list[bytes]:
@@ -153,7 +156,7 @@ def test_a_kiss_of_death_ends_the_questions(share: Share) -> None:
     )
 
 
-def test_what_was_answered_before_a_kiss_counts(share: Share) -> None:
+def test_replies_before_a_kiss_of_death_count(share: Share) -> None:
     good, questions = shifted(0.0), []
 
     def soon_tired(data: bytes) -> list[bytes]:
@@ -170,7 +173,7 @@ def test_what_was_answered_before_a_kiss_counts(share: Share) -> None:
     assert done.err == f"{refused}\nwithin 50 ms\n"
 
 
-def test_forged_answers_are_passed_over_and_the_true_one_is_taken(share: Share) -> None:
+def test_forged_replies_are_skipped(share: Share) -> None:
     good = shifted(0.0)
 
     def besieged(data: bytes) -> list[bytes]:
@@ -237,8 +240,9 @@ def serving(stratum: int = 10) -> Iterator[tuple[subprocess.Popen[str], int]]:
             process.kill()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_server_answers_survives_whatever_comes_and_ends_in_good_order(number: int, share: Share) -> None:
+def test_server_survives_any_input_and_ends_cleanly(number: int, share: Share) -> None:
     with serving(stratum=7) as (process, port):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as enemy:
             for k in range(100):
@@ -255,7 +259,7 @@ def test_a_server_answers_survives_whatever_comes_and_ends_in_good_order(number:
     assert err == "share sync: new client: 127.0.0.1\n"
 
 
-def test_a_port_in_use_is_said(share: Share) -> None:
+def test_port_in_use_is_reported(share: Share) -> None:
     with serving() as (_, port):
         done = share("sync", "server", "--bind", f"127.0.0.1:{port}")
     assert done == Done(
@@ -276,6 +280,6 @@ def test_a_port_in_use_is_said(share: Share) -> None:
         ),
     ],
 )
-def test_share_agent_says_the_offset_or_that_it_is_too_uncertain(sigma_ms: float, said: str) -> None:
+def test_agent_prints_the_offset_or_that_it_is_too_uncertain(sigma_ms: float, said: str) -> None:
     claim = ClockEstimate(0.431, sigma_ms, 0.357, claim_ms=1.0)
-    assert _clock_text(claim.report()).startswith(said)
+    assert clock_text(claim.report()).startswith(said)

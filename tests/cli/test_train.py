@@ -1,4 +1,4 @@
-"""`share train` as a user types it."""
+"""`share train labels`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_labels_of_a_session(share, plain_session, tmp_path):
     assert "is of seed 0; give another --out" in other.err
 
 
-def test_without_a_truth_there_is_nothing_to_learn(share, plain_session, tmp_path):
+def test_session_without_ground_truth_is_refused(share, plain_session, tmp_path):
     bare = tmp_path / "bare"
     bare.mkdir()
     for path in plain_session.glob("*.*"):

@@ -1,4 +1,4 @@
-"""Each judgement at both sides of its limit."""
+"""Each check on both sides of its limit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from share.geometry.se3 import inverse
 
 
 @pytest.mark.parametrize(("mbit_s", "state"), [(480, "FAIL"), (5000, "OK"), (10000, "OK")])
-def test_a_link_is_usb_3_from_5000_mbit_on(mbit_s: float, state: str) -> None:
+def test_usb_3_link_has_at_least_5000_mbit(mbit_s: float, state: str) -> None:
     assert camera_check.check_link([UsbCamera("2-1", mbit_s)]).state.value == state
     assert camera_check.check_link([]).state is camera_check.check_link(None).state is CheckState.FAIL
 
@@ -26,14 +26,14 @@ def test_a_link_is_usb_3_from_5000_mbit_on(mbit_s: float, state: str) -> None:
     ("found", "state"),
     [("5.9.0.0", "FAIL"), ("5.12.0", "WARN"), ("5.13.0.50", "OK"), ("5.15", "WARN"), ("5.16.0.1", "OK")],
 )
-def test_firmware_is_compared_by_numbers_not_letters(found: str, state: str) -> None:
+def test_firmware_versions_are_compared_as_numbers(found: str, state: str) -> None:
     good = ["5.13.0.50", "5.16.0.1"]
     told = camera_check.check_firmware(SdkReport(firmware=(found,)), good, "5.12.0.0")
     assert told.state.value == state
     assert any("librealsense2-utils" in line for line in told.fix) == (state != "OK")
 
 
-def test_nobody_is_told_to_go_back_to_an_older_firmware() -> None:
+def test_newer_firmware_passes() -> None:
     found = camera_check.check_firmware(
         SdkReport(firmware=("5.17.0.10",)), ["5.9.0.1", "5.16.0.1", "5.13"], None
     )
@@ -41,14 +41,14 @@ def test_nobody_is_told_to_go_back_to_an_older_firmware() -> None:
     assert found.what.startswith("5.17.0.10, newer than those tested")
 
 
-def test_a_processor_for_which_there_is_no_poselib_is_told() -> None:
+def test_missing_poselib_is_reported() -> None:
     assert checks.check_libraries({"numpy": None, "poselib": None}).what == "numpy, poselib load"
     found = checks.check_libraries({"numpy": None})
     assert (found.state, found.fix) == (CheckState.OK, ())
     assert found.what.startswith("numpy load; without poselib")
 
 
-def test_into_a_frozen_program_nothing_can_be_installed() -> None:
+def test_advice_in_a_frozen_program_is_not_to_install() -> None:
     for frozen in (False, True):
         mends = [
             *camera_check.check_sdk(SdkReport("no module pyrealsense2"), [], frozen).fix,
@@ -61,7 +61,7 @@ def test_into_a_frozen_program_nothing_can_be_installed() -> None:
     )
 
 
-def test_a_camera_that_is_plugged_in_must_be_one_that_the_sdk_sees() -> None:
+def test_attached_camera_that_the_sdk_misses_fails() -> None:
     here, seen = UsbCamera("2-1", 5000), SdkReport(firmware=("5.16.0.1",))
     assert (
         camera_check.check_sdk(seen, [here]).state
@@ -79,7 +79,7 @@ def test_a_camera_that_is_plugged_in_must_be_one_that_the_sdk_sees() -> None:
     assert "plugdev" in unseen.fix[0]
 
 
-def test_what_cannot_be_seen_is_skipped() -> None:
+def test_invisible_facts_are_skipped() -> None:
     found = [
         checks.check_governor([], "performance"),
         checks.check_throttling([]),
@@ -92,7 +92,7 @@ def test_what_cannot_be_seen_is_skipped() -> None:
     assert {one.state for one in found} == {CheckState.SKIPPED}
 
 
-def test_the_host_is_held_against_the_profile() -> None:
+def test_host_is_compared_with_the_profile() -> None:
     assert checks.check_governor(["performance"] * 4, "performance").state is CheckState.OK
     assert "1 of 2 cores" in checks.check_governor(["performance", "powersave"], "performance").what
     assert (
@@ -114,7 +114,7 @@ def test_the_host_is_held_against_the_profile() -> None:
         (0x8, "it is slowed (get_throttled 0x8)", "cool it"),
     ],
 )
-def test_a_raspberry_pi_tells_of_its_supply_and_of_heat(bits: int, what: str, mend: str) -> None:
+def test_supply_and_heat_of_a_raspberry_pi_are_reported(bits: int, what: str, mend: str) -> None:
     found = checks.check_throttling([], bits)
     assert found.state is (CheckState.WARN if bits else CheckState.OK)
     assert found.what.startswith(what)
@@ -122,7 +122,7 @@ def test_a_raspberry_pi_tells_of_its_supply_and_of_heat(bits: int, what: str, me
     assert len(checks.check_throttling([], bits | 0x90000).fix) == 2  # each has a remedy of its own
 
 
-def test_an_edge_without_keys_or_agents_serves_its_own_machine_only() -> None:
+def test_edge_without_keys_or_authorized_agents_gives_a_warning() -> None:
     assert (checks.missing_edge_keys("k").state, checks.missing_edge_keys("k").fix) == (
         CheckState.WARN,
         ("share keys generate",),
@@ -131,7 +131,7 @@ def test_an_edge_without_keys_or_agents_serves_its_own_machine_only() -> None:
     assert checks.check_edge_keys("edge", ["ann", "bob"]).what == "edge; authorized: ann, bob"
 
 
-def test_what_mends_the_host_outlives_a_start() -> None:
+def test_advice_for_the_host_persists_over_a_reboot() -> None:
     lines, mend = checks.tmpfiles_lines("performance", 128), checks.boot_settings_fix("performance", 128)
     assert [line.split()[-1] for line in lines] == ["performance", "128"]
     assert all(f"'{line}'" in mend[0] for line in lines)
@@ -142,11 +142,11 @@ def test_what_mends_the_host_outlives_a_start() -> None:
 
 
 @pytest.mark.parametrize(("minutes", "state"), [(4, "FAIL"), (6, "WARN"), (61, "OK")])
-def test_a_disk_is_told_in_minutes(minutes: int, state: str) -> None:
+def test_free_disk_is_given_in_minutes_of_recording(minutes: int, state: str) -> None:
     assert checks.check_disk("/", minutes * 60 * 10_000_000, 1e7).state.value == state
 
 
-def test_a_disk_that_may_not_be_written_to_is_of_no_use() -> None:
+def test_unwritable_disk_fails() -> None:
     found = checks.check_disk("/data", 10**12, 1e7, may_write=False)
     assert (found.state, found.what) == (CheckState.FAIL, "/data: this user may not write there")
 
@@ -154,12 +154,12 @@ def test_a_disk_that_may_not_be_written_to_is_of_no_use() -> None:
 @pytest.mark.parametrize(
     ("offset", "state"), [(0.5, CheckState.OK), (-0.5, CheckState.OK), (0.8, CheckState.WARN)]
 )
-def test_the_clock_counts_with_its_uncertainty(offset: float, state: CheckState) -> None:
+def test_clock_is_judged_with_its_uncertainty(offset: float, state: CheckState) -> None:
     assert checks.check_clock((offset, 0.3), None).state is state
     assert checks.check_clock(None, None).state is CheckState.WARN
 
 
-def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
+def test_inverted_extrinsics_differ_from_misplaced_ones() -> None:
     T = np.eye(4)
     T[:3, 3] = (-0.03, 0.02, 0.01)
     T_10 = np.eye(4)
@@ -192,7 +192,7 @@ def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
         ((), ("0123",), CheckState.SKIPPED, []),
     ],
 )
-def test_a_calibration_of_another_camera_is_a_warning(
+def test_calibration_of_another_camera_gives_a_warning(
     said: tuple[str, ...], there: tuple[str, ...], state: CheckState, mended: list[str]
 ) -> None:
     found = check_serial(said, there)
@@ -237,9 +237,7 @@ def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
     assert facts.camera_rules(tmp_path) == ["/etc/udev/rules.d/9.rules"]
 
 
-def test_the_imu_is_started_by_files_that_we_must_be_able_to_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_imu_needs_writable_files_in_sys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usb = tmp_path / "sys/bus/usb/devices/2-1"
     switches = usb / "2-1:1.5/0003:8086:0B3A.0001/HID-SENSOR-200073.1.auto/iio:device0/scan_elements"
     switches.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""What chronyc prints is understood, and what is told to people is what chronyd understands."""
+"""The output of chronyc is parsed, and chronyd accepts the configuration that SHARE prints."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.time_servers import chronyd, needs_chrony
 
-from share.devices import chrony
+from share.devices import clocks
 from share.errors import DataError
 from share.net.udp import HostPort
 
@@ -20,8 +20,8 @@ LINE = (
 )
 
 
-def test_a_line_of_chronyc() -> None:
-    found = chrony.parse_tracking(LINE)
+def test_chronyc_line_is_parsed() -> None:
+    found = clocks.parse_tracking(LINE)
     assert (found.source, found.stratum, found.synchronised, found.local) == ("127.0.0.1", 11, True, False)
     assert (found.offset_s, found.rms_s) == (
         0.004984824,
@@ -30,29 +30,29 @@ def test_a_line_of_chronyc() -> None:
     assert found.uncertainty_s == pytest.approx(0.000034467 / 2 + 0.000007568)
 
 
-def test_who_follows_nobody_is_known() -> None:
-    assert not chrony.parse_tracking(LINE.replace("Normal", "Not synchronised")).synchronised
-    assert chrony.parse_tracking(LINE.replace("7F000001,127.0.0.1", "7F7F0101,")).local
+def test_unsynchronised_chronyd_is_recognised() -> None:
+    assert not clocks.parse_tracking(LINE.replace("Normal", "Not synchronised")).synchronised
+    assert clocks.parse_tracking(LINE.replace("7F000001,127.0.0.1", "7F7F0101,")).local
 
 
 @pytest.mark.parametrize(
     "text", ["", "506 Cannot talk to daemon", LINE.replace("0.004984824", "x"), LINE[:60]]
 )
-def test_what_is_not_understood_is_said(text: str) -> None:
+def test_unparsable_output_is_refused(text: str) -> None:
     with pytest.raises(
         DataError, match=r"chronyc -c tracking: cannot be parsed \(.*(expected 14|could not convert)"
     ):
-        chrony.parse_tracking(text)
+        clocks.parse_tracking(text)
 
 
-def test_no_chrony_is_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_chronyd_gives_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert chrony.read_tracking() is None
+    assert clocks.read_tracking() is None
 
 
 @needs_chrony
-def test_chronyd_understands_what_people_are_told_to_write(tmp_path: Path) -> None:
-    lines = chrony.follow_lines(HostPort("192.168.1.10", 11123))
+def test_chronyd_accepts_the_advised_lines(tmp_path: Path) -> None:
+    lines = clocks.follow_lines(HostPort("192.168.1.10", 11123))
     (tmp_path / "chrony.conf").write_text("\n".join(lines) + "\n")
     done = subprocess.run(
         chronyd("-p", "-f", str(tmp_path / "chrony.conf")), capture_output=True, text=True, check=True

@@ -1,4 +1,4 @@
-"""What is believed of a time server's answer, and what is made of several."""
+"""Which replies of a time server are valid, and the estimate from several."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def answer(there: int, back: int, offset: int = 0) -> NtpReply:
     return NtpReply(Exchange(NOW, arrived + offset, arrived + offset, arrived + back), 10, 0, 0)
 
 
-def test_a_question_gives_nothing_away_but_its_nonce() -> None:
+def test_request_contains_only_a_nonce() -> None:
     assert make_request(NONCE) == b"\x23" + bytes(39) + NONCE.to_bytes(8, "big")
 
 
-def test_an_answer_and_its_bound_by_hand() -> None:
+def test_reply_and_its_error_bound_match_hand_calculation() -> None:
     found = parse_reply(GOOD.encode(), NONCE, NOW, NOW + 5 * MS)
     assert (found.exchange.offset_ns, found.exchange.delay_ns) == (5 * MS, 4 * MS)
     assert (found.stratum, found.precision_ns) == (3, 954)
@@ -63,41 +63,42 @@ def test_an_answer_and_its_bound_by_hand() -> None:
         ({"transmit": to_stamp(NOW + 13 * MS)}, "impossible"),
     ],
 )
-def test_what_cannot_be_believed_is_refused(changed: dict[str, object], reason: str) -> None:
+def test_invalid_replies_are_refused(changed: dict[str, object], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         parse_reply(replace(GOOD, **changed).encode(), NONCE, NOW, NOW + 5 * MS)  # type: ignore[arg-type]
 
 
-def test_a_kiss_of_death_is_told_by_its_code() -> None:
+def test_kiss_of_death_has_its_code() -> None:
     kiss = replace(GOOD, stratum=0, refid=b"RATE")
     with pytest.raises(KissError, match=r"refuses to answer \(RATE\)") as told:
         parse_reply(kiss.encode(), NONCE, NOW, NOW + MS)
     assert told.value.code == "RATE"
 
 
-def test_a_kiss_from_who_did_not_hear_the_question_is_none() -> None:
-    """Else anybody could keep us from our server."""
+def test_kiss_of_death_with_a_wrong_nonce_is_invalid() -> None:
+    """Otherwise any host could make a client give up its server."""
     kiss = replace(GOOD, stratum=0, refid=b"DENY", origin=1)
     with pytest.raises(ValueError, match="another request") as told:
         parse_reply(kiss.encode(), NONCE, NOW, NOW + MS)
     assert not isinstance(told.value, KissError)
 
 
+@pytest.mark.long
 @given(st.binary(max_size=120))
 @settings(max_examples=300)
-def test_any_bytes_are_an_answer_or_a_value_error(data: bytes) -> None:
+def test_any_bytes_give_a_reply_or_a_value_error(data: bytes) -> None:
     for tried in (data, GOOD.encode()[:24] + NONCE.to_bytes(8, "big") + data[:16].ljust(16, b"\1")):
         with contextlib.suppress(ValueError):
             assert parse_reply(tried, NONCE, NOW, NOW + S).exchange.is_valid
 
 
-def test_the_answer_that_was_quickest_is_taken() -> None:
+def test_reply_with_the_least_delay_is_used() -> None:
     found = estimate_offset([answer(5 * MS, MS, 10), answer(MS, MS, 20), answer(MS, 9 * MS, 30)], 0)
     assert (found.offset_ns, found.delay_ns, found.uncertainty_ns) == (20, 2 * MS, MS + 30)
     assert found.answers == 3
 
 
-def test_jitter_is_the_rms_of_the_others_against_the_best() -> None:
+def test_jitter_is_the_rms_of_the_other_offsets() -> None:
     """Against numpy: three others, off by 2, 0 and -4 ms."""
     answers = [answer(MS, MS), answer(6 * MS, 2 * MS), answer(2 * MS, 2 * MS), answer(2 * MS, 10 * MS)]
     assert estimate_offset(answers, 0).jitter_ns == int(
@@ -105,15 +106,16 @@ def test_jitter_is_the_rms_of_the_others_against_the_best() -> None:
     )
 
 
-def test_jitter_is_no_less_than_what_clocks_resolve() -> None:
+def test_jitter_is_at_least_the_clock_precision() -> None:
     assert estimate_offset([answer(MS, MS)], 40).jitter_ns == 40
 
 
-def test_without_answers_there_is_no_estimate() -> None:
+def test_no_replies_give_no_estimate() -> None:
     with pytest.raises(ValueError, match="no answers"):
         estimate_offset([], 1)
 
 
+@pytest.mark.long
 @given(
     st.integers(-(10**12), 10**12),
     st.floats(-15, 15),
@@ -122,7 +124,7 @@ def test_without_answers_there_is_no_estimate() -> None:
     ),
 )
 @settings(max_examples=200)
-def test_the_truth_is_within_the_stated_uncertainty(
+def test_true_offset_is_within_the_uncertainty(
     offset: int, drift_ppm: float, ways: list[tuple[int, int, int]]
 ) -> None:
     """Whatever the ways there and back took, between clocks that part by no more than PHI, at the time

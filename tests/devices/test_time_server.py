@@ -1,4 +1,4 @@
-"""Whom a time server answers, and with what."""
+"""Which requests a time server answers, and with what."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def ask(
     return server.answer(data, address, NOW, round(at_s * S))
 
 
-def test_an_answer_says_what_it_answers_and_when_it_was_asked() -> None:
+def test_reply_repeats_the_request_and_its_arrival() -> None:
     answer = ask(TimeServer(stratum=9, precision=-23))
     assert answer == NtpPacket(
         NtpMode.SERVER,
@@ -36,8 +36,8 @@ def test_an_answer_says_what_it_answers_and_when_it_was_asked() -> None:
 
 
 @pytest.mark.parametrize("mode", [mode for mode in NtpMode if mode is not NtpMode.CLIENT])
-def test_only_questions_are_answered(mode: NtpMode) -> None:
-    """Above all no answers: two servers would answer each other for ever."""
+def test_only_client_requests_are_answered(mode: NtpMode) -> None:
+    """Replies are ignored: two servers would answer each other forever."""
     server = TimeServer()
     assert ask(server, NtpPacket(mode).encode()) is None
     assert server.counts == {"ignored": 1}
@@ -45,7 +45,7 @@ def test_only_questions_are_answered(mode: NtpMode) -> None:
 
 
 @given(st.binary(max_size=600))
-def test_whatever_comes_nobody_gets_more_than_was_sent(data: bytes) -> None:
+def test_reply_is_never_longer_than_the_request(data: bytes) -> None:
     server = TimeServer()
     for tried in (data, QUESTION + data):
         answer = ask(server, tried)
@@ -53,7 +53,7 @@ def test_whatever_comes_nobody_gets_more_than_was_sent(data: bytes) -> None:
     assert ask(server) is not None
 
 
-def test_who_asks_too_often_is_not_answered_and_others_are() -> None:
+def test_rate_limit_applies_to_each_address() -> None:
     server = TimeServer()
     answered = [ask(server, at_s=k / 1000) is not None for k in range(1000)]
     assert sum(answered) == BURST + int(RATE_PER_S * 0.999)
@@ -62,14 +62,14 @@ def test_who_asks_too_often_is_not_answered_and_others_are() -> None:
     assert ask(server, at_s=2.0) is not None  # and again after a while
 
 
-def test_chronyd_at_its_quickest_is_never_turned_away() -> None:
+def test_fastest_chronyd_stays_below_the_rate_limit() -> None:
     """iburst, 4 questions 2 s apart, then one each second with minpoll 0; 100 devices behind one address
     would be too many, 8 are not."""
     server = TimeServer()
     assert all(ask(server, at_s=k + device / 8) for k in range(600) for device in range(8))
 
 
-def test_a_flood_of_forged_addresses_is_forgotten_again() -> None:
+def test_remembered_addresses_are_bounded() -> None:
     server = TimeServer()
     for k in range(3 * MAX_CLIENTS):
         ask(server, address=f"forged-{k}")

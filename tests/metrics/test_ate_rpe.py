@@ -1,4 +1,4 @@
-"""ATE and RPE: against evo on the same data, and against what must be so."""
+"""ATE and RPE, compared with evo on the same data and with known values."""
 
 import copy
 
@@ -71,7 +71,7 @@ def test_rpe_agrees_with_evo(frames):
             assert getattr(have, name) == pytest.approx(want[name], abs=1e-9)
 
 
-def test_alignment_is_found_and_reported():
+def test_alignment_is_estimated_and_reported():
     truth = walk(100, 5)
     T_truth_est = exp(np.array([0.1, 0.2, -2.0, 1.0, 2.0, 3.0]))
     estimate = truth[0], inverse(T_truth_est) @ truth[1]
@@ -82,7 +82,7 @@ def test_alignment_is_found_and_reported():
     assert ate(estimate, truth, "none").rmse > 1.0
 
 
-def test_truth_is_interpolated_on_an_arc_and_only_across_short_gaps():
+def test_truth_is_interpolated_on_an_arc_across_short_gaps_only():
     stamps = T0 + np.array([0, 80, 160, 1000, 1080], np.int64) * 1_000_000
     angle = (stamps - T0) / 1e9  # 1 rad/s, 1 m/s: exactly what slerp and the straight line give back
     truth = stamps, from_rt(so3_exp(np.outer(angle, [0, 0, 1.0])), np.outer(angle, [1.0, 0, 0]))
@@ -111,7 +111,7 @@ def test_joint_alignment_shows_an_agent_in_the_wrong_place():
     assert joint_ate(wrong).agents["b"].rmse > 5 * both.agents["b"].rmse
 
 
-def test_too_little_is_said():
+def test_too_few_poses_are_refused():
     truth = walk(10, 1)
     elsewhere = truth[0] + 10**12, truth[1]
     with pytest.raises(DataError, match="same clock"):

@@ -21,7 +21,7 @@ def test_percentiles():
     assert (s.n, s.p50, s.p95, s.p99, s.max) == (101, 50.0, 95.0, 99.0, 100.0)
 
 
-def test_nothing_is_null_in_json_and_nan_is_refused():
+def test_missing_values_are_null_and_nan_is_refused():
     assert json.loads(json.dumps(summary([]).report(), allow_nan=False)) == {
         "n": 0, "mean": None, "p50": None, "p95": None, "p99": None, "max": None
     }  # fmt: skip
@@ -29,7 +29,7 @@ def test_nothing_is_null_in_json_and_nan_is_refused():
         latency([1.0, math.nan], [])
 
 
-def test_a_frame_waits_for_what_the_one_before_left_to_do():
+def test_frame_waits_for_earlier_work():
     queue = ReplayQueue()
     assert queue.wait_ms(5) == 0
     queue.finish_frame(5, 40.0)
@@ -37,7 +37,7 @@ def test_a_frame_waits_for_what_the_one_before_left_to_do():
     assert queue.wait_ms(5 + 50_000_000) == 0
 
 
-def test_who_is_too_slow_falls_behind_ever_more():
+def test_delay_grows_if_work_exceeds_the_frame_period():
     queue = ReplayQueue()
     for k in range(60):
         stamp = k * 33_000_000

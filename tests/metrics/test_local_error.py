@@ -1,4 +1,4 @@
-"""How wrong odometry is of late."""
+"""The local error of odometry."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ def told(poses: np.ndarray, **also: bool) -> list[float | None]:
     return [error.update(int(stamp), T, **also) for stamp, T in zip(STAMPS, poses, strict=True)]
 
 
-def test_odometry_that_lies_elsewhere_is_not_wrong() -> None:
+def test_constant_transform_is_no_error() -> None:
     moved = se3.exp(np.array([0.0, 0.0, 1.0, 3.0, -2.0, 0.5])) @ walk()
     out = told(moved)
     assert out[:50] == [None] * 50  # half the window
     assert max(error for error in out[50:] if error is not None) < 1e-9
 
 
-def test_noise_is_told_as_large_as_it_is() -> None:
+def test_error_equals_the_noise() -> None:
     poses = walk()
     poses[:, :3, 3] += np.random.default_rng(0).normal(0, 0.01, (len(poses), 3))
     late = [error for error in told(poses)[150:] if error is not None]
     assert np.mean(late) == pytest.approx(np.sqrt(3), rel=0.05)
 
 
-def test_a_jump_is_seen_while_it_is_new_and_then_forgotten() -> None:
+def test_jump_counts_while_it_is_in_the_window() -> None:
     poses = walk()
     poses[200:, 0, 3] += 0.05
     out = np.array(told(poses)[60:], float)
@@ -46,7 +46,7 @@ def test_a_jump_is_seen_while_it_is_new_and_then_forgotten() -> None:
     assert (out[242:] < 1e-6).all()
 
 
-def test_where_there_is_no_truth_or_no_pose_there_is_no_error() -> None:
+def test_no_error_without_truth_or_pose() -> None:
     error = LocalError((STAMPS, walk()))
     poses = walk()
     for stamp, T in zip(STAMPS[:150], poses[:150], strict=True):

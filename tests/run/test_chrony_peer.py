@@ -23,7 +23,7 @@ from helpers.time_servers import (
 )
 
 from share.devices import time_client
-from share.devices.chrony import follow_lines, read_tracking
+from share.devices.clocks import follow_lines, read_tracking
 from share.devices.time_client import query_servers
 from share.devices.time_server import TimeServer, TimeServerRun
 from share.net.udp import HostPort, StampedSocket
@@ -31,7 +31,7 @@ from share.net.udp import HostPort, StampedSocket
 pytestmark = needs_chrony
 QUICK = "iburst minpoll -2 maxpoll -2"  # four questions in a second
 MS = 1_000_000
-CLOSE_MS = 2.0  # on a machine busy with tests; usual values: tools/experiments/measure_sync.py
+CLOSE_MS = 2.0  # on a machine busy with tests; usual values: docs/do/sync.md
 
 
 @pytest.fixture(autouse=True)

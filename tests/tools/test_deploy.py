@@ -1,4 +1,4 @@
-"""`tools/deploy` against a device in a folder: copied, switched, taken back; one line for what is wrong."""
+"""`tools/deploy` to a device in a folder: copy, switch, roll back; one line for each error."""
 
 from __future__ import annotations
 
@@ -24,10 +24,12 @@ from share.devices.camera_check import UDEV_RULES
 from share.errors import ShareError, UsageError
 from share.sensors.profile import load_host_profile, shipped_profiles
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def doctor(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the real one says on this machine: it takes three seconds, and any device will do."""
+    """The output of the real program on this machine, which takes three seconds."""
     command = [sys.executable, "-m", "share", "doctor", "--json"]
     said = subprocess.run(command, capture_output=True, text=True, cwd=TOOLS.parent, timeout=60).stdout
     path = tmp_path_factory.mktemp("doctor") / "said.json"
@@ -40,7 +42,7 @@ def device(tmp_path: Path, doctor: Path) -> FakeDevice:
     return make_device(tmp_path, os.environ["PATH"], doctor)
 
 
-def test_a_first_agent_is_copied_set_up_and_started(device):
+def test_first_agent_is_copied_set_up_and_started(device):
     done = device.agent(device.program("1.0"))
     assert (done.code, done.err) == (0, "")
     assert "share-public-key ann " in done.out  # to be authorized at the edge
@@ -62,7 +64,7 @@ def test_a_first_agent_is_copied_set_up_and_started(device):
     assert max(waited) < asked.index("systemctl restart share-agent@ann")
 
 
-def test_the_program_alone_is_there_and_no_service(device):
+def test_program_is_installed_without_a_service(device):
     program = device.program("1.0")
     done = device.deploy("program", dist=program)
     assert (done.code, done.err) == (0, "")
@@ -77,7 +79,7 @@ def test_the_program_alone_is_there_and_no_service(device):
     assert device.agent(program).code == 0
 
 
-def test_a_newer_program_alone_takes_the_services_with_it_or_comes_not(device):
+def test_newer_program_restarts_the_services_or_is_rolled_back(device):
     device.agent(device.program("1.0"))
     device.asked()
     assert device.deploy("program", dist=device.program("1.1")).code == 0
@@ -90,14 +92,14 @@ def test_a_newer_program_alone_takes_the_services_with_it_or_comes_not(device):
     assert device.current == "1.0"
 
 
-def test_the_rule_that_is_installed_is_one_that_the_doctor_finds(device):
+def test_doctor_finds_the_installed_udev_rule(device):
     from share.devices.host import camera_rules
 
     assert device.agent(device.program("1.0")).code == 0
     assert camera_rules(device.root) == ["/etc/udev/rules.d/99-share-realsense.rules"]
 
 
-def test_the_same_again_changes_nothing(device):
+def test_second_deployment_changes_nothing(device):
     program = device.program("1.0")
     first = device.agent(program)
     device.asked()
@@ -107,7 +109,7 @@ def test_the_same_again_changes_nothing(device):
     assert not [line for line in device.asked() if "restart" in line]
 
 
-def test_an_upgrade_keeps_settings_keys_and_the_release_before(device):
+def test_upgrade_keeps_settings_keys_and_the_previous_release(device):
     device.agent(device.program("1.0"))
     settings = device.root / "etc/share/agent-ann.env"
     settings.write_text(settings.read_text().replace("realsense", "realsense:123") + "# by hand\n")
@@ -122,7 +124,7 @@ def test_an_upgrade_keeps_settings_keys_and_the_release_before(device):
     assert device.releases() == {"1.0", "1.1"}
 
 
-def test_another_edge_is_taken_and_the_service_started_anew(device):
+def test_another_edge_address_restarts_the_service(device):
     program = device.program("1.0")
     device.agent(program)
     device.asked()
@@ -132,7 +134,7 @@ def test_another_edge_is_taken_and_the_service_started_anew(device):
 
 
 @pytest.mark.parametrize("mark", ["broken", "flapping"])
-def test_a_release_that_does_not_stay_up_is_taken_back_with_its_settings(device, mark):
+def test_release_that_stops_is_rolled_back_with_its_settings(device, mark):
     device.agent(device.program("1.0"))
     kept = (device.root / "etc/share/agent-ann.env").read_text()
     bad = device.program("1.1", mark)
@@ -145,7 +147,7 @@ def test_a_release_that_does_not_stay_up_is_taken_back_with_its_settings(device,
     assert (device.root / "etc/share/agent-ann.env").read_text() == kept
 
 
-def test_a_release_whose_libraries_do_not_load_is_taken_back(device):
+def test_release_with_broken_libraries_is_rolled_back(device):
     device.agent(device.program("1.0"))
     bad = device.program("1.1")
     bad.joinpath("share").write_text('#!/bin/sh\n[ "$1" != --version ] || echo "share, version 1.1"\n')
@@ -155,7 +157,7 @@ def test_a_release_whose_libraries_do_not_load_is_taken_back(device):
     assert device.current == "1.0"
 
 
-def test_a_first_release_that_does_not_run_is_stopped(device):
+def test_first_release_that_fails_is_stopped(device):
     done = device.agent(device.program("1.0", "broken"))
     assert done.code == 1
     assert "no other release to go back to" in done.err
@@ -163,8 +165,8 @@ def test_a_first_release_that_does_not_run_is_stopped(device):
 
 
 @pytest.mark.parametrize("leaves", [0, signal.SIGHUP, signal.SIGINT])
-def test_a_release_that_does_not_run_is_taken_back_though_nobody_looks_on(device, leaves):
-    """The line to the device breaks while its services are watched; or who typed it there goes away."""
+def test_rollback_needs_no_connection(device, leaves):
+    """The connection to the device breaks, or the shell there ends, while the services are watched."""
     device.agent(device.program("1.0"))
     device.agent(device.program("1.1", "broken"))
     (bad,) = [path.name for path in (device.root / "opt/share/releases").glob("1.1-*")]
@@ -175,7 +177,7 @@ def test_a_release_that_does_not_run_is_taken_back_though_nobody_looks_on(device
 
 
 @pytest.mark.slow
-def test_a_service_that_fails_where_only_the_program_was_is_said_to_be_gone(device):
+def test_failed_first_service_is_reported_as_removed(device):
     program = device.program("1.0", "broken")
     assert device.deploy("program", dist=program).code == 0
     done = device.agent(program)
@@ -185,7 +187,7 @@ def test_a_service_that_fails_where_only_the_program_was_is_said_to_be_gone(devi
 
 
 @pytest.mark.slow
-def test_a_second_service_that_fails_leaves_the_first_one_running(device):
+def test_failed_second_service_leaves_the_first_running(device):
     program = device.program("1.0")
     assert device.deploy("edge", dist=program).code == 0
     device.asked()
@@ -198,7 +200,7 @@ def test_a_second_service_that_fails_leaves_the_first_one_running(device):
 
 
 @pytest.mark.slow
-def test_back_by_hand_and_forth_again(device):
+def test_manual_rollback_and_return(device):
     device.agent(device.program("1.0"))
     device.agent(device.program("1.1"))
     for version in ("1.0", "1.1"):
@@ -211,7 +213,7 @@ def test_back_by_hand_and_forth_again(device):
 @pytest.mark.parametrize(
     ("kind", "profile"), [("ar", "d435i-n100-headset"), ("robot", "d435i-turtlebot4"), (None, "laptop-edge")]
 )
-def test_the_doctor_looks_for_what_that_kind_of_computer_needs(device, kind, profile):
+def test_doctor_uses_the_profile_of_the_device(device, kind, profile):
     program = device.program("1.0")
     if kind is None:
         device.deploy("edge", dist=program)
@@ -226,7 +228,7 @@ def test_the_doctor_looks_for_what_that_kind_of_computer_needs(device, kind, pro
     assert f"systemd-tmpfiles --create {device.root}/etc/tmpfiles.d/share.conf" in device.asked()
 
 
-def test_what_sets_the_governor_back_at_a_start_is_said_unless_it_is_masked(device):
+def test_governor_reset_at_boot_gives_a_warning(device):
     unit = "systemd/system/power-profiles-daemon.service"
     for path in (f"usr/lib/{unit}", "sys/devices/system/cpu/cpufreq/policy0/energy_performance_preference"):
         (device.root / path).parent.mkdir(parents=True)
@@ -239,20 +241,20 @@ def test_what_sets_the_governor_back_at_a_start_is_said_unless_it_is_masked(devi
     assert second.code == 0 and command not in second.out
 
 
-def test_back_without_a_release_before_is_one_line(device):
+def test_rollback_without_a_previous_release_is_one_line(device):
     device.agent(device.program("1.0"))
     done = device.deploy("agent", "--name", "ann", "--rollback")
     assert (done.code, done.err) == (1, "deploy: there is no previous release to go back to\n")
 
 
 @pytest.mark.slow
-def test_only_the_newest_releases_stay(device):
+def test_only_the_newest_releases_are_kept(device):
     for version in ("1.0", "1.1", "1.2", "1.3"):
         assert device.agent(device.program(version), "--keep", 2).code == 0
     assert device.releases() == {"1.2", "1.3"}
 
 
-def test_a_dry_run_says_all_and_changes_nothing(device):
+def test_dry_run_prints_all_steps_and_changes_nothing(device):
     done = device.agent(device.program("1.0"), "--dry-run")
     assert done.code == 0
     for text in ("/opt/share/releases/1.0-", "EDGE=tcp://127.0.0.1:5555", "none -> 1.0-", "share-agent@ann"):
@@ -261,7 +263,7 @@ def test_a_dry_run_says_all_and_changes_nothing(device):
     assert device.asked() == []
 
 
-def test_the_edge_and_the_time_server(device):
+def test_edge_and_time_server_are_deployed(device):
     program = device.program("1.0")
     assert device.deploy("edge", "--http", "8080", dist=program).code == 0
     assert device.deploy("sync", dist=program).code == 0
@@ -271,7 +273,7 @@ def test_the_edge_and_the_time_server(device):
     assert not (device.root / "etc/share/sync.env").exists()
 
 
-def test_the_key_of_the_edge_is_put_where_the_service_looks(device):
+def test_key_of_the_edge_is_stored_for_the_service(device):
     from share.net.keys import public_key
 
     key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"  # RFC 32's test vector is this long
@@ -282,7 +284,7 @@ def test_the_key_of_the_edge_is_put_where_the_service_looks(device):
     assert line in (device.root / "etc/share/agent-ann.env").read_text()
 
 
-def test_what_is_wrong_is_said_in_one_line(device, tmp_path):
+def test_wrong_use_is_one_line(device, tmp_path):
     program = device.program("1.0")
     cases = {
         "no frozen program there; make one with `make freeze`": device.agent(tmp_path / "nothing"),
@@ -301,7 +303,7 @@ def test_what_is_wrong_is_said_in_one_line(device, tmp_path):
     assert list(device.root.iterdir()) == []
 
 
-def test_a_copy_that_breaks_off_leaves_no_release(device):
+def test_interrupted_copy_leaves_no_release(device):
     program = device.program("1.0")
     (program / "model").write_bytes(os.urandom(5_000_000))  # more than pipes hold
     (device.ssh.parent / "tar").write_text("#!/bin/sh\nhead -c 10 >/dev/null\nexit 2\n")
@@ -314,7 +316,7 @@ def test_a_copy_that_breaks_off_leaves_no_release(device):
     assert list((device.root / "opt/share/releases").iterdir()) == []
 
 
-def test_a_line_that_breaks_while_the_program_is_copied_is_said(device):
+def test_lost_connection_during_the_copy_is_reported(device):
     program = device.program("1.0")
     (program / "model").write_bytes(os.urandom(5_000_000))
     breaks = "*'device.sh receive '*) echo 'client_loop: send disconnect: Broken pipe' >&2; exit 255"
@@ -325,7 +327,7 @@ def test_a_line_that_breaks_while_the_program_is_copied_is_said(device):
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
-def test_systemd_understands_the_units(tmp_path):
+def test_systemd_accepts_the_units(tmp_path):
     units = tmp_path / "etc/systemd/system"
     units.mkdir(parents=True)
     program = tmp_path / "opt/share/current/share"
@@ -343,7 +345,7 @@ def test_systemd_understands_the_units(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("systemd-tmpfiles") is None, reason="needs systemd-tmpfiles")
-def test_systemd_sets_what_a_profile_wants(device):
+def test_systemd_applies_the_profile(device):
     device.agent(device.program("1.0"))
     cores = [device.root / f"sys/devices/system/cpu/cpufreq/policy{k}/scaling_governor" for k in (0, 1)]
     usb = device.root / "sys/module/usbcore/parameters/usbfs_memory_mb"
@@ -356,7 +358,7 @@ def test_systemd_sets_what_a_profile_wants(device):
     assert usb.read_text().startswith("128")
 
 
-def test_an_agent_may_write_what_starts_the_camera_s_imu():
+def test_agent_may_start_the_imu_of_the_camera():
     """ProtectKernelTunables= makes all of /sys read-only, whoever may write there."""
     lines = (TOOLS / "device" / "share-agent@.service").read_text().splitlines()
     assert "ProtectKernelTunables=yes" not in lines
@@ -364,12 +366,12 @@ def test_an_agent_may_write_what_starts_the_camera_s_imu():
 
 
 @pytest.mark.parametrize("unit", ["share-edge.service", "share-agent@.service"])
-def test_libzmq_may_ask_for_the_interfaces_of_the_machine(unit):
+def test_libzmq_may_list_network_interfaces(unit):
     """By netlink, and it aborts the program where it may not: tests/booted saw it."""
     assert re.search("^RestrictAddressFamilies=.*AF_NETLINK", (TOOLS / "device" / unit).read_text(), re.M)
 
 
-def test_over_a_real_ssh(device, tmp_path):
+def test_deployment_over_real_ssh(device, tmp_path):
     program = device.program("1.0")
     agent = ("agent", "--name", "ann", "--edge", "tcp://127.0.0.1:5555")
     with ssh_server(tmp_path / "ssh", device.path) as ssh:
@@ -395,7 +397,7 @@ def test_over_a_real_ssh(device, tmp_path):
         ({"systemd": False}, "has no systemd"),
     ],
 )
-def test_a_device_that_cannot_run_it_is_told_before_anything_is_copied(monkeypatch, told, says):
+def test_unsuitable_device_is_refused_before_the_copy(monkeypatch, told, says):
     monkeypatch.syspath_prepend(TOOLS)
     tool = importlib.import_module("deploy_device")
     release = importlib.import_module("deploy_release").Release(Path(), "1.0-abc", 300_000_000, "x86_64", 36)
@@ -405,7 +407,7 @@ def test_a_device_that_cannot_run_it_is_told_before_anything_is_copied(monkeypat
         tool.check("headset1", release, replace(fine, **told))
 
 
-def test_what_a_program_needs_is_read_from_its_machine_code(monkeypatch, tmp_path, device):
+def test_requirements_are_read_from_the_binary(monkeypatch, tmp_path, device):
     """Python itself, against objdump."""
     monkeypatch.syspath_prepend(TOOLS)
     read_release = importlib.import_module("deploy_release").read_release
@@ -422,7 +424,7 @@ def test_what_a_program_needs_is_read_from_its_machine_code(monkeypatch, tmp_pat
     assert found.name != read_release(folder).name
 
 
-def test_a_program_for_another_processor_comes_as_far_as_the_device(device):
+def test_program_for_another_processor_is_refused_by_the_device(device):
     """A Raspberry Pi's, on a laptop: it cannot be asked for its version here, nor need it be."""
     program = device.program("1.0")
     elf = b"\x7fELF".ljust(18, b"\0") + bytes([183 if platform.machine() != "aarch64" else 62, 0])
@@ -437,7 +439,7 @@ def test_a_program_for_another_processor_comes_as_far_as_the_device(device):
     assert "'../1.0' is not a version" in device.agent(program).err
 
 
-def test_nobody_who_becomes_root_is_one_line(monkeypatch, tmp_path):
+def test_missing_sudo_is_one_line(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(TOOLS)
     tool = importlib.import_module("deploy_device")
     ssh = tmp_path / "ssh"
@@ -449,7 +451,7 @@ def test_nobody_who_becomes_root_is_one_line(monkeypatch, tmp_path):
         tool.Device("pi@headset1", str(ssh)).probe("agent-ann")
 
 
-def test_the_units_ask_the_program_for_what_it_understands():
+def test_units_use_existing_options():
     for path in (TOOLS / "device").glob("*.service"):
         text = path.read_text().replace("\\\n", " ")
         (started,) = re.findall(r"^ExecStart=/opt/share/current/share (\w+(?: server)?)(.*)$", text, re.M)

@@ -1,4 +1,4 @@
-"""Sets of keyframes are what a recording of the same recipe would lead to, and come back from the cache."""
+"""Keyframe sets agree with a recording of the same recipe, and are cached."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from share.sensors.sequencer import SequencerCounters
 from share.types import AgentKind
 from share.vision.orb import make_view
 
+pytestmark = pytest.mark.long
+
 TOOLS = Path(__file__).resolve().parents[2] / "tools" / "experiments"
 NAMES = {"ann": AgentKind.AR, "rob": AgentKind.ROBOT}
 
@@ -38,7 +40,7 @@ def recipe(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def every(tool):
-    return tool("keyframe_types").Spacing(0.1, 0.15, 0.25)
+    return tool("keyframe_set").Spacing(0.1, 0.15, 0.25)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +54,7 @@ def made(tool, recipe, every, cache):
 
 
 @pytest.mark.slow
-def test_views_and_truth_are_the_recordings(made, recipe, tmp_path):
+def test_views_and_truth_equal_those_of_the_recording(made, recipe, tmp_path):
     session = make_session(recipe, tmp_path / "session", workers=1)
     for name, kind in NAMES.items():
         source, agent = open_source(str(session / name)), made.agents[name]
@@ -71,7 +73,7 @@ def test_views_and_truth_are_the_recordings(made, recipe, tmp_path):
         assert np.median(known) > 20
 
 
-def test_keyframes_come_when_it_has_moved(made, every):
+def test_keyframes_follow_the_spacing(made, every):
     for agent in made.agents.values():
         stamps = np.array([k.stamp_ns for k in agent.keyframes])
         T = se3.inverse(agent.T_world_body[:-1]) @ agent.T_world_body[1:]
@@ -79,7 +81,7 @@ def test_keyframes_come_when_it_has_moved(made, every):
         assert far.all() and (np.diff(stamps) >= every.seconds * 1e9).all()
 
 
-def test_keyframes_chain_up_to_odometry(made):
+def test_keyframe_steps_add_up_to_odometry(made):
     for agent in made.agents.values():
         T = np.eye(4)
         for k, keyframe in enumerate(agent.keyframes):
@@ -90,7 +92,7 @@ def test_keyframes_chain_up_to_odometry(made):
             assert np.allclose(keyframe.up, T[2, :3], atol=1e-9) and tilt < 0.6
 
 
-def test_what_is_in_the_cache_is_not_made_again(tool, made, recipe, every, cache, monkeypatch):
+def test_cached_set_is_not_made_again(tool, made, recipe, every, cache, monkeypatch):
     def never(*_):
         raise AssertionError("made again")
 
@@ -107,16 +109,16 @@ def test_what_is_in_the_cache_is_not_made_again(tool, made, recipe, every, cache
         tool("keyframe_set").keyframe_set(recipe, type(every)(0.3, 0.3), cache)
 
 
-def test_a_damaged_file_is_named(tool, made, recipe, every, cache, tmp_path):
+def test_damaged_file_is_named(tool, made, recipe, every, cache, tmp_path):
     data = tool("keyframe_set").place(recipe, every, cache).read_bytes()
     for bad in (data[:-100], data.replace(b"ann", b"a/n"), b""):
         path = tmp_path / "bad.msgpack"
         path.write_bytes(bad)
         with pytest.raises(DataError, match=r"bad\.msgpack: is damaged"):
-            tool("keyframe_file").load(path, recipe, every)
+            tool("keyframe_set").load(path, recipe, every)
 
 
-def test_odometry_errs_as_its_covariance_says(tool, rng):
+def test_odometry_errors_agree_with_the_covariance(tool, rng):
     drift, count = tool("keyframe_odometry").Drift(), 4000
     steps = se3.exp(rng.normal(0, [0.02, 0.02, 0.15, 0.2, 0.05, 0.02], (count, 6)))
     truth = [np.eye(4)]
@@ -137,7 +139,7 @@ def test_odometry_errs_as_its_covariance_says(tool, rng):
     assert np.median(drifted) == pytest.approx(1.54 * drift.step_m, rel=0.15)  # of three axes
 
 
-def test_seeds_are_made_once_and_those_without_room_are_said(tool, recipe, tmp_path, capsys, monkeypatch):
+def test_seeds_are_made_once_and_failures_reported(tool, recipe, tmp_path, capsys, monkeypatch):
     command, makes = tool("make_keyframe_sets"), []
 
     def full(recipe, *rest):
@@ -159,11 +161,11 @@ def test_seeds_are_made_once_and_those_without_room_are_said(tool, recipe, tmp_p
     assert command.main([*words, "--seeds", "2:3"]) == 2
 
 
-def test_bad_words_are_refused(tool, capsys):
+def test_invalid_arguments_are_refused(tool, capsys):
     main = tool("make_keyframe_sets").main
     assert main(["--scene", "corridor-twinz", "--motion", "walk:"]) == 2
     assert "did you mean 'corridor-twins'" in capsys.readouterr().err
     with pytest.raises(UsageError, match="must be positive"):
-        tool("keyframe_types").Spacing(0.0)
+        tool("keyframe_set").Spacing(0.0)
     with pytest.raises(SystemExit):
         main(["--scene", "plain", "--motion", "walk:", "--seeds", "5:5"])

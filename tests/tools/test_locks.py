@@ -1,4 +1,4 @@
-"""The lock files have all that the frozen program needs, by hash; and somebody has read every licence."""
+"""The lock files have all that the frozen program needs, by hash; every licence was checked."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def required(lock: Path) -> list[Requirement]:
     return [one for one in all_of if one.marker is None or one.marker.evaluate(where)]
 
 
-def test_there_are_locks_of_both_processors() -> None:
+def test_both_processors_have_locks() -> None:
     assert {lock.stem.partition("-")[0] for lock in LOCKS} == {"x86_64", "aarch64"}
 
 
 @each_lock
-def test_a_lock_has_what_setup_cfg_asks_for(lock: Path) -> None:
+def test_locks_hold_the_requirements_of_setup_cfg(lock: Path) -> None:
     have = pinned(lock)
     for one in required(lock):
         assert one.specifier.contains(have[canonicalize_name(one.name)]), f"{one}: run make lock"
@@ -58,13 +58,13 @@ def test_every_package_has_hashes_and_no_address(lock: Path) -> None:
 
 
 @each_lock
-def test_every_licence_is_listed(lock: Path) -> None:
+def test_all_licences_are_listed(lock: Path) -> None:
     page = (ROOT / "docs" / "lookup" / "licenses.md").read_text()
     listed = set(re.findall(r"^\| ([\w.-]+) \| [\d.]", page, flags=re.MULTILINE))
     assert not set(pinned(lock)) - listed, "run make licenses"
 
 
-def test_the_page_has_the_versions_of_the_lock_that_it_is_made_of() -> None:
+def test_licence_page_has_the_versions_of_its_lock() -> None:
     page = (ROOT / "docs" / "lookup" / "licenses.md").read_text()
     rows = dict(re.findall(r"^\| ([\w.-]+) \| ([\w.]+) \|", page, flags=re.MULTILINE))
     have = pinned(ROOT / "tools" / "locks" / "x86_64-py3.11.txt")
@@ -72,19 +72,19 @@ def test_the_page_has_the_versions_of_the_lock_that_it_is_made_of() -> None:
 
 
 @pytest.mark.parametrize("expression", ["", "GPL-3.0-only", "MIT AND AGPL-3.0-only"])
-def test_a_licence_that_nobody_has_read_is_refused(expression: str) -> None:
+def test_unknown_licence_is_refused(expression: str) -> None:
     with pytest.raises(ValueError, match=r"newcomer: .*read its licence"):
         LICENSES["table"]([("newcomer", "1.0", expression)])
 
 
-def test_a_licence_that_is_accepted_is_listed() -> None:
+def test_accepted_licence_is_listed() -> None:
     assert "| newcomer | 1.0 | MIT OR Apache-2.0 |  |" in LICENSES["table"](
         [("newcomer", "1.0", "MIT OR Apache-2.0")]
     )
 
 
 @pytest.mark.slow
-def test_the_bill_of_materials_is_valid(tmp_path: Path) -> None:
+def test_bill_of_materials_is_valid(tmp_path: Path) -> None:
     pytest.importorskip("cyclonedx", reason="cyclonedx-bom is not installed: pip install -e '.[release]'")
     subprocess.run([sys.executable, str(SBOM), sys.executable, str(tmp_path / "bom.json")], check=True)
     bom = json.loads((tmp_path / "bom.json").read_text())

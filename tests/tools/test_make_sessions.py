@@ -1,4 +1,4 @@
-"""The sessions of the evaluation and of the error model: what is in them."""
+"""The sessions of the evaluation and of the error model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def tools(monkeypatch):
     return importlib.import_module
 
 
-def test_sessions_have_names_and_motions_that_are_understood(tools, tmp_path):
+def test_session_names_and_motions_are_valid(tools, tmp_path):
     found = tools("make_sessions").recipes(tmp_path)
     assert len(found) == 13
     assert len({(recipe.scene, recipe.motions, recipe.seed) for recipe in found.values()}) == 13
@@ -33,7 +33,7 @@ def test_sessions_have_names_and_motions_that_are_understood(tools, tmp_path):
             assert path is None or Path(path).parent.parent == tmp_path
 
 
-def test_what_is_in_them_is_listed_and_other_names_are_refused():
+def test_sessions_are_listed_and_unknown_names_refused():
     def told(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(TOOLS / "make_sessions.py"), *arguments]
         return subprocess.run(command, capture_output=True, text=True, timeout=60)
@@ -46,7 +46,7 @@ def test_what_is_in_them_is_listed_and_other_names_are_refused():
     assert "--only paper-9: known are warehouse-1, " in done.stderr
 
 
-def test_rooms_of_the_error_model_are_unlike_each_other_and_always_the_same(tools):
+def test_rooms_of_the_error_model_differ_and_are_repeatable(tools):
     recipe = tools("make_error_rooms").recipe
     rooms = [recipe(number, 30.0, "stereo") for number in range(30)]
     assert len({room.digest for room in rooms}) == 30

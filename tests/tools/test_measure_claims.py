@@ -1,4 +1,4 @@
-"""tools/experiments/measure_claims.py: what it makes of a lie, and what lies cost in a room of points."""
+"""tools/experiments/measure_claims.py: false claims, and their cost to others in a room of points."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def alone(tool, seed: int):
 
 @cache
 def honest(tool, seed: int, sure: float):
-    """With a third that is right, but for its sureness."""
+    """With a third agent of which only the covariance is wrong."""
     return played(tool, seed, tool.Lie(sure=sure))
 
 
@@ -82,7 +82,7 @@ def geometric_mean(ratios: list[float]) -> float:
     return float(np.exp(np.mean(np.log(ratios))))
 
 
-def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
+def test_false_claims_change_motion_depths_covariance_or_camera(tool):
     agent = room(1).agents["eve"]
     ((hello, honest),) = tool.claimed_runs(agent, tool.Lie())
     assert (hello.name, hello.run_id) == (agent.hello.name, agent.hello.run_id)
@@ -98,7 +98,7 @@ def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
             assert a.T_odom_body == pytest.approx(agent.T_odom_body[k], abs=1e-9)
 
 
-def test_who_lies_later_or_is_started_again(tool):
+def test_false_claims_can_start_later_or_after_a_restart(tool):
     agent = room(1).agents["eve"]
     ((_, later),) = tool.claimed_runs(agent, tool.Lie(depth=1.1, after_s=6.0))
     ratios = [
@@ -113,7 +113,7 @@ def test_who_lies_later_or_is_started_again(tool):
         assert after[0].arrival_ns - before[-1].arrival_ns > 3e9
 
 
-def test_a_lie_that_there_is_not_is_said(tool, capsys):
+def test_unknown_false_claim_is_refused(tool, capsys):
     words = ["--scene", "empty-hall", "--motion", "walk:", "--lies", "scale 7"]
     assert tool.main(words) == 2
     assert "'scale 7' is not known; known: scale 1.005 sure 10" in capsys.readouterr().err
@@ -121,7 +121,7 @@ def test_a_lie_that_there_is_not_is_said(tool, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1, 11))
-def test_honest_agents_are_never_kept_apart(tool, seed):
+def test_consistent_agents_are_never_quarantined(tool, seed):
     outcome = played(tool, seed, tool.Lie())
     print(f"room {seed}: {outcome}")
     assert not outcome.wronged
@@ -132,9 +132,9 @@ def test_honest_agents_are_never_kept_apart(tool, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("lie", "is_said"), LIES.items())
-def test_a_lie_costs_the_others_little(tool, lie, is_said):
-    """Against the same rooms without it: who is set apart helps nobody either. Who is let in has to help as
-    much as one that is as much too sure, and else right."""
+def test_false_claims_cost_other_agents_little(tool, lie, is_said):
+    """Compared with the same rooms without the agent, which helps no other when set apart. An agent that is
+    let in has to help as much as one with the same wrong covariance and no other fault."""
     told = [played(tool, seed, tool.LIES[lie]) for seed in SEEDS]
     without = [alone(tool, seed) for seed in SEEDS]
     for error in ("final", "causal"):
@@ -150,15 +150,16 @@ def test_a_lie_costs_the_others_little(tool, lie, is_said):
 
 
 @pytest.mark.slow
-def test_noise_of_who_is_too_sure_parts_nobody(tool):
+def test_overconfident_noise_separates_no_agents(tool):
     """In this room it looked like a camera that is turned by 1.6 degrees."""
     outcome = played(tool, 30, tool.LIES["sure 10"])
     assert not outcome.said
     assert outcome.together is not None
 
 
-def test_a_lie_is_found_out_before_it_moves_anybody(tool):
-    """The others come together as they do without it, at the fifth second; by then it is set apart."""
+@pytest.mark.long
+def test_false_claim_is_detected_before_it_moves_other_agents(tool):
+    """The others join at the fifth second, as without the agent, which is set apart by then."""
     short, config = room(1, 21), tool.configured(['edge.policy="covins-g"'])
     outcome = tool.played(short, tool.LIES["scale 0.97 sure 100"], config)
     assert outcome.liar == "set apart"

@@ -19,12 +19,12 @@ def tool():
         yield importlib.import_module("measure_joins")
 
 
-def test_a_row_says_who_was_joined_when_and_what_was_wrong(tool):
+def test_row_holds_join_times_and_wrong_joins(tool):
     runs = [
-        tool.Run(0, {"a b": tool.Pair(5.0, 9.0, None, 0.0, "right")}, 1.0, 2),
-        tool.Run(1, {"a b": tool.Pair(5.0, 20.0, 4.0, 16.0, "right")}, 3.0, 2),
-        tool.Run(3, {"a b": tool.Pair(None, None, 6.0, 10.0, "wrong")}, 99.0, 2),
-        tool.Run(4, {"a b": tool.Pair()}),
+        tool.JoinRun(0, {"a b": tool.AgentPair(5.0, 9.0, None, 0.0, "right")}, 1.0, 2),
+        tool.JoinRun(1, {"a b": tool.AgentPair(5.0, 20.0, 4.0, 16.0, "right")}, 3.0, 2),
+        tool.JoinRun(3, {"a b": tool.AgentPair(None, None, 6.0, 10.0, "wrong")}, 99.0, 2),
+        tool.JoinRun(4, {"a b": tool.AgentPair()}),
     ]
     head, _, row = (line.strip("| ").split(" | ") for line in tool.table("room", runs).splitlines())
     assert dict(zip(head, row, strict=True)) == {
@@ -39,13 +39,13 @@ def test_a_row_says_who_was_joined_when_and_what_was_wrong(tool):
     }
 
 
-def test_settings_are_taken_and_unknown_ones_refused(tool):
+def test_settings_are_applied_and_unknown_ones_refused(tool):
     assert tool.configured(["merge.join_places=7"]).merge.join_places == 7
     with pytest.raises(ConfigError, match="join_place"):
         tool.configured(["merge.join_place=7"])
 
 
-def test_without_sets_there_is_nothing_to_say(tool, tmp_path, capsys):
+def test_missing_keyframe_sets_are_reported(tool, tmp_path, capsys):
     words = ["--scene", "empty-hall", "--motion", "walk:", "--seeds", "7:9", "--cache", str(tmp_path)]
     assert tool.main([*words, "--json", str(tmp_path / "out.json")]) == 2
     assert "there are no sets; make them with make_keyframe_sets.py" in capsys.readouterr().err

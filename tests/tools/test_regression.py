@@ -1,4 +1,4 @@
-"""The regression gate: what it calls worse, and the gate itself (`make slow`)."""
+"""The regression gate: which figures count as worse, and the gate itself (`make slow`)."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def tool(monkeypatch):
         ("share: agents in one map", 2.0, 3.0, "better"),
     ],
 )
-def test_what_is_worse(tool, name, before, now, says):
+def test_worse_figures_are_found(tool, name, before, now, says):
     (verdict,) = tool.judged({name: now}, {name: before})
     assert verdict.says == says
     assert f"| {says} |" in tool.table([verdict])
 
 
-def test_a_run_is_kept_and_the_next_is_held_against_it(tool, monkeypatch, tmp_path, capsys):
+def test_next_run_is_compared_with_the_kept_one(tool, monkeypatch, tmp_path, capsys):
     file = tmp_path / "history.jsonl"
     options = Namespace(history=file, keep="the first", accept=[], cache=None, workers=1)
     monkeypatch.setattr(tool, "played", lambda config, options: {"share: joint ATE": 1.0})
@@ -74,26 +74,26 @@ def test_a_run_is_kept_and_the_next_is_held_against_it(tool, monkeypatch, tmp_pa
         tool.history(file)
 
 
-def test_many_small_steps_down_are_seen(tool):
+def test_many_small_losses_are_found(tool):
     lines = [{"figures": {"share: joint ATE": value}} for value in (1.0, 1.1, 1.3, 1.6, 1.7)]
     now = {"share: joint ATE": 2.1}
     assert tool.judged(now, lines[-1]["figures"])[0].says == ""
     assert tool.judged(now, tool.wanted(lines))[0].says == "worse"
 
 
-def test_one_agent_that_stays_outside_shows(tool):
+def test_agent_outside_the_map_is_found(tool):
     """In one of four runs by each policy."""
     runs = [comparable(policy, 2 if k == 0 else 3) for policy in tool.POLICIES for k in range(4)]
     assert tool.figures_of(runs)["covins-g: agents in one map"] == 2.75
 
 
-def test_history_is_of_figures_that_are_judged(tool):
+def test_history_holds_the_judged_figures(tool):
     for one in tool.history(tool.HISTORY):
         assert {name.partition(": ")[2] for name in one["figures"]} <= set(tool.NOISE)
 
 
 @pytest.mark.slow
-def test_nothing_has_become_worse():
+def test_no_figure_became_worse():
     """The gate. If it is better or worse for a reason, say so: `python tools/regression.py --keep WHY`."""
     told = [sys.executable, str(TOOLS / "regression.py")]
     done = subprocess.run(told, capture_output=True, text=True, timeout=1800)

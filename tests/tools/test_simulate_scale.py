@@ -13,7 +13,7 @@ TOOL = Path(__file__).parents[2] / "tools" / "experiments" / "simulate_scale.py"
 
 
 @pytest.mark.slow
-def test_rooms_that_are_apart_are_a_map_each(tmp_path: Path) -> None:
+def test_separate_rooms_are_separate_maps(tmp_path: Path) -> None:
     kept = tmp_path / "rows.json"
     only = ["--agents", "--rooms-of", "2x2", "--seeds", "401:402", "--workers", "1", "--json", str(kept)]
     done = subprocess.run([sys.executable, str(TOOL), *only], capture_output=True, text=True, timeout=300)
@@ -25,7 +25,7 @@ def test_rooms_that_are_apart_are_a_map_each(tmp_path: Path) -> None:
     assert len(done.stdout.splitlines()) == 4
 
 
-def test_a_size_that_is_none_is_said() -> None:
+def test_invalid_size_is_refused() -> None:
     done = subprocess.run([sys.executable, str(TOOL), "--rooms-of", "10"], capture_output=True, text=True)
     assert done.returncode == 2
     assert "'10': expected ROOMSxAGENTS" in done.stderr

@@ -1,4 +1,4 @@
-"""Small libraries in place of large ones in the frozen program: they load, and do what is said of them."""
+"""Small libraries in place of large ones in the frozen program."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def site_packages() -> Path:
     return Path(found.origin).parents[1]
 
 
-def test_what_cv2_wants_of_ffmpeg_has_a_version(stubs):
+def test_ffmpeg_symbols_of_cv2_have_versions(stubs):
     site = site_packages()
     users = list(site.glob("cv2/cv2*.so"))
     wanted = stubs.wanted(users, next(site.glob("opencv_python_headless.libs/libavcodec-*")))
@@ -51,7 +51,7 @@ def test_what_cv2_wants_of_ffmpeg_has_a_version(stubs):
     assert "avcodec_version" not in wanted or wanted["avcodec_version"] == wanted["avcodec_open2"]
 
 
-def test_scipy_has_all_of_lapack_that_cv2_asks_for(stubs):
+def test_scipy_provides_the_lapack_symbols_of_cv2(stubs):
     """Else its OpenBLAS cannot be led to SciPy's, and `make freeze` says so."""
     site = site_packages()
     (openblas,) = site.glob("opencv_python_headless.libs/libopenblasp*")
@@ -61,7 +61,7 @@ def test_scipy_has_all_of_lapack_that_cv2_asks_for(stubs):
     assert {"scipy_" + name for name in wanted} <= stubs.exported(theirs).keys()
 
 
-def test_a_hollow_library_has_its_versions_and_says_what_it_is_when_called(stubs, tmp_path):
+def test_stub_library_has_versions_and_reports_calls(stubs, tmp_path):
     library = tmp_path / "libavcodec-1234.so.62.1"
     wanted = {"avcodec_open2": "LIBAVCODEC_62", "av_packet_free": "LIBAVCODEC_62"}
     stubs.write_hollow(library, wanted)
@@ -74,7 +74,7 @@ def test_a_hollow_library_has_its_versions_and_says_what_it_is_when_called(stubs
     assert done.stderr == "share: libavcodec is left out of this frozen program\n"
 
 
-def test_one_that_answers_says_nothing_and_returns_null(stubs, tmp_path):
+def test_silent_stub_returns_null(stubs, tmp_path):
     library = tmp_path / "libaom-1.so.3"
     stubs.write_hollow(library, {"aom_codec_av1_dx": ""}, answers=True)
     call = ctypes.CDLL(str(library)).aom_codec_av1_dx
@@ -82,7 +82,7 @@ def test_one_that_answers_says_nothing_and_returns_null(stubs, tmp_path):
     assert call() is None
 
 
-def test_a_function_goes_on_in_another_library_with_all_its_arguments(stubs, tmp_path):
+def test_forwarded_function_gets_all_arguments(stubs, tmp_path):
     code = """
     double scipy_sum_(double *a, int *n) {double s = 0; for (int i = 0; i < *n; i++) s += a[i]; return s;}
     long scipy_many(long a, long b, long c, long d, long e, long f, long g, long h) {return 10 * g + h;}
@@ -98,7 +98,7 @@ def test_a_function_goes_on_in_another_library_with_all_its_arguments(stubs, tmp
     assert loaded.many(*map(ctypes.c_long, (1, 2, 3, 4, 5, 6, 7, 8))) == 78
 
 
-def test_libraries_that_nobody_asks_for_go_with_those_that_asked(slimming, tmp_path):
+def test_libraries_needed_only_by_stubs_are_removed(slimming, tmp_path):
     deep = build(tmp_path / "a.libs" / "libdeep-1.so", "int deep(void) {return 1;}")
     middle = build(
         tmp_path / "a.libs" / "libmiddle-1.so", "int deep(void); int middle(void) {return deep();}", deep
@@ -122,7 +122,7 @@ def test_stripped_libraries_load_and_are_smaller(slimming, tmp_path):
     assert ctypes.CDLL(str(library)).f(41) == 42
 
 
-def test_a_segment_that_is_not_where_its_page_is_makes_a_library_unloadable(slimming, tmp_path):
+def test_misaligned_segment_makes_a_library_unloadable(slimming, tmp_path):
     library = build(tmp_path / "lib.so", "int f(void) {return 1;}")
     assert slimming.loadable(library)
     data = bytearray(library.read_bytes())
@@ -133,7 +133,7 @@ def test_a_segment_that_is_not_where_its_page_is_makes_a_library_unloadable(slim
     assert not slimming.loadable(library)
 
 
-def test_one_library_of_two_wheels_is_there_once_and_others_stay(slimming, tmp_path):
+def test_library_shared_by_two_wheels_is_kept_once(slimming, tmp_path):
     code = "int f(void) {return 1;}"
     one = build(tmp_path / "a.libs" / "libgf-0123abcd.so.5", code)
     two = build(tmp_path / "b.libs" / "libgf-89abcdef-01234567.so.5", code)
@@ -144,7 +144,7 @@ def test_one_library_of_two_wheels_is_there_once_and_others_stay(slimming, tmp_p
     assert ctypes.CDLL(str(two)).f() == 1
 
 
-def test_scipy_optimize_works_without_its_linear_programming():
+def test_scipy_optimize_works_without_linear_programming():
     code = f"""
 import importlib.util, sys
 for name in ("_core", "_highs_options"):

@@ -82,7 +82,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
 Tracker = VisualTracker | InertialTracker
 
 
-class Stages:
+class TimedStages:
     """Records CPU ms of every call of the trackers' stages. A stage within a stage counts as the outer
     one."""
 
@@ -115,12 +115,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200, help="frames of each emulated session")
     parser.add_argument("--recording", type=Path, help="any SOURCE that `share track` takes")
     options = parser.parse_args()
-    stages = Stages()
+    stages = TimedStages()
     report = bench_stereo(options.frames, stages) | bench_robot(options.frames, stages)
     print(json.dumps(report | bench_recording(options.recording, stages), indent=2))
 
 
-def bench_stereo(frames: int, stages: Stages) -> dict[str, Any]:
+def bench_stereo(frames: int, stages: TimedStages) -> dict[str, Any]:
     """Stereo with IMU."""
     reason = missing_reason()
     report: dict[str, Any] = {
@@ -139,7 +139,7 @@ def bench_stereo(frames: int, stages: Stages) -> dict[str, Any]:
     return report
 
 
-def bench_robot(frames: int, stages: Stages) -> dict[str, Any]:
+def bench_robot(frames: int, stages: TimedStages) -> dict[str, Any]:
     """RGB-D without IMU."""
     recipe = SessionRecipe(
         FALLBACK_SCENE, (ROBOT,), max(SHORTEST_S, frames / ROBOT_HZ), profiles={"": ROBOT_PROFILE}
@@ -149,7 +149,7 @@ def bench_robot(frames: int, stages: Stages) -> dict[str, Any]:
         return {"room_robot": bench(source, VisualTracker(source.rig, TrackerConfig()), stages, frames)}
 
 
-def bench_recording(given: Path | None, stages: Stages) -> dict[str, Any]:
+def bench_recording(given: Path | None, stages: TimedStages) -> dict[str, Any]:
     path = given or KITCHEN
     if not given and not path.exists():
         return {"recording": "the kitchen is not beside this checkout; name another with --recording"}
@@ -157,7 +157,7 @@ def bench_recording(given: Path | None, stages: Stages) -> dict[str, Any]:
     return {path.name: bench(source, make_source_tracker(source, Config()), stages)}
 
 
-def bench(source: Source, estimator: Tracker, stages: Stages, most: int | None = None) -> dict[str, Any]:
+def bench(source: Source, estimator: Tracker, stages: TimedStages, most: int | None = None) -> dict[str, Any]:
     """Track the first `most` frames of `source` in one thread."""
     stages.spent.clear()
     tracked, track_ms, pose_ms, keyframe_ms = 0, [], [], []

@@ -4,7 +4,7 @@
     python tools/experiments/contact_sheets.py --session SESSION [--out DIR]
 
 For every scene and two seeds: 3 x 4 views of people (1.5-1.75 m) and robots (0.35 m) from free places along
-free directions, each exposed to the same mean. Figures: corner_statistics.py. With --session:
+free directions, each exposed to the same mean. With --session:
 DIR/session.jpg, the plan of an emulated session and a row of images for each agent.
 """
 

@@ -13,15 +13,21 @@ stereo depths of a view start without a guess, and there are keyframes from the 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
-from keyframe_file import load, save
-from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
+import msgspec
+import numpy as np
 
-from share.files.writing import writable_dir
+from share.errors import DataError, UsageError, WireError
+from share.files.writing import atomic_write, writable_dir
 from share.lab.emulate.progress import Progress, no_progress
 from share.lab.emulate.recipe import SessionRecipe
 from share.lab.emulate.session import default_cache
+from share.types import F64, Keyframe
+from share.wire.codec import decode, encode
+from share.wire.messages import Hello, Message
 
 __all__ = ["AgentKeyframes", "KeyframeSet", "Spacing", "keyframe_set", "place"]
 
@@ -53,3 +59,98 @@ def keyframe_set(
         writable_dir(path.parent)
         save(make(recipe, every, workers, progress), path)
     return load(path, recipe, every)
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """A keyframe follows after `metres` or `radians` since the last one, but not within `seconds`. Raises
+    UsageError where one of them is not positive."""
+
+    metres: float = 0.15
+    radians: float = 0.2
+    seconds: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not min(self.metres, self.radians, self.seconds) > 0:
+            raise UsageError(f"spacing {self}: must be positive")
+
+    def __str__(self) -> str:
+        return f"{self.metres:g}m-{self.radians:g}rad-{self.seconds:g}s"
+
+
+@dataclass(frozen=True, eq=False)
+class AgentKeyframes:
+    """keyframes: N of them, in the order of sending. T_world_body (N, 4, 4): true poses. T_odom_body (N, 4,
+    4): poses of odometry, which the keyframes' steps add up to."""
+
+    hello: Hello
+    keyframes: tuple[Keyframe, ...]
+    T_world_body: F64
+    T_odom_body: F64
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeSet:
+    """agents: by name. size: of the room (x, y, z) m, which
+    `share.lab.emulate.world.scenes.corridor.twin_corridors` needs."""
+
+    recipe: SessionRecipe
+    every: Spacing
+    size: tuple[float, float, float]
+    agents: dict[str, AgentKeyframes]
+
+
+class _Agent(msgspec.Struct, array_like=True):
+    """One agent: frames of messages; poses are (N, 4, 4) little-endian doubles."""
+
+    hello: list[bytes]
+    keyframes: list[list[bytes]]
+    T_world_body: bytes
+    T_odom_body: bytes
+
+
+class _Set(msgspec.Struct):
+    size: tuple[float, float, float]
+    agents: dict[str, _Agent]
+
+
+def save(made: KeyframeSet, path: Path) -> None:
+    """Write the set atomically. Raises as `atomic_write`."""
+    agents = {name: _packed(agent) for name, agent in made.agents.items()}
+    atomic_write(path, msgspec.msgpack.encode(_Set(made.size, agents)))
+
+
+def load(path: Path, recipe: SessionRecipe, every: Spacing) -> KeyframeSet:
+    """Return the set made of this recipe. Raises DataError where the file is damaged."""
+    try:
+        found = msgspec.msgpack.decode(path.read_bytes(), type=_Set)
+        agents = {name: _unpacked(agent) for name, agent in found.agents.items()}
+    except (msgspec.MsgspecError, WireError, ValueError) as error:
+        raise DataError(f"{path}: is damaged ({error}); delete it and run the command again") from None
+    return KeyframeSet(recipe, every, found.size, agents)
+
+
+def _packed(agent: AgentKeyframes) -> _Agent:
+    return _Agent(
+        _frames(agent.hello),
+        [_frames(keyframe) for keyframe in agent.keyframes],
+        agent.T_world_body.astype("<f8").tobytes(),
+        agent.T_odom_body.astype("<f8").tobytes(),
+    )
+
+
+def _unpacked(agent: _Agent) -> AgentKeyframes:
+    return AgentKeyframes(
+        cast(Hello, decode(agent.hello)),
+        tuple(cast(Keyframe, decode(frames)) for frames in agent.keyframes),
+        _poses(agent.T_world_body),
+        _poses(agent.T_odom_body),
+    )
+
+
+def _frames(message: Message) -> list[bytes]:
+    return [bytes(frame) for frame in encode(message)]
+
+
+def _poses(data: bytes) -> F64:
+    return np.frombuffer(data, "<f8").reshape(-1, 4, 4)

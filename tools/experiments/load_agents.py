@@ -24,8 +24,7 @@ import msgspec  # noqa: E402
 import numpy as np  # noqa: E402
 import zmq  # noqa: E402
 from keyframe_set import KeyframeSet  # noqa: E402
-from load_room import room  # noqa: E402
-from load_tracks import RATE_HZ, Walker  # noqa: E402
+from load_tracks import RATE_HZ, Walker, room  # noqa: E402
 
 from share.metrics.frame_log import summary  # noqa: E402
 from share.types import TrackState  # noqa: E402
@@ -39,7 +38,7 @@ _QUEUE = 128
 Frames = list[bytes]
 
 
-class _Agent:
+class _LoadAgent:
     """One agent: its messages, and arrival times of replies."""
 
     def __init__(
@@ -105,14 +104,14 @@ def main() -> None:
     context: zmq.Context[Any] = zmq.Context()
     made = room()
     count = int(seconds * RATE_HZ) + 2
-    all_agents = [_Agent(context, address, made, index, count) for index in range(int(agents))]
+    all_agents = [_LoadAgent(context, address, made, index, count) for index in range(int(agents))]
     began = time.monotonic()
     cpu = _talk(all_agents, began, seconds, counted_from)
     print(json.dumps(_figures(all_agents, began + counted_from, began + seconds) | {"generator_cpu": cpu}))
     context.destroy(linger=500)
 
 
-def _talk(all_agents: list[_Agent], began: float, seconds: float, counted_from: float) -> float:
+def _talk(all_agents: list[_LoadAgent], began: float, seconds: float, counted_from: float) -> float:
     """Run all agents in real time. Return CPU seconds per second since `counted_from`."""
     poller = zmq.Poller()
     by_socket = {agent.socket: agent for agent in all_agents}
@@ -141,7 +140,7 @@ def _talk(all_agents: list[_Agent], began: float, seconds: float, counted_from: 
     return spent / (seconds - counted_from)
 
 
-def _act(agent: _Agent, what: str, now: float) -> list[tuple[float, str]]:
+def _act(agent: _LoadAgent, what: str, now: float) -> list[tuple[float, str]]:
     """Do an action; return actions to repeat, and after how many seconds."""
     match what:
         case "hello" if agent.welcome:
@@ -160,7 +159,7 @@ def _act(agent: _Agent, what: str, now: float) -> list[tuple[float, str]]:
             return [(_KEYFRAME_S, what)]
 
 
-def _figures(all_agents: list[_Agent], since: float, until: float) -> dict[str, Any]:
+def _figures(all_agents: list[_LoadAgent], since: float, until: float) -> dict[str, Any]:
     """Return latencies in ms of keyframes and pings sent in the counted time, less its last second."""
     acks: list[float] = []
     corrections: list[float] = []
@@ -192,7 +191,7 @@ def _figures(all_agents: list[_Agent], since: float, until: float) -> dict[str, 
     }
 
 
-def _until_any(all_agents: list[_Agent], since: float, until: float) -> Iterator[float]:
+def _until_any(all_agents: list[_LoadAgent], since: float, until: float) -> Iterator[float]:
     """Yield the time from sending a keyframe to the first correction that answers it or a later one."""
     for agent in all_agents:
         answers = sorted((at, k) for at, k in agent.corrected_s if k >= 0)

@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 from keyframe_odometry import Drift, odometry
-from keyframe_set import AgentKeyframes, KeyframeSet
+from keyframe_set import AgentKeyframes, KeyframeSet, keyframe_set
 
 from share.geometry import se3
+from share.lab.emulate.recipe import SessionRecipe
 from share.types import F64, I64, U8, Keyframe, View
 from share.wire.messages import Hello
 
@@ -75,3 +76,11 @@ class Walker:
 def _up(T_odom_body: F64) -> F64:
     """Return the up direction in the body frame."""
     return T_odom_body[2, :3]
+
+
+RECIPE = SessionRecipe("warehouse", ("ar1=walk:", "ar2=walk:", "robot=robot:"), 60.0, seed=301)
+
+
+def room() -> KeyframeSet:
+    """Return the set; making it takes a minute."""
+    return keyframe_set(RECIPE)

@@ -73,7 +73,7 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class FaultRun:
     """The tracker's results for each frame."""
 
     frames: list[Frame]
@@ -88,13 +88,13 @@ class Run:
         stamps = np.array([stamp for stamp, _ in there], np.int64)
         return Trajectory(stamps, np.array([T for _, T in there]).reshape(-1, 4, 4))
 
-    def stretches(self) -> list[Run]:
+    def stretches(self) -> list[FaultRun]:
         """Return the frames with a pose by unbroken segment, without segments of less than three."""
         number = np.cumsum([r.new_segment for r in self.results])
         has_pose = np.array([r.T_odom_body is not None for r in self.results])
         chosen = [np.flatnonzero(has_pose & (number == n)) for n in np.unique(number)]
         return [
-            Run([self.frames[k] for k in some], [self.results[k] for k in some], self.log)
+            FaultRun([self.frames[k] for k in some], [self.results[k] for k in some], self.log)
             for some in chosen
             if len(some) >= 3
         ]
@@ -151,7 +151,7 @@ def faulty(case: Case, fault: Fault) -> list[Frame]:
     return apply_fault(fault, frames, case.source.rig, case.truth)
 
 
-def tracked(rig: Rig, frames: list[Frame]) -> Run:
+def tracked(rig: Rig, frames: list[Frame]) -> FaultRun:
     """Run one tracker over all frames."""
     config, log, results = Config(), RunLog(), []
     tracker = InertialTracker(rig, config.inertial, config.tracker)
@@ -164,10 +164,10 @@ def tracked(rig: Rig, frames: list[Frame]) -> Run:
         log.add(frame.stamp_ns, 1e3 * (time.process_time() - began), result.state, result.keyframe_ready)
         log.segments += result.new_segment
         results.append(result)
-    return Run(frames, results, log)
+    return FaultRun(frames, results, log)
 
 
-def scored(run: Run, truth: Trajectory) -> Row:
+def scored(run: FaultRun, truth: Trajectory) -> Row:
     """Return the figures; errors are None in a run without a pose."""
     report, states = run.log.report(), Counter(str(r.state) for r in run.results)
     parts = run.stretches()
@@ -188,7 +188,7 @@ def scored(run: Run, truth: Trajectory) -> Row:
     }
 
 
-def wrongly_ok(part: Run, truth: Trajectory) -> np.ndarray:
+def wrongly_ok(part: FaultRun, truth: Trajectory) -> np.ndarray:
     """Return which frames (N,) of a segment with ground truth are OK although they are wrong."""
     estimate = part.trajectory
     known, true = interpolate(*truth, estimate.stamps_ns)

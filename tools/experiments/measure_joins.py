@@ -49,7 +49,7 @@ WRONG_M, WRONG_RAD = 0.5, float(np.radians(10))
 
 
 @dataclass
-class Pair:
+class AgentPair:
     """Two agents, in seconds since the first keyframe. joined: the first correct merge."""
 
     common: float | None = None
@@ -67,11 +67,11 @@ class Pair:
 
 
 @dataclass
-class Run:
+class JoinRun:
     """pairs: by the names of both. joint_ate_cm: None if no agents were merged."""
 
     seed: int
-    pairs: dict[str, Pair] = field(default_factory=dict)
+    pairs: dict[str, AgentPair] = field(default_factory=dict)
     joint_ate_cm: float | None = None
     agents_in_map: int = 1
 
@@ -83,13 +83,13 @@ class Replay:
         self._made, self._mapper, self._solver = made, Mapper(config), PoseGraphSolver(config.graph)
         self._seen: dict[str, int] = {}  # keyframes of each agent so far
         self._before = 0.0
-        self.run = Run(made.recipe.seed)
+        self.run = JoinRun(made.recipe.seed)
         for name, agent in made.agents.items():
             self._mapper.add_run(name, agent.hello)
         for x, y in itertools.combinations(made.agents, 2):
-            self.run.pairs[f"{x} {y}"] = Pair()
+            self.run.pairs[f"{x} {y}"] = AgentPair()
 
-    def whole(self) -> Run:
+    def whole(self) -> JoinRun:
         for t, name, k in order(self._made):
             self._mapper.add_keyframe(name, self._made.agents[name].keyframes[k])
             self._seen[name] = k + 1
@@ -207,7 +207,7 @@ def configured(settings: Sequence[str]) -> Config:
     return from_mapping(Config, mapping, "--set")
 
 
-def replayed(options: argparse.Namespace, config: Config) -> Iterator[Run]:
+def replayed(options: argparse.Namespace, config: Config) -> Iterator[JoinRun]:
     every = Spacing(options.spacing_m, options.spacing_rad)
     for seed in options.seeds:
         recipe = recipe_of(options, seed)
@@ -215,7 +215,7 @@ def replayed(options: argparse.Namespace, config: Config) -> Iterator[Run]:
             yield Replay(keyframe_set(recipe, every, options.cache), config).whole()
 
 
-def line(run: Run) -> str:
+def line(run: JoinRun) -> str:
     pairs = "; ".join(
         f"{name}: common {_s(p.common)}, joined {_s(p.joined)}, wrong {_s(p.wrong)} "
         f"for {p.seconds_wrong:.1f} s, {p.end}"
@@ -224,7 +224,7 @@ def line(run: Run) -> str:
     return f"{run.seed}: {pairs}; joint ATE {_s(run.joint_ate_cm)} cm of {run.agents_in_map} agents"
 
 
-def table(scene: str, runs: Sequence[Run]) -> str:
+def table(scene: str, runs: Sequence[JoinRun]) -> str:
     """Return a Markdown table with one row."""
     pairs = [pair for run in runs for pair in run.pairs.values()]
     seen = [pair for pair in pairs if pair.common is not None]

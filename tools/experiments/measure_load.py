@@ -26,13 +26,14 @@ from share import child_processes, startup
 
 startup.prepare_process()
 
-from load_process import cpu_s, rss_mb, worker_of  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import ShareError  # noqa: E402
 from share.files.writing import atomic_write, writable_dir  # noqa: E402
 
 COUNTED_FROM_S = 10.0
+_CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 HERE = Path(__file__).parent
 HEAD = (
     "agents",
@@ -189,6 +190,30 @@ def cells_of(row: Row) -> list[str]:
         f"{row['file_mb']:.0f}",
         f"{row['load_average']:.1f}",
     ]
+
+
+# ---- CPU time and memory of a process, from /proc (Linux)
+
+
+def cpu_s(pid: int) -> float:
+    """Return CPU seconds of all its threads, in user and kernel mode, without ended children (proc(5))."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / _CLOCK_TICKS
+
+
+def rss_mb(pid: int) -> float:
+    """Return its resident memory, shared pages included, MB."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE_BYTES / 1e6
+
+
+def worker_of(pid: int) -> int:
+    """Return its worker process. Raises LookupError unless there is exactly one."""
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    children = [int(child) for task in tasks for child in (task / "children").read_text().split()]
+    workers = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+    if len(workers) != 1:
+        raise LookupError(f"process {pid} has {len(workers)} workers, not one")
+    return workers[0]
 
 
 if __name__ == "__main__":

@@ -28,9 +28,12 @@ startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from load_map import TimedMap  # noqa: E402
-from load_process import rss_mb  # noqa: E402
-from load_room import room  # noqa: E402
-from load_tracks import RATE_HZ, Walker  # noqa: E402
+from load_tracks import (  # noqa: E402
+    RATE_HZ,
+    Walker,
+    room,
+)
+from measure_load import rss_mb  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.config import Config  # noqa: E402

@@ -23,16 +23,30 @@ startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from keyframe_set import Spacing  # noqa: E402
-from places_curves import Point, Tried, point, recall_at, tried  # noqa: E402
-from places_data import FIRESTATION, TWINS, WAREHOUSE, Views, emulated, real  # noqa: E402
-from places_picture import draw  # noqa: E402
+from PIL import Image  # noqa: E402  # comes with matplotlib
+from places_views import (  # noqa: E402  # noqa: E402
+    FIRESTATION,
+    TWINS,
+    WAREHOUSE,
+    Point,
+    Tried,
+    Views,
+    emulated,
+    point,
+    real,
+    recall_at,
+    tried,
+)
 from tool_main import exit_code  # noqa: E402
 
 from share.config import PlaceConfig  # noqa: E402
 from share.mapping.recognition.verification import MAX_SIGMA_DEG  # noqa: E402
+from share.types import F64  # noqa: E402
 
 INLIERS = (8, 10, 12, 14, 16, 18, 20, 24, 28, 32, 40, 50, 65, 80, 100, 130, 160, 200)
 SIGMAS = (0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0)
+_COLOURS = ("#00798c", "#d1495b", "#b8860b", "#5f4b8b", "#3b7a3b")
+_PALETTE = 64
 
 
 def main() -> int:
@@ -88,6 +102,59 @@ def without_wrong(pairs: Tried) -> float:
     """Return the best recall by limits on inliers and sigma that accept nothing wrong."""
     points = [point(pairs, n, sigma) for n in INLIERS for sigma in SIGMAS]
     return float(np.max([p.recall for p in points if p.wrong == 0], initial=0.0))
+
+
+def draw(
+    path: Path,
+    recalls: dict[str, F64],
+    curves: dict[str, tuple[list[Point], list[Point]]],
+    here: dict[str, Point],
+) -> None:
+    """Write a PNG. recalls: by name, of the first k results. curves: over inliers and over sigma. here: at
+    SHARE's limits."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    style = {"font.size": 11, "axes.spines.top": False, "axes.spines.right": False}
+    with pyplot.rc_context(style):
+        figure, panels = pyplot.subplots(1, 3, figsize=(14, 4.6), layout="constrained")
+        for (name, recall), colour in zip(recalls.items(), _COLOURS, strict=False):
+            panels[0].plot(range(1, len(recall) + 1), 100 * recall, color=colour, label=name)
+        for panel, over in ((panels[1], 0), (panels[2], 1)):
+            for (name, both), colour in zip(curves.items(), _COLOURS, strict=False):
+                _precision(panel, both[over], here[name], colour, name)
+        _words(panels)
+        figure.legend(
+            handles=panels[0].lines[: len(recalls)],
+            loc="outside lower center",
+            ncols=len(recalls),
+            frameon=False,
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=90)
+        pyplot.close(figure)
+    Image.open(path).convert("RGB").quantize(_PALETTE).save(path, optimize=True)
+
+
+def _precision(panel: Any, points: list[Point], here: Point, colour: str, name: str) -> None:
+    panel.plot(
+        [100 * p.recall for p in points], [100 * p.precision for p in points], color=colour, label=name
+    )
+    panel.plot(100 * here.recall, 100 * here.precision, "o", color=colour)
+
+
+def _words(panels: Any) -> None:
+    panels[0].set(title="query", xlabel="first k answers", ylabel="recall of true pairs [%]", xlim=(1, None))
+    panels[0].axvline(8, color="black", linewidth=0.6, linestyle=":")
+    for panel, over in ((panels[1], "least inliers"), (panels[2], "largest sigma")):
+        panel.set(
+            title=f"verification, over {over}", xlabel="recall of true pairs [%]", ylabel="precision [%]"
+        )
+        panel.set_ylim(0, 102)
+    for panel in panels:
+        panel.grid(alpha=0.3)
 
 
 if __name__ == "__main__":

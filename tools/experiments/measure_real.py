@@ -74,7 +74,7 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Pair:
+class ViewPair:
     """Two neighbours: error of the relative motion, m, NaN without a pose."""
 
     first: Seen
@@ -141,7 +141,7 @@ def real_pairs(options: argparse.Namespace) -> Iterator[str]:
     yield "\nStates: " + ", ".join(f"{n} {state}" for state, n in Counter(s.state for s in seen).items())
 
 
-def summed(longest: float, pairs: list[Pair]) -> str:
+def summed(longest: float, pairs: list[ViewPair]) -> str:
     tracked = sum(not np.isnan(p.error) for p in pairs)
     right, given = (
         sum(error <= p.allowed for p, error in zip(pairs, errors, strict=True))
@@ -172,16 +172,16 @@ def followed(folder: Path) -> list[Seen]:
     return out
 
 
-def pair_of(a: Seen, b: Seen) -> Pair:
+def pair_of(a: Seen, b: Seen) -> ViewPair:
     moved = float(np.linalg.norm((se3.inverse(a.truth) @ b.truth)[:3, 3]))
     if a.T is None or b.T is None or a.segment != b.segment:
-        return Pair(a, b, moved, np.nan, np.nan)
+        return ViewPair(a, b, moved, np.nan, np.nan)
     estimate = se3.inverse(a.T) @ b.T
     error, given = (
         float(np.linalg.norm((se3.inverse(se3.inverse(first) @ second) @ estimate)[:3, 3]))
         for first, second in ((a.truth, b.truth), (a.given, b.given))
     )
-    return Pair(a, b, moved, error, given)
+    return ViewPair(a, b, moved, error, given)
 
 
 # ---------------------------------------------------------------------- kitchen

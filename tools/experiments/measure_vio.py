@@ -11,25 +11,57 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from share import startup
 
 startup.prepare_process()
 
 import numpy as np  # noqa: E402
-import vio_options  # noqa: E402
-from tool_main import exit_code  # noqa: E402
-from vio_kept import code_version, keep, kept  # noqa: E402
+from tool_main import exit_code, line  # noqa: E402
 from vio_picture import Curves, draw  # noqa: E402
 from vio_run import figures, follow, series  # noqa: E402
-from vio_sequences import SECONDS, Sequence  # noqa: E402
-from vio_table import Row, table  # noqa: E402
+from vio_sequences import ROOT, SECONDS, Sequence, chosen_sequences, code_version, keep, kept  # noqa: E402
+from vio_sequences import parser as sequences_parser  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.files.writing import atomic_write  # noqa: E402
 from share.lab.emulate.session import make_cached_session  # noqa: E402
 from share.runtime.source import open_source  # noqa: E402
+
+Row = dict[str, Any]
+
+
+class _Column(NamedTuple):
+    """key: of a run's figures; times: unit conversion; worst: function that picks the worst of several."""
+
+    title: str
+    key: str
+    form: str
+    times: float = 1.0
+    worst: Callable[[list[float]], float] = max
+
+
+COLUMNS = (
+    _Column("ATE cm", "ate_cm", ".2f"),
+    _Column("most cm", "worst_cm", ".2f"),
+    _Column("RPE 1 s cm", "rpe_1s_cm", ".2f"),
+    _Column("RPE 1 s °", "rpe_1s_deg", ".3f"),
+    _Column("OK %", "OK", ".1f", 100, min),
+    _Column("with a pose %", "told", ".1f", 100, min),
+    _Column("LOST s", "lost_s", ".1f"),
+    _Column("new segments", "new_stretches", ".0f"),
+    _Column("ready s", "init_s", ".2f"),
+    _Column("CPU ms", "track_ms", ".1f"),
+    _Column("p99", "track_p99_ms", ".1f"),
+    _Column("keyframe ms", "keyframe_ms", ".1f"),
+    _Column("NEES position", "nees_position", ".2f"),
+    _Column("orientation", "nees_orientation", ".2f"),
+    _Column("in 3σ % position", "inside_position", ".1f", 100, min),
+    _Column("orientation", "inside_orientation", ".1f", 100, min),
+)
 
 
 def main() -> int:
@@ -38,14 +70,14 @@ def main() -> int:
 
 
 def arguments() -> argparse.Namespace:
-    parser = vio_options.parser(__doc__, "vio", (101, 102, 103))
-    parser.add_argument("--pictures", type=Path, default=vio_options.ROOT / "docs" / "pictures" / "vio")
+    parser = sequences_parser(__doc__, "vio", (101, 102, 103))
+    parser.add_argument("--pictures", type=Path, default=ROOT / "docs" / "pictures" / "vio")
     return parser.parse_args()
 
 
 def measure(options: argparse.Namespace) -> None:
     """Do all runs, seed by seed; then the table and the pictures."""
-    code, chosen = code_version(), vio_options.chosen(options)
+    code, chosen = code_version(), chosen_sequences(options)
     rows = [run(sequence, seed, options, code) for seed in options.seeds for sequence in chosen]
     rows.sort(key=lambda row: [s.name for s in chosen].index(row["sequence"]))
     text = table(rows)
@@ -96,6 +128,30 @@ def _file(out: Path, name: str, seed: int) -> Path:
 
 def _cm(row: Row) -> str:
     return "none" if row["ate_cm"] is None else f"{row['ate_cm']:.2f} cm"
+
+
+def table(rows: Iterable[Row]) -> str:
+    """Return the table of runs of any sequences and seeds, in their order."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row["sequence"], []).append(row)
+    lines = [line(["sequence", "seeds", *(column.title for column in COLUMNS)])]
+    lines.append(line(["---"] * (2 + len(COLUMNS))))
+    for name, runs in groups.items():
+        seeds = " ".join(str(run["seed"]) for run in runs)
+        lines.append(line([name, seeds, *(_cell(column, runs) for column in COLUMNS)]))
+    return "\n".join(lines)
+
+
+def _cell(column: _Column, runs: list[Row]) -> str:
+    """Return a cell; a missing figure counts as the worst."""
+    found = [(run | run["states"])[column.key] for run in runs]
+    values = [column.times * value for value in found if value is not None]
+    if not values:
+        return "none"
+    middle = format(float(np.median(values)), column.form)
+    worst = format(column.worst(values), column.form) if len(values) == len(found) else "none"
+    return middle if middle == worst else f"{middle} ({worst})"
 
 
 if __name__ == "__main__":

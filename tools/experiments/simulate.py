@@ -29,7 +29,7 @@ startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from keyframe_set import AgentKeyframes, KeyframeSet  # noqa: E402
-from load_room import room  # noqa: E402
+from load_tracks import room  # noqa: E402
 from measure_joins import configured  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 

@@ -26,7 +26,7 @@ startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from keyframe_making import make_unseen  # noqa: E402
-from keyframe_types import AgentKeyframes, KeyframeSet, Spacing  # noqa: E402
+from keyframe_set import AgentKeyframes, KeyframeSet, Spacing  # noqa: E402
 from measure_joins import configured  # noqa: E402
 from simulate import SIMULATED, Row, mean, play  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402

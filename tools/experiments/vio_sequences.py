@@ -1,10 +1,22 @@
-"""The sequences for measuring the inertial tracker: one agent, 60 s, all sensor effects."""
+"""Sequences x seeds for measuring trackers: one agent, 60 s, all sensor effects.
+
+Also the options of the tools that run over them, and the cache of a run's figures.
+"""
 
 from __future__ import annotations
 
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import share
+from share.errors import UsageError
+from share.files.writing import atomic_write
 from share.lab.emulate.recipe import SessionRecipe
 
 SECONDS = 60.0
@@ -48,3 +60,74 @@ SEQUENCES = (
     Sequence("tumvi-room2", "tumvi:room2", "firestation", _D435I),
     Sequence("tumvi-room3", "tumvi:room3", "warehouse", _D435I),
 )
+
+
+ROOT = Path(__file__).resolve().parents[2]
+_DATA = ROOT.parent / "shared" / "data" / "motion"
+
+
+def parser(doc: str | None, out: str, seeds: tuple[int, ...]) -> argparse.ArgumentParser:
+    """Return a parser. out: name of the folder in build/; seeds: the default."""
+    made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawTextHelpFormatter)
+    names = [sequence.name for sequence in SEQUENCES]
+    made.add_argument("--only", action="append", choices=names, help="may be repeated")
+    made.add_argument("--seeds", type=_seeds, default=seeds, metavar="N,N,…")
+    made.add_argument("--data", type=_folder, default=_DATA, help="recordings: euroc/NAME, tumvi/NAME")
+    made.add_argument("--cache", type=Path, help="of sessions (default: the user's)")
+    made.add_argument("--out", type=Path, default=ROOT / "build" / out)
+    made.add_argument("--workers", type=int, default=2, help="processes that make sessions")
+    made.add_argument("--again", action="store_true", help="repeat runs that exist")
+    return made
+
+
+def chosen_sequences(options: argparse.Namespace) -> list[Sequence]:
+    """Return the chosen sequences with recordings; report the others. Raises UsageError without any."""
+    found = list(_there(options))
+    if not found:
+        raise UsageError("none of the recordings exists; give their folder by --data")
+    return found
+
+
+def _there(options: argparse.Namespace) -> Iterator[Sequence]:
+    for sequence in SEQUENCES:
+        if options.only and sequence.name not in options.only:
+            continue
+        folder = sequence.recording(options.data)
+        if folder is None or folder.exists():
+            yield sequence
+        else:
+            print(f"left out: {sequence.name}, {folder} does not exist", file=sys.stderr)
+
+
+def _folder(text: str) -> Path:
+    return Path(text).resolve()
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(word) for word in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a list of numbers such as 101,102") from None
+
+
+_NOT_IN_A_RUN = ("cli", "emulate", "merge", "mocap", "wire")  # packages of share/ that a run does not use
+
+
+def code_version() -> str:
+    """Return a digest of all code that a run uses."""
+    digest = hashlib.sha256()
+    package = Path(share.__file__).parent
+    files = [p for p in package.rglob("*.py") if p.relative_to(package).parts[0] not in _NOT_IN_A_RUN]
+    for path in sorted(files) + sorted(Path(__file__).parent.glob("vio_run.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def kept(file: Path, made_by: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the file's figures if they were made by the same code and session, else None."""
+    row: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    return row if {key: row.get(key) for key in made_by} == made_by else None
+
+
+def keep(file: Path, row: dict[str, Any]) -> None:
+    atomic_write(file, json.dumps(row, indent=2) + "\n")

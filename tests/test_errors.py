@@ -1,4 +1,4 @@
-"""How people are told to get what is missing."""
+"""Advice on how to install a missing package."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import sys
 from share.errors import install_hint
 
 
-def test_what_is_missing_is_told_with_how_to_get_it():
+def test_missing_package_is_reported_with_install_advice():
     assert install_hint("moderngl", "emulate") == (
         "moderngl is not installed: pip install 'share-slam[emulate]', "
         "in a checkout .venv/bin/pip install -e '.[emulate]'"
     )
 
 
-def test_nobody_is_told_to_pip_into_a_frozen_program(monkeypatch):
+def test_frozen_program_gets_no_pip_advice(monkeypatch):
     monkeypatch.setattr(sys, "frozen", True, raising=False)
     assert "use a computer with Python: pip install 'share-slam[train]'" in install_hint("torch", "train")

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
+from share.cli.evaluate_many import check_none_failed
 from share.cli.terminal import LiveLine
-from share.errors import DataError, ShareError, UsageError
+from share.errors import DataError, UsageError
 from share.lab.peer_trackers import PEERS
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 @click.option(
     "--vocabulary",
     metavar="FILE",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=options.EXISTING_FILE,
     help="ORBvoc.txt, which ORB-SLAM3 needs and its package lacks.",
 )
 @options.config
@@ -40,7 +41,7 @@ def compare(
     sources: tuple[str, ...],
     peers: tuple[str, ...],
     vocabulary: Path | None,
-    config_file: str | None,
+    config_file: Path | None,
     out: Path,
 ) -> None:
     """Run SHARE's tracker and others over the same recordings; compare their errors against ground truth and
@@ -74,10 +75,7 @@ def compare(
     rows_found, failed = _run_jobs(jobs, recordings, out)
     if rows_found:
         _write_report(out, rows_found, missing)
-    if failed:
-        raise ShareError(
-            f"{failed} of {len(jobs)} runs failed; run the same command again to repeat only those"
-        )
+    check_none_failed(len(jobs) - failed, len(jobs))
 
 
 def _open_recordings(sources: tuple[str, ...]) -> dict[str, Source]:

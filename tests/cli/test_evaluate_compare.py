@@ -1,4 +1,4 @@
-"""`share evaluate compare` as a user types it, with a peer that speaks as others do and stays where it is."""
+"""`share evaluate compare`, with a stand-in tracker that reports a constant pose."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def rows_of(out: Path) -> dict[tuple[str, str], dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_all_are_scored_alike_and_kept(compare, plain_session, tmp_path):
+def test_all_trackers_are_scored_alike_and_kept(compare, plain_session, tmp_path):
     out = tmp_path / "compared"
     arguments = (plain_session, "--peer", f"basalt={idler(tmp_path)}", "--out", out)
     done = compare(*arguments)
@@ -92,7 +92,8 @@ def test_all_are_scored_alike_and_kept(compare, plain_session, tmp_path):
     assert sum(path.read_bytes() == was for path, was in kept.items()) >= len(kept) - 1
 
 
-def test_rows_of_another_setting_are_not_taken_for_these(compare, plain_session, tmp_path):
+@pytest.mark.long
+def test_rows_of_other_settings_are_not_reused(compare, plain_session, tmp_path):
     source, out, other = f"{plain_session}/ar1", tmp_path / "compared", tmp_path / "other.yaml"
     assert compare(source, "--out", out).code == 0
     other.write_text("inertial: {max_speed_m_s: 9}\n")
@@ -101,7 +102,8 @@ def test_rows_of_another_setting_are_not_taken_for_these(compare, plain_session,
     assert "is of another recording, version or setting; give another --out" in done.err
 
 
-def test_a_peer_that_breaks_leaves_the_others_their_rows(compare, plain_session, tmp_path):
+@pytest.mark.long
+def test_failing_tracker_does_not_affect_other_rows(compare, plain_session, tmp_path):
     out = tmp_path / "compared"
     peer = idler(tmp_path, breaks=5)
     done = compare(f"{plain_session}/ar1", "--peer", f"basalt={peer}", "--out", out)
@@ -121,14 +123,14 @@ def test_a_peer_that_breaks_leaves_the_others_their_rows(compare, plain_session,
         (("--vocabulary", "/nowhere"), "does not exist"),
     ],
 )
-def test_what_is_wrong_is_said(compare, plain_session, tmp_path, arguments, said):
+def test_wrong_use_is_one_line(compare, plain_session, tmp_path, arguments, said):
     done = compare(plain_session, *arguments, "--out", tmp_path / "compared")
     assert done.code == 2
     assert said in done.err
     assert not (tmp_path / "compared").exists()
 
 
-def test_without_a_truth_nobody_can_be_told_from_another(compare, plain_session, tmp_path):
+def test_recording_without_ground_truth_is_refused(compare, plain_session, tmp_path):
     bare = tmp_path / "bare"
     bare.mkdir()
     for path in plain_session.glob("*.*"):

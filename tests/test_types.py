@@ -1,4 +1,4 @@
-"""A pose is a rigid transform, whoever says so."""
+"""Checked values: a pose is a rigid transform."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def changed(at: tuple[int, int], value: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_rotation_may_be_off_by_a_thousandth(seed: int) -> None:
+def test_rotation_tolerance_is_a_thousandth(seed: int) -> None:
     rng = np.random.default_rng(seed)
     for scale in (1e-4, 3e-4, 1e-3, 1e-2, 1.0):
         near = T.copy()
@@ -33,20 +33,20 @@ def test_a_rotation_may_be_off_by_a_thousandth(seed: int) -> None:
 
 
 @pytest.mark.parametrize("value", [2.0, 1e200, -1e308])
-def test_what_is_too_large_is_none(value: float) -> None:
+def test_too_large_matrices_are_refused(value: float) -> None:
     for at in np.ndindex(3, 3):
         with pytest.raises(ValueError, match="rigid"):
             checked_pose("T", changed(at, value))
 
 
-def test_neither_is_a_reflection_or_one_with_another_last_row() -> None:
+def test_reflections_and_wrong_last_rows_are_refused() -> None:
     for bad in (T @ np.diag([1, 1, -1, 1.0]), *(changed((3, k), 1e-6 + (k == 3)) for k in range(4))):
         with pytest.raises(ValueError, match="rigid"):
             checked_pose("T", bad)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_nor_one_with_a_number_that_is_not_finite(value: float) -> None:
+def test_non_finite_matrices_are_refused(value: float) -> None:
     for at in np.ndindex(4, 4):
         with pytest.raises(ValueError, match="not finite"):
             checked_pose("T", changed(at, value))
@@ -54,7 +54,7 @@ def test_nor_one_with_a_number_that_is_not_finite(value: float) -> None:
 
 
 @pytest.mark.parametrize("value", [1.001 * MAX_POSITION_M, -1e300, 1.7e308])
-def test_nor_one_that_is_further_away_than_any_room(value: float) -> None:
+def test_too_far_poses_are_refused(value: float) -> None:
     for row in range(3):
         with pytest.raises(ValueError, match="m away"):
             checked_pose("T", changed((row, 3), value))

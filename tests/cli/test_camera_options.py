@@ -1,4 +1,4 @@
-"""What is told of a live camera when all is over."""
+"""The lines that summarise a live camera after a run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from share.sensors.watchdog import Watchdog
 RATES = {"cam0": 30.0, "cam1": 30.0, "accel": 250.0, "gyro": 400.0}
 
 
-def test_a_camera_to_which_nothing_happened_is_not_spoken_of() -> None:
+def test_uneventful_camera_has_no_events() -> None:
     report = feed_report(SampleProcessor(RATES), {}, Watchdog(0, RATES))
     assert camera_events(report) == ""
     assert camera_summary({"camera": report}) == [
@@ -18,7 +18,7 @@ def test_a_camera_to_which_nothing_happened_is_not_spoken_of() -> None:
     ]
 
 
-def test_what_was_done_without_at_the_end_is_told() -> None:
+def test_health_at_the_end_is_reported() -> None:
     dog = Watchdog(0, RATES)
     for now_ms in range(0, 20_000, 100):
         for stream in ("cam0", "accel", "gyro"):

@@ -31,7 +31,7 @@ print(json.dumps(found))
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
-def test_what_is_free_between_what_is_kept_goes_back_once_a_minute() -> None:
+def test_free_heap_memory_is_returned_once_a_minute() -> None:
     done = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, check=True)
     at_first, before, after, later = json.loads(done.stdout)
     assert before == pytest.approx(at_first, abs=1)

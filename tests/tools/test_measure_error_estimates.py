@@ -1,4 +1,4 @@
-"""Errors that agents told, laid beside the true ones."""
+"""Error estimates of agents beside the true errors."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ S = 1_000_000_000
 def tool():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(TOOLS)
-        yield importlib.import_module("measure_told")
+        yield importlib.import_module("measure_error_estimates")
 
 
 @pytest.fixture
 def trial(tool, tmp_path, monkeypatch):
-    """Ann stands; after 5 s she comes into the map, and by the map she goes 1 cm a second from where she is.
+    """ann stands still; after 5 s it joins the map, where its pose moves 1 cm a second away from where it is.
     The edge counts from 10 s before she joined it."""
     stamps_ns = (100 + np.arange(11)) * S
     T = np.tile(np.eye(4), (11, 1, 1))
@@ -46,17 +46,17 @@ def trial(tool, tmp_path, monkeypatch):
     return SimpleNamespace(folder=tmp_path, folders={}, session=session)
 
 
-def test_what_was_told_lies_beside_the_error_of_the_moment(tool, trial):
-    [pairs] = tool.told_and_true(trial)
+def test_estimates_are_paired_with_the_true_error_of_their_time(tool, trial):
+    [pairs] = tool.estimated_and_true(trial)
     assert pairs.kind == "ar"
-    assert pairs.told_cm.tolist() == [3.0, 7.5]  # in the map, and with an estimate
+    assert pairs.estimated_cm.tolist() == [3.0, 7.5]  # in the map, and with an estimate
     assert pairs.true_cm.tolist() == pytest.approx([6.0, 7.5])
 
 
-def test_a_row_says_how_well_agents_know_themselves(tool):
+def test_row_compares_estimated_and_true_errors(tool):
     one = tool.Pairs("ar", np.array([1.0, 2.0]), np.array([2.0, 1.0]))
     other = tool.Pairs("ar", np.array([3.0, 4.0]), np.array([8.0, 9.0]))
-    row = dict(zip(tool.HEAD[1:], tool._figures([one, other]), strict=True))
+    row = dict(zip(tool.HEAD[1:], tool.figures([one, other]), strict=True))
     assert row == {
         "runs": "2",
         "N": "4",
@@ -69,7 +69,7 @@ def test_a_row_says_how_well_agents_know_themselves(tool):
     }
 
 
-def test_what_is_not_a_run_is_said(tool, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sys.argv", ["measure_told", str(tmp_path)])
+def test_folder_without_a_run_is_refused(tool, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["measure_error_estimates", str(tmp_path)])
     assert tool.main() == 2
     assert "give a folder by `share evaluate`" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What an agent may be called."""
+"""Valid names of agents."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from share.recordings.session import is_agent_name
         ),
     ],
 )
-def test_honest_names(name: str) -> None:
+def test_valid_names_are_accepted(name: str) -> None:
     assert hello_of(name, 1).name == name
 
 
@@ -51,7 +51,7 @@ def test_honest_names(name: str) -> None:
     ],
     ids=ascii,
 )
-def test_names_that_are_none(name: str) -> None:
+def test_invalid_names_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match=r"^name: .*; use 1 to 64 letters, digits") as refused:
         hello_of(name, 1)
     assert str(refused.value).isprintable()
@@ -59,5 +59,5 @@ def test_names_that_are_none(name: str) -> None:
     assert not is_agent_name(name)
 
 
-def test_names_that_look_alike_by_their_accents_are_alike() -> None:
+def test_names_are_compared_in_normal_form() -> None:
     assert hello_of(normalize("NFD", "Jürgen"), 1).name == "Jürgen"

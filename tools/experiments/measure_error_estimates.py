@@ -1,6 +1,6 @@
 """Errors that agents estimate of themselves, against the true ones.
 
-    python tools/experiments/measure_told.py RUN… [--by policy|SECTION.NAME] [--picture FILE]
+    python tools/experiments/measure_error_estimates.py RUN… [--by policy|SECTION.NAME] [--picture FILE]
 
 A RUN is a folder by `share evaluate run`, or one by `sweep` or `ablation` with its runs. Prints a Markdown
 table, a row for each kind of agent (and each value of the setting): of N evaluations while an agent is in the
@@ -51,10 +51,10 @@ HEAD = (
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Of one agent in one run, at N evaluations. told_cm, true_cm: estimated and true errors (N,)."""
+    """Of one agent in one run, at N evaluations. estimated_cm, true_cm: estimated and true errors (N,)."""
 
     kind: str
-    told_cm: F64
+    estimated_cm: F64
     true_cm: F64
 
 
@@ -64,7 +64,7 @@ def main() -> int:
     parser.add_argument("--by", metavar="WHAT", help="separate rows for each value")
     parser.add_argument("--picture", type=Path, help="plot of true over estimated errors")
     options = parser.parse_args()
-    return exit_code("measure_told", lambda: measure(options))
+    return exit_code("measure_error_estimates", lambda: measure(options))
 
 
 def measure(options: argparse.Namespace) -> None:
@@ -72,18 +72,18 @@ def measure(options: argparse.Namespace) -> None:
     for folder in (one for top in options.runs for one in _runs(top)):
         trial = read_trial(folder)
         value = _setting(trial, options.by) if options.by else ""
-        for pairs in told_and_true(trial):
+        for pairs in estimated_and_true(trial):
             rows[f"{pairs.kind} {value}".strip()].append(pairs)
     if not rows:
         raise UsageError("no run has error estimates in a map; run `share evaluate` with an error model")
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))))
     for name, of in sorted(rows.items()):
-        print(line([name, *_figures(of)]))
+        print(line([name, *figures(of)]))
     if options.picture:
         _draw(options.picture, rows)
 
 
-def told_and_true(trial: Trial) -> Iterator[Pairs]:
+def estimated_and_true(trial: Trial) -> Iterator[Pairs]:
     """Yield the pairs of each agent in the largest map. Raises DataError on damaged files."""
     found = score_session(trial.session, trial.folders)
     if found.joint is None:
@@ -126,15 +126,15 @@ def _setting(trial: Trial, name: str) -> str:
     return str(value)
 
 
-def _figures(of: list[Pairs]) -> list[str]:
+def figures(of: list[Pairs]) -> list[str]:
     estimated, true = (
-        np.concatenate([getattr(pairs, what) for pairs in of]) for what in ("told_cm", "true_cm")
+        np.concatenate([getattr(pairs, what) for pairs in of]) for what in ("estimated_cm", "true_cm")
     )
     runs = np.array(
         [
-            [error_statistics(pairs.told_cm).rmse, error_statistics(pairs.true_cm).rmse]
+            [error_statistics(pairs.estimated_cm).rmse, error_statistics(pairs.true_cm).rmse]
             for pairs in of
-            if len(pairs.told_cm)
+            if len(pairs.estimated_cm)
         ]
     )
     cells = [
@@ -168,7 +168,7 @@ def _draw(path: Path, rows: dict[str, list[Pairs]]) -> None:
     )
     for axis, (name, of) in zip(axes[0], sorted(rows.items()), strict=True):
         for pairs in of:
-            axis.loglog(pairs.told_cm, pairs.true_cm, ".", markersize=2.5, alpha=0.5)
+            axis.loglog(pairs.estimated_cm, pairs.true_cm, ".", markersize=2.5, alpha=0.5)
         axis.plot([0.05, 20], [0.05, 20], color="black", linewidth=0.8)
         axis.set(title=name, xlabel="estimated error, cm")
     axes[0, 0].set_ylabel("true error in the map, cm")

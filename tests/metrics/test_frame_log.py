@@ -1,4 +1,4 @@
-"""What is told of a run's frames, and that they take no memory while it lasts."""
+"""The report of a run's frames, which take no memory while the run lasts."""
 
 from __future__ import annotations
 
@@ -84,9 +84,7 @@ def drive(logs: list[Any], n: int, seed: int) -> None:
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 20, 3000])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("in_a_folder", [True, False])
-def test_the_report_is_that_of_all_rows_to_the_last_byte(
-    n: int, seed: int, in_a_folder: bool, tmp_path: Path
-) -> None:
+def test_report_equals_that_of_all_rows(n: int, seed: int, in_a_folder: bool, tmp_path: Path) -> None:
     spool = Spool(tmp_path / "latency.csv.partial" if in_a_folder else None, print)
     rows, spooled, in_memory = Rows(), RunLog(spool), RunLog()
     drive([rows, spooled, in_memory], n, seed)
@@ -98,7 +96,7 @@ def test_the_report_is_that_of_all_rows_to_the_last_byte(
     spool.close()
 
 
-def test_what_does_not_come_of_rows_is_told_too() -> None:
+def test_counts_beside_the_rows_are_reported() -> None:
     log = RunLog()
     log.add(5, 2.0, TrackState.OK, False)
     log.cpu_s = 0.5
@@ -110,7 +108,7 @@ def test_what_does_not_come_of_rows_is_told_too() -> None:
     assert (told["segments"], told["inconsistent_frames"], told["waiting_frames"]) == (1, 1, {"imu": 2})
 
 
-def test_an_hour_of_frames_takes_no_memory(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_frames(tmp_path: Path) -> None:
     """Rows that were kept took 0.3 kB a frame: tens of MB an hour."""
     spool = Spool(tmp_path / "latency.csv.partial", print)
     log = RunLog(spool)
@@ -126,7 +124,7 @@ def test_an_hour_of_frames_takes_no_memory(tmp_path: Path) -> None:
     spool.close()
 
 
-def test_a_line_that_somebody_changed_is_said() -> None:
+def test_changed_line_is_refused() -> None:
     lines = MemoryLineStore()
     log = RunLog(lines)
     log.add(5, 2.0, TrackState.OK, False)
