@@ -1,15 +1,14 @@
 """Calibration of one or two cameras from views of a flat target, by bundle adjustment.
 
 Estimated together: fx fy cx cy and the lens coefficients of each camera, T_cam1_cam0 and the target's pose in
-each view. Levenberg-Marquardt on the corners' reprojection errors with Huber weights; the poses, each coupled
-to its own view only, are eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern
-synthesis, 2000, section 6.1).
+each view, from the corners' reprojection errors with Huber's loss.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -28,40 +27,14 @@ from share.lab.calibrate.camera_initialisation import (
 )
 from share.lab.calibrate.corners import Detection, robust_sigma
 from share.lab.calibrate.target import Target
+from share.lab.least_squares import ArrowSystem, enclosing_covariance, huber, jackknife, minimise
 from share.types import F64
 
-
-def jackknife(H: F64, g: F64) -> F64:
-    """Return the covariance (S, S) of parameters that V views determine together by H (V, S, S) and g (V, S)
-    each, from how far the solution moves without each view (MacKinnon, Nielsen and Webb, *Cluster-robust
-    inference*, 2023: CV3).
-
-    With few views it has low rank.
-    """
-    moved = np.linalg.solve(H.sum(axis=0) - H, g[..., None])[..., 0]
-    out: F64 = (1 - 1 / len(H)) * moved.T @ moved
-    return out
-
-
-def enclosing_covariance(one: F64, other: F64) -> F64:
-    """Return a covariance (S, S) that is in no direction below `one`, which is positive definite, nor below
-    `other`.
-
-    Where `one` is the unit ball, principal axes of `other` shorter than 1 become 1.
-    """
-    root = np.linalg.cholesky(one)
-    whitened = np.linalg.solve(root, np.linalg.solve(root, other).T)
-    squares, axes = np.linalg.eigh((whitened + whitened.T) / 2)
-    axes_back = root @ axes * np.sqrt(np.maximum(squares, 1))
-    out: F64 = axes_back @ axes_back.T
-    return out
-
-
 MIN_VIEWS = 4
-_MAX_ITERATIONS = 60
+_MAX_STEPS = 60
 _HUBER_SIGMAS = 2.5  # times the residuals' robust sigma
 _K3_SIGMAS = 3.0  # k3 this far from 0 is significant
-_MIN_RELATIVE_DECREASE = 1e-9  # of the cost: converged below
+_CONVERGED = 1e-9  # relative decrease of the cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,16 +129,6 @@ def _with_k3(
     ]
     is_valid = all(lens_problem(camera) is None for camera in with_k3.state.cameras)
     return with_k3 if any(is_significant) and is_valid else without_k3
-
-
-def reprojection_residuals(
-    state: CameraBundleState, views: Sequence[BoardView], target: Target
-) -> tuple[tuple[F64, ...], ...]:
-    """Return residuals (N, 2) px of each view and camera, measured minus predicted."""
-    return tuple(
-        tuple(_linearise(state, view, k, cam, target)[0] for cam in range(len(state.cameras)))
-        for k, view in enumerate(views)
-    )
 
 
 def _board_points(view: BoardView, cam: int, target: Target) -> F64:
@@ -267,100 +230,69 @@ def shared_size(cameras: Sequence[Camera]) -> int:
 
 
 def _solve(views: Sequence[BoardView], target: Target, state: CameraBundleState) -> CameraBundleSolution:
-    """Levenberg-Marquardt in three runs; each fixes the scale of Huber's weights."""
+    """Minimise in three runs; each fixes the limit of Huber's loss."""
     for _ in range(3):
-        blocks = [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
-        limit = _HUBER_SIGMAS * robust_sigma(np.concatenate([r for r, _ in blocks]))
-        state = _levenberg_marquardt(views, target, state, limit)
-    return _solution(views, target, state, limit)
-
-
-def _levenberg_marquardt(
-    views: Sequence[BoardView], target: Target, state: CameraBundleState, limit: float
-) -> CameraBundleState:
-    damping, blocks = 1e-4, [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
-    cost = _cost(blocks, limit)
-    for _ in range(_MAX_ITERATIONS):
-        trial = _updated_state(state, *_solve_step(blocks, limit, damping))
-        trial_blocks = (
-            [_linearise_view(trial, v, k, target) for k, v in enumerate(views)] if trial else blocks
+        residuals, _ = zip(*_linearise_views(state, views, target), strict=True)
+        limit = _HUBER_SIGMAS * robust_sigma(np.concatenate(residuals))
+        minimum = minimise(
+            state, partial(_normal_equations, views, target, limit), _updated_state, _MAX_STEPS, _CONVERGED
         )
-        decrease = cost - _cost(trial_blocks, limit) if trial else -1.0
-        if trial is None or not decrease > 0:
-            damping *= 8
-            if damping > 1e8:
-                break
-            continue
-        state, blocks, cost, damping = trial, trial_blocks, cost - decrease, damping / 5
-        if decrease < _MIN_RELATIVE_DECREASE * cost:
-            break
-    return state
+        state = minimum.state
+    return _solution(views, target, state, *minimum.linearised)
 
 
-def _cost(blocks: list[tuple[F64, F64]], limit: float) -> float:
-    d = np.linalg.norm(np.concatenate([r for r, _ in blocks]), axis=1)
-    if np.isnan(d).any():  # a corner behind the camera
-        return np.inf
-    return float(np.where(d <= limit, d * d / 2, limit * (d - limit / 2)).sum())
+def _linearise_views(
+    state: CameraBundleState, views: Sequence[BoardView], target: Target
+) -> list[tuple[F64, F64]]:
+    return [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
 
 
-def _normal_equations(block: tuple[F64, F64], limit: float) -> tuple[F64, F64]:
-    """Return H (S + 6, S + 6) and g (S + 6,) of one view, with Huber weights."""
-    r, J = block
-    root = np.sqrt(np.minimum(1, limit / np.maximum(np.linalg.norm(r, axis=1), 1e-12)))[:, None]
-    A, b = (J * root[..., None]).reshape(-1, J.shape[2]), (r * root).reshape(-1)
-    return A.T @ A, A.T @ b
+def _normal_equations(
+    views: Sequence[BoardView], target: Target, limit: float, state: CameraBundleState
+) -> tuple[tuple[F64, F64], float]:
+    """Return H (V, S + 6, S + 6) and g (V, S + 6) of each view, and the cost of all."""
+    H, g, cost = [], [], 0.0
+    for r, J in _linearise_views(state, views, target):
+        view_cost, root = huber(np.linalg.norm(r, axis=1), limit)
+        A, b = (J * root[:, None, None]).reshape(-1, J.shape[2]), (r * root[:, None]).reshape(-1)
+        H.append(A.T @ A)
+        g.append(A.T @ b)
+        cost += view_cost
+    return (np.stack(H), np.stack(g)), cost
 
 
-def _solve_step(blocks: list[tuple[F64, F64]], limit: float, damping: float) -> tuple[F64, F64]:
-    """Return the step of the shared parameters (S,) and of the poses (V, 6)."""
-    H, g = _view_normal_equations(blocks, limit)
-    S = H.shape[1] - 6
-    reduced, back_substitution = _schur_complement(H, g, damping)
-    total = reduced.sum(axis=0)
-    damped = damping * np.diag(np.diag(H[:, :S, :S].sum(axis=0)))
-    shared = np.linalg.solve(total[:, :S] + damped, total[:, S])
-    return shared, back_substitution[..., -1] - back_substitution[..., :S] @ shared
-
-
-def _view_normal_equations(blocks: list[tuple[F64, F64]], limit: float) -> tuple[F64, F64]:
-    """Return `_normal_equations` of all views: H (V, S + 6, S + 6) and g (V, S + 6)."""
-    H, g = zip(*(_normal_equations(block, limit) for block in blocks), strict=True)
-    return np.stack(H), np.stack(g)
-
-
-def _schur_complement(H: F64, g: F64, damping: float) -> tuple[F64, F64]:
-    """Eliminate each view's pose: return H and g of the shared parameters side by side, (V, S, S + 1), and
-    the back substitution of the pose by them, with its own step last, (V, 6, S + 1)."""
-    S = H.shape[1] - 6
-    Hpp = H[:, S:, S:] * (1 + damping * np.eye(6))
-    back_substitution = np.linalg.solve(Hpp, np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
-    return np.concatenate([H[:, :S, :S], g[:, :S, None]], axis=2) - H[
-        :, :S, S:
-    ] @ back_substitution, back_substitution
-
-
-def _updated_state(state: CameraBundleState, shared: F64, poses: F64) -> CameraBundleState | None:
-    """Return the state after a step, None where that is no valid camera."""
+def _updated_state(
+    state: CameraBundleState, normals: tuple[F64, F64], damping: float
+) -> CameraBundleState | None:
+    """Return the state after a step, None where there is no step, or it leads to no valid camera."""
+    H, g = normals
+    S = shared_size(state.cameras)
+    system = ArrowSystem(
+        H[:, None, S:, S:], H[:, S:, :S], H[:, :S, :S].sum(axis=0), g[:, S:], g[:, :S].sum(axis=0)
+    )
     try:
+        poses, shared = system.solve(damping)
         cameras = tuple(
             camera_from_parameters(intrinsics(camera) + shared[part], camera)
             for camera, part in zip(state.cameras, state.intrinsic_slices, strict=True)
         )
-    except ValueError:
+    except ValueError:  # LinAlgError is one
         return None
     mount = state.T_cam1_cam0 @ se3.exp(shared[-6:]) if len(cameras) == 2 else state.T_cam1_cam0
     return CameraBundleState(cameras, mount, state.T_cam0_target @ se3.exp(poses))
 
 
 def _solution(
-    views: Sequence[BoardView], target: Target, state: CameraBundleState, limit: float
+    views: Sequence[BoardView], target: Target, state: CameraBundleState, H: F64, g: F64
 ) -> CameraBundleSolution:
-    blocks = [_linearise_view(state, view, k, target) for k, view in enumerate(views)]
-    reduced, _ = _schur_complement(*_view_normal_equations(blocks, limit), damping=0.0)
-    sigma_px = robust_sigma(np.concatenate([r for r, _ in blocks]))
-    H, g = reduced[..., :-1], reduced[..., -1]
-    independent = sigma_px**2 * np.linalg.inv(H.sum(axis=0))
-    return CameraBundleSolution(
-        state, independent, jackknife(H, g), reprojection_residuals(state, views, target), sigma_px
+    S = shared_size(state.cameras)
+    eliminated = np.linalg.solve(H[:, S:, S:], np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
+    reduced_H = H[:, :S, :S] - H[:, :S, S:] @ eliminated[..., :S]
+    reduced_g = g[:, :S] - (H[:, :S, S:] @ eliminated[..., S:])[..., 0]
+    residuals = tuple(
+        tuple(_linearise(state, view, k, cam, target)[0] for cam in range(len(state.cameras)))
+        for k, view in enumerate(views)
     )
+    sigma_px = robust_sigma(np.concatenate([r for view in residuals for r in view]))
+    independent = sigma_px**2 * np.linalg.inv(reduced_H.sum(axis=0))
+    return CameraBundleSolution(state, independent, jackknife(reduced_H, reduced_g), residuals, sigma_px)

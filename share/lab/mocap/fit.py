@@ -15,11 +15,11 @@ import numpy as np
 from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
+from share.lab.least_squares import ArrowFactor
+from share.lab.mocap.factors import ImuChain
 from share.lab.mocap.initialisation import initial_rotation, initial_state, nearest_axis_rotation, up_vector
 from share.lab.mocap.offset import find_offset
-from share.lab.mocap.problem import CHECK, BatchSolution, MocapImuProblem, node_covariances
-from share.lab.mocap.residuals import FitResiduals, compute_residuals
-from share.lab.mocap.scale import axis_scales
+from share.lab.mocap.problem import CHECK, BatchSolution, MocapImuProblem, axis_scales
 from share.lab.mocap.state import MocapFitOptions
 from share.lab.mocap.trajectory import MocapTrajectory, check_imu, find_gaps
 from share.types import F64, I64, ImuBatch
@@ -27,6 +27,28 @@ from share.types import F64, I64, ImuBatch
 _END_MARGIN_NS = 50_000_000  # mocap nearer to the ends is left out: the final offset may shift it beyond
 _MIN_DURATION_S = 2.0
 _MAX_RMS_MM = 100.0  # a path farther from the mocap is another motion
+
+
+@dataclass(frozen=True, eq=False)
+class FitResiduals:
+    """position_mm, rotation_deg: rms distance of the path from the inlier mocap samples. position_sigmas: the
+    former in units of the stated mocap noise. position_p95_mm, rotation_p95_deg: of all samples. samples:
+    their number. doubted: outlier fraction.
+
+    imu_sigmas (6,): rms residual of rotation (x, y, z) and velocity change (x, y, z) between nodes, in units
+    of the data sheet's noise. gyro (3,) rad/s, accel (3,) m/s^2: the same as mean rates.
+    """
+
+    position_mm: float
+    rotation_deg: float
+    position_sigmas: float
+    position_p95_mm: float
+    rotation_p95_deg: float
+    samples: int
+    doubted: float
+    imu_sigmas: F64
+    gyro: F64
+    accel: F64
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +196,7 @@ def _make_fit(batch: MocapImuProblem, solved: BatchSolution, coarse_ns: int, tur
     sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
     distances = np.linalg.norm((solved.observations.residual * sigma).reshape(-1, 2, 3), axis=2)
     chain = solved.chain.without_breaks(batch.is_break)
-    fit_residuals = compute_residuals(
+    fit_residuals = _residual_statistics(
         chain, dt, options.imu_inflation, distances[:, 1], distances[:, 0], inliers, options.sigma_position
     )
     if not fit_residuals.position_mm < _MAX_RMS_MM:
@@ -182,7 +204,7 @@ def _make_fit(batch: MocapImuProblem, solved: BatchSolution, coarse_ns: int, tur
     offset_ns = coarse_ns + round(state.offset_s * 1e9)
     inlier_stamps = state.in_imu_clock(batch.mocap.stamps_ns[inliers])
     scales, scales_cov = axis_scales(solved, batch.mocap, options.sigma_position, batch.sample_weight)
-    covs = node_covariances(solved.normal, solved.cov_shared)
+    covs = solved.system.node_covariances()
     return MocapFit(
         stamps_ns=state.stamps_ns,
         T_world_body=se3.from_rt(state.R, state.p),
@@ -195,7 +217,7 @@ def _make_fit(batch: MocapImuProblem, solved: BatchSolution, coarse_ns: int, tur
         T_body_mocap=state.T_body_mocap,
         offset_ns=offset_ns,
         drift_ppm=state.drift * 1e6,
-        cov_shared=solved.cov_shared,
+        cov_shared=ArrowFactor(solved.system).border_covariance,
         cov_poses=_right_perturbed(state.R, covs[:, :6, :6]),
         scale_error=np.abs(turn.T) @ scales,
         scale_error_sigma=np.abs(turn.T) @ np.sqrt(np.diag(scales_cov)),
@@ -227,3 +249,31 @@ def _right_perturbed(R: F64, cov: F64) -> F64:
     J = np.tile(np.eye(6), (len(R), 1, 1))
     J[:, 3:, 3:] = R.swapaxes(1, 2)
     return np.asarray(J @ cov @ J.swapaxes(1, 2), np.float64)
+
+
+def _residual_statistics(
+    chain: ImuChain, dt: F64, inflation: float, distances: F64, angles: F64, inliers: np.ndarray, noise: float
+) -> FitResiduals:
+    """Return statistics of a chain with intervals dt (M,) s and inflated noise, and of distances (K,) m
+    and angles (K,) rad from the mocap. noise: stated sigma of the mocap on each axis, m."""
+    rows = [0, 1, 2, 6, 7, 8]
+    sigma = np.sqrt(np.diagonal(chain.cov, axis1=1, axis2=2))[:, rows] / inflation
+    raw = chain.raw[:, rows]
+    rates = _rms(raw / dt[:, None])
+    mm, deg = distances * 1e3, np.degrees(angles)
+    return FitResiduals(
+        position_mm=float(_rms(mm[inliers])),
+        rotation_deg=float(_rms(deg[inliers])),
+        position_sigmas=float(_rms(distances[inliers])) / (noise * np.sqrt(3)),
+        position_p95_mm=float(np.percentile(mm, 95)),
+        rotation_p95_deg=float(np.percentile(deg, 95)),
+        samples=len(mm),
+        doubted=float(1 - inliers.mean()),
+        imu_sigmas=_rms(raw / sigma),
+        gyro=rates[:3],
+        accel=rates[3:],
+    )
+
+
+def _rms(values: F64) -> F64:
+    return np.asarray(np.sqrt((values**2).mean(0)), np.float64)

@@ -19,7 +19,6 @@ from helpers.camera_imu_sim import (
 from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.lab.calibrate.camera_imu import normal_equations
-from share.lab.calibrate.camera_imu.arrow_solver import arrow_system, solve_arrow
 from share.lab.calibrate.camera_imu.corner_observations import corner_observations
 from share.lab.calibrate.camera_imu.fit import CameraImuFit, fit_camera_imu
 from share.lab.calibrate.camera_imu.initialisation import align_clocks
@@ -28,6 +27,7 @@ from share.lab.calibrate.camera_imu.spline import EXTRA_KNOTS, ORDER, Curve
 from share.lab.calibrate.camera_imu.state import KNOTS, LOCAL_COLUMNS, SHARED, CameraImuState, node_count
 from share.lab.calibrate.camera_imu.verdict import compare_mountings, judge_camera_imu
 from share.lab.calibrate.camera_initialisation import camera_from_parameters, intrinsics
+from share.lab.least_squares import ArrowFactor
 from share.types import F64
 
 SIGMAS = normal_equations.Sigmas(0.1, 3e-3, 2e-2, huber=1e6)
@@ -112,7 +112,9 @@ def test_the_gradient_is_that_of_the_cost(state: CameraImuState) -> None:
         run.stamps_ns, run.views, TARGET, (run.rig.cam0, run.rig.cam1), run.rig.T_cam1_cam0
     )
     sigmas = replace(SIGMAS, huber=30.0)
-    system = arrow_system(normal_equations.segment_normals(state, seen, run.imu, sigmas), state)
+    system = normal_equations.arrow_system(
+        normal_equations.segment_normals(state, seen, run.imu, sigmas), state
+    )
     rng = np.random.default_rng(5)
     for _ in range(3):
         knots, border = rng.normal(size=(len(state.curve.p), 6)), rng.normal(size=system.g_border.shape)
@@ -120,7 +122,7 @@ def test_the_gradient_is_that_of_the_cost(state: CameraImuState) -> None:
             normal_equations.segment_normals(state.updated(s * knots, s * border), seen, run.imu, sigmas).cost
             for s in (-1e-6, 1e-6)
         )
-        down = system.g_knots @ knots.reshape(-1) + system.g_border @ border
+        down = (system.g_nodes * knots).sum() + system.g_border @ border
         assert (low - high) / 2e-6 == pytest.approx(down, rel=1e-4)
 
 
@@ -137,12 +139,15 @@ def test_the_arrow_is_solved_as_a_dense_system(state: CameraImuState) -> None:
         own = np.concatenate([6 * k + np.arange(KNOTS), size + np.arange(SHARED), first + np.arange(12)])
         H[np.ix_(own, own)] += one.H[k]
         g[own] += one.g[k]
-    system = arrow_system(one, state)
+    system = normal_equations.arrow_system(one, state)
     held = 1e3 * np.eye(SHARED + state.biases.size)
-    knots, border, covariance = solve_arrow(replace(system, corner=system.corner + held), 0.0)
+    factor = ArrowFactor(replace(system, corner=system.corner + held))
+    knots, border = factor.solve(system.g_nodes, system.g_border)
     H[size:, size:] += held
     np.testing.assert_allclose(np.append(knots, border), np.linalg.solve(H, g), rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(covariance, np.linalg.inv(H)[size:, size:], rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(
+        factor.border_covariance, np.linalg.inv(H)[size:, size:], rtol=1e-5, atol=1e-12
+    )
 
 
 def test_without_noise_and_without_a_guess_all_is_found() -> None:

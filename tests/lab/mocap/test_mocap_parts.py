@@ -1,6 +1,4 @@
-"""Preintegration, derivatives, the banded solver and the clocks, each against something simpler."""
-
-from dataclasses import replace
+"""Preintegration, derivatives, normal equations and clock offset, each against something simpler."""
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from share.lab.mocap import factors
 from share.lab.mocap.factors import preintegrate
 from share.lab.mocap.initialisation import initial_rotation
 from share.lab.mocap.offset import find_offset
-from share.lab.mocap.problem import node_covariances, normal_equations, solve_bordered
+from share.lab.mocap.problem import normal_equations
 from share.lab.mocap.state import NODE_SIZE, SHARED_SIZE, MocapImuState
 from share.types import F64, I64, ImuBatch
 
@@ -108,30 +106,33 @@ def test_derivatives_are_those_of_the_residuals(rng: np.random.Generator, shared
         )
 
 
-def test_banded_solution_is_the_dense_one(rng: np.random.Generator) -> None:
+def test_normal_equations_are_those_of_all_residuals_stacked(rng: np.random.Generator) -> None:
     state = start_state(rng)
     chain, seen = factors.imu_chain(state, IMU, NOISE, G, NO_BREAK), seen_at(state)
-    n, ones = len(NODES), np.ones(len(seen.node))
-    normal = normal_equations(chain, seen, ones, np.full(SHARED_SIZE, 1e3), np.zeros(SHARED_SIZE), n)
-    normal = replace(normal, diagonal=normal.diagonal + 1e2 * np.eye(NODE_SIZE))
-    size = n * NODE_SIZE
-    H = np.zeros((size + SHARED_SIZE, size + SHARED_SIZE))
+    n, weight = len(NODES), rng.uniform(0.2, 1, len(seen.node))
+    prior, deviation = rng.uniform(1, 2, SHARED_SIZE), rng.normal(size=SHARED_SIZE)
+    system = normal_equations(chain, seen, weight, prior, deviation, n)
+    J = np.zeros((len(chain.residual) * 15 + len(weight) * 6, n * NODE_SIZE + SHARED_SIZE))
+    by_chain, by_mocap = np.split(J, [len(chain.residual) * 15])
+    for i, (before, after) in enumerate(zip(chain.jacobian_before, chain.jacobian_after, strict=True)):
+        by_chain[i * 15 : i * 15 + 15, i * NODE_SIZE : (i + 2) * NODE_SIZE] = np.hstack([before, after])
+    for k, node in enumerate(seen.node):
+        rows = by_mocap[6 * k : 6 * k + 6]
+        rows[:, node * NODE_SIZE : (node + 1) * NODE_SIZE] = seen.jacobian_node[k]
+        rows[:, -SHARED_SIZE:] = seen.jacobian_shared[k]
+    weights = np.concatenate([np.ones(len(by_chain)), np.repeat(weight, 6)])
+    H = J.T @ (J * weights[:, None])
+    g = -J.T @ (np.concatenate([chain.residual.ravel(), seen.residual.ravel()]) * weights)
+    np.testing.assert_allclose(system.corner, H[-SHARED_SIZE:, -SHARED_SIZE:] + np.diag(prior), rtol=1e-9)
+    np.testing.assert_allclose(system.g_border, g[-SHARED_SIZE:] - prior * deviation, rtol=1e-9)
+    np.testing.assert_allclose(system.g_nodes.ravel(), g[:-SHARED_SIZE], rtol=1e-9, atol=1e-6)
     for i in range(n):
-        at = slice(i * NODE_SIZE, (i + 1) * NODE_SIZE)
-        H[at, at] = normal.diagonal[i]
-        H[at, size:], H[size:, at] = normal.border[i], normal.border[i].T
+        own = slice(i * NODE_SIZE, (i + 1) * NODE_SIZE)
+        ahead = slice((i + 1) * NODE_SIZE, (i + 2) * NODE_SIZE)
+        np.testing.assert_allclose(system.blocks[i, 0], H[own, own], rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(system.edge[i], H[own, -SHARED_SIZE:], rtol=1e-9, atol=1e-6)
         if i + 1 < n:
-            after = slice((i + 1) * NODE_SIZE, (i + 2) * NODE_SIZE)
-            H[after, at], H[at, after] = normal.below[i], normal.below[i].T
-    H[size:, size:] = normal.corner
-    b = np.concatenate([normal.b_nodes.ravel(), normal.b_shared])
-    nodes, shared, cov = solve_bordered(normal, 0.0)
-    expected, inverse = -np.linalg.solve(H, b), np.linalg.inv(H)
-    np.testing.assert_allclose(np.concatenate([nodes.ravel(), shared]), expected, rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(cov, inverse[size:, size:], rtol=1e-4, atol=1e-12)
-    for i, block in enumerate(node_covariances(normal, cov)):
-        at = slice(i * NODE_SIZE, (i + 1) * NODE_SIZE)
-        np.testing.assert_allclose(block, inverse[at, at], rtol=1e-3, atol=1e-9)
+            np.testing.assert_allclose(system.blocks[i, 1], H[own, ahead], rtol=1e-9, atol=1e-6)
 
 
 @pytest.mark.parametrize("offset_s", [0.0, 0.21, -7.3, 1e6])

@@ -12,6 +12,7 @@ from share.geometry.camera import Camera
 from share.lab.calibrate.camera_bundle import BoardView, intrinsic_slices, shared_size
 from share.lab.calibrate.camera_initialisation import project_with_jacobians, transform_with_jacobian
 from share.lab.calibrate.target import Target
+from share.lab.least_squares import huber
 from share.types import F64, I64
 
 
@@ -103,41 +104,36 @@ class PoseNormals:
 
 
 def pose_normals(
-    observations: CornerObservations, T_target_cam0: F64, sigma_px: float, huber: float
+    observations: CornerObservations, T_target_cam0: F64, sigma_px: float, limit: float
 ) -> PoseNormals:
-    """Return the normal equations of all corners, whitened by sigma_px, with Huber weights beyond `huber`
+    """Return the normal equations of all corners, whitened by sigma_px, with Huber weights beyond `limit`
     sigmas."""
     H, g, cost = np.zeros((len(T_target_cam0), 6, 6)), np.zeros((len(T_target_cam0), 6)), 0.0
     for cam, one in enumerate(observations.corners):
         if len(one.frame) == 0:
             continue
         r, J = corner_residuals(observations, cam, T_target_cam0)
-        d = np.linalg.norm(r, axis=1) / sigma_px
-        if np.isnan(d).any():
-            return PoseNormals(H, g, np.inf)
-        root = _root_weights(d, huber)[:, None] / sigma_px
+        camera_cost, root = huber(np.linalg.norm(r, axis=1) / sigma_px, limit)
+        cost += camera_cost
+        if not np.isfinite(cost):
+            break
+        root = root[:, None] / sigma_px
         A, b = J * root[..., None], r * root
         first = np.flatnonzero(np.diff(one.frame, prepend=-1))
         H[one.frame[first]] += np.add.reduceat(A.swapaxes(1, 2) @ A, first)
         g[one.frame[first]] += np.add.reduceat((A.swapaxes(1, 2) @ b[..., None])[..., 0], first)
-        cost += float(np.where(d <= huber, d * d / 2, huber * (d - huber / 2)).sum())
     return PoseNormals(H, g, cost)
 
 
 def rig_cross_terms(
-    observations: CornerObservations, T_target_cam0: F64, sigma_px: float, huber: float
+    observations: CornerObservations, T_target_cam0: F64, sigma_px: float, limit: float
 ) -> F64:
     """Return the cross terms (F, 6, S) of the normal equations between each frame's eta and the rig's
     parameters, with the weights of `pose_normals`."""
     out = np.zeros((len(T_target_cam0), 6, shared_size(observations.cameras)))
     for cam, one in enumerate(observations.corners):
         r, J = corner_residuals(observations, cam, T_target_cam0)
-        weight = (_root_weights(np.linalg.norm(r, axis=1) / sigma_px, huber) / sigma_px) ** 2
+        weight = (huber(np.linalg.norm(r, axis=1) / sigma_px, limit)[1] / sigma_px) ** 2
         crossed = J.swapaxes(1, 2) @ (rig_jacobian(observations, cam, T_target_cam0) * weight[:, None, None])
         np.add.at(out, one.frame, crossed)
     return out
-
-
-def _root_weights(d: F64, huber: float) -> F64:
-    """Return the square roots of Huber's weights (C,) for residuals of d (C,) sigmas."""
-    return np.sqrt(np.minimum(1, huber / np.maximum(d, 1e-12)))

@@ -1,8 +1,7 @@
 """Extrinsics and time offset of camera and IMU, by a batch fit of a continuous-time trajectory.
 
 Method: Furgale, Rehder, Siegwart, *Unified temporal and spatial calibration for multi-sensor systems* (IROS
-2013), with the splines of spline.py. Levenberg-Marquardt; the sigmas of corners and IMU are estimated from
-residuals.
+2013), with the splines of spline.py. The sigmas of corners and IMU are estimated from residuals.
 """
 
 from __future__ import annotations

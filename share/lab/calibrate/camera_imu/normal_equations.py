@@ -1,4 +1,5 @@
-"""Normal equations of corners and IMU, segment by segment of the curve; L = LOCAL_COLUMNS."""
+"""Normal equations of corners and IMU, segment by segment of the curve, and the system of all; L =
+LOCAL_COLUMNS."""
 
 from __future__ import annotations
 
@@ -25,6 +26,7 @@ from share.lab.calibrate.camera_imu.state import (
     CameraImuState,
     body_twist,
 )
+from share.lab.least_squares import ArrowSystem
 from share.types import F64, I64, ImuBatch
 
 _SHARED = slice(KNOTS, KNOTS + SHARED)
@@ -133,6 +135,49 @@ def _add_imu(out: SegmentNormals, state: CameraImuState, imu: ImuBatch, sigmas: 
         out.H[k] += A.T @ A
         out.g[k] += A.T @ r[first:last].reshape(-1)
     return float((r**2).sum() / 2)
+
+
+def arrow_system(segments: SegmentNormals, state: CameraImuState) -> ArrowSystem:
+    """Assemble all segments: K knots, each coupled to the five after it, and a border of SHARED + 6 M
+    columns."""
+    S, K, border = state.curve.segments, len(state.curve.p), SHARED + state.biases.size
+    blocks, edge = np.zeros((K, ORDER, 6, 6)), np.zeros((K, 6, border))
+    corner = np.zeros((border, border))
+    spans = _bias_intervals(state)
+    for a in range(ORDER):
+        rows = slice(6 * a, 6 * a + 6)
+        for b in range(a, ORDER):
+            blocks[a : a + S, b - a] += segments.H[:, rows, 6 * b : 6 * b + 6]
+        for part, columns in spans:
+            edge[a : a + S][part][:, :, columns] += segments.H[part, rows, KNOTS:LOCAL_COLUMNS]
+    for part, columns in spans:
+        corner[np.ix_(columns, columns)] += segments.H[part, KNOTS:, KNOTS:].sum(axis=0)
+    return ArrowSystem(blocks, edge, corner, *gather_gradient(segments.g, state))
+
+
+def gather_gradient(g: F64, state: CameraImuState) -> tuple[F64, F64]:
+    """Sum gradients by local columns, (S, L, ...), into those of the knots (K, 6, ...) and of the border (B,
+    ...)."""
+    S, K, more = state.curve.segments, len(state.curve.p), g.shape[2:]
+    knots, border = np.zeros((K, 6, *more)), np.zeros((SHARED + state.biases.size, *more))
+    for a in range(ORDER):
+        knots[a : a + S] += g[:, 6 * a : 6 * a + 6]
+    for part, columns in _bias_intervals(state):
+        border[columns] += g[part, KNOTS:].sum(axis=0)
+    return knots, border
+
+
+def _bias_intervals(state: CameraImuState) -> list[tuple[slice, np.ndarray]]:
+    """Return the segments of each bias interval, and the border's columns that they involve."""
+    starts = range(0, state.curve.segments, state.per_node)
+    shared, own = np.arange(SHARED), SHARED + np.arange(12)
+    return [
+        (
+            slice(start, min(start + state.per_node, state.curve.segments)),
+            np.concatenate([shared, own + 6 * k]),
+        )
+        for k, start in enumerate(starts)
+    ]
 
 
 def on_curve_mask(curve: Curve, stamps_ns: I64, shift_s: float, margin_s: float) -> np.ndarray:
