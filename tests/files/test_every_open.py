@@ -88,8 +88,8 @@ ALLOWED = {
     ("runtime/capture.py", "open"): "a camera",
     ("lab/evaluate/tracker_runs.py", "loads"): "the answer of a program that the user names",
     ("lab/evaluate/real_time.py", "loads"): "events of the edge that it started itself",
-    ("lab/train/optimisation.py", "load"): "weights only, from bytes that are bounded",
-    ("lab/train/optimisation.py", "save"): MEMORY,
+    ("lab/train/training.py", "load"): "weights only, from bytes that are bounded",
+    ("lab/train/training.py", "save"): MEMORY,
 }  # fmt: skip
 
 
