@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,9 +79,9 @@ def mocap(
     \b
     Example:  share calibrate mocap walk.mcap --truth walk.vicon.tum --out calib/mine
     """
-    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, writable_dir
     from share.lab.calibrate.imu_table import read_imu, stated_noise
+    from share.lab.calibrate.report import to_json
     from share.lab.mocap.files import pick_body, read_bodies
     from share.lab.mocap.fit import fit_mocap
     from share.lab.mocap.report import mocap_yaml, report_values
@@ -102,7 +101,7 @@ def mocap(
         check_fit(result)
         stages("fitting", 1, 1)
     hand_eye_check = _check_with_track(result, track, trajectory) if track else None
-    report = json.dumps(nan_to_none(report_values(result, source, str(truth), hand_eye_check)), indent=1)
+    report = to_json(report_values(result, source, str(truth), hand_eye_check))
     atomic_write(out / "mocap.yaml", mocap_yaml(result, source, str(truth)))
     atomic_write(out / "mocap-report.json", report + "\n")
     click.echo(report if as_json else _summary(result, hand_eye_check))

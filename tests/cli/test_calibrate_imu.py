@@ -57,7 +57,7 @@ def test_the_picture_wants_no_fonts_for_formulas(share, table, tmp_path, monkeyp
 def test_what_five_minutes_do_not_tell_is_said(share, table, tmp_path):
     done = share("calibrate", "imu", table, "--out", tmp_path, "--json")
     report = json.loads(done.out)
-    assert not report["gyroscope"]["walk"]["told"]
+    assert not report["gyroscope"]["walk"]["significant"]
     assert "gyroscope K cannot be measured in 5 min; the file has an upper bound" in done.err
     text = (tmp_path / "kalibr_imu_chain.yaml").read_text()
     line = next(row for row in text.splitlines() if "gyroscope_random_walk" in row)

@@ -22,7 +22,7 @@ def test_true_figures_lie_within_the_stated_errors():
     axes = [
         a for seed in range(2) for a in fit_noise(allan_deviation(made(seed, 1200, 50), 50), model_error=0)
     ]
-    assert all(axis.density.told for axis in axes) and np.mean([axis.walk.told for axis in axes]) > 0.7
+    assert all(axis.density.significant for axis in axes) and np.mean([axis.walk.significant for axis in axes]) > 0.7
     for k, truth in ((1, N), (3, K)):
         off = np.array([(axis.squares[k] - truth**2) / axis.errors[k] for axis in axes])
         assert 0.6 < np.sqrt(np.mean(off**2)) < 1.5
@@ -46,7 +46,7 @@ def test_figures_do_not_depend_on_the_rate():
 
 def test_white_noise_alone_has_a_bound_for_the_walk_and_no_number():
     axes = fit_noise(allan_deviation(made(4, 600, 50, k=0), 50))
-    assert sum(axis.walk.told for axis in axes) <= 1
+    assert sum(axis.walk.significant for axis in axes) <= 1
     assert all(axis.walk.bound < K for axis in axes)
     assert combine_axes(axes, "density").value == pytest.approx(N, rel=0.01)
 
@@ -54,7 +54,7 @@ def test_white_noise_alone_has_a_bound_for_the_walk_and_no_number():
 def test_a_bound_is_above_the_truth_in_most_short_recordings():
     """One minute, in which the walk does not yet show."""
     axes = [a for seed in range(3) for a in fit_noise(allan_deviation(made(seed, 60, 50), 50))]
-    assert np.mean([axis.walk.told for axis in axes]) < 0.4
+    assert np.mean([axis.walk.significant for axis in axes]) < 0.4
     assert np.mean([axis.walk.bound > K for axis in axes]) >= 0.85
 
 
@@ -75,7 +75,7 @@ def test_flicker_noise_is_bias_instability():
     # add up to (1 / f) / (ln(10) / 2), and B^2 / (2 pi f) is two-sided, so B^2 = pi / (ln(10) / 2)
     expected = np.sqrt(np.pi / (np.log(10) / 2))
     found = combine_axes(fit_noise(allan_deviation(flicker, 1.0)), "instability")
-    assert found.told and found.value == pytest.approx(expected, rel=0.06)
+    assert found.significant and found.value == pytest.approx(expected, rel=0.06)
 
 
 def test_coarse_digits_are_quantisation_and_not_white_noise():
@@ -84,7 +84,7 @@ def test_coarse_digits_are_quantisation_and_not_white_noise():
     angle = Q * rng.standard_normal((60_001, 3))
     axes = fit_noise(allan_deviation(np.diff(angle, axis=0) * rate_hz + made(8, 1200, rate_hz, 3), rate_hz))
     assert [axis.quantisation.value for axis in axes] == pytest.approx([Q] * 3, rel=0.05)
-    assert all(axis.quantisation.told for axis in axes)
+    assert all(axis.quantisation.significant for axis in axes)
     assert combine_axes(axes, "density").value == pytest.approx(N, rel=0.03)
 
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from share.lab.calibrate.camera_report import output_paths
+from share.lab.calibrate.report import output_paths
 
 
 def test_what_is_to_be_believed_takes_the_place(tmp_path: Path) -> None:
