@@ -138,7 +138,7 @@ def _summary(result: MocapFit, hand_eye_check: HandEyeCheck | None) -> str:
         f"clock           IMU minus mocap {result.offset_ns * 1e-6:+.2f} ± {sigma[8] * 1e3:.2f} ms, "
         f"drift {result.drift_ppm:+.1f} ± {sigma[9] * 1e6:.1f} ppm",
         f"residuals       {residuals.position_mm:.1f} mm, {residuals.rotation_deg:.2f} deg rms of "
-        f"{residuals.samples} poses, {100 * residuals.doubted:.1f} % outliers",
+        f"{residuals.samples} poses, {100 * residuals.outlier_share:.1f} % outliers",
     ]
     if hand_eye_check:
         lines.append(

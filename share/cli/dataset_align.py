@@ -129,7 +129,7 @@ def align(
         results = write_session(work, devices, _fit_settings(**fitting), stages)
     click.echo(json.dumps(results) if as_json else _result_table(results))
     for name, one in results.items():
-        for line in (*_axis_warnings(one), *one["doubts"]):
+        for line in (*_axis_warnings(one), *one["warnings"]):
             click.echo(f"share: {name}: {line}", err=True)
     if not as_json:
         click.echo(f"{out}: ready; play it: share evaluate run {out} --virtual --out RUN")
@@ -258,15 +258,15 @@ def _result_table(results: dict[str, Any]) -> str:
             f"{one['drift_ppm']:+.1f}",
             f"{one['correlation']:.3f}",
             f"{one['next_correlation']:.3f}",
-            f"{one['body_turned_deg']:.2f}",
-            f"{one['body_turned_sigma_deg']:.2f}",
-            f"{one['body_shifted_mm']:.1f}",
-            f"{one['body_shifted_sigma_mm']:.1f}",
+            f"{one['mounting_rotation_deg']:.2f}",
+            f"{one['mounting_rotation_sigma_deg']:.2f}",
+            f"{one['mounting_translation_mm']:.1f}",
+            f"{one['mounting_translation_sigma_mm']:.1f}",
             one["up"],
             f"{one['tilt_deg']:.3f}",
-            f"{one['left_mm']:.1f}",
-            f"{one['left_deg']:.2f}",
-            f"{100 * one['doubted']:.1f}",
+            f"{one['residual_mm']:.1f}",
+            f"{one['residual_deg']:.2f}",
+            f"{100 * one['outlier_share']:.1f}",
             f"{len(one['gaps_s'])}",
             f"{one['truth_s']:.1f}",
         ]

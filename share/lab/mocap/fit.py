@@ -26,6 +26,9 @@ from share.types import F64, I64, ImuBatch
 
 _END_MARGIN_NS = 50_000_000  # mocap nearer to the ends is left out: the final offset may shift it beyond
 _MIN_DURATION_S = 2.0
+_NODE_NS = 50_000_000  # between nodes
+_MAX_INTEGRATED_NS = 10 * 10**9  # the IMU is not integrated across longer mocap gaps
+_MIN_SPACING_NS = 4_000_000  # denser mocap samples are thinned
 _MAX_RMS_MM = 100.0  # a path farther from the mocap is another motion
 
 
@@ -33,7 +36,7 @@ _MAX_RMS_MM = 100.0  # a path farther from the mocap is another motion
 class FitResiduals:
     """position_mm, rotation_deg: rms distance of the path from the inlier mocap samples. position_sigmas: the
     former in units of the stated mocap noise. position_p95_mm, rotation_p95_deg: of all samples. samples:
-    their number. doubted: outlier fraction.
+    their number.
 
     imu_sigmas (6,): rms residual of rotation (x, y, z) and velocity change (x, y, z) between nodes, in units
     of the data sheet's noise. gyro (3,) rad/s, accel (3,) m/s^2: the same as mean rates.
@@ -45,7 +48,7 @@ class FitResiduals:
     position_p95_mm: float
     rotation_p95_deg: float
     samples: int
-    doubted: float
+    outlier_share: float
     imu_sigmas: F64
     gyro: F64
     accel: F64
@@ -115,11 +118,11 @@ def fit_mocap(
     check_imu(imu)
     inflated = _inflated_noise(noise, options.imu_inflation)
     coarse_ns = 0 if options.within_s == 0 else find_offset(imu, mocap, options.within_s).offset_ns
-    overlap = _overlap(imu, mocap.shifted(coarse_ns)).thinned(round(1e9 / options.max_hz))
+    overlap = _overlap(imu, mocap.shifted(coarse_ns)).thinned(_MIN_SPACING_NS)
     guess, bias = _initial_mounting(imu, overlap, options)
     up_rotation = nearest_axis_rotation(up_vector(overlap, imu, guess))
     overlap = overlap.rotated(up_rotation)
-    nodes, breaks = _node_stamps(overlap, options)
+    nodes, breaks = _node_stamps(overlap)
     batch = MocapImuProblem(imu, inflated, _without_ends(overlap, nodes, breaks), breaks, guess, options)
     return _make_fit(
         batch, batch.solve_robustly(initial_state(nodes, imu, overlap, guess, bias)), coarse_ns, up_rotation
@@ -156,22 +159,20 @@ def _initial_mounting(imu: ImuBatch, mocap: MocapTrajectory, options: MocapFitOp
     return se3.from_rt(R, np.zeros(3)), bias
 
 
-def _node_stamps(mocap: MocapTrajectory, options: MocapFitOptions) -> tuple[I64, np.ndarray]:
+def _node_stamps(mocap: MocapTrajectory) -> tuple[I64, np.ndarray]:
     """Return evenly spaced nodes (N,) ns, none in gaps that break the chain or in parts too short to fit,
     and (N - 1,) bool: where the chain breaks."""
-    step = round(options.node_s * 1e9)
-    nodes = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] + 1, step)
-    longest = round(options.max_integrated_s * 1e9)
-    for start, end in find_gaps(mocap.stamps_ns, longest):
+    nodes = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] + 1, _NODE_NS)
+    for start, end in find_gaps(mocap.stamps_ns, _MAX_INTEGRATED_NS):
         nodes = nodes[(nodes <= start) | (nodes >= end)]
-    parts = np.split(nodes, np.flatnonzero(np.diff(nodes) > longest) + 1)
-    parts = [part for part in parts if len(part) * step > _MIN_DURATION_S * 1e9]
+    parts = np.split(nodes, np.flatnonzero(np.diff(nodes) > _MAX_INTEGRATED_NS) + 1)
+    parts = [part for part in parts if len(part) * _NODE_NS > _MIN_DURATION_S * 1e9]
     if not parts:
         raise DataError(
             f"mocap: the body is never seen for {_MIN_DURATION_S:.0f} s without a gap; record again"
         )
     nodes = np.concatenate(parts)
-    return nodes, np.diff(nodes) > longest
+    return nodes, np.diff(nodes) > _MAX_INTEGRATED_NS
 
 
 def _without_ends(mocap: MocapTrajectory, nodes: I64, breaks: np.ndarray) -> MocapTrajectory:
@@ -268,7 +269,7 @@ def _residual_statistics(
         position_p95_mm=float(np.percentile(mm, 95)),
         rotation_p95_deg=float(np.percentile(deg, 95)),
         samples=len(mm),
-        doubted=float(1 - inliers.mean()),
+        outlier_share=float(1 - inliers.mean()),
         imu_sigmas=_rms(raw / sigma),
         gyro=rates[:3],
         accel=rates[3:],

@@ -22,7 +22,9 @@ CHECK = (
     "check units (m, rad/s, m/s^2), the order of quaternions (TUM: qx qy qz qw; .csv: qw qx qy qz), and that "
     "both are of one body"
 )
-MIN_INLIER_WEIGHT = 0.2
+_MIN_INLIER_WEIGHT = 0.2
+_CAUCHY_SIGMAS = 2.5  # scale of Cauchy's weights
+_MAX_STEPS = 50
 _CONVERGED = 1e-6  # relative decrease of the cost, far below the effect of one sigma
 
 _Residuals: TypeAlias = tuple[ImuChain, MocapObservations]
@@ -41,7 +43,7 @@ class BatchSolution:
     @property
     def is_inlier(self) -> np.ndarray:
         """(K,) bool: inlier samples."""
-        return np.asarray(self.weight > MIN_INLIER_WEIGHT, bool)
+        return np.asarray(self.weight > _MIN_INLIER_WEIGHT, bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +78,9 @@ class MocapImuProblem:
         def step(at: MocapImuState, residuals: _Residuals, damping: float) -> MocapImuState:
             return at.updated(*self._system(at, *residuals).solve(damping))
 
-        minimum = minimise(state, self._evaluate, step, self.options.max_iterations, _CONVERGED)
+        minimum = minimise(state, self._evaluate, step, _MAX_STEPS, _CONVERGED)
         if not minimum.converged:
-            raise CalibrationMismatchError(
-                f"mocap and IMU: no solution after {self.options.max_iterations} steps; {CHECK}"
-            )
+            raise CalibrationMismatchError(f"mocap and IMU: no solution after {_MAX_STEPS} steps; {CHECK}")
         chain, observations = minimum.linearised
         weight = self._weight(observations)
         return BatchSolution(
@@ -101,16 +101,12 @@ class MocapImuProblem:
 
     def _weight(self, observations: MocapObservations) -> F64:
         """Return Cauchy weights (K,) by the mean square of the six residuals."""
-        return np.asarray(
-            1 / (1 + (observations.residual**2).mean(1) / self.options.cauchy_sigmas**2), np.float64
-        )
+        return np.asarray(1 / (1 + (observations.residual**2).mean(1) / _CAUCHY_SIGMAS**2), np.float64)
 
     def _evaluate(self, state: MocapImuState) -> tuple[_Residuals, float]:
         chain = imu_chain(state, self.imu, self.noise, self.options.gravity, self.is_break)
         observations = self._observations(state)
-        robust_cost = (
-            -6 * self.options.cauchy_sigmas**2 * np.log(self._weight(observations)).sum() * self.sample_weight
-        )
+        robust_cost = -6 * _CAUCHY_SIGMAS**2 * np.log(self._weight(observations)).sum() * self.sample_weight
         bias_prior = np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / _BIAS_SIGMA
         prior = (self._prior_information() * self._prior_deviation(state) ** 2).sum()
         cost = float((chain.residual**2).sum() + robust_cost + (bias_prior**2).sum() + prior)

@@ -22,7 +22,10 @@ def test_true_figures_lie_within_the_stated_errors():
     axes = [
         a for seed in range(2) for a in fit_noise(allan_deviation(made(seed, 1200, 50), 50), model_error=0)
     ]
-    assert all(axis.density.significant for axis in axes) and np.mean([axis.walk.significant for axis in axes]) > 0.7
+    assert (
+        all(axis.density.significant for axis in axes)
+        and np.mean([axis.walk.significant for axis in axes]) > 0.7
+    )
     for k, truth in ((1, N), (3, K)):
         off = np.array([(axis.squares[k] - truth**2) / axis.errors[k] for axis in axes])
         assert 0.6 < np.sqrt(np.mean(off**2)) < 1.5

@@ -83,7 +83,7 @@ def test_a_mocap_with_y_up_an_unrelated_clock_and_outliers() -> None:
     assert np.degrees(np.abs(error[2:5])).max() < 0.05
     assert np.abs(error[5:8]).max() < 2e-3
     assert np.abs(error[8]) < 0.2e-3
-    assert found.residuals.doubted == pytest.approx(len(wrong) / len(T), abs=0.002)
+    assert found.residuals.outlier_share == pytest.approx(len(wrong) / len(T), abs=0.002)
     assert found.up == "-y" and found.tilt_deg == pytest.approx(np.degrees(np.linalg.norm(TILT)), abs=0.02)
 
 

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from share.errors import DataError
 from share.lab.mocap.files import read_bodies
-from share.lab.mocap.vicon import read_vicon
 
 HEAD = """Objects
 100
@@ -33,7 +32,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_each_body_has_its_poses_where_it_was_seen(tmp_path):
-    bodies = read_vicon(written(tmp_path, HEAD + ROWS))
+    bodies = read_bodies(written(tmp_path, HEAD + ROWS))
     assert list(bodies) == ["Ann", "Bob:Head"]
     ann, bob = bodies.values()
     assert ann.stamps_ns.tolist() == [k * 10_000_000 for k in (101, 102, 105, 106)]
@@ -44,7 +43,7 @@ def test_each_body_has_its_poses_where_it_was_seen(tmp_path):
 
 
 def test_angles_about_x_then_y_then_z_are_read_when_asked_for(tmp_path):
-    ann = read_vicon(written(tmp_path, HEAD + ROWS), "xyz")["Ann"]
+    ann = read_bodies(written(tmp_path, HEAD + ROWS), "xyz")["Ann"]
     expected = Rotation.from_euler("XYZ", [[10, 20, -30]], degrees=True).as_matrix()  # XYZ: intrinsic
     np.testing.assert_allclose(ann.T[:1, :3, :3], expected, atol=1e-12)
 
@@ -67,7 +66,7 @@ def test_quaternions_metres_and_other_blocks(tmp_path):
 
 def test_decimal_commas_between_semicolons(tmp_path):
     comma = (HEAD + ROWS).replace(",", ";").replace("2000", "2000,5").replace("100\n", "100,0\n", 1)
-    ann = read_vicon(written(tmp_path, comma))["Ann"]
+    ann = read_bodies(written(tmp_path, comma))["Ann"]
     np.testing.assert_allclose(ann.T[:, 1, 3], 2.0005)
     assert ann.stamps_ns[0] == 101 * 10_000_000
 
@@ -98,13 +97,13 @@ def test_what_is_wrong_is_said_with_its_line(old, new, said, tmp_path):
     assert old in HEAD + ROWS
     path = written(tmp_path, (HEAD + ROWS).replace(old, new, 1))
     with pytest.raises(DataError, match="(?s)" + said) as error:
-        read_vicon(path)
+        read_bodies(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
 def test_an_object_that_was_never_there_is_known_but_not_seen(tmp_path):
     hidden = "\n".join(f"{k},0,1,2,3,4,5,{k},,,,,," for k in range(1, 9))
-    bodies = read_vicon(written(tmp_path, HEAD + hidden))
+    bodies = read_bodies(written(tmp_path, HEAD + hidden))
     assert [(name, seen is None) for name, seen in bodies.items()] == [("Ann", False), ("Bob:Head", True)]
     with pytest.raises(DataError, match="no body was ever seen"):
-        read_vicon(written(tmp_path, HEAD + "1,0,,,,,,,,,,,,\n2,0,,,,,,,,,,,,\n"))
+        read_bodies(written(tmp_path, HEAD + "1,0,,,,,,,,,,,,\n2,0,,,,,,,,,,,,\n"))
