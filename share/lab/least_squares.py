@@ -154,10 +154,9 @@ def _banded(blocks: F64) -> F64:
 def huber(norms: F64, limit: float) -> tuple[float, F64]:
     """Return Huber's cost of residual norms (N,), infinite if one is NaN, and the square roots (N,) of their
     weights: 1 up to `limit`."""
-    costs = np.where(norms <= limit, norms * norms / 2, limit * (norms - limit / 2))
-    return float(np.nan_to_num(costs, nan=np.inf).sum()), np.sqrt(
-        np.minimum(1, limit / np.maximum(norms, 1e-12))
-    )
+    cost = np.where(norms <= limit, norms * norms / 2, limit * (norms - limit / 2)).sum()
+    root_weights = np.sqrt(np.minimum(1, limit / np.maximum(norms, 1e-12)))
+    return np.inf if np.isnan(cost) else float(cost), root_weights
 
 
 def jackknife(H: F64, g: F64) -> F64:

@@ -12,8 +12,8 @@ import numpy as np
 from share.errors import DataError, UsageError
 from share.geometry import rig_check
 from share.geometry.camera import Camera, Rig
-from share.lab.calibrate.camera_bundle import BoardView
 from share.lab.calibrate.camera_report import UNKNOWN_UNCERTAINTY, RigUncertainty, read_rig_uncertainty
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import Detection, detector
 from share.lab.calibrate.target import Target
 from share.recordings.calibration import CAMCHAIN, Calibration

@@ -40,7 +40,7 @@ def _seconds(fit: CameraImuFit, stamps_ns: I64) -> F64:
 
 
 def _draw_corners(panel: Any, fit: CameraImuFit) -> None:
-    t = _seconds(fit, fit.observations.stamps_ns) + fit.shift_s
+    t = _seconds(fit, fit.stamps_ns) + fit.shift_s
     for cam, (r, observations) in enumerate(zip(fit.corners, fit.observations.corners, strict=True)):
         inliers = inlier_mask(r, fit.sigmas.px)
         frames, size = observations.frame[inliers], len(t)

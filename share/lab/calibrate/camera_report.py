@@ -17,9 +17,10 @@ from share.files.yaml_file import read_yaml
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.lens import RADTAN
-from share.lab.calibrate.camera_bundle import BoardView, CameraBundleSolution, shared_size
+from share.lab.calibrate.camera_bundle import CameraBundleSolution
 from share.lab.calibrate.camera_initialisation import intrinsics, parameter_names
 from share.lab.calibrate.camera_verdict import CameraVerdict, Coverage, camera_residuals
+from share.lab.calibrate.corner_observations import BoardView, rig_size
 from share.lab.calibrate.corners import inlier_mask, model_radius
 from share.lab.calibrate.report import AXIS_COLOURS, chain_heading, failed_path
 from share.lab.calibrate.target import Target, read_target
@@ -295,7 +296,7 @@ def _read_uncertainty(path: Path, rig: Rig) -> RigUncertainty | None:
         passed = bool(report["passed"])
     except (KeyError, TypeError, ValueError):
         return None if "covariance" not in report else _raise_damaged(path)
-    size = shared_size(_cameras(rig))
+    size = rig_size(_cameras(rig))
     if covariance.shape != (size, size) or not np.isfinite(covariance).all():
         return _raise_damaged(path)
     return RigUncertainty(covariance, str(path), passed)

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from share.geometry.camera import Camera, rays
 from share.geometry.se3 import hat
 from share.lab.calibrate import corners
-from share.lab.calibrate.camera_bundle import BoardView, CameraBundleSolution
+from share.lab.calibrate.camera_bundle import CameraBundleSolution
 from share.lab.calibrate.camera_initialisation import has_enough_corners, homography, intrinsics
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.report import corner_failures
 from share.lab.calibrate.target import Target
 from share.types import F64, I64

@@ -11,7 +11,7 @@ from share.errors import DataError, UsageError
 from share.geometry.camera import Camera, Rig
 from share.lab.calibrate import board_views
 from share.lab.calibrate.board_views import RigImages, find_stamped_views, open_board_images
-from share.lab.calibrate.camera_bundle import BoardView
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import Detection
 from share.lab.calibrate.target import AprilGrid
 

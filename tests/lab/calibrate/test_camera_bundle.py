@@ -7,7 +7,7 @@ import pytest
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.lab.calibrate import camera_bundle
-from share.lab.calibrate.camera_bundle import BoardView, calibrate_cameras
+from share.lab.calibrate.camera_bundle import calibrate_cameras
 from share.lab.calibrate.camera_initialisation import (
     camera_from_parameters,
     has_enough_corners,
@@ -25,6 +25,7 @@ from share.lab.calibrate.camera_verdict import (
     judge_cameras,
     median_epipolar_px,
 )
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import Detection
 from share.lab.calibrate.target import AprilGrid, CharucoBoard
 from share.types import F64

@@ -19,7 +19,6 @@ from helpers.camera_imu_sim import (
 from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.lab.calibrate.camera_imu import normal_equations
-from share.lab.calibrate.camera_imu.corner_observations import corner_observations
 from share.lab.calibrate.camera_imu.fit import CameraImuFit, fit_camera_imu
 from share.lab.calibrate.camera_imu.initialisation import align_clocks
 from share.lab.calibrate.camera_imu.problem import CameraImuProblem
@@ -27,6 +26,7 @@ from share.lab.calibrate.camera_imu.spline import EXTRA_KNOTS, ORDER, Curve
 from share.lab.calibrate.camera_imu.state import KNOTS, LOCAL_COLUMNS, SHARED, CameraImuState, node_count
 from share.lab.calibrate.camera_imu.verdict import compare_mountings, judge_camera_imu
 from share.lab.calibrate.camera_initialisation import camera_from_parameters, intrinsics
+from share.lab.calibrate.corner_observations import corner_observations
 from share.lab.least_squares import ArrowFactor
 from share.types import F64
 
@@ -99,27 +99,26 @@ def test_derivatives_of_poses_are_those_by_differences(state: CameraImuState) ->
             normal_equations.camera_poses(state.updated(*_columns(state, int(segment[0]), s * step)), stamps)
             for s in (-1, 1)
         )
-        np.testing.assert_allclose(
-            J[0, :, column], se3.log(se3.inverse(low) @ high)[0] / 2e-6, rtol=1e-5, atol=1e-6
-        )
-    np.testing.assert_allclose(T, normal_equations.camera_poses(state, stamps))
+        by_column = se3.log(low @ se3.inverse(high))[0] / 2e-6
+        np.testing.assert_allclose(J[0, :, column], by_column, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(T, se3.inverse(normal_equations.camera_poses(state, stamps)))
 
 
 def test_the_gradient_is_that_of_the_cost(state: CameraImuState) -> None:
     """By differences of the cost in three random ways: corners of both cameras, gyro, accel, the lot."""
     run = record(Dance(3), 1.5, wrong=0.1)
-    seen = corner_observations(
-        run.stamps_ns, run.views, TARGET, (run.rig.cam0, run.rig.cam1), run.rig.T_cam1_cam0
-    )
+    seen = corner_observations(run.views, TARGET, (run.rig.cam0, run.rig.cam1), run.rig.T_cam1_cam0)
     sigmas = replace(SIGMAS, huber=30.0)
     system = normal_equations.arrow_system(
-        normal_equations.segment_normals(state, seen, run.imu, sigmas), state
+        normal_equations.segment_normals(state, run.stamps_ns, seen, run.imu, sigmas), state
     )
     rng = np.random.default_rng(5)
     for _ in range(3):
         knots, border = rng.normal(size=(len(state.curve.p), 6)), rng.normal(size=system.g_border.shape)
         low, high = (
-            normal_equations.segment_normals(state.updated(s * knots, s * border), seen, run.imu, sigmas).cost
+            normal_equations.segment_normals(
+                state.updated(s * knots, s * border), run.stamps_ns, seen, run.imu, sigmas
+            ).cost
             for s in (-1e-6, 1e-6)
         )
         down = (system.g_nodes * knots).sum() + system.g_border @ border
@@ -128,10 +127,8 @@ def test_the_gradient_is_that_of_the_cost(state: CameraImuState) -> None:
 
 def test_the_arrow_is_solved_as_a_dense_system(state: CameraImuState) -> None:
     run = record(Dance(3), 1.5)
-    seen = corner_observations(
-        run.stamps_ns, run.views, TARGET, (run.rig.cam0, run.rig.cam1), run.rig.T_cam1_cam0
-    )
-    one = normal_equations.segment_normals(state, seen, run.imu, SIGMAS)
+    seen = corner_observations(run.views, TARGET, (run.rig.cam0, run.rig.cam1), run.rig.T_cam1_cam0)
+    one = normal_equations.segment_normals(state, run.stamps_ns, seen, run.imu, SIGMAS)
     size = 6 * len(state.curve.p)
     H, g = np.zeros((size + SHARED + state.biases.size,) * 2), np.zeros(size + SHARED + state.biases.size)
     for k in range(state.curve.segments):
@@ -267,7 +264,7 @@ def with_moved_cameras(run: Recorded, step: F64) -> Recorded:
 def test_other_cameras_move_it_as_the_derivatives_say(dance: Recorded, found: CameraImuFit) -> None:
     step = RIG_SIGMAS * np.random.default_rng(3).choice([-0.1, 0.1], len(RIG_SIGMAS))
     other = calibrated(with_moved_cameras(dance, step))
-    batch = CameraImuProblem(found.observations, found.imu, NOISE)
+    batch = CameraImuProblem(found.stamps_ns, found.observations, found.imu, NOISE)
     moved = np.append(
         se3.log(se3.inverse(found.T_imu_cam0) @ other.T_imu_cam0), other.shift_s - found.shift_s
     )

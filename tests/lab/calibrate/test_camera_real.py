@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from share.lab.calibrate.camera_bundle import BoardView, calibrate_cameras
+from share.lab.calibrate.camera_bundle import calibrate_cameras
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import detector
 from share.lab.calibrate.target import AprilGrid
 from share.recordings.calibration import read_asl_calibration

@@ -8,12 +8,13 @@ from functools import partial
 import numpy as np
 
 from share.errors import CalibrationMismatchError, DataError
+from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.lab.calibrate.camera_imu import normal_equations
-from share.lab.calibrate.camera_imu.corner_observations import CornerObservations, corner_residuals
 from share.lab.calibrate.camera_imu.initialisation import BIAS_NODE_S
 from share.lab.calibrate.camera_imu.normal_equations import Sigmas
 from share.lab.calibrate.camera_imu.state import SHARED, CameraImuState
+from share.lab.calibrate.corner_observations import CornerObservations
 from share.lab.calibrate.corners import MIN_SIGMA_PX, robust_sigma
 from share.lab.least_squares import ArrowFactor, ArrowSystem, minimise
 from share.types import F64, I64, ImuBatch
@@ -27,8 +28,10 @@ _SLOW_WINDOW_NS = 200_000_000  # means over this show errors that are not white
 
 @dataclass(frozen=True, eq=False)
 class CameraImuProblem:
-    """Corners, the IMU samples meanwhile, and the IMU's stated noise."""
+    """Corners in frames at stamps_ns (F,), camera's clock, the IMU samples meanwhile, and the IMU's stated
+    noise."""
 
+    stamps_ns: I64
     observations: CornerObservations
     imu: ImuBatch
     noise: ImuNoise
@@ -59,7 +62,9 @@ class CameraImuProblem:
         return minimum.state
 
     def _linear_system(self, state: CameraImuState, sigmas: Sigmas) -> tuple[ArrowSystem, float]:
-        segments = normal_equations.segment_normals(state, self.observations, self.imu, sigmas)
+        segments = normal_equations.segment_normals(
+            state, self.stamps_ns, self.observations, self.imu, sigmas
+        )
         system = normal_equations.arrow_system(segments, state)
         return system, segments.cost + self._add_bias_factors(state, system)
 
@@ -92,10 +97,8 @@ class CameraImuProblem:
 
     def corner_residuals(self, state: CameraImuState) -> tuple[F64, ...]:
         """Return residuals (C, 2) px of each camera, measured minus predicted."""
-        T = normal_equations.camera_poses(state, self.observations.stamps_ns)
-        return tuple(
-            corner_residuals(self.observations, cam, T)[0] for cam in range(len(self.observations.cameras))
-        )
+        T_target_cam0 = normal_equations.camera_poses(state, self.stamps_ns)
+        return self.observations.residuals(se3.inverse(T_target_cam0))
 
     def inertial_residuals(self, state: CameraImuState) -> tuple[F64, F64]:
         """Return residuals of gyro, accel (N, 3), measured minus predicted."""
@@ -109,7 +112,7 @@ class CameraImuProblem:
     def rig_sensitivity(self, state: CameraImuState, sigmas: Sigmas) -> F64:
         """Return (7, P): derivatives of extrinsics and time shift by the rig's parameters, in the order of
         `CameraBundleSolution`."""
-        gradients = normal_equations.rig_gradients(state, self.observations, sigmas)
+        gradients = normal_equations.rig_gradients(state, self.stamps_ns, self.observations, sigmas)
         knots_and_border = normal_equations.gather_gradient(gradients, state)
         return -self._factor(state, sigmas).solve(*knots_and_border)[1][:7]
 
