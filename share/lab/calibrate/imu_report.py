@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from share.lab.calibrate.imu import ImuCharacteristics, SensorNoise
-from share.lab.calibrate.imu_noise import FLICKER_FACTOR, AxisNoise, NoiseEstimate
+from share.lab.calibrate.imu_noise import FLICKER_FACTOR, NoiseEstimate
 from share.lab.calibrate.report import AXIS_COLOURS
 from share.lab.evaluate.charts import agg_pyplot, save_png
 from share.recordings.calibration import SERIAL
@@ -129,18 +129,12 @@ def _sensor_values(sensor: SensorNoise, name: str, profile: Profile | None) -> d
         "tau_s": sensor.curve.taus.tolist(),
         "clusters": sensor.curve.clusters.tolist(),
         "axes": {
-            axis: {**_axis_values(noise), "deviation": sensor.curve.deviation[:, k].tolist()}
+            axis: {name: getattr(noise, name)._asdict() for name in (*QUANTITIES, "quantisation")}
+            | {name: getattr(noise, name).tolist() for name in ("low", "high", "modelled")}
+            | {"deviation": sensor.curve.deviation[:, k].tolist()}
             for k, (axis, noise) in enumerate(zip("xyz", sensor.axes, strict=True))
         },
     }
-
-
-def _axis_values(noise: AxisNoise) -> dict[str, Any]:
-    figures = {name: getattr(noise, name)._asdict() for name in (*QUANTITIES, "quantisation")}
-    return figures | {key: getattr(noise, key).tolist() for key in ("low", "high", "modelled")}
-
-
-# Chart of the Allan deviation: measured, confidence interval, fit, and the profile's.
 
 
 def draw_allan(path: Path, characteristics: ImuCharacteristics, profile: Profile | None, title: str) -> None:
@@ -179,7 +173,7 @@ def _draw_profile(
     panel: Any, sensor: SensorNoise, profile_values: dict[str, float], profile: Profile | None
 ) -> None:
     taus = sensor.curve.taus
-    estimates = [sensor.combined(name) for name in ("density", "instability", "walk")]
+    estimates = [sensor.combined(name) for name in QUANTITIES]
     N, B, K = (one.value if one.significant else 0.0 for one in estimates)
     for part in (N / np.sqrt(taus), np.full(len(taus), np.sqrt(FLICKER_FACTOR) * B), K * np.sqrt(taus / 3)):
         if part.all():

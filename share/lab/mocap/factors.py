@@ -28,11 +28,6 @@ class ImuChain:
     raw: F64
     cov: F64
 
-    def without_breaks(self, is_break: np.ndarray) -> ImuChain:
-        """Return only the intervals that the IMU joins."""
-        fields = (self.residual, self.jacobian_before, self.jacobian_after, self.raw, self.cov)
-        return ImuChain(*(field[~is_break] for field in fields))
-
 
 @dataclass(frozen=True, eq=False)
 class MocapObservations:

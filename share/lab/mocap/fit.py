@@ -16,7 +16,6 @@ from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.lab.least_squares import ArrowFactor
-from share.lab.mocap.factors import ImuChain
 from share.lab.mocap.initialisation import initial_rotation, initial_state, nearest_axis_rotation, up_vector
 from share.lab.mocap.offset import find_offset
 from share.lab.mocap.problem import CHECK, BatchSolution, MocapImuProblem, axis_scales
@@ -193,16 +192,13 @@ def _make_fit(batch: MocapImuProblem, solved: BatchSolution, coarse_ns: int, tur
         raise CalibrationMismatchError(
             _misfit_text(f"{100 * (1 - inliers.mean()):.0f} % of the mocap's poses are outliers")
         )
-    dt = np.diff(state.stamps_ns)[~batch.is_break] * 1e-9
-    sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
-    distances = np.linalg.norm((solved.observations.residual * sigma).reshape(-1, 2, 3), axis=2)
-    chain = solved.chain.without_breaks(batch.is_break)
-    fit_residuals = _residual_statistics(
-        chain, dt, options.imu_inflation, distances[:, 1], distances[:, 0], inliers, options.sigma_position
-    )
+    fit_residuals = _residual_statistics(batch, solved)
     if not fit_residuals.position_mm < _MAX_RMS_MM:
         raise CalibrationMismatchError(_misfit_text(f"{fit_residuals.position_mm:.0f} mm rms residual"))
-    offset_ns = coarse_ns + round(state.offset_s * 1e9)
+    mounting_prior_sigmas = 0.0
+    if options.T_body_mocap is not None:
+        error = se3.log(se3.inverse(options.T_body_mocap) @ state.T_body_mocap)
+        mounting_prior_sigmas = float(np.abs(error / np.repeat(options.guess_sigma, 3)).max())
     inlier_stamps = state.in_imu_clock(batch.mocap.stamps_ns[inliers])
     scales, scales_cov = axis_scales(solved, batch.mocap, options.sigma_position, batch.sample_weight)
     covs = solved.system.node_covariances()
@@ -212,36 +208,27 @@ def _make_fit(batch: MocapImuProblem, solved: BatchSolution, coarse_ns: int, tur
         velocity=state.v,
         gyro_bias=state.gyro_bias,
         accel_bias=state.accel_bias,
-        gaps=find_gaps(_with_ends(inlier_stamps, state.stamps_ns), round(options.max_bridged_s * 1e9)),
+        gaps=find_gaps(
+            np.concatenate([state.stamps_ns[:1], inlier_stamps, state.stamps_ns[-1:]]),
+            round(options.max_bridged_s * 1e9),
+        ),
         is_break=batch.is_break,
         R_mocap_world=turn.T @ state.R_mocap_world,
         T_body_mocap=state.T_body_mocap,
-        offset_ns=offset_ns,
+        offset_ns=coarse_ns + round(state.offset_s * 1e9),
         drift_ppm=state.drift * 1e6,
         cov_shared=ArrowFactor(solved.system).border_covariance,
         cov_poses=_right_perturbed(state.R, covs[:, :6, :6]),
         scale_error=np.abs(turn.T) @ scales,
         scale_error_sigma=np.abs(turn.T) @ np.sqrt(np.diag(scales_cov)),
-        mounting_prior_sigmas=_mounting_prior_sigmas(state.T_body_mocap, options),
+        mounting_prior_sigmas=mounting_prior_sigmas,
         residuals=fit_residuals,
         gravity=options.gravity,
     )
 
 
-def _mounting_prior_sigmas(T_body_mocap: F64, options: MocapFitOptions) -> float:
-    if options.T_body_mocap is None:
-        return 0.0
-    error = se3.log(se3.inverse(options.T_body_mocap) @ T_body_mocap)
-    return float(np.abs(error / np.repeat(options.guess_sigma, 3)).max())
-
-
 def _misfit_text(reason: str) -> str:
     return f"mocap and IMU are not of one motion: {reason}; {CHECK}"
-
-
-def _with_ends(stamps: I64, nodes: I64) -> I64:
-    """Return the stamps with both ends of the path."""
-    return np.concatenate([nodes[:1], stamps, nodes[-1:]])
 
 
 def _right_perturbed(R: F64, cov: F64) -> F64:
@@ -252,25 +239,25 @@ def _right_perturbed(R: F64, cov: F64) -> F64:
     return np.asarray(J @ cov @ J.swapaxes(1, 2), np.float64)
 
 
-def _residual_statistics(
-    chain: ImuChain, dt: F64, inflation: float, distances: F64, angles: F64, inliers: np.ndarray, noise: float
-) -> FitResiduals:
-    """Return statistics of a chain with intervals dt (M,) s and inflated noise, and of distances (K,) m
-    and angles (K,) rad from the mocap. noise: stated sigma of the mocap on each axis, m."""
-    rows = [0, 1, 2, 6, 7, 8]
-    sigma = np.sqrt(np.diagonal(chain.cov, axis1=1, axis2=2))[:, rows] / inflation
-    raw = chain.raw[:, rows]
-    rates = _rms(raw / dt[:, None])
+def _residual_statistics(batch: MocapImuProblem, solved: BatchSolution) -> FitResiduals:
+    options, inliers, joined = batch.options, solved.is_inlier, ~batch.is_break
+    sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
+    vectors = (solved.observations.residual * sigma).reshape(-1, 2, 3)
+    angles, distances = np.linalg.norm(vectors, axis=2).T
     mm, deg = distances * 1e3, np.degrees(angles)
+    rotation_and_velocity = [0, 1, 2, 6, 7, 8]
+    raw = solved.chain.raw[joined][:, rotation_and_velocity]
+    variances = np.diagonal(solved.chain.cov[joined], axis1=1, axis2=2)[:, rotation_and_velocity]
+    rates = _rms(raw / (np.diff(solved.state.stamps_ns)[joined] * 1e-9)[:, None])
     return FitResiduals(
         position_mm=float(_rms(mm[inliers])),
         rotation_deg=float(_rms(deg[inliers])),
-        position_sigmas=float(_rms(distances[inliers])) / (noise * np.sqrt(3)),
+        position_sigmas=float(_rms(distances[inliers])) / (options.sigma_position * np.sqrt(3)),
         position_p95_mm=float(np.percentile(mm, 95)),
         rotation_p95_deg=float(np.percentile(deg, 95)),
         samples=len(mm),
         outlier_share=float(1 - inliers.mean()),
-        imu_sigmas=_rms(raw / sigma),
+        imu_sigmas=_rms(raw / np.sqrt(variances) * options.imu_inflation),
         gyro=rates[:3],
         accel=rates[3:],
     )

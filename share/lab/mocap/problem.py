@@ -96,9 +96,6 @@ class MocapImuProblem:
         """Weight of one mocap sample: samples denser than independent ones share a weight of 1."""
         return min(1.0, self.options.independent_hz * self.mocap.spacing_ns * 1e-9)
 
-    def _sigma(self) -> F64:
-        return np.repeat([self.options.sigma_rotation, self.options.sigma_position], 3)
-
     def _weight(self, observations: MocapObservations) -> F64:
         """Return Cauchy weights (K,) by the mean square of the six residuals."""
         return np.asarray(1 / (1 + (observations.residual**2).mean(1) / _CAUCHY_SIGMAS**2), np.float64)
@@ -113,8 +110,10 @@ class MocapImuProblem:
         return (chain, observations), cost
 
     def _observations(self, state: MocapImuState) -> MocapObservations:
-        t, T = self.mocap.stamps_ns, self.mocap.T
-        return mocap_observations(state, self.imu, self.options.gravity, t, T, self._sigma())
+        sigma = np.repeat([self.options.sigma_rotation, self.options.sigma_position], 3)
+        return mocap_observations(
+            state, self.imu, self.options.gravity, self.mocap.stamps_ns, self.mocap.T, sigma
+        )
 
     def _system(self, state: MocapImuState, chain: ImuChain, observations: MocapObservations) -> ArrowSystem:
         weight = self._weight(observations) * self.sample_weight

@@ -98,8 +98,12 @@ def score_baselines(
     training, validation, test = parts["train"], parts["validate"], parts["test"]
     yield _score_constant_mean(training, test)
     for name, train_baseline in BASELINES.items():
-        on_progress(f"{name}: training")
-        predict = train_baseline(training, validation, seed, _with_name(name, on_progress))
+
+        def show(text: str, name: str = name) -> None:
+            on_progress(f"{name}: {text}")
+
+        show("training")
+        predict = train_baseline(training, validation, seed, show)
         yield score_predictions(name, predict(test), test.table.error_cm, ms=_ms_per_keyframe(predict, test))
 
 
@@ -114,10 +118,6 @@ def score_predictions(
     return ErrorModelScore(
         name, rmse, mae, rank, float(np.abs(_qoe(predicted_cm) - _qoe(error_cm)).mean()), coverage, ms
     )
-
-
-def _with_name(name: str, report: ShowProgress) -> ShowProgress:
-    return lambda how_far: report(f"{name}: {how_far}")
 
 
 def _qoe(error_cm: F64 | F32) -> F64:

@@ -39,7 +39,7 @@ def score_table(scores: Sequence[ErrorModelScore]) -> str:
     )
     rows = [
         f"| {s.name} | {s.rmse_cm:.3f} | {s.mae_cm:.3f} | {s.rank:.2f} | {s.qoe_error:.3f} "
-        f"| {_percent(s.coverage)} | {_ms_text(s.cpu_ms)} |"
+        f"| {_cell(100 * s.coverage, 0, ' %')} | {_cell(s.cpu_ms, 2)} |"
         for s in scores
     ]
     return "\n".join([*head, *rows])
@@ -67,12 +67,8 @@ def _score_from_row(row: dict[str, Any]) -> ErrorModelScore:
     return ErrorModelScore(**row)
 
 
-def _percent(value: float) -> str:
-    return "–" if math.isnan(value) else f"{100 * value:.0f} %"
-
-
-def _ms_text(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.2f}"
+def _cell(value: float, digits: int, unit: str = "") -> str:
+    return "–" if math.isnan(value) else f"{value:.{digits}f}{unit}"
 
 
 _LIMITS = (

@@ -55,7 +55,10 @@ def train_model(
         "window_s": WINDOW_S,
         "backbone": backbone,
         "options": asdict(options),
-        "rooms": {name: _rooms(collection, name) for name in collection.parts},
+        "rooms": {
+            name: sorted({str(collection.abouts[run]["session"]) for run in runs.tolist()})
+            for name, runs in collection.parts.items()
+        },
         "keyframes": {name: len(part.log_error) for name, part in parts.items()},
     }
     return TrainedHeads(
@@ -105,11 +108,6 @@ def _standardised(x: F32, mean: F32, deviation: F32) -> F32:
 
 def _tensors(inputs: Inputs) -> list[torch.Tensor]:
     return inputs.tensors(torch.device("cpu"))[:-1]
-
-
-def _rooms(collection: LabelCollection, part: str) -> list[str]:
-    abouts = (collection.abouts[run] for run in collection.parts[part].tolist())
-    return sorted({str(about["session"]) for about in abouts})
 
 
 # Optimisation of the heads.

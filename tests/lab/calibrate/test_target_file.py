@@ -2,12 +2,11 @@
 
 import re
 
-import numpy as np
 import pytest
 import yaml
 
 from share.errors import ConfigError
-from share.lab.calibrate.target import AprilGrid, CharucoBoard, read_target, session_target, target_mapping
+from share.lab.calibrate.target import AprilGrid, CharucoBoard, read_target, target_mapping
 
 KALIBR = """
 target_type: 'aprilgrid' #gridtype
@@ -61,15 +60,3 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
         read_target(written(tmp_path, text))
     assert str(raised.value).startswith(str(tmp_path / "target.yaml"))
     assert "\n" not in str(raised.value)
-
-
-def test_a_session_gives_the_pose_of_its_target(tmp_path):
-    T = np.eye(4)
-    T[:3, 3] = 1, 2, 3
-    session = {"schema": 1, "target": target_mapping(AprilGrid()) | {"T_world_target": T.tolist()}}
-    (tmp_path / "session.yaml").write_text(yaml.safe_dump(session))
-    target, T_world_target = session_target(tmp_path)
-    assert target == AprilGrid()
-    np.testing.assert_array_equal(T_world_target, T)
-    (tmp_path / "session.yaml").write_text("schema: 1")
-    assert session_target(tmp_path) is None

@@ -54,12 +54,23 @@ def segment_normals(
 
     The cost is infinite where a corner would lie behind its camera.
     """
-    segments = state.curve.segments
-    out = SegmentNormals(
-        np.zeros((segments, LOCAL_COLUMNS, LOCAL_COLUMNS)), np.zeros((segments, LOCAL_COLUMNS)), 0.0
-    )
-    cost = _add_corners(out, state, stamps_ns, observations, sigmas) + _add_imu(out, state, imu, sigmas)
-    return SegmentNormals(out.H, out.g, cost)
+    H = np.zeros((state.curve.segments, LOCAL_COLUMNS, LOCAL_COLUMNS))
+    g = np.zeros((state.curve.segments, LOCAL_COLUMNS))
+
+    T, J, segment = pose_derivatives(state, stamps_ns)
+    frames = observations.normals(T, sigmas.huber, sigmas.px)
+    np.add.at(H, segment, J.swapaxes(1, 2) @ frames.H @ J)
+    np.add.at(g, segment, (J.swapaxes(1, 2) @ frames.g[..., None])[..., 0])
+
+    r, J, segment = inertial_residuals(state, imu)
+    sigma = np.repeat([sigmas.gyro, sigmas.accel], 3)
+    r, J = r / sigma, J / sigma[:, None]
+    ends = np.searchsorted(segment, np.arange(state.curve.segments + 1))
+    for k, (first, last) in enumerate(pairwise(ends)):
+        A = J[first:last].reshape(-1, LOCAL_COLUMNS)
+        H[k] += A.T @ A
+        g[k] += A.T @ r[first:last].reshape(-1)
+    return SegmentNormals(H, g, frames.cost + float((r**2).sum() / 2))
 
 
 def camera_poses(state: CameraImuState, stamps_ns: I64) -> F64:
@@ -82,20 +93,6 @@ def pose_derivatives(state: CameraImuState, stamps_ns: I64) -> tuple[F64, F64, I
     T_target_imu = se3.from_rt(rotation.R, p)
     T_cam0_target = se3.inverse(T_target_imu @ state.T_imu_cam0)
     return T_cam0_target, -se3.adjoint(T_target_imu) @ J, spans.segment
-
-
-def _add_corners(
-    out: SegmentNormals,
-    state: CameraImuState,
-    stamps_ns: I64,
-    observations: CornerObservations,
-    sigmas: Sigmas,
-) -> float:
-    T, J, segment = pose_derivatives(state, stamps_ns)
-    frames = observations.normals(T, sigmas.huber, sigmas.px)
-    np.add.at(out.H, segment, J.swapaxes(1, 2) @ frames.H @ J)
-    np.add.at(out.g, segment, (J.swapaxes(1, 2) @ frames.g[..., None])[..., 0])
-    return frames.cost
 
 
 def rig_gradients(
@@ -129,18 +126,6 @@ def inertial_residuals(state: CameraImuState, imu: ImuBatch) -> tuple[F64, F64, 
     J[:, :, -6:] = np.eye(6) * share_after[:, None, None]
     predicted = np.concatenate([rotation.rate, force], axis=1) + bias
     return np.concatenate([imu.gyro, imu.accel], axis=1) - predicted, J, spans.segment
-
-
-def _add_imu(out: SegmentNormals, state: CameraImuState, imu: ImuBatch, sigmas: Sigmas) -> float:
-    r, J, segment = inertial_residuals(state, imu)
-    sigma = np.repeat([sigmas.gyro, sigmas.accel], 3)
-    r, J = r / sigma, J / sigma[:, None]
-    ends = np.searchsorted(segment, np.arange(state.curve.segments + 1))
-    for k, (first, last) in enumerate(pairwise(ends)):
-        A = J[first:last].reshape(-1, LOCAL_COLUMNS)
-        out.H[k] += A.T @ A
-        out.g[k] += A.T @ r[first:last].reshape(-1)
-    return float((r**2).sum() / 2)
 
 
 def arrow_system(segments: SegmentNormals, state: CameraImuState) -> ArrowSystem:
