@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from share.lab.calibrate.handeye import HandEyeCheck
     from share.lab.mocap.fit import MocapFit
     from share.lab.mocap.trajectory import MocapTrajectory
-    from share.types import F64
 
 
 @click.command(short_help="Calibrate a motion capture's body and clock to a device.")
@@ -127,13 +126,16 @@ def _summary(result: MocapFit, hand_eye_check: HandEyeCheck | None) -> str:
     import numpy as np
 
     from share.geometry import se3
+    from share.lab.calibrate.report import cells_with_sigmas
     from share.lab.mocap.verdict import shared_sigmas
 
     T, residuals, sigma = result.T_body_mocap, result.residuals, shared_sigmas(result)
-    rotation_deg = np.degrees(se3.so3_log(T[:3, :3]))
+    turn_deg, turn_sigma = np.degrees(se3.so3_log(T[:3, :3])), np.degrees(sigma[2:5])
+    rotation = "  ".join(cells_with_sigmas(turn_deg, turn_sigma, 2))
+    position = "  ".join(cells_with_sigmas(T[:3, 3] * 1e3, sigma[5:8] * 1e3, 1))
     lines = [
-        f"body rotation   {_triple_text(rotation_deg, np.degrees(sigma[2:5]), 2)} deg (rotation vector)",
-        f"body position   {_triple_text(T[:3, 3] * 1e3, sigma[5:8] * 1e3, 1)} mm, in the IMU frame",
+        f"body rotation   {rotation} deg (rotation vector)",
+        f"body position   {position} mm, in the IMU frame",
         f"world tilt      {result.tilt_deg:.3f} ± {np.degrees(sigma[:2].max()):.3f} deg, up axis {result.up}",
         f"clock           IMU minus mocap {result.offset_ns * 1e-6:+.2f} ± {sigma[8] * 1e3:.2f} ms, "
         f"drift {result.drift_ppm:+.1f} ± {sigma[9] * 1e6:.1f} ppm",
@@ -146,7 +148,3 @@ def _summary(result: MocapFit, hand_eye_check: HandEyeCheck | None) -> str:
             f"{hand_eye_check.translation_error_m * 1e3:.1f} mm, {hand_eye_check.sigmas:.1f} standard errors"
         )
     return "\n".join(lines)
-
-
-def _triple_text(values: F64, errors: F64, digits: int) -> str:
-    return "  ".join(f"{v:+.{digits}f} ± {e:.{digits}f}" for v, e in zip(values, errors, strict=True))

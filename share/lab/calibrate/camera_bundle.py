@@ -39,7 +39,7 @@ from share.types import F64
 
 MIN_VIEWS = 4
 _MAX_STEPS = 60
-_HUBER_SIGMAS = 2.5  # times the residuals' robust sigma
+HUBER_SIGMAS = 2.5  # times the residuals' robust sigma
 _K3_SIGMAS = 3.0  # k3 this far from 0 is significant
 _CONVERGED = 1e-9  # relative decrease of the cost
 
@@ -166,7 +166,7 @@ def _solve(observations: CornerObservations, state: CameraBundleState) -> Camera
     """Minimise in three runs; each fixes the limit of Huber's loss."""
     for _ in range(3):
         residuals = np.concatenate(_seen_by(observations, state).residuals(state.T_cam0_target))
-        linearise = partial(_linearise, observations, _HUBER_SIGMAS * robust_sigma(residuals))
+        linearise = partial(_linearise, observations, HUBER_SIGMAS * robust_sigma(residuals))
         minimum = minimise(state, linearise, _updated_state, _MAX_STEPS, _CONVERGED)
         state = minimum.state
     return _solution(observations, state, minimum.linearised)

@@ -141,34 +141,33 @@ def _camera_values(outcome: CameraCalibration, cam: int) -> dict[str, Any]:
 
 def parameter_table(outcome: CameraCalibration) -> list[list[str]]:
     """Return rows for a terminal: each parameter with its sigma, beside the previous value."""
-    state, previous_rig = outcome.solution.state, outcome.previous_rig
-    rows = [["", "", "value", "sigma", *(["before", "change"] if previous_rig else [])]]
-    previous_cameras = (previous_rig.cam0, previous_rig.cam1) if previous_rig else (None, None)
+    state, rig = outcome.solution.state, outcome.previous_rig
+    rows = [["", "", "value", "sigma", *(["before", "change"] if rig else [])]]
     for cam, camera in enumerate(state.cameras):
-        previous, sigmas = previous_cameras[cam], outcome.solution.sigmas[state.intrinsic_slices[cam]]
-        previous_values = (
-            {}
-            if previous is None
-            else dict(zip(parameter_names(previous), intrinsics(previous).tolist(), strict=True))
-        )
-        same = previous is not None and previous.model == camera.model
-        for k, (name, value) in enumerate(
-            zip(parameter_names(camera), intrinsics(camera).tolist(), strict=True)
-        ):
-            sigma = sigmas[k]
+        before = _values_before(rig, cam, camera)
+        sigmas = outcome.solution.sigmas[state.intrinsic_slices[cam]]
+        for k, (name, value) in enumerate(zip(parameter_names(camera), intrinsics(camera), strict=True)):
             digits = 3 if k < 4 else 5
-            row = [f"cam{cam}", name, f"{value:.{digits}f}", f"{sigma:.{digits}f}"]
-            if previous_rig:
-                previous_value = (
-                    previous_values.get(name, 0.0)
-                    if same or (previous is not None and k < 4)
-                    else float("nan")
-                )
-                row += [f"{previous_value:.{digits}f}", f"{value - previous_value:+.{digits}f}"]
+            row = [f"cam{cam}", name, f"{value:.{digits}f}", f"{sigmas[k]:.{digits}f}"]
+            if rig:
+                row += [f"{before[k]:.{digits}f}", f"{value - before[k]:+.{digits}f}"]
             rows.append(row)
     if len(state.cameras) == 2:
         rows.append(_baseline(outcome))
     return rows
+
+
+def _values_before(rig: Rig | None, cam: int, camera: Camera) -> F64:
+    """Return the previous values of a camera's parameters: NaN where unknown, also coefficients of another
+    lens model; 0 for coefficients that it did not have."""
+    out = np.full(len(parameter_names(camera)), np.nan)
+    if rig is None or (previous := (rig.cam0, rig.cam1)[cam]) is None:
+        return out
+    if previous.model == camera.model:
+        out[:] = 0.0
+    known = min(len(out), len(intrinsics(previous))) if previous.model == camera.model else 4
+    out[:known] = intrinsics(previous)[:known]
+    return out
 
 
 def _baseline(outcome: CameraCalibration) -> list[str]:

@@ -146,7 +146,7 @@ def test_a_fisheye_pair_is_found(rng: np.random.Generator) -> None:
 def test_with_equal_weights_the_solution_is_opencvs(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(camera_bundle, "_HUBER_SIGMAS", 1e6)  # OpenCV has no robust loss
+    monkeypatch.setattr(camera_bundle, "HUBER_SIGMAS", 1e6)  # OpenCV has no robust loss
     views = [BoardView(v.name, v.detections[:1]) for v in _views(rng, 0.2)]
     solution = calibrate_cameras(views, GRID, SIZE)
     boards = [GRID.corners[v.detections[0].ids].astype(np.float32) for v in views]
