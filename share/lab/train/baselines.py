@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from share.array_table import ArrayTable
 from share.lab.train.keyframe_table import KeyframeTable
+from share.lab.train.network import BestWeights
 from share.types import F32, F64
 
 TREES = 70
@@ -170,7 +171,7 @@ def _train(
     optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=0.05)
     x, y = training[0], torch.from_numpy(training[1].table.error_cm)
     validation_inputs, validation_errors = validation[0], torch.from_numpy(validation[1].table.error_cm)
-    best, best_weights, epochs_without_gain = float("inf"), _copy(net), 0
+    best = BestWeights(net)
     for epoch in range(epochs):
         on_progress(f"epoch {epoch + 1} of {epochs} at most")
         net.train()
@@ -186,13 +187,10 @@ def _train(
                     validation_errors,
                 )
             )
-        epochs_without_gain += 1
-        if validation_loss < best:
-            best, best_weights, epochs_without_gain = validation_loss, _copy(net), 0
-        if epochs_without_gain >= patience:
+        best.update(validation_loss)
+        if best.epochs_since >= patience:
             break
-    net.load_state_dict(best_weights)
-    net.eval()
+    best.restore()
 
 
 def _poisson_deviance(log_predicted: Tensor, error_cm: Tensor) -> Tensor:
@@ -202,7 +200,3 @@ def _poisson_deviance(log_predicted: Tensor, error_cm: Tensor) -> Tensor:
 def _predict(net: nn.Module, x: Tensor) -> F64:
     with torch.no_grad():
         return np.concatenate([torch.exp(net(some)[:, 0]).numpy() for some in x.split(_BATCH)]).astype(float)
-
-
-def _copy(net: nn.Module) -> dict[str, Tensor]:
-    return {name: value.clone() for name, value in net.state_dict().items()}

@@ -104,6 +104,30 @@ def _pinball_loss(excess: Tensor, quantile: float) -> Tensor:
     return torch.maximum(quantile * excess, (quantile - 1) * excess).mean()
 
 
+class BestWeights:
+    """The weights with which a network does best on validation data, and the epochs since."""
+
+    def __init__(self, net: nn.Module) -> None:
+        self._net, self.loss, self.epochs_since = net, float("inf"), 0
+        self._copy()
+
+    def update(self, loss: float) -> None:
+        """Take in the validation loss of an epoch."""
+        self.epochs_since += 1
+        if loss < self.loss:
+            self.loss, self.epochs_since = loss, 0
+            self._copy()
+
+    def restore(self) -> None:
+        """Give the network its best weights, for inference."""
+        self._net.load_state_dict(self.weights)
+        self._net.eval()
+
+    def _copy(self) -> None:
+        state = self._net.state_dict()
+        self.weights = {name: value.detach().cpu().clone() for name, value in state.items()}
+
+
 # The same heads as ONNX nodes, written by hand, so that the file does not depend on an exporter.
 
 DEEP_OUTPUT = "deep"  # the backbone's output (N, 1280)

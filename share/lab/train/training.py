@@ -9,7 +9,6 @@ import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from share.errors import DataError
 from share.files.reading import MB, read_bytes
 from share.files.writing import atomic_write
 from share.lab.train.keyframe_table import LabelCollection
-from share.lab.train.network import Heads, loss
+from share.lab.train.network import BestWeights, Heads, loss
 from share.lab.train.trained_heads import (
     TrainedHeads,
     conformal_margin,
@@ -152,13 +151,6 @@ class Inputs:
         return [np.ascontiguousarray(getattr(self, f.name)) for f in dataclasses.fields(self)]
 
 
-@dataclass
-class _TrainingProgress:
-    epoch: int = 0
-    best: float = float("inf")
-    best_epoch: int = 0
-
-
 def train_heads(
     training: Inputs, validation: Inputs, options: TrainingOptions, checkpoint: Path | None, show: ShowEpoch
 ) -> Heads:
@@ -169,31 +161,35 @@ def train_heads(
     heads = Heads(options.heads, options.dropout)
     heads.to(device)
     optimiser = torch.optim.AdamW(heads.parameters(), options.rate, weight_decay=options.decay)
-    progress, best = _TrainingProgress(), _copy(heads)
+    epoch, best = 0, BestWeights(heads)
     identity = {**asdict(options), "train": training.crc, "validate": validation.crc}
     if checkpoint is not None and checkpoint.is_file():
         try:
             saved = torch.load(
                 io.BytesIO(read_bytes(checkpoint, _MAX_BYTES)), map_location=device, weights_only=True
             )
-            if saved["what"] == identity:
+            if saved["identity"] == identity:
                 heads.load_state_dict(saved["heads"])
                 optimiser.load_state_dict(saved["optimiser"])
-                progress, best = _TrainingProgress(**saved["at"]), saved["best"]
+                epoch, best.weights = saved["epoch"], saved["best"]
+                best.loss, best.epochs_since = saved["loss"], saved["epochs_since"]
         except Exception as error:  # torch, pickle and zip raise types of their own
             raise DataError(f"{checkpoint}: is damaged; remove it to start again ({error!r:.200})") from None
     rows, validation_tensors = training.tensors(device), validation.tensors(device)
-    while progress.epoch < options.epochs and progress.epoch - progress.best_epoch < options.patience:
-        training_loss = _train_epoch(heads, optimiser, rows, options, progress.epoch)
+    while epoch < options.epochs and best.epochs_since < options.patience:
+        training_loss = _train_epoch(heads, optimiser, rows, options, epoch)
         validation_loss = _validation_loss(heads, validation_tensors)
-        progress.epoch += 1
-        if validation_loss < progress.best:
-            progress.best, progress.best_epoch, best = validation_loss, progress.epoch, _copy(heads)
-        show(progress.epoch, training_loss, validation_loss)
+        epoch += 1
+        best.update(validation_loss)
+        show(epoch, training_loss, validation_loss)
         if checkpoint is not None:
-            _save_checkpoint(checkpoint, identity, heads, optimiser, progress, best)
-    heads.load_state_dict(best)
-    heads.cpu().eval()
+            data = io.BytesIO()
+            progress = {"epoch": epoch, "loss": best.loss, "epochs_since": best.epochs_since}
+            states = {"heads": heads.state_dict(), "optimiser": optimiser.state_dict(), "best": best.weights}
+            torch.save({"identity": identity} | progress | states, data)
+            atomic_write(checkpoint, data.getvalue())
+    best.restore()
+    heads.cpu()
     return heads
 
 
@@ -225,29 +221,3 @@ def _validation_loss(heads: Heads, rows: list[torch.Tensor]) -> float:
     heads.eval()
     with torch.no_grad():
         return float(loss(heads(*rows[:-1]).mean(dim=0), rows[-1]))
-
-
-def _copy(heads: Heads) -> dict[str, torch.Tensor]:
-    return {name: value.detach().cpu().clone() for name, value in heads.state_dict().items()}
-
-
-def _save_checkpoint(
-    path: Path,
-    identity: dict[str, Any],
-    heads: Heads,
-    optimiser: torch.optim.Optimizer,
-    progress: _TrainingProgress,
-    best: dict[str, torch.Tensor],
-) -> None:
-    data = io.BytesIO()
-    torch.save(
-        {
-            "what": identity,
-            "heads": heads.state_dict(),
-            "optimiser": optimiser.state_dict(),
-            "at": asdict(progress),
-            "best": best,
-        },
-        data,
-    )
-    atomic_write(path, data.getvalue())

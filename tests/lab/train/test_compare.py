@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="make train-test brings it")
+pytest.importorskip("onnx", reason="make train-test brings it")
 pytest.importorskip("sklearn", reason="make train-test brings it")
 
 from share.lab.train.baselines import KeyframeRows, contrastive_loss, forest_inputs
