@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -72,11 +71,11 @@ def camera(
     Example:  share calibrate camera board.mcap --target aprilgrid --out calib/mine
               share calibrate camera pictures --target board.yaml --camera cam0 --out calib/mine
     """
-    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, writable_dir
     from share.lab.calibrate import camera_report
     from share.lab.calibrate.board_views import open_board_images
-    from share.lab.calibrate.camera_report import PICTURE, REPORT, output_paths, written_message
+    from share.lab.calibrate.camera_report import PICTURE, REPORT
+    from share.lab.calibrate.report import failure_message, output_paths, to_json
     from share.lab.calibrate.target import named_target
     from share.recordings.calibration import CAMCHAIN, to_kalibr
 
@@ -87,17 +86,15 @@ def camera(
     options.warn_other_device(source, pictures.given_calibration, pictures.serial)
     writable_dir(out, CAMCHAIN, REPORT, PICTURE)
     outcome = _calibrate(source, pictures, target, every, max_views, model, workers)
-    text = json.dumps(nan_to_none(camera_report.report_values(outcome)), indent=1)
+    text = to_json(camera_report.report_values(outcome))
     files = output_paths(out, outcome.verdict.passed, CAMCHAIN, REPORT, PICTURE)
     chain, report, picture = files
     atomic_write(chain, camera_report.camchain_yaml(outcome, source, report.name))
     atomic_write(report, text + "\n")
-    atomic_write(picture, camera_report.residual_chart(outcome, source))
+    camera_report.draw_residuals(picture, outcome, source)
     click.echo(text if as_json else _summary(outcome, files))
     if not outcome.verdict.passed:
-        raise ShareError(
-            f"{source}: unreliable result ({written_message(chain)}): " + "; ".join(outcome.verdict.reasons)
-        )
+        raise ShareError(f"{source}: {failure_message(chain, outcome.verdict.reasons)}")
 
 
 def _calibrate(

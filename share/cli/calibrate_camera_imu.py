@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -70,14 +69,13 @@ def camera_imu(
     Example:  share calibrate camera-imu dance.mcap --target board.yaml --camera calib/mine \\
                 --imu calib/mine --out calib/mine
     """
-    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, writable_dir
     from share.files.yaml_file import read_yaml_text
     from share.lab.calibrate import camera_imu_report as report
     from share.lab.calibrate.board_views import open_rig_images
-    from share.lab.calibrate.camera_imu_report import residual_chart
-    from share.lab.calibrate.camera_report import has_noise, output_paths, written_message
+    from share.lab.calibrate.camera_report import has_noise
     from share.lab.calibrate.imu_table import chain_file, stated_noise
+    from share.lab.calibrate.report import failure_message, output_paths, to_json
     from share.recordings.calibration import CAMCHAIN, IMU_CHAIN
 
     pictures = open_rig_images(source, camera)
@@ -85,7 +83,7 @@ def camera_imu(
     options.warn_other_device(source, pictures.images.given_calibration, pictures.images.serial)
     writable_dir(out, CAMCHAIN, IMU_CHAIN, report.REPORT, report.PICTURE)
     outcome = _calibrate(source, pictures, noise, target_name, every, max_offset_s, workers)
-    text = json.dumps(nan_to_none(report.report_values(outcome)), indent=1)
+    text = to_json(report.report_values(outcome))
     verdict = "passed" if outcome.verdict.passed else "FAILED"
     chain, report_file, picture = output_paths(
         out, outcome.verdict.passed, CAMCHAIN, report.REPORT, report.PICTURE
@@ -102,13 +100,12 @@ def camera_imu(
             f"{imu_chain} has other noise than was used ({used}) and is kept; to use it, give --imu {out}"
         )
     atomic_write(report_file, text + "\n")
-    atomic_write(picture, residual_chart(outcome.fit, f"{source}: {verdict}"))
+    report.draw_residuals(picture, outcome.fit, f"{source}: {verdict}")
     click.echo(text if as_json else _summary(outcome, (chain, imu_chain, report_file, picture)))
     for warning in warnings:
         print_note(source, warning)
     if not outcome.verdict.passed:
-        reasons = "; ".join(outcome.verdict.reasons)
-        raise ShareError(f"{source}: unreliable result ({written_message(chain)}): {reasons}")
+        raise ShareError(f"{source}: {failure_message(chain, outcome.verdict.reasons)}")
 
 
 def _calibrate(
@@ -167,13 +164,18 @@ def _summary(outcome: CameraImuCalibration, files: tuple[Path, ...]) -> str:
     import numpy as np
 
     from share.geometry import se3
+    from share.lab.calibrate.report import cells_with_sigmas
 
     fit, verdict = outcome.fit, outcome.verdict
     rotation_deg = np.degrees(se3.so3_log(fit.T_imu_cam0[:3, :3]))
     rows = [
         ["", "", "x", "y", "z"],
-        ["rotation of cam0", "deg", *_cells(rotation_deg, np.degrees(fit.sigma_rotation), 3)],
-        ["position of cam0", "mm", *_cells(fit.T_imu_cam0[:3, 3] * 1e3, fit.sigma_position * 1e3, 2)],
+        ["rotation of cam0", "deg", *cells_with_sigmas(rotation_deg, np.degrees(fit.sigma_rotation), 3)],
+        [
+            "position of cam0",
+            "mm",
+            *cells_with_sigmas(fit.T_imu_cam0[:3, 3] * 1e3, fit.sigma_position * 1e3, 2),
+        ],
     ]
     shift = f"{fit.shift_s * 1e3:+.3f} ± {fit.sigma_shift * 1e3:.3f} ms"
     lines = [
@@ -215,10 +217,6 @@ def _camera_sigmas_text(outcome: CameraImuCalibration) -> str:
     )
 
 
-def _cells(values: F64, errors: F64, digits: int) -> list[str]:
-    return [f"{v:+.{digits}f} ± {e:.{digits}f}" for v, e in zip(values, errors, strict=True)]
-
-
 def _comma_list(values: F64) -> str:
     return ", ".join(f"{value:.2f}" for value in values)
 
@@ -253,7 +251,7 @@ def _comparison_warnings(comparison: MountingComparison | None) -> list[str]:
         ]
     if comparison.is_far:
         return [
-            f"cam0 is {comparison.shifted_mm:.0f} mm and {comparison.turned_deg:.1f} deg from its pose in "
-            "the given calibration"
+            f"cam0 is {comparison.translation_mm:.0f} mm and {comparison.rotation_deg:.1f} deg from its pose "
+            "in the given calibration"
         ]
     return []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,12 +43,11 @@ def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_jso
     \b
     Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine
     """
-    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, writable_dir
     from share.lab.calibrate import imu_report
     from share.lab.calibrate.imu import characterise
-    from share.lab.calibrate.imu_report import allan_chart
     from share.lab.calibrate.imu_table import read_imu
+    from share.lab.calibrate.report import to_json
     from share.sensors.profile import load_profile
 
     device_profile = load_profile(profile_name) if profile_name else None
@@ -62,16 +60,14 @@ def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_jso
     report = imu_report.report_values(characteristics, source, device_profile, inflate) | {
         "dropped": table.dropped
     }
-    text = json.dumps(nan_to_none(report), indent=1)
+    text = to_json(report)
     atomic_write(
         out / "kalibr_imu_chain.yaml",
         imu_report.imu_chain_yaml(characteristics, source, inflate, table.serial),
     )
     atomic_write(out / "imu-report.json", text + "\n")
-    atomic_write(
-        out / "imu-report.png",
-        allan_chart(characteristics, device_profile, f"{source}, {characteristics.rest_s:.0f} s at rest"),
-    )
+    title = f"{source}, {characteristics.rest_s:.0f} s at rest"
+    imu_report.draw_allan(out / "imu-report.png", characteristics, device_profile, title)
     rows = imu_report.noise_rows(characteristics, device_profile)
     click.echo(text if as_json else _summary(characteristics, rows, table.dropped))
     for warning in _warnings(characteristics, rows):
@@ -136,7 +132,7 @@ def _warnings(characteristics: ImuCharacteristics, rows: list[NoiseRow]) -> list
                 f"{_row_name(row)} is {row.ratio_to_profile:.2g} times the profile's "
                 f"{row.profile_value:.2g} {row.unit}"
             )
-        if row.quantity == "walk" and not row.combined.told:
+        if row.quantity == "walk" and not row.combined.significant:
             out.append(
                 f"{_row_name(row)} cannot be measured in {characteristics.rest_s / 60:.0f} min; the file has "
                 "an upper bound; record three hours to measure it"

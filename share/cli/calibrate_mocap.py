@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from share.lab.calibrate.handeye import HandEyeCheck
     from share.lab.mocap.fit import MocapFit
     from share.lab.mocap.trajectory import MocapTrajectory
-    from share.types import F64
 
 
 @click.command(short_help="Calibrate a motion capture's body and clock to a device.")
@@ -79,9 +77,9 @@ def mocap(
     \b
     Example:  share calibrate mocap walk.mcap --truth walk.vicon.tum --out calib/mine
     """
-    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, writable_dir
     from share.lab.calibrate.imu_table import read_imu, stated_noise
+    from share.lab.calibrate.report import to_json
     from share.lab.mocap.files import pick_body, read_bodies
     from share.lab.mocap.fit import fit_mocap
     from share.lab.mocap.report import mocap_yaml, report_values
@@ -101,7 +99,7 @@ def mocap(
         check_fit(result)
         stages("fitting", 1, 1)
     hand_eye_check = _check_with_track(result, track, trajectory) if track else None
-    report = json.dumps(nan_to_none(report_values(result, source, str(truth), hand_eye_check)), indent=1)
+    report = to_json(report_values(result, source, str(truth), hand_eye_check))
     atomic_write(out / "mocap.yaml", mocap_yaml(result, source, str(truth)))
     atomic_write(out / "mocap-report.json", report + "\n")
     click.echo(report if as_json else _summary(result, hand_eye_check))
@@ -127,18 +125,21 @@ def _summary(result: MocapFit, hand_eye_check: HandEyeCheck | None) -> str:
     import numpy as np
 
     from share.geometry import se3
+    from share.lab.calibrate.report import cells_with_sigmas
     from share.lab.mocap.verdict import shared_sigmas
 
     T, residuals, sigma = result.T_body_mocap, result.residuals, shared_sigmas(result)
-    rotation_deg = np.degrees(se3.so3_log(T[:3, :3]))
+    turn_deg, turn_sigma = np.degrees(se3.so3_log(T[:3, :3])), np.degrees(sigma[2:5])
+    rotation = "  ".join(cells_with_sigmas(turn_deg, turn_sigma, 2))
+    position = "  ".join(cells_with_sigmas(T[:3, 3] * 1e3, sigma[5:8] * 1e3, 1))
     lines = [
-        f"body rotation   {_triple_text(rotation_deg, np.degrees(sigma[2:5]), 2)} deg (rotation vector)",
-        f"body position   {_triple_text(T[:3, 3] * 1e3, sigma[5:8] * 1e3, 1)} mm, in the IMU frame",
+        f"body rotation   {rotation} deg (rotation vector)",
+        f"body position   {position} mm, in the IMU frame",
         f"world tilt      {result.tilt_deg:.3f} ± {np.degrees(sigma[:2].max()):.3f} deg, up axis {result.up}",
         f"clock           IMU minus mocap {result.offset_ns * 1e-6:+.2f} ± {sigma[8] * 1e3:.2f} ms, "
         f"drift {result.drift_ppm:+.1f} ± {sigma[9] * 1e6:.1f} ppm",
         f"residuals       {residuals.position_mm:.1f} mm, {residuals.rotation_deg:.2f} deg rms of "
-        f"{residuals.samples} poses, {100 * residuals.doubted:.1f} % outliers",
+        f"{residuals.samples} poses, {100 * residuals.outlier_share:.1f} % outliers",
     ]
     if hand_eye_check:
         lines.append(
@@ -146,7 +147,3 @@ def _summary(result: MocapFit, hand_eye_check: HandEyeCheck | None) -> str:
             f"{hand_eye_check.translation_error_m * 1e3:.1f} mm, {hand_eye_check.sigmas:.1f} standard errors"
         )
     return "\n".join(lines)
-
-
-def _triple_text(values: F64, errors: F64, digits: int) -> str:
-    return "  ".join(f"{v:+.{digits}f} ± {e:.{digits}f}" for v, e in zip(values, errors, strict=True))

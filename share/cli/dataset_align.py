@@ -121,7 +121,7 @@ def align(
         results = write_session(work, devices, _fit_settings(**fitting), stages)
     click.echo(json.dumps(results) if as_json else _result_table(results))
     for name, one in results.items():
-        for line in (*_axis_warnings(one), *one["doubts"]):
+        for line in (*_axis_warnings(one), *one["warnings"]):
             print_note(name, line)
     if not as_json:
         click.echo(f"{out}: ready; play it: share evaluate run {out} --virtual --out RUN")
@@ -252,15 +252,15 @@ _COLUMNS: tuple[Column, ...] = (
     _form("drift ppm", "drift_ppm", "+.1f"),
     _form("corr.", "correlation", ".3f"),
     _form("next corr.", "next_correlation", ".3f"),
-    _form("body deg", "body_turned_deg", ".2f"),
-    _form("±", "body_turned_sigma_deg", ".2f"),
-    _form("body mm", "body_shifted_mm", ".1f"),
-    _form("±", "body_shifted_sigma_mm", ".1f"),
+    _form("body deg", "mounting_rotation_deg", ".2f"),
+    _form("±", "mounting_rotation_sigma_deg", ".2f"),
+    _form("body mm", "mounting_translation_mm", ".1f"),
+    _form("±", "mounting_translation_sigma_mm", ".1f"),
     ("up", lambda one: one["up"]),
     _form("tilt deg", "tilt_deg", ".3f"),
-    _form("rms mm", "left_mm", ".1f"),
-    _form("rms deg", "left_deg", ".2f"),
-    _form("outliers %", "doubted", ".1f", 100),
+    _form("rms mm", "residual_mm", ".1f"),
+    _form("rms deg", "residual_deg", ".2f"),
+    _form("outliers %", "outlier_share", ".1f", 100),
     ("gaps", lambda one: str(len(one["gaps_s"]))),
     _form("truth s", "truth_s", ".1f"),
 )

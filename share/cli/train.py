@@ -102,10 +102,9 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
     _check_train_extra()
     from share.files.writing import writable_dir
     from share.lab.train.keyframe_table import collect_labels
-    from share.lab.train.onnx_graph import backbone_id
-    from share.lab.train.optimisation import TrainingOptions
+    from share.lab.train.network import backbone_id
     from share.lab.train.trained_heads import write_trained
-    from share.lab.train.training import train_model
+    from share.lab.train.training import TrainingOptions, train_model
     from share.odometry.error_model.network import backbone_features, open_network, read_model
 
     collection, live = collect_labels(labels, seed), LiveLine()
@@ -143,10 +142,9 @@ def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
     """
     _check_train_extra()
     from share.files.writing import atomic_write, check_writable
-    from share.lab.train.assembled_model import assemble
-    from share.lab.train.card import model_card
-    from share.lab.train.compare import score_network
-    from share.lab.train.onnx_graph import origin
+    from share.lab.train.compare import assemble, score_network
+    from share.lab.train.network import origin
+    from share.lab.train.score import model_card
 
     check_writable(out)
     assembled = assemble(fitted, labels, _base_model_file(base))
@@ -173,8 +171,7 @@ def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> Non
     Example:  share train compare labels --fit fit
     """
     _check_train_extra()
-    from share.lab.train.assembled_model import assemble
-    from share.lab.train.compare import score_baselines, score_network
+    from share.lab.train.compare import assemble, score_baselines, score_network
     from share.lab.train.score import score_table, scores_json
 
     live = LiveLine()

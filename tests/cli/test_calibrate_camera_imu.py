@@ -70,7 +70,7 @@ def test_mounting_and_offset_are_estimated_and_inverted_extrinsics_reported(
     report = json.loads(done.out)
     assert report == json.loads((tmp_path / "camera-imu-report.json").read_text())
     assert report["passed"] and report["given"]["inverted"]
-    assert report["sigmas_by_cameras"] is None and "no camera-report.json" in report["cameras_known_by"]
+    assert report["sigmas_by_cameras"] is None and "no camera-report.json" in report["camera_sigmas_from"]
     assert (tmp_path / "camera-imu-report.png").read_bytes().startswith(b"\x89PNG")
 
 

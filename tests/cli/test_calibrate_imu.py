@@ -60,7 +60,7 @@ def test_chart_needs_no_formula_fonts(share, table, tmp_path, monkeypatch):
 def test_quantities_not_measurable_in_five_minutes_are_named(share, table, tmp_path):
     done = share("calibrate", "imu", table, "--out", tmp_path, "--json")
     report = json.loads(done.out)
-    assert not report["gyroscope"]["walk"]["told"]
+    assert not report["gyroscope"]["walk"]["significant"]
     assert "gyroscope K cannot be measured in 5 min; the file has an upper bound" in done.err
     text = (tmp_path / "kalibr_imu_chain.yaml").read_text()
     line = next(row for row in text.splitlines() if "gyroscope_random_walk" in row)

@@ -71,7 +71,7 @@ def test_body_tilt_and_clock_are_estimated_and_the_track_agrees(share, room, tmp
     assert made.number("timeshift_imu_mocap") == pytest.approx(LATE_NS * 1e-9, abs=2e-4)
     assert made.number("tilt_deg") == pytest.approx(np.degrees(np.linalg.norm(TILT)), abs=0.03)
     report = json.loads((tmp_path / "mocap-report.json").read_text())
-    assert report["hand_eye"]["agrees"] and report["unsure"] is None
+    assert report["hand_eye"]["agrees"] and report["mounting_warning"] is None
     turned, shifted = error_of(np.array(report["hand_eye"]["T_body_mocap"]))
     assert turned < 0.2 and shifted < 0.003
     assert "body position" in done.out and "hand-eye" in done.out

@@ -205,7 +205,7 @@ def test_given_calibration_and_mounting_are_used(share, room, tmp_path):
     assert (done.code, done.err) == (0, "")
     found = json.loads(done.out)["bob"]
     np.testing.assert_allclose(found["T_body_mocap"], T, atol=5e-4)
-    assert found["body_shifted_sigma_mm"] < 0.5
+    assert found["mounting_translation_sigma_mm"] < 0.5
     made, was = tmp_path / "made" / "bob.mcap", room.folder / "bob.mcap"
     assert not os.path.samefile(made, was) and open_source(str(made)).rig.cam0.fx == 97.0
     assert all(
@@ -272,5 +272,5 @@ def test_real_recording_with_processed_motion_capture(share, shared_data, tmp_pa
     found = json.loads(done.out)["ann"]
     assert done.code == 0 and "neither smoothed nor estimated" in done.err
     assert abs(found["offset_ns"] - away) < 10_000_000 and found["lead"] > 100
-    assert found["body_turned_deg"] == pytest.approx(0.28, abs=0.05) and found["left_mm"] < 1.5
+    assert found["mounting_rotation_deg"] == pytest.approx(0.28, abs=0.05) and found["residual_mm"] < 1.5
     assert share("dataset", "info", tmp_path / "made" / "ann").code == 0

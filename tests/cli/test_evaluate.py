@@ -76,7 +76,7 @@ def test_run_is_scored_compared_and_never_overwritten(evaluate, plain_session, t
     assert "give a new name" in again.err
     before = (run / "run.json").stat().st_mtime_ns
     models = tmp_path / "models.json"
-    models.write_text('[{"name": "ours", "rmse_cm": 1, "mae_cm": 1, "rank": 1, "qoe_off": 0}]')
+    models.write_text('[{"name": "ours", "rmse_cm": 1, "mae_cm": 1, "rank": 1, "qoe_error": 0}]')
     assert evaluate(*arguments, "--with", models).code == 0  # there is nothing left to play
     assert "Error models" in (out / "report.html").read_text()
     assert (run / "run.json").stat().st_mtime_ns == before

@@ -23,7 +23,7 @@ def test_labels_of_a_session(share, plain_session, tmp_path):
     assert len(list(out.iterdir())) == 6
     (clean,) = (path for path in out.iterdir() if path.name.endswith("ar1-0.npz"))
     labels = read_labels(clean)
-    assert labels.about["spells"] == []
+    assert labels.about["faults"] == []
     assert labels.about["agent"] == "ar1"
     known = np.isfinite(labels.error_cm)
     assert not known[labels.stamps_ns < labels.stamps_ns[0] + 2.4e9].any()  # half a window first

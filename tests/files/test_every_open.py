@@ -53,9 +53,6 @@ ALLOWED = {
     ("lab/emulate/world/room_files.py", "write_text"): OURS,
     ("metrics/frame_log.py", "loadtxt"): "lines in memory, of the run's own file",
     ("lab/emulate/world/gltf.py", "load_scene"): "from memory, after gltf_file has measured it",
-    ("lab/calibrate/imu_report.py", "savefig"): MEMORY,
-    ("lab/calibrate/camera_imu_report.py", "savefig"): MEMORY,
-    ("lab/calibrate/camera_report.py", "savefig"): MEMORY,
     ("lab/evaluate/charts.py", "savefig"): MEMORY,
     ("lab/evaluate/provenance.py", "read_bytes"): "SHARE's own sources",
     ("recordings/convert.py", "write_text"): OURS,
@@ -88,8 +85,8 @@ ALLOWED = {
     ("runtime/capture.py", "open"): "a camera",
     ("lab/evaluate/tracker_runs.py", "loads"): "the answer of a program that the user names",
     ("lab/evaluate/real_time.py", "loads"): "events of the edge that it started itself",
-    ("lab/train/optimisation.py", "load"): "weights only, from bytes that are bounded",
-    ("lab/train/optimisation.py", "save"): MEMORY,
+    ("lab/train/training.py", "load"): "weights only, from bytes that are bounded",
+    ("lab/train/training.py", "save"): MEMORY,
 }  # fmt: skip
 
 

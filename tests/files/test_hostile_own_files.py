@@ -196,7 +196,7 @@ def test_delays_from_invalid_reports_are_refused(tmp_path, report):
         "5",
         "{}",
         '{"name": 5, "rmse_cm": 1}',
-        '{"name": "a", "rmse_cm": "x", "mae_cm": 1, "rank": 1, "qoe_off": 1}',
+        '{"name": "a", "rmse_cm": "x", "mae_cm": 1, "rank": 1, "qoe_error": 1}',
     ],
 )
 def test_scores_of_other_types_are_refused(tmp_path, row):

@@ -8,7 +8,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.lab.calibrate.camera_bundle import BoardView
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import Detection
 from share.lab.calibrate.target import AprilGrid, Target
 from share.types import F64, I64, ImuBatch

@@ -7,7 +7,7 @@ import pytest
 from helpers.recordings import make_euroc, make_tum
 
 from share.errors import DataError, UsageError
-from share.lab.calibrate.imu_table import read_imu
+from share.lab.calibrate.imu_table import read_imu, rising_mask
 from share.recordings.convert import to_mcap
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.recorder import Recorder
@@ -112,3 +112,11 @@ def test_few_non_finite_samples_are_dropped_and_many_refused(tmp_path):
     values[2, 2] = np.nan
     with pytest.raises(DataError, match=r"sample 3 is not finite \(2 of 5 IMU samples are damaged: too many"):
         read_imu(str(recorded(tmp_path / "b.mcap", list(range(5)), values)))
+
+
+def test_a_stamp_counts_if_it_is_later_than_all_before() -> None:
+    largest = 2**63 - 1
+    stamps = np.array([-5, -7, 3, 3, largest, 4])
+    assert rising_mask(stamps).tolist() == [True, False, True, False, True, False]
+    assert rising_mask(np.array([largest])).tolist() == [True]
+    assert len(rising_mask(stamps[:0])) == 0

@@ -16,6 +16,7 @@ from share.types import F64, I64
 
 _MIN_SAMPLES = 100
 _STARTS_PER_AVERAGE = 16
+_SIZES_PER_OCTAVE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class AllanCurve:
         return np.asarray(np.where(averages >= 2, averages, 0).sum(axis=1), np.int64)
 
 
-def allan_deviation(samples: F64 | Sequence[F64], rate_hz: float, per_octave: int = 4) -> AllanCurve:
+def allan_deviation(samples: F64 | Sequence[F64], rate_hz: float) -> AllanCurve:
     """Return the Allan deviation of samples (N, A) at `rate_hz`, or of several segments with gaps between
     them.
 
@@ -55,20 +56,16 @@ def allan_deviation(samples: F64 | Sequence[F64], rate_hz: float, per_octave: in
     if not all(np.isfinite(s).all() for s in segments):
         raise DataError("Allan deviation: has samples that are not finite")
     octaves = np.log2(longest / 4)
-    sizes = np.unique(np.rint(2 ** np.linspace(0, octaves, int(octaves * per_octave) + 1)).astype(np.int64))
-    total = np.sum([_squared_differences(_running_sum(one), sizes) for one in segments], axis=0)
+    powers = np.linspace(0, octaves, int(octaves * _SIZES_PER_OCTAVE) + 1)
+    sizes = np.unique(np.rint(2**powers).astype(np.int64))
+    sums = [np.cumsum(one - one.mean(axis=0), axis=0) for one in segments]  # the mean does not matter
+    total = np.sum([_squared_differences(np.pad(one, ((1, 0), (0, 0))), sizes) for one in sums], axis=0)
     return AllanCurve(
         sizes=sizes,
         deviation=np.sqrt(total[:, :-1] / total[:, -1:] / 2) / sizes[:, None],
         segment_lengths=np.array([len(s) for s in segments], np.int64),
         rate_hz=rate_hz,
     )
-
-
-def _running_sum(samples: F64) -> F64:
-    """Return the running sum (N + 1, A) of samples (N, A) minus their mean, which does not matter."""
-    sums = np.cumsum(samples - samples.mean(axis=0), axis=0)
-    return np.concatenate([np.zeros((1, samples.shape[1])), sums])
 
 
 def _squared_differences(theta: F64, sizes: I64) -> F64:
@@ -99,19 +96,11 @@ _CORNER_LAGS = 33  # lags about each of its nine corners
 _SECOND_DIFFERENCE = np.array([1.0, -2.0, 1.0])
 
 
-def _white(h: F64) -> F64:
-    return -h / 2
-
-
-def _flicker(h: F64) -> F64:
-    return np.asarray(h * h * np.log(np.maximum(h, 1e-300)) / (2 * np.pi), np.float64)
-
-
-def _walk(h: F64) -> F64:
-    return h**3 / 12
-
-
-_NOISE_MODELS: tuple[Callable[[F64], F64], ...] = (_white, _flicker, _walk)
+_NOISE_MODELS: tuple[Callable[[F64], F64], ...] = (
+    lambda h: -h / 2,
+    lambda h: h * h * np.log(np.maximum(h, 1e-300)) / (2 * np.pi),
+    lambda h: h**3 / 12,
+)
 
 
 def variance_covariance(sizes: I64, lengths: I64, rate_hz: float) -> F64:

@@ -12,9 +12,10 @@ import numpy as np
 from share.errors import DataError, UsageError
 from share.geometry import rig_check
 from share.geometry.camera import Camera, Rig
-from share.lab.calibrate.camera_bundle import BoardView
 from share.lab.calibrate.camera_report import UNKNOWN_UNCERTAINTY, RigUncertainty, read_rig_uncertainty
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import Detection, detector
+from share.lab.calibrate.imu_table import rising_mask
 from share.lab.calibrate.target import Target
 from share.lab.pool import Pool
 from share.recordings.calibration import CAMCHAIN, Calibration
@@ -250,7 +251,7 @@ def find_stamped_views(
     if not all(view.name.isdecimal() and int(view.name) < 2**63 for view in with_target):
         raise DataError(f"{source.name}: images have no stamps; name them cam0/STAMP.png, STAMP in ns")
     stamps = np.array([int(view.name) for view in with_target], np.int64)
-    later = stamps > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps[:-1]]))
+    later = rising_mask(stamps)
     kept_views = [view for view, keep in zip(with_target, later, strict=True) if keep]
     return StampedViews(stamps[later], kept_views, len(views), len(with_target) - len(kept_views))
 

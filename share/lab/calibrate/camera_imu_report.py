@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,31 +16,23 @@ from share.lab.calibrate.camera_imu.fit import CameraImuFit
 from share.lab.calibrate.camera_imu.verdict import CameraImuVerdict, MountingComparison
 from share.lab.calibrate.camera_report import RigUncertainty
 from share.lab.calibrate.corners import inlier_mask
+from share.lab.calibrate.report import AXIS_COLOURS, chain_heading
+from share.lab.evaluate.charts import agg_pyplot, save_png
 from share.recordings.calibration import Calibration, to_kalibr
 from share.types import F64, I64
 
-_COLOURS = ("#00798c", "#d1495b", "#edae49")
 
-
-def residual_chart(fit: CameraImuFit, title: str) -> bytes:
-    """Return a PNG: RMS of each image's inlier corners, and the residuals of gyroscope and accelerometer
-    with three sigmas of the stated noise."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, panels = pyplot.subplots(3, 1, figsize=(12, 8), layout="constrained", sharex=True)
+def draw_residuals(path: Path, fit: CameraImuFit, title: str) -> None:
+    """Write a PNG: RMS of each image's inlier corners, and the residuals of gyroscope and accelerometer with
+    three sigmas of the stated noise."""
+    figure, panels = agg_pyplot().subplots(3, 1, figsize=(12, 8), layout="constrained", sharex=True)
     _draw_corners(panels[0], fit)
     t = _seconds(fit, fit.imu.stamps_ns)
     _draw_inertial(panels[1], t, fit.gyro, fit.stated_sigmas.gyro, "gyroscope, rad/s")
     _draw_inertial(panels[2], t, fit.accel, fit.stated_sigmas.accel, "accelerometer, m/s²")
     panels[2].set_xlabel("s")
     figure.suptitle(title)
-    out = io.BytesIO()
-    figure.savefig(out, dpi=75, format="png")
-    pyplot.close(figure)
-    return out.getvalue()
+    save_png(figure, path, 75)
 
 
 def _seconds(fit: CameraImuFit, stamps_ns: I64) -> F64:
@@ -48,13 +40,15 @@ def _seconds(fit: CameraImuFit, stamps_ns: I64) -> F64:
 
 
 def _draw_corners(panel: Any, fit: CameraImuFit) -> None:
-    t = _seconds(fit, fit.observations.stamps_ns) + fit.shift_s
+    t = _seconds(fit, fit.stamps_ns) + fit.shift_s
     for cam, (r, observations) in enumerate(zip(fit.corners, fit.observations.corners, strict=True)):
         inliers = inlier_mask(r, fit.sigmas.px)
         frames, size = observations.frame[inliers], len(t)
         count = np.bincount(frames, minlength=size)
         rms = np.sqrt(np.bincount(frames, (r[inliers] ** 2).sum(axis=1), size) / np.maximum(count, 1))
-        panel.plot(t[count > 0], rms[count > 0], ".", markersize=3, color=_COLOURS[cam], label=f"cam{cam}")
+        panel.plot(
+            t[count > 0], rms[count > 0], ".", markersize=3, color=AXIS_COLOURS[cam], label=f"cam{cam}"
+        )
     panel.set(ylabel="px", ylim=(0, None), title="corners, RMS of each image")
     panel.legend(loc="upper right", fontsize=8)
     panel.grid(alpha=0.3)
@@ -62,7 +56,7 @@ def _draw_corners(panel: Any, fit: CameraImuFit) -> None:
 
 def _draw_inertial(panel: Any, t: F64, residuals: F64, stated: float, title: str) -> None:
     for k, axis in enumerate("xyz"):
-        panel.plot(t, residuals[:, k], ".", markersize=1, color=_COLOURS[k], label=axis)
+        panel.plot(t, residuals[:, k], ".", markersize=1, color=AXIS_COLOURS[k], label=axis)
     for side in (-3, 3):
         panel.axhline(side * stated, color="black", linewidth=1, linestyle="--")
     rms = float(np.sqrt((residuals**2).mean())) / stated
@@ -105,16 +99,14 @@ class CameraImuCalibration:
 
 def camchain_yaml(outcome: CameraImuCalibration, source: str, report: str) -> str:
     """Return Kalibr's camchain-imucam: intrinsics unchanged, T_cam_imu and timeshift_cam_imu of each camera.
-
-    report: name of the file with the reasons of a failure.
-    """
+    report: as for `chain_heading`."""
     chain = to_kalibr(outcome.calibrated_rig, outcome.given_calibration, outcome.serial)
     del chain["imu0"]
     for cam, T in enumerate(outcome.T_cam_imu):
         chain[f"cam{cam}"] |= {"T_cam_imu": T.tolist(), "timeshift_cam_imu": outcome.fit.shift_s}
-    verdict = "passed" if outcome.verdict.passed else f"FAILED, see {report}"
-    head = f"# share calibrate camera-imu {source}: {verdict}\n# t_imu = t_cam + timeshift_cam_imu\n"
-    return head + yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
+    heading = chain_heading("camera-imu", source, outcome.verdict.passed, report)
+    heading += "# t_imu = t_cam + timeshift_cam_imu\n"
+    return heading + yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
 
 
 def imu_chain_yaml(outcome: CameraImuCalibration, source: str) -> str:
@@ -139,20 +131,20 @@ def report_values(outcome: CameraImuCalibration) -> dict[str, Any]:
         "sigmas": _sigma_values(fit.axis_sigmas(fit.covariance)),
         "sigmas_by_noise": _sigma_values(fit.axis_sigmas(fit.by_noise)),
         "sigmas_by_cameras": None if fit.by_rig is None else _sigma_values(fit.axis_sigmas(fit.by_rig)),
-        "cameras_known_by": outcome.uncertainty.source,
+        "camera_sigmas_from": outcome.uncertainty.source,
         "covariance": fit.covariance.tolist(),
         "gravity": fit.state.gravity.tolist(),
         "gravity_norm": float(np.linalg.norm(fit.state.gravity)),
         "gyro_bias": fit.state.biases[:, :3].mean(axis=0).tolist(),
         "accel_bias": fit.state.biases[:, 3:].mean(axis=0).tolist(),
-        "turning_rms": verdict.rotation_rate_rms.tolist(),
-        "moving_rms": verdict.acceleration_rms.tolist(),
+        "rotation_rate_rms": verdict.rotation_rate_rms.tolist(),
+        "acceleration_rms": verdict.acceleration_rms.tolist(),
         "residuals": _residual_values(outcome),
-        "began": {
+        "initial": {
             "timeshift_cam_imu": fit.initial_alignment.shift_s,
             "correlation": fit.initial_alignment.correlation,
         },
-        "given": None if comparison is None else vars(comparison) | {"far": comparison.is_far},
+        "given": None if comparison is None else vars(comparison) | {"is_far": comparison.is_far},
     }
 
 
@@ -167,7 +159,7 @@ def _sigma_values(sigmas: F64) -> dict[str, Any]:
 def _residual_values(outcome: CameraImuCalibration) -> dict[str, Any]:
     fit, verdict = outcome.fit, outcome.verdict
     cameras = [
-        {"rms_px": rms, "corners": len(r), "corners_left_out": outliers}
+        {"rms_px": rms, "corners": len(r), "outlier_corners": outliers}
         for rms, r, outliers in zip(verdict.rms_px, fit.corners, verdict.outlier_corners, strict=True)
     ]
     rows = (("gyro", fit.gyro, fit.stated_sigmas.gyro), ("accel", fit.accel, fit.stated_sigmas.accel))

@@ -49,11 +49,7 @@ def board_pose(camera: Camera, board: F64, px: F64) -> F64:
     if camera.is_fisheye:
         return _pose_from_rays(camera.directions(px), board)
     H = homography(board, camera.normalise(px))
-    H = H / np.linalg.norm(H[:, :2], axis=0).mean() * np.sign(H[2, 2])
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])])
-    T[:3, 3] = H[:, 2]
-    return se3.orthonormal(T)
+    return _pose_from_homography(H * np.sign(H[2, 2]))
 
 
 def initial_fisheye(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[int, int]) -> Camera:
@@ -63,11 +59,9 @@ def initial_fisheye(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[in
     Raises ValueError where none fits.
     """
     best, lowest_cost = None, np.inf
-    for f in np.geomspace(*_FISHEYE_FOCALS, _FISHEYE_TRIALS) * max(size):
-        middle = (np.array(size) - 1) / 2
-        camera = Camera(
-            *size, float(f), float(f), float(middle[0]), float(middle[1]), (0.0,) * 4, EQUIDISTANT
-        )
+    cx, cy = ((side - 1) / 2 for side in size)
+    for f in (np.geomspace(*_FISHEYE_FOCALS, _FISHEYE_TRIALS) * max(size)).tolist():
+        camera = Camera(*size, f, f, cx, cy, (0.0,) * 4, EQUIDISTANT)
         errors_px = [_reprojection_errors(camera, xy, px) for xy, px in zip(boards, pixels, strict=True)]
         if (cost := float(np.median(np.concatenate(errors_px)))) < lowest_cost:
             best, lowest_cost = camera, cost
@@ -101,9 +95,13 @@ def _pose_from_rays(ray: F64, board: F64) -> F64:
     A = (hat(ray)[:, :, :, None] * normalised_board[:, None, None, :]).reshape(-1, 9)
     H = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3)
     H = H @ np.array([[1 / scale, 0, -middle[0] / scale], [0, 1 / scale, -middle[1] / scale], [0, 0, 1.0]])
-    H = H / np.linalg.norm(H[:, :2], axis=0).mean()
     depths = np.einsum("ni,ij,nj->n", ray, H, np.column_stack([xy, np.ones(len(xy))]))
-    H = H * np.sign(np.median(depths))
+    return _pose_from_homography(H * np.sign(np.median(depths)))
+
+
+def _pose_from_homography(H: F64) -> F64:
+    """Return T_cam_target (4, 4) from H = [r1 r2 t] up to a positive scale."""
+    H = H / np.linalg.norm(H[:, :2], axis=0).mean()
     T = np.eye(4)
     T[:3, :3] = np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])])
     T[:3, 3] = H[:, 2]

@@ -3,7 +3,6 @@ covariance back."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,16 +17,20 @@ from share.files.yaml_file import read_yaml
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.lens import RADTAN
-from share.lab.calibrate.camera_bundle import BoardView, CameraBundleSolution, shared_size
+from share.lab.calibrate.camera_bundle import CameraBundleSolution
 from share.lab.calibrate.camera_initialisation import intrinsics, parameter_names
 from share.lab.calibrate.camera_verdict import CameraVerdict, Coverage, camera_residuals
+from share.lab.calibrate.corner_observations import BoardView, rig_size
 from share.lab.calibrate.corners import inlier_mask, model_radius
+from share.lab.calibrate.report import AXIS_COLOURS, chain_heading, failed_path
 from share.lab.calibrate.target import Target, read_target
-from share.recordings.calibration import CAMCHAIN, Calibration, imu_noise, to_kalibr
+from share.lab.evaluate.charts import agg_pyplot, save_png
+from share.recordings.calibration import Calibration, imu_noise, to_kalibr
 from share.types import F64
 
 REPORT, PICTURE = "camera-report.json", "camera-report.png"
 _MAX_ARROWS = 1500  # more overlap
+_INLIER_COLOUR, _OUTLIER_COLOUR = AXIS_COLOURS[:2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,20 +79,14 @@ class CameraCalibration:
 
 
 def camchain_yaml(outcome: CameraCalibration, source: str, report: str) -> str:
-    """Return the camchain, with the given extrinsics to the IMU. The IMU's noise is in another file, by
-    `share calibrate imu`.
-
-    `report`: name of the file with the reasons of a failure.
-    """
+    """Return the camchain, with the given extrinsics to the IMU. report: as for `chain_heading`."""
     kalibr = to_kalibr(outcome.rig, outcome.given_calibration, outcome.serial)
     chain = {key: value for key, value in kalibr.items() if key != "imu0"}
     if "T_cam_imu" in chain["cam0"] and "cam1" in chain:  # by the new pair
         T_cam1_cam0 = np.array(chain["cam1"]["T_cn_cnm1"])
         chain["cam1"]["T_cam_imu"] = (T_cam1_cam0 @ chain["cam0"]["T_cam_imu"]).tolist()
-    verdict = "passed" if outcome.verdict.passed else f"FAILED, see {report}"
-    return f"# share calibrate camera {source}: {verdict}\n" + yaml.safe_dump(
-        chain, sort_keys=False, default_flow_style=None
-    )
+    heading = chain_heading("camera", source, outcome.verdict.passed, report)
+    return heading + yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
 
 
 def report_values(outcome: CameraCalibration) -> dict[str, Any]:
@@ -119,7 +116,7 @@ def report_values(outcome: CameraCalibration) -> dict[str, Any]:
     if len(outcome.coverages) == 2:
         state, sigmas = outcome.solution.state, outcome.solution.sigmas[-6:]
         out["T_cam1_cam0"] = state.T_cam1_cam0.tolist()
-        out["epipolar_median_px"] = {"found": verdict.epipolar_px, "before": outcome.previous_epipolar_px}
+        out["epipolar_median_px"] = {"after": verdict.epipolar_px, "before": outcome.previous_epipolar_px}
         out["baseline_m"] = float(np.linalg.norm(state.T_cam1_cam0[:3, 3]))
         out["T_cam1_cam0_sigmas"] = {"rad": sigmas[:3].tolist(), "m": sigmas[3:].tolist()}
     return out
@@ -135,43 +132,42 @@ def _camera_values(outcome: CameraCalibration, cam: int) -> dict[str, Any]:
         "sigmas": dict(zip(parameter_names(camera), sigmas.tolist(), strict=True)),
         "rms_px": outcome.verdict.rms_px[cam],
         "rms_all_px": outcome.verdict.rms_all_px[cam],
-        "corners_left_out": outcome.verdict.outlier_corners[cam],
-        "lens_fits_to_px": outcome.model_radius(cam),
-        "covered": cover.share,
-        "missing": list(cover.gaps),
+        "outlier_corners": outcome.verdict.outlier_corners[cam],
+        "model_radius_px": outcome.model_radius(cam),
+        "coverage": cover.share,
+        "coverage_gaps": list(cover.gaps),
     }
 
 
 def parameter_table(outcome: CameraCalibration) -> list[list[str]]:
     """Return rows for a terminal: each parameter with its sigma, beside the previous value."""
-    state, previous_rig = outcome.solution.state, outcome.previous_rig
-    rows = [["", "", "value", "sigma", *(["before", "change"] if previous_rig else [])]]
-    previous_cameras = (previous_rig.cam0, previous_rig.cam1) if previous_rig else (None, None)
+    state, rig = outcome.solution.state, outcome.previous_rig
+    rows = [["", "", "value", "sigma", *(["before", "change"] if rig else [])]]
     for cam, camera in enumerate(state.cameras):
-        previous, sigmas = previous_cameras[cam], outcome.solution.sigmas[state.intrinsic_slices[cam]]
-        previous_values = (
-            {}
-            if previous is None
-            else dict(zip(parameter_names(previous), intrinsics(previous).tolist(), strict=True))
-        )
-        same = previous is not None and previous.model == camera.model
-        for k, (name, value) in enumerate(
-            zip(parameter_names(camera), intrinsics(camera).tolist(), strict=True)
-        ):
-            sigma = sigmas[k]
+        before = _values_before(rig, cam, camera)
+        sigmas = outcome.solution.sigmas[state.intrinsic_slices[cam]]
+        for k, (name, value) in enumerate(zip(parameter_names(camera), intrinsics(camera), strict=True)):
             digits = 3 if k < 4 else 5
-            row = [f"cam{cam}", name, f"{value:.{digits}f}", f"{sigma:.{digits}f}"]
-            if previous_rig:
-                previous_value = (
-                    previous_values.get(name, 0.0)
-                    if same or (previous is not None and k < 4)
-                    else float("nan")
-                )
-                row += [f"{previous_value:.{digits}f}", f"{value - previous_value:+.{digits}f}"]
+            row = [f"cam{cam}", name, f"{value:.{digits}f}", f"{sigmas[k]:.{digits}f}"]
+            if rig:
+                row += [f"{before[k]:.{digits}f}", f"{value - before[k]:+.{digits}f}"]
             rows.append(row)
     if len(state.cameras) == 2:
         rows.append(_baseline(outcome))
     return rows
+
+
+def _values_before(rig: Rig | None, cam: int, camera: Camera) -> F64:
+    """Return the previous values of a camera's parameters: NaN where unknown, also coefficients of another
+    lens model; 0 for coefficients that it did not have."""
+    out = np.full(len(parameter_names(camera)), np.nan)
+    if rig is None or (previous := (rig.cam0, rig.cam1)[cam]) is None:
+        return out
+    if previous.model == camera.model:
+        out[:] = 0.0
+    known = min(len(out), len(intrinsics(previous))) if previous.model == camera.model else 4
+    out[:known] = intrinsics(previous)[:known]
+    return out
 
 
 def _baseline(outcome: CameraCalibration) -> list[str]:
@@ -187,16 +183,11 @@ def _baseline(outcome: CameraCalibration) -> list[str]:
     return row
 
 
-def residual_chart(outcome: CameraCalibration, title: str) -> bytes:
-    """Return a PNG: of each camera the corners with their residuals (times 100), the residuals' scatter,
-    and the RMS of each view."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
+def draw_residuals(path: Path, outcome: CameraCalibration, title: str) -> None:
+    """Write a PNG: of each camera the corners with their residuals (times 100), the residuals' scatter, and
+    the RMS of each view."""
     cams = len(outcome.coverages)
-    figure, panels = pyplot.subplots(
+    figure, panels = agg_pyplot().subplots(
         cams, 3, figsize=(14, 4 * cams), layout="constrained", squeeze=False, width_ratios=(1.6, 1, 1.6)
     )
     for cam, (corner_panel, scatter_panel, view_panel) in enumerate(panels):
@@ -204,10 +195,7 @@ def residual_chart(outcome: CameraCalibration, title: str) -> bytes:
         _draw_scatter(scatter_panel, outcome, cam)
         _draw_views(view_panel, outcome, cam)
     figure.suptitle(f"{title}: {'passed' if outcome.verdict.passed else 'FAILED'}")
-    out = io.BytesIO()
-    figure.savefig(out, dpi=75, format="png")
-    pyplot.close(figure)
-    return out.getvalue()
+    save_png(figure, path, 75)
 
 
 def _draw_corners(panel: Any, outcome: CameraCalibration, cam: int) -> None:
@@ -217,7 +205,7 @@ def _draw_corners(panel: Any, outcome: CameraCalibration, cam: int) -> None:
     px, r, inside = outcome.corners_of(cam)
     drawn = np.flatnonzero(inside)[:: 1 + int(inside.sum()) // _MAX_ARROWS]
     panel.quiver(*px[drawn].T, *r[drawn].T, angles="xy", scale_units="xy", scale=0.01, width=0.0015)
-    panel.plot(*px[~inside].T, "x", color="#d1495b", markersize=4)
+    panel.plot(*px[~inside].T, "x", color=_OUTLIER_COLOUR, markersize=4)
     panel.set(xlim=extent[:2], ylim=extent[2:])
     if (radius := outcome.model_radius(cam)) is not None:
         angles = np.linspace(0, 2 * np.pi, 200)
@@ -225,7 +213,7 @@ def _draw_corners(panel: Any, outcome: CameraCalibration, cam: int) -> None:
             camera.cx + radius * np.cos(angles),
             camera.cy + radius * np.sin(angles),
             "--",
-            color="#d1495b",
+            color=_OUTLIER_COLOUR,
             lw=1,
         )
     panel.set(title=f"cam{cam}: {coverage.share:.0%} of the image; residuals × 100, crosses: outliers")
@@ -234,7 +222,7 @@ def _draw_corners(panel: Any, outcome: CameraCalibration, cam: int) -> None:
 def _draw_scatter(panel: Any, outcome: CameraCalibration, cam: int) -> None:
     r, verdict = camera_residuals(outcome.solution, cam), outcome.verdict
     limit = 6 * outcome.solution.sigma_px
-    panel.plot(*r.T, ".", markersize=2, color="#00798c", alpha=0.4)
+    panel.plot(*r.T, ".", markersize=2, color=_INLIER_COLOUR, alpha=0.4)
     title = (
         f"{verdict.rms_px[cam]:.3f} px RMS, {verdict.rms_all_px[cam]:.3f} "
         f"with {verdict.outlier_corners[cam]} outliers"
@@ -245,40 +233,10 @@ def _draw_scatter(panel: Any, outcome: CameraCalibration, cam: int) -> None:
 
 def _draw_views(panel: Any, outcome: CameraCalibration, cam: int) -> None:
     rms = outcome.verdict.view_rms[:, cam]
-    colours = [
-        "#d1495b" if is_outlier else "#00798c" for is_outlier in outcome.verdict.is_outlier_view[:, cam]
-    ]
+    colours = np.where(outcome.verdict.is_outlier_view[:, cam], _OUTLIER_COLOUR, _INLIER_COLOUR)
     panel.bar(np.arange(len(rms)), np.nan_to_num(rms), color=colours)
     panel.set(title="RMS of each view, outliers red", xlabel="view", ylabel="px")
     panel.set_ylim(0, 1.2 * float(np.nanpercentile(rms, 95)) + 0.05)
-
-
-# Files of an earlier calibration in the output folder are never replaced by a failed one.
-
-_FAILED_SUFFIX = ".failed"
-
-
-def output_paths(out: Path, passed: bool, *names: str) -> tuple[Path, ...]:
-    """Return where to write files: under their names in `out`; or all as NAME.failed.EXT, if the calibration
-    failed and one of them exists.
-
-    A failed calibration never replaces an earlier one.
-    """
-    paths = tuple(out / name for name in names)
-    keeps_previous = not passed and any(path.exists() for path in paths)
-    return tuple(failed_path(path) for path in paths) if keeps_previous else paths
-
-
-def failed_path(path: Path) -> Path:
-    """Return NAME.failed.EXT."""
-    return path.with_name(path.stem + _FAILED_SUFFIX + path.suffix)
-
-
-def written_message(chain: Path) -> str:
-    """Return a message about where `output_paths` put a camchain."""
-    return f"{chain} is written" + (
-        "" if chain.name == CAMCHAIN else f"; the existing {CAMCHAIN} and its report are kept"
-    )
 
 
 def has_noise(chain: Path, noise: ImuNoise) -> bool:
@@ -337,7 +295,7 @@ def _read_uncertainty(path: Path, rig: Rig) -> RigUncertainty | None:
         passed = bool(report["passed"])
     except (KeyError, TypeError, ValueError):
         return None if "covariance" not in report else _raise_damaged(path)
-    size = shared_size(_cameras(rig))
+    size = rig_size(_cameras(rig))
     if covariance.shape != (size, size) or not np.isfinite(covariance).all():
         return _raise_damaged(path)
     return RigUncertainty(covariance, str(path), passed)

@@ -12,26 +12,20 @@ from numpy.typing import NDArray
 from share.geometry.camera import Camera, rays
 from share.geometry.se3 import hat
 from share.lab.calibrate import corners
-from share.lab.calibrate.camera_bundle import MIN_VIEWS, BoardView, CameraBundleSolution
+from share.lab.calibrate.camera_bundle import CameraBundleSolution
 from share.lab.calibrate.camera_initialisation import has_enough_corners, homography, intrinsics
+from share.lab.calibrate.corner_observations import BoardView
+from share.lab.calibrate.report import corner_failures
 from share.lab.calibrate.target import Target
 from share.types import F64, I64
 
-_MAX_OUTLIER_SHARE = 0.05
+MIN_VIEW_COUNT = 12
+MIN_COVERAGE = 0.6  # of the image's cells
+MAX_RMS_PX = 0.5  # of inlier corners
+MAX_EPIPOLAR_PX = 0.3  # median distance from epipolar lines
+MAX_FOCAL_SIGMA = 2e-3  # over the focal length
 _OUTLIER_MADS = 5.0
 _MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
-
-
-@dataclass(frozen=True)
-class CameraLimits:
-    """Limits to pass. rms_px: of inlier corners. epipolar_px: median distance from epipolar lines.
-    focal_sigma_ratio: sigma over focal length. coverage: of the image's cells, at least. views: at least."""
-
-    rms_px: float = 0.5
-    epipolar_px: float = 0.3
-    focal_sigma_ratio: float = 2e-3
-    coverage: float = 0.6
-    views: int = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,72 +56,54 @@ class CameraVerdict:
 
 
 def judge_cameras(
-    solution: CameraBundleSolution,
-    coverages: Sequence[Coverage],
-    stereo_views: Sequence[BoardView] = (),
-    limits: CameraLimits = CameraLimits(),
+    solution: CameraBundleSolution, coverages: Sequence[Coverage], stereo_views: Sequence[BoardView] = ()
 ) -> CameraVerdict:
     """Check a solution and the coverage of each camera's views.
 
     stereo_views: all views in which two cameras saw the board, used in the solution or not.
     """
     cams = range(len(solution.state.cameras))
-    view_rms = np.array([[corners.rms(view[cam]) for cam in cams] for view in solution.residuals])
-    residuals_of = [camera_residuals(solution, cam) for cam in cams]
-    inliers = [corners.inlier_mask(r, solution.sigma_px) for r in residuals_of]
-    rms = tuple(corners.rms(r[k]) for r, k in zip(residuals_of, inliers, strict=True))
-    rms_all = tuple(corners.rms(r) for r in residuals_of)
-    outliers = tuple(int((~k).sum()) for k in inliers)
-    unfit = [corners.count_outliers(r, solution.sigma_px, limits.rms_px) for r in residuals_of]
-    reasons = [reason for cam in cams for reason in _failures(solution, cam, rms[cam], unfit[cam], limits)]
-    for cam, cover in enumerate(coverages):
-        if cover.share < limits.coverage:
+    residuals = [camera_residuals(solution, cam) for cam in cams]
+    inliers = [corners.inlier_mask(r, solution.sigma_px) for r in residuals]
+    reasons = [reason for cam in cams for reason in _failures(solution, cam, residuals[cam])]
+    reasons += [
+        f"cam{cam}: corners in {cover.share:.0%} of the image, {MIN_COVERAGE:.0%} needed; "
+        + "; ".join(cover.gaps)
+        for cam, cover in enumerate(coverages)
+        if cover.share < MIN_COVERAGE
+    ]
+    epipolar_px, state = None, solution.state
+    if len(cams) == 2:
+        epipolar_px = median_epipolar_px(state.cameras[0], state.cameras[1], state.T_cam1_cam0, stereo_views)
+        if not epipolar_px <= MAX_EPIPOLAR_PX:
             reasons.append(
-                f"cam{cam}: corners in {cover.share:.0%} of the image, {limits.coverage:.0%} needed; "
-                + "; ".join(cover.gaps)
+                f"stereo pair: median distance of corners from their epipolar lines is {epipolar_px:.2f} px, "
+                f"at most {MAX_EPIPOLAR_PX:g} allowed: do both cameras expose at once, is one loose?"
             )
-    state = solution.state
-    has_two = len(cams) == 2
-    epipolar_px = (
-        median_epipolar_px(state.cameras[0], state.cameras[1], state.T_cam1_cam0, stereo_views)
-        if has_two
-        else None
-    )
-    if epipolar_px is not None and not epipolar_px <= limits.epipolar_px:
-        reasons.append(
-            f"stereo pair: median distance of corners from their epipolar lines is {epipolar_px:.2f} px, at "
-            f"most {limits.epipolar_px:g} allowed: do both cameras expose at once, is one loose?"
-        )
+    view_rms = np.array([[corners.rms(view[cam]) for cam in cams] for view in solution.residuals])
     return CameraVerdict(
-        tuple(reasons), rms, rms_all, outliers, view_rms, _outlier_views(view_rms), epipolar_px
+        reasons=tuple(reasons),
+        rms_px=tuple(corners.rms(r[k]) for r, k in zip(residuals, inliers, strict=True)),
+        rms_all_px=tuple(corners.rms(r) for r in residuals),
+        outlier_corners=tuple(int((~k).sum()) for k in inliers),
+        view_rms=view_rms,
+        is_outlier_view=_outlier_views(view_rms),
+        epipolar_px=epipolar_px,
     )
 
 
-def _failures(
-    solution: CameraBundleSolution, cam: int, rms: float, unfit: int, limits: CameraLimits
-) -> list[str]:
-    views = sum(len(view[cam]) > 0 for view in solution.residuals)
-    corners = sum(len(view[cam]) for view in solution.residuals)
-    begin = solution.state.intrinsic_slices[cam].start
-    part = slice(begin, begin + 2)
-    focal_sigma_ratio = float((solution.sigmas[part] / intrinsics(solution.state.cameras[cam])[:2]).max())
-    out = []
-    if views < max(limits.views, MIN_VIEWS):
-        out.append(f"cam{cam}: {views} views, {limits.views} needed")
-    if not rms <= limits.rms_px:
+def _failures(solution: CameraBundleSolution, cam: int, residuals: F64) -> list[str]:
+    out, views = [], sum(len(view[cam]) > 0 for view in solution.residuals)
+    if views < MIN_VIEW_COUNT:
+        out.append(f"cam{cam}: {views} views, {MIN_VIEW_COUNT} needed")
+    hint = "are the images blurred, the board bent, or --target wrong?"
+    out += corner_failures(cam, residuals, solution.sigma_px, MAX_RMS_PX, hint)
+    sigmas = solution.sigmas[solution.state.intrinsic_slices[cam]]
+    focal_sigma = float((sigmas[:2] / intrinsics(solution.state.cameras[cam])[:2]).max())
+    if not focal_sigma <= MAX_FOCAL_SIGMA:
         out.append(
-            f"cam{cam}: {rms:.2f} px RMS, at most {limits.rms_px:g} allowed: are the images blurred, the "
-            "board bent, or --target wrong?"
-        )
-    if unfit > _MAX_OUTLIER_SHARE * corners:
-        out.append(
-            f"cam{cam}: {unfit} of {corners} corners do not fit within {limits.rms_px:g} px, at most "
-            f"{_MAX_OUTLIER_SHARE:.0%} allowed"
-        )
-    if not focal_sigma_ratio <= limits.focal_sigma_ratio:
-        out.append(
-            f"cam{cam}: focal length known to {focal_sigma_ratio:.2%}, {limits.focal_sigma_ratio:.2%} "
-            "needed: tilt the board more"
+            f"cam{cam}: focal length known to {focal_sigma:.2%}, {MAX_FOCAL_SIGMA:.2%} needed: tilt the "
+            "board more"
         )
     return out
 

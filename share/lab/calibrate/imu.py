@@ -123,7 +123,7 @@ class ImuCharacteristics:
     accel: SensorNoise
 
 
-def characterise(imu: ImuBatch, model_error: float = 0.02) -> ImuCharacteristics:
+def characterise(imu: ImuBatch) -> ImuCharacteristics:
     """Characterise an IMU by samples in order of time. Raises DataError where they are not at rest, or too
     few."""
     rate_hz = _measured_rate_hz(imu.stamps_ns)
@@ -138,7 +138,7 @@ def characterise(imu: ImuBatch, model_error: float = 0.02) -> ImuCharacteristics
     def sensor(values: F64) -> SensorNoise:
         parts = zip(np.split(values, cut_rows), np.split(np.append(missing, 0), cut_rows), strict=True)
         curve = allan_deviation([_fill_gaps(part, gap) for part, gap in parts], rate_hz)
-        return SensorNoise(values.mean(axis=0), curve, fit_noise(curve, model_error))
+        return SensorNoise(values.mean(axis=0), curve, fit_noise(curve))
 
     seconds = np.ptp(imu.stamps_ns) * 1e-9, np.ptp(at_rest.stamps_ns) * 1e-9
     return ImuCharacteristics(

@@ -30,23 +30,23 @@ _JITTER = 1e-12  # of the variances, so that a model without noise can be factor
 
 
 class NoiseEstimate(NamedTuple):
-    """A value and its standard error. told: whether it is significant. If not, it is below `bound` with 95
-    % confidence, and no more is known."""
+    """A value and its standard error. If it is not significant, it is below `bound` with 95 %
+    confidence, and no more is known."""
 
     value: float
     sigma: float
-    told: bool
+    significant: bool
     bound: float
 
     @property
     def conservative(self) -> float:
         """The value, or the bound if it is not significant."""
-        return self.value if self.told else self.bound
+        return self.value if self.significant else self.bound
 
     @property
     def text(self) -> str:
         """Text for readers."""
-        return f"{self.value:.3g} ± {self.sigma:.1g}" if self.told else f"< {self.bound:.2g}"
+        return f"{self.value:.3g} ± {self.sigma:.1g}" if self.significant else f"< {self.bound:.2g}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,4 +196,6 @@ def _estimate_from_square(square: float, sigma: float, margin: float) -> NoiseEs
 
 
 def _scaled(figure: NoiseEstimate, factor: float) -> NoiseEstimate:
-    return NoiseEstimate(figure.value * factor, figure.sigma * factor, figure.told, figure.bound * factor)
+    return NoiseEstimate(
+        figure.value * factor, figure.sigma * factor, figure.significant, figure.bound * factor
+    )

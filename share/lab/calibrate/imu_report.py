@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import json
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from share.lab.calibrate.imu import ImuCharacteristics, SensorNoise
-from share.lab.calibrate.imu_noise import FLICKER_FACTOR, AxisNoise, NoiseEstimate
+from share.lab.calibrate.imu_noise import FLICKER_FACTOR, NoiseEstimate
+from share.lab.calibrate.report import AXIS_COLOURS
+from share.lab.evaluate.charts import agg_pyplot, save_png
 from share.recordings.calibration import SERIAL
 from share.sensors.profile_types import InertialFacts, Profile
 
@@ -35,7 +37,11 @@ class NoiseRow(NamedTuple):
     @property
     def ratio_to_profile(self) -> float | None:
         """Ratio of the estimate to the profile's value; None where one of the two is unknown."""
-        return self.combined.value / self.profile_value if self.profile_value and self.combined.told else None
+        return (
+            self.combined.value / self.profile_value
+            if self.profile_value and self.combined.significant
+            else None
+        )
 
 
 def noise_rows(characteristics: ImuCharacteristics, profile: Profile | None) -> list[NoiseRow]:
@@ -82,7 +88,7 @@ def imu_chain_yaml(
 
 
 def _uncertainty_text(figure: NoiseEstimate) -> str:
-    if figure.told:
+    if figure.significant:
         return f"+- {100 * figure.sigma / figure.value:.1f} %"
     return "upper bound (95 %): not significant in this recording"
 
@@ -100,7 +106,7 @@ def report_values(
         "samples": characteristics.samples,
         "missing": characteristics.missing,
         "gaps": characteristics.gaps,
-        "cuts": characteristics.unbridged_gaps,
+        "unbridged_gaps": characteristics.unbridged_gaps,
         "inflate": inflate,
         "profile": profile.name if profile else None,
         "gravity": gravity_norm(characteristics),
@@ -123,30 +129,17 @@ def _sensor_values(sensor: SensorNoise, name: str, profile: Profile | None) -> d
         "tau_s": sensor.curve.taus.tolist(),
         "clusters": sensor.curve.clusters.tolist(),
         "axes": {
-            axis: {**_axis_values(noise), "deviation": sensor.curve.deviation[:, k].tolist()}
+            axis: {name: getattr(noise, name)._asdict() for name in (*QUANTITIES, "quantisation")}
+            | {name: getattr(noise, name).tolist() for name in ("low", "high", "modelled")}
+            | {"deviation": sensor.curve.deviation[:, k].tolist()}
             for k, (axis, noise) in enumerate(zip("xyz", sensor.axes, strict=True))
         },
     }
 
 
-def _axis_values(noise: AxisNoise) -> dict[str, Any]:
-    figures = {name: getattr(noise, name)._asdict() for name in (*QUANTITIES, "quantisation")}
-    return figures | {key: getattr(noise, key).tolist() for key in ("low", "high", "modelled")}
-
-
-# Chart of the Allan deviation: measured, confidence interval, fit, and the profile's.
-
-_COLOURS = ("#00798c", "#d1495b", "#edae49")
-
-
-def allan_chart(characteristics: ImuCharacteristics, profile: Profile | None, title: str) -> bytes:
-    """Return a PNG: gyroscope and accelerometer side by side, three axes each."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, panels = pyplot.subplots(1, 2, figsize=(13, 5.4), layout="constrained")
+def draw_allan(path: Path, characteristics: ImuCharacteristics, profile: Profile | None, title: str) -> None:
+    """Write a PNG: gyroscope and accelerometer side by side, three axes each."""
+    figure, panels = agg_pyplot().subplots(1, 2, figsize=(13, 5.4), layout="constrained")
     for panel, name, sensor in zip(
         panels, (GYRO, ACCEL), (characteristics.gyro, characteristics.accel), strict=True
     ):
@@ -164,15 +157,12 @@ def allan_chart(characteristics: ImuCharacteristics, profile: Profile | None, ti
         panel.text(0.03, 0.03, _estimates_text(sensor, UNITS[name]), transform=panel.transAxes, fontsize=9)
         panel.legend(fontsize=8, loc="upper right")
     figure.suptitle(title)
-    out = io.BytesIO()
-    figure.savefig(out, dpi=85, format="png")
-    pyplot.close(figure)
-    return out.getvalue()
+    save_png(figure, path, 85)
 
 
 def _draw_sensor(panel: Any, sensor: SensorNoise) -> None:
     taus = sensor.curve.taus
-    for k, (axis, colour) in enumerate(zip("xyz", _COLOURS, strict=True)):
+    for k, (axis, colour) in enumerate(zip("xyz", AXIS_COLOURS, strict=True)):
         noise = sensor.axes[k]
         panel.fill_between(taus, noise.low, noise.high, color=colour, alpha=0.15, linewidth=0)
         panel.plot(taus, sensor.curve.deviation[:, k], ".", color=colour, markersize=4, label=f"{axis}, 95 %")
@@ -183,8 +173,8 @@ def _draw_profile(
     panel: Any, sensor: SensorNoise, profile_values: dict[str, float], profile: Profile | None
 ) -> None:
     taus = sensor.curve.taus
-    estimates = [sensor.combined(name) for name in ("density", "instability", "walk")]
-    N, B, K = (one.value if one.told else 0.0 for one in estimates)
+    estimates = [sensor.combined(name) for name in QUANTITIES]
+    N, B, K = (one.value if one.significant else 0.0 for one in estimates)
     for part in (N / np.sqrt(taus), np.full(len(taus), np.sqrt(FLICKER_FACTOR) * B), K * np.sqrt(taus / 3)):
         if part.all():
             panel.plot(taus, part, ":", color="#888", linewidth=1)
@@ -198,5 +188,5 @@ def _estimates_text(sensor: SensorNoise, units: dict[str, str]) -> str:
     lines = []
     for letter, (name, unit) in zip("NBK", units.items(), strict=True):
         estimate = sensor.combined(name)
-        lines.append(f"{letter} {'= ' if estimate.told else ''}{estimate.text} {unit}")
+        lines.append(f"{letter} {'= ' if estimate.significant else ''}{estimate.text} {unit}")
     return "\n".join(lines)

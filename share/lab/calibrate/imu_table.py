@@ -96,10 +96,17 @@ def _clean_table(
         losses.add("IMU samples", str(k), f"{name}: IMU sample {k + 1} is not finite")
     losses.check("IMU samples", len(finite))
     stamps_ns, values = stamps_ns[finite], values[finite]
-    later = stamps_ns > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps_ns[:-1]]))
+    later = rising_mask(stamps_ns)
     imu = ImuBatch(stamps_ns[later], values[later, :3], values[later, 3:])
     dropped = int(np.count_nonzero(~later)) + int(np.count_nonzero(~finite)) + unreadable
     return ImuTable(name, imu, dropped, serial)
+
+
+def rising_mask(stamps_ns: I64) -> np.ndarray:
+    """Return which stamps (N,) are later than all before them."""
+    latest, out = np.maximum.accumulate(stamps_ns), np.ones(len(stamps_ns), bool)
+    out[1:] = latest[1:] > latest[:-1]
+    return out
 
 
 def stated_noise(source: str, chain_path: str | None, option: str) -> ImuNoise:

@@ -15,7 +15,6 @@ import numpy as np
 
 from share.errors import ConfigError
 from share.files.yaml_file import Section, read_yaml
-from share.recordings.session import SESSION_FILE
 from share.types import F64
 
 DICTIONARIES = ("4X4", "5X5", "6X6", "7X7")  # OpenCV's, each with 50, 100, 250 or 1000 markers
@@ -209,16 +208,6 @@ def target_from_section(section: Section) -> Target:
         return cls(**values)
     except ValueError as error:
         raise ConfigError(f"{section.where}: {error}") from None
-
-
-def session_target(folder: Path) -> tuple[Target, F64] | None:
-    """Return the target in a session's room and T_world_target (4, 4), None without one. Raises
-    ConfigError with file and key."""
-    top = read_yaml(folder / SESSION_FILE)
-    if TARGET not in top:
-        return None
-    section = top.section(TARGET)
-    return target_from_section(section), section.pose(T_WORLD_TARGET)
 
 
 def target_mapping(target: Target) -> dict[str, Any]:

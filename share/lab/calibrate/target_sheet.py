@@ -54,7 +54,7 @@ def make_sheet(kind: str, columns: int, rows: int, paper: str, edge_mm: float | 
     paper: of `PAPERS`, or WxH in mm. edge_mm: of a tag or square; by default the largest whole millimetres
     that fit, so that a ruler can check the print. Raises ValueError.
     """
-    width_edges, height_edges = _extent_sides(make_board(kind, columns, rows, 1.0))
+    width_edges, height_edges = np.ptp(make_board(kind, columns, rows, 1.0).extent, axis=0).tolist()
     width, height = max(
         (_paper_size(paper), _paper_size(paper)[::-1]),
         key=lambda size: _max_edge_mm(width_edges, height_edges, *size),
@@ -80,12 +80,6 @@ def make_board(kind: str, columns: int, rows: int, edge: float) -> Target:
     return CharucoBoard(columns, rows, edge, round(_MARKER_SHARE * edge, 9), dictionary)
 
 
-def _extent_sides(target: Target) -> tuple[float, float]:
-    low, high = target.extent
-    across, up = (high - low).tolist()
-    return across, up
-
-
 def _paper_size(paper: str) -> tuple[float, float]:
     names = {name.lower(): size for name, size in PAPERS.items()}
     if paper.lower() in names:
@@ -107,7 +101,8 @@ _BORDER = {AprilGrid: 2, CharucoBoard: 1}  # cells around a marker's bits
 def black_rectangles(target: Target) -> F64:
     """Return the black rectangles (M, 4) m, without overlaps: x0, y0, x1, y1 in the target's frame."""
     if isinstance(target, AprilGrid):
-        return np.concatenate([_tag_rectangles(target), _corner_squares(target)])
+        tags = [_marker_rectangles(cells, low, target.tag_size) for cells, low in _marker_cells(target)]
+        return np.concatenate([*tags, _corner_squares(target)])
     squares = target.black_squares
     inset = (target.square - target.marker) / 2
     markers = [
@@ -133,12 +128,6 @@ def _overlap(low: F64, high: F64, borders: F64) -> F64:
     reach = np.minimum(high[:, None], borders[1:]) - np.maximum(low[:, None], borders[:-1])
     share: F64 = np.maximum(reach, 0) / np.diff(borders)
     return share
-
-
-def _tag_rectangles(grid: AprilGrid) -> F64:
-    return np.concatenate(
-        [_marker_rectangles(cells, low, grid.tag_size) for cells, low in _marker_cells(grid)]
-    )
 
 
 def _corner_squares(grid: AprilGrid) -> F64:

@@ -28,11 +28,6 @@ class ImuChain:
     raw: F64
     cov: F64
 
-    def without_breaks(self, is_break: np.ndarray) -> ImuChain:
-        """Return only the intervals that the IMU joins."""
-        fields = (self.residual, self.jacobian_before, self.jacobian_after, self.raw, self.cov)
-        return ImuChain(*(field[~is_break] for field in fields))
-
 
 @dataclass(frozen=True, eq=False)
 class MocapObservations:
@@ -101,10 +96,8 @@ def mocap_observations(
     imu_stamps = state.in_imu_clock(stamps_ns)
     i = np.clip(np.searchsorted(state.stamps_ns, imu_stamps, "right") - 1, 0, len(state.p) - 2)
     inc = preintegrate(imu, state.stamps_ns[i], imu_stamps, state.gyro_bias[i], state.accel_bias[i])
-    t, g = inc.dt[:, None], gravity_vector(gravity)
-    R = state.R[i] @ inc.dR
-    p = state.p[i] + state.v[i] * t + g * t**2 / 2 + _rotate(state.R[i], inc.dp)
-    v = state.v[i] + g * t + _rotate(state.R[i], inc.dv)
+    t = inc.dt[:, None]
+    R, p, v = propagate(state.R[i], state.p[i], state.v[i], inc, gravity)
     R_wl, R_bm, arm = state.R_mocap_world, state.T_body_mocap[:3, :3], state.T_body_mocap[:3, 3]
     marker = p + R @ arm  # the mocap body's origin, levelled world
     turn = se3.so3_log(T_mocap[:, :3, :3].swapaxes(1, 2) @ R_wl @ R @ R_bm)
@@ -131,6 +124,12 @@ def mocap_observations(
     S[:, 3:, 8] = (v + _rotate(lever, inc.rate_end)) @ R_wl.T
     S[:, :, 9] = S[:, :, 8] * (stamps_ns - state.middle_ns)[:, None] * 1e-9
     return MocapObservations(residual / sigma, J / sigma[:, None], S / sigma[:, None], i)
+
+
+def propagate(R: F64, p: F64, v: F64, inc: PreintegratedImu, gravity: float) -> tuple[F64, F64, F64]:
+    """Return rotations (N, 3, 3), positions and velocities (N, 3) after the preintegrated motions `inc`."""
+    t, g = inc.dt[:, None], gravity_vector(gravity)
+    return R @ inc.dR, p + v * t + g * t**2 / 2 + _rotate(R, inc.dp), v + g * t + _rotate(R, inc.dv)
 
 
 def _rotate(R: F64, v: F64) -> F64:

@@ -15,18 +15,42 @@ import numpy as np
 from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
+from share.lab.least_squares import ArrowFactor
 from share.lab.mocap.initialisation import initial_rotation, initial_state, nearest_axis_rotation, up_vector
 from share.lab.mocap.offset import find_offset
-from share.lab.mocap.problem import CHECK, BatchSolution, MocapImuProblem, node_covariances
-from share.lab.mocap.residuals import FitResiduals, compute_residuals
-from share.lab.mocap.scale import axis_scales
+from share.lab.mocap.problem import CHECK, BatchSolution, MocapImuProblem, axis_scales
 from share.lab.mocap.state import MocapFitOptions
 from share.lab.mocap.trajectory import MocapTrajectory, check_imu, find_gaps
 from share.types import F64, I64, ImuBatch
 
 _END_MARGIN_NS = 50_000_000  # mocap nearer to the ends is left out: the final offset may shift it beyond
 _MIN_DURATION_S = 2.0
+_NODE_NS = 50_000_000  # between nodes
+_MAX_INTEGRATED_NS = 10 * 10**9  # the IMU is not integrated across longer mocap gaps
+_MIN_SPACING_NS = 4_000_000  # denser mocap samples are thinned
 _MAX_RMS_MM = 100.0  # a path farther from the mocap is another motion
+
+
+@dataclass(frozen=True, eq=False)
+class FitResiduals:
+    """position_mm, rotation_deg: rms distance of the path from the inlier mocap samples. position_sigmas: the
+    former in units of the stated mocap noise. position_p95_mm, rotation_p95_deg: of all samples. samples:
+    their number.
+
+    imu_sigmas (6,): rms residual of rotation (x, y, z) and velocity change (x, y, z) between nodes, in units
+    of the data sheet's noise. gyro (3,) rad/s, accel (3,) m/s^2: the same as mean rates.
+    """
+
+    position_mm: float
+    rotation_deg: float
+    position_sigmas: float
+    position_p95_mm: float
+    rotation_p95_deg: float
+    samples: int
+    outlier_share: float
+    imu_sigmas: F64
+    gyro: F64
+    accel: F64
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +117,11 @@ def fit_mocap(
     check_imu(imu)
     inflated = _inflated_noise(noise, options.imu_inflation)
     coarse_ns = 0 if options.within_s == 0 else find_offset(imu, mocap, options.within_s).offset_ns
-    overlap = _overlap(imu, mocap.shifted(coarse_ns)).thinned(round(1e9 / options.max_hz))
+    overlap = _overlap(imu, mocap.shifted(coarse_ns)).thinned(_MIN_SPACING_NS)
     guess, bias = _initial_mounting(imu, overlap, options)
     up_rotation = nearest_axis_rotation(up_vector(overlap, imu, guess))
     overlap = overlap.rotated(up_rotation)
-    nodes, breaks = _node_stamps(overlap, options)
+    nodes, breaks = _node_stamps(overlap)
     batch = MocapImuProblem(imu, inflated, _without_ends(overlap, nodes, breaks), breaks, guess, options)
     return _make_fit(
         batch, batch.solve_robustly(initial_state(nodes, imu, overlap, guess, bias)), coarse_ns, up_rotation
@@ -134,22 +158,20 @@ def _initial_mounting(imu: ImuBatch, mocap: MocapTrajectory, options: MocapFitOp
     return se3.from_rt(R, np.zeros(3)), bias
 
 
-def _node_stamps(mocap: MocapTrajectory, options: MocapFitOptions) -> tuple[I64, np.ndarray]:
+def _node_stamps(mocap: MocapTrajectory) -> tuple[I64, np.ndarray]:
     """Return evenly spaced nodes (N,) ns, none in gaps that break the chain or in parts too short to fit,
     and (N - 1,) bool: where the chain breaks."""
-    step = round(options.node_s * 1e9)
-    nodes = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] + 1, step)
-    longest = round(options.max_integrated_s * 1e9)
-    for start, end in find_gaps(mocap.stamps_ns, longest):
+    nodes = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] + 1, _NODE_NS)
+    for start, end in find_gaps(mocap.stamps_ns, _MAX_INTEGRATED_NS):
         nodes = nodes[(nodes <= start) | (nodes >= end)]
-    parts = np.split(nodes, np.flatnonzero(np.diff(nodes) > longest) + 1)
-    parts = [part for part in parts if len(part) * step > _MIN_DURATION_S * 1e9]
+    parts = np.split(nodes, np.flatnonzero(np.diff(nodes) > _MAX_INTEGRATED_NS) + 1)
+    parts = [part for part in parts if len(part) * _NODE_NS > _MIN_DURATION_S * 1e9]
     if not parts:
         raise DataError(
             f"mocap: the body is never seen for {_MIN_DURATION_S:.0f} s without a gap; record again"
         )
     nodes = np.concatenate(parts)
-    return nodes, np.diff(nodes) > longest
+    return nodes, np.diff(nodes) > _MAX_INTEGRATED_NS
 
 
 def _without_ends(mocap: MocapTrajectory, nodes: I64, breaks: np.ndarray) -> MocapTrajectory:
@@ -170,55 +192,43 @@ def _make_fit(batch: MocapImuProblem, solved: BatchSolution, coarse_ns: int, tur
         raise CalibrationMismatchError(
             _misfit_text(f"{100 * (1 - inliers.mean()):.0f} % of the mocap's poses are outliers")
         )
-    dt = np.diff(state.stamps_ns)[~batch.is_break] * 1e-9
-    sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
-    distances = np.linalg.norm((solved.observations.residual * sigma).reshape(-1, 2, 3), axis=2)
-    chain = solved.chain.without_breaks(batch.is_break)
-    fit_residuals = compute_residuals(
-        chain, dt, options.imu_inflation, distances[:, 1], distances[:, 0], inliers, options.sigma_position
-    )
+    fit_residuals = _residual_statistics(batch, solved)
     if not fit_residuals.position_mm < _MAX_RMS_MM:
         raise CalibrationMismatchError(_misfit_text(f"{fit_residuals.position_mm:.0f} mm rms residual"))
-    offset_ns = coarse_ns + round(state.offset_s * 1e9)
+    mounting_prior_sigmas = 0.0
+    if options.T_body_mocap is not None:
+        error = se3.log(se3.inverse(options.T_body_mocap) @ state.T_body_mocap)
+        mounting_prior_sigmas = float(np.abs(error / np.repeat(options.guess_sigma, 3)).max())
     inlier_stamps = state.in_imu_clock(batch.mocap.stamps_ns[inliers])
     scales, scales_cov = axis_scales(solved, batch.mocap, options.sigma_position, batch.sample_weight)
-    covs = node_covariances(solved.normal, solved.cov_shared)
+    covs = solved.system.node_covariances()
     return MocapFit(
         stamps_ns=state.stamps_ns,
         T_world_body=se3.from_rt(state.R, state.p),
         velocity=state.v,
         gyro_bias=state.gyro_bias,
         accel_bias=state.accel_bias,
-        gaps=find_gaps(_with_ends(inlier_stamps, state.stamps_ns), round(options.max_bridged_s * 1e9)),
+        gaps=find_gaps(
+            np.concatenate([state.stamps_ns[:1], inlier_stamps, state.stamps_ns[-1:]]),
+            round(options.max_bridged_s * 1e9),
+        ),
         is_break=batch.is_break,
         R_mocap_world=turn.T @ state.R_mocap_world,
         T_body_mocap=state.T_body_mocap,
-        offset_ns=offset_ns,
+        offset_ns=coarse_ns + round(state.offset_s * 1e9),
         drift_ppm=state.drift * 1e6,
-        cov_shared=solved.cov_shared,
+        cov_shared=ArrowFactor(solved.system).border_covariance,
         cov_poses=_right_perturbed(state.R, covs[:, :6, :6]),
         scale_error=np.abs(turn.T) @ scales,
         scale_error_sigma=np.abs(turn.T) @ np.sqrt(np.diag(scales_cov)),
-        mounting_prior_sigmas=_mounting_prior_sigmas(state.T_body_mocap, options),
+        mounting_prior_sigmas=mounting_prior_sigmas,
         residuals=fit_residuals,
         gravity=options.gravity,
     )
 
 
-def _mounting_prior_sigmas(T_body_mocap: F64, options: MocapFitOptions) -> float:
-    if options.T_body_mocap is None:
-        return 0.0
-    error = se3.log(se3.inverse(options.T_body_mocap) @ T_body_mocap)
-    return float(np.abs(error / np.repeat(options.guess_sigma, 3)).max())
-
-
 def _misfit_text(reason: str) -> str:
     return f"mocap and IMU are not of one motion: {reason}; {CHECK}"
-
-
-def _with_ends(stamps: I64, nodes: I64) -> I64:
-    """Return the stamps with both ends of the path."""
-    return np.concatenate([nodes[:1], stamps, nodes[-1:]])
 
 
 def _right_perturbed(R: F64, cov: F64) -> F64:
@@ -227,3 +237,31 @@ def _right_perturbed(R: F64, cov: F64) -> F64:
     J = np.tile(np.eye(6), (len(R), 1, 1))
     J[:, 3:, 3:] = R.swapaxes(1, 2)
     return np.asarray(J @ cov @ J.swapaxes(1, 2), np.float64)
+
+
+def _residual_statistics(batch: MocapImuProblem, solved: BatchSolution) -> FitResiduals:
+    options, inliers, joined = batch.options, solved.is_inlier, ~batch.is_break
+    sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
+    vectors = (solved.observations.residual * sigma).reshape(-1, 2, 3)
+    angles, distances = np.linalg.norm(vectors, axis=2).T
+    mm, deg = distances * 1e3, np.degrees(angles)
+    rotation_and_velocity = [0, 1, 2, 6, 7, 8]
+    raw = solved.chain.raw[joined][:, rotation_and_velocity]
+    variances = np.diagonal(solved.chain.cov[joined], axis1=1, axis2=2)[:, rotation_and_velocity]
+    rates = _rms(raw / (np.diff(solved.state.stamps_ns)[joined] * 1e-9)[:, None])
+    return FitResiduals(
+        position_mm=float(_rms(mm[inliers])),
+        rotation_deg=float(_rms(deg[inliers])),
+        position_sigmas=float(_rms(distances[inliers])) / (options.sigma_position * np.sqrt(3)),
+        position_p95_mm=float(np.percentile(mm, 95)),
+        rotation_p95_deg=float(np.percentile(deg, 95)),
+        samples=len(mm),
+        outlier_share=float(1 - inliers.mean()),
+        imu_sigmas=_rms(raw / np.sqrt(variances) * options.imu_inflation),
+        gyro=rates[:3],
+        accel=rates[3:],
+    )
+
+
+def _rms(values: F64) -> F64:
+    return np.asarray(np.sqrt((values**2).mean(0)), np.float64)

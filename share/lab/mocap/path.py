@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from share.geometry import se3
-from share.lab.mocap.factors import preintegrate
+from share.lab.mocap.factors import preintegrate, propagate
 from share.lab.mocap.fit import MocapFit
 from share.types import F64, I64, ImuBatch
 
@@ -57,8 +57,6 @@ class FittedPath:
         inc = preintegrate(
             self.imu, fit.stamps_ns[node], stamps_ns, fit.gyro_bias[node], fit.accel_bias[node]
         )
-        T0, v0, t = fit.T_world_body[node], fit.velocity[node], inc.dt[:, None]
-        g = np.array([0.0, 0.0, -fit.gravity])
-        R0 = T0[:, :3, :3]
-        p = T0[:, :3, 3] + v0 * t + g * t**2 / 2 + (R0 @ inc.dp[..., None])[..., 0]
-        return se3.from_rt(R0 @ inc.dR, p), v0 + g * t + (R0 @ inc.dv[..., None])[..., 0]
+        T = fit.T_world_body[node]
+        R, p, v = propagate(T[:, :3, :3], T[:, :3, 3], fit.velocity[node], inc, fit.gravity)
+        return se3.from_rt(R, p), v

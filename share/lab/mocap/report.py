@@ -85,10 +85,10 @@ def report_values(
             "timeshift_s": float(sigma[8]),
             "drift_ppm": float(sigma[9] * 1e6),
         },
-        "too_long_percent": (100 * fit.scale_error).tolist(),
-        "too_long_sigma_percent": (100 * fit.scale_error_sigma).tolist(),
-        "unsure": mounting_warning(fit),
-        "doubts": fit_warnings(fit),
+        "scale_error_percent": (100 * fit.scale_error).tolist(),
+        "scale_error_sigma_percent": (100 * fit.scale_error_sigma).tolist(),
+        "mounting_warning": mounting_warning(fit),
+        "warnings": fit_warnings(fit),
         "residuals": {
             k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(fit.residuals).items()
         },
@@ -100,12 +100,12 @@ def _hand_eye_values(hand_eye_check: HandEyeCheck) -> dict[str, Any]:
     estimate = hand_eye_check.hand_eye
     return {
         "T_body_mocap": estimate.T_a_b.tolist(),
-        "turned_deg": float(np.degrees(hand_eye_check.rotation_error_rad)),
-        "shifted_m": hand_eye_check.translation_error_m,
+        "rotation_error_deg": float(np.degrees(hand_eye_check.rotation_error_rad)),
+        "translation_error_m": hand_eye_check.translation_error_m,
         "sigmas": hand_eye_check.sigmas,
         "agrees": hand_eye_check.agrees,
         "motions": estimate.motions,
-        "turning_deg": np.degrees(estimate.rotation_rms_by_axis).tolist(),
+        "rotation_rms_deg": np.degrees(estimate.rotation_rms_by_axis).tolist(),
     }
 
 

@@ -32,6 +32,7 @@ from share.recordings.trajectory import Trajectory, format_tum
 from share.types import F64, I64, AgentKind
 
 REPORT, PICTURE = "align.json", "align.png"
+_PROVENANCE_KEYS = ("mocap", "offset_sigma_ms", "drift_ppm", "up", "truth_s")  # the rest is in REPORT
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,10 @@ def write_session(
     """Fill the empty `folder`; return the results by device. settings: of the fit, for the provenance.
     Raises ShareError."""
     R_mocap_world = common_level([device.aligned.fit for device in devices.values()])
-    truths = {name: _true_trajectory(device.aligned, R_mocap_world) for name, device in devices.items()}
+    truths = {
+        name: Trajectory(device.aligned.stamps_ns, device.aligned.truth(R_mocap_world))
+        for name, device in devices.items()
+    }
     (folder / "truth").mkdir()
     for name, device in devices.items():
         _write_device_recording(device, folder / f"{name}.mcap", on_progress)
@@ -85,26 +89,22 @@ def device_result(device: AlignedRecording) -> dict[str, Any]:
         "next_correlation": aligned.peak.next_correlation,
         "lead": aligned.peak.lead,
         "T_body_mocap": fit.T_body_mocap.tolist(),
-        "body_turned_deg": float(np.degrees(np.linalg.norm(mounting_rotation))),
-        "body_turned_sigma_deg": float(np.degrees(sigma[2:5].max())),
-        "body_shifted_mm": float(np.linalg.norm(fit.T_body_mocap[:3, 3]) * 1e3),
-        "body_shifted_sigma_mm": float(sigma[5:8].max() * 1e3),
+        "mounting_rotation_deg": float(np.degrees(np.linalg.norm(mounting_rotation))),
+        "mounting_rotation_sigma_deg": float(np.degrees(sigma[2:5].max())),
+        "mounting_translation_mm": float(np.linalg.norm(fit.T_body_mocap[:3, 3]) * 1e3),
+        "mounting_translation_sigma_mm": float(sigma[5:8].max() * 1e3),
         "up": fit.up,
         "tilt_deg": fit.tilt_deg,
-        "too_long_percent": (100 * fit.scale_error).tolist(),
-        "too_long_sigma_percent": (100 * fit.scale_error_sigma).tolist(),
-        "left_mm": fit.residuals.position_mm,
-        "left_deg": fit.residuals.rotation_deg,
-        "left_sigmas": fit.residuals.position_sigmas,
-        "doubted": fit.residuals.doubted,
+        "scale_error_percent": (100 * fit.scale_error).tolist(),
+        "scale_error_sigma_percent": (100 * fit.scale_error_sigma).tolist(),
+        "residual_mm": fit.residuals.position_mm,
+        "residual_deg": fit.residuals.rotation_deg,
+        "residual_sigmas": fit.residuals.position_sigmas,
+        "outlier_share": fit.residuals.outlier_share,
         "truth_s": aligned.seconds,
         "gaps_s": gaps.tolist(),
-        "doubts": aligned.warnings,
+        "warnings": aligned.warnings,
     }
-
-
-def _true_trajectory(aligned: AlignedDevice, R_mocap_world: np.ndarray) -> Trajectory:
-    return Trajectory(aligned.stamps_ns, aligned.truth(R_mocap_world))
 
 
 def _write_device_recording(device: AlignedRecording, out: Path, on_progress: StageProgress) -> None:
@@ -121,12 +121,6 @@ def _write_device_recording(device: AlignedRecording, out: Path, on_progress: St
     except OSError:  # another disk, or another owner's file
         shutil.copyfile(device.recording, out)
     on_progress(stage, 1, 1)
-
-
-def _device_provenance(device: AlignedRecording, result: dict[str, Any]) -> dict[str, Any]:
-    """Return a device's inputs and the accuracy of its clock; the rest is in align.json."""
-    known = ("offset_sigma_ms", "drift_ppm", "up", "truth_s")
-    return {**device.inputs, "mocap": device.mocap_source, **{key: result[key] for key in known}}
 
 
 def _session_yaml(
@@ -149,7 +143,10 @@ def _session_yaml(
         "generator": "share dataset align",
         "share_version": __version__,
         "settings": dict(settings),
-        "devices": {name: _device_provenance(devices[name], one) for name, one in results.items()},
+        "devices": {
+            name: {**devices[name].inputs} | {key: one[key] for key in _PROVENANCE_KEYS}
+            for name, one in results.items()
+        },
     }
     data = {"schema": SCHEMA, "provenance": provenance, "agents": agents}
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
@@ -168,7 +165,7 @@ def draw_alignment(path: Path, devices: Mapping[str, tuple[AlignedDevice, Trajec
     top_view = figure.add_subplot(grid[:, 0])
     for k, (name, (aligned, truth)) in enumerate(devices.items()):
         colour = AGENT_COLOURS[k % len(AGENT_COLOURS)]
-        p = _positions_with_gaps(truth)
+        p = np.insert(truth.T[:, :3, 3], _after_gaps(truth.stamps_ns), np.nan, axis=0)
         top_view.plot(p[:, 0], p[:, 1], color=colour, linewidth=1.2, label=f"{name}, {aligned.seconds:.1f} s")
         top_view.plot(*p[0, :2], "o", color=colour)
         _draw_rotation_rates(figure.add_subplot(grid[k, 1]), name, aligned, colour)
@@ -177,11 +174,6 @@ def draw_alignment(path: Path, devices: Mapping[str, tuple[AlignedDevice, Trajec
     top_view.grid(alpha=0.3)
     top_view.legend()
     save_png(figure, path, 110)
-
-
-def _positions_with_gaps(truth: Trajectory) -> F64:
-    """Return positions (N, 3), with NaN where the truth has a gap."""
-    return np.insert(truth.T[:, :3, 3], _after_gaps(truth.stamps_ns), np.nan, axis=0)
 
 
 def _after_gaps(stamps_ns: I64) -> I64:

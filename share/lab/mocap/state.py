@@ -68,23 +68,18 @@ class MocapFitOptions:
     """Options of a fit.
 
     * sigma_position m, sigma_rotation rad: noise of mocap samples with independent errors at independent_hz;
-      denser samples get less weight each, and are thinned to max_hz. cauchy_sigmas: scale of Cauchy's
-      weights.
+      denser samples get less weight each.
     * imu_inflation: factor on the data sheet's noise.
     * within_s: largest offset of the clocks, None for any, 0 for one clock. offset_sigma s: of the offset
       after that. drift_sigma: of the clocks' relative rate (1e-4: 100 ppm).
     * T_body_mocap (4, 4): a guess, needed only for a body that turns about one axis; with guess_sigma (rad,
       m).
-    * gravity m/s^2. node_s: time between nodes.
-    * max_bridged_s: longest mocap gap in which the path is trusted to the IMU. max_integrated_s: longest gap
-      across which the IMU is integrated at all.
+    * gravity m/s^2. max_bridged_s: longest mocap gap in which the path is trusted to the IMU.
     """
 
     sigma_position: float = 0.002
     sigma_rotation: float = np.radians(0.3)
     independent_hz: float = 20.0
-    max_hz: float = 250.0
-    cauchy_sigmas: float = 2.5
     imu_inflation: float = 2.0
     within_s: float | None = 0.5
     offset_sigma: float = 0.02
@@ -92,7 +87,4 @@ class MocapFitOptions:
     T_body_mocap: F64 | None = None
     guess_sigma: tuple[float, float] = (np.radians(10.0), 0.3)
     gravity: float = 9.81
-    node_s: float = 0.05
     max_bridged_s: float = 0.5
-    max_integrated_s: float = 10.0
-    max_iterations: int = 50

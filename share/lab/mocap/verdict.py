@@ -30,7 +30,7 @@ def shared_sigmas(fit: MocapFit) -> F64:
 def check_fit(fit: MocapFit) -> None:
     """Raise CalibrationMismatchError for a fit that converged although mocap and IMU are not of one
     motion, as may happen with a mirrored world."""
-    fit_residuals = fit.residuals
+    residuals = fit.residuals
     if (scale_text := _scale_error_text(fit, MAX_SCALE_ERROR)) is not None:
         raise CalibrationMismatchError(
             f"mocap and IMU are not of one motion: {scale_text}; is an axis mirrored, or a scale or unit "
@@ -42,13 +42,13 @@ def check_fit(fit: MocapFit) -> None:
             f"{fit.mounting_prior_sigmas:.1f} of its sigmas; were markers moved since, or is it another "
             "device's? Calibrate it again"
         )
-    if fit_residuals.doubted > MAX_OUTLIER_SHARE:
+    if residuals.outlier_share > MAX_OUTLIER_SHARE:
         raise CalibrationMismatchError(
-            f"mocap and IMU are not of one motion: {100 * fit_residuals.doubted:.0f} % of the mocap's poses "
-            "are outliers; were markers swapped for long (cut there), or is an axis mirrored? Export as the "
-            "system shows it"
+            f"mocap and IMU are not of one motion: {100 * residuals.outlier_share:.0f} % of the mocap's "
+            "poses are outliers; were markers swapped for long (cut there), or is an axis mirrored? Export "
+            "as the system shows it"
         )
-    if fit_residuals.position_sigmas > MAX_RESIDUAL_RATIO:
+    if residuals.position_sigmas > MAX_RESIDUAL_RATIO:
         raise CalibrationMismatchError(
             f"mocap and IMU are not of one motion: {_residual_text(fit)}; is an axis mirrored, or a scale "
             "wrong? If the motion capture is that noisy, raise --sigma-mm"
@@ -57,15 +57,15 @@ def check_fit(fit: MocapFit) -> None:
 
 def fit_warnings(fit: MocapFit) -> list[str]:
     """Return warnings, a line each."""
-    fit_residuals, out = fit.residuals, []
+    residuals, out = fit.residuals, []
     if (text := mounting_warning(fit)) is not None:
         out.append(text)
-    if fit_residuals.doubted > _WARN_OUTLIER_SHARE:
+    if residuals.outlier_share > _WARN_OUTLIER_SHARE:
         out.append(
-            f"{100 * fit_residuals.doubted:.0f} % of the motion capture's poses are outliers and not used; "
+            f"{100 * residuals.outlier_share:.0f} % of the motion capture's poses are outliers and not used; "
             "were its markers swapped?"
         )
-    if fit_residuals.position_sigmas > _WARN_RESIDUAL_RATIO:
+    if residuals.position_sigmas > _WARN_RESIDUAL_RATIO:
         out.append(
             f"{_residual_text(fit)}; set --sigma-mm to the motion capture's noise, or calibrate it again"
         )
@@ -107,8 +107,7 @@ def _scale_error_text(fit: MocapFit, max_error: float) -> str | None:
 
 
 def _residual_text(fit: MocapFit) -> str:
-    fit_residuals = fit.residuals
+    residuals = fit.residuals
     return (
-        f"{fit_residuals.position_mm:.1f} mm rms residual, {fit_residuals.position_sigmas:.1f} times the "
-        "stated noise"
+        f"{residuals.position_mm:.1f} mm rms residual, {residuals.position_sigmas:.1f} times the stated noise"
     )

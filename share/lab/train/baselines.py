@@ -15,13 +15,14 @@ from torch.nn import functional
 
 from share.array_table import ArrayTable
 from share.lab.train.keyframe_table import KeyframeTable
+from share.lab.train.network import BestWeights
 from share.types import F32, F64
 
 TREES = 70
 _BLOCKS = (2, 4)  # rows and columns of blocks of each PSD channel: 24 numbers for the forest
 _MIN_CM = 0.01
 _EPOCHS = 100
-_PATIENCE = 12  # rows and columns of blocks of each PSD channel: 24 numbers for the forest
+_PATIENCE = 12
 _BATCH = 256
 _CNN_EPOCHS, _CNN_PATIENCE = 24, 5  # trains on pictures, so an epoch takes long
 _CONTRAST_EPOCHS, _TEMPERATURE = 6, 0.1
@@ -58,9 +59,9 @@ def forest(
     from sklearn.ensemble import RandomForestRegressor
 
     model = RandomForestRegressor(TREES, min_samples_leaf=3, max_features=0.3, random_state=seed, n_jobs=2)
-    model.fit(_forest_inputs(training), training.table.error_cm)
+    model.fit(forest_inputs(training), training.table.error_cm)
     model.n_jobs = 1  # a pool costs more than it gains for one keyframe
-    return lambda rows: np.maximum(model.predict(_forest_inputs(rows)), _MIN_CM)
+    return lambda rows: np.maximum(model.predict(forest_inputs(rows)), _MIN_CM)
 
 
 def perceptron(
@@ -97,7 +98,7 @@ def contrastive(
         on_progress(f"contrast, epoch {epoch + 1} of {_CONTRAST_EPOCHS}")
         for batch_rows in torch.randperm(len(x)).split(_BATCH):
             optimiser.zero_grad()
-            _contrastive_loss(functional.normalize(encoder(x[batch_rows]), dim=1), y[batch_rows]).backward()
+            contrastive_loss(functional.normalize(encoder(x[batch_rows]), dim=1), y[batch_rows]).backward()
             optimiser.step()
     _train(
         net,
@@ -118,7 +119,7 @@ BASELINES: dict[str, Baseline] = {
 }
 
 
-def _forest_inputs(rows: KeyframeRows) -> F32:
+def forest_inputs(rows: KeyframeRows) -> F32:
     """Return (N, 1312): backbone features, block means of the PSD, scalars."""
     psd = rows.table.psd
     n, channels, down, across = psd.shape
@@ -140,7 +141,7 @@ def _encoder() -> nn.Module:
     return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten())
 
 
-def _contrastive_loss(z: Tensor, y: Tensor) -> Tensor:
+def contrastive_loss(z: Tensor, y: Tensor) -> Tensor:
     """Return the loss of embeddings z (B, D) of unit length with errors y (B,): each pair is contrasted with
     all samples at least as far from its anchor in y (Zha et al. 2023).
 
@@ -170,7 +171,7 @@ def _train(
     optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=0.05)
     x, y = training[0], torch.from_numpy(training[1].table.error_cm)
     validation_inputs, validation_errors = validation[0], torch.from_numpy(validation[1].table.error_cm)
-    best, best_weights, epochs_without_gain = float("inf"), _copy(net), 0
+    best = BestWeights(net)
     for epoch in range(epochs):
         on_progress(f"epoch {epoch + 1} of {epochs} at most")
         net.train()
@@ -186,13 +187,10 @@ def _train(
                     validation_errors,
                 )
             )
-        epochs_without_gain += 1
-        if validation_loss < best:
-            best, best_weights, epochs_without_gain = validation_loss, _copy(net), 0
-        if epochs_without_gain >= patience:
+        best.update(validation_loss)
+        if best.epochs_since >= patience:
             break
-    net.load_state_dict(best_weights)
-    net.eval()
+    best.restore()
 
 
 def _poisson_deviance(log_predicted: Tensor, error_cm: Tensor) -> Tensor:
@@ -202,7 +200,3 @@ def _poisson_deviance(log_predicted: Tensor, error_cm: Tensor) -> Tensor:
 def _predict(net: nn.Module, x: Tensor) -> F64:
     with torch.no_grad():
         return np.concatenate([torch.exp(net(some)[:, 0]).numpy() for some in x.split(_BATCH)]).astype(float)
-
-
-def _copy(net: nn.Module) -> dict[str, Tensor]:
-    return {name: value.clone() for name, value in net.state_dict().items()}

@@ -26,14 +26,14 @@ _MIN_DEPTH_M = 0.28  # least range of a depth camera
 
 @dataclass(frozen=True)
 class FaultInterval:
-    """A fault in begin_ns <= t < end_ns. how: one of `FAULT_KINDS`. much: severity, 0 to 1. where: three
+    """A fault in begin_ns <= t < end_ns. kind: one of `FAULT_KINDS`. severity: 0 to 1. position: three
     numbers in 0 .. 1 that place an occluder: right, down and distance."""
 
-    how: str
+    kind: str
     begin_ns: int
     end_ns: int
-    much: float
-    where: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    severity: float
+    position: tuple[float, float, float] = (0.5, 0.5, 0.5)
 
     def is_active(self, stamp_ns: int) -> bool:
         return self.begin_ns <= stamp_ns < self.end_ns
@@ -63,10 +63,10 @@ def inject_faults(
     for frame in frames:
         active = [fault for fault in faults if fault.is_active(frame.stamp_ns)]
         imu = pending_imu.concatenate(frame.imu)
-        if any(fault.how == "deaf" for fault in active):
+        if any(fault.kind == "imu_missing" for fault in active):
             imu = ImuBatch.empty()
         rng = np.random.default_rng((seed, frame.index))
-        if any(fault.how == "drop" and rng.random() < 0.3 + 0.7 * fault.much for fault in active):
+        if any(fault.kind == "drop" and rng.random() < 0.3 + 0.7 * fault.severity for fault in active):
             pending_imu, missing_since_ns = imu, missing_since_ns or frame.stamp_ns - frame.gap_ns
             continue
         gap_ns = frame.gap_ns + (frame.stamp_ns - missing_since_ns if missing_since_ns else 0)
@@ -80,10 +80,10 @@ def _degrade_images(frame: Frame, fault: FaultInterval, seed: int, rig: Rig) -> 
     """Return the frame with its images and depth degraded by `fault`."""
     image0, image1, depth = frame.image0, frame.image1, frame.depth
     noise0, noise1 = (np.random.default_rng((seed, frame.index, eye)) for eye in (0, 1))
-    if fault.how in _IMAGE_FAULTS:
-        image0 = _IMAGE_FAULTS[fault.how](image0, fault, noise0)
-        image1 = None if image1 is None else _IMAGE_FAULTS[fault.how](image1, fault, noise1)
-    elif fault.how == "cover":
+    if fault.kind in _IMAGE_FAULTS:
+        image0 = _IMAGE_FAULTS[fault.kind](image0, fault, noise0)
+        image1 = None if image1 is None else _IMAGE_FAULTS[fault.kind](image1, fault, noise1)
+    elif fault.kind == "cover":
         image0 = _occlude(image0, fault, noise0, 0.0)
         image1 = None if image1 is None else _occlude(image1, fault, noise1, rig.cam0.focal * rig.baseline)
         depth = None if depth is None else _occlude_depth(depth, fault)
@@ -92,19 +92,19 @@ def _degrade_images(frame: Frame, fault: FaultInterval, seed: int, rig: Rig) -> 
 
 def _dark(image: U8, fault: FaultInterval, rng: np.random.Generator) -> U8:
     """Fewer photons, down to 1 %, with their shot noise and read noise."""
-    mean = image.astype(np.float32) * 10 ** (-2 * fault.much)
+    mean = image.astype(np.float32) * 10 ** (-2 * fault.severity)
     noise = np.sqrt(mean / _FULL_WELL + _READ_NOISE**2) * rng.standard_normal(image.shape, np.float32)
     return _as_image(mean + noise)
 
 
 def _blur(image: U8, fault: FaultInterval, rng: np.random.Generator) -> U8:
     """Defocus: a Gaussian blur."""
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5 + (_BLUR_PX - 0.5) * fault.much), np.uint8)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5 + (_BLUR_PX - 0.5) * fault.severity), np.uint8)
 
 
 def _haze(image: U8, fault: FaultInterval, rng: np.random.Generator) -> U8:
     """Less contrast, down to 2 %: untextured walls, glare, fog."""
-    contrast = 50 ** (-fault.much)
+    contrast = 50 ** (-fault.severity)
     return _as_image(contrast * image.astype(np.float32) + (1 - contrast) * float(image.mean()))
 
 
@@ -129,16 +129,16 @@ def _occluded_region(
 ) -> tuple[slice, slice]:
     """Return the rows and columns that the occluder covers."""
     height, width = shape
-    side = np.sqrt(0.33 + 0.65 * fault.much)
+    side = np.sqrt(0.33 + 0.65 * fault.severity)
     w, h = round(side * width), round(side * height)
-    left, top = fault.where[0] * (width - w), round(fault.where[1] * (height - h))
+    left, top = fault.position[0] * (width - w), round(fault.position[1] * (height - h))
     x = round(left - disparity_px_m / _occluder_distance_m(fault))
     return slice(top, top + h), slice(max(0, x), max(0, x + w))
 
 
 def _occluder_distance_m(fault: FaultInterval) -> float:
     nearest, farthest = _OCCLUDER_DISTANCE_M
-    return nearest + fault.where[2] * (farthest - nearest)
+    return nearest + fault.position[2] * (farthest - nearest)
 
 
 def _as_image(values: np.ndarray) -> U8:
@@ -150,4 +150,4 @@ def _ns(seconds: float) -> int:
 
 
 _IMAGE_FAULTS = {"dark": _dark, "blur": _blur, "haze": _haze}
-FAULT_KINDS = (*_IMAGE_FAULTS, "cover", "drop", "deaf")
+FAULT_KINDS = (*_IMAGE_FAULTS, "cover", "drop", "imu_missing")

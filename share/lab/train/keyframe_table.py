@@ -1,8 +1,8 @@
-"""Keyframes of many runs in one table, for training."""
+"""Keyframes of many runs in one table, and the split of the runs by room and motion, never by frame."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from share.array_table import ArrayTable
 from share.errors import UsageError
 from share.files.json_file import own_format_errors
 from share.lab.train.labels import Labels, read_labels
-from share.lab.train.split import room_groups, split_runs
 from share.odometry.error_model.inference import MAX_ERROR_CM
 from share.odometry.error_model.inputs import INPUT_SHAPES, ErrorModelInput
 from share.types import F32, I64, U8
@@ -52,7 +51,7 @@ class KeyframeTable(ArrayTable):
 
 @dataclass(frozen=True, eq=False)
 class LabelCollection:
-    """abouts: metadata of the R runs. parts: the runs in each of `split.PARTS`."""
+    """abouts: metadata of the R runs. parts: the runs in each of `PARTS`."""
 
     abouts: list[dict[str, Any]]
     table: KeyframeTable
@@ -79,8 +78,8 @@ def collect_labels(folder: Path, seed: int) -> LabelCollection:
     group = room_groups(abouts)
     if len(np.unique(group)) < 4:
         raise UsageError(
-            f"{folder}: is of {len(np.unique(group))} rooms; to learn, to stop, to calibrate and to test "
-            f"takes four at least"
+            f"{folder}: is of {len(np.unique(group))} rooms; to train, validate, calibrate and test "
+            "takes at least four"
         )
     return LabelCollection(abouts, tabulate(all_labels), split_runs(group, seed))
 
@@ -94,3 +93,49 @@ def tabulate(all_labels: Sequence[Labels]) -> KeyframeTable:
         for name in ("error_cm", *INPUT_SHAPES)
     ]
     return KeyframeTable(np.concatenate(run), columns[0].clip(_MIN_CM, MAX_ERROR_CM), *columns[1:])
+
+
+# The split: runs that share a room or a recorded motion stay together.
+
+PARTS = ("train", "validate", "calibrate", "test")
+_SHARES = (0.6, 0.12, 0.13, 0.15)  # of the groups
+
+
+def room_groups(abouts: Sequence[Mapping[str, Any]]) -> I64:
+    """Return the group (R,) of each of R runs: runs that share a room or a recorded motion are in one."""
+    merged: list[set[str]] = []
+    for about in abouts:
+        keys = _room_keys(about)
+        overlapping = [group for group in merged if group & keys]
+        merged = [group for group in merged if not group & keys] + [keys.union(*overlapping)]
+    order = sorted(merged, key=min)
+    return np.array(
+        [next(k for k, group in enumerate(order) if _room_keys(about) & group) for about in abouts]
+    )
+
+
+def split_runs(group: I64, seed: int) -> dict[str, I64]:
+    """Return the runs of each of `PARTS`: whole groups, drawn by `seed`. No part is empty if there are as
+    many groups as parts."""
+    names = np.random.default_rng(seed).permutation(np.unique(group))
+    min_groups = min(1, len(names) // len(PARTS))
+    counts = [max(min_groups, round(share * len(names))) for share in _SHARES[1:]]
+    ends = np.cumsum([len(names) - sum(counts), *counts])
+    parts = np.split(names, ends[:-1])
+    return {part: np.flatnonzero(np.isin(group, mine)) for part, mine in zip(PARTS, parts, strict=True)}
+
+
+def _room_keys(about: Mapping[str, Any]) -> set[str]:
+    """Return the keys that a run shares with others of its group: its room, and its recorded motions."""
+    provenance = about["provenance"]
+    if "scene" not in provenance:  # a recording, not emulated
+        return {f"session {about['session']}"}
+    room = f"room {provenance['scene']} {provenance['seed']} {provenance.get('size')}"
+    return {room, *(f"motion {motion}" for motion in provenance["motions"] if _is_recorded(motion))}
+
+
+def _is_recorded(motion: str) -> bool:
+    """Return whether a motion is the same in any room (`paper:1`, a recording), not planned in each, as
+    `ar=walk:speed=0.6`."""
+    name, _, spec = motion.partition("=")
+    return not (spec or name).startswith(("walk:", "robot:"))

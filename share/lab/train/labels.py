@@ -106,7 +106,7 @@ def _make_run(work: tuple[LabelRun, Config]) -> None:
     truth = source.truth()
     assert truth is not None
     rng = np.random.default_rng((job.seed, job.number, zlib.crc32(job.out.name.encode())))
-    allowed_kinds = [kind for kind in FAULT_KINDS if job.imu or kind != "deaf"]
+    allowed_kinds = [kind for kind in FAULT_KINDS if job.imu or kind != "imu_missing"]
     kinds = (
         rng.permutation(allowed_kinds)[: rng.integers(1, _MAX_FAULT_KINDS + 1)].tolist() if job.number else []
     )
@@ -120,7 +120,7 @@ def _make_run(work: tuple[LabelRun, Config]) -> None:
         "number": job.number,
         "seed": job.seed,
         "imu": job.imu and source.rig.imu is not None,
-        "spells": [asdict(spell) for spell in faults],
+        "faults": [asdict(fault) for fault in faults],
         "window_s": WINDOW_S,
         "version": __version__,
     }

@@ -1,11 +1,11 @@
-"""Scores of error models on the same keyframes, as a table and as JSON."""
+"""Scores of error models on the same keyframes, as a table, as JSON and in the card of a model."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,28 +18,28 @@ from share.files.reading import MAX_SETTINGS_BYTES, read_text
 @dataclass(frozen=True)
 class ErrorModelScore:
     """Score of one model on N keyframes. rmse_cm, mae_cm: of the estimate; rank: Spearman correlation with
-    the true error; qoe_off: mean absolute error of a headset's QoE without delay; covered: share of errors
-    within their intervals, NaN without intervals; ms: CPU time a keyframe without the inputs, NaN if not
+    the true error; qoe_error: mean absolute error of a headset's QoE without delay; coverage: share of errors
+    within their intervals, NaN without intervals; cpu_ms: CPU time a keyframe without the inputs, NaN if not
     measured."""
 
     name: str
     rmse_cm: float
     mae_cm: float
     rank: float
-    qoe_off: float
-    covered: float = math.nan
-    ms: float = math.nan
+    qoe_error: float
+    coverage: float = math.nan
+    cpu_ms: float = math.nan
 
 
 def score_table(scores: Sequence[ErrorModelScore]) -> str:
     """Return a Markdown table with the paper's columns: errors, and time a keyframe."""
     head = (
-        "| | RMSE cm | mean error cm | rank correlation | QoE off | in the interval | ms |",
+        "| | RMSE cm | mean error cm | rank correlation | QoE error | in the interval | ms |",
         "|---|" + 6 * "---|",
     )
     rows = [
-        f"| {s.name} | {s.rmse_cm:.3f} | {s.mae_cm:.3f} | {s.rank:.2f} | {s.qoe_off:.3f} "
-        f"| {_percent(s.covered)} | {_ms_text(s.ms)} |"
+        f"| {s.name} | {s.rmse_cm:.3f} | {s.mae_cm:.3f} | {s.rank:.2f} | {s.qoe_error:.3f} "
+        f"| {_cell(100 * s.coverage, 0, ' %')} | {_cell(s.cpu_ms, 2)} |"
         for s in scores
     ]
     return "\n".join([*head, *rows])
@@ -67,9 +67,38 @@ def _score_from_row(row: dict[str, Any]) -> ErrorModelScore:
     return ErrorModelScore(**row)
 
 
-def _percent(value: float) -> str:
-    return "–" if math.isnan(value) else f"{100 * value:.0f} %"
+def _cell(value: float, digits: int, unit: str = "") -> str:
+    return "–" if math.isnan(value) else f"{value:.{digits}f}{unit}"
 
 
-def _ms_text(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.2f}"
+_LIMITS = (
+    "It estimates the error of SHARE's own trackers over that window, not how far odometry has drifted.",
+    "It was trained on emulated rooms. Keyframes unlike all of them are marked out of distribution.",
+    "It cannot detect errors that leave no trace in a keyframe, such as a wrong extrinsic.",
+)
+
+
+def model_card(about: Mapping[str, Any], scores: Sequence[ErrorModelScore], size: int, origin: str) -> str:
+    """Return the card as Markdown. about: the model's metadata; scores: on the test rooms; size: bytes;
+    origin: source and licence of the backbone, empty if unknown."""
+    rooms, counts = about["rooms"], about["keyframes"]
+    parts = [f"| {part} | {len(rooms[part])} | {counts[part]} | {', '.join(rooms[part])} |" for part in rooms]
+    return "\n".join(
+        [
+            "# Error model",
+            "",
+            f"By SHARE {about['version']}; errors over {about['window_s']:g} s; {size / 1e6:.1f} MB.",
+            "",
+            "| part | sessions | keyframes | |",
+            "|---|---|---|---|",
+            *parts,
+            "",
+            "On the rooms of *test*:",
+            "",
+            score_table(scores),
+            "",
+            *([f"* Its backbone is {origin}."] if origin else []),
+            *(f"* {limit}" for limit in _LIMITS),
+            "",
+        ]
+    )

@@ -25,15 +25,15 @@ def test_the_overlapping_estimate_is_the_definition():
     assert deviation(samples, 5) == pytest.approx(defined(samples[:, 0], 5))
 
 
-def test_no_difference_is_taken_across_a_gap():
-    """Two stretches of which one lies far above the other: what is between them does not count."""
+def test_no_difference_spans_a_gap():
+    """Two segments, one far above the other: the step between them does not count."""
     rng = np.random.default_rng(2)
     low, high = rng.standard_normal((300, 1)), 1000 + rng.standard_normal((500, 1))
     both = (296 - 5) * defined(low[:, 0], 5) ** 2 + (496 - 5) * defined(high[:, 0], 5) ** 2
     assert deviation([low, high], 5) == pytest.approx(np.sqrt(both / (296 - 5 + 496 - 5)))
 
 
-def test_clusters_are_counted_within_stretches():
+def test_clusters_are_counted_within_segments():
     curve = allan_deviation([np.zeros((400, 1)), np.zeros((70, 1))], 1.0)
     counted = dict(zip(curve.sizes.tolist(), curve.clusters.tolist(), strict=True))
     m = min(size for size in counted if size > 30)
@@ -41,7 +41,7 @@ def test_clusters_are_counted_within_stretches():
     assert curve.sizes[-1] == 100 and counted[100] == 4
 
 
-def test_a_constant_does_not_matter_and_a_linear_drift_does(rng):
+def test_a_constant_offset_cancels_and_a_linear_drift_does_not(rng):
     white = rng.standard_normal((10_000, 1))
     assert np.allclose(
         allan_deviation(white + 1e6, 1.0).deviation, allan_deviation(white, 1.0).deviation, rtol=1e-6

@@ -1,4 +1,4 @@
-"""Pictures of a board in a folder: in the order of their stamps, and none lost without a word."""
+"""Images of a board in a folder: ordered by stamp, and each skipped one counted."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from share.errors import DataError, UsageError
 from share.geometry.camera import Camera, Rig
 from share.lab.calibrate import board_views
 from share.lab.calibrate.board_views import RigImages, find_stamped_views, open_board_images
-from share.lab.calibrate.camera_bundle import BoardView
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import Detection
 from share.lab.calibrate.target import AprilGrid
 
@@ -27,13 +27,13 @@ def written(folder: Path, *names: str) -> Path:
     return folder
 
 
-def test_a_stamp_with_fewer_digits_goes_first(tmp_path: Path) -> None:
+def test_images_are_ordered_by_number(tmp_path: Path) -> None:
     written(tmp_path / "cam0", "100000000000.png", "99950000000.png", "99900000000.png")
     names = [name for name, _ in open_board_images(str(tmp_path), ("cam0",)).read_images()]
     assert names == ["99900000000", "99950000000", "100000000000"]
 
 
-def test_where_pictures_are_missing_it_is_said_how_to_do_without(tmp_path: Path) -> None:
+def test_a_camera_without_images_gives_a_hint(tmp_path: Path) -> None:
     written(tmp_path / "mono" / "cam0", "1.png", "2.png")
     with pytest.raises(DataError, match=r"of the same name in cam0 and cam1; give --camera cam0$"):
         open_board_images(str(tmp_path / "mono"), ("cam0", "cam1"))
@@ -53,14 +53,14 @@ def test_where_pictures_are_missing_it_is_said_how_to_do_without(tmp_path: Path)
 
 
 def stamped(monkeypatch: pytest.MonkeyPatch, *names: str) -> board_views.StampedViews:
-    """What is found in pictures of these names, which all show the board."""
+    """Return the views in images of these names, which all show the board."""
     views = [BoardView(name, (CORNER,)) for name in names]
     monkeypatch.setattr(board_views, "find_views", lambda *_: (views, [(12, 8)]))
     rig = Rig(Camera(12, 8, 9.0, 9.0, 6.0, 4.0), np.eye(4))
     return find_stamped_views(RigImages("dance", None, rig, None), AprilGrid(), 1, lambda done, total: None)  # type: ignore[arg-type]
 
 
-def test_pictures_that_are_not_later_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_whose_stamps_do_not_increase_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     found = stamped(monkeypatch, "10", "30", "20", "30", "40")
     assert found.stamps.tolist() == [10, 30, 40]
     assert [view.name for view in found.views] == ["10", "30", "40"]
@@ -68,6 +68,6 @@ def test_pictures_that_are_not_later_are_counted(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("name", ["row", "1.5", "12345678901234567890"])
-def test_a_name_that_is_no_stamp_is_refused(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_a_name_that_is_not_a_stamp_is_refused(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     with pytest.raises(DataError, match="dance: images have no stamps; name them cam0/STAMP"):
         stamped(monkeypatch, "10", name)

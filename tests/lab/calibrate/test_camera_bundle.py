@@ -1,4 +1,4 @@
-"""Calibration of cameras: derivatives, recovery of what is known, and honest sigmas."""
+"""Calibration of simulated cameras: derivatives, estimates, covariances, choice of views."""
 
 import cv2
 import numpy as np
@@ -7,7 +7,7 @@ import pytest
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.lab.calibrate import camera_bundle
-from share.lab.calibrate.camera_bundle import BoardView, calibrate_cameras
+from share.lab.calibrate.camera_bundle import calibrate_cameras
 from share.lab.calibrate.camera_initialisation import (
     camera_from_parameters,
     has_enough_corners,
@@ -25,6 +25,7 @@ from share.lab.calibrate.camera_verdict import (
     judge_cameras,
     median_epipolar_px,
 )
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import Detection
 from share.lab.calibrate.target import AprilGrid, CharucoBoard
 from share.types import F64
@@ -42,7 +43,7 @@ def _mount() -> F64:
 
 
 def _poses(rng: np.random.Generator, count: int) -> F64:
-    """T_cam0_target of boards that face the camera, lean by up to 35 degrees and go all over the image."""
+    """T_cam0_target of boards that face the camera, tilted by up to 35 degrees, anywhere in the image."""
     facing = se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
     lean = np.concatenate([rng.uniform(-0.6, 0.6, (count, 3)), np.zeros((count, 3))], axis=1)
     middle = np.append(GRID.extent.mean(axis=0), 0)
@@ -64,20 +65,20 @@ def _views(
 ) -> list[BoardView]:
     out = []
     for k, T in enumerate(_poses(rng, count)):
-        seen = []
+        detections = []
         for camera, pose in zip(pair, (T, _mount() @ T), strict=True):
             px = camera.project_wide(se3.transform(pose, GRID.corners))
             ids = np.flatnonzero(camera.is_inside(px, 3.0))
             noisy = px[ids] + rng.normal(0, noise_px, (len(ids), 2))
-            spoilt = rng.random(len(ids)) < wrong
-            noisy[spoilt] += rng.uniform(-8, 8, (int(spoilt.sum()), 2))
-            seen.append(Detection(ids, noisy))
-        out.append(BoardView(str(k), tuple(seen)))
+            is_wrong = rng.random(len(ids)) < wrong
+            noisy[is_wrong] += rng.uniform(-8, 8, (int(is_wrong.sum()), 2))
+            detections.append(Detection(ids, noisy))
+        out.append(BoardView(str(k), tuple(detections)))
     return out
 
 
 @pytest.mark.parametrize("camera", [LEFT, FIVE, FISHEYE], ids=["radtan", "with k3", "equidistant"])
-def test_the_derivatives_of_a_projection_are_those_by_differences(camera: Camera) -> None:
+def test_the_derivatives_of_a_projection_equal_finite_differences(camera: Camera) -> None:
     T, points = _poses(np.random.default_rng(0), 1)[0], GRID.corners[::7]
     points = points[np.isfinite(camera.project(se3.transform(T, points))).all(axis=1)]
     assert len(points) > 10
@@ -98,6 +99,7 @@ def test_the_derivatives_of_a_projection_are_those_by_differences(camera: Camera
         np.testing.assert_allclose(predicted, (high - low) / (2 * h), rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.long
 def test_without_noise_a_stereo_pair_is_found_exactly(rng: np.random.Generator) -> None:
     solution = calibrate_cameras(_views(rng, 0.0), GRID, SIZE)
     for found, truth in zip(solution.state.cameras, (LEFT, RIGHT), strict=True):
@@ -105,7 +107,7 @@ def test_without_noise_a_stereo_pair_is_found_exactly(rng: np.random.Generator) 
     assert np.linalg.norm(se3.log(se3.inverse(_mount()) @ solution.state.T_cam1_cam0)) < 1e-7
 
 
-def test_k3_is_taken_where_the_views_tell_it(rng: np.random.Generator) -> None:
+def test_k3_is_estimated_where_it_is_significant(rng: np.random.Generator) -> None:
     def one_camera(pair: tuple[Camera, Camera]) -> camera_bundle.CameraBundleState:
         views = [BoardView(view.name, view.detections[:1]) for view in _views(rng, 0.1, 12, pair=pair)]
         solution = calibrate_cameras(views, GRID, SIZE)
@@ -117,17 +119,18 @@ def test_k3_is_taken_where_the_views_tell_it(rng: np.random.Generator) -> None:
     assert len(one_camera((LEFT, RIGHT)).cameras[0].distortion) == 4
 
 
+@pytest.mark.long
 def test_a_fisheye_pair_is_found(rng: np.random.Generator) -> None:
-    """Also from boards so near that they reach beyond 75 degrees, where a tracker sees nothing."""
+    """Also with boards so near that they reach beyond 75 degrees, outside a tracker's field of view."""
     views = []
     for k, T in enumerate(_poses(rng, 12)):
         T[:3, 3] *= 0.4
-        seen = []
+        detections = []
         for pose in (T, _mount() @ T):
             px = FISHEYE.project_wide(se3.transform(pose, GRID.corners))
             ids = np.flatnonzero(FISHEYE.is_inside(np.nan_to_num(px, nan=-1.0), 3.0))
-            seen.append(Detection(ids, px[ids] + rng.normal(0, 0.1, (len(ids), 2))))
-        views.append(BoardView(str(k), tuple(seen)))
+            detections.append(Detection(ids, px[ids] + rng.normal(0, 0.1, (len(ids), 2))))
+        views.append(BoardView(str(k), tuple(detections)))
     every = np.concatenate([one.px for view in views for one in view.detections])
     assert np.isnan(FISHEYE.normalise(every)).any()
     found = calibrate_cameras(views, GRID, (512, 512), "equidistant")
@@ -140,10 +143,10 @@ def test_a_fisheye_pair_is_found(rng: np.random.Generator) -> None:
     assert median_epipolar_px(*state.cameras, state.T_cam1_cam0, views) < 0.2
 
 
-def test_with_corners_of_one_weight_it_is_opencvs_solution(
+def test_with_equal_weights_the_solution_is_opencvs(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(camera_bundle, "_HUBER_SIGMAS", 1e6)  # OpenCV doubts no corner
+    monkeypatch.setattr(camera_bundle, "HUBER_SIGMAS", 1e6)  # OpenCV has no robust loss
     views = [BoardView(v.name, v.detections[:1]) for v in _views(rng, 0.2)]
     solution = calibrate_cameras(views, GRID, SIZE)
     boards = [GRID.corners[v.detections[0].ids].astype(np.float32) for v in views]
@@ -157,7 +160,7 @@ def test_with_corners_of_one_weight_it_is_opencvs_solution(
 
 
 @pytest.mark.slow
-def test_its_sigmas_are_honest() -> None:
+def test_nees_is_consistent() -> None:
     nees = []
     for seed in range(12):
         solution = calibrate_cameras(_views(np.random.default_rng(seed), 0.2, count=15), GRID, SIZE)
@@ -172,8 +175,9 @@ def test_its_sigmas_are_honest() -> None:
     assert 110 < sum(nees) < 280  # chi-square of 12 x 16 = 192: its 1e-5 quantiles are about 117 and 285
 
 
-def test_so_they_are_where_the_board_bends_anew_in_each_view() -> None:
-    """By a millimetre: corners err together, and not by what independent noise would do to them."""
+@pytest.mark.long
+def test_sigmas_include_a_board_that_bends_anew_in_each_view() -> None:
+    """By a millimetre: the corners of a view have correlated errors."""
     low, high = GRID.extent
     across, up = ((GRID.corners[:, :2] - low) / (high - low) * 2 - 1).T
     z, naive = [], []
@@ -194,13 +198,13 @@ def test_so_they_are_where_the_board_bends_anew_in_each_view() -> None:
     assert np.sqrt(np.mean(np.square(naive))) > 2.5
 
 
-def test_corners_that_were_found_wrongly_do_little_harm(rng: np.random.Generator) -> None:
+def test_outlier_corners_hardly_change_the_estimate(rng: np.random.Generator) -> None:
     solution = calibrate_cameras(_views(rng, 0.1, wrong=0.03), GRID, SIZE)
     assert solution.state.cameras[0].fx == pytest.approx(LEFT.fx, rel=1e-3)
     assert solution.state.cameras[1].cx == pytest.approx(RIGHT.cx, abs=0.5)
 
 
-def test_epipolar_lines_tell_a_pair_that_sits_otherwise(rng: np.random.Generator) -> None:
+def test_epipolar_distances_show_a_moved_camera(rng: np.random.Generator) -> None:
     """0.2 px of noise on both corners, across the line: a median of 0.6745 sqrt(2) 0.2, and up to half as
     much again where the lens draws together what lies outside. Then a pitch, and a camera that is late."""
     views = _views(rng, 0.2, wrong=0.03)
@@ -220,7 +224,7 @@ def test_epipolar_lines_tell_a_pair_that_sits_otherwise(rng: np.random.Generator
     assert reason.startswith("stereo pair: median distance of corners from their epipolar lines is 3.")
 
 
-def test_a_board_that_never_leans_is_refused(rng: np.random.Generator) -> None:
+def test_a_board_that_is_never_tilted_is_refused(rng: np.random.Generator) -> None:
     facing = se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
     views = []
     for k in range(15):
@@ -237,7 +241,7 @@ def test_too_few_views_are_refused(rng: np.random.Generator) -> None:
         calibrate_cameras(_views(rng, 0.1, count=3), GRID, SIZE)
 
 
-def test_the_views_that_are_chosen_reach_more_of_the_image_than_the_first(rng: np.random.Generator) -> None:
+def test_chosen_views_cover_more_of_the_image_than_the_first(rng: np.random.Generator) -> None:
     views = _views(rng, 0.1, count=60)
     one = [BoardView(v.name, v.detections[:1]) for v in views]
     chosen = choose_views(one, GRID, SIZE, 8)
@@ -250,8 +254,8 @@ def test_the_views_that_are_chosen_reach_more_of_the_image_than_the_first(rng: n
     assert reached(chosen) >= reached(list(range(8)))
 
 
-def test_of_views_that_are_nearly_copies_few_are_chosen(rng: np.random.Generator) -> None:
-    """A hand rests: each view comes ten times in a row."""
+def test_few_of_nearly_equal_views_are_chosen(rng: np.random.Generator) -> None:
+    """Each view comes ten times in a row."""
     views = [
         BoardView(f"{v.name}-{k}", v.detections[:1]) for v in _views(rng, 0.1, count=20) for k in range(10)
     ]
@@ -259,32 +263,32 @@ def test_of_views_that_are_nearly_copies_few_are_chosen(rng: np.random.Generator
     assert len(chosen) == 20 and len({k // 10 for k in chosen}) >= 19
 
 
-def test_what_is_missing_is_said_in_words() -> None:
+def test_gaps_of_the_coverage_are_described() -> None:
     facing = se3.exp(np.array([[np.pi, 0, 0, 0, 0, 0.8]]))
-    said = coverage([np.array([[300.0, 200.0]])], facing, GRID, SIZE).gaps
-    assert "no view reaches the image's upper right corner" in said
-    assert "all views are from one distance: move nearer and farther" in said
+    gaps = coverage([np.array([[300.0, 200.0]])], facing, GRID, SIZE).gaps
+    assert "no view reaches the image's upper right corner" in gaps
+    assert "all views are from one distance: move nearer and farther" in gaps
 
 
-@pytest.mark.parametrize(("ids", "told"), [(range(8), False), (range(9), False), (range(10), True)])
-def test_corners_on_a_line_tell_no_homography(ids: range, told: bool) -> None:
+@pytest.mark.parametrize(("ids", "enough"), [(range(8), False), (range(9), False), (range(10), True)])
+def test_corners_on_a_line_do_not_determine_a_homography(ids: range, enough: bool) -> None:
     board = CharucoBoard().corners[list(ids), :2]  # 8 corners a row
-    assert has_enough_corners(board) == told
+    assert has_enough_corners(board) == enough
 
 
-def test_views_of_one_row_of_corners_are_passed_over(rng: np.random.Generator) -> None:
+def test_views_with_one_row_of_corners_are_not_chosen(rng: np.random.Generator) -> None:
     board, views = CharucoBoard(), []
     for k, T in enumerate(_poses(rng, 12)):
         px = LEFT.project(se3.transform(T, board.corners))
         ids = np.arange(8) if k == 5 else np.flatnonzero(LEFT.is_inside(px, 3.0))
         views.append(BoardView(str(k), (Detection(ids, px[ids]),)))
     assert 5 not in choose_views(views, board, SIZE, 12)
-    told = [view for view in views if view.name != "5"]
-    solution = calibrate_cameras(told, board, SIZE)
+    usable = [view for view in views if view.name != "5"]
+    solution = calibrate_cameras(usable, board, SIZE)
     np.testing.assert_allclose(intrinsics(solution.state.cameras[0]), intrinsics(LEFT), rtol=1e-5, atol=1e-5)
 
 
-def test_a_view_that_a_camera_does_not_see_covers_nothing() -> None:
+def test_an_empty_view_adds_no_coverage() -> None:
     poses = se3.exp(np.array([[np.pi, 0, 0, 0, 0, 0.8], [np.pi, 0.9, 0, 0, 0, 1.6]]))
     covered = coverage([np.array([[300.0, 200.0]]), np.empty((0, 2))], poses, GRID, SIZE)
     assert len(covered.distances) == len(covered.tilts) == 1

@@ -1,4 +1,4 @@
-"""Camera and IMU calibrated over a dance that is known in closed form."""
+"""Camera-IMU calibration on a simulated motion in closed form."""
 
 from dataclasses import replace
 
@@ -19,8 +19,6 @@ from helpers.camera_imu_sim import (
 from share.errors import CalibrationMismatchError, DataError
 from share.geometry import se3
 from share.lab.calibrate.camera_imu import normal_equations
-from share.lab.calibrate.camera_imu.arrow_solver import arrow_system, solve_arrow
-from share.lab.calibrate.camera_imu.corner_observations import corner_observations
 from share.lab.calibrate.camera_imu.fit import CameraImuFit, fit_camera_imu
 from share.lab.calibrate.camera_imu.initialisation import align_clocks
 from share.lab.calibrate.camera_imu.problem import CameraImuProblem
@@ -28,6 +26,8 @@ from share.lab.calibrate.camera_imu.spline import EXTRA_KNOTS, ORDER, Curve
 from share.lab.calibrate.camera_imu.state import KNOTS, LOCAL_COLUMNS, SHARED, CameraImuState, node_count
 from share.lab.calibrate.camera_imu.verdict import compare_mountings, judge_camera_imu
 from share.lab.calibrate.camera_initialisation import camera_from_parameters, intrinsics
+from share.lab.calibrate.corner_observations import corner_observations
+from share.lab.least_squares import ArrowFactor
 from share.types import F64
 
 SIGMAS = normal_equations.Sigmas(0.1, 3e-3, 2e-2, huber=1e6)
@@ -57,7 +57,7 @@ def found(dance: Recorded) -> CameraImuFit:
 
 @pytest.fixture
 def state(rng: np.random.Generator) -> CameraImuState:
-    """Near a dance's, with a knot every 100 ms, biases every 0.7 s."""
+    """A state near the truth, with a knot every 100 ms and a bias node every 0.7 s."""
     at = (np.arange(15 + EXTRA_KNOTS) - 2) * 0.1
     T = Dance(3).body(at) @ se3.exp(rng.normal(0, 0.02, (len(at), 6)))
     curve = Curve(START_NS, 0.1, T[:, :3, :3], T[:, :3, 3])
@@ -66,7 +66,7 @@ def state(rng: np.random.Generator) -> CameraImuState:
 
 
 def _columns(state: CameraImuState, segment: int, local: F64) -> tuple[F64, F64]:
-    """A step of one segment's own columns (LOCAL,), as one of the knots and of the border."""
+    """Return a step of one segment's local columns as steps of the knots and of the border."""
     knots, border = np.zeros((len(state.curve.p), 6)), np.zeros(SHARED + state.biases.size)
     knots[segment : segment + ORDER] = local[:KNOTS].reshape(ORDER, 6)
     border[:SHARED] = local[KNOTS : KNOTS + SHARED]
@@ -75,7 +75,7 @@ def _columns(state: CameraImuState, segment: int, local: F64) -> tuple[F64, F64]
     return knots, border
 
 
-def test_derivatives_of_the_imu_are_those_by_differences(state: CameraImuState) -> None:
+def test_derivatives_of_imu_residuals_equal_finite_differences(state: CameraImuState) -> None:
     run = record(Dance(3), 1.5)
     one = run.imu.take(np.array([143]))
     _, J, segment = normal_equations.inertial_residuals(state, one)
@@ -90,7 +90,7 @@ def test_derivatives_of_the_imu_are_those_by_differences(state: CameraImuState) 
         np.testing.assert_allclose(J[0, :, column], (low - high)[0] / 2e-6, rtol=1e-4, atol=1e-4)
 
 
-def test_derivatives_of_poses_are_those_by_differences(state: CameraImuState) -> None:
+def test_derivatives_of_poses_equal_finite_differences(state: CameraImuState) -> None:
     stamps = np.array([START_NS + 831_000_000])
     T, J, segment = normal_equations.pose_derivatives(state, stamps)
     for column in range(LOCAL_COLUMNS):
@@ -99,37 +99,36 @@ def test_derivatives_of_poses_are_those_by_differences(state: CameraImuState) ->
             normal_equations.camera_poses(state.updated(*_columns(state, int(segment[0]), s * step)), stamps)
             for s in (-1, 1)
         )
-        np.testing.assert_allclose(
-            J[0, :, column], se3.log(se3.inverse(low) @ high)[0] / 2e-6, rtol=1e-5, atol=1e-6
-        )
-    np.testing.assert_allclose(T, normal_equations.camera_poses(state, stamps))
+        by_column = se3.log(low @ se3.inverse(high))[0] / 2e-6
+        np.testing.assert_allclose(J[0, :, column], by_column, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(T, se3.inverse(normal_equations.camera_poses(state, stamps)))
 
 
 def test_the_gradient_is_that_of_the_cost(state: CameraImuState) -> None:
-    """By differences of the cost in three random ways: corners of both cameras, gyro, accel, the lot."""
+    """By differences of the cost in three random directions."""
     run = record(Dance(3), 1.5, wrong=0.1)
-    seen = corner_observations(
-        run.stamps_ns, run.views, TARGET, (run.rig.cam0, run.rig.cam1), run.rig.T_cam1_cam0
-    )
+    observations = corner_observations(run.views, TARGET, (run.rig.cam0, run.rig.cam1), run.rig.T_cam1_cam0)
     sigmas = replace(SIGMAS, huber=30.0)
-    system = arrow_system(normal_equations.segment_normals(state, seen, run.imu, sigmas), state)
+    system = normal_equations.arrow_system(
+        normal_equations.segment_normals(state, run.stamps_ns, observations, run.imu, sigmas), state
+    )
     rng = np.random.default_rng(5)
     for _ in range(3):
         knots, border = rng.normal(size=(len(state.curve.p), 6)), rng.normal(size=system.g_border.shape)
         low, high = (
-            normal_equations.segment_normals(state.updated(s * knots, s * border), seen, run.imu, sigmas).cost
+            normal_equations.segment_normals(
+                state.updated(s * knots, s * border), run.stamps_ns, observations, run.imu, sigmas
+            ).cost
             for s in (-1e-6, 1e-6)
         )
-        down = system.g_knots @ knots.reshape(-1) + system.g_border @ border
+        down = (system.g_nodes * knots).sum() + system.g_border @ border
         assert (low - high) / 2e-6 == pytest.approx(down, rel=1e-4)
 
 
-def test_the_arrow_is_solved_as_a_dense_system(state: CameraImuState) -> None:
+def test_the_arrow_system_has_the_solution_of_the_dense_one(state: CameraImuState) -> None:
     run = record(Dance(3), 1.5)
-    seen = corner_observations(
-        run.stamps_ns, run.views, TARGET, (run.rig.cam0, run.rig.cam1), run.rig.T_cam1_cam0
-    )
-    one = normal_equations.segment_normals(state, seen, run.imu, SIGMAS)
+    observations = corner_observations(run.views, TARGET, (run.rig.cam0, run.rig.cam1), run.rig.T_cam1_cam0)
+    one = normal_equations.segment_normals(state, run.stamps_ns, observations, run.imu, SIGMAS)
     size = 6 * len(state.curve.p)
     H, g = np.zeros((size + SHARED + state.biases.size,) * 2), np.zeros(size + SHARED + state.biases.size)
     for k in range(state.curve.segments):
@@ -137,15 +136,18 @@ def test_the_arrow_is_solved_as_a_dense_system(state: CameraImuState) -> None:
         own = np.concatenate([6 * k + np.arange(KNOTS), size + np.arange(SHARED), first + np.arange(12)])
         H[np.ix_(own, own)] += one.H[k]
         g[own] += one.g[k]
-    system = arrow_system(one, state)
-    held = 1e3 * np.eye(SHARED + state.biases.size)
-    knots, border, covariance = solve_arrow(replace(system, corner=system.corner + held), 0.0)
-    H[size:, size:] += held
+    system = normal_equations.arrow_system(one, state)
+    prior = 1e3 * np.eye(SHARED + state.biases.size)
+    factor = ArrowFactor(replace(system, corner=system.corner + prior))
+    knots, border = factor.solve(system.g_nodes, system.g_border)
+    H[size:, size:] += prior
     np.testing.assert_allclose(np.append(knots, border), np.linalg.solve(H, g), rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(covariance, np.linalg.inv(H)[size:, size:], rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(
+        factor.border_covariance, np.linalg.inv(H)[size:, size:], rtol=1e-5, atol=1e-12
+    )
 
 
-def test_without_noise_and_without_a_guess_all_is_found() -> None:
+def test_without_noise_the_estimate_is_exact() -> None:
     found = calibrated(record(Dance(2), 6.0, noise_px=0.0, hz=12.0, imu=None))
     off = error(found)
     assert np.degrees(np.linalg.norm(off[:3])) < 1e-3
@@ -154,7 +156,8 @@ def test_without_noise_and_without_a_guess_all_is_found() -> None:
     np.testing.assert_allclose(found.state.gravity, GRAVITY, atol=5e-3)
 
 
-def test_with_a_devices_noise_it_is_found_and_believed(found: CameraImuFit) -> None:
+@pytest.mark.long
+def test_with_noise_the_error_is_within_its_covariance_and_the_verdict_passes(found: CameraImuFit) -> None:
     off = error(found)
     assert np.degrees(np.linalg.norm(off[:3])) < 0.1
     assert np.linalg.norm(off[3:6]) < 2e-3
@@ -168,13 +171,15 @@ def test_with_a_devices_noise_it_is_found_and_believed(found: CameraImuFit) -> N
     ) and verdict.accel_noise_ratio == pytest.approx(1, abs=0.15)
 
 
-def test_corners_that_were_found_wrongly_do_little_harm(found: CameraImuFit) -> None:
-    spoilt = calibrated(record(Dance(1), 12.0, hz=6.0, wrong=0.03))
-    off = error(spoilt)
+@pytest.mark.long
+def test_outlier_corners_hardly_change_the_estimate(found: CameraImuFit) -> None:
+    spoiled = calibrated(record(Dance(1), 12.0, hz=6.0, wrong=0.03))
+    off = error(spoiled)
     assert np.degrees(np.linalg.norm(off[:3])) < 0.1 and np.linalg.norm(off[3:6]) < 2e-3
-    assert judge_camera_imu(spoilt).outlier_corners[0] > 100 > judge_camera_imu(found).outlier_corners[0]
+    assert judge_camera_imu(spoiled).outlier_corners[0] > 100 > judge_camera_imu(found).outlier_corners[0]
 
 
+@pytest.mark.long
 def test_an_imu_noisier_than_stated_makes_sigmas_larger_and_fails(
     dance: Recorded, found: CameraImuFit
 ) -> None:
@@ -185,8 +190,9 @@ def test_an_imu_noisier_than_stated_makes_sigmas_larger_and_fails(
     assert any("gyroscope: residuals" in reason for reason in judge_camera_imu(noisy).reasons)
 
 
-def test_a_gyro_that_errs_in_scale_has_larger_sigmas(dance: Recorded, found: CameraImuFit) -> None:
-    """By half a percent: far below its noise in each sample, far above it in the long run."""
+@pytest.mark.long
+def test_a_scale_error_of_the_gyro_enlarges_the_sigmas(dance: Recorded, found: CameraImuFit) -> None:
+    """By half a percent: far below the noise of a sample, far above that of long means."""
     imu = replace(dance.imu, gyro=dance.imu.gyro * np.array([1.005, 0.996, 1.003]))
     scaled = calibrated(replace(dance, imu=imu))
     assert judge_camera_imu(scaled).gyro_noise_ratio > 3 > 1.1 > judge_camera_imu(found).gyro_noise_ratio
@@ -195,12 +201,12 @@ def test_a_gyro_that_errs_in_scale_has_larger_sigmas(dance: Recorded, found: Cam
     assert np.degrees(np.linalg.norm(off[:3])) < 0.1 and np.linalg.norm(off[3:6]) < 2e-3
 
 
-def test_turning_too_little_about_one_axis_is_said() -> None:
+def test_too_little_rotation_about_one_axis_fails() -> None:
     verdict = judge_camera_imu(calibrated(record(Dance(1, axes=(1, 0.05, 1)), 8.0, hz=8.0)))
     assert any("nod, roll and look around" in reason for reason in verdict.reasons)
 
 
-def test_turning_about_one_axis_alone_is_refused() -> None:
+def test_rotation_about_one_axis_alone_is_refused() -> None:
     with pytest.raises(DataError, match="nod, roll and look around"):
         calibrated(record(Dance(1, axes=(1, 0, 0)), 8.0))
 
@@ -210,28 +216,28 @@ def test_the_imu_of_another_recording_is_refused(dance: Recorded) -> None:
         calibrated(replace(dance, imu=record(Dance(8), 12.0, hz=6.0).imu))
 
 
-def test_an_imu_with_a_hole_is_refused(dance: Recorded) -> None:
+def test_a_gap_in_the_imu_is_refused(dance: Recorded) -> None:
     t = (dance.imu.stamps_ns - START_NS) * 1e-9
     with pytest.raises(DataError, match=r"no samples for 0\.\d+ s"):
         calibrated(replace(dance, imu=dance.imu.take((t < 5) | (t > 5.3))))
 
 
-def test_too_few_pictures_are_refused(dance: Recorded) -> None:
+def test_too_few_images_are_refused(dance: Recorded) -> None:
     with pytest.raises(DataError, match="pairs of successive images"):
         calibrated(replace(dance, stamps_ns=dance.stamps_ns[:20], views=dance.views[:20]))
 
 
 @pytest.mark.parametrize("late_s", [-0.42, 0.0, 0.37])
-def test_clocks_far_apart_are_brought_together(late_s: float) -> None:
+def test_clocks_are_aligned_over_the_search_range(late_s: float) -> None:
     run = record(Dance(4), 12.0)
     T = Dance(4).camera((run.stamps_ns - START_NS) * 1e-9 + SHIFT_S)
     late = run.stamps_ns + round(late_s * 1e9)
-    begun = align_clocks(late, T, run.imu, 0.5)
-    assert begun.shift_s == pytest.approx(SHIFT_S - late_s, abs=2e-3)
-    assert np.degrees(se3.rotation_angle(begun.R_imu_cam0.T @ T_IMU_CAM0[:3, :3])) < 1
+    alignment = align_clocks(late, T, run.imu, 0.5)
+    assert alignment.shift_s == pytest.approx(SHIFT_S - late_s, abs=2e-3)
+    assert np.degrees(se3.rotation_angle(alignment.R_imu_cam0.T @ T_IMU_CAM0[:3, :3])) < 1
 
 
-def test_an_inverted_extrinsic_is_told_from_a_wrong_one() -> None:
+def test_an_inverted_extrinsic_is_distinguished_from_a_wrong_one() -> None:
     assert compare_mountings(T_IMU_CAM0, se3.inverse(T_IMU_CAM0)).inverted
     straight = compare_mountings(T_IMU_CAM0, T_IMU_CAM0 @ se3.exp(np.array([0.002, 0, 0, 0.001, 0, 0])))
     assert not straight.inverted and not straight.is_far
@@ -247,7 +253,7 @@ RIG_SIGMAS = np.array([0.2, 0.2, 0.4, 0.4, 1e-3, 1e-3, 1e-4, 1e-4] * 2 + [2e-4] 
 
 
 def with_moved_cameras(run: Recorded, step: F64) -> Recorded:
-    """As one would be given it whose cameras are off by `step` (22,)."""
+    """The recording with cameras that are wrong by `step` (22,)."""
     rig = run.rig
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
     cam0, cam1 = (
@@ -259,22 +265,23 @@ def with_moved_cameras(run: Recorded, step: F64) -> Recorded:
     )
 
 
-def test_other_cameras_move_it_as_the_derivatives_say(dance: Recorded, found: CameraImuFit) -> None:
+@pytest.mark.long
+def test_the_effect_of_wrong_cameras_is_that_of_the_sensitivity(dance: Recorded, found: CameraImuFit) -> None:
     step = RIG_SIGMAS * np.random.default_rng(3).choice([-0.1, 0.1], len(RIG_SIGMAS))
     other = calibrated(with_moved_cameras(dance, step))
-    batch = CameraImuProblem(found.observations, found.imu, NOISE)
+    batch = CameraImuProblem(found.stamps_ns, found.observations, found.imu, NOISE)
     moved = np.append(
         se3.log(se3.inverse(found.T_imu_cam0) @ other.T_imu_cam0), other.shift_s - found.shift_s
     )
     predicted = batch.rig_sensitivity(found.state, found.sigmas) @ step
     np.testing.assert_allclose(moved, predicted, atol=0.05 * np.abs(predicted[:3]).max())
-    assert np.abs(predicted[3:6]).max() > 2e-5  # m: it is worth looking at
+    assert np.abs(predicted[3:6]).max() > 2e-5  # m: large enough to compare
     np.testing.assert_allclose(moved[3:6], predicted[3:6], atol=0.05 * np.abs(predicted[3:6]).max())
 
 
 @pytest.mark.slow
-def test_sigmas_know_of_cameras_that_are_off() -> None:
-    """By what is stated of them: chi-square of 16 x 7, its 0.1 % quantiles."""
+def test_nees_with_uncertain_cameras_is_consistent() -> None:
+    """Chi-square of 16 x 7: its 0.1 % quantiles."""
     nees, naive = [], []
     for seed in range(200, 216):
         step = np.random.default_rng(seed).normal(0, RIG_SIGMAS)
@@ -284,12 +291,12 @@ def test_sigmas_know_of_cameras_that_are_off() -> None:
         nees.append(off @ np.linalg.solve(found.covariance, off))
         naive.append(off @ np.linalg.solve(found.by_noise, off))
     assert 71 < sum(nees) < 163, nees
-    assert sum(naive) > 2 * 163, naive  # held for exact it would not do
+    assert sum(naive) > 2 * 163, naive  # too small if the cameras were taken as exact
 
 
 @pytest.mark.slow
-def test_sigmas_are_honest() -> None:
-    """Normalised estimation error squared of 24 dances: chi-square of 24 x 7, its 0.1 % quantiles."""
+def test_nees_is_consistent() -> None:
+    """Normalised estimation error squared of 24 recordings: chi-square of 24 x 7, its 0.1 % quantiles."""
     nees = []
     for seed in range(100, 124):
         found = calibrated(record(Dance(seed), 15.0))

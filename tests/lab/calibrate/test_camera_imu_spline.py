@@ -1,4 +1,4 @@
-"""Splines of a body's path, against scipy's and against differences."""
+"""Splines of a trajectory, against scipy's and finite differences."""
 
 from dataclasses import replace
 
@@ -14,12 +14,12 @@ STEP = 0.05
 
 @pytest.fixture
 def curve(rng: np.random.Generator) -> Curve:
-    """Twelve segments that turn by up to a radian a knot."""
+    """Twelve segments with rotations of up to a radian a knot."""
     turns = np.cumsum(rng.normal(0, 0.4, (12 + EXTRA_KNOTS, 3)), axis=0)
     return Curve(1_000, STEP, se3.so3_exp(turns), rng.normal(0, 1, (12 + EXTRA_KNOTS, 3)))
 
 
-def test_positions_velocities_and_accelerations_are_scipys(curve: Curve, rng: np.random.Generator) -> None:
+def test_positions_and_their_derivatives_equal_scipys(curve: Curve, rng: np.random.Generator) -> None:
     t = rng.uniform(0, curve.end_s, 40)
     knots = (np.arange(len(curve.p) + ORDER) - EXTRA_KNOTS) * STEP
     theirs = BSpline(knots, curve.p, EXTRA_KNOTS)
@@ -30,13 +30,13 @@ def test_positions_velocities_and_accelerations_are_scipys(curve: Curve, rng: np
         )
 
 
-def test_blending_begins_and_ends_where_neighbours_do() -> None:
+def test_blending_is_continuous_between_segments() -> None:
     ends = blending(np.array([0.0, 1.0]), 0)
     np.testing.assert_allclose(ends[1, 1:], ends[0, :-1], atol=1e-12)  # a segment on is a knot on
     np.testing.assert_allclose(ends[:, 0], 1, atol=1e-12)
 
 
-def test_the_rate_is_what_the_rotation_does(curve: Curve) -> None:
+def test_the_rate_is_the_derivative_of_the_rotation(curve: Curve) -> None:
     stamps = 1_000 + np.arange(3, 590, 7) * 1_000_000
     h = 1e-5
     low, high = (curve.rotation(curve.locate(stamps, s * h)).R for s in (-1, 1))
@@ -46,7 +46,7 @@ def test_the_rate_is_what_the_rotation_does(curve: Curve) -> None:
     )
 
 
-def test_derivatives_by_knots_are_those_by_differences(curve: Curve) -> None:
+def test_derivatives_by_knots_equal_finite_differences(curve: Curve) -> None:
     at = curve.locate(1_000 + np.array([12, 130, 388, 401, 599]) * 1_000_000)
     here, h = curve.rotation(at), 1e-6
     for knot in range(ORDER):

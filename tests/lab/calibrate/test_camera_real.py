@@ -1,4 +1,4 @@
-"""EuRoC's real AprilGrid pairs: the calibration that its authors give is found again."""
+"""Real AprilGrid pairs of EuRoC against the calibration of its authors."""
 
 import json
 from pathlib import Path
@@ -7,14 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from share.lab.calibrate.camera_bundle import BoardView, calibrate_cameras
+from share.lab.calibrate.camera_bundle import calibrate_cameras
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import detector
 from share.lab.calibrate.target import AprilGrid
 from share.recordings.calibration import read_asl_calibration
 
 
 @pytest.mark.slow
-def test_eurocs_own_focal_lengths_are_found_within_half_a_percent(shared_data: Path) -> None:
+def test_focal_lengths_are_those_of_euroc_within_half_a_percent(shared_data: Path) -> None:
     folder, mav = (shared_data / "real" / name for name in ("euroc_aprilgrid", "euroc_v1_01_keyframes/mav0"))
     if not folder.is_dir() or not mav.is_dir():
         pytest.skip(f"real boards are not here: {folder} or {mav} does not exist")
@@ -31,7 +32,7 @@ def test_eurocs_own_focal_lengths_are_found_within_half_a_percent(shared_data: P
     assert solution.sigma_px < 0.3
 
 
-def test_corners_of_real_boards_are_where_basalt_finds_them(shared_data: Path) -> None:
+def test_corners_of_real_boards_are_those_of_basalt(shared_data: Path) -> None:
     folder = shared_data / "real" / "euroc_aprilgrid"
     if not folder.is_dir():
         pytest.skip(f"real boards are not here: {folder} does not exist")

@@ -1,4 +1,4 @@
-"""Corners in exact pictures of boards lie where the target says, by its ids."""
+"""Detection of corners in exact images of boards."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ _TEXEL = 0.002  # m: tags of 44 px
 _MARGIN = 0.04
 
 
-def _picture(target: Target) -> tuple[U8, F64]:
-    """A picture of the board as it is, and where its corners are in it (N, 2) px."""
+def _image(target: Target) -> tuple[U8, F64]:
+    """Return an image of the board seen from the front, and the pixels (N, 2) of its corners."""
     low, high = target.extent[0] - _MARGIN, target.extent[1] + _MARGIN
     columns, rows = np.round((high - low) / _TEXEL).astype(int)
     xs = low[0] + _TEXEL * np.arange(columns + 1)
@@ -24,26 +24,26 @@ def _picture(target: Target) -> tuple[U8, F64]:
 
 
 @pytest.mark.parametrize("target", [AprilGrid(4, 5), CharucoBoard()])
-def test_every_corner_is_found_where_it_is_printed(target: Target) -> None:
-    image, truth = _picture(target)
+def test_every_corner_is_detected_at_its_place(target: Target) -> None:
+    image, truth = _image(target)
     found = detector(target)(image)
     np.testing.assert_array_equal(found.ids, np.arange(len(truth)))
     assert np.abs(found.px - truth).max() < 0.15
 
 
 @pytest.mark.parametrize("target", [AprilGrid(4, 5), CharucoBoard()])
-def test_of_half_a_board_the_corners_that_are_seen_keep_their_ids(target: Target) -> None:
-    image, truth = _picture(target)
+def test_corners_of_half_a_board_keep_their_ids(target: Target) -> None:
+    image, truth = _image(target)
     half = image.shape[1] // 2
     found = detector(target)(np.ascontiguousarray(image[:, :half]))
     assert 0.3 * len(truth) < len(found) < 0.6 * len(truth)
     assert np.abs(found.px - truth[found.ids]).max() < 0.15
 
 
-def test_tags_that_the_board_has_not_are_left_out() -> None:
-    image, _ = _picture(AprilGrid(4, 5))
+def test_tags_of_another_board_are_ignored() -> None:
+    image, _ = _image(AprilGrid(4, 5))
     assert detector(AprilGrid(2, 5))(image).ids.max() < 40
 
 
-def test_in_a_picture_without_a_board_there_is_nothing(rng: np.random.Generator) -> None:
+def test_an_image_without_a_board_has_no_corners(rng: np.random.Generator) -> None:
     assert len(detector(AprilGrid())(rng.integers(0, 255, (200, 300), np.uint8))) == 0

@@ -11,7 +11,7 @@ X = se3.exp(np.array([0.4, -1.1, 2.0, 0.08, -0.05, 0.12]))
 def motions(
     rng: np.random.Generator, n: int = 200, axes: tuple[int, ...] = (0, 1, 2)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A, and the same as the other body sees them."""
+    """Return motions A, and the same motions of the other body."""
     xi = rng.normal(size=(n, 6)) * np.repeat([0.5, 0.3], 3)
     xi[:, [k for k in range(3) if k not in axes]] = 0
     A = np.stack([se3.exp(one) for one in xi])
@@ -22,12 +22,12 @@ def noisy(T: np.ndarray, rng: np.random.Generator, turn: float, shift: float) ->
     return T @ np.stack([se3.exp(xi) for xi in rng.normal(size=(len(T), 6)) * np.repeat([turn, shift], 3)])
 
 
-def test_without_noise_it_is_exact(rng):
+def test_without_noise_the_estimate_is_exact(rng):
     found = hand_eye(*motions(rng))
     assert found.T_a_b == pytest.approx(X, abs=1e-9)
 
 
-def test_with_noise_the_truth_lies_within_the_stated_errors(rng):
+def test_nees_is_consistent(rng):
     """NEES over 60 draws: 6 for each if the covariance is right."""
     nees = []
     for _ in range(60):
@@ -38,7 +38,7 @@ def test_with_noise_the_truth_lies_within_the_stated_errors(rng):
     assert 3.5 < np.mean(nees) < 9.5
 
 
-def test_a_tenth_of_wild_motions_does_not_matter(rng):
+def test_a_tenth_of_outlier_motions_hardly_matters(rng):
     A, B = motions(rng)
     B[::10] = np.stack([se3.exp(xi) for xi in rng.normal(size=(20, 6))])
     found = hand_eye(noisy(A, rng, 0.002, 0.001), B)
@@ -47,15 +47,15 @@ def test_a_tenth_of_wild_motions_does_not_matter(rng):
 
 
 @pytest.mark.parametrize("axes", [(2,), ()])
-def test_turning_about_one_axis_is_refused_with_what_to_do(rng, axes):
+def test_rotation_about_one_axis_is_refused_with_a_hint(rng, axes):
     with pytest.raises(DataError, match="turn the device about two axes or more"):
         hand_eye(*motions(rng, axes=axes))
 
 
-def test_two_axes_are_enough(rng):
+def test_rotation_about_two_axes_suffices(rng):
     assert hand_eye(*motions(rng, axes=(0, 1))).T_a_b == pytest.approx(X, abs=1e-9)
 
 
-def test_few_motions_are_refused(rng):
+def test_too_few_motions_are_refused(rng):
     with pytest.raises(DataError, match="5 motions, at least 10"):
         hand_eye(*motions(rng, 5))

@@ -1,4 +1,4 @@
-"""Noise made with known figures: are they found, within what is said of the error?"""
+"""Estimates from simulated noise of known density, instability and walk."""
 
 import numpy as np
 import pytest
@@ -17,26 +17,29 @@ def made(seed: int, seconds: float, rate_hz: float, axes: int = 12, n: float = N
     return n * np.sqrt(rate_hz) * white + np.cumsum(k / np.sqrt(rate_hz) * steps, axis=0)
 
 
-def test_true_figures_lie_within_the_stated_errors():
-    """24 axes of 20 min: as many standard errors off as chance has it, and few beyond two."""
+def test_errors_of_the_estimates_are_consistent_with_their_sigmas():
+    """24 axes of 20 min: normalised errors of unit rms, few beyond two."""
     axes = [
         a for seed in range(2) for a in fit_noise(allan_deviation(made(seed, 1200, 50), 50), model_error=0)
     ]
-    assert all(axis.density.told for axis in axes) and np.mean([axis.walk.told for axis in axes]) > 0.7
+    assert (
+        all(axis.density.significant for axis in axes)
+        and np.mean([axis.walk.significant for axis in axes]) > 0.7
+    )
     for k, truth in ((1, N), (3, K)):
         off = np.array([(axis.squares[k] - truth**2) / axis.errors[k] for axis in axes])
         assert 0.6 < np.sqrt(np.mean(off**2)) < 1.5
         assert np.mean(np.abs(off) < 2) >= 0.8
 
 
-def test_the_axes_together_are_nearer_to_the_truth():
+def test_combined_axes_are_more_precise():
     axes = fit_noise(allan_deviation(made(7, 1200, 50, axes=20), 50))
     assert combine_axes(axes, "walk").value == pytest.approx(K, rel=0.08)
     assert combine_axes(axes, "walk").sigma < 0.4 * np.mean([axis.walk.sigma for axis in axes])
     assert combine_axes(axes, "density").value == pytest.approx(N, rel=0.01)
 
 
-def test_figures_do_not_depend_on_the_rate():
+def test_estimates_do_not_depend_on_the_rate():
     for rate_hz in (20.0, 200.0):
         axes = fit_noise(allan_deviation(made(3, 1200, rate_hz, axes=6), rate_hz))
         density, walk = combine_axes(axes, "density"), combine_axes(axes, "walk")
@@ -44,28 +47,28 @@ def test_figures_do_not_depend_on_the_rate():
         assert abs(walk.value - K) < 3 * walk.sigma < 0.5 * K
 
 
-def test_white_noise_alone_has_a_bound_for_the_walk_and_no_number():
+def test_white_noise_alone_gives_a_bound_of_the_walk():
     axes = fit_noise(allan_deviation(made(4, 600, 50, k=0), 50))
-    assert sum(axis.walk.told for axis in axes) <= 1
+    assert sum(axis.walk.significant for axis in axes) <= 1
     assert all(axis.walk.bound < K for axis in axes)
     assert combine_axes(axes, "density").value == pytest.approx(N, rel=0.01)
 
 
 def test_a_bound_is_above_the_truth_in_most_short_recordings():
-    """One minute, in which the walk does not yet show."""
+    """One minute: too short to measure the walk."""
     axes = [a for seed in range(3) for a in fit_noise(allan_deviation(made(seed, 60, 50), 50))]
-    assert np.mean([axis.walk.told for axis in axes]) < 0.4
+    assert np.mean([axis.walk.significant for axis in axes]) < 0.4
     assert np.mean([axis.walk.bound > K for axis in axes]) >= 0.85
 
 
-def test_a_walk_alone_is_found():
+def test_a_walk_alone_is_estimated():
     axes = fit_noise(allan_deviation(made(5, 600, 20, n=0), 20.0))
     assert combine_axes(axes, "walk").value == pytest.approx(K, rel=0.05)
     assert combine_axes(axes, "density").conservative < 1e-3
 
 
 def test_flicker_noise_is_bias_instability():
-    """Processes of first order, two a decade, each alike: 1/f of B^2 / (2 pi), in what is looked at."""
+    """First-order processes, two a decade, of equal variance: 1/f noise of B^2 / (2 pi)."""
     rng, n = np.random.default_rng(6), 100_000
     flicker = np.zeros((n, 4))
     for T in 10.0 ** np.arange(-0.5, 6, 0.5):
@@ -75,20 +78,20 @@ def test_flicker_noise_is_bias_instability():
     # add up to (1 / f) / (ln(10) / 2), and B^2 / (2 pi f) is two-sided, so B^2 = pi / (ln(10) / 2)
     expected = np.sqrt(np.pi / (np.log(10) / 2))
     found = combine_axes(fit_noise(allan_deviation(flicker, 1.0)), "instability")
-    assert found.told and found.value == pytest.approx(expected, rel=0.06)
+    assert found.significant and found.value == pytest.approx(expected, rel=0.06)
 
 
-def test_coarse_digits_are_quantisation_and_not_white_noise():
+def test_coarse_digits_give_quantisation_noise_and_no_white_noise():
     """A slow signal in digits: 3 Q^2 / tau^2 with Q = step sqrt(dt^2 / 12) where errors are independent."""
     rng, rate_hz, Q = np.random.default_rng(80), 50.0, 2e-3
     angle = Q * rng.standard_normal((60_001, 3))
     axes = fit_noise(allan_deviation(np.diff(angle, axis=0) * rate_hz + made(8, 1200, rate_hz, 3), rate_hz))
     assert [axis.quantisation.value for axis in axes] == pytest.approx([Q] * 3, rel=0.05)
-    assert all(axis.quantisation.told for axis in axes)
+    assert all(axis.quantisation.significant for axis in axes)
     assert combine_axes(axes, "density").value == pytest.approx(N, rel=0.03)
 
 
-def test_a_filter_in_the_sensor_does_not_spoil_the_white_noise():
+def test_a_filter_in_the_sensor_does_not_change_the_white_noise():
     smooth = lfilter(np.ones(4) / 4, [1], made(9, 1200, 200, 6), axis=0)
     assert combine_axes(fit_noise(allan_deviation(smooth, 200.0)), "density").value == pytest.approx(
         N, rel=0.01
@@ -107,7 +110,7 @@ def test_equivalent_degrees_of_freedom_are_those_of_nist():
         assert freedom == pytest.approx([stated[m] for m in sizes], rel=0.12)
 
 
-def test_the_covariance_of_variances_is_what_many_recordings_show():
+def test_the_covariance_of_allan_variances_is_that_of_many_recordings():
     curve = allan_deviation(made(10, 1000, 1.0, axes=3000, n=1.0, k=0.05), 1.0)
     some = [10, 14, 22]
     seen = np.cov(curve.deviation[some] ** 2)
@@ -116,8 +119,8 @@ def test_the_covariance_of_variances_is_what_many_recordings_show():
     assert np.einsum("a,b,abij->ij", parts, parts, spread) == pytest.approx(seen, rel=0.15)
 
 
-def test_a_gap_costs_as_much_as_it_should():
-    """Two halves tell of short averages as much as the whole; of long ones, less."""
+def test_a_gap_matters_for_long_averages_only():
+    """Two halves determine short averages as well as the whole does, long ones less well."""
     sizes = np.array([8, 400])
     whole, halves = (
         variance_covariance(sizes, np.array(lengths), 1.0)[0, 0] for lengths in ([4000], [2000, 2000])

@@ -12,7 +12,7 @@ IMU = load_profile("euroc").device.imu
 
 
 def still(seconds: float, seed: int = 0) -> ImuBatch:
-    """What an ADIS16448 on a table says."""
+    """Samples of an ADIS16448 at rest."""
     n = int(seconds * RATE_HZ)
     stamps = np.arange(n, dtype=np.int64) * 5_000_000
     force = np.tile([0.1, 9.8, -0.3], (n, 1))
@@ -21,7 +21,7 @@ def still(seconds: float, seed: int = 0) -> ImuBatch:
 
 
 def handled(imu: ImuBatch, start_s: float, end_s: float) -> ImuBatch:
-    """Held in a hand for a while: it turns and sways, slower than once a second."""
+    """Samples of a device in a hand: slow rotation and sway, below 1 Hz."""
     t = imu.stamps_ns * 1e-9
     by = np.where((t >= start_s) & (t < end_s), 1.0, 0.0)[:, None]
     sway = np.stack([np.sin(2 * np.pi * (0.4 + 0.1 * k) * t + k) for k in range(3)], axis=1)
@@ -32,7 +32,7 @@ def seconds(part: slice) -> tuple[float, float]:
     return part.start / RATE_HZ, part.stop / RATE_HZ
 
 
-def test_a_recording_at_rest_is_used_from_end_to_end():
+def test_a_recording_at_rest_is_used_as_a_whole():
     for seed in range(3):
         assert seconds(find_rest(still(400, seed), RATE_HZ)) == (0, 400)
 
@@ -61,7 +61,7 @@ def test_less_than_a_minute_is_refused():
         find_rest(still(50), RATE_HZ)
 
 
-def test_samples_that_a_filter_has_smoothed_are_at_rest_too():
+def test_rest_is_found_in_filtered_samples():
     imu = still(300)
     smooth = [np.apply_along_axis(np.convolve, 0, v, np.ones(6) / 6, "same") for v in (imu.gyro, imu.accel)]
     inner = ImuBatch(imu.stamps_ns, *smooth).take(slice(20, -20))
@@ -69,7 +69,7 @@ def test_samples_that_a_filter_has_smoothed_are_at_rest_too():
 
 
 def test_lost_samples_are_counted_and_do_not_change_the_noise():
-    """300 samples one by one, and one hole of 2 s."""
+    """300 single samples and a gap of 2 s are lost."""
     imu = still(600)
     keep = np.ones(len(imu), bool)
     keep[np.random.default_rng(3).choice(len(imu), 300, replace=False)] = False
@@ -84,7 +84,7 @@ def test_lost_samples_are_counted_and_do_not_change_the_noise():
     assert nature.gyro.curve.segment_lengths.sum() == pytest.approx(len(imu) - 400, abs=5)
 
 
-def test_the_noise_of_the_profile_is_found():
+def test_the_noise_of_the_profile_is_estimated():
     nature = characterise(still(600))
     assert nature.accel.combined("density").value == pytest.approx(IMU.accel.density, rel=0.03)
     assert nature.accel.combined("walk").value == pytest.approx(IMU.accel.walk, rel=0.25)

@@ -1,4 +1,4 @@
-"""Corners of calibration targets, against Kalibr's drawing of its grid and OpenCV's board."""
+"""Corners of calibration targets, against Kalibr's grid and OpenCV's board."""
 
 import re
 
@@ -18,7 +18,7 @@ def test_aprilgrid_counts_tags_from_the_lower_left_and_corners_against_the_clock
     np.testing.assert_allclose(grid.extent, [(-0.02, -0.02), (0.36, 0.24)])
 
 
-def test_charuco_corners_are_opencvs_seen_with_y_up():
+def test_charuco_corners_are_opencvs_with_y_up():
     ours = CharucoBoard(7, 5, 0.04, 0.03, "DICT_4X4_50")
     theirs = cv2.aruco.CharucoBoard(
         (7, 5), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
@@ -32,7 +32,7 @@ def test_charuco_corners_are_opencvs_seen_with_y_up():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: AprilGrid(rows=0), "rows: 0 must be positive"),
         (lambda: AprilGrid(tag_size=float("nan")), "tag_size: nan must be positive"),
@@ -44,6 +44,6 @@ def test_charuco_corners_are_opencvs_seen_with_y_up():
         (lambda: CharucoBoard(20, 20, dictionary="DICT_5X5_100"), "DICT_5X5_100 is too small for 200"),
     ],
 )
-def test_what_no_target_can_be_is_said(make, said):
-    with pytest.raises(ValueError, match=re.escape(said)):
+def test_an_impossible_target_is_refused(make, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
         make()

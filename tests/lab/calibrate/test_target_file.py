@@ -1,13 +1,12 @@
-"""Targets in YAML under Kalibr's names."""
+"""Target files with Kalibr's keys."""
 
 import re
 
-import numpy as np
 import pytest
 import yaml
 
 from share.errors import ConfigError
-from share.lab.calibrate.target import AprilGrid, CharucoBoard, read_target, session_target, target_mapping
+from share.lab.calibrate.target import AprilGrid, CharucoBoard, read_target, target_mapping
 
 KALIBR = """
 target_type: 'aprilgrid' #gridtype
@@ -37,12 +36,12 @@ def test_kalibrs_newer_file_is_read(tmp_path):
 @pytest.mark.parametrize(
     "target", [AprilGrid(3, 4, 0.05, 0.2), CharucoBoard(5, 4, 0.1, 0.07, "DICT_6X6_250")]
 )
-def test_what_is_written_is_read_again(tmp_path, target):
+def test_a_written_target_is_read(tmp_path, target):
     assert read_target(written(tmp_path, yaml.safe_dump(target_mapping(target)))) == target
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (KALIBR.replace("'aprilgrid'", "circles"), "target_type: 'circles' is not known; known: aprilgrid"),
         (KALIBR.replace("tagSpacing", "tagSpace"), "unknown key 'tagSpace'; did you mean 'tagSpacing'?"),
@@ -56,20 +55,8 @@ def test_what_is_written_is_read_again(tmp_path, target):
         ("- 1", "expected keys and values"),
     ],
 )  # fmt: skip
-def test_a_bad_file_is_refused_in_one_line(tmp_path, text, said):
-    with pytest.raises(ConfigError, match=re.escape(said)) as caught:
+def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=re.escape(message)) as raised:
         read_target(written(tmp_path, text))
-    assert str(caught.value).startswith(str(tmp_path / "target.yaml"))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_session_says_where_its_target_stands(tmp_path):
-    T = np.eye(4)
-    T[:3, 3] = 1, 2, 3
-    session = {"schema": 1, "target": target_mapping(AprilGrid()) | {"T_world_target": T.tolist()}}
-    (tmp_path / "session.yaml").write_text(yaml.safe_dump(session))
-    target, T_world_target = session_target(tmp_path)
-    assert target == AprilGrid()
-    np.testing.assert_array_equal(T_world_target, T)
-    (tmp_path / "session.yaml").write_text("schema: 1")
-    assert session_target(tmp_path) is None
+    assert str(raised.value).startswith(str(tmp_path / "target.yaml"))
+    assert "\n" not in str(raised.value)

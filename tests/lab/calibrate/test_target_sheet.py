@@ -1,4 +1,4 @@
-"""What is printed, looked at as a printer and a camera would."""
+"""The printed sheet as a printer and a camera see it."""
 
 import numpy as np
 import pypdfium2
@@ -11,7 +11,7 @@ INCH = 25.4
 
 
 def printed(made, dpi):
-    """The page (H, W) as gray values."""
+    """Return the page (H, W) as gray values."""
     page = pypdfium2.PdfDocument(sheet_pdf(made))[0]
     size_mm = np.array(page.get_size()) / 72 * INCH
     assert size_mm == pytest.approx([made.width, made.height], abs=1e-3)
@@ -22,7 +22,7 @@ def printed(made, dpi):
     ("kind", "columns", "rows", "paper", "dpi"),
     [("aprilgrid", 6, 6, "A4", 60), ("aprilgrid", 4, 7, "letter", 60), ("charuco", 9, 7, "A3", 75)],
 )
-def test_every_corner_is_found_where_the_target_has_it(kind, columns, rows, paper, dpi):
+def test_every_corner_is_detected_at_its_place(kind, columns, rows, paper, dpi):
     made = make_sheet(kind, columns, rows, paper)
     page = printed(made, dpi)
     found = detector(made.target)(page)
@@ -36,7 +36,7 @@ def test_every_corner_is_found_where_the_target_has_it(kind, columns, rows, pape
     assert np.abs(mm - wanted).max() < 0.1
 
 
-def test_the_ruler_is_as_long_as_it_says():
+def test_the_ruler_has_its_stated_length():
     dpi = 254  # ten pixels a millimetre
     made = make_sheet("aprilgrid", 6, 6, "A4")
     page = printed(made, dpi)
@@ -46,8 +46,8 @@ def test_the_ruler_is_as_long_as_it_says():
     assert len(line) * INCH / dpi == pytest.approx(100, abs=0.3)  # and its end marks
 
 
-def test_neighbours_show_no_seam():
-    """The border of a tag is one black square to a camera, not cells."""
+def test_adjacent_rectangles_show_no_seam():
+    """The border of a tag is one black square."""
     made = make_sheet("aprilgrid", 6, 6, "A4")
     page = printed(made, 97)  # cells end within pixels
     tag = np.array([made.left, made.bottom]) + 1000 * made.target.gap
@@ -56,6 +56,6 @@ def test_neighbours_show_no_seam():
     assert edge.max() < 40
 
 
-def test_the_same_board_is_the_same_file():
+def test_the_same_board_gives_the_same_file():
     made = make_sheet("charuco", 9, 7, "A3")
     assert sheet_pdf(made) == sheet_pdf(made)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.lab.calibrate.camera_bundle import BoardView
 from share.lab.calibrate.camera_imu.fit import fit_camera_imu
 from share.lab.calibrate.camera_imu.verdict import judge_camera_imu
+from share.lab.calibrate.corner_observations import BoardView
 from share.lab.calibrate.corners import Detection
 from share.lab.emulate.motion.motion_plan import plan_motions
 from share.lab.emulate.sensor.device import EmulatedDevice

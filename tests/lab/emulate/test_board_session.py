@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from share.files.yaml_file import read_yaml
 from share.geometry import se3
-from share.lab.calibrate.target import session_target
+from share.lab.calibrate.target import T_WORLD_TARGET, TARGET, target_from_section
 from share.lab.emulate.motion.motion_plan import plan_motions
 from share.lab.emulate.recipe import SessionRecipe
 from share.lab.emulate.render.context import missing_reason
@@ -35,7 +36,8 @@ def session(tmp_path_factory):
 
 
 def test_extrinsics_and_time_offset_are_what_the_session_says(session):
-    target, T_world_target = session_target(session)
+    section = read_yaml(session / "session.yaml").section(TARGET)
+    target, T_world_target = target_from_section(section), section.pose(T_WORLD_TARGET)
     source = open_source(str(session / "board1"))
     rig = source.rig
     path = plan_motions([MOTION], make_scene_layout(SCENE, 0), SECONDS, 0).agents[0].path

@@ -21,7 +21,7 @@ def test_models_of_the_error(tmp_path):
     file.write_text(scores_json(SCORES))
     assert "NaN" not in file.read_text()
     first, second = read_scores(file)
-    assert math.isnan(first.ms)
+    assert math.isnan(first.cpu_ms)
     assert second == SCORES[1]
     made = read_section(file, 1)
     assert made.text.startswith("## Error models: scores\n")

@@ -1,5 +1,5 @@
-"""Offsets that are clear or not, one level world for several fits, and gaps that stay gaps, over motions in
-closed form."""
+"""Alignment of device and motion capture: unique offsets, gaps in the truth, a common level world; simulated
+motions in closed form."""
 
 from dataclasses import dataclass, replace
 
@@ -25,7 +25,7 @@ ANYWHERE = MocapFitOptions(within_s=None)
 
 @dataclass(frozen=True, eq=False)
 class Pacing(Motion):
-    """To and fro in exactly 2 s, forever."""
+    """Periodic motion of exactly 2 s."""
 
     def pose(self, t: F64) -> F64:
         w = np.pi * t
@@ -35,13 +35,13 @@ class Pacing(Motion):
 
 @pytest.fixture(scope="module")
 def done():
-    """20 s, the mocap blind for 0.3 s and for 1.5 s."""
+    """20 s, with mocap gaps of 0.3 s and 1.5 s."""
     motion, hidden = Motion(3), ((6.0, 6.3), (12.0, 13.5))
     mocap = record_mocap(motion, 20, AWAY_NS, gaps=hidden, drift=3e-5)
     return motion, align_device(record_imu(motion, 20), NOISE, mocap, ANYWHERE)
 
 
-def test_unrelated_clocks_are_found_to_a_fraction_of_a_millisecond(done) -> None:
+def test_the_offset_of_unrelated_clocks_is_found_within_0_3_ms(done) -> None:
     _, found = done
     assert abs(found.offset_ns - AWAY_NS) < 0.3e6
     assert found.peak.correlation > 0.95 and found.peak.lead > 2 * MIN_LEAD
@@ -56,7 +56,7 @@ def test_the_truth_is_the_path_of_the_body_in_the_level_world(done) -> None:
     assert np.degrees(np.sqrt((error[:, :3] ** 2).sum(1).mean())) < 0.1
 
 
-def test_a_long_hole_stays_a_gap_and_a_short_one_is_left_to_the_imu(done) -> None:
+def test_a_long_gap_has_no_truth_and_a_short_one_is_bridged(done) -> None:
     _, found = done
     t = (found.stamps_ns - START_NS) * 1e-9
     holes = np.flatnonzero(np.diff(t) > 0.011)
@@ -65,8 +65,9 @@ def test_a_long_hole_stays_a_gap_and_a_short_one_is_left_to_the_imu(done) -> Non
     assert found.seconds == pytest.approx(20 - 0.6 - 1.5, abs=0.1)
 
 
-def test_nothing_is_made_up_at_the_edges_of_a_hole_that_breaks_the_path() -> None:
-    """12 s: too long even for the fit to integrate across."""
+@pytest.mark.long
+def test_there_is_no_truth_in_a_gap_that_breaks_the_path() -> None:
+    """12 s: too long to integrate the IMU across."""
     motion = Motion(3)
     found = align_device(
         record_imu(motion, 40), NOISE, record_mocap(motion, 40, AWAY_NS, gaps=((14, 26),)), ANYWHERE
@@ -92,43 +93,44 @@ def test_the_motion_captures_z_need_not_be_up(turn: tuple[float, ...], up: str) 
     assert np.abs(height - true).max() < 0.01
 
 
-def test_a_motion_that_repeats_itself_is_refused() -> None:
+@pytest.mark.long
+def test_a_periodic_motion_is_refused() -> None:
     imu, mocap = record_imu(Pacing(), 40), record_mocap(Pacing(), 40, AWAY_NS)
     part = mocap.between(int(mocap.stamps_ns[0]) + 12 * 10**9, int(mocap.stamps_ns[0]) + 24 * 10**9)
     with pytest.raises(CalibrationMismatchError, match="is not unique"):
         align_device(imu, NOISE, part, ANYWHERE)
-    near = part.shifted(AWAY_NS)  # said to be within half a period, it is clear
+    near = part.shifted(AWAY_NS)  # unique within half a period
     assert abs(align_device(imu, NOISE, near, replace(ANYWHERE, within_s=0.4)).offset_ns) < 1e6
 
 
 YEARS_NS = 56 * 365 * 86_400 * 10**9
 
 
-def test_a_clock_that_was_set_is_said_and_nothing_searched() -> None:
-    """A device that learns half way that it is not 1970."""
+def test_a_clock_that_was_set_is_refused_before_the_search() -> None:
+    """A device whose clock jumps by decades half way."""
     imu, mocap = record_imu(Motion(3), 12), record_mocap(Motion(3), 12, AWAY_NS)
     stamps = imu.stamps_ns + np.where(np.arange(len(imu)) < 1200, -YEARS_NS // 2, YEARS_NS // 2)
     with pytest.raises(DataError, match=r"IMU: no samples from 5\.995 to 1766016006"):
         align_device(replace(imu, stamps_ns=stamps), NOISE, mocap, ANYWHERE)
 
 
-def test_a_stray_stamp_of_the_motion_capture_is_said() -> None:
+def test_a_stray_stamp_of_the_motion_capture_is_refused() -> None:
     mocap = record_mocap(Motion(3), 12)
     stamps = mocap.stamps_ns.copy()
     stamps[0] = 0
     with pytest.raises(DataError, match=r"stamps jump by 1600000000 s at sample 2, from 0 to .*; cut there"):
         MocapTrajectory(stamps, mocap.T)
     hours = np.arange(5 * 3600 * 10, dtype=np.int64) * 100_000_000  # five at 10 Hz
-    rarely = np.concatenate([hours[:400], hours[-400:]])  # seen as it began, and as it ended
+    rarely = np.concatenate([hours[:400], hours[-400:]])  # visible at the start and at the end
     MocapTrajectory(rarely, np.tile(np.eye(4), (len(rarely), 1, 1)))
 
 
-def test_somebody_elses_motion_is_refused() -> None:
+def test_another_motion_is_refused() -> None:
     with pytest.raises(DataError):
         align_device(record_imu(Motion(3), 20), NOISE, record_mocap(Motion(4), 20, AWAY_NS), ANYWHERE)
 
 
-def test_more_of_the_same_makes_the_peak_clearer() -> None:
+def test_a_longer_recording_has_a_larger_lead() -> None:
     leads = []
     for seconds in (8, 16, 32):
         imu, mocap = record_imu(Motion(3), seconds), record_mocap(Motion(3), seconds, AWAY_NS)
@@ -149,8 +151,8 @@ def test_a_robot_that_only_yaws_is_fitted_with_a_known_mounting() -> None:
     assert np.sqrt((off**2).sum(1).mean()) < 0.005
 
 
-def test_one_level_world_is_the_mean_by_what_each_fit_knows(done) -> None:
-    """Two with the same errors meet half way; one that knows nothing does not count."""
+def test_the_common_level_is_the_mean_weighted_by_information(done) -> None:
+    """Two fits of equal covariance count the same; one without information does not count."""
     _, found = done
 
     def tilted(x: float, y: float, sigma: float):
@@ -166,8 +168,8 @@ def test_one_level_world_is_the_mean_by_what_each_fit_knows(done) -> None:
     assert np.linalg.norm(se3.so3_log(common_level([found.fit]))[:2] - TILT) < np.radians(0.05)
 
 
-def test_poses_that_lag_behind_their_turning_are_doubted(done) -> None:
-    """Positions 20 ms late against the rotations, as a filter makes them."""
+def test_positions_that_lag_behind_rotations_give_a_warning(done) -> None:
+    """Positions 20 ms later than rotations, as after a filter."""
     mocap = record_mocap(Motion(3), 14, AWAY_NS)
     assert done[1].warnings == []
     t = mocap.stamps_ns[100:-100]
@@ -178,8 +180,8 @@ def test_poses_that_lag_behind_their_turning_are_doubted(done) -> None:
 
 
 @pytest.mark.slow
-def test_three_rooms_of_one_device_agree_on_its_clock(shared_data) -> None:
-    """TUM-VI's clocks were one, nearly; here they are 44 years apart, and are found to be one again."""
+def test_three_recordings_of_one_device_agree_on_its_clock(shared_data) -> None:
+    """TUM-VI's clocks are nearly one; shifted by 44 years, the offset is found."""
     tumvi, offsets = shared_data / "motion" / "tumvi", []
     noise = imu_noise(read_yaml(tumvi / "calib" / "kalibr_imu_chain.yaml").section("imu0"), "update_rate")
     for room in ("room1", "room2", "room3"):

@@ -1,4 +1,4 @@
-"""A motion capture's poses as people's programs write them."""
+"""Motion capture files: TUM and CSV, and the choice of a body."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_capitals_and_a_byte_order_mark_do_not_matter(
         ("a.csv", CSV, "1100000000,1,2,4,1,0,0,0", "1100000000,0,0,0,0,0,0,0"),
     ],
 )
-def test_a_body_that_is_not_seen_is_a_gap(
+def test_rows_where_the_body_is_not_seen_are_gaps(
     tmp_path: Path, name: str, text: str, row: str, unseen: str
 ) -> None:
     assert row in text
@@ -50,7 +50,7 @@ def test_a_body_that_is_not_seen_is_a_gap(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (TUM.replace("4 0 0 0 1", "inf 0 0 0 1"), "line 2: 'inf' is not finite"),
         (TUM.replace("4 0 0 0 1", "4 0 0 0 2"), "pose 2: quaternion norm is 2"),
@@ -58,15 +58,15 @@ def test_a_body_that_is_not_seen_is_a_gap(
         ("1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "the body was never seen"),
     ],
 )
-def test_what_is_damaged_is_still_said(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(DataError, match=f"a.tum.*{said}"):
+def test_a_damaged_file_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(DataError, match=f"a.tum.*{message}"):
         read_mocap(written(tmp_path / "a.tum", text))
 
 
 SEEN = MocapTrajectory(np.array([0, 10]), np.tile(np.eye(4), (2, 1, 1)))
 
 
-def test_a_device_is_the_body_wanted_or_of_its_name_or_the_only_one() -> None:
+def test_the_body_is_the_given_one_or_of_the_devices_name_or_the_only_one() -> None:
     there = {"Ann": SEEN, "Hat": SEEN}
     assert pick_body("v.csv", there, None, "ann", "--body") == ("Ann", SEEN)
     assert pick_body("v.csv", there, "hat", "ann", "--body") == ("Hat", SEEN)
@@ -74,7 +74,7 @@ def test_a_device_is_the_body_wanted_or_of_its_name_or_the_only_one() -> None:
     assert pick_body("a.tum", {"": SEEN}, None, "ann", "--body") == ("", SEEN)
 
 
-def test_a_body_that_was_never_seen_is_no_reason_to_take_another() -> None:
+def test_a_body_that_was_never_seen_is_not_replaced_by_another() -> None:
     there = {"Ann": SEEN, "Bob": None}
     with pytest.raises(UsageError, match="body 'Bob' is in the file but was never seen"):
         pick_body("v.csv", there, None, "bob", "--body")

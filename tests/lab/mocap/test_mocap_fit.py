@@ -1,4 +1,4 @@
-"""The fit against a simulated mocap whose body, tilt, delay and holes are known."""
+"""The fit of a simulated motion capture with known mounting, tilt, delay and gaps."""
 
 import numpy as np
 import pytest
@@ -24,18 +24,19 @@ def found() -> MocapFit:
 
 
 def shared_error(fit: MocapFit, delay_ns: int = DELAY) -> F64:
-    """(9,) found against true: tilt, body (rotation, position), offset s; drift apart."""
+    """Return the errors (9,): tilt, mounting (rotation, position), offset s."""
     body = se3.log(se3.inverse(fit.T_body_mocap) @ BODY)
     tilt = TILT - se3.so3_log(fit.R_mocap_world)[:2]
     return np.concatenate([tilt, body, [(delay_ns - fit.offset_ns) * 1e-9]])
 
 
 def pose_error(fit: MocapFit, motion: Motion) -> F64:
-    """(N, 6) of the nodes, perturbation at the right."""
+    """Return the errors (N, 6) of the nodes, perturbed on the right."""
     truth = motion.pose((fit.stamps_ns - START_NS) * 1e-9)
     return se3.log(se3.inverse(fit.T_world_body) @ truth)
 
 
+@pytest.mark.long
 def test_tilt_mounting_and_delay_are_recovered(found: MocapFit) -> None:
     error = np.abs(shared_error(found))
     assert np.degrees(error[:5]).max() < 0.05
@@ -43,6 +44,7 @@ def test_tilt_mounting_and_delay_are_recovered(found: MocapFit) -> None:
     assert error[8] < 0.2e-3
 
 
+@pytest.mark.long
 def test_the_path_is_better_than_the_mocap(found: MocapFit) -> None:
     error = pose_error(found, Motion())
     assert np.sqrt((error[:, 3:] ** 2).sum(1).mean()) < 1e-3  # the mocap's is 3.5 mm
@@ -51,14 +53,16 @@ def test_the_path_is_better_than_the_mocap(found: MocapFit) -> None:
     assert found.residuals.rotation_deg == pytest.approx(0.2 * np.sqrt(3), rel=0.05)
 
 
-def test_velocities_and_the_world_is_level(found: MocapFit) -> None:
+@pytest.mark.long
+def test_velocities_and_tilt_are_recovered(found: MocapFit) -> None:
     t = (found.stamps_ns - START_NS) * 1e-9
     velocity = (Motion().pose(t + 1e-4) - Motion().pose(t - 1e-4))[:, :3, 3] / 2e-4
     assert np.abs(found.velocity - velocity).max() < 0.01
     assert found.tilt_deg == pytest.approx(np.degrees(np.linalg.norm(TILT)), abs=0.05)
 
 
-def test_a_short_hole_is_bridged_and_a_long_one_is_a_gap(found: MocapFit) -> None:
+@pytest.mark.long
+def test_a_short_gap_is_bridged_and_a_long_one_is_reported(found: MocapFit) -> None:
     np.testing.assert_allclose((found.gaps - START_NS) * 1e-9, [(12.0, 14.0)], atol=0.02)
     inside = (found.stamps_ns > START_NS + 12_000_000_000) & (found.stamps_ns < START_NS + 14_000_000_000)
     sigma = np.sqrt(found.cov_poses[:, 3, 3])
@@ -66,6 +70,7 @@ def test_a_short_hole_is_bridged_and_a_long_one_is_a_gap(found: MocapFit) -> Non
     assert np.abs(pose_error(found, Motion())[inside, 3:]).max() < 0.01
 
 
+@pytest.mark.long
 def test_a_mocap_with_y_up_an_unrelated_clock_and_outliers() -> None:
     motion = Motion(3)
     flip = se3.exp(np.array([np.pi / 2, 0, 0, 0, 0, 0]))
@@ -83,11 +88,12 @@ def test_a_mocap_with_y_up_an_unrelated_clock_and_outliers() -> None:
     assert np.degrees(np.abs(error[2:5])).max() < 0.05
     assert np.abs(error[5:8]).max() < 2e-3
     assert np.abs(error[8]) < 0.2e-3
-    assert found.residuals.doubted == pytest.approx(len(wrong) / len(T), abs=0.002)
+    assert found.residuals.outlier_share == pytest.approx(len(wrong) / len(T), abs=0.002)
     assert found.up == "-y" and found.tilt_deg == pytest.approx(np.degrees(np.linalg.norm(TILT)), abs=0.02)
 
 
-def test_a_clock_that_runs_fast_is_seen_to() -> None:
+@pytest.mark.long
+def test_clock_drift_is_estimated() -> None:
     motion = Motion(8)
     mocap = record_mocap(motion, 40, DELAY, drift=60e-6)
     found = fit_mocap(record_imu(motion, 40), NOISE, mocap, WHITE)
@@ -95,16 +101,19 @@ def test_a_clock_that_runs_fast_is_seen_to() -> None:
     assert abs(shared_error(found)[8]) < 0.2e-3
 
 
-def test_a_chain_broken_for_long_goes_on_in_the_same_frame() -> None:
+@pytest.mark.long
+def test_a_broken_chain_continues_in_the_same_frame() -> None:
     motion = Motion(4)
-    mocap = record_mocap(motion, 45, DELAY, gaps=((13.0, 24.0), (24.5, 35.0)))  # half a second is no part
+    mocap = record_mocap(
+        motion, 45, DELAY, gaps=((13.0, 24.0), (24.5, 35.0))
+    )  # half a second is too short to fit
     found = fit_mocap(record_imu(motion, 45), NOISE, mocap, WHITE)
     assert found.is_break.sum() == 1
     assert np.abs(shared_error(found))[5:8].max() < 1e-3
     assert np.abs(pose_error(found, motion)[:, 3:]).max() < 0.006
 
 
-def test_a_robot_that_only_yaws_needs_a_guess() -> None:
+def test_a_body_that_only_yaws_needs_a_given_mounting() -> None:
     motion = Motion(5, planar=True)
     imu, mocap = record_imu(motion, 15), record_mocap(motion, 15)
     with pytest.raises(DataError, match="one axis"):
@@ -112,14 +121,14 @@ def test_a_robot_that_only_yaws_needs_a_guess() -> None:
     guess = BODY @ se3.exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.01]))
     found = fit_mocap(imu, NOISE, mocap, MocapFitOptions(T_body_mocap=guess, guess_sigma=(0.03, 0.02)))
     error = se3.log(se3.inverse(found.T_body_mocap) @ BODY)
-    lever = BODY[:3, :3] @ error[3:]  # in the body: what yaw shows is found, the height stays the guess
+    lever = BODY[:3, :3] @ error[3:]  # yaw determines the horizontal part; the height stays the given one
     assert np.abs(lever[:2]).max() < 3e-3
     height = np.sqrt((BODY[:3, :3] @ found.cov_shared[5:8, 5:8] @ BODY[:3, :3].T)[2, 2])
     assert height > 0.01
 
 
-def test_stillness_is_exact() -> None:
-    """Without noise, what is left is what midpoint steps leave."""
+def test_without_noise_the_fit_is_exact() -> None:
+    """The remaining error is that of midpoint integration."""
     motion = Motion(6)
     mocap = record_mocap(motion, 12, DELAY, sigma=(0.0, 0.0))
     found = fit_mocap(record_imu(motion, 12, None), NOISE, mocap, MocapFitOptions(imu_inflation=1.0))
@@ -130,7 +139,7 @@ def test_stillness_is_exact() -> None:
 
 
 @pytest.mark.slow
-def test_errors_are_what_the_covariances_say() -> None:
+def test_nees_is_consistent() -> None:
     shared, poses = [], []
     for seed in range(12):
         motion = Motion(seed)
@@ -159,7 +168,7 @@ def bad(name: str) -> tuple[ImuBatch, MocapTrajectory]:
     if name == "order":
         t[[50, 51]] = t[[51, 50]]
         return ImuBatch(t, imu.gyro, imu.accel), mocap
-    if name == "hole":
+    if name == "gap":
         keep = (t < t[400]) | (t > t[480])
         return ImuBatch(t[keep], imu.gyro[keep], imu.accel[keep]), mocap
     if name == "short":
@@ -176,10 +185,10 @@ def bad(name: str) -> tuple[ImuBatch, MocapTrajectory]:
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [
         ("order", "IMU: stamp .* is not later"),
-        ("hole", "IMU: no samples from"),
+        ("gap", "IMU: no samples from"),
         ("short", "overlap by 1.* s"),
         ("apart", "match at no time offset .*clocks"),
         ("millimetres", "one (motion|body)"),
@@ -187,8 +196,8 @@ def bad(name: str) -> tuple[ImuBatch, MocapTrajectory]:
         ("still", "match at no time offset"),
     ],
 )
-def test_what_cannot_be_fitted_is_said(name: str, says: str) -> None:
-    with pytest.raises(DataError, match=says):
+def test_bad_input_is_refused(name: str, message: str) -> None:
+    with pytest.raises(DataError, match=message):
         fit_mocap(*_swap(bad(name)))
 
 
@@ -196,7 +205,7 @@ def _swap(pair: tuple[ImuBatch, MocapTrajectory]) -> tuple[ImuBatch, object, Moc
     return pair[0], NOISE, pair[1]
 
 
-def test_what_is_no_mocap_is_said() -> None:
+def test_invalid_poses_are_refused() -> None:
     T = np.tile(np.eye(4), (5, 1, 1))
     t = np.arange(5) * 10_000_000
     lost = T.copy()

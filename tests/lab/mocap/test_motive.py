@@ -1,4 +1,4 @@
-"""Motive's CSV, as its versions write it: what is read, and what is refused."""
+"""Motive's CSV in the forms of its versions: what is read and what is refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Q = Rotation.from_euler("xyz", [0.1, -0.4, 2.0])
 
 
 def text(labels: bool = True, parent: bool = True, code: bool = False, units: str = "Meters") -> str:
-    """Two rigid bodies, each with its error, and a marker of the first between."""
+    """Return a file of two rigid bodies and a marker of the first."""
     kinds = [*KINDS, "Mean Marker Error", *["Position"] * 3, "Marker Quality", *KINDS]
     types = ["Rigid Body"] * 8 + ["Rigid Body Marker"] * 4 + ["Rigid Body"] * 7
     names = ["Ann"] * 8 + ["Ann:Marker1"] * 4 + ["Bob, the robot"] * 7
@@ -50,7 +50,7 @@ def written(folder: Path, content: str) -> Path:
 @pytest.mark.parametrize(
     ("labels", "parent", "code"), [(True, True, False), (True, False, True), (False, False, False)]
 )
-def test_each_rigid_body_has_its_poses_where_it_was_seen(tmp_path, labels, parent, code):
+def test_each_rigid_body_has_poses_where_it_is_seen(tmp_path, labels, parent, code):
     bodies = read_bodies(written(tmp_path, text(labels, parent, code)))
     assert list(bodies) == ["Ann", "Bob, the robot"]
     ann, bob = bodies.values()
@@ -61,12 +61,12 @@ def test_each_rigid_body_has_its_poses_where_it_was_seen(tmp_path, labels, paren
 
 
 @pytest.mark.parametrize(("units", "metres"), [("Millimeters", 1e-3), ("Centimeters", 1e-2)])
-def test_units_are_the_files(tmp_path, units, metres):
+def test_lengths_are_in_the_files_unit(tmp_path, units, metres):
     ann = read_bodies(written(tmp_path, text(units=units)))["Ann"]
     np.testing.assert_allclose(ann.T[0, :3, 3], [0.5 * metres, 1.75 * metres, 0])
 
 
-def test_a_body_that_was_never_there_is_known_but_not_seen(tmp_path):
+def test_a_body_that_was_never_seen_has_no_poses(tmp_path):
     lines = text().splitlines()
     lines = [",".join(line.split(",")[:14]) if line[:1].isdigit() else line for line in lines]
     bodies = read_bodies(written(tmp_path, "\n".join(lines)))
@@ -77,7 +77,7 @@ def test_a_body_that_was_never_there_is_known_but_not_seen(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("Meters", "Feet", "line 1: Length Units 'Feet' are not known; known: Meters"),
         ("Global", "Local", "line 1: Coordinate Space is not Global"),
@@ -92,9 +92,9 @@ def test_a_body_that_was_never_there_is_known_but_not_seen(tmp_path):
         ("0,0.000000,", "0,0.000000,9", "pose 1: quaternion norm is"),
     ],
 )
-def test_what_is_wrong_is_said_with_its_line(tmp_path, old, new, said):
+def test_an_error_names_its_line(tmp_path, old, new, message):
     assert old in text()
     path = written(tmp_path, text().replace(old, new, -1 if old == "Rigid Body" else 1))
-    with pytest.raises(DataError, match=said) as error:
+    with pytest.raises(DataError, match=message) as error:
         read_bodies(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)

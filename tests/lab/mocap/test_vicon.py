@@ -1,4 +1,4 @@
-"""Vicon's CSV, as Tracker and Nexus write it: what is read, and what is refused."""
+"""CSV exports of Vicon's Tracker and Nexus: what is read and what is refused."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from share.errors import DataError
 from share.lab.mocap.files import read_bodies
-from share.lab.mocap.vicon import read_vicon
 
 HEAD = """Objects
 100
@@ -32,25 +31,25 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_each_body_has_its_poses_where_it_was_seen(tmp_path):
-    bodies = read_vicon(written(tmp_path, HEAD + ROWS))
+def test_each_body_has_poses_where_it_is_seen(tmp_path):
+    bodies = read_bodies(written(tmp_path, HEAD + ROWS))
     assert list(bodies) == ["Ann", "Bob:Head"]
     ann, bob = bodies.values()
     assert ann.stamps_ns.tolist() == [k * 10_000_000 for k in (101, 102, 105, 106)]
-    assert bob.stamps_ns.tolist() == [k * 10_000_000 for k in (101, 103, 106)]  # zeros are nothing seen
+    assert bob.stamps_ns.tolist() == [k * 10_000_000 for k in (101, 103, 106)]  # zeros: not seen
     np.testing.assert_allclose(ann.T[0, :3, 3], [1, 2, 1.5])
     expected = Rotation.from_rotvec([10, 20, -30], degrees=True).as_matrix()
     np.testing.assert_allclose(ann.T[0, :3, :3], expected, atol=1e-12)
 
 
-def test_angles_about_x_then_y_then_z_are_read_when_asked_for(tmp_path):
-    ann = read_vicon(written(tmp_path, HEAD + ROWS), "xyz")["Ann"]
+def test_euler_angles_are_read_if_given_as_such(tmp_path):
+    ann = read_bodies(written(tmp_path, HEAD + ROWS), "xyz")["Ann"]
     expected = Rotation.from_euler("XYZ", [[10, 20, -30]], degrees=True).as_matrix()  # XYZ: intrinsic
     np.testing.assert_allclose(ann.T[:1, :3, :3], expected, atol=1e-12)
 
 
 def test_quaternions_metres_and_other_blocks(tmp_path):
-    """Behind a block of markers and a byte-order mark, divided by semicolons, with trailing separators."""
+    """After a block of markers and a byte-order mark, with semicolons and trailing separators."""
     q = Rotation.from_euler("xyz", [0.1, -0.4, 2.0]).as_quat()
     row = ";".join(f"{x:.9f}" for x in (*q, 0.5, -0.25, 1.75))
     path = written(
@@ -67,19 +66,19 @@ def test_quaternions_metres_and_other_blocks(tmp_path):
 
 def test_decimal_commas_between_semicolons(tmp_path):
     comma = (HEAD + ROWS).replace(",", ";").replace("2000", "2000,5").replace("100\n", "100,0\n", 1)
-    ann = read_vicon(written(tmp_path, comma))["Ann"]
+    ann = read_bodies(written(tmp_path, comma))["Ann"]
     np.testing.assert_allclose(ann.T[:, 1, 3], 2.0005)
     assert ann.stamps_ns[0] == 101 * 10_000_000
 
 
-def test_a_file_that_names_nobody_is_one_body(tmp_path):
+def test_a_file_without_names_has_one_body(tmp_path):
     path = tmp_path / "seen.tum"
     path.write_text("1.0 0 0 0 0 0 0 1\n1.1 0 0 0 0 0 0 1\n")
     assert list(read_bodies(path)) == [""]
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("102,0,11", "102,0,eleven", "line 7: 'eleven' is not a number"),
         ("102,0,11", "102,0,1e308", "line 7: '1e308' is not a number"),
@@ -94,17 +93,17 @@ def test_a_file_that_names_nobody_is_one_body(tmp_path):
         (ROWS, "", "the file is cut short"),
     ],
 )
-def test_what_is_wrong_is_said_with_its_line(old, new, said, tmp_path):
+def test_an_error_names_its_line(old, new, message, tmp_path):
     assert old in HEAD + ROWS
     path = written(tmp_path, (HEAD + ROWS).replace(old, new, 1))
-    with pytest.raises(DataError, match="(?s)" + said) as error:
-        read_vicon(path)
+    with pytest.raises(DataError, match="(?s)" + message) as error:
+        read_bodies(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
-def test_an_object_that_was_never_there_is_known_but_not_seen(tmp_path):
+def test_a_body_that_was_never_seen_has_no_poses(tmp_path):
     hidden = "\n".join(f"{k},0,1,2,3,4,5,{k},,,,,," for k in range(1, 9))
-    bodies = read_vicon(written(tmp_path, HEAD + hidden))
+    bodies = read_bodies(written(tmp_path, HEAD + hidden))
     assert [(name, seen is None) for name, seen in bodies.items()] == [("Ann", False), ("Bob:Head", True)]
     with pytest.raises(DataError, match="no body was ever seen"):
-        read_vicon(written(tmp_path, HEAD + "1,0,,,,,,,,,,,,\n2,0,,,,,,,,,,,,\n"))
+        read_bodies(written(tmp_path, HEAD + "1,0,,,,,,,,,,,,\n2,0,,,,,,,,,,,,\n"))

@@ -1,4 +1,4 @@
-"""What is said of a model that is held against the truth."""
+"""Scores of error models against known errors, and the inputs and loss of baselines."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="make train-test brings it")
+pytest.importorskip("onnx", reason="make train-test brings it")
 pytest.importorskip("sklearn", reason="make train-test brings it")
 
-from share.lab.train.baselines import KeyframeRows, _contrastive_loss, _forest_inputs
+from share.lab.train.baselines import KeyframeRows, contrastive_loss, forest_inputs
 from share.lab.train.compare import score_network, score_predictions
 from share.lab.train.keyframe_table import KeyframeTable
 from share.lab.train.score import score_table
@@ -29,54 +30,52 @@ def rows(error_cm=ERROR_CM) -> KeyframeRows:
     return KeyframeRows(table_of, np.zeros((n, 1280), np.float32))
 
 
-def test_who_is_right_has_no_error():
+def test_a_perfect_prediction_has_no_error():
     perfect = score_predictions("x", ERROR_CM.astype(float), ERROR_CM)
-    assert (perfect.rmse_cm, perfect.mae_cm, perfect.qoe_off) == (0, 0, 0)
+    assert (perfect.rmse_cm, perfect.mae_cm, perfect.qoe_error) == (0, 0, 0)
     assert perfect.rank == pytest.approx(1)
 
 
-def test_errors_are_told_by_their_size_and_their_order():
+def test_errors_are_scored_by_size_and_by_rank():
     off = score_predictions("x", ERROR_CM[::-1].astype(float), ERROR_CM)
     assert off.rank == pytest.approx(-1)
     assert off.rmse_cm == pytest.approx(math.sqrt((0.7**2 + 0.2**2 + 0.2**2 + 0.7**2) / 4), rel=1e-6)
     assert off.mae_cm == pytest.approx(0.45, rel=1e-6)
-    assert 0 < off.qoe_off < 1
-    assert (
-        score_predictions("x", np.full(4, 0.3), ERROR_CM).rank == 0
-    )  # who says always the same knows no order
+    assert 0 < off.qoe_error < 1
+    assert score_predictions("x", np.full(4, 0.3), ERROR_CM).rank == 0  # a constant has no rank
 
 
-def test_a_network_is_asked_keyframe_by_keyframe():
+def test_a_network_is_scored_one_keyframe_at_a_time():
     class Network:
-        asked = 0
+        calls = 0
 
         def get_inputs(self):
             return []
 
         def run(self, names, inputs):
             assert inputs["picture"].shape == (1, 128, 128)
-            self.asked += 1
+            self.calls += 1
             log = math.log(0.2)
             return [np.array([[log, log - 0.8, log + 0.8]]), np.zeros((1, 64)), np.array([0.5])]
 
     network = Network()
-    told = score_network("ours", network, rows())
-    assert network.asked == 4
-    assert told.covered == 0.75  # 0.8 cm is more than 0.2 e^0.8
-    assert "| ours | " in score_table([told])
-    assert "75 %" in score_table([told])
+    score = score_network("ours", network, rows())
+    assert network.calls == 4
+    assert score.coverage == 0.75  # 0.8 cm is more than 0.2 e^0.8
+    assert "| ours | " in score_table([score])
+    assert "75 %" in score_table([score])
 
 
-def test_the_forest_has_1312_numbers_each_in_its_place():
+def test_the_forest_has_1312_inputs_in_order():
     one = rows()
     one.table.psd[0, 1, 7, 5] = 24.0  # in the lower half, the second of four across: of 24 cells
-    numbers = _forest_inputs(one)
+    numbers = forest_inputs(one)
     assert numbers.shape == (4, 1312)
     assert numbers[0, 1280 + 8 + 4 + 1] == 1
     assert numbers[0].sum() == 1
 
 
-def test_contrast_is_less_where_likes_are_together():
+def test_contrastive_loss_is_lower_where_similar_errors_are_close():
     import torch
 
     y = torch.tensor([0.0, 0.1, 5.0, 5.1])
@@ -84,11 +83,11 @@ def test_contrast_is_less_where_likes_are_together():
         torch.tensor([[1.0, 0.0], [1.0, 0.1], [-1.0, 0.0], [-1.0, 0.1]]), dim=1
     )
     apart = together[[0, 2, 1, 3]]
-    assert _contrastive_loss(together, y) < _contrastive_loss(apart, y)
+    assert contrastive_loss(together, y) < contrastive_loss(apart, y)
 
 
-def test_contrast_is_the_sum_as_it_is_written():
-    """Zha et al. 2023, equation 1, over all triples; errors that are cut off are the same."""
+def test_contrastive_loss_is_equation_1_of_zha():
+    """Zha et al. 2023, over all triples; clipped errors are equal."""
     import torch
 
     rng = torch.Generator().manual_seed(0)
@@ -100,4 +99,4 @@ def test_contrast_is_the_sum_as_it_is_written():
         for j in set(range(12)) - {i}:
             against = [k for k in range(12) if k != i and abs(y[i] - y[k]) >= abs(y[i] - y[j])]
             terms.append(torch.logsumexp(alike[i, against], 0) - alike[i, j])
-    assert _contrastive_loss(z, y) == pytest.approx(float(torch.stack(terms).mean()), rel=1e-5)
+    assert contrastive_loss(z, y) == pytest.approx(float(torch.stack(terms).mean()), rel=1e-5)

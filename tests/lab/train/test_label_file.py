@@ -1,4 +1,4 @@
-"""Labels as they are kept."""
+"""Label files."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def labels(rng) -> Labels:
         )
         for k in range(4)
     ]
-    return Labels.from_rows({"session": "w1", "agent": "ar", "spells": []}, rows)
+    return Labels.from_rows({"session": "w1", "agent": "ar", "faults": []}, rows)
 
 
-def test_what_is_written_is_read(labels, tmp_path):
+def test_written_labels_are_read(labels, tmp_path):
     write_labels(tmp_path / "one.npz", labels)
     found = read_labels(tmp_path / "one.npz")
     assert found.about == labels.about
@@ -35,7 +35,7 @@ def test_what_is_written_is_read(labels, tmp_path):
         assert np.array_equal(one, two, equal_nan=name == "error_cm")
 
 
-def test_what_is_damaged_is_named(labels, tmp_path):
+def test_a_damaged_file_is_named(labels, tmp_path):
     path = tmp_path / "one.npz"
     write_labels(path, labels)
     whole = path.read_bytes()
@@ -45,6 +45,6 @@ def test_what_is_damaged_is_named(labels, tmp_path):
             read_labels(path)
 
 
-def test_a_run_without_keyframes_is_kept_as_such(tmp_path):
+def test_a_run_without_keyframes_is_written_and_read(tmp_path):
     write_labels(tmp_path / "none.npz", Labels.from_rows({"session": "w1"}, []))
     assert len(read_labels(tmp_path / "none.npz")) == 0

@@ -1,11 +1,11 @@
-"""Rooms and motions stay together, and every part has some."""
+"""Runs of one room or one recorded motion are in one part, and no part is empty."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from share.lab.train.split import PARTS, room_groups, split_runs
+from share.lab.train.keyframe_table import PARTS, room_groups, split_runs
 
 
 def about(scene="warehouse", seed=1, motions=("ar=walk:speed=0.6",), session="s"):
@@ -18,7 +18,7 @@ def test_runs_in_one_room_are_one_group():
     assert len(set(found.tolist())) == 3
 
 
-def test_a_recorded_motion_ties_rooms_together_and_a_planned_one_does_not():
+def test_a_recorded_motion_joins_rooms_and_a_planned_one_does_not():
     found = room_groups(
         [about(seed=1, motions=["paper:1"]), about(seed=2, motions=["paper:1"]), about(seed=3)]
     )
@@ -46,12 +46,12 @@ def test_parts_are_whole_groups_and_none_is_empty(rooms):
     assert list(parts) == list(PARTS)
     assert sorted(np.concatenate(list(parts.values())).tolist()) == list(range(3 * rooms))
     assert all(len(runs) for runs in parts.values())
-    owners = [set(group[runs].tolist()) for runs in parts.values()]
-    assert sum(map(len, owners)) == rooms
-    assert len(parts["learn"]) == max(map(len, parts.values()))
+    groups = [set(group[runs].tolist()) for runs in parts.values()]
+    assert sum(map(len, groups)) == rooms
+    assert len(parts["train"]) == max(map(len, parts.values()))
 
 
-def test_the_seed_decides():
+def test_the_seed_decides_the_split():
     group = np.arange(20)
     one, same, other = (split_runs(group, seed)["test"].tolist() for seed in (1, 1, 2))
     assert one == same != other

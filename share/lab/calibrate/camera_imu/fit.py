@@ -1,8 +1,7 @@
 """Extrinsics and time offset of camera and IMU, by a batch fit of a continuous-time trajectory.
 
 Method: Furgale, Rehder, Siegwart, *Unified temporal and spatial calibration for multi-sensor systems* (IROS
-2013), with the splines of spline.py. Levenberg-Marquardt; the sigmas of corners and IMU are estimated from
-residuals.
+2013), with the splines of spline.py. The sigmas of corners and IMU are estimated from residuals.
 """
 
 from __future__ import annotations
@@ -14,8 +13,6 @@ import numpy as np
 
 from share.errors import DataError
 from share.geometry.camera import ImuNoise, Rig
-from share.lab.calibrate.camera_bundle import BoardView
-from share.lab.calibrate.camera_imu.corner_observations import CornerObservations, corner_observations
 from share.lab.calibrate.camera_imu.initialisation import (
     END_MARGIN_S,
     ClockAlignment,
@@ -27,6 +24,7 @@ from share.lab.calibrate.camera_imu.initialisation import (
 from share.lab.calibrate.camera_imu.normal_equations import Sigmas, on_curve_mask
 from share.lab.calibrate.camera_imu.problem import CameraImuProblem
 from share.lab.calibrate.camera_imu.state import SHIFT, CameraImuState
+from share.lab.calibrate.corner_observations import BoardView, CornerObservations, corner_observations
 from share.lab.calibrate.target import Target
 from share.types import F64, I64, ImuBatch
 
@@ -41,8 +39,8 @@ class CameraImuFit:
 
     Two covariances (7, 7) of xi in T_imu_cam0 Exp(xi) and the time shift: `by_noise` of corners and IMU;
     `by_rig` of the uncertainty of intrinsics and T_cam1_cam0, None where that is unknown. `sigmas`: as
-    estimated; `stated_sigmas`: by the IMU's file. `corners`: residuals (C, 2) px of each camera; `gyro`,
-    `accel` (N, 3): residuals. `imu`: the samples used.
+    estimated; `stated_sigmas`: by the IMU's file. `stamps_ns` (F,): of the frames, camera's clock.
+    `corners`: residuals (C, 2) px of each camera; `gyro`, `accel` (N, 3): residuals. `imu`: the samples used.
     """
 
     state: CameraImuState
@@ -50,6 +48,7 @@ class CameraImuFit:
     by_rig: F64 | None
     sigmas: Sigmas
     stated_sigmas: Sigmas
+    stamps_ns: I64
     observations: CornerObservations
     imu: ImuBatch
     corners: tuple[F64, ...]
@@ -116,12 +115,14 @@ def fit_camera_imu(
     ]
     mounts = [np.eye(4), np.eye(4) if rig.T_cam1_cam0 is None else rig.T_cam1_cam0]
     T, has_enough = initial_poses(views, target, cameras, mounts)
-    observations = corner_observations(stamps_ns, views, target, cameras, rig.T_cam1_cam0).take(has_enough)
-    T = refine_poses(observations, T[has_enough])
-    alignment = align_clocks(observations.stamps_ns, T, imu, within_s)
-    state = initial_state(observations.stamps_ns, T, imu, alignment)
-    is_on_curve = on_curve_mask(state.curve, observations.stamps_ns, state.shift_s, END_MARGIN_S)
-    batch = CameraImuProblem(observations.take(is_on_curve), _samples_on_curve(imu, state), noise)
+    observations = corner_observations(views, target, cameras, rig.T_cam1_cam0).take(has_enough)
+    stamps_ns, T = stamps_ns[has_enough], refine_poses(observations, T[has_enough])
+    alignment = align_clocks(stamps_ns, T, imu, within_s)
+    state = initial_state(stamps_ns, T, imu, alignment)
+    is_on_curve = on_curve_mask(state.curve, stamps_ns, state.shift_s, END_MARGIN_S)
+    batch = CameraImuProblem(
+        stamps_ns[is_on_curve], observations.take(is_on_curve), _samples_on_curve(imu, state), noise
+    )
     stated = batch.stated_sigmas()
     sigmas = replace(stated, px=_INITIAL_SIGMA_PX)
     for done in range(_ROUNDS):
@@ -135,7 +136,7 @@ def fit_camera_imu(
         sensitivity = batch.rig_sensitivity(state, sigmas)
         by_rig = sensitivity @ rig_covariance @ sensitivity.T
     return CameraImuFit(
-        state, by_noise, by_rig, sigmas, stated, batch.observations, batch.imu,
+        state, by_noise, by_rig, sigmas, stated, batch.stamps_ns, batch.observations, batch.imu,
         batch.corner_residuals(state), gyro, accel, alignment,
     )  # fmt: skip
 

@@ -18,10 +18,9 @@ from share.geometry.camera import Camera
 from share.geometry.interpolation import subsample_peak
 from share.geometry.se3 import best_rotation
 from share.lab.calibrate import camera_initialisation
-from share.lab.calibrate.camera_bundle import BoardView
-from share.lab.calibrate.camera_imu.corner_observations import CornerObservations, pose_normals
 from share.lab.calibrate.camera_imu.spline import EXTRA_KNOTS, Curve
 from share.lab.calibrate.camera_imu.state import CameraImuState, node_count
+from share.lab.calibrate.corner_observations import BoardView, CornerObservations
 from share.lab.calibrate.target import Target
 from share.types import F64, I64, ImuBatch
 
@@ -34,6 +33,7 @@ _MIN_PAIRS = 50
 _MIN_CORRELATION = 0.6
 _MIN_SECOND_AXIS_RATE = 0.05  # rad/s rms about the second axis; below, the extrinsics are not observable
 _ITERATIONS = 8
+_HUBER_PX = 2.5
 
 
 def initial_poses(
@@ -51,15 +51,16 @@ def initial_poses(
     return out, has_pose
 
 
-def refine_poses(observations: CornerObservations, T: F64, sigma_px: float = 1.0) -> F64:
+def refine_poses(observations: CornerObservations, T_target_cam0: F64) -> F64:
     """Refine each frame's pose alone, by Gauss-Newton."""
+    T = se3.inverse(T_target_cam0)
     for _ in range(_ITERATIONS):
-        step = pose_normals(observations, T, sigma_px, 2.5)
+        step = observations.normals(T, _HUBER_PX)
         if not np.isfinite(step.cost):
             break
         xi = np.linalg.solve(step.H + 1e-9 * np.eye(6), step.g[..., None])[..., 0]
         T = T @ se3.exp(np.asarray(xi, np.float64))
-    return T
+    return se3.inverse(T)
 
 
 @dataclass(frozen=True, eq=False)

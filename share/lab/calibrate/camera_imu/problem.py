@@ -1,39 +1,37 @@
-"""Least squares over a whole recording by Levenberg-Marquardt, its residuals and covariance."""
+"""Least squares over a whole recording, its residuals and covariance."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from share.errors import CalibrationMismatchError, DataError
+from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.lab.calibrate.camera_imu import normal_equations
-from share.lab.calibrate.camera_imu.arrow_solver import (
-    ArrowSystem,
-    arrow_system,
-    border_steps,
-    gather_gradient,
-    solve_arrow,
-)
-from share.lab.calibrate.camera_imu.corner_observations import CornerObservations, corner_residuals
 from share.lab.calibrate.camera_imu.initialisation import BIAS_NODE_S
 from share.lab.calibrate.camera_imu.normal_equations import Sigmas
 from share.lab.calibrate.camera_imu.state import SHARED, CameraImuState
+from share.lab.calibrate.corner_observations import CornerObservations
 from share.lab.calibrate.corners import MIN_SIGMA_PX, robust_sigma
+from share.lab.least_squares import ArrowFactor, ArrowSystem, minimise
 from share.types import F64, I64, ImuBatch
 
 _BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: larger than any IMU's
 _MIN_WALK = 1e-7
-_MAX_ITERATIONS = 30
-_MIN_RELATIVE_DECREASE = 1e-7  # of the cost: converged below
+_MAX_STEPS = 30
+_CONVERGED = 1e-7  # relative decrease of the cost
 _SLOW_WINDOW_NS = 200_000_000  # means over this show errors that are not white
 
 
 @dataclass(frozen=True, eq=False)
 class CameraImuProblem:
-    """Corners, the IMU samples meanwhile, and the IMU's stated noise."""
+    """Corners in frames at stamps_ns (F,), camera's clock, the IMU samples meanwhile, and the IMU's stated
+    noise."""
 
+    stamps_ns: I64
     observations: CornerObservations
     imu: ImuBatch
     noise: ImuNoise
@@ -44,33 +42,30 @@ class CameraImuProblem:
         return Sigmas(MIN_SIGMA_PX, self.noise.gyro_density * root, self.noise.accel_density * root)
 
     def optimise(self, state: CameraImuState, sigmas: Sigmas) -> CameraImuState:
-        """Minimise the cost. Raises CalibrationMismatchError where it does not converge."""
-        damping, (system, cost) = 1e-5, self._linear_system(state, sigmas)
-        if not np.isfinite(cost):
+        """Minimise the cost. Raises CalibrationMismatchError where it does not converge, DataError where the
+        recording does not determine the motion."""
+        try:
+            minimum = minimise(
+                state, partial(self._linear_system, sigmas=sigmas), _updated_state, _MAX_STEPS, _CONVERGED
+            )
+        except np.linalg.LinAlgError:
+            raise _undetermined() from None
+        except ValueError:
             raise CalibrationMismatchError(
                 "camera and IMU: the board would lie behind a camera; is --target the board shown?"
+            ) from None
+        if not minimum.converged:
+            raise CalibrationMismatchError(
+                f"camera and IMU: no solution after {_MAX_STEPS} steps; "
+                "are --target, --camera and --imu of this rig?"
             )
-        for _ in range(_MAX_ITERATIONS):
-            knots, border, _ = _solve_or_raise(system, damping)
-            trial = state.updated(knots, border)
-            trial_system, trial_cost = self._linear_system(trial, sigmas)
-            if not trial_cost < cost:
-                if damping > 1e6 or trial_cost - cost < _MIN_RELATIVE_DECREASE * cost:
-                    return state
-                damping *= 10
-                continue
-            has_converged = cost - trial_cost < _MIN_RELATIVE_DECREASE * cost
-            state, system, cost, damping = trial, trial_system, trial_cost, max(damping / 10, 1e-12)
-            if has_converged:
-                return state
-        raise CalibrationMismatchError(
-            f"camera and IMU: no solution after {_MAX_ITERATIONS} steps; "
-            "are --target, --camera and --imu of this rig?"
-        )
+        return minimum.state
 
     def _linear_system(self, state: CameraImuState, sigmas: Sigmas) -> tuple[ArrowSystem, float]:
-        segments = normal_equations.segment_normals(state, self.observations, self.imu, sigmas)
-        system = arrow_system(segments, state)
+        segments = normal_equations.segment_normals(
+            state, self.stamps_ns, self.observations, self.imu, sigmas
+        )
+        system = normal_equations.arrow_system(segments, state)
         return system, segments.cost + self._add_bias_factors(state, system)
 
     def _add_bias_factors(self, state: CameraImuState, system: ArrowSystem) -> float:
@@ -102,10 +97,8 @@ class CameraImuProblem:
 
     def corner_residuals(self, state: CameraImuState) -> tuple[F64, ...]:
         """Return residuals (C, 2) px of each camera, measured minus predicted."""
-        T = normal_equations.camera_poses(state, self.observations.stamps_ns)
-        return tuple(
-            corner_residuals(self.observations, cam, T)[0] for cam in range(len(self.observations.cameras))
-        )
+        T_target_cam0 = normal_equations.camera_poses(state, self.stamps_ns)
+        return self.observations.residuals(se3.inverse(T_target_cam0))
 
     def inertial_residuals(self, state: CameraImuState) -> tuple[F64, F64]:
         """Return residuals of gyro, accel (N, 3), measured minus predicted."""
@@ -114,35 +107,38 @@ class CameraImuProblem:
 
     def covariance(self, state: CameraImuState, sigmas: Sigmas) -> F64:
         """Return the covariance (7, 7) of extrinsics and time shift for exact intrinsics and T_cam1_cam0."""
-        return _solve_or_raise(self._linear_system(state, sigmas)[0], 0.0)[2][:7, :7]
+        return self._factor(state, sigmas).border_covariance[:7, :7]
 
     def rig_sensitivity(self, state: CameraImuState, sigmas: Sigmas) -> F64:
         """Return (7, P): derivatives of extrinsics and time shift by the rig's parameters, in the order of
         `CameraBundleSolution`."""
-        gradients = normal_equations.rig_gradients(state, self.observations, sigmas)
-        return -border_steps(self._linear_system(state, sigmas)[0], *gather_gradient(gradients, state))[:7]
+        gradients = normal_equations.rig_gradients(state, self.stamps_ns, self.observations, sigmas)
+        knots_and_border = normal_equations.gather_gradient(gradients, state)
+        return -self._factor(state, sigmas).solve(*knots_and_border)[1][:7]
+
+    def _factor(self, state: CameraImuState, sigmas: Sigmas) -> ArrowFactor:
+        try:
+            return ArrowFactor(self._linear_system(state, sigmas)[0])
+        except np.linalg.LinAlgError:
+            raise _undetermined() from None
 
 
-def _solve_or_raise(system: ArrowSystem, damping: float) -> tuple[F64, F64, F64]:
-    try:
-        return solve_arrow(system, damping)
-    except np.linalg.LinAlgError:
-        raise DataError(
-            "camera and IMU: the recording does not determine the motion; move and turn more"
-        ) from None
+def _updated_state(state: CameraImuState, system: ArrowSystem, damping: float) -> CameraImuState:
+    return state.updated(*system.solve(damping))
 
 
-def low_frequency_rms(stamps_ns: I64, residuals: F64) -> float:
-    """Return the rms of means over 0.2 s of residuals (N, 3), times the root of the number in each.
+def _undetermined() -> DataError:
+    return DataError("camera and IMU: the recording does not determine the motion; move and turn more")
 
-    Equal to their rms if they are white; larger where scale, axes or the board are not as assumed.
+
+def conservative_rms(stamps_ns: I64, residuals: F64) -> float:
+    """Return the larger of the rms of residuals (N, 3) and of the rms of their means over 0.2 s, times the
+    root of the number in each.
+
+    Both are equal if the residuals are white; the second is larger where scale, axes or the board are not as
+    assumed.
     """
     window = (stamps_ns - stamps_ns[0]) // _SLOW_WINDOW_NS
     count = np.maximum(np.bincount(window), 1)
     sums = np.stack([np.bincount(window, column) for column in residuals.T])
-    return float(np.sqrt((sums**2 / count).mean()))
-
-
-def conservative_rms(stamps_ns: I64, residuals: F64) -> float:
-    """Return the larger of the rms and of `low_frequency_rms`."""
-    return max(float(np.sqrt((residuals**2).mean())), low_frequency_rms(stamps_ns, residuals))
+    return float(np.sqrt(max((residuals**2).mean(), (sums**2 / count).mean())))

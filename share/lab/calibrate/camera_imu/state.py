@@ -43,13 +43,9 @@ class CameraImuState:
             gravity=self.gravity + border[GRAVITY],
         )
 
-    def node_before(self, segment: I64) -> I64:
-        """Return the bias node before each segment."""
-        return segment // self.per_node
-
     def bias(self, segment: I64, u: F64) -> tuple[F64, F64]:
         """Return biases (N, 6), and the weight (N,) of the node after."""
-        node = self.node_before(segment)
+        node = segment // self.per_node
         share_after = (segment - node * self.per_node + u) / self.per_node
         return self.biases[node] * (1 - share_after[:, None]) + self.biases[node + 1] * share_after[
             :, None

@@ -10,6 +10,7 @@ from share.geometry import se3
 from share.lab.calibrate import corners
 from share.lab.calibrate.camera_imu.fit import CameraImuFit
 from share.lab.calibrate.camera_imu.problem import conservative_rms
+from share.lab.calibrate.report import corner_failures
 from share.types import F64
 
 _STANDARD_GRAVITY = 9.80665
@@ -18,21 +19,13 @@ _NEAR_MM = 5.0  # likewise
 _FAR_UNITS = 4.0  # more is reported
 
 
-@dataclass(frozen=True)
-class CameraImuLimits:
-    """Limits to pass. rms_px: of inlier corners. outlier_share: of corners. imu_noise_ratio: residuals
-    over stated noise. gravity, m/s^2: error of its norm. rotation_rate_rms rad/s, acceleration_rms m/s^2:
-    at least, about and along the least excited axis. The rest: sigmas of the result."""
-
-    rms_px: float = 1.0
-    outlier_share: float = 0.05
-    imu_noise_ratio: float = 10.0
-    gravity: float = 0.15
-    rotation_rate_rms: float = 0.15
-    acceleration_rms: float = 0.2
-    rotation_deg: float = 0.05
-    position_mm: float = 1.0
-    shift_ms: float = 0.1
+# Limits to pass.
+MAX_RMS_PX = 1.0  # of inlier corners
+MAX_NOISE_RATIO = 10.0  # residuals over stated noise
+MAX_GRAVITY_ERROR = 0.15  # m/s^2, of its norm
+MIN_ROTATION_RATE = 0.15  # rad/s rms about the least excited axis
+MIN_ACCELERATION = 0.2  # m/s^2 rms along the least excited axis
+MAX_SIGMAS = (("rotation", 0.05, "deg"), ("position", 1.0, "mm"), ("time offset", 0.1, "ms"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,90 +47,81 @@ class CameraImuVerdict:
         return not self.reasons
 
 
-def judge_camera_imu(fit: CameraImuFit, limits: CameraImuLimits = CameraImuLimits()) -> CameraImuVerdict:
+def judge_camera_imu(fit: CameraImuFit) -> CameraImuVerdict:
     """Check a fit against the limits."""
     inliers = [corners.inlier_mask(r, fit.sigmas.px) for r in fit.corners]
-    rms = tuple(corners.rms(r[k]) for r, k in zip(fit.corners, inliers, strict=True))
-    outliers = tuple(int((~k).sum()) for k in inliers)
     gyro = conservative_rms(fit.imu.stamps_ns, fit.gyro) / fit.stated_sigmas.gyro
     accel = conservative_rms(fit.imu.stamps_ns, fit.accel) / fit.stated_sigmas.accel
     rotation_rms, acceleration_rms = _excitation(fit)
+    hint = "are the images blurred, or --target or the intrinsics wrong?"
     reasons = [
-        *_corner_failures(fit, rms, limits),
-        *_motion_failures(rotation_rms, acceleration_rms, limits),
-        *_imu_failures(gyro, accel, fit.state.gravity, limits),
-        *_sigma_failures(fit, limits),
+        *(
+            reason
+            for cam, r in enumerate(fit.corners)
+            for reason in corner_failures(cam, r, fit.sigmas.px, MAX_RMS_PX, hint)
+        ),
+        *_motion_failures(rotation_rms[2], acceleration_rms[2]),
+        *_imu_failures(gyro, accel, fit.state.gravity),
+        *_sigma_failures(fit),
     ]
-    return CameraImuVerdict(tuple(reasons), rms, outliers, rotation_rms, acceleration_rms, gyro, accel)
+    return CameraImuVerdict(
+        reasons=tuple(reasons),
+        rms_px=tuple(corners.rms(r[k]) for r, k in zip(fit.corners, inliers, strict=True)),
+        outlier_corners=tuple(int((~k).sum()) for k in inliers),
+        rotation_rate_rms=rotation_rms,
+        acceleration_rms=acceleration_rms,
+        gyro_noise_ratio=gyro,
+        accel_noise_ratio=accel,
+    )
 
 
 def _excitation(fit: CameraImuFit) -> tuple[F64, F64]:
     curve, at = fit.state.curve, fit.state.curve.locate(fit.imu.stamps_ns)
     rates, accelerations = curve.rotation(at).rate, curve.position(at, 2)[0]
-    turning, moving = (np.linalg.svd(x, compute_uv=False) / np.sqrt(len(x)) for x in (rates, accelerations))
-    return turning, moving
+    by_rates, by_accelerations = (
+        np.linalg.svd(x, compute_uv=False) / np.sqrt(len(x)) for x in (rates, accelerations)
+    )
+    return by_rates, by_accelerations
 
 
-def _corner_failures(fit: CameraImuFit, rms: tuple[float, ...], limits: CameraImuLimits) -> list[str]:
+def _motion_failures(rotation_rate: float, acceleration: float) -> list[str]:
     out = []
-    for cam, residuals in enumerate(fit.corners):
-        if len(residuals) and not rms[cam] <= limits.rms_px:
-            out.append(
-                f"cam{cam}: {rms[cam]:.2f} px RMS, at most {limits.rms_px:g} allowed: are the images "
-                "blurred, or --target or the intrinsics wrong?"
-            )
-        unfit = corners.count_outliers(residuals, fit.sigmas.px, limits.rms_px)
-        if unfit > limits.outlier_share * len(residuals):
-            out.append(
-                f"cam{cam}: {unfit} of {len(residuals)} corners do not fit within {limits.rms_px:g} px, at "
-                f"most {limits.outlier_share:.0%} allowed"
-            )
-    return out
-
-
-def _motion_failures(turning: F64, moving: F64, limits: CameraImuLimits) -> list[str]:
-    out = []
-    if turning[2] < limits.rotation_rate_rms:
+    if rotation_rate < MIN_ROTATION_RATE:
         out.append(
-            f"turned by {turning[2]:.2f} rad/s rms about one axis, {limits.rotation_rate_rms:g} needed "
-            "about each: nod, roll and look around"
+            f"turned by {rotation_rate:.2f} rad/s rms about one axis, {MIN_ROTATION_RATE:g} needed about "
+            "each: nod, roll and look around"
         )
-    if moving[2] < limits.acceleration_rms:
+    if acceleration < MIN_ACCELERATION:
         out.append(
-            f"accelerated by {moving[2]:.2f} m/s^2 rms along one axis, {limits.acceleration_rms:g} needed "
-            "along each: move to and fro, up and down, near and far"
+            f"accelerated by {acceleration:.2f} m/s^2 rms along one axis, {MIN_ACCELERATION:g} needed along "
+            "each: move to and fro, up and down, near and far"
         )
     return out
 
 
-def _imu_failures(gyro: float, accel: float, gravity: F64, limits: CameraImuLimits) -> list[str]:
+def _imu_failures(gyro: float, accel: float, gravity: F64) -> list[str]:
     out = [
-        f"{name}: residuals are {times:.1f} times the stated noise, at most {limits.imu_noise_ratio:g} "
-        "allowed: is --imu of this device, the IMU fixed to the cameras, the board's size as in --target?"
+        f"{name}: residuals are {times:.1f} times the stated noise, at most {MAX_NOISE_RATIO:g} allowed: is "
+        "--imu of this device, the IMU fixed to the cameras, the board's size as in --target?"
         for name, times in (("gyroscope", gyro), ("accelerometer", accel))
-        if not times <= limits.imu_noise_ratio
+        if not times <= MAX_NOISE_RATIO
     ]
     deviation = float(np.linalg.norm(gravity)) - _STANDARD_GRAVITY
-    if not abs(deviation) <= limits.gravity:
+    if not abs(deviation) <= MAX_GRAVITY_ERROR:
         out.append(
             f"gravity differs by {deviation:+.2f} m/s^2 from {_STANDARD_GRAVITY:g}, at most "
-            f"{limits.gravity:g} allowed: check the accelerometer's scale and units"
+            f"{MAX_GRAVITY_ERROR:g} allowed: check the accelerometer's scale and units"
         )
     return out
 
 
-def _sigma_failures(fit: CameraImuFit, limits: CameraImuLimits) -> list[str]:
+def _sigma_failures(fit: CameraImuFit) -> list[str]:
     total_sigmas = largest_sigmas(fit.axis_sigmas(fit.covariance))
     noise_sigmas = largest_sigmas(fit.axis_sigmas(fit.by_noise))
-    names = (
-        ("rotation", limits.rotation_deg, "deg"),
-        ("position", limits.position_mm, "mm"),
-        ("time offset", limits.shift_ms, "ms"),
-    )
     return [
         f"{name} known to {sigma:.3g} {unit} (one sigma), {limit:g} needed: "
         + ("record longer, turn quicker" if alone**2 > sigma**2 / 2 else "calibrate the cameras better first")
-        for (name, limit, unit), sigma, alone in zip(names, total_sigmas, noise_sigmas, strict=True)
+        for (name, limit, unit), sigma, alone in zip(MAX_SIGMAS, total_sigmas, noise_sigmas, strict=True)
         if not sigma <= limit
     ]
 
@@ -152,13 +136,13 @@ class MountingComparison:
     """Difference of the estimated extrinsics from the given ones. inverted: the inverse of the given ones
     matches."""
 
-    turned_deg: float
-    shifted_mm: float
+    rotation_deg: float
+    translation_mm: float
     inverted: bool
 
     @property
     def is_far(self) -> bool:
-        return _distance_units(self.turned_deg, self.shifted_mm) > _FAR_UNITS
+        return _distance_units(self.rotation_deg, self.translation_mm) > _FAR_UNITS
 
 
 def compare_mountings(T_imu_cam0: F64, other: F64) -> MountingComparison:
@@ -176,5 +160,5 @@ def _difference(T: F64, other: F64) -> tuple[float, float]:
     return float(np.degrees(se3.rotation_angle(T[:3, :3].T @ other[:3, :3]))), 1e3 * float(distance)
 
 
-def _distance_units(turned_deg: float, shifted_mm: float) -> float:
-    return turned_deg / _NEAR_DEG + shifted_mm / _NEAR_MM
+def _distance_units(rotation_deg: float, translation_mm: float) -> float:
+    return rotation_deg / _NEAR_DEG + translation_mm / _NEAR_MM

@@ -1,4 +1,6 @@
-"""A label is of the keyframe's own frame, not of the one with which it is told."""
+"""A label has the stamp, error and picture of its keyframe's own frame, not of the frame after it."""
+
+import pytest
 
 from share.config import Config
 from share.lab.train.labels import labelled_keyframes
@@ -9,7 +11,8 @@ from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 
 
-def test_stamp_error_and_picture_are_its_own(plain_session):
+@pytest.mark.long
+def test_a_label_is_that_of_the_keyframes_own_frame(plain_session):
     source = open_source(f"{plain_session}/ar1")
     tracker, error = make_tracker(source.rig, Config()), LocalError(source.truth())
     frames, errors, own, late = [], [], [], 0
@@ -21,9 +24,9 @@ def test_stamp_error_and_picture_are_its_own(plain_session):
             ago = tracker.make_keyframe(frame).frames_ago
             own.append((frames[-1 - ago], errors[-1 - ago]))
             late += ago > 0
-    told = list(labelled_keyframes(source, Config()))
+    labels = list(labelled_keyframes(source, Config()))
     assert late > 0
-    assert [stamp_ns for stamp_ns, *_ in told] == [frame.stamp_ns for frame, _ in own]
-    for (_, error_cm, found), (frame, own_cm) in zip(told, own, strict=True):
+    assert [stamp_ns for stamp_ns, *_ in labels] == [frame.stamp_ns for frame, _ in own]
+    for (_, error_cm, found), (frame, own_cm) in zip(labels, own, strict=True):
         assert own_cm is None or error_cm == own_cm
         assert (found.picture == input_picture(frame.image0)).all()

@@ -1,4 +1,4 @@
-"""What is done with a head once it is fitted: scales folded in, intervals widened, knowledge measured."""
+"""Trained heads: standardisation folded in, intervals calibrated, distance from the training data, file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from share.lab.train.trained_heads import (
 )
 
 
-def test_a_scale_is_folded_into_the_layer_that_follows(rng):
+def test_standardisation_is_folded_into_the_next_layer(rng):
     W, b = rng.standard_normal((5, 3)).astype(np.float32), rng.standard_normal(5).astype(np.float32)
     mean, deviation = rng.standard_normal(3).astype(np.float32), rng.uniform(0.1, 3, 3).astype(np.float32)
     x = rng.standard_normal((20, 3)).astype(np.float32)
@@ -25,32 +25,32 @@ def test_a_scale_is_folded_into_the_layer_that_follows(rng):
     assert new["other"] is b
 
 
-def test_a_margin_makes_intervals_cover_what_they_say(rng):
-    """Of new errors of the same sort: 90 %, whatever the intervals were before."""
+def test_the_margin_gives_intervals_their_stated_coverage(rng):
+    """90 % of new errors of the same distribution, however wide the intervals were."""
     for scale in (0.3, 1.0, 3.0):
         y = rng.standard_normal((2, 20_000))
-        told = np.tile([0.0, -scale, scale], (y.shape[1], 1))
-        wider = conformal_margin(told, y[0])
+        intervals = np.tile([0.0, -scale, scale], (y.shape[1], 1))
+        wider = conformal_margin(intervals, y[0])
         assert np.mean(np.abs(y[1]) <= scale + wider) == pytest.approx(0.9, abs=0.01)
 
 
-def test_a_margin_of_few_is_careful():
-    """Of nine, the largest: nothing less covers nine of ten."""
+def test_the_margin_of_few_errors_is_the_largest():
+    """Of nine errors: nothing smaller covers nine of ten."""
     y = np.arange(9.0)
     assert conformal_margin(np.zeros((9, 3)), y) == 8
 
 
-def test_what_is_like_what_was_learnt_is_near(rng):
+def test_inputs_like_the_training_data_are_near(rng):
     mixing = rng.standard_normal((96, 96))
-    learnt, calibrated, new = (rng.standard_normal((4000, 96)) @ mixing for _ in range(3))
-    mean, whitening = mahalanobis_scale(learnt, calibrated)
+    training, calibrated, new = (rng.standard_normal((4000, 96)) @ mixing for _ in range(3))
+    mean, whitening = mahalanobis_scale(training, calibrated)
     away = np.linalg.norm((new - mean) @ whitening, axis=1)
     assert np.mean(away > 1) == pytest.approx(0.01, abs=0.006)
     strange = np.linalg.norm((3 * new - mean) @ whitening, axis=1)
     assert np.mean(strange > 1) > 0.99
 
 
-def test_what_is_kept_is_read(tmp_path, rng):
+def test_written_heads_are_read(tmp_path, rng):
     weights = {"a.weight": rng.standard_normal((2, 3)).astype(np.float32)}
     heads = [weights, {"a.weight": 2 * weights["a.weight"]}]
     whole = TrainedHeads(

@@ -1,4 +1,4 @@
-"""Fits that come together and are wrong: markers swapped for long, mirrored worlds, noise not said."""
+"""Fits that converge to a wrong solution: swapped markers, mirrored worlds, wrong scales, larger noise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SWAP = se3.exp(np.array([0.6, -1.0, 0.8, 0.04, 0.03, -0.05]))
 
 
 def swapped(mocap: MocapTrajectory, start: float, end: float) -> MocapTrajectory:
-    """The body jumps to where its markers would be if they were others."""
+    """Return poses with swapped markers from `start` to `end` s."""
     t = (mocap.stamps_ns - START_NS) * 1e-9
     T = mocap.T.copy()
     T[(t >= start) & (t < end)] @= SWAP
@@ -30,7 +30,7 @@ def swapped(mocap: MocapTrajectory, start: float, end: float) -> MocapTrajectory
 
 
 def mirrored(mocap: MocapTrajectory, axis: int, rotations: bool) -> MocapTrajectory:
-    """An axis of the world the other way round, as a wrong export has it."""
+    """Return poses with a mirrored axis, as after a wrong export."""
     flip, T = np.diag(1.0 - 2.0 * (np.arange(3) == axis)), mocap.T.copy()
     T[:, :3, 3] = T[:, :3, 3] @ flip
     if rotations:
@@ -50,7 +50,7 @@ def found_in(mocap: MocapTrajectory, options: MocapFitOptions = NEAR) -> Aligned
 
 @pytest.mark.slow
 @pytest.mark.parametrize("span", [(11.5, 40.0), (0.0, 4.5), (6.0, 10.0)])
-def test_markers_swapped_for_seconds_pull_nowhere_and_leave_no_truth(span) -> None:
+def test_swapped_markers_are_outliers_and_give_no_truth(span) -> None:
     found = found_in(swapped(record_mocap(Motion(3), SECONDS), *span))
     error = se3.log(se3.inverse(BODY) @ found.fit.T_body_mocap)
     assert (np.abs(error) < 4 * shared_sigmas(found.fit)[2:8]).all()
@@ -58,10 +58,10 @@ def test_markers_swapped_for_seconds_pull_nowhere_and_leave_no_truth(span) -> No
     assert not ((t > span[0] + 0.05) & (t < span[1] - 0.05)).any()
     off = found.truth(found.fit.R_mocap_world)[:, :3, 3] - Motion(3).pose(t)[:, :3, 3]
     assert np.linalg.norm(off, axis=1).max() < 0.012
-    assert any("poses are outliers and not used" in doubt for doubt in found.warnings)
+    assert any("poses are outliers and not used" in text for text in found.warnings)
 
 
-def test_markers_swapped_for_most_of_the_time_are_refused() -> None:
+def test_markers_swapped_for_long_are_refused() -> None:
     with pytest.raises(
         CalibrationMismatchError, match=r"4[0-9] % of the mocap's poses are outliers; were markers"
     ):
@@ -83,15 +83,15 @@ def test_a_wrong_scale_is_refused(scale: float) -> None:
         found_in(scaled(record_mocap(Motion(3), SECONDS), scale))
 
 
-def test_a_scale_that_is_off_by_little_is_said() -> None:
+def test_a_small_scale_error_gives_a_warning() -> None:
     coarse = replace(NEAR, sigma_position=0.004)
-    doubts = found_in(scaled(record_mocap(Motion(3), SECONDS), 1.035), coarse).warnings
-    assert any("longer than the accelerometer's; calibrate" in doubt for doubt in doubts)
+    warnings = found_in(scaled(record_mocap(Motion(3), SECONDS), 1.035), coarse).warnings
+    assert any("longer than the accelerometer's; calibrate" in text for text in warnings)
 
 
 @dataclass(frozen=True, eq=False)
 class Level(Motion):
-    """Hardly up and down."""
+    """Almost no vertical motion."""
 
     def pose(self, t: F64) -> F64:
         T = super().pose(t)
@@ -100,8 +100,8 @@ class Level(Motion):
 
 
 @pytest.mark.slow
-def test_a_mirrored_axis_along_which_little_goes_is_refused_too() -> None:
-    """The path comes together all the same, and would be centimetres off."""
+def test_a_mirrored_axis_with_little_motion_is_refused() -> None:
+    """The fit converges, with errors of centimetres."""
     coarse = replace(NEAR, sigma_position=0.01)
     imu, mocap = record_imu(Level(3), SECONDS), record_mocap(Level(3), SECONDS)
     align_device(imu, NOISE, mocap, coarse)
@@ -112,7 +112,7 @@ def test_a_mirrored_axis_along_which_little_goes_is_refused_too() -> None:
 
 
 def test_the_scale_of_each_axis_is_found_within_its_sigma() -> None:
-    """Of a world that lies on its side, so that the axes are the file's."""
+    """In a world with another axis up: the axes are the file's."""
     mocap = record_mocap(Motion(3), SECONDS).rotated(se3.so3_exp(np.array([-np.pi / 2, 0, 0])))
     fit = found_in(scaled(mocap, (1.03, 0.98, 1.0))).fit
     assert fit.scale_error_sigma.max() < 0.005
@@ -120,17 +120,17 @@ def test_the_scale_of_each_axis_is_found_within_its_sigma() -> None:
 
 
 @pytest.mark.slow
-def test_noise_that_was_not_said_is_asked_for() -> None:
+def test_noise_above_the_stated_gives_a_hint() -> None:
     mocap = record_mocap(Motion(3), SECONDS, sigma=(0.008, np.radians(0.2)))
     with pytest.raises(
         CalibrationMismatchError, match=r"1[34]\.[0-9] mm rms residual, 3\.[0-9]+ times .* --sigma-mm"
     ):
         found_in(mocap)
-    told = found_in(mocap, replace(NEAR, sigma_position=0.004))
-    assert any("times the stated noise" in doubt for doubt in told.warnings)
-    told = found_in(mocap, replace(NEAR, sigma_position=0.008))
-    assert told.fit.residuals.position_sigmas == pytest.approx(1.0, abs=0.05)
-    assert not any("stated noise" in doubt for doubt in told.warnings)
+    found = found_in(mocap, replace(NEAR, sigma_position=0.004))
+    assert any("times the stated noise" in text for text in found.warnings)
+    found = found_in(mocap, replace(NEAR, sigma_position=0.008))
+    assert found.fit.residuals.position_sigmas == pytest.approx(1.0, abs=0.05)
+    assert not any("stated noise" in text for text in found.warnings)
 
 
 def test_a_thousand_poses_a_second_are_thinned() -> None:
@@ -143,8 +143,8 @@ def test_a_thousand_poses_a_second_are_thinned() -> None:
 
 
 @pytest.mark.parametrize("wrong", [(0.0, 0.09, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.05, 0.05)])
-def test_a_mounting_that_is_another_is_refused(wrong: tuple[float, ...]) -> None:
-    """Five degrees, or seven centimetres: what a robot's turning shows of it is not as it was given."""
+def test_a_wrong_given_mounting_is_refused(wrong: tuple[float, ...]) -> None:
+    """Wrong by five degrees, or seven centimetres, along axes that yaw determines."""
     motion = Motion(5, planar=True)
     imu, mocap = record_imu(motion, SECONDS), record_mocap(motion, SECONDS)
     known = replace(NEAR, guess_sigma=(np.radians(0.2), 0.004))

@@ -1,4 +1,4 @@
-"""Pictures of targets: exact to the texel's share, and readable by detectors of real boards."""
+"""Images of targets: exact fractions of texels, and readable by detectors."""
 
 import json
 
@@ -16,7 +16,7 @@ FROM_OPENCV = [1, 0, 3, 2]  # OpenCV's order of a tag's corners in ours: its tag
 
 
 def drawn(target: Target, texel: float, margin: float = 0.03) -> tuple[np.ndarray, np.ndarray]:
-    """A gray picture and where the corners (N, 2) are in it, px."""
+    """Return a gray image and the pixels (N, 2) of the corners."""
     low, high = target.extent[0] - margin, target.extent[1] + margin
     width, height = ((high - low) / texel).astype(int)
     xs, ys = low[0] + np.arange(width + 1) * texel, high[1] - np.arange(height + 1) * texel
@@ -26,7 +26,7 @@ def drawn(target: Target, texel: float, margin: float = 0.03) -> tuple[np.ndarra
 
 
 def tags(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corner ids (N,) and places (N, 2) px of an AprilGrid, by OpenCV."""
+    """Return corner ids (N,) and pixels (N, 2) of an AprilGrid by OpenCV."""
     options = cv2.aruco.DetectorParameters()
     options.markerBorderBits = 2
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -37,7 +37,7 @@ def tags(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_rectangles_cover_each_other_nowhere(target):
+def test_rectangles_do_not_overlap(target):
     low, high = target.extent
     xs, ys = np.linspace(low[0], high[0], 301), np.linspace(high[1], low[1], 301)
     dark = darkness_image(black_rectangles(target), xs, ys)
@@ -47,7 +47,7 @@ def test_rectangles_cover_each_other_nowhere(target):
     np.testing.assert_allclose(dark.mean() * np.prod(high - low), ((x1 - x0) * (y1 - y0)).sum())
 
 
-def test_an_edge_lies_where_it_should_to_a_hundredth_of_a_texel():
+def test_an_edge_is_exact_to_a_hundredth_of_a_texel():
     rectangle = np.array([[0.0123, -1, 1, 1]])
     dark = darkness_image(rectangle, np.linspace(0, 0.05, 51), np.array([0.001, 0.0]))[0]
     assert 50 - dark.sum() == pytest.approx(12.3, abs=1e-9)
@@ -72,7 +72,7 @@ def test_opencv_reads_our_charuco_board(target):
     assert np.abs(np.reshape(corners, (-1, 2)) - true[np.ravel(ids)]).max() < 0.01
 
 
-def test_a_real_boards_corners_have_our_ids_and_places(shared_data):
+def test_corners_of_a_real_board_have_our_ids_and_places(shared_data):
     folder = shared_data / "real" / "euroc_aprilgrid"
     frames = json.loads((folder / "detected_corners.json").read_text())["value0"]
     frame = next(f["value"] for f in frames if f["key"] == {"first": 11, "second": 0})

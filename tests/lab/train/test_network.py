@@ -1,4 +1,4 @@
-"""The model as a file: node by node what the network in torch says."""
+"""The ONNX model gives the outputs of the network in torch."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ onnx = pytest.importorskip("onnx", reason="make train-test brings it")
 from helpers.made_features import made_features  # noqa: E402
 from helpers.tiny_backbone import tiny_backbone  # noqa: E402
 
-from share.lab.train.network import Heads, loss  # noqa: E402
-from share.lab.train.onnx_graph import backbone_id, with_heads  # noqa: E402
+from share.lab.train.network import Heads, backbone_id, loss, with_heads  # noqa: E402  # noqa: E402
 from share.lab.train.trained_heads import TrainedHeads  # noqa: E402
 from share.odometry.error_model.inference import estimate_error  # noqa: E402
 from share.odometry.error_model.inputs import ErrorModelInput  # noqa: E402
@@ -38,7 +37,8 @@ def keyframes(rng, n: int = 7) -> list[ErrorModelInput]:
     return [made_features(rng) for _ in range(n)]
 
 
-def test_the_file_says_what_the_heads_say_on_average(heads, rng):
+@pytest.mark.long
+def test_the_model_gives_the_mean_of_the_heads(heads, rng):
     network = open_network(with_heads(tiny_backbone(), fitted(heads)))
     for one in keyframes(rng):
         deep = torch.from_numpy(backbone_features(network, one.picture[None]))
@@ -47,17 +47,21 @@ def test_the_file_says_what_the_heads_say_on_average(heads, rng):
             inputs = deep, torch.from_numpy(one.psd[None].copy()), torch.from_numpy(numbers[None])
             expected, low, high = heads(*inputs).mean(dim=0)[0].tolist()
             joined = heads.join(*inputs)[0].numpy()
-        told = estimate_error(network, one)
-        assert math.log(told.error_cm) == pytest.approx(expected, abs=1e-4)
-        assert told.embedding == pytest.approx(joined[:64], abs=1e-4)
-        strange = np.linalg.norm(joined) > 4
-        assert told.out_of_distribution == strange
-        wider = 2 if strange else 1
-        assert math.log(told.low_cm) == pytest.approx(expected - wider * (expected - low + 0.2), abs=1e-4)
-        assert math.log(told.high_cm) == pytest.approx(expected + wider * (high - expected + 0.2), abs=1e-4)
+        estimate = estimate_error(network, one)
+        assert math.log(estimate.error_cm) == pytest.approx(expected, abs=1e-4)
+        assert estimate.embedding == pytest.approx(joined[:64], abs=1e-4)
+        is_unfamiliar = np.linalg.norm(joined) > 4
+        assert estimate.out_of_distribution == is_unfamiliar
+        wider = 2 if is_unfamiliar else 1
+        lower = expected - wider * (expected - low + 0.2)
+        assert math.log(estimate.low_cm) == pytest.approx(lower, abs=1e-4)
+        assert math.log(estimate.high_cm) == pytest.approx(
+            expected + wider * (high - expected + 0.2), abs=1e-4
+        )
 
 
-def test_other_heads_take_the_place_of_the_first(heads, rng):
+@pytest.mark.long
+def test_new_heads_replace_the_old_ones(heads, rng):
     first = with_heads(tiny_backbone(), fitted(heads))
     torch.manual_seed(4)
     other = fitted(Heads(1).eval())
@@ -65,31 +69,31 @@ def test_other_heads_take_the_place_of_the_first(heads, rng):
     assert again == with_heads(tiny_backbone(), other)
     assert backbone_id(first) == backbone_id(again) == backbone_id(tiny_backbone())
     (one,) = keyframes(rng, 1)
-    told = [estimate_error(open_network(model), one).error_cm for model in (first, again)]
-    assert told[0] != told[1]
+    estimate = [estimate_error(open_network(model), one).error_cm for model in (first, again)]
+    assert estimate[0] != estimate[1]
 
 
-def test_an_interval_that_is_too_wide_shrinks_no_further_than_to_nothing(heads, rng):
+def test_an_interval_shrinks_to_zero_width_at_most(heads, rng):
     network = open_network(with_heads(tiny_backbone(), fitted(heads, margin=-50.0, reach=1e6)))
     (one,) = keyframes(rng, 1)
-    told = estimate_error(network, one)
-    assert told.low_cm == pytest.approx(told.error_cm) == told.high_cm
+    estimate = estimate_error(network, one)
+    assert estimate.low_cm == pytest.approx(estimate.error_cm) == estimate.high_cm
 
 
+@pytest.mark.long
 def test_the_loss_is_least_at_the_mean_and_the_quantiles(rng):
-    """Of errors whose distribution is known."""
     y = torch.from_numpy(rng.lognormal(0.0, 0.8, 20_000))
-    told = torch.tensor([0.0, -0.5, 0.5], requires_grad=True)
-    optimiser = torch.optim.LBFGS([told], max_iter=200, line_search_fn="strong_wolfe")
+    estimate = torch.tensor([0.0, -0.5, 0.5], requires_grad=True)
+    optimiser = torch.optim.LBFGS([estimate], max_iter=200, line_search_fn="strong_wolfe")
 
     def closure():
         optimiser.zero_grad()
-        value = loss(told.expand(len(y), 3), torch.log(y))
+        value = loss(estimate.expand(len(y), 3), torch.log(y))
         value.backward()
         return value
 
     optimiser.step(closure)
-    expected, low, high = told.tolist()
+    expected, low, high = estimate.tolist()
     assert math.exp(expected) == pytest.approx(float(y.mean()), rel=0.01)
     assert math.exp(low) == pytest.approx(float(y.quantile(0.05)), rel=0.03)
     assert math.exp(high) == pytest.approx(float(y.quantile(0.95)), rel=0.03)

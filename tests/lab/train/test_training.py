@@ -1,4 +1,4 @@
-"""From labels to a model, on made-up keyframes whose error is known to follow from their features."""
+"""From labels to a model, on synthetic keyframes whose error is a function of their features."""
 
 from __future__ import annotations
 
@@ -17,8 +17,11 @@ from helpers.tiny_backbone import tiny_backbone  # noqa: E402
 
 from share.lab.train.keyframe_table import collect_labels  # noqa: E402
 from share.lab.train.labels import Labels, write_labels  # noqa: E402
-from share.lab.train.optimisation import TrainingOptions, train_heads  # noqa: E402
-from share.lab.train.training import _Standardiser  # noqa: E402
+from share.lab.train.training import (  # noqa: E402
+    Standardiser,
+    TrainingOptions,
+    train_heads,
+)
 from share.odometry.error_model.inputs import INPUT_SHAPES  # noqa: E402
 from share.odometry.error_model.network import backbone_features, open_network  # noqa: E402
 
@@ -28,7 +31,7 @@ NOTHING = np.zeros(INPUT_SHAPES["recent"], np.float32)
 
 @pytest.fixture(scope="module")
 def labels(tmp_path_factory) -> Path:
-    """The darker the picture and the fewer the matches, the larger the error, and chance."""
+    """Labels of eight rooms: the error grows with a dark picture and few matches, with noise."""
     folder, rng = tmp_path_factory.mktemp("labels"), np.random.default_rng(5)
     for room in range(ROOMS):
         rows = []
@@ -54,7 +57,8 @@ def base(tmp_path_factory) -> Path:
     return path
 
 
-def test_labels_become_a_model_that_knows_rooms_it_has_not_seen(share, labels, base, tmp_path):
+@pytest.mark.long
+def test_a_trained_model_predicts_errors_in_unseen_rooms(share, labels, base, tmp_path):
     common = ("--base", base)
     done = share("train", "fit", labels, *common, "--epochs", 60, "--out", tmp_path / "fit")
     assert done.code == 0, done.err
@@ -73,7 +77,7 @@ def test_labels_become_a_model_that_knows_rooms_it_has_not_seen(share, labels, b
     assert scores["ours"]["rank"] > 0.9
     assert scores["ours"]["rmse_cm"] < 0.7 * scores["linear regression"]["rmse_cm"]
     assert scores["MLP head"]["rmse_cm"] < scores["always the mean"]["rmse_cm"]
-    assert 0.8 < scores["ours"]["covered"] < 0.98
+    assert 0.8 < scores["ours"]["coverage"] < 0.98
 
     model = tmp_path / "model.onnx"
     done = share("train", "export", tmp_path / "fit", "--labels", labels, *common, "--out", model)
@@ -85,7 +89,8 @@ def test_labels_become_a_model_that_knows_rooms_it_has_not_seen(share, labels, b
     assert again.code == 0, again.err  # a model with a head has a backbone, too
 
 
-def test_a_test_on_what_was_learnt_is_refused(share, labels, base, tmp_path):
+@pytest.mark.long
+def test_a_test_on_training_rooms_is_refused(share, labels, base, tmp_path):
     fit = tmp_path / "fit"
     assert share("train", "fit", labels, "--base", base, "--epochs", 1, "--out", fit).code == 0
     fewer = tmp_path / "fewer"
@@ -97,7 +102,8 @@ def test_a_test_on_what_was_learnt_is_refused(share, labels, base, tmp_path):
     assert "these labels are not those of the training" in done.err
 
 
-def test_too_few_rooms_are_said(share, labels, base, tmp_path):
+@pytest.mark.long
+def test_too_few_rooms_are_refused(share, labels, base, tmp_path):
     few = tmp_path / "few"
     few.mkdir()
     done = share("train", "fit", few, "--base", base, "--out", tmp_path / "fit")
@@ -110,30 +116,33 @@ def test_too_few_rooms_are_said(share, labels, base, tmp_path):
     assert "is of 3 rooms" in done.err
 
 
-def test_what_is_broken_off_goes_on_as_it_would_have(labels, base, tmp_path):
+@pytest.mark.long
+def test_an_interrupted_training_resumes_to_the_same_weights(labels, base, tmp_path):
     collection = collect_labels(labels, 0)
     deep = backbone_features(open_network(base), collection.table.picture)
-    scale = _Standardiser(deep, collection)
-    learn, stop = scale.inputs("learn"), scale.inputs("stop")
-    whole = train_heads(learn, stop, TrainingOptions(epochs=6), None, lambda *told: None)
+    scale = Standardiser(deep, collection)
+    training, validation = scale.inputs("train"), scale.inputs("validate")
+    whole = train_heads(training, validation, TrainingOptions(epochs=6), None, lambda *_: None)
 
-    class BrokenOffError(Exception):
+    class InterruptedTrainingError(Exception):
         pass
 
-    def after_three(epoch: int, learnt: float, stopped: float) -> None:
+    def after_three(epoch: int, training_loss: float, validation_loss: float) -> None:
         if epoch == 4:
-            raise BrokenOffError
+            raise InterruptedTrainingError
 
     kept = tmp_path / "checkpoint.pt"
-    with pytest.raises(BrokenOffError):
-        train_heads(learn, stop, TrainingOptions(epochs=6), kept, after_three)
-    told: list[int] = []
-    resumed = train_heads(learn, stop, TrainingOptions(epochs=6), kept, lambda epoch, *_: told.append(epoch))
-    assert told == [4, 5, 6]
+    with pytest.raises(InterruptedTrainingError):
+        train_heads(training, validation, TrainingOptions(epochs=6), kept, after_three)
+    epochs: list[int] = []
+    resumed = train_heads(
+        training, validation, TrainingOptions(epochs=6), kept, lambda epoch, *_: epochs.append(epoch)
+    )
+    assert epochs == [4, 5, 6]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
     other = train_heads(
-        learn, stop, TrainingOptions(epochs=1, seed=9), kept, lambda epoch, *_: told.append(epoch)
+        training, validation, TrainingOptions(epochs=1, seed=9), kept, lambda epoch, *_: epochs.append(epoch)
     )
-    assert told[-1] == 1  # of other options: begins anew
+    assert epochs[-1] == 1  # other options start again
     assert other is not resumed

@@ -1,4 +1,4 @@
-"""Frames that went right, spoiled: what is done to them, when, and that nothing else is."""
+"""Faults injected into frames: what changes, when, and that nothing else does."""
 
 from __future__ import annotations
 
@@ -34,40 +34,39 @@ def frames(seconds: float = 3.0) -> list[Frame]:
     return out
 
 
-def during(how: str, much: float, begin_s: float = 2.0, end_s: float = 3.0) -> list[Frame]:
+def during(kind: str, severity: float, begin_s: float = 2.0, end_s: float = 3.0) -> list[Frame]:
     return list(
-        inject_faults(frames(), [FaultInterval(how, round(begin_s * S), round(end_s * S), much)], 1, RIG)
+        inject_faults(frames(), [FaultInterval(kind, round(begin_s * S), round(end_s * S), severity)], 1, RIG)
     )
 
 
-@pytest.mark.parametrize("how", ["dark", "blur", "haze", "cover"])
-def test_images_are_spoiled_in_a_spell_and_only_then(how):
-    for before, after in zip(frames(), during(how, 0.7), strict=True):
+@pytest.mark.parametrize("kind", ["dark", "blur", "haze", "cover"])
+def test_images_are_degraded_during_a_fault_only(kind):
+    for before, after in zip(frames(), during(kind, 0.7), strict=True):
         same = (before.image0 == after.image0).all() and (before.image1 == after.image1).all()
         assert same == (not 2 * S <= before.stamp_ns < 3 * S)
         assert len(after.imu) == 2
 
 
-@pytest.mark.parametrize("how", ["dark", "blur", "haze"])
-def test_the_worse_the_less_is_to_be_seen(how):
-    contrast = [during(how, much)[15].image0.std() for much in (0.1, 0.4, 0.7, 1.0)]
+@pytest.mark.parametrize("kind", ["dark", "blur", "haze"])
+def test_contrast_falls_with_severity(kind):
+    contrast = [during(kind, severity)[15].image0.std() for severity in (0.1, 0.4, 0.7, 1.0)]
     assert contrast == sorted(contrast, reverse=True)
     assert contrast[-1] < 0.2 * contrast[0]
 
 
-def test_a_cover_hides_what_it_says():
+def test_an_occluder_hides_a_third_to_nearly_all():
     seen = frames()[15].image0
-    for much, hidden in ((0.0, 0.33), (1.0, 0.98)):
-        covered = during("cover", much)[15].image0
+    for severity, hidden in ((0.0, 0.33), (1.0, 0.98)):
+        covered = during("cover", severity)[15].image0
         assert (covered != seen).mean() == pytest.approx(hidden, abs=0.05)
 
 
-def test_what_covers_is_near_to_both_eyes_and_to_a_depth_camera():
-    """So that it is where things right in front are, not where the sky is."""
+def test_an_occluder_is_near_in_stereo_and_in_depth():
     for away, away_m in ((0.0, 0.1), (1.0, 0.5)):
-        spell = FaultInterval("cover", S, 2 * S, 0.2, (0.7, 0.5, away))
+        fault = FaultInterval("cover", S, 2 * S, 0.2, (0.7, 0.5, away))
         (whole,) = (replace(frame, depth=np.ones((24, 32), np.float32)) for frame in frames(0.1))
-        (seen,) = inject_faults([whole], [spell], 1, RIG)
+        (seen,) = inject_faults([whole], [fault], 1, RIG)
         assert seen.image1 is not None and seen.depth is not None and whole.image1 is not None
         left, right = (
             np.flatnonzero((a != b).mean(axis=0) > 0.5)
@@ -79,7 +78,7 @@ def test_what_covers_is_near_to_both_eyes_and_to_a_depth_camera():
         assert near == {0.0, 1.0} if away_m < 0.28 else near == {np.float32(away_m), 1.0}
 
 
-def test_imu_samples_of_frames_that_are_missing_come_with_the_next():
+def test_imu_samples_of_dropped_frames_come_with_the_next():
     given = during("drop", 1.0)
     assert [frame.index for frame in given] == [*range(10), *range(20, 30)]
     late = given[10]
@@ -89,24 +88,24 @@ def test_imu_samples_of_frames_that_are_missing_come_with_the_next():
     assert {frame.gap_ns for frame in given if frame is not late} == {0}
 
 
-def test_an_imu_is_silent_in_its_spell():
-    heard = [len(frame.imu) for frame in during("deaf", 0.5)]
-    assert heard == [2] * 10 + [0] * 10 + [2] * 10
+def test_an_imu_that_is_missing_gives_no_samples():
+    counts = [len(frame.imu) for frame in during("imu_missing", 0.5)]
+    assert counts == [2] * 10 + [0] * 10 + [2] * 10
 
 
-def test_the_same_seed_spoils_alike():
-    spells = [FaultInterval("dark", S, 4 * S, 0.5)]
-    one, two, other = (list(inject_faults(frames(), spells, seed, RIG)) for seed in (1, 1, 2))
+def test_the_same_seed_gives_the_same_faults():
+    faults = [FaultInterval("dark", S, 4 * S, 0.5)]
+    one, two, other = (list(inject_faults(frames(), faults, seed, RIG)) for seed in (1, 1, 2))
     assert all((a.image0 == b.image0).all() for a, b in zip(one, two, strict=True))
     assert any((a.image0 != b.image0).any() for a, b in zip(one, other, strict=True))
 
 
-def test_spells_are_drawn_within_the_run_and_of_all_strengths(rng):
-    spells = draw_faults(rng, 0, 3000 * S, FAULT_KINDS)
-    assert {spell.how for spell in spells} == set(FAULT_KINDS)
-    for how in FAULT_KINDS:
-        mine = [spell for spell in spells if spell.how == how]
+def test_faults_are_drawn_within_the_run_and_of_all_severities(rng):
+    faults = draw_faults(rng, 0, 3000 * S, FAULT_KINDS)
+    assert {fault.kind for fault in faults} == set(FAULT_KINDS)
+    for kind in FAULT_KINDS:
+        mine = [fault for fault in faults if fault.kind == kind]
         assert mine[0].begin_ns >= 2 * S
         assert all(a.end_ns < b.begin_ns for a, b in pairwise(mine))
-        assert all(1.0 <= (spell.end_ns - spell.begin_ns) / S <= 8.0 for spell in mine)
-        assert min(spell.much for spell in mine) < 0.1 < 0.9 < max(spell.much for spell in mine)
+        assert all(1.0 <= (fault.end_ns - fault.begin_ns) / S <= 8.0 for fault in mine)
+        assert min(fault.severity for fault in mine) < 0.1 < 0.9 < max(fault.severity for fault in mine)

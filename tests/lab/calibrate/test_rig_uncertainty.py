@@ -1,4 +1,4 @@
-"""How well cameras are known, by the report beside their camchain."""
+"""Uncertainty of cameras, read from the report beside their camchain."""
 
 import json
 from dataclasses import replace
@@ -31,28 +31,28 @@ def report(**changed: object) -> str:
     return json.dumps(whole | changed)
 
 
-def test_the_report_of_these_cameras_tells_their_covariance(tmp_path: Path) -> None:
+def test_the_report_of_these_cameras_gives_their_covariance(tmp_path: Path) -> None:
     (tmp_path / "camera-report.json").write_text(report())
     found = read_rig_uncertainty(tmp_path / "chain.yaml", RIG)
     assert found.covariance is not None and found.covariance.tolist() == COVARIANCE and found.passed
     assert found.source == str(tmp_path / "camera-report.json")
 
 
-def test_a_report_that_failed_tells_it_too_and_that(tmp_path: Path) -> None:
-    (tmp_path / "camera-report.json").write_text(report(cameras=[]))  # of others
+def test_a_failed_report_gives_the_covariance_and_the_failure(tmp_path: Path) -> None:
+    (tmp_path / "camera-report.json").write_text(report(cameras=[]))  # of other cameras
     (tmp_path / "camera-report.failed.json").write_text(report(passed=False))
     found = read_rig_uncertainty(tmp_path / "chain.yaml", RIG)
     assert found.covariance is not None and not found.passed
 
 
 @pytest.mark.parametrize("rig", [Rig(CAM0, np.eye(4)), replace(RIG, cam0=replace(CAM0, fx=385.1))])
-def test_a_report_of_other_cameras_tells_nothing(tmp_path: Path, rig: Rig) -> None:
+def test_a_report_of_other_cameras_is_ignored(tmp_path: Path, rig: Rig) -> None:
     (tmp_path / "camera-report.json").write_text(report())
     found = read_rig_uncertainty(tmp_path / "chain.yaml", rig)
     assert found.covariance is None and "no camera-report.json of these cameras" in found.source
 
 
-def test_without_a_report_or_in_an_old_one_there_is_nothing(tmp_path: Path) -> None:
+def test_no_report_or_an_old_one_gives_no_covariance(tmp_path: Path) -> None:
     assert read_rig_uncertainty(tmp_path / "chain.yaml", RIG).covariance is None
     old = json.loads(report())
     del old["covariance"]
@@ -63,7 +63,7 @@ def test_without_a_report_or_in_an_old_one_there_is_nothing(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "text", ["{", report(covariance=[[1.0]]), report(covariance="?"), report(covariance=[[None] * 22] * 22)]
 )
-def test_a_damaged_report_is_said(tmp_path: Path, text: str) -> None:
+def test_a_damaged_report_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "camera-report.json").write_text(text)
     with pytest.raises(DataError, match=r"camera-report\.json: is damaged"):
         read_rig_uncertainty(tmp_path / "chain.yaml", RIG)
