@@ -17,14 +17,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
-from share.lab.emulate.world.image_statistics import (
+from image_statistics import (
     HEIGHT,
     WIDTH,
     ImageStatistics,
     image_statistics,
     resize_to_standard,
 )
+
 from share.types import F32, U8
 
 _FOCAL, _MEAN, _BLUR, _NOISE = 458.0, 110.0, 0.5, 1.5
@@ -43,13 +43,14 @@ def of_folder(folder: Path, most: int) -> list[U8]:
 
 def of_room(name: str, seed: int, count: int) -> list[U8]:
     """Return views of one room."""
+    from room_views import standing_views
+
     from share.geometry.camera import Camera
     from share.lab.emulate.render.gl import GlRenderer
     from share.lab.emulate.types import SceneInstant
     from share.lab.emulate.world.build import build_room
     from share.lab.emulate.world.occupancy import Occupancy
     from share.lab.emulate.world.scenes import make_scene_layout
-    from share.lab.emulate.world.views import standing_views
 
     room, rng = make_scene_layout(name, seed), np.random.default_rng((seed, 5))
     camera = Camera(WIDTH, HEIGHT, _FOCAL, _FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)

@@ -109,7 +109,7 @@ class TrackedFrame:
 
 
 class AnyMapper(Protocol):
-    """`share.mapping.mapper.Mapper`, or `share.lab.evaluate.modelled_mapper.ModelledMapper`."""
+    """`share.mapping.mapper.Mapper`, or a model of it (tools/experiments/modelled_mapper.py)."""
 
     def add_run(self, agent: str, hello: Hello) -> None: ...
     def set_present(self, agent: str, is_present: bool) -> None: ...
