@@ -78,7 +78,7 @@ def demo(
             "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
         )
     from share.files.writing import writable_dir
-    from share.lab.emulate.demo import AGENTS, meeting_seed, recipe
+    from share.lab.emulate.recipe import AGENTS, meeting_seed, recipe
     from share.lab.emulate.session import make_cached_session
     from share.lab.evaluate.real_time import RunOptions, play_in_real_time, score_session
     from share.net.emulated_link import LinkAssignment
@@ -116,7 +116,7 @@ def demo(
 
 def _renderable_scene(scene: str | None) -> str:
     """Return the scene given, or the default; the plain one where OpenGL is missing."""
-    from share.lab.emulate.demo import DEFAULT_SCENE, FALLBACK_SCENE
+    from share.lab.emulate.recipe import DEFAULT_SCENE, FALLBACK_SCENE
     from share.lab.emulate.render.context import missing_reason
 
     if scene is not None:

@@ -208,8 +208,7 @@ def ablation(
 
 def _write_report(out: Path, trials: list[Trial], failed: list[str], sections: list[ReportSection]) -> None:
     from share.files.writing import atomic_write
-    from share.lab.evaluate.html_page import html_page
-    from share.lab.evaluate.report import agents_csv, markdown, runs_csv
+    from share.lab.evaluate.report import agents_csv, html_page, markdown, runs_csv
     from share.lab.evaluate.report_charts import draw_report
     from share.lab.evaluate.scoring import run_metrics
     from share.lab.evaluate.statistics import policy_names

@@ -70,8 +70,7 @@ def sweep(
         which = "--scheduler" if scheduler else "--workers"
         raise UsageError(f"{which} needs --virtual: parallel runs in real time would slow each other down")
     from share.files.writing import writable_dir
-    from share.lab.evaluate.campaign import worker_pool
-    from share.lab.evaluate.cluster import Cluster
+    from share.lab.evaluate.campaign import Cluster, worker_pool
     from share.lab.evaluate.real_time import RunOptions
     from share.lab.evaluate.sweep import Axis, grid, plan_sweep, random_points
     from share.recordings.session import read_session

@@ -195,7 +195,7 @@ def test_a_command_that_is_ended_leaves_nothing_that_looks_whole(tmp_path):
 
 @pytest.mark.slow
 def test_after_ctrl_c_the_same_command_goes_on_where_it_was(tmp_path):
-    from share.lab.emulate.demo import recipe
+    from share.lab.emulate.recipe import recipe
     from share.lab.emulate.session import make_cached_session
 
     assert interrupted(tmp_path, signal.SIGINT) == (130, "", "share: interrupted\n")

@@ -15,7 +15,7 @@ from helpers.children import SHARE
 from share.config import Config
 from share.geometry import se3
 from share.geometry.interpolation import associate
-from share.lab.emulate.demo import DEFAULT_SCENE, recipe
+from share.lab.emulate.recipe import DEFAULT_SCENE, recipe
 from share.lab.emulate.session import make_cached_session
 from share.odometry.initialisation import MIN_SAMPLES
 from share.runtime.offline_tracking import track

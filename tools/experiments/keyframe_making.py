@@ -11,11 +11,9 @@ from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
 from keyframe_views import views
 
 from share.geometry import se3
-from share.lab.emulate.preparation import PreparedSession, keep_room, prepare_session
-from share.lab.emulate.progress import Progress, no_progress
-from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.recipe import Progress, SessionRecipe, no_progress
 from share.lab.emulate.recordings import true_trajectory
-from share.lab.emulate.stage import Actor
+from share.lab.emulate.stage import Actor, PreparedSession, keep_room, prepare_session
 from share.protocol.agent_ledger import KeyframeChain
 from share.recordings.trajectory import Trajectory
 from share.types import F64, I64, Keyframe, KeyframeCandidate, View

@@ -19,8 +19,7 @@ from keyframe_file import load, save
 from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
 
 from share.files.writing import writable_dir
-from share.lab.emulate.progress import Progress, no_progress
-from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.recipe import Progress, SessionRecipe, no_progress
 from share.lab.emulate.session import default_cache
 
 __all__ = ["AgentKeyframes", "KeyframeSet", "Spacing", "keyframe_set", "place"]

@@ -10,10 +10,10 @@ import numpy as np
 
 from share.geometry.camera import Rig
 from share.lab.emulate import drawing
-from share.lab.emulate.chunks import EncodedPicture, encoded_image
-from share.lab.emulate.progress import Progress
+from share.lab.emulate.recipe import Progress
+from share.lab.emulate.recordings import EncodedPicture, encoded_image
 from share.lab.emulate.sensor.device import PictureTimes
-from share.lab.emulate.sensor.exposure import ExposureSeries
+from share.lab.emulate.sensor.imager import ExposureSeries
 from share.lab.emulate.stage import Actor, RoomStage
 from share.runtime.pool import Pool
 from share.sensors.measurement import CAM0, CAM1, DEPTH

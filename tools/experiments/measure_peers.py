@@ -26,8 +26,7 @@ from share.cli.compare_trackers import peer_interpreters  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.files.writing import atomic_write, writable_dir  # noqa: E402
 from share.lab.emulate.session import make_cached_session  # noqa: E402
-from share.lab.evaluate.peer_comparison import tracker_entries, tracker_rows  # noqa: E402
-from share.lab.evaluate.peer_report import markdown  # noqa: E402
+from share.lab.evaluate.peer_comparison import markdown, tracker_entries, tracker_rows  # noqa: E402
 from share.runtime.source import open_source  # noqa: E402
 
 

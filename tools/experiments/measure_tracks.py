@@ -46,13 +46,12 @@ from share.config import Config  # noqa: E402
 from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Camera, rays  # noqa: E402
-from share.lab.emulate.preparation import keep_room, prepare_session  # noqa: E402
-from share.lab.emulate.progress import no_progress  # noqa: E402
-from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
-from share.lab.emulate.room_file import open_renderer  # noqa: E402
+from share.lab.emulate.recipe import SessionRecipe, no_progress  # noqa: E402
 from share.lab.emulate.sensor.effects import NO_EFFECTS, Effects  # noqa: E402
 from share.lab.emulate.session import make_cached_session  # noqa: E402
+from share.lab.emulate.stage import keep_room, prepare_session  # noqa: E402
 from share.lab.emulate.types import SceneInstant  # noqa: E402
+from share.lab.emulate.world.room_files import open_renderer  # noqa: E402
 from share.odometry.inertial_tracker import InertialTracker  # noqa: E402
 from share.odometry.state import FilterState  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402

@@ -15,7 +15,7 @@ import numpy as np
 
 from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
-from share.lab.emulate import mover
+from share.lab.emulate import moving_panel
 from share.lab.emulate.moving_panel import Panel, draw_panel
 from share.recordings.trajectory import Trajectory
 from share.sensors.measurement import IMU, Measurement
@@ -181,11 +181,11 @@ _SMALL_PANEL, _LARGE_PANEL = Panel(0.9, 1.4, seed=5), Panel(1.1, 1.4, seed=6)  #
 
 
 def panel_comes(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
-    return _with_panel(frames, rig, truth, _SMALL_PANEL, mover.path_comes)
+    return _with_panel(frames, rig, truth, _SMALL_PANEL, moving_panel.path_comes)
 
 
 def panel_follows(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
-    return _with_panel(frames, rig, truth, _SMALL_PANEL, mover.path_follows)
+    return _with_panel(frames, rig, truth, _SMALL_PANEL, moving_panel.path_follows)
 
 
 def panel_rests(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
@@ -195,7 +195,7 @@ def panel_rests(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
 
 def panel_starts(frames: Frames, rig: Rig, truth: Trajectory, speed: float = 0.15) -> Frames:
     def path(t: F64, T_world_cam: F64, begin: float, last: float) -> F64:
-        return mover.path_starts(t, T_world_cam, rig.cam0, _LARGE_PANEL, last, speed)
+        return moving_panel.path_starts(t, T_world_cam, rig.cam0, _LARGE_PANEL, last, speed)
 
     return _with_panel(frames, rig, truth, _LARGE_PANEL, path)
 

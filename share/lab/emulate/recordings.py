@@ -1,4 +1,7 @@
-"""Write an actor's recording and ground truth from its chunks and IMU."""
+"""The files of a session: chunks of frames while it is drawn, then recordings and ground truth.
+
+Chunks are kept until the recording is written, so that an interrupted session can be resumed.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,54 @@ import heapq
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
+from share.errors import DataError, UsageError
+from share.files.reading import MAX_ARRAYS_BYTES, read_bytes
 from share.files.writing import atomic_write
-from share.lab.emulate.chunks import read_chunk
-from share.lab.emulate.stage import Actor
+from share.lab.emulate.recipe import Progress
+from share.lab.emulate.stage import Actor, RoomStage
+from share.recordings.convert import stage_progress, to_euroc
+from share.recordings.images import EncodedImage
 from share.recordings.mcap.recorder import Recorder
+from share.recordings.session import SESSION_FILE
 from share.recordings.trajectory import Trajectory, format_tum
-from share.sensors.measurement import IMU, Measurement
+from share.runtime.source import open_source
+from share.sensors.measurement import DEPTH, IMU, Measurement
 from share.types import I64
+
+DEPTH_SCALE = 1000.0  # per metre: millimetres
+
+
+class EncodedPicture(msgspec.Struct, frozen=True, array_like=True):
+    """One image as recorded: JPEG or PNG."""
+
+    stream: str
+    stamp_ns: int
+    width: int
+    height: int
+    data: bytes
+
+
+def write_chunk(path: Path, pictures: list[EncodedPicture]) -> None:
+    """Write the chunk atomically. Raises as `atomic_write`."""
+    atomic_write(path, msgspec.msgpack.encode(pictures))
+
+
+def read_chunk(path: Path) -> Iterator[Measurement]:
+    """Yield the images in the order in which they were written. Raises DataError if the chunk is damaged."""
+    try:
+        pictures = msgspec.msgpack.decode(read_bytes(path, MAX_ARRAYS_BYTES), type=list[EncodedPicture])
+    except (OSError, msgspec.DecodeError, msgspec.ValidationError) as error:
+        raise DataError(f"{path}: is damaged ({error}); delete it and run the command again") from None
+    for p in pictures:
+        yield Measurement(p.stream, p.stamp_ns, encoded_image(p, str(path)))
+
+
+def encoded_image(p: EncodedPicture, where: str) -> EncodedImage:
+    """Return the image as a reader does. where: named in errors."""
+    return EncodedImage(p.data, where, p.width, p.height, DEPTH_SCALE if p.stream == DEPTH else 0.0)
 
 
 def write_recording(actor: Actor, chunks: list[Path], path: Path) -> None:
@@ -64,3 +106,27 @@ def _imu_measurements(actor: Actor) -> Iterator[Measurement]:
 def _image_measurements(chunks: list[Path]) -> Iterator[Measurement]:
     for path in chunks:
         yield from read_chunk(path)
+
+
+def check_asl(stage: RoomStage) -> None:
+    """Raise UsageError where an agent has data that such a folder cannot hold."""
+    for actor in stage.actors:
+        if actor.device.clock.period_ns:
+            raise UsageError("ASL folders cannot hold stamps that wrap; leave out --effect wrap=on")
+        if actor.rig.depth is not None:
+            raise UsageError(
+                f"{actor.name}: an ASL folder has no place for depth; give --sensors {actor.name}=stereo"
+            )
+
+
+def to_asl(folder: Path, names: list[str], progress: Progress) -> None:
+    """Convert each NAME.mcap of the session in `folder` to NAME/mav0, with the ground truth."""
+    for name in names:
+        source = open_source(str(folder / name))
+        count = stage_progress(progress, f"writing {name}/mav0", source.images_count)
+        to_euroc(source, folder / f"{name}.asl", count)
+        (folder / f"{name}.asl").rename(folder / name)
+        (folder / f"{name}.mcap").unlink()
+        (folder / "truth" / f"{name}.tum").unlink()
+    (folder / "truth").rmdir()
+    (folder / SESSION_FILE).rename(folder / "emulation.yaml")

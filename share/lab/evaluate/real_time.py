@@ -1,8 +1,5 @@
 """Play a session in real time on this machine: an edge and one agent per recording, each in a process of its
-own.
-
-Also scores what the agents of a session left, against their ground truth.
-"""
+own."""
 
 from __future__ import annotations
 
@@ -11,6 +8,7 @@ import os
 import re
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -23,12 +21,29 @@ from share.files.json_file import read_json
 from share.files.line_file import GrowingFile
 from share.files.reading import MAX_LOG_BYTES, read_bytes
 from share.files.writing import writable_dir
-from share.lab.evaluate.map_membership import MapMembership
 from share.metrics.ate import Ate, JointAte, ate, joint_ate
 from share.net.emulated_link import LinkAssignment
 from share.recordings.session import Session
 from share.recordings.trajectory import Trajectory, read_tum
 from share.runtime.child_commands import running_child, stop_child
+
+
+class MapMembership:
+    """`map_ids`: the map of each agent's last correction, by agent."""
+
+    def __init__(self) -> None:
+        self.map_ids: dict[str, str] = {}
+
+    def add_correction(self, agent: str, map_id: str) -> None:
+        """Add the next correction, in the order in which they are sent."""
+        self.map_ids[agent] = map_id
+
+    @property
+    def sharing_agents(self) -> list[str]:
+        """Agents that are not alone in their map."""
+        members = Counter(self.map_ids.values())
+        return [agent for agent, map_id in self.map_ids.items() if members[map_id] > 1]
+
 
 EDGE_START_TIMEOUT_S = 20.0  # until the edge listens
 AGENT_GRACE_S = 60.0  # how much longer than its recording an agent may run

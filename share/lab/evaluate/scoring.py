@@ -12,8 +12,7 @@ import numpy as np
 
 from share.errors import DataError
 from share.files.json_file import own_format_errors, read_json, read_json_lines
-from share.lab.evaluate.map_membership import MapMembership
-from share.lab.evaluate.real_time import AgentScore, SessionScore, score_session
+from share.lab.evaluate.real_time import AgentScore, MapMembership, SessionScore, score_session
 from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 from share.lab.evaluate.trial import Trial
 from share.metrics.ate import Ate

@@ -8,7 +8,7 @@ import pytest
 from share.config import SequencerConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.lab.emulate import mover
+from share.lab.emulate import moving_panel
 from share.lab.emulate.faults import FAULTS, apply_fault
 from share.lab.emulate.moving_panel import Panel, draw_panel, share_of_view
 from share.recordings.images import ArrayImage
@@ -297,7 +297,7 @@ def ride(frames, truth):
 def test_what_was_part_of_the_room_goes_off_slowly(ride):
     t, T_world_cam = ride
     panel = Panel(1.1, 1.4)
-    T = mover.path_starts(t, T_world_cam, CAMERA, panel, 5.0)
+    T = moving_panel.path_starts(t, T_world_cam, CAMERA, panel, 5.0)
     gone = np.linalg.norm(T[:, :3, 3] - T[0, :3, 3], axis=1)
     begin = t[np.flatnonzero(gone > 0)[0] - 1]
     assert 0.3 <= begin / t[-1] <= 0.55
@@ -306,7 +306,7 @@ def test_what_was_part_of_the_room_goes_off_slowly(ride):
     seen = share_of_view(CAMERA, panel, se3.inverse(T_world_cam) @ T)
     assert seen[(t > begin - 3) & (t < begin + 5)].min() > 0.2
     assert np.linalg.norm(T[:, :3, 3] - T_world_cam[:, :3, 3], axis=1).min() > 0.4
-    stays = mover.path_starts(t, T_world_cam, CAMERA, panel, 5.0, speed=0.0)
+    stays = moving_panel.path_starts(t, T_world_cam, CAMERA, panel, 5.0, speed=0.0)
     assert np.ptp(stays, axis=0).max() == 0
 
 
@@ -316,12 +316,12 @@ def test_no_place_for_a_panel(ride):
     ahead = T_world_cam.copy()
     ahead[:, 0, 3] = t
     with pytest.raises(ValueError, match="no place"):
-        mover.path_starts(t, ahead, CAMERA, Panel(1.1, 1.4), 5.0)
+        moving_panel.path_starts(t, ahead, CAMERA, Panel(1.1, 1.4), 5.0)
 
 
 def test_what_comes_in_moves_by_itself_and_stays_before_the_camera(ride):
     t, T_world_cam = ride
-    T = mover.path_comes(t, T_world_cam, 5.0, 10.0)
+    T = moving_panel.path_comes(t, T_world_cam, 5.0, 10.0)
     there = ~np.isnan(T[:, 0, 0])
     assert (there == ((t >= 5) & (t <= 15))).all()
     p = (se3.inverse(T_world_cam[there]) @ T[there])[:, :3, 3]
@@ -332,7 +332,7 @@ def test_what_comes_in_moves_by_itself_and_stays_before_the_camera(ride):
 
 def test_what_goes_along_is_fixed_in_the_view(ride):
     t, T_world_cam = ride
-    T = se3.inverse(T_world_cam) @ mover.path_follows(t, T_world_cam, 5.0, 10.0)
+    T = se3.inverse(T_world_cam) @ moving_panel.path_follows(t, T_world_cam, 5.0, 10.0)
     inside = (t > 6.6) & (t < 13.4)
     assert np.ptp(T[inside], axis=0).max() < 1e-9
     assert T[inside][0, :3, 3] == pytest.approx([-0.35, 0, 1.0])

@@ -16,9 +16,9 @@ from helpers.small_session import RATE_HZ, SIZE, files, small_profile, small_rec
 from share.errors import ShareError, UsageError
 from share.geometry import se3
 from share.lab.emulate import session as sessions
-from share.lab.emulate.preparation import prepare_session
-from share.lab.emulate.progress import no_progress
+from share.lab.emulate.recipe import no_progress
 from share.lab.emulate.session import make_cached_session, make_session
+from share.lab.emulate.stage import prepare_session
 from share.lab.emulate.types import START_NS
 from share.recordings.session import read_session
 from share.recordings.trajectory import read_tum

@@ -5,12 +5,11 @@ import pytest
 from helpers.small_session import files, small_profile, small_recipe
 
 from share.geometry import se3
-from share.lab.emulate.preparation import keep_room, prepare_session
-from share.lab.emulate.progress import no_progress
+from share.lab.emulate.recipe import no_progress
 from share.lab.emulate.render.context import missing_reason
-from share.lab.emulate.room_file import open_renderer
 from share.lab.emulate.session import make_session
-from share.lab.emulate.stage import RoomStage, T_body_camera
+from share.lab.emulate.stage import RoomStage, T_body_camera, keep_room, prepare_session
+from share.lab.emulate.world.room_files import open_renderer
 from share.runtime.source import open_source
 
 pytestmark = pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from share.errors import UsageError
-from share.lab.evaluate.cluster import Cluster
+from share.lab.evaluate.campaign import Cluster
 
 distributed = pytest.importorskip("distributed", reason="pip install 'share-slam[cluster]' brings it")
 

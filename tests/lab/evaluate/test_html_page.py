@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from share.lab.evaluate.html_page import html_page
+from share.lab.evaluate.report import html_page
 
 TEXT = """# Two < three
 

@@ -1,6 +1,6 @@
 """Who shares a map, as corrections come."""
 
-from share.lab.evaluate.map_membership import MapMembership
+from share.lab.evaluate.real_time import MapMembership
 
 
 def test_agents_come_together_and_part():

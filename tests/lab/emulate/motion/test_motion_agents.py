@@ -4,8 +4,8 @@ from helpers.motion_sim import driver, every, floor, person, track
 
 from share.lab.emulate.motion import walk
 from share.lab.emulate.motion.crowd import path_length
-from share.lab.emulate.motion.gait import step_phase
 from share.lab.emulate.motion.track import KNOT_S
+from share.lab.emulate.motion.walk import step_phase
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -87,7 +87,7 @@ def test_a_seed_is_a_motion():
 
 
 def test_looks_at_others():
-    from share.lab.emulate.motion.gaze import GazeAgent
+    from share.lab.emulate.motion.walk import GazeAgent
     from share.lab.emulate.types import START_NS
 
     own = track("person", 1)

@@ -5,7 +5,7 @@ from helpers.motion_sim import every, person
 from share.errors import UsageError
 from share.lab.emulate.motion.motion_plan import plan_motions
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.emulate.world.scenes.registry import make_scene_layout
+from share.lab.emulate.world.scenes import make_scene_layout
 from share.recordings.trajectory import Trajectory, format_tum
 from share.types import AgentKind
 

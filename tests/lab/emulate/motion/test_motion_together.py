@@ -6,9 +6,17 @@ from helpers.motion_sim import SECONDS, every, floor
 
 from share.errors import UsageError
 from share.lab.emulate.motion import crowd as crowds
-from share.lab.emulate.motion import paper, walk
-from share.lab.emulate.motion.crowd import FixedPath, SimulatedAgent, fixed_path, path_length, plan_crowd
-from share.lab.emulate.motion.planned_motion import FloorGraphs, MotionPreferences
+from share.lab.emulate.motion import walk
+from share.lab.emulate.motion.crowd import (
+    FixedPath,
+    FloorGraphs,
+    MotionPreferences,
+    SimulatedAgent,
+    fixed_path,
+    path_length,
+    plan_crowd,
+)
+from share.lab.emulate.motion.motion_plan import PAPER_LENGTHS_M, PAPER_S, paper_agents
 from share.lab.emulate.motion.route import POINT_SPACING_M, FloorGraph, arc_length, smooth_route
 from share.lab.emulate.motion.schedule import (
     STEP_S,
@@ -112,9 +120,9 @@ def test_a_room_without_a_way_says_so(monkeypatch):
 
 @pytest.mark.slow
 def test_an_experiment_of_the_paper_has_the_papers_lengths():
-    members = paper.paper_agents(2)
-    paths = plan_crowd(FloorGraphs(floor()), members, [], np.array([[1.0, 1.0, 1.0]]), paper.SECONDS, (1,))
+    members = paper_agents(2)
+    paths = plan_crowd(FloorGraphs(floor()), members, [], np.array([[1.0, 1.0, 1.0]]), PAPER_S, (1,))
     lengths = [path_length(p) for p in paths]
-    assert np.abs(np.array(lengths) / paper.LENGTHS_M[2] - 1).max() < 0.02
+    assert np.abs(np.array(lengths) / PAPER_LENGTHS_M[2] - 1).max() < 0.02
     bodies = [fixed_path(p, 0).xyz for p in paths]
     assert all(floor().at(b[:, :2]).min() > 0.1 for b in bodies)

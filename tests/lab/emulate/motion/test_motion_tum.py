@@ -4,7 +4,7 @@ from helpers.motion_sim import every, person
 
 from share.errors import DataError
 from share.geometry import se3
-from share.lab.emulate.motion.tum_path import fit_spline, read_tum_path
+from share.lab.emulate.motion.spline import fit_spline, read_tum_path
 from share.recordings.trajectory import Trajectory, format_tum
 
 

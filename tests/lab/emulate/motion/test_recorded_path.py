@@ -8,15 +8,15 @@ import pytest
 
 from share.errors import DataError, ShareError, UsageError
 from share.geometry import se3
-from share.lab.emulate.motion import recorded_sources
-from share.lab.emulate.motion.recorded import RecordedPath
-from share.lab.emulate.motion.recorded_sources import (
+from share.lab.emulate.motion.recorded import (
     EUROC_OPTIONS,
     TUMVI_OPTIONS,
     RecordedMotion,
+    RecordedPath,
     open_recorded_motion,
 )
 from share.lab.emulate.types import GRAVITY
+from share.recordings import tables
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def rates_of(path: RecordedPath, stamps: np.ndarray, step_ns: int) -> np.ndarray
 
 
 def test_the_real_imu_is_untouched(euroc: RecordedMotion, shared_data: Path) -> None:
-    stamps, values = recorded_sources.tables.read_table(shared_data / "motion/euroc/V1_02_medium/imu0.csv", 7)
+    stamps, values = tables.read_table(shared_data / "motion/euroc/V1_02_medium/imu0.csv", 7)
     recorded = euroc.path.recorded
     at = np.searchsorted(stamps, recorded.stamps_ns)
     np.testing.assert_array_equal(stamps[at], recorded.stamps_ns)

@@ -7,9 +7,9 @@ from test_gl_place import corners_of_walls, saddles
 
 from share.geometry.camera import Camera
 from share.geometry.se3 import inverse, transform
-from share.lab.emulate.render.fisheye import fisheye_faces
 from share.lab.emulate.render.gl import GlRenderer
-from share.lab.emulate.sensor.photometry import vignetting_gain
+from share.lab.emulate.render.lens import fisheye_faces
+from share.lab.emulate.sensor.imager import vignetting_gain
 from share.lab.emulate.types import SceneInstant
 
 pytestmark = needs_opengl

@@ -35,7 +35,7 @@ def test_a_missing_library_names_its_package(tmp_path, library, package):
     said, stderr = answer(ASK, LD_LIBRARY_PATH=str(tmp_path))
     assert said.endswith(f"apt install {package}") and "\n" not in said and not stderr
     _, stderr = answer(DRAW, LD_LIBRARY_PATH=str(tmp_path))
-    assert stderr.splitlines()[-1].startswith("share.lab.emulate.render.errors.RenderError: ")
+    assert stderr.splitlines()[-1].startswith("share.lab.emulate.render.context.RenderError: ")
 
 
 @needs_opengl

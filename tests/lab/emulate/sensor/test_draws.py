@@ -1,6 +1,6 @@
 import numpy as np
 
-from share.lab.emulate.sensor.indexed_random import normal, uniform
+from share.lab.emulate.sensor.clock import normal, uniform
 
 
 def test_a_number_belongs_to_its_index():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from share.lab.emulate.sensor.exposure import auto_exposure, blur_offsets, lamp_light
+from share.lab.emulate.sensor.imager import auto_exposure, blur_offsets, lamp_light
 from share.sensors.profile_types import ExposureModel
 
 MODEL = ExposureModel(target=100, delay_frames=2, damping=0.5, step=0.03, longest_ms=16)

@@ -3,8 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from share.lab.emulate.sensor.exposure import Exposure
-from share.lab.emulate.sensor.photometry import Imager, vignetting_gain
+from share.lab.emulate.sensor.imager import Exposure, Imager, vignetting_gain
 from share.sensors.profile import load_profile
 
 PROFILE = load_profile("d435i")

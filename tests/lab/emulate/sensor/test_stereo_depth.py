@@ -9,7 +9,7 @@ import pytest
 from share.errors import ConfigError
 from share.lab.emulate.sensor.device import EmulatedDevice
 from share.lab.emulate.sensor.effects import parse_effects
-from share.lab.emulate.sensor.exposure import Exposure
+from share.lab.emulate.sensor.imager import Exposure
 from share.sensors.profile import load_profile
 
 PROFILE = load_profile("d435i")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.lab.emulate.sensor.vibration import knock_acceleration, vibration_acceleration
+from share.lab.emulate.sensor.imu import knock_acceleration, vibration_acceleration
 
 FAST = np.arange(0.0, 20.0, 1e-4)
 

@@ -5,8 +5,8 @@ import pytest
 
 from share.geometry import se3
 from share.lab.calibrate.target import AprilGrid, CharucoBoard
-from share.lab.emulate.world.furniture.board import BLACK, WHITE, printed_sheet
 from share.lab.emulate.world.scenes import make_scene_layout
+from share.lab.emulate.world.scenes.board import BLACK, WHITE, printed_sheet
 
 TARGETS = [AprilGrid(), AprilGrid(5, 7, 0.08, 0.28), CharucoBoard()]
 

@@ -7,8 +7,7 @@ import pytest
 
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import box
-from share.lab.emulate.world.scenes.floor import clear_floor, walkable_share
-from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder
+from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, clear_floor, walkable_share
 
 PAINT = Material("paint")
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from share.errors import DataError, UsageError
-from share.lab.emulate.world.build import build_room
+from share.lab.emulate.world.build import build_room, draw_materials
 from share.lab.emulate.world.gltf import load_gltf
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.emulate.world.pictures import draw_materials
 
 trimesh: Any = pytest.importorskip("trimesh")
 

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from share.lab.emulate.world.layout import Layout, Piece
+from share.lab.emulate.world.layout import Layout, Piece, triangle_distances, winding_numbers
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import box
-from share.lab.emulate.world.proximity import triangle_distances, winding_numbers
 
 
 def test_pieces_in_the_way_go_whole_and_are_named(small_layout: Layout) -> None:

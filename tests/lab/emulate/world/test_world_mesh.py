@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from share.lab.emulate.world.layout import winding_numbers
 from share.lab.emulate.world.materials import MATERIAL_KINDS, Material
 from share.lab.emulate.world.mesh import (
     DECAL_OFFSET_M,
@@ -19,7 +20,6 @@ from share.lab.emulate.world.mesh import (
     quad,
     tube,
 )
-from share.lab.emulate.world.proximity import winding_numbers
 
 WOOD = Material("wood")  # one picture a metre
 BEND = [(np.sin(a), np.cos(a), 0.1 * a) for a in np.linspace(0, 3, 30)]  # a hose is bent softly

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.lab.emulate.world.layout import Layout
+from share.lab.emulate.world.layout import Layout, triangle_distances, winding_numbers
 from share.lab.emulate.world.mesh import concat_shapes
 from share.lab.emulate.world.occupancy import STEP_M, Occupancy
-from share.lab.emulate.world.proximity import triangle_distances, winding_numbers
 
 
 @pytest.fixture(scope="module")

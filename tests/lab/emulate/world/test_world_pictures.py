@@ -7,9 +7,9 @@ import zlib
 import numpy as np
 import pytest
 
+from share.lab.emulate.world.build import MAX_ALBEDO, MIN_ALBEDO, draw_material, mean_albedo
 from share.lab.emulate.world.materials import MATERIAL_KINDS, Material
 from share.lab.emulate.world.noise import PICTURE_TEXELS, cloud
-from share.lab.emulate.world.pictures import MAX_ALBEDO, MIN_ALBEDO, draw_material, mean_albedo
 from share.lab.emulate.world.prints import PRINTS
 from share.lab.emulate.world.surfaces import SURFACES
 
