@@ -15,7 +15,7 @@ from share.config import POLICY_NAMES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.lab.evaluate.real_time import SessionScore
+    from share.lab.evaluate.scoring import SessionScore
     from share.metrics.ate import Ate
 
 
@@ -80,7 +80,8 @@ def demo(
     from share.files.writing import writable_dir
     from share.lab.emulate.recipe import AGENTS, meeting_seed, recipe
     from share.lab.emulate.session import make_cached_session
-    from share.lab.evaluate.real_time import RunOptions, play_in_real_time, score_session
+    from share.lab.evaluate.real_time import RunOptions, play_in_real_time
+    from share.lab.evaluate.scoring import score_session
     from share.net.emulated_link import LinkAssignment
     from share.recordings.session import read_session
     from share.runtime.machine import core_count

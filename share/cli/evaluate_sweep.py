@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from share.lab.evaluate.sweep import Axis, Point
     from share.lab.evaluate.trial import Trial
 
-_HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges a metre", "AR QoE")
+_HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges per metre", "AR QoE")
 
 
 @click.command(short_help="Compare settings on sessions.")

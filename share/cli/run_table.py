@@ -25,7 +25,7 @@ def run_table(run: RunMetrics) -> str:
         f"merges: {run.merges_requested} requested, {run.merges_skipped} skipped, {run.merges_done} done, "
         f"{_value_text(run.merges_per_metre, 'a metre', 2)} over {run.metres:.0f} m"
     )
-    joined_text = f"{run.in_one_map} of {len(run.agents)} agents in one map"
+    joined_text = f"{run.agents_in_largest_map} of {len(run.agents)} agents in one map"
     joint_text = f"joint ATE {_value_text(run.joint_ate_cm, 'cm', 2)}"
     return f"{_title(run.conditions)}\n{latency}\n\n{errors}\n{joined_text}, {joint_text}; {merges}"
 
@@ -48,25 +48,25 @@ def _error_cells(agent: AgentMetrics) -> tuple[str, ...]:
         _value_text(agent.odom_ate_cm, "cm", 2),
         str(agent.odom_n),
         _value_text(agent.ate_cm, "cm", 2),
-        str(agent.in_map),
+        str(agent.ate_n),
         _value_text(10 * agent.rpe_frame_cm, "mm"),
         _value_text(agent.rpe_frame_deg, "°", 3),
         _value_text(agent.rpe_1s_cm, "cm", 2),
         _value_text(agent.rpe_1s_deg, "°", 2),
         str(agent.rpe_1s_n),
-        _value_text(agent.joined_s, "s"),
+        _value_text(agent.shared_map_s, "s"),
         _value_text(agent.rate_hz, "Hz"),
         _value_text(agent.kb_up_s, "kB/s", 0),
         _value_text(agent.kb_down_s, "kB/s", 0),
         _value_text(agent.qoe, "", 2),
-        _value_text(agent.told_cm, "cm", 2),
+        _value_text(agent.estimated_error_cm, "cm", 2),
     )
 
 
 def _title(conditions: Conditions) -> str:
     c = conditions
     where = f"{c.session}: policy {c.policy}, {c.link or 'loopback'}, seed {c.seed}"
-    return f"{where}; in {c.clock}, evaluations report {c.told}"
+    return f"{where}; in {c.clock}, evaluations report {c.error_source}"
 
 
 def _value_text(value: float, unit: str, digits: int = 1) -> str:

@@ -27,9 +27,8 @@ from share.files.writing import atomic_write, lock_folder, sync_folder, writable
 from share.lab.calibrate.target import T_WORLD_TARGET, TARGET, target_mapping
 from share.lab.emulate import drawing
 from share.lab.emulate.drawing import ChunkJob
-from share.lab.emulate.plan_picture import draw_plan
 from share.lab.emulate.recipe import Progress, SessionRecipe, no_progress
-from share.lab.emulate.recordings import check_asl, to_asl, write_recording, write_truth
+from share.lab.emulate.recordings import check_asl, draw_plan, to_asl, write_recording, write_truth
 from share.lab.emulate.sensor.imager import ExposureSeries
 from share.lab.emulate.stage import Actor, PreparedSession, RoomStage, keep_room, prepare_session
 from share.lab.emulate.types import START_NS

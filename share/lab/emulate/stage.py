@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from pathlib import Path as FilePath
@@ -51,11 +50,6 @@ class Actor:
     shapes: tuple[Shape, ...]
     pictures: PictureTimes
 
-    @property
-    def clock_offset_ns(self) -> int:
-        """Return the path's first instant, at which the session begins."""
-        return self.path.start_ns
-
     def in_gap(self, true_ns: I64) -> NDArray[np.bool_]:
         """Return at which of the times (N,) there is no ground truth."""
         return in_gaps(self.path.gaps, true_ns)
@@ -85,7 +79,7 @@ class RoomStage:
         cost is per call, so ask for many at once."""
         actor = self.actors[actor_index]
         times = np.clip(true_ns, actor.path.start_ns, actor.path.end_ns)
-        others = self._other_parts(actor_index, times - actor.clock_offset_ns)
+        others = self._other_parts(actor_index, times - actor.path.start_ns)
         return [
             ActorView(T, {name: parts[k] for name, parts in others.items()})
             for k, T in enumerate(actor.path.poses(times))
@@ -109,7 +103,7 @@ class RoomStage:
         out = {}
         for k, actor in enumerate(self.actors):
             if k != actor_index:
-                own_ns = session_ns + actor.clock_offset_ns
+                own_ns = session_ns + actor.path.start_ns
                 out[actor.name] = actor.avatar.part_poses(
                     np.clip(own_ns, actor.path.start_ns, actor.path.end_ns)
                 )
@@ -192,13 +186,8 @@ def make_layout(recipe: SessionRecipe) -> Layout:
         return plain_layout(recipe.seed, recipe.size)
     if recipe.scene.lower().endswith(_GLTF_SUFFIXES):
         return _gltf_layout(recipe)
-    from share.lab.emulate.world.scenes import SCENES, make_scene_layout
+    from share.lab.emulate.world.scenes import make_scene_layout
 
-    if recipe.scene not in SCENES:
-        known = (*SCENES, PLAIN)
-        near = difflib.get_close_matches(recipe.scene, known, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}, or give a .glb file"
-        raise UsageError(f"scene '{recipe.scene}' is not known; {hint}")
     return make_scene_layout(recipe.scene, recipe.seed, recipe.size)
 
 

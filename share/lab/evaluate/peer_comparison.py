@@ -36,15 +36,15 @@ _FINAL_SUFFIX = ", final trajectory"
 
 @dataclass(frozen=True)
 class TrackerRow:
-    """Metrics of one tracker on one recording; NaN where unknown. `told`: fraction of the frames with a
-    pose. `most_cm`: largest position error."""
+    """Metrics of one tracker on one recording; NaN where unknown. `tracked_share`: of the frames, with a
+    pose. `max_cm`: largest position error."""
 
     recording: str
     tracker: str
     frames: int
-    told: float
+    tracked_share: float
     ate_cm: float
-    most_cm: float
+    max_cm: float
     rpe_1s_cm: float
     rpe_1s_deg: float
     cpu_ms: float = math.nan
@@ -122,7 +122,7 @@ def tracker_rows(
         atomic_write(stem.with_suffix(".tum"), format_tum(run.trajectory))
         if run.final is not None:
             new_rows.append(score_tracker(name, tracker.title + _FINAL_SUFFIX, source, run.final, []))
-            atomic_write(stem.with_name(f"{stem.name}-end.tum"), format_tum(run.final))
+            atomic_write(stem.with_name(f"{stem.name}-final.tum"), format_tum(run.final))
         document = {
             "made_by": made_by,
             "machine": describe_machine(),
@@ -225,9 +225,9 @@ def _medians(rows: Sequence[TrackerRow]) -> Iterator[TrackerRow]:
 
 
 def _cells(row: TrackerRow) -> list[str]:
-    cm = [format_number(value, ".2f") for value in (row.ate_cm, row.most_cm, row.rpe_1s_cm, row.rpe_1s_deg)]
+    cm = [format_number(value, ".2f") for value in (row.ate_cm, row.max_cm, row.rpe_1s_cm, row.rpe_1s_deg)]
     cpu = [format_number(value, ".1f") for value in (row.cpu_ms, row.cpu_mean_ms, row.cpu_p99_ms)]
-    return [row.recording, row.tracker, *cm, f"{100 * row.told:.1f}", *cpu]
+    return [row.recording, row.tracker, *cm, f"{100 * row.tracked_share:.1f}", *cpu]
 
 
 def draw_comparison(folder: Path, rows: Sequence[TrackerRow]) -> str:

@@ -117,7 +117,7 @@ def _section_text(path: Path) -> str:
 _AGENT_COLUMNS = [field.name for field in dataclasses.fields(AgentMetrics)]
 _CONDITION_COLUMNS = [field.name for field in dataclasses.fields(Conditions)]
 _RUN_COLUMNS = (
-    "in_one_map",
+    "agents_in_largest_map",
     "joint_ate_cm",
     "merges_requested",
     "merges_skipped",
@@ -232,7 +232,7 @@ def provenance(runs: Sequence[RunMetrics], trials: Sequence[Trial], failed: Sequ
         f"seeds: {_joined_names(str(c.seed) for c in conditions)}.",
         f"Machine: {'; '.join(sorted(machines))}; load before a run: {min(loads):g} to {max(loads):g}.",
         f"SHARE {_joined_names(r['version'] for r in records)}, {_code_states(conditions)}; "
-        f"estimated errors from {_joined_names(c.told for c in conditions)}.",
+        f"estimated errors from {_joined_names(c.error_source for c in conditions)}.",
     ]
     return "\n".join([*(f"* {line}" for line in lines), bullets(PROTOCOL)])
 

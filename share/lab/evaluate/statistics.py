@@ -71,18 +71,16 @@ _COMPARE_DIGITS = 9  # decimals to which two errors are compared
 
 @dataclass(frozen=True)
 class Measure:
-    """A quantity of a run. `name`: its column in sweep.csv. `label`: its name for readers, if another."""
+    """A quantity of a run. `name`: its column in sweep.csv."""
 
     name: str
     unit: str
     value_of: Callable[[RunMetrics], float]
-    label: str = ""
 
     @property
     def title(self) -> str:
-        """Label with unit."""
-        label = self.label or self.name
-        return f"{label}, {self.unit}" if self.unit else label
+        """Name with unit."""
+        return f"{self.name}, {self.unit}" if self.unit else self.name
 
 
 def _mean_over_kind(kind: str, value: Callable[[AgentMetrics], float]) -> Callable[[RunMetrics], float]:
@@ -102,17 +100,15 @@ MEASURES = (
     Measure("AR frames over 20 ms", "%", _mean_over_kind("ar", lambda a: 100 * a.over_20ms)),
     Measure("AR corrections", "ms", _mean_over_kind("ar", lambda a: a.corrected_ms)),
     Measure("robot latency", "ms", _mean_over_kind("robot", lambda a: a.latency_ms)),
-    Measure("merges a metre", "1/m", lambda run: run.merges_per_metre, "merges per metre"),
+    Measure("merges per metre", "1/m", lambda run: run.merges_per_metre),
     Measure("AR ATE in the map", "cm", _mean_over_kind("ar", lambda a: a.ate_cm)),
     Measure("robot ATE in the map", "cm", _mean_over_kind("robot", lambda a: a.ate_cm)),
-    Measure("AR error told", "cm", _mean_over_kind("ar", lambda a: a.told_cm), "AR estimated error"),
-    Measure("robot error told", "cm", _mean_over_kind("robot", lambda a: a.told_cm), "robot estimated error"),
+    Measure("AR estimated error", "cm", _mean_over_kind("ar", lambda a: a.estimated_error_cm)),
+    Measure("robot estimated error", "cm", _mean_over_kind("robot", lambda a: a.estimated_error_cm)),
     Measure("joint ATE", "cm", lambda run: run.joint_ate_cm),
     Measure("AR RPE over 1 s", "cm", _mean_over_kind("ar", lambda a: a.rpe_1s_cm)),
-    Measure(
-        "AR until in a shared map", "s", _mean_over_kind("ar", lambda a: a.joined_s), "AR time to shared map"
-    ),
-    Measure("agents in one map", "", lambda run: float(run.in_one_map)),
+    Measure("AR time to shared map", "s", _mean_over_kind("ar", lambda a: a.shared_map_s)),
+    Measure("agents in one map", "", lambda run: float(run.agents_in_largest_map)),
     Measure("AR keyframes sent", "Hz", _mean_over_kind("ar", lambda a: a.rate_hz)),
     Measure("AR QoE", "", _mean_over_kind("ar", lambda a: a.qoe)),
     Measure("robot QoE", "", _mean_over_kind("robot", lambda a: a.qoe)),

@@ -35,7 +35,7 @@ def _views(poses: F64, target, rig, rng: np.random.Generator) -> list[BoardView]
 def test_cameras_are_found_on_the_imu(name: str, seed: int) -> None:
     room, made, rng = make_scene_layout("board", seed), load_profile(name), np.random.default_rng(seed)
     rig = made.rig()
-    path = plan_motions(["board:"], room, SECONDS, seed).agents[0].path.turned(rig.T_body_cam0[:3, :3].T)
+    path = plan_motions(["board:"], room, SECONDS, seed).agents[0].path.with_axes(rig.T_body_cam0[:3, :3].T)
     imu = EmulatedDevice(made, None, (seed,), path.start_ns).imu_streams(path).to_batch()
     stamps = path.start_ns + np.arange(0.2, SECONDS - 0.2, 0.1) * 1e9
     poses = path.poses((stamps + SHIFT_S * 1e9).astype(np.int64)) @ rig.T_body_cam0

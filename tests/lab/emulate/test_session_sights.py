@@ -25,7 +25,7 @@ def nearest_view(stage, who, other, times):
     """The time at which the other is nearest to the middle of the image and in front, and its place (px)."""
     a, b = stage.actors[who], stage.actors[other]
     T_cam_world = se3.inverse(a.path.poses(times) @ T_body_camera(a.rig, "cam0"))
-    chest = b.path.poses(times - a.clock_offset_ns + b.clock_offset_ns)[:, :3, 3] - (0, 0, CHEST_M)
+    chest = b.path.poses(times - a.path.start_ns + b.path.start_ns)[:, :3, 3] - (0, 0, CHEST_M)
     p = np.einsum("nij,nj->ni", T_cam_world[:, :3, :3], chest) + T_cam_world[:, :3, 3]
     ahead = p[:, 2] / np.linalg.norm(p, axis=1)
     k = int(np.argmax(ahead))

@@ -58,7 +58,7 @@ def test_ratios_are_of_sessions_that_both_have_played():
     share = found("share")
     assert share["AR latency"] == pytest.approx((15.0, 30 / 50))
     assert share["robot latency"] == pytest.approx((42.0, 84 / 80))
-    assert share["merges a metre"] == pytest.approx((0.75, 30 / 150))
+    assert share["merges per metre"] == pytest.approx((0.75, 30 / 150))
     assert share["robot ATE in the map"] == pytest.approx((3.0, 3 / 2))  # in two it was in no map
     assert math.isnan(share["AR QoE"][0])
 

@@ -34,14 +34,12 @@ _BODY_MODULES: dict[str, ModuleType] = {"person": walk, "robot": robot}
 
 @dataclass(frozen=True)
 class MotionPreferences:
-    """body_kind: `person` or `robot`. speed: m/s. length: m to travel, None for any. start_near: (x, y) m,
-    where to start."""
+    """body_kind: `person` or `robot`. speed: m/s. length: m to travel, None for any."""
 
     body_kind: str
     speed: float
     pauses_per_minute: float
     length: float | None = None
-    start_near: tuple[float, float] | None = None
 
     @property
     def limits(self) -> MotionLimits:
@@ -119,8 +117,7 @@ def _plan_route(
     body = _BODY_MODULES[preferences.body_kind]
     target_speeds = _target_speeds(preferences, body.INITIAL_STILL_S, duration, rng)
     longest = 1.3 * max(target_speeds.sum() * STEP_S, preferences.length or 0.0) + 1.0
-    start = None if preferences.start_near is None else np.array(preferences.start_near)
-    legs = ground.graph_of(preferences.body_kind).random_tour(longest, rng, start)
+    legs = ground.graph_of(preferences.body_kind).random_tour(longest, rng)
     if not legs:
         return None
     route: Route = body.route_from_legs(ground.floor, legs)

@@ -46,7 +46,7 @@ from share.lab.emulate.motion.spline import read_tum_path
 from share.lab.emulate.types import MotionPath
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
-from share.types import F64, I64, AgentKind
+from share.types import F64, AgentKind
 
 PAPER_S = 60.0
 PAPER_NAMES = ("user1", "user2", "robot")
@@ -81,7 +81,6 @@ def _paper_agent(name: str, length: float, height: float) -> SimulatedAgent:
     return SimulatedAgent(name, preferences, height, length=length)
 
 
-_MIN_SESSION_S, _MAX_SESSION_S = 3.0, 3600.0
 _GAZE_TARGETS = 150
 _GAZE_TARGET_HEIGHTS_M = (0.3, 2.3)
 _EYE_HEIGHTS_M = (1.60, 1.75)
@@ -93,8 +92,8 @@ class PlannedAgent:
     """One agent. body_kind: its looks, `person`, `robot` or `drone`.
 
     T_body_cam0 (4, 4): the camera's pose on the body, where a recorded motion has its own rig, else None:
-    that of the sensor's profile (a simulated body is the profile's IMU). images_ns (M,): stamps of the
-    recorded images, if any; imu: noise of the recorded IMU. spec: as given by the user. notes: text for the
+    that of the sensor's profile (a simulated body is the profile's IMU). imu: noise of the
+    recorded IMU. spec: as given by the user. notes: text for the
     user. has_camera_axes: the body has camera axes, x right, y down, z ahead.
     """
 
@@ -104,7 +103,6 @@ class PlannedAgent:
     path: MotionPath
     spec: str
     T_body_cam0: F64 | None = None
-    images_ns: I64 | None = None
     imu: ImuNoise | None = None
     notes: tuple[str, ...] = ()
     has_camera_axes: bool = False
@@ -136,10 +134,6 @@ def plan_motions(specs: Sequence[str], layout: Layout, seconds: float, seed: int
     Raises UsageError for an invalid spec, a name given twice, or paths that do not fit into the room,
     DataError for a damaged recording.
     """
-    if not _MIN_SESSION_S <= seconds <= _MAX_SESSION_S:
-        raise UsageError(
-            f"{seconds:g} seconds: a session lasts {_MIN_SESSION_S:g} to {_MAX_SESSION_S:g} seconds"
-        )
     requests = _named_specs(specs)
     recorded_agents = [_recorded_agent(a, seconds) for a in requests if isinstance(a.spec, RecordedSpec)]
     paths_to_place = [PathToPlace(agent.name, agent.body_kind, agent.path) for agent in recorded_agents]
@@ -199,10 +193,8 @@ def _recorded_agent(request: _NamedSpec, seconds: float) -> PlannedAgent:
     options = recorded.EUROC_OPTIONS if isinstance(spec, EurocSpec) else recorded.TUMVI_OPTIONS
     recording = recorded.open_recorded_motion(File(spec.path), options, spec.start, longest)
     notes = (*recording.notes, *_short_note(recording.path, seconds))
-    mount, stamps = recording.T_body_cam0, recording.images_ns
-    return PlannedAgent(
-        request.name, kind, spec.look, recording.path, request.text, mount, stamps, recording.noise, notes
-    )
+    mount, noise = recording.T_body_cam0, recording.noise
+    return PlannedAgent(request.name, kind, spec.look, recording.path, request.text, mount, noise, notes)
 
 
 def _board_agent(

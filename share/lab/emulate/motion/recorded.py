@@ -1,9 +1,9 @@
 """Recorded motions: from an EuRoC or TUM-VI folder to the path of its IMU, placed in a room.
 
 The path is known at every instant by a batch fit of IMU and motion capture (`share.lab.mocap.path`). A folder
-has one of two forms. ASL, as published: mav0/{imu0,cam0}/data.csv, ground truth, and sensor.yaml files or
-dso/{camchain,imu_config}.yaml. Plain: imu0.csv, groundtruth.csv, cam_timestamps.txt, and Kalibr's two chains
-there or in ../calib. Images are not needed.
+has one of two forms. ASL, as published: mav0/imu0/data.csv, ground truth, and sensor.yaml files or
+dso/{camchain,imu_config}.yaml. Plain: imu0.csv, groundtruth.csv, and Kalibr's two chains there or in
+../calib. Images are not needed.
 """
 
 from __future__ import annotations
@@ -86,12 +86,6 @@ class RecordedPath:
             raise ValueError("T_world_old: turns about more than the vertical")
         return replace(self, T_world_fit=T_world_old @ self.T_world_fit)
 
-    def cut(self, start_ns: int, end_ns: int) -> RecordedPath:
-        """Return the motion between two stamps of the same clock. Raises ValueError outside the span."""
-        if not self.start_ns <= start_ns < end_ns <= self.end_ns:
-            raise ValueError(f"{start_ns} .. {end_ns} ns: is not within {self.start_ns} .. {self.end_ns} ns")
-        return replace(self, start_ns=start_ns, end_ns=end_ns)
-
     def _checked_stamps(self, stamps_ns: I64) -> I64:
         stamps = np.asarray(stamps_ns, np.int64)
         if len(stamps) and not self.start_ns <= stamps.min() <= stamps.max() <= self.end_ns:
@@ -133,12 +127,11 @@ _RAW_MOCAP_FOLDERS = ("mocap0", "vicon0")
 @dataclass(frozen=True, eq=False)
 class RecordedMotion:
     """A recorded motion. T_body_cam0 (4, 4): pose of its first camera. noise: of its IMU's data sheet.
-    images_ns (M,): stamps of its images within the span. notes: text about the fit."""
+    notes: text about the fit."""
 
     path: RecordedPath
     T_body_cam0: F64
     noise: ImuNoise
-    images_ns: I64
     notes: tuple[str, ...]
 
 
@@ -148,7 +141,6 @@ class _MotionFiles:
 
     imu: Path
     truth: Path
-    images: Path
     mounting: Callable[[], tuple[F64, ImuNoise]]
 
 
@@ -176,9 +168,7 @@ def open_recorded_motion(
         raise type(error)(f"{folder}: {error}") from None
     start_ns, end_ns = max(first, int(mocap_fit.stamps_ns[0])), min(last, int(mocap_fit.stamps_ns[-1]))
     path = RecordedPath(mocap_fit, imu_part, start_ns, end_ns, np.eye(4))
-    images = _read_stamps(files.images)
-    images = images[(images >= start_ns) & (images <= end_ns)]
-    return RecordedMotion(path, T_body_cam0, noise, images, (_fit_note(path),))
+    return RecordedMotion(path, T_body_cam0, noise, (_fit_note(path),))
 
 
 def _find_files(folder: Path) -> _MotionFiles:
@@ -199,9 +189,7 @@ def _plain_files(folder: Path) -> _MotionFiles:
         T = kalibr_T_imu_cam(read_yaml(calib / CAMCHAIN).section("cam0"))
         return T, imu_noise(read_yaml(calib / IMU_CHAIN).section("imu0"), "update_rate")
 
-    return _MotionFiles(
-        folder / "imu0.csv", folder / "groundtruth.csv", folder / "cam_timestamps.txt", mounting
-    )
+    return _MotionFiles(folder / "imu0.csv", folder / "groundtruth.csv", mounting)
 
 
 def _asl_files(root: Path) -> _MotionFiles:
@@ -219,17 +207,12 @@ def _asl_files(root: Path) -> _MotionFiles:
         imu, cam0 = read_yaml(root / "imu0" / "sensor.yaml"), read_yaml(root / "cam0" / "sensor.yaml")
         return se3.inverse(imu.pose("T_BS")) @ cam0.pose("T_BS"), imu_noise(imu, "rate_hz")
 
-    return _MotionFiles(root / "imu0" / "data.csv", truth, root / "cam0" / "data.csv", mounting)
+    return _MotionFiles(root / "imu0" / "data.csv", truth, mounting)
 
 
 def _read_imu(path: Path) -> ImuBatch:
     stamps, values = tables.read_table(path, 7)
     return ImuBatch(stamps, values[:, :3], values[:, 3:])
-
-
-def _read_stamps(path: Path) -> I64:
-    """Return the first column of a list of images."""
-    return tables.parse_rows(path, ",", 1, lambda fields, where: (tables.parse_ns(fields[0], where),))[0]
 
 
 def _span(

@@ -98,12 +98,12 @@ class FloorGraph:
         """Return places (N, 2) m where a body may be."""
         return np.asarray(self._cells * self.floor.step + self.floor.origin, np.float64)
 
-    def random_tour(self, length: float, rng: Rng, start: F64 | None = None) -> list[F64]:
-        """Return legs (n, 2) m, end to end, from the place nearest to `start` (2,) m, at least `length` m in
-        all, preferring to continue ahead where they join. Empty where there is no free place."""
+    def random_tour(self, length: float, rng: Rng) -> list[F64]:
+        """Return legs (n, 2) m, end to end, from a random place, at least `length` m in all, preferring to
+        continue ahead where they join. Empty where there is no free place."""
         if len(self._cells) < 2:
             return []
-        at = int(rng.integers(len(self._cells))) if start is None else self.nearest(start)
+        at = int(rng.integers(len(self._cells)))
         legs: list[F64] = []
         done, ahead = 0.0, None
         while done < length:
@@ -114,10 +114,6 @@ class FloorGraph:
             ahead = leg[-1] - leg[max(-6, -len(leg))]
             legs.append(leg)
         return legs
-
-    def nearest(self, xy: F64) -> int:
-        """Return the index of the free place nearest to xy (2,) m."""
-        return int(np.argmin(np.linalg.norm(self.places - xy, axis=1)))
 
     def _next_leg(self, start_cell: int, ahead: F64 | None, rng: Rng) -> tuple[F64, int]:
         from scipy.sparse.csgraph import dijkstra

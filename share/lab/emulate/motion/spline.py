@@ -17,16 +17,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.lab.emulate.types import GRAVITY
 from share.recordings.trajectory import Trajectory, read_tum
-from share.types import F64, I64, ImuBatch
+from share.types import F64, I64
 
 SPLINE_DEGREE = 5
 _NO_GAPS = np.zeros((0, 2), np.int64)
@@ -42,7 +41,7 @@ class SplinePath:
     position: Any
     quaternion: Any
     gaps: I64 = field(default_factory=lambda: _NO_GAPS)
-    recorded: ImuBatch | None = None
+    recorded: ClassVar[None] = None  # its IMU is simulated
 
     def poses(self, stamps_ns: I64) -> F64:
         """Return T_world_body (N, 4, 4). Raises ValueError outside the span."""
@@ -82,23 +81,6 @@ class SplinePath:
             self, quaternion=_with_coefficients(self.quaternion, quaternion_product(self.quaternion.c, turn))
         )
 
-    def cut(self, start_ns: int, end_ns: int) -> SplinePath:
-        """Return the motion between two stamps of the same clock. Raises ValueError outside the span."""
-        if not self.start_ns <= start_ns < end_ns <= self.end_ns:
-            raise ValueError(f"{start_ns} .. {end_ns} ns: is not within {self.start_ns} .. {self.end_ns} ns")
-        shift = (start_ns - self.start_ns) / 1e9
-        moved = [_with_coefficients(s, s.c, s.t - shift) for s in (self.position, self.quaternion)]
-        keep = (self.gaps[:, 1] > start_ns) & (self.gaps[:, 0] < end_ns)
-        return replace(
-            self,
-            start_ns=start_ns,
-            end_ns=end_ns,
-            position=moved[0],
-            quaternion=moved[1],
-            gaps=self.gaps[keep].clip(start_ns, end_ns),
-            recorded=_samples_between(self.recorded, start_ns, end_ns),
-        )
-
     def _seconds(self, stamps_ns: I64) -> F64:
         stamps = np.asarray(stamps_ns, np.int64)
         if len(stamps) and not self.start_ns <= stamps.min() <= stamps.max() <= self.end_ns:
@@ -109,9 +91,7 @@ class SplinePath:
         return (stamps - self.start_ns) / 1e9
 
 
-def spline_through(
-    start_ns: int, seconds: F64, p: F64, q: F64, gaps: ArrayLike = (), recorded: ImuBatch | None = None
-) -> SplinePath:
+def spline_through(start_ns: int, seconds: F64, p: F64, q: F64) -> SplinePath:
     """Return the spline through positions p (N, 3) m and quaternions q (N, 4) xyzw, of any signs, at
     `seconds` (N,), rising from 0. Raises ValueError for fewer than 6 knots."""
     from scipy.interpolate import make_interp_spline
@@ -123,8 +103,6 @@ def spline_through(
         end_ns=start_ns + int(np.floor(seconds[-1] * 1e9)),
         position=make_interp_spline(seconds, p, k=SPLINE_DEGREE),
         quaternion=make_interp_spline(seconds, continuous_quaternions(q), k=SPLINE_DEGREE),
-        gaps=np.asarray(gaps, np.int64).reshape(-1, 2),
-        recorded=recorded,
     )
 
 
@@ -151,16 +129,11 @@ def quaternion_product(a: F64, b: F64) -> F64:
     return np.concatenate([vector, aw * bw - np.sum(av * bv, axis=-1, keepdims=True)], axis=-1)
 
 
-def _with_coefficients(spline: Any, c: F64, t: F64 | None = None) -> Any:
-    return type(spline)(spline.t if t is None else t, c, spline.k)
+def _with_coefficients(spline: Any, c: F64) -> Any:
+    return type(spline)(spline.t, c, spline.k)
 
 
-def _samples_between(imu: ImuBatch | None, start_ns: int, end_ns: int) -> ImuBatch | None:
-    if imu is None:
-        return None
-    keep = (imu.stamps_ns >= start_ns) & (imu.stamps_ns <= end_ns)
-    return imu.take(keep)
-
+# `tum:FILE`, the path through the poses of a file.
 
 _GAP_FACTOR = 4.0  # times the usual step
 _MIN_GAP_S = 0.1

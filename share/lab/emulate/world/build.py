@@ -25,9 +25,7 @@ def draw_material(material: Material | GivenMaterial, seed: int) -> U8:
     """Return the picture of one material in the room `seed`."""
     if isinstance(material, GivenMaterial):
         return material.pixels
-    rng = np.random.default_rng(
-        (seed, zlib.crc32(material.kind.encode()), material.variant, len(material.text))
-    )
+    rng = np.random.default_rng((seed, zlib.crc32(material.kind.encode()), material.variant, 0))
     kind = MATERIAL_KINDS[material.kind]
     mean = kind.gray + rng.normal(0, kind.gray_sigma) if material.gray is None else material.gray
     if material.is_fitted:
@@ -54,9 +52,7 @@ def mean_albedo(pictures: U8) -> F32:
 def _print_sheet(material: Material, rng: np.random.Generator) -> U8:
     """Return all prints of one picture."""
     n = material.cells
-    rows = [
-        [PRINTS[material.kind](rng, PICTURE_TEXELS // n, material.text) for _ in range(n)] for _ in range(n)
-    ]
+    rows = [[PRINTS[material.kind](rng, PICTURE_TEXELS // n) for _ in range(n)] for _ in range(n)]
     return np.block(rows)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -61,7 +62,10 @@ def make_scene_layout(name: str, seed: int, size: Size | None = None) -> Layout:
     """Return the room `name` of this seed; `size` (x, y, z) m instead of its default. Deterministic. Raises
     UsageError for an unknown scene or an unsupported size, ValueError for a negative seed."""
     if name not in SCENES:
-        raise UsageError(f"scene '{name}' is not known; known: {', '.join(SCENES)}")
+        known = (*SCENES, "plain")
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}, or give a .glb file"
+        raise UsageError(f"scene '{name}' is not known; {hint}")
     if seed < 0:
         raise ValueError(f"seed {seed} must not be negative")
     scene = SCENES[name]
