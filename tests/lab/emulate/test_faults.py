@@ -83,7 +83,7 @@ def as_it_was(before, after):
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_the_same_twice_and_the_recording_is_left_alone(name, frames, truth):
+def test_a_fault_is_deterministic_and_leaves_the_recording_unchanged(name, frames, truth):
     kept = [[image.copy() for image in images(f)] for f in frames]
     first, again = done(name, frames, truth), done(name, frames, truth)
     assert all(
@@ -97,7 +97,7 @@ def test_the_same_twice_and_the_recording_is_left_alone(name, frames, truth):
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_something_goes_wrong_and_only_that(name, frames, truth):
+def test_a_fault_changes_only_its_streams(name, frames, truth):
     after = done(name, frames, truth)
     assert (np.diff([f.stamp_ns for f in after]) > 0).all()
     assert all(f.image0.shape == f.image1.shape == SHAPE and f.image0.dtype == np.uint8 for f in after)
@@ -109,7 +109,7 @@ def test_something_goes_wrong_and_only_that(name, frames, truth):
     assert all(shown) == (name in IMU_FAULTS)
 
 
-def test_clean_is_clean(frames, truth):
+def test_the_clean_fault_changes_nothing(frames, truth):
     assert done("clean", frames, truth) is frames
 
 
@@ -151,7 +151,7 @@ def test_bad_stamps_go_through_the_sequencer(frames):
 
 
 @pytest.mark.parametrize(("name", "lasts"), [("black", 2.0), ("covered", 2.0), ("white_wall", 3.0)])
-def test_for_a_while_in_both_cameras(name, lasts, frames, truth):
+def test_a_temporary_fault_affects_both_cameras_for_its_duration(name, lasts, frames, truth):
     after = done(name, frames, truth)
     since = seconds(frames) - 0.4 * seconds(frames)[-1]
     inside = (since >= 0) & (since < lasts)
@@ -200,7 +200,7 @@ def turning(frames, way, rate=3.0):
     ]
 
 
-def test_blur_is_as_long_as_the_way_and_along_it(frames, truth):
+def test_blur_has_the_length_and_direction_of_the_image_motion(frames, truth):
     about_z, about_y = (turning(frames, way) for way in (2, 1))  # the body's z is up
     for after in (done("blur", about_z, truth)[10], done("blur", about_y, truth)[10]):
         assert np.abs(after.image0 - after.image1.astype(int)).max() == 0
@@ -216,7 +216,7 @@ def test_blur_is_as_long_as_the_way_and_along_it(frames, truth):
 # ------------------------------------------------------------------ IMU
 
 
-def test_an_imu_that_is_silent(frames, truth):
+def test_a_silent_imu_has_no_samples(frames, truth):
     until = int(0.4 * len(frames))
     second, dead, never = (
         [len(f.imu) == 0 for f in done(name, frames, truth)]
@@ -228,7 +228,7 @@ def test_an_imu_that_is_silent(frames, truth):
     assert all(never)
 
 
-def test_an_imu_at_its_end(frames, truth):
+def test_a_saturating_imu_is_clipped(frames, truth):
     for name in ("gyro", "accel"):
         before, after = (
             np.concatenate([getattr(f.imu, name) for f in some])
@@ -294,7 +294,7 @@ def ride(frames, truth):
     return seconds(frames), truth.T @ RIG.T_body_cam0
 
 
-def test_what_was_part_of_the_room_goes_off_slowly(ride):
+def test_a_starting_panel_moves_off_slowly(ride):
     t, T_world_cam = ride
     panel = Panel(1.1, 1.4)
     T = moving_panel.path_starts(t, T_world_cam, CAMERA, panel, 5.0)
@@ -310,7 +310,7 @@ def test_what_was_part_of_the_room_goes_off_slowly(ride):
     assert np.ptp(stays, axis=0).max() == 0
 
 
-def test_no_place_for_a_panel(ride):
+def test_a_panel_without_a_free_place_is_refused(ride):
     """Who goes straight ahead by 1 m/s would run into it."""
     t, T_world_cam = ride
     ahead = T_world_cam.copy()
@@ -319,7 +319,7 @@ def test_no_place_for_a_panel(ride):
         moving_panel.path_starts(t, ahead, CAMERA, Panel(1.1, 1.4), 5.0)
 
 
-def test_what_comes_in_moves_by_itself_and_stays_before_the_camera(ride):
+def test_a_coming_panel_moves_on_its_own_and_stays_in_view(ride):
     t, T_world_cam = ride
     T = moving_panel.path_comes(t, T_world_cam, 5.0, 10.0)
     there = ~np.isnan(T[:, 0, 0])
@@ -330,7 +330,7 @@ def test_what_comes_in_moves_by_itself_and_stays_before_the_camera(ride):
     assert p[:, 2] == pytest.approx(1.0, abs=0.05)
 
 
-def test_what_goes_along_is_fixed_in_the_view(ride):
+def test_a_following_panel_is_fixed_in_the_view(ride):
     t, T_world_cam = ride
     T = se3.inverse(T_world_cam) @ moving_panel.path_follows(t, T_world_cam, 5.0, 10.0)
     inside = (t > 6.6) & (t < 13.4)

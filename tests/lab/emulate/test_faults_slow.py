@@ -73,26 +73,26 @@ def each(not_yet):
 
 
 @pytest.mark.parametrize("session", SESSIONS)
-def test_clean(row_of, session):
+def test_a_clean_recording_is_tracked_accurately(row_of, session):
     clean = row_of(session, "clean")
     assert clean["ate_cm"] < 0.8
     assert clean["states"]["OK"] > 88  # a firestation has bare walls
 
 
 @each(FAR)
-def test_not_twice_as_far_off(row_of, session, fault):
+def test_the_error_is_at_most_doubled(row_of, session, fault):
     clean = max(row_of(session, "clean")["ate_cm"], LEAST_CM)
     assert row_of(session, fault)["ate_cm"] <= TIMES * clean
 
 
 @each({})
-def test_never_lost(row_of, session, fault):
+def test_tracking_is_never_lost(row_of, session, fault):
     row = row_of(session, fault)
     assert row["lost_s"] == 0
     assert row["stretches"] == 1
 
 
 @each(WRONG)
-def test_what_is_told_ok_is(row_of, session, fault):
+def test_frames_reported_ok_have_small_errors(row_of, session, fault):
     """Not off by more than 5 cm and more than three sigmas."""
     assert row_of(session, fault)["wrong_ok"] == 0

@@ -1,4 +1,4 @@
-"""Errors against what is told of them: against draws from a known covariance, and what must be so."""
+"""Consistency statistics on draws from a known covariance."""
 
 import numpy as np
 import pytest
@@ -34,13 +34,13 @@ def test_truth_drawn_from_the_covariance_is_consistent_in_any_world():
         )
 
 
-def test_too_small_a_covariance_shows():
+def test_too_small_a_covariance_raises_the_nees():
     T, cov, true = drawn(2000)
     found = deviations(T, cov / 4, true, np.zeros(len(T), np.int64))
     assert nees(found.errors[:, 3:], found.cov[:, 3:, 3:]).mean() == pytest.approx(12, rel=0.1)
 
 
-def test_errors_are_told_less_true_along_odom():
+def test_deviations_are_estimate_minus_truth_along_odom():
     true = np.tile(level(0.7, [1.0, 2.0, 3.0]), (2, 1, 1))
     told = true.copy()
     told[1] = level(0.01, [0, 0, 0]) @ told[1]
@@ -57,7 +57,7 @@ def test_a_wrong_tilt_is_not_aligned_away():
     np.testing.assert_allclose((yaw_alignment(tilted, truth) @ truth)[:3, 3], tilted[:3, 3], atol=1e-12)
 
 
-def test_each_stretch_is_laid_over_for_itself():
+def test_each_segment_is_aligned_on_its_own():
     T, cov, _ = drawn(20)
     broken = T.copy()
     broken[10:] = level(1.0, [4, 4, 0]) @ T[10:]
@@ -71,5 +71,5 @@ def test_nees_of_no_covariance_is_infinite():
     assert found[0] == np.inf and found[1] == pytest.approx(3)
 
 
-def test_inside_asks_for_every_axis():
+def test_share_within_requires_every_axis():
     assert share_within(np.array([[1.0, 3.1], [2.9, -2.9]]), np.ones((2, 2))) == 0.5

@@ -1,9 +1,9 @@
-"""What a fisheye lens is shown: points where they project, also to the sides and behind, and their depth."""
+"""Fisheye images: projected points, also to the sides and behind, and their depth."""
 
 import numpy as np
 from helpers.rendered import checker as checkered
 from helpers.rendered import furnished, looking, needs_opengl, plain
-from test_gl_place import corners_of_walls, saddles
+from test_gl_geometry import corners_of_walls, saddles
 
 from share.geometry.camera import Camera
 from share.geometry.se3 import inverse, transform
@@ -58,6 +58,6 @@ def test_every_pixel_is_of_one_face():
     ).any()  # beyond what the lens shows
 
 
-def test_the_corners_get_the_light_that_is_told():
+def test_vignetting_at_the_corners_is_as_configured():
     light = vignetting_gain(FISHEYE, 0.5)
     assert light[257, 255] > 0.999 and abs(light.min() - 0.5) < 0.01

@@ -1,4 +1,4 @@
-"""Machines that cannot draw: libraries that are really not there, in a process of its own."""
+"""Machines that cannot draw: libraries are missing, in a process of its own."""
 
 import os
 import subprocess
@@ -21,7 +21,7 @@ def answer(code, **environment):
 
 
 @needs_opengl
-def test_nothing_is_missing_where_all_is_there():
+def test_a_machine_that_can_draw_has_nothing_missing():
     assert answer(ASK) == ("None", "")
 
 
@@ -58,7 +58,7 @@ def test_a_missing_moderngl_names_the_extra():
 
 
 @needs_opengl
-def test_no_thread_draws_but_ours():
+def test_the_driver_draws_in_the_calling_thread():
     names = "[open(f'/proc/self/task/{t}/comm').read() for t in os.listdir('/proc/self/task')]"
     said, _ = answer(f"import os; {DRAW}; print({names})", LP_NUM_THREADS="7")
     assert "llvmpipe-" not in said.splitlines()[-1]

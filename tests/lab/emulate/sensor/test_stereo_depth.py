@@ -1,4 +1,4 @@
-"""The model against real block matching of noisy pairs, and what it does at edges and limits."""
+"""The depth model against block matching of noisy pairs, at edges and at limits."""
 
 import time
 

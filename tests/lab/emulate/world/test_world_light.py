@@ -153,7 +153,7 @@ def test_every_vertex_lies_inside_its_own_patch() -> None:
     assert len(np.unique(atlas.patch)) == 360 and np.isfinite(spread).all()
 
 
-def test_texels_keep_within_their_number() -> None:
+def test_the_number_of_texels_is_limited() -> None:
     mesh = quad((0, 0, 0), (100, 0, 0), (0, 100, 0), Material("screed")).mesh
     atlas = unfold_patches(mesh, np.zeros(4, np.int32), 16, 50_000)
     assert 30_000 < len(atlas.row) <= 50_000

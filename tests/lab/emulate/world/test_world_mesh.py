@@ -113,7 +113,7 @@ def test_pictures_stand_upright_and_are_not_mirrored() -> None:
         assert (mesh.uv[on] > 0.5).all()  # cell 3 of 2 x 2
 
 
-def test_decal_stands_proud_of_its_wall() -> None:
+def test_a_decal_lies_in_front_of_its_wall() -> None:
     mesh = decal((1, 2, 1), (-1, 0, 0), (0, 0, 1), Material("sign")).mesh
     assert mesh.vertices[:, 1] == pytest.approx(2 + DECAL_OFFSET_M)
     assert mesh.normals[0].tolist() == [0, 1, 0]

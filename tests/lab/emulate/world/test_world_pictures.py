@@ -64,12 +64,6 @@ def test_prints_of_a_picture_differ() -> None:
     assert len(cells) == 16
 
 
-def test_text_is_written() -> None:
-    assert (
-        draw_material(Material("sign", text="EXIT"), 2) != draw_material(Material("sign", text="STOP"), 2)
-    ).mean() > 0.02
-
-
 def test_noise_has_the_slope_asked_for() -> None:
     noise = cloud(np.random.default_rng(1), slope=1.0)
     amplitude = np.abs(np.fft.fft2(noise))

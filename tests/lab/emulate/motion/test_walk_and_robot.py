@@ -10,7 +10,7 @@ from share.lab.emulate.motion.walk import step_phase
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("speed", [0.6, 1.4])
-def test_a_person_moves_like_one(seed, speed):
+def test_a_walk_has_human_speeds_and_accelerations(seed, speed):
     path = person(seed, speed)
     stamps = every(path, 200)
     T, (rate, force) = path.poses(stamps), path.inertial(stamps)
@@ -78,7 +78,7 @@ def test_vibration_is_as_strong_as_asked_and_gone_at_rest():
     assert up[:400, 1].std() < 0.05
 
 
-def test_a_seed_is_a_motion():
+def test_the_motion_depends_on_the_seed_alone():
     stamps = every(person(), 30)
     person.cache_clear(), track.cache_clear()
     again = person()
@@ -86,7 +86,7 @@ def test_a_seed_is_a_motion():
     assert not np.allclose(again.poses(stamps), person(2).poses(stamps))
 
 
-def test_looks_at_others():
+def test_the_head_turns_to_other_agents():
     from share.lab.emulate.motion.walk import GazeAgent
     from share.lab.emulate.types import START_NS
 

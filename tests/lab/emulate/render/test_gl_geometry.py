@@ -1,4 +1,4 @@
-"""Where things are drawn: projected points, exact depth, tracks, movers; and the same bytes again."""
+"""Geometry of drawn images: projected points, exact depth, tracks, moving parts; determinism."""
 
 import cv2
 import numpy as np
@@ -130,7 +130,7 @@ def test_nothing_has_no_depth(boxes):
 
 
 @CAMERAS
-def test_same_bytes_again(camera, boxes):
+def test_drawing_is_deterministic(camera, boxes):
     moments = [SceneInstant(looking(0.1 + 0.01 * k)) for k in range(4)]
     again = GlRenderer(furnished())
     for shot in (moments[:1], moments):
@@ -182,7 +182,7 @@ def track(before, after, px, start):
 
 
 @pytest.mark.parametrize("camera", [D435I, EUROC], ids=["d435i", "euroc"])
-def test_movers_are_where_they_are(camera):
+def test_moving_parts_are_drawn_at_their_poses(camera):
     cube = box(np.full(3, -0.2), np.full(3, 0.2), 0)
     gray = np.full((64, 64), 40, np.uint8)
     renderer = GlRenderer(plain(gray, {"someone": (cube, cube)}))

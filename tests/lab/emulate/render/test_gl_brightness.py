@@ -1,4 +1,4 @@
-"""What brightness is drawn: gray levels, light, filters, motion blur, shading of movers."""
+"""Brightness of drawn images: gray levels, light, filters, motion blur, shading of moving parts."""
 
 import numpy as np
 import pytest
@@ -28,13 +28,13 @@ def test_gray_level_is_albedo_times_light():
             )  # beyond 255 too: what is exposed so is a sensor's
 
 
-def test_no_image_without_a_moment(boxes):
+def test_an_image_without_an_instant_is_refused(boxes):
     with pytest.raises(ValueError, match="instants"):
         boxes.radiance(D435I, [])
 
 
 @pytest.mark.parametrize("camera", [D435I, EUROC], ids=["d435i", "euroc"])
-def test_no_alias_of_a_fine_pattern(camera):
+def test_a_fine_pattern_is_not_aliased(camera):
     """Squares far smaller than a pixel are gray, not moire."""
     fine = plain(checker(128))
     small = Camera(
@@ -80,7 +80,7 @@ def test_a_pixel_is_the_mean_over_its_area(boxes):
     assert rms[16] < 0.6 * rms[4] < 0.6 * rms[1] < 1.5  # gray levels
 
 
-def test_limbs_have_shape():
+def test_moving_parts_are_shaded():
     """A mover's sides differ in brightness, by the world's directions and not by the camera's."""
     cube = box(np.full(3, -0.2), np.full(3, 0.2), 0)
     room = plain(np.full((64, 64), 100, np.uint8), {"someone": (cube,)})

@@ -34,7 +34,7 @@ def straight(length=10.0):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_tours_keep_off_things_and_are_smooth(seed):
+def test_tours_keep_clear_of_obstacles_and_are_smooth(seed):
     ground = floor()
     legs = FloorGraph(ground, 0.3).random_tour(40.0, np.random.default_rng(seed))
     assert all(np.allclose(a[-1], b[0]) for a, b in pairwise(legs))
@@ -43,14 +43,14 @@ def test_tours_keep_off_things_and_are_smooth(seed):
     assert np.linalg.norm(np.diff(way, 2, axis=0), axis=1).max() < 0.7 * POINT_SPACING_M
 
 
-def test_a_tour_stays_where_it_can_get_to():
+def test_a_tour_stays_in_the_connected_floor():
     split = floor(blocks=((4, 0, 5, 6),))
     for seed in range(5):
         way = np.concatenate(FloorGraph(split, 0.3).random_tour(10.0, np.random.default_rng(seed)))
         assert len(set((way[:, 0] > 4.5).tolist())) == 1
 
 
-def test_one_waits_for_another_who_crosses():
+def test_a_schedule_waits_for_a_crossing_agent():
     way, wanted = straight(), np.full(60, 1.0)
     most = speed_limit(way, MotionLimits(1.2, 2, 2, 1))
     t = np.arange(0, 13, STEP_S / 2)
@@ -64,7 +64,7 @@ def test_one_waits_for_another_who_crosses():
     assert (np.diff(polite) >= 0).all() and polite[-1] > 7
 
 
-def test_nobody_passes_through_one_who_stands_in_the_way():
+def test_no_schedule_passes_a_standing_agent():
     way = straight()
     found = plan_schedule(
         way, np.ones(len(way.distance)), np.full(60, 1.0), (MovingObstacle(np.array([[3.0, 0.0]]), 0.6),)
@@ -78,7 +78,7 @@ def test_nobody_passes_through_one_who_stands_in_the_way():
     )
 
 
-def test_one_goes_as_far_as_asked_and_slows_down_in_bends():
+def test_a_schedule_has_its_length_and_slows_down_in_bends():
     way = straight(30.0)
     most = speed_limit(way, MotionLimits(1.5, 2, 2, 1))
     assert plan_schedule(way, most, np.full(100, 1.0), (), 24.0)[-1] == pytest.approx(24.0, abs=0.3)
@@ -88,7 +88,7 @@ def test_one_goes_as_far_as_asked_and_slows_down_in_bends():
     assert (np.diff(v**2) / np.diff(way.distance) < 2.001).all()
 
 
-def test_two_people_and_a_robot_keep_apart_and_off_one_who_is_there():
+def test_simulated_agents_keep_their_distance_from_each_other_and_a_fixed_path():
     ground = FloorGraphs(floor())
     wishes = [
         MotionPreferences("person", 1.0, 2.0),
@@ -110,7 +110,7 @@ def test_two_people_and_a_robot_keep_apart_and_off_one_who_is_there():
     assert all(np.array_equal(a.position.c, b.position.c) for a, b in zip(paths, again, strict=True))
 
 
-def test_a_room_without_a_way_says_so(monkeypatch):
+def test_a_room_without_a_path_is_refused(monkeypatch):
     monkeypatch.setattr(crowds, "_ATTEMPTS", 3)
     tight = FloorGraphs(floor(size=(1.8, 1.8), blocks=()))
     members = [SimulatedAgent(str(k), MotionPreferences("person", 0.8, 0.0), 1.7) for k in range(6)]

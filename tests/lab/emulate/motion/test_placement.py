@@ -37,7 +37,7 @@ def test_a_flight_finds_room_around_it():
     assert np.array_equal(again.poses(every(path, 3)), path.poses(every(path, 3)))
 
 
-def test_what_stands_in_the_way_leaves_and_is_named():
+def test_obstacles_to_a_recorded_path_are_removed_and_named():
     layout = room((4.0, 3.0, 3.0), ((1.8, 1.3, 0), (2.2, 1.7, 2.8)), ((0, 0, 0), (0.1, 0.1, 0.1)))
     found, (path,), notes = place_paths(layout, [PathToPlace("d", "drone", flight(1.6))], (1,))
     xyz = path.poses(every(path, 30))[:, :3, 3]
@@ -46,14 +46,14 @@ def test_what_stands_in_the_way_leaves_and_is_named():
         assert "block0" in notes[0]
 
 
-def test_what_a_person_stands_in_leaves_even_if_the_head_is_free():
+def test_obstacles_below_the_head_are_removed():
     desk = room((4.0, 3.0, 2.6), ((0.7, 0.7, 0), (3.3, 2.3, 0.8)))
     head = replace(flight(1.2))
     assert place_paths(desk, [PathToPlace("p", "person", head)], (1,))[0].pieces == ()
     assert len(place_paths(desk, [PathToPlace("p", "drone", head)], (1,))[0].pieces) == 1
 
 
-def test_two_share_a_room_and_keep_apart():
+def test_two_recorded_paths_keep_their_distance():
     guests = [PathToPlace(str(k), "drone", flight(1.2, phase=k)) for k in range(2)]
     _, paths, _ = place_paths(room((7.0, 5.0, 3.0)), guests, (1,))
     a, b = (p.poses(every(p, 30))[:, :3, 3] for p in paths)
@@ -62,7 +62,7 @@ def test_two_share_a_room_and_keep_apart():
     assert (shared < 1.0).mean() > 0.4
 
 
-def test_what_does_not_fit_says_what_to_ask_for():
+def test_a_path_that_does_not_fit_is_refused_with_the_needed_size():
     with pytest.raises(UsageError, match=r"needs 6\.5 x 3\.5 x .*--size, such as 7,4,3,") as caught:
         place_paths(room((6.0, 4.0, 3.0)), [PathToPlace("d", "drone", flight(3.0))], (1,))
     assert "\n" not in str(caught.value)

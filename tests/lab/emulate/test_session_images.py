@@ -32,7 +32,7 @@ def nearest_view(stage, who, other, times):
     return times[k], a.rig.cam0.project(p[k : k + 1])[0], ahead[k]
 
 
-def test_two_who_look_at_each_other_are_in_the_images(small, tmp_path):
+def test_two_facing_agents_see_each_other(small, tmp_path):
     recipe = small_recipe(small, "ann=walk:", "bob=walk:", scene="whitewall", seconds=20.0, seed=2)
     prepared = prepare_session(recipe, tmp_path / "room", no_progress)
     keep_room(prepared, no_progress)

@@ -1,4 +1,4 @@
-"""The floor that furniture leaves to walk on."""
+"""The walkable share of the floor between furniture."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def plan() -> LayoutBuilder:
     return LayoutBuilder("hall", 0, (10.0, 6.0, 4.0), np.random.default_rng(0))
 
 
-def test_an_empty_hall(plan: LayoutBuilder) -> None:
+def test_an_empty_hall_is_walkable(plan: LayoutBuilder) -> None:
     """All but 0.45 m along the walls, to a cell of 0.1 m."""
     assert walkable_share(plan) == pytest.approx((10 - 0.9) * (6 - 0.9) / 60, abs=0.03)
 
 
-def test_only_what_stands_in_the_way_counts(plan: LayoutBuilder) -> None:
+def test_only_obstacles_reduce_the_walkable_share(plan: LayoutBuilder) -> None:
     empty = walkable_share(plan)
     plan.add_unchecked("line", box((2, 2, 0), (8, 4, 0.02), PAINT), solid=True)  # below the feet
     plan.add_unchecked("lamp", box((2, 2, 3), (8, 4, 3.2), PAINT), solid=True)  # above the head
@@ -38,7 +38,7 @@ def test_a_hall_cut_in_two_has_its_larger_half(plan: LayoutBuilder) -> None:
     assert walkable_share(plan) == pytest.approx((6 - 0.9) * (6 - 0.9) / 60, abs=0.03)
 
 
-def test_the_last_things_of_these_names_go_until_there_is_floor_enough(plan: LayoutBuilder) -> None:
+def test_the_last_named_pieces_are_removed_until_enough_floor_is_free(plan: LayoutBuilder) -> None:
     for k in range(4):
         plan.add_unchecked("gear", box((2 + 2 * k, 0, 0), (2.2 + 2 * k, 5.5, 2), PAINT), solid=True)
     plan.add_unchecked("van", box((0, 5.6, 0), (0.2, 5.8, 2), PAINT), solid=True)
