@@ -141,7 +141,9 @@ def test_tumvis_own_folder_is_read_as_raw_mocap(shared_data: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize(("start", "seconds"), [(200.0, None), (-1.0, 5.0), (10.0, 0.1)])
-def test_a_span_outside_the_recording_is_refused(shared_data: Path, start: float, seconds: float | None) -> None:
+def test_a_span_outside_the_recording_is_refused(
+    shared_data: Path, start: float, seconds: float | None
+) -> None:
     with pytest.raises(UsageError, match=r"of 83\.. s of IMU and truth"):
         open_recorded_motion(shared_data / "motion/euroc/V1_02_medium", EUROC_OPTIONS, start, seconds)
 

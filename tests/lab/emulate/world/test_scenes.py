@@ -103,7 +103,9 @@ def test_nothing_floats(name: str) -> None:
         ("whitewall", None, 0.5),
     ],
 )
-def test_most_of_the_floor_is_walkable_and_connected(name: str, size: tuple[float, float, float] | None, least: float) -> None:
+def test_most_of_the_floor_is_walkable_and_connected(
+    name: str, size: tuple[float, float, float] | None, least: float
+) -> None:
     for seed in range(4):
         share, connected = free_share(make_scene_layout(name, seed, size) if size else rooms(name)[seed])
         assert share >= least, seed

@@ -11,12 +11,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
+import moving_panel
 import numpy as np
+from moving_panel import Panel, draw_panel
 
 from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
-from share.lab.emulate import moving_panel
-from share.lab.emulate.moving_panel import Panel, draw_panel
 from share.recordings.trajectory import Trajectory
 from share.sensors.measurement import IMU, Measurement
 from share.types import F32, F64, U8, Frame, ImuBatch

@@ -4,19 +4,20 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers.experiments import experiment
 
 from share.config import SequencerConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.lab.emulate import moving_panel
-from share.lab.emulate.faults import FAULTS, apply_fault
-from share.lab.emulate.moving_panel import Panel, draw_panel, share_of_view
 from share.recordings.images import ArrayImage
 from share.recordings.trajectory import Trajectory
 from share.sensors.measurement import CAM0, CAM1, IMU, Measurement
 from share.sensors.sequencer import SequencerCounters, sequence_frames
 from share.types import Frame, ImuBatch
 
+moving_panel, sensor_faults = experiment("moving_panel"), experiment("sensor_faults")
+Panel, draw_panel, share_of_view = moving_panel.Panel, moving_panel.draw_panel, moving_panel.share_of_view
+FAULTS, apply_fault = sensor_faults.FAULTS, sensor_faults.apply_fault
 RATE_HZ, SECONDS, IMU_HZ = 10, 20, 200
 STEP_NS, IMU_NS = 10**9 // RATE_HZ, 10**9 // IMU_HZ
 SHAPE = HEIGHT, WIDTH = 90, 120

@@ -1,16 +1,14 @@
-"""How the inertial tracker bears each fault on its own, on 20 s of a walk. See measure_faults.py.
+"""How the inertial tracker copes with each fault on its own, on 20 s of a walk. See measure_faults.py.
 
 What is not good enough yet is in `FAR` and `WRONG`, with the figure: once it is, it fails here
 until it is taken out.
 """
 
-import importlib
 from functools import cache
-from pathlib import Path
 
 import pytest
+from helpers.experiments import experiment
 
-from share.lab.emulate.faults import FAULTS
 from share.lab.emulate.recipe import SessionRecipe
 from share.lab.emulate.render.context import missing_reason
 from share.lab.emulate.session import make_cached_session
@@ -19,7 +17,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}"),
 ]
-TOOLS = Path(__file__).resolve().parents[3] / "tools" / "experiments"
+FAULTS = experiment("sensor_faults").FAULTS
 SESSIONS = {
     "warehouse": SessionRecipe("warehouse", ("a=walk:",), 20.0, seed=7, profiles={"": "d435i:640x480@30"}),
     "firestation": SessionRecipe("firestation", ("a=walk:",), 20.0, seed=3),
@@ -42,19 +40,17 @@ WRONG = {
 @pytest.fixture(scope="module")
 def row_of():
     """The figures of a fault in a session; each is tracked once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(TOOLS)
-        tool = importlib.import_module("measure_faults")
+    tool = experiment("measure_faults")
 
-        @cache
-        def case(session):
-            return tool.case(f"{make_cached_session(SESSIONS[session])}/a", SESSIONS[session].seconds)
+    @cache
+    def case(session):
+        return tool.case(f"{make_cached_session(SESSIONS[session])}/a", SESSIONS[session].seconds)
 
-        @cache
-        def row(session, fault):
-            return tool.measured(case(session), FAULTS[fault])
+    @cache
+    def row(session, fault):
+        return tool.measured(case(session), FAULTS[fault])
 
-        yield row
+    return row
 
 
 def each(not_yet):
