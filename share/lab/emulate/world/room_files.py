@@ -25,7 +25,7 @@ from share.lab.emulate.world.mesh import Shape
 
 PLAIN = "plain"
 _PLAIN_FILE = "plain.json"
-_GL_FILE = "room.json"  # written by `share.lab.emulate.world.room_files`
+_GL_FILE = "room.json"  # written last
 
 
 def save_room_once(layout: Layout, movers: dict[str, tuple[Shape, ...]], folder: Path) -> None:
@@ -37,7 +37,6 @@ def save_room_once(layout: Layout, movers: dict[str, tuple[Shape, ...]], folder:
         atomic_write(folder / _PLAIN_FILE, json.dumps({"seed": layout.seed, "size": layout.size}))
         return
     from share.lab.emulate.world.build import build_room
-    from share.lab.emulate.world.room_files import save_room
 
     save_room(build_room(layout, movers), folder)
 
@@ -54,7 +53,6 @@ def open_renderer(folder: Path) -> RoomRenderer:
             x, y, z = (float(side) for side in data["size"])
             return PlainRenderer(int(data["seed"]), (x, y, z))
     from share.lab.emulate.render.gl import GlRenderer
-    from share.lab.emulate.world.room_files import load_room
 
     return GlRenderer(load_room(folder))
 
@@ -67,7 +65,6 @@ _ROOM_ARRAYS = ("size", "pictures", "light_uv", "light_map")
 def save_room(room: DrawableRoom, folder: Path) -> None:
     """Write `room` to `folder` atomically. An existing room is kept if another process was quicker. Raises
     UsageError where it cannot be written."""
-    folder = Path(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -83,9 +80,8 @@ def save_room(room: DrawableRoom, folder: Path) -> None:
 def load_room(folder: Path) -> DrawableRoom:
     """Return the room saved in `folder`, its arrays mapped read-only. Raises DataError where it is
     incomplete."""
-    folder = Path(folder)
     try:
-        head = read_json(folder / "room.json")
+        head = read_json(folder / _GL_FILE)
         if head["version"] != _VERSION:
             raise ValueError(f"version {head['version']}, expected {_VERSION}")
         movers = {
@@ -122,14 +118,14 @@ def _write(room: DrawableRoom, folder: Path) -> None:
         "mover_light": room.mover_light,
         "movers": [[name, len(parts)] for name, parts in room.agent_parts.items()],
     }
-    (folder / "room.json").write_text(json.dumps(head, indent=1))
+    (folder / _GL_FILE).write_text(json.dumps(head, indent=1))
 
 
 def _publish_folder(part: Path, folder: Path) -> None:
     try:
         os.rename(part, folder)
     except OSError:
-        if not (folder / "room.json").is_file():
+        if not (folder / _GL_FILE).is_file():
             raise
 
 

@@ -119,53 +119,46 @@ def _one_or_two(rng: Rng, x: float, w: float, d: float, h: float, y: float) -> l
     ]
 
 
-_PALLET_WIDTH, _PALLET_DEPTH, _PALLET_HEIGHT = 1.2, 0.8, 0.144
+_PALLET_W, _PALLET_D, _PALLET_H = 1.2, 0.8, 0.144
 
 
 def pallet(rng: Rng) -> Shape:
     """Top boards over stringers over nine blocks over skids."""
     skin, out = pick_material(rng, "wood"), []
-    for y in (-0.05, -_PALLET_DEPTH / 2, 0.05 - _PALLET_DEPTH):
-        out.append(box_on((0, y, 0), (_PALLET_WIDTH, 0.1, 0.022), skin, rng))
+    for y in (-0.05, -_PALLET_D / 2, 0.05 - _PALLET_D):
+        out.append(box_on((0, y, 0), (_PALLET_W, 0.1, 0.022), skin, rng))
         out += [box_on((x, y, 0.022), (0.145, 0.1, 0.078), skin, rng) for x in (-0.5275, 0, 0.5275)]
-    out += [
-        box_on((x, -_PALLET_DEPTH / 2, 0.1), (0.145, _PALLET_DEPTH, 0.022), skin, rng)
-        for x in (-0.5275, 0, 0.5275)
-    ]
-    tops = -np.linspace(0.06, _PALLET_DEPTH - 0.06, 6)
-    out += [box_on((0, y, 0.122), (_PALLET_WIDTH, 0.11, 0.022), skin, rng) for y in tops]
+    stringers = (-0.5275, 0, 0.5275)
+    out += [box_on((x, -_PALLET_D / 2, 0.1), (0.145, _PALLET_D, 0.022), skin, rng) for x in stringers]
+    tops = -np.linspace(0.06, _PALLET_D - 0.06, 6)
+    out += [box_on((0, y, 0.122), (_PALLET_W, 0.11, 0.022), skin, rng) for y in tops]
     return concat_shapes(out)
 
 
 def pallet_pile(rng: Rng, count: int) -> Shape:
     """A stack of bare pallets, slightly out of line."""
     shift = rng.uniform(-0.03, 0.03, count)
-    return concat_shapes(
-        [pallet(rng).placed_at(float(s), 0, k * _PALLET_HEIGHT) for k, s in enumerate(shift)]
-    )
+    return concat_shapes([pallet(rng).placed_at(float(s), 0, k * _PALLET_H) for k, s in enumerate(shift)])
 
 
 def loaded_pallet(rng: Rng, height: float) -> Shape:
     """A pallet with goods up to `height` m: cartons in layers, sacks, or a block under foil."""
     goods = (_carton_layers, _sacks, _wrapped_block)[int(rng.integers(3))]
-    return concat_shapes(
-        [
-            pallet(rng),
-            *(s.placed_at(0, 0, _PALLET_HEIGHT) for s in goods(rng, max(height - _PALLET_HEIGHT, 0.3))),
-        ]
-    )
+    base = pallet(rng)
+    load = goods(rng, max(height - _PALLET_H, 0.3))
+    return concat_shapes([base, *(s.placed_at(0, 0, _PALLET_H) for s in load)])
 
 
 def _carton_layers(rng: Rng, height: float) -> list[Shape]:
     nx, ny = int(rng.integers(2, 5)), int(rng.integers(1, 4))
     h = float(rng.uniform(0.2, 0.4))
-    w, d, out = _PALLET_WIDTH / nx, _PALLET_DEPTH / ny, []
+    w, d, out = _PALLET_W / nx, _PALLET_D / ny, []
     for k in range(max(1, int(height / h))):
         for i in range(nx):
             for j in range(ny):
                 if k and k >= int(height / h) - 1 and rng.random() < 0.3:
                     continue  # the top layer is incomplete
-                x = (i + 0.5) * w - _PALLET_WIDTH / 2
+                x = (i + 0.5) * w - _PALLET_W / 2
                 out.append(carton(rng, w - 0.012, d - 0.012, h - 0.002).placed_at(x, -j * d - 0.006, k * h))
     return out
 
@@ -183,12 +176,10 @@ def _sacks(rng: Rng, height: float) -> list[Shape]:
 
 
 def _wrapped_block(rng: Rng, height: float) -> list[Shape]:
-    low, high = (
-        (-_PALLET_WIDTH / 2 + 0.02, -_PALLET_DEPTH + 0.02, 0),
-        (_PALLET_WIDTH / 2 - 0.02, -0.02, height),
-    )
+    x = _PALLET_W / 2 - 0.02
+    low, high = (-x, -_PALLET_D + 0.02, 0), (x, -0.02, height)
     body = box(low, high, {"all": pick_material(rng, "foil"), "bottom": None}, rng)
-    return [body, front_print(rng, 0.05, height * 0.6, 0.21, 0.15, "label", -_PALLET_DEPTH + 0.02)]
+    return [body, front_print(rng, 0.05, height * 0.6, 0.21, 0.15, "label", -_PALLET_D + 0.02)]
 
 
 _POST_M = 0.05
@@ -199,11 +190,7 @@ _BEAM_M = 0.07
 def goods_rack(rng: Rng, width: float, depth: float, height: float, pitch: float) -> Shape:
     """Posts, beams, boards about every `pitch` m, braced ends, cartons and bins on every level. The goods on
     top stay below `height` + 0.35 m."""
-    paint, beam, board = (
-        pick_material(rng, "steel"),
-        pick_material(rng, "steel"),
-        pick_material(rng, "plywood"),
-    )
+    paint, beam, board = (pick_material(rng, kind) for kind in ("steel", "steel", "plywood"))
     levels = max(2, round(height / pitch))
     out = [corner_posts(width, depth, height, _POST_M, paint, rng), *_braces(rng, width, depth, height)]
     for k in range(levels):
@@ -296,44 +283,20 @@ def _cupboard_row(rng: Rng, width: float, depth: float, z: float, height: float)
     return out
 
 
-_LOCKER_WIDTH, _LOCKER_DEPTH, _LOCKER_HEIGHT = 0.4, 0.48, 1.85
-
-
 def lockers(rng: Rng, count: int) -> Shape:
     """A row of steel lockers on a plinth, each door with its vents, lock and number."""
-    skin, width = pick_material(rng, "steel"), count * _LOCKER_WIDTH
+    w, d, h = 0.4, 0.48, 1.85
+    skin, width = pick_material(rng, "steel"), count * w
     out = [
-        box_on(
-            (0, -_LOCKER_DEPTH / 2 - 0.01, 0),
-            (width - 0.04, _LOCKER_DEPTH - 0.06, 0.08),
-            Material("rubber"),
-            rng,
-        ),
-        box(
-            (-width / 2, -_LOCKER_DEPTH, 0.08), (width / 2, 0, _LOCKER_HEIGHT), {"all": skin, "+y": None}, rng
-        ),
+        box_on((0, -d / 2 - 0.01, 0), (width - 0.04, d - 0.06, 0.08), Material("rubber"), rng),
+        box((-width / 2, -d, 0.08), (width / 2, 0, h), {"all": skin, "+y": None}, rng),
     ]
     print_, cell = pick_print(rng, "locker")
     for k in range(count):
-        x = -width / 2 + k * _LOCKER_WIDTH + 0.008
-        out.append(
-            quad(
-                (x, -_LOCKER_DEPTH - 0.012, 0.1),
-                (_LOCKER_WIDTH - 0.016, 0, 0),
-                (0, 0, _LOCKER_HEIGHT - 0.12),
-                print_,
-                rng,
-                cell,
-            )
-        )
-        out.append(
-            box_on(
-                (x + 0.33, -_LOCKER_DEPTH - 0.02, 1.0),
-                (0.02, 0.02, 0.09),
-                pick_material(rng, "galvanised"),
-                rng,
-            )
-        )
+        x = -width / 2 + k * w + 0.008
+        out.append(quad((x, -d - 0.012, 0.1), (w - 0.016, 0, 0), (0, 0, h - 0.12), print_, rng, cell))
+        lock = pick_material(rng, "galvanised")
+        out.append(box_on((x + 0.33, -d - 0.02, 1.0), (0.02, 0.02, 0.09), lock, rng))
     return concat_shapes(out)
 
 
