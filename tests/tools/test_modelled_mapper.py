@@ -65,6 +65,7 @@ def test_latencies_are_those_of_the_real_mapper() -> None:
     assert model_ms[1] == pytest.approx(real_ms[1], rel=0.15)
 
 
+@pytest.mark.long
 def test_a_corrected_pose_is_the_truth_plus_the_drawn_error() -> None:
     sure = modelled_mapper.RecognitionModel(sigma_m=0.0, sigma_rad=0.0)
     for model, most_m in ((sure, 0.03), (replace(sure, sigma_m=0.5), 3.0)):
@@ -84,6 +85,7 @@ def test_a_corrected_pose_is_the_truth_plus_the_drawn_error() -> None:
         assert bool(abs(apart - true) > 0.03) is (model is not sure)
 
 
+@pytest.mark.long
 def test_the_error_estimate_contains_the_drawn_sigma() -> None:
     for sigma_m in (0.006, 0.02):
         estimate = played(
@@ -95,6 +97,7 @@ def test_the_error_estimate_contains_the_drawn_sigma() -> None:
         assert estimate == pytest.approx(np.hypot(100 * sigma_m * np.sqrt(3), sure), rel=0.05)
 
 
+@pytest.mark.long
 def test_views_below_the_required_overlap_are_never_merged() -> None:
     room = played(model=modelled_mapper.RecognitionModel(half_overlap=5.0, logistic_width=0.01))
     report = room.edge.report(room.mapper.report())
@@ -102,6 +105,7 @@ def test_views_below_the_required_overlap_are_never_merged() -> None:
     assert sorted(report["maps"].values()) == [24, 24]
 
 
+@pytest.mark.long
 def test_views_without_overlap_are_never_merged() -> None:
     room = played(model=modelled_mapper.RecognitionModel(half_overlap=-1.0), apart_m=1000.0)
     report = room.edge.report(room.mapper.report())
@@ -109,6 +113,7 @@ def test_views_without_overlap_are_never_merged() -> None:
     assert sorted(report["maps"].values()) == [24, 24]
 
 
+@pytest.mark.long
 def test_merge_gate_and_rates_are_those_of_the_policy() -> None:
     rooms = [played("share", seed) for seed in range(4)]
     reports = [room.edge.report(room.mapper.report()) for room in rooms]
@@ -116,6 +121,7 @@ def test_merge_gate_and_rates_are_those_of_the_policy() -> None:
     assert sum(report["merges"]["skipped"] for report in reports) > 0
 
 
+@pytest.mark.long
 def test_a_run_depends_on_its_seed_alone() -> None:
     first, again, other = (played(seed=seed) for seed in (1, 1, 2))
     assert latencies_ms(first) == latencies_ms(again) != latencies_ms(other)

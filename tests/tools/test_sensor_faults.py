@@ -83,6 +83,7 @@ def as_it_was(before, after):
 # ------------------------------------------------------------------ all
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_fault_is_deterministic_and_leaves_the_recording_unchanged(name, frames, truth):
     kept = [[image.copy() for image in images(f)] for f in frames]

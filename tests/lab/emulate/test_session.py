@@ -27,6 +27,8 @@ from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU
 from share.sensors.profile import load_profile
 from share.types import AgentKind
 
+pytestmark = pytest.mark.long
+
 SECONDS = 3.0
 TICK = 3e-6  # rad and m within the microsecond in which a D435i counts
 MOTIONS = ("ann=walk:", "robot:speed=0.5")

@@ -12,7 +12,10 @@ from share.lab.emulate.stage import RoomStage, T_body_camera, keep_room, prepare
 from share.lab.emulate.world.room_files import open_renderer
 from share.runtime.source import open_source
 
-pytestmark = pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}")
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}"),
+]
 CHEST_M = 0.3  # below the eyes
 
 

@@ -33,6 +33,7 @@ def test_pairs_with_a_missing_value_are_left_out(rng):
     assert all(math.isnan(value) for value in statistics.bootstrap_ratio([1.0], [0.0], ["a"], rng))
 
 
+@pytest.mark.long
 def test_the_interval_covers_the_mean_at_its_level():
     """Of 20 normal values; percentiles of so few are known to be a little narrow."""
     inside = 0
@@ -43,6 +44,7 @@ def test_the_interval_covers_the_mean_at_its_level():
     assert 0.89 < inside / 400 < 0.96
 
 
+@pytest.mark.long
 def test_the_interval_covers_the_mean_over_rooms_with_several_runs_each():
     """Rooms differ by 2, runs in one of them by 0.3: three seeds tell hardly more than one."""
     inside = 0

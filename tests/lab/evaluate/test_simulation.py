@@ -11,6 +11,8 @@ from share.config import Config, EdgeConfig
 from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation
 from share.net.channel import NETWORK_PRESETS
 
+pytestmark = pytest.mark.long
+
 ROOM = walls(1)
 
 

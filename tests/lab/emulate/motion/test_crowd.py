@@ -88,6 +88,7 @@ def test_a_schedule_has_its_length_and_slows_down_in_bends():
     assert (np.diff(v**2) / np.diff(way.distance) < 2.001).all()
 
 
+@pytest.mark.long
 def test_simulated_agents_keep_their_distance_from_each_other_and_a_fixed_path():
     ground = FloorGraphs(floor())
     wishes = [
@@ -110,6 +111,7 @@ def test_simulated_agents_keep_their_distance_from_each_other_and_a_fixed_path()
     assert all(np.array_equal(a.position.c, b.position.c) for a, b in zip(paths, again, strict=True))
 
 
+@pytest.mark.long
 def test_a_room_without_a_path_is_refused(monkeypatch):
     monkeypatch.setattr(crowds, "_ATTEMPTS", 3)
     tight = FloorGraphs(floor(size=(1.8, 1.8), blocks=()))

@@ -61,6 +61,7 @@ def test_a_missing_file_is_refused(warehouse, tmp_path):
         plan_motions([f"tum:{tmp_path}/none.tum"], warehouse, 10.0, 1)
 
 
+@pytest.mark.long
 def test_real_motion_is_placed(warehouse, shared_data):
     folder = shared_data / "motion" / "tumvi" / "room1"
     found = plan_motions([f"ann=tumvi:{folder},start=3", "robot:"], warehouse, 6.0, 1)

@@ -27,6 +27,7 @@ def flight(reach=1.5, seconds=10.0, phase=0.0):
     return spline_through(0, t, p, np.tile((0, 0, 0, 1.0), (len(t), 1)))
 
 
+@pytest.mark.long
 def test_a_flight_finds_room_around_it():
     layout = room((8.0, 5.0, 3.0), ((0, 0, 0), (3, 5, 2.9)))
     found, (path,), notes = place_paths(layout, [PathToPlace("d", "drone", flight())], (1,))
@@ -53,6 +54,7 @@ def test_obstacles_below_the_head_are_removed():
     assert len(place_paths(desk, [PathToPlace("p", "drone", head)], (1,))[0].pieces) == 1
 
 
+@pytest.mark.long
 def test_two_recorded_paths_keep_their_distance():
     guests = [PathToPlace(str(k), "drone", flight(1.2, phase=k)) for k in range(2)]
     _, paths, _ = place_paths(room((7.0, 5.0, 3.0)), guests, (1,))

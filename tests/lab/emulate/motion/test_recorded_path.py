@@ -18,6 +18,8 @@ from share.lab.emulate.motion.recorded import (
 from share.lab.emulate.types import GRAVITY
 from share.recordings import tables
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def euroc(shared_data: Path) -> RecordedMotion:

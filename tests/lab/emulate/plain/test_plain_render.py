@@ -10,6 +10,8 @@ from share.geometry.se3 import from_rt, inverse, transform
 from share.lab.emulate.plain.render import PlainRoomRenderer
 from share.lab.emulate.plain.room import make_room
 
+pytestmark = pytest.mark.long
+
 SECONDS = np.arange(0, 20, 0.05)
 
 

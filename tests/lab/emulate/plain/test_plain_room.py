@@ -1,6 +1,9 @@
 import numpy as np
+import pytest
 
 from share.lab.emulate.plain.room import make_room
+
+pytestmark = pytest.mark.long
 
 
 def test_the_room_depends_on_the_seed_alone():

@@ -8,7 +8,7 @@ from share.geometry.camera import Camera
 from share.lab.emulate.render.gl import GlRenderer
 from share.lab.emulate.types import DrawableRoom, SceneInstant
 
-pytestmark = needs_opengl
+pytestmark = [pytest.mark.long, needs_opengl]
 
 
 @pytest.fixture(scope="module")

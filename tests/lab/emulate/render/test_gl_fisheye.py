@@ -1,6 +1,7 @@
 """Fisheye images: projected points, also to the sides and behind, and their depth."""
 
 import numpy as np
+import pytest
 from helpers.rendered import checker as checkered
 from helpers.rendered import furnished, looking, needs_opengl, plain
 from test_gl_geometry import corners_of_walls, saddles
@@ -12,7 +13,7 @@ from share.lab.emulate.render.lens import fisheye_faces
 from share.lab.emulate.sensor.imager import vignetting_gain
 from share.lab.emulate.types import SceneInstant
 
-pytestmark = needs_opengl
+pytestmark = [pytest.mark.long, needs_opengl]
 LENS = (0.00348, 0.000715, -0.00205, 0.000203)
 FISHEYE = Camera(512, 512, 190.98, 190.97, 254.93, 256.90, LENS, "equidistant")
 WIDE = Camera(400, 300, 120.0, 120.0, 199.5, 149.5)  # no lens: what the fisheye's middle has to agree with

@@ -21,7 +21,7 @@ from share.geometry.se3 import inverse, transform
 from share.lab.emulate.render.gl import GlRenderer
 from share.lab.emulate.types import SceneInstant
 
-pytestmark = needs_opengl
+pytestmark = [pytest.mark.long, needs_opengl]
 CAMERAS = pytest.mark.parametrize("camera", [D435I, OFF_CENTRE, EUROC], ids=["d435i", "off-centre", "euroc"])
 
 

@@ -8,6 +8,8 @@ from share.lab.calibrate.target import AprilGrid, CharucoBoard
 from share.lab.emulate.world.scenes import make_scene_layout
 from share.lab.emulate.world.scenes.board import BLACK, WHITE, printed_sheet
 
+pytestmark = pytest.mark.long
+
 TARGETS = [AprilGrid(), AprilGrid(5, 7, 0.08, 0.28), CharucoBoard()]
 
 

@@ -101,6 +101,7 @@ ATTACKS = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ATTACKS)
 def test_a_file_that_is_too_large_is_refused(tmp_path, name):
     made, says = ATTACKS[name]

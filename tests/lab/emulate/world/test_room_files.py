@@ -16,6 +16,8 @@ from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import box
 from share.lab.emulate.world.room_files import load_room, save_room
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def peopled(small_layout: Layout) -> DrawableRoom:

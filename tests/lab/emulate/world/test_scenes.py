@@ -14,6 +14,8 @@ from share.lab.emulate.world.occupancy import Occupancy
 from share.lab.emulate.world.scenes import SCENES, corridor, make_scene_layout
 from share.types import F64
 
+pytestmark = pytest.mark.long
+
 CLEARANCE = 0.45  # m
 SMALL = (9.0, 6.0, 4.0)  # the paper's room
 SEEDS = range(8)

@@ -90,6 +90,7 @@ def test_textures_are_upright(hall: Layout) -> None:
     assert mesh.uv[high, 1] == pytest.approx(0) and mesh.uv[~high, 1] == pytest.approx(1)
 
 
+@pytest.mark.long
 def test_the_room_has_free_floor_and_light(hall: Layout) -> None:
     occupancy = Occupancy.from_layout(hall)
     at = np.array([(4.0, 3.0, 1.5), (6.0, 4.0, 0.5)])

@@ -19,6 +19,8 @@ from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import box, concat_shapes, join_meshes, panels, quad
 from share.types import F64
 
+pytestmark = pytest.mark.long
+
 BLACK = np.zeros(1, np.float32)
 NO_GLOW = np.zeros(1, bool)
 
