@@ -39,10 +39,7 @@ from share.types import F64
 
 PLAN_FILE = "plan.png"
 _CHUNK_FRAMES = 24  # in a chunk: the most that an interruption costs a process
-_IMAGE_BYTES = {
-    "jpeg": 130_000,
-    "png": 330_000,
-}  # estimated size of an image, to check the disk beforehand
+_IMAGE_BYTES = {"jpeg": 130_000, "png": 330_000}  # estimated, to check the disk beforehand
 
 
 def make_session(
@@ -85,85 +82,78 @@ def default_cache() -> Path:
 
 
 def _fill_session(
-    recipe: SessionRecipe, prepared: PreparedSession, growth: PartialSession, workers: int, progress: Progress
+    recipe: SessionRecipe,
+    prepared: PreparedSession,
+    partial: PartialSession,
+    workers: int,
+    progress: Progress,
 ) -> None:
-    stage, folder = prepared.stage, growth.session
+    actors, folder = prepared.stage.actors, partial.session
     keep_room(prepared, progress)
-    with Pool(workers, drawing.start_worker, (stage, recipe.images)) as pool:
-        exposures = [
-            _exposure_series(pool, stage, actor_index, growth.work, progress)
-            for actor_index in range(len(stage.actors))
-        ]
-        chunks = _draw_chunks(pool, stage, exposures, growth, progress)
-    progress("writing recordings", 0, len(stage.actors))
-    for k, (actor, files) in enumerate(zip(stage.actors, chunks, strict=True)):
-        write_recording(actor, files, folder / f"{actor.name}.mcap")
+    with Pool(workers, drawing.start_worker, (prepared.stage, recipe.images)) as pool:
+        exposures = [_metered_exposures(pool, actor, k, partial, progress) for k, actor in enumerate(actors)]
+        jobs = [_chunk_jobs(actor, k, exposures[k], partial) for k, actor in enumerate(actors)]
+        _draw_chunks(pool, [job for actor_jobs in jobs for job in actor_jobs], progress)
+    progress("writing recordings", 0, len(actors))
+    for k, actor in enumerate(actors):
+        write_recording(actor, [job.file for job in jobs[k]], folder / f"{actor.name}.mcap")
         write_truth(actor, folder / "truth" / f"{actor.name}.tum")
-        progress("writing recordings", k + 1, len(stage.actors))
-    draw_plan(folder / PLAN_FILE, prepared.layout, stage.actors)
+        progress("writing recordings", k + 1, len(actors))
+    draw_plan(folder / PLAN_FILE, prepared.layout, actors)
     atomic_write(folder / SESSION_FILE, _session_yaml(recipe, prepared))
 
 
-def _exposure_series(
-    pool: Pool, stage: RoomStage, actor_index: int, work: Path, progress: Progress
+def _metered_exposures(
+    pool: Pool, actor: Actor, actor_index: int, partial: PartialSession, progress: Progress
 ) -> ExposureSeries:
-    """Return the exposure of each frame of the actor, from metering a part of them."""
-    actor, brightness_file = (
-        stage.actors[actor_index],
-        work / f"{stage.actors[actor_index].name}.brightness.npy",
-    )
+    """Return the exposure of each frame of the actor, from metering a part of them, once per session."""
+    file = partial.work / f"{actor.name}.brightness.npy"
     jobs = drawing.meter_jobs(actor_index, actor)
-    if brightness_file.exists():
-        brightness = read_array(brightness_file)
-    else:
-        values: dict[int, F64] = {}
-        for job, brightness_part in pool.run(drawing.measure_brightness, jobs):
-            values[int(job.true_ns[0])] = brightness_part
-            progress(f"metering {actor.name}", len(values), len(jobs))
-        brightness = np.concatenate([values[key] for key in sorted(values)])
-        atomic_write(brightness_file, _npy_bytes(brightness))
-    return drawing.exposure_series(actor, jobs, brightness)
+    if file.exists():
+        return drawing.exposure_series(actor, jobs, read_array(file))
+    values: dict[int, F64] = {}
+    for job, brightness in pool.run(drawing.measure_brightness, jobs):
+        values[int(job.true_ns[0])] = brightness
+        progress(f"metering {actor.name}", len(values), len(jobs))
+    whole = np.concatenate([values[key] for key in sorted(values)])
+    data = BytesIO()
+    np.save(data, whole)
+    atomic_write(file, data.getvalue())
+    return drawing.exposure_series(actor, jobs, whole)
 
 
-def _npy_bytes(values: F64) -> bytes:
-    file = BytesIO()
-    np.save(file, values)
-    return file.getvalue()
-
-
-def _draw_chunks(
-    pool: Pool, stage: RoomStage, exposures: list[ExposureSeries], growth: PartialSession, progress: Progress
-) -> list[list[Path]]:
-    """Draw the missing chunks; return all chunks of each actor, in order."""
-    takes = [
-        _make_takes(actor, actor_index, exposures[actor_index], growth.frames(actor.name))
-        for actor_index, actor in enumerate(stage.actors)
-    ]
-    todo = [take for actor_takes in takes for take in actor_takes if not take.file.exists()]
-    total = sum(len(actor.pictures) for actor in stage.actors)
-    done = total - sum(take.last - take.first for take in todo)
-    progress("drawing images", done, total)
-    for take, _ in pool.run(drawing.draw_chunk, todo):
-        done += take.last - take.first
-        progress("drawing images", done, total)
-    return [[take.file for take in actor_takes] for actor_takes in takes]
-
-
-def _make_takes(actor: Actor, actor_index: int, shots: ExposureSeries, folder: Path) -> list[ChunkJob]:
+def _chunk_jobs(
+    actor: Actor, actor_index: int, shots: ExposureSeries, partial: PartialSession
+) -> list[ChunkJob]:
+    """Return a job for each chunk of the actor, in order."""
+    folder, count = partial.frames(actor.name), len(actor.pictures)
     folder.mkdir(parents=True, exist_ok=True)
-    count = len(actor.pictures)
     spans = [(k, min(k + _CHUNK_FRAMES, count)) for k in range(0, count, _CHUNK_FRAMES)]
     return [ChunkJob(actor_index, a, b, folder / f"{a:06d}.chunk", shots.part(a, b)) for a, b in spans]
 
 
-def _check_space(growth: PartialSession, stage: RoomStage, recipe: SessionRecipe, copies: int) -> None:
+def _draw_chunks(pool: Pool, jobs: list[ChunkJob], progress: Progress) -> None:
+    """Draw the chunks that are not there yet."""
+    missing = [job for job in jobs if not job.file.exists()]
+    total = sum(job.last - job.first for job in jobs)
+    done = total - sum(job.last - job.first for job in missing)
+    progress("drawing images", done, total)
+    for job, _ in pool.run(drawing.draw_chunk, missing):
+        done += job.last - job.first
+        progress("drawing images", done, total)
+
+
+def _check_space(partial: PartialSession, stage: RoomStage, recipe: SessionRecipe, copies: int) -> None:
     """Raise ShareError early if the disk cannot hold `copies` of the images at the same time."""
     images = sum(2 * len(actor.pictures) for actor in stage.actors)
-    existing = sum(chunk.stat().st_size for chunk in growth.drawn_chunks())
-    need, free = copies * images * _IMAGE_BYTES[recipe.images] - existing, shutil.disk_usage(growth.work).free
+    existing = sum(chunk.stat().st_size for chunk in partial.drawn_chunks())
+    need, free = (
+        copies * images * _IMAGE_BYTES[recipe.images] - existing,
+        shutil.disk_usage(partial.work).free,
+    )
     if need > free:
         raise ShareError(
-            f"{growth.out}: about {need / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free; "
+            f"{partial.out}: about {need / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free; "
             "make room, or give fewer --seconds"
         )
 

@@ -205,10 +205,6 @@ class PlainRenderer:
         return self._room_renderer(camera).render(instant.T_world_cam)[1]
 
     def _room_renderer(self, camera: Camera) -> PlainRoomRenderer:
-        if camera.distortion:
-            raise UsageError(
-                "scene 'plain' has no lens distortion; take a profile without (d435i) or another scene"
-            )
         if camera not in self._room_renderers:
             self._room_renderers[camera] = PlainRoomRenderer(self._room, camera)
         return self._room_renderers[camera]

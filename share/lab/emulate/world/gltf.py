@@ -66,8 +66,8 @@ def _read_scene(path: Path) -> Any:
         raise UsageError(f"a glTF room: {install_hint('trimesh', 'emulate')}") from None
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise UsageError(f"{path}: expected a glTF file (.gltf or .glb)")
-    file = read_gltf(path)
-    return trimesh.load_scene(BytesIO(file.data), path.suffix[1:].lower(), resolver=file.files)
+    data, files = read_gltf(path)
+    return trimesh.load_scene(BytesIO(data), path.suffix[1:].lower(), resolver=files)
 
 
 def _room_pieces(scene: Any, path: Path) -> list[Piece]:
