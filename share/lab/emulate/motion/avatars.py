@@ -47,8 +47,7 @@ def person(rng: Rng, height: float) -> tuple[Shape, ...]:
     shoes = Material("rubber", int(rng.integers(1000)))
     arm = [_limb(UPPER_ARM * h, 0.050, 0.040, shirt, rng) for _ in range(2)]
     fore = [
-        concat_shapes([_limb(FOREARM * h, 0.040, 0.030, skin, rng), _hand(FOREARM * h, skin)])
-        for _ in range(2)
+        concat_shapes(_limb(FOREARM * h, 0.040, 0.030, skin, rng), _hand(FOREARM * h, skin)) for _ in range(2)
     ]
     thigh = [_limb(THIGH * h, 0.082, 0.060, trousers, rng) for _ in range(2)]
     shin = [_limb(SHIN * h, 0.060, 0.045, trousers, rng) for _ in range(2)]
@@ -71,22 +70,20 @@ def robot(rng: Rng, height: float) -> tuple[Shape, ...]:
     ]
     return (
         concat_shapes(
-            [
-                cylinder((0, 0, 0.015), 0.170, 0.075, dark, dark, sides=24, rng=rng),
-                cylinder((0, 0, 0.090), 0.150, 0.012, light, light, sides=24, rng=rng),
-                *posts,
-                cylinder((0, 0, 0.195), 0.160, 0.008, light, light, sides=24, rng=rng),
-                box((-0.06, -0.06, 0.105), (0.06, 0.06, 0.165), {"all": dark, "side": label}, rng),
-                box((-0.10, -0.015, 0.203), (-0.07, 0.015, top), metal, rng),
-                box((-0.10, -0.012, top - 0.02), (0.0, 0.012, top), metal, rng),
-                box(
-                    (-0.015, -0.045, top),
-                    (0.010, 0.045, top + 0.05),
-                    {"all": metal, "+x": Material("screen")},
-                    rng,
-                ),
-                cylinder((0.06, 0, 0.203), 0.035, 0.04, dark, dark, sides=16, rng=rng),
-            ]
+            cylinder((0, 0, 0.015), 0.170, 0.075, dark, dark, sides=24, rng=rng),
+            cylinder((0, 0, 0.090), 0.150, 0.012, light, light, sides=24, rng=rng),
+            *posts,
+            cylinder((0, 0, 0.195), 0.160, 0.008, light, light, sides=24, rng=rng),
+            box((-0.06, -0.06, 0.105), (0.06, 0.06, 0.165), {"all": dark, "side": label}, rng),
+            box((-0.10, -0.015, 0.203), (-0.07, 0.015, top), metal, rng),
+            box((-0.10, -0.012, top - 0.02), (0.0, 0.012, top), metal, rng),
+            box(
+                (-0.015, -0.045, top),
+                (0.010, 0.045, top + 0.05),
+                {"all": metal, "+x": Material("screen")},
+                rng,
+            ),
+            cylinder((0.06, 0, 0.203), 0.035, 0.04, dark, dark, sides=16, rng=rng),
         ),
     )
 
@@ -105,7 +102,7 @@ def drone(rng: Rng, height: float) -> tuple[Shape, ...]:
         rotor = cylinder((0.25, 0, 0.035), 0.095, 0.004, dark, dark, sides=16, rng=rng)
         parts += [part.placed_at(0, 0, 0, a) for part in (arm, rotor)]
     legs = [cylinder((x, y, -0.14), 0.006, 0.12, dark, sides=6) for x in (-0.07, 0.07) for y in (-0.06, 0.06)]
-    return (concat_shapes(parts + legs),)
+    return (concat_shapes(*parts + legs),)
 
 
 BODY_SHAPES: dict[str, Callable[[Rng, float], tuple[Shape, ...]]] = {
@@ -119,7 +116,7 @@ def _limb(length: float, upper: float, lower: float, skin: Material, rng: Rng) -
     """Return a limb that hangs down from its joint."""
     round_end = cylinder((0, 0, -0.01), upper, 0.03, skin, skin, sides=10, rng=rng, top=0.6 * upper)
     return concat_shapes(
-        [cylinder((0, 0, -length), lower, length, skin, skin, sides=10, rng=rng, top=upper), round_end]
+        cylinder((0, 0, -length), lower, length, skin, skin, sides=10, rng=rng, top=upper), round_end
     )
 
 
@@ -141,7 +138,7 @@ def _torso(h: float, shirt: Material, trousers: Material, rng: Rng) -> Shape:
     ]
     angle = np.linspace(0, 2 * np.pi, 14, endpoint=False)
     rings = [(np.column_stack([d * np.cos(angle), w * np.sin(angle)]), a, b, m) for d, w, a, b, m in slices]
-    return concat_shapes([prism(ring, low, high, m, m, rng) for ring, low, high, m in rings])
+    return concat_shapes(*[prism(ring, low, high, m, m, rng) for ring, low, high, m in rings])
 
 
 def _head(skin: Material, rng: Rng) -> Shape:
@@ -159,7 +156,7 @@ def _head(skin: Material, rng: Rng) -> Shape:
     )
     camera = box((0.105, -0.045, 0.05), (0.130, 0.045, 0.075), Material("galvanised"), rng)
     strap = cylinder((0, 0, 0.0), 0.093, 0.03, shell, None, sides=14, rng=rng)
-    return concat_shapes([*parts, goggles, camera, strap])
+    return concat_shapes(*parts, goggles, camera, strap)
 
 
 _RATE_HZ = 50

@@ -62,7 +62,7 @@ Movers = Mapping[str, Sequence[Shape]]
 def build_room(layout: Layout, movers: Movers | None = None) -> DrawableRoom:
     """Return the room of `layout` with the parts of agents by name, each in its own frame. Deterministic: the
     same layout and movers give the same bytes. Raises UsageError where the package for light is missing."""
-    fixed = concat_shapes([piece.shape for piece in layout.all_pieces])
+    fixed = concat_shapes(*[piece.shape for piece in layout.all_pieces])
     parts = {name: tuple(shapes) for name, shapes in (movers or {}).items()}
     materials = tuple(
         dict.fromkeys([*fixed.materials, *(m for s in parts.values() for p in s for m in p.materials)])

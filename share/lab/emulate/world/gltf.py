@@ -48,7 +48,7 @@ def load_gltf(path: Path) -> Layout:
     except Exception as error:  # trimesh and its image decoders raise any type
         lines = str(error).splitlines() or [type(error).__name__]
         raise DataError(f"{path}: not a readable glTF 2.0 file: {lines[0]:.200}") from None
-    low, high = concat_shapes([p.shape for p in pieces]).bounding_box
+    low, high = concat_shapes(*[p.shape for p in pieces]).bounding_box
     _check_size(path, pieces, high - low)
     T_room_file = np.eye(4)
     T_room_file[:3, 3] = -low
@@ -190,7 +190,7 @@ def _check_size(path: Path, pieces: list[Piece], extent: F64) -> None:
 
 def _ceiling_lamps(shell: tuple[Piece, ...], extent: F64) -> tuple[Light, ...]:
     """Return panels 0.25 m under whatever is above the middle of the room's height, on a grid."""
-    scene = RayCaster(concat_shapes([p.shape for p in shell]).mesh.triangles)
+    scene = RayCaster(concat_shapes(*[p.shape for p in shell]).mesh.triangles)
     nx, ny = (max(1, round(float(e) / _LAMP_PITCH)) for e in extent[:2])
     x, y = np.meshgrid((np.arange(nx) + 0.5) / nx * extent[0], (np.arange(ny) + 0.5) / ny * extent[1])
     start = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, extent[2] / 2)]).astype(np.float32)

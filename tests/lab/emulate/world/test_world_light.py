@@ -72,7 +72,7 @@ def test_a_white_box_is_brighter_by_its_bounces() -> None:
         quad((0, 0, 0), (0, 3, 0), (0, 0, 3), Material("paint")),
         quad((3, 3, 0), (0, -3, 0), (0, 0, 3), Material("paint")),
     ]
-    mesh, lamp = concat_shapes(walls).mesh, [Light((1.5, 1.5, 2.9))]
+    mesh, lamp = concat_shapes(*walls).mesh, [Light((1.5, 1.5, 2.9))]
     ceiling = []
     for albedo in (0.0, 0.3, 0.6):
         uv, image = bake_light(mesh, np.float32([albedo]), NO_GLOW, lamp, 0.0, 0.5)

@@ -121,12 +121,12 @@ def test_a_decal_lies_in_front_of_its_wall() -> None:
 
 def test_concat_shares_materials_and_moves_keep_shapes() -> None:
     one, two = box((0, 0, 0), (1, 1, 1), WOOD), box((2, 0, 0), (3, 1, 1), WOOD).placed_at(0, 0, 5, np.pi / 2)
-    both = concat_shapes([one, two])
+    both = concat_shapes(one, two)
     assert both.materials == (WOOD,)
     assert two.bounding_box == pytest.approx(np.array([[-1, 2, 5], [0, 3, 6]]), abs=1e-6)
     assert volume(both) == pytest.approx(2)
     with pytest.raises(ValueError, match="no mesh"):
-        concat_shapes([])
+        concat_shapes()
 
 
 def test_an_unknown_material_is_named() -> None:

@@ -37,7 +37,7 @@ def test_clearance_is_near_the_exact_distance_everywhere(
 ) -> None:
     points = rng.uniform(0, 1, (400, 3)) * small_layout.size
     shapes = [p.shape for p in small_layout.all_pieces if p.solid]
-    corners = concat_shapes(shapes).mesh.triangles.astype(float)
+    corners = concat_shapes(*shapes).mesh.triangles.astype(float)
     held = np.max([winding_numbers(s.mesh.triangles.astype(float), points) for s in shapes], axis=0) > 0.5
     exact = np.where(held, 0, triangle_distances(corners, points).min(1))
     error = occupancy.clearance(points) - exact

@@ -32,12 +32,10 @@ def door(rng: Rng) -> Shape:
     skin = pick_material(rng, "steel")
     sign, cell = pick_print(rng, "sign")
     return concat_shapes(
-        [
-            *_frame(rng, 0.9, 0, 2.05, skin),
-            _door_leaf(rng, 0.9, 0, 2.05, "door"),
-            box_on((0.37, -0.05, 1.0), (0.13, 0.03, 0.025), pick_material(rng, "galvanised"), rng),
-            box((-0.2, -0.05, 2.2), (0.2, 0, 2.4), {"-y": sign, "all": skin}, rng, cell),
-        ]
+        *_frame(rng, 0.9, 0, 2.05, skin),
+        _door_leaf(rng, 0.9, 0, 2.05, "door"),
+        box_on((0.37, -0.05, 1.0), (0.13, 0.03, 0.025), pick_material(rng, "galvanised"), rng),
+        box((-0.2, -0.05, 2.2), (0.2, 0, 2.4), {"-y": sign, "all": skin}, rng, cell),
     )
 
 
@@ -50,16 +48,14 @@ def roller_door(rng: Rng, width: float, height: float) -> Shape:
     out.append(box((-width / 2 - 0.12, -0.38, height), (width / 2 + 0.12, 0, top), slat, rng))
     out.append(box_on((0, -0.03, 0), (width, 0.05, 0.1), Material("rubber"), rng))
     out.append(cylinder((width / 2 + 0.12, -0.2, height + 0.2), 0.1, 0.2, rail, rail, axis="x", rng=rng))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def window(rng: Rng, width: float, height: float) -> Shape:
     """A window with its frame and sill; its lower edge is at z = 0."""
     return concat_shapes(
-        [
-            *_frame(rng, width, 0.04, height, pick_material(rng, "steel"), 0.06),
-            _door_leaf(rng, width, 0.04, height, "window"),
-        ]
+        *_frame(rng, width, 0.04, height, pick_material(rng, "steel"), 0.06),
+        _door_leaf(rng, width, 0.04, height, "window"),
     )
 
 
@@ -76,7 +72,7 @@ def concrete_pillar(rng: Rng, side: float, height: float) -> Shape:
     for turn in range(4):
         if rng.random() < 0.6:
             out.append(_notice(rng, half).placed_at(0, 0, 0, turn * np.pi / 2))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def _notice(rng: Rng, half: float) -> Shape:
@@ -97,7 +93,7 @@ def steel_pillar(rng: Rng, side: float, height: float) -> Shape:
     ]
     if rng.random() < 0.7:
         out.append(front_print(rng, -side * 0.4, 1.5, side * 0.8, side, "sign", -side / 2))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def girder(rng: Rng, length: float, height: float) -> Shape:
@@ -108,7 +104,7 @@ def girder(rng: Rng, length: float, height: float) -> Shape:
     for k in range(1, int(length / 1.5) + 1):
         x = min(k * 1.5, length - 0.1) - length / 2
         out.append(box_on((x, 0, t), (0.012, w * 0.9, height - 2 * t), skin, rng))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def pipe_run(rng: Rng, length: float, count: int) -> Shape:
@@ -132,7 +128,7 @@ def pipe_run(rng: Rng, length: float, count: int) -> Shape:
         x = ((k + 0.5) / max(2, round(length / 1.8)) - 0.5) * length
         out.append(box_on((x, y / 2, 0.03), (0.04, -y + 0.06, 0.03), steel, rng))
         out += [box_on((x, at, 0.06), (0.015, 0.015, 0.39), steel, rng) for at in (0.02, y - 0.02)]
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def duct(rng: Rng, length: float) -> Shape:
@@ -145,7 +141,7 @@ def duct(rng: Rng, length: float) -> Shape:
         out.append(box_on((x, -w / 2, 0.46), (0.03, 0.05, 0.04), skin, rng))
     for x in rng.uniform(-length / 2.4, length / 2.4, max(1, int(length / 3))):
         out.append(box_on((float(x), -w / 2, 0.5 - h - 0.12), (0.4, 0.2, 0.06), Material("grating"), rng))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def wall_pipes(rng: Rng, height: float) -> Shape:
@@ -158,7 +154,7 @@ def wall_pipes(rng: Rng, height: float) -> Shape:
             if z < height - 0.1:
                 out.append(box_on((x, -0.05, z), (2 * r + 0.02, 0.1, 0.03), skin, rng))
         x += 2 * r + 0.05
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def radiator(rng: Rng, width: float) -> Shape:
@@ -172,7 +168,7 @@ def radiator(rng: Rng, width: float) -> Shape:
     rails = [box_on((0, -0.1, z), (width, 0.05, 0.05), skin, rng) for z in (0.16, 0.62)]
     feet = [box_on((x * width / 2.5, -0.05, 0.1), (0.03, 0.1, 0.06), skin, rng) for x in (-1, 1)]
     stand = [box_on((x * width / 2.5, -0.1, 0), (0.03, 0.06, 0.14), skin, rng) for x in (-1, 1)]
-    return concat_shapes([*fins, *rails, *feet, *stand])
+    return concat_shapes(*fins, *rails, *feet, *stand)
 
 
 _LAMP_MATERIAL = Material("lamp")
@@ -189,7 +185,7 @@ def tube_lamp(rng: Rng, length: float, drop: float) -> Shape:
     ]
     if drop > 0.02:
         out += [box_on((x * length * 0.4, 0, z + 0.1), (0.008, 0.008, drop), wire, rng) for x in (-1, 1)]
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def tube_light(
@@ -204,12 +200,10 @@ def high_bay_lamp(rng: Rng, drop: float) -> Shape:
     """A high-bay lamp under a ceiling at z = 0: a dish on a rod of `drop` m."""
     skin, z = pick_material(rng, "steel"), -drop - 0.35
     return concat_shapes(
-        [
-            cylinder((0, 0, z), 0.24, 0.22, skin, None, sides=18, rng=rng, top=0.08),
-            cylinder((0, 0, z + 0.22), 0.08, 0.13, skin, skin, sides=12, rng=rng),
-            cylinder((0, 0, z + 0.01), 0.22, 0.01, _LAMP_MATERIAL, _LAMP_MATERIAL, sides=18, rng=rng),
-            box_on((0, 0, z + 0.35), (0.02, 0.02, drop), skin, rng),
-        ]
+        cylinder((0, 0, z), 0.24, 0.22, skin, None, sides=18, rng=rng, top=0.08),
+        cylinder((0, 0, z + 0.22), 0.08, 0.13, skin, skin, sides=12, rng=rng),
+        cylinder((0, 0, z + 0.01), 0.22, 0.01, _LAMP_MATERIAL, _LAMP_MATERIAL, sides=18, rng=rng),
+        box_on((0, 0, z + 0.35), (0.02, 0.02, drop), skin, rng),
     )
 
 

@@ -21,28 +21,24 @@ def cone(rng: Rng) -> Shape:
     """A traffic cone of 0.5 m with a white collar."""
     skin, white = Material("plastic", 0, gray=120), Material("marking")
     return concat_shapes(
-        [
-            box_on((0, -0.15, 0), (0.3, 0.3, 0.03), Material("rubber"), rng),
-            cylinder((0, -0.15, 0.03), 0.115, 0.47, skin, skin, sides=16, rng=rng, top=0.025),
-            cylinder((0, -0.15, 0.22), 0.083, 0.12, white, None, sides=16, rng=rng, top=0.059),
-        ]
+        box_on((0, -0.15, 0), (0.3, 0.3, 0.03), Material("rubber"), rng),
+        cylinder((0, -0.15, 0.03), 0.115, 0.47, skin, skin, sides=16, rng=rng, top=0.025),
+        cylinder((0, -0.15, 0.22), 0.083, 0.12, white, None, sides=16, rng=rng, top=0.059),
     )
 
 
 def cones(rng: Rng) -> Shape:
     """Two or three cones in a row."""
     count = int(rng.integers(2, 4))
-    return concat_shapes([cone(rng).placed_at((k - (count - 1) / 2) * 0.36, 0) for k in range(count)])
+    return concat_shapes(*[cone(rng).placed_at((k - (count - 1) / 2) * 0.36, 0) for k in range(count)])
 
 
 def bucket(rng: Rng) -> Shape:
     skin = pick_material(rng, "plastic")
     return concat_shapes(
-        [
-            cylinder((0, -0.16, 0), 0.11, 0.27, skin, None, sides=14, rng=rng, top=0.145),
-            cylinder((0, -0.16, 0.005), 0.1, 0.12, skin, skin, sides=14, rng=rng),
-            cylinder((0, -0.16, 0.255), 0.155, 0.015, skin, None, sides=14, rng=rng),
-        ]
+        cylinder((0, -0.16, 0), 0.11, 0.27, skin, None, sides=14, rng=rng, top=0.145),
+        cylinder((0, -0.16, 0.005), 0.1, 0.12, skin, skin, sides=14, rng=rng),
+        cylinder((0, -0.16, 0.255), 0.155, 0.015, skin, None, sides=14, rng=rng),
     )
 
 
@@ -61,7 +57,7 @@ def tool_box(rng: Rng) -> Shape:
     for z, h in ((0.2, 0.22), (0.44, 0.14), (0.6, 0.14), (0.76, 0.14)):
         out.append(box((-0.32, -0.465, z), (0.32, -0.45, z + h), skin, rng))
         out.append(box_on((0, -0.48, z + h - 0.05), (0.5, 0.03, 0.02), metal, rng))
-    return concat_shapes([*out, front_print(rng, -0.3, 0.55 - 0.3, 0.12, 0.1, "label", -0.465)])
+    return concat_shapes(*out, front_print(rng, -0.3, 0.55 - 0.3, 0.12, 0.1, "label", -0.465))
 
 
 def hand_truck(rng: Rng) -> Shape:
@@ -79,7 +75,7 @@ def hand_truck(rng: Rng) -> Shape:
         cylinder((x, -0.09, 0.09), 0.09, 0.05, Material("rubber"), skin, axis="x", sides=14, rng=rng)
         for x in (-0.27, 0.22)
     ]
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def crate(rng: Rng) -> Shape:
@@ -92,7 +88,7 @@ def crate(rng: Rng) -> Shape:
         out += [box_on((x * (w - 0.02) / 2, -d / 2, z), (0.02, d - 0.04, 0.1), skin, rng) for x in (-1, 1)]
     if rng.random() < 0.7:
         out.append(front_print(rng, -0.12, 0.13, 0.24, min(0.2, h / 2 - 0.2), "sign", -d + 0.02))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def leaning_ladder(rng: Rng, length: float) -> Shape:
@@ -104,7 +100,7 @@ def leaning_ladder(rng: Rng, length: float) -> Shape:
         s = k * 0.28 / length
         y, z = foot + (-0.04 - foot) * s, 0.02 + (top - 0.02) * s
         out.append(strut((-0.17, y, z), (0.17, y, z), 0.03, skin, rng))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def step_ladder(rng: Rng, height: float) -> Shape:
@@ -119,7 +115,7 @@ def step_ladder(rng: Rng, height: float) -> Shape:
         s = k / count
         out.append(box_on((0, -d + 0.23 * height * s, height * s), (0.38, 0.1, 0.03), skin, rng))
     out.append(box_on((0, -0.3 * height, height), (0.5, 0.28, 0.04), pick_material(rng, "plastic"), rng))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def workbench(rng: Rng, width: float) -> Shape:
@@ -139,7 +135,7 @@ def workbench(rng: Rng, width: float) -> Shape:
         box_on((width / 2 - 0.2, -depth + 0.12, top), (0.12, 0.22, 0.14), pick_material(rng, "steel"), rng),
     ]
     out += [s.placed_at(0, -0.05, top) for s in _table_clutter(rng, width - 0.7, depth - 0.2)]
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def _drawers(rng: Rng, width: float, depth: float, top: float) -> list[Shape]:
@@ -186,7 +182,7 @@ def table(rng: Rng, width: float, depth: float = 0.8) -> Shape:
         box((-width / 2, -depth, top - 0.03), (width / 2, 0, top), pick_material(rng, "wood"), rng),
     ]
     return concat_shapes(
-        out + [s.placed_at(0, -0.1, top) for s in _table_clutter(rng, width - 0.2, depth - 0.3)]
+        *out + [s.placed_at(0, -0.1, top) for s in _table_clutter(rng, width - 0.2, depth - 0.3)]
     )
 
 
@@ -197,22 +193,20 @@ def bench(rng: Rng, width: float) -> Shape:
     for x in (-width / 2 + 0.15, width / 2 - 0.15):
         out.append(box_on((x, -0.17, 0.38), (0.04, 0.32, 0.04), metal, rng))
         out += [box_on((x, y, 0), (0.04, 0.04, 0.38), metal, rng) for y in (-0.05, -0.29)]
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def chair(rng: Rng) -> Shape:
     """A stacking chair with its back at y = 0."""
     shell = pick_material(rng, "plastic")
     return concat_shapes(
-        [
-            corner_posts(0.44, 0.44, 0.44, 0.025, pick_material(rng, "galvanised"), rng),
-            box_on((0, -0.22, 0.44), (0.44, 0.44, 0.03), shell, rng),
-            *(
-                box_on((x, -0.0125, 0.47), (0.025, 0.025, 0.2), pick_material(rng, "galvanised"), rng)
-                for x in (-0.19, 0.19)
-            ),
-            box_on((0, -0.02, 0.6), (0.44, 0.03, 0.25), shell, rng),
-        ]
+        corner_posts(0.44, 0.44, 0.44, 0.025, pick_material(rng, "galvanised"), rng),
+        box_on((0, -0.22, 0.44), (0.44, 0.44, 0.03), shell, rng),
+        *(
+            box_on((x, -0.0125, 0.47), (0.025, 0.025, 0.2), pick_material(rng, "galvanised"), rng)
+            for x in (-0.19, 0.19)
+        ),
+        box_on((0, -0.02, 0.6), (0.44, 0.03, 0.25), shell, rng),
     )
 
 
@@ -226,7 +220,7 @@ def rolled_hose(rng: Rng, radius: float, wide: float = 0.075) -> Shape:
         out.append(
             cylinder((0, -wide - 0.006, radius), float(r), 0.006, skin, None, axis="y", sides=20, rng=rng)
         )
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def hose_rack(rng: Rng, width: float, rows: int) -> Shape:
@@ -243,7 +237,7 @@ def hose_rack(rng: Rng, width: float, rows: int) -> Shape:
             if rng.random() < 0.8:
                 out.append(rolled_hose(rng, rng.uniform(0.15, 0.2)).placed_at(x, -0.12, z))
             x += 0.42
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def hose_reel(rng: Rng) -> Shape:
@@ -260,7 +254,7 @@ def hose_reel(rng: Rng) -> Shape:
         (0.1, -0.1, z - 0.6),
     ]
     out.append(tube(end, 0.016, hose, sides=8, rng=rng))
-    return concat_shapes([*out, front_print(rng, -0.2, z + 0.36, 0.4, 0.2, "sign")])
+    return concat_shapes(*out, front_print(rng, -0.2, z + 0.36, 0.4, 0.2, "sign"))
 
 
 def drying_hoses(rng: Rng, count: int, height: float) -> Shape:
@@ -276,26 +270,24 @@ def drying_hoses(rng: Rng, count: int, height: float) -> Shape:
                 cylinder((x + side * 0.075, -0.08, end - 0.1), 0.035, 0.1, metal, metal, sides=10, rng=rng)
             )
         out.append(box_on((x, -0.08, height), (0.195, 0.09, 0.06), skin, rng))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def extinguisher(rng: Rng) -> Shape:
     """A fire extinguisher on its bracket, with its sign above."""
     red, metal = Material("lacquer", 1, gray=75), pick_material(rng, "galvanised")
     return concat_shapes(
-        [
-            cylinder((0, -0.1, 0.6), 0.075, 0.42, red, red, sides=14, rng=rng),
-            cylinder((0, -0.1, 1.02), 0.075, 0.06, red, None, sides=14, rng=rng, top=0.025),
-            box_on((0, -0.12, 1.08), (0.04, 0.12, 0.06), metal, rng),
-            box_on((0, -0.0125, 0.7), (0.05, 0.025, 0.3), metal, rng),
-            tube(
-                [(0.03, -0.13, 1.1), (0.1, -0.14, 1.05), (0.11, -0.13, 0.85), (0.1, -0.12, 0.7)],
-                0.012,
-                Material("rubber"),
-                6,
-                rng,
-            ),
-            front_print(rng, -0.05, 0.7, 0.1, 0.16, "label", -0.176),
-            front_print(rng, -0.1, 1.35, 0.2, 0.2, "sign"),
-        ]
+        cylinder((0, -0.1, 0.6), 0.075, 0.42, red, red, sides=14, rng=rng),
+        cylinder((0, -0.1, 1.02), 0.075, 0.06, red, None, sides=14, rng=rng, top=0.025),
+        box_on((0, -0.12, 1.08), (0.04, 0.12, 0.06), metal, rng),
+        box_on((0, -0.0125, 0.7), (0.05, 0.025, 0.3), metal, rng),
+        tube(
+            [(0.03, -0.13, 1.1), (0.1, -0.14, 1.05), (0.11, -0.13, 0.85), (0.1, -0.12, 0.7)],
+            0.012,
+            Material("rubber"),
+            6,
+            rng,
+        ),
+        front_print(rng, -0.05, 0.7, 0.1, 0.16, "label", -0.176),
+        front_print(rng, -0.1, 1.35, 0.2, 0.2, "sign"),
     )

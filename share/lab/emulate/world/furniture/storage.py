@@ -27,13 +27,13 @@ def drum(rng: Rng) -> Shape:
         out.append(cylinder((0, y, z), _DRUM_RADIUS, 0.03, skin, None, sides=18, rng=rng))
     if rng.random() < 0.7:
         out.append(front_print(rng, -0.09, 0.36, 0.18, 0.16, "label", -2 * _DRUM_RADIUS))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def drum_row(rng: Rng, count: int) -> Shape:
     """Drums in a row."""
     pitch = 2 * _DRUM_RADIUS + 0.03
-    return concat_shapes([drum(rng).placed_at((k - (count - 1) / 2) * pitch, 0) for k in range(count)])
+    return concat_shapes(*[drum(rng).placed_at((k - (count - 1) / 2) * pitch, 0) for k in range(count)])
 
 
 def waste_bin(rng: Rng) -> Shape:
@@ -42,7 +42,7 @@ def waste_bin(rng: Rng) -> Shape:
     hull = cylinder((0, -0.22, 0), 0.17, 0.6, skin, None, rng=rng, top=0.21)
     rim = cylinder((0, -0.22, 0.57), 0.22, 0.03, skin, None, rng=rng)
     floor = cylinder((0, -0.22, 0.02), 0.155, 0.3, skin, pick_material(rng, "fabric"), rng=rng, top=0.175)
-    return concat_shapes([hull, rim, floor])
+    return concat_shapes(hull, rim, floor)
 
 
 _TAPE = Material("plastic", 9, gray=165, contrast=0.5)
@@ -60,7 +60,7 @@ def carton(rng: Rng, width: float, depth: float, height: float) -> Shape:
         out.append(decal(corner, (0, tape, 0), (0, 0, drop), _TAPE, rng))
     if rng.random() < 0.6:
         out.append(_label(rng, width, depth, height))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def _label(rng: Rng, width: float, depth: float, height: float) -> Shape:
@@ -79,7 +79,7 @@ def carton_stack(rng: Rng, width: float, depth: float, height: float) -> Shape:
         w = min(rng.uniform(0.3, 0.65), width - x)
         out += _carton_column(rng, x - width / 2 + w / 2, w - 0.01, depth, height * rng.uniform(0.35, 1))
         x += w + rng.uniform(0.01, 0.05)
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def _carton_column(rng: Rng, x: float, width: float, depth: float, height: float) -> list[Shape]:
@@ -132,13 +132,13 @@ def pallet(rng: Rng) -> Shape:
     out += [box_on((x, -_PALLET_D / 2, 0.1), (0.145, _PALLET_D, 0.022), skin, rng) for x in stringers]
     tops = -np.linspace(0.06, _PALLET_D - 0.06, 6)
     out += [box_on((0, y, 0.122), (_PALLET_W, 0.11, 0.022), skin, rng) for y in tops]
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def pallet_pile(rng: Rng, count: int) -> Shape:
     """A stack of bare pallets, slightly out of line."""
     shift = rng.uniform(-0.03, 0.03, count)
-    return concat_shapes([pallet(rng).placed_at(float(s), 0, k * _PALLET_H) for k, s in enumerate(shift)])
+    return concat_shapes(*[pallet(rng).placed_at(float(s), 0, k * _PALLET_H) for k, s in enumerate(shift)])
 
 
 def loaded_pallet(rng: Rng, height: float) -> Shape:
@@ -146,7 +146,7 @@ def loaded_pallet(rng: Rng, height: float) -> Shape:
     goods = (_carton_layers, _sacks, _wrapped_block)[int(rng.integers(3))]
     base = pallet(rng)
     load = goods(rng, max(height - _PALLET_H, 0.3))
-    return concat_shapes([base, *(s.placed_at(0, 0, _PALLET_H) for s in load)])
+    return concat_shapes(base, *(s.placed_at(0, 0, _PALLET_H) for s in load))
 
 
 def _carton_layers(rng: Rng, height: float) -> list[Shape]:
@@ -201,7 +201,7 @@ def goods_rack(rng: Rng, width: float, depth: float, height: float, pitch: float
             s.placed_at(0, -0.02, z + _BOARD_M)
             for s in _goods(rng, width - 2 * _POST_M - 0.04, depth - 0.06, room)
         ]
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def _rack_level(
@@ -246,7 +246,7 @@ def _bin(rng: Rng, width: float, depth: float, height: float, skin: Material) ->
     hull = box((-width / 2, -depth, 0), (width / 2, 0, height), {"side": skin}, rng)
     fill = quad((-width / 2, -depth, 0.85 * height), (width, 0, 0), (0, depth, 0), goods, rng, cell)
     return concat_shapes(
-        [hull, fill, front_print(rng, -0.05, 0.3 * height, 0.1, 0.3 * height, "label", -depth)]
+        hull, fill, front_print(rng, -0.05, 0.3 * height, 0.1, 0.3 * height, "label", -depth)
     )
 
 
@@ -265,7 +265,7 @@ def cupboard(rng: Rng, width: float, depth: float, height: float) -> Shape:
         out.append(box((-half + t, -depth, z), (half - t, -t, z + t), skin, rng))
         if k < rows:
             out += _cupboard_row(rng, width - 2 * t, depth - t, z + t, step - t)
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def _cupboard_row(rng: Rng, width: float, depth: float, z: float, height: float) -> list[Shape]:
@@ -297,7 +297,7 @@ def lockers(rng: Rng, count: int) -> Shape:
         out.append(quad((x, -d - 0.012, 0.1), (w - 0.016, 0, 0), (0, 0, h - 0.12), print_, rng, cell))
         lock = pick_material(rng, "galvanised")
         out.append(box_on((x + 0.33, -d - 0.02, 1.0), (0.02, 0.02, 0.09), lock, rng))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def cloakroom(rng: Rng, count: int) -> Shape:
@@ -308,7 +308,7 @@ def cloakroom(rng: Rng, count: int) -> Shape:
     out += [box((-width / 2 + 0.01, -d, z), (width / 2 - 0.01, 0, z + 0.02), skin, rng) for z in (0.3, 1.6)]
     for k in range(count):
         out += _turnout_gear(rng, (k + 0.5 - count / 2) * pitch)
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def _turnout_gear(rng: Rng, x: float) -> list[Shape]:

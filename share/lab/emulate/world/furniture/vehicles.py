@@ -37,7 +37,7 @@ def _wheel(x: float, y: float, radius: float, wide: float, rng: Rng) -> Shape:
         (x + out - 0.03, 0.2 * radius, 0.06, rim, 10),
     )
     return concat_shapes(
-        [
+        *[
             cylinder((left, y, radius), r, thick, skin, skin, axis="x", sides=sides, rng=rng)
             for left, r, thick, skin, sides in discs
         ]
@@ -112,7 +112,7 @@ def fire_engine(rng: Rng, length: float, width: float = 2.3) -> Shape:
     out.append(box_on((0, nose + 0.6, top), (1.5, 0.25, 0.16), Material("plastic", 2, gray=60), rng))
     out += _roof_ladder(rng, length * 0.56, -0.2, top + 0.2)
     out += _rear_parts(rng, half, top)
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def _roof_ladder(rng: Rng, length: float, rear: float, z: float) -> list[Shape]:
@@ -162,7 +162,7 @@ def van(rng: Rng, length: float) -> Shape:
         for x in (-0.42, 0.42)
     ]
     out.append(box_on((0, -0.03, 0.32), (2 * half - 0.1, 0.06, 0.18), Material("rubber"), rng))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def _stripe(rng: Rng) -> tuple[Material, Rng, int]:
@@ -194,7 +194,7 @@ def forklift(rng: Rng) -> Shape:
         out.append(box_on((x * 0.55, -2.4, 0.05), (0.12, 0.98, 0.04), bar, rng))
     for z in (0.1, 0.45, 1.2, 1.95):
         out.append(box_on((0, -1.84, z), (0.55, 0.08, 0.1), bar, rng))
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def pallet_truck(rng: Rng) -> Shape:
@@ -209,4 +209,4 @@ def pallet_truck(rng: Rng) -> Shape:
     out.append(cylinder((0, 0.18, 0.12), 0.05, 0.4, paint, paint, sides=12, rng=rng))
     out.append(tube([(0, 0.2, 0.5), (0, 0.28, 0.85), (0, 0.36, 1.15)], 0.02, paint, 8, rng))
     out.append(tube([(-0.15, 0.38, 1.2), (0, 0.36, 1.15), (0.15, 0.38, 1.2)], 0.015, dark, 8, rng))
-    return concat_shapes(out).placed_at(0, -0.4)
+    return concat_shapes(*out).placed_at(0, -0.4)

@@ -45,7 +45,7 @@ def printed_sheet(target: Target) -> tuple[Shape, F64]:
         for j in range(tiles[1])
         for i in range(tiles[0])
     ]
-    return concat_shapes(parts), paper
+    return concat_shapes(*parts), paper
 
 
 def board_on_stand(target: Target, T_stand_target: F64, rng: Rng) -> Shape:
@@ -58,7 +58,7 @@ def board_on_stand(target: Target, T_stand_target: F64, rng: Rng) -> Shape:
     steel = pick_material(rng, "steel")
     post = box_on((*middle[:2], 0.0), (0.04, 0.04, middle[2]), steel, rng)
     foot = box_on((*middle[:2], 0.0), (0.5, 0.5, 0.03), steel, rng)
-    return concat_shapes([paper.transformed(T_stand_target), plate.transformed(T_stand_target), post, foot])
+    return concat_shapes(paper.transformed(T_stand_target), plate.transformed(T_stand_target), post, foot)
 
 
 def _tile_division(target: Target) -> tuple[np.ndarray, float]:

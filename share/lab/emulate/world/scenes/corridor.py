@@ -92,7 +92,7 @@ def _build_shell(plan: LayoutBuilder, outer: Walls, inner: Walls) -> None:
         plan.add_to_shell("shell", shape)
         plan.add_to_shell("shell", shape.transformed(T))
     sides = [wall_surface(wall, paint, rng) for wall in inner[:2]]
-    plan.add_to_shell("core", concat_shapes([*sides, *(s.transformed(T) for s in sides), *_core_caps(plan)]))
+    plan.add_to_shell("core", concat_shapes(*sides, *(s.transformed(T) for s in sides), *_core_caps(plan)))
     add_skirting(plan, (*outer, *inner))
 
 

@@ -125,7 +125,7 @@ def wall_surface(wall: Wall, bands: Bands, rng: Rng, pitch: float = np.inf) -> S
         for high, skin in bands:
             out.append(quad((left, 0, low), (right - left, 0, 0), (0, 0, high - low), skin, rng))
             low = high
-    return wall.place(concat_shapes(out), 0)
+    return wall.place(concat_shapes(*out), 0)
 
 
 def build_enclosure(
