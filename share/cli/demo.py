@@ -78,7 +78,7 @@ def demo(
             "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
         )
     from share.files.writing import writable_dir
-    from share.lab.emulate.recipe import AGENTS, meeting_seed, recipe
+    from share.lab.emulate.recipe import DEMO_AGENTS, demo_recipe, meeting_seed
     from share.lab.emulate.session import make_cached_session
     from share.lab.evaluate.real_time import RunOptions, play_in_real_time
     from share.lab.evaluate.scoring import score_session
@@ -86,12 +86,12 @@ def demo(
     from share.recordings.session import read_session
     from share.runtime.machine import core_count
 
-    LinkAssignment.parse(link).check(AGENTS)
+    LinkAssignment.parse(link).check(DEMO_AGENTS)
     writable_dir(folder)
     room = _renderable_scene(scene)
     seed = meeting_seed(room) if seed is None else seed
     with Stages() as stages:
-        session = read_session(make_cached_session(recipe(room, seconds, seed), progress=stages))
+        session = read_session(make_cached_session(demo_recipe(room, seconds, seed), progress=stages))
     live = LiveLine()
     run_terms = RunOptions(policy, link, seed, true_error, config=config_file, agents_first=True)
     folders = play_in_real_time(session, seconds, run_terms, folder, lambda now: live.write(str(now)))

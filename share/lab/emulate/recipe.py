@@ -22,6 +22,13 @@ IMAGES = ("jpeg", "png")
 _FOLDER_DEPTHS, _TEXT_SUFFIXES = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")
 
 
+Progress = Callable[[str, int, int], None]  # task, done, total
+
+
+def no_progress(what: str, done: int, total: int) -> None:
+    """Ignore progress."""
+
+
 @dataclass(frozen=True)
 class SessionRecipe:
     """scene: a name, or a glTF file. motions: `[NAME=]SPEC` each. size: of the room, m; None: the scene's
@@ -86,9 +93,11 @@ def _text_files(path: Path) -> list[Path]:
     return sorted(p for p in candidates if p.is_file() and (p == path or p.suffix in _TEXT_SUFFIXES))
 
 
-MOTIONS = ("ar1=walk:speed=0.65", "ar2=walk:speed=0.55", "robot=robot:speed=0.3")
-AGENTS = tuple(motion.partition("=")[0] for motion in MOTIONS)
-PROFILE = "d435i:640x480@15"  # half of the device's frame rate: four processes share two cores
+# `share demo`: two headsets and a robot in one room.
+
+_DEMO_MOTIONS = ("ar1=walk:speed=0.65", "ar2=walk:speed=0.55", "robot=robot:speed=0.3")
+DEMO_AGENTS = tuple(motion.partition("=")[0] for motion in _DEMO_MOTIONS)
+_DEMO_PROFILE = "d435i:640x480@15"  # half of the device's frame rate: four processes share two cores
 DEFAULT_SCENE, FALLBACK_SCENE = "warehouse", "plain"
 
 
@@ -98,13 +107,6 @@ def meeting_seed(scene: str) -> int:
     return 3 if scene == FALLBACK_SCENE else 11
 
 
-def recipe(scene: str, seconds: float, seed: int) -> SessionRecipe:
+def demo_recipe(scene: str, seconds: float, seed: int) -> SessionRecipe:
     """Return the recipe with the same three agents for any scene."""
-    return SessionRecipe(scene, MOTIONS, seconds, seed, profiles={"": PROFILE})
-
-
-Progress = Callable[[str, int, int], None]  # task, done, total
-
-
-def no_progress(what: str, done: int, total: int) -> None:
-    """Ignore progress."""
+    return SessionRecipe(scene, _DEMO_MOTIONS, seconds, seed, profiles={"": _DEMO_PROFILE})

@@ -61,6 +61,9 @@ def encoded_image(p: EncodedPicture, where: str) -> EncodedImage:
     return EncodedImage(p.data, where, p.width, p.height, DEPTH_SCALE if p.stream == DEPTH else 0.0)
 
 
+# Recordings and ground truth.
+
+
 def write_recording(actor: Actor, chunks: list[Path], path: Path) -> None:
     """Write `path`.mcap with all streams in order of time. Raises ShareError where the disk is full."""
     clock = actor.device.clock
@@ -108,6 +111,9 @@ def _imu_measurements(actor: Actor) -> Iterator[Measurement]:
 def _image_measurements(chunks: list[Path]) -> Iterator[Measurement]:
     for path in chunks:
         yield from read_chunk(path)
+
+
+# EuRoC/ASL folders, for other programs.
 
 
 def check_asl(stage: RoomStage) -> None:

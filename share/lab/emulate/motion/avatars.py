@@ -159,6 +159,8 @@ def _head(skin: Material, rng: Rng) -> Shape:
     return concat_shapes(*parts, goggles, camera, strap)
 
 
+# Poses of the parts.
+
 _RATE_HZ = 50
 _TRUNK_SMOOTHING_S = 0.35  # sigma
 _GAZE_WEIGHT = 0.35  # m/s; the trunk faces the direction of motion above this speed, the gaze below

@@ -152,6 +152,8 @@ def _target_speeds(
     return speed
 
 
+# All agents together.
+
 _ATTEMPTS = 60
 _LENGTH_ROUNDS = 6  # replanning rounds that adjust path lengths
 _MIN_IMPROVEMENT = 0.7  # a round must reduce length errors to this share, else a new attempt starts

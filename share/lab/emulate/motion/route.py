@@ -60,6 +60,8 @@ def floor_from_occupancy(occupancy: Occupancy) -> Floor:
     return Floor(grid, step * _VOXELS_PER_CELL, float(origin[0]))
 
 
+# Routes over the floor.
+
 Rng = np.random.Generator
 POINT_SPACING_M = 0.05  # between points of a finished route
 _BAND_SPACING_M = 0.1  # between points of a band

@@ -28,6 +28,8 @@ from share.lab.emulate.motion.spline import SplinePath, spline_through
 from share.lab.emulate.motion.track import KNOT_S, PlanarTrack, knot_times, min_jerk, random_wander
 from share.types import F64
 
+# Gait: motion of the trunk in walking (bob, sway, heel strikes) and in standing.
+
 WALK_RATIO = 0.39  # m s
 _SPEEDS = (0.0, 0.7, 1.6, 2.2)  # m/s
 _BOB_M = (0.012, 0.0274, 0.0483, 0.055)  # m, peak to peak
@@ -82,6 +84,8 @@ def _heel_strikes(phase: F64, speed: F64, seconds: F64) -> F64:
         out[near] += _JOLT_M * min(speed[i] / 1.4, 1.3) * pulse
     return out
 
+
+# Gaze: direction of the head.
 
 _LOOK_AHEAD_S = 0.35  # the head max_rate into a bend before the trunk
 _PITCH_DOWN = 0.14  # rad, when looking ahead
@@ -189,6 +193,8 @@ def _direction_to(track: PlanarTrack, eye: float, xy: F64, z: F64 | float) -> tu
     up = _MAX_UP * np.tanh(np.arctan2(z - eye, _MIN_FOLLOWED_M * np.hypot(near, 1)) / _MAX_UP)
     return track.heading + side, up
 
+
+# The path of the headset.
 
 RADIUS = 0.30  # m, with arms hanging
 INITIAL_STILL_S = 1.3  # at rest at the start, for IMU initialisation

@@ -147,6 +147,8 @@ def crate_texture(rng: Rng, size: Size, per_m: float) -> F32:
     return out
 
 
+# The room.
+
 TEXELS_PER_M = 250.0
 LEVELS = 6  # of the mip pyramid: level l has 2^-l of the resolution
 _PATCH_PADDING = 1 << (

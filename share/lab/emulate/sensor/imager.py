@@ -112,6 +112,8 @@ def blur_offsets(exposure_ms: float, pixels_of_motion: float) -> F64:
     return ((np.arange(samples) + 0.5) / samples - 0.5) * exposure_ms * 1e-3
 
 
+# The imager.
+
 _BANK_MARGIN = 512  # the noise bank exceeds a picture by this, so there are 512^2 offsets to read it at
 
 

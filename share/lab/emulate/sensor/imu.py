@@ -94,6 +94,8 @@ def saturate_and_quantise(values: F64, sensor: InertialFacts) -> F64:
     return np.rint(out / sensor.step) * sensor.step if sensor.step else out
 
 
+# Vibration and knocks.
+
 _ROTORS, _ROTOR_HZ, _WANDER_HZ, _WANDER_S = 4, (70.0, 110.0), 4.0, 2.0
 _HARMONIC_AMPLITUDE = 0.5  # amplitude of the double frequency
 _ROTATION_RATIO = 0.03  # rad/s of rotation for each m/s^2

@@ -204,6 +204,8 @@ def _ceiling_lamps(shell: tuple[Piece, ...], extent: F64) -> tuple[Light, ...]:
     )
 
 
+# Triangles face the room.
+
 _RAYS = 256  # from each place
 _MAX_PLACES = 400
 

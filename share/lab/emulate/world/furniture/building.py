@@ -59,6 +59,9 @@ def window(rng: Rng, width: float, height: float) -> Shape:
     )
 
 
+# Pillars and girders.
+
+
 def concrete_pillar(rng: Rng, side: float, height: float) -> Shape:
     """A square pillar with its corners guarded by striped angles up to 1.2 m, and notices on it. Its
     middle is at the origin."""
@@ -105,6 +108,9 @@ def girder(rng: Rng, length: float, height: float) -> Shape:
         x = min(k * 1.5, length - 0.1) - length / 2
         out.append(box_on((x, 0, t), (0.012, w * 0.9, height - 2 * t), skin, rng))
     return concat_shapes(*out)
+
+
+# Pipes, ducts and radiators.
 
 
 def pipe_run(rng: Rng, length: float, count: int) -> Shape:
@@ -171,6 +177,8 @@ def radiator(rng: Rng, width: float) -> Shape:
     return concat_shapes(*fins, *rails, *feet, *stand)
 
 
+# Lamps: the object and its light.
+
 _LAMP_MATERIAL = Material("lamp")
 _LIGHT_OFFSET_M = 0.02  # the light starts below its lamp
 
@@ -210,6 +218,9 @@ def high_bay_lamp(rng: Rng, drop: float) -> Shape:
 def high_bay_light(x: float, y: float, ceiling: float, drop: float, power: float) -> Light:
     """Return the light of `high_bay_lamp` at (x, y) under `ceiling` m."""
     return Light((x, y, ceiling - drop - 0.35 - _LIGHT_OFFSET_M), power, (0.4, 0.4))
+
+
+# Signs, posters and panels on walls.
 
 
 def printed_plate(rng: Rng, kind: str, width: float, height: float, thick: float = 0.012) -> Shape:

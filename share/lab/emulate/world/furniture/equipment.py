@@ -91,6 +91,9 @@ def crate(rng: Rng) -> Shape:
     return concat_shapes(*out)
 
 
+# Ladders.
+
+
 def leaning_ladder(rng: Rng, length: float) -> Shape:
     """A ladder of `length` m that leans against a wall in the plane y = 0, its feet 0.3 of that away."""
     skin, foot = pick_material(rng, "galvanised"), -0.28 * length
@@ -116,6 +119,9 @@ def step_ladder(rng: Rng, height: float) -> Shape:
         out.append(box_on((0, -d + 0.23 * height * s, height * s), (0.38, 0.1, 0.03), skin, rng))
     out.append(box_on((0, -0.3 * height, height), (0.5, 0.28, 0.04), pick_material(rng, "plastic"), rng))
     return concat_shapes(*out)
+
+
+# Tables, workbenches, benches and chairs.
 
 
 def workbench(rng: Rng, width: float) -> Shape:
@@ -208,6 +214,9 @@ def chair(rng: Rng) -> Shape:
         ),
         box_on((0, -0.02, 0.6), (0.44, 0.03, 0.25), shell, rng),
     )
+
+
+# Fire hoses and extinguishers.
 
 
 def rolled_hose(rng: Rng, radius: float, wide: float = 0.075) -> Shape:

@@ -45,6 +45,8 @@ def waste_bin(rng: Rng) -> Shape:
     return concat_shapes(hull, rim, floor)
 
 
+# Cartons.
+
 _TAPE = Material("plastic", 9, gray=165, contrast=0.5)
 
 
@@ -119,6 +121,8 @@ def _one_or_two(rng: Rng, x: float, w: float, d: float, h: float, y: float) -> l
     ]
 
 
+# Pallets.
+
 _PALLET_W, _PALLET_D, _PALLET_H = 1.2, 0.8, 0.144
 
 
@@ -181,6 +185,8 @@ def _wrapped_block(rng: Rng, height: float) -> list[Shape]:
     body = box(low, high, {"all": pick_material(rng, "foil"), "bottom": None}, rng)
     return [body, front_print(rng, 0.05, height * 0.6, 0.21, 0.15, "label", -_PALLET_D + 0.02)]
 
+
+# Racks and cupboards.
 
 _POST_M = 0.05
 _BOARD_M = 0.025
@@ -281,6 +287,9 @@ def _cupboard_row(rng: Rng, width: float, depth: float, z: float, height: float)
             out.append(box(low, high, {"-y": skins, "all": rest, "bottom": None, "+y": None}, rng, cell))
         x += w + rng.uniform(0.01, 0.1)
     return out
+
+
+# Lockers and cloakrooms.
 
 
 def lockers(rng: Rng, count: int) -> Shape:

@@ -170,6 +170,9 @@ def _stripe(rng: Rng) -> tuple[Material, Rng, int]:
     return skin, rng, cell
 
 
+# Trucks for pallets.
+
+
 def forklift(rng: Rng) -> Shape:
     """A counterbalance truck, 1.1 x 2.9 m, forks towards -y, overhead guard of 2.1 m."""
     paint, dark, bar = Material("lacquer", 1, gray=150), Material("rubber"), Material("steel", 0, gray=50)

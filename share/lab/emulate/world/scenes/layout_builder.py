@@ -105,6 +105,8 @@ class LayoutBuilder:
         return Layout(self.name, self.seed, self.size, *parts, ambient, brightness)
 
 
+# Walls, floor, ceiling and what carries them.
+
 BAY_M = 3.0  # about, between columns and girders
 
 
@@ -180,6 +182,8 @@ def add_skirting(plan: LayoutBuilder, walls: Sequence[Wall]) -> None:
         )
         plan.add_unchecked("skirting", wall.place(strip, 0))
 
+
+# Free floor between the furniture.
 
 _STEP = 0.1
 _WALKER_CLEARANCE_M = 0.45  # least distance of a walker's middle from objects
