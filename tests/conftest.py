@@ -73,11 +73,11 @@ def plain_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's cache folder ($XDG_CACHE_HOME) with the three seconds that `share demo --scene plain
     --seconds 3 --seed 18` plays: ar1, ar2 and robot in the plain room, 45 frames each. With this seed
     each device has had 20 IMU samples by its first picture, all that the tracker needs to begin."""
-    from share.lab.emulate.demo import recipe
+    from share.lab.emulate.recipe import demo_recipe
     from share.lab.emulate.session import make_cached_session
 
     cache = tmp_path_factory.mktemp("cache")
-    make_cached_session(recipe("plain", 3.0, 18), cache / "share")
+    make_cached_session(demo_recipe("plain", 3.0, 18), cache / "share")
     return cache
 
 

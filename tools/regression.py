@@ -71,13 +71,13 @@ NOISE = {
     _ODOMETRY: 0.3,
     "AR latency": 0.05,
     "AR corrections": 0.1,
-    "merges a metre": 0.1,
+    "merges per metre": 0.1,
     "joint ATE": 0.3,
     "AR RPE over 1 s": 0.25,
-    "AR until in a shared map": 0.3,
+    "AR time to shared map": 0.3,
     "agents in one map": 0.2,
-    "AR error told": 0.1,
-    "robot error told": 0.12,
+    "AR estimated error": 0.1,
+    "robot estimated error": 0.12,
 }
 _ALL = "all"
 MORE_IS_BETTER = ("agents in one map",)

@@ -14,7 +14,7 @@ from share.config import STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.lab.evaluate.real_time import SessionScore
+    from share.lab.evaluate.scoring import SessionScore
     from share.metrics.ate import Ate
 
 
@@ -64,19 +64,20 @@ def demo(
             "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
         )
     from share.files.writing import writable_dir
-    from share.lab.emulate.demo import AGENTS, meeting_seed, recipe
+    from share.lab.emulate.recipe import DEMO_AGENTS, demo_recipe, meeting_seed
     from share.lab.emulate.session import make_cached_session
     from share.lab.evaluate.emulated_network import LinkAssignment
-    from share.lab.evaluate.real_time import RunOptions, play_in_real_time, score_session
+    from share.lab.evaluate.real_time import RunOptions, play_in_real_time
+    from share.lab.evaluate.scoring import score_session
     from share.recordings.session import read_session
     from share.runtime.machine import core_count
 
-    LinkAssignment.parse(link).check(AGENTS)
+    LinkAssignment.parse(link).check(DEMO_AGENTS)
     writable_dir(out)
     room = _renderable_scene(scene)
     seed = meeting_seed(room) if seed is None else seed
     with Stages() as stages:
-        session = read_session(make_cached_session(recipe(room, seconds, seed), progress=stages))
+        session = read_session(make_cached_session(demo_recipe(room, seconds, seed), progress=stages))
     live = LiveLine()
     run_terms = RunOptions(
         policy,
@@ -109,7 +110,7 @@ def demo(
 
 def _renderable_scene(scene: str | None) -> str:
     """Return the scene given, or the default; the plain one where OpenGL is missing."""
-    from share.lab.emulate.demo import DEFAULT_SCENE, FALLBACK_SCENE
+    from share.lab.emulate.recipe import DEFAULT_SCENE, FALLBACK_SCENE
     from share.lab.emulate.render.context import missing_reason
 
     if scene is not None:

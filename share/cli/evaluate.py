@@ -151,18 +151,18 @@ _ERROR_COLUMNS = (
     _value("odom ATE", lambda a: a.odom_ate_cm, "cm", 2),
     _plain("of", lambda a: a.odom_n),
     _value("map ATE", lambda a: a.ate_cm, "cm", 2),
-    _plain("of", lambda a: a.in_map),
+    _plain("of", lambda a: a.ate_n),
     _value("RPE frame", lambda a: a.rpe_frame_cm, "mm", factor=10),
     _value("", lambda a: a.rpe_frame_deg, "°", 3),
     _value("RPE 1 s", lambda a: a.rpe_1s_cm, "cm", 2),
     _value("", lambda a: a.rpe_1s_deg, "°", 2),
     _plain("of", lambda a: a.rpe_1s_n),
-    _value("in a map", lambda a: a.joined_s, "s"),
+    _value("in a map", lambda a: a.shared_map_s, "s"),
     _value("sent", lambda a: a.rate_hz, "Hz"),
     _value("up", lambda a: a.kb_up_s, "kB/s", 0),
     _value("down", lambda a: a.kb_down_s, "kB/s", 0),
     _value("QoE", lambda a: a.qoe, "", 2),
-    _value("reported error", lambda a: a.told_cm, "cm", 2),
+    _value("reported error", lambda a: a.estimated_error_cm, "cm", 2),
 )
 
 
@@ -176,7 +176,7 @@ def run_table(run: RunMetrics) -> str:
     where = f"{c.session}: policy {c.policy}, {c.link or 'loopback'}, seed {c.seed}"
     joint_text = f"joint ATE {_value_text(run.joint_ate_cm, 'cm', 2)}"
     return (
-        f"{where}; in {c.clock}, evaluations report {c.told}\n"
+        f"{where}; in {c.clock}, evaluations report {c.error_source}\n"
         f"{column_table(_LATENCY_COLUMNS, run.agents)}\n\n{column_table(_ERROR_COLUMNS, run.agents)}\n"
-        f"{run.in_one_map} of {len(run.agents)} agents in one map, {joint_text}; {merges}"
+        f"{run.agents_in_largest_map} of {len(run.agents)} agents in one map, {joint_text}; {merges}"
     )

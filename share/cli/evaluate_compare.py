@@ -110,8 +110,8 @@ def _run_jobs(
 
 def _write_report(out: Path, rows_found: Sequence[TrackerRow], missing: Sequence[str]) -> None:
     from share.files.writing import atomic_write
-    from share.lab.evaluate.html_page import html_page
-    from share.lab.evaluate.peer_report import draw_comparison, markdown, rows_csv
+    from share.lab.evaluate.peer_comparison import draw_comparison, markdown, rows_csv
+    from share.lab.evaluate.report import html_page
 
     text = markdown(rows_found, missing)
     atomic_write(out / "table.md", text)

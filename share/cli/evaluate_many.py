@@ -136,8 +136,7 @@ def _write_ablation_report(
     out: Path, trials: list[Trial], failed: list[str], sections: list[ReportSection]
 ) -> None:
     from share.files.writing import atomic_write
-    from share.lab.evaluate.html_page import html_page
-    from share.lab.evaluate.report import agents_csv, markdown, runs_csv
+    from share.lab.evaluate.report import agents_csv, html_page, markdown, runs_csv
     from share.lab.evaluate.report_charts import draw_report
     from share.lab.evaluate.scoring import run_metrics
     from share.lab.evaluate.statistics import policy_names
@@ -160,7 +159,7 @@ def _write_ablation_report(
     click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv")
 
 
-_HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges a metre", "AR QoE")
+_HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges per metre", "AR QoE")
 
 
 @click.command(short_help="Compare settings on sessions.")
@@ -206,8 +205,7 @@ def sweep(
     parallel_option = "--scheduler" if scheduler else "--workers" if workers > 1 else None
     _check_parallel(parallel_option, options_given["virtual"])
     from share.files.writing import writable_dir
-    from share.lab.evaluate.campaign import worker_pool
-    from share.lab.evaluate.cluster import Cluster
+    from share.lab.evaluate.campaign import Cluster, worker_pool
     from share.lab.evaluate.real_time import RunOptions
     from share.lab.evaluate.sweep import Axis, grid, plan_sweep, random_points
     from share.recordings.session import read_session

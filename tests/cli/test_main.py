@@ -195,7 +195,7 @@ def test_ended_command_leaves_no_complete_looking_output(tmp_path):
 
 @pytest.mark.slow
 def test_interrupted_command_continues_when_run_again(tmp_path):
-    from share.lab.emulate.demo import recipe
+    from share.lab.emulate.recipe import demo_recipe
     from share.lab.emulate.session import make_cached_session
 
     assert interrupted(tmp_path, signal.SIGINT) == (130, "", "share: interrupted\n")
@@ -208,7 +208,7 @@ def test_interrupted_command_continues_when_run_again(tmp_path):
         now = chunks(tmp_path)
         assert {path: now[path] for path in left} == left  # not drawn again
 
-    session = make_cached_session(recipe("plain", 3.0, 0), tmp_path / "share", progress=watch)
+    session = make_cached_session(demo_recipe("plain", 3.0, 0), tmp_path / "share", progress=watch)
     began = next(done for what, done in seen if what == "drawing images")
     assert 0 < began < 135  # frames that were there at once
     assert ("drawing images", 135) in seen

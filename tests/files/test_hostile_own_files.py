@@ -19,13 +19,11 @@ from share.files.arrays import read_array, read_arrays
 from share.files.json_file import parse_json, read_json, read_json_lines
 from share.files.line_file import GrowingFile
 from share.files.yaml_file import read_settings, read_yaml
-from share.lab.emulate.chunks import read_chunk
-from share.lab.emulate.room_file import open_renderer
-from share.lab.emulate.world.room_files import load_room
+from share.lab.emulate.recordings import read_chunk
+from share.lab.emulate.world.room_files import load_room, open_renderer
 from share.lab.evaluate import charts
 from share.lab.evaluate.charts import draw_bars
-from share.lab.evaluate.html_page import html_page
-from share.lab.evaluate.report import read_section
+from share.lab.evaluate.report import html_page, read_section
 from share.lab.evaluate.trial import read_trial
 from share.lab.evaluate.virtual_time import read_delays
 from share.lab.train.labels import Labels, read_labels, write_labels

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from share.geometry import se3
-from share.lab.emulate.preparation import prepare_session
-from share.lab.emulate.progress import no_progress
-from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.recipe import SessionRecipe, no_progress
+from share.lab.emulate.stage import prepare_session
 from share.lab.emulate.types import MotionPath as Motion
 from share.recordings.mcap.recorder import Recorder
 from share.runtime.source import open_source

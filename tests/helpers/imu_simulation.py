@@ -9,7 +9,7 @@ from helpers.imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
 from share.config import InertialConfig
 from share.geometry import se3
-from share.lab.emulate.sensor.vibration import rotation_rates, vibration_acceleration
+from share.lab.emulate.sensor.imu import rotation_rates, vibration_acceleration
 from share.odometry import feature_matching, filter
 from share.odometry import state as filter_state
 from share.odometry.imu_predictor import ImuBuffer

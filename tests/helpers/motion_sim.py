@@ -9,8 +9,8 @@ from scipy.ndimage import distance_transform_edt
 
 from share.geometry import se3
 from share.lab.emulate.motion import robot, walk
-from share.lab.emulate.motion.floor import Floor
-from share.lab.emulate.motion.planned_motion import FloorGraphs, MotionPreferences, plan_motion
+from share.lab.emulate.motion.crowd import FloorGraphs, MotionPreferences, plan_motion
+from share.lab.emulate.motion.route import Floor
 from share.lab.emulate.types import GRAVITY, START_NS
 
 BLOCKS = ((0, 0, 9, 0.6), (0, 5.4, 9, 6), (0, 2, 0.5, 4), (4, 2.6, 5.2, 3.4), (7, 3, 7.5, 3.5))

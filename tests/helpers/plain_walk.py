@@ -9,7 +9,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.lab.emulate.motion.motion_plan import plan_motions
-from share.lab.emulate.plain.scene import DEFAULT_SIZE, PlainRenderer, plain_layout
+from share.lab.emulate.plain.render import DEFAULT_SIZE, PlainRenderer, plain_layout
 from share.lab.emulate.sensor.device import EmulatedDevice
 from share.lab.emulate.types import MotionPath, SceneInstant
 from share.sensors.profile import load_profile

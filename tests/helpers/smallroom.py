@@ -18,7 +18,7 @@ def table(rng: np.random.Generator) -> Shape:
         for x in (0.0, 1.55)
         for y in (0.0, 0.75)
     ]
-    return concat_shapes([top, *legs])
+    return concat_shapes(top, *legs)
 
 
 def shell(rng: np.random.Generator) -> tuple[Piece, ...]:

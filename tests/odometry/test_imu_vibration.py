@@ -7,7 +7,7 @@ from helpers.imu_simulation import Setup, run
 from helpers.imu_world import NOISE, Path, imu_of
 
 from share.geometry.camera import ImuNoise
-from share.lab.emulate.sensor.vibration import vibration_acceleration
+from share.lab.emulate.sensor.imu import vibration_acceleration
 from share.odometry.imu_predictor import ImuBuffer
 from share.odometry.imu_propagation import noise_with_vibration
 from share.types import ImuBatch

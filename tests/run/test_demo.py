@@ -15,7 +15,7 @@ from helpers.children import SHARE
 from share.config import Config
 from share.geometry import se3
 from share.geometry.interpolation import associate
-from share.lab.emulate.demo import DEFAULT_SCENE, recipe
+from share.lab.emulate.recipe import DEFAULT_SCENE, demo_recipe
 from share.lab.emulate.session import make_cached_session
 from share.runtime.offline_tracking import track
 from share.runtime.source import open_source
@@ -102,7 +102,7 @@ def test_the_whole_demo_to_the_centimetre(tmp_path):
 @pytest.mark.slow
 def test_odometry_does_not_jump_when_a_place_is_seen_again(tmp_path):
     """ar2 comes round to where it began; what it has drifted is for the edge to correct."""
-    session = make_cached_session(recipe(DEFAULT_SCENE, 20, 0), tmp_path)
+    session = make_cached_session(demo_recipe(DEFAULT_SCENE, 20, 0), tmp_path)
     source = open_source(f"{session}/ar2")
     run = track(source, Config(), lambda done: None)
     _, estimate, truth = associate(run.trajectory, source.truth())

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from share.lab.evaluate.real_time import AgentScore, _joint_ate
+from share.lab.evaluate.scoring import AgentScore, largest_map_ate
 from share.metrics.ate import ate
 from share.metrics.frame_log import RunLog
 from share.recordings.trajectory import Trajectory, format_tum, read_tum
@@ -49,12 +49,12 @@ def test_agents_are_scored_by_the_map_of_their_file(tmp_path):
         report = {"map_tum_id": map_tum, "protocol": {"map_id": "joined/0"}}
         return AgentScore(report, ate(told, truth), told, truth)
 
-    found = _joint_ate(
+    found = largest_map_ate(
         {"ann": agent("a/0", truth), "bob": agent("a/0", truth), "late": agent("b/0", elsewhere)}
     )
     assert found is not None
     assert set(found.agents) == {"ann", "bob"}
     assert found.joint.rmse < 1e-9
     alone = {"ann": agent("a/0", truth)}
-    assert _joint_ate(alone | {"late": agent("b/0", elsewhere)}) is None  # each in a map of its own
-    assert _joint_ate(alone) is not None  # who plays alone is all there are
+    assert largest_map_ate(alone | {"late": agent("b/0", elsewhere)}) is None  # each in a map of its own
+    assert largest_map_ate(alone) is not None  # who plays alone is all there are

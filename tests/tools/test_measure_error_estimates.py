@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from share.lab.evaluate.real_time import AgentScore, SessionScore
+from share.lab.evaluate.scoring import AgentScore, SessionScore
 from share.metrics.ate import Ate, JointAte
 from share.recordings.trajectory import Trajectory
 

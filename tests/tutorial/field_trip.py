@@ -11,8 +11,7 @@ import numpy as np
 from helpers.field_sim import Watched, export, paths, seen
 
 from share.geometry import se3
-from share.lab.emulate.progress import Progress, no_progress
-from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.recipe import Progress, SessionRecipe, no_progress
 from share.lab.emulate.sensor.effects import Effects
 from share.lab.emulate.sensor.imu import measured_samples
 from share.lab.emulate.session import make_cached_session

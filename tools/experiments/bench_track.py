@@ -33,8 +33,7 @@ import numpy as np  # noqa: E402
 import poselib  # noqa: E402, F401 -- else the first frame would pay for it
 
 from share.config import Config, TrackerConfig  # noqa: E402
-from share.lab.emulate.demo import DEFAULT_SCENE, FALLBACK_SCENE  # noqa: E402
-from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
+from share.lab.emulate.recipe import DEFAULT_SCENE, FALLBACK_SCENE, SessionRecipe  # noqa: E402
 from share.lab.emulate.render.context import missing_reason  # noqa: E402
 from share.lab.emulate.session import make_cached_session, make_session  # noqa: E402
 from share.odometry import feature_appearance, feature_matching, filter, initial_depth, visual_update  # noqa: E402

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from room_views import level_camera_pose
 
 from share.geometry.camera import Camera
 from share.lab.emulate.render.gl import GlRenderer
@@ -24,7 +25,6 @@ from share.lab.emulate.world.build import build_room
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
 from share.lab.emulate.world.scenes import SCENES, make_scene_layout
-from share.lab.emulate.world.views import level_camera_pose
 from share.recordings.session import read_session
 from share.runtime.source import open_source
 from share.sensors.measurement import CAM0

@@ -11,19 +11,16 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from keyframe_odometry import Drift, odometry
 from keyframe_set import AgentKeyframes, KeyframeSet, Spacing
-from share.runtime.pool import Pool
 
 from share.geometry import se3
 from share.geometry.camera import Rig
 from share.lab.emulate import drawing
-from share.lab.emulate.chunks import EncodedPicture, encoded_image
-from share.lab.emulate.preparation import PreparedSession, keep_room, prepare_session
-from share.lab.emulate.progress import Progress, no_progress
-from share.lab.emulate.recipe import SessionRecipe
-from share.lab.emulate.recordings import true_trajectory
+from share.lab.emulate.recipe import Progress, SessionRecipe, no_progress
+from share.lab.emulate.recordings import EncodedPicture, encoded_image, true_trajectory
 from share.lab.emulate.sensor.device import PictureTimes
-from share.lab.emulate.sensor.exposure import ExposureSeries
-from share.lab.emulate.stage import Actor, RoomStage
+from share.lab.emulate.sensor.imager import ExposureSeries
+from share.lab.emulate.stage import Actor, PreparedSession, RoomStage, keep_room, prepare_session
+from share.lab.pool import Pool
 from share.protocol.agent_ledger import KeyframeChain
 from share.recordings.trajectory import Trajectory
 from share.sensors.measurement import CAM0, CAM1, DEPTH

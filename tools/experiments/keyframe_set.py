@@ -22,8 +22,7 @@ import numpy as np
 
 from share.errors import DataError, UsageError, WireError
 from share.files.writing import atomic_write, writable_dir
-from share.lab.emulate.progress import Progress, no_progress
-from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.recipe import Progress, SessionRecipe, no_progress
 from share.lab.emulate.session import default_cache
 from share.types import F64, Keyframe
 from share.wire.codec import decode, encode

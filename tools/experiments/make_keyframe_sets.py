@@ -25,8 +25,8 @@ from tool_main import exit_code  # noqa: E402
 
 from share.cli.terminal import Stages  # noqa: E402
 from share.errors import UsageError  # noqa: E402
-from share.lab.emulate.preparation import make_layout  # noqa: E402
 from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
+from share.lab.emulate.stage import make_layout  # noqa: E402
 
 NAME = "make_keyframe_sets"
 

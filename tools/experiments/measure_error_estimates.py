@@ -30,8 +30,7 @@ from tool_main import exit_code, line  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.files.json_file import read_json_lines  # noqa: E402
 from share.geometry.interpolation import associate  # noqa: E402
-from share.lab.evaluate.real_time import score_session  # noqa: E402
-from share.lab.evaluate.scoring import first_join_s, traces  # noqa: E402
+from share.lab.evaluate.scoring import first_join_s, score_session, traces  # noqa: E402
 from share.lab.evaluate.trial import RUN_FILE, SETTINGS_FILE, Trial, read_trial  # noqa: E402
 from share.metrics.ate import error_statistics, position_errors  # noqa: E402
 from share.types import F64  # noqa: E402

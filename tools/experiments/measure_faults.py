@@ -2,7 +2,7 @@
 
     python tools/experiments/measure_faults.py [--seconds S] [--faults A,B] [--out FILE] SESSION/NAME ...
 
-Each fault of `share/lab/emulate/faults.py` on its own, on the first S seconds. `ate_cm`: causal poses, SE3
+Each fault of `sensor_faults.py` on its own, on the first S seconds. `ate_cm`: causal poses, SE3
 alignment, of the longest segment (`scored`: its share of all frames with a pose); `ratio`: to the clean run.
 `states`: % of the frames. `lost_s`, `stretches`: as in report.json. `wrong_ok`: % of all frames that are OK
 although the position errs by more than 5 cm and more than three of its sigmas; aligned at the first pose of
@@ -28,14 +28,14 @@ from share import startup
 startup.prepare_process()
 
 import numpy as np  # noqa: E402
+from consistency import deviations  # noqa: E402
+from sensor_faults import FAULTS, Fault, MeasurementFilter, apply_fault  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Rig  # noqa: E402
 from share.geometry.interpolation import interpolate  # noqa: E402
-from share.lab.emulate.faults import FAULTS, Fault, MeasurementFilter, apply_fault  # noqa: E402
-from share.lab.evaluate.statistics import deviations  # noqa: E402
 from share.metrics.ate import ate  # noqa: E402
 from share.metrics.frame_log import RunLog  # noqa: E402
 from share.odometry.inertial_tracker import InertialTracker  # noqa: E402

@@ -24,11 +24,15 @@ startup.prepare_process()
 import numpy as np  # noqa: E402
 
 from share.errors import ShareError  # noqa: E402
-from share.lab.emulate.motion.crowd import fixed_path, path_length  # noqa: E402
-from share.lab.emulate.motion.floor import Floor  # noqa: E402
-from share.lab.emulate.motion.motion_plan import PlannedAgent, plan_motions  # noqa: E402
-from share.lab.emulate.motion.paper import LENGTHS_M, NAMES, SECONDS  # noqa: E402
-from share.lab.emulate.motion.planned_motion import min_distance  # noqa: E402
+from share.lab.emulate.motion.crowd import fixed_path, min_distance, path_length  # noqa: E402
+from share.lab.emulate.motion.motion_plan import (  # noqa: E402
+    PAPER_LENGTHS_M,
+    PAPER_NAMES,
+    PAPER_S,
+    PlannedAgent,
+    plan_motions,
+)
+from share.lab.emulate.motion.route import Floor  # noqa: E402
 from share.lab.emulate.world.layout import Layout  # noqa: E402
 from share.lab.emulate.world.occupancy import Occupancy  # noqa: E402
 from share.lab.emulate.world.scenes import make_scene_layout  # noqa: E402
@@ -73,11 +77,11 @@ def of_plan(scene: str, number: int, seed: int) -> Row:
     room = make_scene_layout(scene, seed, SIZE)
     began = time.process_time()
     try:
-        agents = plan_motions([f"paper:{number}"], room, SECONDS, seed).agents
+        agents = plan_motions([f"paper:{number}"], room, PAPER_S, seed).agents
     except ShareError as error:
         return {"failed": str(error)}
     cpu_s = time.process_time() - began
-    wanted = LENGTHS_M[number]
+    wanted = PAPER_LENGTHS_M[number]
     off = [100 * (path_length(a.path) / length - 1) for a, length in zip(agents, wanted, strict=True)]
     return {"length_off": [_round(x) for x in off], "cpu_s": _round(cpu_s)} | distances(room, agents)
 
@@ -108,7 +112,7 @@ def summary_of_plans(rows: list[Row]) -> Row:
     cpu_s = [row["cpu_s"] for row in done]
 
     def least(key: str) -> dict[str, float]:
-        return dict(zip(NAMES, np.min([row[key] for row in done], axis=0).tolist(), strict=True))
+        return dict(zip(PAPER_NAMES, np.min([row[key] for row in done], axis=0).tolist(), strict=True))
 
     return {
         "runs": len(rows),

@@ -41,7 +41,7 @@ from share.errors import DataError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.interpolation import associate, interpolate  # noqa: E402
 from share.geometry.se3 import umeyama  # noqa: E402
-from share.lab.emulate.motion.recorded_sources import EUROC_OPTIONS, open_recorded_motion  # noqa: E402
+from share.lab.emulate.motion.recorded import EUROC_OPTIONS, open_recorded_motion  # noqa: E402
 from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
 from share.lab.emulate.session import make_cached_session  # noqa: E402
 from share.metrics.ate import ate  # noqa: E402

@@ -31,13 +31,13 @@ import numpy as np  # noqa: E402
 from keyframe_set import AgentKeyframes, KeyframeSet  # noqa: E402
 from load_tracks import room  # noqa: E402
 from measure_joins import configured  # noqa: E402
+from modelled_mapper import GroundTruth, ModelledMapper, RecognitionModel  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.config import POLICY_NAMES, STREAMED, Config  # noqa: E402
 from share.geometry.interpolation import Trajectory  # noqa: E402
 from share.geometry.se3 import transform, umeyama  # noqa: E402
 from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
-from share.lab.evaluate.modelled_mapper import GroundTruth, ModelledMapper, RecognitionModel  # noqa: E402
 from share.lab.evaluate.simulation import ProcessingDelays, Simulation, TrackedFrame  # noqa: E402
 from share.metrics.frame_log import summary as summarised  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402

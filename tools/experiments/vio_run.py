@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from consistency import Deviations, deviations, nees, share_within
 
 from share.config import Config
 from share.errors import DataError
 from share.geometry.interpolation import associate
-from share.lab.evaluate.statistics import Deviations, deviations, nees, share_within
 from share.metrics.ate import ate
 from share.metrics.frame_log import RunLog
 from share.metrics.rpe import rpe_time

@@ -14,11 +14,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from share.lab.emulate.chunks import EncodedPicture, write_chunk
-from share.lab.emulate.room_file import open_renderer
-from share.lab.emulate.sensor.exposure import Exposure, ExposureSeries
+from share.lab.emulate.recordings import EncodedPicture, write_chunk
+from share.lab.emulate.sensor.imager import Exposure, ExposureSeries
 from share.lab.emulate.stage import Actor, ActorView, RoomStage, T_body_camera, downsized
 from share.lab.emulate.types import RoomRenderer
+from share.lab.emulate.world.room_files import open_renderer
 from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.types import F64, I64, U8
 

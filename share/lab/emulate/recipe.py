@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,13 @@ SENSORS = ("stereo", "rgbd", "mono")
 IMAGES = ("jpeg", "png")
 # depths at which a recording's folder has text files, as FOLDER/mav0/imu0/data.csv
 _FOLDER_DEPTHS, _TEXT_SUFFIXES = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")
+
+
+Progress = Callable[[str, int, int], None]  # task, done, total
+
+
+def no_progress(what: str, done: int, total: int) -> None:
+    """Ignore progress."""
 
 
 @dataclass(frozen=True)
@@ -84,3 +91,22 @@ def _text_files(path: Path) -> list[Path]:
     """Return the file, or the text files of a recording's folder."""
     candidates = [path] if path.is_file() else [p for depth in _FOLDER_DEPTHS for p in path.glob(depth)]
     return sorted(p for p in candidates if p.is_file() and (p == path or p.suffix in _TEXT_SUFFIXES))
+
+
+# `share demo`: two headsets and a robot in one room.
+
+_DEMO_MOTIONS = ("ar1=walk:speed=0.65", "ar2=walk:speed=0.55", "robot=robot:speed=0.3")
+DEMO_AGENTS = tuple(motion.partition("=")[0] for motion in _DEMO_MOTIONS)
+_DEMO_PROFILE = "d435i:640x480@15"  # half of the device's frame rate: four processes share two cores
+DEFAULT_SCENE, FALLBACK_SCENE = "warehouse", "plain"
+
+
+def meeting_seed(scene: str) -> int:
+    """Return a seed of the scene with which all three soon see the same things; with others 20 s may be too
+    short."""
+    return 3 if scene == FALLBACK_SCENE else 11
+
+
+def demo_recipe(scene: str, seconds: float, seed: int) -> SessionRecipe:
+    """Return the recipe with the same three agents for any scene."""
+    return SessionRecipe(scene, _DEMO_MOTIONS, seconds, seed, profiles={"": _DEMO_PROFILE})

@@ -1,6 +1,11 @@
 """Make a session folder: session.yaml, plan.png, NAME.mcap and truth/NAME.tum per agent.
 
 recipe -> stage (nothing is written) -> exposure of each frame -> chunks of frames -> recordings, truth
+
+It is made in a work folder, so that a session of a given name is always complete:
+
+.NAME.partial/DIGEST/    room, brightness, chunks of frames: reused by the next attempt
+.NAME.partial/session/   made again in each attempt, and renamed at the end
 """
 
 from __future__ import annotations
@@ -11,25 +16,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 
 from share import __version__
-from share.errors import ShareError
+from share.errors import ShareError, UsageError
 from share.files.arrays import read_array
-from share.files.writing import atomic_write, writable_dir, write_errors, xdg_folder
+from share.files.writing import atomic_write, lock_folder, sync_folder, writable_dir, write_errors, xdg_folder
 from share.lab.calibrate.target import T_WORLD_TARGET, TARGET, target_mapping
 from share.lab.emulate import drawing
-from share.lab.emulate.asl import check_asl, to_asl
 from share.lab.emulate.drawing import ChunkJob
-from share.lab.emulate.partial_session import PartialSession
-from share.lab.emulate.plan_picture import draw_plan
-from share.lab.emulate.preparation import PreparedSession, keep_room, prepare_session
-from share.lab.emulate.progress import Progress, no_progress
-from share.lab.emulate.recipe import SessionRecipe
-from share.lab.emulate.recordings import write_recording, write_truth
-from share.lab.emulate.sensor.exposure import ExposureSeries
-from share.lab.emulate.stage import Actor, RoomStage
+from share.lab.emulate.recipe import Progress, SessionRecipe, no_progress
+from share.lab.emulate.recordings import check_asl, draw_plan, to_asl, write_recording, write_truth
+from share.lab.emulate.sensor.imager import ExposureSeries
+from share.lab.emulate.stage import Actor, PreparedSession, RoomStage, keep_room, prepare_session
 from share.lab.emulate.types import START_NS
 from share.lab.pool import Pool
 from share.recordings.calibration import to_kalibr
@@ -38,10 +39,7 @@ from share.types import F64
 
 PLAN_FILE = "plan.png"
 _CHUNK_FRAMES = 24  # in a chunk: the most that an interruption costs a process
-_IMAGE_BYTES = {
-    "jpeg": 130_000,
-    "png": 330_000,
-}  # estimated size of an image, to check the disk beforehand
+_IMAGE_BYTES = {"jpeg": 130_000, "png": 330_000}  # estimated, to check the disk beforehand
 
 
 def make_session(
@@ -84,85 +82,78 @@ def default_cache() -> Path:
 
 
 def _fill_session(
-    recipe: SessionRecipe, prepared: PreparedSession, growth: PartialSession, workers: int, progress: Progress
+    recipe: SessionRecipe,
+    prepared: PreparedSession,
+    partial: PartialSession,
+    workers: int,
+    progress: Progress,
 ) -> None:
-    stage, folder = prepared.stage, growth.session
+    actors, folder = prepared.stage.actors, partial.session
     keep_room(prepared, progress)
-    with Pool(workers, drawing.start_worker, (stage, recipe.images)) as pool:
-        exposures = [
-            _exposure_series(pool, stage, actor_index, growth.work, progress)
-            for actor_index in range(len(stage.actors))
-        ]
-        chunks = _draw_chunks(pool, stage, exposures, growth, progress)
-    progress("writing recordings", 0, len(stage.actors))
-    for k, (actor, files) in enumerate(zip(stage.actors, chunks, strict=True)):
-        write_recording(actor, files, folder / f"{actor.name}.mcap")
+    with Pool(workers, drawing.start_worker, (prepared.stage, recipe.images)) as pool:
+        exposures = [_metered_exposures(pool, actor, k, partial, progress) for k, actor in enumerate(actors)]
+        jobs = [_chunk_jobs(actor, k, exposures[k], partial) for k, actor in enumerate(actors)]
+        _draw_chunks(pool, [job for actor_jobs in jobs for job in actor_jobs], progress)
+    progress("writing recordings", 0, len(actors))
+    for k, actor in enumerate(actors):
+        write_recording(actor, [job.file for job in jobs[k]], folder / f"{actor.name}.mcap")
         write_truth(actor, folder / "truth" / f"{actor.name}.tum")
-        progress("writing recordings", k + 1, len(stage.actors))
-    draw_plan(folder / PLAN_FILE, prepared.layout, stage.actors)
+        progress("writing recordings", k + 1, len(actors))
+    draw_plan(folder / PLAN_FILE, prepared.layout, actors)
     atomic_write(folder / SESSION_FILE, _session_yaml(recipe, prepared))
 
 
-def _exposure_series(
-    pool: Pool, stage: RoomStage, actor_index: int, work: Path, progress: Progress
+def _metered_exposures(
+    pool: Pool, actor: Actor, actor_index: int, partial: PartialSession, progress: Progress
 ) -> ExposureSeries:
-    """Return the exposure of each frame of the actor, from metering a part of them."""
-    actor, brightness_file = (
-        stage.actors[actor_index],
-        work / f"{stage.actors[actor_index].name}.brightness.npy",
-    )
+    """Return the exposure of each frame of the actor, from metering a part of them, once per session."""
+    file = partial.work / f"{actor.name}.brightness.npy"
     jobs = drawing.meter_jobs(actor_index, actor)
-    if brightness_file.exists():
-        brightness = read_array(brightness_file)
-    else:
-        values: dict[int, F64] = {}
-        for job, brightness_part in pool.run(drawing.measure_brightness, jobs):
-            values[int(job.true_ns[0])] = brightness_part
-            progress(f"metering {actor.name}", len(values), len(jobs))
-        brightness = np.concatenate([values[key] for key in sorted(values)])
-        atomic_write(brightness_file, _npy_bytes(brightness))
-    return drawing.exposure_series(actor, jobs, brightness)
+    if file.exists():
+        return drawing.exposure_series(actor, jobs, read_array(file))
+    values: dict[int, F64] = {}
+    for job, brightness in pool.run(drawing.measure_brightness, jobs):
+        values[int(job.true_ns[0])] = brightness
+        progress(f"metering {actor.name}", len(values), len(jobs))
+    whole = np.concatenate([values[key] for key in sorted(values)])
+    data = BytesIO()
+    np.save(data, whole)
+    atomic_write(file, data.getvalue())
+    return drawing.exposure_series(actor, jobs, whole)
 
 
-def _npy_bytes(values: F64) -> bytes:
-    file = BytesIO()
-    np.save(file, values)
-    return file.getvalue()
-
-
-def _draw_chunks(
-    pool: Pool, stage: RoomStage, exposures: list[ExposureSeries], growth: PartialSession, progress: Progress
-) -> list[list[Path]]:
-    """Draw the missing chunks; return all chunks of each actor, in order."""
-    takes = [
-        _make_takes(actor, actor_index, exposures[actor_index], growth.frames(actor.name))
-        for actor_index, actor in enumerate(stage.actors)
-    ]
-    todo = [take for actor_takes in takes for take in actor_takes if not take.file.exists()]
-    total = sum(len(actor.pictures) for actor in stage.actors)
-    done = total - sum(take.last - take.first for take in todo)
-    progress("drawing images", done, total)
-    for take, _ in pool.run(drawing.draw_chunk, todo):
-        done += take.last - take.first
-        progress("drawing images", done, total)
-    return [[take.file for take in actor_takes] for actor_takes in takes]
-
-
-def _make_takes(actor: Actor, actor_index: int, shots: ExposureSeries, folder: Path) -> list[ChunkJob]:
+def _chunk_jobs(
+    actor: Actor, actor_index: int, shots: ExposureSeries, partial: PartialSession
+) -> list[ChunkJob]:
+    """Return a job for each chunk of the actor, in order."""
+    folder, count = partial.frames(actor.name), len(actor.pictures)
     folder.mkdir(parents=True, exist_ok=True)
-    count = len(actor.pictures)
     spans = [(k, min(k + _CHUNK_FRAMES, count)) for k in range(0, count, _CHUNK_FRAMES)]
     return [ChunkJob(actor_index, a, b, folder / f"{a:06d}.chunk", shots.part(a, b)) for a, b in spans]
 
 
-def _check_space(growth: PartialSession, stage: RoomStage, recipe: SessionRecipe, copies: int) -> None:
+def _draw_chunks(pool: Pool, jobs: list[ChunkJob], progress: Progress) -> None:
+    """Draw the chunks that are not there yet."""
+    missing = [job for job in jobs if not job.file.exists()]
+    total = sum(job.last - job.first for job in jobs)
+    done = total - sum(job.last - job.first for job in missing)
+    progress("drawing images", done, total)
+    for job, _ in pool.run(drawing.draw_chunk, missing):
+        done += job.last - job.first
+        progress("drawing images", done, total)
+
+
+def _check_space(partial: PartialSession, stage: RoomStage, recipe: SessionRecipe, copies: int) -> None:
     """Raise ShareError early if the disk cannot hold `copies` of the images at the same time."""
     images = sum(2 * len(actor.pictures) for actor in stage.actors)
-    existing = sum(chunk.stat().st_size for chunk in growth.drawn_chunks())
-    need, free = copies * images * _IMAGE_BYTES[recipe.images] - existing, shutil.disk_usage(growth.work).free
+    existing = sum(chunk.stat().st_size for chunk in partial.drawn_chunks())
+    need, free = (
+        copies * images * _IMAGE_BYTES[recipe.images] - existing,
+        shutil.disk_usage(partial.work).free,
+    )
     if need > free:
         raise ShareError(
-            f"{growth.out}: about {need / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free; "
+            f"{partial.out}: about {need / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free; "
             "make room, or give fewer --seconds"
         )
 
@@ -214,3 +205,73 @@ def _cache_lock(cache: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+class PartialSession:
+    """Work folder of the session `out`, with an exclusive lock as a context manager. Work of other digests is
+    removed. After an error drawn frames are kept, and the error says so."""
+
+    def __init__(self, out: Path, digest: str) -> None:
+        self.out = out
+        self._folder = out.with_name(f".{out.name}.partial")
+        self.work, self.session = self._folder / digest, self._folder / "session"
+
+    @property
+    def room(self) -> Path:
+        """Return the folder of the finished room."""
+        return self.work / "room"
+
+    def frames(self, name: str) -> Path:
+        """Return the folder of the chunks of agent `name`."""
+        return self.work / "frames" / name
+
+    def drawn_chunks(self) -> list[Path]:
+        """Return all chunks drawn so far."""
+        return sorted(self.work.glob("frames/*/*.chunk"))
+
+    def check_new(self) -> None:
+        """Raise UsageError where `out` exists or cannot be created."""
+        if self.out.exists() or self.out.is_symlink():
+            raise UsageError(f"{self.out}: exists already; give the name of a new folder")
+        parent = next(folder for folder in self.out.absolute().parents if folder.exists())
+        if not parent.is_dir():
+            raise UsageError(f"{self.out}: its parent {parent} is a file; give another --out")
+
+    def finish(self) -> None:
+        """Give the session its name and remove the work folder."""
+        shutil.rmtree(self.work)
+        self.session.rename(self.out)
+        sync_folder(self.out.parent)
+        shutil.rmtree(self._folder)
+
+    def __enter__(self) -> PartialSession:
+        self._created_folders = _missing_parents(self._folder)
+        self._handle = lock_folder(self._folder)
+        self.check_new()  # another process may have finished it since
+        for leftover in self._folder.iterdir():
+            if leftover != self.work:
+                shutil.rmtree(leftover)
+        self.work.mkdir(exist_ok=True)
+        (self.session / "truth").mkdir(parents=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if isinstance(error, ShareError) and self._folder.exists():
+                self._keep_or_remove(error)
+        finally:
+            os.close(self._handle)
+
+    def _keep_or_remove(self, error: ShareError) -> None:
+        if self.drawn_chunks():
+            raise type(error)(f"{error}; run the same command again to resume") from None
+        shutil.rmtree(self._folder)
+        for folder in self._created_folders:
+            folder.rmdir()
+
+
+def _missing_parents(folder: Path) -> list[Path]:
+    """Return the parents that do not exist yet, innermost first."""
+    return [parent for parent in folder.parents if not parent.exists()]

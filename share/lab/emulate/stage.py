@@ -1,19 +1,35 @@
-"""A room with its agents, ready to be recorded: poses of all at any time, and views of cameras."""
+"""A room with its agents, ready to be recorded: poses of all at any time, and views of cameras.
+
+`prepare_session` makes it from a recipe: furnish the room, plan the paths, set up the devices.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from pathlib import Path as FilePath
 
 import numpy as np
 from numpy.typing import NDArray
 
+from share.errors import UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.lab.emulate.motion.avatars import Avatar
+from share.lab.emulate.motion.avatars import Avatar, avatar_shapes
+from share.lab.emulate.motion.motion_plan import MotionPlan, PlannedAgent, plan_motions
+from share.lab.emulate.motion.spec import EurocSpec, parse_motion
+from share.lab.emulate.motion.spline import SplinePath
+from share.lab.emulate.recipe import Progress, SessionRecipe
+from share.lab.emulate.render import context
 from share.lab.emulate.sensor.device import EmulatedDevice, PictureTimes
 from share.lab.emulate.types import MotionPath, SceneInstant
+from share.lab.emulate.types import MotionPath as Motion
+from share.lab.emulate.world import room_files
+from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.mesh import Shape
+from share.lab.emulate.world.room_files import PLAIN
+from share.sensors.profile import load_profile
+from share.sensors.profile_types import Profile
 from share.types import F64, I64, AgentKind
 
 # distance for which motion blur is sampled; nearer things blur more than their samples show
@@ -33,11 +49,6 @@ class Actor:
     avatar: Avatar
     shapes: tuple[Shape, ...]
     pictures: PictureTimes
-
-    @property
-    def clock_offset_ns(self) -> int:
-        """Return the path's first instant, at which the session begins."""
-        return self.path.start_ns
 
     def in_gap(self, true_ns: I64) -> NDArray[np.bool_]:
         """Return at which of the times (N,) there is no ground truth."""
@@ -68,7 +79,7 @@ class RoomStage:
         cost is per call, so ask for many at once."""
         actor = self.actors[actor_index]
         times = np.clip(true_ns, actor.path.start_ns, actor.path.end_ns)
-        others = self._other_parts(actor_index, times - actor.clock_offset_ns)
+        others = self._other_parts(actor_index, times - actor.path.start_ns)
         return [
             ActorView(T, {name: parts[k] for name, parts in others.items()})
             for k, T in enumerate(actor.path.poses(times))
@@ -92,7 +103,7 @@ class RoomStage:
         out = {}
         for k, actor in enumerate(self.actors):
             if k != actor_index:
-                own_ns = session_ns + actor.clock_offset_ns
+                own_ns = session_ns + actor.path.start_ns
                 out[actor.name] = actor.avatar.part_poses(
                     np.clip(own_ns, actor.path.start_ns, actor.path.end_ns)
                 )
@@ -124,3 +135,153 @@ def downsized(camera: Camera, factor: int) -> Camera:
         cx=(camera.cx + 0.5) / factor - 0.5,
         cy=(camera.cy + 0.5) / factor - 0.5,
     )
+
+
+_GLTF_SUFFIXES = (".glb", ".gltf")
+_RESERVED_NAMES = ("truth",)  # a folder of the session has this name
+_PROFILE, _EUROC_PROFILE = "d435i", "euroc"
+_DEPTH, _MONO = "rgbd", "mono"
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedSession:
+    """layout: of the room. notes: text for the user."""
+
+    stage: RoomStage
+    layout: Layout
+    notes: tuple[str, ...]
+
+
+def prepare_session(recipe: SessionRecipe, room: Path, progress: Progress) -> PreparedSession:
+    """Return the stage, with `room` as the folder for its room. Writes nothing.
+
+    Raises UsageError, ConfigError or DataError for an invalid recipe.
+    """
+    progress("planning", 0, 1)
+    _check_first(recipe)
+    motion_plan = plan_motions(recipe.motions, make_layout(recipe), recipe.seconds, recipe.seed)
+    _check_names(recipe, motion_plan)
+    actors = tuple(_make_actor(agent, k, recipe) for k, agent in enumerate(motion_plan.agents))
+    _check_lenses(recipe, actors)
+    notes = motion_plan.notes + tuple(f"{a.name}: {note}" for a in motion_plan.agents for note in a.notes)
+    progress("planning", 1, 1)
+    return PreparedSession(RoomStage(room, actors), motion_plan.layout, notes)
+
+
+def keep_room(prepared: PreparedSession, progress: Progress) -> None:
+    """Draw the room's pictures and bake its light into the stage's folder, unless they are there."""
+    progress("making the room", 0, 1)
+    stage = prepared.stage
+    room_files.save_room_once(
+        prepared.layout, {actor.name: actor.shapes for actor in stage.actors}, stage.room
+    )
+    progress("making the room", 1, 1)
+
+
+def make_layout(recipe: SessionRecipe) -> Layout:
+    """Return the room's layout. Raises UsageError for an unknown scene or an unsupported size."""
+    if recipe.scene == PLAIN:
+        from share.lab.emulate.plain.render import plain_layout
+
+        return plain_layout(recipe.seed, recipe.size)
+    if recipe.scene.lower().endswith(_GLTF_SUFFIXES):
+        return _gltf_layout(recipe)
+    from share.lab.emulate.world.scenes import make_scene_layout
+
+    return make_scene_layout(recipe.scene, recipe.seed, recipe.size)
+
+
+def _gltf_layout(recipe: SessionRecipe) -> Layout:
+    from share.lab.emulate.world.gltf import load_gltf
+
+    if recipe.size is not None:
+        raise UsageError(f"{recipe.scene}: a room file has a fixed size; leave out --size")
+    return load_gltf(Path(recipe.scene))
+
+
+def _make_actor(agent: PlannedAgent, number: int, recipe: SessionRecipe) -> Actor:
+    sensors = _option_for(recipe.sensors, agent.name) or _default_sensors(agent)
+    device_profile = _profile(agent, recipe)
+    rig = _recorded_rig(device_profile.rig(depth=sensors == _DEPTH), agent)
+    if sensors == _MONO:
+        rig = replace(rig, cam1=None, T_cam1_cam0=None)
+    seed = (recipe.seed, 7, number)
+    path = _imu_path(agent, rig)
+    device = EmulatedDevice(device_profile, recipe.effects, seed, agent.path.start_ns, (recipe.seed, 8))
+    pictures = _without_gaps(device.picture_times(agent.path.start_ns, agent.path.end_ns), agent.path.gaps)
+    if len(pictures) < 2:
+        raise UsageError(f"{agent.name}: {agent.spec} leaves {len(pictures)} pictures; give it more time")
+    avatar = Avatar(agent.body_kind, agent.path, agent.T_body_cam0)
+    body_shapes = avatar_shapes(agent.body_kind, agent.path, (recipe.seed, 9, number))
+    return Actor(agent.name, agent.kind, rig, path, device, avatar, body_shapes, pictures)
+
+
+def _profile(agent: PlannedAgent, recipe: SessionRecipe) -> Profile:
+    """Return the profile asked for (`NAME` or `NAME:MODE`), else the usual one of the motion."""
+    _, spec = parse_motion(agent.spec)
+    usual = _EUROC_PROFILE if isinstance(spec, EurocSpec) else _PROFILE
+    return _read_profile(_option_for(recipe.profiles, agent.name) or usual)
+
+
+def _read_profile(spec: str) -> Profile:
+    name, _, mode = spec.partition(":")
+    return load_profile(name, mode or None)
+
+
+def _default_sensors(agent: PlannedAgent) -> str:
+    """Return depth for a simulated robot, else stereo."""
+    simulated = agent.path.recorded is None
+    return _DEPTH if agent.kind is AgentKind.ROBOT and simulated else "stereo"
+
+
+def _recorded_rig(rig: Rig, agent: PlannedAgent) -> Rig:
+    """Return the rig with the recording's camera mount and IMU noise, if any."""
+    if agent.T_body_cam0 is not None:
+        rig = replace(rig, T_body_cam0=agent.T_body_cam0)
+    return rig if agent.imu is None else replace(rig, imu=agent.imu)
+
+
+def _imu_path(agent: PlannedAgent, rig: Rig) -> Motion:
+    """Return the path of the rig's IMU, with its axes; the cameras' path is the same."""
+    if agent.has_camera_axes and isinstance(agent.path, SplinePath):
+        return agent.path.with_axes(rig.T_body_cam0[:3, :3].T)
+    return agent.path
+
+
+def _without_gaps(pictures: PictureTimes, gaps: I64) -> PictureTimes:
+    """Return the pictures with ground truth."""
+    known = ~in_gaps(gaps, pictures.true_ns)
+    return PictureTimes(pictures.index[known], pictures.true_ns[known], pictures.stamp_ns[known])
+
+
+def _option_for(table: dict[str, str], name: str) -> str | None:
+    return table.get(name, table.get(""))
+
+
+def _check_first(recipe: SessionRecipe) -> None:
+    """Check what needs no plan. Raises ConfigError; RenderError where this machine cannot draw."""
+    for words in recipe.profiles.values():
+        _read_profile(words)
+    if recipe.scene != PLAIN:
+        context.create_context().release()
+
+
+def _check_lenses(recipe: SessionRecipe, actors: tuple[Actor, ...]) -> None:
+    for actor in actors:
+        if recipe.scene == PLAIN and actor.rig.cam0.distortion:
+            raise UsageError(
+                f"{actor.name}: scene 'plain' has no lens distortion; "
+                f"give --profile {actor.name}=d435i, or another scene"
+            )
+
+
+def _check_names(recipe: SessionRecipe, motion_plan: MotionPlan) -> None:
+    known = {agent.name for agent in motion_plan.agents}
+    if reserved := known.intersection(_RESERVED_NAMES):
+        raise UsageError(
+            f"an agent cannot be named '{reserved.pop()}': a folder of the session has that name"
+        )
+    for table in (recipe.sensors, recipe.profiles):
+        for name in table:
+            if name and name not in known:
+                raise UsageError(f"'{name}' is not one of the agents: {', '.join(sorted(known))}")

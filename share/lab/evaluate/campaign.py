@@ -1,20 +1,22 @@
-"""Runs that are planned together: finished ones are read, the others are played."""
+"""Runs that are planned together: finished ones are read, the others are played here or on a cluster."""
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Protocol
+from types import TracebackType
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from share import startup
 from share.config import Config, load_config
-from share.errors import DataError, ShareError, UsageError
+from share.errors import DataError, ShareError, UsageError, install_hint
 from share.files.yaml_file import read_settings
 from share.lab.evaluate.real_time import Progress, RunOptions
 from share.lab.evaluate.trial import RUN_FILE, SETTINGS_FILE, Trial, read_trial, run_trial, settings_yaml
@@ -160,3 +162,53 @@ def plan_policies(
             run_options = replace(options, policy=policy, seed=seed)
             runs.append(PlannedRun(session, run_options, out / name, Config() if config is None else config))
     return runs
+
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+_CONNECT_S = 10
+
+
+class Cluster:
+    """A pool with the interface of `share.lab.pool.Pool`, on the dask scheduler at `address`.
+
+    Workers need SHARE, and the same files at the same paths.
+    """
+
+    def __init__(self, address: str) -> None:
+        if importlib.util.find_spec("distributed") is None:
+            raise UsageError(f"--scheduler: {install_hint('distributed', 'cluster')}")
+        from distributed import Client
+
+        try:
+            self._client = Client(address, timeout=_CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise UsageError(f"--scheduler {address}: no answer from a dask scheduler: {error}") from None
+
+    @property
+    def worker_count(self) -> int:
+        """The number of workers now; 1 while none has connected."""
+        return max(1, len(self._client.nthreads()))
+
+    def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
+        """Yield every job with `work(job)`, in order of completion. Raises what a job raised."""
+        from distributed import KilledWorker, as_completed
+
+        running = {self._client.submit(work, job, pure=False): job for job in jobs}
+        try:
+            for future in as_completed(list(running)):
+                yield running[future], future.result()
+        except KilledWorker:
+            raise ShareError(
+                "a run has ended several workers, one after the other; do they have enough memory?"
+            ) from None
+        finally:
+            self._client.cancel(list(running))
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._client.close()

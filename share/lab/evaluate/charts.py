@@ -62,9 +62,7 @@ def draw_bars(
         axis.grid(axis="y", alpha=0.3)
         axis.set_axisbelow(True)
     axes[-1, 0].set_xticks(positions, groups, rotation=30, ha="right")
-    handles, names = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper right", ncols=len(names), fontsize=8)
-    save_png(figure, path, 110)
+    _save_with_legend(figure, path, *axes[0, 0].get_legend_handles_labels())
 
 
 def draw_ratios(
@@ -93,8 +91,7 @@ def draw_ratios(
     axis.set(xlabel=f"ratio to {base}", xlim=(0, None))
     axis.grid(axis="x", alpha=0.3)
     axis.set_axisbelow(True)
-    figure.legend(loc="outside upper right", ncols=len(series), fontsize=8)
-    save_png(figure, path, 110)
+    _save_with_legend(figure, path, *axis.get_legend_handles_labels())
 
 
 def draw_lines(
@@ -113,8 +110,7 @@ def draw_lines(
         axis.grid(alpha=0.3)
     axes[-1, 0].set_xlabel(x_label)
     handles = [pyplot.Line2D([], [], color=_COLOURS[k % len(_COLOURS)]) for k in range(len(names))]
-    figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
-    save_png(figure, path, 110)
+    _save_with_legend(figure, path, handles, names)
 
 
 def draw_paths(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -> None:
@@ -144,8 +140,7 @@ def draw_paths(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) 
     figure.supxlabel("m")
     figure.supylabel("m")
     handles = [pyplot.Line2D([], [], color=colour, marker="o") for colour in colours.values()]
-    figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
-    save_png(figure, path, 110)
+    _save_with_legend(figure, path, handles, names)
 
 
 def draw_heat_maps(
@@ -168,6 +163,11 @@ def draw_heat_maps(
         for (i, j), cell in np.ndenumerate(cells):
             dark = np.isfinite(cell) and image.norm(cell) > 0.5
             axis.text(j, i, f"{cell:.3g}", ha="center", va="center", color="white" if dark else "black")
+    save_png(figure, path, 110)
+
+
+def _save_with_legend(figure: Any, path: Path, handles: Sequence[Any], names: Sequence[str]) -> None:
+    figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
     save_png(figure, path, 110)
 
 

@@ -1,5 +1,4 @@
-"""Compare SHARE's tracker with peers on the same recordings: a row of metrics each, stored as it is
-computed."""
+"""SHARE's tracker and peers on the same recordings: a stored row of metrics each, and a report."""
 
 from __future__ import annotations
 
@@ -11,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,9 @@ from share.config import Config
 from share.errors import DataError, UsageError
 from share.files.json_file import nan_to_none, none_to_nan, read_json, to_plain
 from share.files.writing import atomic_write
+from share.lab.evaluate.charts import draw_bars
 from share.lab.evaluate.provenance import describe_machine
+from share.lab.evaluate.report import bullets, csv_text, format_number, image_link, markdown_table
 from share.lab.evaluate.tracker_runs import TrackerRun, can_run_peers, peer_version, run_peer, run_share
 from share.lab.peer_trackers import PEERS
 from share.metrics.ate import ate
@@ -34,15 +36,15 @@ _FINAL_SUFFIX = ", final trajectory"
 
 @dataclass(frozen=True)
 class TrackerRow:
-    """Metrics of one tracker on one recording; NaN where unknown. `told`: fraction of the frames with a
-    pose. `most_cm`: largest position error."""
+    """Metrics of one tracker on one recording; NaN where unknown. `tracked_share`: of the frames, with a
+    pose. `max_cm`: largest position error."""
 
     recording: str
     tracker: str
     frames: int
-    told: float
+    tracked_share: float
     ate_cm: float
-    most_cm: float
+    max_cm: float
     rpe_1s_cm: float
     rpe_1s_deg: float
     cpu_ms: float = math.nan
@@ -120,7 +122,7 @@ def tracker_rows(
         atomic_write(stem.with_suffix(".tum"), format_tum(run.trajectory))
         if run.final is not None:
             new_rows.append(score_tracker(name, tracker.title + _FINAL_SUFFIX, source, run.final, []))
-            atomic_write(stem.with_name(f"{stem.name}-end.tum"), format_tum(run.final))
+            atomic_write(stem.with_name(f"{stem.name}-final.tum"), format_tum(run.final))
         document = {
             "made_by": made_by,
             "machine": describe_machine(),
@@ -169,3 +171,89 @@ def score_tracker(
     )
     count = source.images_count
     return TrackerRow(name, tracker, count, len(estimate.stamps_ns) / max(count, 1), *errors, *cpu)
+
+
+PROTOCOL = (
+    "causal poses of all frames, as each tracker gave them at the time; truth interpolated at their stamps",
+    "ATE: rms under one SE3 alignment; RPE: rms over 1 s, no alignment; docs/do/evaluate.md",
+    "CPU: process time of all threads, without decoding; SHARE's includes its keyframes",
+    "'final trajectory': not causal; the trajectory by the tracker's final map",
+)
+
+
+def rows_csv(rows: Sequence[TrackerRow]) -> str:
+    """Return a line per row."""
+    return csv_text([f.name for f in dataclasses.fields(TrackerRow)], map(dataclasses.astuple, rows))
+
+
+def markdown(rows: Sequence[TrackerRow], missing: Sequence[str]) -> str:
+    """Return the table, with medians where there are several recordings, and the protocol. `missing`: why
+    trackers were left out."""
+    head = ("recording", "tracker", "ATE cm", "max cm", "RPE 1 s cm", "RPE 1 s °", "tracked %")
+    cpu = ("CPU ms per frame: median", "mean", "p99")
+    body = [_cells(row) for row in rows]
+    if len({row.recording for row in rows}) > 1:
+        body += [_cells(row) for row in _medians(rows)]
+    machine = describe_machine()
+    lines = [
+        "# Trackers side by side",
+        markdown_table([[*head, *cpu], *body]),
+        bullets(
+            (
+                *PROTOCOL,
+                f"machine: {machine['cpu']}, {machine['cores']} cores; SHARE {__version__}",
+                *(f"left out: {text}" for text in missing),
+            )
+        ),
+    ]
+    return "\n\n".join(lines) + "\n"
+
+
+def _medians(rows: Sequence[TrackerRow]) -> Iterator[TrackerRow]:
+    """Yield a row per tracker: medians over the recordings where it has values."""
+    for tracker in dict.fromkeys(row.tracker for row in rows):
+        tracker_rows = [row for row in rows if row.tracker == tracker]
+        values = [
+            median(known)
+            if (known := [v for row in tracker_rows if not math.isnan(v := getattr(row, f.name))])
+            else math.nan
+            for f in dataclasses.fields(TrackerRow)[3:]
+        ]
+        yield TrackerRow(
+            f"median of {len(tracker_rows)}", tracker, sum(row.frames for row in tracker_rows), *values
+        )
+
+
+def _cells(row: TrackerRow) -> list[str]:
+    cm = [format_number(value, ".2f") for value in (row.ate_cm, row.max_cm, row.rpe_1s_cm, row.rpe_1s_deg)]
+    cpu = [format_number(value, ".1f") for value in (row.cpu_ms, row.cpu_mean_ms, row.cpu_p99_ms)]
+    return [row.recording, row.tracker, *cm, f"{100 * row.tracked_share:.1f}", *cpu]
+
+
+def draw_comparison(folder: Path, rows: Sequence[TrackerRow]) -> str:
+    """Write PNG files to `folder`; return the Markdown that shows them."""
+    recordings = list(dict.fromkeys(row.recording for row in rows))
+    trackers = list(dict.fromkeys(row.tracker for row in rows))
+    row_of = {(row.recording, row.tracker): row for row in rows}
+
+    def values(field: str) -> dict[str, list[float]]:
+        return {
+            tracker: [getattr(row_of.get((one, tracker)), field, math.nan) for one in recordings]
+            for tracker in trackers
+        }
+
+    draw_bars(
+        folder / "errors.png",
+        {"ATE": values("ate_cm"), "RPE over 1 s": values("rpe_1s_cm")},
+        recordings,
+        "cm",
+    )
+    causal = {
+        tracker: values_ms
+        for tracker, values_ms in values("cpu_mean_ms").items()
+        if not np.isnan(values_ms).all()
+    }
+    draw_bars(folder / "cpu.png", {"mean CPU per frame": causal}, recordings, "ms")
+    errors = image_link("Errors of each tracker", "errors.png")
+    cpu = image_link("CPU time of each tracker", "cpu.png")
+    return f"{errors}\n\n{cpu}\n"

@@ -1,8 +1,5 @@
 """Play a session in real time on this machine: an edge and one agent per recording, each in a process of its
-own.
-
-Also scores what the agents of a session left, against their ground truth.
-"""
+own."""
 
 from __future__ import annotations
 
@@ -13,24 +10,38 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from share import child_processes
 from share.config import STREAMED
-from share.errors import DataError, ShareError
-from share.files.json_file import read_json
+from share.errors import ShareError
 from share.files.line_file import GrowingFile
 from share.files.reading import MAX_LOG_BYTES, read_bytes
 from share.files.writing import open_new, writable_dir
 from share.lab.evaluate.emulated_network import LinkAssignment
-from share.lab.evaluate.map_membership import MapMembership
-from share.metrics.ate import Ate, JointAte, ate, joint_ate
 from share.recordings.session import Session
-from share.recordings.trajectory import Trajectory, read_tum
+
+
+class MapMembership:
+    """`map_ids`: the map of each agent's last correction, by agent."""
+
+    def __init__(self) -> None:
+        self.map_ids: dict[str, str] = {}
+
+    def add_correction(self, agent: str, map_id: str) -> None:
+        """Add the next correction, in the order in which they are sent."""
+        self.map_ids[agent] = map_id
+
+    @property
+    def sharing_agents(self) -> list[str]:
+        """Agents that are not alone in their map."""
+        members = Counter(self.map_ids.values())
+        return [agent for agent, map_id in self.map_ids.items() if members[map_id] > 1]
+
 
 EDGE_START_TIMEOUT_S = 20.0  # until the edge listens
 AGENT_GRACE_S = 60.0  # how much longer than its recording an agent may run
@@ -183,73 +194,6 @@ def _last_line(log: Path) -> str:
 
 def _log_text(log: Path) -> str:
     return read_bytes(log, MAX_LOG_BYTES).decode(errors="replace")
-
-
-# Scores of a session's agents against the ground truth.
-
-
-@dataclass(frozen=True, eq=False)
-class AgentScore:
-    """An agent's `report.json`, the ATE of its odom.tum (SE3-aligned, None with too few poses), its
-    map.tum and its ground truth."""
-
-    report: dict[str, Any]
-    odometry: Ate | None
-    map: Trajectory | None
-    truth: Trajectory
-
-
-@dataclass(frozen=True, eq=False)
-class SessionScore:
-    """Scores of all agents. `joint`: ATE of map.tum of all agents in the largest map under one alignment.
-
-    `joint` is None where no two agents share a map, since each has a map of its own from the start; a session
-    of one agent is scored alone.
-    """
-
-    agents: dict[str, AgentScore]
-    joint: JointAte | None
-
-
-def score_session(session: Session, folders: dict[str, Path]) -> SessionScore:
-    """Score the files that `share agent --out` left in `folders`. Raises DataError on damaged files."""
-    agents = {}
-    for name, folder in folders.items():
-        truth = read_tum(session.folder / "truth" / f"{name}.tum")
-        report = read_json(folder / "report.json")
-        odometry = _ate(_trajectory(folder / "odom.tum"), truth)
-        agents[name] = AgentScore(report, odometry, _trajectory(folder / "map.tum"), truth)
-    return SessionScore(agents, _joint_ate(agents))
-
-
-def _trajectory(path: Path) -> Trajectory | None:
-    return read_tum(path) if path.stat().st_size else None
-
-
-def _ate(estimate: Trajectory | None, truth: Trajectory) -> Ate | None:
-    try:
-        return None if estimate is None else ate(estimate, truth)
-    except DataError:  # too few poses
-        return None
-
-
-def _joint_ate(agents: dict[str, AgentScore]) -> JointAte | None:
-    """Return the joint ATE of the map that most agents were in at their last published pose."""
-    members: dict[str, list[str]] = {}
-    for name, agent in agents.items():
-        if agent.map is not None:
-            fallback_map = agent.report["protocol"]["map_id"]  # of runs before map_tum_id was written
-            members.setdefault(agent.report.get("map_tum_id", fallback_map), []).append(name)
-    if not members:
-        return None
-    largest = max(members.values(), key=len)
-    if len(largest) < min(2, len(agents)):
-        return None
-    pairs = {name: (agents[name].map, agents[name].truth) for name in largest}
-    try:
-        return joint_ate({name: (m, t) for name, (m, t) in pairs.items() if m is not None})
-    except DataError:
-        return None
 
 
 def share_command(*arguments: str) -> list[str]:

@@ -1,19 +1,23 @@
-"""Results of trials as text: CSV for programs, Markdown for readers."""
+"""Results of trials as text: CSV for programs, Markdown and HTML for readers."""
 
 from __future__ import annotations
 
+import base64
 import csv
 import dataclasses
+import html
 import io
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from share.errors import DataError, UsageError
-from share.files.reading import MAX_SETTINGS_BYTES, read_text
+from share.files.reading import MAX_SETTINGS_BYTES, path_inside, read_text
 from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 from share.lab.evaluate.statistics import (
     MEASURES,
@@ -26,6 +30,7 @@ from share.lab.evaluate.statistics import (
 )
 from share.lab.evaluate.trial import Trial
 from share.lab.train.score import read_scores, score_table
+from share.recordings.images import read_picture
 
 # Tables as text. Unknown values are empty in CSV, a dash in Markdown.
 
@@ -112,7 +117,7 @@ def _section_text(path: Path) -> str:
 _AGENT_COLUMNS = [field.name for field in dataclasses.fields(AgentMetrics)]
 _CONDITION_COLUMNS = [field.name for field in dataclasses.fields(Conditions)]
 _RUN_COLUMNS = (
-    "in_one_map",
+    "agents_in_largest_map",
     "joint_ate_cm",
     "merges_requested",
     "merges_skipped",
@@ -227,7 +232,7 @@ def provenance(runs: Sequence[RunMetrics], trials: Sequence[Trial], failed: Sequ
         f"seeds: {_joined_names(str(c.seed) for c in conditions)}.",
         f"Machine: {'; '.join(sorted(machines))}; load before a run: {min(loads):g} to {max(loads):g}.",
         f"SHARE {_joined_names(r['version'] for r in records)}, {_code_states(conditions)}; "
-        f"estimated errors from {_joined_names(c.told for c in conditions)}.",
+        f"estimated errors from {_joined_names(c.error_source for c in conditions)}.",
     ]
     return "\n".join([*(f"* {line}" for line in lines), bullets(PROTOCOL)])
 
@@ -322,3 +327,43 @@ def _interval_text(interval: Interval, number_format: str) -> str:
         else f" [{interval.low:{number_format}}, {interval.high:{number_format}}]"
     )
     return f"{interval.value:{number_format}}{bounds}"
+
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem;
+  color: #222; }
+h1, h2 { line-height: 1.2; } h2 { margin-top: 2.5rem; border-bottom: 1px solid #ccc; }
+table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums; display: block;
+  overflow-x: auto; }
+th, td { padding: 0.25rem 0.75rem; border-bottom: 1px solid #ddd; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; } th { background: #f3f3f3; }
+tbody tr:hover { background: #f8f8f0; }
+figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 14px; }
+"""
+_PICTURE = re.compile(r'<p><img alt="([^"]*)" src="([^"]*)" ?/?></p>')
+
+
+def html_page(title: str, text: str, folder: Path) -> str:
+    """Return HTML of a Markdown text. HTML in the text is escaped.
+
+    Pictures are PNG files in `folder`, each a paragraph of its own; its alt text becomes the caption.
+    """
+    from markdown import markdown
+    from markdown.extensions.tables import TableExtension  # imported by class, so that a freezer sees it
+
+    body = markdown(html.escape(text, quote=False), extensions=[TableExtension()])
+    body = _PICTURE.sub(partial(_figure_html, folder), body)
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta name="viewport" content="width=device-width">\n<title>{html.escape(title)}</title>\n'
+        f"<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _figure_html(folder: Path, match: re.Match[str]) -> str:
+    caption, name = match[1], html.unescape(match[2])
+    data = base64.b64encode(read_picture(path_inside(folder, name, "a report"))).decode()
+    return (
+        f'<figure>\n<img alt="{caption}" src="data:image/png;base64,{data}">\n'
+        f"<figcaption>{caption}</figcaption>\n</figure>"
+    )

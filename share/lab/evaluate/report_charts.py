@@ -21,7 +21,7 @@ _RATIO_MEASURES = (
     "AR corrections",
     "AR frames over 20 ms",
     "robot latency",
-    "merges a metre",
+    "merges per metre",
     "joint ATE",
     "AR ATE in the map",
     "robot ATE in the map",
@@ -61,7 +61,7 @@ def draw_report(
 def _draw_ratios(folder: Path, runs: Sequence[RunMetrics], names: Sequence[str], base: str) -> str:
     compared = {
         name: {
-            one.measure.label or one.measure.name: one.ratio
+            one.measure.name: one.ratio
             for one in compare_policies(runs, name, base)
             if one.measure.name in _RATIO_MEASURES
         }

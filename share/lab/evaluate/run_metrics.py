@@ -10,7 +10,7 @@ from dataclasses import dataclass
 class Conditions:
     """Under which conditions a session was played. Runs that differ in the policy alone are compared.
 
-    `clock`: real or virtual time. `told`: source of the agents' estimated errors. `code`: digest of SHARE's
+    `clock`: real or virtual time. `error_source`: of the agents' estimated errors. `code`: digest of SHARE's
     code (`share.lab.evaluate.provenance`), empty where unknown.
     """
 
@@ -19,7 +19,7 @@ class Conditions:
     link: str
     seed: int
     clock: str = ""
-    told: str = ""
+    error_source: str = ""
     code: str = ""
 
 
@@ -29,11 +29,11 @@ class AgentMetrics:
 
     * latency_ms and its parts: docs/do/evaluate.md.
     * odom_ate_cm: of odom_n frames, SE3-aligned alone.
-    * ate_cm: of the in_map frames with a pose in the shared map, one alignment for all agents in it; NaN for
+    * ate_cm: of the ate_n frames with a pose in the shared map, one alignment for all agents in it; NaN for
       an agent outside it.
     * rpe_*: rms over *_n pairs of poses in the map, from frame to frame and over 1 s.
-    * metres: path length. joined_s: from the first agent's start until it shared a map.
-    * qoe: mean over evaluations. told_cm: rms of the agent's estimated errors.
+    * metres: path length. shared_map_s: from the first agent's start until it shared a map.
+    * qoe: mean over evaluations. estimated_error_cm: rms of the agent's estimated errors.
     """
 
     agent: str
@@ -54,7 +54,7 @@ class AgentMetrics:
     odom_ate_cm: float
     odom_n: int
     ate_cm: float
-    in_map: int
+    ate_n: int
     rpe_frame_cm: float
     rpe_frame_deg: float
     rpe_frame_n: int
@@ -62,7 +62,7 @@ class AgentMetrics:
     rpe_1s_deg: float
     rpe_1s_n: int
     metres: float
-    joined_s: float
+    shared_map_s: float
     keyframes: int
     sent: int
     rate_hz: float
@@ -70,7 +70,7 @@ class AgentMetrics:
     kb_down_s: float
     cpu_ms_per_frame: float
     qoe: float
-    told_cm: float
+    estimated_error_cm: float
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class RunMetrics:
 
     conditions: Conditions
     agents: tuple[AgentMetrics, ...]
-    in_one_map: int
+    agents_in_largest_map: int
     joint_ate_cm: float
     merges_requested: int
     merges_skipped: int

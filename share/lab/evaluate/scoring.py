@@ -1,4 +1,4 @@
-"""Metrics of a trial, from the files of its agents and its edge."""
+"""Scores and metrics of a run, from the files of its agents and its edge, against the ground truth."""
 
 from __future__ import annotations
 
@@ -11,15 +11,79 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from share.errors import DataError
-from share.files.json_file import own_format_errors, read_json, read_json_lines
-from share.lab.evaluate.map_membership import MapMembership
-from share.lab.evaluate.real_time import AgentScore, SessionScore, score_session
+from share.files.json_file import none_to_nan, own_format_errors, read_json, read_json_lines
+from share.lab.evaluate.real_time import MapMembership
 from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 from share.lab.evaluate.trial import Trial
-from share.metrics.ate import Ate
+from share.metrics.ate import Ate, JointAte, ate, joint_ate
 from share.metrics.rpe import Rpe, rpe_frames, rpe_time
+from share.recordings.session import Session
 from share.recordings.trajectory import Trajectory, read_tum
 from share.types import F64
+
+
+@dataclass(frozen=True, eq=False)
+class AgentScore:
+    """An agent's `report.json`, the ATE of its odom.tum (SE3-aligned, None with too few poses), its
+    map.tum and its ground truth."""
+
+    report: dict[str, Any]
+    odometry: Ate | None
+    map: Trajectory | None
+    truth: Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class SessionScore:
+    """Scores of all agents. `joint`: ATE of map.tum of all agents in the largest map under one alignment.
+
+    `joint` is None where no two agents share a map, since each has a map of its own from the start; a session
+    of one agent is scored alone.
+    """
+
+    agents: dict[str, AgentScore]
+    joint: JointAte | None
+
+
+def score_session(session: Session, folders: dict[str, Path]) -> SessionScore:
+    """Score the files that `share agent --out` left in `folders`. Raises DataError on damaged files."""
+    agents = {}
+    for name, folder in folders.items():
+        truth = read_tum(session.folder / "truth" / f"{name}.tum")
+        report = read_json(folder / "report.json")
+        odometry = _ate(_trajectory(folder / "odom.tum"), truth)
+        agents[name] = AgentScore(report, odometry, _trajectory(folder / "map.tum"), truth)
+    return SessionScore(agents, largest_map_ate(agents))
+
+
+def _trajectory(path: Path) -> Trajectory | None:
+    return read_tum(path) if path.stat().st_size else None
+
+
+def _ate(estimate: Trajectory | None, truth: Trajectory) -> Ate | None:
+    try:
+        return None if estimate is None else ate(estimate, truth)
+    except DataError:  # too few poses
+        return None
+
+
+def largest_map_ate(agents: dict[str, AgentScore]) -> JointAte | None:
+    """Return the joint ATE of the map that most agents were in at their last published pose."""
+    members: dict[str, list[str]] = {}
+    for name, agent in agents.items():
+        if agent.map is not None:
+            fallback_map = agent.report["protocol"]["map_id"]  # of runs before map_tum was written
+            members.setdefault(agent.report.get("map_tum", fallback_map), []).append(name)
+    if not members:
+        return None
+    largest = max(members.values(), key=len)
+    if len(largest) < min(2, len(agents)):
+        return None
+    pairs = {name: (agents[name].map, agents[name].truth) for name in largest}
+    try:
+        return joint_ate({name: (m, t) for name, (m, t) in pairs.items() if m is not None})
+    except DataError:
+        return None
 
 
 def run_metrics(trial: Trial) -> RunMetrics:
@@ -31,10 +95,15 @@ def run_metrics(trial: Trial) -> RunMetrics:
 def _run_metrics(trial: Trial) -> RunMetrics:
     session_score = score_session(trial.session, trial.folders)
     edge = read_json(trial.folder / "edge" / "edge.json")
-    joined_s = _join_times(trial.folder / "edge" / "events.jsonl")
+    shared_map_s = _join_times(trial.folder / "edge" / "events.jsonl")
     agents = tuple(
         _agent_metrics(
-            name, str(trial.session.agents[name].kind), one, session_score, edge, joined_s.get(name, math.nan)
+            name,
+            str(trial.session.agents[name].kind),
+            one,
+            session_score,
+            edge,
+            shared_map_s.get(name, math.nan),
         )
         for name, one in session_score.agents.items()
     )
@@ -51,7 +120,7 @@ def _run_metrics(trial: Trial) -> RunMetrics:
             trial.record.get("code") or "",
         ),
         agents,
-        in_one_map=0 if session_score.joint is None else len(session_score.joint.agents),
+        agents_in_largest_map=0 if session_score.joint is None else len(session_score.joint.agents),
         joint_ate_cm=_rmse_cm(None if session_score.joint is None else session_score.joint.joint),
         merges_requested=merges.get("requested", 0),
         merges_skipped=merges.get("skipped", 0),
@@ -65,11 +134,19 @@ def _agent_metrics(
     score: AgentScore,
     session_score: SessionScore,
     edge: dict[str, Any],
-    joined_s: float,
+    shared_map_s: float,
 ) -> AgentMetrics:
     report = score.report
     in_map = None if session_score.joint is None else session_score.joint.agents.get(name)
     track, corrected = report["track_ms"], report["corrected_ms"]
+    measured = {
+        "latency_ms": report["latency_ms"]["mean"],
+        "track_ms": track["mean"],
+        "corrected_ms": corrected["mean"],
+        **{f"track_{p}_ms": track[p] for p in ("p50", "p95", "p99")},
+        **{f"corrected_{p}_ms": corrected[p] for p in ("p50", "p95", "p99")},
+        **{key: report[key] for key in ("over_20ms", "rate_hz", "cpu_ms_per_frame")},
+    }
     frame, second = _rpe(score, rpe_frames), _rpe(score, rpe_time)
     span_s = float(score.truth.stamps_ns[-1] - score.truth.stamps_ns[0]) / 1e9
     trace = AgentTrace.from_series(edge["series"].get(name, {}))
@@ -78,21 +155,12 @@ def _agent_metrics(
         kind=kind,
         frames=report["frames"],
         tracked=report["tracked"],
-        latency_ms=_nan_if_none(report["latency_ms"]["mean"]),
-        track_ms=_nan_if_none(track["mean"]),
-        track_p50_ms=_nan_if_none(track["p50"]),
-        track_p95_ms=_nan_if_none(track["p95"]),
-        track_p99_ms=_nan_if_none(track["p99"]),
-        over_20ms=_nan_if_none(report["over_20ms"]),
         corrected=corrected["n"],
-        corrected_ms=_nan_if_none(corrected["mean"]),
-        corrected_p50_ms=_nan_if_none(corrected["p50"]),
-        corrected_p95_ms=_nan_if_none(corrected["p95"]),
-        corrected_p99_ms=_nan_if_none(corrected["p99"]),
+        **none_to_nan(measured),
         odom_ate_cm=_rmse_cm(score.odometry),
         odom_n=0 if score.odometry is None else score.odometry.n,
         ate_cm=_rmse_cm(in_map),
-        in_map=0 if in_map is None else in_map.n,
+        ate_n=0 if in_map is None else in_map.n,
         rpe_frame_cm=frame.cm,
         rpe_frame_deg=frame.degrees,
         rpe_frame_n=frame.n,
@@ -100,15 +168,13 @@ def _agent_metrics(
         rpe_1s_deg=second.degrees,
         rpe_1s_n=second.n,
         metres=score.truth.length_m,
-        joined_s=joined_s,
+        shared_map_s=shared_map_s,
         keyframes=report["keyframes"],
         sent=report["sent"],
-        rate_hz=_nan_if_none(report["rate_hz"]),
         kb_up_s=report["bytes_up"] / 1e3 / span_s,
         kb_down_s=report["bytes_down"] / 1e3 / span_s,
-        cpu_ms_per_frame=_nan_if_none(report["cpu_ms_per_frame"]),
         qoe=_mean(trace.qoe),
-        told_cm=math.sqrt(_mean(trace.error_cm**2)),
+        estimated_error_cm=math.sqrt(_mean(trace.error_cm**2)),
     )
 
 
@@ -145,18 +211,14 @@ def _join_times(events: Path) -> dict[str, float]:
     return joined
 
 
-def _rmse_cm(ate: Ate | None) -> float:
-    return math.nan if ate is None else 100 * ate.rmse
+def _rmse_cm(error: Ate | None) -> float:
+    return math.nan if error is None else 100 * error.rmse
 
 
 def _mean(values: F64) -> float:
     """Return the mean without NaN; NaN of none."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else math.nan
-
-
-def _nan_if_none(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 # A run over time: QoE, rates and merges, from the files of its edge.

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from share.config import Config
 from share.lab.evaluate.emulated_network import Channel, NetworkModel
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.loops import KeyframeKey
-from share.mapping.map_changes import MapChange
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Verification
 from share.mapping.steps import MapEvent
@@ -31,7 +30,7 @@ from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
-from share.types import F64, Keyframe, KeyframeCandidate, TrackState
+from share.types import F64, KeyframeCandidate, TrackState
 from share.wire.codec import Bytes, message_bytes
 from share.wire.messages import Hello, peer_id
 
@@ -108,19 +107,6 @@ class TrackedFrame:
     new_segment: bool = False
 
 
-class AnyMapper(Protocol):
-    """`share.mapping.mapper.Mapper`, or `share.lab.evaluate.modelled_mapper.ModelledMapper`."""
-
-    def add_run(self, agent: str, hello: Hello) -> None: ...
-    def set_present(self, agent: str, is_present: bool) -> None: ...
-    def add_keyframe(self, agent: str, keyframe: Keyframe, is_extra: bool = False) -> list[MapEvent]: ...
-    def next_lookup(self) -> Any: ...
-    def next_solve(self) -> Any: ...
-    def finish_step(self, step: Any, result: Any, ms: float) -> list[MapEvent]: ...
-    def take_changes(self) -> tuple[MapChange, ...]: ...
-    def report(self) -> dict[str, Any]: ...
-
-
 class Simulation:
     """A simulated room. All agents share the simulation's clock."""
 
@@ -130,11 +116,12 @@ class Simulation:
         agents: Sequence[tuple[Hello, Iterator[TrackedFrame], NetworkModel]],
         delays: ProcessingDelays,
         seed: int,
-        mapper: AnyMapper | None = None,
+        mapper: Mapper | None = None,
         on_effect: Callable[[str, ev.AgentEffect], None] = lambda name, effect: None,
         on_record: Callable[[dict[str, Any]], None] = lambda fields: None,
     ) -> None:
-        """Take each agent's hello, frames and network. `mapper`: a real one by default.
+        """Take each agent's hello, frames and network. `mapper`: a real one by default, or a
+        model with its interface.
 
         `on_effect(name, effect)` is called for every effect of an agent, `on_record(fields)` for every event
         that the edge records.
@@ -155,7 +142,7 @@ class Simulation:
             self._members[member.peer] = member
             self._schedule_next_frame(member)
         self.edge = Edge(config, session=1)
-        self.mapper: AnyMapper = Mapper(config) if mapper is None else mapper
+        self.mapper = Mapper(config) if mapper is None else mapper
         self._solver = PoseGraphSolver(config.graph)
         self._inbox: deque[tuple[Delay, Callable[[], list[MapEvent]]]] = deque()  # of the mapper process
         self._is_busy = False  # the mapper process

@@ -1,4 +1,4 @@
-"""Statistics of runs: comparison of policies, bootstrap intervals, and consistency (NEES) of an estimator.
+"""Statistics of runs: comparison of policies, bootstrap intervals.
 
 Policies are compared over runs of the same sessions, links and seeds. A ratio is of sums over all pairs of
 runs, so whatever slows all policies alike cancels. 95 % intervals by bootstrap over sessions.
@@ -14,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from share.geometry import se3
 from share.lab.evaluate.run_metrics import AgentMetrics, RunMetrics
-from share.types import F64, I64
+from share.types import F64
 
 # Bootstrap over sessions.
 #
@@ -71,18 +70,16 @@ _COMPARE_DIGITS = 9  # decimals to which two errors are compared
 
 @dataclass(frozen=True)
 class Measure:
-    """A quantity of a run. `name`: its column in sweep.csv. `label`: its name for readers, if another."""
+    """A quantity of a run. `name`: its column in sweep.csv."""
 
     name: str
     unit: str
     value_of: Callable[[RunMetrics], float]
-    label: str = ""
 
     @property
     def title(self) -> str:
-        """Label with unit."""
-        label = self.label or self.name
-        return f"{label}, {self.unit}" if self.unit else label
+        """Name with unit."""
+        return f"{self.name}, {self.unit}" if self.unit else self.name
 
 
 def _mean_over_kind(kind: str, value: Callable[[AgentMetrics], float]) -> Callable[[RunMetrics], float]:
@@ -102,17 +99,15 @@ MEASURES = (
     Measure("AR frames over 20 ms", "%", _mean_over_kind("ar", lambda a: 100 * a.over_20ms)),
     Measure("AR corrections", "ms", _mean_over_kind("ar", lambda a: a.corrected_ms)),
     Measure("robot latency", "ms", _mean_over_kind("robot", lambda a: a.latency_ms)),
-    Measure("merges a metre", "1/m", lambda run: run.merges_per_metre, "merges per metre"),
+    Measure("merges per metre", "1/m", lambda run: run.merges_per_metre),
     Measure("AR ATE in the map", "cm", _mean_over_kind("ar", lambda a: a.ate_cm)),
     Measure("robot ATE in the map", "cm", _mean_over_kind("robot", lambda a: a.ate_cm)),
-    Measure("AR error told", "cm", _mean_over_kind("ar", lambda a: a.told_cm), "AR estimated error"),
-    Measure("robot error told", "cm", _mean_over_kind("robot", lambda a: a.told_cm), "robot estimated error"),
+    Measure("AR estimated error", "cm", _mean_over_kind("ar", lambda a: a.estimated_error_cm)),
+    Measure("robot estimated error", "cm", _mean_over_kind("robot", lambda a: a.estimated_error_cm)),
     Measure("joint ATE", "cm", lambda run: run.joint_ate_cm),
     Measure("AR RPE over 1 s", "cm", _mean_over_kind("ar", lambda a: a.rpe_1s_cm)),
-    Measure(
-        "AR until in a shared map", "s", _mean_over_kind("ar", lambda a: a.joined_s), "AR time to shared map"
-    ),
-    Measure("agents in one map", "", lambda run: float(run.in_one_map)),
+    Measure("AR time to shared map", "s", _mean_over_kind("ar", lambda a: a.shared_map_s)),
+    Measure("agents in one map", "", lambda run: float(run.agents_in_largest_map)),
     Measure("AR keyframes sent", "Hz", _mean_over_kind("ar", lambda a: a.rate_hz)),
     Measure("AR QoE", "", _mean_over_kind("ar", lambda a: a.qoe)),
     Measure("robot QoE", "", _mean_over_kind("robot", lambda a: a.qoe)),
@@ -190,76 +185,3 @@ def _by_conditions(runs: Sequence[RunMetrics], policy: str) -> dict[tuple[str, s
         for run in runs
         if run.conditions.policy == policy
     }
-
-
-# Consistency of an estimator: are errors as large as its covariances claim?
-#
-# The truth is aligned with odometry in its unobservable directions only, yaw and position, at the first pose
-# of each segment. A wrong tilt counts as an error, and so does the drift that it causes. Source: Bar-Shalom,
-# Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation* (2001), 5.4.2.
-
-
-@dataclass(frozen=True, eq=False)
-class Deviations:
-    """Estimated minus true poses along odom's axes: rotation [rad], then translation [m].
-
-    errors (N, 6); cov (N, 6, 6): the estimator's covariance.
-    """
-
-    errors: F64
-    cov: F64
-
-    @property
-    def sigmas(self) -> F64:
-        """(N, 6)."""
-        out: F64 = np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
-        return out
-
-
-def deviations(T_odom_body: F64, cov: F64, T_world_body: F64, segment: I64) -> Deviations:
-    """Compare estimated poses (N, 4, 4), with covariances (N, 6, 6) perturbed on the right, with the truth
-    (N, 4, 4).
-
-    segment (N,): number of the odometry segment of each pose.
-    """
-    T_odom_world = np.zeros_like(T_world_body)
-    for number in np.unique(segment):
-        rows = np.flatnonzero(segment == number)
-        T_odom_world[rows] = yaw_alignment(T_odom_body[rows[0]], T_world_body[rows[0]])
-    true = T_odom_world @ T_world_body
-    R = T_odom_body[:, :3, :3]
-    rotation_errors = se3.so3_log(R @ np.swapaxes(true[:, :3, :3], 1, 2))
-    errors = np.concatenate([rotation_errors, T_odom_body[:, :3, 3] - true[:, :3, 3]], axis=1)
-    axes = np.zeros((len(R), 6, 6))
-    axes[:, :3, :3] = axes[:, 3:, 3:] = R
-    return Deviations(errors, axes @ cov @ np.swapaxes(axes, 1, 2))
-
-
-def yaw_alignment(T_odom_body: F64, T_world_body: F64) -> F64:
-    """Return T_odom_world (4, 4), a rotation about the vertical and a translation, that makes the two
-    positions equal and leaves no yaw between the two poses."""
-    R = T_odom_body[:3, :3] @ T_world_body[:3, :3].T
-    yaw = np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
-    turn = se3.so3_exp(np.array([0.0, 0.0, yaw]))
-    return se3.from_rt(turn, T_odom_body[:3, 3] - turn @ T_world_body[:3, 3])
-
-
-def nees(errors: F64, cov: F64) -> F64:
-    """Return the normalised estimation error squared (N,) of errors (N, D) with covariances (N, D, D).
-
-    Its mean is D for a consistent estimator. A zero covariance makes it infinite.
-    """
-    scale = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        normalised = errors / scale
-        correlation = cov / (scale[:, :, None] * scale[:, None, :])
-    known = np.isfinite(correlation).all(axis=(1, 2))
-    out = np.full(len(errors), np.inf)
-    solved = np.linalg.solve(correlation[known], normalised[known][:, :, None])[:, :, 0]
-    out[known] = (normalised[known] * solved).sum(1)
-    return out
-
-
-def share_within(errors: F64, sigmas: F64, sigma_factor: float = 3.0) -> float:
-    """Return the fraction of errors (N, D), N >= 1, within `sigma_factor` sigmas (N, D) on every axis."""
-    return float((np.abs(errors) <= sigma_factor * sigmas).all(axis=1).mean())

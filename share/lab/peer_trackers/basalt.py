@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from peer_wire import PeerFrame, claim_stdout, read_frame, read_line, write_line
+from peer_wire import PeerFrame, claim_stdout, pose_matrix, read_frame, read_line, write_line
 
 ANSWER_STREAM = claim_stdout()  # the library logs to stdout, from its import on
 
@@ -74,7 +74,10 @@ class Basalt:
         if answer is None:
             raise TimeoutError(f"no pose of frame {self.frame_count} within {TIMEOUT.seconds} s")
         self.frame_count += 1
-        return pose_matrix(answer) @ self.T_flu_body, time.process_time() - cpu_start_s
+        cpu_s = time.process_time() - cpu_start_s
+        q, t = answer.getQuaternion(), answer.getTranslation()
+        T = pose_matrix(np.array([t.x, t.y, t.z]), np.array([q.qx, q.qy, q.qz, q.qw]))
+        return T @ self.T_flu_body, cpu_s
 
     def _image_frame(self, socket: Any, image: NDArray[np.uint8], stamp_ns: int) -> Any:
         frame, timestamp = dai.ImgFrame(), timedelta(microseconds=stamp_ns // 1000)
@@ -141,20 +144,6 @@ def imu_message(stamps_ns: NDArray[np.int64], values: F64) -> Any:
     out = dai.IMUData()
     out.packets = packets
     return out
-
-
-def pose_matrix(transform: Any) -> F64:
-    """Return (4, 4)."""
-    q, t = transform.getQuaternion(), transform.getTranslation()
-    x, y, z, w = np.array([q.qx, q.qy, q.qz, q.qw]) / np.linalg.norm([q.qx, q.qy, q.qz, q.qw])
-    T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    T[:3, 3] = t.x, t.y, t.z
-    return T
 
 
 def intercept_calibration(handler: Any) -> tuple[threading.Event, Any]:

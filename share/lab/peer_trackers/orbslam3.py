@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from peer_wire import PeerFrame, claim_stdout, read_frame, read_line, write_line
+from peer_wire import PeerFrame, claim_stdout, pose_matrix, read_frame, read_line, write_line
 
 ANSWER_STREAM = claim_stdout()  # the library logs to stdout
 
@@ -114,21 +114,8 @@ def final_trajectory(slam: Any, folder: Path, start_ns: int) -> dict[str, Any]:
     file = folder / "final.txt"
     slam.save_trajectory_euroc(str(file))
     rows = np.loadtxt(file, ndmin=2) if file.exists() and file.stat().st_size else np.zeros((0, 8))
-    poses = [_pose_matrix(row[1:4], row[4:8]).tolist() for row in rows]
+    poses = [pose_matrix(row[1:4], row[4:8]).tolist() for row in rows]
     return {"stamps_ns": [round(row[0]) + start_ns for row in rows], "T_world_body": poses}
-
-
-def _pose_matrix(t: F64, q: F64) -> F64:
-    """Return (4, 4); q: x y z w."""
-    x, y, z, w = q / np.linalg.norm(q)
-    T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    T[:3, 3] = t
-    return T
 
 
 def track_all(slam: Any, calibration: dict[str, Any]) -> int:

@@ -27,6 +27,19 @@ class PeerFrame(NamedTuple):
     right: NDArray[np.uint8]
 
 
+def pose_matrix(t: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (4, 4) of a translation (3,) and a quaternion x y z w of any length."""
+    x, y, z, w = q / np.linalg.norm(q)
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = t
+    return T
+
+
 def claim_stdout() -> IO[bytes]:
     """Return this process's stdout, for answers only; whatever else is printed goes to stderr from now on."""
     out = os.fdopen(os.dup(1), "wb")

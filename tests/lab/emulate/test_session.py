@@ -1,4 +1,4 @@
-"""A session is whole, the same for the same recipe, and never half there."""
+"""A session is complete, deterministic, and never incomplete under its name."""
 
 import itertools
 import os
@@ -16,9 +16,9 @@ from helpers.small_session import RATE_HZ, SIZE, files, small_profile, small_rec
 from share.errors import ShareError, UsageError
 from share.geometry import se3
 from share.lab.emulate import session as sessions
-from share.lab.emulate.preparation import prepare_session
-from share.lab.emulate.progress import no_progress
+from share.lab.emulate.recipe import no_progress
 from share.lab.emulate.session import make_cached_session, make_session
+from share.lab.emulate.stage import prepare_session
 from share.lab.emulate.types import START_NS
 from share.recordings.session import read_session
 from share.recordings.trajectory import read_tum
@@ -26,6 +26,8 @@ from share.runtime.source import open_source
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU
 from share.sensors.profile import load_profile
 from share.types import AgentKind
+
+pytestmark = pytest.mark.long
 
 SECONDS = 3.0
 TICK = 3e-6  # rad and m within the microsecond in which a D435i counts
@@ -54,7 +56,7 @@ def stage_of(recipe, tmp_path):
 # ------------------------------------------------------------------ what is in it
 
 
-def test_a_session_is_whole(whole):
+def test_a_session_has_all_its_files(whole):
     assert sorted(files(whole)) == [
         "ann.mcap",
         "plan.png",
@@ -123,7 +125,7 @@ def test_calibration_is_the_rig(whole, small):
                 np.testing.assert_allclose(getattr(stated, key), getattr(rig, key), atol=1e-12)
 
 
-def test_provenance_tells_how_to_make_it_again(whole, recipe):
+def test_provenance_holds_the_recipe(whole, recipe):
     told = read_session(whole).provenance
     assert told["generator"] == "share emulate"
     assert {key: told[key] for key in recipe.to_mapping()} == recipe.to_mapping()
@@ -164,7 +166,7 @@ def test_the_digest_follows_files_that_the_user_edits(small, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_a_kill_leaves_is_used_and_the_result_is_the_same(whole, recipe, small, tmp_path):
+def test_a_killed_session_is_resumed_with_the_same_result(whole, recipe, small, tmp_path):
     out, grows = tmp_path / "session", tmp_path / ".session.partial"
     words = ["--scene", "plain", "--seconds", "3", "--seed", "5", "--workers", "1", "--profile", str(small)]
     words += [word for motion in MOTIONS for word in ("--motion", motion)]
@@ -199,7 +201,7 @@ def test_a_folder_that_exists_is_not_touched(recipe, tmp_path):
     assert files(tmp_path) == {}
 
 
-def test_two_at_a_time_are_told_apart(recipe, tmp_path):
+def test_a_second_process_on_the_same_folder_is_refused(recipe, tmp_path):
     from share.files.writing import lock_folder
 
     held = lock_folder(tmp_path / ".session.partial")
@@ -210,7 +212,7 @@ def test_two_at_a_time_are_told_apart(recipe, tmp_path):
         os.close(held)
 
 
-def test_no_space_is_said_before_anything_is_drawn(recipe, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_before_drawing(recipe, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(sessions.shutil, "disk_usage", lambda path: usage._replace(free=10**6))
     with pytest.raises(ShareError, match=r"about 0.03 GB are needed and 0.00 GB are free; make room, or"):
@@ -299,7 +301,7 @@ def test_a_counter_that_wraps_keeps_its_order(small, tmp_path):
 
 
 @pytest.mark.slow
-def test_where_the_truth_has_a_gap_there_is_no_picture(small, tmp_path):
+def test_pictures_are_left_out_in_gaps_of_the_truth(small, tmp_path):
     stamps = START_NS + np.arange(0, 4 * 10**9, 10**7)
     gap = (stamps[150], stamps[230])
     poses = write_poses(tmp_path / "poses.tum", stamps[(stamps <= gap[0]) | (stamps >= gap[1])])

@@ -1,4 +1,4 @@
-"""How sure a mean over runs is."""
+"""Bootstrap intervals of means over runs."""
 
 import math
 
@@ -18,13 +18,13 @@ def same(found: Interval, wanted: tuple[float, ...]) -> bool:
     return np.array_equal(found, wanted, equal_nan=True)
 
 
-def test_one_session_cannot_say_how_sure_it_is(rng):
+def test_one_session_has_no_interval(rng):
     assert same(statistics.bootstrap_mean([3.0], ["a"], rng), (3.0, math.nan, math.nan))
     assert same(statistics.bootstrap_mean([3.0, 5.0], ["a", "a"], rng), (4.0, math.nan, math.nan))
     assert same(statistics.bootstrap_ratio([3.0, 6.0], [1.0, 2.0], ["a", "b"], rng), (3.0, 3.0, 3.0))
 
 
-def test_what_was_not_measured_is_left_out_with_its_pair(rng):
+def test_pairs_with_a_missing_value_are_left_out(rng):
     assert statistics.bootstrap_mean([1.0, math.nan, 3.0], each(3), rng).value == 2.0
     found = statistics.bootstrap_ratio([1.0, math.nan, 100.0], [2.0, 5.0, math.nan], each(3), rng)
     assert same(found, (0.5, math.nan, math.nan))
@@ -33,7 +33,8 @@ def test_what_was_not_measured_is_left_out_with_its_pair(rng):
     assert all(math.isnan(value) for value in statistics.bootstrap_ratio([1.0], [0.0], ["a"], rng))
 
 
-def test_it_covers_the_mean_as_often_as_it_says():
+@pytest.mark.long
+def test_the_interval_covers_the_mean_at_its_level():
     """Of 20 normal values; percentiles of so few are known to be a little narrow."""
     inside = 0
     for seed in range(400):
@@ -43,7 +44,8 @@ def test_it_covers_the_mean_as_often_as_it_says():
     assert 0.89 < inside / 400 < 0.96
 
 
-def test_it_covers_the_mean_over_rooms_however_often_each_is_played():
+@pytest.mark.long
+def test_the_interval_covers_the_mean_over_rooms_with_several_runs_each():
     """Rooms differ by 2, runs in one of them by 0.3: three seeds tell hardly more than one."""
     inside = 0
     for seed in range(400):
@@ -55,7 +57,7 @@ def test_it_covers_the_mean_over_rooms_however_often_each_is_played():
     assert 0.89 < inside / 400 < 0.96
 
 
-def test_pairs_stay_together():
+def test_values_of_a_pair_are_resampled_together():
     """Sessions that differ much, a policy that takes 0.8 of each: the ratio is sure, the mean is not."""
     rng = np.random.default_rng(1)
     base = rng.uniform(1.0, 20.0, 12)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from share.errors import UsageError
-from share.lab.evaluate.cluster import Cluster
+from share.lab.evaluate.campaign import Cluster
 
 distributed = pytest.importorskip("distributed", reason="pip install 'share-slam[cluster]' brings it")
 
@@ -27,7 +27,7 @@ def slow_square(job: tuple[int, str]) -> int:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # dask's own
-def test_what_a_dead_worker_had_is_done_by_another(tmp_path):
+def test_jobs_of_a_dead_worker_are_done_by_another(tmp_path):
     with (
         distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
         Cluster(cluster.scheduler_address) as workers,
@@ -38,6 +38,6 @@ def test_what_a_dead_worker_had_is_done_by_another(tmp_path):
 
 
 @pytest.mark.slow
-def test_where_nobody_answers_is_said():
+def test_an_unreachable_scheduler_is_refused():
     with pytest.raises(UsageError, match=r"--scheduler tcp://127\.0\.0\.1:1: no answer from"):
         Cluster("tcp://127.0.0.1:1")

@@ -1,4 +1,4 @@
-"""Policies against each other, by hand."""
+"""Comparison of policies against figures computed by hand."""
 
 import dataclasses
 import math
@@ -58,12 +58,12 @@ def test_ratios_are_of_sessions_that_both_have_played():
     share = found("share")
     assert share["AR latency"] == pytest.approx((15.0, 30 / 50))
     assert share["robot latency"] == pytest.approx((42.0, 84 / 80))
-    assert share["merges a metre"] == pytest.approx((0.75, 30 / 150))
+    assert share["merges per metre"] == pytest.approx((0.75, 30 / 150))
     assert share["robot ATE in the map"] == pytest.approx((3.0, 3 / 2))  # in two it was in no map
     assert math.isnan(share["AR QoE"][0])
 
 
-def test_how_many_pairs_a_ratio_rests_on_is_told():
+def test_a_comparison_counts_its_pairs():
     pairs = {
         one.measure.name: (one.pairs, one.total_pairs) for one in compare_policies(RUNS, "share", "covins-g")
     }
@@ -72,7 +72,7 @@ def test_how_many_pairs_a_ratio_rests_on_is_told():
     assert pairs["AR QoE"] == (0, 2)
 
 
-def test_seeds_of_one_session_do_not_make_it_surer():
+def test_more_seeds_of_one_session_give_no_interval():
     again = [dataclasses.replace(r, conditions=dataclasses.replace(r.conditions, seed=1)) for r in RUNS]
     once, twice = (
         {one.measure.name: one.ratio for one in compare_policies(runs, "share", "covins-g")}["AR latency"]
@@ -81,16 +81,16 @@ def test_seeds_of_one_session_do_not_make_it_surer():
     assert once == twice
 
 
-def test_the_base_is_all_of_itself():
+def test_the_ratio_of_the_base_is_one():
     assert {ratio for _, ratio in found("covins-g").values() if not math.isnan(ratio)} == {1.0}
 
 
-def test_whose_error_is_no_more():
+def test_runs_with_no_larger_error_are_counted():
     assert count_no_worse(RUNS, "share", "covins-g") == (2, 3)
     assert count_no_worse(RUNS, "covins-g", "share") == (2, 3)
 
 
-def test_whose_error_is_no_more_on_average():
+def test_means_with_no_larger_error_are_counted():
     again = [
         run("share", "one", (10.0, 40.0), (1.0, 3.0), 20, seed=1),
         run("covins-g", "one", (10.0, 40.0), (0.4, 3.5), 20, seed=1),  # means: 0.7 for 1.0, 2.75 for 3.0

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from share.lab.evaluate.html_page import html_page
+from share.lab.evaluate.report import html_page
 
 TEXT = """# Two < three
 
@@ -35,7 +35,7 @@ def test_text_and_tables_are_html(made):
     assert "<title>R &amp; D</title>" in made
 
 
-def test_it_opens_offline_and_runs_nothing(made):
+def test_the_page_has_no_scripts_and_no_external_links(made):
     assert "<script" not in made
     assert not re.search(r'(?:src|href)="(?!data:)', made)
     assert f'src="data:image/png;base64,{base64.b64encode(PNG).decode()}"' in made

@@ -1,9 +1,9 @@
-"""Who shares a map, as corrections come."""
+"""Which agents share a map, by their corrections."""
 
-from share.lab.evaluate.map_membership import MapMembership
+from share.lab.evaluate.real_time import MapMembership
 
 
-def test_agents_come_together_and_part():
+def test_agents_of_one_map_share_it_until_they_separate():
     together = MapMembership()
     assert together.sharing_agents == []
     together.add_correction("a", "a/0")

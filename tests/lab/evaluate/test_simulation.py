@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 from helpers.edge_sim import Person, walls
+from helpers.room_simulation import MS, tracked_frames
 
 from share.config import Config, EdgeConfig
-from share.geometry import se3
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS
-from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation, TrackedFrame
-from share.types import KeyframeCandidate
+from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation
 
-MS = 1_000_000
+pytestmark = pytest.mark.long
+
 ROOM = walls(1)
-
-
-def seen(person: Person, seconds: float) -> Iterator[TrackedFrame]:
-    """20 frames a second, every fifth a keyframe."""
-    T_before = None
-    for k in range(round(20 * seconds)):
-        if k % 5:
-            yield TrackedFrame(50 * k * MS, person.T_odom_body[-1], 0.5)
-            continue
-        T, view = person.step()
-        T_last_body = T if T_before is None else se3.inverse(T_before) @ T
-        candidate = KeyframeCandidate(T, T_last_body, person.cov, np.zeros(3), 0.0, view, T_before is None)
-        T_before = T
-        yield TrackedFrame(50 * k * MS, T, 0.5, candidate)
 
 
 def world(policy: str = "covins-g", seed: int = 0, seconds: float = 6.0, **costs: Delay) -> Simulation:
     people = [Person("ann", ROOM, 0.0, 11), Person("bob", ROOM, 0.5, 22)]
-    agents = [(person.hello, seen(person, seconds), NETWORK_PRESETS["wifi5"]) for person in people]
+    agents = [(person.hello, tracked_frames(person, seconds), NETWORK_PRESETS["wifi5"]) for person in people]
     made = Simulation(Config(edge=EdgeConfig(policy=policy)), agents, ProcessingDelays(**costs), seed)
     made.run(seconds + 1.0)
     return made
@@ -50,20 +34,20 @@ def corrected_ms(room: Simulation, name: str) -> list[float]:
     return [ms for ms in late if not np.isnan(ms)]
 
 
-def test_a_cost_is_drawn_as_it_is_said() -> None:
+def test_a_delay_has_its_median_and_95th_percentile() -> None:
     rng = np.random.default_rng(0)
     drawn = np.array([Delay(4.0, 9.0).draw_ns(x) for x in rng.standard_normal(20_000)]) / MS
     assert np.percentile(drawn, [50, 95]) == pytest.approx([4.0, 9.0], rel=0.03)
 
 
-def test_samples_are_drawn_as_they_were_measured() -> None:
+def test_a_sampled_delay_has_the_measured_quantiles() -> None:
     rng = np.random.default_rng(0)
     measured = Sampled((0.0, 0.0, 0.0, 2.0, 5.0))
     drawn = np.array([measured.draw_ns(x) for x in rng.standard_normal(20_000)]) / MS
     assert np.percentile(drawn, [0, 25, 50, 75, 100]) == pytest.approx([0, 0, 0, 2, 5], abs=0.06)
 
 
-def test_a_slice_may_come_after_any_frame_and_delays_the_next_one() -> None:
+def test_keyframe_work_after_a_frame_delays_the_next_one() -> None:
     none, always = (
         world(seconds=3.0, frame=Delay(5.0, 5.0), finish_keyframe=Sampled((ms,) * 2)) for ms in (0.0, 80.0)
     )
@@ -72,7 +56,7 @@ def test_a_slice_may_come_after_any_frame_and_delays_the_next_one() -> None:
     assert np.median(waits) == pytest.approx(35.0, abs=1.0)  # 85 ms each, every 50 ms
 
 
-def test_everybody_is_tracked_joined_and_corrected() -> None:
+def test_all_agents_are_tracked_and_corrected_in_one_map() -> None:
     room = world()
     report = room.edge.report(room.mapper.report())
     assert {name: agent["keyframes"] for name, agent in report["agents"].items()} == {"ann": 24, "bob": 24}
@@ -88,12 +72,12 @@ def test_everybody_is_tracked_joined_and_corrected() -> None:
         assert log.report()["latency_ms"]["mean"] == pytest.approx(np.mean(both))
 
 
-def test_the_same_seed_is_the_same_run_and_another_is_not() -> None:
+def test_a_run_depends_on_its_seed_alone() -> None:
     first, again, other = (track_ms(world(seed=seed, seconds=3.0), "ann") for seed in (1, 1, 2))
     assert first == again != other
 
 
-def test_a_slow_tracker_makes_frames_wait_and_a_slow_edge_corrections() -> None:
+def test_slow_tracking_delays_frames_and_slow_solving_delays_corrections() -> None:
     usual = world(seconds=3.0)
     slow = world(seconds=3.0, frame=Delay(70.0, 70.0))
     waits = np.diff(track_ms(slow, "ann"))
@@ -103,9 +87,9 @@ def test_a_slow_tracker_makes_frames_wait_and_a_slow_edge_corrections() -> None:
     assert np.mean(track_ms(late, "bob")) == pytest.approx(np.mean(track_ms(usual, "bob")), rel=0.1)
 
 
-def test_an_agent_hears_its_rate() -> None:
+def test_an_agent_receives_its_rate() -> None:
     room = world("share")
     report = room.edge.report(room.mapper.report())["agents"]
-    heard = {name: told["rate_hz"] for name, told in room.reports().items()}
-    assert all(rate is not None for rate in heard.values())
-    assert {name: agent["rate_hz"] for name, agent in report.items()} == pytest.approx(heard, abs=1e-3)
+    received = {name: own["rate_hz"] for name, own in room.reports().items()}
+    assert all(rate is not None for rate in received.values())
+    assert {name: agent["rate_hz"] for name, agent in report.items()} == pytest.approx(received, abs=1e-3)

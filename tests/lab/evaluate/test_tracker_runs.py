@@ -150,11 +150,11 @@ def test_score_is_of_all_frames_under_one_alignment(source):
     poses = T @ truth.T
     good = score_tracker("x", "y", source, Trajectory(truth.stamps_ns, poses), [1.0, 2.0, 6.0])
     assert good.ate_cm == pytest.approx(0, abs=1e-9)
-    assert good.told == 1
+    assert good.tracked_share == 1
     assert (good.cpu_ms, good.cpu_mean_ms) == (2, 3)
     poses[7, 2, 3] += 0.05
     off = score_tracker("x", "y", source, Trajectory(truth.stamps_ns, poses), [])
-    assert off.most_cm == pytest.approx(5, rel=0.2)
+    assert off.max_cm == pytest.approx(5, rel=0.2)
     assert np.isnan(off.cpu_ms)
 
 

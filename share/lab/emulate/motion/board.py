@@ -17,6 +17,7 @@ from share.geometry import se3
 from share.lab.emulate.motion.spec import BoardSpec
 from share.lab.emulate.motion.spline import SplinePath, spline_through
 from share.lab.emulate.motion.track import knot_times
+from share.lab.emulate.motion.walk import axis_rotation
 from share.lab.emulate.types import START_NS
 from share.lab.emulate.world.layout import Layout, PlacedTarget
 from share.types import F64
@@ -102,11 +103,6 @@ def _looking_pose(around: F64, above: F64, distance: F64, aim: F64, roll: F64) -
     """Return orientation (M, 3, 3) and position (M, 3) m of the body in a frame at the board's middle. aim
     (2, M): where the image shows the middle, tangents."""
     facing = np.array([(1.0, 0, 0), (0, -1, 0), (0, 0, -1)])  # looks at the board from before its middle
-    orbit = _axis_rotation(1, around) @ _axis_rotation(0, -above)
-    aside = _axis_rotation(0, np.arctan(aim[1])) @ _axis_rotation(1, -np.arctan(aim[0]))
-    return orbit @ facing @ _axis_rotation(2, roll) @ aside, orbit[:, :, 2] * distance[:, None]
-
-
-def _axis_rotation(axis: int, angle: F64) -> F64:
-    """Return rotations (M, 3, 3) about one axis."""
-    return se3.so3_exp(angle[:, None] * np.eye(3)[axis])
+    orbit = axis_rotation(1, around) @ axis_rotation(0, -above)
+    aside = axis_rotation(0, np.arctan(aim[1])) @ axis_rotation(1, -np.arctan(aim[0]))
+    return orbit @ facing @ axis_rotation(2, roll) @ aside, orbit[:, :, 2] * distance[:, None]

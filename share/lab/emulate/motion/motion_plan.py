@@ -1,6 +1,10 @@
 """Plan the motion of all agents in a room: from specs to paths that touch neither the room nor each other.
 
 specs -> recorded motions are placed, obstacles to them are removed -> simulated ones keep clear of them
+
+`paper:1` .. `paper:5` are the three agents of the paper's five experiments, 60 s in 9 x 6 x 4 m. Path
+lengths: SHARE (IMWUT 10(3) 97, 2026). The recordings are not public; these are other paths of the same
+lengths.
 """
 
 from __future__ import annotations
@@ -14,11 +18,19 @@ import numpy as np
 
 from share.errors import UsageError
 from share.geometry.camera import ImuNoise
-from share.lab.emulate.motion import board, paper
-from share.lab.emulate.motion.crowd import FixedPath, SimulatedAgent, fixed_path, plan_crowd
-from share.lab.emulate.motion.floor import Floor, floor_from_occupancy
+from share.lab.emulate.motion import board, recorded
+from share.lab.emulate.motion.crowd import (
+    PEOPLE_M,
+    FixedPath,
+    FloorGraphs,
+    MotionPreferences,
+    SimulatedAgent,
+    fixed_path,
+    plan_crowd,
+)
 from share.lab.emulate.motion.placement import MIN_DISTANCE_M, PathToPlace, place_paths
-from share.lab.emulate.motion.planned_motion import PEOPLE_M, FloorGraphs, MotionPreferences
+from share.lab.emulate.motion.robot import INITIAL_STILL_S
+from share.lab.emulate.motion.route import Floor, floor_from_occupancy
 from share.lab.emulate.motion.spec import (
     BoardSpec,
     EurocSpec,
@@ -30,13 +42,45 @@ from share.lab.emulate.motion.spec import (
     WalkSpec,
     parse_motion,
 )
-from share.lab.emulate.motion.tum_path import read_tum_path
+from share.lab.emulate.motion.spline import read_tum_path
 from share.lab.emulate.types import MotionPath
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
-from share.types import F64, I64, AgentKind
+from share.types import F64, AgentKind
 
-_MIN_SESSION_S, _MAX_SESSION_S = 3.0, 3600.0
+PAPER_S = 60.0
+PAPER_NAMES = ("user1", "user2", "robot")
+PAPER_LENGTHS_M: dict[int, tuple[float, float, float]] = {
+    1: (82.56, 17.21, 10.06),
+    2: (33.39, 43.87, 10.88),
+    3: (28.48, 35.66, 8.16),
+    4: (54.02, 40.77, 23.91),
+    5: (37.67, 34.17, 23.09),
+}
+_HEIGHTS_M = (1.70, 1.62, 0.35)
+_MIN_WALK_SPEED, _MIN_DRIVE_SPEED = 0.80, 0.32  # m/s; agents with shorter paths pause more instead
+# times the mean speed, which makes up for slowing down in bends
+_BEND_FACTORS = {"person": 1.1, "robot": 1.3}
+_START_DELAY_S = 2.4
+
+
+def paper_agents(number: int) -> list[SimulatedAgent]:
+    """Return the three agents of one experiment. Raises KeyError for a number outside 1 .. 5."""
+    return [
+        _paper_agent(name, length, height)
+        for name, length, height in zip(PAPER_NAMES, PAPER_LENGTHS_M[number], _HEIGHTS_M, strict=True)
+    ]
+
+
+def _paper_agent(name: str, length: float, height: float) -> SimulatedAgent:
+    body_kind = "robot" if name == "robot" else "person"
+    mean = _BEND_FACTORS[body_kind] * length / (PAPER_S - INITIAL_STILL_S - _START_DELAY_S)
+    preferences = MotionPreferences(
+        body_kind, max(mean, _MIN_DRIVE_SPEED if body_kind == "robot" else _MIN_WALK_SPEED), 0.0
+    )
+    return SimulatedAgent(name, preferences, height, length=length)
+
+
 _GAZE_TARGETS = 150
 _GAZE_TARGET_HEIGHTS_M = (0.3, 2.3)
 _EYE_HEIGHTS_M = (1.60, 1.75)
@@ -48,8 +92,8 @@ class PlannedAgent:
     """One agent. body_kind: its looks, `person`, `robot` or `drone`.
 
     T_body_cam0 (4, 4): the camera's pose on the body, where a recorded motion has its own rig, else None:
-    that of the sensor's profile (a simulated body is the profile's IMU). images_ns (M,): stamps of the
-    recorded images, if any; imu: noise of the recorded IMU. spec: as given by the user. notes: text for the
+    that of the sensor's profile (a simulated body is the profile's IMU). imu: noise of the
+    recorded IMU. spec: as given by the user. notes: text for the
     user. has_camera_axes: the body has camera axes, x right, y down, z ahead.
     """
 
@@ -59,7 +103,6 @@ class PlannedAgent:
     path: MotionPath
     spec: str
     T_body_cam0: F64 | None = None
-    images_ns: I64 | None = None
     imu: ImuNoise | None = None
     notes: tuple[str, ...] = ()
     has_camera_axes: bool = False
@@ -91,24 +134,20 @@ def plan_motions(specs: Sequence[str], layout: Layout, seconds: float, seed: int
     Raises UsageError for an invalid spec, a name given twice, or paths that do not fit into the room,
     DataError for a damaged recording.
     """
-    if not _MIN_SESSION_S <= seconds <= _MAX_SESSION_S:
-        raise UsageError(
-            f"{seconds:g} seconds: a session lasts {_MIN_SESSION_S:g} to {_MAX_SESSION_S:g} seconds"
-        )
     requests = _named_specs(specs)
-    recorded = [_recorded_agent(a, seconds) for a in requests if isinstance(a.spec, RecordedSpec)]
-    paths_to_place = [PathToPlace(agent.name, agent.body_kind, agent.path) for agent in recorded]
+    recorded_agents = [_recorded_agent(a, seconds) for a in requests if isinstance(a.spec, RecordedSpec)]
+    paths_to_place = [PathToPlace(agent.name, agent.body_kind, agent.path) for agent in recorded_agents]
     layout, paths, notes = (
         place_paths(layout, paths_to_place, (seed, 71)) if paths_to_place else (layout, [], [])
     )
-    agents = [replace(agent, path=path) for agent, path in zip(recorded, paths, strict=True)]
+    agents = [replace(agent, path=path) for agent, path in zip(recorded_agents, paths, strict=True)]
     agents += [
         _board_agent(a, a.spec, layout, seconds, seed) for a in requests if isinstance(a.spec, BoardSpec)
     ]
     agents += _simulated_agents(requests, layout, [_fixed_path(agent) for agent in agents], seconds, seed)
     order = [name for a in requests for name in _agent_names(a)]
-    if any(isinstance(a.spec, PaperSpec) for a in requests) and seconds != paper.SECONDS:
-        notes = [*notes, f"an experiment of the paper lasts {paper.SECONDS:g} s"]
+    if any(isinstance(a.spec, PaperSpec) for a in requests) and seconds != PAPER_S:
+        notes = [*notes, f"an experiment of the paper lasts {PAPER_S:g} s"]
     return MotionPlan(layout, tuple(sorted(agents, key=lambda a: order.index(a.name))), tuple(notes))
 
 
@@ -132,7 +171,7 @@ def _named_specs(specs: Sequence[str]) -> list[_NamedSpec]:
 
 
 def _agent_names(request: _NamedSpec) -> tuple[str, ...]:
-    return paper.NAMES if isinstance(request.spec, PaperSpec) else (request.name,)
+    return PAPER_NAMES if isinstance(request.spec, PaperSpec) else (request.name,)
 
 
 def _free_name(kind: str, requests: Sequence[_NamedSpec]) -> str:
@@ -151,17 +190,11 @@ def _recorded_agent(request: _NamedSpec, seconds: float) -> PlannedAgent:
         return PlannedAgent(
             request.name, kind, spec.look, path, request.text, notes=_short_note(path, seconds)
         )
-    from share.lab.emulate.motion import recorded_sources
-
-    options = (
-        recorded_sources.EUROC_OPTIONS if isinstance(spec, EurocSpec) else recorded_sources.TUMVI_OPTIONS
-    )
-    recording = recorded_sources.open_recorded_motion(File(spec.path), options, spec.start, longest)
+    options = recorded.EUROC_OPTIONS if isinstance(spec, EurocSpec) else recorded.TUMVI_OPTIONS
+    recording = recorded.open_recorded_motion(File(spec.path), options, spec.start, longest)
     notes = (*recording.notes, *_short_note(recording.path, seconds))
-    mount, stamps = recording.T_body_cam0, recording.images_ns
-    return PlannedAgent(
-        request.name, kind, spec.look, recording.path, request.text, mount, stamps, recording.noise, notes
-    )
+    mount, noise = recording.T_body_cam0, recording.noise
+    return PlannedAgent(request.name, kind, spec.look, recording.path, request.text, mount, noise, notes)
 
 
 def _board_agent(
@@ -200,7 +233,7 @@ def _simulated_agents(
         return []
     floor = floor_from_occupancy(Occupancy.from_layout(layout))
     if any(isinstance(a.spec, PaperSpec) for a in requests):
-        floor, seconds = _floor_within(floor, _PAPER_SPACE_M), paper.SECONDS
+        floor, seconds = _floor_within(floor, _PAPER_SPACE_M), PAPER_S
     paths = plan_crowd(FloorGraphs(floor), members, fixed, _gaze_targets(layout, rng), seconds, (seed, 73))
     kinds = {"person": AgentKind.AR, "robot": AgentKind.ROBOT}
     return [
@@ -214,7 +247,7 @@ def _simulated_agents(
 def _crowd_members(request: _NamedSpec, rng: np.random.Generator) -> list[SimulatedAgent]:
     spec = request.spec
     if isinstance(spec, PaperSpec):
-        return paper.paper_agents(spec.number)
+        return paper_agents(spec.number)
     if isinstance(spec, WalkSpec):
         height = spec.height or float(rng.uniform(*_EYE_HEIGHTS_M))
         return [

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from share.geometry import se3
-from share.lab.emulate.motion.floor import Floor
-from share.lab.emulate.motion.route import Rng, Route, arc_length, headings, smooth_route
+from share.lab.emulate.motion.route import Floor, Rng, Route, arc_length, headings, smooth_route
 from share.lab.emulate.motion.schedule import MotionLimits, smooth_schedule
 from share.lab.emulate.motion.spline import SplinePath, spline_through
 from share.lab.emulate.motion.track import KNOT_S, PlanarTrack, knot_times

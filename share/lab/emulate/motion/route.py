@@ -1,8 +1,9 @@
 """Routes over free floor: shortest paths that keep off obstacles, smoothed.
 
-Cheapest paths by Dijkstra on the grid with 16 neighbours; the cost of a metre rises near obstacles. Smoothed
-as an elastic band (Quinlan & Khatib, ICRA 1993): diffusion along the path, repulsion where the clearance is
-too small. k steps of diffusion at spacing h smooth over about sqrt(k / 2) h.
+The floor is a grid of distances from the nearest obstacle. Cheapest paths by Dijkstra with 16 neighbours; the
+cost of a metre rises near obstacles. Smoothed as an elastic band (Quinlan & Khatib, ICRA 1993): diffusion
+along the path, repulsion where the clearance is too small. k steps of diffusion at spacing h smooth over
+about sqrt(k / 2) h.
 """
 
 from __future__ import annotations
@@ -12,8 +13,54 @@ from typing import Any
 
 import numpy as np
 
-from share.lab.emulate.motion.floor import Floor
+from share.lab.emulate.world.occupancy import Occupancy
 from share.types import F64
+
+_MIN_OBSTACLE_M = 0.10  # lower steps are walked over
+_MAX_OBSTACLE_M = 1.95  # higher beams are walked under
+_VOXELS_PER_CELL = 2  # voxels of the occupancy per grid cell
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """clearance (X, Y) m at the places origin + (i, j) * step m: distance to the nearest obstacle between
+    floor and head, 0 inside one."""
+
+    clearance: F64
+    step: float
+    origin: float = 0.0
+
+    def clearance_at(self, xy: F64) -> F64:
+        """Return the clearance (N,) m at places (N, 2) m, bilinear; outside the grid that of its edge."""
+        i, f = self._cells(xy)
+        c = self.clearance
+        low = c[i[:, 0], i[:, 1]] * (1 - f[:, 1]) + c[i[:, 0], i[:, 1] + 1] * f[:, 1]
+        high = c[i[:, 0] + 1, i[:, 1]] * (1 - f[:, 1]) + c[i[:, 0] + 1, i[:, 1] + 1] * f[:, 1]
+        out: F64 = low * (1 - f[:, 0]) + high * f[:, 0]
+        return out
+
+    def clearance_gradient(self, xy: F64) -> F64:
+        """Return the gradient (N, 2) of the clearance."""
+        h = self.step * np.eye(2)
+        return np.stack([self.clearance_at(xy + d) - self.clearance_at(xy - d) for d in h], axis=1) / (
+            2 * self.step
+        )
+
+    def _cells(self, xy: F64) -> tuple[np.ndarray, F64]:
+        last_cell = np.array(self.clearance.shape) - 1
+        place = ((np.asarray(xy) - self.origin) / self.step).clip(0, last_cell - 1e-9)
+        cell = place.astype(int)
+        return cell, place - cell
+
+
+def floor_from_occupancy(occupancy: Occupancy) -> Floor:
+    """Return the floor for people and robots alike: the space under a table is not free."""
+    clearance, origin, step = occupancy.floor_clearance(_MIN_OBSTACLE_M, _MAX_OBSTACLE_M)
+    grid = clearance[::_VOXELS_PER_CELL, ::_VOXELS_PER_CELL].astype(np.float64)
+    return Floor(grid, step * _VOXELS_PER_CELL, float(origin[0]))
+
+
+# Routes over the floor.
 
 Rng = np.random.Generator
 POINT_SPACING_M = 0.05  # between points of a finished route
@@ -53,12 +100,12 @@ class FloorGraph:
         """Return places (N, 2) m where a body may be."""
         return np.asarray(self._cells * self.floor.step + self.floor.origin, np.float64)
 
-    def random_tour(self, length: float, rng: Rng, start: F64 | None = None) -> list[F64]:
-        """Return legs (n, 2) m, end to end, from the place nearest to `start` (2,) m, at least `length` m in
-        all, preferring to continue ahead where they join. Empty where there is no free place."""
+    def random_tour(self, length: float, rng: Rng) -> list[F64]:
+        """Return legs (n, 2) m, end to end, from a random place, at least `length` m in all, preferring to
+        continue ahead where they join. Empty where there is no free place."""
         if len(self._cells) < 2:
             return []
-        at = int(rng.integers(len(self._cells))) if start is None else self.nearest(start)
+        at = int(rng.integers(len(self._cells)))
         legs: list[F64] = []
         done, ahead = 0.0, None
         while done < length:
@@ -69,10 +116,6 @@ class FloorGraph:
             ahead = leg[-1] - leg[max(-6, -len(leg))]
             legs.append(leg)
         return legs
-
-    def nearest(self, xy: F64) -> int:
-        """Return the index of the free place nearest to xy (2,) m."""
-        return int(np.argmin(np.linalg.norm(self.places - xy, axis=1)))
 
     def _next_leg(self, start_cell: int, ahead: F64 | None, rng: Rng) -> tuple[F64, int]:
         from scipy.sparse.csgraph import dijkstra

@@ -38,7 +38,7 @@ class RecordedSpec:
 
 @dataclass(frozen=True)
 class EurocSpec(RecordedSpec):
-    """`euroc:FOLDER`: ground truth, real IMU and image stamps in EuRoC's files."""
+    """`euroc:FOLDER`: ground truth and real IMU in EuRoC's files."""
 
     kind: str = "robot"
     look: str = "drone"

@@ -6,8 +6,12 @@ import ctypes
 import os
 from typing import Any
 
-from share.errors import install_hint
-from share.lab.emulate.render.errors import RenderError
+from share.errors import ShareError, install_hint
+
+
+class RenderError(ShareError):
+    """This machine cannot draw a room: a library or a driver is missing."""
+
 
 _VERSION = 430  # of OpenGL, for storage buffers
 _EGL, _GL = "libEGL.so.1", "libGL.so.1"  # by name: ctypes finds the unversioned ones by tools that may lack

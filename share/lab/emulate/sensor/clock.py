@@ -1,19 +1,44 @@
 """Sampling times of a device's streams, and the stamps of its clock.
 
 True time is the path's, in ns: the time in which the motion happens. A picture's time is the middle of its
-exposure.
+exposure. Random numbers are drawn by index: independent of the order and span of requests.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from share.lab.emulate.sensor.indexed_random import Seed, normal, uniform
-from share.types import I64
+from share.types import F64, I64
+
+Seed = tuple[int, ...]
+_BLOCK_SIZE = 4096  # indices that share one generator
+_Draw = Callable[[np.random.Generator, int], Any]
+
+
+def uniform(seed: Seed, index: I64) -> F64:
+    """Return a number in [0, 1) for each index (N,), which must not be negative."""
+    return _draw_by_index(seed, index, lambda rng, n: rng.random(n))
+
+
+def normal(seed: Seed, index: I64) -> F64:
+    """Return a standard normal number for each index (N,), which must not be negative."""
+    return _draw_by_index(seed, index, lambda rng, n: rng.standard_normal(n))
+
+
+def _draw_by_index(seed: Seed, index: I64, draw: _Draw) -> F64:
+    out = np.empty(len(index))
+    block = index // _BLOCK_SIZE
+    for number in np.unique(block):
+        rows = block == number
+        values = draw(np.random.default_rng((*seed, int(number))), _BLOCK_SIZE)
+        out[rows] = values[index[rows] % _BLOCK_SIZE]
+    return out
+
 
 _MAX_BURST_FRAMES = 64
 _MAX_JITTER_SHARE = 0.45  # of a period: largest stamp error that keeps the order

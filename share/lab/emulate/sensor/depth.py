@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from share.errors import ConfigError
-from share.lab.emulate.sensor.indexed_random import Seed
+from share.lab.emulate.sensor.clock import Seed
 from share.sensors.profile_types import CameraModel, Profile
 from share.types import F32, U8
 
@@ -99,7 +99,7 @@ class DepthSensor:
 
 def noise_variance(gray: U8, model: CameraModel, gain: float) -> F32:
     """Return the variance of gray levels (H, W) between two cameras: shot, read, fixed-pattern and rounding
-    noise (see `share.lab.emulate.sensor.photometry`)."""
+    noise (see `share.lab.emulate.sensor.imager`)."""
     K, level = 255 * gain / model.full_well_e, np.arange(256)
     fixed = (model.pixel_gain * level) ** 2 + (K * model.pixel_offset_e) ** 2
     table = K * level + (K * model.read_e) ** 2 + fixed + _ROUNDING

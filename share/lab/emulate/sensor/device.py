@@ -11,15 +11,18 @@ from functools import cached_property
 import numpy as np
 
 from share.lab.emulate.sensor import clock as clocks
-from share.lab.emulate.sensor import exposure as exposures
-from share.lab.emulate.sensor.clock import DeviceClock, SampleStream
+from share.lab.emulate.sensor import imager
+from share.lab.emulate.sensor.clock import DeviceClock, SampleStream, Seed
 from share.lab.emulate.sensor.depth import DepthSensor
 from share.lab.emulate.sensor.effects import Effects
-from share.lab.emulate.sensor.exposure import Exposure, ExposureSeries
-from share.lab.emulate.sensor.imu import ImuStreams, measured_samples
-from share.lab.emulate.sensor.indexed_random import Seed
-from share.lab.emulate.sensor.photometry import Imager
-from share.lab.emulate.sensor.vibration import knock_acceleration, rotation_rates, vibration_acceleration
+from share.lab.emulate.sensor.imager import Exposure, ExposureSeries, Imager
+from share.lab.emulate.sensor.imu import (
+    ImuStreams,
+    knock_acceleration,
+    measured_samples,
+    rotation_rates,
+    vibration_acceleration,
+)
 from share.lab.emulate.types import MotionPath
 from share.sensors.profile_types import InertialFacts, Profile
 from share.types import F32, F64, I64, U8
@@ -110,7 +113,7 @@ class EmulatedDevice:
         light."""
         effects = self.effects
         since = np.asarray(true_ns) - self._origin_ns
-        return exposures.lamp_light(
+        return imager.lamp_light(
             (*self._room_seed, _LAMP_STREAM), since, effects.lamp_every_s, effects.lamp_stops
         )
 
@@ -123,7 +126,7 @@ class EmulatedDevice:
         scene_brightness = np.asarray(brightness, np.float64) * light * self._imagers[0].mean_response
         shortest, longest = device.exposure_ms
         longest = min(longest, _MAX_EXPOSURE_SHARE * 1000 / self.profile.rate_hz)
-        time, gain = exposures.auto_exposure(
+        time, gain = imager.auto_exposure(
             scene_brightness, model, reference, (shortest, longest), device.gain
         )
         return ExposureSeries(time, gain, light)
@@ -131,7 +134,7 @@ class EmulatedDevice:
     def blur_offsets(self, shot: Exposure, pixels_of_motion: float) -> F64:
         """Return times (S,) s, relative to a picture's, at which to draw it; pixels_of_motion: largest image
         motion during the exposure."""
-        return exposures.blur_offsets(shot.exposure_ms, pixels_of_motion if self.effects.blur else 0.0)
+        return imager.blur_offsets(shot.exposure_ms, pixels_of_motion if self.effects.blur else 0.0)
 
     def develop_image(self, radiance: F32, frame: int, camera: int, shot: Exposure | None = None) -> U8:
         """Convert radiance (H, W) float32 of camera 0 or 1 to gray (H, W) uint8. frame: its

@@ -1,8 +1,9 @@
 """A user's own room from a glTF 2.0 file (.gltf or .glb): y up and metres, as the format says.
 
-All nodes belong to the shell, so nothing is removed for paths. Colours become albedo: base-colour textures
-and factors as linear luminance (Rec. 709); vertex colours in 16 steps, one a triangle. Lamps are added under
-the ceiling on a grid, because few files have any.
+All nodes belong to the shell, so nothing is removed for paths; triangles are turned to face the room, since
+many models are boxes inside out. Colours become albedo: base-colour textures and factors as linear luminance
+(Rec. 709); vertex colours in 16 steps, one a triangle. Lamps are added under the ceiling on a grid, because
+few files have any.
 """
 
 from __future__ import annotations
@@ -16,15 +17,14 @@ import numpy as np
 
 from share.errors import DataError, UsageError, install_hint
 from share.lab.emulate.types import Mesh
-from share.lab.emulate.world.facing import face_inwards
+from share.lab.emulate.world.build import MAX_ALBEDO, MIN_ALBEDO
 from share.lab.emulate.world.gltf_file import MAX_TRIANGLES, read_gltf
 from share.lab.emulate.world.layout import Layout, Light, Piece
 from share.lab.emulate.world.materials import GivenMaterial
 from share.lab.emulate.world.mesh import Shape, concat_shapes
 from share.lab.emulate.world.noise import PICTURE_TEXELS
-from share.lab.emulate.world.pictures import MAX_ALBEDO, MIN_ALBEDO
 from share.lab.emulate.world.ray_casting import RayCaster
-from share.types import F32, F64, U8
+from share.types import F32, F64, I64, U8
 
 MAX_PICTURES = 400
 MIN_EXTENT_M, MAX_EXTENT_M = 1.0, 200.0  # m, along any axis
@@ -48,7 +48,7 @@ def load_gltf(path: Path) -> Layout:
     except Exception as error:  # trimesh and its image decoders raise any type
         lines = str(error).splitlines() or [type(error).__name__]
         raise DataError(f"{path}: not a readable glTF 2.0 file: {lines[0]:.200}") from None
-    low, high = concat_shapes([p.shape for p in pieces]).bounding_box
+    low, high = concat_shapes(*[p.shape for p in pieces]).bounding_box
     _check_size(path, pieces, high - low)
     T_room_file = np.eye(4)
     T_room_file[:3, 3] = -low
@@ -66,8 +66,8 @@ def _read_scene(path: Path) -> Any:
         raise UsageError(f"a glTF room: {install_hint('trimesh', 'emulate')}") from None
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise UsageError(f"{path}: expected a glTF file (.gltf or .glb)")
-    file = read_gltf(path)
-    return trimesh.load_scene(BytesIO(file.data), path.suffix[1:].lower(), resolver=file.files)
+    data, files = read_gltf(path)
+    return trimesh.load_scene(BytesIO(data), path.suffix[1:].lower(), resolver=files)
 
 
 def _room_pieces(scene: Any, path: Path) -> list[Piece]:
@@ -190,7 +190,7 @@ def _check_size(path: Path, pieces: list[Piece], extent: F64) -> None:
 
 def _ceiling_lamps(shell: tuple[Piece, ...], extent: F64) -> tuple[Light, ...]:
     """Return panels 0.25 m under whatever is above the middle of the room's height, on a grid."""
-    scene = RayCaster(concat_shapes([p.shape for p in shell]).mesh.triangles)
+    scene = RayCaster(concat_shapes(*[p.shape for p in shell]).mesh.triangles)
     nx, ny = (max(1, round(float(e) / _LAMP_PITCH)) for e in extent[:2])
     x, y = np.meshgrid((np.arange(nx) + 0.5) / nx * extent[0], (np.arange(ny) + 0.5) / ny * extent[1])
     start = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, extent[2] / 2)]).astype(np.float32)
@@ -202,3 +202,54 @@ def _ceiling_lamps(shell: tuple[Piece, ...], extent: F64) -> tuple[Light, ...]:
         Light((float(a), float(b), float(h)), size=(0.6, 0.6))
         for (a, b, _), h in zip(start, heights, strict=True)
     )
+
+
+# Triangles face the room.
+
+_RAYS = 256  # from each place
+_MAX_PLACES = 400
+
+
+def face_inwards(meshes: list[Mesh], extent: F64) -> list[Mesh]:
+    """Return the meshes of a room (from the origin to `extent` (3,) m) with separate triangles, flipped where
+    more rays from places all over the room meet their back than their front."""
+    triangles = np.concatenate([m.triangles for m in meshes])
+    normals = np.concatenate([m.normals[m.faces[:, 0]] for m in meshes])
+    wrong = _front_hits(triangles, normals, extent) < 0
+    ends = np.cumsum([len(m.faces) for m in meshes])[:-1]
+    return [_flip_triangles(m, w) for m, w in zip(meshes, np.split(wrong, ends), strict=True)]
+
+
+def _front_hits(triangles: F32, normals: F32, extent: F64) -> I64:
+    """Return the rays that meet the front of each triangle (F,) less those that meet its back."""
+    scene, directions = RayCaster(triangles), _sphere_directions(_RAYS)
+    score = np.zeros(len(triangles), np.int64)
+    for place in _grid_places(extent):
+        hit, _ = scene.first_hits(np.tile(place, (_RAYS, 1)), directions)
+        front = np.where((normals[hit] * directions).sum(1) < 0, 1, -1)
+        np.add.at(score, hit[hit >= 0], front[hit >= 0])
+    return score
+
+
+def _grid_places(extent: F64) -> F32:
+    """Return a grid (N, 3) m over the room, a metre apart or more."""
+    pitch = max(1.0, float(np.cbrt(extent.prod() / _MAX_PLACES)))
+    axes = [(np.arange(n) + 0.5) / n * e for e, n in ((e, max(2, round(e / pitch))) for e in extent.tolist())]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+    return grid.astype(np.float32)
+
+
+def _sphere_directions(count: int) -> F32:
+    """Return directions (count, 3) evenly over the sphere: the Fibonacci lattice."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1).astype(np.float32)
+
+
+def _flip_triangles(mesh: Mesh, wrong: np.ndarray) -> Mesh:
+    """Flip the triangles `wrong` (F,)."""
+    faces, normals = mesh.faces.copy(), mesh.normals.copy()
+    normals[faces[wrong]] *= -1
+    faces[wrong] = faces[wrong][:, ::-1]
+    return replace(mesh, faces=faces, normals=normals)

@@ -9,8 +9,7 @@ from __future__ import annotations
 import base64
 import binascii
 import struct
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -36,16 +35,9 @@ _STRIP, _TRIANGLES = 5, 4
 _IGNORED_TYPE = "image/ktx2"  # trimesh ignores it
 
 
-@dataclass(frozen=True, eq=False)
-class GltfFile:
-    """data: the file; files: the files that it names, by name."""
-
-    data: bytes
-    files: Mapping[str, bytes]
-
-
-def read_gltf(path: Path) -> GltfFile:
-    """Read a glTF file. Raises DataError that says what is wrong or too large."""
+def read_gltf(path: Path) -> tuple[bytes, dict[str, bytes]]:
+    """Return a glTF file and, by name, the files that it names. Raises DataError that says what is wrong or
+    too large."""
     try:
         data = read_bytes(path, _MAX_BYTES)
         text, binary = _chunks(data) if path.suffix.lower() == ".glb" else (data, b"")
@@ -56,7 +48,7 @@ def read_gltf(path: Path) -> GltfFile:
             raise ValueError("its description is not an object")
         document = _GltfDocument(path, tree, binary)
         document.check()
-        return GltfFile(data, document.files)
+        return data, document.files
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}: {error.filename}") from None
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, struct.error) as error:

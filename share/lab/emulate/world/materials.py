@@ -41,7 +41,6 @@ MATERIAL_KINDS: dict[str, MaterialKind] = {
     "screed": MaterialKind(110, 3.0),  # worn concrete floor
     "tiles": MaterialKind(130, 2.0),
     "planks": MaterialKind(105, 2.0),
-    "asphalt": MaterialKind(80, 2.0),
     "carpet": MaterialKind(90, 2.0),
     # objects
     "wood": MaterialKind(125, 1.0),
@@ -50,9 +49,7 @@ MATERIAL_KINDS: dict[str, MaterialKind] = {
     "steel": MaterialKind(120, 1.2, gray_sigma=25),  # painted steel, scratched
     "lacquer": MaterialKind(130, 2.0, gray_sigma=25),  # a vehicle's body: even, faint dust
     "galvanised": MaterialKind(150, 0.8),  # spangled zinc
-    "perforated": MaterialKind(125, 0.6),  # board with rows of holes
     "grating": MaterialKind(70, 0.6),
-    "tarpaulin": MaterialKind(110, 1.6, gray_sigma=25),
     "fabric": MaterialKind(90, 0.8, gray_sigma=25),
     "rubber": MaterialKind(35, 0.8, gray_sigma=5),
     "hose": MaterialKind(150, 0.5, gray_sigma=20),  # woven fire hose
@@ -86,8 +83,8 @@ class Material:
     """One picture, different for every variant and every seed of the room.
 
     kind: a key of `MATERIAL_KINDS`. gray: mean albedo 0..255 instead of the kind's. contrast: multiplies the
-    deviation from the mean. metres: extent of one picture instead of the kind's (surfaces only). text: of a
-    `sign`; random letters if empty. Raises ValueError for an unknown kind.
+    deviation from the mean. metres: extent of one picture instead of the kind's (surfaces only). Raises
+    ValueError for an unknown kind.
     """
 
     kind: str
@@ -95,7 +92,6 @@ class Material:
     gray: float | None = None
     contrast: float = 1.0
     metres: float | None = None
-    text: str = ""
 
     def __post_init__(self) -> None:
         if self.kind not in MATERIAL_KINDS:

@@ -60,7 +60,7 @@ def transform_mesh(mesh: Mesh, T: F64) -> Mesh:
     )
 
 
-def concat_shapes(shapes: Sequence[Shape]) -> Shape:
+def concat_shapes(*shapes: Shape) -> Shape:
     """Return one shape of all; equal materials are shared. Raises ValueError for none."""
     materials = tuple(dict.fromkeys(m for shape in shapes for m in shape.materials))
     number = {m: i for i, m in enumerate(materials)}
@@ -146,7 +146,7 @@ def box(low: ArrayLike, high: ArrayLike, skins: Skins, rng: Rng | None = None, c
         "top": (lo + z, x, y),
     }
     faces_found = {side: _side_material(skins, side) for side in SIDES}
-    return concat_shapes([quad(*faces[side], skin, rng, cell) for side, skin in faces_found.items() if skin])
+    return concat_shapes(*[quad(*faces[side], skin, rng, cell) for side, skin in faces_found.items() if skin])
 
 
 def prism(
@@ -163,7 +163,7 @@ def prism(
     ]
     if caps:
         out += [polygon(top, caps, rng), polygon(bottom[::-1], caps, rng)]
-    return concat_shapes(out)
+    return concat_shapes(*out)
 
 
 def cylinder(
@@ -194,7 +194,7 @@ def cylinder(
     if caps:
         out += [polygon(high, caps, rng)] if top != 0 else []
         out += [polygon(low[::-1], caps, rng)]
-    return concat_shapes(out).transformed(_axis_transform(axis, centre))
+    return concat_shapes(*out).transformed(_axis_transform(axis, centre))
 
 
 def tube(path: ArrayLike, radius: float, skin: Material, sides: int = 8, rng: Rng | None = None) -> Shape:
@@ -223,7 +223,7 @@ def tube(path: ArrayLike, radius: float, skin: Material, sides: int = 8, rng: Rn
             u, v = np.array([k, k + 1, k + 1, k]) * pitch, -length[[i, i, i + 1, i + 1]]
             out.append(_planar_shape(corners, np.stack([u, v], axis=1) / extent + shift, skin))
     ends = [polygon(ring[0, ::-1], skin, rng), polygon(ring[-1], skin, rng)]
-    return concat_shapes(out + ends)
+    return concat_shapes(*out + ends)
 
 
 def panels(
@@ -234,7 +234,7 @@ def panels(
     c, a, u = (np.asarray(v, float) for v in (corner, along, up))
     columns, rows = (max(1, round(float(np.linalg.norm(v)) / pitch)) for v in (a, u))
     return concat_shapes(
-        [
+        *[
             quad(
                 c + a * i / columns + u * j / rows,
                 a / columns,

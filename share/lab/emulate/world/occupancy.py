@@ -7,8 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from share.lab.emulate.world.layout import Layout
-from share.lab.emulate.world.proximity import winding_numbers
+from share.lab.emulate.world.layout import Layout, winding_numbers
 from share.types import F32, F64
 
 STEP_M = 0.05

@@ -11,7 +11,7 @@ from share.lab.emulate.world.noise import cloud
 from share.types import U8
 
 Rng = np.random.Generator
-Print = Callable[[Rng, int, str], U8]
+Print = Callable[[Rng, int], U8]
 
 _LETTERS = list("ABCDEFGHKLMNPRSTUVXYZ2345789")
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX)
@@ -51,7 +51,7 @@ def _text_lines(rng: Rng, sheet: U8, box: tuple[int, int, int, int], pitch: int,
             left = right + max(pitch // 2, 2)
 
 
-def poster(rng: Rng, n: int, text: str = "") -> U8:
+def poster(rng: Rng, n: int) -> U8:
     """Shapes, a picture and a title in a frame."""
     sheet = _background(rng, n, rng.uniform(60, 215), 16, 4)
     for _ in range(int(rng.integers(4, 9))):
@@ -71,7 +71,7 @@ def poster(rng: Rng, n: int, text: str = "") -> U8:
     _write_text(
         rng,
         sheet,
-        text or _random_text(rng, int(rng.integers(4, 9))),
+        _random_text(rng, int(rng.integers(4, 9))),
         (n // 10, n // 14, 4 * n // 5, n // 6),
         ink,
     )
@@ -80,11 +80,11 @@ def poster(rng: Rng, n: int, text: str = "") -> U8:
     return sheet
 
 
-def notice(rng: Rng, n: int, text: str = "") -> U8:
+def notice(rng: Rng, n: int) -> U8:
     """A sheet of paper: a heading, lines of text, perhaps a table."""
     sheet = _background(rng, n, rng.uniform(185, 225), 5, 1.5)
     ink = float(rng.uniform(25, 70))
-    _write_text(rng, sheet, text or _random_text(rng, 7), (n // 8, n // 12, 3 * n // 4, n // 8), ink)
+    _write_text(rng, sheet, _random_text(rng, 7), (n // 8, n // 12, 3 * n // 4, n // 8), ink)
     _text_lines(rng, sheet, (n // 8, n // 4, 3 * n // 4, n // 4), max(n // 36, 4), ink + 30)
     if rng.random() < 0.5:
         for t in np.linspace(0.58, 0.9, 5):
@@ -96,13 +96,13 @@ def notice(rng: Rng, n: int, text: str = "") -> U8:
     return sheet
 
 
-def sign(rng: Rng, n: int, text: str = "") -> U8:
+def sign(rng: Rng, n: int) -> U8:
     """A few large letters over a band, or an arrow."""
     dark = rng.random() < 0.5
     ground, ink = (rng.uniform(35, 90), 225.0) if dark else (rng.uniform(170, 220), 30.0)
     sheet = _background(rng, n, ground, 4, 1)
-    words = text or _random_text(rng, int(rng.integers(1, 4)))
-    if rng.random() < 0.4 and not text:
+    words = _random_text(rng, int(rng.integers(1, 4)))
+    if rng.random() < 0.4:
         tip = (n // 6, n // 3) if rng.random() < 0.5 else (5 * n // 6, n // 3)
         cv2.arrowedLine(sheet, (n - tip[0], tip[1]), tip, ink, n // 12, cv2.LINE_AA, 0, 0.35)
         _write_text(rng, sheet, words, (n // 8, n // 2, 3 * n // 4, 3 * n // 8), ink)
@@ -113,7 +113,7 @@ def sign(rng: Rng, n: int, text: str = "") -> U8:
     return sheet
 
 
-def label(rng: Rng, n: int, text: str = "") -> U8:
+def label(rng: Rng, n: int) -> U8:
     """A shipping label: bars, a number, lines."""
     sheet = _background(rng, n, rng.uniform(190, 230), 3, 1)
     x = n // 10
@@ -121,12 +121,12 @@ def label(rng: Rng, n: int, text: str = "") -> U8:
         wide = int(rng.integers(1, max(n // 24, 3)))
         cv2.rectangle(sheet, (x, n // 2), (x + wide - 1, 4 * n // 5), 35.0, -1)
         x += wide + int(rng.integers(2, max(n // 20, 4)))
-    _write_text(rng, sheet, text or _random_text(rng, 6), (n // 10, n // 12, 4 * n // 5, n // 5), 30.0)
+    _write_text(rng, sheet, _random_text(rng, 6), (n // 10, n // 12, 4 * n // 5, n // 5), 30.0)
     _text_lines(rng, sheet, (n // 10, n // 3, 3 * n // 5, n // 8), max(n // 20, 4), 60.0)
     return sheet
 
 
-def board(rng: Rng, n: int, text: str = "") -> U8:
+def board(rng: Rng, n: int) -> U8:
     """A pin board with sheets that overlap."""
     sheet = _background(rng, n, rng.uniform(95, 135), 6, 8)
     for _ in range(int(rng.integers(9, 17))):
@@ -162,17 +162,17 @@ def _shelf_rows(
     return _soften(sheet)
 
 
-def goods(rng: Rng, n: int, text: str = "") -> U8:
+def goods(rng: Rng, n: int) -> U8:
     """Small objects on a shelf, from the front."""
     return _shelf_rows(rng, n, int(rng.integers(2, 4)), 0.85, (0.08, 0.25), 0.85)
 
 
-def books(rng: Rng, n: int, text: str = "") -> U8:
+def books(rng: Rng, n: int) -> U8:
     """Spines of files and books."""
     return _shelf_rows(rng, n, 2, 0.9, (0.03, 0.09), 0.93)
 
 
-def tools(rng: Rng, n: int, text: str = "") -> U8:
+def tools(rng: Rng, n: int) -> U8:
     """A wall of hanging tools."""
     sheet = _background(rng, n, rng.uniform(130, 170), 4, 2)
     for x in range(n // 10, n, n // 7):
@@ -188,7 +188,7 @@ def tools(rng: Rng, n: int, text: str = "") -> U8:
     return _soften(sheet)
 
 
-def gauge(rng: Rng, n: int, text: str = "") -> U8:
+def gauge(rng: Rng, n: int) -> U8:
     """Dials, switches and lamps on a panel."""
     sheet = _background(rng, n, rng.uniform(80, 150), 4, 1)
     step = n // 4
@@ -213,7 +213,7 @@ def gauge(rng: Rng, n: int, text: str = "") -> U8:
     return sheet
 
 
-def door(rng: Rng, n: int, text: str = "") -> U8:
+def door(rng: Rng, n: int) -> U8:
     """A door leaf in its frame: handle, a plate, perhaps a pane."""
     gray = rng.uniform(90, 180)
     sheet = _background(rng, n, gray, 4, 1)
@@ -228,7 +228,7 @@ def door(rng: Rng, n: int, text: str = "") -> U8:
     return sheet
 
 
-def locker(rng: Rng, n: int, text: str = "") -> U8:
+def locker(rng: Rng, n: int) -> U8:
     """Narrow doors with slots, a lock and a number."""
     gray = rng.uniform(90, 170)
     sheet = _background(rng, n, gray, 4, 1)
@@ -241,23 +241,21 @@ def locker(rng: Rng, n: int, text: str = "") -> U8:
         cv2.circle(sheet, (x + 5 * wide // 6, n // 2), n // 64, 40.0, -1, cv2.LINE_AA)
         plate = (x + wide // 3, n // 4, wide // 3, n // 16)
         cv2.rectangle(sheet, plate[:2], (plate[0] + plate[2], plate[1] + plate[3]), 215.0, -1)
-        _write_text(rng, sheet, text or str(rng.integers(10, 99)), plate, 30.0)
+        _write_text(rng, sheet, str(rng.integers(10, 99)), plate, 30.0)
     return sheet
 
 
-def shutter(rng: Rng, n: int, text: str = "") -> U8:
+def shutter(rng: Rng, n: int) -> U8:
     """A roller door: slats, some dented, a bar at the bottom."""
     gray = rng.uniform(120, 175)
     sheet = _background(rng, n, gray, 5, 1)
     for y in range(0, n, n // 32):
         cv2.line(sheet, (0, y), (n, y), gray - rng.uniform(8, 22), 2)
     cv2.rectangle(sheet, (0, 15 * n // 16), (n, n), gray * 0.5, -1)
-    if text:
-        _write_text(rng, sheet, text, (n // 4, n // 5, n // 2, n // 3), 45.0)
     return sheet
 
 
-def window(rng: Rng, n: int, text: str = "") -> U8:
+def window(rng: Rng, n: int) -> U8:
     """Bright panes between dark bars, something vague behind."""
     sheet = _background(rng, n, rng.uniform(195, 215), 18, 1)
     for k in range(int(rng.integers(2, 4)) + 1):
@@ -268,7 +266,7 @@ def window(rng: Rng, n: int, text: str = "") -> U8:
     return sheet
 
 
-def screen(rng: Rng, n: int, text: str = "") -> U8:
+def screen(rng: Rng, n: int) -> U8:
     """A monitor: windows, lines, a curve."""
     sheet = _background(rng, n, rng.uniform(25, 60), 2, 0.5)
     x, y = rng.integers(n // 12, n // 3, 2).tolist()

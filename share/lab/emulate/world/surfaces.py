@@ -151,14 +151,6 @@ def _fibre(rng: Rng, m: float) -> F32:
     )
 
 
-def asphalt(rng: Rng, m: float) -> F32:
-    return (
-        _wear_noise(rng, m, 5, 8)
-        + _speckle(rng, m, 4)
-        + spots(rng, _mark_count(rng, m, 15), (1, 4), (-25, 35))
-    )
-
-
 def carpet(rng: Rng, m: float) -> F32:
     return to_float32(
         _wear_noise(rng, m, 4, 7) + 3 * np.sin(2 * np.pi * _phase_ramp(round(m / 0.02), 0)).astype(np.float32)
@@ -220,25 +212,10 @@ def galvanised(rng: Rng, m: float) -> F32:
     return to_float32(_wear_noise(rng, m, 4, 1.5) + soften(flakes, 0.8).astype(np.float32))
 
 
-def perforated(rng: Rng, m: float) -> F32:
-    n = round(m / 0.0375)
-    x, y = _phase_ramp(n, 1) - 0.5, _phase_ramp(n, 0) - 0.5
-    holes = np.clip((0.2 - np.hypot(x, y)) * PICTURE_TEXELS / n + 0.5, 0, 1)
-    return to_float32(_wear_noise(rng, m, 3, 1.5) - 80 * (holes - holes.mean()))
-
-
 def grating(rng: Rng, m: float) -> F32:
     n = round(m / 0.0333)
     bars = np.maximum(_phase_ramp(n, 0) < 0.25, _phase_ramp(round(n / 3), 1) < 0.1).astype(np.float32)
     return to_float32(70 * (bars - bars.mean()) + _wear_noise(rng, m, 4, 2))
-
-
-def tarpaulin(rng: Rng, m: float) -> F32:
-    folds = cloud(rng, 1.8, 2, 24)
-    weave = np.sin(2 * np.pi * _phase_ramp(round(m / 0.016), 0)) + np.sin(
-        2 * np.pi * _phase_ramp(round(m / 0.016), 1)
-    )
-    return to_float32(12 * folds - 8 * np.abs(cloud(rng, 1.8, 2, 16)) + 1.2 * weave)
 
 
 def fabric(rng: Rng, m: float) -> F32:
@@ -303,8 +280,8 @@ def lamp(rng: Rng, m: float) -> F32:
 SURFACES: dict[str, SurfacePainter] = {
     f.__name__: f
     for f in (
-        plaster, paint, brick, block, concrete, corrugated, panel, ceiling, screed, tiles, planks, asphalt,
-        carpet, wood, plywood, cardboard, steel, lacquer, galvanised, perforated, grating, tarpaulin, fabric,
+        plaster, paint, brick, block, concrete, corrugated, panel, ceiling, screed, tiles, planks, 
+        carpet, wood, plywood, cardboard, steel, lacquer, galvanised, grating, fabric,
         rubber, hose, plastic, glass, stripes, marking, foil, skin, lamp,
     )
 }  # fmt: skip

@@ -93,7 +93,7 @@ def test_a_slow_one_pauses(room):
     assert np.median(speed) < 0.3 * np.median(usual)
 
 
-def test_turned_axes_feel_the_same_motion(room):
+def test_inertial_readings_follow_turned_axes(room):
     path = exercised(room)
     R = se3.so3_exp(np.array([0.3, -1.2, 0.7]))
     t = stamps(path, 7)
@@ -103,7 +103,7 @@ def test_turned_axes_feel_the_same_motion(room):
         np.testing.assert_allclose(after, before @ R, atol=1e-9)
 
 
-def test_a_plan_has_it(room):
+def test_a_plan_contains_the_board_motion(room):
     found = plan_motions(["cal=board:vigour=0.5,seconds=10"], room, SECONDS, 4)
     (agent,) = found.agents
     assert (agent.name, agent.kind, agent.has_camera_axes) == ("cal", AgentKind.AR, True)
@@ -116,7 +116,7 @@ def test_a_plan_has_it(room):
     assert np.abs(agent.path.poses(t) - other.path.poses(t)).max() > 0.05
 
 
-def test_what_cannot_be_is_said_in_one_line(room):
+def test_an_impossible_board_motion_is_refused_in_one_line(room):
     with pytest.raises(UsageError, match="the whitewall has no calibration board; use --scene board"):
         plan_motions(["board:"], make_scene_layout("whitewall", 1), 20, 1)
     with pytest.raises(UsageError, match="too small for distance=2"):

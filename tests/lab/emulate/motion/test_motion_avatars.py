@@ -10,7 +10,7 @@ MOTIONS = {"person": person, "robot": driver, "drone": driver}
 
 
 @pytest.mark.parametrize(("look", "motion"), MOTIONS.items())
-def test_every_shape_has_a_place(look, motion):
+def test_every_part_has_a_pose(look, motion):
     path = motion()
     T = Avatar(look, path).part_poses(every(path, 10))
     assert T.shape == (len(every(path, 10)), len(avatar_shapes(look, path, (1,))), 4, 4)
@@ -42,7 +42,7 @@ def test_the_head_is_where_the_headset_is_and_limbs_hang_together():
     assert np.linalg.norm(off, axis=1).max() < 0.45  # the head is over the hips
 
 
-def test_a_recorded_body_with_other_axes_looks_the_same():
+def test_parts_do_not_depend_on_the_axes_of_the_body():
     t = np.arange(0, 10, 0.02)
     own = person()
     T = own.poses(own.start_ns + np.round(t * 1e9).astype(np.int64))
@@ -66,7 +66,7 @@ def test_a_robot_stands_on_the_floor_and_a_drone_flies():
     assert drone[:, 2, 2].min() > 0.99
 
 
-def test_a_seed_is_a_figure():
+def test_the_body_depends_on_the_seed_alone():
     one, same, other = (avatar_shapes("person", person(), (k,))[1] for k in (1, 1, 2))
     assert np.array_equal(one.mesh.uv, same.mesh.uv) and one.materials == same.materials
     assert one.materials != other.materials

@@ -5,7 +5,7 @@ from helpers.motion_sim import every, person
 from share.errors import UsageError
 from share.lab.emulate.motion.motion_plan import plan_motions
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.emulate.world.scenes.registry import make_scene_layout
+from share.lab.emulate.world.scenes import make_scene_layout
 from share.recordings.trajectory import Trajectory, format_tum
 from share.types import AgentKind
 
@@ -51,23 +51,22 @@ def test_a_recording_two_people_and_a_robot_in_a_warehouse(warehouse, recorded):
         (["a=walk:", "a=robot:"], "two agents are named 'a'"),
     ],
 )
-def test_what_cannot_be_planned(warehouse, specs, says):
+def test_an_impossible_plan_is_refused(warehouse, specs, says):
     with pytest.raises(UsageError, match=says):
         plan_motions(specs, warehouse, 10.0, 1)
 
 
-def test_bad_lengths_and_files(warehouse, tmp_path):
-    with pytest.raises(UsageError, match="3 to 3600"):
-        plan_motions(["walk:"], warehouse, float("nan"), 1)
+def test_a_missing_file_is_refused(warehouse, tmp_path):
     with pytest.raises(UsageError, match="no such file"):
         plan_motions([f"tum:{tmp_path}/none.tum"], warehouse, 10.0, 1)
 
 
+@pytest.mark.long
 def test_real_motion_is_placed(warehouse, shared_data):
     folder = shared_data / "motion" / "tumvi" / "room1"
     found = plan_motions([f"ann=tumvi:{folder},start=3", "robot:"], warehouse, 6.0, 1)
     ann = found.agents[0]
-    assert ann.path.recorded is not None and ann.T_body_cam0 is not None and len(ann.images_ns) > 100
+    assert ann.path.recorded is not None and ann.T_body_cam0 is not None
     xyz = ann.path.poses(every(ann.path, 20))[:, :3, 3]
     assert Occupancy.from_layout(found.layout).clearance(xyz).min() > 0.15
     assert 1.3 < xyz[:, 2].mean() < 1.9

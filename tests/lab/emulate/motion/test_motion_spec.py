@@ -36,7 +36,7 @@ def test_specs_are_read(text, name, spec):
         ("robot:speed=nan", "expected a number"),
     ],
 )
-def test_what_is_wrong_is_named(text, says):
+def test_an_error_names_the_wrong_part(text, says):
     with pytest.raises(UsageError) as caught:
         parse_motion(text)
     assert says in str(caught.value) and "\n" not in str(caught.value)

@@ -4,7 +4,7 @@ from helpers.motion_sim import every, person
 
 from share.errors import DataError
 from share.geometry import se3
-from share.lab.emulate.motion.tum_path import fit_spline, read_tum_path
+from share.lab.emulate.motion.spline import fit_spline, read_tum_path
 from share.recordings.trajectory import Trajectory, format_tum
 
 
@@ -61,14 +61,14 @@ def test_a_part_is_taken(tmp_path, samples):
         (lambda s, T: (s, np.tile(T[:1], (len(T), 1, 1))), "does not move"),
     ],
 )
-def test_what_is_no_motion_is_refused_in_a_line(tmp_path, samples, spoil, says):
+def test_invalid_motion_is_refused_in_one_line(tmp_path, samples, spoil, says):
     with pytest.raises(DataError) as caught:
         read_tum_path(write(tmp_path, *spoil(*samples)))
     assert says in str(caught.value) and "path.tum" in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("bad", ["1.0 nan 0 0 0 0 0 1", "1.0 0 0 0 0 0 0 0"])
-def test_poses_that_are_none_are_refused(tmp_path, bad):
+def test_invalid_poses_are_refused(tmp_path, bad):
     file = tmp_path / "bad.tum"
     file.write_text("0.5 0 0 0 0 0 0 1\n" + bad + "\n")
     with pytest.raises(DataError, match=r"bad\.tum"):

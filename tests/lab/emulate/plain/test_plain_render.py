@@ -10,6 +10,8 @@ from share.geometry.se3 import from_rt, inverse, transform
 from share.lab.emulate.plain.render import PlainRoomRenderer
 from share.lab.emulate.plain.room import make_room
 
+pytestmark = pytest.mark.long
+
 SECONDS = np.arange(0, 20, 0.05)
 
 
@@ -107,7 +109,7 @@ def test_tracks_follow_the_exact_projection(renderer, who):
     assert np.percentile(errors, 90) < 0.35
 
 
-def test_statistics_are_near_a_real_images():
+def test_corner_statistics_are_near_those_of_a_real_image():
     """A real EuRoC image: about 750 FAST corners, in 80 % of 8 x 8 cells."""
     corners, cells = [], []
     for who in MOTIONS:

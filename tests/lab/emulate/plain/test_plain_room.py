@@ -1,9 +1,12 @@
 import numpy as np
+import pytest
 
 from share.lab.emulate.plain.room import make_room
 
+pytestmark = pytest.mark.long
 
-def test_a_seed_is_a_room():
+
+def test_the_room_depends_on_the_seed_alone():
     one, same, other = make_room(3), make_room(3), make_room(4)
     assert np.array_equal(one.atlas, same.atlas) and np.array_equal(one.boxes, same.boxes)
     assert one.boxes.shape != other.boxes.shape or not np.allclose(one.boxes, other.boxes)
@@ -11,7 +14,7 @@ def test_a_seed_is_a_room():
     assert (one.atlas[:h] != other.atlas[:h]).mean() > 0.5
 
 
-def test_furniture_stands_in_the_room_and_leaves_a_way_round():
+def test_furniture_stands_in_the_room_and_leaves_free_floor():
     for seed in range(3):
         boxes = make_room(seed, (8.0, 6.0, 3.0)).boxes
         assert len(boxes) >= 6

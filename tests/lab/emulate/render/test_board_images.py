@@ -16,7 +16,7 @@ from share.lab.emulate.world.build import build_room
 from share.lab.emulate.world.scenes import make_scene_layout
 from share.sensors.profile import load_profile
 
-pytestmark = needs_opengl
+pytestmark = [pytest.mark.long, needs_opengl]
 FRAMES = 10
 CLEAR_M = 0.009  # around a corner there is nothing but the corner
 

@@ -1,18 +1,19 @@
-"""What a fisheye lens is shown: points where they project, also to the sides and behind, and their depth."""
+"""Fisheye images: projected points, also to the sides and behind, and their depth."""
 
 import numpy as np
+import pytest
 from helpers.rendered import checker as checkered
 from helpers.rendered import furnished, looking, needs_opengl, plain
-from test_gl_place import corners_of_walls, saddles
+from test_gl_geometry import corners_of_walls, saddles
 
 from share.geometry.camera import Camera
 from share.geometry.se3 import inverse, transform
-from share.lab.emulate.render.fisheye import fisheye_faces
 from share.lab.emulate.render.gl import GlRenderer
-from share.lab.emulate.sensor.photometry import vignetting_gain
+from share.lab.emulate.render.lens import fisheye_faces
+from share.lab.emulate.sensor.imager import vignetting_gain
 from share.lab.emulate.types import SceneInstant
 
-pytestmark = needs_opengl
+pytestmark = [pytest.mark.long, needs_opengl]
 LENS = (0.00348, 0.000715, -0.00205, 0.000203)
 FISHEYE = Camera(512, 512, 190.98, 190.97, 254.93, 256.90, LENS, "equidistant")
 WIDE = Camera(400, 300, 120.0, 120.0, 199.5, 149.5)  # no lens: what the fisheye's middle has to agree with
@@ -58,6 +59,6 @@ def test_every_pixel_is_of_one_face():
     ).any()  # beyond what the lens shows
 
 
-def test_the_corners_get_the_light_that_is_told():
+def test_vignetting_at_the_corners_is_as_configured():
     light = vignetting_gain(FISHEYE, 0.5)
     assert light[257, 255] > 0.999 and abs(light.min() - 0.5) < 0.01

@@ -1,4 +1,4 @@
-"""Machines that cannot draw: libraries that are really not there, in a process of its own."""
+"""Machines that cannot draw: libraries are missing, in a process of its own."""
 
 import os
 import subprocess
@@ -21,7 +21,7 @@ def answer(code, **environment):
 
 
 @needs_opengl
-def test_nothing_is_missing_where_all_is_there():
+def test_a_machine_that_can_draw_has_nothing_missing():
     assert answer(ASK) == ("None", "")
 
 
@@ -35,7 +35,7 @@ def test_a_missing_library_names_its_package(tmp_path, library, package):
     said, stderr = answer(ASK, LD_LIBRARY_PATH=str(tmp_path))
     assert said.endswith(f"apt install {package}") and "\n" not in said and not stderr
     _, stderr = answer(DRAW, LD_LIBRARY_PATH=str(tmp_path))
-    assert stderr.splitlines()[-1].startswith("share.lab.emulate.render.errors.RenderError: ")
+    assert stderr.splitlines()[-1].startswith("share.lab.emulate.render.context.RenderError: ")
 
 
 @needs_opengl
@@ -58,7 +58,7 @@ def test_a_missing_moderngl_names_the_extra():
 
 
 @needs_opengl
-def test_no_thread_draws_but_ours():
+def test_the_driver_draws_in_the_calling_thread():
     names = "[open(f'/proc/self/task/{t}/comm').read() for t in os.listdir('/proc/self/task')]"
     said, _ = answer(f"import os; {DRAW}; print({names})", LP_NUM_THREADS="7")
     assert "llvmpipe-" not in said.splitlines()[-1]

@@ -114,7 +114,7 @@ def test_a_perfect_imu_integrated_from_the_true_start_ends_at_the_true_pose(name
     assert metres < 0.001 and degrees < 0.01
 
 
-def test_a_real_imu_does_not():
+def test_a_noisy_imu_integrated_from_the_true_start_drifts():
     path = Loop()
     batch = EmulatedDevice(load_profile("d435i"), Effects(), (3,), START).imu_streams(path).to_batch()
     metres, degrees = integrate(batch, path)

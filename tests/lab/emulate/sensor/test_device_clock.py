@@ -5,7 +5,9 @@ from share.lab.emulate.sensor.clock import (
     DeviceClock,
     SampleStream,
     dropped_mask,
+    normal,
     stamp_jitter_ns,
+    uniform,
     unwrapped_stamps,
 )
 
@@ -51,3 +53,18 @@ def test_jitter_has_its_sigma_and_never_lets_stamps_overtake():
     assert abs(error.std() / 1e6 - 1) < 0.03
     wild = stamp_jitter_ns((1,), np.arange(50_000), 20e6, 30.0)
     assert (np.diff(np.arange(50_000) * 1e9 / 30 + wild) > 0).all()
+
+
+def test_a_random_number_depends_on_its_index_alone():
+    whole = uniform((7,), np.arange(10_000))
+    some = np.array([9_999, 3, 5_000, 3])
+    assert np.array_equal(uniform((7,), some), whole[some])
+    assert np.array_equal(normal((7,), some), normal((7,), np.arange(10_000))[some])
+
+
+def test_random_numbers_are_uniform_or_normal_and_depend_on_the_seed():
+    u, n = uniform((1, 2), np.arange(100_000)), normal((1, 2), np.arange(100_000))
+    assert u.min() >= 0 and u.max() < 1 and abs(u.mean() - 0.5) < 0.005
+    assert abs(n.mean()) < 0.01 and abs(n.std() - 1) < 0.01
+    assert abs(np.corrcoef(n[:-1], n[1:])[0, 1]) < 0.01
+    assert not np.isin(uniform((1, 3), np.arange(1000)), u[:1000]).any()

@@ -26,7 +26,7 @@ def test_words_change_single_effects():
         ("drop_burst=0.5", "must lie in 1 .. 20"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(word: str, says: str):
+def test_an_invalid_effect_is_refused_in_one_line(word: str, says: str):
     with pytest.raises(UsageError, match=r"^effect ") as refused:
         parse_effects([word])
     assert says in str(refused.value) and "\n" not in str(refused.value)

@@ -19,6 +19,7 @@ SENSORS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [
@@ -46,6 +47,7 @@ def test_allan_deviation_of_rest_is_that_of_the_profile(name: str):
     assert combine_axes(axes, "walk").value == pytest.approx(sensor.walk, rel=0.1)
 
 
+@pytest.mark.long
 def test_digits_add_what_theory_says_to_a_coarse_accelerometer():
     """A 12-bit digit is of the noise's size: step^2 / 12 comes on top."""
     sensor = D435I.accel

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from share.lab.emulate.sensor.exposure import auto_exposure, blur_offsets, lamp_light
+from share.lab.emulate.sensor.imager import auto_exposure, blur_offsets, lamp_light
 from share.sensors.profile_types import ExposureModel
 
 MODEL = ExposureModel(target=100, delay_frames=2, damping=0.5, step=0.03, longest_ms=16)
@@ -38,11 +38,11 @@ def test_darkness_lengthens_the_exposure_to_its_limit_then_raises_the_gain_to_it
     assert time[0] == pytest.approx(0.01) and gain[0] == 1
 
 
-def test_exposure_of_no_pictures():
+def test_an_empty_series_has_no_exposures():
     assert [len(x) for x in expose(np.zeros(0))] == [0, 0, 0]
 
 
-def test_lamps_switch_as_often_as_asked_whatever_is_asked_about():
+def test_lamps_switch_at_their_mean_interval_in_any_span():
     since = np.arange(0, 600 * 10**9, 10**8)
     light = lamp_light((4,), since, 5.0, 1.5)
     switchings = (np.diff(light) != 0).sum()

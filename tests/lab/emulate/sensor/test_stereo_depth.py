@@ -1,4 +1,4 @@
-"""The model against real block matching of noisy pairs, and what it does at edges and limits."""
+"""The depth model against block matching of noisy pairs, at edges and at limits."""
 
 import time
 
@@ -9,7 +9,7 @@ import pytest
 from share.errors import ConfigError
 from share.lab.emulate.sensor.device import EmulatedDevice
 from share.lab.emulate.sensor.effects import parse_effects
-from share.lab.emulate.sensor.exposure import Exposure
+from share.lab.emulate.sensor.imager import Exposure
 from share.sensors.profile import load_profile
 
 PROFILE = load_profile("d435i")

@@ -1,11 +1,11 @@
-"""Vibration and knocks: as large as asked for, the same at the same times, and nobody is carried off."""
+"""Vibration and knocks: strength, determinism, no net motion."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from share.lab.emulate.sensor.vibration import knock_acceleration, vibration_acceleration
+from share.lab.emulate.sensor.imu import knock_acceleration, vibration_acceleration
 
 FAST = np.arange(0.0, 20.0, 1e-4)
 
@@ -37,7 +37,7 @@ def test_a_shorter_series_is_the_head_of_a_longer_one(made):
         (lambda t: knock_acceleration(t, 8.0, 0.5, (7,)), 0.08, 2e-3),
     ],
 )
-def test_nobody_is_carried_off(made, speed, way):
+def test_vibration_leaves_position_and_velocity_unchanged(made, speed, way):
     most_speed, most_way = drift(made(FAST), 1e-4)
     assert most_speed < speed
     assert most_way < way

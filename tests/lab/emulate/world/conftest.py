@@ -1,4 +1,4 @@
-"""What the tests of rooms share."""
+"""Fixtures of the tests of rooms."""
 
 import pytest
 from helpers.smallroom import small_room

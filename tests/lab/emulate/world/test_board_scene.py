@@ -5,8 +5,10 @@ import pytest
 
 from share.geometry import se3
 from share.lab.calibrate.target import AprilGrid, CharucoBoard
-from share.lab.emulate.world.furniture.board import BLACK, WHITE, printed_sheet
 from share.lab.emulate.world.scenes import make_scene_layout
+from share.lab.emulate.world.scenes.board import BLACK, WHITE, printed_sheet
+
+pytestmark = pytest.mark.long
 
 TARGETS = [AprilGrid(), AprilGrid(5, 7, 0.08, 0.28), CharucoBoard()]
 
@@ -64,7 +66,7 @@ def test_the_board_stands_where_the_layout_says(name, target):
     assert room.target.T_world_target[2, 1] > 0.9  # and stands upright
 
 
-def test_another_seed_places_it_otherwise():
+def test_the_pose_of_the_board_depends_on_the_seed():
     poses = [make_scene_layout("board", seed).target.T_world_target for seed in (1, 1, 2)]
     np.testing.assert_array_equal(poses[0], poses[1])
     assert np.degrees(se3.rotation_angle(se3.inverse(poses[0]) @ poses[2])) > 0.5

@@ -1,4 +1,4 @@
-"""glTF files made to hurt: each is refused in one line, soon, in little memory."""
+"""Malicious glTF files are refused in one line, soon, in little memory."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def glb(folder: Path, made: Any, data: bytes = DATA, length: int | None = None) 
     return folder / "room.glb"
 
 
-def test_the_room_itself_is_one(tmp_path):
+def test_the_unchanged_room_is_read(tmp_path):
     assert load_gltf(write(tmp_path, tree())).size == pytest.approx((4, 5, 3))
     inner = tree()
     del inner["buffers"][0]["uri"]
@@ -101,8 +101,9 @@ ATTACKS = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ATTACKS)
-def test_what_asks_for_too_much(tmp_path, name):
+def test_a_file_that_is_too_large_is_refused(tmp_path, name):
     made, says = ATTACKS[name]
     with pytest.raises(DataError, match=says) as error:
         load_gltf(write(tmp_path, made))
@@ -123,7 +124,7 @@ def test_files_elsewhere_are_not_read(tmp_path, uri, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_no_file(tmp_path, kind):
+def test_a_path_that_is_no_regular_file_is_refused(tmp_path, kind):
     path = write(tmp_path, tree())
     (tmp_path / "room.bin").unlink()
     special(tmp_path / "room.bin", kind)
@@ -154,7 +155,7 @@ def _png(width: int, height: int) -> bytes:
     ],
     ids=["huge", "empty", "GIF", "EPS", "cut short"],
 )
-def test_pictures(tmp_path, data, says):
+def test_invalid_pictures_are_refused(tmp_path, data, says):
     made = tree()
     (tmp_path / "wall.png").write_bytes(data)
     made |= {"images": [{"uri": "wall.png"}], "textures": [{"source": 0}]}
@@ -168,13 +169,13 @@ def test_pictures(tmp_path, data, says):
     assert load_gltf(write(tmp_path, made))
 
 
-def test_very_many_pictures_are_too_much_together(tmp_path):
+def test_the_total_size_of_pictures_is_limited(tmp_path):
     (tmp_path / "wall.png").write_bytes(_png(8000, 8000))
     with pytest.raises(DataError, match="pixels"):
         read_gltf(write(tmp_path, tree() | {"images": [{"uri": "wall.png"}] * 10}))
 
 
 @pytest.mark.parametrize("length", [2**32 - 1, 10**6, 3])
-def test_a_chunk_that_says_that_it_is_longer(tmp_path, length):
+def test_a_chunk_with_a_wrong_length_is_refused(tmp_path, length):
     with pytest.raises(DataError, match="not a readable glTF"):
         load_gltf(glb(tmp_path, tree(), length=length))

@@ -14,6 +14,8 @@ from share.lab.emulate.world.occupancy import Occupancy
 from share.lab.emulate.world.scenes import SCENES, corridor, make_scene_layout
 from share.types import F64
 
+pytestmark = pytest.mark.long
+
 CLEARANCE = 0.45  # m
 SMALL = (9.0, 6.0, 4.0)  # the paper's room
 SEEDS = range(8)
@@ -103,7 +105,9 @@ def test_nothing_floats(name: str) -> None:
         ("whitewall", None, 0.5),
     ],
 )
-def test_one_can_walk_round(name: str, size: tuple[float, float, float] | None, least: float) -> None:
+def test_most_of_the_floor_is_walkable_and_connected(
+    name: str, size: tuple[float, float, float] | None, least: float
+) -> None:
     for seed in range(4):
         share, connected = free_share(make_scene_layout(name, seed, size) if size else rooms(name)[seed])
         assert share >= least, seed
@@ -112,7 +116,7 @@ def test_one_can_walk_round(name: str, size: tuple[float, float, float] | None, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["warehouse", "firestation"])
-def test_one_can_walk_round_in_every_small_room(name: str) -> None:
+def test_most_of_the_floor_is_walkable_in_every_small_room(name: str) -> None:
     for seed in range(60):
         share, connected = free_share(make_scene_layout(name, seed, SMALL))
         assert share >= 0.35, seed
@@ -130,7 +134,7 @@ def test_a_large_warehouse_holds_more_things_not_larger_ones() -> None:
 
 
 @pytest.mark.parametrize("size", [None, (9.0, 6.0, 2.7), (30.0, 12.0, 3.5)])
-def test_the_corridors_are_twins(size: tuple[float, float, float] | None) -> None:
+def test_the_two_corridors_look_alike(size: tuple[float, float, float] | None) -> None:
     """Every thing in the north corridor has its like in the south one, but for a few small ones."""
     for seed in range(4):
         room = make_scene_layout("corridor-twins", seed, size) if size else rooms("corridor-twins")[seed]
@@ -166,7 +170,7 @@ def min_distance(box: F64, others: list[F64]) -> float:
     return min(float(np.abs(box - b).max()) for b in others)
 
 
-def test_there_is_much_less_in_a_fire_station_and_next_to_nothing_between_white_walls() -> None:
+def test_a_fire_station_and_white_walls_have_far_fewer_pieces() -> None:
     def density(name: str) -> float:
         per_room = [len(r.pieces) / (r.size[0] * r.size[1]) for r in rooms(name)]
         return float(np.median(per_room))
@@ -185,24 +189,24 @@ def test_there_is_much_less_in_a_fire_station_and_next_to_nothing_between_white_
         ("whitewall", (6, 5, -2.7)),
     ],
 )
-def test_a_size_that_no_such_room_can_have(name: str, size: tuple[float, float, float]) -> None:
+def test_an_unsupported_size_is_refused(name: str, size: tuple[float, float, float]) -> None:
     with pytest.raises(UsageError, match=rf"a {name} cannot be .* m: give a size between .* m and .* m"):
         make_scene_layout(name, 0, size)
 
 
-def test_an_unknown_scene() -> None:
+def test_an_unknown_scene_is_refused() -> None:
     with pytest.raises(UsageError, match="scene 'attic' is not known; known: warehouse, firestation"):
         make_scene_layout("attic", 0)
 
 
-def test_a_negative_seed() -> None:
+def test_a_negative_seed_is_refused() -> None:
     with pytest.raises(ValueError, match="seed -1"):
         make_scene_layout("whitewall", -1)
 
 
 @pytest.mark.parametrize("name", ROOMS)
 @pytest.mark.parametrize("which", ["smallest", "largest"])
-def test_the_limits_themselves_are_rooms(name: str, which: str) -> None:
+def test_the_smallest_and_largest_sizes_are_allowed(name: str, which: str) -> None:
     if (name, which) == ("warehouse", "largest"):
         pytest.skip("takes 10 s; a large warehouse is tested above")
     size = getattr(SCENES[name], which)

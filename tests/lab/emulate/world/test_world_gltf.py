@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from share.errors import DataError, UsageError
-from share.lab.emulate.world.build import build_room
+from share.lab.emulate.world.build import build_room, draw_materials
 from share.lab.emulate.world.gltf import load_gltf
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.emulate.world.pictures import draw_materials
 
 trimesh: Any = pytest.importorskip("trimesh")
 
@@ -91,7 +90,8 @@ def test_textures_are_upright(hall: Layout) -> None:
     assert mesh.uv[high, 1] == pytest.approx(0) and mesh.uv[~high, 1] == pytest.approx(1)
 
 
-def test_one_can_stand_in_it_and_it_is_lit(hall: Layout) -> None:
+@pytest.mark.long
+def test_the_room_has_free_floor_and_light(hall: Layout) -> None:
     occupancy = Occupancy.from_layout(hall)
     at = np.array([(4.0, 3.0, 1.5), (6.0, 4.0, 0.5)])
     assert occupancy.clearance(at) == pytest.approx([1.5, 0], abs=0.06)
@@ -130,7 +130,7 @@ def test_a_cut_file_is_refused(file: Path, tmp_path: Path) -> None:
         load_gltf(tmp_path / "cut.glb")
 
 
-def test_what_is_no_room_is_refused(tmp_path: Path) -> None:
+def test_a_file_without_a_room_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such file"):
         load_gltf(tmp_path / "none.glb")
     trimesh.Scene(trimesh.creation.box((0.08, 0.03, 0.06))).export(tmp_path / "tiny.glb")

@@ -1,4 +1,4 @@
-"""What is in the way of recorded paths is taken out whole; walls stay."""
+"""Obstacles to recorded paths are removed whole; walls stay."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from share.lab.emulate.world.layout import Layout, Piece
+from share.lab.emulate.world.layout import Layout, Piece, triangle_distances, winding_numbers
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import box
-from share.lab.emulate.world.proximity import triangle_distances, winding_numbers
 
 
-def test_pieces_in_the_way_go_whole_and_are_named(small_layout: Layout) -> None:
+def test_blocking_pieces_are_removed_whole_and_named(small_layout: Layout) -> None:
     over_the_table = np.array([(1.3, 0.9, 0.95), (2.5, 2.0, 1.5)])  # 0.21 m above its top
     assert small_layout.without(over_the_table, 0.2)[1] == ()
     rest, removed = small_layout.without(over_the_table, 0.22)

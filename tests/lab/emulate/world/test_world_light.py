@@ -19,6 +19,8 @@ from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import box, concat_shapes, join_meshes, panels, quad
 from share.types import F64
 
+pytestmark = pytest.mark.long
+
 BLACK = np.zeros(1, np.float32)
 NO_GLOW = np.zeros(1, bool)
 
@@ -70,7 +72,7 @@ def test_a_white_box_is_brighter_by_its_bounces() -> None:
         quad((0, 0, 0), (0, 3, 0), (0, 0, 3), Material("paint")),
         quad((3, 3, 0), (0, -3, 0), (0, 0, 3), Material("paint")),
     ]
-    mesh, lamp = concat_shapes(walls).mesh, [Light((1.5, 1.5, 2.9))]
+    mesh, lamp = concat_shapes(*walls).mesh, [Light((1.5, 1.5, 2.9))]
     ceiling = []
     for albedo in (0.0, 0.3, 0.6):
         uv, image = bake_light(mesh, np.float32([albedo]), NO_GLOW, lamp, 0.0, 0.5)
@@ -153,7 +155,7 @@ def test_every_vertex_lies_inside_its_own_patch() -> None:
     assert len(np.unique(atlas.patch)) == 360 and np.isfinite(spread).all()
 
 
-def test_texels_keep_within_their_number() -> None:
+def test_the_number_of_texels_is_limited() -> None:
     mesh = quad((0, 0, 0), (100, 0, 0), (0, 100, 0), Material("screed")).mesh
     atlas = unfold_patches(mesh, np.zeros(4, np.int32), 16, 50_000)
     assert 30_000 < len(atlas.row) <= 50_000

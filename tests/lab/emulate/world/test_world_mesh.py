@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from share.lab.emulate.world.layout import winding_numbers
 from share.lab.emulate.world.materials import MATERIAL_KINDS, Material
 from share.lab.emulate.world.mesh import (
     DECAL_OFFSET_M,
@@ -19,7 +20,6 @@ from share.lab.emulate.world.mesh import (
     quad,
     tube,
 )
-from share.lab.emulate.world.proximity import winding_numbers
 
 WOOD = Material("wood")  # one picture a metre
 BEND = [(np.sin(a), np.cos(a), 0.1 * a) for a in np.linspace(0, 3, 30)]  # a hose is bent softly
@@ -113,7 +113,7 @@ def test_pictures_stand_upright_and_are_not_mirrored() -> None:
         assert (mesh.uv[on] > 0.5).all()  # cell 3 of 2 x 2
 
 
-def test_decal_stands_proud_of_its_wall() -> None:
+def test_a_decal_lies_in_front_of_its_wall() -> None:
     mesh = decal((1, 2, 1), (-1, 0, 0), (0, 0, 1), Material("sign")).mesh
     assert mesh.vertices[:, 1] == pytest.approx(2 + DECAL_OFFSET_M)
     assert mesh.normals[0].tolist() == [0, 1, 0]
@@ -121,12 +121,12 @@ def test_decal_stands_proud_of_its_wall() -> None:
 
 def test_concat_shares_materials_and_moves_keep_shapes() -> None:
     one, two = box((0, 0, 0), (1, 1, 1), WOOD), box((2, 0, 0), (3, 1, 1), WOOD).placed_at(0, 0, 5, np.pi / 2)
-    both = concat_shapes([one, two])
+    both = concat_shapes(one, two)
     assert both.materials == (WOOD,)
     assert two.bounding_box == pytest.approx(np.array([[-1, 2, 5], [0, 3, 6]]), abs=1e-6)
     assert volume(both) == pytest.approx(2)
     with pytest.raises(ValueError, match="no mesh"):
-        concat_shapes([])
+        concat_shapes()
 
 
 def test_an_unknown_material_is_named() -> None:

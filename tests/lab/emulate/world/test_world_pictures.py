@@ -7,9 +7,9 @@ import zlib
 import numpy as np
 import pytest
 
+from share.lab.emulate.world.build import MAX_ALBEDO, MIN_ALBEDO, draw_material, mean_albedo
 from share.lab.emulate.world.materials import MATERIAL_KINDS, Material
 from share.lab.emulate.world.noise import PICTURE_TEXELS, cloud
-from share.lab.emulate.world.pictures import MAX_ALBEDO, MIN_ALBEDO, draw_material, mean_albedo
 from share.lab.emulate.world.prints import PRINTS
 from share.lab.emulate.world.surfaces import SURFACES
 
@@ -62,12 +62,6 @@ def test_prints_of_a_picture_differ() -> None:
         for c in range(0, PICTURE_TEXELS, n)
     }
     assert len(cells) == 16
-
-
-def test_text_is_written() -> None:
-    assert (
-        draw_material(Material("sign", text="EXIT"), 2) != draw_material(Material("sign", text="STOP"), 2)
-    ).mean() > 0.02
 
 
 def test_noise_has_the_slope_asked_for() -> None:

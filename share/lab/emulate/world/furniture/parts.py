@@ -67,4 +67,4 @@ def corner_posts(width: float, depth: float, height: float, thick: float, skin: 
     """Four upright posts at the corners of a footprint with its back at y = 0."""
     at = [(x, y) for x in (-1, 1) for y in (-depth + thick / 2, -thick / 2)]
     reach = (width - thick) / 2
-    return concat_shapes([box_on((x * reach, y, 0), (thick, thick, height), skin, rng) for x, y in at])
+    return concat_shapes(*[box_on((x * reach, y, 0), (thick, thick, height), skin, rng) for x, y in at])

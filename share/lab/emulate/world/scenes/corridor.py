@@ -11,14 +11,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from share.lab.emulate.world.furniture import barrels, doors, hoses, lockers, pipes, shelving, signs, tables
+from share.lab.emulate.world.furniture import building, equipment, storage
 from share.lab.emulate.world.layout import Layout, Light, Piece
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import Shape, concat_shapes, decal, quad
 from share.lab.emulate.world.scenes import fill
 from share.lab.emulate.world.scenes.fill import ShapeMaker
-from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Size, Wall, Walls, outer_walls
-from share.lab.emulate.world.scenes.shell import add_skirting, wall_surface
+from share.lab.emulate.world.scenes.layout_builder import (
+    LayoutBuilder,
+    Size,
+    Wall,
+    Walls,
+    add_skirting,
+    outer_walls,
+    wall_surface,
+)
 from share.types import F64
 
 
@@ -85,7 +92,7 @@ def _build_shell(plan: LayoutBuilder, outer: Walls, inner: Walls) -> None:
         plan.add_to_shell("shell", shape)
         plan.add_to_shell("shell", shape.transformed(T))
     sides = [wall_surface(wall, paint, rng) for wall in inner[:2]]
-    plan.add_to_shell("core", concat_shapes([*sides, *(s.transformed(T) for s in sides), *_core_caps(plan)]))
+    plan.add_to_shell("core", concat_shapes(*sides, *(s.transformed(T) for s in sides), *_core_caps(plan)))
     add_skirting(plan, (*outer, *inner))
 
 
@@ -114,9 +121,9 @@ def _furnish_corridor(plan: LayoutBuilder, outer: Wall, inner: Wall) -> None:
     for k in range(count):
         at = length * (k + 0.5) / count
         if rng.random() < 0.8:
-            fill.place_centred(plan, outer, "door", doors.door(rng), end + at, 0.6)
+            fill.place_centred(plan, outer, "door", building.door(rng), end + at, 0.6)
         if rng.random() < 0.5:
-            fill.place_centred(plan, inner, "door", doors.door(rng), at, 0.6)
+            fill.place_centred(plan, inner, "door", building.door(rng), at, 0.6)
     strip = replace(outer, x=end, length=length)
     fill.furnish_wall(plan, strip, _FURNITURE, (0.3, 1.8))
     for wall in (strip, inner):
@@ -126,20 +133,20 @@ def _furnish_corridor(plan: LayoutBuilder, outer: Wall, inner: Wall) -> None:
 
 
 _FURNITURE: dict[str, tuple[float, ShapeMaker]] = {
-    "cupboard": (2, lambda r: shelving.cupboard(r, r.uniform(0.7, 1.2), 0.34, r.uniform(1.1, 1.9))),
-    "bench": (2, lambda r: tables.bench(r, 1.3)),
-    "chair": (2, tables.chair),
-    "lockers": (1, lambda r: lockers.lockers(r, 3)),
-    "radiator": (2, lambda r: pipes.radiator(r, 1.0)),
-    "extinguisher": (1, hoses.extinguisher),
-    "bin": (1, barrels.waste_bin),
+    "cupboard": (2, lambda r: storage.cupboard(r, r.uniform(0.7, 1.2), 0.34, r.uniform(1.1, 1.9))),
+    "bench": (2, lambda r: equipment.bench(r, 1.3)),
+    "chair": (2, equipment.chair),
+    "lockers": (1, lambda r: storage.lockers(r, 3)),
+    "radiator": (2, lambda r: building.radiator(r, 1.0)),
+    "extinguisher": (1, equipment.extinguisher),
+    "bin": (1, storage.waste_bin),
 }
 
 _HANGINGS: dict[str, tuple[float, ShapeMaker]] = {
-    "poster": (3, signs.poster),
-    "notice": (3, signs.notice),
-    "sign": (2, signs.sign),
-    "pin board": (1, signs.pin_board),
+    "poster": (3, building.poster),
+    "notice": (3, building.notice),
+    "sign": (2, building.sign),
+    "pin board": (1, building.pin_board),
 }
 
 
@@ -148,10 +155,10 @@ def _furnish_passage(plan: LayoutBuilder, outer: Wall, core: Wall) -> None:
     rng = plan.rng
     if rng.random() < 0.5:
         fill.add_window(
-            plan, outer, outer.length / 2, 1.0, doors.window(rng, 1.5, 1.1), rng.uniform(0.2, 0.4)
+            plan, outer, outer.length / 2, 1.0, building.window(rng, 1.5, 1.1), rng.uniform(0.2, 0.4)
         )
     else:
-        fill.place_centred(plan, outer, "door", doors.door(rng), outer.length / 2, 0.8)
+        fill.place_centred(plan, outer, "door", building.door(rng), outer.length / 2, 0.8)
     fill.furnish_wall(plan, outer, _FURNITURE, (0.4, 1.6))
     for wall in (outer, core):
         fill.hang_on_wall(plan, wall, _HANGINGS, int(wall.length), 2.0)
@@ -162,7 +169,7 @@ def _furnish_passage(plan: LayoutBuilder, outer: Wall, core: Wall) -> None:
 def _add_differences(plan: LayoutBuilder, inner: Walls) -> None:
     """One more small object on each side, so that the corridors can be told apart by details."""
     for wall in (inner[0], inner[2]):
-        fill.hang_on_wall(plan, wall, {"notice": (1, signs.notice)}, 1, 1.7)
+        fill.hang_on_wall(plan, wall, {"notice": (1, building.notice)}, 1, 1.7)
 
 
 def _turned_piece(piece: Piece, T: F64, number: int) -> Piece:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from share.lab.emulate.world.furniture import lamps, pipes
+from share.lab.emulate.world.furniture import building
 from share.lab.emulate.world.layout import Light
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import Rng, Shape, box, decal
@@ -100,9 +100,11 @@ def light_tubes(
     z, rng = plan.size[2], plan.rng
     for x in xs:
         for y in ys:
-            if plan.add_if_free("lamp", lamps.tube_lamp(rng, length, drop).placed_at(x, y, z), solid=False):
+            if plan.add_if_free(
+                "lamp", building.tube_lamp(rng, length, drop).placed_at(x, y, z), solid=False
+            ):
                 power = rng.uniform(0.7, 1.3)
-                plan.lights.append(lamps.tube_light(x, y, z, length, drop, power, along_y=False))
+                plan.lights.append(building.tube_light(x, y, z, length, drop, power, along_y=False))
 
 
 def light_bells(plan: LayoutBuilder, xs: Sequence[float], ys: Sequence[float], drop: float) -> None:
@@ -110,8 +112,8 @@ def light_bells(plan: LayoutBuilder, xs: Sequence[float], ys: Sequence[float], d
     z, rng = plan.size[2], plan.rng
     for x in xs:
         for y in ys:
-            if plan.add_if_free("lamp", lamps.high_bay_lamp(rng, drop).placed_at(x, y, z), solid=False):
-                plan.lights.append(lamps.high_bay_light(x, y, z, drop, rng.uniform(0.7, 1.3)))
+            if plan.add_if_free("lamp", building.high_bay_lamp(rng, drop).placed_at(x, y, z), solid=False):
+                plan.lights.append(building.high_bay_light(x, y, z, drop, rng.uniform(0.7, 1.3)))
 
 
 def add_window(
@@ -134,9 +136,9 @@ def add_overhead_pipes(plan: LayoutBuilder, count: int) -> None:
     for _ in range(count):
         length = plan.rng.uniform(0.5, 0.97) * y
         if plan.rng.random() < 0.6:
-            shape, tall = pipes.pipe_run(plan.rng, length, int(plan.rng.integers(1, 4))), 0.45
+            shape, tall = building.pipe_run(plan.rng, length, int(plan.rng.integers(1, 4))), 0.45
         else:
-            shape, tall = pipes.duct(plan.rng, length), 0.5
+            shape, tall = building.duct(plan.rng, length), 0.5
         for _try in range(12):
             at = plan.rng.uniform(0.1, x - 0.5), plan.rng.uniform(length / 2, y - length / 2)
             if plan.add_if_free("pipes", shape.placed_at(*at, z - tall, np.pi / 2), solid=False):

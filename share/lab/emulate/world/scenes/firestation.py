@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.lab.emulate.world.furniture import (
-    barrels,
-    doors,
-    hoses,
-    ladders,
-    lockers,
-    pipes,
-    shelving,
-    signs,
-    small,
-    tables,
-    vehicles,
-)
+from share.lab.emulate.world.furniture import building, equipment, storage, vehicles
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.materials import Material
-from share.lab.emulate.world.scenes import fill, floor
+from share.lab.emulate.world.scenes import fill
 from share.lab.emulate.world.scenes.fill import ShapeMaker
-from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Size, Wall, outer_walls
-from share.lab.emulate.world.scenes.shell import add_floor_joints, add_skirting, build_enclosure
+from share.lab.emulate.world.scenes.layout_builder import (
+    LayoutBuilder,
+    Size,
+    Wall,
+    add_floor_joints,
+    add_skirting,
+    build_enclosure,
+    clear_floor,
+    outer_walls,
+)
 
 _AISLE_M = 1.75  # around the vehicles
 _MIN_WALKABLE = 0.3  # least share of the floor that is left to walk on
@@ -37,12 +33,12 @@ def firestation(seed: int, size: Size) -> Layout:
     lanes = _lane_positions(size)
     _add_doors(plan, walls[1], lanes)
     _add_vehicles(plan, lanes)
-    fill.place_centred(plan, walls[3], "door", doors.door(rng), rng.uniform(1.2, size[1] - 1.2), 1.2)
+    fill.place_centred(plan, walls[3], "door", building.door(rng), rng.uniform(1.2, size[1] - 1.2), 1.2)
     for wall in (walls[0], walls[2], walls[3]):
         fill.furnish_wall(plan, wall, _GEAR, (0.4, 1.7))
         fill.hang_on_wall(plan, wall, _HANGINGS, max(1, int(0.45 * wall.length)), 2.4)
     _add_lights(plan, walls)
-    floor.clear_floor(plan, _MIN_WALKABLE, _GEAR)
+    clear_floor(plan, _MIN_WALKABLE, _GEAR)
     return plan.to_layout(ambient=0.3)
 
 
@@ -70,7 +66,7 @@ def _add_doors(plan: LayoutBuilder, wall: Wall, lanes: list[float]) -> None:
     for y in lanes:
         width = min(2.9, wall.length / len(lanes) - 0.6)
         fill.place_centred(
-            plan, wall, "roller door", doors.roller_door(plan.rng, width, height), wall.length - y, 1.0
+            plan, wall, "roller door", building.roller_door(plan.rng, width, height), wall.length - y, 1.0
         )
 
 
@@ -97,27 +93,27 @@ def _add_vehicles(plan: LayoutBuilder, lanes: list[float]) -> None:
 
 
 _GEAR: dict[str, tuple[float, ShapeMaker]] = {
-    "lockers": (2, lambda r: lockers.lockers(r, int(r.integers(2, 6)))),
-    "gear": (2, lambda r: lockers.cloakroom(r, int(r.integers(2, 5)))),
-    "hose rack": (1.5, lambda r: hoses.hose_rack(r, r.uniform(1.3, 2.0), int(r.integers(2, 4)))),
-    "hoses": (1, lambda r: hoses.drying_hoses(r, int(r.integers(2, 5)), r.uniform(1.7, 2.2))),
-    "hose reel": (1, hoses.hose_reel),
-    "bench": (1, lambda r: tables.bench(r, r.uniform(1.2, 2.0))),
-    "extinguisher": (1, hoses.extinguisher),
-    "workbench": (0.5, lambda r: tables.workbench(r, r.uniform(1.3, 1.8))),
-    "cupboard": (0.3, lambda r: shelving.cupboard(r, 1.0, 0.36, 1.8)),
-    "tool box": (0.5, small.tool_box),
-    "ladder": (0.5, lambda r: ladders.leaning_ladder(r, 2.0)),
-    "cones": (0.7, small.cones),
-    "radiator": (1, lambda r: pipes.radiator(r, r.uniform(0.8, 1.5))),
-    "bin": (0.5, barrels.waste_bin),
+    "lockers": (2, lambda r: storage.lockers(r, int(r.integers(2, 6)))),
+    "gear": (2, lambda r: storage.cloakroom(r, int(r.integers(2, 5)))),
+    "hose rack": (1.5, lambda r: equipment.hose_rack(r, r.uniform(1.3, 2.0), int(r.integers(2, 4)))),
+    "hoses": (1, lambda r: equipment.drying_hoses(r, int(r.integers(2, 5)), r.uniform(1.7, 2.2))),
+    "hose reel": (1, equipment.hose_reel),
+    "bench": (1, lambda r: equipment.bench(r, r.uniform(1.2, 2.0))),
+    "extinguisher": (1, equipment.extinguisher),
+    "workbench": (0.5, lambda r: equipment.workbench(r, r.uniform(1.3, 1.8))),
+    "cupboard": (0.3, lambda r: storage.cupboard(r, 1.0, 0.36, 1.8)),
+    "tool box": (0.5, equipment.tool_box),
+    "ladder": (0.5, lambda r: equipment.leaning_ladder(r, 2.0)),
+    "cones": (0.7, equipment.cones),
+    "radiator": (1, lambda r: building.radiator(r, r.uniform(0.8, 1.5))),
+    "bin": (0.5, storage.waste_bin),
 }
 
 _HANGINGS: dict[str, tuple[float, ShapeMaker]] = {
-    "sign": (2, signs.sign),
-    "notice": (2, signs.notice),
-    "pin board": (0.5, signs.pin_board),
-    "fuse box": (0.7, signs.fuse_box),
+    "sign": (2, building.sign),
+    "notice": (2, building.notice),
+    "pin board": (0.5, building.pin_board),
+    "fuse box": (0.7, building.fuse_box),
 }
 
 
@@ -129,5 +125,5 @@ def _add_lights(plan: LayoutBuilder, walls: tuple[Wall, ...]) -> None:
     for wall in (walls[0], walls[2]):
         for k in range(int(wall.length / 3)):
             if rng.random() < 0.5:
-                shape = doors.window(rng, 1.6, 0.7)
+                shape = building.window(rng, 1.6, 0.7)
                 fill.add_window(plan, wall, 1.5 + 3 * k, z - 1.15, shape, rng.uniform(0.5, 1.3))

@@ -4,35 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.lab.emulate.world.furniture import (
-    barrels,
-    cartons,
-    doors,
-    forklift,
-    hoses,
-    ladders,
-    lockers,
-    pallets,
-    pillars,
-    pipes,
-    shelving,
-    signs,
-    small,
-    tables,
-)
+from share.lab.emulate.world.furniture import building, equipment, storage, vehicles
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.materials import Material
 from share.lab.emulate.world.mesh import Rng, Shape
 from share.lab.emulate.world.scenes import fill
 from share.lab.emulate.world.scenes.fill import ShapeMaker
-from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Size, Wall, outer_walls
-from share.lab.emulate.world.scenes.shell import (
+from share.lab.emulate.world.scenes.layout_builder import (
     BAY_M,
+    LayoutBuilder,
+    Size,
+    Wall,
     add_columns,
     add_floor_joints,
     add_girders,
     bay_joints,
     build_enclosure,
+    outer_walls,
 )
 
 _ROW_DEPTH_M = 0.85  # depth of a row of islands
@@ -78,14 +66,14 @@ def _add_openings(plan: LayoutBuilder, walls: tuple[Wall, ...]) -> None:
     first, second = walls[order[0]], walls[order[1]]
     width = float(min(rng.uniform(2.2, 2.6), _bay_length(first) - 0.9))
     fill.place_centred(
-        plan, first, "roller door", doors.roller_door(rng, width, 2.6), _random_bay_middle(rng, first), 1.2
+        plan, first, "roller door", building.roller_door(rng, width, 2.6), _random_bay_middle(rng, first), 1.2
     )
-    fill.place_centred(plan, second, "door", doors.door(rng), _random_bay_middle(rng, second), 1.2)
+    fill.place_centred(plan, second, "door", building.door(rng), _random_bay_middle(rng, second), 1.2)
     for k in order[1:]:
         for at in _bay_middles(walls[k]):
             if rng.random() < 0.45:
                 tall = min(0.8, z - _GIRDER_M - 2.75)
-                shape = doors.window(rng, rng.uniform(1.0, 1.8), tall)
+                shape = building.window(rng, rng.uniform(1.0, 1.8), tall)
                 fill.add_window(plan, walls[k], at, z - _GIRDER_M - tall - 0.15, shape, rng.uniform(0.5, 1.4))
 
 
@@ -122,41 +110,41 @@ def _wall_furniture(size: Size) -> dict[str, tuple[float, ShapeMaker]]:
 
     def rack(rng: Rng) -> Shape:
         height = rng.uniform(1.8, min(2.6, top)) if rng.random() < 0.6 else rng.uniform(0.75 * top, top)
-        return shelving.goods_rack(
+        return storage.goods_rack(
             rng, rng.uniform(1.2, 2.4), rng.uniform(0.4, 0.55), height, rng.uniform(0.45, 0.8)
         )
 
     return {
         "rack": (5, rack),
-        "cartons": (3, lambda r: cartons.carton_stack(r, r.uniform(0.5, 1.4), 0.5, r.uniform(0.6, 1.7))),
-        "cupboard": (1.5, lambda r: shelving.cupboard(r, r.uniform(0.8, 1.6), 0.36, r.uniform(1.2, 2.1))),
-        "drums": (1, lambda r: barrels.drum_row(r, int(r.integers(1, 4)))),
-        "workbench": (1.2, lambda r: tables.workbench(r, r.uniform(1.3, 2.0))),
-        "lockers": (0.6, lambda r: lockers.lockers(r, int(r.integers(2, 5)))),
-        "crate": (1, small.crate),
-        "tool box": (0.6, small.tool_box),
-        "bin": (0.5, barrels.waste_bin),
-        "hand truck": (0.6, small.hand_truck),
-        "ladder": (0.5, lambda r: ladders.leaning_ladder(r, r.uniform(1.8, 2.1))),
-        "extinguisher": (0.8, hoses.extinguisher),
-        "conduit": (0.7, lambda r: pipes.wall_pipes(r, size[2])),
+        "cartons": (3, lambda r: storage.carton_stack(r, r.uniform(0.5, 1.4), 0.5, r.uniform(0.6, 1.7))),
+        "cupboard": (1.5, lambda r: storage.cupboard(r, r.uniform(0.8, 1.6), 0.36, r.uniform(1.2, 2.1))),
+        "drums": (1, lambda r: storage.drum_row(r, int(r.integers(1, 4)))),
+        "workbench": (1.2, lambda r: equipment.workbench(r, r.uniform(1.3, 2.0))),
+        "lockers": (0.6, lambda r: storage.lockers(r, int(r.integers(2, 5)))),
+        "crate": (1, equipment.crate),
+        "tool box": (0.6, equipment.tool_box),
+        "bin": (0.5, storage.waste_bin),
+        "hand truck": (0.6, equipment.hand_truck),
+        "ladder": (0.5, lambda r: equipment.leaning_ladder(r, r.uniform(1.8, 2.1))),
+        "extinguisher": (0.8, equipment.extinguisher),
+        "conduit": (0.7, lambda r: building.wall_pipes(r, size[2])),
     }
 
 
 _DEEP_FURNITURE: dict[str, tuple[float, ShapeMaker]] = {  # only where there is space for it
-    "loaded pallet": (2, lambda r: pallets.loaded_pallet(r, r.uniform(0.7, 1.8))),
-    "pallets": (0.8, lambda r: pallets.pallet_pile(r, int(r.integers(3, 9)))),
-    "step ladder": (0.4, lambda r: ladders.step_ladder(r, r.uniform(0.9, 1.7))),
+    "loaded pallet": (2, lambda r: storage.loaded_pallet(r, r.uniform(0.7, 1.8))),
+    "pallets": (0.8, lambda r: storage.pallet_pile(r, int(r.integers(3, 9)))),
+    "step ladder": (0.4, lambda r: equipment.step_ladder(r, r.uniform(0.9, 1.7))),
 }
 
 
 _HANGINGS: dict[str, tuple[float, ShapeMaker]] = {
-    "sign": (4, signs.sign),
-    "poster": (3, signs.poster),
-    "notice": (3, signs.notice),
-    "pin board": (0.7, signs.pin_board),
-    "tool wall": (0.7, signs.tool_wall),
-    "fuse box": (1, signs.fuse_box),
+    "sign": (4, building.sign),
+    "poster": (3, building.poster),
+    "notice": (3, building.notice),
+    "pin board": (0.7, building.pin_board),
+    "tool wall": (0.7, building.tool_wall),
+    "fuse box": (1, building.fuse_box),
 }
 
 
@@ -190,8 +178,8 @@ def _add_island_row(plan: LayoutBuilder, y: float, left: float, right: float, lo
 
 def _pillar(rng: Rng, height: float) -> Shape:
     if rng.random() < 0.5:
-        return pillars.concrete_pillar(rng, rng.uniform(0.28, 0.4), height)
-    return pillars.steel_pillar(rng, 0.24, height)
+        return building.concrete_pillar(rng, rng.uniform(0.28, 0.4), height)
+    return building.steel_pillar(rng, 0.24, height)
 
 
 def _add_island(plan: LayoutBuilder, left: float, right: float, y: float) -> float:
@@ -218,27 +206,27 @@ def _double_rack(plan: LayoutBuilder, width: float) -> Shape:
     """A rack in the middle of the room, low under a low roof so that one can look over it."""
     rng, highest = plan.rng, _rack_height(plan.size)
     height = rng.uniform(1.5, min(2.4, highest)) if plan.size[2] < 5 else rng.uniform(0.6, 1) * highest
-    return shelving.goods_rack(rng, width, rng.uniform(0.6, _ROW_DEPTH_M), height, rng.uniform(0.5, 0.9))
+    return storage.goods_rack(rng, width, rng.uniform(0.6, _ROW_DEPTH_M), height, rng.uniform(0.5, 0.9))
 
 
 def _floor_goods(rng: Rng, room: float) -> tuple[str, Shape]:
     """Return name and shape of something in the middle of a warehouse, narrower than `room` m."""
     if room > 4 and rng.random() < 0.3:
-        return "forklift", forklift.forklift(rng).placed_at(0, 0, 0, -np.pi / 2)
+        return "forklift", vehicles.forklift(rng).placed_at(0, 0, 0, -np.pi / 2)
     kind = str(rng.choice(["loaded pallet", "pallets", "table", "crate", "drums", "cartons", "pallet truck"]))
     if room < 1.25 or kind == "crate":
-        return "crate", small.crate(rng)
+        return "crate", equipment.crate(rng)
     if kind == "loaded pallet":
-        return kind, pallets.loaded_pallet(rng, rng.uniform(0.6, 1.6))
+        return kind, storage.loaded_pallet(rng, rng.uniform(0.6, 1.6))
     if kind == "pallets":
-        return kind, pallets.pallet_pile(rng, int(rng.integers(2, 8)))
+        return kind, storage.pallet_pile(rng, int(rng.integers(2, 8)))
     if kind == "drums":
-        return kind, barrels.drum_row(rng, 2)
+        return kind, storage.drum_row(rng, 2)
     if kind == "table":
-        return kind, tables.table(rng, min(room, rng.uniform(1.2, 1.8)))
+        return kind, equipment.table(rng, min(room, rng.uniform(1.2, 1.8)))
     if kind == "pallet truck" and room > 1.7:
-        return kind, forklift.pallet_truck(rng).placed_at(0, 0, 0, -np.pi / 2)
-    return "cartons", cartons.carton_stack(rng, min(room, 1.4), 0.7, rng.uniform(0.8, 1.6))
+        return kind, vehicles.pallet_truck(rng).placed_at(0, 0, 0, -np.pi / 2)
+    return "cartons", storage.carton_stack(rng, min(room, 1.4), 0.7, rng.uniform(0.8, 1.6))
 
 
 def _add_overhead(plan: LayoutBuilder) -> None:
