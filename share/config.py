@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from share.plain_data import from_mapping
 from share.retired_settings import refuse_retired
 
 
@@ -234,6 +233,7 @@ def _require_positive(config: Any, *names: str) -> None:
 
 def load_config(text: str, where: str = "configuration") -> Config:
     """Return a `Config` from YAML text. Raises ConfigError naming the key and the remedy."""
+    from share.plain_data import from_mapping
     from share.strict_yaml import load_yaml
 
     data = load_yaml(text, where)

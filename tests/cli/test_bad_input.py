@@ -335,7 +335,7 @@ CONFIGS = {
     ),
     "huge": ("tracker: {corners: 1" + 40 * "0" + "}", "tracker: corners: expected a number from 0 to 1e+09"),
     "absurd": ("tracker: {corners: 1" + 400 * "0" + "}", "not valid YAML: number of 401 characters"),
-    "too many bits": ("place: {hash_bits: 30}", "place: hash_bits: 8 tables of 30 bits are too many words"),
+    "retired": ("place: {hash_bits: 30}", "place.hash_bits is no longer a setting: it is"),
     "not a number": ("link: {silent_s: .nan}", "silent_s: expected a number from 0 to 1e+09, found nan"),
     "infinite": ("sequencer: {sync_tolerance_ms: .inf}", "from 0 to 1e+09, found inf"),
 }

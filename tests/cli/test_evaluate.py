@@ -62,7 +62,7 @@ def test_run_is_scored_compared_and_never_overwritten(evaluate, plain_session, t
     assert told["conditions"] == {
         **where,
         "clock": "real time",
-        "told": "the true error",
+        "error_source": "the true error",
         "code": told["record"]["code"],
     }
     assert told["agents"][0]["odom_n"] == 45

@@ -67,7 +67,6 @@ ALLOWED = {
     ("lab/evaluate/provenance.py", "read_text"): KERNEL,
     ("store/database.py", "connect"): "after check_is_map",
     ("store/database.py", "open"): "O_NOFOLLOW, and checked",
-    ("store/opening.py", "connect"): "of our own tables, after check_is_map",
     ("store/salvage.py", "connect"): OURS,
     ("store/salvage.py", "open"): OURS,
     ("store/schema.py", "connect"): MEMORY,

@@ -103,7 +103,7 @@ def test_one_agent_may_have_its_own_parameters() -> None:
         ("agents: {bob: {from: ar}}", "control: agents: bob: unknown key 'from'; did you mean 'form'"),
         ("agents: {bob: {form: car}}", "control: agents: bob: form: 'car' is not known"),
         ("agents: {bob: {theta_ms: 0}}", "control: agents: bob: theta_ms: 0.0 must be positive"),
-        ("agents: [bob]", "control: agents: expected dict, found"),
+        ("agents: [bob]", "control: agents: expected keys and values, found"),
         ("rate_min_hz: 20", "control: rate_min_hz, rate_max_hz, 1000 must rise"),
     ],
 )

@@ -72,8 +72,8 @@ def largest_map_ate(agents: dict[str, AgentScore]) -> JointAte | None:
     members: dict[str, list[str]] = {}
     for name, agent in agents.items():
         if agent.map is not None:
-            fallback_map = agent.report["protocol"]["map_id"]  # of runs before map_tum was written
-            members.setdefault(agent.report.get("map_tum", fallback_map), []).append(name)
+            fallback_map = agent.report["protocol"]["map_id"]  # of runs before map_tum_id was written
+            members.setdefault(agent.report.get("map_tum_id", fallback_map), []).append(name)
     if not members:
         return None
     largest = max(members.values(), key=len)

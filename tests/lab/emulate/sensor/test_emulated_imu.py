@@ -35,9 +35,7 @@ def test_allan_deviation_of_rest_is_that_of_the_profile(name: str):
     gyro) on. One axis of one hour scatters by 13 % there: 50 spans of 70 s do not tell more."""
     sensor = replace(SENSORS[name], step=0.0)
     rest = np.zeros((int(3600 * sensor.rate_hz), 3))
-    curves = [
-        allan_deviation(measured_samples(rest, sensor, (seed,)), sensor.rate_hz, 1) for seed in range(8)
-    ]
+    curves = [allan_deviation(measured_samples(rest, sensor, (seed,)), sensor.rate_hz) for seed in range(8)]
     taus = curves[0].taus
     seen = np.sqrt(np.mean([curve.deviation**2 for curve in curves], axis=(0, 2)))
     stated = np.sqrt(sensor.density**2 / taus + sensor.walk**2 * taus / 3)
