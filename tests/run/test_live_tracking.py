@@ -20,7 +20,7 @@ from share.cameras.sample_queue import NewestImageQueue, SampleQueue
 from share.cli import camera_options
 from share.config import Config
 from share.geometry.camera import ImuBias
-from share.odometry import inertial_tracker
+from share.odometry import initialisation
 from share.odometry.track_result import TrackResult
 from share.recordings.calibration import Calibration
 from share.runtime.capture import Capture
@@ -98,9 +98,9 @@ def test_a_live_camera_starts_with_the_bias_of_the_run_before(
     before, after = (ImuBias([0.0, x, 0.0], [0.0, 0.0, x], 1e-3, 2e-2) for x in (0.001, 0.002))
     save_bias("0123", SavedBias(time.time_ns() - 3600 * 10**9, before))
     begun: list[ImuBias] = []
-    first_state = inertial_tracker.state_from_imu
-    monkeypatch.setattr(inertial_tracker, "state_from_imu", lambda *a: begun.append(a[-1]) or first_state(*a))
-    monkeypatch.setattr(inertial_tracker, "estimated_bias", lambda *a: after)
+    first_state = initialisation.state_from_imu
+    monkeypatch.setattr(initialisation, "state_from_imu", lambda *a: begun.append(a[-1]) or first_state(*a))
+    monkeypatch.setattr(initialisation, "estimated_bias", lambda *a: after)
     source = LiveSource(room.feed(STEREO, NewestImageQueue(2 * MAX_WAITING_FRAMES), []), HZ)
     room.begin(source.feed)
     run = tracked(source)
