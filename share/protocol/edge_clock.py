@@ -75,6 +75,9 @@ class ClockFilter:
     """
 
     def __init__(self) -> None:
+        from filterpy import kalman  # takes a second to import: now, not at the first pong
+
+        self._kalman = kalman
         self.reset()
 
     def reset(self) -> None:
@@ -166,18 +169,15 @@ class ClockFilter:
     def _gated_update(self, x: F64, offset_ns: int, at_ns: int, variance: float) -> bool:
         self._x, self._P = x, P = self._predict(x, at_ns)
         self._updated_ns = max(at_ns, self._updated_ns)
-        innovation, S = (offset_ns - self._base_ns) / 1e3 - x[0], P[0, 0] + variance
-        if innovation**2 > GATE_SIGMA**2 * S:
+        z = (offset_ns - self._base_ns) / 1e3
+        if (z - x[0]) ** 2 > GATE_SIGMA**2 * (P[0, 0] + variance):
             self._consecutive_rejects += 1
             self.rejected += 1
             if self._consecutive_rejects >= STEP_AFTER:
                 self.steps += 1
                 self._initialise(offset_ns, at_ns, variance)
             return False
-        K = P[:, :1] * (1 / S)
-        I_KH = np.eye(2) - K @ [[1.0, 0.0]]
-        self._x = x + K[:, 0] * innovation
-        self._P = I_KH @ P @ I_KH.T + K * variance @ K.T  # Joseph's form
+        self._x, self._P = self._kalman.update(x, P, z, np.array([[variance]]), np.array([[1.0, 0.0]]))
         self._consecutive_rejects = 0
         self._agreeing_exchanges += 1
         return True

@@ -26,6 +26,7 @@ HEAVY = [
     "numpy",
     "yaml",
     "msgspec",
+    "filterpy",
 ]
 HELPS = [
     [],
