@@ -117,7 +117,7 @@ class ClockConfig:
 class GraphConfig:
     """Solution of the pose graph."""
 
-    cauchy: float = 3.0  # whitened residual (6 dof: 2.4 is usual) at which a loop begins to lose weight
+    cauchy: float = 3.0  # whitened residual at which a loop has half its weight (6 dof: 2.4 is usual)
 
     def __post_init__(self) -> None:
         _require_positive(self, "cauchy")

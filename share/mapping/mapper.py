@@ -1,7 +1,8 @@
 """The mapper: keyframes in, corrections out.
 
-A keyframe's way (`Mapper._look_up`): query -> for each candidate verify -> overlap gate -> loop checks -> add
-the loop. A map that has changed (`Mapper._solve_map`): optimise -> publish corrections. Both are jobs that
+A keyframe's way (`Mapper._look_up`): query -> review recent merges -> for each candidate verify -> merge gate ->
+agreement of the agents -> loop acceptance. A map that has changed (`Mapper._solve_map`): optimise ->
+localisation gate -> publish corrections. Both are jobs that
 yield their slow steps, frozen values that the caller runs, one of each job at a time. Changes that arrive
 while a map is being solved are solved together afterwards.
 """
@@ -40,7 +41,7 @@ from share.scheduling.merge_gate import MergeGate
 from share.types import Keyframe
 from share.wire.messages import Hello
 
-_RETRY_INTERVAL = 4  # every fourth look-up includes keyframes of agents that are kept apart
+_RETRY_INTERVAL = 4  # nodes of every fourth id are compared with those of agents that are kept apart too
 
 
 class Mapper:

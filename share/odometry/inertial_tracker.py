@@ -40,6 +40,7 @@ from share.vision.orb import measures_depth
 
 _LONG_GAP_NS = 250_000_000  # between frames; integration over more is worse than the IMU's noise model says
 _MAX_IMU_WAIT_FRAMES = 10  # without an IMU sample, after which the tracker begins without IMU
+_MIN_PROVEN = WEAK // 2  # static features that are proven, without which no first pose is published
 _MAX_UP_SIGMA_RAD = np.radians(3.0)  # tilt sigma up to which the up direction is published
 
 
@@ -79,7 +80,7 @@ class InertialTracker:
 
     @property
     def state(self) -> FilterState | None:
-        """The filter's state; None before the start and while LOST."""
+        """The filter's state; None before the start and once it was discarded as LOST."""
         return self._landmarks.state if self._landmarks else None
 
     @property
@@ -121,7 +122,7 @@ class InertialTracker:
             published.T_previous_body,
             published.cov,
             published.T_odom_body[2, :3] if knows_up else np.zeros(3),
-            published.tilt_sigma / np.sqrt(2),
+            published.tilt_sigma / np.sqrt(2),  # of both angles -> of each
             published.view,
             new_segment,
             published.frames_ago,
@@ -184,14 +185,14 @@ class InertialTracker:
         elif self._mono_window is None:
             self._consistency.add(nis, interval_ns * 1e-9)
         is_textured = count >= BLIND or corners.count_fast(frame.image0) >= WEAK
-        if not self._is_healthy(s, matches, count, is_textured, interval_ns):
+        if not self._check_health(s, matches, count, is_textured, interval_ns):
             return self._declare_lost(frame)
         state = self._track_state(s, count, imu)
-        if state is TrackState.LOST:
+        if state is TrackState.LOST:  # neither features nor IMU: the filter goes on
             return TrackResult(state, None)
         wants_keyframe = is_textured and self._keyframes.wants_keyframe(frame.stamp_ns, s.T, count)
         if state is TrackState.INITIALISING:
-            if not self._is_scale_solved(frame, landmarks, wants_keyframe):
+            if not self._advance_mono_window(frame, landmarks, wants_keyframe):
                 return self._waiting_result(s)
             state, wants_keyframe = TrackState.OK, True
         result = self._publish(frame, landmarks, state, wants_keyframe, count)
@@ -216,7 +217,7 @@ class InertialTracker:
         landmarks.record_frame(matches, inliers)
         return inliers, nis
 
-    def _is_healthy(
+    def _check_health(
         self, s: FilterState, matches: FeatureMatches, count: int, is_textured: bool, interval_ns: int
     ) -> bool:
         """Return whether the state is plausible, and the images do not contradict it for long."""
@@ -224,7 +225,7 @@ class InertialTracker:
         self._divergence.add(is_textured, in_view, found_count, count, interval_ns * 1e-9)
         return not self._divergence.has_diverged and is_plausible(s, self._config.max_speed_m_s)
 
-    def _is_scale_solved(self, frame: Frame, landmarks: LandmarkMap, is_keyframe: bool) -> bool:
+    def _advance_mono_window(self, frame: Frame, landmarks: LandmarkMap, is_keyframe: bool) -> bool:
         """Return whether a single camera's window gives the scale, and the state has converged. is_keyframe:
         the frame becomes a keyframe of it."""
         if is_keyframe:
@@ -272,7 +273,7 @@ class InertialTracker:
         return self._is_static() and initialisation.is_publishable(s, waited_s, self._new_segment)
 
     def _is_static(self) -> bool:
-        return self._landmarks is None or self._landmarks.is_static(WEAK // 2)
+        return self._landmarks is None or self._landmarks.is_static(_MIN_PROVEN)
 
     def _waiting_result(self, s: FilterState) -> TrackResult:
         if self._mono_window is not None:
@@ -293,8 +294,8 @@ class InertialTracker:
         new segment."""
         T_found = self._relocalise(frame)
         waiting_state = TrackState.INITIALISING if self._lost_ns is None else TrackState.LOST
-        lost_ns = 0 if self._lost_ns is None else frame.stamp_ns - self._lost_ns
-        if T_found is None and 0 < lost_ns < self._tracker_config.new_stretch_s * 1e9:
+        lost_for_ns = 0 if self._lost_ns is None else frame.stamp_ns - self._lost_ns
+        if T_found is None and 0 < lost_for_ns < self._tracker_config.new_stretch_s * 1e9:
             return TrackResult(waiting_state, None)
         samples = self._imu.buffer.samples
         state = initialisation.state_from_imu(frame.stamp_ns, samples, self._rig, self._config, self._bias)

@@ -40,7 +40,9 @@ class Edge:
     (default: the first event).
     """
 
-    tracks_agents: ClassVar[bool] = False  # agents stream: `share.protocol.remote_tracking`
+    tracks_agents: ClassVar[bool] = (
+        False  # True where agents stream frames (`share.protocol.remote_tracking`)
+    )
 
     def __init__(
         self,
@@ -340,7 +342,9 @@ class Edge:
             self._record(finding.event, peer, finding.reason, finding.event == "step failed")
             return
         peer.last_finding = finding
-        if not peer.is_gone and peer.is_welcomed:  # before the welcome it takes us for the session before
+        if (
+            not peer.is_gone and peer.is_welcomed
+        ):  # until welcomed, the agent counts it to the earlier session
             self._send_correction(peer, finding)
 
     def _send_correction(self, peer: Peer, finding: MapEvent, is_repeat: bool = False) -> None:

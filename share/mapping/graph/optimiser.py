@@ -6,7 +6,7 @@ docs/understand/mapping.md.
 
 Odometry makes long chains, whose equations are block tridiagonal and solved in a millisecond. With the
 information of all other edges added at both ends, they precondition the whole system; the coupling by loops
-is left to some 40 iterations, however many loops there are, where a factorisation would fill in. Source:
+is left to a few ten iterations, however many loops there are, where a factorisation would fill in. Source:
 Dellaert et al., *Subgraph-preconditioned Conjugate Gradients for Large Scale SLAM*, IROS 2010.
 """
 
@@ -53,7 +53,7 @@ def optimise(
 ) -> OptimisedPoses:
     """Optimise poses (N, 4, 4), in `chain_order`, with gravity factors (N, 3). Deterministic.
 
-    cauchy: whitened residual of a loop at which it begins to lose weight.
+    cauchy: whitened residual at which a loop has half its weight.
     The anchor stays, to the bit without gravity factors; with any, it tilts in place.
     """
     with np.errstate(all="ignore"):
