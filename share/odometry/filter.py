@@ -38,7 +38,7 @@ _TILT_AND_VELOCITY = np.array([0, 1, 6, 7, 8])  # columns
 # rad^2, (m/s)^2 of these: with a larger variance, single precision does not suffice.
 _SINGLE_PRECISION_VARIANCE = np.array([3e-4, 3e-4, 1e-2, 1e-2, 1e-2])
 _MIN_VARIANCE = 1e-10  # rounding error of differences of covariances
-GATE = 12.0  # NIS above which a measurement is rejected: 99.8 % with 2 degrees of freedom, 99.3 % with 3
+GATE = 12.0  # NIS above which a measurement is rejected (2 degrees of freedom: 99.8 %; 3: 99.3 %)
 CORRELATION_INFLATION = 16.0  # frames for which a correlated error lasts; chosen by NEES
 FloatArray = NDArray[np.floating[Any]]  # in double or in single precision
 _STEP_TOLERANCE = 1e-4  # rad, m, 1/m: a smaller step does not change the derivatives

@@ -40,9 +40,7 @@ class Edge:
     (default: the first event).
     """
 
-    tracks_agents: ClassVar[bool] = (
-        False  # True where agents stream frames (`share.protocol.remote_tracking`)
-    )
+    tracks_agents: ClassVar[bool] = False  # True where agents stream frames: `remote_tracking`
 
     def __init__(
         self,
