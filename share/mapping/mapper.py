@@ -1,10 +1,10 @@
 """The mapper: keyframes in, corrections out.
 
-A keyframe's way (`Mapper._look_up`): query -> review recent merges -> for each candidate verify -> merge gate ->
-agreement of the agents -> loop acceptance. A map that has changed (`Mapper._solve_map`): optimise ->
-localisation gate -> publish corrections. Both are jobs that
-yield their slow steps, frozen values that the caller runs, one of each job at a time. Changes that arrive
-while a map is being solved are solved together afterwards.
+A keyframe's way (`Mapper._look_up`): query -> review recent merges -> for each candidate verify -> merge
+gate -> agreement of the agents -> loop acceptance. A map that has changed (`Mapper._solve_map`): optimise ->
+localisation gate -> publish corrections. Both are jobs that yield their slow steps, frozen values that the
+caller runs, one of each job at a time. Changes that arrive while a map is being solved are solved together
+afterwards.
 """
 
 from __future__ import annotations
