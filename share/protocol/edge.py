@@ -340,9 +340,7 @@ class Edge:
             self._record(finding.event, peer, finding.reason, finding.event == "step failed")
             return
         peer.last_finding = finding
-        if (
-            not peer.is_gone and peer.is_welcomed
-        ):  # until welcomed, the agent counts it to the earlier session
+        if not peer.is_gone and peer.is_welcomed:  # else the agent counts it to the earlier session
             self._send_correction(peer, finding)
 
     def _send_correction(self, peer: Peer, finding: MapEvent, is_repeat: bool = False) -> None:
