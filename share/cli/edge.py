@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @click.option(
     "--policy",
     type=click.Choice(POLICY_NAMES),
-    help="How keyframe rates are set, see below.  [default: edge.policy of --config, else share]",
+    help="How keyframe rates are set, see above.  [default: edge.policy of --config, else share]",
 )
 @options.keys
 @click.option(

@@ -41,7 +41,7 @@ class _Size(click.ParamType[tuple[float, ...]]):
     multiple=True,
     required=True,
     metavar="[NAME=]SPEC",
-    help="An agent and its motion; see below. May be repeated.",
+    help="An agent and its motion; see above. May be repeated.",
 )
 @click.option("--out", required=True, metavar="SESSION", type=options.PATH, help="A new folder.")
 @click.option("--seconds", type=float, default=30, help="Length of the session, s.")

@@ -4,7 +4,8 @@
 
 Each fault of `sensor_faults.py` on its own, on the first S seconds. `ate_cm`: causal poses, SE3
 alignment, of the longest segment (`scored`: its share of all frames with a pose); `ratio`: to the clean run.
-`states`: % of the frames. `lost_s`, `stretches`: as in report.json. `wrong_ok`: % of all frames that are OK
+`states`: % of the frames. `lost_s`: as in report.json; `stretches`: `segments` there.
+`wrong_ok`: % of all frames that are OK
 although the position errs by more than 5 cm and more than three of its sigmas; aligned at the first pose of
 the segment by yaw, or in full where the tracker has no gravity. `changed`: % of cam0's pixels that differ
 from the recording's, in frames that differ. `cpu_ms`: median of a frame, keyframe included. The table is

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from share.config import Config, from_mapping
+from share.config import Config
 from share.errors import UsageError
 from share.lab.evaluate.campaign import PlannedRun, plan_policies, play_job, run_all, split_jobs
 from share.lab.evaluate.real_time import RunOptions
 from share.lab.evaluate.trial import read_trial, settings_yaml
+from share.plain_data import from_mapping
 from share.recordings.session import Session
 
 TERMS = RunOptions("", "wifi5")
