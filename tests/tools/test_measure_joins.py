@@ -21,10 +21,10 @@ def tool():
 
 def test_row_holds_join_times_and_wrong_joins(tool):
     runs = [
-        tool.JoinRun(0, {"a b": tool.AgentPair(5.0, 9.0, None, 0.0, "right")}, 1.0, 2),
-        tool.JoinRun(1, {"a b": tool.AgentPair(5.0, 20.0, 4.0, 16.0, "right")}, 3.0, 2),
-        tool.JoinRun(3, {"a b": tool.AgentPair(None, None, 6.0, 10.0, "wrong")}, 99.0, 2),
-        tool.JoinRun(4, {"a b": tool.AgentPair()}),
+        tool.JoinRun(0, {"a b": tool.JoiningPair(5.0, 9.0, None, 0.0, "right")}, 1.0, 2),
+        tool.JoinRun(1, {"a b": tool.JoiningPair(5.0, 20.0, 4.0, 16.0, "right")}, 3.0, 2),
+        tool.JoinRun(3, {"a b": tool.JoiningPair(None, None, 6.0, 10.0, "wrong")}, 99.0, 2),
+        tool.JoinRun(4, {"a b": tool.JoiningPair()}),
     ]
     head, _, row = (line.strip("| ").split(" | ") for line in tool.table("room", runs).splitlines())
     assert dict(zip(head, row, strict=True)) == {

@@ -49,7 +49,7 @@ WRONG_M, WRONG_RAD = 0.5, float(np.radians(10))
 
 
 @dataclass
-class AgentPair:
+class JoiningPair:
     """Two agents, in seconds since the first keyframe. joined: the first correct merge."""
 
     common: float | None = None
@@ -71,7 +71,7 @@ class JoinRun:
     """pairs: by the names of both. joint_ate_cm: None if no agents were merged."""
 
     seed: int
-    pairs: dict[str, AgentPair] = field(default_factory=dict)
+    pairs: dict[str, JoiningPair] = field(default_factory=dict)
     joint_ate_cm: float | None = None
     agents_in_map: int = 1
 
@@ -87,7 +87,7 @@ class Replay:
         for name, agent in made.agents.items():
             self._mapper.add_run(name, agent.hello)
         for x, y in itertools.combinations(made.agents, 2):
-            self.run.pairs[f"{x} {y}"] = AgentPair()
+            self.run.pairs[f"{x} {y}"] = JoiningPair()
 
     def whole(self) -> JoinRun:
         for t, name, k in order(self._made):
