@@ -30,6 +30,7 @@ from helpers.edge_sim import Person, walls  # noqa: E402
 from raw_wire import unpack  # noqa: E402
 
 from share.net.transport import AgentLink, connect  # noqa: E402
+from share.wire.messages import public_tag  # noqa: E402
 
 NAMES = ("hope", "faith")
 CHUNK = 300  # frames made ahead
@@ -111,6 +112,7 @@ class Honest(crowd.Walker):
         report = self.machine.report()
         return {
             "name": self.name,
+            "tag": public_tag(self._run_id),
             "keyframes": report["keyframes"],
             "open": report["pending"],
             "drop_oldest": report["drop_oldest"],

@@ -154,9 +154,21 @@ def _judge_keyframes(result: Result, stay: Stay) -> None:
             result.expect(
                 kept[:acked] == list(range(acked)), f"{name}: {acked} acknowledged, {len(kept)} in the file"
             )
-        elif name in stay.counts.get("agents", {}) and not agent["open"]:
-            counted = stay.counts["agents"][name]["keyframes"]
+        elif stay.counts and not agent["open"]:
+            counted = _counted_keyframes(stay.counts["agents"], agent)
             result.expect(counted == made, f"{name}: made {made} keyframes, the edge counted {counted}")
+
+
+def _counted_keyframes(rows: dict[str, Any], agent: dict[str, Any]) -> int:
+    """Return the keyframes that edge.json counts for the agent's run. Its name may have passed to an attacker
+    when it left, so the row is found by the run's public tag."""
+    prefix = f"{agent['name']}-"
+    own = [
+        row
+        for row in rows.values()
+        if (tag := row["run"].removeprefix(prefix)) != row["run"] and agent["tag"].startswith(tag)
+    ]
+    return sum(row["keyframes"] for row in own)
 
 
 def judge_latency(result: Result, attacked: Stay, control: Stay, ratio: float, slack_ms: float) -> None:
