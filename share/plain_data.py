@@ -12,8 +12,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from share.checks import checked_pose
 from share.errors import ConfigError
-from share.types import F64, checked_pose
+from share.types import F64
 
 T = TypeVar("T")
 MAX_NUMBER = 1e9  # larger than any meaningful setting; the check also rejects NaN and infinity

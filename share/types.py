@@ -7,12 +7,24 @@ another thread without a copy. Poses are 4x4 matrices `T_a_b` with p_a = T_a_b p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import NDArray
+
+from share.checks import (
+    MAX_ODOM_M,
+    MAX_POSITION_M,
+    MAX_SIGMA,
+    checked_array,
+    checked_cov,
+    checked_id,
+    checked_pose,
+    checked_sigma,
+    checked_stamp,
+    checked_up,
+)
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -21,18 +33,15 @@ I64 = NDArray[np.int64]
 
 DESCRIPTOR_BYTES = 32  # ORB: 256 bits
 
-# Limits, checked on construction so that no computation overflows; no real room or sensor comes near them.
+# Limits, checked on construction; see also `share.checks`.
 MAX_KEYPOINTS = 2000  # per keyframe
 MAX_NAME_LENGTH = 64  # characters, of an agent's name
 MAX_MAP_ID_LENGTH = MAX_NAME_LENGTH + 32  # a run key has up to 17 characters more, a segment number up to 11
-MAX_POSITION_M = 1e5  # m, of a position or a landmark
-MAX_ODOM_M = 1e4  # m from the odometry origin; map poses, composed of several, stay below MAX_POSITION_M
+MAX_JPEG_BYTES = 64_000  # of a keyframe's image
+MAX_PLANE = 1e3  # 1/m, of each component of a surface's plane: 1 mm from the camera
 MAX_UV = 1e3  # normalised image coordinates: 89.9 degrees off the axis
-MAX_ID = 2**31 - 1  # of keyframes, frames and revisions: 13 years at 5 Hz
 MAX_GYRO_RAD_S = 1e3  # twenty times the range of the widest common gyroscope
 MAX_ACCEL_M_S2 = 1e4  # twenty times that of the widest common accelerometer
-MAX_SIGMA = 1e6  # of any quantity, in its unit
-MAX_STAMP_NS = 2**62  # either side of 0: 146 years; differences fit 64 bits
 
 
 class AgentKind(StrEnum):
@@ -78,101 +87,6 @@ _WAIT_TEXTS = {  # for a person, after "waiting for"
     WaitReason.SPEED: "its velocity",
     WaitReason.SCALE: "the scale: move the camera",
 }
-
-
-def checked_array(
-    name: str, value: ArrayLike, shape: tuple[int | None, ...], dtype: DTypeLike, finite: bool = True
-) -> NDArray[Any]:
-    """Return `value` as a read-only array of `dtype`; None in `shape` admits any length.
-
-    Raises ValueError naming the field if the shape differs or (unless `finite=False`) a value is
-    not finite.
-    """
-    array = np.asarray(value, dtype)
-    fits = array.shape == shape or (
-        array.ndim == len(shape)
-        and all(want in (None, have) for have, want in zip(array.shape, shape, strict=True))
-    )
-    if not fits:
-        raise ValueError(f"{name}: shape {array.shape}, expected {shape}")
-    if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{name}: has values that are not finite")
-    array = array.view()
-    array.flags.writeable = False
-    return array
-
-
-def checked_pose(name: str, value: ArrayLike, max_m: float = MAX_POSITION_M) -> F64:
-    """Return `value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (tolerance
-    1e-3) or its translation exceeds `max_m`."""
-    T = checked_array(name, value, (4, 4), np.float64)
-    rows = T.tolist()
-    if not _is_rigid(*rows):
-        raise ValueError(f"{name}: is not a rigid transform")
-    if not max(abs(row[3]) for row in rows) <= max_m:
-        raise ValueError(f"{name}: is more than {max_m:g} m away")
-    return T
-
-
-def checked_id(name: str, value: int, minimum: int = 0) -> int:
-    """Return `value`. Raises ValueError outside `minimum` .. MAX_ID."""
-    if not minimum <= value <= MAX_ID:
-        raise ValueError(f"{name}: {value} is outside {minimum} .. {MAX_ID}")
-    return value
-
-
-def checked_stamp(name: str, value: int) -> int:
-    """Return `value`, ns. Raises ValueError beyond ±MAX_STAMP_NS."""
-    if abs(value) > MAX_STAMP_NS:
-        raise ValueError(f"{name}: {value} ns is beyond any clock")
-    return value
-
-
-def checked_up(name: str, value: ArrayLike) -> F64:
-    """Return `value` as a read-only unit vector (3,), or zeros if unknown. Raises ValueError (tolerance
-    1e-3)."""
-    up = checked_array(name, value, (3,), np.float64)
-    x, y, z = up.tolist()
-    if any(up) and not abs(x * x + y * y + z * z - 1) <= 1e-3:
-        raise ValueError(f"{name}: is not a unit vector")
-    return up
-
-
-def _is_rigid(x: list[float], y: list[float], z: list[float], bottom: list[float]) -> bool:
-    """Return whether the rows of T (4, 4), finite, are a rigid transform. Plain floats, which take a fraction
-    of numpy's time: every pose of every message is checked."""
-    (a, b, c, _), (d, e, f, _), (g, h, i, _), (p, q, r, s) = x, y, z, bottom
-    return (
-        # R R' = 1; squares first: once they are bounded nothing below overflows
-        abs(a * a + b * b + c * c - 1) <= 1e-3
-        and abs(d * d + e * e + f * f - 1) <= 1e-3
-        and abs(g * g + h * h + i * i - 1) <= 1e-3
-        and abs(a * d + b * e + c * f) <= 1e-3
-        and abs(a * g + b * h + c * i) <= 1e-3
-        and abs(d * g + e * h + f * i) <= 1e-3
-        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0  # det R
-        and max(abs(p), abs(q), abs(r), abs(s - 1)) <= 1e-9
-    )
-
-
-def checked_cov(name: str, value: ArrayLike) -> F64:
-    """Return `value` as a read-only covariance (6, 6). Raises ValueError unless symmetric and positive
-    semidefinite: another one would stop the solver for the whole map."""
-    cov = checked_array(name, value, (6, 6), np.float64)
-    size = np.abs(cov).max()
-    if size > 1e12 or np.abs(cov - cov.T).max() > 1e-6 * size:
-        raise ValueError(f"{name}: is not symmetric, or exceeds 1e12")
-    if size and np.linalg.eigvalsh(cov)[0] < -1e-9 * size:
-        raise ValueError(f"{name}: has a negative variance")
-    return cov
-
-
-def checked_sigma(name: str, value: float) -> float:
-    """Return `value` as a float. Raises ValueError if it is negative or exceeds MAX_SIGMA."""
-    sigma = float(value)
-    if not 0 <= sigma <= MAX_SIGMA:
-        raise ValueError(f"{name}: {sigma} is outside 0 .. {MAX_SIGMA:g}")
-    return sigma
 
 
 def _set_fields(obj: object, **values: object) -> None:
@@ -268,7 +182,7 @@ class FeatureStatistics:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The features of a keyframe from which another agent's keyframe recognises and verifies the place.
+    """ORB features of a keyframe, by which another keyframe recognises the place.
 
     uv (N, 2) float32: undistorted normalised coordinates (x/z, y/z) in cam0. points (N, 3)
     float32: m, in cam0, NaN rows where depth is unknown. descriptors (N, 32) uint8: ORB.
@@ -296,6 +210,61 @@ class View:
     def __len__(self) -> int:
         return len(self.uv)
 
+    @staticmethod
+    def empty() -> View:
+        none = np.zeros((0, 3), np.float32)
+        return View(none[:, :2], none, np.zeros((0, DESCRIPTOR_BYTES), np.uint8))
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeImage:
+    """The image of a keyframe, and the features that the tracker knows in it.
+
+    jpeg (B,) uint8: cam0's image as a gray JPEG; empty if there is none. uv (N, 2) float32: features, in
+    undistorted normalised coordinates. plane (N, 3) float32: the surface at each feature, n with n X = 1 for
+    its points X in cam0, 1/m; so n (u, v, 1) is the inverse depth along a ray. rho_sigma (N,) float32:
+    standard deviation of the feature's inverse depth, 1/m.
+    """
+
+    jpeg: U8
+    uv: F32
+    plane: F32
+    rho_sigma: F32
+
+    def __post_init__(self) -> None:
+        n = len(self.uv)
+        if n > MAX_KEYPOINTS:
+            raise ValueError(f"uv: {n} features, at most {MAX_KEYPOINTS}")
+        if len(self.jpeg) > MAX_JPEG_BYTES:
+            raise ValueError(f"jpeg: {len(self.jpeg)} bytes, at most {MAX_JPEG_BYTES}")
+        _set_fields(
+            self,
+            jpeg=checked_array("jpeg", self.jpeg, (None,), np.uint8),
+            uv=checked_array("uv", self.uv, (n, 2), np.float32),
+            plane=checked_array("plane", self.plane, (n, 3), np.float32),
+            rho_sigma=checked_array("rho_sigma", self.rho_sigma, (n,), np.float32),
+        )
+        for name, values, limit in (("uv", self.uv, MAX_UV), ("plane", self.plane, MAX_PLANE)):
+            if (np.abs(values) > limit).any():
+                raise ValueError(f"{name}: values beyond {limit:g}")
+        if not ((self.rho_sigma >= 0) & (self.rho_sigma <= MAX_SIGMA)).all():
+            raise ValueError(f"rho_sigma: outside 0 .. {MAX_SIGMA:g}")
+
+    @property
+    def points(self) -> F32:
+        """The features' points (N, 3) m, in cam0; NaN rows where the inverse depth is not positive."""
+        ray = np.column_stack([self.uv, np.ones(len(self.uv), np.float32)])
+        rho = (ray * self.plane).sum(axis=1, keepdims=True)
+        return np.asarray(ray / np.where(rho > 1 / MAX_POSITION_M, rho, np.nan), np.float32)
+
+    def without_jpeg(self) -> KeyframeImage:
+        return replace(self, jpeg=np.zeros(0, np.uint8))
+
+    @staticmethod
+    def empty() -> KeyframeImage:
+        none = np.zeros((0, 3), np.float32)
+        return KeyframeImage(np.zeros(0, np.uint8), none[:, :2], none, none[:, 0])
+
 
 @dataclass(frozen=True, eq=False)
 class KeyframeCandidate:
@@ -305,7 +274,7 @@ class KeyframeCandidate:
     filter's present estimate, which may differ from that of the two published T_odom_body; for the first of a
     segment it is T_odom_body. cov (6, 6): of T_previous_body. up (3,): unit vector against gravity in the
     body frame, zeros if unknown; up_sigma: of both its angles, rad. new_segment: odometry broke before this
-    keyframe. frames_ago: frames tracked since its own, while its view was extracted.
+    keyframe. view, image: as in `Keyframe`.
     """
 
     T_odom_body: F64
@@ -315,7 +284,12 @@ class KeyframeCandidate:
     up_sigma: float
     view: View
     new_segment: bool = False
-    frames_ago: int = 0
+    image: KeyframeImage = field(default_factory=KeyframeImage.empty)
+
+    @property
+    def points(self) -> F32:
+        """Known points (N, 3) m, in cam0, NaN rows where depth is unknown."""
+        return np.concatenate([self.view.points, self.image.points])
 
     def __post_init__(self) -> None:
         _set_fields(
@@ -330,7 +304,7 @@ class KeyframeCandidate:
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A keyframe on the wire: its pose relative to the previous sent keyframe, and its view.
+    """A keyframe on the wire: its pose relative to the previous sent keyframe, and its image.
 
     id: per agent run, rising from 0. reference: id of the sent keyframe to which T_ref_body (4, 4) and its
     covariance cov (6, 6) are relative, or -1: T_ref_body is T_odom_body and an odometry segment starts.
@@ -338,7 +312,8 @@ class Keyframe:
     accurate, since the filter later improves its past. up (3,): unit vector against gravity in the body
     frame, zeros if unknown; up_sigma: of both its angles, rad. predecessor: id of the keyframe to apply
     before this one, -1 for none; at least the reference, and more at the start of a segment, so that a
-    reordering network cannot make it overtake.
+    reordering network cannot make it overtake. view: its ORB features, if the agent finds them; the edge
+    finds those of a keyframe with an image.
     """
 
     id: int
@@ -351,6 +326,12 @@ class Keyframe:
     up_sigma: float
     view: View
     predecessor: int = -1
+    image: KeyframeImage = field(default_factory=KeyframeImage.empty)
+
+    @property
+    def points(self) -> F32:
+        """Known points (N, 3) m, in cam0, NaN rows where depth is unknown."""
+        return np.concatenate([self.view.points, self.image.points])
 
     def __post_init__(self) -> None:
         checked_id("id", self.id)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from share.checks import MAX_POSITION_M, checked_pose
 from share.geometry import se3
-from share.types import MAX_POSITION_M, checked_pose
 
 T = se3.exp(np.array([0.3, -0.2, 0.9, 4.0, -5.0, 6.0]))
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from share.checks import checked_array, checked_pose
 from share.geometry import se3
 from share.geometry.lens import COEFFICIENT_COUNTS, EQUIDISTANT, RADTAN, Equidistant, Radtan, lens_model
-from share.types import F64, checked_array, checked_pose
+from share.types import F64
 
 MAX_TIMESHIFT_S = 1.0
 BASELINE_RANGE_M = (0.005, 2.0)

@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from share.checks import checked_array, checked_pose
 from share.geometry import se3
-from share.types import F64, checked_array, checked_pose
+from share.types import F64
 
 
 class KeyframeKey(NamedTuple):

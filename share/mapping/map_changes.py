@@ -12,9 +12,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from share.checks import checked_array, checked_cov, checked_pose
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey, Loop
-from share.types import F64, Keyframe, checked_array, checked_cov, checked_pose
+from share.types import F64, Keyframe
 from share.wire.messages import Hello
 
 

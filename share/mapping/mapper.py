@@ -1,7 +1,8 @@
 """The mapper: keyframes in, corrections out.
 
-A keyframe's way (`Mapper._look_up`): query -> review recent merges -> for each candidate verify -> merge
-gate -> agreement of the agents -> loop acceptance. A map that has changed (`Mapper._solve_map`): optimise ->
+A keyframe's way (`Mapper._look_up`): describe its image -> align it with the images near it in its map ->
+query -> review recent merges -> for each candidate verify -> merge gate -> agreement of the agents -> loop
+acceptance. A map that has changed (`Mapper._solve_map`): optimise ->
 localisation gate -> publish corrections. Both are jobs that yield their slow steps, frozen values that the
 caller runs, one of each job at a time. Changes that arrive while a map is being solved are solved together
 afterwards.
@@ -9,7 +10,7 @@ afterwards.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import asdict
 from typing import Any, cast
 
@@ -24,9 +25,12 @@ from share.mapping.map_changes import MapChange, RemoveLoops, SaveLoop, SavePose
 from share.mapping.map_solving import AppliedSolution
 from share.mapping.mapper_counters import MapperCounters
 from share.mapping.query_queue import CandidateSearch, QueryQueue, map_rank, rank_candidates, service_kind
-from share.mapping.recognition.index import KeyframeViews
+from share.mapping.recognition.keyframe_views import KeyframeViews
+from share.mapping.recognition.nearby import nearby_candidates
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.steps import (
+    AlignStep,
+    DescribeStep,
     Job,
     LookupStep,
     MapEvent,
@@ -41,6 +45,7 @@ from share.scheduling.merge_gate import MergeGate
 from share.types import Keyframe
 from share.wire.messages import Hello
 
+_RECHECK_INTERVAL = 4  # every fourth keyframe is compared by its looks too where the map seems right
 _RETRY_INTERVAL = 4  # nodes of every fourth id are compared with those of agents that are kept apart too
 
 
@@ -144,14 +149,24 @@ class Mapper:
             return None
         self._views.index_restored()
         while (step := self._lookup.next_step()) is None:
-            node_id = self._queries.next_query()
-            if node_id is None and len(self.atlas.map_sizes()) > 1:
-                node_id = self._queries.next_skipped()  # too late for an answer, but it may merge maps
-            if node_id is None:
+            if (job := self._next_job()) is None:
                 return None
-            if node_id in self._views.by_node:
-                self._lookup.start(self._look_up(node_id))
+            self._lookup.start(job)
         return cast(LookupStep, step)
+
+    def _next_job(self) -> Job | None:
+        """Next keyframe to look up, or to describe for later queries."""
+        while (node_id := self._next_query()) is not None:
+            if node_id in self._views.by_node:
+                return self._look_up(node_id)
+        node_id = self._views.next_undescribed()
+        return None if node_id is None else self._describe(node_id)
+
+    def _next_query(self) -> int | None:
+        node_id = self._queries.next_query()
+        if node_id is None and len(self.atlas.map_sizes()) > 1:
+            node_id = self._queries.next_skipped()  # too late for an answer, but it may merge maps
+        return node_id
 
     def next_solve(self) -> SolveStep | None:
         """Next map to solve; None if there is none or one is running."""
@@ -181,8 +196,42 @@ class Mapper:
     # A keyframe's way through the map
 
     def _look_up(self, node_id: int) -> Job:
+        """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
+        yield from self._describe(node_id)
+        is_aligned = yield from self._align_nearby(node_id)
+        if is_aligned and len(self.atlas.map_sizes()) == 1 and node_id % _RECHECK_INTERVAL:
+            return  # the map is right here, and there is no other to find
+        yield from self._query(node_id)
+
+    def _describe(self, node_id: int) -> Job:
+        """Find the ORB features of a keyframe that came as an image only."""
+        if (image := self._views.undescribed_image(node_id)) is not None:
+            self._views.describe(node_id, (yield DescribeStep(node_id, image)))
+            yield []
+
+    def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
+        """Align the images of keyframes near this one by the map's poses. Return whether one did."""
+        views, is_aligned = self._views, False
+        if views.image(node_id) is None:
+            return False
+        for candidate in nearby_candidates(self.atlas.graph, node_id, views.with_image())[
+            : 1 if self._queries.is_hurried else None
+        ]:
+            images = views.image(node_id), views.image(candidate)
+            if images[0] is None or images[1] is None:
+                continue  # removed meanwhile
+            T_c_q = self.atlas.graph.relative_pose(candidate, node_id)
+            outcome = yield AlignStep(node_id, images[0], candidate, images[1], T_c_q)
+            is_kept = {node_id, candidate} <= views.by_node.keys()
+            is_aligned |= isinstance(outcome, Verification)
+            yield self._judge_candidate(None, node_id, candidate, outcome) if is_kept else []
+        return is_aligned
+
+    def _query(self, node_id: int) -> Job:
         """Query with a keyframe and verify the candidates; each verified loop is gated, checked and added."""
         agent, views, place = self.atlas.key(node_id).agent, self._views.by_node, self._config.place
+        if node_id not in views:
+            return
         excluded = self.atlas.graph.odometry.neighbours(node_id)
         if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
             excluded += self.atlas.quarantine.quarantined_nodes(agent)
@@ -197,7 +246,10 @@ class Mapper:
             if not {node_id, candidate} <= views.keys():
                 continue  # removed meanwhile
             try:
-                outcome = yield VerifyStep(node_id, views[node_id], candidate, views[candidate], place)
+                images = self._views.image(node_id), self._views.image(candidate)
+                outcome = yield VerifyStep(
+                    node_id, views[node_id], candidate, views[candidate], place, *images
+                )
                 is_kept = {node_id, candidate} <= views.keys()
                 events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
             except Exception as error:  # costs this candidate only
@@ -205,7 +257,7 @@ class Mapper:
             yield events
 
     def _judge_candidate(
-        self, search: CandidateSearch, node_id: int, candidate: int, outcome: Verification | Refusal
+        self, search: CandidateSearch | None, node_id: int, candidate: int, outcome: Verification | Refusal
     ) -> list[MapEvent]:
         """Decide on a verified candidate: count, gate, compare the agents, check the loop and add it."""
         atlas, a, b = self.atlas, self.atlas.key(candidate), self.atlas.key(node_id)
@@ -213,7 +265,7 @@ class Mapper:
         counters.loops_tried += 1
         if isinstance(outcome, Refusal):
             return [MapEvent(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
-        if not atlas.quarantine.agreement.are_separated(a.agent, b.agent):
+        if search is not None and not atlas.quarantine.agreement.are_separated(a.agent, b.agent):
             search.count_verified()
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
         counters.merges["requested"] += 1

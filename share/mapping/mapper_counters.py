@@ -8,6 +8,7 @@ from typing import Any
 
 from share.metrics.frame_log import summary
 
+STEP_KINDS = "describe", "place", "verify", "align", "solve"
 _MAX_STEP_TIMES = 5000  # newest durations of each kind of step in a report
 
 
@@ -35,7 +36,7 @@ class MapperCounters:
         self.steps: Counter[str] = Counter()
         self.removed_keyframes = self.failed_steps = 0
         self._removed_runs = RunCounters()
-        self._step_ms = {kind: deque[float](maxlen=_MAX_STEP_TIMES) for kind in ("place", "verify", "solve")}
+        self._step_ms = {kind: deque[float](maxlen=_MAX_STEP_TIMES) for kind in STEP_KINDS}
 
     def add_run(self, agent: str) -> None:
         self.runs[agent] = RunCounters()

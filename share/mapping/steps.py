@@ -12,8 +12,21 @@ from share.config import PlaceConfig
 from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.map_solving import SolveJob
 from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
+from share.mapping.recognition.patch_alignment import ImageView, align_from_map, align_verified
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
-from share.types import F64, Correction
+from share.types import F64, Correction, View
+
+
+@dataclass(frozen=True, eq=False)
+class DescribeStep:
+    """Find the ORB features of a keyframe's image."""
+
+    node_id: int
+    image: ImageView
+    kind: str = "describe"
+
+    def run(self) -> View:
+        return self.image.describe()
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +46,40 @@ class QueryStep:
 
 @dataclass(frozen=True, eq=False)
 class VerifyStep:
-    """Verify one candidate: relative pose, or a refusal."""
+    """Verify one candidate by its ORB features, and align the images where there are any: relative pose, or a
+    refusal."""
 
     node_id: int
     query_view: CameraView
     candidate_id: int
     candidate_view: CameraView
     config: PlaceConfig
+    query_image: ImageView | None = None
+    candidate_image: ImageView | None = None
     kind: str = "verify"
 
     def run(self) -> Verification | Refusal:
-        return verify(self.query_view, self.candidate_view, self.config)
+        verified = verify(self.query_view, self.candidate_view, self.config)
+        if isinstance(verified, Refusal) or self.query_image is None or self.candidate_image is None:
+            return verified
+        return align_verified(verified, self.query_image, self.candidate_image)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignStep:
+    """Verify a candidate of the same map: align the images from the pose that the map has.
+
+    T_c_q (4, 4): body of the keyframe in the candidate's body frame."""
+
+    node_id: int
+    query_image: ImageView
+    candidate_id: int
+    candidate_image: ImageView
+    T_c_q: F64
+    kind: str = "align"
+
+    def run(self) -> Verification | Refusal:
+        return align_from_map(self.T_c_q, self.query_image, self.candidate_image)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +96,8 @@ class SolveStep:
         return solver.solve(self.job.anchor, self.job.covariance_nodes)
 
 
-LookupStep = QueryStep | VerifyStep
-Step = QueryStep | VerifyStep | SolveStep
+LookupStep = DescribeStep | QueryStep | VerifyStep | AlignStep
+Step = LookupStep | SolveStep
 
 # Yields in turn a step, whose result or exception it is sent, and the events that follow from it.
 Job = Generator[Any, Any, None]

@@ -34,7 +34,16 @@ from share.odometry.relocalisation import LocalMap
 from share.odometry.state import FilterState, twist
 from share.odometry.tilt_realignment import TiltRealignment
 from share.odometry.track_result import TrackResult, finite_median
-from share.types import F64, FeatureStatistics, Frame, ImuBatch, KeyframeCandidate, TrackState, WaitReason
+from share.types import (
+    F64,
+    FeatureStatistics,
+    Frame,
+    ImuBatch,
+    KeyframeCandidate,
+    TrackState,
+    View,
+    WaitReason,
+)
 from share.vision import corners
 from share.vision.orb import measures_depth
 
@@ -71,7 +80,7 @@ class InertialTracker:
         self._has_published = False
         self._knows_up = False  # the state began with IMU samples
         self._new_segment = False  # the next keyframe begins a segment
-        self._keyframes = KeyframeScheduler(rig, config, tracker_config.view_features)
+        self._keyframes = KeyframeScheduler(config)
         self._realignment = TiltRealignment()
         self._local_map = LocalMap()  # for relocalisation
         self._tracker_config = tracker_config
@@ -109,10 +118,8 @@ class InertialTracker:
         return result
 
     def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
-        """Return the keyframe to publish; call it where `track` says that one is ready.
-
-        It is this frame's, or that of a frame shortly before, whose view is complete by now.
-        """
+        """Return the frame just tracked as a keyframe to publish; call it where `track` says that one is
+        ready."""
         assert self._landmarks is not None
         new_segment, self._new_segment = self._new_segment, False
         published = self._keyframes.publish(self._landmarks, new_segment)
@@ -123,13 +130,13 @@ class InertialTracker:
             published.cov,
             published.T_odom_body[2, :3] if knows_up else np.zeros(3),
             published.tilt_sigma / np.sqrt(2),  # of both angles -> of each
-            published.view,
+            View.empty(),
             new_segment,
-            published.frames_ago,
+            published.surfaces.with_image(frame.image0),
         )
 
     def finish_keyframe(self) -> None:
-        """Run a slice of the pending keyframe work: view, new features, the local map.
+        """Run a slice of the pending keyframe work: new features, the local map.
 
         Call it when the pose, and the candidate if there is one, are sent; otherwise the next `track` calls
         it first.
@@ -142,13 +149,12 @@ class InertialTracker:
         if offered is not None and not self._divergence.is_suspected:
             T_odom_body = s.keyframe_poses[filter.keyframe_index(s, offered.keyframe_id)]
             self._local_map.add_keyframe(offered.frame.image0, T_odom_body @ s.T_body_cam)
-            self._local_map.set_view(offered.view)
+            self._local_map.set_surfaces(offered.surfaces.with_image(None))
 
     def feature_statistics(self) -> FeatureStatistics:
-        """Return the statistics of the frame of the keyframe that is ready; without one, of the frame just
-        tracked, which must have a pose."""
+        """Return the statistics of the frame just tracked, which must have a pose."""
         assert self._landmarks is not None
-        return self._keyframes.statistics or self._landmarks.feature_statistics()
+        return self._landmarks.feature_statistics()
 
     def reset_after_failure(self, frame: Frame) -> None:
         """Start again: something failed in or after `frame`, the last, and the state may be corrupt."""
@@ -251,10 +257,8 @@ class InertialTracker:
             self._realignment.update(s)
         pose, cov = self._published_pose(s), filter.pose_cov(s)
         if wants_keyframe or is_first:
-            publish = not is_first and self._keyframes.may_publish(frame.stamp_ns)
+            publish = is_first or self._keyframes.may_publish(frame.stamp_ns)
             self._keyframes.add(frame, landmarks, self._imu.rate, count < WEAK, publish)
-            if is_first:
-                self._keyframes.publish_at_once(landmarks)
         is_ready = self._keyframes.is_ready
         return TrackResult(state, pose, is_ready, count, new_segment, cov, self._consistency.is_consistent)
 

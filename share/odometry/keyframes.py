@@ -1,10 +1,9 @@
 """Keyframes of a tracker with IMU: when to make one, what is published of it, and its work, in slices.
 
-A keyframe's pose joins the state at once. All else is done after the poses of this frame and the next ones
-are published, one slice a frame (more at low frame rates), so that no frame waits for all of it: the view to
-publish, if the keyframe is published, reactivation of dormant features, corners in free areas, and their
-depth. A view is published at a fixed frame, and new features are searched from a fixed frame on, however long
-a slice takes.
+A keyframe's pose joins the state at once, and what is published of it is known. All else is done after the
+poses of this frame and the next ones are published, one slice a frame (more at low frame rates), so that no
+frame waits for all of it: reactivation of dormant features, corners in free areas, and their depth. New
+features are searched from a fixed frame on, however long a slice takes.
 """
 
 from __future__ import annotations
@@ -18,13 +17,12 @@ import numpy as np
 
 from share.config import InertialConfig
 from share.geometry import se3
-from share.geometry.camera import Rig
 from share.odometry import filter
 from share.odometry.initialisation import tilt_sigma
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.state import FilterState
-from share.types import F32, F64, FeatureStatistics, Frame, View
-from share.vision.orb import ViewBuilder
+from share.types import F32, F64, Frame
+from share.vision.keyframe_images import Surfaces
 
 KEYFRAME_GAP_NS = 100_000_000  # least time between keyframes
 
@@ -99,19 +97,17 @@ _PUBLISH_GAP_NS = 400_000_000  # minimum between published keyframes
 _SLICE_PERIOD_NS = 30_000_000  # of the time between frames: two slices a frame at 15 Hz, one at 20 and at 30
 
 
-class PublishedView(NamedTuple):
-    """A keyframe's view, pose T_odom_body (4, 4) and tilt sigma, rad, by the present state.
+class PublishedKeyframe(NamedTuple):
+    """A keyframe's surfaces, pose T_odom_body (4, 4) and tilt sigma, rad, by the present state.
 
     T_previous_body (4, 4): motion since the keyframe published before, with its covariance (6, 6).
-    frames_ago: frames tracked since its own.
     """
 
-    view: View
+    surfaces: Surfaces
     T_odom_body: F64
     tilt_sigma: float
     T_previous_body: F64
     cov: F64
-    frames_ago: int
 
 
 class OfferedKeyframe(NamedTuple):
@@ -119,26 +115,20 @@ class OfferedKeyframe(NamedTuple):
 
     frame: Frame
     keyframe_id: int
-    view: View
+    surfaces: Surfaces
 
 
 @dataclass(eq=False)
 class _PendingKeyframe:
     """A keyframe with work left.
 
-    occupied_px (N, 2): positions near which no new feature is searched. corners: of new features. frames_ago:
-    frames tracked since its own. view, statistics: only if it is to be published; is_ready: the view is
-    complete.
+    occupied_px (N, 2): positions near which no new feature is searched. corners: of new features.
     """
 
     frame: Frame
     keyframe_id: int
     occupied_px: F32
     corners: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    frames_ago: int = 0
-    view: ViewBuilder | None = None
-    statistics: FeatureStatistics | None = None
-    is_ready: bool = False
 
 
 # The frame is the one just tracked; the rate (3,) is the body's then.
@@ -149,14 +139,13 @@ Slice = list[tuple[KeyframeStep, _PendingKeyframe]]
 class KeyframeScheduler:
     """Schedules the work of one tracker's keyframes."""
 
-    def __init__(self, rig: Rig, config: InertialConfig, view_features: int) -> None:
-        self._rig, self._view_features = rig, view_features
+    def __init__(self, config: InertialConfig) -> None:
         self._spacing = KeyframeSpacing(config.keyframe_m, config.keyframe_rad, _MIN_SEEN_SHARE)
         self._last_published = LastPublishedKeyframe()
         self._published_ns = self._processed_ns = 0
         self._offered: OfferedKeyframe | None = None
-        self._newest_pending: _PendingKeyframe | None = None
-        self._to_publish: _PendingKeyframe | None = None
+        self._newest: _PendingKeyframe | None = None
+        self._to_publish: _PendingKeyframe | None = None  # the frame just tracked
         self._slices: deque[Slice] = deque()
 
     def wants_keyframe(self, stamp_ns: int, T_odom_body: F64, inlier_count: int) -> bool:
@@ -178,78 +167,45 @@ class KeyframeScheduler:
         """Make the frame just tracked a keyframe, if it is not one: its pose now, the rest in
         `process_pending` after the work of earlier ones.
 
-        publish: publish it when its view is made, which then comes first. urgent: add all new features in the
-        next slice, because few are left.
+        publish: offer it for publishing. urgent: add all new features in the next slice, because few are
+        left.
         """
-        if frame.stamp_ns == self._spacing.stamp_ns:
-            return
-        keyframe_id = landmarks.add_keyframe(rate)
-        self._spacing.stamp_ns, self._spacing.T = frame.stamp_ns, landmarks.state.T
-        pending = self._newest_pending = _PendingKeyframe(frame, keyframe_id, landmarks.occupied_px())
-        features: Slice = [
-            (step, pending) for step in (self._reactivate, self._find_corners, self._add_features)
-        ]
-        view: Slice = (
-            [(step, pending) for step in (self._detect_view, self._describe_view)] if publish else []
-        )
-        if view and self._slice_count(frame) == 1:
-            view[-1] = (self._describe_and_measure, pending)
+        if frame.stamp_ns != self._spacing.stamp_ns:
+            keyframe_id = landmarks.add_keyframe(rate)
+            self._spacing.stamp_ns, self._spacing.T = frame.stamp_ns, landmarks.state.T
+            pending = self._newest = _PendingKeyframe(frame, keyframe_id, landmarks.occupied_px())
+            steps: Slice = [
+                (step, pending) for step in (self._reactivate, self._find_corners, self._add_features)
+            ]
+            if not urgent:
+                self._slices.extend([step] for step in steps)
+            elif self._slices:
+                self._slices[0][:0] = steps
+            else:
+                self._slices.append(steps)
         if publish:
-            self._start_publishing(landmarks)
-        if not urgent:
-            self._slices.extend([step] for step in [*view, *features])
-            return
-        if self._slices:
-            self._slices[0][:0] = features
-        else:
-            self._slices.append(features)
-        self._slices.extend([step] for step in view)
-
-    def publish_at_once(self, landmarks: LandmarkMap) -> None:
-        """Publish the newest keyframe, which is the frame just tracked, now."""
-        self._start_publishing(landmarks).is_ready = True
-
-    def _start_publishing(self, landmarks: LandmarkMap) -> _PendingKeyframe:
-        pending = self._to_publish = self._newest_pending
-        assert pending is not None
-        self._published_ns, pending.statistics = pending.frame.stamp_ns, landmarks.feature_statistics()
-        pending.view = ViewBuilder(
-            pending.frame, self._rig, self._view_features, landmarks.known_depths(pending.frame)
-        )
-        return pending
+            self._to_publish, self._published_ns = self._newest, frame.stamp_ns
 
     def may_publish(self, stamp_ns: int) -> bool:
         """Return whether another keyframe may be published."""
-        return self._to_publish is None and stamp_ns - self._published_ns >= _PUBLISH_GAP_NS
+        return stamp_ns - self._published_ns >= _PUBLISH_GAP_NS
 
     @property
     def is_ready(self) -> bool:
-        """Whether a keyframe is ready to be published."""
-        return self._to_publish is not None and self._to_publish.is_ready
+        """Whether the frame just tracked is a keyframe to publish."""
+        return self._to_publish is not None
 
-    @property
-    def statistics(self) -> FeatureStatistics | None:
-        """The feature statistics of the keyframe that is ready; None without one."""
-        pending = self._to_publish
-        return pending.statistics if pending is not None and pending.is_ready else None
-
-    def publish(self, landmarks: LandmarkMap, new_segment: bool) -> PublishedView:
+    def publish(self, landmarks: LandmarkMap, new_segment: bool) -> PublishedKeyframe:
         """Return the keyframe that is ready. Raises ValueError without one."""
         pending, s = self._to_publish, landmarks.state
-        if pending is None or pending.view is None or not pending.is_ready:
+        if pending is None:
             raise ValueError("no keyframe is ready")
-        view = pending.view.finish()
-        self._offered = OfferedKeyframe(pending.frame, pending.keyframe_id, view)
+        surfaces = landmarks.surfaces(pending.frame)
+        self._offered = OfferedKeyframe(pending.frame, pending.keyframe_id, surfaces)
         k = filter.keyframe_index(s, pending.keyframe_id)
         T_previous_body, cov = self._last_published.motion_to(s, k, new_segment)
-        return PublishedView(
-            view,
-            s.keyframe_poses[k],
-            tilt_sigma(s, s.keyframe_columns(k)),
-            T_previous_body,
-            cov,
-            pending.frames_ago,
-        )
+        tilt = tilt_sigma(s, s.keyframe_columns(k))
+        return PublishedKeyframe(surfaces, s.keyframe_poses[k], tilt, T_previous_body, cov)
 
     def process_pending(self, landmarks: LandmarkMap, frame: Frame, rate: F64) -> OfferedKeyframe | None:
         """Run the slices that there is time for after `frame`, the frame just tracked; at least one. Once a
@@ -262,11 +218,9 @@ class KeyframeScheduler:
             # Not before: making its candidate might have failed.
             self._last_published.update(landmarks.state, offered.keyframe_id)
         slices = self._slice_count(frame)
-        if self._to_publish is not None:
-            self._to_publish.frames_ago += 1
-            if self._to_publish.is_ready:  # it was published, or not asked for
-                self._to_publish = None
-                slices -= 1  # publishing took the time of one
+        if self._to_publish is not None:  # it was published, or not asked for
+            self._to_publish = None
+            slices -= 1  # publishing took the time of one
         self._processed_ns = frame.stamp_ns
         for _ in range(max(1, slices)):
             if not self._slices:
@@ -280,7 +234,7 @@ class KeyframeScheduler:
 
     def reset(self) -> None:
         """Drop all pending work: the filter begins anew, with new keyframe ids."""
-        self._offered = self._newest_pending = self._to_publish = None
+        self._offered = self._newest = self._to_publish = None
         self._slices.clear()
         self._last_published.reset()
 
@@ -293,8 +247,7 @@ class KeyframeScheduler:
     ) -> None:
         reactivated_px = landmarks.reactivate(last_frame, rate)
         pending.occupied_px = np.concatenate([pending.occupied_px, reactivated_px])
-        to_publish_id = -1 if self._to_publish is None else self._to_publish.keyframe_id
-        landmarks.drop_keyframes((self._last_published.keyframe_id, to_publish_id))
+        landmarks.drop_keyframes((self._last_published.keyframe_id,))
 
     def _find_corners(
         self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
@@ -306,23 +259,3 @@ class KeyframeScheduler:
     ) -> None:
         landmarks.admit_features(pending.frame, pending.keyframe_id, pending.corners)
         self._spacing.feature_count = len(landmarks.state.feature_ids)
-
-    def _detect_view(
-        self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
-    ) -> None:
-        if pending.view is not None:
-            pending.view.detect()
-
-    def _describe_view(
-        self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
-    ) -> None:
-        if pending.view is not None:
-            pending.view.describe()
-            pending.is_ready = True
-
-    def _describe_and_measure(
-        self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
-    ) -> None:
-        self._describe_view(pending, landmarks, last_frame, rate)
-        if pending.view is not None:
-            pending.view.measure_half()

@@ -19,6 +19,7 @@ from share.odometry.state import FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
 from share.vision import corners
 from share.vision.corners import field_mask
+from share.vision.keyframe_images import Surfaces
 from share.vision.orb import measures_depth
 
 LASTING_PX = 0.3  # persistent error of a feature: edges, patches seen from elsewhere
@@ -34,6 +35,7 @@ _SLANT_PERIOD = 4  # frames between updates of a feature's slant
 _MIN_RHO, _MIN_DEPTH_M = 0.03, 0.2  # 1/m; m
 _UNKNOWN_RHO_SIGMA = 0.05  # 1/m; half a pixel a frame at walking speed
 _KNOWN_DEPTH_RATIO = 0.1  # relative sigma of a known inverse depth
+_MIN_PLANE_OFFSET = 0.05  # share of the distance to a surface's plane that is left: nearer is seen edge on
 _ACTIVE_FEATURES_COST = 100.0  # added to the distance of a keyframe that anchors features in view
 
 
@@ -95,11 +97,22 @@ class LandmarkMap:
         self.keep_features(inliers)
         self._last_matches = matches, inliers, self.state.feature_ids
 
-    def known_depths(self, frame: Frame) -> tuple[F32, F64]:
-        """Return px (N, 2) and depth (N,) m of the features in `frame`, the last one; where it measures no
-        depth, only well-known ones."""
-        known = self._has_known_depth() | measures_depth(frame, self._rig)
-        return self.appearance.last_px[known], self._depths()[known]
+    def surfaces(self, frame: Frame) -> Surfaces:
+        """Return the surfaces of the features in `frame`, the one just tracked; where it measures no depth,
+        of those with a well-known one."""
+        s, appearance = self.state, self.appearance
+        T_cam_anchor = feature_matching.anchors_in_camera(s)
+        T_anchor_cam = se3.inverse(T_cam_anchor)
+        slope = (np.linalg.inv(appearance.ray_per_px).swapaxes(1, 2) @ appearance.slant[:, :, None])[:, :, 0]
+        plane = np.column_stack([slope, s.rho - (slope * s.ray).sum(axis=1)])  # in the anchor: plane X = 1
+        offset = 1 - (plane * T_anchor_cam[:, :3, 3]).sum(axis=1)
+        plane = (T_anchor_cam[:, :3, :3].swapaxes(1, 2) @ plane[:, :, None])[:, :, 0] / offset[:, None]
+        ray_z = (T_cam_anchor[:, 2, :3] * rays(s.ray)).sum(axis=1)
+        rho_scale = ray_z / (ray_z + s.rho * T_cam_anchor[:, 2, 3]) ** 2  # d rho here / d rho in the anchor
+        uv = self._rig.cam0.normalise(appearance.last_px.astype(np.float64))
+        found = Surfaces(uv, plane, np.sqrt(s.rho_variance) * np.abs(rho_scale))
+        is_known = self._has_known_depth() | measures_depth(frame, self._rig)
+        return found.take(is_known & (offset > _MIN_PLANE_OFFSET) & found.is_valid())
 
     def feature_statistics(self) -> FeatureStatistics:
         """Return the statistics of the last frame, empty for the first one."""

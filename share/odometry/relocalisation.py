@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from share.geometry import se3
 from share.geometry.absolute_pose import RansacOptions, absolute_pose
 from share.geometry.camera import Camera, Rig
-from share.types import F32, F64, I64, U8, Frame, View
+from share.types import F32, F64, I64, U8, Frame, KeyframeImage, View
 from share.vision.corners import UNIFORM_FIELD_DEG, field_mask
 from share.vision.matching import match_descriptors
-from share.vision.orb import detect_orb
+from share.vision.orb import detect_orb, image_view
 
 # Pose of a camera from known points: RANSAC, then weighted least squares.
 
@@ -99,17 +99,21 @@ def reprojection_residuals(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F6
 MAX_KEYFRAMES = 60  # of the local map; a full one drops the keyframe closest to another
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class LocalKeyframe:
     """A keyframe of the local map: its image, in which patches of points are found, its pose T_odom_cam (4,
-    4), and its ORB view.
-
-    view: for relocalisation; None until it is made.
-    """
+    4), and the surfaces in it, for relocalisation; None until they are known."""
 
     image: U8
     T_odom_cam: F64
-    view: View | None = None
+    surfaces: KeyframeImage | None = None
+    _view: View | None = None
+
+    def view(self, camera: Camera, count: int) -> View:
+        """Return its ORB view; made when first needed, since an agent is seldom LOST."""
+        if self._view is None and self.surfaces is not None:
+            self._view = image_view(self.image, camera, self.surfaces, count)
+        return View.empty() if self._view is None else self._view
 
 
 class LocalMap:
@@ -137,10 +141,9 @@ class LocalMap:
         self.keyframes[keyframe_id] = LocalKeyframe(image, T_odom_cam)
         return keyframe_id
 
-    def set_view(self, view: View) -> None:
-        """Set the view of the newest keyframe."""
-        newest = self._next_keyframe - 1
-        self.keyframes[newest] = replace(self.keyframes[newest], view=view)
+    def set_surfaces(self, surfaces: KeyframeImage) -> None:
+        """Set the surfaces in the newest keyframe."""
+        self.keyframes[self._next_keyframe - 1].surfaces = surfaces
 
     def add_points(self, anchor: int, points: F64, px: F32) -> I64:
         """Add points (N, 3) m in odom, seen at px (N, 2) in keyframe `anchor`. Return their ids (N,)."""
@@ -230,7 +233,11 @@ def relocalise(keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, view_
     """
     px, descriptors = detect_orb(frame.image0, view_features, mask=field_mask(rig.cam0, UNIFORM_FIELD_DEG))
     uv = rig.cam0.normalise(px.astype(np.float64))
-    estimates = (_match_keyframe(keyframe, uv, descriptors, rig.cam0.focal) for keyframe in keyframes)
+    views = [keyframe.view(rig.cam0, view_features) for keyframe in keyframes]
+    estimates = [
+        _match_view(view, keyframe.T_odom_cam, uv, descriptors, rig.cam0.focal)
+        for view, keyframe in zip(views, keyframes, strict=True)
+    ]
     best = max(
         (estimate for estimate in estimates if estimate is not None),
         key=lambda f: f.inliers.sum(),
@@ -241,15 +248,11 @@ def relocalise(keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, view_
     return se3.inverse(best.T)
 
 
-def _match_keyframe(keyframe: LocalKeyframe, uv: F64, descriptors: U8, focal: float) -> PoseEstimate | None:
-    if keyframe.view is None:
-        return None
-    with_depth = np.flatnonzero(~np.isnan(keyframe.view.points[:, 0]))
-    pairs = match_descriptors(
-        descriptors, keyframe.view.descriptors[with_depth], MAX_HAMMING_BITS, MATCH_RATIO
-    )
-    points = keyframe.view.points[with_depth[pairs[:, 1]]].astype(np.float64)
-    points, matched_uv = se3.transform(keyframe.T_odom_cam, points), uv[pairs[:, 0]]
+def _match_view(view: View, T_odom_cam: F64, uv: F64, descriptors: U8, focal: float) -> PoseEstimate | None:
+    with_depth = np.flatnonzero(~np.isnan(view.points[:, 0]))
+    pairs = match_descriptors(descriptors, view.descriptors[with_depth], MAX_HAMMING_BITS, MATCH_RATIO)
+    points = view.points[with_depth[pairs[:, 1]]].astype(np.float64)
+    points, matched_uv = se3.transform(T_odom_cam, points), uv[pairs[:, 0]]
     initial = ransac_pose(points, matched_uv, focal, RANSAC_PX)
     if initial is None:
         return None

@@ -43,10 +43,12 @@ from share.types import (
 )
 from share.vision import corners, optical_flow
 from share.vision.corners import UNIFORM_FIELD_DEG, field_mask
-from share.vision.orb import make_view, measure_depth
+from share.vision.keyframe_images import Surfaces
+from share.vision.orb import measure_depth
 
 KEYFRAME_M, KEYFRAME_RAD = 0.15, 0.15  # motion since the last keyframe that triggers a new one
 _UP_SIGMA_RAD = float(np.radians(3.0))  # of a candidate's up, which is 0: not known
+_SIGMA_RHO = 0.01  # 1/m, of a point's inverse depth
 _MIN_TRACKED_SHARE = 0.6  # a smaller share of its features still tracked triggers one too
 _SPACING_PX = 14.0  # least distance between corners
 _WEAK_INLIERS = 40  # features that agree with a pose; fewer: WEAK
@@ -91,7 +93,7 @@ class VisualTracker:
         self._new_segment = True  # of the last keyframe
         self._T_last_published = np.eye(4)  # T_odom_body of the last published keyframe
         self._keyframe_pending = False  # the last frame is to become a keyframe of the local map
-        self._offered: tuple[Frame, View] | None = None
+        self._offered: tuple[Frame, Surfaces] | None = None
         self._lost_since_ns: int | None = None
         self._round_robin = relocalisation.RoundRobin()
 
@@ -113,25 +115,37 @@ class VisualTracker:
 
         It is separate from `track` so that a headset has its pose before.
         """
-        view = make_view(frame, self._rig, self._config.view_features)
+        surfaces = self._surfaces()
         new_segment = self._new_segment and not self._keyframe_pending
         T_odom_body = self._T_odom_body()
         T_previous_body = T_odom_body if new_segment else se3.inverse(self._T_last_published) @ T_odom_body
         cov = se3.compose_cov(self._T_cam_body, self._cov, np.zeros((6, 6)))
-        self._offered = frame, view
+        self._offered = frame, surfaces
+        image = surfaces.with_image(frame.image0)
+        up = np.zeros(3)
         return KeyframeCandidate(
-            T_odom_body, T_previous_body, cov, np.zeros(3), _UP_SIGMA_RAD, view, new_segment
+            T_odom_body, T_previous_body, cov, up, _UP_SIGMA_RAD, View.empty(), new_segment, image
         )
+
+    def _surfaces(self) -> Surfaces:
+        """Return the surfaces at the points in the last frame, taken to face the camera."""
+        assert self._T_odom_cam is not None
+        points = self.local_map.points[self.local_map.row_indices(self._tracks.ids)]
+        rho = 1 / se3.transform(se3.inverse(self._T_odom_cam), points)[:, 2]
+        plane = np.column_stack([np.zeros((len(rho), 2)), rho])
+        uv = self._rig.cam0.normalise(self._tracks.px.astype(np.float64))
+        found = Surfaces(uv, plane, np.full(len(rho), _SIGMA_RHO))
+        return found.take(found.is_valid())
 
     def finish_keyframe(self) -> None:
         """Add the last keyframe to the local map; see `InertialTracker.finish_keyframe`."""
         if self._offered is None:
             return
-        (frame, view), self._offered = self._offered, None
+        (frame, surfaces), self._offered = self._offered, None
         self._T_last_published = self._T_odom_body()  # not before: making its candidate might have failed
         if self._keyframe_pending:
             self._add_keyframe(frame)
-        self.local_map.set_view(view)
+        self.local_map.set_surfaces(surfaces.with_image(None))
 
     def reset_after_failure(self, frame: Frame) -> None:
         """Declare LOST: something failed in or after `frame`, the last."""

@@ -6,7 +6,7 @@ unchanged: the edge only moves the map under it.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -29,7 +29,6 @@ HELLO_S = 0.5  # interval of hellos, until welcomed
 REFUSED_S = 5.0  # a running agent that was refused asks again after this
 RATE_BURST = 2.0  # keyframes that may be saved up under a rate limit
 _MIN_RATE_HZ = 0.1  # that an edge cannot undercut: without keyframes it could not evaluate again
-_RECENT_FRAMES = 8  # frames among which a candidate's own is found
 _COUNTERS = (
     *("bytes_up", "bytes_down", "bad_messages", "poses", "candidates", "drop_rate"),
     *("corrections", "corrections_stale"),
@@ -62,7 +61,6 @@ class Agent:
         self._ledger = KeyframeLedger(config.agent.keep_keyframes, config.link.window)
         self._localisation = MapLocalisation(config.agent.blend_s)
         self._self_evaluation = SelfEvaluation()
-        self._recent_frames: deque[ev.FrameTracked] = deque(maxlen=_RECENT_FRAMES)
         self._status_reporter = StatusReporter(self.slow_text)
         # the edge
         self._is_connected = False
@@ -157,7 +155,6 @@ class Agent:
 
     def _on_frame_tracked(self, frame: ev.FrameTracked) -> None:
         self._status_reporter.add_frame(frame, self._now_ns)
-        self._recent_frames.append(frame)
         if frame.new_segment:
             self._keyframe_chain.begin_segment()
             self._localisation.begin_segment()
@@ -178,16 +175,14 @@ class Agent:
         if candidate is None:
             self._finish_frame(replace(frame, is_keyframe=False), sent=False)
             return
-        source_frame = self._recent_frames[-1 - candidate.frames_ago]
         self._counts["candidates"] += 1
-        # since the newest frame: extracting the view of an earlier frame delays no pose
         self._self_evaluation.add_processing_time((self._now_ns - frame.arrived_ns) / 1e6)
         self._keyframe_chain.extend(candidate)
-        sent = self._bucket.take(self._now_ns, self._keyframe_score.is_above_median(candidate.view))
+        sent = self._bucket.take(self._now_ns, self._keyframe_score.is_above_median(candidate))
         if sent:
-            keyframe = self._keyframe_chain.make_keyframe(candidate, source_frame.stamp_ns)
-            self._ledger.add(LedgerEntry(keyframe, source_frame.index, source_frame.arrived_ns))
-            self._self_evaluation.drift.add_keyframe(keyframe, source_frame.arrived_ns)
+            keyframe = self._keyframe_chain.make_keyframe(candidate, frame.stamp_ns)
+            self._ledger.add(LedgerEntry(keyframe, frame.index, frame.arrived_ns))
+            self._self_evaluation.drift.add_keyframe(keyframe, frame.arrived_ns)
             self._send_evaluation(keyframe, frame.error_cm)
         else:
             self._counts["drop_rate"] += 1

@@ -11,7 +11,7 @@ import numpy as np
 
 from share.geometry.se3 import compose_cov, orthonormal
 from share.timing import seconds_to_ns
-from share.types import F64, Keyframe, KeyframeCandidate, View
+from share.types import F64, Keyframe, KeyframeCandidate
 from share.wire.messages import Ack, Welcome
 
 RESEND_S = 1.0  # first wait for an acknowledgement; doubles with each resend
@@ -248,6 +248,7 @@ class KeyframeChain:
             up_sigma=candidate.up_sigma,
             view=candidate.view,
             predecessor=self.next_id - 1,
+            image=candidate.image,
         )
         self.next_id += 1
         self._has_reference = True
@@ -274,9 +275,9 @@ class KeyframeScore:
     def __init__(self) -> None:
         self._recent_scores: deque[float] = deque(maxlen=_SCORE_WINDOW)
 
-    def is_above_median(self, view: View) -> bool:
-        """Return whether the view scores at least the median of the recent ones, itself included."""
-        depth = view.points[:, 2]
+    def is_above_median(self, candidate: KeyframeCandidate) -> bool:
+        """Return whether the candidate scores at least the median of the recent ones, itself included."""
+        depth = candidate.points[:, 2]
         valid = depth[np.isfinite(depth)]
         score = float(np.median(valid.clip(0.0, _MAX_DEPTH_M))) if valid.size else 0.0
         self._recent_scores.append(score)

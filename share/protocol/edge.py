@@ -307,7 +307,7 @@ class Edge:
 
     def _apply(self, peer: Peer, keyframe: Keyframe) -> None:
         try:
-            keyframe, problem = sanitise(keyframe, peer.odometry_base)
+            keyframe, problem = sanitise(keyframe, peer.odometry_base, peer.hello.rig.cam0)
         except ValueError as error:
             self._count_bad_message(peer, str(error))
             return

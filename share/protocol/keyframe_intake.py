@@ -9,8 +9,10 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from share.geometry import se3
+from share.geometry.camera import Camera
 from share.timing import SECOND_NS, TokenBuckets
 from share.types import F64, Keyframe
+from share.vision.keyframe_images import size_objection
 from share.wire.messages import MAX_BUFFERED, Ack
 
 MAX_ID_GAP = 1_000_000  # ids that an agent may have dropped since the last one: two days at 5 Hz
@@ -84,6 +86,7 @@ class ReorderBuffer:
 # most 5 a second (control.rate_max_hz), and resends up to 600 at once to a new edge. Twice that rate and 700
 # at once are accepted.
 _BASE_COST = 250
+_IMAGE_KEYPOINTS = 500  # work of a keyframe's image, in keypoints
 _KEYFRAME_COST = 500 + _BASE_COST
 _COST_HZ = 10.0 * _KEYFRAME_COST
 _COST_BURST = 700.0 * _KEYFRAME_COST
@@ -108,7 +111,8 @@ class KeyframeQuota:
 
     def objection(self, name: str, keyframe: Keyframe, now_ns: int) -> str | None:
         """Return why this keyframe is not accepted now; None if it is, and charge its cost."""
-        cost = (len(keyframe.view.uv) + _BASE_COST) * (1 if keyframe.reference >= 0 else _SEGMENT_FACTOR)
+        keypoints = len(keyframe.view) + (_IMAGE_KEYPOINTS if len(keyframe.image.jpeg) else 0)
+        cost = (keypoints + _BASE_COST) * (1 if keyframe.reference >= 0 else _SEGMENT_FACTOR)
         return None if self._cost_buckets.bucket(name, now_ns).take(now_ns, cost=cost) else _OVERLOAD_TEXT
 
     def is_over_rate(self, name: str, now_ns: int) -> bool:
@@ -157,14 +161,17 @@ class OdometryBase:
         return f"its motion and its two poses differ by {mismatch_m:.2g} m and {mismatch_deg:.2g} degrees"
 
 
-def sanitise(keyframe: Keyframe, base: OdometryBase | None) -> tuple[Keyframe, str | None]:
+def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> tuple[Keyframe, str | None]:
     """Return the next keyframe of a run as the map accepts it, and what was wrong with it, None if nothing.
 
-    base: the run's keyframe before. A keyframe with an implausible jump, or with a motion that contradicts
-    its two poses, starts a segment in the same odom. An excessive covariance is bounded. Raises ValueError
-    if its reference is not `base`.
+    base: the run's keyframe before; camera: its cam0. A keyframe with an implausible jump, or with a motion
+    that contradicts its two poses, starts a segment in the same odom. An excessive covariance is bounded. An
+    image of another size is dropped. Raises ValueError if its reference is not `base`.
     """
     problem = None
+    if objection := size_objection(keyframe.image, camera):
+        problem = f"keyframe {keyframe.id}: {objection}: without it"
+        keyframe = replace(keyframe, image=keyframe.image.without_jpeg())
     if keyframe.reference >= 0:
         if base is None or keyframe.reference != base.id:
             raise ValueError(f"keyframe {keyframe.id} refers to {keyframe.reference}, not to the last one")

@@ -11,11 +11,12 @@ from share.errors import CalibrationMismatchError, DataError, UsageError
 from share.files.writing import atomic_write, check_replaceable, new_folder
 from share.geometry import se3
 from share.recordings.calibration import asl_camera_text, asl_imu_text
-from share.recordings.images import EncodedImage, encode_png, image_format
+from share.recordings.images import EncodedImage
 from share.recordings.mcap.recorder import Recorder
 from share.recordings.recording import Source
 from share.recordings.trajectory import Trajectory, format_tum
 from share.sensors.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
+from share.vision.image_codec import encode_png, image_format
 
 Progress = Callable[[int], None]
 StageProgress = Callable[[str, int, int], None]  # stage, done, total

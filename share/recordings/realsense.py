@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from share.checks import MAX_STAMP_NS, checked_pose
 from share.errors import DataError, UsageError
 from share.files.reading import MB, read_errors
 from share.files.sqlite_file import UntrustedDatabase
@@ -33,7 +34,7 @@ from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, Measurement
 from share.sensors.profile import load_profile
 from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample, SampleProcessor
 from share.sensors.sequencer import rig_streams
-from share.types import F64, I64, MAX_STAMP_NS, checked_pose
+from share.types import F64, I64
 
 STREAMS = {"Infrared_1": CAM0, "Infrared_2": CAM1, "Depth_0": DEPTH, "Accel_0": ACCEL, "Gyro_0": GYRO}
 _DATA_SUFFIXES = ("/imu/data", "/image/data/compressed", "/image/data/compressedDepth")

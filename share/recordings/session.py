@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from share.agent_names import checked_name
+from share.checks import MAX_STAMP_NS
 from share.errors import ConfigError, UsageError
 from share.files.reading import path_inside
 from share.files.yaml_file import Section, read_yaml
 from share.recordings.calibration import Calibration, calibration_from_kalibr, read_calibration
-from share.types import MAX_STAMP_NS, AgentKind
+from share.types import AgentKind
 
 SESSION_FILE = "session.yaml"
 SCHEMA = 1

@@ -12,11 +12,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from share.checks import MAX_STAMP_NS
 from share.errors import DataError
 from share.files import reading
 from share.files.reading import MAX_TABLE_BYTES, read_errors
 from share.recordings.losses import DataLosses
-from share.types import F64, I64, MAX_STAMP_NS
+from share.types import F64, I64
 
 Row = TypeVar("Row", bound=tuple[Any, ...])
 _TRUNCATING = Context(prec=60, rounding=ROUND_DOWN)

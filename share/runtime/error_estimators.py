@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -13,7 +12,7 @@ import numpy as np
 
 from share.metrics.frame_log import summary
 from share.metrics.local_error import LocalError
-from share.odometry.error_model.history import MOST_AGO, FrameOutcome, MotionHistory, RecentMotion
+from share.odometry.error_model.history import FrameOutcome, MotionHistory, RecentMotion
 from share.odometry.error_model.inference import ErrorEstimate, OnnxSession, estimate_error
 from share.odometry.error_model.inputs import error_model_input
 from share.odometry.track_result import TrackResult
@@ -95,19 +94,17 @@ class SynchronousErrorModel(NoErrorEstimate):
 
     def __init__(self, network: OnnxSession) -> None:
         self._network, self._odometer = network, MotionHistory()
-        self._seen: deque[tuple[int, U8]] = deque(maxlen=MOST_AGO)  # stamps, images
         self._latest: ErrorEstimate | None = None
 
     def update(self, frame: Frame, result: TrackResult) -> float | None:
         self._odometer.add_frame(frame_outcome(frame, result))
-        self._seen.append((frame.stamp_ns, frame.image0))
         latest = self._latest
         return None if latest is None or result.T_odom_body is None else latest.error_cm
 
     def make_keyframe(self, frame: Frame, tracker: KeyframeTracker) -> KeyframeCandidate:
         statistics, candidate = tracker.feature_statistics(), tracker.make_keyframe(frame)
-        stamp_ns, image = self._seen[-1 - candidate.frames_ago]
-        self._submit(_EstimateJob(image, statistics, self._odometer.add_keyframe(stamp_ns, candidate)))
+        recent_motion = self._odometer.add_keyframe(frame.stamp_ns, candidate)
+        self._submit(_EstimateJob(frame.image0, statistics, recent_motion))
         return candidate
 
     def _submit(self, job: _EstimateJob) -> None:

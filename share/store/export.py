@@ -108,7 +108,7 @@ def _point_clouds(
     }
     for keyframe in keyframes:
         T_body_cam0, colour = runs[keyframe.run_key]
-        points = keyframe.keyframe.view.points.astype(np.float64)
+        points = keyframe.keyframe.points.astype(np.float64)
         known = points[~np.isnan(points).any(1)]
         yield se3.transform(T[keyframe.keyframe_key] @ T_body_cam0, known), colour
         progress(1)

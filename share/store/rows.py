@@ -10,10 +10,11 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from share.checks import checked_cov, checked_id, checked_pose
 from share.errors import StoreError
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import SaveKeyframe, SaveLink, SavePoses, SaveRun, StoredKeyframe
-from share.types import F64, Keyframe, checked_cov, checked_id, checked_pose
+from share.types import F64, Keyframe
 from share.wire import codec, messages
 
 M = TypeVar("M")
@@ -31,7 +32,7 @@ COLUMNS = {
 }
 
 _CREDENTIAL_PREFIX = "voice "  # before a run's key, a name in `about`; SHARE 0.1 ignores it
-_READABLE_VERSIONS = (3, 4, codec.WIRE_VERSION)  # wire versions with today's Hello and Keyframe
+_READABLE_VERSIONS = (3, 4, 5, codec.WIRE_VERSION)  # wire versions with today's Hello and a known Keyframe
 _pack = msgspec.msgpack.encode
 _decode_frames = msgspec.msgpack.Decoder(list[bytes]).decode
 _decode_pose_keys = msgspec.msgpack.Decoder(list[tuple[str, int, str]]).decode

@@ -1,17 +1,18 @@
-"""Views of keyframes: ORB features spread over the image, with their depth."""
+"""ORB features spread over the image, and the depth that a frame measures."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from share.geometry.camera import Rig, rays
-from share.types import F32, F64, U8, Frame, View
+from share.geometry.camera import Camera, Rig, rays
+from share.types import F32, F64, U8, Frame, KeyframeImage, View
 from share.vision import depth as depths
 from share.vision.corners import UNIFORM_FIELD_DEG, field_mask, spread_order
 
 _GRID = 8, 6  # cells across and down, over which features are spread
-_NEIGHBOUR_PX = 4.0  # where no depth is measured, a feature this near to a known point has its depth
+_SURFACE_PX = 60.0  # a feature at most this far from one of the tracker lies on that one's surface
+_MIN_RHO = 0.03  # 1/m; the depth of what is further away is unknown
 
 
 def measures_depth(frame: Frame, rig: Rig) -> bool:
@@ -31,72 +32,28 @@ def measure_depth(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None 
     return np.full(len(px), np.nan)
 
 
-class ViewBuilder:
-    """Builds a view in steps of about equal time.
+def image_view(image: U8, camera: Camera, features: KeyframeImage, count: int) -> View:
+    """Return a view of up to `count` ORB features (Rublee et al. 2011) of cam0's image (H, W).
 
-    known_depths: px (M, 2) and depth (M,) m of points, used as initial depths of features near them; where
-    the frame measures no depth, only features right beside them have one.
+    Each has the depth of the nearest surface of `features`, if one is near.
     """
-
-    def __init__(
-        self, frame: Frame, rig: Rig, count: int, known_depths: tuple[F32, F64] | None = None
-    ) -> None:
-        self._frame, self._rig, self._count, self._known_depths = frame, rig, count, known_depths
-        self._keypoints: list[cv2.KeyPoint] | None = None
-        self._features: tuple[F32, U8] | None = None
-        self._measured = np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32)
-
-    def detect(self) -> None:
-        """Take the first step: keypoints."""
-        mask = field_mask(self._rig.cam0, UNIFORM_FIELD_DEG)
-        self._keypoints = _detect(self._frame.image0, self._count, mask)
-
-    def describe(self) -> None:
-        """Take the second step: descriptors."""
-        if self._keypoints is None:
-            self.detect()
-        self._features = _describe(self._frame.image0, self._keypoints or [])
-
-    def measure_half(self) -> None:
-        """Take half of the third step, the depths. Call it after `describe`."""
-        assert self._features is not None
-        px, _ = self._features
-        self._measured = self._points(px[: len(px) // 2])
-
-    def finish(self) -> View:
-        """Take the steps that are left and return the view."""
-        if self._features is None:
-            self.describe()
-        assert self._features is not None
-        px, descriptors = self._features
-        uv, points = self._points(px[len(self._measured[0]) :])
-        uv, points = np.concatenate([self._measured[0], uv]), np.concatenate([self._measured[1], points])
-        return View(uv, points, descriptors)
-
-    def _points(self, px: F32) -> tuple[F32, F32]:
-        """Return normalised coordinates (N, 2) and points (N, 3) m of px (N, 2); NaN where depth is
-        unknown."""
-        rig, known = self._rig, self._known_depths
-        uv = rig.cam0.normalise(px.astype(np.float64))
-        if known is not None and not measures_depth(self._frame, rig):
-            z = _nearest_depth(px, *known, _NEIGHBOUR_PX)
-        else:
-            z = measure_depth(self._frame, rig, px, uv, None if known is None else _nearest_depth(px, *known))
-        return uv.astype(np.float32), (rays(uv) * z[:, None]).astype(np.float32)
+    px, descriptors = detect_orb(image, count, field_mask(camera, UNIFORM_FIELD_DEG))
+    uv = camera.normalise(px.astype(np.float64))
+    points = rays(uv) / _surface_rho(px, uv, camera, features)[:, None]
+    return View(uv.astype(np.float32), points.astype(np.float32), descriptors)
 
 
-def make_view(frame: Frame, rig: Rig, count: int = 500) -> View:
-    """Return a view of ORB features (Rublee et al. 2011) of cam0, with 3-D points where the frame measures
-    depth."""
-    return ViewBuilder(frame, rig, count).finish()
-
-
-def _nearest_depth(px: F32, known_px: F32, known_m: F64, within_px: float = np.inf) -> F64:
-    """Return the depth (N,) m of the nearest known point; NaN where there is none within `within_px`."""
-    if len(known_px) == 0:
+def _surface_rho(px: F32, uv: F64, camera: Camera, surfaces: KeyframeImage) -> F64:
+    """Return the inverse depth (N,) 1/m, on the rays through px (N, 2), of the surface at the nearest
+    feature; NaN without one near."""
+    if len(surfaces.uv) == 0 or len(px) == 0:
         return np.full(len(px), np.nan)
+    known_px = camera.distort(surfaces.uv.astype(np.float64)).astype(np.float32)
     squared_px = (px**2).sum(axis=1)[:, None] - 2 * px @ known_px.T + (known_px**2).sum(axis=1)
-    out: F64 = np.where(squared_px.min(axis=1) <= within_px**2, known_m[squared_px.argmin(axis=1)], np.nan)
+    nearest = squared_px.argmin(axis=1)
+    rho = (rays(uv) * surfaces.plane[nearest]).sum(axis=1)
+    is_near = squared_px.min(axis=1) < _SURFACE_PX**2
+    out: F64 = np.where(is_near & (rho > _MIN_RHO), rho, np.nan)
     return out
 
 

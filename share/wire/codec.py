@@ -20,6 +20,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from share.checks import MAX_STAMP_NS, checked_id, checked_stamp
 from share.errors import VersionError, WireError, printable
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import (
@@ -29,28 +30,27 @@ from share.types import (
     I64,
     MAX_ACCEL_M_S2,
     MAX_GYRO_RAD_S,
+    MAX_JPEG_BYTES,
     MAX_KEYPOINTS,
     MAX_MAP_ID_LENGTH,
     MAX_NAME_LENGTH,
-    MAX_STAMP_NS,
     AgentKind,
     Correction,
     Frame,
     ImuBatch,
     Keyframe,
+    KeyframeImage,
     TrackState,
     View,
     WaitReason,
-    checked_id,
-    checked_stamp,
 )
 from share.wire import messages as m
 
-WIRE_VERSION = 5
+WIRE_VERSION = 6
 OLDEST_VERSION = 2  # the STABLE_MESSAGES have not changed since
 MAX_HEADER_BYTES = 4096
-MAX_ARRAYS = 8
-MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # largest array of all messages but Frame
+MAX_ARRAYS = 12
+MAX_FRAME_BYTES = max(MAX_KEYPOINTS * DESCRIPTOR_BYTES, MAX_JPEG_BYTES)  # of all messages but Frame
 MAX_IMAGE_BYTES = 4 * 1920 * 1200  # largest array of a Frame: a depth image
 
 Bytes = bytes | memoryview
@@ -97,10 +97,11 @@ class _Array:
     shape: tuple[int | None, ...]
     optional: bool = False
     max_length: int = MAX_KEYPOINTS
+    key: str = ""  # the name by which `build` takes it; by default that of the attribute
 
     @cached_property
     def name(self) -> str:
-        return _field_name(self.path)
+        return self.key or _field_name(self.path)
 
     @cached_property
     def _getter(self) -> Callable[[object], Any]:
@@ -182,7 +183,22 @@ def _build_hello(*, name: str, kind: AgentKind, run_id: int, streams_frames: boo
     return m.Hello(name, kind, run_id, Rig(**rig), streams_frames)
 
 
-def _build_keyframe(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
+def _build_keyframe(
+    *,
+    uv: Any,
+    points: Any,
+    descriptors: Any,
+    jpeg: Any,
+    feature_uv: Any,
+    plane: Any,
+    rho_sigma: Any,
+    **fields: Any,
+) -> Keyframe:
+    image = KeyframeImage(jpeg, feature_uv, plane, rho_sigma)
+    return Keyframe(**fields, view=View(uv, points, descriptors), image=image)
+
+
+def _build_keyframe_without_image(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
     return Keyframe(**fields, view=View(uv, points, descriptors))
 
 
@@ -211,6 +227,22 @@ _RIG: dict[str, Any] = {  # sent as maps by field name, checked by their types
     "rig.imu": ImuNoise | None,
     "rig.timeshift_s": float,
 }
+_KEYFRAME_ARRAYS = (
+    _pose("T_ref_body"),
+    _Array("cov", "<f8", (6, 6)),
+    _pose("T_odom_body"),
+    _Array("up", "<f8", (3,)),
+    _Array("view.uv", "<f4", (None, 2)),
+    _Array("view.points", "<f4", (None, 3)),
+    _Array("view.descriptors", "|u1", (None, DESCRIPTOR_BYTES)),
+)
+_KEYFRAME_SCALARS: dict[str, Any] = {
+    "id": Int64,
+    "reference": Int64,
+    "stamp_ns": Int64,
+    "predecessor": Int64,
+    "up_sigma": float,
+}
 _LAYOUTS: dict[type, _Layout] = {
     m.Hello: _Layout(
         1,
@@ -226,18 +258,12 @@ _LAYOUTS: dict[type, _Layout] = {
     Keyframe: _Layout(
         3,
         _build_keyframe,
-        _pose("T_ref_body"),
-        _Array("cov", "<f8", (6, 6)),
-        _pose("T_odom_body"),
-        _Array("up", "<f8", (3,)),
-        _Array("view.uv", "<f4", (None, 2)),
-        _Array("view.points", "<f4", (None, 3)),
-        _Array("view.descriptors", "|u1", (None, DESCRIPTOR_BYTES)),
-        id=Int64,
-        reference=Int64,
-        stamp_ns=Int64,
-        predecessor=Int64,
-        up_sigma=float,
+        *_KEYFRAME_ARRAYS,
+        _Array("image.jpeg", "|u1", (None,), max_length=MAX_JPEG_BYTES),
+        _Array("image.uv", "<f4", (None, 2), key="feature_uv"),
+        _Array("image.plane", "<f4", (None, 3)),
+        _Array("image.rho_sigma", "<f4", (None,)),
+        **_KEYFRAME_SCALARS,
     ),
     m.Evaluation: _Layout(4, m.Evaluation, keyframe=Int64, delay_ms=float, error_cm=float | None),
     m.Ping: _Layout(5, m.Ping, sequence=Int64, sent_ns=Int64),
@@ -288,6 +314,8 @@ _LAYOUTS: dict[type, _Layout] = {
 }
 MESSAGE_CODES = {message_type: layout.code for message_type, layout in _LAYOUTS.items()}
 _LAYOUT_BY_CODE = {layout.code: (cls.__name__, layout) for cls, layout in _LAYOUTS.items()}
+_IMAGE_VERSION = 6  # of the first keyframes with an image; map files keep older ones
+_KEYFRAME_WITHOUT_IMAGE = _Layout(3, _build_keyframe_without_image, *_KEYFRAME_ARRAYS, **_KEYFRAME_SCALARS)
 STABLE_MESSAGES = (m.Ping, m.Pong, m.Refused)  # the same since OLDEST_VERSION: peers find a mismatch by them
 
 # All that msgspec, numpy and our own validation raise on bad bytes.
@@ -332,6 +360,8 @@ def decode(frames: Sequence[Bytes], versions: Sequence[int] = (WIRE_VERSION,)) -
         if (known := _LAYOUT_BY_CODE.get(header.code)) is None:
             raise WireError(f"unknown message type {header.code}")
         where, layout = known
+        if header.code == _KEYFRAME_WITHOUT_IMAGE.code and header.version < _IMAGE_VERSION:
+            layout = _KEYFRAME_WITHOUT_IMAGE
         return layout.build(**layout.decode_scalars(header.scalars), **layout.decode_arrays(header, frames))
     except _DECODE_ERRORS as error:
         raise _wire_error(where, error) from None

@@ -10,19 +10,9 @@ import hashlib
 from dataclasses import dataclass
 
 from share.agent_names import checked_name
+from share.checks import checked_id, checked_pose, checked_stamp
 from share.geometry.camera import Camera, Rig
-from share.types import (
-    F64,
-    AgentKind,
-    Correction,
-    Frame,
-    Keyframe,
-    TrackState,
-    WaitReason,
-    checked_id,
-    checked_pose,
-    checked_stamp,
-)
+from share.types import F64, AgentKind, Correction, Frame, Keyframe, TrackState, WaitReason
 
 MAX_RATE_HZ = 1000.0
 MAX_BUFFERED = 256  # ids in one Ack: keyframes buffered at the edge

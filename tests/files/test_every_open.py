@@ -59,7 +59,7 @@ ALLOWED = {
     ("recordings/convert.py", "write_bytes"): OURS,
     ("lab/mocap/session.py", "copyfile"): "a recording that was opened by the door, into a new folder",
     ("devices/host.py", "read_text"): KERNEL,
-    ("recordings/images.py", "imdecode"): "after image_header has measured it",
+    ("vision/image_codec.py", "imdecode"): "after image_header has measured it",
     ("net/keys.py", "open"): "a new file that nobody else can read, or a folder, for its lock",
     ("net/keys.py", "fdopen"): "likewise",
     ("cameras/live.py", "open"): "a camera",

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from helpers.hellos import hello_of
 
+from share.checks import MAX_ID, MAX_POSITION_M, MAX_STAMP_NS
 from share.geometry import se3
-from share.types import MAX_ID, MAX_POSITION_M, MAX_STAMP_NS, Correction, Keyframe, TrackState
+from share.types import Correction, Keyframe, TrackState
 from share.wire import messages as m
 from share.wire.codec import encode
 

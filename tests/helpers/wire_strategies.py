@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from share.agent_names import checked_name
+from share.checks import MAX_ID, MAX_ODOM_M, MAX_POSITION_M, MAX_STAMP_NS
 from share.geometry import se3
 from share.geometry.camera import (
     BASELINE_RANGE_M,
@@ -19,20 +20,7 @@ from share.geometry.camera import (
     ImuNoise,
     Rig,
 )
-from share.types import (
-    MAX_ID,
-    MAX_ODOM_M,
-    MAX_POSITION_M,
-    MAX_STAMP_NS,
-    AgentKind,
-    Correction,
-    Frame,
-    ImuBatch,
-    Keyframe,
-    TrackState,
-    View,
-    WaitReason,
-)
+from share.types import AgentKind, Correction, Frame, ImuBatch, Keyframe, TrackState, View, WaitReason
 from share.wire import messages as m
 
 

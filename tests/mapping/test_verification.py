@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 from helpers.place_sim import bodies, sights
 
+from share.checks import MAX_POSITION_M
 from share.config import PlaceConfig
 from share.geometry import se3
 from share.mapping.recognition import verification
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
-from share.types import MAX_POSITION_M, MAX_UV, View
+from share.types import MAX_UV, View
 
 CONFIG = PlaceConfig()
 T_C_Q = se3.exp(np.array([0.1, -0.15, 0.05, 0.3, 0.1, -0.2]))

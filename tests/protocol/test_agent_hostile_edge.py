@@ -8,11 +8,12 @@ import pytest
 from helpers.liar import Liar
 from helpers.model_edge import COV, HELLO, MS, ModelEdge, S, handle, tracked
 
+from share.checks import MAX_ID, MAX_STAMP_NS
 from share.config import Config
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
-from share.types import MAX_ID, MAX_STAMP_NS, Correction, Keyframe
+from share.types import Correction, Keyframe
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 

@@ -22,7 +22,7 @@ from share.files.reading import path_inside, read_bytes
 from share.files.writing import atomic_write, open_new
 from share.files.yaml_file import read_yaml
 from share.recordings.calibration import read_calibration
-from share.recordings.images import EncodedImage, decode_gray, image_header
+from share.recordings.images import EncodedImage
 from share.recordings.mcap.recorder import Recorder
 from share.recordings.session import read_session
 from share.recordings.tables import longest_nondecreasing, read_table
@@ -30,6 +30,7 @@ from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 from share.strict_yaml import load_yaml
+from share.vision.image_codec import decode_gray, image_header
 
 pytestmark = pytest.mark.usefixtures("soon")
 

@@ -6,7 +6,8 @@ import pytest
 from helpers.recordings import HEIGHT, WIDTH, depth_mm, picture
 
 from share.errors import DataError
-from share.recordings.images import EncodedImage, decode_gray
+from share.recordings.images import EncodedImage
+from share.vision.image_codec import decode_gray
 
 
 def encoded(extension: str, image: np.ndarray, scale: float = 0.0, width: int = WIDTH) -> EncodedImage:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from share.checks import checked_pose
 from share.errors import DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
@@ -17,7 +18,7 @@ from share.geometry.lens import EQUIDISTANT, RADTAN
 from share.recordings.images import ArrayImage
 from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
-from share.types import F32, F64, checked_pose
+from share.types import F32, F64
 
 _INTEGER_TOLERANCE = 1e-3  # of the inverse of a depth unit
 

@@ -19,10 +19,11 @@ from share.lab.calibrate.imu_table import rising_mask
 from share.lab.calibrate.target import Target
 from share.lab.pool import Pool
 from share.recordings.calibration import CAMCHAIN, Calibration
-from share.recordings.images import decode_gray, read_picture
+from share.recordings.images import read_picture
 from share.runtime.source import READERS, open_source, read_given_calibration
 from share.sensors.measurement import CAM0, CAM1
 from share.types import F64, I64, U8
+from share.vision.image_codec import decode_gray
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _MAX_PAIR_GAP_NS = 2_000_000  # between stamps of one stereo pair

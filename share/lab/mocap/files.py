@@ -10,13 +10,14 @@ from typing import TypeAlias
 
 import numpy as np
 
+from share.checks import MAX_STAMP_NS
 from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.lab.mocap.trajectory import MocapTrajectory
 from share.recordings import tables
 from share.recordings.tables import read_text
 from share.recordings.trajectory import check_position_range, make_poses, read_tum_table
-from share.types import F64, I64, MAX_STAMP_NS
+from share.types import F64, I64
 
 _IDENTITY_POSE = (0, 0, 0, 0, 0, 0, 1)  # x y z qx qy qz qw
 

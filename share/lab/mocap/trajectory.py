@@ -7,9 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
+from share.checks import checked_array
 from share.errors import DataError
 from share.geometry import se3
-from share.types import F64, I64, ImuBatch, checked_array
+from share.types import F64, I64, ImuBatch
 
 _GAP_FACTOR = 5  # times the median spacing of samples
 _MAX_IMU_GAP_NS = 100_000_000  # linear interpolation does not hold across longer gaps

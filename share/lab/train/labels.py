@@ -6,7 +6,6 @@ from __future__ import annotations
 import io
 import json
 import zlib
-from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from share.lab.evaluate.campaign import check_unique_names
 from share.lab.pool import Pool
 from share.lab.train.fault_injection import FAULT_KINDS, FaultInterval, draw_faults, inject_faults
 from share.metrics.local_error import WINDOW_S, LocalError
-from share.odometry.error_model.history import MOST_AGO, MotionHistory
+from share.odometry.error_model.history import MotionHistory
 from share.odometry.error_model.inputs import INPUT_SHAPES, ErrorModelInput, error_model_input, input_dtype
 from share.recordings.session import Session, read_session
 from share.runtime.error_estimators import frame_outcome
@@ -32,7 +31,7 @@ from share.runtime.pipeline import check_trackable, make_tracker, read_frames
 from share.runtime.source import Source, open_source
 from share.sensors.sequencer import SequencerCounters
 from share.startup import prepare_process
-from share.types import F32, I64, U8, Frame, ImuBatch
+from share.types import F32, I64, U8, ImuBatch
 
 _MAX_FAULT_KINDS = 3  # fault kinds in one run, at most
 _IMU_SUFFIX = {True: "", False: "-without-imu"}
@@ -141,19 +140,17 @@ def labelled_keyframes(
     rig = source.rig if imu else replace(source.rig, imu=None)
     check_trackable(source.name, rig)
     tracker, error, odometer = make_tracker(rig, config), LocalError(truth), MotionHistory()
-    recent_motion: deque[tuple[Frame, float | None]] = deque(maxlen=MOST_AGO)
     for frame in inject_faults(read_frames(source, config, SequencerCounters()), faults, seed, rig):
         frame = frame if imu else replace(frame, imu=ImuBatch.empty())
         result = tracker.track(frame)
         error_cm = error.update(frame.stamp_ns, result.T_odom_body, result.new_segment)
         odometer.add_frame(frame_outcome(frame, result))
-        recent_motion.append((frame, error_cm))
         if result.keyframe_ready:
             statistics, candidate = tracker.feature_statistics(), tracker.make_keyframe(frame)
-            own, own_cm = recent_motion[-1 - candidate.frames_ago]
-            known_error_cm = float("nan") if own_cm is None else own_cm
-            fares = odometer.add_keyframe(own.stamp_ns, candidate)
-            yield own.stamp_ns, known_error_cm, error_model_input(own.image0, statistics, fares)
+            known_error_cm = float("nan") if error_cm is None else error_cm
+            recent_motion = odometer.add_keyframe(frame.stamp_ns, candidate)
+            model_input = error_model_input(frame.image0, statistics, recent_motion)
+            yield frame.stamp_ns, known_error_cm, model_input
 
 
 # ---- Label files: one NumPy archive (.npz) a run, with an array for each column of `Labels` and `about` as

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from share.checks import checked_array, checked_pose
 from share.geometry import se3
-from share.types import F64, I64, checked_array, checked_pose
+from share.types import F64, I64
 
 
 @dataclass(frozen=True, eq=False)

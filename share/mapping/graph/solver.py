@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from share.checks import checked_array
 from share.config import GraphConfig
 from share.mapping.graph.covariance import relative_covariances
 from share.mapping.graph.edges import EdgeArrays, PoseEdge
 from share.mapping.graph.optimiser import chain_order, optimise
-from share.types import F64, I64, checked_array
+from share.types import F64, I64
 
 
 @dataclass(frozen=True, eq=False)

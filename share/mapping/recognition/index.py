@@ -22,9 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from share.geometry.camera import Rig
-from share.mapping.recognition.verification import CameraView
-from share.types import F32, F64, I64, U8, Keyframe
+from share.types import F32, F64, I64, U8
 
 TABLES = 8  # hash functions
 HASH_BITS = 16  # descriptor bits that form a word in each table
@@ -157,33 +155,6 @@ class PlaceIndex:
             values.astype(np.uint32) + (np.arange(tables, dtype=np.uint32) << np.uint32(bits))
         ).ravel()
         return words
-
-
-class KeyframeViews:
-    """Views of keyframes by node id, and the index that finds similar ones."""
-
-    def __init__(self) -> None:
-        self.by_node: dict[int, CameraView] = {}
-        self.index = PlaceIndex()
-        self._restored: list[tuple[int, Keyframe, Rig]] = []
-
-    def add(self, node_id: int, keyframe: Keyframe, rig: Rig) -> None:
-        self.by_node[node_id] = CameraView(keyframe.view, rig.cam0.focal, rig.T_body_cam0, keyframe.up)
-        self.index.add(node_id, keyframe.view.descriptors)
-
-    def add_restored(self, node_id: int, keyframe: Keyframe, rig: Rig) -> None:
-        """Note a restored keyframe; it takes effect at `index_restored`, so that a restart is quick."""
-        self._restored.append((node_id, keyframe, rig))
-
-    def index_restored(self) -> None:
-        """Add the views of restored keyframes."""
-        for restored in self._restored:
-            self.add(*restored)
-        self._restored = []
-
-    def remove(self, node_id: int) -> None:
-        self.index.remove(node_id)
-        del self.by_node[node_id]
 
 
 U32 = NDArray[np.uint32]

@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from share.checks import checked_array
 from share.odometry.error_model.history import RecentMotion
-from share.types import F32, U8, FeatureStatistics, TrackState, checked_array
+from share.types import F32, U8, FeatureStatistics, TrackState
 from share.vision.corners import cell_indices
 
 # Scalars of a keyframe: of its image and of its tracking.

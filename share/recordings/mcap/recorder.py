@@ -19,11 +19,12 @@ from share.errors import DataError, UsageError
 from share.files.reading import open_regular
 from share.files.writing import check_replaceable, new_file, open_new, sync_folder, write_errors
 from share.geometry.camera import Rig
-from share.recordings.images import EncodedImage, encode_jpeg
+from share.recordings.images import EncodedImage
 from share.recordings.mcap import rig as ros_rig
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.file import BoundedFile, check_magic, chunk_records, damage_errors
 from share.sensors.measurement import DEPTH, IMU, Measurement
+from share.vision.image_codec import encode_jpeg
 
 _CHUNK_BYTES = 256 * 1024
 _FLUSH_PERIOD_NS = 10**9  # a crash loses at most this much

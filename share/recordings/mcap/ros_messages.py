@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from share.errors import DataError
 from share.geometry.camera import Camera
-from share.recordings.images import EncodedImage, check_size, depth_metres, image_format
+from share.recordings.images import EncodedImage, check_size
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, ImuSample
 from share.types import F32, F64, I64
+from share.vision.image_codec import depth_metres, image_format
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"

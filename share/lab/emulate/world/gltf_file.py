@@ -17,7 +17,7 @@ from urllib.parse import unquote
 from share.errors import DataError
 from share.files.json_file import parse_json
 from share.files.reading import MB, path_inside, read_bytes
-from share.recordings.images import image_header
+from share.vision.image_codec import image_header
 
 MAX_TRIANGLES = 300_000
 _MAX_BYTES = 500 * MB  # of all files together, of all views of them, of all arrays

@@ -1,0 +1,303 @@
+"""Loops as exact as odometry: the patches of both keyframes aligned in each other's images.
+
+The pose of a verified candidate rests on descriptors matched to a pixel. Here each feature of one keyframe is
+warped into the other's image by that pose and by the plane of its surface, and its patch is aligned there to
+a tenth of a pixel; the same the other way. The pose that explains all aligned positions is found by robust
+Gauss-Newton, on a pyramid from coarse to fine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from share.geometry import se3
+from share.geometry.camera import Camera, rays
+from share.mapping.recognition.depth_scale import DepthScale
+from share.mapping.recognition.verification import Refusal, Verification
+from share.types import F32, F64, I64, U8, KeyframeImage, View
+from share.vision import patches
+from share.vision.keyframe_images import decompress
+from share.vision.orb import image_view
+
+ORB_FEATURES = 800  # found in a keyframe's image
+_LEVELS = (2, 1, 0)  # of the pyramid, coarse to fine: levels of half the size each
+_BORDER_PX = 6.0  # a patch's centre is at least so far inside the other image
+_REACH_PX = 5.0  # largest distance from the predicted position, px of the level
+_MIN_CORRELATION = 0.8
+_CONVERGED_PX = 0.3  # last step of a converged alignment
+_MAX_STRETCH = 3.0  # of a warped patch, or the inverse
+_MAX_STEPS = 8
+_SIGMA_PX = 0.2  # of an aligned position
+_INLIER_CHI2 = 9.2  # 99 %, 2 degrees of freedom
+_CAUCHY = 2.0  # Mahalanobis distance at which a measurement has half its weight
+_MIN_INLIERS, _MIN_INLIER_SHARE = 25, 0.7  # of the aligned patches
+_MIN_FOUND_SHARE = 0.35  # aligned patches, of those in both views, where nothing but the map's pose says so
+_ITERATIONS = 6
+_MIN_DEPTH_RATIO = 0.02  # of the depth in the other camera: nearer counts as behind it
+_RIDGE = 1e-6
+# Added to the covariance: errors that many patches do not average out (calibration, shutter, the JPEG).
+_FLOOR_DEG, _FLOOR_M = 0.02, 0.001
+_SHARED_ERROR = 2.0  # factor on sigma in the graph: the loops of a keyframe share its depths' errors
+
+
+@dataclass(frozen=True, eq=False)
+class ImageView:
+    """The image of a keyframe with its camera, decoded when needed. T_body_cam0 (4, 4)."""
+
+    source: KeyframeImage
+    camera: Camera
+    T_body_cam0: F64
+
+    @cached_property
+    def pixels(self) -> U8 | None:
+        """The image (H, W); None if it is damaged."""
+        return decompress(self.source, self.camera)
+
+    @cached_property
+    def pyramid(self) -> tuple[U8, ...]:
+        """The image at full, half and a quarter of its size; empty if it is damaged."""
+        if self.pixels is None:
+            return ()
+        half = np.asarray(cv2.pyrDown(self.pixels), np.uint8)
+        return self.pixels, half, np.asarray(cv2.pyrDown(half), np.uint8)
+
+    @cached_property
+    def patches(self) -> tuple[patches.Patches, ...]:
+        """Patches of the features, from each image of `pyramid`."""
+        return tuple(
+            patches.extract(image, self.px / np.float32(2**level)) for level, image in enumerate(self.pyramid)
+        )
+
+    @cached_property
+    def uv(self) -> F64:
+        """Normalised coordinates (N, 2) of the features."""
+        return self.source.uv.astype(np.float64)
+
+    @cached_property
+    def px(self) -> F32:
+        return self.camera.distort(self.uv).astype(np.float32)
+
+    @cached_property
+    def plane(self) -> F64:
+        return self.source.plane.astype(np.float64)
+
+    @cached_property
+    def rho_sigma(self) -> F64:
+        return self.source.rho_sigma.astype(np.float64)
+
+    @cached_property
+    def uv_per_px(self) -> F64:
+        """Derivative (N, 2, 2) of `uv` by px."""
+        return np.asarray(np.linalg.inv(self.camera.jacobian(self.uv)))
+
+    def describe(self) -> View:
+        """Return the ORB features of the image; an empty view if it is damaged."""
+        if self.pixels is None:
+            return View.empty()
+        return image_view(self.pixels, self.camera, self.source, ORB_FEATURES)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedLoop:
+    """T_c_q (4, 4) of the bodies and its covariance (6, 6).
+
+    predicted: features in both views; found: those that were aligned; inliers: those that agree with the
+    pose. depth_scale: as in `Verification`."""
+
+    T_c_q: F64
+    cov: F64
+    predicted: int
+    found: int
+    inliers: int
+    depth_scale: DepthScale | None
+
+
+def align_verified(verified: Verification, query: ImageView, candidate: ImageView) -> Verification | Refusal:
+    """Return the verification with the pose of the aligned images, or why they contradict it. It stays as it
+    is where too few patches can be compared."""
+    aligned = align_images(verified.T_c_q, query, candidate)
+    if aligned is None:
+        return verified
+    return _verification(aligned, verified.matches)
+
+
+def align_from_map(T_c_q: F64, query: ImageView, candidate: ImageView) -> Verification | Refusal:
+    """Return the pose of the query's body in the candidate's by their images, from the pose T_c_q (4, 4) that
+    the map has; or why there is none."""
+    aligned = align_images(T_c_q, query, candidate)
+    if aligned is None:
+        return Refusal("too few patches align from the map's pose")
+    if aligned.found < _MIN_FOUND_SHARE * aligned.predicted:
+        return Refusal(f"{aligned.found} of {aligned.predicted} patches align from the map's pose")
+    return _verification(aligned, aligned.found)
+
+
+def _verification(aligned: AlignedLoop, matches: int) -> Verification | Refusal:
+    if aligned.inliers < max(_MIN_INLIERS, _MIN_INLIER_SHARE * aligned.found):
+        return Refusal(f"{aligned.inliers} of {aligned.found} aligned patches agree with one pose")
+    floor = np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_M**2] * 3)
+    cov = _SHARED_ERROR**2 * (aligned.cov + floor)
+    return Verification(aligned.T_c_q, cov, matches, aligned.inliers, aligned.depth_scale)
+
+
+class _Alignment(NamedTuple):
+    """Features of one view that were aligned in the other. feature (M,): its index; px (M, 2): where.
+    predicted: number of features in the other view."""
+
+    feature: I64
+    px: F64
+    predicted: int
+
+
+def align_images(T_c_q: F64, query: ImageView, candidate: ImageView) -> AlignedLoop | None:
+    """Refine the pose T_c_q (4, 4) of the query's body in the candidate's by aligning their patches; None
+    where too few can be aligned."""
+    if not query.pyramid or not candidate.pyramid:
+        return None
+    T = se3.inverse(candidate.T_body_cam0) @ T_c_q @ query.T_body_cam0
+    for level in _LEVELS:
+        forward = _align(T, query, candidate, level)
+        backward = _align(se3.inverse(T), candidate, query, level)
+        found = len(forward.feature) + len(backward.feature)
+        if found < _MIN_INLIERS:
+            return None
+        try:
+            fit = _fit_pose(T, query, candidate, forward, backward, 2.0**level)
+        except np.linalg.LinAlgError:
+            return None
+        T = fit.T
+    left_to_right = se3.adjoint(se3.inverse(T))  # cov of Exp(xi) T -> of T Exp(xi), of the cameras
+    cov = left_to_right @ fit.cov @ left_to_right.T
+    to_body = se3.adjoint(query.T_body_cam0)
+    T_bodies = se3.orthonormal(candidate.T_body_cam0 @ T @ se3.inverse(query.T_body_cam0))
+    scale = fit.depth_scale
+    if scale is not None and scale.pose_sensitivity is not None:
+        scale = scale._replace(pose_sensitivity=se3.adjoint(candidate.T_body_cam0) @ scale.pose_sensitivity)
+    predicted = forward.predicted + backward.predicted
+    return AlignedLoop(T_bodies, to_body @ cov @ to_body.T, predicted, found, fit.inliers, scale)
+
+
+def _transfer(T: F64, source: ImageView, index: I64 | slice) -> tuple[F64, F64, F64, F64]:
+    """Project the source's features by T (4, 4), target from source.
+
+    Return uv (N, 2) in the target, NaN behind it; the derivative D (N, 2, 3) of uv by the homogeneous point
+    q (N, 3) = R ray + rho t; q; and rho (N,)."""
+    ray, plane = rays(source.uv[index]), source.plane[index]
+    rho = (ray * plane).sum(axis=1)
+    q = ray @ T[:3, :3].T + rho[:, None] * T[:3, 3]
+    z = np.where(q[:, 2] > _MIN_DEPTH_RATIO, q[:, 2], np.nan)
+    uv = q[:, :2] / z[:, None]
+    D = np.zeros((len(q), 2, 3))
+    D[:, 0, 0] = D[:, 1, 1] = 1 / z
+    D[:, :, 2] = -uv / z[:, None]
+    return uv, D, q, rho
+
+
+def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignment:
+    """Align the source's patches in the target's image of a level, from where T (4, 4) puts them."""
+    uv, D, _, _ = _transfer(T, source, slice(None))
+    by_ray = T[:3, :3] + T[:3, 3, None] * source.plane[:, None, :]  # d q / d ray, along the plane
+    warp = target.camera.jacobian(uv) @ D @ by_ray[:, :, :2] @ source.uv_per_px
+    px = target.camera.distort(uv)
+    stretch = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(warp))))
+    inside = target.camera.is_inside(np.nan_to_num(px, nan=-1e6), _BORDER_PX)
+    index = np.flatnonzero(inside & (stretch < _MAX_STRETCH) & (stretch > 1 / _MAX_STRETCH))
+    if len(index) == 0:
+        return _Alignment(index, np.zeros((0, 2)), 0)
+    size = 2.0**level
+    kernels = source.patches[level].kernels[index]
+    images = (target.pyramid[level],)
+    aligned = patches.align(images, len(index), kernels, px[index] / size, warp[index], _MAX_STEPS)
+    distance_px = np.hypot(*(aligned.px - px[index] / size).T)
+    good = (
+        (aligned.correlation > _MIN_CORRELATION)
+        & (aligned.last_step < _CONVERGED_PX)
+        & (distance_px < _REACH_PX)
+    )
+    return _Alignment(index[good], size * aligned.px[good].astype(np.float64), len(index))
+
+
+class _PoseFit(NamedTuple):
+    """T (4, 4) of the cameras, covariance (6, 6) of its left perturbation, inliers, and relative depth
+    scale."""
+
+    T: F64
+    cov: F64
+    inliers: int
+    depth_scale: DepthScale | None
+
+
+def _fit_pose(
+    T: F64, query: ImageView, candidate: ImageView, forward: _Alignment, backward: _Alignment, size: float
+) -> _PoseFit:
+    """Fit the pose to all aligned positions. size: px of the image per px of the level. Raises LinAlgError
+    where they do not determine it."""
+    for _ in range(_ITERATIONS):
+        parts = (
+            _residuals(T, query, candidate, forward, size),
+            _residuals(se3.inverse(T), candidate, query, backward, size),
+        )
+        chain = -se3.adjoint(se3.inverse(T))
+        r = np.concatenate([part.r for part in parts])
+        J = np.concatenate([parts[0].J_pose, parts[1].J_pose @ chain])
+        W = np.concatenate([part.information for part in parts])
+        chi2 = np.einsum("ni,nij,nj->n", r, W, r)
+        JW = np.einsum("nik,nij,n->nkj", J, W, 1 / (1 + chi2 / _CAUCHY**2))
+        information = np.einsum("nkj,njl->kl", JW, J) + _RIDGE * np.eye(6)
+        step = np.linalg.solve(information, np.einsum("nkj,nj->k", JW, r))
+        T = se3.exp(step) @ T
+        if np.abs(step).max() < 1e-5:
+            break
+    inlier = chi2 < _INLIER_CHI2
+    J_scale = np.concatenate([parts[0].J_scale, np.zeros_like(parts[1].J_scale)])
+    depth_scale = _depth_scale(J[inlier], J_scale[inlier], W[inlier], r[inlier])
+    return _PoseFit(T, np.linalg.inv(information), int(inlier.sum()), depth_scale)
+
+
+def _depth_scale(J: F64, J_scale: F64, W: F64, r: F64) -> DepthScale | None:
+    """Return the scale of the query's depths by residuals r (M, 2) at the pose's fit: one more unknown."""
+    if len(r) < _MIN_INLIERS:
+        return None
+    full = np.concatenate([J, J_scale[:, :, None]], axis=2)
+    JW = np.einsum("nik,nij->nkj", full, W)
+    normal = np.einsum("nkj,njl->kl", JW, full) + _RIDGE * np.eye(7)
+    log_scale = float(np.linalg.solve(normal, np.einsum("nkj,nj->k", JW, r))[6])
+    variance = max(1.0, float(np.einsum("ni,nij,nj->", r, W, r)) / max(1, 2 * len(r) - 7))
+    sigma = float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance))
+    return DepthScale(log_scale, sigma, -np.linalg.solve(normal[:6, :6], normal[:6, 6]))
+
+
+class _Residuals(NamedTuple):
+    """r (M, 2): measured minus predicted, px; its derivatives J_pose (M, 2, 6) of the prediction by the left
+    perturbation of T, J_scale (M, 2) by the log of the source's depths; information (M, 2, 2)."""
+
+    r: F64
+    J_pose: F64
+    J_scale: F64
+    information: F64
+
+
+def _residuals(
+    T: F64, source: ImageView, target: ImageView, alignment: _Alignment, size: float
+) -> _Residuals:
+    index = alignment.feature
+    uv, D, q, rho = _transfer(T, source, index)
+    J_px = target.camera.jacobian(uv) @ D
+    J = np.empty((len(index), 2, 6))
+    x, y, z = q[:, 0, None], q[:, 1, None], q[:, 2, None]
+    a, b, c = J_px[..., 0], J_px[..., 1], J_px[..., 2]
+    J[:, :, 0], J[:, :, 1], J[:, :, 2] = y * c - z * b, z * a - x * c, x * b - y * a
+    J[:, :, 3:] = J_px * rho[:, None, None]
+    by_rho = J_px @ T[:3, 3]  # px per 1/m
+    J_depth = by_rho * source.rho_sigma[index, None]
+    S = (size * _SIGMA_PX) ** 2 * np.eye(2) + J_depth[:, :, None] * J_depth[:, None, :]
+    is_visible = np.asarray(np.isfinite(uv).all(axis=1))
+    r: F64 = np.where(is_visible[:, None], alignment.px - target.camera.distort(uv), 1e3)
+    S[~is_visible] = 1e6 * np.eye(2)
+    J_scale = np.nan_to_num(by_rho * rho[:, None])
+    return _Residuals(r, np.nan_to_num(J), J_scale, np.asarray(np.linalg.inv(S)))

@@ -1,0 +1,78 @@
+"""Images of keyframes, compressed to send and to keep."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.array_table import ArrayTable
+from share.checks import MAX_SIGMA
+from share.errors import DataError
+from share.geometry.camera import Camera, rays
+from share.types import F64, MAX_JPEG_BYTES, MAX_PLANE, MAX_UV, U8, KeyframeImage
+from share.vision.image_codec import check_complete, checked_header, decode_gray, encode_jpeg
+
+_JPEG_QUALITIES = (50, 25, 10)  # the first that fits; patches align as well at 50 as uncompressed
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces(ArrayTable):
+    """The surfaces at N features of an image: see `KeyframeImage`. uv (N, 2), plane (N, 3) 1/m, rho_sigma
+    (N,) 1/m."""
+
+    uv: F64
+    plane: F64
+    rho_sigma: F64
+
+    def is_valid(self) -> NDArray[np.bool_]:
+        """Return which (N,) are in front of the camera and within the limits of a `KeyframeImage`."""
+        rho = (rays(self.uv) * self.plane).sum(axis=1)
+        in_bounds = (np.abs(self.uv) <= MAX_UV).all(axis=1) & (np.abs(self.plane) <= MAX_PLANE).all(axis=1)
+        return np.asarray(in_bounds & (rho > 0) & (self.rho_sigma <= MAX_SIGMA))
+
+    def with_image(self, image: U8 | None) -> KeyframeImage:
+        """Return them with an image (H, W), compressed, or without one."""
+        jpeg = np.zeros(0, np.uint8) if image is None else compress(image)
+        return KeyframeImage(
+            jpeg,
+            self.uv.astype(np.float32),
+            self.plane.astype(np.float32),
+            self.rho_sigma.astype(np.float32),
+        )
+
+
+def compress(image: U8) -> U8:
+    """Return the image (H, W) as a JPEG (B,) of at most MAX_JPEG_BYTES; empty if that is impossible."""
+    for quality in _JPEG_QUALITIES:
+        jpeg = encode_jpeg(image, quality)
+        if len(jpeg) <= MAX_JPEG_BYTES:
+            return np.frombuffer(jpeg, np.uint8)
+    return np.zeros(0, np.uint8)
+
+
+def size_objection(image: KeyframeImage, camera: Camera) -> str | None:
+    """Return why the image cannot be of this camera, by its header alone; None if it can, or is empty."""
+    if not len(image.jpeg):
+        return None
+    try:
+        header = checked_header(image.jpeg.tobytes(), "image")
+    except DataError:
+        return "its image is no JPEG"
+    if (header.width, header.height) != (camera.width, camera.height) or header.scans > 1:
+        return f"its image has {header.width}x{header.height} px, its camera {camera.width}x{camera.height}"
+    return None
+
+
+def decompress(image: KeyframeImage, camera: Camera) -> U8 | None:
+    """Return the image (H, W) of this camera; None if there is none, or a damaged one."""
+    if not len(image.jpeg) or size_objection(image, camera) is not None:
+        return None
+    data = image.jpeg.tobytes()
+    try:
+        check_complete(data, "image")
+        decoded = decode_gray(data, "image")
+    except DataError:
+        return None
+    return decoded if decoded.shape == (camera.height, camera.width) else None
