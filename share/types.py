@@ -7,6 +7,7 @@ another thread without a copy. Poses are 4x4 matrices `T_a_b` with p_a = T_a_b p
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -38,6 +39,7 @@ MAX_KEYPOINTS = 2000  # per keyframe
 MAX_NAME_LENGTH = 64  # characters, of an agent's name
 MAX_MAP_ID_LENGTH = MAX_NAME_LENGTH + 32  # a run key has up to 17 characters more, a segment number up to 11
 MAX_JPEG_BYTES = 64_000  # of a keyframe's image
+MAX_EARLIER = 32  # keyframes to which a keyframe's pose is given
 MAX_PLANE = 1e3  # 1/m, of each component of a surface's plane: 1 mm from the camera
 MAX_UV = 1e3  # normalised image coordinates: 89.9 degrees off the axis
 MAX_GYRO_RAD_S = 1e3  # twenty times the range of the widest common gyroscope
@@ -267,6 +269,47 @@ class KeyframeImage:
 
 
 @dataclass(frozen=True, eq=False)
+class EarlierPoses:
+    """Poses of a keyframe's body relative to M earlier keyframes, as the tracker knows them.
+
+    ids (M,) int64: of the keyframes; their stamps, ns, as long as they are candidates. T_earlier_body (M, 4,
+    4) and covariances cov (M, 6, 6), float32.
+    """
+
+    ids: I64
+    T_earlier_body: F32
+    cov: F32
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        if n > MAX_EARLIER:
+            raise ValueError(f"earlier: {n} keyframes, at most {MAX_EARLIER}")
+        for T, cov in zip(self.T_earlier_body, self.cov, strict=True):
+            checked_pose("T_earlier_body", T, MAX_ODOM_M)
+            checked_cov("cov", cov)
+        _set_fields(
+            self,
+            ids=checked_array("ids", self.ids, (n,), np.int64),
+            T_earlier_body=checked_array("T_earlier_body", self.T_earlier_body, (n, 4, 4), np.float32),
+            cov=checked_array("cov", self.cov, (n, 6, 6), np.float32),
+        )
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def take(self, rows: Sequence[int], ids: Sequence[int]) -> EarlierPoses:
+        """Return these rows with other ids."""
+        chosen = np.array(rows, np.int64)
+        return EarlierPoses(np.array(ids, np.int64), self.T_earlier_body[chosen], self.cov[chosen])
+
+    @staticmethod
+    def empty() -> EarlierPoses:
+        return EarlierPoses(
+            np.zeros(0, np.int64), np.zeros((0, 4, 4), np.float32), np.zeros((0, 6, 6), np.float32)
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class KeyframeCandidate:
     """A keyframe that the tracker offers, before the rate decides whether it is sent.
 
@@ -274,7 +317,7 @@ class KeyframeCandidate:
     filter's present estimate, which may differ from that of the two published T_odom_body; for the first of a
     segment it is T_odom_body. cov (6, 6): of T_previous_body. up (3,): unit vector against gravity in the
     body frame, zeros if unknown; up_sigma: of both its angles, rad. new_segment: odometry broke before this
-    keyframe. view, image: as in `Keyframe`.
+    keyframe. view, image: as in `Keyframe`. earlier: relative to earlier candidates.
     """
 
     T_odom_body: F64
@@ -285,6 +328,7 @@ class KeyframeCandidate:
     view: View
     new_segment: bool = False
     image: KeyframeImage = field(default_factory=KeyframeImage.empty)
+    earlier: EarlierPoses = field(default_factory=EarlierPoses.empty)
 
     @property
     def points(self) -> F32:
@@ -313,7 +357,8 @@ class Keyframe:
     frame, zeros if unknown; up_sigma: of both its angles, rad. predecessor: id of the keyframe to apply
     before this one, -1 for none; at least the reference, and more at the start of a segment, so that a
     reordering network cannot make it overtake. view: its ORB features, if the agent finds them; the edge
-    finds those of a keyframe with an image.
+    finds those of a keyframe with an image. earlier: relative to keyframes before the reference, of the same
+    segment; the edge ignores those that it does not have.
     """
 
     id: int
@@ -327,6 +372,7 @@ class Keyframe:
     view: View
     predecessor: int = -1
     image: KeyframeImage = field(default_factory=KeyframeImage.empty)
+    earlier: EarlierPoses = field(default_factory=EarlierPoses.empty)
 
     @property
     def points(self) -> F32:
@@ -336,6 +382,8 @@ class Keyframe:
     def __post_init__(self) -> None:
         checked_id("id", self.id)
         checked_stamp("stamp_ns", self.stamp_ns)
+        if len(self.earlier) and not 0 <= self.earlier.ids.min() <= self.earlier.ids.max() < self.id:
+            raise ValueError(f"earlier: ids must lie in 0 .. {self.id - 1}")
         if not -1 <= self.reference < self.id:
             raise ValueError(f"reference: {self.reference} must lie in -1 .. {self.id - 1}")
         predecessor = max(self.reference, self.predecessor)

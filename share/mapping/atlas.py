@@ -147,6 +147,7 @@ class Atlas:
         cov = inflate_covariance(self._config, keyframe.T_ref_body, keyframe.cov)
         node_id = self.graph.add_keyframe(agent, keyframe, cov, make_gravity_factor(keyframe), rank)
         self.quarantine.add_step(node_id, keyframe.T_ref_body, cov)
+        self.graph.add_spans(node_id, keyframe)
         return node_id
 
     def restore(self, kept: StoredMap, ranks: Sequence[int]) -> list[int]:
@@ -170,6 +171,7 @@ class Atlas:
             )
             graph.add_node(node_id, T_ref_body, cov, make_gravity_factor(sent))
             self.quarantine.add_step(node_id, T_ref_body, cov)
+            graph.add_spans(node_id, sent)
             graph.poses[node_id] = solved.get(key, graph.poses[node_id])
             node_ids.append(node_id)
         for loop in kept.loops:

@@ -55,7 +55,7 @@ def remove_keyframe(graph: MapGraph, node_id: int) -> RemovedKeyframe:
     )
     incident = edges.incident(node_id)
     loops = [(edges.loops[n], edges.by_id[n]) for n in incident if n in edges.loops]
-    odometry_edges = [edges.by_id[n] for n in incident if n not in edges.loops]
+    odometry_edges = [edges.by_id[n] for n in incident if n not in edges.loops and n not in edges.spans]
     for n in incident:
         if n in edges.loops:
             graph.remove_loop_edge(n)

@@ -22,6 +22,9 @@ from share.mapping.loops import KeyframeKey, Loop, RelativePose
 from share.mapping.segments import OdometrySegments
 from share.types import F64, Keyframe
 
+_SHARED_INFORMATION = 2.0  # factor on the covariance of odometry over several keyframes: it shares its
+# measurements with that between neighbours
+
 
 class GraphEdges:
     """Odometry and loop edges between node ids, and what of them the solver has not received yet."""
@@ -30,6 +33,7 @@ class GraphEdges:
         self.covariance_paths = CovariancePaths()
         self.by_id: dict[int, PoseEdge] = {}
         self.loops: dict[int, Loop] = {}  # by edge id, oldest first
+        self.spans: set[int] = set()  # edge ids of odometry over several keyframes
         self._incident: dict[int, set[int]] = {}
         self._next_id = 0
         self.is_reset = True  # the next update contains the whole graph
@@ -52,9 +56,14 @@ class GraphEdges:
         self.covariance_paths.add(edge)
         return edge_id
 
+    def add_span(self, edge: PoseEdge) -> None:
+        """Add an odometry edge over several keyframes, beside those between neighbours."""
+        self.spans.add(self.add(edge))
+
     def remove(self, edge_id: int) -> None:
         """Remove an edge, and its loop if it has one."""
         edge = self.by_id.pop(edge_id)
+        self.spans.discard(edge_id)
         self.loops.pop(edge_id, None)
         for end in (edge.a, edge.b):
             self._incident[end].discard(edge_id)
@@ -85,7 +94,8 @@ class GraphEdges:
 
         poses, gravity_factors: of all node ids (`share.mapping.graph.gravity`).
         """
-        edges = [(n, self.by_id[n], n in self.loops) for n in sorted(self._pending_edges)]
+        is_robust = self.loops.keys() | self.spans
+        edges = [(n, self.by_id[n], n in is_robust) for n in sorted(self._pending_edges)]
         update = GraphUpdate.from_edges(
             {node_id: poses[node_id] for node_id in sorted(self._moved_nodes)},
             edges,
@@ -106,6 +116,11 @@ class GraphEdges:
         self._moved_nodes |= self._sent_nodes
         for forgotten in (self._sent_nodes, self._removed_edges, self._removed_nodes):
             forgotten.clear()
+
+
+def _rescaled(edge: PoseEdge, log_change: float, covariance_ratio: float) -> PoseEdge:
+    T_a_b = rescale_translation(edge.T_a_b, log_change)
+    return replace(edge, T_a_b=T_a_b, cov=covariance_ratio * edge.cov)
 
 
 def rescale_translation(T: F64, log_scale: float) -> F64:
@@ -162,6 +177,20 @@ class MapGraph:
         if gravity_factor.any():
             self.gravity_factors[node_id] = gravity_factor
         self.edges.mark_moved([node_id])
+
+    def add_spans(self, node_id: int, keyframe: Keyframe) -> None:
+        """Add the keyframe's odometry relative to earlier keyframes, where its segment has them."""
+        odometry, edges = self.odometry, self.edges
+        agent, segment = odometry.nodes[node_id].key.agent, odometry.nodes[node_id].segment
+        log_scale, covariance_scale = self.log_scales.get(agent, 0.0), self.covariance_scales.get(agent, 1.0)
+        earlier = keyframe.earlier
+        for earlier_id, T, cov in zip(earlier.ids.tolist(), earlier.T_earlier_body, earlier.cov, strict=True):
+            key = KeyframeKey(agent, earlier_id)
+            if not odometry.has_keyframe(key) or odometry.nodes[odometry.node_id(key)].segment != segment:
+                continue  # removed, or the segment was split
+            T_a_b = rescale_translation(se3.orthonormal(T.astype(np.float64)), log_scale)
+            cov_a_b = covariance_scale * _SHARED_INFORMATION * cov.astype(np.float64)
+            edges.add_span(PoseEdge(odometry.node_id(key), node_id, T_a_b, cov_a_b))
 
     def remove_node(self, node_id: int) -> None:
         """Remove a node that has no edges."""
@@ -240,13 +269,12 @@ class MapGraph:
             for before, after in itertools.pairwise(segment.nodes):
                 edge_id, edge = self._find_odometry_edge(before, after)
                 self.edges.remove(edge_id)
-                self.edges.add(
-                    replace(
-                        edge,
-                        T_a_b=rescale_translation(edge.T_a_b, log_change),
-                        cov=covariance_ratio * edge.cov,
-                    )
-                )
+                self.edges.add(_rescaled(edge, log_change, covariance_ratio))
+            ends = set(segment.nodes)
+            for edge_id in sorted(n for n in self.edges.spans if self.edges.by_id[n].a in ends):
+                edge = self.edges.by_id[edge_id]
+                self.edges.remove(edge_id)
+                self.edges.add_span(_rescaled(edge, log_change, covariance_ratio))
             self.unsolved_maps.setdefault(self.reference_segments[segment_index])
 
     def propagate(self, node_ids: Iterable[int]) -> None:
@@ -271,7 +299,8 @@ class MapGraph:
     def _find_odometry_edge(self, previous: int, node_id: int) -> tuple[int, PoseEdge]:
         for edge_id in self.edges.incident(node_id):
             edge = self.edges.by_id[edge_id]
-            if edge_id not in self.edges.loops and previous in (edge.a, edge.b):
+            is_step = edge_id not in self.edges.loops and edge_id not in self.edges.spans
+            if is_step and previous in (edge.a, edge.b):
                 return edge_id, edge
         raise ValueError(f"no odometry edge from node {previous} to {node_id}")
 

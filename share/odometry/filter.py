@@ -327,6 +327,14 @@ def relative_pose_cov(state: FilterState, a: int, b: int) -> F64:
     return (out + out.T) / 2 + _MIN_VARIANCE * np.eye(6)
 
 
+def relative_poses(state: FilterState, indices: I64, b: int) -> tuple[F64, F64]:
+    """Return T_a_b (M, 4, 4) from the keyframes with `indices` (M,) to keyframe b, with covariances (M, 6,
+    6), perturbed on the right."""
+    T = se3.orthonormal(se3.inverse(state.keyframe_poses[indices]) @ state.keyframe_poses[b])
+    covs = [relative_pose_cov(state, int(a), b) for a in indices]
+    return T, np.array(covs).reshape(-1, 6, 6)
+
+
 def motion_cov_since_keyframe(state: FilterState) -> F64:
     """Return the covariance (6, 6) of the body's motion since the newest keyframe, perturbed on the right."""
     Ad = se3.adjoint(se3.inverse(state.T))

@@ -133,6 +133,7 @@ class InertialTracker:
             View.empty(),
             new_segment,
             published.surfaces.with_image(frame.image0),
+            published.earlier,
         )
 
     def finish_keyframe(self) -> None:

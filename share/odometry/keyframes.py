@@ -21,7 +21,7 @@ from share.odometry import filter
 from share.odometry.initialisation import tilt_sigma
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.state import FilterState
-from share.types import F32, F64, Frame
+from share.types import F32, F64, MAX_EARLIER, EarlierPoses, Frame
 from share.vision.keyframe_images import Surfaces
 
 KEYFRAME_GAP_NS = 100_000_000  # least time between keyframes
@@ -100,7 +100,8 @@ _SLICE_PERIOD_NS = 30_000_000  # of the time between frames: two slices a frame 
 class PublishedKeyframe(NamedTuple):
     """A keyframe's surfaces, pose T_odom_body (4, 4) and tilt sigma, rad, by the present state.
 
-    T_previous_body (4, 4): motion since the keyframe published before, with its covariance (6, 6).
+    T_previous_body (4, 4): motion since the keyframe published before, with its covariance (6, 6). earlier:
+    relative to all published ones in the state.
     """
 
     surfaces: Surfaces
@@ -108,6 +109,7 @@ class PublishedKeyframe(NamedTuple):
     tilt_sigma: float
     T_previous_body: F64
     cov: F64
+    earlier: EarlierPoses
 
 
 class OfferedKeyframe(NamedTuple):
@@ -143,6 +145,7 @@ class KeyframeScheduler:
         self._spacing = KeyframeSpacing(config.keyframe_m, config.keyframe_rad, _MIN_SEEN_SHARE)
         self._last_published = LastPublishedKeyframe()
         self._published_ns = self._processed_ns = 0
+        self._published: dict[int, int] = {}  # stamps, ns, of published keyframes by id
         self._offered: OfferedKeyframe | None = None
         self._newest: _PendingKeyframe | None = None
         self._to_publish: _PendingKeyframe | None = None  # the frame just tracked
@@ -205,7 +208,16 @@ class KeyframeScheduler:
         k = filter.keyframe_index(s, pending.keyframe_id)
         T_previous_body, cov = self._last_published.motion_to(s, k, new_segment)
         tilt = tilt_sigma(s, s.keyframe_columns(k))
-        return PublishedKeyframe(surfaces, s.keyframe_poses[k], tilt, T_previous_body, cov)
+        earlier = EarlierPoses.empty() if new_segment else self._earlier_poses(s, k)
+        return PublishedKeyframe(surfaces, s.keyframe_poses[k], tilt, T_previous_body, cov, earlier)
+
+    def _earlier_poses(self, s: FilterState, k: int) -> EarlierPoses:
+        """Return the pose of keyframe k relative to the published ones in the state, newest last."""
+        self._published = {i: self._published[i] for i in s.keyframe_ids.tolist() if i in self._published}
+        indices = np.flatnonzero(np.isin(s.keyframe_ids, list(self._published)))[-MAX_EARLIER:]
+        T, cov = filter.relative_poses(s, indices, k)
+        stamps_ns = [self._published[i] for i in s.keyframe_ids[indices].tolist()]
+        return EarlierPoses(np.array(stamps_ns, np.int64), T.astype(np.float32), cov.astype(np.float32))
 
     def process_pending(self, landmarks: LandmarkMap, frame: Frame, rate: F64) -> OfferedKeyframe | None:
         """Run the slices that there is time for after `frame`, the frame just tracked; at least one. Once a
@@ -217,6 +229,7 @@ class KeyframeScheduler:
         if offered is not None:
             # Not before: making its candidate might have failed.
             self._last_published.update(landmarks.state, offered.keyframe_id)
+            self._published[offered.keyframe_id] = offered.frame.stamp_ns
         slices = self._slice_count(frame)
         if self._to_publish is not None:  # it was published, or not asked for
             self._to_publish = None
@@ -236,6 +249,7 @@ class KeyframeScheduler:
         """Drop all pending work: the filter begins anew, with new keyframe ids."""
         self._offered = self._newest = self._to_publish = None
         self._slices.clear()
+        self._published.clear()
         self._last_published.reset()
 
     def _run_slice(self, landmarks: LandmarkMap, last_frame: Frame, rate: F64) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from share.geometry.se3 import compose_cov, orthonormal
 from share.timing import seconds_to_ns
-from share.types import F64, Keyframe, KeyframeCandidate
+from share.types import F64, MAX_EARLIER, EarlierPoses, Keyframe, KeyframeCandidate
 from share.wire.messages import Ack, Welcome
 
 RESEND_S = 1.0  # first wait for an acknowledgement; doubles with each resend
@@ -205,7 +205,13 @@ def _rebase(keyframe: Keyframe, dropped: Keyframe) -> Keyframe:
 
 def _detach(entry: LedgerEntry) -> Keyframe:
     """Return the keyframe as the start of a segment, for an edge that has nothing before it."""
-    return replace(entry.keyframe, reference=-1, predecessor=-1, T_ref_body=entry.keyframe.T_odom_body)
+    return replace(
+        entry.keyframe,
+        reference=-1,
+        predecessor=-1,
+        T_ref_body=entry.keyframe.T_odom_body,
+        earlier=EarlierPoses.empty(),
+    )
 
 
 class KeyframeChain:
@@ -219,6 +225,7 @@ class KeyframeChain:
         self.next_id = 0
         self.first_of_segment = 0  # lowest id that the present segment has or will have
         self._has_reference = False  # False: the next keyframe starts a segment
+        self._ids: dict[int, int] = {}  # of the newest keyframes, by stamp, ns
         self._reset_motion()
 
     def begin_segment(self) -> None:
@@ -237,27 +244,64 @@ class KeyframeChain:
 
     def make_keyframe(self, candidate: KeyframeCandidate, stamp_ns: int) -> Keyframe:
         """Return the candidate given to `extend` last as the next keyframe."""
+        T_ref_body, cov, earlier = self._T_keyframe_candidate, self._cov, EarlierPoses.empty()
+        if not self._has_reference:
+            T_ref_body = candidate.T_odom_body
+        else:
+            earlier = self._earlier_keyframes(candidate.earlier)
+            if (
+                len(earlier) and earlier.ids[-1] == self.next_id - 1
+            ):  # more accurate than the candidates' chain
+                T_ref_body = orthonormal(earlier.T_earlier_body[-1].astype(np.float64))
+                cov = earlier.cov[-1].astype(np.float64)
+            earlier = spread_earlier(earlier, self.next_id)
         keyframe = Keyframe(
             id=self.next_id,
             reference=self.next_id - 1 if self._has_reference else -1,
             stamp_ns=stamp_ns,
-            T_ref_body=self._T_keyframe_candidate if self._has_reference else candidate.T_odom_body,
-            cov=self._cov,
+            T_ref_body=T_ref_body,
+            cov=cov,
             T_odom_body=candidate.T_odom_body,
             up=candidate.up,
             up_sigma=candidate.up_sigma,
             view=candidate.view,
             predecessor=self.next_id - 1,
             image=candidate.image,
+            earlier=earlier,
         )
+        if not self._has_reference:
+            self._ids.clear()
+        self._ids[stamp_ns] = keyframe.id
+        if len(self._ids) > MAX_EARLIER:
+            del self._ids[next(iter(self._ids))]
         self.next_id += 1
         self._has_reference = True
         self._reset_motion()
         return keyframe
 
+    def _earlier_keyframes(self, candidates: EarlierPoses) -> EarlierPoses:
+        """Return the poses relative to those candidates that became keyframes of this segment."""
+        sent = [
+            (row, self._ids[stamp]) for row, stamp in enumerate(candidates.ids.tolist()) if stamp in self._ids
+        ]
+        return candidates.take([row for row, _ in sent], [keyframe for _, keyframe in sent])
+
     def _reset_motion(self) -> None:
         """Restart the accumulated motion at the last keyframe, or at the start of the segment."""
         self._T_keyframe_candidate, self._cov = np.eye(4), np.zeros((6, 6))
+
+
+_EARLIER_STEPS = 3, 7, 13  # keyframes back, to which a keyframe's pose is sent beside that to its reference
+
+
+def spread_earlier(earlier: EarlierPoses, keyframe_id: int) -> EarlierPoses:
+    """Return the poses relative to the keyframes nearest to `_EARLIER_STEPS` before this one.
+
+    A chain of steps between neighbours loses what the tracker knows of longer ones: its window."""
+    steps = keyframe_id - earlier.ids
+    rows = sorted({int(np.abs(steps - step).argmin()) for step in _EARLIER_STEPS if (steps > 1).any()})
+    rows = [row for row in rows if steps[row] > 1]
+    return earlier.take(rows, earlier.ids[rows].tolist())
 
 
 _SCORE_WINDOW = 20  # recent candidates with which one is compared

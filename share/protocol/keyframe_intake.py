@@ -11,7 +11,7 @@ import numpy as np
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.timing import SECOND_NS, TokenBuckets
-from share.types import F64, Keyframe
+from share.types import F64, EarlierPoses, Keyframe
 from share.vision.keyframe_images import size_objection
 from share.wire.messages import MAX_BUFFERED, Ack
 
@@ -180,7 +180,8 @@ def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> t
         elif contradiction := base.contradiction(keyframe):
             problem = f"keyframe {keyframe.id}: {contradiction}: new segment"
         if problem:
-            keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body)
+            earlier = EarlierPoses.empty()
+            keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=earlier)
     if (variance := float(keyframe.cov.diagonal().max())) > _MAX_VARIANCE:
         problem = problem or f"keyframe {keyframe.id} has a variance of {variance:.0e}; treated as unknown"
         keyframe = replace(keyframe, cov=keyframe.cov * (_MAX_VARIANCE / variance))

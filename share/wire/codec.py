@@ -29,6 +29,7 @@ from share.types import (
     F64,
     I64,
     MAX_ACCEL_M_S2,
+    MAX_EARLIER,
     MAX_GYRO_RAD_S,
     MAX_JPEG_BYTES,
     MAX_KEYPOINTS,
@@ -36,6 +37,7 @@ from share.types import (
     MAX_NAME_LENGTH,
     AgentKind,
     Correction,
+    EarlierPoses,
     Frame,
     ImuBatch,
     Keyframe,
@@ -49,7 +51,7 @@ from share.wire import messages as m
 WIRE_VERSION = 6
 OLDEST_VERSION = 2  # the STABLE_MESSAGES have not changed since
 MAX_HEADER_BYTES = 4096
-MAX_ARRAYS = 12
+MAX_ARRAYS = 16
 MAX_FRAME_BYTES = max(MAX_KEYPOINTS * DESCRIPTOR_BYTES, MAX_JPEG_BYTES)  # of all messages but Frame
 MAX_IMAGE_BYTES = 4 * 1920 * 1200  # largest array of a Frame: a depth image
 
@@ -192,10 +194,14 @@ def _build_keyframe(
     feature_uv: Any,
     plane: Any,
     rho_sigma: Any,
+    ids: Any,
+    T_earlier_body: Any,
+    earlier_cov: Any,
     **fields: Any,
 ) -> Keyframe:
     image = KeyframeImage(jpeg, feature_uv, plane, rho_sigma)
-    return Keyframe(**fields, view=View(uv, points, descriptors), image=image)
+    earlier = EarlierPoses(ids, T_earlier_body, earlier_cov)
+    return Keyframe(**fields, view=View(uv, points, descriptors), image=image, earlier=earlier)
 
 
 def _build_keyframe_without_image(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
@@ -263,6 +269,9 @@ _LAYOUTS: dict[type, _Layout] = {
         _Array("image.uv", "<f4", (None, 2), key="feature_uv"),
         _Array("image.plane", "<f4", (None, 3)),
         _Array("image.rho_sigma", "<f4", (None,)),
+        _Array("earlier.ids", "<i8", (None,), max_length=MAX_EARLIER),
+        _Array("earlier.T_earlier_body", "<f4", (None, 4, 4), max_length=MAX_EARLIER),
+        _Array("earlier.cov", "<f4", (None, 6, 6), max_length=MAX_EARLIER, key="earlier_cov"),
         **_KEYFRAME_SCALARS,
     ),
     m.Evaluation: _Layout(4, m.Evaluation, keyframe=Int64, delay_ms=float, error_cm=float | None),
