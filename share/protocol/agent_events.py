@@ -131,7 +131,7 @@ class FrameTrackedRemotely:
 @dataclass(frozen=True, eq=False)
 class LocalisedPose:
     """The agent's pose. arrived_ns: arrival of its frame. segment: number of the odometry segment, rising.
-    T_map_odom (4, 4): in force now (blended); None before the first correction."""
+    T_map_odom (4, 4): in force now; None before the first correction."""
 
     index: int
     stamp_ns: int
@@ -145,7 +145,7 @@ class LocalisedPose:
 
 @dataclass(frozen=True)
 class CorrectionApplied:
-    """A correction is in force, or being blended in, from now on.
+    """A correction is the target from now on. jumps: it is in force at once, else it comes gradually.
 
     keyframe_id, frame_index, stamp_ns: the keyframe that it answers and its frame; None where it answers no
     remembered keyframe. corrected_ms: from that frame's arrival to now; None but for the first correction of
@@ -158,7 +158,7 @@ class CorrectionApplied:
     corrected_ms: float | None
     map_id: str
     revision: int
-    new_map: bool
+    jumps: bool
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The agent's pose in the map: T_map_odom without jumps, and its expected error."""
+"""The agent's pose in the map: T_map_odom without visible steps, and its expected error."""
 
 from __future__ import annotations
 
@@ -17,32 +17,55 @@ from share.timing import SECOND_NS, seconds_to_ns
 from share.types import F64, Correction, Keyframe
 from share.wire import messages as m
 
-# A correction that moves the body further, or rotates it further, is blended in.
-BLEND_JUMP_M, BLEND_JUMP_RAD = 0.05, 0.02
+_AHEAD_M = 3.0  # what a wearer looks at; a rotation moves it by this lever
+# The body and what is so far ahead move by at most this speed relative to odometry: 0.8 mm a frame at 30 Hz;
+# faster, but less than 3 mm, where the way is long.
+_SPEED_M_S, _WAY_S, _MAX_SPEED_M_S = 0.025, 6.0, 0.08
+_JUMP_M = 1.0  # a longer way is a mistake of the map that was undone: the pose jumps
+_SETTLED_M = 1e-3  # of the way left
 
 
-class BlendedMapFrame:
-    """T_map_odom (4, 4) in force. Large changes are blended in along the geodesic of SE(3).
+class MapFrame:
+    """T_map_odom (4, 4) in force, which follows the corrections without visible steps.
 
-    The size of a change is judged at the body: far from the odometry origin a small rotation moves it far.
+    What is left of a correction is taken about the body, and decays with a time constant at a limited speed.
+    A newer correction changes where it goes, never the pose in force. A correction into another map, or by a
+    long way, applies at once: the pose jumps.
     """
 
-    def __init__(self, blend_s: float) -> None:
+    def __init__(self, time_constant_s: float) -> None:
         self.map_id: str | None = None
-        self._blend_s = blend_s
+        self._time_constant_s = time_constant_s
         self._target: F64 | None = None
+        self._current: F64 | None = None
         self._cov: F64 = np.zeros((6, 6))  # of the target
-        self._blend_xi: F64 = np.zeros(6)  # from the target to the transform in force when the blend began
-        self._blend_start_ns = 0
+        self._advanced_ns = 0
+        self._unsettled_since_ns: int | None = None
 
-    def transform(self, now_ns: int) -> F64 | None:
-        """Return T_map_odom (4, 4) at `now_ns`; None before the first correction."""
-        if self._target is None:
+    def advance(self, T_odom_body: F64, now_ns: int) -> float | None:
+        """Move towards the newest correction; once a frame. Return the time, s, that it took to settle, if it
+        has settled now."""
+        elapsed_s, self._advanced_ns = max(0, now_ns - self._advanced_ns) / SECOND_NS, now_ns
+        if self._current is None or self._target is None or self._unsettled_since_ns is None:
             return None
-        remaining = 1 - (now_ns - self._blend_start_ns) / (self._blend_s * SECOND_NS)
-        if remaining <= 0 or not self._blend_xi.any():
-            return self._target
-        return self._target @ se3.exp(min(remaining, 1.0) * self._blend_xi)
+        xi = _way(self._current, self._target, T_odom_body)
+        length_m = _length_m(xi)
+        if length_m <= _SETTLED_M / 100:
+            share = 1.0
+        else:
+            speed = min(max(_SPEED_M_S, length_m / _WAY_S), _MAX_SPEED_M_S)
+            share = min(-math.expm1(-elapsed_s / self._time_constant_s), speed * elapsed_s / length_m)
+        moved = self._current @ T_odom_body @ se3.exp(share * xi)
+        self._current = se3.orthonormal(moved @ inverse(T_odom_body))
+        if (1 - share) * length_m > _SETTLED_M:
+            return None
+        since_ns, self._unsettled_since_ns = self._unsettled_since_ns, None
+        return (now_ns - since_ns) / SECOND_NS
+
+    @property
+    def T_map_odom(self) -> F64 | None:
+        """The transform (4, 4) in force; None before the first correction."""
+        return self._current
 
     def sigma_cm(self, T_odom_body: F64) -> float:
         """Return the standard deviation of the body's map position due to T_map_odom, cm; 0 without a
@@ -52,24 +75,36 @@ class BlendedMapFrame:
         return 100 * position_sigma(compose_cov(T_odom_body, self._cov, np.zeros((6, 6))))
 
     def apply(self, correction: Correction, T_odom_body: F64, now_ns: int) -> bool:
-        """Set a new target. Return whether it is in another map."""
-        T_map_odom, map_id = correction.T_map_odom, correction.map_id
-        current, same_map = self.transform(now_ns), map_id == self.map_id
-        self._blend_xi = np.zeros(6)
-        if current is not None and same_map and _is_large(current, T_map_odom, T_odom_body):
-            self._blend_xi = se3.log(inverse(T_map_odom) @ current)
-        self._target, self._blend_start_ns, self.map_id = T_map_odom, now_ns, map_id
-        self._cov = correction.cov
-        return not same_map
+        """Set a new target. Return whether the pose jumps to it."""
+        target, is_same_map = correction.T_map_odom, correction.map_id == self.map_id
+        jumps = (
+            self._current is None
+            or not is_same_map
+            or _length_m(_way(self._current, target, T_odom_body)) > _JUMP_M
+        )
+        self._target, self._cov, self.map_id = target, correction.cov, correction.map_id
+        if jumps:
+            self._current, self._unsettled_since_ns = target, None
+        elif self._unsettled_since_ns is None:
+            self._unsettled_since_ns = now_ns
+        return jumps
 
     def reset(self) -> None:
         """Forget the transform: odometry broke."""
-        self._target = None
+        self._target = self._current = self._unsettled_since_ns = None
 
 
-def _is_large(T_old: F64, T_new: F64, T_odom_body: F64) -> bool:
-    jump = inverse(T_old @ T_odom_body) @ T_new @ T_odom_body
-    return bool(np.linalg.norm(jump[:3, 3]) > BLEND_JUMP_M or se3.rotation_angle(jump) > BLEND_JUMP_RAD)
+def _way(T_old: F64, T_new: F64, T_odom_body: F64) -> F64:
+    """Return the motion (6,) of the body from one T_map_odom to another, on the right."""
+    return se3.log(inverse(T_old @ T_odom_body) @ T_new @ T_odom_body)
+
+
+def _length_m(xi: F64) -> float:
+    """Return how far a motion (6,) of the body moves the body and what is ahead of it, at most."""
+    return float(np.linalg.norm(xi[3:]) + _AHEAD_M * np.linalg.norm(xi[:3]))
+
+
+_MAX_SETTLED = 1000
 
 
 class MapLocalisation:
@@ -78,7 +113,8 @@ class MapLocalisation:
 
     def __init__(self, blend_s: float) -> None:
         self.T_odom_body: F64 | None = None
-        self.map_frame = BlendedMapFrame(blend_s)
+        self.map_frame = MapFrame(blend_s)
+        self.settle_s: deque[float] = deque(maxlen=_MAX_SETTLED)  # times in which corrections came into force
         self._segment = 0  # number of the odometry segment
 
     def begin_segment(self) -> None:
@@ -89,8 +125,11 @@ class MapLocalisation:
     def localise(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> ev.LocalisedPose:
         """Return the localised pose of a frame that has one. T_odom_body (4, 4)."""
         self.T_odom_body = T_odom_body
+        settled_s = self.map_frame.advance(T_odom_body, now_ns)
+        if settled_s is not None:
+            self.settle_s.append(settled_s)
         times = frame.index, frame.stamp_ns, frame.arrived_ns
-        T_map_odom, map_id = self.map_frame.transform(now_ns), self.map_frame.map_id
+        T_map_odom, map_id = self.map_frame.T_map_odom, self.map_frame.map_id
         return ev.LocalisedPose(*times, self._segment, T_odom_body, T_map_odom, map_id, frame.state)
 
     def apply_correction(
@@ -98,11 +137,11 @@ class MapLocalisation:
     ) -> ev.CorrectionApplied:
         """Apply a valid correction. entry, corrected_ms: from `KeyframeLedger.record_correction`."""
         T_odom_body = correction.T_map_odom if self.T_odom_body is None else self.T_odom_body
-        new_map = self.map_frame.apply(correction, T_odom_body, now_ns)
+        jumps = self.map_frame.apply(correction, T_odom_body, now_ns)
         answered: tuple[int | None, int | None, int | None] = (None, None, None)
         if entry is not None:
             answered = (entry.keyframe.id, entry.frame_index, entry.keyframe.stamp_ns)
-        where = (correction.map_id, correction.revision, new_map)
+        where = (correction.map_id, correction.revision, jumps)
         return ev.CorrectionApplied(*answered, corrected_ms, *where)
 
 
