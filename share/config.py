@@ -71,7 +71,7 @@ class AgentConfig:
 
     keep_keyframes: int = 600  # keyframes kept, sent ones included, to resend to a restarted edge
     late_ms: float = 0.0  # frames later than this are skipped; 0: none
-    blend_s: float = 1.0  # time constant with which the pose follows a correction
+    blend_s: float = 0.5  # time constant with which the pose follows a correction
     finish_s: float = 5.0  # longest wait for acknowledgements at the end of a run
     error_model: str = "shipped"  # error model: shipped, a file, or "" for odometry's covariance
 

@@ -18,9 +18,9 @@ from share.types import F64, Correction, Keyframe
 from share.wire import messages as m
 
 _AHEAD_M = 3.0  # what a wearer looks at; a rotation moves it by this lever
-# The body and what is so far ahead move by at most this speed relative to odometry: 0.8 mm a frame at 30 Hz;
+# The body and what is so far ahead move by at most this speed relative to odometry: 1 mm a frame at 15 Hz;
 # faster, but less than 3 mm, where the way is long.
-_SPEED_M_S, _WAY_S, _MAX_SPEED_M_S = 0.025, 6.0, 0.08
+_SPEED_M_S, _WAY_S, _MAX_SPEED_M_S = 0.0148, 10.0, 0.044
 _JUMP_M = 1.0  # a longer way is a mistake of the map that was undone: the pose jumps
 _SETTLED_M = 1e-3  # of the way left
 
