@@ -15,7 +15,7 @@ from share.cli.main import cli
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("*/README.md")])
-CITING = [page for page in PAGES if page.name != "renamed.md" and "results" not in page.parts]
+CITING = [page for page in PAGES if "results" not in page.parts]
 NOT_MODULES = {"share.x.y", "share.rig"}  # an example; a record in MCAP files
 NOT_OURS = {
     "AprilGrid",
