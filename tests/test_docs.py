@@ -27,7 +27,7 @@ NOT_OURS = {
     "RecursionError",
 }
 TOOL: dict[str, Any] = runpy.run_path(str(ROOT / "tools" / "config_table.py"))
-COMMON_LINE = re.compile(r"^\[Common\]\(#common-options\): (.+(?:\n.+)*)", re.MULTILINE)
+COMMON_LINE = re.compile(r"^Also: (.+(?:\n.+)*)", re.MULTILINE)
 COMMANDS = (DOCS / "lookup" / "commands.md").read_text()
 
 
