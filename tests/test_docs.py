@@ -27,6 +27,7 @@ NOT_OURS = {
     "RecursionError",
 }
 TOOL: dict[str, Any] = runpy.run_path(str(ROOT / "tools" / "config_table.py"))
+COMMON_LINE = re.compile(r"^Also: (.+(?:\n.+)*)", re.MULTILINE)
 COMMANDS = (DOCS / "lookup" / "commands.md").read_text()
 
 
@@ -173,8 +174,14 @@ def test_commands_page_has_every_command_and_no_other() -> None:
 
 @pytest.mark.parametrize("name", sorted(commands(cli)))
 def test_commands_page_has_every_option_and_no_other(name: str) -> None:
-    rows = re.findall(r"^\| `[^|]*?(--[a-z-]+)", documented()[name], flags=re.MULTILINE)
-    assert set(rows) == options(commands(cli)[name])
+    section = documented()[name]
+    rows = re.findall(r"^\| `[^|]*?(--[a-z-]+)", section, flags=re.MULTILINE)
+    common = [o for line in COMMON_LINE.findall(section) for o in re.findall(r"`(--[a-z-]+)`", line)]
+    assert sorted(rows + common) == sorted(options(commands(cli)[name]))
+    described = COMMANDS.partition("## Common options\n")[2].partition("\n## ")[0]
+    assert [
+        option for option in common if not re.search(rf"^\| .*`{option}\b", described, re.MULTILINE)
+    ] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
