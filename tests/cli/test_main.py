@@ -11,6 +11,7 @@ import pytest
 
 from share import __version__
 from share.cli.main import COMMANDS, main
+from share.config import POLICY_NAMES
 
 SHARE = [sys.executable, "-m", "share"]
 HEAVY = [
@@ -52,6 +53,14 @@ def test_help(command, capsys):
     assert ("Example:  share " if command else "Try it:   share demo") in out
     assert "..." not in out.replace("[ARGS]...", "")  # no help text is cut off
     assert run(capsys, *command, "-h") == (0, out, "")
+
+
+@pytest.mark.parametrize("command", ["edge", "demo", "evaluate run", "evaluate sweep", "evaluate ablation"])
+def test_help_explains_each_policy(command, capsys):
+    _, out, _ = run(capsys, *command.split(), "--help")
+    rows = out.partition("Policies:")[2].partition("Example:")[0].split("\n\n")[0].splitlines()[1:]
+    assert [row.split()[0] for row in rows] == list(POLICY_NAMES)
+    assert all(len(row.split()) > 4 for row in rows)
 
 
 def test_help_imports_nothing_heavy():
