@@ -163,8 +163,8 @@ run_options = option_group(
 def load_config(path: Path | None, policies: Sequence[str | None] = ()) -> Config:
     """Read settings from a YAML file; the defaults without one. Raises ConfigError, UsageError.
 
-    policies: those given by --policy; the first replaces `edge.policy`. If the file sets a policy that is none
-    of them, a line on stderr says so.
+    policies: those given by --policy; the first replaces `edge.policy`. If the file sets a policy that is
+    none of them, a line on stderr says so.
     """
     from share.config import Config, with_policy
     from share.files.yaml_file import read_given_settings

@@ -81,7 +81,9 @@ def read_settings(path: Path) -> Config:
 
 
 def read_given_settings(path: Path) -> tuple[Config, dict[str, Any]]:
-    """Read a file of settings; return all settings, and only those that it sets. Raises as `read_settings`."""
+    """Read a file of settings; return all settings, and only those that it sets.
+
+    Raises as `read_settings`."""
     with read_errors(path, UsageError):
         text = read_text(path, MAX_SETTINGS_BYTES)
     return load_given_config(text, str(path))

@@ -96,12 +96,16 @@ class StepRunner:
 
 @dataclass(frozen=True, eq=False)
 class MapEvent:
-    """A decision about an agent's run with its reason, and the correction that follows, if any."""
+    """A decision with its reason, and the correction that follows, if any.
 
-    agent: str
+    agent: the run concerned; None where the event concerns the map `map_id`, or the whole mapper.
+    """
+
+    agent: str | None
     event: str
     reason: str
     correction: Correction | None = None
+    map_id: str | None = None
 
 
 def map_assignment(

@@ -334,6 +334,10 @@ class Edge:
 
     def _on_finding(self, finding: MapEvent) -> None:
         """Record a decision of the mapper, and send its correction if there is one."""
+        if finding.agent is None:
+            fields: dict[str, Any] = {} if finding.map_id is None else {"map_id": finding.map_id}
+            self._record(finding.event, None, finding.reason, **fields)
+            return
         if (peer := self._registry.by_key.get(finding.agent)) is None:  # forgotten in the meantime
             return
         if finding.correction is None:

@@ -39,11 +39,12 @@ class EventLog:
     def throttled_event(
         self, now_ns: int, kind: str, agent: str | None, reason: str, **fields: Any
     ) -> WriteEvent | None:
-        """Return the event, or None beyond the limits of its kind and agent; the next one counts those left
-        out."""
-        suppressed = self._throttle.admit((kind, agent), now_ns)
+        """Return the event, or None beyond the limits of its kind and agent, or map where it concerns no
+        agent; the next one counts those left out."""
+        key = kind, agent, fields.get("map_id") if agent is None else None
+        suppressed = self._throttle.admit(key, now_ns)
         if suppressed is not None:
-            suppressed = self._sustained.admit((kind, agent), now_ns, suppressed)
+            suppressed = self._sustained.admit(key, now_ns, suppressed)
         if suppressed is None:
             return None
         more = f" (and {suppressed} more since the last line)" if suppressed else ""

@@ -124,7 +124,7 @@ class EdgeRun:
         self._start_ns = time.monotonic_ns()
         self._refused_handshakes: Counter[str] = Counter()  # by refusal line
         self._troubles = _RecentTroubles()
-        self._agent_troubles = _RecentTroubles()  # of one agent, not of the edge
+        self._other_troubles = _RecentTroubles()  # of one agent or map, not of the edge
         self._report: dict[str, Any] = {}
         self._report_due_s = self._reported_s = 0.0  # next and last report, monotonic s
         self._heap = HeapTrimmer()
@@ -195,7 +195,7 @@ class EdgeRun:
         report = self._totals.with_totals(self._state_machine.report(self._progress.report))
         self._report = {
             **report,
-            "refused": [*self._agent_troubles.current(), *report["refused"]],
+            "refused": [*self._other_troubles.current(), *report["refused"]],
             "refused_handshakes": self._refused_handshakes.total(),
             "trouble": [*self._troubles.current(), *filter(None, current)],
             "uptime_s": round((time.monotonic_ns() - self._start_ns) * 1e-9, 3),
@@ -270,7 +270,7 @@ class EdgeRun:
                     self._handle(answer)
                 case TrackerLost() as tracker if not self._stopping:
                     text = f"agent's run {tracker.key}: its tracker {tracker.reason}"
-                    self._agent_troubles.add(text)
+                    self._other_troubles.add(text)
                     self._handle(tracker)
                 case MapperReport() as report:
                     self._progress.record(report)
@@ -330,6 +330,8 @@ class EdgeRun:
                 self._map_writer.submit(effect)
             case WriteEvent():
                 self._record(effect.fields)
+                if effect.fields["event"] == "step failed" and effect.fields["agent"] is None:
+                    self._other_troubles.add(effect.fields["reason"])
 
     # ------------------------------------------------------------------ from other threads
 

@@ -63,6 +63,15 @@ def test_help_explains_each_policy(command, capsys):
     assert all(len(row.split()) > 4 for row in rows)
 
 
+def test_edge_says_that_policy_overrides_that_of_its_settings(tmp_path, capsys):
+    config = tmp_path / "c.yaml"
+    config.write_text("edge: {policy: linear}")
+    _, _, err = run(capsys, "edge", "--config", config, "--policy", "streamed", "--map", tmp_path / "m")
+    first, second = err.splitlines()
+    assert first == f"share: {config}: edge.policy linear is overridden by policy streamed"
+    assert "--map: policy streamed builds no map" in second
+
+
 def test_help_imports_nothing_heavy():
     program = (
         "import sys\nfrom share.cli.main import main\n"

@@ -9,9 +9,9 @@ import yaml
 from share.config import Config, with_policy
 from share.errors import UsageError
 from share.files.yaml_file import read_settings
+from share.lab.evaluate import trial
 from share.lab.evaluate.campaign import PlannedRun, plan_policies, play_job, run_all, split_jobs
 from share.lab.evaluate.real_time import RunOptions
-from share.lab.evaluate import trial
 from share.lab.evaluate.trial import read_trial, run_trial, settings_yaml
 from share.plain_data import from_mapping
 from share.recordings.session import Session, read_session
