@@ -11,6 +11,7 @@ import click
 from share.cli import options
 from share.config import STREAMED
 from share.errors import UsageError
+from share.event_kinds import EventKind
 
 if TYPE_CHECKING:
     from share.cli.stderr import Stderr
@@ -133,7 +134,7 @@ def _print_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
         stderr.print_line(f"public key '{keys.own.public}'; authorized: {names or 'none yet'}")
 
 
-_SHOWN_EVENTS = {  # without -v
+_SHOWN_EVENTS: set[EventKind] = {  # without -v
     "agent joined",
     "left",
     "reconnected",

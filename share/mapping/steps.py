@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from share.config import PlaceConfig
+from share.event_kinds import EventKind
 from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.map_solving import SolveJob
 from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
@@ -102,7 +103,7 @@ class MapEvent:
     """
 
     agent: str | None
-    event: str
+    event: EventKind
     reason: str
     correction: Correction | None = None
     map_id: str | None = None

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 from share import __version__
 from share.config import Config
 from share.errors import VersionError, WireError, describe_exception
+from share.event_kinds import EventKind
 from share.mapping.map_changes import MapChange, RemoveRun, SaveCredential, SaveKeyframe, SaveRun
 from share.mapping.steps import MapEvent
 from share.plain_data import to_mapping
@@ -260,7 +261,7 @@ class Edge:
             if not peer.is_gone and self._now_ns - peer.last_received_ns > seconds_to_ns(limit_s):
                 self._mark_gone(peer, "silent", f"no message for {limit_s:g} s")
 
-    def _mark_gone(self, peer: Peer, event: str, reason: str) -> None:
+    def _mark_gone(self, peer: Peer, event: EventKind, reason: str) -> None:
         peer.is_gone = True
         peer.reorder_buffer.clear()
         self._effects.append(ed.SetPresence(peer.key, False))
@@ -365,7 +366,7 @@ class Edge:
         self._effects.append(ed.SendToPeer(peer_id, frames))
 
     def _record(
-        self, event: str, peer: Peer | None, reason: str, throttled: bool = True, **fields: Any
+        self, event: EventKind, peer: Peer | None, reason: str, throttled: bool = True, **fields: Any
     ) -> None:
         """Record an event. throttled: unless it is repeated too often, as a peer could cause it."""
         make = self._event_log.throttled_event if throttled else self._event_log.event

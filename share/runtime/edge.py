@@ -21,6 +21,7 @@ from typing import Any
 
 from share.config import Config
 from share.errors import StoreError
+from share.event_kinds import EventKind
 from share.mapping.map_changes import StoredMap
 from share.net.transport import EdgeLink
 from share.protocol.edge import Edge
@@ -73,7 +74,7 @@ _DRAIN_S = 0.5  # that the loop waits for the map writer of a session that is ov
 class _Notice:
     """A line for the event log, from another thread."""
 
-    event: str
+    event: EventKind
     text: str
 
 
@@ -351,7 +352,7 @@ class EdgeRun:
         self._files.write_event(fields)
         self._on_record(fields)
 
-    def _log_event(self, event: str, reason: str) -> None:
+    def _log_event(self, event: EventKind, reason: str) -> None:
         t_s = round((time.monotonic_ns() - self._start_ns) * 1e-9, 6)
         self._record({"t_s": t_s, "event": event, "agent": None, "reason": reason})
 
