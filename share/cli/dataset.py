@@ -211,7 +211,7 @@ def _map_text(d: dict[str, Any]) -> str:
     lines = [f"{d['name']}: map, schema {d['schema']}, {d['bytes'] / 1e6:.1f} MB"]
     for name, agent in d["agents"].items():
         removed = agent["next_keyframe"] - agent["keyframes"]
-        segments_text = f", {agent['stretches']} segments" if agent["stretches"] > 1 else ""
+        segments_text = f", {agent['segments']} segments" if agent["segments"] > 1 else ""
         lines.append(
             f"  {name:<10} {agent['kind']:<6} {agent['keyframes']:>6} keyframes, {removed} removed"
             f"{segments_text}"
