@@ -190,3 +190,20 @@ def test_examples_use_options_that_exist(page: Path) -> None:
         if name:
             wrong = set(re.findall(r"(?<= )--[a-z-]+", line)) - options(known[name]) - {"--help"}
             assert not wrong, f"{page.name}: {line}"
+
+
+@pytest.mark.parametrize("name", sorted(commands(cli)))
+def test_help_explains_each_choice(name: str) -> None:
+    command = commands(cli)[name]
+    for option in command.params:
+        if isinstance(option, click.Option) and isinstance(option.type, click.Choice):
+            text = f"{command.help} {option.help}".partition("  [default")[0]
+            unexplained = [word for word in option.type.choices if not re.search(rf"\b{word}\b", text)]
+            assert not unexplained, f"{option.opts}: {unexplained}"
+
+
+def test_help_of_emulate_has_every_scene() -> None:
+    from share.lab.emulate.world.scenes import SCENES
+
+    text = commands(cli)["share emulate"].help or ""
+    assert [name for name in SCENES if not re.search(rf"\b{name}\b", text)] == []

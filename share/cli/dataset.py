@@ -72,7 +72,11 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     help="Compress gray images as JPEG of this quality.  [default: keep images as they are, byte for byte]",
 )
 @click.option(
-    "--format", "kind", type=click.Choice(["mcap", "euroc"]), default="mcap", help="Format to write."
+    "--format",
+    "kind",
+    type=click.Choice(["mcap", "euroc"]),
+    default="mcap",
+    help="mcap (one file of ROS 2 messages) or euroc (an EuRoC/ASL folder).",
 )
 def convert(
     source: str, out: Path, calib: str | None, frames: slice | None, jpeg: int | None, kind: str

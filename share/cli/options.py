@@ -94,7 +94,8 @@ _policy_option = click.option(
 link = click.option(
     "--link",
     metavar="LINK[,AGENT=LINK…]",
-    help="Emulated network, as share agent --link: one for all agents, or one per agent.",
+    help="Emulated network: wifi5 (an access point alone), wifi-busy (shared with many devices) or a YAML "
+    "file (docs/do/network.md); one for all agents, or one per agent.",
 )
 true_error = click.option(
     "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
