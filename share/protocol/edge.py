@@ -52,14 +52,12 @@ class Edge:
         began_ns: int | None = None,
     ) -> None:
         self._config, self._session = config, session
-        self._registry = RunRegistry()
-        self._unjoined = Sender()
+        self._registry, self._unjoined = RunRegistry(), Sender()
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
         self._admission = Admission(config.edge, self.tracks_agents)
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
         self._event_log, self._version_throttle = EventLog(began_ns), Throttle(_VERSION_REFUSAL_HZ, 1.0)
-        self._durability = DurabilityTracker(has_store)
-        self._internal_errors = 0
+        self._durability, self._internal_errors = DurabilityTracker(has_store), 0
         self._effects: list[ed.EdgeEffect] = []
         self._now_ns = 0  # of the event that is being handled
         for run in restored:
@@ -336,17 +334,15 @@ class Edge:
     def _on_finding(self, finding: MapEvent) -> None:
         """Record a decision of the mapper, and send its correction if there is one."""
         if finding.agent is None:
-            fields: dict[str, Any] = {} if finding.map_id is None else {"map_id": finding.map_id}
-            self._record(finding.event, None, finding.reason, **fields)
-            return
-        if (peer := self._registry.by_key.get(finding.agent)) is None:  # forgotten in the meantime
-            return
-        if finding.correction is None:
+            self._record(finding.event, None, finding.reason, map_id=finding.map_id)
+        elif (peer := self._registry.by_key.get(finding.agent)) is None:
+            return  # forgotten in the meantime
+        elif finding.correction is None:
             self._record(finding.event, peer, finding.reason, finding.event == "step failed")
-            return
-        peer.last_finding = finding
-        if not peer.is_gone and peer.is_welcomed:  # else the agent counts it to the earlier session
-            self._send_correction(peer, finding)
+        else:
+            peer.last_finding = finding
+            if not peer.is_gone and peer.is_welcomed:  # else the agent counts it to the earlier session
+                self._send_correction(peer, finding)
 
     def _send_correction(self, peer: Peer, finding: MapEvent, is_repeat: bool = False) -> None:
         """Send a correction. is_repeat: sent again at the agent's request, so its record is throttled."""
