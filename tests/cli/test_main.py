@@ -129,6 +129,7 @@ def test_no_arguments_prints_help_with_exit_code_2(capsys):
         ("xyz", "no command 'xyz'; commands: demo, capture, track, agent, edge, dataset"),
         ("--bogus", "No such option '--bogus'"),
         ("dataset inf", "No such command 'inf'. Did you mean 'info'?"),
+        ("evaluate ate", "No such command 'ate'. Commands: ablation, sweep, compare, run, score."),
         ("track", "Missing argument 'SOURCE'"),
         ("track x y", "unexpected extra argument (y)"),
         ("track x --ot y", "No such option '--ot'. (Did you mean one of: '--mode', '--out'"),
