@@ -4,7 +4,7 @@ results of every run.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from share.retired_settings import refuse_retired
@@ -145,7 +145,7 @@ POLICY_NAMES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # s
 class EdgeConfig:
     """Limits of the edge."""
 
-    policy: str = "share"  # overridden by `share edge --policy`
+    policy: str = "share"  # scheduling policy; overridden by --policy
     silent_s: float = 3.0  # no message of an agent for this long: it counts as gone
     max_agents: int = 64  # present at once; more are refused
     max_keyframes: int = 2000  # kept; beyond, the agent with most gives up redundant ones first
@@ -233,9 +233,20 @@ def _require_positive(config: Any, *names: str) -> None:
 
 def load_config(text: str, where: str = "configuration") -> Config:
     """Return a `Config` from YAML text. Raises ConfigError naming the key and the remedy."""
+    return load_given_config(text, where)[0]
+
+
+def load_given_config(text: str, where: str = "configuration") -> tuple[Config, dict[str, Any]]:
+    """Return a `Config` from YAML text, and only what the text sets, by section. Raises ConfigError."""
     from share.plain_data import from_mapping
     from share.strict_yaml import load_yaml
 
     data = load_yaml(text, where)
     refuse_retired(data, where)
-    return from_mapping(Config, {} if data is None else data, where)
+    given = {} if data is None else data
+    return from_mapping(Config, given, where), given
+
+
+def with_policy(config: Config, policy: str) -> Config:
+    """Return `config` with this scheduling policy."""
+    return replace(config, edge=replace(config.edge, policy=policy))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from share.config import PlaceConfig
+from share.event_kinds import EventKind
 from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.map_solving import SolveJob
 from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
@@ -96,12 +97,16 @@ class StepRunner:
 
 @dataclass(frozen=True, eq=False)
 class MapEvent:
-    """A decision about an agent's run with its reason, and the correction that follows, if any."""
+    """A decision with its reason, and the correction that follows, if any.
 
-    agent: str
-    event: str
+    agent: the run concerned; None where the event concerns the map `map_id`, or the whole mapper.
+    """
+
+    agent: str | None
+    event: EventKind
     reason: str
     correction: Correction | None = None
+    map_id: str | None = None
 
 
 def map_assignment(

@@ -257,9 +257,9 @@ def apply_update(state: FilterState, residual: F64, HP: FloatArray, S: FloatArra
     return float(whitened @ whitened)
 
 
-def scalar_update(state: FilterState, residual: F64, H: F64, sigma: float, gate: float = np.inf) -> bool:
-    """Update with a few rows H (m, n) of any kind, each with `sigma`. Return False, and change nothing, if
-    the NIS exceeds `gate`."""
+def isotropic_update(state: FilterState, residual: F64, H: F64, sigma: float, gate: float = np.inf) -> bool:
+    """Update with a residual (m,), its Jacobian H (m, n) and independent noise of the same `sigma` in each.
+    Return False, and change nothing, if the NIS exceeds `gate`."""
     HP = H @ state.cov
     S = HP @ H.T + sigma**2 * np.eye(len(H))
     if residual @ np.linalg.solve(S, residual) > gate:
@@ -269,10 +269,10 @@ def scalar_update(state: FilterState, residual: F64, H: F64, sigma: float, gate:
 
 
 def zero_velocity_update(state: FilterState, sigma: float) -> bool:
-    """Update with a velocity of 0, sigma m/s. Return False if `GATE` rejects it, see `scalar_update`."""
+    """Update with a velocity of 0, sigma m/s. Return False if `GATE` rejects it, see `isotropic_update`."""
     H = np.zeros((3, state.size))
     H[:, POSE][:, :3], H[:, VELOCITY] = -se3.hat(state.v), np.eye(3)
-    return scalar_update(state, -state.v, H, sigma, GATE)
+    return isotropic_update(state, -state.v, H, sigma, GATE)
 
 
 def inflate(state: FilterState, sigma_rad: float, sigma_m: float, sigma_m_s: float) -> None:

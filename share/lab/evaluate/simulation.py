@@ -312,7 +312,7 @@ class Simulation:
         return self._delays.verify_refused
 
     def _send_findings(self, findings: list[MapEvent]) -> None:
-        changes = self.mapper.take_changes()
+        findings, changes = [*findings, *self.mapper.take_failures()], self.mapper.take_changes()
         if findings or changes:
             self._to_edge(ed.MapperResult(tuple(findings), changes))
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.event_kinds import EventKind
 from share.mapping.agents.agent_pair import AgentPair
 from share.mapping.agents.covariance_scales import CovarianceScales, SegmentPair
 from share.mapping.agents.identities import AgentIdentities, outvoted_agents
@@ -27,7 +28,10 @@ from share.types import F64
 _APPLY_SIGMAS = 2.5  # significance at which a scale is corrected
 _KEEP_SIGMAS = 1.25  # significance down to which it stays corrected
 _MIN_SCALE_CHANGE = 0.001  # log scale
-_EVENTS = {"set apart": "agent quarantined", "disputed": "agents disputed"}  # by state
+_EVENTS: dict[str, EventKind] = {  # by state
+    "set apart": "agent quarantined",
+    "disputed": "agents disputed",
+}
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ class AgentStanding:
     widened: float = 1.0
 
     @property
-    def event(self) -> tuple[str, str]:
+    def event(self) -> tuple[EventKind, str]:
         """Event and reason to report when this standing is new."""
         if self.state in _EVENTS:
             return _EVENTS[self.state], self.reason
