@@ -85,12 +85,22 @@ class GuardedTracker:
             self._recover(frame)
             return None
 
-    def finish(self, frame: Frame, is_keyframe: bool) -> None:
-        """Finish the frame just tracked where its keyframe data are not sent. is_keyframe: make it a
-        keyframe."""
+    def finish(
+        self,
+        frame: Frame,
+        is_keyframe: bool,
+        make_keyframe: Callable[[Frame, GuardedTracker], KeyframeCandidate] | None = None,
+    ) -> KeyframeCandidate | None:
+        """Finish the frame just tracked where its keyframe is not sent before. is_keyframe: make it a
+        keyframe, by `make_keyframe` where one is given."""
+        candidate = None
         if is_keyframe:
-            self.attempt("making a keyframe", frame, partial(self.make_keyframe, frame))
+            step = (
+                partial(make_keyframe, frame, self) if make_keyframe else partial(self.make_keyframe, frame)
+            )
+            candidate = self.attempt("making a keyframe", frame, step)
         self.attempt("finishing a keyframe", frame, self._tracker.finish_keyframe)
+        return candidate
 
     def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
         """Call within `attempt`, like `finish_keyframe` and `feature_statistics`."""
