@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from share.errors import DataError
 from share.geometry.interpolation import MAX_GAP_NS, Trajectory, associate, require_poses
 from share.geometry.se3 import inverse, transform, umeyama
 from share.types import F64
@@ -59,6 +60,16 @@ def ate(
     _, T_est, T_truth = associate(estimate, truth, max_gap_ns)
     require_poses(len(T_est), _MIN_POSES[alignment], "ATE")
     return _ate_under(_fit_alignment(T_est, T_truth, alignment), T_est, T_truth)
+
+
+def ate_if_known(estimate: Trajectory | None, truth: Trajectory | None) -> Ate | None:
+    """Return the ATE (SE3 alignment); None without an estimate, a truth, or enough poses with a truth."""
+    if estimate is None or truth is None:
+        return None
+    try:
+        return ate(estimate, truth)
+    except DataError:
+        return None
 
 
 def joint_ate(

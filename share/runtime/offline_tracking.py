@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from share import __version__, config
-from share.errors import DataError
-from share.metrics.ate import Ate, ate
 from share.metrics.frame_log import ReplayQueue, RunLog
 from share.odometry.track_result import TrackResult
 from share.plain_data import to_mapping
@@ -109,13 +107,3 @@ def offline_report(log: RunLog, counters: SequencerCounters, settings: config.Co
         "version": __version__,
         "config": to_mapping(settings),
     }
-
-
-def trajectory_accuracy(run: TrackingOutput, truth: Trajectory | None) -> Ate | None:
-    """Return the ATE against the recording's ground truth (SE3 alignment); None without enough truth."""
-    if truth is None:
-        return None
-    try:
-        return ate(run.trajectory, truth)
-    except DataError:  # too few poses have ground truth at their time
-        return None

@@ -7,7 +7,7 @@ import pytest
 
 from share.errors import DataError
 from share.geometry.se3 import exp, from_rt, inverse, quat_from_matrix, so3_exp
-from share.metrics.ate import ate, joint_ate
+from share.metrics.ate import ate, ate_if_known, joint_ate
 from share.metrics.rpe import rpe_frames, rpe_time
 
 T0 = 1_700_000_000_000_000_000
@@ -122,3 +122,11 @@ def test_too_few_poses_are_refused():
         rpe_time(truth, truth)
     with pytest.raises(ValueError, match="rise"):
         ate((truth[0][::-1], truth[1]), truth)
+
+
+def test_the_ate_is_unknown_without_estimate_truth_or_enough_poses():
+    truth = walk(10, 1)
+    two = truth[0][:2], truth[1][:2]
+    assert [ate_if_known(*pair) for pair in ((None, truth), (truth, None), (two, truth))] == [None] * 3
+    found = ate_if_known(truth, truth)
+    assert found is not None and found.n == 10
