@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,24 +10,25 @@ from functools import partial
 from typing import TypeVar
 
 from share.config import Config
-from share.errors import ShareError, printable
+from share.errors import ShareError
 from share.geometry.camera import ImuBias, Rig
 from share.odometry.track_result import TrackResult
 from share.runtime.pipeline import make_tracker
+from share.timing import LineLimiter
 from share.types import FeatureStatistics, Frame, KeyframeCandidate, TrackState
 
-_MAX_FAILURE_KINDS = 16  # that are reported; more are only counted
+_MAX_TEXT = 160  # characters of an error
 
 T = TypeVar("T")
 
 
 class FaultGuard:
-    """Counts failed steps and reports each kind once, with its place in the code."""
+    """Counts failed steps and reports each kind with its place in the code, where it is new."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self.failure_count = 0
         self._notify = notify
-        self._reported: set[str] = set()
+        self._lines = LineLimiter()
 
     @contextmanager
     def step(self, what: str) -> Iterator[None]:
@@ -48,10 +50,9 @@ class FaultGuard:
             f"{what}: {type(error).__name__} at "
             f"{frame_summary.filename.rpartition('/')[2]}:{frame_summary.lineno}"
         )
-        if kind not in self._reported and len(self._reported) < _MAX_FAILURE_KINDS:
-            self._reported.add(kind)
-            text = printable(str(error))[:200]
-            self._notify(f"{kind}: {text}; this step is skipped and the run goes on")
+        text = f"{kind}: {str(error)[:_MAX_TEXT]}; this step is skipped and the run goes on"
+        if (line := self._lines.admit_new(text, time.monotonic_ns(), kind)) is not None:
+            self._notify(line)
 
 
 class GuardedTracker:

@@ -215,4 +215,4 @@ def test_reported_failures_are_bounded() -> None:
     for k in range(100):
         with guard.step(f"step {k}"):
             raise ValueError
-    assert (guard.failure_count, len(said)) == (100, 16)
+    assert (guard.failure_count, len(said)) == (100, 20)
