@@ -290,12 +290,12 @@ class InertialTracker:
         return self._realignment.published_pose(T_odom_body)
 
     def _initialise(self, frame: Frame) -> TrackResult:
-        """Start at odom's origin, z up. After a loss, at the relocalised pose; after `new_stretch_s`, in a
+        """Start at odom's origin, z up. After a loss, at the relocalised pose; after NEW_SEGMENT_S, in a
         new segment."""
         T_found = self._relocalise(frame)
         waiting_state = TrackState.INITIALISING if self._lost_ns is None else TrackState.LOST
         lost_for_ns = 0 if self._lost_ns is None else frame.stamp_ns - self._lost_ns
-        if T_found is None and 0 < lost_for_ns < self._tracker_config.new_stretch_s * 1e9:
+        if T_found is None and 0 < lost_for_ns < relocalisation.NEW_SEGMENT_S * 1e9:
             return TrackResult(waiting_state, None)
         samples = self._imu.buffer.samples
         state = initialisation.state_from_imu(frame.stamp_ns, samples, self._rig, self._config, self._bias)

@@ -21,6 +21,7 @@ from share.vision.orb import detect_orb
 RANSAC_PX = 3.0  # reprojection error of a RANSAC inlier
 NOISE_PX = 1.0  # standard deviation of a point's position in an image
 GATE_SIGMA = 3.0  # a measurement further off is an outlier
+NEW_SEGMENT_S = 3.0  # LOST for this long: odometry starts a new segment
 MIN_INLIERS = 15  # points that agree with a pose; with fewer there is none
 
 

@@ -330,8 +330,8 @@ CONFIGS = {
     "out of range": ("link: {window: 0}", "link: window: 0 must be positive"),
     "zero": ("tracker: {corners: 0}", "tracker: corners: 0 must be positive"),
     "negative": (
-        "tracker: {new_stretch_s: -1}",
-        "new_stretch_s: expected a number from 0 to 1e+09, found -1",
+        "inertial: {max_speed_m_s: -1}",
+        "max_speed_m_s: expected a number from 0 to 1e+09, found -1",
     ),
     "huge": ("tracker: {corners: 1" + 40 * "0" + "}", "tracker: corners: expected a number from 0 to 1e+09"),
     "absurd": ("tracker: {corners: 1" + 400 * "0" + "}", "not valid YAML: number of 401 characters"),
@@ -774,8 +774,8 @@ def test_unknown_network_is_refused(command: tuple[str, ...]) -> None:
 
 def test_invalid_frustum_is_refused_before_the_edge_starts(tmp_path: Path) -> None:
     config = tmp_path / "flat.yaml"
-    config.write_text("control: {near_m: 5, far_m: 1}\n")
+    config.write_text("control: {far_m: 0.1}\n")
     command = [*SHARE, "edge", "--bind", "tcp://127.0.0.1:0", "--policy", "share", "--config", str(config)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == f"share: {config}: control: near_m: 5.0 m is not nearer than far_m, 1.0 m\n"
+    assert done.stderr == f"share: {config}: control: far_m: 0.1 m is not beyond the near plane, 0.3 m\n"

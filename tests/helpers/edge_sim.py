@@ -126,7 +126,7 @@ class ModelRun:
     def __init__(self, config: Config, session: int) -> None:
         self.machine = Edge(config, session)
         self.mapper = Mapper(config)
-        self.solver = PoseGraphSolver(config.graph)
+        self.solver = PoseGraphSolver()
 
     def report(self) -> dict[str, Any]:
         return self.machine.report(self.mapper.report())

@@ -55,7 +55,7 @@ def test_the_pose_sensitivity_is_that_of_a_depth_scale(log):
 
 def compared_agents(scales: dict[str, float], rounds: int = 40) -> AgentAgreement:
     """Agreement of agents with these scales, after loops between all of them."""
-    agreement, rng, names = AgentAgreement(0.015), np.random.default_rng(2), list(scales)
+    agreement, rng, names = AgentAgreement(), np.random.default_rng(2), list(scales)
     nodes = {name: range(10 * i, 10 * i + 10) for i, name in enumerate(names)}
     for name, numbers in nodes.items():
         for n in numbers:

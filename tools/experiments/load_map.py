@@ -19,7 +19,7 @@ class TimedMap:
     """A mapper and a solver that take turns. ms: CPU times of each kind of step."""
 
     def __init__(self, config: Config) -> None:
-        self.mapper, self.solver = Mapper(config), PoseGraphSolver(config.graph)
+        self.mapper, self.solver = Mapper(config), PoseGraphSolver()
         self.ms: dict[str, list[float]] = defaultdict(list)
         self.findings: list[MapEvent] = []
 

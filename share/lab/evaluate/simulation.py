@@ -143,7 +143,7 @@ class Simulation:
             self._schedule_next_frame(member)
         self.edge = Edge(config, session=1)
         self.mapper = Mapper(config) if mapper is None else mapper
-        self._solver = PoseGraphSolver(config.graph)
+        self._solver = PoseGraphSolver()
         self._inbox: deque[tuple[Delay, Callable[[], list[MapEvent]]]] = deque()  # of the mapper process
         self._is_busy = False  # the mapper process
         self._schedule(0, self._tick)
