@@ -10,10 +10,11 @@ from functools import partial
 from typing import Any, TypeVar
 
 from share.config import Config
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.map_changes import StoredMap
 from share.mapping.mapper import Mapper
-from share.mapping.steps import MapEvent, SolveStep
+from share.mapping.steps import SolveStep
 from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, MapperResult, SetCredential, SetPresence
 from share.protocol.keyframe_intake import FairQueue
 from share.runtime.worker_process import END, Inbox, WorkerProcess

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 from share.config import Config
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
-from share.mapping.steps import MapEvent
 from share.types import Keyframe
 from share.wire.messages import Hello
 

@@ -8,9 +8,10 @@ from collections.abc import Collection
 from typing import Any
 
 from share.config import Config, PlaceConfig
+from share.mapping.corrections import MapEvent
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
-from share.mapping.steps import LookupStep, MapEvent, Step, VerifyStep
+from share.mapping.steps import LookupStep, Step, VerifyStep
 from share.wire.messages import Hello
 
 _seen: dict[tuple[bytes, bytes, PlaceConfig], Verification | Refusal] = {}

@@ -20,11 +20,11 @@ import numpy as np
 
 from share.config import Config
 from share.lab.evaluate.emulated_network import Channel, NetworkModel
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.loops import KeyframeKey
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Verification
-from share.mapping.steps import MapEvent
 from share.metrics.frame_log import RunLog
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
