@@ -35,9 +35,8 @@ from share.lab.mocap.files import read_bodies
 from share.lab.train.keyframe_table import collect_labels, tabulate
 from share.lab.train.labels import Labels, read_labels, write_labels
 from share.net.keys import AllowList
-from share.odometry.error_model.inference import estimate_error
 from share.odometry.error_model.inputs import INPUT_SHAPES, input_dtype
-from share.odometry.error_model.network import open_error_model
+from share.odometry.error_model.network import estimate_error, open_error_model
 from share.recordings.calibration import kalibr_texts, read_calibration
 from share.recordings.describe import describe_recording
 from share.recordings.mcap.recorder import Recorder, recover_recording
