@@ -58,10 +58,9 @@ class PlaceConfig:
     """Verification that two views show the same place."""
 
     candidates: int = 8  # keyframes verified per query, best first; more find more loops and take longer
-    min_inliers: int = 20  # matches that agree with the relative pose; fewer: refused
 
     def __post_init__(self) -> None:
-        _require_positive(self, "candidates", "min_inliers")
+        _require_positive(self, "candidates")
 
 
 @dataclass(frozen=True)
@@ -117,11 +116,10 @@ class MergeConfig:
 
     join_places: int = 2  # places that must agree before maps merge; of a smaller map, all but one
     overlap_pairs: int = 0  # least number of overlapping view pairs before maps merge, where rooms are copies
-    odometry_scale: float = 1.0  # agents' standard deviations are too small by this factor
     enter_m: float = 0.05  # an agent with a larger map position sigma waits for its correction
 
     def __post_init__(self) -> None:
-        _require_positive(self, "join_places", "odometry_scale")
+        _require_positive(self, "join_places")
 
 
 STREAMED = "streamed"
@@ -146,7 +144,7 @@ class EdgeConfig:
 
 @dataclass(frozen=True)
 class AgentQoe:
-    """QoE parameters of one agent, under its name in `control.agents`; None: that of its form."""
+    """QoE parameters of one agent, under its name in `control.agents`; None: the default of its form."""
 
     form: str | None = None  # ar or robot; None: its kind
     beta: float | None = None
@@ -167,8 +165,12 @@ NEAR_M = 0.3  # near plane of the view frusta
 class ControlConfig:
     """QoE, keyframe rates and the merge gate (docs/understand/scheduling.md)."""
 
+    ar_beta: float = 0.015  # 1/ms, of delay above 20 ms
     ar_gamma: float = 3.6  # cm, of accuracy: 1.6 is content with 0.6 cm, and asks for fewer keyframes
     ar_target: float = 0.93  # target QoE
+    robot_beta: float = 3.0  # cm, of accuracy below 1/cm
+    robot_gamma: float = 400.0  # ms, of 1 / (delay + theta)
+    robot_theta_ms: float = 20.0  # delays well below this are equally good
     robot_target: float = 0.9  # target QoE
     signed_penalty: bool = False  # allow negative penalties, with QoE above 1, as printed in the paper
     agents: dict[str, AgentQoe] = field(default_factory=dict)  # NAME: {form, beta, gamma, theta_ms, target}
@@ -184,7 +186,7 @@ class ControlConfig:
     eagerness: float = 1.5  # a merge has this probability times its overlap over their mean (alpha_m)
 
     def __post_init__(self) -> None:
-        _require_positive(self, "ar_gamma", "rate_min_hz", "merges")
+        _require_positive(self, "ar_gamma", "robot_gamma", "robot_theta_ms", "rate_min_hz", "merges")
         if not self.far_m > NEAR_M:
             raise ValueError(f"far_m: {self.far_m} m is not beyond the near plane, {NEAR_M} m")
         if not self.rate_min_hz <= self.rate_max_hz <= 1000:

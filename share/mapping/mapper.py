@@ -187,7 +187,7 @@ class Mapper:
             if not {node_id, candidate} <= views.keys():
                 continue  # removed meanwhile
             try:
-                outcome = yield VerifyStep(node_id, views[node_id], candidate, views[candidate], place)
+                outcome = yield VerifyStep(node_id, views[node_id], candidate, views[candidate])
                 is_kept = {node_id, candidate} <= views.keys()
                 events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
             except Exception as error:  # costs this candidate only

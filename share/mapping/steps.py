@@ -6,7 +6,6 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any
 
-from share.config import PlaceConfig
 from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.map_solving import SolveJob
@@ -37,11 +36,10 @@ class VerifyStep:
     query_view: CameraView
     candidate_id: int
     candidate_view: CameraView
-    config: PlaceConfig
     kind: str = "verify"
 
     def run(self) -> Verification | Refusal:
-        return verify(self.query_view, self.candidate_view, self.config)
+        return verify(self.query_view, self.candidate_view)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,10 +16,6 @@ from share.types import AgentKind
 ACCEPTED_DELAY_MS = 20.0  # d0: a headset wearer does not notice less
 REFERENCE_ACCURACY = 1.0  # a0, 1/cm
 MIN_ERROR_CM = 0.05  # smaller estimates count as this
-AR_BETA = 0.015  # 1/ms, of delay above d0
-ROBOT_BETA = 3.0  # cm, of accuracy below a0
-ROBOT_GAMMA = 400.0  # ms, of 1 / (delay + theta)
-ROBOT_THETA_MS = 20.0  # delays well below this are equally good
 _MAX_EXPONENT = 700.0  # exp of it is still finite
 
 
@@ -41,9 +37,9 @@ class QoeParameters:
         override = config.agents.get(agent, AgentQoe())
         form = AgentKind(override.form or kind)
         if form is AgentKind.AR:
-            defaults = (AR_BETA, config.ar_gamma, ROBOT_THETA_MS, config.ar_target)
+            defaults = (config.ar_beta, config.ar_gamma, config.robot_theta_ms, config.ar_target)
         else:
-            defaults = (ROBOT_BETA, ROBOT_GAMMA, ROBOT_THETA_MS, config.robot_target)
+            defaults = (config.robot_beta, config.robot_gamma, config.robot_theta_ms, config.robot_target)
         own = (override.beta, override.gamma, override.theta_ms, override.target)
         beta, gamma, theta_ms, target = (b if a is None else a for a, b in zip(own, defaults, strict=True))
         return cls(form, beta, gamma, theta_ms, target, config.signed_penalty)

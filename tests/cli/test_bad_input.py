@@ -353,11 +353,11 @@ def test_configuration(case, command, share, tmp_path):
 
 
 def test_numbers_of_a_configuration_have_all_yaml_forms(room, share, tmp_path):
-    (tmp_path / "config.yaml").write_text("merge: {odometry_scale: 15e-1}\ninertial: {max_speed_m_s: 9}\n")
+    (tmp_path / "config.yaml").write_text("merge: {enter_m: 15e-2}\ninertial: {max_speed_m_s: 9}\n")
     done = share("track", room / "ar1", "--config", tmp_path / "config.yaml", "--frames", ":3", "--json")
     used = json.loads(done.out)["config"]
     assert done.code == 0
-    assert (used["merge"]["odometry_scale"], used["inertial"]["max_speed_m_s"]) == (1.5, 9.0)
+    assert (used["merge"]["enter_m"], used["inertial"]["max_speed_m_s"]) == (0.15, 9.0)
 
 
 # ------------------------------------------------------------------ where results go
