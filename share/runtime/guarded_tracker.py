@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -23,12 +24,13 @@ T = TypeVar("T")
 
 
 class FaultGuard:
-    """Counts failed steps and reports each kind with its place in the code, where it is new."""
+    """Counts failed steps and reports each kind with its place in the code, where it is new. Safe from any
+    thread."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self.failure_count = 0
         self._notify = notify
-        self._lines = LineLimiter()
+        self._lines, self._lock = LineLimiter(), threading.Lock()
 
     @contextmanager
     def step(self, what: str) -> Iterator[None]:
@@ -44,14 +46,16 @@ class FaultGuard:
             self.record(what, error)
 
     def record(self, what: str, error: Exception) -> None:
-        self.failure_count += 1
         frame_summary = traceback.extract_tb(error.__traceback__)[-1]
         kind = (
             f"{what}: {type(error).__name__} at "
             f"{frame_summary.filename.rpartition('/')[2]}:{frame_summary.lineno}"
         )
         text = f"{kind}: {str(error)[:_MAX_TEXT]}; this step is skipped and the run goes on"
-        if (line := self._lines.admit_new(text, time.monotonic_ns(), kind)) is not None:
+        with self._lock:
+            self.failure_count += 1
+            line = self._lines.admit_new(text, time.monotonic_ns(), kind)
+        if line is not None:
             self._notify(line)
 
 
