@@ -41,7 +41,7 @@ from share.recordings.calibration import kalibr_texts, read_calibration
 from share.recordings.describe import describe_recording
 from share.recordings.mcap.recorder import Recorder, recover_recording
 from share.recordings.session import read_session
-from share.runtime.pipeline import make_source_tracker, read_frames
+from share.runtime.pipeline import check_trackable, make_tracker, read_frames
 from share.runtime.source import open_source
 from share.sensors.profile import load_host_profile, load_profile
 from share.sensors.sequencer import SequencerCounters
@@ -50,7 +50,8 @@ from share.store.map_store import MapStore
 
 
 def _tracked(source: object) -> None:
-    tracker = make_source_tracker(source, config.Config())
+    check_trackable(source.name, source.rig)
+    tracker = make_tracker(source.rig, config.Config())
     for frame in read_frames(source, config.Config(), SequencerCounters()):
         if tracker.track(frame).keyframe_ready:
             tracker.make_keyframe(frame)

@@ -48,7 +48,7 @@ from share.metrics.ate import ate, ate_if_known  # noqa: E402
 from share.recordings import tables  # noqa: E402
 from share.recordings.trajectory import Trajectory, make_poses  # noqa: E402
 from share.runtime.offline_tracking import TrackingOutput, track  # noqa: E402
-from share.runtime.pipeline import make_source_tracker, read_frames  # noqa: E402
+from share.runtime.pipeline import make_tracker, read_frames  # noqa: E402
 from share.runtime.source import Source, open_source  # noqa: E402
 from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64, TrackState  # noqa: E402
@@ -158,7 +158,7 @@ def followed(folder: Path) -> list[Seen]:
     if given is None:
         raise DataError(f"{folder}: has no ground truth")
     T_mocap_imu = se3.inverse(open_recorded_motion(folder, EUROC_OPTIONS).path.fit.T_body_mocap)
-    tracker, segment, out = make_source_tracker(source, settings), 0, []
+    tracker, segment, out = make_tracker(source.rig, settings), 0, []
     for frame in read_frames(source, settings, SequencerCounters()):
         result = tracker.track(frame)
         if result.keyframe_ready:
