@@ -142,12 +142,12 @@ def trace_frames(session: Path) -> list[set[tuple[str, str]]]:
     """Of each frame of the first agent, once it has a pose."""
     from share.config import Config
     from share.recordings.session import read_session
-    from share.runtime.pipeline import make_source_tracker, read_frames
+    from share.runtime.pipeline import make_tracker, read_frames
     from share.runtime.source import open_source
     from share.sensors.sequencer import SequencerCounters
 
     source, config = open_source(str(session / next(iter(read_session(session).agents)))), Config()
-    tracker, out = make_source_tracker(source, config), []
+    tracker, out = make_tracker(source.rig, config), []
     for frame in read_frames(source, config, SequencerCounters()):
         recorder = CallRecorder()
         with recorder.on():

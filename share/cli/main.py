@@ -15,9 +15,9 @@ from typing import Any  # noqa: E402
 import click  # noqa: E402
 
 from share import __version__  # noqa: E402
-from share.cli.signals import unwind_on_signal  # noqa: E402
 from share.cli.stderr import flush_all  # noqa: E402
 from share.errors import ShareError, UsageError, one_line  # noqa: E402
+from share.runtime.signals import unwind_on_signal  # noqa: E402
 
 # name: (module, attribute, one line of help). A literal table, so that a freezer sees every module.
 COMMANDS = {

@@ -17,7 +17,7 @@ map that has changed:
 To change:
 
     the descriptor       `share.vision.orb`, `share.vision.matching`; `recognition.index` hashes its bits
-    the verification     `recognition.verification`; `place.min_inliers`
+    the verification     `recognition.verification`; `MIN_INLIERS`
     accepting loops      `loop_acceptance`; `merge.join_places`
     the solver           `graph.optimiser` (Levenberg-Marquardt, robust kernel), `graph.solver` (incremental)
     the merge gate       `share.scheduling.merge_gate`

@@ -17,7 +17,7 @@ from share.config import Config
 from share.errors import describe_exception
 from share.mapping.agents.quarantine import QuarantineChange
 from share.mapping.atlas import Atlas
-from share.mapping.corrections import CorrectionPublisher
+from share.mapping.corrections import CorrectionPublisher, MapEvent, map_assignment
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import MapChange, RemoveLoops, SaveLoop, SavePoses, StoredMap
@@ -26,17 +26,7 @@ from share.mapping.mapper_counters import MapperCounters
 from share.mapping.query_queue import CandidateSearch, QueryQueue, map_rank, rank_candidates, service_kind
 from share.mapping.recognition.index import KeyframeViews
 from share.mapping.recognition.verification import Refusal, Verification
-from share.mapping.steps import (
-    Job,
-    LookupStep,
-    MapEvent,
-    QueryStep,
-    SolveStep,
-    Step,
-    StepRunner,
-    VerifyStep,
-    map_assignment,
-)
+from share.mapping.steps import Job, LookupStep, QueryStep, SolveStep, Step, StepRunner, VerifyStep
 from share.scheduling.merge_gate import MergeGate
 from share.types import Keyframe
 from share.wire.messages import Hello
@@ -207,7 +197,7 @@ class Mapper:
             if not {node_id, candidate} <= views.keys():
                 continue  # removed meanwhile
             try:
-                outcome = yield VerifyStep(node_id, views[node_id], candidate, views[candidate], place)
+                outcome = yield VerifyStep(node_id, views[node_id], candidate, views[candidate])
                 is_kept = {node_id, candidate} <= views.keys()
                 events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
             except Exception as error:  # costs this candidate only

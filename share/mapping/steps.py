@@ -6,15 +6,11 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from share.config import PlaceConfig
-from share.event_kinds import EventKind
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.map_solving import SolveJob
 from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
-from share.types import F64, Correction
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +36,10 @@ class VerifyStep:
     query_view: CameraView
     candidate_id: int
     candidate_view: CameraView
-    config: PlaceConfig
     kind: str = "verify"
 
     def run(self) -> Verification | Refusal:
-        return verify(self.query_view, self.candidate_view, self.config)
+        return verify(self.query_view, self.candidate_view)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,34 +88,3 @@ class StepRunner:
             self._job.throw(result) if isinstance(result, Exception) else self._job.send(result)
         )
         return events
-
-
-@dataclass(frozen=True, eq=False)
-class MapEvent:
-    """A decision with its reason, and the correction that follows, if any.
-
-    agent: the run concerned; None where the event concerns the map `map_id`, or the whole mapper.
-    """
-
-    agent: str | None
-    event: EventKind
-    reason: str
-    correction: Correction | None = None
-    map_id: str | None = None
-
-
-def map_assignment(
-    agent: str, map_id: str, T_map_odom: F64, about_id: int, cov: F64 | None = None
-) -> MapEvent:
-    """Event that assigns a run to a map. A map is named after its reference segment.
-
-    about_id: a keyframe of the run's segment. cov (6, 6): of T_map_odom; None where it is exact, since the
-    segment defines the map's frame.
-    """
-    verb = "starts" if map_id.startswith(f"{agent}/") else "is in"
-    return MapEvent(
-        agent,
-        "correction",
-        f"{verb} map {map_id}",
-        Correction(T_map_odom, np.zeros((6, 6)) if cov is None else cov, map_id, 0, about_id),
-    )

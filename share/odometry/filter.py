@@ -41,6 +41,7 @@ _MIN_VARIANCE = 1e-10  # rounding error of differences of covariances
 GATE = 12.0  # NIS above which a measurement is rejected (2 degrees of freedom: 99.8 %; 3: 99.3 %)
 CORRELATION_INFLATION = 16.0  # frames for which a correlated error lasts; chosen by NEES
 FloatArray = NDArray[np.floating[Any]]  # in double or in single precision
+_MAX_ITERATIONS = 4  # of the iterated update
 _STEP_TOLERANCE = 1e-4  # rad, m, 1/m: a smaller step does not change the derivatives
 
 
@@ -201,10 +202,7 @@ def nis(rows: FeatureMeasurements, S: FloatArray) -> F64:
 
 
 def relinearised_rows(
-    state: FilterState,
-    make_rows: Callable[[], FeatureMeasurements],
-    common_cov: F64 | None = None,
-    iterations: int = 4,
+    state: FilterState, make_rows: Callable[[], FeatureMeasurements], common_cov: F64 | None = None
 ) -> FeatureMeasurements:
     """Return measurements with derivatives at the state that they lead to: an iterated EKF (Bell & Cathey
     1993).
@@ -213,7 +211,7 @@ def relinearised_rows(
     predictions that are far off. The residuals are as `innovation_covariance` and `update` expect them.
     """
     before, error = state.means(), np.zeros(state.size)
-    for _ in range(iterations):
+    for _ in range(_MAX_ITERATIONS):
         rows = make_rows()
         rows.residual[:] += jacobian_product(state, rows, error)
         step = (

@@ -179,7 +179,7 @@ class InertialTracker:
         """Try to begin the filter with this frame.
 
         The first state is at odom's origin, z up. After a loss it is at the pose found by relocalisation;
-        only after `new_stretch_s` without one it is at the origin again, in a new segment.
+        only after NEW_SEGMENT_S without one it is at the origin again, in a new segment.
         """
         T_odom_cam = self._relocalise(frame)
         if T_odom_cam is None and self._awaits_relocalisation(frame.stamp_ns):
@@ -213,7 +213,7 @@ class InertialTracker:
         """Return whether the loss is so recent that no new segment begins yet."""
         if self._lost_ns is None:
             return False
-        return 0 < stamp_ns - self._lost_ns < self._tracker_config.new_stretch_s * 1e9
+        return 0 < stamp_ns - self._lost_ns < relocalisation.NEW_SEGMENT_S * 1e9
 
     def _first_state(self, stamp_ns: int) -> FilterState | None:
         """Return a state at odom's origin, z up: by the IMU, or after frames without a sample by the camera

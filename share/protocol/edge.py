@@ -15,8 +15,8 @@ from share import __version__
 from share.config import Config
 from share.errors import VersionError, WireError, describe_exception
 from share.event_kinds import EventKind
+from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import MapChange, RemoveRun, SaveCredential, SaveKeyframe, SaveRun
-from share.mapping.steps import MapEvent
 from share.plain_data import to_mapping
 from share.protocol import edge_events as ed
 from share.protocol.admission import Admission, RunRegistry, name_objection, new_run_key

@@ -11,14 +11,15 @@ import pytest
 from helpers.edge_sim import MS, ModelRun, Person, Town, walls
 from helpers.hellos import hello_of
 
-from share.config import AgentQoe, Config, ControlConfig, EdgeConfig, GraphConfig
+from share.config import AgentQoe, Config, ControlConfig, EdgeConfig
 from share.geometry import se3
 from share.mapping import query_queue
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
 from share.mapping.query_queue import ENOUGH_VERIFIED
 from share.mapping.recognition.verification import Refusal, Verification
-from share.mapping.steps import MapEvent, QueryStep, SolveStep, VerifyStep
+from share.mapping.steps import QueryStep, SolveStep, VerifyStep
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
@@ -336,7 +337,7 @@ def test_skipped_keyframes_are_queried_later_and_merge_maps():
         mapper.add_run(name, hello(name, run_id=run_id))
         for keyframe in both.keyframes(name):
             mapper.add_keyframe(name, keyframe)
-    looked, solver = 0, PoseGraphSolver(GraphConfig())
+    looked, solver = 0, PoseGraphSolver()
     assert len(mapper.report()["maps"]) == 2
     while (step := mapper.next_lookup() or mapper.next_solve()) is not None:
         mapper.finish_step(step, step.run(solver) if isinstance(step, SolveStep) else step.run(), 1.0)

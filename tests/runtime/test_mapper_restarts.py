@@ -13,7 +13,7 @@ from helpers.map_changes import ANN, BOB, small_map
 
 from share.config import Config, EdgeConfig
 from share.errors import StoreError
-from share.mapping.steps import MapEvent
+from share.mapping.corrections import MapEvent
 from share.protocol.edge import Edge
 from share.protocol.edge_events import ChangesSaved, MapperResult, TrackerLost
 from share.runtime import edge as edge_module

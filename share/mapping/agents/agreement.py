@@ -68,18 +68,17 @@ AgentNames = tuple[str, str]
 class AgentAgreement:
     """Agreement of all agents, which are given by their runs.
 
-    tolerance: log scale that does no harm. quarantined: agents that must not affect others. disputed: pairs
-    in which it is undetermined who is wrong. log_scales: log of how much too long each agent's metres are,
-    where significant; else missing. pairs: comparisons of every two agents with loops, by their names.
+    quarantined: agents that must not affect others. disputed: pairs in which it is undetermined who is
+    wrong. log_scales: log of how much too long each agent's metres are, where significant; else missing.
+    pairs: comparisons of every two agents with loops, by their names.
     """
 
-    def __init__(self, tolerance: float) -> None:
+    def __init__(self) -> None:
         self.quarantined: frozenset[str] = frozenset()
         self.disputed: frozenset[frozenset[str]] = frozenset()
         self.log_scales: dict[str, float] = {}
         self.identities = AgentIdentities()
         self.covariance_scales = CovarianceScales()
-        self._tolerance = tolerance
         self._accumulated: dict[int, AccumulatedOdometry] = {}
         self.pairs: dict[AgentNames, AgentPair] = {}
 
@@ -144,7 +143,7 @@ class AgentAgreement:
         if first > second:
             first, second, segments, edge = second, first, segments[::-1], edge.reverse()
             scale = None if scale is None else scale.reverse()
-        pair = self.pairs.setdefault((first, second), AgentPair(self._tolerance))
+        pair = self.pairs.setdefault((first, second), AgentPair())
         self.covariance_scales.claims.link(first, second)
         a, b = self._accumulated[edge.a], self._accumulated[edge.b]
         if not pair.add_loop(segments, InterAgentLoop(a, b, edge.T_a_b, edge.cov, scale, tilt)):
