@@ -4,7 +4,7 @@ results of every run.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from share.retired_settings import refuse_retired
@@ -24,11 +24,10 @@ class SequencerConfig:
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """Tracking by cameras alone (`share.odometry.visual_tracker`); the views and loss of any tracker."""
+    """Tracking by cameras alone (`share.odometry.visual_tracker`); the views of any tracker."""
 
     corners: int = 250  # features tracked at once
     view_features: int = 500  # ORB features of a keyframe, for other agents and for relocalisation
-    new_stretch_s: float = 3.0  # LOST for this long: odometry starts a new segment
 
     def __post_init__(self) -> None:
         _require_positive(self, "corners", "view_features")
@@ -59,10 +58,9 @@ class PlaceConfig:
     """Verification that two views show the same place."""
 
     candidates: int = 8  # keyframes verified per query, best first; more find more loops and take longer
-    min_inliers: int = 20  # matches that agree with the relative pose; fewer: refused
 
     def __post_init__(self) -> None:
-        _require_positive(self, "candidates", "min_inliers")
+        _require_positive(self, "candidates")
 
 
 @dataclass(frozen=True)
@@ -97,10 +95,9 @@ class StreamConfig:
     """Streaming of frames to an edge that tracks them (policy streamed)."""
 
     window: int = 3  # frames in flight per agent, and as many at its tracker; beyond, the newest waits
-    patience_s: float = 1.0  # a frame without an answer for this long counts as unanswered
 
     def __post_init__(self) -> None:
-        _require_positive(self, "window", "patience_s")
+        _require_positive(self, "window")
 
 
 @dataclass(frozen=True)
@@ -114,27 +111,15 @@ class ClockConfig:
 
 
 @dataclass(frozen=True)
-class GraphConfig:
-    """Solution of the pose graph."""
-
-    cauchy: float = 3.0  # whitened residual at which a loop has half its weight (6 dof: 2.4 is usual)
-
-    def __post_init__(self) -> None:
-        _require_positive(self, "cauchy")
-
-
-@dataclass(frozen=True)
 class MergeConfig:
     """Acceptance of loops and merging of maps."""
 
     join_places: int = 2  # places that must agree before maps merge; of a smaller map, all but one
     overlap_pairs: int = 0  # least number of overlapping view pairs before maps merge, where rooms are copies
-    odometry_scale: float = 1.0  # agents' standard deviations are too small by this factor
     enter_m: float = 0.05  # an agent with a larger map position sigma waits for its correction
-    scale_tolerance: float = 0.015  # agents whose depths or path lengths differ by more are quarantined
 
     def __post_init__(self) -> None:
-        _require_positive(self, "join_places", "odometry_scale", "scale_tolerance")
+        _require_positive(self, "join_places")
 
 
 STREAMED = "streamed"
@@ -145,7 +130,7 @@ POLICY_NAMES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # s
 class EdgeConfig:
     """Limits of the edge."""
 
-    policy: str = "share"  # overridden by `share edge --policy`
+    policy: str = "share"  # scheduling policy; overridden by --policy
     silent_s: float = 3.0  # no message of an agent for this long: it counts as gone
     max_agents: int = 64  # present at once; more are refused
     max_keyframes: int = 2000  # kept; beyond, the agent with most gives up redundant ones first
@@ -173,12 +158,15 @@ class AgentQoe:
         _require_positive(self, *(name for name in ("gamma", "theta_ms") if getattr(self, name) is not None))
 
 
+NEAR_M = 0.3  # near plane of the view frusta
+
+
 @dataclass(frozen=True)
 class ControlConfig:
     """QoE, keyframe rates and the merge gate (docs/understand/scheduling.md)."""
 
     ar_beta: float = 0.015  # 1/ms, of delay above 20 ms
-    ar_gamma: float = 3.6  # cm, of accuracy
+    ar_gamma: float = 3.6  # cm, of accuracy: 1.6 is content with 0.6 cm, and asks for fewer keyframes
     ar_target: float = 0.93  # target QoE
     robot_beta: float = 3.0  # cm, of accuracy below 1/cm
     robot_gamma: float = 400.0  # ms, of 1 / (delay + theta)
@@ -190,21 +178,19 @@ class ControlConfig:
     kp: float = 0.8  # Hz per evaluation, of an error of 1 in QoE
     ki: float = 0.15  # the same, of an error of 1 for a second
     kd: float = 0.2  # the same, of an error that grows by 1 in a second
-    alpha: float = 0.3  # weight of the newest derivative of the error, of 1
     rate_min_hz: float = 1.5  # lowest rate of an agent
     rate_max_hz: float = 5.0  # highest rate of an agent, and its initial one
     random_seed: int = 1  # of the merge gate and of policy random
-    near_m: float = 0.3  # near plane of the view frusta
-    far_m: float = 5.0  # far plane of the view frusta
+    far_m: float = 5.0  # far plane of the view frusta; the near one is at 0.3 m
     merges: int = 20  # completed merges in the mean overlap that a new one is compared with (N)
     eagerness: float = 1.5  # a merge has this probability times its overlap over their mean (alpha_m)
 
     def __post_init__(self) -> None:
         _require_positive(self, "ar_gamma", "robot_gamma", "robot_theta_ms", "rate_min_hz", "merges")
-        if not self.near_m < self.far_m:
-            raise ValueError(f"near_m: {self.near_m} m is not nearer than far_m, {self.far_m} m")
-        if not (self.rate_min_hz <= self.rate_max_hz <= 1000 and self.alpha <= 1):
-            raise ValueError("rate_min_hz, rate_max_hz, 1000 must rise, and alpha be at most 1")
+        if not self.far_m > NEAR_M:
+            raise ValueError(f"far_m: {self.far_m} m is not beyond the near plane, {NEAR_M} m")
+        if not self.rate_min_hz <= self.rate_max_hz <= 1000:
+            raise ValueError("rate_min_hz, rate_max_hz, 1000 must rise")
 
 
 @dataclass(frozen=True)
@@ -215,7 +201,6 @@ class Config:
     inertial: InertialConfig = field(default_factory=InertialConfig)
     sequencer: SequencerConfig = field(default_factory=SequencerConfig)
     place: PlaceConfig = field(default_factory=PlaceConfig)
-    graph: GraphConfig = field(default_factory=GraphConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
     edge: EdgeConfig = field(default_factory=EdgeConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
@@ -233,9 +218,20 @@ def _require_positive(config: Any, *names: str) -> None:
 
 def load_config(text: str, where: str = "configuration") -> Config:
     """Return a `Config` from YAML text. Raises ConfigError naming the key and the remedy."""
+    return load_given_config(text, where)[0]
+
+
+def load_given_config(text: str, where: str = "configuration") -> tuple[Config, dict[str, Any]]:
+    """Return a `Config` from YAML text, and only what the text sets, by section. Raises ConfigError."""
     from share.plain_data import from_mapping
     from share.strict_yaml import load_yaml
 
     data = load_yaml(text, where)
     refuse_retired(data, where)
-    return from_mapping(Config, {} if data is None else data, where)
+    given = {} if data is None else data
+    return from_mapping(Config, given, where), given
+
+
+def with_policy(config: Config, policy: str) -> Config:
+    """Return `config` with this scheduling policy."""
+    return replace(config, edge=replace(config.edge, policy=policy))

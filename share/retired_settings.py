@@ -26,6 +26,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "tracker.reobserve_px": "odometry.visual_tracker._REOBSERVE_PX",
     "tracker.relocalise_hosts": "odometry.relocalisation._BATCH_SIZE",
     "tracker.max_speed_m_s": "odometry.visual_tracker._MAX_SPEED_M_S",
+    "tracker.new_stretch_s": "odometry.relocalisation.NEW_SEGMENT_S",
     "tracker.max_turn_rad_s": "odometry.visual_tracker._MAX_TURN_RAD_S",
     # inertial
     "inertial.spacing_px": "odometry.landmarks._SPACING_PX",
@@ -73,6 +74,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "place.sigma_px": "mapping.recognition.verification.SIGMA_PX",
     "place.sigma_inverse_depth": "mapping.recognition.verification.SIGMA_INVERSE_DEPTH",
     "place.inlier_chi2": "mapping.recognition.verification.INLIER_CHI2",
+    "place.min_inliers": "mapping.recognition.verification.MIN_INLIERS",
     "place.min_direction_inliers": "mapping.recognition.verification.MIN_DIRECTION_INLIERS",
     "place.max_sigma_deg": "mapping.recognition.verification.MAX_SIGMA_DEG",
     "place.min_spread": "mapping.recognition.verification.MIN_SPREAD",
@@ -80,6 +82,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "place.floor_deg": "mapping.recognition.verification._FLOOR_DEG",
     "place.floor_m": "mapping.recognition.verification._FLOOR_M",
     # graph
+    "graph.cauchy": "mapping.graph.solver.CAUCHY_WIDTH",
     "graph.max_iterations": "mapping.graph.optimiser.MAX_ITERATIONS",
     "graph.relative_tolerance": "mapping.graph.optimiser.RELATIVE_TOLERANCE",
     "graph.step_tolerance": "mapping.graph.optimiser.STEP_TOLERANCE",
@@ -97,6 +100,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "merge.rival_weight": "mapping.loop_acceptance._COMPETING_WEIGHT",
     "merge.rebel_places": "mapping.loop_acceptance._CONTRADICTING_PLACES",
     "merge.rebel_weight": "mapping.loop_acceptance._CONTRADICTING_WEIGHT",
+    "merge.odometry_scale": "mapping.agents.covariance_scales.CovarianceScales",
     "merge.odometry_floor_deg": "mapping.agents.covariance_scales._FLOOR_DEG",
     "merge.odometry_floor_m": "mapping.agents.covariance_scales._FLOOR_M",
     "merge.odometry_floor_per_rad": "mapping.agents.covariance_scales._FLOOR_PER_RAD",
@@ -109,12 +113,15 @@ RETIRED_SETTINGS: dict[str, str] = {
     "merge.near_rad": "mapping.loop_consistency.NEAR_RAD",
     "merge.enter_patience": "mapping.localisation_gate.PATIENCE",
     "merge.drop_chi2": "mapping.map_solving._OUTLIER_CHI2",
+    "merge.scale_tolerance": "mapping.agents.agent_pair.SCALE_TOLERANCE",
     # edge
     "edge.name_hold_s": "protocol.admission.NAME_HOLD_S",
     "edge.each_waiting": "mapping.query_queue.MAX_WAITING_EACH",
     "edge.hurry_waiting": "mapping.query_queue.HURRY_WAITING",
     "edge.hurry_candidates": "mapping.query_queue.HURRY_CANDIDATES",
     # control
+    "control.alpha": "scheduling.policies.DERIVATIVE_WEIGHT",
+    "control.near_m": "config.NEAR_M",
     "control.integral_max_hz": "scheduling.policies.INTEGRAL_MAX_HZ",
     "control.gap_s": "scheduling.policies.GAP_S",
     "control.interval_m": "scheduling.merge_gate.INTERVAL_M",
@@ -130,6 +137,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "link.resend_max_s": "protocol.agent_ledger.RESEND_MAX_S",
     "link.gap_s": "protocol.agent_ledger.GAP_RESEND_S",
     # stream
+    "stream.patience_s": "protocol.streaming.PATIENCE_S",
     "stream.begin_s": "runtime.frame_consumers.TRACKER_START_S",
     # clock
     "clock.noise_us": "protocol.edge_clock.NOISE_US",

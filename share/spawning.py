@@ -18,7 +18,7 @@ from typing import Any
 from share import child_processes
 
 _TERMINAL_SIGNALS = {signal.SIGINT, signal.SIGHUP}  # sent to the whole process group: the parent handles them
-_DEFERRED_SIGNALS = {*_TERMINAL_SIGNALS, signal.SIGTERM, signal.SIGALRM}  # SIGALRM: `share.cli.signals`
+_DEFERRED_SIGNALS = {*_TERMINAL_SIGNALS, signal.SIGTERM, signal.SIGALRM}  # SIGALRM: `share.runtime.signals`
 
 
 def _initialise_child(parent: int, from_main_thread: bool) -> None:

@@ -1,10 +1,12 @@
-"""Timers, rate limits, restart backoff and a ring buffer. The time is passed in."""
+"""Timers, limits on rates and lines, restart backoff and a ring buffer. The time is passed in."""
 
 from __future__ import annotations
 
 import math
 from array import array
 from collections.abc import Sequence
+
+from share.errors import printable
 
 SECOND_NS = 1_000_000_000
 
@@ -151,6 +153,39 @@ class Throttle:
         del self._buckets[oldest]
         self._suppressed.pop(oldest, None)
         return key
+
+
+_LINE_HZ, _LINE_BURST = 0.2, 20.0  # 20 lines at once, then one each 5 s
+_MAX_LINE_LENGTH = 300  # characters
+_MAX_REMEMBERED_LINES = 16
+_QUIET_NS = 60_000_000_000  # a fault absent for this long is new again
+
+
+class LineLimiter:
+    """Limits lines for a person, so that neither a peer nor a lasting fault fills a terminal or a log."""
+
+    def __init__(self) -> None:
+        self._throttle = Throttle(_LINE_HZ, _LINE_BURST)
+        self._last_seen_ns: dict[str, int] = {}  # by kind, least recently seen first
+
+    def admit(self, text: str, now_ns: int) -> str | None:
+        """Return the line in printable characters, with the number of lines suppressed before it; None if it
+        is suppressed."""
+        if (suppressed := self._throttle.admit(None, now_ns)) is None:
+            return None
+        line = printable(text[:_MAX_LINE_LENGTH])
+        return f"{line} ({suppressed} lines before this were suppressed)" if suppressed else line
+
+    def admit_new(self, text: str, now_ns: int, kind: str | None = None) -> str | None:
+        """Return the line as `admit` does the first time, and after none of its kind came for a minute; else
+        None. kind: the text itself by default."""
+        kind = text if kind is None else kind
+        last_ns = self._last_seen_ns.pop(kind, None)
+        self._last_seen_ns[kind] = now_ns
+        if len(self._last_seen_ns) > _MAX_REMEMBERED_LINES:
+            del self._last_seen_ns[next(iter(self._last_seen_ns))]
+        is_new = last_ns is None or now_ns - last_ns > _QUIET_NS
+        return self.admit(text, now_ns) if is_new else None
 
 
 class RingBuffer:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import runpy
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from share.cli.main import cli
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("*/README.md")])
-CITING = [page for page in PAGES if page.name != "renamed.md" and "results" not in page.parts]
+CITING = [page for page in PAGES if "results" not in page.parts]
 NOT_MODULES = {"share.x.y", "share.rig"}  # an example; a record in MCAP files
 NOT_OURS = {
     "AprilGrid",
@@ -27,6 +29,7 @@ NOT_OURS = {
     "RecursionError",
 }
 TOOL: dict[str, Any] = runpy.run_path(str(ROOT / "tools" / "config_table.py"))
+COMMON_LINE = re.compile(r"^Also: (.+(?:\n.+)*)", re.MULTILINE)
 COMMANDS = (DOCS / "lookup" / "commands.md").read_text()
 
 
@@ -173,8 +176,14 @@ def test_commands_page_has_every_command_and_no_other() -> None:
 
 @pytest.mark.parametrize("name", sorted(commands(cli)))
 def test_commands_page_has_every_option_and_no_other(name: str) -> None:
-    rows = re.findall(r"^\| `[^|]*?(--[a-z-]+)", documented()[name], flags=re.MULTILINE)
-    assert set(rows) == options(commands(cli)[name])
+    section = documented()[name]
+    rows = re.findall(r"^\| `[^|]*?(--[a-z-]+)", section, flags=re.MULTILINE)
+    common = [o for line in COMMON_LINE.findall(section) for o in re.findall(r"`(--[a-z-]+)`", line)]
+    assert sorted(rows + common) == sorted(options(commands(cli)[name]))
+    described = COMMANDS.partition("## Common options\n")[2].partition("\n## ")[0]
+    assert [
+        option for option in common if not re.search(rf"^\| .*`{option}\b", described, re.MULTILINE)
+    ] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
@@ -190,3 +199,57 @@ def test_examples_use_options_that_exist(page: Path) -> None:
         if name:
             wrong = set(re.findall(r"(?<= )--[a-z-]+", line)) - options(known[name]) - {"--help"}
             assert not wrong, f"{page.name}: {line}"
+
+
+@pytest.mark.parametrize("name", sorted(commands(cli)))
+def test_help_explains_each_choice(name: str) -> None:
+    command = commands(cli)[name]
+    for option in command.params:
+        if isinstance(option, click.Option) and isinstance(option.type, click.Choice):
+            text = f"{command.help} {option.help}".partition("  [default")[0]
+            unexplained = [word for word in option.type.choices if not re.search(rf"\b{word}\b", text)]
+            assert not unexplained, f"{option.opts}: {unexplained}"
+
+
+def test_help_of_emulate_has_every_scene() -> None:
+    from share.lab.emulate.world.scenes import SCENES
+
+    text = commands(cli)["share emulate"].help or ""
+    assert [name for name in SCENES if not re.search(rf"\b{name}\b", text)] == []
+
+
+PACKAGES = sorted(path.parent for path in (ROOT / "share").rglob("__init__.py"))
+
+
+def introduction(package: Path) -> str:
+    """The package's docstring."""
+    return ast.get_docstring(ast.parse((package / "__init__.py").read_text())) or ""
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_every_package_says_what_it_is(package: Path, sources: dict[str, str]) -> None:
+    """The modules and names exist that its docstring cites, in backticks or first in a row."""
+    text = introduction(package)
+    assert text
+    sections = TOOL["sections"](TOOL["SOURCE"].read_text())
+    settings = {f"{section.name}.{row.name}" for section in sections for row in section.settings}
+    cited = re.findall(r"`([^`\n]+)`|^ {4}(\w+)  ", text, re.MULTILINE)
+    names = {one or other for one, other in cited} - settings
+    for name in {one.removesuffix(".py") for one in names if re.fullmatch(r"[a-z]\w*(\.\w+)*", one)}:
+        module, path = ".".join(package.relative_to(ROOT).parts), name.split(".")
+        if path[0] == "share":
+            module = path.pop(0)
+        while path and f"{module}.{path[0]}" in sources:
+            module = f"{module}.{path.pop(0)}"
+        assert all(defines(sources[module], one) for one in path), name
+
+
+@pytest.mark.long
+def test_the_example_of_the_package_runs(plain_session: Path) -> None:
+    (code,) = re.findall(
+        r"^ {4}from .*?(?=\n\n[A-Z])", introduction(ROOT / "share"), re.MULTILINE | re.DOTALL
+    )
+    names: dict[str, Any] = {}
+    exec(textwrap.dedent(code).replace("room1/ann", str(plain_session / "ar1")), names)
+    assert names["stamps_ns"].shape == (45,)
+    assert names["T_odom_body"].shape == (45, 4, 4)

@@ -1,0 +1,1 @@
+"""Live cameras: samples as they come, with a watchdog; `realsense` is the one kind so far."""

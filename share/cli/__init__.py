@@ -1,0 +1,1 @@
+"""The commands, one file each. `main` has their table, `options` what several share."""

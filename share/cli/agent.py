@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 @click.option(
     "--kind",
     type=click.Choice(["ar", "robot"]),
-    help="Kind of agent: ar (headset) or robot.  [default: the role in --profile]",
+    help="Kind of agent, by which the edge rates its service: ar (headset) or robot.  "
+    "[default: the role in --profile]",
 )
 @click.option("--edge", "address", metavar="tcp://H:P", required=True, help="Address of the edge.")
 @options.keys
@@ -42,7 +43,10 @@ if TYPE_CHECKING:
     help="Public key of the edge; required for an edge on another machine. Turns on encryption.",
 )
 @click.option(
-    "--link", metavar="NAME|FILE", help="Emulate a network to the edge: wifi5, wifi-busy or a YAML file."
+    "--link",
+    metavar="NAME|FILE",
+    help="Emulate a network to the edge: wifi5 (an access point alone), wifi-busy (shared with many devices) "
+    "or a YAML file (docs/do/network.md).",
 )
 @click.option("--link-seed", type=int, default=0, help="Seed of its delays and losses.")
 @click.option("--streamed", is_flag=True, help="Send raw frames and let the edge track (policy streamed).")

@@ -69,7 +69,10 @@ def realsense(serial: str | None, profile_name: str | None, mode: str | None, de
 
 @calibrate.command(short_help="Write a calibration board to print, and its YAML file.")
 @click.option(
-    "--kind", type=click.Choice(["aprilgrid", "charuco"]), default="aprilgrid", help="Pattern of the board."
+    "--kind",
+    type=click.Choice(["aprilgrid", "charuco"]),
+    default="aprilgrid",
+    help="aprilgrid (AprilTags, as Kalibr's) or charuco (chessboard with ArUco tags, as OpenCV's).",
 )
 @click.option(
     "--paper", metavar="P", default="A4", help="Paper: A4 to A0, letter, tabloid, or WIDTHxHEIGHT in mm."

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     "--camera",
     type=click.Choice(["cam0", "both"]),
     default="both",
-    help="Calibrate cam0 only, or cam0 and cam1.",
+    help="cam0 alone, or both: cam0, cam1 and the extrinsics between them.",
 )
 @click.option("--every", type=click.IntRange(1), default=1, metavar="N", help="Use every N-th image.")
 @click.option(
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     "model",
     type=click.Choice(["radtan", "equidistant"]),
     default="radtan",
-    help="Lens model: radial-tangential, or Kannala and Brandt's fisheye model (equidistant).",
+    help="Lens model: radtan (radial-tangential), or equidistant (fisheye, Kannala and Brandt).",
 )
 @options.calib
 @options.workers

@@ -33,7 +33,8 @@ mode = click.option("--mode", metavar="WxH[@HZ]", help="Image size and rate.  [d
 sensors = click.option(
     "--sensors",
     type=click.Choice(["stereo", "rgbd"]),
-    help="Streams of a live camera: infrared pair, or left image and depth.  [default: stereo]",
+    help="Streams of a live camera: stereo (infrared pair) or rgbd (left image and depth).  "
+    "[default: stereo]",
 )
 
 

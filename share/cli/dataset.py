@@ -72,7 +72,11 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     help="Compress gray images as JPEG of this quality.  [default: keep images as they are, byte for byte]",
 )
 @click.option(
-    "--format", "kind", type=click.Choice(["mcap", "euroc"]), default="mcap", help="Format to write."
+    "--format",
+    "kind",
+    type=click.Choice(["mcap", "euroc"]),
+    default="mcap",
+    help="mcap (one file of ROS 2 messages) or euroc (an EuRoC/ASL folder).",
 )
 def convert(
     source: str, out: Path, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
@@ -211,7 +215,7 @@ def _map_text(d: dict[str, Any]) -> str:
     lines = [f"{d['name']}: map, schema {d['schema']}, {d['bytes'] / 1e6:.1f} MB"]
     for name, agent in d["agents"].items():
         removed = agent["next_keyframe"] - agent["keyframes"]
-        segments_text = f", {agent['stretches']} segments" if agent["stretches"] > 1 else ""
+        segments_text = f", {agent['segments']} segments" if agent["segments"] > 1 else ""
         lines.append(
             f"  {name:<10} {agent['kind']:<6} {agent['keyframes']:>6} keyframes, {removed} removed"
             f"{segments_text}"

@@ -41,7 +41,7 @@ class _Seconds(click.FloatRange):
 )
 def demo(
     seconds: float,
-    policy: str,
+    policy: str | None,
     link: str | None,
     true_error: bool,
     config_file: Path | None,
@@ -58,7 +58,7 @@ def demo(
     \b
     Example:  share demo --seconds 30 --out /tmp/demo
     """
-    options.load_config(config_file)  # check it and the link before the room is made
+    policy = options.load_config(config_file, [policy]).edge.policy  # checked before the room is made
     if policy == STREAMED and true_error:
         raise UsageError(
             "--true-error does not go with --policy streamed, where the edge tracks; leave out one"

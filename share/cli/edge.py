@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.config import POLICY_NAMES, STREAMED
+from share.config import STREAMED
 from share.errors import UsageError
+from share.event_kinds import EventKind
 
 if TYPE_CHECKING:
     from share.cli.stderr import Stderr
@@ -20,11 +21,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.option("--bind", default="tcp://127.0.0.1:5555", metavar="tcp://H:P", help="Address to listen on.")
-@click.option(
-    "--policy",
-    type=click.Choice(POLICY_NAMES),
-    help="How keyframe rates are set, see above.  [default: edge.policy of --config, else share]",
-)
+@options.policy
 @options.keys
 @click.option(
     "--map",
@@ -56,23 +53,13 @@ def edge(
     Prints when agents connect and leave and when maps merge; with -v, every decision and its reason.
     Agents on other machines need keys: see `share keys --help`.
 
-    \b
-    Policies:
-      share     rate of each agent by its quality of experience; merges with a small gain are skipped
-      covins-g  every keyframe is sent, every verified loop is merged
-      linear    rate falls with the delay; merges as share
-      equal     as share, robots rated like headsets
-      random    as share, with control gains drawn from control.random_seed
-      streamed  agents send raw frames; the edge tracks each alone, without a shared map
-
     With --map, every keyframe that the edge acknowledged survives a crash; the next start continues there.
 
     \b
     Example:  share edge --bind tcp://127.0.0.1:5555 --map room.sqlite --http 8080 --out out/edge
     """
-    settings = options.load_config(config_file)
+    settings = options.load_config(config_file, [policy])
     from contextlib import ExitStack, closing
-    from dataclasses import replace
 
     from share.cli.stderr import Stderr
     from share.net.transport import bind as bind_link
@@ -83,8 +70,6 @@ def edge(
     from share.wire.codec import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
     edge_key_pair = _edge_keys(keys, parse_address(bind, bind=True).local)
-    if policy is not None:
-        settings = replace(settings, edge=replace(settings.edge, policy=policy))
     is_streamed = settings.edge.policy == STREAMED
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
@@ -149,7 +134,7 @@ def _print_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
         stderr.print_line(f"public key '{keys.own.public}'; authorized: {names or 'none yet'}")
 
 
-_SHOWN_EVENTS = {  # without -v
+_SHOWN_EVENTS: set[EventKind] = {  # without -v
     "agent joined",
     "left",
     "reconnected",

@@ -33,7 +33,7 @@ class _Size(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--scene",
     required=True,
-    help="Room: warehouse, firestation, corridor-twins, whitewall, board, charuco-board, plain, a .glb file.",
+    help="Room that is generated; see above.",
 )
 @click.option(
     "--motion",
@@ -52,32 +52,34 @@ class _Size(click.ParamType[tuple[float, ...]]):
     "profiles",
     multiple=True,
     metavar="[NAME=]PROFILE[:MODE]",
-    help="Device that records: d435i, euroc or a YAML file; MODE such as 848x480@30.",
+    help="Device that records: d435i, euroc, tumvi (fisheye) or a YAML file; MODE such as 848x480@30.",
 )
 @click.option(
     "--sensors",
     multiple=True,
     metavar="[NAME=]stereo|rgbd|mono",
-    help="Infrared pair, left image and depth, or left image only.  [default: stereo; rgbd for robot:]",
+    help="stereo (infrared pair), rgbd (left image and depth) or mono (left image).  "
+    "[default: stereo; rgbd for robot:]",
 )
 @click.option(
     "--effect",
     "effects",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Sensor errors: none, noise=off, blur=off, drops=0.02, jitter_ms=1, time_offset_ms=5, …",
+    help="Sensor errors: none, noise=off, blur=off, drops=0.02, jitter_ms=1, time_offset_ms=5, … "
+    "(all: docs/understand/sensors.md).",
 )
 @click.option(
     "--images",
     type=click.Choice(["jpeg", "png"]),
-    help="Image compression.  [default: jpeg; png for --format euroc]",
+    help="Image files: jpeg (small) or png (without loss).  [default: jpeg; png for --format euroc]",
 )
 @click.option(
     "--format",
     "form",
     type=click.Choice(["session", "euroc"]),
     default="session",
-    help="A session of SHARE, or EuRoC/ASL folders.",
+    help="session (for all commands of SHARE) or euroc (EuRoC/ASL folders, for other programs).",
 )
 @options.as_json
 @click.option("--workers", type=click.IntRange(1, 64), default=_WORKERS, help="Processes to use.")
@@ -102,6 +104,14 @@ def emulate(
     and errors of a real one. The session has the format of one from the field. An interrupted command
     continues when it is run again.
 
+    \b
+    Scenes:   warehouse                 much to see: racks, pallets, signs
+              firestation               few cues: painted walls, fire engines
+              corridor-twins            two corridors that look alike
+              whitewall                 next to nothing to see
+              board, charuco-board      a calibration board on a stand
+              plain                     walls with textures; needs no OpenGL
+              FILE.glb                  your own model of a room (glTF)
     \b
     Motions:  walk:[speed=0.9,…]        a person with a headset
               robot:[speed=0.35,…]      a robot with two wheels

@@ -44,7 +44,7 @@ for command in (ablation, sweep, compare):
 @options.config
 @click.option("--out", required=True, metavar="RUN", type=options.PATH, help="A new folder.")
 def run(
-    session: Path, policy: str, seed: int, config_file: Path | None, out: Path, **options_given: Any
+    session: Path, policy: str | None, seed: int, config_file: Path | None, out: Path, **options_given: Any
 ) -> None:
     """Play SESSION in real time with an edge and its agents, each its own process; or, with --virtual, with
     the same trackers and state machines in virtual time, independent of this machine's load.
@@ -61,8 +61,8 @@ def run(
     from share.recordings.session import read_session
 
     opened, live = read_session(session), LiveLine()
-    config = options.load_run_config(config_file, options_given, [opened])
-    run_terms = RunOptions(policy, seed=seed, **options_given)
+    config = options.load_run_config(config_file, [policy], options_given, [opened])
+    run_terms = RunOptions(config.edge.policy, seed=seed, **options_given)
     trial = run_trial(opened, run_terms, config, out, lambda now: live.write(str(now)))
     live.end()
     click.echo(run_table(run_metrics(trial)))

@@ -11,7 +11,7 @@ import click
 
 from share.cli import options
 from share.cli.terminal import LiveLine
-from share.config import POLICY_NAMES
+from share.config import POLICY_NAMES, STREAMED
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
@@ -80,6 +80,7 @@ def check_none_failed(succeeded: int, total: int) -> None:
 )
 @options.run_options
 @many_run_options
+@options.explain_policies
 @click.option(
     "--with",
     "section_paths",
@@ -116,10 +117,10 @@ def ablation(
     from share.lab.evaluate.report import read_section
     from share.recordings.session import read_session
 
-    policies = policies_given or tuple(policy for policy in POLICY_NAMES if policy != "streamed")
+    policies = policies_given or tuple(name for name in POLICY_NAMES if name != STREAMED)
     sections = [read_section(path, number) for number, path in enumerate(section_paths, 1)]
     opened = [read_session(folder) for folder in sessions]
-    config = options.load_run_config(config_file, options_given, opened)
+    config = options.load_run_config(config_file, policies, options_given, opened)
     planned_runs = plan_policies(
         opened, policies, range(seeds), RunOptions("", **options_given), out / "runs", config
     )
@@ -186,7 +187,7 @@ def sweep(
     sessions: tuple[Path, ...],
     axis_texts: tuple[str, ...],
     count: int | None,
-    policy: str,
+    policy: str | None,
     seeds: int,
     workers: int,
     scheduler: str | None,
@@ -213,9 +214,15 @@ def sweep(
     axes = [Axis.parse(text) for text in axis_texts]
     points = grid(axes) if count is None else random_points(axes, count, seed=0)
     opened = [read_session(folder) for folder in sessions]
-    config = options.load_run_config(config_file, options_given, opened)
+    config = options.load_run_config(config_file, [policy], options_given, opened)
     runs = plan_sweep(
-        opened, axes, points, range(seeds), RunOptions(policy, **options_given), out / "runs", config
+        opened,
+        axes,
+        points,
+        range(seeds),
+        RunOptions(config.edge.policy, **options_given),
+        out / "runs",
+        config,
     )
     writable_dir(out, "sweep.csv", "sweep.md")
     point_of = {one.out: point for one, point in runs}

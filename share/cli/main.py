@@ -15,9 +15,9 @@ from typing import Any  # noqa: E402
 import click  # noqa: E402
 
 from share import __version__  # noqa: E402
-from share.cli.signals import unwind_on_signal  # noqa: E402
 from share.cli.stderr import flush_all  # noqa: E402
 from share.errors import ShareError, UsageError, one_line  # noqa: E402
+from share.runtime.signals import unwind_on_signal  # noqa: E402
 
 # name: (module, attribute, one line of help). A literal table, so that a freezer sees every module.
 COMMANDS = {
@@ -130,7 +130,12 @@ def main(arguments: list[str] | None = None) -> None:
     except click.ClickException as error:
         context = getattr(error, "ctx", None)
         hint = f" (see `{context.command_path} --help`)" if context else ""
-        _exit_with(error.format_message().replace("\n", " ") + hint, error.exit_code)
+        message = error.format_message().replace("\n", " ")
+        if context and isinstance(context.command, click.Group) and message.startswith("No such command"):
+            message += (
+                "" if "Did you mean" in message else f" Commands: {', '.join(context.command.commands)}."
+            )
+        _exit_with(message + hint, error.exit_code)
     except (KeyboardInterrupt, click.Abort):
         _exit_with("interrupted", 130)
     except BrokenPipeError:  # the reader of our output is gone

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
@@ -11,7 +12,7 @@ from unicodedata import normalize
 import click
 
 from share.cli.terminal import print_note
-from share.config import POLICY_NAMES
+from share.config import POLICY_NAMES, STREAMED
 from share.errors import UsageError, one_line
 
 if TYPE_CHECKING:
@@ -77,16 +78,24 @@ rotations = click.option(
     default="helical",
     help="Meaning of RX, RY, RZ in a Vicon CSV without RW: rotation vector (helical) or Euler angles (xyz).",
 )
-policy = click.option(
+POLICY_TEXTS = {
+    "share": "rate of each agent by its quality of experience; merges with a small gain are skipped",
+    "covins-g": "every keyframe is sent, every verified loop is merged",
+    "linear": "rate falls with the delay; merges as share",
+    "equal": "as share, robots rated like headsets",
+    "random": "as share, with control gains drawn from control.random_seed",
+    STREAMED: "agents send raw frames; the edge tracks each alone, without a shared map",
+}
+_policy_option = click.option(
     "--policy",
     type=click.Choice(POLICY_NAMES),
-    default=POLICY_NAMES[0],
-    help="How keyframe rates are set.",
+    help="How keyframe rates are set, see above.  [default: edge.policy of --config, else share]",
 )
 link = click.option(
     "--link",
     metavar="LINK[,AGENT=LINK…]",
-    help="Emulated network, as share agent --link: one for all agents, or one per agent.",
+    help="Emulated network: wifi5 (an access point alone), wifi-busy (shared with many devices) or a YAML "
+    "file (docs/do/network.md); one for all agents, or one per agent.",
 )
 true_error = click.option(
     "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
@@ -108,6 +117,19 @@ class _Frames(click.ParamType[slice]):
 
 
 frames = click.option("--frames", type=_Frames(), help="Use only camera frames A to B-1, such as 0:250.")
+
+
+def explain_policies(command: Command) -> Command:
+    """Add a line about each policy to the help of a command, before its example."""
+    about, example, rest = cleandoc(command.__doc__ or "").partition("\b\nExample:")
+    rows = "\n".join(f"  {name:8}  {text}" for name, text in POLICY_TEXTS.items())
+    command.__doc__ = f"{about}\b\nPolicies:\n{rows}\n\n{example}{rest}"
+    return command
+
+
+def policy(command: Command) -> Command:
+    """Add --policy, whose choices are explained in the command's help."""
+    return _policy_option(explain_policies(command))
 
 
 def option_group(*group: Callable[[Command], Command]) -> Callable[[Command], Command]:
@@ -139,12 +161,23 @@ run_options = option_group(
 )
 
 
-def load_config(path: Path | None) -> Config:
-    """Read settings from a YAML file; the defaults without one. Raises ConfigError, UsageError."""
-    from share.config import Config
-    from share.files.yaml_file import read_settings
+def load_config(path: Path | None, policies: Sequence[str | None] = ()) -> Config:
+    """Read settings from a YAML file; the defaults without one. Raises ConfigError, UsageError.
 
-    return Config() if path is None else read_settings(path)
+    policies: those given by --policy; the first replaces `edge.policy`. If the file sets a policy that is
+    none of them, a line on stderr says so.
+    """
+    from share.config import Config, with_policy
+    from share.files.yaml_file import read_given_settings
+
+    config, given = (Config(), dict[str, Any]()) if path is None else read_given_settings(path)
+    played = [one for one in policies if one is not None]
+    if not played:
+        return config
+    if "policy" in given.get("edge", {}) and config.edge.policy not in played:
+        names = f"{'policies' if len(played) > 1 else 'policy'} {', '.join(played)}"
+        print_note(str(path), f"edge.policy {config.edge.policy} is overridden by {names}")
+    return with_policy(config, played[0])
 
 
 def agent_name(value: str) -> str:
@@ -198,15 +231,18 @@ def print_counters(counters: dict[str, int]) -> None:
 
 
 def load_run_config(
-    config_file: Path | None, options_given: dict[str, Any], sessions: Sequence[Session]
+    config_file: Path | None,
+    policies: Sequence[str | None],
+    options_given: dict[str, Any],
+    sessions: Sequence[Session],
 ) -> Config:
-    """Read the settings and check them and the run options before anything is played.
+    """Read the settings (`load_config`) and check them and the run options before anything is played.
 
     Raises ConfigError, UsageError.
     """
     from share.lab.evaluate.emulated_network import LinkAssignment
 
-    config, links = load_config(config_file), LinkAssignment.parse(options_given["link"])
+    config, links = load_config(config_file, policies), LinkAssignment.parse(options_given["link"])
     for session in sessions:
         links.check(session.agents)
     if options_given["costs"] is not None:

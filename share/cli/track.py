@@ -61,8 +61,8 @@ def track(
     settings = options.load_config(config_file)
     paths_given = {"--out": out, "--report": report_file}
     from share.files.writing import atomic_write
+    from share.metrics.ate import ate_if_known
     from share.recordings.trajectory import format_tum
-    from share.runtime.offline_tracking import trajectory_accuracy
 
     line = LiveLine()
     opened = camera_options.open_source(
@@ -82,7 +82,7 @@ def track(
                 f" {line}." for line in [*_wait_text(run.report), *camera_options.camera_summary(run.report)]
             )
         )
-    ate = trajectory_accuracy(run, truth) if run.report["segments"] == 1 else None
+    ate = ate_if_known(run.trajectory, truth) if run.report["segments"] == 1 else None
     report = {**run.report, "ate_m": ate.rmse if ate else None}
     texts = {"--out": format_tum(run.trajectory), "--report": json.dumps(report, indent=2) + "\n"}
     for option, path in output_files.items():

@@ -1,0 +1,1 @@
+"""A device's readiness (`share doctor`) and its clock (`share sync`)."""

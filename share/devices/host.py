@@ -10,7 +10,6 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Sequence
 from pathlib import Path
 
 from share.devices.camera_check import UsbCamera
@@ -93,12 +92,10 @@ def is_port_free(port: int) -> bool:
     return True
 
 
-def native_libraries(
-    names: Sequence[str] = _NATIVE_LIBRARIES, optional: Sequence[str] = _OPTIONAL_LIBRARIES
-) -> dict[str, str | None]:
-    """Return the load error of each library, None if it loads. optional: checked only if installed."""
-    installed = [name for name in optional if importlib.util.find_spec(name) is not None]
-    return {name: _load_error(name) for name in (*names, *installed)}
+def native_libraries() -> dict[str, str | None]:
+    """Return the load error of each library, None if it loads; of the optional ones only if installed."""
+    installed = [name for name in _OPTIONAL_LIBRARIES if importlib.util.find_spec(name) is not None]
+    return {name: _load_error(name) for name in (*_NATIVE_LIBRARIES, *installed)}
 
 
 def _load_error(name: str) -> str | None:

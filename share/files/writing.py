@@ -189,23 +189,6 @@ def open_new(path: Path) -> IO[bytes]:
 _NEW_FILE_FLAGS = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
-def lock_folder(folder: Path) -> int:
-    """Create `folder` (as `writable_dir`) and lock it, so that two runs do not write the same files.
-
-    Returns a handle; closing it, or the end of the process, releases the lock. Raises UsageError if another
-    run holds it.
-    """
-    import fcntl
-
-    handle = os.open(writable_dir(folder), os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise UsageError(f"{folder}: another run is writing there; give another --out") from None
-    return handle
-
-
 def writable_dir(path: Path, *names: str) -> Path:
     """Create the folder `path` if needed, check that it is writable, and return it. Else raise UsageError.
 

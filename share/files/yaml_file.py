@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from share.config import Config, load_config
+from share.config import Config, load_given_config
 from share.errors import ConfigError, UsageError
 from share.files.reading import MAX_SETTINGS_BYTES, read_errors, read_text
 from share.plain_data import checked_mapping, describe_value, parse_numbers, parse_pose
@@ -77,6 +77,13 @@ def read_yaml(path: Path) -> Section:
 
 def read_settings(path: Path) -> Config:
     """Read a file of settings. Raises ConfigError that names the key and the valid values, UsageError."""
+    return read_given_settings(path)[0]
+
+
+def read_given_settings(path: Path) -> tuple[Config, dict[str, Any]]:
+    """Read a file of settings; return all settings, and only those that it sets.
+
+    Raises as `read_settings`."""
     with read_errors(path, UsageError):
         text = read_text(path, MAX_SETTINGS_BYTES)
-    return load_config(text, str(path))
+    return load_given_config(text, str(path))

@@ -1,0 +1,1 @@
+"""SE(3), cameras with their lenses, rigs, absolute pose, interpolation."""

@@ -1,0 +1,1 @@
+"""The laboratory: emulator, calibration, evaluation, training. The product never imports it."""

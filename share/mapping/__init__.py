@@ -1,0 +1,24 @@
+"""The edge's map of all agents: keyframes in, corrections out (docs/understand/mapping.md).
+
+Begin with `mapper.Mapper`: `mapper.Mapper._look_up` is a keyframe's way, `mapper.Mapper._solve_map` that of a
+map that has changed:
+
+    query_queue          which keyframe is looked up next
+    recognition          candidates (`recognition.index`), and the pose of each (`recognition.verification`)
+    agents               do the agents agree on scale and covariances? else quarantine
+    loop_acceptance      is a loop accepted: alone, or with others (`loop_consistency`, `overlap_check`)
+    map_graph            nodes, edges, and which segments (`segments`) form one map
+    map_solving          the job of the solver (`graph`), and what its solution changes
+    localisation_gate    is an agent's place known well enough to publish a correction?
+    corrections          which agents get one
+
+`atlas.Atlas` holds all of it. Redundant keyframes go by `culling` and `keyframe_removal`.
+
+To change:
+
+    the descriptor       `share.vision.orb`, `share.vision.matching`; `recognition.index` hashes its bits
+    the verification     `recognition.verification`; `MIN_INLIERS`
+    accepting loops      `loop_acceptance`; `merge.join_places`
+    the solver           `graph.optimiser` (Levenberg-Marquardt, robust kernel), `graph.solver` (incremental)
+    the merge gate       `share.scheduling.merge_gate`
+"""

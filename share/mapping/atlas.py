@@ -38,7 +38,6 @@ class Atlas:
 
     def __init__(self, config: MergeConfig, camera_views: Mapping[int, CameraView] | None = None) -> None:
         """camera_views: by node id; the caller keeps them up to date."""
-        self._config = config
         known_views: Mapping[int, CameraView] = {} if camera_views is None else camera_views
         self.graph = MapGraph()
         self.loop_acceptance = LoopAcceptance(config, self.graph, OverlapCheck(self.graph, known_views))
@@ -46,7 +45,7 @@ class Atlas:
         self._runs = AgentRuns()
         self.solving = MapSolving(self.graph, self.loop_acceptance, self._localisation_gate, self._runs)
         self.culling = KeyframeCulling(self.graph, self._runs)
-        self.quarantine = Quarantine(config.scale_tolerance, self.graph, self.loop_acceptance, known_views)
+        self.quarantine = Quarantine(self.graph, self.loop_acceptance, known_views)
 
     def __len__(self) -> int:
         return len(self.graph.poses)
@@ -134,7 +133,7 @@ class Atlas:
         link = reconnect(agent, keyframe, previous)
         if link.reference < 0:
             return keyframe, link
-        inflated = replace(link, cov=inflate_covariance(self._config, link.T_ref_body, link.cov))
+        inflated = replace(link, cov=inflate_covariance(link.T_ref_body, link.cov))
         return replace(keyframe, reference=link.reference, T_ref_body=link.T_ref_body, cov=link.cov), inflated
 
     def add_keyframe(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
@@ -144,7 +143,7 @@ class Atlas:
         equals the oldest, keeps its map's name and frame in a merge. Raises ValueError for a duplicate or an
         unknown reference.
         """
-        cov = inflate_covariance(self._config, keyframe.T_ref_body, keyframe.cov)
+        cov = inflate_covariance(keyframe.T_ref_body, keyframe.cov)
         node_id = self.graph.add_keyframe(agent, keyframe, cov, make_gravity_factor(keyframe), rank)
         self.quarantine.add_step(node_id, keyframe.T_ref_body, cov)
         self.graph.add_spans(node_id, keyframe)
@@ -165,7 +164,7 @@ class Atlas:
         for stored in kept.keyframes:
             key, sent, link = stored.keyframe_key, stored.keyframe, kept.links.get(stored.keyframe_key)
             T_ref_body = sent.T_ref_body if link is None else link.T_ref_body
-            cov = inflate_covariance(self._config, T_ref_body, sent.cov) if link is None else link.cov
+            cov = inflate_covariance(T_ref_body, sent.cov) if link is None else link.cov
             node_id = graph.odometry.append_node(
                 key, segments[stored.segment_name], sent.T_odom_body, stored.ordinal
             )

@@ -1,17 +1,52 @@
-"""Publishing of corrections: an agent is sent those that matter, and told once of one that is held back."""
+"""What the mapper tells of its agents: events with the corrections that follow. An agent is sent those that
+matter, and told once of one that is held back.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from share.event_kinds import EventKind
 from share.geometry import se3
 from share.mapping.map_solving import AppliedSolution
-from share.mapping.steps import MapEvent
-from share.types import Correction
+from share.types import F64, Correction
 
 # Changes below both are not noticeable.
 _MIN_SHIFT_M = 1e-3
 _MIN_ROTATION_RAD = float(np.radians(0.02))
+
+
+@dataclass(frozen=True, eq=False)
+class MapEvent:
+    """A decision with its reason, and the correction that follows, if any.
+
+    agent: the run concerned; None where the event concerns the map `map_id`, or the whole mapper.
+    """
+
+    agent: str | None
+    event: EventKind
+    reason: str
+    correction: Correction | None = None
+    map_id: str | None = None
+
+
+def map_assignment(
+    agent: str, map_id: str, T_map_odom: F64, about_id: int, cov: F64 | None = None
+) -> MapEvent:
+    """Event that assigns a run to a map. A map is named after its reference segment.
+
+    about_id: a keyframe of the run's segment. cov (6, 6): of T_map_odom; None where it is exact, since the
+    segment defines the map's frame.
+    """
+    verb = "starts" if map_id.startswith(f"{agent}/") else "is in"
+    return MapEvent(
+        agent,
+        "correction",
+        f"{verb} map {map_id}",
+        Correction(T_map_odom, np.zeros((6, 6)) if cov is None else cov, map_id, 0, about_id),
+    )
 
 
 class CorrectionPublisher:

@@ -18,7 +18,7 @@ from share.config import Config
 from share.errors import describe_exception
 from share.mapping.agents.quarantine import QuarantineChange
 from share.mapping.atlas import Atlas
-from share.mapping.corrections import CorrectionPublisher
+from share.mapping.corrections import CorrectionPublisher, MapEvent, map_assignment
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import MapChange, RemoveLoops, SaveLoop, SavePoses, StoredMap
@@ -33,13 +33,11 @@ from share.mapping.steps import (
     DescribeStep,
     Job,
     LookupStep,
-    MapEvent,
     QueryStep,
     SolveStep,
     Step,
     StepRunner,
     VerifyStep,
-    map_assignment,
 )
 from share.scheduling.merge_gate import MergeGate
 from share.types import Keyframe
@@ -63,6 +61,7 @@ class Mapper:
         self._lookup, self._solve = StepRunner(), StepRunner()
         self._changes: list[MapChange] = []
         self._empty_runs: list[KeyframeKey] = []
+        self._failures: list[MapEvent] = []
         self._counters = MapperCounters()
 
     # Runs
@@ -174,8 +173,8 @@ class Mapper:
             self._solve.start(self._solve_map(map_id))
             try:
                 return cast(SolveStep, self._solve.next_step())
-            except Exception:  # only this map stays unsolved
-                self._counters.failed_steps += 1
+            except Exception as error:  # only this map stays unsolved
+                self._failures += self.report_failure(SolveStep.kind, error, map_id=map_id)
         return None
 
     def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
@@ -184,14 +183,23 @@ class Mapper:
         try:
             return (self._solve if isinstance(step, SolveStep) else self._lookup).finish(result)
         except Exception as error:
-            agent = None if isinstance(step, SolveStep) else self.atlas.key(step.node_id).agent
-            return self.report_failure(step.kind, error, agent)
+            if isinstance(step, SolveStep):
+                return self.report_failure(step.kind, error, map_id=step.job.map_id)
+            return self.report_failure(step.kind, error, self.atlas.key(step.node_id).agent)
 
-    def report_failure(self, what: str, error: Exception, agent: str | None = None) -> list[MapEvent]:
-        """Count and report an error; the map goes on without the step. agent: the run concerned."""
+    def report_failure(
+        self, what: str, error: Exception, agent: str | None = None, map_id: str | None = None
+    ) -> list[MapEvent]:
+        """Count and report an error; the map goes on without the step. agent, map_id: concerned, if any."""
         self._counters.failed_steps += 1
-        agents = list(self._hellos)[:1] if agent is None else [agent]
-        return [MapEvent(run, "step failed", f"{what}: {describe_exception(error)}") for run in agents]
+        where = "" if map_id is None else f"map {map_id}: "
+        reason = f"{where}{what}: {describe_exception(error)}"
+        return [MapEvent(agent, "step failed", reason, map_id=map_id)]
+
+    def take_failures(self) -> list[MapEvent]:
+        """Return the failures since the last call that no other method has returned."""
+        failures, self._failures = self._failures, []
+        return failures
 
     # A keyframe's way through the map
 
@@ -247,9 +255,7 @@ class Mapper:
                 continue  # removed meanwhile
             try:
                 images = self._views.image(node_id), self._views.image(candidate)
-                outcome = yield VerifyStep(
-                    node_id, views[node_id], candidate, views[candidate], place, *images
-                )
+                outcome = yield VerifyStep(node_id, views[node_id], candidate, views[candidate], *images)
                 is_kept = {node_id, candidate} <= views.keys()
                 events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
             except Exception as error:  # costs this candidate only

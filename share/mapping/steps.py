@@ -6,15 +6,13 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from share.config import PlaceConfig
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.map_solving import SolveJob
 from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
 from share.mapping.recognition.patch_alignment import ImageView, align_from_map, align_verified
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
-from share.types import F64, Correction, View
+from share.types import F64, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +51,12 @@ class VerifyStep:
     query_view: CameraView
     candidate_id: int
     candidate_view: CameraView
-    config: PlaceConfig
     query_image: ImageView | None = None
     candidate_image: ImageView | None = None
     kind: str = "verify"
 
     def run(self) -> Verification | Refusal:
-        verified = verify(self.query_view, self.candidate_view, self.config)
+        verified = verify(self.query_view, self.candidate_view)
         if isinstance(verified, Refusal) or self.query_image is None or self.candidate_image is None:
             return verified
         return align_verified(verified, self.query_image, self.candidate_image)
@@ -128,30 +125,3 @@ class StepRunner:
             self._job.throw(result) if isinstance(result, Exception) else self._job.send(result)
         )
         return events
-
-
-@dataclass(frozen=True, eq=False)
-class MapEvent:
-    """A decision about an agent's run with its reason, and the correction that follows, if any."""
-
-    agent: str
-    event: str
-    reason: str
-    correction: Correction | None = None
-
-
-def map_assignment(
-    agent: str, map_id: str, T_map_odom: F64, about_id: int, cov: F64 | None = None
-) -> MapEvent:
-    """Event that assigns a run to a map. A map is named after its reference segment.
-
-    about_id: a keyframe of the run's segment. cov (6, 6): of T_map_odom; None where it is exact, since the
-    segment defines the map's frame.
-    """
-    verb = "starts" if map_id.startswith(f"{agent}/") else "is in"
-    return MapEvent(
-        agent,
-        "correction",
-        f"{verb} map {map_id}",
-        Correction(T_map_odom, np.zeros((6, 6)) if cov is None else cov, map_id, 0, about_id),
-    )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.errors import DataError
-from share.geometry.interpolation import MAX_GAP_NS, Trajectory, associate
+from share.geometry.interpolation import Trajectory, associate
 from share.geometry.se3 import inverse, rotation_angle
 from share.metrics.ate import ErrorStatistics, error_statistics
 from share.types import F64, I64
@@ -25,15 +25,13 @@ class Rpe:
     rotation: ErrorStatistics
 
 
-def rpe_frames(
-    estimate: Trajectory, truth: Trajectory, max_step_ns: int = 200_000_000, max_gap_ns: int = MAX_GAP_NS
-) -> Rpe:
+def rpe_frames(estimate: Trajectory, truth: Trajectory, max_step_ns: int = 200_000_000) -> Rpe:
     """Return the RPE from each frame to the next. Steps longer than `max_step_ns` (lost, no truth) are left
     out.
 
     Raises DataError if no pair is left.
     """
-    stamps, T_est, T_truth = associate(estimate, truth, max_gap_ns)
+    stamps, T_est, T_truth = associate(estimate, truth)
     i = np.flatnonzero(np.diff(stamps) <= max_step_ns)
     return _rpe(T_est, T_truth, i, i + 1, "between frames")
 
@@ -43,13 +41,12 @@ def rpe_time(
     truth: Trajectory,
     delta_ns: int = 1_000_000_000,
     tolerance_ns: int = 20_000_000,
-    max_gap_ns: int = MAX_GAP_NS,
 ) -> Rpe:
     """Return the RPE from each frame to the frame nearest to `delta_ns` later, within `tolerance_ns`.
 
     Raises DataError if no pair is left.
     """
-    stamps, T_est, T_truth = associate(estimate, truth, max_gap_ns)
+    stamps, T_est, T_truth = associate(estimate, truth)
     if len(stamps) == 0:
         raise DataError("RPE: no estimated pose has a truth at its time")
     j = _nearest(stamps, stamps + delta_ns)

@@ -1,0 +1,1 @@
+"""Links between agents and edge over ZeroMQ: sockets, guards, keys; UDP and NTP for clocks."""

@@ -8,18 +8,18 @@ names of the agents that may run on that machine can follow; without any, only t
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import socket
 import stat
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 from share.errors import UsageError
+from share.files.locks import folder_locked
 from share.files.reading import MAX_KEYS_BYTES, read_text
 from share.files.writing import atomic_write, write_errors, xdg_folder
 
@@ -130,7 +130,7 @@ def generate_pair(folder: Path, name: str | None = None) -> KeyPair:
         name or re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()).strip("-")[:64] or "share"
     )
     _make_folder(folder)
-    with _locked(folder):
+    with folder_locked(folder):
         if old := _secret_files(folder):
             raise UsageError(f"{old[0]}: there is a key pair already; give another folder with --keys")
         public, secret = b"-", b""
@@ -193,7 +193,7 @@ def authorize(folder: Path, name: str, public: str, agents: Sequence[str] = ()) 
     name, agents = _checked_name(name), [_checked_name(agent) for agent in agents]
     line = _format_line(name, public, agents)
     _make_folder(folder)
-    with _locked(folder):
+    with folder_locked(folder):  # one of two writers could undo the other's revocation
         names = dict(allow_list(folder).names_by_key())
         if names.get(public, name) != name:
             raise UsageError(f"'{name}': this key is authorized already, as '{names[public]}'")
@@ -210,7 +210,7 @@ def revoke(folder: Path, name: str) -> None:
     """Remove all keys of the machine `name`. Raises UsageError if there is none, or the list is damaged."""
     if not (folder / _LIST_FILE).exists():
         raise UsageError(f"'{name}' is not authorized; the list is empty")
-    with _locked(folder):
+    with folder_locked(folder):  # one of two writers could undo the other's revocation
         lines = _read_lines(folder / _LIST_FILE)
         keys = {line.key for line in lines if line.grant is not None and line.grant.name == name}
         if not keys:
@@ -329,16 +329,3 @@ def _write_secret(path: Path, text: str) -> None:
         except OSError:
             path.unlink()
             raise
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock `folder`: of two concurrent writers one could undo the other's revocation."""
-    import fcntl
-
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)

@@ -41,6 +41,7 @@ _MIN_VARIANCE = 1e-10  # rounding error of differences of covariances
 GATE = 12.0  # NIS above which a measurement is rejected (2 degrees of freedom: 99.8 %; 3: 99.3 %)
 CORRELATION_INFLATION = 16.0  # frames for which a correlated error lasts; chosen by NEES
 FloatArray = NDArray[np.floating[Any]]  # in double or in single precision
+_MAX_ITERATIONS = 4  # of the iterated update
 _STEP_TOLERANCE = 1e-4  # rad, m, 1/m: a smaller step does not change the derivatives
 
 
@@ -201,10 +202,7 @@ def nis(rows: FeatureMeasurements, S: FloatArray) -> F64:
 
 
 def relinearised_rows(
-    state: FilterState,
-    make_rows: Callable[[], FeatureMeasurements],
-    common_cov: F64 | None = None,
-    iterations: int = 4,
+    state: FilterState, make_rows: Callable[[], FeatureMeasurements], common_cov: F64 | None = None
 ) -> FeatureMeasurements:
     """Return measurements with derivatives at the state that they lead to: an iterated EKF (Bell & Cathey
     1993).
@@ -213,7 +211,7 @@ def relinearised_rows(
     predictions that are far off. The residuals are as `innovation_covariance` and `update` expect them.
     """
     before, error = state.means(), np.zeros(state.size)
-    for _ in range(iterations):
+    for _ in range(_MAX_ITERATIONS):
         rows = make_rows()
         rows.residual[:] += jacobian_product(state, rows, error)
         step = (
@@ -257,9 +255,9 @@ def apply_update(state: FilterState, residual: F64, HP: FloatArray, S: FloatArra
     return float(whitened @ whitened)
 
 
-def scalar_update(state: FilterState, residual: F64, H: F64, sigma: float, gate: float = np.inf) -> bool:
-    """Update with a few rows H (m, n) of any kind, each with `sigma`. Return False, and change nothing, if
-    the NIS exceeds `gate`."""
+def isotropic_update(state: FilterState, residual: F64, H: F64, sigma: float, gate: float = np.inf) -> bool:
+    """Update with a residual (m,), its Jacobian H (m, n) and independent noise of the same `sigma` in each.
+    Return False, and change nothing, if the NIS exceeds `gate`."""
     HP = H @ state.cov
     S = HP @ H.T + sigma**2 * np.eye(len(H))
     if residual @ np.linalg.solve(S, residual) > gate:
@@ -269,10 +267,10 @@ def scalar_update(state: FilterState, residual: F64, H: F64, sigma: float, gate:
 
 
 def zero_velocity_update(state: FilterState, sigma: float) -> bool:
-    """Update with a velocity of 0, sigma m/s. Return False if `GATE` rejects it, see `scalar_update`."""
+    """Update with a velocity of 0, sigma m/s. Return False if `GATE` rejects it, see `isotropic_update`."""
     H = np.zeros((3, state.size))
     H[:, POSE][:, :3], H[:, VELOCITY] = -se3.hat(state.v), np.eye(3)
-    return scalar_update(state, -state.v, H, sigma, GATE)
+    return isotropic_update(state, -state.v, H, sigma, GATE)
 
 
 def inflate(state: FilterState, sigma_rad: float, sigma_m: float, sigma_m_s: float) -> None:

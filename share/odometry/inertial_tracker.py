@@ -111,7 +111,7 @@ class InertialTracker:
         self.finish_keyframe()
         self._imu.buffer.add(frame.imu)
         if self._landmarks is None or self._last_frame is None:
-            result = self._initialise(frame)
+            result = self._begin_state(frame)
         else:
             result = self._track_frame(frame, self._last_frame, self._landmarks)
         self._last_frame, self._is_finished = frame, False
@@ -179,6 +179,73 @@ class InertialTracker:
             return None
         T_odom_body = self._imu.pose_at(self._landmarks.state, t_ns, imu or ImuBatch.empty())
         return self._realignment.published_pose(T_odom_body)
+
+    # A frame without a state: at the beginning, and after a loss
+
+    def _begin_state(self, frame: Frame) -> TrackResult:
+        """Try to begin the filter with this frame.
+
+        The first state is at odom's origin, z up. After a loss it is at the pose found by relocalisation;
+        only after NEW_SEGMENT_S without one it is at the origin again, in a new segment.
+        """
+        T_odom_cam = self._relocalise(frame)
+        if T_odom_cam is None and self._awaits_relocalisation(frame.stamp_ns):
+            return TrackResult(TrackState.LOST, None)
+        waiting_state = TrackState.INITIALISING if self._lost_ns is None else TrackState.LOST
+        state = self._first_state(frame.stamp_ns)
+        if state is None:
+            return TrackResult(waiting_state, None, waiting_for=WaitReason.IMU)
+        if T_odom_cam is not None:
+            state.T = T_odom_cam @ se3.inverse(self._rig.T_body_cam0)
+        landmarks = LandmarkMap(state, self._rig, self._config)
+        self._imu.restart(state)
+        self._keyframes.add_at_once(frame, landmarks, self._imu.rate)
+        if len(state.feature_ids) < WEAK:
+            return TrackResult(waiting_state, None, waiting_for=WaitReason.VIEW)
+        self._adopt_state(landmarks, new_segment=T_odom_cam is None)
+        if self._mono_window is not None or not self._is_publishable(state):
+            return self._waiting_result(state)
+        return self._publish(frame, landmarks, TrackState.OK, True, len(state.feature_ids))
+
+    def _relocalise(self, frame: Frame) -> F64 | None:
+        """Return T_odom_cam (4, 4) of a LOST frame by its ORB features; None if it is not found."""
+        if self._lost_ns is None or not self._local_map.keyframes:
+            return None
+        batch = self._round_robin.next_batch(sorted(self._local_map.keyframes, reverse=True))
+        keyframes = [self._local_map.keyframes[n] for n in batch]
+        view_features = self._tracker_config.view_features
+        return relocalisation.relocalise(keyframes, frame, self._rig, view_features)
+
+    def _awaits_relocalisation(self, stamp_ns: int) -> bool:
+        """Return whether the loss is so recent that no new segment begins yet."""
+        if self._lost_ns is None:
+            return False
+        return 0 < stamp_ns - self._lost_ns < relocalisation.NEW_SEGMENT_S * 1e9
+
+    def _first_state(self, stamp_ns: int) -> FilterState | None:
+        """Return a state at odom's origin, z up: by the IMU, or after frames without a sample by the camera
+        alone; None while samples may still come."""
+        samples = self._imu.buffer.samples
+        state = initialisation.state_from_imu(stamp_ns, samples, self._rig, self._config, self._bias)
+        self._knows_up = state is not None
+        if state is not None:
+            return state
+        self._imu_wait_frames += 1
+        if self._imu_wait_frames < _MAX_IMU_WAIT_FRAMES:
+            return None
+        return initialisation.state_from_camera(stamp_ns, self._rig, self._bias)
+
+    def _adopt_state(self, landmarks: LandmarkMap, new_segment: bool) -> None:
+        """Track from this state on. Its pose is published once it has converged."""
+        s = landmarks.state
+        self._landmarks, self._has_published, self._lost_ns = landmarks, False, None
+        self._start_ns, self._start_position = s.stamp_ns, s.T[:3, 3].copy()  # by the IMU's clock
+        self._mono_window = start_mono_window(s, self._rig.cam0, self._imu.noise, self._config)
+        self._new_segment = new_segment
+        if new_segment:
+            self._local_map = LocalMap()
+
+    # A frame with a state
 
     def _track_frame(self, frame: Frame, last_frame: Frame, landmarks: LandmarkMap) -> TrackResult:
         s, T_before, interval_ns = landmarks.state, landmarks.state.T, frame.stamp_ns - last_frame.stamp_ns
@@ -294,40 +361,6 @@ class InertialTracker:
         T_odom_body = se3.exp(-twist(s, self._imu.rate) * s.timeshift_s) @ s.T
         return self._realignment.published_pose(T_odom_body)
 
-    def _initialise(self, frame: Frame) -> TrackResult:
-        """Start at odom's origin, z up. After a loss, at the relocalised pose; after `new_stretch_s`, in a
-        new segment."""
-        T_found = self._relocalise(frame)
-        waiting_state = TrackState.INITIALISING if self._lost_ns is None else TrackState.LOST
-        lost_for_ns = 0 if self._lost_ns is None else frame.stamp_ns - self._lost_ns
-        if T_found is None and 0 < lost_for_ns < self._tracker_config.new_stretch_s * 1e9:
-            return TrackResult(waiting_state, None)
-        samples = self._imu.buffer.samples
-        state = initialisation.state_from_imu(frame.stamp_ns, samples, self._rig, self._config, self._bias)
-        self._imu_wait_frames += state is None
-        self._knows_up = state is not None
-        if state is None and self._imu_wait_frames >= _MAX_IMU_WAIT_FRAMES:
-            state = initialisation.state_from_camera(frame.stamp_ns, self._rig, self._bias)
-        if state is None:
-            return TrackResult(waiting_state, None, waiting_for=WaitReason.IMU)
-        if T_found is not None:
-            state.T = T_found @ se3.inverse(self._rig.T_body_cam0)
-        landmarks = LandmarkMap(state, self._rig, self._config)
-        self._imu.restart(state)
-        self._keyframes.add_at_once(frame, landmarks, self._imu.rate)
-        if len(state.feature_ids) < WEAK:
-            return TrackResult(waiting_state, None, waiting_for=WaitReason.VIEW)
-        self._landmarks, self._has_published = landmarks, False
-        self._start_ns, self._start_position = state.stamp_ns, state.T[:3, 3].copy()  # by the IMU's clock
-        self._mono_window = start_mono_window(state, self._rig.cam0, self._imu.noise, self._config)
-        self._new_segment = T_found is None
-        if T_found is None:
-            self._local_map = LocalMap()
-        self._lost_ns = None
-        if self._mono_window is not None or not self._is_publishable(state):
-            return self._waiting_result(state)
-        return self._publish(frame, landmarks, TrackState.OK, True, len(state.feature_ids))
-
     def _declare_lost(self, frame: Frame) -> TrackResult:
         """Discard the filter."""
         self._landmarks, self._divergence = None, DivergenceMonitor()
@@ -336,12 +369,3 @@ class InertialTracker:
             return TrackResult(TrackState.INITIALISING, None, waiting_for=WaitReason.SCALE)
         self._has_published, self._lost_ns = False, frame.stamp_ns
         return TrackResult(TrackState.LOST, None)
-
-    def _relocalise(self, frame: Frame) -> F64 | None:
-        """Return T_odom_cam (4, 4) of a LOST frame by its ORB features; None if it is not found."""
-        if self._lost_ns is None or not self._local_map.keyframes:
-            return None
-        batch = self._round_robin.next_batch(sorted(self._local_map.keyframes, reverse=True))
-        keyframes = [self._local_map.keyframes[n] for n in batch]
-        view_features = self._tracker_config.view_features
-        return relocalisation.relocalise(keyframes, frame, self._rig, view_features)

@@ -116,13 +116,13 @@ def _update_with_force(state: FilterState, force: F64, sigma: float, g: float) -
     Rt = state.T[:3, :3].T
     H = np.zeros((3, state.size))
     H[:, POSE][:, :3], H[:, ACCEL_BIAS] = Rt @ se3.hat(z), np.eye(3)
-    filter.scalar_update(state, force - Rt @ z - state.ba, H, sigma)
+    filter.isotropic_update(state, force - Rt @ z - state.ba, H, sigma)
 
 
 def _update_with_rate(state: FilterState, rate: F64) -> None:
     H = np.zeros((3, state.size))
     H[:, GYRO_BIAS] = np.eye(3)
-    filter.scalar_update(state, rate - state.bg, H, _STILL_RATE_SIGMA)
+    filter.isotropic_update(state, rate - state.bg, H, _STILL_RATE_SIGMA)
 
 
 # Convergence: when the state suffices for a first pose, and its biases are worth storing.

@@ -132,4 +132,4 @@ def _fix_gauge(state: FilterState) -> None:
     H = np.zeros((3, state.size))
     H[0, 0] = H[1, 1] = 1
     H[2, state.features_start :] = 1 / len(state.feature_ids)
-    filter.scalar_update(state, np.zeros(3), H, _GAUGE_SIGMA)
+    filter.isotropic_update(state, np.zeros(3), H, _GAUGE_SIGMA)

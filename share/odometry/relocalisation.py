@@ -21,6 +21,7 @@ from share.vision.orb import detect_orb, image_view
 RANSAC_PX = 3.0  # reprojection error of a RANSAC inlier
 NOISE_PX = 1.0  # standard deviation of a point's position in an image
 GATE_SIGMA = 3.0  # a measurement further off is an outlier
+NEW_SEGMENT_S = 3.0  # LOST for this long: odometry starts a new segment
 MIN_INLIERS = 15  # points that agree with a pose; with fewer there is none
 
 
@@ -96,6 +97,7 @@ def reprojection_residuals(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F6
     return (projected - uv) * scale[:, None], J
 
 
+_BORDER_PX = 12.0  # of an image, in which no point is expected to be found
 MAX_KEYFRAMES = 60  # of the local map; a full one drops the keyframe closest to another
 
 
@@ -162,13 +164,11 @@ class LocalMap:
         is_known = self.ids[row] == ids if len(self.ids) else np.zeros(len(ids), bool)
         return np.where(is_known, row, -1)
 
-    def visible_points(
-        self, T_cam_odom: F64, camera: Camera, anchors: list[int], border: float = 12.0
-    ) -> tuple[I64, F32]:
+    def visible_points(self, T_cam_odom: F64, camera: Camera, anchors: list[int]) -> tuple[I64, F32]:
         """Return rows and predicted px of the points of `anchors` in the camera's view."""
         rows = np.flatnonzero(np.isin(self.anchors, anchors))
         px = camera.project(se3.transform(T_cam_odom, self.points[rows]))
-        inside = camera.is_inside(np.nan_to_num(px, nan=-1e6), border)
+        inside = camera.is_inside(np.nan_to_num(px, nan=-1e6), _BORDER_PX)
         return rows[inside], px[inside].astype(np.float32)
 
     def keyframes_near(self, T_odom_cam: F64, max_m: float, max_rad: float) -> list[int]:

@@ -319,7 +319,7 @@ class VisualTracker:
         self._round_robin.reset()
 
     def _relocalise(self, frame: Frame) -> TrackResult:
-        """Relocalise in the local map; after `new_stretch_s`, begin a new segment at the last pose."""
+        """Relocalise in the local map; after NEW_SEGMENT_S, begin a new segment at the last pose."""
         assert self._lost_since_ns is not None
         config, keyframes = self._config, self._next_keyframes()
         T_found = relocalisation.relocalise(keyframes, frame, self._rig, config.view_features)
@@ -327,7 +327,7 @@ class VisualTracker:
         if T_found is not None:
             self._T_odom_cam, self._tracks = T_found, _NO_TRACKS
             self._reobserve(frame)
-        elif waited_s < config.new_stretch_s:
+        elif waited_s < relocalisation.NEW_SEGMENT_S:
             return TrackResult(TrackState.LOST, None)
         old_map = self.local_map
         if T_found is None:

@@ -17,10 +17,10 @@ from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, KeyframeScore, LedgerEntry
 from share.protocol.agent_status import StatusReporter
 from share.protocol.edge_clock import ClockEstimate, PingTracker
+from share.protocol.edge_sessions import EdgeSessions
 from share.protocol.localisation import MapLocalisation, SelfEvaluation, pose_update
-from share.protocol.reply_validation import EdgeSessions, LineLimiter
 from share.protocol.versions import EdgeVersionProbe
-from share.timing import PeriodicTimer, TokenBucket, seconds_to_ns
+from share.timing import LineLimiter, PeriodicTimer, TokenBucket, seconds_to_ns
 from share.types import F64, Correction, Keyframe, KeyframeCandidate
 from share.wire import messages as m
 from share.wire.codec import Bytes, decode, encode, message_bytes
@@ -248,7 +248,7 @@ class Agent:
     def _report_invalid(self, text: str) -> None:
         """Count a message that no edge should send, and print it if new."""
         self._counts["bad_messages"] += 1
-        if (line := self._line_limiter.admit_once(text, self._now_ns)) is not None:
+        if (line := self._line_limiter.admit_new(text, self._now_ns)) is not None:
             self._effects.append(ev.PrintLine(line))
 
     def _is_of_sent(self, message_name: str, *keyframes: int) -> bool:

@@ -14,8 +14,9 @@ from typing import Any, ClassVar
 from share import __version__
 from share.config import Config
 from share.errors import VersionError, WireError, describe_exception
+from share.event_kinds import EventKind
+from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import MapChange, RemoveRun, SaveCredential, SaveKeyframe, SaveRun
-from share.mapping.steps import MapEvent
 from share.plain_data import to_mapping
 from share.protocol import edge_events as ed
 from share.protocol.admission import Admission, RunRegistry, name_objection, new_run_key
@@ -51,14 +52,12 @@ class Edge:
         began_ns: int | None = None,
     ) -> None:
         self._config, self._session = config, session
-        self._registry = RunRegistry()
-        self._unjoined = Sender()
+        self._registry, self._unjoined = RunRegistry(), Sender()
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
         self._admission = Admission(config.edge, self.tracks_agents)
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
         self._event_log, self._version_throttle = EventLog(began_ns), Throttle(_VERSION_REFUSAL_HZ, 1.0)
-        self._durability = DurabilityTracker(has_store)
-        self._internal_errors = 0
+        self._durability, self._internal_errors = DurabilityTracker(has_store), 0
         self._effects: list[ed.EdgeEffect] = []
         self._now_ns = 0  # of the event that is being handled
         for run in restored:
@@ -260,7 +259,7 @@ class Edge:
             if not peer.is_gone and self._now_ns - peer.last_received_ns > seconds_to_ns(limit_s):
                 self._mark_gone(peer, "silent", f"no message for {limit_s:g} s")
 
-    def _mark_gone(self, peer: Peer, event: str, reason: str) -> None:
+    def _mark_gone(self, peer: Peer, event: EventKind, reason: str) -> None:
         peer.is_gone = True
         peer.reorder_buffer.clear()
         self._effects.append(ed.SetPresence(peer.key, False))
@@ -334,14 +333,16 @@ class Edge:
 
     def _on_finding(self, finding: MapEvent) -> None:
         """Record a decision of the mapper, and send its correction if there is one."""
-        if (peer := self._registry.by_key.get(finding.agent)) is None:  # forgotten in the meantime
-            return
-        if finding.correction is None:
+        if finding.agent is None:
+            self._record(finding.event, None, finding.reason, map_id=finding.map_id)
+        elif (peer := self._registry.by_key.get(finding.agent)) is None:
+            return  # forgotten in the meantime
+        elif finding.correction is None:
             self._record(finding.event, peer, finding.reason, finding.event == "step failed")
-            return
-        peer.last_finding = finding
-        if not peer.is_gone and peer.is_welcomed:  # else the agent counts it to the earlier session
-            self._send_correction(peer, finding)
+        else:
+            peer.last_finding = finding
+            if not peer.is_gone and peer.is_welcomed:  # else the agent counts it to the earlier session
+                self._send_correction(peer, finding)
 
     def _send_correction(self, peer: Peer, finding: MapEvent, is_repeat: bool = False) -> None:
         """Send a correction. is_repeat: sent again at the agent's request, so its record is throttled."""
@@ -361,7 +362,7 @@ class Edge:
         self._effects.append(ed.SendToPeer(peer_id, frames))
 
     def _record(
-        self, event: str, peer: Peer | None, reason: str, throttled: bool = True, **fields: Any
+        self, event: EventKind, peer: Peer | None, reason: str, throttled: bool = True, **fields: Any
     ) -> None:
         """Record an event. throttled: unless it is repeated too often, as a peer could cause it."""
         make = self._event_log.throttled_event if throttled else self._event_log.event

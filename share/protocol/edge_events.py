@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from share.geometry.camera import Rig
+from share.mapping.corrections import MapEvent
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange
-from share.mapping.steps import MapEvent
 from share.types import Frame, Keyframe
 from share.wire import messages as wire
 from share.wire.codec import Bytes

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+from share.event_kinds import EventKind
 from share.mapping.map_changes import MapChange
 from share.protocol.edge_events import SaveChanges, WriteEvent
 from share.protocol.peer import Peer
@@ -32,18 +33,21 @@ class EventLog:
         assert self._began_ns is not None
         return round((now_ns - self._began_ns) * 1e-9, 6)
 
-    def event(self, now_ns: int, kind: str, agent: str | None, reason: str, **fields: Any) -> WriteEvent:
+    def event(
+        self, now_ns: int, kind: EventKind, agent: str | None, reason: str, **fields: Any
+    ) -> WriteEvent:
         head = {"t_s": self.elapsed_s(now_ns), "event": kind, "agent": agent, "reason": reason}
         return WriteEvent(head | fields)
 
     def throttled_event(
-        self, now_ns: int, kind: str, agent: str | None, reason: str, **fields: Any
+        self, now_ns: int, kind: EventKind, agent: str | None, reason: str, **fields: Any
     ) -> WriteEvent | None:
-        """Return the event, or None beyond the limits of its kind and agent; the next one counts those left
-        out."""
-        suppressed = self._throttle.admit((kind, agent), now_ns)
+        """Return the event, or None beyond the limits of its kind and agent, or map where it concerns no
+        agent; the next one counts those left out."""
+        key = kind, agent, fields.get("map_id") if agent is None else None
+        suppressed = self._throttle.admit(key, now_ns)
         if suppressed is not None:
-            suppressed = self._sustained.admit((kind, agent), now_ns, suppressed)
+            suppressed = self._sustained.admit(key, now_ns, suppressed)
         if suppressed is None:
             return None
         more = f" (and {suppressed} more since the last line)" if suppressed else ""

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from share.geometry import se3
+from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import StoredMap, map_poses
-from share.mapping.steps import MapEvent, map_assignment
 from share.protocol.keyframe_intake import OdometryBase, ReorderBuffer
 from share.timing import SECOND_NS, seconds_to_ns
 from share.types import TrackState

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from share.event_kinds import EventKind
 from share.geometry import rig_check
 from share.geometry.camera import Rig
 from share.protocol import edge_events as ed
@@ -210,7 +211,7 @@ class TrackingEdge(Edge):
         super()._readmit(peer)
         self._effects.extend(self._trackers[peer.key].start())
 
-    def _mark_gone(self, peer: Peer, event: str, reason: str) -> None:
+    def _mark_gone(self, peer: Peer, event: EventKind, reason: str) -> None:
         super()._mark_gone(peer, event, reason)
         self._effects.extend(self._trackers[peer.key].stop())
 

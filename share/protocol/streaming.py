@@ -16,6 +16,8 @@ from share.types import Frame, ImuBatch
 from share.wire.codec import encode, message_bytes
 from share.wire.messages import MAX_IMU_SAMPLES, Hello, Message, RemoteTrackingResult
 
+PATIENCE_S = 1.0  # a frame without an answer for this long counts as unanswered
+
 
 @dataclass(frozen=True, eq=False)
 class InFlightFrame:
@@ -94,7 +96,7 @@ class FrameStreamer:
     """Frames up, poses down. A frame without an answer was not tracked."""
 
     def __init__(self, config: StreamConfig) -> None:
-        self._timeout_ns = seconds_to_ns(config.patience_s)
+        self._timeout_ns = seconds_to_ns(PATIENCE_S)
         self._window = FrameWindow(config.window)
         self._counts: Counter[str] = Counter()
         self._segment_broken = False  # the next pose starts a segment

@@ -1,0 +1,4 @@
+"""Readers of recordings and sessions, calibration files, trajectories.
+
+A new reader subclasses `recording.Recording`.
+"""

@@ -72,6 +72,8 @@ def is_session(folder: Path) -> bool:
 def read_session(folder: Path) -> Session:
     """Read a session. Raises ConfigError that names a wrong key, UsageError if it is not a session."""
     if not is_session(folder):
+        if is_session(folder.parent):
+            raise UsageError(f"{folder}: is one agent of a session; give the session: {folder.parent}")
         what = f"has no {SESSION_FILE}" if folder.is_dir() else "there is no such folder"
         raise UsageError(f"{folder}: {what}; give a session made by `share emulate` or `share dataset align`")
     top = read_yaml(folder / SESSION_FILE)

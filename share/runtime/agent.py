@@ -32,7 +32,6 @@ from share.net.transport import AgentLink
 from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
-from share.protocol.reply_validation import FaultDeduplicator
 from share.protocol.streaming import StreamingAgent
 from share.runtime.arrivals import (
     FrameArrivals,
@@ -51,6 +50,7 @@ from share.runtime.run_files import AgentFiles, BackgroundLines
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
 from share.startup import HeapTrimmer
+from share.timing import LineLimiter
 from share.types import Frame
 from share.wire import messages as m
 
@@ -128,7 +128,7 @@ class AgentRun:
         self._messages_in_tick = 0
         self._finished_ns: int | None = None  # when the input ended
         self.report: dict[str, Any] = {}
-        self._troubles = FaultDeduplicator()
+        self._trouble_lines = LineLimiter()
         self.trouble: str | None = None  # why the edge refuses this agent
 
     def stop(self) -> None:
@@ -243,8 +243,10 @@ class AgentRun:
 
     def _notify_trouble(self) -> None:
         self.trouble = self._link.trouble()
-        if self.trouble is not None and self._troubles.is_new(self.trouble, time.monotonic_ns()):
-            self._notify(self.trouble)
+        if self.trouble is not None:
+            line = self._trouble_lines.admit_new(self.trouble, time.monotonic_ns())
+            if line is not None:
+                self._notify(line)
 
     def _handle(self, event: ev.AgentEvent) -> None:
         """Handle one event. A failure costs this event, not the run."""

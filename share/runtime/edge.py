@@ -21,6 +21,7 @@ from typing import Any
 
 from share.config import Config
 from share.errors import StoreError
+from share.event_kinds import EventKind
 from share.mapping.map_changes import StoredMap
 from share.net.transport import EdgeLink
 from share.protocol.edge import Edge
@@ -73,7 +74,7 @@ _DRAIN_S = 0.5  # that the loop waits for the map writer of a session that is ov
 class _Notice:
     """A line for the event log, from another thread."""
 
-    event: str
+    event: EventKind
     text: str
 
 
@@ -124,7 +125,7 @@ class EdgeRun:
         self._start_ns = time.monotonic_ns()
         self._refused_handshakes: Counter[str] = Counter()  # by refusal line
         self._troubles = _RecentTroubles()
-        self._agent_troubles = _RecentTroubles()  # of one agent, not of the edge
+        self._other_troubles = _RecentTroubles()  # of one agent or map, not of the edge
         self._report: dict[str, Any] = {}
         self._report_due_s = self._reported_s = 0.0  # next and last report, monotonic s
         self._heap = HeapTrimmer()
@@ -195,7 +196,7 @@ class EdgeRun:
         report = self._totals.with_totals(self._state_machine.report(self._progress.report))
         self._report = {
             **report,
-            "refused": [*self._agent_troubles.current(), *report["refused"]],
+            "refused": [*self._other_troubles.current(), *report["refused"]],
             "refused_handshakes": self._refused_handshakes.total(),
             "trouble": [*self._troubles.current(), *filter(None, current)],
             "uptime_s": round((time.monotonic_ns() - self._start_ns) * 1e-9, 3),
@@ -270,7 +271,7 @@ class EdgeRun:
                     self._handle(answer)
                 case TrackerLost() as tracker if not self._stopping:
                     text = f"agent's run {tracker.key}: its tracker {tracker.reason}"
-                    self._agent_troubles.add(text)
+                    self._other_troubles.add(text)
                     self._handle(tracker)
                 case MapperReport() as report:
                     self._progress.record(report)
@@ -330,6 +331,8 @@ class EdgeRun:
                 self._map_writer.submit(effect)
             case WriteEvent():
                 self._record(effect.fields)
+                if effect.fields["event"] == "step failed" and effect.fields["agent"] is None:
+                    self._other_troubles.add(effect.fields["reason"])
 
     # ------------------------------------------------------------------ from other threads
 
@@ -349,7 +352,7 @@ class EdgeRun:
         self._files.write_event(fields)
         self._on_record(fields)
 
-    def _log_event(self, event: str, reason: str) -> None:
+    def _log_event(self, event: EventKind, reason: str) -> None:
         t_s = round((time.monotonic_ns() - self._start_ns) * 1e-9, 6)
         self._record({"t_s": t_s, "event": event, "agent": None, "reason": reason})
 

@@ -13,8 +13,8 @@ import numpy as np
 from share.metrics.frame_log import summary
 from share.metrics.local_error import LocalError
 from share.odometry.error_model.history import FrameOutcome, MotionHistory, RecentMotion
-from share.odometry.error_model.inference import ErrorEstimate, OnnxSession, estimate_error
 from share.odometry.error_model.inputs import error_model_input
+from share.odometry.error_model.network import ErrorEstimate, OnnxSession, estimate_error
 from share.odometry.track_result import TrackResult
 from share.timing import RingBuffer
 from share.types import U8, FeatureStatistics, Frame, KeyframeCandidate

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,24 +11,26 @@ from functools import partial
 from typing import TypeVar
 
 from share.config import Config
-from share.errors import ShareError, printable
+from share.errors import ShareError
 from share.geometry.camera import ImuBias, Rig
 from share.odometry.track_result import TrackResult
 from share.runtime.pipeline import make_tracker
+from share.timing import LineLimiter
 from share.types import FeatureStatistics, Frame, KeyframeCandidate, TrackState
 
-_MAX_FAILURE_KINDS = 16  # that are reported; more are only counted
+_MAX_TEXT = 160  # characters of an error
 
 T = TypeVar("T")
 
 
 class FaultGuard:
-    """Counts failed steps and reports each kind once, with its place in the code."""
+    """Counts failed steps and reports each kind with its place in the code, where it is new. Safe from any
+    thread."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self.failure_count = 0
         self._notify = notify
-        self._reported: set[str] = set()
+        self._lines, self._lock = LineLimiter(), threading.Lock()
 
     @contextmanager
     def step(self, what: str) -> Iterator[None]:
@@ -42,16 +46,17 @@ class FaultGuard:
             self.record(what, error)
 
     def record(self, what: str, error: Exception) -> None:
-        self.failure_count += 1
         frame_summary = traceback.extract_tb(error.__traceback__)[-1]
         kind = (
             f"{what}: {type(error).__name__} at "
             f"{frame_summary.filename.rpartition('/')[2]}:{frame_summary.lineno}"
         )
-        if kind not in self._reported and len(self._reported) < _MAX_FAILURE_KINDS:
-            self._reported.add(kind)
-            text = printable(str(error))[:200]
-            self._notify(f"{kind}: {text}; this step is skipped and the run goes on")
+        text = f"{kind}: {str(error)[:_MAX_TEXT]}; this step is skipped and the run goes on"
+        with self._lock:
+            self.failure_count += 1
+            line = self._lines.admit_new(text, time.monotonic_ns(), kind)
+        if line is not None:
+            self._notify(line)
 
 
 class GuardedTracker:
@@ -85,12 +90,22 @@ class GuardedTracker:
             self._recover(frame)
             return None
 
-    def finish(self, frame: Frame, is_keyframe: bool) -> None:
-        """Finish the frame just tracked where its keyframe data are not sent. is_keyframe: make it a
-        keyframe."""
+    def finish(
+        self,
+        frame: Frame,
+        is_keyframe: bool,
+        make_keyframe: Callable[[Frame, GuardedTracker], KeyframeCandidate] | None = None,
+    ) -> KeyframeCandidate | None:
+        """Finish the frame just tracked where its keyframe is not sent before. is_keyframe: make it a
+        keyframe, by `make_keyframe` where one is given."""
+        candidate = None
         if is_keyframe:
-            self.attempt("making a keyframe", frame, partial(self.make_keyframe, frame))
+            step = (
+                partial(make_keyframe, frame, self) if make_keyframe else partial(self.make_keyframe, frame)
+            )
+            candidate = self.attempt("making a keyframe", frame, step)
         self.attempt("finishing a keyframe", frame, self._tracker.finish_keyframe)
+        return candidate
 
     def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
         """Call within `attempt`, like `finish_keyframe` and `feature_statistics`."""

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
-from share.config import Config, GraphConfig
+from share.config import Config
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.map_changes import StoredMap
 from share.mapping.mapper import Mapper
-from share.mapping.steps import MapEvent, SolveStep
+from share.mapping.steps import SolveStep
 from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, MapperResult, SetCredential, SetPresence
 from share.protocol.keyframe_intake import FairQueue
 from share.runtime.worker_process import END, Inbox, WorkerProcess
@@ -165,6 +166,7 @@ class _MapperProcess:
 
     def _send_to_solver(self) -> None:
         step = self._guarded("solve", self._mapper.next_solve, None)
+        self._findings += self._mapper.take_failures()
         if step is not None:
             self._running_solve, self._solve_start_s = step, time.monotonic()
             self._solver.send(step)
@@ -176,10 +178,7 @@ class _MapperProcess:
             self._findings += self._mapper.finish_step(step, result, ms)
 
     def _new_solver(self, start_delay_s: float) -> WorkerProcess:
-        arguments = (self._settings.graph,)
-        return WorkerProcess(
-            "solver", run_solver, arguments, self._inbox.put, self._post_solver_died, start_delay_s
-        )
+        return WorkerProcess("solver", run_solver, (), self._inbox.put, self._post_solver_died, start_delay_s)
 
     def _post_solver_died(self, reason: str) -> None:
         """Called from another thread."""
@@ -210,9 +209,9 @@ class _MapperProcess:
             self._heap.trim_if_due(time.monotonic())
 
 
-def run_solver(inbox: Inbox, answer: Callable[[Any], None], settings: GraphConfig) -> None:
+def run_solver(inbox: Inbox, answer: Callable[[Any], None]) -> None:
     """Work of a `WorkerProcess`: takes a SolveStep, answers its _SolveResult, until END."""
-    solver, heap = PoseGraphSolver(settings), HeapTrimmer()
+    solver, heap = PoseGraphSolver(), HeapTrimmer()
     while (step := inbox.get()) is not END:
         answer(_SolveResult(*_run_timed(partial(step.run, solver))))
         heap.trim_if_due(time.monotonic())

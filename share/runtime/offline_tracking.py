@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from share import __version__, config
-from share.errors import DataError
-from share.metrics.ate import Ate, ate
 from share.metrics.frame_log import ReplayQueue, RunLog
 from share.odometry.track_result import TrackResult
 from share.plain_data import to_mapping
 from share.recordings.trajectory import Trajectory
+from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
 from share.runtime.imu_bias_store import ImuBiasStore
 from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
+from share.types import Frame, KeyframeCandidate
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +30,37 @@ class TrackingOutput:
 
     trajectory: Trajectory
     report: dict[str, Any]
+
+
+class OfflineFrame(NamedTuple):
+    """A frame with all work on it done. `error_cm`: its estimated error, `candidate`: its keyframe, if any.
+
+    `track_s` and `total_s`: time until the pose was there, and until the end; `cpu_s`: CPU time of the
+    process.
+    """
+
+    frame: Frame
+    result: TrackResult
+    error_cm: float | None
+    candidate: KeyframeCandidate | None
+    track_s: float
+    total_s: float
+    cpu_s: float
+
+
+def track_frames(
+    frames: Iterable[Frame], tracker: GuardedTracker, error_estimator: ErrorEstimator | None = None
+) -> Iterator[OfflineFrame]:
+    """Track all frames in turn, where nothing waits for a pose. Decoding does not count in the times."""
+    estimator = error_estimator or NoErrorEstimate()
+    for frame in frames:
+        start_s, cpu_start_s = time.perf_counter(), time.process_time()
+        result = tracker.track(frame)
+        track_s = time.perf_counter() - start_s
+        error_cm = estimator.update(frame, result)
+        candidate = tracker.finish(frame, result.keyframe_ready, estimator.make_keyframe)
+        total_s, cpu_s = time.perf_counter() - start_s, time.process_time() - cpu_start_s
+        yield OfflineFrame(frame, result, error_cm, candidate, track_s, total_s, cpu_s)
 
 
 def track(
@@ -45,18 +76,16 @@ def track(
     tracker = GuardedTracker(source.rig, settings, guard, bias_store.bias)
     log, counters, queue = RunLog(), SequencerCounters(), ReplayQueue()
     stamps, poses = [], []
-    for frame in read_frames(source, settings, counters, on_decoded=log.add_decode_time, notify=notify):
-        start_s, cpu = time.perf_counter(), time.process_time()
-        result = tracker.track(frame)
-        waited_ms = queue.wait_ms(frame.stamp_ns)
-        track_ms = waited_ms + 1e3 * (time.perf_counter() - start_s)
+    frames = read_frames(source, settings, counters, on_decoded=log.add_decode_time, notify=notify)
+    for step in track_frames(frames, tracker):
+        stamp_ns, result = step.frame.stamp_ns, step.result
+        waited_ms = queue.wait_ms(stamp_ns)
+        queue.finish_frame(stamp_ns, waited_ms + 1e3 * step.total_s)
         log.add_result(result.new_segment, result.is_consistent, result.waiting_for)
-        tracker.finish(frame, result.keyframe_ready)
-        queue.finish_frame(frame.stamp_ns, waited_ms + 1e3 * (time.perf_counter() - start_s))
-        log.cpu_s += time.process_time() - cpu
-        log.add(frame.stamp_ns, track_ms, result.state, result.keyframe_ready)
+        log.cpu_s += step.cpu_s
+        log.add(stamp_ns, waited_ms + 1e3 * step.track_s, result.state, result.keyframe_ready)
         if result.T_odom_body is not None:
-            stamps.append(frame.stamp_ns)
+            stamps.append(stamp_ns)
             poses.append(result.T_odom_body)
         on_result(result)
     bias_store.save(tracker.bias)
@@ -78,13 +107,3 @@ def offline_report(log: RunLog, counters: SequencerCounters, settings: config.Co
         "version": __version__,
         "config": to_mapping(settings),
     }
-
-
-def trajectory_accuracy(run: TrackingOutput, truth: Trajectory | None) -> Ate | None:
-    """Return the ATE against the recording's ground truth (SE3 alignment); None without enough truth."""
-    if truth is None:
-        return None
-    try:
-        return ate(run.trajectory, truth)
-    except DataError:  # too few poses have ground truth at their time
-        return None

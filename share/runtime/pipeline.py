@@ -149,12 +149,6 @@ class _SkippedFrames:
             raise self._misfits[0]
 
 
-def make_source_tracker(source: Source, config: Config) -> VisualTracker | InertialTracker:
-    """Return a tracker for the source's rig. Raises UsageError if none fits."""
-    check_trackable(source.name, source.rig)
-    return make_tracker(source.rig, config)
-
-
 def check_trackable(name: str, rig: Rig) -> None:
     """Raises UsageError if no tracker fits the rig of the source `name`."""
     if (objection := rig_check.rig_problem(rig)) is not None:

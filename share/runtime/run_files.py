@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from share.files.line_file import LineFile, Spool
-from share.files.writing import atomic_write, check_replaceable, lock_folder
+from share.files.locks import lock_folder
+from share.files.writing import atomic_write, check_replaceable
 from share.metrics.frame_log import LineStore, RunLog
 from share.recordings.trajectory import format_pose
 from share.runtime.output_writer import OutputWriter

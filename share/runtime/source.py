@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -83,8 +84,21 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
     if is_session(path):
         agents = ", ".join(str(path / name) for name in read_session(path).agents)
         raise UsageError(f"{spec}: is a session; name one of its agents: {agents}")
+    if path.suffix == ".bag" or (path / "metadata.yaml").is_file():
+        raise UsageError(f"{spec}: is a ROS bag; {_bag_advice(path)}")
     known = "; ".join(reader.description for reader in READERS)
     raise UsageError(f"{spec}: not a recording that SHARE reads: {known}")
+
+
+def _bag_advice(path: Path) -> str:
+    """Return how to read a ROS bag: a file of ROS 1, or a folder of ROS 2."""
+    if files := sorted(path.glob("*.mcap")):
+        return f"give its file {files[0]}"
+    folder = path.with_name(f"{path.stem}-mcap")
+    command = shlex.join(
+        ["rosbags-convert", "--src", f"{path}", "--dst", f"{folder}", "--dst-storage", "mcap"]
+    )
+    return f"convert it with `{command}`, then give {folder / folder.name}.mcap (and --calib)"
 
 
 def read_given_calibration(calib: str | None) -> Calibration | None:

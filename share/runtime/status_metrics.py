@@ -32,7 +32,7 @@ METRICS = (
     MetricSpec("share_edge_waiting_keyframes", "Keyframes waiting for place recognition.", "waiting"),
     MetricSpec("share_edge_last_solve_age_seconds", "Time since the last pose graph solve.", "last_solve_s"),
     MetricSpec("share_edge_troubles", "Number of current problems; /health lists them.", "trouble"),
-    MetricSpec("share_edge_failed_jobs_total", "Jobs that raised an error.", "failed_steps"),
+    MetricSpec("share_edge_failed_steps_total", "Steps of the mapper that raised an error.", "failed_steps"),
     MetricSpec("share_edge_refused_handshakes_total", "Refused attempts to connect.", "refused_handshakes"),
     MetricSpec("share_edge_maps", "Separate maps.", "maps"),
     MetricSpec("share_edge_map_keyframes", "Keyframes in a map.", "", "maps", ("map",)),
@@ -78,7 +78,7 @@ METRICS = (
     ),
 )
 _INFO = ("share_edge_agent_info", "State of an agent as labels; always 1.", ("agent", "kind", "state", "map"))
-_JOBS = ("share_edge_job_seconds", "Duration of a job of the mapper.")
+_STEPS = ("share_edge_step_seconds", "Duration of a step of the mapper.")
 _QUANTILES = {"p50": "0.5", "p95": "0.95", "p99": "0.99"}
 
 
@@ -107,7 +107,7 @@ class _Collector:
             if metric.samples:
                 yield metric
         yield _info(self.report)
-        yield _jobs(self.report)
+        yield _steps(self.report)
 
 
 def _samples(report: dict[str, Any], row: MetricSpec) -> Iterator[tuple[list[str], float]]:
@@ -126,20 +126,20 @@ def _info(report: dict[str, Any]) -> Metric:
     return metric
 
 
-def _jobs(report: dict[str, Any]) -> Metric:
+def _steps(report: dict[str, Any]) -> Metric:
     """Return a summary of each NAME_ms in the report that has percentiles."""
     from prometheus_client.core import Metric
 
-    metric = Metric(*_JOBS, typ="summary")
+    metric = Metric(*_STEPS, typ="summary")
     for key, times in report.items():
         if not key.endswith("_ms") or not isinstance(times, dict):
             continue
-        job, count = {"job": key.removesuffix("_ms")}, _as_number(times.get("n")) or 0.0
+        step, count = {"step": key.removesuffix("_ms")}, _as_number(times.get("n")) or 0.0
         for name, quantile in _QUANTILES.items():
             if (ms := _as_number(times.get(name))) is not None:
-                metric.add_sample(_JOBS[0], {**job, "quantile": quantile}, ms * 1e-3)
-        metric.add_sample(f"{_JOBS[0]}_sum", job, count * (_as_number(times.get("mean")) or 0.0) * 1e-3)
-        metric.add_sample(f"{_JOBS[0]}_count", job, count)
+                metric.add_sample(_STEPS[0], {**step, "quantile": quantile}, ms * 1e-3)
+        metric.add_sample(f"{_STEPS[0]}_sum", step, count * (_as_number(times.get("mean")) or 0.0) * 1e-3)
+        metric.add_sample(f"{_STEPS[0]}_count", step, count)
     return metric
 
 

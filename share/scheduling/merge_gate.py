@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from share.config import ControlConfig
+from share.config import NEAR_M, ControlConfig
 from share.geometry.camera import Camera, Rig
 from share.scheduling.overlap import Frustum, SampledFrustum, overlap_volumes
 from share.scheduling.policies import POLICIES
@@ -32,7 +32,7 @@ class MergeGate:
 
         @lru_cache(_CACHED_CAMERAS)
         def sampled_frustum(camera: Camera) -> SampledFrustum:
-            return SampledFrustum(Frustum.from_camera(camera, config.near_m, config.far_m), INTERVAL_M)
+            return SampledFrustum(Frustum.from_camera(camera, NEAR_M, config.far_m), INTERVAL_M)
 
         self._sampled_frustum = sampled_frustum
 

@@ -27,6 +27,7 @@ from share.types import AgentKind
 from share.wire.messages import Evaluation
 
 INTEGRAL_MAX_HZ = 0.1  # I_max: the past never outweighs the present
+DERIVATIVE_WEIGHT = 0.3  # alpha, of the newest slope: about the mean of three evaluations
 GAP_S = 5.0  # without an evaluation for longer, the derivative is reset and the integral held
 
 
@@ -51,7 +52,9 @@ def pid_step(state: PidState, error: float, now_ns: int, gains: ControlConfig) -
     integral, derivative = state.integral_hz, 0.0
     if 0 < dt <= GAP_S:
         integral = _clip(integral + gains.ki * error * dt, -INTEGRAL_MAX_HZ, INTEGRAL_MAX_HZ)
-        derivative = gains.alpha * (error - state.error) / dt + (1 - gains.alpha) * state.derivative
+        derivative = (
+            DERIVATIVE_WEIGHT * (error - state.error) / dt + (1 - DERIVATIVE_WEIGHT) * state.derivative
+        )
     rate = state.rate_hz + gains.kp * error + integral + gains.kd * derivative
     return PidState(_clip(rate, gains.rate_min_hz, gains.rate_max_hz), error, integral, derivative, now_ns)
 

@@ -1,0 +1,1 @@
+"""Samples of single sensors: repaired stamps, frames (`sequencer`), profiles of devices."""

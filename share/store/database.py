@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from share.errors import StoreError, UsageError
+from share.files.locks import lock_handle
 from share.files.reading import is_sparse, open_regular, read_bytes
 from share.files.sqlite_file import limit_untrusted, read_only_uri, shm_path, wal_path
 from share.store.schema import PAGE_BYTES, first_page
@@ -205,16 +206,13 @@ def write_obstacle(path: Path) -> str:
 def lock_map(path: Path) -> int:
     """Lock the map by a file beside it, which is released when this process ends. Return a handle; close it
     to unlock. Raises StoreError while another edge has the lock."""
-    import fcntl
-
     name = path.with_name(path.name + ".lock")
     try:
         handle = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
     except OSError as error:
         raise StoreError(f"{name}: cannot be locked: {error.strerror}; remove it") from None
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock_handle(handle)
     except OSError:
-        os.close(handle)
         raise StoreError(f"{path}: another edge uses this map; stop it, or give another file") from None
     return handle

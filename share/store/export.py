@@ -166,7 +166,7 @@ def _describe_agents(stored_map: StoredMap) -> dict[str, Any]:
             "kind": str(run.hello.kind),
             "keyframes": keyframe_counts[run.run_key],
             "next_keyframe": stored_map.next_ids[run.run_key],
-            "stretches": segment_counts[run.run_key],
+            "segments": segment_counts[run.run_key],
         }
         for run in stored_map.runs
     }

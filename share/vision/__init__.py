@@ -1,0 +1,1 @@
+"""Images: corners, optical flow, patches, depth, ORB features and their matching."""

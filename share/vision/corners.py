@@ -16,6 +16,7 @@ _BLOCK_PX = 5
 _MIN_EIGENVALUE = 4e-4  # above the noise of an image
 _SUPPRESSION_PX = 9  # window in which only the strongest corner is kept
 _BORDER_PX = 6
+_FAST_CONTRAST = 12
 _GRID = (8, 6)  # cells across and down
 
 
@@ -100,9 +101,9 @@ def _free_mask(occupied_px: F32, spacing: float, shape: tuple[int, ...]) -> U8:
     return free
 
 
-def count_fast(image: U8, contrast: int = 12) -> int:
+def count_fast(image: U8) -> int:
     """Return the number of FAST corners: whether the image has texture."""
-    return len(cv2.FastFeatureDetector.create(contrast).detect(image))
+    return len(cv2.FastFeatureDetector.create(_FAST_CONTRAST).detect(image))
 
 
 Size = tuple[int, int]  # width, height; or cells across and down

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from share.types import F32, U8
 from share.vision.patches import sample_square
 
+_NCC_HALF_PX = 5  # of the compared patches, 11 x 11
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
 
@@ -56,12 +57,12 @@ def _lucas_kanade(
     return np.asarray(out, np.float32).reshape(-1, 2), status.ravel() > 0
 
 
-def ncc(source: U8, target: U8, px: F32, found_px: F32, half: int = 5) -> F32:
-    """Return the normalised cross-correlation (N,) of the (2 half + 1)^2 patches: 1 if equal up to gain
-    and bias."""
+def ncc(source: U8, target: U8, px: F32, found_px: F32) -> F32:
+    """Return the normalised cross-correlation (N,) of patches about px and found_px (N, 2): 1 if equal up to
+    gain and bias."""
     if len(px) == 0:
         return np.zeros(0, np.float32)
-    a, b = sample_square(source, px, half), sample_square(target, found_px, half)
+    a, b = sample_square(source, px, _NCC_HALF_PX), sample_square(target, found_px, _NCC_HALF_PX)
     a = a - a.mean(axis=1, keepdims=True)
     b = b - b.mean(axis=1, keepdims=True)
     scale = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))

@@ -1,0 +1,1 @@
+"""Messages between agent and edge, and their bytes (docs/lookup/wire.md)."""

@@ -330,8 +330,8 @@ CONFIGS = {
     "out of range": ("link: {window: 0}", "link: window: 0 must be positive"),
     "zero": ("tracker: {corners: 0}", "tracker: corners: 0 must be positive"),
     "negative": (
-        "tracker: {new_stretch_s: -1}",
-        "new_stretch_s: expected a number from 0 to 1e+09, found -1",
+        "inertial: {max_speed_m_s: -1}",
+        "max_speed_m_s: expected a number from 0 to 1e+09, found -1",
     ),
     "huge": ("tracker: {corners: 1" + 40 * "0" + "}", "tracker: corners: expected a number from 0 to 1e+09"),
     "absurd": ("tracker: {corners: 1" + 400 * "0" + "}", "not valid YAML: number of 401 characters"),
@@ -353,11 +353,11 @@ def test_configuration(case, command, share, tmp_path):
 
 
 def test_numbers_of_a_configuration_have_all_yaml_forms(room, share, tmp_path):
-    (tmp_path / "config.yaml").write_text("merge: {odometry_scale: 15e-1}\ninertial: {max_speed_m_s: 9}\n")
+    (tmp_path / "config.yaml").write_text("merge: {enter_m: 15e-2}\ninertial: {max_speed_m_s: 9}\n")
     done = share("track", room / "ar1", "--config", tmp_path / "config.yaml", "--frames", ":3", "--json")
     used = json.loads(done.out)["config"]
     assert done.code == 0
-    assert (used["merge"]["odometry_scale"], used["inertial"]["max_speed_m_s"]) == (1.5, 9.0)
+    assert (used["merge"]["enter_m"], used["inertial"]["max_speed_m_s"]) == (0.15, 9.0)
 
 
 # ------------------------------------------------------------------ where results go
@@ -774,8 +774,8 @@ def test_unknown_network_is_refused(command: tuple[str, ...]) -> None:
 
 def test_invalid_frustum_is_refused_before_the_edge_starts(tmp_path: Path) -> None:
     config = tmp_path / "flat.yaml"
-    config.write_text("control: {near_m: 5, far_m: 1}\n")
+    config.write_text("control: {far_m: 0.1}\n")
     command = [*SHARE, "edge", "--bind", "tcp://127.0.0.1:0", "--policy", "share", "--config", str(config)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == f"share: {config}: control: near_m: 5.0 m is not nearer than far_m, 1.0 m\n"
+    assert done.stderr == f"share: {config}: control: far_m: 0.1 m is not beyond the near plane, 0.3 m\n"

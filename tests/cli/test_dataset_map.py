@@ -26,7 +26,7 @@ def test_info(room):
     assert "  map ann-0001/0: 40 keyframes\n" in text
     assert "  5 loops, 40 keyframes in the latest solution\n" in text
     data = json.loads(good("info", room, "--json"))
-    assert data["agents"]["ann"]["next_keyframe"] == 20
+    assert (data["agents"]["ann"]["next_keyframe"], data["agents"]["ann"]["segments"]) == (20, 1)
     assert data["damage"] == []
     assert "is a map; --calib and --frames" in bad(2, "info", room, "--frames", "0:3")
 

@@ -121,6 +121,58 @@ def test_wrong_use_is_refused_before_anything_is_played(evaluate, plain_session,
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.parametrize(
+    ("settings", "given", "said"),
+    [
+        (
+            "edge: {policy: linear}",
+            ("--policy", "covins-g"),
+            "edge.policy linear is overridden by policy covins-g",
+        ),
+        ("edge: {policy: linear}", ("--policy", "linear"), None),
+        ("edge: {policy: linear}", (), None),
+        ("control: {kp: 1}", ("--policy", "covins-g"), None),  # the file does not name a policy
+        (
+            "edge: {policy: share}",
+            ("--policy", "covins-g"),
+            "edge.policy share is overridden by policy covins-g",
+        ),
+        ("", ("--policy", "covins-g"), None),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "sweep"])
+def test_a_policy_other_than_that_of_the_settings_is_said(
+    evaluate, plain_session, tmp_path, command, settings, given, said
+):
+    """It stops at --costs, before anything is played."""
+    config = tmp_path / "c.yaml"
+    config.write_text(settings)
+    axis = ("--set", "control.kp=1") if command == "sweep" else ()
+    done = evaluate(
+        command, plain_session, *axis, *given, "--config", config, "--costs", "none", "--out", tmp_path / "r"
+    )
+    lines = [f"share: {config}: {said}"] if said else []
+    assert done.err.splitlines()[:-1] == lines
+    assert "--costs needs --virtual" in done.err
+
+
+def test_ablation_says_that_the_policy_of_the_settings_is_not_played(evaluate, plain_session, tmp_path):
+    config = tmp_path / "c.yaml"
+    config.write_text("edge: {policy: streamed}")
+    rest = ("--config", config, "--costs", "none", "--out", tmp_path / "r")
+    first, *_ = evaluate("ablation", plain_session, *rest).err.splitlines()
+    names = "share, covins-g, linear, equal, random"
+    assert first == f"share: {config}: edge.policy streamed is overridden by policies {names}"
+    assert "edge.policy" not in evaluate("ablation", plain_session, "--policy", "streamed", *rest).err
+
+
+def test_without_policy_that_of_the_settings_is_played(evaluate, plain_session, tmp_path):
+    config = tmp_path / "c.yaml"
+    config.write_text("edge: {policy: streamed}")
+    done = evaluate("run", plain_session, "--virtual", "--config", config, "--out", tmp_path / "r")
+    assert "policy streamed cannot be played in virtual time" in done.err
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("clock", ["--virtual", "--agents-first"])  # the latter is in real time
 def test_each_agent_can_have_its_own_link(evaluate, plain_session, tmp_path, clock):

@@ -124,7 +124,7 @@ def test_import_is_not_interrupted(tmp_path):
         "except BaseException as error:\n    raise RuntimeError('cannot be imported') from error\n"
     )
     program = (
-        "import sys, time\nfrom share.cli.signals import unwind_on_signal\n"
+        "import sys, time\nfrom share.runtime.signals import unwind_on_signal\n"
         f"sys.path.insert(0, {str(tmp_path)!r})\n"
         "try:\n    with unwind_on_signal():\n        import swallows\n        time.sleep(10)\n"
         "except KeyboardInterrupt:\n    print('interrupted')\n"
@@ -138,7 +138,7 @@ def test_signal_during_a_worker_start_leaves_no_process():
     program = (
         "import os, signal, threading, time\n"
         "from multiprocessing import popen_spawn_posix as spawning\n"
-        "from share.cli.signals import unwind_on_signal\n"
+        "from share.runtime.signals import unwind_on_signal\n"
         "from share.spawning import SPAWN_CONTEXT\n"
         "threading.Thread(target=time.sleep, args=(2.0,), daemon=True).start()\n"
         "start = spawning.util.spawnv_passfds\n"
@@ -181,7 +181,7 @@ def test_signal_deferred_by_an_import_is_deferred_by_a_worker_start():
     program = (
         "import os, signal, time\n"
         "from multiprocessing import popen_spawn_posix as spawning\n"
-        "from share.cli import signals as module\n"
+        "from share.runtime import signals as module\n"
         "from share.spawning import SPAWN_CONTEXT\n"
         "start = spawning.util.spawnv_passfds\n"
         "def slow(*arguments):\n"

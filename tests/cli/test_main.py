@@ -11,6 +11,7 @@ import pytest
 
 from share import __version__
 from share.cli.main import COMMANDS, main
+from share.config import POLICY_NAMES
 
 SHARE = [sys.executable, "-m", "share"]
 HEAVY = [
@@ -52,6 +53,23 @@ def test_help(command, capsys):
     assert ("Example:  share " if command else "Try it:   share demo") in out
     assert "..." not in out.replace("[ARGS]...", "")  # no help text is cut off
     assert run(capsys, *command, "-h") == (0, out, "")
+
+
+@pytest.mark.parametrize("command", ["edge", "demo", "evaluate run", "evaluate sweep", "evaluate ablation"])
+def test_help_explains_each_policy(command, capsys):
+    _, out, _ = run(capsys, *command.split(), "--help")
+    rows = out.partition("Policies:")[2].partition("Example:")[0].split("\n\n")[0].splitlines()[1:]
+    assert [row.split()[0] for row in rows] == list(POLICY_NAMES)
+    assert all(len(row.split()) > 4 for row in rows)
+
+
+def test_edge_says_that_policy_overrides_that_of_its_settings(tmp_path, capsys):
+    config = tmp_path / "c.yaml"
+    config.write_text("edge: {policy: linear}")
+    _, _, err = run(capsys, "edge", "--config", config, "--policy", "streamed", "--map", tmp_path / "m")
+    first, second = err.splitlines()
+    assert first == f"share: {config}: edge.policy linear is overridden by policy streamed"
+    assert "--map: policy streamed builds no map" in second
 
 
 def test_help_imports_nothing_heavy():
@@ -111,6 +129,7 @@ def test_no_arguments_prints_help_with_exit_code_2(capsys):
         ("xyz", "no command 'xyz'; commands: demo, capture, track, agent, edge, dataset"),
         ("--bogus", "No such option '--bogus'"),
         ("dataset inf", "No such command 'inf'. Did you mean 'info'?"),
+        ("evaluate ate", "No such command 'ate'. Commands: ablation, sweep, compare, run, score."),
         ("track", "Missing argument 'SOURCE'"),
         ("track x y", "unexpected extra argument (y)"),
         ("track x --ot y", "No such option '--ot'. (Did you mean one of: '--mode', '--out'"),

@@ -45,8 +45,8 @@ KERNEL = "of the kernel (/proc, /sys, /etc), not of a person"
 OURS = "into or from a temporary folder of our own making"
 MEMORY = "into memory, or from bytes that are bounded"
 ALLOWED = {
+    ("files/locks.py", "open"): "a folder, for its lock",
     ("cli/edge.py", "open"): "MapStore.open",
-    ("lab/emulate/session.py", "open"): "a folder, for its lock",
     ("lab/emulate/session.py", "save"): MEMORY,
     ("lab/emulate/world/room_files.py", "load"): "mapped, after open_regular; rebuilt if not whole",
     ("lab/emulate/world/room_files.py", "save"): OURS,
@@ -60,7 +60,7 @@ ALLOWED = {
     ("lab/mocap/session.py", "copyfile"): "a recording that was opened by the door, into a new folder",
     ("devices/host.py", "read_text"): KERNEL,
     ("vision/image_codec.py", "imdecode"): "after image_header has measured it",
-    ("net/keys.py", "open"): "a new file that nobody else can read, or a folder, for its lock",
+    ("net/keys.py", "open"): "a new file that nobody else can read",
     ("net/keys.py", "fdopen"): "likewise",
     ("cameras/live.py", "open"): "a camera",
     ("runtime/machine.py", "read_text"): KERNEL,

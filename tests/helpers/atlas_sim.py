@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.atlas import Atlas
 from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
@@ -74,7 +73,7 @@ def near_loops(a: Walker, b: Walker, rng: np.random.Generator, every: int = 4) -
 def answer(atlas: Atlas, map_id: str) -> tuple[SolveJob, GraphSolution]:
     """By a solver that knows nothing before."""
     atlas.graph.edges.reset()
-    job, solver = atlas.solving.make_job(map_id), PoseGraphSolver(GraphConfig())
+    job, solver = atlas.solving.make_job(map_id), PoseGraphSolver()
     solver.update(job.change)
     return job, solver.solve(job.anchor, job.covariance_nodes)
 

@@ -13,9 +13,10 @@ from helpers.hellos import hello_of
 from share.config import Config, EdgeConfig
 from share.geometry import se3
 from share.geometry.se3 import umeyama
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
-from share.mapping.steps import MapEvent, SolveStep, Step
+from share.mapping.steps import SolveStep, Step
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
@@ -126,7 +127,7 @@ class ModelRun:
     def __init__(self, config: Config, session: int) -> None:
         self.machine = Edge(config, session)
         self.mapper = Mapper(config)
-        self.solver = PoseGraphSolver(config.graph)
+        self.solver = PoseGraphSolver()
 
     def report(self) -> dict[str, Any]:
         return self.machine.report(self.mapper.report())

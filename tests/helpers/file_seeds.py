@@ -35,14 +35,13 @@ from share.lab.mocap.files import read_bodies
 from share.lab.train.keyframe_table import collect_labels, tabulate
 from share.lab.train.labels import Labels, read_labels, write_labels
 from share.net.keys import AllowList
-from share.odometry.error_model.inference import estimate_error
 from share.odometry.error_model.inputs import INPUT_SHAPES, input_dtype
-from share.odometry.error_model.network import open_error_model
+from share.odometry.error_model.network import estimate_error, open_error_model
 from share.recordings.calibration import kalibr_texts, read_calibration
 from share.recordings.describe import describe_recording
 from share.recordings.mcap.recorder import Recorder, recover_recording
 from share.recordings.session import read_session
-from share.runtime.pipeline import make_source_tracker, read_frames
+from share.runtime.pipeline import check_trackable, make_tracker, read_frames
 from share.runtime.source import open_source
 from share.sensors.profile import load_host_profile, load_profile
 from share.sensors.sequencer import SequencerCounters
@@ -51,7 +50,8 @@ from share.store.map_store import MapStore
 
 
 def _tracked(source: object) -> None:
-    tracker = make_source_tracker(source, config.Config())
+    check_trackable(source.name, source.rig)
+    tracker = make_tracker(source.rig, config.Config())
     for frame in read_frames(source, config.Config(), SequencerCounters()):
         if tracker.track(frame).keyframe_ready:
             tracker.make_keyframe(frame)

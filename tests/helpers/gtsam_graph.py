@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.graph.optimiser import MAX_ITERATIONS, RELATIVE_TOLERANCE
+from share.mapping.graph.solver import CAUCHY_WIDTH
 from share.types import F64
 
 ANCHOR_SIGMA = 1e-4  # rad and m; holds the gauge, removed again after solving
@@ -34,7 +34,7 @@ def solve(
     loops: Sequence[PoseEdge],
     anchors: Sequence[int],
     covariances_of: Sequence[int] = (),
-    cauchy_width: float = GraphConfig.cauchy,
+    cauchy_width: float = CAUCHY_WIDTH,
     relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> SolvedGraph:
     """The most likely poses, starting from `poses` (N, 4, 4); anchored ones stay exactly as given.

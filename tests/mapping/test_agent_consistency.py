@@ -125,7 +125,7 @@ def test_depth_scales_are_pooled_robustly():
 
 def town(scales: dict[str, float], pairs: list[tuple[str, str]]) -> tuple[AgentAgreement, list[bool]]:
     """Agents with these scales of their depths, with loops between these pairs."""
-    agreement, rng, said = AgentAgreement(0.015), np.random.default_rng(2), []
+    agreement, rng, said = AgentAgreement(), np.random.default_rng(2), []
     nodes = {name: range(10 * i, 10 * i + 10) for i, name in enumerate(scales)}
     for name, numbers in nodes.items():
         for number in numbers:

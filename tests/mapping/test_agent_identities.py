@@ -25,7 +25,7 @@ class Town:
     """Runs with loops at one spot, one after the other."""
 
     def __init__(self) -> None:
-        self.agreement, self.rng = AgentAgreement(0.015), np.random.default_rng(3)
+        self.agreement, self.rng = AgentAgreement(), np.random.default_rng(3)
         self.numbers: dict[str, int] = {}
 
     def enter(self, run: str) -> None:

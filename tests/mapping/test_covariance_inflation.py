@@ -55,7 +55,7 @@ def test_the_pose_sensitivity_is_that_of_a_depth_scale(log):
 
 def compared_agents(scales: dict[str, float], rounds: int = 40) -> AgentAgreement:
     """Agreement of agents with these scales, after loops between all of them."""
-    agreement, rng, names = AgentAgreement(0.015), np.random.default_rng(2), list(scales)
+    agreement, rng, names = AgentAgreement(), np.random.default_rng(2), list(scales)
     nodes = {name: range(10 * i, 10 * i + 10) for i, name in enumerate(names)}
     for name, numbers in nodes.items():
         for n in numbers:
@@ -106,13 +106,13 @@ def test_the_graph_is_rescaled_and_stored_links_are_not():
             assert T[:3, 3] == pytest.approx(by * stated[:3, 3])
             assert T[:3, :3] == pytest.approx(stated[:3, :3])
             width = 1.0 if walker is ann else 4.0
-            cov = width * inflate_covariance(MergeConfig(), stated, walker.keyframes[k].cov)
+            cov = width * inflate_covariance(stated, walker.keyframes[k].cov)
             assert graph.odometry_edge(before, number).cov == pytest.approx(cov)
     taken = atlas.remove_keyframes([graph.odometry.node_id(KeyframeKey("eve", 5))])[0]
     stated = eve.keyframes[5].T_ref_body @ eve.keyframes[6].T_ref_body
     assert taken.link is not None
     assert taken.link.T_ref_body[:3, 3] == pytest.approx(stated[:3, 3], abs=1e-4)
-    plain = inflate_covariance(MergeConfig(), stated, eve.keyframes[6].cov)
+    plain = inflate_covariance(stated, eve.keyframes[6].cov)
     assert np.trace(taken.link.cov) < 3 * np.trace(plain)  # of two steps
     agreement.log_scales["eve"] = 0.0
     atlas.quarantine.apply_scales()

@@ -143,7 +143,7 @@ def test_dropped_evidence_no_longer_scales():
 
 def test_loops_between_agents_that_disagree_scale_no_covariance():
     """The path of bob is 10 % too long, which does not scale the covariance of either."""
-    rng, agreement, widths = np.random.default_rng(1), AgentAgreement(0.015), []
+    rng, agreement, widths = np.random.default_rng(1), AgentAgreement(), []
     x, y = ring(0.0), ring(0.7)
     for name, first, steps in (("ann", 0, steps_of(x, rng)), ("bob", 1000, steps_of(y, rng, scale=1.1))):
         for i, step in enumerate([np.eye(4), *steps]):

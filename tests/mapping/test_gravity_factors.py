@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from helpers.rooms import Room, simulate
 
-from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.graph import gravity
-from share.mapping.graph.solver import GraphSolution, GraphUpdate, PoseGraphSolver
+from share.mapping.graph.solver import CAUCHY_WIDTH, GraphSolution, GraphUpdate, PoseGraphSolver
 from share.types import F64
 
-CONFIG = GraphConfig()
 SIGMA = float(np.radians(0.1))
 
 
@@ -24,8 +22,10 @@ def plumb_lines(room: Room, seed: int) -> dict[int, F64]:
     return dict(enumerate(up / SIGMA))
 
 
-def solved(room: Room, lines: dict[int, F64] | None, wanted: list[int], config: GraphConfig) -> GraphSolution:
-    solver = PoseGraphSolver(config)
+def solved(
+    room: Room, lines: dict[int, F64] | None, wanted: list[int], cauchy_width: float = CAUCHY_WIDTH
+) -> GraphSolution:
+    solver = PoseGraphSolver(cauchy_width)
     edges = [(i, edge, False) for i, edge in enumerate(room.chain)]
     loops = [(10**6 + i, edge, True) for i, edge in enumerate(room.closures)]
     solver.update(GraphUpdate.from_edges(dict(enumerate(room.guess)), edges + loops, gravity_factors=lines))
@@ -60,13 +60,13 @@ def test_gradient_and_hessian_are_those_of_the_cost() -> None:
 
 def test_the_map_is_upright_though_its_first_pose_was_not() -> None:
     room = tilted(simulate(300, 3, 1), 2.0)
-    found = solved(room, plumb_lines(room, 1), [], CONFIG)
+    found = solved(room, plumb_lines(room, 1), [])
     up = (found.poses[:, :3, :3] @ np.swapaxes(room.truth[:, :3, :3], 1, 2))[:, :2, 2].mean(0)
     assert np.degrees(np.linalg.norm(up)) < 0.03
     assert np.array_equal(found.poses[0, :3, 3], room.guess[0, :3, 3])
     turned = se3.so3_log(room.guess[0, :3, :3] @ found.poses[0, :3, :3].T)
     assert abs(turned[2]) < np.radians(0.03)  # about the vertical: of second order
-    alone = solved(room, None, [], CONFIG)
+    alone = solved(room, None, [])
     assert np.array_equal(alone.poses[0], room.guess[0])
     assert spread(found.poses, room.truth) < spread(alone.poses, room.truth)
 
@@ -80,7 +80,7 @@ def spread(poses: F64, truth: F64) -> float:
 def test_gravity_factors_reduce_the_covariances_consistently() -> None:
     """NEES of a late pose over 40 rooms, by an upper bound: not over 6."""
     nees, surer = [], []
-    exact = GraphConfig(cauchy=1e6)
+    exact = 1e6
     for seed in range(40):
         room = simulate(60, 2, 100 + seed)
         solution = solved(room, plumb_lines(room, seed), [58], exact)
@@ -94,8 +94,8 @@ def test_gravity_factors_reduce_the_covariances_consistently() -> None:
 
 def test_without_gravity_factors_the_anchor_stays_to_the_bit() -> None:
     room = simulate(60, 2, 5)
-    found = solved(room, dict.fromkeys(range(60), np.zeros(3)), [58], CONFIG)
+    found = solved(room, dict.fromkeys(range(60), np.zeros(3)), [58])
     assert np.array_equal(found.poses[0], room.guess[0])
-    same = solved(room, None, [58], CONFIG)
+    same = solved(room, None, [58])
     assert found.poses.tobytes() == same.poses.tobytes()
     assert found.covariances.tobytes() == same.covariances.tobytes()

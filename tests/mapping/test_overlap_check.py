@@ -4,7 +4,7 @@ import numpy as np
 from helpers.atlas_sim import Walker, loop
 from numpy.typing import NDArray
 
-from share.config import GraphConfig, MergeConfig
+from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.atlas import Atlas
 from share.mapping.graph.solver import PoseGraphSolver
@@ -51,7 +51,7 @@ class Room:
         self.walkers = Walker("a", 1, n=60, turn=1.9 * np.pi), Walker("b", 2, n=60, turn=1.9 * np.pi)
         self.sights: dict[int, CameraView] = {}
         self.atlas = Atlas(config or MergeConfig(), self.sights)
-        self.rings, self.rng, self.solver = rings, np.random.default_rng(3), PoseGraphSolver(GraphConfig())
+        self.rings, self.rng, self.solver = rings, np.random.default_rng(3), PoseGraphSolver()
 
     def walk(self, first: int, last: int) -> list[LoopDecision]:
         """Add keyframes first .. last - 1 of both; return the decisions of the reviews."""

@@ -16,8 +16,6 @@ from share.geometry import se3
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.verification import Verification, verify
 
-CONFIG = PlaceConfig()
-
 
 @pytest.fixture(scope="module")
 def euroc(shared_data: Path) -> Seen:
@@ -39,7 +37,7 @@ def accepted(seen: Seen, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, in
     """Pairs (query, candidate) that verification accepts, with the error of their pose: m, deg."""
     out = {}
     for q, c in pairs:
-        found = verify(seen.sights[q], seen.sights[c], CONFIG)
+        found = verify(seen.sights[q], seen.sights[c])
         if isinstance(found, Verification):
             apart = se3.inverse(se3.inverse(seen.T_world_body[c]) @ seen.T_world_body[q]) @ found.T_c_q
             out[q, c] = float(np.linalg.norm(apart[:3, 3])), float(np.degrees(se3.rotation_angle(apart)))
@@ -54,7 +52,7 @@ def candidates(index: PlaceIndex, seen: Seen) -> list[tuple[int, int]]:
     return [
         (q, c.id)
         for q, camera_view in enumerate(seen.sights)
-        for c in index.query(camera_view.view.descriptors, CONFIG.candidates, exclude=[q])
+        for c in index.query(camera_view.view.descriptors, PlaceConfig().candidates, exclude=[q])
         if c.id < 1000
     ]
 
@@ -109,5 +107,5 @@ def test_kitchen_every_pair(kitchen: Seen) -> None:
 def test_two_different_rooms_are_never_one(euroc: Seen, kitchen: Seen) -> None:
     for query in euroc.sights[::2]:
         for candidate in kitchen.sights[::2]:
-            assert not isinstance(verify(query, candidate, CONFIG), Verification)
-            assert not isinstance(verify(candidate, query, CONFIG), Verification)
+            assert not isinstance(verify(query, candidate), Verification)
+            assert not isinstance(verify(candidate, query), Verification)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.atlas_sim import Walker, error, loop, near_loops
 
-from share.config import GraphConfig, MergeConfig
+from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping import keyframe_removal
 from share.mapping.atlas import Atlas
@@ -141,7 +141,7 @@ def settle(atlas: Atlas, solver: PoseGraphSolver) -> None:
 
 def test_a_culled_map_is_solved_as_well_and_continues() -> None:
     walkers = Walker("ann", 1, n=200), Walker("bob", 2, n=200, phase=0.4)
-    rng, atlas, solver = np.random.default_rng(0), Atlas(CONFIG), PoseGraphSolver(GraphConfig())
+    rng, atlas, solver = np.random.default_rng(0), Atlas(CONFIG), PoseGraphSolver()
     for k in range(150):
         for w in walkers:
             atlas.add_keyframe(w.name, w.keyframes[k])
@@ -175,7 +175,7 @@ def test_a_culled_map_is_solved_as_well_and_continues() -> None:
 
 def test_keyframes_removed_while_the_map_is_solved() -> None:
     walkers = Walker("ann", 1), Walker("bob", 2, phase=0.4)
-    rng, atlas, solver = np.random.default_rng(0), Atlas(CONFIG), PoseGraphSolver(GraphConfig())
+    rng, atlas, solver = np.random.default_rng(0), Atlas(CONFIG), PoseGraphSolver()
     for k in range(60):
         for w in walkers:
             atlas.add_keyframe(w.name, w.keyframes[k])

@@ -29,7 +29,7 @@ class Session:
 
     def __init__(self) -> None:
         self.config = Config()
-        self.mapper, self.solver = Mapper(self.config), PoseGraphSolver(self.config.graph)
+        self.mapper, self.solver = Mapper(self.config), PoseGraphSolver()
 
     def step(self, person: Person) -> SaveKeyframe:
         """Add a keyframe of each, and run all steps."""

@@ -28,7 +28,7 @@ class Session:
     """A mapper, its solver, and the changes to store."""
 
     def __init__(self, config: Config) -> None:
-        self.mapper, self.solver = Mapper(config), PoseGraphSolver(config.graph)
+        self.mapper, self.solver = Mapper(config), PoseGraphSolver()
         self.changes: list[MapChange] = []
 
     def join(self, person: Person) -> None:

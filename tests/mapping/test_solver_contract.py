@@ -3,7 +3,6 @@ import pytest
 from helpers.exact_solver import make_exact, use_all_edges
 from helpers.rooms import Room, simulate
 
-from share.config import GraphConfig
 from share.geometry import se3
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.graph.solver import GraphSolution, GraphUpdate, PoseGraphSolver
@@ -91,7 +90,7 @@ def thinned(room: Room, gone: list[int]) -> tuple[list[PoseEdge], list[PoseEdge]
 def solved(
     poses: dict[int, F64], odometry: list[PoseEdge], loops: list[PoseEdge], wanted: list[int]
 ) -> GraphSolution:
-    solver = PoseGraphSolver(GraphConfig(cauchy=1e6))
+    solver = PoseGraphSolver(1e6)
     edges = [*((e, False) for e in odometry), *((e, True) for e in loops)]
     solver.update(GraphUpdate.from_edges(poses, [(i, e, loop) for i, (e, loop) in enumerate(edges)]))
     return solver.solve(0, wanted)

@@ -6,18 +6,16 @@ import pytest
 from helpers.place_sim import bodies, sights
 
 from share.checks import MAX_POSITION_M
-from share.config import PlaceConfig
 from share.geometry import se3
 from share.mapping.recognition import verification
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
 from share.types import MAX_UV, View
 
-CONFIG = PlaceConfig()
 T_C_Q = se3.exp(np.array([0.1, -0.15, 0.05, 0.3, 0.1, -0.2]))
 
 
 def test_finds_the_pose_between_bodies() -> None:
-    found = verify(*sights(0, T_C_Q), CONFIG)
+    found = verify(*sights(0, T_C_Q))
     assert isinstance(found, Verification), found
     xi = se3.log(se3.inverse(bodies(T_C_Q)) @ found.T_c_q)
     assert np.linalg.norm(xi[:3]) < np.radians(0.5)
@@ -31,7 +29,7 @@ def test_covariance_of_the_body_pose_is_consistent(monkeypatch: pytest.MonkeyPat
         monkeypatch.setattr(verification, name, value)
     nees = []
     for seed in range(40):
-        found = verify(*sights(seed, T_C_Q), CONFIG)
+        found = verify(*sights(seed, T_C_Q))
         assert isinstance(found, Verification)
         xi = se3.log(se3.inverse(bodies(T_C_Q)) @ found.T_c_q)
         nees.append(xi @ np.linalg.solve(found.cov, xi))
@@ -40,7 +38,7 @@ def test_covariance_of_the_body_pose_is_consistent(monkeypatch: pytest.MonkeyPat
 
 def test_the_reverse_query_has_the_inverse_pose() -> None:
     query, candidate = sights(1, T_C_Q)
-    there, back = verify(query, candidate, CONFIG), verify(candidate, query, CONFIG)
+    there, back = verify(query, candidate), verify(candidate, query)
     assert isinstance(there, Verification)
     assert isinstance(back, Verification)
     assert np.abs(se3.log(there.T_c_q @ back.T_c_q)).max() < 2e-3
@@ -48,14 +46,14 @@ def test_the_reverse_query_has_the_inverse_pose() -> None:
 
 def test_same_input_same_output() -> None:
     pair = sights(2, T_C_Q)
-    first, second = verify(*pair, CONFIG, seed=7), verify(*pair, CONFIG, seed=7)
+    first, second = verify(*pair, seed=7), verify(*pair, seed=7)
     assert isinstance(first, Verification)
     assert isinstance(second, Verification)
     assert first.T_c_q.tobytes() == second.T_c_q.tobytes()
 
 
-def reason(query: CameraView, candidate: CameraView, config: PlaceConfig = CONFIG) -> str:
-    found = verify(query, candidate, config)
+def reason(query: CameraView, candidate: CameraView) -> str:
+    found = verify(query, candidate)
     assert isinstance(found, Refusal), found
     return found.reason
 
@@ -82,7 +80,7 @@ def test_gravity_must_agree() -> None:
     query, candidate = sights(7, T_C_Q)
     tilted = replace(query, up=se3.so3_exp(np.array([0.2, 0, 0])) @ query.up)
     assert reason(tilted, candidate).startswith("gravity differs by 11.")
-    assert isinstance(verify(replace(query, up=np.zeros(3)), candidate, CONFIG), Verification)
+    assert isinstance(verify(replace(query, up=np.zeros(3)), candidate), Verification)
 
 
 def test_scale_that_differs_between_the_directions_is_refused() -> None:
@@ -102,11 +100,16 @@ def test_inliers_in_one_corner_are_refused(half: float, monkeypatch: pytest.Monk
         near[:, None], candidate.view.descriptors, rng.integers(0, 256, (len(near), 32), np.uint8)
     )
     corner = View(candidate.view.uv, candidate.view.points, others)
-    limits = {"MIN_MATCHES": 10, "MIN_DIRECTION_INLIERS": 6, "_MIN_CONSENSUS": 6, "MIN_SPREAD": 0.15}
+    limits = {
+        "MIN_INLIERS": 8,
+        "MIN_MATCHES": 10,
+        "MIN_DIRECTION_INLIERS": 6,
+        "_MIN_CONSENSUS": 6,
+        "MIN_SPREAD": 0.15,
+    }
     for name, value in limits.items():
         monkeypatch.setattr(verification, name, value)
-    loose = PlaceConfig(min_inliers=8)
-    assert "inliers crowd in the" in reason(query, replace(candidate, view=corner), loose)
+    assert "inliers crowd in the" in reason(query, replace(candidate, view=corner))
 
 
 def test_an_uncertain_pose_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,8 +146,8 @@ def test_hostile_numbers_do_not_raise(seed: int) -> None:
         query, view=View(uv, points, query.view.descriptors), up=rng.normal(0, 10.0 ** (seed % 9), 3)
     )
     for result in (
-        verify(broken, candidate, CONFIG),
-        verify(candidate, broken, CONFIG),
-        verify(broken, broken, CONFIG),
+        verify(broken, candidate),
+        verify(candidate, broken),
+        verify(broken, broken),
     ):
         assert isinstance(result, Verification | Refusal)

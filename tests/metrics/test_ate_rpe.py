@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from share.errors import DataError
+from share.geometry.interpolation import associate
 from share.geometry.se3 import exp, from_rt, inverse, quat_from_matrix, so3_exp
-from share.metrics.ate import ate, joint_ate
+from share.metrics.ate import ate, ate_if_known, joint_ate
 from share.metrics.rpe import rpe_frames, rpe_time
 
 T0 = 1_700_000_000_000_000_000
@@ -75,11 +76,9 @@ def test_alignment_is_estimated_and_reported():
     truth = walk(100, 5)
     T_truth_est = exp(np.array([0.1, 0.2, -2.0, 1.0, 2.0, 3.0]))
     estimate = truth[0], inverse(T_truth_est) @ truth[1]
-    for alignment in ("se3", "origin"):
-        found = ate(estimate, truth, alignment)
-        assert found.rmse < 1e-9
-        assert np.allclose(found.T_truth_est, T_truth_est, atol=1e-9)
-    assert ate(estimate, truth, "none").rmse > 1.0
+    found = ate(estimate, truth)
+    assert found.rmse < 1e-9
+    assert np.allclose(found.T_truth_est, T_truth_est, atol=1e-9)
 
 
 def test_truth_is_interpolated_on_an_arc_across_short_gaps_only():
@@ -89,9 +88,9 @@ def test_truth_is_interpolated_on_an_arc_across_short_gaps_only():
     at = T0 + np.array([-1, 0, 37, 160, 500, 1000, 1043, 1081], np.int64) * 1_000_000
     a = (at - T0) / 1e9
     estimate = at, from_rt(so3_exp(np.outer(a, [0, 0, 1.0])), np.outer(a, [1.0, 0, 0]))
-    found = ate(estimate, truth, "none")
-    assert found.n == 5  # 0, 37, 160, 1000, 1043: not before, not in the gap, not after
-    assert found.max < 1e-9
+    _, T_est, T_truth = associate(estimate, truth)
+    assert len(T_est) == 5  # 0, 37, 160, 1000, 1043: not before, not in the gap, not after
+    assert np.allclose(T_est, T_truth, rtol=0, atol=1e-9)
     step = rpe_frames(estimate, truth)
     assert step.translation.n == 3  # the step across the gap is left out
     assert step.rotation.max < 1e-8
@@ -122,3 +121,11 @@ def test_too_few_poses_are_refused():
         rpe_time(truth, truth)
     with pytest.raises(ValueError, match="rise"):
         ate((truth[0][::-1], truth[1]), truth)
+
+
+def test_the_ate_is_unknown_without_estimate_truth_or_enough_poses():
+    truth = walk(10, 1)
+    two = truth[0][:2], truth[1][:2]
+    assert [ate_if_known(*pair) for pair in ((None, truth), (truth, None), (two, truth))] == [None] * 3
+    found = ate_if_known(truth, truth)
+    assert found is not None and found.n == 10

@@ -14,11 +14,13 @@ from helpers.special_files import KINDS, special
 
 from share.errors import DataError, ShareError
 from share.odometry.error_model.history import FrameOutcome, RecentMotion
-from share.odometry.error_model.inference import MAX_ERROR_CM, ErrorEstimate, estimate_error
 from share.odometry.error_model.inputs import INPUT_SHAPES, error_model_input
 from share.odometry.error_model.network import (
+    MAX_ERROR_CM,
     SHIPPED_MODEL,
+    ErrorEstimate,
     backbone_features,
+    estimate_error,
     open_error_model,
     open_network,
     read_model,

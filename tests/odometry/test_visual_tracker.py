@@ -94,21 +94,22 @@ def test_lost_in_the_dark_and_relocalised(walk):
     assert not any(c.new_segment for c in candidates[1:])
 
 
-def test_the_map_survives_a_long_darkness(walk):
+def test_the_map_survives_a_long_darkness(walk, monkeypatch):
     """Longer than it takes to begin anew, but there was nothing to begin with."""
     images, _ = walk
     dark = (np.zeros((480, 640), np.uint8),) * 2
-    results, candidates = run([*images[:40], *[dark] * 20, *images[45:55]], TrackerConfig(new_stretch_s=0.3))
+    monkeypatch.setattr(relocalisation, "NEW_SEGMENT_S", 0.3)
+    results, candidates = run([*images[:40], *[dark] * 20, *images[45:55]])
     assert [r.state for r in results[40:60]] == [TrackState.LOST] * 20
     assert all(r.state.has_pose for r in results[60:])
     assert not any(c.new_segment for c in candidates[1:])
 
 
-def test_moved_while_blind_starts_a_new_segment(walk):
+def test_moved_while_blind_starts_a_new_segment(walk, monkeypatch):
     images, _ = walk
     other = pairs(poses("stroller", np.arange(1, 2, 1 / HZ), 77), 77)
-    config = TrackerConfig(new_stretch_s=0.3)
-    results, candidates = run([*images[:20], *other], config)
+    monkeypatch.setattr(relocalisation, "NEW_SEGMENT_S", 0.3)
+    results, candidates = run([*images[:20], *other])
     states = [r.state for r in results]
     assert TrackState.LOST in states[20:30]
     assert states[-1].has_pose

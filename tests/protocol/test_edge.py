@@ -11,9 +11,10 @@ import pytest
 from helpers.edge_sim import MS, ModelRun, Person, Town, walls
 from helpers.hellos import hello_of
 
-from share.config import AgentQoe, Config, ControlConfig, EdgeConfig, GraphConfig
+from share.config import AgentQoe, Config, ControlConfig, EdgeConfig
 from share.geometry import se3
 from share.mapping import query_queue
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
 from share.mapping.query_queue import ENOUGH_VERIFIED
@@ -263,6 +264,59 @@ def test_a_step_that_fails_costs_its_keyframe_only():
     assert mapper.next_lookup() is None
 
 
+def two_maps() -> Mapper:
+    """Ann's map and Bob's, both due to be solved."""
+    both, mapper = town(), Mapper(Config())
+    both.walk(1)
+    for name, run_id in (("ann", 11), ("bob", 22)):
+        mapper.add_run(f"{name}-1", hello(name, run_id=run_id))
+        mapper.add_keyframe(f"{name}-1", both.keyframes(name)[0])
+    mapper.atlas.graph.unsolved_maps.update(dict.fromkeys(mapper.atlas.graph.odometry.live_segments))
+    return mapper
+
+
+def test_a_solution_that_fails_is_reported_under_its_map():
+    """It is no agent's, also where all keyframes of the map are."""
+    mapper, edge = two_maps(), Edge(Config(), 7)
+    tell(edge, 11, hello(run_id=11))
+    findings = []
+    for text in ("no pivot", "no memory"):
+        step = mapper.next_solve()
+        findings += mapper.finish_step(step, RuntimeError(text), 1.0)
+    effects = edge.handle(ed.MapperResult(findings), 2 * 10**9)
+    lines = [effect.fields for effect in effects if isinstance(effect, ed.WriteEvent)]
+    assert [(line["event"], line["agent"], line["map_id"]) for line in lines] == [
+        ("step failed", None, "ann-1/0"),
+        ("step failed", None, "bob-1/0"),
+    ]
+    assert lines[0]["reason"].startswith("map ann-1/0: solve: RuntimeError: no pivot")
+    assert mapper.report()["failed_steps"] == 2
+
+
+def test_a_map_that_cannot_be_prepared_for_the_solver_is_reported(monkeypatch):
+    mapper = two_maps()
+    make_job = mapper.atlas.solving.make_job
+
+    def fails_for_ann(map_id):
+        return make_job(map_id) if map_id == "bob-1/0" else [][0]
+
+    monkeypatch.setattr(mapper.atlas.solving, "make_job", fails_for_ann)
+    step = mapper.next_solve()
+    assert step.job.map_id == "bob-1/0"
+    (failure,) = mapper.take_failures()
+    assert (failure.event, failure.agent, failure.map_id) == ("step failed", None, "ann-1/0")
+    assert not mapper.take_failures()
+
+
+def test_failures_of_one_map_do_not_hide_those_of_another():
+    edge = Edge(Config(), 7)
+    failures = [MapEvent(None, "step failed", "map a/0: solve: x", map_id="a/0")] * 100
+    edge.handle(ed.MapperResult(failures), 10**9)
+    other = ed.MapperResult([MapEvent(None, "step failed", "map b/0: solve: x", map_id="b/0")])
+    (line,) = edge.handle(other, 10**9)
+    assert line.fields["map_id"] == "b/0"
+
+
 def test_under_load_keyframes_are_stored_but_not_queried():
     slow = town(job_ms=4000)
     slow.walk(40)
@@ -283,7 +337,7 @@ def test_skipped_keyframes_are_queried_later_and_merge_maps():
         mapper.add_run(name, hello(name, run_id=run_id))
         for keyframe in both.keyframes(name):
             mapper.add_keyframe(name, keyframe)
-    looked, solver = 0, PoseGraphSolver(GraphConfig())
+    looked, solver = 0, PoseGraphSolver()
     assert len(mapper.report()["maps"]) == 2
     while (step := mapper.next_lookup() or mapper.next_solve()) is not None:
         mapper.finish_step(step, step.run(solver) if isinstance(step, SolveStep) else step.run(), 1.0)

@@ -8,8 +8,7 @@ import pytest
 from helpers.model_edge import S
 
 from share.protocol.edge_records import EventLog
-from share.protocol.reply_validation import FaultDeduplicator
-from share.timing import Throttle
+from share.timing import LineLimiter, Throttle
 
 
 def test_a_burst_passes_then_the_rate_and_the_rest_is_counted() -> None:
@@ -57,16 +56,26 @@ def test_suppressed_events_are_counted() -> None:
 
 
 def test_a_fault_is_new_again_after_a_minute_of_absence() -> None:
-    lasting = FaultDeduplicator()
-    said = [t for t in range(0, 600, 2) if lasting.is_new("wants keys", t * S)]
+    lines = LineLimiter()
+    said = [t for t in range(0, 600, 2) if lines.admit_new("wants keys", t * S)]
     assert said == [0]
-    assert not lasting.is_new("wants keys", 655 * S)
-    assert lasting.is_new("another key", 656 * S)
-    assert lasting.is_new("wants keys", 716 * S)
+    assert not lines.admit_new("wants keys", 655 * S)
+    assert lines.admit_new("another key", 656 * S)
+    assert lines.admit_new("wants keys", 716 * S)
+    assert not lines.admit_new("wants more keys", 716 * S, "another key")
+    assert lines.admit_new("and one more", 718 * S, "a third")
 
 
 def test_the_number_of_remembered_faults_is_bounded() -> None:
-    lasting = FaultDeduplicator()
-    assert all(lasting.is_new(str(k), k) for k in range(1000))
-    assert not lasting.is_new("999", 1000)
-    assert lasting.is_new("980", 1001)  # forgotten, although it was seen less than a minute ago
+    lines = LineLimiter()
+    assert all(lines.admit_new(str(k), k) for k in range(20))
+    assert not lines.admit_new("19", 6 * S)
+    assert lines.admit_new("0", 6 * S)  # forgotten, although it was seen less than a minute ago
+
+
+def test_lines_are_limited_printable_and_short() -> None:
+    lines = LineLimiter()
+    said = [lines.admit(f"{k} \x1b[2J" + "x" * 1000, 0) for k in range(50)]
+    assert [k for k, line in enumerate(said) if line is not None] == list(range(20))
+    assert all(line.isprintable() and len(line) <= 300 for line in said[:20] if line)
+    assert lines.admit("all is well", 5 * S) == "all is well (30 lines before this were suppressed)"

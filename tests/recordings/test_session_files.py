@@ -81,3 +81,5 @@ def test_unknown_and_missing_agents_are_refused(session):
         open_source(f"{session}/rob")
     with pytest.raises(ShareError, match="is a session; name one of its agents"):
         open_source(str(session))
+    with pytest.raises(UsageError, match=r"/ann: is one agent of a session; give the session: "):
+        read_session(session / "ann")

@@ -19,7 +19,7 @@ import pytest
 
 from share.geometry.camera import ImuBias
 from share.recordings.trajectory import read_tum
-from share.sensors.imu_memory import SavedBias, save_bias
+from share.runtime.imu_bias_store import SavedBias, save_bias
 
 pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

@@ -24,9 +24,9 @@ from share.odometry import initialisation
 from share.odometry.track_result import TrackResult
 from share.recordings.calibration import Calibration
 from share.runtime.capture import Capture
+from share.runtime.imu_bias_store import SavedBias, load_bias, save_bias
 from share.runtime.offline_tracking import TrackingOutput, track
 from share.runtime.source import Source, open_source
-from share.sensors.imu_memory import SavedBias, load_bias, save_bias
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

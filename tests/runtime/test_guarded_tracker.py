@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import threading
 import time
 
 import numpy as np
@@ -215,4 +216,32 @@ def test_reported_failures_are_bounded() -> None:
     for k in range(100):
         with guard.step(f"step {k}"):
             raise ValueError
-    assert (guard.failure_count, len(said)) == (100, 16)
+    assert (guard.failure_count, len(said)) == (100, 20)
+
+
+def test_two_threads_do_not_limit_lines_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An agent's tracker and its main thread share the guard."""
+    inside, overlaps = threading.Lock(), []
+
+    class Limiter:
+        def admit_new(self, text: str, now_ns: int, kind: str) -> None:
+            overlaps.append(not inside.acquire(blocking=False))
+            time.sleep(0.05)
+            if not overlaps[-1]:
+                inside.release()
+
+    monkeypatch.setattr(guarded_tracker, "LineLimiter", Limiter)
+    guard = FaultGuard(lambda text: None)
+    threads = [threading.Thread(target=guard.record, args=("a step", failure())) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (guard.failure_count, overlaps) == (2, [False, False])
+
+
+def failure() -> Exception:
+    try:
+        raise ValueError("by chance")
+    except ValueError as error:
+        return error

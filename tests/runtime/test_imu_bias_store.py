@@ -12,8 +12,7 @@ from helpers.plain_walk import RIG
 from share.cameras.live import LiveSource
 from share.config import Config
 from share.geometry.camera import ImuBias
-from share.runtime.imu_bias_store import ImuBiasStore
-from share.sensors.imu_memory import POWER_ON_ACCEL, bias_file
+from share.runtime.imu_bias_store import POWER_ON_ACCEL, ImuBiasStore, bias_file
 
 DAY_NS = 86_400 * 10**9
 NOON_NS = 1_790_000_000 * 10**9

@@ -13,8 +13,9 @@ from helpers.map_changes import ANN, BOB, small_map
 
 from share.config import Config, EdgeConfig
 from share.errors import StoreError
+from share.mapping.corrections import MapEvent
 from share.protocol.edge import Edge
-from share.protocol.edge_events import ChangesSaved, TrackerLost
+from share.protocol.edge_events import ChangesSaved, MapperResult, TrackerLost
 from share.runtime import edge as edge_module
 from share.runtime.edge import EdgeRun
 from share.runtime.map_writer import MapWriter
@@ -267,3 +268,21 @@ def test_a_failed_report_is_shown_as_stale(edge, monkeypatch):
         until(lambda: any("stuck" in line for line in run.report()["trouble"]))
         assert [line["event"] for line in events].count("internal error") == 1
     until(lambda: not any("stuck" in line for line in run.report()["trouble"]))
+
+
+def fails_to_solve(inbox, answer, settings):
+    """A mapper whose first solution fails."""
+    reason = "map ann-1/0: solve: RuntimeError: no pivot"
+    answer(MapperResult([MapEvent(None, "step failed", reason, map_id="ann-1/0")]))
+    while inbox.get() is not END:
+        pass
+
+
+def test_a_failed_solution_is_shown_with_its_map(edge):
+    """The page lists it; the edge itself is healthy."""
+    run, _, events = edge(fails_to_solve)
+    until(lambda: run.report().get("refused"))
+    assert run.report()["refused"] == ["map ann-1/0: solve: RuntimeError: no pivot"]
+    assert run.report()["trouble"] == []
+    (line,) = [event for event in events if event["event"] == "step failed"]
+    assert (line["agent"], line["map_id"]) == (None, "ann-1/0")

@@ -167,10 +167,10 @@ def test_metrics_are_read_back():
         ("share_edge_agent_info", bob | {("state", "OK"), ("map", "")}, 1),
         ("share_edge_maps", set(), 2),
         ("share_edge_map_keyframes", {("map", "3")}, 1),
-        ("share_edge_failed_jobs_total", set(), 2),
-        ("share_edge_job_seconds", {("job", "solve"), ("quantile", "0.95")}, 0.03),
-        ("share_edge_job_seconds_count", {("job", "solve")}, 4),
-        ("share_edge_job_seconds_sum", {("job", "solve")}, 0.08),
+        ("share_edge_failed_steps_total", set(), 2),
+        ("share_edge_step_seconds", {("step", "solve"), ("quantile", "0.95")}, 0.03),
+        ("share_edge_step_seconds_count", {("step", "solve")}, 4),
+        ("share_edge_step_seconds_sum", {("step", "solve")}, 0.08),
     ]:
         assert read[name, frozenset(labels)] == pytest.approx(value), name
 

@@ -176,9 +176,9 @@ def test_the_number_of_sample_points_is_bounded_for_any_interval(frustum: Frustu
     assert 9 <= SampledFrustum(frustum, interval_m).points.shape[1] <= 2_048_000
 
 
-def test_a_near_plane_beyond_the_far_plane_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"near_m: 6.0 m is not nearer than far_m, 5.0 m"):
-        from_mapping(ControlConfig, {"near_m": 6.0}, "control")
+def test_a_far_plane_before_the_near_plane_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"far_m: 0.2 m is not beyond the near plane, 0.3 m"):
+        from_mapping(ControlConfig, {"far_m": 0.2}, "control")
 
 
 @pytest.mark.parametrize("frustum", [(0.0, 1.0, 0.3, 5.0), (1.0, math.pi, 0.3, 5.0), (1.0, 1.0, 5.0, 5.0)])

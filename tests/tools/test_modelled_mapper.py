@@ -10,7 +10,7 @@ from helpers.edge_sim import Person, walls
 from helpers.experiments import experiment
 from helpers.room_simulation import MS, tracked_frames
 
-from share.config import Config, EdgeConfig
+from share.config import NEAR_M, Config, EdgeConfig
 from share.geometry import se3
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS
 from share.lab.evaluate.simulation import ProcessingDelays, Simulation
@@ -32,7 +32,7 @@ def played(
     rigs = {name: person.hello.rig for name, person in people.items()}
     there = {name: np.array(person.T_world_body) for name, person in people.items()}
     there["bob"][:, 0, 3] += apart_m
-    truth = modelled_mapper.GroundTruth(config.control.near_m, config.control.far_m, rigs, there)
+    truth = modelled_mapper.GroundTruth(NEAR_M, config.control.far_m, rigs, there)
     mapper = model and modelled_mapper.ModelledMapper(
         config, truth, lambda name, ns: stamps_ns[name].index(ns), model, seed
     )

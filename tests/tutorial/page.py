@@ -1,16 +1,18 @@
 """docs/start/first-room.md as what is typed on which machine, and what was shown there.
 
 In a fenced block, `MACHINE$ words` is typed; a line that ends in a backslash continues in the next. What
-follows up to the next prompt was shown. Within a block machines run in parallel; blocks run in sequence.
+follows up to the next prompt was shown; a line `…` stands for lines that the page leaves out. Within a block
+machines run in parallel; blocks run in sequence.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 MACHINES = ("laptop", "headset", "robot")
+LEFT_OUT = "…"
 _FENCE = "```"
 _TYPED = re.compile(rf"({'|'.join(MACHINES)})\$ (.*)")
 
@@ -73,8 +75,20 @@ def _steps(lines: Sequence[str]) -> Iterator[Step]:
 
 
 def renewed(text: str, walked: Sequence[tuple[Block, Sequence[Step]]]) -> str:
-    """The page with what these steps showed in place of what stood there."""
+    """The page with what these steps showed in place of what stood there, abridged where that was."""
     lines = text.splitlines()
     for block, steps in reversed(walked):
-        lines[block.start : block.end] = [line.rstrip() for step in steps for line in step.lines]
+        new = [abridged(step, old) for old, step in zip(block.steps, steps, strict=True)]
+        lines[block.start : block.end] = [line.rstrip() for step in new for line in step.lines]
     return "\n".join(lines) + "\n"
+
+
+def abridged(step: Step, old: Step) -> Step:
+    """The step with as many lines before and after a line `…` as `old` shows; whole where `old` has none."""
+    if LEFT_OUT not in old.shown:
+        return step
+    first = old.shown.index(LEFT_OUT)
+    last = len(step.shown) - (len(old.shown) - first - 1)
+    if first >= last:
+        return step
+    return replace(step, shown=(*step.shown[:first], LEFT_OUT, *step.shown[last:]))

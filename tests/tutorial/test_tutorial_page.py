@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from machines import Machine
 from page import blocks, renewed
 
@@ -44,6 +46,17 @@ def test_what_was_shown_is_put_there_and_nothing_else_changes() -> None:
     assert renewed(PAGE, [(first, first.steps), (second, second.steps)]) == PAGE
     quiet = [(first, [type(step)(step.machine, step.typed) for step in first.steps])]
     assert renewed(PAGE, quiet) == PAGE.replace("shown\n\nshown below an empty line\n", "")
+
+
+def test_a_page_that_leaves_lines_out_leaves_out_those_of_the_next_walk() -> None:
+    page = PAGE.replace("shown\n\nshown below an empty line", "table\n…\nend")
+    first, _ = blocks(page)
+    one, two = first.steps
+    assert one.shown == ("table", "…", "end")
+    longer = replace(one, shown=("head", "a", "b", "c", "tail"))
+    assert renewed(page, [(first, [longer, two])]) == page.replace("table", "head").replace("end\n", "tail\n")
+    short = replace(one, shown=("head", "tail"))
+    assert "head\ntail\nrobot$ two" in renewed(page, [(first, [short, two])])
 
 
 def test_machines_are_shells_with_jobs_and_copy_from_each_other(tmp_path) -> None:

@@ -32,7 +32,6 @@ from helpers.exact_solver import make_exact  # noqa: E402
 from helpers.gtsam_graph import solve  # noqa: E402
 from helpers.rooms import Room, simulate  # noqa: E402
 
-from share.config import GraphConfig  # noqa: E402
 from share.mapping.graph.covariance import CovariancePaths  # noqa: E402
 from share.mapping.graph.solver import (  # noqa: E402
     GraphSolution,
@@ -41,7 +40,6 @@ from share.mapping.graph.solver import (  # noqa: E402
 )
 from share.types import F64  # noqa: E402
 
-CONFIG = GraphConfig()
 NEW = 3  # keyframes a step
 FIRST_LOOP = 10**6  # odometry edges have the ids of the keyframes that they lead to
 
@@ -78,7 +76,7 @@ def cold(room: Room, agents: int) -> dict[str, float]:
     news = change(room, range(n), dict(enumerate(room.guess)), room.closures)
     times, pickling = [], []
     for _ in range(5):
-        solver = PoseGraphSolver(CONFIG)
+        solver = PoseGraphSolver()
         times.append(cpu_ms(lambda s=solver: (s.update(news), s.solve(0, range(n - agents, n))))[0])
         pickling.append(cpu_ms(lambda: pickle.loads(pickle.dumps(news, protocol=5)))[0])
     return {"cold": round(np.median(times), 1), "pickle": round(np.median(pickling), 2)}
@@ -101,7 +99,7 @@ def one_warm(n: int, agents: int, density: float, seed: int, steps: int) -> tupl
     """Return times [ms], and the distance of every pose from the minimum [mm] at the end."""
     room = simulate(n, agents, seed, density)
     first = n - steps * NEW
-    solver = PoseGraphSolver(CONFIG)
+    solver = PoseGraphSolver()
     loops = [edge for edges in room.loops[:first] for edge in edges]
     solver.update(change(room, range(first), dict(enumerate(room.guess[:first])), loops))
     solution, known, times = solver.solve(0), loops, []
@@ -113,7 +111,7 @@ def one_warm(n: int, agents: int, density: float, seed: int, steps: int) -> tupl
         wanted = range(k + NEW - agents, k + NEW)
         spent, solution = cpu_ms(lambda c=news, w=wanted: (solver.update(c), solver.solve(0, w))[1])
         times.append(spent)
-    exact = PoseGraphSolver(CONFIG)
+    exact = PoseGraphSolver()
     exact.update(change(room, range(n), dict(enumerate(solution.poses)), known))
     with pytest.MonkeyPatch.context() as patch:
         make_exact(patch)

@@ -76,7 +76,7 @@ def bench_place(views: list[CameraView], n: int) -> dict[str, float]:
 
     def chain(query: CameraView) -> None:
         for candidate in index.query(query.view.descriptors, PLACE.candidates):
-            verify(query, views[candidate.id % len(views)], PLACE)
+            verify(query, views[candidate.id % len(views)])
 
     return {"add": add, "query": ask, "chain": median_ms([lambda v=v: chain(v) for v in asked])}
 
@@ -84,7 +84,7 @@ def bench_place(views: list[CameraView], n: int) -> dict[str, float]:
 def bench_pair(views: list[CameraView]) -> dict[str, float]:
     """Time matching and verification, the latter by outcome, of neighbouring and of distant views."""
     pairs = [*itertools.pairwise(views), *zip(views, views[7:], strict=False)]
-    accepts = [isinstance(verify(a, b, PLACE), Verification) for a, b in pairs]
+    accepts = [isinstance(verify(a, b), Verification) for a, b in pairs]
     matching = [
         lambda a=a, b=b: match_descriptors(a.view.descriptors, b.view.descriptors, MAX_BITS, 1.0)
         for a, b in pairs
@@ -92,7 +92,7 @@ def bench_pair(views: list[CameraView]) -> dict[str, float]:
 
     def verifying(outcome: bool) -> list[Callable[[], Any]]:
         chosen = [p for p, ok in zip(pairs, accepts, strict=True) if ok == outcome]
-        return [lambda a=a, b=b: verify(a, b, PLACE) for a, b in chosen]
+        return [lambda a=a, b=b: verify(a, b) for a, b in chosen]
 
     return {
         "match": median_ms(matching),

@@ -40,7 +40,7 @@ from share.odometry import feature_appearance, feature_matching, filter, initial
 from share.odometry.inertial_tracker import InertialTracker  # noqa: E402
 from share.odometry.landmarks import LandmarkMap  # noqa: E402
 from share.odometry.visual_tracker import VisualTracker  # noqa: E402
-from share.runtime.pipeline import make_source_tracker, read_frames  # noqa: E402
+from share.runtime.pipeline import make_tracker, read_frames  # noqa: E402
 from share.runtime.source import Source, open_source  # noqa: E402
 from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64  # noqa: E402
@@ -134,7 +134,7 @@ def bench_stereo(frames: int, stages: TimedStages) -> dict[str, Any]:
             FALLBACK_SCENE if reason else DEFAULT_SCENE, ("a=walk:",), seconds, profiles={"": profile}
         )
         source = open_source(str(make_cached_session(recipe) / "a"))
-        report[name] = bench(source, make_source_tracker(source, Config()), stages, frames)
+        report[name] = bench(source, make_tracker(source.rig, Config()), stages, frames)
     return report
 
 
@@ -153,7 +153,7 @@ def bench_recording(given: Path | None, stages: TimedStages) -> dict[str, Any]:
     if not given and not path.exists():
         return {"recording": "the kitchen is not beside this checkout; name another with --recording"}
     source = open_source(str(path))
-    return {path.name: bench(source, make_source_tracker(source, Config()), stages)}
+    return {path.name: bench(source, make_tracker(source.rig, Config()), stages)}
 
 
 def bench(source: Source, estimator: Tracker, stages: TimedStages, most: int | None = None) -> dict[str, Any]:

@@ -25,8 +25,7 @@ from tool_main import exit_code, line  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.lab.train.labels import labelled_keyframes  # noqa: E402
-from share.odometry.error_model.inference import OnnxSession, estimate_error  # noqa: E402
-from share.odometry.error_model.network import open_network, read_model  # noqa: E402
+from share.odometry.error_model.network import OnnxSession, estimate_error, open_network, read_model  # noqa: E402  # noqa: E402
 from share.runtime.source import open_source  # noqa: E402
 from share.types import F64  # noqa: E402
 

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 from share.config import Config
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
-from share.mapping.steps import MapEvent
 from share.types import Keyframe
 from share.wire.messages import Hello
 
@@ -19,7 +19,7 @@ class TimedMap:
     """A mapper and a solver that take turns. ms: CPU times of each kind of step."""
 
     def __init__(self, config: Config) -> None:
-        self.mapper, self.solver = Mapper(config), PoseGraphSolver(config.graph)
+        self.mapper, self.solver = Mapper(config), PoseGraphSolver()
         self.ms: dict[str, list[float]] = defaultdict(list)
         self.findings: list[MapEvent] = []
 

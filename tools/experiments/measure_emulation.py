@@ -34,8 +34,9 @@ from share.lab.emulate.world.layout import Layout  # noqa: E402
 from share.lab.emulate.world.ray_casting import RayCaster  # noqa: E402
 from share.lab.emulate.world.scenes import make_scene_layout  # noqa: E402
 from share.lab.mocap.factors import interpolate_samples, preintegrate  # noqa: E402
+from share.metrics.ate import ate_if_known  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402
-from share.runtime.offline_tracking import track, trajectory_accuracy  # noqa: E402
+from share.runtime.offline_tracking import track  # noqa: E402
 from share.runtime.source import Source, open_source  # noqa: E402
 from share.sensors.measurement import CAM0, IMU  # noqa: E402
 from share.types import F64, I64, U8, ImuBatch  # noqa: E402
@@ -81,7 +82,7 @@ def tracked(source: Source) -> Row:
     """Track by cameras alone, causal."""
     run = track(source, Config(), lambda _: None)
     whole = run.report["segments"] == 1
-    found = trajectory_accuracy(run, source.truth()) if whole else None
+    found = ate_if_known(run.trajectory, source.truth()) if whole else None
     return {
         "track_frames": run.report["frames"],
         "track_tracked": run.report["tracked"],

@@ -80,7 +80,7 @@ class Replay:
     """Replays one set, keyframe by keyframe."""
 
     def __init__(self, made: KeyframeSet, config: Config) -> None:
-        self._made, self._mapper, self._solver = made, Mapper(config), PoseGraphSolver(config.graph)
+        self._made, self._mapper, self._solver = made, Mapper(config), PoseGraphSolver()
         self._seen: dict[str, int] = {}  # keyframes of each agent so far
         self._before = 0.0
         self.run = JoinRun(made.recipe.seed)

@@ -39,8 +39,7 @@ from places_views import (  # noqa: E402  # noqa: E402
 )
 from tool_main import exit_code  # noqa: E402
 
-from share.config import PlaceConfig  # noqa: E402
-from share.mapping.recognition.verification import MAX_SIGMA_DEG  # noqa: E402
+from share.mapping.recognition.verification import MAX_SIGMA_DEG, MIN_INLIERS  # noqa: E402
 from share.types import F64  # noqa: E402
 
 INLIERS = (8, 10, 12, 14, 16, 18, 20, 24, 28, 32, 40, 50, 65, 80, 100, 130, 160, 200)
@@ -69,7 +68,7 @@ def measure(options: argparse.Namespace) -> None:
         recalls[views.name], served = recall_at(views, [v for v in rooms if v is not views])
         pairs = tried(views, options.far)
         curves[views.name] = over_both(pairs)
-        here[views.name] = point(pairs, PlaceConfig.min_inliers, MAX_SIGMA_DEG)
+        here[views.name] = point(pairs, MIN_INLIERS, MAX_SIGMA_DEG)
         row = report(views, recalls[views.name], served, pairs, here[views.name])
         print(json.dumps(row), flush=True)
     if options.picture:
@@ -79,7 +78,7 @@ def measure(options: argparse.Namespace) -> None:
 def over_both(pairs: Tried) -> tuple[list[Point], list[Point]]:
     """Return curves over inliers at the allowed sigma, and over sigma at the allowed inliers."""
     inliers = [point(pairs, n, MAX_SIGMA_DEG) for n in INLIERS]
-    return inliers, [point(pairs, PlaceConfig.min_inliers, sigma) for sigma in SIGMAS]
+    return inliers, [point(pairs, MIN_INLIERS, sigma) for sigma in SIGMAS]
 
 
 def report(views: Views, recall: Any, served: float, pairs: Tried, here: Point) -> dict[str, Any]:

@@ -44,11 +44,11 @@ from share.geometry.se3 import umeyama  # noqa: E402
 from share.lab.emulate.motion.recorded import EUROC_OPTIONS, open_recorded_motion  # noqa: E402
 from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
 from share.lab.emulate.session import make_cached_session  # noqa: E402
-from share.metrics.ate import ate  # noqa: E402
+from share.metrics.ate import ate, ate_if_known  # noqa: E402
 from share.recordings import tables  # noqa: E402
 from share.recordings.trajectory import Trajectory, make_poses  # noqa: E402
-from share.runtime.offline_tracking import TrackingOutput, track, trajectory_accuracy  # noqa: E402
-from share.runtime.pipeline import make_source_tracker, read_frames  # noqa: E402
+from share.runtime.offline_tracking import TrackingOutput, track  # noqa: E402
+from share.runtime.pipeline import make_tracker, read_frames  # noqa: E402
 from share.runtime.source import Source, open_source  # noqa: E402
 from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64, TrackState  # noqa: E402
@@ -158,7 +158,7 @@ def followed(folder: Path) -> list[Seen]:
     if given is None:
         raise DataError(f"{folder}: has no ground truth")
     T_mocap_imu = se3.inverse(open_recorded_motion(folder, EUROC_OPTIONS).path.fit.T_body_mocap)
-    tracker, segment, out = make_source_tracker(source, settings), 0, []
+    tracker, segment, out = make_tracker(source.rig, settings), 0, []
     for frame in read_frames(source, settings, SequencerCounters()):
         result = tracker.track(frame)
         if result.keyframe_ready:
@@ -195,7 +195,7 @@ def kitchen(options: argparse.Namespace) -> Iterator[str]:
         first, last = map(int, frames.split(":"))
         source = open_source(str(folder), frames=slice(first, last))
         run = track(source, Config(), lambda _: None)
-        found = trajectory_accuracy(run, source.truth()) if run.report["segments"] == 1 else None
+        found = ate_if_known(run.trajectory, source.truth()) if run.report["segments"] == 1 else None
         error = f"{100 * found.rmse:.2f}" if found else "broke"
         tracked = f"{run.report['tracked']} of {run.report['frames']}"
         yield f"| {frames} | {error} | {before} | {tracked} | {run.report['lost_s']:.1f} |"

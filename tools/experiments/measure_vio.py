@@ -3,7 +3,7 @@
     python tools/experiments/measure_vio.py [--only NAME] [--seeds 101,102,103] [--data FOLDER] [--again]
 
 Causal poses of every frame. Sessions are made once (minutes each) and kept in the cache; a run by the same
-code is not repeated. In --out: a JSON and the series of each run, table.md; in --pictures: a PNG a sequence.
+code is not repeated. In --out: a JSON and the series of each run, table.md, a PNG a sequence.
 CPU is process time of one thread without decoding; all other figures are deterministic.
 """
 
@@ -23,7 +23,7 @@ import numpy as np  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 from vio_picture import Curves, draw  # noqa: E402
 from vio_run import figures, follow, series  # noqa: E402
-from vio_sequences import ROOT, SECONDS, Sequence, chosen_sequences, code_version, keep, kept  # noqa: E402
+from vio_sequences import SECONDS, Sequence, chosen_sequences, code_version, keep, kept  # noqa: E402
 from vio_sequences import parser as sequences_parser  # noqa: E402
 
 from share.config import Config  # noqa: E402
@@ -70,9 +70,7 @@ def main() -> int:
 
 
 def arguments() -> argparse.Namespace:
-    parser = sequences_parser(__doc__, "vio", (101, 102, 103))
-    parser.add_argument("--pictures", type=Path, default=ROOT / "docs" / "pictures" / "vio")
-    return parser.parse_args()
+    return sequences_parser(__doc__, "vio", (101, 102, 103)).parse_args()
 
 
 def measure(options: argparse.Namespace) -> None:
@@ -119,7 +117,7 @@ def picture(sequence: Sequence, rows: list[Row], options: argparse.Namespace) ->
         with np.load(_file(options.out, sequence.name, row["seed"]).with_suffix(".npz")) as curves:
             runs.append(Curves(f"seed {row['seed']}: ATE {_cm(row)}", **curves))
     what = f"{sequence.motion.rstrip(':')} in {sequence.scene}, {sequence.profile}, {SECONDS:g} s"
-    draw(options.pictures / f"{sequence.name}.png", f"{sequence.name}: {what}", runs)
+    draw(options.out / f"{sequence.name}.png", f"{sequence.name}: {what}", runs)
 
 
 def _file(out: Path, name: str, seed: int) -> Path:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from keyframe_set import KeyframeSet, Spacing, keyframe_set
 
-from share.config import PlaceConfig
 from share.geometry import se3
 from share.lab.emulate.recipe import SessionRecipe
 from share.lab.emulate.world.scenes.corridor import twin_corridors
@@ -88,8 +87,7 @@ def _twin(made: KeyframeSet) -> F64 | None:
 
 
 FALSE_M, FALSE_DEG = 0.25, 5.0
-LOOSE = PlaceConfig(min_inliers=8)
-LOOSE_LIMITS = {"MIN_DIRECTION_INLIERS": 4, "MAX_SIGMA_DEG": 3.0}  # of the verification
+LOOSE_LIMITS = {"MIN_INLIERS": 8, "MIN_DIRECTION_INLIERS": 4, "MAX_SIGMA_DEG": 3.0}  # of the verification
 
 
 class Tried(NamedTuple):
@@ -133,7 +131,7 @@ def _kind(views: Views, q: int) -> np.ndarray:
 
 def _try(views: Views, q: int, c: int, stands_for: float) -> tuple[float, ...]:
     true = bool(views.true(q)[c])
-    found = verify(views.sights[q], views.sights[c], LOOSE)
+    found = verify(views.sights[q], views.sights[c])
     if not isinstance(found, Verification):
         return true, False, False, 0, 0.0, stands_for
     right = _right(views.error(q, c, found.T_c_q))

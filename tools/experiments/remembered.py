@@ -7,20 +7,21 @@ import hashlib
 from collections.abc import Collection
 from typing import Any
 
-from share.config import Config, PlaceConfig
+from share.config import Config
+from share.mapping.corrections import MapEvent
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
-from share.mapping.steps import LookupStep, MapEvent, Step, VerifyStep
+from share.mapping.steps import LookupStep, Step, VerifyStep
 from share.wire.messages import Hello
 
-_seen: dict[tuple[bytes, bytes, PlaceConfig], Verification | Refusal] = {}
+_seen: dict[tuple[bytes, bytes], Verification | Refusal] = {}
 
 
 class _Remembered(VerifyStep):
     """A verification step; its result depends on the two views alone."""
 
     def run(self) -> Verification | Refusal:
-        key = _digest(self.query_view), _digest(self.candidate_view), self.config
+        key = _digest(self.query_view), _digest(self.candidate_view)
         if key not in _seen:
             _seen[key] = super().run()
         return _seen[key]
@@ -43,7 +44,7 @@ class RememberingMapper(Mapper):
         look = super().next_lookup()
         if not isinstance(look, VerifyStep):
             return look
-        return _Remembered(look.node_id, look.query_view, look.candidate_id, look.candidate_view, look.config)
+        return _Remembered(look.node_id, look.query_view, look.candidate_id, look.candidate_view)
 
     def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
         findings = super().finish_step(step, result, ms)

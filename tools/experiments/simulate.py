@@ -34,7 +34,7 @@ from measure_joins import configured  # noqa: E402
 from modelled_mapper import GroundTruth, ModelledMapper, RecognitionModel  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
-from share.config import POLICY_NAMES, STREAMED, Config  # noqa: E402
+from share.config import NEAR_M, POLICY_NAMES, STREAMED, Config  # noqa: E402
 from share.geometry.interpolation import Trajectory  # noqa: E402
 from share.geometry.se3 import transform, umeyama  # noqa: E402
 from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
@@ -96,7 +96,7 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
     }
     mapper = None
     if modelled:
-        known = truth_of(made, config.control.near_m, config.control.far_m)
+        known = truth_of(made, NEAR_M, config.control.far_m)
         mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
     links = LinkAssignment.parse(link)
     links.check(made.agents)

@@ -18,7 +18,7 @@ from share.metrics.frame_log import RunLog
 from share.metrics.rpe import rpe_time
 from share.odometry.track_result import TrackResult
 from share.recordings.trajectory import Trajectory
-from share.runtime.pipeline import make_source_tracker, read_frames
+from share.runtime.pipeline import make_tracker, read_frames
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
 from share.types import F64, I64, TrackState
@@ -68,7 +68,7 @@ class Series:
 
 def follow(source: Source, settings: Config) -> TrackedRun:
     """Track every frame in turn, causal. Decoding does not count."""
-    tracker, run = make_source_tracker(source, settings), TrackedRun()
+    tracker, run = make_tracker(source.rig, settings), TrackedRun()
     for frame in read_frames(source, settings, SequencerCounters()):
         began = time.process_time()
         result = tracker.track(frame)

@@ -28,14 +28,13 @@ class HandEye:
     motions.
 
     rotation_rms_by_axis (3,): rms rotation, rad, of the motions about their principal axes, largest first.
-    rotation_rms rad, position_rms m: weighted residuals.
+    rotation_rms rad: weighted residuals.
     """
 
     T_a_b: F64
     cov: F64
     rotation_rms_by_axis: F64
     rotation_rms: float
-    position_rms: float
     motions: int
 
 
@@ -105,7 +104,7 @@ def _refine(A: F64, B: F64, X: F64, rotation_rms_by_axis: F64) -> HandEye:
         JW = J / sigma[:, None] ** 2 * weight[:, None, None]
         cov = np.linalg.inv(np.einsum("nij,nik->jk", JW, J))
         X = X @ se3.exp(-cov @ np.einsum("nij,ni->j", JW, residuals))
-    return HandEye(X, cov, rotation_rms_by_axis, rms[0], rms[1], len(A))
+    return HandEye(X, cov, rotation_rms_by_axis, rms[0], len(A))
 
 
 # Check of a mounting from another source by hand-eye.

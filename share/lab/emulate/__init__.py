@@ -1,0 +1,1 @@
+"""The emulator: sessions of agents in a virtual room (`share emulate`)."""

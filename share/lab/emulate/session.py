@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +21,8 @@ import numpy as np
 from share import __version__
 from share.errors import ShareError, UsageError
 from share.files.arrays import read_array
-from share.files.writing import atomic_write, lock_folder, sync_folder, writable_dir, write_errors, xdg_folder
+from share.files.locks import folder_locked, lock_folder
+from share.files.writing import atomic_write, sync_folder, writable_dir, write_errors, xdg_folder
 from share.lab.calibrate.target import T_WORLD_TARGET, TARGET, target_mapping
 from share.lab.emulate import drawing
 from share.lab.emulate.drawing import ChunkJob
@@ -70,7 +69,7 @@ def make_cached_session(
     """Return the session of this recipe in `cache` (default: the user's); make it if it is not there."""
     out = (default_cache() if cache is None else cache) / f"session-{recipe.digest}"
     if not out.exists():
-        with _cache_lock(out.parent):
+        with folder_locked(writable_dir(out.parent)):
             if not out.exists():  # another process may have made it while this one waited
                 make_session(recipe, out, workers, progress)
     return out
@@ -191,20 +190,6 @@ def _session_yaml(recipe: SessionRecipe, prepared: PreparedSession) -> str:
             T_WORLD_TARGET: placed_target.T_world_target.tolist()
         }
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
-
-
-@contextmanager
-def _cache_lock(cache: Path) -> Iterator[None]:
-    """Let one process at a time write to `cache`. The lock is on the folder itself, so it leaves nothing
-    behind, and the system releases it if the process is killed."""
-    import fcntl
-
-    handle = os.open(writable_dir(cache), os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
 
 
 class PartialSession:

@@ -1,0 +1,1 @@
+"""Evaluation: play sessions, score them, compare policies, settings and trackers (`share evaluate`)."""

@@ -15,7 +15,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from share import startup
-from share.config import Config, load_config
+from share.config import Config, load_config, with_policy
 from share.errors import DataError, ShareError, UsageError, install_hint
 from share.files.yaml_file import read_settings
 from share.lab.evaluate.real_time import Progress, RunOptions
@@ -130,8 +130,9 @@ def _read_matching_trial(run: PlannedRun) -> Trial:
     Raises UsageError where its session, options or settings differ.
     """
     trial = read_trial(run.out)
-    text = settings_yaml(run.config, run.options.seed)
-    settings = read_settings(run.out / SETTINGS_FILE)
+    text = settings_yaml(with_policy(run.config, run.options.policy), run.options.seed)
+    # 0.2.0 and older wrote another policy into the settings than they played
+    settings = with_policy(read_settings(run.out / SETTINGS_FILE), trial.options.policy)
     actual = trial.session.folder.resolve(), trial.options, settings
     expected = run.session.folder.resolve(), run.options, load_config(text)
     if actual != expected:

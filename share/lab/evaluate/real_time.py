@@ -46,6 +46,7 @@ class MapMembership:
 EDGE_START_TIMEOUT_S = 20.0  # until the edge listens
 AGENT_GRACE_S = 60.0  # how much longer than its recording an agent may run
 _POLL_S = 0.5
+_STOP_S = 10.0
 _EDGE_NICENESS = 10  # on a shared core, about a tenth of an agent's time
 Processes = dict[str, subprocess.Popen[bytes]]
 
@@ -226,12 +227,12 @@ def running_child(log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes
             stop_child(process)
 
 
-def stop_child(process: subprocess.Popen[bytes], timeout_s: float = 10.0) -> int:
-    """Send SIGINT, kill after `timeout_s`, and return the exit code."""
+def stop_child(process: subprocess.Popen[bytes]) -> int:
+    """Send SIGINT, kill after `_STOP_S`, and return the exit code."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
     try:
-        return process.wait(timeout_s)
+        return process.wait(_STOP_S)
     except subprocess.TimeoutExpired:
         process.kill()
         return process.wait()

@@ -15,7 +15,7 @@ from share.files.json_file import none_to_nan, own_format_errors, read_json, rea
 from share.lab.evaluate.real_time import MapMembership
 from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 from share.lab.evaluate.trial import Trial
-from share.metrics.ate import Ate, JointAte, ate, joint_ate
+from share.metrics.ate import Ate, JointAte, ate_if_known, joint_ate
 from share.metrics.rpe import Rpe, rpe_frames, rpe_time
 from share.recordings.session import Session
 from share.recordings.trajectory import Trajectory, read_tum
@@ -51,20 +51,13 @@ def score_session(session: Session, folders: dict[str, Path]) -> SessionScore:
     for name, folder in folders.items():
         truth = read_tum(session.folder / "truth" / f"{name}.tum")
         report = read_json(folder / "report.json")
-        odometry = _ate(_trajectory(folder / "odom.tum"), truth)
+        odometry = ate_if_known(_trajectory(folder / "odom.tum"), truth)
         agents[name] = AgentScore(report, odometry, _trajectory(folder / "map.tum"), truth)
     return SessionScore(agents, largest_map_ate(agents))
 
 
 def _trajectory(path: Path) -> Trajectory | None:
     return read_tum(path) if path.stat().st_size else None
-
-
-def _ate(estimate: Trajectory | None, truth: Trajectory) -> Ate | None:
-    try:
-        return None if estimate is None else ate(estimate, truth)
-    except DataError:  # too few poses
-        return None
 
 
 def largest_map_ate(agents: dict[str, AgentScore]) -> JointAte | None:

@@ -20,11 +20,11 @@ import numpy as np
 
 from share.config import Config
 from share.lab.evaluate.emulated_network import Channel, NetworkModel
+from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.loops import KeyframeKey
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Verification
-from share.mapping.steps import MapEvent
 from share.metrics.frame_log import RunLog
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
@@ -143,7 +143,7 @@ class Simulation:
             self._schedule_next_frame(member)
         self.edge = Edge(config, session=1)
         self.mapper = Mapper(config) if mapper is None else mapper
-        self._solver = PoseGraphSolver(config.graph)
+        self._solver = PoseGraphSolver()
         self._inbox: deque[tuple[Delay, Callable[[], list[MapEvent]]]] = deque()  # of the mapper process
         self._is_busy = False  # the mapper process
         self._schedule(0, self._tick)
@@ -312,7 +312,7 @@ class Simulation:
         return self._delays.verify_refused
 
     def _send_findings(self, findings: list[MapEvent]) -> None:
-        changes = self.mapper.take_changes()
+        findings, changes = [*findings, *self.mapper.take_failures()], self.mapper.take_changes()
         if findings or changes:
             self._to_edge(ed.MapperResult(tuple(findings), changes))
 

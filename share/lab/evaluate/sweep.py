@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from share.config import Config
+from share.config import Config, with_policy
 from share.errors import UsageError
 from share.lab.evaluate import statistics
 from share.lab.evaluate.campaign import PlannedRun, check_unique_names
@@ -109,12 +109,13 @@ def plan_sweep(
 ) -> list[tuple[PlannedRun, Point]]:
     """Return all runs, with their points. Raises UsageError, ConfigError."""
     check_unique_names(sessions)
+    config = with_policy(config, options.policy)
     configs = {point: config_at(config, axes, point) for point in points}
     return [
         (
             PlannedRun(
                 session,
-                replace(options, seed=seed),
+                replace(options, policy=configs[point].edge.policy, seed=seed),
                 out / _run_name(session, axes, point, seed),
                 configs[point],
             ),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,9 @@ from share.geometry.camera import Camera
 from share.lab.peer_trackers import PeerTracker
 from share.lab.peer_trackers.peer_wire import PeerFrame, read_line, write_frame, write_line
 from share.recordings.trajectory import Trajectory
-from share.runtime.pipeline import make_source_tracker, read_frames
+from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.offline_tracking import track_frames
+from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.source import Source
 from share.sensors.measurement import IMU
 from share.sensors.sequencer import SequencerCounters
@@ -63,16 +64,25 @@ def peer_version(peer: PeerTracker, python: Path) -> str | None:
     return str(json.loads(process.stdout)["version"]) if process.returncode == 0 else None
 
 
+class _FaultsRaised(FaultGuard):
+    def record(self, what: str, error: Exception) -> None:
+        raise error
+
+
+def strict_tracker(source: Source, settings: Config) -> GuardedTracker:
+    """Return a tracker whose failures end the run: an experiment must not hide them.
+
+    Raises UsageError where none fits.
+    """
+    check_trackable(source.name, source.rig)
+    return GuardedTracker(source.rig, settings, _FaultsRaised(lambda text: None))
+
+
 def run_share(source: Source, settings: Config, show: ShowFrames = lambda done: None) -> TrackerRun:
     """Run SHARE's tracker. CPU time includes a frame's keyframe, not its decoding."""
-    tracker, run = make_source_tracker(source, settings), TrackerRun()
-    for frame in read_frames(source, settings, SequencerCounters()):
-        cpu_start_s = time.process_time()
-        result = tracker.track(frame)
-        if result.keyframe_ready:
-            tracker.make_keyframe(frame)
-        tracker.finish_keyframe()
-        run.add(frame.stamp_ns, result.T_odom_body, time.process_time() - cpu_start_s)
+    run, frames = TrackerRun(), read_frames(source, settings, SequencerCounters())
+    for step in track_frames(frames, strict_tracker(source, settings)):
+        run.add(step.frame.stamp_ns, step.result.T_odom_body, step.cpu_s)
         show(len(run.cpu_ms))
     run.cpu_ms = run.cpu_ms[1:]
     return run

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from share import __version__
-from share.config import Config
+from share.config import Config, with_policy
 from share.errors import ConfigError, DataError, UsageError
 from share.files.json_file import read_json, to_plain
 from share.files.writing import atomic_write, new_folder
@@ -76,7 +76,7 @@ def run_trial(
     """
     seconds = _duration_s(session)
     with new_folder(out) as work:
-        atomic_write(work / SETTINGS_FILE, settings_yaml(config, options.seed))
+        atomic_write(work / SETTINGS_FILE, settings_yaml(with_policy(config, options.policy), options.seed))
         began, machine = datetime.now(UTC), describe_machine()
         play_options = dataclasses.replace(options, config=str(work / SETTINGS_FILE))
         (play_in_virtual_time if options.virtual else play_in_real_time)(

@@ -27,6 +27,7 @@ from share.geometry.camera import Rig
 from share.lab.evaluate.emulated_network import LinkAssignment
 from share.lab.evaluate.real_time import MapMembership, Progress, RunOptions
 from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation, TrackedFrame
+from share.lab.evaluate.tracker_runs import strict_tracker
 from share.metrics.local_error import LocalError
 from share.odometry.error_model.network import open_error_model
 from share.plain_data import to_mapping
@@ -38,7 +39,8 @@ from share.runtime.error_estimators import (
     NoErrorEstimate,
     SynchronousErrorModel,
 )
-from share.runtime.pipeline import make_source_tracker, read_frames
+from share.runtime.offline_tracking import track_frames
+from share.runtime.pipeline import read_frames
 from share.runtime.run_files import AgentFiles
 from share.runtime.source import Source, open_source
 from share.sensors.sequencer import SequencerCounters
@@ -116,22 +118,19 @@ def _track_all(
 def _track_agent(
     source: Source, settings: Config, clock_offset_ns: int, error_source: str
 ) -> tuple[Rig, list[TrackedFrame]]:
-    tracker, errors = make_source_tracker(source, settings), _error_estimator(source, error_source)
-    frames = []
-    for frame in read_frames(source, settings, SequencerCounters()):
-        result = tracker.track(frame)
-        error_cm = errors.update(frame, result)
-        frames.append(
-            TrackedFrame(
-                arrival_ns=frame.stamp_ns - clock_offset_ns,
-                T_odom_body=result.T_odom_body,
-                error_cm=error_cm,
-                candidate=errors.make_keyframe(frame, tracker) if result.keyframe_ready else None,
-                stamp_ns=frame.stamp_ns,
-                state=result.state,
-                new_segment=result.new_segment,
-            )
+    tracker, errors = strict_tracker(source, settings), _error_estimator(source, error_source)
+    frames = [
+        TrackedFrame(
+            arrival_ns=step.frame.stamp_ns - clock_offset_ns,
+            T_odom_body=step.result.T_odom_body,
+            error_cm=step.error_cm,
+            candidate=step.candidate,
+            stamp_ns=step.frame.stamp_ns,
+            state=step.result.state,
+            new_segment=step.result.new_segment,
         )
+        for step in track_frames(read_frames(source, settings, SequencerCounters()), tracker, errors)
+    ]
     return source.rig, frames
 
 

@@ -1,7 +1,7 @@
 """Other trackers, each run in an interpreter of its own at the end of a pipe.
 
-`basalt.py` and `orbslam3.py` are scripts that need their tracker's package and numpy but nothing of SHARE, so
-that requirements never conflict. Both ends of the pipe use `peer_wire.py`.
+`basalt.py` and `orbslam3.py` are scripts that need their tracker's package and numpy but nothing of
+SHARE, so that requirements never conflict. Both ends of the pipe use `peer_wire.py`.
 """
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""Training of the error model (`share train`)."""

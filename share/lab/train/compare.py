@@ -18,8 +18,13 @@ from share.lab.train.keyframe_table import LabelCollection, collect_labels
 from share.lab.train.network import backbone_id, with_heads
 from share.lab.train.score import ErrorModelScore
 from share.lab.train.trained_heads import TrainedHeads, read_trained
-from share.odometry.error_model.inference import OnnxSession, estimate_error
-from share.odometry.error_model.network import backbone_features, open_network, read_model
+from share.odometry.error_model.network import (
+    OnnxSession,
+    backbone_features,
+    estimate_error,
+    open_network,
+    read_model,
+)
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe
 from share.types import F32, F64, AgentKind
 

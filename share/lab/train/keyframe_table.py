@@ -14,8 +14,8 @@ from share.array_table import ArrayTable
 from share.errors import UsageError
 from share.files.json_file import own_format_errors
 from share.lab.train.labels import Labels, read_labels
-from share.odometry.error_model.inference import MAX_ERROR_CM
 from share.odometry.error_model.inputs import INPUT_SHAPES, ErrorModelInput
+from share.odometry.error_model.network import MAX_ERROR_CM
 from share.types import F32, I64, U8
 
 _MIN_CM = 0.01

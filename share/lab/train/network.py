@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from share.lab.train.trained_heads import TrainedHeads
-from share.odometry.error_model.inference import OUTPUTS
 from share.odometry.error_model.inputs import INPUT_SHAPES, RECENT_NAMES, SCALAR_NAMES
+from share.odometry.error_model.network import OUTPUTS
 from share.types import F32
 
 DEEP_SIZE, EMBEDDING_SIZE, JOINED_SIZE = 1280, 64, 96

@@ -48,11 +48,11 @@ def fold_standardisation(weights: dict[str, F32], layer: str, mean: F32, deviati
     }
 
 
-def conformal_margin(predicted: F32, log_error: F32, coverage: float = INTERVAL_COVERAGE) -> float:
+def conformal_margin(predicted: F32, log_error: F32) -> float:
     """Return the margin by which intervals of predicted (N, 3) must widen on both sides to cover a new error
-    with probability `coverage` (conformalised quantile regression, Romano et al. 2019)."""
+    with probability `INTERVAL_COVERAGE` (conformalised quantile regression, Romano et al. 2019)."""
     excess = np.sort(np.maximum(predicted[:, 1] - log_error, log_error - predicted[:, 2]))
-    rank = math.ceil((len(excess) + 1) * coverage)
+    rank = math.ceil((len(excess) + 1) * INTERVAL_COVERAGE)
     return float(excess[min(rank, len(excess)) - 1])
 
 

@@ -24,6 +24,7 @@ from share.mapping.graph.edges import PoseEdge
 from share.mapping.recognition.depth_scale import DepthScale
 from share.types import F64
 
+SCALE_TOLERANCE = 0.015  # log scale that is harmless; agents disagree whose depths or paths differ by more
 _MAX_LOOPS = 32  # kept of two segments
 _MAX_SCALES = 160
 _MAX_ROTATION_RAD = np.radians(1.5)  # harmless below
@@ -83,20 +84,19 @@ class SegmentPairLoops:
 
 
 class AgentPair:
-    """Comparison of two agents, in alphabetical order. tolerance: log scale that does no harm.
+    """Comparison of two agents, in alphabetical order.
 
     by_segments: loops by pair of segments; those of ended segments are pooled. severity: a disagreement
     begins at 1. reason_second: contradictions of the second agent against the first; reason_first: the
     reverse. pooled_depth_scale: of more loops than are kept in by_segments.
     """
 
-    def __init__(self, tolerance: float) -> None:
+    def __init__(self) -> None:
         self.by_segments: dict[SegmentPair, SegmentPairLoops] = {}
         self.pooled_depth_scale: ScalarEstimate | None = None
         self.severity = 0.0
         self.disagrees = False
         self.reason_second = self.reason_first = ""
-        self._tolerance = tolerance
         self._depth_scales = deque[DepthScale](maxlen=_MAX_SCALES)
         self._depth_scale: ScalarEstimate | None = None
         self._recent_depth_scale: ScalarEstimate | None = None
@@ -116,7 +116,7 @@ class AgentPair:
     def agrees(self) -> bool:
         """True if the depths are known to agree and nothing contradicts."""
         depth_scale = self._depth_scale
-        return not self.disagrees and depth_scale is not None and depth_scale.sigma < self._tolerance / 2
+        return not self.disagrees and depth_scale is not None and depth_scale.sigma < SCALE_TOLERANCE / 2
 
     def add_loop(self, segment_pair: SegmentPair, loop: InterAgentLoop) -> bool:
         """Add a loop; return whether it is time for another comparison."""
@@ -180,7 +180,7 @@ class AgentPair:
     def _depth_contradictions(self) -> list[Contradiction]:
         estimates = [scale for scale in (self._depth_scale, self._recent_depth_scale) if scale is not None]
         words = "its depths are {} % {}", ("larger", "smaller")
-        return [scale_contradiction(scale, self._tolerance, *words) for scale in estimates]
+        return [scale_contradiction(scale, *words) for scale in estimates]
 
     def _path_contradictions(self, segment_loops: SegmentPairLoops) -> list[Contradiction]:
         out: list[Contradiction] = []
@@ -191,7 +191,7 @@ class AgentPair:
                 continue
             if comparison.inlier_share >= _MIN_INLIER_SHARE:
                 words = "its path is {} % {}", ("longer", "shorter")
-                out.append(scale_contradiction(comparison.path_scale, self._tolerance, *words))
+                out.append(scale_contradiction(comparison.path_scale, *words))
                 rotation = comparison.camera_rotation
                 degrees = np.degrees(rotation.value)
                 text = f"its camera is rotated by {degrees:.1f} degrees against its calibration"
@@ -253,13 +253,11 @@ def severity(estimate: ScalarEstimate, tolerance: float) -> float:
     return min(abs(estimate.value) / tolerance, estimate.significance / _MIN_SIGMAS)
 
 
-def scale_contradiction(
-    estimate: ScalarEstimate, tolerance: float, text: str, words: tuple[str, str]
-) -> Contradiction:
+def scale_contradiction(estimate: ScalarEstimate, text: str, words: tuple[str, str]) -> Contradiction:
     """Contradiction in scale, with either agent's text; `text` has places for the size and a word."""
     size = f"{100 * abs(np.expm1(estimate.value)):.1f} ± {100 * np.exp(estimate.value) * estimate.sigma:.1f}"
     more, less = (text.format(size, word) for word in words)
-    return (severity(estimate, tolerance), *((more, less) if estimate.value > 0 else (less, more)))
+    return (severity(estimate, SCALE_TOLERANCE), *((more, less) if estimate.value > 0 else (less, more)))
 
 
 def first_of_each_kind(texts: list[str]) -> str:

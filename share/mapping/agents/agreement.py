@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.event_kinds import EventKind
 from share.mapping.agents.agent_pair import AgentPair
 from share.mapping.agents.covariance_scales import CovarianceScales, SegmentPair
 from share.mapping.agents.identities import AgentIdentities, outvoted_agents
@@ -27,7 +28,10 @@ from share.types import F64
 _APPLY_SIGMAS = 2.5  # significance at which a scale is corrected
 _KEEP_SIGMAS = 1.25  # significance down to which it stays corrected
 _MIN_SCALE_CHANGE = 0.001  # log scale
-_EVENTS = {"set apart": "agent quarantined", "disputed": "agents disputed"}  # by state
+_EVENTS: dict[str, EventKind] = {  # by state
+    "set apart": "agent quarantined",
+    "disputed": "agents disputed",
+}
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ class AgentStanding:
     widened: float = 1.0
 
     @property
-    def event(self) -> tuple[str, str]:
+    def event(self) -> tuple[EventKind, str]:
         """Event and reason to report when this standing is new."""
         if self.state in _EVENTS:
             return _EVENTS[self.state], self.reason
@@ -64,18 +68,17 @@ AgentNames = tuple[str, str]
 class AgentAgreement:
     """Agreement of all agents, which are given by their runs.
 
-    tolerance: log scale that does no harm. quarantined: agents that must not affect others. disputed: pairs
-    in which it is undetermined who is wrong. log_scales: log of how much too long each agent's metres are,
-    where significant; else missing. pairs: comparisons of every two agents with loops, by their names.
+    quarantined: agents that must not affect others. disputed: pairs in which it is undetermined who is
+    wrong. log_scales: log of how much too long each agent's metres are, where significant; else missing.
+    pairs: comparisons of every two agents with loops, by their names.
     """
 
-    def __init__(self, tolerance: float) -> None:
+    def __init__(self) -> None:
         self.quarantined: frozenset[str] = frozenset()
         self.disputed: frozenset[frozenset[str]] = frozenset()
         self.log_scales: dict[str, float] = {}
         self.identities = AgentIdentities()
         self.covariance_scales = CovarianceScales()
-        self._tolerance = tolerance
         self._accumulated: dict[int, AccumulatedOdometry] = {}
         self.pairs: dict[AgentNames, AgentPair] = {}
 
@@ -140,7 +143,7 @@ class AgentAgreement:
         if first > second:
             first, second, segments, edge = second, first, segments[::-1], edge.reverse()
             scale = None if scale is None else scale.reverse()
-        pair = self.pairs.setdefault((first, second), AgentPair(self._tolerance))
+        pair = self.pairs.setdefault((first, second), AgentPair())
         self.covariance_scales.claims.link(first, second)
         a, b = self._accumulated[edge.a], self._accumulated[edge.b]
         if not pair.add_loop(segments, InterAgentLoop(a, b, edge.T_a_b, edge.cov, scale, tilt)):

@@ -24,7 +24,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.agents.pairwise import ComparisonEquations
 from share.types import F64, I64
@@ -36,15 +35,15 @@ _FLOOR_PER_RAD = 0.0005
 _FLOOR_PER_M = 0.003
 
 
-def inflate_covariance(config: MergeConfig, T_ref_body: F64, cov: F64) -> F64:
+def inflate_covariance(T_ref_body: F64, cov: F64) -> F64:
     """Covariance (6, 6) of an odometry step as the graph uses it.
 
-    Agents understate it, so it is scaled; a floor that grows with the step is added in quadrature.
+    A floor that grows with the step is added in quadrature; `CovarianceScales` scales what agents understate.
     """
     angle_rad, length_m = float(se3.rotation_angle(T_ref_body)), float(np.linalg.norm(T_ref_body[:3, 3]))
     rad2 = np.radians(_FLOOR_DEG) ** 2 + (_FLOOR_PER_RAD * angle_rad) ** 2
     m2 = _FLOOR_M**2 + (_FLOOR_PER_M * length_m) ** 2
-    return config.odometry_scale**2 * cov + np.diag([rad2] * 3 + [m2] * 3)
+    return cov + np.diag([rad2] * 3 + [m2] * 3)
 
 
 _MAX_STEPS = 64  # newest of each agent

@@ -41,12 +41,11 @@ class Quarantine:
 
     def __init__(
         self,
-        tolerance: float,
         graph: MapGraph,
         loop_acceptance: LoopAcceptance,
         camera_views: Mapping[int, CameraView],
     ) -> None:
-        self.agreement = AgentAgreement(tolerance)
+        self.agreement = AgentAgreement()
         self._graph, self._loop_acceptance, self._camera_views = graph, loop_acceptance, camera_views
         self.withdrawn: list[Loop] = []
 

@@ -1,0 +1,3 @@
+"""The pose graph's numbers: edges, optimiser, incremental solver, covariances. It knows no agents and no
+maps.
+"""

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from share.checks import checked_array
-from share.config import GraphConfig
 from share.mapping.graph.covariance import relative_covariances
 from share.mapping.graph.edges import EdgeArrays, PoseEdge
 from share.mapping.graph.optimiser import chain_order, optimise
@@ -102,11 +101,15 @@ class GraphSolution:
     reason: str = ""
 
 
+CAUCHY_WIDTH = 3.0  # 2.4 is usual for 6 degrees of freedom
+
+
 class PoseGraphSolver:
     """All poses, by id, and the edges between them, of all maps."""
 
-    def __init__(self, config: GraphConfig) -> None:
-        self._config = config
+    def __init__(self, cauchy_width: float = CAUCHY_WIDTH) -> None:
+        """cauchy_width: whitened residual at which a loop has half its weight."""
+        self._cauchy_width = cauchy_width
         self.clear()
 
     def clear(self) -> None:
@@ -146,7 +149,7 @@ class PoseGraphSolver:
         anchor_index = int(rank[np.searchsorted(pose_ids, anchor)])
         gravity_factors = self._gravity_factors[component][order]
         minimum = optimise(
-            self._poses[component][order], gravity_factors, ordered_edges, anchor_index, self._config.cauchy
+            self._poses[component][order], gravity_factors, ordered_edges, anchor_index, self._cauchy_width
         )
         poses = minimum.poses[rank]
         if minimum.reason:

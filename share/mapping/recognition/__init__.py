@@ -1,0 +1,1 @@
+"""Place recognition: candidates by an inverted index, then verification of their geometry."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from share.config import PlaceConfig
 from share.geometry import se3
 from share.geometry.absolute_pose import RansacOptions, absolute_pose
 from share.geometry.camera import rays
@@ -37,7 +36,8 @@ _COMPETING_SHARE = 0.5  # another pose with more than this share of the inliers:
 SIGMA_PX = 1.5  # standard deviation of a keypoint
 SIGMA_INVERSE_DEPTH = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
 INLIER_CHI2 = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 degrees of freedom)
-MIN_DIRECTION_INLIERS = 10  # of `place.min_inliers`, with the query's depths and with the candidate's
+MIN_INLIERS = 20  # matches that agree with the relative pose; fewer: refused
+MIN_DIRECTION_INLIERS = 10  # of these, with the query's depths and with the candidate's
 MAX_SIGMA_DEG = 0.5  # a pose with a larger standard deviation is refused
 MIN_SPREAD = 0.05  # narrow side (1 sigma) of the inliers, normalised coordinates
 GRAVITY_DEG = 6.0  # largest difference of the two gravity directions, where both are known
@@ -99,15 +99,13 @@ class _RefusedError(Exception):
     """A failed check; the text is the reason."""
 
 
-def verify(
-    query: CameraView, candidate: CameraView, config: PlaceConfig, seed: int = 0
-) -> Verification | Refusal:
+def verify(query: CameraView, candidate: CameraView, seed: int = 0) -> Verification | Refusal:
     """Return the pose of the query's body in the candidate's body frame, or why there is none.
 
     Deterministic for a given seed. Does not raise for any two valid views.
     """
     try:
-        return _verify_or_raise(query, candidate, config.min_inliers, seed)
+        return _verify_or_raise(query, candidate, seed)
     except _RefusedError as failed:
         return Refusal(str(failed))
     except np.linalg.LinAlgError:
@@ -136,7 +134,7 @@ class _PoseFit:
         return len(self.inliers_q)
 
 
-def _verify_or_raise(query: CameraView, candidate: CameraView, min_inliers: int, seed: int) -> Verification:
+def _verify_or_raise(query: CameraView, candidate: CameraView, seed: int) -> Verification:
     y_q, y_c = query.keypoints, candidate.keypoints
     candidate_pairs = pairs_within(
         hamming_matrix(query.view.descriptors, candidate.view.descriptors), GUIDED_BITS
@@ -148,8 +146,8 @@ def _verify_or_raise(query: CameraView, candidate: CameraView, min_inliers: int,
     has_gravity = bool(query.up.any() and candidate.up.any())
     if not has_gravity and len(initial_poses) > 1:
         raise _RefusedError("the two directions give different poses, and gravity is unknown")
-    fit = _best_fit(_refine_poses(initial_poses, candidate_pairs, y_q, y_c, noises, min_inliers))
-    _require_count(fit.inliers, min_inliers, "inliers")
+    fit = _best_fit(_refine_poses(initial_poses, candidate_pairs, y_q, y_c, noises))
+    _require_count(fit.inliers, MIN_INLIERS, "inliers")
     for y, side in ((fit.inliers_q, "query"), (fit.inliers_c, "candidate")):
         known = int(np.isfinite(y[:, 2]).sum())
         _require_count(known, MIN_DIRECTION_INLIERS, f"inliers with the {side}'s depth")
@@ -186,7 +184,6 @@ def _refine_poses(
     y_q: F64,
     y_c: F64,
     noises: tuple[KeypointNoise, KeypointNoise],
-    min_inliers: int,
 ) -> list[_PoseFit]:
     """Refine the initial poses, except those with too few matches to compete."""
     radius = noises[0].uv / SIGMA_PX * GUIDED_PX
@@ -195,7 +192,7 @@ def _refine_poses(
         for initial_pose in initial_poses
     ]
     matched.sort(key=lambda found: -len(found[0].rows))
-    _require_count(len(matched[0][0].rows), min_inliers, "matches near the projected points")
+    _require_count(len(matched[0][0].rows), MIN_INLIERS, "matches near the projected points")
     fits: list[_PoseFit] = []
     for pairs, initial_pose in matched:
         if not fits or len(pairs.rows) > _COMPETING_SHARE * max(fit.inliers for fit in fits):

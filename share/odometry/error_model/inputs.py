@@ -225,20 +225,11 @@ def error_model_input(image: U8, statistics: FeatureStatistics, motion: RecentMo
     thumbnail = _resized(image, _THUMBNAIL_SIZE)
     distribution = point_distribution(thumbnail, statistics, (image.shape[1], image.shape[0]))
     return ErrorModelInput(
-        _to_picture(thumbnail),
+        _resized(thumbnail, INPUT_SHAPES["picture"]),
         distribution,
         scalar_features(thumbnail, statistics, motion.sigma_cm),
         recent_features(motion),
     )
-
-
-def input_picture(image: U8) -> U8:
-    """Return the picture of `ErrorModelInput` for an image (H, W)."""
-    return _to_picture(_resized(image, _THUMBNAIL_SIZE))
-
-
-def _to_picture(thumbnail: U8) -> U8:
-    return _resized(thumbnail, INPUT_SHAPES["picture"])
 
 
 def _resized(image: U8, size: tuple[int, ...]) -> U8:

@@ -1,4 +1,6 @@
-"""Networks as ONNX files, run by onnxruntime on one thread, because agents need the other cores.
+"""The error model as an ONNX file: opened, checked and run, from inputs to an estimate.
+
+onnxruntime has one thread, because agents need the other cores.
 
 A file from anywhere is checked before the runtime reads it (`check_model`), and an error model is run once on
 zeros, so that its inputs and outputs are known to be right.
@@ -6,9 +8,12 @@ zeros, so that its inputs and outputs are known to be right.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +21,61 @@ from numpy.typing import NDArray
 from share.errors import DataError
 from share.files.onnx_file import check_model
 from share.files.reading import MB, read_bytes
-from share.odometry.error_model.inference import OUTPUTS
-from share.odometry.error_model.inputs import INPUT_SHAPES, input_dtype
+from share.odometry.error_model.inputs import INPUT_SHAPES, ErrorModelInput, input_dtype
 from share.types import F32, U8
-
-if TYPE_CHECKING:
-    from share.odometry.error_model.inference import OnnxSession
 
 SHIPPED_MODEL = Path(__file__).with_name("error_model.onnx")
 _BATCH_SIZE, _BACKBONE_SIZE = 32, 1280
 _MAX_BYTES = 100 * MB  # of a file; the shipped model has 4
 _MAX_MEMORY_BYTES = 1000 * MB  # of all networks; the shipped model takes 20, and 300 for a batch
 _OUTPUT_SHAPES = {"log_error": (1, 3), "embedding": (1, 64), "distance": (1,)}
+
+OUTPUTS = ("log_error", "embedding", "distance")
+MAX_ERROR_CM = 20.0  # a tracker this wrong is as good as lost; labels and estimates end here
+_MAX_LOG_ERROR = 10.0  # bound of the network's output: e^10 cm is far above `MAX_ERROR_CM`
+_UNFAMILIAR_SCALE = 2.0  # widens the interval, in logarithms, out of the training distribution
+
+
+class OnnxSession(Protocol):
+    """The part of onnxruntime.InferenceSession that is used.
+
+    Inputs: picture (N, 128, 128) uint8, psd (N, 3, 12, 16), scalars (N, 8), recent (N, 14). Outputs:
+    log_error (N, 3), of cm: expected, low, high; embedding (N, 64); distance (N,) from the training
+    distribution, which ends at 1.
+    """
+
+    def get_inputs(self) -> Sequence[Any]: ...
+    def run(self, names: Sequence[str], inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorEstimate:
+    """The expected position error of the last seconds, at most 20 cm, with a 90 % interval low_cm to high_cm.
+
+    out_of_distribution: the training data has nothing similar, so the interval is wider. embedding (64,): of
+    the picture.
+    """
+
+    error_cm: float
+    low_cm: float
+    high_cm: float
+    out_of_distribution: bool
+    embedding: F32
+
+
+def estimate_error(network: OnnxSession, features: ErrorModelInput) -> ErrorEstimate:
+    """Return the estimate for one keyframe. Raises DataError where the network's output is not finite."""
+    inputs = {name: value[None] for name, value in features.arrays_by_name().items()}
+    log_error, embedding, distance = network.run(OUTPUTS, inputs)
+    if not (np.isfinite(log_error).all() and np.isfinite(distance).all()):
+        raise DataError("the error model's output for a keyframe is not finite; use another model")
+    expected, low, high = np.clip(log_error[0], -_MAX_LOG_ERROR, _MAX_LOG_ERROR).tolist()
+    out_of_distribution = bool(distance[0] > 1)
+    if out_of_distribution:
+        low = expected + _UNFAMILIAR_SCALE * (low - expected)
+        high = expected + _UNFAMILIAR_SCALE * (high - expected)
+    error_cm, low_cm, high_cm = (min(math.exp(x), MAX_ERROR_CM) for x in (expected, low, high))
+    return ErrorEstimate(error_cm, low_cm, high_cm, out_of_distribution, np.asarray(embedding[0], np.float32))
 
 
 def read_model(path: Path) -> bytes:

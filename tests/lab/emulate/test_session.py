@@ -202,7 +202,7 @@ def test_a_folder_that_exists_is_not_touched(recipe, tmp_path):
 
 
 def test_a_second_process_on_the_same_folder_is_refused(recipe, tmp_path):
-    from share.files.writing import lock_folder
+    from share.files.locks import lock_folder
 
     held = lock_folder(tmp_path / ".session.partial")
     try:

@@ -6,13 +6,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from share.config import Config
+from share.config import Config, with_policy
 from share.errors import UsageError
+from share.files.yaml_file import read_settings
+from share.lab.evaluate import trial
 from share.lab.evaluate.campaign import PlannedRun, plan_policies, play_job, run_all, split_jobs
 from share.lab.evaluate.real_time import RunOptions
-from share.lab.evaluate.trial import read_trial, settings_yaml
+from share.lab.evaluate.trial import read_trial, run_trial, settings_yaml
 from share.plain_data import from_mapping
-from share.recordings.session import Session
+from share.recordings.session import Session, read_session
 
 TERMS = RunOptions("", "wifi5")
 
@@ -63,6 +65,13 @@ def test_each_seed_draws_anew_and_settings_come_back_as_they_were():
     assert third.control.random_seed == first.control.random_seed + 3
 
 
+def test_settings_of_a_run_have_the_policy_that_is_played(plain_session, tmp_path, monkeypatch):
+    monkeypatch.setattr(trial, "play_in_virtual_time", lambda *_: {})
+    terms = RunOptions("linear", virtual=True)
+    run_trial(read_session(plain_session), terms, Config(), tmp_path / "run", lambda now: None)
+    assert read_settings(tmp_path / "run" / "config.yaml") == with_policy(Config(), "linear")
+
+
 @pytest.fixture
 def done(tmp_path) -> PlannedRun:
     """A run that is there, as far as files say."""
@@ -104,6 +113,13 @@ def test_runs_without_a_new_setting_are_used(done):
     (one.out / "config.yaml").write_text(yaml.safe_dump(settings))
     with pytest.raises(UsageError, match="was played with other options or settings"):
         list(run_all([one], lambda number, now: None))
+
+
+def test_runs_whose_settings_name_another_policy_than_was_played_are_used(done):
+    """As 0.2.0 and older wrote them."""
+    (done.out / "config.yaml").write_text(settings_yaml(with_policy(Config(), "equal"), 0))
+    (came,) = play_job([done])
+    assert came.folder == done.out
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", "{", json.dumps({"policy": "share"})])

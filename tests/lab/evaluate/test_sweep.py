@@ -74,6 +74,15 @@ def test_every_run_has_a_folder_of_its_own():
     assert not {one.out for one, _ in again} & {one.out for one, _ in runs}  # of another sweep
 
 
+def test_a_policy_of_the_sweep_is_played():
+    axis = Axis.parse("edge.policy=equal,linear")
+    options = RunOptions("share")
+    runs = plan_sweep([Session(Path("a"), {}, {})], [axis], grid([axis]), [0], options, Path("out"), Config())
+    assert [one.options.policy for one, _ in runs] == ["equal", "linear"]
+    other = plan_sweep([Session(Path("a"), {}, {})], [KP], [("1",)], [0], options, Path("out"), Config())
+    assert [one.options.policy for one, _ in other] == ["share"]
+
+
 def test_heat_is_the_mean_over_all_other_settings():
     third = Axis.parse("control.kd=0,1")
     measure = MEASURES[0].name

@@ -17,6 +17,8 @@ from share.lab import peer_trackers
 from share.lab.evaluate.peer_comparison import score_tracker
 from share.lab.evaluate.tracker_runs import peer_frames, peer_version, rig_calibration, run_peer, run_share
 from share.lab.peer_trackers import PEERS
+from share.odometry.inertial_tracker import InertialTracker
+from share.odometry.visual_tracker import VisualTracker
 from share.recordings.trajectory import Trajectory
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
@@ -138,6 +140,16 @@ def test_our_result_is_that_of_share_track(source):
     assert run.trajectory.stamps_ns.tolist() == told.trajectory.stamps_ns.tolist()
     assert np.array_equal(run.trajectory.T, told.trajectory.T)
     assert len(run.cpu_ms) == 24
+
+
+def test_a_failure_of_our_tracker_ends_the_experiment(source, monkeypatch):
+    def fail(self, frame):
+        raise ArithmeticError("a singular matrix")
+
+    monkeypatch.setattr(VisualTracker, "track", fail)
+    monkeypatch.setattr(InertialTracker, "track", fail)
+    with pytest.raises(ArithmeticError, match="a singular matrix"):
+        run_share(source, Config())
 
 
 def test_similar_cameras_need_not_be_turned(source):

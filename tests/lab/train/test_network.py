@@ -15,9 +15,12 @@ from helpers.tiny_backbone import tiny_backbone  # noqa: E402
 
 from share.lab.train.network import Heads, backbone_id, loss, with_heads  # noqa: E402  # noqa: E402
 from share.lab.train.trained_heads import TrainedHeads  # noqa: E402
-from share.odometry.error_model.inference import estimate_error  # noqa: E402
 from share.odometry.error_model.inputs import ErrorModelInput  # noqa: E402
-from share.odometry.error_model.network import backbone_features, open_network  # noqa: E402
+from share.odometry.error_model.network import (  # noqa: E402
+    backbone_features,
+    estimate_error,
+    open_network,
+)
 
 
 @pytest.fixture

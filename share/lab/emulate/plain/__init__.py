@@ -1,0 +1,1 @@
+"""The plain room, which needs no OpenGL."""

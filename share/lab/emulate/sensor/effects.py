@@ -81,10 +81,10 @@ _LIMITS: dict[str, tuple[float, float]] = {
 NO_EFFECTS = Effects(**{f.name: False for f in dataclasses.fields(Effects) if f.default is True})
 
 
-def parse_effects(words: Iterable[str], base: Effects | None = None) -> Effects:
-    """Return `base` with changes such as "noise=off", "drops=0.02", "time_offset_ms=-8" and "none" (a perfect
-    device, then the words that follow). Raises UsageError with the word and the known ones."""
-    effects = base or Effects()
+def parse_effects(words: Iterable[str]) -> Effects:
+    """Return the usual effects with changes such as "noise=off", "drops=0.02", "time_offset_ms=-8" and "none"
+    (a perfect device, then the words that follow). Raises UsageError with the word and the known ones."""
+    effects = Effects()
     for word in words:
         if word == "none":
             effects = NO_EFFECTS

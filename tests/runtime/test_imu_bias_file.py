@@ -13,7 +13,7 @@ import pytest
 from share.config import InertialConfig
 from share.errors import DataError, ShareError, UsageError
 from share.geometry.camera import ImuBias, ImuNoise
-from share.sensors.imu_memory import (
+from share.runtime.imu_bias_store import (
     POWER_ON_ACCEL,
     POWER_ON_GYRO,
     SavedBias,
