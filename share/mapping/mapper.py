@@ -42,7 +42,7 @@ from share.mapping.steps import (
     map_assignment,
 )
 from share.scheduling.merge_gate import MergeGate
-from share.types import Keyframe
+from share.types import Keyframe, View
 from share.wire.messages import Hello
 
 _RECHECK_INTERVAL = 4  # every fourth keyframe is compared by its looks too where the map seems right
@@ -205,9 +205,15 @@ class Mapper:
 
     def _describe(self, node_id: int) -> Job:
         """Find the ORB features of a keyframe that came as an image only."""
-        if (image := self._views.undescribed_image(node_id)) is not None:
-            self._views.describe(node_id, (yield DescribeStep(node_id, image)))
-            yield []
+        if (image := self._views.undescribed_image(node_id)) is None:
+            return
+        try:
+            view = yield DescribeStep(node_id, image)
+        except Exception:
+            self._views.describe(node_id, View.empty())  # else it would be tried for ever
+            raise
+        self._views.describe(node_id, view)
+        yield []
 
     def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
         """Align the images of keyframes near this one by the map's poses. Return whether one did."""
