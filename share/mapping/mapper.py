@@ -184,7 +184,9 @@ class Mapper:
         try:
             return (self._solve if isinstance(step, SolveStep) else self._lookup).finish(result)
         except Exception as error:
-            agent = None if isinstance(step, SolveStep) else self.atlas.key(step.node_id).agent
+            agent = None
+            if not isinstance(step, SolveStep) and step.node_id in self._views.by_node:
+                agent = self.atlas.key(step.node_id).agent
             return self.report_failure(step.kind, error, agent)
 
     def report_failure(self, what: str, error: Exception, agent: str | None = None) -> list[MapEvent]:
@@ -235,9 +237,10 @@ class Mapper:
 
     def _query(self, node_id: int) -> Job:
         """Query with a keyframe and verify the candidates; each verified loop is gated, checked and added."""
-        agent, views, place = self.atlas.key(node_id).agent, self._views.by_node, self._config.place
+        views, place = self._views.by_node, self._config.place
         if node_id not in views:
-            return
+            return  # removed meanwhile
+        agent = self.atlas.key(node_id).agent
         excluded = self.atlas.graph.odometry.neighbours(node_id)
         if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
             excluded += self.atlas.quarantine.quarantined_nodes(agent)

@@ -151,9 +151,10 @@ def test_a_keyframe_that_waits_is_described_for_the_queries_of_others(place: Pla
     assert mapper.next_lookup() is None
 
 
+@pytest.mark.parametrize("fails", [False, True], ids=["", "fails"])
 @pytest.mark.parametrize("at", [DescribeStep, QueryStep])
 def test_a_keyframe_may_be_removed_while_it_is_looked_up(
-    place: Planes, at: type, monkeypatch: pytest.MonkeyPatch
+    place: Planes, at: type, fails: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mapper = mapper_of("ann")
     monkeypatch.setattr(mapper.atlas.culling, "is_removable", lambda node_id: node_id == 1)
@@ -165,10 +166,10 @@ def test_a_keyframe_may_be_removed_while_it_is_looked_up(
         step = mapper.next_lookup()
     mapper.remove_keyframes([step.node_id])
     is_removed = step.node_id not in mapper._views.by_node
-    mapper.finish_step(step, step.run(), 1.0)
+    mapper.finish_step(step, ValueError("bad") if fails else step.run(), 1.0)
     rest = work(mapper)
     assert is_removed and all(other.node_id != step.node_id for other, _ in rest)
-    assert mapper.report()["failed_steps"] == 0
+    assert mapper.report()["failed_steps"] == fails
     assert len(mapper._views.index) == len(mapper._views.by_node) == 2
 
 
