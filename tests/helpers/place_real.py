@@ -9,11 +9,11 @@ import numpy as np
 from helpers.frame_keyframe import frame_image
 
 from share.geometry import se3
+from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView
 from share.recordings.recording import FolderSource
 from share.runtime.source import open_source
 from share.sensors.measurement import CAM0, CAM1, DEPTH
-from share.mapping.recognition.patch_alignment import ImageView
 from share.types import F64, Frame
 
 

@@ -40,7 +40,13 @@ class Planes:
             (_TEXELS_PER_M * (position[k] + _linear_image(rotation[k]) / rho) + 317.0 * hit) % _TEXTURE_SIDE
             for k in (0, 1)
         )
-        image = cv2.remap(self.texture, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        image = cv2.remap(
+            self.texture,
+            x.astype(np.float32),
+            y.astype(np.float32),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_WRAP,
+        )
         grain = sigma * noise.standard_normal(image.shape, np.float32)
         return (image + grain).clip(0, 255).astype(np.uint8)
 

@@ -99,7 +99,7 @@ def test_two_agents_join_by_their_images_and_are_then_aligned_by_the_map(place: 
     assert mapper.atlas.map_sizes() == {"ann/0": 11}
     assert aligned[0] == [] and aligned[-1]
     assert all(isinstance(outcome, Verification) for outcomes in aligned for outcome in outcomes)
-    poses = {key: T for key, T in zip(*_all_poses(mapper), strict=True)}
+    poses = dict(zip(*_all_poses(mapper), strict=True))
     T_map_world = poses["bob", 6] @ se3.inverse(bob[6][0])
     for name, run in (("ann", ann), ("bob", bob)):
         for T, sent in run:

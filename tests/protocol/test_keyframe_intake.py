@@ -65,7 +65,9 @@ def test_all_that_is_wrong_is_said() -> None:
     sent = replace(keyframe(1, WRONG, far()), cov=1e11 * np.eye(6))
     got, problem = sanitise(sent, BASE, CAMERA)
     assert problem is not None
-    assert [word in problem for word in ("px", "50 m from the previous one: new segment", "1e+11")] == [True] * 3
+    assert [word in problem for word in ("px", "50 m from the previous one: new segment", "1e+11")] == [
+        True
+    ] * 3
     assert (len(got.image.jpeg), got.reference, got.cov.max()) == (0, -1, pytest.approx(100))
 
 

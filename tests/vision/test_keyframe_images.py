@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from share.geometry.camera import Camera
-from share.types import MAX_JPEG_BYTES, MAX_KEYPOINTS, MAX_PLANE, MAX_UV, KeyframeCandidate, KeyframeImage, View
+from share.types import (
+    MAX_JPEG_BYTES,
+    MAX_KEYPOINTS,
+    MAX_PLANE,
+    MAX_UV,
+    KeyframeCandidate,
+    KeyframeImage,
+    View,
+)
 from share.vision.image_codec import encode_jpeg, encode_png
 from share.vision.keyframe_images import Surfaces, compress, decompress, image_objection
 
@@ -27,7 +35,9 @@ def of_jpeg(data: bytes | np.ndarray) -> KeyframeImage:
     return replace(KeyframeImage.empty(), jpeg=jpeg)
 
 
-def surfaces(uv: object = ((0.1, 0.2),), plane: object = ((0.0, 0.1, 0.5),), sigma: object = (0.01,)) -> Surfaces:
+def surfaces(
+    uv: object = ((0.1, 0.2),), plane: object = ((0.0, 0.1, 0.5),), sigma: object = (0.01,)
+) -> Surfaces:
     return Surfaces(*(np.array(values, np.float64) for values in (uv, plane, sigma)))
 
 
@@ -69,7 +79,12 @@ def test_a_keyframe_image_has_limits(changed: dict, said: str) -> None:
 
 def test_a_keyframe_image_is_read_only_and_keeps_its_types() -> None:
     image = image_of()
-    for name, dtype in (("jpeg", np.uint8), ("uv", np.float32), ("plane", np.float32), ("rho_sigma", np.float32)):
+    for name, dtype in (
+        ("jpeg", np.uint8),
+        ("uv", np.float32),
+        ("plane", np.float32),
+        ("rho_sigma", np.float32),
+    ):
         values = getattr(image, name)
         assert values.dtype == dtype and not values.flags.writeable
     assert len(image.without_jpeg().jpeg) == 0 and image.without_jpeg().plane is not None

@@ -190,8 +190,8 @@ def test_an_image_view_is_spread_and_has_the_depth_of_the_surfaces_near(scene):
 
 
 def test_an_orb_feature_lies_on_the_plane_of_the_surface_near_it():
-    """A slanted one: the depth is where the feature's own ray meets it. Too far from it, or where the plane is
-    behind or far away, depth is unknown."""
+    """A slanted one: the depth is where the feature's own ray meets it. Too far from it, or where the plane
+    is behind or far away, depth is unknown."""
     rng = np.random.default_rng(0)
     image = cv2.resize(rng.integers(0, 255, (60, 80), np.uint8), (640, 480))
     plane = np.array([0.2, -0.1, 0.5])

@@ -135,7 +135,7 @@ def test_the_largest_keyframe_image_is_decoded() -> None:
 def test_a_keyframe_of_wire_5_is_decoded_where_its_version_is_accepted() -> None:
     """It is today's without its last four arrays. Map files keep such; a peer may not send one."""
     sent = keyframe(5)
-    version, code, scalars, table = msgspec.msgpack.decode(codec.encode(sent)[0])
+    _, code, scalars, table = msgspec.msgpack.decode(codec.encode(sent)[0])
     old = [header(5, code, scalars, table[:7]), *copied(codec.encode(sent))[1:8]]
     assert same(codec.decode(old, (5, V)), sent)
     with pytest.raises(WireError, match="peer speaks wire 5"):
