@@ -27,7 +27,7 @@ class TrackerConfig:
     """Tracking by cameras alone (`share.odometry.visual_tracker`); the views and loss of any tracker."""
 
     corners: int = 250  # features tracked at once
-    view_features: int = 500  # ORB features of a keyframe, for other agents and for relocalisation
+    view_features: int = 500  # ORB features of a keyframe, for relocalisation
     new_stretch_s: float = 3.0  # LOST for this long: odometry starts a new segment
 
     def __post_init__(self) -> None:
