@@ -218,6 +218,23 @@ def test_another_place_is_refused(room: Planes, pairs) -> None:
         assert isinstance(refusal, Refusal) and "patches align" in refusal.reason
 
 
+def test_a_quarter_of_the_patches_confirms_no_pose_of_the_map(room: Planes) -> None:
+    """They agree with one pose, but most of what should be there is not."""
+    rng, true = np.random.default_rng(5), se3.inverse(T_WORLD_C) @ moved(MOTIONS[0])
+    query, candidate = (
+        textured_planes.image_view(room, T, rng, count=220) for T in (moved(MOTIONS[0]), T_WORLD_C)
+    )
+    elsewhere = textured_planes.image_view(Planes(ROOM, seed=8), T_WORLD_C, rng)
+    assert candidate.pixels is not None and elsewhere.pixels is not None
+    mixed, edge = candidate.pixels.copy(), int(0.34 * CAMERA.width)
+    mixed[:, edge:] = elsewhere.pixels[:, edge:]
+    changed = ImageView(dataclasses.replace(candidate.source, jpeg=compress(mixed)), CAMERA, T_BODY_CAM)
+    refusal = align_from_map(true, query, changed)
+    assert isinstance(refusal, Refusal) and refusal.reason.endswith("patches align from the map's pose")
+    assert refusal.reason[0].isdigit()
+    assert isinstance(align_verified(verified(true), query, changed), Verification)
+
+
 def test_a_pose_of_the_map_that_is_far_off_is_refused(pairs) -> None:
     true, query, candidate = pairs[0]
     off = np.array([0.0, 0.1, 0.0, 0.1, 0.1, 0.0])
