@@ -10,18 +10,18 @@ from share.vision import corners
 from share.vision.keyframe_images import Surfaces
 from share.vision.orb import measure_depth
 
-_SPACING_PX = 15
+_SPACING_PX = 10
 _RHO_SIGMA = 0.01  # 1/m, of an inverse depth
 
 
 def frame_surfaces(frame: Frame, rig: Rig, count: int = 300) -> Surfaces:
-    """Surfaces at corners with a measured depth, taken to face the camera."""
-    px = corners.detect(frame.image0, np.zeros((0, 2), np.float32), count, _SPACING_PX)
+    """Surfaces at up to `count` corners with a measured depth, taken to face the camera."""
+    px = corners.detect(frame.image0, np.zeros((0, 2), np.float32), 4 * count, _SPACING_PX)
     uv = rig.cam0.normalise(px.astype(np.float64))
     rho = 1 / measure_depth(frame, rig, px, uv)  # NaN is not valid
     plane = np.column_stack([np.zeros((len(rho), 2)), rho])
     found = Surfaces(uv, plane, np.full(len(rho), _RHO_SIGMA))
-    return found.take(found.is_valid())
+    return found.take(np.flatnonzero(found.is_valid())[:count])
 
 
 def frame_image(frame: Frame, rig: Rig, count: int = 300) -> KeyframeImage:
