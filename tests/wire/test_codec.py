@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from share.errors import WireError
 from share.geometry.camera import Camera, ImuNoise, Rig
+from share.net.backlog import BacklogLimits
 from share.types import (
     MAX_JPEG_BYTES,
     AgentKind,
@@ -130,6 +131,8 @@ def test_the_largest_keyframe_image_is_decoded() -> None:
     sent = keyframe_with_image(2000, MAX_JPEG_BYTES)
     assert same(codec.decode(copied(codec.encode(sent))), sent)
     assert max(map(len, codec.encode(sent))) <= codec.MAX_FRAME_BYTES
+    guard = BacklogLimits.for_frame_size(codec.MAX_FRAME_BYTES)
+    assert codec.message_bytes(codec.encode(sent)) < guard.message_bytes  # else its connection is reset
 
 
 def test_a_keyframe_of_wire_5_is_decoded_where_its_version_is_accepted() -> None:
