@@ -27,7 +27,7 @@ class TrackerConfig:
     """Tracking by cameras alone (`share.odometry.visual_tracker`); the views of any tracker."""
 
     corners: int = 250  # features tracked at once
-    view_features: int = 500  # ORB features of a keyframe, for other agents and for relocalisation
+    view_features: int = 500  # ORB features of a keyframe, for relocalisation
 
     def __post_init__(self) -> None:
         _require_positive(self, "corners", "view_features")

@@ -162,7 +162,7 @@ def trace_keyframes(session: Path) -> list[set[tuple[str, str]]]:
     from share.lab.evaluate.real_time import RunOptions
     from share.lab.evaluate.virtual_time import play_in_virtual_time
     from share.mapping.mapper import Mapper
-    from share.mapping.steps import QueryStep, SolveStep, VerifyStep
+    from share.mapping.steps import AlignStep, DescribeStep, QueryStep, SolveStep, VerifyStep
     from share.recordings.session import read_session
 
     out: list[set[tuple[str, str]]] = []
@@ -184,7 +184,7 @@ def trace_keyframes(session: Path) -> list[set[tuple[str, str]]]:
 
     for name in ("add_keyframe", "next_lookup", "next_solve", "finish_step"):
         recorded(Mapper, name)
-    for step in (QueryStep, VerifyStep, SolveStep):
+    for step in (DescribeStep, AlignStep, QueryStep, VerifyStep, SolveStep):
         recorded(step, "run")
     with tempfile.TemporaryDirectory() as folder:
         play_in_virtual_time(

@@ -40,7 +40,7 @@ from share.mapping.steps import (
     VerifyStep,
 )
 from share.scheduling.merge_gate import MergeGate
-from share.types import Keyframe
+from share.types import Keyframe, View
 from share.wire.messages import Hello
 
 _RECHECK_INTERVAL = 4  # every fourth keyframe is compared by its looks too where the map seems right
@@ -185,7 +185,8 @@ class Mapper:
         except Exception as error:
             if isinstance(step, SolveStep):
                 return self.report_failure(step.kind, error, map_id=step.job.map_id)
-            return self.report_failure(step.kind, error, self.atlas.key(step.node_id).agent)
+            agent = self.atlas.key(step.node_id).agent if step.node_id in self._views.by_node else None
+            return self.report_failure(step.kind, error, agent)
 
     def report_failure(
         self, what: str, error: Exception, agent: str | None = None, map_id: str | None = None
@@ -213,9 +214,15 @@ class Mapper:
 
     def _describe(self, node_id: int) -> Job:
         """Find the ORB features of a keyframe that came as an image only."""
-        if (image := self._views.undescribed_image(node_id)) is not None:
-            self._views.describe(node_id, (yield DescribeStep(node_id, image)))
-            yield []
+        if (image := self._views.undescribed_image(node_id)) is None:
+            return
+        try:
+            view = yield DescribeStep(node_id, image)
+        except Exception:
+            self._views.describe(node_id, View.empty())  # else it would be tried for ever
+            raise
+        self._views.describe(node_id, view)
+        yield []
 
     def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
         """Align the images of keyframes near this one by the map's poses. Return whether one did."""
@@ -237,9 +244,10 @@ class Mapper:
 
     def _query(self, node_id: int) -> Job:
         """Query with a keyframe and verify the candidates; each verified loop is gated, checked and added."""
-        agent, views, place = self.atlas.key(node_id).agent, self._views.by_node, self._config.place
+        views, place = self._views.by_node, self._config.place
         if node_id not in views:
-            return
+            return  # removed meanwhile
+        agent = self.atlas.key(node_id).agent
         excluded = self.atlas.graph.odometry.neighbours(node_id)
         if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
             excluded += self.atlas.quarantine.quarantined_nodes(agent)

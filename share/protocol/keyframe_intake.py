@@ -12,7 +12,7 @@ from share.geometry import se3
 from share.geometry.camera import Camera
 from share.timing import SECOND_NS, TokenBuckets
 from share.types import F64, EarlierPoses, Keyframe
-from share.vision.keyframe_images import size_objection
+from share.vision.keyframe_images import image_objection
 from share.wire.messages import MAX_BUFFERED, Ack
 
 MAX_ID_GAP = 1_000_000  # ids that an agent may have dropped since the last one: two days at 5 Hz
@@ -166,26 +166,32 @@ def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> t
 
     base: the run's keyframe before; camera: its cam0. A keyframe with an implausible jump, or with a motion
     that contradicts its two poses, starts a segment in the same odom. An excessive covariance is bounded. An
-    image of another size is dropped. Raises ValueError if its reference is not `base`.
+    image that cannot be this camera's is dropped. Raises ValueError if its reference is not `base`.
     """
-    problem = None
-    if objection := size_objection(keyframe.image, camera):
-        problem = f"keyframe {keyframe.id}: {objection}: without it"
+    problems = []
+    if objection := image_objection(keyframe.image, camera):
+        problems.append(f"keyframe {keyframe.id}: {objection}: without it")
         keyframe = replace(keyframe, image=keyframe.image.without_jpeg())
     if keyframe.reference >= 0:
         if base is None or keyframe.reference != base.id:
             raise ValueError(f"keyframe {keyframe.id} refers to {keyframe.reference}, not to the last one")
-        if jump_m := base.jump_m(keyframe):
-            problem = f"keyframe {keyframe.id} is {jump_m:.0f} m from the previous one: new segment"
-        elif contradiction := base.contradiction(keyframe):
-            problem = f"keyframe {keyframe.id}: {contradiction}: new segment"
-        if problem:
+        if reason := _segment_reason(keyframe, base):
+            problems.append(f"{reason}: new segment")
             earlier = EarlierPoses.empty()
             keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=earlier)
     if (variance := float(keyframe.cov.diagonal().max())) > _MAX_VARIANCE:
-        problem = problem or f"keyframe {keyframe.id} has a variance of {variance:.0e}; treated as unknown"
+        problems.append(f"keyframe {keyframe.id} has a variance of {variance:.0e}; treated as unknown")
         keyframe = replace(keyframe, cov=keyframe.cov * (_MAX_VARIANCE / variance))
-    return keyframe, problem
+    return keyframe, "; ".join(problems) or None
+
+
+def _segment_reason(keyframe: Keyframe, base: OdometryBase) -> str | None:
+    """Return why the keyframe has to start a segment; None if it does not."""
+    if jump_m := base.jump_m(keyframe):
+        return f"keyframe {keyframe.id} is {jump_m:.0f} m from the previous one"
+    if contradiction := base.contradiction(keyframe):
+        return f"keyframe {keyframe.id}: {contradiction}"
+    return None
 
 
 T = TypeVar("T")

@@ -12,7 +12,7 @@ from share.checks import MAX_SIGMA
 from share.errors import DataError
 from share.geometry.camera import Camera, rays
 from share.types import F64, MAX_JPEG_BYTES, MAX_PLANE, MAX_UV, U8, KeyframeImage
-from share.vision.image_codec import check_complete, checked_header, decode_gray, encode_jpeg
+from share.vision.image_codec import check_complete, checked_header, decode_gray, encode_jpeg, image_format
 
 _JPEG_QUALITIES = (50, 25, 10)  # the first that fits; patches align as well at 50 as uncompressed
 
@@ -52,27 +52,29 @@ def compress(image: U8) -> U8:
     return np.zeros(0, np.uint8)
 
 
-def size_objection(image: KeyframeImage, camera: Camera) -> str | None:
-    """Return why the image cannot be of this camera, by its header alone; None if it can, or is empty."""
+def image_objection(image: KeyframeImage, camera: Camera) -> str | None:
+    """Return why the image cannot be of this camera, without decoding it; None if it can, or is empty."""
     if not len(image.jpeg):
         return None
+    data = image.jpeg.tobytes()
     try:
-        header = checked_header(image.jpeg.tobytes(), "image")
+        header = checked_header(data, "image")
+        check_complete(data, "image")
     except DataError:
-        return "its image is no JPEG"
-    if (header.width, header.height) != (camera.width, camera.height) or header.scans > 1:
+        return "its image is no JPEG, or cut short"
+    if image_format(data) != "jpg" or header.scans > 1:
+        return "its image is no baseline JPEG"
+    if (header.width, header.height) != (camera.width, camera.height):
         return f"its image has {header.width}x{header.height} px, its camera {camera.width}x{camera.height}"
     return None
 
 
 def decompress(image: KeyframeImage, camera: Camera) -> U8 | None:
     """Return the image (H, W) of this camera; None if there is none, or a damaged one."""
-    if not len(image.jpeg) or size_objection(image, camera) is not None:
+    if not len(image.jpeg) or image_objection(image, camera) is not None:
         return None
-    data = image.jpeg.tobytes()
     try:
-        check_complete(data, "image")
-        decoded = decode_gray(data, "image")
+        decoded = decode_gray(image.jpeg.tobytes(), "image")
     except DataError:
         return None
     return decoded if decoded.shape == (camera.height, camera.width) else None

@@ -52,7 +52,7 @@ def test_export_works_while_an_edge_writes(room, tmp_path):
         store.write([keyframe("ann-0001", 20)])
         said = good("export", room, "--out", tmp_path / "out")
         store.write([keyframe("ann-0001", 21)])
-    assert said == (f"{tmp_path}/out: map ann-0001/0, 41 keyframes of ann, bob; 1640 points, 5 loops\n")
+    assert said == (f"{tmp_path}/out: map ann-0001/0, 41 keyframes of ann, bob; 1763 points, 5 loops\n")
     assert len((tmp_path / "out" / "ann.tum").read_text().splitlines()) == 21
     data = json.loads(good("export", room, "--out", tmp_path / "two", "--json"))
     assert data["ann-0001/0"]["keyframes"] == 42

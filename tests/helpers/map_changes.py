@@ -16,7 +16,7 @@ from share.mapping.map_changes import (
     StoredKeyframe,
     StoredMap,
 )
-from share.types import F64, Keyframe, View
+from share.types import F64, Keyframe, KeyframeImage, View
 
 ANN, BOB = "ann-0001", "bob-0002"
 
@@ -32,7 +32,8 @@ def run(key: str) -> SaveRun:
 
 
 def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> SaveKeyframe:
-    """Number i of a run, relative to the one before unless it is the first of a stretch."""
+    """Number i of a run, relative to the one before unless it is the first of a stretch. It has `points`, and
+    three more of its image."""
     rng = np.random.default_rng([i, *key.encode()])
     view = View(
         rng.normal(size=(points, 2)),
@@ -43,7 +44,11 @@ def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> SaveKey
     T = pose(i) if begins else se3.inverse(pose(i - 1)) @ pose(i)
     cov = np.diag([1e-6, 1e-6, 1e-6, 1e-5, 1e-5, 2e-5])
     up = np.array([0.0, 0.0, 1.0])
-    own = Keyframe(i, -1 if begins else i - 1, 10**9 + i * 10**8, T, cov, pose(i), up, 0.01, view, i - 1)
+    facing = np.column_stack([np.zeros((3, 2)), rng.uniform(0.2, 1, 3)])
+    surfaces = rng.normal(size=(3, 2)), facing, rng.uniform(0, 0.1, 3)
+    image = KeyframeImage(rng.integers(0, 256, 60).astype(np.uint8), *surfaces)
+    stamp_ns = 10**9 + i * 10**8
+    own = Keyframe(i, -1 if begins else i - 1, stamp_ns, T, cov, pose(i), up, 0.01, view, i - 1, image)
     return SaveKeyframe(key, own)
 
 
@@ -94,6 +99,10 @@ def _keyframe(k: StoredKeyframe) -> tuple[object, ...]:
         own.view.uv,
         own.view.points,
         own.view.descriptors,
+        own.image.jpeg,
+        own.image.uv,
+        own.image.plane,
+        own.image.rho_sigma,
     )
     return (
         k.keyframe_key,

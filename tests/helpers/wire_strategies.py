@@ -20,7 +20,17 @@ from share.geometry.camera import (
     ImuNoise,
     Rig,
 )
-from share.types import AgentKind, Correction, Frame, ImuBatch, Keyframe, TrackState, View, WaitReason
+from share.types import (
+    AgentKind,
+    Correction,
+    Frame,
+    ImuBatch,
+    Keyframe,
+    KeyframeImage,
+    TrackState,
+    View,
+    WaitReason,
+)
 from share.wire import messages as m
 
 
@@ -63,13 +73,29 @@ def views(draw: st.DrawFn, most: int = 40) -> View:
 
 
 @st.composite
+def keyframe_images(draw: st.DrawFn, most: int = 40) -> KeyframeImage:
+    n, size = draw(st.integers(0, most)), draw(st.integers(0, 500))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    surfaces = rng.normal(size=(n, 2)), rng.normal(size=(n, 3)), rng.uniform(0, 2, n)
+    return KeyframeImage(rng.integers(0, 256, size).astype(np.uint8), *surfaces)
+
+
+@st.composite
 def keyframes(draw: st.DrawFn) -> Keyframe:
     id_ = draw(ids)
     reference = draw(st.integers(-1, id_ - 1))
     follows = draw(st.integers(reference, id_ - 1))
     motion = draw(poses(MAX_ODOM_M)), draw(covs), draw(poses(MAX_ODOM_M))
     return Keyframe(
-        id_, reference, draw(stamps), *motion, draw(ups), draw(st.floats(0, 10)), draw(views()), follows
+        id_,
+        reference,
+        draw(stamps),
+        *motion,
+        draw(ups),
+        draw(st.floats(0, 10)),
+        draw(views()),
+        follows,
+        draw(keyframe_images()),
     )
 
 

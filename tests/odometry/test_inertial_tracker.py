@@ -18,6 +18,8 @@ from share.runtime.source import open_source
 from share.sensors.measurement import IMU
 from share.sensors.sequencer import SequencerCounters
 from share.types import ImuBatch, TrackState, WaitReason
+from share.vision.depth import from_stereo
+from share.vision.keyframe_images import decompress
 
 pytestmark = pytest.mark.long
 
@@ -107,10 +109,9 @@ def test_keyframes_carry_the_motion_by_the_present_state(walk):
     """The first keyframes are published with a tilt a degree off; its correction is no rotation."""
     frames, rig, truth = walk
     tracker, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), []
-    for k, frame in enumerate(frames):
+    for frame in frames:
         if tracker.track(frame).keyframe_ready:
-            candidate = tracker.make_keyframe(frame)
-            shown.append((frames[k - candidate.frames_ago].stamp_ns, candidate))
+            shown.append((frame.stamp_ns, tracker.make_keyframe(frame)))
     stamps = np.array([stamp for stamp, _ in shown])
     _, true = interpolate(truth.stamps_ns, truth.T, stamps)
     true = se3.inverse(true[:-1]) @ true[1:]
@@ -124,9 +125,14 @@ def test_keyframes_carry_the_motion_by_the_present_state(walk):
     assert np.sqrt((off**2).mean()) < 0.2 * np.sqrt((before**2).mean())
 
 
+def anchoring_keyframes(tracker):
+    """The keyframes that have features."""
+    return set(tracker.state.keyframe_ids[tracker.state.anchor].tolist())
+
+
 def test_keyframe_work_is_sliced_and_poses_do_not_depend_on_when_it_runs(walk, tracked):
-    """It is published one frame after its own; its features come with the second slice, or with the
-    third where it is shown. Whether anybody calls `finish_keyframe`, or the next frame does it."""
+    """A keyframe is published with its own frame; its features come a frame later. Whether anybody calls
+    `finish_keyframe`, or the next frame does it."""
     frames, rig, _ = walk
     tracker, poses, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], {}
     begun, hosts = {}, []  # when each keyframe came; which have features after each frame
@@ -134,38 +140,63 @@ def test_keyframe_work_is_sliced_and_poses_do_not_depend_on_when_it_runs(walk, t
         result = tracker.track(frame)
         poses.append(result.T_odom_body)
         if result.keyframe_ready:
-            candidate = tracker.make_keyframe(frame)
-            assert candidate.frames_ago == (1 if shown else 0)
-            shown[k - candidate.frames_ago] = candidate
+            shown[k] = tracker.make_keyframe(frame)
+            np.testing.assert_allclose(shown[k].T_odom_body, result.T_odom_body, atol=1e-8)
         for keyframe in tracker.state.keyframe_ids.tolist():
             begun.setdefault(keyframe, k)
         tracker.finish_keyframe()
         tracker.finish_keyframe()  # once a frame is enough
-        hosts.append(set(tracker.state.keyframe_ids[tracker.state.anchor].tolist()))
-    later = {keyframe: k for keyframe, k in begun.items() if 0 < k < len(frames) - 3}
+        hosts.append(anchoring_keyframes(tracker))
+    later = {keyframe: k for keyframe, k in begun.items() if 0 < k < len(frames) - 2}
     for keyframe, k in later.items():
-        assert [keyframe in at for at in hosts[k : k + 3]] == [False, k not in shown, True]
+        assert [keyframe in at for at in hosts[k : k + 2]] == [False, True]
     assert len(later) >= 2 and set(shown) & set(later.values())
     results, candidates, _ = tracked
     for mine, result in zip(poses, results, strict=True):
         np.testing.assert_array_equal(mine, result.T_odom_body)
     for mine, candidate in zip(shown.values(), candidates, strict=True):
-        np.testing.assert_array_equal(mine.view.points, candidate.view.points)
+        for name in ("jpeg", "uv", "plane", "rho_sigma"):
+            np.testing.assert_array_equal(getattr(mine.image, name), getattr(candidate.image, name))
         np.testing.assert_array_equal(mine.cov, candidate.cov)
 
 
 @pytest.mark.parametrize("every", [2, 3])  # of 15 Hz
-def test_at_low_frame_rates_a_keyframe_is_published_with_the_next_frame(walk, every):
-    """Of a keyframe, as its view is made in between."""
+def test_at_low_frame_rates_a_keyframe_has_its_features_before_the_next_frame(walk, every):
     frames, rig, _ = walk
-    rare, samples = [], ImuBatch.empty()
+    tracker, published, samples = InertialTracker(rig, InertialConfig(), TrackerConfig()), 0, ImuBatch.empty()
     for k, frame in enumerate(frames):
         samples = samples.concatenate(frame.imu)
-        if k % every == 0:
-            rare.append(dataclasses.replace(frame, index=len(rare), imu=samples))
-            samples = ImuBatch.empty()
-    _, candidates, _ = run((None, rig, None), rare)
-    assert {c.frames_ago for c in candidates[1:]} == {1}
+        if k % every:
+            continue
+        rare, samples = dataclasses.replace(frame, index=k // every, imu=samples), ImuBatch.empty()
+        if tracker.track(rare).keyframe_ready:
+            tracker.make_keyframe(rare)
+            newest = int(tracker.state.keyframe_ids[-1])
+            tracker.finish_keyframe()
+            assert newest in anchoring_keyframes(tracker)
+            published += 1
+    assert published >= 3
+
+
+def test_a_keyframe_is_its_image_and_surfaces(walk, tracked):
+    """The image of its own frame, compressed, and surfaces whose depth is that of the pair of images."""
+    frames, rig, _ = walk
+    tracker, off = InertialTracker(rig, InertialConfig(), TrackerConfig()), []
+    for frame in frames:
+        if not tracker.track(frame).keyframe_ready:
+            continue
+        candidate = tracker.make_keyframe(frame)
+        image = candidate.image
+        assert len(candidate.view) == 0 and len(image.uv) > 20
+        assert 0 < len(image.jpeg) < 30_000
+        decoded = decompress(image, rig.cam0)
+        assert np.abs(decoded.astype(float) - frame.image0).mean() < 3
+        rho = 1 / image.points[:, 2]
+        px = rig.cam0.distort(image.uv.astype(np.float64)).astype(np.float32)
+        z = from_stereo(frame.image0, frame.image1, rig, px, image.uv.astype(np.float64), 1 / rho)
+        off += ((1 / z - rho) / np.hypot(image.rho_sigma, 0.02))[np.isfinite(z)].tolist()
+    assert len(off) > 100
+    assert np.median(np.abs(off)) < 1 and np.percentile(np.abs(off), 90) < 3
 
 
 class Late:

@@ -60,7 +60,7 @@ def test_scale_from_the_imu(walk):  # noqa: F811
     assert scale_of(mono[0], results, mono[2]) == pytest.approx(1, abs=0.08)
     assert error_m(mono, mono[0], results) < 0.03
     assert candidates[0].new_segment
-    assert np.isfinite(candidates[-1].view.points[:, 2]).sum() > 20
+    assert np.isfinite(candidates[-1].points[:, 2]).sum() > 20
 
 
 def test_no_pose_at_rest_because_there_is_no_scale(walk):  # noqa: F811

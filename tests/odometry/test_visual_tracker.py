@@ -10,6 +10,9 @@ from share.geometry.camera import Rig
 from share.odometry import initialisation, relocalisation, visual_tracker
 from share.odometry.visual_tracker import VisualTracker
 from share.types import Frame, TrackState, WaitReason
+from share.vision.depth import from_stereo
+from share.vision.keyframe_images import decompress
+from share.vision.orb import image_view
 
 pytestmark = pytest.mark.long
 
@@ -50,6 +53,40 @@ def test_tracks_every_frame_to_the_centimetre(walk):
     assert 4 < len(candidates) < 40
     assert candidates[0].new_segment
     assert not any(c.new_segment for c in candidates[1:])
+
+
+def test_a_keyframe_is_its_image_and_surfaces_that_face_the_camera(walk):
+    images, _ = walk
+    tracker, off = VisualTracker(STEREO, DEFAULT), []
+    for i, (left, right) in enumerate(images[:40]):
+        if not tracker.track(Frame(stamp(i), i, left, right)).keyframe_ready:
+            continue
+        candidate = tracker.make_keyframe(Frame(stamp(i), i, left, right))
+        image = candidate.image
+        assert len(candidate.view) == 0 and len(image.uv) > 60
+        assert np.abs(decompress(image, CAMERA).astype(float) - left).mean() < 3
+        assert (image.plane[:, :2] == 0).all()
+        uv = image.uv.astype(np.float64)
+        z = from_stereo(left, right, STEREO, CAMERA.distort(uv).astype(np.float32), uv, image.points[:, 2])
+        off += ((1 / z - image.plane[:, 2]) / image.rho_sigma)[np.isfinite(z)].tolist()
+    assert len(off) > 500
+    assert np.median(np.abs(off)) < 1 and np.percentile(np.abs(off), 90) < 4
+
+
+def test_orb_features_are_found_only_once_an_agent_is_lost(walk, monkeypatch):
+    images, made = walk[0], []
+
+    def counted(image, *rest):
+        made.append(image)
+        return image_view(image, *rest)
+
+    monkeypatch.setattr(relocalisation, "image_view", counted)
+    results, _ = run(images[:40])
+    assert made == [] and results[-1].state is TrackState.OK
+    dark = (np.zeros((480, 640), np.uint8),) * 2
+    results, _ = run([*images[:40], *[dark] * 3, *images[43:46]])
+    assert results[-1].state.has_pose
+    assert 0 < len(made) == len({id(image) for image in made})  # of each keyframe once
 
 
 def test_finishing_a_keyframe_may_wait_for_the_next_frame(walk):

@@ -15,7 +15,7 @@ from share.errors import UsageError
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
-from share.types import Correction, Keyframe, KeyframeCandidate, TrackState, View
+from share.types import Correction, Keyframe, KeyframeCandidate, KeyframeImage, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import WIRE_VERSION, decode, encode, message_bytes
 
@@ -160,19 +160,6 @@ def test_pings_measure_round_trip_and_clock() -> None:
     assert abs(report["clock_drift_ppm"]) < 1
 
 
-def test_extracting_a_view_of_an_earlier_frame_is_no_delay() -> None:
-    """No pose waits for the view, so the evaluation includes only the processing of the last frame."""
-    agent = welcomed()
-    [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)
-    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
-    for k in (11, 12, 13):
-        handle(agent, tracked(k, pose(1)), (50 * k + 4) * MS)
-    frame = replace(tracked(14, pose(1)), is_keyframe=True)
-    candidate = KeyframeCandidate(pose(1), pose(1), COV, UP, 0.01, seen_at(2.0), True, frames_ago=3)
-    effects = agent.handle(frame, 704 * MS) + agent.handle(ev.KeyframeMade(frame, candidate), 710 * MS)
-    assert [told.delay_ms for told in only(m.Evaluation, effects, messages=True)] == [3.0 + 10.0]
-
-
 def latencies(edge_ns: Callable[[int], int], claim_ms: float = 1.0) -> tuple[list[float], Agent]:
     """All that is called latency or delay in 30 s of keyframes, each corrected 27 ms after its frame came,
     with an edge whose clock shows `edge_ns` of the agent's."""
@@ -255,21 +242,24 @@ def test_a_frame_is_done_if_its_keyframe_could_not_be_made() -> None:
     np.testing.assert_allclose(after.T_ref_body, pose(2))
 
 
-def test_a_delayed_candidate_is_a_keyframe_of_its_own_frame() -> None:
-    """Its stamp is that frame's, and a correction that answers it is as old as that; the frame that it came
-    with is the one that is done."""
+def test_a_keyframe_is_of_the_frame_that_it_came_with() -> None:
+    """Its stamp and pose are that frame's, and a correction that answers it is as old as that. It carries the
+    candidate's image, and no ORB features: the edge finds them."""
     agent = welcomed()
     for k in range(3):
         handle(agent, tracked(k, pose(k)), 50 * k * MS)
     frame = replace(tracked(3, pose(3)), is_keyframe=True)
-    candidate = KeyframeCandidate(pose(1), pose(1), COV, UP, 0.01, seen_at(2.0), True, frames_ago=2)
+    image = KeyframeImage(np.arange(9, dtype=np.uint8), np.zeros((1, 2)), [[0, 0, 0.5]], [0.01])
+    candidate = KeyframeCandidate(pose(3), pose(3), COV, UP, 0.01, View.empty(), True, image)
     effects = agent.handle(frame, 154 * MS) + agent.handle(ev.KeyframeMade(frame, candidate), 160 * MS)
     [made] = only(Keyframe, effects, messages=True)
-    assert made.stamp_ns == tracked(1).stamp_ns
+    assert made.stamp_ns == tracked(3).stamp_ns
+    assert made.image.jpeg.tolist() == image.jpeg.tolist() and made.image.plane.tolist() == [[0, 0, 0.5]]
+    assert len(made.view) == 0
     [done] = only(ev.FrameDone, effects)
     assert (done.stamp_ns, done.is_keyframe, done.is_sent) == (frame.stamp_ns, True, True)
     [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(0), 1, answers=0), 250 * MS))
-    assert (applied.stamp_ns, applied.corrected_ms) == (made.stamp_ns, pytest.approx(200.0))
+    assert (applied.stamp_ns, applied.corrected_ms) == (made.stamp_ns, pytest.approx(100.0))
 
 
 def test_poses_are_relative_to_the_last_acknowledged_keyframe() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -129,15 +128,11 @@ def test_in_virtual_time_an_estimate_is_immediate():
     assert errors.update(frame(1), LOST) is None
 
 
-def test_a_keyframe_made_late_is_estimated_by_its_own_image():
-    class Late(Tracker):
-        def make_keyframe(self, frame):
-            return replace(CANDIDATE, frames_ago=2)
-
+def test_a_keyframe_is_estimated_by_the_image_that_it_is_made_of():
     network = Network()
     network.may.set()
     errors = SynchronousErrorModel(network)
     for brightness in (3, 40, 90):
         errors.update(frame(brightness), TRACKED)
-    errors.make_keyframe(frame(90), Late())
-    assert network.seen == [3.0]
+    errors.make_keyframe(frame(90), Tracker())
+    assert network.seen == [90.0]

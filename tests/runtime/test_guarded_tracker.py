@@ -118,7 +118,7 @@ def test_a_failed_keyframe_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.Mo
     guard = FaultGuard(lambda text: None)
     tracker = GuardedTracker(RIG, Config(), guard)
     assert tracker.track(walk.frames[0]).keyframe_ready
-    monkeypatch.setattr("share.odometry.keyframes.ViewBuilder.finish", _no_gain)
+    monkeypatch.setattr("share.odometry.landmarks.LandmarkMap.surfaces", _no_gain)
     kept = tracker.attempt("a keyframe", walk.frames[0], lambda: tracker.make_keyframe(walk.frames[0]))
     assert kept is None and guard.failure_count == 1
     assert tracker.track(walk.frames[1]).state is TrackState.LOST

@@ -53,12 +53,12 @@ def test_one_map_is_exported(tmp_path):
     assert stamps.tolist() == [10**9 + i * 10**8 for i in range(20)]
     assert np.allclose(T, [pose(7) @ pose(i) for i in range(20)], atol=1e-8)
     points, colours = read_ply(tmp_path / "out" / "points.ply")
-    assert len(points) == done[f"{ANN}/0"].points == 40 * 40
+    assert len(points) == done[f"{ANN}/0"].points == 40 * 43
     assert sum(counted) == 40
-    third = keyframe(ANN, 1).keyframe.view.points  # ann 0, bob 0, ann 1
+    third = keyframe(ANN, 1).keyframe.points  # ann 0, bob 0, ann 1
     expected = se3.transform(pose(7) @ pose(1) @ run(ANN).hello.rig.T_body_cam0, third.astype(float))
-    assert np.allclose(points[80:120], expected, atol=1e-5)
-    assert [tuple(c) for c in colours[[0, 40, 80]]] == [COLOURS[0], COLOURS[1], COLOURS[0]]
+    assert np.allclose(points[86:129], expected, atol=1e-5)
+    assert [tuple(c) for c in colours[[0, 43, 86]]] == [COLOURS[0], COLOURS[1], COLOURS[0]]
     rows = list(csv.DictReader((tmp_path / "out" / "loops.csv").read_text().splitlines()))
     assert [(r["a_run"], r["a"], r["b_run"], r["b"], r["inliers"]) for r in rows][1] == (
         ANN,
@@ -77,7 +77,7 @@ def test_points_of_unknown_depth_are_left_out(tmp_path):
     object.__setattr__(kept.keyframes[0].keyframe.view, "points", hidden)
     export_map(kept, tmp_path / "out", nothing)
     found, _ = read_ply(tmp_path / "out" / "points.ply")
-    assert len(found) == 80 - 7
+    assert len(found) == 86 - 7
     assert np.isfinite(found).all()
 
 

@@ -13,6 +13,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from helpers.map_changes import ANN, BOB, as_values, keyframe, loop, pose, run, small_map, solution
@@ -75,6 +76,37 @@ def test_all_changes_are_read_back(path):
     assert kept.segments == (f"{ANN}/0", f"{BOB}/0")
     assert kept.next_ids == {ANN: 20, BOB: 20}
     assert kept.problems == ()
+
+
+def test_images_are_read_back_byte_by_byte(path):
+    sent = keyframe(ANN, 0).keyframe.image
+    with MapStore.open(path) as store:
+        store.write([run(ANN), keyframe(ANN, 0)])
+    found = reopened(path).keyframes[0].keyframe.image
+    assert len(sent.jpeg) == 60 and len(sent.uv) == 3
+    for name in ("jpeg", "uv", "plane", "rho_sigma"):
+        assert getattr(found, name).tobytes() == getattr(sent, name).tobytes()
+
+
+def test_keyframes_of_wire_5_are_read_without_an_image(path):
+    """As SHARE before images wrote them: today's message without its last four arrays."""
+    with MapStore.open(path) as store:
+        store.write([run(ANN), keyframe(ANN, 0), keyframe(ANN, 1)])
+    sent = keyframe(ANN, 0).keyframe
+    frames = [bytes(frame) for frame in codec.encode(sent)]
+    _, code, scalars, table = msgspec.msgpack.decode(frames[0])
+    blob = msgspec.msgpack.encode([msgspec.msgpack.encode((5, code, scalars, table[:7])), *frames[1:8]])
+    with closing(sqlite3.connect(path)) as connection, connection:
+        columns = "number, run, id, stretch, ordinal"
+        number, *place = connection.execute(f"SELECT {columns} FROM keyframe WHERE id = 0").fetchone()
+        connection.execute("DELETE FROM keyframe WHERE number = ?", (number,))
+        insert(connection, "keyframe", (*place, 5, blob), number)
+    kept = reopened(path)
+    assert kept.problems == ()
+    old, new = (found.keyframe for found in kept.keyframes)
+    assert (len(old.image.jpeg), len(old.image.uv), len(new.image.jpeg)) == (0, 0, 60)
+    assert np.array_equal(old.view.descriptors, sent.view.descriptors)
+    assert np.array_equal(old.T_ref_body, sent.T_ref_body)
 
 
 def test_repeated_changes_change_nothing(path):

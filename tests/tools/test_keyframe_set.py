@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import importlib
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.frame_keyframe import frame_image
 from helpers.small_session import small_profile, small_recipe
 
 from share.config import Config
 from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.lab.emulate.session import make_session
+from share.mapping.recognition.patch_alignment import ImageView
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
 from share.sensors.sequencer import SequencerCounters
 from share.types import AgentKind
-from share.vision.orb import make_view
+from share.vision.keyframe_images import decompress
 
 pytestmark = pytest.mark.long
 
@@ -54,7 +57,7 @@ def made(tool, recipe, every, cache):
 
 
 @pytest.mark.slow
-def test_views_and_truth_equal_those_of_the_recording(made, recipe, tmp_path):
+def test_images_and_truth_equal_those_of_the_recording(made, recipe, tmp_path):
     session = make_session(recipe, tmp_path / "session", workers=1)
     for name, kind in NAMES.items():
         source, agent = open_source(str(session / name)), made.agents[name]
@@ -65,11 +68,13 @@ def test_views_and_truth_equal_those_of_the_recording(made, recipe, tmp_path):
         assert np.allclose(agent.hello.rig.T_body_cam0, source.rig.T_body_cam0, atol=1e-9)
         assert len(agent.keyframes) == len(agent.T_world_body) == len(agent.T_odom_body) >= 3
         for keyframe, T in zip(agent.keyframes, agent.T_world_body, strict=True):
-            view = make_view(recorded[keyframe.stamp_ns], source.rig)
-            assert np.array_equal(keyframe.view.descriptors, view.descriptors)
-            assert np.allclose(keyframe.view.points, view.points, atol=1e-5, equal_nan=True)
+            image = frame_image(recorded[keyframe.stamp_ns], source.rig, 70)
+            assert np.array_equal(keyframe.image.jpeg, image.jpeg)
+            assert np.allclose(keyframe.image.points, image.points, atol=1e-5)
             assert np.allclose(truth.T[truth.stamps_ns == keyframe.stamp_ns], T, atol=1e-8)
-        known = [np.isfinite(k.view.points).all(axis=1).sum() for k in agent.keyframes]
+        rig = agent.hello.rig
+        views = [ImageView(k.image, rig.cam0, rig.T_body_cam0).describe() for k in agent.keyframes]
+        known = [np.isfinite(view.points).all(axis=1).sum() for view in views]
         assert np.median(known) > 20
 
 
@@ -79,6 +84,18 @@ def test_keyframes_follow_the_spacing(made, every):
         T = se3.inverse(agent.T_world_body[:-1]) @ agent.T_world_body[1:]
         far = (np.linalg.norm(T[:, :3, 3], axis=1) >= every.metres) | (se3.rotation_angle(T) >= every.radians)
         assert far.all() and (np.diff(stamps) >= every.seconds * 1e9).all()
+
+
+def test_another_agent_on_the_same_track_sends_other_images(tool, made):
+    """Of the same place: as large, and nearly the same depths."""
+    one, other = (list(islice(tool("load_tracks").Walker(made, k).keyframes(), 5)) for k in (0, 2))
+    camera = made.agents["ann"].hello.rig.cam0
+    sent = {k.stamp_ns: k for k in made.agents["ann"].keyframes}
+    assert all(decompress(k.image, camera) is not None for k in (*one, *other, *sent.values()))
+    sizes = [len(k.image.jpeg) for k in (*one, *sent.values())]
+    assert max(sizes) < 1.5 * min(sizes)
+    assert {k.image.jpeg.tobytes() for k in one}.isdisjoint(k.image.jpeg.tobytes() for k in other)
+    assert len(one[0].view) == 0 and len(one[0].image.uv) > 20
 
 
 def test_keyframe_steps_add_up_to_odometry(made):
@@ -102,9 +119,8 @@ def test_cached_set_is_not_made_again(tool, made, recipe, every, cache, monkeypa
     for name, agent in again.agents.items():
         assert agent.hello.run_id == made.agents[name].hello.run_id
         assert np.array_equal(agent.T_world_body, made.agents[name].T_world_body)
-        assert np.array_equal(
-            agent.keyframes[-1].view.points, made.agents[name].keyframes[-1].view.points, True
-        )
+        assert np.array_equal(agent.keyframes[-1].points, made.agents[name].keyframes[-1].points)
+        assert np.array_equal(agent.keyframes[-1].image.jpeg, made.agents[name].keyframes[-1].image.jpeg)
     with pytest.raises(AssertionError, match="made again"):
         tool("keyframe_set").keyframe_set(recipe, type(every)(0.3, 0.3), cache)
 

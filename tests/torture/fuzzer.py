@@ -217,15 +217,18 @@ class Attacker:
 
 
 def _small(messages: list[Message], kind: str) -> list[Message]:
-    """Keyframes with few points, as they could well be."""
+    """Keyframes with few points, as they could well be; one in eight with its image."""
     if kind != "keyframe":
         return messages
     out = []
-    for parts in messages[:200]:
+    for k, parts in enumerate(messages[:200]):
         fields: Any = unpack(parts[0])
-        n = min(SMALL_POINTS, fields[3][4][1][0])
-        for i, size in ((4, 8), (5, 12), (6, 32)):
-            fields[3][i][1][0] = n
+        image_bytes = 0 if k % 8 else fields[3][7][1][0]
+        for i, size, most in (
+            *((i, size, SMALL_POINTS) for i, size in ((4, 8), (5, 12), (6, 32), (8, 8), (9, 12), (10, 4))),
+            (7, 1, image_bytes),
+        ):
+            n = fields[3][i][1][0] = min(most, fields[3][i][1][0])
             parts = [*parts[: i + 1], parts[i + 1][: n * size], *parts[i + 2 :]]
         out.append([pack(fields), *parts[1:]])
     return out

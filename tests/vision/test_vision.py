@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from helpers.frame_keyframe import frame_image
 from helpers.plain_walk import CAMERA, T_CAM1_CAM0
 
 from share.geometry import se3
@@ -10,9 +11,9 @@ from share.geometry.camera import Camera, Rig
 from share.lab.emulate.motion import walk
 from share.lab.emulate.plain.render import PlainRoomRenderer
 from share.lab.emulate.plain.room import make_room
-from share.types import Frame
+from share.types import Frame, KeyframeImage
 from share.vision import corners, depth, optical_flow
-from share.vision.orb import detect_orb, make_view
+from share.vision.orb import detect_orb, image_view
 
 
 @pytest.fixture(scope="module")
@@ -161,19 +162,46 @@ def test_no_points_are_no_error():
     assert depth.from_stereo(image, image, stereo, px, none).shape == (0,)
     assert optical_flow.track_points(image, image, px, px)[0].shape == (0, 2)
     for frame, rig in ((Frame(0, 0, image, depth=far), rgbd), (Frame(0, 0, image, image), stereo)):
-        assert len(make_view(frame, rig)) == 0
+        surfaces = frame_image(frame, rig)
+        assert len(surfaces.uv) == 0
+        assert len(image_view(image, CAMERA, surfaces, 300)) == 0
 
 
 @pytest.mark.long
-def test_a_view_is_spread_and_has_depth(scene):
-    left, _, right, _, _ = scene
+def test_an_image_view_is_spread_and_has_the_depth_of_the_surfaces_near(scene):
+    left, exact, right, _, _ = scene
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
-    view = make_view(Frame(0, 0, left, right), rig, 300)
+    surfaces = frame_image(Frame(0, 0, left, right), rig)
+    view = image_view(left, CAMERA, surfaces, 300)
     assert 250 < len(view) <= 300
-    cells = np.unique((CAMERA.distort(view.uv.astype(float)) // 80).astype(int), axis=0)
+    px = CAMERA.distort(view.uv.astype(float))
+    cells = np.unique((px // 80).astype(int), axis=0)
     assert len(cells) > 30  # of 48
     known = ~np.isnan(view.points[:, 0])
     assert known.mean() > 0.7
     assert np.allclose(view.points[known, :2] / view.points[known, 2:], view.uv[known], atol=1e-5)
-    again = make_view(Frame(0, 0, left, right), rig, 300)
+    at = np.rint(px[known]).astype(int)
+    off = np.abs(view.points[known, 2] / exact[at[:, 1], at[:, 0]] - 1)
+    assert np.median(off) < 0.05
+    again = image_view(left, CAMERA, surfaces, 300)
     assert (again.descriptors == view.descriptors).all()
+    unknown = image_view(left, CAMERA, KeyframeImage.empty(), 300)
+    assert (unknown.descriptors == view.descriptors).all() and np.isnan(unknown.points).all()
+
+
+def test_an_orb_feature_lies_on_the_plane_of_the_surface_near_it():
+    """A slanted one: the depth is where the feature's own ray meets it. Too far from it, or where the plane
+    is behind or far away, depth is unknown."""
+    rng = np.random.default_rng(0)
+    image = cv2.resize(rng.integers(0, 255, (60, 80), np.uint8), (640, 480))
+    plane = np.array([0.2, -0.1, 0.5])
+    at = np.array([[320.0, 240.0]])
+    one = KeyframeImage(np.zeros(0, np.uint8), CAMERA.normalise(at), plane[None], [0.01])
+    view = image_view(image, CAMERA, one, 600)
+    known = ~np.isnan(view.points[:, 0])
+    far_px = np.linalg.norm(CAMERA.distort(view.uv.astype(float)) - at, axis=1)
+    assert known.sum() > 5 and (known == (far_px < 60)).all()
+    np.testing.assert_allclose(view.points[known] @ plane, 1, atol=1e-5)
+    for hidden in ([0.0, 0.0, -0.5], [0.0, 0.0, 0.02]):
+        behind = KeyframeImage(np.zeros(0, np.uint8), CAMERA.normalise(at), [hidden], [0.01])
+        assert np.isnan(image_view(image, CAMERA, behind, 600).points).all()

@@ -16,7 +16,19 @@ from hypothesis import strategies as st
 
 from share.errors import WireError
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.types import AgentKind, Correction, Frame, ImuBatch, Keyframe, TrackState, View, WaitReason
+from share.net.backlog import BacklogLimits
+from share.types import (
+    MAX_JPEG_BYTES,
+    AgentKind,
+    Correction,
+    Frame,
+    ImuBatch,
+    Keyframe,
+    KeyframeImage,
+    TrackState,
+    View,
+    WaitReason,
+)
 from share.wire import codec
 from share.wire import messages as m
 
@@ -36,6 +48,14 @@ def keyframe(n: int, id_: int = 7) -> Keyframe:
     return Keyframe(id_, id_ - 1, 10**18, POSE, np.eye(6), POSE, np.array([0, 0, 1.0]), 0.01, view)
 
 
+def keyframe_with_image(n: int, jpeg_bytes: int, id_: int = 7) -> Keyframe:
+    """A keyframe as an agent sends it: an image and `n` surfaces, no ORB features."""
+    rng = np.random.default_rng(n)
+    jpeg = rng.integers(0, 256, jpeg_bytes).astype(np.uint8)
+    surfaces = rng.normal(size=(n, 2)), rng.normal(size=(n, 3)), rng.uniform(0, 0.1, n)
+    return dataclasses.replace(keyframe(0, id_), image=KeyframeImage(jpeg, *surfaces))
+
+
 def frame(stereo: bool) -> Frame:
     rng = np.random.default_rng(1)
     image0, image1 = rng.integers(0, 256, (2, 12, 16)).astype(np.uint8)
@@ -48,6 +68,7 @@ EXAMPLES: list[m.Message] = [
     m.Hello("ann", AgentKind.AR, 2**62, STEREO),
     m.PoseUpdate(1_700_000_000_123_456_789, TrackState.INERTIAL_ONLY, 2**31 - 1, POSE),
     keyframe(5),
+    keyframe_with_image(3, 40),
     m.Evaluation(3, 12.5, None),
     m.Status(TrackState.LOST, 2100.5, "no image for 2.1 s"),
     m.Ping(1, 10**18),
@@ -100,9 +121,32 @@ def test_round_trip(message: m.Message) -> None:
     assert same(codec.decode(frames), message)
 
 
-def test_a_pose_fits_into_200_bytes_and_a_keyframe_into_30_kb() -> None:
+def test_a_pose_fits_into_200_bytes_and_a_keyframe_into_its_image_and_3_kb() -> None:
     assert codec.message_bytes(codec.encode(EXAMPLES[1])) <= 200
-    assert codec.message_bytes(codec.encode(keyframe(500, 10**9))) <= 30_000
+    sent = keyframe_with_image(70, 17_000, 10**9)
+    assert codec.message_bytes(codec.encode(sent)) <= 17_000 + 3_000
+
+
+def test_the_largest_keyframe_image_is_decoded() -> None:
+    sent = keyframe_with_image(2000, MAX_JPEG_BYTES)
+    assert same(codec.decode(copied(codec.encode(sent))), sent)
+    assert max(map(len, codec.encode(sent))) <= codec.MAX_FRAME_BYTES
+    guard = BacklogLimits.for_frame_size(codec.MAX_FRAME_BYTES)
+    assert codec.message_bytes(codec.encode(sent)) < guard.message_bytes  # else its connection is reset
+
+
+def test_a_keyframe_of_wire_5_is_decoded_where_its_version_is_accepted() -> None:
+    """It is today's without its last four arrays. Map files keep such; a peer may not send one."""
+    sent = keyframe(5)
+    _, code, scalars, table = msgspec.msgpack.decode(codec.encode(sent)[0])
+    old = [header(5, code, scalars, table[:7]), *copied(codec.encode(sent))[1:8]]
+    assert same(codec.decode(old, (5, V)), sent)
+    with pytest.raises(WireError, match="peer speaks wire 5"):
+        codec.decode(old)
+    with pytest.raises(WireError, match="7 declared, 11 expected"):
+        codec.decode([header(V, code, scalars, table[:7]), *old[1:]])
+    with pytest.raises(WireError, match="11 declared, 7 expected"):
+        codec.decode([header(5, code, scalars, table), *copied(codec.encode(sent))[1:]], (5, V))
 
 
 def test_arrays_are_views_on_both_sides() -> None:
@@ -141,11 +185,24 @@ def header(version: object = V, code: object = 5, scalars: object = (1, 2), arra
 T_FRAMES = [b"\0" * 128]
 OURS = bytes([0x94, V])  # how a header begins
 POSE_SCALARS = (1, "OK", -1)
+
+
+def bad_keyframe(
+    scalars: object = (7, -1, 0, 6, 0.0), at: int = 0, entry: object = None, data: bytes = b""
+) -> list[bytes]:
+    """A keyframe without features, with these scalars and with array number `at`, if `entry` is given."""
+    frames = copied(codec.encode(keyframe(0)))
+    table = msgspec.msgpack.decode(frames[0])[3]
+    if entry is not None:
+        table[at], frames[at + 1] = entry, data
+    return [header(V, 3, scalars, table), *frames[1:]]
+
+
 BAD = {
     "empty message": [],
     "header of 4097 bytes": [b"\0" * 4097],
     "header: ": [b""],
-    "peer speaks wire 2, this SHARE wire 5: upgrade the older one": [header(version=2)],
+    f"peer speaks wire 2, this SHARE wire {V}: upgrade the older one": [header(version=2)],
     "peer speaks wire 9": [msgspec.msgpack.encode((9, "some", {"other": "layout"}))],
     "unknown message type 99": [header(code=99)],
     "Ping: Expected `int`": [header(scalars=("a", 2))],
@@ -161,15 +218,14 @@ BAD = {
     "is not a rigid transform": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), *T_FRAMES],
     "not finite": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
     "Invalid enum value 'LOSTER'": [header(V, 2, (1, "LOSTER", -1), [("<f8", (4, 4))]), *T_FRAMES],
-    "predecessor: 9": [header(V, 3, (7, -1, 0, 9, 0.0), codec_table := [
-        ("<f8", (4, 4)), ("<f8", (6, 6)), ("<f8", (4, 4)), ("<f8", (3,)),
-        ("<f4", (0, 2)), ("<f4", (0, 3)), ("|u1", (0, 32))]),
-        POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
-    "up_sigma: -0.1 is outside 0 .. 1e+06": [header(V, 3, (7, -1, 0, 6, -0.1), codec_table),
-        POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
-    "view.uv: <f4 of shape (2001, 2)": [header(V, 3, (7, -1, 0, 6, 0.0), [
-        *codec_table[:4], ("<f4", (2001, 2)), *codec_table[5:]]),
-        POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"\0" * 16008, b"", b""],
+    "predecessor: 9": bad_keyframe((7, -1, 0, 9, 0.0)),
+    "up_sigma: -0.1 is outside 0 .. 1e+06": bad_keyframe((7, -1, 0, 6, -0.1)),
+    "view.uv: <f4 of shape (2001, 2)": bad_keyframe(at=4, entry=("<f4", (2001, 2)), data=b"\0" * 16008),
+    "image.jpeg: |u1 of shape (64001,)": bad_keyframe(at=7, entry=("|u1", (64_001,)), data=b"\0" * 64_001),
+    "image.jpeg: 3 bytes, its shape needs 4": bad_keyframe(at=7, entry=("|u1", (4,)), data=b"\0" * 3),
+    "image.uv: <f4 of shape (2001, 2)": bad_keyframe(at=8, entry=("<f4", (2001, 2)), data=b"\0" * 16008),
+    "plane: shape (1, 3), expected (0, 3)": bad_keyframe(at=9, entry=("<f4", (1, 3)), data=b"\0" * 12),
+    "rho_sigma: shape (1,), expected (0,)": bad_keyframe(at=10, entry=("<f4", (1,)), data=b"\0" * 4),
 }  # fmt: skip
 
 
@@ -185,6 +241,21 @@ def test_a_peer_cannot_forge_log_lines() -> None:
     for text in ("a\nb", "\x1b[2J", "x" * 2000):
         assert refused([header(V, 2, (1, text, -1), [(text, (4, 4))]), *T_FRAMES])
         assert refused([header(V, 2, POSE_SCALARS, [(text, (4, 4))]), *T_FRAMES])
+
+
+def test_surfaces_that_no_camera_sees_are_refused() -> None:
+    frames = copied(codec.encode(keyframe_with_image(3, 0)))
+    for index, shape, value, said in (
+        (9, (3, 2), np.nan, "uv: has values that are not finite"),
+        (9, (3, 2), 1001.0, "uv: values beyond 1000"),
+        (10, (3, 3), -1001.0, "plane: values beyond 1000"),
+        (10, (3, 3), np.inf, "plane: has values that are not finite"),
+        (11, (3,), -0.1, "rho_sigma: outside 0"),
+        (11, (3,), 1e7, "rho_sigma: outside 0"),
+    ):
+        data = np.full(shape, value, np.float32).tobytes()
+        with pytest.raises(WireError, match=said):
+            codec.decode([*frames[:index], data, *frames[index + 1 :]])
 
 
 def test_infinite_points_and_disagreeing_lengths_are_refused() -> None:

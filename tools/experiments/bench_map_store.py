@@ -26,7 +26,7 @@ from share.geometry.camera import Camera, Rig  # noqa: E402
 from share.mapping.loops import KeyframeKey  # noqa: E402
 from share.mapping.map_changes import MapChange, RemoveKeyframes, SaveKeyframe, SavePoses, SaveRun  # noqa: E402
 from share.store.map_store import MapStore  # noqa: E402
-from share.types import AgentKind, Keyframe, View  # noqa: E402
+from share.types import AgentKind, Keyframe, KeyframeImage, View  # noqa: E402
 from share.wire.messages import Hello  # noqa: E402
 
 RUN = "ann-0001"
@@ -58,12 +58,14 @@ def fresh(folder: Path | None, bench: Callable[[Path], dict[str, Any]]) -> dict[
 
 def keyframes() -> Callable[[int], SaveKeyframe]:
     rng = np.random.default_rng(0)
-    view = View(rng.normal(size=(500, 2)), rng.normal(size=(500, 3)), rng.integers(0, 256, (500, 32)))
+    surfaces = rng.normal(size=(70, 2)), rng.normal(size=(70, 3)), rng.uniform(0, 0.1, 70)
+    image = KeyframeImage(rng.integers(0, 256, 17_000, np.uint8), *surfaces)
     step, up = np.eye(4), np.array([0.0, 0.0, 1.0])
 
     def make(i: int) -> SaveKeyframe:
         cov = np.eye(6) * 1e-6
-        return SaveKeyframe(RUN, Keyframe(i, i - 1, i * 10**8, step, cov, step, up, 0.01, view))
+        view = View.empty()
+        return SaveKeyframe(RUN, Keyframe(i, i - 1, i * 10**8, step, cov, step, up, 0.01, view, image=image))
 
     return make
 

@@ -45,7 +45,7 @@ from share.runtime.source import Source, open_source  # noqa: E402
 from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64  # noqa: E402
 from share.vision import corners, patches  # noqa: E402
-from share.vision.orb import ViewBuilder  # noqa: E402
+from share.vision.keyframe_images import Surfaces  # noqa: E402
 
 STEREO = {"euroc_752x480": ("euroc", 20), "d435i_848x480": ("d435i:848x480@30", 30)}  # profile, Hz
 NEEDS_LENS = "euroc_752x480"  # the plain room has no lens distortion
@@ -67,16 +67,15 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (LandmarkMap, "drop_dormant", "keyframe: forget"),
     (initial_depth, "initial_depths", "keyframe: depth"),
     (feature_appearance, "extract_appearance", "keyframe: patches"),
-    (ViewBuilder, "detect", "view: features"),
-    (ViewBuilder, "describe", "view: descriptors"),
-    (ViewBuilder, "finish", "view: depth"),
+    (LandmarkMap, "surfaces", "keyframe: surfaces"),
+    (Surfaces, "with_image", "keyframe: JPEG"),
     (corners, "detect", "keyframe: corners"),
     (VisualTracker, "_follow_tracks", "klt"),
     (VisualTracker, "_estimate_pose", "pose"),
     (VisualTracker, "_reobserve", "reobservation"),
     (VisualTracker, "_add_corners", "corners"),
     (VisualTracker, "_relocalise", "relocalisation"),
-    (VisualTracker, "make_keyframe", "view"),
+    (VisualTracker, "make_keyframe", "keyframe"),
 )
 Tracker = VisualTracker | InertialTracker
 

@@ -23,19 +23,29 @@ import numpy as np
 
 from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate_pair
 from share.net.transport import AgentLink, EdgeLink, bind, connect
-from share.types import Keyframe, TrackState, View
+from share.types import Keyframe, KeyframeImage, TrackState, View
 from share.wire.codec import Bytes, decode, encode, message_bytes
 from share.wire.messages import Message, Ping, PoseUpdate
 
 
 def messages() -> dict[str, Message]:
     rng = np.random.default_rng(0)
-    view = View(rng.normal(size=(500, 2)), rng.normal(size=(500, 3)), rng.integers(0, 256, (500, 32)))
+    surfaces = rng.normal(size=(70, 2)), rng.normal(size=(70, 3)), rng.uniform(0, 0.1, 70)
+    image = KeyframeImage(rng.integers(0, 256, 17_000, np.uint8), *surfaces)
     return {
         "ping": Ping(1, 10**18),
         "pose": PoseUpdate(10**18, TrackState.OK, 100, np.eye(4)),
-        "keyframe_500": Keyframe(
-            100, 99, 10**18, np.eye(4), np.eye(6), np.eye(4), np.array([0, 0, 1.0]), 0.01, view
+        "keyframe": Keyframe(
+            100,
+            99,
+            10**18,
+            np.eye(4),
+            np.eye(6),
+            np.eye(4),
+            np.array([0, 0, 1.0]),
+            0.01,
+            View.empty(),
+            image=image,
         ),
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -24,11 +25,14 @@ from share.lab.pool import Pool
 from share.protocol.agent_ledger import KeyframeChain
 from share.recordings.trajectory import Trajectory
 from share.sensors.measurement import CAM0, CAM1, DEPTH
-from share.types import F64, I64, Frame, Keyframe, KeyframeCandidate, View
-from share.vision.orb import make_view
+from share.types import F64, I64, Frame, Keyframe, KeyframeCandidate, KeyframeImage, View
 from share.wire.messages import Hello
 
-_POINTS = 500  # of a view, as a tracker has
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+
+from helpers.frame_keyframe import frame_image
+
+_SURFACES = 70  # of an image, as a tracker has
 _STREAM = 81  # of random numbers, not used by the emulator
 
 
@@ -39,21 +43,26 @@ def make(recipe: SessionRecipe, every: Spacing, workers: int, progress: Progress
         prepared = prepare_session(recipe, Path(folder) / "room", progress)
         keep_room(prepared, progress)
         chosen = [_chosen(actor, every) for actor in prepared.stage.actors]
-        seen = views(prepared.stage, [at for at, _ in chosen], recipe.images, workers, progress)
+        seen = images(prepared.stage, [at for at, _ in chosen], recipe.images, workers, progress)
     return _set(recipe, every, prepared, [truth for _, truth in chosen], seen)
 
 
 def make_unseen(recipe: SessionRecipe, every: Spacing) -> KeyframeSet:
-    """Return the same set with views of the same size but without content, with depths drawn from 1 to 8 m,
-    one a view. Takes seconds, and needs no OpenGL."""
+    """Return the same set with surfaces only, without images, with depths drawn from 1 to 8 m, one a
+    keyframe. Takes seconds, and needs no OpenGL."""
     rng = np.random.default_rng((recipe.seed, _STREAM))
     with TemporaryDirectory(prefix="keyframes-") as folder:
         prepared = prepare_session(recipe, Path(folder) / "room", no_progress)
     truths = [_chosen(actor, every)[1] for actor in prepared.stage.actors]
-    uv = rng.uniform(-0.5, 0.5, (_POINTS, 2)).astype(np.float32)
-    rays, nothing = np.c_[uv, np.ones(len(uv), np.float32)], np.zeros((len(uv), 32), np.uint8)
-    seen = [[View(uv, rays * rng.uniform(1.0, 8.0), nothing) for _ in truth.stamps_ns] for truth in truths]
+    uv = rng.uniform(-0.5, 0.5, (_SURFACES, 2))
+    seen = [[_facing(uv, rng.uniform(1.0, 8.0)) for _ in truth.stamps_ns] for truth in truths]
     return _set(recipe, every, prepared, truths, seen)
+
+
+def _facing(uv: F64, depth_m: float) -> KeyframeImage:
+    """Surfaces at uv (N, 2) of a wall that faces the camera, without an image."""
+    plane = np.tile([0.0, 0.0, 1 / depth_m], (len(uv), 1))
+    return replace(KeyframeImage.empty(), uv=uv, plane=plane, rho_sigma=np.full(len(uv), 0.01))
 
 
 def _set(
@@ -61,7 +70,7 @@ def _set(
     every: Spacing,
     prepared: PreparedSession,
     truths: list[Trajectory],
-    seen: list[list[View]],
+    seen: list[list[KeyframeImage]],
 ) -> KeyframeSet:
     agents = {
         actor.name: _agent(actor, truth, shown, np.random.default_rng((recipe.seed, _STREAM, k)))
@@ -91,22 +100,24 @@ def _chosen(actor: Actor, every: Spacing) -> tuple[I64, Trajectory]:
     return known[at], Trajectory(truth.stamps_ns[at], truth.T[at])
 
 
-def _agent(actor: Actor, truth: Trajectory, seen: list[View], rng: np.random.Generator) -> AgentKeyframes:
+def _agent(
+    actor: Actor, truth: Trajectory, seen: list[KeyframeImage], rng: np.random.Generator
+) -> AgentKeyframes:
     run_id = int(rng.integers(2**63))
     hello = Hello(actor.name, actor.kind, run_id, actor.rig)
     T_odom_body, cov = odometry(truth.T, truth.stamps_ns, rng, Drift())
     return AgentKeyframes(hello, _chained(T_odom_body, cov, truth.stamps_ns, seen), truth.T, T_odom_body)
 
 
-def _chained(T_odom_body: F64, cov: F64, stamps_ns: I64, seen: list[View]) -> tuple[Keyframe, ...]:
+def _chained(T_odom_body: F64, cov: F64, stamps_ns: I64, seen: list[KeyframeImage]) -> tuple[Keyframe, ...]:
     """Return all candidates as sent keyframes. As with a tracker, up is the z of odom."""
     before = np.concatenate([np.eye(4)[None], T_odom_body[:-1]])
     T_last_body = se3.orthonormal(se3.inverse(before) @ T_odom_body)
     chain, out = KeyframeChain(), []
-    for T, T_last, step, stamp_ns, view in zip(
+    for T, T_last, step, stamp_ns, image in zip(
         T_odom_body, T_last_body, cov, stamps_ns.tolist(), seen, strict=True
     ):
-        candidate = KeyframeCandidate(T, T_last, step, T[2, :3], Drift().tilt_rad, view)
+        candidate = KeyframeCandidate(T, T_last, step, T[2, :3], Drift().tilt_rad, View.empty(), image=image)
         chain.extend(candidate)
         out.append(chain.make_keyframe(candidate, stamp_ns))
     return tuple(out)
@@ -118,7 +129,7 @@ _STRIP = 12  # frames a job
 @dataclass(frozen=True, eq=False)
 class Strip:
     """Pictures first .. last - 1 of actor number `actor_index`, on a stage with keyframes only. shots:
-    exposure of each picture. rig: for making views."""
+    exposure of each picture. rig: for measuring depth."""
 
     actor_index: int
     first: int
@@ -127,14 +138,14 @@ class Strip:
     rig: Rig
 
 
-def views(
-    stage: RoomStage, chosen: list[I64], images: str, workers: int, progress: Progress
-) -> list[list[View]]:
-    """Return the views of each actor at the chosen (N,) of its pictures. The light is metered over all
-    pictures, as for a recording, so that images are equal to the recording's byte by byte. images: jpeg or
+def images(
+    stage: RoomStage, chosen: list[I64], encoding: str, workers: int, progress: Progress
+) -> list[list[KeyframeImage]]:
+    """Return the images of each actor at the chosen (N,) of its pictures. The light is metered over all
+    pictures, as for a recording, so that they are made of the recording's, byte by byte. encoding: jpeg or
     png, as in `SessionRecipe.images`."""
     thinned = replace(stage, actors=tuple(map(_thinned, stage.actors, chosen)))
-    with Pool(workers, drawing.start_worker, (thinned, images)) as pool:
+    with Pool(workers, drawing.start_worker, (thinned, encoding)) as pool:
         exposed = [
             _exposed(pool, actor_index, actor, progress) for actor_index, actor in enumerate(stage.actors)
         ]
@@ -149,22 +160,22 @@ def views(
             for actor_index, (actor, at) in enumerate(zip(stage.actors, chosen, strict=True))
             for k in range(0, len(at), _STRIP)
         ]
-        seen: dict[tuple[int, int], list[View]] = {}
+        seen: dict[tuple[int, int], list[KeyframeImage]] = {}
         for strip, found in pool.run(see, strips):
             seen[strip.actor_index, strip.first] = found
             progress("drawing keyframes", len(seen), len(strips))
     return [_of_one(seen, actor_index) for actor_index in range(len(chosen))]
 
 
-def see(strip: Strip) -> list[View]:
-    """Draw, encode, decode, and make views as a tracker without depth estimates does, in a worker process."""
+def see(strip: Strip) -> list[KeyframeImage]:
+    """Draw, encode and decode, and measure the depth of corners, in a worker process."""
     pictures = drawing.draw_pictures(strip.actor_index, slice(strip.first, strip.last), strip.shots)
     frames = groupby(pictures, key=lambda picture: picture.stamp_ns)
-    return [make_view(_frame(stamp_ns, of_one), strip.rig) for stamp_ns, of_one in frames]
+    return [frame_image(_frame(stamp_ns, of_one), strip.rig, _SURFACES) for stamp_ns, of_one in frames]
 
 
-def _of_one(seen: dict[tuple[int, int], list[View]], actor_index: int) -> list[View]:
-    return [view for key in sorted(seen) if key[0] == actor_index for view in seen[key]]
+def _of_one(seen: dict[tuple[int, int], list[KeyframeImage]], actor_index: int) -> list[KeyframeImage]:
+    return [image for key in sorted(seen) if key[0] == actor_index for image in seen[key]]
 
 
 def _frame(stamp_ns: int, pictures: Iterator[EncodedPicture]) -> Frame:

@@ -5,10 +5,11 @@
     made = keyframe_set(SessionRecipe("corridor-twins", ("walk:", "walk:"), 40.0, seed=3), Spacing(0.3, 0.35))
     for name, agent in made.agents.items():  # agent.hello, .keyframes, .T_world_body, .T_odom_body
 
-Room, motions, sensors, exposure and noise are those of `share emulate` with the same recipe, and each view is
-what `make_view` finds in the frame that it would record. Only keyframes are drawn: the first along the true
-path after each `Spacing`. Odometry is simulated, see `keyframe_odometry`. Unlike with an inertial tracker,
-stereo depths of a view start without a guess, and there are keyframes from the first frame on.
+Room, motions, sensors, exposure and noise are those of `share emulate` with the same recipe, and each image
+is that of the frame that it would record. Only keyframes are drawn: the first along the true path after each
+`Spacing`. Odometry is simulated, see `keyframe_odometry`. Unlike with an inertial tracker, surfaces are
+corners with the depth of this one frame, taken to face the camera, and there are keyframes from the first
+frame on.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from share.wire.messages import Hello, Message
 
 __all__ = ["AgentKeyframes", "KeyframeSet", "Spacing", "keyframe_set", "place"]
 
-# increase it when any keyframe changes (ORB, depth, odometry); the recipe has the emulator's version
-VERSION = 3
+# increase it when any keyframe changes (image, depth, odometry); the recipe has the emulator's version
+VERSION = 4
 
 
 def place(recipe: SessionRecipe, every: Spacing, cache: Path | None = None) -> Path:

@@ -1,6 +1,6 @@
 """Many agents from a few recorded ones: they walk the same tracks, each from another start.
 
-Every view is that of the track with descriptor bits flipped and image points and depths moved, so that no two
+Every image is that of the track with more noise, and every inverse depth with another error, so that no two
 are equal; odometry is drawn for each agent. At the end of a track the agent starts it again as a new odometry
 segment.
 """
@@ -8,20 +8,20 @@ segment.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from keyframe_odometry import Drift, odometry
 from keyframe_set import AgentKeyframes, KeyframeSet, keyframe_set
 
 from share.geometry import se3
+from share.geometry.camera import rays
 from share.lab.emulate.recipe import SessionRecipe
-from share.types import F64, I64, U8, Keyframe, View
+from share.types import F64, I64, Keyframe, KeyframeImage, View
+from share.vision.keyframe_images import Surfaces, decompress
 from share.wire.messages import Hello
 
 RATE_HZ = 3.0  # of keyframes
-_FLIPPED = 0.04  # share of the descriptors' bits
-_PIXELS = 0.3  # standard deviation of an image point
+_GRAY = 3.0  # gray levels, standard deviation of a pixel
 _INVERSE_DEPTH = 0.003  # 1/m, standard deviation of inverse depths
 _FIRST_NS = 1_000_000_000
 
@@ -58,19 +58,19 @@ class Walker:
                 T[k],
                 _up(T[k]),
                 Drift().tilt_rad,
-                self._seen_anew(self._track.keyframes[source].view),
+                View.empty(),
                 number + k - 1,
+                self._seen_anew(self._track.keyframes[source].image),
             )
 
-    def _seen_anew(self, view: View) -> View:
-        n, rng = len(view), self._rng
-        uv = view.uv + rng.normal(0, _PIXELS / self.hello.rig.cam0.focal, (n, 2)).astype(np.float32)
-        rho = np.maximum(1 / view.points[:, 2] + rng.normal(0, _INVERSE_DEPTH, n), 1e-3)
-        points = np.column_stack([uv, np.ones(n)]) / rho[:, None]
-        return replace(view, uv=uv, points=points, descriptors=view.descriptors ^ self._flips(n))
-
-    def _flips(self, n: int) -> U8:
-        return np.packbits(self._rng.random((n, 256), np.float32) < _FLIPPED, axis=1)
+    def _seen_anew(self, image: KeyframeImage) -> KeyframeImage:
+        rng = self._rng
+        rho = (rays(image.uv) * image.plane).sum(axis=1, keepdims=True)
+        factor = np.maximum(rho + rng.normal(0, _INVERSE_DEPTH, rho.shape), 1e-3) / rho
+        pixels = decompress(image, self.hello.rig.cam0)
+        if pixels is not None:
+            pixels = (pixels + rng.normal(0, _GRAY, pixels.shape)).clip(0, 255).astype(np.uint8)
+        return Surfaces(image.uv, image.plane * factor, image.rho_sigma).with_image(pixels)
 
 
 def _up(T_odom_body: F64) -> F64:

@@ -115,11 +115,12 @@ def claimed_runs(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[Trac
         now = lie if since_s >= lie.after_s else Lie()
         T = _longer(keyframe.T_ref_body, 1.0 if begins else now.path)
         T_odom = agent.T_odom_body[n] if begins else se3.orthonormal(T_odom @ T)
-        view = keyframe.view
+        view, image = keyframe.view, keyframe.image
         if now.depth != 1:
             view = View(view.uv, view.points * np.float32(now.depth), view.descriptors)
+            image = replace(image, plane=image.plane / np.float32(now.depth))
         cov = keyframe.cov / now.sure**2
-        candidate = KeyframeCandidate(T_odom, T, cov, keyframe.up, keyframe.up_sigma, view, begins)
+        candidate = KeyframeCandidate(T_odom, T, cov, keyframe.up, keyframe.up_sigma, view, begins, image)
         runs[-1].append(TrackedFrame(keyframe.stamp_ns, T_odom, candidate=candidate))
     hello = _turned(agent.hello, lie.turn_deg)
     return [(replace(hello, run_id=(hello.run_id + n) % 2**64), seen) for n, seen in enumerate(runs)]

@@ -11,12 +11,14 @@ import numpy as np
 from keyframe_set import KeyframeSet, Spacing, keyframe_set
 
 from share.geometry import se3
+from share.geometry.camera import Rig
 from share.lab.emulate.recipe import SessionRecipe
 from share.lab.emulate.world.scenes.corridor import twin_corridors
 from share.mapping.recognition import verification
 from share.mapping.recognition.index import PlaceIndex
+from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView, Verification, verify
-from share.types import F64
+from share.types import F64, Keyframe, View
 
 STEREO, KITCHEN = "euroc_v1_01_keyframes", "redkitchen_0000_0499"
 _THREE = ("ar1=walk:", "ar2=walk:", "robot=robot:")
@@ -65,7 +67,10 @@ def real(folder: Path) -> list[Views]:
     from helpers.place_real import load
 
     stereo, kitchen = load(folder / STEREO), load(folder / KITCHEN, step=5, upright=False)
-    return [Views("stereo", *stereo), Views("kitchen", *kitchen)]
+    return [
+        Views(name, seen.sights, seen.T_world_body, seen.T_world_cam0)
+        for name, seen in (("stereo", stereo), ("kitchen", kitchen))
+    ]
 
 
 def emulated(recipe: SessionRecipe, every: Spacing, step: int) -> Views:
@@ -73,13 +78,18 @@ def emulated(recipe: SessionRecipe, every: Spacing, step: int) -> Views:
     made = keyframe_set(recipe, every)
     agents = [(a, slice(None, None, step)) for a in made.agents.values()]
     sights = [
-        CameraView(k.view, a.hello.rig.cam0.focal, a.hello.rig.T_body_cam0, k.up)
+        CameraView(_described(k, a.hello.rig), a.hello.rig.cam0.focal, a.hello.rig.T_body_cam0, k.up)
         for a, some in agents
         for k in a.keyframes[some]
     ]
     bodies = np.concatenate([a.T_world_body[some] for a, some in agents])
     cameras = bodies @ np.array([s.T_body_cam0 for s in sights])
     return Views(recipe.scene, sights, bodies, cameras, _twin(made))
+
+
+def _described(keyframe: Keyframe, rig: Rig) -> View:
+    """Return the ORB features that the edge finds in the keyframe's image."""
+    return ImageView(keyframe.image, rig.cam0, rig.T_body_cam0).describe()
 
 
 def _twin(made: KeyframeSet) -> F64 | None:

@@ -10,6 +10,7 @@ from typing import Any
 from share.config import Config
 from share.mapping.corrections import MapEvent
 from share.mapping.mapper import Mapper
+from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
 from share.mapping.steps import LookupStep, Step, VerifyStep
 from share.wire.messages import Hello
@@ -18,10 +19,11 @@ _seen: dict[tuple[bytes, bytes], Verification | Refusal] = {}
 
 
 class _Remembered(VerifyStep):
-    """A verification step; its result depends on the two views alone."""
+    """A verification step; its result depends on the two views and images alone."""
 
     def run(self) -> Verification | Refusal:
-        key = _digest(self.query_view), _digest(self.candidate_view)
+        query = _digest(self.query_view, self.query_image)
+        key = query, _digest(self.candidate_view, self.candidate_image)
         if key not in _seen:
             _seen[key] = super().run()
         return _seen[key]
@@ -44,7 +46,8 @@ class RememberingMapper(Mapper):
         look = super().next_lookup()
         if not isinstance(look, VerifyStep):
             return look
-        return _Remembered(look.node_id, look.query_view, look.candidate_id, look.candidate_view)
+        views = look.query_view, look.candidate_id, look.candidate_view
+        return _Remembered(look.node_id, *views, look.query_image, look.candidate_image)
 
     def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
         findings = super().finish_step(step, result, ms)
@@ -68,9 +71,10 @@ class RememberingMapper(Mapper):
                 self._were_apart.add(pair)
 
 
-def _digest(sight: CameraView) -> bytes:
+def _digest(sight: CameraView, image: ImageView | None) -> bytes:
     view, made = sight.view, hashlib.blake2b(digest_size=16)
-    for array in (view.uv, view.points, view.descriptors, sight.T_body_cam0, sight.up):
+    of_image = () if image is None else (image.source.jpeg, image.source.plane)
+    for array in (view.uv, view.points, view.descriptors, sight.T_body_cam0, sight.up, *of_image):
         made.update(array.tobytes())
     made.update(repr(sight.focal).encode())
     return made.digest()

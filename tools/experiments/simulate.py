@@ -173,7 +173,8 @@ def offered(agent: AgentKeyframes) -> list[tuple[int, KeyframeCandidate, float |
     out = []
     for keyframe, T in zip(agent.keyframes, agent.T_odom_body, strict=True):
         up, fresh = (keyframe.up, keyframe.up_sigma), keyframe.reference < 0
-        candidate = KeyframeCandidate(T, keyframe.T_ref_body, keyframe.cov, *up, keyframe.view, fresh)
+        seen = keyframe.view, fresh, keyframe.image
+        candidate = KeyframeCandidate(T, keyframe.T_ref_body, keyframe.cov, *up, *seen)
         out.append((keyframe.stamp_ns, candidate, error.update(keyframe.stamp_ns, T)))
     return out
 

@@ -1,0 +1,215 @@
+"""A keyframe's way through the mapper when it comes as an image: describe, align, query, verify."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pytest
+from helpers import textured_planes
+from helpers.hellos import NOISE, hello_of
+from helpers.textured_planes import CAMERA, T_BODY_CAM, Planes
+
+from share.config import Config
+from share.geometry import se3
+from share.geometry.camera import Camera, Rig
+from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.mapper import Mapper
+from share.mapping.recognition.verification import Verification
+from share.mapping.steps import AlignStep, DescribeStep, QueryStep, Step, VerifyStep
+from share.types import Keyframe, KeyframeImage, View
+from share.vision.image_codec import encode_jpeg
+
+ROOM = [[0.1, 0.05, 0.4], [-0.6, 0.0, 0.3], [0.0, 0.7, 0.25]]  # a back wall, a side wall, a floor
+COV = np.diag([1e-6] * 3 + [1e-5] * 3)
+RIG = Rig(CAMERA, T_BODY_CAM, imu=NOISE)
+UP = np.zeros(3)  # unknown
+
+
+def way(start: float, steps: int) -> Iterator[np.ndarray]:
+    """T_world_body (4, 4): the camera moves sideways before the back wall, 5 cm a step."""
+    for k in range(steps):
+        xi = np.array([0.0, 0.01 * k, 0.0, start + 0.05 * k, 0.02 * (k % 2), 0.01 * k])
+        yield se3.exp(xi) @ se3.inverse(T_BODY_CAM)
+
+
+def keyframes(place: Planes, start: float, seed: int, steps: int = 4) -> list[tuple[np.ndarray, Keyframe]]:
+    """Of one run: true poses, and what it sends; its odom is anywhere."""
+    rng, found = np.random.default_rng(seed), []
+    T_odom_world = se3.exp(rng.normal(0, [0.1, 0.1, 0.1, 1, 1, 1]))
+    for k, T in enumerate(way(start, steps)):
+        image = textured_planes.image_view(place, T, rng, rho_sigma=0.005).source
+        T_odom = T_odom_world @ T
+        T_ref = se3.inverse(found[-1][1].T_odom_body) @ T_odom if k else T_odom
+        sent = Keyframe(k, k - 1, k * 10**8, T_ref, COV, T_odom, UP, 0.0, View.empty(), k - 1, image)
+        found.append((T, sent))
+    return found
+
+
+@pytest.fixture(scope="module")
+def place() -> Planes:
+    return Planes(ROOM, seed=3)
+
+
+def mapper_of(*names: str) -> Mapper:
+    mapper = Mapper(Config())
+    for k, name in enumerate(names):
+        mapper.add_run(name, replace(hello_of(name, k + 1), rig=RIG))
+    return mapper
+
+
+_SOLVERS: WeakKeyDictionary[Mapper, PoseGraphSolver] = WeakKeyDictionary()
+
+
+def work(mapper: Mapper) -> list[tuple[Step, object]]:
+    """All steps that are due, with their results."""
+    done, solver = [], _SOLVERS.setdefault(mapper, PoseGraphSolver(Config().graph))
+    while (step := mapper.next_lookup()) is not None:
+        done.append((step, step.run()))
+        mapper.finish_step(step, done[-1][1], 1.0)
+        while (solve := mapper.next_solve()) is not None:
+            mapper.finish_step(solve, solve.run(solver), 1.0)
+    return done
+
+
+def kinds(done: list[tuple[Step, object]]) -> list[str]:
+    return [step.kind for step, _ in done]
+
+
+@pytest.mark.long
+def test_two_agents_join_by_their_images_and_are_then_aligned_by_the_map(place: Planes) -> None:
+    """The first loops are found by looks; once the maps are one, by the map's poses."""
+    mapper = mapper_of("ann", "bob")
+    ann, bob = keyframes(place, -0.1, 1), keyframes(place, 0.0, 2, steps=7)
+    for _, sent in ann:
+        mapper.add_keyframe("ann", sent)
+        alone = work(mapper)
+        assert kinds(alone)[:2] == ["describe", "place"]
+    aligned = []
+    for _, sent in bob:
+        mapper.add_keyframe("bob", sent)
+        done = work(mapper)
+        assert isinstance(done[0][0], DescribeStep) and len(done[0][1]) > 200
+        assert all(step.query_image is not None for step, _ in done if isinstance(step, VerifyStep))
+        aligned.append([outcome for step, outcome in done if isinstance(step, AlignStep)])
+        if not aligned[-1]:
+            assert "place" in kinds(done)
+    assert mapper.atlas.map_sizes() == {"ann/0": 11}
+    assert aligned[0] == [] and aligned[-1]
+    assert all(isinstance(outcome, Verification) for outcomes in aligned for outcome in outcomes)
+    poses = dict(zip(*_all_poses(mapper), strict=True))
+    T_map_world = poses["bob", 6] @ se3.inverse(bob[6][0])
+    for name, run in (("ann", ann), ("bob", bob)):
+        for T, sent in run:
+            off = se3.log(se3.inverse(T_map_world @ T) @ poses[name, sent.id])
+            assert np.linalg.norm(off[3:]) < 0.004
+            assert np.degrees(np.linalg.norm(off[:3])) < 0.15
+    assert mapper.report()["failed_steps"] == 0
+
+
+def _all_poses(mapper: Mapper) -> tuple[list[tuple[str, int]], np.ndarray]:
+    saved = mapper.atlas.all_poses()
+    return [tuple(key) for key in saved.keys], saved.T_map_body
+
+
+@pytest.mark.long
+def test_where_the_map_is_right_only_every_fourth_is_compared_by_its_looks(place: Planes) -> None:
+    """And all, as soon as there is another map to find."""
+    mapper = mapper_of("ann", "bob", "eve")
+    for _, sent in keyframes(place, -0.1, 1):
+        mapper.add_keyframe("ann", sent)
+    work(mapper)
+    bob = keyframes(place, 0.0, 2, steps=12)
+    looks = []
+    for _, sent in bob[:8]:
+        mapper.add_keyframe("bob", sent)
+        done = work(mapper)
+        looks.append(("align" in kinds(done), "place" in kinds(done), done[0][0].node_id))
+    joined = looks[[is_aligned for is_aligned, *_ in looks].index(True) :]
+    assert len(joined) >= 4
+    for is_aligned, is_queried, node_id in joined:
+        assert is_aligned and is_queried == (node_id % 4 == 0)
+    elsewhere = keyframes(Planes(ROOM, seed=9), 0.0, 3, steps=1)
+    mapper.add_keyframe("eve", elsewhere[0][1])
+    work(mapper)
+    for _, sent in bob[8:10]:
+        mapper.add_keyframe("bob", sent)
+        assert {"align", "place"} <= set(kinds(work(mapper)))
+
+
+def test_a_keyframe_that_waits_is_described_for_the_queries_of_others(place: Planes) -> None:
+    """Also of one that is not looked up itself."""
+    mapper = mapper_of("ann")
+    [(_, sent)] = keyframes(place, 0.0, 1, steps=1)
+    mapper.add_keyframe("ann", sent)
+    while mapper._queries.next_query() is not None:
+        pass
+    [(step, view)] = work(mapper)
+    assert isinstance(step, DescribeStep) and len(view) > 200
+    assert mapper.next_lookup() is None
+
+
+@pytest.mark.parametrize("fails", [False, True], ids=["", "fails"])
+@pytest.mark.parametrize("at", [DescribeStep, QueryStep])
+def test_a_keyframe_may_be_removed_while_it_is_looked_up(
+    place: Planes, at: type, fails: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapper = mapper_of("ann")
+    monkeypatch.setattr(mapper.atlas.culling, "is_removable", lambda node_id: node_id == 1)
+    for _, sent in keyframes(place, 0.0, 1, steps=3):
+        mapper.add_keyframe("ann", sent)
+    step = mapper.next_lookup()
+    while not (isinstance(step, at) and step.node_id == 1):
+        mapper.finish_step(step, step.run(), 1.0)
+        step = mapper.next_lookup()
+    mapper.remove_keyframes([step.node_id])
+    is_removed = step.node_id not in mapper._views.by_node
+    mapper.finish_step(step, ValueError("bad") if fails else step.run(), 1.0)
+    rest = work(mapper)
+    assert is_removed and all(other.node_id != step.node_id for other, _ in rest)
+    assert mapper.report()["failed_steps"] == fails
+    assert len(mapper._views.index) == len(mapper._views.by_node) == 2
+
+
+def narrow() -> tuple[Rig, KeyframeImage]:
+    """A camera one pixel wide: what OpenCV cannot resize."""
+    camera = Camera(1, 480, 385.0, 385.0, 0.0, 239.5)
+    jpeg = np.frombuffer(encode_jpeg(np.zeros((480, 1), np.uint8), 50), np.uint8)
+    return Rig(camera, np.eye(4), imu=NOISE), replace(KeyframeImage.empty(), jpeg=jpeg)
+
+
+def test_an_image_in_which_no_features_can_be_found_is_tried_once() -> None:
+    rig, image = narrow()
+    mapper = Mapper(Config())
+    mapper.add_run("eve", replace(hello_of("eve", 1), rig=rig))
+    sent = Keyframe(0, -1, 0, np.eye(4), COV, np.eye(4), UP, 0.0, View.empty(), -1, image)
+    mapper.add_keyframe("eve", sent)
+    findings = []
+    for _ in range(20):
+        if (step := mapper.next_lookup()) is None:
+            break
+        try:
+            result = step.run()
+        except Exception as error:
+            result = error
+        findings += mapper.finish_step(step, result, 1.0)
+    else:
+        pytest.fail("it is tried for ever")
+    assert [finding.event for finding in findings].count("step failed") == 1
+    assert mapper.report()["failed_steps"] == 1
+
+
+def test_a_damaged_image_costs_the_keyframe_its_features_only(place: Planes) -> None:
+    mapper = mapper_of("ann")
+    sent = [sent for _, sent in keyframes(place, 0.0, 1, steps=2)]
+    for keyframe in sent:
+        broken = keyframe.image.jpeg.copy()
+        broken[2:] = 0
+        mapper.add_keyframe("ann", replace(keyframe, image=replace(keyframe.image, jpeg=broken)))
+    done = work(mapper)
+    assert [len(view) for step, view in done if isinstance(step, DescribeStep)] == [0, 0]
+    assert mapper.report()["failed_steps"] == 0
+    mapper.remove_keyframes([done[0][0].node_id])
+    assert len(mapper._views.index) == len(mapper._views.by_node)
