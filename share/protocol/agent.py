@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 from share.config import Config
 from share.errors import UsageError, VersionError, WireError, printable
+from share.metrics.frame_log import summary
 from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, KeyframeScore, LedgerEntry
 from share.protocol.agent_status import StatusReporter
@@ -137,6 +138,7 @@ class Agent:
             "map_id": self._localisation.map_frame.map_id,
             "revision": self._sessions.revision,
             "refusal": self._refusal,
+            "settle_s": summary(list(self._localisation.settle_s)).report(),
             **self._pings.clock.report(),
         }
 

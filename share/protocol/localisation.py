@@ -22,7 +22,8 @@ _AHEAD_M = 3.0  # what a wearer looks at; a rotation moves it by this lever
 # faster, but less than 3 mm, where the way is long.
 _SPEED_M_S, _WAY_S, _MAX_SPEED_M_S = 0.0148, 10.0, 0.044
 _JUMP_M = 1.0  # a longer way is a mistake of the map that was undone: the pose jumps
-_SETTLED_M = 1e-3  # of the way left
+_SETTLED_M, _ARRIVED_M = 1e-3, 1e-6  # of the way left
+_MAX_FRAME_S = 0.1  # a frame after a gap moves the pose no further than one after this time
 
 
 class MapFrame:
@@ -46,18 +47,19 @@ class MapFrame:
         """Move towards the newest correction; once a frame. Return the time, s, that it took to settle, if it
         has settled now."""
         elapsed_s, self._advanced_ns = max(0, now_ns - self._advanced_ns) / SECOND_NS, now_ns
-        if self._current is None or self._target is None or self._unsettled_since_ns is None:
+        if self._current is None or self._target is None or self._current is self._target:
             return None
         xi = _way(self._current, self._target, T_odom_body)
         length_m = _length_m(xi)
-        if length_m <= _SETTLED_M / 100:
-            share = 1.0
-        else:
-            speed = min(max(_SPEED_M_S, length_m / _WAY_S), _MAX_SPEED_M_S)
-            share = min(-math.expm1(-elapsed_s / self._time_constant_s), speed * elapsed_s / length_m)
+        if length_m <= _ARRIVED_M:
+            self._current = self._target
+            return None
+        elapsed_s = min(elapsed_s, _MAX_FRAME_S)
+        speed = min(max(_SPEED_M_S, length_m / _WAY_S), _MAX_SPEED_M_S)
+        share = min(-math.expm1(-elapsed_s / self._time_constant_s), speed * elapsed_s / length_m)
         moved = self._current @ T_odom_body @ se3.exp(share * xi)
         self._current = se3.orthonormal(moved @ inverse(T_odom_body))
-        if (1 - share) * length_m > _SETTLED_M:
+        if self._unsettled_since_ns is None or (1 - share) * length_m > _SETTLED_M:
             return None
         since_ns, self._unsettled_since_ns = self._unsettled_since_ns, None
         return (now_ns - since_ns) / SECOND_NS
@@ -77,15 +79,15 @@ class MapFrame:
     def apply(self, correction: Correction, T_odom_body: F64, now_ns: int) -> bool:
         """Set a new target. Return whether the pose jumps to it."""
         target, is_same_map = correction.T_map_odom, correction.map_id == self.map_id
-        jumps = (
-            self._current is None
-            or not is_same_map
-            or _length_m(_way(self._current, target, T_odom_body)) > _JUMP_M
-        )
+        way_m = 0.0 if self._current is None else _length_m(_way(self._current, target, T_odom_body))
+        jumps = self._current is None or not is_same_map or way_m > _JUMP_M
         self._target, self._cov, self.map_id = target, correction.cov, correction.map_id
-        if jumps:
+        if jumps or self._current is None:
             self._current, self._unsettled_since_ns = target, None
-        elif self._unsettled_since_ns is None:
+        elif (
+            self._unsettled_since_ns is None
+            and _length_m(_way(self._current, target, T_odom_body)) > _SETTLED_M
+        ):
             self._unsettled_since_ns = now_ns
         return jumps
 

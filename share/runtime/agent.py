@@ -353,4 +353,5 @@ class AgentRun:
 def _describe_correction(effect: ev.CorrectionApplied) -> str:
     after = "" if effect.corrected_ms is None else f", {effect.corrected_ms:.0f} ms after its frame"
     answers = "" if effect.keyframe_id is None else f", answers keyframe {effect.keyframe_id}{after}"
-    return f"correction {effect.revision} of map {effect.map_id}{answers}"
+    jump = ", the pose jumps" if effect.jumps else ""
+    return f"correction {effect.revision} of map {effect.map_id}{answers}{jump}"

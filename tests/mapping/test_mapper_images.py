@@ -65,7 +65,7 @@ _SOLVERS: WeakKeyDictionary[Mapper, PoseGraphSolver] = WeakKeyDictionary()
 
 def work(mapper: Mapper) -> list[tuple[Step, object]]:
     """All steps that are due, with their results."""
-    done, solver = [], _SOLVERS.setdefault(mapper, PoseGraphSolver(Config().graph))
+    done, solver = [], _SOLVERS.setdefault(mapper, PoseGraphSolver())
     while (step := mapper.next_lookup()) is not None:
         done.append((step, step.run()))
         mapper.finish_step(step, done[-1][1], 1.0)

@@ -1,4 +1,4 @@
-"""Standard deviation of the agent's map position, and its expected drift."""
+"""How the pose follows corrections, the sigma of the agent's map position, and its expected drift."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import pytest
 from helpers.model_edge import EMPTY, MS, UP, S
 
 from share.geometry import se3
-from share.protocol.localisation import BlendedMapFrame, DriftEstimator
+from share.protocol.localisation import DriftEstimator, MapFrame
 from share.types import Correction, Keyframe
 
 
-def placed(cov: np.ndarray, T_map_odom: np.ndarray) -> BlendedMapFrame:
-    frame = BlendedMapFrame(0.5)
+def placed(cov: np.ndarray, T_map_odom: np.ndarray) -> MapFrame:
+    frame = MapFrame(0.5)
     frame.apply(Correction(T_map_odom, cov, "a", 1, 0), np.eye(4), 0)
     return frame
 
@@ -34,11 +34,93 @@ def test_the_map_sigma_agrees_with_samples(rng) -> None:
 
 
 def test_the_map_sigma_is_zero_before_a_correction() -> None:
-    frame = BlendedMapFrame(0.5)
+    frame = MapFrame(0.5)
     assert frame.sigma_cm(np.eye(4)) == 0.0
     frame = placed(np.eye(6), np.eye(4))
     frame.reset()
     assert frame.sigma_cm(np.eye(4)) == 0.0
+
+
+FRAME_NS = S // 15
+
+
+def moved_to(xyz: tuple[float, float, float], yaw: float = 0.0) -> np.ndarray:
+    return se3.from_rt(se3.so3_exp(np.array([0.0, 0.0, yaw])), np.array(xyz, float))
+
+
+def followed(frame: MapFrame, T_odom_body: np.ndarray, seconds: float, start_ns: int = 0) -> list[np.ndarray]:
+    """T_map_body of each frame at 15 Hz, the body at rest."""
+    out = []
+    for k in range(1, int(15 * seconds) + 1):
+        frame.advance(T_odom_body, start_ns + k * FRAME_NS)
+        assert frame.T_map_odom is not None
+        out.append(frame.T_map_odom @ T_odom_body)
+    return out
+
+
+def steps_m(poses: list[np.ndarray], ahead_m: float = 0.0) -> np.ndarray:
+    """Steps of a point on the body's x axis, m."""
+    points = np.array([(T @ (ahead_m, 0, 0, 1))[:3] for T in poses])
+    return np.linalg.norm(np.diff(points, axis=0), axis=1)
+
+
+def correct(
+    frame: MapFrame, T_map_odom: np.ndarray, T_odom_body: np.ndarray, now_ns: int, map_id: str = "a"
+) -> bool:
+    return frame.apply(Correction(T_map_odom, np.eye(6) * 1e-6, map_id, 1, 0), T_odom_body, now_ns)
+
+
+@pytest.mark.parametrize(
+    "way", [moved_to((0.04, 0, 0)), moved_to((0, 0, 0), 0.005), moved_to((0.2, 0, 0), 0.02)]
+)
+def test_a_correction_comes_without_visible_steps_and_arrives(way: np.ndarray) -> None:
+    T_odom_body = moved_to((7.0, -3.0, 1.0), 0.7)
+    frame = MapFrame(0.5)
+    assert correct(frame, np.eye(4), T_odom_body, 0)
+    assert not correct(frame, way, T_odom_body @ np.eye(4), 0)
+    goal = way @ T_odom_body
+    poses = [T_odom_body, *followed(frame, T_odom_body, 30.0)]
+    is_long = np.linalg.norm((goal - T_odom_body)[:3, 3]) > 0.1
+    assert max(steps_m(poses).max(), steps_m(poses, 3.0).max()) < (3e-3 if is_long else 1e-3)
+    np.testing.assert_allclose(poses[-1], goal, atol=1e-6)
+
+
+def test_a_turn_far_from_the_origin_counts_at_the_body() -> None:
+    frame, T_odom_body = MapFrame(0.5), moved_to((50.0, 0, 0))
+    correct(frame, np.eye(4), T_odom_body, 0)
+    about_the_body = T_odom_body @ moved_to((0, 0, 0), 0.005) @ se3.inverse(T_odom_body)
+    correct(frame, about_the_body, T_odom_body, 0)
+    assert steps_m([T_odom_body, *followed(frame, T_odom_body, 5.0)]).max() < 1e-9  # it turns where it is
+
+
+def test_a_newer_correction_never_makes_a_step() -> None:
+    frame, T_odom_body = MapFrame(0.5), moved_to((2.0, 1.0, 0))
+    correct(frame, np.eye(4), T_odom_body, 0)
+    poses = [T_odom_body]
+    for k in range(12):  # before the last one has arrived
+        correct(frame, moved_to((0.05 * (-1) ** k, 0.02, 0)), T_odom_body, k * S // 3)
+        poses += followed(frame, T_odom_body, 1 / 3, k * S // 3)
+    assert steps_m(poses).max() < 1.01e-3
+
+
+def test_the_time_to_settle_is_measured_from_the_first_of_several_corrections() -> None:
+    frame, T_odom_body = MapFrame(0.5), np.eye(4)
+    correct(frame, np.eye(4), T_odom_body, 0)
+    assert frame.advance(T_odom_body, FRAME_NS) is None
+    correct(frame, moved_to((0.01, 0, 0)), T_odom_body, S)
+    settled = [s for k in range(1, 60) if (s := frame.advance(T_odom_body, S + k * FRAME_NS)) is not None]
+    assert len(settled) == 1
+    assert 0.5 < settled[0] < 2.5
+
+
+def test_another_map_or_a_long_way_makes_the_pose_jump() -> None:
+    frame, T_odom_body = MapFrame(0.5), np.eye(4)
+    assert correct(frame, np.eye(4), T_odom_body, 0)
+    assert correct(frame, moved_to((0.02, 0, 0)), T_odom_body, 1, "b")
+    np.testing.assert_array_equal(frame.T_map_odom, moved_to((0.02, 0, 0)))
+    assert not correct(frame, moved_to((0.9, 0, 0)), T_odom_body, 2, "b")
+    assert correct(frame, moved_to((1.5, 0, 0)), T_odom_body, 3, "b")
+    np.testing.assert_array_equal(frame.T_map_odom, moved_to((1.5, 0, 0)))
 
 
 COV = np.diag([1e-6, 1e-6, 1e-6, 4e-6, 4e-6, 4e-6])
