@@ -68,7 +68,7 @@ def test_latencies_are_those_of_the_real_mapper() -> None:
 @pytest.mark.long
 def test_a_corrected_pose_is_the_truth_plus_the_drawn_error() -> None:
     sure = modelled_mapper.RecognitionModel(sigma_m=0.0, sigma_rad=0.0)
-    for model, most_m in ((sure, 0.03), (replace(sure, sigma_m=0.5), 3.0)):
+    for model, most_m in ((sure, 0.01), (replace(sure, sigma_m=0.5), 3.0)):
         room = played(model=model)
         both = {name: poses[-1] for name, poses in room.localised.items()}
         assert len({pose.map_id for pose in both.values()}) == 1
@@ -82,7 +82,7 @@ def test_a_corrected_pose_is_the_truth_plus_the_drawn_error() -> None:
             list(tracked_frames(person, SECONDS))
         true = np.linalg.norm((se3.inverse(people[0].T_world_body[-1]) @ people[1].T_world_body[-1])[:3, 3])
         assert abs(apart - true) < most_m
-        assert bool(abs(apart - true) > 0.03) is (model is not sure)
+        assert bool(abs(apart - true) > 0.01) is (model is not sure)  # the pose follows slowly
 
 
 @pytest.mark.long
