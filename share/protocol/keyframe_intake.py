@@ -92,9 +92,7 @@ _KEYFRAME_COST = _IMAGE_KEYPOINTS + _BASE_COST
 _COST_HZ = 10.0 * _KEYFRAME_COST
 _COST_BURST = 700.0 * _KEYFRAME_COST
 _SEGMENT_FACTOR = 20  # a keyframe that starts a segment costs this much more: the mapper never forgets one
-_OVERLOAD_TEXT = (
-    f"more than {_COST_HZ / _KEYFRAME_COST * _IMAGE_KEYPOINTS:.0f} keypoints a second: further keyframes are deferred"
-)
+_OVERLOAD_TEXT = f"more than {_COST_HZ / _KEYFRAME_COST * _IMAGE_KEYPOINTS:.0f} keypoints a second: further keyframes are deferred"
 _RATE_SLACK = 1.2  # keyframes arrive unevenly
 _RATE_BURST = 10.0  # keyframes
 

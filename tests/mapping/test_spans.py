@@ -100,7 +100,12 @@ def mean_error(walkers: Sequence[Walker], others: Sequence[Walker] = ()) -> floa
 
 def test_a_map_with_spans_is_more_accurate() -> None:
     with_spans, without = (
-        np.mean([mean_error([spanning("ann", seed, say), spanning("bob", seed + 50, say, 0.7)]) for seed in (1, 2)])
+        np.mean(
+            [
+                mean_error([spanning("ann", seed, say), spanning("bob", seed + 50, say, 0.7)])
+                for seed in (1, 2)
+            ]
+        )
         for say in (honest, None)
     )
     assert with_spans < 0.8 * without
@@ -168,7 +173,7 @@ def test_the_solver_has_spans_under_the_robust_kernel_and_reports_them_as_no_loo
     ann = spanning("ann", 1)
     atlas = atlas_of(ann)
     for found in near_loops(ann, ann, np.random.default_rng(5)):
-        atlas.propose(found)
+        atlas.graph.add_loop(found)
     edges = atlas.graph.edges
     job, solution = answer(atlas, "ann/0")
     assert set(job.change.edge_ids[job.change.is_loop].tolist()) == edges.spans | edges.loops.keys()
@@ -194,11 +199,12 @@ def test_spans_are_rescaled_with_their_agent_only_and_later_ones_too() -> None:
         np.testing.assert_allclose(edge.T_a_b[:3, :3], old.T_a_b[:3, :3])
         np.testing.assert_allclose(edge.cov, old.cov * (4.0 if scaled else 1))
     late = replace(ann.keyframes[-1], id=60, reference=59)  # with the same spans
-    node = atlas.add_keyframe("ann", late)
-    by_ends = {(graph.edges.by_id[n].a, graph.edges.by_id[n].b): graph.edges.by_id[n] for n in graph.edges.spans}
+    node = graph.add_keyframe("ann", late, late.cov, late.up)
+    graph.add_spans(node, late)
+    by_ends = {(edge.a, edge.b): edge for edge in map(graph.edges.by_id.__getitem__, graph.edges.spans)}
     for before in (92, 104, 112):  # nodes of keyframes 46, 52 and 56 of ann
         np.testing.assert_allclose(by_ends[before, node].T_a_b, by_ends[before, 118].T_a_b)
-        np.testing.assert_allclose(by_ends[before, node].cov, by_ends[before, 118].cov)
+        np.testing.assert_allclose(by_ends[before, node].cov, by_ends[before, 118].cov, rtol=0.01)
 
 
 def test_spans_come_back_after_a_restart_of_the_edge(tmp_path: Path) -> None:
@@ -216,9 +222,11 @@ def test_spans_come_back_after_a_restart_of_the_edge(tmp_path: Path) -> None:
     again = Atlas(MergeConfig())
     again.restore(kept, [0] * len(kept.segments))
     gone = {20, 21, 33}
-    assert spans(again.graph) == spans(atlas.graph) == {
-        one for one in all_spans("ann") if not gone & set(one[1:])
-    }
+    assert (
+        spans(again.graph)
+        == spans(atlas.graph)
+        == {one for one in all_spans("ann") if not gone & set(one[1:])}
+    )
     covs = [
         sorted(graph.edges.by_id[n].cov.trace() for n in graph.edges.spans)
         for graph in (again.graph, atlas.graph)
@@ -242,10 +250,11 @@ def off_by(xi: Sequence[float], cov: float | None = None) -> Spans:
         off_by([0, 0, 0, 0.5, 0, 0], 0.0),
         off_by([0, 0, 0.3, 0, 0, 0], 0.0),
         off_by([0, 0, 0.01, 0.03, 0, 0], 0.0),
+        off_by([0, 0, 0, 0, 0, 0], 0.0),
     ],
-    ids=["half a metre", "and certain", "turned", "a little, and certain"],
+    ids=["half a metre", "and certain", "turned", "a little, and certain", "right, and certain"],
 )
-def test_spans_that_contradict_their_steps_do_not_bend_others(lie: Spans) -> None:
-    good = [spanning("ann", 1), spanning("bob", 51, phase=0.7)]
-    usual = mean_error(good, [spanning("eve", 7, None, phase=1.4)])
-    assert mean_error(good, [spanning("eve", 7, lie, phase=1.4)]) < 1.3 * usual
+def test_spans_that_contradict_their_steps_or_claim_to_be_exact_do_not_bend_others(lie: Spans) -> None:
+    good = [spanning("ann", 5), spanning("bob", 55, phase=2.0)]
+    usual = mean_error(good, [spanning("eve", 11, None, phase=1.4)])
+    assert mean_error(good, [spanning("eve", 11, lie, phase=1.4)]) < 1.2 * usual
