@@ -284,15 +284,15 @@ class EarlierPoses:
         n = len(self.ids)
         if n > MAX_EARLIER:
             raise ValueError(f"earlier: {n} keyframes, at most {MAX_EARLIER}")
-        for T, cov in zip(self.T_earlier_body, self.cov, strict=True):
-            checked_pose("T_earlier_body", T, MAX_ODOM_M)
-            checked_cov("cov", cov)
         _set_fields(
             self,
             ids=checked_array("ids", self.ids, (n,), np.int64),
             T_earlier_body=checked_array("T_earlier_body", self.T_earlier_body, (n, 4, 4), np.float32),
-            cov=checked_array("cov", self.cov, (n, 6, 6), np.float32),
+            cov=checked_array("earlier.cov", self.cov, (n, 6, 6), np.float32),
         )
+        for T, cov in zip(self.T_earlier_body, self.cov, strict=True):
+            checked_pose("T_earlier_body", T, MAX_ODOM_M)
+            checked_cov("earlier.cov", cov)
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -10,8 +10,8 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.timing import SECOND_NS, TokenBuckets
 from share.mapping.recognition.patch_alignment import ORB_FEATURES
+from share.timing import SECOND_NS, TokenBuckets
 from share.types import F64, EarlierPoses, Keyframe
 from share.vision.keyframe_images import image_objection
 from share.wire.messages import MAX_BUFFERED, Ack
@@ -91,8 +91,9 @@ _IMAGE_KEYPOINTS = ORB_FEATURES  # that the edge finds in an image
 _KEYFRAME_COST = _IMAGE_KEYPOINTS + _BASE_COST
 _COST_HZ = 10.0 * _KEYFRAME_COST
 _COST_BURST = 700.0 * _KEYFRAME_COST
-_SEGMENT_FACTOR = 20  # a keyframe that starts a segment costs this much more: the mapper never forgets one
-_OVERLOAD_TEXT = f"more than {_COST_HZ / _KEYFRAME_COST * _IMAGE_KEYPOINTS:.0f} keypoints a second: further keyframes are deferred"
+_SEGMENT_FACTOR = 28  # a keyframe that starts a segment costs this much more: the mapper never forgets one
+_KEYPOINTS_HZ = _COST_HZ / _KEYFRAME_COST * _IMAGE_KEYPOINTS
+_OVERLOAD_TEXT = f"more than {_KEYPOINTS_HZ:.0f} keypoints a second: further keyframes are deferred"
 _RATE_SLACK = 1.2  # keyframes arrive unevenly
 _RATE_BURST = 10.0  # keyframes
 

@@ -1,4 +1,4 @@
-"""Odometry over several keyframes in the map graph: what enters it, what leaves it, and what it is good for."""
+"""Odometry over several keyframes in the map graph: what enters it, what leaves it, what it gains."""
 
 from __future__ import annotations
 

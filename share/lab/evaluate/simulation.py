@@ -76,7 +76,7 @@ class ProcessingDelays:
     Agent: `frame`: from a frame to its published pose; `keyframe`: from there until its keyframe may be sent;
     `finish_keyframe`: slice of keyframe work that may follow any frame. Edge: `receive`: a message at the
     front; the rest: steps of mapper and solver. Those of images (`describe`, `align_*`, `verify_images_*`)
-    were measured as CPU time in two emulated sessions of 640x480 px and seven agents, 222 to 1,539 steps each.
+    were measured as CPU time in two emulated sessions of 640x480 px, 222 to 1,539 steps each.
     """
 
     frame: Delay = Delay(4.3, 5.4)

@@ -250,9 +250,9 @@ def _read_delays(edge: Path, agents: Sequence[Path]) -> ProcessingDelays:
         verify_accepted=verify,
         verify_refused=verify,
         solve=solve,
-        **({name: verify for name in _VERIFY_IMAGES} if has_images else {}),
+        **(dict.fromkeys(_VERIFY_IMAGES, verify) if has_images else {}),
         **({"describe": _mean_delay([describe], edge)} if has_images else {}),
-        **({name: _mean_delay([align], edge) for name in _ALIGN} if align.get("n") else {}),
+        **(dict.fromkeys(_ALIGN, _mean_delay([align], edge)) if align.get("n") else {}),
     )
 
 
