@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from share.checks import MAX_ID, MAX_ODOM_M, MAX_POSITION_M, checked_pose
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry import se3
-from share.types import MAX_EARLIER, EarlierPoses, Keyframe, View
+from share.types import Keyframe, View
 
 COV = np.eye(6)
 T = se3.exp(np.array([0.3, -0.2, 0.9, 4.0, -5.0, 6.0]))

@@ -8,11 +8,12 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from share.earlier_poses import EarlierPoses
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.mapping.recognition.patch_alignment import ORB_FEATURES
 from share.timing import SECOND_NS, TokenBuckets
-from share.types import F64, EarlierPoses, Keyframe
+from share.types import F64, Keyframe
 from share.vision.keyframe_images import image_objection
 from share.wire.messages import MAX_BUFFERED, Ack
 

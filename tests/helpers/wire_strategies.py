@@ -11,6 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from share.agent_names import checked_name
 from share.checks import MAX_ID, MAX_ODOM_M, MAX_POSITION_M, MAX_STAMP_NS
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry import se3
 from share.geometry.camera import (
     BASELINE_RANGE_M,
@@ -21,10 +22,8 @@ from share.geometry.camera import (
     Rig,
 )
 from share.types import (
-    MAX_EARLIER,
     AgentKind,
     Correction,
-    EarlierPoses,
     Frame,
     ImuBatch,
     Keyframe,

@@ -12,13 +12,14 @@ from helpers.atlas_sim import EMPTY, UP, UP_SIGMA, Walker, answer, error, loop, 
 from helpers.hellos import hello_of
 
 from share.config import MergeConfig
+from share.earlier_poses import EarlierPoses
 from share.geometry import se3
 from share.mapping.atlas import Atlas
 from share.mapping.keyframe_removal import remove_keyframe
 from share.mapping.map_changes import SaveKeyframe, SaveRun
 from share.mapping.map_graph import MapGraph
 from share.store.map_store import MapStore
-from share.types import F64, EarlierPoses, Keyframe
+from share.types import F64, Keyframe
 
 BACK = 13, 7, 3  # keyframes, oldest first
 DRIFT = np.diag([0.0003**2] * 3 + [0.001**2] * 3)  # of odometry, a keyframe

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry import se3
 from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry, spread_earlier
-from share.types import MAX_EARLIER, EarlierPoses, Keyframe, KeyframeCandidate, View
+from share.types import Keyframe, KeyframeCandidate, View
 from share.wire.messages import Ack, Welcome
 
 S = 1_000_000_000

@@ -9,11 +9,12 @@ import pytest
 from helpers.hellos import hello_of
 
 from share.config import Config
+from share.earlier_poses import EarlierPoses
 from share.geometry.camera import Camera
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
 from share.protocol.keyframe_intake import OdometryBase, sanitise
-from share.types import EarlierPoses, Keyframe, KeyframeImage, View
+from share.types import Keyframe, KeyframeImage, View
 from share.vision.image_codec import encode_jpeg
 from share.vision.keyframe_images import Surfaces
 from share.wire import messages as m

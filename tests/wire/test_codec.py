@@ -14,16 +14,15 @@ from helpers.wire_strategies import messages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.errors import WireError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.net.backlog import BacklogLimits
 from share.types import (
-    MAX_EARLIER,
     MAX_JPEG_BYTES,
     AgentKind,
     Correction,
-    EarlierPoses,
     Frame,
     ImuBatch,
     Keyframe,
