@@ -127,8 +127,8 @@ RETIRED_SETTINGS: dict[str, str] = {
     "control.interval_m": "scheduling.merge_gate.INTERVAL_M",
     # agent
     "agent.rate_burst": "protocol.agent.RATE_BURST",
-    "agent.blend_jump_m": "protocol.localisation.BLEND_JUMP_M",
-    "agent.blend_jump_rad": "protocol.localisation.BLEND_JUMP_RAD",
+    "agent.blend_jump_m": "protocol.localisation.JUMP_M",
+    "agent.blend_jump_rad": "protocol.localisation.JUMP_M",  # a rotation counts by its lever
     # link
     "link.hello_s": "protocol.agent.HELLO_S",
     "link.refused_s": "protocol.agent.REFUSED_S",

@@ -7,7 +7,6 @@ another thread without a copy. Poses are 4x4 matrices `T_a_b` with p_a = T_a_b p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -26,6 +25,7 @@ from share.checks import (
     checked_stamp,
     checked_up,
 )
+from share.earlier_poses import EarlierPoses
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -39,7 +39,6 @@ MAX_KEYPOINTS = 2000  # per keyframe
 MAX_NAME_LENGTH = 64  # characters, of an agent's name
 MAX_MAP_ID_LENGTH = MAX_NAME_LENGTH + 32  # a run key has up to 17 characters more, a segment number up to 11
 MAX_JPEG_BYTES = 64_000  # of a keyframe's image
-MAX_EARLIER = 32  # keyframes to which a keyframe's pose is given
 MAX_PLANE = 1e3  # 1/m, of each component of a surface's plane: 1 mm from the camera
 MAX_UV = 1e3  # normalised image coordinates: 89.9 degrees off the axis
 MAX_GYRO_RAD_S = 1e3  # twenty times the range of the widest common gyroscope
@@ -266,47 +265,6 @@ class KeyframeImage:
     def empty() -> KeyframeImage:
         none = np.zeros((0, 3), np.float32)
         return KeyframeImage(np.zeros(0, np.uint8), none[:, :2], none, none[:, 0])
-
-
-@dataclass(frozen=True, eq=False)
-class EarlierPoses:
-    """Poses of a keyframe's body relative to M earlier keyframes, as the tracker knows them.
-
-    ids (M,) int64: of the keyframes; their stamps, ns, as long as they are candidates. T_earlier_body (M, 4,
-    4) and covariances cov (M, 6, 6), float32.
-    """
-
-    ids: I64
-    T_earlier_body: F32
-    cov: F32
-
-    def __post_init__(self) -> None:
-        n = len(self.ids)
-        if n > MAX_EARLIER:
-            raise ValueError(f"earlier: {n} keyframes, at most {MAX_EARLIER}")
-        for T, cov in zip(self.T_earlier_body, self.cov, strict=True):
-            checked_pose("T_earlier_body", T, MAX_ODOM_M)
-            checked_cov("cov", cov)
-        _set_fields(
-            self,
-            ids=checked_array("ids", self.ids, (n,), np.int64),
-            T_earlier_body=checked_array("T_earlier_body", self.T_earlier_body, (n, 4, 4), np.float32),
-            cov=checked_array("cov", self.cov, (n, 6, 6), np.float32),
-        )
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def take(self, rows: Sequence[int], ids: Sequence[int]) -> EarlierPoses:
-        """Return these rows with other ids."""
-        chosen = np.array(rows, np.int64)
-        return EarlierPoses(np.array(ids, np.int64), self.T_earlier_body[chosen], self.cov[chosen])
-
-    @staticmethod
-    def empty() -> EarlierPoses:
-        return EarlierPoses(
-            np.zeros(0, np.int64), np.zeros((0, 4, 4), np.float32), np.zeros((0, 6, 6), np.float32)
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from share.geometry import se3
+from share.mapping.agents.covariance_scales import inflate_span
 from share.mapping.graph.covariance import CovariancePaths
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.graph.solver import GraphUpdate
@@ -188,9 +189,12 @@ class MapGraph:
             key = KeyframeKey(agent, earlier_id)
             if not odometry.has_keyframe(key) or odometry.nodes[odometry.node_id(key)].segment != segment:
                 continue  # removed, or the segment was split
-            T_a_b = rescale_translation(se3.orthonormal(T.astype(np.float64)), log_scale)
-            cov_a_b = covariance_scale * _SHARED_INFORMATION * cov.astype(np.float64)
-            edges.add_span(PoseEdge(odometry.node_id(key), node_id, T_a_b, cov_a_b))
+            earlier_node, T_a_b = odometry.node_id(key), se3.orthonormal(T.astype(np.float64))
+            steps = odometry.nodes[node_id].ordinal - odometry.nodes[earlier_node].ordinal
+            cov_a_b = covariance_scale * inflate_span(
+                T_a_b, _SHARED_INFORMATION * cov.astype(np.float64), steps
+            )
+            edges.add_span(PoseEdge(earlier_node, node_id, rescale_translation(T_a_b, log_scale), cov_a_b))
 
     def remove_node(self, node_id: int) -> None:
         """Remove a node that has no edges."""

@@ -229,6 +229,7 @@ class Mapper:
         views, is_aligned = self._views, False
         if views.image(node_id) is None:
             return False
+        agent = self.atlas.key(node_id).agent
         for candidate in nearby_candidates(self.atlas.graph, node_id, views.with_image())[
             : 1 if self._queries.is_hurried else None
         ]:
@@ -236,10 +237,14 @@ class Mapper:
             if images[0] is None or images[1] is None:
                 continue  # removed meanwhile
             T_c_q = self.atlas.graph.relative_pose(candidate, node_id)
-            outcome = yield AlignStep(node_id, images[0], candidate, images[1], T_c_q)
-            is_kept = {node_id, candidate} <= views.by_node.keys()
-            is_aligned |= isinstance(outcome, Verification)
-            yield self._judge_candidate(None, node_id, candidate, outcome) if is_kept else []
+            try:
+                outcome = yield AlignStep(node_id, images[0], candidate, images[1], T_c_q)
+                is_kept = {node_id, candidate} <= views.by_node.keys()
+                events = self._judge_candidate(None, node_id, candidate, outcome) if is_kept else []
+                is_aligned |= isinstance(outcome, Verification)
+            except Exception as error:  # costs this candidate only
+                events = self.report_failure(AlignStep.kind, error, agent)
+            yield events
         return is_aligned
 
     def _query(self, node_id: int) -> Job:

@@ -16,12 +16,13 @@ from typing import NamedTuple
 import numpy as np
 
 from share.config import InertialConfig
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry import se3
 from share.odometry import filter
 from share.odometry.initialisation import tilt_sigma
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.state import FilterState
-from share.types import F32, F64, MAX_EARLIER, EarlierPoses, Frame
+from share.types import F32, F64, Frame
 from share.vision.keyframe_images import Surfaces
 
 KEYFRAME_GAP_NS = 100_000_000  # least time between keyframes

@@ -9,9 +9,10 @@ from statistics import median
 
 import numpy as np
 
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry.se3 import compose_cov, orthonormal
 from share.timing import seconds_to_ns
-from share.types import F64, MAX_EARLIER, EarlierPoses, Keyframe, KeyframeCandidate
+from share.types import F64, Keyframe, KeyframeCandidate
 from share.wire.messages import Ack, Welcome
 
 RESEND_S = 1.0  # first wait for an acknowledgement; doubles with each resend

@@ -8,10 +8,12 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from share.earlier_poses import EarlierPoses
 from share.geometry import se3
 from share.geometry.camera import Camera
+from share.mapping.recognition.patch_alignment import ORB_FEATURES
 from share.timing import SECOND_NS, TokenBuckets
-from share.types import F64, EarlierPoses, Keyframe
+from share.types import F64, Keyframe
 from share.vision.keyframe_images import image_objection
 from share.wire.messages import MAX_BUFFERED, Ack
 
@@ -82,18 +84,17 @@ class ReorderBuffer:
 # Keyframe quota: the mapper work that one agent may cause, over all its runs.
 #
 # The work grows with the keypoints; a keyframe without any costs as much as _BASE_COST of them
-# (docs/understand/robustness.md). With the default settings an agent sends keyframes of 500 keypoints, at
-# most 5 a second (control.rate_max_hz), and resends up to 600 at once to a new edge. Twice that rate and 700
-# at once are accepted.
+# (docs/understand/robustness.md). With the default settings an agent sends keyframes with an image, at most 5
+# a second (control.rate_max_hz), and resends up to 600 at once to a new edge. Twice that rate and 700 at once
+# are accepted.
 _BASE_COST = 250
-_IMAGE_KEYPOINTS = 500  # work of a keyframe's image, in keypoints
-_KEYFRAME_COST = 500 + _BASE_COST
+_IMAGE_KEYPOINTS = ORB_FEATURES  # that the edge finds in an image
+_KEYFRAME_COST = _IMAGE_KEYPOINTS + _BASE_COST
 _COST_HZ = 10.0 * _KEYFRAME_COST
 _COST_BURST = 700.0 * _KEYFRAME_COST
-_SEGMENT_FACTOR = 20  # a keyframe that starts a segment costs this much more: the mapper never forgets one
-_OVERLOAD_TEXT = (
-    f"more than {_COST_HZ / _KEYFRAME_COST * 500:.0f} keypoints a second: further keyframes are deferred"
-)
+_SEGMENT_FACTOR = 28  # a keyframe that starts a segment costs this much more: the mapper never forgets one
+_KEYPOINTS_HZ = _COST_HZ / _KEYFRAME_COST * _IMAGE_KEYPOINTS
+_OVERLOAD_TEXT = f"more than {_KEYPOINTS_HZ:.0f} keypoints a second: further keyframes are deferred"
 _RATE_SLACK = 1.2  # keyframes arrive unevenly
 _RATE_BURST = 10.0  # keyframes
 

@@ -21,7 +21,7 @@ _AHEAD_M = 3.0  # what a wearer looks at; a rotation moves it by this lever
 # The body and what is so far ahead move by at most this speed relative to odometry: 1 mm a frame at 15 Hz;
 # faster, but less than 3 mm, where the way is long.
 _SPEED_M_S, _WAY_S, _MAX_SPEED_M_S = 0.0148, 10.0, 0.044
-_JUMP_M = 1.0  # a longer way is a mistake of the map that was undone: the pose jumps
+JUMP_M = 1.0  # a longer way is a mistake of the map that was undone: the pose jumps
 _SETTLED_M, _ARRIVED_M = 1e-3, 1e-6  # of the way left
 _MAX_FRAME_S = 0.1  # a frame after a gap moves the pose no further than one after this time
 
@@ -80,7 +80,7 @@ class MapFrame:
         """Set a new target. Return whether the pose jumps to it."""
         target, is_same_map = correction.T_map_odom, correction.map_id == self.map_id
         way_m = 0.0 if self._current is None else _length_m(_way(self._current, target, T_odom_body))
-        jumps = self._current is None or not is_same_map or way_m > _JUMP_M
+        jumps = self._current is None or not is_same_map or way_m > JUMP_M
         self._target, self._cov, self.map_id = target, correction.cov, correction.map_id
         if jumps or self._current is None:
             self._current, self._unsettled_since_ns = target, None
@@ -175,7 +175,7 @@ class SelfEvaluation:
     ) -> m.Evaluation:
         """Return the evaluation to send with `keyframe`, within the bounds of the wire.
 
-        local_cm: as in `DriftEstimator.expected_cm`. map_sigma_cm: as in `BlendedMapFrame.sigma_cm`."""
+        local_cm: as in `DriftEstimator.expected_cm`. map_sigma_cm: as in `MapFrame.sigma_cm`."""
         error_cm = self.drift.expected_cm(local_cm, now_ns)
         if error_cm is not None:
             error_cm = min(math.hypot(error_cm, map_sigma_cm), m.MAX_ERROR_CM)

@@ -21,6 +21,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from share.checks import MAX_STAMP_NS, checked_id, checked_stamp
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.errors import VersionError, WireError, printable
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import (
@@ -29,7 +30,6 @@ from share.types import (
     F64,
     I64,
     MAX_ACCEL_M_S2,
-    MAX_EARLIER,
     MAX_GYRO_RAD_S,
     MAX_JPEG_BYTES,
     MAX_KEYPOINTS,
@@ -37,7 +37,6 @@ from share.types import (
     MAX_NAME_LENGTH,
     AgentKind,
     Correction,
-    EarlierPoses,
     Frame,
     ImuBatch,
     Keyframe,

@@ -11,6 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from share.agent_names import checked_name
 from share.checks import MAX_ID, MAX_ODOM_M, MAX_POSITION_M, MAX_STAMP_NS
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry import se3
 from share.geometry.camera import (
     BASELINE_RANGE_M,
@@ -81,6 +82,16 @@ def keyframe_images(draw: st.DrawFn, most: int = 40) -> KeyframeImage:
 
 
 @st.composite
+def earlier_poses(draw: st.DrawFn, below: int) -> EarlierPoses:
+    n = draw(st.integers(0, min(below, MAX_EARLIER)))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    A = rng.normal(size=(n, 6, 6))
+    T = [draw(poses(MAX_ODOM_M / 2)) if k == 0 else se3.exp(rng.normal(size=6)) for k in range(n)]
+    ids = rng.integers(0, max(below, 1), n)
+    return EarlierPoses(ids, np.array(T, np.float32).reshape(n, 4, 4), np.float32(A @ A.swapaxes(1, 2)))
+
+
+@st.composite
 def keyframes(draw: st.DrawFn) -> Keyframe:
     id_ = draw(ids)
     reference = draw(st.integers(-1, id_ - 1))
@@ -96,6 +107,7 @@ def keyframes(draw: st.DrawFn) -> Keyframe:
         draw(views()),
         follows,
         draw(keyframe_images()),
+        draw(earlier_poses(id_)),
     )
 
 

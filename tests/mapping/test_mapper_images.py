@@ -151,6 +151,43 @@ def test_a_keyframe_that_waits_is_described_for_the_queries_of_others(place: Pla
     assert mapper.next_lookup() is None
 
 
+@pytest.mark.long
+def test_an_alignment_that_fails_costs_its_candidate_only(place: Planes) -> None:
+    """The other candidates are aligned, and the keyframe is looked up."""
+    mapper = mapper_of("ann", "bob")
+    for name, run in (("ann", keyframes(place, -0.1, 1)), ("bob", keyframes(place, 0.0, 2, steps=7))):
+        for _, sent in run[:6]:
+            mapper.add_keyframe(name, sent)
+            work(mapper)
+    mapper.add_keyframe("bob", run[6][1])
+    done, findings = [], []
+    while (step := mapper.next_lookup()) is not None:
+        done.append(step)
+        is_first = [one.kind for one in done].count("align") == 1 and step.kind == "align"
+        findings += mapper.finish_step(step, RuntimeError("bad") if is_first else step.run(), 1.0)
+    assert [step.kind for step in done].count("align") >= 2
+    failed = [finding for finding in findings if finding.event == "step failed"]
+    assert [finding.agent for finding in failed] == ["bob"]
+    assert "align: RuntimeError: bad" in failed[0].reason
+    assert mapper.report()["failed_steps"] == 1
+
+
+@pytest.mark.long
+def test_where_all_alignments_fail_a_keyframe_is_compared_by_its_looks(place: Planes) -> None:
+    mapper = mapper_of("ann", "bob")
+    for name, run in (("ann", keyframes(place, -0.1, 1)), ("bob", keyframes(place, 0.0, 2, steps=6))):
+        for _, sent in run[:5]:
+            mapper.add_keyframe(name, sent)
+            work(mapper)
+    mapper.add_keyframe("bob", run[5][1])
+    seen = []
+    while (step := mapper.next_lookup()) is not None:
+        seen.append(step.kind)
+        mapper.finish_step(step, RuntimeError("bad") if step.kind == "align" else step.run(), 1.0)
+    assert "align" in seen and "place" in seen and seen.index("align") < seen.index("place")
+    assert mapper.report()["failed_steps"] == seen.count("align")
+
+
 @pytest.mark.parametrize("fails", [False, True], ids=["", "fails"])
 @pytest.mark.parametrize("at", [DescribeStep, QueryStep])
 def test_a_keyframe_may_be_removed_while_it_is_looked_up(

@@ -1,6 +1,7 @@
 """The tracker with IMU on three seconds of an emulated D435i with exact truth, and under faults."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
 from share.metrics.ate import ate
-from share.odometry import initialisation
+from share.odometry import filter, initialisation
 from share.odometry.inertial_tracker import InertialTracker
+from share.protocol.agent_ledger import KeyframeChain
 from share.recordings.trajectory import Trajectory
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source
@@ -123,6 +125,62 @@ def test_keyframes_carry_the_motion_by_the_present_state(walk):
     assert before.max() > 10 * sigma.max()
     assert (off < 4 * sigma).all()
     assert np.sqrt((off**2).mean()) < 0.2 * np.sqrt((before**2).mean())
+
+
+def test_keyframes_carry_their_pose_relative_to_earlier_ones_by_the_present_state(walk):
+    """Of those published, as long as the state has them."""
+    frames, rig, _ = walk
+    tracker, published, known = InertialTracker(rig, InertialConfig(), TrackerConfig()), {}, 0
+    for frame in frames:
+        if not tracker.track(frame).keyframe_ready:
+            continue
+        earlier, s = tracker.make_keyframe(frame).earlier, tracker.state
+        ids = s.keyframe_ids.tolist()
+        assert earlier.ids.tolist() == [stamp for stamp, id_ in published.items() if id_ in ids]
+        newest = len(ids) - 1
+        for k, stamp in enumerate(earlier.ids.tolist()):
+            before = ids.index(published[stamp])
+            T, cov = filter.relative_pose(s, before, newest), filter.relative_pose_cov(s, before, newest)
+            np.testing.assert_allclose(earlier.T_earlier_body[k], T, atol=1e-6)
+            np.testing.assert_allclose(earlier.cov[k], cov, rtol=1e-4, atol=1e-12)
+        known += len(earlier) > 1
+        published[frame.stamp_ns] = ids[newest]
+    assert known >= 2
+
+
+def test_the_tracker_tells_the_ledger_the_pose_relative_to_the_reference(tracked, walk):
+    """By its stamps the ledger finds the keyframes that it has sent: every other one here."""
+    frames, _, _ = walk
+    results, candidates, _ = tracked
+    stamps = [f.stamp_ns for f, r in zip(frames, results, strict=True) if r.keyframe_ready]
+    chain, sent = KeyframeChain(), []
+    for k, (stamp, candidate) in enumerate(zip(stamps, candidates, strict=True)):
+        chain.extend(candidate)
+        if k % 2 == 0:
+            sent.append((stamp, candidate, chain.make_keyframe(candidate, stamp)))
+    assert len(sent) >= 2
+    for (before, *_), (_, candidate, keyframe) in itertools.pairwise(sent):
+        row = candidate.earlier.ids.tolist().index(before)
+        np.testing.assert_allclose(keyframe.T_ref_body, candidate.earlier.T_earlier_body[row], atol=1e-6)
+        np.testing.assert_array_equal(keyframe.cov, candidate.earlier.cov[row].astype(float))
+
+
+def test_after_a_loss_keyframes_are_relative_to_none_before_it(walk):
+    frames, rig, _ = walk
+    tracker, before = InertialTracker(rig, InertialConfig(), TrackerConfig()), set()
+    for frame in frames[: len(frames) // 2]:
+        if tracker.track(frame).keyframe_ready:
+            tracker.make_keyframe(frame)
+            before.add(frame.stamp_ns)
+    assert before
+    tracker._declare_lost(frames[len(frames) // 2])
+    later = []
+    for frame in frames[len(frames) // 2 + 1 :]:
+        if tracker.track(frame).keyframe_ready:
+            later.append(tracker.make_keyframe(frame).earlier)
+    assert len(later) >= 2
+    assert not len(later[0]) and len(later[-1])
+    assert not before & {stamp for earlier in later for stamp in earlier.ids.tolist()}
 
 
 def anchoring_keyframes(tracker):

@@ -11,10 +11,11 @@ from helpers.hellos import hello_of
 
 from share.config import Config
 from share.mapping.query_queue import QueryQueue
+from share.mapping.recognition.patch_alignment import ORB_FEATURES
 from share.protocol.edge import Edge
 from share.protocol.edge_events import AddKeyframe, PeerMessageReceived, SendToPeer
 from share.protocol.keyframe_intake import FairQueue, KeyframeQuota
-from share.types import AgentKind, Keyframe, View
+from share.types import AgentKind, Keyframe, KeyframeImage, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
@@ -34,28 +35,43 @@ def taken_in(allowance: KeyframeQuota, points: int, hz: float, seconds: float, n
     return sum(allowance.objection(name, one, at_ns) is None for at_ns in times)
 
 
-def test_an_agent_within_its_rate_is_never_refused() -> None:
-    """The whole ledger at once, and from then on control.rate_max_hz."""
+def with_image(id: int) -> Keyframe:
+    jpeg = np.zeros(9, np.uint8)
+    return replace(keyframe(id, 0), image=replace(KeyframeImage.empty(), jpeg=jpeg))
+
+
+@pytest.mark.parametrize("has_image", [True, False], ids=["images", "views"])
+def test_an_agent_within_its_rate_is_never_refused(has_image: bool) -> None:
+    """The whole ledger at once, and from then on twice control.rate_max_hz."""
     config = Config()
-    allowance, one = KeyframeQuota(5.0), keyframe(1, config.tracker.view_features)
-    burst = [allowance.objection("ann", one, 0) for _ in range(config.agent.keep_keyframes)]
-    assert not any(burst)
-    hz = config.control.rate_max_hz
-    assert taken_in(allowance, 500, hz, 60, name="ann") == 60 * hz
+    one = with_image(1) if has_image else keyframe(1, config.tracker.view_features)
+    allowance, hz = KeyframeQuota(5.0), 2 * config.control.rate_max_hz
+    assert not any(allowance.objection("ann", one, 0) for _ in range(config.agent.keep_keyframes))
+    assert not any(allowance.objection("ann", one, round(k * S / hz)) for k in range(60 * int(hz)))
+
+
+def test_an_image_counts_as_the_keypoints_that_are_found_in_it() -> None:
+    def accepted(one: Keyframe) -> int:
+        allowance = KeyframeQuota(5.0)
+        return sum(allowance.objection("eve", one, 0) is None for _ in range(2000))
+
+    assert accepted(with_image(1)) == accepted(keyframe(1, ORB_FEATURES)) < accepted(keyframe(1, 700))
+    both = replace(keyframe(1, 800), image=with_image(1).image)
+    assert accepted(both) < 0.6 * accepted(with_image(1))
 
 
 def test_the_quota_counts_keypoints() -> None:
     allowance = KeyframeQuota(5.0)
     assert taken_in(allowance, 2000, 50, 60) < 60 * 50 / 4
     after = taken_in(allowance, 2000, 50, 60)
-    assert 60 * 3 <= after <= 60 * 4
-    assert taken_in(KeyframeQuota(5.0), 0, 50, 600) < 600 * 32 + 2000
+    assert 60 * 4 <= after <= 60 * 5
+    assert taken_in(KeyframeQuota(5.0), 0, 50, 600) < 600 * 44 + 2000
 
 
 def test_the_quota_is_per_name_and_not_per_run() -> None:
     allowance = KeyframeQuota(5.0)
     taken_in(allowance, 2000, 50, 60)
-    assert taken_in(allowance, 2000, 50, 1) <= 4
+    assert taken_in(allowance, 2000, 50, 1) <= 5
     assert taken_in(allowance, 500, 5, 20, name="ann") == 100
 
 
@@ -68,17 +84,17 @@ def test_a_keyframe_beyond_the_quota_is_not_acknowledged_and_is_reported() -> No
 
     tell(hello)
     applied, acked = 0, m.Ack(0)
-    for k in range(300):
+    for k in range(400):
         effects = tell(keyframe(k, 2000))
         applied += sum(isinstance(effect, AddKeyframe) for effect in effects)
         (acked,) = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, SendToPeer)]
-    assert 100 < applied < 250
+    assert 200 < applied < 350
     assert acked == m.Ack(applied)
     report = edge.report({})
     eve = report["agents"]["eve"]
-    assert "5000 keypoints a second" in eve["reason"]
-    assert eve["refused_messages"] == 300 - applied
-    assert report["refused"] == [f"agent 'eve': {300 - applied} messages refused, the last: {eve['reason']}"]
+    assert "8000 keypoints a second" in eve["reason"]
+    assert eve["refused_messages"] == 400 - applied
+    assert report["refused"] == [f"agent 'eve': {400 - applied} messages refused, the last: {eve['reason']}"]
     now_ns += 10 * S  # sent again, it is taken in
     assert any(isinstance(effect, AddKeyframe) for effect in tell(keyframe(applied, 2000)))
     now_ns += 10 * S
@@ -146,7 +162,7 @@ def test_a_duplicate_of_a_buffered_keyframe_costs_nothing() -> None:
     assert [effect.keyframe.id for effect in effects if isinstance(effect, AddKeyframe)] == [0, 1]
 
 
-def test_a_keyframe_that_starts_a_segment_costs_twenty() -> None:
+def test_a_keyframe_that_starts_a_segment_costs_much_more() -> None:
     allowance, first = KeyframeQuota(5.0), keyframe(0, 0)
     taken = sum(allowance.objection("eve", first, k * S // 50) is None for k in range(50 * 600))
     assert 60 < taken < 1100

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry import se3
-from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry
-from share.types import KeyframeCandidate, View
+from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry, spread_earlier
+from share.types import Keyframe, KeyframeCandidate, View
 from share.wire.messages import Ack, Welcome
 
 S = 1_000_000_000
@@ -71,6 +75,126 @@ def test_a_segment_starts_even_if_its_first_candidate_was_not_sent() -> None:
     keyframe = chain.make_keyframe(candidate(2), 2)
     assert (keyframe.reference, keyframe.predecessor, chain.first_of_segment) == (-1, 0, 1)
     np.testing.assert_array_equal(keyframe.T_ref_body, ODOMETRY[2])
+
+
+def reaching_back(k: int, *candidates: int, new_segment: bool = False) -> KeyframeCandidate:
+    """Candidate k with its pose relative to others, that differs from the chain's."""
+    T = np.array([se3.inverse(ODOMETRY[i]) @ ODOMETRY[k] @ se3.exp(np.full(6, 0.01)) for i in candidates])
+    cov = np.array([(k - i) * COV for i in candidates])
+    return replace(candidate(k, new_segment), earlier=EarlierPoses(np.array(candidates, np.int64), T, cov))
+
+
+def chain_of(sent: Collection[int], n: int, back: int = 20) -> tuple[KeyframeChain, list[Keyframe]]:
+    """Of n candidates, with stamps 0 .. n - 1; those `sent` become keyframes."""
+    chain, made = KeyframeChain(), []
+    for k in range(n):
+        one = reaching_back(k, *range(max(0, k - back), k)) if k else candidate(0)
+        chain.extend(one)
+        if k in sent:
+            made.append(chain.make_keyframe(one, k))
+    return chain, made
+
+
+def test_the_pose_relative_to_the_reference_is_the_trackers_where_it_knows_it() -> None:
+    _, made = chain_of([0, 2, 5], 6)
+    for keyframe, (before, k) in zip(made[1:], [(0, 2), (2, 5)], strict=True):
+        T = se3.inverse(ODOMETRY[before]) @ ODOMETRY[k] @ se3.exp(np.full(6, 0.01))
+        np.testing.assert_allclose(keyframe.T_ref_body, T, atol=1e-6)
+        np.testing.assert_allclose(keyframe.cov, (k - before) * COV, rtol=1e-6)
+
+
+def test_where_it_does_not_know_it_the_candidates_are_composed() -> None:
+    """The reference has left the tracker's window, or was dropped by it."""
+    _, made = chain_of([0, 1, 5], 6, back=2)
+    assert len(made[2].earlier) == 0
+    np.testing.assert_allclose(made[2].T_ref_body, se3.inverse(ODOMETRY[1]) @ ODOMETRY[5], atol=1e-12)
+    assert made[2].cov[0, 0] > 3 * COV[0, 0]
+
+
+def test_the_pose_relative_to_another_keyframe_is_not_taken_for_that_to_the_reference() -> None:
+    chain, _ = chain_of([0, 1], 2)
+    chain.extend(reaching_back(2, 0))
+    keyframe = chain.make_keyframe(reaching_back(2, 0), 2)
+    assert (keyframe.reference, keyframe.earlier.ids.tolist()) == (1, [0])
+    np.testing.assert_allclose(keyframe.T_ref_body, STEPS[1], atol=1e-12)
+
+
+def test_earlier_poses_are_relative_to_keyframes_that_were_sent_by_their_ids() -> None:
+    sent = [0, 3, 4, 7, 8, 9, 12, 15]
+    _, made = chain_of(sent, 16)
+    last = made[-1]
+    assert last.id == 7 and last.reference == 6
+    assert last.earlier.ids.tolist() == [0, 4]  # nearest to 13, 7 and 3 keyframes back
+    for id_, T, cov in zip(last.earlier.ids, last.earlier.T_earlier_body, last.earlier.cov, strict=True):
+        truth = se3.inverse(ODOMETRY[sent[id_]]) @ ODOMETRY[15] @ se3.exp(np.full(6, 0.01))
+        np.testing.assert_allclose(T, truth, atol=1e-6)
+        np.testing.assert_allclose(cov, (15 - sent[id_]) * COV, rtol=1e-6)
+    assert made[0].earlier.ids.tolist() == made[1].earlier.ids.tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("known", "kept"),
+    [
+        (range(10, 40), [27, 33, 37]),
+        ([39], []),  # only the reference
+        ([38, 39], [38]),
+        ([20, 39], [20]),
+        ([30, 31, 39], [30, 31]),  # 31 for 7 and for 3 back
+    ],
+)
+def test_earlier_poses_are_spread(known: Collection[int], kept: list[int]) -> None:
+    assert spread_earlier(reaching_back(40, *known).earlier, 40).ids.tolist() == kept
+
+
+@pytest.mark.parametrize("how", ["candidate", "told"])
+def test_a_new_segment_is_relative_to_nothing_and_nothing_later_to_the_one_before(how: str) -> None:
+    chain, _ = chain_of(range(8), 8)
+    if how == "told":
+        chain.begin_segment()
+    made = []
+    for k in range(8, 16):
+        one = reaching_back(k, *range(k), new_segment=how == "candidate" and k == 8)
+        chain.extend(one)
+        made.append(chain.make_keyframe(one, k))
+    assert (made[0].reference, len(made[0].earlier)) == (-1, 0)
+    np.testing.assert_array_equal(made[0].T_ref_body, ODOMETRY[8])
+    assert {i for keyframe in made for i in keyframe.earlier.ids.tolist()} == {8, 9, 10, 11, 12}
+
+
+def test_the_ids_of_keyframes_are_kept_as_long_as_they_may_be_needed() -> None:
+    chain, made = chain_of(range(70), 70, back=MAX_EARLIER)
+    assert [69 - i for i in made[-1].earlier.ids.tolist()] == [13, 7, 3]
+    assert len(chain._ids) == MAX_EARLIER
+
+
+def book_of(made: list[Keyframe], capacity: int = 100) -> KeyframeLedger:
+    book = KeyframeLedger(capacity, 100)
+    for k, keyframe in enumerate(made):
+        book.add(LedgerEntry(keyframe, k, k))
+    return book
+
+
+def test_a_keyframe_that_starts_a_segment_for_a_restarted_edge_has_no_earlier_poses() -> None:
+    _, made = chain_of(range(20), 20)
+    book = book_of(made)
+    book.take_due(0)
+    book.acknowledge(Ack(15))
+    for k in range(15):  # they are dropped
+        book._acknowledged.pop(k, None)
+    book.begin_session(Welcome(2, 0))
+    pending = [entry.keyframe for entry in book.pending]
+    assert [(one.id, one.reference, len(one.earlier)) for one in pending[:2]] == [(15, -1, 0), (16, 15, 3)]
+
+
+def test_a_rebased_keyframe_keeps_its_earlier_poses() -> None:
+    """They do not depend on the reference; the edge leaves out those that it does not have."""
+    _, made = chain_of(range(12), 12)
+    book = book_of(made[9:], capacity=2)
+    assert book.counts["drop_oldest"] == 1
+    rebased = book.pending[0].keyframe
+    assert (rebased.id, rebased.reference) == (10, 8)
+    np.testing.assert_array_equal(rebased.earlier.ids, made[10].earlier.ids)
+    np.testing.assert_allclose(rebased.T_ref_body, made[9].T_ref_body @ made[10].T_ref_body)
 
 
 def test_the_window_moves_with_the_acknowledgements() -> None:

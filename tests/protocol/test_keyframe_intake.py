@@ -9,6 +9,7 @@ import pytest
 from helpers.hellos import hello_of
 
 from share.config import Config
+from share.earlier_poses import EarlierPoses
 from share.geometry.camera import Camera
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
@@ -59,6 +60,21 @@ def test_a_damaged_image_is_left_out(jpeg: np.ndarray) -> None:
     got, problem = sanitise(keyframe(1, replace(RIGHT, jpeg=jpeg)), BASE, CAMERA)
     assert problem == "keyframe 1: its image is no JPEG, or cut short: without it"
     assert (len(got.image.jpeg), got.reference) == (0, 0)
+
+
+def reaching_back(T: np.ndarray) -> Keyframe:
+    sent = keyframe(5, RIGHT, T)
+    earlier = EarlierPoses(np.array([1, 2]), np.tile(np.eye(4), (2, 1, 1)), np.tile(np.eye(6), (2, 1, 1)))
+    return replace(sent, reference=4, earlier=earlier)
+
+
+def test_a_keyframe_that_has_to_start_a_segment_loses_its_earlier_poses() -> None:
+    base = OdometryBase(4, 4 * 10**8, np.eye(4))
+    got, problem = sanitise(reaching_back(far()), base, CAMERA)
+    assert problem == "keyframe 5 is 50 m from the previous one: new segment"
+    assert (got.reference, len(got.earlier)) == (-1, 0)
+    got, problem = sanitise(reaching_back(np.eye(4)), base, CAMERA)
+    assert problem is None and got.earlier.ids.tolist() == [1, 2]
 
 
 def test_all_that_is_wrong_is_said() -> None:

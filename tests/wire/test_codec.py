@@ -14,7 +14,9 @@ from helpers.wire_strategies import messages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.errors import WireError
+from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.net.backlog import BacklogLimits
 from share.types import (
@@ -127,8 +129,24 @@ def test_a_pose_fits_into_200_bytes_and_a_keyframe_into_its_image_and_3_kb() -> 
     assert codec.message_bytes(codec.encode(sent)) <= 17_000 + 3_000
 
 
+def with_earlier(sent: Keyframe, count: int) -> Keyframe:
+    T = se3.exp(np.full((count, 6), 0.1))
+    cov = np.tile(1e-6 * np.eye(6), (count, 1, 1))
+    return dataclasses.replace(sent, earlier=EarlierPoses(np.arange(count), T, cov))
+
+
+def test_poses_relative_to_earlier_keyframes_come_as_they_were_sent() -> None:
+    sent = with_earlier(keyframe(0, 40), MAX_EARLIER)
+    got = codec.decode(copied(codec.encode(sent)))
+    assert isinstance(got, Keyframe)
+    for name in ("ids", "T_earlier_body", "cov"):
+        np.testing.assert_array_equal(getattr(got.earlier, name), getattr(sent.earlier, name))
+    three, none = (codec.message_bytes(codec.encode(with_earlier(keyframe(0, 40), n))) for n in (3, 0))
+    assert three - none < 700
+
+
 def test_the_largest_keyframe_image_is_decoded() -> None:
-    sent = keyframe_with_image(2000, MAX_JPEG_BYTES)
+    sent = with_earlier(keyframe_with_image(2000, MAX_JPEG_BYTES, 40), MAX_EARLIER)
     assert same(codec.decode(copied(codec.encode(sent))), sent)
     assert max(map(len, codec.encode(sent))) <= codec.MAX_FRAME_BYTES
     guard = BacklogLimits.for_frame_size(codec.MAX_FRAME_BYTES)
@@ -226,6 +244,13 @@ BAD = {
     "image.uv: <f4 of shape (2001, 2)": bad_keyframe(at=8, entry=("<f4", (2001, 2)), data=b"\0" * 16008),
     "plane: shape (1, 3), expected (0, 3)": bad_keyframe(at=9, entry=("<f4", (1, 3)), data=b"\0" * 12),
     "rho_sigma: shape (1,), expected (0,)": bad_keyframe(at=10, entry=("<f4", (1,)), data=b"\0" * 4),
+    "earlier.ids: <i8 of shape (33,)": bad_keyframe(at=11, entry=("<i8", (33,)), data=b"\0" * 264),
+    "T_earlier_body: shape (0, 4, 4), expected (1, 4, 4)": bad_keyframe(
+        at=11, entry=("<i8", (1,)), data=b"\0" * 8
+    ),
+    "earlier.cov: shape (1, 6, 6), expected (0, 6, 6)": bad_keyframe(
+        at=13, entry=("<f4", (1, 6, 6)), data=b"\0" * 144
+    ),
 }  # fmt: skip
 
 

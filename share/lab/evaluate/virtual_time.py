@@ -203,14 +203,19 @@ def _ignore_full_disk(text: str) -> None:
 # Delays measured in a real-time run, for runs in virtual time.
 
 _DEFAULT_DELAYS = ProcessingDelays()
+_SMALL_STEPS = "receive", "add", "check_loop", "apply_solution"
+_ALIGN = "align_accepted", "align_refused"
+_VERIFY_IMAGES = "verify_images_accepted", "verify_images_refused"
+_IMAGE_STEPS = "describe", *_ALIGN, *_VERIFY_IMAGES
 
 
 def read_delays(run: Path) -> ProcessingDelays:
-    """Read the delays of frames, queries, verifications and solutions from the reports in `run`, a folder of
+    """Read the delays of frames, solutions and the steps of look-ups from the reports in `run`, a folder of
     `share evaluate run`.
 
     Delays that are not measured are the defaults times a factor: the agent's keyframe work by that of frames,
-    the edge's small steps by that of verifications. Raises UsageError or DataError.
+    the edge's small steps by that of describing images, or of verifications in a run without images. Raises
+    UsageError or DataError.
     """
     edge, agents = run / "edge" / "edge.json", sorted(run.glob("*/report.json"))
     if not edge.is_file() or not agents:
@@ -226,12 +231,16 @@ def _read_delays(edge: Path, agents: Sequence[Path]) -> ProcessingDelays:
         _mean_delay([edge_report.get(f"{kind}_ms", {})], edge) for kind in ("place", "verify", "solve")
     )
     agent_factor = frame.p50 / _DEFAULT_DELAYS.frame.p50
+    describe, align = (edge_report.get(f"{kind}_ms", {}) for kind in ("describe", "align"))
+    has_images = bool(describe.get("n"))
     edge_factor = verify.p50 / _DEFAULT_DELAYS.verify_accepted.p50
+    if has_images:
+        edge_factor = _mean_delay([describe], edge).p50 / _DEFAULT_DELAYS.describe.p50
     return replace(
         ProcessingDelays(
             **{
                 name: _scaled(getattr(_DEFAULT_DELAYS, name), edge_factor)
-                for name in ("receive", "add", "check_loop", "apply_solution")
+                for name in (*_SMALL_STEPS, *_IMAGE_STEPS)
             }
         ),
         frame=frame,
@@ -241,6 +250,9 @@ def _read_delays(edge: Path, agents: Sequence[Path]) -> ProcessingDelays:
         verify_accepted=verify,
         verify_refused=verify,
         solve=solve,
+        **(dict.fromkeys(_VERIFY_IMAGES, verify) if has_images else {}),
+        **({"describe": _mean_delay([describe], edge)} if has_images else {}),
+        **(dict.fromkeys(_ALIGN, _mean_delay([align], edge)) if align.get("n") else {}),
     )
 
 

@@ -40,10 +40,22 @@ def inflate_covariance(T_ref_body: F64, cov: F64) -> F64:
 
     A floor that grows with the step is added in quadrature; `CovarianceScales` scales what agents understate.
     """
-    angle_rad, length_m = float(se3.rotation_angle(T_ref_body)), float(np.linalg.norm(T_ref_body[:3, 3]))
+    return cov + _floor(T_ref_body)
+
+
+def inflate_span(T_earlier_body: F64, cov: F64, steps: int) -> F64:
+    """Covariance (6, 6) of odometry over several steps as the graph uses it: with the floor of that many
+    equal steps, so that an agent's spans, which `CovarianceClaims` does not see, cannot be certain.
+    """
+    return cov + steps * _floor(T_earlier_body, steps)
+
+
+def _floor(T: F64, steps: int = 1) -> F64:
+    """Covariance (6, 6) added to each of `steps` equal steps that make T (4, 4)."""
+    angle_rad, length_m = float(se3.rotation_angle(T)) / steps, float(np.linalg.norm(T[:3, 3])) / steps
     rad2 = np.radians(_FLOOR_DEG) ** 2 + (_FLOOR_PER_RAD * angle_rad) ** 2
     m2 = _FLOOR_M**2 + (_FLOOR_PER_M * length_m) ** 2
-    return cov + np.diag([rad2] * 3 + [m2] * 3)
+    return np.diag([rad2] * 3 + [m2] * 3)
 
 
 _MAX_STEPS = 64  # newest of each agent

@@ -45,6 +45,46 @@ def test_unmeasured_delays_are_in_proportion_to_measured_ones(tmp_path):
         assert getattr(costs, name).p50 == pytest.approx(0.5 * getattr(usual, name).p50)
 
 
+def with_images(folder: Path, align_n: int = 10) -> Path:
+    """An edge that describes images in twice the usual time."""
+    path = run(folder) / "edge" / "edge.json"
+    usual = ProcessingDelays()
+    report = json.loads(path.read_text()) | {
+        "describe_ms": spread(2 * usual.describe.p50, 30.0),
+        "align_ms": spread(7.0, 21.0, align_n),
+    }
+    path.write_text(json.dumps(report))
+    return folder
+
+
+def test_describing_and_aligning_images_take_as_long_as_in_the_run(tmp_path):
+    costs, usual = read_delays(with_images(tmp_path)), ProcessingDelays()
+    assert costs.describe == Delay(2 * usual.describe.p50, 30.0)
+    assert costs.align_accepted == costs.align_refused == Delay(7.0, 21.0)
+    assert costs.verify_images_accepted == costs.verify_images_refused == Delay(2.0, 5.0)
+    for name in ("receive", "add", "check_loop", "apply_solution"):
+        assert getattr(costs, name).p50 == pytest.approx(2 * getattr(usual, name).p50)
+
+
+def test_where_nothing_was_described_or_aligned_both_are_in_proportion(tmp_path):
+    (tmp_path / "some").mkdir()
+    (tmp_path / "none").mkdir()
+    usual, some, none = (
+        ProcessingDelays(),
+        read_delays(with_images(tmp_path / "some", align_n=0)),
+        read_delays(run(tmp_path / "none")),
+    )
+    assert some.align_accepted == Delay(2 * usual.align_accepted.p50, 2 * usual.align_accepted.p95)
+    for name in (
+        "describe",
+        "align_accepted",
+        "align_refused",
+        "verify_images_accepted",
+        "verify_images_refused",
+    ):
+        assert getattr(none, name).p50 == pytest.approx(0.5 * getattr(usual, name).p50)
+
+
 def test_missing_delays_are_reported(tmp_path):
     with pytest.raises(UsageError, match="not a folder of"):
         read_delays(tmp_path)

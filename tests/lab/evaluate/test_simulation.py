@@ -8,12 +8,20 @@ from helpers.edge_sim import Person, walls
 from helpers.room_simulation import MS, tracked_frames
 
 from share.config import Config, EdgeConfig
+from share.geometry.camera import Camera
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS
 from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation
+from share.mapping.recognition.index import PlaceIndex
+from share.mapping.recognition.patch_alignment import ImageView
+from share.mapping.recognition.verification import CameraView, Refusal, Verification
+from share.mapping.steps import AlignStep, DescribeStep, LookupStep, QueryStep, VerifyStep
+from share.types import KeyframeImage, View
 
 pytestmark = pytest.mark.long
 
 ROOM = walls(1)
+IMAGE = ImageView(KeyframeImage.empty(), Camera(640, 480, 385.0, 385.0, 320.0, 240.0), np.eye(4))
+LOOKS = CameraView(View.empty(), 385.0, np.eye(4), np.zeros(3))
 
 
 def world(policy: str = "covins-g", seed: int = 0, seconds: float = 6.0, **costs: Delay) -> Simulation:
@@ -93,3 +101,26 @@ def test_an_agent_receives_its_rate() -> None:
     received = {name: own["rate_hz"] for name, own in room.reports().items()}
     assert all(rate is not None for rate in received.values())
     assert {name: agent["rate_hz"] for name, agent in report.items()} == pytest.approx(received, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("step", "accepted", "refused"),
+    [
+        (DescribeStep(0, IMAGE), "describe", "describe"),
+        (QueryStep(PlaceIndex(), 0, LOOKS, 5, ()), "query", "query"),
+        (AlignStep(0, IMAGE, 1, IMAGE, np.eye(4)), "align_accepted", "align_refused"),
+        (VerifyStep(0, LOOKS, 1, LOOKS), "verify_accepted", "verify_refused"),
+        (VerifyStep(0, LOOKS, 1, LOOKS, IMAGE, None), "verify_accepted", "verify_refused"),
+        (VerifyStep(0, LOOKS, 1, LOOKS, IMAGE, IMAGE), "verify_images_accepted", "verify_images_refused"),
+    ],
+    ids=lambda value: getattr(value, "kind", ""),
+)
+def test_each_step_of_a_look_up_has_its_delay(step: LookupStep, accepted: str, refused: str) -> None:
+    """An accepted candidate is checked too."""
+    delays, room = ProcessingDelays(), world(seconds=0.0)
+    if accepted != refused:
+        loop = Verification(np.eye(4), np.eye(6), 80, 70)
+        done = getattr(delays, accepted)
+        checked = Delay(done.p50 + delays.check_loop.p50, done.p95 + delays.check_loop.p95)
+        assert room._delay_of(step, loop) == checked
+    assert room._delay_of(step, Refusal("no")) == getattr(delays, refused)
