@@ -131,6 +131,8 @@ def test_the_covariance_of_aligned_images_is_not_too_small(room: Planes, pairs) 
 
 def test_derivatives_of_the_residuals(pairs) -> None:
     true, query, candidate = pairs[0]
+    exact = dataclasses.replace(query.source, rho_sigma=np.zeros_like(query.source.rho_sigma))
+    query = ImageView(exact, CAMERA, T_BODY_CAM)  # so that residuals are whitened by 0.2 px alone
     T = se3.inverse(T_BODY_CAM) @ true @ T_BODY_CAM
     forward = patch_alignment._align(T, query, candidate, 0)
     assert len(forward.feature) > 40
@@ -144,7 +146,7 @@ def test_derivatives_of_the_residuals(pairs) -> None:
         xi = np.zeros(6)
         xi[k] = step
         slope = (predicted(se3.exp(xi) @ T, query) - predicted(se3.exp(-xi) @ T, query)) / (2 * step)
-        np.testing.assert_allclose(at.J_pose[:, :, k], slope, atol=1e-3)
+        np.testing.assert_allclose(at.J_pose[:, :, k], slope, atol=5e-3)
     source, grown = query.source, 1e-3
     nearer, farther = (
         ImageView(dataclasses.replace(source, plane=source.plane * np.exp(log)), CAMERA, T_BODY_CAM)
@@ -154,17 +156,14 @@ def test_derivatives_of_the_residuals(pairs) -> None:
     np.testing.assert_allclose(at.J_scale, slope, atol=0.01 * np.abs(slope).max())
 
 
-def test_the_information_of_a_residual_is_of_pixels_and_depth(pairs) -> None:
-    """Across the epipolar line only the pixel's; along it the depth's too."""
-    true, query, candidate = pairs[0]
-    T = se3.inverse(T_BODY_CAM) @ true @ T_BODY_CAM
-    forward = patch_alignment._align(T, query, candidate, 0)
-    at = patch_alignment._residuals(T, query, candidate, forward, 1.0)
-    variance = np.linalg.eigvalsh(np.linalg.inv(at.information))
-    rho = (rays(query.uv) * query.plane).sum(axis=1)[forward.feature]
-    along = at.J_scale * (query.rho_sigma[forward.feature] / rho)[:, None]
-    np.testing.assert_allclose(variance[:, 0], 0.2**2, rtol=1e-6)
-    np.testing.assert_allclose(variance[:, 1], 0.2**2 + (along**2).sum(axis=1), rtol=1e-6)
+def test_residuals_are_whitened_by_pixels_and_depth() -> None:
+    """Across the epipolar line by the pixel's error only; along it by the depth's too."""
+    rng = np.random.default_rng(3)
+    common = rng.normal(0, 2.0, (20, 2))
+    common[0] = 0.0  # a known depth
+    root = patch_alignment._whitened(np.broadcast_to(np.eye(2), (20, 2, 2)), 0.2, common)
+    S = 0.2**2 * np.eye(2) + common[:, :, None] * common[:, None, :]
+    np.testing.assert_allclose(root @ S @ root.swapaxes(1, 2), np.broadcast_to(np.eye(2), S.shape), atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [1.05, 0.95])

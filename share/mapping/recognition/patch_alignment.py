@@ -38,6 +38,8 @@ _CAUCHY = 2.0  # Mahalanobis distance at which a measurement has half its weight
 _MIN_INLIERS, _MIN_INLIER_SHARE = 25, 0.7  # of the aligned patches
 _MIN_FOUND_SHARE = 0.35  # aligned patches, of those in both views, where nothing but the map's pose says so
 _ITERATIONS = 6
+_CONVERGED_STEP = 1e-4  # rad and m, at full size
+_NOT_VISIBLE = 1e3  # whitened residual of what the pose puts behind the camera
 _MIN_DEPTH_RATIO = 0.02  # of the depth in the other camera: nearer counts as behind it
 _RIDGE = 1e-6
 # Added to the covariance: errors that many patches do not average out (calibration, shutter, the JPEG).
@@ -242,48 +244,43 @@ def _fit_pose(
     """Fit the pose to all aligned positions. size: px of the image per px of the level. Raises LinAlgError
     where they do not determine it."""
     for _ in range(_ITERATIONS):
-        parts = (
-            _residuals(T, query, candidate, forward, size),
-            _residuals(se3.inverse(T), candidate, query, backward, size),
-        )
-        chain = -se3.adjoint(se3.inverse(T))
-        r = np.concatenate([part.r for part in parts])
-        J = np.concatenate([parts[0].J_pose, parts[1].J_pose @ chain])
-        W = np.concatenate([part.information for part in parts])
-        chi2 = np.einsum("ni,nij,nj->n", r, W, r)
-        JW = np.einsum("nik,nij,n->nkj", J, W, 1 / (1 + chi2 / _CAUCHY**2))
-        information = np.einsum("nkj,njl->kl", JW, J) + _RIDGE * np.eye(6)
-        step = np.linalg.solve(information, np.einsum("nkj,nj->k", JW, r))
+        at_candidate = _residuals(T, query, candidate, forward, size)
+        at_query = _residuals(se3.inverse(T), candidate, query, backward, size)
+        r = np.concatenate([at_candidate.r, at_query.r])
+        J = np.concatenate([at_candidate.J_pose, at_query.J_pose @ -se3.adjoint(se3.inverse(T))])
+        chi2 = (r * r).sum(axis=1)
+        root_weight = 1 / np.sqrt(1 + chi2 / _CAUCHY**2)
+        A = (J * root_weight[:, None, None]).reshape(-1, 6)
+        information = A.T @ A + _RIDGE * np.eye(6)
+        step = np.linalg.solve(information, A.T @ (r * root_weight[:, None]).ravel())
         T = se3.exp(step) @ T
-        if np.abs(step).max() < 1e-5:
+        if np.abs(step).max() < _CONVERGED_STEP * size:
             break
     inlier = chi2 < _INLIER_CHI2
-    J_scale = np.concatenate([parts[0].J_scale, np.zeros_like(parts[1].J_scale)])
-    depth_scale = _depth_scale(J[inlier], J_scale[inlier], W[inlier], r[inlier])
+    J_scale = np.concatenate([at_candidate.J_scale, np.zeros_like(at_query.J_scale)])
+    depth_scale = _depth_scale(J[inlier], J_scale[inlier], r[inlier])
     return _PoseFit(T, np.linalg.inv(information), int(inlier.sum()), depth_scale)
 
 
-def _depth_scale(J: F64, J_scale: F64, W: F64, r: F64) -> DepthScale | None:
+def _depth_scale(J: F64, J_scale: F64, r: F64) -> DepthScale | None:
     """Return the scale of the query's depths by residuals r (M, 2) at the pose's fit: one more unknown."""
     if len(r) < _MIN_INLIERS:
         return None
-    full = np.concatenate([J, J_scale[:, :, None]], axis=2)
-    JW = np.einsum("nik,nij->nkj", full, W)
-    normal = np.einsum("nkj,njl->kl", JW, full) + _RIDGE * np.eye(7)
-    log_scale = float(np.linalg.solve(normal, np.einsum("nkj,nj->k", JW, r))[6])
-    variance = max(1.0, float(np.einsum("ni,nij,nj->", r, W, r)) / max(1, 2 * len(r) - 7))
+    A = np.concatenate([J, J_scale[:, :, None]], axis=2).reshape(-1, 7)
+    normal = A.T @ A + _RIDGE * np.eye(7)
+    log_scale = float(np.linalg.solve(normal, A.T @ r.ravel())[6])
+    variance = max(1.0, float((r * r).sum()) / max(1, 2 * len(r) - 7))
     sigma = float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance))
     return DepthScale(log_scale, sigma, -np.linalg.solve(normal[:6, :6], normal[:6, 6]))
 
 
 class _Residuals(NamedTuple):
-    """r (M, 2): measured minus predicted, px; its derivatives J_pose (M, 2, 6) of the prediction by the left
-    perturbation of T, J_scale (M, 2) by the log of the source's depths; information (M, 2, 2)."""
+    """Whitened: r (M, 2), measured minus predicted; its derivatives J_pose (M, 2, 6) of the prediction by the
+    left perturbation of T, and J_scale (M, 2) by the log of the source's depths."""
 
     r: F64
     J_pose: F64
     J_scale: F64
-    information: F64
 
 
 def _residuals(
@@ -292,16 +289,26 @@ def _residuals(
     index = alignment.feature
     uv, D, q, rho = _transfer(T, source, index)
     J_px = target.camera.jacobian(uv) @ D
-    J = np.empty((len(index), 2, 6))
+    by_rho = J_px @ T[:3, 3]  # px per 1/m
+    J = np.empty((len(index), 2, 8))  # by the pose, by the log of the depth, and the residual
     x, y, z = q[:, 0, None], q[:, 1, None], q[:, 2, None]
     a, b, c = J_px[..., 0], J_px[..., 1], J_px[..., 2]
     J[:, :, 0], J[:, :, 1], J[:, :, 2] = y * c - z * b, z * a - x * c, x * b - y * a
-    J[:, :, 3:] = J_px * rho[:, None, None]
-    by_rho = J_px @ T[:3, 3]  # px per 1/m
-    J_depth = by_rho * source.rho_sigma[index, None]
-    S = (size * _SIGMA_PX) ** 2 * np.eye(2) + J_depth[:, :, None] * J_depth[:, None, :]
-    is_visible = np.asarray(np.isfinite(uv).all(axis=1))
-    r: F64 = np.where(is_visible[:, None], alignment.px - target.camera.distort(uv), 1e3)
-    S[~is_visible] = 1e6 * np.eye(2)
-    J_scale = np.nan_to_num(by_rho * rho[:, None])
-    return _Residuals(r, np.nan_to_num(J), J_scale, np.asarray(np.linalg.inv(S)))
+    J[:, :, 3:6] = J_px * rho[:, None, None]
+    J[:, :, 6] = by_rho * rho[:, None]
+    J[:, :, 7] = alignment.px - target.camera.distort(uv)
+    is_visible = np.isfinite(uv).all(axis=1)
+    J = _whitened(J, size * _SIGMA_PX, by_rho * source.rho_sigma[index, None])
+    J[~is_visible] = 0.0
+    J[~is_visible, :, 7] = _NOT_VISIBLE
+    return _Residuals(J[:, :, 7], J[:, :, :6], J[:, :, 6])
+
+
+def _whitened(J: F64, sigma: float, common: F64) -> F64:
+    """Return S^-1/2 J for rows J (M, 2, K) with covariance S = sigma^2 1 + common common' (M, 2, 2)."""
+    length = np.sqrt((common * common).sum(axis=1))
+    along = common / np.maximum(length, 1e-12)[:, None]
+    reduction = 1 - sigma / np.sqrt(sigma**2 + length**2)
+    part = (along[:, None, :] @ J) * reduction[:, None, None]  # (M, 1, K)
+    out: F64 = (J - along[:, :, None] * part) / sigma
+    return out
