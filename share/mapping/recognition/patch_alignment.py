@@ -228,7 +228,7 @@ def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignme
     return _Alignment(index[good], size * aligned.px[good].astype(np.float64), len(index))
 
 
-class _PoseFit(NamedTuple):
+class _AlignedPose(NamedTuple):
     """T (4, 4) of the cameras, covariance (6, 6) of its left perturbation, inliers, and relative depth
     scale."""
 
@@ -240,7 +240,7 @@ class _PoseFit(NamedTuple):
 
 def _fit_pose(
     T: F64, query: ImageView, candidate: ImageView, forward: _Alignment, backward: _Alignment, size: float
-) -> _PoseFit:
+) -> _AlignedPose:
     """Fit the pose to all aligned positions. size: px of the image per px of the level. Raises LinAlgError
     where they do not determine it."""
     for _ in range(_ITERATIONS):
@@ -259,7 +259,7 @@ def _fit_pose(
     inlier = chi2 < _INLIER_CHI2
     J_scale = np.concatenate([at_candidate.J_scale, np.zeros_like(at_query.J_scale)])
     depth_scale = _depth_scale(J[inlier], J_scale[inlier], r[inlier])
-    return _PoseFit(T, np.linalg.inv(information), int(inlier.sum()), depth_scale)
+    return _AlignedPose(T, np.linalg.inv(information), int(inlier.sum()), depth_scale)
 
 
 def _depth_scale(J: F64, J_scale: F64, r: F64) -> DepthScale | None:
