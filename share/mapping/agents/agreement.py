@@ -289,14 +289,15 @@ class AgentAgreement:
         for row, ((a, b), scale) in enumerate(known):
             J[row, column[a]], J[row, column[b]] = -1 / scale.sigma, 1 / scale.sigma
             z[row] = scale.value / scale.sigma
-        x = np.linalg.pinv(J) @ z
+        inverse = np.linalg.pinv(J)
+        x = inverse @ z
         by_credential = {
             self.identities.credential(agent): x[column[agent]]
             for agent in agents
             if agent not in self.quarantined
         }
         x -= np.median([*by_credential.values()] or x)  # one value per credential
-        sigma = np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))
+        sigma = np.sqrt((inverse * inverse).sum(axis=1))  # z has unit variance
         return {name: (float(x[i]), float(sigma[i])) for name, i in column.items()}
 
 
