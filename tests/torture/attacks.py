@@ -56,7 +56,7 @@ class Ctx:
     def keyframe(self, number: int, follows: int, far_m: float = 0.0, points: bool = False) -> Message:
         """A valid one, of that id; relative to the one that it follows."""
         all_of = self.corpus.by_kind["keyframe"]
-        header, *arrays = all_of[0] if points else _small(all_of[:1], "keyframe")[0]
+        header, *arrays = all_of[0] if points else _small(all_of[:2], "keyframe")[1]
         fields: Any = unpack(header)
         fields[2][0], fields[2][1], fields[2][3] = number, follows, follows
         fields[2][2] += 300_000_000 * min(number, 10**6)
