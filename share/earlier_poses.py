@@ -34,6 +34,8 @@ class EarlierPoses:
             "T_earlier_body": checked_array("T_earlier_body", self.T_earlier_body, (n, 4, 4), np.float32),
             "cov": checked_array("earlier.cov", self.cov, (n, 6, 6), np.float32),
         }
+        if len(np.unique(checked["ids"])) < n:
+            raise ValueError("earlier: a keyframe occurs twice")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         for T, cov in zip(self.T_earlier_body, self.cov, strict=True):

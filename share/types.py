@@ -39,6 +39,7 @@ MAX_KEYPOINTS = 2000  # per keyframe
 MAX_NAME_LENGTH = 64  # characters, of an agent's name
 MAX_MAP_ID_LENGTH = MAX_NAME_LENGTH + 32  # a run key has up to 17 characters more, a segment number up to 11
 MAX_JPEG_BYTES = 64_000  # of a keyframe's image
+MAX_SURFACES = 256  # in a keyframe's image; a tracker has some 80
 MAX_PLANE = 1e3  # 1/m, of each component of a surface's plane: 1 mm from the camera
 MAX_UV = 1e3  # normalised image coordinates: 89.9 degrees off the axis
 MAX_GYRO_RAD_S = 1e3  # twenty times the range of the widest common gyroscope
@@ -234,8 +235,8 @@ class KeyframeImage:
 
     def __post_init__(self) -> None:
         n = len(self.uv)
-        if n > MAX_KEYPOINTS:
-            raise ValueError(f"uv: {n} features, at most {MAX_KEYPOINTS}")
+        if n > MAX_SURFACES:
+            raise ValueError(f"uv: {n} features, at most {MAX_SURFACES}")
         if len(self.jpeg) > MAX_JPEG_BYTES:
             raise ValueError(f"jpeg: {len(self.jpeg)} bytes, at most {MAX_JPEG_BYTES}")
         _set_fields(

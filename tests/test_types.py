@@ -92,6 +92,11 @@ def test_poses_relative_to_earlier_keyframes_are_poses_and_their_covariances_cov
             earlier([1, 2], cov=cov)
 
 
+def test_a_keyframe_occurs_once_among_the_earlier_ones() -> None:
+    with pytest.raises(ValueError, match="occurs twice"):
+        EarlierPoses(np.array([3, 3]), np.array([np.eye(4)] * 2), np.array([np.eye(6)] * 2))
+
+
 def test_a_row_of_them_keeps_its_pose_under_another_id() -> None:
     poses = se3.exp(0.1 * np.arange(18.0).reshape(3, 6))
     known = EarlierPoses(np.array([70, 80, 90]), poses, np.array([np.eye(6) * k for k in (1, 2, 3)]))

@@ -84,10 +84,9 @@ class MapFrame:
         self._target, self._cov, self.map_id = target, correction.cov, correction.map_id
         if jumps or self._current is None:
             self._current, self._unsettled_since_ns = target, None
-        elif (
-            self._unsettled_since_ns is None
-            and _length_m(_way(self._current, target, T_odom_body)) > _SETTLED_M
-        ):
+        elif way_m <= _SETTLED_M:
+            self._unsettled_since_ns = None  # a correction that was taken back
+        elif self._unsettled_since_ns is None:
             self._unsettled_since_ns = now_ns
         return jumps
 

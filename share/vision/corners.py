@@ -139,6 +139,7 @@ def spread_order(
 # Limit for views and for a tracker without an IMU, which weigh all points alike: here a pixel is four times
 # as large in (x/z, y/z) as on the axis.
 UNIFORM_FIELD_DEG = 60.0
+_MASK_SIDE_PX = 1000
 
 
 @lru_cache(maxsize=8)
@@ -147,7 +148,12 @@ def field_mask(camera: Camera, max_deg: float = MAX_FIELD_DEG) -> U8 | None:
     an unbounded lens."""
     if not camera.is_bounded:
         return None
-    px = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    step = 1 + max(camera.width, camera.height) // _MASK_SIDE_PX  # large images: computed on a grid
+    px = np.stack(np.meshgrid(np.arange(0, camera.width, step), np.arange(0, camera.height, step)), axis=-1)
     uv = camera.normalise(px.astype(np.float64))
     radius = np.hypot(uv[..., 0], uv[..., 1])
-    return np.where(radius < np.tan(np.radians(max_deg)), 255, 0).astype(np.uint8)
+    mask = np.where(radius < np.tan(np.radians(max_deg)), 255, 0).astype(np.uint8)
+    if step == 1:
+        return mask
+    size = camera.width, camera.height
+    return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), np.uint8)

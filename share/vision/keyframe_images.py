@@ -11,9 +11,10 @@ from share.array_table import ArrayTable
 from share.checks import MAX_SIGMA
 from share.errors import DataError
 from share.geometry.camera import Camera, rays
-from share.types import F64, MAX_JPEG_BYTES, MAX_PLANE, MAX_UV, U8, KeyframeImage
+from share.types import F64, MAX_JPEG_BYTES, MAX_PLANE, MAX_SURFACES, MAX_UV, U8, KeyframeImage
 from share.vision.image_codec import check_complete, checked_header, decode_gray, encode_jpeg, image_format
 
+MAX_IMAGE_PIXELS = 2_400_000  # of a keyframe's image: 1920 x 1200; larger ones cost the edge too much
 _JPEG_QUALITIES = (50, 25, 10)  # the first that fits; patches align as well at 50 as uncompressed
 
 
@@ -35,16 +36,17 @@ class Surfaces(ArrayTable):
     def with_image(self, image: U8 | None) -> KeyframeImage:
         """Return them with an image (H, W), compressed, or without one."""
         jpeg = np.zeros(0, np.uint8) if image is None else compress(image)
-        return KeyframeImage(
-            jpeg,
-            self.uv.astype(np.float32),
-            self.plane.astype(np.float32),
-            self.rho_sigma.astype(np.float32),
-        )
+        n = len(self.uv)
+        kept = np.linspace(0, n - 1, min(n, MAX_SURFACES)).astype(np.int64)  # evenly, of too many
+        uv, plane, rho_sigma = (a[kept].astype(np.float32) for a in (self.uv, self.plane, self.rho_sigma))
+        return KeyframeImage(jpeg, uv, plane, rho_sigma)
 
 
 def compress(image: U8) -> U8:
-    """Return the image (H, W) as a JPEG (B,) of at most MAX_JPEG_BYTES; empty if that is impossible."""
+    """Return the image (H, W) as a JPEG (B,) of at most MAX_JPEG_BYTES; empty if that is impossible, or the
+    image has more than MAX_IMAGE_PIXELS."""
+    if image.size > MAX_IMAGE_PIXELS:
+        return np.zeros(0, np.uint8)
     for quality in _JPEG_QUALITIES:
         jpeg = encode_jpeg(image, quality)
         if len(jpeg) <= MAX_JPEG_BYTES:
@@ -66,6 +68,8 @@ def image_objection(image: KeyframeImage, camera: Camera) -> str | None:
         return "its image is no baseline JPEG"
     if (header.width, header.height) != (camera.width, camera.height):
         return f"its image has {header.width}x{header.height} px, its camera {camera.width}x{camera.height}"
+    if header.width * header.height > MAX_IMAGE_PIXELS:
+        return f"its image has {header.width}x{header.height} px, more than {MAX_IMAGE_PIXELS}"
     return None
 
 

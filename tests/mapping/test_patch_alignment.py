@@ -195,7 +195,7 @@ def test_a_verified_pose_is_replaced_and_its_covariance_has_a_floor(pairs) -> No
     found = align_verified(orb, query, candidate)
     assert isinstance(found, Verification)
     assert np.linalg.norm(error(true, found.T_c_q)[3:]) < 0.0015
-    assert (found.matches, found.inliers > 100) == (60, True)
+    assert found.matches >= found.inliers > 100  # patches, not descriptors
     floor = np.diag([np.radians(0.02) ** 2] * 3 + [0.001**2] * 3)
     assert np.linalg.eigvalsh(found.cov - 4 * floor)[0] > 0
     assert np.trace(found.cov[3:, 3:]) < 0.01**2
@@ -246,7 +246,7 @@ def test_views_without_common_ground_are_refused(pairs) -> None:
     assert isinstance(align_from_map(behind, query, candidate), Refusal)
 
 
-def test_two_rigid_halves_that_disagree_are_refused(pairs) -> None:
+def test_a_pose_whose_patches_disagree_is_kept_and_trusted_less(pairs) -> None:
     """Surfaces whose depths are nonsense: patches are found, but no pose explains where."""
     true, query, candidate = pairs[0]
     rng = np.random.default_rng(6)
@@ -256,8 +256,11 @@ def test_two_rigid_halves_that_disagree_are_refused(pairs) -> None:
     wild_c = dataclasses.replace(
         candidate.source, plane=candidate.source.plane * rng.choice([0.93, 1.07], (len(candidate.uv), 1))
     )
-    views = (ImageView(image, CAMERA, T_BODY_CAM) for image in (wild, wild_c))
-    refusal = align_verified(verified(true), *views)
+    views = [ImageView(image, CAMERA, T_BODY_CAM) for image in (wild, wild_c)]
+    kept = align_verified(verified(true), *views)
+    np.testing.assert_array_equal(kept.T_c_q, true)
+    np.testing.assert_allclose(kept.cov, 10 * verified(true).cov)
+    refusal = align_from_map(true, *views)
     assert isinstance(refusal, Refusal) and "agree with one pose" in refusal.reason
 
 

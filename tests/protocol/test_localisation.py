@@ -113,6 +113,18 @@ def test_the_time_to_settle_is_measured_from_the_first_of_several_corrections() 
     assert 0.5 < settled[0] < 2.5
 
 
+def test_a_correction_that_is_taken_back_leaves_no_time_running() -> None:
+    frame, T_odom_body = MapFrame(0.5), np.eye(4)
+    correct(frame, np.eye(4), T_odom_body, 0)
+    correct(frame, moved_to((0.05, 0, 0)), T_odom_body, S)
+    correct(frame, np.eye(4), T_odom_body, S)
+    correct(frame, moved_to((0.002, 0, 0)), T_odom_body, 60 * S)
+    settled = [
+        s for k in range(1, 30) if (s := frame.advance(T_odom_body, 60 * S + k * FRAME_NS)) is not None
+    ]
+    assert len(settled) == 1 and settled[0] < 2.0
+
+
 def test_another_map_or_a_long_way_makes_the_pose_jump() -> None:
     frame, T_odom_body = MapFrame(0.5), np.eye(4)
     assert correct(frame, np.eye(4), T_odom_body, 0)

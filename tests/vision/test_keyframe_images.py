@@ -11,8 +11,8 @@ import pytest
 from share.geometry.camera import Camera
 from share.types import (
     MAX_JPEG_BYTES,
-    MAX_KEYPOINTS,
     MAX_PLANE,
+    MAX_SURFACES,
     MAX_UV,
     KeyframeCandidate,
     KeyframeImage,
@@ -59,7 +59,7 @@ def image_of(n: int = 2, **changed: object) -> KeyframeImage:
     [
         ({"jpeg": np.zeros(MAX_JPEG_BYTES + 1, np.uint8)}, "jpeg: 64001 bytes, at most 64000"),
         ({"jpeg": np.zeros((2, 2), np.uint8)}, "jpeg: shape"),
-        ({"uv": np.zeros((MAX_KEYPOINTS + 1, 2))}, "uv: 2001 features, at most 2000"),
+        ({"uv": np.zeros((MAX_SURFACES + 1, 2))}, "uv: 257 features, at most 256"),
         ({"uv": np.zeros((3, 2))}, "plane: shape"),
         ({"plane": np.zeros((1, 3))}, "plane: shape"),
         ({"rho_sigma": np.zeros(1)}, "rho_sigma: shape"),
@@ -189,3 +189,13 @@ def test_no_damaged_image_raises() -> None:
         decoded = decompress(of_jpeg(damaged), CAMERA)
         sizes.add(None if decoded is None else decoded.shape)
     assert sizes <= {None, (480, 640)} and (480, 640) in sizes
+
+
+def test_an_image_larger_than_any_edge_bears_is_left_out() -> None:
+    """libjpeg would fill 8192 x 8192 px of an 11 kB file."""
+    large = Camera(8192, 8192, 4000, 4000, 4096, 4096)
+    assert not len(compress(np.zeros((8192, 8192), np.uint8)))
+    jpeg = encode_jpeg(np.zeros((2000, 2000), np.uint8), 10)
+    said = image_objection(of_jpeg(np.frombuffer(jpeg, np.uint8)), Camera(2000, 2000, 900, 900, 1000, 1000))
+    assert said is not None and "more than 2400000" in said
+    assert decompress(of_jpeg(np.frombuffer(jpeg, np.uint8)), large) is None

@@ -21,6 +21,7 @@ from share.geometry.camera import Camera, ImuNoise, Rig
 from share.net.backlog import BacklogLimits
 from share.types import (
     MAX_JPEG_BYTES,
+    MAX_SURFACES,
     AgentKind,
     Correction,
     Frame,
@@ -146,7 +147,7 @@ def test_poses_relative_to_earlier_keyframes_come_as_they_were_sent() -> None:
 
 
 def test_the_largest_keyframe_image_is_decoded() -> None:
-    sent = with_earlier(keyframe_with_image(2000, MAX_JPEG_BYTES, 40), MAX_EARLIER)
+    sent = with_earlier(keyframe_with_image(MAX_SURFACES, MAX_JPEG_BYTES, 40), MAX_EARLIER)
     assert same(codec.decode(copied(codec.encode(sent))), sent)
     assert max(map(len, codec.encode(sent))) <= codec.MAX_FRAME_BYTES
     guard = BacklogLimits.for_frame_size(codec.MAX_FRAME_BYTES)

@@ -11,7 +11,7 @@ from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView
 from share.types import Keyframe, KeyframeImage, View
 
-_DECODED_IMAGES = 64  # kept decoded, with their patches; the others stay compressed
+_DECODED_IMAGES = 32  # kept decoded, with their patches; the others stay compressed
 
 
 class KeyframeViews:

@@ -8,7 +8,7 @@ Gauss-Newton, on a pyramid from coarse to fine.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -47,6 +47,7 @@ _FLOOR_DEG, _FLOOR_M = 0.02, 0.001
 # Surfaces are no planes, which shows from elsewhere: without this factor on the variance 90 % of the NEES (6
 # degrees of freedom) are below 6 at 0.3 m, 15 at 1.2 m, 25 at 2 m, 75 at 3 m (three emulated sessions).
 _WIDE_VARIANCE_PER_M2 = 0.5
+_UNALIGNED_VARIANCE = 10.0  # factor on that of a pair whose patches do not align: NEES of 17 to 116 measured
 _SHARED_ERROR = 2.0  # factor on sigma in the graph: the loops of a keyframe share its depths' errors
 
 
@@ -122,13 +123,16 @@ class AlignedLoop:
     depth_scale: DepthScale | None
 
 
-def align_verified(verified: Verification, query: ImageView, candidate: ImageView) -> Verification | Refusal:
-    """Return the verification with the pose of the aligned images, or why they contradict it. It stays as it
-    is where too few patches can be compared."""
+def align_verified(verified: Verification, query: ImageView, candidate: ImageView) -> Verification:
+    """Return the verification with the pose of the aligned images; with its own pose, which is trusted less,
+    where too few patches can be compared or agree: surfaces seen from elsewhere."""
+    if not query.pyramid or not candidate.pyramid:
+        return verified  # damaged: nothing to compare
     aligned = align_images(verified.T_c_q, query, candidate)
-    if aligned is None:
-        return verified
-    return _verification(aligned, verified.matches)
+    refined = None if aligned is None else _verification(aligned, aligned.found)
+    if isinstance(refined, Verification):
+        return refined
+    return replace(verified, cov=_UNALIGNED_VARIANCE * verified.cov)
 
 
 def align_from_map(T_c_q: F64, query: ImageView, candidate: ImageView) -> Verification | Refusal:
