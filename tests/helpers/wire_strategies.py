@@ -87,8 +87,8 @@ def earlier_poses(draw: st.DrawFn, below: int) -> EarlierPoses:
     rng = np.random.default_rng(draw(st.integers(0, 99)))
     A = rng.normal(size=(n, 6, 6))
     T = [draw(poses(MAX_ODOM_M / 2)) if k == 0 else se3.exp(rng.normal(size=6)) for k in range(n)]
-    ids = rng.integers(0, max(below, 1), n)
-    return EarlierPoses(ids, np.array(T, np.float32).reshape(n, 4, 4), np.float32(A @ A.swapaxes(1, 2)))
+    ids = draw(st.lists(st.integers(0, max(below - 1, 0)), min_size=n, max_size=n, unique=True))
+    return EarlierPoses(np.array(ids, np.int64), np.array(T, np.float32).reshape(n, 4, 4), np.float32(A @ A.swapaxes(1, 2)))
 
 
 @st.composite
