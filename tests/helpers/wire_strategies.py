@@ -88,7 +88,9 @@ def earlier_poses(draw: st.DrawFn, below: int) -> EarlierPoses:
     A = rng.normal(size=(n, 6, 6))
     T = [draw(poses(MAX_ODOM_M / 2)) if k == 0 else se3.exp(rng.normal(size=6)) for k in range(n)]
     ids = draw(st.lists(st.integers(0, max(below - 1, 0)), min_size=n, max_size=n, unique=True))
-    return EarlierPoses(np.array(ids, np.int64), np.array(T, np.float32).reshape(n, 4, 4), np.float32(A @ A.swapaxes(1, 2)))
+    return EarlierPoses(
+        np.array(ids, np.int64), np.array(T, np.float32).reshape(n, 4, 4), np.float32(A @ A.swapaxes(1, 2))
+    )
 
 
 @st.composite
