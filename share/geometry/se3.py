@@ -212,3 +212,14 @@ def best_rotation(M: F64) -> F64:
     """
     U, _, Vt = np.linalg.svd(M)
     return np.asarray(U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+
+
+def point_jacobian(D: F64, q: F64, rho: F64) -> F64:
+    """Return D [-hat(q) | rho I] (N, K, 6): the derivative of q (N, 3) by xi of Exp(xi), times D (N, K, 3) or
+    (K, 3)."""
+    out = np.empty((len(q), D.shape[-2], 6))
+    x, y, z = q[:, 0, None], q[:, 1, None], q[:, 2, None]
+    a, b, c = D[..., 0], D[..., 1], D[..., 2]
+    out[:, :, 0], out[:, :, 1], out[:, :, 2] = y * c - z * b, z * a - x * c, x * b - y * a
+    np.multiply(D, rho[:, None, None], out=out[:, :, 3:])
+    return out

@@ -95,8 +95,7 @@ class GraphEdges:
 
         poses, gravity_factors: of all node ids (`share.mapping.graph.gravity`).
         """
-        is_robust = self.loops.keys() | self.spans
-        edges = [(n, self.by_id[n], n in is_robust) for n in sorted(self._pending_edges)]
+        edges = [(n, self.by_id[n], n in self.loops or n in self.spans) for n in sorted(self._pending_edges)]
         update = GraphUpdate.from_edges(
             {node_id: poses[node_id] for node_id in sorted(self._moved_nodes)},
             edges,

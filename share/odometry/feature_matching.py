@@ -250,8 +250,8 @@ def predict(
     H_rho = t_odom_anchor @ R.T + t
     uv, D, H_rho = _project_with_jacobians(q, rho, H_rho, T_cam1_cam0, in_cam1)
     DR = D @ R
-    H_extrinsic = pose_jacobian(DR @ R_odom_anchor, f, rho) - pose_jacobian(D, q, rho)
-    return Prediction(uv, -pose_jacobian(DR, q_odom, rho), H_extrinsic, H_rho)
+    H_extrinsic = se3.point_jacobian(DR @ R_odom_anchor, f, rho) - se3.point_jacobian(D, q, rho)
+    return Prediction(uv, -se3.point_jacobian(DR, q_odom, rho), H_extrinsic, H_rho)
 
 
 def in_image_plane(predicted: Prediction, camera: Camera, mask: NDArray[np.bool_]) -> Prediction:
@@ -338,17 +338,6 @@ def anchors_in_camera(state: FilterState, indices: I64 | slice = slice(None)) ->
     """Return T_cam_anchor (N, 4, 4): from cam0 of the anchor of each feature in `indices` to cam0 now."""
     T_cam_anchor = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses @ state.T_body_cam
     out: F64 = T_cam_anchor[state.anchor[indices]]
-    return out
-
-
-def pose_jacobian(D: F64, q: F64, rho: F64) -> F64:
-    """Return D [-hat(q) | rho I] (N, K, 6): the derivative of q (N, 3) by xi of Exp(xi), times D (N, K, 3) or
-    (K, 3)."""
-    out = np.empty((len(q), D.shape[-2], 6))
-    x, y, z = q[:, 0, None], q[:, 1, None], q[:, 2, None]
-    a, b, c = D[..., 0], D[..., 1], D[..., 2]
-    out[:, :, 0], out[:, :, 1], out[:, :, 2] = y * c - z * b, z * a - x * c, x * b - y * a
-    np.multiply(D, rho[:, None, None], out=out[:, :, 3:])
     return out
 
 

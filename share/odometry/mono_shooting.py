@@ -15,7 +15,6 @@ import numpy as np
 from share.array_table import ArrayTable
 from share.geometry import se3
 from share.geometry.camera import rays
-from share.odometry.feature_matching import pose_jacobian
 from share.odometry.imu_propagation import ImuPropagation
 from share.odometry.state import IMU_STATE_SIZE, FilterState
 from share.types import F64, I64
@@ -97,7 +96,7 @@ class ShootingSolver:
         r = -(project @ in_camera[:, :, None])[:, :, 0]
         weight = 1 / np.sqrt(1 + (r**2).sum(axis=1) / scale**2)
         project = (project @ R_cam_odom) * weight[:, None, None]
-        J_pose = pose_jacobian(np.eye(3), point, np.ones(len(point)))
+        J_pose = se3.point_jacobian(np.eye(3), point, np.ones(len(point)))
         J = project @ (J_pose @ (self._J_first[s.anchor, :6] - self._J_first[s.frame, :6]))
         return r * weight[:, None], J, (project @ direction)[:, :, 0]
 

@@ -22,13 +22,13 @@ def measures_depth(frame: Frame, rig: Rig) -> bool:
     )
 
 
-def measure_depth(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
-    """Return the depth (N,) m in cam0 of image points, from stereo or a depth camera; NaN where unknown.
-    guess_m (N,): expected depths."""
+def measure_depth(frame: Frame, rig: Rig, px: F32, uv: F64) -> F64:
+    """Return the depth (N,) m in cam0 of image points, from stereo or a depth camera; NaN where
+    unknown."""
     if frame.depth is not None and rig.depth is not None:
         return depths.from_depth_camera(frame.depth, rig, uv)
     if frame.image1 is not None and rig.cam1 is not None:
-        return depths.from_stereo(frame.image0, frame.image1, rig, px, uv, guess_m)
+        return depths.from_stereo(frame.image0, frame.image1, rig, px, uv)
     return np.full(len(px), np.nan)
 
 

@@ -295,10 +295,7 @@ def _residuals(
     J_px = target.camera.jacobian(uv) @ D
     by_rho = J_px @ T[:3, 3]  # px per 1/m
     J = np.empty((len(index), 2, 8))  # by the pose, by the log of the depth, and the residual
-    x, y, z = q[:, 0, None], q[:, 1, None], q[:, 2, None]
-    a, b, c = J_px[..., 0], J_px[..., 1], J_px[..., 2]
-    J[:, :, 0], J[:, :, 1], J[:, :, 2] = y * c - z * b, z * a - x * c, x * b - y * a
-    J[:, :, 3:6] = J_px * rho[:, None, None]
+    J[:, :, :6] = se3.point_jacobian(J_px, q, rho)
     J[:, :, 6] = by_rho * rho[:, None]
     J[:, :, 7] = alignment.px - target.camera.distort(uv)
     is_visible = np.isfinite(uv).all(axis=1)

@@ -11,8 +11,6 @@ from share.geometry.se3 import compose_cov, position_sigma, rotation_angle
 from share.metrics.local_error import WINDOW_S
 from share.types import F64, KeyframeCandidate, TrackState
 
-MOST_AGO = 8  # frames kept, to find that of a keyframe published later
-
 
 class FrameOutcome(NamedTuple):
     """How a frame was tracked: with IMU samples or not, its state, features found and inliers, and the
