@@ -105,13 +105,19 @@ def path_in_map(
     seconds = float(np.ptp(pair[0].stamps_ns)) * 1e-9 if len(i) else math.nan
     steps_mm, ahead_mm = correction_steps(*pair)
     is_step = steps_mm < _JUMP_MM
+    map_cm, odom_cm, late_map_cm, late_odom_cm = (_ate_cm(path, truth) for path in (*pair, *late))
+    map_rpe_cm, odom_rpe_cm = (_rpe_cm(path, truth) for path in pair)
     return PathInMap(
         run,
         agent,
         joint_cm,
         seconds,
-        *(_ate_cm(path, truth) for path in (*pair, *late)),
-        *(_rpe_cm(path, truth) for path in pair),
+        map_cm,
+        odom_cm,
+        late_map_cm,
+        late_odom_cm,
+        map_rpe_cm,
+        odom_rpe_cm,
         float((is_step & (steps_mm > _STEP_MM)).sum()) / seconds,
         float((is_step & (ahead_mm > _STEP_MM)).sum()) / seconds,
         float(steps_mm[is_step].max(initial=0.0)),
@@ -147,8 +153,8 @@ def _rpe_cm(path: Trajectory, truth: Trajectory) -> float:
 
 
 def table(paths: Sequence[PathInMap]) -> str:
-    head = ("run", "agent", "s in map", "joint cm", "map / odometry cm", "ratio", "late ratio", "RPE ratio")
-    head += ("steps > 1 mm /s", "3 m ahead /s", "max mm", "jumps")
+    head = ["run", "agent", "s in map", "joint cm", "map / odometry cm", "ratio", "late ratio", "RPE ratio"]
+    head += ["steps > 1 mm /s", "3 m ahead /s", "max mm", "jumps"]
     rows = [line(head), line(["---"] * len(head))]
     for p in paths:
         cells = [p.run, p.agent, f"{p.seconds:.0f}", f"{p.joint_cm:.2f}", f"{p.map_cm:.2f} / {p.odom_cm:.2f}"]
