@@ -81,10 +81,10 @@ class Atlas:
 
     def all_poses(self) -> SavePoses:
         """Current pose and map of every keyframe."""
-        nodes, poses = self.graph.odometry.nodes, self.graph.poses
-        maps = tuple(self.graph.map_id(node.segment) for node in nodes.values())
-        T_map_body = np.array([poses[n] for n in nodes]).reshape(-1, 4, 4)
-        return SavePoses(tuple(node.key for node in nodes.values()), T_map_body, maps)
+        graph, nodes = self.graph, self.graph.odometry.nodes
+        map_ids = {segment: graph.map_id(segment) for segment in graph.odometry.live_segments}
+        maps = tuple(map_ids[node.segment] for node in nodes.values())
+        return SavePoses(tuple(node.key for node in nodes.values()), graph.poses.stack(list(nodes)), maps)
 
     # Runs
 

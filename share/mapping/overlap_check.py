@@ -70,7 +70,7 @@ class OverlapCheck:
         if not nodes_a or not nodes_b:
             return []
         T_b = graph.poses[a] @ loop.T_a_b @ se3.inverse(graph.poses[b])  # map of b in that of a
-        poses_a, poses_b = (np.array([graph.poses[n] for n in nodes]) for nodes in (nodes_a, nodes_b))
+        poses_a, poses_b = (graph.poses.stack(nodes) for nodes in (nodes_a, nodes_b))
         pairs = _near_pairs(poses_a, T_b @ poses_b)
         comparisons = ((j, self._compare_views(nodes_a[i], nodes_b[j], T)) for i, j, T in pairs)
         return [comparison for _, comparison in sorted(_informative(comparisons, _MAX_PAIRS))]
@@ -119,7 +119,7 @@ class OverlapCheck:
         if not nodes or node_id not in self._camera_views:
             return None
         poses = self._graph.poses
-        pairs = _near_pairs(np.array([poses[n] for n in nodes]), poses[node_id][None])
+        pairs = _near_pairs(poses.stack(nodes), poses[node_id][None])
         comparisons = _informative(((j, self._compare_views(nodes[i], node_id, T)) for i, j, T in pairs), 1)
         return comparisons[0][1] if comparisons else None
 
