@@ -3,7 +3,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from share.mapping.recognition.index import PlaceIndex, build_page, merge_pages
+from share.mapping.recognition.index import IndexPage, PlaceIndex, build_page, merge_in_steps
 from share.types import U8
 
 
@@ -17,6 +17,16 @@ def filled(n: int, rng: np.random.Generator) -> tuple[PlaceIndex, list[U8]]:
     for i, descriptors in enumerate(places):
         index.add(1000 + i, descriptors)
     return index, places
+
+
+def merged(pages: list[IndexPage]) -> IndexPage:
+    steps = merge_in_steps(pages)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            page: IndexPage = end.value
+            return page
 
 
 def test_a_half_overlapping_view_is_found() -> None:
@@ -101,7 +111,7 @@ def test_removed_keyframes_can_be_added_again() -> None:
 
 def test_merged_pages_equal_one_page_of_the_remaining_keyframes() -> None:
     rng = np.random.default_rng(8)
-    vocabulary = 150_000  # joined in several blocks
+    vocabulary = 300_000  # merged in several steps
     common = rng.integers(0, vocabulary, 500, np.uint32)
     views = [np.append(rng.choice(common, n), [0, vocabulary - 1]).astype(np.uint32) for n in range(120)]
     pages = [build_page(range(i, j), views[i:j], vocabulary) for i, j in ((0, 70), (70, 80), (80, 120))]
@@ -109,7 +119,7 @@ def test_merged_pages_equal_one_page_of_the_remaining_keyframes() -> None:
     for page in pages:
         page.is_alive[np.isin(page.ids, dead)] = False
     left = [i for i in range(120) if i not in dead]
-    one, whole = merge_pages(pages), build_page(left, [views[i] for i in left], vocabulary)
+    one, whole = merged(pages), build_page(left, [views[i] for i in left], vocabulary)
     for name in ("ids", "sizes", "is_alive", "starts", "slots"):
         np.testing.assert_array_equal(getattr(one, name), getattr(whole, name), name, strict=True)
 
