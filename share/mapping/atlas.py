@@ -45,7 +45,7 @@ class Atlas:
         self._runs = AgentRuns()
         self.solving = MapSolving(self.graph, self.loop_acceptance, self._localisation_gate, self._runs)
         self.culling = KeyframeCulling(self.graph, self._runs)
-        self.quarantine = Quarantine(self.graph, self.loop_acceptance, known_views)
+        self.quarantine = Quarantine(self.graph, self.loop_acceptance)
 
     def __len__(self) -> int:
         return len(self.graph.poses)

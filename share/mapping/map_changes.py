@@ -16,6 +16,7 @@ from share.checks import checked_array, checked_cov, checked_pose
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey, Loop
 from share.types import F64, Keyframe
+from share.vision.packed_view import PackedView
 from share.wire.messages import Hello
 
 
@@ -87,6 +88,14 @@ class SaveLink:
 
 
 @dataclass(frozen=True, eq=False)
+class SaveView:
+    """The ORB features of a keyframe's image, so that a restarted edge need not find them again."""
+
+    key: KeyframeKey
+    view: PackedView
+
+
+@dataclass(frozen=True, eq=False)
 class SaveLoop:
     """An accepted loop. Several may connect the same two keyframes."""
 
@@ -140,6 +149,7 @@ MapChange = (
     | SaveCredential
     | SaveKeyframe
     | SaveLink
+    | SaveView
     | SaveLoop
     | RemoveLoops
     | RemoveKeyframes
@@ -193,7 +203,8 @@ def map_poses(kept: StoredMap) -> dict[KeyframeKey, tuple[str, F64]]:
             out[keyframe.keyframe_key] = solved[keyframe.keyframe_key]
             continue
         edge = odometry_link(keyframe, kept.links)
-        previous = out.get(KeyframeKey(keyframe.run_key, edge.reference))
+        reference = KeyframeKey(keyframe.run_key, edge.reference)
+        previous = out.get(reference) or solved.get(reference)
         if previous is None:
             out[keyframe.keyframe_key] = keyframe.segment_name, keyframe.keyframe.T_odom_body
         else:

@@ -66,7 +66,10 @@ class PlaceIndex:
 
     def add(self, id: int, descriptors: U8) -> None:
         """Add keyframe `id` with its descriptors (N, 32)."""
-        words = self.words(descriptors)
+        self.add_words(id, self.words(descriptors))
+
+    def add_words(self, id: int, words: U32) -> None:
+        """Add keyframe `id` with the words of its descriptors."""
         np.add.at(self._word_counts, words, np.int32(1))  # another dtype is 30 times slower
         self._unpaged[id] = words
         if len(self._unpaged) == _MAX_UNPAGED:
