@@ -7,15 +7,16 @@ newest solution.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from share.checks import checked_array, checked_cov, checked_pose
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey, Loop
-from share.types import F64, Keyframe
+from share.types import F64, I64, Keyframe
 from share.vision.packed_view import PackedView
 from share.wire.messages import Hello
 
@@ -142,6 +143,26 @@ class SavePoses:
         object.__setattr__(
             self, "T_map_body", checked_array("T_map_body", self.T_map_body, (n, 4, 4), np.float64)
         )
+
+    def __reduce__(self) -> tuple[Callable[..., SavePoses], tuple[Any, ...]]:
+        """To another process as columns: pickled one by one, 20,000 keys take 30 ms."""
+        agents, agent_numbers = _numbered([key.agent for key in self.keys])
+        maps, map_numbers = _numbered(self.map_ids)
+        ids = np.array([key.id for key in self.keys], np.int64)
+        return _poses_of_columns, (agents, agent_numbers, ids, maps, map_numbers, self.T_map_body)
+
+
+def _numbered(names: Sequence[str]) -> tuple[tuple[str, ...], I64]:
+    """Return the distinct names, and the number (N,) of each name among them."""
+    numbers = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    return tuple(numbers), np.array([numbers[name] for name in names], np.int64)
+
+
+def _poses_of_columns(
+    agents: tuple[str, ...], agent_numbers: I64, ids: I64, maps: tuple[str, ...], map_numbers: I64, T: F64
+) -> SavePoses:
+    keys = (KeyframeKey(agents[a], i) for a, i in zip(agent_numbers.tolist(), ids.tolist(), strict=True))
+    return SavePoses(tuple(keys), T, tuple(maps[m] for m in map_numbers.tolist()))
 
 
 MapChange = (

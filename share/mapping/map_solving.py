@@ -164,7 +164,11 @@ class MapSolving:
         added = self._loop_acceptance.accept_fitting()
         waiting = self._update_gate(job, solution)
         corrections, failed = self._corrections(job)
-        loop_count = sum(n in graph.edges.loops for n in solution.loop_ids.tolist())
+        loop_count = sum(
+            count
+            for (segment, _), count in graph.loop_counts.items()
+            if graph.reference_segments[segment] == reference_segment
+        )
         counts = f"{len(solution.pose_ids)} poses, {loop_count} loops solved"
         reason = f"map {job.map_id}: {counts}, corrections for {', '.join(corrections) or 'no agent'}"
         reason += "".join(f"; {agent}: {cause}" for agent, cause in failed.items())
