@@ -9,8 +9,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from share.config import MergeConfig
 from share.mapping.agents.covariance_scales import inflate_covariance
 from share.mapping.agents.quarantine import Quarantine

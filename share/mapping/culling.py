@@ -166,9 +166,7 @@ class KeyframeCulling:
         )
         return out + fair_quotas(held_counts, removable, out.pop(_ABSENT_AGENTS, 0), presence_order)
 
-    def _protected(
-        self, reference_segments: Iterable[int], reserve: ReturnReserve
-    ) -> InSlices[set[int]]:
+    def _protected(self, reference_segments: Iterable[int], reserve: ReturnReserve) -> InSlices[set[int]]:
         """Nodes that must stay: the newest of each growing segment, the anchors of these maps, and a node of
         each segment that connects a map.
         """

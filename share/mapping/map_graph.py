@@ -101,8 +101,9 @@ class GraphEdges:
         poses, gravity_factors: of all node ids (`share.mapping.graph.gravity`).
         """
         edges = [(n, self.by_id[n], n in self.loops or n in self.spans) for n in sorted(self._pending_edges)]
+        moved = sorted(self._moved_nodes)
         update = GraphUpdate.from_edges(
-            {node_id: poses[node_id] for node_id in sorted(self._moved_nodes)},
+            dict(zip(moved, poses.stack(moved), strict=True)),
             edges,
             sorted(self._removed_edges),
             sorted(self._removed_nodes),

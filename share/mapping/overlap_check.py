@@ -161,7 +161,7 @@ def _informative(
 def _near_pairs(poses_a: F64, poses_b: F64) -> Iterator[tuple[int, int, F64]]:
     """Yield pairs of poses a (N, 4, 4), b (K, 4, 4) from about one spot as i, j, T_a_b.
 
-    Nearest first, each pose in at most one pair. Of each pose of b the `_NEIGHBOURS` nearest of a are considered.
+    Nearest first, each pose in at most one pair. Of each b the `_NEIGHBOURS` nearest poses a are considered.
     """
     count = min(_NEIGHBOURS, len(poses_a))
     distance, rows = KDTree(poses_a[:, :3, 3]).query(

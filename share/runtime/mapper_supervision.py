@@ -49,8 +49,8 @@ class MapperRestarts:
         return self._backoff.record_failure(time.monotonic_ns())
 
     def load_map(self) -> tuple[RestoreMap | None, list[RestoredRun]]:
-        """Return the map for the mapper, and the agents' runs for a new session. Raises StoreError if the file is unreadable
-        now."""
+        """Return the map for the mapper, and the agents' runs for a new session. Raises StoreError if the
+        file is unreadable now."""
         self._is_restoring = False
         if self._tries >= _MAX_TRIES:
             self._set_aside(f"{self._tries} mappers in a row have died while restoring it")

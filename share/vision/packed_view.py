@@ -61,7 +61,9 @@ class PackedView:
         """Return the view; points that are too far for one have no depth."""
         uv = self.uv * self.uv_step
         rho = self.rho.astype(np.float64)
-        points = rays(uv) / np.where(rho * MAX_POSITION_M > np.abs(rays(uv)).max(axis=1), rho, np.nan)[:, None]
+        points = (
+            rays(uv) / np.where(rho * MAX_POSITION_M > np.abs(rays(uv)).max(axis=1), rho, np.nan)[:, None]
+        )
         return View(uv.astype(np.float32).clip(-MAX_UV, MAX_UV), points.astype(np.float32), self.descriptors)
 
     def to_bytes(self) -> bytes:

@@ -2,10 +2,10 @@
 
     python tools/experiments/measure_restart.py [--keyframes 2000 20000] [--folder DIR]
 
-The map is of 24 agents on the tracks of an emulated room (`load_tracks`), with an image and a view each. Prints
-one JSON object a size: size of the file; seconds until `share edge --map` listens, and its front's CPU s and memory
-then; then, in one process, CPU s to decode and to restore the map, until the first keyframe of a new agent is verified
-against it, and until all of it is indexed.
+The map is of 24 agents on the tracks of an emulated room (`load_tracks`), with an image and a view each.
+Prints one JSON object a size: size of the file; seconds until `share edge --map` listens, CPU s and memory of
+its front then; then, in one process, CPU s until the map is read, decoded and restored, the first keyframe of a
+new agent is verified against it, and all of it is indexed.
 """
 
 from __future__ import annotations
@@ -148,9 +148,9 @@ def recognise(path: Path, track: AgentKeyframes) -> dict[str, float]:
     mapper.add_run("eve-0001", Hello("eve", track.hello.kind, 99, track.hello.rig))
     coming, indexed = iter(track.keyframes), 0
     while "recognised_s" not in out or "indexed_s" not in out:
-        if (step := mapper.next_lookup()) is None or isinstance(step, IndexStep):
-            if "recognised_s" not in out:
-                mapper.add_keyframe("eve-0001", next(coming))
+        step = mapper.next_lookup()
+        if "recognised_s" not in out and (step is None or isinstance(step, IndexStep)):
+            mapper.add_keyframe("eve-0001", next(coming))
         if step is not None:
             mapper.finish_step(step, step.run(), 0.0)
         indexed += len(step.entries) if isinstance(step, IndexStep) else 0

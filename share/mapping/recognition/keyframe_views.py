@@ -21,6 +21,7 @@ _DECODED_IMAGES = 32  # kept decoded, with their patches; the others stay compre
 _KEPT_JPEGS, _KEPT_VIEWS = 500, 1000  # kept in memory where the map file has them too
 _RESTORED_STRIDE = 16  # restored keyframes are indexed in so many passes: each goes over the whole map
 _RESTORED_PER_SLICE = 16
+_NO_VIEW = View.empty()  # one for all, since it takes 500 bytes
 
 
 class KeyframeArchive(Protocol):
@@ -94,10 +95,8 @@ class KeyframeViews:
             self._restored.extend(node_id for node_id, *_ in keyframes[first::_RESTORED_STRIDE])
 
     def _add(self, node_id: int, key: KeyframeKey, keyframe: Keyframe, rig: Rig, has_image: bool) -> None:
-        image = keyframe.image
-        self._known[node_id] = _Known(
-            key, rig, keyframe.up, keyframe.view, image.without_jpeg(), has_image
-        )
+        image, view = keyframe.image, keyframe.view if len(keyframe.view) else _NO_VIEW
+        self._known[node_id] = _Known(key, rig, keyframe.up, view, image.without_jpeg(), has_image)
         if has_image:
             self._images[node_id] = None
             if not len(keyframe.view):
