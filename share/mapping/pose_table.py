@@ -55,7 +55,10 @@ class PoseTable(MutableMapping[int, F64]):
     def assign(self, node_ids: Sequence[int] | I64, T: F64) -> None:
         """Set the poses (N, 4, 4) of those of these nodes that are known."""
         rows, is_known = self._find(np.asarray(node_ids, np.int64))
-        self._T[rows[is_known]] = T[is_known]
+        if is_known.all():
+            self._T[rows] = T
+        else:
+            self._T[rows[is_known]] = T[is_known]
 
     def near(self, T: F64, max_m: float) -> tuple[I64, F64]:
         """Nodes (N,) whose positions are nearer than `max_m` to that of T (4, 4), and their poses (N, 4, 4);

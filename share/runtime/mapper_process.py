@@ -6,7 +6,7 @@ import queue
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,7 +41,7 @@ class RestoreMap:
     rows: ReadRows
     has_keys: bool = False
 
-    @cached_property
+    @property
     def stored_map(self) -> StoredMap:
         """Decoding takes seconds for a large map, so the mapper does it."""
         decoded = decode_map(self.rows.copy())

@@ -51,7 +51,7 @@ def test_points_without_a_sensible_depth_have_none() -> None:
     [b"", b"\xc1", PackedView.pack(view(3)).to_bytes()[:-1], PackedView.pack(view(3)).to_bytes() + b"\0"],
 )
 def test_other_bytes_are_refused(data: bytes) -> None:
-    with pytest.raises(ValueError, match="."):
+    with pytest.raises(ValueError, match=r"."):
         PackedView.from_bytes(data)
 
 

@@ -4,8 +4,8 @@
 
 The map is of 24 agents on the tracks of an emulated room (`load_tracks`), with an image and a view each.
 Prints one JSON object a size: size of the file; seconds until `share edge --map` listens, CPU s and memory of
-its front then; then, in one process, CPU s until the map is read, decoded and restored, the first keyframe of a
-new agent is verified against it, and all of it is indexed.
+its front then. Then, in one process, CPU s until the map is read, decoded and restored, until the first
+keyframe of a new agent is verified against it, and until all of it is indexed.
 """
 
 from __future__ import annotations

@@ -53,8 +53,8 @@ class Quarantine:
         """Add a node, by odometry from the previous one of its segment."""
         odometry = self._graph.odometry
         agent = odometry.nodes[node_id].key.agent
-        self.agreement.add_step(agent, node_id, odometry.previous_node(node_id), T_ref_body, cov)
-        self.apply_scales()
+        if self.agreement.add_step(agent, node_id, odometry.previous_node(node_id), T_ref_body, cov):
+            self.apply_scales()
 
     def add_loop(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
         """Compare the agents of a verified loop, and split maps of agents that no longer agree.
