@@ -5,13 +5,14 @@
 The map is of 24 agents on the tracks of an emulated room (`load_tracks`), with an image and a view each.
 Prints one JSON object a size: size of the file; seconds until `share edge --map` listens, CPU s and memory of
 its front then. Then, in one process, CPU s until the map is read, decoded and restored, until the first
-keyframe of a new agent is verified against it, and until all of it is indexed.
+keyframe of a new agent is verified against it, and until all of it is indexed; and what it takes of memory.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -38,6 +39,7 @@ from share.mapping.map_changes import MapChange, SaveKeyframe, SavePoses, SaveRu
 from share.mapping.mapper import Mapper  # noqa: E402
 from share.mapping.recognition.patch_alignment import ImageView  # noqa: E402
 from share.mapping.steps import IndexStep  # noqa: E402
+from share.startup import HeapTrimmer  # noqa: E402
 from share.store.keyframe_archive import KeyframeArchive  # noqa: E402
 from share.store.loading import decode_map  # noqa: E402
 from share.store.map_store import MapStore  # noqa: E402
@@ -132,7 +134,7 @@ def restart(path: Path) -> dict[str, Any]:
 
 def recognise(path: Path, track: AgentKeyframes) -> dict[str, float]:
     """Restore the map in a mapper, and look up keyframes of a new agent in it."""
-    out = {}
+    out, before_mb = {}, trimmed_mb()
     began = time.process_time()
 
     def spent(what: str) -> None:
@@ -159,7 +161,18 @@ def recognise(path: Path, track: AgentKeyframes) -> dict[str, float]:
         if "recognised_s" not in out and mapper.report()["agents"]["eve-0001"]["merges"]["requested"]:
             spent("recognised_s")
             out["indexed_then"] = indexed
+    count = len(kept.keyframes)
+    del kept, step
+    out["mapper_kb_a_keyframe"] = round(1e3 * (trimmed_mb() - before_mb) / count, 1)
     return out
+
+
+def trimmed_mb() -> float:
+    """Memory of this process, after free heap is given back."""
+    heap = HeapTrimmer()
+    heap.trim_if_due(0.0)
+    heap.trim_if_due(1e6)
+    return rss_mb(os.getpid())
 
 
 if __name__ == "__main__":
